@@ -37,7 +37,7 @@ RUNS = {
             "observation.runs.0.cycles=0.05"),
     "plan": ("plan", "fiducial", "gain_1e-2", "--workers", "1", "--vary", "frequency_mhz=10,25",
              *SMALL),
-    "paper": ("map", "beam_4MHz", "--covariance", "--updatable", "--draws", "5", *SMALL),
+    "paper": ("map", "beam_4MHz", "--covariance", "--information", "--draws", "5", *SMALL),
     "sessions": (
         "map", "fiducial",
         "--data", *(str(SHARED / "flight" / f"session_{name}.h5") for name in "abcd"),

@@ -32,10 +32,10 @@ from lusee_bayes.core.harmonics import tilt_powers
 from lusee_bayes.experiment.experiment import inform
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.experiment.term import Around
 from lusee_bayes.linear.joint import ComponentSums, summed_information
 from lusee_bayes.linear.normal_matrix import normal_matrix
 from lusee_bayes.noise.radiometer import radiometer_noise
+from lusee_bayes.systematics.context import Around
 
 SAMPLES = [(1.0, 7200.0), (1.0, 600.0), (3.0, 7200.0), (12.0, 600.0), (13.368, 600.0)]
 LMAX = [16, 24, 32, 47, 64, 95]

@@ -27,14 +27,13 @@ from rich.table import Table
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import modes_to_map
-from lusee_bayes.experiment.draws import deviations
-from lusee_bayes.experiment.experiment import under_sky
+from lusee_bayes.experiment.experiment import deviations, under_sky
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.judge.coverage import Counts
 from lusee_bayes.judge.levels import LEVELS
 from lusee_bayes.report.figures.drawing import BLUE, DIVERGING, GREY, ORANGE, colour_bar, mollweide
 from lusee_bayes.results.channel import ChannelResult
-from lusee_bayes.runs.map_run import map_result
+from lusee_bayes.results.channel_map import conditioned
 from lusee_bayes.sky.sky_source import FileSource, GalaxySource, SkySource
 
 # each takes a seed
@@ -150,9 +149,10 @@ def main() -> int:
     mapped = []
     for name, source in map(find_sky, options.skies):
         # noise of its own for each sky, whatever the others are
-        result = map_result(under_sky(setup, source, scenario.seed + zlib.crc32(name.encode())))
-        channel, error = result.channel, result.channel.truth - result.channel.mean
-        drawn = deviations(result.experiment, result.inference.posterior, n_draws)
+        made = conditioned(under_sky(setup, source, scenario.seed + zlib.crc32(name.encode())))
+        channel = made.result(made.known())
+        error = channel.truth - channel.mean
+        drawn = deviations(made.experiment, made.posterior, n_draws)
         pixels = Counts.of_pixels(channel.pixel_std, error, drawn)
         mapped.append(Mapped(name, channel, pixels, Counts.of_modes(channel.std, error, drawn)))
     table = Table("sky", "part", *(f"{level:.0%}" for level in LEVELS), "rms pull", "largest")

@@ -24,8 +24,8 @@ from lusee_bayes.experiment.model import base_model, true_values
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.judge.measures import ell_cross, signal_to_noise
 from lusee_bayes.report.figures.drawing import BLUE, ORANGE, colour_bar, mollweide, shown
-from lusee_bayes.report.figures.maps import sky_maps
-from lusee_bayes.runs.map_run import map_result
+from lusee_bayes.report.figures.maps import channel_map
+from lusee_bayes.results.channel_map import conditioned
 from lusee_bayes.sampling.datatree import read_datatree
 from lusee_bayes.sampling.mode import summary
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, galaxy_map
@@ -36,8 +36,8 @@ GREEN = "#009E73"  # of the same palette as BLUE and ORANGE
 
 def first_map() -> None:
     """Draw the maps of `lusee-bayes map fiducial`."""
-    channel = map_result(lb.build(lb.load_scenario("fiducial"))).channel
-    sky_maps(channel).savefig(HERE / "maps.png", dpi=110)
+    made = conditioned(lb.build(lb.load_scenario("fiducial")))
+    channel_map(made.result(made.known())).savefig(HERE / "maps.png", dpi=110)
 
 
 def fixed_axis() -> None:
@@ -208,12 +208,13 @@ def point_sources() -> None:
     for treatment in ("marginalised", "ignored"):
         overrides = [f"sources.list=[{listed}]", f"sources.treatment={treatment}"]
         experiment = lb.build(lb.load_scenario("fiducial", overrides))
-        result = map_result(experiment)
-        mean, truth = result.channel.mean, result.channel.truth
+        made = conditioned(experiment)
+        channel = made.result(made.known())
+        mean, truth = channel.mean, channel.truth
         lines[treatment] = signal_to_noise(mean, truth)
         residuals[treatment] = shown(mean - truth, 64)
-        if result.fluxes is not None:
-            print(result.fluxes.to_string(float_format="{:.4g}".format))
+        if channel.fluxes is not None:
+            print(channel.fluxes.to_string(float_format="{:.4g}".format))
     # the sky with its sources up to lmax, which the second map should show
     with_sources, fluxes = truth, true_values(experiment.setup)
     for source in BRIGHT_SOURCES:

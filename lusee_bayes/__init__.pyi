@@ -35,7 +35,6 @@ from .instrument.waterfalls import write_waterfall as write_waterfall
 from .linear.information import Information as Information
 from .linear.joint import solve_directly as solve_directly
 from .linear.linear_gaussian import LinearGaussian as LinearGaussian
-from .linear.linear_gaussian import updated as updated
 from .linear.posterior import Posterior as Posterior
 from .noise.covariance import Covariance as Covariance
 from .noise.covariance import DenseCovariance as DenseCovariance
@@ -48,12 +47,13 @@ from .noise.instrument_errors import beam_error_noise as beam_error_noise
 from .noise.instrument_errors import template_noise as template_noise
 from .noise.radiometer import radiometer_noise as radiometer_noise
 from .results.channel import ChannelResult as ChannelResult
-from .results.cube import CubeResult as CubeResult
 from .results.map_result import MapResult as MapResult
 from .runs.compare_run import run_compare as run_compare
 from .runs.compare_run import run_compare_priors as run_compare_priors
 from .runs.data_run import run_average as run_average
+from .runs.data_run import run_reduce as run_reduce
 from .runs.data_run import run_simulate as run_simulate
+from .runs.data_run import run_simulate_flight as run_simulate_flight
 from .runs.map_run import run_map as run_map
 from .runs.paper_run import run_paper as run_paper
 from .runs.plan_run import run_plan as run_plan

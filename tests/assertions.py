@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import numpy as np
@@ -36,3 +36,9 @@ def refused(words: str) -> Iterator[pytest.ExceptionInfo[InputError]]:
     text = str(caught.value)
     assert words in text or re.search(words, text), text
     assert "\n" not in text and "Traceback" not in text and "pydantic" not in text
+
+
+def refuse(words: str, call: Callable[..., object], *arguments: object, **options: object) -> None:
+    """Assert that a call is refused so."""
+    with refused(words):
+        call(*arguments, **options)

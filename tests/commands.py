@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import xarray as xr
 
 from lusee_bayes.cli.main import main
@@ -21,6 +22,13 @@ def content(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in found}
 
 
-def posterior_of(folder: Path) -> xr.Dataset:
+def posterior_of(folder: Path) -> xr.DataTree:
     """What a map run has written."""
-    return xr.load_dataset(folder / "posterior.nc", engine="h5netcdf")
+    with xr.open_datatree(folder / "posterior.nc", engine="h5netcdf") as tree:
+        return tree.load()
+
+
+def sky_draws_of(folder: Path) -> np.ndarray:
+    """Its draws, on (frequency, draw, mode)."""
+    sky = posterior_of(folder)["posterior"]["sky"]
+    return sky.isel(chain=0).transpose("frequency", "draw", "mode").values

@@ -2,6 +2,7 @@
 
 import gc
 import os
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -112,6 +113,15 @@ SMALL_MAP = [
     "observation.runs=[{cycles: 0.1}, {cycles: 0.1, turntable_deg: 30}]",
     "output={draws: 400, covariance: true}",
 ]
+
+
+@pytest.fixture
+def numbers_alone(monkeypatch):
+    """Maps of this process are written without figures and pages, which take longer."""
+    from lusee_bayes.runs import folder, map_run
+
+    monkeypatch.setattr(map_run, "MAP", replace(map_run.MAP, figures={}))
+    monkeypatch.setattr(folder, "PAGES", {})
 
 
 # runs are imported when they are asked for: matplotlib and all that draws take seconds

@@ -13,13 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 from numpyro.infer.util import log_density
 
-from lusee_bayes.experiment.experiment import Experiment, build, program_pieces
+import lusee_bayes as lb
+from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.experiment.model import full_model, radiometer, simulate
-from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.experiment.term import Around
-from lusee_bayes.sampling.hmc import WHITE_SUFFIX, whitened
-from lusee_bayes.sampling.programs import Program, latent_sites, numpyro_promotion
+from lusee_bayes.instrument.products import DataLayout
+from lusee_bayes.results.channel_map import Conditioned, conditioned
+from lusee_bayes.results.map_files import SavedInformation
+from lusee_bayes.sampling.programs import WHITE_SUFFIX, Program, latent_sites, numpyro_promotion
+from lusee_bayes.systematics.context import Around
 from lusee_bayes.testing.scenarios import small_scenario
 
 # nothing of these enters a setup (test_experiment.py checks it), only the data and N; the mean of
@@ -28,26 +30,44 @@ NOT_IN_SETUP = ("noise.gain", "noise.radiometer", "noise.beam", "noise.pointing"
 
 
 @lru_cache
-def small_experiment(*overrides: str, lmax: int = 6, cycles: float = 0.02) -> Experiment:
+def small_experiment(*overrides: str, lmax: int = 6, cycles: float = 0.02) -> lb.Experiment:
     """The experiment of :func:`small_scenario`, with simulated data."""
     scenario = small_scenario(*overrides, lmax=lmax, cycles=cycles)
     in_setup = tuple(o for o in overrides if not o.startswith(NOT_IN_SETUP))
     if in_setup == overrides:
-        return build(scenario)
+        return lb.build(scenario)
     built = small_experiment(*in_setup, lmax=lmax, cycles=cycles).setup
     setup = replace(built, scenario=scenario)
-    return Experiment(setup, simulate(setup))
+    return lb.Experiment(setup, simulate(setup))
 
 
-def four_ports(response: Path, *overrides: str) -> Scenario:
+def four_ports(response: Path, *overrides: str) -> lb.Scenario:
     """A cycle in 23 samples of four ports over warm ground: 16 modes, noise of 1e-5."""
     plain = ["lmax=3", "frequency_mhz=20", "observation.step_s=1e5"]
     noise = ["noise.radiometer.bandwidth_hz=1e5", "prior={model: isotropic, spectrum: sky}"]
     beam = [f"beam.file={response}", "beam.moon_temperature_k=250"]
-    return load_scenario("fiducial", [*plain, *noise, *beam, *overrides])
+    return lb.load_scenario("fiducial", [*plain, *noise, *beam, *overrides])
 
 
-def program_arguments(program: Program, experiment: Experiment) -> dict[str, Any]:
+def mapped(
+    experiment: lb.Experiment, earlier: SavedInformation | None = None, *, thorough: bool = False
+) -> tuple[Conditioned, lb.ChannelResult]:
+    """What a map run finds of one frequency, without its folder."""
+    made = conditioned(experiment, earlier)
+    return made, made.result(made.known(thorough=thorough))
+
+
+def of_run(data: lb.Visibilities, run: int) -> lb.Visibilities:
+    """The data of one run by themselves."""
+    keep = data.observation.run == run
+    observation = data.observation.select(keep)
+    flat = jnp.asarray(data.grid()[:, keep].ravel())
+    return replace(
+        data, data=flat, layout=DataLayout(16, observation.n_times), observation=observation
+    )
+
+
+def program_arguments(program: Program, experiment: lb.Experiment) -> dict[str, Any]:
     """All that a program asks for, and the data."""
     model = full_model(experiment.setup, Around(experiment.data))
     arguments = program.arguments(model, program_pieces(experiment))
@@ -76,7 +96,7 @@ def draw_within(program, arguments, key, sampler, whitening=None, thin=1) -> dic
 
     The sampler's ``chains`` and ``seed`` are not used.
     """
-    run = program if whitening is None else whitened(program, whitening)
+    run = program if whitening is None else lb.whitened(program, whitening)
     white = set() if whitening is None else set(whitening.names)
     all_white = set(latent_sites(program, arguments)) == white
     dynamic, static = eqx.partition(arguments, eqx.is_array)

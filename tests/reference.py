@@ -8,12 +8,7 @@ phi from East towards North; packed real modes at ell^2 + ell + m; time conventi
 
 import astropy.units as u
 import numpy as np
-from astropy.coordinates import (
-    ICRS,
-    CartesianRepresentation,
-    Galactic,
-    get_body_barycentric,
-)
+from astropy.coordinates import ICRS, CartesianRepresentation, Galactic, get_body_barycentric
 from lunarsky import MCMF, LunarTopo, MoonLocation
 from scipy.special import sph_harm_y
 
@@ -118,10 +113,7 @@ def layered_reflection(permittivities, thickness_m, cos_theta, frequency_mhz):
             q, y = admittance(eps)
             delta = k * q * thickness_m
             matrix = matrix @ np.array(
-                [
-                    [np.cos(delta), 1j * np.sin(delta) / y],
-                    [1j * y * np.sin(delta), np.cos(delta)],
-                ]
+                [[np.cos(delta), 1j * np.sin(delta) / y], [1j * y * np.sin(delta), np.cos(delta)]]
             )
         _, y0 = admittance(1.0)
         _, y_end = admittance(permittivities[-1])

@@ -15,39 +15,19 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from os.path import expanduser
 from threading import current_thread, main_thread
 
-from cyclopts import App, CycloptsError, Parameter
+from cyclopts import CycloptsError
 from rich.console import Console
 
-from lusee_bayes.cli.commands import MODULES, help_of
+from lusee_bayes.cli.commands import app
+from lusee_bayes.cli.options import say
 from lusee_bayes.core.errors import InputError, WorkersLost
-from lusee_bayes.core.files import user_path
-from lusee_bayes.core.version import COMMAND, printable, release
+from lusee_bayes.core.version import COMMAND, printable
 
 # the beginning of a path in the user's folder, by itself or after the name of an option
 HOME = re.compile(r"^(--[a-z-]+=)?(~.*)$", re.DOTALL)
-
-app = App(
-    name="lusee-bayes",
-    version=release,
-    suppress_keyboard_interrupt=False,
-    # [ begins a file's name like any other character
-    default_parameter=Parameter(json_list=False, json_dict=False),
-    help=(
-        "Bayesian maps of the low-frequency sky from LuSEE-Night's visibilities.\n\n"
-        "Exit codes: 0 success, 1 a validation failed, or workers, memory or disk gave out, 2 bad "
-        "input (one sentence on standard error), 130 interrupted, 143 terminated. lusee-bayes "
-        "COMMAND --help shows examples."
-    ),
-)
-app.register_install_completion_command()
-# named by path: each is imported when called, so that --help and completion answer at once
-for _module, _names in MODULES.items():
-    for _name in _names:
-        _command = f"lusee_bayes.cli.{_module}:{_name.replace('-', '_')}_command"
-        app.command(_command, name=_name, help=help_of(_name))
-
 
 # beginnings of messages of RuntimeErrors for want of memory: of XLA, and of Python's threads
 NO_MEMORY = ("RESOURCE_EXHAUSTED", "can't start new thread")
@@ -81,7 +61,7 @@ def main(arguments: list[str] | None = None) -> int:
     gc.set_threshold(100_000, 20, 100)
     given = sys.argv[1:] if arguments is None else arguments
     # ~ within an option, as in --data=~/a.nc, is one that no shell has replaced
-    expanded = [HOME.sub(lambda own: (own[1] or "") + str(user_path(own[2])), one) for one in given]
+    expanded = [HOME.sub(lambda own: (own[1] or "") + expanduser(own[2]), one) for one in given]
     for stream in (sys.stdout, sys.stderr):
         # names of files may have bytes, and reports letters, that the terminal's encoding lacks
         if isinstance(stream, io.TextIOWrapper):
@@ -89,46 +69,42 @@ def main(arguments: list[str] | None = None) -> int:
     before = COMMAND.set(printable(shlex.join(["lusee-bayes", *given])))
     try:
         with _heeding_termination() as came:
-            return _run(expanded, came)
+            code, sentence = _outcome(expanded, came)
     finally:
         COMMAND.reset(before)
+    if sentence:
+        say(Console(stderr=True, soft_wrap=True), f"lusee-bayes: {sentence}")
+    return code
 
 
-def _run(arguments: list[str], came: list[int]) -> int:
-    def refused(sentence: object, code: int) -> int:
-        errors = Console(stderr=True, soft_wrap=True, highlight=False, markup=False)
-        errors.print(f"lusee-bayes: {sentence}")
-        return code
-
+def _outcome(arguments: list[str], came: list[int]) -> tuple[int, str]:
+    """The exit code of a command, and why it has failed, if it has."""
     try:
         code = app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
-    except InputError as error:
-        return refused(error, 2)
-    except CycloptsError as error:
-        return refused(" ".join(str(error).split()), 2)
+    except (InputError, CycloptsError) as error:
+        return 2, " ".join(str(error).split())
     except BrokenPipeError:
         # whoever was to read the output has gone: head has its lines
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
+        return 1, ""
     except OSError as error:
         if error.errno is None:
             raise
         at = f" ('{error.filename}')" if error.filename else ""
-        return refused(f"{error.strerror}{at}; {UNCHANGED}", 1)
+        return 1, f"{error.strerror}{at}; {UNCHANGED}"
     except WorkersLost as error:
-        return refused(error, 1)
+        return 1, str(error)
     except (MemoryError, RuntimeError) as error:
         if not isinstance(error, MemoryError) and not str(error).startswith(NO_MEMORY):
             raise
         why = " ".join(str(error).split())[:200]
-        return refused(
+        return 1, (
             f"not enough memory{f' ({why})' if why else ''}; {UNCHANGED}. Use a smaller lmax, "
-            "fewer times or fewer draws, or a machine with more memory",
-            1,
+            "fewer times or fewer draws, or a machine with more memory"
         )
     except KeyboardInterrupt as interrupt:
         # runs say what their folder holds
         held = str(interrupt) or "nothing has been written"
         how = "terminated" if came else "interrupted"
-        return refused(f"{how}; {held}", 128 + (came or [signal.SIGINT])[0])
-    return code if isinstance(code, int) else 0
+        return 128 + (came or [signal.SIGINT])[0], f"{how}; {held}"
+    return code if isinstance(code, int) else 0, ""

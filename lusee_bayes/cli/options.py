@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from math import inf, isclose
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from cyclopts import Parameter, Token
+from cyclopts import Parameter
 from rich.console import Console
 from rich.table import Table
 
@@ -21,29 +23,74 @@ from lusee_bayes.core.progress import Stages
 if TYPE_CHECKING:
     from lusee_bayes.core.engine import Demand, Engine
     from lusee_bayes.experiment.scenario import Scenario
+    from lusee_bayes.sampling.hmc import Sampler
 
 
-def _whole(least: int) -> Callable[[object, Sequence[Token]], int]:
-    """A converter for whole numbers of at least ``least``: no fractions, no other digits."""
+# a number and its unit
+DURATION = re.compile(r"\s*([0-9]*\.?[0-9]+(?:e[+-]?[0-9]+)?)\s*(s|min|h|d)\s*", re.ASCII)
+SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+# channels of one run: far more than 25 kHz apart over the band
+MOST_CHANNELS = 4096
 
-    def convert(_: object, tokens: Sequence[Token]) -> int:
-        token = tokens[0]
-        text = token.value
-        plain = text.removeprefix("-")
-        if not (plain.isascii() and plain.isdigit() and len(plain) < 10) or int(text) < least:
-            raise InputError(f"expected a whole number from {least} to 999999999, got {text[:40]}")
-        return int(text)
 
-    return convert
+def whole(least: int, text: str) -> int:
+    """A whole number of at least ``least``: no fractions, no other digits. InputError if not."""
+    if not re.fullmatch("-?[0-9]{1,9}", text) or int(text) < least:
+        raise InputError(f"expected a whole number from {least} to 999999999, got {text[:40]}")
+    return int(text)
+
+
+def parse_duration(text: str) -> float:
+    """Seconds out of ``30s``, ``10min``, ``2h`` or ``1d``. InputError if it is none of these."""
+    found = DURATION.fullmatch(text)
+    seconds = float(found[1]) * SECONDS[found[2]] if found else 0.0
+    if not 0.0 < seconds < inf:
+        raise InputError(
+            f"'{text[:40]}' is not a length of time; give a positive number and its unit, s, min, "
+            "h or d, as in 30s, 10min, 2h or 1d"
+        )
+    return seconds
+
+
+def parse_frequencies(text: str) -> list[float]:
+    """MHz out of ``10,25,30`` or of ``first:last:step``, the last included.
+
+    InputError if it is neither.
+    """
+    found, count = [], 0
+    with suppress(ValueError, ZeroDivisionError, OverflowError):
+        if ":" not in text:
+            found = [float(part) for part in text.split(",")]
+        else:
+            first, last, step = (float(part) for part in text.split(":"))
+            count = round((last - first) / step)
+            if step > 0 and isclose(first + count * step, last, rel_tol=1e-5, abs_tol=1e-8):
+                found = [first + k * step for k in range(min(count, MOST_CHANNELS) + 1)]
+    if count >= MOST_CHANNELS:
+        raise InputError(
+            f"{text} is {count + 1} channels; at most {MOST_CHANNELS} are possible in one run"
+        )
+    if not found or any(b <= a for a, b in pairwise(found)):
+        raise InputError(
+            f"expected growing MHz, as 10,25,30 or as 5:50:5 (first, last, step), got {text[:40]}"
+        )
+    return found
+
+
+def _read_by(read: Callable[[str], Any]) -> Parameter:
+    return Parameter(converter=lambda _, tokens: read(tokens[0].value), n_tokens=1, negative="")
 
 
 # so many of something: none of them is possible, or at least one
-Number = Annotated[int, Parameter(converter=_whole(0))]
-Count = Annotated[int, Parameter(converter=_whole(1))]
+Number = Annotated[int, _read_by(partial(whole, 0))]
+Count = Annotated[int, _read_by(partial(whole, 1))]
+Duration = Annotated[float, _read_by(parse_duration)]
+Frequencies = Annotated[list[float], _read_by(parse_frequencies)]
 Flag = Annotated[bool, Parameter(negative="")]
-# one or many, or all that follow the option
+Quiet = Annotated[bool, Parameter(name=["--quiet", "-q"], negative="")]
+# as often as needed; and one or many, or all that follow the option
+Repeated = Parameter(negative="", show_default=False)
 Many = Parameter(consume_multiple=True, negative="", show_default=False)
-Output = Annotated[Path, Parameter(name=["--output", "-o"])]
 
 
 @Parameter(name="*")
@@ -53,6 +100,8 @@ class Options:
 
     Attributes
     ----------
+    output
+        The folder of the results, or their file; the command says what it is by default.
     force
         Replace what is there already: a file, or results of another run in the folder.
     quiet
@@ -61,33 +110,23 @@ class Options:
         Print the memory in use after every stage.
     """
 
+    output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None
     force: Flag = False
-    quiet: Annotated[bool, Parameter(name=["--quiet", "-q"], negative="")] = False
+    quiet: Quiet = False
     verbose: Annotated[bool, Parameter(name=["--verbose", "-v"], negative="")] = False
-
-    @property
-    def console(self) -> Console:
-        """Where the command prints."""
-        return Console(quiet=self.quiet, soft_wrap=True)
-
-    def stages(self) -> Stages:
-        """What shows and times the stages of the run."""
-        return Stages(self.console, verbose=self.verbose)
 
     def running(self) -> dict[str, bool | Stages]:
         """What every run takes."""
-        return {"replace": self.force, "stages": self.stages()}
+        stages = Stages(Console(quiet=self.quiet, soft_wrap=True), verbose=self.verbose)
+        return {"replace": self.force, "stages": stages}
 
-    def say(self, *lines: object) -> None:
-        """Print lines as they are."""
-        say(self.console, *lines)
-
-    def tell(self, files: Sequence[Path], *lines: object, table: Table | None = None) -> None:
+    def tell(self, *lines: object, files: Sequence[Path] = (), table: Table | None = None) -> None:
         """Print which files were written, a table, and what else there is to say."""
-        self.say(*(f"  {path}" for path in files))
+        console = Console(quiet=self.quiet, soft_wrap=True)
+        say(console, *(f"  {path}" for path in files))
         if table is not None:
-            show(self.console, table)
-        self.say(*lines)
+            show(console, table)
+        say(console, *lines)
 
 
 @Parameter(name="*")
@@ -101,45 +140,38 @@ class ScenarioOptions(Options):
         key.path=value; overrides an entry of the scenario, as often as needed.
     """
 
-    set_: Annotated[tuple[str, ...], Parameter(name="--set", negative="", show_default=False)] = ()
+    set_: Annotated[tuple[str, ...], Parameter(name="--set"), Repeated] = ()
 
-    def load(
-        self,
-        source: str,
-        frequencies: str | None = None,
-        replaces: Path | None = None,
-        **flags: str | int | bool | None,
-    ) -> Scenario:
+    def load(self, source: str, **entries: object) -> Scenario:
         """The scenario of the command, with ``--set`` and with what options say of it.
 
         Parameters
         ----------
         source : str
             A YAML file or the name of a scenario.
-        frequencies : str
-            See :func:`parse_frequencies`.
-        replaces : Path
-            The folder or file of the results: with ``--force`` not one that the scenario is in.
-        **flags
+        **entries
             Values of entries, dots written as ``__``; those that are None or False are left alone.
 
         Raises
         ------
         InputError
-            As :func:`.load_scenario`, and as :func:`.require_apart`.
+            As :func:`.load_scenario`, and as :func:`.require_apart` if results are to be replaced.
         """
         from lusee_bayes.core.files import require_apart
         from lusee_bayes.experiment.scenario import load_scenario
 
-        if replaces is not None and self.force:
-            require_apart(replaces, [source])
-        overrides = list(self.set_)
-        if frequencies is not None:
-            overrides.append(f"frequencies_mhz={parse_frequencies(frequencies)}")
-        for name, value in flags.items():
-            if value is not None and value is not False:
-                overrides.append(f"{name.replace('__', '.')}={str(value).lower()}")
-        return load_scenario(source, overrides)
+        if self.output is not None and self.force:
+            require_apart(self.output, [source])
+        given = [
+            f"{name.replace('__', '.')}={json.dumps(value)}"
+            for name, value in entries.items()
+            if value is not None and value is not False
+        ]
+        return load_scenario(source, [*self.set_, *given])
+
+    def folder(self, source: str, suffix: str = "") -> Path:
+        """Where the results of a scenario go."""
+        return self.output or Path("output") / f"{Path(source).stem}{suffix}"
 
 
 @Parameter(name="*")
@@ -155,23 +187,10 @@ class DataOptions(ScenarioOptions):
     clock
         Clock reference in JSON, for sessions with no absolute time, or to correct the UTC that they
         state (flight.clock).
-    output
-        Folder for the results; by default output/NAME, with the command's own ending.
     """
 
     data: Annotated[tuple[Path, ...] | None, Many] = None
     clock: str | None = None
-    output: Output | None = None
-
-    def loaded(
-        self, source: str, frequencies: str | None = None, **flags: str | int | bool | None
-    ) -> Scenario:
-        """The scenario with its clock. InputError as :meth:`load`."""
-        return self.load(source, frequencies, self.output, flight__clock=self.clock, **flags)
-
-    def folder(self, source: str, suffix: str = "") -> Path:
-        """Where the results of a scenario go."""
-        return self.output or Path("output") / f"{Path(source).stem}{suffix}"
 
 
 @Parameter(name="*")
@@ -198,13 +217,33 @@ class EngineOptions:
         return open_engine(demand, self.workers, self.cluster)
 
 
-# a number and its unit
-DURATION = re.compile(r"\s*([0-9]*\.?[0-9]+(?:e[+-]?[0-9]+)?)\s*(s|min|h|d)\s*", re.ASCII)
-SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+@Parameter(name="*")
+@dataclass(frozen=True)
+class ChainOptions:
+    """What commands take that sample.
 
+    Attributes
+    ----------
+    resume
+        Continue the unfinished run in the folder, or judge the finished one again.
+    chains
+        Chains side by side.
+    draws
+        Draws of each chain, after warmup.
+    warmup
+        Iterations in which the step size is found; they are not kept.
+    """
 
-# channels of one run: far more than 25 kHz apart over the band
-MOST_CHANNELS = 4096
+    resume: Flag = False
+    chains: Count = 4
+    draws: Count = 1000
+    warmup: Number = 150
+
+    def sampler(self, seed: int, algorithm: Literal["nuts", "hmc"] = "nuts") -> Sampler:
+        """What draws them."""
+        from lusee_bayes.sampling.hmc import Sampler
+
+        return Sampler(self.chains, self.warmup, self.draws, seed, algorithm)
 
 
 def say(console: Console, *lines: object) -> None:
@@ -216,46 +255,3 @@ def say(console: Console, *lines: object) -> None:
 def show(console: Console, table: Table) -> None:
     """Print a table within the width of the terminal: its cells are wrapped."""
     console.print(table, soft_wrap=False)
-
-
-def parse_duration(text: str) -> float:
-    """Seconds out of ``30s``, ``10min``, ``2h`` or ``1d``. InputError if it is none of these."""
-    found = DURATION.fullmatch(text)
-    seconds = float(found[1]) * SECONDS[found[2]] if found else 0.0
-    if not 0.0 < seconds < inf:
-        raise InputError(
-            f"'{text[:40]}' is not a length of time; give a positive number and its unit, s, min, "
-            "h or d, as in 30s, 10min, 2h or 1d"
-        )
-    return seconds
-
-
-def parse_frequencies(text: str) -> list[float]:
-    """MHz out of ``10,25,30`` or of ``first:last:step``, the last included.
-
-    InputError if it is neither.
-    """
-    try:
-        if ":" not in text:
-            found = [float(part) for part in text.split(",")]
-        else:
-            first, last, step = (float(part) for part in text.split(":"))
-            count = round((last - first) / step)
-            if count >= MOST_CHANNELS:
-                raise InputError(
-                    f"--frequencies {text}: {count + 1} channels; at most {MOST_CHANNELS} are "
-                    "possible in one run"
-                )
-            found = [first + k * step for k in range(count + 1)]
-            if not step > 0 or not (found and isclose(found[-1], last, rel_tol=1e-5, abs_tol=1e-8)):
-                raise ValueError
-    except InputError:
-        raise
-    except (ValueError, ZeroDivisionError, OverflowError):
-        found = []
-    if not found or any(b <= a for a, b in pairwise(found)):
-        raise InputError(
-            f"--frequencies {text}: expected growing MHz, as 10,25,30 or as 5:50:5 (first, last, "
-            "step)"
-        )
-    return found

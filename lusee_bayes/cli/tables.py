@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from rich.markup import escape
 from rich.table import Table
@@ -52,34 +52,36 @@ def checks_table(checks: list[Check]) -> Table:
     return table
 
 
+def _of_numbers(header: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
+    """A column of names, and others of numbers."""
+    table = Table()
+    for number, name in enumerate(header):
+        table.add_column(escape(name), justify="right" if number else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*map(escape, row))
+    return table
+
+
 def priors_table(result: PriorComparison) -> Table:
     """One data set under several priors, a column for each."""
-    header, rows = result.table()
-    shown = Table(header[0])
-    for name in header[1:]:
-        shown.add_column(escape(name), justify="right", overflow="fold")
-    for row in rows:
-        shown.add_row(*map(escape, row))
-    return shown
+    return _of_numbers(*result.table())
 
 
 def comparison_table(runs: Sequence[FinishedRun]) -> Table:
     """Finished runs side by side."""
-    shown = Table("run", "MHz", "fit")
-    shown.columns[0].overflow = "fold"
-    for name in ("SNR<1 at ell", "bits", "ln evidence", "- best", "p instr.", "p prior"):
-        shown.add_column(name, justify="right")
-    for run, row in zip(runs, comparison_rows(runs), strict=True):
-        less = row["log_evidence_less_best"]
-        shown.add_row(
-            escape(run.name),
+    header = "run", "MHz", "fit", "SNR<1 at ell", "bits", "ln evidence", "- best"
+    rows = [
+        (
+            run.name,
             f"{row['frequency_mhz']:g}",
             str(row["level"]),
             run.cross_in_words(),
             f"{row['information_bits']:.0f}",
             f"{row['log_evidence']:.1f}",
-            "-" if less is None else f"{less:.1f}",
+            "-" if (less := row["log_evidence_less_best"]) is None else f"{less:.1f}",
             f"{row['instrument_p']:.2g}",
             f"{row['prior_p']:.2g}",
         )
-    return shown
+        for run, row in zip(runs, comparison_rows(runs), strict=True)
+    ]
+    return _of_numbers((*header, "p instr.", "p prior"), rows)

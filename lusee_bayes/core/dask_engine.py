@@ -16,10 +16,10 @@ import pickle
 import shutil
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from threading import Lock
 from typing import Any, TypeVar
@@ -30,7 +30,15 @@ import distributed
 from distributed.scheduler import NoWorkerError
 
 from lusee_bayes.core.arrays import use_compilation_cache
-from lusee_bayes.core.engine import Demand, Engine, Tasks, carry_out, processors, threads
+from lusee_bayes.core.engine import (
+    Demand,
+    Engine,
+    Tasks,
+    carry_out,
+    merged_as_tree,
+    processors,
+    threads,
+)
 from lusee_bayes.core.errors import InputError, WorkersLost
 from lusee_bayes.core.files import scratch_folder
 from lusee_bayes.core.progress import Stages, gigabytes, memory_limit
@@ -78,55 +86,34 @@ class DaskEngine(Engine):
 
     def each(self, tasks: Tasks[T, R], stages: Stages, stage: str) -> list[R]:
         found: list[Any] = [None] * len(tasks.items)
-        with self._job(tasks) as job, self._explained(stages, stage) as names:
-            futures = self._submitted(job, tasks, names)
-            numbers = {future.key: number for number, future in enumerate(futures)}
-            for future in self._finished(futures, names, stages, stage):
+        with self._submitted(tasks, None, stages, stage) as (_, futures, numbers):
+            for future in self._finished(futures, numbers, tasks.names, stages, stage):
                 found[numbers[future.key]] = future.result()
         return found
 
     def reduced(
         self, tasks: Tasks[T, R], merge: Callable[[R, R], R], stages: Stages, stage: str
     ) -> R:
-        with self._job(tasks, merge) as job, self._explained(stages, stage) as names:
-            futures = level = self._submitted(job, tasks, names)
-            height = 0
-            while len(level) > 1:
-                height += 1
-                level = [
-                    self._merged(job, level[first : first + 2], height)
-                    for first in range(0, len(level), 2)
-                ]
-            (total,) = level
+        with self._submitted(tasks, merge, stages, stage) as (job, futures, numbers):
+            # before other tasks, so that few parts wait
+            merged = partial(self._submit, run_merge, job, priority=1)
+            total = merged_as_tree(iter(futures), len(futures), merged)
             # what the tasks give is left with the workers
-            for future in self._finished(futures, names, stages, stage):
+            for future in self._finished(futures, numbers, tasks.names, stages, stage):
                 if future.status != "finished":
                     future.result()
             return total.result()
 
-    def _submitted(
-        self, job: Path, tasks: Tasks[T, R], names: dict[str, str]
-    ) -> list[distributed.Future]:
-        numbers = range(len(tasks.items))
-        futures = [
-            self.client.submit(run_task, job, number, pure=False, retries=REPEATS)
-            for number in numbers
-        ]
-        names |= {futures[number].key: tasks.names[number] for number in numbers}
-        return futures
-
-    def _merged(
-        self, job: Path, parts: list[distributed.Future], height: int
-    ) -> distributed.Future:
-        if len(parts) == 1:
-            return parts[0]
-        # before other tasks, so that few parts wait
-        return self.client.submit(
-            run_merge, job, *parts, pure=False, retries=REPEATS, priority=height
-        )
+    def _submit(self, *call: Any, **options: Any) -> distributed.Future:
+        return self.client.submit(*call, pure=False, retries=REPEATS, **options)
 
     def _finished(
-        self, futures: list[distributed.Future], names: dict[str, str], stages: Stages, stage: str
+        self,
+        futures: list[distributed.Future],
+        numbers: Mapping[str, int],
+        names: Sequence[str],
+        stages: Stages,
+        stage: str,
     ) -> Iterator[distributed.Future]:
         """Futures as they finish, well or not; the list is emptied, so that results are freed."""
         waiting, n = distributed.as_completed(futures, loop=self.client.loop), len(futures)
@@ -135,33 +122,46 @@ class DaskEngine(Engine):
             with stages.progress(stage, n) as done:
                 for finished, future in enumerate(waiting, start=1):
                     yield future
-                    done(finished, names[future.key])
+                    done(finished, names[numbers[future.key]])
         finally:
             waiting.clear()
 
     @contextmanager
-    def _explained(self, stages: Stages, stage: str) -> Iterator[dict[str, str]]:
-        """Say in a sentence which workers end, and whether the block fails because of that.
+    def _submitted(
+        self, tasks: Tasks[T, R], merge: Callable[[R, R], R] | None, stages: Stages, stage: str
+    ) -> Iterator[tuple[Path, list[distributed.Future], dict[str, int]]]:
+        """Give all tasks to the workers, and say in a sentence which of them end.
 
-        Yields the names of tasks by their keys, which the block fills in.
+        Yields the file with what the tasks share, where the workers see it, their futures, and
+        their numbers by the futures' keys.
         """
-        names: dict[str, str] = {}
+        if self._folder is None:
+            raise RuntimeError("the engine is not told where to work: call work_in first")
+        place, numbers = scratch_folder(self._folder), {}
+        job = place / "job.pickle"
 
         def note(event: tuple[float, Any]) -> None:
             said = event[1]
             if said.get("action") == "remove-worker" and not said.get("expected"):
-                again = ", ".join(names[key] for key in said["processing-tasks"] if key in names)
+                again = [tasks.names[numbers[k]] for k in said["processing-tasks"] if k in numbers]
                 if again:
-                    stages.say(f"  worker {said['worker']} ended; given to others: {again}")
+                    ended = f"worker {said['worker']} ended"
+                    stages.say(f"  {ended}; given to others: {', '.join(again)}")
 
         self.client.subscribe_topic("all", note)
         try:
-            yield names
+            with job.open("wb") as file:
+                cloudpickle.dump((os.getpid(), tasks.function, tasks.items, merge), file)
+            futures = [self._submit(run_task, job, number) for number in range(len(tasks.items))]
+            numbers |= {future.key: number for number, future in enumerate(futures)}
+            yield job, futures, numbers
         except distributed.KilledWorker as error:
+            number = numbers.get(str(error.task))
+            what = "a sum" if number is None else tasks.names[number]
             raise WorkersLost(
-                f"{stage}, {names.get(str(error.task), 'a sum')}: {error.allowed_failures + 1} "
-                "workers ended while they worked on it, one after the other, the last of them "
-                f"{error.last_worker.address} (killed, or out of memory)"
+                f"{stage}, {what}: {error.allowed_failures + 1} workers ended while they worked on "
+                f"it, one after the other, the last of them {error.last_worker.address} (killed, "
+                "or out of memory)"
             ) from error
         except (CancelledError, NoWorkerError) as error:
             raise WorkersLost(
@@ -170,18 +170,6 @@ class DaskEngine(Engine):
         finally:
             if self.client.status == "running":
                 self.client.unsubscribe_topic("all")
-
-    @contextmanager
-    def _job(self, tasks: Tasks[T, R], merge: Callable[[R, R], R] | None = None) -> Iterator[Path]:
-        """Write what all tasks share where the workers see it."""
-        if self._folder is None:
-            raise RuntimeError("the engine is not told where to work: call work_in first")
-        place = scratch_folder(self._folder)
-        try:
-            with (place / "job.pickle").open("wb") as file:
-                cloudpickle.dump((os.getpid(), tasks.function, tasks.items, merge), file)
-            yield place / "job.pickle"
-        finally:
             shutil.rmtree(place, ignore_errors=True)
 
 

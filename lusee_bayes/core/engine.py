@@ -208,33 +208,41 @@ class ThisProcess(Engine):
     side_by_side: int = SIDE_BY_SIDE
 
     def each(self, tasks: Tasks[T, R], stages: Stages, stage: str) -> list[R]:
-        found = dict(self._results(tasks, stages, stage))
-        return [found[number] for number in range(len(tasks.items))]
+        with self._results(tasks, stages, stage) as results:
+            return list(results)
 
     def reduced(
         self, tasks: Tasks[T, R], merge: Callable[[R, R], R], stages: Stages, stage: str
     ) -> R:
-        tree = _Tree(len(tasks.items), merge)
-        for number, value in self._results(tasks, stages, stage):
-            tree.add(number, value)
-        return tree.total
+        with self._results(tasks, stages, stage) as results:
+            return merged_as_tree(results, len(tasks.items), merge)
 
     def work_in(self, folder: Path) -> None:
         pass
 
-    def _results(self, tasks: Tasks[T, R], stages: Stages, stage: str) -> Iterator[tuple[int, R]]:
-        """Numbers of the items and what the function gives for them, as they finish."""
+    @contextmanager
+    def _results(self, tasks: Tasks[T, R], stages: Stages, stage: str) -> Iterator[Iterator[R]]:
+        """What the function gives, in the order of the items, as soon as it is there."""
         n_threads = max(1, min(self.side_by_side, len(tasks.items)))
         with stages.progress(stage, len(tasks.items)) as done, threads(n_threads) as pool:
             numbers = {
                 pool.submit(carry_out, tasks.function, item): number
                 for number, item in enumerate(tasks.items)
             }
-            try:
+
+            def in_order() -> Iterator[R]:
+                early: dict[int, R] = {}
+                given = 0
                 for finished, future in enumerate(as_completed(numbers), start=1):
                     number = numbers.pop(future)
-                    yield number, future.result()
+                    early[number] = future.result()
                     done(finished, tasks.names[number])
+                    while given in early:
+                        yield early.pop(given)
+                        given += 1
+
+            try:
+                yield in_order()
             finally:
                 pool.shutdown(wait=False, cancel_futures=True)
 
@@ -247,33 +255,13 @@ def carry_out(function: Callable[[T], R], item: T) -> R:
         gc.collect()
 
 
-class _Tree(Generic[R]):
-    """Merges results as they come; which with which depends on their numbers alone."""
+def merged_as_tree(parts: Iterator[R], n: int, merge: Callable[[R, R], R]) -> R:
+    """Merge n parts as they come: neighbours first, then their neighbours.
 
-    total: R
-
-    def __init__(self, n: int, merge: Callable[[R, R], R]):
-        self._n, self._merge = n, merge
-        self._waiting: dict[tuple[int, int], R] = {}
-
-    def add(self, number: int, value: R) -> None:
-        """Merge a result with its neighbour, that with its own and so on, as far as they are there.
-
-        Parameters
-        ----------
-        number : int
-            Of the item.
-        value
-            What the function gave.
-        """
-        width, level = self._n, 0
-        while width > 1:
-            neighbour = number ^ 1
-            if neighbour < width:
-                if (level, neighbour) not in self._waiting:
-                    self._waiting[level, number] = value
-                    return
-                other = self._waiting.pop((level, neighbour))
-                value = self._merge(*((value, other) if number < neighbour else (other, value)))
-            number, width, level = number // 2, (width + 1) // 2, level + 1
-        self.total = value
+    Which with which depends on n alone. Besides the last part, one for each level is kept.
+    """
+    if n == 1:
+        return next(parts)
+    half = 1 << ((n - 1).bit_length() - 1)
+    first = merged_as_tree(parts, half, merge)
+    return merge(first, merged_as_tree(parts, n - half, merge))

@@ -3,6 +3,8 @@
 A folder of results changes in one transaction. Everything is written into a scratch folder first;
 renaming that one is the moment from which the new results count. Its files are then moved into
 place, and where that is interrupted, whoever opens the folder next (:func:`recover`) completes it.
+The folder itself is not replaced: it holds files of the user's own, a shell may stand in it, and it
+may be a mount point.
 
 Where results cannot be written is found out before anything is computed (:func:`require_folder`,
 :func:`require_target`).
@@ -11,19 +13,18 @@ Where results cannot be written is found out before anything is computed (:func:
 from __future__ import annotations
 
 import errno
-import fcntl
-import json
 import os
 import re
 import shutil
-import signal
 import socket
-import stat
 import tempfile
-import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
+from typing import Annotated, Any
+
+from filelock import FileLock, Timeout
+from pydantic import AfterValidator, BaseModel, ValidationError
 
 from lusee_bayes.core.errors import InputError
 
@@ -31,10 +32,6 @@ from lusee_bayes.core.errors import InputError
 def user_path(path: str | os.PathLike[str]) -> Path:
     """A path, with the user's folder in place of a leading ``~``."""
     return Path(os.path.expanduser(path))
-
-
-# held while a run works in a folder; says whose it is
-LOCK = ".lock"
 
 
 def require_folder(folder: str | Path) -> None:
@@ -54,15 +51,17 @@ def require_folder(folder: str | Path) -> None:
     _require_name(folder)
     if folder.resolve() == Path(folder.resolve().anchor):
         raise InputError(f"'{folder}' is the root of all files; give a folder for the results")
-    for place in (folder, *folder.absolute().parents):
-        mode = _mode(place)
-        if mode is None:
-            continue
-        if not stat.S_ISDIR(mode):
-            kind = "a file" if stat.S_ISREG(mode) else "neither a file nor a folder"
-            raise InputError(f"'{place}' is {kind}; give a folder for the results")
-        _require_writable(place)
-        return
+    place = next(place for place in (folder, *folder.absolute().parents) if _is_there(place))
+    if not place.is_dir():
+        kind = "a file" if place.is_file() else "neither a file nor a folder"
+        raise InputError(f"'{place}' is {kind}; give a folder for the results")
+    try:
+        # a file without a name: whatever happens, nothing of it is left
+        tempfile.TemporaryFile(dir=place).close()
+    except OSError as error:
+        raise InputError(
+            f"nothing can be written into '{place}': {error.strerror}; give another folder"
+        ) from error
 
 
 def require_target(path: str | Path) -> None:
@@ -79,10 +78,10 @@ def require_target(path: str | Path) -> None:
     """
     path = user_path(path)
     _require_name(path)
-    mode = _mode(path)
-    if not path.name or (mode is not None and stat.S_ISDIR(mode)):
+    is_there = _is_there(path)
+    if not path.name or path.is_dir():
         raise InputError(f"'{path}' is a folder; give the name of a file for the results")
-    if mode is not None and not stat.S_ISREG(mode):
+    if is_there and not path.is_file():
         raise InputError(f"'{path}' is neither a file nor a folder; give the name of a file")
     if path.absolute().parent != Path(path.absolute().anchor):
         require_folder(path.parent)
@@ -117,67 +116,54 @@ def _require_name(path: Path) -> None:
         raise InputError(f"'{path!s}' is no name of a file; give one without NUL characters")
 
 
-def _mode(path: Path) -> int | None:
-    """What is at a path; None if nothing is. A link to nothing is something that cannot be used."""
+def _is_there(path: Path) -> bool:
+    """Whether something is at a path. A link to nothing is something that cannot be used."""
     try:
-        return path.stat().st_mode
+        path.stat()
     except (FileNotFoundError, NotADirectoryError):
         if path.is_symlink():
             raise InputError(f"'{path}' is a link that leads nowhere; remove it") from None
-        return None
+        return False
     except OSError as error:
         raise InputError(f"'{path}' cannot be used for the results: {error.strerror}") from error
+    return True
 
 
-def _require_writable(place: Path) -> None:
-    try:
-        # a file without a name: whatever happens, nothing of it is left
-        tempfile.TemporaryFile(dir=place).close()
-    except OSError as error:
-        raise InputError(
-            f"nothing can be written into '{place}': {error.strerror}; give another folder"
-        ) from error
+# names inside a folder of results: the lock of the run that works in it, which says whose it is,
+# scratch folders, the new results that are still to be moved into place, and the list of what the
+# last run has written
+LOCK, SCRATCH, COMMITTED, MANIFEST = ".lock", ".partial-", ".committed", "manifest.json"
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Keep other runs out of a folder, which is there, during the block.
 
-    The lock ends with the process, however that ends.
+    The lock ends with the process, however that ends. What a run that was killed has left in
+    scratch folders is removed.
 
     Raises
     ------
     InputError
         If another run works in it.
     """
-    path = folder / LOCK
-    while True:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            owner = os.read(handle, 200).decode(errors="replace").strip() or "another process"
-            os.close(handle)
-            raise InputError(
-                f"another run works in '{folder}' ({owner}); wait for it, or give another folder"
-            ) from error
-        # the one before may have removed the file between the two steps
-        if path.exists() and os.fstat(handle).st_ino == path.stat().st_ino:
-            break
-        os.close(handle)
+    path, lock, owner = folder / LOCK, FileLock(folder / LOCK), "another process"
     try:
-        os.truncate(handle, 0)
-        os.write(handle, f"process {os.getpid()} on {socket.gethostname()}".encode())
+        lock.acquire(blocking=False)
+    except Timeout as error:
+        with suppress(FileNotFoundError):
+            owner = path.read_text(encoding="utf-8", errors="replace") or owner
+        raise InputError(
+            f"another run works in '{folder}' ({owner}); wait for it, or give another folder"
+        ) from error
+    try:
+        path.write_text(f"process {os.getpid()} on {socket.gethostname()}", encoding="utf-8")
+        for scratch in folder.glob(f"{SCRATCH}*"):
+            shutil.rmtree(scratch, ignore_errors=True)
         yield
     finally:
         path.unlink(missing_ok=True)
-        os.close(handle)
-
-
-# names inside a folder of results: scratch folders (with the process's number and its host, since
-# several may share a disk), the new results that are still to be moved into place, and the list of
-# what the last run has written
-SCRATCH, COMMITTED, MANIFEST = ".partial-", ".committed", "manifest.json"
+        lock.release()
 
 
 def require_files(folder: Path, names: Sequence[str], command: str) -> None:
@@ -187,6 +173,45 @@ def require_files(folder: Path, names: Sequence[str], command: str) -> None:
             raise InputError(
                 f"'{folder}' has no {name}; make the results again with lusee-bayes {command}"
             )
+
+
+def _is_inside(name: str) -> str:
+    path = PurePosixPath(name)
+    if "\0" in name or path.is_absolute() or ".." in path.parts or not path.parts:
+        raise ValueError("names of files in the folder are expected")
+    return name
+
+
+# the name of something in the folder, and not of the folder itself
+_Inside = Annotated[str, AfterValidator(_is_inside)]
+
+
+class _Manifest(BaseModel):
+    kind: str
+    files: list[_Inside]
+    discard: list[_Inside]
+    origin: dict[str, str] = {}
+
+
+def read_manifest(folder: Path) -> dict[str, Any] | None:
+    """What the last run has written into a folder, and of what; None if it is not said.
+
+    Raises
+    ------
+    InputError
+        If the manifest cannot be read.
+    """
+    path = folder / MANIFEST
+    if not path.is_file():
+        return None
+    try:
+        return _Manifest.model_validate_json(path.read_bytes()).model_dump()
+    except (ValidationError, OSError) as error:
+        why = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error.strerror
+        raise InputError(
+            f"'{path}' cannot be read ({why}); delete it, and the next run replaces the files of "
+            "its own names"
+        ) from error
 
 
 @contextmanager
@@ -204,7 +229,7 @@ def transaction(
     Parameters
     ----------
     folder : path
-        Folder of the results; made if there is none.
+        Folder of the results; made if there is none. :func:`locked`, where several runs may write.
     kind : str
         The kind of run, kept in ``manifest.json``.
     discard : sequence of str
@@ -232,19 +257,65 @@ def transaction(
         with _naming_last(folder, stage):
             yield stage
         files = sorted(str(p.relative_to(stage)) for p in stage.rglob("*") if p.is_file())
-        _require_free(folder, files)
-        manifest = {
-            "kind": kind,
-            "files": files,
-            "discard": list(discard),
-            "origin": dict(origin or {}),
-        }
-        (stage / MANIFEST).write_text(json.dumps(manifest, indent=2) + "\n", encoding="utf-8")
-        with uninterrupted():
-            os.replace(stage, folder / COMMITTED)
-            recover(folder)
+        for name in files:
+            _require_free(folder / name)
+        manifest = _Manifest(
+            kind=kind, files=files, discard=list(discard), origin=dict(origin or {})
+        )
+        (stage / MANIFEST).write_text(manifest.model_dump_json(indent=2) + "\n", encoding="utf-8")
+        os.replace(stage, folder / COMMITTED)
+        recover(folder)
     finally:
         shutil.rmtree(stage, ignore_errors=True)
+
+
+def scratch_folder(folder: Path) -> Path:
+    """Make a folder in ``folder`` for the run that has locked it."""
+    return Path(tempfile.mkdtemp(prefix=SCRATCH, dir=folder))
+
+
+def _require_free(target: Path) -> None:
+    """InputError if a folder has the name of a result, or a file that of a folder of it."""
+    if target.is_dir():
+        raise InputError(f"'{target}' is a folder, and a file of the results has its name")
+    require_folder(target.parent)
+
+
+def recover(folder: str | Path) -> None:
+    """Complete what an interrupted transaction has begun.
+
+    Harmless at any time; every reader of a folder of results calls it first.
+
+    Raises
+    ------
+    InputError
+        If the folder's manifest cannot be read.
+    """
+    folder = user_path(folder)
+    committed = folder / COMMITTED
+    old, new = read_manifest(folder), read_manifest(committed)
+    # a new manifest is moved last: until then this can be begun again, and where there is none the
+    # new results are in place
+    if new is not None:
+        for name in new["files"]:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            _move(committed / name, folder / name)
+        for name in sorted(set(old["files"] if old else ()) - set(new["files"])):
+            (folder / name).unlink(missing_ok=True)
+            # and the folders that it was in, as far as they are empty
+            for place in PurePosixPath(name).parents:
+                with suppress(OSError):
+                    (folder / place).rmdir()
+        for name in new["discard"]:
+            shutil.rmtree(folder / name, ignore_errors=True)
+        _move(committed / MANIFEST, folder / MANIFEST)
+    shutil.rmtree(committed, ignore_errors=True)
+
+
+def _move(source: Path, target: Path) -> None:
+    # moved already, by what was interrupted or by another process that completes the same
+    with suppress(FileNotFoundError):
+        os.replace(source, target)
 
 
 def require_apart(folder: Path, inputs: Iterable[str | Path]) -> None:
@@ -258,149 +329,6 @@ def require_apart(folder: Path, inputs: Iterable[str | Path]) -> None:
                 f"'{path}' is an input of this run, which would replace it; give another place "
                 "for the results with -o"
             )
-
-
-def recover(folder: str | Path) -> None:
-    """Complete what an interrupted transaction has begun, and remove scratch folders left behind.
-
-    Harmless at any time; every reader of a folder of results calls it first.
-
-    Raises
-    ------
-    InputError
-        If the folder's manifest cannot be read.
-    """
-    folder = user_path(folder)
-    if not folder.is_dir():
-        return
-    old, committed = read_manifest(folder), folder / COMMITTED
-    # a new manifest is moved last: until then this can be begun again, and where there is none the
-    # new results are in place
-    new = read_manifest(committed)
-    if new is not None:
-        for name in new["files"]:
-            if (committed / name).is_file():
-                (folder / name).parent.mkdir(parents=True, exist_ok=True)
-                _move(committed / name, folder / name)
-        for name in sorted(set(old["files"] if old else ()) - set(new["files"])):
-            (folder / name).unlink(missing_ok=True)
-            _remove_if_empty((folder / name).parent, folder)
-        for name in new["discard"]:
-            shutil.rmtree(folder / name, ignore_errors=True)
-        _move(committed / MANIFEST, folder / MANIFEST)
-    shutil.rmtree(committed, ignore_errors=True)
-    remove_left_scratch(folder)
-
-
-def scratch_folder(folder: Path) -> Path:
-    """Make a folder in ``folder`` for this process alone."""
-    prefix = f"{SCRATCH}{os.getpid()}-{socket.gethostname()}-"
-    return Path(tempfile.mkdtemp(prefix=prefix, dir=folder))
-
-
-def remove_left_scratch(folder: Path) -> None:
-    """Remove the scratch folders of processes of this host that have ended."""
-    for scratch in folder.glob(f"{SCRATCH}*"):
-        process, _, rest = scratch.name.removeprefix(SCRATCH).partition("-")
-        # a process of another host is not to be seen from here
-        if rest.rpartition("-")[0] == socket.gethostname() and not _alive(process):
-            shutil.rmtree(scratch, ignore_errors=True)
-
-
-def _move(source: Path, target: Path) -> None:
-    # where another process completes the same transaction, it may have moved the file already
-    with suppress(FileNotFoundError):
-        os.replace(source, target)
-
-
-def _remove_if_empty(place: Path, folder: Path) -> None:
-    """Remove the folder ``place``, and those that it lies in below ``folder``, where empty."""
-    while place != folder:
-        with suppress(FileNotFoundError):
-            if any(place.iterdir()):
-                return
-            place.rmdir()
-        place = place.parent
-
-
-def _require_free(folder: Path, files: Sequence[str]) -> None:
-    """InputError if a folder has the name of one of the files, or a file that of a folder."""
-    for name in files:
-        target = folder / name
-        if target.is_dir():
-            raise InputError(f"'{target}' is a folder, and a file of the results has its name")
-        require_folder(target.parent)
-
-
-def read_manifest(folder: Path) -> dict | None:
-    """What the last run has written into a folder, and of what; None if it is not said.
-
-    Raises
-    ------
-    InputError
-        If the manifest cannot be read.
-    """
-    path = folder / MANIFEST
-    if not path.is_file():
-        return None
-    try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
-        found = {name: manifest[name] for name in ("kind", "files", "discard")}
-        if not isinstance(found["kind"], str):
-            raise TypeError("the kind of the run is no text")
-        if not all(map(_is_inside, (*found["files"], *found["discard"]))):
-            raise TypeError("names of files in the folder are expected")
-        origin = manifest.get("origin", {})
-        if not isinstance(origin, dict):
-            raise TypeError("what the results are made of is no object")
-        return found | {"origin": origin}
-    except (ValueError, KeyError, TypeError, RecursionError, OSError) as error:
-        raise InputError(
-            f"'{path}' cannot be read ({type(error).__name__}: {error}); delete it, and the next "
-            "run replaces the files of its own names"
-        ) from error
-
-
-def _is_inside(name: object) -> bool:
-    """Whether it is the name of something inside the folder, and not of the folder itself."""
-    if not isinstance(name, str) or not name or "\0" in name:
-        return False
-    path = PurePosixPath(name)
-    return not path.is_absolute() and ".." not in path.parts and bool(path.parts)
-
-
-def _alive(process: str) -> bool:
-    if not process.isdigit():
-        return False
-    try:
-        os.kill(int(process), 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
-
-
-@contextmanager
-def uninterrupted() -> Iterator[None]:
-    """Hold back the signals that end a program until the block is done."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    came: list[int] = []
-    # handlers and not masks: a signal that is masked here is taken by another of JAX's threads
-    before = {
-        number: signal.signal(number, lambda came_in, _: came.append(came_in))
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-        if signal.getsignal(number) not in (signal.SIG_IGN, None)
-    }
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        for number in came:
-            os.kill(os.getpid(), number)
 
 
 @contextmanager

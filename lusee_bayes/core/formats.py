@@ -103,13 +103,12 @@ def _read(item: h5py.Group | h5py.Dataset, size: int) -> None:
 
 
 VISIBILITIES = "lusee_bayes visibilities 1"
-POSTERIOR = "lusee_bayes posterior 1"
-POSTERIOR_CUBE = "lusee_bayes posterior cube 1"
+POSTERIOR = "lusee_bayes posterior 2"
 SAMPLES = "lusee_bayes samples 1"
 BEAMS = "lusee_bayes beams 1"
 GAINS = "lusee_bayes gains 1"
 REDUCED = "lusee_bayes reduced spectra 1"
-DIAGNOSTICS = "lusee_bayes diagnostics 2"
+DIAGNOSTICS = "lusee_bayes diagnostics 3"
 PAPER_CASE = "lusee_bayes paper case 1"
 
 # words of the primary header that tell pyuvdata's beams from other FITS files
@@ -167,11 +166,28 @@ def read_netcdf(path: str | Path, format_: str, layout: Layout, hint: str = "") 
         return _checked_netcdf(path, dataset, layout)
 
 
-def read_dataset(path: str | Path, format_: str, layout: Layout, hint: str = "") -> xr.Dataset:
-    """As :func:`read_netcdf`, with the file as a whole: what is not declared, too."""
-    with _opened_netcdf(path, format_, layout, hint) as dataset:
-        _checked_netcdf(path, dataset, layout)
-        return dataset.load()
+@contextmanager
+def opened_tree(path: str | Path, format_: str, what: str, hint: str = "") -> Iterator[xr.DataTree]:
+    """Open a file of the package that holds groups; what is not asked for is not read.
+
+    Parameters
+    ----------
+    path : str or Path
+    format_ : str
+        Its ``format``, one of :mod:`.formats`.
+    what : str
+        What it should be, for messages.
+    hint : str
+        What to do if there is no such file.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged or of another kind.
+    """
+    path = _of_format(path, format_, what, hint)
+    with reading(path, what), xr.open_datatree(path, engine="h5netcdf", decode_times=False) as tree:
+        yield tree
 
 
 def says(path: Path, attributes: Mapping[str, str]) -> bool:
@@ -188,17 +204,22 @@ def says(path: Path, attributes: Mapping[str, str]) -> bool:
         return False
 
 
+def _of_format(path: str | Path, format_: str, what: str, hint: str) -> Path:
+    path = require_file(path, what, hint)
+    found = format_of(path)
+    if found != format_:
+        raise InputError(
+            f"{path} is not a file of {what}: its format is '{found or 'absent'}', expected "
+            f"'{format_}'" + (f"; {hint}" if hint else "")
+        )
+    return path
+
+
 @contextmanager
 def _opened_netcdf(
     path: str | Path, format_: str, layout: Layout, hint: str
 ) -> Iterator[xr.Dataset]:
-    path = require_file(path, layout.what, hint)
-    found = format_of(path)
-    if found != format_:
-        raise InputError(
-            f"{path} is not a file of {layout.what}: its format is '{found or 'absent'}', expected "
-            f"'{format_}'" + (f"; {hint}" if hint else "")
-        )
+    path = _of_format(path, format_, layout.what, hint)
     with (
         reading(path, layout.what),
         xr.open_dataset(path, engine="h5netcdf", decode_times=False) as dataset,

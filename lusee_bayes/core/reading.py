@@ -15,9 +15,10 @@ from contextlib import contextmanager
 from functools import partial
 from io import StringIO
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from pydantic import BaseModel, ValidationError
 from ruamel.yaml import YAML, YAMLError
 from ruamel.yaml.constructor import SafeConstructor
 
@@ -25,6 +26,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import user_path
 from lusee_bayes.core.layouts import Content, Layout, Unloaded
 
+Model = TypeVar("Model", bound=BaseModel)
 # a text file that is larger is none that a person or this package has written
 LARGEST_TEXT = 50_000_000
 
@@ -153,6 +155,35 @@ def read_json(path: str | Path, layout: Layout, hint: str = "") -> dict[str, Any
     if not isinstance(found, dict):
         raise InputError(f"{path} holds a {type(found).__name__}; expected {layout.what}")
     return found | layout.checked(path, {}, found).values
+
+
+def read_model(path: str | Path, kind: type[Model], what: str, hint: str = "") -> Model:
+    """Read an object in JSON into a pydantic model.
+
+    Parameters
+    ----------
+    path : str or Path
+    kind : type
+        The model.
+    what : str
+        What it should be, for messages.
+    hint : str
+        What to do if there is no such file.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or the first thing in it that is not as the model has it.
+    """
+    text = read_text(path, what, hint)
+    try:
+        return kind.model_validate_json(text)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise InputError(
+            f"{path} is not {what}: {f'{where}: ' if where else ''}{first['msg']}"
+        ) from error
 
 
 def entries(

@@ -34,7 +34,6 @@ from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.experiment.term import Around
 from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix
 from lusee_bayes.instrument.observation import Observation
@@ -49,6 +48,7 @@ from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.prior import HarmonicPrior
+from lusee_bayes.systematics.context import Around
 
 # arrays that recur
 Products = Float[np.ndarray, " products"]

@@ -10,35 +10,34 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
+from operator import attrgetter
 from typing import Any
 
+import jax
 import numpy as np
+from jaxtyping import PRNGKeyArray
 
-from lusee_bayes.core.arrays import on_device
+from lusee_bayes.core.arrays import Draws, on_device, on_host
 from lusee_bayes.core.checks import Described
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment.instrument_terms import gain_drifts
 from lusee_bayes.experiment.leave_out import Fitting, fitting, without
 from lusee_bayes.experiment.model import model_to_sample, radiometer, simulate
-from lusee_bayes.experiment.rounds import (
-    Inference,
-    model_about,
-    rebuilds,
-    settled,
-    with_learned_prior,
-)
+from lusee_bayes.experiment.rounds import Inference, rebuilds, settled, with_learned_prior
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import Setup, set_up
-from lusee_bayes.experiment.sky_terms import point_sources
-from lusee_bayes.experiment.term import Around
-from lusee_bayes.experiment.terms import TERMS
 from lusee_bayes.instrument.instrument import Instrument
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.plausibility import require_plausible
 from lusee_bayes.linear.information import Information
-from lusee_bayes.priors.learning import Learned
+from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.priors.learning import Learned, draws_with_parameters
 from lusee_bayes.sky.sky_source import SkySource
+from lusee_bayes.systematics.beam import BeamErrors
+from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.gain_drifts import GainDrifts
+from lusee_bayes.systematics.sources import PointSources
+from lusee_bayes.systematics.systematic import Systematic
 
 
 @dataclass(frozen=True, repr=False)
@@ -59,6 +58,8 @@ class Experiment(Described):
         Of flight data: the times that did not fit and are left out; None for other data.
     around : Around or None
         What N was built around when the prior was learned, in rounds; None for the data alone.
+    information : Information or None
+        What the data say of the sky, where the prior was learned from it.
     """
 
     setup: Setup
@@ -67,6 +68,7 @@ class Experiment(Described):
     learned: Learned | None = None
     fitting: Fitting | None = None
     around: Around | None = None
+    information: Information | None = None
 
     def description(self) -> tuple[str, ...]:
         scenario = self.scenario
@@ -82,7 +84,11 @@ class Experiment(Described):
 
 
 def build(
-    scenario: Scenario, data: Visibilities | None = None, stages: Stages | None = None
+    scenario: Scenario,
+    data: Visibilities | None = None,
+    stages: Stages | None = None,
+    *,
+    earlier: Information | None = None,
 ) -> Experiment:
     """Build the experiment of a scenario, with the prior that its data tell.
 
@@ -95,6 +101,8 @@ def build(
         cut, or filled with zeros.
     stages : Stages, optional
         Told what is being done.
+    earlier : Information, optional
+        Of earlier data, which the prior learns from, too.
 
     Raises
     ------
@@ -103,7 +111,7 @@ def build(
         gives (:func:`.require_plausible`), and for a prior that does not settle.
     """
     stages = stages or Stages()
-    return _learned(_fitting(observed(scenario, data, stages), stages), stages)
+    return _learned(_fitting(observed(scenario, data, stages), stages), stages, earlier)
 
 
 @contextmanager
@@ -179,12 +187,16 @@ def _fitting(experiment: Experiment, stages: Stages) -> Experiment:
     return replace(experiment, setup=setup, data=kept, doubts=doubts, fitting=found)
 
 
-def _learned(experiment: Experiment, stages: Stages) -> Experiment:
+def _learned(
+    experiment: Experiment, stages: Stages, earlier: Information | None = None
+) -> Experiment:
     if experiment.setup.family is None:
         return experiment
     with stages("prior"):
-        setup, learned, around = with_learned_prior(experiment.setup, experiment.data)
-    return replace(experiment, setup=setup, learned=learned, around=around)
+        setup, learned, around, known = with_learned_prior(
+            experiment.setup, experiment.data, earlier
+        )
+    return replace(experiment, setup=setup, learned=learned, around=around, information=known)
 
 
 def with_truth(experiment: Experiment) -> Experiment:
@@ -230,28 +242,7 @@ def infer(experiment: Experiment) -> Inference:
     InputError
         As :func:`.settled`.
     """
-    return settled(experiment.setup, experiment.data, experiment.around)
-
-
-def inform(experiment: Experiment) -> tuple[Information, Inference]:
-    """What the data say of the sky as a quadratic form, and the posterior that it gives.
-
-    Parameters
-    ----------
-    experiment : Experiment
-
-    Raises
-    ------
-    InputError
-        As :func:`infer`.
-    """
-    if rebuilds(experiment.setup):
-        found = infer(experiment)
-    else:
-        around = Around(experiment.data)
-        found = Inference(*model_about(experiment.setup, around), None, 1, around)
-    information, posterior = found.model.inform(experiment.data.data)
-    return information, replace(found, posterior=posterior)
+    return settled(experiment.setup, experiment.data, experiment.around, experiment.information)
 
 
 def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
@@ -261,14 +252,22 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
     """
     setup, data, log_normal = experiment.setup, experiment.data, experiment.scenario.log_normal
 
-    def free(key: str, piece: Any) -> Any:
-        term = next(term for term in TERMS if term.key == key)
-        if any(t == "marginalised" for t, _ in term.build(setup, Around())):
+    def require_free(cls: type[Systematic]) -> None:
+        if cls.treatment(experiment.scenario) == "marginalised":
             raise InputError(
                 "the program samples what the scenario marginalises, so that it would count "
-                f"twice; set {key}.treatment=sampled"
+                f"twice; set {cls.key}.treatment=sampled"
             )
-        return piece
+
+    def own(cls: type[Systematic]) -> Systematic:
+        if cls.treatment(experiment.scenario) is None:
+            raise InputError(f"the scenario has no {cls.key} that could be sampled")
+        require_free(cls)
+        return cls.build(attrgetter(cls.key)(experiment.scenario), setup, around())
+
+    def instrument() -> Instrument:
+        require_free(BeamErrors)
+        return embedded_instrument(setup)
 
     @cache
     def around() -> Around:
@@ -281,9 +280,9 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
     return {
         "gaussian": lambda: to_sample()[0],
         "systematics": lambda: to_sample()[1],
-        "gain_drifts": lambda: free("noise.gain", gain_drifts(setup, around())),
-        "instrument": lambda: free("noise.beam", embedded_instrument(setup)),
-        "sources": lambda: free("sources", point_sources(setup)),
+        "gain_drifts": lambda: own(GainDrifts),
+        "instrument": instrument,
+        "sources": lambda: own(PointSources),
         "log_normal": lambda: on_device(log_normal.prior(setup.sky.frequency_mhz, setup.sky.lmax)),
         "layout": lambda: data.layout,
     }
@@ -297,3 +296,63 @@ def embedded_instrument(setup: Setup) -> Instrument:
             "beam.file"
         )
     return setup.prepared
+
+
+# what the seed is folded with for posterior draws
+DRAWS = 1
+
+
+def draw_key(scenario: Scenario) -> PRNGKeyArray:
+    """The key of a scenario's posterior draws."""
+    return jax.random.fold_in(jax.random.key(scenario.seed), DRAWS)
+
+
+def posterior_draws(
+    experiment: Experiment, posterior: Posterior, information: Callable[[], Information], n: int
+) -> Draws:
+    """Draw the sky.
+
+    Where the prior was learned, its parameters are drawn, too (:mod:`.learning`); not for
+    data that do not fit, which would not let them be uncertain.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    posterior : Posterior
+        The Gaussian posterior.
+    information : callable
+        ``information()`` of the data behind it, asked for where parameters are drawn.
+    n : int
+
+    Returns
+    -------
+    (draws, modes) array
+        In K.
+    """
+    key, learned = draw_key(experiment.scenario), experiment.learned
+    if learned is not None and learned.fits:
+        family = experiment.setup.family
+        return draws_with_parameters(family, learned, information(), key, n)
+    return np.asarray(on_host(posterior).sample(key, n))
+
+
+def doubts(experiment: Experiment, inference: Inference) -> tuple[str, ...]:
+    """What is doubtful about an experiment's data, its prior and its rounds."""
+    learned, found = experiment.learned, list(experiment.doubts)
+    if learned is not None and not learned.settled:
+        found.append(
+            "The prior is a fixed, wide one: its parameters do not settle, whatever the noise."
+        )
+    elif learned is not None and learned.noise_factor > 1.0:
+        found.append(
+            f"The prior was learned with N times {learned.noise_factor:.2g}, as the residual chi^2 "
+            "demands; the map has the scenario's N."
+        )
+    if learned is not None and learned.still_moves > 0.0:
+        found.append(
+            f"The map still moves by {learned.still_moves:.2g} of its standard deviations from one "
+            "round of learning its prior to the next."
+        )
+    if inference.unsettled:
+        found.append(inference.unsettled)
+    return tuple(found)

@@ -1,10 +1,9 @@
 """Sections of a scenario on the instrument and its data.
 
-They say where, when and with which turntable angles; what is not known about clock and pointing;
-the beams, and what is connected to their ports; and how sessions of the spectrometer become
-visibilities, or are simulated. Beams and receivers have one section for each kind, told by
-``model``. A new kind of beams is a class here, with its :class:`BeamSource`, and its name in
-``BEAM_SECTIONS``.
+They say where, when and with which turntable angles; the beams, and what is connected to their
+ports; and how sessions of the spectrometer become visibilities, or are simulated. Beams and
+receivers have one section for each kind, told by ``model``. A new kind of beams is a class here,
+with its :class:`BeamSource`, and its name in ``BEAM_SECTIONS``.
 """
 
 from __future__ import annotations
@@ -17,14 +16,13 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from lusee_bayes.experiment.section import (
+from lusee_bayes.core.section import (
     LARGEST,
     Angle,
     Frequency,
     Positive,
     Section,
     Temperature,
-    Treatment,
     kinds_of,
     one_of,
     requires,
@@ -48,7 +46,6 @@ from lusee_bayes.instrument.beams.source import (
     ScalarFileBeams,
 )
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.pointing import OFFSETS
 from lusee_bayes.instrument.products import N_ANTENNAS
 from lusee_bayes.instrument.schedule import CYCLE_DAYS, Interval, Run, read_schedule
 from lusee_bayes.instrument.times import Timestamp
@@ -161,62 +158,6 @@ def _observation(section: ObservationSection, intervals: tuple[Interval, ...]) -
         return Observation.from_schedule(intervals, **common)
     runs = tuple(Run(r.cycles, r.turntable_deg, r.night_only) for r in section.runs)
     return Observation.from_runs(runs, start=section.start, **common)
-
-
-# wider priors are none: the sky looks nothing like it did
-Offset = Annotated[Positive, Field(le=45)]
-
-
-class PointingSection(Section):
-    """Offsets of clock and pointing: prior standard deviations of what has to be added.
-
-    Attributes
-    ----------
-    clock_s : float
-        Samples were taken later than their times say by so many seconds.
-    clock_drift_s_per_day : float
-        And later by so much more every day from the first sample on.
-    turntable_deg : float
-        Angle of the turntable, of every run on its own.
-    lon_deg : float
-        Longitude of the site.
-    lat_deg : float
-        Latitude of the site.
-    tilt_east_deg : float
-        Lean of the lander towards East.
-    tilt_north_deg : float
-        Lean of the lander towards North.
-    treatment : {"marginalised", "sampled", "ignored"}
-        Their covariance is added to N to first order, they are sampled with the map, or they are
-        left out of the model.
-    around : {"posterior", "model"}
-        The sky and the offsets about which data depend on offsets to first order: those that the
-        data tell, found in rounds, or the scenario's sky and none.
-    true_values : dict
-        What simulated data hold, by name (turntable_0_deg, ... where there are several runs);
-        the others are drawn from their priors.
-    """
-
-    clock_s: Annotated[Positive, Field(le=1e6)] | None = None
-    clock_drift_s_per_day: Annotated[Positive, Field(le=1e4)] | None = None
-    turntable_deg: Offset | None = None
-    lon_deg: Offset | None = None
-    lat_deg: Offset | None = None
-    tilt_east_deg: Offset | None = None
-    tilt_north_deg: Offset | None = None
-    treatment: Treatment = "marginalised"
-    around: Literal["posterior", "model"] = "posterior"
-    true_values: dict[str, Annotated[float, Field(ge=-1e6, le=1e6)]] = Field(default_factory=dict)
-
-    _something_is_not_known = requires(
-        lambda section: section.kinds,
-        f"give a standard deviation of at least one of {', '.join(OFFSETS)}",
-    )
-
-    @property
-    def kinds(self) -> tuple[str, ...]:
-        """What is not known."""
-        return tuple(kind for kind in OFFSETS if getattr(self, kind) is not None)
 
 
 def _each_port(value: Any) -> Any:

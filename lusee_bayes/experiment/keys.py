@@ -1,24 +1,18 @@
-"""Every key of a scenario: meaning, unit, choices and default, as the schema has them.
+"""Every key of a scenario: meaning, unit, choices and default, from its JSON schema.
 
-Meanings are the ``Attributes`` of the sections' docstrings, units the endings of names, choices the
-fields' types.
+Units are the endings of names; all else is in ``Scenario.model_json_schema()``, which editors of
+YAML read, too.
 """
 
 from __future__ import annotations
 
-import types
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
-
-from docstring_parser import DocstringStyle, parse
-from pydantic.fields import FieldInfo
-from pydantic_core import PydanticUndefined
+from typing import Any
 
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.reading import as_yaml
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.section import Section
 
 UNITS = {
     "mhz": "MHz",
@@ -34,11 +28,13 @@ UNITS = {
     "nh": "nH",
     "ohm": "Ohm",
 }
-TYPES = {float: "number", int: "integer", str: "text", bool: "true, false"}
-# annotated-types' names of bounds, as they are written
-BOUNDS = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
+TYPES = {"number": "number", "integer": "integer", "string": "text", "boolean": "true, false"}
+# JSON schema's names of bounds, as they are written
+BOUNDS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
 # bounds that only keep numbers within what floats and seeds can hold
 WIDEST = 1e18
+
+Schema = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -68,6 +64,12 @@ class Key:
     default: str
     meaning: str
 
+    def __str__(self) -> str:
+        model = f"  (model {self.kind})" if self.kind else ""
+        unit = f" [{self.unit}]" if self.unit else ""
+        choices = f"{self.choices}{unit}"
+        return f"{self.path} = {self.default}{model}\n    {self.meaning}\n    {choices}"
+
 
 def scenario_keys(within: str = "") -> list[Key]:
     """List the keys of a scenario in the order of the schema.
@@ -82,7 +84,8 @@ def scenario_keys(within: str = "") -> list[Key]:
     InputError
         If there is no such key.
     """
-    keys = list(_keys_of(Scenario, "", ""))
+    schema = Scenario.model_json_schema()
+    keys = list(_keys_of(schema, schema["$defs"], "", ""))
     if not within:
         return keys
     found = [k for k in keys if k.path == within or k.path.startswith(f"{within}.")]
@@ -101,70 +104,44 @@ def keys_as_markdown(keys: Iterable[Key]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _keys_of(section: type[Section], prefix: str, kind: str) -> Iterator[Key]:
-    meanings = _meanings(section)
-    for name, field in section.model_fields.items():
-        path = f"{prefix}{name}"
-        inner = list(_sections(field.annotation))
+def _keys_of(section: Schema, sections: Schema, prefix: str, kind: str) -> Iterator[Key]:
+    for name, entry in section["properties"].items():
         if kind and name == "model":
             continue
+        path, meaning = f"{prefix}{name}", entry.get("description", "")
+        inner = [sections[reference] for reference in _references(entry)]
+        # where nothing is said of an entry, what its section says of itself
+        if not meaning and len(inner) == 1:
+            meaning = str(inner[0].get("description", "")).rstrip(".").replace("``", "`")
+        default = "required" if name in section.get("required", ()) else _default(entry)
+        is_list = entry.get("type") == "array"
         if not inner:
+            meaning = meaning or (f"Kind of {prefix.rstrip('.')}" if name == "model" else "")
+            yield Key(path, kind, _unit(name), _choices(entry), default, meaning)
+        elif is_list or default == "none":
             yield Key(
-                path,
-                kind,
-                _unit(name),
-                _choices(field.annotation, field.metadata),
-                _as_yaml(field.get_default(call_default_factory=True)),
-                meanings.get(name, f"Kind of {prefix.rstrip('.')}" if name == "model" else ""),
+                path, kind, "", "list of sections" if is_list else "a section", default, meaning
             )
-        elif field.default is None or _is_sequence(field.annotation):
-            choices = "list of sections" if _is_sequence(field.annotation) else "a section"
-            yield Key(path, kind, "", choices, _as_yaml(field.default), meanings.get(name, ""))
+        kinds = [one["properties"]["model"]["const"] for one in inner] if len(inner) > 1 else [""]
         if len(inner) > 1:
-            kinds = [str(one.model_fields["model"].default) for one in inner]
+            first = "none" if default == "none" else kinds[0]
             meaning = f"Kind of {name}, on which the keys below depend"
-            first = "none" if field.default is None else kinds[0]
             yield Key(f"{path}.model", kind, "", ", ".join(kinds), first, meaning)
-        for one in inner:
-            several = str(one.model_fields["model"].default) if len(inner) > 1 else ""
-            number = ".0" if _is_sequence(field.annotation) else ""
-            yield from _keys_of(one, f"{path}{number}.", several)
+        for one, its_kind in zip(inner, kinds, strict=False):
+            yield from _keys_of(one, sections, f"{path}{'.0' * is_list}.", its_kind)
 
 
-def _meanings(section: type[Section]) -> dict[str, str]:
-    parsed = parse(section.__doc__ or "", style=DocstringStyle.NUMPYDOC)
-    return {
-        p.arg_name: " ".join((p.description or "").split()).rstrip(".").replace("``", "`")
-        for p in parsed.params
-    }
+def _alternatives(entry: Schema) -> list[Schema]:
+    """What an entry may be, besides null."""
+    return [one for one in entry.get("anyOf", [entry]) if one.get("type") != "null"]
 
 
-def _without_metadata(annotation: Any) -> tuple[Any, tuple[Any, ...]]:
-    if get_origin(annotation) is Annotated:
-        inner, *metadata = get_args(annotation)
-        return inner, tuple(metadata)
-    return annotation, ()
-
-
-def _alternatives(annotation: Any) -> tuple[Any, ...]:
-    """The parts of a union, None left out."""
-    bare = _without_metadata(annotation)[0]
-    if get_origin(bare) in (Union, types.UnionType):
-        return tuple(b for a in get_args(bare) if a is not type(None) for b in _alternatives(a))
-    return (annotation,)
-
-
-def _sections(annotation: Any) -> Iterator[type[Section]]:
-    for one in _alternatives(annotation):
-        bare = _without_metadata(one)[0]
-        if isinstance(bare, type) and issubclass(bare, Section):
-            yield bare
-        elif _is_sequence(one):
-            yield from _sections(get_args(bare)[0])
-
-
-def _is_sequence(annotation: Any) -> bool:
-    return get_origin(_without_metadata(annotation)[0]) is tuple
+def _references(entry: Schema) -> Iterator[str]:
+    """Names of the sections that an entry may be, or may be a list of."""
+    for one in _alternatives(entry):
+        for kind in one.get("oneOf", [one.get("items", one)]):
+            if "$ref" in kind:
+                yield kind["$ref"].rpartition("/")[2]
 
 
 def _unit(name: str) -> str:
@@ -173,40 +150,23 @@ def _unit(name: str) -> str:
     return UNITS.get(name.rsplit("_", 1)[-1], "") if "_" in name else ""
 
 
-def _choices(annotation: Any, metadata: Iterable[Any] = ()) -> str:
-    (one,) = _alternatives(annotation)
-    bare, own = _without_metadata(one)
-    if get_origin(bare) is Literal:
-        return ", ".join(str(value) for value in get_args(bare))
-    if get_origin(bare) is tuple:
-        return f"list of: {_choices(get_args(bare)[0])}"
-    if get_origin(bare) is dict:
-        return f"name: {_choices(get_args(bare)[1])}"
-    bounds = dict(_bounds([*metadata, *own]))
-    if "ge" in bounds and "le" in bounds:
-        return f"{TYPES[bare]}, {bounds['ge']} to {bounds['le']}"
-    return ", ".join([TYPES[bare], *(f"{BOUNDS[name]} {at}" for name, at in bounds.items())])
+def _choices(entry: Schema) -> str:
+    (one,) = _alternatives(entry)
+    if "enum" in one:
+        return ", ".join(map(str, one["enum"]))
+    if one["type"] == "array":
+        return f"list of: {_choices(one['items'] if 'items' in one else one['prefixItems'][0])}"
+    if one["type"] == "object":
+        return f"name: {_choices(one['additionalProperties'])}"
+    bounds = {key: f"{one[key]:g}" for key in BOUNDS if abs(one.get(key, WIDEST)) < WIDEST}
+    if bounds.keys() == {"minimum", "maximum"}:
+        return f"{TYPES[one['type']]}, {bounds['minimum']} to {bounds['maximum']}"
+    return ", ".join([TYPES[one["type"]], *(f"{BOUNDS[key]} {at}" for key, at in bounds.items())])
 
 
-def _bounds(metadata: Iterable[Any]) -> Iterator[tuple[str, str]]:
-    for item in metadata:
-        if isinstance(item, FieldInfo):
-            yield from _bounds(item.metadata)
-        for name in BOUNDS:
-            limit = getattr(item, name, None)
-            if limit is not None and abs(limit) < WIDEST:
-                yield name, f"{limit:g}"
-
-
-def _as_yaml(value: Any) -> str:
-    if value is PydanticUndefined:
-        return "required"
-    if value is None:
-        return "none"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, Section):
-        return as_yaml(value.model_dump(), flow=True).strip()
-    if isinstance(value, tuple):
-        return f"[{', '.join(_as_yaml(item) for item in value)}]"
-    return "{}" if value == {} else str(value)
+def _default(entry: Schema) -> str:
+    """As in YAML; where a function makes it, as that of a mapping, it is empty."""
+    value = entry.get("default", {})
+    if value is None or isinstance(value, str):
+        return value or "none"
+    return as_yaml(value, flow=True).removesuffix("\n...\n").strip()

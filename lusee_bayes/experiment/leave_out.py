@@ -24,16 +24,16 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.lazy import special
 from lusee_bayes.core.progress import Stages, memory_limit
+from lusee_bayes.core.section import is_modelled
 from lusee_bayes.experiment.rounds import model_about, rebuilds, settled
-from lusee_bayes.experiment.section import is_modelled
 from lusee_bayes.experiment.setup import Setup, set_up
-from lusee_bayes.experiment.term import Around
 from lusee_bayes.instrument.products import DataLayout, all_products
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.left_out import DataGroup, LeftOut, Missed, groups_of
 from lusee_bayes.judge.split import WIDER, Split
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.systematics.context import Around
 
 # of the times beyond the limit, those within this share of the worst go in one round
 WORST = 0.3

@@ -10,25 +10,19 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import jax
+import numpy as np
 
-from lusee_bayes.core.arrays import Grid, on_device
-from lusee_bayes.experiment.instrument_terms import (
-    PointingTerm,
-    pointed,
-    table_factors,
-    true_beams,
-    true_instrument,
-    true_setup,
-)
+from lusee_bayes.core.arrays import Grid, on_device, on_host
 from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.experiment.term import Around, Truth, noise_visibilities, radiometer_about
-from lusee_bayes.experiment.terms import TERMS
-from lusee_bayes.instrument.coupling import CouplingMatrix, DenseCoupling
+from lusee_bayes.instrument.coupling import DenseCoupling
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import Covariance
 from lusee_bayes.noise.radiometer import radiometer_noise
-from lusee_bayes.systematics.systematic import Marginalised, Systematic
+from lusee_bayes.systematics.context import Around, Context, noise_visibilities
+from lusee_bayes.systematics.noise_level import radiometer_about
+from lusee_bayes.systematics.registered import SYSTEMATICS
+from lusee_bayes.systematics.systematic import Expanded, Marginalised, Systematic, Truth, present
 
 
 def radiometer(setup: Setup, around: Around | None = None) -> Covariance:
@@ -48,23 +42,26 @@ def radiometer(setup: Setup, around: Around | None = None) -> Covariance:
     return radiometer_noise(visibilities, setup.layout, **given, **common)
 
 
+def moved(setup: Setup, values: Truth | None) -> Context:
+    """The setup with the instrument that has these values, its signal with it."""
+    for cls, section in present(SYSTEMATICS, setup.scenario) if values else ():
+        setup = cls.moved(section, setup, values)
+    return setup
+
+
 def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, Systematic]]:
     """Treatment and systematic, for all that the scenario does not ignore, in their order.
 
-    Where clock and pointing are built around offsets, the others are, too: gains multiply, and
-    sources are seen, where the antennas then pointed. Where the gain table is built around its
-    errors, what N holds of the others is seen through these gains.
+    Where the instrument is built around values, such as those of clock and pointing, the others
+    are, too: gains multiply, and sources are seen, where the antennas then pointed.
     """
     around = around or Around()
-    there = pointed(setup, around.values)
-    gains = table_factors(setup, around)
-    return [
-        (treatment, found if gains is None else found.behind(gains))
-        for term in TERMS
-        for treatment, found in term.build(
-            setup if isinstance(term, PointingTerm) else there, around
-        )
+    there = moved(setup, around.values)
+    treated = [
+        (cls.treatment(setup.scenario), cls, section)
+        for cls, section in present(SYSTEMATICS, setup.scenario)
     ]
+    return [(t, cls.build(s, there, around)) for t, cls, s in treated if t != "ignored"]
 
 
 def base_model(setup: Setup, around: Around | None = None) -> LinearGaussian:
@@ -73,36 +70,86 @@ def base_model(setup: Setup, around: Around | None = None) -> LinearGaussian:
     return on_device(LinearGaussian(setup.coupling, setup.prior, noise, setup.offset))
 
 
+def in_noise(
+    setup: Setup, model: LinearGaussian, found: Iterable[Systematic], around: Around
+) -> list[Marginalised]:
+    """Systematics as N holds them, one after the other, about what the terms are built around.
+
+    Parameters
+    ----------
+    setup : Setup
+    model : LinearGaussian
+        Without them.
+    found : iterable of Systematic
+        In their order.
+    around : Around
+    """
+    sky = np.asarray(setup.sky.modes if around.sky is None else around.sky)
+    model, held, gains = on_host(model), [], []
+    for systematic in found:
+        if systematic.first_order:
+            held.append(on_host(Expanded.about(systematic, model, sky, around.values)))
+            model = held[-1].seen(model)
+        else:
+            held.append(Marginalised(systematic))
+        gains.append(model.coupling.response)
+    if gains and gains[-1] is None:
+        return held
+    later = [gains[-1] if before is None else gains[-1] / before for before in gains]
+    return [s.behind(g) if isinstance(s, Expanded) else s for s, g in zip(held, later, strict=True)]
+
+
+def model_about(
+    setup: Setup, around: Around, *, scaling: bool = True
+) -> tuple[LinearGaussian, tuple[Marginalised, ...]]:
+    """The full model, and the systematics in its N.
+
+    Parameters
+    ----------
+    setup : Setup
+    around : Around
+        What N is built around.
+    scaling : bool
+        Whether those are part of it that scale the sky.
+    """
+    model, found = base_model(setup, around), (s for _, s in systematics(setup, around))
+    held = in_noise(setup, model, (s for s in found if scaling or not s.scales_sky), around)
+    return marginalised(model, held), tuple(held)
+
+
 def full_model(setup: Setup, around: Around | None = None) -> LinearGaussian:
     """d = A m + n with every systematic in N that is not ignored.
 
     Those that are to be sampled, too, to first order: what a Gaussian can say about them.
     """
-    around = around or Around()
-    return marginalised(base_model(setup, around), systematics(setup, around))
+    return model_about(setup, around or Around())[0]
 
 
-def marginalised(model: LinearGaussian, found: Iterable[tuple[str, Systematic]]) -> LinearGaussian:
-    """The model with these systematics (:func:`systematics`) in N."""
-    for _, systematic in found:
+def marginalised(model: LinearGaussian, held: Iterable[Marginalised]) -> LinearGaussian:
+    """The model with these systematics (:func:`in_noise`) in N."""
+    for systematic in held:
         model = systematic.marginalised(model)
     return model
 
 
-def model_to_sample(setup: Setup, around: Around) -> tuple[LinearGaussian, tuple[Systematic, ...]]:
+def model_to_sample(
+    setup: Setup, around: Around
+) -> tuple[LinearGaussian, tuple[Systematic | Marginalised, ...]]:
     """The model before anything is sampled, and what is then to be applied to it.
 
     Systematics that are marginalised come in their place in the order, as sampled ones without a
     site.
     """
     model, later = base_model(setup, around), []
-    for treatment, systematic in systematics(setup, around):
+    found = systematics(setup, around)
+    held = in_noise(setup, model, (systematic for _, systematic in found), around)
+    for (treatment, systematic), as_noise in zip(found, held, strict=True):
         if treatment == "sampled":
             later.append(systematic)
         elif later:
-            later.append(Marginalised(systematic))
+            later.append(as_noise)
         else:
-            model = systematic.marginalised(model)
+            model = as_noise.marginalised(model)
     if later and not any(systematic.changes_coupling for systematic in later):
         model = replace(model, coupling=DenseCoupling(model.coupling.dense()))
     return model, tuple(later)
@@ -110,30 +157,33 @@ def model_to_sample(setup: Setup, around: Around) -> tuple[LinearGaussian, tuple
 
 def true_values(setup: Setup) -> Truth:
     """True values of what simulated data hold, by the names of their sites."""
+    key, truth = jax.random.key(setup.scenario.seed), {}
+    for cls, section in present(SYSTEMATICS, setup.scenario):
+        truth |= cls.truth(section, setup, key)
+    return truth
+
+
+def true_model(setup: Setup, truth: Truth) -> LinearGaussian:
+    """The model of simulated data: the true instrument and values, and the radiometer noise."""
     key = jax.random.key(setup.scenario.seed)
-    return {name: value for term in TERMS for name, value in term.truth(setup, key).items()}
+    there = moved(setup, truth)
+    model = LinearGaussian(there.coupling, setup.prior, radiometer(setup), there.offset)
+    for cls, section in present(SYSTEMATICS, setup.scenario):
+        model = cls.in_data(section, there, model, truth, key)
+    return model
 
 
 def true_signal(setup: Setup, truth: Truth) -> Grid:
     """Visibilities of sky, ground and systematics with the true instrument and values, in K."""
-    key = jax.random.key(setup.scenario.seed)
-    setup = true_setup(setup, truth)
-    true = CouplingMatrix.build(true_beams(setup), setup.pointing)
-    visibilities = true.layout.scatter(true @ setup.sky.modes)
-    source, frequency_mhz = true_instrument(setup)
-    visibilities = visibilities + source.background(frequency_mhz)[:, None]
-    for term in TERMS:
-        visibilities = term.distort(visibilities, setup, truth, key)
-    return visibilities
+    return setup.layout.scatter(true_model(setup, truth).predict(setup.sky.modes))
 
 
 def simulate(setup: Setup) -> Visibilities:
     """Visibilities of the scenario's sky, with every draw from its seed."""
-    truth = true_values(setup)
-    visibilities = true_signal(setup, truth)
-    noise = radiometer(setup).scaled(truth.get("noise_level", 1.0))
+    model = true_model(setup, true_values(setup))
+    noise = model.noise.sample(jax.random.key(setup.scenario.seed))
     return Visibilities(
-        setup.layout.gather(visibilities) + noise.sample(jax.random.key(setup.scenario.seed)),
+        model.predict(setup.sky.modes) + noise,
         setup.layout,
         setup.observation,
         setup.scenario.frequency_mhz,

@@ -12,27 +12,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import DataVector, Grid, Vector, on_host
+from lusee_bayes.core.arrays import DataVector, Grid, Vector
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import n_modes
-from lusee_bayes.experiment.instrument_terms import pointed
-from lusee_bayes.experiment.model import (
-    base_model,
-    full_model,
-    marginalised,
-    radiometer,
-    systematics,
-)
+from lusee_bayes.core.section import is_modelled
+from lusee_bayes.experiment.model import full_model, model_about, moved
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.section import is_modelled
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.sky_sections import (
     IsotropicPriorSection,
     LocalScalesPriorSection,
     PriorSection,
 )
-from lusee_bayes.experiment.term import Around, Term, gains_about, radiometer_about
-from lusee_bayes.experiment.terms import TERMS
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.measures import data_freedom
@@ -42,10 +33,12 @@ from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.priors.families import PriorFamily
 from lusee_bayes.priors.learning import Learned, learn_whatever_fits
-from lusee_bayes.systematics.gain_table import GainTable
-from lusee_bayes.systematics.instrument_unknowns import PointingOffsets
-from lusee_bayes.systematics.sky_unknowns import PointSources
-from lusee_bayes.systematics.systematic import Expanded, Systematic, Templated
+from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.gain_drifts import gains_about
+from lusee_bayes.systematics.noise_level import radiometer_about
+from lusee_bayes.systematics.pointing_offsets import PointingOffsets
+from lusee_bayes.systematics.registered import SYSTEMATICS
+from lusee_bayes.systematics.systematic import Expanded, Marginalised, Systematic, present
 
 # N is rebuilt until the map moves by less than this (rms, in standard deviations)
 SETTLED, MAX_ROUNDS = 1e-2, 30
@@ -64,7 +57,7 @@ class Inference:
     ----------
     model : LinearGaussian
         With every systematic in N that the scenario does not ignore.
-    systematics : tuple of Systematic
+    systematics : tuple of Marginalised
         Those, as they are in N.
     posterior : Posterior
     rounds : int
@@ -73,27 +66,40 @@ class Inference:
         What it was built around.
     unsettled : str
         A sentence if the map still moves from round to round; empty otherwise.
+    information : Information or None
+        What the data say of the sky, where the posterior was found through it.
     """
 
     model: LinearGaussian
-    systematics: tuple[Systematic, ...]
+    systematics: tuple[Marginalised, ...]
     posterior: Posterior | None
     rounds: int
     around: Around
     unsettled: str = ""
+    information: Information | None = None
 
     @property
-    def offsets(self) -> PointingOffsets | None:
-        """Of clock and pointing, as they are in N."""
-        return next((s for s in self.systematics if isinstance(s, PointingOffsets)), None)
+    def expanded(self) -> tuple[Expanded, ...]:
+        """What is to first order about values, as it is in N."""
+        return tuple(s for s in self.systematics if isinstance(s, Expanded))
 
     @property
     def moving(self) -> tuple[Expanded, ...]:
-        """What is to first order about values that the data tell, as it is in N."""
-        return tuple(s for s in self.systematics if isinstance(s, Expanded) and s.moves)
+        """What is so about values that the data determine."""
+        return tuple(s for s in self.expanded if s.systematic.moves)
+
+    @property
+    def offsets(self) -> Expanded | None:
+        """Of clock and pointing, as they are in N."""
+        return next((s for s in self.expanded if isinstance(s.systematic, PointingOffsets)), None)
 
 
-def settled(setup: Setup, data: Visibilities, start: Around | None = None) -> Inference:
+def settled(
+    setup: Setup,
+    data: Visibilities,
+    start: Around | None = None,
+    known: Information | None = None,
+) -> Inference:
     """Condition the model on data, in as many rounds as its N needs.
 
     One round, unless a term of N is built around what the data tell: the gains around the
@@ -108,6 +114,8 @@ def settled(setup: Setup, data: Visibilities, start: Around | None = None) -> In
     data : Visibilities
     start : Around, optional
         What N is built around in the first round; by default the data.
+    known : Information, optional
+        Of the data, where N is built once.
 
     Returns
     -------
@@ -122,7 +130,12 @@ def settled(setup: Setup, data: Visibilities, start: Around | None = None) -> In
 
     def conditioned(around: Around, rounds: int) -> Inference:
         model, found = model_about(setup, around)
-        return Inference(model, found, model.condition(data.data), rounds, around)
+        information, posterior = None, None
+        if model.is_structured:
+            information, posterior = model.inform(data.data, known)
+        else:
+            posterior = model.condition(data.data)
+        return Inference(model, found, posterior, rounds, around, information=information)
 
     found = conditioned(start or _start(setup, data), 1)
     if not rebuilds(setup):
@@ -134,7 +147,7 @@ def settled(setup: Setup, data: Visibilities, start: Around | None = None) -> In
         if float(found.posterior.rms_shift_from(before.posterior)) < SETTLED * step.size:
             return found
     moves = float(found.posterior.rms_shift_from(before.posterior))
-    remedies = [term.remedy for term in first_order(setup)]
+    remedies = [cls.remedy for cls in first_order(setup)]
     if rebuilds_gains(setup):
         remedies.append("noise.gain.visibilities=model")
     unsettled = (
@@ -142,12 +155,6 @@ def settled(setup: Setup, data: Visibilities, start: Around | None = None) -> In
         "of rebuilding N around it"
     )
     return replace(found, unsettled=f"{'; use '.join([unsettled, *remedies[:1]])}.")
-
-
-def model_about(setup: Setup, around: Around) -> tuple[LinearGaussian, tuple[Systematic, ...]]:
-    """The full model, and the systematics in its N."""
-    found = systematics(setup, around)
-    return marginalised(base_model(setup, around), found), tuple(s for _, s in found)
 
 
 @dataclass(frozen=True)
@@ -176,28 +183,20 @@ class _Step:
 
 def _around(setup: Setup, found: Inference, step: _Step) -> tuple[Around, _Step]:
     """What the terms of N are built around next, given a posterior, and the step there."""
-    visibilities, sky, values, seen = None, None, None, None
+    visibilities, sky, values = None, None, None
     solved = weighted_residual(found.model, found.posterior, found.around.data.data)
     if found.moving:
-        told = [s.expected + np.asarray(s.columns).T @ solved for s in found.moving]
-        centres = [np.asarray(s.centre) for s in found.moving]
-        step = step.after(np.concatenate(told) - np.concatenate(centres))
+        ways = [s.expected + s.columns.T @ solved - s.centre for s in found.expanded]
+        far = zip(found.expanded, ways, strict=True)
+        step = step.after(np.concatenate([way for s, way in far if s.systematic.moves]))
         values = {}
-        for moving, z, centre in zip(found.moving, told, centres, strict=True):
-            values |= moving.in_units(centre + step.size * (z - centre))
-            if isinstance(moving, GainTable):
-                # what the data tell of visibilities before the gains: less radiometer noise, and F
-                noise = np.asarray(on_host(radiometer(setup, found.around)).mv(solved))
-                less_noise = np.asarray(found.around.data.data) - noise
-                before = less_noise / np.asarray(moving.errors.factors(z))
-                seen = moving.seen + step.size * (before - moving.seen)
-            else:
-                here = np.asarray(setup.sky.modes if found.around.sky is None else found.around.sky)
-                sky = here + step.size * (np.asarray(found.posterior.mean) - here)
+        for s, way in zip(found.expanded, ways, strict=True):
+            values |= s.systematic.in_units(s.centre + step.size * way)
+        here = np.asarray(setup.sky.modes if found.around.sky is None else found.around.sky)
+        sky = here + step.size * (np.asarray(found.posterior.mean) - here)
     if rebuilds_visibilities(setup):
-        visibilities = prediction(pointed(setup, values), found, solved)
-    around = replace(found.around, visibilities=visibilities, sky=sky, values=values, seen=seen)
-    return around, step
+        visibilities = prediction(moved(setup, values), found, solved)
+    return replace(found.around, visibilities=visibilities, sky=sky, values=values), step
 
 
 def _start(setup: Setup, data: Visibilities) -> Around:
@@ -205,20 +204,18 @@ def _start(setup: Setup, data: Visibilities) -> Around:
 
     That model gives the share of each datum that it follows, which errors of the table change by no
     more than what they change the radiometer noise by; and, where the modelled sky is another than
-    the data's, visibilities before the gains.
+    the data's, the sky.
     """
-    found = systematics(setup, Around(data))
-    others = [(treatment, s) for treatment, s in found if not isinstance(s, GainTable)]
-    if len(others) == len(found):
-        return Around(data)
-    model = marginalised(base_model(setup, Around(data)), others)
+    around = Around(data)
+    if not any(cls.scales_sky for cls in first_order(setup)):
+        return around
+    model, held = model_about(setup, around, scaling=False)
     columns = [np.zeros((model.n_data, 0))]
-    columns += [np.asarray(s.columns) for _, s in others if isinstance(s, Templated)]
-    columns += [np.asarray(s.templates()) for _, s in others if isinstance(s, PointSources)]
+    columns += [s.columns for s in held if isinstance(s, Expanded)]
     posterior = model.condition(data.data)
     freedom = data_freedom(model, posterior, np.concatenate(columns, axis=1))
-    seen = np.asarray(model.predict(posterior.mean)) if setup.measured else None
-    return Around(data, seen=seen, freedom=freedom)
+    sky = np.asarray(posterior.mean) if setup.measured else None
+    return Around(data, sky=sky, freedom=freedom)
 
 
 def offset_posterior(
@@ -240,8 +237,8 @@ def offset_posterior(
     """
     offsets, data = found.offsets, found.around.data.data
     told = template_amplitudes(found.model, found.posterior, data, offsets.columns)
-    stds = np.asarray(offsets.stds)
-    return offsets.in_units(told.mean), told.covariance * np.outer(stds, stds)
+    stds = offsets.systematic.stds
+    return offsets.systematic.in_units(told.mean), told.covariance * np.outer(stds, stds)
 
 
 def rebuilds(setup: Setup) -> bool:
@@ -249,9 +246,13 @@ def rebuilds(setup: Setup) -> bool:
     return rebuilds_visibilities(setup) or bool(first_order(setup))
 
 
-def first_order(setup: Setup) -> tuple[Term, ...]:
-    """The terms that are to first order about values that the data tell."""
-    return tuple(term for term in TERMS if term.moves(setup.scenario))
+def first_order(setup: Setup) -> tuple[type[Systematic], ...]:
+    """Those that are to first order about values that the data tell."""
+    return tuple(
+        cls
+        for cls, section in present(SYSTEMATICS, setup.scenario)
+        if cls.treatment(setup.scenario) != "ignored" and cls.in_rounds(section)
+    )
 
 
 def rebuilds_gains(setup: Setup) -> bool:
@@ -278,10 +279,9 @@ def prediction(setup: Setup, found: Inference, solved: DataVector) -> Grid:
     complete = CouplingMatrix.build(setup.beams, setup.pointing)
     difference_of_skies = found.posterior.mean - setup.sky.modes
     besides = np.zeros(len(solved))
-    for systematic in found.systematics:
-        if isinstance(systematic, Templated) and not isinstance(systematic, PointingOffsets):
-            columns = np.asarray(systematic.columns)
-            besides = besides + columns @ (columns.T @ solved)
+    for expanded in found.expanded:
+        if not expanded.systematic.changes_coupling:
+            besides = besides + expanded.columns @ (expanded.columns.T @ solved)
     grid = complete.layout.scatter(complete @ difference_of_skies)
     return setup.signal + grid + setup.layout.scatter(besides)
 
@@ -293,7 +293,9 @@ PRIOR_SETTLED, MAX_PRIOR_ROUNDS = 0.05, 8
 COARSE_LMAX = 24
 
 
-def with_learned_prior(setup: Setup, data: Visibilities) -> tuple[Setup, Learned, Around | None]:
+def with_learned_prior(
+    setup: Setup, data: Visibilities, earlier: Information | None = None
+) -> tuple[Setup, Learned, Around | None, Information | None]:
     """Learn the prior from data.
 
     Systematics are in N as far as they are marginalised. Where N is built around what the data
@@ -305,6 +307,8 @@ def with_learned_prior(setup: Setup, data: Visibilities) -> tuple[Setup, Learned
     setup : Setup
         With a family of priors.
     data : Visibilities
+    earlier : Information, optional
+        Of earlier data, which are learned from, too.
 
     Returns
     -------
@@ -314,21 +318,25 @@ def with_learned_prior(setup: Setup, data: Visibilities) -> tuple[Setup, Learned
         How it was learned.
     Around or None
         What N was built around in the last round; None where that is the data alone.
+    Information or None
+        Of these data, where N is built once.
     """
     if not rebuilds(setup):
-        learned = learned_prior(setup, setup.family, about_sky(setup, data))
-        return replace(setup, prior=learned.prior), learned, None
+        information = about_sky(setup, data)
+        learned = learned_prior(setup, setup.family, _with_more(information, earlier))
+        return replace(setup, prior=learned.prior), learned, None, information
     learned, before, found = None, None, settled(setup, data)
     for _ in range(MAX_PRIOR_ROUNDS):
-        information = full_model(setup, found.around).inform(data.data)[0]
+        own = full_model(setup, found.around).inform(data.data)[0]
+        information = _with_more(own, earlier)
         start = None if learned is None or not learned.settled else learned.parameters
         learned = learned_prior(setup, setup.family, information, start)
         setup = replace(setup, prior=learned.prior)
         before, found = found, settled(setup, data, found.around)
         moved = float(found.posterior.rms_shift_from(before.posterior))
         if moved < PRIOR_SETTLED:
-            return setup, learned, found.around
-    return setup, replace(learned, still_moves=moved), found.around
+            return setup, learned, found.around, None
+    return setup, replace(learned, still_moves=moved), found.around, None
 
 
 def about_sky(setup: Setup, data: Visibilities) -> Information:
@@ -338,6 +346,10 @@ def about_sky(setup: Setup, data: Visibilities) -> Information:
     """
     around = settled(setup, data).around if rebuilds(setup) else Around(data)
     return full_model(setup, around).inform(data.data)[0]
+
+
+def _with_more(information: Information, earlier: Information | None) -> Information:
+    return information if earlier is None else information + earlier
 
 
 def learned_prior(

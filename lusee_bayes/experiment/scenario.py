@@ -18,20 +18,12 @@ from pydantic import BaseModel, Field, ValidationError, field_validator, model_v
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.files import user_path
 from lusee_bayes.core.reading import as_yaml, parse_yaml, read_yaml
+from lusee_bayes.core.section import Frequency, Section, Seed, is_modelled, requires
 from lusee_bayes.experiment.instrument_sections import (
     BeamSection,
     FlightSection,
     MonopoleBeamSection,
     ObservationSection,
-)
-from lusee_bayes.experiment.noise_sections import NoiseSection
-from lusee_bayes.experiment.section import (
-    Frequency,
-    OutputSection,
-    Section,
-    Seed,
-    is_modelled,
-    requires,
 )
 from lusee_bayes.experiment.sky_sections import (
     GalaxySection,
@@ -40,9 +32,10 @@ from lusee_bayes.experiment.sky_sections import (
     LogNormalSection,
     PriorSection,
     SkySection,
-    SourcesSection,
     SpectralSection,
 )
+from lusee_bayes.systematics.registered import SYSTEMATICS, NoiseSection
+from lusee_bayes.systematics.sources import SourcesSection
 
 
 def apply_override(tree: dict[str, Any], override: str) -> None:
@@ -152,6 +145,24 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
 
 # the scenarios that ship with the package
 FOLDER = resources.files("lusee_bayes.experiment") / "scenarios"
+
+
+class OutputSection(Section):
+    """Results that are written on request.
+
+    Attributes
+    ----------
+    draws : int
+        Number of posterior draws ``posterior.nc`` keeps.
+    covariance : bool
+        Keep the posterior covariance in ``posterior.nc``.
+    information : bool
+        Keep in ``posterior.nc`` what the data say of the sky, so that new data can be added later.
+    """
+
+    draws: Annotated[int, Field(ge=0)] = 0
+    covariance: bool = False
+    information: bool = False
 
 
 class Scenario(Section):
@@ -267,6 +278,20 @@ class Scenario(Section):
         "with joint, leave it out",
     )
 
+    _one_makes_a = requires(
+        lambda scenario: (
+            not (
+                scenario.noise.pointing is not None
+                and scenario.noise.beam is not None
+                and scenario.noise.beam.parameters
+                and {scenario.noise.pointing.treatment, scenario.noise.beam.treatment}
+                == {"sampled"}
+            )
+        ),
+        "noise.pointing and the parameters of noise.beam cannot both be sampled: each of them "
+        "makes A anew; set the treatment of one to marginalised",
+    )
+
     @property
     def ties_receivers(self) -> bool:
         """Whether receivers' powers of several frequencies are inferred as smooth spectra."""
@@ -278,6 +303,11 @@ class Scenario(Section):
         """The scenario with some values of a section changed."""
         section = getattr(self, name).model_copy(update=values)
         return self.model_copy(update={name: section})
+
+    @property
+    def single(self) -> bool:
+        """Whether it is of one frequency."""
+        return not self.frequencies_mhz
 
     def channels(self) -> tuple[Scenario, ...]:
         """The scenario of every channel; draws of each have a seed of their own, one further."""
@@ -298,11 +328,7 @@ class Scenario(Section):
     @property
     def samples(self) -> bool:
         """Whether something besides the sky is to be sampled."""
-        return (
-            "sampled" in _treatments(self)
-            or self.noise.radiometer.log_factor_std is not None
-            or self.prior.samples
-        )
+        return "sampled" in {cls.treatment(self) for cls in SYSTEMATICS}
 
     @property
     def map_nside(self) -> int:
@@ -312,16 +338,6 @@ class Scenario(Section):
     def to_yaml(self) -> str:
         """The resolved scenario, defaults included."""
         return as_yaml(self.model_dump(mode="json"))
-
-
-def _treatments(section: Section) -> set[str]:
-    """What a section, and all within it, say is done about what is not known."""
-    found = {section.treatment} if "treatment" in type(section).model_fields else set()
-    for name in type(section).model_fields:
-        value = getattr(section, name)
-        if isinstance(value, Section):
-            found |= _treatments(value)
-    return found
 
 
 def scenario_names() -> list[str]:

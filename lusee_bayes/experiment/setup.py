@@ -6,30 +6,30 @@ That is A, S, the sky, and what antennas and receivers add to every visibility, 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array, DataVector, Grid
-from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
+from lusee_bayes.experiment.instrument_sections import section_of_file
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.sky_sections import PriorSection, SourceSection
-from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ, ProductBeams
-from lusee_bayes.instrument.beams.monopoles import Monopoles, Receiver
+from lusee_bayes.experiment.sky_sections import PriorSection
+from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ
+from lusee_bayes.instrument.beams.monopoles import Monopoles
 from lusee_bayes.instrument.beams.source import BeamSource
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.instrument import Instrument
-from lusee_bayes.instrument.observation import BODIES, Observation, body_direction
 from lusee_bayes.instrument.pointing import Pointing
-from lusee_bayes.instrument.products import DataLayout, auto_indices
-from lusee_bayes.instrument.source_response import source_response
-from lusee_bayes.instrument.visibilities import Calibration, Visibilities
+from lusee_bayes.instrument.products import auto_indices
+from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.priors.families import PriorFamily
-from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, galactic_unit_vector, kelvin_steradian
 from lusee_bayes.sky.prior import Prior
 from lusee_bayes.sky.sky_source import Sky
+from lusee_bayes.systematics.context import Context
+from lusee_bayes.systematics.regolith import ground_per_kelvin
+from lusee_bayes.systematics.sources import expected_signal, source_responses
 
 
 def background_of(scenario: Scenario, source: BeamSource) -> Float[Array, " products"]:
@@ -49,131 +49,31 @@ def background_of(scenario: Scenario, source: BeamSource) -> Float[Array, " prod
     background = np.array(source.background(scenario.frequency_mhz))
     if scenario.noise.regolith is not None:
         ground_per_kelvin(source, scenario.frequency_mhz)  # refuses what has no ground
-    background[auto_indices(source.n_ports)] += receiver_powers(scenario, source)
+    if (receiver := scenario.noise.receiver) is not None:
+        autos = auto_indices(source.n_ports)
+        background[autos] += receiver.powers(source, scenario.frequency_mhz)
     return background
 
 
-def receiver_powers(scenario: Scenario, source: BeamSource) -> Float[np.ndarray, " ports"]:
-    """Mean noise of every port's receiver in K; zeros where the scenario has none.
-
-    Raises
-    ------
-    InputError
-        If it is given in V^2/Hz, and the beams know no volts.
-    """
-    section, frequency = scenario.noise.receiver, scenario.frequency_mhz
-    if section is None:
-        return np.zeros(source.n_ports)
-    rise = (frequency / section.reference_mhz) ** section.slope
-    if section.power_k is not None:
-        return np.full(source.n_ports, section.power_k * rise)
-    circuit = source.circuit(frequency)
-    if circuit is None:
-        raise InputError(
-            "noise.receiver.power_v2_hz needs antennas that know volts, which are those of a "
-            "response file; give that as beam.file, or use noise.receiver.power_k"
-        )
-    return section.power_v2_hz * rise / circuit.per_kelvin.diagonal().real
-
-
-def ground_per_kelvin(source: BeamSource, frequency_mhz: float) -> Float[Array, " products"]:
-    """Visibilities that each kelvin of the ground's temperature adds, in K per K.
-
-    Raises
-    ------
-    InputError
-        If the beams do not say what the ground emits.
-    """
-    if not hasattr(source, "moon_k"):
-        raise InputError(
-            "noise.regolith needs antennas that receive from the ground, which are those of a "
-            "response file or of a scalar beam file; give one as beam.file, or leave out "
-            "noise.regolith"
-        )
-    warm, cold = (replace(source, moon_k=kelvin) for kelvin in (1.0, 0.0))
-    return np.asarray(warm.background(frequency_mhz)) - np.asarray(cold.background(frequency_mhz))
-
-
-CATALOGUE = {source.name: source for source in BRIGHT_SOURCES}
-# instants in each piece of a window for the response to a source: antennas see nothing smaller
-# than some degrees, and nothing at the horizon, where a source appears within a window
-SOURCE_NODES = 8
 # two sites closer than that are one: 30 m
 SAME_SITE_DEG = 1e-3
 
 
 @dataclass(frozen=True)
-class Setup:
+class Setup(Context):
     """The pieces of d = A m + n that a scenario stands for.
 
     Attributes
     ----------
-    scenario : Scenario
-    observation : Observation
-    sky : Sky
-        The scenario's model sky, up to lmax.
-    beam_source : BeamSource
-    instrument : Instrument
-        Orientations and samples, of which A is made for given beams.
-    beams : ProductBeams
-    coupling : CouplingMatrix
-        A.
-    prior : Prior
-        S. Where it is to be learned, what is expected before there are data.
-    responses : tuple of (products, times) arrays
-        Of each point source beside the map, to 1 K sr.
-    background : (products,) array
-        Visibilities without any sky, of ground, antennas and the mean receiver, in K.
-    signal : (products, times) array
-        Visibilities of sky, background and sources through the modelled beams, in K.
-    receiver : Receiver or None
-        The receivers that the data say; None for others.
     family : PriorFamily or None
         Of which data choose the prior; None for a prior that is given.
-    calibration : Calibration or None
-        Of data that are averages of a spectrometer's spectra; None for others.
-    measured : bool
-        Whether the data were given, so that their sky is not the modelled one.
     """
 
     scenario: Scenario
-    observation: Observation
-    sky: Sky
-    beam_source: BeamSource
-    instrument: Instrument
-    beams: ProductBeams
-    coupling: CouplingMatrix
-    prior: Prior
-    responses: tuple[Grid, ...]
-    background: Float[Array, " products"]
-    signal: Grid
-    receiver: Receiver | None = None
     family: PriorFamily | None = None
-    calibration: Calibration | None = None
-    measured: bool = False
 
-    @property
-    def pointing(self) -> Pointing:
-        """The orientation of the lander at every sample."""
-        return self.instrument.pointing
-
-    @property
-    def layout(self) -> DataLayout:
-        """The product and the time of every datum."""
-        return self.coupling.layout
-
-    @property
-    def offset(self) -> DataVector | None:
-        """The background in every datum, in K; None where there is none."""
-        if not np.any(self.background):
-            return None
-        grid = (self.layout.n_products, self.layout.n_times)
-        return self.layout.gather(np.broadcast_to(self.background[:, None], grid))
-
-    @cached_property
-    def prepared(self) -> Instrument:
-        """The instrument, prepared for A to be made of many beams."""
-        return self.instrument.prepared()
+    def source_of_file(self, file: str) -> BeamSource:
+        return section_of_file(file, self.scenario.beam).source().behind(self.receiver)
 
     def with_prior(self, section: PriorSection) -> Setup:
         """Return the same with another prior, or family of priors.
@@ -237,7 +137,8 @@ def set_up(
         source = scenario.beam.source().behind(receiver)
         beams = source.beams(scenario.frequency_mhz, scenario.lmax)
         background = background_of(scenario, source)
-        responses = source_responses(scenario, observation, source)
+        sources = scenario.sources.list
+        responses = source_responses(sources, observation, source, scenario.frequency_mhz)
     if data is not None and data.layout.n_products != beams.n_products:
         raise InputError(
             f"the data have {data.layout.n_products} products, the beams supply "
@@ -246,7 +147,7 @@ def set_up(
     with stages("coupling"):
         complete = CouplingMatrix.build(beams, pointing)
         layout = complete.layout if data is None else data.layout
-        signal = expected_signal(scenario, complete, sky, background, responses)
+        signal = expected_signal(sources, complete, sky, background, responses)
         # those of a file have no parameters
         antennas = Monopoles() if scenario.beam.is_file else source.monopoles
         instrument = Instrument(antennas, pointing, layout, scenario.frequency_mhz, scenario.lmax)
@@ -264,9 +165,9 @@ def set_up(
         background,
         signal,
         receiver,
-        family,
         None if data is None else data.calibration,
         data is not None,
+        family,
     )
 
 
@@ -307,94 +208,3 @@ def require_fitting(data: Visibilities, scenario: Scenario) -> None:
             f"observation.lon_deg={here.lon_deg:.15g} --set observation.lat_deg={here.lat_deg:.15g}"
             + ("" if data.calibration is None else unsettled)
         )
-
-
-def source_responses(
-    scenario: Scenario,
-    observation: Observation,
-    beams: BeamSource,
-    frequency_mhz: float | None = None,
-) -> tuple[Grid, ...]:
-    """Response to 1 K sr of each of the scenario's sources, with these beams, in K.
-
-    Sources need the exact pattern, which only the embedded antennas have.
-
-    Their means over the windows, by instants: a source may rise and set within one.
-    """
-    if not scenario.sources.list:
-        return ()
-    frequency_mhz = scenario.frequency_mhz if frequency_mhz is None else frequency_mhz
-    instants, sample, weight = observation.at_nodes(SOURCE_NODES)
-    first = np.searchsorted(sample, np.arange(observation.n_times))
-    responses = (
-        source_response(
-            instants,
-            _direction(one, instants),
-            frequency_mhz,
-            beams.monopoles,
-            stokes_v=one.stokes_v,
-        )
-        for one in scenario.sources.list
-    )
-    return tuple(np.add.reduceat(np.asarray(r) * weight, first, axis=1) for r in responses)
-
-
-def _direction(source: SourceSection, observation: Observation) -> Float[np.ndarray, "..."]:
-    """Galactic unit vector(s) of a source: its own, the catalogue's, or the ephemeris'."""
-    if source.ra_deg is not None:
-        return galactic_unit_vector(source.ra_deg, source.dec_deg)
-    if source.name in BODIES:
-        return body_direction(source.name, observation)
-    known = CATALOGUE.get(source.name)
-    if known is None:
-        raise InputError(
-            f"unknown source '{source.name}'; {nearest(source.name, [*CATALOGUE, *BODIES])} "
-            "(or give ra_deg and dec_deg of your own)"
-        )
-    return galactic_unit_vector(known.ra_deg, known.dec_deg)
-
-
-def expected_signal(
-    scenario: Scenario,
-    complete: CouplingMatrix,
-    sky: Sky,
-    background: Float[Array, " products"],
-    responses: tuple[Grid, ...],
-) -> Grid:
-    """Visibilities of sky, background and sources with their mean fluxes, in K.
-
-    Parameters
-    ----------
-    scenario : Scenario
-    complete : CouplingMatrix
-        A, for all products at all times.
-    sky : Sky
-    background : (products,) array
-        In K.
-    responses : tuple of (products, times) arrays
-        As in :class:`Setup`.
-    """
-    signal = complete.layout.scatter(complete @ sky.modes) + background[:, None]
-    for section, response in zip(scenario.sources.list, responses, strict=True):
-        signal = signal + mean_flux(section, scenario.frequency_mhz) * response
-    return signal
-
-
-def mean_flux(source: SourceSection, frequency_mhz: float) -> float:
-    """Mean of the prior of a source's flux, in K sr. InputError if nothing is known about it."""
-    if source.flux_jy is not None:
-        return float(kelvin_steradian(source.flux_jy, frequency_mhz))
-    if source.name in CATALOGUE:
-        return float(CATALOGUE[source.name].kelvin_steradian(frequency_mhz))
-    raise InputError(
-        f"the source '{source.name}' is not in the catalogue, so that its flux is not known; give "
-        "flux_jy, the mean of its prior"
-    )
-
-
-def block_of_times(section: SourceSection, observation: Observation) -> Int[np.ndarray, " times"]:
-    """Which of a source's amplitudes belongs to each time."""
-    if section.block_h is None:
-        return np.zeros(observation.n_times, dtype=int)
-    _, block = np.unique(np.floor(observation.hours / section.block_h), return_inverse=True)
-    return block

@@ -2,8 +2,7 @@
 
 Sky and prior have one section for each kind, selected by ``model``. A new kind is a class here,
 with its :class:`SkySource` or :class:`Prior`, and its name in ``SKY_SECTIONS`` or
-``PRIOR_SECTIONS``. Point sources that are not part of the map, and the prior on skies of several
-frequencies, have sections of their own.
+``PRIOR_SECTIONS``. The prior on skies of several frequencies has a section of its own.
 """
 
 from __future__ import annotations
@@ -13,12 +12,11 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from lusee_bayes.experiment.section import (
+from lusee_bayes.core.section import (
     Megahertz,
     Positive,
     Section,
     Seed,
-    Treatment,
     kinds_of,
     one_of,
     requires,
@@ -34,6 +32,7 @@ from lusee_bayes.sky.prior import HarmonicPrior, Prior, read_mean, read_spectrum
 from lusee_bayes.sky.sky_source import FileSource, GalaxySource, Sky, SkySource
 from lusee_bayes.sky.spectral_prior import SpectralPrior, check_components, require_names
 from lusee_bayes.sky.template import EmbeddedTemplate
+from lusee_bayes.systematics.prior_spectrum import SpectrumSection
 
 
 class GalaxySection(Section):
@@ -104,65 +103,6 @@ def _kind_of_sky(value: Any) -> Any:
 SkySection = one_of(SKY_SECTIONS, _kind_of_sky)
 
 
-class SourceSection(Section):
-    """A point source, apart from the map: one of the catalogue, a body of the solar system, or own.
-
-    Attributes
-    ----------
-    name : str
-        Of the catalogue (Cas A, ...), of a body (Sun, Jupiter, ...), or any other with a position.
-    flux_jy : float
-        Mean of the prior on its flux density; by default the catalogue's.
-    relative_std : float
-        Standard deviation of that prior over its mean.
-    ra_deg : float
-        Right ascension of an own source (ICRS).
-    dec_deg : float
-        Declination of an own source (ICRS).
-    stokes_v : float
-        Circularly polarised fraction V / I, positive if right-handed (IAU).
-    block_h : float
-        Length of blocks of time that have independent amplitudes; by default one for all times.
-    """
-
-    name: str
-    flux_jy: Positive | None = None
-    relative_std: Positive = 0.5
-    ra_deg: Annotated[float, Field(ge=-360, le=360)] | None = None
-    dec_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
-    stokes_v: Annotated[float, Field(ge=-1, le=1)] = 0.0
-    block_h: Positive | None = None
-
-    _both_coordinates = requires(
-        lambda section: (section.ra_deg is None) == (section.dec_deg is None),
-        "give both ra_deg and dec_deg, or none",
-    )
-
-
-class SourcesSection(Section):
-    """Point sources that are not part of the map: in N, sampled, or ignored.
-
-    Attributes
-    ----------
-    list : tuple of SourceSection
-        The sources.
-    treatment : {"marginalised", "sampled", "ignored"}
-        Their covariance is added to N, their fluxes are sampled with the map, or they are left out
-        of the model.
-    """
-
-    list: tuple[SourceSection, ...] = ()
-    treatment: Treatment = "marginalised"
-
-    @model_validator(mode="after")
-    def _names_differ(self) -> SourcesSection:
-        names = [source.name for source in self.list]
-        if len(set(names)) < len(names):
-            twice = next(name for name in names if names.count(name) > 1)
-            raise ValueError(f"the source '{twice}' is there twice")
-        return self
-
-
 # where C_ell comes from
 LEARNED = "learned from these data"
 # what is expected of A and of the tilt where they are sampled: as of relative deviations
@@ -170,7 +110,7 @@ AMPLITUDE, TILT = 0.04, -2.5
 LOG_AMPLITUDE_STD, TILT_STD = 1.0, 0.5
 
 
-class IsotropicPriorSection(Section):
+class IsotropicPriorSection(SpectrumSection):
     """Independent coefficients: C_ell learned from the data, the sky's own, or a file's; mean 0.
 
     ``sky`` takes C_ell of the scenario's sky, which simulations know and observers do not: the
@@ -193,14 +133,6 @@ class IsotropicPriorSection(Section):
     spectral_index : float
         Scales them from ``file_frequency_mhz`` to the scenario's frequency: the mean once, C_ell
         twice.
-    log_amplitude_std : float
-        Prior standard deviation of ln A; A is sampled if it is given.
-    tilt_std : float
-        Prior standard deviation of the tilt, which is sampled if it is given.
-    band_edges : tuple of int
-        First ell of each band but the lowest; amplitudes of the bands are sampled if it is given.
-    log_band_std : float
-        Prior standard deviation of ln of each band's amplitude.
     """
 
     model: Literal["isotropic"] = "isotropic"
@@ -210,10 +142,6 @@ class IsotropicPriorSection(Section):
     mean_file: str | None = None
     file_frequency_mhz: Megahertz | None = None
     spectral_index: Annotated[float, Field(ge=-20, le=20)] = -2.5
-    log_amplitude_std: Positive | None = None
-    tilt_std: Positive | None = None
-    band_edges: tuple[Annotated[int, Field(ge=1)], ...] = ()
-    log_band_std: Positive = 1.0
 
     @model_validator(mode="before")
     @classmethod
@@ -224,12 +152,6 @@ class IsotropicPriorSection(Section):
         known = any(value.get(name) for name in acting)
         return {**value, "spectrum": "sky" if known else "learned"}
 
-    _one_parameterisation = requires(
-        lambda section: (
-            not (section.band_edges and (section.log_amplitude_std or section.tilt_std))
-        ),
-        "give either band_edges or log_amplitude_std and tilt_std",
-    )
     _known_where_it_is_changed = requires(
         lambda section: (
             not section.is_learned
@@ -237,10 +159,6 @@ class IsotropicPriorSection(Section):
         ),
         "a learned C_ell has no scale, no mean_file and nothing to sample; give spectrum=sky or a "
         "spectrum_file with them",
-    )
-    _bands_grow = requires(
-        lambda section: list(section.band_edges) == sorted(set(section.band_edges)),
-        "band_edges must grow from one to the next",
     )
 
     @property
@@ -279,12 +197,6 @@ class IsotropicPriorSection(Section):
     def has_files(self) -> bool:
         """Whether the prior is read from files, which are of one frequency."""
         return self.spectrum_file is not None or self.mean_file is not None
-
-    @property
-    def samples(self) -> bool:
-        """Whether something of the prior is to be sampled."""
-        known = self.log_amplitude_std is None and self.tilt_std is None
-        return not known or bool(self.band_edges)
 
 
 class LocalScalesPriorSection(Section):

@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
+from scipy.linalg import block_diag
 
 from lusee_bayes.core.arrays import Modes, ModesMatrix, on_host
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.instrument_terms import offsets_about, second_order
-from lusee_bayes.experiment.model import radiometer, true_values
+from lusee_bayes.experiment.model import base_model, radiometer, true_values
 from lusee_bayes.experiment.rounds import Inference, offset_posterior
 from lusee_bayes.instrument.pointing import offset_names
 from lusee_bayes.judge.measures import preferences
@@ -35,9 +35,10 @@ from lusee_bayes.linear.amplitudes import (
     template_amplitudes,
 )
 from lusee_bayes.sky.galaxy import kelvin_steradian
-from lusee_bayes.systematics.gain_table import GainTable
-from lusee_bayes.systematics.sky_unknowns import PointSources
-from lusee_bayes.systematics.systematic import LinearUnknowns
+from lusee_bayes.systematics.gain_table import COMMON_GAIN
+from lusee_bayes.systematics.pointing_offsets import PointingOffsets, shifted
+from lusee_bayes.systematics.sources import PointSources
+from lusee_bayes.systematics.systematic import Expanded
 
 # a null direction is worth a sentence where it keeps more than that of the prior's variance, and a
 # part of it a word where its weight is that large
@@ -98,8 +99,8 @@ class NullDirection:
 
 # of a table of unknowns, in their order in a report; "true" stands behind them where it is known
 UNKNOWN_COLUMNS = ("unknown", "unit", "value", "std", "prior", "prior_std")
-# what these are called beside receivers and ground
-SKY, GAIN = "uniform sky", "common gain"
+# what the sky's monopole is called beside them
+SKY = "uniform sky"
 # an unknown that keeps more of its prior's standard deviation is not told by the data
 UNTOLD = 0.9
 
@@ -213,10 +214,10 @@ class Unknowns:
         reference : (modes,) array
             A sky near its posterior mean, in K.
         """
-        listed = [s for s in found.systematics if isinstance(s, (LinearUnknowns, GainTable))]
+        listed = [s for s in found.expanded if not s.systematic.has_table]
         if not listed:
             return None
-        columns = np.concatenate([np.asarray(s.columns) for s in listed], axis=1)
+        columns = np.concatenate([s.columns for s in listed], axis=1)
         amplitudes = amplitudes_of_sky(found.model, reference, experiment.data.data, columns)
         names, parts = _like_the_sky(listed)
         sky_std = float(np.sqrt(np.asarray(found.model.prior.variance())[0]))
@@ -240,8 +241,8 @@ class Unknowns:
         rows = rows.assign(value=values, std=rows["prior_std"] * told.std)
         null = None if joint else self._null_direction(told, float(covariance[0, 0]))
         common = None
-        if GAIN in self.names:
-            gain = self.parts[self.names.index(GAIN)]
+        if COMMON_GAIN in self.names:
+            gain = self.parts[self.names.index(COMMON_GAIN)]
             common = float(np.sqrt(gain @ told.covariance @ gain))
         columns = [*UNKNOWN_COLUMNS, *(["true"] if "true" in rows else [])]
         return UnknownsReport(rows[columns], null, common)
@@ -275,23 +276,20 @@ def unknowns_report(experiment: Experiment, found: Inference) -> UnknownsReport 
     return unknowns.report(np.asarray(posterior.mean), np.asarray(posterior.covariance()))
 
 
-def _rows(
-    experiment: Experiment, listed: list[LinearUnknowns | GainTable]
-) -> tuple[dict[str, Any], ...]:
+def _rows(experiment: Experiment, listed: list[Expanded]) -> tuple[dict[str, Any], ...]:
     """Those of :class:`Unknowns`."""
     # of spectra, the sky behind them may be known, but not what the scenario would have drawn
     simulated = experiment.data.truth is not None and experiment.data.calibration is None
     truth = true_values(experiment.setup) if simulated else None
     rows = []
-    for systematic in listed:
-        stds = np.asarray(systematic.stds)
-        expected = systematic.in_units(np.asarray(systematic.expected))
-        prior = systematic.in_units(0.0 * stds)
-        true = None if truth is None else systematic.true(truth)
-        for name, std in zip(expected, stds.tolist(), strict=True):
+    for expanded in listed:
+        own = expanded.systematic
+        expected, prior = own.in_units(expanded.expected), own.in_units(0.0 * own.stds)
+        true = None if truth is None else own.true(truth)
+        for name, std in zip(own.names, own.stds.tolist(), strict=True):
             row = {
                 "unknown": name,
-                "unit": systematic.unit,
+                "unit": own.unit,
                 "expected": expected[name],
                 "prior": prior[name],
                 "prior_std": std,
@@ -301,18 +299,11 @@ def _rows(
 
 
 def _like_the_sky(
-    listed: list[LinearUnknowns | GainTable],
+    listed: list[Expanded],
 ) -> tuple[tuple[str, ...], Float[np.ndarray, "parts n"]]:
     """Names and unit vectors of what may look like a uniform sky."""
-    names, weights, at = [], [], 0
-    every = np.eye(sum(len(systematic.names) for systematic in listed))
-    for systematic in listed:
-        own = every[at : at + len(systematic.names)]
-        table = isinstance(systematic, GainTable)
-        names += [GAIN] if table else systematic.labels
-        weights.append(systematic.common[None] @ own if table else own)
-        at += len(own)
-    return tuple(names), np.concatenate(weights)
+    found = [expanded.systematic.like_the_sky() for expanded in listed]
+    return tuple(name for names, _ in found for name in names), block_diag(*(p for _, p in found))
 
 
 # offsets that are tested whatever the scenario says, and how far apart the two sides of their
@@ -379,17 +370,19 @@ def pointing_report(
 
 def _table(experiment: Experiment, found: Inference, sky: Modes) -> pd.DataFrame:
     mean, covariance = offset_posterior(found)
-    std = dict(zip(mean, np.sqrt(np.diagonal(covariance)).tolist(), strict=True))
-    prior = found.offsets.in_units(np.ones(len(mean)))
+    std, prior = np.sqrt(np.diagonal(covariance)), found.offsets.systematic.stds
     # where values and sky are those that the data tell, only what is left of the offsets counts
-    about = prior if found.around.sky is None else std
+    about = np.ones(len(prior)) if found.around.sky is None else std / prior
     noise = np.sqrt(np.asarray(radiometer(experiment.setup).diagonal()))
-    left = second_order(experiment.setup, about, sky)
-    truth = true_values(experiment.setup) if experiment.data.truth is not None else {}
-    beyond = {name: float(np.sqrt(np.mean((left[name] / noise) ** 2))) for name in mean}
-    columns = {"value": mean, "std": std, "prior_std": prior, "beyond_first_order": beyond}
-    columns |= {"true": {name: truth[name] for name in mean}} if truth else {}
-    return pd.DataFrame(columns, index=list(mean)).rename_axis("offset").reset_index()
+    model = on_host(base_model(experiment.setup))
+    left = found.offsets.systematic.beyond_first_order(model, sky, about)
+    beyond = [float(np.sqrt(np.mean((left[name] / noise) ** 2))) for name in mean]
+    parts = {"value": mean.values(), "std": std, "prior_std": prior, "beyond_first_order": beyond}
+    table = pd.DataFrame({"offset": list(mean), **parts})
+    if experiment.data.truth is None:
+        return table
+    truth = true_values(experiment.setup)
+    return table.assign(true=[truth[name] for name in mean])
 
 
 def _preferred(
@@ -403,8 +396,10 @@ def _preferred(
     n_runs = setup.observation.n_runs
     steps = {name: step for kind, step in TESTED.items() for name in offset_names((kind,), n_runs)}
     centre = dict.fromkeys(steps, 0.0) | values
-    offsets = offsets_about(setup, steps, sky, centre)
-    per_unit = offsets.templates / np.asarray(offsets.stds)
+    there = shifted(setup, centre)
+    offsets = PointingOffsets.of(there, steps, centre)
+    about = Expanded.about(offsets, on_host(base_model(setup)), sky, centre)
+    per_unit = np.asarray(about.columns) / offsets.stds
     day = setup.observation.day
     length = -(-(int(day.max()) + 1) // MOST_STRETCHES)
     stretches = np.unique(day // length)
@@ -443,21 +438,17 @@ def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
         its flux is known from the prior only.
     """
     setup, data = experiment.setup, experiment.data
-    sources = next(s for s in inference.systematics if isinstance(s, PointSources))
-    amplitudes = template_amplitudes(
-        inference.model, inference.posterior, data.data, sources.templates()
-    )
-    prior_std = np.asarray(sources.std())
-    mean = np.asarray(sources.mean()) + prior_std * amplitudes.mean
-    std = prior_std * amplitudes.std
+    held = next(s for s in inference.expanded if isinstance(s.systematic, PointSources))
+    own, found = held.systematic, (inference.model, inference.posterior, data.data)
+    amplitudes = template_amplitudes(*found, held.columns)
+    mean, std = own.means + own.stds * amplitudes.mean, own.stds * amplitudes.std
     jansky = 1.0 / kelvin_steradian(1.0, experiment.scenario.frequency_mhz)
-    truth = true_values(setup) if data.truth is not None else {}
-    listed = [(s, block) for s in sources.sources for block in range(s.n_blocks)]
+    listed = [(s, block) for s in own.sources for block in range(s.n_blocks)]
     table = pd.DataFrame(
         {
             "source": [source.name for source, _ in listed],
             "block": [block for _, block in listed],
-            "above_horizon": [bool(up) for s in sources.sources for up in s.seen()],
+            "above_horizon": [bool(up) for s in own.sources for up in s.seen()],
             "flux_jy": mean * jansky,
             "std_jy": std * jansky,
             "flux_k_sr": mean,
@@ -468,8 +459,8 @@ def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
     )
     if data.truth is None:
         return table
-    true = [np.broadcast_to(truth.get(s.site, np.nan), s.n_blocks) for s in sources.sources]
-    return table.assign(true_jy=np.concatenate(true) * jansky)
+    true = own.true(true_values(setup))
+    return table.assign(true_jy=np.array(list(true.values())) * jansky)
 
 
 def flux_lines(fluxes: pd.DataFrame) -> list[str]:

@@ -400,6 +400,8 @@ def _one_run_an_angle(observation: Observation) -> Observation:
 HINT = "make it with: lusee-bayes reduce SCENARIO SESSION..."
 CURVE_DIMS = ("level_3", "port", "curve")
 BAND_DIMS, GAIN_DIMS = ("frequency", "product", "bin"), ("frequency", "port", "bin")
+# what a run calls its file of them
+REDUCED = "reduced.nc"
 LAYOUT = Layout(
     "reduced spectra",
     {

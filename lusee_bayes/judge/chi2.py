@@ -39,8 +39,6 @@ from lusee_bayes.core.lazy import special
 
 Level = Literal["consistent", "unlike the prior", "does not fit"]
 LEVELS: tuple[Level, ...] = ("consistent", "unlike the prior", "does not fit")
-# kinds of groups of data, as in files and in sentences
-KINDS = {"product": "product", "day": "day", "angle": "turntable angle"}
 # of a report of data that fit: a mission makes some hundred of them
 FALSE_ALARM = 1e-3
 # groups or channels that are named in a sentence

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -16,15 +15,15 @@ CRITERIA = (
 )
 
 
-def warnings_of(table: Mapping[str, np.ndarray], sampling: Mapping[str, Any]) -> list[str]:
+def warnings_of(table: Mapping[str, np.ndarray], *, chains: int, divergences: int) -> list[str]:
     """Why draws are not to be trusted yet, and what to do; empty if there is no reason.
 
     Parameters
     ----------
     table : mapping
         Columns of summary.csv: quantity, r_hat, ess_bulk, ess_tail.
-    sampling : mapping
-        sampling.json.
+    chains, divergences : int
+        Of the run.
     """
     found = []
     names, r_hat = table["quantity"], np.nan_to_num(table["r_hat"], nan=-np.inf, posinf=np.inf)
@@ -35,7 +34,7 @@ def warnings_of(table: Mapping[str, np.ndarray], sampling: Mapping[str, Any]) ->
             f"Not converged: R-hat is above {AGREE:g} for {above} of {len(names)} quantities, most "
             f"for {names[furthest]} ({r_hat[furthest]:.3f}). Raise --draws."
         )
-    least = PER_CHAIN * sampling["chains"]
+    least = PER_CHAIN * chains
     for column, what in (("ess_bulk", "bulk"), ("ess_tail", "tail")):
         if column not in table:
             continue
@@ -47,9 +46,9 @@ def warnings_of(table: Mapping[str, np.ndarray], sampling: Mapping[str, Any]) ->
                 f"The {what} effective size is below {least} for {few} of {len(names)} quantities, "
                 f"least for {names[worst]} ({size[worst]:.0f}): raise --draws."
             )
-    if sampling["divergences"]:
+    if divergences:
         found.append(
-            f"{sampling['divergences']} trajectories diverged: the steps are too long where the "
+            f"{divergences} trajectories diverged: the steps are too long where the "
             "posterior is narrow. Raise --warmup; if that does not help, write the program in "
             "coordinates in which its posterior is wide."
         )

@@ -116,6 +116,9 @@ class Missed(NamedTuple):
 NOT_TOLD = (np.nan, np.nan, np.nan)
 
 
+KINDS = ("product", "day", "turntable angle")
+
+
 class DataGroup(NamedTuple):
     """Data that are left out together.
 
@@ -152,7 +155,7 @@ def groups_of(data: Visibilities) -> list[DataGroup]:
     product = np.arange(len(present))[:, None]
     found = [("product", label, product == k) for k, label in enumerate(data.labels)]
     found += [("day", f"{k}", (day == k)[None]) for k in np.unique(day)]
-    found += [("angle", f"{x:g}", (angle == x)[None]) for x in np.unique(angle)]
+    found += [("turntable angle", f"{x:g}", (angle == x)[None]) for x in np.unique(angle)]
     groups = [DataGroup(*one, np.broadcast_to(flags, present.shape)) for *one, flags in found]
     return [group for group in groups if (group.data & present).any()]
 

@@ -22,8 +22,8 @@ import numpy as np
 
 from lusee_bayes.core.arrays import DataVector, on_host
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.judge.chi2 import KINDS, ChiSquare, Fit, Level, in_brief, probability, stands_out
-from lusee_bayes.judge.left_out import DataGroup, LeftOut, Missed, groups_of
+from lusee_bayes.judge.chi2 import ChiSquare, Fit, Level, in_brief, probability, stands_out
+from lusee_bayes.judge.left_out import KINDS, DataGroup, LeftOut, Missed, groups_of
 from lusee_bayes.judge.split import Split, with_sky
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
@@ -69,7 +69,7 @@ class Group:
     others_p: float
 
     def __str__(self) -> str:
-        return f"{KINDS[self.kind]} {self.name}"
+        return f"{self.kind} {self.name}"
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class Residuals:
             return []
         looked_at = self.extremes() or self.compared()
         found = [one for one in looked_at if not stands_out(one.others_p, self.n_tests)]
-        return sorted(found, key=lambda group: (list(KINDS).index(group.kind), group.p))
+        return sorted(found, key=lambda group: (KINDS.index(group.kind), group.p))
 
     def fit(self, strengths: str = "") -> Fit:
         """Judge whether the data fit, and say what to do if not.
@@ -169,14 +169,14 @@ class Residuals:
         if suspects and extremes:
             named = in_brief([f"{group} (p {probability(group.p)})" for group in extremes])
             parts.append(f"Of {len(self.compared())} groups these stand out: {named}.")
-        for kind, word in KINDS.items():
+        for kind in KINDS:
             mine = [group for group in suspects if group.kind == kind]
             if len(mine) == 1:
                 p = probability(mine[0].others_p)
                 parts.append(f"The others fit without {mine[0]} (p {p}): leave it out.")
             elif mine:
                 parts.append(
-                    f"The others fit without any one of {len(mine)} {word}s "
+                    f"The others fit without any one of {len(mine)} {kind}s "
                     f"({in_brief([group.name for group in mine])}): the data do not tell which."
                 )
         if not suspects:

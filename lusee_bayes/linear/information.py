@@ -75,6 +75,7 @@ class Information(Described, eqx.Module):
         noise: Covariance,
         offset: DataVector | None,
         data: DataVector,
+        known: Information | None = None,
     ) -> tuple[Information, Posterior]:
         """Compute the information of data, and the posterior under a prior.
 
@@ -92,6 +93,8 @@ class Information(Described, eqx.Module):
             Mean of the data without a sky, in K; None for zero.
         data : (data,) array
             d, in K.
+        known : Information, optional
+            Of the same data under the same A and N, with any reference sky.
 
         Returns
         -------
@@ -112,21 +115,25 @@ class Information(Described, eqx.Module):
                 (coupling, prior, noise, offset, data)
             )
         factor = noise.factor()
-        if has_structure(coupling, noise):
-            matrix = normal_matrix(coupling, noise)
-        else:
+        structured = has_structure(coupling, noise)
+        if not structured:
             coupling = DenseCoupling(coupling.dense())
-            matrix = gram_matrix(factor.whiten(coupling.dense()))
-        xp = namespace(matrix)
+        xp = namespace((coupling, noise, data))
         centred = xp.asarray(data) if offset is None else data - offset
-        zero, n_data = xp.zeros(prior.size), xp.asarray(float(noise.size))
-        vector, misfit = gradient_and_misfit(coupling, factor, centred, zero)
-        first = cls(matrix, vector, zero, misfit, xp.asarray(factor.log_det()), n_data)
-        _require_modes(prior, len(zero))
-        lower = _precision_root(matrix, prior)
+        first = known
+        if first is None:
+            if structured:
+                matrix = normal_matrix(coupling, noise)
+            else:
+                matrix = gram_matrix(factor.whiten(coupling.dense()))
+            zero, n_data = xp.zeros(prior.size), xp.asarray(float(noise.size))
+            vector, misfit = gradient_and_misfit(coupling, factor, centred, zero)
+            first = cls(matrix, vector, zero, misfit, xp.asarray(factor.log_det()), n_data)
+        _require_modes(prior, first.n_modes)
+        lower = _precision_root(first.matrix, prior)
         mean = prior.colour(_condition(first, prior, lower, 1)[0])
         vector, misfit = gradient_and_misfit(coupling, factor, centred, mean)
-        information = cls(matrix, vector, mean, misfit, first.log_det, n_data)
+        information = replace(first, vector=vector, reference=mean, misfit=misfit)
         return information, information._posterior(prior, lower)
 
     def description(self) -> tuple[str, ...]:
@@ -164,6 +171,31 @@ class Information(Described, eqx.Module):
         misfit = self.misfit - 2.0 * (self.vector @ shift) + shift @ pulled
         misfit = namespace(misfit).asarray(misfit)
         return replace(self, vector=self.vector - pulled, reference=sky, misfit=misfit)
+
+    def __add__(self, other: Information) -> Information:
+        """The information of the data of both, whose noise is independent.
+
+        Parameters
+        ----------
+        other : Information
+            Of other data, for the same modes.
+
+        Raises
+        ------
+        InputError
+            If it is for another number of modes.
+        """
+        require_shape("the other reference sky", other.reference, (self.n_modes,))
+        here, xp = other.recentred(self.reference), namespace(self.matrix)
+        return Information(
+            self.matrix + here.matrix,
+            self.vector + here.vector,
+            self.reference,
+            *(
+                xp.asarray(getattr(self, name) + getattr(here, name))
+                for name in ("misfit", "log_det", "n_data")
+            ),
+        )
 
     def raised(self, factor: float) -> Information:
         """The information of the same data under N times a factor.
@@ -203,6 +235,38 @@ class Information(Described, eqx.Module):
             If ``sky`` has another length.
         """
         return self.recentred(sky).misfit
+
+    def fit(self, mean: Modes, covariance: ModesMatrix) -> dict[str, float]:
+        """Compute chi^2 of the residuals about a mean, and its expectation if the model holds.
+
+        Parameters
+        ----------
+        mean, covariance : (modes,) and (modes, modes) array
+            Of the posterior, which may be given other data, too, in K and K^2.
+
+        Returns
+        -------
+        dict of float
+            ``chi2``, and ``chi2_expected``: N_data - tr(M C).
+        """
+        expected = float(self.n_data - np.vdot(self.matrix, covariance))
+        return {"chi2": float(self.chi2(mean)), "chi2_expected": expected}
+
+    def log_likelihood(self, skies: Float[Array, "n modes"]) -> Float[np.ndarray, " n"]:
+        """Compute ln p(d | m) of some skies.
+
+        Parameters
+        ----------
+        skies : (n, modes) array
+            m, in K.
+
+        Returns
+        -------
+        (n,) array
+            For data in K.
+        """
+        rest = float(self.log_det + self.n_data * np.log(2.0 * np.pi))
+        return np.array([-0.5 * (float(self.chi2(sky)) + rest) for sky in skies])
 
     def posterior(self, prior: Prior) -> Posterior:
         """Compute the posterior over the sky.

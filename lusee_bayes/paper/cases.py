@@ -11,19 +11,17 @@ import numpy as np
 import xarray as xr
 
 from lusee_bayes.core import formats
-from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.formats import says
 from lusee_bayes.core.reading import require_file
 from lusee_bayes.core.version import __version__, versions
-from lusee_bayes.experiment.experiment import build, infer
-from lusee_bayes.experiment.instrument_terms import beam_rms_difference
+from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.sky_sections import FileSkySection
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, stokes_beam
 from lusee_bayes.paper.claims import FREQUENCIES, Cases, cross, frequency_case
-from lusee_bayes.results.channel import channel_of_posterior
+from lusee_bayes.results.channel_map import conditioned
 
 # by name: a scenario of the package and what differs from it; those after the frequencies are not
 # among the paper's figures, but its text speaks of them or they tell why a claim does not hold
@@ -110,14 +108,14 @@ def compute_case(scenario: Scenario) -> xr.Dataset:
         phi; temperatures in K. Attributes: the scenario, the versions and what is one number.
     """
     experiment = build(scenario)
-    setup, data, inference = experiment.setup, experiment.data, infer(experiment)
-    channel = channel_of_posterior(experiment, inference, on_host(inference.posterior).covariance())
+    setup, data, made = experiment.setup, experiment.data, conditioned(experiment)
+    channel = made.result(made.known(alone=False))
     spectra, maps = channel.spectra(), channel.maps()
     variances = data.layout.scatter(radiometer(setup).diagonal())
     grid = HemisphereGrid.gauss_legendre(*BEAM_NODES)
     fields = setup.beam_source.fields(scenario.frequency_mhz, grid)
     beams = np.abs(stokes_beam(fields))
-    rms = beam_rms_difference(setup)
+    rms = channel.beam_rms_difference
     return xr.Dataset(
         {
             **{name: ("ell", spectra[name]) for name in ("rho", "snr", "cl_mean", "cl_truth")},

@@ -76,7 +76,7 @@ def beam_panels(cases: Cases) -> Figure:
         beam = cases[frequency_case(frequency)]["beam"]
         grid = HemisphereGrid.gauss_legendre(beam.sizes["theta"], beam.sizes["phi"])
         for row, name in enumerate(beam["pattern"].values):
-            image = orthographic(panels[row, column], grid, beam.values[row].astype(complex))
+            image = orthographic(panels[row, column], grid, np.abs(beam.values[row]))
             panels[0, column].set_title(f"{frequency} MHz")
             panels[row, 0].set_ylabel(str(name))
     figure.colorbar(image, ax=panels, label="beam / its peak", shrink=0.6)

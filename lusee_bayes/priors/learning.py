@@ -393,7 +393,7 @@ ATTEMPTS = 5
 
 
 def draws_with_parameters(
-    family: PriorFamily, learned: Learned, posterior: Posterior, key: PRNGKeyArray, n: int
+    family: PriorFamily, learned: Learned, information: Information, key: PRNGKeyArray, n: int
 ) -> Draws:
     """Draw skies; neighbouring ones have different parameters.
 
@@ -402,8 +402,8 @@ def draws_with_parameters(
     family : PriorFamily
     learned : Learned
         Its parameters, and how uncertain they are.
-    posterior : Posterior
-        Of the same data under the learned prior.
+    information : Information
+        Of the same data.
     key : PRNG key
     n : int
 
@@ -417,10 +417,10 @@ def draws_with_parameters(
     InputError
         If S is not positive definite for five theta in a row.
     """
-    drawn = np.empty((n, posterior.prior.size))
+    drawn = np.empty((n, information.n_modes))
     if not n:
         return drawn
-    information = information_behind(on_host(posterior))
+    information = on_host(information)
     root = np.linalg.cholesky(learned.covariance)
     sets = min(n, max(LEAST, -(-n // SHARED)))
 
@@ -431,38 +431,6 @@ def draws_with_parameters(
 
     in_threads(some, range(sets))
     return drawn
-
-
-def information_behind(posterior: Posterior) -> Information:
-    """What the data said, from the posterior that they gave.
-
-    Parameters
-    ----------
-    posterior : Posterior
-        Over modes of which each is uncertain under the prior; in NumPy's arrays.
-
-    Returns
-    -------
-    Information
-        About the posterior mean; chi^2, ln|N| and the number of data are not known: NaN.
-    """
-    prior, lower = posterior.prior, np.tril(posterior.lower)
-    known = lower @ lower.T - np.eye(len(lower))
-    if posterior.basis is not None:
-        known = posterior.basis @ known @ posterior.basis.T
-    matrix = prior.whiten_columns(prior.whiten_columns(known).T)
-    expected = prior.white_mean
-    away = posterior.white_mean if expected is None else posterior.white_mean - expected
-    unknown = np.asarray(np.nan)
-    return Information(
-        0.5 * (matrix + matrix.T),
-        # at the mean, data and prior pull the same
-        prior.whiten_columns(away[None])[0],
-        np.asarray(posterior.mean),
-        unknown,
-        unknown,
-        unknown,
-    )
 
 
 def _under_drawn_parameters(

@@ -15,7 +15,6 @@ from lusee_bayes.core.reading import require_file
 OWN_FORMATS = {
     formats.VISIBILITIES: "describe_data:describe_visibilities",
     formats.POSTERIOR: "describe_results:describe_posterior",
-    formats.POSTERIOR_CUBE: "describe_results:describe_posterior_cube",
     formats.BEAMS: "describe_data:describe_sampled_beams",
     formats.DIAGNOSTICS: "describe_results:describe_diagnostics",
     formats.SAMPLES: "describe_runs:describe_samples",

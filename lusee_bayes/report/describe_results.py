@@ -1,63 +1,81 @@
-"""What info says of results (diagnostics, posteriors, samples) and of runs' folders, as lines."""
+"""What info says of results (diagnostics, posteriors), as lines; it needs few libraries."""
 
 from __future__ import annotations
 
+import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from lusee_bayes.core import formats
-from lusee_bayes.core.formats import read_netcdf
-from lusee_bayes.results.diagnostics_file import read_diagnostics
-from lusee_bayes.results.saved import CUBE, POSTERIOR
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.formats import opened_tree
+from lusee_bayes.core.trees import from_tree
+
+# a uniform sky of 1 K
+MONOPOLE = np.sqrt(4.0 * np.pi)
+HOLDS = ("posterior", "log_likelihood", "observed_data", "constant_data", "information")
 
 
 def describe_diagnostics(path: Path) -> list[str]:
     """The diagnostics of a map."""
-    found = read_diagnostics(path)
-    kinds = found["group_kind"].values
-    counts = [f"{int((kinds == kind).sum())} {kind}s" for kind in ("product", "day", "angle")]
-    return [
-        f"diagnostics of a map at {found.attrs['frequency_mhz']:g} MHz",
-        found.attrs["verdict"],
-        f"residuals by {', '.join(counts)}; {found.sizes['draw']} draws, "
-        f"resolution of {found.sizes['mode']} modes",
-    ]
+    lines = []
+    with opened_tree(path, formats.DIAGNOSTICS, "diagnostics of lusee-bayes map") as tree:
+        for frequency, channel in sorted(tree.children.items(), key=lambda one: float(one[0])):
+            lines.append(f"diagnostics of a map at {frequency} MHz")
+            judged = channel.children.get("judged")
+            if judged is None:
+                lines.append("the data fit as a whole and were not judged group by group")
+                continue
+            counts = [
+                f"{judged[kind].sizes.get(f'{kind}_row', 0)} {kind}"
+                for kind in ("products", "days", "angles")
+            ]
+            lines += [str(judged.attrs["verdict"]), f"residuals by {', '.join(counts)}"]
+    return lines
+
+
+@dataclass(frozen=True)
+class _Skies:
+    """What is said of a posterior: skies in K, where they are, and where they come from."""
+
+    frequency: Float[np.ndarray, " frequency"]
+    mean: Float[np.ndarray, "frequency mode"]
+    std: Float[np.ndarray, "frequency mode"]
+    prior_std: Float[np.ndarray, "frequency mode"]
+    lmax: int
+    frame: str
+    versions: dict[str, str]
+    unmapped: str = ""
 
 
 def describe_posterior(path: Path) -> list[str]:
-    """A posterior at one frequency."""
-    found = read_netcdf(path, formats.POSTERIOR, POSTERIOR)
-    mean, std, attrs = found.arrays["mean"], found.arrays["std"], found.values
-    extra = [name for name in ("truth", "draws", "covariance") if name in found.there]
-    draws = found.sizes.get("draw", 0)
-    constrained = int((std < 0.5 * found.arrays["prior_std"]).sum())
-    return [
-        f"posterior over {mean.size} modes (lmax {attrs['lmax']}) at "
-        f"{float(attrs['frequency_mhz']):g} MHz, {attrs['frame']}",
-        f"mean temperature {mean[0] / np.sqrt(4 * np.pi):.6g} K +- "
-        f"{std[0] / np.sqrt(4 * np.pi):.3g} K",
-        f"{constrained} modes known to better than half their prior width",
-        f"also holds: {', '.join(extra) or 'nothing else'}"
-        + (f" ({draws} draws)" if draws else ""),
-        f"versions: {attrs['versions']}",
+    """A posterior at one frequency or at several."""
+    with opened_tree(path, formats.POSTERIOR, "a posterior of lusee-bayes map") as tree:
+        found = from_tree(_Skies, tree, str(path))
+        held = [name for name in ("truth", "covariance", "independent_mean") if name in tree]
+        held += [name for name in HOLDS if name in tree.children]
+        joint = "component_mean" in tree
+    if not found.mean.size:
+        raise InputError(f"{path} holds no sky; make that map again")
+    frequencies, (n, n_modes) = found.frequency, found.mean.shape
+    at = f"{frequencies[0]:g} MHz"
+    if n > 1:
+        kind = "one posterior for all" if joint else "each on its own"
+        at = f"{n} frequencies from {frequencies[0]:g} to {frequencies[-1]:g} MHz, {kind}"
+    temperature = [
+        f"{m:.6g} K +- {s:.3g} K"
+        for m, s in zip(found.mean[:, 0] / MONOPOLE, found.std[:, 0] / MONOPOLE, strict=True)
     ]
-
-
-def describe_posterior_cube(path: Path) -> list[str]:
-    """Posteriors at several frequencies."""
-    found = read_netcdf(path, formats.POSTERIOR_CUBE, CUBE)
-    frequencies, attrs = found.arrays["frequency"], found.values
-    temperature = found.arrays["mean"][:, 0] / np.sqrt(4 * np.pi)
-    joint, modes = "component_mean" in found.there, found.sizes["mode"]
-    extra = [name for name in ("truth", "draws", "independent_mean") if name in found.there]
-    kind = "one posterior for all" if joint else "each on its own"
+    known = (found.std < 0.5 * found.prior_std).sum(axis=1)
     return [
-        f"posterior over {modes} modes (lmax {attrs['lmax']}) at {len(frequencies)} "
-        f"frequencies from {frequencies[0]:g} to {frequencies[-1]:g} MHz, {kind}, "
-        f"{attrs['frame']}",
-        f"mean temperature {temperature[0]:.6g} K to {temperature[-1]:.6g} K",
-        *attrs.get("unmapped", "").splitlines(),
-        f"also holds: {', '.join(extra) or 'nothing else'}",
-        f"versions: {attrs['versions']}",
+        f"posterior over {n_modes} modes (lmax {found.lmax}) at {at}, {found.frame}",
+        f"mean temperature {' to '.join(dict.fromkeys((temperature[0], temperature[-1])))}",
+        f"{' to '.join(dict.fromkeys((str(known.min()), str(known.max()))))} modes known to better "
+        "than half their prior width",
+        *found.unmapped.splitlines(),
+        f"also holds: {', '.join(held) or 'nothing else'}",
+        f"versions: {json.dumps(found.versions)}",
     ]

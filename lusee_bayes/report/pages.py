@@ -8,10 +8,7 @@ from pathlib import Path
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import read_manifest, recover, replacing
-from lusee_bayes.core.layouts import Layout
-from lusee_bayes.core.reading import read_json
 from lusee_bayes.report.comparison_page import priors_page
-from lusee_bayes.report.cube_page import cube_page
 from lusee_bayes.report.map_page import map_page
 from lusee_bayes.report.sample_page import sample_page
 
@@ -19,7 +16,6 @@ REPORT = "report.html"
 # by the kind of run: the page as text, of a folder and the run's name
 PAGES: dict[str, Callable[[Path, str], str]] = {
     "map": map_page,
-    "cube": cube_page,
     "sample": sample_page,
     "validate": sample_page,
     "compare-priors": priors_page,
@@ -58,8 +54,4 @@ def _kind(folder: Path) -> str | None:
     # folders that were written before there were manifests
     if (folder / "samples.nc").is_file():
         return "sample"
-    if not (folder / "posterior.nc").is_file():
-        return None
-    summary = folder / "summary.json"
-    found = read_json(summary, Layout("the figures of a run")) if summary.is_file() else {}
-    return "cube" if "frequencies_mhz" in found else "map"
+    return "map" if (folder / "posterior.nc").is_file() else None

@@ -1,110 +1,206 @@
-"""The posterior over the sky at one frequency: what every kind of run has in common.
+"""The posterior over the sky at one frequency, and what judges it: a map is one channel or several.
 
-A map is one channel, a cube several; samples and the paper's cases stand beside one. It is made of
-an information with its covariance, or of a posterior with its model, and tells how far it is from a
-known truth, by latitude and at some multipoles.
+It tells how far it is from a known truth, by latitude and at some multipoles, and whether
+instrument, noise and prior are those of the data.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Shaped
+import pandas as pd
+from jaxtyping import Bool, Float, Int8, Shaped
 
-from lusee_bayes.core.arrays import Array, Ells, Modes, ModesMatrix, Pixels
+from lusee_bayes.core.arrays import Ells, Pixels
 from lusee_bayes.core.checks import Described, extent
-from lusee_bayes.core.harmonics import mean_over_m, modes_to_map, power_spectrum
-from lusee_bayes.experiment.draws import deviations, doubts, posterior_draws
-from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.rounds import Inference
-from lusee_bayes.experiment.unknowns import Unknowns, UnknownsReport
-from lusee_bayes.judge.chi2 import ChiSquare
-from lusee_bayes.judge.coverage import Counts, Coverage, latitudes
+from lusee_bayes.core.harmonics import modes_to_map, power_spectrum
+from lusee_bayes.core.trees import quantity
+from lusee_bayes.experiment.diagnosis import Diagnosis
+from lusee_bayes.experiment.unknowns import PointingReport, UnknownsReport
+from lusee_bayes.judge.chi2 import ChiSquare, Level
+from lusee_bayes.judge.coverage import Coverage, latitudes
 from lusee_bayes.judge.measures import (
     correlation,
+    effective_resolution_deg,
     ell_cross,
-    expected_chi2,
-    highest_altitude,
     signal_to_noise,
 )
-from lusee_bayes.judge.plausibility import about_information
+from lusee_bayes.judge.residuals import Group
 from lusee_bayes.linear.information import Information
-from lusee_bayes.linear.posterior import pixel_std
+
+# arrays that recur, of NumPy's
+SkyModes = Float[np.ndarray, " mode"]
+SkyMatrix = Float[np.ndarray, "mode mode_2"]
+OnGrid = Float[np.ndarray, "product time"]
 
 
 @dataclass(frozen=True)
-class Observed:
-    """What is known of a channel besides its posterior: for :func:`channel_of_information`.
+class Judged:
+    """The data of a channel against what all others predict, group by group.
+
+    Attributes
+    ----------
+    level, verdict : str
+        Whether they fit, in a word and in sentences.
+    prior : ChiSquare
+        What the prior does not expect.
+    extremes, suspects : tuple of str
+        Groups that stand out, and those without which the others fit.
+    predicted, z : (products, times) array
+        Of each datum, in K and in standard deviations; NaN where a sample is missing.
+    groups : tuple of Group
+        Products, days and turntable angles; none where groups are not judged.
+    """
+
+    level: Level
+    verdict: str
+    prior: ChiSquare
+    extremes: tuple[str, ...]
+    suspects: tuple[str, ...]
+    predicted: OnGrid = quantity("K", "visibilities of the mean map")
+    z: OnGrid = quantity("1", "data less their prediction by all others, in standard deviations")
+    groups: tuple[Group, ...] = ()
+
+    def of_kind(self, kind: str) -> list[Group]:
+        """The products, for example."""
+        return [group for group in self.groups if group.kind == kind]
+
+
+@dataclass(frozen=True)
+class Details:
+    """What a report shows of a single map beyond it.
+
+    Attributes
+    ----------
+    prior_fraction : (pixels,) array
+        The prior's share of each pixel's variance, the monopole taken for known.
+    region_mean, region_std, region_prior_fraction : (regions,) array
+        Of coarse HEALPix RING pixels; the first two in K.
+    resolution, resolution_step, prior_width : array
+        The resolution matrix (:func:`.packed_resolution`).
+    patterns : (patterns, nodes, azimuths) array
+        Beams over their peaks, on the nodes of ``HemisphereGrid.gauss_legendre``.
+    pattern_names : tuple of str
+    draws : (draws, modes) array
+        A few draws of the posterior, in K.
+    """
+
+    pattern_names: tuple[str, ...]
+    draws: Float[np.ndarray, "few mode"] = quantity("K", "draws of the posterior")
+    prior_fraction: Pixels = quantity("1", "share of the variance that the prior supplies")
+    region_mean: Float[np.ndarray, " region"] = quantity("K", "posterior mean of regions")
+    region_std: Float[np.ndarray, " region"] = quantity("K", "standard deviation of regions")
+    region_prior_fraction: Float[np.ndarray, " region"] = quantity("1")
+    resolution: Int8[np.ndarray, "mode mode_2"] = quantity("1", "resolution matrix, in steps")
+    resolution_step: Float[np.ndarray, "ell ell_2"] = quantity("1", "steps of the resolution")
+    prior_width: SkyModes = quantity("K", "prior standard deviation, or rms over m")
+    patterns: Float[np.ndarray, "pattern node azimuth"] = quantity("1", "beams over their peaks")
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class ChannelData:
+    """What is known of a channel besides its sky.
 
     Attributes
     ----------
     frequency_mhz : float
+    taken : dict
+        When and where its data were taken (:func:`.taken`).
+    labels : tuple of str
+        Of the products.
+    hours, turntable_deg : (times,) array
+        Time since the first sample, and the turntable's angle.
+    data : (products, times) array
+        In K; NaN where a sample is missing.
+    n_data, n_missing, rounds : int
+        Data, samples left out, and how often N was built.
+    flagged : (products, times) array or None
+        Of flight data: what did not fit and is left out.
+    flagged_share : float
+        Of the values.
     prior_std : (modes,) array
         Of the channel's own prior, in K.
     truth : (modes,) array or None
+        The sky behind simulated data, in K.
     highest_altitude : (pixels,) array
-    n_missing, rounds : int
+        sin of the highest altitude that each pixel (HEALPix RING) reached.
     instrument : ChiSquare
-        What no sky explains of the channel's own data.
+        Of the channel's own data, what no sky explains (:mod:`.chi2`).
+    prior : str
+        Where its prior comes from, in a sentence.
+    parameters : tuple of dict
+        Of the prior, where they were learned: name, value and std.
+    log_evidence_learned : float or None
+        ln p with the prior's parameters integrated out.
+    beam_rms_difference : float or None
+        Of true and modelled beams, where they differ.
     doubts : tuple of str
-    unknowns : Unknowns or None
-        Receivers, ground and gain table, where the model has them.
+        What is doubtful about measured data, a sentence each.
+    judged : Judged or None
+        Group by group; None for a channel of many that fits.
+    details : Details or None
+        Of a map of one frequency.
+    pointing : PointingReport or None
+        Of clock and pointing, where the scenario has them or the data do not fit.
+    fluxes : DataFrame or None
+        Of the point sources beside the map, a row each.
+    diagnosis : Diagnosis or None
+        The usual mistakes that would explain the data, where they were tried.
+    digests : tuple of str
+        Of all data behind the map.
+    information : Information or None
+        Of all these data, where it is kept for data to be added.
     """
 
     frequency_mhz: float
-    prior_std: Modes
-    truth: Modes | None
-    highest_altitude: Pixels
+    taken: dict[str, Any]
+    labels: tuple[str, ...]
+    hours: Float[np.ndarray, " time"] = quantity("h", "time since the first sample")
+    turntable_deg: Float[np.ndarray, " time"] = quantity("degree", "angle of the turntable")
+    data: OnGrid = quantity("K", "visibilities")
+    n_data: int
     n_missing: int
     rounds: int
+    flagged: Bool[np.ndarray, "product time"] | None = None
+    flagged_share: float = 0.0
+    prior_std: SkyModes = quantity("K", "prior standard deviation")
+    truth: SkyModes | None = quantity("K", "true sky")
+    highest_altitude: Pixels = quantity("1", "sine of the highest altitude")
     instrument: ChiSquare
+    prior: str
+    parameters: tuple[dict[str, Any], ...] = ()
+    log_evidence_learned: float | None = None
+    beam_rms_difference: float | None = None
     doubts: tuple[str, ...] = ()
-    unknowns: Unknowns | None = None
-
-    @classmethod
-    def of(
-        cls,
-        experiment: Experiment,
-        inference: Inference,
-        instrument: ChiSquare,
-        unknowns: Unknowns | None = None,
-    ) -> Observed:
-        """Of an experiment, and what no sky explains of its data."""
-        data, nside = experiment.data, experiment.scenario.map_nside
-        return cls(
-            experiment.scenario.frequency_mhz,
-            np.sqrt(np.asarray(experiment.setup.prior.variance())),
-            None if data.truth is None else np.asarray(data.truth),
-            highest_altitude(data.observation, nside),
-            data.n_missing,
-            inference.rounds,
-            instrument,
-            doubts(experiment, inference),
-            unknowns,
-        )
+    judged: Judged | None = None
+    details: Details | None = None
+    pointing: PointingReport | None = None
+    fluxes: pd.DataFrame | None = None
+    diagnosis: Diagnosis | None = None
+    digests: tuple[str, ...] = ()
+    information: Information | None = None
 
 
-@dataclass(frozen=True, repr=False)
-class ChannelResult(Described):
+@dataclass(frozen=True, kw_only=True, repr=False)
+class ChannelResult(ChannelData, Described):
     """The posterior over the sky at one frequency, and what judges it. Skies in K, Galactic.
 
     Attributes
     ----------
-    frequency_mhz : float
-    mean, std, prior_std : (modes,) array
+    mean, std : (modes,) array
         Of the real harmonic coefficients.
     prior_fraction : (ells,) array
         Share of the variance that the prior supplies, mean over m.
     pixel_std : (pixels,) array
         Standard deviation of HEALPix RING pixels.
-    highest_altitude : (pixels,) array
-        sin of the highest altitude that each pixel reached.
     draws : (n, modes) array
         Of the posterior; none, if none were asked for.
-    truth : (modes,) array or None
-        The sky behind simulated data.
+    log_likelihood : (n,) array
+        ln p(d | m) of each draw, with all of N in it.
+    covariance : (modes, modes) array or None
+        Where it was asked for, in K^2.
     independent : (modes,) array or None
         Mean given this channel's data alone, where ``mean`` is given those of all.
     log_evidence, information_bits : float
@@ -115,45 +211,29 @@ class ChannelResult(Described):
     chi2_model : float
         Of the data under the model, sky included: a chi^2 distribution of ``n_data`` degrees of
         freedom. NaN for a channel of a joint posterior, which has no model of its own.
-    instrument_chi2, instrument_chi2_expected : float
-        Of the channel's own data, what no sky explains (:mod:`.chi2`). NaN for a map of its own,
-        whose diagnostics have it.
     refinement : float
         Last correction of the mean, in standard deviations.
-    n_data, n_missing, rounds : int
-        Data, samples left out, and how often the gain term was built.
-    doubts : tuple of str
-        What is doubtful about measured data, a sentence each.
     coverage : tuple of Coverage
         How often error bars hold the truth, by latitude; empty where it is not known.
     unknowns : UnknownsReport or None
-        Of receivers, ground and gain table, where the model has them. None for a map of its own,
-        which has it beside its channel.
+        Of receivers, ground and gain table, where the model has them.
     """
 
-    frequency_mhz: float
-    mean: Modes
-    std: Modes
-    prior_std: Modes
-    prior_fraction: Ells
-    pixel_std: Pixels
-    highest_altitude: Pixels
-    draws: Float[np.ndarray, "n modes"]
-    truth: Modes | None
-    independent: Modes | None
-    log_evidence: float
-    information_bits: float
+    mean: SkyModes = quantity("K", "posterior mean")
+    std: SkyModes = quantity("K", "posterior standard deviation")
+    prior_fraction: Ells = quantity("1", "share of the variance that the prior supplies")
+    pixel_std: Pixels = quantity("K", "posterior standard deviation of pixels")
+    draws: Float[np.ndarray, "draw mode"] = quantity("K", "draws of the posterior")
+    log_likelihood: Float[np.ndarray, " draw"] = quantity("1", "ln p(d | m) of each draw")
+    covariance: SkyMatrix | None = quantity("K2", "posterior covariance", default=None)
+    independent: SkyModes | None = quantity("K", "mean given its own data alone", default=None)
+    log_evidence: float = np.nan
+    information_bits: float = np.nan
     chi2: float
     chi2_expected: float
-    chi2_model: float
-    refinement: float
-    n_data: int
-    n_missing: int
-    rounds: int
-    doubts: tuple[str, ...] = ()
+    chi2_model: float = np.nan
+    refinement: float = np.nan
     coverage: tuple[Coverage, ...] = ()
-    instrument_chi2: float = np.nan
-    instrument_chi2_expected: float = np.nan
     unknowns: UnknownsReport | None = None
 
     def description(self) -> tuple[str, ...]:
@@ -173,7 +253,7 @@ class ChannelResult(Described):
         """Share of the sky that was never above the horizon."""
         return float((self.highest_altitude < 0).mean())
 
-    def snr(self, mean: Modes | None = None) -> np.ndarray | None:
+    def snr(self, mean: SkyModes | None = None) -> np.ndarray | None:
         """SNR_ell of the map, or of another mean; None where the truth is not known."""
         if self.truth is None:
             return None
@@ -184,6 +264,11 @@ class ChannelResult(Described):
         """First ell >= 1 with SNR < 1; None if there is none, or no truth."""
         snr = self.snr()
         return None if snr is None else ell_cross(snr)
+
+    @property
+    def resolution_deg(self) -> float | None:
+        """180 degrees over the first ell of which the prior supplies more than half."""
+        return effective_resolution_deg(self.prior_fraction)
 
     def spectra(self) -> dict[str, Shaped[np.ndarray, " ells"]]:
         """Columns of spectra.csv; rho, snr and cl_truth only where the truth is known."""
@@ -201,10 +286,6 @@ class ChannelResult(Described):
         }
         return {name: values for name, values in columns.items() if values is not None}
 
-    def coverage_rows(self) -> list[dict[str, float | str]] | None:
-        """:attr:`coverage` for summary.json; None where the truth is not known."""
-        return [band.row() for band in self.coverage] or None
-
     def maps(self) -> dict[str, Pixels]:
         """HEALPix RING maps by name, in K: mean, std and, where known, truth and residual."""
         maps = {"mean": modes_to_map(self.mean, self.nside), "std": self.pixel_std}
@@ -213,152 +294,38 @@ class ChannelResult(Described):
             maps |= {"truth": truth, "residual": maps["mean"] - truth}
         return maps
 
-    def variables(self) -> dict[str, tuple[tuple[str, ...], np.ndarray]]:
-        """What posterior.nc holds of a channel, on dims ``mode`` and ``draw``; in K."""
-        known = {
-            "mean": self.mean,
-            "std": self.std,
-            "prior_std": self.prior_std,
-            "truth": self.truth,
-            "independent_mean": self.independent,
-        }
-        found = {name: (("mode",), values) for name, values in known.items() if values is not None}
-        return found | ({"draws": (("draw", "mode"), self.draws)} if len(self.draws) else {})
-
-
-def channel_of_information(
-    observed: Observed,
-    information: Information,
-    mean: Modes,
-    covariance: ModesMatrix,
-    draws: Float[Array, "n modes"],
-    *,
-    compared: Float[np.ndarray, "more modes"] | None = None,
-    independent: Modes | None = None,
-    log_evidence: float = np.nan,
-    information_bits: float = np.nan,
-    chi2_model: float = np.nan,
-    refinement: float = np.nan,
-) -> ChannelResult:
-    """The channel of a mean and a covariance.
-
-    Parameters
-    ----------
-    observed : Observed
-    information : Information
-        What the channel's own data say.
-    mean : (modes,) array
-        In K.
-    covariance : (modes, modes) array
-        In K^2.
-    draws : (n, modes) array
-        In K.
-    compared : (more, modes) array, optional
-        Draws less mean for :class:`.Counts`, where the truth is known, in K.
-    independent, log_evidence, information_bits, chi2_model, refinement
-        See :class:`ChannelResult`.
-    """
-    variance, unknowns = np.diagonal(np.asarray(covariance)), observed.unknowns
-    joint = independent is not None
-    return _channel(
-        observed,
-        np.asarray(mean),
-        covariance,
-        compared,
-        prior_fraction=mean_over_m(np.sqrt(variance) ** 2 / observed.prior_std**2),
-        draws=np.asarray(draws),
-        independent=np.asarray(independent) if joint else None,
-        log_evidence=log_evidence,
-        information_bits=information_bits,
-        chi2=float(information.chi2(mean)),
-        chi2_expected=float(information.n_data - np.vdot(information.matrix, covariance)),
-        chi2_model=chi2_model,
-        refinement=refinement,
-        n_data=int(information.n_data),
-        unknowns=None if unknowns is None else unknowns.report(mean, covariance, joint=joint),
-    )
-
-
-def _channel(
-    observed: Observed,
-    mean: Modes,
-    covariance: ModesMatrix,
-    compared: Float[np.ndarray, "more modes"] | None,
-    **figures: Any,
-) -> ChannelResult:
-    """A channel with what follows from its observation, a mean and a covariance."""
-    width, found = pixel_std(covariance, round(np.sqrt(observed.highest_altitude.size / 12))), ()
-    if compared is not None and observed.truth is not None:
-        found = Counts.of_pixels(width, observed.truth - mean, compared).coverage()
-    names = ("frequency_mhz", "prior_std", "highest_altitude", "truth", "n_missing", "rounds")
-    return ChannelResult(
-        mean=mean,
-        std=np.sqrt(np.diagonal(np.asarray(covariance))),
-        pixel_std=width,
-        doubts=(*observed.doubts, *about_information(figures["information_bits"])),
-        coverage=found,
-        instrument_chi2=observed.instrument.chi2,
-        instrument_chi2_expected=observed.instrument.degrees,
-        **{name: getattr(observed, name) for name in names},
-        **figures,
-    )
-
-
-def channel_of_posterior(
-    experiment: Experiment,
-    inference: Inference,
-    covariance: ModesMatrix,
-    *,
-    n_draws: int = 0,
-    judged: Inference | None = None,
-) -> ChannelResult:
-    """The channel of a posterior over harmonic coefficients.
-
-    Parameters
-    ----------
-    experiment : Experiment
-    inference : Inference
-        The posterior, and the model of the data.
-    covariance : (modes, modes) array
-        In K^2.
-    n_draws : int
-        How many draws of the posterior to keep.
-    judged : Inference, optional
-        The model that predicts the data and its posterior, where earlier data were there.
-    """
-    model, posterior, data = inference.model, inference.posterior, experiment.data
-    judged = inference if judged is None else judged
-    prior_variance = np.asarray(model.prior.variance())
-    variance = np.sqrt(np.diagonal(covariance)) ** 2
-    fraction = np.divide(
-        variance, prior_variance, out=np.zeros(len(variance)), where=prior_variance > 0
-    )
-    observed = Observed.of(experiment, inference, ChiSquare(np.nan, np.nan))
-    misfit = float(judged.model.chi2(judged.posterior.mean, data.data))
-    return _channel(
-        replace(observed, prior_std=np.sqrt(prior_variance)),
-        np.asarray(posterior.mean),
-        covariance,
-        None if data.truth is None else deviations(experiment, posterior),
-        prior_fraction=mean_over_m(fraction),
-        draws=posterior_draws(experiment, posterior, n_draws),
-        independent=None,
-        log_evidence=float(posterior.log_evidence),
-        information_bits=float(posterior.information_bits()),
-        chi2=float(model.chi2(posterior.mean, data.data)),
-        chi2_expected=expected_chi2(judged.posterior, model.n_data),
-        chi2_model=misfit + float(judged.posterior.prior_chi2()),
-        refinement=float(posterior.refinement),
-        n_data=model.n_data,
-    )
+    def figures(self) -> list[str]:
+        """The few figures that matter, in words."""
+        parts = []
+        if self.truth is not None:
+            cross = self.ell_cross
+            parts = ["SNR > 1 at every ell" if cross is None else f"SNR < 1 first at ell {cross}"]
+        if self.resolution_deg is not None:
+            parts.append(f"resolution {self.resolution_deg:.1f} deg")
+        parts.append(f"chi2 {self.chi2:.0f} (expected {self.chi2_expected:.0f})")
+        parts.append(f"ln evidence {self.log_evidence:.1f}")
+        return [*parts, f"{self.information_bits:.0f} bits"]
 
 
 # at which SNR is told
 ELLS = (5, 10, 20, 30)
 
 
-def errors_by_latitude(channel: ChannelResult) -> list[dict[str, float | str]]:
-    """By latitude: rms error in K, and the width of error bars over the sky's brightness.
+@dataclass(frozen=True)
+class SkyErrors:
+    """Errors of a map in a band of latitude.
+
+    name : of the band; rms_error_k : in K; std_over_sky : width of error bars over the sky's
+    brightness
+    """
+
+    name: str
+    rms_error_k: float
+    std_over_sky: float
+
+
+def errors_by_latitude(channel: ChannelResult) -> tuple[SkyErrors, ...]:
+    """Errors of a channel's map by latitude.
 
     Parameters
     ----------
@@ -366,14 +333,14 @@ def errors_by_latitude(channel: ChannelResult) -> list[dict[str, float | str]]:
         With its truth.
     """
     truth, mean = (modes_to_map(m, channel.nside) for m in (channel.truth, channel.mean))
-    return [
-        {
-            "name": name,
-            "rms_error_k": float(np.sqrt(((mean - truth)[inside] ** 2).mean())),
-            "std_over_sky": float(channel.pixel_std[inside].mean() / truth[inside].mean()),
-        }
+    return tuple(
+        SkyErrors(
+            name,
+            float(np.sqrt(((mean - truth)[inside] ** 2).mean())),
+            float(channel.pixel_std[inside].mean() / truth[inside].mean()),
+        )
         for name, inside in latitudes(channel.nside).items()
-    ]
+    )
 
 
 def snr_at_some_ell(channel: ChannelResult) -> dict[int, float]:

@@ -5,33 +5,43 @@ Their provenance says which data they are of, of which site and dates, by which 
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import xarray as xr
+from pydantic import BaseModel
 
-from lusee_bayes.core.arrays import Ells, Pixels
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import recover, require_files, user_path
-from lusee_bayes.core.reading import read_json, read_table
+from lusee_bayes.core.reading import read_model
 from lusee_bayes.core.version import COMMAND, release
 from lusee_bayes.experiment.data_files import Data, names_of_data
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.results.diagnostics_file import read_diagnostics
-from lusee_bayes.results.saved import MAP_SUMMARY, PROVENANCE, SPECTRA
-from lusee_bayes.sky.sky_files import SkyMap
+from lusee_bayes.results.channel import ChannelResult
+from lusee_bayes.results.map_files import read_channels
+from lusee_bayes.results.summaries import MapSummary
 
 NAME = "provenance.json"
 
 
-@dataclass(frozen=True)
-class Provenance:
+def taken(observation: Observation) -> dict[str, Any]:
+    """When and where data were taken: first and last time, step, number of times, site."""
+    return {
+        "first": str(observation.times[0].isot)[:19],
+        "last": str(observation.times[-1].isot)[:19],
+        "step_s": float(observation.step_s),
+        "n_times": int(observation.n_times),
+        "lon_deg": float(observation.lon_deg),
+        "lat_deg": float(observation.lat_deg),
+    }
+
+
+class Provenance(BaseModel, frozen=True):
     """Where the results of a run come from.
 
     Attributes
@@ -73,19 +83,14 @@ class Provenance:
 
     @classmethod
     def of(
-        cls, scenario: Scenario, observation: Observation, data: Data | None, *, known_sky: bool
+        cls, scenario: Scenario, times: Mapping[str, Any], data: Data | None, *, known_sky: bool
     ) -> Provenance:
-        """Of a run that has used data of an observation, read from files or simulated."""
+        """Of a run that has used data of an observation (:func:`taken`), given or simulated."""
         return cls(
             file="" if data is None else ", ".join(names_of_data(data)),
             known_sky=known_sky,
             seed=scenario.seed,
-            first=str(observation.times[0].isot)[:19],
-            last=str(observation.times[-1].isot)[:19],
-            step_s=float(observation.step_s),
-            n_times=int(observation.n_times),
-            lon_deg=float(observation.lon_deg),
-            lat_deg=float(observation.lat_deg),
+            **times,
             lmax=scenario.lmax,
             command=COMMAND.get(),
             version=release(),
@@ -96,7 +101,8 @@ class Provenance:
     def of_experiment(cls, experiment: Experiment, data: Data | None) -> Provenance:
         """Of a run with an experiment's data."""
         known = experiment.data.truth is not None
-        return cls.of(experiment.scenario, experiment.data.observation, data, known_sky=known)
+        times = taken(experiment.data.observation)
+        return cls.of(experiment.scenario, times, data, known_sky=known)
 
     @classmethod
     def read(cls, folder: Path) -> Provenance | None:
@@ -107,12 +113,11 @@ class Provenance:
         path = folder / NAME
         if not path.is_file():
             return None
-        found = read_json(path, PROVENANCE)
-        return cls(**{name: found[name] for name in cls.__dataclass_fields__})
+        return read_model(path, cls, "the provenance of a run's results")
 
     def write(self, folder: Path) -> None:
         """Write provenance.json."""
-        (folder / NAME).write_text(json.dumps(asdict(self), indent=2) + "\n", encoding="utf-8")
+        (folder / NAME).write_text(self.model_dump_json(indent=2) + "\n", encoding="utf-8")
 
     def data_line(self) -> str:
         """Whether the data are measured or simulated, and from where."""
@@ -123,30 +128,33 @@ class Provenance:
         return f"measured: {self.file}"
 
 
-NEEDED = ("summary.json", "spectra.csv", "diagnostics.nc", "mean.fits", "std.fits")
+NEEDED = ("summary.json", "diagnostics.nc")
 
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """What a map run has left: name of its folder, figures of summary.json, spectra, maps in K.
+    """What a map run has left: the name of its folder, its figures, and its channels.
 
     ``provenance`` is None for a folder of an earlier version, which did not record it.
     """
 
     name: str
-    summary: dict
-    spectra: dict[str, Ells]
-    mean: Pixels
-    std: Pixels
-    diagnostics: xr.Dataset
+    summary: MapSummary
+    channels: tuple[ChannelResult, ...]
     provenance: Provenance | None
+
+    @property
+    def channel(self) -> ChannelResult:
+        """The first channel: of a map of one frequency, the only one."""
+        return self.channels[0]
 
     def cross_in_words(self) -> str:
         """First ell with SNR < 1: above the last one, or unknown without a truth."""
-        cross = self.summary["ell_cross"]
+        cross = self.channel.ell_cross
         if cross is not None:
             return str(cross)
-        return f"> {self.spectra['ell'][-1]:.0f}" if "snr" in self.spectra else "no truth"
+        lmax = len(self.channel.prior_fraction) - 1
+        return "no truth" if self.channel.truth is None else f"> {lmax}"
 
     @classmethod
     def read(cls, folder: str | Path) -> FinishedRun:
@@ -154,26 +162,20 @@ class FinishedRun:
         folder = user_path(folder)
         recover(folder)
         require_files(folder, NEEDED, "map")
-        summary = read_json(folder / "summary.json", MAP_SUMMARY)
-        diagnostics = read_diagnostics(folder / "diagnostics.nc")
-        if diagnostics.attrs["frequency_mhz"] != summary["frequency_mhz"]:
+        summary = read_model(folder / "summary.json", MapSummary, "the figures of a map run")
+        channels = read_channels(folder / "diagnostics.nc")
+        found = [channel.frequency_mhz for channel in channels]
+        if found != summary.frequencies_mhz:
             raise InputError(
                 f"'{folder}' holds files of different runs: summary.json is of "
-                f"{summary['frequency_mhz']:g} MHz, diagnostics.nc of "
-                f"{diagnostics.attrs['frequency_mhz']:g} MHz; make the map again"
+                f"{_in_mhz(summary.frequencies_mhz)}, diagnostics.nc of {_in_mhz(found)}; make the "
+                "map again"
             )
-        maps = {name: SkyMap.read(folder / f"{name}.fits").pixels for name in ("mean", "std")}
-        if maps["mean"].size != maps["std"].size:
-            raise InputError(f"'{folder}': mean.fits and std.fits are of different NSIDE")
-        return cls(
-            folder.resolve().name,
-            summary,
-            read_table(folder / "spectra.csv", SPECTRA),
-            maps["mean"],
-            maps["std"],
-            diagnostics,
-            Provenance.read(folder),
-        )
+        return cls(folder.resolve().name, summary, channels, Provenance.read(folder))
+
+
+def _in_mhz(frequencies: Sequence[float]) -> str:
+    return f"{', '.join(f'{f:g}' for f in frequencies)} MHz"
 
 
 def read_runs(folders: Sequence[str | Path]) -> list[FinishedRun]:
@@ -185,6 +187,11 @@ def read_runs(folders: Sequence[str | Path]) -> list[FinishedRun]:
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise InputError(f"two of the folders are named '{twice}'; rename one of them")
+    for run in runs:
+        if len(run.channels) > 1 or run.channel.judged is None:
+            raise InputError(
+                f"'{run.name}' is a run of frequencies_mhz; give folders of maps of one frequency"
+            )
     return runs
 
 
@@ -211,8 +218,8 @@ def evidence_caveat(runs: Sequence[FinishedRun]) -> str | None:
 
 def _difference(first: FinishedRun, run: FinishedRun) -> str | None:
     """How the data of a run differ from those of the first, in words; None if they do not."""
-    here, there = (one.diagnostics["data"].values for one in (first, run))
-    frequencies = [one.summary["frequency_mhz"] for one in (first, run)]
+    here, there = (one.channel.data for one in (first, run))
+    frequencies = [one.channel.frequency_mhz for one in (first, run)]
     if frequencies[0] != frequencies[1]:
         return f"is at {frequencies[1]:g} MHz instead of {frequencies[0]:g}"
     if here.shape != there.shape:
@@ -227,7 +234,7 @@ def _difference(first: FinishedRun, run: FinishedRun) -> str | None:
     scale = float(np.vdot(here[known], there[known]) / np.vdot(here[known], here[known]))
     if np.allclose(there[known], scale * here[known], rtol=1e-6, atol=0.0):
         return f"has the same data in another unit (times {scale:.6g})"
-    if not np.array_equal(first.diagnostics["hours"].values, run.diagnostics["hours"].values):
+    if not np.array_equal(first.channel.hours, run.channel.hours):
         return "was observed at other times"
     return "has other values at the same times (another file, noise, sky or seed)"
 
@@ -241,23 +248,23 @@ def comparison_rows(runs: Sequence[FinishedRun]) -> list[dict[str, object]]:
         "frequency_mhz",
         "n_data",
         "ell_cross",
-        "effective_resolution_deg",
+        "resolution_deg",
         "information_bits",
         "log_evidence",
         "chi2",
         "chi2_expected",
     )
-    best = max(run.summary["log_evidence"] for run in runs)
+    best = max(run.channel.log_evidence for run in runs)
     comparable = evidence_caveat(runs) is None
     return [
         {
             "run": run.name,
-            "level": run.diagnostics.attrs["level"],
-            **{key: run.summary[key] for key in keys},
-            "log_evidence_less_best": run.summary["log_evidence"] - best if comparable else None,
-            "instrument_p": float(run.diagnostics.attrs["instrument_p"]),
-            "prior_p": float(run.diagnostics.attrs["prior_p"]),
-            "mean_std_k": float(run.std.mean()),
+            "level": run.summary.level,
+            **{key: getattr(run.channel, key) for key in keys},
+            "log_evidence_less_best": run.channel.log_evidence - best if comparable else None,
+            "instrument_p": run.channel.instrument.p,
+            "prior_p": run.channel.judged.prior.p,
+            "mean_std_k": float(run.channel.pixel_std.mean()),
         }
         for run in runs
     ]

@@ -83,6 +83,24 @@ def baseline(forecasts: Sequence[Forecast], source: str) -> Forecast:
     return next(f for f in forecasts if f.variation.source == source)
 
 
+def forecast_lines(forecasts: Sequence[Forecast]) -> list[str]:
+    """The information in a scenario as given, and its most informative variation.
+
+    Parameters
+    ----------
+    forecasts : sequence of Forecast
+        Of one source, the scenario as it is first.
+    """
+    first, best = forecasts[0], max(forecasts, key=lambda one: one.information_bits)
+    source = first.variation.source
+    text = f"{source}: {first.information_bits:.0f} bits, {first.modes} modes with expected SNR > 1"
+    if best.information_bits > first.information_bits:
+        more = best.information_bits - first.information_bits
+        text += f"; most: {best.variation.family}, {best.variation.name}: +{more:.0f} bits"
+    offsets = first.offsets_line()
+    return [text, f"{source}: {offsets}"] if offsets else [text]
+
+
 def forecast_rows(forecasts: Sequence[Forecast]) -> list[dict[str, object]]:
     """Rows of plan.csv; ``difference_bits`` is that to the same source's first variation."""
     rows = []

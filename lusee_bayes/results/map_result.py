@@ -1,43 +1,47 @@
-"""A posterior map at one frequency, with what is needed to judge it.
+"""What a map run has found: the posterior of every channel's sky, and whether the data fit.
 
-Beside the map are the fluxes of point sources, and where its prior comes from.
+A map of one frequency is one channel. Channels have a posterior each, or share that of component
+maps.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from functools import cached_property
 from textwrap import wrap
-from typing import Any
 
+import numpy as np
 import pandas as pd
-import xarray as xr
+from jaxtyping import Float
 
-from lusee_bayes.core.checks import Described
+from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.checks import Described, counted, extent
+from lusee_bayes.core.harmonics import synthesis_matrix
+from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.progress import about_run
-from lusee_bayes.experiment.diagnosis import Diagnosis
+from lusee_bayes.core.reading import rows_of
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.instrument_terms import beam_rms_difference
-from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.unknowns import (
-    PointingReport,
-    UnknownsReport,
-    flux_lines,
-)
+from lusee_bayes.experiment.unknowns import UnknownsReport, flux_lines
 from lusee_bayes.flight.reduced import Reduced
-from lusee_bayes.judge.chi2 import RULE
-from lusee_bayes.judge.measures import effective_resolution_deg
+from lusee_bayes.judge.chi2 import RULE, ChiSquare, Fit
+from lusee_bayes.judge.cube_fit import ChannelFits
+from lusee_bayes.linear.positive_joint import PositiveMode
 from lusee_bayes.results.channel import ChannelResult
-from lusee_bayes.results.saved import JUDGED
+from lusee_bayes.results.summaries import (
+    ChannelSummary,
+    JointSummary,
+    JointTestSummary,
+    MapSummary,
+    PullSummary,
+)
+from lusee_bayes.sky.galaxy import LANDMARKS
+from lusee_bayes.sky.spectral_prior import SpectralPrior
 
 
 def prior_sentence(experiment: Experiment) -> str:
-    """The prior's model, where its C_ell comes from and, if it was learned, its parameters.
-
-    Parameters
-    ----------
-    experiment : Experiment
-    """
+    """The prior's model, where its C_ell comes from and, if it was learned, its parameters."""
     section, learned = experiment.scenario.prior, experiment.learned
     rows = [] if learned is None else learned.as_rows()
     found = ", ".join(f"{r['name']} {r['value']:.2f} +- {r['std']:.2f}" for r in rows)
@@ -45,13 +49,7 @@ def prior_sentence(experiment: Experiment) -> str:
 
 
 def joint_prior_sentence(scenario: Scenario) -> str:
-    """Which prior the skies of a joint posterior have.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        Of joint channels.
-    """
+    """Which prior the skies of a scenario's joint posterior have."""
     section, kept = scenario.spectral, f"prior.model={scenario.prior.model} is not used"
     if section.model == "positive":
         return (
@@ -61,134 +59,365 @@ def joint_prior_sentence(scenario: Scenario) -> str:
     return f"Prior spectral.model={section.model}, C_ell of the scenario's own skies; {kept}."
 
 
-@dataclass(frozen=True, repr=False)
-class MapResult(Described):
-    """A posterior map at one frequency: a cube of one channel, with its model at hand.
+@dataclass(frozen=True)
+class ChannelUnknowns:
+    """What is told of the unknowns of every channel.
 
     Attributes
     ----------
-    experiment : Experiment
-    inference : Inference
-        The model and its posterior, given all data.
-    channel : ChannelResult
-    diagnostics : xarray.Dataset
-        What a report shows beyond the map (:func:`.diagnostics`).
-    fluxes : DataFrame or None
-        Of the point sources beside the map, a row each, if there are any.
-    pointing : PointingReport or None
-        Of clock and pointing, where the scenario has them or the data do not fit.
-    unknowns : UnknownsReport or None
-        Of receivers, ground and gain table, where the model has them.
-    digests : tuple of str
-        Of all data behind the posterior.
-    seconds : dict
-        By stage.
-    diagnosis : Diagnosis or None
-        The usual mistakes that would explain the data, where they were tried.
-    reduced : Reduced or None
-        Of flight data: the spectra behind them.
+    reports : dict of UnknownsReport
+        By frequency in MHz.
+    octaves : float or None
+        Over which receivers' spectra are smooth; None where every frequency has its own power.
     """
 
-    experiment: Experiment
-    inference: Inference
-    channel: ChannelResult
-    diagnostics: xr.Dataset
-    fluxes: pd.DataFrame | None
-    pointing: PointingReport | None
-    unknowns: UnknownsReport | None
-    digests: tuple[str, ...]
-    diagnosis: Diagnosis | None = None
+    reports: dict[float, UnknownsReport]
+    octaves: float | None = None
+
+    @classmethod
+    def of(
+        cls, channels: Iterable[ChannelResult], octaves: float | None = None
+    ) -> ChannelUnknowns | None:
+        """Of a run's channels; None if they have no such unknowns."""
+        reports = {c.frequency_mhz: c.unknowns for c in channels if c.unknowns is not None}
+        return cls(reports, octaves) if reports else None
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """unknowns.csv: the channels' tables, one below the other, with ``frequency_mhz``."""
+        return below({f: report.table for f, report in self.reports.items()})
+
+    def lines(self) -> list[str]:
+        """What a terminal shows: which of them, and which combination, the data do not tell."""
+        if len(self.reports) == 1:
+            return next(iter(self.reports.values())).lines()
+        n, untold = len(self.reports), dict[str, int]()
+        for report in self.reports.values():
+            for name in report.table["unknown"][~report.told]:
+                untold[name] = untold.get(name, 0) + 1
+        counts = [f"{name} (at {k} of {n} frequencies)" for name, k in untold.items()]
+        what = f"do not tell {', '.join(counts)}" if counts else "tell all of them"
+        found = [f"Receivers, ground and gain table: the data {what}."]
+        if self.octaves is not None:
+            found.append(
+                f"Powers of receivers are smooth over {self.octaves:g} octaves: every channel is "
+                "given what the others tell of them."
+            )
+        sentence = self._null_sentence()
+        return [*found, sentence] if sentence else found
+
+    def _null_sentence(self) -> str:
+        """Of the channel whose data leave most open; empty where all tell most of it."""
+        nulls = {f: report.null for f, report in self.reports.items() if report.null is not None}
+        left_open = [f for f, null in nulls.items() if null.sentence()]
+        if not left_open:
+            return ""
+        worst = left_open[int(np.argmax([nulls[f].share for f in left_open]))]
+        words, share = nulls[worst].words(), nulls[worst].share
+        return (
+            f"One combination of what looks alike is hardly told at {len(left_open)} of "
+            f"{len(nulls)} frequencies. At {worst:g} MHz ({words}, in prior standard deviations) "
+            f"it keeps {share:.0%} of its prior variance."
+        )
+
+
+def below(tables: dict[float, pd.DataFrame | None]) -> pd.DataFrame | None:
+    """Tables of channels, one below the other, with ``frequency_mhz`` first; None without any."""
+    known = {f: table.copy() for f, table in tables.items() if table is not None}
+    for frequency, table in known.items():
+        table.insert(0, "frequency_mhz", frequency)
+    return pd.concat(known.values(), ignore_index=True) if known else None
+
+
+@dataclass(frozen=True)
+class Components:
+    """The joint posterior of the component maps: in K, of positive skies fields without unit.
+
+    Attributes
+    ----------
+    prior : SpectralPrior
+    mean : (components, modes) array
+    spread : (pairs, modes, modes) array
+        Their covariance (:func:`.paired`).
+    draws : (n, components, modes) array
+    chi2 : float
+        Of all data under the model, prior included: chi^2 of N_data if it holds.
+    log_evidence, information_bits : float
+    refinement : float
+        Distance left, in standard deviations.
+    mode : PositiveMode or None
+        Of positive skies.
+    """
+
+    prior: SpectralPrior
+    mean: Array
+    spread: Array
+    draws: Array
+    chi2: float
+    log_evidence: float
+    information_bits: float
+    refinement: float
+    mode: PositiveMode | None = None
+
+    @property
+    def solver(self) -> str:
+        """How the mean was found."""
+        return "direct" if self.mode is None else "Gauss-Newton rounds"
+
+    @property
+    def iterations(self) -> int:
+        """Rounds of positive skies."""
+        return 0 if self.mode is None else self.mode.rounds
+
+
+@dataclass(frozen=True, repr=False)
+class MapResult(Described):
+    """The posterior of every channel's sky, in K.
+
+    Attributes
+    ----------
+    scenario : Scenario
+        Of one frequency or of several, those that could not be mapped included.
+    channels : tuple of ChannelResult
+        That could be mapped.
+    joint : Components or None
+        The component maps that all channels share; None where each has a posterior of its own.
+    seconds : dict
+        By stage.
+    unmapped : dict
+        Why the other channels could not be mapped, by frequency in MHz.
+    reduced : Reduced or None
+        Of flight data: the spectra behind them.
+    tie_log_evidence : float
+        What smooth spectra of the receivers add to the sum of the channels' ln evidence.
+    """
+
+    scenario: Scenario
+    channels: tuple[ChannelResult, ...]
+    joint: Components | None = None
     seconds: dict[str, float] = field(default_factory=dict)
+    unmapped: dict[float, str] = field(default_factory=dict)
     reduced: Reduced | None = None
+    tie_log_evidence: float = 0.0
 
     def description(self) -> tuple[str, ...]:
-        channel = self.channel
+        if self.single:
+            sizes = f"{self.channel.n_data} data"
+            head = f"{self.channel.frequency_mhz:g} MHz, lmax = {self.scenario.lmax}, {sizes}"
+            return head, self.headline(), *wrap(self.verdict(), 100)[:2]
+        kind = "independent channel" if self.joint is None else "joint channel"
         return (
-            f"{channel.frequency_mhz:g} MHz, lmax = {self.scenario.lmax}, {channel.n_data} data",
-            self.headline(),
-            *wrap(self.verdict(), 100)[:2],
+            f"{counted(len(self.channels), kind)}, {extent(self.frequencies_mhz, 'MHz')}, "
+            f"lmax = {self.scenario.lmax}",
+            self.verdict(),
         )
 
     @property
-    def scenario(self) -> Scenario:
-        """The resolved scenario."""
-        return self.experiment.scenario
+    def single(self) -> bool:
+        """Whether the scenario has one frequency."""
+        return self.scenario.single
 
     @property
-    def channels(self) -> tuple[ChannelResult, ...]:
-        """The one channel."""
-        return (self.channel,)
+    def channel(self) -> ChannelResult:
+        """The first channel: of a map of one frequency, the only one."""
+        return self.channels[0]
 
     @property
-    def band(self) -> int:
-        """The number of its band among the reduced spectra."""
-        return 0 if self.reduced is None else self.reduced.band(self.channel.frequency_mhz)
+    def frequencies_mhz(self) -> Float[np.ndarray, " channels"]:
+        """Of the channels that could be mapped."""
+        return np.array([channel.frequency_mhz for channel in self.channels])
 
-    def summary(self) -> dict[str, object]:
-        """Figures of summary.json; null where a truth would be needed and is not known."""
-        channel, learned = self.channel, self.experiment.learned
-        offsets = None if self.pointing is None else self.pointing.offsets
-        return {
-            **_figures(channel, "frequency_mhz", "ell_cross"),
-            "effective_resolution_deg": effective_resolution_deg(channel.prior_fraction),
-            **_figures(channel, "log_evidence", "information_bits", "chi2", "chi2_expected"),
-            "level": self.diagnostics.attrs["level"],
-            "verdict": self.verdict(),
-            **{name: self.diagnostics.attrs[name] for name in JUDGED},
-            "diagnosis": None if self.diagnosis is None else self.diagnosis.rows(),
-            "coverage": channel.coverage_rows(),
-            **_figures(channel, "n_data", "n_missing"),
-            "n_modes": len(channel.mean),
-            "rounds": channel.rounds,
-            "prior": prior_sentence(self.experiment),
-            "prior_parameters": [] if learned is None else learned.as_rows(),
-            # the parameters integrated out, too
-            "log_evidence_learned": None if learned is None else learned.log_evidence,
-            "pointing": None if offsets is None else offsets.to_dict("records"),
-            "unknowns": None if self.unknowns is None else self.unknowns.summary(),
-            "beam_rms_difference": beam_rms_difference(self.experiment.setup),
-            "mean_refinement_sigma": channel.refinement,
-            "never_observed_fraction": channel.never_observed,
-            "doubts": list(channel.doubts),
-            **about_run(self.seconds),
-        }
+    def stacked(self, name: str) -> np.ndarray | None:
+        """An attribute of the channels, channels first; None where it is not known of all."""
+        values = [getattr(channel, name) for channel in self.channels]
+        return None if any(v is None for v in values) else np.stack(values)
+
+    def snr(self, *, independent: bool = False) -> Float[np.ndarray, "channels ells"] | None:
+        """SNR_ell of every channel, or of the means given its own data alone; None if unknown."""
+        if self.stacked("truth") is None or (independent and self.stacked("independent") is None):
+            return None
+        return np.stack([c.snr(c.independent if independent else None) for c in self.channels])
+
+    def fits(self) -> ChannelFits:
+        """chi^2 of every channel, and the tests of all of them together."""
+        parts = [channel.instrument for channel in self.channels]
+        chi2, degrees = (np.array([getattr(p, n) for p in parts]) for n in ("chi2", "degrees"))
+        n_data = float(self.stacked("n_data").sum())
+        total = float(self.stacked("chi2_model").sum()) if self.joint is None else self.joint.chi2
+        rest = ChiSquare(total - float(chi2.sum()), n_data - float(degrees.sum()))
+        return ChannelFits(self.frequencies_mhz, chi2, degrees, rest, self.joint is not None)
+
+    @cached_property
+    def fit(self) -> Fit:
+        """Whether the data of all channels fit."""
+        if self.single:
+            return Fit(self.channel.judged.level, self.channel.judged.verdict)
+        found = self.fits().fit()
+        blamed = [
+            f"{c.frequency_mhz:g} MHz: {c.judged.verdict}"
+            for c in self.channels
+            if c.judged is not None and c.judged.level == "does not fit"
+        ]
+        return Fit(found.level, " ".join([found.text, *blamed[:NAMED]]))
+
+    @cached_property
+    def unknowns(self) -> ChannelUnknowns | None:
+        """Receivers, ground and gain table, where the model has them."""
+        tied = self.scenario.ties_receivers
+        octaves = self.scenario.noise.receiver.smooth_octaves if tied else None
+        return ChannelUnknowns.of(self.channels, octaves)
+
+    def table(self, name: str, part: str = "") -> pd.DataFrame | None:
+        """A table of all channels, or a part of what they have by that name."""
+        found = {c.frequency_mhz: getattr(c, name) for c in self.channels}
+        if part:
+            found = {f: held and getattr(held, part) for f, held in found.items()}
+        return below(found)
 
     def verdict(self) -> str:
-        """Whether the data fit, in sentences."""
-        return str(self.diagnostics.attrs["verdict"])
+        """What the residuals say, in sentences."""
+        return self.fit.text
 
     def headline(self) -> str:
         """The few figures that matter, in one line."""
-        channel, parts = self.channel, []
-        if channel.truth is not None:
-            cross = channel.ell_cross
-            parts = ["SNR > 1 at every ell" if cross is None else f"SNR < 1 first at ell {cross}"]
-        resolution = effective_resolution_deg(channel.prior_fraction)
-        if resolution is not None:
-            parts.append(f"resolution {resolution:.1f} deg")
-        parts.append(f"chi2 {channel.chi2:.0f} (expected {channel.chi2_expected:.0f})")
-        parts.append(f"ln evidence {channel.log_evidence:.1f}")
-        parts.append(f"{channel.information_bits:.0f} bits")
+        if self.single:
+            return ", ".join(self.channel.figures())
+        kind = "each on its own" if self.joint is None else "one posterior"
+        if self.scenario.ties_receivers:
+            kind = "each on its own but for smooth spectra of receivers"
+        parts = [f"{counted(len(self.channels), 'frequency', 'frequencies')}, {kind}"]
+        crosses = [c.ell_cross for c in self.channels if c.ell_cross is not None]
+        if crosses:
+            parts.append(f"SNR < 1 first at ell {min(crosses)} to {max(crosses)}")
+        parts.append(f"ln evidence {self.log_evidence:.1f}")
+        joint = self.joint
+        if joint is not None and joint.iterations:
+            parts.append(f"{joint.iterations} iterations, {joint.refinement:.1g} sigma left")
         return ", ".join(parts)
 
     def lines(self) -> list[str]:
         """What a terminal shows: verdict and causes first, then prior, unknowns and figures."""
-        fluxes = [] if self.fluxes is None else flux_lines(self.fluxes)
-        offsets = [] if self.pointing is None else self.pointing.lines()
-        unknowns = [] if self.unknowns is None else self.unknowns.lines()
-        told = [prior_sentence(self.experiment), *fluxes, *offsets, *unknowns]
-        causes = [] if self.diagnosis is None else self.diagnosis.sentences()
-        figures = [self.headline(), RULE, *self.channel.doubts, *self._flags()]
-        return [self.verdict(), *causes, *told, *figures]
+        told = [self.verdict()]
+        for channel in self.channels:
+            at = "" if self.single else f"{channel.frequency_mhz:g} MHz: "
+            causes = [] if channel.diagnosis is None else channel.diagnosis.sentences()
+            fluxes = [] if channel.fluxes is None else flux_lines(channel.fluxes)
+            offsets = [] if channel.pointing is None else channel.pointing.lines()
+            prior = [channel.prior] if self.single else []
+            told += [f"{at}{line}" for line in (*causes, *prior, *fluxes, *offsets)]
+        told += [] if self.joint is None else [joint_prior_sentence(self.scenario)]
+        told += [] if self.unknowns is None else self.unknowns.lines()
+        return [*told, self.headline(), RULE, *self.doubts(), *self.gaps(), *self._flags()]
 
     def _flags(self) -> list[str]:
         """How much of flight data was flagged, and what is doubtful about them."""
-        if self.reduced is None:
+        reduced = self.reduced
+        if reduced is None:
             return []
-        fitting = self.experiment.fitting
-        line = self.reduced.flag_line(self.band, 0.0 if fitting is None else fitting.share)
-        return [line.capitalize(), *self.reduced.doubts(self.band), *self.reduced.notes()]
+        if not self.single:
+            return [reduced.flag_line().capitalize(), *reduced.notes()]
+        band = self.band
+        line = reduced.flag_line(band, self.channel.flagged_share)
+        return [line.capitalize(), *reduced.doubts(band), *reduced.notes()]
+
+    @property
+    def band(self) -> int:
+        """The number of the first channel's band among the reduced spectra."""
+        return 0 if self.reduced is None else self.reduced.band(self.channel.frequency_mhz)
+
+    def doubts(self) -> list[str]:
+        """What is doubtful about the data, with the channel where there are several."""
+        if self.single:
+            return list(self.channel.doubts)
+        return [f"{c.frequency_mhz:g} MHz: {d}" for c in self.channels for d in c.doubts]
+
+    def gaps(self) -> list[str]:
+        """Which channels could not be mapped, and why, a sentence each."""
+        return [f"Not mapped, {f:g} MHz: {reason}" for f, reason in self.unmapped.items()]
+
+    @property
+    def log_evidence(self) -> float:
+        """ln p of all data."""
+        if self.joint is not None:
+            return self.joint.log_evidence
+        alone = float(np.sum([channel.log_evidence for channel in self.channels]))
+        return alone + self.tie_log_evidence
+
+    def landmarks(self) -> dict[str, dict[str, np.ndarray]]:
+        """Brightness, its standard deviation and, if known, the truth of some directions."""
+        nside = self.scenario.map_nside
+        mean, pixel_std, truth = (self.stacked(n) for n in ("mean", "pixel_std", "truth"))
+        found = {}
+        for name, (lon, lat) in LANDMARKS.items():
+            pixel = healpy.ang2pix(nside, lon, lat, lonlat=True)
+            theta, phi = healpy.pix2ang(nside, pixel)
+            y = synthesis_matrix(np.array([theta]), np.array([phi]), self.scenario.lmax)[0]
+            found[name] = {"mean": mean @ y, "std": pixel_std[:, pixel]}
+            if truth is not None:
+                found[name]["truth"] = truth @ y
+        return found
+
+    def pulls(self) -> list[PullSummary]:
+        """How far the means of some directions are from the truth, in standard deviations."""
+        found = []
+        for name, values in self.landmarks().items():
+            if "truth" not in values:
+                return []
+            pull = (values["mean"] - values["truth"]) / values["std"]
+            worst = int(np.argmax(np.abs(pull)))
+            found.append(
+                PullSummary(
+                    direction=name,
+                    rms=np.sqrt((pull**2).mean()),
+                    worst=pull[worst],
+                    worst_mhz=self.frequencies_mhz[worst],
+                )
+            )
+        return found
+
+    def summary(self) -> MapSummary:
+        """Figures of summary.json."""
+        tests = [] if self.single else self.fits().tests()
+        return MapSummary(
+            frequencies_mhz=self.frequencies_mhz.tolist(),
+            unmapped=self.gaps(),
+            joint=self._joint_summary(),
+            tied=self.scenario.ties_receivers,
+            level=self.fit.level,
+            verdict=self.fit.text,
+            log_evidence=self.log_evidence,
+            n_data=sum(channel.n_data for channel in self.channels),
+            n_modes=len(self.channel.mean),
+            doubts=self.doubts(),
+            tests=[JointTestSummary.model_validate(test) for test in tests],
+            pulls=[] if self.single else self.pulls(),
+            unknowns=[] if self.unknowns is None else self.unknowns.lines(),
+            channels=[ChannelSummary.model_validate(channel) for channel in self.channels],
+            **about_run(self.seconds),
+        )
+
+    def _joint_summary(self) -> JointSummary | None:
+        joint = self.joint
+        if joint is None:
+            return None
+        named = {"prior": joint_prior_sentence(self.scenario), "components": joint.prior.names}
+        same = set(JointSummary.model_fields) - set(named)
+        return JointSummary(**named, **{name: getattr(joint, name) for name in same})
+
+    def spectra(self) -> list[dict[str, float]]:
+        """Rows of spectra.csv: one for every channel and ell."""
+        rows = []
+        for channel in self.channels:
+            columns = {name: v.astype(np.float64) for name, v in channel.spectra().items()}
+            for ell, row in enumerate(rows_of(columns)):
+                rows.append({"frequency_mhz": channel.frequency_mhz, **row, "ell": ell})
+        return rows
+
+    def maps(self) -> dict[str, Float[np.ndarray, "channels pixels"]]:
+        """Cubes by name, in K: mean, std and, where the truth is known, truth and residual."""
+        parts = [channel.maps() for channel in self.channels]
+        return {name: np.stack([part[name] for part in parts]) for name in parts[0]}
 
 
-def _figures(channel: ChannelResult, *names: str) -> dict[str, Any]:
-    return {name: getattr(channel, name) for name in names}
+# channels whose verdicts are in that of the run
+NAMED = 4

@@ -6,18 +6,22 @@ with the prior that was learned from all. Where the sky is known, so is how ofte
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import reduce
-from operator import getitem
-from typing import Any
+from typing import Annotated
+
+from pydantic import BaseModel, Field, model_validator
 
 from lusee_bayes.core.progress import about_run
 from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.judge.chi2 import ChiSquare
+from lusee_bayes.judge.coverage import Coverage
+from lusee_bayes.judge.levels import LEVELS
 from lusee_bayes.judge.residuals import HeldOut
 from lusee_bayes.judge.split import Split
 from lusee_bayes.results.channel import (
     ChannelResult,
+    SkyErrors,
     errors_by_latitude,
     snr_at_some_ell,
 )
@@ -58,24 +62,65 @@ class UnderPrior:
     held_out: tuple[HeldOut, ...]
     split: Split
 
-    def as_json(self) -> dict[str, object]:
-        """Its entry of priors.json; null where the sky is not known."""
+    def summary(self) -> PriorSummary:
+        """Its entry of priors.json."""
         channel, known = self.channel, self.channel.truth is not None
-        snr = snr_at_some_ell(channel) if known else {}
-        return {
-            "name": self.name,
-            "prior": self.words,
-            "parameters": self.n_parameters,
-            "log_evidence": self.log_evidence,
-            "held_out": [vars(one) for one in self.held_out],
-            "chi2_instrument": self.split.instrument.chi2,
-            "degrees_instrument": self.split.instrument.degrees,
-            "chi2_prior": self.split.prior.chi2,
-            "degrees_prior": self.split.prior.degrees,
-            "coverage": channel.coverage_rows(),
-            "errors": errors_by_latitude(channel) if known else None,
-            "snr": [{"ell": ell, "snr": value} for ell, value in snr.items()],
-        }
+        return PriorSummary(
+            name=self.name,
+            prior=self.words,
+            parameters=self.n_parameters,
+            log_evidence=self.log_evidence,
+            held_out=self.held_out,
+            instrument=self.split.instrument,
+            rest=self.split.prior,
+            coverage=channel.coverage,
+            errors=errors_by_latitude(channel) if known else (),
+            snr=snr_at_some_ell(channel) if known else {},
+        )
+
+
+class PriorSummary(BaseModel):
+    """The data under a prior, in priors.json.
+
+    ``instrument`` and ``rest`` are chi^2 of what no sky explains and of what the prior does not
+    expect; ``coverage``, ``errors`` and ``snr`` (by multipole) are there where the sky is known.
+    """
+
+    name: str
+    prior: str
+    parameters: int
+    log_evidence: float
+    held_out: tuple[HeldOut, ...]
+    instrument: ChiSquare
+    rest: ChiSquare
+    coverage: tuple[Coverage, ...]
+    errors: tuple[SkyErrors, ...]
+    snr: dict[int, float]
+
+    def tells(self) -> tuple[object, ...]:
+        """What of it differs from run to run: kinds of groups, parts of the sky, multipoles."""
+        kinds, parts = ([held.kind for held in self.held_out], [c.name for c in self.coverage])
+        return kinds, parts, [error.name for error in self.errors], list(self.snr)
+
+
+class PriorsSummary(BaseModel):
+    """priors.json."""
+
+    verdict: str
+    notes: list[str]
+    best: str
+    frequency_mhz: float
+    n_data: int
+    priors: Annotated[list[PriorSummary], Field(min_length=1)]
+    seconds: dict[str, float]
+    peak_memory_gb: float
+    versions: dict[str, str]
+
+    @model_validator(mode="after")
+    def _tell_the_same(self) -> PriorsSummary:
+        if any(one.tells() != self.priors[0].tells() for one in self.priors):
+            raise ValueError("its priors tell different things; make the results anew")
+        return self
 
 
 @dataclass(frozen=True)
@@ -131,23 +176,23 @@ class PriorComparison:
 
     def table(self) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
         """Header and rows, a column for each prior."""
-        return prior_table(self.as_json()["priors"])
+        return prior_table([one.summary() for one in self.priors])
 
     def rows(self) -> list[dict[str, object]]:
         """Rows of priors.csv, one for each prior; empty where something is not known."""
-        return [_row(one, self.best.log_evidence) for one in self.priors]
+        return [_row(one.summary(), self.best.log_evidence) for one in self.priors]
 
-    def as_json(self) -> dict[str, object]:
+    def summary(self) -> PriorsSummary:
         """priors.json."""
-        return {
-            "verdict": f"{self.headline()}.",
-            "notes": self.lines()[1:],
-            "best": self.best.name,
-            "frequency_mhz": self.scenario.frequency_mhz,
-            "n_data": self.best.channel.n_data,
-            "priors": [one.as_json() for one in self.priors],
+        return PriorsSummary(
+            verdict=f"{self.headline()}.",
+            notes=self.lines()[1:],
+            best=self.best.name,
+            frequency_mhz=self.scenario.frequency_mhz,
+            n_data=self.best.channel.n_data,
+            priors=[one.summary() for one in self.priors],
             **about_run(self.seconds),
-        }
+        )
 
     def as_markdown(self) -> str:
         """priors.md."""
@@ -161,70 +206,62 @@ class PriorComparison:
         return "\n".join([*lines, *others, "", *notes]) + "\n"
 
 
-def _row(one: UnderPrior, best: float) -> dict[str, object]:
-    channel, known = one.channel, one.channel.truth is not None
+def _row(one: PriorSummary, best: float) -> dict[str, object]:
     row: dict[str, object] = {
         "prior": one.name,
-        "parameters": one.n_parameters,
+        "parameters": one.parameters,
         "log_evidence": one.log_evidence,
         "log_evidence_less_best": one.log_evidence - best,
     }
     for held in one.held_out:
         row |= {f"{held.kind}_{key}": getattr(held, key) for key in ("n", "chi2", "log_density")}
-    for name, part in (("instrument", one.split.instrument), ("prior", one.split.prior)):
+    for name, part in (("instrument", one.instrument), ("prior", one.rest)):
         row |= {f"chi2_{name}": part.chi2, f"degrees_{name}": part.degrees}
-    if known:
-        for part, error in zip(channel.coverage, errors_by_latitude(channel), strict=True):
-            told = part.row() | error
-            row |= {f"{part.name}: {key}": x for key, x in told.items() if key not in ("name", "n")}
-        row |= {f"snr_{ell}": value for ell, value in snr_at_some_ell(channel).items()}
-    return row
+    for part, error in zip(one.coverage, one.errors, strict=True):
+        told = part.row() | vars(error)
+        row |= {f"{part.name}: {key}": x for key, x in told.items() if key not in ("name", "n")}
+    return row | {f"snr_{ell}": value for ell, value in one.snr.items()}
 
 
-def prior_table(
-    priors: Sequence[Mapping[str, Any]],
-) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Header and rows: a column for each prior.
+def prior_table(priors: Sequence[PriorSummary]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Header and rows: a column for each prior."""
+    header, first = ("", *(one.name for one in priors)), priors[0]
 
-    Parameters
-    ----------
-    priors : sequence of mappings
-        Entries of priors.json.
-    """
-    header = ("", *(str(one["name"]) for one in priors))
+    def each(form: str, of: Callable[[PriorSummary], float]) -> list[str]:
+        """A cell for each prior."""
+        return [format(of(one), form) for one in priors]
 
-    def each(form: str, *path: str | int) -> list[str]:
-        """A cell for each prior, of the entry at this place."""
-        return [format(reduce(getitem, path, one), form) for one in priors]
-
-    def less_best(*path: str | int) -> list[str]:
-        values = [reduce(getitem, path, one) for one in priors]
+    def less_best(of: Callable[[PriorSummary], float]) -> list[str]:
+        values = [of(one) for one in priors]
         return [f"{value - max(values):.1f}" for value in values]
 
     rows = [
-        ("ln evidence", *each(".1f", "log_evidence")),
-        ("less the best", *less_best("log_evidence")),
-        ("parameters learned", *each("", "parameters")),
+        ("ln evidence", *each(".1f", lambda one: one.log_evidence)),
+        ("less the best", *less_best(lambda one: one.log_evidence)),
+        ("parameters learned", *each("", lambda one: one.parameters)),
     ]
-    for k, held in enumerate(priors[0]["held_out"]):
-        kind = f"{held['kind']}s left out"
+    for k, held in enumerate(first.held_out):
+        density = less_best(lambda one, k=k: one.held_out[k].log_density)
         rows += [
-            (f"{kind}: ln p less the best", *less_best("held_out", k, "log_density")),
-            (f"{kind}: chi2 of {held['n']}", *each(".0f", "held_out", k, "chi2")),
+            (f"{held.kind}s left out: ln p less the best", *density),
+            (
+                f"{held.kind}s left out: chi2 of {held.n}",
+                *each(".0f", lambda one, k=k: one.held_out[k].chi2),
+            ),
         ]
-    for key, words in (("instrument", "no sky explains"), ("prior", "of the sky")):
-        pairs = zip(each(".0f", f"chi2_{key}"), each(".0f", f"degrees_{key}"), strict=True)
-        rows.append((f"chi2 {words}", *(f"{chi2} of {degrees}" for chi2, degrees in pairs)))
-    if not all(one["coverage"] for one in priors):
+    for key, words in (("instrument", "no sky explains"), ("rest", "of the sky")):
+        parts = [getattr(one, key) for one in priors]
+        rows.append((f"chi2 {words}", *(f"{x.chi2:.0f} of {x.degrees:.0f}" for x in parts)))
+    if not first.coverage:
         return header, rows
-    held = (("68% hold", "held_68", ".1%"), ("95% hold", "held_95", ".1%"))
-    for k, part in enumerate(priors[0]["coverage"]):
-        rows += [
-            (f"{w}, {part['name']}", *each(f, "coverage", k, key))
-            for w, key, f in (*held, ("rms pull", "rms", ".2f"))
-        ]
-    rows.append(("largest pull", *each(".1f", "coverage", -1, "largest")))
-    rows.append(("rms error [K]", *each(",.0f", "errors", -1, "rms_error_k")))
-    for k, found in enumerate(priors[0]["snr"]):
-        rows.append((f"SNR at ell {found['ell']}", *each(".1f", "snr", k, "snr")))
+    for k, part in enumerate(first.coverage):
+        for level, name in ((0.68, "68% hold"), (0.95, "95% hold")):
+            n = LEVELS.index(level)
+            held = each(".1%", lambda one, k=k, n=n: one.coverage[k].held[n])
+            rows.append((f"{name}, {part.name}", *held))
+        rows.append((f"rms pull, {part.name}", *each(".2f", lambda one, k=k: one.coverage[k].rms)))
+    rows.append(("largest pull", *each(".1f", lambda one: one.coverage[-1].largest)))
+    rows.append(("rms error [K]", *each(",.0f", lambda one: one.errors[-1].rms_error_k)))
+    for ell in first.snr:
+        rows.append((f"SNR at ell {ell}", *each(".1f", lambda one, ell=ell: one.snr[ell])))
     return header, rows

@@ -13,6 +13,7 @@ from lusee_bayes.core.progress import about_run
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.judge.convergence import warnings_of
+from lusee_bayes.results.summaries import SamplingSummary
 from lusee_bayes.sampling import mode
 from lusee_bayes.sky.galaxy import LANDMARKS
 from lusee_bayes.systematics.systematic import SKY
@@ -74,10 +75,10 @@ class SampleResult:
         """The few figures that matter, in one line."""
         table, figures = self.summary, self.figures()
         parts = [
-            f"{figures['chains']} x {figures['draws']} draws of {figures['program']}",
+            f"{figures.chains} x {figures.draws} draws of {figures.program}",
             f"R-hat at most {table['r_hat'].max():.4f}",
             f"bulk ESS at least {table['ess_bulk'].min():.0f}",
-            f"{figures['divergences']} divergences",
+            f"{figures.divergences} divergences",
         ]
         if self.gradients_per_second is not None:
             parts.append(f"{self.gradients_per_second:.0f} gradients/s")
@@ -86,22 +87,27 @@ class SampleResult:
     def lines(self) -> list[str]:
         """What a terminal shows."""
         table = self.summary.rename_axis("quantity").reset_index()
-        reasons = warnings_of({name: table[name].to_numpy() for name in table}, self.figures())
+        figures = self.figures()
+        reasons = warnings_of(
+            {name: table[name].to_numpy() for name in table},
+            chains=figures.chains,
+            divergences=figures.divergences,
+        )
         return [self.headline(), *reasons, *self.experiment.doubts]
 
-    def figures(self) -> dict[str, object]:
+    def figures(self) -> SamplingSummary:
         """What sampling.json tells: sizes, speeds, times, memory, versions."""
         stats = self.tree["sample_stats"]
         chains, draws = self.skies.shape[:2]
-        return {
-            "program": self.tree.attrs["program"],
-            "chains": chains,
-            "draws": draws,
-            "divergences": int(stats["diverging"].sum()),
-            "mean_acceptance": float(stats["acceptance_rate"].mean()),
-            "doubts": list(self.experiment.doubts),
-            "step_size": [float(x) for x in stats["step_size"].values[:, -1]],
-            "mean_steps": float(stats["n_steps"].mean()),
-            "gradients_per_second": self.gradients_per_second,
+        return SamplingSummary(
+            program=self.tree.attrs["program"],
+            chains=chains,
+            draws=draws,
+            divergences=int(stats["diverging"].sum()),
+            mean_acceptance=float(stats["acceptance_rate"].mean()),
+            doubts=list(self.experiment.doubts),
+            step_size=[float(x) for x in stats["step_size"].values[:, -1]],
+            mean_steps=float(stats["n_steps"].mean()),
+            gradients_per_second=self.gradients_per_second,
             **about_run(self.seconds),
-        }
+        )

@@ -8,6 +8,7 @@ import numpy as np
 
 from lusee_bayes.judge.levels import LEVELS
 from lusee_bayes.results.sample_result import SampleResult
+from lusee_bayes.results.summaries import CheckSummary, ValidationSummary
 from lusee_bayes.sampling.validation import Check, Comparison, Ranks
 
 # what a comparison has mode by mode
@@ -88,29 +89,17 @@ class ValidationResult:
         lines.append(f"| standard error | {errors} |")
         return "\n".join(lines) + "\n"
 
-    def as_json(self) -> dict[str, object]:
-        """validation.json: every check, mode by mode where there are modes."""
-        found, ranks = self.comparison, self.ranks
-        return {
-            "passed": self.passed,
-            "checks": [
-                {
-                    "name": check.name,
-                    "value": check.value,
-                    "lower": check.lower if np.isfinite(check.lower) else None,
-                    "upper": check.upper if np.isfinite(check.upper) else None,
-                    "passed": check.passed,
-                    "meaning": check.meaning,
-                }
-                for check in self.checks
-            ],
-            **{name: getattr(found, name).tolist() for name in OF_MODES},
-            "coverage": {
-                name: {f"{p:g}": share for p, share in levels.items()}
-                for name, levels in ranks.coverage().items()
-            },
-            "p_values": dict(zip(ranks.names, ranks.p_values().tolist(), strict=True)),
-        }
+    def summary(self) -> ValidationSummary:
+        """validation.json."""
+        ranks = self.ranks
+        levels = ranks.coverage().items()
+        return ValidationSummary(
+            passed=self.passed,
+            checks=[CheckSummary.model_validate(check) for check in self.checks],
+            modes={name: getattr(self.comparison, name).tolist() for name in OF_MODES},
+            coverage={name: {f"{p:g}": x for p, x in shares.items()} for name, shares in levels},
+            p_values=dict(zip(ranks.names, ranks.p_values().tolist(), strict=True)),
+        )
 
 
 def calibration_check(ranks: Ranks) -> Check:

@@ -14,32 +14,51 @@ means E and covariance V of z, becomes that given all data (:mod:`.amplitudes`) 
     mean of m + G (E' - E),    covariance of m + G (V' - V) G^T,    G = Cov(m, z) V^-1,
 
 since m depends on other channels through z alone, and so do ground and gains.
+
+Unfinished work is kept in files: ``DIR/channels/25.information.nc`` holds what its data say,
+``25.result.nc`` its posterior. So memory stays bounded, and an interrupted run goes on where it
+was. Files of other scenarios or data are made anew. A joint posterior adds up what the files of all
+channels say.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+import json
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
+import xarray as xr
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import n_modes
+from lusee_bayes.core.files import replacing
+from lusee_bayes.core.formats import says
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment.data_files import Data, anchored, read_data
-from lusee_bayes.experiment.draws import deviations, draw_key, posterior_draws
-from lusee_bayes.experiment.experiment import build, explained, inform, with_truth
+from lusee_bayes.core.trees import from_tree, to_tree
+from lusee_bayes.core.version import __version__
+from lusee_bayes.experiment.data_files import Data, anchored, digest_of
+from lusee_bayes.experiment.experiment import build, draw_key
+from lusee_bayes.experiment.positive import lmax_of_fields, positive_skies
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.sky_terms import is_receiver
+from lusee_bayes.experiment.unknowns import Unknowns
 from lusee_bayes.judge.coverage import N_DRAWS
 from lusee_bayes.linear.amplitudes import Amplitudes, Tied, information_given, tie, told_by_others
-from lusee_bayes.linear.joint import channel_sky, component_posterior, paired
+from lusee_bayes.linear.information import Information
+from lusee_bayes.linear.joint import (
+    ComponentSums,
+    channel_sky,
+    component_posterior,
+    paired,
+    summed_information,
+)
 from lusee_bayes.linear.positive_joint import (
     COARSE_LMAX,
     MAX_ROUNDS,
@@ -48,82 +67,170 @@ from lusee_bayes.linear.positive_joint import (
     learn_laws,
     positive_sky,
 )
-from lusee_bayes.results.channel import ChannelResult, channel_of_information
-from lusee_bayes.results.cube import Components, CubeResult
-from lusee_bayes.runs.channel_files import (
-    ChannelFiles,
-    ChannelInformation,
-    ChannelsInFiles,
-    identity_of,
-    names_of,
-)
-from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
-from lusee_bayes.sky.positive_skies import PositiveSkies
-from lusee_bayes.sky.template import EmbeddedTemplate, galactic_share
+from lusee_bayes.results.channel import ChannelData, ChannelResult
+from lusee_bayes.results.channel_map import Conditioned, channel_result, conditioned
+from lusee_bayes.results.map_files import information_file, read_information
+from lusee_bayes.results.map_result import Components, MapResult
+from lusee_bayes.runs.cost import measured_experiment
+from lusee_bayes.sky.spectral_prior import SpectralPrior
+from lusee_bayes.systematics.receivers import is_receiver
 
-# highest ell of the fields, over that of the map
-FIELDS = 1.5
-# most fields' modes: every round factorises their matrix
-MOST_UNKNOWNS = 10_000
+T = TypeVar("T")
+CHANNELS = "channels"
 
 
-def lmax_of_fields(scenario: Scenario, lmax: int | None = None) -> int:
-    """Choose the highest ell of the fields: 1.5 times that of the map, if they can be solved for.
-
-    Structure that a map does not resolve still changes it where the sky is steep.
+class ChannelFiles:
+    """The files of a run's channels.
 
     Parameters
     ----------
-    scenario : Scenario
-        Of positive joint skies.
-    lmax : int, optional
-        Of the map; by default the scenario's.
+    folder : Path
+        Of the run.
+    identity : str
+        Of the run (:func:`identity_of`), whose files alone are taken up again.
+    """
+
+    def __init__(self, folder: Path, identity: str):
+        self.folder = folder / CHANNELS
+        self.identity = identity
+
+    def path(self, scenario: Scenario, kind: str) -> Path:
+        """Of the ``information`` or the ``result`` of a channel."""
+        return self.folder / f"{scenario.frequency_mhz:.15g}.{kind}.nc"
+
+    def has(self, scenario: Scenario, kind: str) -> bool:
+        """Whether it is there, whole and of this run."""
+        return says(self.path(scenario, kind), {"identity": self.identity})
+
+    def write(self, scenario: Scenario, kind: str, value: Any) -> None:
+        """Write a dataclass whole or not at all."""
+        with replacing(self.path(scenario, kind)) as partial:
+            tree = to_tree(value)
+            tree.attrs["identity"] = self.identity
+            tree.to_netcdf(partial, engine="h5netcdf")
+
+    def read(self, scenario: Scenario, kind: str, of: type[T], part: str = "/") -> T:
+        """Read what was written, or a part of it by its path."""
+        path = self.path(scenario, kind)
+        with xr.open_datatree(path, engine="h5netcdf") as tree:
+            return from_tree(of, tree[part], str(path))
+
+    def arrays(self, scenario: Scenario, kind: str, *names: str) -> list[np.ndarray]:
+        """Read some arrays of it, by their paths."""
+        with xr.open_datatree(self.path(scenario, kind), engine="h5netcdf") as tree:
+            return [np.asarray(tree[name]) for name in names]
+
+
+def identity_of(scenario: Scenario, data: Data | None, *others: object) -> str:
+    """Of all that the results of a run depend on: scenario, data, others, and the package.
 
     Raises
     ------
     InputError
-        If fields of the map's own lmax are too many unknowns.
+        If there are no data at the path.
     """
-    lmax = scenario.lmax if lmax is None else lmax
-    n_fields = len(scenario.spectral.fields)
-    highest = int(np.sqrt(MOST_UNKNOWNS / n_fields)) - 1
-    if highest < lmax:
-        raise InputError(
-            f"positive joint skies of lmax {lmax} have {n_fields * n_modes(lmax)} unknowns, more "
-            f"than the {MOST_UNKNOWNS} of one solution; use lmax={highest}, fewer "
-            "spectral.fields, or spectral.model=components"
-        )
-    return min(round(FIELDS * lmax), highest)
+    parts = [scenario.to_yaml(), *map(str, others), __version__]
+    if data is not None:
+        parts.append(digest_of(data))
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
-def positive_skies(scenario: Scenario) -> PositiveSkies:
-    """The skies of a scenario's channels as functions of the fields.
+@dataclass(frozen=True)
+class ChannelInformation:
+    """What a channel's data say, with what it takes to make a posterior of it and to judge it.
 
-    Parameters
+    Attributes
     ----------
-    scenario : Scenario
-        Of positive joint skies.
-
-    Raises
-    ------
-    InputError
-        As :func:`lmax_of_fields`.
+    information : Information
+    known : ChannelData
+    unknowns : Unknowns or None
+        Receivers, ground and gain table given the sky, where the model has them.
+    sky : (modes,) array
+        The scenario's model sky, in K.
     """
-    section, frequencies, lmax = scenario.spectral, scenario.frequencies_mhz, scenario.lmax
-    sources = None
-    if section.sources:
-        sources = np.array([[s.modes(f, lmax) for s in BRIGHT_SOURCES] for f in frequencies])
-    return PositiveSkies.of(
-        np.array(frequencies),
-        [EmbeddedTemplate(f) for f in frequencies],
-        lmax,
-        section.fields,
-        reference_mhz=section.reference_mhz,
-        turnover_mhz=section.turnover_mhz,
-        sources=sources,
-        weight=galactic_share,
-        lmax_fields=lmax_of_fields(scenario),
-    )
+
+    information: Information
+    known: ChannelData
+    unknowns: Unknowns | None
+    sky: Float[np.ndarray, " mode"]
+
+
+# channels that one task adds up, one after the other
+BLOCK = 4
+
+
+@dataclass(frozen=True)
+class ChannelsInFiles:
+    """Channels whose information is read from files, by whatever carries out the tasks.
+
+    Attributes
+    ----------
+    channels : tuple of Scenario
+        Of the whole run.
+    files : ChannelFiles
+        With the information of every channel.
+    engine : Engine
+    stages : Stages
+        Told what is being done.
+    """
+
+    channels: tuple[Scenario, ...]
+    files: ChannelFiles
+    engine: Engine
+    stages: Stages
+
+    def each(
+        self,
+        function: Callable[[int, Information], dict[str, np.ndarray]],
+        shapes: dict[str, tuple[int, ...]],
+    ) -> dict[str, np.ndarray]:
+        """Call a function with number and information of every channel; its arrays, stacked."""
+        files, channels = self.files, self.channels
+
+        def call(number: int) -> dict[str, np.ndarray]:
+            return function(number, _information(files, channels[number]))
+
+        numbers = range(len(channels))
+        tasks = Tasks(call, numbers, [names_of(channels[k : k + 1]) for k in numbers])
+        found = self.engine.each(tasks, self.stages, "joint sums")
+        return {name: np.stack([np.asarray(one[name]) for one in found]) for name in shapes}
+
+    def summed(
+        self,
+        prior: SpectralPrior,
+        reference: Float[np.ndarray, "channels modes"],
+        function: Callable[[int, Information], Information],
+    ) -> Information:
+        """What a function of every channel's information says of the component maps."""
+        files, channels = self.files, self.channels
+
+        def add(numbers: range) -> ComponentSums:
+            sums = ComponentSums.empty(prior, reference)
+            for number in numbers:
+                information = function(number, _information(files, channels[number]))
+                sums = summed_information(sums, prior, number, information)
+            return on_host(sums)
+
+        # the same blocks, and the same tree of them, whatever carries out the tasks
+        blocks = [
+            range(first, min(first + BLOCK, len(channels)))
+            for first in range(0, len(channels), BLOCK)
+        ]
+        names = [names_of(channels[block.start : block.stop]) for block in blocks]
+        tasks = Tasks(add, blocks, names)
+        return self.engine.reduced(
+            tasks, ComponentSums.plus, self.stages, "joint sums"
+        ).information()
+
+
+def names_of(channels: tuple[Scenario, ...]) -> str:
+    """What one channel, or neighbouring ones, are called: 25 MHz, or 25 to 28 MHz."""
+    first, last = (f"{c.frequency_mhz:g}" for c in (channels[0], channels[-1]))
+    return f"{first} MHz" if len(channels) == 1 else f"{first} to {last} MHz"
+
+
+def _information(files: ChannelFiles, channel: Scenario) -> Information:
+    return files.read(channel, "information", Information, "information")
 
 
 def positive_mode(scenario: Scenario, channels: ChannelsInFiles, stages: Stages) -> PositiveMode:
@@ -181,7 +288,7 @@ def solve_components(
         mode = positive_mode(scenario, at_hand, stages)
         prior, posterior, chi2 = mode.prior, mode.posterior, mode.energy
     else:
-        names = ("Information.reference", "ChannelInformation.sky")
+        names = ("information/reference", "sky")
         small = [files.arrays(channel, "information", *names) for channel in channels]
         reference, skies = map(np.array, zip(*small, strict=True))
         prior = scenario.spectral.prior(np.array(scenario.frequencies_mhz), skies)
@@ -214,25 +321,30 @@ class ChannelAlone:
 
     Attributes
     ----------
-    known : ChannelInformation
-    mean : (modes,) array
-        In K.
-    covariance : (modes, modes) array
-        In K^2.
-    draws : (n, modes) array
-        Less the mean, in K.
-    compared : (more, modes) array
-        Draws less the mean that coverage is compared with, in K; none where no truth is known.
-    numbers : dict of float
-        log_evidence, information_bits, chi2_model and refinement, as in :class:`.ChannelResult`.
+    known : ChannelData
+    information : Information
+        Of its own data.
+    unknowns : Unknowns
+        Receivers, ground and gain table given the sky.
+    mean, covariance : (modes,) and (modes, modes) array
+        In K and K^2.
+    deviations : (all, modes) array
+        Draws less the mean, those that are kept first, then those that coverage is compared with,
+        in K.
+    n_draws : int
+        That are kept.
+    figures : dict
+        :meth:`.Conditioned.figures`.
     """
 
-    known: ChannelInformation
-    mean: Float[np.ndarray, " modes"]
-    covariance: Float[np.ndarray, "modes modes"]
-    draws: Float[np.ndarray, "n modes"]
-    compared: Float[np.ndarray, "more modes"]
-    numbers: dict[str, float]
+    known: ChannelData
+    information: Information
+    unknowns: Unknowns
+    mean: Float[np.ndarray, " mode"]
+    covariance: Float[np.ndarray, "mode mode_2"]
+    deviations: Float[np.ndarray, "all mode"]
+    n_draws: int
+    figures: dict[str, float | bool]
 
     def receivers(self) -> tuple[Float[np.ndarray, " ports"], Float[np.ndarray, "ports ports"]]:
         """E and V of the receivers' powers, in prior standard deviations."""
@@ -240,12 +352,11 @@ class ChannelAlone:
         return told.mean[own], told.covariance[np.ix_(own, own)]
 
     def _told(self) -> Amplitudes:
-        return self.known.observed.unknowns.amplitudes.integrated(self.mean, self.covariance)
+        return self.unknowns.amplitudes.integrated(self.mean, self.covariance)
 
     def _own(self) -> Int[np.ndarray, " ports"]:
         """Which unknowns are powers of receivers."""
-        rows = self.known.observed.unknowns.rows
-        return np.flatnonzero([is_receiver(row["unknown"]) for row in rows])
+        return np.flatnonzero([is_receiver(row["unknown"]) for row in self.unknowns.rows])
 
     def tied(
         self,
@@ -261,7 +372,7 @@ class ChannelAlone:
         mean, covariance : (ports,) and (ports, ports) array
             E' and V' of its receivers' powers.
         draws : (all, ports) array
-            Of these, for ``draws`` and ``compared``.
+            Of these, for ``deviations``.
         key : PRNG key
             For the powers that go with the channel's own draws.
         """
@@ -271,33 +382,32 @@ class ChannelAlone:
         moved = self.mean + gain @ (mean - e)
         left = self.covariance + gain @ (covariance - v) @ gain.T
         # powers that go with the channel's own draws, less their mean
-        amplitudes = self.known.observed.unknowns.amplitudes
+        amplitudes = self.unknowns.amplitudes
         inner = amplitudes.covariance[np.ix_(own, own)]
-        deviations = np.concatenate([self.draws, self.compared])
-        normals = np.asarray(jax.random.normal(key, (len(deviations), len(own))))
+        normals = np.asarray(jax.random.normal(key, (len(self.deviations), len(own))))
         variances, axes = np.linalg.eigh(inner)
         normals = (normals * np.sqrt(np.maximum(variances, 0.0))) @ axes.T
-        with_them = normals - deviations @ amplitudes.pull[own].T
-        deviations = deviations + (draws - mean - with_them) @ gain.T
+        with_them = normals - self.deviations @ amplitudes.pull[own].T
+        deviations = self.deviations + (draws - mean - with_them) @ gain.T
         # what the other channels tell of this one's unknowns
         n = len(amplitudes.mean)
         precision, vector = np.zeros((n, n)), np.zeros(n)
         precision[np.ix_(own, own)], vector[own] = told_by_others(e, v, mean, covariance)
-        unknowns = replace(
-            self.known.observed.unknowns, amplitudes=amplitudes.given(precision, vector)
-        )
+        unknowns = replace(self.unknowns, amplitudes=amplitudes.given(precision, vector))
         sky_share = np.linalg.solve(v, (np.linalg.solve(v, v - inner)).T)
         gained = np.linalg.slogdet(np.eye(len(own)) + (covariance - v) @ sky_share)[1]
-        n_draws = len(self.draws)
-        bits = self.numbers["information_bits"] - 0.5 * gained / np.log(2.0)
-        return channel_of_information(
-            replace(self.known.observed, unknowns=unknowns),
-            information_given(self.known.information, amplitudes, precision, vector),
+        bits = self.figures["information_bits"] - 0.5 * gained / np.log(2.0)
+        information = information_given(self.information, amplitudes, precision, vector)
+        skies = moved + deviations[: self.n_draws]
+        return channel_result(
+            self.known,
             moved,
             left,
-            moved + deviations[:n_draws],
-            compared=deviations[n_draws:] if len(self.compared) else None,
-            **(self.numbers | {"information_bits": float(bits)}),
+            skies,
+            information.log_likelihood(skies),
+            deviations[self.n_draws :],
+            unknowns=unknowns.report(moved, left),
+            **(self.figures | information.fit(moved, left) | {"information_bits": float(bits)}),
         )
 
 
@@ -327,11 +437,11 @@ def tie_receivers(scenario: Scenario, channels: Sequence[Scenario], files: Chann
     """
     means, covariances, n_draws = [], [], 0
     for channel in channels:
-        alone = files.read(channel, "alone")
+        alone = files.read(channel, "alone", ChannelAlone)
         mean, covariance = alone.receivers()
         means.append(mean)
         covariances.append(covariance)
-        n_draws = len(alone.draws) + len(alone.compared)
+        n_draws = len(alone.deviations)
     own = jax.random.fold_in(draw_key(scenario), TIED)
     normals = np.asarray(jax.random.normal(own, (n_draws, sum(map(len, means)))))
     frequencies = np.array([channel.frequency_mhz for channel in channels])
@@ -346,37 +456,44 @@ def _write_tied_sky(
     channel = channels[number]
     if files.has(channel, "result"):
         return
-    alone = files.read(channel, "alone")
+    alone = files.read(channel, "alone", ChannelAlone)
     key = jax.random.fold_in(draw_key(channel), TIED + 1)
     found = alone.tied(tied.mean[number], tied.covariance[number], tied.draws[:, number], key)
     files.write(channel, "result", found)
 
 
-def cube_result(
+def map_channels(
     scenario: Scenario,
     folder: Path,
     *,
     data: Data | None = None,
     truth: bool = False,
+    earlier: str | Path | None = None,
+    thorough: bool = False,
     engine: Engine | None = None,
     stages: Stages | None = None,
-) -> CubeResult:
+) -> MapResult:
     """Work out all channels, going on from what an interrupted run has left in ``folder``.
 
     Where receivers have smooth spectra, each channel is worked out alone, and then given what the
-    others tell of its receivers (:mod:`.claims`). A channel that cannot be mapped leaves
-    the others as they are: it is named in the result, and a joint posterior is that of the others.
+    others tell of its receivers. A channel that cannot be mapped leaves the others as they are: it
+    is named in the result, and a joint posterior is that of the others. Of a single frequency
+    nothing unfinished is kept.
 
     Parameters
     ----------
     scenario : Scenario
-        Of several frequencies.
+        Of one frequency or of several.
     folder : Path
         Of the run; unfinished work is kept in it.
     data : Visibilities, path, or sequence of them, optional
         Measured; without them the scenario's own are simulated.
     truth : bool
         The data are of the scenario's own sky.
+    earlier : path, optional
+        Folder of a run that has kept its information, to whose data these are added.
+    thorough : bool
+        Judge groups of data and try the usual mistakes even if the data fit.
     engine : Engine, optional
         What carries out the channels; by default this process.
     stages : Stages, optional
@@ -385,52 +502,64 @@ def cube_result(
     Raises
     ------
     InputError
-        For a scenario without frequencies, if no channel can be mapped, or if too few of them can
-        for a joint posterior.
+        If no channel can be mapped, if too few of them can for a joint posterior, or as
+        :func:`.conditioned`.
     """
-    engine, stages = engine or ThisProcess(), stages or Stages()
-    engine.work_in(folder)
-    if not scenario.frequencies_mhz:
-        raise InputError("the scenario names no frequencies_mhz; give --frequencies")
-    n_draws = scenario.output.draws
+    engine, stages, single = engine or ThisProcess(), stages or Stages(), scenario.single
     # workers may have other folders of their own
-    files = ChannelFiles(folder.resolve(), identity_of(scenario, data, truth, n_draws))
-    channels = tuple(channel.anchored() for channel in scenario.channels())
     data = None if data is None else anchored(data)
-    names = [names_of((channel,)) for channel in channels]
-    tied = scenario.ties_receivers
+    kept = None if earlier is None else information_file(earlier)
+
+    def condition(channel: Scenario, told: Stages) -> Conditioned:
+        before = None if kept is None else read_information(kept, channel)
+        information = None if before is None else before.information
+        make = partial(build, earlier=information)
+        experiment = measured_experiment(channel, data, told, truth=truth, make=make)
+        return conditioned(experiment, before, told)
+
+    if single:
+        made = condition(scenario, stages)
+        known = made.known(stages, alone=True, thorough=thorough)
+        return MapResult(scenario, (made.result(known, stages),), seconds=stages.seconds)
+    engine.work_in(folder)
+    n_draws = scenario.output.draws
+    digest = None if kept is None else digest_of(kept)
+    identity = identity_of(scenario, data, truth, digest, thorough)
+    files = ChannelFiles(folder.resolve(), identity)
+    channels = tuple(channel.anchored() for channel in scenario.channels())
+    names, tied = [names_of((channel,)) for channel in channels], scenario.ties_receivers
     wanted = "information" if scenario.joint else "alone" if tied else "result"
 
     def observe(channel: Scenario) -> None:
         if files.has(channel, wanted):
             return
-        experiment = build(channel, None if data is None else read_data(data, channel))
-        if truth:
-            experiment = with_truth(experiment)
-        with explained(experiment):
-            information, inference = inform(experiment)
-        known = ChannelInformation.of(experiment, information, inference)
+        silent = Stages()
+        made = condition(channel, silent)
+        known = made.known(silent, alone=False, thorough=thorough)
         if scenario.joint:
-            files.write(channel, wanted, known)
-            return
-        posterior = on_host(inference.posterior)
-        mean, covariance = posterior.mean, posterior.covariance()
-        draws = posterior_draws(experiment, posterior, n_draws)
-        compared = None if known.observed.truth is None else deviations(experiment, posterior)
-        numbers = {
-            "log_evidence": float(posterior.log_evidence),
-            "information_bits": float(posterior.information_bits()),
-            "chi2_model": float(information.chi2(mean) + posterior.prior_chi2()),
-            "refinement": float(posterior.refinement),
-        }
-        if tied:
-            rest = np.zeros((0, len(mean))) if compared is None else compared
-            alone = ChannelAlone(known, mean, covariance, draws - mean, rest, numbers)
+            sky = np.asarray(made.experiment.setup.sky.modes)
+            known = made.of_all(known)
+            found = ChannelInformation(made.information, known, made.unknowns, sky)
+            files.write(channel, wanted, found)
+        elif tied:
+            compared = made.compared()
+            deviations = [
+                made.draws - made.posterior.mean,
+                *([] if compared is None else [compared]),
+            ]
+            alone = ChannelAlone(
+                known,
+                made.information,
+                made.unknowns,
+                made.posterior.mean,
+                made.covariance,
+                np.concatenate(deviations),
+                n_draws,
+                made.figures(),
+            )
             files.write(channel, wanted, alone)
-            return
-        given = (known.observed, information, mean, covariance, draws)
-        found = channel_of_information(*given, compared=compared, **numbers)
-        files.write(channel, wanted, found)
+        else:
+            files.write(channel, wanted, made.result(known, silent))
 
     def refusal(channel: Scenario) -> str:
         try:
@@ -458,11 +587,11 @@ def cube_result(
         n_solved = max(n_draws, N_DRAWS) if known else n_draws
         components = solve_components(left, files, n_solved, engine, stages)
         # for workers of other processes
-        write = partial(_write_joint_sky, mapped, on_host(components), scenario, files, n_draws)
+        write = partial(_write_joint_sky, mapped, on_host(components), scenario, files)
         engine.each(Tasks(write, numbers, names), stages, "joint skies")
-    found = tuple(files.read(c, "result") for c in mapped)
-    tied_evidence = {"tie_log_evidence": tie_log_evidence}
-    return CubeResult(scenario, found, components, stages.seconds, unmapped, **tied_evidence)
+    found = tuple(files.read(c, "result", ChannelResult) for c in mapped)
+    seconds, tied_evidence = stages.seconds, {"tie_log_evidence": tie_log_evidence}
+    return MapResult(scenario, found, components, seconds, unmapped, **tied_evidence)
 
 
 def _without(unmapped: dict[float, str], scenario: Scenario) -> Scenario:
@@ -488,29 +617,33 @@ def _write_joint_sky(
     components: Components,
     scenario: Scenario,
     files: ChannelFiles,
-    n_draws: int,
     number: int,
 ) -> None:
-    channel, key = channels[number], draw_key(scenario)
+    channel, key, n_draws = channels[number], draw_key(scenario), scenario.output.draws
     if files.has(channel, "result"):
         return
-    known = files.read(channel, "information")
-    draws = components.draws
+    alone = files.read(channel, "information", ChannelInformation)
+    information, draws = alone.information, components.draws
     if components.mode is not None:
         spread = np.asarray(components.spread)
-        sky = positive_sky(
-            components.mode, number, known.information, spread, np.asarray(draws), key
-        )
+        sky = positive_sky(components.mode, number, information, spread, np.asarray(draws), key)
     else:
         means = (components.mean, components.spread, draws)
-        sky = channel_sky(components.prior, number, known.information, *means, key)
-    found = channel_of_information(
-        known.observed,
-        known.information,
+        sky = channel_sky(components.prior, number, information, *means, key)
+    skies = np.asarray(sky.draws[:n_draws])
+    report = None
+    if alone.unknowns is not None:
+        report = alone.unknowns.report(sky.mean, sky.covariance, joint=True)
+    found = channel_result(
+        alone.known,
         sky.mean,
         sky.covariance,
-        sky.draws[:n_draws],
-        compared=np.asarray(sky.draws) - np.asarray(sky.mean),
-        independent=known.information.reference,
+        skies,
+        information.log_likelihood(skies),
+        np.asarray(sky.draws) - np.asarray(sky.mean),
+        unknowns=report,
+        independent=information.reference,
+        covariance_kept=scenario.output.covariance,
+        **information.fit(sky.mean, sky.covariance),
     )
     files.write(channel, "result", found)

@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import Data
-from lusee_bayes.experiment.experiment import Experiment, infer, observed
+from lusee_bayes.experiment.experiment import Experiment, observed
 from lusee_bayes.experiment.rounds import about_sky, learned_prior, named_priors
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.setup import Setup
@@ -20,9 +19,8 @@ from lusee_bayes.linear.information import Information
 from lusee_bayes.report.comparison_page import comparison_page
 from lusee_bayes.report.figures.maps import curves_of_runs, maps_of_runs
 from lusee_bayes.report.figures.plans import priors
-from lusee_bayes.results.channel import channel_of_posterior
+from lusee_bayes.results.channel_map import conditioned
 from lusee_bayes.results.finished_runs import FinishedRun, Provenance, comparison_rows, read_runs
-from lusee_bayes.results.map_result import prior_sentence
 from lusee_bayes.results.prior_comparison import PriorComparison, UnderPrior
 from lusee_bayes.runs.cost import measured_experiment
 from lusee_bayes.runs.folder import (
@@ -30,7 +28,7 @@ from lusee_bayes.runs.folder import (
     Output,
     RunKind,
     RunOutcome,
-    json_file,
+    model_file,
     require_marginal,
     require_single_frequency,
     rows_file,
@@ -157,12 +155,12 @@ def _under(name: str, setup: Setup, experiment: Experiment, information: Informa
         learned = learned_prior(setup, setup.family, information)
         setup, evidence = replace(setup, prior=learned.prior), learned.log_evidence
     mapped = replace(experiment, setup=setup, learned=learned)
-    inference = infer(mapped)
-    model, posterior = inference.model, inference.posterior
-    channel = channel_of_posterior(mapped, inference, on_host(posterior).covariance())
+    made = conditioned(mapped)
+    channel = made.result(made.known(alone=False))
+    model, posterior = made.own.model, made.own.posterior
     return UnderPrior(
         name,
-        prior_sentence(mapped),
+        channel.prior,
         channel,
         evidence,
         0 if learned is None else len(learned.parameters),
@@ -175,7 +173,7 @@ def _under(name: str, setup: Setup, experiment: Experiment, information: Informa
 COMPARE_PRIORS = RunKind(
     "compare-priors",
     outputs=(
-        json_file("priors.json", lambda result: result.as_json()),
+        model_file("priors.json", lambda result: result.summary()),
         text_file("priors.md", lambda result: result.as_markdown()),
         SCENARIO,
         rows_file("priors.csv", lambda result: result.rows()),

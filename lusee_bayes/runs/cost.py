@@ -21,9 +21,9 @@ from lusee_bayes.core.progress import Stages, gigabytes, memory_limit
 from lusee_bayes.experiment.data_files import Data, read_data
 from lusee_bayes.experiment.experiment import Experiment, build, with_truth
 from lusee_bayes.experiment.leave_out import ARRAYS, MOST_MEMORY
+from lusee_bayes.experiment.positive import lmax_of_fields
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.runs.channels import lmax_of_fields
 
 # measured at lmax 12 to 80 and up to 3e5 data (docs/commands.md): what is there before anything is
 # computed, and what each datum takes from reading to the report

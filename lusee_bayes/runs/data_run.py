@@ -17,7 +17,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import require_new, transaction, user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming
-from lusee_bayes.experiment.data_files import Data, files_of, names_of_data, read_data
+from lusee_bayes.experiment.data_files import Data, names_of_data, read_data
 from lusee_bayes.experiment.experiment import Experiment, simulated
 from lusee_bayes.experiment.flight_data import reduce_files
 from lusee_bayes.experiment.flight_simulation import FlightSimulation, flight_of, simulate_flight
@@ -32,7 +32,7 @@ from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.instrument.waterfalls import NO_ROOM, write_four_port, write_waterfall
 from lusee_bayes.runs.cost import require_fits, require_resources, simulation_cost
 from lusee_bayes.runs.folder import RunKind, inputs_of, scenario_run
-from lusee_bayes.runs.forecasting import expected_posterior
+from lusee_bayes.runs.plan_run import expected_inference
 
 
 def run_simulate(
@@ -82,8 +82,7 @@ def run_simulate(
                 f"'{path}': netCDF files hold one frequency; with --frequencies, give -o a name "
                 "that ends in .fits"
             )
-        several = scenario.model_copy(update={"frequencies_mhz": tuple(frequencies_mhz)})
-        channels = several.channels()
+        channels = _at(scenario, frequencies_mhz).channels()
     experiments = [
         simulated(channel, stages=Stages(stages.console, verbose=stages.verbose))
         for channel in channels
@@ -94,6 +93,11 @@ def run_simulate(
         return data
     _write_waterfall(path, experiments, scenario)
     return data
+
+
+def _at(scenario: Scenario, frequencies_mhz: Sequence[float]) -> Scenario:
+    several = {"frequencies_mhz": tuple(frequencies_mhz)} if frequencies_mhz else {}
+    return scenario.model_copy(update=several)
 
 
 def _write_waterfall(path: Path, experiments: Sequence[Experiment], scenario: Scenario) -> None:
@@ -194,10 +198,12 @@ class FlightFiles:
     scenario: Path
     n_spectra: int
 
-    @property
-    def command(self) -> str:
-        """The command that maps them."""
-        return f"lusee-bayes map {self.scenario} --data {' '.join(map(str, self.sessions))}"
+    def lines(self) -> tuple[str, str]:
+        """What was written, and the command that maps it."""
+        return (
+            f"{self.n_spectra} spectra of {len(self.sessions)} sessions -> {self.scenario.parent}",
+            f"lusee-bayes map {self.scenario} --data {' '.join(map(str, self.sessions))}",
+        )
 
 
 def run_simulate_flight(
@@ -233,8 +239,7 @@ def run_simulate_flight(
     scenario, folder = load_scenario(scenario), user_path(folder)
     _require_no_sessions(folder, replace)
     stages = stages or Stages()
-    if frequencies_mhz:
-        scenario = scenario.model_copy(update={"frequencies_mhz": tuple(frequencies_mhz)})
+    scenario = _at(scenario, frequencies_mhz)
     with scenario_run(folder, FLIGHT, scenario, replace=replace) as run:
         made, place = simulate_flight(scenario, stages), run.path
         with transaction(place, FLIGHT.name, origin=run.origin) as stage:
@@ -417,11 +422,6 @@ def run_average(
             f"'{path}': averages have windows, for which luseepy's waterfalls have no room; give "
             "-o a name that does not end in .fits"
         )
-    if path.resolve() in [file.resolve() for file in files_of(data)]:
-        raise InputError(
-            f"'{path}': the averages would replace the data that they are made of; give -o "
-            "another name"
-        )
     require_new(path, replace=replace, inputs=inputs_of(scenario, data))
     if scenario.frequencies_mhz:
         raise InputError(
@@ -446,4 +446,4 @@ def run_average(
 
 
 def _bits(scenario: Scenario, data: Visibilities) -> float:
-    return float(expected_posterior(set_up(scenario, data))[1].information_bits())
+    return float(expected_inference(set_up(scenario, data)).posterior.information_bits())

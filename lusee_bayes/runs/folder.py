@@ -16,6 +16,7 @@ from typing import Any, Generic, TypeVar
 
 from matplotlib.figure import Figure
 from pandas import DataFrame
+from pydantic import BaseModel
 from xarray import Dataset, DataTree
 
 from lusee_bayes.core.arrays import use_compilation_cache
@@ -181,9 +182,9 @@ def text_file(name: str, text: Callable[[Any], str]) -> Output:
     return Output(lambda result, folder: (folder / name).write_text(text(result), encoding="utf-8"))
 
 
-def json_file(name: str, figures: Callable[[Any], Mapping[str, Any]]) -> Output:
-    """A file of JSON."""
-    return text_file(name, lambda result: json.dumps(figures(result), indent=2) + "\n")
+def model_file(name: str, figures: Callable[[Any], BaseModel]) -> Output:
+    """A pydantic model as JSON."""
+    return text_file(name, lambda result: figures(result).model_dump_json(indent=2) + "\n")
 
 
 def rows_file(name: str, rows: Callable[[Any], Sequence[Mapping[str, object]]]) -> Output:

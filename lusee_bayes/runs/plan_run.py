@@ -1,19 +1,373 @@
-"""A plan: the information in observations, without data."""
+"""A plan: forecasts of the information in observations, from the posterior covariance alone.
+
+No data are needed. A plan looks at variations of a scenario, by itself at those of turntable,
+duration, nights, duty cycle and lost antennas: turned in the same time and repeated at the same
+angles, so that a turn is compared with standing still for as long. Each forecast is kept in a file
+as soon as it is made.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
+import time
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
-from lusee_bayes.core.engine import Engine, ThisProcess
+import numpy as np
+from jaxtyping import Float
+
+from lusee_bayes.core.arrays import namespace
+from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.files import replacing
+from lusee_bayes.core.harmonics import sum_over_m
+from lusee_bayes.core.linalg import solve_lower
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.reading import naming
+from lusee_bayes.core.reading import naming, parse_yaml
+from lusee_bayes.core.version import __version__
+from lusee_bayes.experiment.instrument_sections import RunSection
+from lusee_bayes.experiment.model import model_about
+from lusee_bayes.experiment.rounds import Inference
+from lusee_bayes.experiment.scenario import Scenario, load_scenario
+from lusee_bayes.experiment.setup import Setup, set_up
+from lusee_bayes.instrument.products import DataLayout, all_products
+from lusee_bayes.judge.measures import effective_resolution_deg, prior_fraction_per_ell
+from lusee_bayes.linear.amplitudes import template_amplitudes
+from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.report.figures.plans import forecasts
-from lusee_bayes.results.forecast import Forecast, Variation, forecast_rows
-from lusee_bayes.runs.cost import posterior_cost, require_fits
+from lusee_bayes.results.forecast import AS_GIVEN, Forecast, Variation, forecast_rows
+from lusee_bayes.runs.cost import duration, posterior_cost, require_fits
 from lusee_bayes.runs.folder import RunKind, RunOutcome, inputs_of, origin_of, rows_file, run_folder
-from lusee_bayes.runs.forecasting import forecasts_of
+from lusee_bayes.systematics.context import Around
+
+
+def expected_snr_squared(posterior: Posterior) -> Float[np.ndarray, " ells"]:
+    """sum_m (S - C) / sum_m C for each ell, of a posterior over harmonic coefficients.
+
+    NaN at an ell where the prior has no power.
+    """
+    prior = sum_over_m(posterior.prior.variance())
+    left = sum_over_m(posterior.std() ** 2)
+    ratio = np.divide(prior, left, out=np.full_like(prior, np.nan), where=left > 0)
+    return ratio - 1.0
+
+
+def informed_modes(posterior: Posterior) -> int:
+    """How many eigen-directions of C relative to S keep less than half of the prior's variance.
+
+    Counted on the covariance of the whitened sky, whose eigenvalues lie between 0 and 1: on
+    Lambda, whose largest is 1e13, rounding would blur the threshold.
+    """
+    xp = namespace(posterior.lower)
+    lower = xp.tril(posterior.lower)
+    half = np.asarray(solve_lower(lower, xp.eye(lower.shape[0]), transpose=False))
+    return int((np.linalg.eigvalsh(half.T @ half) < 0.5).sum())
+
+
+def without_ports(setup: Setup, lost: Sequence[int]) -> Setup:
+    """The setup with every product of the ``lost`` ports flagged at all times.
+
+    Raises
+    ------
+    InputError
+        For a port that does not exist, or if none is left.
+    """
+    layout = setup.layout
+    n_ports = round(np.sqrt(layout.n_products))
+    for port in lost:
+        if not 0 <= port < n_ports:
+            raise InputError(f"there is no port {port} to lose; ports are 0 to {n_ports - 1}")
+    dead = np.array([p.i in lost or p.j in lost for p in all_products(n_ports)])
+    left = DataLayout.from_flags(~np.asarray(layout.present) | dead[:, None])
+    instrument = replace(setup.instrument, layout=left)
+    coupling = instrument.coupling_of(setup.beams)
+    return replace(setup, instrument=instrument, coupling=coupling)
+
+
+def expected_inference(setup: Setup) -> Inference:
+    """The model of a setup, and its posterior, of which all but the mean is known without data.
+
+    N is the model's, with marginalised systematics and noise levels from the modelled sky.
+    """
+    model, held = model_about(setup, Around())
+    # the covariance is that of any data; these are the shortest to write
+    return Inference(model, held, model.condition(np.zeros(model.n_data)), 1, Around())
+
+
+def expected_offsets(found: Inference) -> dict[str, float]:
+    """Expected standard deviations of clock and pointing, in the units that their names end with.
+
+    To first order about the scenario's sky and no offsets; empty where the model has none.
+    """
+    if found.offsets is None:
+        return {}
+    no_data = np.zeros(found.model.n_data)
+    columns = found.offsets.columns
+    amplitudes = template_amplitudes(found.model, found.posterior, no_data, columns)
+    return found.offsets.systematic.in_units(amplitudes.std)
+
+
+def forecast(variation: Variation) -> Forecast:
+    """Build A, S and N of a variation and take the numbers from its posterior covariance.
+
+    Raises
+    ------
+    InputError
+        With the variation's name, for whatever is wrong with its scenario.
+    """
+    try:
+        setup = set_up(variation.scenario)
+        if variation.lost:
+            setup = without_ports(setup, variation.lost)
+        found = expected_inference(setup)
+        posterior = found.posterior
+        return Forecast(
+            variation=variation,
+            days=float(setup.observation.live_s.sum()) / 86400.0,
+            n_data=setup.layout.size,
+            information_bits=float(posterior.information_bits()),
+            modes=informed_modes(posterior),
+            snr_squared=expected_snr_squared(posterior),
+            resolution_deg=effective_resolution_deg(prior_fraction_per_ell(posterior)),
+            offsets=expected_offsets(found),
+        )
+    except InputError as error:
+        raise InputError(f"{variation.source}, {variation.name}: {error}") from error
+
+
+def variations_of(
+    sources: Sequence[str], overrides: Sequence[str], vary: Sequence[str], stages: Stages
+) -> list[Variation]:
+    """List what a plan is to forecast: every scenario as it is, and its variations.
+
+    Parameters
+    ----------
+    sources : sequence of str
+        Files or names of scenarios.
+    overrides : sequence of str
+        ``key.path=value``, for all of them.
+    vary : sequence of str
+        ``key.path=value,value,...``; without it, :func:`default_variations`.
+    stages : Stages
+        Told which of these are left out, since they cannot be observed.
+
+    Raises
+    ------
+    InputError
+        If a scenario is given twice, and as :func:`given_variations`.
+    """
+    found: list[Variation] = []
+    for number, source in enumerate(sources):
+        if source in sources[:number]:
+            raise InputError(f"the scenario '{source}' is given twice; give each once")
+        if vary:
+            found += given_variations(source, vary, overrides)
+            continue
+        first, *others = default_variations(source, load_scenario(source, overrides))
+        found.append(first)
+        for one in others:
+            if (why := one.obstacle()) is None:
+                found.append(one)
+            else:
+                stages.say(f"  left out: {source}, {one.family}, {one.name}: {why}")
+    return found
+
+
+def given_variations(source: str, vary: Sequence[str], overrides: Sequence[str]) -> list[Variation]:
+    """The scenario as baseline, and with every value of every ``key.path=value,value,...``.
+
+    InputError if one of them is not of that form, or its values are not the scenario's.
+    """
+    found = [Variation(source, AS_GIVEN, AS_GIVEN, load_scenario(source, overrides))]
+    for text in vary:
+        key, _, listed = text.partition("=")
+        values = parse_yaml(f"[{listed}]", f"--vary {text}")
+        if not key or not isinstance(values, list) or not values:
+            raise InputError(
+                f"--vary takes key.path=value,value,... (as "
+                f"noise.radiometer.duty_cycle=0.25,0.5), got '{text}'"
+            )
+        for value in values:
+            change = f"{key}={json.dumps(value, default=str)}"
+            scenario = load_scenario(source, [*overrides, change])
+            found.append(Variation(source, key, f"{value}", scenario))
+    return found
+
+
+# one turn of the table
+TURN_DEG = 30.0
+# each run in so many parts, or all of them repeated so often
+PARTS = (1, 2, 3)
+CYCLES = (0.25, 0.5, 1.0, 2.0, 3.0)
+DUTY_CYCLES = (0.25, 0.5, 1.0)
+
+
+def default_variations(source: str, scenario: Scenario) -> list[Variation]:
+    """The scenario as it is, then turntable, duration, nights, duty cycle and lost antennas.
+
+    A schedule keeps its dates and angles.
+    """
+    families = {AS_GIVEN: {AS_GIVEN: scenario}}
+    if scenario.observation.schedule is None:
+        families |= families_of_runs(scenario)
+    families["duty cycle"] = {f"{duty:g}": with_duty_cycle(scenario, duty) for duty in DUTY_CYCLES}
+    found = [
+        Variation(source, family, name, varied)
+        for family, members in families.items()
+        for name, varied in members.items()
+    ]
+    n_ports = scenario.beam.n_ports
+    if n_ports > 1:
+        found += [
+            Variation(source, "antenna lost", f"port {port}", scenario, (port,))
+            for port in range(n_ports)
+        ]
+    return found
+
+
+def families_of_runs(scenario: Scenario) -> dict[str, dict[str, Scenario]]:
+    """The scenario with its runs turned, longer or shorter, or by night."""
+    runs = scenario.observation.runs
+    turned = [runs_repeated(runs, n, TURN_DEG) for n in PARTS[1:]]
+    families = {
+        "turned, same time": {angles(r): r for r in (parted(runs, n) for n in PARTS)},
+        "turned, more time": {f"{length(r)}: {angles(r)}": r for r in turned},
+        "duration": {length(r): r for r in (lasting(runs, cycles) for cycles in CYCLES)},
+        "nights only": {
+            length(r): tuple(changed(run, night_only=True) for run in r)
+            for r in (runs_repeated(runs, n, 0.0) for n in PARTS[:2])
+        },
+    }
+    return {
+        family: {
+            name: scenario.with_section("observation", runs=varied)
+            for name, varied in members.items()
+        }
+        for family, members in families.items()
+    }
+
+
+Runs = tuple[RunSection, ...]
+
+
+def changed(run: RunSection, **values: Any) -> RunSection:
+    """A run with other values, checked again."""
+    return RunSection(**{**run.model_dump(), **values})
+
+
+def parted(runs: Sequence[RunSection], parts: int) -> Runs:
+    """Every run in equal parts, each turned by 30 degrees more than the one before."""
+    return tuple(
+        changed(run, cycles=run.cycles / parts, turntable_deg=run.turntable_deg + part * TURN_DEG)
+        for run in runs
+        for part in range(parts)
+    )
+
+
+def runs_repeated(runs: Sequence[RunSection], times: int, turn_deg: float) -> Runs:
+    """All runs so many times, each time turned by ``turn_deg`` more."""
+    return tuple(
+        changed(run, turntable_deg=run.turntable_deg + number * turn_deg)
+        for number in range(times)
+        for run in runs
+    )
+
+
+def lasting(runs: Sequence[RunSection], cycles: float) -> Runs:
+    """The runs, longer or shorter by one factor, so that they last ``cycles`` together."""
+    factor = cycles / sum(run.cycles for run in runs)
+    return tuple(changed(run, cycles=run.cycles * factor) for run in runs)
+
+
+def angles(runs: Sequence[RunSection]) -> str:
+    """Their turntable angles, in words."""
+    return ", ".join(f"{run.turntable_deg:g}°" for run in runs)
+
+
+def length(runs: Sequence[RunSection]) -> str:
+    """How long they last, in words."""
+    cycles = sum(run.cycles for run in runs)
+    return f"{cycles:g} cycle{'' if cycles == 1.0 else 's'}"
+
+
+def with_duty_cycle(scenario: Scenario, duty_cycle: float) -> Scenario:
+    """The scenario with another duty cycle of the receivers."""
+    radiometer = scenario.noise.radiometer.model_copy(update={"duty_cycle": duty_cycle})
+    return scenario.with_section("noise", radiometer=radiometer)
+
+
+def kept_forecast(folder: Path, variation: Variation) -> Forecast:
+    """Read the forecast of a variation from its JSON file in a folder, or make and write it."""
+    path = folder / f"{_digest(variation)}.json"
+    if path.is_file():
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        return Forecast(variation, **kept | {"snr_squared": np.array(kept["snr_squared"])})
+    made = forecast(variation)
+    kept = vars(made) | {"snr_squared": made.snr_squared.tolist()}
+    del kept["variation"]
+    with replacing(path) as scratch:
+        scratch.write_text(json.dumps(kept), encoding="utf-8")
+    return made
+
+
+def _digest(variation: Variation) -> str:
+    """Of all that a forecast depends on."""
+    parts = [variation.scenario.to_yaml(), list(variation.lost), __version__]
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
+
+
+def forecasts_of(
+    variations: Sequence[Variation], folder: Path, engine: Engine, stages: Stages
+) -> list[Forecast]:
+    """Make a forecast of every variation; what is there twice is computed once.
+
+    Parameters
+    ----------
+    variations : sequence of Variation
+    folder : Path
+        Of unfinished work: what an interrupted plan has made is taken from it.
+    engine : Engine
+    stages : Stages
+        Told how many there are, and after the first about how long the others take.
+
+    Returns
+    -------
+    list of Forecast
+        In the order of the variations.
+
+    Raises
+    ------
+    InputError
+        As :func:`.forecast`.
+    """
+    # workers may have other folders of their own
+    anchored = [replace(v, scenario=v.scenario.anchored()) for v in variations]
+    different: dict[str, Variation] = {}
+    for variation in anchored:
+        different.setdefault(_digest(variation), variation)
+    stages.say(f"  {len(variations)} variations, {len(different)} of them different")
+    first, *others = different.values()
+    start = time.perf_counter()
+    with stages("first forecast"):
+        found = [kept_forecast(folder, first)]
+    if others:
+        longest = len(others) * (time.perf_counter() - start)
+        stages.say(f"  the other {len(others)} take about {duration(longest)}, or less")
+        names = [f"{other.source}, {other.name}" for other in others]
+        found += engine.each(
+            Tasks(partial(kept_forecast, folder), others, names), stages, "planning"
+        )
+    known = {_digest(one.variation): one for one in found}
+    return [
+        replace(known[_digest(there)], variation=here)
+        for here, there in zip(variations, anchored, strict=True)
+    ]
+
 
 UNFINISHED = "unfinished-forecasts"
 

@@ -36,7 +36,7 @@ from lusee_bayes.runs.folder import (
     RunFolder,
     RunKind,
     RunOutcome,
-    json_file,
+    model_file,
     netcdf_file,
     scenario_run,
     text_file,
@@ -46,8 +46,7 @@ from lusee_bayes.sampling.distributions import TimesStudentT
 from lusee_bayes.sampling.hmc import Chains, Checkpoints, Sampler, Whitening, sample
 from lusee_bayes.sampling.log_normal_program import coordinates_of
 from lusee_bayes.sampling.mode import laplace_approximation
-from lusee_bayes.sampling.program_checks import require_sampleable
-from lusee_bayes.sampling.programs import Program, load_program, predicts
+from lusee_bayes.sampling.programs import Program, load_program, predicts, require_sampleable
 from lusee_bayes.systematics.gain_drifts import SCALES
 from lusee_bayes.systematics.systematic import SKY, Chart, Systematic
 
@@ -317,7 +316,7 @@ SAMPLE_OUTPUTS = (
     Output(lambda run, folder: write_maps(folder, run.maps, run.experiment.scenario)),
     text_file("summary.csv", lambda run: run.summary.to_csv(index_label="quantity")),
     text_file("scenario.yaml", lambda run: run.experiment.scenario.to_yaml()),
-    json_file("sampling.json", lambda run: run.figures()),
+    model_file("sampling.json", lambda run: run.figures()),
 )
 
 # what the folder of a sampled program holds; a new file is one line here

@@ -14,7 +14,7 @@ from lusee_bayes.results.finished_runs import Provenance
 from lusee_bayes.results.sample_result import CHAINS
 from lusee_bayes.results.validation_result import ValidationResult
 from lusee_bayes.runs.cost import demand_of, measured_experiment, posterior_cost
-from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, json_file, text_file
+from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, model_file, text_file
 from lusee_bayes.runs.sample_run import RESUME, SAMPLE_OUTPUTS, sample_folder, sample_result
 from lusee_bayes.sampling.hmc import Sampler
 from lusee_bayes.sampling.least import require_draws, require_simulations
@@ -110,7 +110,7 @@ VALIDATION = RunKind(
     "validate",
     outputs=(
         *map(_of_sampled, SAMPLE_OUTPUTS),
-        json_file("validation.json", lambda result: result.as_json()),
+        model_file("validation.json", lambda result: result.summary()),
         text_file("validation.md", lambda result: result.as_markdown()),
     ),
     figures={

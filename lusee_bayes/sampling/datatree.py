@@ -12,18 +12,22 @@ import xarray as xr
 from numpyro.infer import Predictive
 
 from lusee_bayes.core import formats
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, mode_numbers
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
-from lusee_bayes.core.reading import reading, require_file
+from lusee_bayes.core.reading import reading
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sampling.hmc import Chains
-from lusee_bayes.sampling.programs import Program, collapsed_draws, is_collapsed, numpyro_promotion
+from lusee_bayes.sampling.programs import (
+    DATA,
+    Program,
+    collapsed_draws,
+    is_collapsed,
+    numpyro_promotion,
+)
 from lusee_bayes.systematics.systematic import SKY
 
-DATA = "data"
 # what a file of samples holds at least
 STATISTIC = ("chain", "draw")
 GROUPS = Layout(
@@ -89,74 +93,66 @@ def to_datatree(
     arguments = program.arguments(model) if arguments is None else arguments
     keys = jax.random.split(jax.random.fold_in(jax.random.key(seed), 1), 3)
     sites = dict(chains.sites)
-    collapsed = is_collapsed(program, arguments, data.data)
     n_chains, n_draws = next(iter(sites.values())).shape[:2]
     step = max(1, n_chains * n_draws // n_predictive)
+    thinned = {name: values[:, ::step] for name, values in sites.items()}
     with numpyro_promotion():
-        if collapsed:
-            sites[SKY] = collapsed_draws(program, arguments, data.data, sites, keys[0])
         prior = Predictive(program.model, num_samples=n_predictive)(keys[1], **arguments)
-        thinned = {name: values[:, ::step] for name, values in sites.items()}
-        if collapsed:
-            skies = thinned.pop(SKY)
-            replicated = collapsed_draws(program, arguments, data.data, thinned, keys[2], skies)
+        if is_collapsed(program, arguments, data.data):
+            given = (program, arguments, data.data)
+            sites[SKY] = collapsed_draws(*given, sites, keys[0])
+            replicated = collapsed_draws(*given, thinned, keys[2], sites[SKY][:, ::step])
         else:
-            again = Predictive(program.model, thinned, batch_ndims=2, return_sites=["data"])
-            replicated = np.asarray(again(keys[2], **arguments)["data"])
-    prior = {name: np.asarray(values)[None] for name, values in prior.items()}
+            again = Predictive(program.model, thinned, batch_ndims=2, return_sites=[DATA])
+            replicated = again(keys[2], **arguments)[DATA]
     constants = {
-        "prior_std": np.sqrt(np.asarray(model.prior.variance())),
-        "analytic_mean": np.asarray(posterior.mean),
-        "analytic_std": np.asarray(posterior.std()),
+        "prior_std": np.sqrt(model.prior.variance()),
+        "analytic_mean": posterior.mean,
+        "analytic_std": posterior.std(),
     }
     if data.truth is not None:
-        constants["truth"] = np.asarray(data.truth)
-    dims = {SKY: ["mode"], "data": ["datum"]}
+        constants["truth"] = data.truth
+    dims = {DATA: ["datum"], **{name: ["mode"] for name in (SKY, *constants)}}
     if sites.get("gains", np.empty(0)).ndim == 4:
         dims["gains"] = ["antenna", "sample"]
-    dims |= {name: ["mode"] for name in constants}
-    for name, value in (truth or {}).items():
-        if name in sites:
-            constants[f"true_{name}"] = np.asarray(value)
+    constants |= {f"true_{name}": value for name, value in (truth or {}).items() if name in sites}
     groups = {
         "posterior": sites,
         "sample_stats": chains.statistics,
-        "prior": {name: v for name, v in prior.items() if name in sites},
-        "prior_predictive": {"data": prior["data"]},
-        "posterior_predictive": {"data": replicated},
-        "observed_data": {"data": np.asarray(data.data)},
+        "prior": {name: values[None] for name, values in prior.items() if name in sites},
+        "prior_predictive": {DATA: prior[DATA][None]},
+        "posterior_predictive": {DATA: replicated},
+        "observed_data": {DATA: data.data},
         "constant_data": constants,
     }
     tree = arviz_base.from_dict(
-        groups,
+        jax.tree.map(np.asarray, groups),
         dims=dims,
         check_conventions=False,  # more chains than draws is unusual, not wrong
         attrs={"/": {"format": formats.SAMPLES, "program": program.name, **(attributes or {})}},
     )
-    tree["posterior_predictive"] = tree["posterior_predictive"].dataset.assign_coords(
-        draw=np.arange(n_draws)[::step]
-    )
+    predicted = tree["posterior_predictive"]
+    predicted.dataset = predicted.dataset.assign_coords(draw=np.arange(n_draws)[::step])
     return _with_coordinates(tree, model, data)
 
 
 def _with_coordinates(tree: xr.DataTree, model: LinearGaussian, data: Visibilities) -> xr.DataTree:
     """ell and m of every mode, product and time of every sample, and units."""
     ell, m = mode_numbers(lmax_of(model.prior.size))
-    times = data.observation.times.isot
-    labels = np.asarray(data.labels)
-    mode = {"ell": ("mode", ell), "m": ("mode", m)}
-    sample = {
-        "product": ("datum", labels[data.layout.product]),
-        "time": ("datum", np.asarray(times)[data.layout.time]),
+    coordinates = {
+        "ell": ("mode", ell),
+        "m": ("mode", m),
+        "product": ("datum", np.asarray(data.labels)[data.layout.product]),
+        "time": ("datum", np.asarray(data.observation.times.isot)[data.layout.time]),
     }
 
     def labelled(dataset: xr.Dataset) -> xr.Dataset:
-        for dimension, coordinates in [("mode", mode), ("datum", sample)]:
-            if dimension in dataset.dims:
-                dataset = dataset.assign_coords(coordinates)
-        for name in dataset.data_vars:
-            if {"mode", "datum"} & set(dataset[name].dims):
-                dataset[name].attrs["units"] = "K"
+        dataset = dataset.assign_coords(
+            {name: given for name, given in coordinates.items() if given[0] in dataset.dims}
+        )
+        for values in dataset.data_vars.values():
+            if {"mode", "datum"} & set(values.dims):
+                values.attrs["units"] = "K"
         return dataset
 
     return tree.map_over_datasets(labelled)
@@ -170,16 +166,9 @@ def read_datatree(path: str | Path) -> xr.DataTree:
     InputError
         For any other file.
     """
-    path, what = require_file(path, "samples"), "samples of lusee-bayes sample"
-    found = formats.format_of(path)
-    if found != formats.SAMPLES:
-        raise InputError(
-            f"{path} is not a file of samples: its format is '{found or 'absent'}', expected "
-            f"'{formats.SAMPLES}' (lusee-bayes sample writes one)"
-        )
-    with reading(path, what):
-        tree = xr.load_datatree(path, engine="h5netcdf")
-    GROUPS.checked(
-        path, {f"{g}.{v}": tree[g][v] for g in tree.children for v in tree[g]}, tree.attrs
-    )
+    formats.read_netcdf(path, formats.SAMPLES, Layout(GROUPS.what))
+    with reading(path, GROUPS.what) as file:
+        tree = xr.load_datatree(file, engine="h5netcdf")
+    arrays = {f"{g}.{name}": tree[g][name] for g in tree.children for name in tree[g]}
+    GROUPS.checked(path, arrays, tree.attrs)
     return tree

@@ -27,12 +27,12 @@ from numpyro.infer.util import potential_energy
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.sampling.hmc import whitened
 from lusee_bayes.sampling.mode import LaplaceApproximation, laplace_approximation
-from lusee_bayes.sampling.programs import Program, numpyro_promotion, side_by_side
+from lusee_bayes.sampling.programs import DATA, WHITE_SUFFIX, Program, numpyro_promotion
 
 # degrees of freedom of the proposal, whose tails are heavier than a Gaussian's
 TAILS = 7.0
-DATA = "data"
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,12 @@ def estimate_evidence(
         If the mode of the posterior is not found.
     """
     arguments = {**arguments, DATA: jnp.asarray(data)}
-    laplace = laplace_approximation(program.model, arguments).require_converged()
+    laplace = laplace_approximation(program.model, arguments)
+    if not bool(laplace.converged):
+        raise InputError(
+            f"no mode of the posterior was found in {int(laplace.steps)} steps (the last moved by "
+            f"{float(laplace.moved):.2g} standard deviations); narrow the priors"
+        )
     with numpyro_promotion():
         weights = np.asarray(_log_weights(program, arguments, laplace, n, jax.random.key(seed)))
     largest, relative = weights.max(), np.exp(weights - weights.max())
@@ -109,59 +114,10 @@ def _log_weights(
     proposal = dist.MultivariateStudentT(TAILS, jnp.zeros(size), jnp.eye(size))
     z = proposal.sample(key, (n,))
 
-    def one(z):
-        x = whitening.split(whitening.mean + whitening.root @ z)
-        return whitening.log_det - potential_energy(program.model, (), arguments, x)
-
-    return jax.lax.map(one, z) - proposal.log_prob(z)
-
-
-def pointwise(
-    program: Program,
-    arguments: Mapping[str, Any],
-    data: Float[Array, " data"],
-    sites: Mapping[str, np.ndarray],
-) -> Float[np.ndarray, "chains draws data"]:
-    """Compute ln p(d_i | all other data, sites) of every datum and draw.
-
-    Parameters
-    ----------
-    program : Program
-        The program.
-    arguments : mapping
-        What it asks for, without the data.
-    data : (data,) array
-        d, in K.
-    sites : mapping of (chains, draws, ...) array
-        Draws by site.
-
-    Raises
-    ------
-    InputError
-        If the program's data are not at a site Marginal or CorrelatedNormal.
-    """
-    shape = next(iter(sites.values())).shape[:2]
-    with numpyro_promotion():
-        given = {**arguments, DATA: jnp.asarray(data)}
-        rows = _pointwise(program, given, side_by_side(dict(sites)))
-    return np.asarray(rows).reshape(*shape, -1)
-
-
-@eqx.filter_jit
-def _pointwise(
-    program: Program, arguments: dict[str, Any], sites: dict[str, Array]
-) -> Float[Array, "draws data"]:
-    def one(values):
-        model = handlers.substitute(handlers.seed(program.model, 0), values)
-        fn = handlers.trace(model).get_trace(**arguments)[DATA]["fn"]
-        if not hasattr(fn, "leave_one_out"):
-            raise InputError(
-                f"the data of the program '{program.name}' follow {type(fn).__name__}; a "
-                "comparison needs Marginal or CorrelatedNormal"
-            )
-        return fn.leave_one_out(arguments[DATA])
-
-    return jax.lax.map(one, sites)
+    model = whitened(program.model, whitening)
+    site = f"{whitening.names[0]}{WHITE_SUFFIX}"
+    log_p = jax.lax.map(lambda z: -potential_energy(model, (), arguments, {site: z}), z)
+    return log_p - proposal.log_prob(z)
 
 
 def with_log_likelihood(
@@ -184,14 +140,33 @@ def with_log_likelihood(
     -------
     DataTree
         Its posterior has these draws only.
+
+    Raises
+    ------
+    InputError
+        If the program's data are not at a site Marginal or CorrelatedNormal.
     """
     posterior = tree["posterior"].dataset
     each = max(1, most // posterior.sizes["chain"])
-    step = -(-posterior.sizes["draw"] // each)
-    few = posterior.isel(draw=slice(None, None, step))
-    data = tree["observed_data"]["data"].values
+    few = posterior.isel(draw=slice(None, None, -(-posterior.sizes["draw"] // each)))
     sites = {str(name): value.values for name, value in few.data_vars.items()}
-    rows = pointwise(program, arguments, data, sites)
+    data = jnp.asarray(tree["observed_data"][DATA].values)
+
+    def predicted(values):
+        """ln p(d_i | all other data, sites) of every datum."""
+        model = handlers.substitute(handlers.seed(program.model, 0), values)
+        fn = handlers.trace(model).get_trace(**arguments, data=data)[DATA]["fn"]
+        if not hasattr(fn, "leave_one_out"):
+            raise InputError(
+                f"the data of the program '{program.name}' follow {type(fn).__name__}; a "
+                "comparison needs Marginal or CorrelatedNormal"
+            )
+        return fn.leave_one_out(data)
+
+    with numpyro_promotion():
+        flat = {name: jnp.reshape(v, (-1, *v.shape[2:])) for name, v in sites.items()}
+        rows = np.asarray(jax.lax.map(predicted, flat))
+    rows = rows.reshape(few.sizes["chain"], few.sizes["draw"], -1)
     return arviz_base.from_dict(
         {"posterior": sites, "log_likelihood": {DATA: rows}},
         dims={DATA: ["datum"]},

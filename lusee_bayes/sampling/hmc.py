@@ -13,8 +13,9 @@ not at all. The last file is the place to go on from; nothing else needs to be c
 from __future__ import annotations
 
 import json
+import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -31,11 +32,12 @@ from numpyro.infer.hmc import HMCState
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import is_traced
 from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.files import replacing
 from lusee_bayes.core.layouts import Layout
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.core.reading import read_json, reading
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.sampling.programs import latent_sites, numpyro_promotion, predicts
+from lusee_bayes.sampling.programs import WHITE_SUFFIX, latent_sites, numpyro_promotion, predicts
 from lusee_bayes.systematics.systematic import Chart
 
 # statistics of every draw, by their ArviZ names
@@ -70,10 +72,6 @@ class Chains:
         return int(self.statistics["n_steps"].sum())
 
 
-# the site of z is that of m with this appended
-WHITE_SUFFIX = "_white"
-
-
 class Whitening(eqx.Module):
     """Coordinates z of one or more sites, x = mean + R z, in which a posterior is round.
 
@@ -106,7 +104,7 @@ class Whitening(eqx.Module):
     chart: Chart | None = None
 
     def __check_init__(self):
-        n = sum(int(np.prod(shape)) for _, shape in self.sites)
+        n = sum(math.prod(shape) for _, shape in self.sites)
         if not is_traced(self.mean) and self.mean.shape != (n,):
             raise InputError(f"the sites have {n} values, the mean {self.mean.shape[0]}")
 
@@ -137,12 +135,9 @@ class Whitening(eqx.Module):
 
     def split(self, x: Float[Array, " unknowns"]) -> dict[str, Float[Array, "..."]]:
         """Split x by site, each in its shape."""
-        values, start = {}, 0
-        for name, shape in self.sites:
-            size = int(np.prod(shape))
-            values[name] = x[start : start + size].reshape(shape)
-            start += size
-        return values
+        ends = np.cumsum([math.prod(shape) for _, shape in self.sites])
+        parts = zip(self.sites, jnp.split(x, ends[:-1]), strict=True)
+        return {name: part.reshape(shape) for (name, shape), part in parts}
 
     def join(self, values: Mapping[str, Float[Array, "..."]]) -> Float[Array, " unknowns"]:
         """Join values by site to x."""
@@ -223,7 +218,7 @@ class _Given:
         return None, value
 
 
-IDENTITY_LAYOUT = Layout("the description of an unfinished run")
+IDENTITY_LAYOUT = Layout("the description of an unfinished run (else delete its folder)")
 IDENTITY = "run.json"
 CHUNK_GLOB = "chunk-*.npz"
 
@@ -237,45 +232,33 @@ class Chunk:
     iteration : int
         Iterations done at its end, warmup included.
     state : list of array
-        Leaves of the sampler's state.
+        Leaves of the sampler's state there.
     draws : dict of (draws, chains, ...) array
-        Draws of the chunk by name.
-    start : int
-        Iterations done before it.
+        Draws of the chunk by name; empty in warmup.
     """
 
     iteration: int
     state: list[np.ndarray]
     draws: dict[str, np.ndarray]
-    start: int = 0
 
-    def write(self, folder: Path) -> None:
-        """Write the chunk's file whole or not at all."""
-        arrays = {f"state:{i:03d}": leaf for i, leaf in enumerate(self.state)}
-        arrays |= {f"draws:{name}": values for name, values in self.draws.items()}
-        arrays["start:"] = np.array(self.start)
-        target = folder / f"chunk-{self.iteration:08d}.npz"
-        scratch = folder / f".partial-{target.name}"
-        with scratch.open("wb") as file:
-            np.savez(file, **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(scratch, target)
+    @property
+    def start(self) -> int:
+        """Iterations done before the first of its draws."""
+        return self.iteration - max(map(len, self.draws.values()), default=0)
 
     @classmethod
     def read(cls, path: Path) -> Chunk:
         """Read a chunk's file. InputError if it cannot be read."""
-        kinds: dict[str, dict[str, np.ndarray]] = {"start": {}, "state": {}, "draws": {}}
+        kinds: dict[str, dict[str, np.ndarray]] = {"state": {}, "draws": {}}
         try:
             with reading(path, "a checkpoint"), path.open("rb") as file, np.load(file) as arrays:
                 for key in arrays.files:
                     kind, name = key.split(":", 1)
                     kinds[kind][name] = arrays[key]
-                start = int(kinds["start"][""])
         except InputError as error:
             raise InputError(f"{error}; delete it to go on from the one before") from error
         state = [kinds["state"][name] for name in sorted(kinds["state"])]
-        return cls(_iteration(path), state, kinds["draws"], start)
+        return cls(_iteration(path), state, kinds["draws"])
 
 
 class Checkpoints:
@@ -300,97 +283,66 @@ class Checkpoints:
     def __init__(self, folder: str | Path, identity: dict[str, object], *, resume: bool):
         self.folder = Path(folder)
         described = json.loads(json.dumps(identity))
-        marker = self.folder / IDENTITY
+        marker, paths = self.folder / IDENTITY, self._paths()
+        if marker.exists() and not resume:
+            done = _iteration(paths[-1]) if paths else "no"
+            raise InputError(
+                f"'{self.folder}' holds an unfinished run ({done} iterations done); go on with "
+                "--resume, or delete the folder"
+            )
         if marker.exists():
-            self._require_same(_read_marker(marker), described, resume)
-        elif self._paths():
+            found = read_json(marker, IDENTITY_LAYOUT)
+            for name in sorted({*found, *described}):
+                if found.get(name) != described.get(name):
+                    raise InputError(
+                        f"the unfinished run in '{self.folder}' has another {name}: "
+                        f"{_short(found.get(name))}, now {_short(described.get(name))}; resume it "
+                        "with the same, or delete the folder"
+                    )
+        elif paths:
             raise InputError(
                 f"'{self.folder}' holds draws, but no {IDENTITY} that says of which run; delete "
                 "the folder"
             )
         else:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            scratch = self.folder / f".partial-{IDENTITY}"
-            scratch.write_text(json.dumps(described, indent=2) + "\n", encoding="utf-8")
-            os.replace(scratch, marker)
-
-    def _require_same(self, found: dict, described: dict, resume: bool) -> None:
-        if not resume:
-            chunks = self._paths()
-            done = _iteration(chunks[-1]) if chunks else "no"
-            raise InputError(
-                f"'{self.folder}' holds an unfinished run ({done} iterations done); go on with "
-                "--resume, or delete the folder"
-            )
-        for name in sorted({*found, *described}):
-            if found.get(name) != described.get(name):
-                raise InputError(
-                    f"the unfinished run in '{self.folder}' has another {name}: "
-                    f"{_short(found.get(name))}, now {_short(described.get(name))}; resume it with "
-                    "the same, or delete the folder"
-                )
+            with replacing(marker) as scratch:
+                scratch.write_text(json.dumps(described, indent=2) + "\n", encoding="utf-8")
 
     def _paths(self) -> list[Path]:
         return sorted(self.folder.glob(CHUNK_GLOB))
 
-    def last(self) -> Chunk | None:
-        """Return the last chunk; None if nothing is done yet."""
-        paths = self._paths()
-        return Chunk.read(paths[-1]) if paths else None
-
-    def append(self, iteration: int, state: list[Array], draws: dict[str, Array]) -> None:
-        """Keep what was sampled since the last call.
-
-        Parameters
-        ----------
-        iteration : int
-            Iterations done by now, warmup included.
-        state : list of array
-            Leaves of the sampler's state.
-        draws : dict of (draws, chains, ...) array
-            Draws since the last call by name.
-        """
-        paths = self._paths()
-        start = _iteration(paths[-1]) if paths else 0
-        arrays = {name: np.asarray(values) for name, values in draws.items()}
-        Chunk(iteration, [np.asarray(leaf) for leaf in state], arrays, start).write(self.folder)
-
-    def draws(self) -> dict[str, np.ndarray]:
-        """Return all draws so far, (chains, draws, ...) by name.
+    def chunks(self) -> list[Chunk]:
+        """Read all chunks so far.
 
         Raises
         ------
         InputError
-            If a chunk is missing.
+            If one cannot be read, or is missing before the last.
         """
         chunks = [Chunk.read(path) for path in self._paths()]
         done = 0
         for chunk in chunks:
-            if chunk.start != done:
+            if chunk.draws and chunk.start != done:
                 raise InputError(
                     f"'{self.folder}' lacks the draws of iterations {done} to {chunk.start}; "
                     "delete the chunks behind them to go on from there"
                 )
             done = chunk.iteration
-        return _by_chain([chunk.draws for chunk in chunks])
+        return chunks
 
-
-def _by_chain(parts: list[dict[str, Array]]) -> dict[str, np.ndarray]:
-    """Draws (chains, draws, ...) by name, of parts (draws, chains, ...) one after the other."""
-    kept = [part for part in parts if part]
-    names = kept[0] if kept else ()
-    return {n: np.concatenate([np.asarray(k[n]) for k in kept]).swapaxes(0, 1) for n in names}
+    def append(self, chunk: Chunk) -> None:
+        """Write the next chunk's file whole or not at all."""
+        arrays = {f"state:{i:03d}": leaf for i, leaf in enumerate(chunk.state)}
+        arrays |= {f"draws:{name}": values for name, values in chunk.draws.items()}
+        path = self.folder / f"chunk-{chunk.iteration:08d}.npz"
+        with replacing(path) as scratch, scratch.open("wb") as file:
+            np.savez(file, **arrays)
+            file.flush()
+            os.fsync(file.fileno())
 
 
 def _iteration(path: Path) -> int:
     return int(path.stem.removeprefix("chunk-"))
-
-
-def _read_marker(marker: Path) -> dict[str, object]:
-    try:
-        return read_json(marker, IDENTITY_LAYOUT)
-    except InputError as error:
-        raise InputError(f"{error}; delete its folder") from error
 
 
 def _short(value: object) -> str:
@@ -521,39 +473,36 @@ def sample(
         If ``whitening`` has a site that the program does not sample.
     """
     run = _Run(program, dict(arguments), sampler, whitening)
-    done, state, kept = 0, None, []
-    previous = None if checkpoints is None else checkpoints.last()
+    chunks = [] if checkpoints is None else checkpoints.chunks()
+    done, total = 0, sampler.warmup + sampler.draws
     with numpyro_promotion():
         state = run.start()
         if not bool(jnp.isfinite(state.potential_energy).all()):
-            raise InputError(NOT_FINITE)
-        if previous is not None:
-            done, state = previous.iteration, run.restore(state, previous.state)
-        total = sampler.warmup + sampler.draws
+            raise InputError(
+                "the density is NaN or infinite where the chains begin; look for logarithms and "
+                "roots of negative numbers, for scales of zero, and for data outside a support"
+            )
+        if chunks:
+            done, state = chunks[-1].iteration, run.restore(state, chunks[-1].state)
         while done < total:
-            limit = sampler.warmup if done < sampler.warmup else total
-            n = min(CHUNK, limit - done)
-            state, draws = run.advance(state, n)
+            n = min(CHUNK, (sampler.warmup if done < sampler.warmup else total) - done)
+            state, rows = run.advance(state, n, run.dynamic)
             done += n
-            if done <= sampler.warmup:
-                draws = {}
-            if checkpoints is None:
-                kept.append(draws)
-            else:
-                checkpoints.append(done, jax.tree.leaves(state), draws)
+            leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(state)]
+            draws = {name: np.asarray(v)[:n] for name, v in rows.items() if done > sampler.warmup}
+            chunks.append(Chunk(done, leaves, draws))
+            if checkpoints is not None:
+                checkpoints.append(chunks[-1])
             report(done, state)
-    merged = _by_chain(kept) if checkpoints is None else checkpoints.draws()
-    merged = {name: values[:, : sampler.draws] for name, values in merged.items()}
+    parts = [chunk.draws for chunk in chunks if chunk.draws]
+    merged = {
+        name: np.concatenate([part[name] for part in parts]).swapaxes(0, 1)[:, : sampler.draws]
+        for name in parts[0]
+    }
     return Chains(
         {name: values for name, values in merged.items() if name not in STATISTICS},
         {name: merged[name] for name in STATISTICS},
     )
-
-
-NOT_FINITE = (
-    "the density is NaN or infinite where the chains begin; look for logarithms and roots of "
-    "negative numbers, for scales of zero, and for data outside a support"
-)
 
 
 class _Run:
@@ -568,46 +517,40 @@ class _Run:
 
         latent = latent_sites(program, arguments)
         white = set() if whitening is None else set(whitening.names)
-        unknown = white - set(latent)
-        if unknown:
+        if unknown := white - set(latent):
             raise InputError(
                 f"the program has no latent site '{min(unknown)}' to whiten; it has "
                 f"{', '.join(latent)}"
             )
-        all_white = set(latent) == white
         self.sampler = sampler
         # leaves of the model's arguments that are arrays are traced, the rest is structure
         self.dynamic, static = eqx.partition((whitening, arguments), eqx.is_array)
         self.kernel = sampler.kernel(
             lambda dynamic: model(*eqx.combine(dynamic, static)),
-            whitening.root.shape[1] if all_white else None,
+            whitening.root.shape[1] if set(latent) == white else None,
         )
         # XLA may stand still over batches of matrices to factorise where cores are few; several
         # devices, each with a chain of its own, would only stand idle
         chart = None if whitening is None else whitening.chart
         factorises = not predicts(program, arguments) or (chart is not None and chart.factorises)
         self.one_by_one = len(jax.local_devices()) == 1 and factorises
-        self._advance = jax.jit(self._advance_traced)
+        self.advance = jax.jit(self._advance)
+
+    def _of_chains(self, function: Callable[[Any], HMCState], chains: Any) -> HMCState:
+        """Apply a function of NumPyro's that takes one chain or all of them."""
+        return jax.lax.map(function, chains) if self.one_by_one else function(chains)
 
     def start(self) -> HMCState:
         """The first state of every chain."""
-        keys = jax.random.split(jax.random.PRNGKey(self.sampler.seed), self.sampler.chains)
-        if not self.one_by_one:
-            try:
-                state = self.kernel.init(keys, self.sampler.warmup, None, (self.dynamic,), {})
-            except RuntimeError as error:
-                # NumPyro's word for a density that is finite nowhere near the start
-                if "initial parameters" not in str(error):
-                    raise
-                raise InputError(NOT_FINITE) from error
-            return self._shared_out(state)
 
         def first(keys, dynamic):
-            return jax.lax.map(
-                lambda key: self.kernel.init(key, self.sampler.warmup, None, (dynamic,), {}), keys
+            warmup = self.sampler.warmup
+            return self._of_chains(
+                lambda key: self.kernel.init(key, warmup, None, (dynamic,), {}), keys
             )
 
-        return jax.jit(first)(keys, self.dynamic)
+        keys = jax.random.split(jax.random.PRNGKey(self.sampler.seed), self.sampler.chains)
+        return self._shared_out(jax.jit(first)(keys, self.dynamic))
 
     def restore(self, like: HMCState, leaves: list[np.ndarray]) -> HMCState:
         """The state whose leaves these are; ``like``: any state of this run."""
@@ -617,32 +560,20 @@ class _Run:
         ]
         return self._shared_out(jax.tree.unflatten(jax.tree.structure(like), arrays))
 
-    def advance(self, state: HMCState, n: int) -> tuple[HMCState, dict[str, Array]]:
-        """``n`` iterations: the state behind them, and the draws (n, chains, ...)."""
-        state, rows = self._advance(state, n, self.dynamic)
-        return state, {name: values[:n] for name, values in rows.items()}
+    def _advance(self, state: HMCState, n, dynamic) -> tuple[HMCState, dict[str, Array]]:
+        """``n`` iterations: the state behind them, and rows (CHUNK, chains, ...), draws the first.
 
-    def _advance_traced(self, state: HMCState, n, dynamic):
-        """The loop's length is traced: every chunk runs one compiled program, whatever n."""
-
-        def collect(state):
-            return {"z": state.z} | {name: of(state) for name, of in STATISTICS.items()}
-
-        rows = jax.tree.map(
-            lambda x: jnp.zeros((CHUNK, *x.shape), x.dtype), jax.eval_shape(collect, state)
-        )
+        ``n`` is traced: every chunk runs one compiled program.
+        """
 
         def sample(state):
-            if self.one_by_one:
-                return jax.lax.map(lambda s: self.kernel.sample(s, (dynamic,), {}), state)
-            return self.kernel.sample(state, (dynamic,), {})
+            return self._of_chains(lambda s: self.kernel.sample(s, (dynamic,), {}), state)
 
-        def step(i, carry):
-            state, rows = carry
-            state = sample(state)
-            return state, jax.tree.map(lambda r, x: r.at[i].set(x), rows, collect(state))
+        def step(state, i):
+            state = jax.lax.cond(i < n, sample, lambda state: state, state)
+            return state, {"z": state.z} | {name: of(state) for name, of in STATISTICS.items()}
 
-        state, rows = jax.lax.fori_loop(0, n, step, (state, rows))
+        state, rows = jax.lax.scan(step, state, jnp.arange(CHUNK))
         constrain = self.kernel.postprocess_fn((dynamic,), {})
         sites = jax.vmap(jax.vmap(constrain))(rows.pop("z"))
         sites = {n: values for n, values in sites.items() if not n.endswith(WHITE_SUFFIX)}

@@ -37,7 +37,7 @@ changes there says how well the data know theta.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import equinox as eqx
@@ -142,12 +142,7 @@ class StraightSky(Chart):
 
     def _begun(
         self, values: dict[str, Array]
-    ) -> tuple[
-        LogNormalSky,
-        Float[Array, " directions"],
-        Float[Array, " directions"],
-        Float[Array, " unknowns"],
-    ]:
+    ) -> tuple[LogNormalSky, Array, Array, Float[Array, " unknowns"]]:
         """The sky with the sites' C_ell, k, V^T (x - u*), and u* + V_0 x_0.
 
         Where C_ell is not that of the mode, u* is what keeps the logarithm as it is there.
@@ -191,6 +186,10 @@ class LogNormalMode:
         J there, in K.
     lower : (unknowns, unknowns) array
         L of H = L L^T.
+    power_law : (2,) array, optional
+        ln A and the tilt of C_ell, where they are unknowns as well.
+    covariance : (2, 2) array, optional
+        Of these.
     """
 
     sky: LogNormalSky
@@ -198,6 +197,8 @@ class LogNormalMode:
     white: Float[np.ndarray, " unknowns"]
     jacobian: Float[np.ndarray, "modes unknowns"]
     lower: Float[np.ndarray, "unknowns unknowns"]
+    power_law: Float[np.ndarray, "2"] | None = None
+    covariance: Float[np.ndarray, "2 2"] | None = None
 
     @property
     def modes(self) -> Float[np.ndarray, " modes"]:
@@ -289,26 +290,8 @@ def _descended(
     return white, here
 
 
-@dataclass(frozen=True)
-class LearnedSpectrum:
-    """C_ell of maximum evidence, and the mode there.
-
-    Attributes
-    ----------
-    power_law : (2,) array
-        ln A and the tilt.
-    covariance : (2, 2) array
-        Of these.
-    mode : LogNormalMode
-    """
-
-    power_law: Float[np.ndarray, "2"]
-    covariance: Float[np.ndarray, "2 2"]
-    mode: LogNormalMode
-
-
-def learn_spectrum(prior: LogNormalPrior, information: Information) -> LearnedSpectrum:
-    """Maximise p(d | A, tilt) p(A, tilt).
+def learn_spectrum(prior: LogNormalPrior, information: Information) -> LogNormalMode:
+    """Find the mode at C_ell of maximum evidence, p(d | A, tilt) p(A, tilt).
 
     Parameters
     ----------
@@ -333,7 +316,7 @@ def learn_spectrum(prior: LogNormalPrior, information: Information) -> LearnedSp
         slope, fisher = slope - narrow * (theta - centre), fisher + np.diag(narrow)
         if np.sqrt(slope @ np.linalg.solve(fisher, slope)) < SPECTRUM_SETTLED:
             covariance = _covariance(theta, mode, np.linalg.inv(fisher), narrow)
-            return LearnedSpectrum(theta, covariance, mode)
+            return replace(mode, power_law=theta, covariance=covariance)
         if last is not None:  # what the Fisher information of the last step did not foresee
             moved = theta - last[0]
             bend = np.outer(last[1] - slope - last[2] @ moved, moved) / (moved @ moved)
@@ -422,26 +405,17 @@ def coordinates_of(prior: LogNormalPrior, information: Information) -> Whitening
         As :func:`find_mode` and :func:`learn_spectrum`.
     """
     prior = on_host(prior)
-    if not prior.samples_spectrum:
-        return straight_coordinates(find_mode(prior.sky, information))
-    found = learn_spectrum(prior, information)
-    return straight_coordinates(found.mode, found.power_law, found.covariance)
+    if prior.samples_spectrum:
+        return straight_coordinates(learn_spectrum(prior, information))
+    return straight_coordinates(find_mode(prior.sky, information))
 
 
-def straight_coordinates(
-    mode: LogNormalMode,
-    power_law: Float[np.ndarray, "2"] | None = None,
-    covariance: Float[np.ndarray, "2 2"] | None = None,
-) -> Whitening:
+def straight_coordinates(mode: LogNormalMode) -> Whitening:
     """Make the coordinates about a mode.
 
     Parameters
     ----------
     mode : LogNormalMode
-    power_law : (2,) array, optional
-        ln A and the tilt of the mode's C_ell, where they are unknowns as well.
-    covariance : (2, 2) array, optional
-        Of these.
 
     Returns
     -------
@@ -456,17 +430,17 @@ def straight_coordinates(
     down = pulled / (strength[stiff] - 1.0)[:, None]
     root = vectors / np.sqrt(strength)[None]
     left_open = ((mode.sky.root()[:, None] * root)[: mode.sky.n_modes] ** 2).sum() / (4.0 * np.pi)
-    if covariance is not None:  # C_ell moves the logarithm, too, where it is not known
+    if mode.covariance is not None:  # C_ell moves the logarithm, too, where it is not known
         slopes = mode.sky.power_law_slopes()[:, 1:]
-        left_open += np.einsum("im,ij,jm->m", slopes, covariance, slopes).max()
+        left_open += np.einsum("im,ij,jm->m", slopes, mode.covariance, slopes).max()
     bounds = _bounds(strength[stiff], GAIN**2 * left_open)
     chart = StraightSky(mode.sky, mode.white, mode.modes, across, down, bounds)
     log_det, mean = -np.log(np.diagonal(mode.lower)).sum(), mode.white
     sites: tuple[tuple[str, tuple[int, ...]], ...] = ((STRUCTURE, (mode.sky.size,)),)
-    if power_law is not None:
-        own = np.linalg.cholesky(covariance)
+    if mode.power_law is not None:
+        own = np.linalg.cholesky(mode.covariance)
         log_det = log_det + np.log(np.diagonal(own)).sum()
-        mean, root = np.concatenate([power_law, mean]), block_diag(own, root)
+        mean, root = np.concatenate([mode.power_law, mean]), block_diag(own, root)
         sites = ((AMPLITUDE, ()), (TILT, ()), *sites)
     return on_device(Whitening(mean, root, np.asarray(log_det), sites, chart))
 

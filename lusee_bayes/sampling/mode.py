@@ -29,16 +29,16 @@ from jaxtyping import Bool, Float, Int
 from numpyro import distributions as dist
 from numpyro import handlers
 from numpyro.infer import init_to_median
-from numpyro.infer.util import potential_energy
+from numpyro.infer.util import constrain_fn, potential_energy
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import is_traced, require_shape
+from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, pixel_matrix, power_spectrum, synthesis_matrix
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.sampling.distributions import HALF_LOG_2PI, Prediction
 from lusee_bayes.sampling.hmc import Whitening
-from lusee_bayes.sampling.programs import numpyro_promotion
+from lusee_bayes.sampling.programs import latent_of, numpyro_promotion
 from lusee_bayes.systematics.systematic import MOST_COLLAPSED, Chart
 
 # step of the differences that give the Hessian, in standard deviations
@@ -92,22 +92,13 @@ class Potential(eqx.Module):
 
     def _predictions(self, x: Float[Array, " n"], still: bool) -> list[tuple[Prediction, Array]]:
         values, _ = self.shapes.to_values(x, self.hold if still else ())
-
-        def place(site):
-            if site["name"] in values:
-                return dist.biject_to(site["fn"].support)(values[site["name"]])
-            return None
-
-        model = handlers.substitute(handlers.seed(self.program, 0), substitute_fn=place)
+        program = handlers.seed(self.program, 0)
+        model = handlers.substitute(program, constrain_fn(program, (), self.arguments, values))
         return [
             (site["fn"], site["value"])
             for site in handlers.trace(model).get_trace(**self.arguments).values()
             if site["type"] == "sample" and isinstance(site["fn"], Prediction)
         ]
-
-    def slope(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Return the gradient at x."""
-        return jax.grad(self.value)(x)
 
     def gradient_and_curvature(
         self, x: Float[Array, " n"], scale: Float[Array, " n"]
@@ -117,11 +108,12 @@ class Potential(eqx.Module):
         The curvature is that of Gauss and Newton where the program predicts the data, else the
         Hessian by differences of gradients.
         """
+        slope = jax.grad(self.value)
         if not self.predicts:
             # all in one map: second derivatives of banded factors take minutes to compile
             steps = DIFFERENCE * jnp.diag(scale)
             places = jnp.concatenate([x[None], x[None] + steps, x[None] - steps])
-            gradients = jax.lax.map(self.slope, places)
+            gradients = jax.lax.map(slope, places)
             up, down = jnp.split(gradients[1:], 2)
             slopes = (up - down) / (2.0 * DIFFERENCE * scale[:, None])
             return gradients[0], 0.5 * (slopes + slopes.T)
@@ -133,9 +125,9 @@ class Potential(eqx.Module):
         if self.shapes.chart is None:
             # every site's prior is a product over its values
             _, diagonal = jax.jvp(jax.grad(prior), (x,), (jnp.ones_like(x),))
-            return self.slope(x), columns @ columns.T + jnp.diag(jnp.abs(diagonal))
+            return slope(x), columns @ columns.T + jnp.diag(jnp.abs(diagonal))
         of_prior = self._derivatives(jax.grad(prior), x)
-        return self.slope(x), columns @ columns.T + 0.5 * (of_prior + of_prior.T)
+        return slope(x), columns @ columns.T + 0.5 * (of_prior + of_prior.T)
 
     def _derivatives(
         self, f: Callable[..., Float[Array, " m"]], x: Float[Array, " n"]
@@ -154,12 +146,6 @@ class Potential(eqx.Module):
         return rows.at[held].set(
             jax.lax.map(lambda e: jax.jvp(lambda x: f(x, False), (x,), (e,))[1], unit[held])
         )
-
-
-def without_held(curvature: Float[Array, "n n"], free: Float[Array, " n"]) -> Float[Array, "n n"]:
-    """Keep only the diagonal, made positive, of what is held: its block may not be positive."""
-    held = (1.0 - free) * jnp.abs(jnp.diagonal(curvature))
-    return curvature * free[:, None] * free[None] + jnp.diag(held)
 
 
 def root_of_inverse(curvature: Float[Array, "n n"], problem: Potential) -> tuple[Array, Array]:
@@ -222,21 +208,6 @@ class LaplaceApproximation(eqx.Module):
         """Whether the mode was found."""
         return self.moved < SETTLED
 
-    def require_converged(self) -> LaplaceApproximation:
-        """Return itself.
-
-        Raises
-        ------
-        InputError
-            If the mode was not found.
-        """
-        if not is_traced(self.moved) and not bool(self.converged):
-            raise InputError(
-                f"no mode of the posterior was found in {int(self.steps)} steps (the last moved by "
-                f"{float(self.moved):.2g} standard deviations); narrow the priors, or start nearer"
-            )
-        return self
-
 
 @numpyro_promotion()
 def laplace_approximation(
@@ -279,18 +250,13 @@ def laplace_approximation(
     """
     arguments = dict(arguments)
     trace = _trace(program, arguments, start or {})
-    latent = {
-        name: site
-        for name, site in trace.items()
-        if site["type"] == "sample" and not site["is_observed"]
-    }
+    latent = {name: trace[name] for name in latent_of(trace)}
     unconstrained = {name: _unconstrained(site) for name, site in latent.items()}
     sites = tuple((name, value.shape) for name, value in unconstrained.items())
     n = sum(value.size for value in unconstrained.values())
     shapes = Whitening(jnp.zeros(n), jnp.zeros((n, 0)), jnp.zeros(()), sites, chart)
     first = shapes.from_values(unconstrained)
-    observed = [s for s in trace.values() if s["type"] == "sample" and s["is_observed"]]
-    predicts = any(isinstance(site["fn"], Prediction) for site in observed)
+    predicts = any(isinstance(s.get("fn"), Prediction) and s["is_observed"] for s in trace.values())
     problem = Potential(program, arguments, shapes, predicts, tuple(hold))
     if not problem.predicts and n > MOST_COLLAPSED:
         raise InputError(
@@ -361,17 +327,19 @@ def _climb(
     """
 
     def look(x, scale):
-        """White gradient at x, the coordinates' root, and whether all curvature is positive."""
+        """Newton's step at x, its length, and the coordinates' root."""
         gradient, curvature = problem.gradient_and_curvature(x, scale)
-        gradient = gradient * free
-        curvature = without_held(curvature, free)
+        # of what is held only the diagonal stays, made positive: its block may not be
+        diagonal = jnp.abs(jnp.diagonal(curvature))
+        curvature = curvature * free[:, None] * free[None] + jnp.diag((1.0 - free) * diagonal)
         root, positive = root_of_inverse(curvature, problem)
-        narrow = 1.0 / jnp.sqrt(jnp.abs(jnp.diagonal(curvature)))
-        return root.T @ gradient, root, positive, jnp.minimum(narrow, scale)
+        white = root.T @ (gradient * free)
+        moved = jnp.sqrt((white**2).mean())
+        moved = jnp.where(positive, moved, jnp.maximum(moved, 1.0))
+        return root @ white, moved, root, jnp.minimum(1.0 / jnp.sqrt(diagonal), scale)
 
     def step(carry):
-        x, value, white, root, _, scale, n = carry
-        direction = root @ white
+        x, value, direction, _, _, scale, n = carry
 
         def worse(inner):
             _, trial, count = inner
@@ -390,23 +358,16 @@ def _climb(
         n = jnp.where(better, n + 1, MAX_STEPS)
         return x, jnp.where(better, trial, value), *look(x, scale), n
 
-    def length_of(white, positive):
-        moved = jnp.sqrt((white**2).mean())
-        return jnp.where(positive, moved, jnp.maximum(moved, 1.0))
-
     def going(carry):
-        _, _, white, _, positive, _, n = carry
-        return (~(length_of(white, positive) < SETTLED)) & (n < MAX_STEPS)
+        moved, n = carry[3], carry[-1]
+        return (~(moved < SETTLED)) & (n < MAX_STEPS)
 
     start = (first, problem.value(first), *look(first, scale), jnp.asarray(0))
-    x, value, white, _, positive, scale, n = jax.lax.while_loop(going, step, start)
-    root, _ = root_of_inverse(
-        without_held(problem.gradient_and_curvature(x, scale)[1], free), problem
-    )
+    x, value, _, moved, root, _, n = jax.lax.while_loop(going, step, start)
     log_det = jnp.linalg.slogdet(root)[1]
     whitening = Whitening(x, root, log_det, problem.shapes.sites, problem.shapes.chart)
     log_evidence = -value + log_det + x.shape[0] * HALF_LOG_2PI
-    return LaplaceApproximation(whitening, log_evidence, length_of(white, positive), n)
+    return LaplaceApproximation(whitening, log_evidence, moved, n)
 
 
 # pixels of which all draws are held at once

@@ -1,4 +1,4 @@
-"""NumPyro programs: files with a ``model``, what they can ask for, and what their sites are.
+"""NumPyro programs: files with a ``model``, what they can ask for, and what their sites must be.
 
 NumPyro runs under JAX's standard rules of types and ranks, the package under strict ones
 (:func:`numpyro_promotion`).
@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import hashlib
 import inspect
+import re
 import sys
+import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,8 +22,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Key, PRNGKeyArray
+import numpyro
+from jaxtyping import Float, PRNGKeyArray
+from numpyro import distributions as dist
 from numpyro import handlers
+from numpyro.infer import Predictive
+from numpyro.infer.util import log_density
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError, nearest
@@ -30,6 +36,7 @@ from lusee_bayes.core.reading import read_text, require_file
 from lusee_bayes.core.version import printable
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.sampling.distributions import Prediction
+from lusee_bayes.systematics.systematic import SKY
 
 
 @contextmanager
@@ -46,6 +53,11 @@ def numpyro_promotion() -> Iterator[None]:
 # the programs that come along: beside the package in a checkout, inside it once installed
 PACKAGE = Path(__file__).parents[1]
 FOLDERS = (PACKAGE / "models", PACKAGE.parent / "models")
+
+# the site of the data, and the argument that it observes
+DATA = "data"
+# a site in white coordinates is that of the program with this appended
+WHITE_SUFFIX = "_white"
 
 # what a program's arguments may be called: pieces of the model with all systematics in N, ...
 PIECES: dict[str, Callable[[LinearGaussian], Any]] = {
@@ -122,7 +134,7 @@ class Program:
         for name in names:
             if name in PIECES:
                 found[name] = PIECES[name](model)
-            elif name != "data":
+            elif name != DATA:
                 if more is None or name not in more:
                     raise InputError(
                         f"the program '{self.name}' asks for '{name}', a piece of an experiment; "
@@ -168,26 +180,23 @@ def load_program(source: str | Path) -> Program:
         raise InputError(
             f"'{path}' has no function 'model'; a program is def model(..., data=None)"
         )
-    asked = inspect.signature(model).parameters
+    asked, known = inspect.signature(model).parameters, [*PIECES, *EXPERIMENT_PIECES]
     for name, argument in asked.items():
         if argument.kind not in (argument.POSITIONAL_OR_KEYWORD, argument.KEYWORD_ONLY):
             raise InputError(
                 f"model in '{path}' takes '{name}' by position, or as many as come; every argument "
                 "is given by its name: def model(coupling, prior, noise, data=None)"
             )
-    if "data" not in asked:
-        raise InputError(f"model in '{path}' has no argument 'data'; the data could not enter it")
-    if asked["data"].default is not None:
-        raise InputError(
-            f"model in '{path}' has no data=None; without data, data are drawn from it"
-        )
-    for name in asked:
-        known = [*PIECES, *EXPERIMENT_PIECES]
-        if name != "data" and name not in known:
+        if name != DATA and name not in known:
             raise InputError(
                 f"model in '{path}' asks for '{name}', which is neither data nor a piece; "
                 f"{nearest(name, known)}"
             )
+    if DATA not in asked or asked[DATA].default is not None:
+        raise InputError(
+            f"model in '{path}' has no argument 'data' that is None by default; write data=None: "
+            "with data they are observed, without they are drawn"
+        )
     return Program(path.stem, model, hashlib.sha256(text).hexdigest(), str(path))
 
 
@@ -208,20 +217,19 @@ def traced(program: Callable, arguments: Mapping[str, Any]) -> tuple[dict[str, d
     """Return the sites of a program by name, and what it returns, without running it."""
     found = []
 
-    def run(dynamic):
+    def run(arguments):
         with handlers.trace() as sites:
-            returned = handlers.seed(program, 0)(**eqx.combine(dynamic, static))
+            returned = handlers.seed(program, 0)(**arguments)
         found.append((dict(sites), returned))
 
-    dynamic, static = eqx.partition(dict(arguments), eqx.is_array)
     with numpyro_promotion():
-        jax.eval_shape(run, dynamic)
+        eqx.filter_eval_shape(run, dict(arguments))
     return found[0]
 
 
 def is_collapsed(program: Program, arguments: dict[str, Any], data: Array) -> bool:
     """Tell whether the program integrates the sky out: its model returns a LinearGaussian."""
-    return isinstance(traced(program.model, {**arguments, "data": data})[1], LinearGaussian)
+    return isinstance(traced(program.model, {**arguments, DATA: data})[1], LinearGaussian)
 
 
 def predicts(program: Callable, arguments: dict, kind: type[Prediction] = Prediction) -> bool:
@@ -229,21 +237,18 @@ def predicts(program: Callable, arguments: dict, kind: type[Prediction] = Predic
 
     It then samples everything that they depend on, and its density needs matrix products only.
     """
-    return any(isinstance(site["fn"], kind) for site in _sampled(program, arguments))
+    sites = traced(program, arguments)[0].values()
+    return any(site["type"] == "sample" and isinstance(site["fn"], kind) for site in sites)
 
 
 def latent_sites(program: Callable, arguments: dict) -> list[str]:
     """Return the names of the sites that a program samples and does not observe."""
-    return [site["name"] for site in _sampled(program, arguments) if not site["is_observed"]]
+    return latent_of(traced(program, arguments)[0])
 
 
-def _sampled(program: Callable, arguments: dict) -> list[dict]:
-    return [s for s in traced(program, arguments)[0].values() if s["type"] == "sample"]
-
-
-def side_by_side(draws: Any) -> Any:
-    """Put the draws of all chains of a tree of (chains, draws, ...) arrays one after the other."""
-    return jax.tree.map(lambda v: jnp.asarray(v).reshape(-1, *v.shape[2:]), draws)
+def latent_of(sites: Mapping[str, dict]) -> list[str]:
+    """Return the names of those of a program's sites that it samples and does not observe."""
+    return [n for n, s in sites.items() if s["type"] == "sample" and not s["is_observed"]]
 
 
 @numpyro_promotion()
@@ -277,29 +282,132 @@ def collapsed_draws(
     (chains, draws, modes) or (chains, draws, data) array
         Skies; or, of skies that are given, data with new noise. In K.
     """
-    shape = next(iter(sites.values())).shape[:2]
-    keys = jax.random.split(key, shape[0] * shape[1])
-    rows = _draw(program, arguments, jnp.asarray(data), *side_by_side((sites, skies)), keys)
-    return np.asarray(rows).reshape(*shape, -1)
+
+    def model():
+        gaussian = program.model(**arguments, data=jnp.asarray(data))
+        exact = gaussian.condition(data).sample(numpyro.prng_key())
+        sky = numpyro.sample("drawn sky", dist.Delta(exact, event_dim=1))
+        replicated = gaussian.predict(sky) + gaussian.noise.sample(numpyro.prng_key())
+        numpyro.deterministic("drawn data", replicated)
+
+    drawn = "drawn sky" if skies is None else "drawn data"
+    given = sites if skies is None else {**sites, "drawn sky": skies}
+    return np.asarray(Predictive(model, given, batch_ndims=2, return_sites=[drawn])(key)[drawn])
 
 
-@eqx.filter_jit
-def _draw(
-    program: Program,
-    arguments: dict[str, Any],
-    data: Float[Array, " data"],
-    sites: dict[str, Array],
-    skies: Float[Array, "draws modes"] | None,
-    keys: Key[Array, " draws"],
-) -> Float[Array, "draws n"]:
-    """Skies, or data where skies are given, one draw after the other."""
+# names that samples.nc uses for something else
+TAKEN = ("chain", "draw", "mode", "datum", "ell", "m", "product", "time")
+# what netCDF, summaries and tables can name without quotes
+NAME = re.compile(r"[^\W\d][\w.\-]*")
 
-    def one(inputs):
-        values, sky, key = inputs
-        model = handlers.substitute(handlers.seed(program.model, 0), values)
-        gaussian = model(**arguments, data=data)
-        if sky is None:
-            return gaussian.condition(data).sample(key)
-        return gaussian.predict(sky) + gaussian.noise.sample(key)
 
-    return jax.lax.map(one, (sites, skies, keys))
+def require_sampleable(
+    program: Program, arguments: dict[str, Any], data: Float[Array, " data"], n_modes: int
+) -> list[str]:
+    """Check that a program can be sampled, and that draws of the sky come of it.
+
+    The program is traced, not run: no density is computed.
+
+    Parameters
+    ----------
+    program : Program
+    arguments : dict
+        What it asks for, without the data.
+    data : (data,) array
+        d, in K.
+    n_modes : int
+        Harmonic coefficients of the sky.
+
+    Returns
+    -------
+    list of str
+        The sites that it samples.
+
+    Raises
+    ------
+    InputError
+        If it fails when it is called, with or without data; if one of its sites cannot be sampled
+        or kept; if ``data`` is not what it observes; or if it neither samples or computes the sky
+        nor returns a LinearGaussian to draw it from.
+    """
+    who, given = f"the program '{program.path or program.name}'", {**arguments, DATA: data}
+    with _blaming(who, "when it is called"):
+        sites, returned = traced(program.model, given)
+    latent = latent_of(sites)
+    for name, site in sites.items():
+        if site["type"] in ("sample", "deterministic"):
+            _require_site(name, site, name in latent, who)
+    if DATA not in sites or DATA in latent:
+        raise InputError(f"{who} has no observed site 'data'; sample('data', ..., obs=data)")
+    _require_shape(sites[DATA], data.shape, f"{who} observes")
+    if not latent:
+        raise InputError(f"{who} samples nothing: it has no site that is not observed")
+    if SKY in sites:
+        what = "samples" if SKY in latent else "computes"
+        _require_shape(sites[SKY], (n_modes,), f"{who} {what}")
+    elif not isinstance(returned, LinearGaussian):
+        raise InputError(
+            f"{who} has no site 'sky', and returns no LinearGaussian to draw the sky from; do one "
+            "or the other"
+        )
+    with _blaming(who, "when it is called with data=None"):
+        drawn = latent_sites(program.model, {**arguments, DATA: None})
+    if DATA not in drawn:
+        raise InputError(
+            f"{who} draws no data where data=None; sample('data', ..., obs=data) in both cases"
+        )
+    if differing := {*drawn} ^ {*latent, DATA}:
+        raise InputError(
+            f"{who} samples '{min(differing)}' only with data, or only without; sample the same "
+            "sites in both cases"
+        )
+
+    def slope(arguments):
+        trace = handlers.trace(handlers.seed(program.model, 0)).get_trace(**arguments)
+        values = {name: trace[name]["value"] for name in latent}
+        return jax.grad(lambda v: log_density(program.model, (), arguments, v)[0])(values)
+
+    with _blaming(who, "when its density is differentiated"), numpyro_promotion():
+        eqx.filter_eval_shape(slope, given)
+    return latent
+
+
+@contextmanager
+def _blaming(who: str, doing: str) -> Iterator[None]:
+    """Whatever a user's program may raise: it is not our failure, and it is said in a sentence."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (Exception, SystemExit) as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        own = [frame.lineno for frame in frames if f"'{frame.filename}'" in who]
+        at = f" (line {own[-1]})" if own else ""
+        text = " ".join(str(error).split())
+        text = text if len(text) <= 300 else f"{text[:297]}..."
+        kind = type(error).__name__
+        raise InputError(f"{who} fails {doing}{at}: {kind}: {text}") from error
+
+
+def _require_site(name: str, site: dict[str, Any], latent: bool, who: str) -> None:
+    if not NAME.fullmatch(name):
+        raise InputError(
+            f"{who} has a site '{name}'; names are letters, digits, '_', '.' and '-', and begin "
+            "with a letter or '_'"
+        )
+    if name in TAKEN or name.endswith(WHITE_SUFFIX):
+        raise InputError(f"{who} has a site '{name}', a name that is taken; give it another")
+    if latent and site["fn"].support.is_discrete:
+        raise InputError(
+            f"{who} has the discrete site '{name}'; Hamiltonian Monte Carlo needs continuous "
+            "ones: sum it out, or put a continuous distribution in its place"
+        )
+    if latent and jnp.issubdtype(jnp.result_type(site["value"]), jnp.complexfloating):
+        raise InputError(f"{who} has the complex site '{name}'; sample its two parts")
+
+
+def _require_shape(site: dict[str, Any], shape: tuple[int, ...], what: str) -> None:
+    density = tuple(site["fn"].shape()) if site["type"] == "sample" else shape
+    for found in (jnp.shape(site["value"]), density):
+        if found != shape:
+            raise InputError(f"{what} '{site['name']}' with shape {found}; expected {shape}")

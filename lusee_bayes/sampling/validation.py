@@ -433,7 +433,6 @@ def validate_draws(
     low, high = null.mean(0)[0] - spread[0], null.mean(0)[-1] + spread[-1]
     total = NULL_MARGIN * float(null.mean(1).std(ddof=1))
     ess_floor = float(MIN_ESS_PER_CHAIN * n_chains)
-    infinite = float("inf")
     # R-hat^2 - 1 of m half chains is chi^2 with m - 1 degrees over ESS: the largest of many modes
     halves = 2 * n_chains
     chance = stats.chi2.isf(FALSE_ALARM / n_modes, halves - 1) / np.median(ess_square)
@@ -443,17 +442,17 @@ def validate_draws(
               "largest difference of a mode's means, in Monte Carlo errors"),
         Check("variance", _largest(variance_z), -limit, limit,
               "largest deviation of a mode's variance, as a normal score"),
-        Check("covariance, smallest", float(eigenvalues[0]), low, infinite,
+        Check("covariance, smallest", float(eigenvalues[0]), low, np.inf,
               "smallest generalised eigenvalue of the draws' covariance"),
         Check("covariance, largest", float(eigenvalues[-1]), 0.0, high,
               "largest generalised eigenvalue of the draws' covariance"),
         Check("covariance, mean", float(eigenvalues.mean()), 1.0 - total, 1.0 + total,
               "mean generalised eigenvalue: the total variance in analytic coordinates"),
         Check("R-hat", float(rhat.max()), 0.0, rhat_limit, "largest of all modes"),
-        Check("bulk ESS", float(bulk.min()), ess_floor, infinite, "smallest of all modes"),
-        Check("tail ESS", float(tail.min()), ess_floor, infinite, "smallest of all modes"),
+        Check("bulk ESS", float(bulk.min()), ess_floor, np.inf, "smallest of all modes"),
+        Check("tail ESS", float(tail.min()), ess_floor, np.inf, "smallest of all modes"),
         Check("divergences", float(diverging.sum()), 0.0, 0.0, "diverging trajectories"),
-        Check("BFMI", float(bfmi.min()), MIN_BFMI, infinite,
+        Check("BFMI", float(bfmi.min()), MIN_BFMI, np.inf,
               "smallest of all chains: how well energies are explored"),
     )  # fmt: skip
     error, null_mean = np.sqrt(2.0 / ess_square), null.mean(0)

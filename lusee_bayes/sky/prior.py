@@ -226,6 +226,29 @@ class DensePrior(Prior):
             _require_covariance(np.asarray(covariance), np.asarray(lower))
         return cls(lower, mean=mean)
 
+    @classmethod
+    def of_root(
+        cls,
+        root: Float[np.ndarray, "modes columns"],
+        mean: Float[np.ndarray, " unknowns"] | None = None,
+    ) -> DensePrior:
+        """Make the prior of any R with S = R R^T, which is not formed: it may be ill conditioned.
+
+        Parameters
+        ----------
+        root : (modes, columns) array
+            R, in K, with as many columns as modes or more.
+        mean : (modes,) array, optional
+            In K.
+
+        Raises
+        ------
+        InputError
+            If S is not positive definite.
+        """
+        lower = np.linalg.qr(root.T, mode="r").T
+        return cls(np.tril(lower * np.sign(np.diagonal(lower))), mean=mean)
+
     def description(self) -> tuple[str, ...]:
         about = "zero" if self.mean is None else "a mean sky"
         width = extent(namespace(self).sqrt(self.variance()), "K")

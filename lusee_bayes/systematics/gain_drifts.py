@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, PRNGKeyArray
+from pydantic import Field
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.lazy import dist, numpyro
+from lusee_bayes.core.section import Positive, Section, Treatment, requires
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.instrument_errors import GainDrift, white_grid, with_gains
+from lusee_bayes.systematics.context import Around, Context, NoiseAbout, noise_visibilities
 from lusee_bayes.systematics.systematic import (
     SKY,
     Chart,
     Systematic,
+    Truth,
+    Unknown,
     multiplied,
     scalar_or_none,
-    uncertain_scale,
 )
 
 # how far, in standard deviations of ln, a correlation time that is not known can be off, and by
@@ -35,6 +41,50 @@ SCALES = ("gain_sigma", "gain_log_correlation")
 # white noise that makes drifts: three times per correlation time are exact to exp(-9 pi^2 / 2),
 # and beyond six correlation times it enters with exp(-36)
 PER_CORRELATION, MARGIN = 3.0, 6.0
+# what the scenario's seed is folded with for the scales
+SCALE_DRAW = 6
+# NumPyro's handlers are those of all threads, in which channels and cases are simulated
+_HANDLERS = threading.Lock()
+
+
+class GainSection(Section):
+    """Gain drifts in the data: their covariance in N, or the drifts themselves ``sampled``.
+
+    Attributes
+    ----------
+    sigma : float
+        Standard deviation of the relative gains.
+    correlation_h : float
+        Correlation time.
+    log_sigma_std : float
+        Prior standard deviation of ln sigma, where it is not known. Simulated data hold one drawn
+        from it, and it is sampled with the drifts.
+    log_correlation_std : float
+        The same for ln of the correlation time.
+    treatment : {"marginalised", "sampled", "ignored"}
+        Their covariance is added to N, they are sampled with the map, or they are left out of the
+        model.
+    visibilities : {"model", "measured", "posterior"}, optional
+        Visibilities that the covariance is built around: the modelled sky's; the data, whose own
+        drifts move the map by about a standard deviation; or the map's prediction, in rounds. By
+        default the modelled sky's for simulated data, and the map's prediction for measured ones.
+    """
+
+    sigma: Positive = 0.01
+    correlation_h: Positive = 10.0
+    log_sigma_std: Positive | None = None
+    log_correlation_std: Annotated[float, Field(gt=0, le=1)] | None = None
+    treatment: Treatment = "marginalised"
+    visibilities: NoiseAbout | None = None
+
+    _scales_are_sampled = requires(
+        lambda section: (
+            section.treatment != "marginalised"
+            or (section.log_sigma_std is None and section.log_correlation_std is None)
+        ),
+        "log_sigma_std and log_correlation_std need treatment 'sampled': a covariance has to know "
+        "its scales",
+    )
 
 
 class GainDrifts(Systematic):
@@ -58,7 +108,11 @@ class GainDrifts(Systematic):
         Prior standard deviations of the natural logarithms of the two; None where known.
     """
 
+    key: ClassVar[str] = "noise.gain"
+    section: ClassVar[type[Section]] = GainSection
+    draw: ClassVar[int] = 2
     needs_sky: ClassVar[bool] = True
+    first_order: ClassVar[bool] = False
 
     drift: GainDrift
     visibilities: Float[Array, "products times"]
@@ -108,6 +162,32 @@ class GainDrifts(Systematic):
         hours, grid = jnp.asarray(hours), jnp.asarray(grid)
         return cls(drift, visibilities, hours, grid, layout, *widths, *stds)
 
+    @classmethod
+    def build(cls, section: GainSection, context: Context, around: Around) -> GainDrifts:
+        return cls.of(
+            GainDrift(section.sigma, section.correlation_h),
+            noise_visibilities(context, around, gains_about(context)),
+            context.observation.hours,
+            context.layout,
+            section.log_sigma_std,
+            section.log_correlation_std,
+        )
+
+    @classmethod
+    def truth(cls, section: GainSection, context: Context, key: PRNGKeyArray) -> Truth:
+        """The scales, where they are not known; their prior is the program's own."""
+        with _HANDLERS, numpyro.handlers.seed(rng_seed=jax.random.fold_in(key, SCALE_DRAW)):
+            drift = cls.build(section, context, Around()).scales()
+        return {"gain_sigma": float(drift.sigma), "gain_correlation_h": float(drift.correlation_h)}
+
+    @classmethod
+    def in_data(cls, section, context, model, truth, key) -> LinearGaussian:
+        """Multiply by one draw of the drifts."""
+        drift = GainDrift(truth["gain_sigma"], truth["gain_correlation_h"])
+        gains = drift.sample(cls.own_key(key), context.observation.hours)
+        response = cls.build(section, context, Around()).response(gains)
+        return multiplied(model, np.asarray(response))
+
     @property
     def n_antennas(self) -> int:
         """Number of antennas."""
@@ -121,7 +201,8 @@ class GainDrifts(Systematic):
         """
         sigma, correlation_h = self.drift.sigma, self.drift.correlation_h
         if self.log_sigma_std is not None:
-            sigma = numpyro.sample("gain_sigma", uncertain_scale(sigma, self.log_sigma_std))
+            prior = Unknown("gain_sigma", sigma, self.log_sigma_std, log=True).prior()
+            sigma = numpyro.sample("gain_sigma", prior)
         if self.log_correlation_std is not None:
             reach = CORRELATION_REACH * self.log_correlation_std
             normal = dist.TruncatedNormal(0.0, self.log_correlation_std, low=-reach, high=reach)
@@ -182,9 +263,19 @@ class GainDrifts(Systematic):
         grid = jnp.broadcast_to(mean, (self.layout.n_products, self.layout.n_times))
         return multiplied(replace(model, noise=model.noise + noise), self.layout.gather(grid))
 
+    def effect(self, model, values):
+        """Multiply by the response to ``gains``."""
+        return multiplied(model, self.response(values["gains"]))
+
     def sampled(self, model: LinearGaussian) -> LinearGaussian:
         """Sample the sites of :meth:`scales` and :meth:`histories`."""
-        return multiplied(model, self.response(self.histories(self.scales())))
+        return self.effect(model, {"gains": self.histories(self.scales())})
+
+
+def gains_about(context: Context) -> NoiseAbout:
+    """Which visibilities the covariance of gain drifts is built around."""
+    chosen = context.scenario.noise.gain.visibilities
+    return chosen or ("posterior" if context.measured else "model")
 
 
 class GainCoordinates(Chart):

@@ -1,16 +1,13 @@
-"""Errors of a gain table: exact factors of the visibilities, or templates of first order.
+"""Errors of a gain table: factors of the visibilities.
 
 With eps_i(t) = sum_e z_e s_e(t) over the errors e of port i, z ~ N(0, 1), the relative error of
 port i's power gain, the data are ::
 
     d = F(z) v + n,    F_ij = sqrt((1 + eps_i)(1 + eps_j)),    v = A m + all that adds to it,
 
-and about z_0 and v_0, to first order, ::
-
-    d = F(z_0) v + T (z - z_0) + n,    T = dF/dz v_0.
-
-With errors of 1 % what this leaves out, 1e-4, is ten times the radiometer noise, unless z_0 and
-v_0 are those that the data tell: then it is the Gaussian about the joint mode of all unknowns.
+With errors of 1 % what the first order leaves out, 1e-4, is ten times the radiometer noise, unless
+it is about values and a sky that the data determine: then it is the Gaussian about the joint mode
+of all unknowns.
 
 That mode is not where the bulk is: a larger gain and a smaller sky fit as well, and of n modes that
 the data determine, each gains by being smaller. With the sky integrated out, ln|K| makes up for it,
@@ -18,161 +15,183 @@ K(z) = F (A S A^T + ...) F + N_0, whose derivative is ::
 
     d(-ln|K| / 2)/dz_e = -sum_k h_k dln F_k/dz_e,    h = diag(1 - N_0 K^-1),
 
-h_k the share of datum k that the model follows (:mod:`.linear.freedom`). It is that of a prior mean
+h_k the share of datum k that the model follows (:func:`.data_freedom`). It is that of a prior mean
 of -dln F/dz^T h in place of 0, with which rounds lead to the mode of p(z | d).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from pydantic import Field
 
-from lusee_bayes.core.arrays import Array, namespace
-from lusee_bayes.core.lazy import dist, numpyro
+from lusee_bayes.core.arrays import Array, DataVector, Vector, namespace, on_device
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.section import NOT_TINY, Section, Treatment
 from lusee_bayes.instrument.products import DataLayout, ports
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
-from lusee_bayes.noise.covariance import LowRankCovariance
-from lusee_bayes.systematics.systematic import Expanded, Systematic, multiplied, with_added
+from lusee_bayes.systematics.context import Around, Context
+from lusee_bayes.systematics.systematic import Systematic, Unknown, multiplied
 
 # the site of the errors, in prior standard deviations
 GAIN_TABLE = "gain_table"
+# standard deviation of a port's power gain: 1 + eps is then positive by ten of them
+LARGEST = 0.1
+# what all errors have in common, in words
+COMMON_GAIN = "common gain"
 
 
-class TableErrors(eqx.Module):
-    """Slopes of the errors, and what values of them make of the data.
+class GainTableSection(Section):
+    """Errors of the gain table, which all spectra of one level of one port share.
 
     Attributes
     ----------
-    names : tuple of str
-        Of the errors.
+    std : float
+        Prior standard deviation of every port's power gain, relative, where the data do not say
+        the errors of their table themselves and ``flight.gain_std`` does not, either.
+    treatment : {"marginalised", "sampled", "ignored"}
+        Their covariance is added to N to first order about what the data tell, found in rounds;
+        they are sampled with the map; or they are left out of the model.
+    """
+
+    std: Annotated[float, Field(gt=0, le=LARGEST), NOT_TINY] | None = None
+    treatment: Treatment = "marginalised"
+
+
+class GainTable(Systematic):
+    """Errors of the gain table with independent Gaussian priors, in prior standard deviations.
+
+    Attributes
+    ----------
+    errors : tuple of str
+        Their names.
     port : tuple of int
         The port of each.
     slope : (errors, times) array
         Relative change of the port's power gain per prior standard deviation.
     layout : DataLayout
         The data.
+    freedom : (data,) array or None
+        h: the share of each datum that sky and others follow; None for zeros.
     """
 
-    names: tuple[str, ...] = eqx.field(static=True)
+    key: ClassVar[str] = "noise.gain_table"
+    section: ClassVar[type[Section]] = GainTableSection
+    words: ClassVar[str] = "the gain table"
+    draw: ClassVar[int] = 10
+    remedy: ClassVar[str] = "noise.gain_table.treatment=sampled"
+    changes_coupling: ClassVar[bool] = False
+    moves: ClassVar[bool] = True
+    scales_sky: ClassVar[bool] = True
+
+    errors: tuple[str, ...] = eqx.field(static=True)
     port: tuple[int, ...] = eqx.field(static=True)
     slope: Float[Array, "errors times"]
     layout: DataLayout
-
-    def factors(self, z: Float[Array, " errors"]) -> Float[Array, " data"]:
-        """Compute F of every datum, of values in prior standard deviations."""
-        first, second, gains = self._gains(z)
-        return self.layout.gather(namespace(gains).sqrt(gains[first] * gains[second]))
-
-    def slopes(self, z: Float[np.ndarray, " errors"]) -> Float[np.ndarray, "data errors"]:
-        """Compute dF/dz of every datum."""
-        first, second, gains = self._gains(z)
-        own = self._own.astype(np.float64)
-        share = own[first][:, None] / gains[first][..., None]
-        share = share + own[second][:, None] / gains[second][..., None]
-        log_slope = share * np.asarray(self.slope).T[None] / 2.0
-        factors = np.sqrt(gains[first] * gains[second])
-        return np.asarray(self.layout.gather(factors[..., None] * log_slope))
-
-    @property
-    def stds(self) -> Float[np.ndarray, " errors"]:
-        """Prior standard deviations of the power gains, relative: rms over the times of each."""
-        slope = np.asarray(self.slope)
-        return np.sqrt((slope**2).sum(1) / (slope != 0).sum(1))
-
-    @property
-    def _own(self) -> np.ndarray:
-        """Whether an error is a port's: (ports, errors)."""
-        n_ports = round(np.sqrt(self.layout.n_products))
-        return np.arange(n_ports)[:, None] == np.array(self.port)[None]
-
-    def _gains(self, z: Float[Array, " errors"]) -> tuple[np.ndarray, np.ndarray, Array]:
-        """The two ports of every product, and the power gains (ports, times)."""
-        own = self._own.astype(np.float64)
-        first, second, _ = ports(len(own))
-        return first, second, 1.0 + own @ (z[:, None] * self.slope)
-
-
-class GainTable(Expanded):
-    """Errors of the gain table with independent Gaussian priors, in prior standard deviations.
-
-    Attributes
-    ----------
-    errors : TableErrors
-    centre : (errors,) array
-        z_0, in prior standard deviations.
-    seen : (data,) array
-        v_0: the visibilities before these gains, in K.
-    freedom : (data,) array or None
-        h: the share of each datum that sky and others follow; None for zeros.
-    moves : bool
-        Whether z_0 and v_0 are those that the data tell, found in rounds.
-    """
-
-    changes_coupling: ClassVar[bool] = False
-
-    errors: TableErrors
-    centre: Float[Array, " errors"]
-    seen: Float[Array, " data"]
     freedom: Float[Array, " data"] | None = None
-    moves: bool = eqx.field(static=True, default=True)
+
+    @classmethod
+    def build(cls, section: GainTableSection, context: Context, around: Around) -> GainTable:
+        return cls(*table_errors(context), context.layout, around.freedom)
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        return (Unknown(GAIN_TABLE, size=len(self.errors)),)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the errors."""
-        return self.errors.names
+        return self.errors
 
     @property
-    def stds(self) -> Float[np.ndarray, " errors"]:
-        """Prior standard deviations of the power gains, relative."""
-        return self.errors.stds
+    def stds(self) -> Vector:
+        """Prior standard deviations of the power gains, relative: rms over the times of each."""
+        slope = np.asarray(self.slope)
+        return np.sqrt((slope**2).sum(1) / (slope != 0).sum(1))
+
+    def like_the_sky(self) -> tuple[tuple[str, ...], Float[np.ndarray, "parts n"]]:
+        """What all have in common: those of single ports and levels look like no sky."""
+        return (COMMON_GAIN,), self.common[None]
 
     @property
-    def common(self) -> Float[np.ndarray, " errors"]:
+    def common(self) -> Vector:
         """Unit vector of errors along the mean power gain of all ports and times."""
-        along = np.asarray(self.errors.slope).mean(1)
+        along = np.asarray(self.slope).mean(1)
         return along / max(float(np.linalg.norm(along)), np.finfo(np.float64).tiny)
 
-    @property
-    def templates(self) -> Float[np.ndarray, "data errors"]:
-        """T, in K."""
-        return self.errors.slopes(np.asarray(self.centre)) * np.asarray(self.seen)[:, None]
+    def factors(self, z: Float[Array, " errors"]) -> DataVector:
+        """Compute F of every datum, of values in prior standard deviations."""
+        n_ports = round(np.sqrt(self.layout.n_products))
+        own = (np.arange(n_ports)[:, None] == np.array(self.port)[None]).astype(np.float64)
+        first, second, _ = ports(n_ports)
+        gains = 1.0 + own @ (z[:, None] * self.slope)
+        return self.layout.gather(namespace(gains).sqrt(gains[first] * gains[second]))
 
-    @property
-    def expected(self) -> Float[np.ndarray, " errors"]:
+    def effect(self, model, values):
+        """Multiply by F."""
+        return multiplied(model, self.factors(values[GAIN_TABLE]))
+
+    def expected(self, centre: Vector) -> Vector:
         """What makes up for the volume of skies that fit: -dln F/dz^T h."""
         if self.freedom is None:
-            return np.zeros(len(self.names))
-        centre = np.asarray(self.centre)
-        log_slopes = self.errors.slopes(centre) / np.asarray(self.errors.factors(centre))[:, None]
-        return -log_slopes.T @ np.asarray(self.freedom)
+            return np.zeros(len(centre))
+        return -np.asarray(_volume_slopes(*on_device((self, centre))))
 
-    @property
-    def response(self) -> None:
-        """T has the gains in it."""
-        return
 
-    def behind(self, response: Float[Array, " data"]) -> Systematic:
-        return self
+@eqx.filter_jit
+def _volume_slopes(table: GainTable, z: Array) -> Array:
+    return jax.grad(lambda z: table.freedom @ jnp.log(table.factors(z)))(z)
 
-    def marginalised(self, model: LinearGaussian) -> LinearGaussian:
-        """Multiply by F(z_0), add T T^T to N and T (expected - z_0) to the mean."""
-        columns = self.templates
-        model = multiplied(model, self.errors.factors(self.centre))
-        noise = model.noise + LowRankCovariance(columns, "the gain table")
-        return with_added(
-            replace(model, noise=noise), columns @ (self.expected - np.asarray(self.centre))
+
+def table_errors(
+    context: Context,
+) -> tuple[tuple[str, ...], tuple[int, ...], Float[np.ndarray, "errors times"]]:
+    """Names, ports and slopes of the errors that the data name, or of one for each port.
+
+    Raises
+    ------
+    InputError
+        If the scenario and the data both say how large they are, or none of them, and for errors
+        of more than 10 %.
+    """
+    std, calibration = context.scenario.noise.gain_table.std, context.calibration
+    named = calibration is not None and calibration.gain_slope is not None
+    if named and std is not None:
+        raise InputError(
+            "the data say the errors of their gain table themselves; leave out noise.gain_table.std"
         )
-
-    def sampled(self, model: LinearGaussian) -> LinearGaussian:
-        """Sample the site ``gain_table`` (errors,), in prior standard deviations."""
-        normal = dist.Normal(jnp.zeros(len(self.names)), 1.0).to_event(1)
-        return multiplied(model, self.errors.factors(numpyro.sample(GAIN_TABLE, normal)))
-
-    def true(self, truth: Mapping[str, float | np.ndarray]) -> dict[str, float]:
-        return self.in_units(np.asarray(truth[GAIN_TABLE]))
+    if not named:
+        if std is None and context.scenario.flight is not None:
+            # what it says of every level of every port: these data have one
+            std = context.scenario.flight.gain_std
+            if std is not None and std > LARGEST:
+                raise InputError(
+                    f"flight.gain_std is {std:g}, and power gains that are off by more than "
+                    f"{LARGEST:g} of themselves are not modelled; give a smaller "
+                    "noise.gain_table.std for simulated data"
+                )
+        if std is None:
+            raise InputError(
+                "the data say nothing of a gain table; give noise.gain_table.std, the relative "
+                "error of every port's power gain"
+            )
+        ports = tuple(range(context.beam_source.n_ports))
+        slope = np.full((len(ports), context.layout.n_times), std)
+        return tuple(f"gain_{port}" for port in ports), ports, slope
+    # of levels that no port has at these times the data say nothing
+    used = np.flatnonzero(calibration.gain_slope.any(1))
+    port, slope = calibration.gain_port[used], calibration.gain_slope[used]
+    for number in np.unique(port):
+        total = float(np.sqrt((slope[port == number] ** 2).sum(0)).max())
+        if total > LARGEST:
+            raise InputError(
+                f"the data say that the power gain of port {number} is known to {total:.2g} of "
+                f"itself, expected at most {LARGEST:g}; noise.gain_table.treatment=ignored takes "
+                "it as it is"
+            )
+    names = tuple(f"gain_{calibration.gain_names[k].replace(' ', '_')}" for k in used)
+    return names, tuple(port.tolist()), slope

@@ -1,34 +1,61 @@
-"""What is not known of instrument and sky: marginalised into N, or sampled.
+"""What is not known of instrument and sky: one function of its values, marginalised or sampled.
 
-Every systematic is a term of the noise covariance, and sites of a NumPyro program; a :class:`Chart`
-has coordinates of several sites in which a posterior's ridges are straight.
+A systematic has unknowns with priors, and an effect: the model d = A m + n given their values, as a
+function that JAX can differentiate. Sampled, the unknowns are sites of a NumPyro program, and the
+model is the function of them. Marginalised, the function is taken to first order about values z_0
+of all unknowns (in prior standard deviations) and a sky m_0, ::
 
-Unknowns whose part in the data is linear, or taken to first order, are columns of N's square root:
-N gets T T^T, a column of T for each unknown: what one prior standard deviation of it does to the
-data. Where gains multiply what the data are of (:meth:`Templated.behind`), they multiply T, too.
-Powers and temperatures add to the data in proportion: d = A m + T (x - mean) / std + n.
+    d = v(m, z) + n = v(m, z_0) + T (z - z_0) + n,    T = dv/dz at (m_0, z_0),    z ~ N(0, 1),
+
+so that N gets T T^T, a column of T for each unknown, and the data the mean -T z_0. Gains that come
+later multiply T, too. Where z_0 and m_0 are those that the data
+determine, found in rounds, this is the Gaussian about the joint mode of sky and unknowns (Gauss and
+Newton), with the term that couples z - z_0 and m - m_0 left out.
+
+Some are marginalised otherwise, by a method :meth:`Systematic.marginalised` of their own: unknowns
+that are many and Gaussian have a covariance of their own (gain drifts, :class:`AdditiveNoise`),
+errors of beams one that is averaged over the skies of the prior, and scales (:class:`Scale`) have
+no Gaussian term at all.
 """
 
 from __future__ import annotations
 
+import zlib
 from abc import abstractmethod
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from operator import attrgetter
 from statistics import NormalDist
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array, scalar
+from lusee_bayes.core.arrays import Array, DataVector, Modes, Vector, namespace, on_device, scalar
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import dist, numpyro
+from lusee_bayes.core.section import Section
+from lusee_bayes.instrument.coupling import DenseCoupling
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
-from lusee_bayes.noise.covariance import Covariance, LowRankCovariance
+from lusee_bayes.noise.covariance import Covariance, DiagonalCovariance, LowRankCovariance
+from lusee_bayes.sky.prior import IndependentPrior
+from lusee_bayes.systematics.context import Around, Context
+
+# where programs sample the sky
+SKY = "sky"
+# with more unknowns than this beside an integrated sky, no exact Hessian says how to sample them:
+# finding it takes two gradients of the evidence for each
+MOST_COLLAPSED = 64
+
+# true values of what simulated data hold, by the names of their sites
+Truth = dict[str, float | np.ndarray]
+# values of a systematic's unknowns, by the names of their sites
+Values = Mapping[str, float | Float[Array, "..."]]
 
 
 class Chart(eqx.Module):
@@ -76,29 +103,295 @@ class Chart(eqx.Module):
         """Compute the coordinates of unconstrained values by site."""
 
 
-# where programs sample the sky
-SKY = "sky"
-# with more unknowns than this beside an integrated sky, no exact Hessian says how to sample them:
-# finding it takes two gradients of the evidence for each
-MOST_COLLAPSED = 64
+@dataclass(frozen=True)
+class Unknown:
+    """A number that is not known, or several alike: a site of programs.
+
+    Attributes
+    ----------
+    name : str
+        Of the site.
+    mean, std : float
+        Of the Gaussian prior of each.
+    size : int or None
+        How many there are; None for a number.
+    log : bool
+        The logarithm is Gaussian: ``mean`` is the median, ``std`` that of the natural logarithm.
+    low, high : float
+        Ends of the domain, at which the prior is cut off.
+    """
+
+    name: str
+    mean: float | Float[Array, ""] = 0.0
+    std: float | Float[Array, ""] = 1.0
+    size: int | None = None
+    log: bool = False
+    low: float = -np.inf
+    high: float = np.inf
+
+    def prior(self) -> dist.Distribution:
+        """Return the prior, of all of them.
+
+        Raises
+        ------
+        InputError
+            As :func:`normal_within`.
+        """
+        if np.isfinite([self.low, self.high]).any():
+            return normal_within(self.name, self.mean, self.std, self.low, self.high)
+        kind, mean = (dist.LogNormal, jnp.log) if self.log else (dist.Normal, jnp.asarray)
+        prior = kind(mean(scalar(self.mean)), scalar(self.std))
+        return prior if self.size is None else prior.expand([self.size]).to_event(1)
+
+    def at(self, z: float | Float[Array, "..."]) -> float | Float[Array, "..."]:
+        """Compute values of numbers in prior standard deviations from the prior mean."""
+        if self.log:
+            return self.mean * namespace(z).exp(self.std * z)
+        return self.mean + self.std * z
 
 
 class Systematic(eqx.Module):
     """Something about the instrument or the sky that is not known.
 
-    Both methods take a ``LinearGaussian`` and return one, so that systematics are applied one
-    after the other.
+    A subclass has :attr:`unknowns` and :meth:`effect`. For a scenario it has a section, its key and
+    :meth:`build`, too, and a line in :mod:`.systematics.registered`.
 
     Attributes
     ----------
+    key : str
+        Path of its section in a scenario, such as ``noise.gain``.
+    section : type
+        The schema of that section.
+    words : str
+        What it is called in messages.
+    unit : str
+        Of all unknowns; empty for numbers, and where their names tell it.
+    draw : int or None
+        What the seed of simulated data is folded with; by default a number of the key.
+    remedy : str
+        What may help where rounds do not settle.
     needs_sky : bool
         Whether it has so many unknowns that the sky has to be sampled together with them.
     changes_coupling : bool
         Whether A depends on it: if not, A is made dense once and for all.
+    first_order : bool
+        Whether :meth:`marginalised` takes the effect to first order.
+    moves : bool
+        Whether that is about values and a sky that the data determine, found in rounds.
+    scales_sky : bool
+        Whether its effect is a factor of all visibilities; more unknown skies then fit the data the
+        larger it is, which :meth:`expected` makes up for.
+    has_table : bool
+        Whether reports have a table of its unknowns alone.
     """
 
+    key: ClassVar[str] = ""
+    section: ClassVar[type[Section]]
+    words: ClassVar[str] = "a systematic"
+    unit: ClassVar[str] = ""
+    draw: ClassVar[int | None] = None
+    remedy: ClassVar[str] = ""
     needs_sky: ClassVar[bool] = False
     changes_coupling: ClassVar[bool] = True
+    first_order: ClassVar[bool] = True
+    moves: ClassVar[bool] = False
+    scales_sky: ClassVar[bool] = False
+    has_table: ClassVar[bool] = False
+
+    # --- in a scenario ---
+
+    @classmethod
+    def treatment(cls, scenario: Any) -> str | None:
+        """What a scenario does about it; None if it has nothing of it."""
+        section = attrgetter(cls.key)(scenario)
+        return None if section is None else section.treatment
+
+    @classmethod
+    def build(cls, section: Any, context: Context, around: Around) -> Systematic:
+        """Build it from a scenario's section.
+
+        Parameters
+        ----------
+        section : Section
+            Of the type :attr:`section`.
+        context : Context
+            Where :attr:`Around.values` move others, with these.
+        around : Around
+            What it may be built around.
+        """
+        raise NotImplementedError(f"{cls.__name__} has no scenario's section")
+
+    @classmethod
+    def moved(cls, section: Any, context: Context, values: Values) -> Context:
+        """The context with an instrument that has these values; by default no other."""
+        return context
+
+    @classmethod
+    def in_rounds(cls, section: Any) -> bool:
+        """Whether a section makes it move, see :attr:`moves`."""
+        return cls.moves
+
+    @classmethod
+    def truth(cls, section: Any, context: Context, key: PRNGKeyArray) -> Truth:
+        """Draw the true values in simulated data from their priors.
+
+        Parameters
+        ----------
+        section : Section
+        context : Context
+        key : PRNG key
+            Of the scenario's seed.
+        """
+        found = cls.build(section, context, Around())
+        z = np.asarray(jax.random.normal(cls.own_key(key), (len(found.names),)))
+        return {
+            name: value if value.ndim else float(value) for name, value in found.values(z).items()
+        }
+
+    @classmethod
+    def own_key(cls, key: PRNGKeyArray) -> PRNGKeyArray:
+        """The scenario's key, folded with a number of this systematic."""
+        return jax.random.fold_in(key, cls.draw or zlib.crc32(cls.key.encode()))
+
+    @classmethod
+    def in_data(
+        cls, section: Any, context: Context, model: LinearGaussian, truth: Truth, key: PRNGKeyArray
+    ) -> LinearGaussian:
+        """The model with the true values of simulated data.
+
+        Parameters
+        ----------
+        section : Section
+        context : Context
+            Moved to all true values (:meth:`moved`), as the model's A is.
+        model : LinearGaussian
+            Without it.
+        truth : dict
+            True values of all systematics.
+        key : PRNG key
+            Of the scenario's seed, for what else is drawn.
+        """
+        found = cls.build(section, context, Around())
+        return found.effect(model, {u.name: truth[u.name] for u in found.unknowns})
+
+    # --- its unknowns ---
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        """The sites, with their priors."""
+        return ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all numbers that are not known."""
+        return tuple(
+            name
+            for u in self.unknowns
+            for name in ([u.name] if u.size is None else [f"{u.name}_{k}" for k in range(u.size)])
+        )
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """The same in words."""
+        return tuple(name.replace("_", " ") for name in self.names)
+
+    @property
+    def means(self) -> Vector:
+        """Prior means, in the units of the names."""
+        return np.concatenate([np.full(u.size or 1, float(u.mean)) for u in self.unknowns])
+
+    @property
+    def stds(self) -> Vector:
+        """Prior standard deviations."""
+        return np.concatenate([np.full(u.size or 1, float(u.std)) for u in self.unknowns])
+
+    def values(self, z: Float[Array, " n"]) -> dict[str, float | Float[Array, "..."]]:
+        """Values by site, of numbers in prior standard deviations from the prior mean."""
+        found, first = {}, 0
+        for u in self.unknowns:
+            own = z[first] if u.size is None else z[first : first + u.size]
+            found[u.name] = u.at(own)
+            first += u.size or 1
+        return found
+
+    def stacked(self, values: Values) -> Float[Array, " n"]:
+        """Values by site as one array."""
+        xp = namespace(*values.values())
+        return xp.concatenate([xp.atleast_1d(xp.asarray(values[u.name])) for u in self.unknowns])
+
+    def in_units(self, z: Float[np.ndarray, " n"]) -> dict[str, float]:
+        """Values by name, of numbers in prior standard deviations from the prior mean."""
+        return dict(zip(self.names, (self.means + self.stds * z).tolist(), strict=True))
+
+    def true(self, truth: Truth) -> dict[str, float]:
+        """True values by name, of those by site."""
+        z = {u.name: (np.asarray(truth[u.name]) - u.mean) / u.std for u in self.unknowns}
+        return self.in_units(self.stacked(z))
+
+    def like_the_sky(self) -> tuple[tuple[str, ...], Float[np.ndarray, "parts n"]]:
+        """What of it may look like a uniform sky: in words, and as unit vectors of its unknowns."""
+        return self.labels, np.eye(len(self.names))
+
+    # --- its effect ---
+
+    def effect(self, model: LinearGaussian, values: Values) -> LinearGaussian:
+        """The model given values of the unknowns, differentiable in them.
+
+        Parameters
+        ----------
+        model : LinearGaussian
+            Without it.
+        values : mapping of array
+            By site.
+        """
+        raise NotImplementedError(f"{type(self).__name__} has no effect of its values")
+
+    def derivative(
+        self, model: LinearGaussian, sky: Modes, centre: Vector
+    ) -> Float[Array, "data n"]:
+        """Compute T, the derivative of the data by the unknowns in prior std's, in K.
+
+        Parameters
+        ----------
+        model : LinearGaussian
+            With what comes before it.
+        sky : (modes,) array
+            In K.
+        centre : (n,) array
+            About which, in prior standard deviations.
+        """
+        coupling, prior, unit = model.coupling, model.prior, np.ones(1)
+        if not self.changes_coupling:  # how much of this sky there is
+            coupling, prior = DenseCoupling((coupling @ sky)[:, None]), IndependentPrior(unit)
+            sky = unit
+        noise = DiagonalCovariance(np.ones(model.n_data))
+        bare = LinearGaussian(coupling, prior, noise, model.offset)
+        return _derivative(*on_device((self, bare, sky, centre)))
+
+    def beyond_first_order(
+        self, model: LinearGaussian, sky: Modes, z: Vector
+    ) -> dict[str, DataVector]:
+        """What each unknown does to the data beyond first order, in K, by name.
+
+        Parameters
+        ----------
+        model : LinearGaussian
+            Without it.
+        sky : (modes,) array
+            In K.
+        z : (n,) array
+            How far each is off on either side, in prior standard deviations.
+        """
+
+        def seen(way: Vector) -> DataVector:
+            return np.asarray(self.effect(model, self.values(way)).predict(sky))
+
+        middle, ways = seen(0.0 * z), zip(self.names, np.diag(z), strict=True)
+        return {name: (seen(way) + seen(-way)) / 2.0 - middle for name, way in ways}
+
+    def expected(self, centre: Vector) -> Vector:
+        """What :meth:`marginalised` takes the prior mean for, about values, in prior std's."""
+        return np.zeros(len(centre))
 
     def chart(self, model: LinearGaussian) -> Chart | None:
         """Return coordinates of its sites, and of the sky's, in which ridges are straight.
@@ -115,19 +408,11 @@ class Systematic(eqx.Module):
         """
         return None
 
-    def behind(self, response: Float[Array, " data"]) -> Systematic:
-        """Return it as N holds it where gains multiply what the data are of.
-
-        Parameters
-        ----------
-        response : (data,) array
-            The gains.
-        """
-        return self
-
-    @abstractmethod
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Integrate it out of the model, as a term of N (and of the mean).
+
+        Here it is to first order about the prior means of the unknowns and of the sky, and nothing
+        comes after it; :class:`Expanded` is about any.
 
         Parameters
         ----------
@@ -139,10 +424,12 @@ class Systematic(eqx.Module):
         LinearGaussian
             The model averaged over its prior.
         """
+        prior = model.prior
+        mean = prior.white_mean if prior.white_mean is not None else np.zeros(prior.rank)
+        return Expanded.about(self, model, prior.colour(mean)).marginalised(model)
 
-    @abstractmethod
     def sampled(self, model: LinearGaussian) -> LinearGaussian:
-        """Sample it; call this inside a NumPyro program.
+        """Sample its unknowns; call this inside a NumPyro program.
 
         Parameters
         ----------
@@ -154,6 +441,103 @@ class Systematic(eqx.Module):
         LinearGaussian
             The model given the values of its sites.
         """
+        return self.effect(
+            model, {u.name: numpyro.sample(u.name, u.prior()) for u in self.unknowns}
+        )
+
+
+class Marginalised(eqx.Module):
+    """A systematic as N holds it; among sampled ones it keeps its place, but has no site.
+
+    Attributes
+    ----------
+    systematic : Systematic
+        The systematic.
+    """
+
+    systematic: Systematic
+
+    needs_sky: ClassVar[bool] = False
+
+    @property
+    def changes_coupling(self) -> bool:
+        """Whether A depends on it."""
+        return self.systematic.changes_coupling
+
+    def marginalised(self, model: LinearGaussian) -> LinearGaussian:
+        """The model with it in N."""
+        return self.systematic.marginalised(model)
+
+    def sampled(self, model: LinearGaussian) -> LinearGaussian:
+        """The same: no site is sampled."""
+        return self.marginalised(model)
+
+
+class Expanded(Marginalised):
+    """A systematic to first order about values, as N holds it.
+
+    Attributes
+    ----------
+    centre : (n,) array
+        z_0, in prior standard deviations.
+    columns : (data, n) array
+        T: what one prior standard deviation of each unknown does to the data, in K.
+    expected : (n,) array
+        What the prior mean is taken for, in prior standard deviations.
+    shift : (data,) array
+        T (expected - z_0), before the gains that come later.
+    """
+
+    centre: Float[Array, " n"]
+    columns: Float[Array, "data n"]
+    expected: Float[Array, " n"]
+    shift: DataVector
+
+    @classmethod
+    def about(
+        cls,
+        systematic: Systematic,
+        model: LinearGaussian,
+        sky: Modes,
+        values: Mapping[str, float] | None = None,
+    ) -> Expanded:
+        """Expand a systematic about values and a sky.
+
+        Parameters
+        ----------
+        systematic : Systematic
+        model : LinearGaussian
+            With all that comes before it, at its values.
+        sky : (modes,) array
+            m_0, in K.
+        values : mapping of float, optional
+            Of its unknowns, by name; what is left out is at its prior mean.
+        """
+        given = values or {}
+        means, names = systematic.means, systematic.names
+        at = np.array([given.get(name, mean) for name, mean in zip(names, means, strict=True)])
+        centre = (at - means) / systematic.stds
+        columns = systematic.derivative(model, sky, centre)
+        expected = systematic.expected(centre)
+        return cls(systematic, centre, columns, expected, columns @ (expected - centre))
+
+    def seen(self, model: LinearGaussian) -> LinearGaussian:
+        """The model at z_0."""
+        return self.systematic.effect(model, self.systematic.values(self.centre))
+
+    def behind(self, gains: DataVector) -> Expanded:
+        """The same where gains come later."""
+        return replace(self, columns=self.columns * gains[:, None])
+
+    def marginalised(self, model: LinearGaussian) -> LinearGaussian:
+        """Take the effect at z_0, add T T^T to N and T (expected - z_0) to the mean."""
+        noise = model.noise + LowRankCovariance(self.columns, self.systematic.words)
+        return with_added(replace(self.seen(model), noise=noise), self.shift)
+
+
+@eqx.filter_jit
+def _derivative(systematic, model, sky, centre):
+    return jax.jacfwd(lambda z: systematic.effect(model, systematic.values(z)).predict(sky))(centre)
 
 
 class AdditiveNoise(Systematic):
@@ -170,6 +554,7 @@ class AdditiveNoise(Systematic):
     """
 
     changes_coupling: ClassVar[bool] = False
+    first_order: ClassVar[bool] = False
 
     name: str = eqx.field(static=True)
     layout: DataLayout
@@ -179,72 +564,45 @@ class AdditiveNoise(Systematic):
         """Return its covariance over the entries of the data vector, in K^2."""
 
     @property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        return (Unknown(f"{self.name}_noise", size=self.covariance().rank),)
+
+    @property
     def needs_sky(self) -> bool:
         return self.covariance().rank > MOST_COLLAPSED
 
+    def effect(self, model, values):
+        """Add the noise that (rank,) unit normals make."""
+        return with_added(model, self.covariance().colour(values[f"{self.name}_noise"]))
+
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
+        """Add the covariance to N."""
         return replace(model, noise=model.noise + self.covariance())
-
-    def sampled(self, model: LinearGaussian) -> LinearGaussian:
-        """Sample the site ``NAME_noise``: (rank,) unit normals of which the noise is made."""
-        covariance = self.covariance()
-        normal = dist.Normal(jnp.zeros(covariance.rank), 1.0).to_event(1)
-        noise = covariance.colour(numpyro.sample(f"{self.name}_noise", normal))
-        return with_added(model, noise)
-
-    def distort(
-        self, visibilities: Float[Array, "products times"], key: PRNGKeyArray
-    ) -> Float[Array, "products times"]:
-        """Add one draw of the noise, as simulated data hold it.
-
-        Parameters
-        ----------
-        visibilities : (products, times) array
-            Visibilities on the full grid, in K.
-        key : PRNG key
-            For the draw.
-
-        Returns
-        -------
-        (products, times) array
-            In K; samples that the layout leaves out stay as they are.
-        """
-        return visibilities + self.layout.scatter(self.covariance().sample(key))
-
-
-class Marginalised(Systematic):
-    """A systematic that keeps its place among sampled ones, but is integrated out.
-
-    Attributes
-    ----------
-    systematic : Systematic
-        The systematic.
-    """
-
-    systematic: Systematic
-
-    def marginalised(self, model: LinearGaussian) -> LinearGaussian:
-        return self.systematic.marginalised(model)
-
-    sampled = marginalised
 
 
 class Scale(Systematic):
     """A systematic without a Gaussian term: marginalised, it stays at its median."""
 
     changes_coupling: ClassVar[bool] = False
+    first_order: ClassVar[bool] = False
 
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Return the model as it is."""
         return model
 
 
-def with_added(model: LinearGaussian, signal: Float[Array, " data"]) -> LinearGaussian:
+def present(systematics: Sequence[type[Systematic]], scenario: Any) -> list[tuple[type, Any]]:
+    """Those of which a scenario has something, with their sections."""
+    found = [cls for cls in systematics if cls.treatment(scenario) is not None]
+    return [(cls, attrgetter(cls.key)(scenario)) for cls in found]
+
+
+def with_added(model: LinearGaussian, signal: DataVector) -> LinearGaussian:
     """Add a signal in K to the mean of a model's data."""
     return replace(model, offset=signal if model.offset is None else model.offset + signal)
 
 
-def multiplied(model: LinearGaussian, response: Float[Array, " data"]) -> LinearGaussian:
+def multiplied(model: LinearGaussian, response: DataVector) -> LinearGaussian:
     """Multiply the mean of a model's data, of sky and offset, by gains."""
     offset = None if model.offset is None else model.offset * response
     return replace(model, coupling=model.coupling.with_response(response), offset=offset)
@@ -253,21 +611,6 @@ def multiplied(model: LinearGaussian, response: Float[Array, " data"]) -> Linear
 def scalar_or_none(value: float | Float[Array, ""] | None) -> Float[Array, ""] | None:
     """Convert a number like :func:`scalar`; None stays None."""
     return None if value is None else scalar(value)
-
-
-def uncertain_scale(
-    value: float | Float[Array, ""], log_std: float | Float[Array, ""]
-) -> dist.Distribution:
-    """Return the prior of a positive number whose logarithm is Gaussian.
-
-    Parameters
-    ----------
-    value : float
-        The median.
-    log_std : float
-        Standard deviation of the natural logarithm.
-    """
-    return dist.LogNormal(jnp.log(scalar(value)), log_std)
 
 
 def normal_within(
@@ -304,104 +647,3 @@ def normal_within(
     return dist.TruncatedNormal(
         mean, std, low=None if np.isinf(low) else low, high=None if np.isinf(high) else high
     )
-
-
-class Templated(Systematic):
-    """Unknowns with independent Gaussian priors, and a column of N's square root for each.
-
-    Subclasses have the attributes ``names``, ``stds`` (n,), ``templates`` (data, n) and
-    ``response`` ((data,) or None).
-    """
-
-    @property
-    def unit(self) -> str:
-        """Unit of all values; empty for numbers, and where their names tell it."""
-        return ""
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """The unknowns in words."""
-        return self.names
-
-    @property
-    def columns(self) -> Float[Array, "data n"]:
-        """The columns that are in N: the templates behind the gains, in K."""
-        if self.response is None:
-            return self.templates
-        return self.templates * self.response[:, None]
-
-    @property
-    def expected(self) -> Float[Array, " n"]:
-        """What :meth:`marginalised` takes the prior mean for, in prior standard deviations."""
-        return np.zeros(len(self.names))
-
-    def behind(self, response: Float[Array, " data"]) -> Systematic:
-        return replace(self, response=response)
-
-    def in_units(self, z: Float[np.ndarray, " n"]) -> dict[str, float]:
-        """Values by name, of numbers in prior standard deviations from the prior mean."""
-        return dict(zip(self.names, (np.asarray(self.stds) * z).tolist(), strict=True))
-
-    def true(self, truth: Mapping[str, float | np.ndarray]) -> dict[str, float]:
-        """True values by name, of those by site."""
-        return {name: float(truth[name]) for name in self.names}
-
-
-class Expanded(Templated):
-    """Unknowns taken to first order about values.
-
-    Subclasses have the attributes ``centre`` (n,), the values in prior standard deviations, and
-    ``moves``: whether these are those that the data tell, found in rounds.
-    """
-
-
-class LinearUnknowns(Templated):
-    """Temperatures with independent Gaussian priors, which add to the data in proportion.
-
-    What they add on average is part of the model's offset already.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Of the sites, each ending with ``_k``.
-    means, stds : (unknowns,) array
-        Of the priors, in K.
-    templates : (data, unknowns) array
-        T: what one prior standard deviation of each adds to the data, in K.
-    response : (data,) array or None
-        Gains that the templates are seen through in N; None for ones.
-    """
-
-    changes_coupling: ClassVar[bool] = False
-
-    names: tuple[str, ...] = eqx.field(static=True)
-    means: Float[Array, " unknowns"]
-    stds: Float[Array, " unknowns"]
-    templates: Float[Array, "data unknowns"]
-    response: Float[Array, " data"] | None = None
-
-    @property
-    def unit(self) -> str:
-        return "K"
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        return tuple(name.removesuffix("_k").replace("_", " ") for name in self.names)
-
-    def marginalised(self, model: LinearGaussian) -> LinearGaussian:
-        """Add T T^T to N."""
-        name = f"the {self.labels[0].split()[0]}"
-        return replace(model, noise=model.noise + LowRankCovariance(self.columns, name))
-
-    def sampled(self, model: LinearGaussian) -> LinearGaussian:
-        """Sample one site for each, of its name, in K."""
-        values = [
-            numpyro.sample(name, dist.Normal(mean, std))
-            for name, mean, std in zip(self.names, self.means, self.stds, strict=True)
-        ]
-        z = (jnp.stack([jnp.asarray(value) for value in values]) - self.means) / self.stds
-        return with_added(model, self.templates @ z)
-
-    def in_units(self, z: Float[np.ndarray, " n"]) -> dict[str, float]:
-        values = np.asarray(self.means) + np.asarray(self.stds) * z
-        return dict(zip(self.names, values.tolist(), strict=True))

@@ -17,11 +17,12 @@ import numpy as np
 import pytest
 import xarray as xr
 from astropy.io import fits
-from commands import content, posterior_of, run
+from commands import content, posterior_of, run, sky_draws_of
 
 import lusee_bayes
+from lusee_bayes.cli.options import ScenarioOptions
 from lusee_bayes.core.harmonics import from_healpy, modes_to_map, pixel_matrix
-from lusee_bayes.experiment.section import OutputSection
+from lusee_bayes.experiment.scenario import OutputSection
 from lusee_bayes.results.map_result import MapResult
 from lusee_bayes.runs import map_run as runs
 from lusee_bayes.runs.folder import Output
@@ -48,12 +49,12 @@ def test_map_writes_what_it_promises(folder):
 
 def test_the_files_agree_with_each_other(folder):
     posterior = posterior_of(folder)
-    mean, std = posterior["mean"].values, posterior["std"].values
+    mean, std = posterior["mean"].values[0], posterior["std"].values[0]
     np.testing.assert_array_equal(
         posterior["ell"].values ** 2 + posterior["ell"].values + posterior["m"].values,
         np.arange(81),
     )
-    covariance = posterior["covariance"].values
+    covariance = posterior["covariance"].values[0]
     # rounding of products of numbers that span 1e10 in the covariance
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), std, rtol=1e-7)
     nside = 8
@@ -64,15 +65,16 @@ def test_the_files_agree_with_each_other(folder):
     got = healpy.read_map(folder / "std.fits", dtype=np.float64)
     np.testing.assert_allclose(got, expected, rtol=1e-6)
     # 400 draws: each variance to 5 sigma of sqrt(2 / 400), 81 of them
-    ratio = posterior["draws"].values.var(axis=0, ddof=1) / std**2
+    ratio = sky_draws_of(folder)[0].var(axis=0, ddof=1) / std**2
     assert np.abs(ratio - 1).max() < 5 * np.sqrt(2 / 400)
     # sqrt(2) there and back again
     alm = healpy.read_alm(folder / "mean_alm.fits")
     np.testing.assert_allclose(from_healpy(alm), mean, rtol=4e-16)
     with (folder / "spectra.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert list(rows[0])[:7] == [
-        "ell", "rho", "snr", "cl_prior", "cl_mean", "cl_truth", "cl_posterior_variance",
+    assert list(rows[0])[:8] == [
+        "frequency_mhz", "ell", "rho", "snr", "cl_prior", "cl_mean", "cl_truth",
+        "cl_posterior_variance",
     ]  # fmt: skip
     assert float(rows[2]["cl_posterior_variance"]) == pytest.approx(np.mean(std[4:9] ** 2))
     summary = json.loads((folder / "summary.json").read_text())
@@ -115,16 +117,25 @@ def test_simulate_then_map_equals_map(folder, tmp_path, capsys):
     first, again = posterior_of(folder), posterior_of(tmp_path / "out")
     np.testing.assert_array_equal(first["mean"].values, again["mean"].values)
     np.testing.assert_array_equal(first["truth"].values, again["truth"].values)
-    assert again.sizes["draw"] == 3 and "covariance" in first and "covariance" not in again
+    assert (
+        again["posterior"].sizes["draw"] == 3
+        and "covariance" in first
+        and "covariance" not in again
+    )
 
 
-@pytest.mark.parametrize("flag", ["covariance", "updatable"])
+@pytest.mark.parametrize("flag", ["covariance", "information"])
 def test_options_of_the_output_reach_the_scenario(flag, monkeypatch):
     """What they make is tested beside run_map."""
     given, stop = [], raises(KeyboardInterrupt())
     monkeypatch.setattr(runs, "run_map", lambda *a, **_: given.append(a) or stop())
     assert run("map", "fiducial", f"--{flag}", "--draws", 7, "-o", "x", "-q") == 130
     assert given[0][0].output == OutputSection(draws=7, **{flag: True})
+
+
+def test_names_of_files_keep_their_capitals():
+    loaded = ScenarioOptions(set_=("lmax=6",)).load("fiducial", flight__clock="Of/A Clock.JSON")
+    assert (loaded.flight.clock, loaded.lmax) == ("Of/A Clock.JSON", 6)
 
 
 def test_info_recognises_its_files(folder, tmp_path, capsys):
@@ -163,7 +174,7 @@ def test_data_without_truth(folder, tmp_path):
     out = tmp_path / "out"
     assert run("map", "fiducial", *SMALL, "--data", tmp_path / "real.nc", "-o", out, "-q") == 0
     assert not (out / "truth.fits").exists()
-    assert json.loads((out / "summary.json").read_text())["ell_cross"] is None
+    assert json.loads((out / "summary.json").read_text())["channels"][0]["ell_cross"] is None
     assert "rho" not in (out / "spectra.csv").read_text()
 
 
@@ -175,7 +186,7 @@ def test_an_interrupted_write_leaves_the_previous_result_whole(
 
     # the last file but the page
     monkeypatch.setattr(MapResult, "summary", raises(KeyboardInterrupt()))
-    monkeypatch.setattr(runs, "map_result", lambda *_, **__: small_map.result)
+    monkeypatch.setattr(runs, "map_channels", lambda *_, **__: small_map.result)
     monkeypatch.setattr(runs, "MAP", replace(runs.MAP, figures={}))
     assert run("map", "fiducial", *SMALL, "--set", "seed=2", "-o", out, "--force", "-q") == 130
     said = capsys.readouterr().err.strip()
@@ -218,7 +229,7 @@ def test_what_ends_a_run_is_one_sentence_and_leaves_nothing(
         (folder / "mean.fits").write_text("half")
         fail()
 
-    monkeypatch.setattr(runs, "map_result", lambda *_, **__: small_map.result)
+    monkeypatch.setattr(runs, "map_channels", lambda *_, **__: small_map.result)
     monkeypatch.setattr(runs, "MAP", replace(runs.MAP, figures={}, outputs=[Output(write)]))
     out = tmp_path / "out [red]"
     assert run("map", "fiducial", *SMALL, "-o", out, "-q") == code
@@ -235,7 +246,7 @@ def test_force_does_not_replace_what_the_run_reads(small_map, tmp_path, capsys):
         ["map", out / "scenario.yaml", "-o", out],
         ["map", "fiducial", *SMALL, "--set", f"sky.file={out}/mean.fits", "-o", out],
         ["map", "fiducial", *SMALL, "--data", out / "diagnostics.nc", "-o", out],
-        ["map", "fiducial", *SMALL, "--onto", out, "-o", out],
+        ["map", "fiducial", *SMALL, "--add", out, "-o", out],
         ["compare", out, small_map.folder, "-o", out],
         ["simulate", out / "scenario.yaml", "-o", out / "scenario.yaml"],
     ):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -12,8 +13,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from lusee_bayes.cli.commands import COMMANDS
-from lusee_bayes.cli.main import app, main
+from lusee_bayes.cli.commands import app
+from lusee_bayes.cli.main import main
 from lusee_bayes.cli.options import show
 from lusee_bayes.cli.tables import checks_table, comparison_table
 from lusee_bayes.core.version import COMMAND
@@ -35,9 +36,8 @@ def printed(table) -> list[str]:
 
 def with_data(run, name, change):
     """The same run with other data."""
-    diagnostics = run.diagnostics.copy(deep=True)
-    diagnostics["data"] = change(diagnostics["data"])
-    return replace(run, name=name, diagnostics=diagnostics)
+    channel = replace(run.channel, data=change(run.channel.data))
+    return replace(run, name=name, channels=(channel,))
 
 
 @pytest.mark.parametrize(("arguments", "code"), [(["keys"], 0), (["map", "no.yaml"], 2)])
@@ -49,7 +49,7 @@ def test_what_a_program_calls_next_is_not_said_to_be_of_a_command_before(argumen
 def test_tables_fit_eighty_columns(finished):
     others = [
         replace(finished, name="a run with a name that is longer than it had better be " * 2),
-        replace(finished, name="unknown", summary=finished.summary | {"ell_cross": None}),
+        replace(finished, name="unknown", channels=(replace(finished.channel, truth=None),)),
     ]
     lines = printed(comparison_table([finished, *others]))
     assert max(map(len, lines)) <= 80
@@ -63,7 +63,7 @@ def test_tables_fit_eighty_columns(finished):
     [
         (lambda d: d + 1.0, "other values at the same times"),
         (lambda d: 4e-24 * d, "the same data in another unit (times 4e-24)"),
-        (lambda d: d.where(np.arange(d.sizes["time"]) > 3), "samples instead of"),
+        (lambda d: np.where(np.arange(d.shape[1]) > 3, d, np.nan), "samples instead of"),
     ],
 )
 def test_evidences_of_other_data_are_not_compared(finished, change, reason):
@@ -74,7 +74,7 @@ def test_evidences_of_other_data_are_not_compared(finished, change, reason):
     assert reason in evidence_caveat([finished, same, other])
     assert "same has" not in evidence_caveat([finished, same, other])
     assert comparison_rows([finished, other])[0]["log_evidence_less_best"] is None
-    ten = replace(finished, name="ten", summary=finished.summary | {"frequency_mhz": 10.0})
+    ten = replace(finished, name="ten", channels=(replace(finished.channel, frequency_mhz=10.0),))
     assert "ten is at 10 MHz instead of 25" in evidence_caveat([finished, ten])
 
 
@@ -106,16 +106,21 @@ def test_info_of_a_folder(small_map, tmp_path, capsys):
     assert "a folder that no run has written" in capsys.readouterr().err
 
 
-EXAMPLES = [(name, line) for name, (_, lines) in COMMANDS.items() for line in lines]
+COMMANDS = [name for name in app if not name.startswith("-")]
+EXAMPLES = [
+    (name, line)
+    for name in COMMANDS
+    for line in re.findall(r"^ *- ``(.*)``$", app[name].default_command.__doc__, re.MULTILINE)
+]
 
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_help_shows_the_examples(name, capsys):
     assert main([name, "--help"]) == 0
     shown = " ".join(capsys.readouterr().out.split())
-    for example in COMMANDS[name][1]:
-        assert example in shown
-    assert "Examples" in shown
+    examples = [line for its, line in EXAMPLES if its == name]
+    assert "Examples" in shown and examples
+    assert all(example in shown for example in examples)
 
 
 @pytest.mark.parametrize(("name", "line"), EXAMPLES, ids=[line for _, line in EXAMPLES])

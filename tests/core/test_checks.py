@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from assertions import refused
+from assertions import refuse, refused
 
 import lusee_bayes as lb
 from lusee_bayes.core.checks import (
@@ -38,8 +38,7 @@ from lusee_bayes.core.errors import nearest
     ids=str,
 )
 def test_only_arrays_of_float64_are_accepted(value, got):
-    with refused(f"the beam must be a float64 array, got {got}"):
-        require_float64("the beam", value)
+    refuse(f"the beam must be a float64 array, got {got}", require_float64, "the beam", value)
     for right in (np.ones(2), jnp.ones(2), np.float64(1.0)):
         require_float64("x", right)
 
@@ -49,8 +48,7 @@ def test_only_arrays_of_float64_are_accepted(value, got):
     [((3, 5), "(3, 5)"), ((None,), "(any,)"), ((3, 4, None), "(3, 4, any)"), ((), "()")],
 )
 def test_other_shapes_are_refused_with_both_shapes(shape, said):
-    with refused(f"x has shape (3, 4), expected {said}"):
-        require_shape("x", np.ones((3, 4)), shape)
+    refuse(f"x has shape (3, 4), expected {said}", require_shape, "x", np.ones((3, 4)), shape)
     for right in ((3, 4), (None, 4), (3, None), (None, None)):
         require_shape("x", np.ones((3, 4)), right)
 
@@ -61,8 +59,7 @@ def test_non_finite_entries_are_counted_and_the_first_three_located(bad):
     x[1, 3] = x[1, 4] = bad
     with refused("x holds NaN or infinity (2 of 10 entries, first at (1, 3), (1, 4))"):
         require_finite("x", x)
-    with refused("5 of 5 entries, first at (0,), (1,), (2,))"):
-        require_finite("x", np.full(5, bad))
+    refuse("5 of 5 entries, first at (0,), (1,), (2,))", require_finite, "x", np.full(5, bad))
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, np.nan, np.inf])
@@ -88,8 +85,7 @@ def test_inside_a_transformation_values_pass_and_dtypes_do_not():
     f(jnp.array([-1.0, jnp.nan]))
     assert seen == [True]
     assert not is_traced(jnp.ones(2), 1.0)
-    with refused("float32"):
-        f(jnp.ones(2, dtype=jnp.float32))
+    refuse("float32", f, jnp.ones(2, dtype=jnp.float32))
 
 
 def test_nearest_names_the_close_one_or_all():
@@ -108,8 +104,8 @@ def test_the_representation_is_the_description():
 
 
 def objects(small_map):
-    experiment = small_map.result.experiment
-    inference = small_map.result.inference
+    experiment = lb.build(small_map.result.scenario)
+    inference = lb.infer(experiment)
     setup = experiment.setup
     return [
         (experiment.data, ["16 products", "25 MHz", "K", "00R, 01R", "2027-01-15"]),

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from assertions import refuse
 from core.test_engine import joined, tasks_of, tree
 from threadpoolctl import threadpool_info
 
@@ -71,10 +72,8 @@ def test_a_failure_of_ours_ends_the_stage_as_it_is(engine):
     def fail(k):
         raise InputError(f"of number {k}")
 
-    with pytest.raises(InputError, match="^of number 0$"):
-        engine.each(tasks_of(fail, 1), Stages(), "s")
-    with pytest.raises(InputError, match="^of number "):
-        engine.reduced(tasks_of(fail, 3), joined, Stages(), "s")
+    refuse("^of number 0$", engine.each, tasks_of(fail, 1), Stages(), "s")
+    refuse("^of number ", engine.reduced, tasks_of(fail, 3), joined, Stages(), "s")
 
     def wrong(k):
         return 1 // (k - k)

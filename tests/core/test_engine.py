@@ -47,9 +47,10 @@ def joined(a, b):
 
 @pytest.mark.parametrize(("n", "side_by_side"), [(1, 2), (2, 1), (3, 2), (7, 5), (12, 2)])
 def test_results_come_in_order_and_merge_as_a_tree(n, side_by_side):
-    found = ThisProcess(side_by_side)
-    assert found.each(tasks_of(lambda k: k * k, n), Stages(), "s") == [k * k for k in range(n)]
-    assert found.reduced(tasks_of(str, n), joined, Stages(), "s") == tree([*map(str, range(n))])
+    found, stages = ThisProcess(side_by_side), Stages()
+    assert found.each(tasks_of(lambda k: k * k, n), stages, "s") == [k * k for k in range(n)]
+    assert found.reduced(tasks_of(str, n), joined, stages, "sum") == tree([*map(str, range(n))])
+    assert [*stages.seconds] == ["s", "sum"]
 
 
 def test_so_many_are_carried_out_at_a_time():

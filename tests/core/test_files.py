@@ -5,14 +5,14 @@ And locks: one run at a time works in a folder.
 
 import json
 import os
-import signal
-import socket
 import subprocess
 import sys
 import threading
+from functools import partial
 from pathlib import Path
 
 import pytest
+from assertions import refuse
 
 import lusee_bayes
 from lusee_bayes.core.errors import InputError
@@ -50,7 +50,7 @@ for name in ("lusee_bayes", "lusee_bayes.core.checks"):
     sys.modules[name] = types.ModuleType(name)
 sys.modules["lusee_bayes"].__path__ = [root]
 sys.modules["lusee_bayes.core.checks"].InputError = ValueError
-from lusee_bayes.core.files import recover, transaction
+from lusee_bayes.core.files import locked, recover, transaction
 
 CHANGES = {"os.rename", "os.remove", "os.rmdir", "os.mkdir", "os.link"}
 left = None
@@ -75,7 +75,8 @@ def content(folder):
             for p in sorted(folder.rglob("*"))}
 
 def run(folder, files):
-    with transaction(folder, "test", ["chains"]) as stage:
+    folder.mkdir(exist_ok=True)
+    with locked(folder), transaction(folder, "test", ["chains"]) as stage:
         write(stage, files)
         # a file that is kept: a second link to the one that is there
         if (folder / "kept.fits").exists():
@@ -107,7 +108,8 @@ def deaths(base, earlier):
             # whoever recovers dies as well, each time one event later
             while dies(lambda: recover(folder), again):
                 again += 1
-        recover(folder)
+        with locked(folder):
+            recover(folder)
         found.append([hit, content(folder)])
     return start, found, again
 
@@ -203,55 +205,36 @@ def test_own_files_stay_and_those_of_the_earlier_run_go(folder):
     assert content(folder).keys() == {*OWN, *NEW, MANIFEST}
 
 
-def test_scratch_folders_of_the_dead_go_and_of_the_living_stay(folder):
-    ended = subprocess.Popen([sys.executable, "-c", ""])
-    ended.wait()
-    living = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
-    try:
-        host = socket.gethostname()
-        pids = (ended.pid, living.pid, os.getpid(), "x")
-        names = {pid: f"{SCRATCH}{pid}-{host}-abc" for pid in pids}
-        # on a disk that several hosts share: whether that process is alive is not to be seen here
-        elsewhere = f"{SCRATCH}{ended.pid}-not-{host}-abc"
-        for name in (*names.values(), elsewhere):
-            write(folder, {f"{name}/figures/maps.png": "half"})
-        recover(folder)
-        left = {path.name for path in folder.glob(f"{SCRATCH}*")}
-        assert left == {names[living.pid], names[os.getpid()], elsewhere}
-    finally:
-        living.communicate()
+def test_a_run_removes_what_a_dead_one_has_left_and_a_reader_leaves_it(folder):
+    """The one that works may be alive: only who has the lock knows that it is not."""
+    write(folder, {f"{SCRATCH}abc/figures/maps.png": "half"})
     recover(folder)
-    left = {path.name for path in folder.glob(f"{SCRATCH}*")}
-    assert left == {names[os.getpid()], elsewhere}
+    assert (folder / f"{SCRATCH}abc/figures/maps.png").exists()
+    with locked(folder):
+        assert not (folder / f"{SCRATCH}abc").exists()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_signals_wait_until_the_results_are_in_place(number, folder, monkeypatch):
-    """Sent before every move: none is heard until the last is done, then all are."""
-    heard, replace = [], os.replace
+def test_an_interrupt_while_files_are_moved_loses_nothing(folder, monkeypatch):
+    """Raised at each move in turn: what opens the folder next completes it."""
+    moves = iter(range(100))
 
-    def handler(_number, _frame):
-        heard.append(content(folder).keys())
-
-    def replace_with_a_signal(*paths):
-        os.kill(os.getpid(), number)
+    def interrupted_once(at, *paths, replace=os.replace):
+        if next(moves) == at:
+            raise KeyboardInterrupt
         replace(*paths)
 
-    earlier = signal.signal(number, handler)
-    try:
-        with transaction(folder, "test") as stage:
-            write(stage, NEW)
-            monkeypatch.setattr(os, "replace", replace_with_a_signal)
-        assert signal.getsignal(number) is handler
-    finally:
-        monkeypatch.undo()
-        signal.signal(number, earlier)
     # the rename, each file and the manifest
-    assert heard == [{*OWN, *NEW, MANIFEST}] * (len(NEW) + 2)
+    for at in range(1, len(NEW) + 2):
+        moves = iter(range(100))
+        finished(folder, OLD)
+        with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+            patched.setattr(os, "replace", partial(interrupted_once, at))
+            finished(folder, NEW)
+        recover(folder)
+        assert content(folder).keys() == {*OWN, *NEW, MANIFEST}
 
 
 def test_a_thread_commits_too(folder):
-    """Signals are the main thread's."""
     thread = threading.Thread(target=finished, args=(folder, NEW))
     thread.start()
     thread.join()
@@ -291,12 +274,10 @@ def test_what_is_in_the_way_is_refused_before_the_commit(folder, tmp_path):
         "figures": "'.*figures' is a folder, and a file of the results has its name",
         "mean.fits/x": "'.*mean.fits' is a file",
     }.items():
-        with pytest.raises(InputError, match=words):
-            finished(folder, {name: "x"})
+        refuse(words, finished, folder, {name: "x"})
         assert content(folder) == before
     for place in ("notes.txt", "notes.txt/below"):
-        with pytest.raises(InputError, match="notes.txt' is a file; give a folder"):
-            finished(folder / place, NEW)
+        refuse("notes.txt' is a file; give a folder", finished, folder / place, NEW)
     assert content(folder) == before
 
 

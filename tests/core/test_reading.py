@@ -7,6 +7,7 @@ import time
 import h5py
 import numpy as np
 import pytest
+from assertions import refuse
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -66,16 +67,14 @@ def test_what_is_declared_comes_back_in_its_kind():
     ],
 )
 def test_what_is_not_as_declared_is_said(changes, message):
-    with pytest.raises(InputError, match=message):
-        LAYOUT.checked("x", arrays(**changes), {"step": 2.0})
+    refuse(message, LAYOUT.checked, "x", arrays(**changes), {"step": 2.0})
 
 
 @pytest.mark.parametrize(
     "step", ["two", np.nan, 0.0, [1.0, 2.0], [[1], [1, 2]], None, True, 10**400]
 )
 def test_attributes_are_checked(step):
-    with pytest.raises(InputError, match="step"):
-        LAYOUT.checked("x", arrays(), {} if step is None else {"step": step})
+    refuse("step", LAYOUT.checked, "x", arrays(), {} if step is None else {"step": step})
 
 
 def test_what_no_memory_holds_is_not_read(tmp_path, monkeypatch):
@@ -94,14 +93,11 @@ def test_tables_objects_and_arrays(tmp_path):
     table = Layout("a table", {"ell": Variable(("row",)), "name": Variable(("row",), "text")})
     np.testing.assert_array_equal(read_table(tmp_path / "t.csv", table)["ell"], [0.0, 1.0])
     (tmp_path / "t.csv").write_text("ell,name\n0,a\n1\n")
-    with pytest.raises(InputError, match="line 3 has 1 entries for 2 columns"):
-        read_table(tmp_path / "t.csv", table)
+    refuse("line 3 has 1 entries for 2 columns", read_table, tmp_path / "t.csv", table)
     (tmp_path / "o.json").write_text("[1]")
-    with pytest.raises(InputError, match="holds a list"):
-        read_json(tmp_path / "o.json", Layout("an object"))
+    refuse("holds a list", read_json, tmp_path / "o.json", Layout("an object"))
     np.save(tmp_path / "a.npz", np.ones(3))
-    with pytest.raises(InputError, match="a.npz"):
-        read_arrays(tmp_path / "a.npz.npy", Layout("arrays"))
+    refuse("a.npz", read_arrays, tmp_path / "a.npz.npy", Layout("arrays"))
 
 
 @pytest.fixture
@@ -118,8 +114,7 @@ def test_a_file_without_end_is_refused(path, monkeypatch):
     monkeypatch.setattr(formats, "LIMIT_S", 0.2)
     monkeypatch.setattr(formats, "_read_all", lambda path, size: time.sleep(60))
     start = time.monotonic()
-    with pytest.raises(InputError, match="does not come to an end with it within 0.2 s"):
-        require_readable_hdf5(path)
+    refuse("does not come to an end with it within 0.2 s", require_readable_hdf5, path)
     assert time.monotonic() - start < 30
 
 
@@ -129,8 +124,7 @@ def test_a_file_that_ends_the_process_is_refused(path, monkeypatch):
         os.abort()
 
     monkeypatch.setattr(formats, "_read_all", end)
-    with pytest.raises(InputError, match="HDF5's library fails on it"):
-        require_readable_hdf5(path)
+    refuse("HDF5's library fails on it", require_readable_hdf5, path)
 
 
 TEXT = st.text(max_size=10)
@@ -172,14 +166,12 @@ def test_numbers_are_decimal_and_dates_are_text(text, value):
     ],
 )
 def test_what_is_not_valid_is_refused(text, message):
-    with pytest.raises(InputError, match=message):
-        parse_yaml(text, "the text")
+    refuse(message, parse_yaml, text, "the text")
 
 
 def test_files_are_utf8(tmp_path):
     path = tmp_path / "x.yaml"
     path.write_bytes("a: é".encode("latin-1"))
-    with pytest.raises(InputError, match=r"x.yaml cannot be read as a scenario: .*utf-8"):
-        read_yaml(path, "a scenario")
+    refuse(r"x.yaml cannot be read as a scenario: .*utf-8", read_yaml, path, "a scenario")
     path.write_bytes(b"\xef\xbb\xbfa: 1")
     assert read_yaml(path, "a scenario") == {"a": 1}

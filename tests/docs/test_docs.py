@@ -28,9 +28,7 @@ import lusee_bayes as lb
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import from_healpy
 from lusee_bayes.core.reading import parse_yaml
-from lusee_bayes.experiment.scenario import load_scenario, scenario_names
-from lusee_bayes.sampling.evidence import estimate_evidence
-from lusee_bayes.sampling.programs import load_program
+from lusee_bayes.experiment.scenario import scenario_names
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -141,7 +139,7 @@ def test_the_scenarios_of_the_pages_are_scenarios(tmp_path):
     for text in found:
         path = tmp_path / "mine.yaml"
         path.write_text(text)
-        load_scenario(path)
+        lb.load_scenario(path)
 
 
 def test_every_module_has_an_entry_in_the_api():
@@ -298,9 +296,9 @@ def test_both_faces_of_the_guides_systematic_have_one_evidence():
     )
     cable = made["CablePickup"](jnp.asarray(rng.normal(size=30)), 0.7)
     data = gaussian.sample(jax.random.key(0))[1] + 0.5 * cable.pattern
-    program = load_program("systematics")
+    program = lb.load_program("systematics")
     arguments = {"gaussian": gaussian, "systematics": (cable,)}
-    found = estimate_evidence(program, arguments, data)
+    found = lb.estimate_evidence(program, arguments, data)
     exact = float(cable.marginalised(gaussian).log_prob(data))
     # a Gaussian is what the proposal is about, so that nearly every draw counts
     assert found.effective > 200

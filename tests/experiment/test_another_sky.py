@@ -13,6 +13,7 @@ import pytest
 import wrong_data
 from scipy import linalg, stats
 
+import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.harmonics import lmax_of, synthesis_matrix
 from lusee_bayes.experiment.diagnosis import (
@@ -23,18 +24,17 @@ from lusee_bayes.experiment.diagnosis import (
     model_mistakes,
     port_mixing,
 )
-from lusee_bayes.experiment.draws import doubts
-from lusee_bayes.experiment.experiment import build, infer
+from lusee_bayes.experiment.experiment import doubts
 from lusee_bayes.experiment.model import full_model, radiometer, simulate
 from lusee_bayes.experiment.rounds import learned_prior, settled
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.experiment.sky_sections import FileSkySection
-from lusee_bayes.experiment.term import Around, gains_about, radiometer_about
 from lusee_bayes.instrument.products import DataLayout, to_matrix, to_real
 from lusee_bayes.judge.residuals import residuals
-from lusee_bayes.noise.instrument_errors import GainDrift, with_gains
-from lusee_bayes.sky.prior import HarmonicPrior
-from lusee_bayes.sky.sky_source import Sky
+from lusee_bayes.noise.instrument_errors import with_gains
+from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.gain_drifts import gains_about
+from lusee_bayes.systematics.noise_level import radiometer_about
 
 LMAX = 8
 TERMS = {
@@ -55,11 +55,13 @@ def measured(scenario, seed, scale=1e-3):
     known = set_up(scenario)
     other = wrong_data.Mixed(seed).at(scenario.frequency_mhz, scenario.lmax).modes
     spectrum = scale * np.asarray(known.sky.spectrum())
-    prior = HarmonicPrior(spectrum, mean=other)
+    prior = lb.HarmonicPrior(spectrum, mean=other)
     z = np.random.default_rng(seed).standard_normal(prior.size)
     truth = prior.colour(z) + other
     with_noise = scenario.model_copy(update={"seed": seed})
-    there = replace(known.under(Sky(truth, scenario.frequency_mhz, "other")), scenario=with_noise)
+    there = replace(
+        known.under(lb.Sky(truth, scenario.frequency_mhz, "other")), scenario=with_noise
+    )
     return simulate(there), prior, truth
 
 
@@ -134,11 +136,11 @@ def test_the_default_path_with_drifts(sigma, test_data):
         def distort(setup, v, seen=seen, seed=seed):
             seen["true"] = np.asarray(v)
             key, hours = jax.random.key(100 + seed), setup.observation.hours
-            return with_gains(v, GainDrift(sigma, 10.0).sample(key, hours))
+            return with_gains(v, lb.GainDrift(sigma, 10.0).sample(key, hours))
 
         data = wrong_data.measured(scenario, sky, seed, distort=distort)
-        experiment = build(scenario, data)
-        found = infer(experiment)
+        experiment = lb.build(scenario, data)
+        found = lb.infer(experiment)
         around = Around(data, seen["true"])
         setup = set_up(scenario, data)
         information = full_model(setup, around).inform(data.data)[0]
@@ -170,9 +172,9 @@ def test_a_prior_that_does_not_settle_with_n_is_said_to(monkeypatch):
     short = "observation.step_s=60000", "prior.model=isotropic"
     scenario = wrong_data.scenario(4, *short, *TERMS["gain drifts"])
     data = wrong_data.measured(scenario, wrong_data.Mixed(1).at(25.0, 4), 1)
-    experiment = build(scenario, data)
+    experiment = lb.build(scenario, data)
     assert experiment.learned.still_moves > 0.0
-    assert "still moves" in " ".join(doubts(experiment, infer(experiment)))
+    assert "still moves" in " ".join(doubts(experiment, lb.infer(experiment)))
 
 
 def sky(lmax):
@@ -182,8 +184,8 @@ def sky(lmax):
 def diagnosed(wrong, scenario=None):
     scenario = scenario or wrong_data.scenario(LMAX)
     data = wrong.make(scenario, sky(scenario.lmax), 1)
-    experiment = build(scenario, data)
-    found = infer(experiment)
+    experiment = lb.build(scenario, data)
+    found = lb.infer(experiment)
     chi2 = float(found.model.chi2(found.posterior.mean, data.data))
     left = residuals(found.model, found.posterior, data, chi2 + float(found.posterior.prior_chi2()))
     return left, diagnose(experiment, found, left)
@@ -240,12 +242,12 @@ def test_chi2_of_mixed_data_is_that_of_matrices():
     scenario = wrong_data.scenario(4, "observation.step_s=60000", loud)
     data = wrong_data.measured(scenario, sky(4), 1)
     setup = set_up(scenario, data)
-    experiment = build(scenario, data)
-    model = on_host(infer(experiment).model)
+    experiment = lb.build(scenario, data)
+    model = on_host(lb.infer(experiment).model)
     spectrum = 1e2 * np.asarray(setup.sky.spectrum())
     here = UnderAnySky(setup, data, model, spectrum)
     base, posterior = here.wide(model.coupling)
-    a, s = np.asarray(model.coupling.dense()), np.asarray(HarmonicPrior(spectrum).variance())
+    a, s = np.asarray(model.coupling.dense()), np.asarray(lb.HarmonicPrior(spectrum).variance())
     inverse = np.linalg.inv(a @ np.diag(s) @ a.T + np.asarray(model.noise.dense()))
 
     def expected(grid):

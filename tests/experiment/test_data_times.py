@@ -13,25 +13,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from assertions import refuse
 from fits_files import write_images
 from scipy import stats
 from scipy.linalg import eigh
 
-from lusee_bayes.core.errors import InputError
-from lusee_bayes.experiment.data_files import digest_of, items_of, read_data
-from lusee_bayes.experiment.experiment import build, infer
+import lusee_bayes as lb
+from lusee_bayes.experiment.data_files import digest_of, items_of
 from lusee_bayes.experiment.model import full_model, simulate
-from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.averaging import averaged
-from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.schedule import Run, read_schedule
-from lusee_bayes.instrument.visibilities import Visibilities, read_visibilities
-from lusee_bayes.instrument.waterfalls import write_waterfall
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.runs.cost import posterior_cost, simulation_cost
-from lusee_bayes.runs.data_run import run_simulate
-from lusee_bayes.runs.forecasting import default_variations, expected_posterior, forecast
+from lusee_bayes.runs.plan_run import default_variations, expected_inference, forecast
 from lusee_bayes.testing.contracts import assert_refused
 from lusee_bayes.testing.scenarios import small_scenario
 
@@ -42,10 +35,10 @@ TO_START = {"start": 0.0, "middle": -0.5, "end": -1.0}
 
 def file_of(folder, window):
     """Of samples with windows or instants; of neither, where ``window`` is None."""
-    observation = Observation.from_runs([Run(0.02)], window=window or "instant")
+    observation = lb.Observation.from_runs([lb.Run(0.02)], window=window or "instant")
     n = observation.n_times
     data = np.random.default_rng(2).normal(3e4, 1e2, (n, 16))
-    made = Visibilities.from_arrays(
+    made = lb.Visibilities.from_arrays(
         data, observation.times, 25.0, timestamp="instant" if window != "mean" else "middle"
     )
     dataset = made.to_dataset()
@@ -64,31 +57,30 @@ def test_data_come_as_paths_or_in_memory(tmp_path, monkeypatch):
     """A string, ~ of a user, several frequencies: the same data by every way."""
     monkeypatch.setenv("HOME", str(tmp_path))
     path, _ = file_of(tmp_path, "mean")
-    read = read_visibilities(path)
+    read = lb.read_visibilities(path)
     for given in (path, str(path), "~/data.nc", [str(path)], read, (read,)):
-        found = read_data(given, scenario())
+        found = lb.read_data(given, scenario())
         assert found.digest() == read.digest() == digest_of(found)
     other = replace(read, frequency_mhz=30.0)
-    there = read_data([read, other], scenario("frequency_mhz=30"))
+    there = lb.read_data([read, other], scenario("frequency_mhz=30"))
     assert there.frequency_mhz == 30.0
-    averages = read_data(read, scenario(f"observation.average_s={2 * STEP}"))
+    averages = lb.read_data(read, scenario(f"observation.average_s={2 * STEP}"))
     assert averages.digest() == averaged(read, 2 * STEP).digest()
     for given, noun in (
         ([read, other], "none of them at 20 MHz"),
         ([read, path], "not in both"),
         ([], "no data"),
     ):
-        with pytest.raises(InputError, match=noun):
-            read_data(given, scenario("frequency_mhz=20"))
+        refuse(noun, lb.read_data, given, scenario("frequency_mhz=20"))
     for given in (np.zeros(3), [3.0]):
         assert_refused(lambda given=given: items_of(given))
 
 
 def test_a_truth_of_another_lmax_is_cut_or_filled():
     """Data that are simulated at one lmax and mapped at others."""
-    made = build(scenario()).data
+    made = lb.build(scenario()).data
     for lmax in (1, 2, 4):
-        truth = build(small_scenario(lmax=lmax, cycles=0.02), made).data.truth
+        truth = lb.build(small_scenario(lmax=lmax, cycles=0.02), made).data.truth
         n = min(9, (lmax + 1) ** 2)
         assert truth.shape == ((lmax + 1) ** 2,)
         np.testing.assert_array_equal(truth[:n], made.truth[:n])
@@ -101,12 +93,12 @@ def test_a_scenario_says_what_a_file_does_not(tmp_path, timestamp):
     # what is simulated is no matter of data
     for window in ("mean", "instant"):
         given = scenario(f"observation.timestamp={timestamp}", f"observation.window={window}")
-        found = read_data(path, given).observation
+        found = lb.read_data(path, given).observation
         start = (found.times - stamps.times).sec + found.windows.bounds_s[:, 0]
         # Julian dates in two parts
         np.testing.assert_allclose(start, TO_START[timestamp] * STEP, rtol=0, atol=1e-6)
         np.testing.assert_allclose(found.live_s, STEP, rtol=0, atol=1e-6)
-    instants = read_data(path, scenario("observation.timestamp=instant"))
+    instants = lb.read_data(path, scenario("observation.timestamp=instant"))
     assert instants.observation.windows is None and instants.says_window
 
 
@@ -115,7 +107,7 @@ def test_a_file_that_says_it_is_believed_whatever_is_simulated(tmp_path, window)
     path, _ = file_of(tmp_path, window)
     agreeing = "middle" if window == "mean" else "instant"
     for more in ([], ["observation.window=instant"], [f"observation.timestamp={agreeing}"]):
-        found = read_data(path, scenario(*more))
+        found = lb.read_data(path, scenario(*more))
         assert (found.observation.windows is None) == (window == "instant")
 
 
@@ -131,19 +123,18 @@ def test_a_file_that_says_it_is_believed_whatever_is_simulated(tmp_path, window)
 def test_what_is_unclear_or_contradicts_is_refused(tmp_path, window, timestamp, words):
     path, _ = file_of(tmp_path, window)
     given = [] if timestamp is None else [f"observation.timestamp={timestamp}"]
-    with pytest.raises(InputError) as caught:
-        read_data(path, scenario(*given))
+    with pytest.raises(lb.InputError) as caught:
+        lb.read_data(path, scenario(*given))
     assert words in str(caught.value)
     assert str(caught.value).startswith(str(path))
     assert "\n" not in str(caught.value)
 
 
 def test_no_experiment_of_data_with_unclear_times_or_a_fixed_axis_in_windows(tmp_path):
-    data = read_visibilities(file_of(tmp_path, None)[0])
-    with pytest.raises(InputError, match="do not say what their times are; use data.stamped"):
-        set_up(scenario(), data)
-    data = read_visibilities(file_of(tmp_path, "mean")[0])
-    with pytest.raises(InputError, match="means over windows.*leave out observation.fixed_axis"):
+    data = lb.read_visibilities(file_of(tmp_path, None)[0])
+    refuse("do not say what their times are; use data.stamped", set_up, scenario(), data)
+    data = lb.read_visibilities(file_of(tmp_path, "mean")[0])
+    with pytest.raises(lb.InputError, match="means over windows.*leave out observation.fixed_axis"):
         set_up(scenario("observation.fixed_axis=true"), data)
 
 
@@ -160,21 +151,21 @@ def test_waterfalls_are_instants_unless_the_scenario_says_other(tmp_path):
         "combinations": np.array([[i, j] for i in range(4) for j in range(i, 4)]),
     }
     path = write_images(tmp_path / "w.fits", images, header)
-    found = read_data(path, scenario())
+    found = lb.read_data(path, scenario())
     assert found.observation.windows is None and found.says_window
-    started = read_data(path, scenario("observation.timestamp=start")).observation
+    started = lb.read_data(path, scenario("observation.timestamp=start")).observation
     late = (started.times - found.observation.times).sec
     np.testing.assert_allclose(late, STEP / 2, rtol=0, atol=1e-6)
     np.testing.assert_allclose(started.windows.bounds_s, [[-STEP / 2, STEP / 2]] * 12)
-    assert read_data(path, scenario("observation.timestamp=instant")).digest() == found.digest()
-    with pytest.raises(InputError, match=r"w\.fits: the samples are instants"):
-        read_data(path, scenario("observation.average_s=14400"))
+    assert lb.read_data(path, scenario("observation.timestamp=instant")).digest() == found.digest()
+    with pytest.raises(lb.InputError, match=r"w\.fits: the samples are instants"):
+        lb.read_data(path, scenario("observation.average_s=14400"))
 
 
 def test_waterfalls_have_no_room_for_windows(tmp_path):
-    experiment = build(scenario("observation.window=mean"))
-    with pytest.raises(InputError, match=r"no room for windows.*observation\.window=instant"):
-        write_waterfall(tmp_path / "w.fits", 2 * [experiment.data])
+    experiment = lb.build(scenario("observation.window=mean"))
+    with pytest.raises(lb.InputError, match=r"no room for windows.*observation\.window=instant"):
+        lb.write_waterfall(tmp_path / "w.fits", 2 * [experiment.data])
     assert not list(tmp_path.iterdir())
 
 
@@ -201,18 +192,18 @@ def given(path):
 
 
 def test_a_schedule_is_simulated_and_mapped(path, given, tmp_path):
-    scenario = load_scenario("fiducial", given)
+    scenario = lb.load_scenario("fiducial", given)
     observation = scenario.observation.observation()
-    expected = Observation.from_schedule(read_schedule(path), step_s=STEP_S)
+    expected = lb.Observation.from_schedule(lb.read_schedule(path), step_s=STEP_S)
     np.testing.assert_array_equal(observation.times.jd, expected.times.jd)
     np.testing.assert_array_equal(observation.live_s, expected.live_s)
     # 3 days, 47.5 hours and 5.5 days in steps of 20000 s: 13, 9 and 24 of them
     assert (observation.n_times, observation.turntable_deg) == (46, (0.0, 30.0))
-    (simulated,) = run_simulate(scenario, tmp_path / "data.nc")
+    (simulated,) = lb.run_simulate(scenario, tmp_path / "data.nc")
     assert simulated.observation.n_times == 46
-    experiment = build(scenario)
+    experiment = lb.build(scenario)
     np.testing.assert_array_equal(experiment.data.observation.run, expected.run)
-    posterior = infer(experiment).posterior
+    posterior = lb.infer(experiment).posterior
     error = np.asarray(posterior.mean - experiment.setup.sky.modes)
     # 25 modes: their chi^2 is not above 60 once in 1e4 schedules
     covariance = np.asarray(posterior.covariance())
@@ -220,16 +211,16 @@ def test_a_schedule_is_simulated_and_mapped(path, given, tmp_path):
 
 
 def test_costs_count_the_samples_of_a_schedule(given):
-    scenario = load_scenario("fiducial", given)
+    scenario = lb.load_scenario("fiducial", given)
     n_data = 16 * scenario.observation.observation().n_times
     assert simulation_cost(scenario).n_data == n_data
     assert posterior_cost(scenario).n_data == n_data
-    runs = load_scenario("fiducial", ["observation.step_s=7200"])
+    runs = lb.load_scenario("fiducial", ["observation.step_s=7200"])
     assert simulation_cost(runs).n_data == 16 * runs.observation.observation().n_times
 
 
 def test_a_plan_keeps_the_dates_of_a_schedule(given):
-    scenario = load_scenario("fiducial", given)
+    scenario = lb.load_scenario("fiducial", given)
     variations = default_variations("fiducial", scenario)
     assert {v.family for v in variations} == {"as given", "duty cycle", "antenna lost"}
     assert all(v.scenario.observation == scenario.observation for v in variations)
@@ -246,7 +237,7 @@ def test_half_duty_in_the_schedule_is_half_duty_of_the_receivers(given, path):
         lines = [f"{row.rpartition(',')[0]},{duty}" for row in rows]
         path.write_text("\n".join([header, *lines]))
         overrides = [*given, f"noise.radiometer.duty_cycle={of_receivers}"]
-        scenario = load_scenario("fiducial", overrides)
+        scenario = lb.load_scenario("fiducial", overrides)
         said[duty] = forecast(default_variations("fiducial", scenario)[0])
     # the same numbers but for products of 0.5, which are exact
     assert said["0.5"].information_bits == pytest.approx(said["1"].information_bits, rel=1e-9)
@@ -255,11 +246,11 @@ def test_half_duty_in_the_schedule_is_half_duty_of_the_receivers(given, path):
 
 def test_what_is_wrong_with_the_file_is_said(given, path):
     path.write_text(TABLE.replace("2027-01-18,", "2028-01-18,"))
-    with pytest.raises(InputError, match=r"nights.csv, row 2: the interval from .* begins"):
-        build(load_scenario("fiducial", given))
+    with pytest.raises(lb.InputError, match=r"nights.csv, row 2: the interval from .* begins"):
+        lb.build(lb.load_scenario("fiducial", given))
     path.unlink()
-    with pytest.raises(InputError, match="no schedule, a table in CSV or .* at '"):
-        posterior_cost(load_scenario("fiducial", given))
+    with pytest.raises(lb.InputError, match="no schedule, a table in CSV or .* at '"):
+        posterior_cost(lb.load_scenario("fiducial", given))
 
 
 DRAWS = 12
@@ -270,7 +261,7 @@ HOUR = 3600.0
 class Map:
     """A model, the covariance of its posterior, and what the planner says of its information."""
 
-    model: LinearGaussian
+    model: lb.LinearGaussian
     covariance: np.ndarray
     bits: float
 
@@ -297,7 +288,7 @@ class Map:
 class Maps:
     """Maps of fine samples (as instants), of averages, and of of averages taken for instants."""
 
-    samples: Visibilities
+    samples: lb.Visibilities
     to_s: float
     sky: np.ndarray
     fine: Map
@@ -312,7 +303,7 @@ def map_of(scenario, data, observation):
     setup = set_up(scenario, replace(data, observation=observation))
     model = full_model(setup)
     covariance = np.asarray(model.condition(np.zeros(model.n_data)).covariance())
-    bits = float(expected_posterior(setup)[1].information_bits())
+    bits = float(expected_inference(setup).posterior.information_bits())
     return Map(model, covariance, bits)
 
 
@@ -323,7 +314,7 @@ def maps_of(lmax, step_s, cycles, to_s):
         "observation.window=mean",
         f"observation.runs=[{{cycles: {cycles}}}]",
     ]
-    scenario = load_scenario("fiducial", overrides)
+    scenario = lb.load_scenario("fiducial", overrides)
     setup = set_up(scenario)
     samples = simulate(setup)
     coarse = averaged(samples, to_s)

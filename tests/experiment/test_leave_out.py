@@ -7,19 +7,18 @@ from dataclasses import replace
 import jax
 import numpy as np
 import pytest
+from assertions import refuse
 
-from lusee_bayes.core.errors import InputError
+import lusee_bayes as lb
 from lusee_bayes.experiment import leave_out
-from lusee_bayes.experiment.experiment import build, explained
+from lusee_bayes.experiment.experiment import explained
 from lusee_bayes.experiment.leave_out import NOT_JUDGED, TOO_MANY, fitting, without
 from lusee_bayes.experiment.model import radiometer
-from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.experiment.term import measured_visibilities
 from lusee_bayes.instrument.visibilities import Calibration
 from lusee_bayes.judge.left_out import LeftOut
 from lusee_bayes.judge.plausibility import SIGNIFICANT, about_information, require_plausible
-from lusee_bayes.noise.radiometer import radiometer_noise
+from lusee_bayes.systematics.context import measured_visibilities
 from lusee_bayes.testing.contracts import assert_refused
 
 FALSE_ALARM = 1e-4
@@ -29,7 +28,7 @@ FALSE_ALARM = 1e-4
 def experiment():
     """A fifth of a lunar day, noise of all products together."""
     changes = ["lmax=6", "observation.runs.0.cycles=0.2", "noise.radiometer.form=exact"]
-    return build(load_scenario("fiducial", changes))
+    return lb.build(lb.load_scenario("fiducial", changes))
 
 
 def spoilt(experiment, bad, strength, seed=8):
@@ -155,19 +154,19 @@ def test_what_the_reduction_took_counts(experiment, lost, goes):
 
 def test_before_data_are_flagged_lmax_is_tried(experiment):
     """Of a sky with structure up to lmax 14, mapped up to 6: the times fit at 14."""
-    fine = build(experiment.scenario.model_copy(update={"lmax": 14}))
+    fine = lb.build(experiment.scenario.model_copy(update={"lmax": 14}))
     setup = set_up(experiment.scenario, fine.data)
     found = fitting(setup, fine.data, FALSE_ALARM)
     assert not found.flagged.any()
     assert found.remark.startswith("lmax=6 is too small") and "--set lmax=14" in found.remark
     # and if the map then fails, it is not the prior that is blamed
-    told = pytest.raises(InputError, match=r"^lmax=6 is .*lmax=14 \(no prior\)")
+    told = pytest.raises(lb.InputError, match=r"^lmax=6 is .*lmax=14 \(no prior\)")
     with told, explained(replace(fine, fitting=found)):
-        raise InputError("no prior")
+        raise lb.InputError("no prior")
 
 
 def test_what_does_not_fit_at_a_higher_lmax_either_is_flagged(experiment):
-    fine = build(experiment.scenario.model_copy(update={"lmax": 14}))
+    fine = lb.build(experiment.scenario.model_copy(update={"lmax": 14}))
     data = with_bursts(fine, [20], 30.0)
     found = fitting(set_up(experiment.scenario, data), data, FALSE_ALARM)
     assert np.flatnonzero(found.times).tolist() == [20] and found.flagged.sum() == 16
@@ -217,7 +216,7 @@ def test_what_64_bits_do_not_tell_is_not_compared(experiment, monkeypatch):
 @pytest.fixture(scope="module")
 def check(small_experiment):
     setup = small_experiment.setup
-    noise = radiometer_noise(setup.signal, setup.layout, step_s=7200.0)
+    noise = lb.radiometer_noise(setup.signal, setup.layout, step_s=7200.0)
     std = np.sqrt(np.asarray(noise.diagonal()))
 
     def check(change):
@@ -249,14 +248,13 @@ def test_single_values_that_cannot_be(check, small_experiment, label, value, mes
     def change(grid):
         grid[of(small_experiment, label), 5] = value
 
-    with pytest.raises(InputError, match=message):
-        check(change)
+    refuse(message, check, change)
 
 
 def test_an_auto_within_noise_of_zero_is_no_fault(check, small_experiment):
     """Half of what is refused: six standard deviations below zero."""
     setup = small_experiment.setup
-    noise = radiometer_noise(setup.signal, setup.layout, step_s=7200.0)
+    noise = lb.radiometer_noise(setup.signal, setup.layout, step_s=7200.0)
     std = np.asarray(setup.layout.scatter(np.sqrt(np.asarray(noise.diagonal()))))
     row = of(small_experiment, "11R")
 
@@ -264,8 +262,7 @@ def test_an_auto_within_noise_of_zero_is_no_fault(check, small_experiment):
         grid[row, 5] = factor * SIGNIFICANT * std[row, 5]
 
     check(lambda grid: change(grid, -0.5))
-    with pytest.raises(InputError, match="negative beyond its noise"):
-        check(lambda grid: change(grid, -1.5))
+    refuse("negative beyond its noise", check, lambda grid: change(grid, -1.5))
 
 
 def test_another_unit_is_refused_and_another_scale_doubted(check):
@@ -275,8 +272,7 @@ def test_another_unit_is_refused_and_another_scale_doubted(check):
 
         return change
 
-    with pytest.raises(InputError, match=r"1e-06 times those of the modelled sky"):
-        check(scaled(1e-6))
+    refuse(r"1e-06 times those of the modelled sky", check, scaled(1e-6))
     doubts = check(scaled(5.0))
     assert "5 times those of the modelled sky" in doubts[0]
 

@@ -21,10 +21,8 @@ from scipy.stats import chi2, kstest
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import from_healpy
 from lusee_bayes.experiment.model import base_model
-from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.instrument.waterfalls import read_waterfall
 
 pytestmark = pytest.mark.long
 SITE = {"lon_deg": 182.258, "lat_deg": -23.814}
@@ -89,12 +87,12 @@ def test_posteriors_of_gaussian_skies(naive, test_data, quadrature, calibrated):
     chi^2 follows its distribution with luseepy's rule, and does not with the exact quadrature."""
     lmax, every = 6, 10
     beam = test_data / "luseepy" / "synthetic_monopole_beam.fits"
-    waterfall = read_waterfall(test_data / "luseepy" / "waterfall_exact_engine.fits")
+    waterfall = lb.read_waterfall(test_data / "luseepy" / "waterfall_exact_engine.fits")
     keep = np.arange(328) % every == 0
     observation = waterfall.observation.select(keep)
     overrides = [f"frequency_mhz={FREQUENCY}", f"lmax={lmax}", f"beam.file={beam}"]
     overrides += [f"beam.quadrature={quadrature}", "noise.radiometer.factor=1e-4"]
-    scenario = load_scenario("fiducial", overrides)
+    scenario = lb.load_scenario("fiducial", overrides)
     matrix = np.concatenate([naive.rows(time, lmax)[None] for time in observation.times])
     matrix = np.moveaxis(matrix, 0, 1).reshape(16 * len(matrix), -1)
     layout = DataLayout(16, observation.n_times)

@@ -5,24 +5,30 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from assertions import refuse
 from numpyro import handlers
 from scipy import stats
 
+import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_host
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.diagnosis import diagnose
-from lusee_bayes.experiment.experiment import Experiment, build, infer, program_pieces
-from lusee_bayes.experiment.instrument_terms import pointing_offsets, shifted
-from lusee_bayes.experiment.model import base_model, full_model, radiometer, simulate, true_values
+from lusee_bayes.experiment.experiment import program_pieces
+from lusee_bayes.experiment.model import (
+    base_model,
+    full_model,
+    model_about,
+    radiometer,
+    simulate,
+    true_values,
+)
 from lusee_bayes.experiment.rounds import offset_posterior
-from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.experiment.setup import Setup, set_up
-from lusee_bayes.experiment.term import Around
 from lusee_bayes.experiment.unknowns import pointing_report
 from lusee_bayes.instrument.source_response import source_response
 from lusee_bayes.judge.residuals import residuals
 from lusee_bayes.sky.galaxy import galactic_unit_vector
-from lusee_bayes.sky.prior import HarmonicPrior
+from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.pointing_offsets import PointingOffsets, shifted
 
 TWO_RUNS = "observation.runs=[{cycles: 1}, {cycles: 1, turntable_deg: 30}]"
 OFF = "clock_s: 60, turntable_0_deg: 0.3, turntable_1_deg: 0.0, clock_drift_s_per_day: 0.0"
@@ -31,15 +37,15 @@ PRIORS = "clock_s: 60, turntable_deg: 0.3, clock_drift_s_per_day: 1"
 
 def scenario_of(*overrides, lmax=10, step_s=21600.0):
     plain = [f"lmax={lmax}", f"observation.step_s={step_s}", "observation.window=mean"]
-    return load_scenario("fiducial", overrides=[*plain, *overrides])
+    return lb.load_scenario("fiducial", overrides=[*plain, *overrides])
 
 
 def about_a_mean(setup: Setup, scale: float, seed: int) -> Setup:
     """A sky that is known to a part of its C_ell: the truth is a draw of the prior."""
     spectrum = scale * np.asarray(setup.prior.spectrum)
-    prior = HarmonicPrior(spectrum)
+    prior = lb.HarmonicPrior(spectrum)
     z = np.random.default_rng(seed).standard_normal(prior.size)
-    return replace(setup, prior=HarmonicPrior(spectrum, mean=setup.sky.modes - prior.colour(z)))
+    return replace(setup, prior=lb.HarmonicPrior(spectrum, mean=setup.sky.modes - prior.colour(z)))
 
 
 def chi2_of(found, data):
@@ -52,11 +58,11 @@ def known_sky():
     """The sky to 0.1 %, so that the data tell the clock, too."""
     pointing = f"noise.pointing={{{PRIORS}, true_values: {{{OFF}}}}}"
     setup = about_a_mean(set_up(scenario_of(TWO_RUNS, pointing, lmax=8, step_s=43200.0)), 1e-6, 3)
-    return Experiment(setup, simulate(setup))
+    return lb.Experiment(setup, simulate(setup))
 
 
 def test_a_clock_and_a_turntable_that_are_off_are_found(known_sky):
-    found = infer(known_sky)
+    found = lb.infer(known_sky)
     mean, covariance = offset_posterior(found)
     truth = true_values(known_sky.setup)
     assert truth == pytest.approx(
@@ -81,8 +87,8 @@ def test_a_clock_and_a_turntable_that_are_off_are_found(known_sky):
         update={"noise": known_sky.setup.scenario.noise.model_copy(update={"pointing": None})}
     )
     setup = replace(known_sky.setup, scenario=straight)
-    plain = Experiment(setup, simulate(setup))
-    known = infer(plain)
+    plain = lb.Experiment(setup, simulate(setup))
+    known = lb.infer(plain)
     expected = (known.posterior.mean - setup.sky.modes) / known.posterior.std()
     assert np.mean(pull**2) == pytest.approx(np.mean(expected**2), abs=0.2)
     assert np.median(found.posterior.std() / known.posterior.std()) < 1.2
@@ -97,8 +103,8 @@ def test_ignored_the_report_points_at_it(known_sky):
     section = known_sky.setup.scenario.noise.pointing.model_copy(update={"treatment": "ignored"})
     noise = known_sky.setup.scenario.noise.model_copy(update={"pointing": section})
     scenario = known_sky.setup.scenario.model_copy(update={"noise": noise})
-    experiment = Experiment(replace(known_sky.setup, scenario=scenario), known_sky.data)
-    found = infer(experiment)
+    experiment = lb.Experiment(replace(known_sky.setup, scenario=scenario), known_sky.data)
+    found = lb.infer(experiment)
     assert chi2_of(found, known_sky.data) > 2 * found.model.n_data
     report = pointing_report(experiment, found, on_host(found.posterior).covariance())
     assert report.offsets is None
@@ -119,8 +125,8 @@ def test_where_nothing_is_off_the_report_is_silent():
     none = "true_values: {clock_s: 0, turntable_0_deg: 0, turntable_1_deg: 0}"
     nothing = f"noise.pointing={{clock_s: 60, turntable_deg: 0.3, {none}, treatment: ignored}}"
     setup = about_a_mean(set_up(scenario_of(TWO_RUNS, nothing, lmax=6, step_s=86400.0)), 1e-2, 5)
-    experiment = Experiment(setup, simulate(setup))
-    found = infer(experiment)
+    experiment = lb.Experiment(setup, simulate(setup))
+    found = lb.infer(experiment)
     told = diagnosis(experiment, found)
     assert told.fits and "fit as they are" in " ".join(told.sentences())
 
@@ -128,7 +134,7 @@ def test_where_nothing_is_off_the_report_is_silent():
 def test_preferences_are_those_of_matrices(known_sky):
     """a = t^T K^-1 r / t^T K^-1 t with K = A S A^T + N as a matrix."""
     experiment = known_sky
-    found = infer(experiment)
+    found = lb.infer(experiment)
     report = pointing_report(experiment, found, on_host(found.posterior).covariance())
     model = found.model
     a = np.asarray(model.coupling.dense())
@@ -158,8 +164,8 @@ def test_preferences_are_those_of_matrices(known_sky):
 def test_about_no_offsets_large_ones_are_not_described():
     """The report does not ask for what the scenario has."""
     far = "true_values: {turntable_deg: 2.0}"
-    experiment = build(scenario_of(f"noise.pointing={{turntable_deg: 1, around: model, {far}}}"))
-    found = infer(experiment)
+    experiment = lb.build(scenario_of(f"noise.pointing={{turntable_deg: 1, around: model, {far}}}"))
+    found = lb.infer(experiment)
     report = pointing_report(experiment, found, on_host(found.posterior).covariance())
     assert "too much: set noise.pointing.treatment=sampled" in report.lines()[0]
 
@@ -174,7 +180,7 @@ def test_sampled_sites_move_a_as_the_exact_shift_does(name):
     # about a mean: a sky of which nothing is known may as well have turned
     setup = about_a_mean(set_up(scenario_of(runs, pointing, lmax=5)), 1e-4, 1)
     data = simulate(setup)
-    offsets = pointing_offsets(setup, Around(data))
+    offsets = PointingOffsets.build(setup.scenario.noise.pointing, setup, Around(data))
     values = dict.fromkeys(offsets.names, 0.0) | {
         name: 1.5 * dict(zip(offsets.names, offsets.stds.tolist(), strict=True))[name]
     }
@@ -204,15 +210,15 @@ def test_simulation_based_calibration():
     pointing = "noise.pointing={clock_s: 60, turntable_deg: 0.1, tilt_east_deg: 0.1, %s}"
     first = set_up(scenario_of(pointing % "tilt_north_deg: 0.1", lmax=6, step_s=43200.0))
     # known to 1 %, where the clock is told to some 40 s
-    prior = HarmonicPrior(1e-4 * np.asarray(first.prior.spectrum), mean=first.sky.modes)
+    prior = lb.HarmonicPrior(1e-4 * np.asarray(first.prior.spectrum), mean=first.sky.modes)
     z, ranks = [], []
     for seed in range(100):
         draw = np.asarray(prior.colour(np.random.default_rng(seed).standard_normal(prior.size)))
         sky = replace(first.sky, modes=first.sky.modes + draw)
         scenario = first.scenario.model_copy(update={"seed": seed})
         setup = replace(first.under(sky), scenario=scenario, prior=prior)
-        experiment = Experiment(setup, simulate(setup))
-        found = infer(experiment)
+        experiment = lb.Experiment(setup, simulate(setup))
+        found = lb.infer(experiment)
         mean, covariance = offset_posterior(found)
         truth = true_values(setup)
         std = np.sqrt(np.diagonal(covariance))
@@ -238,8 +244,8 @@ def test_offsets_that_can_stand_for_one_another_settle(size):
     Whole steps swing between two points at the smaller size, and run away at the larger one.
     """
     section = f"{{clock_s: {300 * size}, turntable_deg: {2 * size}, tilt_east_deg: {size}}}"
-    experiment = build(scenario_of(f"noise.pointing={section}", lmax=6, step_s=43200.0))
-    found = infer(experiment)
+    experiment = lb.build(scenario_of(f"noise.pointing={section}", lmax=6, step_s=43200.0))
+    found = lb.infer(experiment)
     n = found.model.n_data
     assert abs(chi2_of(found, experiment.data) - n) < 4 * np.sqrt(2 * n)
     mean, covariance = offset_posterior(found)
@@ -262,17 +268,16 @@ def test_sources_and_gains_are_those_of_the_offsets():
     there = set_up(scenario_of(turned, *extra, lmax=5, step_s=43200.0))
     expected = full_model(there)
     around = Around(None, None, setup.sky.modes, values)
-    offsets = pointing_offsets(setup, around)
-    found = full_model(setup, around)
-    # the templates' own part left out; gains make 1 + sigma^2 of every auto, that part too
-    own = offsets.templates @ offsets.centre
+    found, (offsets, *_) = model_about(setup, around)
+    # the columns' own part left out; gains make 1 + sigma^2 of every auto, that part too
+    own = offsets.columns @ offsets.centre
     np.testing.assert_allclose(
         found.predict(setup.sky.modes) + own,
         expected.predict(setup.sky.modes),
         rtol=0,
         atol=2e-4 * np.abs(own).max(),
     )
-    systematic = np.asarray(found.noise.dense()) - offsets.templates @ offsets.templates.T
+    systematic = np.asarray(found.noise.dense()) - offsets.columns @ offsets.columns.T
     systematic -= np.diag(np.asarray(radiometer(setup).diagonal()))
     wanted = np.asarray(expected.noise.dense())
     wanted = wanted - np.diag(np.asarray(radiometer(there).diagonal()))
@@ -283,7 +288,7 @@ def test_sources_and_gains_are_those_of_the_offsets():
 def test_what_is_left_to_sample_is_about_the_offsets():
     """Gains are sampled, a turntable is marginalised: what is left of the model fits."""
     far = "noise.pointing={turntable_deg: 1, true_values: {turntable_deg: 2.0}}"
-    experiment = build(
+    experiment = lb.build(
         scenario_of(far, "noise.gain={sigma: 1e-9, treatment: sampled}", lmax=6, step_s=86400.0)
     )
     model = program_pieces(experiment)["gaussian"]()
@@ -297,7 +302,7 @@ def test_a_prior_is_learned_about_the_offsets():
     learned = "prior={model: isotropic, spectrum: learned}"
     off = "noise.pointing={turntable_deg: 1, true_values: {turntable_deg: 2.0}}"
     with_it, without = (
-        build(scenario_of(learned, *more, lmax=6, step_s=43200.0)) for more in ((off,), ())
+        lb.build(scenario_of(learned, *more, lmax=6, step_s=43200.0)) for more in ((off,), ())
     )
     np.testing.assert_allclose(
         with_it.learned.parameters, without.learned.parameters, rtol=0, atol=0.1
@@ -306,18 +311,17 @@ def test_a_prior_is_learned_about_the_offsets():
 
 def test_what_cannot_be():
     far = "noise.pointing={lat_deg: 1, true_values: {lat_deg: 200}}"
-    with pytest.raises(InputError, match=r"noise.pointing, with lat_deg = 200: lat_deg must lie"):
+    with pytest.raises(
+        lb.InputError, match=r"noise.pointing, with lat_deg = 200: lat_deg must lie"
+    ):
         simulate(set_up(scenario_of(far, lmax=4)))
     setup = set_up(scenario_of("noise.pointing={clock_s: 1, true_values: {lat_deg: 1}}", lmax=4))
-    with pytest.raises(InputError, match="true_values has 'lat_deg', which is not among the off"):
-        simulate(setup)
+    refuse("true_values has 'lat_deg', which is not among the off", simulate, setup)
     both = [
         "noise.pointing={clock_s: 60, treatment: sampled}",
         "noise.beam={parameters: {height_m: 0.1}, treatment: sampled}",
     ]
-    experiment = build(scenario_of(*both, lmax=4))
-    with pytest.raises(InputError, match="cannot both be sampled"):
-        infer(experiment)
+    refuse("cannot both be sampled", scenario_of, *both, lmax=4)
 
 
 def test_sources_are_seen_as_means_over_windows():

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from experiments import small_experiment
 
+import lusee_bayes as lb
+from lusee_bayes.core.section import Positive, Section, Treatment
 from lusee_bayes.experiment import model as model_module
-from lusee_bayes.experiment.experiment import Experiment, build, infer
-from lusee_bayes.experiment.instrument_terms import beam_directions, beam_rms_difference, true_beams
+from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import (
     full_model,
     model_to_sample,
@@ -22,22 +23,13 @@ from lusee_bayes.experiment.model import (
     systematics,
     true_values,
 )
-from lusee_bayes.experiment.noise_sections import NoiseSection
-from lusee_bayes.experiment.rounds import SETTLED, Inference, prediction
-from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.section import Positive, Section, Treatment
+from lusee_bayes.experiment.rounds import SETTLED, prediction
 from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.experiment.term import AdditiveTerm, Around, Term, Truth
-from lusee_bayes.experiment.terms import TERMS
-from lusee_bayes.instrument.beams.monopoles import monopole_beams
-from lusee_bayes.instrument.coupling import CouplingMatrix
-from lusee_bayes.noise.covariance import (
-    Covariance,
-    DiagonalCovariance,
-    LowRankCovariance,
-    LowRankUpdate,
-)
-from lusee_bayes.systematics.systematic import AdditiveNoise
+from lusee_bayes.noise.covariance import LowRankUpdate
+from lusee_bayes.systematics.beam import beam_rms_difference, difference_of_beams, true_beams
+from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.registered import SYSTEMATICS, NoiseSection
+from lusee_bayes.systematics.systematic import AdditiveNoise, Truth, multiplied
 from lusee_bayes.testing.scenarios import small_scenario
 
 GAIN = "noise.gain.sigma=0.01"
@@ -45,13 +37,13 @@ SHIFT = "noise.beam.shift_mhz=4"
 PARAMETERS = "noise.beam.parameters={length_m: 0.1, zenith_angle_deg: 2.0}"
 
 
-def experiment(*overrides: str) -> Experiment:
+def experiment(*overrides: str) -> lb.Experiment:
     return small_experiment(*overrides, cycles=0.2)
 
 
 @lru_cache
-def inferred(*overrides: str) -> Inference:
-    return infer(experiment(*overrides))
+def inferred(*overrides: str) -> lb.Inference:
+    return lb.infer(experiment(*overrides))
 
 
 # --- marginalised or ignored ------------------------------------------------------------------
@@ -63,7 +55,7 @@ def test_gains_that_are_ignored_are_not_in_the_model_nor_in_the_signal():
     # by JAX here, by NumPy there: sums in another order
     found, rows = ignoring.coupling.dense(), plain.coupling.dense()
     np.testing.assert_allclose(found, rows, rtol=0, atol=1e-15)
-    assert isinstance(ignoring.noise, DiagonalCovariance)
+    assert isinstance(ignoring.noise, lb.DiagonalCovariance)
     built = build(small_scenario(GAIN, cycles=0.2)).setup
     np.testing.assert_array_equal(built.signal, plain.signal)
 
@@ -76,7 +68,7 @@ def test_the_posteriors_own_prediction_has_settled():
     e, found = (f(GAIN, "noise.gain.visibilities=posterior") for f in (experiment, inferred))
     setup, data, posterior = e.setup, e.data, found.posterior
     assert 2 <= found.rounds <= 10
-    predicted = CouplingMatrix.build(setup.beams, setup.pointing) @ posterior.mean
+    predicted = lb.CouplingMatrix.build(setup.beams, setup.pointing) @ posterior.mean
     predicted = predicted.reshape(16, -1)
     # the signal plus A (m - sky) cancels to rounding
     scale = float(jnp.abs(predicted).max())
@@ -118,14 +110,17 @@ def test_beam_parameters_are_directions_of_one_sigma():
 
 def test_a_shifted_beam_is_that_of_the_other_frequency():
     setup, data = experiment(SHIFT).setup, experiment(SHIFT).data
-    other = monopole_beams(29.0, 6)
+    other = lb.monopole_beams(29.0, 6)
     # the same beams compiled twice: rounding
     for got, expected in [
         (true_beams(setup).modes, np.asarray(other.modes)),
-        (beam_directions(setup)[0].modes, np.asarray(other.modes) - np.asarray(setup.beams.modes)),
+        (
+            difference_of_beams(setup.scenario.noise.beam, setup).modes,
+            np.asarray(other.modes) - np.asarray(setup.beams.modes),
+        ),
     ]:
         np.testing.assert_allclose(got, expected, rtol=0, atol=1e-15)
-    seen = CouplingMatrix.build(other, setup.pointing) @ setup.sky.modes
+    seen = lb.CouplingMatrix.build(other, setup.pointing) @ setup.sky.modes
     sigma = np.sqrt(np.asarray(radiometer(setup).diagonal()))
     z = np.asarray(data.data - seen) / sigma
     assert abs((z**2).sum() - z.size) < 5 * np.sqrt(2 * z.size)
@@ -164,7 +159,7 @@ class NoiseWithHum(NoiseSection):
     hum: HumSection | None = None
 
 
-class ScenarioWithHum(Scenario):
+class ScenarioWithHum(lb.Scenario):
     """A scenario that can say so."""
 
     noise: NoiseWithHum = NoiseWithHum()
@@ -173,10 +168,18 @@ class ScenarioWithHum(Scenario):
 class Hum(AdditiveNoise):
     """Patterns with unknown amplitudes of zero mean."""
 
+    key = KEY
+    section = HumSection
+
     root: jax.Array
 
-    def covariance(self) -> Covariance:
-        return LowRankCovariance(self.root, "the hum")
+    @classmethod
+    def build(cls, section, context, around) -> Hum:
+        root = patterns(context.layout.size, section.sigma_k)
+        return cls("hum", context.layout, jnp.asarray(root))
+
+    def covariance(self) -> lb.Covariance:
+        return lb.LowRankCovariance(self.root, "the hum")
 
 
 def patterns(n_data: int, sigma_k: float) -> np.ndarray:
@@ -184,22 +187,13 @@ def patterns(n_data: int, sigma_k: float) -> np.ndarray:
     return sigma_k * np.random.default_rng(5).normal(size=(n_data, 3))
 
 
-def hum(setup: Setup, section: HumSection) -> Hum:
-    """The term of a scenario."""
-    root = jnp.asarray(patterns(setup.layout.size, section.sigma_k))
-    return Hum("hum", setup.layout, root)
-
-
-TERM = AdditiveTerm(KEY, hum)
-
-
 @pytest.fixture
 def registered(monkeypatch, tiny_experiment):
     """The term behind those of the package, once there is an experiment without it."""
-    monkeypatch.setattr(model_module, "TERMS", (*TERMS, TERM))
+    monkeypatch.setattr(model_module, "SYSTEMATICS", (*SYSTEMATICS, Hum))
 
 
-def with_hum(**section) -> Scenario:
+def with_hum(**section) -> lb.Scenario:
     """The small scenario with the hum, if there is one."""
     tree = small_experiment().scenario.model_dump()
     tree["noise"]["hum"] = section or None
@@ -265,35 +259,33 @@ def test_simulated_data_hold_it_whatever_its_treatment(registered):
 # --- a term with values of its own ----------------------------------------------------------------
 
 
-class Amplifier(Term):
+class Amplifier(lb.Systematic):
     """A factor that simulated data hold and the model does not know."""
 
-    key = "amplifier"
+    key = "noise.hum"
 
-    def build(self, setup, around):
-        return []
-
-    def truth(self, setup, key) -> Truth:
+    @classmethod
+    def truth(cls, section, context, key) -> Truth:
         return {"factor": 3.0}
 
-    def distort(self, visibilities, setup, truth, key):
-        return truth["factor"] * visibilities
+    @classmethod
+    def in_data(cls, section, context, model, truth, key):
+        return multiplied(model, np.full(model.n_data, truth["factor"]))
 
 
-def test_terms_distort_in_their_order(monkeypatch):
+def test_systematics_act_in_their_order(monkeypatch):
     """What comes before the amplifier is amplified with the sky; radiometer noise never is."""
     setup = setup_with(sigma_k=100.0)
 
-    def simulated(*terms: Term) -> np.ndarray:
-        monkeypatch.setattr(model_module, "TERMS", (*TERMS, *terms))
-        assert true_values(setup) == ({"factor": 3.0} if Amplifier in map(type, terms) else {})
+    def simulated(*more: type[lb.Systematic]) -> np.ndarray:
+        monkeypatch.setattr(model_module, "SYSTEMATICS", (*SYSTEMATICS, *more))
+        known = {Hum: "hum_noise", Amplifier: "factor"}
+        assert set(true_values(setup)) == {known[systematic] for systematic in more}
         return np.asarray(simulate(setup).data)
 
     signal = np.asarray(setup.layout.gather(setup.signal))
     noise = simulated() - signal
-    added = simulated(TERM) - signal - noise
+    added = simulated(Hum) - signal - noise
     close = {"rtol": 0, "atol": 1e-9}
-    np.testing.assert_allclose(
-        simulated(TERM, Amplifier()), 3.0 * (signal + added) + noise, **close
-    )
-    np.testing.assert_allclose(simulated(Amplifier(), TERM), 3.0 * signal + added + noise, **close)
+    np.testing.assert_allclose(simulated(Hum, Amplifier), 3.0 * (signal + added) + noise, **close)
+    np.testing.assert_allclose(simulated(Amplifier, Hum), 3.0 * signal + added + noise, **close)

@@ -13,10 +13,11 @@ from reference_linear import white_posterior
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import radiometer, simulate, true_values
-from lusee_bayes.experiment.setup import Setup, ground_per_kelvin, set_up
+from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.experiment.unknowns import NullDirection, unknowns_report
 from lusee_bayes.instrument.products import auto_indices
 from lusee_bayes.report.map_page import map_page
+from lusee_bayes.systematics.regolith import ground_per_kelvin
 
 RECEIVER, GROUND = "noise.receiver={power_k: 2000}", "noise.regolith={std_k: 30}"
 TABLE = "noise.gain_table={std: 0.01}"
@@ -32,12 +33,12 @@ def joint(experiment: lb.Experiment):
     """Sky and unknowns of the model about what the data told, as one Gaussian in NumPy."""
     found, setup = lb.infer(experiment), experiment.setup
     table = found.systematics[-1]
-    factors = np.asarray(table.errors.factors(table.centre))
+    factors = np.asarray(table.systematic.factors(table.centre))
     t = np.concatenate([np.asarray(s.columns) for s in found.systematics], axis=1)
     a = np.concatenate([factors[:, None] * np.asarray(setup.coupling.dense()), t], axis=1)
     prior = np.append(np.sqrt(np.asarray(setup.prior.variance())), np.ones(t.shape[1]))
     noise = np.sqrt(np.asarray(radiometer(setup).diagonal()))
-    own = table.templates @ (np.asarray(table.centre) - table.expected)
+    own = table.columns @ (np.asarray(table.centre) - table.expected)
     rest = np.asarray(experiment.data.data) - factors * np.asarray(setup.offset) + own
     return found, prior, white_posterior(a, prior, noise, rest)
 
@@ -118,15 +119,15 @@ def test_the_common_gain_is_told_where_it_keeps_its_prior(experiment, common, to
 
 
 @pytest.mark.long
-def test_unknowns_of_a_map_onto_another_are_said_to_be_of_the_new_data(response_file, tmp_path):
+def test_unknowns_of_added_data_are_said_to_be_of_the_new_data(response_file, tmp_path):
     """As numbers: those of these data mapped alone."""
-    first = four_ports(response_file, GROUND, "output.updatable=true")
+    first = four_ports(response_file, GROUND, "output.information=true")
     lb.run_map(first, tmp_path / "first")
     second = first.model_copy(update={"seed": 7})
     alone = lb.build(second)
-    run = lb.run_map(second, tmp_path / "both", onto=tmp_path / "first")
+    run = lb.run_map(second, tmp_path / "both", earlier=tmp_path / "first")
     expected = unknowns_report(alone, lb.infer(alone))
-    pd.testing.assert_frame_equal(run.result.unknowns.table, expected.table)
+    pd.testing.assert_frame_equal(run.result.channel.unknowns.table, expected.table)
     note = "what the new data alone tell"
     assert any(note in line for line in run.result.lines())
     assert note in map_page(tmp_path / "both", "both")
@@ -137,7 +138,7 @@ def test_a_run_writes_them(experiment, tmp_path):
     run = lb.run_map(experiment.scenario, tmp_path / "map")
     table = pd.read_csv(tmp_path / "map" / "unknowns.csv", keep_default_na=False)
     assert len(table) == 9
-    summary = json.loads((tmp_path / "map" / "summary.json").read_text())["unknowns"]
+    summary = json.loads((tmp_path / "map" / "summary.json").read_text())["channels"][0]["unknowns"]
     np.testing.assert_allclose([row["value"] for row in summary["rows"]], table["value"], rtol=1e-9)
     assert summary["null_share"] > 0.5
     assert sum(weight**2 for weight in summary["null_direction"].values()) == pytest.approx(1.0)
@@ -154,7 +155,10 @@ def test_a_run_writes_them(experiment, tmp_path):
 
 def test_runs_without_them_are_as_before(small_map):
     assert not (small_map.folder / "unknowns.csv").exists()
-    assert json.loads((small_map.folder / "summary.json").read_text())["unknowns"] is None
+    assert (
+        json.loads((small_map.folder / "summary.json").read_text())["channels"][0]["unknowns"]
+        is None
+    )
     assert "gain table" not in map_page(small_map.folder, "a run")
 
 

@@ -13,65 +13,62 @@ import jax
 import numpy as np
 from made_skies import SmoothSky, SpottySky
 
+import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers, turn_about_z
 from lusee_bayes.experiment.model import radiometer
-from lusee_bayes.experiment.scenario import Scenario, apply_override
+from lusee_bayes.experiment.scenario import apply_override
 from lusee_bayes.experiment.setup import Setup, set_up
-from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.products import labels
-from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.sky.sky_source import Sky, SkySource
 
 LABELS = labels(4)
 
 
-def scenario(lmax: int = 8, *overrides: str, frequency_mhz: float = 25.0) -> Scenario:
+def scenario(lmax: int = 8, *overrides: str, frequency_mhz: float = 25.0) -> lb.Scenario:
     """One cycle of 110 samples with every default, at one turntable angle."""
     sizes = {"frequency_mhz": frequency_mhz, "lmax": lmax, "observation.step_s": 21460.0}
-    return changed(Scenario(), *(f"{k}={v}" for k, v in sizes.items()), *overrides)
+    return changed(lb.Scenario(), *(f"{k}={v}" for k, v in sizes.items()), *overrides)
 
 
-def changed(scenario: Scenario, *overrides: str) -> Scenario:
+def changed(scenario: lb.Scenario, *overrides: str) -> lb.Scenario:
     """A scenario with other entries, ``key.path=value`` as on the command line."""
     tree = scenario.model_dump(mode="json")
     for override in overrides:
         apply_override(tree, override)
-    return Scenario.model_validate(tree)
+    return lb.Scenario.model_validate(tree)
 
 
 @dataclass(frozen=True)
-class Mixed(SkySource):
+class Mixed(lb.SkySource):
     """A smooth and a spotty sky, half and half: bright, positive, not the Galaxy."""
 
     seed: int = 1
 
-    def at(self, frequency_mhz: float, lmax: int) -> Sky:
+    def at(self, frequency_mhz: float, lmax: int) -> lb.Sky:
         one, other = (s(self.seed).at(frequency_mhz, lmax) for s in (SmoothSky, SpottySky))
-        return Sky((one.modes + other.modes) / 2.0, float(frequency_mhz), "mixed sky")
+        return lb.Sky((one.modes + other.modes) / 2.0, float(frequency_mhz), "mixed sky")
 
 
 def measured(
-    truth: Scenario,
-    sky: Sky,
+    truth: lb.Scenario,
+    sky: lb.Sky,
     seed: int = 1,
     *,
-    beams: Callable[[Setup], ProductBeams] = lambda setup: setup.beams,
+    beams: Callable[[Setup], lb.ProductBeams] = lambda setup: setup.beams,
     distort: Callable[[Setup, np.ndarray], np.ndarray] = lambda setup, v: v,
-    seen_by: Scenario | None = None,
-) -> Visibilities:
+    seen_by: lb.Scenario | None = None,
+) -> lb.Visibilities:
     """Data that ``truth`` describes, of a sky, with their noise; dated as ``seen_by`` says.
 
     The noise is that of the data's own visibilities.
     """
     setup = set_up(truth)
-    coupling = CouplingMatrix.build(beams(setup), setup.pointing)
+    coupling = lb.CouplingMatrix.build(beams(setup), setup.pointing)
     signal = np.asarray(setup.layout.scatter(coupling @ sky.modes))
     signal = signal + np.asarray(setup.background)[:, None]
     signal = np.asarray(distort(setup, signal))
     noise = radiometer(replace(setup, signal=signal)).sample(jax.random.key(seed))
     nominal = setup if seen_by is None else set_up(seen_by)
-    return Visibilities(
+    return lb.Visibilities(
         np.asarray(setup.layout.gather(signal) + noise),
         setup.layout,
         nominal.observation,
@@ -80,7 +77,7 @@ def measured(
     )
 
 
-def mixed_by(data: Visibilities, matrix: np.ndarray) -> Visibilities:
+def mixed_by(data: lb.Visibilities, matrix: np.ndarray) -> lb.Visibilities:
     """Each time's products, mixed: ``matrix @ products``."""
     return replace(data, data=np.asarray(data.layout.gather(matrix @ np.asarray(data.grid()))))
 
@@ -107,13 +104,13 @@ def exchanged(one: str, other: str) -> np.ndarray:
     return np.eye(16)[order]
 
 
-def mirrored(setup: Setup) -> ProductBeams:
+def mirrored(setup: Setup) -> lb.ProductBeams:
     """Beams with azimuth counted the other way: phi to -phi."""
     _, m = mode_numbers(setup.beams.lmax)
     return replace(setup.beams, modes=np.asarray(setup.beams.modes) * np.where(m < 0, -1.0, 1.0))
 
 
-def from_north(setup: Setup) -> ProductBeams:
+def from_north(setup: Setup) -> lb.ProductBeams:
     """Beams whose phi was counted from North towards East: phi to 90 degrees - phi."""
     modes = turn_about_z(np.asarray(mirrored(setup).modes), np.pi / 2.0)
     return replace(setup.beams, modes=np.asarray(modes))
@@ -125,32 +122,34 @@ class Wrong:
 
     name: str
     cause: str
-    make: Callable[[Scenario, Sky, int], Visibilities]
+    make: Callable[[lb.Scenario, lb.Sky, int], lb.Visibilities]
 
 
-def _mix(matrix: np.ndarray) -> Callable[[Scenario, Sky, int], Visibilities]:
+def _mix(matrix: np.ndarray) -> Callable[[lb.Scenario, lb.Sky, int], lb.Visibilities]:
     return lambda scenario, sky, seed: mixed_by(measured(scenario, sky, seed), matrix)
 
 
-def _other(*overrides: str) -> Callable[[Scenario, Sky, int], Visibilities]:
+def _other(*overrides: str) -> Callable[[lb.Scenario, lb.Sky, int], lb.Visibilities]:
     """Taken as the scenario with overrides says, dated as without them."""
     return lambda scenario, sky, seed: measured(
         changed(scenario, *overrides), sky, seed, seen_by=scenario
     )
 
 
-def _beams(beams: Callable[[Setup], ProductBeams]) -> Callable[[Scenario, Sky, int], Visibilities]:
+def _beams(
+    beams: Callable[[Setup], lb.ProductBeams],
+) -> Callable[[lb.Scenario, lb.Sky, int], lb.Visibilities]:
     return lambda scenario, sky, seed: measured(scenario, sky, seed, beams=beams)
 
 
-def shifted_by(mhz: float) -> Callable[[Setup], ProductBeams]:
+def shifted_by(mhz: float) -> Callable[[Setup], lb.ProductBeams]:
     """Beams of a neighbouring channel."""
     return lambda setup: setup.beam_source.beams(
         setup.scenario.frequency_mhz + mhz, setup.scenario.lmax
     )
 
 
-def _finer(scenario: Scenario, sky: Sky, seed: int) -> Visibilities:
+def _finer(scenario: lb.Scenario, sky: lb.Sky, seed: int) -> lb.Visibilities:
     """Of a sky with structure to lmax + 8."""
     finer = changed(scenario, f"lmax={scenario.lmax + 8}")
     whole = Mixed(seed).at(scenario.frequency_mhz, finer.lmax)
@@ -158,7 +157,7 @@ def _finer(scenario: Scenario, sky: Sky, seed: int) -> Visibilities:
     return replace(data, truth=whole.modes[: len(sky.modes)])
 
 
-def _opposite(scenario: Scenario, sky: Sky, seed: int) -> Visibilities:
+def _opposite(scenario: lb.Scenario, sky: lb.Sky, seed: int) -> lb.Visibilities:
     """Taken at -20 degrees, dated as at 20."""
     here, there = (
         changed(scenario, f"observation.runs.0.turntable_deg={angle}") for angle in (-20, 20)
@@ -166,13 +165,13 @@ def _opposite(scenario: Scenario, sky: Sky, seed: int) -> Visibilities:
     return measured(here, sky, seed, seen_by=there)
 
 
-def _reversed(scenario: Scenario, sky: Sky, seed: int) -> Visibilities:
+def _reversed(scenario: lb.Scenario, sky: lb.Sky, seed: int) -> lb.Visibilities:
     data = measured(scenario, sky, seed)
     return replace(data, data=np.asarray(data.layout.gather(np.asarray(data.grid())[:, ::-1])))
 
 
-def _one_time(factor: float, time: int) -> Callable[[Scenario, Sky, int], Visibilities]:
-    def make(scenario: Scenario, sky: Sky, seed: int) -> Visibilities:
+def _one_time(factor: float, time: int) -> Callable[[lb.Scenario, lb.Sky, int], lb.Visibilities]:
+    def make(scenario: lb.Scenario, sky: lb.Sky, seed: int) -> lb.Visibilities:
         data = measured(scenario, sky, seed)
         grid = np.array(data.grid())
         grid[:, time] *= factor
@@ -181,14 +180,14 @@ def _one_time(factor: float, time: int) -> Callable[[Scenario, Sky, int], Visibi
     return make
 
 
-def _noisier(factor: float) -> Callable[[Scenario, Sky, int], Visibilities]:
+def _noisier(factor: float) -> Callable[[lb.Scenario, lb.Sky, int], lb.Visibilities]:
     return _other(f"noise.radiometer.factor={factor}")
 
 
-def _constant(kelvin: float) -> Callable[[Scenario, Sky, int], Visibilities]:
+def _constant(kelvin: float) -> Callable[[lb.Scenario, lb.Sky, int], lb.Visibilities]:
     autos = np.array([label[0] == label[1] for label in LABELS])
 
-    def make(scenario: Scenario, sky: Sky, seed: int) -> Visibilities:
+    def make(scenario: lb.Scenario, sky: lb.Sky, seed: int) -> lb.Visibilities:
         return measured(scenario, sky, seed, distort=lambda _, v: v + kelvin * autos[:, None])
 
     return make

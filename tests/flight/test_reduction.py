@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from assertions import refuse
 from naive_flight import FLIGHT_ORDER, naive_band
 
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.flight import reduction
 from lusee_bayes.flight.flags import KnownLines
 from lusee_bayes.flight.gain_model import read_gain_table
@@ -225,13 +225,8 @@ def test_bins_that_do_not_fit_are_taken_out(reduced):
 
 def test_what_contradicts_itself_is_refused(flight, table):
     a, unknown = sessions(flight, "a")[0], read_session(flight / "session_a_unknown_time_scale.h5")
-    with pytest.raises(InputError, match="does not say which UTC"):
-        reduce_sessions([unknown], recipe(table))
-    with pytest.raises(InputError, match="overlap in time"):
-        reduce_sessions([a, a], recipe(table))
-    with pytest.raises(InputError, match="have no mean over a time"):
-        reduce_sessions([a], recipe(table, average_s=7200.0))
-    with pytest.raises(InputError, match="last for"):
-        reduce_sessions([a], recipe(table, timestamp="middle", average_s=60.0))
-    with pytest.raises(InputError, match="lacks"):
-        reduce_sessions([replace(a, telemetry={})], recipe(table))
+    refuse("does not say which UTC", reduce_sessions, [unknown], recipe(table))
+    refuse("overlap in time", reduce_sessions, [a, a], recipe(table))
+    refuse("have no mean over a time", reduce_sessions, [a], recipe(table, average_s=7200.0))
+    refuse("last for", reduce_sessions, [a], recipe(table, timestamp="middle", average_s=60.0))
+    refuse("lacks", reduce_sessions, [replace(a, telemetry={})], recipe(table))

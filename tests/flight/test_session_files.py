@@ -8,7 +8,7 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
-from assertions import refused
+from assertions import refuse
 from astropy.io import fits
 from astropy.time import Time
 from layout_4 import (
@@ -28,7 +28,6 @@ from layout_4 import (
 )
 
 from lusee_bayes.cli.main import main
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.formats import is_session
 from lusee_bayes.flight.clock import Clock
 from lusee_bayes.flight.session import FLIGHT_PRODUCTS, OF_FLIGHT, TELEMETRY
@@ -245,11 +244,9 @@ def test_bins_that_are_not_there_are_nan_and_a_clock_may_be_unknown(tmp_path, ki
 )
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_no_session_leaves_nothing_behind(tmp_path, kind, blocks, text):
-    with pytest.raises(InputError, match=text):
-        write_session(tmp_path / "s", some_rows(), blocks, kind=kind)
+    refuse(text, write_session, tmp_path / "s", some_rows(), blocks, kind=kind)
     assert not list(tmp_path.iterdir())
-    with pytest.raises(InputError, match="not as netcdf"):
-        write_session(tmp_path / "s", some_rows(), [], kind="netcdf")
+    refuse("not as netcdf", write_session, tmp_path / "s", some_rows(), [], kind="netcdf")
 
 
 def test_a_file_has_the_chunks_that_luseepy_makes_and_they_stay_in_memory(tmp_path):
@@ -331,13 +328,11 @@ def test_damaged_and_foreign_sessions_are_refused(request, layout, words, damage
     path = request.getfixturevalue({3: "copy", 4: "newer"}[layout])
     with h5py.File(path, "a") as file:
         damage(file)
-    with refused(words):
-        read_session(path)
+    refuse(words, read_session, path)
 
 
 def test_layout_4_in_fits_is_refused(tmp_path):
     primary = fits.PrimaryHDU()
     primary.header["LAYOUTV"] = 4
     primary.writeto(tmp_path / "s.fits")
-    with refused("as HDF5"):
-        read_session(tmp_path / "s.fits")
+    refuse("as HDF5", read_session, tmp_path / "s.fits")

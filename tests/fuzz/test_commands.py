@@ -66,8 +66,11 @@ WRONG = [
     ("map fiducial --joint", "joint needs frequencies_mhz"),
     ("map fiducial --workers 2", "give --frequencies"),
     ("map fiducial --cluster tcp://127.0.0.1:1", "give --frequencies"),
-    ("map fiducial --frequencies 20,25 --covariance", "--covariance is for a single frequency"),
-    ("map fiducial --frequencies 20,25 --onto x", "--onto is for a single frequency"),
+    (
+        "map fiducial --frequencies 20,25 --add x",
+        "no posterior of lusee-bayes map --information at",
+    ),
+    ("map fiducial --add x", "no posterior of lusee-bayes map --information at"),
     (f"map fiducial {JOINT}", "need at least as many channels, got 2"),
     ("compare-priors fiducial --priors isotropic,local", "'local'; did you mean 'local_scales'?"),
     ("compare-priors fiducial --priors isotropic", "1 given, and a comparison needs two or more"),

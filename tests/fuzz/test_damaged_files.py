@@ -16,21 +16,14 @@ from hypothesis import strategies as st
 from layout_4 import write_layout_4
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.data_files import read_data
-from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.flight_data import reduce_files
-from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.flight.gain_model import read_gain_table
 from lusee_bayes.flight.reduced import read_reduced, write_reduced
 from lusee_bayes.flight.session_files import read_session
-from lusee_bayes.instrument.beams.sampled import read_beam, sampled_beams, write_sampled_beams
-from lusee_bayes.instrument.visibilities import read_visibilities
-from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
 from lusee_bayes.report.describe import describe
-from lusee_bayes.results.updatable import read_updatable
+from lusee_bayes.results.map_files import read_channels, read_information
 from lusee_bayes.runs import folder as folder_module
 from lusee_bayes.runs import map_run
-from lusee_bayes.runs.data_run import run_simulate_flight
 from lusee_bayes.sky.sky_files import write_alms
 from lusee_bayes.testing.scenarios import small_scenario
 
@@ -39,21 +32,15 @@ FEW, MANY = 2, 150 * SCALE
 
 def read_sky(path: Path) -> object:
     overrides = ["lmax=2", f"sky={{model: file, file: '{path}'}}"]
-    return load_scenario("fiducial", overrides).sky.source().at(25.0, 2)
+    return lb.load_scenario("fiducial", overrides).sky.source().at(25.0, 2)
 
 
 def read_any_data(path: Path) -> object:
-    return read_data(path, small_scenario(lmax=2))
+    return lb.read_data(path, small_scenario(lmax=2))
 
 
-def read_onto(path: Path) -> object:
-    folder = path.parent / "onto"
-    folder.mkdir(exist_ok=True)
-    try:
-        shutil.copy(path, folder / "posterior.nc")
-        return read_updatable(folder, small_scenario(lmax=2))
-    finally:
-        shutil.rmtree(folder)
+def read_kept(path: Path) -> object:
+    return read_information(path, small_scenario(lmax=2))
 
 
 def read_spectra(path: Path) -> object:
@@ -63,19 +50,19 @@ def read_spectra(path: Path) -> object:
 
 
 READERS = {
-    "visibilities.nc": (describe, read_visibilities),
-    "windows.nc": (describe, read_visibilities),
-    "waterfall.fits": (describe, read_waterfall, read_any_data),
-    "four_port.fits": (describe, read_waterfall),
-    "scalar_beam.fits": (describe, lambda path: read_beam(path).beams(10.0, 2)),
-    "response.fits": (describe, lambda path: read_beam(path).beams(10.0, 2)),
-    "sampled_fields.nc": (describe, lambda path: read_beam(path).beams(25.0, 2)),
-    "sampled_fields.fits": (describe, lambda path: read_beam(path).beams(25.0, 2)),
-    "sampled_products.nc": (describe, lambda path: read_beam(path).beams(25.0, 2)),
+    "visibilities.nc": (describe, lb.read_visibilities),
+    "windows.nc": (describe, lb.read_visibilities),
+    "waterfall.fits": (describe, lb.read_waterfall, read_any_data),
+    "four_port.fits": (describe, lb.read_waterfall),
+    "scalar_beam.fits": (describe, lambda path: lb.read_beam(path).beams(10.0, 2)),
+    "response.fits": (describe, lambda path: lb.read_beam(path).beams(10.0, 2)),
+    "sampled_fields.nc": (describe, lambda path: lb.read_beam(path).beams(25.0, 2)),
+    "sampled_fields.fits": (describe, lambda path: lb.read_beam(path).beams(25.0, 2)),
+    "sampled_products.nc": (describe, lambda path: lb.read_beam(path).beams(25.0, 2)),
     "posterior.nc": (describe,),
-    "updatable.nc": (describe, read_onto),
+    "information.nc": (describe, read_kept),
     "cube.nc": (describe,),
-    "diagnostics.nc": (describe,),
+    "diagnostics.nc": (describe, read_channels),
     "map.fits": (describe, read_sky),
     "cube.fits": (describe, read_sky),
     "alm.fits": (describe, read_sky),
@@ -99,24 +86,24 @@ LUSEEPYS = {
 def files(tmp_path_factory, small_map, small_cube) -> Path:
     """A file of every kind."""
     folder = tmp_path_factory.mktemp("files")
-    experiment = build(small_scenario(lmax=2))
+    experiment = lb.build(small_scenario(lmax=2))
     experiment.data.write(folder / "visibilities.nc")
     experiment.data.stamped("start").write(folder / "windows.nc")
     channels = [replace(experiment.data, frequency_mhz=f) for f in (20.0, 25.0)]
-    write_waterfall(folder / "waterfall.fits", channels, np.array([1 + 1j, 1 + 2j]), "")
+    lb.write_waterfall(folder / "waterfall.fits", channels, np.array([1 + 1j, 1 + 2j]), "")
     theta, phi = np.linspace(0.0, 90.0, 7), np.arange(0.0, 360.0, 45.0)
     fields = np.ones((4, 7, 8), dtype=complex)
-    sampled = sampled_beams(25.0, e_theta=fields, e_phi=fields, theta_deg=theta, phi_deg=phi)
-    write_sampled_beams(folder / "sampled_fields.nc", sampled)
-    write_sampled_beams(folder / "sampled_fields.fits", sampled)
-    products = sampled_beams([20.0, 30.0], products=np.ones((2, 4, 48)))
-    write_sampled_beams(folder / "sampled_products.nc", products)
+    sampled = lb.sampled_beams(25.0, e_theta=fields, e_phi=fields, theta_deg=theta, phi_deg=phi)
+    lb.write_sampled_beams(folder / "sampled_fields.nc", sampled)
+    lb.write_sampled_beams(folder / "sampled_fields.fits", sampled)
+    products = lb.sampled_beams([20.0, 30.0], products=np.ones((2, 4, 48)))
+    lb.write_sampled_beams(folder / "sampled_products.nc", products)
     with pytest.MonkeyPatch.context() as patch:
         # neither figures nor a page, which take longer than the map
         patch.setattr(map_run, "MAP", replace(map_run.MAP, figures={}))
         patch.setattr(folder_module, "PAGES", {})
-        run = lb.run_map(small_scenario("output.updatable=true", lmax=2), folder / "run")
-    shutil.copy(run.folder / "posterior.nc", folder / "updatable.nc")
+        run = lb.run_map(small_scenario("output.information=true", lmax=2), folder / "run")
+    shutil.copy(run.folder / "posterior.nc", folder / "information.nc")
     for name in ("posterior.nc", "diagnostics.nc"):
         shutil.copy(small_map.folder / name, folder / name)
     shutil.copy(small_map.folder / "mean.fits", folder / "map.fits")
@@ -136,11 +123,11 @@ def write_sessions(folder: Path) -> None:
     flight = "flight={per_kelvin_v2_hz: 1e-21, simulated: {kind: %s}}"
     size = ["observation.step_s=900", "observation.runs=[{cycles: 0.0012}]"]
     for name, kind in (("session.h5", "hdf5"), ("session.fits", "fits")):
-        scenario = load_scenario("fiducial", ["lmax=2", *size, flight % kind])
-        made = run_simulate_flight(scenario, folder / name.replace(".", "_"))
+        scenario = lb.load_scenario("fiducial", ["lmax=2", *size, flight % kind])
+        made = lb.run_simulate_flight(scenario, folder / name.replace(".", "_"))
         shutil.copy(made.sessions[0], folder / name)
     write_layout_4(folder / "session_4.h5")
-    known = load_scenario(str(made.scenario), ["observation.average_s=null"])
+    known = lb.load_scenario(str(made.scenario), ["observation.average_s=null"])
     write_reduced(folder / "reduced.nc", reduce_files(list(made.sessions), known))
     shutil.copy(made.scenario.parent / "gains.nc", folder / "gains.nc")
 

@@ -21,7 +21,6 @@ from hypothesis import strategies as st
 import lusee_bayes as lb
 from lusee_bayes.report.pages import write_report
 from lusee_bayes.results.finished_runs import read_runs
-from lusee_bayes.sampling.hmc import Sampler
 from lusee_bayes.testing.scenarios import small_scenario
 
 FEW, MANY = 2, 60 * SCALE
@@ -30,7 +29,7 @@ FEW, MANY = 2, 60 * SCALE
 @pytest.fixture(scope="session")
 def sampled(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("sampled") / "run"
-    sampler = Sampler(chains=2, warmup=20, draws=12)
+    sampler = lb.Sampler(chains=2, warmup=20, draws=12)
     return lb.run_sample(small_scenario(lmax=2), folder, sampler=sampler).folder
 
 

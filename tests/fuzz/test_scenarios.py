@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lusee_bayes.cli.options import parse_frequencies
-from lusee_bayes.cli.plan_command import own_variations
 from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.experiment.keys import scenario_keys
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.runs.cost import posterior_cost, require_fits
+from lusee_bayes.runs.plan_run import given_variations
 
 few_and_many = pytest.mark.parametrize("n", [50, pytest.param(500 * SCALE, marks=pytest.mark.long)])
 
@@ -67,7 +67,7 @@ def test_any_text_as_an_override(n):
     @given(st.one_of(st.text(), st.builds("{}={}".format, st.sampled_from(PATHS), st.text())))
     def check(override):
         require_answer(lambda: load([override]))
-        require_answer(lambda: own_variations("fiducial", [override], []))
+        require_answer(lambda: given_variations("fiducial", [override], []))
 
     check()
 

@@ -6,7 +6,7 @@ import astropy.units as u
 import erfa
 import numpy as np
 import pytest
-from assertions import within
+from assertions import refuse, within
 from astropy.coordinates import (
     ICRS,
     CartesianRepresentation,
@@ -142,8 +142,7 @@ def test_times_inside_the_ephemeris_work(start):
     ],
 )
 def test_bad_input_is_refused(options, message):
-    with pytest.raises(lb.InputError, match=message):
-        lb.Observation.from_runs(**options)
+    refuse(message, lb.Observation.from_runs, **options)
 
 
 @pytest.mark.parametrize(
@@ -157,8 +156,7 @@ def test_bad_input_is_refused(options, message):
 )
 def test_inconsistent_samples_are_refused(run, turntable, message):
     times = Time("2027-01-15") + np.arange(3.0) * u.hour
-    with pytest.raises(lb.InputError, match=message):
-        lb.Observation(0.0, 0.0, times, np.array(run), turntable, 3600.0)
+    refuse(message, lb.Observation, 0.0, 0.0, times, np.array(run), turntable, 3600.0)
 
 
 # --- Sun, Earth and planets -----------------------------------------------------------------------
@@ -275,5 +273,4 @@ def test_every_body_is_known_in_any_case():
     ],
 )
 def test_unknown_bodies_are_refused(body, message):
-    with pytest.raises(lb.InputError, match=message):
-        body_direction(body, dates("2027-01-15T00:00:00"))
+    refuse(message, body_direction, body, dates("2027-01-15T00:00:00"))

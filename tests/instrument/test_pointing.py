@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from assertions import refused
+from assertions import refuse, refused
 from reference import steep_sky
 from scipy.linalg import block_diag, expm
 from scipy.spatial.transform import Rotation as SpatialRotation
@@ -21,7 +21,6 @@ from lusee_bayes.instrument.pointing import (
     LEAST_ORDER,
     OFFSETS,
     TILT_TOLERANCE,
-    Pointing,
     mean_pole_frame,
     offset_names,
     split,
@@ -89,12 +88,12 @@ def test_sufficient_order_is_the_lowest_that_bounds_the_series(size, lmax):
 
 def test_a_negative_order_is_refused():
     with refused("order of the tilt expansion must be 0, 1, ..., got -1"):
-        Pointing.of(lb.Observation.from_runs([lb.Run(0.1)]), 3, order=-1)
+        lb.Pointing.of(lb.Observation.from_runs([lb.Run(0.1)]), 3, order=-1)
 
 
 def test_runs_and_fixed_rotations():
     o = lb.Observation.from_runs([lb.Run(0.1, 0.0), lb.Run(0.2, 90.0)])
-    p = Pointing.of(o, 3, order=1)
+    p = lb.Pointing.of(o, 3, order=1)
     assert p.n_times == o.n_times
     assert p.order == 1
     for number, span in p.runs():
@@ -113,7 +112,7 @@ def test_functions_and_factors_expand_the_transposed_tilt(monkeypatch):
     monkeypatch.setattr("lusee_bayes.instrument.averaging.TOLERANCE", 1e-15)
     lmax, order = 3, 6
     o = lb.Observation.from_runs([lb.Run(0.05)])
-    p = Pointing.of(o, lmax, order=order)
+    p = lb.Pointing.of(o, lmax, order=order)
     # instants: every order m alike, and nothing imaginary
     factors = np.asarray(p.factors)
     np.testing.assert_allclose(factors[..., 1], 0.0, atol=1e-15)
@@ -237,5 +236,4 @@ def test_names():
     every = offset_names(tuple(OFFSETS), 2)
     assert every == tuple(VALUES)
     assert offset_names(("turntable_deg",), 1) == ("turntable_deg",)
-    with pytest.raises(lb.InputError, match="no offset 'clock'; did you mean 'clock_s'"):
-        offset_names(("clock",), 1)
+    refuse("no offset 'clock'; did you mean 'clock_s'", offset_names, ("clock",), 1)

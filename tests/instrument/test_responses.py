@@ -9,7 +9,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from assertions import close, off, within
+from assertions import close, off, refuse, within
 from astropy.io import fits
 from fits_files import write_images, write_response
 from reference import hemisphere, real_harmonics
@@ -20,12 +20,7 @@ from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import from_healpy
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.instrument.beams.luseepy_files import CONVENTIONS
-from lusee_bayes.instrument.beams.monopoles import (
-    CapacitorReceiver,
-    JFETReceiver,
-    read_receiver,
-)
-from lusee_bayes.instrument.beams.sampled import read_beam
+from lusee_bayes.instrument.beams.monopoles import CapacitorReceiver, JFETReceiver, read_receiver
 from lusee_bayes.instrument.products import labels, to_matrix, to_real
 from lusee_bayes.testing.scenarios import small_scenario
 
@@ -43,7 +38,7 @@ def luseepy(test_data):
     path = folder / "four_port_covariance.fits"
     with fits.open(path) as hdus:
         images = {hdu.name.lower(): np.array(hdu.data) for hdu in hdus}
-    return read_beam(folder / "synthetic_response_v3.fits"), path, images
+    return lb.read_beam(folder / "synthetic_response_v3.fits"), path, images
 
 
 def matrix(images, name, channel) -> np.ndarray:
@@ -197,7 +192,7 @@ def between(values, part):
 def test_between_frequencies_as_luseepy_does(tmp_path):
     """ZA, resistances and the integrals of open ports over lambda^2 go straight from 20 to 40 MHz;
     M is that of the ZA in between."""
-    response = read_beam(write(tmp_path / "response.fits", change=varied))
+    response = lb.read_beam(write(tmp_path / "response.fits", change=varied))
     f, part = 27.0, 0.35
     theta, phi, solid_angle = hemisphere(20, 40)
     harmonics = real_harmonics(theta, phi, 3) * solid_angle[:, None]
@@ -262,9 +257,8 @@ def test_receivers(tmp_path):
     measured = read_receiver(write_images(tmp_path / "zl.fits", images, {}))
     zl = 0.45 * loads[0] + 0.55 * loads[1]
     np.testing.assert_allclose(measured.load(21.0), zl, rtol=1e-13)
-    with pytest.raises(lb.InputError, match=r"zl.fits has values from 10 to 30 MHz, not at 31"):
-        measured.load(31.0)
-    response = replace(read_beam(write(tmp_path / "response.fits")), receiver=measured)
+    refuse(r"zl.fits has values from 10 to 30 MHz, not at 31", measured.load, 31.0)
+    response = replace(lb.read_beam(write(tmp_path / "response.fits")), receiver=measured)
     za = 0.95 * response.impedance[1] + 0.05 * response.impedance[2]
     np.testing.assert_allclose(
         response.circuit(21.0).loading, zl @ np.linalg.inv(za + zl), rtol=1e-12
@@ -277,7 +271,7 @@ def test_losses_emit_at_the_antennas_temperature(tmp_path):
             images["Rloss"] = np.tile(0.5 * np.eye(4), (3, 1, 1))
             images["ZA"] = images["ZA"] + images["Rloss"]
 
-    response = read_beam(write(tmp_path / "response.fits", change=lossy))
+    response = lb.read_beam(write(tmp_path / "response.fits", change=lossy))
     m = response.circuit(20.0).loading
     expected = 4 * Boltzmann * 300.0 * 0.5 * m @ m.conj().T
     got = volts(response, 20.0, response.background(20.0, 0.0, 300.0)[:, None])
@@ -285,7 +279,7 @@ def test_losses_emit_at_the_antennas_temperature(tmp_path):
 
 
 def test_open_ports_and_turns(tmp_path):
-    response = read_beam(write(tmp_path / "response.fits"))
+    response = lb.read_beam(write(tmp_path / "response.fits"))
     open_ = replace(response, receiver=None)
     np.testing.assert_array_equal(open_.circuit(20.0).loading, np.eye(4))
     # a quarter turn makes East North: each port takes the place of the next
@@ -316,8 +310,7 @@ def test_open_ports_and_turns(tmp_path):
     ],
 )  # fmt: skip
 def test_files_that_cannot_be_used(tmp_path, options, message):
-    with pytest.raises(lb.InputError, match=message):
-        read_beam(write(tmp_path / "response.fits", **options))
+    refuse(message, lb.read_beam, write(tmp_path / "response.fits", **options))
 
 
 # --- in scenarios -------------------------------------------------------------------------------
@@ -329,8 +322,8 @@ def test_a_scenario_with_a_response_and_a_warm_moon(tmp_path):
     cold_scenario = small_scenario(*given[:-1], cycles=0.05)
     warm, cold = lb.build(small_scenario(*given, cycles=0.05)), lb.build(cold_scenario)
     setup, data = warm.setup, warm.data
-    np.testing.assert_array_equal(setup.beams.modes, read_beam(path).beams(20.0, 6).modes)
-    moon = np.asarray(read_beam(path).background(20.0, 5e4))
+    np.testing.assert_array_equal(setup.beams.modes, lb.read_beam(path).beams(20.0, 6).modes)
+    moon = np.asarray(lb.read_beam(path).background(20.0, 5e4))
     np.testing.assert_array_equal(setup.background, moon)
     np.testing.assert_array_equal(cold.setup.background, 0.0)
     added = np.asarray(setup.signal) - np.asarray(cold.setup.signal)
@@ -361,8 +354,7 @@ def test_a_scenario_with_a_response_and_a_warm_moon(tmp_path):
 def test_data_of_another_instrument(luseepy, overrides, message):
     response, path, _ = luseepy
     given = ["frequency_mhz=10", *(o.format(response=response.path) for o in overrides)]
-    with pytest.raises(lb.InputError, match=message):
-        lb.read_data(path, lb.load_scenario("fiducial", given))
+    refuse(message, lb.read_data, path, lb.load_scenario("fiducial", given))
 
 
 def test_luseepys_data_in_kelvin(luseepy):
@@ -380,7 +372,7 @@ def test_luseepys_data_in_kelvin(luseepy):
 def test_short_dipoles_see_no_even_ell_above_two(tmp_path):
     """Their products are polynomials of degree 2 cut at the horizon: (P + P sign(z)) / 2, of which
     the first part ends at ell = 2 and the second is odd."""
-    modes = np.asarray(read_beam(write(tmp_path / "response.fits")).beams(20.0, 9).modes)
+    modes = np.asarray(lb.read_beam(write(tmp_path / "response.fits")).beams(20.0, 9).modes)
     ell = np.floor(np.sqrt(np.arange(100))).astype(int)
     even, odd = (np.abs(modes[:, (ell > 2) & (ell % 2 == p)]).max() for p in (0, 1))
     assert even < 1e-6 * odd
@@ -433,7 +425,7 @@ def test_headers_that_contradict_the_reader_are_refused(tmp_path, words):
     for key, value in words.items():
         fits.setval(path, f"HIERARCH {key}", value=value)
     with pytest.raises(lb.InputError, match="|".join([*words, "unit"])) as refused:
-        read_beam(path)
+        lb.read_beam(path)
     assert "expected" in str(refused.value) or "known" in str(refused.value)
 
 
@@ -445,7 +437,7 @@ def test_headers_that_state_what_the_reader_assumes_are_read(luseepy, tmp_path):
     for words in (converted, dict.fromkeys(converted, "UNKNOWN")):
         for key, value in words.items():
             fits.setval(path, f"HIERARCH {key}", value=value)
-        read_beam(path)
+        lb.read_beam(path)
 
 
 # --- waterfalls in luseepy's layout of four ports -------------------------------------------------
@@ -584,8 +576,7 @@ def test_simulated_and_mapped_between_the_responses_frequencies(luseepy, tmp_pat
         ),
         ("beam.interpolation=spline", "use --set beam.interpolation=linear"),
     ):
-        with pytest.raises(lb.InputError, match=message):
-            lb.read_data(path, lb.load_scenario("fiducial", [*given, override]))
+        refuse(message, lb.read_data, path, lb.load_scenario("fiducial", [*given, override]))
     assert simulate("beam.interpolation=spline") == 0
     with pytest.raises(lb.InputError, match="use --set beam.interpolation=spline"):
         lb.read_data(path, lb.load_scenario("fiducial", given))

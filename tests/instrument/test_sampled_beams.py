@@ -9,19 +9,13 @@ import healpy
 import numpy as np
 import pytest
 import xarray as xr
-from assertions import close, refused
+from assertions import close, refuse
 from astropy.io import fits
 from reference import unit_vectors
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, from_rings, wavenumber
-from lusee_bayes.instrument.beams.monopoles import Monopoles
-from lusee_bayes.instrument.beams.sampled import (
-    SampledFileBeams,
-    read_beam,
-    sampled_beams,
-    write_sampled_beams,
-)
+from lusee_bayes.instrument.beams.sampled import SampledFileBeams
 from lusee_bayes.instrument.products import labels, to_real
 from lusee_bayes.report.describe import describe
 from lusee_bayes.testing.contracts import check_beam_source
@@ -74,7 +68,7 @@ KINDS = {
 
 @cache
 def embedded(kind, frequency_mhz=FREQUENCY):
-    return KINDS[kind](Monopoles(), frequency_mhz)
+    return KINDS[kind](lb.Monopoles(), frequency_mhz)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -97,7 +91,7 @@ def test_short_dipoles_have_their_closed_form(kind):
             phase = np.exp(1j * k * np.tensordot(places, n, 1))
             return tuple(np.tensordot(arms, axis, 1) * phase for axis in axes)
 
-    made = sampled_beams(FREQUENCY, **KINDS[kind](Dipoles()), absolute=True)
+    made = lb.sampled_beams(FREQUENCY, **KINDS[kind](Dipoles()), absolute=True)
     grid = HemisphereGrid.gauss_legendre(12, 20)
     n = unit_vectors(grid)
     along = np.tensordot(arms, n, 1)
@@ -133,7 +127,7 @@ def test_rings_go_through_the_zenith():
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_sampled_beams_keep_the_contract(kind):
-    made = sampled_beams(FREQUENCY, **embedded(kind))
+    made = lb.sampled_beams(FREQUENCY, **embedded(kind))
     source = SampledFileBeams(made, turntable_offset_deg=5.0)
     check_beam_source(
         source,
@@ -148,15 +142,15 @@ def test_sampled_beams_keep_the_contract(kind):
 def test_the_scale_is_the_autos_or_the_files():
     given = dict(embedded("grid"))
     bright = given | {"e_theta": 3.0 * given["e_theta"], "e_phi": 3.0 * given["e_phi"]}
-    scaled = sampled_beams(FREQUENCY, **bright).beams(FREQUENCY, LMAX).modes
+    scaled = lb.sampled_beams(FREQUENCY, **bright).beams(FREQUENCY, LMAX).modes
     autos = scaled[[0, 7, 12, 15], 0] * np.sqrt(4 * np.pi)
     np.testing.assert_allclose(autos.mean(), 1.0, rtol=1e-12)
     one, nine = (
-        sampled_beams(FREQUENCY, **g, absolute=True).beams(FREQUENCY, LMAX).modes
+        lb.sampled_beams(FREQUENCY, **g, absolute=True).beams(FREQUENCY, LMAX).modes
         for g in (given, bright)
     )
     np.testing.assert_allclose(nine, 9.0 * one, rtol=1e-12, atol=1e-12 * np.abs(nine).max())
-    kept = sampled_beams(FREQUENCY, **bright).beams(FREQUENCY, LMAX, normalise=False).modes
+    kept = lb.sampled_beams(FREQUENCY, **bright).beams(FREQUENCY, LMAX, normalise=False).modes
     np.testing.assert_array_equal(kept, nine)
 
 
@@ -168,17 +162,16 @@ def test_files_come_back(tmp_path, kind, suffix):
         name: values if name.endswith("deg") else np.stack([values, two[name]])
         for name, values in one.items()
     }
-    made = sampled_beams([20.0, 30.0], **arrays, absolute=True)
-    path = write_sampled_beams(tmp_path / f"mine.{suffix}", made)
-    again = read_beam(path)
+    made = lb.sampled_beams([20.0, 30.0], **arrays, absolute=True)
+    path = lb.write_sampled_beams(tmp_path / f"mine.{suffix}", made)
+    again = lb.read_beam(path)
     assert again.absolute
     np.testing.assert_array_equal(again.frequencies_mhz, [20.0, 30.0])
     # the grid's angles go through degrees and back: one rounding
     for f in (20.0, 24.0):
         ours, own = (np.asarray(b.beams(f, LMAX).modes) for b in (again, made))
         close(ours, own, 1e-13)
-    with pytest.raises(lb.InputError, match="from 20 to 30 MHz, not at 31"):
-        again.beams(31.0, LMAX)
+    refuse("from 20 to 30 MHz, not at 31", again.beams, 31.0, LMAX)
     text = describe(path)
     assert "4 antennas" in text
     assert "at 20, 30 MHz" in text
@@ -186,7 +179,7 @@ def test_files_come_back(tmp_path, kind, suffix):
 
 def test_a_scenario_takes_the_file(tmp_path):
     path = tmp_path / "mine.nc"
-    write_sampled_beams(path, sampled_beams(FREQUENCY, **embedded("pixels")))
+    lb.write_sampled_beams(path, lb.sampled_beams(FREQUENCY, **embedded("pixels")))
     scenario = small_scenario(f"beam.file={path}")
     assert scenario.beam.model == "sampled"
     assert (scenario.beam.n_ports, scenario.beam.label) == (4, "mine.nc")
@@ -198,18 +191,17 @@ def test_a_scenario_takes_the_file(tmp_path):
 
 def test_product_beams_of_a_file_may_be_in_any_order(tmp_path):
     path = tmp_path / "mine.nc"
-    made = sampled_beams(FREQUENCY, **embedded("products on pixels"))
-    write_sampled_beams(path, made)
+    made = lb.sampled_beams(FREQUENCY, **embedded("products on pixels"))
+    lb.write_sampled_beams(path, made)
     order = np.random.default_rng(0).permutation(16)
     with xr.open_dataset(path, engine="h5netcdf") as file:
         shuffled = file.load().isel(product=order)
     shuffled.attrs["products"] = ", ".join(labels()[k] for k in order)
     shuffled.to_netcdf(path, engine="h5netcdf")
-    np.testing.assert_array_equal(read_beam(path).products, made.products)
+    np.testing.assert_array_equal(lb.read_beam(path).products, made.products)
     shuffled.attrs["products"] = "00R, 01R"
     shuffled.to_netcdf(path, engine="h5netcdf")
-    with pytest.raises(lb.InputError, match=r"mine\.nc: products is 00R, 01R, expected the names"):
-        read_beam(path)
+    refuse(r"mine\.nc: products is 00R, 01R, expected the names", lb.read_beam, path)
 
 
 @pytest.mark.parametrize("kind", ["pixels", "grid"])
@@ -223,7 +215,7 @@ def test_what_is_on_or_below_the_horizon_is_not_used(kind):
     else:
         further = {n: np.where(UP, given[n], np.nan) for n in ("e_theta", "e_phi")}
     ours, own = (
-        sampled_beams(FREQUENCY, **one).beams(FREQUENCY, LMAX).modes
+        lb.sampled_beams(FREQUENCY, **one).beams(FREQUENCY, LMAX).modes
         for one in (given | further, given)
     )
     np.testing.assert_array_equal(ours, own)
@@ -253,18 +245,16 @@ def nan_at_the_zenith():
     ],
 )
 def test_arrays_that_are_no_beams_are_refused(given, words):
-    with refused(words):
-        sampled_beams(FREQUENCY, **given())
+    refuse(words, lb.sampled_beams, FREQUENCY, **given())
 
 
 def test_what_cannot_be_computed_is_refused():
-    zero = sampled_beams(FREQUENCY, products=np.zeros((16, 12 * 4**2)))
-    with pytest.raises(lb.InputError, match="autos integrate to 0 sr"):
-        zero.beams(FREQUENCY, 2)
+    zero = lb.sampled_beams(FREQUENCY, products=np.zeros((16, 12 * 4**2)))
+    refuse("autos integrate to 0 sr", zero.beams, FREQUENCY, 2)
     with pytest.raises(lb.InputError, match="beams of products, not the E fields"):
         zero.fields(FREQUENCY, HemisphereGrid.for_lmax(2))
     with pytest.raises(lb.InputError, match="must be positive and grow"):
-        sampled_beams([20.0, 10.0], products=np.zeros((2, 16, 48)))
+        lb.sampled_beams([20.0, 10.0], products=np.zeros((2, 16, 48)))
 
 
 DAMAGE = {
@@ -301,8 +291,7 @@ def test_damaged_files_are_refused(tmp_path, change, suffix):
         with xr.open_dataset(path, engine="h5netcdf") as file:
             found = DAMAGE[change][0](file.load())
         found.to_netcdf(path, engine="h5netcdf")
-    with pytest.raises(lb.InputError, match=str(path)):
-        lb.read_beam(path)
+    refuse(str(path), lb.read_beam, path)
 
 
 # --- pyuvdata -------------------------------------------------------------------------------------
@@ -325,10 +314,10 @@ def uvbeam(coordinates: str):
     }
     if coordinates == "healpix":
         options |= {"nside": NSIDE}
-        given = [on_pixels(Monopoles(), f) for f in (20.0, 30.0)]
+        given = [on_pixels(lb.Monopoles(), f) for f in (20.0, 30.0)]
     else:
         options |= {"axis1_array": np.radians(PHI_DEG), "axis2_array": np.radians(THETA_DEG)}
-        given = [on_grid(Monopoles(), f) for f in (20.0, 30.0)]
+        given = [on_grid(lb.Monopoles(), f) for f in (20.0, 30.0)]
     # (vector: along phi, along theta; feed; frequency; directions)
     options["data_array"] = np.stack(
         [np.stack([one[name][:2] for one in given], axis=1) for name in ("e_phi", "e_theta")]
@@ -351,8 +340,7 @@ def test_a_uvbeam_is_its_fields(tmp_path, coordinates):
     conjugate = lb.from_uvbeam(beam, conjugate=True).beams(20.0, LMAX).modes
     np.testing.assert_allclose(conjugate[2], -found.beams(20.0, LMAX).modes[2], atol=1e-15)
     beam.efield_to_power()
-    with pytest.raises(lb.InputError, match="give one of type efield"):
-        lb.from_uvbeam(beam)
+    refuse("give one of type efield", lb.from_uvbeam, beam)
 
 
 def test_without_pyuvdata_its_files_are_refused_with_what_to_install(tmp_path, monkeypatch):
@@ -361,5 +349,4 @@ def test_without_pyuvdata_its_files_are_refused_with_what_to_install(tmp_path, m
     hdu.header["NORMSTD"], hdu.header["FEEDLIST"] = "physical", "[x, y]"
     hdu.writeto(path)
     monkeypatch.setattr("lusee_bayes.instrument.beams.sampled.find_spec", lambda name: None)
-    with pytest.raises(lb.InputError, match=r"pip install '\.\[uvdata\]'"):
-        read_beam(path)
+    refuse(r"pip install '\.\[uvdata\]'", lb.read_beam, path)

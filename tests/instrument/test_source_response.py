@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from assertions import close, within
+from assertions import close, refuse, within
 from astropy.time import Time
 from reference import galactic_directions, hemisphere, real_harmonics, vectors
 from scipy.signal import hilbert
@@ -12,17 +12,12 @@ from scipy.special import eval_legendre
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.beams.fields import STOKES, stokes_pairs
-from lusee_bayes.instrument.beams.monopoles import (
-    Monopoles,
-    Regolith,
-    beams_towards,
-    monopole_beams,
-)
+from lusee_bayes.instrument.beams.monopoles import beams_towards
 from lusee_bayes.instrument.products import labels, to_matrix
 from lusee_bayes.instrument.source_response import antenna_directions, source_response
 
 FREQUENCY = 25.0
-SHORT = Monopoles(Regolith(1.0, 1.0, 0.0), length_m=1e-3, zenith_angle_deg=90.0)  # free space
+SHORT = lb.Monopoles(lb.Regolith(1.0, 1.0, 0.0), length_m=1e-3, zenith_angle_deg=90.0)  # free space
 ZENITH = np.array([[0.0, 0.0, 1.0]])
 
 
@@ -51,7 +46,7 @@ def test_their_integrals_with_harmonics_are_the_modes(stokes):
     theta, phi, solid_angle = hemisphere(160, 48)
     beams = np.asarray(beams_towards(FREQUENCY, vectors(theta, phi), stokes=stokes))
     got = (beams * solid_angle) @ real_harmonics(theta, phi, lmax)
-    expected = np.asarray(monopole_beams(FREQUENCY, lmax, stokes=stokes).modes)
+    expected = np.asarray(lb.monopole_beams(FREQUENCY, lmax, stokes=stokes).modes)
     # both sums over Gauss nodes have converged (test_monopoles.py: 1e-12 at 25 MHz)
     close(got, expected, 2e-12)
     assert np.abs(expected).max() > 1e-3
@@ -84,7 +79,7 @@ def test_gradients_are_finite_and_right_with_sources_below_the_horizon():
     def f(monopoles, directions):
         return jnp.sum(weights * beams_towards(FREQUENCY, directions, monopoles))
 
-    m = Monopoles()
+    m = lb.Monopoles()
     slopes = eqx.filter_grad(f)(m, jnp.asarray(directions))
     leaves = jax.tree.leaves(slopes)
     assert len(leaves) == len(jax.tree.leaves(m))
@@ -221,7 +216,7 @@ def test_a_smoothed_source_agrees_with_the_coupling_matrix():
     n0 = o.zenith_galactic()[2] + np.array([0.1, 0.25, -0.2])
     n0 /= np.linalg.norm(n0)
     modes, g = smoothed_source(n0, sigma, lmax)
-    coupling = lb.CouplingMatrix.observe(monopole_beams(FREQUENCY, lmax), o)
+    coupling = lb.CouplingMatrix.observe(lb.monopole_beams(FREQUENCY, lmax), o)
     expected = np.asarray(coupling @ jnp.asarray(modes)).reshape(16, o.n_times)
     n, weights = around(n0, g, 6.0 * sigma, 28, 36)
     np.testing.assert_allclose(weights.sum(), 1.0, rtol=0, atol=1e-6)
@@ -289,8 +284,7 @@ def test_the_circularly_polarised_part_enters_by_the_v_beam():
     ],
 )
 def test_bad_directions_are_refused(arguments, message):
-    with pytest.raises(lb.InputError, match=message):
-        beams_towards(*arguments)
+    refuse(message, beams_towards, *arguments)
 
 
 @pytest.mark.parametrize(
@@ -306,5 +300,4 @@ def test_bad_directions_are_refused(arguments, message):
     ],
 )
 def test_bad_sources_are_refused(galactic, options, message):
-    with pytest.raises(lb.InputError, match=message):
-        source_response(observation(), galactic, FREQUENCY, **options)
+    refuse(message, source_response, observation(), galactic, FREQUENCY, **options)

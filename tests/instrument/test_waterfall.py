@@ -10,7 +10,7 @@ import astropy.units as u
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from assertions import refused
+from assertions import refuse, refused
 from astropy.io import fits
 from astropy.time import Time, TimeDelta
 from fits_files import write_images
@@ -131,8 +131,7 @@ def test_any_subset_and_order_of_products(tmp_path):
     ],
 )
 def test_files_that_cannot_be_used(tmp_path, options, message):
-    with pytest.raises(lb.InputError, match=message):
-        lb.read_waterfall(write(tmp_path / "w.fits", **options))
+    refuse(message, lb.read_waterfall, write(tmp_path / "w.fits", **options))
 
 
 def test_missing_channels_files_and_ends(tmp_path):
@@ -141,11 +140,9 @@ def test_missing_channels_files_and_ends(tmp_path):
         lb.read_data(path, lb.load_scenario("fiducial"))
     with pytest.raises(lb.InputError, match="all 192 samples are flagged"):
         lb.read_data(write(tmp_path / "empty.fits", np.full((12, 16, 2), np.nan)), ten)
-    with pytest.raises(lb.InputError, match="no data at"):
-        lb.read_data(tmp_path / "none.fits", ten)
+    refuse("no data at", lb.read_data, tmp_path / "none.fits", ten)
     path.write_bytes(path.read_bytes()[:4000])
-    with pytest.raises(lb.InputError, match="cut short"):
-        lb.read_data(path, ten)
+    refuse("cut short", lb.read_data, path, ten)
 
 
 def test_what_info_says_of_luseepys_files(test_data):
@@ -248,8 +245,7 @@ def test_what_is_written_is_read_back_bit_by_bit(tmp_path):
     ],
 )
 def test_what_luseepys_layout_cannot_hold(tmp_path, runs, message):
-    with pytest.raises(lb.InputError, match=message):
-        lb.write_waterfall(tmp_path / "w.fits", 2 * [random_channel(runs)])
+    refuse(message, lb.write_waterfall, tmp_path / "w.fits", 2 * [random_channel(runs)])
     assert not list(tmp_path.iterdir())
 
 
@@ -313,8 +309,7 @@ def test_another_site_and_other_ports(tmp_path):
 
 def test_products_that_the_beams_cannot_supply(tmp_path):
     waterfall = lb.read_waterfall(write(tmp_path / "w.fits"))
-    with refused("has the product 02R, but the beams are those of 2 ports"):
-        waterfall.at(10.0, n_ports=2)
+    refuse("has the product 02R, but the beams are those of 2 ports", waterfall.at, 10.0, n_ports=2)
     few = lb.read_waterfall(write(tmp_path / "few.fits", pairs=[[0, 0], [0, 1], [1, 1]]))
     data = few.at(10.0, n_ports=2)
     assert (data.layout.n_products, data.n_missing) == (4, 0)
@@ -376,5 +371,4 @@ twice = np.array([[2461000.0, 0.5], [2461000.0, 0.5], [2461000.0, 0.6]])
     ],
 )
 def test_four_port_files_that_cannot_be_used(tmp_path, changes, message):
-    with pytest.raises(lb.InputError, match=message):
-        lb.read_waterfall(four_port(tmp_path / "w.fits", **changes))
+    refuse(message, lb.read_waterfall, four_port(tmp_path / "w.fits", **changes))

@@ -13,8 +13,7 @@ import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.judge import left_out
-from lusee_bayes.judge.chi2 import KINDS
-from lusee_bayes.judge.left_out import LeftOut, groups_of
+from lusee_bayes.judge.left_out import KINDS, LeftOut, groups_of
 from lusee_bayes.judge.residuals import held_out
 
 # noise a thousand times larger than the telescope's: what matrices lose to cancellation is then

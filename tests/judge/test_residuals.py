@@ -15,7 +15,7 @@ import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.judge.chi2 import FALSE_ALARM, KINDS, ChiSquare, stands_out, two_sided
+from lusee_bayes.judge.chi2 import FALSE_ALARM, ChiSquare, stands_out, two_sided
 from lusee_bayes.judge.measures import data_freedom, preferences
 from lusee_bayes.judge.residuals import residuals
 from lusee_bayes.judge.split import WIDER, Split, widened
@@ -120,10 +120,10 @@ def test_groups_and_single_data_by_hand(case):
     layout, run = data.layout, data.observation.run
     hours = data.observation.hours
     assert [g.name for g in of_kind(found, "product")] == list(data.labels)
-    assert [g.name for g in of_kind(found, "angle")] == ["0", "40"]
+    assert [g.name for g in of_kind(found, "turntable angle")] == ["0", "40"]
     angle = np.array(data.observation.turntable_deg)[run[layout.time]]
     members = [layout.product == 7, hours[layout.time] // 24 == 1, angle == 40.0]
-    numbers = {"product": 7, "day": 1, "angle": 1}
+    numbers = {"product": 7, "day": 1, "turntable angle": 1}
     groups = [of_kind(found, kind)[number] for kind, number in numbers.items()]
     for group, member in zip(groups, members, strict=True):
         index = np.flatnonzero(member)
@@ -163,7 +163,7 @@ def test_a_prior_that_is_too_wide_is_told_from_one_that_is_too_narrow(width, sai
 def test_one_group_is_everything():
     model, data = simulated("observation.runs=[{cycles: 0.02}]")
     found = judged(model, data)
-    (angle,) = of_kind(found, "angle")
+    (angle,) = of_kind(found, "turntable angle")
     whole = found.split.instrument
     assert (angle.chi2, angle.degrees, angle.n) == (whole.chi2, whole.degrees, data.layout.size)
     assert np.isnan(angle.others_p)
@@ -188,13 +188,15 @@ def corrupted(data, where, by):
     return replace(data, data=data.layout.gather(jnp.asarray(np.nan_to_num(grid))))
 
 
-@pytest.mark.parametrize(("kind", "name"), [("product", "22R"), ("day", "1"), ("angle", "40")])
+@pytest.mark.parametrize(
+    ("kind", "name"), [("product", "22R"), ("day", "1"), ("turntable angle", "40")]
+)
 def test_what_is_wrong_is_pointed_at(kind, name):
     model, data = simulated()
     where = {
         "product": np.arange(16)[:, None] == 12,
         "day": data.observation.hours[None] // 24 == 1,
-        "angle": data.observation.run[None] == 1,
+        "turntable angle": data.observation.run[None] == 1,
     }[kind] & np.ones((16, 24), dtype=bool)
     bad = corrupted(data, where, 40.0 * np.sqrt(float(model.noise.diagonal().mean())))
     found = judged(model, bad)
@@ -202,7 +204,7 @@ def test_what_is_wrong_is_pointed_at(kind, name):
     verdict = found.fit().text
     assert (kind, name) in [(group.kind, group.name) for group in found.suspects()]
     assert (
-        f"{KINDS[kind]} {name}" in verdict
+        f"{kind} {name}" in verdict
         and "The others fit without" in verdict
         and "leave it out" in verdict
     )

@@ -12,14 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from experiments import mapped
 from reference_linear import assert_draws_follow
 from scipy.stats import chi2, kstest
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.solver import FORMS
-from lusee_bayes.runs.map_run import map_result
 
 LMAX, N_MODES, N_DRAWS, SEED = 8, 81, 4000, 20270115
 SPECTRUM = 1e8 * (1.0 + np.arange(LMAX + 1.0)) ** -2.5  # K^2; the monopole is 20000 K below
@@ -61,7 +60,7 @@ class Setup:
         """C^-1/2 (m - mean), shape (draws, modes), of data with noise ``truth``."""
         skies, data = self.simulate(truth)
         prior = lb.HarmonicPrior(jnp.asarray(SPECTRUM))
-        solver = LinearGaussian(self.coupling, prior, assumed).factorise(form)
+        solver = lb.LinearGaussian(self.coupling, prior, assumed).factorise(form)
         means = jax.jit(jax.vmap(lambda d: solver.condition(d).mean))(jnp.asarray(data))
         covariance = np.asarray(solver.condition(jnp.asarray(data[0])).covariance())
         # in units of the prior: the monopole's variance is 1e-10 of it, the rest of order one
@@ -143,12 +142,12 @@ def test_notices_a_missing_gain_term(long_run):
 @pytest.mark.parametrize("frequency", [5, 25, 45])
 def test_one_word_changes_the_frequency(frequency):
     scenario = lb.load_scenario("fiducial", [f"frequency_mhz={frequency}"])
-    result = map_result(lb.build(scenario))
-    spectra, summary = result.channel.spectra(), result.summary()
+    _, channel = mapped(lb.build(scenario))
+    spectra = channel.spectra()
     assert spectra["rho"][1:11].min() > 0.9
-    assert summary["ell_cross"] >= 20
+    assert channel.ell_cross >= 20
     # N_data - rank + tr Lambda^-1, with the scatter of chi^2 and a sky that is no Gaussian draw
-    assert summary["chi2"] == pytest.approx(summary["chi2_expected"], abs=6 * np.sqrt(2 * 5232))
+    assert channel.chi2 == pytest.approx(channel.chi2_expected, abs=6 * np.sqrt(2 * 5232))
     if frequency == 25:
         assert spectra["rho"][1:24].min() > 0.5
 

@@ -7,14 +7,10 @@ import pytest
 from reference_linear import z_of
 from scipy import stats
 
+import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_device, on_host
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear import joint
-from lusee_bayes.linear.joint import channel_sky, paired, solve_directly
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
-from lusee_bayes.noise.covariance import DiagonalCovariance
-from lusee_bayes.sky.prior import HarmonicPrior
-from lusee_bayes.sky.spectral_prior import SpectralPrior
+from lusee_bayes.linear.joint import channel_sky, paired
 
 FREQUENCIES = np.array([10.0, 17.0, 25.0, 40.0])
 LMAX, N_MODES = 2, 9
@@ -30,9 +26,11 @@ def skies(seed=0):
 
 
 PRIORS = {
-    "components": lambda: SpectralPrior.components(FREQUENCIES, skies(), ("power_law", "turnover")),
-    "kernel": lambda: SpectralPrior.kernel(FREQUENCIES, skies(), length=0.8, residual=0.05),
-    "no rest": lambda: SpectralPrior.components(FREQUENCIES, skies(), residual=0.0),
+    "components": lambda: lb.SpectralPrior.components(
+        FREQUENCIES, skies(), ("power_law", "turnover")
+    ),
+    "kernel": lambda: lb.SpectralPrior.kernel(FREQUENCIES, skies(), length=0.8, residual=0.05),
+    "no rest": lambda: lb.SpectralPrior.components(FREQUENCIES, skies(), residual=0.0),
 }
 
 
@@ -58,10 +56,10 @@ def models(prior, seed=4):
         spectrum = prior.mixing[k] ** 2 @ prior.spectra
         if prior.residual is not None:
             spectrum = spectrum + prior.residual[k]
-        own = HarmonicPrior(spectrum)
+        own = lb.HarmonicPrior(spectrum)
         level = 0.1 * float(np.sqrt(np.asarray(own.variance()).mean()))
-        noise = DiagonalCovariance(jnp.asarray(level**2 * rng.uniform(0.5, 2.0, n)))
-        made.append(LinearGaussian(a, own, noise))
+        noise = lb.DiagonalCovariance(jnp.asarray(level**2 * rng.uniform(0.5, 2.0, n)))
+        made.append(lb.LinearGaussian(a, own, noise))
     return made
 
 
@@ -123,7 +121,7 @@ def test_the_direct_solution_is_the_textbooks(case, place, monkeypatch):
     for module in (joint, joint):
         monkeypatch.setattr(module, "on_processor", place)
     prior, _, channels, reference, mean, covariance, evidence = case
-    posterior = solve_directly(prior, channels, reference)
+    posterior = lb.solve_directly(prior, channels, reference)
     np.testing.assert_allclose(posterior.log_evidence, evidence, rtol=1e-8)
     std = np.sqrt(np.diag(covariance)).reshape(-1, N_MODES)
     maps = posterior.mean.reshape(prior.n_components, N_MODES)
@@ -152,7 +150,7 @@ def test_chi2_of_data_drawn_from_the_joint_prior():
     def evidence(data):
         channels = information_from(made, data)
         reference = np.stack([np.asarray(t.reference) for t in channels])
-        return float(solve_directly(prior, channels, reference).log_evidence)
+        return float(lb.solve_directly(prior, channels, reference).log_evidence)
 
     highest = evidence(at_zero)
     n_data = sum(m.n_data for m in made)
@@ -162,8 +160,8 @@ def test_chi2_of_data_drawn_from_the_joint_prior():
 
 def test_skies_that_do_not_obey_the_prior_are_told():
     """Skies with a rest of their own, under a prior that has none: evidence and residuals fall."""
-    true = SpectralPrior.components(FREQUENCIES, skies(), ("power_law",), residual=0.2)
-    wrong = SpectralPrior.components(FREQUENCIES, skies(), ("power_law",), residual=1e-4)
+    true = lb.SpectralPrior.components(FREQUENCIES, skies(), ("power_law",), residual=0.2)
+    wrong = lb.SpectralPrior.components(FREQUENCIES, skies(), ("power_law",), residual=1e-4)
     made = models(true)
     found = {}
     for name, obeys in (("obeyed", wrong), ("not obeyed", true)):
@@ -171,7 +169,7 @@ def test_skies_that_do_not_obey_the_prior_are_told():
         channels = information_from(made, data)
         reference = np.stack([np.asarray(t.reference) for t in channels])
         for prior_name, prior in (("true", true), ("wrong", wrong)):
-            posterior = solve_directly(prior, channels, reference)
+            posterior = lb.solve_directly(prior, channels, reference)
             maps = posterior.mean.reshape(prior.n_components, N_MODES)
             spread = paired(posterior.covariance(), prior)
             none = jnp.zeros((0, prior.n_components, N_MODES))
@@ -193,14 +191,16 @@ def test_components_are_a_fit_to_the_skies():
     x = FREQUENCIES / 20.0
     a, b = np.random.default_rng(1).standard_normal((2, N_MODES))
     exact = x[:, None] ** -2.5 * (a + b * np.log(x)[:, None])
-    prior = SpectralPrior.components(FREQUENCIES, exact, ("power_law", "curvature"), residual=0.0)
+    prior = lb.SpectralPrior.components(
+        FREQUENCIES, exact, ("power_law", "curvature"), residual=0.0
+    )
     np.testing.assert_allclose(prior.spectra[0, 0], a[0] ** 2, rtol=1e-10)
     np.testing.assert_allclose(prior.spectra[1, 1], (b[1:4] ** 2).mean(), rtol=1e-10)
     np.testing.assert_allclose(prior.mixing[:, 1], x**-2.5 * np.log(x), rtol=1e-14)
 
 
 def test_the_kernel_is_its_formula():
-    prior = SpectralPrior.kernel(FREQUENCIES, skies(), length=0.7, index=-2.3, residual=0.05)
+    prior = lb.SpectralPrior.kernel(FREQUENCIES, skies(), length=0.7, index=-2.3, residual=0.05)
     log_x = np.log(FREQUENCIES / 20.0)
     kernel = np.exp(-2.3 * (log_x[:, None] + log_x[None]))
     kernel *= np.exp(-((log_x[:, None] - log_x[None]) ** 2) / (2 * 0.7**2))
@@ -222,16 +222,16 @@ def test_draws_of_the_prior_have_its_covariance():
 
 
 def test_bad_priors_and_channels_are_refused():
-    with pytest.raises(InputError, match="unknown component 'turnver'; did you mean 'turnover'"):
-        SpectralPrior.components(FREQUENCIES, skies(), ("turnver",))
-    with pytest.raises(InputError, match="3 spectral components need at least as many channels"):
-        SpectralPrior.components(FREQUENCIES[:2], skies()[:2])
-    with pytest.raises(InputError, match="fit the skies of 2 channels exactly"):
-        SpectralPrior.components(FREQUENCIES[:2], skies()[:2], ("power_law", "curvature"))
-    with pytest.raises(InputError, match="must not be negative"):
-        SpectralPrior.components(FREQUENCIES, skies(), residual=-0.1)
+    with pytest.raises(lb.InputError, match="unknown component 'turnver'; did you mean 'turnover'"):
+        lb.SpectralPrior.components(FREQUENCIES, skies(), ("turnver",))
+    with pytest.raises(lb.InputError, match="3 spectral components need at least as many channels"):
+        lb.SpectralPrior.components(FREQUENCIES[:2], skies()[:2])
+    with pytest.raises(lb.InputError, match="fit the skies of 2 channels exactly"):
+        lb.SpectralPrior.components(FREQUENCIES[:2], skies()[:2], ("power_law", "curvature"))
+    with pytest.raises(lb.InputError, match="must not be negative"):
+        lb.SpectralPrior.components(FREQUENCIES, skies(), residual=-0.1)
     prior = PRIORS["kernel"]()
     channels = information_from(models(prior), [np.zeros(m.n_data) for m in models(prior)])
     reference = np.zeros((4, N_MODES))
-    with pytest.raises(InputError, match="there are 3 channels, the prior is for 4"):
-        solve_directly(prior, channels[:3], reference)
+    with pytest.raises(lb.InputError, match="there are 3 channels, the prior is for 4"):
+        lb.solve_directly(prior, channels[:3], reference)

@@ -12,7 +12,6 @@ from scipy import integrate, stats
 from scipy.optimize import minimize
 
 import lusee_bayes as lb
-from lusee_bayes.core.arrays import on_host
 from lusee_bayes.linear.information import integrated_out
 from lusee_bayes.priors.families import IsotropicFamily
 from lusee_bayes.priors.learning import (
@@ -21,7 +20,6 @@ from lusee_bayes.priors.learning import (
     _root,
     demanded_factor,
     draws_with_parameters,
-    information_behind,
     learn,
     learn_whatever_fits,
 )
@@ -207,32 +205,6 @@ LOW = 3
 SIZE = (LOW + 1) ** 2
 
 
-# --- what data said, back from a posterior ----------------------------------------------------
-
-
-@pytest.mark.parametrize("n_data", [40, 6], ids=["map-space form", "data-space form"])
-@pytest.mark.parametrize("dense", [False, True], ids=["independent", "dense with a mean"])
-def test_another_prior_gives_the_posterior_that_the_data_give(n_data, dense):
-    rng = np.random.default_rng(3)
-    prior = lb.HarmonicPrior(np.geomspace(1e8, 1e6, LOW + 1))
-    if dense:
-        root = 3e3 * rng.standard_normal((SIZE, SIZE))
-        mean = 1e4 * rng.standard_normal(SIZE)
-        prior = lb.DensePrior.of_covariance(root @ root.T + 1e6 * np.eye(SIZE), mean)
-    coupling = rng.standard_normal((n_data, SIZE))
-    data = 1e4 * rng.standard_normal(n_data)
-    noise = lb.DiagonalCovariance(np.geomspace(1.0, 1e6, n_data))
-    behind = information_behind(on_host(lb.LinearGaussian(coupling, prior, noise).condition(data)))
-    other = lb.HarmonicPrior(np.full(LOW + 1, 3e7))
-    expected = lb.LinearGaussian(coupling, other, noise).condition(data)
-    found = behind.posterior(other)
-    std = np.asarray(expected.std())
-    # M is what is left of Lambda of up to 1e8 when 1 is taken off: 1e-8 of what the prior says
-    assert np.abs((np.asarray(found.mean) - np.asarray(expected.mean)) / std).max() < 1e-5
-    np.testing.assert_allclose(np.asarray(found.std()), std, rtol=1e-6)
-    assert np.isnan(float(found.log_evidence))
-
-
 # --- one parameter, the strength of the sky ---------------------------------------------------
 
 
@@ -266,9 +238,7 @@ def one_parameter():
     )
     prior = family.prior(family.at(np.array([0.4])).covariance)
     learned = Learned(prior, ("theta",), np.array([0.4]), np.array([[width**2]]), 0.0, 0)
-    draws = draws_with_parameters(
-        family, learned, information.posterior(prior), jax.random.key(1), 4500
-    )
+    draws = draws_with_parameters(family, learned, information, jax.random.key(1), 4500)
     return noise, seen, draws
 
 
@@ -291,15 +261,15 @@ def test_draws_are_those_of_the_integral_over_the_parameter(one_parameter):
             assert abs(level - expected) < 4.0 * error
 
 
-def weakly_known(family: IsotropicFamily, std: float) -> tuple[Learned, lb.Posterior]:
-    """Parameters known to so much, and the posterior of a sky that the data hardly tell."""
+def weakly_known(family: IsotropicFamily, std: float) -> tuple[Learned, lb.Information]:
+    """Parameters known to so much, and the information of data that hardly tell the sky."""
     theta = family.hyperprior.start()
     prior = family.prior(family.at(theta).covariance)
     information = lb.Information(
         np.eye(SIZE) * 1e-8, np.ones(SIZE), np.zeros(SIZE), *[np.ones(())] * 3
     )
     learned = Learned(prior, (), theta, std**2 * np.eye(len(theta)), 0.0, 0)
-    return learned, information.posterior(prior)
+    return learned, information
 
 
 def test_few_draws_and_none():

@@ -7,12 +7,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lusee_bayes.core.errors import InputError
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
-from lusee_bayes.noise.covariance import DiagonalCovariance
+import lusee_bayes as lb
 from lusee_bayes.priors.families import FREEDOM, Hyperprior, IsotropicFamily
 from lusee_bayes.priors.learning import learn
-from lusee_bayes.sky.prior import HarmonicPrior
 
 LMAX, N_DATA, NOISE = 4, 40, 2000.0
 
@@ -23,8 +20,8 @@ def information_of(family, seed=3):
     prior = family.prior(family.at(family.hyperprior.start()).covariance)
     sky = np.asarray(prior.sample(jax.random.key(4)))
     coupling = rng.standard_normal((N_DATA, len(sky))) / 3.0
-    noise = DiagonalCovariance(np.full(N_DATA, NOISE**2))
-    model = LinearGaussian(coupling, HarmonicPrior(np.full(LMAX + 1, 1e8)), noise)
+    noise = lb.DiagonalCovariance(np.full(N_DATA, NOISE**2))
+    model = lb.LinearGaussian(coupling, lb.HarmonicPrior(np.full(LMAX + 1, 1e8)), noise)
     return model.inform(coupling @ sky + NOISE * rng.standard_normal(N_DATA))[0]
 
 
@@ -41,7 +38,7 @@ def test_the_evidence_agrees_with_draws_of_the_hyperprior():
         try:
             prior = family.prior(family.at(theta).covariance)
             values.append(float(information.posterior(prior).log_evidence))
-        except InputError:  # nothing of that size is in the data
+        except lb.InputError:  # nothing of that size is in the data
             values.append(-np.inf)
     largest = max(values)
     expected = largest + np.log(np.exp(np.array(values) - largest).mean())

@@ -16,16 +16,12 @@ import numpy as np
 import pytest
 import xarray as xr
 
+import lusee_bayes as lb
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
-from lusee_bayes.experiment.experiment import build
-from lusee_bayes.experiment.scenario import load_scenario
-from lusee_bayes.judge import residuals as residuals_module
-from lusee_bayes.results.diagnostics_file import read_diagnostics
-from lusee_bayes.runs.diagnostics import region_of
-from lusee_bayes.runs.map_run import run_map
-from lusee_bayes.runs.sample_run import run_sample
-from lusee_bayes.sampling.hmc import Sampler
+from lusee_bayes.judge import left_out
+from lusee_bayes.results.channel_map import region_of
+from lusee_bayes.results.map_files import read_channels
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
@@ -44,19 +40,18 @@ def cube(small_cube):
 
 @pytest.fixture(scope="module")
 def sampled(tmp_path_factory):
-    scenario = load_scenario("fiducial", ["lmax=2", "observation.runs.0.cycles=0.05"])
-    sampler = Sampler(draws=50, warmup=50, seed=scenario.seed)
-    return run_sample(scenario, tmp_path_factory.mktemp("run") / "s", sampler=sampler).folder
+    scenario = lb.load_scenario("fiducial", ["lmax=2", "observation.runs.0.cycles=0.05"])
+    sampler = lb.Sampler(draws=50, warmup=50, seed=scenario.seed)
+    return lb.run_sample(scenario, tmp_path_factory.mktemp("run") / "s", sampler=sampler).folder
 
 
-def explorer_data(page: str) -> dict:
-    (text,) = re.findall(r'<script type="application/json" id="explorer-data">(.*?)</script>', page)
+def viewer_data(page: str) -> dict:
+    (text,) = re.findall(r'<script type="application/json" id="viewer-data">(.*?)</script>', page)
     return json.loads(text)
 
 
-def layer(data: dict, key: str) -> np.ndarray:
-    (found,) = [one for one in data["layers"] if one["key"] == key]
-    return np.frombuffer(base64.b64decode(found["values"]), dtype="<f4")
+def layer(data: dict, name: str) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(data["maps"][name]["values"]), dtype="<f4")
 
 
 class Outline(HTMLParser):
@@ -107,9 +102,9 @@ def test_pages_are_whole_and_need_nothing_else(which, request):
 @pytest.mark.long
 @pytest.mark.essential
 def test_a_pixels_posterior_is_that_of_the_file(folder):
-    data = explorer_data((folder / "report.html").read_text())
+    data = viewer_data((folder / "report.html").read_text())
     with xr.open_dataset(folder / "posterior.nc", engine="h5netcdf") as file:
-        mean, covariance = file["mean"].values, file["covariance"].values
+        mean, covariance = file["mean"].values[0], file["covariance"].values[0]
     nside = data["nside"]
     y = pixel_matrix(nside, 8)
     single = {"rtol": 2e-7, "atol": 0}
@@ -127,10 +122,34 @@ def test_a_pixels_posterior_is_that_of_the_file(folder):
         np.testing.assert_allclose(got[[0, 300, 767]], values, rtol=1e-6)
     # what is left of the prior, the monopole apart
     with xr.open_dataset(folder / "posterior.nc", engine="h5netcdf") as file:
-        prior = file["prior_std"].values[1:] ** 2
+        prior = file["prior_std"].values[0, 1:] ** 2
     inner = np.einsum("pi,ij,pj->p", y[:, 1:], covariance[1:, 1:], y[:, 1:])
     share = inner / (y[:, 1:] ** 2 @ prior)
     np.testing.assert_allclose(layer(data, "prior_fraction"), share, rtol=1e-5)
+
+
+def test_a_page_of_many_channels_has_a_part_for_each(cube):
+    """One is shown at a time; selectors stand above them, and the maps have a slider."""
+    page = (cube / "report.html").read_text()
+    summary = json.loads((cube / "summary.json").read_text())
+    n = len(summary["channels"])
+    assert n == 3 and viewer_data(page)["frequencies"] == [20.0, 25.0, 30.0]
+    (slider,) = re.findall(r'<input id="viewer-channel" type="range" [^>]*>', page)
+    assert 'max="2"' in slider
+    selectors = re.findall(r'<select class="channel">\s*(.*?)\s*</select>', page, re.DOTALL)
+    options = "".join(f'<option value="{k}">{20 + 5 * k} MHz</option>' for k in range(n))
+    assert selectors and all("".join(one.split("\n")) == options for one in selectors)
+    parts = re.findall(r'<div data-channel="(\d)"( hidden)?>', page)
+    assert parts == [("0", ""), ("1", " hidden"), ("2", " hidden")] * len(selectors)
+    # what each says is that channel's
+    for channel in summary["channels"]:
+        assert f"expected {channel['chi2_expected']:.1f}" in page
+        assert f"<td>{channel['frequency_mhz']:g}</td><td>{channel['n_data']}</td>" in page
+
+
+def test_a_page_of_one_channel_has_no_selector(folder):
+    page = (folder / "report.html").read_text()
+    assert 'class="channel"' not in page and "viewer-channel" not in page.split("<script", 1)[0]
 
 
 @pytest.mark.parametrize("which", [FOLDER, CUBE, SAMPLED])
@@ -162,18 +181,18 @@ def test_what_has_no_report_is_told(tmp_path, capsys):
 def test_a_corrupted_product_is_pointed_at(tmp_path, factor):
     """One product of a gain run is too large: the page says which, or that the data do not tell."""
     given = ["lmax=8", "observation.runs.0.cycles=0.2"]
-    scenario = load_scenario("gain_1e-3", given)
-    data = build(scenario).data
+    scenario = lb.load_scenario("gain_1e-3", given)
+    data = lb.build(scenario).data
     grid = data.grid()
     grid[8] *= factor
     replace(data, data=data.layout.gather(jnp.asarray(grid))).write(tmp_path / "bad.nc")
-    run_map(scenario, tmp_path / "out", data=tmp_path / "bad.nc")
+    lb.run_map(scenario, tmp_path / "out", data=tmp_path / "bad.nc")
     page = (tmp_path / "out" / "report.html").read_text()
     told = {1.2: "without product 12R .*: leave it out", 1.02: "any one of .* do not tell which"}
     assert re.search(rf'class="verdict bad">Does not fit.*{told[factor]}', page)
     assert re.search(r"<tr class=bad><td>12R</td>", page)
-    found = read_diagnostics(tmp_path / "out" / "diagnostics.nc")
-    suspects = np.atleast_1d(found.attrs["suspects"])
+    (channel,) = read_channels(tmp_path / "out" / "diagnostics.nc")
+    suspects = channel.judged.suspects
     assert "product 12R" in suspects
     assert (sum(name.startswith("product") for name in suspects) == 1) == (factor == 1.2)
 
@@ -181,18 +200,20 @@ def test_a_corrupted_product_is_pointed_at(tmp_path, factor):
 @pytest.mark.long
 def test_a_page_without_groups(tmp_path, monkeypatch):
     """Noise that couples times, and an A that would be too large to judge its data one by one."""
-    monkeypatch.setattr(residuals_module, "DENSE_BYTES", 0.0)
+    monkeypatch.setattr(left_out, "DENSE_BYTES", 0.0)
     overrides = ["lmax=4", "observation.runs.0.cycles=0.1", "noise.gain={sigma: 0.01}"]
-    run = run_map(load_scenario("fiducial", overrides), tmp_path / "map")
-    found = read_diagnostics(run.folder / "diagnostics.nc")
-    assert found.sizes["group"] == 0 and np.isnan(found["z"]).all()
-    assert found.attrs["verdict"] == run.result.verdict()
+    run = lb.run_map(lb.load_scenario("fiducial", overrides), tmp_path / "map")
+    (channel,) = read_channels(run.folder / "diagnostics.nc")
+    assert not channel.judged.groups
+    assert np.isnan(channel.judged.z).all()
+    assert channel.judged.verdict == run.result.verdict()
     # the rest is judged as ever: chi^2 of all data under the model, by matrices
-    model, data = run.result.inference.model, run.result.experiment.data.data
+    experiment = lb.build(run.result.scenario)
+    model, data = lb.infer(experiment).model, experiment.data.data
     a = np.asarray(model.coupling.dense())
     k = a @ np.diag(np.asarray(model.prior.variance())) @ a.T + np.asarray(model.noise.dense())
     expected = np.asarray(data) @ np.linalg.solve(k, np.asarray(data))
-    told = found.attrs["instrument_chi2"] + found.attrs["prior_chi2"]
+    told = channel.instrument.chi2 + channel.judged.prior.chi2
     assert told == pytest.approx(expected, rel=1e-4)
     page = (run.folder / "report.html").read_text()
     assert "By product" not in page and run.result.verdict() in page
@@ -206,9 +227,9 @@ const shown = [...document.querySelectorAll("img, canvas, dl, p, h1, h2")];
 const found = {
   errors: window.problems, width: innerWidth, needed: document.documentElement.scrollWidth,
   cut: shown.filter((e) => beyond(e) && !e.closest(".scroll, figure")).length, pixels: []};
-if (window.explorer) for (const [l, b] of POINTS) found.pixels.push(explorer.at(l, b));
-if (window.explorer) { explorer.choose(POINTS[0][0], POINTS[0][1]);
-  found.values = document.getElementById("explorer-values").textContent; }
+if (window.viewer) for (const [l, b] of POINTS) found.pixels.push(viewer.at(l, b));
+if (window.viewer) { viewer.choose(POINTS[0][0], POINTS[0][1]);
+  found.values = document.getElementById("viewer-values").textContent; }
 const text = document.createElement("pre"); text.id = "found";
 text.textContent = JSON.stringify(found); document.body.append(text);
 </script>"""
@@ -244,7 +265,7 @@ def in_browser(page: str, tmp_path, width: int, points) -> dict:
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 @pytest.mark.parametrize("width", [1280, 390])
-@pytest.mark.parametrize("which", [FOLDER, SAMPLED])
+@pytest.mark.parametrize("which", [FOLDER, CUBE, SAMPLED])
 def test_in_a_browser(which, width, request, tmp_path):
     folder = request.getfixturevalue(which)
     points = np.random.default_rng(3).uniform([0, -90], [360, 90], (300, 2))
@@ -255,7 +276,7 @@ def test_in_a_browser(which, width, request, tmp_path):
     assert found["needed"] <= width
     assert found["cut"] == 0
     if which == "folder":
-        # the page's own HEALPix is healpy's (test_explorer.py)
+        # the page's own HEALPix is healpy's (test_viewer.py)
         pixels = np.array([p["pixel"] for p in found["pixels"]])
         mean = healpy.read_map(folder / "mean.fits", dtype=np.float64)
         np.testing.assert_allclose([p["mean"] for p in found["pixels"]], mean[pixels], rtol=1e-7)

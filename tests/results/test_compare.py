@@ -6,7 +6,6 @@ import csv
 import json
 
 import matplotlib.image
-import numpy as np
 import pytest
 
 import lusee_bayes as lb
@@ -39,6 +38,7 @@ def test_the_right_model_wins(runs, tmp_path, capsys):
     for name, row in rows.items():
         summary = json.loads((runs / name / "summary.json").read_text())
         assert float(row["log_evidence"]) == summary["log_evidence"]
+        assert float(row["instrument_p"]) == summary["channels"][0]["instrument"]["p"]
     assert float(rows["gain_1e-2"]["log_evidence_less_best"]) == 0.0
     difference = float(rows["fiducial"]["log_evidence"]) - float(rows["gain_1e-2"]["log_evidence"])
     assert float(rows["fiducial"]["log_evidence_less_best"]) == difference < -100.0
@@ -54,14 +54,19 @@ def test_different_data_are_told_apart(runs, tmp_path, capsys):
     read = read_runs([runs / "fiducial", runs / "other"])
     assert "has other values at the same times" in evidence_caveat(read)
     assert evidence_caveat(read_runs([runs / "fiducial", runs / "gain_1e-2"])) is None
-    np.testing.assert_array_equal(read[0].mean.shape, read[1].mean.shape)
+    assert read[0].channel.mean.shape == read[1].channel.mean.shape
     out = str(tmp_path / "out")
     assert main(["compare", str(runs / "fiducial"), str(runs / "other"), "-o", out]) == 0
     assert "Do not compare the evidences" in capsys.readouterr().out
 
 
-def test_what_cannot_be_compared(runs, tmp_path, capsys):
+def test_what_cannot_be_compared(runs, small_cube, tmp_path, capsys, numbers_alone):
+    one = lb.run_map(
+        lb.load_scenario("fiducial", [*SMALL, "frequencies_mhz=[25]"]), tmp_path / "one"
+    )
     for folders, message in (
+        ([runs / "fiducial", small_cube.folder], "'cube' is a run of frequencies_mhz"),
+        ([runs / "fiducial", one.folder], "'one' is a run of frequencies_mhz"),
         ([runs / "fiducial"], "give two folders or more to compare, got 1"),
         ([runs / "fiducial", tmp_path], "has no summary.json"),
         ([runs / "fiducial", runs / "fiducial"], "two of the folders are named 'fiducial'"),

@@ -1,24 +1,20 @@
 """What a run is expected to take: more of everything takes more; what does not fit is refused."""
 
 import pytest
+from assertions import refuse
 
-from lusee_bayes.core.errors import InputError
-from lusee_bayes.experiment.scenario import load_scenario
+import lusee_bayes as lb
 from lusee_bayes.results.forecast import AS_GIVEN, Variation
 from lusee_bayes.runs import cost
-from lusee_bayes.runs.plan_run import run_plan
 
 SOURCES = "sources.list=[{name: Cas A}, {name: Cyg A}]"
 
 
 def cost_of(*overrides):
-    return cost.posterior_cost(load_scenario("fiducial", ["lmax=8", *overrides]))
+    return cost.posterior_cost(lb.load_scenario("fiducial", ["lmax=8", *overrides]))
 
 
-@pytest.mark.parametrize(
-    "more",
-    ["observation.step_s=600", "frequencies_mhz=[20, 25]", SOURCES],
-)
+@pytest.mark.parametrize("more", ["observation.step_s=600", "frequencies_mhz=[20, 25]", SOURCES])
 def test_times_channels_and_sources_cost_time_and_memory(more, monkeypatch):
     monkeypatch.setattr(cost, "_operations_a_second", lambda: 1e9)
     one, other = cost_of(), cost_of(more)
@@ -28,24 +24,22 @@ def test_times_channels_and_sources_cost_time_and_memory(more, monkeypatch):
 
 def test_a_plan_that_does_not_fit_is_refused_before_it_starts(tmp_path, monkeypatch):
     monkeypatch.setattr(cost, "memory_limit", lambda: 8e9)
-    scenario = load_scenario("fiducial", ["lmax=383"])
-    with pytest.raises(InputError, match="memory"):
-        run_plan([Variation("fiducial", AS_GIVEN, AS_GIVEN, scenario)], tmp_path / "plan")
+    scenario = lb.load_scenario("fiducial", ["lmax=383"])
+    with pytest.raises(lb.InputError, match="memory"):
+        lb.run_plan([Variation("fiducial", AS_GIVEN, AS_GIVEN, scenario)], tmp_path / "plan")
     assert not (tmp_path / "plan").exists()
 
 
 def test_a_joint_posterior_that_does_not_fit_is_refused_with_what_would(monkeypatch):
     frequencies = "frequencies_mhz=[10,15,20,25,30]"
-    scenario = load_scenario("fiducial", ["lmax=100", frequencies, "joint=true"])
+    scenario = lb.load_scenario("fiducial", ["lmax=100", frequencies, "joint=true"])
     found = cost.posterior_cost(scenario)
     assert found.n_unknowns == 3 * 101**2 and found.memory > 8.0 * 4 * found.n_unknowns**2
     monkeypatch.setattr(cost, "memory_limit", lambda: 16e9)
     refused = r"30,603 unknowns; this process may use 16 GB; joint=false would fit"
-    with pytest.raises(InputError, match=refused):
-        cost.require_fits(found, scenario)
+    refuse(refused, cost.require_fits, found, scenario)
     monkeypatch.setattr(cost, "memory_limit", lambda: 3e9)
-    with pytest.raises(InputError, match=r"may use 3 GB; lmax=\d\d would fit"):
-        cost.require_fits(found, scenario)
+    refuse(r"may use 3 GB; lmax=\d\d would fit", cost.require_fits, found, scenario)
 
 
 def test_the_maps_of_a_kernel_are_its_principal_spectra():

@@ -8,15 +8,14 @@ import healpy
 import jax
 import numpy as np
 import pytest
+from experiments import mapped
 
 from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
-from lusee_bayes.experiment.draws import deviations
+from lusee_bayes.core.trees import from_tree, to_tree
 from lusee_bayes.experiment.experiment import build, under_sky
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.judge.coverage import Counts, Coverage
 from lusee_bayes.judge.levels import LEVELS
-from lusee_bayes.runs.channel_files import from_dataset, to_dataset
-from lusee_bayes.runs.map_run import map_result
 from lusee_bayes.sky.sky_files import write_alms
 from lusee_bayes.sky.sky_source import FileSource, GalaxySource
 from lusee_bayes.testing.scenarios import small_scenario
@@ -60,7 +59,7 @@ def test_pixels_are_counted_by_latitude():
     for part, (low, high) in zip(found, bands, strict=True):
         here = [k for k in range(len(b)) if low <= abs(b[k]) < high]
         compare(part, pull[here], [draw[here] for draw in drawn])
-        assert from_dataset(to_dataset(part)) == part
+        assert from_tree(Coverage, to_tree(part), "a file") == part
 
 
 def test_modes_are_counted_by_multipole():
@@ -135,8 +134,8 @@ def test_skies_of_the_prior_are_covered_within_the_printed_errors(tmp_path):
         # antennas have to be warm
         sky[0] = setup.sky.modes[0]
         path = write_alms(tmp_path / f"{seed}.fits", sky, {})
-        result = map_result(under_sky(setup, FileSource(path), seed))
-        channel, drawn = result.channel, deviations(result.experiment, result.inference.posterior)
+        made, channel = mapped(under_sky(setup, FileSource(path), seed))
+        drawn = made.compared()
         error = channel.truth - channel.mean
         for factor, found in far.items():
             pixels = Counts.of_pixels(factor * channel.pixel_std, error, drawn).coverage()

@@ -15,10 +15,9 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import per_mode
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.experiment.unknowns import unknowns_report
-from lusee_bayes.report.cube_page import FIGURES as CUBE_FIGURES
-from lusee_bayes.report.cube_page import cube_page
+from lusee_bayes.report.map_page import map_page
 from lusee_bayes.runs import map_run
-from lusee_bayes.runs.channels import cube_result
+from lusee_bayes.runs.channels import map_channels
 
 RECEIVER, GROUND = "noise.receiver={power_k: 2000, slope: -2}", "noise.regolith={std_k: 30}"
 TABLE = "noise.gain_table={std: 0.01}"
@@ -34,9 +33,9 @@ def cube_of(response_file, *overrides, frequencies="[15, 20]"):
 
 @pytest.mark.long
 def test_a_channel_has_those_of_its_own_map(response_file, tmp_path, monkeypatch):
-    others = {name: lambda _: Figure() for name in CUBE_FIGURES}
-    drawn = {**others, "unknowns": map_run.CUBE.figures["unknowns"]}
-    monkeypatch.setattr(map_run, "CUBE", replace(map_run.CUBE, figures=drawn))
+    drawn = dict.fromkeys(map_run.MAP.figures, lambda _: Figure())
+    drawn["unknowns"] = map_run.MAP.figures["unknowns"]
+    monkeypatch.setattr(map_run, "MAP", replace(map_run.MAP, figures=drawn))
     run = lb.run_map(cube_of(response_file, RECEIVER, GROUND, TABLE), tmp_path / "cube")
     written = pd.read_csv(tmp_path / "cube" / "unknowns.csv", keep_default_na=False)
     assert list(written)[:3] == ["frequency_mhz", "unknown", "unit"]
@@ -64,9 +63,9 @@ def test_a_channel_has_those_of_its_own_map(response_file, tmp_path, monkeypatch
     (sentence,) = (line for line in lines if line.startswith("One combination of what looks alike"))
     worst = max(nulls, key=lambda frequency: nulls[frequency].share)
     assert f"at 2 of 2 frequencies. At {worst:g} MHz ({nulls[worst].words()}, in" in sentence
-    page = cube_page(tmp_path / "cube", "a run")
+    page = map_page(tmp_path / "cube", "a run")
     assert line in page and sentence in page
-    assert "Powers of receivers" in page and "<td>15</td><td>regolith_k</td><td>K</td>" in page
+    assert "Powers of receivers" in page and page.count("<td>regolith_k</td><td>K</td>") == 2
 
 
 def test_in_a_joint_posterior_they_are_those_of_all_skies_and_unknowns_together(
@@ -77,8 +76,8 @@ def test_in_a_joint_posterior_they_are_those_of_all_skies_and_unknowns_together(
     scenario = cube_of(
         response_file, RECEIVER, GROUND, "joint=true", spectral, frequencies="[15, 20, 25]"
     )
-    channels = cube_result(scenario, tmp_path)
-    prior = channels.components.prior
+    channels = map_channels(scenario, tmp_path)
+    prior = channels.joint.prior
     n_modes, n_own = 16, 5
     stds = [np.sqrt(np.asarray(per_mode(c))) for c in (prior.spectra[0], *prior.residual)]
     stds = np.concatenate([*stds, np.ones(3 * n_own)])

@@ -6,16 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from experiments import mapped
 from reference_linear import matrices, random_covariance
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers
 from lusee_bayes.linear.posterior import pixel_std
-from lusee_bayes.results.map_files import posterior_dataset
-from lusee_bayes.results.map_result import MapResult
-from lusee_bayes.results.updatable import read_updatable
-from lusee_bayes.runs.diagnostics import region_rows
-from lusee_bayes.runs.map_run import map_result
+from lusee_bayes.results.channel_map import region_rows
+from lusee_bayes.results.map_files import posterior_tree, read_information
 from lusee_bayes.testing.scenarios import small_scenario
 
 LMAX = 6
@@ -30,16 +28,17 @@ def with_dense_prior(experiment: lb.Experiment) -> lb.Experiment:
 
 
 @pytest.fixture(scope="module")
-def mapped() -> MapResult:
-    scenario = small_scenario("output.updatable=true", lmax=LMAX, cycles=0.1)
-    return map_result(with_dense_prior(lb.build(scenario)))
+def found():
+    """The experiment conditioned on its data, and the channel."""
+    scenario = small_scenario("output.information=true", lmax=LMAX, cycles=0.1)
+    return mapped(with_dense_prior(lb.build(scenario)))
 
 
-def test_the_channel_is_that_of_matrices(mapped):
-    model, data = mapped.inference.model, np.asarray(mapped.experiment.data.data)
+def test_the_channel_is_that_of_matrices(found):
+    made, channel = found
+    model, data = made.own.model, np.asarray(made.experiment.data.data)
     (a, s, n), mean = matrices(model), np.asarray(model.prior.mean)
-    covariance = np.asarray(mapped.inference.posterior.covariance())
-    channel = mapped.channel
+    covariance = np.asarray(made.found.posterior.covariance())
     # chi^2 of residuals: N_data less what the sky takes, tr(A C A^T N^-1)
     taken = np.trace(np.linalg.solve(n, a @ covariance @ a.T))
     np.testing.assert_allclose(channel.chi2_expected, len(data) - taken, rtol=1e-6)
@@ -50,44 +49,47 @@ def test_the_channel_is_that_of_matrices(mapped):
     # K spans ten orders of magnitude
     total = centred @ np.linalg.solve(k, centred)
     np.testing.assert_allclose(channel.chi2_model, total, rtol=1e-4)
-    page = mapped.diagnostics
-    parts = page.attrs["instrument_chi2"] + page.attrs["prior_chi2"]
+    parts = channel.instrument.chi2 + channel.judged.prior.chi2
     np.testing.assert_allclose(parts, channel.chi2_model, rtol=1e-6)
     # shares of the prior, the monopole taken for known
     rest, left = s.copy(), covariance.copy()
     for matrix in (rest, left):
         matrix[0] = matrix[:, 0] = 0.0
     share = (pixel_std(left, channel.nside) / pixel_std(rest, channel.nside)) ** 2
-    np.testing.assert_allclose(page["prior_fraction"], share, rtol=1e-8)
+    np.testing.assert_allclose(channel.details.prior_fraction, share, rtol=1e-8)
     rows = region_rows(channel.nside, LMAX)
     share = ((rows @ left) * rows).sum(1) / ((rows @ rest) * rows).sum(1)
-    np.testing.assert_allclose(page["region_prior_fraction"], share, rtol=1e-8)
+    np.testing.assert_allclose(channel.details.region_prior_fraction, share, rtol=1e-8)
 
 
-def test_its_resolution_is_packed(mapped):
-    page = mapped.diagnostics
-    width = page["prior_std"].values
+def test_its_resolution_is_packed(found):
+    made, channel = found
+    details = channel.details
+    width = details.prior_width
     ell, _ = mode_numbers(LMAX)
-    steps = page["resolution_step"].values[np.ix_(ell, ell)]
+    steps = details.resolution_step[np.ix_(ell, ell)]
     scale = width[:, None] / width[None]
-    found = page["resolution"].values * steps * scale
-    s = np.asarray(mapped.inference.model.prior.covariance())
-    covariance = np.asarray(mapped.inference.posterior.covariance())
+    found = details.resolution * steps * scale
+    s = np.asarray(made.own.model.prior.covariance())
+    covariance = np.asarray(made.found.posterior.covariance())
     exact = np.eye(len(s)) - covariance @ np.linalg.inv(s)
     assert (np.abs(found - exact) <= 0.51 * steps * scale).all()
 
 
-def test_new_data_are_added_to_its_file(mapped, tmp_path):
-    posterior_dataset(mapped).to_netcdf(tmp_path / "posterior.nc", engine="h5netcdf")
-    saved = read_updatable(tmp_path, mapped.scenario).posterior
-    full = mapped.inference.posterior
-    np.testing.assert_array_equal(saved.prior.root, full.prior.root)
-    np.testing.assert_allclose(saved.mean, full.mean, rtol=1e-12)
-    np.testing.assert_allclose(saved.std(), full.std(), rtol=1e-12)
+def test_new_data_are_added_to_its_file(found, tmp_path):
+    made, channel = found
+    scenario, path = made.experiment.scenario, tmp_path / "posterior.nc"
+    posterior_tree(lb.MapResult(scenario, (channel,))).to_netcdf(path, engine="h5netcdf")
+    saved, full = read_information(path, scenario), made.found.posterior
+    assert saved.digests == (made.experiment.data.digest(),)
+    # what is saved is information, from which the posterior is found anew
+    again = saved.information.posterior(full.prior)
+    assert (np.abs(again.mean - np.asarray(full.mean)) / channel.std).max() < 1e-6
+    np.testing.assert_allclose(again.std(), full.std(), rtol=1e-9)
     later = small_scenario(
-        "output.updatable=true", "observation.start=2027-02-20", "seed=5", lmax=LMAX
+        "output.information=true", "observation.start=2027-02-20", "seed=5", lmax=LMAX
     )
-    again = map_result(with_dense_prior(lb.build(later)), onto=tmp_path)
-    assert (again.channel.std < mapped.channel.std * (1 + 1e-9)).all()
-    more = again.channel.information_bits - mapped.channel.information_bits
-    assert more > 10
+    _, both = mapped(with_dense_prior(lb.build(later)), saved)
+    assert (both.std < channel.std * (1 + 1e-9)).all()
+    assert both.information_bits - channel.information_bits > 10
+    assert len(both.digests) == 2

@@ -15,7 +15,7 @@ import lusee_bayes as lb
 from lusee_bayes.experiment.model import radiometer, true_values
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.runs import channels
-from lusee_bayes.runs.channels import cube_result
+from lusee_bayes.runs.channels import map_channels
 
 FREQUENCIES, OCTAVES = np.array([15.0, 20.0, 22.0]), 0.4
 RECEIVER = (
@@ -111,7 +111,7 @@ def folder(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def cube(scenario, folder):
-    return cube_result(scenario, folder)
+    return map_channels(scenario, folder)
 
 
 def part(k: int, sky: bool = True) -> slice:
@@ -191,8 +191,8 @@ def test_other_channels_do_tell(dense, expected):
 def test_a_resumed_run_is_the_same(scenario, folder, cube, tmp_path, monkeypatch):
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     (tmp_path / "channels" / "22.result.nc").unlink()
-    monkeypatch.setattr(channels, "inform", None)
-    resumed = cube_result(scenario, tmp_path)
+    monkeypatch.setattr(channels, "conditioned", None)
+    resumed = map_channels(scenario, tmp_path)
     assert resumed.log_evidence == cube.log_evidence
     for here, there in zip(resumed.channels, cube.channels, strict=True):
         np.testing.assert_array_equal(here.draws, there.draws)

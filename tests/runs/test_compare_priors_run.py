@@ -9,12 +9,11 @@ import jax
 import numpy as np
 import pytest
 from commands import run
+from experiments import mapped
 
-from lusee_bayes.experiment.experiment import build
+import lusee_bayes as lb
 from lusee_bayes.experiment.rounds import NAMED
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.runs.compare_run import run_compare_priors
-from lusee_bayes.runs.map_run import map_result
 from lusee_bayes.sky.sky_files import write_alms
 from lusee_bayes.testing.scenarios import small_scenario
 
@@ -63,17 +62,15 @@ def test_it_is_what_separate_maps_find(finished):
     found = json.loads((finished / "priors.json").read_text())["priors"]
     for one in found[:2]:  # learned, and given
         scenario = small_scenario(**SIZES).model_copy(update={"prior": NAMED[one["name"]]})
-        experiment = build(scenario)
-        result = map_result(experiment)
+        experiment = lb.build(scenario)
+        _, channel = mapped(experiment)
         learned = experiment.learned
-        expected = result.channel.log_evidence if learned is None else learned.log_evidence
+        expected = channel.log_evidence if learned is None else learned.log_evidence
         # the reference sky of the quadratic form differs: rounding of sums of 1e10
         assert one["log_evidence"] == pytest.approx(expected, abs=1e-3)
-        assert [row["name"] for row in one["coverage"]] == [
-            row["name"] for row in result.channel.coverage_rows()
-        ]
-        for row, other in zip(one["coverage"], result.channel.coverage_rows(), strict=True):
-            assert row["rms"] == pytest.approx(other["rms"], rel=1e-3)
+        assert [row["name"] for row in one["coverage"]] == [c.name for c in channel.coverage]
+        for row, other in zip(one["coverage"], channel.coverage, strict=True):
+            assert row["rms"] == pytest.approx(other.rms, rel=1e-3)
 
 
 @pytest.mark.parametrize("name", ["isotropic-sky", "local_scales"])
@@ -86,7 +83,9 @@ def test_data_of_a_prior_prefer_it(name, tmp_path):
     sky[0] = setup.sky.modes[0]
     path = write_alms(tmp_path / "sky.fits", sky, {})
     drawn = small_scenario(f"sky={{model: file, file: {path}}}", "sky.sources=null", **SIZES)
-    result = run_compare_priors(drawn, tmp_path / "out", ["isotropic-sky", "local_scales"]).result
+    result = lb.run_compare_priors(
+        drawn, tmp_path / "out", ["isotropic-sky", "local_scales"]
+    ).result
     assert result.best.name == name
     assert f"The data prefer {name}" in result.headline()
     if name == "local_scales":  # it has seen what it predicts, with parameters enough to gain by it

@@ -10,7 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-import xarray as xr
+from commands import posterior_of
 from matplotlib.figure import Figure
 
 import lusee_bayes as lb
@@ -20,7 +20,8 @@ from lusee_bayes.experiment.flight_data import reduce_files
 from lusee_bayes.flight.reduced import read_reduced, write_reduced
 from lusee_bayes.flight.session_files import read_session
 from lusee_bayes.report.figures.judgement import calibration
-from lusee_bayes.report.sections import flight_section
+from lusee_bayes.report.map_page import flight_section
+from lusee_bayes.report.rendering import render
 from lusee_bayes.runs.data_run import reduced_lines, run_simulate_flight
 
 SET = [
@@ -63,9 +64,9 @@ def test_a_map_of_simulated_sessions_has_the_sky_that_was_simulated(tmp_path, ca
     lines = capsys.readouterr().out.splitlines()
     assert sum(line.startswith("Flagged ") and "% of the values" in line for line in lines) == 1
     assert any("times compared at lmax=3, round 1" in line for line in lines)
-    found = xr.load_dataset(tmp_path / "map" / "posterior.nc", engine="h5netcdf")
-    off = (found["mean"] - found["truth"]).values
-    chi2 = off @ np.linalg.solve(found["covariance"].values, off)
+    found = posterior_of(tmp_path / "map")
+    off = (found["mean"] - found["truth"]).values[0]
+    chi2 = off @ np.linalg.solve(found["covariance"].values[0], off)
     assert abs(chi2 / len(off) - 1.0) < 4.0 * np.sqrt(2.0 / len(off))
 
 
@@ -178,7 +179,7 @@ def reduced(of_two_bands):
 
 def test_the_section_says_how_spectra_were_reduced(reduced, tmp_path):
     write_reduced(tmp_path / "reduced.nc", reduced)
-    page = "\n".join(*flight_section(tmp_path).values())
+    page = render("flight.html", tmp_path, flight=flight_section(tmp_path))
     for told in (
         "gains.nc (netCDF)",
         "the centre of channel k is at k times 25 kHz",
@@ -197,7 +198,7 @@ def test_files_of_older_versions_are_described_as_far_as_they_say_it(reduced, tm
     session = {name: value for name, value in session.items() if name not in new}
     older = replace(reduced, sessions=(session,), recipe={})
     write_reduced(tmp_path / "reduced.nc", older)
-    page = "\n".join(*flight_section(tmp_path).values())
+    page = render("flight.html", tmp_path, flight=flight_section(tmp_path))
     assert "longitude 182.258°, latitude -23.814°<" in page
     assert "of the clock file" in page and "0x307" in page
     assert read_reduced(tmp_path / "reduced.nc").notes() == ()

@@ -13,8 +13,7 @@ from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.results.sample_result import SampleResult
 from lusee_bayes.runs.sample_run import coordinates
-from lusee_bayes.sampling.hmc import Sampler
-from lusee_bayes.sampling.programs import load_program, numpyro_promotion
+from lusee_bayes.sampling.programs import numpyro_promotion
 from lusee_bayes.sky import log_normal
 from lusee_bayes.testing.scenarios import small_scenario
 
@@ -34,7 +33,7 @@ def coarse_grid():
 
 def weighted_draws(result: SampleResult, n: int) -> tuple[np.ndarray, np.ndarray]:
     """ln A, tilt and modes of n draws in straight coordinates, and their weights."""
-    program, data = load_program("log_normal"), result.experiment.data
+    program, data = lb.load_program("log_normal"), result.experiment.data
     arguments = program.arguments(result.inference.model, program_pieces(result.experiment))
     prior = arguments["log_normal"]
     white = coordinates(program, arguments, data, result.inference, list(prior.sites))
@@ -63,11 +62,14 @@ def weighted_draws(result: SampleResult, n: int) -> tuple[np.ndarray, np.ndarray
 def test_samples_have_the_moments_of_weighted_draws(tmp_path):
     """Hamiltonian Monte Carlo and weighted draws, of the sky, A and the tilt."""
     scenario = small_scenario(NO_SOURCES, lmax=LMAX, cycles=0.1)
-    sampler, program = Sampler(chains=2, warmup=100, draws=500, seed=1), load_program("log_normal")
+    sampler, program = (
+        lb.Sampler(chains=2, warmup=100, draws=500, seed=1),
+        lb.load_program("log_normal"),
+    )
     run = lb.run_sample(scenario, tmp_path / "samples", program=program, sampler=sampler)
     (sampled,) = run.result
     # tails of A where the sky hardly tells it are steep: one of a thousand may fail
-    assert sampled.figures()["divergences"] <= 5
+    assert sampled.figures().divergences <= 5
     table = sampled.summary
     assert table["r_hat"].max() < 1.02
     rows, weights = weighted_draws(sampled, 4000)

@@ -23,17 +23,14 @@ from commands import content, run
 from reference_linear import z_of
 
 import lusee_bayes
-from lusee_bayes.core.errors import InputError
+import lusee_bayes as lb
 from lusee_bayes.core.files import LOCK
 from lusee_bayes.core.harmonics import modes_to_map
-from lusee_bayes.experiment.experiment import Experiment, build, infer
-from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.runs import sample_run, validate_run
 from lusee_bayes.runs.sample_run import sample_result
 from lusee_bayes.sampling import hmc
 from lusee_bayes.sampling.datatree import read_datatree
-from lusee_bayes.sampling.hmc import CHUNK, Sampler
-from lusee_bayes.sampling.programs import load_program
+from lusee_bayes.sampling.hmc import CHUNK
 
 ROOT = Path(lusee_bayes.__file__).resolve().parents[1]
 OVERRIDES = ["lmax=6", "observation.runs.0.cycles=0.1"]
@@ -41,7 +38,7 @@ SMALL = ["fiducial", *(a for override in OVERRIDES for a in ("--set", override))
 # what SETTINGS make of a scenario with seed 1
 # runs that are killed and resumed take a minute and more together
 pytestmark = pytest.mark.long
-SAMPLER = Sampler(chains=4, warmup=100, draws=1000, seed=1)
+SAMPLER = lb.Sampler(chains=4, warmup=100, draws=1000, seed=1)
 SETTINGS = ["--chains", "4", "--warmup", "100", "--draws", "1000"]
 N_MODES, NSIDE = 49, 8
 GROUPS = {
@@ -116,7 +113,7 @@ def killed(runs, tmp_path):
 @pytest.fixture(scope="module")
 def experiment():
     """That of the runs."""
-    return build(load_scenario("fiducial", OVERRIDES))
+    return lb.build(lb.load_scenario("fiducial", OVERRIDES))
 
 
 @pytest.fixture(scope="module")
@@ -171,15 +168,15 @@ def test_a_killed_run_resumes_to_the_draws_of_an_undisturbed_one(killed, tree, m
     """Bit by bit, in another process, with nothing done twice."""
     before = {i: (p.stat().st_ino, p.stat().st_mtime_ns) for i, p in chunks(killed).items()}
     written, untouched = [], []
-    write = hmc.Chunk.write
+    append = hmc.Checkpoints.append
 
-    def spy(chunk, folder):
+    def spy(checkpoints, chunk):
         written.append(chunk.iteration)
-        write(chunk, folder)
+        append(checkpoints, chunk)
         now = {i: (p.stat().st_ino, p.stat().st_mtime_ns) for i, p in chunks(killed).items()}
         untouched.append(before.items() <= now.items())
 
-    monkeypatch.setattr(hmc.Chunk, "write", spy)
+    monkeypatch.setattr(hmc.Checkpoints, "append", spy)
     assert run("sample", *SMALL, *SETTINGS, "-q", "-o", killed, "--resume") == 0
     total = SAMPLER.warmup + SAMPLER.draws
     assert written == list(range(max(before) + CHUNK, total + 1, CHUNK))
@@ -212,18 +209,18 @@ def test_resuming_another_run_is_refused_and_the_difference_named(
     experiment, killed, no_sampling, change, message
 ):
     setup, data = experiment.setup, experiment.data
-    program = load_program(change.get("program", "sky"))
+    program = lb.load_program(change.get("program", "sky"))
     if "digest" in change:
         program = replace(program, digest=change["digest"])
     if "nside" in change:
-        scenario = load_scenario("fiducial", [*OVERRIDES, f"nside={change['nside']}"])
+        scenario = lb.load_scenario("fiducial", [*OVERRIDES, f"nside={change['nside']}"])
         setup = replace(setup, scenario=scenario)
     if "data" in change:
         data = replace(data, data=data.data * (1.0 + change["data"]))
     sampler = replace(SAMPLER, **change.get("sampler", {}))
     before = content(killed)
-    with pytest.raises(InputError, match=message):
-        sample_result(Experiment(setup, data), program, sampler, killed, resume=True)
+    with pytest.raises(lb.InputError, match=message):
+        sample_result(lb.Experiment(setup, data), program, sampler, killed, resume=True)
     assert content(killed) == before
 
 
@@ -232,7 +229,7 @@ def short(experiment, runs, tmp_path_factory):
     """The killed run resumed for sixty draws, fewer than there are; not written yet."""
     folder = shutil.copytree(runs[1], tmp_path_factory.mktemp("short") / "killed")
     sampler = replace(SAMPLER, draws=60)
-    return sample_result(experiment, load_program("sky"), sampler, folder, resume=True)
+    return sample_result(experiment, lb.load_program("sky"), sampler, folder, resume=True)
 
 
 def test_resuming_with_fewer_draws_takes_the_first_of_those_there_are(short, tree):
@@ -261,9 +258,9 @@ def test_a_finished_run_with_other_settings_is_not_taken_over(
     experiment, whole, no_sampling, change
 ):
     before = content(whole)
-    with pytest.raises(InputError, match="finished run with other settings; leave out --resume"):
+    with pytest.raises(lb.InputError, match="finished run with other settings; leave out --resume"):
         sample_result(
-            experiment, load_program("sky"), replace(SAMPLER, **change), whole, resume=True
+            experiment, lb.load_program("sky"), replace(SAMPLER, **change), whole, resume=True
         )
     assert content(whole) == before
 
@@ -283,8 +280,8 @@ def test_sample_writes_what_it_promises(runs):
     }  # fmt: skip
     for figure in (whole / "figures").iterdir():
         assert matplotlib.image.imread(figure).std() > 0.01  # not blank
-    expected = load_scenario("fiducial", OVERRIDES)
-    assert load_scenario(whole / "scenario.yaml") == expected
+    expected = lb.load_scenario("fiducial", OVERRIDES)
+    assert lb.load_scenario(whole / "scenario.yaml") == expected
 
 
 def maps_of(folder, *names):
@@ -309,7 +306,7 @@ def test_the_maps_are_those_of_the_draws(runs, tree):
 
 
 def test_the_samples_hold_the_analytic_posterior_and_what_they_are(runs, tree, experiment, capsys):
-    data, posterior = experiment.data, infer(experiment).posterior
+    data, posterior = experiment.data, lb.infer(experiment).posterior
     constants = tree["constant_data"]
     np.testing.assert_array_equal(constants["analytic_mean"], posterior.mean)
     np.testing.assert_array_equal(constants["analytic_std"], posterior.std())
@@ -424,16 +421,18 @@ def test_validation_json_and_md_agree_with_each_other_and_the_draws(validated, t
     report = consistent(folder)
     skies, constants = tree["posterior"]["sky"].values, tree["constant_data"]
     scaled = (skies - constants["analytic_mean"].values) / constants["analytic_std"].values
-    np.testing.assert_allclose(report["variance_ratio"], (scaled**2).mean((0, 1)), rtol=1e-9)
+    np.testing.assert_allclose(
+        report["modes"]["variance_ratio"], (scaled**2).mean((0, 1)), rtol=1e-9
+    )
     ess = array_stats.ess(scaled, chain_axis=0, draw_axis=1, method="mean")
     expected = scaled.mean((0, 1)) * np.sqrt(ess)
     # ESS by the same library: rounding, of numbers that may be near zero
-    np.testing.assert_allclose(report["mean_z"], expected, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(report["modes"]["mean_z"], expected, rtol=1e-6, atol=1e-6)
     values = {check["name"]: check["value"] for check in report["checks"]}
     assert abs(values["mean"]) == pytest.approx(np.abs(expected).max(), rel=1e-6)
     assert values["divergences"] == tree["sample_stats"]["diverging"].values.sum()
     assert values["calibration"] == pytest.approx(min(report["p_values"].values()))
-    assert len(report["eigenvalues"]) == N_MODES
+    assert len(report["modes"]["eigenvalues"]) == N_MODES
     for levels in report["coverage"].values():
         for level, share in levels.items():
             # binomial of 100 simulations; about a hundred shares
@@ -462,8 +461,9 @@ def test_half_the_covariance_is_found_out_with_exit_code_1(validated, tmp_path, 
     # which may or may not be seen; nothing else knows of the covariance
     assert {"variance", "covariance, largest"} <= failed
     assert all(name.startswith(("variance", "covariance", "mean")) for name in failed)
+    before = json.loads((validated[1] / "validation.json").read_text())
     np.testing.assert_allclose(
-        np.array(report["variance_ratio"]),
-        2 * np.array(json.loads((validated[1] / "validation.json").read_text())["variance_ratio"]),
+        np.array(report["modes"]["variance_ratio"]),
+        2 * np.array(before["modes"]["variance_ratio"]),
         rtol=1e-6,
     )

@@ -5,10 +5,11 @@ import re
 
 import numpy as np
 import pytest
+from assertions import refuse
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.sampling import hmc
-from lusee_bayes.sampling.hmc import Checkpoints
+from lusee_bayes.sampling.hmc import Checkpoints, Chunk
 
 IDENTITY = {"program": "sky", "sampler's seed": 3, "versions": {"jax": "0.10"}}
 N_CHUNKS, N_DRAWS, N_CHAINS = 3, 4, 2
@@ -35,9 +36,9 @@ def arrays_of(number):
 def folder(tmp_path):
     """An unfinished run: a chunk of warmup without draws, then chunks with draws."""
     run = Checkpoints(tmp_path / "deep" / "chains", IDENTITY, resume=False)
-    run.append(N_DRAWS, arrays_of(0)[0], {})
+    run.append(Chunk(N_DRAWS, arrays_of(0)[0], {}))
     for number in range(1, N_CHUNKS + 1):
-        run.append(N_DRAWS * (number + 1), *arrays_of(number))
+        run.append(Chunk(N_DRAWS * (number + 1), *arrays_of(number)))
     return run.folder
 
 
@@ -49,51 +50,47 @@ def chunks(folder):
     return sorted(folder.glob(hmc.CHUNK_GLOB))
 
 
-def test_a_run_found_again_goes_on_from_its_last_chunk_with_all_its_draws(folder):
-    found = again(folder)
-    last, expected = found.last(), arrays_of(N_CHUNKS)[0]
-    assert last.iteration == N_DRAWS * (N_CHUNKS + 1)
-    for got, leaf in zip(last.state, expected, strict=True):
-        np.testing.assert_array_equal(got, leaf, strict=True)
-    draws = found.draws()
-    written = [arrays_of(number)[1] for number in range(1, N_CHUNKS + 1)]
-    assert set(draws) == set(written[0])
-    for name, values in draws.items():
-        for chain in range(N_CHAINS):
-            one_by_one = [draw[chain] for chunk in written for draw in chunk[name]]
-            np.testing.assert_array_equal(values[chain], one_by_one, strict=True)
+def test_a_run_found_again_has_all_its_chunks(folder):
+    found = again(folder).chunks()
+    assert [chunk.iteration for chunk in found] == [N_DRAWS * (n + 1) for n in range(N_CHUNKS + 1)]
+    assert [chunk.start for chunk in found] == [N_DRAWS, *(N_DRAWS * n for n in (1, 2, 3))]
+    for number, chunk in enumerate(found):
+        state, draws = arrays_of(number)
+        for got, leaf in zip(chunk.state, state, strict=True):
+            np.testing.assert_array_equal(got, leaf, strict=True)
+        assert set(chunk.draws) == (set(draws) if number else set())
+        for name, values in chunk.draws.items():
+            np.testing.assert_array_equal(values, draws[name], strict=True)
 
 
 def test_chunks_are_in_the_order_of_their_iterations(tmp_path):
     """9 before 10 before 100000: names are not to be sorted as words."""
     run = Checkpoints(tmp_path, IDENTITY, resume=False)
     for first, last in [(0, 9), (9, 10), (10, 100_000)]:
-        run.append(last, [], {"x": np.arange(first, last)[:, None]})
-    np.testing.assert_array_equal(run.draws()["x"], [np.arange(100_000)])
-    assert run.last().iteration == 100_000
+        run.append(Chunk(last, [], {"x": np.arange(first, last)[:, None]}))
+    draws = np.concatenate([chunk.draws["x"] for chunk in run.chunks()])
+    np.testing.assert_array_equal(draws[:, 0], np.arange(100_000))
+    assert run.chunks()[-1].iteration == 100_000
 
 
 def test_a_run_that_has_just_begun(tmp_path):
     run = Checkpoints(tmp_path / "chains", IDENTITY, resume=True)
-    assert run.last() is None
-    assert run.draws() == {}
-    run.append(25, [np.zeros(2)], {})
-    assert run.draws() == {}
+    assert run.chunks() == []
+    run.append(Chunk(25, [np.zeros(2)], {}))
+    assert [chunk.draws for chunk in run.chunks()] == [{}]
 
 
 def test_what_a_kill_left_half_written_is_ignored(folder):
     """The scratch file of a later chunk, cut in the middle, beside the marker's scratch file."""
     half = chunks(folder)[-1].read_bytes()[:500]
     later = N_DRAWS * (N_CHUNKS + 2)
-    (folder / f".partial-chunk-{later:08d}.npz").write_bytes(half)
-    (folder / ".partial-run.json").write_text("{")
+    (folder / f".chunk-{later:08d}.npz.123.partial").write_bytes(half)
+    (folder / ".run.json.123.partial").write_text("{")
     run = again(folder)
-    assert run.last().iteration == N_DRAWS * (N_CHUNKS + 1)
-    assert run.draws()["sky"].shape[1] == N_DRAWS * N_CHUNKS
+    assert len(run.chunks()) == N_CHUNKS + 1
     # and it is in nobody's way when that chunk is written after all
-    run.append(later, *arrays_of(9))
-    assert run.last().iteration == later
-    assert not (folder / f".partial-chunk-{later:08d}.npz").exists()
+    run.append(Chunk(later, *arrays_of(9)))
+    assert run.chunks()[-1].iteration == later
 
 
 @pytest.mark.parametrize("moment", ["savez", "fsync", "replace"])
@@ -109,9 +106,9 @@ def test_a_chunk_is_written_whole_or_not_at_all(folder, monkeypatch, moment):
     with monkeypatch.context() as patch:
         patch.setattr(owner, moment, fail)
         with pytest.raises(OSError, match="disk full"):
-            run.append(99, *arrays_of(9))
+            run.append(Chunk(20, *arrays_of(9)))
     assert {path.name: path.read_bytes() for path in chunks(folder)} == before
-    assert run.last().iteration == N_DRAWS * (N_CHUNKS + 1)
+    assert not list(folder.glob(".*"))
 
 
 def test_a_chunk_is_on_the_disk_before_it_has_its_name(folder, monkeypatch):
@@ -125,7 +122,7 @@ def test_a_chunk_is_on_the_disk_before_it_has_its_name(folder, monkeypatch):
             return real(*args)
 
         monkeypatch.setattr(hmc.os, name, spy)
-    again(folder).append(99, *arrays_of(9))
+    again(folder).append(Chunk(20, *arrays_of(9)))
     assert events == ["fsync", "replace"]
 
 
@@ -188,19 +185,15 @@ def test_an_unreadable_chunk_is_named_and_deleting_it_helps(folder, damage):
     path = chunks(folder)[-1]
     DAMAGE[damage](path)
     run = again(folder)
-    for use in (run.last, run.draws):
-        with pytest.raises(InputError, match=f"{path} cannot be read.*delete it"):
-            use()
+    refuse(f"{path} cannot be read.*delete it", run.chunks)
     path.unlink()
-    assert run.last().iteration == N_DRAWS * N_CHUNKS
-    assert run.draws()["sky"].shape[1] == N_DRAWS * (N_CHUNKS - 1)
+    assert run.chunks()[-1].iteration == N_DRAWS * N_CHUNKS
 
 
 def test_a_chunk_missing_in_the_middle_is_noticed(folder):
     """Draws behind the gap would silently take the place of those in it."""
     chunks(folder)[2].unlink()
-    with pytest.raises(InputError):
-        again(folder).draws()
+    refuse("lacks the draws of iterations 8 to 12", again(folder).chunks)
 
 
 def test_chunks_without_a_marker_are_not_taken_for_ones_own(folder):
@@ -210,11 +203,10 @@ def test_chunks_without_a_marker_are_not_taken_for_ones_own(folder):
         run = Checkpoints(folder, IDENTITY | {"sampler's seed": 4}, resume=False)
     except InputError:
         return
-    assert run.last() is None
+    assert run.chunks() == []
 
 
 @pytest.mark.parametrize("content", ["", "{", "[1]"])
 def test_an_unreadable_marker_is_bad_input(folder, content):
     (folder / hmc.IDENTITY).write_text(content)
-    with pytest.raises(InputError, match=re.escape(str(folder))):
-        again(folder)
+    refuse(re.escape(str(folder)) + ".*delete its folder", again, folder)

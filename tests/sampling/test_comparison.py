@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import arviz_base
-import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro
@@ -17,8 +16,7 @@ from scipy.stats import multivariate_normal, norm
 
 import lusee_bayes as lb
 from lusee_bayes.sampling import evidence as comparison
-from lusee_bayes.sampling.mode import laplace_approximation
-from lusee_bayes.sampling.programs import load_program
+from lusee_bayes.sampling.programs import Program
 
 FIXED = '''
 import numpyro
@@ -121,7 +119,7 @@ def spectrum_grid() -> np.ndarray:
 @lru_cache
 def program(name: str):
     """Loaded once: each load is a function of its own, to be compiled."""
-    return load_program(name)
+    return lb.load_program(name)
 
 
 @lru_cache
@@ -198,11 +196,9 @@ def test_where_there_is_no_mode_nothing_is_found():
         x = numpyro.sample("x", dist.Normal(jnp.zeros(()), 1.0))
         numpyro.factor("ever more", 0.1 * (x - 1.0) ** 4)
 
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        found = laplace_approximation(model, {"data": None})
-    assert not bool(found.converged)
+    assert not bool(lb.laplace_approximation(model, {"data": None}).converged)
     with pytest.raises(lb.InputError, match="no mode of the posterior was found"):
-        found.require_converged()
+        comparison.estimate_evidence(Program("endless", model, ""), {}, np.zeros(1))
 
 
 # --- leaving one out ------------------------------------------------------------------------------
@@ -306,7 +302,7 @@ def test_the_right_program_is_ranked_first(tmp_path):
     """
     path = tmp_path / "fixed.py"
     path.write_text(FIXED)
-    fixed, free, arguments = load_program(path), program("sky_marginal"), case().arguments()
+    fixed, free, arguments = lb.load_program(path), program("sky_marginal"), case().arguments()
     amplitudes = np.array([case().log_amplitude(x) for x in AMPLITUDES])
     trees = {
         "fixed": comparison.with_log_likelihood(
@@ -342,5 +338,5 @@ def test_other_distributions_cannot_be_compared(tmp_path):
     wanted = "the data of the program 'independent' follow Independent; .* Marginal or Correlated"
     with pytest.raises(lb.InputError, match=wanted):
         comparison.with_log_likelihood(
-            free_tree(), load_program(path), {"noise": case().arguments()["noise"]}
+            free_tree(), lb.load_program(path), {"noise": case().arguments()["noise"]}
         )

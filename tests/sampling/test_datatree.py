@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from assertions import refuse
 from reference_linear import assert_draws_follow, matrices, random_covariance
 from reference_linear import posterior as naive_posterior
 
@@ -303,7 +304,7 @@ def test_files_that_are_no_samples_are_refused(setting, tmp_path):
     xr.Dataset({"x": ("x", [1.0])}).to_netcdf(tmp_path / "bare.nc", engine="h5netcdf")
     np.savez(tmp_path / "arrays.nc", x=np.ones(3))
     for name, message in [
-        ("gone.nc", "no samples at .*gone.nc"),
+        ("gone.nc", "no samples of lusee-bayes sample at .*gone.nc"),
         ("text.nc", "its format is 'absent', expected"),
         ("empty.nc", "its format is 'absent', expected"),
         ("arrays.nc.npz", "its format is 'absent', expected"),
@@ -311,13 +312,11 @@ def test_files_that_are_no_samples_are_refused(setting, tmp_path):
         ("bare.nc", "its format is 'absent', expected"),
         (".", "is a folder; give a file: samples"),
     ]:
-        with pytest.raises(lb.InputError, match=message):
-            read_datatree(tmp_path / name)
+        refuse(message, read_datatree, tmp_path / name)
 
 
 def test_a_tree_cut_short_is_refused(drawn, tmp_path):
     path = tmp_path / "samples.nc"
     drawn[0].to_netcdf(path, engine="h5netcdf")
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with pytest.raises(lb.InputError, match="cannot be read as HDF5"):
-        read_datatree(path)
+    refuse("cannot be read as HDF5", read_datatree, path)

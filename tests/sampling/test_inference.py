@@ -325,10 +325,10 @@ def test_an_interrupted_run_resumes_to_the_same_draws(uninterrupted, tmp_path):
 
     in_warmup, among_draws = CHUNK, TINY.warmup + CHUNK
     tiny(checkpoints=opened(), stop_at=in_warmup)
-    assert opened().last().iteration == in_warmup
+    assert opened().chunks()[-1].iteration == in_warmup
     first = kept()
     tiny(checkpoints=opened(), stop_at=among_draws)
-    assert opened().last().iteration == among_draws
+    assert opened().chunks()[-1].iteration == among_draws
     second = kept()
     assert_identical(tiny(checkpoints=opened()), uninterrupted)
     third = kept()

@@ -18,10 +18,9 @@ from reference_linear import posterior, random_covariance, z_of
 from scipy.stats import lognorm, norm
 
 import lusee_bayes as lb
-from lusee_bayes.sampling.hmc import Sampler, sample
-from lusee_bayes.sampling.programs import collapsed_draws, load_program
+from lusee_bayes.sampling.programs import collapsed_draws
 
-PROGRAM = load_program("prior_amplitude")
+PROGRAM = lb.load_program("prior_amplitude")
 
 
 def ell_of_mode(lmax):
@@ -146,7 +145,7 @@ def grid(case):
 @pytest.fixture(scope="module")
 def sites(case):
     """4 x 1500 draws by NUTS, of which about a third count."""
-    chains = sample(PROGRAM.model, case.arguments(), Sampler(draws=1500, seed=1))
+    chains = lb.sample(PROGRAM.model, case.arguments(), lb.Sampler(draws=1500, seed=1))
     assert not chains.statistics["diverging"].any()
     return chains.sites
 

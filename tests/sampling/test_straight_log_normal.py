@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import jax
@@ -10,9 +11,8 @@ import numpy as np
 import pytest
 from scipy import optimize
 
+import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_device
-from lusee_bayes.core.errors import InputError
-from lusee_bayes.linear.information import Information
 from lusee_bayes.sampling.log_normal_prior import AMPLITUDE, STRUCTURE, TILT, LogNormalPrior
 from lusee_bayes.sampling.log_normal_program import (
     LogNormalMode,
@@ -23,7 +23,6 @@ from lusee_bayes.sampling.log_normal_program import (
 )
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
 from lusee_bayes.sky.log_normal import LogNormalSky, deviation_spectrum
-from lusee_bayes.sky.prior import DensePrior
 from lusee_bayes.sky.template import EmbeddedTemplate
 
 MHZ, LMAX, TILTED = 25.0, 3, -2.0
@@ -35,12 +34,12 @@ def log_normal(amplitude, lmax=LMAX, level=LEVEL, sources=()) -> LogNormalSky:
     return LogNormalSky.of(EmbeddedTemplate(MHZ), spectrum, MHZ, sources, band=16)
 
 
-def informed(truth: np.ndarray) -> Information:
+def informed(truth: np.ndarray) -> lb.Information:
     """What data say that know combinations of 16 modes to 10 to 1e5 K; the template's is 1e5 K."""
     rng = np.random.default_rng(1)
     rotation = np.linalg.qr(rng.standard_normal((16, 16)))[0]
     precision = np.geomspace(1e-2, 1e-10, 16)
-    return Information(
+    return lb.Information(
         (rotation * precision) @ rotation.T,
         rotation @ (np.sqrt(precision) * rng.standard_normal(16)),
         truth,
@@ -51,7 +50,7 @@ def informed(truth: np.ndarray) -> Information:
 
 
 @lru_cache
-def information(amplitude: float = 0.03) -> Information:
+def information(amplitude: float = 0.03) -> lb.Information:
     """Of a sky that departs from the template by 10 % on large scales."""
     sky = log_normal(amplitude, sources=BRIGHT_SOURCES[:1])
     return informed(sky.modes(np.random.default_rng(2).standard_normal(sky.size)))
@@ -71,7 +70,7 @@ def two_unknowns():
     sky = log_normal(0.1, lmax=0, sources=BRIGHT_SOURCES[:1])
     value = 1.5 * sky.modes(np.zeros(2))
     precision = float((0.05 * value[0]) ** -2)
-    given = Information(
+    given = lb.Information(
         np.array([[precision]]),
         np.zeros(1),
         value,
@@ -96,7 +95,7 @@ def test_small_deviations_have_the_posterior_of_a_gaussian_sky():
     """s of 1e-4: exp(s) - 1 - s is 1e-8, of skies that the data know to 1e-5."""
     sky = log_normal(1e-4, level=np.array([1e-8]))
     root = sky.jacobian(np.zeros(sky.size))
-    prior = DensePrior.of_covariance(root @ root.T, sky.modes(np.zeros(sky.size)))
+    prior = lb.DensePrior.of_covariance(root @ root.T, sky.modes(np.zeros(sky.size)))
     given = informed(sky.modes(np.random.default_rng(0).standard_normal(sky.size)))
     expected, found = given.posterior(prior), find_mode(sky, given)
     std = np.asarray(expected.std())
@@ -124,7 +123,8 @@ def test_the_gradient_vanishes_at_the_mode():
 def test_straight_coordinates_are_one_to_one_with_the_determinant_they_say(learned):
     power_law = np.array([np.log(0.03), TILTED]) if learned else None
     covariance = np.array([[0.04, 0.01], [0.01, 0.09]]) if learned else None
-    coordinates = straight_coordinates(mode(), power_law, covariance)
+    found = replace(mode(), power_law=power_law, covariance=covariance)
+    coordinates = straight_coordinates(found)
     n = coordinates.root.shape[0]
     z = jax.random.normal(jax.random.key(3), (n,), dtype=jnp.float64)
     x = coordinates.mean + coordinates.root @ z
@@ -186,11 +186,13 @@ def test_the_learned_spectrum_has_the_highest_evidence_and_its_curvature():
 
 
 def test_refusals():
-    with pytest.raises(InputError, match="the information has shape"):
+    with pytest.raises(lb.InputError, match="the information has shape"):
         find_mode(log_normal(0.1, lmax=2), information())
-    with pytest.raises(InputError, match="amplitude of the logarithm of the sky must be positive"):
+    with pytest.raises(
+        lb.InputError, match="amplitude of the logarithm of the sky must be positive"
+    ):
         LogNormalPrior.of(log_normal(0.1), 0.0, TILTED)
-    with pytest.raises(InputError, match="standard deviation of the tilt must be positive"):
+    with pytest.raises(lb.InputError, match="standard deviation of the tilt must be positive"):
         LogNormalPrior.of(log_normal(0.1), 0.1, TILTED, (1.0, 0.0))
 
 

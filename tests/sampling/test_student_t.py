@@ -12,11 +12,9 @@ from numpyro.infer.util import log_density
 from scipy import stats
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.experiment import build, infer
 from lusee_bayes.instrument.products import DataLayout, auto_indices
 from lusee_bayes.runs.sample_run import coordinates, sample_result
-from lusee_bayes.sampling.hmc import Sampler, sample
-from lusee_bayes.sampling.programs import load_program, numpyro_promotion
+from lusee_bayes.sampling.programs import numpyro_promotion
 
 N_TIMES = 8
 FORMS = ["paper", "exact"]
@@ -134,7 +132,7 @@ def test_noise_that_couples_times_is_refused(case):
 
 # --- the program ----------------------------------------------------------------------------------
 
-PROGRAM = load_program("student_t")
+PROGRAM = lb.load_program("student_t")
 STRENGTH = 1000.0
 NU = 4.0
 
@@ -168,23 +166,23 @@ def burst():
     """98 times of 16 products, 81 modes, every twentieth time with bursts of 1000 sigma."""
     clean = small_experiment(lmax=8, cycles=0.3)
     rng = np.random.default_rng(3)
-    layout, noise = clean.data.layout, infer(clean).model.noise
+    layout, noise = clean.data.layout, lb.infer(clean).model.noise
     bad = rng.choice(layout.n_times, round(0.05 * layout.n_times), replace=False)
     hit = np.isin(layout.time, bad)
     strength = STRENGTH * np.abs(rng.standard_normal(layout.size)) * np.sqrt(noise.diagonal())
     dirty = np.asarray(clean.data.data) + np.where(hit, strength, 0.0)
     experiment = replace(clean, data=replace(clean.data, data=dirty))
     arguments = program_arguments(PROGRAM, experiment)
-    gaussian = infer(experiment).model
+    gaussian = lb.infer(experiment).model
     white = coordinates(
         PROGRAM,
         {name: value for name, value in arguments.items() if name != "data"},
         experiment.data,
-        infer(experiment),
+        lb.infer(experiment),
         ["sky"],
     )
-    chains = sample(
-        PROGRAM.model, arguments, Sampler(warmup=100, draws=300, algorithm="hmc"), white
+    chains = lb.sample(
+        PROGRAM.model, arguments, lb.Sampler(warmup=100, draws=300, algorithm="hmc"), white
     )
     good = lb.LinearGaussian(
         np.asarray(gaussian.coupling.dense())[~hit],
@@ -241,7 +239,7 @@ def test_draws_are_those_of_another_sampler(burst):
 def test_systematics_are_sampled_with_it(response_file):
     """Receivers: every time is scipy's multivariate t about sky, ground and receivers."""
     section = "noise.receiver={power_k: 800, relative_std: 0.1, treatment: sampled}"
-    experiment = build(four_ports(response_file, section))
+    experiment = lb.build(four_ports(response_file, section))
     arguments = program_arguments(PROGRAM, experiment)
     gaussian, layout = arguments["gaussian"], experiment.data.layout
     power = np.array([790.0, 805.0, 850.0, 700.0])
@@ -268,7 +266,7 @@ def test_systematics_are_sampled_with_it(response_file):
 @pytest.mark.long
 def test_a_run_keeps_the_weights(tmp_path):
     experiment = small_experiment(lmax=2)
-    result = sample_result(experiment, PROGRAM, Sampler(chains=2, warmup=20, draws=30), tmp_path)
+    result = sample_result(experiment, PROGRAM, lb.Sampler(chains=2, warmup=20, draws=30), tmp_path)
     weight = result.tree["posterior"]["weight"].values
     assert weight.shape == (2, 30, experiment.data.layout.n_times)
     assert result.tree.attrs["coordinates"] == "white"

@@ -20,13 +20,14 @@ from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.experiment.model import full_model, simulate, true_values
 from lusee_bayes.experiment.rounds import settled
 from lusee_bayes.experiment.setup import Setup, set_up
-from lusee_bayes.experiment.unknowns import GAIN, SKY, unknowns_report
+from lusee_bayes.experiment.unknowns import SKY, unknowns_report
 from lusee_bayes.judge.levels import LEVELS
 from lusee_bayes.linear.amplitudes import template_amplitudes
 from lusee_bayes.sampling.hmc import Sampler
 from lusee_bayes.sampling.programs import numpyro_promotion
 from lusee_bayes.sampling.validation import FALSE_ALARM, N_DRAWS, Ranks, calibrate
 from lusee_bayes.systematics.gain_drifts import SCALES
+from lusee_bayes.systematics.gain_table import COMMON_GAIN
 from lusee_bayes.systematics.systematic import Chart
 
 TINY = ("lmax=6", "observation.runs.0.cycles=0.02")  # 96 data, 49 modes
@@ -141,7 +142,7 @@ def test_permittivity_loss_tangent_and_tilt():
     arguments = {**arguments, "systematics": (coarse,)}
     sampler = Sampler(warmup=40, draws=N_DRAWS, algorithm="hmc")
     draws = Draws(program, arguments, sampler, starts=3)
-    found = ranks_of(program, arguments, Sites(tuple(antennas.stds)), draws=draws)
+    found = ranks_of(program, arguments, Sites(antennas.names), draws=draws)
     assert_calibrated(found)
 
 
@@ -279,7 +280,7 @@ def test_simulation_based_calibration(response_file):
         # along the null direction, in prior standard deviations
         report = unknowns_report(experiment, found)
         assert report.null.names[0] == SKY
-        assert report.null.names[-1] == GAIN
+        assert report.null.names[-1] == COMMON_GAIN
         off = true - mean
         parts = np.concatenate([off[:1] / sky_std[0], off[16:21], [off[21:].sum() / 2.0]])
         null.append(report.null.weights @ parts)

@@ -18,13 +18,13 @@ from scipy.stats import lognorm, multivariate_normal, norm
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model, model_to_sample, radiometer, true_values
 from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.experiment.sky_terms import point_sources
-from lusee_bayes.experiment.term import Around
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.noise.instrument_errors import difference
 from lusee_bayes.sampling.programs import numpyro_promotion
-from lusee_bayes.systematics.instrument_unknowns import NoiseLevel
-from lusee_bayes.systematics.sky_unknowns import PointSources, PowerSpectrum, Source, SpectrumBands
+from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.noise_level import NoiseLevel
+from lusee_bayes.systematics.prior_spectrum import PriorSpectrum
+from lusee_bayes.systematics.sources import PointSources, Source
 from lusee_bayes.systematics.systematic import (
     MOST_COLLAPSED,
     AdditiveNoise,
@@ -91,12 +91,12 @@ def test_amplitude_and_tilt_of_the_spectrum(case, amplitude, tilt):
     """C_ell A ((ell + 1) / 10)^tilt; either may be known."""
     steep = ((ELLS + 1) / 10) ** tilt
     of_amplitude, of_tilt = lognorm.logpdf(amplitude, 0.4), norm.logpdf(tilt, 0.0, 0.6)
-    got = general(case, [PowerSpectrum(0.4, 0.6)], {"amplitude": amplitude, "tilt": tilt})
+    got = general(case, [PriorSpectrum(0.4, 0.6)], {"amplitude": amplitude, "tilt": tilt})
     expected = case.evidence(amplitude * steep) + of_amplitude + of_tilt
     assert got == pytest.approx(expected, rel=CLOSE)
-    got = general(case, [PowerSpectrum(0.4)], {"amplitude": amplitude})
+    got = general(case, [PriorSpectrum(0.4)], {"amplitude": amplitude})
     assert got == pytest.approx(case.evidence(amplitude) + of_amplitude, rel=CLOSE)
-    got = general(case, [PowerSpectrum(tilt_std=0.6)], {"tilt": tilt})
+    got = general(case, [PriorSpectrum(tilt_std=0.6)], {"tilt": tilt})
     assert got == pytest.approx(case.evidence(steep) + of_tilt, rel=CLOSE)
 
 
@@ -110,7 +110,9 @@ def test_amplitude_and_tilt_of_the_spectrum(case, amplitude, tilt):
 def test_bands_of_the_spectrum(case, edges, power, factors):
     """An edge is the first ell of its band; the lowest band begins at 0, the highest ends it."""
     expected = case.evidence(np.array(factors)) + lognorm.logpdf(power, 0.8).sum()
-    got = general(case, [SpectrumBands(edges, 0.8)], {"band_power": np.array(power)})
+    got = general(
+        case, [PriorSpectrum(edges=edges, log_band_std=0.8)], {"band_power": np.array(power)}
+    )
     assert got == pytest.approx(expected, rel=CLOSE)
 
 
@@ -131,7 +133,7 @@ def test_the_program_with_bands(case):
 
 def test_marginalised_they_stay_as_they_are(case):
     """There is no Gaussian for them."""
-    for systematic in (NoiseLevel(0.5), PowerSpectrum(0.5, 0.5), SpectrumBands((2,))):
+    for systematic in (NoiseLevel(0.5), PriorSpectrum(0.5, 0.5), PriorSpectrum(edges=(2,))):
         assert systematic.marginalised(case.model) is case.model
         assert not systematic.needs_sky
 
@@ -151,7 +153,7 @@ def test_several_at_once(case):
     priors += norm.logpdf(flux, 2.0, 0.5).sum()
     factors = np.array([0.6, 0.6, 0.6, 1.9, 1.9])
     mean, term = columns @ flux + 3.0 * other[:, 0], 16.0 * other @ other.T
-    levels, bands = NoiseLevel(0.7), SpectrumBands((3,), 0.8)
+    levels, bands = NoiseLevel(0.7), PriorSpectrum(edges=(3,), log_band_std=0.8)
     # the order of those that do not touch the noise is all the same
     for order in (
         [levels, bands, source, Marginalised(hidden)],
@@ -200,7 +202,7 @@ def test_the_level_is_that_of_the_radiometer_only():
     np.testing.assert_array_equal(base.noise.diagonal(), radiometer(setup).diagonal())
     _, da, s, n = matrices(setup)
     t = np.stack([np.asarray(r).reshape(-1) for r in setup.responses], axis=1)
-    std = np.array([source.std for source in point_sources(setup).sources])
+    std = PointSources.build(setup.scenario.sources, setup, Around()).stds
     arguments = program_arguments(program, e)
     with numpyro_promotion():
         model = handlers.substitute(program.model, {"noise_level": jnp.asarray(9.0)})
@@ -296,17 +298,11 @@ def test_sampled_noise_is_added_to_what_is_there(model):
 
 
 @pytest.mark.parametrize("term", terms(), ids=lambda term: term.name)
-def test_simulated_data_hold_a_draw_of_it(term):
-    grid = jnp.ones((N_PRODUCTS, N_TIMES))
-    key = jax.random.key(3)
-    drawn = np.asarray(term.layout.gather(term.distort(grid, key) - grid))
-    np.testing.assert_allclose(drawn, term.covariance().sample(key), rtol=0, atol=1e-14)
-
-
-def test_samples_that_are_not_there_stay_as_they_are():
-    flags = np.zeros((N_PRODUCTS, N_TIMES), dtype=bool)
-    flags[1, 3:5] = True
-    layout = DataLayout.from_flags(flags)
-    term = Pickup("pickup", layout, jnp.ones((layout.size, 1)))
-    changed = np.asarray(term.distort(jnp.zeros(flags.shape), jax.random.key(0)))
-    np.testing.assert_array_equal(changed == 0.0, flags)
+def test_simulated_data_hold_a_draw_of_it(model, term, monkeypatch):
+    monkeypatch.setattr(type(term), "build", classmethod(lambda cls, *args: term))
+    setup, key = small_experiment().setup, jax.random.key(3)
+    truth = type(term).truth(None, setup, key)
+    assert set(truth) == {f"{term.name}_noise"}
+    drawn = np.asarray(type(term).in_data(None, setup, model, truth, key).offset)
+    expected = term.covariance().sample(type(term).own_key(key))
+    np.testing.assert_allclose(drawn, expected, rtol=0, atol=1e-14)

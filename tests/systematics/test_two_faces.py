@@ -15,10 +15,9 @@ from scipy.stats import lognorm, loguniform, norm, truncnorm, uniform
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.experiment import program_pieces
-from lusee_bayes.experiment.instrument_terms import gain_drifts
 from lusee_bayes.experiment.model import full_model, radiometer
-from lusee_bayes.experiment.term import Around
 from lusee_bayes.instrument.products import all_products
+from lusee_bayes.systematics.context import Around
 from lusee_bayes.systematics.gain_drifts import GainDrifts
 
 GAINS = "noise.gain={sigma: %g, correlation_h: 10, treatment: %s, visibilities: %s}"
@@ -60,7 +59,7 @@ def test_the_program_is_the_exact_product_of_gains():
 
 def test_white_noise_makes_drifts_of_the_right_covariance():
     """The response of histories to white noise, squared, is C_g: to exp(-9 pi^2 / 2) = 5e-20."""
-    drifts = gain_drifts(experiment().setup, Around())
+    drifts = GainDrifts.build(experiment().setup.scenario.noise.gain, experiment().setup, Around())
     hours = np.asarray(drifts.hours)
     for correlation_h in (10.0, 14.0, 20.0):
         drift = lb.GainDrift(0.02, correlation_h)
@@ -230,7 +229,9 @@ def test_the_program_of_gain_scales():
     sigma, octaves = 0.013, 0.4
     correlation_h = 8.0 * 2.0**octaves
     hours, products = np.asarray(data.observation.hours), all_products(4)
-    around = np.asarray(gain_drifts(setup, Around(data)).visibilities)
+    around = np.asarray(
+        GainDrifts.build(setup.scenario.noise.gain, setup, Around(data)).visibilities
+    )
     lag = hours[:, None] - hours[None]
     c = sigma**2 * np.exp(-(lag**2) / (2 * correlation_h**2))
     n_times = len(hours)

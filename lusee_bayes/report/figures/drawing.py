@@ -15,7 +15,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Float
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
@@ -115,11 +115,10 @@ def without_minor_ticks(axis: Axis) -> None:
     axis.set_minor_locator(NullLocator())
 
 
-def orthographic(axes: Axes, grid: HemisphereGrid, pattern: Complex[np.ndarray, "theta phi"]):
-    """Draw ``|pattern|`` on the plane of the horizon: x East, y North."""
-    power = np.abs(pattern)
+def orthographic(axes: Axes, grid: HemisphereGrid, pattern: Float[np.ndarray, "theta phi"]):
+    """Draw a pattern on the plane of the horizon: x East, y North."""
     phi = np.append(grid.phi, 2 * np.pi)
-    closed = np.concatenate([power, power[:, :1]], axis=1) / power.max()
+    closed = np.concatenate([pattern, pattern[:, :1]], axis=1) / pattern.max()
     # the grid has no node at the zenith itself: every azimuth of the first ring meets there
     closed = np.concatenate([np.full((1, closed.shape[1]), closed[0].mean()), closed])
     theta = np.append(0.0, grid.theta)

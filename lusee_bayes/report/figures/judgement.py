@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import astropy.units as u
 import numpy as np
-import pandas as pd
-import xarray as xr
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
@@ -22,15 +20,11 @@ from lusee_bayes.report.figures.drawing import (
     DIVERGING,
     GREY,
     ORANGE,
-    colour_bar,
     framed,
-    in_places,
-    mollweide,
     plain_ticks,
-    temperatures,
     without_minor_ticks,
 )
-from lusee_bayes.results.cube import CubeUnknowns
+from lusee_bayes.results.map_result import MapResult
 
 # residuals beyond that have the darkest colours
 WIDEST = 4.0
@@ -38,25 +32,12 @@ WIDEST = 4.0
 LEAST_P = 1e-10
 
 
-def draws_of_posterior(found: xr.Dataset) -> Figure:
-    """Draws of the posterior as Galactic maps, on one scale."""
-    maps = found["draws"].values
-    scale = temperatures(maps)
-    altitude = found["highest_altitude"].values
-    rows = (len(maps) + 1) // 2
-    places = {"left": 0.01, "right": 0.98, "bottom": 0.01, "top": 0.9, "wspace": 0.02}
-    figure, grid_of_axes = in_places((12, 3.6 * rows), rows, 2, **places, hspace=0.12)
-    for k, (axes, pixels) in enumerate(zip(grid_of_axes, maps, strict=True)):
-        image = mollweide(axes, pixels, norm=scale, highest_altitude=altitude)
-        axes.set_title(f"draw {k + 1}")
-    colour_bar(figure, image, figure.axes, label="K", shrink=0.7, extend="both", pad=0.02)
-    figure.suptitle(f"Draws of the posterior at {found.attrs['frequency_mhz']:g} MHz")
-    return figure
-
-
-def residuals_by_product(found: xr.Dataset) -> Figure:
+def residuals_by_product(result: MapResult) -> Figure | None:
     """Every datum against the prediction of all others, and what each product's removal mends."""
-    labels, hours, z = found["product"].values, found["hours"].values, found["z"].values
+    channel = result.channel
+    if not result.single:
+        return None
+    z, hours, labels = channel.judged.z, channel.hours, channel.labels
     figure = Figure(figsize=(12, 4.8))
     places = {"left": 0.06, "right": 0.98, "bottom": 0.11, "top": 0.82, "wspace": 0.03}
     left, right = figure.subplots(1, 2, width_ratios=(3, 1), sharey=True, gridspec_kw=places)
@@ -78,24 +59,40 @@ def residuals_by_product(found: xr.Dataset) -> Figure:
     figure.colorbar(
         image, ax=left, label="standard deviations", extend="both", shrink=0.9, pad=0.02
     )
-    of_products = found["group_kind"].values == "product"
-    names = found["group_name"].values[of_products]
-    rows = [list(labels).index(name) for name in names]
+    products = channel.judged.of_kind("product")
+    rows = [labels.index(group.name) for group in products]
     for key, marker, colour, text in (
-        ("group_p", "o", BLUE, "product given all others"),
-        ("group_others_p", "D", ORANGE, "all others without it"),
+        ("p", "o", BLUE, "product given all others"),
+        ("others_p", "D", ORANGE, "all others without it"),
     ):
-        p = np.maximum(found[key].values[of_products], LEAST_P)
+        p = np.maximum([getattr(group, key) for group in products], LEAST_P)
         right.semilogx(p, rows, ls="", marker=marker, color=colour, ms=5, label=text)
     without_minor_ticks(right.xaxis)
     right.axvline(1.0, color=GREY, lw=0.5)
     right.set(xlabel=f"p-value (drawn down to {LEAST_P:g})", xlim=(LEAST_P / 3, 3))
     right.grid(axis="y", lw=0.3)
     right.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False, fontsize=8)
-    p = probability(found.attrs["instrument_p"])
-    figure.suptitle(
-        f"Residuals at {found.attrs['frequency_mhz']:g} MHz: p {p} of what no sky explains"
-    )
+    p = probability(channel.instrument.p)
+    figure.suptitle(f"Residuals at {channel.frequency_mhz:g} MHz: p {p} of what no sky explains")
+    return figure
+
+
+def groups_by_frequency(result: MapResult) -> Figure | None:
+    """p-values of products, days and angles of every channel whose groups were judged."""
+    judged = [channel for channel in result.channels if channel.judged is not None]
+    if result.single or not judged:
+        return None
+    found = [{str(group): group.p for group in channel.judged.groups} for channel in judged]
+    names = list(dict.fromkeys(name for one in found for name in one))
+    p = np.array([[one.get(name, np.nan) for one in found] for name in names])
+    figure, axes = framed((max(5.0, 2.5 + 0.3 * len(judged)), 1.0 + 0.2 * len(names)))
+    scale = Normalize(np.log10(LEAST_P), 0.0)
+    image = axes.imshow(np.log10(np.maximum(p, LEAST_P)), cmap="magma", norm=scale, aspect="auto")
+    shown = np.arange(0, len(judged), 1 + len(judged) // 20)
+    axes.set_xticks(shown, [f"{judged[k].frequency_mhz:g}" for k in shown])
+    axes.set_yticks(range(len(names)), names, fontsize=7)
+    axes.set(xlabel="frequency [MHz]", title="Groups of data given all others")
+    figure.colorbar(image, ax=axes, label="log10 of p")
     return figure
 
 
@@ -105,14 +102,11 @@ TOO_WIDE = 20.0
 UNITS = {"s": "s", "day": "s/day", "deg": "degrees"}
 
 
-def pointing_by_day(preferred: pd.DataFrame) -> Figure:
-    """Draw the preferred value of every offset for each day, and for all of them together.
-
-    Parameters
-    ----------
-    preferred : DataFrame
-        As :class:`.PointingReport` has it.
-    """
+def pointing_by_day(result: MapResult) -> Figure | None:
+    """Draw the preferred value of every offset for each day, and for all of them together."""
+    if not result.single or result.channel.pointing is None:
+        return None
+    preferred = result.channel.pointing.preferred
     names = list(dict.fromkeys(preferred["offset"]))
     size = (12, 0.6 + 2.1 * len(names))
     figure, panels = framed(size, len(names), sharex=True, squeeze=False)
@@ -144,9 +138,11 @@ PANELS_IN_A_ROW = 4
 WIDE = 3.0
 
 
-def unknowns_by_frequency(unknowns: CubeUnknowns) -> Figure:
+def unknowns_by_frequency(result: MapResult) -> Figure | None:
     """Draw every unknown of all channels with its error, its prior and, if known, the truth."""
-    table = unknowns.table
+    if result.single or result.unknowns is None:
+        return None
+    table = result.unknowns.table
     names = list(dict.fromkeys(table["unknown"]))
     n_rows = -(-len(names) // PANELS_IN_A_ROW)
     size = (13, 0.6 + 2.5 * n_rows)
@@ -220,8 +216,11 @@ def time_line(reduced: Reduced) -> Figure:
     return figure
 
 
-def waterfall(reduced: Reduced, band: int) -> Figure:
-    """Draw the 16 products of a band over time, before and after flags."""
+def waterfall(result: MapResult) -> Figure | None:
+    """Draw the 16 products of the map's band over time, before and after flags."""
+    reduced, band = result.reduced, result.band
+    if not result.single or reduced is None:
+        return None
     figure, panels = framed((13, 9), 4, 4, sharex=True)
     first = np.searchsorted(reduced.bin_of, np.arange(reduced.values.shape[2]))
     days = _days(reduced)[first]

@@ -10,10 +10,8 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
-from lusee_bayes.core.harmonics import lmax_of
-from lusee_bayes.experiment.setup import Setup
+from lusee_bayes.core.harmonics import lmax_of, modes_to_map
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
-from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.measures import ell_cross
 from lusee_bayes.report.figures.drawing import (
     BLUE,
@@ -23,8 +21,10 @@ from lusee_bayes.report.figures.drawing import (
     LINES,
     ORANGE,
     SEQUENTIAL,
+    colour_bar,
     framed,
     in_places,
+    mollweide,
     orthographic,
     seen_range,
     shown,
@@ -34,49 +34,86 @@ from lusee_bayes.report.figures.drawing import (
     without_minor_ticks,
 )
 from lusee_bayes.results.channel import ChannelResult
-from lusee_bayes.results.cube import CubeResult
 from lusee_bayes.results.finished_runs import FinishedRun
+from lusee_bayes.results.map_result import MapResult
 
 
-def data_vector(data: Visibilities) -> Figure:
+def data_vector(result: MapResult) -> Figure | None:
     """The data vector as the paper draws it: products side by side, time running within each."""
+    if not result.single:
+        return None
+    channel = result.channel
+    n_products, n_times = channel.data.shape
     figure, (axes,) = in_places((11, 4), left=0.08, right=0.99, bottom=0.13, top=0.91)
-    n_times = data.layout.n_times
-    axes.plot(data.grid().ravel(), color=BLUE, lw=0.7)
-    for k in range(1, data.layout.n_products):
+    axes.plot(channel.data.ravel(), color=BLUE, lw=0.7)
+    for k in range(1, n_products):
         axes.axvline(k * n_times, color=GREY, lw=0.4)
-    axes.set_xticks((np.arange(data.layout.n_products) + 0.5) * n_times, data.labels, fontsize=8)
+    axes.set_xticks((np.arange(n_products) + 0.5) * n_times, channel.labels, fontsize=8)
     axes.tick_params(axis="x", length=0)
     axes.set(
         xlabel="product (time runs within each)",
         ylabel="visibility [K]",
-        xlim=(0, n_times * data.layout.n_products),
-        title=f"Data vector at {data.frequency_mhz:g} MHz, {data.layout.size} samples"
-        + (f", {data.n_missing} missing" if data.n_missing else ""),
+        xlim=(0, n_times * n_products),
+        title=f"Data vector at {channel.frequency_mhz:g} MHz, {channel.n_data} samples"
+        + (f", {channel.n_missing} missing" if channel.n_missing else ""),
     )
     return figure
 
 
-def beams(setup: Setup) -> Figure:
+def beams(result: MapResult) -> Figure | None:
     """An auto and two crosses from above: zenith in the centre, North up, horizon at the rim."""
-    frequency = setup.scenario.frequency_mhz
-    grid = HemisphereGrid.gauss_legendre(48, 120)
-    patterns = np.asarray(setup.beam_source.patterns(frequency, grid))
-    names = {0: "auto 00", 2: "|cross 02|", 1: "|cross 01|"}
-    if not setup.scenario.beam.is_file:
-        names = {0: "auto 00 (North)", 2: "|cross 02| (opposite)", 1: "|cross 01| (perpendicular)"}
-    panels = [(name, patterns[0, k]) for k, name in names.items() if k < len(patterns)]
+    details = result.channel.details
+    if details is None:
+        return None
+    _, *nodes = details.patterns.shape
+    grid = HemisphereGrid.gauss_legendre(*nodes)
     places = {"left": 0.01, "right": 0.99, "bottom": 0.02, "top": 0.82, "wspace": 0.04}
-    figure, grid_of_axes = in_places((11, 4), 1, len(panels), **places)
-    for axes, (title, pattern) in zip(grid_of_axes, panels, strict=True):
+    figure, grid_of_axes = in_places((11, 4), 1, len(details.patterns), **places)
+    for axes, title, pattern in zip(
+        grid_of_axes, details.pattern_names, details.patterns, strict=True
+    ):
         image = orthographic(axes, grid, pattern)
         axes.set_title(title)
     figure.colorbar(image, ax=figure.axes, label="beam / its peak", shrink=0.8, pad=0.02)
-    figure.suptitle(f"Beams at {frequency:g} MHz, zenith at the centre")
+    figure.suptitle(f"Beams at {result.channel.frequency_mhz:g} MHz, zenith at the centre")
     return figure
 
 
-def sky_maps(channel: ChannelResult) -> Figure:
+def draws(result: MapResult) -> Figure | None:
+    """A few draws of the posterior as Galactic maps, on one scale."""
+    channel = result.channel
+    if channel.details is None:
+        return None
+    found = np.stack([modes_to_map(sky, channel.nside) for sky in channel.details.draws])
+    scale, rows = temperatures(found), (len(found) + 1) // 2
+    places = {"left": 0.01, "right": 0.98, "bottom": 0.01, "top": 0.9, "wspace": 0.02}
+    figure, grid_of_axes = in_places((12, 3.6 * rows), rows, 2, **places, hspace=0.12)
+    for k, (axes, pixels) in enumerate(zip(grid_of_axes, found, strict=True)):
+        image = mollweide(axes, pixels, norm=scale, highest_altitude=channel.highest_altitude)
+        axes.set_title(f"draw {k + 1}")
+    colour_bar(figure, image, figure.axes, label="K", shrink=0.7, extend="both", pad=0.02)
+    figure.suptitle(f"Draws of the posterior at {channel.frequency_mhz:g} MHz")
+    return figure
+
+
+def sky_maps(result: MapResult) -> Figure:
+    """The maps of one channel, or of a few of many."""
+    return channel_maps(result) if len(result.channels) > 1 else channel_map(result.channel)
+
+
+def fidelity(result: MapResult) -> Figure:
+    """The fidelity of a channel by multipole, or of many by multipole and frequency."""
+    if len(result.channels) > 1:
+        return channel_fidelity(result)
+    return map_fidelity(result.channel)
+
+
+def spectra(result: MapResult) -> Figure:
+    """Power spectra of a channel, or brightness against frequency of many."""
+    return channel_spectra(result) if len(result.channels) > 1 else sky_spectra(result.channel)
+
+
+def channel_map(channel: ChannelResult) -> Figure:
     """Truth, posterior mean, residual over the mean temperature, and standard deviation.
 
     All but the standard deviation are drawn through the beam of :mod:`.drawing`.
@@ -174,7 +211,7 @@ def sky_spectra(channel: ChannelResult) -> Figure:
 SHOWN = 3
 
 
-def channel_maps(cube: CubeResult) -> Figure:
+def channel_maps(cube: MapResult) -> Figure:
     """Posterior mean and standard deviation of a few channels from the lowest to the highest."""
     n = len(cube.frequencies_mhz)
     shown = np.unique(np.linspace(0, n - 1, min(n, SHOWN)).round().astype(int))
@@ -189,7 +226,7 @@ def channel_maps(cube: CubeResult) -> Figure:
     return figure
 
 
-def channel_spectra(cube: CubeResult) -> Figure:
+def channel_spectra(cube: MapResult) -> Figure:
     """Brightness against frequency in some directions, with one standard deviation."""
     landmarks = cube.landmarks()
     figure, panels = framed((11, 7), 2, 2, sharex=True)
@@ -207,7 +244,7 @@ def channel_spectra(cube: CubeResult) -> Figure:
     return figure
 
 
-def channel_fidelity(cube: CubeResult) -> Figure:
+def channel_fidelity(cube: MapResult) -> Figure:
     """SNR_ell (or, without a truth, the prior's share) over frequency and ell, and its mean."""
     snr, alone = cube.snr(), cube.snr(independent=True)
     known = snr is not None
@@ -236,8 +273,10 @@ def channel_fidelity(cube: CubeResult) -> Figure:
     return figure
 
 
-def chi2(cube: CubeResult) -> Figure:
+def chi2(cube: MapResult) -> Figure | None:
     """chi^2 that judges every channel, over its mean if the model holds."""
+    if cube.single:
+        return None
     figure, axes = framed((8, 4))
     fits = cube.fits()
     ratio, width = fits.chi2 / fits.degrees, np.sqrt(2.0 / fits.degrees)
@@ -254,25 +293,29 @@ def chi2(cube: CubeResult) -> Figure:
 
 def maps_of_runs(runs: Sequence[FinishedRun]) -> Figure:
     """Posterior mean and standard deviation of every run, each kind on one scale."""
-    scale = temperatures(np.concatenate([run.mean for run in runs]))
-    bounds = [seen_range(run.std, run.diagnostics["highest_altitude"].values) for run in runs]
+    channels = [run.channel for run in runs]
+    means = [modes_to_map(channel.mean, channel.nside) for channel in channels]
+    scale = temperatures(np.concatenate(means))
+    bounds = [seen_range(channel.pixel_std, channel.highest_altitude) for channel in channels]
     spread = LogNorm(min(low for low, _ in bounds), max(high for _, high in bounds))
     figure, rows = framed((12, 3.4 * len(runs) + 0.4), len(runs), 2, squeeze=False)
-    for run, (left, right) in zip(runs, rows, strict=True):
-        options = {"altitude": run.diagnostics["highest_altitude"].values, "shrink": 0.85}
-        sky_panel(left, f"{run.name}: mean", run.mean, scale, **options)
-        sky_panel(right, f"{run.name}: standard deviation", run.std, spread, **options)
+    for run, mean, (left, right) in zip(runs, means, rows, strict=True):
+        options = {"altitude": run.channel.highest_altitude, "shrink": 0.85}
+        sky_panel(left, f"{run.name}: mean", mean, scale, **options)
+        std = run.channel.pixel_std
+        sky_panel(right, f"{run.name}: standard deviation", std, spread, **options)
     return figure
 
 
 def curves_of_runs(runs: Sequence[FinishedRun]) -> Figure:
     """rho_ell and SNR_ell where the truth is known, and the prior's share, of every run."""
-    known = all("snr" in run.spectra for run in runs)
+    spectra = [run.channel.spectra() for run in runs]
+    known = all("snr" in one for one in spectra)
     figure, panels = framed((12 if known else 6, 4.2), 1, 3 if known else 1, squeeze=False)
     panels = list(panels.flat)
     for k, run in enumerate(runs):
         style = {"color": COLOURS[k % len(COLOURS)], "ls": LINES[k % len(LINES)], "lw": 1.3}
-        _fidelity(panels, run.spectra, run.name, **style)
+        _fidelity(panels, spectra[k], run.name, **style)
     if known:
         panels[1].axhline(1.0, color=GREY, lw=0.8)
     panels[-1].legend(frameon=False, fontsize=8)

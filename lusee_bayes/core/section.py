@@ -1,0 +1,171 @@
+"""What all sections of a scenario have in common: types of entries, validators, kinds."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from functools import reduce
+from operator import or_
+from typing import Annotated, Any, Literal, TypeVar
+
+from docstring_parser import DocstringStyle, parse
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+
+from lusee_bayes.core.files import user_path
+from lusee_bayes.core.layouts import LARGEST_MHZ, NOT_HZ
+
+S = TypeVar("S", bound="Section")
+
+
+def _not_tiny(value: float) -> float:
+    if value < SMALLEST:
+        raise ValueError(f"input should be at least {SMALLEST:g}")
+    return value
+
+
+def _not_hz(value: Any) -> Any:
+    if isinstance(value, int | float) and value > LARGEST_MHZ:
+        raise ValueError(NOT_HZ)
+    return value
+
+
+# what is smaller or larger has no meaning here, and its powers no room in 64 bits
+SMALLEST, LARGEST = 1e-30, 1e30
+NOT_TINY = AfterValidator(_not_tiny)
+Positive = Annotated[float, Field(gt=0, le=LARGEST), NOT_TINY]
+Temperature = Annotated[float, Field(ge=0, le=1e6)]
+Angle = Annotated[float, Field(ge=-3600, le=3600)]
+# of random numbers; channels have one each, so that some room is left below 64 bits
+Seed = Annotated[int, Field(ge=0, lt=2**62)]
+# of LuSEE-Night's band, in MHz
+Frequency = Annotated[float, Field(ge=1, le=50), BeforeValidator(_not_hz)]
+# of a file, or of a spectrum
+Megahertz = Annotated[Positive, BeforeValidator(_not_hz)]
+# what is done about something that is not known
+Treatment = Literal["marginalised", "sampled", "ignored"]
+
+
+# entries that name files; one that has its default names none
+FILES = ("clock", "file", "gain_table", "lines", "mean_file", "schedule", "spectrum_file")
+
+
+def _described(schema: dict[str, Any], section: type[BaseModel]) -> None:
+    """Give the entries of a JSON schema the meanings that docstrings of the section have."""
+    for cls in reversed(section.__mro__):
+        if not issubclass(cls, Section) or cls is Section:
+            continue
+        docstring = parse(cls.__doc__ or "", style=DocstringStyle.NUMPYDOC)
+        schema["description"] = docstring.short_description
+        for entry in docstring.params:
+            meaning = " ".join((entry.description or "").split()).rstrip(".").replace("``", "`")
+            schema["properties"][entry.arg_name]["description"] = meaning
+
+
+class Section(BaseModel):
+    """Part of a scenario: no key that is not declared, no NaN, nothing changed once made.
+
+    Types are strict: no text for numbers, no ``true`` for 1, no 12.0 for 12.
+    """
+
+    model_config = ConfigDict(
+        extra="forbid",
+        frozen=True,
+        allow_inf_nan=False,
+        strict=True,
+        json_schema_extra=_described,
+    )
+
+    def anchored(self: S) -> S:
+        """The same with absolute names of files, which are then the same in any folder."""
+        found: dict[str, Any] = {}
+        for name, declared in type(self).model_fields.items():
+            value = getattr(self, name)
+            if isinstance(value, Section):
+                found[name] = value.anchored()
+            elif name in FILES and value is not None and value != declared.default:
+                found[name] = os.path.abspath(value)
+        return self.model_copy(update=found)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_sections_have_it(cls, tree: Any) -> Any:
+        """YAML has lists where sections have tuples, and ``~`` in the names of files."""
+        if not isinstance(tree, Mapping):
+            return tree
+        found = {key: tuple(v) if isinstance(v, list) else v for key, v in tree.items()}
+        names = {key: found[key] for key in FILES if isinstance(found.get(key), str)}
+        return found | {key: str(user_path(n)) for key, n in names.items() if n.startswith("~")}
+
+
+def requires(holds: Callable[[Any], Any], message: str) -> Any:
+    """A validator of a section: ValueError with this message unless a rule holds of it."""
+
+    def checked(section: Any) -> Any:
+        if not holds(section):
+            raise ValueError(message)
+        return section
+
+    return model_validator(mode="after")(checked)
+
+
+def kinds_of(*sections: type[Section]) -> dict[str, type[Section]]:
+    """The kinds that a section comes in, by what their ``model`` says."""
+    return {section.model_fields["model"].default: section for section in sections}
+
+
+def one_of(kinds: Mapping[str, type[Section]], completed: Callable[[Any], Any]) -> Any:
+    """The type of a section that comes in kinds, with what is done to a tree before it is read."""
+    kind = Field(discriminator="model")
+    return Annotated[reduce(or_, kinds.values()), kind, BeforeValidator(completed)]
+
+
+def is_modelled(section: Any) -> bool:
+    """Whether there is a section, and what it has is not ignored."""
+    return section is not None and section.treatment != "ignored"
+
+
+def without_other_kinds(
+    tree: dict[str, Any], kinds: Mapping[str, type[Section]], *, strict: bool
+) -> dict[str, Any]:
+    """A section's entries without those that only other kinds of it have.
+
+    Scenarios that were written with all keys, or in which one kind is put in another's place by
+    ``--set``, still hold the keys of the other kind.
+
+    Parameters
+    ----------
+    tree : dict
+        The section's entries, ``model`` among them.
+    kinds : mapping
+        The section of each ``model``.
+    strict : bool
+        Refuse a key of another kind whose value is not that kind's default.
+
+    Returns
+    -------
+    dict
+        The entries that the kind has, and those that no kind has.
+
+    Raises
+    ------
+    ValueError
+        For such a key, where ``strict``.
+    """
+    own = kinds.get(tree["model"]) if isinstance(tree["model"], str) else None
+    if own is None:
+        return tree
+    kept = {}
+    for key, value in tree.items():
+        others = [k for k in kinds.values() if key in k.model_fields]
+        if key in own.model_fields or not others:
+            kept[key] = value
+            continue
+        theirs = others[0]
+        default = theirs.model_fields[key].get_default(call_default_factory=True)
+        # YAML has lists where sections have tuples
+        plain = list(default) if isinstance(default, tuple) else default
+        same = value is None or value in (default, plain)
+        if strict and not same:
+            names = ", ".join(name for name, kind in kinds.items() if kind in others)
+            raise ValueError(f"{key} is an entry of model {names}, not of {tree['model']}")
+    return kept

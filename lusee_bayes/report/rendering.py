@@ -1,0 +1,134 @@
+"""Pages out of templates: what every template may use, and what the pages of all runs have.
+
+The words of a page, its tables and its captions stand in ``templates/``; the modules beside this
+one read and compute what they show. A page is one file with everything inside. That of a run begins
+with its verdict and where the data come from, and ends with links to its files, how to cite it, and
+how it was made: scenario, versions, times, memory.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from lusee_bayes.core.checks import counted
+from lusee_bayes.core.files import require_files
+from lusee_bayes.core.reading import read_text
+from lusee_bayes.core.version import __version__, printable
+from lusee_bayes.judge.chi2 import RULE, probability
+from lusee_bayes.judge.convergence import CRITERIA
+from lusee_bayes.results.finished_runs import Provenance
+from lusee_bayes.results.map_files import text_hash
+
+
+def render(template: str, folder: Path, **context: Any) -> str:
+    """A page, or a part of one, as text.
+
+    Bytes of file names that are no UTF-8 are shown by their escapes.
+
+    Parameters
+    ----------
+    template : str
+        Name of a file of ``templates/``.
+    folder : Path
+        Of the results, with pictures in ``figures/``.
+    **context
+        What else the template names.
+
+    Raises
+    ------
+    InputError
+        If the template shows a picture that the folder lacks.
+    """
+    pictures = {"picture": partial(picture, folder), "has_picture": partial(has_picture, folder)}
+    return printable(ENVIRONMENT.get_template(template).render(context | pictures))
+
+
+def has_picture(folder: Path, name: str) -> bool:
+    """Whether a run has a picture of this name."""
+    return (folder / "figures" / f"{name}.png").is_file()
+
+
+def picture(folder: Path, name: str) -> str:
+    """A picture of a run as an address that holds it. InputError if the run has none."""
+    require_files(folder, (f"figures/{name}.png",), "map")
+    data = (folder / "figures" / f"{name}.png").read_bytes()
+    return f"data:image/png;base64,{base64.b64encode(data).decode()}"
+
+
+def asset(name: str) -> Markup:
+    """A style sheet or script of ``templates/`` as it is."""
+    return Markup(ENVIRONMENT.loader.get_source(ENVIRONMENT, name)[0])
+
+
+def formatted(value: Any, form: str, missing: str = "") -> str:
+    """Format a number.
+
+    Parameters
+    ----------
+    value : number or None
+        Text stays as it is.
+    form : str
+        Of Python's ``format``.
+    missing : str
+        In place of None and NaN.
+    """
+    if value is None or value != value:
+        return missing
+    return value if isinstance(value, str) else format(value, form)
+
+
+def p_value(p: float, missing: str = "") -> str:
+    """Format a probability (:func:`.probability`) for a column of them; ``missing`` for NaN."""
+    return missing if p != p else probability(p).removeprefix("= ")
+
+
+ENVIRONMENT = Environment(
+    loader=PackageLoader("lusee_bayes.report"),
+    autoescape=True,
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
+ENVIRONMENT.filters |= {"number": formatted, "probability": p_value}
+ENVIRONMENT.globals |= {"asset": asset, "counted": counted, "RULE": RULE, "CRITERIA": CRITERIA}
+
+
+def render_run(template: str, path: Path, run: Mapping[str, Any], **context: Any) -> str:
+    """The page of a run, of a template that extends ``run.html``.
+
+    Parameters
+    ----------
+    template : str
+    path : Path
+        Of the run's figures, in its folder.
+    run : mapping
+        The figures, with the run's seconds, versions and peak memory.
+    **context
+        As in :func:`render`.
+
+    Raises
+    ------
+    InputError
+        As in :func:`render`; if the scenario is missing.
+    """
+    folder = path.parent
+    scenario = read_text(folder / "scenario.yaml", "a scenario")
+    return render(
+        template,
+        folder,
+        run=run,
+        doubts=run.get("doubts", ()),
+        provenance=Provenance.read(folder),
+        version=__version__,
+        scenario=scenario,
+        scenario_hash=text_hash(scenario)[:12],
+        bytes_of={file.name: file.stat().st_size for file in folder.iterdir() if file.is_file()},
+        **context,
+    )

@@ -1,0 +1,292 @@
+"use strict";
+// A map to point at: layers of one channel or many behind a slider, the posterior of a direction, and
+// its spectrum and point-spread function where the page has them.
+(function () {
+  const { bytes, floats, degrees, radians, pixelOf, number } = skyView;
+  const page = JSON.parse(document.getElementById("viewer-data").textContent);
+  const element = (name) => document.getElementById(`viewer-${name}`);
+  const n = 12 * page.nside ** 2;
+  const frequencies = page.frequencies;
+  const many = frequencies.length > 1;
+
+  // a map as a function of channel and pixel: single precision, or steps above its least value
+  function unpacked(map) {
+    if (map.values) {
+      const values = floats(map.values);
+      return (channel, pixel) => values[channel * n + pixel];
+    }
+    const levels = new Uint16Array(bytes(map.levels).buffer);
+    return (channel, pixel) =>
+      map.low[channel] + map.step[channel] * levels[channel * n + pixel];
+  }
+  const maps = Object.fromEntries(
+    Object.entries(page.maps).map(([name, map]) => [name, unpacked(map)])
+  );
+  const tables = Object.fromEntries(
+    Object.entries(page.colours).map(([name, text]) => [name, bytes(text)])
+  );
+  const never = page.highest_altitude && floats(page.highest_altitude);
+  const hidden = never && ((pixel) => never[pixel] < 0);
+  const regions = page.regions && Object.fromEntries(
+    ["mean", "std", "prior_fraction"].map((name) => [name, floats(page.regions[name])])
+  );
+  const spreads = [];
+  const spread = (channel) =>
+    (spreads[channel] = spreads[channel] || pointSpread(page.resolutions[channel]));
+
+  const residual = (channel, pixel) => maps.mean(channel, pixel) - maps.truth(channel, pixel);
+  const pull = (channel, pixel) => residual(channel, pixel) / maps.std(channel, pixel);
+  const layers = [
+    { key: "mean", title: "posterior mean", unit: "K", of: maps.mean, scale: "temperature" },
+    { key: "std", title: "standard deviation", unit: "K", of: maps.std, scale: "std" },
+  ];
+  if (maps.truth) {
+    layers.push(
+      { key: "truth", title: "truth", unit: "K", of: maps.truth, scale: "temperature" },
+      {
+        key: "residual", title: "mean - truth", unit: "K", of: residual, scale: "residual",
+        colours: "diverging",
+      },
+      {
+        key: "pull", title: "pull, (mean - truth) / standard deviation", unit: "sigma", of: pull,
+        bounds: { low: -4, high: 4, log: false }, colours: "diverging",
+      }
+    );
+  }
+  if (maps.prior_fraction) {
+    layers.push({
+      key: "prior_fraction", title: "share from the prior", unit: "", of: maps.prior_fraction,
+      scale: "prior_fraction",
+    });
+  }
+  for (let k = 1; maps[`draw${k}`]; k += 1) {
+    layers.push({
+      key: `draw${k}`, title: `draw ${k} of the posterior`, unit: "K", of: maps[`draw${k}`],
+      scale: "temperature",
+    });
+  }
+
+  const map = new skyView.View(element("map"), page.rotation, page.sources);
+  const below = page.resolutions.length && new skyView.View(element("psf"), page.rotation, []);
+  const choice = element("layer");
+  for (const one of layers) choice.add(new Option(one.title, one.key));
+  const slider = many && element("channel");
+  const inputs = ["l", "b"].map(element);
+  // the direction, the channel, and the values of the layer in it
+  const state = { z: 0, longitude: 0, channel: 0, values: null, peak: 0 };
+  const chosen = () => layers.find((one) => one.key === choice.value);
+
+  const coordinates = (at) => {
+    const l = (degrees(at.longitude) + 360) % 360;
+    const there = skyView.equatorial(page.rotation, at.z, at.longitude);
+    return {
+      galactic: `${l.toFixed(2)}°, ${degrees(Math.asin(at.z)).toFixed(2)}°`,
+      equatorial: `${there.ra.toFixed(2)}°, ${there.dec.toFixed(2)}°`,
+    };
+  };
+
+  function draw() {
+    const one = chosen();
+    const scale = one.bounds || page.scales[one.scale][state.channel];
+    const table = tables[one.colours || "sequential"];
+    map.paint(page.nside, state.values, scale, table, one.key === "std" ? hidden : null);
+    if (hidden) map.rim(page.nside, hidden);
+    map.graticule();
+    map.marks();
+    map.ring(state.z, state.longitude, 8, "#4fc3f7");
+    skyView.bar(element("bar"), scale, table);
+    element("unit").textContent = one.unit;
+  }
+  // anew for another layer or channel
+  function select() {
+    const one = chosen();
+    state.values = Float64Array.from({ length: n }, (_, pixel) => one.of(state.channel, pixel));
+    if (many) {
+      const text = `${frequencies[state.channel]} MHz`;
+      element("frequency").textContent = text;
+      slider.setAttribute("aria-valuetext", text);
+      // what the page says of each channel
+      for (const part of document.querySelectorAll("[data-channel]")) {
+        part.hidden = Number(part.dataset.channel) !== state.channel;
+      }
+    }
+    draw();
+  }
+  function drawSpread() {
+    const kernel = spread(state.channel).kernel(state.z, state.longitude);
+    state.peak = kernel.reduce((most, x) => Math.max(most, Math.abs(x)), 0);
+    const most = state.peak || 1;
+    const nside = page.resolutions[state.channel].nside;
+    below.paint(nside, kernel, { low: -most, high: most }, tables.diverging);
+    below.ring(state.z, state.longitude, 6, "#4fc3f7");
+  }
+  function drawSpectrum(pixel) {
+    const canvas = element("spectrum");
+    const context = canvas.getContext("2d");
+    const points = frequencies.map((f, k) => ({
+      f, mean: maps.mean(k, pixel), std: maps.std(k, pixel),
+      truth: maps.truth ? maps.truth(k, pixel) : NaN,
+    }));
+    const known = points.flatMap((p) => [p.mean - p.std, p.mean, p.mean + p.std, p.truth]);
+    const positive = known.filter((x) => x > 0);
+    const [low, high] = [0.8 * Math.min(...positive), 1.25 * Math.max(...positive)];
+    const [first, last] = [0.95 * frequencies[0], 1.05 * frequencies[frequencies.length - 1]];
+    context.font = "15px system-ui, sans-serif";
+    const marks = skyView.ticks(low, high, true).map((y) => [y, `${y.toLocaleString("en")} K`]);
+    const widest = Math.max(0, ...marks.map(([, text]) => context.measureText(text).width));
+    const [left, top, right, bottom] = [widest + 14, 12, canvas.width - 14, canvas.height - 44];
+    const share = (x, a, b) => Math.log(Math.max(x, a) / a) / Math.log(b / a);
+    const xOf = (x) => left + share(x, first, last) * (right - left);
+    const yOf = (y) => bottom - share(y, low, high) * (bottom - top);
+    context.clearRect(0, 0, canvas.width, canvas.height);
+    context.fillStyle = context.strokeStyle = "#1b1b1b";
+    context.lineWidth = 1;
+    context.strokeRect(left, top, right - left, bottom - top);
+    context.textAlign = "center";
+    for (const tick of skyView.ticks(first, last, true)) {
+      context.fillRect(xOf(tick), bottom, 1, 5);
+      context.fillText(String(tick), xOf(tick), bottom + 20);
+    }
+    context.fillText("frequency [MHz]", (left + right) / 2, bottom + 39);
+    context.textAlign = "right";
+    for (const [tick, text] of marks) {
+      context.fillRect(left - 5, yOf(tick), 5, 1);
+      context.fillText(text, left - 8, yOf(tick) + 5);
+    }
+    context.strokeStyle = "#d55e00";
+    context.lineWidth = 2;
+    context.setLineDash([6, 4]);
+    context.beginPath();
+    points.forEach((p, k) => {
+      if (Number.isFinite(p.truth)) context[k ? "lineTo" : "moveTo"](xOf(p.f), yOf(p.truth));
+    });
+    context.stroke();
+    context.setLineDash([]);
+    context.fillStyle = context.strokeStyle = "#0072b2";
+    points.forEach((p, k) => {
+      const [up, down] = [yOf(p.mean + p.std), yOf(p.mean - p.std)];
+      context.fillRect(xOf(p.f) - 1, up, 2, down - up);
+      context.beginPath();
+      context.arc(xOf(p.f), yOf(p.mean), k === state.channel ? 6 : 3.5, 0, 2 * Math.PI);
+      context.fill();
+    });
+  }
+
+  function rows(pixel) {
+    const at = coordinates(state);
+    const of = (name) => maps[name](state.channel, pixel);
+    const found = [
+      ["Galactic longitude, latitude", at.galactic],
+      ["right ascension, declination (ICRS)", at.equatorial],
+    ];
+    if (page.nside === page.full_nside) found.push(["pixel (RING)", String(pixel)]);
+    if (many) found.push(["frequency", `${frequencies[state.channel]} MHz`]);
+    found.push(["posterior mean", number(of("mean"), "K")]);
+    found.push(["standard deviation", number(of("std"), "K")]);
+    if (maps.truth) {
+      found.push(["truth", number(of("truth"), "K")]);
+      found.push(["mean - truth", `${number(pull(state.channel, pixel))} standard deviations`]);
+    }
+    if (maps.prior_fraction) {
+      found.push(["share from the prior (ell ≥ 1)", number(of("prior_fraction"))]);
+    }
+    if (never) found.push(["ever above the horizon", hidden(pixel) ? "no" : "yes"]);
+    if (regions) {
+      const { nside } = page.regions;
+      const region = 12 * nside ** 2 * state.channel + pixelOf(nside, state.z, state.longitude);
+      found.push(
+        [`region of ${page.regions.size_deg.toFixed(1)}° around it: mean`,
+          number(regions.mean[region], "K")],
+        ["its standard deviation", number(regions.std[region], "K")],
+        ["its share from the prior", number(regions.prior_fraction[region])]
+      );
+    }
+    if (below) found.push(["peak of the point-spread function", number(state.peak, "per sr")]);
+    return found;
+  }
+  function describe() {
+    const pixel = pixelOf(page.nside, state.z, state.longitude);
+    if (below) drawSpread();
+    if (many) drawSpectrum(pixel);
+    const list = element("values");
+    list.replaceChildren();
+    for (const [name, value] of rows(pixel)) {
+      const [term, text] = ["dt", "dd"].map((tag) => document.createElement(tag));
+      term.textContent = name;
+      text.textContent = value;
+      list.append(term, text);
+    }
+    const at = coordinates(state).galactic;
+    map.canvas.setAttribute("aria-label", `${chosen().title}; chosen: l, b ${at}`);
+  }
+  function choose(longitude, b) {
+    state.longitude = longitude;
+    state.z = Math.sin(Math.max(-Math.PI / 2, Math.min(Math.PI / 2, b)));
+    draw();
+    describe();
+    inputs[0].value = ((degrees(longitude) % 360 + 360) % 360).toFixed(1);
+    inputs[1].value = degrees(Math.asin(state.z)).toFixed(1);
+  }
+  function tell(at) {
+    if (!at) {
+      element("hover").textContent = "\u00a0";
+      return;
+    }
+    const one = chosen();
+    const there = coordinates(at);
+    const value = number(state.values[pixelOf(page.nside, at.z, at.longitude)], one.unit);
+    element("hover").textContent =
+      `${one.title}: ${value} at l, b ${there.galactic}; RA, Dec ${there.equatorial}`;
+  }
+
+  map.listen({ tell, draw, choose: (at) => choose(at.longitude, Math.asin(at.z)) });
+  map.canvas.addEventListener("keydown", (event) => {
+    const step = Math.PI / 90;
+    const moves = {
+      ArrowLeft: [step, 0], ArrowRight: [-step, 0], ArrowUp: [0, step], ArrowDown: [0, -step],
+    };
+    const move = moves[event.key];
+    if (!move) return;
+    event.preventDefault();
+    choose(state.longitude + move[0], Math.asin(state.z) + move[1]);
+  });
+  for (const input of inputs) {
+    input.addEventListener("change", () => {
+      const [l, b] = inputs.map((one) => radians(Number(one.value)));
+      if (Number.isFinite(l) && Number.isFinite(b)) choose(l, b);
+    });
+  }
+  choice.addEventListener("change", () => {
+    select();
+    describe();
+  });
+  if (many) {
+    const selectors = Array.from(document.querySelectorAll("select.channel"));
+    for (const one of [slider, ...selectors]) {
+      one.addEventListener("input", () => {
+        state.channel = Number(one.value);
+        for (const other of [slider, ...selectors]) other.value = one.value;
+        select();
+        describe();
+      });
+    }
+  }
+  skyView.controls(map, element, () => skyView.place(state.z, state.longitude), draw);
+  select();
+  choose(0, 0);
+  // for checks of the page: what is shown of a direction, in degrees
+  window.viewer = {
+    choose: (l, b) => choose(radians(l), radians(b)),
+    at: (l, b, channel = 0) => {
+      const z = Math.sin(radians(b));
+      const pixel = pixelOf(page.nside, z, radians(l));
+      const values = ["mean", "std", "truth"].filter((name) => maps[name])
+        .map((name) => [name, maps[name](channel, pixel)]);
+      const { ra, dec } = skyView.equatorial(page.rotation, z, radians(l));
+      return { pixel, ra, dec, ...Object.fromEntries(values) };
+    },
+    kernel: (l, b, channel = 0) =>
+      Array.from(spread(channel).kernel(Math.sin(radians(b)), radians(l))),
+    ticks: skyView.ticks,
+  };
+})();

@@ -1,0 +1,521 @@
+"""The map of one channel: its posterior, what its data fit and tell, and the result.
+
+A channel is conditioned on its own data (:func:`conditioned`), which are looked at once: chi^2,
+group by group where that is asked for or needed, unknowns, and the usual mistakes where they do not
+fit. The result (:func:`channel_result`) takes the posterior of the sky, which may be that given
+other channels, too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import jax
+import numpy as np
+from jaxtyping import Float, Int8
+
+from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels, on_host
+from lusee_bayes.core.harmonics import (
+    azimuth_functions,
+    lmax_of,
+    mean_over_m,
+    mode_numbers,
+    modes_to_map,
+    polar_functions,
+)
+from lusee_bayes.core.lazy import healpy
+from lusee_bayes.core.progress import Stages
+from lusee_bayes.experiment.diagnosis import diagnose
+from lusee_bayes.experiment.experiment import Experiment, doubts, explained, infer, posterior_draws
+from lusee_bayes.experiment.rounds import Inference
+from lusee_bayes.experiment.unknowns import Unknowns, UnknownsReport, flux_table, pointing_report
+from lusee_bayes.instrument.beams.fields import HemisphereGrid
+from lusee_bayes.judge.chi2 import LEVELS
+from lusee_bayes.judge.coverage import N_DRAWS, Counts
+from lusee_bayes.judge.measures import (
+    expected_chi2,
+    highest_altitude,
+    strengths,
+    strengths_in_words,
+)
+from lusee_bayes.judge.plausibility import about_information
+from lusee_bayes.judge.residuals import Residuals, residuals
+from lusee_bayes.judge.split import Split
+from lusee_bayes.linear.information import Information
+from lusee_bayes.linear.posterior import Posterior, pixel_std, prior_pixel_std
+from lusee_bayes.results.channel import ChannelData, ChannelResult, Details, Judged
+from lusee_bayes.results.finished_runs import taken
+from lusee_bayes.results.map_files import SavedInformation
+from lusee_bayes.results.map_result import prior_sentence
+from lusee_bayes.sky.prior import DensePrior, Prior
+from lusee_bayes.systematics.beam import beam_rms_difference
+
+DOES_NOT_FIT = LEVELS[-1]
+# standard deviation of modes without prior variance, over the widest
+EXACT = 1e-12
+# groups of the data of a channel of many are judged where what no sky explains is less probable
+DOUBTFUL = 0.01
+REGION_NSIDE = 8
+# draws that a report shows
+FEW = 4
+# of a byte with its sign
+LARGEST_STEP = 127
+# the nodes of the beams that are drawn, and which: an auto, and its crosses with the antennas
+# opposite and beside
+BEAM_NODES, BEAMS = (48, 120), (0, 2, 1)
+
+
+def conditioned(
+    experiment: Experiment, earlier: SavedInformation | None = None, stages: Stages | None = None
+) -> Conditioned:
+    """Condition an experiment's model on its data, and on earlier ones.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    earlier : SavedInformation, optional
+        Of earlier data, to which these are added.
+    stages : Stages, optional
+        Told what is being done.
+
+    Raises
+    ------
+    InputError
+        For data that the earlier ones hold already, and as :func:`infer`.
+    """
+    with (stages or Stages())("posterior"), explained(experiment):
+        own, data = infer(experiment), experiment.data
+        made = Conditioned(experiment, own, own, own, (data.digest(),))
+        if earlier is not None:
+            information = earlier.with_more(made.information, data.digest())
+            prior = own.model.prior
+            posterior = information.posterior(prior)
+            model = replace(own.model, prior=_given_earlier(earlier.information.posterior(prior)))
+            made = Conditioned(
+                experiment,
+                own,
+                replace(own, posterior=posterior),
+                replace(own, model=model, posterior=model.condition(data.data)),
+                (*earlier.digests, data.digest()),
+                information.recentred(np.asarray(posterior.mean)),
+            )
+        jax.block_until_ready(made.found.posterior.white_mean)
+        return made
+
+
+def _given_earlier(posterior: Posterior) -> DensePrior:
+    """What earlier data leave of the sky, as the prior of data to come."""
+    width = np.sqrt(np.asarray(posterior.prior.variance()))
+    # a prior has no density where modes are known exactly
+    exact = np.diag(EXACT * width.max() * (width == 0))[:, width == 0]
+    root = np.concatenate([np.asarray(posterior.root()), exact], axis=1)
+    return DensePrior.of_root(root, np.asarray(posterior.mean))
+
+
+@dataclass(frozen=True)
+class Conditioned:
+    """A channel conditioned on its own data, and on earlier ones of the same frequency.
+
+    Attributes
+    ----------
+    experiment : Experiment
+    own : Inference
+        Of these data alone.
+    found : Inference
+        The model of these data, and the posterior given all.
+    judged : Inference
+        The model that predicts these data, with what earlier ones tell of the sky in its prior.
+    digests : tuple of str
+        Of all data.
+    given : Information or None
+        Of all data; None where there are no earlier ones.
+    """
+
+    experiment: Experiment
+    own: Inference
+    found: Inference
+    judged: Inference
+    digests: tuple[str, ...]
+    given: Information | None = None
+
+    @cached_property
+    def information(self) -> Information:
+        """Of all data."""
+        known = self.own.information if self.given is None else self.given
+        return known or self.own.model.inform(self.experiment.data.data)[0]
+
+    @cached_property
+    def posterior(self) -> Posterior:
+        """Given all data, in NumPy's arrays."""
+        return on_host(self.found.posterior)
+
+    @cached_property
+    def covariance(self) -> ModesMatrix:
+        """Of the posterior, in K^2."""
+        return self.posterior.covariance()
+
+    @property
+    def own_covariance(self) -> ModesMatrix:
+        """Of the posterior given these data alone, in K^2."""
+        return self.covariance if self.given is None else on_host(self.own.posterior).covariance()
+
+    @cached_property
+    def pixel_std(self) -> Pixels:
+        """Standard deviations of the map's pixels, in K."""
+        return pixel_std(self.covariance, self.experiment.scenario.map_nside)
+
+    @cached_property
+    def without_monopole(self) -> tuple[Pixels, Pixels]:
+        """Variances of pixels, of posterior and prior, the monopole taken for known.
+
+        The prior leaves the monopole wide open, which any data settle; with it the prior's share
+        would be close to zero everywhere.
+        """
+        covariance, nside = self.covariance, self.experiment.scenario.map_nside
+        monopole = 1.0 / np.sqrt(4.0 * np.pi)
+        with_monopole = 2.0 * modes_to_map(covariance[0], nside) - monopole * covariance[0, 0]
+        before = prior_pixel_std(on_host(self.found.model.prior), nside) ** 2
+        return self.pixel_std**2 - monopole * with_monopole, before
+
+    @cached_property
+    def unknowns(self) -> Unknowns | None:
+        """Receivers, ground and gain table given the sky, as these data alone tell of them."""
+        reference = np.asarray(self.own.posterior.mean)
+        return Unknowns.of(self.experiment, self.own, reference)
+
+    def chi2(self) -> float:
+        """Of these data under the model that predicts them, sky included."""
+        model, posterior = self.judged.model, self.judged.posterior
+        misfit = float(model.chi2(posterior.mean, self.experiment.data.data))
+        return misfit + float(posterior.prior_chi2())
+
+    @cached_property
+    def drawn(self) -> Float[np.ndarray, "n modes"]:
+        """All draws that are needed, in K; parameters of the prior are drawn once for all."""
+        known = self.experiment.data.truth is not None
+        n = max(self.experiment.scenario.output.draws, FEW) + known * N_DRAWS
+        return posterior_draws(self.experiment, self.posterior, lambda: self.information, n)
+
+    @property
+    def draws(self) -> Float[np.ndarray, "n modes"]:
+        """So many draws as the scenario's output asks for, in K."""
+        return self.drawn[: self.experiment.scenario.output.draws]
+
+    def log_likelihood(self) -> Float[np.ndarray, " n"]:
+        """ln p(d | m) of these data for every draw."""
+        model, data = on_host(self.own.model), self.experiment.data.data
+        if not len(self.draws):
+            return np.zeros(0)
+        # factorised once: it takes far longer than a prediction where N couples times
+        factor = model.noise.factor()
+        white = [factor.whiten(data - model.predict(sky)) for sky in self.draws]
+        chi2 = np.array([float(one @ one) for one in white])
+        return -0.5 * (chi2 + float(factor.log_det()) + model.n_data * np.log(2.0 * np.pi))
+
+    def of_all(self, known: ChannelData) -> ChannelData:
+        """The same with number and chi^2 of all data: a joint posterior is given their sum."""
+        if self.given is None:
+            return known
+        posterior, n_data = self.posterior, int(self.given.n_data)
+        chi2 = float(self.given.chi2(posterior.mean) + posterior.prior_chi2())
+        instrument = Split.of(posterior, chi2, n_data).instrument
+        return replace(known, n_data=n_data, instrument=instrument)
+
+    def compared(self) -> Float[np.ndarray, "more modes"] | None:
+        """Draws less the mean for :class:`.Counts`, in K; None where no truth is known."""
+        if self.experiment.data.truth is None:
+            return None
+        return self.drawn[-N_DRAWS:] - np.asarray(self.posterior.mean)
+
+    def figures(self) -> dict[str, float | bool]:
+        """What :func:`channel_result` takes besides: numbers, and whether C is kept."""
+        model, posterior, data = self.found.model, self.posterior, self.experiment.data.data
+        return {
+            "log_evidence": float(posterior.log_evidence),
+            "information_bits": float(posterior.information_bits()),
+            "chi2": float(model.chi2(posterior.mean, data)),
+            "chi2_expected": expected_chi2(self.judged.posterior, model.n_data),
+            "chi2_model": self.chi2(),
+            "refinement": float(posterior.refinement),
+            "covariance_kept": self.experiment.scenario.output.covariance,
+        }
+
+    def result(self, known: ChannelData, stages: Stages | None = None) -> ChannelResult:
+        """The channel's result under this posterior."""
+        with (stages or Stages())("standard deviations"):
+            report = None
+            if self.unknowns is not None:
+                mean = np.asarray(self.own.posterior.mean)
+                report = self.unknowns.report(mean, self.own_covariance)
+                report = replace(report, onto=self.given is not None)
+            given = (known, self.posterior.mean, self.covariance, self.draws, self.log_likelihood())
+            more = {"unknowns": report, "pixels": self.pixel_std, **self.figures()}
+            return channel_result(*given, self.compared(), **more)
+
+    def known(
+        self, stages: Stages | None = None, *, alone: bool = True, thorough: bool = False
+    ) -> ChannelData:
+        """Look at these data.
+
+        Parameters
+        ----------
+        stages : Stages, optional
+            Told what is being done.
+        alone : bool
+            It is the only channel: a report shows more of it.
+        thorough : bool
+            Judge groups of data and try the usual mistakes even if the data fit.
+        """
+        experiment, own, stages = self.experiment, self.own, stages or Stages()
+        scenario, data, learned = experiment.scenario, experiment.data, experiment.learned
+        fluxes, pointing, diagnosis, left, judged = None, None, None, None, None
+        if experiment.setup.responses and scenario.sources.treatment != "ignored":
+            with stages("fluxes"):
+                fluxes = flux_table(experiment, own)
+        with stages("diagnostics"):
+            if not (alone or thorough):
+                split = Split.of(self.judged.posterior, self.chi2(), own.model.n_data)
+            if alone or thorough or split.instrument.p < DOUBTFUL:
+                left = residuals(self.judged.model, self.judged.posterior, data, self.chi2())
+                split, judged = left.split, self._judged(left)
+            details = _details(self) if alone else None
+        bad = judged is not None and judged.level == DOES_NOT_FIT
+        if bad or (thorough and left is not None):
+            with stages("usual mistakes"):
+                diagnosis = diagnose(experiment, own, left)
+        if scenario.noise.pointing is not None or bad:
+            with stages("clock and pointing"):
+                pointing = pointing_report(experiment, own, self.own_covariance)
+        fitting = experiment.fitting
+        return ChannelData(
+            frequency_mhz=scenario.frequency_mhz,
+            taken=taken(data.observation),
+            labels=tuple(data.labels),
+            hours=np.asarray(data.observation.hours),
+            turntable_deg=np.asarray(data.observation.turntable_deg)[data.observation.run],
+            data=np.asarray(data.grid()),
+            n_data=own.model.n_data,
+            n_missing=data.n_missing,
+            rounds=own.rounds,
+            flagged=None if fitting is None or not fitting.flagged.any() else fitting.flagged,
+            flagged_share=0.0 if fitting is None else fitting.share,
+            prior_std=np.sqrt(np.asarray(own.model.prior.variance())),
+            truth=None if data.truth is None else np.asarray(data.truth),
+            highest_altitude=highest_altitude(data.observation, scenario.map_nside),
+            instrument=split.instrument,
+            prior=prior_sentence(experiment),
+            parameters=() if learned is None else tuple(learned.as_rows()),
+            log_evidence_learned=None if learned is None else learned.log_evidence,
+            beam_rms_difference=beam_rms_difference(experiment.setup),
+            doubts=doubts(experiment, own),
+            judged=judged,
+            details=details,
+            pointing=pointing,
+            fluxes=fluxes,
+            diagnosis=diagnosis,
+            digests=self.digests,
+            information=self.information if scenario.output.information else None,
+        )
+
+    def _judged(self, found: Residuals) -> Judged:
+        """The residuals, with the verdict in words."""
+        data = self.experiment.data
+        prior = on_host(self.found.model.prior)
+        usual = 0.0 if prior.white_mean is None else prior.colour(prior.white_mean)
+        expected = prior.variance() - np.diagonal(self.covariance)
+        left, before = self.without_monopole
+        strong = strengths(self.posterior.mean - usual, expected, before - left)
+        fit = found.fit(strengths_in_words(strong))
+
+        def on_grid(values: np.ndarray) -> np.ndarray:
+            return np.where(data.layout.present, data.layout.scatter(values), np.nan)
+
+        return Judged(
+            level=fit.level,
+            verdict=fit.text,
+            prior=found.split.prior,
+            extremes=tuple(map(str, found.extremes())),
+            suspects=tuple(map(str, found.suspects())),
+            predicted=on_grid(found.predicted),
+            z=on_grid(found.z),
+            groups=found.groups,
+        )
+
+
+def channel_result(
+    known: ChannelData,
+    mean: Modes,
+    covariance: ModesMatrix,
+    draws: Float[np.ndarray, "n modes"],
+    log_likelihood: Float[np.ndarray, " n"],
+    compared: Float[np.ndarray, "more modes"] | None = None,
+    *,
+    unknowns: UnknownsReport | None = None,
+    pixels: Pixels | None = None,
+    independent: Modes | None = None,
+    log_evidence: float = np.nan,
+    information_bits: float = np.nan,
+    chi2: float,
+    chi2_expected: float,
+    chi2_model: float = np.nan,
+    refinement: float = np.nan,
+    covariance_kept: bool = False,
+) -> ChannelResult:
+    """The channel of a mean and a covariance.
+
+    Parameters
+    ----------
+    known : ChannelData
+        Of its own data.
+    mean, covariance : (modes,) and (modes, modes) array
+        In K and K^2.
+    draws : (n, modes) array
+        In K.
+    log_likelihood : (n,) array
+        Of the draws.
+    compared : (more, modes) array, optional
+        Draws less mean for :class:`.Counts`, where the truth is known, in K.
+    unknowns : UnknownsReport, optional
+        Receivers, ground and gain table.
+    pixels : (pixels,) array, optional
+        Standard deviations of pixels in K, where they are known already.
+    independent, log_evidence, information_bits, chi2, chi2_expected, chi2_model, refinement
+        See :class:`.ChannelResult`.
+    covariance_kept : bool
+        Keep the covariance with the result.
+    """
+    mean, covariance = np.asarray(mean), np.asarray(covariance)
+    nside = round(np.sqrt(known.highest_altitude.size / 12))
+    width, held, variance = pixels, (), np.diagonal(covariance)
+    if width is None:
+        width = pixel_std(covariance, nside)
+    if compared is not None and known.truth is not None:
+        held = Counts.of_pixels(width, known.truth - mean, np.asarray(compared)).coverage()
+    power = known.prior_std**2
+    share = np.divide(variance, power, out=np.zeros(len(variance)), where=power > 0)
+    said = vars(known) | {"doubts": (*known.doubts, *about_information(information_bits))}
+    return ChannelResult(
+        **said,
+        mean=mean,
+        std=np.sqrt(variance),
+        prior_fraction=mean_over_m(share),
+        pixel_std=width,
+        draws=np.asarray(draws),
+        log_likelihood=np.asarray(log_likelihood),
+        covariance=covariance if covariance_kept else None,
+        independent=None if independent is None else np.asarray(independent),
+        log_evidence=log_evidence,
+        information_bits=information_bits,
+        chi2=chi2,
+        chi2_expected=chi2_expected,
+        chi2_model=chi2_model,
+        refinement=refinement,
+        coverage=held,
+        unknowns=unknowns,
+    )
+
+
+def _details(channel: Conditioned) -> Details:
+    """What a report shows of a single map beyond it."""
+    setup, covariance = channel.experiment.setup, channel.covariance
+    lmax, nside = setup.scenario.lmax, setup.scenario.map_nside
+    prior = on_host(channel.found.model.prior)
+    known, steps, widths = packed_resolution(covariance, prior)
+    left, before = channel.without_monopole
+    rows = region_rows(nside, lmax)
+    seen = rows @ covariance
+    of_regions = (seen * rows).sum(1)
+    with_monopole = 2.0 * seen[:, 0] - rows[:, 0] * covariance[0, 0]
+    without = np.where(np.arange(len(covariance)) > 0, rows, 0.0)
+    region_prior = (prior.colour_columns(without) ** 2).sum(1)
+    grid = HemisphereGrid.gauss_legendre(*BEAM_NODES)
+    patterns = np.asarray(setup.beam_source.patterns(setup.scenario.frequency_mhz, grid))[0]
+    names = ["auto 00", "|cross 02|", "|cross 01|"]
+    if not setup.scenario.beam.is_file:
+        names = ["auto 00 (North)", "|cross 02| (opposite)", "|cross 01| (perpendicular)"]
+    drawn = [(name, patterns[k]) for name, k in zip(names, BEAMS, strict=True) if k < len(patterns)]
+    return Details(
+        pattern_names=tuple(name for name, _ in drawn),
+        draws=channel.drawn[:FEW],
+        prior_fraction=left / before,
+        region_mean=rows @ channel.posterior.mean,
+        region_std=np.sqrt(of_regions),
+        region_prior_fraction=(of_regions - rows[:, 0] * with_monopole) / region_prior,
+        resolution=known,
+        resolution_step=steps,
+        prior_width=widths,
+        patterns=np.stack([np.abs(pattern) for _, pattern in drawn]),
+    )
+
+
+def packed_resolution(
+    covariance: ModesMatrix, prior: Prior
+) -> tuple[Int8[np.ndarray, "modes modes"], Float[np.ndarray, "ells ells"], Modes]:
+    """Pack what the data know of the modes, for point-spread functions of any direction.
+
+    The resolution matrix is R = 1 - C S^-1 = D K D^-1, with D the prior's standard deviations; of
+    modes that are correlated, those of whole multipoles, since one mode may be 60 times as wide as
+    another. K, which is symmetric where S is diagonal, is kept with a byte for each entry, in steps
+    of its pair of multipoles.
+
+    Parameters
+    ----------
+    covariance : (modes, modes) array
+        Of the posterior, in K^2.
+    prior : Prior
+        S, over the same modes, with NumPy's arrays.
+
+    Returns
+    -------
+    (modes, modes) array of int8
+        In steps; zero for modes without prior variance.
+    (ells, ells) array
+        The steps.
+    (modes,) array
+        D, in K.
+    """
+    variance = np.asarray(prior.variance())
+    ell, _ = mode_numbers(lmax_of(len(variance)))
+    width = np.sqrt(variance if prior.independent else mean_over_m(variance)[ell])
+    power = width > 0
+    # row by row, D^-1 C S^-1 D
+    left = prior.whiten_columns(prior.whiten(covariance))
+    left *= np.divide(width[None], width[:, None], out=np.zeros(left.shape), where=power[:, None])
+    white = np.diag(power.astype(np.float64)) - left
+    if prior.independent:  # but for rounding
+        white = (white + white.T) / 2.0
+    starts = np.flatnonzero(np.diff(ell, prepend=-1))
+    largest = np.maximum.reduceat(np.abs(white), starts, axis=0)
+    largest = np.maximum.reduceat(largest, starts, axis=1)
+    steps = np.where(largest > 0, largest, 1.0) / LARGEST_STEP
+    return np.rint(white / steps[np.ix_(ell, ell)]).astype(np.int8), steps, width
+
+
+def region_nside(nside: int) -> int:
+    """NSIDE of the regions of a map: REGION_NSIDE, or the map's own if that is coarser."""
+    return min(REGION_NSIDE, nside)
+
+
+def region_of(nside: int) -> np.ndarray:
+    """The region (HEALPix RING of :func:`region_nside`) that each pixel (RING) belongs to."""
+    nested = healpy.ring2nest(nside, np.arange(healpy.nside2npix(nside)))
+    coarse = region_nside(nside)
+    return healpy.nest2ring(coarse, nested // (nside // coarse) ** 2)
+
+
+def region_rows(nside: int, lmax: int) -> Float[np.ndarray, "regions modes"]:
+    """Rows that average the pixels of a map over each region."""
+    of = region_of(nside)
+    theta, phi = healpy.pix2ang(nside, np.arange(len(of)))
+    heights, ring = np.unique(theta, return_inverse=True)
+    # pixels of a region on one ring have lambda_l|m|(theta) in common
+    part = of * len(heights) + ring
+    by_part = np.argsort(part, kind="stable")
+    _, first = np.unique(part[by_part], return_index=True)
+    parts = by_part[first]
+    sums = np.add.reduceat(azimuth_functions(phi, lmax)[by_part], first)
+    _, m = mode_numbers(lmax)
+    rows = polar_functions(heights, lmax)[ring[parts]] * sums[:, m + lmax]
+    _, first = np.unique(of[parts], return_index=True)
+    return np.add.reduceat(rows, first) / np.bincount(of)[:, None]

@@ -1,0 +1,163 @@
+"""What the JSON files in the folders of runs hold: written by runs, read back by pages."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import BaseModel, field_validator
+
+from lusee_bayes.experiment.diagnosis import Diagnosis
+from lusee_bayes.experiment.unknowns import PointingReport, UnknownsReport
+from lusee_bayes.judge.chi2 import Level
+from lusee_bayes.judge.coverage import Coverage
+
+
+class ChiSquareSummary(BaseModel, from_attributes=True):
+    """A chi^2 in summary.json, with its expectation and its probability."""
+
+    chi2: float
+    degrees: float
+    p: float
+
+
+class JudgedSummary(BaseModel, from_attributes=True):
+    """How the data of a channel fit, in summary.json."""
+
+    level: Level
+    verdict: str
+    prior: ChiSquareSummary
+    extremes: list[str]
+    suspects: list[str]
+
+
+class ChannelSummary(BaseModel, from_attributes=True):
+    """Figures of a channel in summary.json; null where they are not known."""
+
+    frequency_mhz: float
+    instrument: ChiSquareSummary
+    judged: JudgedSummary | None
+    diagnosis: Diagnosis | None
+    ell_cross: int | None
+    resolution_deg: float | None
+    log_evidence: float | None
+    information_bits: float | None
+    chi2: float
+    chi2_expected: float
+    chi2_model: float | None
+    refinement: float | None
+    n_data: int
+    n_missing: int
+    rounds: int
+    never_observed: float
+    beam_rms_difference: float | None
+    prior: str
+    parameters: list[dict[str, Any]]
+    log_evidence_learned: float | None
+    coverage: tuple[Coverage, ...]
+    unknowns: dict[str, Any] | None
+    pointing: list[dict[str, Any]] | None
+    doubts: list[str]
+
+    @field_validator("unknowns", mode="before")
+    @classmethod
+    def _rows_of_unknowns(cls, told: Any) -> Any:
+        return told.summary() if isinstance(told, UnknownsReport) else told
+
+    @field_validator("pointing", mode="before")
+    @classmethod
+    def _rows_of_offsets(cls, told: Any) -> Any:
+        if not isinstance(told, PointingReport):
+            return told
+        return None if told.offsets is None else told.offsets.to_dict("records")
+
+
+class JointSummary(BaseModel, from_attributes=True):
+    """Figures of a joint posterior in summary.json."""
+
+    prior: str
+    components: tuple[str, ...]
+    solver: str
+    iterations: int
+    chi2: float
+    log_evidence: float
+    information_bits: float
+    refinement: float
+
+
+class JointTestSummary(BaseModel, from_attributes=True):
+    """A joint test of all channels in summary.json."""
+
+    name: str
+    found: str
+    p: float
+    n: int
+    level: Level
+
+
+class PullSummary(BaseModel):
+    """How far the spectrum of a direction is from the truth, in standard deviations."""
+
+    direction: str
+    rms: float
+    worst: float
+    worst_mhz: float
+
+
+class MapSummary(BaseModel):
+    """summary.json of a map run."""
+
+    frequencies_mhz: list[float]
+    unmapped: list[str]
+    joint: JointSummary | None
+    tied: bool
+    level: Level
+    verdict: str
+    log_evidence: float
+    n_data: int
+    n_modes: int
+    doubts: list[str]
+    tests: list[JointTestSummary]
+    pulls: list[PullSummary]
+    unknowns: list[str]
+    channels: list[ChannelSummary]
+    seconds: dict[str, float]
+    peak_memory_gb: float
+    versions: dict[str, str]
+
+
+class SamplingSummary(BaseModel):
+    """sampling.json of a sampled run."""
+
+    program: str
+    chains: int
+    draws: int
+    divergences: int
+    mean_acceptance: float
+    doubts: list[str]
+    step_size: list[float]
+    mean_steps: float
+    gradients_per_second: float | None
+    seconds: dict[str, float]
+    peak_memory_gb: float
+    versions: dict[str, str]
+
+
+class CheckSummary(BaseModel, from_attributes=True):
+    """A check in validation.json; bounds that are not finite are null."""
+
+    name: str
+    value: float
+    lower: float | None
+    upper: float | None
+    passed: bool
+    meaning: str
+
+
+class ValidationSummary(BaseModel):
+    """validation.json: every check, and mode by mode what there is."""
+
+    passed: bool
+    checks: list[CheckSummary]
+    modes: dict[str, list[float | None]]
+    coverage: dict[str, dict[str, float]]
+    p_values: dict[str, float]

@@ -1,0 +1,231 @@
+"""Errors of the beams: along the direction to other beams, or in parameters of the antennas.
+
+Marginalised, they are averaged over the skies of the prior: to first order data hold dA m besides
+A m, which adds dA (S + mu mu^T) dA^T to N, dA being the derivative of A by the unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Annotated, ClassVar
+
+import jax
+import numpy as np
+from jaxtyping import PRNGKeyArray
+from pydantic import Field
+
+from lusee_bayes.core.section import Positive, Section, Treatment, requires
+from lusee_bayes.instrument.beams.fields import ProductBeams
+from lusee_bayes.instrument.beams.monopoles import parameter, with_values
+from lusee_bayes.instrument.beams.source import BeamSource, EmbeddedBeams
+from lusee_bayes.instrument.coupling import Coupling
+from lusee_bayes.instrument.instrument import Instrument
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
+from lusee_bayes.noise import instrument_errors
+from lusee_bayes.systematics.context import Around, Context
+from lusee_bayes.systematics.sources import source_responses
+from lusee_bayes.systematics.systematic import Systematic, Truth, Unknown, Values
+
+
+class BeamErrorSection(Section):
+    """Beams that differ from the model's in the data; give one of the first three keys.
+
+    Attributes
+    ----------
+    shift_mhz : float
+        The data are taken with the beams of frequency + shift.
+    file : str
+        The data are taken with the beams of this file.
+    parameters : dict
+        Prior standard deviations of parameters of the embedded antennas about the values in
+        ``beam``, by name; the data's own are drawn with the seed.
+    treatment : {"marginalised", "sampled", "ignored"}
+        The error's covariance is added to N, its amplitude or parameters are sampled with the
+        map, or it is left out of the model.
+    """
+
+    shift_mhz: Annotated[float, Field(ge=-49, le=49)] | None = None
+    file: str | None = None
+    parameters: dict[str, Positive] = Field(default_factory=dict)
+    treatment: Treatment = "marginalised"
+
+    _one_direction = requires(
+        lambda section: (
+            [section.shift_mhz, section.file, section.parameters or None].count(None) == 2
+        ),
+        "give either shift_mhz, file or parameters",
+    )
+
+
+class BeamErrors(Systematic):
+    """Errors of the beams, of either kind."""
+
+    key: ClassVar[str] = "noise.beam"
+    section: ClassVar[type[Section]] = BeamErrorSection
+    draw: ClassVar[int] = 3
+    first_order: ClassVar[bool] = False
+
+    @classmethod
+    def build(cls, section: BeamErrorSection, context: Context, around: Around) -> BeamErrors:
+        if not section.parameters:
+            return BeamError(context.instrument.coupling_of(difference_of_beams(section, context)))
+        sampled = section.treatment == "sampled"
+        instrument = context.prepared if sampled else context.instrument
+        return InstrumentParameters.centred(instrument, section.parameters)
+
+    @classmethod
+    def truth(cls, section: BeamErrorSection, context: Context, key: PRNGKeyArray) -> Truth:
+        if not section.parameters:
+            return {"beam_amplitude": 1.0}
+        unknowns = InstrumentParameters.centred(context.instrument, section.parameters).unknowns
+        keys = jax.random.split(cls.own_key(key), len(unknowns))
+        return {u.name: float(u.prior().sample(k)) for u, k in zip(unknowns, keys, strict=True)}
+
+    @classmethod
+    def moved(cls, section: BeamErrorSection, context: Context, values: Values) -> Context:
+        """With the true beams, what the ground then adds, and the responses to sources."""
+        if not {"beam_amplitude", *section.parameters} & set(values):
+            return context
+        source, frequency_mhz = _true(section, context, values)
+        beams = source.beams(frequency_mhz, context.beams.lmax)
+        emitted = np.asarray(source.background(frequency_mhz))
+        nominal = np.asarray(context.beam_source.background(context.frequency_mhz))
+        sources = context.scenario.sources.list
+        return replace(
+            context,
+            beam_source=source,
+            beams=beams,
+            coupling=context.instrument.coupling_of(beams),
+            background=context.background + (emitted - nominal),
+            responses=source_responses(sources, context.observation, source, frequency_mhz),
+        )
+
+    @classmethod
+    def in_data(cls, section, context, model, truth, key) -> LinearGaussian:
+        """The same: its A is that of the true beams."""
+        return model
+
+
+def _true(section: BeamErrorSection, context: Context, values: Values) -> tuple[BeamSource, float]:
+    """The antennas that have these values, and the frequency at which they are used."""
+    source, frequency_mhz = context.beam_source, context.frequency_mhz
+    if section.shift_mhz is not None:
+        return source, frequency_mhz + section.shift_mhz
+    if section.file is not None:
+        return context.source_of_file(section.file), frequency_mhz
+    own = {name: values[name] for name in section.parameters}
+    return EmbeddedBeams(with_values(source.monopoles, own)), frequency_mhz
+
+
+def difference_of_beams(section: BeamErrorSection, context: Context) -> ProductBeams:
+    """The direction to other beams, those of a shift or of a file."""
+    source, frequency_mhz = _true(section, context, {})
+    other = source.beams(frequency_mhz, context.beams.lmax)
+    return instrument_errors.difference(other, context.beams)
+
+
+class BeamError(BeamErrors):
+    """Beams that are off along one direction dA by an unknown amplitude, N(0, 1).
+
+    Attributes
+    ----------
+    direction : Coupling
+        dA for an amplitude of one, such as the difference to another beam.
+    """
+
+    direction: Coupling
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        return (Unknown("beam_amplitude"),)
+
+    def effect(self, model, values):
+        """A + amplitude dA."""
+        amplitude = values["beam_amplitude"]
+        return replace(model, coupling=model.coupling.plus(amplitude, self.direction))
+
+    def marginalised(self, model: LinearGaussian) -> LinearGaussian:
+        """Add dA S dA^T to N."""
+        noise = instrument_errors.beam_error_noise(self.direction, model.prior)
+        return replace(model, noise=model.noise + noise)
+
+
+class InstrumentParameters(BeamErrors):
+    """Parameters of the antennas that are not known; their priors are Gaussian.
+
+    Attributes
+    ----------
+    instrument : Instrument
+        The instrument with its present parameters. :meth:`sampled` needs it prepared.
+    centres, widths : dict of float
+        Means and standard deviations of the priors, by the parameters' names.
+    """
+
+    instrument: Instrument
+    # numbers, not arrays: equinox's jit then keeps them known, and the checks of the priors and
+    # the ends of their domains need their values
+    centres: dict[str, float]
+    widths: dict[str, float]
+
+    @classmethod
+    def centred(cls, instrument: Instrument, stds: Mapping[str, float]) -> InstrumentParameters:
+        """Put the priors' means at the instrument's present values.
+
+        Parameters
+        ----------
+        instrument : Instrument
+            The instrument.
+        stds : mapping of float
+            Prior standard deviations by the parameters' names, in their units.
+
+        Raises
+        ------
+        InputError
+            For unknown names, and for a prior that reaches out of a parameter's domain.
+        """
+        centres = {name: float(instrument.value(name)) for name in stds}
+        made = cls(instrument, centres, {name: float(std) for name, std in stds.items()})
+        for unknown in made.unknowns:
+            unknown.prior()
+        return made
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        found = []
+        for name, std in self.widths.items():
+            low, high = parameter(name).low, parameter(name).high
+            found.append(Unknown(name, self.centres[name], std, low=low, high=high))
+        return tuple(found)
+
+    def effect(self, model, values):
+        """A of antennas that have these values."""
+        return replace(model, coupling=self.instrument.dense(values))
+
+    def directions(self) -> list[ProductBeams]:
+        """What one prior standard deviation of each does to the beams, to first order."""
+        known = self.instrument.frequency_mhz, self.instrument.lmax, self.instrument.monopoles
+        slopes = {name: instrument_errors.derivative(name, *known).modes for name in self.widths}
+        return [ProductBeams(std * slopes[name], known[0]) for name, std in self.widths.items()]
+
+    def marginalised(self, model: LinearGaussian) -> LinearGaussian:
+        """Add dA S dA^T for every parameter to N, dA = std times the derivative of A."""
+        for direction in self.directions():
+            error = BeamError(self.instrument.coupling_of(direction))
+            model = error.marginalised(model)
+        return model
+
+
+def true_beams(context: Context) -> ProductBeams:
+    """The beams that simulated data are taken with."""
+    section, key = context.scenario.noise.beam, jax.random.key(context.scenario.seed)
+    if section is None:
+        return context.beams
+    return BeamErrors.moved(section, context, BeamErrors.truth(section, context, key)).beams
+
+
+def beam_rms_difference(context: Context) -> float | None:
+    """RMS difference of the true beams and the model's, over the model's; None if the same."""
+    if context.scenario.noise.beam is None:
+        return None
+    return instrument_errors.rms_difference(true_beams(context), context.beams)

@@ -1,0 +1,189 @@
+"""What systematics are built from: an instrument pointed at a sky, and what the data determine.
+
+Radiometer noise and gain drifts are built around visibilities. Those of the modelled sky are right
+where it is the true one, as for simulated data. Measured visibilities hold their own noise: N is
+small where an auto came out low, and the map is pulled there. With n times of B tau samples each,
+and the exact covariance of p antennas' products, a common amplitude moves by up to
+4 p sqrt(n / (B tau)) of its standard deviation. Drifts are not small, and stay in the measured
+visibilities. What neither troubles is the map's own prediction, in rounds
+(:mod:`lusee_bayes.experiment.rounds`).
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from lusee_bayes.core.arrays import Array, DataVector, Grid, Modes
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.instrument.beams.fields import ProductBeams
+from lusee_bayes.instrument.beams.monopoles import Receiver
+from lusee_bayes.instrument.beams.source import BeamSource
+from lusee_bayes.instrument.coupling import CouplingMatrix
+from lusee_bayes.instrument.instrument import Instrument
+from lusee_bayes.instrument.observation import Observation
+from lusee_bayes.instrument.pointing import Pointing
+from lusee_bayes.instrument.products import DataLayout, all_products, auto_indices
+from lusee_bayes.instrument.schedule import without_gaps
+from lusee_bayes.instrument.visibilities import Calibration, Visibilities
+from lusee_bayes.sky.prior import Prior
+from lusee_bayes.sky.sky_source import Sky
+
+# visibilities that a term of N is built around: the modelled sky's, the data, or the map's own
+NoiseAbout = Literal["model", "measured", "posterior"]
+
+
+@dataclass(frozen=True)
+class Context(ABC):
+    """The pieces of d = A m + n that a scenario stands for.
+
+    Attributes
+    ----------
+    scenario : Scenario
+        Each systematic reads its own section.
+    observation : Observation
+    sky : Sky
+        The scenario's model sky, up to lmax.
+    beam_source : BeamSource
+    instrument : Instrument
+        Orientations and samples, of which A is made for given beams.
+    beams : ProductBeams
+    coupling : CouplingMatrix
+        A.
+    prior : Prior
+        S. Where it is to be learned, what is expected before there are data.
+    responses : tuple of (products, times) arrays
+        Of each point source beside the map, to 1 K sr.
+    background : (products,) array
+        Visibilities without any sky, of ground, antennas and the mean receiver, in K.
+    signal : (products, times) array
+        Visibilities of sky, background and sources through the modelled beams, in K.
+    receiver : Receiver or None
+        The receivers that the data name; None for others.
+    calibration : Calibration or None
+        Of data that are averages of a spectrometer's spectra; None for others.
+    measured : bool
+        Whether the data were given, so that their sky is not the modelled one.
+    """
+
+    scenario: Any
+    observation: Observation
+    sky: Sky
+    beam_source: BeamSource
+    instrument: Instrument
+    beams: ProductBeams
+    coupling: CouplingMatrix
+    prior: Prior
+    responses: tuple[Grid, ...]
+    background: Float[Array, " products"]
+    signal: Grid
+    receiver: Receiver | None = None
+    calibration: Calibration | None = None
+    measured: bool = False
+
+    @abstractmethod
+    def source_of_file(self, file: str) -> BeamSource:
+        """The beams of another file, behind the same receivers and turned as the scenario's."""
+
+    @property
+    def frequency_mhz(self) -> float:
+        """Of the data."""
+        return self.scenario.frequency_mhz
+
+    @property
+    def pointing(self) -> Pointing:
+        """The orientation of the lander at every sample."""
+        return self.instrument.pointing
+
+    @property
+    def layout(self) -> DataLayout:
+        """The product and the time of every datum."""
+        return self.coupling.layout
+
+    @property
+    def offset(self) -> DataVector | None:
+        """The background in every datum, in K; None where there is none."""
+        if not np.any(self.background):
+            return None
+        grid = (self.layout.n_products, self.layout.n_times)
+        return self.layout.gather(np.broadcast_to(self.background[:, None], grid))
+
+    @cached_property
+    def prepared(self) -> Instrument:
+        """The instrument, prepared for A to be made of many beams."""
+        return self.instrument.prepared()
+
+    @property
+    def has_autos(self) -> bool:
+        """Whether every port that was used has its auto somewhere."""
+        seen, n = np.asarray(self.layout.present).any(1), self.beam_source.n_ports
+        products = np.array(all_products(n), dtype=object)
+        used = set(products[seen, :2].ravel())
+        return all(seen[k] for port, k in enumerate(auto_indices(n)) if port in used)
+
+
+@dataclass(frozen=True)
+class Around:
+    """What a systematic may be built around, besides its context.
+
+    Attributes
+    ----------
+    data : Visibilities or None
+        The measured data; None before there are any.
+    visibilities : (products, times) array or None
+        Visibilities for the gain term, in K; None for those that the scenario names.
+    sky : (modes,) array or None
+        About which the model is linear in its unknowns, in K; None for the scenario's.
+    values : mapping of float or None
+        Of the unknowns about which it is linear, by name; None for their prior means.
+    freedom : (data,) array or None
+        Share of each datum that sky and others follow, for the gain table; None for none.
+    """
+
+    data: Visibilities | None = None
+    visibilities: Grid | None = None
+    sky: Modes | None = None
+    values: Mapping[str, float] | None = None
+    freedom: DataVector | None = None
+
+
+def noise_visibilities(context: Context, around: Around, about: NoiseAbout) -> Grid:
+    """The visibilities that a term of N is built around, in K.
+
+    Before there is a prediction it is the measured ones', or, if autos that noise depends on were
+    never measured, the modelled sky's.
+    """
+    if about == "model" or around.data is None:
+        return context.signal
+    if about == "posterior" and around.visibilities is not None:
+        return around.visibilities
+    if about == "posterior" and not context.has_autos:
+        return context.signal
+    return measured_visibilities(around.data, context.signal)
+
+
+def measured_visibilities(data: Visibilities, model: Grid) -> Grid:
+    """Visibilities that set a noise level: the measured ones, absent samples interpolated.
+
+    A time without any sample takes the model's (it enters nothing).
+
+    Raises
+    ------
+    InputError
+        If an auto was never measured, but other products of its port were.
+    """
+    some = data.layout.present.any(0)
+    try:
+        measured = without_gaps(data.layout.scatter(data.data), data.layout)
+    except InputError as error:
+        raise InputError(
+            f"{error}, or use noise.radiometer.temperature=posterior and "
+            "noise.gain.visibilities=posterior"
+        ) from error
+    return np.where(some[None], measured, model)

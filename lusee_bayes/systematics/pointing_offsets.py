@@ -1,0 +1,386 @@
+"""Offsets of clock and pointing: A is that of antennas that lean, are turned and look later.
+
+The clock is expanded about, too: what is left of it beyond its value in :attr:`Pointing.about` is a
+turn of the Moon at a constant rate (:func:`.turned_by_offsets`); all angles are exact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Annotated, Any, ClassVar, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+from pydantic import Field
+
+from lusee_bayes.core.arrays import Array, DataVector, namespace, on_device
+from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.harmonics import Rotation, generators, lmax_of
+from lusee_bayes.core.reading import naming
+from lusee_bayes.core.section import NOT_TINY, Section, Treatment, requires
+from lusee_bayes.instrument.beams.monopoles import Monopoles, beams_towards
+from lusee_bayes.instrument.coupling import CouplingMatrix
+from lusee_bayes.instrument.pointing import (
+    CLOCK,
+    OFFSETS,
+    Pointing,
+    offset_kind,
+    offset_names,
+    turned_by_offsets,
+    with_offsets,
+)
+from lusee_bayes.instrument.products import DataLayout
+from lusee_bayes.systematics.context import Around, Context
+from lusee_bayes.systematics.sources import SOURCE_NODES, expected_signal, source_responses
+from lusee_bayes.systematics.systematic import Systematic, Truth, Unknown, Values, with_added
+
+# wider priors are none: the sky looks nothing like it did
+Offset = Annotated[float, Field(gt=0, le=45), NOT_TINY]
+
+
+class PointingSection(Section):
+    """Offsets of clock and pointing: prior standard deviations of what has to be added.
+
+    Attributes
+    ----------
+    clock_s : float
+        Samples were taken later than their times say by so many seconds.
+    clock_drift_s_per_day : float
+        And later by so much more every day from the first sample on.
+    turntable_deg : float
+        Angle of the turntable, of every run on its own.
+    lon_deg : float
+        Longitude of the site.
+    lat_deg : float
+        Latitude of the site.
+    tilt_east_deg : float
+        Lean of the lander towards East.
+    tilt_north_deg : float
+        Lean of the lander towards North.
+    treatment : {"marginalised", "sampled", "ignored"}
+        Their covariance is added to N to first order, they are sampled with the map, or they are
+        left out of the model.
+    around : {"posterior", "model"}
+        The sky and the offsets about which data depend on offsets to first order: those that the
+        data tell, found in rounds, or the scenario's sky and none.
+    true_values : dict
+        What simulated data hold, by name (turntable_0_deg, ... where there are several runs);
+        the others are drawn from their priors.
+    """
+
+    clock_s: Annotated[float, Field(gt=0, le=1e6), NOT_TINY] | None = None
+    clock_drift_s_per_day: Annotated[float, Field(gt=0, le=1e4), NOT_TINY] | None = None
+    turntable_deg: Offset | None = None
+    lon_deg: Offset | None = None
+    lat_deg: Offset | None = None
+    tilt_east_deg: Offset | None = None
+    tilt_north_deg: Offset | None = None
+    treatment: Treatment = "marginalised"
+    around: Literal["posterior", "model"] = "posterior"
+    true_values: dict[str, Annotated[float, Field(ge=-1e6, le=1e6)]] = Field(default_factory=dict)
+
+    _something_is_not_known = requires(
+        lambda section: section.kinds,
+        f"give a standard deviation of at least one of {', '.join(OFFSETS)}",
+    )
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """What is not known."""
+        return tuple(kind for kind in OFFSETS if getattr(self, kind) is not None)
+
+
+class PointingOffsets(Systematic):
+    """Offsets of clock and pointing with independent Gaussian priors about zero.
+
+    Attributes
+    ----------
+    offsets : tuple of str
+        Their names (:func:`.offset_names`).
+    errors : (offsets,) array
+        Prior standard deviations, in the units that the names end with.
+    about : (2,) array
+        What clock and its drift are off by in :attr:`pointing`.
+    pointing : Pointing
+        Of a clock that is off, and all else as the observation says.
+    hours : (times,) array
+        Since the first sample.
+    modes : (products, modes) array
+        The beams in the frame of the lander.
+    mcmf_from_lander : (3, 3) array
+        Without offsets.
+    layout : DataLayout
+        The data.
+    sources : MovingSources or None
+        The point sources; None where the model has none.
+    about_data : bool
+        Whether they are about values and a sky that the data determine.
+    """
+
+    key: ClassVar[str] = "noise.pointing"
+    section: ClassVar[type[Section]] = PointingSection
+    words: ClassVar[str] = "clock and pointing"
+    draw: ClassVar[int] = 7
+    remedy: ClassVar[str] = (
+        "smaller standard deviations in noise.pointing, or its treatment=sampled"
+    )
+    has_table: ClassVar[bool] = True
+
+    offsets: tuple[str, ...] = eqx.field(static=True)
+    errors: Float[Array, " offsets"]
+    about: Float[Array, "2"]
+    pointing: Pointing
+    hours: Float[Array, " times"]
+    modes: Float[Array, "products modes"]
+    mcmf_from_lander: Float[Array, "3 3"]
+    layout: DataLayout
+    sources: MovingSources | None = None
+    about_data: bool = eqx.field(static=True, default=True)
+
+    @property
+    def moves(self) -> bool:
+        return self.about_data
+
+    @classmethod
+    def in_rounds(cls, section: PointingSection) -> bool:
+        return section.around == "posterior"
+
+    @classmethod
+    def build(cls, section: PointingSection, context: Context, around: Around) -> PointingOffsets:
+        names = offset_names(section.kinds, context.observation.n_runs)
+        stds = {name: float(getattr(section, offset_kind(name))) for name in names}
+        values = around.values or {}
+        found = cls.of(context, stds, {name: values.get(name, 0.0) for name in names})
+        return replace(found, about_data=cls.in_rounds(section))
+
+    @classmethod
+    def of(
+        cls, context: Context, stds: Mapping[str, float], values: Mapping[str, float]
+    ) -> PointingOffsets:
+        """Of a context that is moved to values, with these prior standard deviations."""
+        back = {name: -value for name, value in values.items() if name not in CLOCK}
+        observation = with_offsets(context.observation, back)
+        pointing = context.pointing.placed(observation)
+        sources = None
+        if context.responses and context.scenario.sources.treatment != "ignored":
+            sources = MovingSources.of(context)
+        found = cls(
+            tuple(stds),
+            np.array(list(stds.values())),
+            np.array([values.get(name, 0.0) for name in CLOCK]),
+            pointing,
+            context.observation.hours,
+            context.beams.modes,
+            observation.lander_from_mcmf().T,
+            context.layout,
+            sources,
+        )
+        if sources is None:
+            return found
+        # those of the context are there already
+        orientation = found.orientation(dict.fromkeys(stds, 0.0) | dict(values))
+        known = np.asarray(sources.seen(orientation, context.layout))
+        return replace(found, sources=replace(sources, known=known))
+
+    @classmethod
+    def moved(cls, section: PointingSection, context: Context, values: Values) -> Context:
+        """Seen at other times, from other places: A, the responses to sources, and the signal."""
+        names = offset_names(section.kinds, context.observation.n_runs)
+        offsets = {name: value for name, value in values.items() if name in names}
+        return shifted(context, offsets) if offsets else context
+
+    @classmethod
+    def truth(cls, section: PointingSection, context: Context, key: Any) -> Truth:
+        drawn = super().truth(section, context, key)
+        for name in section.true_values:
+            if name not in drawn:
+                raise InputError(
+                    f"noise.pointing.true_values has '{name}', which is not among the offsets "
+                    f"that have a prior; {nearest(name, tuple(drawn))}"
+                )
+        return drawn | {name: float(value) for name, value in section.true_values.items()}
+
+    @classmethod
+    def in_data(cls, section, context, model, truth, key):
+        """The same: its A is that of the offsets."""
+        return model
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        pairs = zip(self.offsets, self.errors, strict=True)
+        return tuple(Unknown(name, 0.0, std) for name, std in pairs)
+
+    def turned(self, values: Values) -> Pointing:
+        """The pointing of values by name."""
+        known = dict(zip(CLOCK, self.about, strict=True))
+        left = {name: values[name] - known.get(name, 0.0) for name in self.offsets}
+        return turned_by_offsets(self.pointing, self.hours, left)
+
+    def effect(self, model, values):
+        """A of the offsets; sources with their mean fluxes move with it."""
+        pointing = self.turned(values)
+        model = replace(model, coupling=CouplingMatrix.of_modes(self.modes, pointing, self.layout))
+        if self.sources is None:
+            return model
+        seen = self.sources.seen(self.orientation(values), self.layout)
+        return with_added(model, seen - self.sources.known)
+
+    def derivative(self, model, sky, centre):
+        """That of :meth:`effect`, through the turns of the antennas.
+
+        ::
+
+            A(z) m = sum_k w_k A_k m to first order,    A_k of the beams K_k b,
+
+        with the rotation vector w(t) by which the antennas turn, in their frame, and the generators
+        K_k of turns about its axes. What JAX differentiates, w(z), compiles in no time.
+        """
+        pointing = self.turned(self.values(centre))
+        parts = _orientation_and_slopes(*on_device((self, centre)))
+        orientation, slopes = np.asarray(parts[0]), np.asarray(parts[1])
+        turn = np.einsum("tji,tjkn->tikn", orientation, slopes)
+        columns = 0.0
+        for axis in range(3):
+            blocks = (generators(ell)[axis] for ell in range(lmax_of(self.modes.shape[1]) + 1))
+            beams = Rotation(tuple(blocks))(self.modes)
+            seen = CouplingMatrix.of_modes(beams, pointing, self.layout) @ np.asarray(sky)
+            w = turn[:, (axis + 2) % 3, (axis + 1) % 3]
+            columns = columns + seen[:, None] * w[np.asarray(self.layout.time)]
+        return (
+            columns
+            if self.sources is None
+            else columns + _source_slopes(*on_device((self, centre)))
+        )
+
+    def orientation(self, values: Values) -> Float[Array, "times 3 3"]:
+        """The rotation from the antennas' frame to the Moon-fixed one at every sample.
+
+        The Moon turns about its z axis, 0.04 degrees from the pole.
+        """
+        pointing = self.turned(values)
+        lon, lat, east, north = (pointing.turns[k] for k in range(4))
+        spans = [span.stop - span.start for _, span in pointing.runs()]
+        turntable = pointing.turntable[np.repeat(np.arange(len(spans)), spans)]
+        lean = _about(0, -lat) @ _about(1, east) @ _about(0, -north)
+        later = pointing.azimuth - self.pointing.azimuth
+        return _about(2, lon - later) @ self.mcmf_from_lander @ lean @ _about(2, turntable)
+
+
+@eqx.filter_jit
+def _orientation_and_slopes(offsets: PointingOffsets, centre: Array) -> tuple[Array, Array]:
+    def orientation(z: Array) -> Array:
+        return offsets.orientation(offsets.values(z))
+
+    return orientation(centre), jax.jacfwd(orientation)(centre)
+
+
+@eqx.filter_jit
+def _source_slopes(offsets: PointingOffsets, centre: Array) -> Array:
+    def seen(z: Array) -> Array:
+        return offsets.sources.seen(offsets.orientation(offsets.values(z)), offsets.layout)
+
+    return jax.jacfwd(seen)(centre)
+
+
+def _about(axis: int, angle: float | Array) -> Float[Array, "*batch 3 3"]:
+    """Rotations about an axis by angles in radians."""
+    xp = namespace(angle)
+    cosine, sine, one, zero = xp.cos(angle), xp.sin(angle), xp.ones_like(angle), 0.0 * angle
+    # about x, from y towards z; the others by a cyclic swap
+    rows = [[one, zero, zero], [zero, cosine, -sine], [zero, sine, cosine]]
+    return xp.stack(
+        [xp.stack([rows[(i - axis) % 3][(j - axis) % 3] for j in range(3)], -1) for i in range(3)],
+        -2,
+    )
+
+
+class MovingSources(eqx.Module):
+    """Point sources with their mean fluxes, as antennas see them that are turned.
+
+    Between the clock's values in :attr:`PointingOffsets.about` and others, those of the solar
+    system stand still among the stars.
+
+    Attributes
+    ----------
+    directions : (sources, instants, 3) array
+        Unit vectors in the Moon-fixed frame, at all instants of all samples.
+    fluxes : (sources,) array
+        In K sr.
+    stokes_v : (sources,) array or None
+        V / I; None where all are zero.
+    sample : (instants,) array
+        The sample of each instant.
+    weight : (instants,) array
+        Of each in the mean over its sample.
+    monopoles : Monopoles
+    frequency_mhz : float
+    known : (data,) array or None
+        What of it is part of the data already, in K.
+    """
+
+    directions: Float[Array, "sources instants 3"]
+    fluxes: Float[Array, " sources"]
+    stokes_v: Float[Array, " sources"] | None
+    sample: Int[Array, " instants"]
+    weight: Float[Array, " instants"]
+    monopoles: Monopoles
+    frequency_mhz: float = eqx.field(static=True)
+    known: Float[Array, " data"] | None = None
+
+    @classmethod
+    def of(cls, context: Context) -> MovingSources:
+        """The sources of a context."""
+        instants, sample, weight = context.observation.at_nodes(SOURCE_NODES)
+        sections = context.scenario.sources.list
+        vectors = [np.broadcast_to(s.direction(instants), (len(sample), 3)) for s in sections]
+        circular = np.array([s.stokes_v for s in sections])
+        return cls(
+            np.einsum("tij,stj->sti", instants.mcmf_from_galactic, np.stack(vectors)),
+            np.array([s.mean_flux(context.frequency_mhz) for s in sections]),
+            circular if circular.any() else None,
+            sample,
+            weight,
+            context.beam_source.monopoles,
+            context.beams.frequency_mhz,
+        )
+
+    def seen(self, orientation: Float[Array, "times 3 3"], layout: DataLayout) -> DataVector:
+        """What they add to the data, in K; differentiable but where a source rises or sets."""
+        turned = jnp.einsum("sti,tij->stj", self.directions, orientation[self.sample])
+        shape = (layout.n_products, *turned.shape[:2])
+        known = (self.frequency_mhz, turned.reshape(-1, 3), self.monopoles)
+        response = beams_towards(*known).reshape(shape)
+        if self.stokes_v is not None:
+            circular = beams_towards(*known, stokes="V").reshape(shape)
+            response = response + self.stokes_v[None, :, None] * circular
+        both = jnp.einsum("kst,s,t->kt", response, self.fluxes, self.weight)
+        grid = jnp.zeros((layout.n_products, layout.n_times)).at[:, self.sample].add(both)
+        return layout.gather(grid)
+
+
+def shifted(context: Context, values: Mapping[str, float]) -> Context:
+    """The context with another observation, and what follows: A, responses to sources, signal."""
+    given = ", ".join(f"{name} = {value:g}" for name, value in values.items() if value)
+    with naming(f"noise.pointing, with {given or 'no offsets'}"):
+        observation = with_offsets(context.observation, values)
+    if any(values.get(name) for name in CLOCK):
+        frame = np.asarray(context.pointing.pole_frame)
+        pointing = Pointing.of(observation, context.sky.lmax, pole_frame=frame)
+    else:  # the sky turns as before
+        pointing = context.pointing.placed(observation)
+    sources, frequency_mhz = context.scenario.sources.list, context.frequency_mhz
+    responses = source_responses(sources, observation, context.beam_source, frequency_mhz)
+    complete = CouplingMatrix.build(context.beams, pointing)
+    parts = complete, context.sky, context.background, responses
+    return replace(
+        context,
+        observation=observation,
+        instrument=replace(context.instrument, pointing=pointing),
+        coupling=replace(complete, layout=context.layout),
+        responses=responses,
+        signal=expected_signal(sources, *parts),
+    )

@@ -1,0 +1,142 @@
+"""The sky's prior spectrum, where it is known up to an amplitude and a tilt, or a factor a band.
+
+There is no Gaussian term for them: marginalised, they stay at their medians. Nothing of it is in
+the data.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Annotated, Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+from pydantic import Field
+
+from lusee_bayes.core.arrays import Array, scalar
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.section import Positive, Section, requires
+from lusee_bayes.sky.prior import HarmonicPrior
+from lusee_bayes.systematics.context import Around, Context
+from lusee_bayes.systematics.systematic import Scale, Truth, Unknown, scalar_or_none
+
+# the ell at which the amplitude of the spectrum is defined, plus one
+PIVOT = 10.0
+
+
+class SpectrumSection(Section):
+    """What may be sampled of C_ell.
+
+    Attributes
+    ----------
+    log_amplitude_std : float
+        Prior standard deviation of ln A; A is sampled if it is given.
+    tilt_std : float
+        Prior standard deviation of the tilt, which is sampled if it is given.
+    band_edges : tuple of int
+        First ell of each band but the lowest; amplitudes of the bands are sampled if it is given.
+    log_band_std : float
+        Prior standard deviation of ln of each band's amplitude.
+    """
+
+    log_amplitude_std: Positive | None = None
+    tilt_std: Positive | None = None
+    band_edges: tuple[Annotated[int, Field(ge=1)], ...] = ()
+    log_band_std: Positive = 1.0
+
+    _one_parameterisation = requires(
+        lambda section: (
+            not (section.band_edges and (section.log_amplitude_std or section.tilt_std))
+        ),
+        "give either band_edges or log_amplitude_std and tilt_std",
+    )
+    _bands_grow = requires(
+        lambda section: list(section.band_edges) == sorted(set(section.band_edges)),
+        "band_edges must grow from one to the next",
+    )
+
+    @property
+    def samples(self) -> bool:
+        """Whether something of the prior is to be sampled."""
+        known = self.log_amplitude_std is None and self.tilt_std is None
+        return not known or bool(self.band_edges)
+
+
+class PriorSpectrum(Scale):
+    """C_ell up to an amplitude and a tilt, A ((ell + 1) / 10)^tilt, or a factor for each band.
+
+    Attributes
+    ----------
+    log_amplitude_std : () array, optional
+        Prior standard deviation of ln A; None if A is known.
+    tilt_std : () array, optional
+        Prior standard deviation of the tilt; None if it is known.
+    edges : tuple of int
+        First ell of every band but the lowest, growing; none for no bands.
+    log_band_std : () array
+        Prior standard deviation of the natural logarithm of each band's factor.
+    """
+
+    key: ClassVar[str] = "prior"
+    section: ClassVar[type[Section]] = SpectrumSection
+
+    log_amplitude_std: Float[Array, ""] | None = eqx.field(default=None, converter=scalar_or_none)
+    tilt_std: Float[Array, ""] | None = eqx.field(default=None, converter=scalar_or_none)
+    edges: tuple[int, ...] = eqx.field(static=True, default=())
+    log_band_std: Float[Array, ""] = eqx.field(default=1.0, converter=scalar)
+
+    @classmethod
+    def treatment(cls, scenario: Any) -> str | None:
+        return "sampled" if scenario.prior.samples else None
+
+    @classmethod
+    def build(cls, section: SpectrumSection, context: Context, around: Around) -> PriorSpectrum:
+        stds = section.log_amplitude_std, section.tilt_std
+        return cls(*stds, section.band_edges, section.log_band_std)
+
+    @classmethod
+    def truth(cls, section: Any, context: Context, key: PRNGKeyArray) -> Truth:
+        return {}
+
+    @classmethod
+    def in_data(cls, section, context, model, truth, key):
+        return model
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        """The sites ``amplitude`` and ``tilt``, or ``band_power``: lowest ells first."""
+        found = []
+        if self.log_amplitude_std is not None:
+            found.append(Unknown("amplitude", 1.0, self.log_amplitude_std, log=True))
+        if self.tilt_std is not None:
+            found.append(Unknown("tilt", 0.0, self.tilt_std))
+        if self.edges:
+            n_bands = len(self.edges) + 1
+            found.append(Unknown("band_power", 1.0, self.log_band_std, n_bands, log=True))
+        return tuple(found)
+
+    def effect(self, model, values):
+        """Multiply C_ell by the factor of each ell.
+
+        Raises
+        ------
+        InputError
+            If the prior has no C_ell, or a band begins above its highest ell.
+        """
+        if not isinstance(model.prior, HarmonicPrior):
+            raise InputError(
+                "a sampled spectrum is that of an isotropic prior, got "
+                f"{type(model.prior).__name__}; use a HarmonicPrior"
+            )
+        spectrum = model.prior.spectrum
+        ell = np.arange(spectrum.shape[0])
+        if self.edges:
+            if self.edges[-1] > ell[-1]:
+                raise InputError(f"a band begins at ell = {self.edges[-1]}, above lmax = {ell[-1]}")
+            band = np.searchsorted(np.asarray(self.edges), ell, side="right")
+            spectrum = spectrum * values["band_power"][band]
+        slope = jnp.asarray((ell + 1.0) / PIVOT) ** values.get("tilt", 0.0)
+        spectrum = spectrum * values.get("amplitude", 1.0) * slope
+        return replace(model, prior=HarmonicPrior(spectrum, mean=model.prior.mean))

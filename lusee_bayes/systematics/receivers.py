@@ -1,0 +1,157 @@
+"""Noise of the receivers: every port's own power, constant in time, in that port's auto.
+
+The mean power is part of the background, and so of the radiometer noise; what is unknown is by how
+much each port's power differs from it.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+import jax
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+from pydantic import Field
+
+from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.section import Megahertz, Positive, Section, Seed, Treatment, requires
+from lusee_bayes.instrument.beams.source import BeamSource
+from lusee_bayes.instrument.products import auto_indices
+from lusee_bayes.systematics.context import Around, Context
+from lusee_bayes.systematics.systematic import Systematic, Truth, Unknown, with_added
+
+# cosines and sines of which a smooth spectrum is made
+N_WAVES = 512
+
+
+class ReceiverNoiseSection(Section):
+    """Noise of every port's receiver: constant, in that port's auto; give one of the powers.
+
+    Attributes
+    ----------
+    power_v2_hz : float
+        Mean power in V^2/Hz at the receiver's input; needs a response file, which knows volts.
+    power_k : float
+        Mean power as an antenna temperature.
+    slope : float
+        Exponent of frequency, with which the mean goes.
+    reference_mhz : float
+        Frequency at which the mean is the given power.
+    relative_std : float
+        Prior standard deviation of every port's own power over the mean.
+    smooth_octaves : float
+        What a port's power is off by is a smooth function of frequency, which forgets itself over
+        so many octaves; without it, every frequency has an error of its own.
+    smooth_seed : int
+        Seed of that function in simulated data; by default the scenario's. Channels of a run of
+        several frequencies have that of the run.
+    treatment : {"marginalised", "sampled", "ignored"}
+        Their covariance is added to N, the powers are sampled with the map, or the model takes
+        all of them for the mean.
+    """
+
+    power_v2_hz: Positive | None = None
+    power_k: Positive | None = None
+    slope: Annotated[float, Field(ge=-10, le=10)] = 0.0
+    reference_mhz: Megahertz = 10.0
+    relative_std: Positive = 0.1
+    smooth_octaves: Positive | None = None
+    smooth_seed: Seed | None = None
+    treatment: Treatment = "marginalised"
+
+    _one_power = requires(
+        lambda section: (section.power_v2_hz is None) != (section.power_k is None),
+        "give either power_v2_hz or power_k",
+    )
+
+    def powers(self, source: BeamSource, frequency_mhz: float) -> Float[np.ndarray, " ports"]:
+        """Mean noise of every port's receiver in K.
+
+        Raises
+        ------
+        InputError
+            If it is given in V^2/Hz, and the beams know no volts.
+        """
+        rise = (frequency_mhz / self.reference_mhz) ** self.slope
+        if self.power_k is not None:
+            return np.full(source.n_ports, self.power_k * rise)
+        circuit = source.circuit(frequency_mhz)
+        if circuit is None:
+            raise InputError(
+                "noise.receiver.power_v2_hz needs antennas that know volts, which are those of a "
+                "response file; give that as beam.file, or use noise.receiver.power_k"
+            )
+        return self.power_v2_hz * rise / circuit.per_kelvin.diagonal().real
+
+
+class Receivers(Systematic):
+    """Powers of the receivers, with independent Gaussian priors.
+
+    Attributes
+    ----------
+    powers, errors : (ports,) array
+        Means and standard deviations of the priors, in K.
+    per_kelvin : (data, ports) array
+        What each kelvin adds to the data: 1 in the port's auto.
+    """
+
+    key: ClassVar[str] = "noise.receiver"
+    section: ClassVar[type[Section]] = ReceiverNoiseSection
+    words: ClassVar[str] = "the receivers"
+    unit: ClassVar[str] = "K"
+    draw: ClassVar[int] = 8
+    changes_coupling: ClassVar[bool] = False
+
+    powers: Float[Array, " ports"]
+    errors: Float[Array, " ports"]
+    per_kelvin: Float[Array, "data ports"]
+
+    @classmethod
+    def build(cls, section: ReceiverNoiseSection, context: Context, around: Around) -> Receivers:
+        powers = section.powers(context.beam_source, context.frequency_mhz)
+        own = np.asarray(context.layout.product)[:, None] == auto_indices(len(powers))[None]
+        return cls(powers, section.relative_std * powers, own.astype(np.float64))
+
+    @classmethod
+    def truth(cls, section: ReceiverNoiseSection, context: Context, key: PRNGKeyArray) -> Truth:
+        if section.smooth_octaves is None:
+            return super().truth(section, context, key)
+        shared = key if section.smooth_seed is None else jax.random.key(section.smooth_seed)
+        octave = float(np.log2(context.frequency_mhz))
+        receivers = cls.build(section, context, Around())
+        own, n = jax.random.fold_in(shared, cls.draw), len(receivers.unknowns)
+        return receivers.values(_smooth_spectra(own, n, octave / section.smooth_octaves))
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        pairs = zip(self.powers, self.errors, strict=True)
+        return tuple(Unknown(f"receiver_{port}_k", *pair) for port, pair in enumerate(pairs))
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return tuple(f"receiver {port}" for port in range(len(self.powers)))
+
+    def effect(self, model, values):
+        """Add what the powers differ from their means by."""
+        return with_added(model, self.per_kelvin @ (self.stacked(values) - self.powers))
+
+
+def _smooth_spectra(key: PRNGKeyArray, n_ports: int, x: float) -> Float[np.ndarray, " ports"]:
+    """Values at x of functions of covariance exp(-(x - x')^2 / 2), one for each port.
+
+    ::
+
+        z(x) = sum_k (a_k cos w_k x + b_k sin w_k x) / sqrt(K),    a, b, w ~ N(0, 1),
+
+    whose covariance over keys is the mean of cos w (x - x'), and whose values are N(0, 1) for
+    any w.
+    """
+    waves, cosines, sines = np.asarray(jax.random.normal(key, (3, n_ports, N_WAVES)))
+    values = cosines * np.cos(waves * x) + sines * np.sin(waves * x)
+    return values.sum(1) / np.sqrt(N_WAVES)
+
+
+def is_receiver(name: str) -> bool:
+    """Tell whether an unknown's name is that of a receiver's power."""
+    return name.startswith("receiver_") and name.endswith("_k")

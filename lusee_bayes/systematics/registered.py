@@ -1,0 +1,47 @@
+"""The systematics that a scenario may have, and its section ``noise``, which follows from them.
+
+A new one is a file beside this one, and its line here.
+"""
+
+from __future__ import annotations
+
+from pydantic import create_model
+
+from lusee_bayes.core.section import Section
+from lusee_bayes.systematics.beam import BeamErrors
+from lusee_bayes.systematics.gain_drifts import GainDrifts
+from lusee_bayes.systematics.gain_table import GainTable
+from lusee_bayes.systematics.noise_level import NoiseLevel, RadiometerSection
+from lusee_bayes.systematics.pointing_offsets import PointingOffsets
+from lusee_bayes.systematics.prior_spectrum import PriorSpectrum
+from lusee_bayes.systematics.receivers import Receivers
+from lusee_bayes.systematics.regolith import RegolithTemperature
+from lusee_bayes.systematics.sources import PointSources
+from lusee_bayes.systematics.systematic import Systematic
+
+# in the order in which they are applied to the model
+SYSTEMATICS: tuple[type[Systematic], ...] = (
+    NoiseLevel,
+    PriorSpectrum,
+    PointingOffsets,
+    BeamErrors,
+    PointSources,
+    Receivers,
+    RegolithTemperature,
+    GainTable,
+    GainDrifts,
+)
+
+_TERMS = {
+    cls.key.removeprefix("noise."): (cls.section | None, None)
+    for cls in SYSTEMATICS
+    if cls.key.startswith("noise.")
+} | {"radiometer": (RadiometerSection, RadiometerSection())}
+# every systematic ``noise.KEY`` is an entry
+NoiseSection = create_model(
+    "NoiseSection",
+    __base__=Section,
+    __doc__="The terms of N; a term that is left out is neither in the data nor in N.",
+    __module__=__name__,
+    **_TERMS,
+)

@@ -1,0 +1,89 @@
+"""Temperature of the ground, whose emission is in every product."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+from jaxtyping import Float
+
+from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.section import Positive, Section, Treatment
+from lusee_bayes.instrument.beams.source import BeamSource
+from lusee_bayes.systematics.context import Around, Context
+from lusee_bayes.systematics.systematic import Systematic, Unknown, with_added
+
+
+class RegolithSection(Section):
+    """Temperature of the ground, known to be about ``beam.moon_temperature_k``.
+
+    Attributes
+    ----------
+    std_k : float
+        Prior standard deviation.
+    treatment : {"marginalised", "sampled", "ignored"}
+        Its covariance is added to N, it is sampled with the map, or the model takes
+        ``beam.moon_temperature_k`` for the truth.
+    """
+
+    std_k: Positive
+    treatment: Treatment = "marginalised"
+
+
+class RegolithTemperature(Systematic):
+    """Temperature of the ground, with a Gaussian prior.
+
+    Attributes
+    ----------
+    mean, std : () array
+        Of the prior, in K.
+    per_kelvin : (data,) array
+        What each kelvin adds to the data.
+    """
+
+    key: ClassVar[str] = "noise.regolith"
+    section: ClassVar[type[Section]] = RegolithSection
+    words: ClassVar[str] = "the regolith"
+    unit: ClassVar[str] = "K"
+    labels: ClassVar[tuple[str, ...]] = ("regolith",)
+    draw: ClassVar[int] = 9
+    changes_coupling: ClassVar[bool] = False
+
+    mean: Float[Array, ""]
+    std: Float[Array, ""]
+    per_kelvin: Float[Array, " data"]
+
+    @classmethod
+    def build(cls, section: RegolithSection, context: Context, around: Around):
+        added = ground_per_kelvin(context.beam_source, context.beams.frequency_mhz)
+        seen = added[np.asarray(context.layout.product)]
+        mean = np.asarray(context.scenario.beam.moon_temperature_k)
+        return cls(mean, np.asarray(section.std_k), seen)
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        return (Unknown("regolith_k", self.mean, self.std),)
+
+    def effect(self, model, values):
+        """Add what ground that is warmer than the mean emits."""
+        return with_added(model, self.per_kelvin * (values["regolith_k"] - self.mean))
+
+
+def ground_per_kelvin(source: BeamSource, frequency_mhz: float) -> Float[Array, " products"]:
+    """Visibilities that each kelvin of the ground's temperature adds, in K per K.
+
+    Raises
+    ------
+    InputError
+        If the beams do not say what the ground emits.
+    """
+    if not hasattr(source, "moon_k"):
+        raise InputError(
+            "noise.regolith needs antennas that receive from the ground, which are those of a "
+            "response file or of a scalar beam file; give one as beam.file, or leave out "
+            "noise.regolith"
+        )
+    warm, cold = (replace(source, moon_k=kelvin) for kelvin in (1.0, 0.0))
+    return np.asarray(warm.background(frequency_mhz)) - np.asarray(cold.background(frequency_mhz))

@@ -1,0 +1,143 @@
+"""What data say of the sky: sums for data in parts, and likelihoods of skies."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from experiments import of_run
+from reference_linear import posterior, random_covariance
+from scipy.linalg import block_diag
+from scipy.stats import multivariate_normal
+
+import lusee_bayes as lb
+from lusee_bayes.experiment.model import full_model
+from lusee_bayes.systematics.context import Around
+
+
+def two_cycles(*overrides):
+    # N of the parts is that of the whole: about the model, and not about each one's data
+    about = "noise.radiometer.temperature=model"
+    scenario = lb.load_scenario("two_cycles", [about, *overrides])
+    experiment = lb.build(scenario)
+    data = experiment.data
+    parts = [of_run(data, run) for run in (0, 1)]
+    models = [full_model(lb.build(scenario, part).setup, Around(part)) for part in parts]
+    return full_model(experiment.setup, Around(data)), data, models, parts
+
+
+# the mean's last step may be 1e-6 standard deviations, and the gradient of the earlier data at the
+# mean of the later ones is a small difference; variances of normal equations lose 1e-6 (Posterior)
+MEAN, WIDTH, EVIDENCE = 1e-5, 1e-5, 1e-3
+
+
+def assert_sum_is_the_whole(whole, data, models, parts):
+    first, second = (model.inform(part.data)[0] for model, part in zip(models, parts, strict=True))
+    got = (second + first).posterior(whole.prior)
+    expected = whole.condition(data.data, form="root")
+    std = np.asarray(expected.std())
+    assert (np.abs(np.asarray(got.mean - expected.mean)) / std).max() < MEAN
+    np.testing.assert_allclose(got.std(), std, rtol=WIDTH)
+    assert abs(float(got.log_evidence - expected.log_evidence)) < EVIDENCE
+    # the second cycle did say something
+    alone = first.posterior(whole.prior)
+    assert (np.abs(np.asarray(alone.mean - expected.mean)) / std).max() > 0.5
+
+
+N = 9
+SPECTRUM = np.array([4.0, 1.0, 0.25])
+# numbers of order one, condition below 1e3
+TOL = 1e-10
+
+
+def random_parts():
+    """Models of two data sets of one sky, whose noise has no structure, and their data."""
+    rng = np.random.default_rng(4)
+    prior = lb.HarmonicPrior(jnp.asarray(SPECTRUM))
+    models, data = [], []
+    for n in (20, 7):
+        noise = lb.DenseCovariance(jnp.asarray(random_covariance(rng, n)))
+        models.append(
+            lb.LinearGaussian(
+                jnp.asarray(rng.normal(size=(n, N))), prior, noise, jnp.asarray(rng.normal(size=n))
+            )
+        )
+        data.append(jnp.asarray(3.0 * rng.normal(size=n)))
+    return models, data
+
+
+def test_likelihoods_and_sums_are_those_of_matrices():
+    models, data = random_parts()
+    skies = np.random.default_rng(5).normal(size=(6, N))
+    parts = [model.inform(d)[0] for model, d in zip(models, data, strict=True)]
+    expected = [
+        multivariate_normal(np.zeros(m.n_data), m.noise.dense()).logpdf(
+            np.asarray(d) - np.array([m.predict(sky) for sky in skies])
+        )
+        for m, d in zip(models, data, strict=True)
+    ]
+    for part, likelihoods in zip(parts, expected, strict=True):
+        np.testing.assert_allclose(part.log_likelihood(skies), likelihoods, rtol=TOL)
+    # whichever is first
+    for total in (parts[0] + parts[1], parts[1] + parts[0]):
+        np.testing.assert_allclose(total.log_likelihood(skies), sum(expected), rtol=TOL)
+        assert float(total.n_data) == 27
+
+
+def test_the_posterior_of_a_sum_is_that_of_all_data():
+    models, data = random_parts()
+    first, second = (model.inform(d)[0] for model, d in zip(models, data, strict=True))
+    total = second + first
+    a = np.concatenate([np.asarray(model.coupling.dense()) for model in models])
+    noise = block_diag(*(np.asarray(model.noise.dense()) for model in models))
+    offset = np.concatenate([np.asarray(model.offset) for model in models])
+    every = np.concatenate([np.asarray(d) for d in data])
+    # the prior is that of neither
+    prior = lb.HarmonicPrior(jnp.asarray(0.5 * SPECTRUM))
+    answer = posterior(a, np.asarray(prior.covariance()), noise, every, offset)
+    found = total.posterior(prior)
+    np.testing.assert_allclose(found.mean, answer.mean, atol=TOL)
+    np.testing.assert_allclose(found.covariance(), answer.covariance, atol=TOL)
+    np.testing.assert_allclose(found.log_evidence, answer.log_prob, rtol=TOL)
+    residual = every - offset - a @ answer.mean
+    told = total.fit(np.asarray(found.mean), np.asarray(found.covariance()))
+    assert told["chi2"] == pytest.approx(residual @ np.linalg.solve(noise, residual), rel=TOL)
+    seen = a.T @ np.linalg.solve(noise, a)
+    assert told["chi2_expected"] == pytest.approx(27 - np.vdot(seen, answer.covariance), rel=TOL)
+
+
+def test_information_about_other_modes_is_not_added():
+    models, data = random_parts()
+    whole, _ = models[0].inform(data[0])
+    four = replace(
+        models[0],
+        coupling=lb.DenseCoupling(models[0].coupling.dense()[:, :4]),
+        prior=lb.HarmonicPrior(jnp.asarray(SPECTRUM[:2])),
+    )
+    few, _ = four.inform(data[0])
+    with pytest.raises(lb.InputError, match="the other reference sky"):
+        whole + few
+    with pytest.raises(lb.InputError, match="needs a prior over the same modes"):
+        whole.posterior(four.prior)
+
+
+@pytest.fixture
+def exact_tilt(monkeypatch):
+    """Tilts about the pole between two runs as exact as about each one's own."""
+    monkeypatch.setattr("lusee_bayes.instrument.pointing.LEAST_ORDER", 4)
+    monkeypatch.setattr("lusee_bayes.instrument.averaging.TOLERANCE", 1e-13)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("form", ["paper", "exact"])
+def test_a_second_run_adds_to_the_first(form, exact_tilt):
+    runs = "observation.runs=[{cycles: 0.2}, {cycles: 0.1, turntable_deg: 30}]"
+    parts = two_cycles("lmax=6", runs, f"noise.radiometer.form={form}")
+    assert_sum_is_the_whole(*parts)
+
+
+@pytest.mark.long
+def test_a_second_cycle_at_full_size(exact_tilt):
+    assert_sum_is_the_whole(*two_cycles())

@@ -1,0 +1,306 @@
+"""The page's own arithmetic: pixels, coordinates, point-spread functions, ticks, channels.
+
+Scripts of a page are run in node, with a document that only keeps what is set.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+
+import astropy.units as u
+import healpy
+import numpy as np
+import pytest
+from assertions import refuse
+from astropy.coordinates import SkyCoord
+from astropy.io import fits
+from reference_linear import resolution_rows
+
+import lusee_bayes as lb
+from lusee_bayes.core.harmonics import mode_numbers, pixel_matrix, synthesis_matrix
+from lusee_bayes.report.rendering import render
+from lusee_bayes.report.viewer import BUDGET, KERNEL_NSIDE, nside_of_page, resolution, viewer
+from lusee_bayes.results.map_files import read_channels
+
+NODE = shutil.which("node")
+# elements that remember; a canvas whose context keeps the last image
+STUB = """
+const elements = {};
+function element(id) {
+  if (elements[id]) return elements[id];
+  const context = new Proxy({ measureText: (t) => ({ width: 7 * t.length }),
+    createImageData: (w, h) => ({ data: new Uint8ClampedArray(4 * w * h), width: w, height: h }),
+    putImageData(image) { elements[id].image = image; },
+    fillText(text) { elements[id].texts.push(text); } },
+    { get: (o, k) => (k in o ? o[k] : () => {}), set: () => true });
+  const size = SIZES[id] || [400, 42];
+  return (elements[id] = { id, width: size[0], height: size[1], textContent: "", value: "",
+    texts: [], style: {}, options: [], listeners: {}, rows: [], getContext: () => context,
+    add(o) { this.options.push(o); if (!this.value) this.value = o.value; },
+    addEventListener(kind, f) { this.listeners[kind] = f; }, setAttribute() {},
+    replaceChildren() { this.rows = []; }, append(...x) { this.rows.push(...x); },
+    getBoundingClientRect: () => ({ left: 0, top: 0, width: size[0], height: size[1] }) });
+}
+const parts = [0, 1, 2].map((k) => ({ dataset: { channel: String(k) }, hidden: k > 0 }));
+const selectors = [element("first"), element("second")];
+globalThis.document = { getElementById: element, createElement: () => ({}),
+  querySelectorAll: (of) => (of === "select.channel" ? selectors : parts) };
+globalThis.Option = function (text, value) { this.text = text; this.value = value; };
+globalThis.window = globalThis;
+globalThis.requestAnimationFrame = (f) => f();
+"""
+SIZES = {"viewer-map": [400, 200], "viewer-psf": [120, 60]}
+
+
+def run_page(page: str, tmp_path, commands: str) -> dict:
+    """What ``commands`` leave in ``told`` after the scripts of the page have run."""
+    (data,) = re.findall(
+        r'<script type="application/json" id="viewer-data">(.*?)</script>', page, re.DOTALL
+    )
+    scripts = re.findall(r"<script>\n(.*?)\n</script>", page, re.DOTALL)
+    text = "\n".join(
+        [
+            STUB.replace("SIZES", json.dumps(SIZES)),
+            f"element('viewer-data').textContent = {json.dumps(data)};",
+            *scripts,
+            "const told = {};",
+            commands,
+            "require('fs').writeFileSync('told.json', JSON.stringify(told));",
+        ]
+    )
+    (tmp_path / "page.js").write_text(text)
+    subprocess.run([NODE, "page.js"], cwd=tmp_path, check=True, timeout=120)
+    return json.loads((tmp_path / "told.json").read_text())
+
+
+needs_node = pytest.mark.skipif(NODE is None, reason="no node on this machine")
+POINTS = [(0.0, 0.0), (280.0, -32.0), (123.4, 56.7), (33.0, -89.0), (180.0, 90.0)]
+
+
+@pytest.fixture(scope="module")
+def page(small_map):
+    return (small_map.folder / "report.html").read_text()
+
+
+@needs_node
+def test_pixels_and_equatorial_coordinates(page, small_map, tmp_path):
+    rng = np.random.default_rng(3)
+    lon, lat = rng.uniform(0, 360, 300), np.degrees(np.arcsin(rng.uniform(-1, 1, 300)))
+    points = json.dumps(np.stack([lon, lat], 1).tolist())
+    told = run_page(page, tmp_path, f"told.at = {points}.map((p) => viewer.at(...p));")["at"]
+    nside = small_map.result.channel.nside
+    expected = healpy.ang2pix(nside, lon, lat, lonlat=True)
+    np.testing.assert_array_equal([one["pixel"] for one in told], expected)
+    icrs = SkyCoord(lon, lat, unit="deg", frame="galactic").icrs
+    found = SkyCoord([x["ra"] for x in told], [x["dec"] for x in told], unit="deg")
+    # the rotation is kept with 16 digits; asin near the poles loses half of them
+    assert found.separation(icrs).max() < 1e-5 * u.deg
+
+
+@needs_node
+@pytest.mark.parametrize(
+    "which",
+    ["small_map", pytest.param("correlated", marks=[pytest.mark.long, pytest.mark.essential])],
+)
+def test_point_spread_functions_are_those_of_the_posterior(which, request, tmp_path):
+    """Against y^T R from the posterior; bytes are wrong by half a step at most, at random."""
+    run = request.getfixturevalue(which)
+    commands = f"told.kernels = {json.dumps(POINTS)}.map((p) => viewer.kernel(...p));"
+    page = (run.folder / "report.html").read_text()
+    kernels = np.array(run_page(page, tmp_path, commands)["kernels"])
+    lon, lat = np.radians(POINTS).T
+    y = synthesis_matrix(np.pi / 2 - lat, lon, 8)
+    there = pixel_matrix(KERNEL_NSIDE, 8)
+    posterior = lb.infer(lb.build(run.result.scenario)).posterior
+    expected = np.asarray(resolution_rows(posterior, y)) @ there.T
+    (channel,) = read_channels(run.folder / "diagnostics.nc")
+    ell, _ = mode_numbers(8)
+    details = channel.details
+    step, width = details.resolution_step[np.ix_(ell, ell)], details.prior_width
+    variance = (y * width) ** 2 @ (step**2 / 12) @ ((there / width) ** 2).T
+    # entries of the two triangles are the same number: errors may add, sqrt(2) at most
+    assert (np.abs(kernels - expected) < 6 * np.sqrt(2 * variance) + 1e-6 * expected.max()).all()
+    assert np.abs(kernels - expected).max() < 0.03 * np.abs(expected).max()
+
+
+@needs_node
+def test_what_a_direction_and_the_pointer_tell(page, tmp_path):
+    told = run_page(
+        page,
+        tmp_path,
+        """viewer.choose(280, -30);
+        told.rows = elements["viewer-values"].rows.map((one) => one.textContent);
+        elements["viewer-map"].listeners.pointermove({ clientX: 200, clientY: 100, buttons: 0 });
+        told.hover = elements["viewer-hover"].textContent;
+        told.texts = elements["viewer-map"].texts;
+        told.options = elements["viewer-layer"].options.map((one) => one.value);
+        told.ticks = [viewer.ticks(1, 1000, true), viewer.ticks(-4, 4, false),
+          viewer.ticks(3700, 6300, true)];
+        const seen = (id) => elements[id].image.data.filter((x, k) => k % 4 === 3 && x).length;
+        told.seen = [seen("viewer-map"), seen("viewer-psf")];
+        elements["viewer-in"].listeners.click();
+        told.zoomed = seen("viewer-map");""",
+    )
+    assert "right ascension, declination (ICRS)" in told["rows"]
+    assert told["hover"].startswith("posterior mean: ") and "RA, Dec" in told["hover"]
+    # the Galactic centre is at 266.4, -28.9 degrees
+    assert "266.4" in told["hover"] and "-28.9" in told["hover"]
+    assert {"Cas A", "Cyg A", "60°", "-30°"} <= set(told["texts"])
+    assert {"mean", "std", "truth", "residual", "pull"} <= set(told["options"])
+    assert told["ticks"] == [[1, 10, 100, 1000], [-4, -2, 0, 2, 4], [4000, 5000, 6000]]
+    # the ellipse fills pi/4 of its rectangle, and more of it when zoomed in
+    assert told["seen"] == pytest.approx([400 * 200 * np.pi / 4, 120 * 60 * np.pi / 4], rel=0.02)
+    assert told["zoomed"] > told["seen"][0]
+
+
+LMAX = 8
+SMALL = [
+    f"lmax={LMAX}",
+    "observation.runs=[{cycles: 0.1}, {cycles: 0.1, turntable_deg: 30}]",
+    "prior.model=local_scales",
+]
+
+
+@pytest.fixture(scope="module")
+def correlated(tmp_path_factory):
+    scenario = lb.load_scenario("fiducial", SMALL)
+    return lb.run_map(scenario, tmp_path_factory.mktemp("correlated") / "map")
+
+
+@needs_node
+def test_channels_of_the_page_are_those_of_the_files(small_cube, tmp_path):
+    page = (small_cube.folder / "report.html").read_text()
+    rng = np.random.default_rng(3)
+    lon, lat = rng.uniform(0, 360, 40), np.degrees(np.arcsin(rng.uniform(-1, 1, 40)))
+    points = json.dumps(np.stack([lon, lat], 1).tolist())
+    told = run_page(
+        page,
+        tmp_path,
+        f"""told.at = [0, 1, 2].map((k) => {points}.map((p) => viewer.at(...p, k)));
+        told.texts = [0, 2].map((k) => {{
+          elements["viewer-channel"].value = k;
+          elements["viewer-channel"].listeners.input();
+          return elements["viewer-frequency"].textContent;
+        }});
+        told.options = elements["viewer-layer"].options.map((one) => one.value);
+        told.rows = elements["viewer-values"].rows.map((one) => one.textContent);
+        told.hidden = parts.map((one) => one.hidden);
+        elements["second"].value = 1;
+        elements["second"].listeners.input();
+        told.chosen = ["viewer-channel", "first"].map((id) => elements[id].value);
+        told.shown = parts.map((one) => !one.hidden);""",
+    )
+    # the slider, and every selector of the page, choose the channel that is told of
+    assert told["hidden"] == [True, True, False] and told["chosen"] == [1, 1]
+    assert told["shown"] == [False, True, False]
+    nside = small_cube.result.scenario.map_nside
+    pixels = healpy.ang2pix(nside, lon, lat, lonlat=True)
+    for name in ("mean", "std", "truth"):
+        cube = fits.getdata(small_cube.folder / f"{name}.fits")
+        step = np.ptp(cube, axis=1) / 65535
+        got = np.array([[one[name] for one in channel] for channel in told["at"]])
+        # half a step, and what rounding adds
+        assert (np.abs(got - cube[:, pixels]) <= 0.501 * step[:, None]).all()
+    assert told["texts"] == ["20 MHz", "30 MHz"]
+    assert told["options"] == ["mean", "std", "truth", "residual", "pull"]
+    assert "30 MHz" in told["rows"]
+
+
+@needs_node
+@pytest.mark.parametrize("which", ["small_map", "small_cube"])
+def test_keys_move_the_direction_and_parts_are_those_that_the_page_has(which, request, tmp_path):
+    page = (request.getfixturevalue(which).folder / "report.html").read_text()
+    many = which == "small_cube"
+    assert ('id="viewer-channel"' in page, 'id="viewer-spectrum"' in page) == (many, many)
+    assert ('id="viewer-psf"' in page) != many
+    told = run_page(
+        page,
+        tmp_path,
+        """const place = () => ["l", "b"].map((name) => Number(elements[`viewer-${name}`].value));
+        const press = (key) => {
+          elements["viewer-map"].listeners.keydown({ key, preventDefault() {} });
+          return place();
+        };
+        told.places = [place(), ...["ArrowLeft", "ArrowUp", "ArrowRight", "ArrowDown"].map(press)];
+        elements["viewer-l"].value = "30"; elements["viewer-b"].value = "-45";
+        elements["viewer-l"].listeners.change();
+        told.rows = elements["viewer-values"].rows.map((one) => one.textContent);""",
+    )
+    assert told["places"] == [[0, 0], [2, 0], [2, 2], [0, 2], [0, 0]]
+    assert "30.00°, -45.00°" in told["rows"]
+    assert ("peak of the point-spread function" in told["rows"]) != many
+
+
+@needs_node
+def test_everything_that_is_given_of_two_channels_is_shown(small_map, tmp_path):
+    """The second channel has twice the temperatures of the first, and another resolution."""
+    (channel,) = read_channels(small_map.folder / "diagnostics.nc")
+    details = channel.details
+    both = np.array([[1.0], [2.0]])
+    maps = {
+        name: both * healpy.read_map(small_map.folder / f"{name}.fits", dtype=np.float64)
+        for name in ("mean", "std", "truth")
+    }
+    maps["prior_fraction"] = both / 4 * np.ones(maps["mean"].shape)
+    maps["draw1"] = maps["mean"] + 1.0
+    larger = replace(details, resolution_step=3.0 * details.resolution_step)
+    names = ("mean", "std", "prior_fraction")
+    shown = viewer(
+        [10.0, 20.0],
+        maps,
+        highest_altitude=channel.highest_altitude,
+        regions={name: both * getattr(details, f"region_{name}") for name in names},
+        resolutions=[resolution(details), resolution(larger)],
+    )
+    told = run_page(
+        render("viewer.html", tmp_path, viewer=shown),
+        tmp_path,
+        """const rows = () => {
+          const texts = elements["viewer-values"].rows.map((one) => one.textContent);
+          return Object.fromEntries(texts.flatMap((x, k) => (k % 2 ? [] : [[x, texts[k + 1]]])));
+        };
+        told.first = rows();
+        elements["viewer-channel"].value = 1;
+        elements["viewer-channel"].listeners.input();
+        told.second = rows();
+        told.options = elements["viewer-layer"].options.map((one) => one.value);
+        told.kernels = [0, 1].map((k) => viewer.kernel(30, 40, k));""",
+    )
+    assert told["options"] == [
+        "mean", "std", "truth", "residual", "pull", "prior_fraction", "draw1"
+    ]  # fmt: skip
+    assert (told["first"]["frequency"], told["second"]["frequency"]) == ("10 MHz", "20 MHz")
+    assert told["first"]["ever above the horizon"] == told["second"]["ever above the horizon"]
+    region = "region of 7.3° around it: mean"
+    for name in ("posterior mean", "standard deviation", "truth", region):
+        values = [float(told[k][name].replace(",", "").split()[0]) for k in ("first", "second")]
+        # rounded to a kelvin, and quantised to 1/65535 of their range
+        assert values[1] == pytest.approx(2 * values[0], rel=1e-3)
+    # steps and kernels are in single precision, and add up to less than their peak
+    expected = 3.0 * np.array(told["kernels"][0])
+    np.testing.assert_allclose(told["kernels"][1], expected, atol=1e-6 * expected.max())
+
+
+def test_maps_that_do_not_go_together_are_refused():
+    mean = np.ones((2, 12))
+    for other in (np.ones((1, 12)), np.ones((2, 48))):
+        refuse("maps of std have the shape", viewer, [10.0, 20.0], {"mean": mean, "std": other})
+    refuse("on a HEALPix grid", viewer, [10.0], {"mean": np.ones((1, 13)), "std": np.ones((1, 13))})
+
+
+def test_a_sky_below_zero_has_a_linear_scale():
+    maps = {"mean": np.linspace(-2.0, -1.0, 24).reshape(2, 12), "std": np.ones((2, 12))}
+    for scale in viewer([10.0, 20.0], maps)["scales"]["temperature"]:
+        assert not scale["log"] and -2.0 <= scale["low"] < scale["high"] <= -1.0
+
+
+def test_pages_stay_within_their_size():
+    assert nside_of_page(32, 9) == 32
+    for nside, n_maps in ((64, 138), (64, 1383), (32, 30)):
+        shown = nside_of_page(nside, n_maps)
+        assert 24 * shown**2 * n_maps <= BUDGET
+        assert shown == nside or 24 * (2 * shown) ** 2 * n_maps > BUDGET

@@ -1,0 +1,217 @@
+"""A channel's map: likelihoods of its draws, and which groups of its data are judged."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import arviz_base as az
+import arviz_stats
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from commands import posterior_of, sky_draws_of
+from experiments import mapped, small_experiment
+
+import lusee_bayes as lb
+from lusee_bayes.instrument.products import DataLayout
+from lusee_bayes.judge.chi2 import stands_out
+from lusee_bayes.results.channel_map import conditioned
+from lusee_bayes.results.finished_runs import FinishedRun
+from lusee_bayes.results.map_files import SavedInformation
+
+
+def dense_log_likelihood(model, data, skies) -> np.ndarray:
+    """ln N(d; A m + offset, N) with matrices."""
+    lower = np.linalg.cholesky(np.asarray(model.noise.dense()))
+    predicted = skies @ np.asarray(model.coupling.dense()).T
+    offset = 0.0 if model.offset is None else np.asarray(model.offset)
+    white = np.linalg.solve(lower, (np.asarray(data) - offset - predicted).T)
+    log_det = 2.0 * np.log(np.diagonal(lower)).sum()
+    return -0.5 * ((white**2).sum(0) + log_det + len(data) * np.log(2.0 * np.pi))
+
+
+@pytest.mark.parametrize(
+    "noise",
+    [
+        (),
+        ("noise.gain={sigma: 0.01}",),
+        ("noise.radiometer.form=exact", "noise.beam={shift_mhz: 1}"),
+    ],
+    ids=["diagonal", "banded", "templates"],
+)
+def test_likelihoods_of_draws_are_those_of_matrices(noise):
+    made, channel = mapped(small_experiment("output.draws=4", *noise))
+    data = made.experiment.data.data
+    expected = dense_log_likelihood(made.own.model, data, channel.draws)
+    # data of 1e5 standard deviations
+    np.testing.assert_allclose(channel.log_likelihood, expected, atol=1e-6)
+    assert len(expected) == 4 and np.ptp(expected) > 0.1
+
+
+def test_none_are_worked_out_for_no_draws():
+    _, channel = mapped(small_experiment())
+    assert channel.draws.shape == (0, 49) and channel.log_likelihood.shape == (0,)
+
+
+def test_arviz_opens_a_posterior(small_cube):
+    """With the groups and dimensions of ArviZ, and the likelihood of every channel's draws."""
+    tree = posterior_of(small_cube.folder)
+    groups = {"posterior", "log_likelihood", "observed_data", "constant_data"}
+    assert groups == set(tree.children)
+    sky, result = tree["posterior"]["sky"], small_cube.result
+    assert sky.dims == ("chain", "draw", "frequency", "mode") and sky.shape == (1, 3, 3, 25)
+    np.testing.assert_array_equal(sky["frequency"], [20.0, 25.0, 30.0])
+    assert az.extract(tree, num_samples=3).sizes["sample"] == 3
+    assert len(arviz_stats.summary(tree, kind="stats")) == 75
+    assert tree["log_likelihood"]["visibility"].dims == ("chain", "draw", "frequency")
+    drawn = sky_draws_of(small_cube.folder)
+    for k, (channel, scenario) in enumerate(
+        zip(result.channels, result.scenario.channels(), strict=True)
+    ):
+        np.testing.assert_array_equal(drawn[k], channel.draws)
+        experiment = lb.build(scenario)
+        model, data = lb.infer(experiment).model, experiment.data
+        told = tree["log_likelihood"]["visibility"].isel(chain=0, frequency=k)
+        np.testing.assert_allclose(
+            told, dense_log_likelihood(model, data.data, channel.draws), atol=1e-6
+        )
+        seen = tree["observed_data"]["visibility"].isel(frequency=k)
+        np.testing.assert_array_equal(seen, data.grid())
+        assert list(tree["observed_data"]["product"].values) == list(data.labels)
+        angles = tree["constant_data"]["turntable_deg"].isel(frequency=k)
+        turntable = np.asarray(data.observation.turntable_deg)
+        np.testing.assert_array_equal(angles, turntable[data.observation.run])
+
+
+def test_data_of_channels_at_other_times_have_gaps(tmp_path, numbers_alone):
+    sizes = ["lmax=3", "observation.runs.0.cycles=0.1", "frequencies_mhz=[20, 25]"]
+    scenario = lb.load_scenario("fiducial", sizes)
+    whole = [lb.build(channel).data for channel in scenario.channels()]
+    kept = np.arange(whole[1].observation.n_times) >= 5
+    observation = whole[1].observation.select(kept)
+    flat = jnp.asarray(whole[1].grid()[:, kept].ravel())
+    layout = DataLayout(16, observation.n_times)
+    later = replace(whole[1], data=flat, layout=layout, observation=observation)
+    run = lb.run_map(scenario, tmp_path / "run", data=[whole[0], later])
+    tree = posterior_of(run.folder)
+    seen = tree["observed_data"]["visibility"]
+    hours = [np.asarray(one.observation.hours) for one in (whole[0], later)]
+    for k, data in enumerate((whole[0], later)):
+        there = seen.isel(frequency=k).dropna("time")
+        np.testing.assert_array_equal(there["time"], hours[k])
+        np.testing.assert_array_equal(there, data.grid())
+    assert seen.sizes["time"] == len(np.union1d(*hours))
+
+
+@pytest.fixture(scope="module")
+def bad(tmp_path_factory):
+    """Data of three channels; a product of the second is too large."""
+    sizes = ["lmax=4", "observation.runs.0.cycles=0.1", "frequencies_mhz=[20, 25, 30]"]
+    scenario = lb.load_scenario("fiducial", sizes)
+    data = [lb.build(channel).data for channel in scenario.channels()]
+    grid = np.array(data[1].grid())
+    grid[8] *= 1.2
+    data[1] = replace(data[1], data=data[1].layout.gather(jnp.asarray(grid)))
+    return scenario, data
+
+
+def run_of(bad, folder, **options):
+    scenario, data = bad
+    return lb.run_map(scenario, folder, data=data, **options)
+
+
+@pytest.fixture(scope="module")
+def found(bad, tmp_path_factory):
+    return run_of(bad, tmp_path_factory.mktemp("bad") / "run")
+
+
+def test_groups_of_a_channel_are_judged_where_it_does_not_fit(found):
+    first, second, third = found.result.channels
+    assert first.judged is None and third.judged is None
+    assert first.diagnosis is None and third.diagnosis is None
+    judged = second.judged
+    assert judged.level == "does not fit" and "product 12R" in judged.suspects
+    assert stands_out(second.instrument.p, 12)
+    assert len(judged.of_kind("product")) == 16 and judged.of_kind("day")
+    # what is tried where a map of one frequency does not fit
+    assert second.diagnosis is not None and second.pointing is not None
+
+
+def test_they_are_named_wherever_the_verdict_is(found):
+    result, summary = found.result, FinishedRun.read(found.folder).summary
+    assert result.fit.level == summary.level == "does not fit"
+    assert f"25 MHz: {result.channels[1].judged.verdict}" in result.verdict()
+    assert summary.verdict == result.verdict()
+    assert summary.channels[1].judged.suspects == list(result.channels[1].judged.suspects)
+    assert summary.channels[0].judged is None
+    assert any(line.startswith("25 MHz: ") for line in result.lines()[1:])
+    page = (found.folder / "report.html").read_text()
+    assert "Did you mean?" in page and "<tr class=bad><td>12R</td>" in page
+    assert "were not judged group by group" in page
+    assert (found.folder / "figures" / "groups.png").is_file()
+
+
+def test_as_in_a_map_of_its_own(bad, found):
+    scenario, data = bad
+    channel = scenario.channels()[1]
+    _, expected = mapped(lb.build(channel, data[1]))
+    here, there = found.result.channels[1].judged, expected.judged
+    assert here.suspects == there.suspects and here.level == there.level
+    np.testing.assert_allclose(here.z, there.z, rtol=0, atol=1e-6)
+    for one, other in zip(here.groups, there.groups, strict=True):
+        assert one.name == other.name and one.chi2 == pytest.approx(other.chi2, rel=1e-6)
+
+
+def test_every_channel_is_judged_if_that_is_asked_for(bad, tmp_path, numbers_alone):
+    result = run_of(bad, tmp_path / "run", thorough=True).result
+    assert [c.judged is None for c in result.channels] == [False] * 3
+    assert [c.judged.level for c in result.channels] == ["consistent", "does not fit", "consistent"]
+    assert all(c.diagnosis is not None for c in result.channels)
+    posterior = posterior_of(tmp_path / "run")
+    np.testing.assert_array_equal(posterior["mean"], result.stacked("mean"))
+
+
+def test_modes_that_the_prior_knows_exactly_can_have_earlier_data():
+    """A C_ell of zero: the prior that earlier data leave has a density anyway."""
+    experiment = small_experiment()
+    spectrum = np.array(experiment.setup.prior.spectrum)
+    spectrum[3] = 0.0
+    setup = replace(experiment.setup, prior=lb.HarmonicPrior(jnp.asarray(spectrum)))
+    experiment = replace(experiment, setup=setup)
+    data = experiment.data
+    other = replace(experiment, data=replace(data, data=data.data + 1e-9 * jnp.abs(data.data)))
+    first = conditioned(other)
+    earlier = SavedInformation(first.information, first.digests)
+    _, channel = mapped(experiment, earlier)
+    assert (channel.std[9:16] == 0).all() and (channel.mean[9:16] == 0).all()
+    expected = first.information + conditioned(experiment).information
+    np.testing.assert_allclose(channel.std, expected.posterior(setup.prior).std(), rtol=1e-4)
+    # the same data twice: what the second asks of the first is nothing
+    assert channel.chi2_model < 1.5 * channel.n_data
+    assert np.isfinite(channel.judged.z).all()
+
+
+@pytest.mark.parametrize(
+    "kind", [[], ["joint=true", "spectral.components=[power_law]"]], ids=["independent", "joint"]
+)
+def test_covariances_of_every_channel_are_kept(kind, tmp_path, numbers_alone):
+    """And with all that can be asked for at once, every channel is judged."""
+    sizes = ["lmax=3", "observation.runs.0.cycles=0.1", "frequencies_mhz=[20, 25, 30]"]
+    output = "output={covariance: true, draws: 2, information: true}"
+    scenario = lb.load_scenario("fiducial", [*sizes, output, *kind])
+    run = lb.run_map(scenario, tmp_path / "run", thorough=True)
+    tree = posterior_of(run.folder)
+    assert tree["covariance"].dims == ("frequency", "mode", "mode_2")
+    variances = np.diagonal(tree["covariance"].values, axis1=1, axis2=2)
+    np.testing.assert_allclose(np.sqrt(variances), tree["std"], rtol=1e-9)
+    assert list(tree["information"].children) == ["20", "25", "30"]
+    for channel in run.result.channels:
+        assert channel.judged.level == "consistent" and channel.diagnosis is not None
+    # what is written is read back
+    again = FinishedRun.read(run.folder).channels
+    for here, there in zip(run.result.channels, again, strict=True):
+        assert here.judged.suspects == there.judged.suspects
+        assert repr(here.judged.groups) == repr(there.judged.groups)  # with NaN
+        assert here.diagnosis == there.diagnosis and here.coverage == there.coverage
+        np.testing.assert_array_equal(here.mean, there.mean)
+        np.testing.assert_array_equal(here.judged.z, there.judged.z)

@@ -1,0 +1,167 @@
+"""Data that are added to those of an earlier run: the map is that of all of them."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from commands import posterior_of, run
+from experiments import of_run
+
+import lusee_bayes as lb
+from lusee_bayes.results.map_files import information_file, read_information
+from lusee_bayes.runs import map_run
+
+# N of the parts is that of the whole: about the model, and not about each one's data
+SIZES = [
+    "lmax=4",
+    "observation.runs=[{cycles: 0.1}, {cycles: 0.1, turntable_deg: 30}]",
+    "noise.radiometer.temperature=model",
+    "output.information=true",
+]
+LEARNED = "prior={model: isotropic}"
+JOINT = ["joint=true", "spectral.components=[power_law]"]
+
+
+pytestmark = pytest.mark.usefixtures("numbers_alone")
+
+
+@pytest.fixture
+def exact_tilt(monkeypatch):
+    """Tilts about the pole between two runs as exact as about each one's own."""
+    monkeypatch.setattr("lusee_bayes.instrument.pointing.LEAST_ORDER", 4)
+    monkeypatch.setattr("lusee_bayes.instrument.averaging.TOLERANCE", 1e-13)
+
+
+def in_parts(scenario, folder):
+    """The run of all data, that of the first part, and that of the second added to the first."""
+    whole = [lb.build(channel).data for channel in scenario.channels() or (scenario,)]
+    first, second = ([of_run(data, k) for data in whole] for k in (0, 1))
+    runs = [
+        lb.run_map(scenario, folder / "whole", data=whole, truth=True),
+        lb.run_map(scenario, folder / "first", data=first, truth=True),
+    ]
+    both = lb.run_map(scenario, folder / "both", data=second, truth=True, earlier=folder / "first")
+    return [one.result for one in (*runs, both)]
+
+
+# means are known to 1e-6 standard deviations, and the sum loses a digit (test_information.py)
+SIGMA, WIDTH, EVIDENCE = 1e-4, 1e-4, 1e-3
+
+
+def assert_equal(found, expected, *, than):
+    for here, there, alone in zip(found.channels, expected.channels, than.channels, strict=True):
+        off = np.abs(here.mean - there.mean) / there.std
+        assert off.max() < SIGMA
+        np.testing.assert_allclose(here.std, there.std, rtol=WIDTH)
+        # the first part alone would be seen
+        assert (np.abs(alone.mean - there.mean) / there.std).max() > 0.5
+    assert found.log_evidence == pytest.approx(expected.log_evidence, abs=EVIDENCE)
+
+
+@pytest.mark.parametrize(
+    "prior", ["prior={model: isotropic, spectrum: sky}", LEARNED], ids=["given", "learned"]
+)
+def test_a_map_is_that_of_all_data(prior, tmp_path, exact_tilt):
+    """A prior that is learned is learned anew, from all of them."""
+    scenario = lb.load_scenario("fiducial", [*SIZES, prior])
+    whole, first, both = in_parts(scenario, tmp_path)
+    assert_equal(both, whole, than=first)
+    if prior == LEARNED:
+        for here, there in zip(both.channel.parameters, whole.channel.parameters, strict=True):
+            assert here["value"] == pytest.approx(there["value"], abs=1e-3 * there["std"])
+        assert both.channel.parameters != first.channel.parameters
+    # residuals are those of the new data, and they fit
+    assert both.channel.n_data == whole.channel.n_data - first.channel.n_data
+    assert both.fit.level == "consistent"
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param(["prior={model: isotropic, spectrum: sky}"], id="independent"),
+        pytest.param([LEARNED], id="learned", marks=pytest.mark.long),
+        pytest.param(JOINT, id="joint"),
+    ],
+)
+def test_channels_are_those_of_all_data(kind, tmp_path, exact_tilt):
+    scenario = lb.load_scenario("fiducial", [*SIZES, "frequencies_mhz=[20, 25, 30]", *kind])
+    whole, first, both = in_parts(scenario, tmp_path)
+    assert_equal(both, whole, than=first)
+    assert both.fit.level == whole.fit.level == "consistent"
+    if kind == JOINT:
+        # one posterior of all data: whatever is told of them is of all
+        np.testing.assert_allclose(both.fits().chi2, whole.fits().chi2, rtol=1e-4)
+        assert both.fits().rest.chi2 == pytest.approx(whole.fits().rest.chi2, rel=1e-3)
+        assert both.fits().rest.degrees == pytest.approx(whole.fits().rest.degrees, rel=1e-3)
+        for here, there in zip(both.channels, whole.channels, strict=True):
+            assert here.n_data == there.n_data
+            assert (np.abs(here.independent - there.independent) / there.std).max() < SIGMA
+    # and it can go on
+    for channel in scenario.channels():
+        kept = read_information(information_file(tmp_path / "both"), channel)
+        assert len(kept.digests) == 2
+        assert kept.information.n_data == 2 * first.channel.n_data
+
+
+def test_a_stopped_run_does_not_go_on_with_other_earlier_data(tmp_path):
+    """The folder is the same, its content is not."""
+    scenario = lb.load_scenario("fiducial", [*SIZES, "frequencies_mhz=[20, 25]"])
+    whole = [lb.build(channel).data for channel in scenario.channels() or (scenario,)]
+    first, second = ([of_run(data, k) for data in whole] for k in (0, 1))
+    lb.run_map(scenario, tmp_path / "a", data=first)
+    keeping = replace(map_run.MAP, unfinished="")
+    with pytest.MonkeyPatch.context() as patch:
+        # the channels' files stay, as if the run had been stopped
+        patch.setattr(map_run, "MAP", keeping)
+        lb.run_map(scenario, tmp_path / "b", data=second, earlier=tmp_path / "a")
+    other = [replace(data, data=1.01 * data.data) for data in first]
+    lb.run_map(scenario, tmp_path / "a", data=other, replace=True)
+    given = {"data": second, "earlier": tmp_path / "a"}
+    found = lb.run_map(scenario, tmp_path / "b", replace=True, **given).result
+    expected = lb.run_map(scenario, tmp_path / "c", **given).result
+    for here, there in zip(found.channels, expected.channels, strict=True):
+        np.testing.assert_array_equal(here.mean, there.mean)
+
+
+SMALL = ("--set", "lmax=5", "--set", "observation.runs.0.cycles=0.1")
+
+
+def test_from_the_command_line(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    second = ("--set", "observation.start=2027-02-15", "--set", "seed=2")
+    assert run("simulate", "fiducial", *SMALL, "-o", "a.nc", "-q") == 0
+    assert run("simulate", "fiducial", *SMALL, *second, "-o", "b.nc", "-q") == 0
+    mapped = ("map", "fiducial", *SMALL, "-q")
+    assert run(*mapped, "--data", "a.nc", "--information", "-o", "first") == 0
+    add = ("--add", "first", "--information", "-o", "both")
+    assert run(*mapped, "--data", "b.nc", *add) == 0
+    assert run(*mapped, "--data", "a.nc", "-o", "plain") == 0
+    scenario = lb.load_scenario("fiducial", list(SMALL[1::2]))
+    saved, before = (
+        read_information(information_file(tmp_path / name), scenario) for name in ("both", "first")
+    )
+    assert len(saved.digests) == 2 and saved.digests[0] == before.digests[0]
+    first, both = (posterior_of(tmp_path / name) for name in ("first", "both"))
+    assert (both["std"].values <= first["std"].values * (1 + 1e-12)).all()
+    prior = lb.build(scenario).setup.prior
+    bits = [float(one.information.posterior(prior).information_bits()) for one in (saved, before)]
+    assert bits[0] > bits[1] + 10
+    capsys.readouterr()
+    for arguments, message in (
+        (("--data", "b.nc", "--add", "both"), "would count twice"),
+        (("--add", "none"), "no posterior of lusee-bayes map --information at"),
+        (("--add", "plain"), "does not hold the information of its data; make that map again"),
+        (("--add", "both", "--set", "frequency_mhz=10"), "is of 25 MHz, the scenario of 10 MHz"),
+        (("--add", "both", "--set", "lmax=4"), "is of lmax 5, the scenario of 4; use --set lmax=5"),
+        (
+            ("--add", "both", "--frequencies", "10,20"),
+            "no channel can be mapped: 10 MHz: .* is of 25 MHz",
+        ),
+    ):
+        assert run(*mapped, *arguments, "-o", "third") == 2
+        told = capsys.readouterr().err
+        assert re.search(message, told) and told.count("\n") == 1
+    assert not (tmp_path / "third").exists()
