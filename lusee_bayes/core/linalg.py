@@ -329,17 +329,17 @@ def spanning_rows(
     # rows of fewer numbers, with the same products
     rest = np.linalg.qr(matrix.T, mode="r").T.copy()
     picked, along = [], []
-    squares = (rest**2).sum(axis=1)
-    least = SPANNED**2 * squares.max()
-    while squares.max() > least:
+    least = SPANNED**2 * (rest**2).sum(axis=1).max()
+    while (squares := (rest**2).sum(axis=1)).max() > least:
         if len(picked) == most:
             return None
         k = int(squares.argmax())
         unit = rest[k] / np.sqrt(squares[k])
-        along.append(np.where(kind == kind[k], rest @ unit, 0.0))
+        # not by BLAS, whose threads would wait for each other every time
+        products = np.einsum("rc,c->r", rest, unit)
+        along.append(np.where(kind == kind[k], products, 0.0))
         picked.append(k)
         rest -= along[-1][:, None] * unit
-        squares = (rest**2).sum(axis=1)
     coordinates = np.stack(along, axis=1)
     return np.array(picked), np.linalg.solve(coordinates[picked].T, coordinates.T).T
 

@@ -670,7 +670,7 @@ def _offsets(here: UnderAnySky, low: Pointing) -> Iterator[tuple[float, ModelMis
 
 def _noise_level(found: Residuals, data: Visibilities) -> Iterator[Proposal]:
     """Another noise level, if what is left is white: alike in all groups, and from time to time."""
-    whole, groups = found.split.instrument, [g for _, g in found.compared() if g.degrees > 1.0]
+    whole, groups = found.split.instrument, [g for g in found.compared() if g.degrees > 1.0]
     factor = whole.chi2 / whole.degrees
     if not groups or not factor > 0.0:
         return

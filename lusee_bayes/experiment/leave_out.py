@@ -132,13 +132,10 @@ class GroupsCompared:
             None if none stands out.
         """
         present = self.left_out.present
-        # one that holds all data has nothing to be compared with
         groups = [
             group
             for group in groups_of(self.data)
-            if group.kind in ("product", "day")
-            and (group.data & present).any()
-            and (present & ~group.data).any()
+            if group.kind in ("product", "day") and (group.data & present).any()
         ]
         chi2, degrees = _judged(self.left_out.each([group.data for group in groups]))
         out = _tail(chi2, degrees) < false_alarm
@@ -192,7 +189,7 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Groups
     else:
         model, wide = on_host(model_about(setup, Around(data))[0]), None
         prior = model.prior.widened(WIDER)
-    left_out = LeftOut(replace(model, prior=prior), data.data, data.layout, posterior=wide)
+    left_out = LeftOut(replace(model, prior=prior), data, posterior=wide)
     return GroupsCompared.of(left_out, data)
 
 

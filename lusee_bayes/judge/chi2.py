@@ -41,6 +41,8 @@ Level = Literal["consistent", "unlike the prior", "does not fit"]
 LEVELS: tuple[Level, ...] = ("consistent", "unlike the prior", "does not fit")
 # of a report of data that fit: a mission makes some hundred of them
 FALSE_ALARM = 1e-3
+# groups or channels that are named in a sentence
+NAMED = 4
 RULE = (
     f"A test stands out if its p times the number of tests is below {FALSE_ALARM:g}: by chance "
     f"once in {1.0 / FALSE_ALARM:.0f} reports"
@@ -68,6 +70,13 @@ class ChiSquare:
     def too_small(self) -> bool:
         """Whether it is below what is expected, where it stands out."""
         return bool(self.chi2 < self.degrees)
+
+    @property
+    def of_sky(self) -> str:
+        """What the sky is where its prior's chi^2 stands out."""
+        if self.too_small:
+            return "weaker, or closer to the prior's mean, than the prior expects"
+        return "not what the prior allows"
 
     def words(self) -> str:
         """p, and chi^2 with what is expected of it."""
@@ -115,6 +124,12 @@ def two_sided(chi2: float, n: float | int) -> float:
 def stands_out(p: float, among: int) -> bool:
     """Whether a probability, one of ``among`` of a report, is too small for chance."""
     return among * p < FALSE_ALARM
+
+
+def in_brief(names: list[str]) -> str:
+    """The first ``NAMED`` of several names, and how many more there are."""
+    more = len(names) - NAMED
+    return ", ".join([*names[:NAMED], *([f"{more} more"] if more > 0 else [])])
 
 
 def probability(p: float) -> str:

@@ -133,19 +133,12 @@ class Counts:
     def coverage(self) -> tuple[Coverage, ...]:
         """What was counted, with its scatter, part by part."""
         truth, draws = self.values[..., 0], self.values[..., 1:]
-        scatter, allowed = draws.std(2), np.quantile(draws[:, -1], ALLOWED, axis=1)
-        n = len(LEVELS)
+        n, allowed = len(LEVELS), np.quantile(draws[:, -1], ALLOWED, axis=1)
+        columns = (x.tolist() for x in (truth, draws.std(2), truth[:, n + 1], allowed))
+        parts = zip(self.names, self.sizes, *columns, strict=True)
         return tuple(
             Coverage(name, size, tuple(held[:n]), tuple(spread[:n]), held[n], spread[n], *largest)
-            for name, size, held, spread, *largest in zip(
-                self.names,
-                self.sizes,
-                truth.tolist(),
-                scatter.tolist(),
-                truth[:, n + 1].tolist(),
-                allowed.tolist(),
-                strict=True,
-            )
+            for name, size, held, spread, *largest in parts
         )
 
 

@@ -16,10 +16,8 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import bdtr, chdtrc
 
-from lusee_bayes.judge.chi2 import LEVELS, ChiSquare, Fit, Level, probability, stands_out, two_sided
+from lusee_bayes.judge.chi2 import LEVELS, ChiSquare, Fit, Level, in_brief, probability, stands_out
 
-# channels that are named in a sentence
-NAMED = 4
 # of the joint tests
 N_TESTS = 4
 
@@ -79,7 +77,7 @@ class ChannelFits:
     def p(self) -> Float[np.ndarray, " channels"]:
         """Probability of every channel's chi^2, two-sided."""
         pairs = zip(self.chi2.tolist(), self.degrees.tolist(), strict=True)
-        return np.array([two_sided(chi2, n) for chi2, n in pairs])
+        return np.array([ChiSquare(*pair).p for pair in pairs])
 
     def extremes(self) -> list[int]:
         """Channels that stand out among all of them, the least probable first."""
@@ -95,13 +93,11 @@ class ChannelFits:
         signs = min(1.0, 2.0 * float(bdtr(min(above, n - above), n, 0.5)))
         total = ChiSquare(float(self.chi2.sum()), float(self.degrees.sum()))
         furthest = ChiSquare(float(self.chi2[least]), float(self.degrees[least]))
-        frequency = f"{self.frequencies_mhz[least]:g} MHz"
+        where = f"{self.frequencies_mhz[least]:g} MHz, {furthest.found()}"
         return [
             JointTest("sum over all channels", total.p, 1, total.found()),
             JointTest("channels above the median", signs, 1, f"{above} of {n}"),
-            JointTest(
-                "channel furthest out", float(p[least]), n, f"{frequency}, {furthest.found()}"
-            ),
+            JointTest("channel furthest out", float(p[least]), n, where),
             JointTest("prior", self.rest.p, 1, self.rest.found(), of_prior=True),
         ]
 
@@ -109,9 +105,7 @@ class ChannelFits:
         """The verdict of all tests, and the channels that stand out."""
         tests, p = self.tests(), self.p()
         level = max((test.level for test in tests), key=LEVELS.index)
-        sky, misfit = "not what the prior allows", "no sky explains the data of all channels"
-        if self.rest.too_small:
-            sky = "weaker, or closer to the prior's mean, than the prior expects"
+        sky, misfit = self.rest.of_sky, "no sky explains the data of all channels"
         if self._too_quiet():
             misfit = (
                 "the data scatter less about what a sky explains than the noise would have them"
@@ -132,13 +126,9 @@ class ChannelFits:
             )
         extremes = self.extremes()
         if extremes:
-            names = ", ".join(
-                f"{self.frequencies_mhz[k]:g} MHz (p {probability(float(p[k]))})"
-                for k in extremes[:NAMED]
-            )
-            more = len(extremes) - NAMED
-            names += f", {more} more" if more > 0 else ""
-            told.append(f"{len(extremes)} of {len(p)} channels stand out: {names}.")
+            frequencies = self.frequencies_mhz
+            names = [f"{frequencies[k]:g} MHz (p {probability(float(p[k]))})" for k in extremes]
+            told.append(f"{len(extremes)} of {len(p)} channels stand out: {in_brief(names)}.")
         return Fit(level, " ".join([*told, *self._advice(level)]))
 
     def _too_quiet(self) -> bool:

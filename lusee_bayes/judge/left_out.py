@@ -18,9 +18,11 @@ With N = N_0 + T T^T, F = [T, A S^(1/2)], and D = N_0^-1, whose blocks are the d
 
     K_ss = c (1 - W W^T) c^T,    directions = |(1 - W W^T)^(-1/2) W L^-1|^2 over the sky's columns.
 
-W of all data is kept where it fits into ``KEPT_BYTES``. In longer runs rows of A at times close to
-each other are combinations of those at a few of them, A_s = U A_few, and so c^T U = q r gives
-W = q (r F_few L^-T): of a day of ten-minute samples a sixth of the rows is computed.
+Rows of A at times close to each other are combinations of those at a few of them, A_s = U A_few
+(:func:`.spanning_rows`), and so c^T U = q r gives W = q (r F_few L^-T): of a day of ten-minute
+samples an eighth of the rows is computed. Runs of at most ``SHARED`` times have one F_few, which is
+kept for all groups; where D couples products, and where A has no structure in time, Y L^-T of all
+data is kept.
 
 **A large group** is taken out of Q, without rows of A where A and N have structure in time::
 
@@ -39,12 +41,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from lusee_bayes.core.arrays import DataVector, Grid, GridFlags, Square, Vector, on_host
+from lusee_bayes.core.arrays import Grid, GridFlags, Square, Vector, on_host
 from lusee_bayes.core.engine import in_threads, once
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import (
     cholesky,
-    inverse_from_cholesky,
     invert_factorised,
     solve_lower,
     spanning_rows,
@@ -52,6 +53,7 @@ from lusee_bayes.core.linalg import (
 )
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.judge.split import log_det_of
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.normal_matrix import is_within_times, summed
 from lusee_bayes.linear.posterior import Posterior
@@ -59,15 +61,15 @@ from lusee_bayes.noise.covariance import LowRankUpdate
 
 # a larger A without structure in time is not formed: 60,000 data at lmax 47
 DENSE_BYTES = 1.2e9
-# W and W L^-1 of all data are kept up to this size (a month of hours at lmax 47: 0.4 GB)
+# Y L^-T and Y Q^-1 of all data are kept up to this size (a month of hours at lmax 47: 0.4 GB)
 KEPT_BYTES = 5e8
 # steps that refine Q^-1 F^T D d, which loses what the normal equations lose
 REFINEMENTS = 2
 # runs of no more times have one F_few for all groups; in others, own entries of K^-1 have one for
 # so many times
 SHARED, NEAR = 1000, 144
-# times whose rows are computed at once
-CHUNK = 64
+# times whose rows are computed at once, and data that are a small group in any case
+CHUNK, QUICK = 64, 500
 
 # arrays by block of D (times, or one block of all data) and place in it (products, or data)
 Cells = Float[np.ndarray, "blocks places"]
@@ -76,6 +78,7 @@ Weights = Float[np.ndarray, "blocks places *places"]
 Roots = Float[np.ndarray, "blocks used *used"]
 Rows = Float[np.ndarray, "rows rank"]
 SkyRows = Float[np.ndarray, "rows sky"]
+Answer = tuple[float, float, float]
 
 
 class Missed(NamedTuple):
@@ -183,10 +186,8 @@ class LeftOut:
     ----------
     model : LinearGaussian
         Of any kind. Without structure in time A is formed, and where N couples times N^-1, too.
-    data : (data,) array
+    data : Visibilities
         In K.
-    layout : DataLayout
-        The product and the time of every datum.
     posterior : Posterior, optional
         Of this model, given any data: saves factorising it.
     gone : (products, times) array of bool, optional
@@ -205,24 +206,19 @@ class LeftOut:
         If the model cannot be factorised.
     """
 
-    present: GridFlags
-    u: Grid
-
     def __init__(
         self,
         model: LinearGaussian,
-        data: DataVector,
-        layout: DataLayout,
+        data: Visibilities,
         *,
         posterior: Posterior | None = None,
         gone: GridFlags | None = None,
     ):
-        self._model, self._data, self._layout = on_host(model), np.asarray(data), layout
-        self.present = np.asarray(layout.present)
+        self._model, self._data, self._layout = on_host(model), data, on_host(data.layout)
+        self._set_noise()
+        self.present = np.asarray(self._layout.present)
         if gone is not None:
             self.present = self.present & ~gone
-        self._set_noise()
-        if gone is not None:
             self._weights = self._weights - lost_weights(self._weights, self._on_cells(gone))
         self._lower = self._factorised(None if gone is not None else on_host(posterior))
         self._u = self._weighted_residuals()
@@ -231,12 +227,11 @@ class LeftOut:
         if not self._summable:
             self._kept = self._halves(weigh(self._weights, self._rows(None)))
         elif len(self._u) <= SHARED and 16 * self._u.size * len(self._lower) <= KEPT_BYTES:
-            shared = self._near(np.arange(len(self._u)))
+            shared = self._near(np.arange(len(self._u)), len(self._u))
             if self._weights.ndim == 2:
                 self._shared = shared
             else:
-                halves = (np.tensordot(shared.factors, x, axes=(1, 1)) for x in shared[:2])
-                self._kept = tuple(weigh(self._weights, x) for x in halves)
+                self._kept = self._expanded(shared)
 
     @classmethod
     def of(
@@ -260,7 +255,7 @@ class LeftOut:
         summable = model.coupling.has_time_structure and is_within_times(model.noise)
         if not summable and 8 * model.n_data * model.prior.size > DENSE_BYTES:
             return None
-        return cls(model, data.data, data.layout, posterior=posterior)
+        return cls(model, data, posterior=posterior)
 
     def without(self, gone: GridFlags) -> LeftOut:
         """Take out data for good; nothing else of the model changes.
@@ -269,7 +264,7 @@ class LeftOut:
         ----------
         gone : (products, times) array of bool
         """
-        return LeftOut(self._model, self._data, self._layout, gone=gone | ~self.present)
+        return LeftOut(self._model, self._data, gone=gone | ~self.present)
 
     def missed(self, group: GridFlags) -> Missed:
         """Leave out a group.
@@ -294,13 +289,10 @@ class LeftOut:
         b = solve_roots(root, np.where(cells[where], self._u[where], 0.0)[..., None])
         chosen = Chosen(cells, blocks, places, cells[where], root, b)
         small = self._small(chosen)
+        # all NaN where Q_s, or 1 - W W^T, has no root
         answer = self._taken_out(chosen) if small is None else self._among_data(chosen, *small)
-        if np.isnan(answer[-1]):
-            return Missed(n, *NOT_TOLD)
-        diagonal = root if root.ndim == 2 else np.diagonal(root, axis1=1, axis2=2)
         chi2, directions, log_det = answer
-        log_det += 2.0 * float(np.log(diagonal).sum())
-        return Missed(n, chi2, directions, log_det)
+        return Missed(n, chi2, directions, log_det + 2.0 * float(np.log(diagonal_of(root)).sum()))
 
     def each(self, groups: Sequence[GridFlags]) -> list[Missed]:
         """Leave out each of several groups, in threads."""
@@ -312,11 +304,9 @@ class LeftOut:
         if self._kept is not None:
             less = np.einsum("tkm,tkm->tk", self._kept[0], self._kept[0])
         else:
-            n = len(self._u) if self._shared is not None else NEAR
-            parts = [np.arange(len(self._u))[k : k + n] for k in range(0, len(self._u), n)]
+            parts = pieces(np.arange(len(self._u)), NEAR)
             less = np.concatenate(in_threads(self._lost_by_prediction, parts))
-        weights = self._weights
-        own = weights if weights.ndim == 2 else np.diagonal(weights, axis1=1, axis2=2)
+        own = diagonal_of(self._weights)
         own = np.where(own > less, own - less, np.nan)
         return self._layout.scatter(self._cells.gather(own.T))
 
@@ -324,17 +314,16 @@ class LeftOut:
 
     def _set_noise(self) -> None:
         """D and T by block: of every time, or one of all data where N couples times."""
-        noise, base, templates = self._model.noise, self._model.noise, None
-        if isinstance(noise, LowRankUpdate):
-            base, templates = noise.base, np.asarray(noise.update.root)
-        self._cells, weights = self._layout, base.time_weights(self._layout)
+        noise, self._cells = self._model.noise, self._layout
+        base, self._templates = noise, np.zeros((noise.size, 0))
+        if isinstance(noise, LowRankUpdate) and is_within_times(noise):
+            base, self._templates = noise.base, np.asarray(noise.update.root)
+        weights = base.time_weights(self._layout)
         self._summable = weights is not None and self._model.coupling.has_time_structure
         if weights is None:
-            self._cells, templates = DataLayout(noise.size, 1), None
-            root = cholesky(np.asarray(noise.dense()))
-            weights = inverse_from_cholesky(root)[..., None]
+            self._cells = DataLayout(noise.size, 1)
+            weights = np.linalg.inv(np.asarray(noise.dense()))[..., None]
         self._weights = np.moveaxis(np.asarray(weights), -1, 0)
-        self._templates = np.zeros((noise.size, 0)) if templates is None else templates
         self._t, self._n_templates = self._by_cell(self._templates), self._templates.shape[1]
 
     def _factorised(self, posterior: Posterior | None) -> Square:
@@ -361,7 +350,7 @@ class LeftOut:
     def _weighted_residuals(self) -> Cells:
         """u = D (d - E[d] - F z), with z = Q^-1 F^T D (d - E[d])."""
         model, z = self._model, np.zeros(len(self._lower))
-        rest = self._data if model.offset is None else self._data - model.offset
+        rest = np.asarray(self._data.data) - (0.0 if model.offset is None else model.offset)
         if model.prior.white_mean is not None:
             rest = rest - model.coupling @ model.prior.colour(model.prior.white_mean)
         n, weighted = self._n_templates, weigh(self._weights, self._by_cell(rest[:, None]))
@@ -389,11 +378,11 @@ class LeftOut:
     def _gram(self, weights: Weights) -> Square:
         """F^T W F."""
         if not self._summable:
-            rows, rank = self._rows(None), self._n_templates + self._model.prior.rank
+            rows = self._rows(None)
             some = weights.any(axis=-1) if weights.ndim == 3 else weights != 0.0
-            return rows[some].T @ weigh(weights, rows)[some].reshape(-1, rank)
-        n, coupling = self._n_templates, self._model.coupling
-        sky = self._model.prior.sandwich(summed(coupling, np.moveaxis(weights, 0, -1)))
+            return rows[some].T @ weigh(weights, rows)[some]
+        n, model = self._n_templates, self._model
+        sky = model.prior.sandwich(summed(model.coupling, np.moveaxis(weights, 0, -1)))
         if not n:
             return sky
         across = self._pull(weigh(weights, self._t))
@@ -405,11 +394,9 @@ class LeftOut:
         if blocks is None:
             sky = prior.colour_columns(coupling.dense())
             return self._by_cell(np.concatenate([self._templates, sky], axis=1))
-        n_products = self._layout.n_products
-        product, time = np.tile(np.arange(n_products), len(blocks)), np.repeat(blocks, n_products)
-        sky = prior.colour_columns(coupling.rows(product, time)).reshape(
-            len(blocks), n_products, -1
-        )
+        shape = len(blocks), self._layout.n_products
+        product, time = np.indices(shape)[1].ravel(), np.repeat(blocks, shape[1])
+        sky = prior.colour_columns(coupling.rows(product, time)).reshape(*shape, -1)
         return np.concatenate([self._t[blocks], sky], axis=2)
 
     def _halves(self, rows: Float[np.ndarray, "*cells rank"]) -> tuple[np.ndarray, np.ndarray]:
@@ -419,7 +406,7 @@ class LeftOut:
         sky = solve_lower(self._lower, half, transpose=True)[self._n_templates :].T
         return half.T.reshape(rows.shape), sky.reshape(*rows.shape[:-1], -1)
 
-    def _near(self, times: Int[np.ndarray, " n"], most: int | None = None) -> Near | None:
+    def _near(self, times: Int[np.ndarray, " n"], most: int) -> Near | None:
         """F of all products at these times; None if it takes more than ``most`` of them."""
         if self._shared is not None:
             return self._shared._replace(factors=self._shared.factors[times])
@@ -428,16 +415,28 @@ class LeftOut:
         templates = templates / np.maximum(np.abs(templates).max(axis=0), 1e-300)
         features = [self._model.coupling.time_features(times), templates]
         run = np.searchsorted(pointing.run_starts, times, side="right")
-        few = spanning_rows(np.concatenate(features, axis=1), run, most or len(times))
+        few = spanning_rows(np.concatenate(features, axis=1), run, most)
         if few is None:
             return None
-        parts = np.array_split(times[few[0]], -(-len(few[0]) // CHUNK))
+        parts = pieces(times[few[0]], CHUNK)
         halves = in_threads(lambda part: self._halves(self._rows(part).swapaxes(0, 1)), parts)
         return Near(*(np.concatenate(x, axis=1) for x in zip(*halves, strict=True)), few[1])
 
+    def _expanded(self, near: Near) -> tuple[np.ndarray, np.ndarray]:
+        """Y L^-T and the columns of the sky of Y Q^-1 at all times."""
+        kept = tuple(np.empty((*self._u.shape, few.shape[-1])) for few in near[:2])
+
+        def fill(times: Int[np.ndarray, " n"]) -> None:
+            for whole, few in zip(kept, near[:2], strict=True):
+                rows = (near.factors[times] @ few).swapaxes(0, 1)
+                whole[times] = weigh(self._weights[times], rows)
+
+        in_threads(fill, pieces(np.arange(len(self._u)), CHUNK))
+        return kept
+
     def _lost_by_prediction(self, times: Int[np.ndarray, " n"]) -> Cells:
         """The diagonal of Y Q^-1 Y^T at these times."""
-        half, _, factors = self._near(times)
+        half, _, factors = self._near(times, len(times))
         weights = self._weights[times]
         if weights.ndim == 2:
             within = half @ half.swapaxes(1, 2)
@@ -450,13 +449,12 @@ class LeftOut:
 
     def _small(self, chosen: Chosen) -> tuple[Rows, SkyRows, Vector] | None:
         """q^T W, q^T W L^-1, and q^T c^-1 u_s; None for a large group."""
-        (cells, blocks, places, some, root, b), rank = chosen, len(self._lower)
+        cells, blocks, places, some, root, b = chosen
+        rank = max(len(self._lower), QUICK)
         if self._kept is not None:
             if np.count_nonzero(some) > rank:
                 return None
-            halves = [x[np.ix_(blocks, places)] for x in self._kept]
-            for half in halves:
-                half[~some] = 0.0
+            halves = (some[..., None] * x[np.ix_(blocks, places)] for x in self._kept)
             w, with_sky = (solve_roots(root, x).reshape(some.size, -1) for x in halves)
             return w, with_sky, b.ravel()
         independent = self._weights.ndim == 2
@@ -464,7 +462,7 @@ class LeftOut:
         if not whole or len(blocks) > rank:
             return None
         near = self._near(blocks, rank // len(places))
-        if near is None or len(places) * near.factors.shape[1] > rank:
+        if near is None or len(places) * min(near.factors.shape) > rank:
             return None
         if independent:
             c, b = (root * some).T[..., None] * near.factors, b.swapaxes(0, 1)
@@ -477,9 +475,7 @@ class LeftOut:
         w, with_sky = ((r @ x).reshape(-1, x.shape[-1]) for x in halves)
         return w, with_sky, (q.swapaxes(1, 2) @ b).ravel()
 
-    def _among_data(
-        self, chosen: Chosen, w: Rows, with_sky: SkyRows, inside: Vector
-    ) -> tuple[float, float, float]:
+    def _among_data(self, chosen: Chosen, w: Rows, with_sky: SkyRows, inside: Vector) -> Answer:
         """chi^2_s, directions and ln|1 - W W^T|."""
         lower = cholesky(np.eye(len(w)) - w @ w.T, overwrite=True)
         solved = solve_lower(lower, np.column_stack([inside, with_sky]), transpose=False)
@@ -504,7 +500,7 @@ class LeftOut:
         invert_factorised(lower)
         return float(np.diagonal(lower)[self._n_templates :].sum())
 
-    def _taken_out(self, chosen: Chosen) -> tuple[float, float, float]:
+    def _taken_out(self, chosen: Chosen) -> Answer:
         """chi^2_s, directions and ln|Q_s| - ln|Q|."""
         mean = np.zeros((*chosen.cells.shape, 1))
         where = np.ix_(chosen.blocks, chosen.places)
@@ -518,9 +514,14 @@ class LeftOut:
         return float((chosen.b**2).sum() + (h**2).sum()), directions, log_det
 
 
-def log_det_of(root: Square) -> float:
-    """ln|M| of a matrix with this Cholesky factor."""
-    return 2.0 * float(np.log(np.diagonal(root)).sum())
+def pieces(times: Int[np.ndarray, " n"], most: int) -> list[np.ndarray]:
+    """So many times, or fewer, each."""
+    return np.array_split(times, -(-len(times) // most))
+
+
+def diagonal_of(blocks: np.ndarray) -> Cells:
+    """The diagonals of blocks, which may be all of them."""
+    return blocks if blocks.ndim == 2 else np.diagonal(blocks, axis1=1, axis2=2)
 
 
 def weigh(weights: Weights, x: Float[np.ndarray, "blocks places k"]) -> np.ndarray:

@@ -22,14 +22,12 @@ import numpy as np
 
 from lusee_bayes.core.arrays import DataVector, on_host
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.judge.chi2 import ChiSquare, Fit, Level, probability, stands_out, two_sided
+from lusee_bayes.judge.chi2 import ChiSquare, Fit, Level, in_brief, probability, stands_out
 from lusee_bayes.judge.left_out import KINDS, DataGroup, LeftOut, Missed, groups_of
 from lusee_bayes.judge.split import Split, with_sky
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 
-# groups that stand out and are named in a sentence
-NAMED = 4
 # of a prior that the sky is unlike
 TOO_WIDE = (
     "The prior is wider than the sky needs: where the sky is weaker than it expects, error bars "
@@ -43,12 +41,12 @@ TOO_NARROW = (
 
 @dataclass(frozen=True)
 class Group:
-    """Data that are left out together.
+    """Data that are left out together, and how they differ from their prediction.
 
     Attributes
     ----------
-    name : str
-        Of the product, day or turntable angle.
+    kind, name : str
+        Of the product, day or turntable angle, as in :class:`.DataGroup`.
     n : int
         Number of data.
     degrees : float
@@ -62,12 +60,16 @@ class Group:
         The same of the others without these; NaN if there are no others.
     """
 
+    kind: str
     name: str
     n: int
     degrees: float
     chi2: float
     p: float
     others_p: float
+
+    def __str__(self) -> str:
+        return f"{self.kind} {self.name}"
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ class Residuals:
         and not independent. NaN where groups are not judged.
     split : Split
         chi^2 of all data: what no sky explains, and what the prior does not expect.
-    products, days, angles : tuple of Group
+    groups : tuple of Group
         The data of every product, day and turntable angle; none where they are not judged, since
         noise that couples times would need too large an A (:meth:`.LeftOut.of`).
     """
@@ -91,27 +93,21 @@ class Residuals:
     predicted: DataVector
     z: DataVector
     split: Split
-    products: tuple[Group, ...]
-    days: tuple[Group, ...]
-    angles: tuple[Group, ...]
+    groups: tuple[Group, ...]
 
-    def kinds(self) -> tuple[tuple[str, tuple[Group, ...]], ...]:
-        """The groups by kind, each with the kind's name."""
-        return tuple(zip(KINDS, (self.products, self.days, self.angles), strict=True))
-
-    def compared(self) -> list[tuple[str, Group]]:
-        """The groups that others predict, with their kinds."""
-        return [(k, g) for k, groups in self.kinds() for g in groups if np.isfinite(g.others_p)]
+    def compared(self) -> list[Group]:
+        """The groups that others predict."""
+        return [group for group in self.groups if np.isfinite(group.others_p)]
 
     @property
     def n_tests(self) -> int:
         """Number of all tests: instrument, prior, and every group."""
         return 2 + len(self.compared())
 
-    def extremes(self) -> list[tuple[str, Group]]:
+    def extremes(self) -> list[Group]:
         """Groups that stand out from what all others predict, the least probable first."""
-        found = [(k, g) for k, g in self.compared() if stands_out(g.p, self.n_tests)]
-        return sorted(found, key=lambda one: one[1].p)
+        found = [group for group in self.compared() if stands_out(group.p, self.n_tests)]
+        return sorted(found, key=lambda group: group.p)
 
     def level(self) -> Level:
         """The verdict in a word.
@@ -124,21 +120,20 @@ class Residuals:
         unlike = stands_out(self.split.prior.p, self.n_tests)
         return "unlike the prior" if unlike else "consistent"
 
-    def suspects(self) -> list[tuple[str, Group]]:
+    def suspects(self) -> list[Group]:
         """Find the groups without which the rest fits.
 
         Returns
         -------
-        list of (str, Group)
-            With their kinds, those of a kind that say most against all others first; empty if all
-            data fit. Only groups that stand out are looked at, if any does.
+        list of Group
+            By kind, those that say most against all others first; empty if all data fit. Only
+            groups that stand out are looked at, if any does.
         """
         if self.level() != "does not fit":
             return []
         looked_at = self.extremes() or self.compared()
-        found = [one for one in looked_at if not stands_out(one[1].others_p, self.n_tests)]
-        kinds = [kind for kind, _ in self.kinds()]
-        return sorted(found, key=lambda one: (kinds.index(one[0]), one[1].p))
+        found = [one for one in looked_at if not stands_out(one.others_p, self.n_tests)]
+        return sorted(found, key=lambda group: (KINDS.index(group.kind), group.p))
 
     def fit(self, strengths: str = "") -> Fit:
         """Judge whether the data fit, and say what to do if not.
@@ -154,16 +149,10 @@ class Residuals:
             told = f"instrument and noise fit ({instrument}), and so does the prior ({prior})."
             return Fit(level, f"Consistent: {told}")
         if level == "unlike the prior":
-            sky, advice = "not what the prior allows", TOO_NARROW
-            if self.split.prior.too_small:
-                sky, advice = (
-                    "weaker, or closer to the prior's mean, than the prior expects",
-                    TOO_WIDE,
-                )
-            fits = f"Unlike the prior: instrument and noise fit ({instrument}), but the sky is"
-            return Fit(
-                level, " ".join(filter(None, [f"{fits} {sky} ({prior}).", strengths, advice]))
-            )
+            fits, sky = f"instrument and noise fit ({instrument})", self.split.prior.of_sky
+            advice = TOO_WIDE if self.split.prior.too_small else TOO_NARROW
+            told = [f"Unlike the prior: {fits}, but the sky is {sky} ({prior}).", strengths, advice]
+            return Fit(level, " ".join(filter(None, told)))
         small = self.split.instrument.too_small and not self.extremes()
         why = "the noise is smaller than assumed" if small else "no sky explains these data"
         told = f"Does not fit: {why} ({instrument}); do not trust the error bars."
@@ -171,28 +160,24 @@ class Residuals:
 
     def _blame(self) -> list[str]:
         """Which groups stand out, and what to leave out or to look at."""
-        if not self.products:
+        if not self.groups:
             return [
                 "Products, days and turntable angles were not judged: the noise couples different "
                 "times, which would need the whole of A."
             ]
         parts, extremes, suspects = [], self.extremes(), self.suspects()
         if suspects and extremes:
-            named = [f"{kind} {g.name} (p {probability(g.p)})" for kind, g in extremes[:NAMED]]
-            more = len(extremes) - NAMED
-            named += [f"{more} more"] if more > 0 else []
-            parts.append(f"Of {len(self.compared())} groups these stand out: {', '.join(named)}.")
-        for kind, _ in self.kinds():
-            mine = [group for of, group in suspects if of == kind]
-            named = ", ".join(group.name for group in mine[:NAMED])
+            named = in_brief([f"{group} (p {probability(group.p)})" for group in extremes])
+            parts.append(f"Of {len(self.compared())} groups these stand out: {named}.")
+        for kind in KINDS:
+            mine = [group for group in suspects if group.kind == kind]
             if len(mine) == 1:
                 p = probability(mine[0].others_p)
-                parts.append(f"The others fit without {kind} {named} (p {p}): leave it out.")
+                parts.append(f"The others fit without {mine[0]} (p {p}): leave it out.")
             elif mine:
-                more = f" and {len(mine) - NAMED} more" if len(mine) > NAMED else ""
                 parts.append(
-                    f"The others fit without any one of {len(mine)} {kind}s ({named}{more}): the "
-                    "data do not tell which."
+                    f"The others fit without any one of {len(mine)} {kind}s "
+                    f"({in_brief([group.name for group in mine])}): the data do not tell which."
                 )
         if not suspects:
             parts.append(
@@ -236,24 +221,22 @@ def residuals(
     wide = replace(model, prior=split.wide.prior)
     left_out = LeftOut.of(wide, data, split.wide)
     if left_out is None:
-        return Residuals(predicted, np.full(model.n_data, np.nan), split, (), (), ())
+        return Residuals(predicted, np.full(model.n_data, np.nan), split, ())
     whole = split.instrument
 
     def judged(group: DataGroup, missed: Missed) -> Group:
-        n = missed.n
+        kind, name, n = group.kind, group.name, missed.n
         if n == model.n_data:
-            return Group(group.name, n, whole.degrees, whole.chi2, whole.p, np.nan)
+            return Group(kind, name, n, whole.degrees, whole.chi2, whole.p, np.nan)
         degrees = n - with_sky(n - missed.degrees)
         others = ChiSquare(whole.chi2 - missed.chi2, whole.degrees - degrees)
-        p = two_sided(missed.chi2, degrees)
-        return Group(group.name, n, degrees, missed.chi2, p, others.p)
+        p = ChiSquare(missed.chi2, degrees).p
+        return Group(kind, name, n, degrees, missed.chi2, p, others.p)
 
-    found: dict[str, list[Group]] = {kind: [] for kind in KINDS}
     groups = groups_of(data)
-    for group, missed in zip(groups, left_out.each([one.data for one in groups]), strict=True):
-        found[group.kind].append(judged(group, missed))
+    found = tuple(map(judged, groups, left_out.each([group.data for group in groups])))
     z = layout.gather(left_out.u) / np.sqrt(layout.gather(left_out.inverse_diagonal))
-    return Residuals(predicted, z, split, *map(tuple, found.values()))
+    return Residuals(predicted, z, split, found)
 
 
 @dataclass(frozen=True)

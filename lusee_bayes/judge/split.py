@@ -109,7 +109,7 @@ def widened(posterior: Posterior, factor: float) -> tuple[Posterior, float]:
     step = (factor**2 - 1.0) * solve_lower(root, half, transpose=True)[:, 0]
     less = (1.0 - factor**-2) * float(inside @ (inside + step))
     moved = step if posterior.basis is None else posterior.basis @ step
-    log_evidence = posterior.log_evidence + 0.5 * less + _log_diagonal(lower) - _log_diagonal(root)
+    log_evidence = posterior.log_evidence + 0.5 * (less + log_det_of(lower) - log_det_of(root))
     wide = Posterior(
         prior.widened(factor),
         (posterior.white_mean + moved) / factor,
@@ -121,5 +121,6 @@ def widened(posterior: Posterior, factor: float) -> tuple[Posterior, float]:
     return wide, less
 
 
-def _log_diagonal(lower: Square) -> float:
-    return float(np.log(np.diagonal(lower)).sum())
+def log_det_of(root: Square) -> float:
+    """ln|M| of a matrix with this Cholesky factor."""
+    return 2.0 * float(np.log(np.diagonal(root)).sum())

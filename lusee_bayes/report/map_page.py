@@ -12,6 +12,7 @@ from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.flight.reduced import REASONS, REDUCED, Reduced, read_reduced
 from lusee_bayes.judge.chi2 import stands_out
 from lusee_bayes.judge.cube_fit import N_TESTS
+from lusee_bayes.judge.left_out import KINDS
 from lusee_bayes.report.rendering import render_run
 from lusee_bayes.report.viewer import resolution, viewer
 from lusee_bayes.results.channel import ChannelResult, Judged
@@ -88,12 +89,12 @@ def _groups(judged: Judged | None) -> dict[str, dict[str, Any]]:
     if judged is None:
         return shown
     marked = {*judged.suspects, *judged.extremes}
-    for kind, groups in judged.kinds():
-        listed = list(groups)
+    for kind in KINDS:
+        listed = groups = judged.of_kind(kind)
         if kind == "day" and len(listed) > WORST_DAYS:
             listed = sorted(listed, key=lambda group: group.p)[:WORST_DAYS]
         if listed:
-            bad = [f"{kind} {group.name}" in marked for group in listed]
+            bad = [str(group) in marked for group in listed]
             shown[kind] = {"number": len(groups), "rows": listed, "bad": bad}
     return shown
 

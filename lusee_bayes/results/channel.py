@@ -50,8 +50,8 @@ class Judged:
         Groups that stand out, and those without which the others fit.
     predicted, z : (products, times) array
         Of each datum, in K and in standard deviations; NaN where a sample is missing.
-    products, days, angles : tuple of Group
-        None where groups are not judged.
+    groups : tuple of Group
+        Products, days and turntable angles; none where groups are not judged.
     """
 
     level: Level
@@ -61,13 +61,11 @@ class Judged:
     suspects: tuple[str, ...]
     predicted: OnGrid = quantity("K", "visibilities of the mean map")
     z: OnGrid = quantity("1", "data less their prediction by all others, in standard deviations")
-    products: tuple[Group, ...] = ()
-    days: tuple[Group, ...] = ()
-    angles: tuple[Group, ...] = ()
+    groups: tuple[Group, ...] = ()
 
-    def kinds(self) -> tuple[tuple[str, tuple[Group, ...]], ...]:
-        """The groups by kind, each with the kind's name."""
-        return ("product", self.products), ("day", self.days), ("turntable angle", self.angles)
+    def of_kind(self, kind: str) -> list[Group]:
+        """The products, for example."""
+        return [group for group in self.groups if group.kind == kind]
 
 
 @dataclass(frozen=True)

@@ -331,20 +331,15 @@ class Conditioned:
         def on_grid(values: np.ndarray) -> np.ndarray:
             return np.where(data.layout.present, data.layout.scatter(values), np.nan)
 
-        def named(groups: list) -> tuple[str, ...]:
-            return tuple(f"{kind} {group.name}" for kind, group in groups)
-
         return Judged(
             level=fit.level,
             verdict=fit.text,
             prior=found.split.prior,
-            extremes=named(found.extremes()),
-            suspects=named(found.suspects()),
+            extremes=tuple(map(str, found.extremes())),
+            suspects=tuple(map(str, found.suspects())),
             predicted=on_grid(found.predicted),
             z=on_grid(found.z),
-            products=found.products,
-            days=found.days,
-            angles=found.angles,
+            groups=found.groups,
         )
 
 

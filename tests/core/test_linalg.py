@@ -31,6 +31,7 @@ from lusee_bayes.core.linalg import (
     precise_residual,
     sandwich,
     solve_lower,
+    spanning_rows,
     symmetric_product,
     times_lower,
 )
@@ -193,3 +194,19 @@ def test_a_residual_of_large_numbers_is_precise(xp):
     # 23 bits more than those of a float
     assert (np.abs(found - truth) / scale).max() < 1e-21
     assert (np.abs(vector - np.asarray(matrix @ x) - truth) / scale).max() > 1e-17
+
+
+def test_few_rows_span_a_matrix():
+    """Two kinds of rows, smooth functions of one variable each, that do not help each other."""
+    rng = np.random.default_rng(0)
+    x = np.linspace(0.0, 1.0, 150)
+    kind = rng.integers(0, 2, 150)
+    matrix = np.cos(x[:, None] * np.arange(12.0)) * rng.standard_normal(12)
+    picked, factors = spanning_rows(matrix, kind, 150)
+    assert len(picked) == len(set(picked.tolist())) <= 24
+    np.testing.assert_allclose(factors @ matrix[picked], matrix, rtol=0, atol=1e-11)
+    assert not factors[kind[:, None] != kind[picked]].any()
+    # rows without anything in common need all of them
+    rough = rng.standard_normal((20, 30))
+    assert sorted(spanning_rows(rough, np.zeros(20), 20)[0]) == list(range(20))
+    assert spanning_rows(rough, np.zeros(20), 19) is None

@@ -31,6 +31,8 @@ def test_the_fiducial_cycle_and_three_of_them():
     assert one.n_times == 327
     assert one.times[0].isot == "2027-01-15T00:00:00.000"
     within(one.hours, 2.0 * np.arange(327), 1e-6)  # a double JD: 20 ns
+    np.testing.assert_array_equal(np.unique(one.day), np.arange(28))
+    assert one.day[5] == 0 and one.day[-1] == 652 // 24
     three = lb.Observation.from_runs([lb.Run(1.0, angle) for angle in (0.0, 30.0, 60.0)])
     assert (three.n_times, three.n_runs) == (981, 3)
     np.testing.assert_array_equal(np.bincount(three.run), [327, 327, 327])

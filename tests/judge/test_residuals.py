@@ -57,6 +57,10 @@ def judged(model, data):
     return residuals(model, posterior, data, float(total))
 
 
+def of_kind(found, kind):
+    return [group for group in found.groups if group.kind == kind]
+
+
 def by_hand(model, data, index, prior):
     """chi^2 of some data given all others, by the textbook's conditional of a Gaussian."""
     k = covariance_of(model, prior)
@@ -115,13 +119,13 @@ def test_groups_and_single_data_by_hand(case):
     wide, whole = found.split.wide.prior, found.split.instrument
     layout, run = data.layout, data.observation.run
     hours = data.observation.hours
-    assert [g.name for g in found.products] == list(data.labels)
-    assert [g.name for g in found.angles] == ["0", "40"]
+    assert [g.name for g in of_kind(found, "product")] == list(data.labels)
+    assert [g.name for g in of_kind(found, "turntable angle")] == ["0", "40"]
     angle = np.array(data.observation.turntable_deg)[run[layout.time]]
     members = [layout.product == 7, hours[layout.time] // 24 == 1, angle == 40.0]
-    for group, member in zip(
-        (found.products[7], found.days[1], found.angles[1]), members, strict=True
-    ):
+    numbers = {"product": 7, "day": 1, "turntable angle": 1}
+    groups = [of_kind(found, kind)[number] for kind, number in numbers.items()]
+    for group, member in zip(groups, members, strict=True):
         index = np.flatnonzero(member)
         _, _, expected = by_hand(model, data, index, wide)
         assert group.n == len(index)
@@ -159,7 +163,7 @@ def test_a_prior_that_is_too_wide_is_told_from_one_that_is_too_narrow(width, sai
 def test_one_group_is_everything():
     model, data = simulated("observation.runs=[{cycles: 0.02}]")
     found = judged(model, data)
-    (angle,) = found.angles
+    (angle,) = of_kind(found, "turntable angle")
     whole = found.split.instrument
     assert (angle.chi2, angle.degrees, angle.n) == (whole.chi2, whole.degrees, data.layout.size)
     assert np.isnan(angle.others_p)
@@ -173,7 +177,7 @@ def test_precise_data_of_one_day_are_judged_by_product():
     assert found.level() == "consistent"
     # N(0, 1) or narrower: one of 1e5 data is beyond 5
     assert np.abs(found.z).max() < 5
-    (day,) = found.days
+    (day,) = of_kind(found, "day")
     assert day.n == data.layout.size and np.isnan(day.others_p)
     assert len(found.compared()) == 16
 
@@ -198,14 +202,14 @@ def test_what_is_wrong_is_pointed_at(kind, name):
     found = judged(model, bad)
     assert found.fit().level == "does not fit"
     verdict = found.fit().text
-    assert (kind, name) in [(k, group.name) for k, group in found.suspects()]
+    assert (kind, name) in [(group.kind, group.name) for group in found.suspects()]
     assert (
         f"{kind} {name}" in verdict
         and "The others fit without" in verdict
         and "leave it out" in verdict
     )
     # and no other of its kind
-    assert len(found.suspects()) == len({k for k, _ in found.suspects()})
+    assert len(found.suspects()) == len({group.kind for group in found.suspects()})
 
 
 @pytest.mark.long

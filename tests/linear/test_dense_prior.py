@@ -203,7 +203,7 @@ def test_structure_in_time_gives_what_matrices_give(noise):
     assert (np.abs(np.asarray(found.mean) - mean - answer.mean) / sigma).max() < 1e-5
     np.testing.assert_allclose(found.std(), sigma, rtol=1e-6)
     np.testing.assert_allclose(found.log_evidence, answer.log_prob, rtol=1e-7)
-    left_out = LeftOut(model, data, experiment.data.layout, posterior=found)
+    left_out = LeftOut(model, experiment.data, posterior=found)
     inverse = np.linalg.inv(a @ s @ a.T + n)
     u = inverse @ (np.asarray(data) - shift)
     of_sky = inverse @ a @ s @ a.T @ inverse

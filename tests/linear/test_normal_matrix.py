@@ -14,7 +14,7 @@ from lusee_bayes.core.harmonics import pixel_matrix
 from lusee_bayes.instrument.averaging import windowed
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.linear import information
-from lusee_bayes.linear.normal_matrix import CHUNK, normal_matrix, time_sums
+from lusee_bayes.linear.normal_matrix import CHUNK, normal_matrix, summed, time_sums
 from lusee_bayes.linear.posterior import pixel_std
 
 LMAX, N_PRODUCTS = 5, 4
@@ -104,6 +104,20 @@ def test_more_times_than_a_chunk():
     for q in range(-4, 5):
         expected = np.einsum("ct,at,bt,t->cab", weights, factors, factors, np.exp(1j * q * phi))
         np.testing.assert_allclose(got[..., q + 4], expected, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("blocks", [False, True])
+def test_products_without_weight_take_no_part(blocks):
+    coupling = on_host(setting(missing=False))
+    rng, n_times = np.random.default_rng(5), coupling.layout.n_times
+    weights = np.zeros((N_PRODUCTS, N_PRODUCTS, n_times))
+    weights[1, 1], weights[3, 3] = rng.uniform(1.0, 2.0, (2, n_times))
+    if blocks:
+        weights[1, 3] = weights[3, 1] = rng.uniform(0.0, 0.5, n_times)
+    a = np.asarray(coupling.dense()).reshape(N_PRODUCTS, n_times, -1)
+    expected = np.einsum("ktm,kjt,jtn->mn", a, weights, a, optimize=True)
+    given = weights if blocks else np.einsum("kkt->kt", weights)
+    close(summed(coupling, given), expected, 1e-12)
 
 
 def test_what_has_no_structure_is_refused():

@@ -59,7 +59,7 @@ def residuals_by_product(result: MapResult) -> Figure | None:
     figure.colorbar(
         image, ax=left, label="standard deviations", extend="both", shrink=0.9, pad=0.02
     )
-    products = channel.judged.products
+    products = channel.judged.of_kind("product")
     rows = [labels.index(group.name) for group in products]
     for key, marker, colour, text in (
         ("p", "o", BLUE, "product given all others"),
@@ -82,10 +82,7 @@ def groups_by_frequency(result: MapResult) -> Figure | None:
     judged = [channel for channel in result.channels if channel.judged is not None]
     if result.single or not judged:
         return None
-    found = [
-        {f"{kind} {g.name}": g.p for kind, groups in c.judged.kinds() for g in groups}
-        for c in judged
-    ]
+    found = [{str(group): group.p for group in channel.judged.groups} for channel in judged]
     names = list(dict.fromkeys(name for one in found for name in one))
     p = np.array([[one.get(name, np.nan) for one in found] for name in names])
     figure, axes = framed((max(5.0, 2.5 + 0.3 * len(judged)), 1.0 + 0.2 * len(names)))
