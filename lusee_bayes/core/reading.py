@@ -125,7 +125,7 @@ def _reason(error: BaseException) -> str:
     """The first line of an error, short."""
     text = " ".join(str(error).split()) or type(error).__name__
     if isinstance(error, KeyError):
-        text = f"there is no {text}"
+        text = text.strip("'\"") if " " in text else f"there is no {text}"
     return text if len(text) <= 160 else f"{text[:157]}..."
 
 

@@ -29,11 +29,9 @@ def describe_diagnostics(path: Path) -> list[str]:
             if judged is None:
                 lines.append("the data fit as a whole and were not judged group by group")
                 continue
-            counts = [
-                f"{judged[kind].sizes.get(f'{kind}_row', 0)} {kind}"
-                for kind in ("products", "days", "angles")
-            ]
-            lines += [str(judged.attrs["verdict"]), f"residuals by {', '.join(counts)}"]
+            kinds, n = np.unique(judged["groups/kind"].values, return_counts=True)
+            counts = ", ".join(f"{k} {kind}s" for kind, k in zip(kinds, n, strict=True))
+            lines += [str(judged.attrs["verdict"]), f"residuals by {counts}"]
     return lines
 
 

@@ -102,6 +102,9 @@ def test_info_of_a_folder(small_map, tmp_path, capsys):
     told = capsys.readouterr().out
     assert "results of lusee-bayes map" in told and "simulated by this run, seed 1" in told
     assert small_map.result.verdict() in told and "mean_alm.fits" in told
+    assert main(["info", str(small_map.folder / "diagnostics.nc")]) == 0
+    (days,) = {len(c.judged.of_kind("day")) for c in small_map.result.channels}
+    assert f"residuals by {days} days, 16 products" in capsys.readouterr().out
     assert main(["info", str(tmp_path)]) == 2
     assert "a folder that no run has written" in capsys.readouterr().err
 
