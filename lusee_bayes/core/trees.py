@@ -2,8 +2,8 @@
 
 The types of the fields say what becomes of them. Arrays (``Float[np.ndarray, "draw mode"]``) are
 variables on the dimensions that they name; numbers and text are attributes; None is absent;
-dataclasses are groups, and so are tuples of them: a table where a row is numbers and text alone,
-else a group for each. Whatever else JSON holds is an attribute in JSON.
+dataclasses with arrays are groups, and tuples of dataclasses of numbers and text alone are tables.
+Whatever else JSON holds, other dataclasses too, is an attribute in JSON.
 
 Arrays say their unit and what they are with :func:`quantity`, as the CF conventions have it.
 """
@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import types
 from collections.abc import Mapping
-from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, Field, asdict, dataclass, field, fields, is_dataclass
 from functools import lru_cache
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -27,6 +27,8 @@ from lusee_bayes.core.lazy import xarray as xr
 T = TypeVar("T")
 # an attribute that lists arrays without entries, which files do not hold
 EMPTY = "empty"
+# kinds that are attributes
+ATTRIBUTES = ("number", "text", "json")
 
 
 def quantity(units: str, long_name: str = "", **options: Any) -> Any:
@@ -49,7 +51,7 @@ def quantity(units: str, long_name: str = "", **options: Any) -> Any:
 class _Kind:
     """What becomes of a field.
 
-    what : "array", "number", "text", "json", "group", "table", "groups" or "frame"; of : the type
+    what : "array", "number", "text", "json", "group", "table" or "frame"; of : the type
     of the value or of its rows; dims : of an array; optional : whether it may be None
     """
 
@@ -83,16 +85,13 @@ def to_tree(value: Any) -> xr.DataTree:
                 empty[name] = array.shape
         elif kind.what == "group":
             groups[name] = to_tree(held)
-        elif kind.what == "groups":
-            numbered = {str(k): to_tree(one) for k, one in enumerate(held)}
-            groups[name] = xr.DataTree(children=numbered)
         elif kind.what == "table":
             columns = {f.name: [getattr(one, f.name) for one in held] for f in fields(kind.of)}
             groups[name] = _table(name, columns)
         elif kind.what == "frame":
             groups[name] = _table(name, {str(key): list(held[key]) for key in held})
         elif kind.what == "json":
-            attributes[name] = json.dumps(held)
+            attributes[name] = json.dumps(held, default=_for_json)
         else:
             attributes[name] = int(held) if isinstance(held, bool) else held
     if empty:
@@ -125,7 +124,7 @@ def from_tree(kind: type[T], tree: xr.DataTree, where: str) -> T:
     empty = _json(where, tree.attrs.get(EMPTY, "{}"))
     for name, kind_of, said in _fields(kind):
         place = f"{where}: {name}"
-        if kind_of.what in ("group", "groups", "table", "frame"):
+        if kind_of.what in ("group", "table", "frame"):
             if name in tree.children:
                 found[name] = _of_group(kind_of, tree.children[name], place)
         elif kind_of.what == "array":
@@ -143,6 +142,16 @@ def from_tree(kind: type[T], tree: xr.DataTree, where: str) -> T:
             there = [*tree.variables, *tree.attrs, *tree.children]
             raise InputError(f"{where} has no {name} (it has {', '.join(map(str, there))})")
     return kind(**found)
+
+
+@lru_cache(maxsize=128)
+def _checker(kind: Any) -> TypeAdapter:
+    return TypeAdapter(kind)
+
+
+def _for_json(value: Any) -> Any:
+    """What JSON has no words for: dataclasses, NumPy's numbers."""
+    return asdict(value) if is_dataclass(value) else value.item()
 
 
 @lru_cache(maxsize=128)
@@ -166,9 +175,9 @@ def _kind_of(hint: Any) -> _Kind:
         return _Kind("array", hint.dtypes, tuple(dims))
     if get_origin(hint) is tuple and is_dataclass(arguments[0]):
         kinds = [k for _, k, _ in _fields(arguments[0])]
-        plain = all(k.what == "number" or (k.what == "text" and not k.optional) for k in kinds)
-        return _Kind("table" if plain else "groups", arguments[0])
-    if is_dataclass(hint):
+        if all(k.what == "number" or (k.what == "text" and not k.optional) for k in kinds):
+            return _Kind("table", arguments[0])
+    if is_dataclass(hint) and any(k.what not in ATTRIBUTES for _, k, _ in _fields(hint)):
         return _Kind("group", hint)
     if hint in (int, float, bool):
         return _Kind("number", hint)
@@ -193,9 +202,6 @@ def _table(name: str, columns: Mapping[str, list]) -> xr.DataTree:
 def _of_group(kind: _Kind, tree: xr.DataTree, where: str) -> Any:
     if kind.what == "group":
         return from_tree(kind.of, tree, where)
-    if kind.what == "groups":
-        numbered = sorted(tree.children, key=lambda name: (len(name), name))
-        return tuple(from_tree(kind.of, tree.children[name], where) for name in numbered)
     if kind.what == "frame":
         names = _json(where, tree.attrs.get("columns", "[]"))
         return pd.DataFrame({name: _column(tree, name, where) for name in names})
@@ -244,7 +250,7 @@ def _value(kind: _Kind, value: Any, where: str) -> Any:
     value = value.item() if isinstance(value, np.generic) else value
     if kind.what == "json":
         try:
-            return TypeAdapter(kind.of).validate_python(_json(where, value))
+            return _checker(kind.of).validate_python(_json(where, value))
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
             raise InputError(f"{where} is {value!r}: {first['msg']}") from error

@@ -199,9 +199,9 @@ def test_a_file_is_one_that_others_can_read(tmp_path):
 def test_what_is_absent_has_its_default():
     """As in a file of a version that did not have the field yet."""
     tree = to_tree(example())
-    for name in ("labels", "told", "open"):
+    for name in ("labels", "told", "open", "remarks"):
         del tree.attrs[name]
-    del tree["rows"], tree["remarks"], tree["table"]
+    del tree["rows"], tree["table"]
     expected = example(labels=(), rows=(), table=None)
     assert same(expected, from_tree(Everything, tree, "a file"))
 
