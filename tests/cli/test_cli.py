@@ -145,7 +145,7 @@ def test_info_recognises_its_files(folder, tmp_path, capsys):
         (folder / "posterior.nc", "posterior over 81 modes"),
         (folder / "mean.fits", "HEALPix sky map, NSIDE 8"),
         (folder / "mean.fits", "mean of the posterior at 25 MHz up to ell = 8"),
-        (folder / "diagnostics.nc", "residuals by 16 products, 6 days, 2 angles"),
+        (folder / "diagnostics.nc", "residuals by 6 days, 16 products, 2 turntable angles"),
         (folder / "mean_alm.fits", "coefficients of one sky up to ell = 8"),
     ]:
         assert run("info", path) == 0
