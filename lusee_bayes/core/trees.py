@@ -5,30 +5,43 @@ variables on the dimensions that they name; numbers and text are attributes; Non
 dataclasses with arrays are groups, and tuples of dataclasses of numbers and text alone are tables.
 Whatever else JSON holds, other dataclasses too, is an attribute in JSON.
 
-Arrays say their unit and what they are with :func:`quantity`, as the CF conventions have it.
+Arrays say their unit and what they are with :func:`quantity`, as the CF conventions have it. Those
+on one of the dimensions :data:`HEALPIX` have the grid mapping of HEALPix of CF 1.13: a variable that
+names grid and order, and the index of every pixel.
+
+Files are written with xarray, and read with h5py, which takes a tenth of the time.
 """
 
 from __future__ import annotations
 
 import json
 import types
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import MISSING, Field, asdict, dataclass, field, fields, is_dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache, partial
+from pathlib import Path
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
+import h5py
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.formats import require_format
+from lusee_bayes.core.layouts import Unloaded, Unread
 from lusee_bayes.core.lazy import pandas as pd
 from lusee_bayes.core.lazy import xarray as xr
+from lusee_bayes.core.reading import reading
 
 T = TypeVar("T")
 # an attribute that lists arrays without entries, which files do not hold
 EMPTY = "empty"
 # kinds that are attributes
 ATTRIBUTES = ("number", "text", "json")
+CONVENTIONS = "CF-1.13"
+# dimensions that are the pixels of a HEALPix map in RING order
+HEALPIX = ("pixel", "pixels", "region")
 
 
 def quantity(units: str, long_name: str = "", **options: Any) -> Any:
@@ -96,17 +109,92 @@ def to_tree(value: Any) -> xr.DataTree:
             attributes[name] = int(held) if isinstance(held, bool) else held
     if empty:
         attributes[EMPTY] = json.dumps(empty)
-    return xr.DataTree(xr.Dataset(variables, attrs=attributes), children=groups)
+    return xr.DataTree(with_grid(xr.Dataset(variables, attrs=attributes)), children=groups)
 
 
-def from_tree(kind: type[T], tree: xr.DataTree, where: str) -> T:
+def with_grid(dataset: xr.Dataset) -> xr.Dataset:
+    """The same with the grid of all arrays in pixels, of whole maps, as CF 1.13 has it."""
+    for dim in {*HEALPIX} & {*dataset.dims}:
+        n = dataset.sizes[dim]
+        grid, index = f"{dim}_grid", f"{dim}_index"
+        for variable in dataset.variables.values():
+            if dim in variable.dims:
+                variable.attrs["grid_mapping"] = grid
+        mapping = {
+            "grid_mapping_name": "healpix",
+            "indexing_scheme": "ring",
+            "refinement_level": round(np.log2(n / 12) / 2),
+        }
+        indices = {"standard_name": "healpix_index", "units": "1"}
+        packed = {"zlib": True, "shuffle": True}
+        dataset = dataset.assign_coords(
+            {index: (dim, np.arange(n, dtype=np.int32), indices, packed)}
+        ).assign({grid: ((), np.int8(0), mapping)})
+    return dataset
+
+
+class StoredTree:
+    """A group of a netCDF file that is open, with what :func:`from_tree` looks at in a tree.
+
+    Parameters
+    ----------
+    group : h5py.Group
+    """
+
+    def __init__(self, group: h5py.Group):
+        self._group = group
+
+    @cached_property
+    def attrs(self) -> dict[str, Any]:
+        """Attributes, of one entry each as numbers and text."""
+        found = {name: np.asarray(value) for name, value in self._group.attrs.items()}
+        return {name: v.item() if v.size == 1 else v for name, v in found.items()}
+
+    @cached_property
+    def variables(self) -> dict[str, Unread]:
+        """Arrays, not yet read."""
+        items = ((name, x) for name, x in self._group.items() if isinstance(x, h5py.Dataset))
+        return {name: Unloaded(x.shape, x.dtype, partial(_stored, x)) for name, x in items}
+
+    @cached_property
+    def children(self) -> dict[str, StoredTree]:
+        """Groups in this one."""
+        items = ((name, x) for name, x in self._group.items() if isinstance(x, h5py.Group))
+        return {name: StoredTree(group) for name, group in items}
+
+
+def _stored(variable: h5py.Dataset) -> np.ndarray:
+    is_text = h5py.check_string_dtype(variable.dtype) is not None
+    return (variable.asstr() if is_text else variable)[...]
+
+
+@contextmanager
+def opened_tree(path: str | Path, format_: str, what: str, hint: str = "") -> Iterator[StoredTree]:
+    """Open a file of the package; what is not asked for is not read.
+
+    Parameters
+    ----------
+    path, format_, what, hint
+        As of :func:`.require_format`.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, damaged or of another kind.
+    """
+    path = require_format(path, format_, what, hint)
+    with reading(path, what), h5py.File(path) as file:
+        yield StoredTree(file)
+
+
+def from_tree(kind: type[T], tree: xr.DataTree | StoredTree, where: str) -> T:
     """Make a dataclass of what :func:`to_tree` made of one.
 
     Parameters
     ----------
     kind : type
         The dataclass.
-    tree : xarray.DataTree
+    tree : xarray.DataTree or StoredTree
     where : str
         The file, for messages.
 
@@ -199,7 +287,7 @@ def _table(name: str, columns: Mapping[str, list]) -> xr.DataTree:
     return xr.DataTree(xr.Dataset(rows, attrs=attributes))
 
 
-def _of_group(kind: _Kind, tree: xr.DataTree, where: str) -> Any:
+def _of_group(kind: _Kind, tree: xr.DataTree | StoredTree, where: str) -> Any:
     if kind.what == "group":
         return from_tree(kind.of, tree, where)
     if kind.what == "frame":
@@ -215,27 +303,29 @@ def _of_group(kind: _Kind, tree: xr.DataTree, where: str) -> Any:
     )
 
 
-def _column(tree: xr.DataTree, name: str, where: str) -> list:
+def _column(tree: xr.DataTree | StoredTree, name: str, where: str) -> list:
     if name in tree.variables:
-        return tree.variables[name].values.tolist()
+        return np.asarray(tree.variables[name]).tolist()
     if tree.variables:
         raise InputError(f"{where} has no column {name} (it has {', '.join(tree.variables)})")
     return []
 
 
-def _array(kind: _Kind, variable: xr.Variable, where: str, sizes: dict[str, int]) -> np.ndarray:
-    if variable.ndim != len(kind.dims):
+def _array(kind: _Kind, variable: Unread, where: str, sizes: dict[str, int]) -> np.ndarray:
+    if len(variable.shape) != len(kind.dims):
         raise InputError(
-            f"{where} has {variable.ndim} dimensions, expected {len(kind.dims)}"
+            f"{where} has {len(variable.shape)} dimensions, expected {len(kind.dims)}"
             f" ({', '.join(kind.dims) or 'none'})"
         )
     for dim, n in zip(kind.dims, variable.shape, strict=True):
         if sizes.setdefault(dim, n) != n:
             raise InputError(f"{where} has {n} {dim}, other arrays of its group {sizes[dim]}")
     wanted = _dtype(kind.of)
-    if not np.can_cast(variable.dtype, wanted, casting="same_kind"):
+    # files hold no true and false, but whole numbers
+    as_bool = wanted == bool and variable.dtype.kind in "iu"
+    if not as_bool and not np.can_cast(variable.dtype, wanted, casting="same_kind"):
         raise InputError(f"{where} holds values of type {variable.dtype}, expected {wanted}")
-    return np.asarray(variable.values).astype(wanted, copy=False)
+    return np.asarray(variable).astype(wanted, copy=False)
 
 
 def _dtype(names: Any) -> np.dtype:

@@ -17,11 +17,10 @@ from lusee_bayes.core import formats
 from lusee_bayes.core.arrays import Pixels
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import recover, user_path
-from lusee_bayes.core.formats import opened_tree
 from lusee_bayes.core.harmonics import mode_numbers, n_modes
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.reading import require_file
-from lusee_bayes.core.trees import from_tree, to_tree
+from lusee_bayes.core.trees import from_tree, opened_tree, to_tree
 from lusee_bayes.core.version import __version__, versions
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.information import Information
