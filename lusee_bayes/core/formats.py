@@ -26,6 +26,7 @@ from lusee_bayes.core.layouts import Content, Layout, Unloaded
 from lusee_bayes.core.lazy import astropy_exceptions, fits
 from lusee_bayes.core.lazy import xarray as xr
 from lusee_bayes.core.reading import reading, require_file
+from lusee_bayes.core.version import __version__
 
 # a file is read whole up to this size; of a larger one, all metadata and the first value of each
 # array
@@ -65,7 +66,8 @@ def _probe(path: str, mtime_ns: int, size: int) -> None:
     _, status = os.waitpid(child, 0)
     if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGALRM:
         raise InputError(
-            f"{path} is damaged: HDF5's library does not come to an end with it within {LIMIT_S:g} s"
+            f"{path} is damaged: HDF5's library does not come to an end with it within "
+            f"{LIMIT_S:g} s"
         )
     if os.WIFSIGNALED(status):
         raise InputError(f"{path} is damaged: HDF5's library fails on it")
@@ -98,8 +100,8 @@ VISIBILITIES = "lusee_bayes visibilities 1"
 POSTERIOR = "lusee_bayes posterior 2"
 SAMPLES = "lusee_bayes samples 1"
 BEAMS = "lusee_bayes beams 1"
-GAINS = "lusee_bayes gains 1"
-REDUCED = "lusee_bayes reduced spectra 1"
+GAINS = "lusee_bayes gains 2"
+REDUCED = "lusee_bayes reduced spectra 2"
 DIAGNOSTICS = "lusee_bayes diagnostics 3"
 PAPER_CASE = "lusee_bayes paper case 1"
 
@@ -124,6 +126,15 @@ def format_of(path: str | Path) -> str | None:
             kind = file.attrs.get("format")
     kind = kind.decode(errors="replace") if isinstance(kind, bytes) else kind
     return kind if isinstance(kind, str) else None
+
+
+# the conventions that files of the package follow
+CF = "CF-1.13"
+
+
+def header(format_: str) -> dict[str, str]:
+    """Attributes of a file of the package: its format, conventions and version."""
+    return {"Conventions": CF, "format": format_, "lusee_bayes_version": __version__}
 
 
 # what the CF conventions call times, and what bounds may leave to the variable that they bound
