@@ -103,6 +103,7 @@ BEAMS = "lusee_bayes beams 1"
 GAINS = "lusee_bayes gains 2"
 REDUCED = "lusee_bayes reduced spectra 2"
 DIAGNOSTICS = "lusee_bayes diagnostics 3"
+CHANNEL = "lusee_bayes unfinished channel 1"
 PAPER_CASE = "lusee_bayes paper case 1"
 
 # words of the primary header that tell pyuvdata's beams from other FITS files

@@ -33,7 +33,7 @@ def describe_diagnostics(path: Path) -> list[str]:
                 lines.append("the data fit as a whole and were not judged group by group")
                 continue
             kinds, n = np.unique(judged.children["groups"].variables["kind"], return_counts=True)
-            counts = ", ".join(counted(k, kind) for kind, k in zip(kinds, n, strict=True))
+            counts = ", ".join(counted(k, kind) for kind, k in zip(kinds, n.tolist(), strict=True))
             lines += [str(judged.attrs["verdict"]), f"residuals by {counts}"]
     return lines
 
