@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,20 +28,6 @@ from lusee_bayes.linear.information import Information
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.map_result import MapResult
 
-# FITS keys have eight letters
-VERSION_KEYS = {
-    "lusee_bayes": "V_LUSEE",
-    "commit": "V_COMMIT",
-    "jax": "V_JAX",
-    "numpyro": "V_NPYRO",
-    "arviz-stats": "V_ARVIZ",
-    "numpy": "V_NUMPY",
-    "scipy": "V_SCIPY",
-    "healpy": "V_HEALPY",
-    "astropy": "V_ASTRO",
-    "lunarsky": "V_LUNAR",
-}
-
 
 def cards(name: str, scenario: Scenario) -> dict[str, object]:
     """Header cards of a result: what it is, of which frequency, beam, site and scenario.
@@ -58,7 +45,11 @@ def cards(name: str, scenario: Scenario) -> dict[str, object]:
         "SITELAT": (site.lat_deg, "selenographic latitude in degrees"),
         "SCENHASH": text_hash(scenario.to_yaml()),
         "CREATOR": f"lusee_bayes {__version__}",
-        **{VERSION_KEYS[package]: (v, package) for package, v in versions().items()},
+        # FITS keys have eight letters
+        **{
+            f"V_{re.split('[-_]', name)[0][:6].upper()}": (v, name)
+            for name, v in versions().items()
+        },
     }
 
 

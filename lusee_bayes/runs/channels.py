@@ -640,7 +640,7 @@ def _write_joint_sky(
         information.log_likelihood(skies),
         np.asarray(sky.draws) - np.asarray(sky.mean),
         unknowns=report,
-        independent=information.reference,
+        independent=np.asarray(information.reference),
         covariance_kept=scenario.output.covariance,
         **information.fit(sky.mean, sky.covariance),
     )
