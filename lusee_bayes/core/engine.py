@@ -160,7 +160,8 @@ class Engine(ABC):
         Raises
         ------
         Exception
-            The first that a task raises; those that wait are not begun.
+            That of the first task, in their order, that raises one; those that wait then are not
+            begun.
         WorkersLost
             If a task cannot be carried out because its workers fail.
         """
