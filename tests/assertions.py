@@ -23,6 +23,16 @@ def off(got: object, expected: object) -> float:
     return np.abs(got - expected).max() / np.abs(expected).max()
 
 
+def assert_same_map(got: object, expected: object, sigma: float) -> None:
+    """Assert that means agree to ``sigma`` standard deviations, and these to that part."""
+    (mean, std), (other, width) = (
+        (np.asarray(m.mean), np.asarray(m.std() if callable(m.std) else m.std))
+        for m in (got, expected)
+    )
+    assert (np.abs(mean - other) / width).max() < sigma
+    np.testing.assert_allclose(std, width, rtol=sigma)
+
+
 def within(got: object, expected: object, atol: object) -> None:
     """Assert that arrays agree to so much, whatever their size."""
     np.testing.assert_allclose(got, expected, rtol=0, atol=atol)

@@ -28,13 +28,6 @@ JOINT = ["joint=true", "spectral.components=[power_law]"]
 pytestmark = pytest.mark.usefixtures("numbers_alone")
 
 
-@pytest.fixture
-def exact_tilt(monkeypatch):
-    """Tilts about the pole between two runs as exact as about each one's own."""
-    monkeypatch.setattr("lusee_bayes.instrument.pointing.LEAST_ORDER", 4)
-    monkeypatch.setattr("lusee_bayes.instrument.averaging.TOLERANCE", 1e-13)
-
-
 def in_parts(scenario, folder):
     """The run of all data, that of the first part, and that of the second added to the first."""
     whole = [lb.build(channel).data for channel in scenario.channels() or (scenario,)]
