@@ -11,12 +11,12 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
+from assertions import refuse
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from jaxtyping import Bool, Float, Int8
 
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.trees import from_tree, quantity, to_tree
 
 
@@ -222,26 +222,14 @@ DAMAGED = {
     "no array": (lambda t: without(t, "sky"), "a file has no sky (it has "),
     "no group": (lambda t: without(t, "inner"), "a file has no inner (it has "),
     "within a group": (lambda t: without(t["inner"], "level"), "a file: inner has no level"),
-    "text for a number": (
-        lambda t: t.attrs.update(count="many"),
-        "count is 'many', expected a whole number",
-    ),
+    "text for a number": (lambda t: t.attrs.update(count="many"), "count is 'many', expected"),
     "half a count": (lambda t: t.attrs.update(count=2.5), "count is 2.5, expected a whole number"),
-    "NaN for a count": (
-        lambda t: t.attrs.update(count=np.nan),
-        "count is nan, expected a whole number",
-    ),
+    "NaN for a count": (lambda t: t.attrs.update(count=np.nan), "count is nan, expected"),
     "numbers for one": (lambda t: t.attrs.update(share=np.ones(2)), "expected a number"),
     "a number for text": (lambda t: t.attrs.update(name=3), "name is 3, expected text"),
     "not JSON": (lambda t: t.attrs.update(labels="{one"), "labels is '{one', expected JSON"),
-    "other JSON": (
-        lambda t: t.attrs.update(labels="[1, 2]"),
-        "labels is '[1, 2]': Input should be a valid string",
-    ),
-    "a list for an object": (
-        lambda t: t.attrs.update(told="[]"),
-        "told is '[]': Input should be a valid dict",
-    ),
+    "other JSON": (lambda t: t.attrs.update(labels="[1, 2]"), "labels is '[1, 2]'"),
+    "a list for an object": (lambda t: t.attrs.update(told="[]"), "told is '[]'"),
     "a number for JSON": (lambda t: t.attrs.update(told=5), "told is 5, expected JSON"),
     "another shape": (
         lambda t: put(t, "sky", np.ones((4, 4)), "mode", "mode_2"),
@@ -277,6 +265,4 @@ def test_what_is_damaged_is_told_in_a_sentence(name):
     damage, words = DAMAGED[name]
     tree = to_tree(example())
     damage(tree)
-    with pytest.raises(InputError) as told:
-        from_tree(Everything, tree, "a file")
-    assert words in str(told.value) and "\n" not in str(told.value)
+    refuse(words, from_tree, Everything, tree, "a file")

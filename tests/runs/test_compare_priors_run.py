@@ -83,9 +83,8 @@ def test_data_of_a_prior_prefer_it(name, tmp_path):
     sky[0] = setup.sky.modes[0]
     path = write_alms(tmp_path / "sky.fits", sky, {})
     drawn = small_scenario(f"sky={{model: file, file: {path}}}", "sky.sources=null", **SIZES)
-    result = lb.run_compare_priors(
-        drawn, tmp_path / "out", ["isotropic-sky", "local_scales"]
-    ).result
+    two = ["isotropic-sky", "local_scales"]
+    result = lb.run_compare_priors(drawn, tmp_path / "out", two).result
     assert result.best.name == name
     assert f"The data prefer {name}" in result.headline()
     if name == "local_scales":  # it has seen what it predicts, with parameters enough to gain by it

@@ -62,10 +62,8 @@ def weighted_draws(result: SampleResult, n: int) -> tuple[np.ndarray, np.ndarray
 def test_samples_have_the_moments_of_weighted_draws(tmp_path):
     """Hamiltonian Monte Carlo and weighted draws, of the sky, A and the tilt."""
     scenario = small_scenario(NO_SOURCES, lmax=LMAX, cycles=0.1)
-    sampler, program = (
-        lb.Sampler(chains=2, warmup=100, draws=500, seed=1),
-        lb.load_program("log_normal"),
-    )
+    sampler = lb.Sampler(chains=2, warmup=100, draws=500, seed=1)
+    program = lb.load_program("log_normal")
     run = lb.run_sample(scenario, tmp_path / "samples", program=program, sampler=sampler)
     (sampled,) = run.result
     # tails of A where the sky hardly tells it are steep: one of a thousand may fail
