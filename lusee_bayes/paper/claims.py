@@ -63,9 +63,8 @@ class Claim:
         return globals()[f"_{self.judge}"](cases, *self.of)
 
 
-CLAIMS = tuple(
-    Claim(**row) for row in read_yaml(Path(__file__).with_name("claims.yaml"), "the paper's claims")
-)
+ROWS = read_yaml(Path(__file__).with_name("claims.yaml"), "the paper's claims")
+CLAIMS = tuple(Claim(**row | {"of": tuple(row.get("of", ()))}) for row in ROWS)
 
 
 def grade(obtained: str, agrees: bool | np.bool_, partly: bool | np.bool_ = False) -> Verdict:
