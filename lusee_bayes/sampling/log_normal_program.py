@@ -58,7 +58,7 @@ from lusee_bayes.core.linalg import (
 from lusee_bayes.linear.information import Information
 from lusee_bayes.sampling.hmc import Whitening
 from lusee_bayes.sampling.log_normal_prior import AMPLITUDE, STRUCTURE, TILT, LogNormalPrior
-from lusee_bayes.sky.log_normal import LogNormalSky
+from lusee_bayes.sky.positive_skies import LogNormalSky, matching_step
 from lusee_bayes.systematics.systematic import Chart
 
 # the mode is found when a step is shorter than this, in standard deviations, all unknowns together
@@ -75,8 +75,8 @@ DAMPING, POOR, GOOD, ROUNDING = 4.0, 0.25, 0.75, 1e-5
 # A and the tilt are found when a step is shorter than this, in standard deviations
 SPECTRUM_SETTLED = 0.02
 SPECTRUM_STEPS = 30
-# steps of ln A and of the tilt up to which the slope is nearly straight, and longest step
-NEAR, REACH = 0.2, 3.0
+# steps of ln A and of the tilt up to which the slope is nearly straight
+NEAR = 0.2
 # curvature from which on directions are made straight; the prior's is one
 STIFF = 1.5
 # a correction gains the rms of s that is left open times this: with 1.25, the energy of 2304
@@ -306,8 +306,7 @@ def learn_spectrum(prior: LogNormalPrior, information: Information) -> LogNormal
         If no maximum is found in 30 steps, or for one of them no mode.
     """
     sky, start, last = prior.sky, None, None
-    centre = np.array([np.log(prior.amplitude), prior.tilt])
-    narrow = np.array([prior.log_amplitude_std, prior.tilt_std], dtype=float) ** -2.0
+    centre, narrow = prior.expected, prior.std**-2.0
     theta, bend = centre, np.zeros((2, 2))
     for _ in range(SPECTRUM_STEPS + 1):
         sky = sky.with_power_law(np.exp(theta[0]), theta[1])
@@ -322,7 +321,7 @@ def learn_spectrum(prior: LogNormalPrior, information: Information) -> LogNormal
             bend = np.outer(last[1] - slope - last[2] @ moved, moved) / (moved @ moved)
         step = np.linalg.solve(fisher + bend, slope)
         if np.abs(step).max() > NEAR or step @ slope <= 0:
-            step, bend = _matched(mode, centre - theta, narrow), np.zeros((2, 2))
+            step, bend = _matched(mode, theta - centre, narrow), np.zeros((2, 2))
         last = theta, slope, fisher
         # near by, the logarithm stays as it is: the data know it
         theta = theta + step
@@ -372,22 +371,13 @@ def _slope_and_fisher(
 
 
 def _matched(
-    mode: LogNormalMode, centre: Float[np.ndarray, "2"], narrow: Float[np.ndarray, "2"]
+    mode: LogNormalMode, away: Float[np.ndarray, "2"], narrow: Float[np.ndarray, "2"]
 ) -> Float[np.ndarray, "2"]:
-    """The step after which the modes have as much power as they should, each for itself.
-
-    u_i^2 is 1 - (H^-1)_ii on average where theta is right. This goes far where a slope does not.
-    """
+    """The step of :func:`.matching_step`, each mode for itself."""
     sky = mode.sky
-    left = np.diagonal(inverse_from_cholesky(mode.lower))[: sky.n_modes]
-    slopes, known, power = sky.power_law_slopes(), 1.0 - left, mode.white[: sky.n_modes] ** 2
-    step = np.zeros(2)
-    for _ in range(SPECTRUM_STEPS):
-        expected = known * np.exp(2.0 * (step @ slopes))
-        slope = slopes @ (known * (power / expected - 1.0)) + narrow * (centre - step)
-        fisher = 2.0 * (slopes * np.maximum(known, power * known / expected)) @ slopes.T
-        step = step + np.linalg.solve(fisher + np.diag(narrow), slope)
-    return np.clip(step, -REACH, REACH)
+    known = 1.0 - np.diagonal(inverse_from_cholesky(mode.lower))[: sky.n_modes]
+    power = mode.white[: sky.n_modes] ** 2
+    return matching_step(power, known, sky.power_law_slopes(), away, narrow)
 
 
 def coordinates_of(prior: LogNormalPrior, information: Information) -> Whitening:

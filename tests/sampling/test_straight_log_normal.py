@@ -22,7 +22,7 @@ from lusee_bayes.sampling.log_normal_program import (
     straight_coordinates,
 )
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
-from lusee_bayes.sky.log_normal import LogNormalSky, deviation_spectrum
+from lusee_bayes.sky.positive_skies import LogNormalSky, deviation_spectrum
 from lusee_bayes.sky.template import EmbeddedTemplate
 
 MHZ, LMAX, TILTED = 25.0, 3, -2.0
@@ -192,7 +192,7 @@ def test_refusals():
         lb.InputError, match="amplitude of the logarithm of the sky must be positive"
     ):
         LogNormalPrior.of(log_normal(0.1), 0.0, TILTED)
-    with pytest.raises(lb.InputError, match="standard deviation of the tilt must be positive"):
+    with pytest.raises(lb.InputError, match="of ln A or of the tilt must be positive"):
         LogNormalPrior.of(log_normal(0.1), 0.1, TILTED, (1.0, 0.0))
 
 
