@@ -13,14 +13,12 @@ FREQ_START, FREQ_END and FREQ_STEP in MHz. The file does not say its frame and o
 
 from __future__ import annotations
 
-import warnings
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
 import numpy as np
-from astropy import units as u
 from astropy.io import fits
 from jaxtyping import Float
 
@@ -204,7 +202,8 @@ def _read_map(path: Path) -> np.ndarray:
         header, column = tables[0].header, tables[0].columns[0]
         # healpy writes rows of 1024 pixels
         given = {column.name: np.ravel(tables[0].data.field(0))}
-        values = _layout(column.name).checked(path, given, {}).arrays[column.name]
+        units = {f"{column.name}.units": column.unit}
+        values = _layout(column.name).checked(path, given, units).arrays[column.name]
     ordering = str(header.get("ORDERING", "absent")).strip().upper()
     if ordering != "RING":
         raise InputError(
@@ -217,21 +216,7 @@ def _read_map(path: Path) -> np.ndarray:
             f"{path}: COORDSYS is {frame}, expected G (Galactic); rotate the map with "
             f"healpy.Rotator(coord=['{frame[:1]}', 'G'])"
         )
-    return values * _kelvin(path, column.unit)
-
-
-def _kelvin(path: Path, unit: str | None) -> float:
-    """Factor from the file's unit to K; a map without unit is taken to be in K."""
-    if not unit:
-        return 1.0
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", u.UnitsWarning)
-            return u.Unit(unit, format="fits").to(u.K)
-    except (ValueError, u.UnitConversionError) as error:
-        raise InputError(
-            f"{path}: the map's unit is '{unit}', expected a temperature (K); convert it first"
-        ) from error
+    return values
 
 
 COLUMNS = ("index", "real", "imag")
@@ -353,19 +338,14 @@ def write_alms(path: str | Path, modes: Float[Array, " modes"], header: dict[str
     alm = to_healpy(modes)
     lmax = lmax_of(np.shape(modes)[-1])
     ell, m = healpy.Alm.getlm(lmax)
-    values = (ell**2 + ell + m + 1, alm.real, alm.imag)
-    formats = ("J", "D", "D")
-    table = fits.BinTableHDU.from_columns(
-        [
-            fits.Column(name, format_, array=value, unit=None if name == "index" else "K")
-            for name, format_, value in zip(COLUMNS, formats, values, strict=True)
-        ],
-        name="ALM",
-    )
-    table.header["MAX-LPOL"] = (lmax, "highest ell")
-    table.header["MAX-MPOL"] = (lmax, "highest m")
-    for key, value in header.items():
-        table.header[key] = value
+    columns = [
+        fits.Column("index", "J", array=ell**2 + ell + m + 1),
+        fits.Column("real", "D", "K", array=alm.real),
+        fits.Column("imag", "D", "K", array=alm.imag),
+    ]
+    table = fits.BinTableHDU.from_columns(columns, name="ALM")
+    ends = {"MAX-LPOL": (lmax, "highest ell"), "MAX-MPOL": (lmax, "highest m")}
+    table.header.update(ends | header)
     with replacing(path) as partial:
         fits.HDUList([fits.PrimaryHDU(), table]).writeto(partial)
     return user_path(path)
