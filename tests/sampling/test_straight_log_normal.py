@@ -177,8 +177,9 @@ def test_the_learned_spectrum_has_the_highest_evidence_and_its_curvature():
     top = log_posterior(best)
     for direction in np.linalg.cholesky(found.covariance).T:
         up, down = log_posterior(best + direction), log_posterior(best - direction)
-        # a parabola with this covariance falls by 1/2 on both sides
-        assert 0.5 * (up + down) - top == pytest.approx(-0.5, abs=0.1)
+        # a parabola of the Fisher information falls by 1/2; of 16 modes what these data say differs
+        # from it by sqrt(2 / 16) of that: two standard deviations
+        assert 0.5 * (up + down) - top == pytest.approx(-0.5, abs=0.35)
         assert 0.5 * (up - down) == pytest.approx(0.0, abs=0.1)
 
 
