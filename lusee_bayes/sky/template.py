@@ -9,6 +9,7 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float
 
+from lusee_bayes.core.arrays import Vector
 from lusee_bayes.sky.galaxy import MAXIMUM_MHZ, Slabs, background, brightness, galaxy_map
 from lusee_bayes.sky.sky_source import GalaxySource
 
@@ -29,9 +30,7 @@ def _slabs(points: bytes) -> tuple[Slabs, tuple[np.ndarray, np.ndarray]]:
     return Slabs.towards(np.degrees(both[1]), np.degrees(both[0])), places
 
 
-def galactic_share(
-    theta: Float[np.ndarray, " points"], phi: Float[np.ndarray, " points"]
-) -> Float[np.ndarray, " points"]:
+def galactic_share(theta: Vector, phi: Vector) -> Vector:
     """Compute the Galaxy's share of the embedded diffuse sky, where it is transparent.
 
     The rest is the extragalactic background, which is the same everywhere.
@@ -51,9 +50,7 @@ class Template(ABC):
     """A brightness temperature in every direction, at one frequency."""
 
     @abstractmethod
-    def at(
-        self, theta: Float[np.ndarray, " points"], phi: Float[np.ndarray, " points"]
-    ) -> Float[np.ndarray, " points"]:
+    def at(self, theta: Vector, phi: Vector) -> Vector:
         """Compute it in Galactic directions.
 
         Parameters
