@@ -22,6 +22,8 @@ from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.judge.measures import ell_cross
 
 Cases = Mapping[str, xr.Dataset]
+# the cases by name: their scenarios, and what figures call them
+TABLE = read_yaml(Path(__file__).with_name("cases.yaml"), "the paper's cases")
 
 FREQUENCIES = tuple(range(5, 51, 5))
 SHOWN_FREQUENCIES = (5, 15, 25, 35, 45)
