@@ -30,7 +30,7 @@ from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.priors.families import Hyperprior, Member, Parameters, PriorFamily, SpectrumBasis
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, PointSource
 from lusee_bayes.sky.prior import PIVOT, DensePrior
-from lusee_bayes.sky.template import EmbeddedTemplate
+from lusee_bayes.sky.sky_source import EmbeddedTemplate
 
 # arrays that recur
 Covariates = Float[np.ndarray, " covariates"]

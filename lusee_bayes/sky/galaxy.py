@@ -37,6 +37,7 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float
 
+from lusee_bayes.core.arrays import Vector
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import require_nside, synthesis_matrix
 from lusee_bayes.core.lazy import coordinates, healpy
@@ -580,3 +581,49 @@ def galaxy_map(frequency_mhz: float, nside: int = 64, seed: int | None = 1) -> n
     if seed is not None:
         synchrotron *= np.exp(_fluctuations(nside, seed) - 0.5 * FLUCTUATION_RMS**2)
     return brightness(synchrotron, depth, frequency_mhz)
+
+
+def _towards(theta: np.ndarray, phi: np.ndarray) -> tuple[Slabs, tuple[np.ndarray, np.ndarray]]:
+    """Lines of sight, the same at all frequencies, and the side and line of each direction."""
+    return _slabs(np.stack([0.5 * np.pi - np.asarray(theta), phi]).astype(np.float64).tobytes())
+
+
+@lru_cache(maxsize=1)
+def _slabs(points: bytes) -> tuple[Slabs, tuple[np.ndarray, np.ndarray]]:
+    latitude, longitude = np.frombuffer(points).reshape(2, -1)
+    # lines of sight above and below the plane share what is symmetric: each once for both
+    both, of_point = np.unique(
+        np.stack([np.abs(latitude).round(12), longitude]), axis=1, return_inverse=True
+    )
+    places = (latitude < 0).astype(int), of_point.ravel()
+    return Slabs.towards(np.degrees(both[1]), np.degrees(both[0])), places
+
+
+def galactic_share(theta: Vector, phi: Vector) -> Vector:
+    """Compute the Galaxy's share of the embedded diffuse sky, where it is transparent.
+
+    The rest is the extragalactic background, which is the same everywhere.
+
+    Parameters
+    ----------
+    theta, phi : (points,) array
+        Galactic, in radians; theta from the north pole.
+    """
+    slabs, places = _towards(theta, phi)
+    synchrotron, depth = slabs.synchrotron(MAXIMUM_MHZ)
+    whole = brightness(synchrotron, depth, MAXIMUM_MHZ)
+    return (1.0 - background(MAXIMUM_MHZ) * np.exp(-depth) / whole)[places]
+
+
+def diffuse_brightness(frequency_mhz: float, theta: Vector, phi: Vector) -> Vector:
+    """Compute the diffuse sky without its random component in given directions, in K.
+
+    Parameters
+    ----------
+    frequency_mhz : float
+        Frequency in MHz, 1 to 50.
+    theta, phi : (points,) array
+        Galactic, in radians; theta from the north pole.
+    """
+    slabs, places = _towards(theta, phi)
+    return brightness(*slabs.synchrotron(frequency_mhz), frequency_mhz)[places]

@@ -48,8 +48,8 @@ from lusee_bayes.core.harmonics import n_modes, per_mode
 from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.sky.galaxy import FREE_FREE_SLOPE, PointSource
 from lusee_bayes.sky.prior import PIVOT
+from lusee_bayes.sky.sky_source import Template
 from lusee_bayes.sky.spectral_prior import SpectralPrior, require_names
-from lusee_bayes.sky.template import Template
 
 # steps of Newton's method, of which each closes in on the root; longest change of a parameter
 NEWTON, REACH = 30, 2.0

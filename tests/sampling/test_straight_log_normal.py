@@ -23,7 +23,7 @@ from lusee_bayes.sampling.log_normal_program import (
 )
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
 from lusee_bayes.sky.positive_skies import LogNormalSky, deviation_spectrum
-from lusee_bayes.sky.template import EmbeddedTemplate
+from lusee_bayes.sky.sky_source import EmbeddedTemplate
 
 MHZ, LMAX, TILTED = 25.0, 3, -2.0
 LEVEL = np.array([4.0 * np.pi])

@@ -17,7 +17,7 @@ from lusee_bayes.core.harmonics import map_to_modes, n_modes, synthesis_matrix
 from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, galaxy_map
 from lusee_bayes.sky.positive_skies import LogNormalSky, deviation_spectrum
-from lusee_bayes.sky.template import EmbeddedTemplate, Template
+from lusee_bayes.sky.sky_source import EmbeddedTemplate, Template
 
 LMAX, MHZ = 5, 25.0
 LEVEL = np.array([0.5])

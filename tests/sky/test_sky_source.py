@@ -24,8 +24,16 @@ from lusee_bayes.core.harmonics import (
 )
 from lusee_bayes.report.describe import describe
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
-from lusee_bayes.sky.sky_files import SkyAlms, SkyCube, SkyMap, write_alms
-from lusee_bayes.sky.sky_source import SKY_READERS, FileSource, GalaxySource, read_sky_file
+from lusee_bayes.sky.sky_source import (
+    SKY_READERS,
+    FileSource,
+    GalaxySource,
+    SkyAlms,
+    SkyCube,
+    SkyMap,
+    read_sky_file,
+    write_alms,
+)
 from lusee_bayes.testing.contracts import assert_refused, check_sky_source
 
 NSIDE, LMAX = 16, 8
