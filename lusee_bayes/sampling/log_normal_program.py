@@ -303,23 +303,19 @@ def learn_spectrum(prior: LogNormalPrior, information: Information) -> LogNormal
     InputError
         If no maximum is found in 30 steps, or for one of them no mode.
     """
-    sky, start, last = prior.sky, None, None
+    sky, start = prior.sky, None
     centre, narrow = prior.expected, prior.std**-2.0
-    theta, bend = centre, np.zeros((2, 2))
+    theta = centre
     for _ in range(SPECTRUM_STEPS + 1):
         sky = sky.with_power_law(np.exp(theta[0]), theta[1])
         mode = find_mode(sky, information, start)
         slope, fisher = _slope_and_fisher(mode)
         slope, fisher = slope - narrow * (theta - centre), fisher + np.diag(narrow)
-        if np.sqrt(slope @ np.linalg.solve(fisher, slope)) < SPECTRUM_SETTLED:
+        step = np.linalg.solve(fisher, slope)
+        if np.sqrt(slope @ step) < SPECTRUM_SETTLED:
             return replace(mode, power_law=theta, covariance=np.linalg.inv(fisher))
-        if last is not None:  # what the Fisher information of the last step did not foresee
-            moved = theta - last[0]
-            bend = np.outer(last[1] - slope - last[2] @ moved, moved) / (moved @ moved)
-        step = np.linalg.solve(fisher + bend, slope)
-        if np.abs(step).max() > NEAR or step @ slope <= 0:
-            step, bend = _matched(mode, theta - centre, narrow), np.zeros((2, 2))
-        last = theta, slope, fisher
+        if np.abs(step).max() > NEAR:
+            step = _matched(mode, theta - centre, narrow)
         # near by, the logarithm stays as it is: the data know it
         theta = theta + step
         ratio = sky.root() / sky.with_power_law(np.exp(theta[0]), theta[1]).root()
