@@ -7,9 +7,9 @@ import numpy as np
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
+from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, galactic_share
 from lusee_bayes.sky.positive_skies import PositiveSkies
-from lusee_bayes.sky.template import EmbeddedTemplate, galactic_share
+from lusee_bayes.sky.sky_source import EmbeddedTemplate
 
 # highest ell of the fields, over that of the map
 FIELDS = 1.5

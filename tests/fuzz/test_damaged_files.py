@@ -24,7 +24,7 @@ from lusee_bayes.report.describe import describe
 from lusee_bayes.results.map_files import read_channels, read_information
 from lusee_bayes.runs import folder as folder_module
 from lusee_bayes.runs import map_run
-from lusee_bayes.sky.sky_files import write_alms
+from lusee_bayes.sky.sky_source import write_alms
 from lusee_bayes.testing.scenarios import small_scenario
 
 FEW, MANY = 2, 150 * SCALE

@@ -19,7 +19,7 @@ from lusee_bayes.linear.positive_joint import (
     positive_sky,
 )
 from lusee_bayes.sky.positive_skies import FieldLaws, PositiveSkies
-from lusee_bayes.sky.template import Template
+from lusee_bayes.sky.sky_source import Template
 
 LMAX = 3
 N = n_modes(LMAX)

@@ -25,7 +25,7 @@ from lusee_bayes.runs import channels, map_run
 from lusee_bayes.runs import folder as folder_module
 from lusee_bayes.runs.channels import map_channels
 from lusee_bayes.sampling.datatree import read_datatree
-from lusee_bayes.sky.sky_files import SkyCube
+from lusee_bayes.sky.sky_source import SkyCube
 from lusee_bayes.systematics.context import Around
 
 SMALL = ["--set", "lmax=4", "--set", "observation.runs.0.cycles=0.1"]
