@@ -41,7 +41,7 @@ from lusee_bayes.core.harmonics import lmax_of, n_modes
 from lusee_bayes.core.layouts import Attribute, Content, Layout, Variable, require_mhz
 from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.core.version import __version__
-from lusee_bayes.instrument.beams.monopoles import MeasuredReceiver, receiver_of
+from lusee_bayes.instrument.beams.source import MeasuredReceiver, receiver_of
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import (
     N_ANTENNAS,

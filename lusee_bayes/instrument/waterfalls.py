@@ -44,7 +44,7 @@ from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.core.version import __version__
 from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ, Interpolation
-from lusee_bayes.instrument.beams.monopoles import LOADS, Circuit, MeasuredReceiver, receiver_of
+from lusee_bayes.instrument.beams.source import LOADS, Circuit, MeasuredReceiver, receiver_of
 from lusee_bayes.instrument.observation import Observation, body_direction
 from lusee_bayes.instrument.products import (
     N_ANTENNAS,

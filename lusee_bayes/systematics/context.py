@@ -23,8 +23,7 @@ from jaxtyping import Float
 from lusee_bayes.core.arrays import Array, DataVector, Grid, Modes
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.beams.monopoles import Receiver
-from lusee_bayes.instrument.beams.source import BeamSource
+from lusee_bayes.instrument.beams.source import BeamSource, Receiver
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.instrument import Instrument
 from lusee_bayes.instrument.observation import Observation

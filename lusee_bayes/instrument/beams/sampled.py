@@ -54,7 +54,6 @@ from lusee_bayes.instrument.beams.fields import (
     at_frequency,
     from_rings,
     on_grid,
-    stokes_beam,
 )
 from lusee_bayes.instrument.beams.luseepy_files import (
     PortResponse,
@@ -215,8 +214,8 @@ def _axes(theta: np.ndarray, phi: np.ndarray) -> tuple[list[np.ndarray], list[np
     )
 
 
-@dataclass(frozen=True, repr=False)
-class SampledBeams(Described):
+@dataclass(frozen=True, repr=False, eq=False)
+class SampledBeams(Described, BeamSource):
     """Fields of antennas, or beams of products, in directions of a grid or of HEALPix pixels.
 
     :func:`sampled_beams` makes them of arrays.
@@ -236,6 +235,11 @@ class SampledBeams(Described):
         autos are scaled to integrate to one on average.
     path : str
         Where they come from, for messages.
+    turntable_offset_deg : float
+        How much further the turntable is than it says, from East towards North.
+    normalise : bool or None
+        Scale the beams so that autos integrate to one on average; by default unless they are
+        absolute.
     """
 
     frequencies_mhz: Float[np.ndarray, " frequencies"]
@@ -245,6 +249,8 @@ class SampledBeams(Described):
     products: Float[np.ndarray, "frequencies products *directions"] | None = None
     absolute: bool = False
     path: str = "the beams"
+    turntable_offset_deg: float = 0.0
+    normalise: bool | None = None
 
     def description(self) -> tuple[str, ...]:
         kind = "E fields of" if self.products is None else "product beams of"
@@ -256,81 +262,32 @@ class SampledBeams(Described):
 
     @property
     def n_ports(self) -> int:
-        """Number of antennas."""
         if self.products is None:
             return self.e_theta.shape[1]
         return round(np.sqrt(self.products.shape[1]))
 
-    def fields(
-        self, frequency_mhz: float, grid: HemisphereGrid, turn_deg: float = 0.0
-    ) -> AntennaFields:
-        """Return the fields on a grid.
-
-        Parameters
-        ----------
-        frequency_mhz : float
-        grid : HemisphereGrid
-        turn_deg : float
-            How far the antennas are turned, from East towards North.
-
-        Returns
-        -------
-        AntennaFields
-
-        Raises
-        ------
-        InputError
-            Outside the frequencies, or for beams of products.
-        """
+    def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
         if self.products is not None:
             raise InputError(
                 f"{self.path} has beams of products, not the E fields of antennas, which this needs"
             )
         parts = self._at(frequency_mhz, self.e_theta, self.e_phi)
-        return AntennaFields(*self.directions.vectors_on(*parts, grid, turn_deg), grid)
+        turned = self.directions.vectors_on(*parts, grid, self.turntable_offset_deg)
+        return AntennaFields(*turned, grid)
 
     def patterns(
-        self, frequency_mhz: float, grid: HemisphereGrid, turn_deg: float = 0.0
-    ) -> Complex[np.ndarray, "antennas antennas theta phi"]:
-        """Return the response of every pair to Stokes I on a grid; arguments as of :meth:`fields`.
-
-        Raises
-        ------
-        InputError
-            Outside the frequencies.
-        """
+        self, frequency_mhz: float, grid: HemisphereGrid
+    ) -> Complex[Array, "antennas antennas theta phi"]:
         if self.products is None:
-            return np.asarray(stokes_beam(self.fields(frequency_mhz, grid, turn_deg)))
+            return super().patterns(frequency_mhz, grid)
         (beams,) = self._at(frequency_mhz, self.products)
-        return to_matrix(self.directions.scalars_on(beams, grid, turn_deg))
+        return to_matrix(self.directions.scalars_on(beams, grid, self.turntable_offset_deg))
 
     def _at(self, frequency_mhz: float, *parts: np.ndarray) -> list[np.ndarray]:
         return at_frequency(self.path, self.frequencies_mhz, frequency_mhz, *parts, rule="spline")
 
-    def beams(
-        self,
-        frequency_mhz: float,
-        lmax: int,
-        *,
-        turn_deg: float = 0.0,
-        normalise: bool | None = None,
-    ) -> ProductBeams:
-        """Return the beams of all products.
-
-        Parameters
-        ----------
-        frequency_mhz : float
-        lmax : int
-        turn_deg : float
-            How far the antennas are turned, from East towards North.
-        normalise : bool, optional
-            Scale them so that autos integrate to one on average; by default unless they are
-            absolute.
-
-        Returns
-        -------
-        ProductBeams
-            In K per K.
+    def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
+        """Return the beams of all products in K per K.
 
         Raises
         ------
@@ -339,8 +296,8 @@ class SampledBeams(Described):
             positive.
         """
         grid = self.directions.quadrature(lmax)
-        patterns = to_real(self.patterns(frequency_mhz, grid, turn_deg))
-        if not self.absolute if normalise is None else normalise:
+        patterns = to_real(self.patterns(frequency_mhz, grid))
+        if not self.absolute if self.normalise is None else self.normalise:
             scale = float(grid.integrate(patterns[auto_indices(self.n_ports)]).mean())
             if not scale > 0.0:
                 raise InputError(
@@ -567,40 +524,6 @@ def _in_order(beams: np.ndarray, products: str) -> np.ndarray:
             f"{', '.join(expected)}"
         )
     return beams[:, [names.index(name) for name in expected]]
-
-
-@dataclass(frozen=True, eq=False)
-class SampledFileBeams(BeamSource):
-    """Fields of antennas or beams of products that are sampled in directions; nothing emits.
-
-    Attributes
-    ----------
-    sampled : SampledBeams
-    turntable_offset_deg : float
-        How much further the turntable is than it says, from East towards North.
-    normalise : bool or None
-        Scale the beams so that autos integrate to one on average; None for as the file says.
-    """
-
-    sampled: SampledBeams
-    turntable_offset_deg: float = 0.0
-    normalise: bool | None = None
-
-    @property
-    def n_ports(self) -> int:
-        return self.sampled.n_ports
-
-    def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
-        return self.sampled.fields(frequency_mhz, grid, self.turntable_offset_deg)
-
-    def patterns(
-        self, frequency_mhz: float, grid: HemisphereGrid
-    ) -> Complex[Array, "antennas antennas theta phi"]:
-        return self.sampled.patterns(frequency_mhz, grid, self.turntable_offset_deg)
-
-    def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
-        turn_deg, normalise = self.turntable_offset_deg, self.normalise
-        return self.sampled.beams(frequency_mhz, lmax, turn_deg=turn_deg, normalise=normalise)
 
 
 def read_uvbeam(path: str | Path) -> SampledBeams:
