@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 import astropy.units as u
 import numpy as np
@@ -28,13 +28,14 @@ from scipy.spatial.transform import Rotation as SpatialRotation
 
 from lusee_bayes.core.checks import Described, listed, require_finite, require_positive
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.instrument.schedule import Cuts, Interval, Run, cut_intervals, cut_runs
+from lusee_bayes.instrument.schedule import Cut, Interval, Run, cut_intervals, cut_runs
 from lusee_bayes.instrument.times import (
     Windows,
     later,
     require_ephemeris,
     seconds_from,
     unannounced_leap_seconds,
+    utc_from_text,
 )
 
 ONE_CYCLE = (Run(),)
@@ -176,9 +177,9 @@ class Observation(Described):
         InputError
             For a bad date, step or length, and for a run without samples.
         """
-        cuts = cut_runs(runs, start, step_s)
-        site = {"lon_deg": lon_deg, "lat_deg": lat_deg, "fixed_axis": fixed_axis}
-        return cls._of_cuts(cuts, window, throughout=False, step_s=step_s, **site)
+        cuts, site = cut_runs(runs, step_s), (lon_deg, lat_deg)
+        t0, number = utc_from_text("start", start), np.arange(len(runs))
+        return cls._of_cuts(cuts, t0, number, window, site, step_s, fixed_axis)
 
     @classmethod
     def from_schedule(
@@ -218,27 +219,58 @@ class Observation(Described):
             For intervals that overlap or are not in order, for a duty cycle of instants, and where
             an interval of nights holds none.
         """
-        cuts = cut_intervals(intervals, step_s)
-        site = {"lon_deg": lon_deg, "lat_deg": lat_deg, "fixed_axis": fixed_axis}
-        return cls._of_cuts(cuts, window, throughout=True, step_s=step_s, **site)
+        cuts, site = cut_intervals(intervals, step_s), (lon_deg, lat_deg)
+        turned = np.diff([one.turntable_deg for one in intervals], prepend=np.nan) != 0.0
+        t0, number = intervals[0].start_time, np.cumsum(turned) - 1
+        return cls._of_cuts(cuts, t0, number, window, site, step_s, fixed_axis)
 
     @classmethod
     def _of_cuts(
-        cls, cuts: Cuts, window: Literal["instant", "mean"], *, throughout: bool, **others: Any
+        cls,
+        cuts: Sequence[Cut],
+        t0: Time,
+        number: Int[np.ndarray, " cuts"],
+        window: Literal["instant", "mean"],
+        site: tuple[float, float],
+        step_s: float,
+        fixed_axis: bool,
     ) -> Observation:
-        """Of samples by night alone where asked for, at their times or from end to end."""
-        times, windows = cuts.samples(window)
-        observation = cls(
-            times=times, run=cuts.run, turntable_deg=cuts.turntable_deg, windows=windows, **others
-        )
-        if not any(cuts.night_only):
+        """Of the samples of cuts, by night alone where asked for; ``number``: the run of each.
+
+        A window of a schedule is dark from end to end, that of a run in its middle.
+        """
+        parts = [(cut.start_s, cut.length_s, cut.live_s) for cut in cuts]
+        times_s, length_s, live_s = (np.concatenate(part) for part in zip(*parts, strict=True))
+        require_ephemeris(np.array([t0.jd + times_s[-1] / 86400.0]))
+        cut_of = np.repeat(np.arange(len(cuts)), [len(cut.start_s) for cut in cuts])
+        windows = None
+        if window == "mean":
+            half = length_s / 2.0
+            times_s, windows = times_s + half, Windows.whole(-half, half, live_s)
+        elif (live_s < length_s).any():
+            raise InputError(
+                "samples that are instants have no duty cycle; take windows "
+                "(observation.window=mean), or leave out the schedule's duty_cycle"
+            )
+        angles = tuple(cuts[k].of.turntable_deg for k in np.unique(number, return_index=True)[1])
+        times, run = later(t0, times_s), number[cut_of]
+        observation = cls(*site, times, run, angles, step_s, fixed_axis, windows)
+        night_only = np.array([cut.of.night_only for cut in cuts])
+        if not night_only.any():
             return observation
         dark = observation.sun_altitude_deg() < 0.0
-        if throughout and windows is not None:
+        if windows is not None and isinstance(cuts[0].of, Interval):
             for offset_s in windows.bounds_s.T:
                 at_end = replace(observation, times=later(times, offset_s), windows=None)
                 dark &= at_end.sun_altitude_deg() < 0.0
-        return observation.select(cuts.by_night(dark))
+        keep = dark | ~night_only[cut_of]
+        for k, cut in enumerate(cuts):
+            if not keep[cut_of == k].any():
+                raise InputError(
+                    f"{cut.name} holds no lunar night; lengthen it, move its start or drop "
+                    "night_only"
+                )
+        return observation.select(keep)
 
     def select(self, keep: Bool[np.ndarray, " times"]) -> Observation:
         """Return the observation with only the samples where ``keep`` is True.
@@ -349,8 +381,9 @@ class Observation(Described):
 
     def sun_altitude_deg(self) -> Float[np.ndarray, " times"]:
         """Return the geometric altitude of the Sun's centre above the horizon in degrees."""
-        height = np.einsum("ti,ti->t", self.zenith_galactic(), sun_direction(self.times))
-        return np.degrees(np.arcsin(height))
+        sun = _barycentric_km("sun", self.times) - _barycentric_km("moon", self.times)
+        height = np.einsum("ti,ti->t", self.zenith_galactic(), sun)
+        return np.degrees(np.arcsin(height / np.linalg.norm(sun, axis=1)))
 
 
 def mcmf_from_galactic(times: Time) -> Float[np.ndarray, "times 3 3"]:
@@ -363,17 +396,6 @@ def mcmf_from_galactic(times: Time) -> Float[np.ndarray, "times 3 3"]:
     with unannounced_leap_seconds():
         turned = icrs.transform_to(MCMF(obstime=times))
     return np.moveaxis(turned.cartesian.xyz.value, 2, 0)
-
-
-def sun_direction(times: Time) -> Float[np.ndarray, "times 3"]:
-    """Return Galactic unit vectors from the Moon's centre to where the Sun's is at the time."""
-    with unannounced_leap_seconds():
-        sun = get_body_barycentric("sun", times, ephemeris="builtin")
-        moon = get_body_barycentric("moon", times, ephemeris="builtin")
-    direction = (sun - moon).xyz.to_value(u.km)
-    galactic = ICRS(CartesianRepresentation(direction)).transform_to(Galactic())
-    vector = galactic.cartesian.xyz.value
-    return (vector / np.linalg.norm(vector, axis=0)).T
 
 
 BODIES = ("Sun", "Mercury", "Venus", "Earth", "Mars", "Jupiter", "Saturn", "Uranus", "Neptune")
@@ -424,6 +446,7 @@ def body_direction(body: str, observation: Observation) -> Float[np.ndarray, "ti
 
 def _barycentric_km(body: str, times: Time) -> Float[np.ndarray, "times 3"]:
     """Place from the barycentre of the Solar System along Galactic axes."""
-    place = get_body_barycentric(body, times, ephemeris="builtin").xyz.to_value(u.km)
+    with unannounced_leap_seconds():
+        place = get_body_barycentric(body, times, ephemeris="builtin").xyz.to_value(u.km)
     axes = ICRS(CartesianRepresentation(np.eye(3))).transform_to(Galactic())
     return (axes.cartesian.xyz.value @ place).T

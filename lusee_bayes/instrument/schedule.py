@@ -19,11 +19,10 @@ from functools import cached_property, lru_cache
 from io import StringIO
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from astropy.time import Time
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.checks import is_traced, require_positive
@@ -33,8 +32,6 @@ from lusee_bayes.core.reading import naming, parse_yaml, read_text, reading
 from lusee_bayes.instrument.products import DataLayout, all_products
 from lusee_bayes.instrument.times import (
     ROUNDING_S,
-    Windows,
-    later,
     require_ephemeris,
     seconds_from,
     unannounced_leap_seconds,
@@ -134,105 +131,39 @@ class Interval:
 
 
 @dataclass(frozen=True)
-class Cuts:
-    """Stretches of observing, cut into samples.
+class Cut:
+    """A run or an interval, cut into samples.
 
     Attributes
     ----------
-    t0 : Time
-        Beginning of the first sample.
     start_s : (samples,) array
-        Beginning of every sample, in seconds from ``t0``.
+        Beginning of every sample, in seconds from the first of all.
     length_s, live_s : (samples,) array
         How long it lasts, and what of that was integrated, in seconds.
-    stretch : (samples,) array of int
-        The run or interval that it lies in.
-    run : (samples,) array of int
-        The same, but one number for neighbours at the same turntable angle in a schedule.
-    turntable_deg : (runs,) tuple of float
-    night_only : (stretches,) tuple of bool
-    names : (stretches,) tuple of str
-        What messages call them.
+    of : Run or Interval
+    name : str
+        What messages call it.
     """
 
-    t0: Time
     start_s: Float[np.ndarray, " samples"]
     length_s: Float[np.ndarray, " samples"]
     live_s: Float[np.ndarray, " samples"]
-    stretch: Int[np.ndarray, " samples"]
-    run: Int[np.ndarray, " samples"]
-    turntable_deg: tuple[float, ...]
-    night_only: tuple[bool, ...]
-    names: tuple[str, ...]
-
-    def samples(self, window: Literal["instant", "mean"]) -> tuple[Time, Windows | None]:
-        """Return the times of the samples, and what they are the means of.
-
-        Parameters
-        ----------
-        window : {"instant", "mean"}
-            Whether a sample is the sky at its beginning, or the mean over its window, of which the
-            middle is its time then.
-
-        Returns
-        -------
-        times : (samples,) Time
-            UTC.
-        windows : Windows or None
-            None for instants.
-
-        Raises
-        ------
-        InputError
-            For times outside the ephemeris, and for a duty cycle of instants.
-        """
-        seconds, windows = self.start_s, None
-        require_ephemeris(np.array([self.t0.jd + seconds[-1] / 86400.0]))
-        if window == "mean":
-            half = self.length_s / 2.0
-            seconds, windows = seconds + half, Windows.whole(-half, half, self.live_s)
-        elif (self.live_s < self.length_s).any():
-            raise InputError(
-                "samples that are instants have no duty cycle; take windows "
-                "(observation.window=mean), or leave out the schedule's duty_cycle"
-            )
-        return later(self.t0, seconds), windows
-
-    def by_night(self, dark: Bool[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
-        """Return the samples that are left where nights alone are wanted.
-
-        Parameters
-        ----------
-        dark : (samples,) array of bool
-            Whether the Sun is down.
-
-        Raises
-        ------
-        InputError
-            If nothing is left of a run or interval.
-        """
-        keep = dark | ~np.array(self.night_only)[self.stretch]
-        for number, name in enumerate(self.names):
-            if not keep[self.stretch == number].any():
-                raise InputError(
-                    f"{name} holds no lunar night; lengthen it, move its start or drop night_only"
-                )
-        return keep
+    of: Run | Interval
+    name: str
 
 
-def cut_runs(runs: Sequence[Run], start: str, step_s: float) -> Cuts:
+def cut_runs(runs: Sequence[Run], step_s: float) -> list[Cut]:
     """Cut runs that follow one another into whole steps; see :meth:`.Observation.from_runs`.
 
     Raises
     ------
     InputError
-        For a bad date, step or length, for a run without samples, and if there is no run.
+        For a bad step or length, for a run without samples, and if there is no run.
     """
     require_positive("step_s", step_s)
     if not runs:
         raise InputError("an observation needs at least one run, got none")
-    t0 = utc_from_text("start", start)
-    elapsed, stretches = 0.0, []
+    elapsed, cuts = 0.0, []
     for number, run in enumerate(runs):
         require_positive(f"the length in cycles of run {number}", run.cycles)
         length = run.cycles * CYCLE_DAYS * 86400.0
@@ -243,29 +174,12 @@ def cut_runs(runs: Sequence[Run], start: str, step_s: float) -> Cuts:
                 "lengthen it or shorten step_s"
             )
         steps = np.full(n, float(step_s))
-        stretches.append((elapsed + step_s * np.arange(n), steps, steps))
+        cuts.append(Cut(elapsed + step_s * np.arange(n), steps, steps, run, f"run {number}"))
         elapsed += length
-    names = tuple(f"run {number}" for number in range(len(runs)))
-    angles = tuple(run.turntable_deg for run in runs)
-    return _joined(t0, stretches, np.arange(len(runs)), angles, runs, names)
+    return cuts
 
 
-def _joined(
-    t0: Time,
-    stretches: list[tuple[np.ndarray, ...]],
-    run: Int[np.ndarray, " stretches"],
-    turntable_deg: tuple[float, ...],
-    asked: Sequence[Run | Interval],
-    names: tuple[str, ...],
-) -> Cuts:
-    """Starts, lengths and live times of all stretches, one after the other."""
-    number = np.repeat(np.arange(len(stretches)), [len(starts) for starts, _, _ in stretches])
-    seconds = (np.concatenate(one) for one in zip(*stretches, strict=True))
-    nights = tuple(one.night_only for one in asked)
-    return Cuts(t0, *seconds, number, run[number], turntable_deg, nights, names)
-
-
-def cut_intervals(intervals: Sequence[Interval], step_s: float) -> Cuts:
+def cut_intervals(intervals: Sequence[Interval], step_s: float) -> list[Cut]:
     """Cut every interval into steps from its start, of which the last may be shorter.
 
     Raises
@@ -275,17 +189,13 @@ def cut_intervals(intervals: Sequence[Interval], step_s: float) -> Cuts:
     """
     require_positive("step_s", step_s)
     require_sequence(intervals)
-    t0 = intervals[0].start_time
-    stretches = []
-    for interval in intervals:
+    cuts = []
+    for interval, name in zip(intervals, _names(intervals), strict=True):
         begins = step_s * np.arange(interval.n_samples(step_s))
         length = np.diff(begins, append=interval.length_s)
-        start = seconds_from(t0, interval.start_time) + begins
-        stretches.append((start, length, interval.duty_cycle * length))
-    given = np.array([interval.turntable_deg for interval in intervals])
-    turned = np.append(True, np.diff(given) != 0.0)
-    run, angles = np.cumsum(turned) - 1, tuple(given[turned].tolist())
-    return _joined(t0, stretches, run, angles, intervals, _names(intervals))
+        start = seconds_from(intervals[0].start_time, interval.start_time) + begins
+        cuts.append(Cut(start, length, interval.duty_cycle * length, interval, name))
+    return cuts
 
 
 def _names(intervals: Sequence[Interval]) -> tuple[str, ...]:
@@ -303,19 +213,18 @@ def require_sequence(intervals: Sequence[Interval]) -> None:
     """
     if not intervals:
         raise InputError("a schedule needs at least one interval, got none")
-    names = _names(intervals)
-    for number, after in enumerate(intervals[1:]):
-        before = intervals[number]
+    named = zip(_names(intervals), intervals, strict=True)
+    for (_, before), (name, after) in pairwise(named):
         ahead = seconds_from(before.start_time, after.start_time)
         if ahead < 0.0:
             raise InputError(
-                f"{names[number + 1]}: the interval from {after.start} begins before the one that "
+                f"{name}: the interval from {after.start} begins before the one that "
                 f"precedes it, from {before.start}; sort the intervals by their start"
             )
         overlap = before.length_s - ahead
         if overlap > ROUNDING_S:
             raise InputError(
-                f"{names[number + 1]}: the interval from {after.start} begins {overlap:g} s before "
+                f"{name}: the interval from {after.start} begins {overlap:g} s before "
                 f"the one that precedes it ends, {before.end}; give each stretch of time once"
             )
 
@@ -475,31 +384,21 @@ def without_gaps(
     if not absent.any():
         return visibilities
     products = all_products(round(np.sqrt(layout.n_products)))
-    times = np.arange(layout.n_times)
-    unused = []
-    for number, product in enumerate(products):
-        gaps = absent[number]
-        if not gaps.any():
-            continue
-        if not gaps.all():
-            values[number, gaps] = np.interp(times[gaps], times[~gaps], values[number, ~gaps])
-        elif product.i != product.j:
-            values[number] = 0.0
-        else:
-            _require_unused(product.i, present)
-            unused.append(number)
-    if unused:
-        autos = [k for k, p in enumerate(products) if p.i == p.j and k not in unused]
-        values[unused] = values[autos].mean(0)
+    times, measured = np.arange(layout.n_times), present.any(1)
+    for gaps, row in zip(absent, values, strict=True):
+        if gaps.any():
+            known = ~gaps
+            row[gaps] = np.interp(times[gaps], times[known], row[known]) if known.any() else 0.0
+    autos = np.array([p.i == p.j for p in products])
+    unused = np.flatnonzero(autos & absent.all(1))
+    for auto in (products[k] for k in unused):
+        for product, is_there in zip(products, measured, strict=True):
+            if is_there and auto.i in (product.i, product.j):
+                raise InputError(
+                    f"the auto {auto.label} is absent at all times, and the noise of "
+                    f"{product.label} depends on it; give modelled visibilities of all samples, "
+                    "such as the signal of a CouplingMatrix without flags"
+                )
+    if unused.size:
+        values[unused] = values[autos & ~absent.all(1)].mean(0)
     return namespace(visibilities).asarray(values)
-
-
-def _require_unused(port: int, present: np.ndarray) -> None:
-    products = all_products(round(np.sqrt(len(present))))
-    for product, there in zip(products, present.any(1), strict=True):
-        if there and port in (product.i, product.j):
-            raise InputError(
-                f"the auto {port}{port}R is absent at all times, and the noise of "
-                f"{product.label} depends on it; give modelled visibilities of all samples, such "
-                "as the signal of a CouplingMatrix without flags"
-            )
