@@ -61,7 +61,6 @@ from lusee_bayes.instrument.times import (
     stamped,
     step_of,
     utc_bounds,
-    utc_of_datetimes,
     utc_of_jd,
     utc_times,
 )
@@ -136,9 +135,8 @@ def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None, boo
             _require_same(windows, times, here["time_bounds"])
         return times, windows, True
     if "time_bounds" in here:
-        bounds = utc_of_datetimes(here["time_bounds"])
-        live_s = here.get("live_time")
-        middles, _, windows = bounded(times, bounds, found.values["step_s"], live_s)
+        bounds, step_s = utc_bounds(here["time_bounds"], len(times)), found.values["step_s"]
+        middles, _, windows = bounded(times, bounds, step_s, here.get("live_time"))
         return middles, windows, True
     if given or said == "mean":
         what = "live_time" if given else "the attribute window = 'mean'"
@@ -149,7 +147,7 @@ def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None, boo
 
 
 def _require_same(windows: Windows, times: Time, there: np.ndarray) -> None:
-    seconds = seconds_from(times[:, None], utc_of_datetimes(there))
+    seconds = seconds_from(times[:, None], utc_bounds(there, len(times)))
     if windows.n_samples != len(times):
         return  # an Observation says so
     off = np.abs(seconds - windows.bounds_s).max(axis=1)
