@@ -36,11 +36,10 @@ from lusee_bayes.core.checks import (
 )
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing, user_path
-from lusee_bayes.core.formats import read_netcdf
+from lusee_bayes.core.formats import as_dataset, read_netcdf
 from lusee_bayes.core.harmonics import lmax_of, n_modes
 from lusee_bayes.core.layouts import Attribute, Content, Layout, Variable, require_mhz
 from lusee_bayes.core.reading import naming, require_file
-from lusee_bayes.core.version import __version__
 from lusee_bayes.instrument.beams.source import MeasuredReceiver, receiver_of
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import (
@@ -67,27 +66,12 @@ from lusee_bayes.instrument.times import (
 
 PIECES = ("piece_sample", "piece_start_s", "piece_end_s", "piece_live_s")
 # times for people are written to the millisecond
-EYE = {"units": "milliseconds since 1970-01-01", "calendar": "proleptic_gregorian"}
-ENCODING = EYE | {"dtype": "int64"}
+ENCODING = {
+    "units": "milliseconds since 1970-01-01",
+    "calendar": "proleptic_gregorian",
+    "dtype": "int64",
+}
 EYE_S = 0.01
-
-
-def window_variables(observation: Observation) -> dict[str, tuple[Any, ...]]:
-    """Return the variables of a Dataset that hold the windows of an observation, if it has any."""
-    windows = observation.windows
-    if windows is None:
-        return {}
-    bounds = later(observation.times[:, None], windows.bounds_s)
-    values = (windows.sample, windows.start_s, windows.end_s, windows.live_s)
-    return {
-        "time_bounds": (("time", "bounds"), _datetimes(bounds), {}, ENCODING),
-        "live_time": (("time",), windows.live_per_sample_s, {"units": "s"}),
-        "piece_sample": (("piece",), values[0]),
-        **{
-            name: (("piece",), value, {"units": "s"})
-            for name, value in zip(PIECES[1:], values[1:], strict=True)
-        },
-    }
 
 
 def _datetimes(times: Time) -> np.ndarray:
@@ -119,17 +103,16 @@ def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None, boo
         as :class:`.Windows`.
     """
     here, said = found.arrays, found.values.get("window")
-    pieces = [name for name in PIECES if name in here]
-    given = [*pieces, *(name for name in ("time_bounds", "live_time") if name in here)]
+    given = [name for name in (*PIECES, "time_bounds", "live_time") if name in here]
+    lost = [name for name in PIECES if name not in here]
     if said == "instant" and given:
         raise InputError(
             f"the attribute window says that the samples are instants, and {given[0]} gives "
             "them windows; leave out one of them"
         )
-    if pieces and len(pieces) < len(PIECES):
-        lost = next(name for name in PIECES if name not in here)
-        raise InputError(f"there is {pieces[0]}, but no {lost}; pieces of windows need both")
-    if pieces:
+    if 0 < len(lost) < len(PIECES):
+        raise InputError(f"there is {given[0]}, but no {lost[0]}; pieces of windows need both")
+    if not lost:
         windows = Windows(*(here[name] for name in PIECES))
         if "time_bounds" in here:
             _require_same(windows, times, here["time_bounds"])
@@ -413,40 +396,37 @@ class Visibilities(Described):
 
         With the dims piece and bounds for windows, and mode if the truth is known.
         """
-        observation = self.observation
-        variables = {
-            "visibility": (("product", "time"), self.grid(), {"units": "K"}),
-            "flag": (("product", "time"), ~np.asarray(self.layout.present)),
-            "run": (("time",), observation.run),
-            "turntable_deg": (("run_number",), np.array(observation.turntable_deg)),
-            **window_variables(observation),
+        seen, windows, receiver = self.observation, self.observation.windows, self.receiver
+        arrays = {
+            "product": list(self.labels),
+            "visibility": self.grid(),
+            "flag": ~np.asarray(self.layout.present),
+            "run": seen.run,
+            "turntable_deg": np.array(seen.turntable_deg),
+            "truth": self.truth,
+            # two parts keep the times exact
+            "jd1": seen.times.jd1,
+            "jd2": seen.times.jd2,
         }
-        if self.truth is not None:
-            variables["truth"] = (("mode",), np.asarray(self.truth), {"units": "K"})
-        if self.receiver is not None:
-            dims, ohm = ("load_frequency", "port", "port_2"), self.receiver.load_ohm
-            variables["load_frequency_mhz"] = (dims[:1], self.receiver.frequencies_mhz)
-            variables |= {n: (dims, x) for n, x in zip(LOADS, (ohm.real, ohm.imag), strict=True)}
-        # two parts keep the times exact
-        variables["jd1"] = (("time",), observation.times.jd1, {"scale": "utc"})
-        variables["jd2"] = (("time",), observation.times.jd2, {"scale": "utc"})
-        instants = observation.windows is None
-        for_eyes = {} if instants else {"bounds": "time_bounds"}
-        time = (("time",), _datetimes(observation.times), for_eyes, ENCODING)
-        said = {"window": "instant" if instants else "mean"} if self.says_window else {}
-        return xr.Dataset(
-            variables,
-            coords={"product": list(self.labels), "time": time},
-            attrs={
-                "format": formats.VISIBILITIES,
-                "frequency_mhz": self.frequency_mhz,
-                "lon_deg": observation.lon_deg,
-                "lat_deg": observation.lat_deg,
-                "step_s": observation.step_s,
-                **said,
-                "lusee_bayes_version": __version__,
-            },
-        )
+        if windows is not None:
+            pieces = (windows.sample, windows.start_s, windows.end_s, windows.live_s)
+            arrays |= dict(zip(PIECES, pieces, strict=True))
+            arrays["live_time"] = windows.live_per_sample_s
+        if receiver is not None:
+            ohm = receiver.load_ohm
+            arrays["load_frequency_mhz"] = receiver.frequencies_mhz
+            arrays |= dict(zip(LOADS, (ohm.real, ohm.imag), strict=True))
+        kind = "instant" if windows is None else "mean"
+        said = {name: getattr(seen, name) for name in ("lon_deg", "lat_deg", "step_s")}
+        said |= {"frequency_mhz": self.frequency_mhz, "jd1.scale": "utc", "jd2.scale": "utc"}
+        said["window"] = kind if self.says_window else None
+        dataset = as_dataset(formats.VISIBILITIES, LAYOUT, arrays, said)
+        time, bounds = ("time", _datetimes(seen.times), {}, ENCODING), {}
+        if windows is not None:
+            edges = _datetimes(later(seen.times[:, None], windows.bounds_s))
+            bounds = {"time_bounds": (("time", "bounds"), edges, {}, ENCODING)}
+            time = ("time", time[1], {"bounds": "time_bounds"}, ENCODING)
+        return dataset.assign(bounds).assign_coords(time=time)
 
     def write(self, path: str | Path, attrs: dict[str, str] | None = None) -> Path:
         """Write a netCDF file, whole or not at all.
@@ -480,20 +460,21 @@ LAYOUT = Layout(
         "product": Variable(("product",), "text"),
         "visibility": Variable(("product", "time"), finite=False, unit="K"),
         "flag": Variable(("product", "time"), "boolean"),
-        "jd1": Variable(("time",)),
-        "jd2": Variable(("time",)),
+        **{name: Variable(("time",), unit="d") for name in ("jd1", "jd2")},
         "run": Variable(("time",), "integer", low=0.0),
-        "turntable_deg": Variable(("run_number",)),
+        "turntable_deg": Variable(("run_number",), unit="deg"),
         "time_bounds": Variable(("time", 2), "time", optional=True),
-        "live_time": Variable(("time",), optional=True),
+        "live_time": Variable(("time",), optional=True, unit="s"),
         "piece_sample": Variable(("piece",), "integer", low=0.0, optional=True),
-        **{name: Variable(("piece",), optional=True) for name in PIECES[1:]},
+        **{name: Variable(("piece",), optional=True, unit="s") for name in PIECES[1:]},
         "truth": Variable(("mode",), optional=True, unit="K"),
         # the receivers' loads ZL, where they are known
         "load_frequency_mhz": Variable(
             ("load_frequency",), low=0.0, grows=True, optional=True, unit="MHz"
         ),
-        **{name: Variable(("load_frequency", "port", "port_2"), optional=True) for name in LOADS},
+        **dict.fromkeys(
+            LOADS, Variable(("load_frequency", "port", "port_2"), optional=True, unit="Ohm")
+        ),
     },
     {
         "frequency_mhz": Attribute(low=0.0, unit="MHz"),

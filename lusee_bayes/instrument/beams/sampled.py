@@ -27,7 +27,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from astropy.io import fits
 from jaxtyping import Complex, Float, Inexact
 
@@ -38,6 +37,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing, user_path
 from lusee_bayes.core.formats import (
     UVBEAM_WORDS,
+    as_dataset,
     has_words,
     image_names,
     is_fits,
@@ -508,9 +508,9 @@ def write_sampled_beams(path: str | Path, beams: SampledBeams) -> Path:
             ]
             fits.HDUList(hdus).writeto(partial)
         else:
-            declared = layout(fields=fields, grid=grid).variables
-            variables = {name: (declared[name].dims, one) for name, one in arrays.items()}
-            xr.Dataset(variables, attrs=said).to_netcdf(partial, engine="h5netcdf")
+            declared = layout(fields=fields, grid=grid)
+            dataset = as_dataset(formats.BEAMS, declared, arrays, said)
+            dataset.to_netcdf(partial, engine="h5netcdf")
     return path
 
 
