@@ -519,11 +519,6 @@ def read_visibilities(path: str | Path) -> Visibilities:
     flags = here["flag"]
     values = np.where(flags, 0.0, here["visibility"])
     require_finite(f"{path}: visibility (where not flagged)", values)
-    if here["run"].max() >= found.sizes["run_number"]:
-        raise InputError(
-            f"{path}: run numbers go up to {here['run'].max()}, and turntable_deg has "
-            f"{found.sizes['run_number']} runs"
-        )
     with naming(path):
         layout = DataLayout.from_flags(flags)
         utc = utc_of_jd(found)
