@@ -289,9 +289,7 @@ def _grid(
     grid = np.full((len(places), len(data), data.shape[2]), np.nan)
     for number, (label, scale) in enumerate(columns):
         if label not in places:
-            raise InputError(
-                f"there is no product '{label}'; expected some of {', '.join(labels())}"
-            )
+            raise InputError(f"there is no product '{label}'; known: {', '.join(places)}")
         if label in dict(columns[:number]):
             raise InputError(f"the product {label} is there twice; give each once")
         grid[places[label]] = data[:, number] / scale
@@ -596,7 +594,8 @@ def write_four_port(
     clock = {"TIMESYS": "UTC", "TIMEUNIT": "d", "CLOCKSRC": "supplied", "SCALEASM": False}
     hdus[2].header.update(TIMEFMT="JD1+JD2", **clock)
     label = fits.Column("label", "8A", unit="1", array=labels())
-    hdus.insert(3, fits.BinTableHDU.from_columns([label], name="products"))
+    table = fits.Header([("EXTNAME", "products")])
+    hdus.insert(3, fits.BinTableHDU.from_columns([label], header=table))
     header = {
         "VERSION": 3,
         "ENGINE": "lusee_bayes",
@@ -624,8 +623,10 @@ def _hdus(name: str, values: Any, unit: str) -> list[fits.ImageHDU]:
     parts = {name: np.asarray(values)}
     if np.iscomplexobj(values):
         parts = {f"{name}_real": np.real(values).copy(), f"{name}_imag": np.imag(values).copy()}
-    header = fits.Header([("BUNIT", unit)])
-    return [fits.ImageHDU(part, header, name=key) for key, part in parts.items()]
+    return [
+        fits.ImageHDU(part, fits.Header([("EXTNAME", key), ("BUNIT", unit)]))
+        for key, part in parts.items()
+    ]
 
 
 def _eigenvalues(
