@@ -351,8 +351,12 @@ def read_fits(path: str | Path, layout: Layout, hint: str = "") -> Content:
     with opened(path, layout.what, hint) as hdus:
         arrays: dict[str, Any] = {}
         words = hdus[0].header
-        said = {key: words[key] for key in words if key and not key.startswith(STRUCTURE)}
-        declared = {name.lower(): name for name in layout.variables}
+        declared = {name.lower(): name for name in (*layout.variables, *layout.attributes)}
+        said = {
+            declared.get(key.lower(), key): words[key]
+            for key in words
+            if key and not key.startswith(STRUCTURE)
+        }
 
         def put(name: str, array: Any, unit: str | None) -> None:
             name = declared.get(name.lower(), name.lower())

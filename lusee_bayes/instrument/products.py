@@ -16,6 +16,7 @@ taken are not in d at all, so the positions are explicit.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from functools import lru_cache
 from operator import attrgetter
 from typing import Any, NamedTuple
@@ -103,9 +104,30 @@ AUTO_TOLERANCE = 1e-5
 NAME = re.compile(r"\s*(\d)\s*[-_x, ]?\s*(\d)\s*([RI]?)\s*", re.IGNORECASE)
 
 
+def in_order(
+    columns: Sequence[tuple[str, Float[np.ndarray, "*shape"]]], n_antennas: int = N_ANTENNAS
+) -> Float[np.ndarray, "products *shape"]:
+    """Return named columns in the package's order of products, NaN for those without one.
+
+    Raises
+    ------
+    InputError
+        For a name that is no product's, or that is given twice.
+    """
+    places = {label: place for place, label in enumerate(labels(n_antennas))}
+    grid = np.full((len(places), *columns[0][1].shape), np.nan)
+    for number, (name, values) in enumerate(columns):
+        if name not in places:
+            raise InputError(f"there is no product '{name}'; known: {', '.join(places)}")
+        if name in [other for other, _ in columns[:number]]:
+            raise InputError(f"the product {name} is given more than once; name each once")
+        grid[places[name]] = values
+    return grid
+
+
 def real_products(
     data: Any, products: Any, flags: Any, convention: str, n_antennas: int
-) -> tuple[Float[np.ndarray, "products times"], Bool[np.ndarray, "products times"]]:
+) -> Float[np.ndarray, "products times"]:
     """Return the real products of arrays of correlations in the package's order.
 
     Parameters
@@ -123,9 +145,7 @@ def real_products(
     Returns
     -------
     (products, times) array
-        In the unit of the data, 0 where absent.
-    (products, times) array of bool
-        Whether each is absent.
+        In the unit of the data, NaN where absent.
 
     Raises
     ------
@@ -137,12 +157,12 @@ def real_products(
     data = _numbers(data)
     if convention not in CONVENTIONS:
         raise InputError(f"unknown convention '{convention}'; {nearest(convention, CONVENTIONS)}")
-    columns = _columns(products, np.iscomplexobj(data), n_antennas)
-    if data.shape[1] != len(columns):
-        turned = "; transpose them" if data.shape[0] == len(columns) else ""
+    ports_and_parts = _columns(products, np.iscomplexobj(data), n_antennas)
+    if data.shape[1] != len(ports_and_parts):
+        turned = "; transpose them" if data.shape[0] == len(ports_and_parts) else ""
         raise InputError(
             f"the data have shape {data.shape}, expected (times, products) with "
-            f"{len(columns)} products{turned}"
+            f"{len(ports_and_parts)} products{turned}"
         )
     absent = np.isnan(data) | masked | _flags(flags, data.shape)
     if np.isinf(data[~absent]).any():
@@ -151,26 +171,17 @@ def real_products(
             f"the data hold infinity at time {first[0]}, product {first[1]}; flag such samples, or "
             "put NaN there"
         )
-    known = {label: number for number, label in enumerate(labels(n_antennas))}
-    values = np.zeros((len(known), len(data)))
-    missing = np.ones(values.shape, dtype=bool)
-    for column, (i, j, part) in enumerate(columns):
-        gone, one = absent[:, column], np.where(absent[:, column], 0.0, data[:, column])
-        sign = CONVENTIONS[convention] * (1.0 if i <= j else -1.0)
-        pair = f"{min(i, j)}{max(i, j)}"
-        parts = {part: one} if part else {"R": one.real, "I": one.imag}
-        if i == j and np.iscomplexobj(data):
-            _require_real(pair, one)
+    columns: list[tuple[str, np.ndarray]] = []
+    for (i, j, part), values, gone in zip(ports_and_parts, data.T, absent.T, strict=True):
+        pair, sign = f"{min(i, j)}{max(i, j)}", CONVENTIONS[convention] * (1.0 if i <= j else -1.0)
+        if i == j:
+            _require_real(pair, np.where(gone, 0.0, values))
+        parts = {part: values} if part else {"R": values.real, "I": values.imag}
         for name, numbers in parts.items():
-            label = f"{pair}{name}"
-            if label not in known:
-                continue
-            row = known[label]
-            if not missing[row].all():
-                raise InputError(f"the product {label} is given more than once; name each once")
-            values[row] = numbers if name == "R" else sign * numbers
-            missing[row] = gone
-    return values, missing
+            if i != j or name == "R":
+                signed = np.where(gone, np.nan, numbers if name == "R" else sign * numbers)
+                columns.append((f"{pair}{name}", signed))
+    return in_order(columns, n_antennas)
 
 
 def _numbers(data: Any) -> np.ndarray:
@@ -190,9 +201,8 @@ def _columns(products: Any, is_complex: bool, n_antennas: int) -> list[tuple[int
     """Ports and part of each column; the part is empty for complex numbers."""
     if products is None:
         ordered = all_products(n_antennas)
-        if is_complex:
-            return [(p.i, p.j, "") for p in ordered if p.part == "R"]
-        return [(p.i, p.j, p.part) for p in ordered]
+        return [(i, j, "" if is_complex else part) for i, j, part in ordered
+                if part == "R" or not is_complex]  # fmt: skip
     if isinstance(products, str):
         raise InputError(f"products is '{products}'; give a list with the name of each column")
     columns: list[tuple[int, int, str]] = []
@@ -222,27 +232,21 @@ def _columns(products: Any, is_complex: bool, n_antennas: int) -> list[tuple[int
         if i == j and part == "I":
             raise InputError(f"there is no product '{name}': an auto is real")
         columns.append((i, j, part if is_complex else part or "R"))
-        if columns[-1] in columns[:-1]:
-            raise InputError(f"the product '{name}' is given more than once; name each once")
     return columns
 
 
 def _flags(flags: Any, shape: tuple[int, ...]) -> np.ndarray:
-    if flags is None:
-        return np.zeros(shape, dtype=bool)
-    flags = np.asarray(flags)
+    flags = np.zeros(shape, dtype=bool) if flags is None else np.asarray(flags)
     if flags.dtype.kind not in "biu" or not np.isin(flags, (0, 1)).all():
         raise InputError(
             "flags hold other values than true and false; give true where a sample is not to be "
             "used"
         )
-    if flags.shape == shape[:1]:
-        flags = flags[:, None]
-    elif flags.shape != shape:
+    if flags.shape not in (shape, shape[:1]):
         raise InputError(
             f"flags have shape {flags.shape}, expected {shape} as the data, or {shape[:1]}"
         )
-    return np.broadcast_to(flags.astype(bool), shape)
+    return (flags if flags.ndim == 2 else flags[:, None]).astype(bool)
 
 
 def _require_real(pair: str, auto: np.ndarray) -> None:

@@ -301,7 +301,7 @@ class Visibilities(Described):
         InputError
             If arrays do not fit each other or cannot be what they are said to be.
         """
-        values, missing = real_products(data, products, flags, convention, n_antennas)
+        values = real_products(data, products, flags, convention, n_antennas)
         utc = utc_times(times)
         if len(utc) != values.shape[1]:
             raise InputError(
@@ -320,7 +320,7 @@ class Visibilities(Described):
         else:
             middles, step_s, windows = bounded(utc, utc_bounds(bounds, len(utc)), step_s, live_s)
         observation = Observation(lon_deg, lat_deg, middles, run, angles, step_s, windows=windows)
-        layout = DataLayout.from_flags(missing)
+        layout = DataLayout.from_flags(np.isnan(values))
         return cls(layout.gather(values), layout, observation, float(frequency_mhz))
 
     def description(self) -> tuple[str, ...]:

@@ -51,6 +51,7 @@ from lusee_bayes.instrument.products import (
     N_ANTENNAS,
     DataLayout,
     all_products,
+    in_order,
     labels,
     ports,
     to_matrix,
@@ -274,26 +275,13 @@ def read_scalar(path: Path) -> Waterfall:
             "ports in combinations"
         )
     with naming(path):
-        grid, said = _grid(data, columns), found.values
+        said, values = found.values, np.moveaxis(data, 1, 0)
+        signed = zip(columns, values, strict=True)
+        grid = in_order([(label, sign * one) for (label, sign), one in signed])
         first, seconds = start_of(said["LUNAR_DAY"]), said["DELTAT_SEC"] * np.arange(len(data))
         require_ephemeris(first.jd + seconds[-1:] / 86400.0)
         observation = _observation(later(first, seconds), said)
     return Waterfall(str(path), grid, found.arrays["freq"], observation)
-
-
-def _grid(
-    data: Float[np.ndarray, "times columns frequencies"], columns: Sequence[tuple[str, Any]]
-) -> Float[np.ndarray, "products times frequencies"]:
-    """The columns, of these labels and over these scales, in the package's order."""
-    places = {label: place for place, label in enumerate(labels())}
-    grid = np.full((len(places), len(data), data.shape[2]), np.nan)
-    for number, (label, scale) in enumerate(columns):
-        if label not in places:
-            raise InputError(f"there is no product '{label}'; known: {', '.join(places)}")
-        if label in dict(columns[:number]):
-            raise InputError(f"the product {label} is there twice; give each once")
-        grid[places[label]] = data[:, number] / scale
-    return grid
 
 
 def _observation(times: Time, said: Mapping[str, Any]) -> Observation:
@@ -354,8 +342,9 @@ def read_four_port(path: Path) -> Waterfall:
     root = np.sqrt(per_kelvin)
     scales = {p.label: root[:, p.i] * root[:, p.j] for p in all_products()}
     names = [str(label).strip() for label in images["products.label"]]
+    named = zip(names, np.moveaxis(images["data"], 1, 0), strict=True)
     with naming(path):
-        grid = _grid(images["data"], [(name, scales.get(name)) for name in names])
+        grid = in_order([(name, volts / scales.get(name, 1.0)) for name, volts in named])
         scale = scale_of("TIMESYS", said.get("TIMESYS", "UTC"))
         observation = _observation(utc_of(*images["time"].T, scale), said)
     return Waterfall(

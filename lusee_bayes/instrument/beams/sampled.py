@@ -393,7 +393,7 @@ WHAT = "sampled beams"
 HINT = "lusee_bayes.write_sampled_beams makes one of sampled_beams(...)"
 
 
-def layout(*, fields: bool, grid: bool, upper: bool = False) -> Layout:
+def layout(*, fields: bool, grid: bool) -> Layout:
     """Return what a file holds.
 
     Parameters
@@ -402,8 +402,6 @@ def layout(*, fields: bool, grid: bool, upper: bool = False) -> Layout:
         Whether it has fields, not product beams.
     grid : bool
         Whether it has a grid, not HEALPix pixels.
-    upper : bool
-        Whether attributes are words of a FITS header.
     """
     directions = ("theta", "phi") if grid else ("pixel",)
     first = "antenna" if fields else "product"
@@ -413,7 +411,6 @@ def layout(*, fields: bool, grid: bool, upper: bool = False) -> Layout:
         "theta_deg": Variable(("theta",), low=0.0, high=180.0, grows=True, unit="deg"),
         "phi_deg": Variable(("phi",), low=0.0, high=360.0, grows=True, unit="deg"),
     }
-    attributes = {"absolute": Attribute("boolean"), "products": Attribute("text", optional=fields)}
     return Layout(
         WHAT,
         {
@@ -421,7 +418,7 @@ def layout(*, fields: bool, grid: bool, upper: bool = False) -> Layout:
             **dict.fromkeys(FIELDS if fields else (POWER,), values),
             **(angles if grid else {}),
         },
-        {name.upper() if upper else name: one for name, one in attributes.items()},
+        {"absolute": Attribute("boolean"), "products": Attribute("text", optional=fields)},
     )
 
 
@@ -450,8 +447,8 @@ def read_sampled_beams(path: str | Path) -> SampledBeams:
         return read_netcdf(path, formats.BEAMS, declared, HINT)
 
     there = read(Layout(WHAT)).there
-    found = read(layout(fields=POWER not in there, grid="theta_deg" in there, upper=in_fits))
-    arrays, said = found.arrays, {key.lower(): value for key, value in found.values.items()}
+    found = read(layout(fields=POWER not in there, grid="theta_deg" in there))
+    arrays, said = found.arrays, found.values
     given: dict[str, np.ndarray] = {}
     if POWER in arrays:
         with naming(path):
