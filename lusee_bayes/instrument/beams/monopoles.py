@@ -44,6 +44,10 @@ N_LAYERS = 8
 DEPTH_M = 100.0
 
 
+Frequency = float | Float[Array, ""]
+Vectors = Float[Array, "directions 3"]
+
+
 def _array(x) -> Float[Array, "..."]:
     return namespace(x).asarray(x, dtype=np.float64)
 
@@ -84,13 +88,12 @@ class Regolith(eqx.Module):
     def permittivities(self) -> Complex[Array, " layers"]:
         """Return the complex relative permittivity of each layer from the top down."""
         rise = np.linspace(0.0, 1.0, N_LAYERS)
-        real = self.surface_permittivity + rise * (
-            self.deep_permittivity - self.surface_permittivity
-        )
+        top, bottom = self.surface_permittivity, self.deep_permittivity
+        real = top + rise * (bottom - top)
         return as_complex(real, -real * self.loss_tangent)
 
     def reflection(
-        self, cos_theta: Float[Array, " theta"], frequency_mhz: float | Float[Array, ""]
+        self, cos_theta: Float[Array, " theta"], frequency_mhz: Frequency
     ) -> tuple[Complex[Array, " theta"], Complex[Array, " theta"]]:
         """Return the reflection coefficients for waves that arrive at zenith angle theta.
 
@@ -189,9 +192,7 @@ class Monopoles(BeamSource, eqx.Module):
     def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
         return monopole_beams(frequency_mhz, lmax, self)
 
-    def fields(
-        self, frequency_mhz: float | Float[Array, ""], grid: HemisphereGrid
-    ) -> AntennaFields:
+    def fields(self, frequency_mhz: Frequency, grid: HemisphereGrid) -> AntennaFields:
         """Return the field patterns on a grid, with the phase centre at the feed for all arms."""
         require_positive("frequency_mhz", frequency_mhz)
         # an array, so that all frequencies share one program
@@ -201,7 +202,7 @@ class Monopoles(BeamSource, eqx.Module):
     @compiled
     def towards(
         self,
-        frequency_mhz: float | Float[Array, ""],
+        frequency_mhz: Frequency,
         theta: Float[Array, "*#directions"],
         phi: Float[Array, "*#directions"],
     ) -> tuple[Complex[Array, "antennas *directions"], Complex[Array, "antennas *directions"]]:
@@ -227,9 +228,8 @@ class Monopoles(BeamSource, eqx.Module):
         # the arm along the horizontal direction of the wave, across it, and up
         along, across = xp.sin(tilt) * xp.cos(relative), -xp.sin(tilt) * xp.sin(relative)
         up = xp.cos(tilt)
-        s, p = (
-            r.reshape(cos.shape) for r in self.regolith.reflection(cos.reshape(-1), frequency_mhz)
-        )
+        reflected = self.regolith.reflection(cos.reshape(-1), frequency_mhz)
+        s, p = (r.reshape(cos.shape) for r in reflected)
         ground = phasor(-2.0 * k * self.height_m * cos)
         direct = self._current_integral(k, along * sin + up * cos)
         bounced = self._current_integral(k, along * sin - up * cos) * ground
@@ -240,7 +240,7 @@ class Monopoles(BeamSource, eqx.Module):
         return e_theta, e_phi
 
     def _current_integral(
-        self, k: float | Float[Array, ""], projection: Float[Array, "antennas *directions"]
+        self, k: Frequency, projection: Float[Array, "antennas *directions"]
     ) -> Complex[Array, "antennas *directions"]:
         """int_0^L sin k(L - s) exp(i k s projection) ds.
 
@@ -371,8 +371,8 @@ NORMALISATION_LMAX = 63
 
 
 def beams_towards(
-    frequency_mhz: float | Float[Array, ""],
-    directions: Float[Array, "directions 3"],
+    frequency_mhz: Frequency,
+    directions: Vectors,
     monopoles: Monopoles | None = None,
     *,
     stokes: str = "I",
@@ -424,10 +424,7 @@ def beams_towards(
 
 @compiled
 def _patterns(
-    frequency_mhz: Float[Array, ""],
-    directions: Float[Array, "directions 3"],
-    monopoles: Monopoles,
-    stokes: str,
+    frequency_mhz: Frequency, directions: Vectors, monopoles: Monopoles, stokes: str
 ) -> Float[Array, "products directions"]:
     visible = directions[:, 2] > 0.0
     # a visible direction replaces the hidden ones: its field and its slopes are finite
