@@ -31,7 +31,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from lusee_bayes.core.arrays import Array, compiled, namespace
+from lusee_bayes.core.arrays import Array, DataVector, Modes, compiled, namespace
 from lusee_bayes.core.checks import Described, require_array, require_float64, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import (
@@ -47,6 +47,10 @@ from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout
 
+Matrix = Float[Array, "data unknowns"]
+ProductModes = Float[Array, "products modes"]
+BodyBeams = Float[Array, "runs products functions modes"]
+TimeModes = Float[Array, "products times modes"]
 # times whose data A^T d takes at once: it bounds the memory
 MOST_TIMES = 8192
 
@@ -60,7 +64,7 @@ class Coupling(Described, eqx.Module):
         Factors of the rows, such as gains; None for ones.
     """
 
-    response: Float[Array, " data"] | None = eqx.field(default=None, kw_only=True)
+    response: DataVector | None = eqx.field(default=None, kw_only=True)
 
     def description(self) -> tuple[str, ...]:
         data, unknowns = self.shape
@@ -76,13 +80,13 @@ class Coupling(Described, eqx.Module):
         """Whether A^T N^-1 A can be summed over time without A (``linear.normal_matrix``)."""
         return False
 
-    def dense(self) -> Float[Array, "data unknowns"]:
+    def dense(self) -> Matrix:
         """A as a matrix, with the response."""
         matrix = self._matrix()
         return matrix if self.response is None else matrix * self.response[:, None]
 
     @abstractmethod
-    def _matrix(self) -> Float[Array, "data unknowns"]:
+    def _matrix(self) -> Matrix:
         """A as a matrix, as all of the following without the response."""
 
     @abstractmethod
@@ -108,14 +112,14 @@ class Coupling(Described, eqx.Module):
         """
 
     @abstractmethod
-    def _forward(self, sky: Float[Array, " unknowns"]) -> Float[Array, " data"]:
+    def _forward(self, sky: Modes) -> DataVector:
         """A m, of a vector whose type and shape are right."""
 
     @abstractmethod
-    def _backward(self, data: Float[Array, " data"]) -> Float[Array, " unknowns"]:
+    def _backward(self, data: DataVector) -> Modes:
         """A^T d, of a vector whose type and shape are right."""
 
-    def __matmul__(self, sky: Float[Array, " unknowns"]) -> Float[Array, " data"]:
+    def __matmul__(self, sky: Modes) -> DataVector:
         """Compute A m: the mean data of a sky.
 
         Parameters
@@ -139,7 +143,7 @@ class Coupling(Described, eqx.Module):
         data = self._forward(sky)
         return data if self.response is None else data * self.response
 
-    def transpose_mv(self, data: Float[Array, " data"]) -> Float[Array, " unknowns"]:
+    def transpose_mv(self, data: DataVector) -> Modes:
         """Compute A^T d.
 
         Parameters
@@ -161,7 +165,7 @@ class Coupling(Described, eqx.Module):
         require_shape("the data", data, (self.shape[0],))
         return self._backward(data if self.response is None else data * self.response)
 
-    def with_response(self, factors: Float[Array, " data"]) -> Coupling:
+    def with_response(self, factors: DataVector) -> Coupling:
         """Multiply every row by a factor, on top of those it has.
 
         Parameters
@@ -185,9 +189,7 @@ class Coupling(Described, eqx.Module):
 
 
 @compiled
-def body_beams(
-    modes: Float[Array, "products modes"], pointing: Pointing
-) -> Float[Array, "runs products functions modes"]:
+def body_beams(modes: ProductModes, pointing: Pointing) -> BodyBeams:
     """Turn beams into the Moon-fixed frame, as every function of time of the pointing sees them.
 
     Parameters
@@ -208,7 +210,7 @@ def body_beams(
     return xp.stack(runs)
 
 
-def _on_the_moon(modes: Float[Array, "products modes"], pointing: Pointing) -> Array:
+def _on_the_moon(modes: ProductModes, pointing: Pointing) -> Array:
     """Beams of the lander in the Moon-fixed frame, with the pointing's further turns."""
     if pointing.turns is None:
         return pointing.mcmf_from_lander(modes)
@@ -252,7 +254,7 @@ class DenseCoupling(Coupling):
         inside a JAX transformation.
     """
 
-    matrix: Float[Array, "data unknowns"] = eqx.field(converter=jnp.asarray)
+    matrix: Matrix = eqx.field(converter=jnp.asarray)
 
     def __check_init__(self):
         require_array("the coupling matrix", self.matrix, (None, None))
@@ -301,7 +303,7 @@ class CouplingMatrix(Coupling):
         The product and the time of every row.
     """
 
-    body_beams: Float[Array, "runs products functions modes"]
+    body_beams: BodyBeams
     by_order: Float[Array, "runs orders beams degrees"]
     pointing: Pointing
     layout: DataLayout
@@ -439,10 +441,8 @@ class CouplingMatrix(Coupling):
         """
         product, time = np.asarray(product), np.asarray(time)
         require_shape("time", time, product.shape)
-        for name, numbers, limit in [
-            ("product", product, self.layout.n_products),
-            ("time", time, self.layout.n_times),
-        ]:
+        limits = {"product": self.layout.n_products, "time": self.layout.n_times}
+        for numbers, (name, limit) in zip((product, time), limits.items(), strict=True):
             if ((numbers < 0) | (numbers >= limit)).any():
                 raise InputError(f"{name} numbers must lie in 0..{limit - 1}, got {numbers}")
         places, blocks = [], []
@@ -470,13 +470,13 @@ class CouplingMatrix(Coupling):
         return (self.pointing.functions[times][:, :, None] * waves[:, None]).reshape(len(times), -1)
 
     @compiled
-    def _matrix(self) -> Float[Array, "data modes"]:
+    def _matrix(self) -> Matrix:
         """96 MB for 5232 x 2304."""
         blocks = [self._block(run, span) for run, span in self.pointing.runs()]
         return self.layout.gather(namespace(*blocks).concatenate(blocks, axis=1))
 
     @compiled
-    def _forward(self, sky: Float[Array, " modes"]) -> Float[Array, " data"]:
+    def _forward(self, sky: Modes) -> DataVector:
         n_products, n_functions = self.body_beams.shape[1:3]
         pairs = _pairs(self.pointing.pole_from_galactic(sky), self.lmax)
         plus, minus = pairs[: self.lmax + 1], pairs[self.lmax + 1 :]
@@ -495,7 +495,7 @@ class CouplingMatrix(Coupling):
         return self.layout.gather(xp.concatenate(grids, axis=1))
 
     @compiled
-    def _backward(self, data: Float[Array, " data"]) -> Float[Array, " modes"]:
+    def _backward(self, data: DataVector) -> Modes:
         """The transpose of :func:`_forward`, step by step."""
         n = self.lmax + 1
         grid = self.layout.scatter(data)
@@ -507,9 +507,8 @@ class CouplingMatrix(Coupling):
                 part = slice(first, min(first + MOST_TIMES, span.stop))
                 weighted = grid[:, part].T[:, :, None] * functions[part][:, None]
                 weighted = weighted.reshape(weighted.shape[0], -1)
-                x_and_y = namespace(weighted).stack(
-                    [cosine[part].T @ weighted, sine[part].T @ weighted], axis=-1
-                )
+                x_and_y = [wave[part].T @ weighted for wave in (cosine, sine)]
+                x_and_y = namespace(weighted).stack(x_and_y, axis=-1)
                 both = both + self.by_order[run].swapaxes(1, 2) @ x_and_y
         # (orders, degrees): of pairs, and of what they are crossed to
         straight, crossed = both[..., 0], both[..., 1]
@@ -521,14 +520,11 @@ class CouplingMatrix(Coupling):
     def _block(self, run: int, times) -> Float[Array, "products times modes"]:
         """Rows of all products for some samples of one run; times: a slice or numbers."""
         beams = self.pointing.functions[times] @ self.body_beams[run]
-        return self.pointing.pole_from_galactic.T(
-            turned_about_pole(beams, self.pointing.azimuth[times])
-        )
+        turned = turned_about_pole(beams, self.pointing.azimuth[times])
+        return self.pointing.pole_from_galactic.T(turned)
 
 
-def turned_about_pole(
-    beams: Float[Array, "products times modes"], azimuth: Float[Array, " times"]
-) -> Float[Array, "products times modes"]:
+def turned_about_pole(beams: TimeModes, azimuth: Float[Array, " times"]) -> TimeModes:
     """Turn beams about the pole by the azimuth of every time: D_z(-phi(t)).
 
     Parameters
@@ -560,9 +556,7 @@ def _phases(pointing: Pointing, lmax: int) -> tuple[Array, Array]:
 
 
 @compiled
-def _by_order(
-    body_beams: Float[Array, "runs products functions modes"], lmax: int
-) -> Float[Array, "runs orders beams degrees"]:
+def _by_order(body_beams: BodyBeams, lmax: int) -> Float[Array, "runs orders beams degrees"]:
     """W_lm and W_l,-m side by side for every order: the matrices behind X and Y.
 
     A tenth of the time of sums over modes that lie in the packed order (fiducial size).
@@ -632,7 +626,7 @@ class BeamOperator(eqx.Module):
                     blocks[ell].append(inside)
         return cls(tuple(jnp.concatenate(parts) for parts in blocks), layout)
 
-    def coupling(self, beams: ProductBeams) -> Float[Array, "data modes"]:
+    def coupling(self, beams: ProductBeams) -> Matrix:
         """Compute A as a matrix.
 
         Parameters
@@ -660,9 +654,7 @@ class BeamOperator(eqx.Module):
 
 
 @eqx.filter_jit
-def _turned(
-    beams: Float[Array, "beams modes"], pointing: Pointing
-) -> Float[Array, "beams times modes"]:
+def _turned(beams: ProductModes, pointing: Pointing) -> TimeModes:
     """Rows of A of any number of beams, without a response and with nothing missing."""
     layout = DataLayout(beams.shape[0], pointing.n_times)
     coupling = CouplingMatrix.of_modes(beams, pointing, layout)

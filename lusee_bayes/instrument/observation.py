@@ -26,10 +26,13 @@ from jaxtyping import Bool, Float, Int
 from lunarsky import MCMF
 from scipy.spatial.transform import Rotation as SpatialRotation
 
+from lusee_bayes.core.arrays import Times
 from lusee_bayes.core.checks import Described, listed, require_finite, require_positive
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.instrument.schedule import Cut, Interval, Run, cut_intervals, cut_runs
 from lusee_bayes.instrument.times import (
+    Nodes,
+    Numbers,
     Windows,
     later,
     require_ephemeris,
@@ -302,15 +305,13 @@ class Observation(Described):
         return len(self.turntable_deg)
 
     @property
-    def live_s(self) -> Float[np.ndarray, " times"]:
+    def live_s(self) -> Times:
         """Integration time of every sample, in seconds."""
         if self.windows is None:
             return np.full(self.n_times, float(self.step_s))
         return self.windows.live_per_sample_s
 
-    def at_nodes(
-        self, n: int
-    ) -> tuple[Observation, Int[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]]:
+    def at_nodes(self, n: int) -> tuple[Observation, Numbers, Nodes]:
         """Return the observation at instants whose weighted means are those over the windows.
 
         Parameters
@@ -335,7 +336,7 @@ class Observation(Described):
         return instants, sample, weight
 
     @cached_property
-    def hours(self) -> Float[np.ndarray, " times"]:
+    def hours(self) -> Times:
         """Hours since the first sample."""
         with unannounced_leap_seconds():
             tdb = self.times.tdb
@@ -379,7 +380,7 @@ class Observation(Described):
         """Return the Galactic unit vector of the zenith at every time."""
         return self.topocentric_from_mcmf()[2] @ self.mcmf_from_galactic
 
-    def sun_altitude_deg(self) -> Float[np.ndarray, " times"]:
+    def sun_altitude_deg(self) -> Times:
         """Return the geometric altitude of the Sun's centre above the horizon in degrees."""
         sun = _barycentric_km("sun", self.times) - _barycentric_km("moon", self.times)
         height = np.einsum("ti,ti->t", self.zenith_galactic(), sun)

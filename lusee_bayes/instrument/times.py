@@ -30,11 +30,13 @@ import numpy as np
 from astropy.time import Time
 from jaxtyping import Bool, Float, Int
 
+from lusee_bayes.core.arrays import Times
 from lusee_bayes.core.checks import Described, require_finite
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.layouts import Attribute, Content
 from lusee_bayes.core.reading import naming
 
+Numbers, Nodes = Int[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]
 EPHEMERIS_YEARS = (1900, 2050)
 # scales of time that files may state
 SCALES = ("utc", "tai", "tt", "tdb")
@@ -81,7 +83,7 @@ def utc_from_text(name: str, text: str) -> Time:
     return time
 
 
-def require_ephemeris(jd: Float[np.ndarray, " times"]) -> None:
+def require_ephemeris(jd: Times) -> None:
     """Check that Julian dates lie within lunarsky's kernel of the Moon's orientation.
 
     Raises
@@ -109,9 +111,7 @@ def _ephemeris_jd() -> tuple[float, ...]:
     return tuple(float(Time(f"{year}-01-01", scale="tdb").jd) for year in EPHEMERIS_YEARS)
 
 
-def utc_of(
-    jd1: Float[np.ndarray, " times"], jd2: Float[np.ndarray, " times"], scale: str = "utc"
-) -> Time:
+def utc_of(jd1: Times, jd2: Times, scale: str = "utc") -> Time:
     """Return times of Julian dates in two parts, in UTC.
 
     Raises
@@ -269,12 +269,7 @@ class Windows(Described):
                 raise InputError(f"sample {self.sample[k]} {text}")
 
     @classmethod
-    def whole(
-        cls,
-        start_s: Float[np.ndarray, " samples"],
-        end_s: Float[np.ndarray, " samples"],
-        live_s: Float[np.ndarray, " samples"] | None = None,
-    ) -> Windows:
+    def whole(cls, start_s: Times, end_s: Times, live_s: Times | None = None) -> Windows:
         """Return windows of one piece each, live all of the time unless ``live_s`` says less."""
         live_s = end_s - start_s if live_s is None else live_s
         return cls(np.arange(len(start_s)), start_s, end_s, live_s)
@@ -342,9 +337,7 @@ class Windows(Described):
         _, sample = np.unique(self.sample[here], return_inverse=True)
         return Windows(sample, self.start_s[here], self.end_s[here], self.live_s[here])
 
-    def nodes(
-        self, n: int
-    ) -> tuple[Int[np.ndarray, " nodes"], Float[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]]:
+    def nodes(self, n: int) -> tuple[Numbers, Nodes, Nodes]:
         """Return instants whose weighted means are those over the windows (Gauss-Legendre).
 
         Parameters
@@ -377,7 +370,7 @@ ROUNDED_S, ROUNDED_SHARE = 1e-3, 1e-4
 
 
 def stamped(
-    times: Time, timestamp: str, step_s: float, live_s: Float[np.ndarray, " times"] | None = None
+    times: Time, timestamp: str, step_s: float, live_s: Times | None = None
 ) -> tuple[Time, Windows | None]:
     """Return the middles and the windows of samples that last for a step each.
 
@@ -423,7 +416,7 @@ def bounded(
     times: Time,
     bounds: Time,
     step_s: float | None = None,
-    live_s: Float[np.ndarray, " times"] | None = None,
+    live_s: Times | None = None,
 ) -> tuple[Time, float, Windows]:
     """Return the middles, the step and the windows of samples whose start and end are known.
 
@@ -494,10 +487,10 @@ def _rounding(step_s: float) -> float:
 
 def _windowed(
     times: Time,
-    start_s: Float[np.ndarray, " times"],
-    end_s: Float[np.ndarray, " times"],
+    start_s: Times,
+    end_s: Times,
     step_s: float,
-    live_s: Float[np.ndarray, " times"] | None,
+    live_s: Times | None,
 ) -> tuple[Time, Windows]:
     """Middles of windows of one piece each, and these, with overlaps by rounding cut off."""
     middles, half = later(times, (start_s + end_s) / 2.0), (end_s - start_s) / 2.0
