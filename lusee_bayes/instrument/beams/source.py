@@ -29,12 +29,14 @@ from lusee_bayes.instrument.beams.fields import (
     AntennaFields,
     HemisphereGrid,
     Interpolation,
+    Pairs,
     ProductBeams,
     at_frequency,
     stokes_beam,
 )
 from lusee_bayes.instrument.products import N_ANTENNAS
 
+Ohms = Complex[np.ndarray, "ports ports"]
 LOADS = ("ZL_real", "ZL_imag")
 LOADS_LAYOUT = Layout(
     "loads ZL of four receivers, as luseepy's four-port waterfalls hold them",
@@ -60,7 +62,7 @@ class Receiver(ABC):
     luseepy_parameters: ClassVar[dict[str, str]] = {}
 
     @abstractmethod
-    def load(self, frequency_mhz: float) -> Complex[np.ndarray, "ports ports"]:
+    def load(self, frequency_mhz: float) -> Ohms:
         """Return ZL in Ohm. InputError at a frequency that the receiver does not know."""
 
 
@@ -96,7 +98,7 @@ class JFETReceiver(Receiver):
     skin_ohm: tuple[float, ...] = (5.2e-12, 6.9e-20, 2.2e-38, 1.9e-16)
     skin_power: tuple[float, ...] = (1.39, 2.26, 4.35, 1.88)
 
-    def load(self, frequency_mhz: float) -> Complex[np.ndarray, "ports ports"]:
+    def load(self, frequency_mhz: float) -> Ohms:
         w = 2.0e6 * np.pi * frequency_mhz
         parallel = np.array(self.parallel_ohm)
         z = np.array(self.series_ohm) + np.array(self.skin_ohm) * w ** np.array(self.skin_power)
@@ -119,7 +121,7 @@ class CapacitorReceiver(Receiver):
 
     capacitance_pf: tuple[float, ...] = (30.0, 30.0, 30.0, 30.0)
 
-    def load(self, frequency_mhz: float) -> Complex[np.ndarray, "ports ports"]:
+    def load(self, frequency_mhz: float) -> Ohms:
         return np.diag(1.0 / (2.0e-6j * np.pi * frequency_mhz * np.array(self.capacitance_pf)))
 
 
@@ -142,7 +144,7 @@ class MeasuredReceiver(Receiver):
     frequencies_mhz: Float[np.ndarray, " frequencies"]
     load_ohm: Complex[np.ndarray, "frequencies ports ports"]
 
-    def load(self, frequency_mhz: float) -> Complex[np.ndarray, "ports ports"]:
+    def load(self, frequency_mhz: float) -> Ohms:
         (ohm,) = at_frequency(self.path, self.frequencies_mhz, frequency_mhz, self.load_ohm)
         return ohm
 
@@ -193,23 +195,23 @@ class Circuit:
     """
 
     frequency_mhz: float
-    antenna_ohm: Complex[np.ndarray, "ports ports"]
-    moon_ohm: Complex[np.ndarray, "ports ports"]
-    loss_ohm: Complex[np.ndarray, "ports ports"]
+    antenna_ohm: Ohms
+    moon_ohm: Ohms
+    loss_ohm: Ohms
     receiver: Receiver | None
 
     @property
-    def load_ohm(self) -> Complex[np.ndarray, "ports ports"] | None:
+    def load_ohm(self) -> Ohms | None:
         """ZL; None for open ports."""
         return None if self.receiver is None else self.receiver.load(self.frequency_mhz)
 
     @property
-    def resistance_ohm(self) -> Complex[np.ndarray, "ports ports"]:
+    def resistance_ohm(self) -> Ohms:
         """The whole resistive part, (ZA + ZA^H) / 2."""
         return (self.antenna_ohm + self.antenna_ohm.conj().T) / 2.0
 
     @property
-    def loading(self) -> Complex[np.ndarray, "ports ports"]:
+    def loading(self) -> Ohms:
         """M = ZL (ZA + ZL)^-1; the identity for open ports."""
         load_ohm = self.load_ohm
         if load_ohm is None:
@@ -217,13 +219,11 @@ class Circuit:
         return np.linalg.solve((self.antenna_ohm + load_ohm).T, load_ohm.T).T
 
     @property
-    def per_kelvin(self) -> Complex[np.ndarray, "ports ports"]:
+    def per_kelvin(self) -> Ohms:
         """U = 4 k M (ZA + ZA^H) / 2 M^H, the V^2/Hz that an enclosure of 1 K makes."""
         return self.emitted(self.resistance_ohm)
 
-    def emitted(
-        self, kelvin_ohm: Complex[np.ndarray, "ports ports"]
-    ) -> Complex[np.ndarray, "ports ports"]:
+    def emitted(self, kelvin_ohm: Ohms) -> Ohms:
         """Return the V^2/Hz at the receivers of resistances times their temperatures in K."""
         return 4.0 * Boltzmann * self.loading @ kelvin_ohm @ self.loading.conj().T
 
@@ -264,9 +264,7 @@ class BeamSource(ABC):
             If the source has no beams at this frequency, or no fields of antennas.
         """
 
-    def patterns(
-        self, frequency_mhz: float, grid: HemisphereGrid
-    ) -> Complex[Array, "antennas antennas theta phi"]:
+    def patterns(self, frequency_mhz: float, grid: HemisphereGrid) -> Pairs:
         """Return the response of every pair to Stokes I on a grid, in the unit of :meth:`fields`.
 
         Raises
