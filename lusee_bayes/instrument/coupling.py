@@ -19,11 +19,16 @@ A with a vector never forms A, and nothing in it but the last sum grows with the
 (:class:`BeamOperator`): row t of product k is b_k R(t), with R(t) block diagonal in ell: one
 rotation matrix for each ell and sample, computed once. Then A costs 16 products with (2 ell + 1)^2
 numbers per ell and sample, and derivatives cost no more.
+
+**Sources** that are much smaller than the antennas' resolution need no harmonic expansion
+(:func:`source_response`): one of x K sr in the direction n(t), in the frame of the antennas, gives
+V_k(t) = x B_k(n(t)). It rises and sets sharply, and it may move.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import replace
 
 import equinox as eqx
@@ -32,7 +37,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lusee_bayes.core.arrays import Array, DataVector, Modes, compiled, namespace
-from lusee_bayes.core.checks import Described, require_array, require_float64, require_shape
+from lusee_bayes.core.checks import (
+    Described,
+    is_traced,
+    require_array,
+    require_float64,
+    require_shape,
+)
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import (
     lmax_of,
@@ -43,6 +54,14 @@ from lusee_bayes.core.harmonics import (
     turn_about_z,
 )
 from lusee_bayes.instrument.beams.fields import ProductBeams
+from lusee_bayes.instrument.beams.monopoles import (
+    Frequency,
+    Monopoles,
+    beams_towards,
+    monopole_beams,
+    parameter,
+    with_values,
+)
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout
@@ -659,3 +678,175 @@ def _turned(beams: ProductModes, pointing: Pointing) -> TimeModes:
     layout = DataLayout(beams.shape[0], pointing.n_times)
     coupling = CouplingMatrix.of_modes(beams, pointing, layout)
     return coupling.dense().reshape(beams.shape[0], pointing.n_times, -1)
+
+
+class Instrument(eqx.Module):
+    """Antennas whose parameters may change, with everything else that A is made of.
+
+    Attributes
+    ----------
+    monopoles : Monopoles
+        The antennas and the ground, with the present values of all parameters.
+    pointing : Pointing
+        The orientations at every sample.
+    layout : DataLayout
+        The product and the time of every row of A.
+    frequency_mhz : float
+        In MHz.
+    lmax : int
+        Highest ell of the beams and the sky.
+    nodes : (int, int) or None
+        Of the grid on which beams are computed; see ``monopole_beams``.
+    operator : BeamOperator or None
+        The rotations of all samples, computed by :meth:`prepared`.
+    """
+
+    monopoles: Monopoles
+    pointing: Pointing
+    layout: DataLayout
+    frequency_mhz: float = eqx.field(static=True)
+    lmax: int = eqx.field(static=True)
+    nodes: tuple[int, int] | None = eqx.field(static=True, default=None)
+    operator: BeamOperator | None = None
+
+    def prepared(self) -> Instrument:
+        """Compute the rotations of all samples, as :meth:`dense` needs them.
+
+        Returns
+        -------
+        Instrument
+            The same with its operator.
+        """
+        return replace(self, operator=BeamOperator.of(self.pointing, self.layout))
+
+    def value(self, name: str) -> Float[Array, ""]:
+        """Look up the present value of a parameter.
+
+        Parameters
+        ----------
+        name : str
+            One of ``beams.PARAMETERS``.
+
+        Returns
+        -------
+        () array
+            In the unit that the name ends with.
+
+        Raises
+        ------
+        InputError
+            If there is no such parameter; the message names the nearest.
+        """
+        return parameter(name).where(self.monopoles)
+
+    def beams(self, values: Mapping[str, Float[Array, ""]] | None = None) -> ProductBeams:
+        """Compute the beams of all products.
+
+        Parameters
+        ----------
+        values : mapping of str to () array, optional
+            Values of some parameters (``beams.PARAMETERS``); the others keep theirs.
+
+        Returns
+        -------
+        ProductBeams
+            Up to ``lmax``; differentiable in the values.
+
+        Raises
+        ------
+        InputError
+            If there is no parameter of that name.
+        """
+        antennas = with_values(self.monopoles, values or {})
+        return monopole_beams(self.frequency_mhz, self.lmax, antennas, nodes=self.nodes)
+
+    def dense(self, values: Mapping[str, Float[Array, ""]]) -> Float[Array, "data modes"]:
+        """Compute A as a matrix, of a :meth:`prepared` instrument.
+
+        Parameters
+        ----------
+        values : mapping of str to () array
+            Values of some parameters (``beams.PARAMETERS``); the others keep theirs.
+
+        Returns
+        -------
+        (data, modes) array
+            Differentiable in the values.
+
+        Raises
+        ------
+        InputError
+            If the instrument was not prepared, or there is no parameter of that name.
+        """
+        if self.operator is None:
+            raise InputError("prepare the instrument first: instrument = instrument.prepared()")
+        return self.operator.coupling(self.beams(values))
+
+    def coupling_of(self, beams: ProductBeams) -> CouplingMatrix:
+        """Compute A of given beams, or dA of a difference of beams.
+
+        Parameters
+        ----------
+        beams : ProductBeams
+            Up to the instrument's lmax.
+
+        Returns
+        -------
+        CouplingMatrix
+            For the instrument's orientations and layout.
+
+        Raises
+        ------
+        InputError
+            If the beams have another lmax or other products.
+        """
+        return CouplingMatrix.build(beams, self.pointing, self.layout)
+
+
+def source_response(
+    observation: Observation,
+    galactic: Float[np.ndarray, "..."],
+    frequency_mhz: Frequency,
+    monopoles: Monopoles | None = None,
+    *,
+    stokes_v: float | Float[Array, ""] = 0.0,
+) -> Float[Array, "products times"]:
+    """Return the visibilities of a source of 1 K sr at every sample.
+
+    V_k(t) = B_k^I(n(t)) + stokes_v B_k^V(n(t)), since I = 1 K sr and V = stokes_v I. Multiply by
+    the flux in K sr, constant or (times,). Differentiable in ``monopoles`` and ``stokes_v``.
+
+    Parameters
+    ----------
+    observation : Observation
+    galactic : (3,) or (times, 3) array
+        As of :meth:`.Observation.antenna_directions`.
+    frequency_mhz : float
+    monopoles : Monopoles, optional
+        By default the paper's antennas.
+    stokes_v : float
+        V / I with the IAU's sign. Where it is positive, a receiver that looks towards the source
+        sees the electric field turn counter-clockwise (right-handed).
+
+    Returns
+    -------
+    (products, times) array
+        In K; zero while the source is below the horizon.
+
+    Raises
+    ------
+    InputError
+        As :meth:`.Observation.antenna_directions`; for vectors whose length is not one, a frequency
+        that is not positive, or ``|stokes_v| > 1``.
+    """
+    if not is_traced(stokes_v) and not abs(stokes_v) <= 1.0:
+        raise InputError(
+            f"stokes_v is the fraction V / I, from -1 to 1, got {stokes_v}; no wave is polarised "
+            "by more than all of itself"
+        )
+    directions = observation.antenna_directions(galactic)
+    response = beams_towards(frequency_mhz, directions, monopoles)
+    if not is_traced(stokes_v) and stokes_v == 0.0:
+        return response
+    circular = beams_towards(frequency_mhz, directions, monopoles, stokes="V")
+    return response + stokes_v * circular

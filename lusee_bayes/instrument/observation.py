@@ -27,7 +27,13 @@ from lunarsky import MCMF
 from scipy.spatial.transform import Rotation as SpatialRotation
 
 from lusee_bayes.core.arrays import Times
-from lusee_bayes.core.checks import Described, listed, require_finite, require_positive
+from lusee_bayes.core.checks import (
+    Described,
+    listed,
+    require_array,
+    require_finite,
+    require_positive,
+)
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.instrument.schedule import Cut, Interval, Run, cut_intervals, cut_runs
 from lusee_bayes.instrument.times import (
@@ -41,6 +47,7 @@ from lusee_bayes.instrument.times import (
     utc_from_text,
 )
 
+Vectors, Turn = Float[np.ndarray, "times 3"], Float[np.ndarray, "3 3"]
 ONE_CYCLE = (Run(),)
 # period after which the sky repeats itself in luseepy's engine croissant
 LUSEEPY_MONTH_HOURS = 655.72
@@ -359,14 +366,14 @@ class Observation(Described):
         rotations.setflags(write=False)  # all channels share them
         return rotations
 
-    def topocentric_from_mcmf(self) -> Float[np.ndarray, "3 3"]:
+    def topocentric_from_mcmf(self) -> Turn:
         """Return the rotation from MCMF to the East, North and up of the site, its rows."""
         lon, lat = np.radians(self.lon_deg), np.radians(self.lat_deg)
         up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
         east = np.array([-np.sin(lon), np.cos(lon), 0.0])
         return np.array([east, np.cross(up, east), up])
 
-    def lander_from_mcmf(self) -> Float[np.ndarray, "3 3"]:
+    def lander_from_mcmf(self) -> Turn:
         """Return the rotation from MCMF to the lander's axes: East, North and up if it is level.
 
         It leans first towards North, about East, then towards East, about North.
@@ -376,9 +383,41 @@ class Observation(Described):
         turned *= SpatialRotation.from_rotvec([-north, 0.0, 0.0])
         return turned.inv().as_matrix() @ self.topocentric_from_mcmf()
 
-    def zenith_galactic(self) -> Float[np.ndarray, "times 3"]:
+    def zenith_galactic(self) -> Vectors:
         """Return the Galactic unit vector of the zenith at every time."""
         return self.topocentric_from_mcmf()[2] @ self.mcmf_from_galactic
+
+    def antenna_directions(self, galactic: Float[np.ndarray, "..."]) -> Vectors:
+        """Return the direction of a source in the frame of the antennas at every sample.
+
+        The frame turns with the antennas: seen from antennas that are turned by psi from East
+        towards North, a source has turned by -psi. As for all skies here, stellar aberration (0.006
+        degrees) is left out.
+
+        Parameters
+        ----------
+        galactic : (3,) or (times, 3) array
+            Galactic unit vector of the source, fixed or at every sample.
+
+        Returns
+        -------
+        (times, 3) array
+            East, North and up components.
+
+        Raises
+        ------
+        InputError
+            Unless ``galactic`` is a finite float64 array of such a shape.
+        """
+        require_array("galactic", galactic, (3,) if galactic.ndim == 1 else (self.n_times, 3))
+        vectors = np.broadcast_to(galactic, (self.n_times, 3))
+        mcmf = np.einsum("tij,tj->ti", self.mcmf_from_galactic, vectors)
+        topocentric_from_mcmf = self.topocentric_from_mcmf()
+        leaning = self.lander_from_mcmf() @ topocentric_from_mcmf.T
+        east, north, up = leaning @ (mcmf @ topocentric_from_mcmf.T).T
+        turned = np.radians(np.asarray(self.turntable_deg, dtype=np.float64))[self.run]
+        cos, sin = np.cos(turned), np.sin(turned)
+        return np.stack([cos * east + sin * north, cos * north - sin * east, up], axis=1)
 
     def sun_altitude_deg(self) -> Times:
         """Return the geometric altitude of the Sun's centre above the horizon in degrees."""
@@ -408,7 +447,7 @@ LIGHT_KM_PER_S = c.to_value(u.km / u.s)
 LIGHT_TIME_ITERATIONS = 3
 
 
-def body_direction(body: str, observation: Observation) -> Float[np.ndarray, "times 3"]:
+def body_direction(body: str, observation: Observation) -> Vectors:
     """Return the direction from the lander to a body at every sample.
 
     The direction is that from the lander's place on the Moon to where the body was when its light
@@ -445,7 +484,7 @@ def body_direction(body: str, observation: Observation) -> Float[np.ndarray, "ti
     return vector / np.linalg.norm(vector, axis=1, keepdims=True)
 
 
-def _barycentric_km(body: str, times: Time) -> Float[np.ndarray, "times 3"]:
+def _barycentric_km(body: str, times: Time) -> Vectors:
     """Place from the barycentre of the Solar System along Galactic axes."""
     with unannounced_leap_seconds():
         place = get_body_barycentric(body, times, ephemeris="builtin").xyz.to_value(u.km)

@@ -19,8 +19,7 @@ from lusee_bayes.core.section import Positive, Section, Treatment, requires
 from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.beams.monopoles import parameter, with_values
 from lusee_bayes.instrument.beams.source import BeamSource
-from lusee_bayes.instrument.coupling import Coupling
-from lusee_bayes.instrument.instrument import Instrument
+from lusee_bayes.instrument.coupling import Coupling, Instrument
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise import instrument_errors
 from lusee_bayes.systematics.context import Around, Context
