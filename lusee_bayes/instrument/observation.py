@@ -40,6 +40,7 @@ from lusee_bayes.instrument.times import (
     Nodes,
     Numbers,
     Windows,
+    counts_up,
     later,
     require_ephemeris,
     seconds_from,
@@ -113,15 +114,11 @@ class Observation(Described):
                 f"times must grow from sample to sample, but sample {back[0] + 1} ({after}) does "
                 f"not come after sample {back[0]} ({before}); sort them, and give each time once"
             )
-        steps = np.diff(self.run)
-        if (
-            self.run[0] != 0
-            or self.run[-1] != len(self.turntable_deg) - 1
-            or not ((steps == 0) | (steps == 1)).all()
-        ):
+        last = self.n_runs - 1
+        if not counts_up(self.run) or self.run[-1] != last:
             raise InputError(
-                f"run must count 0, 1, ... up to {len(self.turntable_deg) - 1} (one number for "
-                "each turntable angle) without going back"
+                f"run must count 0, 1, ... up to {last} (one number for each turntable angle) "
+                "without going back"
             )
         require_ephemeris(self.times.jd)
         if self.windows is None:
@@ -277,8 +274,7 @@ class Observation(Described):
         for k, cut in enumerate(cuts):
             if not keep[cut_of == k].any():
                 raise InputError(
-                    f"{cut.name} holds no lunar night; lengthen it, move its start or drop "
-                    "night_only"
+                    f"{cut.name} holds no lunar night; lengthen it, move it or drop night_only"
                 )
         return observation.select(keep)
 

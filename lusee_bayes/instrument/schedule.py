@@ -24,12 +24,10 @@ import numpy as np
 from astropy.time import Time
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array, namespace
-from lusee_bayes.core.checks import is_traced, require_positive
+from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import pandas
 from lusee_bayes.core.reading import naming, parse_yaml, read_text, reading
-from lusee_bayes.instrument.products import DataLayout, all_products
 from lusee_bayes.instrument.times import (
     ROUNDING_S,
     require_ephemeris,
@@ -95,8 +93,7 @@ class Interval:
         place = f"{self.where}: " if self.where else ""
         if not self.length_s > ROUNDING_S:
             raise InputError(
-                f"{place}end {self.end} does not come after start {self.start}; give the dates "
-                "between which is observed"
+                f"{place}end {self.end} does not come after start {self.start}; exchange them"
             )
         if not np.isfinite(self.turntable_deg):
             raise InputError(
@@ -348,57 +345,3 @@ def _date(mjd: float) -> str:
     """To the microsecond, which is all that a double holds of it."""
     with unannounced_leap_seconds():
         return str(Time(mjd, format="mjd", scale="utc", precision=6).isot)
-
-
-def without_gaps(
-    visibilities: Float[Array, "products times"], layout: DataLayout
-) -> Float[Array, "products times"]:
-    """Return visibilities with a value at every sample, for the noise around them.
-
-    The noise of a sample depends on the antenna temperatures of its ports, and in the exact form
-    on all products of its time. Where one of these is absent, it is interpolated linearly between
-    the samples of the same product before and after it (at the ends the nearest one is taken). A
-    cross that was never measured is zero: its ports are taken to be uncorrelated. The auto of a
-    port that was never used is the mean of the others, and no sample depends on it.
-
-    Parameters
-    ----------
-    visibilities : (products, times) array
-        In K. A sample is absent where it is not in the layout, and its value is 0 (as
-        :meth:`DataLayout.scatter` leaves it) or NaN; a model's values at absent samples are kept.
-    layout : DataLayout
-
-    Returns
-    -------
-    (products, times) array
-
-    Raises
-    ------
-    InputError
-        If an auto is absent at all times, but a product of its port is not.
-    """
-    if layout.index is None or is_traced(visibilities, layout.index):
-        return visibilities
-    values, present = np.array(visibilities), np.asarray(layout.present)
-    absent = ~present & (np.isnan(values) | (values == 0.0))
-    if not absent.any():
-        return visibilities
-    products = all_products(round(np.sqrt(layout.n_products)))
-    times, measured = np.arange(layout.n_times), present.any(1)
-    for gaps, row in zip(absent, values, strict=True):
-        if gaps.any():
-            known = ~gaps
-            row[gaps] = np.interp(times[gaps], times[known], row[known]) if known.any() else 0.0
-    autos = np.array([p.i == p.j for p in products])
-    unused = np.flatnonzero(autos & absent.all(1))
-    for auto in (products[k] for k in unused):
-        for product, is_there in zip(products, measured, strict=True):
-            if is_there and auto.i in (product.i, product.j):
-                raise InputError(
-                    f"the auto {auto.label} is absent at all times, and the noise of "
-                    f"{product.label} depends on it; give modelled visibilities of all samples, "
-                    "such as the signal of a CouplingMatrix without flags"
-                )
-    if unused.size:
-        values[unused] = values[autos & ~absent.all(1)].mean(0)
-    return namespace(visibilities).asarray(values)

@@ -206,6 +206,11 @@ def step_of(times: Time, step_s: float | None) -> float:
     return float(np.median(np.abs(seconds_from(times[:-1], times[1:]))))
 
 
+def counts_up(numbers: Int[np.ndarray, " n"]) -> bool:
+    """Return whether whole numbers count 0, 1, ... without going back or leaving one out."""
+    return numbers[0] == 0 and bool(np.isin(np.diff(numbers), (0, 1)).all())
+
+
 # times of a Julian date in two parts are exact to less than a nanosecond, others to a few of them
 ROUNDING_S = 1e-6
 
@@ -242,8 +247,7 @@ class Windows(Described):
                 "sample, start_s, end_s and live_s of windows must be lists of the same length, "
                 f"with at least one piece; got the shapes {sorted(lengths)}"
             )
-        steps = np.diff(self.sample)
-        if self.sample[0] != 0 or not np.isin(steps, (0, 1)).all():
+        if not counts_up(self.sample):
             raise InputError(
                 "pieces of windows must count the samples 0, 1, ... without going back, with at "
                 "least one piece for each"
@@ -251,7 +255,7 @@ class Windows(Described):
         for name in ("start_s", "end_s", "live_s"):
             require_finite(f"{name} of the windows", getattr(self, name))
         start, end, live = self.start_s, self.end_s, self.live_s
-        early = (steps == 0) & (start[1:] < end[:-1] - ROUNDING_S)
+        early = (np.diff(self.sample) == 0) & (start[1:] < end[:-1] - ROUNDING_S)
         rules = (
             (end <= start, "ends {1:g} s from its time, not after its start at {0:g} s; windows "
              "need a start and then an end"),
@@ -474,8 +478,7 @@ def utc_bounds(bounds: Any, n_times: int) -> Time:
     bounds = bounds if isinstance(bounds, Time) else np.asarray(bounds)
     if bounds.shape != (n_times, 2):
         raise InputError(
-            f"bounds have shape {bounds.shape}, expected ({n_times}, 2): start and end of every "
-            "sample"
+            f"bounds have shape {bounds.shape}, expected ({n_times}, 2): starts and ends"
         )
     with naming("bounds, taken row by row"):
         return utc_times(bounds).reshape(n_times, 2)

@@ -45,6 +45,7 @@ from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import (
     N_ANTENNAS,
     DataLayout,
+    antennas_of,
     labels,
     numbers_of_times,
     real_products,
@@ -229,11 +230,10 @@ class Visibilities(Described):
 
     def __post_init__(self):
         require_array("the data", self.data, (self.layout.size,))
-        if self.layout.n_times != self.observation.n_times:
-            raise InputError(
-                f"the data have {self.layout.n_times} times, the observation "
-                f"{self.observation.n_times}"
-            )
+        seen = self.observation
+        if self.layout.n_times != seen.n_times:
+            n_times = self.layout.n_times
+            raise InputError(f"the data have {n_times} times, the observation {seen.n_times}")
         if self.calibration is not None:
             n_averaged = self.calibration.n_averaged
             require_shape("n_averaged of the calibration", n_averaged, (self.layout.n_times,))
@@ -343,20 +343,18 @@ class Visibilities(Described):
     @property
     def labels(self) -> tuple[str, ...]:
         """Labels of the products, in order."""
-        return labels(round(np.sqrt(self.layout.n_products)))
+        return labels(antennas_of(self.layout.n_products))
 
     def digest(self) -> str:
         """Return a hash of data, layout, times and windows, which tells data sets apart."""
-        content = hashlib.sha256(np.ascontiguousarray(self.data).tobytes())
-        content.update(self.layout.product.tobytes() + self.layout.time.tobytes())
-        content.update(self.observation.times.jd.tobytes())
+        parts = [self.data, self.layout.product, self.layout.time, self.observation.times.jd]
         windows = self.observation.windows
         if windows is not None:
-            for values in (windows.sample, windows.start_s, windows.end_s, windows.live_s):
-                content.update(np.ascontiguousarray(values).tobytes())
+            parts += [windows.sample, windows.start_s, windows.end_s, windows.live_s]
         if self.calibration is not None:
-            content.update(np.ascontiguousarray(self.calibration.n_averaged).tobytes())
-        return content.hexdigest()
+            parts.append(self.calibration.n_averaged)
+        content = b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
+        return hashlib.sha256(content).hexdigest()
 
     def grid(self) -> Float[np.ndarray, "products times"]:
         """Return the full grid in K, NaN where a sample is missing: for files and figures only."""
@@ -511,10 +509,10 @@ def read_visibilities(path: str | Path) -> Visibilities:
     require_file(path, "data", HINT)
     found = read_netcdf(path, formats.VISIBILITIES, LAYOUT, HINT)
     here = found.arrays
-    n, products = round(np.sqrt(found.sizes["product"])), tuple(map(str, here["product"]))
-    if products != labels(n):
+    products, expected = tuple(map(str, here["product"])), labels(antennas_of(len(here["product"])))
+    if products != expected:
         raise InputError(
-            f"{path} has products {', '.join(products)}; expected {', '.join(labels(n))}"
+            f"{path} has products {', '.join(products)}; expected {', '.join(expected)}"
         )
     flags = here["flag"]
     values = np.where(flags, 0.0, here["visibility"])

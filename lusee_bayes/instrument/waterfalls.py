@@ -271,8 +271,7 @@ def read_scalar(path: Path) -> Waterfall:
         columns += [(f"{pair}R", 1.0)] if i == j else [(f"{pair}R", 1.0), (f"{pair}I", sign)]
     if data.shape[1] != len(columns):
         raise InputError(
-            f"{path}: data has {data.shape[1]} products, expected {len(columns)} for the pairs of "
-            "ports in combinations"
+            f"{path}: data has {data.shape[1]} products, expected {len(columns)} by combinations"
         )
     with naming(path):
         said, values = found.values, np.moveaxis(data, 1, 0)
@@ -381,10 +380,10 @@ def read_waterfall(path: str | Path) -> Waterfall:
     return read_four_port(path) if "blackbody_normalization_real" in names else read_scalar(path)
 
 
-HINT = "write netCDF instead (a name that does not end in .fits)"
+HINT = "write netCDF (a name that does not end in .fits)"
 NO_ROOM = (
-    "luseepy's waterfalls have no room for windows, and the samples are means over theirs; write "
-    "netCDF (a name that does not end in .fits), or simulate with --set observation.window=instant"
+    "luseepy's waterfalls have no room for windows, and the samples are means over theirs; "
+    f"{HINT}, or simulate with --set observation.window=instant"
 )
 
 
@@ -421,8 +420,7 @@ def write_waterfall(
     path, first = user_path(path), channels[0].observation
     if len(channels) < 2:
         raise InputError(
-            f"{path}: luseepy's reader takes waterfalls of at least two channels; give it "
-            "--frequencies, or write netCDF (a name that does not end in .fits)"
+            f"{path}: luseepy's reader takes at least two channels; give --frequencies, or {HINT}"
         )
     data = _kelvin(path, channels)
     seconds = seconds_from(first.times[0], first.times)
@@ -546,8 +544,7 @@ def write_four_port(
     if receiver is None:
         raise InputError(
             f"{path}: luseepy's four-port waterfalls hold the loads of receivers, and the ports "
-            "are open; give another beam.receiver, or write netCDF (a name that does not end in "
-            ".fits)"
+            f"are open; give another beam.receiver, or {HINT}"
         )
     enclosure = np.array([circuit.per_kelvin for circuit in circuits])
     root = np.sqrt(enclosure.diagonal(axis1=1, axis2=2).real)

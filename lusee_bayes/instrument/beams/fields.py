@@ -35,7 +35,7 @@ from lusee_bayes.core.checks import (
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import LARGEST_LMAX, SQRT2, lmax_of, mode_numbers, polar_functions
 from lusee_bayes.core.lazy import healpy
-from lusee_bayes.instrument.products import auto_indices, labels, to_real
+from lusee_bayes.instrument.products import antennas_of, auto_indices, labels, to_real
 
 # responses of antennas, and of pairs of them, in any directions
 Fields = Complex[Array, "antennas *directions"]
@@ -377,15 +377,10 @@ class ProductBeams(Described, eqx.Module):
     def __check_init__(self):
         require_float64("the beam coefficients", self.modes)
         lmax_of(self.modes.shape[-1])
-        n = round(np.sqrt(self.modes.shape[0]))
-        if n * n != self.modes.shape[0]:
-            raise InputError(
-                f"{self.modes.shape[0]} products do not come from any number of antennas; "
-                "expected 1, 4, 9, 16, ..."
-            )
+        antennas_of(self.n_products)
 
     def description(self) -> tuple[str, ...]:
-        autos = self.modes[auto_indices(round(np.sqrt(self.n_products))), 0]
+        autos = self.modes[auto_indices(antennas_of(self.n_products)), 0]
         return (
             f"{self.n_products} products at {self.frequency_mhz:g} MHz, lmax = {self.lmax}",
             f"{self.modes.shape[1]} real coefficients each, topocentric, K per K: "
@@ -406,7 +401,7 @@ class ProductBeams(Described, eqx.Module):
     @property
     def labels(self) -> tuple[str, ...]:
         """Labels of the products, in order."""
-        return labels(round(np.sqrt(self.n_products)))
+        return labels(antennas_of(self.n_products))
 
 
 def product_beams(

@@ -63,7 +63,7 @@ from lusee_bayes.instrument.beams.luseepy_files import (
     read_scalar_beam,
 )
 from lusee_bayes.instrument.beams.source import BeamSource
-from lusee_bayes.instrument.products import auto_indices, labels, to_matrix, to_real
+from lusee_bayes.instrument.products import antennas_of, auto_indices, labels, to_matrix, to_real
 
 # functions in the directions that were sampled, and on a grid
 Sampled = Inexact[np.ndarray, "n *directions"]
@@ -158,8 +158,7 @@ class Directions:
         bad = ~np.isfinite(kept)
         if bad.any():
             raise InputError(
-                f"{what} holds NaN or infinity in {int(bad.sum())} of {bad.size} places above the "
-                "horizon"
+                f"{what} holds NaN or infinity in {bad.sum()} of {bad.size} places in the sky"
             )
         return kept
 
@@ -254,7 +253,7 @@ class SampledBeams(Described, BeamSource):
     def n_ports(self) -> int:
         if self.products is None:
             return self.e_theta.shape[1]
-        return round(np.sqrt(self.products.shape[1]))
+        return antennas_of(self.products.shape[1])
 
     def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
         if self.products is not None:
@@ -354,11 +353,9 @@ def sampled_beams(
     given = layout(tuple(fields), bool(grid), kind).checked(path, arrays, {}).arrays
     some = given[next(iter(fields))]
     directions = Directions.of(given.get("theta_deg"), given.get("phi_deg"), some.shape[-1], path)
-    if products is not None and round(np.sqrt(some.shape[1])) ** 2 != some.shape[1]:
-        raise InputError(
-            f"{path}: {some.shape[1]} products do not come from any number of antennas; expected "
-            "1, 4, 9, 16, ..."
-        )
+    if products is not None:
+        with naming(path):
+            antennas_of(some.shape[1])
     above = {name: directions.above(given[name], f"{path}: {name}") for name in fields}
     return SampledBeams(given["frequency_mhz"], directions, **above, absolute=absolute, path=path)
 
@@ -465,7 +462,7 @@ def write_sampled_beams(path: str | Path, beams: SampledBeams) -> Path:
 def _in_order(beams: np.ndarray, products: str) -> np.ndarray:
     """Product beams in the package's order."""
     names = [name.strip() for name in products.split(",")]
-    expected = labels(round(np.sqrt(beams.shape[1])))
+    expected = labels(antennas_of(beams.shape[1]))
     if len(names) != beams.shape[1] or sorted(names) != sorted(expected):
         raise InputError(
             f"products is {products}, expected the names of its {beams.shape[1]} product beams: "
