@@ -285,7 +285,7 @@ class Visibilities(Described):
         bounds : (times, 2) sequence, optional
             Start and end of every sample, of any kind of times, where they are not those of
             ``timestamp`` and ``step_s``. The times then may be anywhere between.
-        live_s : (times,) array, optional
+        live_s : float or (times,) array, optional
             How long each sample was integrated, in seconds; by default all of its window.
         step_s : float, optional
             From sample to sample, in seconds; by default the median of the times.
