@@ -287,8 +287,7 @@ class DenseCoupling(Coupling):
 
     def plus(self, amplitude, direction):
         require_shape("the direction", direction, self.shape)
-        if direction.response is not None:
-            raise InputError("the direction must have no response of its own")
+        _require_bare(direction)
         return DenseCoupling(self.matrix + amplitude * direction.dense(), response=self.response)
 
     def _forward(self, sky):
@@ -296,6 +295,11 @@ class DenseCoupling(Coupling):
 
     def _backward(self, data):
         return self.matrix.T @ data
+
+
+def _require_bare(direction: Coupling) -> None:
+    if direction.response is not None:
+        raise InputError("the direction must have no response of its own")
 
 
 def as_coupling(coupling: Coupling | Array) -> Coupling:
@@ -426,8 +430,7 @@ class CouplingMatrix(Coupling):
         return self.response is None
 
     def plus(self, amplitude, direction):
-        if direction.response is not None:
-            raise InputError("the direction must have no response of its own")
+        _require_bare(direction)
         if not isinstance(direction, CouplingMatrix):
             dense = DenseCoupling(self._matrix(), response=self.response)
             return dense.plus(amplitude, direction)

@@ -90,19 +90,18 @@ class Interval:
     where: str = field(default="", compare=False)
 
     def __post_init__(self):
-        place = f"{self.where}: " if self.where else ""
         if not self.length_s > ROUNDING_S:
             raise InputError(
-                f"{place}end {self.end} does not come after start {self.start}; exchange them"
+                f"end {self.end} does not come after start {self.start}; exchange them"
             )
         if not np.isfinite(self.turntable_deg):
             raise InputError(
-                f"{place}turntable_deg is {self.turntable_deg}; give an angle in degrees, positive "
+                f"turntable_deg is {self.turntable_deg}; give an angle in degrees, positive "
                 "from East towards North"
             )
         if not 0.0 < self.duty_cycle <= 1.0:
             raise InputError(
-                f"{place}duty_cycle is {self.duty_cycle:g}; give the fraction of the time that is "
+                f"duty_cycle is {self.duty_cycle:g}; give the fraction of the time that is "
                 "integrated, above 0 and up to 1, and leave out intervals in which nothing is"
             )
 
@@ -122,9 +121,7 @@ class Interval:
 
     def _date(self, name: str, text: str) -> Time:
         # astropy knows no Z, which ISO has for UTC
-        return utc_from_text(
-            f"{self.where}: {name}" if self.where else name, text.removesuffix("Z")
-        )
+        return utc_from_text(name, text.removesuffix("Z"))
 
 
 @dataclass(frozen=True)
@@ -182,12 +179,11 @@ def cut_intervals(intervals: Sequence[Interval], step_s: float) -> list[Cut]:
     Raises
     ------
     InputError
-        For a bad step, and as :func:`require_sequence`.
+        For a bad step, and as :func:`named_in_order`.
     """
     require_positive("step_s", step_s)
-    require_sequence(intervals)
     cuts = []
-    for interval, name in zip(intervals, _names(intervals), strict=True):
+    for name, interval in named_in_order(intervals):
         begins = step_s * np.arange(interval.n_samples(step_s))
         length = np.diff(begins, append=interval.length_s)
         start = seconds_from(intervals[0].start_time, interval.start_time) + begins
@@ -195,13 +191,8 @@ def cut_intervals(intervals: Sequence[Interval], step_s: float) -> list[Cut]:
     return cuts
 
 
-def _names(intervals: Sequence[Interval]) -> tuple[str, ...]:
-    """Where intervals are written, or their numbers."""
-    return tuple(one.where or f"interval {number}" for number, one in enumerate(intervals))
-
-
-def require_sequence(intervals: Sequence[Interval]) -> None:
-    """Check that the intervals of a schedule come one after the other.
+def named_in_order(intervals: Sequence[Interval]) -> list[tuple[str, Interval]]:
+    """Return intervals that come one after the other, each with what messages call it.
 
     Raises
     ------
@@ -210,7 +201,7 @@ def require_sequence(intervals: Sequence[Interval]) -> None:
     """
     if not intervals:
         raise InputError("a schedule needs at least one interval, got none")
-    named = zip(_names(intervals), intervals, strict=True)
+    named = [(one.where or f"interval {number}", one) for number, one in enumerate(intervals)]
     for (_, before), (name, after) in pairwise(named):
         ahead = seconds_from(before.start_time, after.start_time)
         if ahead < 0.0:
@@ -224,6 +215,7 @@ def require_sequence(intervals: Sequence[Interval]) -> None:
                 f"{name}: the interval from {after.start} begins {overlap:g} s before "
                 f"the one that precedes it ends, {before.end}; give each stretch of time once"
             )
+    return named
 
 
 WHAT = "a schedule, a table in CSV or OpSim's in YAML"
@@ -264,7 +256,7 @@ def _parsed(path: str, text: str) -> tuple[Interval, ...]:
     is_yaml = Path(path).suffix in (".yaml", ".yml")
     intervals = _of_commands(path, text) if is_yaml else _of_table(path, text)
     with naming(path):
-        require_sequence(intervals)
+        named_in_order(intervals)
     return intervals
 
 
@@ -279,10 +271,11 @@ def _of_table(path: str, text: str) -> tuple[Interval, ...]:
             f"{path} has the columns {', '.join(table.columns)}; a schedule has "
             f"{', '.join(sorted(REQUIRED))}, and may have {' and '.join(sorted(OPTIONAL))}"
         )
-    return tuple(
-        _interval(f"{path}, row {number}", row)
-        for number, row in enumerate(table.to_dict("records"), start=1)
-    )
+    intervals = []
+    for number, row in enumerate(table.to_dict("records"), start=1):
+        with naming(place := f"{path}, row {number}"):
+            intervals.append(_interval(place, row))
+    return tuple(intervals)
 
 
 def _interval(place: str, row: dict[str, str]) -> Interval:
@@ -291,13 +284,11 @@ def _interval(place: str, row: dict[str, str]) -> Interval:
         try:
             numbers[name] = float(row.get(name) or default)
         except ValueError as error:
-            raise InputError(f"{place}: {name} is '{row[name]}', not a number") from error
-    night_only = (row.get("night_only", "").strip() or "false").lower()
-    if night_only not in ("true", "false"):
-        raise InputError(f"{place}: night_only is '{night_only}'; write true or false")
-    return Interval(
-        row["start"], row["end"], **numbers, night_only=night_only == "true", where=place
-    )
+            raise InputError(f"{name} is '{row[name]}', not a number") from error
+    night = (row.get("night_only", "").strip() or "false").lower()
+    if night not in ("true", "false"):
+        raise InputError(f"night_only is '{night}'; write true or false")
+    return Interval(row["start"], row["end"], **numbers, night_only=night == "true", where=place)
 
 
 def _of_commands(path: str, text: str) -> tuple[Interval, ...]:

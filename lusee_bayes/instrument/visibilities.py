@@ -185,7 +185,7 @@ class Calibration:
             require_finite("gain_slope", self.gain_slope)
 
 
-LOADS = ("load_ohm_real", "load_ohm_imag")
+LOADS, LOAD = ("load_ohm_real", "load_ohm_imag"), ("load_frequency", "port", "port_2")
 # what to do where there is no file of them
 HINT = "make some with: lusee-bayes simulate SCENARIO"
 
@@ -467,12 +467,8 @@ LAYOUT = Layout(
         **{name: Variable(("piece",), optional=True, unit="s") for name in PIECES[1:]},
         "truth": Variable(("mode",), optional=True, unit="K"),
         # the receivers' loads ZL, where they are known
-        "load_frequency_mhz": Variable(
-            ("load_frequency",), low=0.0, grows=True, optional=True, unit="MHz"
-        ),
-        **dict.fromkeys(
-            LOADS, Variable(("load_frequency", "port", "port_2"), optional=True, unit="Ohm")
-        ),
+        "load_frequency_mhz": Variable(LOAD[:1], low=0.0, grows=True, optional=True, unit="MHz"),
+        **dict.fromkeys(LOADS, Variable(LOAD, optional=True, unit="Ohm")),
     },
     {
         "frequency_mhz": Attribute(low=0.0, unit="MHz"),
@@ -521,12 +517,7 @@ def read_visibilities(path: str | Path) -> Visibilities:
         layout = DataLayout.from_flags(flags)
         utc = utc_of_jd(found)
         times, windows, says_window = read_windows(found, utc)
-        return Visibilities(
-            layout.gather(values),
-            layout,
-            observation_of(found, times, windows),
-            found.values["frequency_mhz"],
-            here.get("truth"),
-            receiver_of(path, here, "load_frequency_mhz", *LOADS),
-            says_window,
-        )
+        seen, mhz = observation_of(found, times, windows), found.values["frequency_mhz"]
+        receiver = receiver_of(path, here, "load_frequency_mhz", *LOADS)
+        truth = here.get("truth")
+        return Visibilities(layout.gather(values), layout, seen, mhz, truth, receiver, says_window)

@@ -157,14 +157,8 @@ class Waterfall:
             )
         with naming(f"{self.path} at {frequency_mhz:g} MHz"):
             layout = DataLayout.from_flags(~present[within])
-        data = layout.gather(np.where(present, values, 0.0)[within])
-        return Visibilities(
-            data,
-            layout,
-            self.observation,
-            float(self.frequencies_mhz[channel]),
-            receiver=self.receiver,
-        )
+        data, mhz = layout.gather(values[within]), float(self.frequencies_mhz[channel])
+        return Visibilities(data, layout, self.observation, mhz, receiver=self.receiver)
 
 
 YEAR = re.compile(r"(CY|FY)([0-9]{2}|[0-9]{4})")
@@ -300,10 +294,9 @@ FOUR_PORT_WATERFALL = Layout(
         # NaN where a sample is missing
         "data": Variable(("time", "product", "freq"), finite=False, unit=UNIT),
         "blackbody_normalization_real": Variable(("freq", N_ANTENNAS, N_ANTENNAS)),
-        **{
-            name: Variable(("freq", N_ANTENNAS, N_ANTENNAS), optional=True, unit="Ohm")
-            for name in LOADS
-        },
+        **dict.fromkeys(
+            LOADS, Variable(("freq", N_ANTENNAS, N_ANTENNAS), optional=True, unit="Ohm")
+        ),
     },
     {
         **SITE_AND_STEP,
@@ -346,17 +339,10 @@ def read_four_port(path: Path) -> Waterfall:
         grid = in_order([(name, volts / scales.get(name, 1.0)) for name, volts in named])
         scale = scale_of("TIMESYS", said.get("TIMESYS", "UTC"))
         observation = _observation(utc_of(*images["time"].T, scale), said)
-    return Waterfall(
-        str(path),
-        grid,
-        images["freq"],
-        observation,
-        per_kelvin,
-        said["TMOON_K"],
-        said.get("TANT_K", 0.0),
-        receiver_of(path, images, "freq", *LOADS),
-        said.get("FREQINT"),
-    )
+    warm = {"moon_k": said["TMOON_K"], "antenna_k": said.get("TANT_K", 0.0)}
+    loads, rule = receiver_of(path, images, "freq", *LOADS), said.get("FREQINT")
+    known = {"per_kelvin": per_kelvin, "receiver": loads, "interpolation": rule}
+    return Waterfall(str(path), grid, images["freq"], observation, **known, **warm)
 
 
 def read_waterfall(path: str | Path) -> Waterfall:

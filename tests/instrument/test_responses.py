@@ -108,7 +108,7 @@ def test_other_conventions_are_noticed(luseepy, test_data):
     signs = np.array([-1.0 if label[-1] == "I" else 1.0 for label in labels()])
     mirrored = np.r_[0, -1 : -response.n_phi : -1]
     flipped = replace(
-        response, h_theta=response.h_theta[..., mirrored], h_phi=-response.h_phi[..., mirrored]
+        response, e_theta=response.e_theta[..., mirrored], e_phi=-response.e_phi[..., mirrored]
     )
     unloaded, warm = replace(response, receiver=None), replace(response, moon_k=MOON)
     moonless = right - volts(response, 25.0, warm.background(25.0)[:, None])[:, 0]

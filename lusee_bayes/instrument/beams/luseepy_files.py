@@ -48,6 +48,7 @@ from lusee_bayes.core.harmonics import mode_numbers, polar_functions
 from lusee_bayes.core.layouts import UNSTATED, Attribute, Layout, Variable
 from lusee_bayes.instrument.beams.fields import (
     SPEED_OF_LIGHT,
+    Angles,
     AntennaFields,
     HemisphereGrid,
     Interpolation,
@@ -124,13 +125,11 @@ class BandLimitedGrid(HemisphereGrid):
     """
 
     @classmethod
-    def of(cls, theta: Float[np.ndarray, " theta"], n_phi: int) -> BandLimitedGrid:
+    def of(cls, theta: Angles, n_phi: int) -> BandLimitedGrid:
         """Return the rule for ``theta`` in equal steps from 0 to pi / 2, both included."""
-        n = len(theta)
-        nodes, weights = roots_legendre(4 * n)
-        even = weights @ cardinal_functions(np.arccos(nodes), 2 * n - 2, 0)[:, :n]
-        even[-1] /= 2.0
-        return cls(theta, even, n_phi)
+        # lambda_00 = 1 / sqrt(4 pi)
+        even = cls(theta, np.ones_like(theta), n_phi).polar_weights(0)[:, 0]
+        return cls(theta, even * np.sqrt(4.0 * np.pi), n_phi)
 
     def polar_weights(self, lmax: int) -> Float[np.ndarray, "theta modes"]:
         """Return the integrals of each sample's cardinal function times lambda_lm(theta)."""
@@ -149,9 +148,7 @@ class BandLimitedGrid(HemisphereGrid):
         return summed
 
 
-def cardinal_functions(
-    theta: Float[np.ndarray, " theta"], intervals: int, parity: int
-) -> Float[np.ndarray, "theta samples"]:
+def cardinal_functions(theta: Angles, intervals: int, parity: int) -> np.ndarray:
     """Return trigonometric polynomials that are 1 at one sample and 0 at the others.
 
     The samples are pi k / intervals, k = 0 .. intervals.
@@ -186,22 +183,22 @@ VACUUM_OHM = physical_constants["characteristic impedance of vacuum"][0]
 LENGTHS = ("H_theta", "H_phi")
 MATRICES = ("ZA", "Rsky", "Rmoon", "Rloss")
 AXES = ("freq", "theta", "phi")
-PARTS = ("real", "imag")
+
+
+def parts_of(*names: str) -> list[str]:
+    """Return the names of the images that hold real and imaginary parts."""
+    return [f"{name}_{part}" for name in names for part in ("real", "imag")]
+
+
 RESPONSE_LAYOUT = Layout(
     "a four-port response of luseepy, FITS version 3",
     {
         "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
         **{name: Variable((name,), grows=True, unit="deg") for name in AXES[1:]},
-        **{
-            f"{name}_{part}": Variable((N_ANTENNAS, *AXES), unit="m")
-            for name in LENGTHS
-            for part in PARTS
-        },
-        **{
-            f"{name}_{part}": Variable(("freq", N_ANTENNAS, N_ANTENNAS), unit="Ohm")
-            for name in MATRICES
-            for part in PARTS
-        },
+        **dict.fromkeys(parts_of(*LENGTHS), Variable((N_ANTENNAS, *AXES), unit="m")),
+        **dict.fromkeys(
+            parts_of(*MATRICES), Variable(("freq", N_ANTENNAS, N_ANTENNAS), unit="Ohm")
+        ),
     },
     dict.fromkeys((*CONVENTIONS, *SOURCES), Attribute("word", optional=True)),
 )
@@ -220,6 +217,8 @@ class LuseepyBeam(BeamSource):
     frequencies_mhz : (frequencies,) array
     theta : (theta,) array
         From 0 to pi / 2 in equal steps; azimuths are 2 pi k / n_phi.
+    e_theta, e_phi : (frequencies, ..., theta, phi) complex array
+        Response to the theta and phi components of the incident field.
     interpolation : {"linear", "spline"}
         Between the frequencies: luseepy's rule, products of fields linearly and so impedances, or
         cubic splines through fields and impedances.
@@ -233,16 +232,18 @@ class LuseepyBeam(BeamSource):
 
     path: str
     frequencies_mhz: Float[np.ndarray, " frequencies"]
-    theta: Float[np.ndarray, " theta"]
+    theta: Angles
+    e_theta: Complex[np.ndarray, "frequencies *ports theta phi"]
+    e_phi: Complex[np.ndarray, "frequencies *ports theta phi"]
     interpolation: Interpolation = field(default="linear", kw_only=True)
     turntable_offset_deg: float = field(default=0.0, kw_only=True)
     luseepy_quadrature: bool = field(default=False, kw_only=True)
     moon_k: float = field(default=0.0, kw_only=True)
 
     @property
-    @abstractmethod
     def n_phi(self) -> int:
         """Number of azimuths."""
+        return self.e_theta.shape[-1]
 
     @property
     @abstractmethod
@@ -250,9 +251,7 @@ class LuseepyBeam(BeamSource):
         """The directions of the file with luseepy's rule."""
 
     @abstractmethod
-    def _linear(
-        self, frequency_mhz: float, lmax: int, grid: HemisphereGrid
-    ) -> Float[np.ndarray, "_ modes"]:
+    def _linear(self, frequency_mhz: float, lmax: int, grid: HemisphereGrid) -> np.ndarray:
         """Coefficients of the beams of all products by luseepy's rule."""
 
     @property
@@ -286,8 +285,8 @@ class PortResponse(LuseepyBeam):
 
     Attributes
     ----------
-    h_theta, h_phi : (frequencies, ports, theta, phi) complex array
-        Effective lengths in m.
+    e_theta, e_phi : (frequencies, ports, theta, phi) complex array
+        Effective lengths H_theta and H_phi in m.
     impedance_ohm : (frequencies, ports, ports) complex array
         ZA.
     moon_ohm, loss_ohm : (frequencies, ports, ports) complex array
@@ -300,8 +299,6 @@ class PortResponse(LuseepyBeam):
         Temperature of the lossy antennas in K.
     """
 
-    h_theta: Complex[np.ndarray, "frequencies ports theta phi"]
-    h_phi: Complex[np.ndarray, "frequencies ports theta phi"]
     impedance_ohm: Complex[np.ndarray, "frequencies ports ports"]
     moon_ohm: Complex[np.ndarray, "frequencies ports ports"]
     loss_ohm: Complex[np.ndarray, "frequencies ports ports"]
@@ -312,10 +309,6 @@ class PortResponse(LuseepyBeam):
     @property
     def n_ports(self) -> int:
         return N_ANTENNAS
-
-    @property
-    def n_phi(self) -> int:
-        return self.h_theta.shape[3]
 
     @property
     def luseepy_grid(self) -> BandLimitedGrid:
@@ -345,7 +338,7 @@ class PortResponse(LuseepyBeam):
         Between the frequencies of the file this is so with splines only. With linear interpolation
         the fields themselves are interpolated here, for pictures; use :meth:`beams` for products.
         """
-        opened = self._open(self._at(frequency_mhz, self.h_theta, self.h_phi), grid)
+        opened = self._open(self._at(frequency_mhz, self.e_theta, self.e_phi), grid)
         mixing = self._mixing(frequency_mhz) / (SPEED_OF_LIGHT / (1e6 * frequency_mhz))
         parts = (np.tensordot(mixing, part, axes=1) for part in (opened.e_theta, opened.e_phi))
         return AntennaFields(*parts, grid)
@@ -353,7 +346,7 @@ class PortResponse(LuseepyBeam):
     def _linear(self, frequency_mhz, lmax, grid):
         opened = np.zeros((N_ANTENNAS**2, (lmax + 1) ** 2))
         for k, weight in self._neighbours(frequency_mhz):
-            fields = self._open([self.h_theta[k], self.h_phi[k]], grid)
+            fields = self._open([self.e_theta[k], self.e_phi[k]], grid)
             wavelength = SPEED_OF_LIGHT / (1e6 * self.frequencies_mhz[k])
             opened += weight / wavelength**2 * product_modes(fields, lmax, normalise=False)
         mixing = self._mixing(frequency_mhz)
@@ -425,7 +418,8 @@ def read_response(path: str | Path) -> PortResponse:
     return PortResponse(str(path), frequencies, theta, h_theta, h_phi, impedance, moon, loss)
 
 
-FIELDS = ("Etheta_real", "Etheta_imag", "EPhi_real", "EPhi_imag")
+FIELD_NAMES = ("Etheta", "EPhi")
+FIELDS = parts_of(*FIELD_NAMES)
 IMPEDANCE = ("Z_real", "Z_imag")
 FIELD, OHM = Variable(("freq", "theta", "phi")), Variable(("freq",), optional=True, unit="Ohm")
 SCALAR_LAYOUT = Layout(
@@ -467,8 +461,6 @@ class ScalarBeam(LuseepyBeam):
         How far the pattern is turned for each port, from East towards North.
     """
 
-    e_theta: Complex[np.ndarray, "frequencies theta phi"]
-    e_phi: Complex[np.ndarray, "frequencies theta phi"]
     gain: Float[np.ndarray, " frequencies"]
     impedance_ohm: Complex[np.ndarray, " frequencies"] | None = None
     taper: bool = True
@@ -477,10 +469,6 @@ class ScalarBeam(LuseepyBeam):
     @property
     def n_ports(self) -> int:
         return len(self.rotations_deg)
-
-    @property
-    def n_phi(self) -> int:
-        return self.e_theta.shape[2]
 
     @property
     def luseepy_grid(self) -> HemisphereGrid:
@@ -570,8 +558,7 @@ def read_scalar_beam(path: str | Path) -> ScalarBeam:
         )
     # the last azimuth is the first once more
     e_theta, e_phi = (
-        (images[real] + 1j * images[imaginary])[:, :, :-1]
-        for real, imaginary in (FIELDS[:2], FIELDS[2:])
+        (images[f"{name}_real"] + 1j * images[f"{name}_imag"])[..., :-1] for name in FIELD_NAMES
     )
     theta = np.linspace(0.0, np.pi / 2.0, sizes["theta"])
     z = images["Z_real"] + 1j * images["Z_imag"] if set(IMPEDANCE) <= set(images) else None
