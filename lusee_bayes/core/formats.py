@@ -27,6 +27,7 @@ from lusee_bayes.core.layouts import Content, Layout, Unloaded
 from lusee_bayes.core.lazy import astropy_exceptions, fits
 from lusee_bayes.core.lazy import xarray as xr
 from lusee_bayes.core.reading import reading, require_file
+from lusee_bayes.core.version import __version__
 
 # a file is read whole up to this size; of a larger one, all metadata and the first value of each
 # array
@@ -134,6 +135,8 @@ def format_of(path: str | Path) -> str | None:
     return kind if isinstance(kind, str) else None
 
 
+# the conventions that files follow, as they write it
+CF = "CF-1.11"
 # what the CF conventions call times, and what bounds may leave to the variable that they bound
 CF_TIME = ("units", "calendar")
 
@@ -164,6 +167,36 @@ def read_netcdf(path: str | Path, format_: str, layout: Layout, hint: str = "") 
     """
     with _opened_netcdf(path, format_, layout, hint) as dataset:
         return _checked_netcdf(path, dataset, layout)
+
+
+def as_dataset(
+    format_: str, layout: Layout, arrays: Mapping[str, Any], values: Mapping[str, Any]
+) -> xr.Dataset:
+    """Lay out what :func:`read_netcdf` reads, on the dimensions and in the units of a layout.
+
+    Parameters
+    ----------
+    format_ : str
+        One of :mod:`.formats`.
+    layout : Layout
+    arrays : mapping of str to array or None
+        By their names in the layout; None is absent.
+    values : mapping of str to object
+        Attributes, likewise; ``variable.attribute`` is one of a variable.
+    """
+    variables = {}
+    for name, array in arrays.items():
+        declared = layout.variables[name]
+        units = {"units": declared.unit} if declared.unit else {}
+        if array is not None:
+            variables[name] = (tuple(map(str, declared.dims)), array, units)
+    attributes = {"format": format_, "Conventions": CF, "lusee_bayes_version": __version__}
+    dataset = xr.Dataset(variables, attrs=attributes)
+    for name, value in values.items():
+        variable, _, attribute = name.rpartition(".")
+        if value is not None:
+            (dataset[variable] if variable else dataset).attrs[attribute] = value
+    return dataset
 
 
 @contextmanager
@@ -318,8 +351,12 @@ def read_fits(path: str | Path, layout: Layout, hint: str = "") -> Content:
     with opened(path, layout.what, hint) as hdus:
         arrays: dict[str, Any] = {}
         words = hdus[0].header
-        said = {key: words[key] for key in words if key and not key.startswith(STRUCTURE)}
-        declared = {name.lower(): name for name in layout.variables}
+        declared = {name.lower(): name for name in (*layout.variables, *layout.attributes)}
+        said = {
+            declared.get(key.lower(), key): words[key]
+            for key in words
+            if key and not key.startswith(STRUCTURE)
+        }
 
         def put(name: str, array: Any, unit: str | None) -> None:
             name = declared.get(name.lower(), name.lower())

@@ -29,6 +29,7 @@ UNITS: Mapping[str, Mapping[str, float]] = {
     "deg": dict.fromkeys(("deg", "degree", "degrees"), 1.0),
     "m": {"m": 1.0},
     "d": {"d": 1.0},
+    "s": dict.fromkeys(("s", "second", "seconds"), 1.0),
 }
 # what software writes that was not given a word or a unit, in lower case
 UNSTATED = ("", "unknown", "unspecified", "none")

@@ -26,7 +26,7 @@ from lusee_bayes.experiment.model import model_to_sample, radiometer, simulate
 from lusee_bayes.experiment.rounds import Inference, rebuilds, settled, with_learned_prior
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import Setup, set_up
-from lusee_bayes.instrument.instrument import Instrument
+from lusee_bayes.instrument.coupling import Instrument
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.plausibility import require_plausible
 from lusee_bayes.linear.information import Information

@@ -41,13 +41,16 @@ def warm(response_file) -> lb.Experiment:
     return lb.build(four_ports(response_file, RECEIVER % "marginalised", GROUND % "marginalised"))
 
 
+def ground(response_file, moon_k: float) -> np.ndarray:
+    return np.asarray(replace(lb.read_beam(response_file), moon_k=moon_k).background(20.0))
+
+
 def columns(response_file, n_times: int) -> np.ndarray:
     """What one standard deviation of each of the five adds to the data, made by hand."""
     grid = np.zeros((16, n_times, 5))
     for port, product in enumerate(AUTOS):
         grid[product, :, port] = 200.0
-    response = lb.read_beam(response_file)
-    warmer = response.background(20.0, 280.0) - response.background(20.0, 250.0)
+    warmer = ground(response_file, 280.0) - ground(response_file, 250.0)
     grid[:, :, 4] = warmer[:, None]
     return grid.reshape(-1, 5)
 
@@ -58,7 +61,7 @@ def joint(warm: lb.Experiment, response_file):
     t = columns(response_file, setup.layout.n_times)
     a = np.concatenate([np.asarray(setup.coupling.dense()), t], axis=1)
     prior = np.append(np.sqrt(np.asarray(setup.prior.variance())), np.ones(5))
-    constant = np.asarray(lb.read_beam(response_file).background(20.0, 250.0)).copy()
+    constant = ground(response_file, 250.0).copy()
     constant[AUTOS] += 2000.0
     noise = np.sqrt(np.asarray(radiometer(setup).diagonal()))
     rest = data - np.repeat(constant, setup.layout.n_times)
@@ -103,10 +106,10 @@ def test_powers_in_volts_and_their_slope(response_file):
     per_kelvin = lb.read_beam(response_file).per_kelvin(20.0)
     keys = "slope: -2, reference_mhz: 5"
     volts = set_up(four_ports(response_file, f"noise.receiver={{power_v2_hz: 1e-17, {keys}}}"))
-    ground = lb.read_beam(response_file).background(20.0, 250.0)[AUTOS]
-    np.testing.assert_allclose(volts.background[AUTOS] - ground, 1e-17 / 16 / per_kelvin, rtol=1e-9)
+    moon = ground(response_file, 250.0)[AUTOS]
+    np.testing.assert_allclose(volts.background[AUTOS] - moon, 1e-17 / 16 / per_kelvin, rtol=1e-9)
     kelvin = set_up(four_ports(response_file, f"noise.receiver={{power_k: 160, {keys}}}"))
-    np.testing.assert_allclose(kelvin.background[AUTOS] - ground, 10.0, rtol=1e-9)
+    np.testing.assert_allclose(kelvin.background[AUTOS] - moon, 10.0, rtol=1e-9)
 
 
 def test_receivers_of_antennas_that_know_no_volts():
