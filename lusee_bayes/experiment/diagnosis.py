@@ -39,7 +39,7 @@ from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing, offset_kind, offset_names, with_offsets
-from lusee_bayes.instrument.products import all_products, auto_indices
+from lusee_bayes.instrument.products import all_products, auto_indices, ports
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.chi2 import ChiSquare, stands_out, two_sided
 from lusee_bayes.judge.measures import expected_chi2
@@ -109,21 +109,21 @@ def weights(mixing: Mixing, *, reversed_times: bool = False, b: float = -1.0) ->
     return np.concatenate([mixing.ravel(), np.zeros(len(mixing)), [float(reversed_times), b]])
 
 
-def port_mixing(ports: Sequence[int], signs: Sequence[float] | None = None) -> Mixing:
-    """What makes the products of ports 0, 1, ... of data that have them as ``ports``.
+def port_mixing(numbers: Sequence[int], signs: Sequence[float] | None = None) -> Mixing:
+    """What makes the products of ports 0, 1, ... of data that have them as ``numbers``.
 
     Parameters
     ----------
-    ports : sequence of int
+    numbers : sequence of int
         Of each port, under which number the data have it.
     signs : sequence of float, optional
         Of each port, the sign of its voltage.
     """
-    products, signs = all_products(len(ports)), signs or np.ones(len(ports))
+    products, signs = all_products(len(numbers)), signs or np.ones(len(numbers))
     place = {tuple(product): k for k, product in enumerate(products)}
     mixing = np.zeros((len(products), len(products)))
     for row, (a, b, part) in enumerate(products):
-        i, j = ports[a], ports[b]
+        i, j = numbers[a], numbers[b]
         conjugated = -1.0 if part == "I" and i > j else 1.0
         mixing[row, place[min(i, j), max(i, j), part]] = conjugated * signs[a] * signs[b]
     return mixing
@@ -131,31 +131,31 @@ def port_mixing(ports: Sequence[int], signs: Sequence[float] | None = None) -> M
 
 def data_mistakes(n_ports: int) -> Iterator[tuple[str, str, Mixing]]:
     """Conjugation, signs and exchanges: what is wrong, what to do, and what mixes the products."""
-    products, ports = all_products(n_ports), range(n_ports)
-    imaginary, crosses = np.array([(p.part == "I", p.i != p.j) for p in products]).T
+    products, numbers = all_products(n_ports), range(n_ports)
+    first, second, imaginary = ports(n_ports)
     wrong = "the data are conjugated: the imaginary parts have the other sign"
     remedy = "change their sign (from_arrays: convention='conj(s_i) s_j')"
     yield wrong, remedy, np.diag(np.where(imaginary, -1.0, 1.0))
     wrong = "all crosses have the other sign"
-    yield wrong, "change their sign", np.diag(np.where(crosses, -1.0, 1.0))
+    yield wrong, "change their sign", np.diag(np.where(first != second, -1.0, 1.0))
     for size in range(1, n_ports // 2 + 1):
-        for flipped in combinations(ports, size):
+        for flipped in combinations(numbers, size):
             if 2 * size == n_ports and 0 not in flipped:  # as if the others were flipped
                 continue
             named = " and ".join(map(str, flipped))
             wrong = f"the voltages of port {named} have the other sign"
             remedy = f"change the sign of all crosses of port {named} with others"
-            signs = [-1.0 if port in flipped else 1.0 for port in ports]
-            yield wrong, remedy, port_mixing(ports, signs)
-    for i, j in combinations(ports, 2):
+            signs = [-1.0 if port in flipped else 1.0 for port in numbers]
+            yield wrong, remedy, port_mixing(numbers, signs)
+    for i, j in combinations(numbers, 2):
         wrong, remedy = (
             f"ports {i} and {j} are exchanged",
             f"exchange ports {i} and {j} of the data",
         )
-        yield wrong, remedy, port_mixing([{i: j, j: i}.get(port, port) for port in ports])
+        yield wrong, remedy, port_mixing([{i: j, j: i}.get(port, port) for port in numbers])
     for turn in range(1, n_ports):
         wrong = f"the ports are turned by {turn}: the model's port 0 is the data's port {turn}"
-        turned = port_mixing([(port + turn) % n_ports for port in ports])
+        turned = port_mixing([(port + turn) % n_ports for port in numbers])
         yield wrong, "number the data's ports as the beams'", turned
     for i, j in combinations(range(len(products)), 2):
         order = np.arange(len(products))
@@ -327,18 +327,15 @@ class MixedProducts:
     def tried(self) -> Iterator[tuple[float, DataMistake]]:
         """Every mistake with its chi^2."""
         n_ports, n = self.here.setup.beam_source.n_ports, len(self.grid)
-        products = all_products(n_ports)
-        ends = np.array([(p.i, p.j) for p in products])
-        autos = ends[:, 0] == ends[:, 1]
+        first, second, _ = ports(n_ports)
+        autos = first == second
         known = [DataMistake(*one, weights(mixing)) for *one, mixing in data_mistakes(n_ports)]
         turned = weights(np.zeros((n, n)), reversed_times=True)
         known.append(DataMistake("the times are reversed", "sort the data by time", turned))
-        names = [f"product {product.label}" for product in products]
-        known += [self._factor(name, which) for name, which in zip(names, np.eye(n), strict=True)]
+        names = [f"product {product.label}" for product in all_products(n_ports)]
+        known += list(map(self._factor, names, np.eye(n)))
         known.append(self._factor("every auto", autos * 1.0))
-        known += [
-            self._gain(port, (ends == port).sum(1, dtype=np.float64)) for port in range(n_ports)
-        ]
+        known += [self._gain(k, 1.0 * (first == k) + (second == k)) for k in range(n_ports)]
         known.append(self._constant(np.flatnonzero(autos)))
         for mistake in known:
             yield self.chi2(mistake.w), mistake
