@@ -138,14 +138,15 @@ class ObservationSection(Section):
 
     def observation(self) -> Observation:
         """Site, times and turntable angles."""
-        return _observation(self, self._intervals())
+        return _observation(self, self._intervals)
 
     def n_samples(self) -> int:
         """Count the samples, those by day among them."""
         if self.schedule is None:
             return sum(int(run.cycles * CYCLE_DAYS * 86400.0 // self.step_s) for run in self.runs)
-        return sum(interval.n_samples(self.step_s) for interval in self._intervals())
+        return sum(interval.n_samples(self.step_s) for interval in self._intervals)
 
+    @property
     def _intervals(self) -> tuple[Interval, ...]:
         return () if self.schedule is None else read_schedule(self.schedule)
 
@@ -256,11 +257,9 @@ def _named(value: Any) -> Any:
     return {"model": value} if isinstance(value, str) else value
 
 
-ReceiverSection = Annotated[
-    JFETSection | CapacitorSection | ReceiverFileSection | OpenSection,
-    Field(discriminator="model"),
-    BeforeValidator(_named),
-]
+ReceiverSection = one_of(
+    kinds_of(JFETSection, CapacitorSection, ReceiverFileSection, OpenSection), _named
+)
 
 
 class MonopoleBeamSection(Section):
@@ -300,31 +299,49 @@ class MonopoleBeamSection(Section):
 
     def source(self) -> BeamSource:
         """The antennas."""
-        ground = ("surface_permittivity", "deep_permittivity", "loss_tangent")
-        regolith = Regolith(*(getattr(self, name) for name in ground))
-        return EmbeddedBeams(
-            Monopoles(regolith=regolith, **self.model_dump(exclude={"model", *ground}))
-        )
+        ground = {"surface_permittivity", "deep_permittivity", "loss_tangent"}
+        regolith = Regolith(**self.model_dump(include=ground))
+        arms = self.model_dump(exclude={"model", *ground})
+        return EmbeddedBeams(Monopoles(regolith=regolith, **arms))
 
 
 class _FileSection(Section):
-    """What the beams of luseepy's files have in common."""
+    """What the beams of files have in common.
+
+    Attributes
+    ----------
+    turntable_offset_deg : float
+        Added to every angle of the turntable, from East towards North.
+    """
 
     is_file: ClassVar[bool] = True
 
     file: str
     turntable_offset_deg: Angle = 0.0
-    quadrature: Literal["exact", "luseepy"] = "exact"
-    interpolation: Interpolation = "linear"
-    moon_temperature_k: Temperature = 0.0
 
     @property
     def label(self) -> str:
         """Which antennas, for the header of a file."""
         return Path(self.file).name
 
-    def turned(self) -> dict[str, Any]:
-        """What is said of every file, as its beams take it."""
+
+class _LuseepySection(_FileSection):
+    """What the beams of luseepy's files have in common.
+
+    Attributes
+    ----------
+    quadrature : {"exact", "luseepy"}
+        ``luseepy`` is luseepy's own rule, for data that luseepy has made.
+    moon_temperature_k : float
+        Temperature of the ground, which adds its own radiation.
+    """
+
+    quadrature: Literal["exact", "luseepy"] = "exact"
+    interpolation: Interpolation = "linear"
+    moon_temperature_k: Temperature = 0.0
+
+    def shared(self) -> dict[str, Any]:
+        """What is said of every file of luseepy, as its beams take it."""
         return {
             "turntable_offset_deg": self.turntable_offset_deg,
             "luseepy_quadrature": self.quadrature == "luseepy",
@@ -332,7 +349,7 @@ class _FileSection(Section):
         }
 
 
-class ScalarBeamSection(_FileSection):
+class ScalarBeamSection(_LuseepySection):
     """A scalar beam of luseepy: the pattern of one arm, used once for every port.
 
     Attributes
@@ -344,15 +361,9 @@ class ScalarBeamSection(_FileSection):
         added.
     taper : bool
         Fade out towards the horizon as luseepy does.
-    turntable_offset_deg : float
-        Added to every angle of the turntable, from East towards North.
-    quadrature : {"exact", "luseepy"}
-        ``luseepy`` is luseepy's own rule, for data that luseepy has made.
     interpolation : {"linear", "spline"}
         Between the file's frequencies: products of fields linearly as in luseepy, or fields by
         cubic splines.
-    moon_temperature_k : float
-        Temperature of the ground, which adds its own radiation.
     """
 
     model: Literal["luseepy"] = "luseepy"
@@ -370,11 +381,11 @@ class ScalarBeamSection(_FileSection):
             replace(read_scalar_beam(self.file), interpolation=self.interpolation),
             taper=self.taper,
             rotations_deg=self.rotations_deg,
-            **self.turned(),
+            **self.shared(),
         )
 
 
-class ResponseSection(_FileSection):
+class ResponseSection(_LuseepySection):
     """A four-port response of luseepy: coupled antennas with their receivers.
 
     Attributes
@@ -387,12 +398,6 @@ class ResponseSection(_FileSection):
     receiver : {"jfet", "capacitor", "file", "open"} or mapping, optional
         What is connected to the ports, with its parameters. If it is left out, that of the data
         where their file holds it, else luseepy's preamplifiers.
-    turntable_offset_deg : float
-        Added to every angle of the turntable, from East towards North.
-    quadrature : {"exact", "luseepy"}
-        ``luseepy`` is luseepy's own rule, for data that luseepy has made.
-    moon_temperature_k : float
-        Temperature of the ground, which adds its own radiation.
     antenna_temperature_k : float
         Temperature of the antennas' losses, which add their own radiation.
     """
@@ -411,34 +416,23 @@ class ResponseSection(_FileSection):
             response,
             receiver_said=self.receiver is not None,
             antenna_k=self.antenna_temperature_k,
-            **self.turned(),
+            **self.shared(),
         )
 
 
-class SampledBeamSection(Section):
+class SampledBeamSection(_FileSection):
     """Beams of one's own in directions: fields of antennas or beams of products, or a UVBeam.
 
     Attributes
     ----------
     file : str
         netCDF or FITS of :func:`lusee_bayes.sampled_beams`, or pyuvdata's beam FITS.
-    turntable_offset_deg : float
-        By how much the turntable is further round than it says, from East towards North.
     normalise : bool
         Scale the beams so that autos integrate to one on average; by default as the file says.
     """
 
-    is_file: ClassVar[bool] = True
-
     model: Literal["sampled"] = "sampled"
-    file: str
-    turntable_offset_deg: float = 0.0
     normalise: bool | None = None
-
-    @property
-    def label(self) -> str:
-        """Which antennas, for the header of a file."""
-        return Path(self.file).name
 
     @property
     def n_ports(self) -> int:
@@ -487,12 +481,7 @@ BeamSection = one_of(BEAM_SECTIONS, _one_kind)
 def section_of_file(file: str, like: Any) -> Any:
     """The section of another beam file, turned as the beams of ``like`` are."""
     kind = BEAM_SECTIONS[beam_kind(file)]
-    shared = {
-        name: value
-        for name, value in like.model_dump().items()
-        if name in kind.model_fields and name not in ("model", "file")
-    }
-    return kind(file=file, **shared)
+    return kind(file=file, **like.model_dump(include=set(kind.model_fields) - {"model", "file"}))
 
 
 Share = Annotated[float, Field(ge=0, le=0.5)]
