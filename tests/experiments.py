@@ -14,10 +14,14 @@ import numpy as np
 from numpyro.infer.util import log_density
 
 import lusee_bayes as lb
+from lusee_bayes.core.arrays import on_host
 from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.experiment.model import full_model, radiometer, simulate
+from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.setup import Setup
+from lusee_bayes.experiment.unknowns import Unknowns, UnknownsReport
 from lusee_bayes.instrument.products import DataLayout
+from lusee_bayes.linear.amplitudes import template_amplitudes
 from lusee_bayes.results.channel_map import Conditioned, conditioned
 from lusee_bayes.results.map_files import SavedInformation
 from lusee_bayes.sampling.programs import WHITE_SUFFIX, Program, latent_sites, numpyro_promotion
@@ -55,6 +59,21 @@ def mapped(
     """What a map run finds of one frequency, without its folder."""
     made = conditioned(experiment, earlier)
     return made, made.result(made.known(thorough=thorough))
+
+
+def unknowns_report(experiment: lb.Experiment, found: Inference) -> UnknownsReport | None:
+    """What data alone tell of receivers, ground and gain table."""
+    posterior = on_host(found.posterior)
+    unknowns = Unknowns.of(experiment, found, posterior.mean)
+    return None if unknowns is None else unknowns.report(posterior.mean, posterior.covariance())
+
+
+def offset_posterior(found: Inference) -> tuple[dict[str, float], np.ndarray]:
+    """Mean of every offset of clock and pointing by name, and their covariance in these units."""
+    offsets, data = found.offsets, found.around.data.data
+    told = template_amplitudes(found.model, found.posterior, data, offsets.columns)
+    stds = offsets.systematic.stds
+    return offsets.systematic.in_units(told.mean), told.covariance * np.outer(stds, stds)
 
 
 def of_run(data: lb.Visibilities, run: int) -> lb.Visibilities:

@@ -27,7 +27,7 @@ from lusee_bayes.experiment.sky_sections import (
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.measures import data_freedom
-from lusee_bayes.linear.amplitudes import template_amplitudes, weighted_residual
+from lusee_bayes.linear.amplitudes import weighted_residual
 from lusee_bayes.linear.information import Information, integrated_out
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
@@ -216,29 +216,6 @@ def _start(setup: Setup, data: Visibilities) -> Around:
     freedom = data_freedom(model, posterior, np.concatenate(columns, axis=1))
     sky = np.asarray(posterior.mean) if setup.measured else None
     return Around(data, sky=sky, freedom=freedom)
-
-
-def offset_posterior(
-    found: Inference,
-) -> tuple[dict[str, float], Float[np.ndarray, "offsets offsets"]]:
-    """Mean of every offset of clock and pointing by name, and their covariance.
-
-    Parameters
-    ----------
-    found : Inference
-        Of its data alone, with offsets.
-
-    Returns
-    -------
-    mean : dict of float
-        In the units that the names end with.
-    covariance : (offsets, offsets) array
-        In these units.
-    """
-    offsets, data = found.offsets, found.around.data.data
-    told = template_amplitudes(found.model, found.posterior, data, offsets.columns)
-    stds = offsets.systematic.stds
-    return offsets.systematic.in_units(told.mean), told.covariance * np.outer(stds, stds)
 
 
 def rebuilds(setup: Setup) -> bool:

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from assertions import refuse
+from experiments import unknowns_report
 from naive_flight import naive_band
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.flight_data import per_kelvin_of, reduce_files
 from lusee_bayes.experiment.flight_simulation import simulate_flight
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.experiment.unknowns import unknowns_report
 from lusee_bayes.flight.gain_model import synthetic_gains
 from lusee_bayes.flight.reduced import BURST, COMB, NO_DATA, SATURATED, USED
 from lusee_bayes.flight.session import CHANNEL_MHZ

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from assertions import refused, within
-from experiments import density, four_ports, parts, program_arguments
+from experiments import density, four_ports, offset_posterior, parts, program_arguments
 from reference_linear import white_posterior
 from scipy.optimize import least_squares
 from scipy.stats import norm
@@ -22,7 +22,7 @@ from lusee_bayes.experiment.model import (
     true_signal,
     true_values,
 )
-from lusee_bayes.experiment.rounds import Inference, offset_posterior
+from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.instrument.products import all_products, labels
 from lusee_bayes.instrument.visibilities import Calibration
