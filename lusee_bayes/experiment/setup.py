@@ -152,23 +152,9 @@ def set_up(
         antennas = Monopoles() if scenario.beam.is_file else source.monopoles
         instrument = Instrument(antennas, pointing, layout, scenario.frequency_mhz, scenario.lmax)
         coupling = replace(complete, layout=layout)
-    return Setup(
-        scenario,
-        observation,
-        sky,
-        source,
-        instrument,
-        beams,
-        coupling,
-        prior,
-        responses,
-        background,
-        signal,
-        receiver,
-        None if data is None else data.calibration,
-        data is not None,
-        family,
-    )
+    pieces = observation, sky, source, instrument, beams, coupling, prior, responses, background
+    of_data = None if data is None else data.calibration, data is not None
+    return Setup(scenario, *pieces, signal, receiver, *of_data, family)
 
 
 def prior_and_family(scenario: Scenario, sky: Sky) -> tuple[Prior, PriorFamily | None]:

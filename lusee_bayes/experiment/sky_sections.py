@@ -12,6 +12,8 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.section import (
     Megahertz,
     Positive,
@@ -27,11 +29,11 @@ from lusee_bayes.priors.local_scales import embedded_local_scales
 from lusee_bayes.sampling.log_normal_prior import LogNormalPrior
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
 from lusee_bayes.sky.log_normal import LogNormalSky, deviation_spectrum
-from lusee_bayes.sky.positive_skies import FIELDS, FIELDS_OF
+from lusee_bayes.sky.positive_skies import FIELDS, FIELDS_OF, PositiveSkies
 from lusee_bayes.sky.prior import HarmonicPrior, Prior, read_mean, read_spectrum
 from lusee_bayes.sky.sky_source import FileSource, GalaxySource, Sky, SkySource
 from lusee_bayes.sky.spectral_prior import SpectralPrior, check_components, require_names
-from lusee_bayes.sky.template import EmbeddedTemplate
+from lusee_bayes.sky.template import EmbeddedTemplate, galactic_share
 from lusee_bayes.systematics.prior_spectrum import SpectrumSection
 
 
@@ -286,6 +288,12 @@ class LogNormalSection(Section):
         return LogNormalPrior.of(sky, amplitude, tilt, widths)
 
 
+# highest ell of fields of the logarithm, over that of the map
+FINER = 1.5
+# most fields' modes: every round factorises their matrix
+MOST_UNKNOWNS = 10_000
+
+
 class SpectralSection(Section):
     """The prior on skies of several frequencies that are mapped together.
 
@@ -339,6 +347,54 @@ class SpectralSection(Section):
             check_components(self.components, n, self.residual)
         if self.model == "positive":
             require_names("field", FIELDS_OF, self.fields, FIELDS, n)
+
+    def lmax_of_fields(self, lmax: int) -> int:
+        """Choose the highest ell of the fields: 1.5 times that of the map, if they can be solved.
+
+        Structure that a map does not resolve still changes it where the sky is steep.
+
+        Parameters
+        ----------
+        lmax : int
+            Of the map.
+
+        Raises
+        ------
+        InputError
+            If fields of the map's own lmax are too many unknowns.
+        """
+        highest = int(np.sqrt(MOST_UNKNOWNS / len(self.fields))) - 1
+        if highest < lmax:
+            raise InputError(
+                f"positive joint skies of lmax {lmax} have {len(self.fields) * n_modes(lmax)} "
+                f"unknowns, more than the {MOST_UNKNOWNS} of one solution; use lmax={highest}, "
+                "fewer spectral.fields, or spectral.model=components"
+            )
+        return min(round(FINER * lmax), highest)
+
+    def positive_skies(self, frequencies_mhz: tuple[float, ...], lmax: int) -> PositiveSkies:
+        """The skies of channels up to an ell as functions of the fields.
+
+        Raises
+        ------
+        InputError
+            As :meth:`lmax_of_fields`.
+        """
+        sources = None
+        if self.sources:
+            sources = np.array(
+                [[s.modes(f, lmax) for s in BRIGHT_SOURCES] for f in frequencies_mhz]
+            )
+        return PositiveSkies.of(
+            np.array(frequencies_mhz),
+            [EmbeddedTemplate(f) for f in frequencies_mhz],
+            lmax,
+            self.fields,
+            **self.model_dump(include={"reference_mhz", "turnover_mhz"}),
+            sources=sources,
+            weight=galactic_share,
+            lmax_fields=self.lmax_of_fields(lmax),
+        )
 
     def n_maps(self, frequencies_mhz: tuple[float, ...]) -> int:
         """How many maps the skies of these channels are made of."""
