@@ -126,51 +126,24 @@ class GainDrifts(Systematic):
     log_correlation_std: Float[Array, ""] | None = eqx.field(default=None, converter=scalar_or_none)
 
     @classmethod
-    def of(
-        cls,
-        drift: GainDrift,
-        visibilities: Float[Array, "products times"],
-        hours: Float[np.ndarray, " times"],
-        layout: DataLayout,
-        log_sigma_std: float | None = None,
-        log_correlation_std: float | None = None,
-    ) -> GainDrifts:
-        """Work out the grid and the bands that these drifts need.
-
-        Parameters
-        ----------
-        drift : GainDrift
-            Standard deviation and correlation time (medians, where uncertain).
-        visibilities : (products, times) array
-            Visibilities that the covariance is built around, in K.
-        hours : (times,) array
-            Sample times in hours, growing.
-        layout : DataLayout
-            The data.
-        log_sigma_std, log_correlation_std : float, optional
-            Prior standard deviations of the natural logarithms of the two; None where known.
-        """
-        middle, factor = float(drift.correlation_h), 1.0
-        if log_correlation_std is not None:
-            factor = float(np.exp(CORRELATION_REACH * log_correlation_std))
-        longest = GainDrift(drift.sigma, middle * max(factor, FACTOR))
-        grid = white_grid(
-            hours, middle / factor, middle * factor, per_correlation=PER_CORRELATION, margin=MARGIN
-        )
-        widths = drift.width(hours), longest.width(hours)
-        stds = log_sigma_std, log_correlation_std
-        hours, grid = jnp.asarray(hours), jnp.asarray(grid)
-        return cls(drift, visibilities, hours, grid, layout, *widths, *stds)
-
-    @classmethod
     def build(cls, section: GainSection, context: Context, around: Around) -> GainDrifts:
-        return cls.of(
-            GainDrift(section.sigma, section.correlation_h),
+        """Work out the grid and the bands that these drifts need."""
+        middle, log_std = section.correlation_h, section.log_correlation_std
+        factor = 1.0 if log_std is None else float(np.exp(CORRELATION_REACH * log_std))
+        drift = GainDrift(section.sigma, middle)
+        longest = GainDrift(section.sigma, middle * max(factor, FACTOR))
+        hours, ends = context.observation.hours, (middle / factor, middle * factor)
+        grid = white_grid(hours, *ends, per_correlation=PER_CORRELATION, margin=MARGIN)
+        return cls(
+            drift,
             noise_visibilities(context, around, gains_about(context)),
-            context.observation.hours,
+            jnp.asarray(hours),
+            jnp.asarray(grid),
             context.layout,
+            drift.width(hours),
+            longest.width(hours),
             section.log_sigma_std,
-            section.log_correlation_std,
+            log_std,
         )
 
     @classmethod

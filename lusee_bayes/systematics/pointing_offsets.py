@@ -240,9 +240,8 @@ class PointingOffsets(Systematic):
         K_k of turns about its axes. What JAX differentiates, w(z), compiles in no time.
         """
         pointing = self.turned(self.values(centre))
-        parts = _orientation_and_slopes(*on_device((self, centre)))
-        orientation, slopes = np.asarray(parts[0]), np.asarray(parts[1])
-        turn = np.einsum("tji,tjkn->tikn", orientation, slopes)
+        orientation, slopes, of_sources = _slopes(*on_device((self, centre)))
+        turn = np.einsum("tji,tjkn->tikn", np.asarray(orientation), np.asarray(slopes))
         columns = 0.0
         for axis in range(3):
             blocks = (generators(ell)[axis] for ell in range(lmax_of(self.modes.shape[1]) + 1))
@@ -250,11 +249,7 @@ class PointingOffsets(Systematic):
             seen = CouplingMatrix.of_modes(beams, pointing, self.layout) @ np.asarray(sky)
             w = turn[:, (axis + 2) % 3, (axis + 1) % 3]
             columns = columns + seen[:, None] * w[np.asarray(self.layout.time)]
-        return (
-            columns
-            if self.sources is None
-            else columns + _source_slopes(*on_device((self, centre)))
-        )
+        return columns if self.sources is None else columns + np.asarray(of_sources)
 
     def orientation(self, values: Values) -> Float[Array, "times 3 3"]:
         """The rotation from the antennas' frame to the Moon-fixed one at every sample.
@@ -271,19 +266,15 @@ class PointingOffsets(Systematic):
 
 
 @eqx.filter_jit
-def _orientation_and_slopes(offsets: PointingOffsets, centre: Array) -> tuple[Array, Array]:
-    def orientation(z: Array) -> Array:
-        return offsets.orientation(offsets.values(z))
+def _slopes(offsets: PointingOffsets, centre: Array) -> tuple[Array, Array, Array | None]:
+    """The orientation, its derivative by the offsets, and that of what sources add."""
 
-    return orientation(centre), jax.jacfwd(orientation)(centre)
+    def seen(z: Array) -> tuple[Array, Array | None]:
+        orientation = offsets.orientation(offsets.values(z))
+        sources = offsets.sources
+        return orientation, None if sources is None else sources.seen(orientation, offsets.layout)
 
-
-@eqx.filter_jit
-def _source_slopes(offsets: PointingOffsets, centre: Array) -> Array:
-    def seen(z: Array) -> Array:
-        return offsets.sources.seen(offsets.orientation(offsets.values(z)), offsets.layout)
-
-    return jax.jacfwd(seen)(centre)
+    return seen(centre)[0], *jax.jacfwd(seen)(centre)
 
 
 def _about(axis: int, angle: float | Array) -> Float[Array, "*batch 3 3"]:

@@ -580,6 +580,42 @@ class AdditiveNoise(Systematic):
         return replace(model, noise=model.noise + self.covariance())
 
 
+class Temperatures(Systematic):
+    """Temperatures of what adds to the data, whatever the sky; independent Gaussian priors.
+
+    Their means are part of the background.
+
+    Attributes
+    ----------
+    sites : tuple of str
+        Their names, which end with ``_k``.
+    expectation, errors : (n,) array
+        Means and standard deviations of the priors, in K.
+    per_kelvin : (data, n) array
+        What each kelvin adds to the data.
+    """
+
+    unit: ClassVar[str] = "K"
+    changes_coupling: ClassVar[bool] = False
+
+    sites: tuple[str, ...] = eqx.field(static=True)
+    expectation: Float[Array, " n"]
+    errors: Float[Array, " n"]
+    per_kelvin: Float[Array, "data n"]
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        return tuple(map(Unknown, self.sites, self.expectation, self.errors))
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return tuple(name.removesuffix("_k").replace("_", " ") for name in self.sites)
+
+    def effect(self, model, values):
+        """Add what they differ from their means by."""
+        return with_added(model, self.per_kelvin @ (self.stacked(values) - self.expectation))
+
+
 class Scale(Systematic):
     """A systematic without a Gaussian term: marginalised, it stays at its median."""
 
