@@ -54,20 +54,21 @@ def items_of(data: object) -> tuple[Visibilities, ...] | tuple[Path, ...]:
     InputError
         For nothing, for anything else, and for sets and files together.
     """
-    given = (data,) if isinstance(data, Visibilities | str | Path) else data
-    wrong = [given] if not isinstance(given, Sequence) else []
-    wrong = wrong or [one for one in given if not isinstance(one, Visibilities | str | Path)]
+    one = Visibilities | str | Path
+    given = (data,) if isinstance(data, one) else data
+    items = given if isinstance(given, Sequence) else (given,)
+    wrong = [item for item in items if not isinstance(item, one)]
     if wrong:
         raise InputError(
             f"data are Visibilities, paths of files, or several of one of them, not a "
             f"{type(wrong[0]).__name__}; Visibilities.from_arrays makes some of arrays"
         )
-    sets = tuple(one for one in given if isinstance(one, Visibilities))
-    if not given or len(sets) not in (0, len(given)):
-        raise InputError(
-            "no data are given" if not given else "data are in memory or in files, not in both"
-        )
-    return sets or tuple(user_path(path) for path in given)
+    sets = tuple(item for item in items if isinstance(item, Visibilities))
+    if not items:
+        raise InputError("no data are given")
+    if len(sets) not in (0, len(items)):
+        raise InputError("data are in memory or in files, not in both")
+    return sets or tuple(user_path(path) for path in items)
 
 
 def files_of(data: Data) -> tuple[Path, ...]:
@@ -155,37 +156,34 @@ def read_data(data: Data, scenario: Scenario) -> Visibilities:
     reduced = reduced_of(data, scenario)
     if reduced is not None:
         return visibilities_of(reduced, scenario)
-    timestamp, average_s = scenario.observation.timestamp, scenario.observation.average_s
-    files = files_of(data)
+    files, timestamp = files_of(data), scenario.observation.timestamp
     path = files[0] if files else "the data"
-    if files:
-        _require_data(path)
     if not files:
         data = _stamped(path, _nearest(items_of(data), scenario.frequency_mhz), timestamp)
-    elif is_fits(path):
+    elif not _is_waterfall(path):
+        data = _stamped(path, read_visibilities(path), timestamp)
+    else:
         data = _channel(path, scenario)
         # samples of luseepy's simulators are instants; its layout cannot say that others are not
         if timestamp is not None:
             with naming(path):
                 data = data.stamped(timestamp)
-    else:
-        data = _stamped(path, read_visibilities(path), timestamp)
-    if average_s is None:
+    if scenario.observation.average_s is None:
         return data
     with naming(path):
-        return averaged(data, average_s)
+        return averaged(data, scenario.observation.average_s)
 
 
-def _require_data(path: Path) -> None:
-    """InputError for files that hold nothing to be mapped, with all that do."""
-    kind = format_of(path)
-    if is_fits(path):
+def _is_waterfall(path: Path) -> bool:
+    """Whether a file holds a waterfall of luseepy, not our visibilities. InputError if neither."""
+    kind, is_waterfall = format_of(path), is_fits(path)
+    known = kind == formats.VISIBILITIES
+    if is_waterfall:
         known = bool(WATERFALL_IMAGES & set(image_names(path)))
-    else:
-        known = kind == formats.VISIBILITIES
     if not known:
         said = f" (its format is '{kind}')" if kind else ""
         raise InputError(f"{path} holds nothing that can be mapped{said}; give {ACCEPTED}")
+    return is_waterfall
 
 
 def _nearest(sets: Sequence[Visibilities], frequency_mhz: float) -> Visibilities:
@@ -240,11 +238,10 @@ def _require_same_instrument(waterfall: Waterfall, scenario: Scenario) -> None:
     rule, said = source.interpolated(frequency), waterfall.interpolation
     if rule is not None and said is not None and said != INTERPOLATIONS[rule]:
         known = [name for name, word in INTERPOLATIONS.items() if word == said]
-        what_to_do = (
-            f"use --set beam.interpolation={known[0]}"
-            if known
-            else f"expected one of {', '.join(INTERPOLATIONS.values())}, or a response that has it"
-        )
+        words = ", ".join(INTERPOLATIONS.values())
+        what_to_do = f"expected one of {words}, or a response that has it"
+        if known:
+            what_to_do = f"use --set beam.interpolation={known[0]}"
         raise InputError(
             f"{section.file} does not have the frequency {frequency:.15g} MHz; {waterfall.path} "
             f"has it by FREQINT = '{said}', the scenario by beam.interpolation={rule}; {what_to_do}"
@@ -253,27 +250,23 @@ def _require_same_instrument(waterfall: Waterfall, scenario: Scenario) -> None:
     ours = circuit.per_kelvin.diagonal().real
     port = int(np.argmax(np.abs(theirs / ours - 1.0)))
     if abs(theirs[port] / ours[port] - 1.0) > SAME_SCALE:
-        own_loads = waterfall.receiver is not None
+        if waterfall.receiver is None:
+            what_to_do = "give the response and the beam.receiver that the data were taken with"
+        elif section.receiver is not None:
+            what_to_do = "leave out beam.receiver, so that the loads ZL in the data are used"
+        else:
+            what_to_do = "give the response that the data, which have the loads ZL, were taken with"
         raise InputError(
             f"in {waterfall.path} 1 K is {theirs[port]:.6g} V^2/Hz at port {port}, with "
-            f"{section.file} it is {ours[port]:.6g}; "
-            + _what_differs(own_loads, section.receiver is not None)
+            f"{section.file} it is {ours[port]:.6g}; {what_to_do}"
         )
-    for name, theirs_k, ours_k in (
-        ("moon_temperature_k", waterfall.moon_k, section.moon_temperature_k),
-        ("antenna_temperature_k", waterfall.antenna_k, section.antenna_temperature_k),
+    for name, theirs_k in (
+        ("moon_temperature_k", waterfall.moon_k),
+        ("antenna_temperature_k", waterfall.antenna_k),
     ):
+        ours_k = getattr(section, name)
         if not np.isclose(theirs_k, ours_k, rtol=SAME_TEMPERATURE, atol=0.0):
             raise InputError(
                 f"{waterfall.path} holds the emission of {theirs_k:.15g} K, the scenario's {name} "
                 f"is {ours_k:.15g}; use --set beam.{name}={theirs_k:.15g}"
             )
-
-
-def _what_differs(own_loads: bool, said: bool) -> str:
-    """What may be wrong, and what to do: the data may hold the loads, the scenario may say them."""
-    if not own_loads:
-        return "give the response and the beam.receiver that the data were taken with"
-    if said:
-        return "leave out beam.receiver, so that the loads ZL in the data are used"
-    return "both are with the loads ZL in the data: give the response that they were taken with"

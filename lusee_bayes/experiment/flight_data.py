@@ -93,23 +93,20 @@ def recipe_of(scenario: Scenario) -> Recipe:
             "the integrations; use --set observation.timestamp=middle (or start, end, instant)"
         )
     here = scenario.observation
+    as_given = {"degree", "turntable_deg", "comb", "false_alarm", "gain_std"}
     return Recipe(
         gain_table_of(section),
         section.bin_origin,
         timestamp,
         scenario.frequencies_mhz or (scenario.frequency_mhz,),
         section.bandwidth_hz / 1e6,
-        section.degree,
-        here.average_s,
-        shared_noise(section.filter_taps, section.filter_window),
-        int(CONVENTIONS[section.convention]),
-        section.turntable_deg,
-        NO_LINES if section.lines is None else read_lines(section.lines),
-        section.comb,
-        section.false_alarm,
-        section.gain_std,
-        None if section.clock is None else read_clock(section.clock),
-        (here.lon_deg, here.lat_deg) if section.site == "scenario" else None,
+        average_s=here.average_s,
+        shared_noise=shared_noise(section.filter_taps, section.filter_window),
+        sign=int(CONVENTIONS[section.convention]),
+        lines=NO_LINES if section.lines is None else read_lines(section.lines),
+        clock=None if section.clock is None else read_clock(section.clock),
+        site=(here.lon_deg, here.lat_deg) if section.site == "scenario" else None,
+        **section.model_dump(include=as_given),
     )
 
 
