@@ -148,8 +148,7 @@ def settled(
             return found
     moves = float(found.posterior.rms_shift_from(before.posterior))
     remedies = [cls.remedy for cls in first_order(setup)]
-    if rebuilds_gains(setup):
-        remedies.append("noise.gain.visibilities=model")
+    remedies += ["noise.gain.visibilities=model"] * rebuilds_gains(setup)
     unsettled = (
         f"The map still moves by {moves:.2g} of its standard deviations after {MAX_ROUNDS} rounds "
         "of rebuilding N around it"
@@ -256,9 +255,9 @@ def prediction(setup: Setup, found: Inference, solved: DataVector) -> Grid:
     complete = CouplingMatrix.build(setup.beams, setup.pointing)
     difference_of_skies = found.posterior.mean - setup.sky.modes
     besides = np.zeros(len(solved))
-    for expanded in found.expanded:
-        if not expanded.systematic.changes_coupling:
-            besides = besides + expanded.columns @ (expanded.columns.T @ solved)
+    for part in found.expanded:
+        if not part.changes_coupling:
+            besides = besides + part.columns @ (part.columns.T @ solved)
     grid = complete.layout.scatter(complete @ difference_of_skies)
     return setup.signal + grid + setup.layout.scatter(besides)
 
@@ -304,10 +303,9 @@ def with_learned_prior(
         return replace(setup, prior=learned.prior), learned, None, information
     learned, before, found = None, None, settled(setup, data)
     for _ in range(MAX_PRIOR_ROUNDS):
-        own = full_model(setup, found.around).inform(data.data)[0]
-        information = _with_more(own, earlier)
+        information = full_model(setup, found.around).inform(data.data)[0]
         start = None if learned is None or not learned.settled else learned.parameters
-        learned = learned_prior(setup, setup.family, information, start)
+        learned = learned_prior(setup, setup.family, _with_more(information, earlier), start)
         setup = replace(setup, prior=learned.prior)
         before, found = found, settled(setup, data, found.around)
         moved = float(found.posterior.rms_shift_from(before.posterior))
@@ -395,11 +393,9 @@ def named_priors(
     for name in names:
         if name not in NAMED:
             raise InputError(f"--priors: no prior '{name}'; {nearest(name, NAMED)}")
-    if len(set(names)) < len(names):
-        raise InputError(f"--priors {','.join(names)}: give each prior once")
-    if len(names) < 2:
+    if len(names) < 2 or len(set(names)) < len(names):
         raise InputError(
-            f"--priors: {len(names)} given, and a comparison needs two or more of "
+            f"--priors {','.join(names)}: a comparison needs two or more different ones of "
             f"{', '.join(NAMED)}"
         )
     if OF_TRUE_SKY in names and not known_sky:
