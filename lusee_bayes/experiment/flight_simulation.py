@@ -18,7 +18,7 @@ from lusee_bayes.core.arrays import Grid
 from lusee_bayes.core.engine import in_threads, processors
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment.flight_data import gain_table_of, per_kelvin_of
+from lusee_bayes.experiment.data_files import gain_table_of, per_kelvin_of
 from lusee_bayes.experiment.instrument_sections import FlightSection, FlightSimulatedSection
 from lusee_bayes.experiment.model import true_signal, true_values
 from lusee_bayes.experiment.scenario import Scenario

@@ -17,9 +17,8 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import require_new, transaction, user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming
-from lusee_bayes.experiment.data_files import Data, names_of_data, read_data
+from lusee_bayes.experiment.data_files import Data, names_of_data, read_data, reduce_files
 from lusee_bayes.experiment.experiment import Experiment, observed
-from lusee_bayes.experiment.flight_data import reduce_files
 from lusee_bayes.experiment.flight_simulation import FlightSimulation, flight_of, simulate_flight
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.setup import require_fitting, set_up

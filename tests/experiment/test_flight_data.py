@@ -11,7 +11,7 @@ from experiments import unknowns_report
 from naive_flight import naive_band
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.flight_data import per_kelvin_of, reduce_files
+from lusee_bayes.experiment.data_files import per_kelvin_of, reduce_files
 from lusee_bayes.experiment.flight_simulation import simulate_flight
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.flight.gain_model import synthetic_gains
