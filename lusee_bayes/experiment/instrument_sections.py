@@ -262,7 +262,18 @@ ReceiverSection = one_of(
 )
 
 
-class MonopoleBeamSection(Section):
+class _BeamSection(Section):
+    """What all beams have in common."""
+
+    def of_file(self, file: str) -> Any:
+        """The section of beams of a file that are turned as these are."""
+        kind = BEAM_SECTIONS[beam_kind(file)]
+        return kind(
+            file=file, **self.model_dump(include=set(kind.model_fields) - {"model", "file"})
+        )
+
+
+class MonopoleBeamSection(_BeamSection):
     """The embedded antennas: four monopoles over layered regolith.
 
     Attributes
@@ -305,7 +316,7 @@ class MonopoleBeamSection(Section):
         return EmbeddedBeams(Monopoles(regolith=regolith, **arms))
 
 
-class _FileSection(Section):
+class _FileSection(_BeamSection):
     """What the beams of files have in common.
 
     Attributes
@@ -476,12 +487,6 @@ def _one_kind(value: Any) -> Any:
 
 
 BeamSection = one_of(BEAM_SECTIONS, _one_kind)
-
-
-def section_of_file(file: str, like: Any) -> Any:
-    """The section of another beam file, turned as the beams of ``like`` are."""
-    kind = BEAM_SECTIONS[beam_kind(file)]
-    return kind(file=file, **like.model_dump(include=set(kind.model_fields) - {"model", "file"}))
 
 
 Share = Annotated[float, Field(ge=0, le=0.5)]

@@ -17,7 +17,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.section import Megahertz, Positive, Section, Seed, Treatment, requires
 from lusee_bayes.instrument.beams.source import BeamSource
 from lusee_bayes.instrument.products import auto_indices
-from lusee_bayes.systematics.context import Around, Context
+from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.systematic import Temperatures, Truth
 
 # cosines and sines of which a smooth spectrum is made
@@ -93,19 +93,19 @@ class Receivers(Temperatures):
     draw: ClassVar[int] = 8
 
     @classmethod
-    def build(cls, section: ReceiverNoiseSection, context: Context, around: Around) -> Receivers:
-        powers = section.powers(context.beam_source, context.frequency_mhz)
-        own = np.asarray(context.layout.product)[:, None] == auto_indices(len(powers))[None]
+    def build(cls, section: ReceiverNoiseSection, setup: Setup, around: Around) -> Receivers:
+        powers = section.powers(setup.beam_source, setup.frequency_mhz)
+        own = np.asarray(setup.layout.product)[:, None] == auto_indices(len(powers))[None]
         sites = tuple(f"receiver_{port}_k" for port in range(len(powers)))
         return cls(sites, powers, section.relative_std * powers, own.astype(np.float64))
 
     @classmethod
-    def truth(cls, section: ReceiverNoiseSection, context: Context, key: PRNGKeyArray) -> Truth:
+    def truth(cls, section: ReceiverNoiseSection, setup: Setup, key: PRNGKeyArray) -> Truth:
         if section.smooth_octaves is None:
-            return super().truth(section, context, key)
+            return super().truth(section, setup, key)
         shared = key if section.smooth_seed is None else jax.random.key(section.smooth_seed)
-        octave = float(np.log2(context.frequency_mhz))
-        receivers = cls.build(section, context, Around())
+        octave = float(np.log2(setup.frequency_mhz))
+        receivers = cls.build(section, setup, Around())
         own, n = jax.random.fold_in(shared, cls.draw), len(receivers.unknowns)
         return receivers.values(_smooth_spectra(own, n, octave / section.smooth_octaves))
 

@@ -12,7 +12,7 @@ from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.section import Positive, Section, Treatment
 from lusee_bayes.instrument.beams.source import BeamSource
-from lusee_bayes.systematics.context import Around, Context
+from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.systematic import Temperatures
 
 
@@ -41,10 +41,10 @@ class RegolithTemperature(Temperatures):
     draw: ClassVar[int] = 9
 
     @classmethod
-    def build(cls, section: RegolithSection, context: Context, around: Around):
-        added = ground_per_kelvin(context.beam_source, context.beams.frequency_mhz)
-        seen = added[np.asarray(context.layout.product)]
-        mean = np.array([context.scenario.beam.moon_temperature_k])
+    def build(cls, section: RegolithSection, setup: Setup, around: Around):
+        added = ground_per_kelvin(setup.beam_source, setup.beams.frequency_mhz)
+        seen = added[np.asarray(setup.layout.product)]
+        mean = np.array([setup.scenario.beam.moon_temperature_k])
         return cls(("regolith_k",), mean, np.array([section.std_k]), seen[:, None])
 
 

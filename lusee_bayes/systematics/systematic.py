@@ -44,7 +44,7 @@ from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import Covariance, DiagonalCovariance, LowRankCovariance
 from lusee_bayes.sky.prior import IndependentPrior
-from lusee_bayes.systematics.context import Around, Context
+from lusee_bayes.systematics.context import Around, Setup
 
 # where programs sample the sky
 SKY = "sky"
@@ -207,14 +207,14 @@ class Systematic(eqx.Module):
         return None if section is None else section.treatment
 
     @classmethod
-    def build(cls, section: Any, context: Context, around: Around) -> Systematic:
+    def build(cls, section: Any, setup: Setup, around: Around) -> Systematic:
         """Build it from a scenario's section.
 
         Parameters
         ----------
         section : Section
             Of the type :attr:`section`.
-        context : Context
+        setup : Setup
             Where :attr:`Around.values` move others, with these.
         around : Around
             What it may be built around.
@@ -222,9 +222,9 @@ class Systematic(eqx.Module):
         raise NotImplementedError(f"{cls.__name__} has no scenario's section")
 
     @classmethod
-    def moved(cls, section: Any, context: Context, values: Values) -> Context:
-        """The context with an instrument that has these values; by default no other."""
-        return context
+    def moved(cls, section: Any, setup: Setup, values: Values) -> Setup:
+        """The setup with an instrument that has these values; by default no other."""
+        return setup
 
     @classmethod
     def in_rounds(cls, section: Any) -> bool:
@@ -232,17 +232,17 @@ class Systematic(eqx.Module):
         return cls.moves
 
     @classmethod
-    def truth(cls, section: Any, context: Context, key: PRNGKeyArray) -> Truth:
+    def truth(cls, section: Any, setup: Setup, key: PRNGKeyArray) -> Truth:
         """Draw the true values in simulated data from their priors.
 
         Parameters
         ----------
         section : Section
-        context : Context
+        setup : Setup
         key : PRNG key
             Of the scenario's seed.
         """
-        found = cls.build(section, context, Around())
+        found = cls.build(section, setup, Around())
         z = np.asarray(jax.random.normal(cls.own_key(key), (len(found.names),)))
         return {
             name: value if value.ndim else float(value) for name, value in found.values(z).items()
@@ -255,14 +255,14 @@ class Systematic(eqx.Module):
 
     @classmethod
     def in_data(
-        cls, section: Any, context: Context, model: LinearGaussian, truth: Truth, key: PRNGKeyArray
+        cls, section: Any, setup: Setup, model: LinearGaussian, truth: Truth, key: PRNGKeyArray
     ) -> LinearGaussian:
         """The model with the true values of simulated data.
 
         Parameters
         ----------
         section : Section
-        context : Context
+        setup : Setup
             Moved to all true values (:meth:`moved`), as the model's A is.
         model : LinearGaussian
             Without it.
@@ -271,7 +271,7 @@ class Systematic(eqx.Module):
         key : PRNG key
             Of the scenario's seed, for what else is drawn.
         """
-        found = cls.build(section, context, Around())
+        found = cls.build(section, setup, Around())
         return found.effect(model, {u.name: truth[u.name] for u in found.unknowns})
 
     # --- its unknowns ---
