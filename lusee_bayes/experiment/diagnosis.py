@@ -25,6 +25,7 @@ from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Float, Int
 
 from lusee_bayes.core.arrays import Ells, Grid, Square, on_host
@@ -34,7 +35,6 @@ from lusee_bayes.core.linalg import solve_lower
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.rounds import Inference
-from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix
 from lusee_bayes.instrument.observation import Observation
@@ -49,7 +49,7 @@ from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.prior import HarmonicPrior
-from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.context import Around, Setup
 
 # arrays that recur
 Products = Float[np.ndarray, " products"]
@@ -287,12 +287,8 @@ class UnderAnySky:
 
 def filled(data: Visibilities) -> Grid:
     """The data on the full grid, absent samples interpolated in time."""
-    grid = np.array(data.grid())
-    times = np.arange(grid.shape[1])
-    for row in grid:
-        there = np.isfinite(row)
-        row[~there] = np.interp(times[~there], times[there], row[there]) if there.any() else 0.0
-    return grid
+    grid = pd.DataFrame(np.asarray(data.grid()).T).interpolate(limit_direction="both")
+    return grid.fillna(0.0).to_numpy().T
 
 
 # times that are tried one by one, the worst first

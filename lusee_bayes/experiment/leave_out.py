@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Grid, GridFlags, TimeFlags, Vector, on_host
+from lusee_bayes.core.arrays import Grid, GridFlags, Vector, on_host
 from lusee_bayes.core.checks import counted
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
@@ -28,12 +28,12 @@ from lusee_bayes.core.progress import Stages, memory_limit
 from lusee_bayes.core.section import is_modelled
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.rounds import rebuilds, settled
-from lusee_bayes.experiment.setup import Setup, set_up
+from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.products import DataLayout, auto_indices, ports
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.left_out import DataGroup, LeftOut, Missed, groups_of
 from lusee_bayes.judge.split import WIDER, Split
-from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.context import Around, Setup
 
 # of the times beyond the limit, those within this share of the worst go in one round
 WORST = 0.3
@@ -240,11 +240,6 @@ class Fitting:
     share: float = 0.0
     refused: bool = False
     cause: str = ""
-
-    @property
-    def times(self) -> TimeFlags:
-        """Times of which every product is flagged."""
-        return self.flagged.all(axis=0)
 
 
 def fitting(

@@ -18,7 +18,6 @@ from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.section import is_modelled
 from lusee_bayes.experiment.model import full_model, model_about, moved
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.sky_sections import (
     IsotropicPriorSection,
     LocalScalesPriorSection,
@@ -33,7 +32,7 @@ from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.priors.families import PriorFamily
 from lusee_bayes.priors.learning import Learned, learn_whatever_fits
-from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.gain_drifts import gains_about
 from lusee_bayes.systematics.noise_level import radiometer_about
 from lusee_bayes.systematics.pointing_offsets import PointingOffsets

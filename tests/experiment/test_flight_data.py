@@ -293,7 +293,7 @@ def test_what_the_comb_spoils_and_nothing_else_is_left_out(mapped, truth):
     saturated = {(s, int(r)) for s, r in truth["saturated"]}
     names = [(s, int(r)) for s, r in zip(truth["session"], truth["row"], strict=True)]
     times = [name for name in names if name not in saturated]
-    flagged = [times[k] for k in np.flatnonzero(experiment.fitting.times)]
+    flagged = [times[k] for k in np.flatnonzero(experiment.fitting.flagged.all(axis=0))]
     assert flagged == comb
     assert "3 of 124 times" in experiment.fitting.remark
 
