@@ -21,7 +21,6 @@ from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.unknowns import Unknowns, UnknownsReport
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.linear.amplitudes import template_amplitudes
 from lusee_bayes.results.channel_map import Conditioned, conditioned
 from lusee_bayes.results.map_files import SavedInformation
 from lusee_bayes.sampling.programs import WHITE_SUFFIX, Program, latent_sites, numpyro_promotion
@@ -70,8 +69,7 @@ def unknowns_report(experiment: lb.Experiment, found: Inference) -> UnknownsRepo
 
 def offset_posterior(found: Inference) -> tuple[dict[str, float], np.ndarray]:
     """Mean of every offset of clock and pointing by name, and their covariance in these units."""
-    offsets, data = found.offsets, found.around.data.data
-    told = template_amplitudes(found.model, found.posterior, data, offsets.columns)
+    offsets, told = found.offsets, found.amplitudes(found.offsets)
     stds = offsets.systematic.stds
     return offsets.systematic.in_units(told.mean), told.covariance * np.outer(stds, stds)
 

@@ -113,7 +113,9 @@ def model_about(
     """
     model, found = base_model(setup, around), (s for _, s in systematics(setup, around))
     held = in_noise(setup, model, (s for s in found if scaling or not s.scales_sky), around)
-    return marginalised(model, held), tuple(held)
+    for systematic in held:
+        model = systematic.marginalised(model)
+    return model, tuple(held)
 
 
 def full_model(setup: Setup, around: Around | None = None) -> LinearGaussian:
@@ -122,13 +124,6 @@ def full_model(setup: Setup, around: Around | None = None) -> LinearGaussian:
     Those that are to be sampled, too, to first order: what a Gaussian can say about them.
     """
     return model_about(setup, around or Around())[0]
-
-
-def marginalised(model: LinearGaussian, held: Iterable[Marginalised]) -> LinearGaussian:
-    """The model with these systematics (:func:`in_noise`) in N."""
-    for systematic in held:
-        model = systematic.marginalised(model)
-    return model
 
 
 def model_to_sample(

@@ -26,7 +26,7 @@ from lusee_bayes.experiment.sky_sections import (
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.measures import data_freedom
-from lusee_bayes.linear.amplitudes import weighted_residual
+from lusee_bayes.linear.amplitudes import Amplitudes, template_amplitudes, weighted_residual
 from lusee_bayes.linear.information import Information, integrated_out
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
@@ -91,6 +91,11 @@ class Inference:
     def offsets(self) -> Expanded | None:
         """Of clock and pointing, as they are in N."""
         return next((s for s in self.expanded if isinstance(s.systematic, PointingOffsets)), None)
+
+    def amplitudes(self, part: Expanded) -> Amplitudes:
+        """What these data tell of a systematic's unknowns, in prior standard deviations."""
+        data = self.around.data.data
+        return template_amplitudes(self.model, self.posterior, data, part.columns)
 
 
 def settled(

@@ -28,12 +28,7 @@ from lusee_bayes.experiment.model import base_model, radiometer, true_values
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.instrument.pointing import offset_names
 from lusee_bayes.judge.measures import preferences
-from lusee_bayes.linear.amplitudes import (
-    Amplitudes,
-    AmplitudesOfSky,
-    amplitudes_of_sky,
-    template_amplitudes,
-)
+from lusee_bayes.linear.amplitudes import Amplitudes, AmplitudesOfSky, amplitudes_of_sky
 from lusee_bayes.sky.galaxy import kelvin_steradian
 from lusee_bayes.systematics.gain_table import COMMON_GAIN
 from lusee_bayes.systematics.pointing_offsets import PointingOffsets, shifted
@@ -255,8 +250,8 @@ class Unknowns:
     def _null_direction(self, told: Amplitudes, variance: float) -> NullDirection:
         mixed = self.parts @ told.with_sky[0] / self.sky_std
         inner = self.parts @ told.covariance @ self.parts.T
-        sky = np.array([[variance / self.sky_std**2]])
-        blocks = np.block([[sky, mixed[None]], [mixed[:, None], inner]])
+        sky = variance / self.sky_std**2
+        blocks = np.block([[np.full((1, 1), sky), mixed[None]], [mixed[:, None], inner]])
         return NullDirection.of((SKY, *self.names), blocks)
 
 
@@ -297,10 +292,8 @@ def given_data(table: pd.DataFrame, told: Amplitudes) -> pd.DataFrame:
 
 def _alone(experiment: Experiment, found: Inference, part: Expanded) -> pd.DataFrame:
     """The table of one systematic."""
-    data = experiment.data
-    truth = None if data.truth is None else true_values(experiment.setup)
-    told = template_amplitudes(found.model, found.posterior, data.data, part.columns)
-    return given_data(before_data([part], truth), told)
+    truth = None if experiment.data.truth is None else true_values(experiment.setup)
+    return given_data(before_data([part], truth), found.amplitudes(part))
 
 
 # offsets that are tested whatever the scenario says, and how far apart the two sides of their
@@ -385,25 +378,23 @@ def _preferred(
     n_runs = setup.observation.n_runs
     steps = {name: step for kind, step in TESTED.items() for name in offset_names((kind,), n_runs)}
     centre = dict.fromkeys(steps, 0.0) | values
-    there = shifted(setup, centre)
-    offsets = PointingOffsets.of(there, steps, centre)
+    offsets = PointingOffsets.of(shifted(setup, centre), steps, centre)
     about = Expanded.about(offsets, on_host(base_model(setup)), sky, centre)
     per_unit = np.asarray(about.columns) / offsets.stds
     day = setup.observation.day
     length = -(-(int(day.max()) + 1) // MOST_STRETCHES)
-    stretches = np.unique(day // length)
+    stretches = [(-1, -1, np.ones(len(day), dtype=bool))]
+    for first in (np.unique(day // length) * length).tolist():
+        stretches.append((first, first + length - 1, day // length * length == first))
     rows, columns = [], []
     for name, template in zip(steps, per_unit.T, strict=True):
-        for first in [None, *(stretches * length).tolist()]:
-            inside = True if first is None else (day // length * length == first)[data.layout.time]
-            column = np.where(inside, template, 0.0)
-            if first is None or column.any():
-                days = (-1, -1) if first is None else (first, first + length - 1)
-                rows.append((name, *days))
+        for first, last, times in stretches:
+            column = np.where(times[data.layout.time], template, 0.0)
+            if first < 0 or column.any():
+                rows.append((name, first, last))
                 columns.append(column)
-    told = preferences(
-        found.model, found.posterior, covariance, data.data, np.stack(columns, axis=1)
-    )
+    given = found.model, found.posterior, covariance, data.data
+    told = preferences(*given, np.stack(columns, axis=1))
     table = pd.DataFrame(rows, columns=["offset", "first_day", "last_day"])
     return table.assign(value=told.amplitude, std=told.std, chi2_gain=told.gain)
 

@@ -135,13 +135,26 @@ class Unknown:
         Raises
         ------
         InputError
-            As :func:`normal_within`.
+            If 0.25 % or more of the Gaussian lies outside the domain: the prior then allows what
+            cannot be.
         """
-        if np.isfinite([self.low, self.high]).any():
-            return normal_within(self.name, self.mean, self.std, self.low, self.high)
-        kind, mean = (dist.LogNormal, jnp.log) if self.log else (dist.Normal, jnp.asarray)
-        prior = kind(mean(scalar(self.mean)), scalar(self.std))
-        return prior if self.size is None else prior.expand([self.size]).to_event(1)
+        mean, std, low, high = self.mean, self.std, self.low, self.high
+        if np.isinf(low) and np.isinf(high):
+            kind, centre = (dist.LogNormal, jnp.log) if self.log else (dist.Normal, jnp.asarray)
+            prior = kind(centre(scalar(mean)), scalar(std))
+            return prior if self.size is None else prior.expand([self.size]).to_event(1)
+        require_positive(f"the prior standard deviation of {self.name}", std)
+        cdf = NormalDist().cdf
+        outside = cdf((low - mean) / std) + cdf((mean - high) / std)
+        if outside > 0.0025:
+            edge = f"at least {low:g}" if mean - low < high - mean else f"at most {high:g}"
+            raise InputError(
+                f"the prior of {self.name}, {mean:g} +- {std:g}, has {outside:.1%} of its weight "
+                f"outside what it can be ({edge}); give a smaller standard deviation or move the "
+                "mean"
+            )
+        ends = {name: end for name, end in (("low", low), ("high", high)) if np.isfinite(end)}
+        return dist.TruncatedNormal(mean, std, **ends)
 
     def at(self, z: float | Float[Array, "..."]) -> float | Float[Array, "..."]:
         """Compute values of numbers in prior standard deviations from the prior mean."""
@@ -647,39 +660,3 @@ def multiplied(model: LinearGaussian, response: DataVector) -> LinearGaussian:
 def scalar_or_none(value: float | Float[Array, ""] | None) -> Float[Array, ""] | None:
     """Convert a number like :func:`scalar`; None stays None."""
     return None if value is None else scalar(value)
-
-
-def normal_within(
-    name: str, mean: float, std: float, low: float = -np.inf, high: float = np.inf
-) -> dist.Distribution:
-    """Return N(mean, std), cut off at the ends of a parameter's domain.
-
-    Parameters
-    ----------
-    name : str
-        The parameter, for messages.
-    mean, std : float
-        Of the Gaussian, in the parameter's unit.
-    low, high : float
-        Ends of the domain.
-
-    Raises
-    ------
-    InputError
-        If 0.25 % or more of the Gaussian lies outside the domain: the prior then allows what
-        cannot be.
-    """
-    require_positive(f"the prior standard deviation of {name}", std)
-    cdf = NormalDist().cdf
-    outside = cdf((low - mean) / std) + cdf((mean - high) / std)
-    if outside > 0.0025:
-        edge = f"at least {low:g}" if mean - low < high - mean else f"at most {high:g}"
-        raise InputError(
-            f"the prior of {name}, {mean:g} +- {std:g}, has {outside:.1%} of its weight outside "
-            f"what it can be ({edge}); give a smaller standard deviation or move the mean"
-        )
-    if np.isinf(low) and np.isinf(high):
-        return dist.Normal(mean, std)
-    return dist.TruncatedNormal(
-        mean, std, low=None if np.isinf(low) else low, high=None if np.isinf(high) else high
-    )
