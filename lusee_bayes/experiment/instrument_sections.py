@@ -26,7 +26,6 @@ from lusee_bayes.core.section import (
     kinds_of,
     one_of,
     requires,
-    without_other_kinds,
 )
 from lusee_bayes.instrument.beams.fields import Interpolation
 from lusee_bayes.instrument.beams.luseepy_files import read_response, read_scalar_beam
@@ -257,9 +256,11 @@ def _named(value: Any) -> Any:
     return {"model": value} if isinstance(value, str) else value
 
 
-ReceiverSection = one_of(
-    kinds_of(JFETSection, CapacitorSection, ReceiverFileSection, OpenSection), _named
-)
+ReceiverSection = Annotated[
+    JFETSection | CapacitorSection | ReceiverFileSection | OpenSection,
+    Field(discriminator="model"),
+    BeforeValidator(_named),
+]
 
 
 class _BeamSection(Section):
@@ -268,9 +269,8 @@ class _BeamSection(Section):
     def of_file(self, file: str) -> Any:
         """The section of beams of a file that are turned as these are."""
         kind = BEAM_SECTIONS[beam_kind(file)]
-        return kind(
-            file=file, **self.model_dump(include=set(kind.model_fields) - {"model", "file"})
-        )
+        shared = set(kind.model_fields) - {"model", "file"}
+        return kind(file=file, **self.model_dump(include=shared))
 
 
 class MonopoleBeamSection(_BeamSection):
@@ -460,11 +460,8 @@ BEAM_SECTIONS = kinds_of(
 )
 
 
-def _one_kind(value: Any) -> Any:
+def _complete_beam(tree: dict[str, Any]) -> None:
     """``beam: {file: ...}`` without a model, as scenarios had it before: the file tells."""
-    if not isinstance(value, dict):
-        return value
-    tree = dict(value)
     default = MonopoleBeamSection.model_fields["model"].default
     tree["model"] = tree.get("model") or default
     file = tree.get("file")
@@ -483,10 +480,9 @@ def _one_kind(value: Any) -> Any:
             f"{file} is a scalar beam, which knows of no losses; leave out "
             "beam.antenna_temperature_k"
         )
-    return without_other_kinds(tree, BEAM_SECTIONS, strict=True)
 
 
-BeamSection = one_of(BEAM_SECTIONS, _one_kind)
+BeamSection = one_of(BEAM_SECTIONS, _complete_beam)
 
 
 Share = Annotated[float, Field(ge=0, le=0.5)]

@@ -22,7 +22,6 @@ from lusee_bayes.core.section import (
     kinds_of,
     one_of,
     requires,
-    without_other_kinds,
 )
 from lusee_bayes.priors.families import IsotropicFamily, PriorFamily
 from lusee_bayes.priors.local_scales import embedded_local_scales
@@ -89,20 +88,16 @@ class FileSkySection(Section):
 SKY_SECTIONS = kinds_of(GalaxySection, FileSkySection)
 
 
-def _kind_of_sky(value: Any) -> Any:
+def _complete_sky(tree: dict[str, Any]) -> None:
     """``sky: {file: ...}`` without a model, as scenarios had it before."""
-    if not isinstance(value, dict):
-        return value
-    tree = dict(value)
     default = GalaxySection.model_fields["model"].default
     tree["model"] = tree.get("model") or default
     if tree["model"] == default and tree.get("file") is not None:
         tree["model"] = "file"
-    # the sources of the embedded sky were said beside a file, too, where they had no effect
-    return without_other_kinds(tree, SKY_SECTIONS, strict=False)
 
 
-SkySection = one_of(SKY_SECTIONS, _kind_of_sky)
+# the sources of the embedded sky were said beside a file, too, where they had no effect
+SkySection = one_of(SKY_SECTIONS, _complete_sky, strict=False)
 
 
 # where C_ell comes from
@@ -230,21 +225,17 @@ class LocalScalesPriorSection(Section):
 PRIOR_SECTIONS = kinds_of(LocalScalesPriorSection, IsotropicPriorSection)
 
 
-def _kind_of_prior(value: Any) -> Any:
+def _complete_prior(tree: dict[str, Any]) -> None:
     """``prior`` without a model is that of its entries: isotropic, as scenarios had it before."""
-    if not isinstance(value, dict):
-        return value
-    tree = dict(value)
     if not tree.get("model"):
         told = set(tree) & set(IsotropicPriorSection.model_fields) - {"model"}
         default = IsotropicPriorSection if told else LocalScalesPriorSection
         tree["model"] = default.model_fields["model"].default
     if tree["model"] != "isotropic":  # another kind in the place of the paper's prior
         tree.pop("spectrum", None)
-    return without_other_kinds(tree, PRIOR_SECTIONS, strict=True)
 
 
-PriorSection = one_of(PRIOR_SECTIONS, _kind_of_prior)
+PriorSection = one_of(PRIOR_SECTIONS, _complete_prior)
 
 
 class LogNormalSection(Section):
