@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from layout_4 import write_layout_4
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.flight_data import reduce_files
+from lusee_bayes.experiment.data_files import reduce_files
 from lusee_bayes.flight.gain_model import read_gain_table
 from lusee_bayes.flight.reduced import read_reduced, write_reduced
 from lusee_bayes.flight.session_files import read_session

@@ -18,7 +18,6 @@ from lusee_bayes.core.engine import ThisProcess
 from lusee_bayes.core.harmonics import modes_to_map, n_modes
 from lusee_bayes.core.reading import read_model
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.experiment.positive import lmax_of_fields, positive_skies
 from lusee_bayes.judge.measures import signal_to_noise
 from lusee_bayes.results.summaries import MapSummary
 from lusee_bayes.runs import channels, map_run
@@ -270,7 +269,8 @@ def test_files_of_a_run_agree_with_each_other(tmp_path, capsys):
     units = [channels[name].attrs["units"] for name in ("component_mean", "mean")]
     assert units == ["1", "K"]
     assert channels["component_mean"].shape == (2, n_modes(6))  # 1.5 times the maps' lmax
-    skies = positive_skies(scenario_of("spectral.sources=false"))
+    scenario = scenario_of("spectral.sources=false")
+    skies = scenario.spectral.positive_skies(scenario.frequencies_mhz, scenario.lmax)
     exponents = channels["mixing"].values @ channels["component_mean"].values
     for k, draws in enumerate(sky_draws_of(tmp_path / "out")):
         assert (skies.values(k, exponents[k]) > 0).all()
@@ -310,5 +310,6 @@ def test_joint_maps_of_low_frequencies_are_no_worse_than_independent_ones(tmp_pa
 
 
 def test_bad_input_is_refused_in_a_sentence():
-    refuse(r"lmax 80 have 13122 unknowns.*use lmax=69", lmax_of_fields, scenario_of("lmax=80"))
-    assert lmax_of_fields(scenario_of("lmax=60")) == 69
+    lmax_of_fields = scenario_of().spectral.lmax_of_fields
+    refuse(r"lmax 80 have 13122 unknowns.*use lmax=69", lmax_of_fields, 80)
+    assert lmax_of_fields(60) == 69

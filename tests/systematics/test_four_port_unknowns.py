@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from assertions import refused, within
-from experiments import density, four_ports, parts, program_arguments
+from experiments import density, four_ports, offset_posterior, parts, program_arguments
 from reference_linear import white_posterior
 from scipy.optimize import least_squares
 from scipy.stats import norm
@@ -22,7 +22,7 @@ from lusee_bayes.experiment.model import (
     true_signal,
     true_values,
 )
-from lusee_bayes.experiment.rounds import Inference, offset_posterior
+from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.instrument.products import all_products, labels
 from lusee_bayes.instrument.visibilities import Calibration
@@ -352,12 +352,21 @@ def test_rounds_find_the_mode_and_the_first_order_does_not(experiment, response_
     # every unknown, and every direction of them
     assert np.abs(off(found) / std).max() < 0.05
     assert np.abs(root @ off(found)).max() < 0.05
-    # about the sky of gains that are right
-    around = Around(experiment.data, sky=np.linalg.lstsq(a, d - offset, rcond=None)[0])
+    # first order leaves out what goes as the square of the way to the mode: about gains that are
+    # three prior standard deviations too high, three times as far as their prior means, it is wrong
+    # by a hundred times what is allowed; rounds lead to the mode from there, too
+    high = np.full(4, 3.0)
+    sky = np.linalg.lstsq(a, d / per_port(high) - offset, rcond=None)[0]
+    values = {f"gain_{port}": 0.01 * z for port, z in enumerate(high)}
+    around = replace(found.around, values=values, sky=sky)
+    ways = np.linalg.norm([mode[21:] - high, mode[21:]], axis=1)
+    assert ways[0] > 3.0 * ways[1]
     model, unknowns = model_about(setup, around)
     first = Inference(model, unknowns, model.condition(d), 1, around)
-    assert np.abs(off(first) / std).max() > 0.5
-    assert np.abs(root @ off(first)).max() > 50.0
+    assert np.abs(off(first) / std).max() > 5.0
+    assert np.abs(root @ off(first)).max() > 5.0
+    again = lb.infer(replace(experiment, around=around))
+    assert np.abs(off(again) / std).max() < 0.05
     # the joint mode is another: each of 21 skies and powers gains by being 0.5 % smaller
     assert force.min() > 0.04
     joint = least_squares(residuals, mode, jacobian, args=(np.zeros(4),), **tight).x
