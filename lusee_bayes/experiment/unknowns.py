@@ -23,6 +23,7 @@ from jaxtyping import Float
 from scipy.linalg import block_diag
 
 from lusee_bayes.core.arrays import Modes, ModesMatrix, on_host
+from lusee_bayes.core.trees import quantity
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import base_model, radiometer, true_values
 from lusee_bayes.experiment.rounds import Inference
@@ -55,7 +56,7 @@ class NullDirection:
     """
 
     names: tuple[str, ...]
-    weights: Float[np.ndarray, " parts"]
+    weights: Float[np.ndarray, " parts"] = quantity("1", "in prior standard deviations")
     share: float
 
     @classmethod

@@ -33,6 +33,7 @@ from lusee_bayes.core.arrays import (
 from lusee_bayes.core.checks import Described, is_traced, number, require_array, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import cholesky, gram_matrix, precise_residual, scaled, solve_lower
+from lusee_bayes.core.trees import quantity
 from lusee_bayes.instrument.coupling import Coupling, DenseCoupling
 from lusee_bayes.linear.normal_matrix import has_structure, is_within_times, normal_matrix
 from lusee_bayes.linear.posterior import Posterior
@@ -60,12 +61,12 @@ class Information(Described, eqx.Module):
         Number of data, as a float.
     """
 
-    matrix: ModesMatrix
-    vector: Modes
-    reference: Modes
-    misfit: Float[Array, ""]
-    log_det: Float[Array, ""]
-    n_data: Float[Array, ""]
+    matrix: ModesMatrix = quantity("K-2", "A^T N^-1 A")
+    vector: Modes = quantity("K-1", "A^T N^-1 (d - A reference)")
+    reference: Modes = quantity("K", "reference sky")
+    misfit: Float[Array, ""] = quantity("1", "chi^2 at the reference sky")
+    log_det: Float[Array, ""] = quantity("1", "ln det N")
+    n_data: Float[Array, ""] = quantity("1", "number of data")
 
     @classmethod
     def of(

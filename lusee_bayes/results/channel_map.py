@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import jax
 import numpy as np
@@ -29,7 +30,7 @@ from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.diagnosis import diagnose
 from lusee_bayes.experiment.experiment import Experiment, doubts, explained, infer, posterior_draws
 from lusee_bayes.experiment.rounds import Inference
-from lusee_bayes.experiment.unknowns import Unknowns, UnknownsReport, flux_table, pointing_report
+from lusee_bayes.experiment.unknowns import Unknowns, flux_table, pointing_report
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.judge.chi2 import LEVELS
 from lusee_bayes.judge.coverage import N_DRAWS, Counts
@@ -351,16 +352,10 @@ def channel_result(
     log_likelihood: Float[np.ndarray, " n"],
     compared: Float[np.ndarray, "more modes"] | None = None,
     *,
-    unknowns: UnknownsReport | None = None,
     pixels: Pixels | None = None,
-    independent: Modes | None = None,
-    log_evidence: float = np.nan,
-    information_bits: float = np.nan,
-    chi2: float,
-    chi2_expected: float,
-    chi2_model: float = np.nan,
-    refinement: float = np.nan,
     covariance_kept: bool = False,
+    information_bits: float = np.nan,
+    **figures: Any,
 ) -> ChannelResult:
     """The channel of a mean and a covariance.
 
@@ -376,14 +371,12 @@ def channel_result(
         Of the draws.
     compared : (more, modes) array, optional
         Draws less mean for :class:`.Counts`, where the truth is known, in K.
-    unknowns : UnknownsReport, optional
-        Receivers, ground and gain table.
     pixels : (pixels,) array, optional
         Standard deviations of pixels in K, where they are known already.
-    independent, log_evidence, information_bits, chi2, chi2_expected, chi2_model, refinement
-        See :class:`.ChannelResult`.
     covariance_kept : bool
         Keep the covariance with the result.
+    information_bits, **figures
+        Whatever else a :class:`.ChannelResult` has: ``chi2``, ``unknowns``, ``independent`` ...
     """
     mean, covariance = np.asarray(mean), np.asarray(covariance)
     nside = round(np.sqrt(known.highest_altitude.size / 12))
@@ -397,6 +390,7 @@ def channel_result(
     said = vars(known) | {"doubts": (*known.doubts, *about_information(information_bits))}
     return ChannelResult(
         **said,
+        **figures,
         mean=mean,
         std=np.sqrt(variance),
         prior_fraction=mean_over_m(share),
@@ -404,15 +398,8 @@ def channel_result(
         draws=np.asarray(draws),
         log_likelihood=np.asarray(log_likelihood),
         covariance=covariance if covariance_kept else None,
-        independent=None if independent is None else np.asarray(independent),
-        log_evidence=log_evidence,
         information_bits=information_bits,
-        chi2=chi2,
-        chi2_expected=chi2_expected,
-        chi2_model=chi2_model,
-        refinement=refinement,
         coverage=held,
-        unknowns=unknowns,
     )
 
 

@@ -19,6 +19,7 @@ from lusee_bayes.linear.information import Information
 from lusee_bayes.report.comparison_page import comparison_page
 from lusee_bayes.report.figures.maps import curves_of_runs, maps_of_runs
 from lusee_bayes.report.figures.plans import priors
+from lusee_bayes.report.rendering import render_text
 from lusee_bayes.results.channel_map import conditioned
 from lusee_bayes.results.finished_runs import FinishedRun, Provenance, comparison_rows, read_runs
 from lusee_bayes.results.prior_comparison import PriorComparison, UnderPrior
@@ -174,7 +175,7 @@ COMPARE_PRIORS = RunKind(
     "compare-priors",
     outputs=(
         model_file("priors.json", lambda result: result.summary()),
-        text_file("priors.md", lambda result: result.as_markdown()),
+        text_file("priors.md", lambda result: render_text("priors.md", result=result)),
         SCENARIO,
         rows_file("priors.csv", lambda result: result.rows()),
     ),

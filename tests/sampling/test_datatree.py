@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
-from assertions import refuse
+from assertions import refuse, require_conventions
 from reference_linear import assert_draws_follow, matrices, random_covariance
 from reference_linear import posterior as naive_posterior
 
@@ -150,7 +150,7 @@ def test_units_are_written_on_what_has_them(drawn):
     tree, _ = drawn
     for group in tree.children.values():
         for name, values in group.data_vars.items():
-            assert values.attrs.get("units") == (None if name in STATISTICS else "K"), name
+            assert values.attrs.get("units") == ("1" if name in STATISTICS else "K"), name
 
 
 def test_constants_against_the_textbook(drawn, setting, exact):
@@ -294,6 +294,11 @@ def test_arviz_reads_the_tree(drawn):
     assert (np.abs(table["ess_bulk"] / skies[..., 0].size - 1) < 0.3).all()
     # 2000 independent draws of 4 chains: R-hat - 1 of order 1 / 500
     assert (table["r_hat"] < 1.01).all()
+
+
+def test_files_follow_the_conventions(drawn, tmp_path):
+    drawn[0].to_netcdf(tmp_path / "samples.nc", engine="h5netcdf")
+    require_conventions(tmp_path / "samples.nc")
 
 
 def test_files_that_are_no_samples_are_refused(setting, tmp_path):
