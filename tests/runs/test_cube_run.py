@@ -13,7 +13,7 @@ from commands import posterior_of, refused, run, sky_draws_of
 from experiments import channels_of
 
 import lusee_bayes as lb
-from lusee_bayes.core import engines as engine_module
+from lusee_bayes.core import engine as engine_module
 from lusee_bayes.core.engine import ThisProcess
 from lusee_bayes.core.harmonics import modes_to_map, n_modes
 from lusee_bayes.core.reading import read_model
