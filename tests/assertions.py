@@ -26,6 +26,20 @@ def off(got: object, expected: object) -> float:
     return np.abs(got - expected).max() / np.abs(expected).max()
 
 
+def assert_same_map(got: object, expected: object, sigma: float) -> None:
+    """Assert that means agree to ``sigma`` standard deviations, and these to that part."""
+    (mean, std), (other, width) = (_moments(one) for one in (got, expected))
+    assert (np.abs(mean - other) / width).max() < sigma
+    np.testing.assert_allclose(std, width, rtol=sigma)
+
+
+def _moments(of: object) -> list[np.ndarray]:
+    """Mean and standard deviation of a posterior, a channel or a file."""
+    if isinstance(of, xr.Dataset | xr.DataTree):
+        return [of[name].values for name in ("mean", "std")]
+    return [np.asarray(of.mean), np.asarray(of.std() if callable(of.std) else of.std)]
+
+
 def within(got: object, expected: object, atol: object) -> None:
     """Assert that arrays agree to so much, whatever their size."""
     np.testing.assert_allclose(got, expected, rtol=0, atol=atol)

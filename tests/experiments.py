@@ -14,9 +14,12 @@ import numpy as np
 from numpyro.infer.util import log_density
 
 import lusee_bayes as lb
+from lusee_bayes.core.arrays import on_host
 from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.experiment.model import full_model, radiometer, simulate
+from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.setup import Setup
+from lusee_bayes.experiment.unknowns import Unknowns, UnknownsReport
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.results.channel_map import Conditioned, conditioned
 from lusee_bayes.results.map_files import SavedInformation
@@ -57,14 +60,48 @@ def mapped(
     return made, made.result(made.known(thorough=thorough))
 
 
+def channels_of(scenario: lb.Scenario) -> list[lb.Visibilities]:
+    """The data of every channel."""
+    return [lb.build(channel).data for channel in scenario.channels() or (scenario,)]
+
+
+def at_times(data: lb.Visibilities, keep: np.ndarray) -> lb.Visibilities:
+    """The data of some times by themselves."""
+    observation = data.observation.select(keep)
+    flat, layout = jnp.asarray(data.grid()[:, keep].ravel()), DataLayout(16, observation.n_times)
+    return replace(data, data=flat, layout=layout, observation=observation)
+
+
+def unknowns_report(experiment: lb.Experiment, found: Inference) -> UnknownsReport | None:
+    """What data alone tell of receivers, ground and gain table."""
+    posterior = on_host(found.posterior)
+    unknowns = Unknowns.of(experiment, found, posterior.mean)
+    return None if unknowns is None else unknowns.report(posterior.mean, posterior.covariance())
+
+
+def offset_posterior(found: Inference) -> tuple[dict[str, float], np.ndarray]:
+    """Mean of every offset of clock and pointing by name, and their covariance in these units."""
+    offsets, told = found.offsets, found.amplitudes(found.offsets)
+    stds = offsets.systematic.stds
+    return offsets.systematic.in_units(told.mean), told.covariance * np.outer(stds, stds)
+
+
 def of_run(data: lb.Visibilities, run: int) -> lb.Visibilities:
     """The data of one run by themselves."""
-    keep = data.observation.run == run
-    observation = data.observation.select(keep)
-    flat = jnp.asarray(data.grid()[:, keep].ravel())
-    return replace(
-        data, data=flat, layout=DataLayout(16, observation.n_times), observation=observation
-    )
+    return at_times(data, data.observation.run == run)
+
+
+def flagged(data: lb.Visibilities, flags: np.ndarray) -> lb.Visibilities:
+    """The data without those of the flags, a (products, times) array."""
+    layout = DataLayout.from_flags(flags)
+    return replace(data, layout=layout, data=layout.gather(data.grid()))
+
+
+def scaled_product(data: lb.Visibilities, product: int, factor: float) -> lb.Visibilities:
+    """Data in which one product is too large."""
+    grid = np.array(data.grid())
+    grid[product] *= factor
+    return replace(data, data=data.layout.gather(jnp.asarray(grid)))
 
 
 def program_arguments(program: Program, experiment: lb.Experiment) -> dict[str, Any]:

@@ -32,6 +32,7 @@ Array = jax.Array | np.ndarray
 # arrays that recur, with their shapes
 DataVector = Float[Array, " data"]
 Grid = Float[Array, "products times"]
+Times = Float[np.ndarray, " times"]
 GridFlags = Bool[np.ndarray, "products times"]
 TimeFlags = Bool[np.ndarray, " times"]
 Modes = Float[Array, " modes"]

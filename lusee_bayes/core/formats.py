@@ -192,6 +192,35 @@ def _decoded(dataset: xr.Dataset, name: str, variable: xr.Variable) -> xr.Variab
     return xr.conventions.decode_cf_variable(name, known)
 
 
+def as_dataset(
+    format_: str, layout: Layout, arrays: Mapping[str, Any], values: Mapping[str, Any]
+) -> xr.Dataset:
+    """Lay out what :func:`read_netcdf` reads, on the dimensions and in the units of a layout.
+
+    Parameters
+    ----------
+    format_ : str
+        One of :mod:`.formats`.
+    layout : Layout
+    arrays : mapping of str to array or None
+        By their names in the layout; None is absent.
+    values : mapping of str to object
+        Attributes, likewise; ``variable.attribute`` is one of a variable.
+    """
+    variables = {}
+    for name, array in arrays.items():
+        declared = layout.variables[name]
+        units = {"units": declared.unit} if declared.unit else {}
+        if array is not None:
+            variables[name] = (tuple(map(str, declared.dims)), array, units)
+    dataset = xr.Dataset(variables, attrs=header(format_))
+    for name, value in values.items():
+        variable, _, attribute = name.rpartition(".")
+        if value is not None:
+            (dataset[variable] if variable else dataset).attrs[attribute] = value
+    return dataset
+
+
 def require_format(path: str | Path, format_: str, what: str, hint: str = "") -> Path:
     """Check that a file is of one format of the package.
 
@@ -298,8 +327,12 @@ def read_fits(path: str | Path, layout: Layout, hint: str = "") -> Content:
     with opened(path, layout.what, hint) as hdus:
         arrays: dict[str, Any] = {}
         words = hdus[0].header
-        said = {key: words[key] for key in words if key and not key.startswith(STRUCTURE)}
-        declared = {name.lower(): name for name in layout.variables}
+        declared = {name.lower(): name for name in (*layout.variables, *layout.attributes)}
+        said = {
+            declared.get(key.lower(), key): words[key]
+            for key in words
+            if key and not key.startswith(STRUCTURE)
+        }
 
         def put(name: str, array: Any, unit: str | None) -> None:
             name = declared.get(name.lower(), name.lower())

@@ -23,13 +23,14 @@ from lusee_bayes.core.progress import gigabytes, memory_limit
 
 # for each unit of the package, what a file may state instead, with the factor to it
 UNITS: Mapping[str, Mapping[str, float]] = {
-    "K": {"K": 1.0, "kelvin": 1.0, "Kelvin": 1.0, "mK": 1e-3, "kK": 1e3},
+    "K": {"K": 1.0, "kelvin": 1.0, "Kelvin": 1.0, "mK": 1e-3, "uK": 1e-6, "kK": 1e3},
     "V^2/Hz": dict.fromkeys(("V^2/Hz", "V**2/Hz", "V2/Hz", "V2 Hz-1", "V2 / Hz"), 1.0),
     "MHz": {"MHz": 1.0, "kHz": 1e-3, "Hz": 1e-6, "GHz": 1e3},
     "Ohm": dict.fromkeys(("Ohm", "ohm"), 1.0),
     "deg": dict.fromkeys(("deg", "degree", "degrees"), 1.0),
     "m": {"m": 1.0},
     "d": {"d": 1.0},
+    "s": dict.fromkeys(("s", "second", "seconds"), 1.0),
 }
 # what software writes that was not given a word or a unit, in lower case
 UNSTATED = ("", "unknown", "unspecified", "none")

@@ -18,7 +18,6 @@ from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.section import is_modelled
 from lusee_bayes.experiment.model import full_model, model_about, moved
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.sky_sections import (
     IsotropicPriorSection,
     LocalScalesPriorSection,
@@ -27,13 +26,13 @@ from lusee_bayes.experiment.sky_sections import (
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.measures import data_freedom
-from lusee_bayes.linear.amplitudes import template_amplitudes, weighted_residual
+from lusee_bayes.linear.amplitudes import Amplitudes, template_amplitudes, weighted_residual
 from lusee_bayes.linear.information import Information, integrated_out
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.priors.families import PriorFamily
 from lusee_bayes.priors.learning import Learned, learn_whatever_fits
-from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.gain_drifts import gains_about
 from lusee_bayes.systematics.noise_level import radiometer_about
 from lusee_bayes.systematics.pointing_offsets import PointingOffsets
@@ -93,6 +92,11 @@ class Inference:
         """Of clock and pointing, as they are in N."""
         return next((s for s in self.expanded if isinstance(s.systematic, PointingOffsets)), None)
 
+    def amplitudes(self, part: Expanded) -> Amplitudes:
+        """What these data tell of a systematic's unknowns, in prior standard deviations."""
+        data = self.around.data.data
+        return template_amplitudes(self.model, self.posterior, data, part.columns)
+
 
 def settled(
     setup: Setup,
@@ -148,8 +152,7 @@ def settled(
             return found
     moves = float(found.posterior.rms_shift_from(before.posterior))
     remedies = [cls.remedy for cls in first_order(setup)]
-    if rebuilds_gains(setup):
-        remedies.append("noise.gain.visibilities=model")
+    remedies += ["noise.gain.visibilities=model"] * rebuilds_gains(setup)
     unsettled = (
         f"The map still moves by {moves:.2g} of its standard deviations after {MAX_ROUNDS} rounds "
         "of rebuilding N around it"
@@ -218,29 +221,6 @@ def _start(setup: Setup, data: Visibilities) -> Around:
     return Around(data, sky=sky, freedom=freedom)
 
 
-def offset_posterior(
-    found: Inference,
-) -> tuple[dict[str, float], Float[np.ndarray, "offsets offsets"]]:
-    """Mean of every offset of clock and pointing by name, and their covariance.
-
-    Parameters
-    ----------
-    found : Inference
-        Of its data alone, with offsets.
-
-    Returns
-    -------
-    mean : dict of float
-        In the units that the names end with.
-    covariance : (offsets, offsets) array
-        In these units.
-    """
-    offsets, data = found.offsets, found.around.data.data
-    told = template_amplitudes(found.model, found.posterior, data, offsets.columns)
-    stds = offsets.systematic.stds
-    return offsets.systematic.in_units(told.mean), told.covariance * np.outer(stds, stds)
-
-
 def rebuilds(setup: Setup) -> bool:
     """Whether some term of N is built around what the data tell."""
     return rebuilds_visibilities(setup) or bool(first_order(setup))
@@ -279,9 +259,9 @@ def prediction(setup: Setup, found: Inference, solved: DataVector) -> Grid:
     complete = CouplingMatrix.build(setup.beams, setup.pointing)
     difference_of_skies = found.posterior.mean - setup.sky.modes
     besides = np.zeros(len(solved))
-    for expanded in found.expanded:
-        if not expanded.systematic.changes_coupling:
-            besides = besides + expanded.columns @ (expanded.columns.T @ solved)
+    for part in found.expanded:
+        if not part.changes_coupling:
+            besides = besides + part.columns @ (part.columns.T @ solved)
     grid = complete.layout.scatter(complete @ difference_of_skies)
     return setup.signal + grid + setup.layout.scatter(besides)
 
@@ -327,10 +307,9 @@ def with_learned_prior(
         return replace(setup, prior=learned.prior), learned, None, information
     learned, before, found = None, None, settled(setup, data)
     for _ in range(MAX_PRIOR_ROUNDS):
-        own = full_model(setup, found.around).inform(data.data)[0]
-        information = _with_more(own, earlier)
+        information = full_model(setup, found.around).inform(data.data)[0]
         start = None if learned is None or not learned.settled else learned.parameters
-        learned = learned_prior(setup, setup.family, information, start)
+        learned = learned_prior(setup, setup.family, _with_more(information, earlier), start)
         setup = replace(setup, prior=learned.prior)
         before, found = found, settled(setup, data, found.around)
         moved = float(found.posterior.rms_shift_from(before.posterior))
@@ -418,11 +397,9 @@ def named_priors(
     for name in names:
         if name not in NAMED:
             raise InputError(f"--priors: no prior '{name}'; {nearest(name, NAMED)}")
-    if len(set(names)) < len(names):
-        raise InputError(f"--priors {','.join(names)}: give each prior once")
-    if len(names) < 2:
+    if len(names) < 2 or len(set(names)) < len(names):
         raise InputError(
-            f"--priors: {len(names)} given, and a comparison needs two or more of "
+            f"--priors {','.join(names)}: a comparison needs two or more different ones of "
             f"{', '.join(NAMED)}"
         )
     if OF_TRUE_SKY in names and not known_sky:

@@ -21,37 +21,12 @@ from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.sky_sections import FileSkySection
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, stokes_beam
-from lusee_bayes.paper.claims import FREQUENCIES, Cases, cross, frequency_case
+from lusee_bayes.paper.claims import TABLE, Cases, cross
 from lusee_bayes.results.channel_map import conditioned
 
-# by name: a scenario of the package and what differs from it; those after the frequencies are not
-# among the paper's figures, but its text speaks of them or they tell why a claim does not hold
+# by name: a scenario of the package and what differs from it
 CASES = {
-    **{
-        name: (name, [])
-        for name in (
-            *("fiducial", "noise_x10", "noise_x100", "duty_cycle_50"),
-            *("gain_1e-2", "gain_1e-3", "gain_ignored"),
-            *("beam_4MHz", "beam_0.4MHz", "beam_ignored"),
-            *("two_cycles", "three_cycles", "quarter_cycle"),
-        )
-    },
-    **{
-        frequency_case(f): ("fiducial", [f"frequency_mhz={f}"])
-        for f in FREQUENCIES
-        if frequency_case(f) != "fiducial"
-    },
-    "gain_1e-1": ("gain_1e-2", ["noise.gain.sigma=0.1"]),
-    "half_cycle": ("fiducial", ["observation.runs.0.cycles=0.5"]),
-    "prior_x10": ("fiducial", ["prior.scale=10"]),
-    "three_cycles_at_rest": (
-        "three_cycles",
-        [f"observation.runs.{k}.turntable_deg=0" for k in (1, 2)],
-    ),
-    # the quarters that follow the scenario's, which starts on 15 January
-    "quarter_2nd": ("quarter_cycle", ["observation.start=2027-01-22"]),
-    "quarter_3rd": ("quarter_cycle", ["observation.start=2027-01-29"]),
-    "quarter_4th": ("quarter_cycle", ["observation.start=2027-02-05"]),
+    name: (case.get("scenario", name), case.get("changes", [])) for name, case in TABLE.items()
 }
 
 # of a channel, as a case file has them

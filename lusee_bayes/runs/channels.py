@@ -46,7 +46,6 @@ from lusee_bayes.core.trees import StoredTree, from_tree, write_tree
 from lusee_bayes.core.version import __version__
 from lusee_bayes.experiment.data_files import Data, anchored, digest_of
 from lusee_bayes.experiment.experiment import build, draw_key
-from lusee_bayes.experiment.positive import lmax_of_fields, positive_skies
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.unknowns import Unknowns
 from lusee_bayes.judge.coverage import N_DRAWS
@@ -248,9 +247,9 @@ def positive_mode(scenario: Scenario, channels: ChannelsInFiles, stages: Stages)
         As :func:`.find_joint_mode`.
     """
     with stages("templates"):
-        skies = positive_skies(scenario)
+        skies = scenario.spectral.positive_skies(scenario.frequencies_mhz, scenario.lmax)
     silent = replace(channels, stages=Stages())
-    coarse = lmax_of_fields(scenario, min(scenario.lmax, COARSE_LMAX))
+    coarse = scenario.spectral.lmax_of_fields(min(scenario.lmax, COARSE_LMAX))
     with stages.progress("laws of the fields", MAX_ROUNDS) as report:
         laws = learn_laws(skies, silent, lmax_fields=coarse, report=report)
     with stages.progress("positive skies", MAX_ROUNDS) as report:

@@ -12,12 +12,12 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
+from assertions import refuse, refused
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from jaxtyping import Bool, Float, Int8, Shaped
 
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.trees import StoredTree, from_tree, opened_tree, quantity, to_tree, write_tree
 
 
@@ -234,7 +234,7 @@ def test_pixels_have_a_grid(tmp_path):
         assert "grid_mapping" not in file["mhz"].attrs
     with opened_tree(path, FORMAT, "a sky") as tree:
         assert same(sky(), from_tree(Sky, tree, str(path)))
-    with pytest.raises(InputError, match="its format is 'lusee_bayes example 1'"):
+    with refused("its format is 'lusee_bayes example 1'"):
         opened_tree(path, "lusee_bayes example 2", "a sky").__enter__()
 
 
@@ -248,7 +248,7 @@ def test_pixels_have_a_grid(tmp_path):
     ],
 )
 def test_what_fields_ask_for_is_checked(changes, words):
-    with pytest.raises(InputError, match=words):
+    with refused(words):
         from_tree(Sky, to_tree(sky(**changes)), "a file")
 
 
@@ -278,15 +278,9 @@ DAMAGED = {
     "no array": (lambda t: without(t, "sky"), "a file has no sky (it has "),
     "no group": (lambda t: without(t, "inner"), "a file has no inner (it has "),
     "within a group": (lambda t: without(t["inner"], "level"), "a file: inner has no level"),
-    "text for a number": (
-        lambda t: t.attrs.update(count="many"),
-        "count is 'many', expected a whole number",
-    ),
+    "text for a number": (lambda t: t.attrs.update(count="many"), "count is 'many', expected"),
     "half a count": (lambda t: t.attrs.update(count=2.5), "count is 2.5, expected a whole number"),
-    "NaN for a count": (
-        lambda t: t.attrs.update(count=np.nan),
-        "count is nan, expected a whole number",
-    ),
+    "NaN for a count": (lambda t: t.attrs.update(count=np.nan), "count is nan, expected"),
     "numbers for one": (lambda t: t.attrs.update(share=np.ones(2)), "expected a number"),
     "a number for text": (lambda t: t.attrs.update(name=3), "name is 3, expected text"),
     "not JSON": (lambda t: t.attrs.update(labels="{one"), "labels is '{one', expected JSON"),
@@ -333,6 +327,4 @@ def test_what_is_damaged_is_told_in_a_sentence(name):
     damage, words = DAMAGED[name]
     tree = to_tree(example())
     damage(tree)
-    with pytest.raises(InputError) as told:
-        from_tree(Everything, tree, "a file")
-    assert words in str(told.value) and "\n" not in str(told.value)
+    refuse(words, from_tree, Everything, tree, "a file")

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from assertions import refuse
+from experiments import offset_posterior
 from numpyro import handlers
 from scipy import stats
 
@@ -21,10 +22,9 @@ from lusee_bayes.experiment.model import (
     simulate,
     true_values,
 )
-from lusee_bayes.experiment.rounds import offset_posterior
 from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.experiment.unknowns import pointing_report
-from lusee_bayes.instrument.source_response import source_response
+from lusee_bayes.instrument.coupling import source_response
 from lusee_bayes.judge.residuals import residuals
 from lusee_bayes.sky.galaxy import galactic_unit_vector
 from lusee_bayes.systematics.context import Around

@@ -16,7 +16,6 @@ from lusee_bayes.experiment.instrument_sections import (
     MonopoleBeamSection,
     ResponseSection,
     ScalarBeamSection,
-    section_of_file,
 )
 from lusee_bayes.experiment.keys import keys_as_markdown, scenario_keys
 from lusee_bayes.experiment.scenario import Scenario, load_scenario, scenario_names
@@ -338,15 +337,13 @@ def test_the_section_of_another_file_is_put_up_alike(response, scalar):
         quadrature="luseepy",
         moon_temperature_k=250.0,
     )
-    assert section_of_file(scalar, arm) == arm.model_copy(update={"file": scalar})
+    assert arm.of_file(scalar) == arm.model_copy(update={"file": scalar})
     shared = {"turntable_offset_deg": 7.0, "quadrature": "luseepy", "moon_temperature_k": 250.0}
-    assert section_of_file(response, arm) == ResponseSection(file=response, **shared)
+    assert arm.of_file(response) == ResponseSection(file=response, **shared)
     ports = ResponseSection(file="own.fits", receiver="open", **shared)
-    assert section_of_file(scalar, ports) == ScalarBeamSection(file=scalar, **shared)
+    assert ports.of_file(scalar) == ScalarBeamSection(file=scalar, **shared)
     embedded = MonopoleBeamSection(turntable_offset_deg=7.0, length_m=2.0)
-    assert section_of_file(scalar, embedded) == ScalarBeamSection(
-        file=scalar, turntable_offset_deg=7.0
-    )
+    assert embedded.of_file(scalar) == ScalarBeamSection(file=scalar, turntable_offset_deg=7.0)
 
 
 KEYS = scenario_keys()

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from layout_4 import write_layout_4
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.flight_data import reduce_files
+from lusee_bayes.experiment.data_files import reduce_files
 from lusee_bayes.flight.gain_model import read_gain_table
 from lusee_bayes.flight.reduced import read_reduced, write_reduced
 from lusee_bayes.flight.session_files import read_session
@@ -25,7 +25,7 @@ from lusee_bayes.report.describe import describe
 from lusee_bayes.results.map_files import read_channels, read_information
 from lusee_bayes.runs import folder as folder_module
 from lusee_bayes.runs import map_run
-from lusee_bayes.sky.sky_files import write_alms
+from lusee_bayes.sky.sky_source import write_alms
 from lusee_bayes.testing.scenarios import small_scenario
 
 FEW, MANY = 2, 150 * SCALE

@@ -7,6 +7,7 @@ from dataclasses import replace
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from experiments import flagged
 from reference_linear import matrices
 from scipy import stats
 from scipy.stats import chi2
@@ -14,7 +15,6 @@ from scipy.stats import chi2
 import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.judge.chi2 import FALSE_ALARM, ChiSquare, stands_out, two_sided
 from lusee_bayes.judge.measures import data_freedom, preferences
 from lusee_bayes.judge.residuals import residuals
@@ -45,11 +45,6 @@ def both_sides(x, n):
     return 2 * min(chi2.sf(x, n), chi2.cdf(x, n))
 
 
-def flagged(data, flags):
-    layout = DataLayout.from_flags(flags)
-    return replace(data, layout=layout, data=layout.gather(data.layout.scatter(data.data)))
-
-
 def judged(model, data):
     """The residuals of a model's data."""
     posterior = model.condition(data.data)
@@ -73,8 +68,8 @@ def by_hand(model, data, index, prior):
 
 
 def covariance_of(model, prior):
-    a = np.asarray(model.coupling.dense())
-    return a @ np.diag(np.asarray(prior.variance())) @ a.T + np.asarray(model.noise.dense())
+    a, s, n = matrices(with_prior(model, prior))
+    return a @ s @ a.T + n
 
 
 def degrees_by_hand(model, index, prior):
@@ -89,32 +84,22 @@ FLAGS = np.zeros((16, 24), dtype=bool)
 FLAGS[3, 5], FLAGS[:, 11] = True, True
 
 
+EXACT = "noise.radiometer.form=exact"
+GAIN, BEAM = "noise.gain={sigma: 0.01}", "noise.beam={shift_mhz: 4}"
+LONG, ESSENTIAL = pytest.mark.long, pytest.mark.essential
+
+
 @pytest.mark.parametrize(
-    "case",
+    ("overrides", "flags"),
     [
-        pytest.param({"overrides": ()}, id="diagonal"),
-        pytest.param(
-            {"overrides": ("noise.radiometer.form=exact",)},
-            id="blocks",
-            marks=[pytest.mark.long, pytest.mark.essential],
-        ),
-        pytest.param(
-            {"overrides": ("noise.gain={sigma: 0.01}", "noise.beam={shift_mhz: 4}")},
-            id="banded and low rank",
-            marks=pytest.mark.long,
-        ),
-        pytest.param(
-            {
-                "overrides": ("noise.radiometer.form=exact", "noise.gain={sigma: 0.01}"),
-                "flags": FLAGS,
-            },
-            id="banded with gaps",
-            marks=pytest.mark.long,
-        ),
+        pytest.param((), None, id="diagonal"),
+        pytest.param((EXACT,), None, id="blocks", marks=[LONG, ESSENTIAL]),
+        pytest.param((GAIN, BEAM), None, id="banded and low rank", marks=LONG),
+        pytest.param((EXACT, GAIN), FLAGS, id="banded with gaps", marks=LONG),
     ],
 )
-def test_groups_and_single_data_by_hand(case):
-    model, data = simulated(*case["overrides"], flags=case.get("flags"))
+def test_groups_and_single_data_by_hand(overrides, flags):
+    model, data = simulated(*overrides, flags=flags)
     found = judged(model, data)
     wide, whole = found.split.wide.prior, found.split.instrument
     layout, run = data.layout, data.observation.run
@@ -134,9 +119,8 @@ def test_groups_and_single_data_by_hand(case):
         degrees = degrees_by_hand(model, index, wide)
         assert group.degrees == pytest.approx(degrees, abs=1e-4)
         assert group.p == pytest.approx(both_sides(group.chi2, group.degrees), rel=1e-6)
-        assert group.others_p == pytest.approx(
-            both_sides(whole.chi2 - group.chi2, whole.degrees - group.degrees), rel=1e-6
-        )
+        others = whole.chi2 - group.chi2, whole.degrees - group.degrees
+        assert group.others_p == pytest.approx(both_sides(*others), rel=1e-6)
     for datum in (0, 33, layout.size - 1):
         off, covariance, _ = by_hand(model, data, np.array([datum]), wide)
         assert found.z[datum] == pytest.approx(off[0] / np.sqrt(covariance[0, 0]), abs=1e-6)
@@ -201,13 +185,9 @@ def test_what_is_wrong_is_pointed_at(kind, name):
     bad = corrupted(data, where, 40.0 * np.sqrt(float(model.noise.diagonal().mean())))
     found = judged(model, bad)
     assert found.fit().level == "does not fit"
-    verdict = found.fit().text
     assert (kind, name) in [(group.kind, group.name) for group in found.suspects()]
-    assert (
-        f"{kind} {name}" in verdict
-        and "The others fit without" in verdict
-        and "leave it out" in verdict
-    )
+    for words in (f"{kind} {name}", "The others fit without", "leave it out"):
+        assert words in found.fit().text
     # and no other of its kind
     assert len(found.suspects()) == len({group.kind for group in found.suspects()})
 
@@ -336,11 +316,9 @@ def test_noise_that_is_wrong_is_no_matter_of_the_prior():
 
 def test_data_that_are_fewer_than_the_modes_leave_little():
     """Every sky explains them: what is left has few degrees of freedom, and no verdict."""
-    model = lb.LinearGaussian(
-        jnp.asarray(100.0 * np.random.default_rng(1).standard_normal((9, N_MODES))),
-        lb.HarmonicPrior(jnp.ones(5)),
-        lb.DiagonalCovariance(jnp.ones(9)),
-    )
+    a = jnp.asarray(100.0 * np.random.default_rng(1).standard_normal((9, N_MODES)))
+    prior, noise = lb.HarmonicPrior(jnp.ones(5)), lb.DiagonalCovariance(jnp.ones(9))
+    model = lb.LinearGaussian(a, prior, noise)
     found, _, _ = split_of(model, drawn(model, np.random.default_rng(2)), form="data")
     assert found.instrument.degrees == pytest.approx(0.01 * 9, rel=1e-3)
     assert 0.0 < found.instrument.p <= 1.0

@@ -80,16 +80,14 @@ def beams():
 
 @pytest.fixture(scope="module")
 def long_run(beams):
-    setup = Setup(beams, 0.1)
-    assert setup.coupling.shape == (512, N_MODES)
-    return setup
+    """512 data."""
+    return Setup(beams, 0.1)
 
 
 @pytest.fixture(scope="module")
 def short_run(beams):
-    setup = Setup(beams, 0.015)
-    assert setup.coupling.shape == (64, N_MODES)
-    return setup
+    """64 data, fewer than modes."""
+    return Setup(beams, 0.015)
 
 
 def assert_calibrated(z: np.ndarray):

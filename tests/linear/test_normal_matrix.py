@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from assertions import close, refuse
+from assertions import close, off, refuse
 
 import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_device, on_host
@@ -78,11 +78,9 @@ def test_equals_the_product_of_matrices(place, kind, order, missing):
     np.testing.assert_array_equal(got, got.T)
     # sums of some 500 terms, in another order
     close(got, expected, 1e-12)
-    if order:
-        other = a.T @ np.linalg.solve(n, a) - np.asarray(setting(order - 1, missing).dense()).T @ (
-            np.linalg.solve(n, np.asarray(setting(order - 1, missing).dense()))
-        )
-        assert np.abs(other).max() > 1e-4 * np.abs(expected).max()  # the order does matter here
+    if order:  # which does matter here
+        lower = np.asarray(setting(order - 1, missing).dense())
+        assert off(lower.T @ np.linalg.solve(n, lower), expected) > 1e-4
 
 
 @pytest.mark.parametrize("kind", [pytest.param("diagonal", marks=pytest.mark.long), "templates"])
@@ -127,8 +125,8 @@ def test_what_has_no_structure_is_refused():
     dense = lb.DenseCovariance(diagonal.dense())
     for noise in (dense, dense + lb.LowRankCovariance(jnp.ones((layout.size, 1)))):
         refuse("no structure in time", normal_matrix, coupling, noise)
-    with pytest.raises(lb.InputError, match="response of its own"):
-        normal_matrix(coupling.with_response(jnp.ones(layout.size)), diagonal)
+    response = coupling.with_response(jnp.ones(layout.size))
+    refuse("response of its own", normal_matrix, response, diagonal)
     refuse("N has shape", normal_matrix, coupling, lb.DiagonalCovariance(jnp.ones(7)))
 
 
@@ -159,19 +157,6 @@ def test_information_gives_the_posterior_of_the_dense_form(kind):
     residual = np.asarray(data - gaussian.predict(sky))
     chi2 = residual @ np.linalg.solve(np.asarray(gaussian.noise.dense()), residual)
     np.testing.assert_allclose(found.chi2(sky), chi2, rtol=1e-10)
-
-
-def test_information_under_another_prior():
-    gaussian = model()
-    data = jnp.asarray(np.random.default_rng(2).standard_normal(gaussian.n_data))
-    found, _ = gaussian.inform(data)
-    spectrum = np.asarray(gaussian.prior.spectrum) * 0.1
-    spectrum[3] = 0.0  # an ell that is known to be zero
-    other = lb.HarmonicPrior(jnp.asarray(spectrum))
-    expected = lb.LinearGaussian(gaussian.coupling, other, gaussian.noise).condition(data, "map")
-    got = found.posterior(other)
-    np.testing.assert_allclose(got.mean, expected.mean, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(got.log_evidence, expected.log_evidence, rtol=1e-11)
 
 
 @pytest.mark.parametrize("kind", ["diagonal", "low rank"])

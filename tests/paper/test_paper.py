@@ -257,6 +257,6 @@ def synthetic(name: str, agrees: bool) -> xr.Dataset:
 @pytest.mark.parametrize("agrees", [True, False])
 def test_every_claim_can_come_out_both_ways(agrees):
     cases = {name: synthetic(name, agrees) for name in paper.CASES}
-    verdicts = {claim.statement: claim.judge(cases) for claim in CLAIMS}
+    verdicts = {claim.paper: claim.verdict(cases) for claim in CLAIMS}
     wrong = {s: v for s, v in verdicts.items() if (v.agrees == "yes") != agrees}
     assert not wrong

@@ -11,7 +11,7 @@ from dataclasses import replace
 import equinox as eqx
 import numpy as np
 import pytest
-from experiments import draw_within, four_ports
+from experiments import draw_within, four_ports, unknowns_report
 from numpyro import handlers
 from scipy import stats
 
@@ -20,7 +20,7 @@ from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.experiment.model import full_model, simulate, true_values
 from lusee_bayes.experiment.rounds import settled
 from lusee_bayes.experiment.setup import Setup, set_up
-from lusee_bayes.experiment.unknowns import SKY, unknowns_report
+from lusee_bayes.experiment.unknowns import SKY
 from lusee_bayes.judge.levels import LEVELS
 from lusee_bayes.linear.amplitudes import template_amplitudes
 from lusee_bayes.sampling.hmc import Sampler

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from assertions import refused, within
-from experiments import density, four_ports, parts, program_arguments
+from experiments import density, four_ports, offset_posterior, parts, program_arguments
 from reference_linear import white_posterior
 from scipy.optimize import least_squares
 from scipy.stats import norm
@@ -22,7 +22,7 @@ from lusee_bayes.experiment.model import (
     true_signal,
     true_values,
 )
-from lusee_bayes.experiment.rounds import Inference, offset_posterior
+from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.instrument.products import all_products, labels
 from lusee_bayes.instrument.visibilities import Calibration
@@ -41,13 +41,16 @@ def warm(response_file) -> lb.Experiment:
     return lb.build(four_ports(response_file, RECEIVER % "marginalised", GROUND % "marginalised"))
 
 
+def ground(response_file, moon_k: float) -> np.ndarray:
+    return np.asarray(replace(lb.read_beam(response_file), moon_k=moon_k).background(20.0))
+
+
 def columns(response_file, n_times: int) -> np.ndarray:
     """What one standard deviation of each of the five adds to the data, made by hand."""
     grid = np.zeros((16, n_times, 5))
     for port, product in enumerate(AUTOS):
         grid[product, :, port] = 200.0
-    response = lb.read_beam(response_file)
-    warmer = response.background(20.0, 280.0) - response.background(20.0, 250.0)
+    warmer = ground(response_file, 280.0) - ground(response_file, 250.0)
     grid[:, :, 4] = warmer[:, None]
     return grid.reshape(-1, 5)
 
@@ -58,7 +61,7 @@ def joint(warm: lb.Experiment, response_file):
     t = columns(response_file, setup.layout.n_times)
     a = np.concatenate([np.asarray(setup.coupling.dense()), t], axis=1)
     prior = np.append(np.sqrt(np.asarray(setup.prior.variance())), np.ones(5))
-    constant = np.asarray(lb.read_beam(response_file).background(20.0, 250.0)).copy()
+    constant = ground(response_file, 250.0).copy()
     constant[AUTOS] += 2000.0
     noise = np.sqrt(np.asarray(radiometer(setup).diagonal()))
     rest = data - np.repeat(constant, setup.layout.n_times)
@@ -103,10 +106,10 @@ def test_powers_in_volts_and_their_slope(response_file):
     per_kelvin = lb.read_beam(response_file).per_kelvin(20.0)
     keys = "slope: -2, reference_mhz: 5"
     volts = set_up(four_ports(response_file, f"noise.receiver={{power_v2_hz: 1e-17, {keys}}}"))
-    ground = lb.read_beam(response_file).background(20.0, 250.0)[AUTOS]
-    np.testing.assert_allclose(volts.background[AUTOS] - ground, 1e-17 / 16 / per_kelvin, rtol=1e-9)
+    moon = ground(response_file, 250.0)[AUTOS]
+    np.testing.assert_allclose(volts.background[AUTOS] - moon, 1e-17 / 16 / per_kelvin, rtol=1e-9)
     kelvin = set_up(four_ports(response_file, f"noise.receiver={{power_k: 160, {keys}}}"))
-    np.testing.assert_allclose(kelvin.background[AUTOS] - ground, 10.0, rtol=1e-9)
+    np.testing.assert_allclose(kelvin.background[AUTOS] - moon, 10.0, rtol=1e-9)
 
 
 def test_receivers_of_antennas_that_know_no_volts():
@@ -349,12 +352,21 @@ def test_rounds_find_the_mode_and_the_first_order_does_not(experiment, response_
     # every unknown, and every direction of them
     assert np.abs(off(found) / std).max() < 0.05
     assert np.abs(root @ off(found)).max() < 0.05
-    # about the sky of gains that are right
-    around = Around(experiment.data, sky=np.linalg.lstsq(a, d - offset, rcond=None)[0])
+    # first order leaves out what goes as the square of the way to the mode: about gains that are
+    # three prior standard deviations too high, three times as far as their prior means, it is wrong
+    # by a hundred times what is allowed; rounds lead to the mode from there, too
+    high = np.full(4, 3.0)
+    sky = np.linalg.lstsq(a, d / per_port(high) - offset, rcond=None)[0]
+    values = {f"gain_{port}": 0.01 * z for port, z in enumerate(high)}
+    around = replace(found.around, values=values, sky=sky)
+    ways = np.linalg.norm([mode[21:] - high, mode[21:]], axis=1)
+    assert ways[0] > 3.0 * ways[1]
     model, unknowns = model_about(setup, around)
     first = Inference(model, unknowns, model.condition(d), 1, around)
-    assert np.abs(off(first) / std).max() > 0.5
-    assert np.abs(root @ off(first)).max() > 50.0
+    assert np.abs(off(first) / std).max() > 5.0
+    assert np.abs(root @ off(first)).max() > 5.0
+    again = lb.infer(replace(experiment, around=around))
+    assert np.abs(off(again) / std).max() < 0.05
     # the joint mode is another: each of 21 skies and powers gains by being 0.5 % smaller
     assert force.min() > 0.04
     joint = least_squares(residuals, mode, jacobian, args=(np.zeros(4),), **tight).x

@@ -44,7 +44,7 @@ from lusee_bayes.systematics.sources import (
     SourceSection,
     source_responses,
 )
-from lusee_bayes.systematics.systematic import normal_within
+from lusee_bayes.systematics.systematic import Unknown
 from lusee_bayes.testing.scenarios import small_scenario
 
 # Cas A is up, For A has an amplitude for every two of the six samples, and the last lies near the
@@ -372,13 +372,13 @@ def test_antennas_that_cannot_be_sampled(parameters, message):
 
 def test_the_nearer_end_is_named():
     with pytest.raises(lb.InputError, match="at most 180"):
-        normal_within("angle", 170.0, 20.0, 0.0, 180.0)
+        Unknown("angle", 170.0, 20.0, low=0.0, high=180.0).prior()
     # a quarter of a percent is allowed: 2.81 standard deviations
-    normal_within("angle", 180.0 - 2.82, 1.0, 0.0, 180.0)
+    Unknown("angle", 180.0 - 2.82, 1.0, low=0.0, high=180.0).prior()
     with pytest.raises(lb.InputError, match="0.3% of its weight"):
-        normal_within("angle", 180.0 - 2.80, 1.0, 0.0, 180.0)
+        Unknown("angle", 180.0 - 2.80, 1.0, low=0.0, high=180.0).prior()
     with pytest.raises(lb.InputError, match="standard deviation of angle must be positive"):
-        normal_within("angle", 1.0, 0.0)
+        Unknown("angle", 1.0, 0.0, low=0.0).prior()
 
 
 def test_bands_beyond_the_highest_ell():
