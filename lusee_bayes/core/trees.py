@@ -6,7 +6,7 @@ dataclasses with arrays are groups, and tuples of dataclasses of numbers and tex
 Whatever else JSON holds, other dataclasses too, is an attribute in JSON.
 
 Arrays say their unit and what they are with :func:`quantity`, as the CF conventions have it. Those
-on one of the dimensions :data:`HEALPIX` have the grid mapping of HEALPix of CF 1.13: a variable
+on one of the dimensions :data:`.HEALPIX` have the grid mapping of HEALPix of CF 1.13: a variable
 that names grid and order, and the index of every pixel.
 
 Files are written with xarray, and read with h5py, which takes a tenth of the time.
@@ -29,7 +29,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing, user_path
-from lusee_bayes.core.formats import header, require_format
+from lusee_bayes.core.formats import header, require_format, with_grid
 from lusee_bayes.core.layouts import Attribute, Layout, Unloaded, Unread, Variable
 from lusee_bayes.core.lazy import pandas as pd
 from lusee_bayes.core.lazy import xarray as xr
@@ -45,8 +45,6 @@ NUMBERS = {int: "integer", float: "real", bool: "boolean"}
 KINDS = {"f": "real", "c": "complex", "i": "integer", "u": "integer", "b": "boolean", "U": "text"}
 ANY = {"missing": True, "low": -np.inf, "high": np.inf}
 GAPS = {"kind": "real"}
-# dimensions that are the pixels of a HEALPix map in RING order
-HEALPIX = ("pixel", "pixels", "region")
 # how netCDF marks arrays in HDF5 that stand for a dimension alone
 DIMENSION = b"This is a netCDF dimension but not a netCDF variable"
 
@@ -158,27 +156,6 @@ def write_tree(
     with replacing(path) as partial:
         tree.to_netcdf(partial, engine="h5netcdf")
     return user_path(path)
-
-
-def with_grid(dataset: xr.Dataset) -> xr.Dataset:
-    """The same with the grid of all arrays in pixels, of whole maps, as CF 1.13 has it."""
-    for dim in {*HEALPIX} & {*dataset.dims}:
-        n = dataset.sizes[dim]
-        grid, index = f"{dim}_grid", f"{dim}_index"
-        for variable in dataset.variables.values():
-            if dim in variable.dims:
-                variable.attrs["grid_mapping"] = grid
-        mapping = {
-            "grid_mapping_name": "healpix",
-            "indexing_scheme": "ring",
-            "refinement_level": round(np.log2(n / 12) / 2),
-        }
-        indices = {"standard_name": "healpix_index", "units": "1"}
-        packed = {"zlib": True, "shuffle": True}
-        dataset = dataset.assign_coords(
-            {index: (dim, np.arange(n, dtype=np.int32), indices, packed)}
-        ).assign({grid: ((), np.int8(0), mapping)})
-    return dataset
 
 
 class StoredTree:
