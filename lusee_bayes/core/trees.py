@@ -54,6 +54,7 @@ def quantity(
     long_name: str = "",
     *,
     checks: Mapping[str, Any] | None = None,
+    attributes: Mapping[str, Any] | None = None,
     packed: bool = False,
     **options: Any,
 ) -> Any:
@@ -68,13 +69,15 @@ def quantity(
     checks : mapping, optional
         What a file is checked for, as of :class:`.Variable`: ``low``, ``grows`` and others. By
         default there may be any numbers.
+    attributes : mapping, optional
+        Further ones of CF's, such as ``flag_meanings``.
     packed : bool
         Compress it in files.
     **options
         As of ``dataclasses.field``.
     """
     said = {"units": units, "long_name": long_name}
-    attributes = {name: words for name, words in said.items() if words}
+    attributes = {name: words for name, words in said.items() if words} | dict(attributes or {})
     encoding = {"zlib": True, "complevel": 1} if packed else {}
     metadata = {"attributes": attributes, "checks": checks or ANY, "encoding": encoding}
     return field(metadata=metadata, **options)
