@@ -44,8 +44,7 @@ from lusee_bayes.judge.chi2 import ChiSquare, stands_out, two_sided
 from lusee_bayes.judge.measures import expected_chi2
 from lusee_bayes.judge.residuals import Residuals
 from lusee_bayes.judge.split import WIDER, with_sky
-from lusee_bayes.linear.information import Information
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import FromInformation, LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.prior import HarmonicPrior
 from lusee_bayes.systematics.context import Around
@@ -284,15 +283,10 @@ class UnderAnySky:
         n_ells = lmax_of(coupling.shape[1]) + 1
         more = max(0, n_ells - len(self.spectrum))
         spectrum = np.pad(self.spectrum, (0, more), mode="edge")[:n_ells]
-        information, posterior = Information.of(
-            coupling,
-            HarmonicPrior(spectrum),
-            self.model.noise,
-            self.model.offset,
-            np.asarray(self.data.data),
-        )
-        posterior, n = on_host(posterior), self.model.n_data
-        chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
+        model = replace(self.model, coupling=coupling, prior=HarmonicPrior(spectrum))
+        solution = model.condition(np.asarray(self.data.data), FromInformation)
+        posterior, n = solution.posterior, model.n_data
+        chi2 = float(solution.information.chi2(posterior.mean) + posterior.prior_chi2())
         degrees = n - with_sky(n - expected_chi2(posterior, n))
         return ChiSquare(chi2, float(degrees)), posterior
 

@@ -31,8 +31,7 @@ from lusee_bayes.instrument.products import DataLayout, all_products
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.left_out import DataGroup, LeftOut, Missed, groups_of
 from lusee_bayes.judge.split import WIDER, Split
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
-from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.linear.linear_gaussian import Solution
 from lusee_bayes.systematics.context import Around
 
 # of the times beyond the limit, those within this share of the worst go in one round
@@ -183,8 +182,8 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Groups
     if 8.0 * ARRAYS * n * (setup.prior.size + n * across) > MOST_MEMORY * memory_limit():
         return None
     if settle:
-        model, posterior = on_host(_conditioned(setup, data))
-        wide = Split.of(posterior, 0.0, model.n_data).wide
+        solution = _solved(setup, data)
+        model, wide = solution.model, Split.of(solution.posterior, 0.0, data.layout.size).wide
         prior = wide.prior
     else:
         model, wide = on_host(model_about(setup, Around(data))[0]), None
@@ -193,13 +192,12 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Groups
     return GroupsCompared.of(left_out, data)
 
 
-def _conditioned(setup: Setup, data: Visibilities) -> tuple[LinearGaussian, Posterior]:
-    """Model and posterior, in as many rounds as N needs; in one where bad data let none settle."""
+def _solved(setup: Setup, data: Visibilities) -> Solution:
+    """Solve in as many rounds as N needs; in one where bad data let none settle."""
     found = settled(setup, data)
     if found.unsettled:
-        model, _ = model_about(setup, Around(data))
-        return model, model.condition(data.data)
-    return found.model, found.posterior
+        return model_about(setup, Around(data))[0].condition(data.data)
+    return found.solution
 
 
 MAX_ROUNDS = 10

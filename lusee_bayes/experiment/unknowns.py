@@ -203,7 +203,7 @@ class Unknowns:
     sky_std: float
 
     @classmethod
-    def of(cls, experiment: Experiment, found: Inference, reference: Modes) -> Unknowns | None:
+    def of(cls, experiment: Experiment, found: Inference) -> Unknowns | None:
         """Of data and their model; None if that has no such unknowns.
 
         Parameters
@@ -211,14 +211,12 @@ class Unknowns:
         experiment : Experiment
         found : Inference
             Of these data alone.
-        reference : (modes,) array
-            A sky near its posterior mean, in K.
         """
         listed = [s for s in found.expanded if not s.systematic.has_table]
         if not listed:
             return None
         columns = np.concatenate([s.columns for s in listed], axis=1)
-        amplitudes = amplitudes_of_sky(found.model, reference, experiment.data.data, columns)
+        amplitudes = amplitudes_of_sky(found.solution, columns)
         names, parts = _like_the_sky(listed)
         sky_std = float(np.sqrt(np.asarray(found.model.prior.variance())[0]))
         return cls(_rows(experiment, listed), amplitudes, names, parts, sky_std)
@@ -269,11 +267,8 @@ def unknowns_report(experiment: Experiment, found: Inference) -> UnknownsReport 
     UnknownsReport or None
         None if the model has no such unknowns.
     """
-    posterior = on_host(found.posterior)
-    unknowns = Unknowns.of(experiment, found, posterior.mean)
-    if unknowns is None:
-        return None
-    return unknowns.report(np.asarray(posterior.mean), np.asarray(posterior.covariance()))
+    unknowns, sky = Unknowns.of(experiment, found), found.solution
+    return None if unknowns is None else unknowns.report(sky.posterior.mean, sky.covariance)
 
 
 def _rows(experiment: Experiment, listed: list[Expanded]) -> tuple[dict[str, Any], ...]:
@@ -349,9 +344,7 @@ class PointingReport:
         return lines
 
 
-def pointing_report(
-    experiment: Experiment, found: Inference, covariance: ModesMatrix
-) -> PointingReport:
+def pointing_report(experiment: Experiment, found: Inference) -> PointingReport:
     """Work out the offsets of the model, and those that the data prefer besides.
 
     Parameters
@@ -359,13 +352,11 @@ def pointing_report(
     experiment : Experiment
     found : Inference
         Of these data alone.
-    covariance : (modes, modes) array
-        Of the posterior, in K^2.
     """
-    sky = np.asarray(found.posterior.mean)
+    sky = found.posterior.mean
     table = None if found.offsets is None else _table(experiment, found, sky)
     values = {} if table is None else dict(zip(table["offset"], table["value"], strict=True))
-    return PointingReport(table, _preferred(experiment, found, covariance, sky, values))
+    return PointingReport(table, _preferred(experiment, found, sky, values))
 
 
 def _table(experiment: Experiment, found: Inference, sky: Modes) -> pd.DataFrame:
@@ -386,11 +377,7 @@ def _table(experiment: Experiment, found: Inference, sky: Modes) -> pd.DataFrame
 
 
 def _preferred(
-    experiment: Experiment,
-    found: Inference,
-    covariance: ModesMatrix,
-    sky: Modes,
-    values: dict[str, float],
+    experiment: Experiment, found: Inference, sky: Modes, values: dict[str, float]
 ) -> pd.DataFrame:
     setup, data = experiment.setup, experiment.data
     n_runs = setup.observation.n_runs
@@ -414,9 +401,7 @@ def _preferred(
                 first = stretch * length
                 rows.append({"offset": name, "first_day": first, "last_day": first + length - 1})
                 columns.append(column)
-    told = preferences(
-        found.model, found.posterior, covariance, data.data, np.stack(columns, axis=1)
-    )
+    told = preferences(found.solution, np.stack(columns, axis=1))
     table = pd.DataFrame(rows)
     return table.assign(value=told.amplitude, std=told.std, chi2_gain=told.gain)
 
@@ -439,8 +424,7 @@ def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
     """
     setup, data = experiment.setup, experiment.data
     held = next(s for s in inference.expanded if isinstance(s.systematic, PointSources))
-    own, found = held.systematic, (inference.model, inference.posterior, data.data)
-    amplitudes = template_amplitudes(*found, held.columns)
+    own, amplitudes = held.systematic, template_amplitudes(inference.solution, held.columns)
     mean, std = own.means + own.stds * amplitudes.mean, own.stds * amplitudes.std
     jansky = 1.0 / kelvin_steradian(1.0, experiment.scenario.frequency_mhz)
     listed = [(s, block) for s in own.sources for block in range(s.n_blocks)]

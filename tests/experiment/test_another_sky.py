@@ -31,6 +31,7 @@ from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.experiment.sky_sections import FileSkySection
 from lusee_bayes.instrument.products import DataLayout, to_matrix, to_real
 from lusee_bayes.judge.residuals import residuals
+from lusee_bayes.linear.linear_gaussian import FromInformation
 from lusee_bayes.noise.instrument_errors import with_gains
 from lusee_bayes.systematics.context import Around
 from lusee_bayes.systematics.gain_drifts import gains_about
@@ -143,11 +144,10 @@ def test_the_default_path_with_drifts(sigma, test_data):
         found = lb.infer(experiment)
         around = Around(data, seen["true"])
         setup = set_up(scenario, data)
-        information = full_model(setup, around).inform(data.data)[0]
+        information = full_model(setup, around).condition(data.data, FromInformation).information
         prior = learned_prior(setup, setup.family, information).prior
-        ideal = replace(
-            found, posterior=full_model(replace(setup, prior=prior), around).condition(data.data)
-        )
+        model = full_model(replace(setup, prior=prior), around)
+        ideal = replace(found, solution=model.condition(data.data))
         n = len(sky.modes)
         assert distance(found, sky.modes) / n == pytest.approx(
             distance(ideal, sky.modes) / n, abs=0.1
@@ -186,8 +186,7 @@ def diagnosed(wrong, scenario=None):
     data = wrong.make(scenario, sky(scenario.lmax), 1)
     experiment = lb.build(scenario, data)
     found = lb.infer(experiment)
-    chi2 = float(found.model.chi2(found.posterior.mean, data.data))
-    left = residuals(found.model, found.posterior, data, chi2 + float(found.posterior.prior_chi2()))
+    left = residuals(found.solution, data)
     return left, diagnose(experiment, found, left)
 
 

@@ -140,7 +140,7 @@ def test_a_matrix_without_structure_in_time(kind, monkeypatch):
 
 def test_what_the_posterior_saves_changes_nothing():
     model, data, *expected = observed("few", "blocks and templates")
-    posterior = model.condition(data.data)
+    posterior = model.condition(data.data).posterior
     found = LeftOut(model, data, posterior=posterior)
     check(found, data, *expected, every_kind(data))
 
@@ -192,7 +192,7 @@ def test_densities_of_groups_are_what_the_covariance_of_the_data_says():
         "product": [data.layout.product == j for j in range(16)],
         "day": [day == j for j in np.unique(day)],
     }
-    for found in held_out(model, model.condition(data.data), data):
+    for found in held_out(model.condition(data.data), data):
         chosen = groups.pop(found.kind)
         expected = sum(log_density(every) - log_density(~inside) for inside in chosen)
         assert (found.groups, found.n) == (len(chosen), len(less))

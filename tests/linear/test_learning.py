@@ -13,6 +13,7 @@ from scipy.optimize import minimize
 
 import lusee_bayes as lb
 from lusee_bayes.linear.information import integrated_out
+from lusee_bayes.linear.linear_gaussian import FromInformation
 from lusee_bayes.priors.families import IsotropicFamily
 from lusee_bayes.priors.learning import (
     ROUNDING,
@@ -38,7 +39,7 @@ def information_of(sky: np.ndarray, noise: float = 30.0, seed: int = 2) -> lb.In
         lb.HarmonicPrior(np.full(LMAX + 1, 1e8)),
         lb.DiagonalCovariance(np.full(N_DATA, noise**2)),
     )
-    return model.inform(data)[0]
+    return model.condition(data, FromInformation).information
 
 
 @dataclass(frozen=True)
@@ -157,7 +158,9 @@ def test_raised_information_is_that_of_raised_noise():
             coupling,
             lb.HarmonicPrior(np.full(LMAX + 1, 1e4)),
             lb.DiagonalCovariance(np.full(N_DATA, variance)),
-        ).inform(data)[0]
+        )
+        .condition(data, FromInformation)
+        .information
         for variance in (9.0, 63.0)
     )
     raised, sky = plain.raised(7.0), rng.standard_normal(n)

@@ -8,6 +8,7 @@ import pytest
 from scipy import stats
 
 import lusee_bayes as lb
+from lusee_bayes.linear.linear_gaussian import FromInformation
 from lusee_bayes.priors.families import FREEDOM, Hyperprior, IsotropicFamily
 from lusee_bayes.priors.learning import learn
 
@@ -22,7 +23,9 @@ def information_of(family, seed=3):
     coupling = rng.standard_normal((N_DATA, len(sky))) / 3.0
     noise = lb.DiagonalCovariance(np.full(N_DATA, NOISE**2))
     model = lb.LinearGaussian(coupling, lb.HarmonicPrior(np.full(LMAX + 1, 1e8)), noise)
-    return model.inform(coupling @ sky + NOISE * rng.standard_normal(N_DATA))[0]
+    return model.condition(
+        coupling @ sky + NOISE * rng.standard_normal(N_DATA), FromInformation
+    ).information
 
 
 @pytest.mark.long

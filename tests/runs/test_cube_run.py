@@ -72,7 +72,7 @@ def test_independent_channels_are_maps_of_each_frequency(independent):
         experiment = lb.build(lb.load_scenario("fiducial", settings))
         data = experiment.data
         model = full_model(experiment.setup, Around(data))
-        expected = model.condition(data.data)
+        expected = model.condition(data.data).posterior
         here, std = channels.dataset.isel(frequency=number), np.asarray(expected.std())
         assert (np.abs(here["mean"] - np.asarray(expected.mean)) / std).max() < 1e-6
         # standard deviations of the normal equations

@@ -184,18 +184,22 @@ def burst():
     chains = lb.sample(
         PROGRAM.model, arguments, lb.Sampler(warmup=100, draws=300, algorithm="hmc"), white
     )
-    good = lb.LinearGaussian(
-        np.asarray(gaussian.coupling.dense())[~hit],
-        gaussian.prior,
-        lb.DiagonalCovariance(np.asarray(gaussian.noise.diagonal())[~hit]),
-    ).condition(dirty[~hit])
+    good = (
+        lb.LinearGaussian(
+            np.asarray(gaussian.coupling.dense())[~hit],
+            gaussian.prior,
+            lb.DiagonalCovariance(np.asarray(gaussian.noise.diagonal())[~hit]),
+        )
+        .condition(dirty[~hit])
+        .posterior
+    )
     return SimpleNamespace(
         bad=np.isin(np.arange(layout.n_times), bad),
         layout=layout,
         gaussian=gaussian,
         dirty=dirty,
-        clean=gaussian.condition(np.asarray(clean.data.data)),
-        naive=gaussian.condition(dirty),
+        clean=gaussian.condition(np.asarray(clean.data.data)).posterior,
+        naive=gaussian.condition(dirty).posterior,
         good=good,
         chains=chains,
         skies=chains.sites["sky"].reshape(-1, good.mean.shape[0]),
