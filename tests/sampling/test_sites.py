@@ -164,7 +164,7 @@ def test_a_prior_without_density_has_no_white_coordinates():
 def test_the_density_of_z_is_the_programs_own_times_the_determinant(gaussian, case, z):
     """For any coordinates, and a program for which they are the wrong ones."""
     arguments, right = case
-    wrong = lb.Whitening.of(gaussian.condition(3.0 + 2.0 * arguments["data"], "data").posterior)
+    wrong = lb.Whitening.of(gaussian.condition(3.0 + 2.0 * arguments["data"], InData).posterior)
     wrong = eqx.tree_at(
         lambda w: (w.root, w.log_det), wrong, (2.0 * wrong.root, wrong.log_det + 9 * np.log(2.0))
     )
