@@ -26,7 +26,7 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Ells, Grid, Square, on_host
+from lusee_bayes.core.arrays import Ells, Grid, Square
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, mean_over_m, mode_numbers, n_modes, turn_about_z
 from lusee_bayes.core.linalg import solve_lower
@@ -268,7 +268,7 @@ class UnderAnySky:
     @classmethod
     def of(cls, setup: Setup, data: Visibilities, model: LinearGaussian) -> UnderAnySky:
         """Under a prior that allows any sky, as bright as the data ask for."""
-        prior = on_host(setup.prior if setup.family is None else setup.family.expected())
+        prior = setup.prior if setup.family is None else setup.family.expected()
         power = np.asarray(prior.variance())
         if prior.white_mean is not None:
             power = power + np.asarray(prior.colour(prior.white_mean)) ** 2
@@ -276,7 +276,7 @@ class UnderAnySky:
         modelled = float(np.median(np.asarray(setup.signal)[autos]))
         brighter = np.nanmedian(np.asarray(data.grid())[autos]) / modelled
         spectrum = mean_over_m(power) * (WIDER * np.fmax(1.0, brighter)) ** 2
-        return cls(setup, data, on_host(model), spectrum)
+        return cls(setup, data, model, spectrum)
 
     def wide(self, coupling: Coupling) -> tuple[ChiSquare, Posterior]:
         """Residual chi^2, and the posterior under the wide prior."""
@@ -310,7 +310,7 @@ class UnderAnySky:
         right = np.asarray(layout.gather(mistake.undone(filled(self.data))))
         data = replace(self.data, data=right)
         try:
-            model = on_host(full_model(self.setup, Around(data)))
+            model = full_model(self.setup, Around(data))
         except InputError:  # without it, some auto is not positive
             return ChiSquare(np.inf, float(layout.size))
         return replace(self, data=data, model=model).wide(model.coupling)[0]

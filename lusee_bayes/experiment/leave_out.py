@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Grid, GridFlags, TimeFlags, Vector, on_host
+from lusee_bayes.core.arrays import Grid, GridFlags, TimeFlags, Vector
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.lazy import special
@@ -186,7 +186,7 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Groups
         model, wide = solution.model, Split.of(solution.posterior, 0.0, data.layout.size).wide
         prior = wide.prior
     else:
-        model, wide = on_host(model_about(setup, Around(data))[0]), None
+        model, wide = model_about(setup, Around(data))[0], None
         prior = model.prior.widened(WIDER)
     left_out = LeftOut(replace(model, prior=prior), data, posterior=wide)
     return GroupsCompared.of(left_out, data)

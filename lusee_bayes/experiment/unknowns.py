@@ -22,7 +22,7 @@ import pandas as pd
 from jaxtyping import Float
 from scipy.linalg import block_diag
 
-from lusee_bayes.core.arrays import Modes, ModesMatrix, on_host
+from lusee_bayes.core.arrays import Modes, ModesMatrix
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import base_model, radiometer, true_values
 from lusee_bayes.experiment.rounds import Inference, offset_posterior
@@ -365,7 +365,7 @@ def _table(experiment: Experiment, found: Inference, sky: Modes) -> pd.DataFrame
     # where values and sky are those that the data tell, only what is left of the offsets counts
     about = np.ones(len(prior)) if found.around.sky is None else std / prior
     noise = np.sqrt(np.asarray(radiometer(experiment.setup).diagonal()))
-    model = on_host(base_model(experiment.setup))
+    model = base_model(experiment.setup)
     left = found.offsets.systematic.beyond_first_order(model, sky, about)
     beyond = [float(np.sqrt(np.mean((left[name] / noise) ** 2))) for name in mean]
     parts = {"value": mean.values(), "std": std, "prior_std": prior, "beyond_first_order": beyond}
@@ -385,7 +385,7 @@ def _preferred(
     centre = dict.fromkeys(steps, 0.0) | values
     there = shifted(setup, centre)
     offsets = PointingOffsets.of(there, steps, centre)
-    about = Expanded.about(offsets, on_host(base_model(setup)), sky, centre)
+    about = Expanded.about(offsets, base_model(setup), sky, centre)
     per_unit = np.asarray(about.columns) / offsets.stds
     day = setup.observation.day
     length = -(-(int(day.max()) + 1) // MOST_STRETCHES)

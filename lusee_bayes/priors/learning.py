@@ -37,7 +37,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Draws, Square, on_host
+from lusee_bayes.core.arrays import Draws, Square
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky, cholesky, inverse_from_cholesky, invert_lower
@@ -222,7 +222,7 @@ def learn(
     InputError
         If S is not positive definite.
     """
-    rng, information = np.random.default_rng(seed), on_host(information)
+    rng = np.random.default_rng(seed)
     here = _at(family, information, family.hyperprior.start() if start is None else start)
     for steps in range(MAX_STEPS + 1):
         gradient, curvature = _slope(family, here, rng, SIMULATIONS)
@@ -252,7 +252,6 @@ def learn_whatever_fits(
     family, information, start, seed
         As for :func:`learn`.
     """
-    information = on_host(information)
     demanded = demanded_factor(information, family.expected())
     for factor in demanded * HIGHER:
         try:
@@ -420,7 +419,6 @@ def draws_with_parameters(
     drawn = np.empty((n, information.n_modes))
     if not n:
         return drawn
-    information = on_host(information)
     root = np.linalg.cholesky(learned.covariance)
     sets = min(n, max(LEAST, -(-n // SHARED)))
 
