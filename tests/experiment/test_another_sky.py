@@ -14,7 +14,6 @@ import wrong_data
 from scipy import linalg, stats
 
 import lusee_bayes as lb
-from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.harmonics import lmax_of, synthesis_matrix
 from lusee_bayes.experiment.diagnosis import (
     MixedProducts,
@@ -31,7 +30,6 @@ from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.experiment.sky_sections import FileSkySection
 from lusee_bayes.instrument.products import DataLayout, to_matrix, to_real
 from lusee_bayes.judge.residuals import residuals
-from lusee_bayes.linear.linear_gaussian import FromInformation
 from lusee_bayes.noise.instrument_errors import with_gains
 from lusee_bayes.systematics.context import Around
 from lusee_bayes.systematics.gain_drifts import gains_about
@@ -67,7 +65,7 @@ def measured(scenario, seed, scale=1e-3):
 
 
 def distance(inference, truth):
-    posterior = on_host(inference.posterior)
+    posterior = inference.posterior
     off = truth - np.asarray(posterior.mean)
     return float(off @ np.linalg.solve(np.asarray(posterior.covariance()), off))
 
@@ -144,7 +142,7 @@ def test_the_default_path_with_drifts(sigma, test_data):
         found = lb.infer(experiment)
         around = Around(data, seen["true"])
         setup = set_up(scenario, data)
-        information = full_model(setup, around).condition(data.data, FromInformation).information
+        information = full_model(setup, around).condition(data.data).information
         prior = learned_prior(setup, setup.family, information).prior
         model = full_model(replace(setup, prior=prior), around)
         ideal = replace(found, solution=model.condition(data.data))
@@ -152,7 +150,7 @@ def test_the_default_path_with_drifts(sigma, test_data):
         assert distance(found, sky.modes) / n == pytest.approx(
             distance(ideal, sky.modes) / n, abs=0.1
         )
-        posterior = on_host(found.posterior)
+        posterior = found.posterior
         share, directions = linalg.eigh(
             np.asarray(posterior.covariance()), np.asarray(posterior.prior.covariance())
         )
@@ -242,7 +240,7 @@ def test_chi2_of_mixed_data_is_that_of_matrices():
     data = wrong_data.measured(scenario, sky(4), 1)
     setup = set_up(scenario, data)
     experiment = lb.build(scenario, data)
-    model = on_host(lb.infer(experiment).model)
+    model = lb.infer(experiment).model
     spectrum = 1e2 * np.asarray(setup.sky.spectrum())
     here = UnderAnySky(setup, data, model, spectrum)
     base, posterior = here.wide(model.coupling)

@@ -74,11 +74,8 @@ def test_flagged_data_are_left_out_of_a_and_n(small_experiment):
     np.testing.assert_array_equal(variances(gapped.setup), variances(setup)[keep])
     # leaving a sample out is the limit of giving it no weight
     heavy = np.where(keep, variances(setup), 1e30)
-    limit = (
-        lb.LinearGaussian(setup.coupling, setup.prior, lb.DiagonalCovariance(jnp.asarray(heavy)))
-        .condition(whole.data)
-        .posterior
-    )
+    noise = lb.DiagonalCovariance(jnp.asarray(heavy))
+    limit = lb.LinearGaussian(setup.coupling, setup.prior, noise).condition(whole.data).posterior
     posterior = full_model(gapped.setup).condition(gapped.data.data).posterior
     shift = (posterior.mean - limit.mean) / posterior.std()
     assert float(jnp.abs(shift).max()) < 1e-6

@@ -14,7 +14,7 @@ from scipy.stats import multivariate_normal
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.linear.linear_gaussian import FromInformation, InData
+from lusee_bayes.linear.linear_gaussian import InData
 from lusee_bayes.systematics.context import Around
 
 
@@ -36,8 +36,7 @@ MEAN, WIDTH, EVIDENCE = 1e-5, 1e-5, 1e-3
 
 def assert_sum_is_the_whole(whole, data, models, parts):
     first, second = (
-        model.condition(part.data, FromInformation).information
-        for model, part in zip(models, parts, strict=True)
+        m.condition(part.data).information for m, part in zip(models, parts, strict=True)
     )
     got = (second + first).posterior(whole.prior)
     expected = whole.condition(data.data, form=InData).posterior
@@ -75,10 +74,7 @@ def random_parts():
 def test_likelihoods_and_sums_are_those_of_matrices():
     models, data = random_parts()
     skies = np.random.default_rng(5).normal(size=(6, N))
-    parts = [
-        model.condition(d, FromInformation).information
-        for model, d in zip(models, data, strict=True)
-    ]
+    parts = [m.condition(d).information for m, d in zip(models, data, strict=True)]
     expected = [
         multivariate_normal(np.zeros(m.n_data), m.noise.dense()).logpdf(
             np.asarray(d) - np.array([m.predict(sky) for sky in skies])
@@ -95,10 +91,7 @@ def test_likelihoods_and_sums_are_those_of_matrices():
 
 def test_the_posterior_of_a_sum_is_that_of_all_data():
     models, data = random_parts()
-    first, second = (
-        model.condition(d, FromInformation).information
-        for model, d in zip(models, data, strict=True)
-    )
+    first, second = (m.condition(d).information for m, d in zip(models, data, strict=True))
     total = second + first
     a = np.concatenate([np.asarray(model.coupling.dense()) for model in models])
     noise = block_diag(*(np.asarray(model.noise.dense()) for model in models))

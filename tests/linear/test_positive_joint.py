@@ -12,7 +12,6 @@ from scipy import optimize, stats
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import n_modes, synthesis_matrix
 from lusee_bayes.linear.joint import paired
-from lusee_bayes.linear.linear_gaussian import FromInformation
 from lusee_bayes.linear.positive_joint import (
     ChannelsInMemory,
     find_joint_mode,
@@ -81,7 +80,7 @@ def observed(skies, laws, seed=0, noise=0.05, n_data=40):
         model = lb.LinearGaussian(
             jnp.asarray(a), wide, lb.DiagonalCovariance(jnp.asarray(sigma**2))
         )
-        found.append((a, sigma, d, model.condition(jnp.asarray(d), FromInformation).information))
+        found.append((a, sigma, d, model.condition(jnp.asarray(d)).information))
     return found
 
 
@@ -197,7 +196,7 @@ def test_far_templates_are_reached_in_shorter_steps():
     a, sigma, d, _ = observed(skies, laws)[0]
     wide = lb.HarmonicPrior(jnp.asarray(np.full(LMAX + 1, 1e12)))
     model = lb.LinearGaussian(jnp.asarray(a), wide, lb.DiagonalCovariance(jnp.asarray(sigma**2)))
-    information = model.condition(jnp.asarray(20.0 * d), FromInformation).information
+    information = model.condition(jnp.asarray(20.0 * d)).information
     mode = find_joint_mode(skies, laws, ChannelsInMemory((information,)))
     assert np.exp(skies.grid.synthesise(mode.exponents[0])).mean() > 10.0
 

@@ -184,15 +184,11 @@ def burst():
     chains = lb.sample(
         PROGRAM.model, arguments, lb.Sampler(warmup=100, draws=300, algorithm="hmc"), white
     )
-    good = (
-        lb.LinearGaussian(
-            np.asarray(gaussian.coupling.dense())[~hit],
-            gaussian.prior,
-            lb.DiagonalCovariance(np.asarray(gaussian.noise.diagonal())[~hit]),
-        )
-        .condition(dirty[~hit])
-        .posterior
-    )
+    good = lb.LinearGaussian(
+        np.asarray(gaussian.coupling.dense())[~hit],
+        gaussian.prior,
+        lb.DiagonalCovariance(np.asarray(gaussian.noise.diagonal())[~hit]),
+    ).condition(dirty[~hit])
     return SimpleNamespace(
         bad=np.isin(np.arange(layout.n_times), bad),
         layout=layout,
@@ -200,9 +196,9 @@ def burst():
         dirty=dirty,
         clean=gaussian.condition(np.asarray(clean.data.data)).posterior,
         naive=gaussian.condition(dirty).posterior,
-        good=good,
+        good=good.posterior,
         chains=chains,
-        skies=chains.sites["sky"].reshape(-1, good.mean.shape[0]),
+        skies=chains.sites["sky"].reshape(-1, good.model.prior.size),
     )
 
 
