@@ -15,6 +15,7 @@ from scipy.stats import multivariate_normal
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
+from lusee_bayes.linear.linear_gaussian import InData
 from lusee_bayes.systematics.context import Around
 
 N = 9
