@@ -103,7 +103,7 @@ def posterior_of_a_year() -> dict:
     experiment = lb.build(scenario)
     data = experiment.data
     start = time.perf_counter()
-    posterior = full_model(experiment.setup, Around(data)).condition(data.data)
+    posterior = full_model(experiment.setup, Around(data)).condition(data.data).posterior
     posterior.std()
     return {
         "visibilities": int(data.layout.size),

@@ -19,20 +19,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Grid, GridFlags, Vector, on_host
+from lusee_bayes.core.arrays import Grid, GridFlags, Vector
 from lusee_bayes.core.checks import counted
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.lazy import special
 from lusee_bayes.core.progress import Stages, memory_limit
 from lusee_bayes.core.section import is_modelled
-from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.rounds import rebuilds, settled
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.products import DataLayout, auto_indices, ports
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.left_out import DataGroup, LeftOut, Missed, groups_of
 from lusee_bayes.judge.split import WIDER, Split
+from lusee_bayes.linear.linear_gaussian import Solution
 from lusee_bayes.systematics.context import Around, Setup
 
 # of the times beyond the limit, those within this share of the worst go in one round
@@ -179,15 +179,23 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Groups
     n, across = data.layout.size, is_modelled(setup.scenario.noise.gain)
     if 8.0 * ARRAYS * n * (setup.prior.size + n * across) > MOST_MEMORY * memory_limit():
         return None
-    found = settled(setup, data) if settle else None
-    if found is None or found.unsettled:  # bad data may let no rounds settle
-        model = on_host(full_model(setup, Around(data)))
-        posterior = model.condition(data.data) if settle else None
+    if settle:
+        solution = _solved(setup, data)
+        model, wide = solution.model, Split.of(solution.posterior, 0.0, data.layout.size).wide
+        prior = wide.prior
     else:
-        model, posterior = on_host((found.model, found.posterior))
-    wide = None if posterior is None else Split.of(on_host(posterior), 0.0, model.n_data).wide
-    prior = model.prior.widened(WIDER) if wide is None else wide.prior
-    return GroupsCompared.of(LeftOut(replace(model, prior=prior), data, posterior=wide), data)
+        model, wide = model_about(setup, Around(data))[0], None
+        prior = model.prior.widened(WIDER)
+    left_out = LeftOut(replace(model, prior=prior), data, posterior=wide)
+    return GroupsCompared.of(left_out, data)
+
+
+def _solved(setup: Setup, data: Visibilities) -> Solution:
+    """Solve in as many rounds as N needs; in one where bad data let none settle."""
+    found = settled(setup, data)
+    if found.unsettled:
+        return model_about(setup, Around(data))[0].condition(data.data)
+    return found.solution
 
 
 MAX_ROUNDS = 10

@@ -38,7 +38,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 from numpy.random import Generator
 
-from lusee_bayes.core.arrays import Draws, Square, on_host
+from lusee_bayes.core.arrays import Draws, Square
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky, cholesky, inverse_from_cholesky
@@ -206,7 +206,7 @@ def learn(
     InputError
         If S is not positive definite.
     """
-    rng, information = np.random.default_rng(seed), on_host(information)
+    rng = np.random.default_rng(seed)
     here = _at(family, information, family.hyperprior.start() if start is None else start)
     for steps in range(MAX_STEPS + 1):
         gradient, curvature = _slope(family, here, rng, SIMULATIONS)
@@ -236,7 +236,6 @@ def learn_whatever_fits(
     family, information, start, seed
         As for :func:`learn`.
     """
-    information = on_host(information)
     demanded = demanded_factor(information, family.expected())
     for factor in demanded * HIGHER:
         try:
@@ -398,7 +397,6 @@ def draws_with_parameters(
     drawn = np.empty((n, information.n_modes))
     if not n:
         return drawn
-    information = on_host(information)
     root = np.linalg.cholesky(learned.covariance)
     sets = min(n, max(LEAST, -(-n // SHARED)))
 

@@ -37,7 +37,6 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 
 from lusee_bayes.core import formats
-from lusee_bayes.core.arrays import on_host
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.formats import says
@@ -206,7 +205,7 @@ class ChannelsInFiles:
             for number in numbers:
                 information = function(number, _information(files, channels[number]))
                 sums = summed_information(sums, prior, number, information)
-            return on_host(sums)
+            return sums
 
         # the same blocks, and the same tree of them, whatever carries out the tasks
         blocks = [
@@ -584,7 +583,7 @@ def map_channels(
         n_solved = max(n_draws, N_DRAWS) if known else n_draws
         components = solve_components(left, files, n_solved, engine, stages)
         # for workers of other processes
-        write = partial(_write_joint_sky, mapped, on_host(components), scenario, files)
+        write = partial(_write_joint_sky, mapped, components, scenario, files)
         engine.each(Tasks(write, numbers, names), stages, "joint skies")
     found = tuple(files.read(c, "result", ChannelResult) for c in mapped)
     seconds, tied_evidence = stages.seconds, {"tie_log_evidence": tie_log_evidence}

@@ -283,7 +283,7 @@ def collapsed_draws(
 
     def model():
         gaussian = program.model(**arguments, data=jnp.asarray(data))
-        exact = gaussian.condition(data).sample(numpyro.prng_key())
+        exact = gaussian.condition(data).posterior.sample(numpyro.prng_key())
         sky = numpyro.sample("drawn sky", dist.Delta(exact, event_dim=1))
         replicated = gaussian.predict(sky) + gaussian.noise.sample(numpyro.prng_key())
         numpyro.deterministic("drawn data", replicated)

@@ -42,9 +42,8 @@ from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.judge.levels import LEVELS
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian, Whitened
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.linear.solver import Solver
 from lusee_bayes.sampling.least import N_BINS, require_draws, require_simulations
 
 Skies = Float[np.ndarray, "chains draws modes"]
@@ -266,8 +265,8 @@ def calibrate_sky(
     return replace(ranks, names=tuple(numbers.get(name, name) for name in ranks.names))
 
 
-def _sky_draws(solver: Solver, key: PRNGKeyArray, data: Array) -> Float[Array, "draws modes"]:
-    return solver.condition(data).sample(key, N_DRAWS)
+def _sky_draws(solver: Whitened, key: PRNGKeyArray, data: Array) -> Float[Array, "draws modes"]:
+    return solver.condition(data).posterior.sample(key, N_DRAWS)
 
 
 class SkyQuantities(eqx.Module):
@@ -275,7 +274,7 @@ class SkyQuantities(eqx.Module):
 
     Attributes
     ----------
-    solver : Solver
+    solver : Whitened
         Of the model that is conditioned on the data.
     modes : tuple of int
         Numbers of the single modes.
@@ -283,28 +282,29 @@ class SkyQuantities(eqx.Module):
         Directions in units of the prior.
     """
 
-    solver: Solver
+    solver: Whitened
     modes: tuple[int, ...] = eqx.field(static=True)
     directions: Float[Array, "projections white"]
 
     @classmethod
-    def spread(cls, solver: Solver, n_modes: int, n_projections: int, seed: int) -> SkyQuantities:
+    def spread(cls, solver: Whitened, n_modes: int, n_projections: int, seed: int) -> SkyQuantities:
         """Choose modes from the lowest to the highest ell, and random directions."""
-        size = solver.prior.size
+        size = solver.model.prior.size
         chosen = np.unique(np.linspace(0, size - 1, min(n_modes, size)).astype(int))
         rng = np.random.default_rng(seed)
-        directions = rng.standard_normal((n_projections, solver.prior.rank))
+        directions = rng.standard_normal((n_projections, solver.model.prior.rank))
         return cls(solver, tuple(int(c) for c in chosen), jnp.asarray(directions))
 
     def __call__(self, sky: Float[Array, " modes"], data: Float[Array, " data"]) -> dict:
         """Compute the quantities of one sky, given the data."""
         solver = self.solver
-        u = solver.prior.whiten(sky)
-        white = solver.factor.whiten(data if solver.offset is None else data - solver.offset)
+        u = solver.model.prior.whiten(sky)
+        offset = solver.model.offset
+        white = solver.factor.whiten(data if offset is None else data - offset)
         return {
             "mode": sky[np.array(self.modes)],
             "projection": self.directions @ u,
-            "distance": (solver.condition(data).whiten(sky[None])[0] ** 2).sum(),
+            "distance": (solver.condition(data).posterior.whiten(sky[None])[0] ** 2).sum(),
             "log likelihood": -0.5 * ((white - solver.whitened @ u) ** 2).sum(),
         }
 

@@ -188,7 +188,7 @@ def test_densities_of_groups_are_what_the_covariance_of_the_data_says():
         "product": [data.layout.product == j for j in range(16)],
         "day": [day == j for j in np.unique(day)],
     }
-    for found in held_out(model, model.condition(data.data), data):
+    for found in held_out(model.condition(data.data), data):
         chosen = groups.pop(found.kind)
         expected = sum(log_density(every) - log_density(~inside) for inside in chosen)
         assert (found.groups, found.n) == (len(chosen), len(less))

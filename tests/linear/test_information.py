@@ -15,6 +15,7 @@ from scipy.stats import multivariate_normal
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
+from lusee_bayes.linear.linear_gaussian import InData
 from lusee_bayes.systematics.context import Around
 
 N = 9
@@ -42,7 +43,7 @@ def random_parts():
 def test_likelihoods_and_sums_are_those_of_matrices():
     models, data = random_parts()
     skies = np.random.default_rng(5).normal(size=(6, N))
-    parts = [model.inform(d)[0] for model, d in zip(models, data, strict=True)]
+    parts = [m.condition(d).information for m, d in zip(models, data, strict=True)]
     expected = [
         multivariate_normal(np.zeros(m.n_data), m.noise.dense()).logpdf(
             np.asarray(d) - np.array([m.predict(sky) for sky in skies])
@@ -71,7 +72,7 @@ PRIORS = {
 @pytest.mark.parametrize("kind", PRIORS)
 def test_the_posterior_of_a_sum_is_that_of_all_data(kind):
     models, data = random_parts()
-    first, second = (model.inform(d)[0] for model, d in zip(models, data, strict=True))
+    first, second = (m.condition(d).information for m, d in zip(models, data, strict=True))
     total = second + first
     a = np.concatenate([np.asarray(model.coupling.dense()) for model in models])
     noise = block_diag(*(np.asarray(model.noise.dense()) for model in models))
@@ -93,13 +94,13 @@ def test_the_posterior_of_a_sum_is_that_of_all_data(kind):
 
 def test_information_about_other_modes_is_not_added():
     models, data = random_parts()
-    whole, _ = models[0].inform(data[0])
+    whole = models[0].condition(data[0]).information
     four = replace(
         models[0],
         coupling=lb.DenseCoupling(models[0].coupling.dense()[:, :4]),
         prior=lb.HarmonicPrior(jnp.asarray(SPECTRUM[:2])),
     )
-    few, _ = four.inform(data[0])
+    few = four.condition(data[0]).information
     with pytest.raises(lb.InputError, match="the other reference sky"):
         whole + few
     with pytest.raises(lb.InputError, match="needs a prior over the same modes"):
@@ -114,9 +115,10 @@ def test_a_second_cycle_at_full_size(exact_tilt):
     data, parts = experiment.data, [of_run(experiment.data, run) for run in (0, 1)]
     models = [full_model(lb.build(scenario, part).setup, Around(part)) for part in parts]
     whole = full_model(experiment.setup, Around(data))
-    first, second = (model.inform(part.data)[0] for model, part in zip(models, parts, strict=True))
+    each = zip(models, parts, strict=True)
+    first, second = (model.condition(part.data).information for model, part in each)
     got = (second + first).posterior(whole.prior)
-    expected = whole.condition(data.data, form="root")
+    expected = whole.condition(data.data, InData).posterior
     # the mean's last step may be 1e-6 standard deviations, and the gradient of the earlier data at
     # the mean of the later ones is a small difference; variances lose 1e-6 (Posterior)
     assert_same_map(got, expected, 1e-5)

@@ -77,7 +77,7 @@ def observed(skies, laws, seed=0, noise=0.05, n_data=40):
 def information_of(a, sigma, d, wide):
     prior = lb.HarmonicPrior(jnp.full(LMAX + 1, wide))
     noise = lb.DiagonalCovariance(jnp.asarray(sigma**2))
-    return lb.LinearGaussian(jnp.asarray(a), prior, noise).inform(jnp.asarray(d))[0]
+    return lb.LinearGaussian(jnp.asarray(a), prior, noise).condition(jnp.asarray(d)).information
 
 
 def rough(skies, level=0.3):

@@ -25,8 +25,9 @@ from lusee_bayes.judge.measures import (
     signal_to_noise,
 )
 from lusee_bayes.linear import posterior as posterior_module
-from lusee_bayes.linear.solver import FORMS
+from lusee_bayes.linear.linear_gaussian import FromInformation, InData, InMap
 
+FORMS = (InMap, InData, FromInformation)
 SPECTRUM = np.array([4.0, 1.0, 0.5, 0.25])
 PER_MODE = np.repeat(SPECTRUM, [1, 3, 5, 7])
 SIZES = [30, 9]  # more and fewer data than the 16 modes
@@ -45,7 +46,7 @@ def conditioned(n_data, form, prior=None, blind=False):
     a = jnp.asarray(a)
     a = prior.coupling(a) if isinstance(prior, lb.PixelPrior) else a
     model = lb.LinearGaussian(a, prior, lb.DenseCovariance(jnp.asarray(n)))
-    return model.condition(jnp.asarray(d), form), posterior(a, prior.covariance(), n, d)
+    return model.condition(jnp.asarray(d), form).posterior, posterior(a, prior.covariance(), n, d)
 
 
 cases = pytest.mark.parametrize(("n_data", "form"), [(n, f) for n in SIZES for f in FORMS])
@@ -66,7 +67,7 @@ def test_what_it_says_of_itself(n_data, form):
 
 
 def test_std_of_does_not_depend_on_the_chunks(monkeypatch):
-    post, _ = conditioned(30, "map")
+    post, _ = conditioned(30, InMap)
     directions = jnp.asarray(np.random.default_rng(0).normal(size=(23, 16)))
     whole = np.asarray(post.std_of(directions))
     monkeypatch.setattr(posterior_module, "CHUNK", 5)  # 4 chunks of 5 and one of 3
@@ -84,7 +85,7 @@ def test_draws_have_the_posteriors_mean_and_covariance(n_data, form):
 
 
 def test_the_draw_test_notices_sqrt_two():
-    post, expected = conditioned(30, "map")
+    post, expected = conditioned(30, InMap)
     draws = np.asarray(post.sample(jax.random.key(0), 20_000))
     narrow = expected.mean + (draws - expected.mean) / np.sqrt(2)
     with pytest.raises(AssertionError, match="sample covariance off"):
@@ -141,7 +142,7 @@ def test_whitening_inverts_mean_plus_root_times_z(n_data, form):
 
 def test_whitening_in_a_traced_program():
     """Under jit the spectrum's values are not known; the check of them must not get in the way."""
-    post, _ = conditioned(9, "data")
+    post, _ = conditioned(9, InData)
     skies = post.sample(jax.random.key(6), 3)
     traced = jax.jit(lambda posterior, x: posterior.whiten(x))(post, skies)
     np.testing.assert_allclose(traced, post.whiten(skies), atol=TOL)
@@ -194,7 +195,7 @@ def test_expected_chi2_and_prior_fraction_per_ell():
     rng = np.random.default_rng(5)
     a, variance = rng.standard_normal((60, 16)), rng.uniform(0.5, 2.0, 60)
     noise, prior = (lb.DiagonalCovariance(jnp.asarray(variance)), lb.HarmonicPrior(SPECTRUM))
-    post = lb.LinearGaussian(jnp.asarray(a), prior, noise).condition(jnp.zeros(60))
+    post = lb.LinearGaussian(jnp.asarray(a), prior, noise).condition(jnp.zeros(60)).posterior
     inverse = np.linalg.inv(a * PER_MODE @ a.T + np.diag(variance))
     assert expected_chi2(post, 60) == pytest.approx(variance @ np.diag(inverse), rel=1e-10)
     left = 1.0 - np.einsum("di,de,ei->i", a, inverse, a) * PER_MODE
@@ -223,20 +224,20 @@ def test_the_sky_that_never_rises_is_a_cap_round_the_north_pole():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("cycles", "form"), [(0.3, "map"), (0.1, "map"), (0.1, "data")])
+@pytest.mark.parametrize(("cycles", "form"), [(0.3, InMap), (0.1, InMap), (0.1, InData)])
 def test_a_row_is_what_the_map_shows_there_of_each_source(cycles, form):
     # the best mode's signal-to-noise squared times 1e-16 is what is lost: 1e-9
     given = ["lmax=12", f"observation.runs.0.cycles={cycles}", "noise.radiometer.factor=1e5"]
     experiment = lb.build(lb.load_scenario("fiducial", given))
     model = base_model(experiment.setup)
     solver = model.factorise(form)
-    posterior = solver.condition(experiment.data.data)
+    posterior = solver.condition(experiment.data.data).posterior
     y = pixel_matrix(4, 12)
     pixels = [0, 60, 131]
     rows = np.asarray(resolution_rows(posterior, y[pixels]))
     for source in (3, 60, 100):
         # noiseless data of a source of 1 K sr, mapped
-        mapped = solver.condition(model.coupling @ jnp.asarray(y[source])).mean
+        mapped = solver.condition(model.coupling @ jnp.asarray(y[source])).posterior.mean
         expected = y[pixels] @ np.asarray(mapped)
         peak = np.abs(rows @ y.T).max()
         np.testing.assert_allclose(rows @ y[source], expected, rtol=0, atol=1e-8 * peak)

@@ -63,7 +63,7 @@ def test_independent_channels_are_maps_of_each_frequency(independent):
         experiment = lb.build(lb.load_scenario("fiducial", settings))
         data = experiment.data
         model = full_model(experiment.setup, Around(data))
-        expected = model.condition(data.data)
+        expected = model.condition(data.data).posterior
         here = channels.dataset.isel(frequency=number)
         assert_same_map(here, expected, 1e-6)
         np.testing.assert_array_equal(here["truth"], np.asarray(data.truth))

@@ -61,7 +61,7 @@ def chains_of(sites):
 def drawn(setting):
     """(tree, chains) of the program sky."""
     model, data = setting
-    posterior = model.condition(data.data)
+    posterior = model.condition(data.data).posterior
     skies = np.asarray(posterior.sample(jax.random.key(3), N_CHAINS * N_DRAWS))
     chains = chains_of({"sky": skies.reshape(N_CHAINS, N_DRAWS, N_MODES)})
     tree = to_datatree(
@@ -78,7 +78,7 @@ def collapsed(setting):
     levels = np.exp(np.random.default_rng(8).uniform(-2.3, 2.3, (N_CHAINS, N_DRAWS)))
     chains = chains_of({"noise_level": levels})
     tree = to_datatree(
-        chains, lb.load_program("sky_marginal"), model, model.condition(data.data), data,
+        chains, lb.load_program("sky_marginal"), model, model.condition(data.data).posterior, data,
         n_predictive=N_CHAINS * N_DRAWS,
     )  # fmt: skip
     return tree, chains
@@ -187,7 +187,7 @@ def test_posterior_predictive_follows_the_posterior(drawn, setting, exact):
 def test_predictive_groups_are_thinned_and_know_which_draws_they_belong_to(setting):
     """4 x 30 draws to about 10: every twelfth."""
     model, data = setting
-    posterior = model.condition(data.data)
+    posterior = model.condition(data.data).posterior
     skies = np.asarray(posterior.sample(jax.random.key(1), 120)).reshape(4, 30, N_MODES)
     program = lb.load_program("sky")
     # noise a million times smaller than the sky tells which sky the data belong to
@@ -211,7 +211,7 @@ def test_predictive_groups_are_thinned_and_know_which_draws_they_belong_to(setti
 def test_another_seed_makes_other_predictive_draws_and_real_data_have_no_truth(setting):
     model, data = setting
     real = lb.Visibilities(data.data, data.layout, data.observation, 25.0)
-    posterior = model.condition(data.data)
+    posterior = model.condition(data.data).posterior
     chains = chains_of({"sky": np.asarray(posterior.sample(jax.random.key(1), 8))[None]})
     first, other = (
         to_datatree(chains, lb.load_program("sky"), model, posterior, d, seed=seed, n_predictive=8)
