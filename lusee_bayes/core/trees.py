@@ -44,7 +44,6 @@ NUMBERS = {int: "integer", float: "real", bool: "boolean"}
 # what an array is declared as by the kind of its dtype, and how one that may have any numbers is
 KINDS = {"f": "real", "c": "complex", "i": "integer", "u": "integer", "b": "boolean", "U": "text"}
 ANY = {"missing": True, "low": -np.inf, "high": np.inf}
-GAPS = {"kind": "real"}
 # how netCDF marks arrays in HDF5 that stand for a dimension alone
 DIMENSION = b"This is a netCDF dimension but not a netCDF variable"
 
@@ -242,10 +241,9 @@ def from_tree(kind: type[T], tree: xr.DataTree | StoredTree, where: str) -> T:
     """
     kinds, found = _fields(kind), dict[str, Any]()
     empty = _json(where, tree.attrs.get(EMPTY, "{}"))
-    arrays, values = (
-        {n: k.declared for n, k in kinds.items() if k.declared and n not in empty and of(k)}
-        for of in (lambda k: k.what == "array", lambda k: k.what != "array")
-    )
+    said = {n: k for n, k in kinds.items() if k.declared is not None and n not in empty}
+    arrays = {name: one.declared for name, one in said.items() if one.what == "array"}
+    values = {name: one.declared for name, one in said.items() if one.what != "array"}
     content = Layout(kind.__name__, arrays, values).checked(where, tree.variables, tree.attrs)
     for name, one in kinds.items():
         place = f"{where}: {name}"
@@ -345,9 +343,10 @@ def _rows(kind: type[T], tree: xr.DataTree | StoredTree, where: str) -> Iterator
     if not tree.variables:
         return
     kinds = _fields(kind)
+    # gaps make whole numbers real
+    as_real = {name: {"kind": "real"} if one.optional else {} for name, one in kinds.items()}
     columns = {
-        # gaps make whole numbers real
-        name: replace(one.declared, dims=("row",), optional=False, **(GAPS if one.optional else {}))
+        name: replace(one.declared, dims=("row",), optional=False, **as_real[name])
         for name, one in kinds.items()
     }
     found = Layout(kind.__name__, columns).checked(where, tree.variables, {}).arrays
