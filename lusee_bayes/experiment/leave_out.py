@@ -199,6 +199,10 @@ TOO_MANY = (
     "More than a fifth of the data are inconsistent with the rest, so that none was flagged: "
     "noise, gains or beams are not those of the data."
 )
+KEPT = (
+    "Product {port}{port}R is inconsistent with the rest and was kept, since the noise of port "
+    "{port}'s other products depends on it: check the gain and the receiver of port {port}."
+)
 # where all rules together would take more, it is not the data but noise, gains or beams
 MOST = 0.2
 # flagged without looking for another cause, whatever the rules of the reduction took
@@ -421,7 +425,8 @@ class _Rules:
                 return result or first, ""
             of_groups = of_groups | group.data
             if self.broken(gone | of_groups, gone | of_groups):
-                return first, _about_auto(self.auto_alone(gone | of_groups))
+                port = self.auto_alone(gone | of_groups)
+                return first, "" if port is None else KEPT.format(port=port)
             groups, base = (*groups, group), start.without(of_groups)
 
     def remark(self, gone: GridFlags, groups: tuple[DataGroup, ...], share: float) -> str:
@@ -440,16 +445,6 @@ class _Rules:
             f"Noise alone would cause {2.0 * n * self.false_alarm:.2g} such flags of times or "
             "values."
         )
-
-
-def _about_auto(port: int | None) -> str:
-    if port is None:
-        return ""
-    return (
-        f"Product {port}{port}R is inconsistent with the rest and was kept, since the noise of "
-        f"port {port}'s other products depends on it: check the gain and the receiver of port "
-        f"{port}."
-    )
 
 
 def without(setup: Setup, data: Visibilities, gone: GridFlags) -> tuple[Setup, Visibilities]:

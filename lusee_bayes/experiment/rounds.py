@@ -407,12 +407,9 @@ def named_priors(
             f"--priors: {OF_TRUE_SKY} takes C_ell of the scenario's sky, which nobody knows of "
             "measured data; leave it out, or give --truth if the data are of that sky"
         )
-    return {name: _section(NAMED[name], scenario.prior) for name in names}
-
-
-def _section(named: PriorSection, own: PriorSection) -> PriorSection:
-    """The scenario's own section if it is of the kind of a named one."""
-    if own.model != named.model:
-        return named
+    own, named = scenario.prior, {name: NAMED[name] for name in names}
     # isotropic priors differ in where C_ell comes from
-    return own if own.model != "isotropic" or own.origin == named.origin else named
+    return {
+        name: own if (own.model, own.origin) == (one.model, one.origin) else one
+        for name, one in named.items()
+    }
