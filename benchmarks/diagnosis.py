@@ -38,9 +38,7 @@ def main(lmax: int = 47) -> None:
         data = replace(good, data=factor * np.asarray(good.data))
         experiment = observed(scenario, data)
         found = infer(experiment)
-        model, posterior = found.model, found.posterior
-        chi2 = float(model.chi2(posterior.mean, data.data)) + float(posterior.prior_chi2())
-        left = residuals(model, posterior, data, chi2)
+        left = residuals(found.solution, data)
         for run in ("first", "again"):
             before = unit()
             start = time.perf_counter()

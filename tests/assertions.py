@@ -5,9 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
+import astropy.units as u
 import numpy as np
 import pytest
+import xarray as xr
 
 from lusee_bayes.core.errors import InputError
 
@@ -23,9 +26,44 @@ def off(got: object, expected: object) -> float:
     return np.abs(got - expected).max() / np.abs(expected).max()
 
 
+def assert_same_map(got: object, expected: object, sigma: float) -> None:
+    """Assert that means agree to ``sigma`` standard deviations, and these to that part."""
+    (mean, std), (other, width) = (_moments(one) for one in (got, expected))
+    assert (np.abs(mean - other) / width).max() < sigma
+    np.testing.assert_allclose(std, width, rtol=sigma)
+
+
+def _moments(of: object) -> list[np.ndarray]:
+    """Mean and standard deviation of a posterior, a channel or a file."""
+    if isinstance(of, xr.Dataset | xr.DataTree):
+        return [of[name].values for name in ("mean", "std")]
+    return [np.asarray(of.mean), np.asarray(of.std() if callable(of.std) else of.std)]
+
+
 def within(got: object, expected: object, atol: object) -> None:
     """Assert that arrays agree to so much, whatever their size."""
     np.testing.assert_allclose(got, expected, rtol=0, atol=atol)
+
+
+def require_conventions(path: Path) -> None:
+    """Assert that a file follows CF: its name for it, units that are some, and grids of pixels."""
+    with xr.open_datatree(path, engine="h5netcdf", decode_cf=False) as tree:
+        assert tree.attrs["Conventions"] == "CF-1.13" and tree.attrs["format"]
+        for group in tree.subtree:
+            variables = {str(name): variable for name, variable in group.variables.items()}
+            bounds = {variable.attrs.get("bounds") for variable in variables.values()}
+            for name, variable in variables.items():
+                said = variable.attrs
+                # columns of tables have words for their units, bounds the units of their variable
+                if variable.dtype.kind in "fc" and "columns" not in group.attrs:
+                    assert "units" in said or name in bounds, f"{path}{group.path}: {name}"
+                u.Unit(said.get("units", "1").split(" since ")[0])
+                pixels = {"pixel", "pixels", "region"} & set(variable.dims)
+                if pixels and said.get("standard_name") != "healpix_index":
+                    grid, n = variables[said["grid_mapping"]].attrs, variable.sizes[pixels.pop()]
+                    assert grid["grid_mapping_name"] == "healpix"
+                    assert grid["indexing_scheme"] == "ring"
+                    assert n == 12 * 4 ** grid["refinement_level"]
 
 
 @contextmanager

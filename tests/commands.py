@@ -16,6 +16,15 @@ def run(*arguments: object) -> int:
     return main([str(argument) for argument in arguments])
 
 
+def refused(capsys, *arguments: object) -> str:
+    """The one sentence with which a command ends that refuses its input, with exit code 2."""
+    capsys.readouterr()
+    assert run(*arguments) == 2
+    (sentence,) = capsys.readouterr().err.splitlines()
+    assert sentence.startswith("lusee-bayes: ")
+    return sentence
+
+
 def content(folder: Path) -> dict[str, bytes]:
     """Of all files but the lock, which nobody holds once its process is killed."""
     found = (path for path in folder.rglob("*") if path.is_file() and path.name != LOCK)

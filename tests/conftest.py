@@ -124,6 +124,13 @@ def numbers_alone(monkeypatch):
     monkeypatch.setattr(folder, "PAGES", {})
 
 
+@pytest.fixture
+def exact_tilt(monkeypatch):
+    """Tilts about the pole between two runs as exact as about each one's own."""
+    monkeypatch.setattr("lusee_bayes.instrument.pointing.LEAST_ORDER", 4)
+    monkeypatch.setattr("lusee_bayes.instrument.averaging.TOLERANCE", 1e-13)
+
+
 # runs are imported when they are asked for: matplotlib and all that draws take seconds
 @pytest.fixture(scope="session")
 def small_map(tmp_path_factory):

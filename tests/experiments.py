@@ -60,6 +60,18 @@ def mapped(
     return made, made.result(made.known(thorough=thorough))
 
 
+def channels_of(scenario: lb.Scenario) -> list[lb.Visibilities]:
+    """The data of every channel."""
+    return [lb.build(channel).data for channel in scenario.channels() or (scenario,)]
+
+
+def at_times(data: lb.Visibilities, keep: np.ndarray) -> lb.Visibilities:
+    """The data of some times by themselves."""
+    observation = data.observation.select(keep)
+    flat, layout = jnp.asarray(data.grid()[:, keep].ravel()), DataLayout(16, observation.n_times)
+    return replace(data, data=flat, layout=layout, observation=observation)
+
+
 def unknowns_report(experiment: lb.Experiment, found: Inference) -> UnknownsReport | None:
     """What data alone tell of receivers, ground and gain table."""
     posterior = on_host(found.posterior)
@@ -76,12 +88,20 @@ def offset_posterior(found: Inference) -> tuple[dict[str, float], np.ndarray]:
 
 def of_run(data: lb.Visibilities, run: int) -> lb.Visibilities:
     """The data of one run by themselves."""
-    keep = data.observation.run == run
-    observation = data.observation.select(keep)
-    flat = jnp.asarray(data.grid()[:, keep].ravel())
-    return replace(
-        data, data=flat, layout=DataLayout(16, observation.n_times), observation=observation
-    )
+    return at_times(data, data.observation.run == run)
+
+
+def flagged(data: lb.Visibilities, flags: np.ndarray) -> lb.Visibilities:
+    """The data without those of the flags, a (products, times) array."""
+    layout = DataLayout.from_flags(flags)
+    return replace(data, layout=layout, data=layout.gather(data.grid()))
+
+
+def scaled_product(data: lb.Visibilities, product: int, factor: float) -> lb.Visibilities:
+    """Data in which one product is too large."""
+    grid = np.array(data.grid())
+    grid[product] *= factor
+    return replace(data, data=data.layout.gather(jnp.asarray(grid)))
 
 
 def program_arguments(program: Program, experiment: lb.Experiment) -> dict[str, Any]:

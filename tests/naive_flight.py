@@ -36,12 +36,8 @@ def naive_gain(folder, level, port, seen, mhz):
     return CubicSpline(anchors, mean + q["PC1"] * vectors[:, 0] + q["PC2"] * vectors[:, 1])(mhz)
 
 
-def naive_band(flight, name, row, f, comb=False):
-    """A parabola through the channels of a band of 1 MHz, product by product, in V^2/Hz.
-
-    Without the channels of the comb where it is on. And the number of independent samples behind
-    each value, for a flat spectrum.
-    """
+def naive_band(flight, name, row, f):
+    """A parabola through the channels of a band of 1 MHz, product by product, in V^2/Hz."""
     with h5py.File(flight / f"session_{name}.h5") as file:
         counts = file["spectra/data"][row].astype(float)
         codes = file["spectra/metadata/actual_gain"][row]
@@ -51,8 +47,6 @@ def naive_band(flight, name, row, f, comb=False):
     channels = stride * np.arange(2048 // stride)[:, None] + np.arange(stride)
     x = 0.025 * channels - f
     within = (np.abs(x) <= 0.5 + 1e-9).all(axis=1)
-    if comb:
-        within &= (channels % 4 != 2).all(axis=1)
     gains = [
         naive_gain(flight / "gain", "LMH"[codes[p]], p, seen, 0.025 * channels[within]).mean(axis=1)
         for p in range(4)
@@ -60,10 +54,7 @@ def naive_band(flight, name, row, f, comb=False):
     # mean powers of each bin's channels
     powers = np.stack([(x[within] ** k).mean(axis=1) for k in range(3)], axis=1)
     weights, found = np.linalg.pinv(powers)[0], {}
-    for number, label in enumerate(FLIGHT_ORDER):
-        i, j = int(label[0]), int(label[1])
-        found[label] = weights @ (
-            counts[number, np.flatnonzero(within)] * 1e-18 / np.sqrt(gains[i] * gains[j])
-        )
-    values = np.array([found[label] for label in labels()])
-    return values, 2.0**25 * stride / (weights @ weights)
+    for label, spectrum in zip(FLIGHT_ORDER, counts[:, np.flatnonzero(within)], strict=True):
+        gain = np.sqrt(gains[int(label[0])] * gains[int(label[1])])
+        found[label] = weights @ (spectrum * 1e-18 / gain)
+    return np.array([found[label] for label in labels()])

@@ -28,7 +28,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float, Int
 
-from lusee_bayes.core.arrays import Ells, Grid, Square, on_host
+from lusee_bayes.core.arrays import Ells, Grid, Square
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, mean_over_m, mode_numbers, n_modes, turn_about_z
 from lusee_bayes.core.linalg import solve_lower
@@ -45,8 +45,7 @@ from lusee_bayes.judge.chi2 import ChiSquare, stands_out, two_sided
 from lusee_bayes.judge.measures import expected_chi2
 from lusee_bayes.judge.residuals import Residuals
 from lusee_bayes.judge.split import WIDER, with_sky
-from lusee_bayes.linear.information import Information
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import FromInformation, LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.prior import HarmonicPrior
 from lusee_bayes.systematics.context import Around, Setup
@@ -233,7 +232,7 @@ class UnderAnySky:
     @classmethod
     def of(cls, setup: Setup, data: Visibilities, model: LinearGaussian) -> UnderAnySky:
         """Under a prior that allows any sky, as bright as the data ask for."""
-        prior = on_host(setup.prior if setup.family is None else setup.family.expected())
+        prior = setup.prior if setup.family is None else setup.family.expected()
         power = np.asarray(prior.variance())
         if prior.white_mean is not None:
             power = power + np.asarray(prior.colour(prior.white_mean)) ** 2
@@ -241,21 +240,17 @@ class UnderAnySky:
         modelled = float(np.median(np.asarray(setup.signal)[autos]))
         brighter = np.nanmedian(np.asarray(data.grid())[autos]) / modelled
         spectrum = mean_over_m(power) * (WIDER * np.fmax(1.0, brighter)) ** 2
-        return cls(setup, data, on_host(model), spectrum)
+        return cls(setup, data, model, spectrum)
 
     def wide(self, coupling: Coupling) -> tuple[ChiSquare, Posterior]:
         """Residual chi^2, and the posterior under the wide prior."""
-        ell = np.arange(lmax_of(coupling.shape[1]) + 1)
-        spectrum = self.spectrum[np.minimum(ell, len(self.spectrum) - 1)]
-        information, posterior = Information.of(
-            coupling,
-            HarmonicPrior(spectrum),
-            self.model.noise,
-            self.model.offset,
-            np.asarray(self.data.data),
-        )
-        posterior, n = on_host(posterior), self.model.n_data
-        chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
+        n_ells = lmax_of(coupling.shape[1]) + 1
+        more = max(0, n_ells - len(self.spectrum))
+        spectrum = np.pad(self.spectrum, (0, more), mode="edge")[:n_ells]
+        model = replace(self.model, coupling=coupling, prior=HarmonicPrior(spectrum))
+        solution = model.condition(np.asarray(self.data.data), FromInformation)
+        posterior, n = solution.posterior, model.n_data
+        chi2 = float(solution.information.chi2(posterior.mean) + posterior.prior_chi2())
         degrees = n - with_sky(n - expected_chi2(posterior, n))
         return ChiSquare(chi2, float(degrees)), posterior
 
@@ -279,7 +274,7 @@ class UnderAnySky:
         right = np.asarray(layout.gather(mistake.undone(filled(self.data))))
         data = replace(self.data, data=right)
         try:
-            model = on_host(full_model(self.setup, Around(data)))
+            model = full_model(self.setup, Around(data))
         except InputError:  # without it, some auto is not positive
             return ChiSquare(np.inf, float(layout.size))
         return replace(self, data=data, model=model).wide(model.coupling)[0]

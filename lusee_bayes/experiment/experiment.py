@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from lusee_bayes.core.arrays import Draws, on_device, on_host
+from lusee_bayes.core.arrays import Draws, on_device
 from lusee_bayes.core.checks import Described
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
@@ -26,10 +26,11 @@ from lusee_bayes.experiment.model import model_to_sample, radiometer, simulate
 from lusee_bayes.experiment.rounds import Inference, rebuilds, settled, with_learned_prior
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import Setup, set_up
-from lusee_bayes.instrument.instrument import Instrument
+from lusee_bayes.instrument.coupling import Instrument
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.plausibility import require_plausible
 from lusee_bayes.linear.information import Information
+from lusee_bayes.linear.linear_gaussian import Solution
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.priors.learning import Learned, draws_with_parameters
 from lusee_bayes.sky.sky_source import SkySource
@@ -58,8 +59,8 @@ class Experiment(Described):
         Of flight data: the times that did not fit and are left out; None for other data.
     around : Around or None
         What N was built around when the prior was learned, in rounds; None for the data alone.
-    information : Information or None
-        What the data say of the sky, where the prior was learned from it.
+    solution : Solution or None
+        Of the data under the prior before them, where the prior was learned from it.
     """
 
     setup: Setup
@@ -68,7 +69,7 @@ class Experiment(Described):
     learned: Learned | None = None
     fitting: Fitting | None = None
     around: Around | None = None
-    information: Information | None = None
+    solution: Solution | None = None
 
     def description(self) -> tuple[str, ...]:
         scenario = self.scenario
@@ -178,7 +179,7 @@ def _learned(
         setup, learned, around, known = with_learned_prior(
             experiment.setup, experiment.data, earlier
         )
-    return replace(experiment, setup=setup, learned=learned, around=around, information=known)
+    return replace(experiment, setup=setup, learned=learned, around=around, solution=known)
 
 
 def with_truth(experiment: Experiment) -> Experiment:
@@ -224,7 +225,7 @@ def infer(experiment: Experiment) -> Inference:
     InputError
         As :func:`.settled`.
     """
-    return settled(experiment.setup, experiment.data, experiment.around, experiment.information)
+    return settled(experiment.setup, experiment.data, experiment.around, experiment.solution)
 
 
 def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
@@ -310,7 +311,7 @@ def posterior_draws(
     if learned is not None and learned.fits:
         family = experiment.setup.family
         return draws_with_parameters(family, learned, information(), key, n)
-    return np.asarray(on_host(posterior).sample(key, n))
+    return posterior.sample(key, n)
 
 
 def doubts(experiment: Experiment, inference: Inference) -> tuple[str, ...]:

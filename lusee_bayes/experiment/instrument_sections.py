@@ -29,20 +29,14 @@ from lusee_bayes.core.section import (
 )
 from lusee_bayes.instrument.beams.fields import Interpolation
 from lusee_bayes.instrument.beams.luseepy_files import read_response, read_scalar_beam
-from lusee_bayes.instrument.beams.monopoles import (
-    CapacitorReceiver,
-    JFETReceiver,
-    Monopoles,
-    Receiver,
-    Regolith,
-    read_receiver,
-)
-from lusee_bayes.instrument.beams.sampled import SampledFileBeams, beam_kind, read_sampled
+from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith
+from lusee_bayes.instrument.beams.sampled import beam_kind, read_sampled
 from lusee_bayes.instrument.beams.source import (
     BeamSource,
-    EmbeddedBeams,
-    ResponseBeams,
-    ScalarFileBeams,
+    CapacitorReceiver,
+    JFETReceiver,
+    Receiver,
+    read_receiver,
 )
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import N_ANTENNAS
@@ -312,8 +306,7 @@ class MonopoleBeamSection(_BeamSection):
         """The antennas."""
         ground = {"surface_permittivity", "deep_permittivity", "loss_tangent"}
         regolith = Regolith(**self.model_dump(include=ground))
-        arms = self.model_dump(exclude={"model", *ground})
-        return EmbeddedBeams(Monopoles(regolith=regolith, **arms))
+        return Monopoles(regolith=regolith, **self.model_dump(exclude={"model", *ground}))
 
 
 class _FileSection(_BeamSection):
@@ -351,9 +344,10 @@ class _LuseepySection(_FileSection):
     interpolation: Interpolation = "linear"
     moon_temperature_k: Temperature = 0.0
 
-    def shared(self) -> dict[str, Any]:
-        """What is said of every file of luseepy, as its beams take it."""
+    def asked(self) -> dict[str, Any]:
+        """What is asked of every file, as its beams take it."""
         return {
+            "interpolation": self.interpolation,
             "turntable_offset_deg": self.turntable_offset_deg,
             "luseepy_quadrature": self.quadrature == "luseepy",
             "moon_k": self.moon_temperature_k,
@@ -388,12 +382,8 @@ class ScalarBeamSection(_LuseepySection):
 
     def source(self) -> BeamSource:
         """The pattern of the file, turned to every angle."""
-        return ScalarFileBeams(
-            replace(read_scalar_beam(self.file), interpolation=self.interpolation),
-            taper=self.taper,
-            rotations_deg=self.rotations_deg,
-            **self.shared(),
-        )
+        beam, ports = read_scalar_beam(self.file), self.rotations_deg
+        return replace(beam, taper=self.taper, rotations_deg=ports, **self.asked())
 
 
 class ResponseSection(_LuseepySection):
@@ -420,15 +410,10 @@ class ResponseSection(_LuseepySection):
 
     def source(self) -> BeamSource:
         """The response of the file, with its receivers."""
-        response = replace(read_response(self.file), interpolation=self.interpolation)
-        if self.receiver is not None:
-            response = replace(response, receiver=self.receiver.receiver())
-        return ResponseBeams(
-            response,
-            receiver_said=self.receiver is not None,
-            antenna_k=self.antenna_temperature_k,
-            **self.shared(),
-        )
+        asked = self.asked() | {"antenna_k": self.antenna_temperature_k}
+        if self.receiver is None:
+            return replace(read_response(self.file), receiver_said=False, **asked)
+        return replace(read_response(self.file), receiver=self.receiver.receiver(), **asked)
 
 
 class SampledBeamSection(_FileSection):
@@ -452,7 +437,8 @@ class SampledBeamSection(_FileSection):
 
     def source(self) -> BeamSource:
         """The beams of the file."""
-        return SampledFileBeams(read_sampled(self.file), self.turntable_offset_deg, self.normalise)
+        asked = {"turntable_offset_deg": self.turntable_offset_deg, "normalise": self.normalise}
+        return replace(read_sampled(self.file), **asked)
 
 
 BEAM_SECTIONS = kinds_of(

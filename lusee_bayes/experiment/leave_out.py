@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Grid, GridFlags, Vector, on_host
+from lusee_bayes.core.arrays import Grid, GridFlags, Vector
 from lusee_bayes.core.checks import counted
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
@@ -180,12 +180,12 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Groups
     if 8.0 * ARRAYS * n * (setup.prior.size + n * across) > MOST_MEMORY * memory_limit():
         return None
     found = settled(setup, data) if settle else None
-    if found is None or found.unsettled:  # bad data may let no rounds settle
-        model = on_host(full_model(setup, Around(data)))
-        posterior = model.condition(data.data) if settle else None
-    else:
-        model, posterior = on_host((found.model, found.posterior))
-    wide = None if posterior is None else Split.of(on_host(posterior), 0.0, model.n_data).wide
+    if found is not None and not found.unsettled:
+        model, posterior = found.model, found.posterior
+    else:  # bad data may let no rounds settle
+        model = full_model(setup, Around(data))
+        posterior = model.condition(data.data).posterior if settle else None
+    wide = None if posterior is None else Split.of(posterior, 0.0, data.layout.size).wide
     prior = model.prior.widened(WIDER) if wide is None else wide.prior
     return GroupsCompared.of(LeftOut(replace(model, prior=prior), data, posterior=wide), data)
 

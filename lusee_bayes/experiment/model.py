@@ -66,7 +66,7 @@ def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, S
 def base_model(setup: Setup, around: Around | None = None) -> LinearGaussian:
     """d = A m + background + n with radiometer noise only."""
     noise = radiometer(setup, around)
-    return on_device(LinearGaussian(setup.coupling, setup.prior, noise, setup.offset))
+    return LinearGaussian(setup.coupling, setup.prior, noise, setup.offset)
 
 
 def in_noise(
@@ -84,7 +84,7 @@ def in_noise(
     around : Around
     """
     sky = np.asarray(setup.sky.modes if around.sky is None else around.sky)
-    model, held, gains = on_host(model), [], []
+    held, gains = [], []
     for systematic in found:
         if systematic.first_order:
             held.append(on_host(Expanded.about(systematic, model, sky, around.values)))
@@ -134,7 +134,7 @@ def model_to_sample(
     Systematics that are marginalised come in their place in the order, as sampled ones without a
     site.
     """
-    model, later = base_model(setup, around), []
+    model, later = on_device(base_model(setup, around)), []
     found = systematics(setup, around)
     held = in_noise(setup, model, (systematic for _, systematic in found), around)
     for (treatment, systematic), as_noise in zip(found, held, strict=True):

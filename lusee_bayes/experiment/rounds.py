@@ -26,9 +26,9 @@ from lusee_bayes.experiment.sky_sections import (
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.measures import data_freedom
-from lusee_bayes.linear.amplitudes import Amplitudes, template_amplitudes, weighted_residual
+from lusee_bayes.linear.amplitudes import Amplitudes, template_amplitudes
 from lusee_bayes.linear.information import Information, integrated_out
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import FromInformation, LinearGaussian, Solution
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.priors.families import PriorFamily
 from lusee_bayes.priors.learning import Learned, learn_whatever_fits
@@ -50,32 +50,37 @@ SHORTEST = 0.125
 
 @dataclass(frozen=True)
 class Inference:
-    """A model, the posterior given the data, and how it was found.
+    """A model solved for the data, and how it was found.
 
     Attributes
     ----------
-    model : LinearGaussian
-        With every systematic in N that the scenario does not ignore.
+    solution : Solution
+        Of the model with every systematic in N that the scenario does not ignore.
     systematics : tuple of Marginalised
         Those, as they are in N.
-    posterior : Posterior
     rounds : int
         How often N was built.
     around : Around
         What it was built around.
     unsettled : str
         A sentence if the map still moves from round to round; empty otherwise.
-    information : Information or None
-        What the data say of the sky, where the posterior was found through it.
     """
 
-    model: LinearGaussian
+    solution: Solution
     systematics: tuple[Marginalised, ...]
-    posterior: Posterior | None
     rounds: int
     around: Around
     unsettled: str = ""
-    information: Information | None = None
+
+    @property
+    def model(self) -> LinearGaussian:
+        """Of the solution."""
+        return self.solution.model
+
+    @property
+    def posterior(self) -> Posterior:
+        """Of the solution."""
+        return self.solution.posterior
 
     @property
     def expanded(self) -> tuple[Expanded, ...]:
@@ -94,15 +99,14 @@ class Inference:
 
     def amplitudes(self, part: Expanded) -> Amplitudes:
         """What these data tell of a systematic's unknowns, in prior standard deviations."""
-        data = self.around.data.data
-        return template_amplitudes(self.model, self.posterior, data, part.columns)
+        return template_amplitudes(self.solution, part.columns)
 
 
 def settled(
     setup: Setup,
     data: Visibilities,
     start: Around | None = None,
-    known: Information | None = None,
+    known: Solution | None = None,
 ) -> Inference:
     """Condition the model on data, in as many rounds as its N needs.
 
@@ -118,8 +122,8 @@ def settled(
     data : Visibilities
     start : Around, optional
         What N is built around in the first round; by default the data.
-    known : Information, optional
-        Of the data, where N is built once.
+    known : Solution, optional
+        Of the data under another prior, where N is built once.
 
     Returns
     -------
@@ -134,12 +138,8 @@ def settled(
 
     def conditioned(around: Around, rounds: int) -> Inference:
         model, found = model_about(setup, around)
-        information, posterior = None, None
-        if model.is_structured:
-            information, posterior = model.inform(data.data, known)
-        else:
-            posterior = model.condition(data.data)
-        return Inference(model, found, posterior, rounds, around, information=information)
+        solution = model.condition(data.data) if known is None else known.under(model.prior)
+        return Inference(solution, found, rounds, around)
 
     found = conditioned(start or _start(setup, data), 1)
     if not rebuilds(setup):
@@ -187,7 +187,7 @@ class _Step:
 def _around(setup: Setup, found: Inference, step: _Step) -> tuple[Around, _Step]:
     """What the terms of N are built around next, given a posterior, and the step there."""
     visibilities, sky, values = None, None, None
-    solved = weighted_residual(found.model, found.posterior, found.around.data.data)
+    solved = found.solution.weighted_residual()
     if found.moving:
         ways = [s.expected + s.columns.T @ solved - s.centre for s in found.expanded]
         far = zip(found.expanded, ways, strict=True)
@@ -196,7 +196,7 @@ def _around(setup: Setup, found: Inference, step: _Step) -> tuple[Around, _Step]
         for s, way in zip(found.expanded, ways, strict=True):
             values |= s.systematic.in_units(s.centre + step.size * way)
         here = np.asarray(setup.sky.modes if found.around.sky is None else found.around.sky)
-        sky = here + step.size * (np.asarray(found.posterior.mean) - here)
+        sky = here + step.size * (found.posterior.mean - here)
     if rebuilds_visibilities(setup):
         visibilities = prediction(moved(setup, values), found, solved)
     return replace(found.around, visibilities=visibilities, sky=sky, values=values), step
@@ -215,9 +215,9 @@ def _start(setup: Setup, data: Visibilities) -> Around:
     model, held = model_about(setup, around, scaling=False)
     columns = [np.zeros((model.n_data, 0))]
     columns += [s.columns for s in held if isinstance(s, Expanded)]
-    posterior = model.condition(data.data)
-    freedom = data_freedom(model, posterior, np.concatenate(columns, axis=1))
-    sky = np.asarray(posterior.mean) if setup.measured else None
+    solution = model.condition(data.data)
+    freedom = data_freedom(solution, np.concatenate(columns, axis=1))
+    sky = solution.posterior.mean if setup.measured else None
     return Around(data, sky=sky, freedom=freedom)
 
 
@@ -275,7 +275,7 @@ COARSE_LMAX = 24
 
 def with_learned_prior(
     setup: Setup, data: Visibilities, earlier: Information | None = None
-) -> tuple[Setup, Learned, Around | None, Information | None]:
+) -> tuple[Setup, Learned, Around | None, Solution | None]:
     """Learn the prior from data.
 
     Systematics are in N as far as they are marginalised. Where N is built around what the data
@@ -298,16 +298,16 @@ def with_learned_prior(
         How it was learned.
     Around or None
         What N was built around in the last round; None where that is the data alone.
-    Information or None
-        Of these data, where N is built once.
+    Solution or None
+        Of these data under the prior before them, where N is built once.
     """
     if not rebuilds(setup):
-        information = about_sky(setup, data)
-        learned = learned_prior(setup, setup.family, _with_more(information, earlier))
-        return replace(setup, prior=learned.prior), learned, None, information
+        solution = about_sky(setup, data)
+        learned = learned_prior(setup, setup.family, _with_more(solution.information, earlier))
+        return replace(setup, prior=learned.prior), learned, None, solution
     learned, before, found = None, None, settled(setup, data)
     for _ in range(MAX_PRIOR_ROUNDS):
-        information = full_model(setup, found.around).inform(data.data)[0]
+        information = found.solution.information
         start = None if learned is None or not learned.settled else learned.parameters
         learned = learned_prior(setup, setup.family, _with_more(information, earlier), start)
         setup = replace(setup, prior=learned.prior)
@@ -318,13 +318,13 @@ def with_learned_prior(
     return setup, replace(learned, still_moves=moved), found.around, None
 
 
-def about_sky(setup: Setup, data: Visibilities) -> Information:
-    """What data say of the sky; only its reference sky depends on the setup's prior.
+def about_sky(setup: Setup, data: Visibilities) -> Solution:
+    """Solve for the sky under the setup's prior, through what data say of it.
 
     Where N is built around what data tell, it is about that of the prior before them.
     """
     around = settled(setup, data).around if rebuilds(setup) else Around(data)
-    return full_model(setup, around).inform(data.data)[0]
+    return full_model(setup, around).condition(data.data, FromInformation)
 
 
 def _with_more(information: Information, earlier: Information | None) -> Information:

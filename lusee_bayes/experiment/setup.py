@@ -14,8 +14,7 @@ from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ
 from lusee_bayes.instrument.beams.monopoles import Monopoles
-from lusee_bayes.instrument.coupling import CouplingMatrix
-from lusee_bayes.instrument.instrument import Instrument
+from lusee_bayes.instrument.coupling import CouplingMatrix, Instrument
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import auto_indices
 from lusee_bayes.instrument.visibilities import Visibilities

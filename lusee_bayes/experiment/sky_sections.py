@@ -26,13 +26,17 @@ from lusee_bayes.core.section import (
 from lusee_bayes.priors.families import IsotropicFamily, PriorFamily
 from lusee_bayes.priors.local_scales import embedded_local_scales
 from lusee_bayes.sampling.log_normal_prior import LogNormalPrior
-from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
-from lusee_bayes.sky.log_normal import LogNormalSky, deviation_spectrum
-from lusee_bayes.sky.positive_skies import FIELDS, FIELDS_OF, PositiveSkies
+from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, galactic_share
+from lusee_bayes.sky.positive_skies import (
+    FIELDS,
+    FIELDS_OF,
+    LogNormalSky,
+    PositiveSkies,
+    deviation_spectrum,
+)
 from lusee_bayes.sky.prior import HarmonicPrior, Prior, read_mean, read_spectrum
-from lusee_bayes.sky.sky_source import FileSource, GalaxySource, Sky, SkySource
+from lusee_bayes.sky.sky_source import EmbeddedTemplate, FileSource, GalaxySource, Sky, SkySource
 from lusee_bayes.sky.spectral_prior import SpectralPrior, check_components, require_names
-from lusee_bayes.sky.template import EmbeddedTemplate, galactic_share
 from lusee_bayes.systematics.prior_spectrum import SpectrumSection
 
 

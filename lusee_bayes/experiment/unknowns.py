@@ -22,7 +22,8 @@ import pandas as pd
 from jaxtyping import Float
 from scipy.linalg import block_diag
 
-from lusee_bayes.core.arrays import Modes, ModesMatrix, on_host
+from lusee_bayes.core.arrays import Modes, ModesMatrix
+from lusee_bayes.core.trees import quantity
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import base_model, radiometer, true_values
 from lusee_bayes.experiment.rounds import Inference
@@ -55,7 +56,7 @@ class NullDirection:
     """
 
     names: tuple[str, ...]
-    weights: Float[np.ndarray, " parts"]
+    weights: Float[np.ndarray, " parts"] = quantity("1", "in prior standard deviations")
     share: float
 
     @classmethod
@@ -198,7 +199,7 @@ class Unknowns:
     sky_std: float
 
     @classmethod
-    def of(cls, experiment: Experiment, found: Inference, reference: Modes) -> Unknowns | None:
+    def of(cls, experiment: Experiment, found: Inference) -> Unknowns | None:
         """Of data and their model; None if that has no such unknowns.
 
         Parameters
@@ -206,8 +207,6 @@ class Unknowns:
         experiment : Experiment
         found : Inference
             Of these data alone.
-        reference : (modes,) array
-            A sky near its posterior mean, in K.
         """
         listed = [s for s in found.expanded if not s.systematic.has_table]
         if not listed:
@@ -219,7 +218,7 @@ class Unknowns:
         alike = [s.systematic.like_the_sky() for s in listed]
         return cls(
             tuple(rows.to_dict("records")),
-            amplitudes_of_sky(found.model, reference, data.data, columns),
+            amplitudes_of_sky(found.solution, columns),
             tuple(name for names, _ in alike for name in names),
             block_diag(*(parts for _, parts in alike)),
             float(np.sqrt(np.asarray(found.model.prior.variance())[0])),
@@ -334,9 +333,7 @@ class PointingReport:
         return lines
 
 
-def pointing_report(
-    experiment: Experiment, found: Inference, covariance: ModesMatrix
-) -> PointingReport:
+def pointing_report(experiment: Experiment, found: Inference) -> PointingReport:
     """Work out the offsets of the model, and those that the data prefer besides.
 
     Parameters
@@ -344,13 +341,11 @@ def pointing_report(
     experiment : Experiment
     found : Inference
         Of these data alone.
-    covariance : (modes, modes) array
-        Of the posterior, in K^2.
     """
-    sky = np.asarray(found.posterior.mean)
+    sky = found.posterior.mean
     table = None if found.offsets is None else _table(experiment, found, sky)
     values = {} if table is None else dict(zip(table["offset"], table["value"], strict=True))
-    return PointingReport(table, _preferred(experiment, found, covariance, sky, values))
+    return PointingReport(table, _preferred(experiment, found, sky, values))
 
 
 def _table(experiment: Experiment, found: Inference, sky: Modes) -> pd.DataFrame:
@@ -359,7 +354,7 @@ def _table(experiment: Experiment, found: Inference, sky: Modes) -> pd.DataFrame
     moves = found.around.sky is not None
     about = np.asarray(table["std"] / table["prior_std"] if moves else np.ones(len(table)))
     noise = np.sqrt(np.asarray(radiometer(experiment.setup).diagonal()))
-    model = on_host(base_model(experiment.setup))
+    model = base_model(experiment.setup)
     left = found.offsets.systematic.beyond_first_order(model, sky, about)
     beyond = [float(np.sqrt(np.mean((left[name] / noise) ** 2))) for name in table["unknown"]]
     table = table.assign(beyond_first_order=beyond).rename(columns={"unknown": "offset"})
@@ -368,18 +363,14 @@ def _table(experiment: Experiment, found: Inference, sky: Modes) -> pd.DataFrame
 
 
 def _preferred(
-    experiment: Experiment,
-    found: Inference,
-    covariance: ModesMatrix,
-    sky: Modes,
-    values: dict[str, float],
+    experiment: Experiment, found: Inference, sky: Modes, values: dict[str, float]
 ) -> pd.DataFrame:
     setup, data = experiment.setup, experiment.data
     n_runs = setup.observation.n_runs
     steps = {name: step for kind, step in TESTED.items() for name in offset_names((kind,), n_runs)}
     centre = dict.fromkeys(steps, 0.0) | values
     offsets = PointingOffsets.of(shifted(setup, centre), steps, centre)
-    about = Expanded.about(offsets, on_host(base_model(setup)), sky, centre)
+    about = Expanded.about(offsets, base_model(setup), sky, centre)
     per_unit = np.asarray(about.columns) / offsets.stds
     day = setup.observation.day
     length = -(-(int(day.max()) + 1) // MOST_STRETCHES)
@@ -393,8 +384,7 @@ def _preferred(
             if first < 0 or column.any():
                 rows.append((name, first, last))
                 columns.append(column)
-    given = found.model, found.posterior, covariance, data.data
-    told = preferences(*given, np.stack(columns, axis=1))
+    told = preferences(found.solution, np.stack(columns, axis=1))
     table = pd.DataFrame(rows, columns=["offset", "first_day", "last_day"])
     return table.assign(value=told.amplitude, std=told.std, chi2_gain=told.gain)
 

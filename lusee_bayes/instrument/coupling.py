@@ -19,11 +19,16 @@ A with a vector never forms A, and nothing in it but the last sum grows with the
 (:class:`BeamOperator`): row t of product k is b_k R(t), with R(t) block diagonal in ell: one
 rotation matrix for each ell and sample, computed once. Then A costs 16 products with (2 ell + 1)^2
 numbers per ell and sample, and derivatives cost no more.
+
+**Sources** that are much smaller than the antennas' resolution need no harmonic expansion
+(:func:`source_response`): one of x K sr in the direction n(t), in the frame of the antennas, gives
+V_k(t) = x B_k(n(t)). It rises and sets sharply, and it may move.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import replace
 
 import equinox as eqx
@@ -31,8 +36,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from lusee_bayes.core.arrays import Array, compiled, namespace
-from lusee_bayes.core.checks import Described, require_array, require_float64, require_shape
+from lusee_bayes.core.arrays import Array, DataVector, Modes, compiled, namespace
+from lusee_bayes.core.checks import (
+    Described,
+    is_traced,
+    require_array,
+    require_float64,
+    require_shape,
+)
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import (
     lmax_of,
@@ -43,10 +54,22 @@ from lusee_bayes.core.harmonics import (
     turn_about_z,
 )
 from lusee_bayes.instrument.beams.fields import ProductBeams
+from lusee_bayes.instrument.beams.monopoles import (
+    Frequency,
+    Monopoles,
+    beams_towards,
+    monopole_beams,
+    parameter,
+    with_values,
+)
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout
 
+Matrix = Float[Array, "data unknowns"]
+ProductModes = Float[Array, "products modes"]
+BodyBeams = Float[Array, "runs products functions modes"]
+TimeModes = Float[Array, "products times modes"]
 # times whose data A^T d takes at once: it bounds the memory
 MOST_TIMES = 8192
 
@@ -60,7 +83,7 @@ class Coupling(Described, eqx.Module):
         Factors of the rows, such as gains; None for ones.
     """
 
-    response: Float[Array, " data"] | None = eqx.field(default=None, kw_only=True)
+    response: DataVector | None = eqx.field(default=None, kw_only=True)
 
     def description(self) -> tuple[str, ...]:
         data, unknowns = self.shape
@@ -76,13 +99,13 @@ class Coupling(Described, eqx.Module):
         """Whether A^T N^-1 A can be summed over time without A (``linear.normal_matrix``)."""
         return False
 
-    def dense(self) -> Float[Array, "data unknowns"]:
+    def dense(self) -> Matrix:
         """A as a matrix, with the response."""
         matrix = self._matrix()
         return matrix if self.response is None else matrix * self.response[:, None]
 
     @abstractmethod
-    def _matrix(self) -> Float[Array, "data unknowns"]:
+    def _matrix(self) -> Matrix:
         """A as a matrix, as all of the following without the response."""
 
     @abstractmethod
@@ -108,14 +131,14 @@ class Coupling(Described, eqx.Module):
         """
 
     @abstractmethod
-    def _forward(self, sky: Float[Array, " unknowns"]) -> Float[Array, " data"]:
+    def _forward(self, sky: Modes) -> DataVector:
         """A m, of a vector whose type and shape are right."""
 
     @abstractmethod
-    def _backward(self, data: Float[Array, " data"]) -> Float[Array, " unknowns"]:
+    def _backward(self, data: DataVector) -> Modes:
         """A^T d, of a vector whose type and shape are right."""
 
-    def __matmul__(self, sky: Float[Array, " unknowns"]) -> Float[Array, " data"]:
+    def __matmul__(self, sky: Modes) -> DataVector:
         """Compute A m: the mean data of a sky.
 
         Parameters
@@ -139,7 +162,7 @@ class Coupling(Described, eqx.Module):
         data = self._forward(sky)
         return data if self.response is None else data * self.response
 
-    def transpose_mv(self, data: Float[Array, " data"]) -> Float[Array, " unknowns"]:
+    def transpose_mv(self, data: DataVector) -> Modes:
         """Compute A^T d.
 
         Parameters
@@ -161,7 +184,7 @@ class Coupling(Described, eqx.Module):
         require_shape("the data", data, (self.shape[0],))
         return self._backward(data if self.response is None else data * self.response)
 
-    def with_response(self, factors: Float[Array, " data"]) -> Coupling:
+    def with_response(self, factors: DataVector) -> Coupling:
         """Multiply every row by a factor, on top of those it has.
 
         Parameters
@@ -185,9 +208,7 @@ class Coupling(Described, eqx.Module):
 
 
 @compiled
-def body_beams(
-    modes: Float[Array, "products modes"], pointing: Pointing
-) -> Float[Array, "runs products functions modes"]:
+def body_beams(modes: ProductModes, pointing: Pointing) -> BodyBeams:
     """Turn beams into the Moon-fixed frame, as every function of time of the pointing sees them.
 
     Parameters
@@ -208,7 +229,7 @@ def body_beams(
     return xp.stack(runs)
 
 
-def _on_the_moon(modes: Float[Array, "products modes"], pointing: Pointing) -> Array:
+def _on_the_moon(modes: ProductModes, pointing: Pointing) -> Array:
     """Beams of the lander in the Moon-fixed frame, with the pointing's further turns."""
     if pointing.turns is None:
         return pointing.mcmf_from_lander(modes)
@@ -252,7 +273,7 @@ class DenseCoupling(Coupling):
         inside a JAX transformation.
     """
 
-    matrix: Float[Array, "data unknowns"] = eqx.field(converter=jnp.asarray)
+    matrix: Matrix = eqx.field(converter=jnp.asarray)
 
     def __check_init__(self):
         require_array("the coupling matrix", self.matrix, (None, None))
@@ -266,8 +287,7 @@ class DenseCoupling(Coupling):
 
     def plus(self, amplitude, direction):
         require_shape("the direction", direction, self.shape)
-        if direction.response is not None:
-            raise InputError("the direction must have no response of its own")
+        _require_bare(direction)
         return DenseCoupling(self.matrix + amplitude * direction.dense(), response=self.response)
 
     def _forward(self, sky):
@@ -275,6 +295,11 @@ class DenseCoupling(Coupling):
 
     def _backward(self, data):
         return self.matrix.T @ data
+
+
+def _require_bare(direction: Coupling) -> None:
+    if direction.response is not None:
+        raise InputError("the direction must have no response of its own")
 
 
 def as_coupling(coupling: Coupling | Array) -> Coupling:
@@ -301,7 +326,7 @@ class CouplingMatrix(Coupling):
         The product and the time of every row.
     """
 
-    body_beams: Float[Array, "runs products functions modes"]
+    body_beams: BodyBeams
     by_order: Float[Array, "runs orders beams degrees"]
     pointing: Pointing
     layout: DataLayout
@@ -405,8 +430,7 @@ class CouplingMatrix(Coupling):
         return self.response is None
 
     def plus(self, amplitude, direction):
-        if direction.response is not None:
-            raise InputError("the direction must have no response of its own")
+        _require_bare(direction)
         if not isinstance(direction, CouplingMatrix):
             dense = DenseCoupling(self._matrix(), response=self.response)
             return dense.plus(amplitude, direction)
@@ -439,10 +463,8 @@ class CouplingMatrix(Coupling):
         """
         product, time = np.asarray(product), np.asarray(time)
         require_shape("time", time, product.shape)
-        for name, numbers, limit in [
-            ("product", product, self.layout.n_products),
-            ("time", time, self.layout.n_times),
-        ]:
+        limits = {"product": self.layout.n_products, "time": self.layout.n_times}
+        for numbers, (name, limit) in zip((product, time), limits.items(), strict=True):
             if ((numbers < 0) | (numbers >= limit)).any():
                 raise InputError(f"{name} numbers must lie in 0..{limit - 1}, got {numbers}")
         places, blocks = [], []
@@ -470,13 +492,13 @@ class CouplingMatrix(Coupling):
         return (self.pointing.functions[times][:, :, None] * waves[:, None]).reshape(len(times), -1)
 
     @compiled
-    def _matrix(self) -> Float[Array, "data modes"]:
+    def _matrix(self) -> Matrix:
         """96 MB for 5232 x 2304."""
         blocks = [self._block(run, span) for run, span in self.pointing.runs()]
         return self.layout.gather(namespace(*blocks).concatenate(blocks, axis=1))
 
     @compiled
-    def _forward(self, sky: Float[Array, " modes"]) -> Float[Array, " data"]:
+    def _forward(self, sky: Modes) -> DataVector:
         n_products, n_functions = self.body_beams.shape[1:3]
         pairs = _pairs(self.pointing.pole_from_galactic(sky), self.lmax)
         plus, minus = pairs[: self.lmax + 1], pairs[self.lmax + 1 :]
@@ -495,7 +517,7 @@ class CouplingMatrix(Coupling):
         return self.layout.gather(xp.concatenate(grids, axis=1))
 
     @compiled
-    def _backward(self, data: Float[Array, " data"]) -> Float[Array, " modes"]:
+    def _backward(self, data: DataVector) -> Modes:
         """The transpose of :func:`_forward`, step by step."""
         n = self.lmax + 1
         grid = self.layout.scatter(data)
@@ -507,9 +529,8 @@ class CouplingMatrix(Coupling):
                 part = slice(first, min(first + MOST_TIMES, span.stop))
                 weighted = grid[:, part].T[:, :, None] * functions[part][:, None]
                 weighted = weighted.reshape(weighted.shape[0], -1)
-                x_and_y = namespace(weighted).stack(
-                    [cosine[part].T @ weighted, sine[part].T @ weighted], axis=-1
-                )
+                x_and_y = [wave[part].T @ weighted for wave in (cosine, sine)]
+                x_and_y = namespace(weighted).stack(x_and_y, axis=-1)
                 both = both + self.by_order[run].swapaxes(1, 2) @ x_and_y
         # (orders, degrees): of pairs, and of what they are crossed to
         straight, crossed = both[..., 0], both[..., 1]
@@ -521,14 +542,11 @@ class CouplingMatrix(Coupling):
     def _block(self, run: int, times) -> Float[Array, "products times modes"]:
         """Rows of all products for some samples of one run; times: a slice or numbers."""
         beams = self.pointing.functions[times] @ self.body_beams[run]
-        return self.pointing.pole_from_galactic.T(
-            turned_about_pole(beams, self.pointing.azimuth[times])
-        )
+        turned = turned_about_pole(beams, self.pointing.azimuth[times])
+        return self.pointing.pole_from_galactic.T(turned)
 
 
-def turned_about_pole(
-    beams: Float[Array, "products times modes"], azimuth: Float[Array, " times"]
-) -> Float[Array, "products times modes"]:
+def turned_about_pole(beams: TimeModes, azimuth: Float[Array, " times"]) -> TimeModes:
     """Turn beams about the pole by the azimuth of every time: D_z(-phi(t)).
 
     Parameters
@@ -560,9 +578,7 @@ def _phases(pointing: Pointing, lmax: int) -> tuple[Array, Array]:
 
 
 @compiled
-def _by_order(
-    body_beams: Float[Array, "runs products functions modes"], lmax: int
-) -> Float[Array, "runs orders beams degrees"]:
+def _by_order(body_beams: BodyBeams, lmax: int) -> Float[Array, "runs orders beams degrees"]:
     """W_lm and W_l,-m side by side for every order: the matrices behind X and Y.
 
     A tenth of the time of sums over modes that lie in the packed order (fiducial size).
@@ -632,7 +648,7 @@ class BeamOperator(eqx.Module):
                     blocks[ell].append(inside)
         return cls(tuple(jnp.concatenate(parts) for parts in blocks), layout)
 
-    def coupling(self, beams: ProductBeams) -> Float[Array, "data modes"]:
+    def coupling(self, beams: ProductBeams) -> Matrix:
         """Compute A as a matrix.
 
         Parameters
@@ -660,10 +676,180 @@ class BeamOperator(eqx.Module):
 
 
 @eqx.filter_jit
-def _turned(
-    beams: Float[Array, "beams modes"], pointing: Pointing
-) -> Float[Array, "beams times modes"]:
+def _turned(beams: ProductModes, pointing: Pointing) -> TimeModes:
     """Rows of A of any number of beams, without a response and with nothing missing."""
     layout = DataLayout(beams.shape[0], pointing.n_times)
     coupling = CouplingMatrix.of_modes(beams, pointing, layout)
     return coupling.dense().reshape(beams.shape[0], pointing.n_times, -1)
+
+
+class Instrument(eqx.Module):
+    """Antennas whose parameters may change, with everything else that A is made of.
+
+    Attributes
+    ----------
+    monopoles : Monopoles
+        The antennas and the ground, with the present values of all parameters.
+    pointing : Pointing
+        The orientations at every sample.
+    layout : DataLayout
+        The product and the time of every row of A.
+    frequency_mhz : float
+        In MHz.
+    lmax : int
+        Highest ell of the beams and the sky.
+    nodes : (int, int) or None
+        Of the grid on which beams are computed; see ``monopole_beams``.
+    operator : BeamOperator or None
+        The rotations of all samples, computed by :meth:`prepared`.
+    """
+
+    monopoles: Monopoles
+    pointing: Pointing
+    layout: DataLayout
+    frequency_mhz: float = eqx.field(static=True)
+    lmax: int = eqx.field(static=True)
+    nodes: tuple[int, int] | None = eqx.field(static=True, default=None)
+    operator: BeamOperator | None = None
+
+    def prepared(self) -> Instrument:
+        """Compute the rotations of all samples, as :meth:`dense` needs them.
+
+        Returns
+        -------
+        Instrument
+            The same with its operator.
+        """
+        return replace(self, operator=BeamOperator.of(self.pointing, self.layout))
+
+    def value(self, name: str) -> Float[Array, ""]:
+        """Look up the present value of a parameter.
+
+        Parameters
+        ----------
+        name : str
+            One of ``beams.PARAMETERS``.
+
+        Returns
+        -------
+        () array
+            In the unit that the name ends with.
+
+        Raises
+        ------
+        InputError
+            If there is no such parameter; the message names the nearest.
+        """
+        return parameter(name).where(self.monopoles)
+
+    def beams(self, values: Mapping[str, Float[Array, ""]] | None = None) -> ProductBeams:
+        """Compute the beams of all products.
+
+        Parameters
+        ----------
+        values : mapping of str to () array, optional
+            Values of some parameters (``beams.PARAMETERS``); the others keep theirs.
+
+        Returns
+        -------
+        ProductBeams
+            Up to ``lmax``; differentiable in the values.
+
+        Raises
+        ------
+        InputError
+            If there is no parameter of that name.
+        """
+        antennas = with_values(self.monopoles, values or {})
+        return monopole_beams(self.frequency_mhz, self.lmax, antennas, nodes=self.nodes)
+
+    def dense(self, values: Mapping[str, Float[Array, ""]]) -> Float[Array, "data modes"]:
+        """Compute A as a matrix, of a :meth:`prepared` instrument.
+
+        Parameters
+        ----------
+        values : mapping of str to () array
+            Values of some parameters (``beams.PARAMETERS``); the others keep theirs.
+
+        Returns
+        -------
+        (data, modes) array
+            Differentiable in the values.
+
+        Raises
+        ------
+        InputError
+            If the instrument was not prepared, or there is no parameter of that name.
+        """
+        if self.operator is None:
+            raise InputError("prepare the instrument first: instrument = instrument.prepared()")
+        return self.operator.coupling(self.beams(values))
+
+    def coupling_of(self, beams: ProductBeams) -> CouplingMatrix:
+        """Compute A of given beams, or dA of a difference of beams.
+
+        Parameters
+        ----------
+        beams : ProductBeams
+            Up to the instrument's lmax.
+
+        Returns
+        -------
+        CouplingMatrix
+            For the instrument's orientations and layout.
+
+        Raises
+        ------
+        InputError
+            If the beams have another lmax or other products.
+        """
+        return CouplingMatrix.build(beams, self.pointing, self.layout)
+
+
+def source_response(
+    observation: Observation,
+    galactic: Float[np.ndarray, "..."],
+    frequency_mhz: Frequency,
+    monopoles: Monopoles | None = None,
+    *,
+    stokes_v: float | Float[Array, ""] = 0.0,
+) -> Float[Array, "products times"]:
+    """Return the visibilities of a source of 1 K sr at every sample.
+
+    V_k(t) = B_k^I(n(t)) + stokes_v B_k^V(n(t)), since I = 1 K sr and V = stokes_v I. Multiply by
+    the flux in K sr, constant or (times,). Differentiable in ``monopoles`` and ``stokes_v``.
+
+    Parameters
+    ----------
+    observation : Observation
+    galactic : (3,) or (times, 3) array
+        As of :meth:`.Observation.antenna_directions`.
+    frequency_mhz : float
+    monopoles : Monopoles, optional
+        By default the paper's antennas.
+    stokes_v : float
+        V / I with the IAU's sign. Where it is positive, a receiver that looks towards the source
+        sees the electric field turn counter-clockwise (right-handed).
+
+    Returns
+    -------
+    (products, times) array
+        In K; zero while the source is below the horizon.
+
+    Raises
+    ------
+    InputError
+        As :meth:`.Observation.antenna_directions`; for vectors whose length is not one, a frequency
+        that is not positive, or ``|stokes_v| > 1``.
+    """
+    if not is_traced(stokes_v) and not abs(stokes_v) <= 1.0:
+        raise InputError(
+            f"stokes_v is the fraction V / I, from -1 to 1, got {stokes_v}; no wave is polarised "
+            "by more than all of itself"
+        )
+    directions = observation.antenna_directions(galactic)
+    response = beams_towards(frequency_mhz, directions, monopoles)
+    if not is_traced(stokes_v) and stokes_v == 0.0:
+        return response
+    circular = beams_towards(frequency_mhz, directions, monopoles, stokes="V")
+    return response + stokes_v * circular

@@ -36,7 +36,7 @@ from lusee_bayes.runs.folder import (
     scenario_run,
     table_file,
 )
-from lusee_bayes.sky.sky_files import write_alms
+from lusee_bayes.sky.sky_source import write_alms
 
 
 def run_map(

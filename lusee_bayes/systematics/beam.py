@@ -18,9 +18,8 @@ from pydantic import Field
 from lusee_bayes.core.section import Positive, Section, Treatment, requires
 from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.beams.monopoles import parameter, with_values
-from lusee_bayes.instrument.beams.source import BeamSource, EmbeddedBeams
-from lusee_bayes.instrument.coupling import Coupling
-from lusee_bayes.instrument.instrument import Instrument
+from lusee_bayes.instrument.beams.source import BeamSource
+from lusee_bayes.instrument.coupling import Coupling, Instrument
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise import instrument_errors
 from lusee_bayes.systematics.context import Around, Setup
@@ -115,7 +114,7 @@ def _true(section: BeamErrorSection, setup: Setup, values: Values) -> tuple[Beam
     if section.file is not None:
         return setup.source_of_file(section.file), frequency_mhz
     own = {name: values[name] for name in section.parameters}
-    return EmbeddedBeams(with_values(source.monopoles, own)), frequency_mhz
+    return with_values(source.monopoles, own), frequency_mhz
 
 
 def difference_of_beams(section: BeamErrorSection, setup: Setup) -> ProductBeams:

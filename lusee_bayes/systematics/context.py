@@ -22,14 +22,11 @@ from jaxtyping import Float
 from lusee_bayes.core.arrays import Array, DataVector, Grid, Modes
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.beams.monopoles import Receiver
-from lusee_bayes.instrument.beams.source import BeamSource
-from lusee_bayes.instrument.coupling import CouplingMatrix
-from lusee_bayes.instrument.instrument import Instrument
+from lusee_bayes.instrument.beams.source import BeamSource, Receiver
+from lusee_bayes.instrument.coupling import CouplingMatrix, Instrument
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
-from lusee_bayes.instrument.products import DataLayout, all_products, auto_indices
-from lusee_bayes.instrument.schedule import without_gaps
+from lusee_bayes.instrument.products import DataLayout, all_products, auto_indices, without_gaps
 from lusee_bayes.instrument.visibilities import Calibration, Visibilities
 from lusee_bayes.priors.families import PriorFamily
 from lusee_bayes.sky.prior import Prior

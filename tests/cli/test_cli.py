@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from astropy.io import fits
-from commands import content, posterior_of, run, sky_draws_of
+from commands import content, posterior_of, refused, run, sky_draws_of
 
 import lusee_bayes
 from lusee_bayes.cli.options import ScenarioOptions
@@ -117,11 +117,8 @@ def test_simulate_then_map_equals_map(folder, tmp_path, capsys):
     first, again = posterior_of(folder), posterior_of(tmp_path / "out")
     np.testing.assert_array_equal(first["mean"].values, again["mean"].values)
     np.testing.assert_array_equal(first["truth"].values, again["truth"].values)
-    assert (
-        again["posterior"].sizes["draw"] == 3
-        and "covariance" in first
-        and "covariance" not in again
-    )
+    assert again["posterior"].sizes["draw"] == 3
+    assert "covariance" in first and "covariance" not in again
 
 
 @pytest.mark.parametrize("flag", ["covariance", "information"])
@@ -159,18 +156,16 @@ def test_the_users_folder_stands_for_a_tilde_everywhere(tmp_path, monkeypatch, c
     assert (tmp_path / "sim.nc").is_file()
     assert run("info", "~/sim.nc") == 0
     (tmp_path / "own.yaml").write_text("sky: {model: file, file: ~/gone.fits}")
-    assert run("map", "~/own.yaml", "-o", "~/out") == 2
-    assert run("map", "fiducial", "--set", "beam.file=~/gone.nc", "-o", "~/out") == 2
-    told = capsys.readouterr().err
-    assert f"'{tmp_path / 'gone.fits'}'" in told and f"'{tmp_path / 'gone.nc'}'" in told
+    assert f"'{tmp_path / 'gone.fits'}'" in refused(capsys, "map", "~/own.yaml", "-o", "~/out")
+    other = ("--set", "beam.file=~/gone.nc", "-o", "~/out")
+    assert f"'{tmp_path / 'gone.nc'}'" in refused(capsys, "map", "fiducial", *other)
 
 
 @pytest.mark.long
 def test_data_without_truth(folder, tmp_path):
     run("simulate", "fiducial", *SMALL, "-o", tmp_path / "sim.nc", "-q")
-    xr.load_dataset(tmp_path / "sim.nc", engine="h5netcdf", decode_times=False).drop_vars(
-        "truth"
-    ).to_netcdf(tmp_path / "real.nc", engine="h5netcdf")
+    data = xr.load_dataset(tmp_path / "sim.nc", engine="h5netcdf", decode_times=False)
+    data.drop_vars("truth").to_netcdf(tmp_path / "real.nc", engine="h5netcdf")
     out = tmp_path / "out"
     assert run("map", "fiducial", *SMALL, "--data", tmp_path / "real.nc", "-o", out, "-q") == 0
     assert not (out / "truth.fits").exists()
@@ -214,11 +209,7 @@ def raises(error):
         (raises(RuntimeError("RESOURCE_EXHAUSTED: Out of memory")), 1, "not enough memory (RES"),
         (raises(RuntimeError("can't start new thread")), 1, "not enough memory (can't start"),
         (raises(OSError(errno.ENOSPC, "No space left on device")), 1, "mean.fits'); results"),
-        (
-            raises(OSError("Can't write data (errno = 28, error message = ...)")),
-            1,
-            "mean.fits'); r",
-        ),
+        (raises(OSError("Can't write data (errno = 28, error message = ..)")), 1, "mean.fits')"),
         (raises(OSError("Not enough space on disk: requested 839168")), 1, "mean.fits'); results"),
     ],
 )
@@ -242,7 +233,7 @@ def test_what_ends_a_run_is_one_sentence_and_leaves_nothing(
 def test_force_does_not_replace_what_the_run_reads(small_map, tmp_path, capsys):
     out = Path(shutil.copytree(small_map.folder, tmp_path / "out"))
     before = content(out)
-    for arguments in (
+    for command in (
         ["map", out / "scenario.yaml", "-o", out],
         ["map", "fiducial", *SMALL, "--set", f"sky.file={out}/mean.fits", "-o", out],
         ["map", "fiducial", *SMALL, "--data", out / "diagnostics.nc", "-o", out],
@@ -250,8 +241,7 @@ def test_force_does_not_replace_what_the_run_reads(small_map, tmp_path, capsys):
         ["compare", out, small_map.folder, "-o", out],
         ["simulate", out / "scenario.yaml", "-o", out / "scenario.yaml"],
     ):
-        assert run(*arguments, "--force", "-q") == 2
-        assert "is an input of this run" in capsys.readouterr().err
+        assert "is an input of this run" in refused(capsys, *command, "--force", "-q")
         assert content(out) == before
 
 

@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from commands import refused, run
 from rich.console import Console
 
 from lusee_bayes.cli.commands import app
@@ -98,15 +99,14 @@ def test_options_are_checked_before_anything_is_loaded(option, message, tmp_path
 
 
 def test_info_of_a_folder(small_map, tmp_path, capsys):
-    assert main(["info", str(small_map.folder)]) == 0
+    assert run("info", small_map.folder) == 0
     told = capsys.readouterr().out
     assert "results of lusee-bayes map" in told and "simulated by this run, seed 1" in told
     assert small_map.result.verdict() in told and "mean_alm.fits" in told
-    assert main(["info", str(small_map.folder / "diagnostics.nc")]) == 0
+    assert run("info", small_map.folder / "diagnostics.nc") == 0
     (days,) = {len(c.judged.of_kind("day")) for c in small_map.result.channels}
     assert f"residuals by {days} days, 16 products" in capsys.readouterr().out
-    assert main(["info", str(tmp_path)]) == 2
-    assert "a folder that no run has written" in capsys.readouterr().err
+    assert "a folder that no run has written" in refused(capsys, "info", tmp_path)
 
 
 COMMANDS = [name for name in app if not name.startswith("-")]
@@ -142,10 +142,7 @@ def test_keys_are_listed(capsys):
     assert "number, > 0 [h]" in shown
     assert main(["keys", "--markdown", "lmax"]) == 0
     assert "| `lmax` |" in capsys.readouterr().out
-    assert main(["keys", "lmx"]) == 2
-    assert capsys.readouterr().err == (
-        "lusee-bayes: a scenario has no key 'lmx'; did you mean 'lmax'?\n"
-    )
+    assert "no key 'lmx'; did you mean 'lmax'?" in refused(capsys, "keys", "lmx")
 
 
 # as without the extra "cluster": xarray imports Dask where it is there, and Dask SciPy
@@ -168,13 +165,9 @@ def outcome(*arguments, count=False):
     """The number of programs compiled, and the modules imported."""
     program = PROGRAM.format(count=count, arguments=[str(a) for a in arguments])
     environment = {name: v for name, v in os.environ.items() if not name.startswith("JAX")}
-    found = subprocess.run(
-        [sys.executable, "-c", program],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=environment | {"LUSEE_BAYES_CACHE": "off"},
-    )
+    environment["LUSEE_BAYES_CACHE"] = "off"
+    command = [sys.executable, "-c", program]
+    found = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
     n, *modules = found.stdout.splitlines()[-1].split()
     return int(n), set(modules)
 
@@ -199,11 +192,8 @@ def test_info_waits_for_no_more_than_its_file(name, spared, small_map):
 
 
 def test_a_map_compiles_little_and_imports_no_sampler(tmp_path):
-    n, modules = outcome(
-        *("map", "fiducial", "--set", "lmax=8", "--set", "observation.runs.0.cycles=0.2"),
-        *("-o", tmp_path / "map", "-q"),
-        count=True,
-    )
+    small = ("--set", "lmax=8", "--set", "observation.runs.0.cycles=0.2")
+    n, modules = outcome("map", "fiducial", *small, "-o", tmp_path / "map", "-q", count=True)
     # single random numbers, most of them; none of it grows with the map
     assert 0 < n <= 60
     assert not modules & {"numpyro", "arviz_stats", "scipy.stats", "scipy.optimize"}

@@ -25,13 +25,8 @@ print(sum("cache_hits" in name for name in found), flush=True)
 def run(cache, *without):
     """What the program says, in an environment without variables that begin so."""
     own = {k: v for k, v in os.environ.items() if not k.startswith(("JAX", *without))}
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=own | {SWITCH: str(cache)},
-    )
+    command, env = [sys.executable, "-c", PROGRAM], own | {SWITCH: str(cache)}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=env)
     return done.stdout, done.stderr
 
 

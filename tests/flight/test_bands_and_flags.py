@@ -135,16 +135,21 @@ def test_smooth_skies_are_flagged_as_rarely_as_is_said():
     assert flagged / total < 1e-3
 
 
-@pytest.mark.parametrize(("length", "strength"), [(1, 10.0), (4, 8.0), (20, 6.0), (60, 20.0)])
-def test_bursts_are_found(length, strength):
-    rng = np.random.default_rng(11)
-    t, values, noise = bands_in_time(rng)
-    starts = np.arange(100, N - 100, 340)
+def bursts_found(seed, offsets, length, strength):
+    """Flags of data with bursts, and where these are."""
+    t, values, noise = bands_in_time(np.random.default_rng(seed))
     burst = np.zeros(N, dtype=bool)
-    for start in starts:
-        burst[start : start + length] = True
+    for start in np.arange(100, N - 100, 340):
+        for offset in offsets:
+            burst[start + offset : start + offset + length] = True
     values[burst] += strength * noise[burst]
     found, _ = burst_flags(t, values, noise, np.ones(N, dtype=bool), FALSE_ALARM)
+    return found, burst
+
+
+@pytest.mark.parametrize(("length", "strength"), [(1, 10.0), (4, 8.0), (20, 6.0), (60, 20.0)])
+def test_bursts_are_found(length, strength):
+    found, burst = bursts_found(11, (0,), length, strength)
     assert found[burst].mean() >= 0.95
     assert found[~burst].mean() <= 1e-3
 
@@ -155,13 +160,7 @@ def test_what_is_between_weak_bursts_stays():
     A spectrum beside a burst goes with it where one auto's noise is beyond (3 - sqrt(8)) 4.5
     sqrt(8) = 2.2 sigma: one is expected in all, and more than five are rare.
     """
-    rng = np.random.default_rng(13)
-    t, values, noise = bands_in_time(rng)
-    burst = np.zeros(N, dtype=bool)
-    for start in np.arange(100, N - 100, 340):
-        burst[start : start + 8] = burst[start + 16 : start + 24] = True
-    values[burst] += 4.5 * noise[burst]
-    found, _ = burst_flags(t, values, noise, np.ones(N, dtype=bool), FALSE_ALARM)
+    found, burst = bursts_found(13, (0, 16), 8, 4.5)
     assert found[burst].mean() >= 0.95
     assert (found & ~burst).sum() <= 5
 
@@ -188,13 +187,8 @@ def spectrum(mhz, coefficients):
 
 def binned(averaging, per_channel):
     """What the flight software makes of channels, one bin after the other."""
-    return np.array(
-        [
-            sum(per_channel[averaging.stride * i + k] for k in range(averaging.members))
-            / averaging.members
-            for i in range(averaging.n_bins)
-        ]
-    )
+    starts = averaging.stride * np.arange(averaging.n_bins)
+    return np.array([per_channel[at : at + averaging.members].mean() for at in starts])
 
 
 @pytest.mark.parametrize("origin", ["centre", "edge"])
@@ -213,11 +207,10 @@ def test_polynomials_of_the_degree_are_exact_in_the_middle(navgf, degree, origin
     np.testing.assert_allclose(found, 3.0, rtol=1e-12)
     np.testing.assert_allclose(further, 0.0, atol=1e-9)
     # of independent channels with noise in proportion to the spectrum, by the pseudo-inverse
-    powers = [
-        binned(averaging, (mhz - 10.0) ** k)[band.first : band.last] for k in range(degree + 1)
-    ]
+    powers = [binned(averaging, (mhz - 10.0) ** k) for k in range(degree + 1)]
+    powers = np.stack(powers, axis=1)[band.first : band.last]
     for row, kept in enumerate(good):
-        weights = np.linalg.pinv(np.stack(powers, axis=1)[kept])[0]
+        weights = np.linalg.pinv(powers[kept])[0]
         expected = ((weights * here[kept] / 3.0) ** 2).sum() / averaging.members
         assert variance[row] == pytest.approx(expected, rel=1e-9)
 
@@ -252,16 +245,15 @@ def test_noise_of_steep_spectra_and_shared_channels_by_drawing_it():
     rng = np.random.default_rng(5)
     root = np.linalg.cholesky(band.shared)
     drawn = shape * (root @ rng.standard_normal((n, 20_000))).T
-    values, _, _ = band.values(
-        drawn[:, None], np.broadcast_to(shape, drawn.shape), np.broadcast_to(good, drawn.shape)
-    )
+    shapes, flags = (np.broadcast_to(x, drawn.shape) for x in (shape, good))
+    values, _, _ = band.values(drawn[:, None], shapes, flags)
     middle, _, _ = band.values(shape[:, None], shape, good)
     # the scatter of a variance of 20000 draws is 1 %
     assert np.var(values) / middle[0, 0] ** 2 == pytest.approx(variance[0], rel=0.04)
 
 
 def test_too_many_flags_leave_nothing():
-    band = ChannelBand.of(10.0, 1.0, 2, AVERAGING[1], channel_mhz("centre"))
+    band = band_of()
     n = band.last - band.first
     good = np.zeros((3, n), dtype=bool)
     good[1, :3] = True  # no more than terms
@@ -271,9 +263,9 @@ def test_too_many_flags_leave_nothing():
     assert np.isinf(variance).all()
 
 
-def test_bands_with_too_few_bins_are_refused():
-    assert_refused(lambda: ChannelBand.of(10.0, 0.1, 2, AVERAGING[1], channel_mhz("centre")))
-    assert_refused(lambda: ChannelBand.of(70.0, 1.0, 2, AVERAGING[1], channel_mhz("centre")))
+@pytest.mark.parametrize(("f", "width"), [(10.0, 0.1), (70.0, 1.0)])
+def test_bands_with_too_few_bins_are_refused(f, width):
+    assert_refused(lambda: ChannelBand.of(f, width, 2, AVERAGING[1], MHZ))
 
 
 def test_windows_share_noise_as_their_transforms_say():

@@ -128,26 +128,19 @@ def test_gains_are_positive_and_their_frequencies_in_mhz(tmp_path, changes, word
         refuse(words, read_gain_table, one)
 
 
-def test_telemetry_has_to_be_there():
+def test_what_lacks_something_is_refused(tmp_path):
     seen = telemetry()
     del seen["VMON_1V2D"]
     refuse("the telemetry lacks VMON_1V2D", table().strengths, "M", 0, seen)
-
-
-def test_folders_that_lack_something_are_refused(tmp_path):
     assert_refused(lambda: read_gain_table(tmp_path / "absent"))
     folder = write_folder(tmp_path / "gain", table())
     assert_refused(lambda: read_gain_table(folder, "cubic"))
     # no coefficients of that family
     assert_refused(lambda: read_gain_table(folder, "linear"))
     text = (folder / "alpha_refit.csv").read_text()
-    for old, new in (
-        ("L0,PC1,quadratic,1,", "X0,PC1,quadratic,1,"),
-        ("L0,PC1,quadratic,1,", "L0,PC3,quadratic,1,"),
-        ("L0,PC1,quadratic,1,", "L0,PC1,quadratic,SPE_ADC1_T,"),
-        ("L0,PC1,quadratic,1,", "L0,PC1,quadratic,THERM_FPGA,"),
-    ):
-        (folder / "alpha_refit.csv").write_text(text.replace(old, new, 1))
+    for row in ("X0,PC1,quadratic,1", "L0,PC3,quadratic,1", "L0,PC1,quadratic,SPE_ADC1_T",
+                "L0,PC1,quadratic,THERM_FPGA"):  # fmt: skip
+        (folder / "alpha_refit.csv").write_text(text.replace("L0,PC1,quadratic,1", row, 1))
         assert_refused(lambda: read_gain_table(folder))
     (folder / "alpha_refit.csv").write_text(text)
     np.save(folder / "M2_mean.npy", np.full(len(ANCHORS), np.nan))
@@ -199,11 +192,10 @@ def test_counts_are_gains_times_power_in_the_order_of_the_spectrometer():
     spectra = covariances(1, n, np.random.default_rng(3))[0][..., None] * np.ones(2048) * 1e-17
     one = Counting(table, "LMHM", 1, "centre")(spectra, telemetry)
     at = 800  # 20 MHz
-    gain = [
-        (np.array([1.0, *table.strengths(level, port, telemetry)[1]])
-         @ table.basis(level, port, np.array([20.0]))[:, 0])
-        for port, level in enumerate("LMHM")
-    ]  # fmt: skip
+    gain = []
+    for port, level in enumerate("LMHM"):
+        strengths = [1.0, *table.strengths(level, port, telemetry)[1]]
+        gain.append(strengths @ table.basis(level, port, np.array([20.0]))[:, 0])
     assert gain[2] / gain[0] > 500.0
     expected = spectra[:, 1, at] / 1e-18
     np.testing.assert_allclose(one[1, 0, at], expected[0] * gain[0], rtol=1e-12)

@@ -6,26 +6,13 @@ import shutil
 from dataclasses import replace
 
 import h5py
+import layout_4
 import numpy as np
 import pytest
 from assertions import refuse
 from astropy.io import fits
 from astropy.time import Time
-from layout_4 import (
-    GAINS,
-    LANDING,
-    NAMES,
-    NOTCH,
-    RAW_S,
-    SPECTROMETER_S,
-    WEIGHT,
-    N,
-    counts,
-    metadata,
-    telemetry,
-    write_families,
-    write_layout_4,
-)
+from layout_4 import NAMES, RAW_S, write_families, write_layout_4
 
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.formats import is_session
@@ -114,31 +101,32 @@ def test_gains_in_letters_are_the_same(copy):
 
 
 def test_what_a_session_of_layout_4_says(newer):
-    session, rows = read_session(newer), metadata()
+    session, rows = read_session(newer), layout_4.metadata()
     assert is_session(newer)
-    assert (session.n_rows, session.layout, session.kind) == (N, 4, "HDF5")
+    assert (session.n_rows, session.layout, session.kind) == (layout_4.N, 4, "HDF5")
     assert (session.lon_deg, session.lat_deg, session.software) == (182.258, -23.814, "0x307")
     expected = {
         "raw_s": RAW_S,
         "navgf": 2,
-        "frames": 2.0**14 * WEIGHT,
-        "level": np.array(list("LMH"))[GAINS],
+        "frames": 2.0**14 * layout_4.WEIGHT,
+        "level": np.array(list("LMH"))[layout_4.GAINS],
         "adc_low": rows["adc_min"],
         "adc_high": rows["adc_max"],
         "adc_invalid": rows["adc_invalid_count_max"],
         "errors": rows["errors"],
-        "notch": NOTCH,
+        "notch": layout_4.NOTCH,
     }
     for name, values in expected.items():
         np.testing.assert_array_equal(getattr(session, name), values)
     np.testing.assert_allclose(session.window_s, 2**20 * 40e-6, rtol=1e-12)
     assert session.telemetry.keys() == set(NAMES[1:])
     for name, values in session.telemetry.items():
-        np.testing.assert_allclose(values, telemetry(name, RAW_S), rtol=1e-9)
+        np.testing.assert_allclose(values, layout_4.telemetry(name, RAW_S), rtol=1e-9)
     utc = session.clock.utc(RAW_S)
-    np.testing.assert_allclose((utc - Time(LANDING)).sec, RAW_S - SPECTROMETER_S, atol=1e-5)
+    elapsed = RAW_S - layout_4.SPECTROMETER_S
+    np.testing.assert_allclose((utc - Time(layout_4.LANDING)).sec, elapsed, atol=1e-5)
     with session.spectra() as read:
-        np.testing.assert_array_equal(read(1, 4), counts()[1:4])
+        np.testing.assert_array_equal(read(1, 4), layout_4.counts()[1:4])
 
 
 def test_families_that_are_not_used_are_named(newer, capsys):
@@ -150,10 +138,9 @@ def test_families_that_are_not_used_are_named(newer, capsys):
     rows = {"calibrator__zoom_spectra": 12, "tr_spectra": 2, "calibrator__data": 3}
     write_families(newer, **rows, grimm_spectra=1, housekeeping=4)
     (line,) = told()
-    assert line.split("not used: ")[1] == (
-        "time-resolved spectra (2 rows), zoom spectra (12 rows), Grimm's spectra (1 row), "
-        "calibrator data (3 rows), housekeeping (4 rows)"
-    )
+    for name, n in (("time-resolved spectra", 2), ("zoom spectra", 12), ("calibrator data", 3)):
+        assert f"{name} ({n} rows)" in line
+    assert "Grimm's spectra (1 row)" in line and "housekeeping (4 rows)" in line
 
 
 def test_without_a_clock_reference_the_telemetry_of_layout_4_is_not_known(newer):

@@ -9,6 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from assertions import require_conventions
 from astropy.io import fits
 from changes import SCALE, byte_changes, change_bytes, change_items, item_changes, require_answer
 from hypothesis import given, settings
@@ -24,7 +25,7 @@ from lusee_bayes.report.describe import describe
 from lusee_bayes.results.map_files import read_channels, read_information
 from lusee_bayes.runs import folder as folder_module
 from lusee_bayes.runs import map_run
-from lusee_bayes.sky.sky_files import write_alms
+from lusee_bayes.sky.sky_source import write_alms
 from lusee_bayes.testing.scenarios import small_scenario
 
 FEW, MANY = 2, 150 * SCALE
@@ -75,6 +76,8 @@ READERS = {
     "gains.nc": (describe, read_gain_table),
 }
 
+# files of the package by its one mapper
+OWN = ("posterior.nc", "information.nc", "cube.nc", "diagnostics.nc", "reduced.nc", "gains.nc")
 LUSEEPYS = {
     "scalar_beam.fits": "synthetic_monopole_beam.fits",
     "response.fits": "synthetic_response_v3.fits",
@@ -146,6 +149,11 @@ def luseepys(tmp_path_factory, test_data) -> Path:
                 hdus[0].header.update({"FREQ_MIN": 9.0, "FREQ_MAX": 12.0, "FREQ_N": 4})
             hdus.writeto(folder / name)
     return folder
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_own_files_follow_the_conventions(name, files):
+    require_conventions(files / name)
 
 
 @pytest.mark.parametrize("n", [FEW, pytest.param(MANY, marks=pytest.mark.long)])

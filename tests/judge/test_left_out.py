@@ -7,6 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from experiments import flagged
 from reference_linear import matrices
 
 import lusee_bayes as lb
@@ -56,8 +57,7 @@ def observed(size, kind, *more, gaps=False):
     scenario = lb.load_scenario("fiducial", [*SIZES[size], NOISY, *NOISES[kind], *more])
     e = lb.build(scenario)
     if gaps:
-        layout = DataLayout.from_flags(flags_of(e.data.layout))
-        e = lb.build(scenario, replace(e.data, layout=layout, data=layout.gather(e.data.grid())))
+        e = lb.build(scenario, flagged(e.data, flags_of(e.data.layout)))
     model = full_model(e.setup)
     a, s, n = matrices(model)
     inverse = np.linalg.inv(a @ s @ a.T + n)
@@ -138,18 +138,14 @@ def test_a_matrix_without_structure_in_time(kind, monkeypatch):
     check(LeftOut(model, data), data, *expected, every_kind(data))
 
 
-def test_what_the_posterior_saves_changes_nothing():
-    model, data, *expected = observed("few", "blocks and templates")
-    posterior = model.condition(data.data)
-    found = LeftOut(model, data, posterior=posterior)
-    check(found, data, *expected, every_kind(data))
-
-
-def test_means_over_windows():
-    """Other functions of time than those of instants."""
+def test_what_the_posterior_saves_and_means_over_windows():
+    """Which have other functions of time than those of instants."""
     model, data, *expected = observed("many", "diagonal", "observation.window=mean")
     assert data.observation.windows is not None
     check(LeftOut(model, data), data, *expected, every_kind(data))
+    model, data, *expected = observed("few", "blocks and templates")
+    found = LeftOut(model, data, posterior=model.condition(data.data))
+    check(found, data, *expected, every_kind(data))
 
 
 def test_all_data_have_nothing_to_be_compared_with():
@@ -192,7 +188,7 @@ def test_densities_of_groups_are_what_the_covariance_of_the_data_says():
         "product": [data.layout.product == j for j in range(16)],
         "day": [day == j for j in np.unique(day)],
     }
-    for found in held_out(model, model.condition(data.data), data):
+    for found in held_out(model.condition(data.data), data):
         chosen = groups.pop(found.kind)
         expected = sum(log_density(every) - log_density(~inside) for inside in chosen)
         assert (found.groups, found.n) == (len(chosen), len(less))
@@ -208,6 +204,5 @@ def test_groups_have_data():
     assert [sum(group.kind == kind for group in found) for kind in KINDS] == [16, 2, 2]
     day = data.observation.hours // 24 == 1
     np.testing.assert_array_equal(found[17].data, np.broadcast_to(day, (16, len(day))))
-    layout = DataLayout.from_flags(found[3].data)
-    fewer = replace(data, layout=layout, data=layout.gather(data.grid()))
-    assert found[3].name not in [group.name for group in groups_of(fewer)]
+    fewer = groups_of(flagged(data, found[3].data))
+    assert found[3].name not in [group.name for group in fewer]

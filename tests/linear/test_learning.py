@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 
 import lusee_bayes as lb
 from lusee_bayes.linear.information import integrated_out
-from lusee_bayes.priors.families import IsotropicFamily
+from lusee_bayes.priors.families import FREEDOM, Hyperprior, IsotropicFamily
 from lusee_bayes.priors.learning import (
     ROUNDING,
     Learned,
@@ -28,17 +28,14 @@ from lusee_bayes.priors.local_scales import embedded_local_scales
 LMAX, N_DATA = 6, 120
 
 
-def information_of(sky: np.ndarray, noise: float = 30.0, seed: int = 2) -> lb.Information:
+def information_of(sky, noise=30.0, seed=2, n_data=N_DATA, strength=1.0) -> lb.Information:
     """Of data of a sky through a random A."""
     rng = np.random.default_rng(seed)
-    coupling = rng.standard_normal((N_DATA, len(sky))) / np.sqrt(len(sky))
-    data = coupling @ sky + noise * rng.standard_normal(N_DATA)
-    model = lb.LinearGaussian(
-        coupling,
-        lb.HarmonicPrior(np.full(LMAX + 1, 1e8)),
-        lb.DiagonalCovariance(np.full(N_DATA, noise**2)),
-    )
-    return model.inform(data)[0]
+    coupling = strength * rng.standard_normal((n_data, len(sky))) / np.sqrt(len(sky))
+    data = coupling @ sky + noise * rng.standard_normal(n_data)
+    prior = lb.HarmonicPrior(np.full(round(np.sqrt(len(sky))), 1e8))
+    variance = lb.DiagonalCovariance(np.full(n_data, noise**2))
+    return lb.LinearGaussian(coupling, prior, variance).condition(data).information
 
 
 @dataclass(frozen=True)
@@ -69,12 +66,8 @@ def test_the_maximum_is_that_of_a_general_optimiser(case):
     """Nelder-Mead knows no gradient; ln p there and here agree to what is said to be settled."""
     found = learn(case.family, case.information)
     start = case.family.hyperprior.start()
-    other = minimize(
-        lambda x: -log_density(case, x),
-        start,
-        method="Powell",
-        options={"xtol": 1e-4, "ftol": 1e-9, "maxiter": 200},
-    )
+    options = {"xtol": 1e-4, "ftol": 1e-9, "maxiter": 200}
+    other = minimize(lambda x: -log_density(case, x), start, method="Powell", options=options)
     here = log_density(case, found.parameters)
     assert here > -other.fun - 0.05
     std = np.sqrt(np.diagonal(found.covariance))
@@ -144,6 +137,48 @@ def test_a_root_of_what_rounding_has_spoilt():
         np.testing.assert_allclose(root @ root.T, expected, atol=1.1 * ROUNDING)
 
 
+# --- normal scores --------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+def test_the_evidence_agrees_with_draws_of_the_hyperprior():
+    """The mean of p(d | theta) over theta ~ p(theta), which no maximum enters."""
+    family = IsotropicFamily.around(2e4, 4)
+    prior = family.prior(family.at(family.hyperprior.start()).covariance)
+    sky = np.asarray(prior.sample(jax.random.key(4)))
+    information = information_of(sky, noise=2000.0, seed=3, n_data=40, strength=5.0 / 3.0)
+    hyperprior, rng = family.hyperprior, np.random.default_rng(5)
+    size = (1000, hyperprior.size)
+    drawn = hyperprior.centre + hyperprior.width * rng.standard_t(FREEDOM, size)
+    values = []
+    for theta in drawn:
+        try:
+            prior = family.prior(family.at(theta).covariance)
+            values.append(float(information.posterior(prior).log_evidence))
+        except lb.InputError:  # nothing of that size is in the data
+            values.append(-np.inf)
+    largest = max(values)
+    expected = largest + np.log(np.exp(np.array(values) - largest).mean())
+    # without the tails Laplace's approximation is 1.7 below
+    assert abs(learn(family, information).log_evidence - expected) < 0.6
+
+
+def test_scores_are_standard_normal_under_the_hyperprior():
+    """Against SciPy's distributions: Student's, and a gamma distribution of a cell's power."""
+    hyperprior = Hyperprior(np.array([1.0]), np.array([0.5]), n_cells=1)
+    for score in np.linspace(-3.0, 3.0, 7):
+        both, step = np.full(2, score), 1e-5
+        found = hyperprior.of_scores(both)
+        power = stats.gamma.isf(stats.norm.cdf(score), 0.75, scale=1.0 / 0.75)
+        assert found[0] == pytest.approx(1.0 + 0.5 * stats.t.ppf(stats.norm.cdf(score), 2))
+        assert found[1] == pytest.approx(-0.5 * np.log(power))
+        np.testing.assert_allclose(hyperprior.scores(found), both, rtol=1e-10, atol=1e-12)
+        rise = hyperprior.of_scores(both + step) - hyperprior.of_scores(both - step)
+        np.testing.assert_allclose(
+            hyperprior.slopes_of_scores(both), rise / (2.0 * step), rtol=1e-7
+        )
+
+
 # --- data that do not fit -------------------------------------------------------------------------
 
 
@@ -152,13 +187,10 @@ def test_raised_information_is_that_of_raised_noise():
     rng = np.random.default_rng(3)
     n = (LMAX + 1) ** 2
     coupling, data = rng.standard_normal((N_DATA, n)), 100.0 * rng.standard_normal(N_DATA)
+    prior = lb.HarmonicPrior(np.full(LMAX + 1, 1e4))
+    noise = (lb.DiagonalCovariance(np.full(N_DATA, variance)) for variance in (9.0, 63.0))
     plain, expected = (
-        lb.LinearGaussian(
-            coupling,
-            lb.HarmonicPrior(np.full(LMAX + 1, 1e4)),
-            lb.DiagonalCovariance(np.full(N_DATA, variance)),
-        ).inform(data)[0]
-        for variance in (9.0, 63.0)
+        lb.LinearGaussian(coupling, prior, n).condition(data).information for n in noise
     )
     raised, sky = plain.raised(7.0), rng.standard_normal(n)
     np.testing.assert_allclose(raised.matrix, expected.matrix, rtol=1e-12)
@@ -169,10 +201,8 @@ def test_raised_information_is_that_of_raised_noise():
 def test_data_that_fit_demand_nothing(case):
     """And the prior is that of learning without a question asked."""
     assert demanded_factor(case.information, case.family.expected()) == 1.0
-    plain, found = (
-        learn(case.family, case.information),
-        learn_whatever_fits(case.family, case.information),
-    )
+    plain = learn(case.family, case.information)
+    found = learn_whatever_fits(case.family, case.information)
     assert found.fits and found.noise_factor == 1.0
     np.testing.assert_array_equal(found.parameters, plain.parameters)
 
@@ -203,9 +233,6 @@ def test_where_nothing_settles_the_prior_is_fixed_and_wide(case, monkeypatch):
 
 LOW = 3
 SIZE = (LOW + 1) ** 2
-
-
-# --- one parameter, the strength of the sky ---------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -265,11 +292,9 @@ def weakly_known(family: IsotropicFamily, std: float) -> tuple[Learned, lb.Infor
     """Parameters known to so much, and the information of data that hardly tell the sky."""
     theta = family.hyperprior.start()
     prior = family.prior(family.at(theta).covariance)
-    information = lb.Information(
-        np.eye(SIZE) * 1e-8, np.ones(SIZE), np.zeros(SIZE), *[np.ones(())] * 3
-    )
-    learned = Learned(prior, (), theta, std**2 * np.eye(len(theta)), 0.0, 0)
-    return learned, information
+    matrix, one = np.eye(SIZE) * 1e-8, np.ones(())
+    information = lb.Information(matrix, np.ones(SIZE), np.zeros(SIZE), one, one, one)
+    return Learned(prior, (), theta, std**2 * np.eye(len(theta)), 0.0, 0), information
 
 
 def test_few_draws_and_none():

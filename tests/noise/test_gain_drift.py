@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from assertions import close, refuse, refused
+from assertions import close, refuse
 from reference_linear import assert_draws_follow, z_of
 
 import lusee_bayes as lb
@@ -246,10 +246,10 @@ def test_bad_parameters_are_refused(bad):
 def test_bad_visibilities_are_refused():
     drift, layout = GainDrift(0.01), DataLayout(4, N_TIMES)
     d = jnp.asarray(visibilities(2))
-    with refused(r"the visibilities has shape \(4, 5\), expected \(4, 6\)"):
-        drift.covariance(d[:, :5], HOURS[:5], layout)
-    with pytest.raises(lb.InputError, match=r"the visibilities holds NaN .* first at \(2, 1\)"):
-        drift.covariance(d.at[2, 1].set(jnp.nan), HOURS, layout)
+    short, shapes = d[:, :5], r"the visibilities has shape \(4, 5\), expected \(4, 6\)"
+    refuse(shapes, drift.covariance, short, HOURS[:5], layout)
+    bad = d.at[2, 1].set(jnp.nan)
+    refuse(r"visibilities holds NaN .* first at \(2, 1\)", drift.covariance, bad, HOURS, layout)
 
 
 def test_the_term_alone_is_not_a_noise():

@@ -7,9 +7,9 @@ import json
 
 import matplotlib.image
 import pytest
+from commands import refused, run
 
 import lusee_bayes as lb
-from lusee_bayes.cli.main import main
 from lusee_bayes.results.finished_runs import evidence_caveat, read_runs
 
 pytestmark = pytest.mark.long
@@ -30,7 +30,7 @@ def runs(tmp_path_factory):
 
 def test_the_right_model_wins(runs, tmp_path, capsys):
     out = tmp_path / "out"
-    assert main(["compare", str(runs / "fiducial"), str(runs / "gain_1e-2"), "-o", str(out)]) == 0
+    assert run("compare", runs / "fiducial", runs / "gain_1e-2", "-o", out) == 0
     told = capsys.readouterr().out
     assert "look at" in told and "Do not compare the evidences" not in told
     with (out / "comparison.csv").open(newline="") as file:
@@ -55,15 +55,13 @@ def test_different_data_are_told_apart(runs, tmp_path, capsys):
     assert "has other values at the same times" in evidence_caveat(read)
     assert evidence_caveat(read_runs([runs / "fiducial", runs / "gain_1e-2"])) is None
     assert read[0].channel.mean.shape == read[1].channel.mean.shape
-    out = str(tmp_path / "out")
-    assert main(["compare", str(runs / "fiducial"), str(runs / "other"), "-o", out]) == 0
+    assert run("compare", runs / "fiducial", runs / "other", "-o", tmp_path / "out") == 0
     assert "Do not compare the evidences" in capsys.readouterr().out
 
 
 def test_what_cannot_be_compared(runs, small_cube, tmp_path, capsys, numbers_alone):
-    one = lb.run_map(
-        lb.load_scenario("fiducial", [*SMALL, "frequencies_mhz=[25]"]), tmp_path / "one"
-    )
+    scenario = lb.load_scenario("fiducial", [*SMALL, "frequencies_mhz=[25]"])
+    one = lb.run_map(scenario, tmp_path / "one")
     for folders, message in (
         ([runs / "fiducial", small_cube.folder], "'cube' is a run of frequencies_mhz"),
         ([runs / "fiducial", one.folder], "'one' is a run of frequencies_mhz"),
@@ -71,7 +69,5 @@ def test_what_cannot_be_compared(runs, small_cube, tmp_path, capsys, numbers_alo
         ([runs / "fiducial", tmp_path], "has no summary.json"),
         ([runs / "fiducial", runs / "fiducial"], "two of the folders are named 'fiducial'"),
     ):
-        command = ["compare", *map(str, folders), "-o", str(tmp_path / "out")]
-        assert main(command) == 2
-        assert message in capsys.readouterr().err
+        assert message in refused(capsys, "compare", *folders, "-o", tmp_path / "out")
     assert not (tmp_path / "out").exists()

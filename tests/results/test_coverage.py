@@ -16,8 +16,7 @@ from lusee_bayes.experiment.experiment import build, under_sky
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.judge.coverage import Counts, Coverage
 from lusee_bayes.judge.levels import LEVELS
-from lusee_bayes.sky.sky_files import write_alms
-from lusee_bayes.sky.sky_source import FileSource, GalaxySource
+from lusee_bayes.sky.sky_source import FileSource, GalaxySource, write_alms
 from lusee_bayes.testing.scenarios import small_scenario
 
 NSIDE, LMAX = 8, 6
@@ -49,12 +48,8 @@ def test_pixels_are_counted_by_latitude():
     pull, *drawn = [modes_to_map(sky, NSIDE) / std for sky in (error, *draws)]
     b = np.degrees(np.pi / 2 - healpy.pix2ang(NSIDE, np.arange(len(std)))[0])
     found = Counts.of_pixels(std, error, draws).coverage()
-    assert [part.name for part in found] == [
-        "|b| < 10 deg",
-        "|b| 10 to 30 deg",
-        "|b| > 30 deg",
-        "whole sky",
-    ]
+    names = ["|b| < 10 deg", "|b| 10 to 30 deg", "|b| > 30 deg", "whole sky"]
+    assert [part.name for part in found] == names
     bands = [(0, 10), (10, 30), (30, 90), (0, 90)]
     for part, (low, high) in zip(found, bands, strict=True):
         here = [k for k in range(len(b)) if low <= abs(b[k]) < high]

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from reference_linear import matrices
 from scipy import stats
 
 import lusee_bayes as lb
@@ -27,10 +28,8 @@ def test_each_joint_test_is_right_where_the_model_holds():
     """p-values of sum, of the channel furthest out and of the prior are uniform, those of the sign
     test are of a binomial distribution; all together make a false alarm once in a thousand."""
     rng = np.random.default_rng(4)
-    runs = [
-        fits(rng.chisquare(5000.0, 46), rest=(float(rng.chisquare(200.0)), 200.0))
-        for _ in range(300)
-    ]
+    drawn = ((rng.chisquare(5000.0, 46), float(rng.chisquare(200.0))) for _ in range(300))
+    runs = [fits(chi2, rest=(rest, 200.0)) for chi2, rest in drawn]
     by_test = np.array([[t.p for t in run.tests()] for run in runs])
     for column in (0, 3):
         assert stats.kstest(by_test[:, column], "uniform").pvalue > 1e-4
@@ -100,19 +99,17 @@ def test_chi2_of_a_channel_is_that_of_its_data_under_the_model(small_cube):
     for channel, scenario in zip(run.channels, run.scenario.channels(), strict=True):
         experiment = lb.build(scenario)
         model = full_model(experiment.setup)
-        a, d = np.asarray(model.coupling.dense()), np.asarray(experiment.data.data)
-        k = a @ np.diag(np.asarray(model.prior.variance())) @ a.T + np.asarray(model.noise.dense())
-        assert channel.chi2_model == pytest.approx(d @ np.linalg.solve(k, d), rel=1e-4)
+        (a, s, n), d = matrices(model), np.asarray(experiment.data.data)
+        sky = a @ s @ a.T
+        assert channel.chi2_model == pytest.approx(d @ np.linalg.solve(sky + n, d), rel=1e-4)
         # what no sky explains, with a prior that is wide by hand
-        wide = WIDER**2 * (k - np.asarray(model.noise.dense())) + np.asarray(model.noise.dense())
+        wide = WIDER**2 * sky + n
         expected = d @ np.linalg.solve(wide, d)
         assert channel.instrument.chi2 == pytest.approx(expected, abs=0.02 * expected)
     fits = run.fits()
-    total = sum(c.chi2_model for c in run.channels)
+    total, n_data = (sum(getattr(c, k) for c in run.channels) for k in ("chi2_model", "n_data"))
     assert fits.rest.chi2 + fits.chi2.sum() == pytest.approx(total)
-    assert fits.rest.degrees + fits.degrees.sum() == pytest.approx(
-        sum(c.n_data for c in run.channels)
-    )
+    assert fits.rest.degrees + fits.degrees.sum() == pytest.approx(n_data)
     told = json.loads((small_cube.folder / "summary.json").read_text())
     assert told["level"] == run.fit.level and told["verdict"] == run.verdict()
     assert [t["name"] for t in told["tests"]][::3] == ["sum over all channels", "prior"]

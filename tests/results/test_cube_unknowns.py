@@ -72,20 +72,19 @@ def test_in_a_joint_posterior_they_are_those_of_all_skies_and_unknowns_together(
 ):
     """Every sky and every unknown as one Gaussian in NumPy."""
     spectral = "spectral.components=[power_law]"
-    scenario = cube_of(
-        response_file, RECEIVER, GROUND, "joint=true", spectral, frequencies="[15, 20, 25]"
-    )
+    given = (RECEIVER, GROUND, "joint=true", spectral)
+    scenario = cube_of(response_file, *given, frequencies="[15, 20, 25]")
     channels = map_channels(scenario, tmp_path)
     prior = channels.joint.prior
     n_modes, n_own = 16, 5
     stds = [np.sqrt(np.asarray(per_mode(c))) for c in (prior.spectra[0], *prior.residual)]
     stds = np.concatenate([*stds, np.ones(3 * n_own)])
-    rows, noise, rest, tables = [], [], [], []
+    rows, noise, rest, tables = found = [], [], [], []
     for number, channel in enumerate(scenario.channels()):
         experiment = lb.build(channel)
-        found = lb.infer(experiment)
+        inference = lb.infer(experiment)
         a = np.asarray(experiment.setup.coupling.dense())
-        t = np.concatenate([np.asarray(s.columns) for s in found.systematics], axis=1)
+        t = np.concatenate([np.asarray(s.columns) for s in inference.systematics], axis=1)
         row = np.zeros((len(a), len(stds)))
         row[:, :n_modes] = float(prior.mixing[number, 0]) * a
         row[:, (1 + number) * n_modes : (2 + number) * n_modes] = a
@@ -93,10 +92,9 @@ def test_in_a_joint_posterior_they_are_those_of_all_skies_and_unknowns_together(
         rows.append(row)
         noise.append(np.sqrt(np.asarray(radiometer(experiment.setup).diagonal())))
         rest.append(np.asarray(experiment.data.data) - np.asarray(experiment.setup.offset))
-        tables.append(unknowns_report(experiment, found).table)
-    expected = white_posterior(
-        np.concatenate(rows), stds, np.concatenate(noise), np.concatenate(rest)
-    )
+        tables.append(unknowns_report(experiment, inference).table)
+    a, noise, rest = map(np.concatenate, found[:3])
+    expected = white_posterior(a, stds, noise, rest)
     alone = pd.concat(tables, ignore_index=True)
     table = channels.unknowns.table
     scale, own = table["prior_std"].to_numpy(), slice(4 * n_modes, None)

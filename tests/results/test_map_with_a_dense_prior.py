@@ -1,4 +1,4 @@
-"""A whole map under a prior that correlates modes: results, files, page, and new data."""
+"""A whole map under a prior that correlates modes: results, and its resolution."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers
 from lusee_bayes.linear.posterior import pixel_std
 from lusee_bayes.results.channel_map import region_rows
-from lusee_bayes.results.map_files import posterior_tree, read_information
 from lusee_bayes.testing.scenarios import small_scenario
 
 LMAX = 6
@@ -30,7 +29,7 @@ def with_dense_prior(experiment: lb.Experiment) -> lb.Experiment:
 @pytest.fixture(scope="module")
 def found():
     """The experiment conditioned on its data, and the channel."""
-    scenario = small_scenario("output.information=true", lmax=LMAX, cycles=0.1)
+    scenario = small_scenario(lmax=LMAX, cycles=0.1)
     return mapped(with_dense_prior(lb.build(scenario)))
 
 
@@ -74,22 +73,3 @@ def test_its_resolution_is_packed(found):
     covariance = np.asarray(made.found.posterior.covariance())
     exact = np.eye(len(s)) - covariance @ np.linalg.inv(s)
     assert (np.abs(found - exact) <= 0.51 * steps * scale).all()
-
-
-def test_new_data_are_added_to_its_file(found, tmp_path):
-    made, channel = found
-    scenario, path = made.experiment.scenario, tmp_path / "posterior.nc"
-    posterior_tree(lb.MapResult(scenario, (channel,))).to_netcdf(path, engine="h5netcdf")
-    saved, full = read_information(path, scenario), made.found.posterior
-    assert saved.digests == (made.experiment.data.digest(),)
-    # what is saved is information, from which the posterior is found anew
-    again = saved.information.posterior(full.prior)
-    assert (np.abs(again.mean - np.asarray(full.mean)) / channel.std).max() < 1e-6
-    np.testing.assert_allclose(again.std(), full.std(), rtol=1e-9)
-    later = small_scenario(
-        "output.information=true", "observation.start=2027-02-20", "seed=5", lmax=LMAX
-    )
-    _, both = mapped(with_dense_prior(lb.build(later)), saved)
-    assert (both.std < channel.std * (1 + 1e-9)).all()
-    assert both.information_bits - channel.information_bits > 10
-    assert len(both.digests) == 2

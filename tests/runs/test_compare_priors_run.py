@@ -14,7 +14,7 @@ from experiments import mapped
 import lusee_bayes as lb
 from lusee_bayes.experiment.rounds import NAMED
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.sky.sky_files import write_alms
+from lusee_bayes.sky.sky_source import write_alms
 from lusee_bayes.testing.scenarios import small_scenario
 
 SIZES = {"lmax": 8, "cycles": 0.15}
@@ -83,9 +83,8 @@ def test_data_of_a_prior_prefer_it(name, tmp_path):
     sky[0] = setup.sky.modes[0]
     path = write_alms(tmp_path / "sky.fits", sky, {})
     drawn = small_scenario(f"sky={{model: file, file: {path}}}", "sky.sources=null", **SIZES)
-    result = lb.run_compare_priors(
-        drawn, tmp_path / "out", ["isotropic-sky", "local_scales"]
-    ).result
+    two = ["isotropic-sky", "local_scales"]
+    result = lb.run_compare_priors(drawn, tmp_path / "out", two).result
     assert result.best.name == name
     assert f"The data prefer {name}" in result.headline()
     if name == "local_scales":  # it has seen what it predicts, with parameters enough to gain by it

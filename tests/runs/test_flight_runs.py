@@ -10,11 +10,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from commands import posterior_of
+from commands import posterior_of, refused, run
 from matplotlib.figure import Figure
 
 import lusee_bayes as lb
-from lusee_bayes.cli.main import main
 from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.experiment.data_files import reduce_files
 from lusee_bayes.flight.reduced import read_reduced, write_reduced
@@ -35,9 +34,12 @@ SET = [
 
 
 def simulate(folder, *more, force=False):
-    options = [option for one in (*SET, *more) for option in ("--set", one)]
-    options += ["--force"] if force else []
-    return main(["simulate", "fiducial", "--flight", "-q", "-o", str(folder), *options])
+    options = ["--force"] if force else []
+    return run("simulate", "fiducial", "--flight", "-q", "-o", folder, *given(*more), *options)
+
+
+def given(*more):
+    return [option for one in (*SET, *more) for option in ("--set", one)]
 
 
 def files_of(folder):
@@ -51,8 +53,7 @@ def test_a_map_of_simulated_sessions_has_the_sky_that_was_simulated(tmp_path, ca
     folder = tmp_path / "flight"
     more = ["observation.step_s=3600", "observation.runs=[{cycles: 0.06}]"]
     more += ["flight.simulated={session_h: 12, clock: unknown, switch_h: 20, navgf: 2}"]
-    options = [option for one in (*SET, *more) for option in ("--set", one)]
-    assert main(["simulate", "fiducial", "--flight", "-o", str(folder), *options]) == 0
+    assert run("simulate", "fiducial", "--flight", "-o", folder, *given(*more)) == 0
     names = [f"session_{k:03d}.h5" for k in range(4)]
     known = ["clock.json", "gains.nc", "manifest.json", "scenario.yaml", *names, "truth.npz"]
     assert files_of(folder) == known
@@ -60,7 +61,7 @@ def test_a_map_of_simulated_sessions_has_the_sky_that_was_simulated(tmp_path, ca
     line = capsys.readouterr().out.strip().splitlines()[-1]
     program, *arguments = shlex.split(line)
     assert program == "lusee-bayes"
-    assert main([*arguments, "--covariance", "--truth", "-o", str(tmp_path / "map")]) == 0
+    assert run(*arguments, "--covariance", "--truth", "-o", tmp_path / "map") == 0
     lines = capsys.readouterr().out.splitlines()
     assert sum(line.startswith("Flagged ") and "% of the values" in line for line in lines) == 1
     assert any("times compared at lmax=3, round 1" in line for line in lines)
@@ -74,8 +75,8 @@ def test_fits_and_a_gain_table_of_ones_own(tmp_path):
     first, second = tmp_path / "a", tmp_path / "b"
     assert simulate(first) == 0
     assert files_of(first)[0] == "gains.nc"
-    assert simulate(second, f"flight.gain_table={first / 'gains.nc'}",
-                    "flight.simulated={kind: fits}") == 0  # fmt: skip
+    table = f"flight.gain_table={first / 'gains.nc'}"
+    assert simulate(second, table, "flight.simulated={kind: fits}") == 0
     assert "gains.nc" not in files_of(second) and "clock.json" not in files_of(second)
     scenario = parse_yaml((second / "scenario.yaml").read_text(), "the file")
     assert scenario["flight"]["gain_table"] == str(first / "gains.nc")
@@ -104,35 +105,31 @@ def simulated(tmp_path_factory):
 def test_files_are_replaced_only_if_it_is_asked_for(simulated, tmp_path, capsys):
     out, session = tmp_path / "out.nc", simulated / "session_000.h5"
     before = session.read_bytes()
-    assert simulate(simulated) == 2
+    again = ("simulate", "fiducial", "--flight", "-q", "-o", simulated, *given())
     told = f"'{simulated}' holds sessions already (session_000.h5); give -o another folder, or"
-    assert told in capsys.readouterr().err
+    assert told in refused(capsys, *again)
     assert session.read_bytes() == before
     for command in (
         ["simulate", "fiducial", "-q", "--set", "lmax=3"],
-        ["reduce", "-q", str(simulated / "scenario.yaml"), str(session)],
+        ["reduce", "-q", simulated / "scenario.yaml", session],
     ):
         out.write_bytes(b"mine")
-        assert main([*command, "-o", str(out)]) == 2
-        assert "is there already; give -o another name, or --force" in capsys.readouterr().err
+        there = refused(capsys, *command, "-o", out)
+        assert "is there already; give -o another name, or --force" in there
         assert out.read_bytes() == b"mine"
-        assert main([*command, "-o", str(out), "--force"]) == 0
+        assert run(*command, "-o", out, "--force") == 0
         assert out.read_bytes() != b"mine"
     # and what is reduced is not reduced again
-    assert main([*command[:3], str(out), "-o", str(tmp_path / "x.nc")]) == 2
-    told = f"lusee-bayes: '{out}' is reduced already; give it to lusee-bayes map --data\n"
-    assert capsys.readouterr().err == told
+    told = refused(capsys, *command[:3], out, "-o", tmp_path / "x.nc")
+    assert f"'{out}' is reduced already; give it to lusee-bayes map --data" in told
 
 
 @pytest.mark.parametrize("name", ["gains.nc", "truth.npz", "scenario.yaml"])
 def test_what_can_be_mapped_is_said_of_a_file_that_cannot(simulated, tmp_path, capsys, name):
-    out = ["-q", "-o", str(tmp_path / "map")]
-    data = ["--data", str(simulated / name)]
-    assert main(["map", str(simulated / "scenario.yaml"), *data, *out]) == 2
-    error = capsys.readouterr().err
+    given = ["--data", simulated / name, "-q", "-o", tmp_path / "map"]
+    error = refused(capsys, "map", simulated / "scenario.yaml", *given)
     assert f"{name} holds nothing that can be mapped" in error
-    for kind in ("visibilities", "waterfall", "sessions", "reduce"):
-        assert kind in error
+    assert all(kind in error for kind in ("visibilities", "waterfall", "sessions", "reduce"))
 
 
 def test_sessions_without_a_number_are_refused(simulated, tmp_path, capsys):
@@ -140,22 +137,20 @@ def test_sessions_without_a_number_are_refused(simulated, tmp_path, capsys):
     shutil.copy(simulated / "session_000.h5", empty)
     with h5py.File(empty, "a") as file:
         file["spectra/data"][...] = np.nan
-    assert main(["reduce", "-q", str(simulated / "scenario.yaml"), str(empty), "-o", str(out)]) == 2
-    assert "NaN" in capsys.readouterr().err and not out.exists()
+    said = refused(capsys, "reduce", "-q", simulated / "scenario.yaml", empty, "-o", out)
+    assert "NaN" in said and not out.exists()
 
 
 def test_info_of_several_files_names_the_bad_one_and_shows_the_others(simulated, tmp_path, capsys):
     bad = tmp_path / "bad.h5"
     bad.write_text("nothing")
     good = [simulated / "session_000.h5", simulated / "gains.nc"]
-    assert main(["info", str(good[0]), str(bad), str(good[1])]) == 2
+    assert run("info", good[0], bad, good[1]) == 2
     told = capsys.readouterr()
-    parts = told.out.split("\n\n")
-    assert [part.startswith(f"{path}: ") for part, path in zip(parts, good, strict=True)] == [
-        True
-    ] * 2
+    parts = zip(told.out.split("\n\n"), good, strict=True)
+    assert all(part.startswith(f"{path}: ") for part, path in parts)
     assert told.err.startswith(f"lusee-bayes: {bad} ") and told.err.count("\n") == 1
-    assert main(["info", *map(str, good)]) == 0
+    assert run("info", *good) == 0
 
 
 TWO_BANDS = [*SET, "flight={per_kelvin_v2_hz: 1e-21, gain_std: 0.01, simulated: {clock: unknown}}"]
@@ -164,11 +159,9 @@ TWO_BANDS = [*SET, "flight={per_kelvin_v2_hz: 1e-21, gain_std: 0.01, simulated: 
 @pytest.fixture(scope="module")
 def of_two_bands(tmp_path_factory):
     """Two bands of a session whose clock is known from outside."""
-    made = run_simulate_flight(
-        lb.load_scenario("fiducial", TWO_BANDS), tmp_path_factory.mktemp("flight")
-    )
-    scenario = lb.load_scenario(str(made.scenario))
-    return scenario, list(made.sessions)
+    scenario = lb.load_scenario("fiducial", TWO_BANDS)
+    made = run_simulate_flight(scenario, tmp_path_factory.mktemp("flight"))
+    return lb.load_scenario(str(made.scenario)), list(made.sessions)
 
 
 @pytest.fixture(scope="module")
@@ -206,10 +199,7 @@ def test_files_of_older_versions_are_described_as_far_as_they_say_it(reduced, tm
 
 def test_a_clock_that_the_sessions_do_not_say_is_told_in_one_line(of_two_bands, reduced, tmp_path):
     (told,) = [line for line in reduced_lines(reduced) if "clock file" in line]
-    assert told == (
-        "session_000.h5 does not say which UTC the clock stands for: its scale (UTC) and epoch are "
-        "those of the clock file clock.json."
-    )
+    assert told.startswith("session_000.h5 ") and told.endswith("of the clock file clock.json.")
     # nothing to say where the session says it itself
     known = lb.load_scenario("fiducial", [*TWO_BANDS, "flight.simulated.clock=known"])
     made = run_simulate_flight(known, tmp_path)

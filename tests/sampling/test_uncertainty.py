@@ -38,7 +38,7 @@ def gaussian():
         lb.DenseCovariance(jnp.asarray(random_covariance(rng, 10))),
     )
     _, data = model.sample(jax.random.key(0))
-    return model.condition(data), naive_posterior(*matrices(model), data)
+    return model.condition(data).posterior, naive_posterior(*matrices(model), data)
 
 
 @pytest.fixture(scope="module")

@@ -155,7 +155,9 @@ def marginalised(arguments, data):
     around = data
     for _ in range(4):
         seen = drifts.layout.scatter(around)
-        posterior = replace(drifts, visibilities=seen).marginalised(gaussian).condition(data)
+        posterior = (
+            replace(drifts, visibilities=seen).marginalised(gaussian).condition(data).posterior
+        )
         around = gaussian.predict(posterior.mean)
     return posterior
 
@@ -265,7 +267,7 @@ def test_simulation_based_calibration(response_file):
         setup, experiment = drawn(first, seed)
         found, truth = settled(setup, experiment.data), true_values(setup)
         columns = np.concatenate([np.asarray(s.columns) for s in found.systematics], axis=1)
-        told = template_amplitudes(found.model, found.posterior, experiment.data.data, columns)
+        told = template_amplitudes(found.solution, columns)
         sky_covariance = np.asarray(found.posterior.covariance())
         expected = np.concatenate([s.expected for s in found.systematics])
         mean = np.concatenate([np.asarray(found.posterior.mean), expected + told.mean])

@@ -171,14 +171,14 @@ def test_the_sky_is_the_same_with_fluxes_in_the_noise_or_beside_it():
     """Both against the closed form: Lambda's condition of 1e10 costs 1e-6 of a variance; means are
     refined, to better than 1e-6 standard deviations."""
     setup, expected = setup_of(), answer()
-    marginal = full_model(setup).condition(data().data)
+    marginal = full_model(setup).condition(data().data).posterior
     sky = expected.std[:49]
     off = (np.asarray(marginal.mean) - expected.mean[:49]) / sky
     assert np.abs(off).max() < 1e-5
     np.testing.assert_allclose(np.asarray(marginal.std()), sky, rtol=1e-5)
     assert float(marginal.log_evidence) == pytest.approx(expected.log_prob, abs=1e-4)
     # the sources matter: with them in the data only, the sky is off by what can be seen
-    wrong = full_model(setup_of("ignored")).condition(data().data)
+    wrong = full_model(setup_of("ignored")).condition(data().data).posterior
     assert np.abs((np.asarray(wrong.mean) - expected.mean[:49]) / sky).max() > 1.0
 
 
