@@ -23,7 +23,6 @@ from lusee_bayes.experiment.sky_sections import (
     LocalScalesPriorSection,
     PriorSection,
 )
-from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.measures import data_freedom
 from lusee_bayes.linear.amplitudes import Amplitudes, template_amplitudes
@@ -213,10 +212,10 @@ def _start(setup: Setup, data: Visibilities) -> Around:
     if not any(cls.scales_sky for cls in first_order(setup)):
         return around
     model, held = model_about(setup, around, scaling=False)
-    columns = [np.zeros((model.n_data, 0))]
-    columns += [s.columns for s in held if isinstance(s, Expanded)]
+    columns = [s.columns for s in held if isinstance(s, Expanded)]
     solution = model.condition(data.data)
-    freedom = data_freedom(solution, np.concatenate(columns, axis=1))
+    nothing = np.zeros((model.n_data, 0))
+    freedom = data_freedom(solution, np.concatenate([nothing, *columns], axis=1))
     sky = solution.posterior.mean if setup.measured else None
     return Around(data, sky=sky, freedom=freedom)
 
@@ -256,14 +255,12 @@ def prediction(setup: Setup, found: Inference, solved: DataVector) -> Grid:
     solved : (data,) array
         N^-1 (d - A m), of the mean map.
     """
-    complete = CouplingMatrix.build(setup.beams, setup.pointing)
-    difference_of_skies = found.posterior.mean - setup.sky.modes
+    mean = replace(setup.sky, modes=found.posterior.mean)
     besides = np.zeros(len(solved))
     for part in found.expanded:
         if not part.changes_coupling:
             besides = besides + part.columns @ (part.columns.T @ solved)
-    grid = complete.layout.scatter(complete @ difference_of_skies)
-    return setup.signal + grid + setup.layout.scatter(besides)
+    return setup.under(mean).signal + setup.layout.scatter(besides)
 
 
 # the map and its prior are found together when the map moves by less than this, rms; a step of
