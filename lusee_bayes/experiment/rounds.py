@@ -102,10 +102,7 @@ class Inference:
 
 
 def settled(
-    setup: Setup,
-    data: Visibilities,
-    start: Around | None = None,
-    known: Solution | None = None,
+    setup: Setup, data: Visibilities, start: Around | None = None, known: Solution | None = None
 ) -> Inference:
     """Condition the model on data, in as many rounds as its N needs.
 
