@@ -251,11 +251,7 @@ def source_responses(
     first = np.searchsorted(sample, np.arange(observation.n_times))
     responses = (
         source_response(
-            instants,
-            one.direction(instants),
-            frequency_mhz,
-            beams.monopoles,
-            stokes_v=one.stokes_v,
+            instants, one.direction(instants), frequency_mhz, beams.monopoles, stokes_v=one.stokes_v
         )
         for one in sources
     )
