@@ -316,9 +316,7 @@ class Windows(Described):
             next.
         """
         if self.n_samples != len(times):
-            raise InputError(
-                f"there are windows of {self.n_samples} samples for {len(times)} times"
-            )
+            raise InputError(f"windows of {self.n_samples} samples for {len(times)} times")
         bounds = self.bounds_s
         length = bounds[:, 1] - bounds[:, 0]
         if (length > step_s * (1.0 + 1e-9) + ROUNDING_S).any():
@@ -402,25 +400,18 @@ def stamped(
     """
     if timestamp == "instant":
         if live_s is not None:
-            raise InputError(
-                "instants have no live time; say whether the times are the start, middle or end "
-                "of the samples, or leave out the live time"
-            )
+            raise InputError("instants have no live time; leave it out, or give another timestamp")
         return times, None
     if timestamp not in TO_MIDDLE:
-        raise InputError(
-            f"unknown timestamp '{timestamp}'; {nearest(timestamp, [*TO_MIDDLE, 'instant'])}"
-        )
+        known = [*TO_MIDDLE, "instant"]
+        raise InputError(f"unknown timestamp '{timestamp}'; {nearest(timestamp, known)}")
     ones = np.ones(len(times))
     start, end = (step_s * (TO_MIDDLE[timestamp] + side) * ones for side in (-0.5, 0.5))
     return _windowed(times, start, end, step_s, live_s)
 
 
 def bounded(
-    times: Time,
-    bounds: Time,
-    step_s: float | None = None,
-    live_s: Times | None = None,
+    times: Time, bounds: Time, step_s: float | None = None, live_s: Times | None = None
 ) -> tuple[Time, float, Windows]:
     """Return the middles, the step and the windows of samples whose start and end are known.
 
@@ -477,9 +468,7 @@ def utc_bounds(bounds: Any, n_times: int) -> Time:
     """
     bounds = bounds if isinstance(bounds, Time) else np.asarray(bounds)
     if bounds.shape != (n_times, 2):
-        raise InputError(
-            f"bounds have shape {bounds.shape}, expected ({n_times}, 2): starts and ends"
-        )
+        raise InputError(f"bounds have shape {bounds.shape}, expected ({n_times}, 2)")
     with naming("bounds, taken row by row"):
         return utc_times(bounds).reshape(n_times, 2)
 
@@ -489,11 +478,7 @@ def _rounding(step_s: float) -> float:
 
 
 def _windowed(
-    times: Time,
-    start_s: Times,
-    end_s: Times,
-    step_s: float,
-    live_s: Times | None,
+    times: Time, start_s: Times, end_s: Times, step_s: float, live_s: Times | None
 ) -> tuple[Time, Windows]:
     """Middles of windows of one piece each, and these, with overlaps by rounding cut off."""
     middles, half = later(times, (start_s + end_s) / 2.0), (end_s - start_s) / 2.0

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -29,6 +30,7 @@ from lusee_bayes.core.checks import is_traced, require_array, require_finite, re
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.instrument.beams.fields import (
     AntennaFields,
+    Fields,
     HemisphereGrid,
     ProductBeams,
     mean_auto_integral,
@@ -46,6 +48,8 @@ DEPTH_M = 100.0
 
 Frequency = float | Float[Array, ""]
 Vectors = Float[Array, "directions 3"]
+Angles = Float[Array, "*#directions"]
+Coefficients = Complex[Array, " theta"]
 
 
 def _array(x) -> Float[Array, "..."]:
@@ -94,7 +98,7 @@ class Regolith(eqx.Module):
 
     def reflection(
         self, cos_theta: Float[Array, " theta"], frequency_mhz: Frequency
-    ) -> tuple[Complex[Array, " theta"], Complex[Array, " theta"]]:
+    ) -> tuple[Coefficients, Coefficients]:
         """Return the reflection coefficients for waves that arrive at zenith angle theta.
 
         By recursion over the interfaces from the bottom up, with Fresnel coefficients at each.
@@ -201,11 +205,8 @@ class Monopoles(BeamSource, eqx.Module):
 
     @compiled
     def towards(
-        self,
-        frequency_mhz: Frequency,
-        theta: Float[Array, "*#directions"],
-        phi: Float[Array, "*#directions"],
-    ) -> tuple[Complex[Array, "antennas *directions"], Complex[Array, "antennas *directions"]]:
+        self, frequency_mhz: Frequency, theta: Angles, phi: Angles
+    ) -> tuple[Fields, Fields]:
         """Return the fields of every arm in directions above the horizon; phase centre: the feed.
 
         Parameters
@@ -239,9 +240,7 @@ class Monopoles(BeamSource, eqx.Module):
         e_phi = across.astype(direct.dtype) * (direct + s * bounced)
         return e_theta, e_phi
 
-    def _current_integral(
-        self, k: Frequency, projection: Float[Array, "antennas *directions"]
-    ) -> Complex[Array, "antennas *directions"]:
+    def _current_integral(self, k: Frequency, projection: Array) -> Fields:
         """int_0^L sin k(L - s) exp(i k s projection) ds.
 
         = (L / 2i) [exp(i b) sinc a - exp(-i a) sinc b],  a, b = k L (1 -+ projection) / 2:
@@ -297,11 +296,7 @@ def monopole_beams(
 
 @compiled
 def _modes(
-    frequency_mhz: Float[Array, ""],
-    lmax: int,
-    monopoles: Monopoles,
-    stokes: str,
-    nodes: tuple[int, int] | None,
+    frequency_mhz: Frequency, lmax: int, monopoles: Monopoles, stokes: str, nodes: Any
 ) -> Float[Array, "products modes"]:
     exact = HemisphereGrid.for_lmax
     grid = exact(lmax) if nodes is None else HemisphereGrid.gauss_legendre(*nodes)
@@ -411,9 +406,9 @@ def beams_towards(
         length = np.linalg.norm(np.asarray(directions), axis=1)
         bad = np.flatnonzero(np.abs(length - 1.0) > UNIT_TOLERANCE)
         if bad.size:
+            k = bad[0]
             raise InputError(
-                f"directions must be unit vectors, number {bad[0]} has length "
-                f"{length[bad[0]]:.6g}; divide them by their length"
+                f"directions must be unit vectors, number {k} has length {length[k]:.6g}"
             )
     monopoles = Monopoles() if monopoles is None else monopoles
     # an array: one compilation for all frequencies
