@@ -805,10 +805,7 @@ def source_response(
         that is not positive, or ``|stokes_v| > 1``.
     """
     if not is_traced(stokes_v) and not abs(stokes_v) <= 1.0:
-        raise InputError(
-            f"stokes_v is the fraction V / I, from -1 to 1, got {stokes_v}; no wave is polarised "
-            "by more than all of itself"
-        )
+        raise InputError(f"stokes_v is the fraction V / I, from -1 to 1, got {stokes_v}")
     directions = observation.antenna_directions(galactic)
     response = beams_towards(frequency_mhz, directions, monopoles)
     if not is_traced(stokes_v) and stokes_v == 0.0:

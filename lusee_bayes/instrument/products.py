@@ -169,8 +169,7 @@ def real_products(data: Any, products: Any, flags: Any, convention: str, n_anten
     if data.shape[1] != len(ports_and_parts):
         turned = "; transpose them" if data.shape[0] == len(ports_and_parts) else ""
         raise InputError(
-            f"the data have shape {data.shape}, expected (times, products) with "
-            f"{len(ports_and_parts)} products{turned}"
+            f"the data have shape {data.shape}, expected (times, {len(ports_and_parts)}){turned}"
         )
     absent = np.isnan(data) | masked | _flags(flags, data.shape)
     if np.isinf(data[~absent]).any():
@@ -276,8 +275,7 @@ def site_of(site: Any) -> tuple[float, float]:
         lon, lat = (float(x) for x in site)
     except (TypeError, ValueError) as error:
         raise InputError(
-            f"the site is {site!r}; give selenographic longitude and latitude in degrees, or a "
-            f"name: {', '.join(SITES)}"
+            f"the site is {site!r}; give longitude and latitude in degrees, or {', '.join(SITES)}"
         ) from error
     return lon, lat
 

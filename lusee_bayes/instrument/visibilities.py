@@ -79,7 +79,7 @@ def _datetimes(times: Time) -> np.ndarray:
     return times.isot.astype("datetime64[ms]")
 
 
-def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None, bool]:
+def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None]:
     """Return what a file says of the windows of its samples.
 
     Parameters
@@ -94,8 +94,6 @@ def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None, boo
     Time
         The middles of the windows; the times as they are where there are none.
     Windows or None
-    bool
-        Whether the file says what its times are.
 
     Raises
     ------
@@ -117,17 +115,17 @@ def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None, boo
         windows = Windows(*(here[name] for name in PIECES))
         if "time_bounds" in here:
             _require_same(windows, times, here["time_bounds"])
-        return times, windows, True
+        return times, windows
     if "time_bounds" in here:
         bounds, step_s = utc_bounds(here["time_bounds"], len(times)), found.values["step_s"]
         middles, _, windows = bounded(times, bounds, step_s, here.get("live_time"))
-        return middles, windows, True
+        return middles, windows
     if given or said == "mean":
         what = "live_time" if given else "the attribute window = 'mean'"
         raise InputError(
             f"there is {what}, but no time_bounds; add the start and the end of every sample"
         )
-    return times, None, said == "instant"
+    return times, None
 
 
 def _require_same(windows: Windows, times: Time, there: np.ndarray) -> None:
@@ -516,7 +514,8 @@ def read_visibilities(path: str | Path) -> Visibilities:
     with naming(path):
         layout = DataLayout.from_flags(flags)
         utc = utc_of_jd(found)
-        times, windows, says_window = read_windows(found, utc)
+        times, windows = read_windows(found, utc)
+        says_window = windows is not None or found.values.get("window") == "instant"
         seen, mhz = observation_of(found, times, windows), found.values["frequency_mhz"]
         receiver = receiver_of(path, here, "load_frequency_mhz", *LOADS)
         truth = here.get("truth")

@@ -293,7 +293,7 @@ def test_a_command_table_of_opsim(write):
         ("1: {start: 61050.8, mode: maint}\n", "comtable.yml: a schedule needs at least one"),
         (
             "1: {start: 61050.8, mode: maint}\n2: {start: 61051, mode: science}\n",
-            "entry 2: the last entry is in the mode science, and nothing says when it ends; add an",
+            "entry 2: the last entry, science, has no end; add one of another mode",
         ),
     ],
 )

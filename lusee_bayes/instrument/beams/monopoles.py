@@ -130,13 +130,11 @@ class Regolith(eqx.Module):
         roots = [xp.sqrt(e - sin2) for e in eps[1:]]
         vertical = [cosine] + [xp.where(root.imag > 0, -root, root) for root in roots]
         s, p = xp.zeros_like(vertical[0]), xp.zeros_like(vertical[0])
+        # nothing comes back from below the last interface: s = p = 0
         for upper in range(N_LAYERS - 1, -1, -1):
             q0, q1 = vertical[upper], vertical[upper + 1]
             y0, y1 = q0 * eps[upper + 1], q1 * eps[upper]
             fresnel_s, fresnel_p = (q0 - q1) / (q0 + q1), (y0 - y1) / (y0 + y1)
-            if upper == N_LAYERS - 1:  # nothing comes back from below the last interface
-                s, p = fresnel_s, fresnel_p
-                continue
             delay = xp.exp(-2j * thickness * q1)
             s = (fresnel_s + s * delay) / (1.0 + fresnel_s * s * delay)
             p = (fresnel_p + p * delay) / (1.0 + fresnel_p * p * delay)
@@ -406,9 +404,9 @@ def beams_towards(
         length = np.linalg.norm(np.asarray(directions), axis=1)
         bad = np.flatnonzero(np.abs(length - 1.0) > UNIT_TOLERANCE)
         if bad.size:
-            k = bad[0]
             raise InputError(
-                f"directions must be unit vectors, number {k} has length {length[k]:.6g}"
+                f"directions must be unit vectors, number {bad[0]} has length "
+                f"{length[bad[0]]:.6g}; divide them by their length"
             )
     monopoles = Monopoles() if monopoles is None else monopoles
     # an array: one compilation for all frequencies
