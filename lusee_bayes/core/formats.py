@@ -185,11 +185,9 @@ def as_dataset(
         Attributes, likewise; ``variable.attribute`` is one of a variable.
     """
     variables = {}
-    for name, array in arrays.items():
-        declared = layout.variables[name]
-        units = {"units": declared.unit} if declared.unit else {}
-        if array is not None:
-            variables[name] = (tuple(map(str, declared.dims)), array, units)
+    for name in (name for name, array in arrays.items() if array is not None):
+        dims, unit = layout.variables[name].dims, layout.variables[name].unit
+        variables[name] = (tuple(map(str, dims)), arrays[name], {"units": unit} if unit else {})
     attributes = {"format": format_, "Conventions": CF, "lusee_bayes_version": __version__}
     dataset = xr.Dataset(variables, attrs=attributes)
     for name, value in values.items():
@@ -352,11 +350,8 @@ def read_fits(path: str | Path, layout: Layout, hint: str = "") -> Content:
         arrays: dict[str, Any] = {}
         words = hdus[0].header
         declared = {name.lower(): name for name in (*layout.variables, *layout.attributes)}
-        said = {
-            declared.get(key.lower(), key): words[key]
-            for key in words
-            if key and not key.startswith(STRUCTURE)
-        }
+        keys = [key for key in words if key and not key.startswith(STRUCTURE)]
+        said = {declared.get(key.lower(), key): words[key] for key in keys}
 
         def put(name: str, array: Any, unit: str | None) -> None:
             name = declared.get(name.lower(), name.lower())
