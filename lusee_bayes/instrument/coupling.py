@@ -19,10 +19,6 @@ A with a vector never forms A, and nothing in it but the last sum grows with the
 (:class:`Instrument`): row t of product k is b_k R(t), with R(t) block diagonal in ell: one
 rotation matrix for each ell and sample, computed once. Then A costs 16 products with (2 ell + 1)^2
 numbers per ell and sample, and derivatives cost no more.
-
-**Sources** that are much smaller than the antennas' resolution need no harmonic expansion
-(:func:`source_response`): one of x K sr in the direction n(t), in the frame of the antennas, gives
-V_k(t) = x B_k(n(t)). It rises and sets sharply, and it may move.
 """
 
 from __future__ import annotations
@@ -37,13 +33,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lusee_bayes.core.arrays import Array, DataVector, Modes, compiled, namespace
-from lusee_bayes.core.checks import (
-    Described,
-    is_traced,
-    require_array,
-    require_float64,
-    require_shape,
-)
+from lusee_bayes.core.checks import Described, require_array, require_float64, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import (
     lmax_of,
@@ -54,14 +44,7 @@ from lusee_bayes.core.harmonics import (
     turn_about_z,
 )
 from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.beams.monopoles import (
-    Frequency,
-    Monopoles,
-    beams_towards,
-    monopole_beams,
-    parameter,
-    with_values,
-)
+from lusee_bayes.instrument.beams.monopoles import Monopoles, monopole_beams, parameter, with_values
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout
@@ -766,49 +749,3 @@ class Instrument(eqx.Module):
             If the beams have another lmax or other products.
         """
         return CouplingMatrix.build(beams, self.pointing, self.layout)
-
-
-def source_response(
-    observation: Observation,
-    galactic: Float[np.ndarray, "..."],
-    frequency_mhz: Frequency,
-    monopoles: Monopoles | None = None,
-    *,
-    stokes_v: float | Float[Array, ""] = 0.0,
-) -> Float[Array, "products times"]:
-    """Return the visibilities of a source of 1 K sr at every sample.
-
-    V_k(t) = B_k^I(n(t)) + stokes_v B_k^V(n(t)), since I = 1 K sr and V = stokes_v I. Multiply by
-    the flux in K sr, constant or (times,). Differentiable in ``monopoles`` and ``stokes_v``.
-
-    Parameters
-    ----------
-    observation : Observation
-    galactic : (3,) or (times, 3) array
-        As of :meth:`.Observation.antenna_directions`.
-    frequency_mhz : float
-    monopoles : Monopoles, optional
-        By default the paper's antennas.
-    stokes_v : float
-        V / I with the IAU's sign. Where it is positive, a receiver that looks towards the source
-        sees the electric field turn counter-clockwise (right-handed).
-
-    Returns
-    -------
-    (products, times) array
-        In K; zero while the source is below the horizon.
-
-    Raises
-    ------
-    InputError
-        As :meth:`.Observation.antenna_directions`; for vectors whose length is not one, a frequency
-        that is not positive, or ``|stokes_v| > 1``.
-    """
-    if not is_traced(stokes_v) and not abs(stokes_v) <= 1.0:
-        raise InputError(f"stokes_v is the fraction V / I, from -1 to 1, got {stokes_v}")
-    directions = observation.antenna_directions(galactic)
-    response = beams_towards(frequency_mhz, directions, monopoles)
-    if not is_traced(stokes_v) and stokes_v == 0.0:
-        return response
-    circular = beams_towards(frequency_mhz, directions, monopoles, stokes="V")
-    return response + stokes_v * circular

@@ -12,7 +12,8 @@ between arms, no lander: this is good enough for the paper's findings, and diffe
 parameters.
 
 **Point sources** are blurred by harmonic coefficients up to lmax, but not by the field pattern
-itself (:func:`beams_towards`).
+itself (:func:`beams_towards`). One of x K sr in the direction n(t), in the frame of the antennas,
+gives V_k(t) = x B_k(n(t)) (:func:`source_response`). It rises and sets sharply, and it may move.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ from lusee_bayes.instrument.beams.fields import (
     wavenumber,
 )
 from lusee_bayes.instrument.beams.source import BeamSource
+from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import to_real
 
 N_LAYERS = 8
@@ -434,3 +436,49 @@ def _normalisation(frequency_mhz: Float[Array, ""], monopoles: Monopoles) -> Flo
     grid = HemisphereGrid.for_lmax(NORMALISATION_LMAX)
     e_theta, e_phi = monopoles.towards(frequency_mhz, grid.theta[:, None], grid.phi[None])
     return mean_auto_integral(AntennaFields(e_theta, e_phi, grid))
+
+
+def source_response(
+    observation: Observation,
+    galactic: Float[np.ndarray, "..."],
+    frequency_mhz: Frequency,
+    monopoles: Monopoles | None = None,
+    *,
+    stokes_v: float | Float[Array, ""] = 0.0,
+) -> Float[Array, "products times"]:
+    """Return the visibilities of a source of 1 K sr at every sample.
+
+    V_k(t) = B_k^I(n(t)) + stokes_v B_k^V(n(t)), since I = 1 K sr and V = stokes_v I. Multiply by
+    the flux in K sr, constant or (times,). Differentiable in ``monopoles`` and ``stokes_v``.
+
+    Parameters
+    ----------
+    observation : Observation
+    galactic : (3,) or (times, 3) array
+        As of :meth:`.Observation.antenna_directions`.
+    frequency_mhz : float
+    monopoles : Monopoles, optional
+        By default the paper's antennas.
+    stokes_v : float
+        V / I with the IAU's sign. Where it is positive, a receiver that looks towards the source
+        sees the electric field turn counter-clockwise (right-handed).
+
+    Returns
+    -------
+    (products, times) array
+        In K; zero while the source is below the horizon.
+
+    Raises
+    ------
+    InputError
+        As :meth:`.Observation.antenna_directions`; for vectors whose length is not one, a frequency
+        that is not positive, or ``|stokes_v| > 1``.
+    """
+    if not is_traced(stokes_v) and not abs(stokes_v) <= 1.0:
+        raise InputError(f"stokes_v is the fraction V / I, from -1 to 1, got {stokes_v}")
+    directions = observation.antenna_directions(galactic)
+    response = beams_towards(frequency_mhz, directions, monopoles)
+    if not is_traced(stokes_v) and stokes_v == 0.0:
+        return response
+    circular = beams_towards(frequency_mhz, directions, monopoles, stokes="V")
+    return response + stokes_v * circular
