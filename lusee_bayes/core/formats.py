@@ -233,11 +233,10 @@ def as_dataset(
         Attributes, likewise; ``variable.attribute`` is one of a variable.
     """
     variables = {}
-    for name, array in arrays.items():
+    for name in (name for name, array in arrays.items() if array is not None):
         declared = layout.variables[name]
         units = {"units": declared.unit or "1"} if declared.kind == "real" else {}
-        if array is not None:
-            variables[name] = (tuple(map(str, declared.dims)), array, units)
+        variables[name] = (tuple(map(str, declared.dims)), arrays[name], units)
     dataset = xr.Dataset(variables, attrs=header(format_))
     for name, value in values.items():
         variable, _, attribute = name.rpartition(".")
@@ -353,11 +352,8 @@ def read_fits(path: str | Path, layout: Layout, hint: str = "") -> Content:
         arrays: dict[str, Any] = {}
         words = hdus[0].header
         declared = {name.lower(): name for name in (*layout.variables, *layout.attributes)}
-        said = {
-            declared.get(key.lower(), key): words[key]
-            for key in words
-            if key and not key.startswith(STRUCTURE)
-        }
+        keys = [key for key in words if key and not key.startswith(STRUCTURE)]
+        said = {declared.get(key.lower(), key): words[key] for key in keys}
 
         def put(name: str, array: Any, unit: str | None) -> None:
             name = declared.get(name.lower(), name.lower())
