@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from assertions import refuse
 from jaxtyping import Array, Float
 from scipy import stats
 
@@ -247,8 +248,7 @@ def test_a_posterior_that_ignores_the_data_is_noticed_only_by_what_depends_on_th
 
 
 def test_too_few_data_sets_are_refused():
-    with pytest.raises(lb.InputError, match="at least 100 simulations, .*got 99"):
-        conjugate(simulations=99)
+    refuse("at least 100 simulations, .*got 99", conjugate, simulations=99)
     assert conjugate(simulations=100).n_simulations == 100
     with pytest.raises(lb.InputError, match="at least 100 simulations, .*got 20"):
         lb.calibrate_sky(random_model(True), random_model(True), n_simulations=20)
