@@ -1,7 +1,5 @@
 """Assertions that the tests share."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Every file, damaged in every way, is read or refused in a sentence: no traceback, no hang."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path
