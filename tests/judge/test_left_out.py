@@ -149,7 +149,7 @@ def test_what_the_posterior_saves_and_means_over_windows():
     assert data.observation.windows is not None
     check(LeftOut(model, data), data, *expected, every_kind(data))
     model, data, *expected = observed("few", "blocks and templates")
-    found = LeftOut(model, data, posterior=model.condition(data.data))
+    found = LeftOut(model, data, posterior=model.condition(data.data).posterior)
     check(found, data, *expected, every_kind(data))
 
 
