@@ -27,10 +27,10 @@ def dense_log_likelihood(model, data, skies) -> np.ndarray:
     return noise.logpdf(np.asarray(data) - predicted)
 
 
-def dense_z(judged, data, chi2) -> np.ndarray:
+def dense_z(judged, data) -> np.ndarray:
     """Every datum against all others, of independent noise: K^-1 = N^-1 - (Q of a QR) (its Q)^T."""
     model, n = on_host(judged.model), len(data)
-    prior = Split.of(judged.posterior, chi2, n).wide.prior
+    prior = Split.of(judged.posterior, judged.solution.chi2, n).wide.prior
     a, std = np.asarray(model.coupling.dense()), np.sqrt(np.asarray(model.noise.diagonal()))
     white = prior.colour_columns(a) / std[:, None]
     q = np.linalg.qr(np.concatenate([white, np.eye(white.shape[1])]))[0][:n]
@@ -187,7 +187,7 @@ def test_modes_that_the_prior_knows_exactly_can_have_earlier_data():
     np.testing.assert_allclose(channel.std, expected.posterior(setup.prior).std(), rtol=1e-4)
     # the same data twice: what the second asks of the first is nothing
     assert channel.chi2_model < 1.5 * channel.n_data
-    expected = dense_z(made.judged, data.data, made.chi2())
+    expected = dense_z(made.judged, data.data)
     # a mean is accepted where each of its 49 coefficients is known to 1e-6 standard deviations
     np.testing.assert_allclose(channel.judged.z.ravel(), expected, rtol=0, atol=7e-6)
 
