@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from lusee_bayes.core.progress import peak_memory_gb
-from lusee_bayes.experiment.flight_data import recipe_of
+from lusee_bayes.experiment.data_files import recipe_of
 from lusee_bayes.experiment.flight_simulation import simulate_flight
 from lusee_bayes.experiment.scenario import load_scenario
 from lusee_bayes.flight.reduction import reduce_sessions

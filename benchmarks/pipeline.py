@@ -61,7 +61,7 @@ def main() -> None:
 
     def to_posterior():
         coupling = lb.CouplingMatrix.build(beams, pointing)
-        return lb.LinearGaussian(coupling, model.prior, model.noise).condition(data.data)
+        return lb.LinearGaussian(coupling, model.prior, model.noise).condition(data.data).posterior
 
     measure("b_lm and pointings to posterior", to_posterior)
     posterior = to_posterior()

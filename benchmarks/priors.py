@@ -41,9 +41,11 @@ def main() -> None:
     data, independent = experiment.data.data, full_model(experiment.setup)
     family = embedded_local_scales(scenario.frequency_mhz, scenario.lmax)
     correlated = replace(independent, prior=family.expected())
-    posteriors = [model.condition(data) for model in (independent, correlated)]
+    posteriors = [model.condition(data).posterior for model in (independent, correlated)]
     steps = {
-        "data to posterior": [lambda m=m: m.condition(data) for m in (independent, correlated)],
+        "data to posterior": [
+            lambda m=m: m.condition(data).posterior for m in (independent, correlated)
+        ],
         "covariance": [p.covariance for p in posteriors],
         "std of every mode": [p.std for p in posteriors],
         "100 draws": [lambda p=p: p.sample(jax.random.key(0), 100) for p in posteriors],

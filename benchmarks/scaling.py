@@ -29,12 +29,12 @@ from scipy.linalg.blas import dsyrk
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import tilt_powers
-from lusee_bayes.experiment.experiment import inform
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.linear.joint import ComponentSums, summed_information
 from lusee_bayes.linear.normal_matrix import normal_matrix
 from lusee_bayes.noise.radiometer import radiometer_noise
+from lusee_bayes.results.channel_map import conditioned
 from lusee_bayes.systematics.context import Around
 
 SAMPLES = [(1.0, 7200.0), (1.0, 600.0), (3.0, 7200.0), (12.0, 600.0), (13.368, 600.0)]
@@ -103,7 +103,7 @@ def posterior_of_a_year() -> dict:
     experiment = lb.build(scenario)
     data = experiment.data
     start = time.perf_counter()
-    posterior = full_model(experiment.setup, Around(data)).condition(data.data)
+    posterior = full_model(experiment.setup, Around(data)).condition(data.data).posterior
     posterior.std()
     return {
         "visibilities": int(data.layout.size),
@@ -155,7 +155,7 @@ def tasks_of_joint_run(lmax: int) -> dict:
     scenario = scenario.model_copy(update={"joint": True})
     channel = scenario.channels()[1]
     start = time.perf_counter()
-    known = inform(lb.build(channel))[0]
+    known = conditioned(lb.build(channel)).information
     inform_s = time.perf_counter() - start
     frequencies = np.array(scenario.frequencies_mhz)
     reference = np.stack([np.asarray(known.reference)] * 4)

@@ -27,7 +27,7 @@ from rich.table import Table
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import modes_to_map
-from lusee_bayes.experiment.experiment import deviations, under_sky
+from lusee_bayes.experiment.experiment import posterior_draws, under_sky
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.judge.coverage import Counts
 from lusee_bayes.judge.levels import LEVELS
@@ -152,7 +152,10 @@ def main() -> int:
         made = conditioned(under_sky(setup, source, scenario.seed + zlib.crc32(name.encode())))
         channel = made.result(made.known())
         error = channel.truth - channel.mean
-        drawn = deviations(made.experiment, made.posterior, n_draws)
+        drawn = posterior_draws(
+            made.experiment, made.posterior, lambda made=made: made.information, n_draws
+        )
+        drawn = drawn - channel.mean
         pixels = Counts.of_pixels(channel.pixel_std, error, drawn)
         mapped.append(Mapped(name, channel, pixels, Counts.of_modes(channel.std, error, drawn)))
     table = Table("sky", "part", *(f"{level:.0%}" for level in LEVELS), "rms pull", "largest")

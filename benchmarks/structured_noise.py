@@ -51,10 +51,10 @@ def fiducial() -> tuple[lb.LinearGaussian, jax.Array]:
 def routes(repeats: int) -> None:
     """From A, N and d to the posterior, against LAPACK."""
     model, data = fiducial()
-    banded = median_seconds(lambda: model.condition(data).white_mean, repeats)
+    banded = median_seconds(lambda: model.condition(data).posterior.white_mean, repeats)
     matrix = model.noise.dense()
     full = lb.LinearGaussian(model.coupling, model.prior, lb.DenseCovariance(matrix))
-    dense = median_seconds(lambda: full.condition(data).white_mean, repeats)
+    dense = median_seconds(lambda: full.condition(data).posterior.white_mean, repeats)
     n = np.asfortranarray(matrix)
     lower = np.asfortranarray(dpotrf(n, lower=1)[0])
     a = np.asfortranarray(model.coupling.dense())
@@ -100,7 +100,7 @@ def scaling(repeats: int) -> None:
 def memory() -> None:
     """Peak memory of a process that does nothing but the banded route."""
     model, data = fiducial()
-    jax.block_until_ready(model.condition(data).white_mean)
+    jax.block_until_ready(model.condition(data).posterior.white_mean)
     console.print(f"peak memory of the time-banded route: {peak_memory_gb():.2f} GB")
 
 

@@ -59,7 +59,7 @@ def fixed_axis() -> None:
         )
         error = np.abs((coupling @ sky - truth) / sigma)
         model = lb.LinearGaussian(coupling, found.model.prior, found.model.noise)
-        snr = signal_to_noise(model.condition(data).mean, sky)
+        snr = signal_to_noise(model.condition(data).posterior.mean, sky)
         lines[name] = snr
         print(
             f"| {name} | {np.sqrt(np.mean(error**2)):.2g} | {error.max():.2g} | {ell_cross(snr)} |"
@@ -140,7 +140,7 @@ def instants() -> None:
 
 def _chi2(model: lb.LinearGaussian, data: np.ndarray) -> float:
     """Of data under a model without a mean, any sky of the prior being possible."""
-    found = model.condition(data)
+    found = model.condition(data).posterior
     return float(model.chi2(found.mean, data)) + float(found.prior_chi2())
 
 
@@ -282,7 +282,7 @@ def regolith(folder: Path) -> None:
 
     def fixed(values):
         model = lb.LinearGaussian(setup.prepared.dense(values), base.prior, base.noise)
-        return signal_to_noise(model.condition(data.data).mean, sky)
+        return signal_to_noise(model.condition(data.data).posterior.mean, sky)
 
     mean = tree["posterior"]["sky"].values.mean((0, 1))
     lines = {

@@ -23,7 +23,7 @@ The folders are the symbols, then what is done with them; each imports only from
     runs          one function for each command: it computes, and writes its folder whole
     cli           the command line
 
-``LinearGaussian(A, S, N).condition(d)`` is the :class:`Posterior`: mean, std, covariance and draws.
+``LinearGaussian(A, S, N).condition(d).posterior`` is the :class:`Posterior`: mean, std, draws.
 Importing the package switches JAX to 64 bit: Lambda's condition number is about 1e10.
 """
 

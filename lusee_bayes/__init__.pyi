@@ -21,7 +21,7 @@ from .instrument.beams.source import BeamSource as BeamSource
 from .instrument.coupling import Coupling as Coupling
 from .instrument.coupling import CouplingMatrix as CouplingMatrix
 from .instrument.coupling import DenseCoupling as DenseCoupling
-from .instrument.instrument import Instrument as Instrument
+from .instrument.coupling import Instrument as Instrument
 from .instrument.observation import Observation as Observation
 from .instrument.pointing import Pointing as Pointing
 from .instrument.schedule import Interval as Interval

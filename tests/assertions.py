@@ -3,7 +3,9 @@
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
+import astropy.units as u
 import numpy as np
 import pytest
 import xarray as xr
@@ -39,6 +41,28 @@ def _moments(of: object) -> list[np.ndarray]:
 def within(got: object, expected: object, atol: object) -> None:
     """Assert that arrays agree to so much, whatever their size."""
     np.testing.assert_allclose(got, expected, rtol=0, atol=atol)
+
+
+def require_conventions(path: Path) -> None:
+    """Assert that a file follows CF: its name for it, units that are some, and grids of pixels."""
+    with xr.open_datatree(path, engine="h5netcdf", decode_cf=False) as tree:
+        assert tree.attrs["Conventions"] == "CF-1.13" and tree.attrs["format"]
+        for group in tree.subtree:
+            variables = {str(name): variable for name, variable in group.variables.items()}
+            bounds = {variable.attrs.get("bounds") for variable in variables.values()}
+            for name, variable in variables.items():
+                said = variable.attrs
+                # columns of tables have words for their units, bounds the units of their variable
+                if variable.dtype.kind in "fc" and "columns" not in group.attrs:
+                    assert "units" in said or name in bounds, f"{path}{group.path}: {name}"
+                unit, _, epoch = said.get("units", "1").partition(" since ")
+                u.Unit(unit.removesuffix("s") if epoch else unit)
+                pixels = {"pixel", "pixels", "region"} & set(variable.dims)
+                if pixels and said.get("standard_name") != "healpix_index":
+                    grid, n = variables[said["grid_mapping"]].attrs, variable.sizes[pixels.pop()]
+                    assert grid["grid_mapping_name"] == "healpix"
+                    assert grid["indexing_scheme"] == "ring"
+                    assert n == 12 * 4 ** grid["refinement_level"]
 
 
 @contextmanager

@@ -13,9 +13,12 @@ from numpyro.infer.util import log_density
 from reference_linear import random_covariance
 
 import lusee_bayes as lb
+from lusee_bayes.core.arrays import on_host
 from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.experiment.model import full_model, radiometer, simulate
+from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.setup import Setup
+from lusee_bayes.experiment.unknowns import Unknowns, UnknownsReport
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.results.channel_map import Conditioned, conditioned
 from lusee_bayes.results.map_files import SavedInformation
@@ -66,6 +69,20 @@ def at_times(data: lb.Visibilities, keep: np.ndarray) -> lb.Visibilities:
     observation = data.observation.select(keep)
     flat, layout = jnp.asarray(data.grid()[:, keep].ravel()), DataLayout(16, observation.n_times)
     return replace(data, data=flat, layout=layout, observation=observation)
+
+
+def unknowns_report(experiment: lb.Experiment, found: Inference) -> UnknownsReport | None:
+    """What data alone tell of receivers, ground and gain table."""
+    posterior = on_host(found.posterior)
+    unknowns = Unknowns.of(experiment, found, posterior.mean)
+    return None if unknowns is None else unknowns.report(posterior.mean, posterior.covariance())
+
+
+def offset_posterior(found: Inference) -> tuple[dict[str, float], np.ndarray]:
+    """Mean of every offset of clock and pointing by name, and their covariance in these units."""
+    offsets, told = found.offsets, found.amplitudes(found.offsets)
+    stds = offsets.systematic.stds
+    return offsets.systematic.in_units(told.mean), told.covariance * np.outer(stds, stds)
 
 
 def of_run(data: lb.Visibilities, run: int) -> lb.Visibilities:

@@ -32,6 +32,7 @@ Array = jax.Array | np.ndarray
 # arrays that recur, with their shapes
 DataVector = Float[Array, " data"]
 Grid = Float[Array, "products times"]
+Times = Float[np.ndarray, " times"]
 GridFlags = Bool[np.ndarray, "products times"]
 TimeFlags = Bool[np.ndarray, " times"]
 Modes = Float[Array, " modes"]
@@ -41,9 +42,6 @@ Ells = Float[np.ndarray, " ells"]
 Pixels = Float[np.ndarray, " pixels"]
 Vector = Float[np.ndarray, " n"]
 Square = Float[np.ndarray, "n n"]
-
-# rows that are added at once
-ACCUMULATED = 16
 
 F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T")
@@ -80,76 +78,12 @@ def compiled(function: F) -> F:
     return either
 
 
-def scan(
-    xp: ModuleType, step: Callable[[Any, Any], tuple[Any, Any]], start: Any, parts: Any
-) -> tuple[Any, Any]:
-    """Return what jax.lax.scan does; with NumPy by a loop.
-
-    Parameters
-    ----------
-    xp : module
-        numpy or jax.numpy, that of all arrays that the steps use.
-    step : callable
-        ``step(carry, part)`` gives the next carry and an array, or None.
-    start : tree of arrays
-        The first carry.
-    parts : tree of arrays
-        Their first axis is looped over.
-
-    Returns
-    -------
-    tree of arrays
-        The last carry.
-    array or None
-        The arrays of all steps, stacked.
-    """
-    if xp is not np:
-        return jax.lax.scan(step, start, parts)
-    leaves, structure = jax.tree.flatten(parts)
-    carry, found = start, []
-    for k in range(len(leaves[0])):
-        carry, value = step(carry, structure.unflatten([leaf[k, ...] for leaf in leaves]))
-        found.append(value)
-    return carry, None if found[0] is None else np.stack(found)
-
-
-def repeated(xp: ModuleType, unfinished: Callable[[T], Any], step: Callable[[T], T], state: T) -> T:
-    """Return what jax.lax.while_loop does; with NumPy by a loop.
-
-    Parameters
-    ----------
-    xp : module
-        numpy or jax.numpy, that of all arrays that the steps use.
-    unfinished : callable
-        Whether a state is to be followed by another one.
-    step : callable
-        ``step(state)`` gives the next state.
-    state : tree of arrays
-        The first one.
-    """
-    if xp is not np:
-        return jax.lax.while_loop(unfinished, step, state)
-    while unfinished(state):
-        state = step(state)
-    return state
-
-
 def placed(array: Array, where: Any, values: Array) -> Array:
     """Return the array with values at an index; a NumPy array is changed in place."""
     if namespace(array, values) is not np:
         return array.at[where].set(values)
     array[where] = values
     return array
-
-
-def accumulated(total: Array, weight: Array | np.floating, part: Array) -> Array:
-    """Return total + weight * part; a NumPy total is changed in place."""
-    if namespace(total, weight, part) is not np:
-        return total + weight * part
-    for first in range(0, len(total), ACCUMULATED):  # products that fit into a cache
-        rows = slice(first, first + ACCUMULATED)
-        total[rows] += weight * part[rows]
-    return total
 
 
 def on_device(tree: T) -> T:
@@ -160,16 +94,6 @@ def on_device(tree: T) -> T:
 def on_host(tree: T) -> T:
     """Return the same tree with NumPy arrays in place of JAX's, on a CPU without copying them."""
     return jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, tree)
-
-
-def on_processor(tree: T) -> T:
-    """Return the same tree in NumPy's arrays on a machine without accelerator, else in JAX's.
-
-    NumPy and LAPACK need no compiling; what is being traced stays as it is.
-    """
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree)):
-        return tree
-    return on_host(tree) if jax.default_backend() == "cpu" else on_device(tree)
 
 
 def _of_jax(tree: Any) -> bool:

@@ -12,10 +12,10 @@ from __future__ import annotations
 from abc import abstractmethod
 from typing import Any
 
-import jax
 import numpy as np
 
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.lazy import jax
 
 
 def is_traced(*arrays: Any) -> bool:

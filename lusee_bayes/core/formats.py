@@ -11,7 +11,6 @@ import faulthandler
 import os
 import signal
 import sys
-import time
 import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -27,6 +26,7 @@ from lusee_bayes.core.layouts import Content, Layout, Unloaded
 from lusee_bayes.core.lazy import astropy_exceptions, fits
 from lusee_bayes.core.lazy import xarray as xr
 from lusee_bayes.core.reading import reading, require_file
+from lusee_bayes.core.version import __version__
 
 # a file is read whole up to this size; of a larger one, all metadata and the first value of each
 # array
@@ -59,22 +59,16 @@ def _probe(path: str, mtime_ns: int, size: int) -> None:
         warnings.simplefilter("ignore")
         child = os.fork()
     if child == 0:
+        # the kernel ends the child, whatever the library is doing
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
+        signal.setitimer(signal.ITIMER_REAL, LIMIT_S)
         _read_all(path, size)
-    limit, status = time.monotonic() + LIMIT_S, 0
-    pause = 1e-3
-    while True:
-        done, status = os.waitpid(child, os.WNOHANG)
-        if done:
-            break
-        if time.monotonic() > limit:
-            os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
-            raise InputError(
-                f"{path} is damaged: HDF5's library does not come to an end with it within "
-                f"{LIMIT_S:g} s"
-            )
-        time.sleep(pause)
-        pause = min(2 * pause, 0.05)
+    _, status = os.waitpid(child, 0)
+    if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGALRM:
+        raise InputError(
+            f"{path} is damaged: HDF5's library does not come to an end with it within "
+            f"{LIMIT_S:g} s"
+        )
     if os.WIFSIGNALED(status):
         raise InputError(f"{path} is damaged: HDF5's library fails on it")
 
@@ -107,8 +101,9 @@ POSTERIOR = "lusee_bayes posterior 2"
 SAMPLES = "lusee_bayes samples 1"
 BEAMS = "lusee_bayes beams 1"
 GAINS = "lusee_bayes gains 1"
-REDUCED = "lusee_bayes reduced spectra 1"
+REDUCED = "lusee_bayes reduced spectra 2"
 DIAGNOSTICS = "lusee_bayes diagnostics 3"
+CHANNEL = "lusee_bayes unfinished channel 1"
 PAPER_CASE = "lusee_bayes paper case 1"
 
 # words of the primary header that tell pyuvdata's beams from other FITS files
@@ -132,6 +127,40 @@ def format_of(path: str | Path) -> str | None:
             kind = file.attrs.get("format")
     kind = kind.decode(errors="replace") if isinstance(kind, bytes) else kind
     return kind if isinstance(kind, str) else None
+
+
+# the conventions that files of the package follow
+CF = "CF-1.13"
+
+
+# dimensions that are the pixels of a HEALPix map in RING order
+HEALPIX = ("pixel", "pixels", "region")
+
+
+def header(format_: str) -> dict[str, str]:
+    """Attributes of a file of the package: its format, conventions and version."""
+    return {"Conventions": CF, "format": format_, "lusee_bayes_version": __version__}
+
+
+def with_grid(dataset: xr.Dataset) -> xr.Dataset:
+    """The same with the grid of all arrays in pixels, of whole maps, as CF 1.13 has it."""
+    for dim in {*HEALPIX} & {*dataset.dims}:
+        n = dataset.sizes[dim]
+        grid, index = f"{dim}_grid", f"{dim}_index"
+        for variable in dataset.variables.values():
+            if dim in variable.dims:
+                variable.attrs["grid_mapping"] = grid
+        mapping = {
+            "grid_mapping_name": "healpix",
+            "indexing_scheme": "ring",
+            "refinement_level": round(np.log2(n / 12) / 2),
+        }
+        indices = {"standard_name": "healpix_index", "units": "1"}
+        packed = {"zlib": True, "shuffle": True}
+        dataset = dataset.assign_coords(
+            {index: (dim, np.arange(n, dtype=np.int32), indices, packed)}
+        ).assign({grid: ((), np.int8(0), mapping)})
+    return dataset
 
 
 # what the CF conventions call times, and what bounds may leave to the variable that they bound
@@ -162,13 +191,62 @@ def read_netcdf(path: str | Path, format_: str, layout: Layout, hint: str = "") 
     InputError
         If the file is missing, damaged or of another kind, or not as declared.
     """
-    with _opened_netcdf(path, format_, layout, hint) as dataset:
-        return _checked_netcdf(path, dataset, layout)
+    path = require_format(path, format_, layout.what, hint)
+    opened_as = {"engine": "h5netcdf", "decode_times": False}
+    with reading(path, layout.what), xr.open_dataset(path, **opened_as) as dataset:
+        arrays = {str(name): variable for name, variable in dataset.variables.items()}
+        for name in arrays.keys() & layout.variables.keys():
+            declared, dims = layout.variables[name], arrays[name].dims
+            if set(dims) == set(declared.dims):
+                arrays[name] = arrays[name].transpose(*declared.dims)
+            if declared.kind == "time":
+                arrays[name] = _decoded(dataset, name, arrays[name])
+        said = {f"{name}.{key}": v for name, one in arrays.items() for key, v in one.attrs.items()}
+        return layout.checked(path, arrays, said | dataset.attrs)
 
 
-@contextmanager
-def opened_tree(path: str | Path, format_: str, what: str, hint: str = "") -> Iterator[xr.DataTree]:
-    """Open a file of the package that holds groups; what is not asked for is not read.
+def _decoded(dataset: xr.Dataset, name: str, variable: xr.Variable) -> xr.Variable:
+    """Times by the CF conventions: bounds have the units of what they bound, if none of their own.
+
+    Without units they stay numbers.
+    """
+    bounding = (v.attrs for v in dataset.variables.values() if v.attrs.get("bounds") == name)
+    units = {key: v for attrs in bounding for key, v in attrs.items() if key in CF_TIME}
+    known = variable.copy(deep=False)
+    known.attrs = units | dict(variable.attrs)
+    return xr.conventions.decode_cf_variable(name, known)
+
+
+def as_dataset(
+    format_: str, layout: Layout, arrays: Mapping[str, Any], values: Mapping[str, Any]
+) -> xr.Dataset:
+    """Lay out what :func:`read_netcdf` reads, on the dimensions and in the units of a layout.
+
+    Parameters
+    ----------
+    format_ : str
+        One of :mod:`.formats`.
+    layout : Layout
+    arrays : mapping of str to array or None
+        By their names in the layout; None is absent.
+    values : mapping of str to object
+        Attributes, likewise; ``variable.attribute`` is one of a variable.
+    """
+    variables = {}
+    for name in (name for name, array in arrays.items() if array is not None):
+        declared = layout.variables[name]
+        units = {"units": declared.unit or "1"} if declared.kind == "real" else {}
+        variables[name] = (tuple(map(str, declared.dims)), arrays[name], units)
+    dataset = xr.Dataset(variables, attrs=header(format_))
+    for name, value in values.items():
+        variable, _, attribute = name.rpartition(".")
+        if value is not None:
+            (dataset[variable] if variable else dataset).attrs[attribute] = value
+    return with_grid(dataset)
+
+
+def require_format(path: str | Path, format_: str, what: str, hint: str = "") -> Path:
+    """Check that a file is of one format of the package.
 
     Parameters
     ----------
@@ -185,26 +263,6 @@ def opened_tree(path: str | Path, format_: str, what: str, hint: str = "") -> It
     InputError
         If the file is missing, damaged or of another kind.
     """
-    path = _of_format(path, format_, what, hint)
-    with reading(path, what), xr.open_datatree(path, engine="h5netcdf", decode_times=False) as tree:
-        yield tree
-
-
-def says(path: Path, attributes: Mapping[str, str]) -> bool:
-    """Tell whether a netCDF file of unfinished work is whole, and says so of itself.
-
-    What is damaged is made anew, as what is not there.
-    """
-    if not path.is_file():
-        return False
-    try:
-        with reading(path, "unfinished work"), xr.open_dataset(path, engine="h5netcdf") as file:
-            return all(file.attrs.get(name) == value for name, value in attributes.items())
-    except InputError:
-        return False
-
-
-def _of_format(path: str | Path, format_: str, what: str, hint: str) -> Path:
     path = require_file(path, what, hint)
     found = format_of(path)
     if found != format_:
@@ -215,43 +273,18 @@ def _of_format(path: str | Path, format_: str, what: str, hint: str) -> Path:
     return path
 
 
-@contextmanager
-def _opened_netcdf(
-    path: str | Path, format_: str, layout: Layout, hint: str
-) -> Iterator[xr.Dataset]:
-    path = _of_format(path, format_, layout.what, hint)
-    with (
-        reading(path, layout.what),
-        xr.open_dataset(path, engine="h5netcdf", decode_times=False) as dataset,
-    ):
-        yield dataset
+def says(path: Path, attributes: Mapping[str, str]) -> bool:
+    """Tell whether a netCDF file of unfinished work is whole, and says so of itself.
 
-
-def _decoded(dataset: xr.Dataset, name: str, variable: xr.Variable) -> xr.Variable:
-    """Times by the CF conventions: bounds have the units of what they bound, if none of their own.
-
-    Without units they stay numbers.
+    What is damaged is made anew, as what is not there.
     """
-    bounding = (v.attrs for v in dataset.variables.values() if v.attrs.get("bounds") == name)
-    units = {key: v for attrs in bounding for key, v in attrs.items() if key in CF_TIME}
-    known = variable.copy(deep=False)
-    known.attrs = units | dict(variable.attrs)
-    return xr.conventions.decode_cf_variable(name, known)
-
-
-def _checked_netcdf(path: str | Path, dataset: xr.Dataset, layout: Layout) -> Content:
-    arrays = {str(name): variable for name, variable in dataset.variables.items()}
-    for name, declared in layout.variables.items():
-        if name not in arrays:
-            continue
-        array = dataset[name]
-        dims = [str(d) for d in declared.dims]
-        if array.dims != tuple(dims) and sorted(map(str, array.dims)) == sorted(dims):
-            array = array.transpose(*dims)
-        variable = array.variable
-        arrays[name] = _decoded(dataset, name, variable) if declared.kind == "time" else variable
-    said = {f"{name}.{key}": v for name, one in arrays.items() for key, v in one.attrs.items()}
-    return layout.checked(path, arrays, said | dataset.attrs)
+    if not path.is_file():
+        return False
+    try:
+        with reading(path, "unfinished work"), h5py.File(path) as file:
+            return all(file.attrs.get(name) == value for name, value in attributes.items())
+    except InputError:
+        return False
 
 
 # kinds of numbers that images hold, by BITPIX
@@ -318,8 +351,9 @@ def read_fits(path: str | Path, layout: Layout, hint: str = "") -> Content:
     with opened(path, layout.what, hint) as hdus:
         arrays: dict[str, Any] = {}
         words = hdus[0].header
-        said = {key: words[key] for key in words if key and not key.startswith(STRUCTURE)}
-        declared = {name.lower(): name for name in layout.variables}
+        declared = {name.lower(): name for name in (*layout.variables, *layout.attributes)}
+        keys = [key for key in words if key and not key.startswith(STRUCTURE)]
+        said = {declared.get(key.lower(), key): words[key] for key in keys}
 
         def put(name: str, array: Any, unit: str | None) -> None:
             name = declared.get(name.lower(), name.lower())

@@ -12,6 +12,7 @@ from __future__ import annotations
 import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -22,13 +23,14 @@ from lusee_bayes.core.progress import gigabytes, memory_limit
 
 # for each unit of the package, what a file may state instead, with the factor to it
 UNITS: Mapping[str, Mapping[str, float]] = {
-    "K": {"K": 1.0, "kelvin": 1.0, "Kelvin": 1.0, "mK": 1e-3, "kK": 1e3},
+    "K": {"K": 1.0, "kelvin": 1.0, "Kelvin": 1.0, "mK": 1e-3, "uK": 1e-6, "kK": 1e3},
     "V^2/Hz": dict.fromkeys(("V^2/Hz", "V**2/Hz", "V2/Hz", "V2 Hz-1", "V2 / Hz"), 1.0),
     "MHz": {"MHz": 1.0, "kHz": 1e-3, "Hz": 1e-6, "GHz": 1e3},
     "Ohm": dict.fromkeys(("Ohm", "ohm"), 1.0),
     "deg": dict.fromkeys(("deg", "degree", "degrees"), 1.0),
     "m": {"m": 1.0},
     "d": {"d": 1.0},
+    "s": dict.fromkeys(("s", "second", "seconds"), 1.0),
 }
 # what software writes that was not given a word or a unit, in lower case
 UNSTATED = ("", "unknown", "unspecified", "none")
@@ -111,20 +113,21 @@ class Unloaded:
 
 @dataclass(frozen=True)
 class Variable:
-    """An array of a file.
+    """An array of a file, or an attribute (:data:`Attribute`).
 
     Attributes
     ----------
     dims : sequence of str or int
         Names of lengths, which all arrays of the file share, or lengths.
-    kind : {"real", "complex", "integer", "boolean", "text", "time"}
+    kind : {"real", "complex", "integer", "boolean", "text", "word", "time"}
         What it holds; it is read as float64, complex128, int64, bool, str or datetime64[ns].
+        Attributes alone are words: text, or a whole number that is read as text.
     low, high : float
-        The range of its numbers, ends included.
+        The range of its numbers, ends included, as far as they are finite.
     finite : bool
         Whether every number is to be finite; else there may be NaN.
     missing : bool
-        Whether numbers may be of any kind, NaN and infinity too.
+        Whether there may be NaN and infinity.
     grows : bool
         Whether every number is to be above the one before.
     choices : sequence of str
@@ -138,8 +141,8 @@ class Variable:
 
     dims: Sequence[str | int]
     kind: Kind = "real"
-    low: float = -np.inf
-    high: float = np.inf
+    low: float = -LARGEST
+    high: float = LARGEST
     finite: bool = True
     missing: bool = False
     grows: bool = False
@@ -148,30 +151,8 @@ class Variable:
     unit: str = ""
 
 
-@dataclass(frozen=True)
-class Attribute:
-    """A number, or a text, that a file says of itself.
-
-    Attributes
-    ----------
-    kind : {"real", "integer", "boolean", "text", "word"}
-        A word is text, or a whole number that is read as text.
-    low, high : float
-        Its range, ends included.
-    choices : sequence of str
-        All texts that it may be; any, if there are none.
-    optional : bool
-        Whether it may be absent.
-    unit : str
-        "MHz" of a frequency.
-    """
-
-    kind: Kind = "real"
-    low: float = -np.inf
-    high: float = np.inf
-    choices: Sequence[str] = ()
-    optional: bool = False
-    unit: str = ""
+# a number, or a text, that a file says of itself: it has no dimensions
+Attribute = partial(Variable, ())
 
 
 @dataclass(frozen=True)
@@ -205,12 +186,12 @@ class Layout:
     what : str
         Such as "visibilities of lusee-bayes simulate", for messages.
     variables : mapping of str to Variable
-    attributes : mapping of str to Attribute
+    attributes : mapping of str to Variable
     """
 
     what: str
     variables: Mapping[str, Variable] = field(default_factory=dict)
-    attributes: Mapping[str, Attribute] = field(default_factory=dict)
+    attributes: Mapping[str, Variable] = field(default_factory=dict)
 
     def checked(
         self, path: str | Path, arrays: Mapping[str, Unread], values: Mapping[str, Any]
@@ -312,21 +293,18 @@ def _checked_array(where: str, values: np.ndarray, declared: Variable, factor: f
         return values.astype("datetime64[ns]")
     if declared.kind == "boolean" and not np.isin(values, (0, 1)).all():
         raise InputError(f"{where} holds other numbers than 0 and 1, expected true or false")
-    values = np.ascontiguousarray(values, dtype=KINDS[declared.kind][1])
+    values = np.asarray(values, dtype=KINDS[declared.kind][1], order="C")
     if declared.kind == "boolean":
         return values
     values = values if factor == 1.0 else values * factor
-    parts = (values.real, values.imag) if declared.kind == "complex" else (values,)
-    large = np.logical_or.reduce([np.isfinite(p) & (np.abs(p) > LARGEST) for p in parts])
-    _require_none(where, values, large, f"a number beyond {LARGEST:g}")
-    if declared.missing:
-        return values
-    bad = np.isinf(values) | (np.isnan(values) if declared.finite else False)
-    _require_none(where, values, bad, "NaN or infinity" if declared.finite else "infinity")
-    if declared.kind == "complex":
-        return values
-    outside = (values < declared.low) | (values > declared.high)
-    _require_none(where, values, outside, f"a value outside {declared.low:g} to {declared.high:g}")
+    if not declared.missing:
+        bad = np.isinf(values) | (np.isnan(values) if declared.finite else False)
+        _require_none(where, values, bad, "NaN or infinity" if declared.finite else "infinity")
+    low, high = declared.low, declared.high
+    if np.isfinite([low, high]).any():
+        parts = (values.real, values.imag) if declared.kind == "complex" else (values,)
+        outside = np.any([np.isfinite(p) & ((p < low) | (p > high)) for p in parts], axis=0)
+        _require_none(where, values, outside, f"a value outside {_range(declared)}")
     if declared.unit == "MHz":
         require_mhz(where, values)
     if declared.grows and not (np.diff(values) > 0).all():
@@ -335,6 +313,10 @@ def _checked_array(where: str, values: np.ndarray, declared: Variable, factor: f
             f"{where} does not grow: {values[place + 1]:.12g} follows {values[place]:.12g}"
         )
     return values
+
+
+def _range(declared: Variable) -> str:
+    return f"{declared.low:g} to {declared.high:g}".replace(f"{LARGEST:g}", "inf")
 
 
 def _require_none(where: str, values: np.ndarray, bad: np.ndarray, what: str) -> None:
@@ -346,35 +328,28 @@ def _require_none(where: str, values: np.ndarray, bad: np.ndarray, what: str) ->
         )
 
 
-def _checked_value(where: str, value: Any, declared: Attribute) -> Any:
+def _checked_value(where: str, value: Any, declared: Variable) -> Any:
+    kind, low, high = declared.kind, declared.low, declared.high
     if isinstance(value, np.ndarray | np.generic) and value.size == 1:
         value = value.reshape(()).item()
-    if declared.kind == "word" and isinstance(value, int) and not isinstance(value, bool):
+    if kind == "word" and isinstance(value, int) and not isinstance(value, bool):
         value = str(value)
-    if declared.kind in ("text", "word"):
+    if kind in ("text", "word"):
         text = _text(where, value)
         _require_choice(where, text, declared.choices)
         return text
     # lists of lists of different lengths are no array
     number = np.asarray(None if isinstance(value, list) else value)
-    if number.ndim or number.dtype.kind not in KINDS[declared.kind][0]:
-        raise InputError(f"{where} is {reprlib.repr(value)}, expected {_one(declared.kind)}")
-    if declared.kind == "boolean":
-        return bool(number)
-    finite = np.isfinite(number) and abs(number) <= LARGEST
-    if not finite or not declared.low <= number <= declared.high:
-        limits = f" from {declared.low:g} to {declared.high:g}"
-        limited = np.isfinite([declared.low, declared.high]).any()
-        raise InputError(
-            f"{where} is {value!r}, expected {_one(declared.kind)}{limits if limited else ''}"
-        )
+    good = number.ndim == 0 and number.dtype.kind in KINDS[kind][0]
+    if good and kind != "boolean" and not (declared.missing and not np.isfinite(number)):
+        good = bool(low <= number <= high)
+    if not good:
+        limits = "" if low == -LARGEST and high == LARGEST else f" from {_range(declared)}"
+        words = {"real": "a number", "integer": "a whole number"}.get(kind, KINDS[kind][2])
+        raise InputError(f"{where} is {reprlib.repr(value)}, expected {words}{limits}")
     if declared.unit == "MHz":
         require_mhz(where, number)
-    return int(number) if declared.kind == "integer" else float(number)
-
-
-def _one(kind: Kind) -> str:
-    return {"real": "a number", "integer": "a whole number"}.get(kind, KINDS[kind][2])
+    return KINDS[kind][1](number).item()
 
 
 def _text(where: str, value: Any) -> str:

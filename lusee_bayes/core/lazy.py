@@ -29,6 +29,8 @@ class LazyModule:
 # healpy brings matplotlib and astropy.coordinates with it
 healpy = LazyModule("healpy")
 coordinates = LazyModule("astropy.coordinates")
+# for whoever checks whether something is traced, and shows numbers
+jax = LazyModule("jax")
 numpyro = LazyModule("numpyro")
 interpolate = LazyModule("scipy.interpolate")
 fits = LazyModule("astropy.io.fits")

@@ -186,25 +186,6 @@ def read_model(path: str | Path, kind: type[Model], what: str, hint: str = "") -
         ) from error
 
 
-def entries(
-    path: str | Path, found: dict[str, Any], name: str, layout: Layout
-) -> list[dict[str, Any]]:
-    """Check a list of objects that a JSON file holds under a name.
-
-    Raises
-    ------
-    InputError
-        If it is none, or one of the objects lacks a value.
-    """
-    listed = found.get(name)
-    if not isinstance(listed, list) or not all(isinstance(one, dict) for one in listed):
-        raise InputError(f"{path}: {name} is {type(listed).__name__}, expected a list of objects")
-    return [
-        one | layout.checked(f"{path}: {name} {number}", {}, one).values
-        for number, one in enumerate(listed)
-    ]
-
-
 def read_table(path: str | Path, layout: Layout, hint: str = "") -> dict[str, np.ndarray]:
     """Read a CSV table with a header: every column by its name, numbers where all are.
 
@@ -259,12 +240,10 @@ def read_arrays(path: str | Path, layout: Layout, hint: str = "") -> Content:
 
 
 def _unloaded(arrays: np.lib.npyio.NpzFile, name: str) -> Unloaded:
+    """The array with the shape and dtype of its header."""
     with arrays.zip.open(f"{name}.npy") as file:
-        version = np.lib.format.read_magic(file)
-        header = {
-            (1, 0): np.lib.format.read_array_header_1_0,
-            (2, 0): np.lib.format.read_array_header_2_0,
-        }[version](file)
+        major, _ = np.lib.format.read_magic(file)
+        header = getattr(np.lib.format, f"read_array_header_{major}_0")(file)
     return Unloaded(header[0], header[2], partial(arrays.__getitem__, name))
 
 

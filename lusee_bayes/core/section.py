@@ -113,8 +113,31 @@ def kinds_of(*sections: type[Section]) -> dict[str, type[Section]]:
     return {section.model_fields["model"].default: section for section in sections}
 
 
-def one_of(kinds: Mapping[str, type[Section]], completed: Callable[[Any], Any]) -> Any:
-    """The type of a section that comes in kinds, with what is done to a tree before it is read."""
+def one_of(
+    kinds: Mapping[str, type[Section]],
+    complete: Callable[[dict[str, Any]], None],
+    *,
+    strict: bool = True,
+) -> Any:
+    """The type of a section that comes in kinds.
+
+    Parameters
+    ----------
+    kinds : mapping
+        The section of each ``model``.
+    complete : callable
+        Adds to a tree that is read, in place, what it leaves out: at least ``model``.
+    strict : bool
+        As in :func:`without_other_kinds`.
+    """
+
+    def completed(value: Any) -> Any:
+        if not isinstance(value, dict):
+            return value
+        tree = dict(value)
+        complete(tree)
+        return without_other_kinds(tree, kinds, strict=strict)
+
     kind = Field(discriminator="model")
     return Annotated[reduce(or_, kinds.values()), kind, BeforeValidator(completed)]
 
@@ -160,12 +183,10 @@ def without_other_kinds(
         if key in own.model_fields or not others:
             kept[key] = value
             continue
-        theirs = others[0]
-        default = theirs.model_fields[key].get_default(call_default_factory=True)
+        default = others[0].model_fields[key].get_default(call_default_factory=True)
         # YAML has lists where sections have tuples
         plain = list(default) if isinstance(default, tuple) else default
-        same = value is None or value in (default, plain)
-        if strict and not same:
+        if strict and value not in (None, default, plain):
             names = ", ".join(name for name, kind in kinds.items() if kind in others)
             raise ValueError(f"{key} is an entry of model {names}, not of {tree['model']}")
     return kept

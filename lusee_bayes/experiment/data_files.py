@@ -1,4 +1,4 @@
-"""Measured data of a scenario, from whatever file holds them."""
+"""Measured data of a scenario, from whatever file holds them; sessions are reduced as it says."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
@@ -14,11 +15,19 @@ from lusee_bayes.core.files import user_path
 from lusee_bayes.core.formats import format_of, image_names, is_fits, is_session
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming, require_file
-from lusee_bayes.experiment.flight_data import reduce_files, visibilities_of
+from lusee_bayes.experiment.instrument_sections import FlightSection
 from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.flight.bands import shared_noise
+from lusee_bayes.flight.clock import read_clock
+from lusee_bayes.flight.flags import NO_LINES, read_lines
+from lusee_bayes.flight.gain_model import GainModel, read_gain_table
+from lusee_bayes.flight.recipe import Recipe
 from lusee_bayes.flight.reduced import Reduced, read_reduced
+from lusee_bayes.flight.reduction import reduce_sessions
+from lusee_bayes.flight.session_files import read_session
 from lusee_bayes.instrument.averaging import averaged
 from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ
+from lusee_bayes.instrument.products import CONVENTIONS
 from lusee_bayes.instrument.times import Timestamp
 from lusee_bayes.instrument.visibilities import HINT, Visibilities, read_visibilities
 from lusee_bayes.instrument.waterfalls import INTERPOLATIONS, Waterfall, read_waterfall
@@ -54,20 +63,21 @@ def items_of(data: object) -> tuple[Visibilities, ...] | tuple[Path, ...]:
     InputError
         For nothing, for anything else, and for sets and files together.
     """
-    given = (data,) if isinstance(data, Visibilities | str | Path) else data
-    wrong = [given] if not isinstance(given, Sequence) else []
-    wrong = wrong or [one for one in given if not isinstance(one, Visibilities | str | Path)]
+    one = Visibilities | str | Path
+    given = (data,) if isinstance(data, one) else data
+    items = given if isinstance(given, Sequence) else (given,)
+    wrong = [item for item in items if not isinstance(item, one)]
     if wrong:
         raise InputError(
             f"data are Visibilities, paths of files, or several of one of them, not a "
             f"{type(wrong[0]).__name__}; Visibilities.from_arrays makes some of arrays"
         )
-    sets = tuple(one for one in given if isinstance(one, Visibilities))
-    if not given or len(sets) not in (0, len(given)):
-        raise InputError(
-            "no data are given" if not given else "data are in memory or in files, not in both"
-        )
-    return sets or tuple(user_path(path) for path in given)
+    sets = tuple(item for item in items if isinstance(item, Visibilities))
+    if not items:
+        raise InputError("no data are given")
+    if len(sets) not in (0, len(items)):
+        raise InputError("data are in memory or in files, not in both")
+    return sets or tuple(user_path(path) for path in items)
 
 
 def files_of(data: Data) -> tuple[Path, ...]:
@@ -155,37 +165,37 @@ def read_data(data: Data, scenario: Scenario) -> Visibilities:
     reduced = reduced_of(data, scenario)
     if reduced is not None:
         return visibilities_of(reduced, scenario)
-    timestamp, average_s = scenario.observation.timestamp, scenario.observation.average_s
-    files = files_of(data)
+    files, timestamp = files_of(data), scenario.observation.timestamp
     path = files[0] if files else "the data"
-    if files:
-        _require_data(path)
     if not files:
         data = _stamped(path, _nearest(items_of(data), scenario.frequency_mhz), timestamp)
-    elif is_fits(path):
-        data = _channel(path, scenario)
+    elif not _is_waterfall(path):
+        data = _stamped(path, read_visibilities(path), timestamp)
+    else:
+        waterfall = read_waterfall(path)
+        data = waterfall.at(scenario.frequency_mhz, scenario.beam.n_ports)
+        if waterfall.per_kelvin is not None:
+            _require_same_instrument(waterfall, scenario)
         # samples of luseepy's simulators are instants; its layout cannot say that others are not
         if timestamp is not None:
             with naming(path):
                 data = data.stamped(timestamp)
-    else:
-        data = _stamped(path, read_visibilities(path), timestamp)
-    if average_s is None:
+    if scenario.observation.average_s is None:
         return data
     with naming(path):
-        return averaged(data, average_s)
+        return averaged(data, scenario.observation.average_s)
 
 
-def _require_data(path: Path) -> None:
-    """InputError for files that hold nothing to be mapped, with all that do."""
-    kind = format_of(path)
-    if is_fits(path):
+def _is_waterfall(path: Path) -> bool:
+    """Whether a file holds a waterfall of luseepy, not our visibilities. InputError if neither."""
+    kind, is_waterfall = format_of(path), is_fits(path)
+    known = kind == formats.VISIBILITIES
+    if is_waterfall:
         known = bool(WATERFALL_IMAGES & set(image_names(path)))
-    else:
-        known = kind == formats.VISIBILITIES
     if not known:
         said = f" (its format is '{kind}')" if kind else ""
         raise InputError(f"{path} holds nothing that can be mapped{said}; give {ACCEPTED}")
+    return is_waterfall
 
 
 def _nearest(sets: Sequence[Visibilities], frequency_mhz: float) -> Visibilities:
@@ -219,14 +229,6 @@ def _stamped(path: str | Path, data: Visibilities, timestamp: Timestamp | None) 
     return data
 
 
-def _channel(path: Path, scenario: Scenario) -> Visibilities:
-    waterfall = read_waterfall(path)
-    data = waterfall.at(scenario.frequency_mhz, scenario.beam.n_ports)
-    if waterfall.per_kelvin is not None:
-        _require_same_instrument(waterfall, scenario)
-    return data
-
-
 def _require_same_instrument(waterfall: Waterfall, scenario: Scenario) -> None:
     """InputError unless data in V^2/Hz are those of these antennas, receivers and temperatures."""
     section, frequency = scenario.beam, scenario.frequency_mhz
@@ -240,11 +242,10 @@ def _require_same_instrument(waterfall: Waterfall, scenario: Scenario) -> None:
     rule, said = source.interpolated(frequency), waterfall.interpolation
     if rule is not None and said is not None and said != INTERPOLATIONS[rule]:
         known = [name for name, word in INTERPOLATIONS.items() if word == said]
-        what_to_do = (
-            f"use --set beam.interpolation={known[0]}"
-            if known
-            else f"expected one of {', '.join(INTERPOLATIONS.values())}, or a response that has it"
-        )
+        words = ", ".join(INTERPOLATIONS.values())
+        what_to_do = f"expected one of {words}, or a response that has it"
+        if known:
+            what_to_do = f"use --set beam.interpolation={known[0]}"
         raise InputError(
             f"{section.file} does not have the frequency {frequency:.15g} MHz; {waterfall.path} "
             f"has it by FREQINT = '{said}', the scenario by beam.interpolation={rule}; {what_to_do}"
@@ -253,16 +254,21 @@ def _require_same_instrument(waterfall: Waterfall, scenario: Scenario) -> None:
     ours = circuit.per_kelvin.diagonal().real
     port = int(np.argmax(np.abs(theirs / ours - 1.0)))
     if abs(theirs[port] / ours[port] - 1.0) > SAME_SCALE:
-        own_loads = waterfall.receiver is not None
+        if waterfall.receiver is None:
+            what_to_do = "give the response and the beam.receiver that the data were taken with"
+        elif section.receiver is not None:
+            what_to_do = "leave out beam.receiver, so that the loads ZL in the data are used"
+        else:
+            what_to_do = "give the response that the data, which have the loads ZL, were taken with"
         raise InputError(
             f"in {waterfall.path} 1 K is {theirs[port]:.6g} V^2/Hz at port {port}, with "
-            f"{section.file} it is {ours[port]:.6g}; "
-            + _what_differs(own_loads, section.receiver is not None)
+            f"{section.file} it is {ours[port]:.6g}; {what_to_do}"
         )
-    for name, theirs_k, ours_k in (
-        ("moon_temperature_k", waterfall.moon_k, section.moon_temperature_k),
-        ("antenna_temperature_k", waterfall.antenna_k, section.antenna_temperature_k),
+    for name, theirs_k in (
+        ("moon_temperature_k", waterfall.moon_k),
+        ("antenna_temperature_k", waterfall.antenna_k),
     ):
+        ours_k = getattr(section, name)
         if not np.isclose(theirs_k, ours_k, rtol=SAME_TEMPERATURE, atol=0.0):
             raise InputError(
                 f"{waterfall.path} holds the emission of {theirs_k:.15g} K, the scenario's {name} "
@@ -270,10 +276,133 @@ def _require_same_instrument(waterfall: Waterfall, scenario: Scenario) -> None:
             )
 
 
-def _what_differs(own_loads: bool, said: bool) -> str:
-    """What may be wrong, and what to do: the data may hold the loads, the scenario may say them."""
-    if not own_loads:
-        return "give the response and the beam.receiver that the data were taken with"
-    if said:
-        return "leave out beam.receiver, so that the loads ZL in the data are used"
-    return "both are with the loads ZL in the data: give the response that they were taken with"
+def reduce_files(
+    paths: Sequence[str | Path], scenario: Scenario, stages: Stages | None = None
+) -> Reduced:
+    """Reduce sessions to the scenario's frequencies.
+
+    Parameters
+    ----------
+    paths : sequence of paths
+        HDF5 or FITS of luseepy's ``lusee.ingest``, in any order.
+    scenario : Scenario
+    stages : Stages, optional
+        Told how far it is.
+
+    Raises
+    ------
+    InputError
+        If the scenario does not say what the files leave open, a file is given twice or reduced
+        already, or as :func:`.read_session` and :func:`.reduce_sessions`.
+    """
+    stages = stages or Stages()
+    paths = [user_path(path) for path in paths]
+    known = [path.resolve() for path in paths]
+    for k, path in enumerate(known):
+        if path in known[:k]:
+            raise InputError(f"'{paths[k]}' is given twice; give every session once")
+        if format_of(path) == formats.REDUCED:
+            raise InputError(f"'{paths[k]}' is reduced already; give it to lusee-bayes map --data")
+    recipe = recipe_of(scenario)
+    with stages("sessions"):
+        sessions = [read_session(path) for path in paths]
+    return reduce_sessions(sessions, recipe, stages)
+
+
+def recipe_of(scenario: Scenario) -> Recipe:
+    """How a scenario reduces sessions.
+
+    Raises
+    ------
+    InputError
+        If it does not say what the files leave open: gains, bin origin, what the times are.
+    """
+    section = scenario.flight
+    if section is None:
+        raise InputError(
+            "the data are sessions of the spectrometer, and the scenario does not say how they "
+            "become visibilities; give it a section flight, or --set 'flight={gain_table: ..., "
+            "bin_origin: centre}' (docs/howto/first_light.md)"
+        )
+    if section.gain_table is None:
+        raise InputError(
+            "the sessions hold counts, and the scenario names no gain table; use --set "
+            "flight.gain_table=... (the folder of luseepy's gain model, or a netCDF file)"
+        )
+    if section.bin_origin is None:
+        raise InputError(
+            "it is not settled whether channel k of the spectrometer has its centre or its lower "
+            "edge at k times 25 kHz, which differ by 12.5 kHz; use --set flight.bin_origin=centre "
+            "(luseepy's labels) or edge"
+        )
+    timestamp = scenario.observation.timestamp
+    if timestamp is None:
+        raise InputError(
+            "the sessions do not say whether their times are the start, the middle or the end of "
+            "the integrations; use --set observation.timestamp=middle (or start, end, instant)"
+        )
+    here = scenario.observation
+    as_given = {"degree", "turntable_deg", "comb", "false_alarm", "gain_std"}
+    return Recipe(
+        gain_table_of(section),
+        section.bin_origin,
+        timestamp,
+        scenario.frequencies_mhz or (scenario.frequency_mhz,),
+        section.bandwidth_hz / 1e6,
+        average_s=here.average_s,
+        shared_noise=shared_noise(section.filter_taps, section.filter_window),
+        sign=int(CONVENTIONS[section.convention]),
+        lines=NO_LINES if section.lines is None else read_lines(section.lines),
+        clock=None if section.clock is None else read_clock(section.clock),
+        site=(here.lon_deg, here.lat_deg) if section.site == "scenario" else None,
+        **section.model_dump(include=as_given),
+    )
+
+
+def visibilities_of(reduced: Reduced, scenario: Scenario) -> Visibilities:
+    """One band of reduced spectra, in K, as the scenario's beams have it.
+
+    Raises
+    ------
+    InputError
+        If there is no such band, nothing is left of it, or the beams know no volts.
+    """
+    return reduced.at(scenario.frequency_mhz, per_kelvin_of(scenario))
+
+
+def per_kelvin_of(scenario: Scenario) -> Float[np.ndarray, " ports"]:
+    """V^2/Hz that an enclosure of 1 K makes at each port.
+
+    Raises
+    ------
+    InputError
+        If neither the beams nor the scenario say it.
+    """
+    said = None if scenario.flight is None else scenario.flight.per_kelvin_v2_hz
+    circuit = scenario.beam.source().circuit(scenario.frequency_mhz)
+    if circuit is None and said is None:
+        raise InputError(
+            "flight data are in V^2/Hz, at the receivers' inputs, and these beams know no volts; "
+            "give luseepy's four-port response as beam.file (beam.model=response), or say what "
+            "1 K makes: --set flight.per_kelvin_v2_hz=..."
+        )
+    if circuit is not None and said is not None:
+        raise InputError(
+            "flight.per_kelvin_v2_hz is for beams that know no volts, and these have impedances; "
+            "leave it out"
+        )
+    if circuit is None:
+        return np.full(scenario.beam.n_ports, float(said))
+    return np.ascontiguousarray(circuit.per_kelvin.diagonal().real)
+
+
+def gain_table_of(section: FlightSection) -> GainModel:
+    """The gain table that a scenario names, with what it says of its errors.
+
+    Raises
+    ------
+    InputError
+        If the table cannot be read, or says itself what the scenario says of its components.
+    """
+    table = read_gain_table(section.gain_table, section.gain_model)
+    return table.with_component_std(section.component_std)

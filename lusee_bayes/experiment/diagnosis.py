@@ -22,37 +22,37 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+import pandas as pd
+from jaxtyping import Float, Int
 
-from lusee_bayes.core.arrays import Ells, Grid, Square, on_host
+from lusee_bayes.core.arrays import Ells, Grid, Square
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, mean_over_m, mode_numbers, n_modes, turn_about_z
 from lusee_bayes.core.linalg import solve_lower
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.rounds import Inference
-from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing, offset_kind, offset_names, with_offsets
-from lusee_bayes.instrument.products import all_products, auto_indices
+from lusee_bayes.instrument.products import all_products, auto_indices, ports
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.chi2 import ChiSquare, stands_out, two_sided
 from lusee_bayes.judge.measures import expected_chi2
 from lusee_bayes.judge.residuals import Residuals
 from lusee_bayes.judge.split import WIDER, with_sky
-from lusee_bayes.linear.information import Information
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import FromInformation, LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.prior import HarmonicPrior
-from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.context import Around, Setup
 
 # arrays that recur
 Products = Float[np.ndarray, " products"]
-
+Columns = Float[np.ndarray, " columns"]
 Mixing = Float[np.ndarray, "products products"]
 
 # seconds to be added to times that are not what they are taken for
@@ -66,55 +66,36 @@ CLOCKS = {
 }
 
 
-@dataclass(frozen=True)
-class DataMistake:
+class DataMistake(NamedTuple):
     """A mistake in the data.
 
     Attributes
     ----------
     words, remedy : str
         What is wrong, and what to do.
-    mixing : (products, products) array
-        What makes the right products of each time's wrong ones.
-    constant : (products,) array or None
-        What is then taken away, in K.
+    w : (columns,) array
+        Of the module's equations, b included: what makes the right data of the wrong ones.
     time : int or None
         The only time that is wrong; None for all.
-    reverses : bool
-        Whether the order of times is reversed.
     """
 
     words: str
     remedy: str
-    mixing: Mixing
-    constant: Products | None = None
+    w: Columns
     time: int | None = None
-    reverses: bool = False
 
     def undone(self, grid: Grid) -> Grid:
         """The visibilities without the mistake, in K."""
-        grid = grid[:, ::-1] if self.reverses else grid
-        mixed = self.mixing @ grid
-        if self.constant is not None:
-            mixed = mixed - self.constant[:, None]
+        n = len(grid)
+        mixing, constant, (turned, _) = np.split(self.w, [n * n, n * n + n])
+        right = mixing.reshape(n, n) @ grid + constant[:, None] + turned * grid[:, ::-1]
         if self.time is None:
-            return mixed
-        return np.where(np.arange(grid.shape[1]) == self.time, mixed, grid)
+            return right
+        return np.where(np.arange(grid.shape[1]) == self.time, right, grid)
 
 
-@dataclass(frozen=True)
-class ModelMistake:
-    """A mistake in the model.
-
-    Attributes
-    ----------
-    words, remedy : str
-        What is wrong, and what to do.
-    beams : ProductBeams
-        Those without the mistake.
-    observation : Observation
-        That without the mistake.
-    """
+class ModelMistake(NamedTuple):
+    """A mistake in the model: what is wrong, what to do, and beams and observation without it."""
 
     words: str
     remedy: str
@@ -122,129 +103,111 @@ class ModelMistake:
     observation: Observation
 
 
-def port_mixing(ports: tuple[int, ...], signs: tuple[float, ...] | None = None) -> Mixing:
-    """What makes the products of ports 0, 1, ... of data that have them as ``ports``.
+def weights(mixing: Mixing, *, reversed_times: bool = False, b: float = -1.0) -> Columns:
+    """(w, -1) of a mixing, with no constant; or, of ``b`` 0, what is added to one."""
+    return np.concatenate([mixing.ravel(), np.zeros(len(mixing)), [float(reversed_times), b]])
+
+
+def port_mixing(numbers: Sequence[int], signs: Sequence[float] | None = None) -> Mixing:
+    """What makes the products of ports 0, 1, ... of data that have them as ``numbers``.
 
     Parameters
     ----------
-    ports : tuple of int
+    numbers : sequence of int
         Of each port, under which number the data have it.
-    signs : tuple of float, optional
+    signs : sequence of float, optional
         Of each port, the sign of its voltage.
     """
-    products, signs = all_products(len(ports)), signs or (1.0,) * len(ports)
+    products, signs = all_products(len(numbers)), signs or np.ones(len(numbers))
     place = {tuple(product): k for k, product in enumerate(products)}
     mixing = np.zeros((len(products), len(products)))
     for row, (a, b, part) in enumerate(products):
-        i, j = ports[a], ports[b]
+        i, j = numbers[a], numbers[b]
         conjugated = -1.0 if part == "I" and i > j else 1.0
         mixing[row, place[min(i, j), max(i, j), part]] = conjugated * signs[a] * signs[b]
     return mixing
 
 
-def data_mistakes(n_ports: int) -> Iterator[DataMistake]:
-    """Conjugation, signs, exchanges, and reversed times."""
-    products, ports = all_products(n_ports), tuple(range(n_ports))
-    same = np.eye(len(products))
-    imaginary = np.array([p.part == "I" for p in products])
-    crosses = np.array([p.i != p.j for p in products])
-    yield DataMistake(
-        "the data are conjugated: the imaginary parts have the other sign",
-        "change their sign (from_arrays: convention='conj(s_i) s_j')",
-        np.diag(np.where(imaginary, -1.0, 1.0)),
-    )
-    yield DataMistake(
-        "all crosses have the other sign",
-        "change their sign",
-        np.diag(np.where(crosses, -1.0, 1.0)),
-    )
+def data_mistakes(n_ports: int) -> Iterator[tuple[str, str, Mixing]]:
+    """Conjugation, signs and exchanges: what is wrong, what to do, and what mixes the products."""
+    products, numbers = all_products(n_ports), range(n_ports)
+    first, second, imaginary = ports(n_ports)
+    wrong = "the data are conjugated: the imaginary parts have the other sign"
+    remedy = "change their sign (from_arrays: convention='conj(s_i) s_j')"
+    yield wrong, remedy, np.diag(np.where(imaginary, -1.0, 1.0))
+    wrong = "all crosses have the other sign"
+    yield wrong, "change their sign", np.diag(np.where(first != second, -1.0, 1.0))
     for size in range(1, n_ports // 2 + 1):
-        for flipped in combinations(ports, size):
+        for flipped in combinations(numbers, size):
             if 2 * size == n_ports and 0 not in flipped:  # as if the others were flipped
                 continue
             named = " and ".join(map(str, flipped))
-            yield DataMistake(
-                f"the voltages of port {named} have the other sign",
-                f"change the sign of all crosses of port {named} with others",
-                port_mixing(ports, tuple(-1.0 if p in flipped else 1.0 for p in ports)),
-            )
-    for i, j in combinations(ports, 2):
-        yield DataMistake(
+            wrong = f"the voltages of port {named} have the other sign"
+            remedy = f"change the sign of all crosses of port {named} with others"
+            signs = [-1.0 if port in flipped else 1.0 for port in numbers]
+            yield wrong, remedy, port_mixing(numbers, signs)
+    for i, j in combinations(numbers, 2):
+        wrong, remedy = (
             f"ports {i} and {j} are exchanged",
             f"exchange ports {i} and {j} of the data",
-            port_mixing(tuple({i: j, j: i}.get(port, port) for port in ports)),
         )
+        yield wrong, remedy, port_mixing([{i: j, j: i}.get(port, port) for port in numbers])
     for turn in range(1, n_ports):
-        yield DataMistake(
-            f"the ports are turned by {turn}: the model's port 0 is the data's port {turn}",
-            "number the data's ports as the beams'",
-            port_mixing(tuple((port + turn) % n_ports for port in ports)),
-        )
+        wrong = f"the ports are turned by {turn}: the model's port 0 is the data's port {turn}"
+        turned = port_mixing([(port + turn) % n_ports for port in numbers])
+        yield wrong, "number the data's ports as the beams'", turned
     for i, j in combinations(range(len(products)), 2):
         order = np.arange(len(products))
         order[[i, j]] = j, i
         named = f"{products[i].label} and {products[j].label}"
-        yield DataMistake(
-            f"products {named} are exchanged", f"exchange {named} of the data", same[order]
-        )
-    yield DataMistake("the times are reversed", "sort the data by time", same, reverses=True)
+        mixing = np.eye(len(products))[order]
+        yield f"products {named} are exchanged", f"exchange {named} of the data", mixing
 
 
 def model_mistakes(setup: Setup) -> Iterator[ModelMistake]:
     """Angles, azimuths, clocks, the site's signs, and neighbouring channels."""
     observation, beams = setup.observation, setup.beams
-    angles = observation.turntable_deg
-
-    def seen(words: str, remedy: str, other: Observation) -> ModelMistake:
-        return ModelMistake(words, remedy, beams, other)
-
-    for turn in (90.0, 180.0, 270.0):
-        yield seen(
+    turntables = offset_names(("turntable_deg",), observation.n_runs)
+    angles = dict(zip(turntables, observation.turntable_deg, strict=True))
+    offsets: list[tuple[str, str, dict[str, float]]] = [
+        (
             f"the array is turned by {turn:g} degrees from East towards North",
             f"use --set beam.turntable_offset_deg={turn:g}",
-            replace(observation, turntable_deg=tuple(angle + turn for angle in angles)),
+            dict.fromkeys(turntables, turn),
         )
-    if any(angles):
-        yield seen(
-            "the turntable's angles have the other sign",
-            "count them from East towards North",
-            replace(observation, turntable_deg=tuple(-angle for angle in angles)),
-        )
-    _, m = mode_numbers(beams.lmax)
-    mirrored = np.asarray(beams.modes) * np.where(m < 0, -1.0, 1.0)
-    for words, modes in (
-        ("the azimuth of the beams is mirrored", mirrored),
-        (
-            "the azimuth of the beams is counted from North towards East",
-            np.asarray(turn_about_z(mirrored, np.pi / 2.0)),
-        ),
-    ):
-        remedy = "count it from East towards North"
-        yield ModelMistake(words, remedy, replace(beams, modes=modes), observation)
+        for turn in (90.0, 180.0, 270.0)
+    ]
+    if any(angles.values()):
+        wrong = "the turntable's angles have the other sign"
+        opposite = {name: -2.0 * angle for name, angle in angles.items()}
+        offsets.append((wrong, "count them from East towards North", opposite))
     half = observation.step_s / 2.0
     starts = {"the times are starts of samples": half, "the times are ends of samples": -half}
-    for words, seconds in (CLOCKS | starts).items():
-        shifted = with_offsets(observation, {"clock_s": seconds})
-        yield seen(words, f"add {seconds:g} s to the times", shifted)
+    for wrong, seconds in (CLOCKS | starts).items():
+        offsets.append((wrong, f"add {seconds:g} s to the times", {"clock_s": seconds}))
     for name, key in (("latitude", "lat_deg"), ("longitude", "lon_deg")):
         value = getattr(observation, key)
-        yield seen(
-            f"the site's {name} has the other sign",
-            f"use --set observation.{key}={-value:g}",
-            with_offsets(observation, {key: -2.0 * value}),
-        )
+        remedy = f"use --set observation.{key}={-value:g}"
+        offsets.append((f"the site's {name} has the other sign", remedy, {key: -2.0 * value}))
+    for wrong, remedy, values in offsets:
+        yield ModelMistake(wrong, remedy, beams, with_offsets(observation, values))
+    _, m = mode_numbers(beams.lmax)
+    mirrored = np.asarray(beams.modes) * np.where(m < 0, -1.0, 1.0)
+    azimuths = {
+        "mirrored": mirrored,
+        "counted from North towards East": np.asarray(turn_about_z(mirrored, np.pi / 2.0)),
+    }
+    for how, modes in azimuths.items():
+        wrong, remedy = f"the azimuth of the beams is {how}", "count it from East towards North"
+        yield ModelMistake(wrong, remedy, replace(beams, modes=modes), observation)
     width = setup.scenario.noise.radiometer.bandwidth_hz / 1e6
     for frequency in (beams.frequency_mhz - width, beams.frequency_mhz + width):
         try:
             other = setup.beam_source.beams(frequency, beams.lmax)
         except InputError:  # the source has none there
             continue
-        yield ModelMistake(
-            f"the frequency is that of the neighbouring channel, {frequency:g} MHz",
-            f"use --set frequency_mhz={frequency:g}",
-            other,
-            observation,
-        )
+        wrong = f"the frequency is that of the neighbouring channel, {frequency:g} MHz"
+        yield ModelMistake(wrong, f"use --set frequency_mhz={frequency:g}", other, observation)
 
 
 @dataclass(frozen=True)
@@ -269,7 +232,7 @@ class UnderAnySky:
     @classmethod
     def of(cls, setup: Setup, data: Visibilities, model: LinearGaussian) -> UnderAnySky:
         """Under a prior that allows any sky, as bright as the data ask for."""
-        prior = on_host(setup.prior if setup.family is None else setup.family.expected())
+        prior = setup.prior if setup.family is None else setup.family.expected()
         power = np.asarray(prior.variance())
         if prior.white_mean is not None:
             power = power + np.asarray(prior.colour(prior.white_mean)) ** 2
@@ -277,22 +240,17 @@ class UnderAnySky:
         modelled = float(np.median(np.asarray(setup.signal)[autos]))
         brighter = np.nanmedian(np.asarray(data.grid())[autos]) / modelled
         spectrum = mean_over_m(power) * (WIDER * np.fmax(1.0, brighter)) ** 2
-        return cls(setup, data, on_host(model), spectrum)
+        return cls(setup, data, model, spectrum)
 
     def wide(self, coupling: Coupling) -> tuple[ChiSquare, Posterior]:
         """Residual chi^2, and the posterior under the wide prior."""
         n_ells = lmax_of(coupling.shape[1]) + 1
         more = max(0, n_ells - len(self.spectrum))
         spectrum = np.pad(self.spectrum, (0, more), mode="edge")[:n_ells]
-        information, posterior = Information.of(
-            coupling,
-            HarmonicPrior(spectrum),
-            self.model.noise,
-            self.model.offset,
-            np.asarray(self.data.data),
-        )
-        posterior, n = on_host(posterior), self.model.n_data
-        chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
+        model = replace(self.model, coupling=coupling, prior=HarmonicPrior(spectrum))
+        solution = model.condition(np.asarray(self.data.data), FromInformation)
+        posterior, n = solution.posterior, model.n_data
+        chi2 = float(solution.information.chi2(posterior.mean) + posterior.prior_chi2())
         degrees = n - with_sky(n - expected_chi2(posterior, n))
         return ChiSquare(chi2, float(degrees)), posterior
 
@@ -316,7 +274,7 @@ class UnderAnySky:
         right = np.asarray(layout.gather(mistake.undone(filled(self.data))))
         data = replace(self.data, data=right)
         try:
-            model = on_host(full_model(self.setup, Around(data)))
+            model = full_model(self.setup, Around(data))
         except InputError:  # without it, some auto is not positive
             return ChiSquare(np.inf, float(layout.size))
         return replace(self, data=data, model=model).wide(model.coupling)[0]
@@ -324,12 +282,8 @@ class UnderAnySky:
 
 def filled(data: Visibilities) -> Grid:
     """The data on the full grid, absent samples interpolated in time."""
-    grid = np.array(data.grid())
-    times = np.arange(grid.shape[1])
-    for row in grid:
-        there = np.isfinite(row)
-        row[~there] = np.interp(times[~there], times[there], row[there]) if there.any() else 0.0
-    return grid
+    grid = pd.DataFrame(np.asarray(data.grid()).T).interpolate(limit_direction="both")
+    return grid.fillna(0.0).to_numpy().T
 
 
 # times that are tried one by one, the worst first
@@ -361,50 +315,39 @@ class MixedProducts:
         columns += [np.stack([grid[:, ::-1][product, time], steady], axis=1)]
         return cls(here, posterior, grid, _gram(here, posterior, np.concatenate(columns, axis=1)))
 
-    def chi2(self, vector: Float[np.ndarray, " columns"]) -> float:
-        """chi^2 of (w, -1)."""
-        return float(vector @ self.q @ vector)
-
-    def vector(self, mixing: Float[np.ndarray, "products products"], b: float = -1.0) -> np.ndarray:
-        """(w, -1) of a mixing, or w of one that is added."""
-        return np.concatenate([mixing.ravel(), np.zeros(len(mixing) + 1), [b]])
-
     def tried(self) -> Iterator[tuple[float, DataMistake]]:
         """Every mistake with its chi^2."""
-        n_ports = self.here.setup.beam_source.n_ports
-        for mistake in data_mistakes(n_ports):
-            w = self.vector(mistake.mixing)
-            if mistake.reverses:
-                w = np.zeros(len(w))
-                w[-2:] = 1.0, -1.0
-            yield self.chi2(w), mistake
-        products = all_products(n_ports)
-        autos = np.array([p.i == p.j for p in products], dtype=np.float64)
-        for product, which in zip(products, np.eye(len(products)), strict=True):
-            yield self._factor(f"product {product.label}", which)
-        yield self._factor("every auto", autos)
-        for port in range(n_ports):
-            powers = np.array([float(p.i == port) + float(p.j == port) for p in products])
-            yield self._gain(port, powers)
-        yield self._constant(np.flatnonzero(autos))
+        n_ports, n = self.here.setup.beam_source.n_ports, len(self.grid)
+        first, second, _ = ports(n_ports)
+        autos = first == second
+        known = [DataMistake(*one, weights(mixing)) for *one, mixing in data_mistakes(n_ports)]
+        turned = weights(np.zeros((n, n)), reversed_times=True)
+        known.append(DataMistake("the times are reversed", "sort the data by time", turned))
+        names = [f"product {product.label}" for product in all_products(n_ports)]
+        known += list(map(self._factor, names, np.eye(n)))
+        known.append(self._factor("every auto", autos * 1.0))
+        known += [self._gain(k, 1.0 * (first == k) + (second == k)) for k in range(n_ports)]
+        known.append(self._constant(np.flatnonzero(autos)))
+        for mistake in known:
+            yield self.chi2(mistake.w), mistake
         yield from self._times()
 
-    def _factor(self, name: str, which: Products) -> tuple[float, DataMistake]:
-        """A factor of some products: chi^2 is a parabola in what is missing."""
-        whole = self.vector(np.eye(len(which)))
-        step = self.vector(np.diag(which), 0.0)
-        curvature = float(step @ self.q @ step)
-        missing = -float(step @ self.q @ whole) / curvature
-        return self.chi2(whole + missing * step), DataMistake(
-            f"{name} is {_number(1.0 / (1.0 + missing), curvature**-0.5)} times what the others "
-            "predict",
-            f"look at the calibration of {name}",
-            np.diag(1.0 + missing * which),
-        )
+    def chi2(self, w: Columns) -> float:
+        """chi^2 of (w, -1)."""
+        return float(w @ self.q @ w)
 
-    def _gain(self, port: int, powers: Products) -> tuple[float, DataMistake]:
+    def _factor(self, name: str, which: Products) -> DataMistake:
+        """A factor of some products: chi^2 is a parabola in what is missing."""
+        whole, step = weights(np.eye(len(which))), weights(np.diag(which), b=0.0)
+        curvature = self.chi2(step)
+        missing = -float(step @ self.q @ whole) / curvature
+        factor = _number(1.0 / (1.0 + missing), curvature**-0.5)
+        wrong = f"{name} is {factor} times what the others predict"
+        return DataMistake(wrong, f"look at the calibration of {name}", whole + missing * step)
+
+    def _gain(self, port: int, powers: Products) -> DataMistake:
         """A gain of a port's voltage, squared in its auto: chi^2 is of fourth order in it."""
-        parts = [self.vector(np.diag((powers == k) * 1.0), -1.0 * (k == 0)) for k in range(3)]
+        parts = [weights(np.diag((powers == k) * 1.0), b=-1.0 * (k == 0)) for k in range(3)]
         gram = np.array([[u @ self.q @ v for v in parts] for u in parts])
         chi2 = np.polynomial.Polynomial(
             [np.trace(gram[:, ::-1], offset=2 - order) for order in range(5)]
@@ -412,59 +355,46 @@ class MixedProducts:
         roots = chi2.deriv().roots()
         real = roots.real[np.abs(roots.imag) <= 1e-6 * np.abs(roots.real)]
         gain = real[np.argmin(chi2(real))]
-        return float(chi2(gain)), DataMistake(
-            f"the voltage of port {port} is {1.0 / gain:.5g} times what the others predict",
-            f"look at the calibration of port {port}",
-            np.diag(gain**powers),
-        )
+        wrong = f"the voltage of port {port} is {1.0 / gain:.5g} times what the others predict"
+        remedy = f"look at the calibration of port {port}"
+        return DataMistake(wrong, remedy, weights(np.diag(gain**powers)))
 
-    def _constant(self, autos: np.ndarray) -> tuple[float, DataMistake]:
+    def _constant(self, autos: Int[np.ndarray, " autos"]) -> DataMistake:
         """A constant in every auto."""
         n = len(self.grid)
-        whole = self.vector(np.eye(n))
-        places = n * n + autos
+        whole, places = weights(np.eye(n)), n * n + autos
         level = np.linalg.solve(self.q[np.ix_(places, places)], self.q[places] @ whole)
         whole[places] -= level
-        constant = np.zeros(n)
-        constant[autos] = level
         named = ", ".join(f"{x:.4g}" for x in level)
-        return self.chi2(whole), DataMistake(
-            f"the autos have a constant of {named} K besides the sky",
-            "give noise.receiver, or subtract it",
-            np.eye(n),
-            constant,
-        )
+        wrong = f"the autos have a constant of {named} K besides the sky"
+        return DataMistake(wrong, "give noise.receiver, or subtract it", whole)
 
     def _times(self) -> Iterator[tuple[float, DataMistake]]:
         """A factor of all products of one time."""
         here, layout, values = self.here, self.here.data.layout, np.asarray(self.here.data.data)
         factor = here.model.noise.factor()
         # K^-1 (d - b)
-        left = np.asarray(
-            factor.solve(values - np.asarray(here.model.predict(self.posterior.mean)))
-        )
+        off = values - np.asarray(here.model.predict(self.posterior.mean))
+        left = np.asarray(factor.solve(off))
         pull = np.bincount(layout.time, values * left, layout.n_times)
         most = np.bincount(layout.time, values * np.asarray(factor.solve(values)), layout.n_times)
         worst = np.argsort(-(pull**2) / np.where(most > 0.0, most, np.inf))[:TIMES]
         worst = worst[most[worst] > 0.0]
         columns = np.where(layout.time[:, None] == worst, values[:, None], 0.0)
         curvature = np.diagonal(_gram(here, self.posterior, columns))
-        whole = self.chi2(self.vector(np.eye(len(self.grid))))
+        whole = weights(np.eye(len(self.grid)))
         for time, bend in zip(worst.tolist(), curvature.tolist(), strict=True):
             if not bend > 0.0:  # the others predict nothing
                 continue
-            missing = -pull[time] / bend
+            factor = 1.0 - pull[time] / bend
             when = here.data.observation.times[time].isot[:19]
-            yield (
-                whole - pull[time] ** 2 / bend,
-                DataMistake(
-                    f"all products at {when} are {_number(1.0 / (1.0 + missing), bend**-0.5)} "
-                    "times what the other times predict",
-                    "leave this time out",
-                    (1.0 + missing) * np.eye(len(self.grid)),
-                    time=time,
-                ),
+            wrong = (
+                f"all products at {when} are {_number(1.0 / factor, bend**-0.5)} times what the "
+                "other times predict"
             )
+            right = weights(factor * np.eye(len(self.grid)))
+            mistake = DataMistake(wrong, "leave this time out", right, time)
+            yield self.chi2(whole) - pull[time] ** 2 / bend, mistake
 
 
 def _number(factor: float, std: float) -> str:
@@ -524,17 +454,6 @@ class Proposal:
         """How far chi^2 is from what is expected."""
         return abs(self.chi2.chi2 - self.chi2.degrees)
 
-    def row(self) -> dict[str, object]:
-        """Of summary.json."""
-        return {
-            "mistake": self.words,
-            "remedy": self.remedy,
-            "chi2": self.chi2.chi2,
-            "chi2_expected": self.chi2.degrees,
-            "p": self.chi2.p,
-            "fits": self.fits,
-        }
-
 
 @dataclass(frozen=True)
 class Diagnosis:
@@ -559,10 +478,6 @@ class Diagnosis:
     def fits(self) -> bool:
         """Whether the data fit as they are."""
         return not stands_out(self.chi2.p, 1)
-
-    def rows(self) -> list[dict[str, object]]:
-        """The proposals as rows of a table."""
-        return [proposal.row() for proposal in self.proposals]
 
     def sentences(self) -> list[str]:
         """The proposals in words, one each; or that there are none."""

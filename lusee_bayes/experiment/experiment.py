@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from lusee_bayes.core.arrays import Draws, on_device, on_host
+from lusee_bayes.core.arrays import Draws, on_device
 from lusee_bayes.core.checks import Described
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
@@ -26,10 +26,11 @@ from lusee_bayes.experiment.model import model_to_sample, radiometer, simulate
 from lusee_bayes.experiment.rounds import Inference, rebuilds, settled, with_learned_prior
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import Setup, set_up
-from lusee_bayes.instrument.instrument import Instrument
+from lusee_bayes.instrument.coupling import Instrument
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.plausibility import require_plausible
 from lusee_bayes.linear.information import Information
+from lusee_bayes.linear.linear_gaussian import Solution
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.priors.learning import Learned, draws_with_parameters
 from lusee_bayes.sky.sky_source import SkySource
@@ -58,8 +59,8 @@ class Experiment(Described):
         Of flight data: the times that did not fit and are left out; None for other data.
     around : Around or None
         What N was built around when the prior was learned, in rounds; None for the data alone.
-    information : Information or None
-        What the data say of the sky, where the prior was learned from it.
+    solution : Solution or None
+        Of the data under the prior before them, where the prior was learned from it.
     """
 
     setup: Setup
@@ -68,7 +69,7 @@ class Experiment(Described):
     learned: Learned | None = None
     fitting: Fitting | None = None
     around: Around | None = None
-    information: Information | None = None
+    solution: Solution | None = None
 
     def description(self) -> tuple[str, ...]:
         scenario = self.scenario
@@ -81,6 +82,12 @@ class Experiment(Described):
     def scenario(self) -> Scenario:
         """What the experiment was built of."""
         return self.setup.scenario
+
+
+GAIN_ERRORS = (
+    "The gains may be off by errors that are known (flight.gain_std, or the gain table's own) and "
+    "not part of N: give noise.gain_table={}."
+)
 
 
 def build(
@@ -133,43 +140,19 @@ def observed(
     Parameters and errors are those of :func:`build`, but that no prior has to settle.
     """
     stages = stages or Stages()
-    if data is None:
-        return simulated(scenario, stages)
-    data = data.with_truth_up_to(scenario.lmax)
+    data = None if data is None else data.with_truth_up_to(scenario.lmax)
     setup = set_up(scenario, data, stages)
+    if data is None:
+        with stages("noise"):
+            return Experiment(setup, simulate(setup))
     std = np.sqrt(np.asarray(radiometer(setup).diagonal()))
-    doubts = (*require_plausible(data, setup.signal, std), *_about_gains(scenario, data))
-    found = Experiment(setup, data, doubts)
-    for doubt in found.doubts:
+    doubts = list(require_plausible(data, setup.signal, std))
+    gains_known = data.calibration is not None and data.calibration.gain_names
+    if gains_known and scenario.noise.gain_table is None:
+        doubts.append(GAIN_ERRORS)
+    for doubt in doubts:
         stages.say(f"  doubtful: {doubt}")
-    return found
-
-
-def _about_gains(scenario: Scenario, data: Visibilities) -> tuple[str, ...]:
-    """Say that errors of the gains are known and not part of N, if so."""
-    known = data.calibration is not None and data.calibration.gain_names
-    if not known or scenario.noise.gain_table is not None:
-        return ()
-    return (
-        "The gains may be off by errors that are known (flight.gain_std, or the gain table's own) "
-        "and not part of N: give noise.gain_table={}.",
-    )
-
-
-def simulated(scenario: Scenario, stages: Stages | None = None) -> Experiment:
-    """Simulate the data of a scenario; what its prior could learn of them is left out.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        Of one frequency.
-    stages : Stages, optional
-        Told what is being done.
-    """
-    stages = stages or Stages()
-    setup = set_up(scenario, None, stages)
-    with stages("noise"):
-        return Experiment(setup, simulate(setup))
+    return Experiment(setup, data, tuple(doubts))
 
 
 def _fitting(experiment: Experiment, stages: Stages) -> Experiment:
@@ -180,10 +163,10 @@ def _fitting(experiment: Experiment, stages: Stages) -> Experiment:
     with stages("times that do not fit"):
         found = fitting(experiment.setup, data, section.false_alarm, stages)
         setup, kept = without(experiment.setup, data, found.flagged)
-    remarks = (found.remark,) if found.remark else ()
-    for remark in remarks:
-        stages.say(f"  {remark}")
-    doubts = (*experiment.doubts, *remarks)
+    doubts = experiment.doubts
+    if found.remark:
+        stages.say(f"  {found.remark}")
+        doubts = (*doubts, found.remark)
     return replace(experiment, setup=setup, data=kept, doubts=doubts, fitting=found)
 
 
@@ -196,7 +179,7 @@ def _learned(
         setup, learned, around, known = with_learned_prior(
             experiment.setup, experiment.data, earlier
         )
-    return replace(experiment, setup=setup, learned=learned, around=around, information=known)
+    return replace(experiment, setup=setup, learned=learned, around=around, solution=known)
 
 
 def with_truth(experiment: Experiment) -> Experiment:
@@ -242,7 +225,7 @@ def infer(experiment: Experiment) -> Inference:
     InputError
         As :func:`.settled`.
     """
-    return settled(experiment.setup, experiment.data, experiment.around, experiment.information)
+    return settled(experiment.setup, experiment.data, experiment.around, experiment.solution)
 
 
 def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
@@ -267,7 +250,12 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
 
     def instrument() -> Instrument:
         require_free(BeamErrors)
-        return embedded_instrument(setup)
+        if experiment.scenario.beam.is_file:
+            raise InputError(
+                "the program asks for the embedded antennas, which beam.file replaces; leave out "
+                "beam.file"
+            )
+        return setup.prepared
 
     @cache
     def around() -> Around:
@@ -286,16 +274,6 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
         "log_normal": lambda: on_device(log_normal.prior(setup.sky.frequency_mhz, setup.sky.lmax)),
         "layout": lambda: data.layout,
     }
-
-
-def embedded_instrument(setup: Setup) -> Instrument:
-    """The embedded antennas, prepared. InputError where the beams are those of a file."""
-    if setup.scenario.beam.is_file:
-        raise InputError(
-            "the program asks for the embedded antennas, which beam.file replaces; leave out "
-            "beam.file"
-        )
-    return setup.prepared
 
 
 # what the seed is folded with for posterior draws
@@ -333,7 +311,7 @@ def posterior_draws(
     if learned is not None and learned.fits:
         family = experiment.setup.family
         return draws_with_parameters(family, learned, information(), key, n)
-    return np.asarray(on_host(posterior).sample(key, n))
+    return posterior.sample(key, n)
 
 
 def doubts(experiment: Experiment, inference: Inference) -> tuple[str, ...]:

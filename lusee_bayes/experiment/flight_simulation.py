@@ -14,11 +14,10 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from lusee_bayes.core.arrays import Grid
 from lusee_bayes.core.engine import in_threads, processors
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment.flight_data import gain_table_of, per_kelvin_of
+from lusee_bayes.experiment.data_files import gain_table_of, per_kelvin_of
 from lusee_bayes.experiment.instrument_sections import FlightSection, FlightSimulatedSection
 from lusee_bayes.experiment.model import true_signal, true_values
 from lusee_bayes.experiment.scenario import Scenario
@@ -29,13 +28,7 @@ from lusee_bayes.flight.gain_model import GainModel, draw_gains, synthetic_gains
 from lusee_bayes.flight.session import ADC_HIGH, ADC_LOW, FRAME_S, PORTS, BinOrigin, channel_mhz
 from lusee_bayes.flight.session_files import SessionRows
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.products import (
-    CONVENTIONS,
-    DataLayout,
-    all_products,
-    to_matrix,
-    to_real,
-)
+from lusee_bayes.instrument.products import CONVENTIONS, DataLayout, ports, to_matrix, to_real
 from lusee_bayes.instrument.times import Windows
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.noise.radiometer import sample_covariances
@@ -128,8 +121,8 @@ class FlightSimulation:
         session : slice
             Of :attr:`sessions`.
         """
-        made = self.disturbances
-        level, saturated = made.level[session], made.saturated[session, None]
+        level = self.disturbances.level[session]
+        saturated = self.disturbances.saturated[session, None]
         n = len(level)
         rms = np.vectorize(ADC_RMS.__getitem__, otypes=[np.float64])(level)
         peak = np.rint(ADC_PEAK * rms).astype(np.int64)
@@ -167,9 +160,9 @@ class FlightSimulation:
         """
         level = self.disturbances.level
         changes = np.flatnonzero((level[1:] != level[:-1]).any(axis=1)) + 1
-        ends = sorted({*range(session.start, session.stop, BLOCK), session.stop, *changes.tolist()})
-        ends = [end for end in ends if session.start <= end <= session.stop]
-        blocks = [slice(a, b) for a, b in pairwise(ends)]
+        changes = changes[(changes > session.start) & (changes < session.stop)]
+        ends = {*range(session.start, session.stop, BLOCK), session.stop, *changes.tolist()}
+        blocks = [slice(a, b) for a, b in pairwise(sorted(ends))]
         together = 2 * processors()
         for k in range(0, len(blocks), together):
             yield from in_threads(self._block, blocks[k : k + together])
@@ -197,22 +190,20 @@ class FlightSimulation:
     @cached_property
     def _slices(self) -> dict[str, Int[np.ndarray, " products"]]:
         """Bit slices for each state of the gains."""
-        first, at = slice(0, 1), self._telemetry(slice(0, 1))
+        first = slice(0, 1)
+        spectra, telemetry = self.spectra(first), self._telemetry(first)
         states = {"".join(one) for one in np.unique(self.disturbances.level, axis=0)}
-        return {
-            levels: synthesis.bit_slices(self._counting(levels)(self.spectra(first), at))
-            for levels in states
-        }
+        counts = {levels: self._counting(levels)(spectra, telemetry) for levels in states}
+        return {levels: synthesis.bit_slices(one) for levels, one in counts.items()}
 
     def _counting(self, levels: str) -> synthesis.Counting:
         sign = int(CONVENTIONS[flight_of(self.scenario).convention])
         return synthesis.Counting(self.gains, levels, self.section.navgf, self.origin, sign)
 
     def _telemetry(self, rows: slice) -> Mapping[str, Float[np.ndarray, " _"]]:
-        hours = self.observation.hours[rows]
+        turns = 2.0 * np.pi * self.observation.hours[rows]
         return {
-            name: mean + amplitude * np.sin(2.0 * np.pi * hours / period_h)
-            for name, (mean, amplitude, period_h) in TELEMETRY.items()
+            name: m + a * np.sin(turns / period_h) for name, (m, a, period_h) in TELEMETRY.items()
         }
 
 
@@ -240,38 +231,36 @@ def simulate_flight(scenario: Scenario, stages: Stages | None = None) -> FlightS
     stages = stages or Stages()
     flight = flight_of(scenario)
     section = flight.simulated or FlightSimulatedSection()
-    _require_own_noise(scenario, flight)
-    step_s = scenario.observation.step_s
+    radiometer, step_s = scenario.noise.radiometer, scenario.observation.step_s
+    if radiometer.duty_cycle != 1.0 or radiometer.log_factor_std is not None:
+        raise InputError(
+            "the noise of spectra is that of the frames they average; leave out duty_cycle and "
+            "log_factor_std of noise.radiometer"
+        )
+    if flight.filter_taps:
+        raise InputError(
+            "channels of simulated spectra share no noise, and flight.filter_taps says that they "
+            "do; set it to 0"
+        )
     if step_s < FRAME_S:
         raise InputError(
             f"a frame of the spectrometer lasts {FRAME_S:g} s, and a sample {step_s:g} s; use a "
             "longer observation.step_s (42 s in flight)"
         )
     shift = int(np.floor(np.log2(step_s / FRAME_S * (1.0 + 1e-12))))
-    table, gains, errors = _drawn_gains(scenario, flight)
+    gains = _drawn_gains(scenario, flight)
     observation = spectra_observation(scenario, FRAME_S * 2.0**shift)
     origin = flight.bin_origin or "centre"
-    nodes = np.array(scenario.frequencies_mhz or (scenario.frequency_mhz,))
-    hours = observation.hours
+    hours = observation.hours - observation.hours[0]
     made = synthesis.Disturbances.drawn(
-        hours - hours[0], step_s, origin, scenario.seed, **section.disturbances()
+        hours, step_s, origin, scenario.seed, **section.disturbances()
     )
-    visibilities = true_visibilities(scenario, observation, stages)
+    nodes = np.array(scenario.frequencies_mhz or (scenario.frequency_mhz,))
+    sky = nodes, true_visibilities(scenario, observation, stages)
     mjd = float(np.floor(observation.times[0].mjd)) - CLOCK_DAYS
     clock = Clock("the simulation", MJD_ZERO, mjd, "utc", CLOCK_S)
     return FlightSimulation(
-        scenario,
-        section,
-        observation,
-        nodes,
-        visibilities,
-        made,
-        table,
-        gains,
-        errors,
-        origin,
-        shift,
-        clock,
+        scenario, section, observation, *sky, made, *gains, origin, shift, clock
     )
 
 
@@ -338,35 +327,25 @@ def true_visibilities(
     """
     scenario = scenario.with_section("noise", gain_table=None)
     channels = scenario.channels() or (scenario,)
-    scales = [_volts_per_kelvin(channel) for channel in channels]
+    first, second, _ = ports()
+    scales = [np.sqrt(v[first] * v[second]) for v in map(per_kelvin_of, channels)]
     # what changes with time has to be drawn for all of it
-    noise = scenario.noise
+    noise, n = scenario.noise, observation.n_times
     whole = noise.gain is not None or noise.pointing is not None or bool(scenario.sources.list)
-    n = observation.n_times
     piece = n if whole else PIECE
-    found = np.empty((len(channels), len(all_products()), n))
+    found = np.empty((len(channels), len(first), n))
     with stages.progress("visibilities", n * len(channels)) as done:
         for start in range(0, n, piece):
-            here = np.zeros(n, dtype=bool)
-            here[start : start + piece] = True
+            here = np.arange(n) // piece == start // piece
             part = observation.select(here)
             for number, (channel, scale) in enumerate(zip(channels, scales, strict=True)):
-                found[number, :, here] = (scale[:, None] * _true_kelvin(channel, part)).T
+                nothing = np.zeros(len(first) * part.n_times)
+                layout = DataLayout(len(first), part.n_times)
+                setup = set_up(channel, Visibilities(nothing, layout, part, channel.frequency_mhz))
+                kelvin = np.asarray(true_signal(setup, true_values(setup)))
+                found[number, :, here] = (scale[:, None] * kelvin).T
                 done(start * len(channels) + (number + 1) * part.n_times)
     return found
-
-
-def _volts_per_kelvin(scenario: Scenario) -> Float[np.ndarray, " products"]:
-    """V^2/Hz for 1 K in each product."""
-    per_kelvin = per_kelvin_of(scenario)
-    return np.sqrt([per_kelvin[p.i] * per_kelvin[p.j] for p in all_products()])
-
-
-def _true_kelvin(scenario: Scenario, observation: Observation) -> Grid:
-    layout = DataLayout(len(all_products()), observation.n_times)
-    nothing = Visibilities(np.zeros(layout.size), layout, observation, scenario.frequency_mhz)
-    setup = set_up(scenario, nothing)
-    return np.asarray(true_signal(setup, true_values(setup)))
 
 
 def _drawn_gains(
@@ -393,17 +372,3 @@ def _drawn_gains(
     generator = np.random.default_rng([scenario.seed, 3])
     gains, errors = draw_gains(table, flight.gain_std, generator)
     return table, gains, errors
-
-
-def _require_own_noise(scenario: Scenario, flight: FlightSection) -> None:
-    radiometer = scenario.noise.radiometer
-    if radiometer.duty_cycle != 1.0 or radiometer.log_factor_std is not None:
-        raise InputError(
-            "the noise of spectra is that of the frames they average; leave out duty_cycle and "
-            "log_factor_std of noise.radiometer"
-        )
-    if flight.filter_taps:
-        raise InputError(
-            "channels of simulated spectra share no noise, and flight.filter_taps says that they "
-            "do; set it to 0"
-        )

@@ -2,8 +2,8 @@
 
 They say where, when and with which turntable angles; the beams, and what is connected to their
 ports; and how sessions of the spectrometer become visibilities, or are simulated. Beams and
-receivers have one section for each kind, told by ``model``. A new kind of beams is a class here,
-with its :class:`BeamSource`, and its name in ``BEAM_SECTIONS``.
+receivers have one section for each kind, told by ``model``. A new kind of beams is a subclass of
+:class:`BaseBeamSection` here, with its :class:`BeamSource`, and its name in ``BEAM_SECTIONS``.
 """
 
 from __future__ import annotations
@@ -26,24 +26,17 @@ from lusee_bayes.core.section import (
     kinds_of,
     one_of,
     requires,
-    without_other_kinds,
 )
 from lusee_bayes.instrument.beams.fields import Interpolation
 from lusee_bayes.instrument.beams.luseepy_files import read_response, read_scalar_beam
-from lusee_bayes.instrument.beams.monopoles import (
-    CapacitorReceiver,
-    JFETReceiver,
-    Monopoles,
-    Receiver,
-    Regolith,
-    read_receiver,
-)
-from lusee_bayes.instrument.beams.sampled import SampledFileBeams, beam_kind, read_sampled
+from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith
+from lusee_bayes.instrument.beams.sampled import beam_kind, read_sampled
 from lusee_bayes.instrument.beams.source import (
     BeamSource,
-    EmbeddedBeams,
-    ResponseBeams,
-    ScalarFileBeams,
+    CapacitorReceiver,
+    JFETReceiver,
+    Receiver,
+    read_receiver,
 )
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import N_ANTENNAS
@@ -138,14 +131,15 @@ class ObservationSection(Section):
 
     def observation(self) -> Observation:
         """Site, times and turntable angles."""
-        return _observation(self, self._intervals())
+        return _observation(self, self._intervals)
 
     def n_samples(self) -> int:
         """Count the samples, those by day among them."""
         if self.schedule is None:
             return sum(int(run.cycles * CYCLE_DAYS * 86400.0 // self.step_s) for run in self.runs)
-        return sum(interval.n_samples(self.step_s) for interval in self._intervals())
+        return sum(interval.n_samples(self.step_s) for interval in self._intervals)
 
+    @property
     def _intervals(self) -> tuple[Interval, ...]:
         return () if self.schedule is None else read_schedule(self.schedule)
 
@@ -263,7 +257,17 @@ ReceiverSection = Annotated[
 ]
 
 
-class MonopoleBeamSection(Section):
+class BaseBeamSection(Section):
+    """What all beams have in common."""
+
+    def of_file(self, file: str) -> Any:
+        """The section of beams of a file that are turned as these are."""
+        kind = BEAM_SECTIONS[beam_kind(file)]
+        shared = set(kind.model_fields) - {"model", "file"}
+        return kind(file=file, **self.model_dump(include=shared))
+
+
+class MonopoleBeamSection(BaseBeamSection):
     """The embedded antennas: four monopoles over layered regolith.
 
     Attributes
@@ -300,39 +304,57 @@ class MonopoleBeamSection(Section):
 
     def source(self) -> BeamSource:
         """The antennas."""
-        ground = ("surface_permittivity", "deep_permittivity", "loss_tangent")
-        regolith = Regolith(*(getattr(self, name) for name in ground))
-        return EmbeddedBeams(
-            Monopoles(regolith=regolith, **self.model_dump(exclude={"model", *ground}))
-        )
+        ground = {"surface_permittivity", "deep_permittivity", "loss_tangent"}
+        regolith = Regolith(**self.model_dump(include=ground))
+        return Monopoles(regolith=regolith, **self.model_dump(exclude={"model", *ground}))
 
 
-class _FileSection(Section):
-    """What the beams of luseepy's files have in common."""
+class _FileSection(BaseBeamSection):
+    """What the beams of files have in common.
+
+    Attributes
+    ----------
+    turntable_offset_deg : float
+        Added to every angle of the turntable, from East towards North.
+    """
 
     is_file: ClassVar[bool] = True
 
     file: str
     turntable_offset_deg: Angle = 0.0
-    quadrature: Literal["exact", "luseepy"] = "exact"
-    interpolation: Interpolation = "linear"
-    moon_temperature_k: Temperature = 0.0
 
     @property
     def label(self) -> str:
         """Which antennas, for the header of a file."""
         return Path(self.file).name
 
-    def turned(self) -> dict[str, Any]:
-        """What is said of every file, as its beams take it."""
+
+class _LuseepySection(_FileSection):
+    """What the beams of luseepy's files have in common.
+
+    Attributes
+    ----------
+    quadrature : {"exact", "luseepy"}
+        ``luseepy`` is luseepy's own rule, for data that luseepy has made.
+    moon_temperature_k : float
+        Temperature of the ground, which adds its own radiation.
+    """
+
+    quadrature: Literal["exact", "luseepy"] = "exact"
+    interpolation: Interpolation = "linear"
+    moon_temperature_k: Temperature = 0.0
+
+    def asked(self) -> dict[str, Any]:
+        """What is asked of every file, as its beams take it."""
         return {
+            "interpolation": self.interpolation,
             "turntable_offset_deg": self.turntable_offset_deg,
             "luseepy_quadrature": self.quadrature == "luseepy",
             "moon_k": self.moon_temperature_k,
         }
 
 
-class ScalarBeamSection(_FileSection):
+class ScalarBeamSection(_LuseepySection):
     """A scalar beam of luseepy: the pattern of one arm, used once for every port.
 
     Attributes
@@ -344,15 +366,9 @@ class ScalarBeamSection(_FileSection):
         added.
     taper : bool
         Fade out towards the horizon as luseepy does.
-    turntable_offset_deg : float
-        Added to every angle of the turntable, from East towards North.
-    quadrature : {"exact", "luseepy"}
-        ``luseepy`` is luseepy's own rule, for data that luseepy has made.
     interpolation : {"linear", "spline"}
         Between the file's frequencies: products of fields linearly as in luseepy, or fields by
         cubic splines.
-    moon_temperature_k : float
-        Temperature of the ground, which adds its own radiation.
     """
 
     model: Literal["luseepy"] = "luseepy"
@@ -366,15 +382,11 @@ class ScalarBeamSection(_FileSection):
 
     def source(self) -> BeamSource:
         """The pattern of the file, turned to every angle."""
-        return ScalarFileBeams(
-            replace(read_scalar_beam(self.file), interpolation=self.interpolation),
-            taper=self.taper,
-            rotations_deg=self.rotations_deg,
-            **self.turned(),
-        )
+        beam, ports = read_scalar_beam(self.file), self.rotations_deg
+        return replace(beam, taper=self.taper, rotations_deg=ports, **self.asked())
 
 
-class ResponseSection(_FileSection):
+class ResponseSection(_LuseepySection):
     """A four-port response of luseepy: coupled antennas with their receivers.
 
     Attributes
@@ -387,12 +399,6 @@ class ResponseSection(_FileSection):
     receiver : {"jfet", "capacitor", "file", "open"} or mapping, optional
         What is connected to the ports, with its parameters. If it is left out, that of the data
         where their file holds it, else luseepy's preamplifiers.
-    turntable_offset_deg : float
-        Added to every angle of the turntable, from East towards North.
-    quadrature : {"exact", "luseepy"}
-        ``luseepy`` is luseepy's own rule, for data that luseepy has made.
-    moon_temperature_k : float
-        Temperature of the ground, which adds its own radiation.
     antenna_temperature_k : float
         Temperature of the antennas' losses, which add their own radiation.
     """
@@ -404,41 +410,25 @@ class ResponseSection(_FileSection):
 
     def source(self) -> BeamSource:
         """The response of the file, with its receivers."""
-        response = replace(read_response(self.file), interpolation=self.interpolation)
-        if self.receiver is not None:
-            response = replace(response, receiver=self.receiver.receiver())
-        return ResponseBeams(
-            response,
-            receiver_said=self.receiver is not None,
-            antenna_k=self.antenna_temperature_k,
-            **self.turned(),
-        )
+        asked = self.asked() | {"antenna_k": self.antenna_temperature_k}
+        if self.receiver is None:
+            return replace(read_response(self.file), receiver_said=False, **asked)
+        return replace(read_response(self.file), receiver=self.receiver.receiver(), **asked)
 
 
-class SampledBeamSection(Section):
+class SampledBeamSection(_FileSection):
     """Beams of one's own in directions: fields of antennas or beams of products, or a UVBeam.
 
     Attributes
     ----------
     file : str
         netCDF or FITS of :func:`lusee_bayes.sampled_beams`, or pyuvdata's beam FITS.
-    turntable_offset_deg : float
-        By how much the turntable is further round than it says, from East towards North.
     normalise : bool
         Scale the beams so that autos integrate to one on average; by default as the file says.
     """
 
-    is_file: ClassVar[bool] = True
-
     model: Literal["sampled"] = "sampled"
-    file: str
-    turntable_offset_deg: float = 0.0
     normalise: bool | None = None
-
-    @property
-    def label(self) -> str:
-        """Which antennas, for the header of a file."""
-        return Path(self.file).name
 
     @property
     def n_ports(self) -> int:
@@ -447,7 +437,8 @@ class SampledBeamSection(Section):
 
     def source(self) -> BeamSource:
         """The beams of the file."""
-        return SampledFileBeams(read_sampled(self.file), self.turntable_offset_deg, self.normalise)
+        asked = {"turntable_offset_deg": self.turntable_offset_deg, "normalise": self.normalise}
+        return replace(read_sampled(self.file), **asked)
 
 
 BEAM_SECTIONS = kinds_of(
@@ -455,11 +446,8 @@ BEAM_SECTIONS = kinds_of(
 )
 
 
-def _one_kind(value: Any) -> Any:
+def _complete_beam(tree: dict[str, Any]) -> None:
     """``beam: {file: ...}`` without a model, as scenarios had it before: the file tells."""
-    if not isinstance(value, dict):
-        return value
-    tree = dict(value)
     default = MonopoleBeamSection.model_fields["model"].default
     tree["model"] = tree.get("model") or default
     file = tree.get("file")
@@ -478,21 +466,9 @@ def _one_kind(value: Any) -> Any:
             f"{file} is a scalar beam, which knows of no losses; leave out "
             "beam.antenna_temperature_k"
         )
-    return without_other_kinds(tree, BEAM_SECTIONS, strict=True)
 
 
-BeamSection = one_of(BEAM_SECTIONS, _one_kind)
-
-
-def section_of_file(file: str, like: Any) -> Any:
-    """The section of another beam file, turned as the beams of ``like`` are."""
-    kind = BEAM_SECTIONS[beam_kind(file)]
-    shared = {
-        name: value
-        for name, value in like.model_dump().items()
-        if name in kind.model_fields and name not in ("model", "file")
-    }
-    return kind(file=file, **shared)
+BeamSection = one_of(BEAM_SECTIONS, _complete_beam)
 
 
 Share = Annotated[float, Field(ge=0, le=0.5)]

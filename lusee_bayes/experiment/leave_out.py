@@ -19,21 +19,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Grid, GridFlags, TimeFlags, Vector, on_host
+from lusee_bayes.core.arrays import Grid, GridFlags, Vector
+from lusee_bayes.core.checks import counted
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.lazy import special
 from lusee_bayes.core.progress import Stages, memory_limit
 from lusee_bayes.core.section import is_modelled
-from lusee_bayes.experiment.rounds import model_about, rebuilds, settled
-from lusee_bayes.experiment.setup import Setup, set_up
-from lusee_bayes.instrument.products import DataLayout, all_products
+from lusee_bayes.experiment.model import full_model
+from lusee_bayes.experiment.rounds import rebuilds, settled
+from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.instrument.products import DataLayout, auto_indices, ports
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.left_out import DataGroup, LeftOut, Missed, groups_of
 from lusee_bayes.judge.split import WIDER, Split
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
-from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.context import Around, Setup
 
 # of the times beyond the limit, those within this share of the worst go in one round
 WORST = 0.3
@@ -132,11 +132,8 @@ class GroupsCompared:
             None if none stands out.
         """
         present = self.left_out.present
-        groups = [
-            group
-            for group in groups_of(self.data)
-            if group.kind in ("product", "day") and (group.data & present).any()
-        ]
+        groups = [one for one in groups_of(self.data) if one.kind in ("product", "day")]
+        groups = [one for one in groups if (one.data & present).any()]
         chi2, degrees = _judged(self.left_out.each([group.data for group in groups]))
         out = _tail(chi2, degrees) < false_alarm
         if not out.any():
@@ -170,36 +167,27 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Groups
     data : Visibilities
         Measured.
     settle : bool
-        In as many rounds as N needs to be built around what the data say; else in one, and under
-        a prior whose width asks nothing of them: for what stands out in any case.
+        In as many rounds as N needs to be built around what the data say, if they settle; else in
+        one, and under a prior whose width asks nothing of them: for what stands out in any case.
 
     Returns
     -------
-    Comparison or None
+    GroupsCompared or None
         None where it would need too much memory.
     """
     # where N couples times, it is a matrix of all data, too
     n, across = data.layout.size, is_modelled(setup.scenario.noise.gain)
     if 8.0 * ARRAYS * n * (setup.prior.size + n * across) > MOST_MEMORY * memory_limit():
         return None
-    if settle:
-        model, posterior = on_host(_conditioned(setup, data))
-        wide = Split.of(posterior, 0.0, model.n_data).wide
-        prior = wide.prior
-    else:
-        model, wide = on_host(model_about(setup, Around(data))[0]), None
-        prior = model.prior.widened(WIDER)
-    left_out = LeftOut(replace(model, prior=prior), data, posterior=wide)
-    return GroupsCompared.of(left_out, data)
-
-
-def _conditioned(setup: Setup, data: Visibilities) -> tuple[LinearGaussian, Posterior]:
-    """Model and posterior, in as many rounds as N needs; in one where bad data let none settle."""
-    found = settled(setup, data)
-    if found.unsettled:
-        model, _ = model_about(setup, Around(data))
-        return model, model.condition(data.data)
-    return found.model, found.posterior
+    found = settled(setup, data) if settle else None
+    if found is not None and not found.unsettled:
+        model, posterior = found.model, found.posterior
+    else:  # bad data may let no rounds settle
+        model = full_model(setup, Around(data))
+        posterior = model.condition(data.data).posterior if settle else None
+    wide = None if posterior is None else Split.of(posterior, 0.0, data.layout.size).wide
+    prior = model.prior.widened(WIDER) if wide is None else wide.prior
+    return GroupsCompared.of(LeftOut(replace(model, prior=prior), data, posterior=wide), data)
 
 
 MAX_ROUNDS = 10
@@ -210,6 +198,10 @@ NOT_JUDGED = (
 TOO_MANY = (
     "More than a fifth of the data are inconsistent with the rest, so that none was flagged: "
     "noise, gains or beams are not those of the data."
+)
+KEPT = (
+    "Product {port}{port}R is inconsistent with the rest and was kept, since the noise of port "
+    "{port}'s other products depends on it: check the gain and the receiver of port {port}."
 )
 # where all rules together would take more, it is not the data but noise, gains or beams
 MOST = 0.2
@@ -230,8 +222,6 @@ class Fitting:
     Attributes
     ----------
     flagged : (products, times) array of bool
-    rounds : int
-        How often the data were fitted.
     chi2 : (times,) array
         Of each time against its prediction by the others, before anything was flagged, over its
         mean; 0 where the others do not tell.
@@ -248,18 +238,12 @@ class Fitting:
     """
 
     flagged: GridFlags
-    rounds: int
     chi2: Float[np.ndarray, " times"]
     remark: str = ""
     groups: tuple[DataGroup, ...] = ()
     share: float = 0.0
     refused: bool = False
     cause: str = ""
-
-    @property
-    def times(self) -> TimeFlags:
-        """Times of which every product is flagged."""
-        return self.flagged.all(axis=0)
 
 
 def fitting(
@@ -284,31 +268,29 @@ def fitting(
         With nothing flagged, and a remark, if so many data do not fit that it is not them; with
         what does not fit at a higher lmax either, if others do.
     """
-    stages = stages or Stages()
-    found = _found(setup, data, false_alarm, stages)
+    rules, stages = _Rules.of(data, false_alarm), stages or Stages()
+    found = _found(setup, data, rules, stages)
     if not found.refused and found.share <= SMALL:
         return found
-    return _at_higher_lmax(setup, data, false_alarm, found, stages)
+    return _at_higher_lmax(setup, data, rules, found, stages)
 
 
-def _found(setup: Setup, data: Visibilities, false_alarm: float, stages: Stages) -> Fitting:
+def _found(setup: Setup, data: Visibilities, rules: _Rules, stages: Stages) -> Fitting:
     """Find data that do not fit at the setup's lmax."""
-    limits = _Limits.of(data)
-    gone = nothing = np.zeros(limits.present.shape, dtype=bool)
+    gone = nothing = np.zeros(rules.present.shape, dtype=bool)
     before, groups, kept = np.zeros(nothing.shape[1]), (), ""
-    first = 0 if rebuilds(setup) else 1
-    for rounds in range(first, MAX_ROUNDS + 1):
-        start = compared(*without(setup, data, gone), settle=rounds > 0)
+    start = compared(setup, data, settle=False) if rebuilds(setup) else None
+    if start is not None:
+        least = OBVIOUS * max(float(np.median(start.size)), 1.0)
+        _, obvious = rules.one_by_one(start, gone, nothing, least)
+        gone = nothing if obvious is None else obvious
+        before = np.where(gone.any(axis=0), start.ratio, 0.0)
+    for rounds in range(1, MAX_ROUNDS + 1):
+        start = compared(*without(setup, data, gone))
         if start is None:
-            return Fitting(nothing, rounds, before, NOT_JUDGED)
+            return Fitting(nothing, before, NOT_JUDGED)
         before = np.where(before > 0.0, before, start.ratio)
-        if not rounds:
-            least = OBVIOUS * max(float(np.median(start.size)), 1.0)
-            _, obvious = _one_by_one(start, gone, nothing, limits, false_alarm, least)
-            gone = nothing if obvious is None else obvious
-            before = np.where(gone.any(axis=0), before, 0.0)
-            continue
-        more, auto = _eliminated(start, gone, limits, false_alarm)
+        more, auto = rules.eliminated(start, gone)
         kept = kept or auto
         if more is None:
             break
@@ -316,18 +298,17 @@ def _found(setup: Setup, data: Visibilities, false_alarm: float, stages: Stages)
         gone, groups = gone | flagged, (*groups, *blamed)
         stages.say(
             f"  times compared at lmax={setup.scenario.lmax}, round {rounds}: "
-            f"{limits.count(gone)} of {data.layout.size} values flagged"
+            f"{rules.count(gone)} of {data.layout.size} values flagged"
         )
         if not flagged.any():
-            share = limits.count(gone) / data.layout.size
-            remark = " ".join(filter(None, [_remark(gone, groups, share, false_alarm), kept]))
-            return Fitting(gone, rounds, before, remark, groups, share)
-    remark = f"{TOO_MANY} {kept}".strip()
-    return Fitting(nothing, rounds, before, remark, refused=True)
+            share = rules.count(gone) / data.layout.size
+            remark = " ".join(filter(None, [rules.remark(gone, groups, share), kept]))
+            return Fitting(gone, before, remark, groups, share)
+    return Fitting(nothing, before, f"{TOO_MANY} {kept}".strip(), refused=True)
 
 
 def _at_higher_lmax(
-    setup: Setup, data: Visibilities, false_alarm: float, found: Fitting, stages: Stages
+    setup: Setup, data: Visibilities, rules: _Rules, found: Fitting, stages: Stages
 ) -> Fitting:
     """What does not fit at a higher lmax, where others do; ``found`` where none is any better.
 
@@ -344,46 +325,46 @@ def _at_higher_lmax(
         except InputError:
             # no beams or sky up to there
             break
-        again, before = _found(wider, data, false_alarm, stages), size
+        again, before = _found(wider, data, rules, stages), size
         size = float(np.median(again.chi2))
         if again.remark == NOT_JUDGED:
             break
+        too_small = f"lmax={lmax} is too small for these data"
         if not again.refused and again.share <= enough:
-            cause = (
-                f"lmax={lmax} is too small for these data: lmax={higher} fits; use --set "
-                f"lmax={higher}"
-            )
+            cause = f"{too_small}: lmax={higher} fits; use --set lmax={higher}"
             remark = f"{cause}. {again.remark}".strip()
             return replace(again, chi2=found.chi2, remark=remark, cause=cause)
         if not 0.0 < size < FALLS * before:
             break
         cause = (
-            f"lmax={lmax} is too small for these data, so that none was flagged: with "
-            f"lmax={higher} chi^2 of the times is {size / float(np.median(found.chi2)):.2g} of "
-            f"what it is now; use --set lmax={higher} or more"
+            f"{too_small}, so that none was flagged: with lmax={higher} chi^2 of the times is "
+            f"{size / float(np.median(found.chi2)):.2g} of what it is now; use --set "
+            f"lmax={higher} or more"
         )
         nothing = np.zeros_like(found.flagged)
-        best = Fitting(nothing, found.rounds, found.chi2, f"{cause}.", refused=True, cause=cause)
+        best = Fitting(nothing, found.chi2, f"{cause}.", refused=True, cause=cause)
     return best
 
 
 @dataclass(frozen=True)
-class _Limits:
-    """How much may go.
+class _Rules:
+    """What goes, and how much may.
 
-    present : (products, times) array of bool; values : number of values
+    false_alarm : as in :func:`fitting`; present : (products, times) array of bool; values : how
+    many may go
     """
 
+    false_alarm: float
     present: GridFlags
     values: float
 
     @classmethod
-    def of(cls, data: Visibilities) -> _Limits:
+    def of(cls, data: Visibilities, false_alarm: float) -> _Rules:
         """A fifth of what there was, less what the rules of the reduction took."""
         n = data.layout.size
         lost = 0.0 if data.calibration is None else data.calibration.lost
-        left = (MOST - lost) / (1.0 - lost) * n
-        return cls(np.asarray(data.layout.present), max(left, SMALL * n, data.layout.n_products))
+        left = max((MOST - lost) / (1.0 - lost) * n, SMALL * n, data.layout.n_products)
+        return cls(false_alarm, np.asarray(data.layout.present), left)
 
     def count(self, gone: GridFlags) -> int:
         """Number of values that there were."""
@@ -397,94 +378,73 @@ class _Limits:
 
     def auto_alone(self, gone: GridFlags) -> int | None:
         """The port whose auto goes while crosses stay."""
-        products = all_products(round(np.sqrt(len(gone))))
-        left = (self.present & ~gone).any(axis=1)
-        for number, product in enumerate(products):
-            if product.i == product.j and self.present[number].any() and not left[number]:
-                port = product.i
-                crosses = [k for k, p in enumerate(products) if port in (p.i, p.j)]
-                if left[crosses].any():
-                    return port
+        n_ports = round(np.sqrt(len(gone)))
+        first, second, _ = ports(n_ports)
+        used, left = self.present.any(axis=1), (self.present & ~gone).any(axis=1)
+        for port, auto in enumerate(auto_indices(n_ports)):
+            crosses = (first == port) | (second == port)
+            if used[auto] and not left[auto] and left[crosses].any():
+                return port
         return None
 
+    def one_by_one(
+        self, start: GroupsCompared, gone: GridFlags, groups: GridFlags, least: float
+    ) -> tuple[GroupsCompared, GridFlags | None]:
+        """Flag the worst first; ``groups`` are among what is ``gone`` from ``start``.
 
-def _one_by_one(
-    start: GroupsCompared,
-    gone: GridFlags,
-    groups: GridFlags,
-    limits: _Limits,
-    false_alarm: float,
-    least: float,
-) -> tuple[GroupsCompared, GridFlags | None]:
-    """Flag times and values, the worst first; ``groups`` are among what is ``gone`` from ``start``.
+        Of what is left, and what goes in all; or of what was left before that was too much, and
+        None.
+        """
+        found = start
+        while (worst := found.worst(self.false_alarm, least)).any():
+            gone = gone | worst
+            if self.broken(gone, groups):
+                return found, None
+            found = found.without(worst)
+        return found, gone
 
-    Of what is left, and what goes in all; or of what was left before that was too much, and None.
-    """
-    found = start
-    while (worst := found.worst(false_alarm, least)).any():
-        gone = gone | worst
-        if limits.broken(gone, groups):
-            return found, None
-        found = found.without(worst)
-    return found, gone
+    def eliminated(
+        self, start: GroupsCompared, gone: GridFlags
+    ) -> tuple[tuple[GridFlags, tuple[DataGroup, ...]] | None, str]:
+        """What goes under one model, besides what is ``gone``; None if that is too much.
 
+        And what is to be said of an auto that cannot go.
+        """
+        base, groups, first = start, (), None
+        of_groups = np.zeros_like(gone)
+        while True:
+            whole, least = gone | of_groups, FAR * float(base.size.max())
+            found, flagged = self.one_by_one(base, whole, whole, least)
+            result = None if flagged is None else (flagged & ~gone, groups)
+            first = first if groups else result
+            if result is not None and found.worst(self.false_alarm).any():
+                return result, ""
+            group = found.worst_group(self.false_alarm)
+            if group is None:
+                # where no few groups are to blame: what was found without blaming any
+                return result or first, ""
+            of_groups = of_groups | group.data
+            if self.broken(gone | of_groups, gone | of_groups):
+                port = self.auto_alone(gone | of_groups)
+                return first, "" if port is None else KEPT.format(port=port)
+            groups, base = (*groups, group), start.without(of_groups)
 
-def _eliminated(
-    start: GroupsCompared, gone: GridFlags, limits: _Limits, false_alarm: float
-) -> tuple[tuple[GridFlags, tuple[DataGroup, ...]] | None, str]:
-    """What goes under one model, besides what is ``gone``; None if that is too much.
-
-    And what is to be said of an auto that cannot go.
-    """
-    base, groups, first = start, (), None
-    of_groups = np.zeros_like(gone)
-    while True:
-        least = FAR * float(base.size.max())
-        found, flagged = _one_by_one(
-            base, gone | of_groups, gone | of_groups, limits, false_alarm, least
+    def remark(self, gone: GridFlags, groups: tuple[DataGroup, ...], share: float) -> str:
+        """What goes, in words."""
+        single = gone & ~np.any([np.zeros_like(gone), *(group.data for group in groups)], axis=0)
+        whole = gone.all(axis=0) & single.any(axis=0)
+        n_single, n = int(single[:, ~whole].sum()), gone.shape[1]
+        parts = [f"{group.kind} {group.name}" for group in groups]
+        parts += [f"{int(whole.sum())} of {n} times"] if whole.any() else []
+        parts += [counted(n_single, "single value")] if n_single else []
+        if not parts:
+            return ""
+        named = " and ".join(filter(None, [", ".join(parts[:-1]), parts[-1]]))
+        return (
+            f"Flagged as inconsistent with the remaining data: {named}, {share:.2g} of the values. "
+            f"Noise alone would cause {2.0 * n * self.false_alarm:.2g} such flags of times or "
+            "values."
         )
-        result = None if flagged is None else (flagged & ~gone, groups)
-        first = first if groups else result
-        if result is not None and found.worst(false_alarm).any():
-            return result, ""
-        group = found.worst_group(false_alarm)
-        if group is None:
-            # where no few groups are to blame: what was found without blaming any
-            return result or first, ""
-        of_groups = of_groups | group.data
-        if limits.broken(gone | of_groups, gone | of_groups):
-            return first, _about_auto(limits.auto_alone(gone | of_groups))
-        groups, base = (*groups, group), start.without(of_groups)
-
-
-def _about_auto(port: int | None) -> str:
-    if port is None:
-        return ""
-    return (
-        f"Product {port}{port}R is inconsistent with the rest and was kept, since the noise of "
-        f"port {port}'s other products depends on it: check the gain and the receiver of port "
-        f"{port}."
-    )
-
-
-def _remark(
-    gone: GridFlags, groups: tuple[DataGroup, ...], share: float, false_alarm: float
-) -> str:
-    single = gone & ~np.any([np.zeros_like(gone), *(group.data for group in groups)], axis=0)
-    whole = gone.all(axis=0) & single.any(axis=0)
-    n_single, n = int(single[:, ~whole].sum()), gone.shape[1]
-    parts = [f"{group.kind} {group.name}" for group in groups]
-    if whole.any():
-        parts.append(f"{int(whole.sum())} of {n} times")
-    if n_single:
-        parts.append(f"{n_single} single value" + ("s" if n_single > 1 else ""))
-    if not parts:
-        return ""
-    named = f"{', '.join(parts[:-1])} and {parts[-1]}" if len(parts) > 1 else parts[0]
-    return (
-        f"Flagged as inconsistent with the remaining data: {named}, {share:.2g} of the values. "
-        f"Noise alone would cause {2.0 * n * false_alarm:.2g} such flags of times or values."
-    )
 
 
 def without(setup: Setup, data: Visibilities, gone: GridFlags) -> tuple[Setup, Visibilities]:

@@ -13,13 +13,12 @@ import jax
 import numpy as np
 
 from lusee_bayes.core.arrays import Grid, on_device, on_host
-from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.instrument.coupling import DenseCoupling
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import Covariance
 from lusee_bayes.noise.radiometer import radiometer_noise
-from lusee_bayes.systematics.context import Around, Context, noise_visibilities
+from lusee_bayes.systematics.context import Around, Setup, noise_visibilities
 from lusee_bayes.systematics.noise_level import radiometer_about
 from lusee_bayes.systematics.registered import SYSTEMATICS
 from lusee_bayes.systematics.systematic import Expanded, Marginalised, Systematic, Truth, present
@@ -42,7 +41,7 @@ def radiometer(setup: Setup, around: Around | None = None) -> Covariance:
     return radiometer_noise(visibilities, setup.layout, **given, **common)
 
 
-def moved(setup: Setup, values: Truth | None) -> Context:
+def moved(setup: Setup, values: Truth | None) -> Setup:
     """The setup with the instrument that has these values, its signal with it."""
     for cls, section in present(SYSTEMATICS, setup.scenario) if values else ():
         setup = cls.moved(section, setup, values)
@@ -67,7 +66,7 @@ def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, S
 def base_model(setup: Setup, around: Around | None = None) -> LinearGaussian:
     """d = A m + background + n with radiometer noise only."""
     noise = radiometer(setup, around)
-    return on_device(LinearGaussian(setup.coupling, setup.prior, noise, setup.offset))
+    return LinearGaussian(setup.coupling, setup.prior, noise, setup.offset)
 
 
 def in_noise(
@@ -85,7 +84,7 @@ def in_noise(
     around : Around
     """
     sky = np.asarray(setup.sky.modes if around.sky is None else around.sky)
-    model, held, gains = on_host(model), [], []
+    held, gains = [], []
     for systematic in found:
         if systematic.first_order:
             held.append(on_host(Expanded.about(systematic, model, sky, around.values)))
@@ -114,7 +113,9 @@ def model_about(
     """
     model, found = base_model(setup, around), (s for _, s in systematics(setup, around))
     held = in_noise(setup, model, (s for s in found if scaling or not s.scales_sky), around)
-    return marginalised(model, held), tuple(held)
+    for systematic in held:
+        model = systematic.marginalised(model)
+    return model, tuple(held)
 
 
 def full_model(setup: Setup, around: Around | None = None) -> LinearGaussian:
@@ -125,13 +126,6 @@ def full_model(setup: Setup, around: Around | None = None) -> LinearGaussian:
     return model_about(setup, around or Around())[0]
 
 
-def marginalised(model: LinearGaussian, held: Iterable[Marginalised]) -> LinearGaussian:
-    """The model with these systematics (:func:`in_noise`) in N."""
-    for systematic in held:
-        model = systematic.marginalised(model)
-    return model
-
-
 def model_to_sample(
     setup: Setup, around: Around
 ) -> tuple[LinearGaussian, tuple[Systematic | Marginalised, ...]]:
@@ -140,7 +134,7 @@ def model_to_sample(
     Systematics that are marginalised come in their place in the order, as sampled ones without a
     site.
     """
-    model, later = base_model(setup, around), []
+    model, later = on_device(base_model(setup, around)), []
     found = systematics(setup, around)
     held = in_noise(setup, model, (systematic for _, systematic in found), around)
     for (treatment, systematic), as_noise in zip(found, held, strict=True):

@@ -18,22 +18,20 @@ from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.section import is_modelled
 from lusee_bayes.experiment.model import full_model, model_about, moved
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.sky_sections import (
     IsotropicPriorSection,
     LocalScalesPriorSection,
     PriorSection,
 )
-from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.measures import data_freedom
-from lusee_bayes.linear.amplitudes import template_amplitudes, weighted_residual
+from lusee_bayes.linear.amplitudes import Amplitudes, template_amplitudes
 from lusee_bayes.linear.information import Information, integrated_out
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import FromInformation, LinearGaussian, Solution
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.priors.families import PriorFamily
 from lusee_bayes.priors.learning import Learned, learn_whatever_fits
-from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.gain_drifts import gains_about
 from lusee_bayes.systematics.noise_level import radiometer_about
 from lusee_bayes.systematics.pointing_offsets import PointingOffsets
@@ -51,32 +49,37 @@ SHORTEST = 0.125
 
 @dataclass(frozen=True)
 class Inference:
-    """A model, the posterior given the data, and how it was found.
+    """A model solved for the data, and how it was found.
 
     Attributes
     ----------
-    model : LinearGaussian
-        With every systematic in N that the scenario does not ignore.
+    solution : Solution
+        Of the model with every systematic in N that the scenario does not ignore.
     systematics : tuple of Marginalised
         Those, as they are in N.
-    posterior : Posterior
     rounds : int
         How often N was built.
     around : Around
         What it was built around.
     unsettled : str
         A sentence if the map still moves from round to round; empty otherwise.
-    information : Information or None
-        What the data say of the sky, where the posterior was found through it.
     """
 
-    model: LinearGaussian
+    solution: Solution
     systematics: tuple[Marginalised, ...]
-    posterior: Posterior | None
     rounds: int
     around: Around
     unsettled: str = ""
-    information: Information | None = None
+
+    @property
+    def model(self) -> LinearGaussian:
+        """Of the solution."""
+        return self.solution.model
+
+    @property
+    def posterior(self) -> Posterior:
+        """Of the solution."""
+        return self.solution.posterior
 
     @property
     def expanded(self) -> tuple[Expanded, ...]:
@@ -93,12 +96,13 @@ class Inference:
         """Of clock and pointing, as they are in N."""
         return next((s for s in self.expanded if isinstance(s.systematic, PointingOffsets)), None)
 
+    def amplitudes(self, part: Expanded) -> Amplitudes:
+        """What these data tell of a systematic's unknowns, in prior standard deviations."""
+        return template_amplitudes(self.solution, part.columns)
+
 
 def settled(
-    setup: Setup,
-    data: Visibilities,
-    start: Around | None = None,
-    known: Information | None = None,
+    setup: Setup, data: Visibilities, start: Around | None = None, known: Solution | None = None
 ) -> Inference:
     """Condition the model on data, in as many rounds as its N needs.
 
@@ -114,8 +118,8 @@ def settled(
     data : Visibilities
     start : Around, optional
         What N is built around in the first round; by default the data.
-    known : Information, optional
-        Of the data, where N is built once.
+    known : Solution, optional
+        Of the data under another prior, where N is built once.
 
     Returns
     -------
@@ -130,12 +134,8 @@ def settled(
 
     def conditioned(around: Around, rounds: int) -> Inference:
         model, found = model_about(setup, around)
-        information, posterior = None, None
-        if model.is_structured:
-            information, posterior = model.inform(data.data, known)
-        else:
-            posterior = model.condition(data.data)
-        return Inference(model, found, posterior, rounds, around, information=information)
+        solution = model.condition(data.data) if known is None else known.under(model.prior)
+        return Inference(solution, found, rounds, around)
 
     found = conditioned(start or _start(setup, data), 1)
     if not rebuilds(setup):
@@ -148,8 +148,7 @@ def settled(
             return found
     moves = float(found.posterior.rms_shift_from(before.posterior))
     remedies = [cls.remedy for cls in first_order(setup)]
-    if rebuilds_gains(setup):
-        remedies.append("noise.gain.visibilities=model")
+    remedies += ["noise.gain.visibilities=model"] * rebuilds_gains(setup)
     unsettled = (
         f"The map still moves by {moves:.2g} of its standard deviations after {MAX_ROUNDS} rounds "
         "of rebuilding N around it"
@@ -184,7 +183,7 @@ class _Step:
 def _around(setup: Setup, found: Inference, step: _Step) -> tuple[Around, _Step]:
     """What the terms of N are built around next, given a posterior, and the step there."""
     visibilities, sky, values = None, None, None
-    solved = weighted_residual(found.model, found.posterior, found.around.data.data)
+    solved = found.solution.weighted_residual()
     if found.moving:
         ways = [s.expected + s.columns.T @ solved - s.centre for s in found.expanded]
         far = zip(found.expanded, ways, strict=True)
@@ -193,7 +192,7 @@ def _around(setup: Setup, found: Inference, step: _Step) -> tuple[Around, _Step]
         for s, way in zip(found.expanded, ways, strict=True):
             values |= s.systematic.in_units(s.centre + step.size * way)
         here = np.asarray(setup.sky.modes if found.around.sky is None else found.around.sky)
-        sky = here + step.size * (np.asarray(found.posterior.mean) - here)
+        sky = here + step.size * (found.posterior.mean - here)
     if rebuilds_visibilities(setup):
         visibilities = prediction(moved(setup, values), found, solved)
     return replace(found.around, visibilities=visibilities, sky=sky, values=values), step
@@ -210,35 +209,12 @@ def _start(setup: Setup, data: Visibilities) -> Around:
     if not any(cls.scales_sky for cls in first_order(setup)):
         return around
     model, held = model_about(setup, around, scaling=False)
-    columns = [np.zeros((model.n_data, 0))]
-    columns += [s.columns for s in held if isinstance(s, Expanded)]
-    posterior = model.condition(data.data)
-    freedom = data_freedom(model, posterior, np.concatenate(columns, axis=1))
-    sky = np.asarray(posterior.mean) if setup.measured else None
+    columns = [s.columns for s in held if isinstance(s, Expanded)]
+    solution = model.condition(data.data)
+    nothing = np.zeros((model.n_data, 0))
+    freedom = data_freedom(solution, np.concatenate([nothing, *columns], axis=1))
+    sky = solution.posterior.mean if setup.measured else None
     return Around(data, sky=sky, freedom=freedom)
-
-
-def offset_posterior(
-    found: Inference,
-) -> tuple[dict[str, float], Float[np.ndarray, "offsets offsets"]]:
-    """Mean of every offset of clock and pointing by name, and their covariance.
-
-    Parameters
-    ----------
-    found : Inference
-        Of its data alone, with offsets.
-
-    Returns
-    -------
-    mean : dict of float
-        In the units that the names end with.
-    covariance : (offsets, offsets) array
-        In these units.
-    """
-    offsets, data = found.offsets, found.around.data.data
-    told = template_amplitudes(found.model, found.posterior, data, offsets.columns)
-    stds = offsets.systematic.stds
-    return offsets.systematic.in_units(told.mean), told.covariance * np.outer(stds, stds)
 
 
 def rebuilds(setup: Setup) -> bool:
@@ -276,14 +252,12 @@ def prediction(setup: Setup, found: Inference, solved: DataVector) -> Grid:
     solved : (data,) array
         N^-1 (d - A m), of the mean map.
     """
-    complete = CouplingMatrix.build(setup.beams, setup.pointing)
-    difference_of_skies = found.posterior.mean - setup.sky.modes
+    mean = replace(setup.sky, modes=found.posterior.mean)
     besides = np.zeros(len(solved))
-    for expanded in found.expanded:
-        if not expanded.systematic.changes_coupling:
-            besides = besides + expanded.columns @ (expanded.columns.T @ solved)
-    grid = complete.layout.scatter(complete @ difference_of_skies)
-    return setup.signal + grid + setup.layout.scatter(besides)
+    for part in found.expanded:
+        if not part.changes_coupling:
+            besides = besides + part.columns @ (part.columns.T @ solved)
+    return setup.under(mean).signal + setup.layout.scatter(besides)
 
 
 # the map and its prior are found together when the map moves by less than this, rms; a step of
@@ -295,7 +269,7 @@ COARSE_LMAX = 24
 
 def with_learned_prior(
     setup: Setup, data: Visibilities, earlier: Information | None = None
-) -> tuple[Setup, Learned, Around | None, Information | None]:
+) -> tuple[Setup, Learned, Around | None, Solution | None]:
     """Learn the prior from data.
 
     Systematics are in N as far as they are marginalised. Where N is built around what the data
@@ -318,19 +292,18 @@ def with_learned_prior(
         How it was learned.
     Around or None
         What N was built around in the last round; None where that is the data alone.
-    Information or None
-        Of these data, where N is built once.
+    Solution or None
+        Of these data under the prior before them, where N is built once.
     """
     if not rebuilds(setup):
-        information = about_sky(setup, data)
-        learned = learned_prior(setup, setup.family, _with_more(information, earlier))
-        return replace(setup, prior=learned.prior), learned, None, information
+        solution = about_sky(setup, data)
+        learned = learned_prior(setup, setup.family, _with_more(solution.information, earlier))
+        return replace(setup, prior=learned.prior), learned, None, solution
     learned, before, found = None, None, settled(setup, data)
     for _ in range(MAX_PRIOR_ROUNDS):
-        own = full_model(setup, found.around).inform(data.data)[0]
-        information = _with_more(own, earlier)
+        information = found.solution.information
         start = None if learned is None or not learned.settled else learned.parameters
-        learned = learned_prior(setup, setup.family, information, start)
+        learned = learned_prior(setup, setup.family, _with_more(information, earlier), start)
         setup = replace(setup, prior=learned.prior)
         before, found = found, settled(setup, data, found.around)
         moved = float(found.posterior.rms_shift_from(before.posterior))
@@ -339,13 +312,13 @@ def with_learned_prior(
     return setup, replace(learned, still_moves=moved), found.around, None
 
 
-def about_sky(setup: Setup, data: Visibilities) -> Information:
-    """What data say of the sky; only its reference sky depends on the setup's prior.
+def about_sky(setup: Setup, data: Visibilities) -> Solution:
+    """Solve for the sky under the setup's prior, through what data say of it.
 
     Where N is built around what data tell, it is about that of the prior before them.
     """
     around = settled(setup, data).around if rebuilds(setup) else Around(data)
-    return full_model(setup, around).inform(data.data)[0]
+    return full_model(setup, around).condition(data.data, FromInformation)
 
 
 def _with_more(information: Information, earlier: Information | None) -> Information:
@@ -418,11 +391,9 @@ def named_priors(
     for name in names:
         if name not in NAMED:
             raise InputError(f"--priors: no prior '{name}'; {nearest(name, NAMED)}")
-    if len(set(names)) < len(names):
-        raise InputError(f"--priors {','.join(names)}: give each prior once")
-    if len(names) < 2:
+    if len(names) < 2 or len(set(names)) < len(names):
         raise InputError(
-            f"--priors: {len(names)} given, and a comparison needs two or more of "
+            f"--priors {','.join(names)}: a comparison needs two or more different ones of "
             f"{', '.join(NAMED)}"
         )
     if OF_TRUE_SKY in names and not known_sky:
@@ -430,12 +401,9 @@ def named_priors(
             f"--priors: {OF_TRUE_SKY} takes C_ell of the scenario's sky, which nobody knows of "
             "measured data; leave it out, or give --truth if the data are of that sky"
         )
-    return {name: _section(NAMED[name], scenario.prior) for name in names}
-
-
-def _section(named: PriorSection, own: PriorSection) -> PriorSection:
-    """The scenario's own section if it is of the kind of a named one."""
-    if own.model != named.model:
-        return named
+    own, named = scenario.prior, {name: NAMED[name] for name in names}
     # isotropic priors differ in where C_ell comes from
-    return own if own.model != "isotropic" or own.origin == named.origin else named
+    return {
+        name: own if (own.model, own.origin) == (one.model, one.origin) else one
+        for name, one in named.items()
+    }

@@ -18,7 +18,7 @@ from pydantic import BaseModel, Field, ValidationError, field_validator, model_v
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.files import user_path
 from lusee_bayes.core.reading import as_yaml, parse_yaml, read_yaml
-from lusee_bayes.core.section import Frequency, Section, Seed, is_modelled, requires
+from lusee_bayes.core.section import Frequency, Section, Seed, is_modelled
 from lusee_bayes.experiment.instrument_sections import (
     BeamSection,
     FlightSection,
@@ -49,25 +49,19 @@ def apply_override(tree: dict[str, Any], override: str) -> None:
     *parents, last = key.split(".")
     node: Any = tree
     for parent in parents:
-        node = _step(node, parent, override)
-    value = parse_yaml(text, f"--set {override}: the value")
-    if isinstance(node, list):
-        node[_position(node, last, override)] = value
-    else:
-        node[last] = value
+        place = _place(node, parent, override)
+        if isinstance(node, dict) and node.get(place) is None:
+            node[place] = {}
+        node = node[place]
+        if not isinstance(node, dict | list):
+            raise InputError(f"--set {override}: '{parent}' holds a value, not a section")
+    node[_place(node, last, override)] = parse_yaml(text, f"--set {override}: the value")
 
 
-def _step(node: Any, key: str, override: str) -> Any:
-    if isinstance(node, list):
-        return node[_position(node, key, override)]
-    if node.get(key) is None:
-        node[key] = {}
-    if not isinstance(node[key], dict | list):
-        raise InputError(f"--set {override}: '{key}' holds a value, not a section")
-    return node[key]
-
-
-def _position(node: list[Any], key: str, override: str) -> int:
+def _place(node: dict[str, Any] | list[Any], key: str, override: str) -> int | str:
+    """Where an entry is: in a section its key, in a list its number."""
+    if isinstance(node, dict):
+        return key
     if not (key.isascii() and key.isdigit() and len(key) < 10) or int(key) >= len(node):
         raise InputError(f"--set {override}: '{key}' is not one of the entries 0..{len(node) - 1}")
     return int(key)
@@ -221,16 +215,6 @@ class Scenario(Section):
     output: OutputSection = OutputSection()
     seed: Seed = 1
 
-    @model_validator(mode="after")
-    def _frequencies_grow(self) -> Scenario:
-        if any(b <= a for a, b in pairwise(self.frequencies_mhz)):
-            raise ValueError("frequencies_mhz must grow from one to the next")
-        if self.joint and not self.frequencies_mhz:
-            raise ValueError("joint needs frequencies_mhz, the channels that share a posterior")
-        if self.joint:
-            self.spectral.require_channels(len(self.frequencies_mhz))
-        return self
-
     @field_validator("nside")
     @classmethod
     def _nside_is_healpix(cls, nside: int | None) -> int | None:
@@ -238,59 +222,50 @@ class Scenario(Section):
             raise ValueError("a power of two is expected, as HEALPix's ring maps have it")
         return nside
 
-    _sources_are_there_once = requires(
-        lambda scenario: not (scenario.sky.sources and scenario.sources.list),
-        "the embedded sky holds the catalogue's sources already; with sources.list of its own, set "
-        "sky.sources=false",
-    )
-
     @model_validator(mode="after")
-    def _files_have_no_parameters(self) -> Scenario:
-        error = self.noise.beam
-        if self.beam.is_file and error is not None and error.parameters:
+    def _sections_agree(self) -> Scenario:
+        many, own_sources = self.frequencies_mhz, self.sources.list
+        prior, error, pointing = self.prior, self.noise.beam, self.noise.pointing
+        parameters = error is not None and error.parameters
+        if any(b <= a for a, b in pairwise(many)):
+            raise ValueError("frequencies_mhz must grow from one to the next")
+        if self.joint and not many:
+            raise ValueError("joint needs frequencies_mhz, the channels that share a posterior")
+        if self.joint:
+            self.spectral.require_channels(len(many))
+        if self.sky.sources and own_sources:
+            raise ValueError(
+                "the embedded sky holds the catalogue's sources already; with sources.list of its "
+                "own, set sky.sources=false"
+            )
+        if self.beam.is_file and parameters:
             raise ValueError(
                 "noise.beam.parameters are those of the embedded antennas, which beam.file "
                 "replaces; use noise.beam.shift_mhz or noise.beam.file"
             )
-        from_file = self.beam.is_file or (error is not None and error.file is not None)
-        if from_file and self.sources.list:
+        if (self.beam.is_file or (error is not None and error.file is not None)) and own_sources:
             raise ValueError(
                 "sources.list needs the exact beams of the embedded antennas; leave out beam.file "
                 "and noise.beam.file, or the sources"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _prior_files_have_a_frequency(self) -> Scenario:
-        prior = self.prior
         if self.joint and prior.has_files:
             raise ValueError("joint takes the spectral prior; leave out the files of the prior")
-        if self.frequencies_mhz and prior.has_files and prior.file_frequency_mhz is None:
+        if many and prior.has_files and prior.file_frequency_mhz is None:
             raise ValueError(
                 "the files of the prior are of one frequency; with frequencies_mhz, say which in "
                 "prior.file_frequency_mhz"
             )
-        return self
-
-    _joint_channels_are_not_tied = requires(
-        lambda scenario: not (scenario.joint and scenario.ties_receivers),
-        "noise.receiver.smooth_octaves ties the receivers of channels that have a posterior each; "
-        "with joint, leave it out",
-    )
-
-    _one_makes_a = requires(
-        lambda scenario: (
-            not (
-                scenario.noise.pointing is not None
-                and scenario.noise.beam is not None
-                and scenario.noise.beam.parameters
-                and {scenario.noise.pointing.treatment, scenario.noise.beam.treatment}
-                == {"sampled"}
+        if self.joint and self.ties_receivers:
+            raise ValueError(
+                "noise.receiver.smooth_octaves ties the receivers of channels that have a "
+                "posterior each; with joint, leave it out"
             )
-        ),
-        "noise.pointing and the parameters of noise.beam cannot both be sampled: each of them "
-        "makes A anew; set the treatment of one to marginalised",
-    )
+        if pointing and parameters and pointing.treatment == error.treatment == "sampled":
+            raise ValueError(
+                "noise.pointing and the parameters of noise.beam cannot both be sampled: each of "
+                "them makes A anew; set the treatment of one to marginalised"
+            )
+        return self
 
     @property
     def ties_receivers(self) -> bool:

@@ -5,99 +5,25 @@ That is A, S, the sky, and what antennas and receivers add to every visibility, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment.instrument_sections import section_of_file
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.sky_sections import PriorSection
 from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ
 from lusee_bayes.instrument.beams.monopoles import Monopoles
-from lusee_bayes.instrument.beams.source import BeamSource
-from lusee_bayes.instrument.coupling import CouplingMatrix
-from lusee_bayes.instrument.instrument import Instrument
+from lusee_bayes.instrument.coupling import CouplingMatrix, Instrument
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import auto_indices
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.priors.families import PriorFamily
-from lusee_bayes.sky.prior import Prior
-from lusee_bayes.sky.sky_source import Sky
-from lusee_bayes.systematics.context import Context
+from lusee_bayes.systematics.context import Setup, prior_and_family
 from lusee_bayes.systematics.regolith import ground_per_kelvin
 from lusee_bayes.systematics.sources import expected_signal, source_responses
 
-
-def background_of(scenario: Scenario, source: BeamSource) -> Float[Array, " products"]:
-    """Visibilities without any sky: ground, antennas, and receivers with their mean noise; in K.
-
-    Parameters
-    ----------
-    scenario : Scenario
-    source : BeamSource
-        Its beams, behind the receivers of the data.
-
-    Raises
-    ------
-    InputError
-        If the scenario's receivers or ground need to know of the beams what these do not say.
-    """
-    background = np.array(source.background(scenario.frequency_mhz))
-    if scenario.noise.regolith is not None:
-        ground_per_kelvin(source, scenario.frequency_mhz)  # refuses what has no ground
-    if (receiver := scenario.noise.receiver) is not None:
-        autos = auto_indices(source.n_ports)
-        background[autos] += receiver.powers(source, scenario.frequency_mhz)
-    return background
-
-
 # two sites closer than that are one: 30 m
 SAME_SITE_DEG = 1e-3
-
-
-@dataclass(frozen=True)
-class Setup(Context):
-    """The pieces of d = A m + n that a scenario stands for.
-
-    Attributes
-    ----------
-    family : PriorFamily or None
-        Of which data choose the prior; None for a prior that is given.
-    """
-
-    scenario: Scenario
-    family: PriorFamily | None = None
-
-    def source_of_file(self, file: str) -> BeamSource:
-        return section_of_file(file, self.scenario.beam).source().behind(self.receiver)
-
-    def with_prior(self, section: PriorSection) -> Setup:
-        """Return the same with another prior, or family of priors.
-
-        Parameters
-        ----------
-        section : PriorSection
-            The scenario's section, in place of its own.
-        """
-        scenario = self.scenario.model_copy(update={"prior": section})
-        prior, family = prior_and_family(scenario, self.sky)
-        return replace(self, scenario=scenario, prior=prior, family=family)
-
-    def under(self, sky: Sky) -> Setup:
-        """Point the instrument at another sky; the prior stays that of the scenario.
-
-        Parameters
-        ----------
-        sky : Sky
-            Of the same frequency and lmax.
-        """
-        complete = CouplingMatrix.build(self.beams, self.pointing)
-        change = complete.layout.scatter(complete @ (sky.modes - self.sky.modes))
-        return replace(self, sky=sky, signal=self.signal + change)
 
 
 def set_up(
@@ -117,7 +43,8 @@ def set_up(
     ------
     InputError
         If the data are of another frequency, another site or other ports, or do not say what
-        their times are.
+        their times are, or the scenario's receivers or ground need to know of the beams what these
+        do not say.
     """
     stages = stages or Stages()
     if data is not None:
@@ -136,7 +63,12 @@ def set_up(
         receiver = None if data is None else data.receiver
         source = scenario.beam.source().behind(receiver)
         beams = source.beams(scenario.frequency_mhz, scenario.lmax)
-        background = background_of(scenario, source)
+        background = np.array(source.background(scenario.frequency_mhz))
+        if scenario.noise.regolith is not None:
+            ground_per_kelvin(source, scenario.frequency_mhz)  # refuses what has no ground
+        if (noise := scenario.noise.receiver) is not None:
+            autos = auto_indices(source.n_ports)
+            background[autos] += noise.powers(source, scenario.frequency_mhz)
         sources = scenario.sources.list
         responses = source_responses(sources, observation, source, scenario.frequency_mhz)
     if data is not None and data.layout.n_products != beams.n_products:
@@ -152,29 +84,9 @@ def set_up(
         antennas = Monopoles() if scenario.beam.is_file else source.monopoles
         instrument = Instrument(antennas, pointing, layout, scenario.frequency_mhz, scenario.lmax)
         coupling = replace(complete, layout=layout)
-    return Setup(
-        scenario,
-        observation,
-        sky,
-        source,
-        instrument,
-        beams,
-        coupling,
-        prior,
-        responses,
-        background,
-        signal,
-        receiver,
-        None if data is None else data.calibration,
-        data is not None,
-        family,
-    )
-
-
-def prior_and_family(scenario: Scenario, sky: Sky) -> tuple[Prior, PriorFamily | None]:
-    """The scenario's prior, or what is expected of it before there are data, and its family."""
-    family = scenario.prior.family(scenario.frequency_mhz, scenario.lmax)
-    return (scenario.prior.prior(sky) if family is None else family.expected()), family
+    pieces = observation, sky, source, instrument, beams, coupling, prior, responses, background
+    of_data = None if data is None else data.calibration, data is not None
+    return Setup(scenario, *pieces, signal, receiver, *of_data, family)
 
 
 def require_fitting(data: Visibilities, scenario: Scenario) -> None:

@@ -12,26 +12,23 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from lusee_bayes.core.section import (
-    Megahertz,
-    Positive,
-    Section,
-    Seed,
-    kinds_of,
-    one_of,
-    requires,
-    without_other_kinds,
-)
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.harmonics import n_modes
+from lusee_bayes.core.section import Megahertz, Positive, Section, Seed, kinds_of, one_of, requires
 from lusee_bayes.priors.families import IsotropicFamily, PriorFamily
 from lusee_bayes.priors.local_scales import embedded_local_scales
 from lusee_bayes.sampling.log_normal_prior import LogNormalPrior
-from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
-from lusee_bayes.sky.log_normal import LogNormalSky, deviation_spectrum
-from lusee_bayes.sky.positive_skies import FIELDS, FIELDS_OF
+from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, galactic_share
+from lusee_bayes.sky.positive_skies import (
+    FIELDS,
+    FIELDS_OF,
+    LogNormalSky,
+    PositiveSkies,
+    deviation_spectrum,
+)
 from lusee_bayes.sky.prior import HarmonicPrior, Prior, read_mean, read_spectrum
-from lusee_bayes.sky.sky_source import FileSource, GalaxySource, Sky, SkySource
+from lusee_bayes.sky.sky_source import EmbeddedTemplate, FileSource, GalaxySource, Sky, SkySource
 from lusee_bayes.sky.spectral_prior import SpectralPrior, check_components, require_names
-from lusee_bayes.sky.template import EmbeddedTemplate
 from lusee_bayes.systematics.prior_spectrum import SpectrumSection
 
 
@@ -87,20 +84,16 @@ class FileSkySection(Section):
 SKY_SECTIONS = kinds_of(GalaxySection, FileSkySection)
 
 
-def _kind_of_sky(value: Any) -> Any:
+def _complete_sky(tree: dict[str, Any]) -> None:
     """``sky: {file: ...}`` without a model, as scenarios had it before."""
-    if not isinstance(value, dict):
-        return value
-    tree = dict(value)
     default = GalaxySection.model_fields["model"].default
     tree["model"] = tree.get("model") or default
     if tree["model"] == default and tree.get("file") is not None:
         tree["model"] = "file"
-    # the sources of the embedded sky were said beside a file, too, where they had no effect
-    return without_other_kinds(tree, SKY_SECTIONS, strict=False)
 
 
-SkySection = one_of(SKY_SECTIONS, _kind_of_sky)
+# the sources of the embedded sky were said beside a file, too, where they had no effect
+SkySection = one_of(SKY_SECTIONS, _complete_sky, strict=False)
 
 
 # where C_ell comes from
@@ -228,21 +221,17 @@ class LocalScalesPriorSection(Section):
 PRIOR_SECTIONS = kinds_of(LocalScalesPriorSection, IsotropicPriorSection)
 
 
-def _kind_of_prior(value: Any) -> Any:
+def _complete_prior(tree: dict[str, Any]) -> None:
     """``prior`` without a model is that of its entries: isotropic, as scenarios had it before."""
-    if not isinstance(value, dict):
-        return value
-    tree = dict(value)
     if not tree.get("model"):
         told = set(tree) & set(IsotropicPriorSection.model_fields) - {"model"}
         default = IsotropicPriorSection if told else LocalScalesPriorSection
         tree["model"] = default.model_fields["model"].default
     if tree["model"] != "isotropic":  # another kind in the place of the paper's prior
         tree.pop("spectrum", None)
-    return without_other_kinds(tree, PRIOR_SECTIONS, strict=True)
 
 
-PriorSection = one_of(PRIOR_SECTIONS, _kind_of_prior)
+PriorSection = one_of(PRIOR_SECTIONS, _complete_prior)
 
 
 class LogNormalSection(Section):
@@ -284,6 +273,12 @@ class LogNormalSection(Section):
         template = EmbeddedTemplate(frequency_mhz)
         sky = LogNormalSky.of(template, spectrum, frequency_mhz, sources)
         return LogNormalPrior.of(sky, amplitude, tilt, widths)
+
+
+# highest ell of fields of the logarithm, over that of the map
+FINER = 1.5
+# most fields' modes: every round factorises their matrix
+MOST_UNKNOWNS = 10_000
 
 
 class SpectralSection(Section):
@@ -339,6 +334,54 @@ class SpectralSection(Section):
             check_components(self.components, n, self.residual)
         if self.model == "positive":
             require_names("field", FIELDS_OF, self.fields, FIELDS, n)
+
+    def lmax_of_fields(self, lmax: int) -> int:
+        """Choose the highest ell of the fields: 1.5 times that of the map, if they can be solved.
+
+        Structure that a map does not resolve still changes it where the sky is steep.
+
+        Parameters
+        ----------
+        lmax : int
+            Of the map.
+
+        Raises
+        ------
+        InputError
+            If fields of the map's own lmax are too many unknowns.
+        """
+        highest = int(np.sqrt(MOST_UNKNOWNS / len(self.fields))) - 1
+        if highest < lmax:
+            raise InputError(
+                f"positive joint skies of lmax {lmax} have {len(self.fields) * n_modes(lmax)} "
+                f"unknowns, more than the {MOST_UNKNOWNS} of one solution; use lmax={highest}, "
+                "fewer spectral.fields, or spectral.model=components"
+            )
+        return min(round(FINER * lmax), highest)
+
+    def positive_skies(self, frequencies_mhz: tuple[float, ...], lmax: int) -> PositiveSkies:
+        """The skies of channels up to an ell as functions of the fields.
+
+        Raises
+        ------
+        InputError
+            As :meth:`lmax_of_fields`.
+        """
+        sources = None
+        if self.sources:
+            sources = np.array(
+                [[s.modes(f, lmax) for s in BRIGHT_SOURCES] for f in frequencies_mhz]
+            )
+        return PositiveSkies.of(
+            np.array(frequencies_mhz),
+            [EmbeddedTemplate(f) for f in frequencies_mhz],
+            lmax,
+            self.fields,
+            **self.model_dump(include={"reference_mhz", "turnover_mhz"}),
+            sources=sources,
+            weight=galactic_share,
+            lmax_fields=self.lmax_of_fields(lmax),
+        )
 
     def n_maps(self, frequencies_mhz: tuple[float, ...]) -> int:
         """How many maps the skies of these channels are made of."""

@@ -13,7 +13,7 @@ Of clock and pointing, the offsets of the model are told, and which each day pre
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,23 +22,19 @@ import pandas as pd
 from jaxtyping import Float
 from scipy.linalg import block_diag
 
-from lusee_bayes.core.arrays import Modes, ModesMatrix, on_host
+from lusee_bayes.core.arrays import Modes, ModesMatrix
+from lusee_bayes.core.trees import quantity
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import base_model, radiometer, true_values
-from lusee_bayes.experiment.rounds import Inference, offset_posterior
+from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.instrument.pointing import offset_names
 from lusee_bayes.judge.measures import preferences
-from lusee_bayes.linear.amplitudes import (
-    Amplitudes,
-    AmplitudesOfSky,
-    amplitudes_of_sky,
-    template_amplitudes,
-)
+from lusee_bayes.linear.amplitudes import Amplitudes, AmplitudesOfSky, amplitudes_of_sky
 from lusee_bayes.sky.galaxy import kelvin_steradian
 from lusee_bayes.systematics.gain_table import COMMON_GAIN
 from lusee_bayes.systematics.pointing_offsets import PointingOffsets, shifted
 from lusee_bayes.systematics.sources import PointSources
-from lusee_bayes.systematics.systematic import Expanded
+from lusee_bayes.systematics.systematic import Expanded, Truth
 
 # a null direction is worth a sentence where it keeps more than that of the prior's variance, and a
 # part of it a word where its weight is that large
@@ -60,7 +56,7 @@ class NullDirection:
     """
 
     names: tuple[str, ...]
-    weights: Float[np.ndarray, " parts"]
+    weights: Float[np.ndarray, " parts"] = quantity("1", "in prior standard deviations")
     share: float
 
     @classmethod
@@ -97,7 +93,7 @@ class NullDirection:
         )
 
 
-# of a table of unknowns, in their order in a report; "true" stands behind them where it is known
+# of the table of a report, in their order; "true" stands behind them where it is known
 UNKNOWN_COLUMNS = ("unknown", "unit", "value", "std", "prior", "prior_std")
 # what the sky's monopole is called beside them
 SKY = "uniform sky"
@@ -149,15 +145,8 @@ class UnknownsReport:
 
     def lines(self) -> list[str]:
         """One line for every unknown, the sentence of the null direction, and the notes."""
-        lines = []
-        for row, told in zip(self.table.to_dict("records"), self.told, strict=True):
-            unit = f" {row['unit']}" if row["unit"] else ""
-            text = f"{row['unknown']}: {row['value']:.4g} +- {row['std']:.2g}{unit}"
-            if not told:
-                text += f", the prior's {row['prior_std']:.2g}: these data do not tell it"
-            lines.append(text)
-        sentence = self.null_sentence()
-        return [*lines, *([sentence] if sentence else []), *self.notes()]
+        lines = [_line(row["unknown"], row) for row in self.table.to_dict("records")]
+        return [*lines, *filter(None, [self.null_sentence()]), *self.notes()]
 
     def null_sentence(self) -> str:
         """What the data cannot tell; empty where they tell most of it, or it is not judged."""
@@ -167,13 +156,20 @@ class UnknownsReport:
         """Entry of summary.json."""
         rows, notes = self.table.to_dict("records"), self.notes()
         found: dict[str, Any] = {"rows": rows, "common_gain_std_share": self.common, "notes": notes}
-        if self.null is None:
-            return found
-        return found | {
-            "null_direction": dict(zip(self.null.names, self.null.weights.tolist(), strict=True)),
-            "null_share": self.null.share,
-            "null_sentence": self.null_sentence(),
-        }
+        if self.null is not None:
+            weights = zip(self.null.names, self.null.weights.tolist(), strict=True)
+            found |= {"null_direction": dict(weights), "null_share": self.null.share}
+            found["null_sentence"] = self.null_sentence()
+        return found
+
+
+def _line(name: str, row: Mapping[str, Any]) -> str:
+    """A row of a table in words."""
+    unit = f" {row['unit']}" if row.get("unit") else ""
+    text = f"{name}: {row['value']:.4g} +- {row['std']:.2g}{unit}"
+    if row["std"] > UNTOLD * row["prior_std"]:
+        text += f", the prior's {row['prior_std']:.2g}: these data do not tell it"
+    return text
 
 
 @dataclass(frozen=True)
@@ -203,7 +199,7 @@ class Unknowns:
     sky_std: float
 
     @classmethod
-    def of(cls, experiment: Experiment, found: Inference, reference: Modes) -> Unknowns | None:
+    def of(cls, experiment: Experiment, found: Inference) -> Unknowns | None:
         """Of data and their model; None if that has no such unknowns.
 
         Parameters
@@ -211,17 +207,22 @@ class Unknowns:
         experiment : Experiment
         found : Inference
             Of these data alone.
-        reference : (modes,) array
-            A sky near its posterior mean, in K.
         """
         listed = [s for s in found.expanded if not s.systematic.has_table]
         if not listed:
             return None
-        columns = np.concatenate([s.columns for s in listed], axis=1)
-        amplitudes = amplitudes_of_sky(found.model, reference, experiment.data.data, columns)
-        names, parts = _like_the_sky(listed)
-        sky_std = float(np.sqrt(np.asarray(found.model.prior.variance())[0]))
-        return cls(_rows(experiment, listed), amplitudes, names, parts, sky_std)
+        data, columns = experiment.data, np.concatenate([s.columns for s in listed], axis=1)
+        # of spectra, the sky behind them may be known, but not what the scenario would have drawn
+        known = data.truth is not None and data.calibration is None
+        rows = before_data(listed, true_values(experiment.setup) if known else None)
+        alike = [s.systematic.like_the_sky() for s in listed]
+        return cls(
+            tuple(rows.to_dict("records")),
+            amplitudes_of_sky(found.solution, columns),
+            tuple(name for names, _ in alike for name in names),
+            block_diag(*(parts for _, parts in alike)),
+            float(np.sqrt(np.asarray(found.model.prior.variance())[0])),
+        )
 
     def report(
         self, mean: Modes, covariance: ModesMatrix, *, joint: bool = False
@@ -235,10 +236,8 @@ class Unknowns:
         joint : bool
             It is also that of other data: no null direction is looked for.
         """
-        told = self.amplitudes.integrated(np.asarray(mean), np.asarray(covariance))
-        rows = pd.DataFrame(self.rows)
-        values = rows["expected"] + rows["prior_std"] * told.mean
-        rows = rows.assign(value=values, std=rows["prior_std"] * told.std)
+        told = self.amplitudes.integrated(mean, covariance)
+        rows = given_data(pd.DataFrame(self.rows), told)
         null = None if joint else self._null_direction(told, float(covariance[0, 0]))
         common = None
         if COMMON_GAIN in self.names:
@@ -250,60 +249,50 @@ class Unknowns:
     def _null_direction(self, told: Amplitudes, variance: float) -> NullDirection:
         mixed = self.parts @ told.with_sky[0] / self.sky_std
         inner = self.parts @ told.covariance @ self.parts.T
-        sky = np.array([[variance / self.sky_std**2]])
-        blocks = np.block([[sky, mixed[None]], [mixed[:, None], inner]])
+        sky = variance / self.sky_std**2
+        blocks = np.block([[np.full((1, 1), sky), mixed[None]], [mixed[:, None], inner]])
         return NullDirection.of((SKY, *self.names), blocks)
 
 
-def unknowns_report(experiment: Experiment, found: Inference) -> UnknownsReport | None:
-    """Work out what the data tell of receivers, ground and gain table.
+def before_data(parts: Sequence[Expanded], truth: Truth | None) -> pd.DataFrame:
+    """Unknowns of systematics as their priors have them.
 
     Parameters
     ----------
-    experiment : Experiment
-    found : Inference
-        Of these data alone.
+    parts : sequence of Expanded
+    truth : dict or None
+        True values of all systematics; None where they are not known.
 
     Returns
     -------
-    UnknownsReport or None
-        None if the model has no such unknowns.
+    DataFrame
+        A row for each: unknown, unit, prior, prior_std, ``expected`` (the prior mean in N) and, if
+        known, true.
     """
-    posterior = on_host(found.posterior)
-    unknowns = Unknowns.of(experiment, found, posterior.mean)
-    if unknowns is None:
-        return None
-    return unknowns.report(np.asarray(posterior.mean), np.asarray(posterior.covariance()))
+    tables = []
+    for part in parts:
+        own = part.systematic
+        columns = {
+            "expected": own.in_units(part.expected),
+            "prior": own.in_units(0.0 * own.stds),
+            "prior_std": dict(zip(own.names, own.stds.tolist(), strict=True)),
+            "true": {} if truth is None else own.true(truth),
+        }
+        table = pd.DataFrame({name: values for name, values in columns.items() if values})
+        tables.append(table.rename_axis("unknown").reset_index().assign(unit=own.unit))
+    return pd.concat(tables, ignore_index=True)
 
 
-def _rows(experiment: Experiment, listed: list[Expanded]) -> tuple[dict[str, Any], ...]:
-    """Those of :class:`Unknowns`."""
-    # of spectra, the sky behind them may be known, but not what the scenario would have drawn
-    simulated = experiment.data.truth is not None and experiment.data.calibration is None
-    truth = true_values(experiment.setup) if simulated else None
-    rows = []
-    for expanded in listed:
-        own = expanded.systematic
-        expected, prior = own.in_units(expanded.expected), own.in_units(0.0 * own.stds)
-        true = None if truth is None else own.true(truth)
-        for name, std in zip(own.names, own.stds.tolist(), strict=True):
-            row = {
-                "unknown": name,
-                "unit": own.unit,
-                "expected": expected[name],
-                "prior": prior[name],
-                "prior_std": std,
-            }
-            rows.append(row if true is None else row | {"true": true[name]})
-    return tuple(rows)
+def given_data(table: pd.DataFrame, told: Amplitudes) -> pd.DataFrame:
+    """The same with value and std, from amplitudes in prior standard deviations."""
+    value = table["expected"] + table["prior_std"] * told.mean
+    return table.assign(value=value, std=table["prior_std"] * told.std)
 
 
-def _like_the_sky(
-    listed: list[Expanded],
-) -> tuple[tuple[str, ...], Float[np.ndarray, "parts n"]]:
-    """Names and unit vectors of what may look like a uniform sky."""
-    found = [expanded.systematic.like_the_sky() for expanded in listed]
-    return tuple(name for names, _ in found for name in names), block_diag(*(p for _, p in found))
+def _alone(experiment: Experiment, found: Inference, part: Expanded) -> pd.DataFrame:
+    """The table of one systematic."""
+    truth = None if experiment.data.truth is None else true_values(experiment.setup)
+    return given_data(before_data([part], truth), found.amplitudes(part))
 
 
 # offsets that are tested whatever the scenario says, and how far apart the two sides of their
@@ -334,24 +323,17 @@ class PointingReport:
 
     def lines(self) -> list[str]:
         """One line for every offset."""
-        if self.offsets is None:
-            return []
         lines = []
-        for row in self.offsets.to_dict("records"):
-            text = f"{row['offset']}: {row['value']:.4g} +- {row['std']:.2g}"
-            if row["std"] > 0.9 * row["prior_std"]:
-                text += f", the prior's {row['prior_std']:.2g}: these data do not tell it"
+        for row in [] if self.offsets is None else self.offsets.to_dict("records"):
             left = row["beyond_first_order"]
-            text += f"; beyond first order {left:.1g} of the noise"
+            text = f"{_line(row['offset'], row)}; beyond first order {left:.1g} of the noise"
             if left > NEGLIGIBLE:
                 text += ", too much: set noise.pointing.treatment=sampled"
             lines.append(text)
         return lines
 
 
-def pointing_report(
-    experiment: Experiment, found: Inference, covariance: ModesMatrix
-) -> PointingReport:
+def pointing_report(experiment: Experiment, found: Inference) -> PointingReport:
     """Work out the offsets of the model, and those that the data prefer besides.
 
     Parameters
@@ -359,65 +341,51 @@ def pointing_report(
     experiment : Experiment
     found : Inference
         Of these data alone.
-    covariance : (modes, modes) array
-        Of the posterior, in K^2.
     """
-    sky = np.asarray(found.posterior.mean)
+    sky = found.posterior.mean
     table = None if found.offsets is None else _table(experiment, found, sky)
     values = {} if table is None else dict(zip(table["offset"], table["value"], strict=True))
-    return PointingReport(table, _preferred(experiment, found, covariance, sky, values))
+    return PointingReport(table, _preferred(experiment, found, sky, values))
 
 
 def _table(experiment: Experiment, found: Inference, sky: Modes) -> pd.DataFrame:
-    mean, covariance = offset_posterior(found)
-    std, prior = np.sqrt(np.diagonal(covariance)), found.offsets.systematic.stds
+    table = _alone(experiment, found, found.offsets)
     # where values and sky are those that the data tell, only what is left of the offsets counts
-    about = np.ones(len(prior)) if found.around.sky is None else std / prior
+    moves = found.around.sky is not None
+    about = np.asarray(table["std"] / table["prior_std"] if moves else np.ones(len(table)))
     noise = np.sqrt(np.asarray(radiometer(experiment.setup).diagonal()))
-    model = on_host(base_model(experiment.setup))
+    model = base_model(experiment.setup)
     left = found.offsets.systematic.beyond_first_order(model, sky, about)
-    beyond = [float(np.sqrt(np.mean((left[name] / noise) ** 2))) for name in mean]
-    parts = {"value": mean.values(), "std": std, "prior_std": prior, "beyond_first_order": beyond}
-    table = pd.DataFrame({"offset": list(mean), **parts})
-    if experiment.data.truth is None:
-        return table
-    truth = true_values(experiment.setup)
-    return table.assign(true=[truth[name] for name in mean])
+    beyond = [float(np.sqrt(np.mean((left[name] / noise) ** 2))) for name in table["unknown"]]
+    table = table.assign(beyond_first_order=beyond).rename(columns={"unknown": "offset"})
+    columns = ["offset", "value", "std", "prior_std", "beyond_first_order", "true"]
+    return table[[name for name in columns if name in table]]
 
 
 def _preferred(
-    experiment: Experiment,
-    found: Inference,
-    covariance: ModesMatrix,
-    sky: Modes,
-    values: dict[str, float],
+    experiment: Experiment, found: Inference, sky: Modes, values: dict[str, float]
 ) -> pd.DataFrame:
     setup, data = experiment.setup, experiment.data
     n_runs = setup.observation.n_runs
     steps = {name: step for kind, step in TESTED.items() for name in offset_names((kind,), n_runs)}
     centre = dict.fromkeys(steps, 0.0) | values
-    there = shifted(setup, centre)
-    offsets = PointingOffsets.of(there, steps, centre)
-    about = Expanded.about(offsets, on_host(base_model(setup)), sky, centre)
+    offsets = PointingOffsets.of(shifted(setup, centre), steps, centre)
+    about = Expanded.about(offsets, base_model(setup), sky, centre)
     per_unit = np.asarray(about.columns) / offsets.stds
     day = setup.observation.day
     length = -(-(int(day.max()) + 1) // MOST_STRETCHES)
-    stretches = np.unique(day // length)
+    stretches = [(-1, -1, np.ones(len(day), dtype=bool))]
+    for first in (np.unique(day // length) * length).tolist():
+        stretches.append((first, first + length - 1, day // length * length == first))
     rows, columns = [], []
-    for number, name in enumerate(steps):
-        template = per_unit[:, number]
-        rows.append({"offset": name, "first_day": -1, "last_day": -1})
-        columns.append(template)
-        for stretch in stretches.tolist():
-            column = np.where((day // length == stretch)[data.layout.time], template, 0.0)
-            if column.any():
-                first = stretch * length
-                rows.append({"offset": name, "first_day": first, "last_day": first + length - 1})
+    for name, template in zip(steps, per_unit.T, strict=True):
+        for first, last, times in stretches:
+            column = np.where(times[data.layout.time], template, 0.0)
+            if first < 0 or column.any():
+                rows.append((name, first, last))
                 columns.append(column)
-    told = preferences(
-        found.model, found.posterior, covariance, data.data, np.stack(columns, axis=1)
-    )
-    table = pd.DataFrame(rows)
+    told = preferences(found.solution, np.stack(columns, axis=1))
+    table = pd.DataFrame(rows, columns=["offset", "first_day", "last_day"])
     return table.assign(value=told.amplitude, std=told.std, chi2_gain=told.gain)
 
 
@@ -437,30 +405,20 @@ def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
         A row for each source, or block of it. ``above_horizon``: whether it is ever up; if not,
         its flux is known from the prior only.
     """
-    setup, data = experiment.setup, experiment.data
     held = next(s for s in inference.expanded if isinstance(s.systematic, PointSources))
-    own, found = held.systematic, (inference.model, inference.posterior, data.data)
-    amplitudes = template_amplitudes(*found, held.columns)
-    mean, std = own.means + own.stds * amplitudes.mean, own.stds * amplitudes.std
+    told = _alone(experiment, inference, held)
     jansky = 1.0 / kelvin_steradian(1.0, experiment.scenario.frequency_mhz)
-    listed = [(s, block) for s in own.sources for block in range(s.n_blocks)]
-    table = pd.DataFrame(
-        {
-            "source": [source.name for source, _ in listed],
-            "block": [block for _, block in listed],
-            "above_horizon": [bool(up) for s in own.sources for up in s.seen()],
-            "flux_jy": mean * jansky,
-            "std_jy": std * jansky,
-            "flux_k_sr": mean,
-            "std_k_sr": std,
-            "prior_jy": [float(source.mean) * jansky for source, _ in listed],
-            "prior_std_jy": [float(source.std) * jansky for source, _ in listed],
-        }
+    sources = held.systematic.sources
+    blocks = [(s.name, block, bool(up)) for s in sources for block, up in enumerate(s.seen())]
+    table = pd.DataFrame(blocks, columns=["source", "block", "above_horizon"]).assign(
+        flux_jy=told["value"] * jansky,
+        std_jy=told["std"] * jansky,
+        flux_k_sr=told["value"],
+        std_k_sr=told["std"],
+        prior_jy=told["prior"] * jansky,
+        prior_std_jy=told["prior_std"] * jansky,
     )
-    if data.truth is None:
-        return table
-    true = own.true(true_values(setup))
-    return table.assign(true_jy=np.array(list(true.values())) * jansky)
+    return table.assign(true_jy=told["true"] * jansky) if "true" in told else table
 
 
 def flux_lines(fluxes: pd.DataFrame) -> list[str]:

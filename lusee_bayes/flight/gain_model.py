@@ -21,23 +21,24 @@ from math import prod
 from pathlib import Path
 
 import numpy as np
-import xarray as xr
 from jaxtyping import Float, Shaped
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.checks import require_positive, require_shape
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.core.files import replacing, user_path
-from lusee_bayes.core.formats import read_netcdf
+from lusee_bayes.core.files import user_path
 from lusee_bayes.core.layouts import Layout, Variable, require_mhz
 from lusee_bayes.core.lazy import interpolate
 from lusee_bayes.core.reading import read_table, reading, require_file
+from lusee_bayes.core.trees import from_tree, opened_tree, quantity, write_tree
 from lusee_bayes.flight.session import LEVELS, PORTS, TELEMETRY
 
 LETTERS = tuple(LEVELS.values())
 N_COMPONENTS, N_TERMS = 2, 9
 # one nV^2/Hz
 NANO2 = 1e-18
+# of gains: counts for one nV^2/Hz
+COUNTS = "count Hz nV-2"
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +53,7 @@ class GainModel:
         Frequencies, growing.
     mean : (levels, ports, anchors) array
         Counts for 1 nV^2/Hz.
-    component : (levels, ports, components, anchors) array
+    components : (levels, ports, components, anchors) array
         v_r, in the same unit.
     coefficient : (levels, ports, components, terms) array
         c_rk, in the order of phi.
@@ -63,17 +64,25 @@ class GainModel:
     """
 
     path: str
-    anchor_mhz: Float[np.ndarray, "levels ports anchors"]
-    mean: Float[np.ndarray, "levels ports anchors"]
-    component: Float[np.ndarray, "levels ports components anchors"]
-    coefficient: Float[np.ndarray, "levels ports components terms"]
-    component_std: Float[np.ndarray, "levels ports components"] | None = None
+    anchor_mhz: Float[np.ndarray, "level port anchor"] = quantity(
+        "MHz", "frequencies of the gains", checks={"low": 0.0, "unit": "MHz"}
+    )
+    mean: Float[np.ndarray, "level port anchor"] = quantity(COUNTS, "mean gains", checks={})
+    components: Float[np.ndarray, "level port component anchor"] = quantity(
+        COUNTS, "components of gains", checks={}
+    )
+    coefficient: Float[np.ndarray, "level port component term"] = quantity(
+        "1", "strengths of components for telemetry", checks={}
+    )
+    component_std: Float[np.ndarray, "level port component"] | None = quantity(
+        "1", "errors of the strengths", checks={"low": 0.0}, default=None
+    )
     kind: str = "made"
 
     def __post_init__(self):
         require_shape(f"{self.path}: mean", self.mean, (len(LETTERS), PORTS, None))
         *lead, anchors = self.mean.shape
-        shapes = {"anchor_mhz": [anchors], "component": [N_COMPONENTS, anchors]}
+        shapes = {"anchor_mhz": [anchors], "components": [N_COMPONENTS, anchors]}
         for name, shape in (shapes | {"coefficient": [N_COMPONENTS, N_TERMS]}).items():
             require_shape(f"{self.path}: {name}", getattr(self, name), (*lead, *shape))
         if not (np.diff(self.anchor_mhz, axis=2) > 0.0).all():
@@ -86,7 +95,7 @@ class GainModel:
         return {
             (level, port): interpolate.CubicSpline(
                 self.anchor_mhz[level, port],
-                np.vstack([self.mean[level, port], self.component[level, port]]).T,
+                np.vstack([self.mean[level, port], self.components[level, port]]).T,
                 extrapolate=False,
             )
             for level in range(len(LETTERS))
@@ -126,7 +135,7 @@ class GainModel:
                 f"{self.path} says by how much its components may be off, and so does "
                 "flight.component_std; leave that out"
             )
-        return replace(self, component_std=np.broadcast_to(std, self.component.shape[:3]).copy())
+        return replace(self, component_std=np.broadcast_to(std, self.components.shape[:3]).copy())
 
     def strengths(
         self, level: str, port: int, telemetry: Mapping[str, Float[np.ndarray, " rows"]]
@@ -180,9 +189,9 @@ class Curves:
         By how much they may be off; 0 where that is not known.
     """
 
-    frequencies_mhz: Float[np.ndarray, " curve"]
-    gain: Float[np.ndarray, "levels ports curve"]
-    std: Float[np.ndarray, "levels ports curve"]
+    frequencies_mhz: Float[np.ndarray, " curve"] = quantity("MHz", checks={"grows": True})
+    gain: Float[np.ndarray, "level port curve"] = quantity(COUNTS)
+    std: Float[np.ndarray, "level port curve"] = quantity(COUNTS)
 
 
 def gain_curves(
@@ -269,18 +278,6 @@ def draw_gains(
 
 COEFFICIENTS = "alpha_refit.csv"
 MODELS = ("quadratic", "linear")
-DIMS = ("level", "port", "component", "anchor")
-LAYOUT = Layout(
-    "a gain table",
-    {
-        "level": Variable(("level",), "text", choices=LETTERS),
-        "anchor_mhz": Variable(("level", "port", "anchor"), low=0.0, unit="MHz"),
-        "mean": Variable(("level", "port", "anchor")),
-        "components": Variable(DIMS),
-        "coefficient": Variable((*DIMS[:3], "term")),
-        "component_std": Variable(DIMS[:3], low=0.0, optional=True),
-    },
-)
 CSV = Layout(
     "luseepy's coefficients of gains",
     {name: Variable(("row",), "text") for name in ("gain_setting", "component", "model", "term")}
@@ -308,30 +305,14 @@ def read_gain_table(path: str | Path, model: str = "quadratic") -> GainModel:
     path = user_path(path)
     if path.is_dir():
         return _read_folder(path, model)
-    require_file(path, "a gain table", HINT)
-    found = read_netcdf(path, formats.GAINS, LAYOUT, HINT).arrays
-    if tuple(map(str, found["level"])) != LETTERS:
-        raise InputError(f"{path}: levels are {found['level']}; expected {', '.join(LETTERS)}")
-    tables = (found[name] for name in ("anchor_mhz", "mean", "components", "coefficient"))
-    return GainModel(str(path), *tables, found.get("component_std"), "netCDF")
+    with opened_tree(path, formats.GAINS, "a gain table", HINT) as tree:
+        tree.attrs.update(path=str(path), kind="netCDF")
+        return from_tree(GainModel, tree, str(path))
 
 
 def write_gain_table(path: str | Path, table: GainModel) -> Path:
     """Write a gain table as netCDF, whole or not at all."""
-    variables = {
-        "anchor_mhz": (("level", "port", "anchor"), table.anchor_mhz, {"units": "MHz"}),
-        "mean": (("level", "port", "anchor"), table.mean, {"units": "count / (nV^2/Hz)"}),
-        "components": (DIMS, table.component),
-        "coefficient": ((*DIMS[:3], "term"), table.coefficient),
-    }
-    if table.component_std is not None:
-        variables["component_std"] = (DIMS[:3], table.component_std)
-    dataset = xr.Dataset(
-        variables, coords={"level": list(LETTERS)}, attrs={"format": formats.GAINS}
-    )
-    with replacing(path) as partial:
-        dataset.to_netcdf(partial, engine="h5netcdf")
-    return user_path(path)
+    return write_tree(path, table, formats.GAINS)
 
 
 def _read_folder(folder: Path, model: str) -> GainModel:

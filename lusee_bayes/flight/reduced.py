@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -10,30 +9,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from jaxtyping import Bool, Float, Float32, Int, Shaped, UInt8
 
 from lusee_bayes.core import formats
-from lusee_bayes.core.checks import Described, counted
+from lusee_bayes.core.checks import Described, counted, require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import replacing, user_path
-from lusee_bayes.core.formats import read_netcdf
-from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.reading import naming
-from lusee_bayes.core.version import __version__
-from lusee_bayes.flight.gain_model import LETTERS, N_COMPONENTS, Curves
+from lusee_bayes.core.trees import from_tree, opened_tree, quantity, write_tree
+from lusee_bayes.flight.gain_model import COUNTS, LETTERS, N_COMPONENTS, Curves
 from lusee_bayes.flight.session import AUTOS, FIRST_PORT, N_PRODUCTS, NO_LEVEL, PORTS, SECOND_PORT
 from lusee_bayes.instrument.averaging import binned
 from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import DataLayout, labels, runs_of
-from lusee_bayes.instrument.times import Windows, utc_of_jd
-from lusee_bayes.instrument.visibilities import (
-    PLACE_AND_TIME,
-    Calibration,
-    Visibilities,
-    observation_of,
-)
+from lusee_bayes.instrument.times import Windows, utc_of
+from lusee_bayes.instrument.visibilities import Calibration, Visibilities
 
 # why a spectrum is not used in a band; the first is that it is
 REASONS = (
@@ -398,51 +388,64 @@ def _one_run_an_angle(observation: Observation) -> Observation:
 
 
 HINT = "make it with: lusee-bayes reduce SCENARIO SESSION..."
-CURVE_DIMS = ("level_3", "port", "curve")
-BAND_DIMS, GAIN_DIMS = ("frequency", "product", "bin"), ("frequency", "port", "bin")
 # what a run calls its file of them
 REDUCED = "reduced.nc"
-LAYOUT = Layout(
-    "reduced spectra",
-    {
-        "frequency": Variable(("frequency",), low=0.0, grows=True, unit="MHz"),
-        "product": Variable(("product",), "text"),
-        "visibility": Variable(BAND_DIMS, missing=True, unit="V^2/Hz"),
-        "before_flags": Variable(BAND_DIMS, missing=True, unit="V^2/Hz"),
-        "n_averaged": Variable(("frequency", "bin"), low=0.0),
-        "level": Variable(("bin", PORTS), "text", choices=(*LETTERS, NO_LEVEL)),
-        "gain": Variable(GAIN_DIMS, missing=True),
-        "gain_slope": Variable(("frequency", "port", "component", "bin"), missing=True),
-        "component_std": Variable((len(LETTERS), PORTS, "component"), low=0.0, optional=True),
-        "curve_mhz": Variable(("curve",), low=0.0, grows=True),
-        "curve_gain": Variable((len(LETTERS), PORTS, "curve"), missing=True),
-        "curve_std": Variable((len(LETTERS), PORTS, "curve"), missing=True),
-        "scatter": Variable(("frequency",), missing=True),
-        "line_scatter": Variable(("frequency",), missing=True),
-        "curvature": Variable(("frequency",), missing=True),
-        "jd1": Variable(("spectrum",)),
-        "jd2": Variable(("spectrum",)),
-        "run": Variable(("spectrum",), "integer", low=0.0),
-        "bin_of": Variable(("spectrum",), "integer", low=0.0),
-        "window_start_s": Variable(("spectrum",), optional=True),
-        "window_end_s": Variable(("spectrum",), optional=True),
-        "live_s": Variable(("spectrum",), low=0.0, optional=True),
-        "turntable_deg": Variable(("run_number",)),
-        "reason": Variable(
-            ("frequency", "spectrum"), "integer", low=0.0, high=float(len(REASONS) - 1)
-        ),
-        "line_share": Variable(("frequency", "spectrum"), low=0.0, high=1.0),
-    },
-    {
-        **PLACE_AND_TIME,
-        "bandwidth_mhz": Attribute(low=0.0),
-        "average_s": Attribute(low=0.0, optional=True),
-        "gain_std": Attribute(low=0.0, optional=True),
-        "sessions": Attribute("text"),
-        # files of older versions do not say it
-        "recipe": Attribute("text", optional=True),
-    },
-)
+SHARE = {"low": 0.0, "high": 1.0}
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Saved:
+    """What a file holds: :class:`Reduced`, with an observation's times, windows and place.
+
+    Numbers that are medians of parts of a band are one for a band.
+    """
+
+    frequency: Float[np.ndarray, " frequency"] = quantity(
+        "MHz", checks={"low": 0.0, "grows": True, "unit": "MHz"}
+    )
+    product: Shaped[np.ndarray, " product"] = quantity("", checks={"choices": labels()})
+    visibility: Float[np.ndarray, "frequency product bin"] = quantity("V2 Hz-1", packed=True)
+    before_flags: Float32[np.ndarray, "frequency product bin"] = quantity("V2 Hz-1", packed=True)
+    n_averaged: Float[np.ndarray, "frequency bin"] = quantity("1", checks={"low": 0.0})
+    level: Shaped[np.ndarray, "bin port"] = quantity("", checks={"choices": (*LETTERS, NO_LEVEL)})
+    gain: Float[np.ndarray, "frequency port bin"] = quantity(COUNTS)
+    gain_slope: Float[np.ndarray, "frequency port component bin"] = quantity("1")
+    component_std: Float[np.ndarray, "letter port component"] | None = quantity(
+        "1", checks={"low": 0.0}
+    )
+    curves: Curves
+    scatter: Float[np.ndarray, " frequency"] = quantity("1", "over radiometer noise, in time")
+    line_scatter: Float[np.ndarray, " frequency"] = quantity("1", "of channels, likewise")
+    curvature: Float[np.ndarray, " frequency"] = quantity("1", "in standard deviations")
+    jd1: Float[np.ndarray, " spectrum"] = quantity("d", "Julian date, UTC", checks={})
+    jd2: Float[np.ndarray, " spectrum"] = quantity("d", "its second part", checks={})
+    run: Int[np.ndarray, " spectrum"] = quantity("1", checks={"low": 0.0})
+    bin_of: Int[np.ndarray, " spectrum"] = quantity("1", checks={"low": 0.0})
+    window_start_s: Float[np.ndarray, " spectrum"] | None = quantity("s", checks={})
+    window_end_s: Float[np.ndarray, " spectrum"] | None = quantity("s", checks={})
+    live_s: Float[np.ndarray, " spectrum"] | None = quantity("s", checks={"low": 0.0})
+    turntable_deg: Float[np.ndarray, " state"] = quantity("degree", checks={})
+    reason: UInt8[np.ndarray, "frequency spectrum"] = quantity(
+        "1",
+        checks={"low": 0.0, "high": len(REASONS) - 1.0},
+        attributes={
+            "flag_values": np.arange(len(REASONS), dtype=np.uint8),
+            "flag_meanings": " ".join(reason.replace(" ", "_") for reason in REASONS),
+        },
+        packed=True,
+    )
+    line_share: Float32[np.ndarray, "frequency spectrum"] = quantity(
+        "1", "flagged channels", checks=SHARE, packed=True
+    )
+    lon_deg: float
+    lat_deg: float
+    step_s: float
+    bandwidth_mhz: float
+    average_s: float | None
+    gain_std: float | None
+    sessions: tuple[dict[str, Any], ...]
+    recipe: dict[str, str]
+    scenario: str = ""
 
 
 def write_reduced(path: str | Path, reduced: Reduced, scenario: str = "") -> Path:
@@ -455,58 +458,30 @@ def write_reduced(path: str | Path, reduced: Reduced, scenario: str = "") -> Pat
     scenario : str
         Text of the scenario that they were reduced with.
     """
-    seen, meanings = reduced.observation, {"flag_meanings": ", ".join(REASONS)}
-    variables = {
-        "visibility": (BAND_DIMS, reduced.values, {"units": "V^2/Hz"}),
-        "before_flags": (BAND_DIMS, reduced.before.astype(np.float32), {"units": "V^2/Hz"}),
-        "n_averaged": (("frequency", "bin"), reduced.n_averaged),
-        "level": (("bin", "port"), reduced.level.astype(object)),
-        "gain": (GAIN_DIMS, reduced.gain, {"units": "count / (nV^2/Hz)"}),
-        "gain_slope": (("frequency", "port", "component", "bin"), reduced.slope),
-        "curve_mhz": (("curve",), reduced.curves.frequencies_mhz, {"units": "MHz"}),
-        "curve_gain": (CURVE_DIMS, reduced.curves.gain, {"units": "count / (nV^2/Hz)"}),
-        "curve_std": (CURVE_DIMS, reduced.curves.std, {"units": "count / (nV^2/Hz)"}),
-        "scatter": (("frequency",), reduced.scatter),
-        "line_scatter": (("frequency",), reduced.line_scatter),
-        "curvature": (("frequency",), reduced.curvature),
-        "jd1": (("spectrum",), seen.times.jd1, {"scale": "utc"}),
-        "jd2": (("spectrum",), seen.times.jd2, {"scale": "utc"}),
-        "run": (("spectrum",), seen.run.astype(np.int32)),
-        "bin_of": (("spectrum",), reduced.bin_of.astype(np.int32)),
-        "turntable_deg": (("run_number",), np.array(seen.turntable_deg)),
-        "reason": (("frequency", "spectrum"), reduced.reason, meanings),
-        "line_share": (("frequency", "spectrum"), reduced.lines),
-    }
-    if seen.windows is not None:
-        variables |= {
-            "window_start_s": (("spectrum",), seen.windows.start_s),
-            "window_end_s": (("spectrum",), seen.windows.end_s),
-            "live_s": (("spectrum",), seen.windows.live_s),
-        }
-    if reduced.component_std is not None:
-        variables["component_std"] = (("level_3", "port", "component"), reduced.component_std)
-    numbers = {"average_s": reduced.average_s, "gain_std": reduced.gain_std}
-    dataset = xr.Dataset(
-        variables,
-        coords={"frequency": reduced.frequencies_mhz, "product": list(labels())},
-        attrs={
-            "format": formats.REDUCED,
-            "lon_deg": seen.lon_deg,
-            "lat_deg": seen.lat_deg,
-            "step_s": seen.step_s,
-            "bandwidth_mhz": reduced.bandwidth_mhz,
-            "sessions": json.dumps([dict(one) for one in reduced.sessions]),
-            "recipe": json.dumps(dict(reduced.recipe)),
-            "scenario": scenario,
-            "lusee_bayes_version": __version__,
-            **{name: value for name, value in numbers.items() if value is not None},
-        },
+    seen, windows = reduced.observation, reduced.observation.windows
+    same = ("n_averaged", "level", "gain", "component_std", "curves", "scatter", "line_scatter")
+    same += ("curvature", "bin_of", "reason", "bandwidth_mhz", "average_s", "gain_std")
+    saved = _Saved(
+        frequency=reduced.frequencies_mhz,
+        product=np.array(labels()),
+        visibility=reduced.values,
+        before_flags=reduced.before.astype(np.float32),
+        gain_slope=reduced.slope,
+        jd1=seen.times.jd1,
+        jd2=seen.times.jd2,
+        run=np.asarray(seen.run),
+        turntable_deg=np.array(seen.turntable_deg),
+        line_share=reduced.lines,
+        window_start_s=None if windows is None else windows.start_s,
+        window_end_s=None if windows is None else windows.end_s,
+        live_s=None if windows is None else windows.live_s,
+        sessions=tuple(dict(one) for one in reduced.sessions),
+        recipe=dict(reduced.recipe),
+        scenario=scenario,
+        **{name: getattr(seen, name) for name in ("lon_deg", "lat_deg", "step_s")},
+        **{name: getattr(reduced, name) for name in same},
     )
-    small = {"zlib": True, "complevel": 1}
-    encoding = dict.fromkeys(("before_flags", "reason", "line_share", "visibility"), small)
-    with replacing(path) as partial:
-        dataset.to_netcdf(partial, engine="h5netcdf", encoding=encoding)
-    return user_path(path)
+    return write_tree(path, saved, formats.REDUCED)
 
 
 def read_reduced(path: str | Path) -> Reduced:
@@ -521,46 +496,34 @@ def read_reduced(path: str | Path) -> Reduced:
     InputError
         If the file is missing, of another kind or damaged.
     """
-    found = read_netcdf(path, formats.REDUCED, LAYOUT, HINT)
-    here, said = found.arrays, found.values
-    if tuple(map(str, here["product"])) != labels():
+    with opened_tree(path, formats.REDUCED, "reduced spectra", HINT) as tree:
+        saved = from_tree(_Saved, tree, str(path))
+    if tuple(saved.product) != labels():
         raise InputError(f"{path} has other products than {', '.join(labels())}")
-    texts = {"sessions": said["sessions"], "recipe": said.get("recipe", "{}")}
-    told: dict[str, Any] = {}
-    for name, text in texts.items():
-        try:
-            told[name] = json.loads(text)
-        except json.JSONDecodeError as error:
-            raise InputError(f"{path}: the attribute {name} is no JSON: {error}") from error
-    windows = None
     with naming(path):
-        if "window_start_s" in here and "window_end_s" in here:
-            windows = Windows.whole(
-                here["window_start_s"], here["window_end_s"], here.get("live_s")
-            )
-        observation = observation_of(found, utc_of_jd(found), windows)
-    if here["bin_of"].max() >= found.sizes["bin"]:
-        raise InputError(f"{path}: bin_of goes beyond the {found.sizes['bin']} bins")
+        require_shape("level", saved.level, (None, PORTS))
+        require_shape("curves", saved.curves.gain, (len(LETTERS), PORTS, None))
+        if saved.component_std is not None:
+            require_shape("component_std", saved.component_std, (len(LETTERS), PORTS, None))
+        windows = None
+        if saved.window_start_s is not None and saved.window_end_s is not None:
+            windows = Windows.whole(saved.window_start_s, saved.window_end_s, saved.live_s)
+        place, times = (saved.lon_deg, saved.lat_deg), utc_of(saved.jd1, saved.jd2)
+        runs = saved.run, tuple(saved.turntable_deg.tolist()), saved.step_s
+        observation = Observation(*place, times, *runs, windows=windows)
+    if saved.bin_of.max() >= saved.n_averaged.shape[1]:
+        raise InputError(f"{path}: bin_of goes beyond the {saved.n_averaged.shape[1]} bins")
+    same = ("bandwidth_mhz", "bin_of", "average_s", "reason", "n_averaged", "level", "gain")
+    same += ("component_std", "gain_std", "curves", "sessions", "recipe")
     return Reduced(
-        frequencies_mhz=here["frequency"],
-        bandwidth_mhz=said["bandwidth_mhz"],
+        frequencies_mhz=saved.frequency,
         observation=observation,
-        bin_of=here["bin_of"],
-        average_s=said.get("average_s"),
-        reason=here["reason"].astype(np.uint8),
-        values=here["visibility"],
-        before=here["before_flags"],
-        n_averaged=here["n_averaged"],
-        level=here["level"],
-        gain=here["gain"],
-        slope=here["gain_slope"],
-        bend=here["curvature"][:, None, None],
-        span_scatter=here["scatter"][:, None],
-        slab_scatter=here["line_scatter"][:, None],
-        lines=here["line_share"].astype(np.float32),
-        component_std=here.get("component_std"),
-        gain_std=said.get("gain_std"),
-        curves=Curves(here["curve_mhz"], here["curve_gain"], here["curve_std"]),
-        sessions=tuple(told["sessions"]),
-        recipe=told["recipe"],
+        values=saved.visibility,
+        before=saved.before_flags.astype(np.float64),
+        slope=saved.gain_slope,
+        bend=saved.curvature[:, None, None],
+        span_scatter=saved.scatter[:, None],
+        slab_scatter=saved.line_scatter[:, None],
+        lines=saved.line_share,
+        **{name: getattr(saved, name) for name in same},
     )

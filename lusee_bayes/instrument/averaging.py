@@ -37,13 +37,21 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from threadpoolctl import threadpool_limits
 
+from lusee_bayes.core.arrays import Array, GridFlags, TimeFlags, Times
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import tilt_powers
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.instrument.times import ROUNDING_S, Windows, later, seconds_from
+from lusee_bayes.instrument.times import ROUNDING_S, Nodes, Numbers, Windows, later, seconds_from
 from lusee_bayes.instrument.visibilities import Visibilities
+
+# numbers of samples; ex and ey; u_j and G_j of the module's equations
+Samples, Tilts = Int[np.ndarray, " samples"], Float[np.ndarray, "nodes 2"]
+Functions = Float[np.ndarray, "times functions"]
+Factors = Float[np.ndarray, "functions powers orders 2"]
+Moments = Float[np.ndarray, "times moments"]
+Series = Float[np.ndarray, "moments columns"]
 
 # of what is left out of any sample, relative to its visibility if what a beam sees of the sky falls
 # with ell to this power: less than 1e-6 of the radiometer noise in the fiducial case
@@ -81,17 +89,8 @@ def _quadrature_error(n: int, angle: float) -> float:
 
 
 def windowed(
-    sample: Int[np.ndarray, " nodes"],
-    weight: Float[np.ndarray, " nodes"],
-    azimuth: Float[np.ndarray, " nodes"],
-    tilt: Float[np.ndarray, "nodes 2"],
-    order: int,
-    lmax: int,
-) -> tuple[
-    Float[np.ndarray, " times"],
-    Float[np.ndarray, "times functions"],
-    Float[np.ndarray, "functions powers orders 2"],
-]:
+    sample: Numbers, weight: Nodes, azimuth: Nodes, tilt: Tilts, order: int, lmax: int
+) -> tuple[Times, Functions, Factors]:
     """Average what A knows of time over windows.
 
     Parameters
@@ -131,13 +130,10 @@ def windowed(
     ex, ey = -tilt[:, 0], -tilt[:, 1]
     # the transpose of the exponential has the opposite sign
     e = np.stack([ex**a * ey**b / factorial(a + b) for a, b in powers], axis=1)
-    moments = np.stack(
-        [
-            np.add.reduceat(weight[:, None] * e * scaled[:, None] ** k, first, axis=0)
-            for k in range(n_moments)
-        ],
-        axis=2,
-    ).reshape(len(first), -1)
+    weighted = weight[:, None] * e
+    of_power = [weighted * scaled[:, None] ** k for k in range(n_moments)]
+    moments = np.stack([np.add.reduceat(x, first, axis=0) for x in of_power], axis=2)
+    moments = moments.reshape(len(first), -1)
     series = _series(powers, n_moments, largest, lmax)
     # small matrices: several threads would wait for one another
     with threadpool_limits(1, "blas"):
@@ -159,22 +155,14 @@ def _sufficient_moments(angle: float) -> int:
 def _importance(powers: list[tuple[int, int]], lmax: int) -> Float[np.ndarray, "powers orders"]:
     """What each power of the tilt makes of the harmonics of one order."""
     ell = np.arange(1.0, max(lmax, 1) + 1.0)
-    return np.array(
-        [
-            [(ell[ell >= max(m, 1)] ** (a + b + FALLING)).sum() for m in range(lmax + 1)]
-            for a, b in powers
-        ]
-    )
+    above = [ell[ell >= max(m, 1)] for m in range(lmax + 1)]
+    return np.array([[(x ** (a + b + FALLING)).sum() for x in above] for a, b in powers])
 
 
-def _series(
-    powers: list[tuple[int, int]], n_moments: int, largest: float, lmax: int
-) -> Float[np.ndarray, "moments columns"]:
+def _series(powers: list[tuple[int, int]], n_moments: int, largest: float, lmax: int) -> Series:
     """(i m)^k / k! for scaled moments, real and imaginary parts, weighted by their importance."""
-    m = np.arange(lmax + 1.0)
-    terms = np.zeros((n_moments, lmax + 1), dtype=complex)
-    for k in range(n_moments):
-        terms[k] = (1j * m * largest) ** k / factorial(k)
+    angle = 1j * np.arange(lmax + 1.0) * largest
+    terms = np.array([angle**k / factorial(k) for k in range(n_moments)])
     parts = np.stack([terms.real, terms.imag], axis=-1)
     weighted = _importance(powers, lmax)[:, None, :, None] * parts[None]
     n = len(powers)
@@ -183,9 +171,7 @@ def _series(
     return series.reshape(n * n_moments, -1)
 
 
-def _fewest(
-    moments: Float[np.ndarray, "times moments"], series: Float[np.ndarray, "moments columns"]
-) -> tuple[Float[np.ndarray, "times functions"], Float[np.ndarray, "functions columns"]]:
+def _fewest(moments: Moments, series: Series) -> tuple[Functions, Array]:
     """Functions u and factors G with u G = moments x series at every time, to ``TOLERANCE``."""
     q, r = np.linalg.qr(moments)
     across, left = np.linalg.qr(series.T)
@@ -232,13 +218,11 @@ def averaged(data: Visibilities, to_s: float) -> Visibilities:
         nothing is left.
     """
     require_positive("the time to average over, in seconds,", to_s)
-    observation = data.observation
-    windows = observation.windows
+    observation, windows = data.observation, data.observation.windows
     if windows is None:
         raise InputError(
-            "the samples are instants, which have no mean over a time; average samples with "
-            "windows (observation.window=mean in a simulation, observation.timestamp for data "
-            "whose file does not say what its times are)"
+            "the samples are instants, which have no mean over a time; give samples with windows "
+            "(observation.window=mean in a simulation, observation.timestamp for other data)"
         )
     if to_s < observation.step_s - ROUNDING_S:
         raise InputError(
@@ -251,8 +235,8 @@ def averaged(data: Visibilities, to_s: float) -> Visibilities:
     left = np.flatnonzero(used)
     if not left.size:
         raise InputError(
-            f"nothing is left of the data in bins of {to_s:g} s: in none of them do the products "
-            "have samples in common; average over less"
+            f"nothing is left of the data in bins of {to_s:g} s, in which products have no samples "
+            "in common; average over less"
         )
     # bins of which something remains, counted anew
     bins, bin_of_left = np.unique(bin_of[left], return_inverse=True)
@@ -260,12 +244,9 @@ def averaged(data: Visibilities, to_s: float) -> Visibilities:
     grid = np.asarray(data.layout.scatter(data.data))[:, left] * weight
     first = np.searchsorted(bin_of_left, np.arange(len(bins)))
     layout = DataLayout.from_flags(~kept[:, bins])
-    return replace(
-        data,
-        data=layout.gather(np.add.reduceat(grid, first, axis=1)),
-        layout=layout,
-        observation=binned(observation, left, bin_of_left, to_s),
-    )
+    means = layout.gather(np.add.reduceat(grid, first, axis=1))
+    seen = binned(observation, left, bin_of_left, to_s)
+    return replace(data, data=means, layout=layout, observation=seen)
 
 
 def product_live_s(data: Visibilities) -> float:
@@ -275,7 +256,7 @@ def product_live_s(data: Visibilities) -> float:
 
 def bins_of(
     observation: Observation, bounds_s: Float[np.ndarray, "times 2"], to_s: float
-) -> Int[np.ndarray, " times"]:
+) -> Samples:
     """Return the number of the bin of every sample.
 
     Parameters
@@ -312,10 +293,8 @@ def bins_of(
 
 
 def by_the_rule(
-    present: Bool[np.ndarray, "products times"],
-    bin_of: Int[np.ndarray, " times"],
-    live_s: Float[np.ndarray, " times"],
-) -> tuple[Bool[np.ndarray, "products bins"], Bool[np.ndarray, " times"]]:
+    present: GridFlags, bin_of: Samples, live_s: Times
+) -> tuple[Bool[np.ndarray, "products bins"], TimeFlags]:
     """Return which products each bin has, and which samples it is made of.
 
     Parameters
@@ -337,10 +316,7 @@ def by_the_rule(
 
 
 def binned(
-    observation: Observation,
-    left: Int[np.ndarray, " samples"],
-    bin_of_left: Int[np.ndarray, " samples"],
-    to_s: float,
+    observation: Observation, left: Samples, bin_of_left: Samples, to_s: float
 ) -> Observation:
     """Return the times and windows of bins.
 
@@ -356,19 +332,18 @@ def binned(
         Length of the bins, in seconds.
     """
     first = np.searchsorted(bin_of_left, np.arange(bin_of_left[-1] + 1))
-    keep = np.isin(np.arange(observation.n_times), left)
-    here = observation.select(keep)
+    here = observation.select(np.isin(np.arange(observation.n_times), left))
     windows = here.windows
     seconds = seconds_from(here.times[0], here.times)
     offset = seconds[windows.sample]
     start, end = windows.start_s + offset, windows.end_s + offset
     bin_of_piece, share = bin_of_left[windows.sample], windows.live_s / (end - start)
-    gap = start[1:] - end[:-1]
     # the live time that the piece would have with the share of the one before
     differ = np.abs(np.diff(share)) * (end - start)[1:]
-    merged = (np.diff(bin_of_piece) == 0) & (gap <= ROUNDING_S) & (differ <= ROUNDING_S)
-    opens = np.append(True, ~merged)
-    at = np.flatnonzero(opens)
+    merged = (
+        (np.diff(bin_of_piece) == 0) & (start[1:] - end[:-1] <= ROUNDING_S) & (differ <= ROUNDING_S)
+    )
+    at = np.flatnonzero(np.append(True, ~merged))
     start, bin_of_piece = start[at], bin_of_piece[at]
     end = end[np.append(at[1:], len(end)) - 1]
     # pieces touch up to rounding
@@ -376,12 +351,6 @@ def binned(
     begin = np.searchsorted(bin_of_piece, np.arange(len(first)))
     last = np.append(begin[1:], len(start)) - 1
     middle = (start[begin] + end[last]) / 2.0
-    times = later(here.times[first], middle - seconds[first])
-    offset = middle[bin_of_piece]
-    return replace(
-        here,
-        times=times,
-        run=here.run[first],
-        step_s=to_s,
-        windows=Windows(bin_of_piece, start - offset, end - offset, live),
-    )
+    times, offset = later(here.times[first], middle - seconds[first]), middle[bin_of_piece]
+    windows = Windows(bin_of_piece, start - offset, end - offset, live)
+    return replace(here, times=times, run=here.run[first], step_s=to_s, windows=windows)

@@ -16,7 +16,7 @@ Time enters only through exp(i m phi) and the slow scalars u_j, beams only throu
 A with a vector never forms A, and nothing in it but the last sum grows with the number of times.
 
 **A as a linear function of the beams**, for fixed orientations and beams that change
-(:class:`BeamOperator`): row t of product k is b_k R(t), with R(t) block diagonal in ell: one
+(:class:`Instrument`): row t of product k is b_k R(t), with R(t) block diagonal in ell: one
 rotation matrix for each ell and sample, computed once. Then A costs 16 products with (2 ell + 1)^2
 numbers per ell and sample, and derivatives cost no more.
 """
@@ -24,6 +24,7 @@ numbers per ell and sample, and derivatives cost no more.
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import replace
 
 import equinox as eqx
@@ -31,7 +32,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from lusee_bayes.core.arrays import Array, compiled, namespace
+from lusee_bayes.core.arrays import Array, DataVector, Modes, compiled, namespace
 from lusee_bayes.core.checks import Described, require_array, require_float64, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import (
@@ -43,10 +44,16 @@ from lusee_bayes.core.harmonics import (
     turn_about_z,
 )
 from lusee_bayes.instrument.beams.fields import ProductBeams
+from lusee_bayes.instrument.beams.monopoles import Monopoles, monopole_beams, parameter, with_values
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout
 
+Matrix = Float[Array, "data unknowns"]
+ProductModes = Float[Array, "products modes"]
+BodyBeams = Float[Array, "runs products functions modes"]
+RowNumbers = Int[np.ndarray, " rows"]
+TimeModes = Float[Array, "products times modes"]
 # times whose data A^T d takes at once: it bounds the memory
 MOST_TIMES = 8192
 
@@ -60,7 +67,7 @@ class Coupling(Described, eqx.Module):
         Factors of the rows, such as gains; None for ones.
     """
 
-    response: Float[Array, " data"] | None = eqx.field(default=None, kw_only=True)
+    response: DataVector | None = eqx.field(default=None, kw_only=True)
 
     def description(self) -> tuple[str, ...]:
         data, unknowns = self.shape
@@ -76,13 +83,13 @@ class Coupling(Described, eqx.Module):
         """Whether A^T N^-1 A can be summed over time without A (``linear.normal_matrix``)."""
         return False
 
-    def dense(self) -> Float[Array, "data unknowns"]:
+    def dense(self) -> Matrix:
         """A as a matrix, with the response."""
         matrix = self._matrix()
         return matrix if self.response is None else matrix * self.response[:, None]
 
     @abstractmethod
-    def _matrix(self) -> Float[Array, "data unknowns"]:
+    def _matrix(self) -> Matrix:
         """A as a matrix, as all of the following without the response."""
 
     @abstractmethod
@@ -108,14 +115,14 @@ class Coupling(Described, eqx.Module):
         """
 
     @abstractmethod
-    def _forward(self, sky: Float[Array, " unknowns"]) -> Float[Array, " data"]:
+    def _forward(self, sky: Modes) -> DataVector:
         """A m, of a vector whose type and shape are right."""
 
     @abstractmethod
-    def _backward(self, data: Float[Array, " data"]) -> Float[Array, " unknowns"]:
+    def _backward(self, data: DataVector) -> Modes:
         """A^T d, of a vector whose type and shape are right."""
 
-    def __matmul__(self, sky: Float[Array, " unknowns"]) -> Float[Array, " data"]:
+    def __matmul__(self, sky: Modes) -> DataVector:
         """Compute A m: the mean data of a sky.
 
         Parameters
@@ -139,7 +146,7 @@ class Coupling(Described, eqx.Module):
         data = self._forward(sky)
         return data if self.response is None else data * self.response
 
-    def transpose_mv(self, data: Float[Array, " data"]) -> Float[Array, " unknowns"]:
+    def transpose_mv(self, data: DataVector) -> Modes:
         """Compute A^T d.
 
         Parameters
@@ -161,7 +168,7 @@ class Coupling(Described, eqx.Module):
         require_shape("the data", data, (self.shape[0],))
         return self._backward(data if self.response is None else data * self.response)
 
-    def with_response(self, factors: Float[Array, " data"]) -> Coupling:
+    def with_response(self, factors: DataVector) -> Coupling:
         """Multiply every row by a factor, on top of those it has.
 
         Parameters
@@ -185,9 +192,7 @@ class Coupling(Described, eqx.Module):
 
 
 @compiled
-def body_beams(
-    modes: Float[Array, "products modes"], pointing: Pointing
-) -> Float[Array, "runs products functions modes"]:
+def body_beams(modes: ProductModes, pointing: Pointing) -> BodyBeams:
     """Turn beams into the Moon-fixed frame, as every function of time of the pointing sees them.
 
     Parameters
@@ -208,7 +213,7 @@ def body_beams(
     return xp.stack(runs)
 
 
-def _on_the_moon(modes: Float[Array, "products modes"], pointing: Pointing) -> Array:
+def _on_the_moon(modes: ProductModes, pointing: Pointing) -> Array:
     """Beams of the lander in the Moon-fixed frame, with the pointing's further turns."""
     if pointing.turns is None:
         return pointing.mcmf_from_lander(modes)
@@ -252,7 +257,7 @@ class DenseCoupling(Coupling):
         inside a JAX transformation.
     """
 
-    matrix: Float[Array, "data unknowns"] = eqx.field(converter=jnp.asarray)
+    matrix: Matrix = eqx.field(converter=jnp.asarray)
 
     def __check_init__(self):
         require_array("the coupling matrix", self.matrix, (None, None))
@@ -266,8 +271,7 @@ class DenseCoupling(Coupling):
 
     def plus(self, amplitude, direction):
         require_shape("the direction", direction, self.shape)
-        if direction.response is not None:
-            raise InputError("the direction must have no response of its own")
+        _require_bare(direction)
         return DenseCoupling(self.matrix + amplitude * direction.dense(), response=self.response)
 
     def _forward(self, sky):
@@ -275,6 +279,11 @@ class DenseCoupling(Coupling):
 
     def _backward(self, data):
         return self.matrix.T @ data
+
+
+def _require_bare(direction: Coupling) -> None:
+    if direction.response is not None:
+        raise InputError("the direction must have no response of its own")
 
 
 def as_coupling(coupling: Coupling | Array) -> Coupling:
@@ -301,7 +310,7 @@ class CouplingMatrix(Coupling):
         The product and the time of every row.
     """
 
-    body_beams: Float[Array, "runs products functions modes"]
+    body_beams: BodyBeams
     by_order: Float[Array, "runs orders beams degrees"]
     pointing: Pointing
     layout: DataLayout
@@ -331,8 +340,8 @@ class CouplingMatrix(Coupling):
         InputError
             If beams, pointing and layout differ in lmax, products or times.
         """
-        n_modes = sum(b.shape[0] for b in pointing.pole_from_galactic.blocks)
-        require_shape("the beam coefficients", beams.modes, (beams.n_products, n_modes))
+        size = n_modes(len(pointing.pole_from_galactic.blocks) - 1)
+        require_shape("the beam coefficients", beams.modes, (beams.n_products, size))
         if layout is None:
             layout = DataLayout(beams.n_products, pointing.n_times)
         if (layout.n_products, layout.n_times) != (beams.n_products, pointing.n_times):
@@ -405,8 +414,7 @@ class CouplingMatrix(Coupling):
         return self.response is None
 
     def plus(self, amplitude, direction):
-        if direction.response is not None:
-            raise InputError("the direction must have no response of its own")
+        _require_bare(direction)
         if not isinstance(direction, CouplingMatrix):
             dense = DenseCoupling(self._matrix(), response=self.response)
             return dense.plus(amplitude, direction)
@@ -417,9 +425,7 @@ class CouplingMatrix(Coupling):
             by_order=self.by_order + amplitude * direction.by_order,
         )
 
-    def rows(
-        self, product: Int[np.ndarray, " rows"], time: Int[np.ndarray, " rows"]
-    ) -> Float[Array, "rows modes"]:
+    def rows(self, product: RowNumbers, time: RowNumbers) -> Float[Array, "rows modes"]:
         """Compute chosen rows of A, flagged or not, without the response.
 
         Parameters
@@ -439,10 +445,8 @@ class CouplingMatrix(Coupling):
         """
         product, time = np.asarray(product), np.asarray(time)
         require_shape("time", time, product.shape)
-        for name, numbers, limit in [
-            ("product", product, self.layout.n_products),
-            ("time", time, self.layout.n_times),
-        ]:
+        limits = {"product": self.layout.n_products, "time": self.layout.n_times}
+        for numbers, (name, limit) in zip((product, time), limits.items(), strict=True):
             if ((numbers < 0) | (numbers >= limit)).any():
                 raise InputError(f"{name} numbers must lie in 0..{limit - 1}, got {numbers}")
         places, blocks = [], []
@@ -470,13 +474,13 @@ class CouplingMatrix(Coupling):
         return (self.pointing.functions[times][:, :, None] * waves[:, None]).reshape(len(times), -1)
 
     @compiled
-    def _matrix(self) -> Float[Array, "data modes"]:
+    def _matrix(self) -> Matrix:
         """96 MB for 5232 x 2304."""
         blocks = [self._block(run, span) for run, span in self.pointing.runs()]
         return self.layout.gather(namespace(*blocks).concatenate(blocks, axis=1))
 
     @compiled
-    def _forward(self, sky: Float[Array, " modes"]) -> Float[Array, " data"]:
+    def _forward(self, sky: Modes) -> DataVector:
         n_products, n_functions = self.body_beams.shape[1:3]
         pairs = _pairs(self.pointing.pole_from_galactic(sky), self.lmax)
         plus, minus = pairs[: self.lmax + 1], pairs[self.lmax + 1 :]
@@ -495,7 +499,7 @@ class CouplingMatrix(Coupling):
         return self.layout.gather(xp.concatenate(grids, axis=1))
 
     @compiled
-    def _backward(self, data: Float[Array, " data"]) -> Float[Array, " modes"]:
+    def _backward(self, data: DataVector) -> Modes:
         """The transpose of :func:`_forward`, step by step."""
         n = self.lmax + 1
         grid = self.layout.scatter(data)
@@ -507,9 +511,8 @@ class CouplingMatrix(Coupling):
                 part = slice(first, min(first + MOST_TIMES, span.stop))
                 weighted = grid[:, part].T[:, :, None] * functions[part][:, None]
                 weighted = weighted.reshape(weighted.shape[0], -1)
-                x_and_y = namespace(weighted).stack(
-                    [cosine[part].T @ weighted, sine[part].T @ weighted], axis=-1
-                )
+                x_and_y = [wave[part].T @ weighted for wave in (cosine, sine)]
+                x_and_y = namespace(weighted).stack(x_and_y, axis=-1)
                 both = both + self.by_order[run].swapaxes(1, 2) @ x_and_y
         # (orders, degrees): of pairs, and of what they are crossed to
         straight, crossed = both[..., 0], both[..., 1]
@@ -521,14 +524,11 @@ class CouplingMatrix(Coupling):
     def _block(self, run: int, times) -> Float[Array, "products times modes"]:
         """Rows of all products for some samples of one run; times: a slice or numbers."""
         beams = self.pointing.functions[times] @ self.body_beams[run]
-        return self.pointing.pole_from_galactic.T(
-            turned_about_pole(beams, self.pointing.azimuth[times])
-        )
+        turned = turned_about_pole(beams, self.pointing.azimuth[times])
+        return self.pointing.pole_from_galactic.T(turned)
 
 
-def turned_about_pole(
-    beams: Float[Array, "products times modes"], azimuth: Float[Array, " times"]
-) -> Float[Array, "products times modes"]:
+def turned_about_pole(beams: TimeModes, azimuth: Float[Array, " times"]) -> TimeModes:
     """Turn beams about the pole by the azimuth of every time: D_z(-phi(t)).
 
     Parameters
@@ -560,9 +560,7 @@ def _phases(pointing: Pointing, lmax: int) -> tuple[Array, Array]:
 
 
 @compiled
-def _by_order(
-    body_beams: Float[Array, "runs products functions modes"], lmax: int
-) -> Float[Array, "runs orders beams degrees"]:
+def _by_order(body_beams: BodyBeams, lmax: int) -> Float[Array, "runs orders beams degrees"]:
     """W_lm and W_l,-m side by side for every order: the matrices behind X and Y.
 
     A tenth of the time of sums over modes that lie in the packed order (fiducial size).
@@ -585,85 +583,169 @@ def _pairs(modes: Float[Array, "*batch modes"], lmax: int) -> Float[Array, "*bat
 
 # unit beams that are rotated at once
 CHUNK = 64
+Rotations = tuple[Float[Array, "_ times _"], ...]
 
 
-class BeamOperator(eqx.Module):
-    """R(t) of every sample, which rotates beams into Galactic coordinates, up to one lmax.
+def rotations_of(pointing: Pointing) -> Rotations:
+    """Compute R(t) of all samples, which rotates beams into Galactic coordinates.
 
-    Attributes
+    It takes 8 (lmax + 1)^3 4 / 3 bytes a sample: 54 MB for a month at lmax 24.
+
+    Parameters
     ----------
-    blocks : tuple of (2 ell + 1, times, 2 ell + 1) arrays
-        R(t) for every ell: topocentric orders first, Galactic orders last.
-    layout : DataLayout
-        The product and the time of every row of A.
+    pointing : Pointing
+        The orientations at every sample.
+
+    Returns
+    -------
+    tuple of (2 ell + 1, times, 2 ell + 1) arrays
+        For every ell up to the lmax of ``pointing``: topocentric orders first, Galactic orders
+        last.
     """
-
-    blocks: tuple[Float[Array, "_ times _"], ...]
-    layout: DataLayout
-
-    @classmethod
-    def of(cls, pointing: Pointing, layout: DataLayout) -> BeamOperator:
-        """Compute R(t) of all samples.
-
-        It takes 8 (lmax + 1)^3 4 / 3 bytes a sample: 54 MB for a month at lmax 24.
-
-        Parameters
-        ----------
-        pointing : Pointing
-            The orientations at every sample.
-        layout : DataLayout
-            Leaves out missing samples.
-
-        Returns
-        -------
-        BeamOperator
-            Up to the lmax of ``pointing``.
-        """
-        lmax = len(pointing.pole_from_galactic.blocks) - 1
-        size = n_modes(lmax)
-        blocks: list[list[Array]] = [[] for _ in range(lmax + 1)]
-        for start in range(0, size, CHUNK):
-            unit = jnp.eye(CHUNK, size, start)
-            rows = _turned(unit, pointing)
-            for ell in range(lmax + 1):
-                first, end = max(start, ell**2), min(start + CHUNK, (ell + 1) ** 2)
-                if first < end:
-                    inside = rows[first - start : end - start, :, ell**2 : (ell + 1) ** 2]
-                    blocks[ell].append(inside)
-        return cls(tuple(jnp.concatenate(parts) for parts in blocks), layout)
-
-    def coupling(self, beams: ProductBeams) -> Float[Array, "data modes"]:
-        """Compute A as a matrix.
-
-        Parameters
-        ----------
-        beams : ProductBeams
-            Of all products, up to the operator's lmax.
-
-        Returns
-        -------
-        (data, modes) array
-            A of these beams.
-
-        Raises
-        ------
-        InputError
-            If the beams have another lmax.
-        """
-        lmax = len(self.blocks) - 1
-        require_shape("the beam coefficients", beams.modes, (None, n_modes(lmax)))
-        parts = [
-            jnp.einsum("km,mtn->ktn", beams.modes[:, ell**2 : (ell + 1) ** 2], block)
-            for ell, block in enumerate(self.blocks)
-        ]
-        return self.layout.gather(jnp.concatenate(parts, axis=2))
+    lmax = len(pointing.pole_from_galactic.blocks) - 1
+    size = n_modes(lmax)
+    blocks: list[list[Array]] = [[] for _ in range(lmax + 1)]
+    for start in range(0, size, CHUNK):
+        rows = _turned(jnp.eye(CHUNK, size, start), pointing)
+        for ell in range(lmax + 1):
+            first, end = max(start, ell**2), min(start + CHUNK, (ell + 1) ** 2)
+            if first < end:
+                inside = rows[first - start : end - start, :, ell**2 : (ell + 1) ** 2]
+                blocks[ell].append(inside)
+    return tuple(jnp.concatenate(parts) for parts in blocks)
 
 
 @eqx.filter_jit
-def _turned(
-    beams: Float[Array, "beams modes"], pointing: Pointing
-) -> Float[Array, "beams times modes"]:
+def _turned(beams: ProductModes, pointing: Pointing) -> TimeModes:
     """Rows of A of any number of beams, without a response and with nothing missing."""
     layout = DataLayout(beams.shape[0], pointing.n_times)
     coupling = CouplingMatrix.of_modes(beams, pointing, layout)
     return coupling.dense().reshape(beams.shape[0], pointing.n_times, -1)
+
+
+class Instrument(eqx.Module):
+    """Antennas whose parameters may change, with everything else that A is made of.
+
+    Attributes
+    ----------
+    monopoles : Monopoles
+        The antennas and the ground, with the present values of all parameters.
+    pointing : Pointing
+        The orientations at every sample.
+    layout : DataLayout
+        The product and the time of every row of A.
+    frequency_mhz : float
+        In MHz.
+    lmax : int
+        Highest ell of the beams and the sky.
+    nodes : (int, int) or None
+        Of the grid on which beams are computed; see ``monopole_beams``.
+    rotations : tuple of array or None
+        :func:`rotations_of` all samples, computed by :meth:`prepared`.
+    """
+
+    monopoles: Monopoles
+    pointing: Pointing
+    layout: DataLayout
+    frequency_mhz: float = eqx.field(static=True)
+    lmax: int = eqx.field(static=True)
+    nodes: tuple[int, int] | None = eqx.field(static=True, default=None)
+    rotations: Rotations | None = None
+
+    def prepared(self) -> Instrument:
+        """Compute the rotations of all samples, as :meth:`dense` needs them.
+
+        Returns
+        -------
+        Instrument
+            The same with them.
+        """
+        return replace(self, rotations=rotations_of(self.pointing))
+
+    def value(self, name: str) -> Float[Array, ""]:
+        """Look up the present value of a parameter.
+
+        Parameters
+        ----------
+        name : str
+            One of ``beams.PARAMETERS``.
+
+        Returns
+        -------
+        () array
+            In the unit that the name ends with.
+
+        Raises
+        ------
+        InputError
+            If there is no such parameter; the message names the nearest.
+        """
+        return parameter(name).where(self.monopoles)
+
+    def beams(self, values: Mapping[str, Float[Array, ""]] | None = None) -> ProductBeams:
+        """Compute the beams of all products.
+
+        Parameters
+        ----------
+        values : mapping of str to () array, optional
+            Values of some parameters (``beams.PARAMETERS``); the others keep theirs.
+
+        Returns
+        -------
+        ProductBeams
+            Up to ``lmax``; differentiable in the values.
+
+        Raises
+        ------
+        InputError
+            If there is no parameter of that name.
+        """
+        antennas = with_values(self.monopoles, values or {})
+        return monopole_beams(self.frequency_mhz, self.lmax, antennas, nodes=self.nodes)
+
+    def dense(self, values: Mapping[str, Float[Array, ""]]) -> Float[Array, "data modes"]:
+        """Compute A as a matrix, of a :meth:`prepared` instrument.
+
+        Parameters
+        ----------
+        values : mapping of str to () array
+            Values of some parameters (``beams.PARAMETERS``); the others keep theirs.
+
+        Returns
+        -------
+        (data, modes) array
+            Differentiable in the values.
+
+        Raises
+        ------
+        InputError
+            If the instrument was not prepared, or there is no parameter of that name.
+        """
+        if self.rotations is None:
+            raise InputError("prepare the instrument first: instrument = instrument.prepared()")
+        beams = self.beams(values).modes
+        rows = [
+            jnp.einsum("km,mtn->ktn", beams[:, ell**2 : (ell + 1) ** 2], block)
+            for ell, block in enumerate(self.rotations)
+        ]
+        return self.layout.gather(jnp.concatenate(rows, axis=2))
+
+    def coupling_of(self, beams: ProductBeams) -> CouplingMatrix:
+        """Compute A of given beams, or dA of a difference of beams.
+
+        Parameters
+        ----------
+        beams : ProductBeams
+            Up to the instrument's lmax.
+
+        Returns
+        -------
+        CouplingMatrix
+            For the instrument's orientations and layout.
+
+        Raises
+        ------
+        InputError
+            If the beams have another lmax or other products.
+        """
+        return CouplingMatrix.build(beams, self.pointing, self.layout)

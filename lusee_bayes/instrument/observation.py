@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 import astropy.units as u
 import numpy as np
@@ -26,17 +26,29 @@ from jaxtyping import Bool, Float, Int
 from lunarsky import MCMF
 from scipy.spatial.transform import Rotation as SpatialRotation
 
-from lusee_bayes.core.checks import Described, listed, require_finite, require_positive
+from lusee_bayes.core.arrays import Times
+from lusee_bayes.core.checks import (
+    Described,
+    listed,
+    require_array,
+    require_finite,
+    require_positive,
+)
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.instrument.schedule import Cuts, Interval, Run, cut_intervals, cut_runs
+from lusee_bayes.instrument.schedule import Cut, Interval, Run, cut_intervals, cut_runs
 from lusee_bayes.instrument.times import (
+    Nodes,
+    Numbers,
     Windows,
+    counts_up,
     later,
     require_ephemeris,
     seconds_from,
     unannounced_leap_seconds,
+    utc_from_text,
 )
 
+Vectors, Turn = Float[np.ndarray, "times 3"], Float[np.ndarray, "3 3"]
 ONE_CYCLE = (Run(),)
 # period after which the sky repeats itself in luseepy's engine croissant
 LUSEEPY_MONTH_HOURS = 655.72
@@ -92,8 +104,7 @@ class Observation(Described):
         require_finite("tilt_deg", np.array(self.tilt_deg))
         if self.times.shape != self.run.shape or self.times.ndim != 1 or not self.times.size:
             raise InputError(
-                f"times {self.times.shape} and run {self.run.shape} must be two lists of the "
-                "same length, with at least one sample"
+                f"times {self.times.shape} and run {self.run.shape} must be lists of one length"
             )
         back = np.flatnonzero(~(seconds_from(self.times[:-1], self.times[1:]) > 0.0))
         if back.size:
@@ -102,15 +113,10 @@ class Observation(Described):
                 f"times must grow from sample to sample, but sample {back[0] + 1} ({after}) does "
                 f"not come after sample {back[0]} ({before}); sort them, and give each time once"
             )
-        steps = np.diff(self.run)
-        if (
-            self.run[0] != 0
-            or self.run[-1] != len(self.turntable_deg) - 1
-            or not ((steps == 0) | (steps == 1)).all()
-        ):
+        last = self.n_runs - 1
+        if not counts_up(self.run) or self.run[-1] != last:
             raise InputError(
-                f"run must count 0, 1, ... up to {len(self.turntable_deg) - 1} (one number for "
-                "each turntable angle) without going back"
+                f"run must count 0, 1, ... up to {last}, one for each turntable angle, never back"
             )
         require_ephemeris(self.times.jd)
         if self.windows is None:
@@ -176,9 +182,9 @@ class Observation(Described):
         InputError
             For a bad date, step or length, and for a run without samples.
         """
-        cuts = cut_runs(runs, start, step_s)
-        site = {"lon_deg": lon_deg, "lat_deg": lat_deg, "fixed_axis": fixed_axis}
-        return cls._of_cuts(cuts, window, throughout=False, step_s=step_s, **site)
+        cuts, site = cut_runs(runs, step_s), (lon_deg, lat_deg)
+        t0, number = utc_from_text("start", start), np.arange(len(runs))
+        return cls._of_cuts(cuts, t0, number, window, site, step_s, fixed_axis)
 
     @classmethod
     def from_schedule(
@@ -218,27 +224,57 @@ class Observation(Described):
             For intervals that overlap or are not in order, for a duty cycle of instants, and where
             an interval of nights holds none.
         """
-        cuts = cut_intervals(intervals, step_s)
-        site = {"lon_deg": lon_deg, "lat_deg": lat_deg, "fixed_axis": fixed_axis}
-        return cls._of_cuts(cuts, window, throughout=True, step_s=step_s, **site)
+        cuts, site = cut_intervals(intervals, step_s), (lon_deg, lat_deg)
+        turned = np.diff([one.turntable_deg for one in intervals], prepend=np.nan) != 0.0
+        t0, number = intervals[0].start_time, np.cumsum(turned) - 1
+        return cls._of_cuts(cuts, t0, number, window, site, step_s, fixed_axis)
 
     @classmethod
     def _of_cuts(
-        cls, cuts: Cuts, window: Literal["instant", "mean"], *, throughout: bool, **others: Any
+        cls,
+        cuts: Sequence[Cut],
+        t0: Time,
+        number: Int[np.ndarray, " cuts"],
+        window: Literal["instant", "mean"],
+        site: tuple[float, float],
+        step_s: float,
+        fixed_axis: bool,
     ) -> Observation:
-        """Of samples by night alone where asked for, at their times or from end to end."""
-        times, windows = cuts.samples(window)
-        observation = cls(
-            times=times, run=cuts.run, turntable_deg=cuts.turntable_deg, windows=windows, **others
-        )
-        if not any(cuts.night_only):
+        """Of the samples of cuts, by night alone where asked for; ``number``: the run of each.
+
+        A window of a schedule is dark from end to end, that of a run in its middle.
+        """
+        parts = [(cut.start_s, cut.length_s, cut.live_s) for cut in cuts]
+        times_s, length_s, live_s = (np.concatenate(part) for part in zip(*parts, strict=True))
+        require_ephemeris(np.array([t0.jd + times_s[-1] / 86400.0]))
+        cut_of = np.repeat(np.arange(len(cuts)), [len(cut.start_s) for cut in cuts])
+        windows = None
+        if window == "mean":
+            half = length_s / 2.0
+            times_s, windows = times_s + half, Windows.whole(-half, half, live_s)
+        elif (live_s < length_s).any():
+            raise InputError(
+                "samples that are instants have no duty cycle; take windows "
+                "(observation.window=mean), or leave out the schedule's duty_cycle"
+            )
+        angles = tuple(cuts[k].of.turntable_deg for k in np.unique(number, return_index=True)[1])
+        times, run = later(t0, times_s), number[cut_of]
+        observation = cls(*site, times, run, angles, step_s, fixed_axis, windows)
+        night_only = np.array([cut.of.night_only for cut in cuts])
+        if not night_only.any():
             return observation
         dark = observation.sun_altitude_deg() < 0.0
-        if throughout and windows is not None:
+        if windows is not None and isinstance(cuts[0].of, Interval):
             for offset_s in windows.bounds_s.T:
                 at_end = replace(observation, times=later(times, offset_s), windows=None)
                 dark &= at_end.sun_altitude_deg() < 0.0
-        return observation.select(cuts.by_night(dark))
+        keep = dark | ~night_only[cut_of]
+        for k, cut in enumerate(cuts):
+            if not keep[cut_of == k].any():
+                raise InputError(
+                    f"{cut.name} holds no lunar night; lengthen it, move it or drop night_only"
+                )
+        return observation.select(keep)
 
     def select(self, keep: Bool[np.ndarray, " times"]) -> Observation:
         """Return the observation with only the samples where ``keep`` is True.
@@ -270,15 +306,13 @@ class Observation(Described):
         return len(self.turntable_deg)
 
     @property
-    def live_s(self) -> Float[np.ndarray, " times"]:
+    def live_s(self) -> Times:
         """Integration time of every sample, in seconds."""
         if self.windows is None:
             return np.full(self.n_times, float(self.step_s))
         return self.windows.live_per_sample_s
 
-    def at_nodes(
-        self, n: int
-    ) -> tuple[Observation, Int[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]]:
+    def at_nodes(self, n: int) -> tuple[Observation, Numbers, Nodes]:
         """Return the observation at instants whose weighted means are those over the windows.
 
         Parameters
@@ -303,7 +337,7 @@ class Observation(Described):
         return instants, sample, weight
 
     @cached_property
-    def hours(self) -> Float[np.ndarray, " times"]:
+    def hours(self) -> Times:
         """Hours since the first sample."""
         with unannounced_leap_seconds():
             tdb = self.times.tdb
@@ -326,14 +360,14 @@ class Observation(Described):
         rotations.setflags(write=False)  # all channels share them
         return rotations
 
-    def topocentric_from_mcmf(self) -> Float[np.ndarray, "3 3"]:
+    def topocentric_from_mcmf(self) -> Turn:
         """Return the rotation from MCMF to the East, North and up of the site, its rows."""
         lon, lat = np.radians(self.lon_deg), np.radians(self.lat_deg)
         up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
         east = np.array([-np.sin(lon), np.cos(lon), 0.0])
         return np.array([east, np.cross(up, east), up])
 
-    def lander_from_mcmf(self) -> Float[np.ndarray, "3 3"]:
+    def lander_from_mcmf(self) -> Turn:
         """Return the rotation from MCMF to the lander's axes: East, North and up if it is level.
 
         It leans first towards North, about East, then towards East, about North.
@@ -343,14 +377,47 @@ class Observation(Described):
         turned *= SpatialRotation.from_rotvec([-north, 0.0, 0.0])
         return turned.inv().as_matrix() @ self.topocentric_from_mcmf()
 
-    def zenith_galactic(self) -> Float[np.ndarray, "times 3"]:
+    def zenith_galactic(self) -> Vectors:
         """Return the Galactic unit vector of the zenith at every time."""
         return self.topocentric_from_mcmf()[2] @ self.mcmf_from_galactic
 
-    def sun_altitude_deg(self) -> Float[np.ndarray, " times"]:
+    def antenna_directions(self, galactic: Float[np.ndarray, "..."]) -> Vectors:
+        """Return the direction of a source in the frame of the antennas at every sample.
+
+        The frame turns with the antennas: seen from antennas that are turned by psi from East
+        towards North, a source has turned by -psi. As for all skies here, stellar aberration (0.006
+        degrees) is left out.
+
+        Parameters
+        ----------
+        galactic : (3,) or (times, 3) array
+            Galactic unit vector of the source, fixed or at every sample.
+
+        Returns
+        -------
+        (times, 3) array
+            East, North and up components.
+
+        Raises
+        ------
+        InputError
+            Unless ``galactic`` is a finite float64 array of such a shape.
+        """
+        require_array("galactic", galactic, (3,) if galactic.ndim == 1 else (self.n_times, 3))
+        vectors = np.broadcast_to(galactic, (self.n_times, 3))
+        mcmf = np.einsum("tij,tj->ti", self.mcmf_from_galactic, vectors)
+        topocentric_from_mcmf = self.topocentric_from_mcmf()
+        leaning = self.lander_from_mcmf() @ topocentric_from_mcmf.T
+        east, north, up = leaning @ (mcmf @ topocentric_from_mcmf.T).T
+        turned = np.radians(np.asarray(self.turntable_deg, dtype=np.float64))[self.run]
+        cos, sin = np.cos(turned), np.sin(turned)
+        return np.stack([cos * east + sin * north, cos * north - sin * east, up], axis=1)
+
+    def sun_altitude_deg(self) -> Times:
         """Return the geometric altitude of the Sun's centre above the horizon in degrees."""
-        height = np.einsum("ti,ti->t", self.zenith_galactic(), sun_direction(self.times))
-        return np.degrees(np.arcsin(height))
+        sun = _barycentric_km("sun", self.times) - _barycentric_km("moon", self.times)
+        height = np.einsum("ti,ti->t", self.zenith_galactic(), sun)
+        return np.degrees(np.arcsin(height / np.linalg.norm(sun, axis=1)))
 
 
 def mcmf_from_galactic(times: Time) -> Float[np.ndarray, "times 3 3"]:
@@ -365,17 +432,6 @@ def mcmf_from_galactic(times: Time) -> Float[np.ndarray, "times 3 3"]:
     return np.moveaxis(turned.cartesian.xyz.value, 2, 0)
 
 
-def sun_direction(times: Time) -> Float[np.ndarray, "times 3"]:
-    """Return Galactic unit vectors from the Moon's centre to where the Sun's is at the time."""
-    with unannounced_leap_seconds():
-        sun = get_body_barycentric("sun", times, ephemeris="builtin")
-        moon = get_body_barycentric("moon", times, ephemeris="builtin")
-    direction = (sun - moon).xyz.to_value(u.km)
-    galactic = ICRS(CartesianRepresentation(direction)).transform_to(Galactic())
-    vector = galactic.cartesian.xyz.value
-    return (vector / np.linalg.norm(vector, axis=0)).T
-
-
 BODIES = ("Sun", "Mercury", "Venus", "Earth", "Mars", "Jupiter", "Saturn", "Uranus", "Neptune")
 
 MOON_RADIUS_KM = 1737.4  # IAU mean radius
@@ -385,7 +441,7 @@ LIGHT_KM_PER_S = c.to_value(u.km / u.s)
 LIGHT_TIME_ITERATIONS = 3
 
 
-def body_direction(body: str, observation: Observation) -> Float[np.ndarray, "times 3"]:
+def body_direction(body: str, observation: Observation) -> Vectors:
     """Return the direction from the lander to a body at every sample.
 
     The direction is that from the lander's place on the Moon to where the body was when its light
@@ -422,8 +478,9 @@ def body_direction(body: str, observation: Observation) -> Float[np.ndarray, "ti
     return vector / np.linalg.norm(vector, axis=1, keepdims=True)
 
 
-def _barycentric_km(body: str, times: Time) -> Float[np.ndarray, "times 3"]:
+def _barycentric_km(body: str, times: Time) -> Vectors:
     """Place from the barycentre of the Solar System along Galactic axes."""
-    place = get_body_barycentric(body, times, ephemeris="builtin").xyz.to_value(u.km)
+    with unannounced_leap_seconds():
+        place = get_body_barycentric(body, times, ephemeris="builtin").xyz.to_value(u.km)
     axes = ICRS(CartesianRepresentation(np.eye(3))).transform_to(Galactic())
     return (axes.cartesian.xyz.value @ place).T

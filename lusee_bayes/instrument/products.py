@@ -16,6 +16,7 @@ taken are not in d at all, so the positions are explicit.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from functools import lru_cache
 from operator import attrgetter
 from typing import Any, NamedTuple
@@ -24,11 +25,15 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int, Shaped
 
-from lusee_bayes.core.arrays import Array, as_complex, namespace
+from lusee_bayes.core.arrays import Array, Grid, GridFlags, Times, as_complex, namespace, placed
 from lusee_bayes.core.checks import Described, is_traced
 from lusee_bayes.core.errors import InputError, nearest
 
 N_ANTENNAS = 4
+Products = Float[Array, "products *rest"]
+Hermitian = Complex[Array, "antennas antennas *rest"]
+ByTime = Float[Array, "times products all_columns"]
+Columns = Float[Array, "data *columns"]
 
 
 class Product(NamedTuple):
@@ -60,6 +65,14 @@ def labels(n_antennas: int = N_ANTENNAS) -> tuple[str, ...]:
     return tuple(p.label for p in all_products(n_antennas))
 
 
+def antennas_of(n_products: int) -> int:
+    """Return the number of antennas that have so many products. InputError if none has."""
+    n = round(np.sqrt(n_products))
+    if n * n != n_products:
+        raise InputError(f"{n_products} products do not come from any number of antennas (n^2)")
+    return n
+
+
 def auto_indices(n_antennas: int = N_ANTENNAS) -> np.ndarray:
     """Return the positions of the autos 00R, 11R, ... among the products; shape (antennas,)."""
     return np.array([k for k, p in enumerate(all_products(n_antennas)) if p.i == p.j])
@@ -72,7 +85,7 @@ def ports(n_antennas: int = N_ANTENNAS) -> tuple[np.ndarray, np.ndarray, np.ndar
     return np.array(i), np.array(j), np.array(part) == "I"
 
 
-def to_real(matrix: Complex[Array, "antennas antennas *rest"]) -> Float[Array, "products *rest"]:
+def to_real(matrix: Hermitian) -> Products:
     """Return the products of a Hermitian matrix V_ij (first two axes), in luseepy's order."""
     i, j, imaginary = ports(matrix.shape[0])
     picked = matrix[i, j]
@@ -80,11 +93,9 @@ def to_real(matrix: Complex[Array, "antennas antennas *rest"]) -> Float[Array, "
     return namespace(matrix).where(imaginary, picked.imag, picked.real)
 
 
-def to_matrix(
-    products: Float[Array, "products *rest"],
-) -> Complex[Array, "antennas antennas *rest"]:
+def to_matrix(products: Products) -> Hermitian:
     """Return the Hermitian matrix V_ij of real products; inverse of :func:`to_real`."""
-    xp, n = namespace(products), round(np.sqrt(products.shape[0]))
+    xp, n = namespace(products), antennas_of(products.shape[0])
     at = {label: products[k] for k, label in enumerate(labels(n))}
     rows = []
     for i, j in np.ndindex(n, n):
@@ -103,9 +114,28 @@ AUTO_TOLERANCE = 1e-5
 NAME = re.compile(r"\s*(\d)\s*[-_x, ]?\s*(\d)\s*([RI]?)\s*", re.IGNORECASE)
 
 
-def real_products(
-    data: Any, products: Any, flags: Any, convention: str, n_antennas: int
-) -> tuple[Float[np.ndarray, "products times"], Bool[np.ndarray, "products times"]]:
+def in_order(
+    columns: Sequence[tuple[str, Float[np.ndarray, "*shape"]]], n_antennas: int = N_ANTENNAS
+) -> Float[np.ndarray, "products *shape"]:
+    """Return named columns in the package's order of products, NaN for those without one.
+
+    Raises
+    ------
+    InputError
+        For a name that is no product's, or that is given twice.
+    """
+    places = {label: place for place, label in enumerate(labels(n_antennas))}
+    grid = np.full((len(places), *columns[0][1].shape), np.nan)
+    for number, (name, values) in enumerate(columns):
+        if name not in places:
+            raise InputError(f"there is no product '{name}'; known: {', '.join(places)}")
+        if name in [other for other, _ in columns[:number]]:
+            raise InputError(f"the product {name} is given more than once; name each once")
+        grid[places[name]] = values
+    return grid
+
+
+def real_products(data: Any, products: Any, flags: Any, convention: str, n_antennas: int) -> Grid:
     """Return the real products of arrays of correlations in the package's order.
 
     Parameters
@@ -123,9 +153,7 @@ def real_products(
     Returns
     -------
     (products, times) array
-        In the unit of the data, 0 where absent.
-    (products, times) array of bool
-        Whether each is absent.
+        In the unit of the data, NaN where absent.
 
     Raises
     ------
@@ -137,40 +165,29 @@ def real_products(
     data = _numbers(data)
     if convention not in CONVENTIONS:
         raise InputError(f"unknown convention '{convention}'; {nearest(convention, CONVENTIONS)}")
-    columns = _columns(products, np.iscomplexobj(data), n_antennas)
-    if data.shape[1] != len(columns):
-        turned = "; transpose them" if data.shape[0] == len(columns) else ""
+    ports_and_parts = _columns(products, np.iscomplexobj(data), n_antennas)
+    if data.shape[1] != len(ports_and_parts):
+        turned = "; transpose them" if data.shape[0] == len(ports_and_parts) else ""
         raise InputError(
-            f"the data have shape {data.shape}, expected (times, products) with "
-            f"{len(columns)} products{turned}"
+            f"the data have shape {data.shape}, expected (times, {len(ports_and_parts)}){turned}"
         )
     absent = np.isnan(data) | masked | _flags(flags, data.shape)
     if np.isinf(data[~absent]).any():
         first = np.argwhere(np.isinf(data) & ~absent)[0]
         raise InputError(
-            f"the data hold infinity at time {first[0]}, product {first[1]}; flag such samples, or "
-            "put NaN there"
+            f"the data hold infinity at time {first[0]}, product {first[1]}; flag such samples"
         )
-    known = {label: number for number, label in enumerate(labels(n_antennas))}
-    values = np.zeros((len(known), len(data)))
-    missing = np.ones(values.shape, dtype=bool)
-    for column, (i, j, part) in enumerate(columns):
-        gone, one = absent[:, column], np.where(absent[:, column], 0.0, data[:, column])
-        sign = CONVENTIONS[convention] * (1.0 if i <= j else -1.0)
-        pair = f"{min(i, j)}{max(i, j)}"
-        parts = {part: one} if part else {"R": one.real, "I": one.imag}
-        if i == j and np.iscomplexobj(data):
-            _require_real(pair, one)
+    columns: list[tuple[str, np.ndarray]] = []
+    for (i, j, part), values, gone in zip(ports_and_parts, data.T, absent.T, strict=True):
+        pair, sign = f"{min(i, j)}{max(i, j)}", CONVENTIONS[convention] * (1.0 if i <= j else -1.0)
+        if i == j:
+            _require_real(pair, np.where(gone, 0.0, values))
+        parts = {part: values} if part else {"R": values.real, "I": values.imag}
         for name, numbers in parts.items():
-            label = f"{pair}{name}"
-            if label not in known:
-                continue
-            row = known[label]
-            if not missing[row].all():
-                raise InputError(f"the product {label} is given more than once; name each once")
-            values[row] = numbers if name == "R" else sign * numbers
-            missing[row] = gone
-    return values, missing
+            if i != j or name == "R":
+                signed = np.where(gone, np.nan, numbers if name == "R" else sign * numbers)
+                columns.append((f"{pair}{name}", signed))
+    return in_order(columns, n_antennas)
 
 
 def _numbers(data: Any) -> np.ndarray:
@@ -190,35 +207,26 @@ def _columns(products: Any, is_complex: bool, n_antennas: int) -> list[tuple[int
     """Ports and part of each column; the part is empty for complex numbers."""
     if products is None:
         ordered = all_products(n_antennas)
-        if is_complex:
-            return [(p.i, p.j, "") for p in ordered if p.part == "R"]
-        return [(p.i, p.j, p.part) for p in ordered]
+        return [(i, j, "" if is_complex else part) for i, j, part in ordered
+                if part == "R" or not is_complex]  # fmt: skip
     if isinstance(products, str):
         raise InputError(f"products is '{products}'; give a list with the name of each column")
     columns: list[tuple[int, int, str]] = []
     for name in products:
         found = NAME.fullmatch(name if isinstance(name, str) else "".join(map(str, name)))
         if not found:
-            raise InputError(
-                f"unknown product '{name}'; name the two ports, such as "
-                + ("'01'" if is_complex else "'01R' and '01I'")
-            )
+            example = "'01'" if is_complex else "'01R' and '01I'"
+            raise InputError(f"unknown product '{name}'; name the two ports, such as {example}")
         i, j, part = int(found[1]), int(found[2]), found[3].upper()
         if max(i, j) >= n_antennas:
             raise InputError(
-                f"the product '{name}' has port {max(i, j)}, but there are {n_antennas} ports "
-                f"(0 to {n_antennas - 1}); give n_antennas if there are more"
+                f"the product '{name}' has port {max(i, j)}, of ports 0 to {n_antennas - 1}; "
+                "give n_antennas if there are more"
             )
         if is_complex and part:
-            raise InputError(
-                f"the data are complex and the product is named '{name}'; name the ports alone "
-                f"('{i}{j}'), or give real and imaginary parts as two real columns"
-            )
+            raise InputError(f"the data are complex; name the ports of '{name}' alone, '{i}{j}'")
         if not is_complex and not part and i != j:
-            raise InputError(
-                f"the data are real and the product is named '{name}'; name the part, '{name}R' "
-                f"or '{name}I'"
-            )
+            raise InputError(f"the data are real; name the part of '{name}', {name}R or {name}I")
         if i == j and part == "I":
             raise InputError(f"there is no product '{name}': an auto is real")
         columns.append((i, j, part if is_complex else part or "R"))
@@ -228,29 +236,23 @@ def _columns(products: Any, is_complex: bool, n_antennas: int) -> list[tuple[int
 
 
 def _flags(flags: Any, shape: tuple[int, ...]) -> np.ndarray:
-    if flags is None:
-        return np.zeros(shape, dtype=bool)
-    flags = np.asarray(flags)
+    flags = np.zeros(shape, dtype=bool) if flags is None else np.asarray(flags)
     if flags.dtype.kind not in "biu" or not np.isin(flags, (0, 1)).all():
         raise InputError(
-            "flags hold other values than true and false; give true where a sample is not to be "
-            "used"
+            "flags hold other values than true and false; give true where samples are not used"
         )
-    if flags.shape == shape[:1]:
-        flags = flags[:, None]
-    elif flags.shape != shape:
+    if flags.shape not in (shape, shape[:1]):
         raise InputError(
             f"flags have shape {flags.shape}, expected {shape} as the data, or {shape[:1]}"
         )
-    return np.broadcast_to(flags.astype(bool), shape)
+    return (flags if flags.ndim == 2 else flags[:, None]).astype(bool)
 
 
 def _require_real(pair: str, auto: np.ndarray) -> None:
     bad = np.flatnonzero(np.abs(auto.imag) > AUTO_TOLERANCE * np.abs(auto.real))
     if bad.size:
         raise InputError(
-            f"the auto {pair} is {auto[bad[0]]:.6g} at time {bad[0]}, but an auto is real; check "
-            "the names and the order of the products"
+            f"the auto {pair} is {auto[bad[0]]:.6g} at time {bad[0]}, not real; check the names"
         )
 
 
@@ -266,36 +268,33 @@ def site_of(site: Any) -> tuple[float, float]:
         known = {name.lower(): place for name, place in SITES.items()}
         if site.lower() not in known:
             raise InputError(
-                f"unknown site '{site}'; {nearest(site, SITES)} (or give longitude and latitude in "
-                "degrees)"
+                f"unknown site '{site}'; {nearest(site, SITES)} (or give two angles in degrees)"
             )
         return known[site.lower()]
     try:
         lon, lat = (float(x) for x in site)
     except (TypeError, ValueError) as error:
         raise InputError(
-            f"the site is {site!r}; give selenographic longitude and latitude in degrees, or a "
-            f"name: {', '.join(SITES)}"
+            f"the site is {site!r}; give longitude and latitude in degrees, or {', '.join(SITES)}"
         ) from error
     return lon, lat
 
 
-def numbers_of_times(
-    name: str, values: Any, n_times: int, *, or_one: bool = False
-) -> Float[np.ndarray, " times"]:
-    """Return a finite number for each time. InputError, with the name, if there are others.
+def numbers_of_times(name: str, values: Any, n_times: int) -> Times:
+    """Return a finite number for each time, of as many or of one that stands for all.
 
-    With ``or_one`` a single number may stand for all times.
+    Raises
+    ------
+    InputError
+        If there are others; with the name.
     """
-    alone = "one number, or one for each" if or_one else "a number for each"
+    expected = f"give one finite number, or one for each of {n_times} times"
     try:
         numbers = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{name} is {values!r}; give {alone} time") from error
-    fits = numbers.shape == (n_times,) or (or_one and not numbers.ndim)
-    if not fits or not np.isfinite(numbers).all():
-        several = alone.replace("number", "finite number")
-        raise InputError(f"{name} has shape {numbers.shape}; give {several} of {n_times} times")
+        raise InputError(f"{name} is {values!r}; {expected}") from error
+    if numbers.shape not in ((), (n_times,)) or not np.isfinite(numbers).all():
+        raise InputError(f"{name} has shape {numbers.shape}; {expected}")
     return np.broadcast_to(numbers, (n_times,))
 
 
@@ -313,7 +312,7 @@ def runs_of(turntable_deg: Any, n_times: int) -> tuple[np.ndarray, tuple[float, 
     InputError
         If there are neither one angle nor as many as times, or they are not finite.
     """
-    angles = numbers_of_times("turntable_deg", turntable_deg, n_times, or_one=True)
+    angles = numbers_of_times("turntable_deg", turntable_deg, n_times)
     run = np.concatenate([[0], np.cumsum(np.diff(angles) != 0.0)]).astype(np.int64)
     return run, tuple(angles[np.searchsorted(run, np.arange(run[-1] + 1))].tolist())
 
@@ -340,7 +339,7 @@ class DataLayout(Described, eqx.Module):
         return (f"{self.n_products} products x {self.n_times} times, {self.size} data{absent}",)
 
     @classmethod
-    def from_flags(cls, flags: Bool[np.ndarray, "products times"]) -> DataLayout:
+    def from_flags(cls, flags: GridFlags) -> DataLayout:
         """Return the layout that leaves out every sample whose flag is True.
 
         Raises
@@ -413,21 +412,66 @@ class DataLayout(Described, eqx.Module):
             return data.reshape(self.n_products, self.n_times, *rest)
         xp = namespace(data, self.index)
         flat = xp.zeros((self.n_products * self.n_times, *rest), dtype=data.dtype)
-        if xp is np:
-            flat[self.index] = data
-        else:
-            flat = flat.at[self.index].set(data)
+        flat = placed(flat, self.index, data)
         return flat.reshape(self.n_products, self.n_times, *rest)
 
-    def by_time(
-        self, data: Float[Array, "data *columns"]
-    ) -> Float[Array, "times products all_columns"]:
+    def by_time(self, data: Columns) -> ByTime:
         """Return d with the products of one time together; missing samples are zero."""
         grid = self.scatter(data)
         return grid.reshape(*grid.shape[:2], -1).swapaxes(0, 1)
 
-    def from_times(
-        self, grid: Float[Array, "times products all_columns"], shape: tuple[int, ...]
-    ) -> Float[Array, "data *columns"]:
+    def from_times(self, grid: ByTime, shape: tuple[int, ...]) -> Columns:
         """Return the array of this shape that :meth:`by_time` has made ``grid`` of."""
         return self.gather(grid.swapaxes(0, 1)).reshape(shape)
+
+
+def without_gaps(visibilities: Grid, layout: DataLayout) -> Grid:
+    """Return visibilities with a value at every sample, for the noise around them.
+
+    The noise of a sample depends on the antenna temperatures of its ports, and in the exact form
+    on all products of its time. Where one of these is absent, it is interpolated linearly between
+    the samples of the same product before and after it (at the ends the nearest one is taken). A
+    cross that was never measured is zero: its ports are taken to be uncorrelated. The auto of a
+    port that was never used is the mean of the others, and no sample depends on it.
+
+    Parameters
+    ----------
+    visibilities : (products, times) array
+        In K. A sample is absent where it is not in the layout, and its value is 0 (as
+        :meth:`DataLayout.scatter` leaves it) or NaN; a model's values at absent samples are kept.
+    layout : DataLayout
+
+    Returns
+    -------
+    (products, times) array
+
+    Raises
+    ------
+    InputError
+        If an auto is absent at all times, but a product of its port is not.
+    """
+    if layout.index is None or is_traced(visibilities, layout.index):
+        return visibilities
+    values, present = np.array(visibilities), np.asarray(layout.present)
+    absent = ~present & (np.isnan(values) | (values == 0.0))
+    if not absent.any():
+        return visibilities
+    products = all_products(antennas_of(layout.n_products))
+    times, measured = np.arange(layout.n_times), present.any(1)
+    for gaps, row in zip(absent, values, strict=True):
+        if gaps.any():
+            known = ~gaps
+            row[gaps] = np.interp(times[gaps], times[known], row[known]) if known.any() else 0.0
+    autos = np.array([p.i == p.j for p in products])
+    unused = np.flatnonzero(autos & absent.all(1))
+    for auto in (products[k] for k in unused):
+        for product, is_there in zip(products, measured, strict=True):
+            if is_there and auto.i in (product.i, product.j):
+                raise InputError(
+                    f"the auto {auto.label} is absent at all times, and the noise of "
+                    f"{product.label} depends on it; give modelled visibilities of all samples, "
+                    "such as the signal of a CouplingMatrix without flags"
+                )
+    if unused.size:
+        values[unused] = values[autos & ~absent.all(1)].mean(0)
+    return namespace(visibilities).asarray(values)

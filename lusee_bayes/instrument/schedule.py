@@ -19,22 +19,17 @@ from functools import cached_property, lru_cache
 from io import StringIO
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from astropy.time import Time
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array, namespace
-from lusee_bayes.core.checks import is_traced, require_positive
+from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import pandas
 from lusee_bayes.core.reading import naming, parse_yaml, read_text, reading
-from lusee_bayes.instrument.products import DataLayout, all_products
 from lusee_bayes.instrument.times import (
     ROUNDING_S,
-    Windows,
-    later,
     require_ephemeris,
     seconds_from,
     unannounced_leap_seconds,
@@ -95,21 +90,15 @@ class Interval:
     where: str = field(default="", compare=False)
 
     def __post_init__(self):
-        place = f"{self.where}: " if self.where else ""
         if not self.length_s > ROUNDING_S:
             raise InputError(
-                f"{place}end {self.end} does not come after start {self.start}; give the dates "
-                "between which is observed"
+                f"end {self.end} does not come after start {self.start}; exchange them"
             )
         if not np.isfinite(self.turntable_deg):
-            raise InputError(
-                f"{place}turntable_deg is {self.turntable_deg}; give an angle in degrees, positive "
-                "from East towards North"
-            )
+            raise InputError(f"turntable_deg is {self.turntable_deg}; give an angle in degrees")
         if not 0.0 < self.duty_cycle <= 1.0:
             raise InputError(
-                f"{place}duty_cycle is {self.duty_cycle:g}; give the fraction of the time that is "
-                "integrated, above 0 and up to 1, and leave out intervals in which nothing is"
+                f"duty_cycle is {self.duty_cycle:g}; give the fraction integrated, above 0, up to 1"
             )
 
     @cached_property
@@ -128,173 +117,77 @@ class Interval:
 
     def _date(self, name: str, text: str) -> Time:
         # astropy knows no Z, which ISO has for UTC
-        return utc_from_text(
-            f"{self.where}: {name}" if self.where else name, text.removesuffix("Z")
-        )
+        return utc_from_text(name, text.removesuffix("Z"))
 
 
 @dataclass(frozen=True)
-class Cuts:
-    """Stretches of observing, cut into samples.
+class Cut:
+    """A run or an interval, cut into samples.
 
     Attributes
     ----------
-    t0 : Time
-        Beginning of the first sample.
     start_s : (samples,) array
-        Beginning of every sample, in seconds from ``t0``.
+        Beginning of every sample, in seconds from the first of all.
     length_s, live_s : (samples,) array
         How long it lasts, and what of that was integrated, in seconds.
-    stretch : (samples,) array of int
-        The run or interval that it lies in.
-    run : (samples,) array of int
-        The same, but one number for neighbours at the same turntable angle in a schedule.
-    turntable_deg : (runs,) tuple of float
-    night_only : (stretches,) tuple of bool
-    names : (stretches,) tuple of str
-        What messages call them.
+    of : Run or Interval
+    name : str
+        What messages call it.
     """
 
-    t0: Time
     start_s: Float[np.ndarray, " samples"]
     length_s: Float[np.ndarray, " samples"]
     live_s: Float[np.ndarray, " samples"]
-    stretch: Int[np.ndarray, " samples"]
-    run: Int[np.ndarray, " samples"]
-    turntable_deg: tuple[float, ...]
-    night_only: tuple[bool, ...]
-    names: tuple[str, ...]
-
-    def samples(self, window: Literal["instant", "mean"]) -> tuple[Time, Windows | None]:
-        """Return the times of the samples, and what they are the means of.
-
-        Parameters
-        ----------
-        window : {"instant", "mean"}
-            Whether a sample is the sky at its beginning, or the mean over its window, of which the
-            middle is its time then.
-
-        Returns
-        -------
-        times : (samples,) Time
-            UTC.
-        windows : Windows or None
-            None for instants.
-
-        Raises
-        ------
-        InputError
-            For times outside the ephemeris, and for a duty cycle of instants.
-        """
-        seconds, windows = self.start_s, None
-        require_ephemeris(np.array([self.t0.jd + seconds[-1] / 86400.0]))
-        if window == "mean":
-            half = self.length_s / 2.0
-            seconds, windows = seconds + half, Windows.whole(-half, half, self.live_s)
-        elif (self.live_s < self.length_s).any():
-            raise InputError(
-                "samples that are instants have no duty cycle; take windows "
-                "(observation.window=mean), or leave out the schedule's duty_cycle"
-            )
-        return later(self.t0, seconds), windows
-
-    def by_night(self, dark: Bool[np.ndarray, " samples"]) -> Bool[np.ndarray, " samples"]:
-        """Return the samples that are left where nights alone are wanted.
-
-        Parameters
-        ----------
-        dark : (samples,) array of bool
-            Whether the Sun is down.
-
-        Raises
-        ------
-        InputError
-            If nothing is left of a run or interval.
-        """
-        keep = dark | ~np.array(self.night_only)[self.stretch]
-        for number, name in enumerate(self.names):
-            if not keep[self.stretch == number].any():
-                raise InputError(
-                    f"{name} holds no lunar night; lengthen it, move its start or drop night_only"
-                )
-        return keep
+    of: Run | Interval
+    name: str
 
 
-def cut_runs(runs: Sequence[Run], start: str, step_s: float) -> Cuts:
+def cut_runs(runs: Sequence[Run], step_s: float) -> list[Cut]:
     """Cut runs that follow one another into whole steps; see :meth:`.Observation.from_runs`.
 
     Raises
     ------
     InputError
-        For a bad date, step or length, for a run without samples, and if there is no run.
+        For a bad step or length, for a run without samples, and if there is no run.
     """
     require_positive("step_s", step_s)
     if not runs:
         raise InputError("an observation needs at least one run, got none")
-    t0 = utc_from_text("start", start)
-    elapsed, stretches = 0.0, []
+    elapsed, cuts = 0.0, []
     for number, run in enumerate(runs):
         require_positive(f"the length in cycles of run {number}", run.cycles)
         length = run.cycles * CYCLE_DAYS * 86400.0
         n = int(length // step_s)
         if n < 1:
             raise InputError(
-                f"run {number} of {run.cycles} cycles holds no sample of {step_s} s; "
-                "lengthen it or shorten step_s"
+                f"run {number} of {run.cycles} cycles holds no sample of {step_s} s; shorten step_s"
             )
         steps = np.full(n, float(step_s))
-        stretches.append((elapsed + step_s * np.arange(n), steps, steps))
+        cuts.append(Cut(elapsed + step_s * np.arange(n), steps, steps, run, f"run {number}"))
         elapsed += length
-    names = tuple(f"run {number}" for number in range(len(runs)))
-    angles = tuple(run.turntable_deg for run in runs)
-    return _joined(t0, stretches, np.arange(len(runs)), angles, runs, names)
+    return cuts
 
 
-def _joined(
-    t0: Time,
-    stretches: list[tuple[np.ndarray, ...]],
-    run: Int[np.ndarray, " stretches"],
-    turntable_deg: tuple[float, ...],
-    asked: Sequence[Run | Interval],
-    names: tuple[str, ...],
-) -> Cuts:
-    """Starts, lengths and live times of all stretches, one after the other."""
-    number = np.repeat(np.arange(len(stretches)), [len(starts) for starts, _, _ in stretches])
-    seconds = (np.concatenate(one) for one in zip(*stretches, strict=True))
-    nights = tuple(one.night_only for one in asked)
-    return Cuts(t0, *seconds, number, run[number], turntable_deg, nights, names)
-
-
-def cut_intervals(intervals: Sequence[Interval], step_s: float) -> Cuts:
+def cut_intervals(intervals: Sequence[Interval], step_s: float) -> list[Cut]:
     """Cut every interval into steps from its start, of which the last may be shorter.
 
     Raises
     ------
     InputError
-        For a bad step, and as :func:`require_sequence`.
+        For a bad step, and as :func:`named_in_order`.
     """
     require_positive("step_s", step_s)
-    require_sequence(intervals)
-    t0 = intervals[0].start_time
-    stretches = []
-    for interval in intervals:
+    cuts = []
+    for name, interval in named_in_order(intervals):
         begins = step_s * np.arange(interval.n_samples(step_s))
         length = np.diff(begins, append=interval.length_s)
-        start = seconds_from(t0, interval.start_time) + begins
-        stretches.append((start, length, interval.duty_cycle * length))
-    given = np.array([interval.turntable_deg for interval in intervals])
-    turned = np.append(True, np.diff(given) != 0.0)
-    run, angles = np.cumsum(turned) - 1, tuple(given[turned].tolist())
-    return _joined(t0, stretches, run, angles, intervals, _names(intervals))
+        start = seconds_from(intervals[0].start_time, interval.start_time) + begins
+        cuts.append(Cut(start, length, interval.duty_cycle * length, interval, name))
+    return cuts
 
 
-def _names(intervals: Sequence[Interval]) -> tuple[str, ...]:
-    """Where intervals are written, or their numbers."""
-    return tuple(one.where or f"interval {number}" for number, one in enumerate(intervals))
-
-
-def require_sequence(intervals: Sequence[Interval]) -> None:
-    """Check that the intervals of a schedule come one after the other.
+def named_in_order(intervals: Sequence[Interval]) -> list[tuple[str, Interval]]:
+    """Return intervals that come one after the other, each with what messages call it.
 
     Raises
     ------
@@ -303,21 +196,21 @@ def require_sequence(intervals: Sequence[Interval]) -> None:
     """
     if not intervals:
         raise InputError("a schedule needs at least one interval, got none")
-    names = _names(intervals)
-    for number, after in enumerate(intervals[1:]):
-        before = intervals[number]
+    named = [(one.where or f"interval {number}", one) for number, one in enumerate(intervals)]
+    for (_, before), (name, after) in pairwise(named):
         ahead = seconds_from(before.start_time, after.start_time)
         if ahead < 0.0:
             raise InputError(
-                f"{names[number + 1]}: the interval from {after.start} begins before the one that "
+                f"{name}: the interval from {after.start} begins before the one that "
                 f"precedes it, from {before.start}; sort the intervals by their start"
             )
         overlap = before.length_s - ahead
         if overlap > ROUNDING_S:
             raise InputError(
-                f"{names[number + 1]}: the interval from {after.start} begins {overlap:g} s before "
+                f"{name}: the interval from {after.start} begins {overlap:g} s before "
                 f"the one that precedes it ends, {before.end}; give each stretch of time once"
             )
+    return named
 
 
 WHAT = "a schedule, a table in CSV or OpSim's in YAML"
@@ -358,7 +251,7 @@ def _parsed(path: str, text: str) -> tuple[Interval, ...]:
     is_yaml = Path(path).suffix in (".yaml", ".yml")
     intervals = _of_commands(path, text) if is_yaml else _of_table(path, text)
     with naming(path):
-        require_sequence(intervals)
+        named_in_order(intervals)
     return intervals
 
 
@@ -373,10 +266,11 @@ def _of_table(path: str, text: str) -> tuple[Interval, ...]:
             f"{path} has the columns {', '.join(table.columns)}; a schedule has "
             f"{', '.join(sorted(REQUIRED))}, and may have {' and '.join(sorted(OPTIONAL))}"
         )
-    return tuple(
-        _interval(f"{path}, row {number}", row)
-        for number, row in enumerate(table.to_dict("records"), start=1)
-    )
+    intervals = []
+    for number, row in enumerate(table.to_dict("records"), start=1):
+        with naming(place := f"{path}, row {number}"):
+            intervals.append(_interval(place, row))
+    return tuple(intervals)
 
 
 def _interval(place: str, row: dict[str, str]) -> Interval:
@@ -385,13 +279,11 @@ def _interval(place: str, row: dict[str, str]) -> Interval:
         try:
             numbers[name] = float(row.get(name) or default)
         except ValueError as error:
-            raise InputError(f"{place}: {name} is '{row[name]}', not a number") from error
-    night_only = (row.get("night_only", "").strip() or "false").lower()
-    if night_only not in ("true", "false"):
-        raise InputError(f"{place}: night_only is '{night_only}'; write true or false")
-    return Interval(
-        row["start"], row["end"], **numbers, night_only=night_only == "true", where=place
-    )
+            raise InputError(f"{name} is '{row[name]}', not a number") from error
+    night = (row.get("night_only", "").strip() or "false").lower()
+    if night not in ("true", "false"):
+        raise InputError(f"night_only is '{night}'; write true or false")
+    return Interval(row["start"], row["end"], **numbers, night_only=night == "true", where=place)
 
 
 def _of_commands(path: str, text: str) -> tuple[Interval, ...]:
@@ -411,8 +303,7 @@ def _of_commands(path: str, text: str) -> tuple[Interval, ...]:
             )
     if entries and entries[-1][2] == OBSERVING:
         raise InputError(
-            f"{entries[-1][0]}: the last entry is in the mode {OBSERVING}, and nothing says when "
-            "it ends; add an entry of another mode"
+            f"{entries[-1][0]}: the last entry, {OBSERVING}, has no end; add one of another mode"
         )
     return tuple(
         Interval(_date(start), _date(end), where=place)
@@ -439,67 +330,3 @@ def _date(mjd: float) -> str:
     """To the microsecond, which is all that a double holds of it."""
     with unannounced_leap_seconds():
         return str(Time(mjd, format="mjd", scale="utc", precision=6).isot)
-
-
-def without_gaps(
-    visibilities: Float[Array, "products times"], layout: DataLayout
-) -> Float[Array, "products times"]:
-    """Return visibilities with a value at every sample, for the noise around them.
-
-    The noise of a sample depends on the antenna temperatures of its ports, and in the exact form
-    on all products of its time. Where one of these is absent, it is interpolated linearly between
-    the samples of the same product before and after it (at the ends the nearest one is taken). A
-    cross that was never measured is zero: its ports are taken to be uncorrelated. The auto of a
-    port that was never used is the mean of the others, and no sample depends on it.
-
-    Parameters
-    ----------
-    visibilities : (products, times) array
-        In K. A sample is absent where it is not in the layout, and its value is 0 (as
-        :meth:`DataLayout.scatter` leaves it) or NaN; a model's values at absent samples are kept.
-    layout : DataLayout
-
-    Returns
-    -------
-    (products, times) array
-
-    Raises
-    ------
-    InputError
-        If an auto is absent at all times, but a product of its port is not.
-    """
-    if layout.index is None or is_traced(visibilities, layout.index):
-        return visibilities
-    values, present = np.array(visibilities), np.asarray(layout.present)
-    absent = ~present & (np.isnan(values) | (values == 0.0))
-    if not absent.any():
-        return visibilities
-    products = all_products(round(np.sqrt(layout.n_products)))
-    times = np.arange(layout.n_times)
-    unused = []
-    for number, product in enumerate(products):
-        gaps = absent[number]
-        if not gaps.any():
-            continue
-        if not gaps.all():
-            values[number, gaps] = np.interp(times[gaps], times[~gaps], values[number, ~gaps])
-        elif product.i != product.j:
-            values[number] = 0.0
-        else:
-            _require_unused(product.i, present)
-            unused.append(number)
-    if unused:
-        autos = [k for k, p in enumerate(products) if p.i == p.j and k not in unused]
-        values[unused] = values[autos].mean(0)
-    return namespace(visibilities).asarray(values)
-
-
-def _require_unused(port: int, present: np.ndarray) -> None:
-    products = all_products(round(np.sqrt(len(present))))
-    for product, there in zip(products, present.any(1), strict=True):
-        if there and port in (product.i, product.j):
-            raise InputError(
-                f"the auto {port}{port}R is absent at all times, and the noise of "
-                f"{product.label} depends on it; give modelled visibilities of all samples, such "
-                "as the signal of a CouplingMatrix without flags"
-            )

@@ -28,19 +28,20 @@ import astropy.units as u
 import erfa
 import numpy as np
 from astropy.time import Time
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int
 
+from lusee_bayes.core.arrays import Times
 from lusee_bayes.core.checks import Described, require_finite
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.layouts import Attribute, Content
 from lusee_bayes.core.reading import naming
 
+Numbers, Nodes = Int[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]
 EPHEMERIS_YEARS = (1900, 2050)
 # scales of time that files may state
 SCALES = ("utc", "tai", "tt", "tdb")
 # what a file of Julian dates in two parts, jd1 and jd2, may state of them
 JD_SCALES = {name: Attribute("text", optional=True) for name in ("jd1.scale", "jd2.scale")}
-EPOCH, CENTURIES = np.datetime64("2000-01-01"), np.timedelta64(100_000, "D")
 
 
 @contextmanager
@@ -82,7 +83,7 @@ def utc_from_text(name: str, text: str) -> Time:
     return time
 
 
-def require_ephemeris(jd: Float[np.ndarray, " times"]) -> None:
+def require_ephemeris(jd: Times) -> None:
     """Check that Julian dates lie within lunarsky's kernel of the Moon's orientation.
 
     Raises
@@ -110,9 +111,7 @@ def _ephemeris_jd() -> tuple[float, ...]:
     return tuple(float(Time(f"{year}-01-01", scale="tdb").jd) for year in EPHEMERIS_YEARS)
 
 
-def utc_of(
-    jd1: Float[np.ndarray, " times"], jd2: Float[np.ndarray, " times"], scale: str = "utc"
-) -> Time:
+def utc_of(jd1: Times, jd2: Times, scale: str = "utc") -> Time:
     """Return times of Julian dates in two parts, in UTC.
 
     Raises
@@ -149,20 +148,6 @@ def utc_of_jd(found: Content) -> Time:
     return utc_of(found.arrays["jd1"], found.arrays["jd2"], scales.pop())
 
 
-def utc_of_datetimes(times: Shaped[np.ndarray, "*shape"]) -> Time:
-    """Return times of an array of datetime64 in UTC, all at once.
-
-    Raises
-    ------
-    InputError
-        If one is outside the ephemeris.
-    """
-    with unannounced_leap_seconds():
-        found = Time(times, format="datetime64", scale="utc")
-    require_ephemeris(np.ravel(found.jd))
-    return found
-
-
 def utc_times(times: Any) -> Time:
     """Return times of any kind in UTC.
 
@@ -176,22 +161,24 @@ def utc_times(times: Any) -> Time:
     InputError
         If they are none, or outside the ephemeris.
     """
-    if not isinstance(times, Time):
-        given = np.atleast_1d(np.asarray(times)).ravel()
-        if given.dtype.kind == "M":
-            if (np.abs(given - EPOCH) < CENTURIES).all():
-                return utc_of_datetimes(given)
-            # what is no date, or so far away that astropy cannot read it, is named by what follows
-            given = np.datetime_as_string(given)
-        listed = given.tolist()
-        return Time([_utc(number, one) for number, one in enumerate(listed)])
-    times = times.reshape(-1)
-    require_ephemeris(np.asarray(times.jd))
-    with unannounced_leap_seconds():
-        return times.utc
+    if isinstance(times, Time):
+        require_ephemeris(np.ravel(times.jd))
+        with unannounced_leap_seconds():
+            return times.reshape(-1).utc
+    given = np.atleast_1d(np.asarray(times)).ravel()
+    listed = np.datetime_as_string(given, unit="ns") if given.dtype.kind == "M" else given
+    texts = [_as_text(number, one) for number, one in enumerate(listed.tolist())]
+    try:
+        with unannounced_leap_seconds():
+            found = Time(texts, scale="utc")
+    except ValueError:
+        # dates of several forms, or something else that the message names
+        return Time([utc_from_text(f"time {k}", text) for k, text in enumerate(texts)])
+    require_ephemeris(found.jd)
+    return found
 
 
-def _utc(number: int, one: Any) -> Time:
+def _as_text(number: int, one: Any) -> str:
     if isinstance(one, datetime):
         one = one.astimezone(UTC).replace(tzinfo=None) if one.tzinfo else one
         one = one.isoformat()
@@ -201,7 +188,7 @@ def _utc(number: int, one: Any) -> Time:
             "UTC, or an astropy Time"
         )
     # astropy knows no Z, which ISO has for UTC
-    return utc_from_text(f"time {number}", one.removesuffix("Z"))
+    return one.removesuffix("Z")
 
 
 def step_of(times: Time, step_s: float | None) -> float:
@@ -219,8 +206,15 @@ def step_of(times: Time, step_s: float | None) -> float:
     return float(np.median(np.abs(seconds_from(times[:-1], times[1:]))))
 
 
+def counts_up(numbers: Int[np.ndarray, " n"]) -> bool:
+    """Return whether whole numbers count 0, 1, ... without going back or leaving one out."""
+    return numbers[0] == 0 and bool(np.isin(np.diff(numbers), (0, 1)).all())
+
+
 # times of a Julian date in two parts are exact to less than a nanosecond, others to a few of them
 ROUNDING_S = 1e-6
+# for people they are written to the millisecond
+EYE_S = 0.01
 
 
 @dataclass(frozen=True, repr=False)
@@ -255,41 +249,33 @@ class Windows(Described):
                 "sample, start_s, end_s and live_s of windows must be lists of the same length, "
                 f"with at least one piece; got the shapes {sorted(lengths)}"
             )
-        steps = np.diff(self.sample)
-        if self.sample[0] != 0 or not ((steps == 0) | (steps == 1)).all():
+        if not counts_up(self.sample):
             raise InputError(
                 "pieces of windows must count the samples 0, 1, ... without going back, with at "
                 "least one piece for each"
             )
         for name in ("start_s", "end_s", "live_s"):
             require_finite(f"{name} of the windows", getattr(self, name))
-        length = self.end_s - self.start_s
-        same = np.zeros(len(length), dtype=bool)
-        same[1:] = (steps == 0) & (self.start_s[1:] < self.end_s[:-1] - ROUNDING_S)
+        start, end, live = self.start_s, self.end_s, self.live_s
+        early = (np.diff(self.sample) == 0) & (start[1:] < end[:-1] - ROUNDING_S)
         rules = (
-            (~(length > 0.0), "ends {end:g} s from its time, not after its start at {start:g} s; "
-             "windows need a start and then an end"),
-            (self.live_s > length + ROUNDING_S, "was live for {live:g} s of a window of {length:g} "
-             "s; live time cannot be longer than the window"),
-            (~(self.live_s > 0.0), "has a live time of {live:g} s; leave out samples in which "
-             "nothing was integrated"),
-            (same, "has a piece that begins at {start:g} s, before the one before it has ended; "
-             "pieces of a window must not overlap"),
+            (end <= start, "ends {1:g} s from its time, not after its start at {0:g} s; windows "
+             "need a start and then an end"),
+            (live > end - start + ROUNDING_S, "was live for {2:g} s of a window of {3:g} s; live "
+             "time cannot be longer than the window"),
+            (live <= 0.0, "has a live time of {2:g} s; leave out samples in which nothing was "
+             "integrated"),
+            (np.append(False, early), "has a piece that begins at {0:g} s, before the one before "
+             "it has ended; pieces of a window must not overlap"),
         )  # fmt: skip
-        values = {"start": self.start_s, "end": self.end_s, "live": self.live_s, "length": length}
         for wrong, text in rules:
             if wrong.any():
-                first = int(np.argmax(wrong))
-                here = {name: float(value[first]) for name, value in values.items()}
-                raise InputError(f"sample {self.sample[first]} {text.format(**here)}")
+                k = int(np.argmax(wrong))
+                text = text.format(start[k], end[k], live[k], end[k] - start[k])
+                raise InputError(f"sample {self.sample[k]} {text}")
 
     @classmethod
-    def whole(
-        cls,
-        start_s: Float[np.ndarray, " samples"],
-        end_s: Float[np.ndarray, " samples"],
-        live_s: Float[np.ndarray, " samples"] | None = None,
-    ) -> Windows:
+    def whole(cls, start_s: Times, end_s: Times, live_s: Times | None = None) -> Windows:
         """Return windows of one piece each, live all of the time unless ``live_s`` says less."""
         live_s = end_s - start_s if live_s is None else live_s
         return cls(np.arange(len(start_s)), start_s, end_s, live_s)
@@ -332,9 +318,7 @@ class Windows(Described):
             next.
         """
         if self.n_samples != len(times):
-            raise InputError(
-                f"there are windows of {self.n_samples} samples for {len(times)} times"
-            )
+            raise InputError(f"windows of {self.n_samples} samples for {len(times)} times")
         bounds = self.bounds_s
         length = bounds[:, 1] - bounds[:, 0]
         if (length > step_s * (1.0 + 1e-9) + ROUNDING_S).any():
@@ -351,15 +335,32 @@ class Windows(Described):
                 f"overlap by {-gaps[first]:g} s; give each stretch of time to one sample"
             )
 
+    def require_bounds(self, times: Time, bounds: Any) -> None:
+        """Check that windows of samples at these times have these bounds, which people read.
+
+        Raises
+        ------
+        InputError
+            If they differ by more than a hundredth of a second.
+        """
+        seconds = seconds_from(times[:, None], utc_bounds(bounds, len(times)))
+        if self.n_samples != len(times):
+            return  # an Observation says so
+        off = np.abs(seconds - self.bounds_s).max(axis=1)
+        if (off > EYE_S).any():
+            first = int(np.argmax(off > EYE_S))
+            raise InputError(
+                f"time_bounds and the pieces of sample {first} differ by {off[first]:g} s; change "
+                "both, or leave out the variables of the pieces"
+            )
+
     def select(self, keep: Bool[np.ndarray, " samples"]) -> Windows:
         """Return the windows of the samples where ``keep`` is True."""
         here = keep[self.sample]
         _, sample = np.unique(self.sample[here], return_inverse=True)
         return Windows(sample, self.start_s[here], self.end_s[here], self.live_s[here])
 
-    def nodes(
-        self, n: int
-    ) -> tuple[Int[np.ndarray, " nodes"], Float[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]]:
+    def nodes(self, n: int) -> tuple[Numbers, Nodes, Nodes]:
         """Return instants whose weighted means are those over the windows (Gauss-Legendre).
 
         Parameters
@@ -391,84 +392,69 @@ TO_MIDDLE = {"start": 0.5, "middle": 0.0, "end": -0.5}
 ROUNDED_S, ROUNDED_SHARE = 1e-3, 1e-4
 
 
-def stamped(
-    times: Time, timestamp: str, step_s: float, live_s: Float[np.ndarray, " times"] | None = None
-) -> tuple[Time, Windows | None]:
-    """Return the middles and the windows of samples that last for a step each.
+def windows_of(
+    times: Time,
+    timestamp: str,
+    step_s: float | None = None,
+    live_s: Times | None = None,
+    bounds: Any = None,
+) -> tuple[Time, float, Windows | None]:
+    """Return the middles, the step and the windows of samples.
 
     Parameters
     ----------
     times : (times,) Time
+        With bounds, anywhere within the samples.
     timestamp : {"start", "middle", "end", "instant"}
-        What they are.
-    step_s : float
-        Length of the windows, in seconds.
+        What they are; without bounds samples last for a step each.
+    step_s : float, optional
+        From sample to sample, in seconds; by default the median.
     live_s : (times,) array, optional
-        What was integrated in them, in seconds; all of the time by default.
+        What was integrated, in seconds; all of the time by default.
+    bounds : (times, 2) array of any kind of times, optional
+        Start and end of each.
 
     Returns
     -------
     Time
         The middles; for instants the times as they are.
+    float
+        The step in seconds.
     Windows or None
         None for instants.
 
     Raises
     ------
     InputError
-        For another timestamp, for instants with live times, and as :class:`.Windows`.
+        For another timestamp, for instants with live times or bounds, for a time outside its
+        bounds, without a step for a single sample, and as :class:`.Windows`.
     """
+    if bounds is not None and timestamp != "instant":
+        return _bounded(times, utc_bounds(bounds, len(times)), step_s, live_s)
+    step_s = step_of(times, step_s)
     if timestamp == "instant":
-        if live_s is not None:
-            raise InputError(
-                "instants have no live time; say whether the times are the start, middle or end "
-                "of the samples, or leave out the live time"
-            )
-        return times, None
+        if live_s is not None or bounds is not None:
+            what = "live time" if bounds is None else "bounds"
+            raise InputError(f"instants have no {what}; leave it out, or give another timestamp")
+        return times, step_s, None
     if timestamp not in TO_MIDDLE:
-        raise InputError(
-            f"unknown timestamp '{timestamp}'; {nearest(timestamp, [*TO_MIDDLE, 'instant'])}"
-        )
-    middles = later(times, TO_MIDDLE[timestamp] * step_s)
-    half = np.full(len(times), step_s / 2.0)
-    return middles, _windows(seconds_from(times[0], times), -half, half, step_s, live_s)
+        known = [*TO_MIDDLE, "instant"]
+        raise InputError(f"unknown timestamp '{timestamp}'; {nearest(timestamp, known)}")
+    ones = np.ones(len(times))
+    start, end = (step_s * (TO_MIDDLE[timestamp] + side) * ones for side in (-0.5, 0.5))
+    return _windowed(times, start, end, step_s, live_s)
 
 
-def bounded(
-    times: Time,
-    bounds: Time,
-    step_s: float | None = None,
-    live_s: Float[np.ndarray, " times"] | None = None,
+def _bounded(
+    times: Time, bounds: Time, step_s: float | None, live_s: Times | None
 ) -> tuple[Time, float, Windows]:
-    """Return the middles, the step and the windows of samples whose start and end are known.
-
-    Parameters
-    ----------
-    times : (times,) Time
-        Anywhere within the samples.
-    bounds : (times, 2) Time
-        Start and end of each.
-    step_s : float, optional
-        In seconds; by default the median step from sample to sample.
-    live_s : (times,) array, optional
-        What was integrated, in seconds; all of the time by default.
-
-    Raises
-    ------
-    InputError
-        For a time outside its bounds, without a step for a single sample, and as
-        :class:`.Windows`.
-    """
     start, end = (seconds_from(times, bounds[:, k]) for k in (0, 1))
-    middles = later(times, (start + end) / 2.0)
-    seconds = seconds_from(middles[0], middles)
     length = end - start
     step = step_of(times, float(length[0]) if step_s is None and len(times) == 1 else step_s)
     rounding = _rounding(step)
-    outside = (start > rounding) | (end < -rounding)
-    backward = ~(length > 0.0)
-    if (outside & ~backward).any():
-        first = int(np.argmax(outside & ~backward))
+    outside = ((start > rounding) | (end < -rounding)) & (length > 0.0)
+    if outside.any():
+        first = int(np.argmax(outside))
         raise InputError(
             f"the time of sample {first} ({times[first].isot[:19]}) is not within its bounds, "
             f"which begin {start[first]:g} s and end {end[first]:g} s from it; give bounds in the "
@@ -476,7 +462,7 @@ def bounded(
         )
     if step_s is None and step < length.max() <= step + rounding:
         step = float(length.max())
-    return middles, step, _windows(seconds, -length / 2.0, length / 2.0, step, live_s)
+    return _windowed(times, start, end, step, live_s)
 
 
 def utc_bounds(bounds: Any, n_times: int) -> Time:
@@ -497,10 +483,7 @@ def utc_bounds(bounds: Any, n_times: int) -> Time:
     """
     bounds = bounds if isinstance(bounds, Time) else np.asarray(bounds)
     if bounds.shape != (n_times, 2):
-        raise InputError(
-            f"bounds have shape {bounds.shape}, expected ({n_times}, 2): start and end of every "
-            "sample"
-        )
+        raise InputError(f"bounds have shape {bounds.shape}, expected ({n_times}, 2)")
     with naming("bounds, taken row by row"):
         return utc_times(bounds).reshape(n_times, 2)
 
@@ -509,20 +492,16 @@ def _rounding(step_s: float) -> float:
     return max(ROUNDED_S, ROUNDED_SHARE * step_s)
 
 
-def _windows(
-    seconds: Float[np.ndarray, " times"],
-    start_s: Float[np.ndarray, " times"],
-    end_s: Float[np.ndarray, " times"],
-    step_s: float,
-    live_s: Float[np.ndarray, " times"] | None,
-) -> Windows:
-    """Windows of one piece each, about ``seconds``, with overlaps by rounding cut off."""
-    overlap = end_s[:-1] - start_s[1:] - np.diff(seconds)
+def _windowed(
+    times: Time, start_s: Times, end_s: Times, step_s: float, live_s: Times | None
+) -> tuple[Time, float, Windows]:
+    """Middles of windows of one piece each, and these, with overlaps by rounding cut off."""
+    middles, half = later(times, (start_s + end_s) / 2.0), (end_s - start_s) / 2.0
+    overlap = end_s[:-1] - start_s[1:] - np.diff(seconds_from(times[0], times))
     cut = np.where((overlap > 0.0) & (overlap <= _rounding(step_s)), overlap / 2.0, 0.0)
-    start_s = start_s + np.append(0.0, cut)
-    end_s = end_s - np.append(cut, 0.0)
+    start_s, end_s = np.append(0.0, cut) - half, half - np.append(cut, 0.0)
     if live_s is not None:
         length = end_s - start_s
         rounded = (live_s > length) & (live_s <= length + _rounding(step_s))
         live_s = np.where(rounded, length, live_s)
-    return Windows.whole(start_s, end_s, live_s)
+    return middles, step_s, Windows.whole(start_s, end_s, live_s)

@@ -36,66 +36,38 @@ from lusee_bayes.core.checks import (
 )
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing, user_path
-from lusee_bayes.core.formats import read_netcdf
+from lusee_bayes.core.formats import as_dataset, read_netcdf
 from lusee_bayes.core.harmonics import lmax_of, n_modes
 from lusee_bayes.core.layouts import Attribute, Content, Layout, Variable, require_mhz
 from lusee_bayes.core.reading import naming, require_file
-from lusee_bayes.core.version import __version__
-from lusee_bayes.instrument.beams.monopoles import MeasuredReceiver, receiver_of
+from lusee_bayes.instrument.beams.source import MeasuredReceiver, receiver_of
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import (
     N_ANTENNAS,
     DataLayout,
+    antennas_of,
     labels,
     numbers_of_times,
     real_products,
     runs_of,
     site_of,
 )
-from lusee_bayes.instrument.times import (
-    JD_SCALES,
-    Windows,
-    bounded,
-    later,
-    seconds_from,
-    stamped,
-    step_of,
-    utc_bounds,
-    utc_of_datetimes,
-    utc_of_jd,
-    utc_times,
-)
+from lusee_bayes.instrument.times import JD_SCALES, Windows, later, utc_of_jd, utc_times, windows_of
 
 PIECES = ("piece_sample", "piece_start_s", "piece_end_s", "piece_live_s")
 # times for people are written to the millisecond
-EYE = {"units": "milliseconds since 1970-01-01", "calendar": "proleptic_gregorian"}
-ENCODING = EYE | {"dtype": "int64"}
-EYE_S = 0.01
-
-
-def window_variables(observation: Observation) -> dict[str, tuple[Any, ...]]:
-    """Return the variables of a Dataset that hold the windows of an observation, if it has any."""
-    windows = observation.windows
-    if windows is None:
-        return {}
-    bounds = later(observation.times[:, None], windows.bounds_s)
-    values = (windows.sample, windows.start_s, windows.end_s, windows.live_s)
-    return {
-        "time_bounds": (("time", "bounds"), _datetimes(bounds), {}, ENCODING),
-        "live_time": (("time",), windows.live_per_sample_s, {"units": "s"}),
-        "piece_sample": (("piece",), values[0]),
-        **{
-            name: (("piece",), value, {"units": "s"})
-            for name, value in zip(PIECES[1:], values[1:], strict=True)
-        },
-    }
+ENCODING = {
+    "units": "milliseconds since 1970-01-01",
+    "calendar": "proleptic_gregorian",
+    "dtype": "int64",
+}
 
 
 def _datetimes(times: Time) -> np.ndarray:
     return times.isot.astype("datetime64[ms]")
 
 
-def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None, bool]:
+def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None]:
     """Return what a file says of the windows of its samples.
 
     Parameters
@@ -110,8 +82,6 @@ def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None, boo
     Time
         The middles of the windows; the times as they are where there are none.
     Windows or None
-    bool
-        Whether the file says what its times are.
 
     Raises
     ------
@@ -120,45 +90,30 @@ def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None, boo
         as :class:`.Windows`.
     """
     here, said = found.arrays, found.values.get("window")
-    pieces = [name for name in PIECES if name in here]
-    given = [*pieces, *(name for name in ("time_bounds", "live_time") if name in here)]
+    given = [name for name in (*PIECES, "time_bounds", "live_time") if name in here]
+    lost = [name for name in PIECES if name not in here]
     if said == "instant" and given:
         raise InputError(
             f"the attribute window says that the samples are instants, and {given[0]} gives "
             "them windows; leave out one of them"
         )
-    if pieces and len(pieces) < len(PIECES):
-        lost = next(name for name in PIECES if name not in here)
-        raise InputError(f"there is {pieces[0]}, but no {lost}; pieces of windows need both")
-    if pieces:
+    if 0 < len(lost) < len(PIECES):
+        raise InputError(f"there is {given[0]}, but no {lost[0]}; pieces of windows need both")
+    if not lost:
         windows = Windows(*(here[name] for name in PIECES))
         if "time_bounds" in here:
-            _require_same(windows, times, here["time_bounds"])
-        return times, windows, True
+            windows.require_bounds(times, here["time_bounds"])
+        return times, windows
     if "time_bounds" in here:
-        bounds = utc_of_datetimes(here["time_bounds"])
-        live_s = here.get("live_time")
-        middles, _, windows = bounded(times, bounds, found.values["step_s"], live_s)
-        return middles, windows, True
+        step_s, live_s = found.values["step_s"], here.get("live_time")
+        middles, _, windows = windows_of(times, "middle", step_s, live_s, here["time_bounds"])
+        return middles, windows
     if given or said == "mean":
         what = "live_time" if given else "the attribute window = 'mean'"
         raise InputError(
             f"there is {what}, but no time_bounds; add the start and the end of every sample"
         )
-    return times, None, said == "instant"
-
-
-def _require_same(windows: Windows, times: Time, there: np.ndarray) -> None:
-    seconds = seconds_from(times[:, None], utc_of_datetimes(there))
-    if windows.n_samples != len(times):
-        return  # an Observation says so
-    off = np.abs(seconds - windows.bounds_s).max(axis=1)
-    if (off > EYE_S).any():
-        first = int(np.argmax(off > EYE_S))
-        raise InputError(
-            f"time_bounds and the pieces of sample {first} differ by {off[first]:g} s; change "
-            "both, or leave out the variables of the pieces"
-        )
+    return times, None
 
 
 @dataclass(frozen=True)
@@ -203,7 +158,7 @@ class Calibration:
             require_finite("gain_slope", self.gain_slope)
 
 
-LOADS = ("load_ohm_real", "load_ohm_imag")
+LOADS, LOAD = ("load_ohm_real", "load_ohm_imag"), ("load_frequency", "port", "port_2")
 # what to do where there is no file of them
 HINT = "make some with: lusee-bayes simulate SCENARIO"
 
@@ -248,11 +203,10 @@ class Visibilities(Described):
 
     def __post_init__(self):
         require_array("the data", self.data, (self.layout.size,))
-        if self.layout.n_times != self.observation.n_times:
-            raise InputError(
-                f"the data have {self.layout.n_times} times, the observation "
-                f"{self.observation.n_times}"
-            )
+        seen = self.observation
+        if self.layout.n_times != seen.n_times:
+            n_times = self.layout.n_times
+            raise InputError(f"the data have {n_times} times, the observation {seen.n_times}")
         if self.calibration is not None:
             n_averaged = self.calibration.n_averaged
             require_shape("n_averaged of the calibration", n_averaged, (self.layout.n_times,))
@@ -304,7 +258,7 @@ class Visibilities(Described):
         bounds : (times, 2) sequence, optional
             Start and end of every sample, of any kind of times, where they are not those of
             ``timestamp`` and ``step_s``. The times then may be anywhere between.
-        live_s : (times,) array, optional
+        live_s : float or (times,) array, optional
             How long each sample was integrated, in seconds; by default all of its window.
         step_s : float, optional
             From sample to sample, in seconds; by default the median of the times.
@@ -320,7 +274,7 @@ class Visibilities(Described):
         InputError
             If arrays do not fit each other or cannot be what they are said to be.
         """
-        values, missing = real_products(data, products, flags, convention, n_antennas)
+        values = real_products(data, products, flags, convention, n_antennas)
         utc = utc_times(times)
         if len(utc) != values.shape[1]:
             raise InputError(
@@ -331,15 +285,9 @@ class Visibilities(Described):
         lon_deg, lat_deg = site_of(site)
         run, angles = runs_of(turntable_deg, len(utc))
         live_s = None if live_s is None else numbers_of_times("live_s", live_s, len(utc))
-        if bounds is None:
-            step_s = step_of(utc, step_s)
-            middles, windows = stamped(utc, timestamp, step_s, live_s)
-        elif timestamp == "instant":
-            raise InputError("instants have no bounds; leave out bounds, or timestamp='instant'")
-        else:
-            middles, step_s, windows = bounded(utc, utc_bounds(bounds, len(utc)), step_s, live_s)
+        middles, step_s, windows = windows_of(utc, timestamp, step_s, live_s, bounds)
         observation = Observation(lon_deg, lat_deg, middles, run, angles, step_s, windows=windows)
-        layout = DataLayout.from_flags(missing)
+        layout = DataLayout.from_flags(np.isnan(values))
         return cls(layout.gather(values), layout, observation, float(frequency_mhz))
 
     def description(self) -> tuple[str, ...]:
@@ -362,20 +310,18 @@ class Visibilities(Described):
     @property
     def labels(self) -> tuple[str, ...]:
         """Labels of the products, in order."""
-        return labels(round(np.sqrt(self.layout.n_products)))
+        return labels(antennas_of(self.layout.n_products))
 
     def digest(self) -> str:
         """Return a hash of data, layout, times and windows, which tells data sets apart."""
-        content = hashlib.sha256(np.ascontiguousarray(self.data).tobytes())
-        content.update(self.layout.product.tobytes() + self.layout.time.tobytes())
-        content.update(self.observation.times.jd.tobytes())
+        parts = [self.data, self.layout.product, self.layout.time, self.observation.times.jd]
         windows = self.observation.windows
         if windows is not None:
-            for values in (windows.sample, windows.start_s, windows.end_s, windows.live_s):
-                content.update(np.ascontiguousarray(values).tobytes())
+            parts += [windows.sample, windows.start_s, windows.end_s, windows.live_s]
         if self.calibration is not None:
-            content.update(np.ascontiguousarray(self.calibration.n_averaged).tobytes())
-        return content.hexdigest()
+            parts.append(self.calibration.n_averaged)
+        content = b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
+        return hashlib.sha256(content).hexdigest()
 
     def grid(self) -> Float[np.ndarray, "products times"]:
         """Return the full grid in K, NaN where a sample is missing: for files and figures only."""
@@ -397,7 +343,7 @@ class Visibilities(Described):
         observation = self.observation
         if observation.windows is not None:
             raise InputError("the data have windows, so that their times are the middles of these")
-        times, windows = stamped(observation.times, timestamp, observation.step_s)
+        times, _, windows = windows_of(observation.times, timestamp, observation.step_s)
         seen = replace(observation, times=times, windows=windows)
         return replace(self, observation=seen, says_window=True)
 
@@ -415,40 +361,37 @@ class Visibilities(Described):
 
         With the dims piece and bounds for windows, and mode if the truth is known.
         """
-        observation = self.observation
-        variables = {
-            "visibility": (("product", "time"), self.grid(), {"units": "K"}),
-            "flag": (("product", "time"), ~np.asarray(self.layout.present)),
-            "run": (("time",), observation.run),
-            "turntable_deg": (("run_number",), np.array(observation.turntable_deg)),
-            **window_variables(observation),
+        seen, windows, receiver = self.observation, self.observation.windows, self.receiver
+        arrays = {
+            "product": list(self.labels),
+            "visibility": self.grid(),
+            "flag": ~np.asarray(self.layout.present),
+            "run": seen.run,
+            "turntable_deg": np.array(seen.turntable_deg),
+            "truth": self.truth,
+            # two parts keep the times exact
+            "jd1": seen.times.jd1,
+            "jd2": seen.times.jd2,
         }
-        if self.truth is not None:
-            variables["truth"] = (("mode",), np.asarray(self.truth), {"units": "K"})
-        if self.receiver is not None:
-            dims, ohm = ("load_frequency", "port", "port_2"), self.receiver.load_ohm
-            variables["load_frequency_mhz"] = (dims[:1], self.receiver.frequencies_mhz)
-            variables |= {n: (dims, x) for n, x in zip(LOADS, (ohm.real, ohm.imag), strict=True)}
-        # two parts keep the times exact
-        variables["jd1"] = (("time",), observation.times.jd1, {"scale": "utc"})
-        variables["jd2"] = (("time",), observation.times.jd2, {"scale": "utc"})
-        instants = observation.windows is None
-        for_eyes = {} if instants else {"bounds": "time_bounds"}
-        time = (("time",), _datetimes(observation.times), for_eyes, ENCODING)
-        said = {"window": "instant" if instants else "mean"} if self.says_window else {}
-        return xr.Dataset(
-            variables,
-            coords={"product": list(self.labels), "time": time},
-            attrs={
-                "format": formats.VISIBILITIES,
-                "frequency_mhz": self.frequency_mhz,
-                "lon_deg": observation.lon_deg,
-                "lat_deg": observation.lat_deg,
-                "step_s": observation.step_s,
-                **said,
-                "lusee_bayes_version": __version__,
-            },
-        )
+        if windows is not None:
+            pieces = (windows.sample, windows.start_s, windows.end_s, windows.live_s)
+            arrays |= dict(zip(PIECES, pieces, strict=True))
+            arrays["live_time"] = windows.live_per_sample_s
+        if receiver is not None:
+            ohm = receiver.load_ohm
+            arrays["load_frequency_mhz"] = receiver.frequencies_mhz
+            arrays |= dict(zip(LOADS, (ohm.real, ohm.imag), strict=True))
+        kind = "instant" if windows is None else "mean"
+        said = {name: getattr(seen, name) for name in ("lon_deg", "lat_deg", "step_s")}
+        said |= {"frequency_mhz": self.frequency_mhz, "jd1.scale": "utc", "jd2.scale": "utc"}
+        said["window"] = kind if self.says_window else None
+        dataset = as_dataset(formats.VISIBILITIES, LAYOUT, arrays, said)
+        time, bounds = ("time", _datetimes(seen.times), {}, ENCODING), {}
+        if windows is not None:
+            edges = _datetimes(later(seen.times[:, None], windows.bounds_s))
+            bounds = {"time_bounds": (("time", "bounds"), edges, {}, ENCODING)}
+            time = ("time", time[1], {"bounds": "time_bounds"}, ENCODING)
+        return dataset.assign(bounds).assign_coords(time=time)
 
     def write(self, path: str | Path, attrs: dict[str, str] | None = None) -> Path:
         """Write a netCDF file, whole or not at all.
@@ -482,20 +425,17 @@ LAYOUT = Layout(
         "product": Variable(("product",), "text"),
         "visibility": Variable(("product", "time"), finite=False, unit="K"),
         "flag": Variable(("product", "time"), "boolean"),
-        "jd1": Variable(("time",)),
-        "jd2": Variable(("time",)),
+        **{name: Variable(("time",), unit="d") for name in ("jd1", "jd2")},
         "run": Variable(("time",), "integer", low=0.0),
-        "turntable_deg": Variable(("run_number",)),
+        "turntable_deg": Variable(("run_number",), unit="deg"),
         "time_bounds": Variable(("time", 2), "time", optional=True),
-        "live_time": Variable(("time",), optional=True),
+        "live_time": Variable(("time",), optional=True, unit="s"),
         "piece_sample": Variable(("piece",), "integer", low=0.0, optional=True),
-        **{name: Variable(("piece",), optional=True) for name in PIECES[1:]},
+        **{name: Variable(("piece",), optional=True, unit="s") for name in PIECES[1:]},
         "truth": Variable(("mode",), optional=True, unit="K"),
         # the receivers' loads ZL, where they are known
-        "load_frequency_mhz": Variable(
-            ("load_frequency",), low=0.0, grows=True, optional=True, unit="MHz"
-        ),
-        **{name: Variable(("load_frequency", "port", "port_2"), optional=True) for name in LOADS},
+        "load_frequency_mhz": Variable(LOAD[:1], low=0.0, grows=True, optional=True, unit="MHz"),
+        **dict.fromkeys(LOADS, Variable(LOAD, optional=True, unit="Ohm")),
     },
     {
         "frequency_mhz": Attribute(low=0.0, unit="MHz"),
@@ -532,29 +472,20 @@ def read_visibilities(path: str | Path) -> Visibilities:
     require_file(path, "data", HINT)
     found = read_netcdf(path, formats.VISIBILITIES, LAYOUT, HINT)
     here = found.arrays
-    n, products = round(np.sqrt(found.sizes["product"])), tuple(map(str, here["product"]))
-    if products != labels(n):
+    products, expected = tuple(map(str, here["product"])), labels(antennas_of(len(here["product"])))
+    if products != expected:
         raise InputError(
-            f"{path} has products {', '.join(products)}; expected {', '.join(labels(n))}"
+            f"{path} has products {', '.join(products)}; expected {', '.join(expected)}"
         )
     flags = here["flag"]
     values = np.where(flags, 0.0, here["visibility"])
     require_finite(f"{path}: visibility (where not flagged)", values)
-    if here["run"].max() >= found.sizes["run_number"]:
-        raise InputError(
-            f"{path}: run numbers go up to {here['run'].max()}, and turntable_deg has "
-            f"{found.sizes['run_number']} runs"
-        )
     with naming(path):
         layout = DataLayout.from_flags(flags)
         utc = utc_of_jd(found)
-        times, windows, says_window = read_windows(found, utc)
-        return Visibilities(
-            layout.gather(values),
-            layout,
-            observation_of(found, times, windows),
-            found.values["frequency_mhz"],
-            here.get("truth"),
-            receiver_of(path, here, "load_frequency_mhz", *LOADS),
-            says_window,
-        )
+        times, windows = read_windows(found, utc)
+        says_window = windows is not None or found.values.get("window") == "instant"
+        seen, mhz = observation_of(found, times, windows), found.values["frequency_mhz"]
+        receiver = receiver_of(path, here, "load_frequency_mhz", *LOADS)
+        truth = here.get("truth")
+        return Visibilities(layout.gather(values), layout, seen, mhz, truth, receiver, says_window)

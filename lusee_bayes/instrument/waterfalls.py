@@ -32,9 +32,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from astropy.io import fits
 from astropy.time import Time
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Complex, Float
 
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
@@ -44,18 +45,17 @@ from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.core.version import __version__
 from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ, Interpolation
-from lusee_bayes.instrument.beams.monopoles import LOADS, Circuit, MeasuredReceiver, receiver_of
+from lusee_bayes.instrument.beams.source import LOADS, Circuit, MeasuredReceiver, receiver_of
 from lusee_bayes.instrument.observation import Observation, body_direction
 from lusee_bayes.instrument.products import (
     N_ANTENNAS,
     DataLayout,
-    Product,
     all_products,
-    labels,
-    ports,
+    in_order,
     to_matrix,
 )
 from lusee_bayes.instrument.times import (
+    ROUNDING_S,
     later,
     require_ephemeris,
     scale_of,
@@ -155,22 +155,16 @@ class Waterfall:
             )
         with naming(f"{self.path} at {frequency_mhz:g} MHz"):
             layout = DataLayout.from_flags(~present[within])
-        data = layout.gather(np.where(present, values, 0.0)[within])
-        return Visibilities(
-            data,
-            layout,
-            self.observation,
-            float(self.frequencies_mhz[channel]),
-            receiver=self.receiver,
-        )
+        data, mhz = layout.gather(values[within]), float(self.frequencies_mhz[channel])
+        return Visibilities(data, layout, self.observation, mhz, receiver=self.receiver)
 
 
 YEAR = re.compile(r"(CY|FY)([0-9]{2}|[0-9]{4})")
 LUNAR_DAY = re.compile(r"[0-9]{3,4}")
 # luseepy looks for noons day by day until the end of January of the next year
 DAYS_AFTER_NEW_YEAR = 30
-# each round finds the noon to a twentieth: after four, a day has become half a second
-ROUNDS, POINTS = 4, 41
+# of the noon of a lunar day, a tenth of a second
+NOON_JD = 1e-6
 
 
 def start_of(text: str) -> Time:
@@ -211,23 +205,18 @@ def _noon(number: int) -> Time:
     height = _sun_height(days)
     highest = (height[1:-1] > height[:-2]) & (height[1:-1] > height[2:])
     # a lunar day needs an end, too
-    beginning = days[1:-1][highest][:-1]
-    noon = _refined(beginning[place]) if place < len(beginning) else np.inf
+    beginning, noon = days[1:-1][highest][:-1], np.inf
+    if place < len(beginning):
+        around = (beginning[place] - 1.0, beginning[place] + 1.0)
+        noon = scipy.optimize.minimize_scalar(
+            lambda jd: -_sun_height(np.array([jd]))[0], bounds=around, options={"xatol": NOON_JD}
+        ).x
     if noon >= next_year:
         raise InputError(
             f"LUNAR_DAY {number}: expected a number from {number - place}, the first lunar day of "
             f"{year}; 12 or 13 of them begin in a year"
         )
     return utc_of(np.array([noon]), np.zeros(1))[0]
-
-
-def _refined(jd: float) -> float:
-    """The time when the Sun is highest, within a day."""
-    span = 1.0
-    for _ in range(ROUNDS):
-        around = jd + np.linspace(-span, span, POINTS)
-        jd, span = float(around[np.argmax(_sun_height(around))]), span * 2.0 / (POINTS - 1)
-    return jd
 
 
 def _sun_height(jd: Float[np.ndarray, " times"]) -> Float[np.ndarray, " times"]:
@@ -267,47 +256,28 @@ def read_scalar(path: Path) -> Waterfall:
         products, ports beyond 0..3, or a bad date.
     """
     found = read_fits(path, SCALAR_WATERFALL)
-    data, frequencies = found.arrays["data"], found.arrays["freq"]
-    columns = _columns(path, found.arrays["combinations"])
+    data, columns = found.arrays["data"], []
+    for i, j in found.arrays["combinations"]:
+        # V_ji is V_ij conjugated
+        pair, sign = f"{min(i, j)}{max(i, j)}", 1.0 if i < j else -1.0
+        columns += [(f"{pair}R", 1.0)] if i == j else [(f"{pair}R", 1.0), (f"{pair}I", sign)]
     if data.shape[1] != len(columns):
         raise InputError(
-            f"{path}: data has {data.shape[1]} products, expected {len(columns)} for the pairs of "
-            "ports in combinations"
+            f"{path}: data has {data.shape[1]} products, expected {len(columns)} by combinations"
         )
-    places = {product: k for k, product in enumerate(all_products())}
-    grid = np.full((len(places), len(data), len(frequencies)), np.nan)
-    for column, (product, sign) in enumerate(columns):
-        grid[places[product]] = sign * data[:, column]
-    return Waterfall(str(path), grid, frequencies, _observation(path, found.values, len(data)))
-
-
-def _columns(path: Path, combinations: Int[np.ndarray, "pairs 2"]) -> list[tuple[Product, float]]:
-    """The product in each column of the data, and its sign: V_ji is V_ij conjugated."""
-    columns: list[tuple[Product, float]] = []
-    for i, j in combinations:
-        low, high = (int(min(i, j)), int(max(i, j)))
-        columns.append((Product(low, high, "R"), 1.0))
-        if i != j:
-            columns.append((Product(low, high, "I"), 1.0 if i < j else -1.0))
-    products = [product for product, _ in columns]
-    if len(set(products)) < len(products):
-        raise InputError(f"{path}: combinations names the same pair of ports twice")
-    return columns
-
-
-def _observation(
-    path: Path, said: dict[str, Any], n_times: int, jd: Float[np.ndarray, "times 2"] | None = None
-) -> Observation:
-    """Samples of a file: at the times that it gives, or in steps from the first one."""
     with naming(path):
-        if jd is not None:
-            times = utc_of(jd[:, 0], jd[:, 1], scale_of("TIMESYS", said.get("TIMESYS", "UTC")))
-        else:
-            first, step_s = start_of(said["LUNAR_DAY"]), said["DELTAT_SEC"]
-            require_ephemeris(first.jd + np.array([(n_times - 1) * step_s / 86400.0]))
-            times = later(first, step_s * np.arange(n_times))
-        site, zeros = (said["LUN_LONG_DEG"], said["LUN_LAT_DEG"]), np.zeros(n_times, dtype=int)
-        return Observation(*site, times, zeros, (0.0,), said["DELTAT_SEC"])
+        said, values = found.values, np.moveaxis(data, 1, 0)
+        signed = zip(columns, values, strict=True)
+        grid = in_order([(label, sign * one) for (label, sign), one in signed])
+        first, seconds = start_of(said["LUNAR_DAY"]), said["DELTAT_SEC"] * np.arange(len(data))
+        require_ephemeris(first.jd + seconds[-1:] / 86400.0)
+        observation = _observation(later(first, seconds), said)
+    return Waterfall(str(path), grid, found.arrays["freq"], observation)
+
+
+def _observation(times: Time, said: Mapping[str, Any]) -> Observation:
+    site, run = (said["LUN_LONG_DEG"], said["LUN_LAT_DEG"]), np.zeros(len(times), dtype=int)
+    return Observation(*site, times, run, (0.0,), said["DELTAT_SEC"])
 
 
 UNIT = "V^2/Hz"
@@ -322,10 +292,9 @@ FOUR_PORT_WATERFALL = Layout(
         # NaN where a sample is missing
         "data": Variable(("time", "product", "freq"), finite=False, unit=UNIT),
         "blackbody_normalization_real": Variable(("freq", N_ANTENNAS, N_ANTENNAS)),
-        **{
-            name: Variable(("freq", N_ANTENNAS, N_ANTENNAS), optional=True, unit="Ohm")
-            for name in LOADS
-        },
+        **dict.fromkeys(
+            LOADS, Variable(("freq", N_ANTENNAS, N_ANTENNAS), optional=True, unit="Ohm")
+        ),
     },
     {
         **SITE_AND_STEP,
@@ -358,40 +327,20 @@ def read_four_port(path: Path) -> Waterfall:
     """
     found = read_fits(path, FOUR_PORT_WATERFALL)
     images, said = found.arrays, found.values
-    data, frequencies = images["data"], images["freq"]
-    places = _places(path, images["products.label"])
-    enclosure = images["blackbody_normalization_real"]
-    per_kelvin = enclosure.diagonal(axis1=1, axis2=2)
+    per_kelvin = images["blackbody_normalization_real"].diagonal(axis1=1, axis2=2)
     require_positive(f"{path}: the diagonal of blackbody_normalization_real", per_kelvin)
     root = np.sqrt(per_kelvin)
-    grid = np.full((len(all_products()), len(data), len(frequencies)), np.nan)
-    for column, place in enumerate(places):
-        product = all_products()[place]
-        grid[place] = data[:, column] / (root[:, product.i] * root[:, product.j])
-    return Waterfall(
-        str(path),
-        grid,
-        frequencies,
-        _observation(path, said, len(data), images["time"]),
-        per_kelvin,
-        said["TMOON_K"],
-        said.get("TANT_K", 0.0),
-        receiver_of(path, images, "freq", *LOADS),
-        said.get("FREQINT"),
-    )
-
-
-def _places(path: Path, products: np.ndarray) -> list[int]:
-    """The number of the product in each column, in the package's order."""
-    named, known = [str(label).strip() for label in products], labels()
-    for label in named:
-        if label not in known:
-            raise InputError(
-                f"{path}: there is no product '{label}'; expected some of {', '.join(known)}"
-            )
-    if len(set(named)) < len(named):
-        raise InputError(f"{path}: products names the same product twice")
-    return [known.index(label) for label in named]
+    scales = {p.label: root[:, p.i] * root[:, p.j] for p in all_products()}
+    names = [str(label).strip() for label in images["products.label"]]
+    named = zip(names, np.moveaxis(images["data"], 1, 0), strict=True)
+    with naming(path):
+        grid = in_order([(name, volts / scales.get(name, 1.0)) for name, volts in named])
+        scale = scale_of("TIMESYS", said.get("TIMESYS", "UTC"))
+        observation = _observation(utc_of(*images["time"].T, scale), said)
+    warm = {"moon_k": said["TMOON_K"], "antenna_k": said.get("TANT_K", 0.0)}
+    loads, rule = receiver_of(path, images, "freq", *LOADS), said.get("FREQINT")
+    known = {"per_kelvin": per_kelvin, "receiver": loads, "interpolation": rule}
+    return Waterfall(str(path), grid, images["freq"], observation, **known, **warm)
 
 
 def read_waterfall(path: str | Path) -> Waterfall:
@@ -415,10 +364,10 @@ def read_waterfall(path: str | Path) -> Waterfall:
     return read_four_port(path) if "blackbody_normalization_real" in names else read_scalar(path)
 
 
-HINT = "write netCDF instead (a name that does not end in .fits)"
+HINT = "write netCDF (a name that does not end in .fits)"
 NO_ROOM = (
-    "luseepy's waterfalls have no room for windows, and the samples are means over theirs; write "
-    "netCDF (a name that does not end in .fits), or simulate with --set observation.window=instant"
+    "luseepy's waterfalls have no room for windows, and the samples are means over theirs; "
+    f"{HINT}, or simulate with --set observation.window=instant"
 )
 
 
@@ -455,42 +404,33 @@ def write_waterfall(
     path, first = user_path(path), channels[0].observation
     if len(channels) < 2:
         raise InputError(
-            f"{path}: luseepy's reader takes waterfalls of at least two channels; give it "
-            "--frequencies, or write netCDF (a name that does not end in .fits)"
+            f"{path}: luseepy's reader takes at least two channels; give --frequencies, or {HINT}"
         )
-    grid = grid_of(path, channels)
+    data = _kelvin(path, channels)
     seconds = seconds_from(first.times[0], first.times)
-    # the time of a Julian date in two parts is exact to less than a nanosecond
-    if np.abs(seconds - first.step_s * np.arange(first.n_times)).max() > 1e-6:
+    if np.abs(seconds - first.step_s * np.arange(first.n_times)).max() > ROUNDING_S:
         raise InputError(
             f"{path}: luseepy's waterfalls have a sample every {first.step_s:g} s without gaps; "
             f"{HINT}"
         )
-    pairs = [(p.i, p.j) for p in all_products() if p.part == "R"]
+    pairs = np.array([(p.i, p.j) for p in all_products() if p.part == "R"])
     z = np.full(len(channels), np.nan + 1j * np.nan) if impedance_ohm is None else impedance_ohm
-    images = {
-        "data": grid,
-        "freq": np.array([channel.frequency_mhz for channel in channels]),
-        "combinations": np.array(pairs),
-    }
+    images = {"data": data, "freq": _frequencies(channels), "combinations": pairs}
     for port in range(N_ANTENNAS):
         images |= {f"ZRe_{port}": z.real.copy(), f"ZIm_{port}": z.imag.copy()}
     hdus = [fits.ImageHDU(image, name=name) for name, image in images.items()]
-    return write_hdus(path, hdus, {"VERSION": 0.1} | site_and_times(first), scenario)
+    return _write(path, hdus, {"VERSION": 0.1} | _site_and_times(first), scenario)
 
 
-def grid_of(
+def _frequencies(channels: Sequence[Visibilities]) -> Float[np.ndarray, " frequencies"]:
+    return np.array([channel.frequency_mhz for channel in channels])
+
+
+def _kelvin(
     path: Path, channels: Sequence[Visibilities]
 ) -> Float[np.ndarray, "times products frequencies"]:
-    """Return the samples of all channels in K, NaN where they are missing.
-
-    Raises
-    ------
-    InputError
-        For samples with windows, turntable angles other than 0, other than four ports, or channels
-        of different times.
-    """
-    first = channels[0].observation
+    """Samples of all channels, NaN where they are missing; InputError if there is no room."""
+    times = channels[0].observation.times
     for channel in channels:
         observation = channel.observation
         if observation.windows is not None:
@@ -502,18 +442,18 @@ def grid_of(
             )
         if channel.layout.n_products != N_ANTENNAS**2:
             raise InputError(f"{path}: expected {N_ANTENNAS**2} products; {HINT}")
-        same = observation.n_times == first.n_times
-        if not same or not bool((observation.times == first.times).all()):
+        if observation.n_times != len(times) or (observation.times != times).any():
             raise InputError(f"{path}: the channels have different times; {HINT}")
     return np.moveaxis(np.stack([channel.grid() for channel in channels], axis=-1), 0, 1)
 
 
-def site_and_times(observation: Observation) -> dict[str, Any]:
-    """Return the words of the header that say where and when."""
+def _site_and_times(observation: Observation) -> dict[str, Any]:
+    """The words of the header that say where and when."""
     # luseepy counts steps up to the end: half a step less leaves no room for rounding
-    end = later(observation.times[-1], -0.5 * observation.step_s)
+    last = later(observation.times[-1], -0.5 * observation.step_s)
+    ends = [Time(t, format="iso", precision=9).value for t in (observation.times[0], last)]
     return {
-        "LUNAR_DAY": f"{_written(observation.times[0])} to {_written(end)}",
+        "LUNAR_DAY": " to ".join(ends),
         "LUN_LAT_DEG": observation.lat_deg,
         "LUN_LONG_DEG": observation.lon_deg,
         "LUN_HEIGHT_M": 0.0,
@@ -521,24 +461,13 @@ def site_and_times(observation: Observation) -> dict[str, Any]:
     }
 
 
-def write_hdus(
+def _write(
     path: Path,
     hdus: Sequence[fits.ImageHDU | fits.BinTableHDU],
     header: Mapping[str, Any],
     scenario: str | None,
 ) -> Path:
-    """Write a FITS file, whole or not at all.
-
-    Parameters
-    ----------
-    path : Path
-    hdus : sequence of ImageHDU or BinTableHDU
-        The first one, ``data``, becomes the primary image.
-    header : mapping
-        Words of its header.
-    scenario : str or None
-        Text of the scenario, for an image of bytes.
-    """
+    """Write a FITS file, whole or not at all; the first image, ``data``, becomes the primary."""
     primary = fits.PrimaryHDU(hdus[0].data)
     for key, value in ({"EXTNAME": "data"} | dict(header)).items():
         primary.header[key if len(key) <= 8 else f"HIERARCH {key}"] = value
@@ -550,13 +479,6 @@ def write_hdus(
     with replacing(path) as partial:
         written.writeto(partial)
     return path
-
-
-def _written(time: Time) -> str:
-    """A time as luseepy reads it, to the nanosecond."""
-    exact = time.copy(format="iso")
-    exact.precision = 9
-    return str(exact.value)
 
 
 def write_four_port(
@@ -602,39 +524,17 @@ def write_four_port(
         than four ports, channels of different observations.
     """
     path, observation = user_path(path), channels[0].observation
-    receiver, loads = circuits[0].receiver, [circuit.load_ohm for circuit in circuits]
+    receiver = circuits[0].receiver
     if receiver is None:
         raise InputError(
             f"{path}: luseepy's four-port waterfalls hold the loads of receivers, and the ports "
-            "are open; give another beam.receiver, or write netCDF (a name that does not end in "
-            ".fits)"
+            f"are open; give another beam.receiver, or {HINT}"
         )
-    kelvin = grid_of(path, channels)
     enclosure = np.array([circuit.per_kelvin for circuit in circuits])
     root = np.sqrt(enclosure.diagonal(axis1=1, axis2=2).real)
-    i, j, _ = ports()
-    data = kelvin * (root[:, i] * root[:, j]).T
-    matrices = {
-        "ZA": [c.antenna_ohm for c in circuits],
-        "ZL": loads,
-        "M": [c.loading for c in circuits],
-        "Rsky": [c.resistance_ohm - c.moon_ohm - c.loss_ohm for c in circuits],
-        "Rmoon": [c.moon_ohm for c in circuits],
-        "Rloss": [c.loss_ohm for c in circuits],
-    }
-    times = np.stack([observation.times.jd1, observation.times.jd2], axis=-1)
-    clock = {"TIMESYS": "UTC", "TIMEUNIT": "d", "CLOCKSRC": "supplied", "SCALEASM": False}
-    hdus: list[fits.ImageHDU | fits.BinTableHDU] = [
-        _image("data", data, UNIT),
-        _image("freq", np.array([channel.frequency_mhz for channel in channels]), "MHz"),
-        _image("time", times, "d", TIMEFMT="JD1+JD2", **clock),
-        fits.BinTableHDU.from_columns([fits.Column("label", "8A", unit="1", array=labels())]),
-    ]
-    hdus[-1].header["EXTNAME"] = "products"
-    for name, values in matrices.items():
-        hdus += _complex(name, np.array(values), "1" if name == "M" else "Ohm")
-    hdus += _complex("blackbody_normalization", enclosure, "V^2/(Hz K)")
-    condition = np.linalg.cond(np.array(matrices["ZA"]) + np.array(loads))
+    i, j = np.array([(p.i, p.j) for p in all_products()]).T
+    data = _kelvin(path, channels) * (root[:, i] * root[:, j]).T
+    condition = np.linalg.cond([c.antenna_ohm + c.load_ohm for c in circuits])
     eigenvalues = _eigenvalues(data)
     largest = np.abs(eigenvalues).max(-1)
     ratio = np.divide(eigenvalues[..., 0], largest, out=np.zeros_like(largest), where=largest > 0)
@@ -642,18 +542,34 @@ def write_four_port(
     none = np.zeros_like(ratio)
     names = receiver.luseepy_parameters
     parameters = json.dumps({k: getattr(receiver, own) for k, own in names.items()}, sort_keys=True)
-    hdus += [
-        _image("loading_condition_number", condition, "1"),
-        _image("covariance_antihermitian_absolute", none, UNIT),
-        _image("covariance_antihermitian_relative", none, "1"),
-        _image("covariance_eigenvalues", eigenvalues, UNIT),
-        _image("covariance_minimum_eigenvalue_ratio", ratio, "1"),
-        _image("receiver_params", np.frombuffer(parameters.encode(), dtype=np.uint8), "1"),
+    images: list[tuple[str, Any, str]] = [
+        ("data", data, UNIT),
+        ("freq", _frequencies(channels), "MHz"),
+        ("time", np.stack([observation.times.jd1, observation.times.jd2], axis=-1), "d"),
+        ("ZA", [c.antenna_ohm for c in circuits], "Ohm"),
+        ("ZL", [c.load_ohm for c in circuits], "Ohm"),
+        ("M", [c.loading for c in circuits], "1"),
+        ("Rsky", [c.resistance_ohm - c.moon_ohm - c.loss_ohm for c in circuits], "Ohm"),
+        ("Rmoon", [c.moon_ohm for c in circuits], "Ohm"),
+        ("Rloss", [c.loss_ohm for c in circuits], "Ohm"),
+        ("blackbody_normalization", enclosure, "V^2/(Hz K)"),
+        ("loading_condition_number", condition, "1"),
+        ("covariance_antihermitian_absolute", none, UNIT),
+        ("covariance_antihermitian_relative", none, "1"),
+        ("covariance_eigenvalues", eigenvalues, UNIT),
+        ("covariance_minimum_eigenvalue_ratio", ratio, "1"),
+        ("receiver_params", np.frombuffer(parameters.encode(), dtype=np.uint8), "1"),
     ]
+    hdus = [hdu for image in images for hdu in _hdus(*image)]
+    clock = {"TIMESYS": "UTC", "TIMEUNIT": "d", "CLOCKSRC": "supplied", "SCALEASM": False}
+    hdus[2].header.update(TIMEFMT="JD1+JD2", **clock)
+    label = fits.Column("label", "8A", unit="1", array=[p.label for p in all_products()])
+    table = fits.Header([("EXTNAME", "products")])
+    hdus.insert(3, fits.BinTableHDU.from_columns([label], header=table))
     header = {
         "VERSION": 3,
         "ENGINE": "lusee_bayes",
-        **site_and_times(observation),
+        **_site_and_times(observation),
         "RESPONSE": Path(response).name,
         "FREQINT": INTERPOLATIONS[interpolation],
         **clock,
@@ -669,21 +585,18 @@ def write_four_port(
     }
     if np.isfinite(eigenvalues).any():
         header |= {"COVEIMIN": float(np.nanmin(eigenvalues)), "COVERMIN": float(np.nanmin(ratio))}
-    return write_hdus(path, hdus, header, scenario)
+    return _write(path, hdus, header, scenario)
 
 
-def _image(name: str, values: np.ndarray, unit: str, **words: Any) -> fits.ImageHDU:
-    hdu = fits.ImageHDU(values)
-    for key, value in ({"EXTNAME": name, "BUNIT": unit} | words).items():
-        hdu.header[key] = value
-    return hdu
-
-
-def _complex(
-    name: str, values: Complex[np.ndarray, "frequencies ports ports"], unit: str
-) -> list[fits.ImageHDU]:
-    parts = {"real": values.real.copy(), "imag": values.imag.copy()}
-    return [_image(f"{name}_{part}", image, unit) for part, image in parts.items()]
+def _hdus(name: str, values: Any, unit: str) -> list[fits.ImageHDU]:
+    """An image, or those of the real and the imaginary part."""
+    parts = {name: np.asarray(values)}
+    if np.iscomplexobj(values):
+        parts = {f"{name}_real": np.real(values).copy(), f"{name}_imag": np.imag(values).copy()}
+    return [
+        fits.ImageHDU(part, fits.Header([("EXTNAME", key), ("BUNIT", unit)]))
+        for key, part in parts.items()
+    ]
 
 
 def _eigenvalues(

@@ -25,22 +25,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import (
-    Array,
-    DataVector,
-    Ells,
-    Modes,
-    ModesMatrix,
-    Pixels,
-    Vector,
-    on_host,
-)
+from lusee_bayes.core.arrays import Array, DataVector, Ells, Modes, Pixels, Vector
 from lusee_bayes.core.harmonics import lmax_of, mean_over_m, modes_to_map, sum_over_m
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.linalg import invert_lower
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.judge.coverage import latitudes, multipoles
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import Solution
 from lusee_bayes.linear.posterior import Posterior
 
 # directions of the sky that are seen at once, and entries of A up to which it is made a matrix:
@@ -48,9 +39,7 @@ from lusee_bayes.linear.posterior import Posterior
 CHUNK, DENSE = 256, 10**8
 
 
-def data_freedom(
-    model: LinearGaussian, posterior: Posterior, columns: Float[Array, "data n"]
-) -> DataVector:
+def data_freedom(solution: Solution, columns: Float[Array, "data n"]) -> DataVector:
     """Compute the diagonal of K_s K^-1: which share of each datum sky and templates follow.
 
     With the templates V among the columns of N's square root, K_s = A S A^T + V V^T is the
@@ -59,10 +48,8 @@ def data_freedom(
 
     Parameters
     ----------
-    model : LinearGaussian
-        With ``columns @ columns.T`` in its noise.
-    posterior : Posterior
-        Of this model, given any data.
+    solution : Solution
+        For any data, of a model with ``columns @ columns.T`` in its noise.
     columns : (data, n) array
         V, in K.
 
@@ -71,8 +58,8 @@ def data_freedom(
     InputError
         If N is not positive definite.
     """
-    model, posterior, columns = on_host((model, posterior, columns))
-    factor, root = model.noise.factor(), np.asarray(posterior.root())
+    model, columns = solution.model, np.asarray(columns)
+    factor, root = model.noise.factor(), solution.posterior.root()
     weighted_columns = np.asarray(factor.solve(columns))
     solved = weighted_columns
     freedom = np.zeros(model.n_data)
@@ -111,25 +98,13 @@ class Preferences:
     gain: Vector
 
 
-def preferences(
-    model: LinearGaussian,
-    posterior: Posterior,
-    covariance: ModesMatrix,
-    data: DataVector,
-    templates: Float[np.ndarray, "data n"],
-) -> Preferences:
+def preferences(solution: Solution, templates: Float[np.ndarray, "data n"]) -> Preferences:
     """Test templates one by one.
 
     Parameters
     ----------
-    model : LinearGaussian
-        Without them.
-    posterior : Posterior
-        Of the model, given these data.
-    covariance : (modes, modes) array
-        Of the posterior, in K^2.
-    data : (data,) array
-        d, in K.
+    solution : Solution
+        Of the data and a model without them.
     templates : (data, n) array
         t, in K per unit of their amplitudes.
 
@@ -143,14 +118,11 @@ def preferences(
     InputError
         If N is not positive definite.
     """
-    model, posterior, data = on_host((model, posterior, data))
-    factor = model.noise.factor()
-    residual = data - np.asarray(model.predict(posterior.mean))
-    pull = templates.T @ np.asarray(factor.solve(residual))
-    solved = np.asarray(factor.solve(templates))
+    model, pull = solution.model, templates.T @ solution.weighted_residual()
+    solved = np.asarray(model.noise.factor().solve(templates))
     # rows of P^T
     seen = np.stack([np.asarray(model.coupling.transpose_mv(column)) for column in solved.T])
-    known = (templates * solved).sum(0) - ((seen @ covariance) * seen).sum(1)
+    known = (templates * solved).sum(0) - ((seen @ solution.covariance) * seen).sum(1)
     # what the sky can take up altogether is left with rounding alone
     told = known > ROUNDING * (templates * solved).sum(0)
     inverse = np.divide(1.0, known, out=np.full(len(known), np.nan), where=told)

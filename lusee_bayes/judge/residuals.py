@@ -20,13 +20,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lusee_bayes.core.arrays import DataVector, on_host
+from lusee_bayes.core.arrays import DataVector
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.chi2 import ChiSquare, Fit, Level, in_brief, probability, stands_out
 from lusee_bayes.judge.left_out import KINDS, DataGroup, LeftOut, Missed, groups_of
 from lusee_bayes.judge.split import Split, with_sky
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
-from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.linear.linear_gaussian import Solution
 
 # of a prior that the sky is unlike
 TOO_WIDE = (
@@ -187,23 +186,17 @@ class Residuals:
         return parts
 
 
-def residuals(
-    model: LinearGaussian, posterior: Posterior, data: Visibilities, chi2: float
-) -> Residuals:
+def residuals(solution: Solution, data: Visibilities) -> Residuals:
     """Compare data with what the model predicts for them, group by group.
 
     Days of 24 hours are counted from the first sample. Runs of one turntable angle are one group.
 
     Parameters
     ----------
-    model : LinearGaussian
+    solution : Solution
         Of these data.
-    posterior : Posterior
-        Of the model, given these data.
     data : Visibilities
         In K, with their times and turntable angles.
-    chi2 : float
-        Of the data under the model, sky included.
 
     Returns
     -------
@@ -215,9 +208,9 @@ def residuals(
     InputError
         If the model cannot be factorised.
     """
-    model, layout = on_host(model), data.layout
-    predicted = np.asarray(model.predict(posterior.mean))
-    split = Split.of(posterior, chi2, model.n_data)
+    model, layout = solution.model, data.layout
+    predicted = np.asarray(model.predict(solution.posterior.mean))
+    split = Split.of(solution.posterior, solution.chi2, model.n_data)
     wide = replace(model, prior=split.wide.prior)
     left_out = LeftOut.of(wide, data, split.wide)
     if left_out is None:
@@ -261,17 +254,13 @@ class HeldOut:
     log_density: float
 
 
-def held_out(
-    model: LinearGaussian, posterior: Posterior, data: Visibilities
-) -> tuple[HeldOut, ...]:
+def held_out(solution: Solution, data: Visibilities) -> tuple[HeldOut, ...]:
     """Predict products, and days of 24 hours from the first sample, from all others.
 
     Parameters
     ----------
-    model : LinearGaussian
+    solution : Solution
         Of these data.
-    posterior : Posterior
-        Of the model, given these data.
     data : Visibilities
         In K.
 
@@ -286,7 +275,7 @@ def held_out(
     InputError
         If the model cannot be factorised.
     """
-    left_out = LeftOut.of(model, data, posterior)
+    left_out = LeftOut.of(solution.model, data, solution.posterior)
     if left_out is None:
         return ()
     groups, found = groups_of(data), []

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lusee_bayes.core.arrays import Square, on_host
+from lusee_bayes.core.arrays import Square
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import cholesky, solve_lower, times_lower
 from lusee_bayes.judge.chi2 import ChiSquare
@@ -52,7 +52,6 @@ class Split:
         InputError
             As :func:`widened`.
         """
-        posterior = on_host(posterior)
         known = n_data - expected_chi2(posterior, n_data)
         size = max(1.0, np.sqrt(float(posterior.prior_chi2()) / known)) if known > 0 else 1.0
         try:

@@ -44,13 +44,12 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array, DataVector, Modes, ModesMatrix, Square, Vector, on_host
+from lusee_bayes.core.arrays import Array, Modes, ModesMatrix, Square, Vector
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky, solve_lower
 from lusee_bayes.linear.information import Information
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
-from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.linear.linear_gaussian import Solution
 
 
 @dataclass(frozen=True)
@@ -132,19 +131,14 @@ class AmplitudesOfSky:
         )
 
 
-def amplitudes_of_sky(
-    model: LinearGaussian, reference: Modes, data: DataVector, templates: Float[Array, "data n"]
-) -> AmplitudesOfSky:
+def amplitudes_of_sky(solution: Solution, templates: Float[Array, "data n"]) -> AmplitudesOfSky:
     """Compute the posterior of templates' amplitudes given the sky.
 
     Parameters
     ----------
-    model : LinearGaussian
-        With ``templates @ templates.T`` in its noise.
-    reference : (modes,) array
-        A sky near the one that is meant, in K: differences from it keep their digits.
-    data : (data,) array
-        d, in K.
+    solution : Solution
+        Of a model with ``templates @ templates.T`` in its noise. Its posterior mean becomes the
+        reference sky: differences from it keep their digits.
     templates : (data, n) array
         T, in K.
 
@@ -153,64 +147,21 @@ def amplitudes_of_sky(
     InputError
         If N is not positive definite.
     """
-    model, reference, data, t = on_host((model, reference, data, templates))
+    model, t = solution.model, np.asarray(templates)
     solved = np.asarray(model.noise.factor().solve(t))
     pull = np.stack([np.asarray(model.coupling.transpose_mv(column)) for column in solved.T])
-    return AmplitudesOfSky(
-        solved.T @ (data - np.asarray(model.predict(reference))),
-        pull,
-        np.eye(t.shape[1]) - t.T @ solved,
-        np.asarray(reference),
-    )
+    mean, covariance = t.T @ solution.weighted_residual(), np.eye(t.shape[1]) - t.T @ solved
+    return AmplitudesOfSky(mean, pull, covariance, solution.posterior.mean)
 
 
-def template_amplitudes(
-    model: LinearGaussian, posterior: Posterior, data: DataVector, templates: Float[Array, "data n"]
-) -> Amplitudes:
-    """Compute the posterior of templates' amplitudes.
+def template_amplitudes(solution: Solution, templates: Float[Array, "data n"]) -> Amplitudes:
+    """Compute the posterior of templates' amplitudes, the sky integrated out.
 
-    Parameters
-    ----------
-    model : LinearGaussian
-        With ``templates @ templates.T`` in its noise.
-    posterior : Posterior
-        Of this model, given these data alone.
-    data : (data,) array
-        d, in K.
-    templates : (data, n) array
-        T, in K.
-
-    Raises
-    ------
-    InputError
-        As :meth:`Posterior.covariance`, and if N is not positive definite.
+    Parameters and errors are those of :func:`amplitudes_of_sky`, and of
+    :meth:`Posterior.covariance`.
     """
-    posterior = on_host(posterior)
-    found = amplitudes_of_sky(model, posterior.mean, data, templates)
-    return found.integrated(np.asarray(posterior.mean), np.asarray(posterior.covariance()))
-
-
-def weighted_residual(model: LinearGaussian, posterior: Posterior, data: DataVector) -> DataVector:
-    """Compute N^-1 (d - offset - A m), m the posterior mean of the sky.
-
-    T^T of it is the mean of amplitudes, and a term N_0 of N times it that of its part in the data.
-
-    Parameters
-    ----------
-    model : LinearGaussian
-    posterior : Posterior
-        Of this model, given these data alone.
-    data : (data,) array
-        d, in K.
-
-    Raises
-    ------
-    InputError
-        If N is not positive definite.
-    """
-    model, posterior, data = on_host((model, posterior, data))
-    residual = data - np.asarray(model.predict(posterior.mean))
-    return np.asarray(model.noise.factor().solve(residual))
+    of_sky = amplitudes_of_sky(solution, templates)
+    return of_sky.integrated(solution.posterior.mean, solution.covariance)
 
 
 class Patterns(eqx.Module):
@@ -438,8 +389,8 @@ def information_given(
     log_det = np.linalg.slogdet(mixed)[1] - np.linalg.slogdet(one + precision)[1]
     return replace(
         information,
-        matrix=np.asarray(information.matrix) + pull.T @ (0.5 * (weight + weight.T)) @ pull,
-        vector=np.asarray(information.vector) - pull.T @ gradient,
+        matrix=information.matrix + pull.T @ (0.5 * (weight + weight.T)) @ pull,
+        vector=information.vector - pull.T @ gradient,
         misfit=np.asarray(information.misfit + misfit),
         log_det=np.asarray(information.log_det + log_det),
     )

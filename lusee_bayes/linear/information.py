@@ -9,6 +9,8 @@ for any reference sky m0. It has the size of the sky, however many data there ar
 gives the posterior, with those of other frequencies a joint one. m0 is chosen near the posterior
 mean: for m0 = 0 the terms are 1e10 times larger than their sum. Unknowns that are
 of no interest are integrated out.
+
+All of this is NumPy's; nothing here is differentiated or traced.
 """
 
 from __future__ import annotations
@@ -19,26 +21,30 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import (
-    Array,
-    DataVector,
-    Modes,
-    ModesMatrix,
-    compiled,
-    namespace,
-    on_processor,
-    placed,
-    repeated,
-)
-from lusee_bayes.core.checks import Described, is_traced, number, require_array, require_shape
+from lusee_bayes.core.arrays import Array, Modes, ModesMatrix, on_host
+from lusee_bayes.core.checks import Described, number, require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.linalg import cholesky, gram_matrix, precise_residual, scaled, solve_lower
-from lusee_bayes.instrument.coupling import Coupling, DenseCoupling
-from lusee_bayes.linear.normal_matrix import has_structure, is_within_times, normal_matrix
+from lusee_bayes.core.linalg import cholesky, precise_residual, scaled, solve_lower
+from lusee_bayes.core.trees import quantity
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.linear.solver import CONVERGENCE, MAX_REFINEMENTS, unfinished
-from lusee_bayes.noise.covariance import Covariance, Factor
 from lusee_bayes.sky.prior import Prior
+
+# a mean is accepted when its last refinement moved no coefficient of u by more than this many
+# posterior standard deviations
+CONVERGENCE = 1e-6
+MAX_REFINEMENTS = 10
+
+
+def unfinished(
+    moved: float | Array, before: float | Array, count: int | Array, most: int = MAX_REFINEMENTS
+) -> bool | Array:
+    """Whether a mean is to be refined once more, after ``count`` steps, at most so often.
+
+    ``moved`` and ``before`` are the lengths of the last step and of that before.
+    """
+    # what is left may be rounding, which no refinement makes smaller
+    gains = (moved >= CONVERGENCE) | (moved <= 0.5 * before)
+    return (count < 1) | ((moved > 1e-3 * CONVERGENCE) & gains & (count < most))
 
 
 class Information(Described, eqx.Module):
@@ -60,81 +66,12 @@ class Information(Described, eqx.Module):
         Number of data, as a float.
     """
 
-    matrix: ModesMatrix
-    vector: Modes
-    reference: Modes
-    misfit: Float[Array, ""]
-    log_det: Float[Array, ""]
-    n_data: Float[Array, ""]
-
-    @classmethod
-    def of(
-        cls,
-        coupling: Coupling,
-        prior: Prior,
-        noise: Covariance,
-        offset: DataVector | None,
-        data: DataVector,
-        known: Information | None = None,
-    ) -> tuple[Information, Posterior]:
-        """Compute the information of data, and the posterior under a prior.
-
-        A is not formed where N has structure in time.
-
-        Parameters
-        ----------
-        coupling : Coupling
-            A, of shape (data, modes).
-        prior : Prior
-            Over the same modes. Its posterior mean becomes the reference sky.
-        noise : Covariance
-            N, in K^2.
-        offset : (data,) array or None
-            Mean of the data without a sky, in K; None for zero.
-        data : (data,) array
-            d, in K.
-        known : Information, optional
-            Of the same data under the same A and N, with any reference sky.
-
-        Returns
-        -------
-        Information
-            Of these data; only its reference sky depends on the prior.
-        Posterior
-            Under the prior.
-
-        Raises
-        ------
-        InputError
-            If ``data`` is not float64, not finite or of another length, N is not positive definite,
-            the prior is over pixels, or the mean does not converge.
-        """
-        require_array("the data", data, (noise.size,))
-        if is_within_times(noise):
-            coupling, prior, noise, offset, data = on_processor(
-                (coupling, prior, noise, offset, data)
-            )
-        factor = noise.factor()
-        structured = has_structure(coupling, noise)
-        if not structured:
-            coupling = DenseCoupling(coupling.dense())
-        xp = namespace((coupling, noise, data))
-        centred = xp.asarray(data) if offset is None else data - offset
-        first = known
-        if first is None:
-            if structured:
-                matrix = normal_matrix(coupling, noise)
-            else:
-                matrix = gram_matrix(factor.whiten(coupling.dense()))
-            zero, n_data = xp.zeros(prior.size), xp.asarray(float(noise.size))
-            vector, misfit = gradient_and_misfit(coupling, factor, centred, zero)
-            first = cls(matrix, vector, zero, misfit, xp.asarray(factor.log_det()), n_data)
-        _require_modes(prior, first.n_modes)
-        lower = _precision_root(first.matrix, prior)
-        mean = prior.colour(_condition(first, prior, lower, 1)[0])
-        vector, misfit = gradient_and_misfit(coupling, factor, centred, mean)
-        information = replace(first, vector=vector, reference=mean, misfit=misfit)
-        return information, information._posterior(prior, lower)
+    matrix: ModesMatrix = quantity("K-2", "A^T N^-1 A")
+    vector: Modes = quantity("K-1", "A^T N^-1 (d - A reference)")
+    reference: Modes = quantity("K", "reference sky")
+    misfit: Float[Array, ""] = quantity("1", "chi^2 at the reference sky")
+    log_det: Float[Array, ""] = quantity("1", "ln det N")
+    n_data: Float[Array, ""] = quantity("1", "number of data")
 
     def description(self) -> tuple[str, ...]:
         return (
@@ -168,8 +105,7 @@ class Information(Described, eqx.Module):
         require_shape("the sky", sky, (self.n_modes,))
         shift = sky - self.reference
         pulled = self.matrix @ shift
-        misfit = self.misfit - 2.0 * (self.vector @ shift) + shift @ pulled
-        misfit = namespace(misfit).asarray(misfit)
+        misfit = np.asarray(self.misfit - 2.0 * (self.vector @ shift) + shift @ pulled)
         return replace(self, vector=self.vector - pulled, reference=sky, misfit=misfit)
 
     def __add__(self, other: Information) -> Information:
@@ -186,13 +122,13 @@ class Information(Described, eqx.Module):
             If it is for another number of modes.
         """
         require_shape("the other reference sky", other.reference, (self.n_modes,))
-        here, xp = other.recentred(self.reference), namespace(self.matrix)
+        here = other.recentred(self.reference)
         return Information(
             self.matrix + here.matrix,
             self.vector + here.vector,
             self.reference,
             *(
-                xp.asarray(getattr(self, name) + getattr(here, name))
+                np.asarray(getattr(self, name) + getattr(here, name))
                 for name in ("misfit", "log_det", "n_data")
             ),
         )
@@ -207,13 +143,12 @@ class Information(Described, eqx.Module):
         """
         if factor == 1.0:
             return self
-        xp = namespace(self.matrix)
         return replace(
             self,
             matrix=self.matrix / factor,
             vector=self.vector / factor,
-            misfit=xp.asarray(self.misfit / factor),
-            log_det=xp.asarray(self.log_det + self.n_data * np.log(factor)),
+            misfit=np.asarray(self.misfit / factor),
+            log_det=np.asarray(self.log_det + self.n_data * np.log(factor)),
         )
 
     def chi2(self, sky: Modes) -> Float[Array, ""]:
@@ -268,13 +203,15 @@ class Information(Described, eqx.Module):
         rest = float(self.log_det + self.n_data * np.log(2.0 * np.pi))
         return np.array([-0.5 * (float(self.chi2(sky)) + rest) for sky in skies])
 
-    def posterior(self, prior: Prior) -> Posterior:
+    def posterior(self, prior: Prior, lower: ModesMatrix | None = None) -> Posterior:
         """Compute the posterior over the sky.
 
         Parameters
         ----------
         prior : Prior
             Over the same modes.
+        lower : (modes, modes) array, optional
+            :func:`precision_root` under this prior, where it is known.
 
         Returns
         -------
@@ -286,91 +223,102 @@ class Information(Described, eqx.Module):
         InputError
             If the prior is over pixels or has another size, or the mean does not converge.
         """
-        _require_modes(prior, self.n_modes)
-        return self._posterior(prior, _precision_root(self.matrix, prior))
-
-    def _posterior(self, prior: Prior, lower: Array) -> Posterior:
-        u, log_evidence, moved = _condition(self, prior, lower, MAX_REFINEMENTS)
-        if not is_traced(moved) and not float(moved) <= CONVERGENCE:
+        prior = on_host(prior)
+        lower = precision_root(self.matrix, prior) if lower is None else lower
+        u, log_evidence, moved = self.white_mean(prior, lower)
+        if not moved <= CONVERGENCE:
             # m0 is far from the mean, so that the gradient is the small difference of large numbers
-            u, log_evidence, moved = _condition(self, prior, lower, MAX_REFINEMENTS, precise=True)
+            u, log_evidence, moved = self.white_mean(prior, lower, precise=True)
         # rounding grows with u, which is of order one where the data are what the prior allows
-        if not is_traced(moved) and not float(moved) <= (
-            accepted := CONVERGENCE * max(1.0, float(np.sqrt(np.mean(np.square(u)))))
-        ):
+        accepted = CONVERGENCE * max(1.0, float(np.sqrt(np.mean(np.square(u)))))
+        if not moved <= accepted:
             raise InputError(
-                f"the posterior mean did not converge: its last step was {float(moved):.2g} "
+                f"the posterior mean did not converge: its last step was {moved:.2g} "
                 f"standard deviations (accepted: {accepted:.2g}); the data are too precise for "
                 "the normal equations, or far from anything that the prior allows"
             )
-        return Posterior(prior, u, lower, None, log_evidence, moved)
+        return Posterior(prior, u, lower, None, np.asarray(log_evidence), np.asarray(moved))
+
+    def white_mean(
+        self,
+        prior: Prior,
+        lower: ModesMatrix,
+        most: int = MAX_REFINEMENTS,
+        *,
+        precise: bool = False,
+    ) -> tuple[Modes, float, float]:
+        """Compute the mean of u = G^-1 m.
+
+        It is found as a correction to that of m0; components without prior power are zero. The
+        solution is repeated on what is left of the gradient, as long as that gains.
+
+        Parameters
+        ----------
+        prior : Prior
+            Over the same modes, in NumPy's arrays.
+        lower : (modes, modes) array
+            :func:`precision_root` under this prior.
+        most : int
+            How often the solution is repeated at most.
+        precise : bool
+            Compute the gradient with more digits than float64 has.
+
+        Returns
+        -------
+        u : (modes,) array
+        log_evidence : float
+            ln p(d).
+        moved : float
+            The last step, in posterior standard deviations.
+        """
+        start = prior.whiten(self.reference)
+        expected = np.zeros_like(start) if prior.white_mean is None else prior.white_mean
+        here, correction = self.recentred(prior.colour(start)), np.zeros_like(start)
+        moved, before, count = np.inf, np.inf, 0
+        while unfinished(moved, before, count, most):
+            shift = prior.colour(correction)
+            if precise:
+                pull = precise_residual(here.vector, here.matrix, shift)
+            else:
+                pull = here.vector - here.matrix @ shift
+            gradient = prior.colour_columns(pull[None])[0] - (start + correction - expected)
+            half = solve_lower(lower, gradient[:, None], transpose=False)
+            correction = correction + solve_lower(lower, half, transpose=True)[:, 0]
+            moved, before, count = float(np.linalg.norm(half)), moved, count + 1
+        u = start + correction
+        log_evidence = -0.5 * (
+            here.recentred(prior.colour(u)).misfit
+            + (u - expected) @ (u - expected)
+            + here.log_det
+            + 2.0 * np.log(np.diagonal(lower)).sum()
+            + here.n_data * np.log(2.0 * np.pi)
+        )
+        return u, float(log_evidence), moved
 
 
-def _require_modes(prior: Prior, n_modes: int) -> None:
-    if not prior.invertible or prior.size != n_modes:
+def precision_root(matrix: ModesMatrix, prior: Prior) -> ModesMatrix:
+    """Compute L of the precision 1 + G^T M G of u = G^-1 m; NaN where there is none.
+
+    Parameters
+    ----------
+    matrix : (modes, modes) array
+        M, in 1/K^2.
+    prior : Prior
+        Over the same modes, in NumPy's arrays.
+
+    Raises
+    ------
+    InputError
+        If it is over pixels or has another size.
+    """
+    if not prior.invertible or prior.size != len(matrix):
         raise InputError(
-            f"information about {n_modes} modes needs a prior over the same modes, got "
+            f"information about {len(matrix)} modes needs a prior over the same modes, got "
             f"{type(prior).__name__} over {prior.size} unknowns"
         )
-
-
-@compiled
-def gradient_and_misfit(
-    coupling: Coupling, factor: Factor, data: Array, sky: Array
-) -> tuple[Array, Array]:
-    """Return A^T N^-1 (d - A m) and ``|L^-1 (d - A m)|^2``."""
-    white = factor.whiten(data - coupling @ sky)
-    solved = factor.whiten_transpose(white)
-    return coupling.transpose_mv(solved), namespace(white).asarray(white @ white)
-
-
-@compiled
-def _precision_root(matrix: ModesMatrix, prior: Prior) -> Array:
-    """L of the precision 1 + G^T M G of u = G^-1 m."""
     precision = prior.sandwich(matrix)
-    diagonal = np.diag_indices(len(precision))
-    return cholesky(placed(precision, diagonal, precision[diagonal] + 1.0), overwrite=True)
-
-
-@compiled
-def _condition(
-    information: Information, prior: Prior, lower: Array, refinements: int, *, precise: bool = False
-) -> tuple[Array, Array, Array]:
-    """Mean of u, ln p(d), and the last step in standard deviations.
-
-    u is found as a correction to that of m0; components without prior power are zero. The solution
-    is repeated on what is left of the gradient, up to so many times, as long as that gains.
-    """
-    xp = namespace(information)
-    start = prior.whiten(information.reference)
-    mean = prior.white_mean
-    expected = xp.zeros_like(start) if mean is None else mean
-    here = information.recentred(prior.colour(start))
-
-    def refine(state):
-        correction, before, _, count = state
-        shift = prior.colour(correction)
-        if precise:
-            pull = precise_residual(here.vector, here.matrix, shift)
-        else:
-            pull = here.vector - here.matrix @ shift
-        gradient = prior.colour_columns(pull[None])[0] - (start + correction - expected)
-        half = solve_lower(lower, gradient[:, None], transpose=False)
-        step = solve_lower(lower, half, transpose=True)[:, 0]
-        return correction + step, xp.asarray(xp.linalg.norm(half)), before, count + 1
-
-    never = xp.asarray(np.inf)
-    first = (xp.zeros_like(start), never, never, xp.asarray(0))
-    correction, moved, _, _ = repeated(xp, unfinished(refinements), refine, first)
-    u = start + correction
-    log_evidence = -0.5 * (
-        here.recentred(prior.colour(u)).misfit
-        + (u - expected) @ (u - expected)
-        + here.log_det
-        + 2.0 * xp.log(xp.diagonal(lower)).sum()
-        + here.n_data * np.log(2.0 * np.pi)
-    )
-    return u, xp.asarray(log_evidence), moved
+    precision[np.diag_indices_from(precision)] += 1.0
+    return cholesky(precision, overwrite=True)
 
 
 def integrated_out(
@@ -403,17 +351,16 @@ def integrated_out(
     """
     others = information.n_modes - n
     require_shape("the variance", variance, (others,))
-    xp = namespace(information)
-    here = information.recentred(xp.concatenate([information.reference[:n], xp.zeros(others)]))
-    scale = xp.sqrt(variance)
-    lower = cholesky(scaled(here.matrix[n:, n:], scale) + xp.eye(others))
+    here = information.recentred(np.concatenate([information.reference[:n], np.zeros(others)]))
+    scale = np.sqrt(variance)
+    lower = cholesky(scaled(here.matrix[n:, n:], scale) + np.eye(others))
     across = solve_lower(lower, scale[:, None] * here.matrix[n:, :n], transpose=False)
     pull = solve_lower(lower, (scale * here.vector[n:])[:, None], transpose=False)
     return Information(
         here.matrix[:n, :n] - across.T @ across,
         here.vector[:n] - (across.T @ pull)[:, 0],
         here.reference[:n],
-        xp.asarray(here.misfit - (pull**2).sum()),
-        xp.asarray(here.log_det + 2.0 * xp.log(xp.diagonal(lower)).sum()),
+        np.asarray(here.misfit - (pull**2).sum()),
+        np.asarray(here.log_det + 2.0 * np.log(np.diagonal(lower)).sum()),
         here.n_data,
     )

@@ -22,16 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import (
-    Array,
-    Modes,
-    ModesMatrix,
-    accumulated,
-    compiled,
-    namespace,
-    on_processor,
-    placed,
-)
+from lusee_bayes.core.arrays import Array, Modes, ModesMatrix, on_host
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import (
@@ -46,11 +37,13 @@ from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.prior import IndependentPrior
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
+# rows that are added at once
+ROWS = 16
+
 # arrays that recur
 ChannelModes = Float[Array, "channels modes"]
 
 
-@compiled
 def common_part(information: Information, residual_root: Modes | None) -> Information:
     """Integrate a channel's residual out of its information about the sky.
 
@@ -68,20 +61,19 @@ def common_part(information: Information, residual_root: Modes | None) -> Inform
     """
     if residual_root is None:
         return information
-    xp = namespace(information, residual_root)
     lower = residual_lower(information, residual_root)
     inverse = inverse_from_cholesky(lower)
     gradient = residual_root * information.vector
     solved = inverse @ gradient
-    log_det = 2.0 * xp.log(xp.diagonal(lower)).sum()
-    diagonal = np.diag_indices(residual_root.shape[0])
-    matrix = placed(-inverse, diagonal, 1.0 - inverse[diagonal])
+    log_det = 2.0 * np.log(np.diagonal(lower)).sum()
+    matrix = -inverse
+    matrix[np.diag_indices_from(matrix)] += 1.0
     return Information(
         scaled(matrix, 1.0 / residual_root, overwrite=True),
         solved / residual_root,
         information.reference,
-        xp.asarray(information.misfit - gradient @ solved),
-        xp.asarray(information.log_det + log_det),
+        np.asarray(information.misfit - gradient @ solved),
+        np.asarray(information.log_det + log_det),
         information.n_data,
     )
 
@@ -89,8 +81,8 @@ def common_part(information: Information, residual_root: Modes | None) -> Inform
 def residual_lower(information: Information, residual_root: Modes) -> ModesMatrix:
     """L L^T = 1 + P."""
     normal = scaled(information.matrix, residual_root)
-    diagonal = np.diag_indices(len(residual_root))
-    return cholesky(placed(normal, diagonal, normal[diagonal] + 1.0), overwrite=True)
+    normal[np.diag_indices_from(normal)] += 1.0
+    return cholesky(normal, overwrite=True)
 
 
 class ComponentSums(eqx.Module):
@@ -143,52 +135,26 @@ class ComponentSums(eqx.Module):
 
     def plus(self, others: ComponentSums) -> ComponentSums:
         """Add the sums of other channels, about the same reference maps; neither is changed."""
-        names = ("matrices", "vectors", "misfit", "log_det", "n_data")
-        xp = namespace(self, others)
-        both = {name: xp.asarray(getattr(self, name) + getattr(others, name)) for name in names}
+        return self._plus(others, "matrices", "vectors", "misfit", "log_det", "n_data")
+
+    def _plus(self, others: ComponentSums | Information, *names: str) -> ComponentSums:
+        both = {name: np.asarray(getattr(self, name) + getattr(others, name)) for name in names}
         return replace(self, **both)
 
     def information(self) -> Information:
         """Information about all component maps in one vector, the first map first."""
-        return _assembled(self)
-
-
-@compiled
-def _with_channel(
-    sums: ComponentSums, information: Information, mixing: Array, residual_root: Array | None
-) -> ComponentSums:
-    here = common_part(information, residual_root).recentred(mixing @ sums.reference)
-    matrices = sums.matrices
-    for pair, (i, j) in enumerate(zip(*np.tril_indices(mixing.shape[0]), strict=True)):
-        total = accumulated(matrices[pair], mixing[i] * mixing[j], here.matrix)
-        matrices = placed(matrices, pair, total)
-    return ComponentSums(
-        matrices,
-        sums.vectors + mixing[:, None] * here.vector[None],
-        sums.reference,
-        *(
-            namespace(sums).asarray(getattr(sums, name) + getattr(here, name))
-            for name in ("misfit", "log_det", "n_data")
-        ),
-    )
-
-
-@compiled
-def _assembled(sums: ComponentSums) -> Information:
-    k, n = sums.reference.shape
-    matrix = namespace(sums).zeros((k * n, k * n))
-    for pair, (i, j) in enumerate(zip(*np.tril_indices(k), strict=True)):
-        for rows, columns in ((i, j), (j, i)):
-            where = slice(rows * n, (rows + 1) * n), slice(columns * n, (columns + 1) * n)
-            matrix = placed(matrix, where, sums.matrices[pair])
-    return Information(
-        matrix,
-        sums.vectors.reshape(k * n),
-        sums.reference.reshape(k * n),
-        sums.misfit,
-        sums.log_det,
-        sums.n_data,
-    )
+        k, n = self.reference.shape
+        matrix = np.zeros((k, n, k, n))
+        for pair, (i, j) in enumerate(zip(*np.tril_indices(k), strict=True)):
+            matrix[i, :, j] = matrix[j, :, i] = self.matrices[pair]
+        return Information(
+            matrix.reshape(k * n, k * n),
+            self.vectors.reshape(k * n),
+            self.reference.reshape(k * n),
+            self.misfit,
+            self.log_det,
+            self.n_data,
+        )
 
 
 def solve_directly(
@@ -233,7 +199,7 @@ def summed_information(
     Parameters
     ----------
     sums : ComponentSums
-        Of other channels. Its memory is reused: it cannot be read afterwards.
+        Of other channels; its matrices are changed in place.
     prior : SpectralPrior
         Of all channels.
     channel : int
@@ -246,8 +212,17 @@ def summed_information(
     ComponentSums
         The sums with the channel.
     """
-    sums, prior, information = on_processor((sums, prior, information))
-    return _with_channel(sums, information, prior.mixing[channel], prior.residual_root(channel))
+    prior = on_host(prior)
+    mixing = prior.mixing[channel]
+    common = common_part(information, prior.residual_root(channel))
+    common = common.recentred(mixing @ sums.reference)
+    for pair, (i, j) in enumerate(zip(*np.tril_indices(len(mixing)), strict=True)):
+        weight, total = mixing[i] * mixing[j], sums.matrices[pair]
+        for first in range(0, len(total), ROWS):  # products that fit into a cache
+            rows = slice(first, first + ROWS)
+            total[rows] += weight * common.matrix[rows]
+    vectors = sums.vectors + mixing[:, None] * common.vector
+    return replace(sums, vectors=vectors)._plus(common, "misfit", "log_det", "n_data")
 
 
 def component_posterior(information: Information, prior: SpectralPrior) -> Posterior:
@@ -270,11 +245,9 @@ def component_posterior(information: Information, prior: SpectralPrior) -> Poste
     InputError
         If the mean does not converge.
     """
-    information, prior = on_processor((information, prior))
     return information.posterior(IndependentPrior(prior.roots.reshape(-1)))
 
 
-@compiled
 def paired(
     covariance: Float[Array, "unknowns unknowns"], prior: SpectralPrior
 ) -> Float[Array, "pairs modes modes"]:
@@ -294,7 +267,7 @@ def paired(
     """
     k = prior.n_components
     blocks = covariance.reshape(k, -1, k, covariance.shape[0] // k)
-    return namespace(covariance).stack(
+    return np.stack(
         [
             blocks[i, :, j] + blocks[j, :, i] if i > j else blocks[i, :, i]
             for i, j in zip(*np.tril_indices(k), strict=True)
@@ -364,39 +337,23 @@ def channel_sky(
     require_shape("the component maps", maps, (prior.n_components, None))
     n_draws, _, n_modes = draws.shape
     z = jax.random.normal(jax.random.fold_in(key, channel), (n_draws, n_modes), dtype=jnp.float64)
-    prior, *given = on_processor((prior, information, maps, covariances, draws, z))
-    return _channel_sky(prior.mixing[channel], prior.residual_root(channel), *given)
-
-
-@compiled
-def _channel_sky(
-    mixing: Array,
-    residual_root: Array | None,
-    information: Information,
-    maps: Array,
-    covariances: Array | None,
-    draws: Array,
-    z: Array,
-) -> ChannelSky:
-    xp = namespace(information)
+    prior, maps, covariances, draws, z = on_host((prior, maps, covariances, draws, z))
+    mixing, residual_root = prior.mixing[channel], prior.residual_root(channel)
     mean, skies = mixing @ maps, mixing @ draws
     covariance = None
     if covariances is not None:
-        first, second = np.tril_indices(mixing.shape[0])
-        covariance = xp.tensordot(mixing[first] * mixing[second], covariances, 1)
+        first, second = np.tril_indices(len(mixing))
+        covariance = np.tensordot(mixing[first] * mixing[second], covariances, 1)
     if residual_root is not None:
         lower = residual_lower(information, residual_root)
-
         # of the mean and of every draw: the residual's mean, given the common part
-        common = xp.concatenate([mean[None], skies])
-        pull = (
-            information.vector[None] - (common - information.reference[None]) @ information.matrix
-        )
-        half = solve_lower(lower, (residual_root[None] * pull).T, transpose=False)
+        common = np.concatenate([mean[None], skies])
+        pull = information.vector - (common - information.reference) @ information.matrix
+        half = solve_lower(lower, (residual_root * pull).T, transpose=False)
         # a draw deviates from it by L^-T z
-        half = half + xp.pad(z, ((1, 0), (0, 0))).T
-        found = common + residual_root[None] * solve_lower(lower, half, transpose=True).T
-        mean, skies = found[0], found[1:]
+        half[:, 1:] += z.T
+        whole = common + residual_root * solve_lower(lower, half, transpose=True).T
+        mean, skies = whole[0], whole[1:]
         if covariance is not None:
             inverse = inverse_from_cholesky(lower)
             white = scaled(covariance, 1.0 / residual_root, overwrite=True)

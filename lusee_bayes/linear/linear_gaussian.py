@@ -1,29 +1,60 @@
-"""The linear Gaussian model d = A m + n.
+"""The linear Gaussian model d = A m + n, and its solutions.
 
 It is a distribution over data, with a posterior over m, ::
 
     Lambda = A^T N^-1 A + S^-1,    C = Lambda^-1,    mean = C A^T N^-1 d
 
-The posterior is computed in a map-space form, of the size of the sky, or a data-space form, of the
-size of the data; :mod:`lusee_bayes.linear.solver` has the algebra of both. Data with independent
-noise are added to earlier ones through their :class:`.Information`.
+With N = L L^T, S = G G^T and the whitened sky u (m = G u), set W = L^-1 A G and w = L^-1 d. Then ::
+
+    Lambda = 1 + W^T W,   u | d ~ N(Lambda^-1 W^T w, Lambda^-1),
+    log p(d) = -1/2 [ |w - W u|^2 + |u|^2 + ln|N| + ln|Lambda| + N_data ln 2 pi ]    (u the mean),
+
+the equations of the map-space form, preconditioned. (Where the prior has a mean mu, d is less
+A mu, and u is that of m - mu.) The forms are classes behind one interface:
+
+- :class:`InData`, with fewer data than modes: the same in the row space of W. W^T = Q R
+  (Householder), u = Q v + (a part that only the prior knows), Lambda_v = 1 + R R^T of the size of
+  the data. It equals S A^T (A S A^T + N)^-1 d without the cancellation of S - S A^T (...)^-1 A S,
+  which loses the variance of well measured modes.
+- :class:`FromInformation`, with more data: through A^T N^-1 A in NumPy, without A where A and N
+  have structure in time (:mod:`.normal_matrix`).
+- :class:`InMap`, in its place where a model is differentiated, traced or over pixels: through W in
+  JAX.
+
+W^T W squares the signal-to-noise ratio s of the best measured mode: in map space standard
+deviations are good to eps s^2 at worst (1e-6 in the fiducial case; Posterior.std checks it), in
+data space to eps s. The mean is refined to the same quality in all of them.
+
+Data with independent noise are added to earlier ones through their :class:`.Information`.
 """
 
 from __future__ import annotations
 
+from abc import abstractmethod
+from dataclasses import dataclass, replace
+from functools import cached_property
+
 import equinox as eqx
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Array, DataVector, on_processor
-from lusee_bayes.core.checks import Described, require_array
-from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.instrument.coupling import Coupling, as_coupling
-from lusee_bayes.linear.information import Information, gradient_and_misfit
-from lusee_bayes.linear.normal_matrix import has_structure, is_within_times
+from lusee_bayes.core.arrays import Array, DataVector, Modes, ModesMatrix, namespace, on_host
+from lusee_bayes.core.checks import Described, is_traced, require_array
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.linalg import gram_matrix, solve_lower
+from lusee_bayes.instrument.coupling import Coupling, DenseCoupling, as_coupling
+from lusee_bayes.linear.information import (
+    CONVERGENCE,
+    MAX_REFINEMENTS,
+    Information,
+    precision_root,
+    unfinished,
+)
+from lusee_bayes.linear.normal_matrix import has_structure, normal_matrix
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.linear.solver import FORMS, Solver, factorise
-from lusee_bayes.noise.covariance import Covariance
+from lusee_bayes.noise.covariance import Covariance, Factor
 from lusee_bayes.sky.prior import Prior
 
 
@@ -73,7 +104,7 @@ class LinearGaussian(Described, eqx.Module):
             f"d = A m{offset} + n, {self.n_data} data, {self.prior.size} unknowns of the sky, in K",
             f"A {type(self.coupling).__name__}, S {type(self.prior).__name__}, "
             f"N {type(self.noise).__name__}",
-            "condition(data) gives the posterior",
+            "condition(data).posterior is that of the sky",
         )
 
     @property
@@ -122,11 +153,8 @@ class LinearGaussian(Described, eqx.Module):
         InputError
             If N is not positive definite.
         """
-        model = self
-        if is_within_times(self.noise):
-            model, sky, data = on_processor((self, sky, data))
-        centred = data if model.offset is None else data - model.offset
-        return gradient_and_misfit(model.coupling, model.noise.factor(), centred, sky)[1]
+        white = self.noise.factor().whiten(data - self.predict(sky))
+        return namespace(white).asarray(white @ white)
 
     def sample(self, key: PRNGKeyArray) -> tuple[Float[Array, " unknowns"], DataVector]:
         """Draw a sky from the prior, and data of that sky.
@@ -152,46 +180,42 @@ class LinearGaussian(Described, eqx.Module):
         sky = self.prior.sample(sky_key)
         return sky, self.predict(sky) + self.noise.sample(noise_key)
 
-    def factorise(self, form: str | None = None) -> Solver:
+    def factorise(self, form: type[Whitened] | None = None) -> Whitened:
         """Do all work that does not depend on the data, to condition on many data vectors.
+
+        Works inside JAX's transformations, as do the solver's methods.
 
         Parameters
         ----------
-        form : {"map", "data", "root"}, optional
-            See :mod:`lusee_bayes.linear.solver`. By default the cheaper of "map" and "data".
+        form : {InMap, InData}, optional
+            By default the smaller one.
 
         Returns
         -------
-        Solver
+        Whitened
             The factorised model.
 
         Raises
         ------
         InputError
-            If the form is unknown, N is not positive definite, or Lambda cannot be factorised.
+            If N is not positive definite, or Lambda cannot be factorised.
         """
-        if form is None:
-            form = "data" if self.n_data < self.prior.rank else "map"
-        if form not in FORMS:
-            raise InputError(f"unknown form '{form}'; {nearest(form, FORMS)}")
-        return factorise(self.coupling, self.prior, self.noise, self.offset, form)
+        return (form or form_of(self, transformed=True)).of(self)
 
-    def condition(self, data: DataVector, form: str | None = None) -> Posterior:
-        """Compute the posterior over the sky given data.
+    def condition(self, data: DataVector, form: type[Form] | None = None) -> Solution:
+        """Solve the model for data.
 
         Parameters
         ----------
         data : (data,) array
             d, in K.
-        form : {"map", "data", "root", "structured"}, optional
-            As for :meth:`factorise`, or "structured": through A^T N^-1 A without A. That is the
-            default where A and N have structure in time, the prior is over modes, and the data
-            are as many as these.
+        form : {FromInformation, InMap, InData}, optional
+            By default that of :func:`form_of`.
 
         Returns
         -------
-        Posterior
-            With the evidence of the data.
+        Solution
+            With the posterior over the sky, and the information in the data.
 
         Raises
         ------
@@ -199,41 +223,8 @@ class LinearGaussian(Described, eqx.Module):
             If the data are not float64, not finite or of another length, the model cannot be
             factorised, or the mean does not converge.
         """
-        if form == "structured" or (form is None and self.is_structured):
-            return self.inform(data)[1]
-        return self.factorise(form).condition(data)
-
-    @property
-    def is_structured(self) -> bool:
-        """Whether the posterior is found without A by default; see :meth:`condition`."""
-        enough = self.n_data >= self.prior.size
-        return self.prior.invertible and enough and has_structure(self.coupling, self.noise)
-
-    def inform(
-        self, data: DataVector, known: Information | None = None
-    ) -> tuple[Information, Posterior]:
-        """Compute the information of data, and the posterior; see :meth:`Information.of`.
-
-        Parameters
-        ----------
-        data : (data,) array
-            d, in K.
-        known : Information, optional
-            Of the same data, found with another prior.
-
-        Returns
-        -------
-        Information
-            ln p(d | m) as a function of the sky.
-        Posterior
-            Under the model's prior.
-
-        Raises
-        ------
-        InputError
-            As :meth:`Information.of`.
-        """
-        return Information.of(self.coupling, self.prior, self.noise, self.offset, data, known)
+        traced = is_traced(*jax.tree.leaves((self, data)))
+        return (form or form_of(self, transformed=traced)).of(self).condition(data)
 
     def log_prob(self, data: DataVector) -> Float[Array, ""]:
         """Compute the evidence ln p(d), with the sky integrated out. Differentiable.
@@ -254,3 +245,371 @@ class LinearGaussian(Described, eqx.Module):
             As :meth:`condition`.
         """
         return self.factorise().log_prob(data)
+
+
+@dataclass(frozen=True, repr=False)
+class Solution(Described):
+    """A model solved for data, in NumPy's arrays except inside JAX's transformations.
+
+    Attributes
+    ----------
+    model : LinearGaussian
+        The model.
+    data : (data,) array
+        d, in K.
+    posterior : Posterior
+        Over the sky, with the evidence of the data.
+    known : Information or None
+        :attr:`information`, where the posterior was computed from it.
+    """
+
+    model: LinearGaussian
+    data: DataVector
+    posterior: Posterior
+    known: Information | None = None
+
+    def description(self) -> tuple[str, ...]:
+        return (*self.posterior.description(), "posterior, information, covariance, under(prior)")
+
+    @cached_property
+    def information(self) -> Information:
+        """ln p(d | m) as a function of the sky; only its reference depends on the prior."""
+        if self.known is not None:
+            return self.known
+        return FromInformation.of(self.model).condition(self.data).information
+
+    @cached_property
+    def covariance(self) -> Float[Array, "unknowns unknowns"]:
+        """C of the posterior, in K^2."""
+        return self.posterior.covariance()
+
+    @cached_property
+    def chi2(self) -> float:
+        """(d - E[d])^T (A S A^T + N)^-1 (d - E[d]): of the data under the model, sky included."""
+        misfit = self.model.chi2(self.posterior.mean, self.data)
+        return float(misfit + self.posterior.prior_chi2())
+
+    def weighted_residual(self) -> DataVector:
+        """Compute N^-1 (d - offset - A m), m the posterior mean of the sky.
+
+        T^T of it is the mean of templates' amplitudes, and a term N_0 of N times it that of its
+        part in the data.
+        """
+        residual = self.data - self.model.predict(self.posterior.mean)
+        return np.asarray(self.model.noise.factor().solve(residual))
+
+    def under(self, prior: Prior) -> Solution:
+        """Solve for the same data under another prior; A^T N^-1 A is not computed again.
+
+        Parameters
+        ----------
+        prior : Prior
+            Over the same unknowns.
+
+        Raises
+        ------
+        InputError
+            As :meth:`LinearGaussian.condition`.
+        """
+        model = replace(self.model, prior=prior)
+        if form_of(model) is not FromInformation:
+            return model.condition(self.data)
+        return FromInformation.of(model, self.information.matrix).condition(self.data)
+
+
+def form_of(model: LinearGaussian, *, transformed: bool = False) -> type[Form]:
+    """Choose the form in which a model is solved.
+
+    Parameters
+    ----------
+    model : LinearGaussian
+        The model.
+    transformed : bool
+        Inside JAX's transformations, such as ``grad`` or ``vmap``, which need a form in JAX.
+
+    Returns
+    -------
+    type
+        The cheapest of the forms that can be used.
+    """
+    if model.n_data < model.prior.rank:
+        return InData
+    return InMap if transformed or not model.prior.invertible else FromInformation
+
+
+class Form(eqx.Module):
+    """A factorised model, which is solved for data at the cost of a few products each.
+
+    Attributes
+    ----------
+    model : LinearGaussian
+        The model.
+    factor : Factor
+        L of N = L L^T.
+    """
+
+    model: LinearGaussian
+    factor: Factor
+
+    @classmethod
+    @abstractmethod
+    def of(cls, model: LinearGaussian) -> Form:
+        """Factorise a model.
+
+        Raises
+        ------
+        InputError
+            If N is not positive definite, or Lambda cannot be factorised.
+        """
+
+    @abstractmethod
+    def condition(self, data: DataVector) -> Solution:
+        """Solve for data.
+
+        Parameters
+        ----------
+        data : (data,) array
+            d, in K.
+
+        Raises
+        ------
+        InputError
+            If the data are not float64, not finite or of another length, or the refinement of the
+            mean does not converge.
+        """
+
+    def log_prob(self, data: DataVector) -> Float[Array, ""]:
+        """Compute the evidence ln p(d) of data in K; errors are those of :meth:`condition`."""
+        return self.condition(data).posterior.log_evidence
+
+
+class FromInformation(Form):
+    """Through A^T N^-1 A, in NumPy; not inside JAX's transformations.
+
+    Attributes
+    ----------
+    coupling : Coupling
+        A: a matrix, where there is no structure in time.
+    matrix : (modes, modes) array
+        A^T N^-1 A, in 1/K^2.
+    lower : (modes, modes) array
+        Cholesky factor of Lambda.
+    """
+
+    coupling: Coupling
+    matrix: ModesMatrix
+    lower: ModesMatrix
+
+    @classmethod
+    def of(cls, model: LinearGaussian, matrix: ModesMatrix | None = None) -> FromInformation:
+        """Factorise a model, of which A^T N^-1 A may be known."""
+        model = on_host(model)
+        coupling, factor = model.coupling, model.noise.factor()
+        structured = has_structure(coupling, model.noise)
+        if not structured:
+            coupling = DenseCoupling(coupling.dense())
+        if matrix is None and structured:
+            matrix = normal_matrix(coupling, model.noise)
+        elif matrix is None:
+            matrix = gram_matrix(np.asarray(factor.whiten(coupling.dense())))
+        return cls(model, factor, coupling, matrix, precision_root(matrix, model.prior))
+
+    def condition(self, data: DataVector) -> Solution:
+        data, prior = np.asarray(data), self.model.prior
+        require_array("the data", data, (self.model.n_data,))
+        u, _, _ = self._about(data, np.zeros(prior.size)).white_mean(prior, self.lower, most=1)
+        information = self._about(data, prior.colour(u))
+        posterior = information.posterior(prior, self.lower)
+        return Solution(self.model, data, posterior, information)
+
+    def _about(self, data: DataVector, sky: Modes) -> Information:
+        """The information of data, about a reference sky."""
+        offset, n = self.model.offset, self.model.n_data
+        centred = data if offset is None else data - offset
+        white = self.factor.whiten(centred - self.coupling @ sky)
+        vector = self.coupling.transpose_mv(np.asarray(self.factor.whiten_transpose(white)))
+        scalars = map(np.asarray, (white @ white, self.factor.log_det(), float(n)))
+        return Information(self.matrix, np.asarray(vector), sky, *scalars)
+
+
+class Whitened(Form):
+    """Through W, in JAX: differentiable, and inside JAX's transformations, too.
+
+    Attributes
+    ----------
+    whitened : (data, white) array
+        W = L^-1 A G.
+    lower : (rank, rank) array
+        Cholesky factor of Lambda, or of Lambda_v where ``basis`` is given.
+    basis : (white, rank) array or None
+        Q of the data-space form; None in map space.
+    """
+
+    whitened: Float[Array, "data white"]
+    lower: Float[Array, "rank rank"]
+    basis: Float[Array, "white rank"] | None
+
+    @classmethod
+    def of(cls, model: LinearGaussian) -> Whitened:
+        solver = cls(model, *cls._factorised(model))
+        if not is_traced(solver.lower) and not np.isfinite(np.diagonal(solver.lower)).all():
+            model.noise.factor()  # outside jit: raises and names the term that is not positive
+            raise InputError(
+                "Lambda = 1 + W^T W could not be factorised: the data are too precise for the "
+                "normal equations; use form=InData"
+            )
+        return solver
+
+    @staticmethod
+    @abstractmethod
+    def _factorised(model: LinearGaussian) -> tuple[Factor, Array, Array, Array | None]:
+        """L of N, W, L of Lambda, and the basis."""
+
+    @abstractmethod
+    def _log_det(self) -> Float[Array, ""]:
+        """ln|Lambda|."""
+
+    def condition(self, data: DataVector) -> Solution:
+        require_array("the data", data, (self.model.n_data,))
+        data = jnp.asarray(data)
+        u, log_evidence, moved = _solve(self, data)
+        traced = is_traced(moved)
+        if not traced and not float(moved) <= CONVERGENCE:
+            raise InputError(
+                f"the posterior mean did not converge: after {MAX_REFINEMENTS} refinements it "
+                f"still moves by {float(moved):.2g} standard deviations (accepted: "
+                f"{CONVERGENCE:g}); the noise is too small for float64 arithmetic"
+            )
+        prior = self.model.prior
+        posterior = Posterior(prior, u, self.lower, self.basis, log_evidence, moved)
+        parts = self.model, data, posterior
+        return Solution(*(parts if traced else on_host(parts)))
+
+    def surprise(self, data: DataVector) -> DataVector:
+        """Compute L^-1 (d - E[d]), where E[d] is what the prior's mean sky predicts.
+
+        Parameters
+        ----------
+        data : (data,) array
+            d, in K.
+
+        Returns
+        -------
+        (data,) array
+            White data, of which the model says N(0, 1 + W W^T).
+        """
+        offset, mean = self.model.offset, self.model.prior.white_mean
+        white = self.factor.whiten(data if offset is None else data - offset)
+        return white if mean is None else white - self.whitened @ mean
+
+    def half(self) -> Float[Array, "rank data"]:
+        """Compute H with (A S A^T + N)^-1 = L^-T (1 - H^T H) L^-1.
+
+        Returns
+        -------
+        (rank, data) array
+            L_Lambda^-1 W^T; in the data-space form L_v^-1 R.
+        """
+        inside = self.whitened if self.basis is None else self.whitened @ self.basis
+        return solve_lower(self.lower, inside.T, transpose=False)
+
+
+class InMap(Whitened):
+    """In map space: Lambda = 1 + W^T W."""
+
+    @staticmethod
+    @eqx.filter_jit
+    def _factorised(model):
+        factor, whitened = _white(model)
+        return factor, whitened, _root(gram_matrix(whitened)), None
+
+    def _log_det(self):
+        return 2.0 * jnp.log(jnp.diagonal(self.lower)).sum()
+
+
+class InData(Whitened):
+    """In data space: Lambda_v = 1 + R R^T, with W^T = Q R."""
+
+    @staticmethod
+    @eqx.filter_jit
+    def _factorised(model):
+        factor, whitened = _white(model)
+        basis, triangle = jnp.linalg.qr(jax.lax.stop_gradient(whitened).T)
+        return factor, whitened, _root(triangle @ triangle.T), basis
+
+    def _log_det(self):
+        return _log_det_in_span(self.whitened, jax.lax.stop_gradient(self.lower))
+
+
+def _white(model: LinearGaussian) -> tuple[Factor, Array]:
+    factor = model.noise.factor()
+    return factor, factor.whiten(model.prior.colour_columns(model.coupling.dense()))
+
+
+def _root(normal: Array) -> Array:
+    return jax.lax.linalg.cholesky(normal + jnp.eye(len(normal)), symmetrize_input=False)
+
+
+@jax.custom_jvp
+def _log_det_in_span(whitened: Array, lower: Array) -> Array:
+    """ln|1 + W W^T| from the factor of the data form, whose QR has no derivative at low rank."""
+    return 2.0 * jnp.log(jnp.diagonal(lower)).sum()
+
+
+@_log_det_in_span.defjvp
+def _log_det_in_span_jvp(primals, tangents):
+    """d ln|1 + W W^T| = 2 sum( (1 + W W^T)^-1 W * dW )."""
+    whitened, lower = primals
+    gram_of_data = jnp.eye(whitened.shape[0]) + whitened @ whitened.T
+    slope = jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(gram_of_data), True), whitened)
+    return _log_det_in_span(whitened, lower), 2.0 * (slope * tangents[0]).sum()
+
+
+def _newton(
+    whitened: Array, lower: Array, basis: Array | None, white: Array, u: Array
+) -> tuple[Array, Array]:
+    """u plus Lambda^-1 (W^T (w - W u) - u), and the length of that step in standard deviations."""
+    gradient = whitened.T @ (white - whitened @ u) - u
+    projected = gradient if basis is None else basis.T @ gradient
+    half = solve_lower(lower, projected[:, None], transpose=False)
+    step = solve_lower(lower, half, transpose=True)[:, 0]
+    if basis is not None:
+        # outside the span of W^T, Lambda is 1 and the gradient is zero but for rounding; it is
+        # kept only in derivatives
+        outside = gradient - basis @ projected
+        step = basis @ step + (outside - jax.lax.stop_gradient(outside))
+    return u + step, jnp.linalg.norm(half)
+
+
+@eqx.filter_jit
+def _solve(solver: Whitened, data: DataVector) -> tuple[Array, Array, Array]:
+    """Mean of u, log evidence, and size of the last refinement in standard deviations.
+
+    The normal equations square the condition number; repeating the solve on the residual
+    (corrected seminormal equations) restores what they lose. Derivatives do not go through the
+    iteration: at its fixed point one more step with live arrays carries them exactly.
+    """
+    white = solver.surprise(data)
+    live = (solver.whitened, solver.lower, solver.basis, white)
+    frozen = jax.lax.stop_gradient(live)
+
+    def refine(state):
+        u, moved = _newton(*frozen, state[0])
+        return u, moved, state[1], state[3] + 1
+
+    first, _ = _newton(*frozen, jnp.zeros(solver.whitened.shape[1]))
+    start = (first, jnp.inf, jnp.inf, 0)
+    u, moved, _, _ = jax.lax.while_loop(lambda state: unfinished(*state[1:]), refine, start)
+    fixed = (solver.whitened, *frozen[1:3], white)
+    u, _ = _newton(*fixed, jax.lax.stop_gradient(u))
+    misfit = white - solver.whitened @ u
+    log_evidence = -0.5 * (
+        misfit @ misfit
+        + u @ u
+        + solver.factor.log_det()
+        + solver._log_det()
+        + white.shape[0] * np.log(2.0 * np.pi)
+    )
+    # u was that of the sky's deviation from the prior's mean
+    mean = solver.model.prior.white_mean
+    return u if mean is None else u + mean, log_evidence, moved

@@ -14,31 +14,20 @@ visibility is Re sum_m conj(c_lm) (a_lm + i a_l,-m), and for noise that does not
     sum_t w(t) c_lm c'_l'm'       = sum_jk beta_j,lm beta'_k,l'm' F_jk(m + m')       = Q,
 
 at each turntable angle. The four parts of the matrix follow from P + Q and P - Q.
-Noise that couples different times is whitened in order of time, a few rows of A at once.
+Noise that couples different times is whitened in order of time, a few rows of A at once. All of
+this is NumPy's, whatever arrays A and N have.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from itertools import pairwise
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from lusee_bayes.core.arrays import (
-    Array,
-    ModesMatrix,
-    as_complex,
-    compiled,
-    namespace,
-    placed,
-    scan,
-)
-from lusee_bayes.core.checks import is_traced, require_shape
+from lusee_bayes.core.arrays import ModesMatrix, on_host
+from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import Rotation, mode_numbers
 from lusee_bayes.core.linalg import checked_cholesky, gram_matrix, mirrored, solve_lower
@@ -48,23 +37,22 @@ from lusee_bayes.noise.covariance import (
     DiagonalCovariance,
     LowRankUpdate,
     TimeBandedCovariance,
-    TimeBandedFactor,
     TimeBlockCovariance,
 )
 
 # arrays that recur
-Beams = Float[Array, "orders products 2 functions degrees"]
+Beams = Float[np.ndarray, "orders products 2 functions degrees"]
 
 # times that are summed at once: it bounds the memory
 CHUNK = 512
 
 
 def time_sums(
-    weights: Float[Array, "weights times"],
-    azimuth: Float[Array, " times"],
-    functions: Float[Array, "times functions"],
+    weights: Float[np.ndarray, "weights times"],
+    azimuth: Float[np.ndarray, " times"],
+    functions: Float[np.ndarray, "times functions"],
     lmax: int,
-) -> Complex[Array, "weights functions functions q"]:
+) -> Complex[np.ndarray, "weights functions functions q"]:
     """Compute F for every pair of functions of time.
 
     Parameters
@@ -85,83 +73,47 @@ def time_sums(
     """
     n = functions.shape[1]
     left, right = np.triu_indices(n)
-    n_chunks = -(-azimuth.shape[0] // CHUNK)
-    missing = n_chunks * CHUNK - azimuth.shape[0]
-
-    xp = namespace(weights, azimuth, functions)
-
-    def chunked(x: Array) -> Array:
-        padded = xp.pad(x, ((0, missing), *((0, 0),) * (x.ndim - 1)))
-        return padded.reshape(n_chunks, CHUNK, *x.shape[1:])
-
-    def add(total, part):
-        w, phi, u = part
+    sums = np.zeros((weights.shape[0] * len(left), 2 * (2 * lmax + 1)))
+    for first in range(0, len(azimuth), CHUNK):
+        times = slice(first, first + CHUNK)
+        u = functions[times]
         pairs = u[:, left] * u[:, right]
-        angle = phi[:, None] * np.arange(2.0 * lmax + 1.0)[None]
-        phases = xp.concatenate([xp.cos(angle), xp.sin(angle)], axis=1)
-        weighted = (w.T[:, None] * pairs.T[None]).reshape(-1, CHUNK)
-        return total + weighted @ phases, None
-
-    start = xp.zeros((weights.shape[0] * len(left), 2 * (2 * lmax + 1)))
-    parts = (chunked(weights.T), chunked(azimuth), chunked(functions))
-    sums, _ = scan(xp, add, start, parts)
-    cosine, sine = xp.split(sums.reshape(weights.shape[0], len(left), -1), 2, axis=-1)
-    positive = as_complex(cosine, sine)
-    full = xp.concatenate([positive[..., :0:-1].conj(), positive], axis=-1)
+        angle = azimuth[times, None] * np.arange(2.0 * lmax + 1.0)
+        phases = np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
+        sums += (weights[:, None, times] * pairs.T).reshape(len(sums), -1) @ phases
+    cosine, sine = np.split(sums.reshape(weights.shape[0], len(left), -1), 2, axis=-1)
+    positive = cosine + 1j * sine
+    full = np.concatenate([positive[..., :0:-1].conj(), positive], axis=-1)
     place = np.zeros((n, n), dtype=int)
     place[left, right] = place[right, left] = np.arange(len(left))
-    return xp.take(full, place, axis=1)
+    return full[:, place]
 
 
-# strips of orders where they are compiled: more save products with zeros
-N_STRIPS = 6
-
-
-@compiled
 def of_one_angle(
-    by_order: Float[Array, "orders beams degrees"],
-    weights: Float[Array, "..."],
-    azimuth: Float[Array, " times"],
-    functions: Float[Array, "functions times"],
+    by_order: Float[np.ndarray, "orders beams degrees"],
+    weights: Float[np.ndarray, "..."],
+    azimuth: Float[np.ndarray, " times"],
+    functions: Float[np.ndarray, "functions times"],
     n_products: int,
 ) -> ModesMatrix:
-    """The lower triangle of their part in the mean-pole frame; modes as :func:`places` has them."""
+    """The lower triangle of their part in the mean-pole frame; modes as :func:`places` has them.
+
+    One order after the other is one block row on and below the diagonal: only columns of orders up
+    to its own, and rows of degrees from it, are computed; the others are mirror images, or zero.
+    """
     n = by_order.shape[0]
     beams = by_order.reshape(n, n_products, -1, 2, n).swapaxes(2, 3)
     f = time_sums(weights.reshape(-1, azimuth.shape[0]), azimuth, functions.T, n - 1)
-    return _from_sums(beams, f.reshape(*weights.shape[:-1], *f.shape[1:]))
-
-
-def _from_sums(beams: Beams, f: Complex[Array, "..."]) -> ModesMatrix:
-    """The matrix of beams (W_lm, W_l,-m) and Fourier sums, one strip of orders after the other.
-
-    Only columns of orders up to the strip's own last one, and rows of degrees from its first one,
-    are computed; the others are mirror images, or zero. Modes come in the order of
-    :func:`places`, so that a strip is one block on and below the diagonal.
-    """
-    xp, n = namespace(beams, f), beams.shape[0]
+    f = f.reshape(*weights.shape[:-1], *f.shape[1:])
     # of every mode: degree, order, and whether it is a_l,-m
     ell, m = (x[_by_order(n - 1)] for x in mode_numbers(n - 1))
     m, s = np.abs(m), (m < 0).astype(int)
-    whole = xp.zeros((len(m),) * 2)
-    n_strips = n if xp is np else min(N_STRIPS, n)
-    strips = list(pairwise(np.linspace(0, n, n_strips + 1).astype(int).tolist()))
-
-    def put(strip: tuple[int, int], whole: Array) -> Array:
-        first, end = strip
-
-        def add(_, number):
-            return None, _rows_of_order(number, beams, f, first, end)
-
-        _, rows = scan(xp, add, None, np.arange(first, end))
-        start, stop = np.searchsorted(m, (first, end))
-        row = ((m - first) * 2 + s) * (n - first) + ell - first
-        column = (s * end + m) * n + ell
-        rows = rows.reshape(-1, rows.shape[-1])[row[start:stop][:, None], column[:stop][None]]
-        return placed(whole, (slice(start, stop), slice(stop)), rows)
-
-    for strip in strips:
-        whole = put(strip, whole)
+    whole = np.zeros((len(m),) * 2)
+    for order in range(n):
+        start, stop = np.searchsorted(m, (order, order + 1))
+        column = (s * (order + 1) + m) * n + ell
+        rows = _rows_of_order(order, beams, f)
+        whole[start:stop, :stop] = rows[: stop - start, column[:stop]]
     return whole
 
 
@@ -177,40 +129,39 @@ def _by_order(lmax: int) -> Int[np.ndarray, " modes"]:
 
 
 def _rows_of_order(
-    m: Array, beams: Beams, f: Complex[Array, "..."], first: int, end: int
-) -> Float[Array, "rows columns"]:
-    """Rows a_lm, then a_l,-m, of one order; columns a_l'm', then a_l',-m', of orders below end.
+    m: int, beams: Beams, f: Complex[np.ndarray, "..."]
+) -> Float[np.ndarray, "rows columns"]:
+    """Rows a_lm, then a_l,-m, of one order; columns a_l'm', then a_l',-m', of orders up to it.
 
-    Rows of degrees from ``first``; columns of all degrees, with zeros where there is no mode.
+    Rows of degrees from ``m``; columns of all degrees, with zeros where there is no mode.
     """
-    xp, n, others = namespace(beams, f), beams.shape[0], np.arange(end)
-    difference = xp.take(f, m - others + 2 * (n - 1), axis=-1)
-    total = xp.take(f, m + others + 2 * (n - 1), axis=-1)
-    plus, minus = _weighted((total + difference) / 2.0, (total - difference) / 2.0, beams[:end])
-    real, imaginary = own = beams[m][..., first:].swapaxes(0, 1)
+    n, others = beams.shape[0], np.arange(m + 1)
+    difference = np.take(f, m - others + 2 * (n - 1), axis=-1)
+    total = np.take(f, m + others + 2 * (n - 1), axis=-1)
+    plus, minus = _weighted((total + difference) / 2.0, (total - difference) / 2.0, beams[: m + 1])
+    real, imaginary = own = beams[m][..., m:].swapaxes(0, 1)
     # real and imaginary parts of complex products by products of real matrices
-    both = xp.concatenate([xp.stack([real, -imaginary], 1), xp.stack([imaginary, real], 1)], -1)
+    both = np.concatenate([np.stack([real, -imaginary], 1), np.stack([imaginary, real], 1)], -1)
     both = both.reshape(-1, 2 * own.shape[-1]).T
     # (rows, orders, degrees) of either
-    u, v = ((both @ x).swapaxes(0, 1) for x in (plus, minus))
-    r = n - first
-    u, v = u.reshape(2 * r, -1), v.reshape(2 * r, -1)
-    return xp.concatenate([xp.concatenate([u[:r], -v[r:]], 1), xp.concatenate([u[r:], v[:r]], 1)])
+    r = n - m
+    u, v = ((both @ x).swapaxes(0, 1).reshape(2 * r, -1) for x in (plus, minus))
+    return np.block([[u[:r], -v[r:]], [u[r:], v[:r]]])
 
 
 def _weighted(
-    even: Complex[Array, "..."], odd: Complex[Array, "..."], beams: Beams
-) -> list[Float[Array, "orders parts degrees"]]:
+    even: Complex[np.ndarray, "..."], odd: Complex[np.ndarray, "..."], beams: Beams
+) -> list[Float[np.ndarray, "orders parts degrees"]]:
     """(P + Q) / 2 and (P - Q) / 2 without the row's own beam, real and imaginary parts.
 
     With the other beam W + i W', and F(m + m') + F(m - m') = 2 even, their difference 2 odd::
 
         (P + Q) / 2 = even W + i odd W',    (P - Q) / 2 = -odd W - i even W'.
     """
-    xp, (n_orders, n_products, _, n_functions, n) = namespace(even, beams), beams.shape
+    n_orders, n_products, _, n_functions, n = beams.shape
     factors = [
-        xp.stack([xp.stack([even.real, -odd.imag]), xp.stack([even.imag, odd.real])]),
-        xp.stack([xp.stack([-odd.real, even.imag]), xp.stack([-odd.imag, -even.real])]),
+        np.stack([np.stack([even.real, -odd.imag]), np.stack([even.imag, odd.real])]),
+        np.stack([np.stack([-odd.real, even.imag]), np.stack([-odd.imag, -even.real])]),
     ]
     if even.ndim == 5:
         # part, other part, product, other product, function, other function, order
@@ -219,20 +170,14 @@ def _weighted(
         return [x @ beams.reshape(n_orders, -1, n) for x in factors]
     beams = beams.reshape(n_orders, n_products, -1, n)
     factors = [x.transpose(5, 2, 0, 3, 1, 4).reshape(*beams.shape[:3], -1) for x in factors]
-    if xp is np:
-        products = [x @ beams for x in factors]
-    else:  # XLA multiplies many small matrices a sixth as fast as it adds these terms
-        products = [
-            sum(x[..., q, None] * beams[:, :, None, q] for q in range(beams.shape[2]))
-            for x in factors
-        ]
-    return [x.reshape(n_orders, -1, n) for x in products]
+    return [(x @ beams).reshape(n_orders, -1, n) for x in factors]
 
 
 def normal_matrix(coupling: Coupling, noise: Covariance) -> ModesMatrix:
     """Compute A^T N^-1 A without forming A.
 
-    Exact for the coupling's own functions of time. For diagonal noise and blocks in time the cost
+    Exact for the coupling's own functions of time. JAX's arrays are copied to the host, so that it
+    cannot be called inside JAX's transformations. For diagonal noise and blocks in time the cost
     hardly grows with the number of samples; for time-banded noise it grows in proportion, in
     bounded memory.
 
@@ -260,7 +205,7 @@ def normal_matrix(coupling: Coupling, noise: Covariance) -> ModesMatrix:
             f"{type(noise).__name__} has no structure in time that A^T N^-1 A could use, or the "
             "coupling has a response of its own; use the dense form"
         )
-    return NORMAL_MATRICES[type(noise)](coupling, noise)
+    return NORMAL_MATRICES[type(noise)](*on_host((coupling, noise)))
 
 
 def has_structure(coupling: Coupling, noise: Covariance) -> bool:
@@ -301,30 +246,21 @@ def _base(noise: Covariance) -> Covariance:
     return noise.base if isinstance(noise, LowRankUpdate) else noise
 
 
-def _within_times(coupling: CouplingMatrix, noise: Covariance) -> Array:
+def _within_times(coupling: CouplingMatrix, noise: Covariance) -> ModesMatrix:
     return summed(coupling, noise.time_weights(coupling.layout))
 
 
-def _with_templates(coupling: CouplingMatrix, noise: LowRankUpdate) -> Array:
+def _with_templates(coupling: CouplingMatrix, noise: LowRankUpdate) -> ModesMatrix:
     """With N_0 + T T^T: A^T D A - V^T (1 + T^T D T)^-1 V, V = T^T D A, D = N_0^-1."""
     base = noise.base.factor()
-    weighted = base.solve(noise.update.root)
-    v = namespace(weighted).stack([coupling.transpose_mv(column) for column in weighted.T])
+    weighted = np.asarray(base.solve(noise.update.root))
+    v = np.stack([coupling.transpose_mv(column) for column in weighted.T])
     small = np.eye(v.shape[0]) + noise.update.root.T @ weighted
     lower = checked_cholesky(f"1 + T^T D T of {noise.update.name}", small)
     return normal_matrix(coupling, noise.base) - gram_matrix(solve_lower(lower, v, transpose=False))
 
 
-# how A^T N^-1 A is summed for each structure of N in time; those without an entry need A itself
-NORMAL_MATRICES: dict[type[Covariance], Callable[..., Array]] = {
-    DiagonalCovariance: _within_times,
-    TimeBlockCovariance: _within_times,
-    TimeBandedCovariance: lambda coupling, noise: _streamed(coupling, noise.factor()),
-    LowRankUpdate: _with_templates,
-}
-
-
-def summed(coupling: CouplingMatrix, weights: Float[Array, "..."]) -> ModesMatrix:
+def summed(coupling: CouplingMatrix, weights: Float[np.ndarray, "..."]) -> ModesMatrix:
     """Compute A^T W A for weights W within times.
 
     Parameters
@@ -339,61 +275,24 @@ def summed(coupling: CouplingMatrix, weights: Float[Array, "..."]) -> ModesMatri
     (modes, modes) array
         In Galactic modes; symmetric to the last bit.
     """
-    xp, pointing = namespace(coupling, weights), coupling.pointing
-    runs, total, beams = dict(pointing.runs()), 0.0, coupling.by_order
-    n_products = coupling.body_beams.shape[1]
-    if xp is np:
-        # products without weight, such as all but one that is left out
-        used = np.flatnonzero(weights.any(axis=-1).reshape(-1, n_products).any(axis=0))
-        if len(used) < n_products:
-            by_product = beams.reshape(*beams.shape[:2], n_products, -1, beams.shape[3])
-            beams = by_product[:, :, used].reshape(*beams.shape[:2], -1, beams.shape[3])
-            weights = weights[used] if weights.ndim == 2 else weights[used][:, used]
-            n_products = len(used)
-    for group in _turntable_groups(coupling, weights):
-        spans = [runs[run] for run in group]
-        here = [
-            xp.concatenate([x[..., span] for span in spans], axis=-1)
-            for x in (weights, pointing.azimuth, pointing.functions.T)
-        ]
-        missing = -here[1].shape[0] % CHUNK
-        padded = [xp.pad(x, ((0, 0),) * (x.ndim - 1) + ((0, missing),)) for x in here]
-        part = of_one_angle(beams[group[0]], *padded, n_products)
-        total = total + part
+    pointing, total = coupling.pointing, 0.0
+    runs, beams, n_products = dict(pointing.runs()), coupling.by_order, coupling.body_beams.shape[1]
+    # products without weight, such as all but one that is left out
+    used = np.flatnonzero(weights.any(axis=-1).reshape(-1, n_products).any(axis=0))
+    if len(used) < n_products:
+        by_product = beams.reshape(*beams.shape[:2], n_products, -1, beams.shape[3])
+        beams = by_product[:, :, used].reshape(*beams.shape[:2], -1, beams.shape[3])
+        weights = weights[used] if weights.ndim == 2 else weights[used][:, used]
+    # runs of one turntable angle see the sky with the same beams
+    angles = np.asarray(pointing.turntable)
+    weighs = [bool(weights[..., span].any()) for span in runs.values()]
+    for angle in np.unique(angles[weighs]):
+        group = np.flatnonzero(angles == angle)
+        times = np.concatenate([np.arange(pointing.n_times)[runs[run]] for run in group])
+        sums = weights[..., times], pointing.azimuth[times], pointing.functions[times].T
+        total = total + of_one_angle(beams[group[0]], *sums, len(used))
     turn = pointing.pole_from_galactic
-    return _to_galactic(turn, total, places(len(turn.blocks) - 1))
-
-
-def _turntable_groups(
-    coupling: CouplingMatrix, weights: Float[Array, "..."]
-) -> tuple[tuple[int, ...], ...]:
-    """Runs of one turntable angle, which see the sky with the same beams, if they have weight."""
-    runs = dict(coupling.pointing.runs())
-    if is_traced(coupling.pointing.turntable):  # which angles are the same is not known
-        return tuple((run,) for run in runs)
-    angles = np.asarray(coupling.pointing.turntable)
-    every = np.unique(angles)
-    if not is_traced(weights):
-        weighs = [bool(np.asarray(weights[..., span]).any()) for span in runs.values()]
-        every = np.unique(angles[weighs])
-    return tuple(tuple(np.flatnonzero(angles == angle).tolist()) for angle in every)
-
-
-@compiled
-def _to_galactic(
-    pole_from_galactic: Rotation, lower: ModesMatrix, place: Int[Array, " modes"]
-) -> ModesMatrix:
-    """R^T M R, symmetric to the last bit.
-
-    Of M the lower triangle is given, with the packed mode k in row ``place[k]``. NumPy's is
-    overwritten.
-    """
-    if namespace(pole_from_galactic, lower) is np:
-        return _turned(pole_from_galactic, mirrored(lower), place)
-    matrix = jnp.tril(lower) + jnp.tril(lower, -1).T
-    back = pole_from_galactic.T
-    turned = back(back(matrix[place[:, None], place[None]]).T)
-    return (turned + turned.T) / 2.0
+    return _turned(turn, mirrored(total), places(len(turn.blocks) - 1))
 
 
 def _turned(
@@ -409,34 +308,39 @@ def _turned(
     return mirrored(turned)
 
 
-@eqx.filter_jit
-def _streamed(coupling: CouplingMatrix, factor: TimeBandedFactor) -> ModesMatrix:
+# rows of A that are multiplied with each other at once, where N couples times
+STREAMED = 1024
+
+
+def _streamed(coupling: CouplingMatrix, noise: TimeBandedCovariance) -> ModesMatrix:
     """For time-banded noise: A is made, whitened and summed one block row of N after the other."""
-    pointing, layout = coupling.pointing, coupling.layout
+    pointing, layout, factor = coupling.pointing, coupling.layout, on_host(noise.factor())
     n_blocks, rows, window = factor.left.shape
     steps, n_modes = rows // layout.n_products, coupling.shape[1]
-    starts = np.array(pointing.run_starts)
-    run_of = jnp.asarray(np.repeat(np.arange(len(starts) - 1), np.diff(starts)))
-    missing = n_blocks * steps - layout.n_times
+    present, total = layout.present.T, np.zeros((n_modes, n_modes))
+    run_of = np.repeat(np.arange(len(pointing.run_starts) - 1), np.diff(pointing.run_starts))
+    # white rows: of the window before a block row, and since they were last summed
+    white = np.zeros((window, n_modes))
+    for block in range(n_blocks):
+        times = slice(block * steps, (block + 1) * steps)
+        beams = np.einsum(
+            "tj,tkjc->ktc", pointing.functions[times], coupling.body_beams[run_of[times]]
+        )
+        a = turned_about_pole(beams, pointing.azimuth[times]).swapaxes(0, 1)
+        a = (a * present[times][:, :, None]).reshape(-1, n_modes)
+        a = np.pad(a, ((0, rows - len(a)), (0, 0)))
+        solved = factor.inverse[block] @ (a - factor.left[block] @ white[-window:])
+        white = np.concatenate([white, solved])
+        if len(white) >= window + STREAMED or block == n_blocks - 1:
+            total += gram_matrix(white[window:])
+            white = white[-window:]
+    return _turned(pointing.pole_from_galactic, total, np.arange(n_modes))
 
-    def blocked(x: Array) -> Array:
-        padded = jnp.pad(x, ((0, missing), *((0, 0),) * (x.ndim - 1)))
-        return padded.reshape(n_blocks, steps, *x.shape[1:])
 
-    def add(carry, block):
-        before, total = carry
-        left, inverse, u, phi, run, present = block
-        beams = jnp.einsum("tj,tkjc->ktc", u, coupling.body_beams[run])
-        a = jnp.swapaxes(turned_about_pole(beams, phi), 0, 1) * present[:, :, None]
-        white = inverse @ (a.reshape(rows, n_modes) - left @ before)
-        return (jnp.concatenate([before[rows:], white]), total + gram_matrix(white)), None
-
-    present = layout.present.T.astype(jnp.float64)
-    parts = (
-        factor.left,
-        factor.inverse,
-        *map(blocked, (pointing.functions, pointing.azimuth, run_of, present)),
-    )
-    start = (jnp.zeros((window, n_modes)), jnp.zeros((n_modes, n_modes)))
-    (_, total), _ = jax.lax.scan(add, start, parts)
-    return _to_galactic(pointing.pole_from_galactic, total, np.arange(n_modes))
+# how A^T N^-1 A is summed for each structure of N in time; those without an entry need A itself
+NORMAL_MATRICES: dict[type[Covariance], Callable[..., ModesMatrix]] = {
+    DiagonalCovariance: _within_times,
+    TimeBlockCovariance: _within_times,
+    TimeBandedCovariance: _streamed,
+    LowRankUpdate: _with_templates,
+}

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core.arrays import Modes, on_host
+from lusee_bayes.core.arrays import Modes
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes, per_mode, power_spectrum, sum_over_m
 from lusee_bayes.core.linalg import inverse_from_cholesky, symmetric_product
@@ -136,7 +136,7 @@ class PositiveMode:
 
 def diffuse_part(skies: PositiveSkies, channel: int, information: Information) -> Patterns:
     """What a channel's data say of its point sources, and without them of the diffuse sky."""
-    return Patterns.of(skies.sources[channel], on_host(information))
+    return Patterns.of(skies.sources[channel], information)
 
 
 def linearised(
@@ -269,9 +269,9 @@ def _linear_round(
         return linearised(skies, channel, information, exponents[channel])
 
     information = channels.summed(prior, exponents, relative)
-    posterior = on_host(joint.component_posterior(information, prior))
-    maps = np.asarray(posterior.mean).reshape(prior.n_components, -1)
-    spread = np.asarray(joint.paired(posterior.covariance(), prior)) if "power" in shapes else None
+    posterior = joint.component_posterior(information, prior)
+    maps = posterior.mean.reshape(prior.n_components, -1)
+    spread = joint.paired(posterior.covariance(), prior) if "power" in shapes else None
 
     def judged(channel: int, information: Information) -> Arrays:
         return _judged(prior, channel, relative(channel, information), maps, spread)
@@ -285,10 +285,8 @@ def _judged(
 ) -> Arrays:
     """Exponent and chi^2 of a channel at the mean of a linear round, and its residual's power."""
     none = np.zeros((0, *maps.shape))
-    sky = on_host(
-        joint.channel_sky(prior, channel, information, maps, None, none, jax.random.key(0))
-    )
-    found = {"exponent": np.asarray(sky.mean), "chi2": np.asarray(sky.chi2)}
+    sky = joint.channel_sky(prior, channel, information, maps, None, none, jax.random.key(0))
+    found = {"exponent": sky.mean, "chi2": sky.chi2}
     if spread is None:
         return found
     root, mixing = prior.residual_root(channel), np.asarray(prior.mixing[channel])
@@ -369,9 +367,7 @@ def positive_sky(
     """
     skies, exponent = mode.skies, mode.exponents[channel]
     relative = linearised(skies, channel, information, exponent)
-    found = on_host(
-        joint.channel_sky(mode.prior, channel, relative, mode.fields, spread, draws, key)
-    )
+    found = joint.channel_sky(mode.prior, channel, relative, mode.fields, spread, draws, key)
     beside = diffuse_part(skies, channel, information)
     slope = skies.jacobian(channel, exponent)
     covariance = beside.whole_covariance(symmetric_product(slope @ found.covariance, slope.T))
@@ -383,8 +379,7 @@ def positive_sky(
     for first in range(0, len(draws), CHUNK):
         here = slice(first, first + CHUNK)
         drawn[here] = skies.modes(channel, np.asarray(found.draws[here]))
-    whole = on_host(information)
-    return joint.ChannelSky(mean, covariance, beside.whole_skies(drawn, z), whole.chi2(mean))
+    return joint.ChannelSky(mean, covariance, beside.whole_skies(drawn, z), information.chi2(mean))
 
 
 # highest ell of the maps that laws are learned from
@@ -427,10 +422,9 @@ def _large_scales(skies: PositiveSkies, channels: Channels, n: int) -> ChannelsI
     names = ("matrix", "vector", "reference", "misfit", "log_det", "n_data")
 
     def large(channel: int, information: Information) -> Arrays:
-        found = on_host(information)
-        if found.n_modes > n:
-            found = integrated_out(found, n, _small_scales(skies, channel)[n:])
-        return {name: np.asarray(getattr(found, name)) for name in names}
+        if information.n_modes > n:
+            information = integrated_out(information, n, _small_scales(skies, channel)[n:])
+        return {name: getattr(information, name) for name in names}
 
     shapes = dict(zip(names, ((n, n), (n,), (n,), (), (), ()), strict=True))
     found = channels.each(large, shapes)

@@ -620,8 +620,9 @@ ROWS = 176
 class TimeBandedFactor(Factor):
     """The Cholesky factor of a banded covariance, in block rows.
 
-    The last block row is padded with rows of the unit matrix. Whitened entries are in order of
-    time, which spares a transposition of every matrix that is whitened.
+    Its products are compiled: outside of a program, JAX compiles a loop anew in every call. The
+    last block row is padded with rows of the unit matrix. Whitened entries are in order of time,
+    which spares a transposition of every matrix that is whitened.
 
     Attributes
     ----------
@@ -675,6 +676,7 @@ class TimeBandedFactor(Factor):
     def _window(self, columns: int) -> Float[Array, "window columns"]:
         return jnp.zeros((self.left.shape[2], columns))
 
+    @eqx.filter_jit
     def whiten(self, x):
         blocks, rows = self._from_data(x), self.diagonal.shape[1]
 
@@ -687,6 +689,7 @@ class TimeBandedFactor(Factor):
         _, solved = jax.lax.scan(step, start, (self.left, self.inverse, blocks))
         return self._to_white(solved, x.shape)
 
+    @eqx.filter_jit
     def whiten_transpose(self, x):
         blocks, rows = self._from_white(x), self.diagonal.shape[1]
 
@@ -700,6 +703,7 @@ class TimeBandedFactor(Factor):
         _, solved = jax.lax.scan(step, start, (self.left, self.inverse, blocks), reverse=True)
         return self._to_data(solved, x.shape)
 
+    @eqx.filter_jit
     def colour(self, z):
         blocks, rows = self._from_white(z), self.diagonal.shape[1]
 

@@ -29,8 +29,7 @@ from lusee_bayes.core.checks import (
     require_shape,
 )
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.instrument.products import DataLayout, auto_indices, ports, to_matrix
-from lusee_bayes.instrument.schedule import without_gaps
+from lusee_bayes.instrument.products import DataLayout, auto_indices, ports, to_matrix, without_gaps
 from lusee_bayes.noise.covariance import Covariance, DiagonalCovariance, TimeBlockCovariance
 
 

@@ -12,45 +12,20 @@ import xarray as xr
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.formats import says
+from lusee_bayes.core.formats import says, with_grid
 from lusee_bayes.core.reading import require_file
-from lusee_bayes.core.version import __version__, versions
+from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.sky_sections import FileSkySection
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, stokes_beam
-from lusee_bayes.paper.claims import FREQUENCIES, Cases, cross, frequency_case
+from lusee_bayes.paper.claims import TABLE, Cases, cross
 from lusee_bayes.results.channel_map import conditioned
 
-# by name: a scenario of the package and what differs from it; those after the frequencies are not
-# among the paper's figures, but its text speaks of them or they tell why a claim does not hold
+# by name: a scenario of the package and what differs from it
 CASES = {
-    **{
-        name: (name, [])
-        for name in (
-            *("fiducial", "noise_x10", "noise_x100", "duty_cycle_50"),
-            *("gain_1e-2", "gain_1e-3", "gain_ignored"),
-            *("beam_4MHz", "beam_0.4MHz", "beam_ignored"),
-            *("two_cycles", "three_cycles", "quarter_cycle"),
-        )
-    },
-    **{
-        frequency_case(f): ("fiducial", [f"frequency_mhz={f}"])
-        for f in FREQUENCIES
-        if frequency_case(f) != "fiducial"
-    },
-    "gain_1e-1": ("gain_1e-2", ["noise.gain.sigma=0.1"]),
-    "half_cycle": ("fiducial", ["observation.runs.0.cycles=0.5"]),
-    "prior_x10": ("fiducial", ["prior.scale=10"]),
-    "three_cycles_at_rest": (
-        "three_cycles",
-        [f"observation.runs.{k}.turntable_deg=0" for k in (1, 2)],
-    ),
-    # the quarters that follow the scenario's, which starts on 15 January
-    "quarter_2nd": ("quarter_cycle", ["observation.start=2027-01-22"]),
-    "quarter_3rd": ("quarter_cycle", ["observation.start=2027-01-29"]),
-    "quarter_4th": ("quarter_cycle", ["observation.start=2027-02-05"]),
+    name: (case.get("scenario", name), case.get("changes", [])) for name, case in TABLE.items()
 }
 
 # of a channel, as a case file has them
@@ -94,8 +69,7 @@ def with_sky_file(scenario: Scenario, files: Mapping[float, Path]) -> Scenario:
 
 def is_case(path: Path, scenario: Scenario) -> bool:
     """Whether a file holds the case of a scenario, computed by this version of the package."""
-    wanted = {"format": formats.PAPER_CASE, "scenario": scenario.to_yaml(), "version": __version__}
-    return says(path, wanted)
+    return says(path, formats.header(formats.PAPER_CASE) | {"scenario": scenario.to_yaml()})
 
 
 def compute_case(scenario: Scenario) -> xr.Dataset:
@@ -116,37 +90,35 @@ def compute_case(scenario: Scenario) -> xr.Dataset:
     fields = setup.beam_source.fields(scenario.frequency_mhz, grid)
     beams = np.abs(stokes_beam(fields))
     rms = channel.beam_rms_difference
-    return xr.Dataset(
-        {
-            **{name: ("ell", spectra[name]) for name in ("rho", "snr", "cl_mean", "cl_truth")},
-            **{f"{name}_modes": ("mode", getattr(channel, name)) for name in MODES},
-            **{name: ("pixel", maps[name]) for name in ("mean", "truth")},
-            "highest_altitude": ("pixel", channel.highest_altitude),
-            "data": (("product", "time"), data.grid()),
-            "noise_std": (("product", "time"), np.sqrt(np.asarray(variances))),
-            "beam": (
-                ("pattern", "theta", "phi"),
-                np.stack([beams[0, 0], beams[0, 2], beams[0, 1]]).astype(np.float32),
-            ),
-        },
-        coords={
-            "ell": np.arange(scenario.lmax + 1),
-            "product": list(data.labels),
-            "pattern": ["auto 00", "|cross 02|", "|cross 01|"],
-            "theta": grid.theta,
-            "phi": grid.phi,
-        },
-        attrs={
-            "format": formats.PAPER_CASE,
-            "scenario": scenario.to_yaml(),
-            "version": __version__,
-            "versions": json.dumps(versions()),
-            "frequency_mhz": scenario.frequency_mhz,
-            **{name: getattr(channel, name) for name in NUMBERS},
-            "n_modes": len(channel.mean),
-            **({} if rms is None else {"beam_rms_difference": rms}),
-        },
-    )
+    beams = np.stack([beams[0, 0], beams[0, 2], beams[0, 1]]).astype(np.float32)
+    units = {"rho": "1", "snr": "1", "cl_mean": "K2", "cl_truth": "K2"}
+    grid_of_data, kelvin, angle = ("product", "time"), {"units": "K"}, {"units": "rad"}
+    variables = {
+        **{name: ("ell", spectra[name], {"units": unit}) for name, unit in units.items()},
+        **{f"{name}_modes": ("mode", getattr(channel, name), kelvin) for name in MODES},
+        **{name: ("pixel", maps[name], kelvin) for name in ("mean", "truth")},
+        "highest_altitude": ("pixel", channel.highest_altitude, {"units": "1"}),
+        "data": (grid_of_data, data.grid(), kelvin),
+        "noise_std": (grid_of_data, np.sqrt(np.asarray(variances)), kelvin),
+        "beam": (("pattern", "theta", "phi"), beams, {"units": "1"}),
+    }
+    coords = {
+        "ell": np.arange(scenario.lmax + 1),
+        "product": list(data.labels),
+        "pattern": ["auto 00", "|cross 02|", "|cross 01|"],
+        "theta": ("theta", grid.theta, angle),
+        "phi": ("phi", grid.phi, angle),
+    }
+    attributes = {
+        **formats.header(formats.PAPER_CASE),
+        "scenario": scenario.to_yaml(),
+        "versions": json.dumps(versions()),
+        "frequency_mhz": scenario.frequency_mhz,
+        **{name: getattr(channel, name) for name in NUMBERS},
+        "n_modes": len(channel.mean),
+        **({} if rms is None else {"beam_rms_difference": rms}),
+    }
+    return with_grid(xr.Dataset(variables, coords, attributes))
 
 
 def case_table(cases: Cases) -> list[dict[str, object]]:

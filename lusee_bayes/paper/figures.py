@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from lusee_bayes.core.harmonics import lmax_of
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
-from lusee_bayes.paper.claims import FREQUENCIES, SHOWN_FREQUENCIES, Cases, frequency_case
+from lusee_bayes.paper.claims import FREQUENCIES, SHOWN_FREQUENCIES, TABLE, Cases, frequency_case
 from lusee_bayes.report.figures.drawing import (
     BLUE,
     DIVERGING,
@@ -28,39 +28,11 @@ from lusee_bayes.report.figures.drawing import (
 
 # the paper's colours by group, of lightness different enough for colour-blind readers; the lines
 # within a group differ in style
-GROUPS = {
-    "radiometer noise": (
-        "#E08A00",
-        {
-            "noise_x10": "noise x 10",
-            "noise_x100": "noise x 100",
-            "duty_cycle_50": "duty cycle 50 %",
-        },
-    ),
-    "beam error": (
-        "#009E73",
-        {
-            "beam_4MHz": "4 MHz, marginalised",
-            "beam_0.4MHz": "0.4 MHz, marginalised",
-            "beam_ignored": "4 MHz, ignored",
-        },
-    ),
-    "gain drift": (
-        "#B2182B",
-        {
-            "gain_1e-2": "1 %, marginalised",
-            "gain_1e-3": "0.1 %, marginalised",
-            "gain_ignored": "1 %, ignored",
-        },
-    ),
-    "cycles and turntable": (
-        "#7B4FB5",
-        {
-            "two_cycles": "2 cycles, 0 and 30°",
-            "three_cycles": "3 cycles, 0, 30 and 60°",
-            "quarter_cycle": "quarter cycle",
-        },
-    ),
+COLOURS = {
+    "radiometer noise": "#E08A00",
+    "beam error": "#009E73",
+    "gain drift": "#B2182B",
+    "cycles and turntable": "#7B4FB5",
 }
 LINES = ("-", "--", ":")
 MAP_CASES = (
@@ -192,12 +164,13 @@ def by_scenario(cases: Cases, metric: str) -> Figure:
     The fiducial one is black in all of them.
     """
     figure, panels = framed((12, 8), 2, 2, sharex=True, sharey=True)
-    for axes, (title, (colour, members)) in zip(panels.flat, GROUPS.items(), strict=True):
+    for axes, (title, colour) in zip(panels.flat, COLOURS.items(), strict=True):
         curve = cases["fiducial"][metric]
         axes.plot(curve["ell"][1:], curve[1:], color="black", lw=1.6, label="fiducial")
-        for line, (name, label) in zip(LINES, members.items(), strict=True):
-            curve = cases[name][metric]
-            axes.plot(curve["ell"][1:], curve[1:], color=colour, ls=line, lw=1.6, label=label)
+        members = {name: case for name, case in TABLE.items() if case.get("group") == title}
+        for line, (name, case) in zip(LINES, members.items(), strict=True):
+            style = {"color": colour, "ls": line, "lw": 1.6, "label": case["label"]}
+            axes.plot(cases[name]["ell"][1:], cases[name][metric][1:], **style)
         dress(axes, metric, int(curve["ell"][-1]))
         axes.label_outer()
         axes.set_title(title)
@@ -211,15 +184,18 @@ def by_scenario(cases: Cases, metric: str) -> Figure:
     return figure
 
 
+def _title(name: str) -> str:
+    case = TABLE[name]
+    return f"{case['group']}: {case['label']}" if "group" in case else name
+
+
 def scenario_maps(cases: Cases) -> Figure:
     """Figure 9: the true sky at 25 MHz and the map of every scenario, in the same colours."""
-    labels = {name: f"{group}: {label}" for group, (_, members) in GROUPS.items()
-              for name, label in members.items()}  # fmt: skip
     truth = drawn(cases["fiducial"], "truth")
     norm = temperatures(truth)
     figure = Figure(figsize=(13, 11), layout="constrained")
     panels = [("truth", truth, None)] + [
-        (labels.get(name, name), drawn(cases[name], "mean"), cases[name]["highest_altitude"].values)
+        (_title(name), drawn(cases[name], "mean"), cases[name]["highest_altitude"].values)
         for name in MAP_CASES
     ]
     for position, (title, pixels, altitude) in enumerate(panels, 1):

@@ -36,11 +36,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
+from numpy.random import Generator
 
-from lusee_bayes.core.arrays import Draws, Square, on_host
+from lusee_bayes.core.arrays import Draws, Square
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.linalg import checked_cholesky, cholesky, inverse_from_cholesky, invert_lower
+from lusee_bayes.core.linalg import checked_cholesky, cholesky, inverse_from_cholesky
 from lusee_bayes.judge.chi2 import ChiSquare, stands_out
 from lusee_bayes.judge.measures import expected_chi2
 from lusee_bayes.judge.split import Split
@@ -53,69 +54,52 @@ from lusee_bayes.sky.prior import Prior
 STEPS, HALVINGS = 2, 10
 
 
-@dataclass(frozen=True)
-class NormalScores:
-    """A normal distribution of normal scores, about their maximum.
+def normal_scores(
+    hyperprior: Hyperprior, parameters: Parameters, covariance: Square
+) -> tuple[Parameters, float]:
+    """Transform the normal distribution about the most probable parameters to normal scores.
 
-    Attributes
+    Parameters
     ----------
     hyperprior : Hyperprior
+    parameters : (parameters,) array
+        Most probable, hyperprior included.
+    covariance : (parameters, parameters) array
+        Of the normal distribution about them.
+
+    Returns
+    -------
     mean : (parameters,) array
-    root : (parameters, parameters) array
-        R with the covariance R R^T.
+        Of the normal distribution of the scores, about their maximum.
+    log_volume : float
+        Its integral, by Laplace's approximation: what turns ln p(d | theta) at the mean into ln
+        p(d).
+
+    Raises
+    ------
+    InputError
+        If the data's curvature is far from positive.
     """
+    known = np.linalg.inv(covariance) - np.diag(hyperprior.curvature(parameters))
+    slope = -hyperprior.gradient(parameters)
 
-    hyperprior: Hyperprior
-    mean: Parameters
-    root: Float[np.ndarray, "parameters parameters"]
+    def value(z: Parameters) -> float:
+        off = hyperprior.of_scores(z) - parameters
+        return float(slope @ off - 0.5 * off @ known @ off - 0.5 * z @ z)
 
-    @classmethod
-    def around(
-        cls,
-        hyperprior: Hyperprior,
-        parameters: Parameters,
-        covariance: Float[np.ndarray, "parameters parameters"],
-    ) -> NormalScores:
-        """Transform the normal distribution about the most probable parameters.
+    def precision(z: Parameters) -> np.ndarray:
+        j = hyperprior.slopes_of_scores(z)
+        return j[:, None] * known * j + np.eye(len(z))
 
-        Parameters
-        ----------
-        hyperprior : Hyperprior
-        parameters : (parameters,) array
-            Most probable, hyperprior included.
-        covariance : (parameters, parameters) array
-            Of the normal distribution about them.
-
-        Raises
-        ------
-        InputError
-            If the data's curvature is far from positive.
-        """
-        known = np.linalg.inv(covariance) - np.diag(hyperprior.curvature(parameters))
-        slope = -hyperprior.gradient(parameters)
-
-        def value(z: Parameters) -> float:
-            off = hyperprior.of_scores(z) - parameters
-            return float(slope @ off - 0.5 * off @ known @ off - 0.5 * z @ z)
-
-        def precision(z: Parameters) -> np.ndarray:
-            j = hyperprior.slopes_of_scores(z)
-            return j[:, None] * known * j + np.eye(len(z))
-
-        z = hyperprior.scores(parameters)
-        for _ in range(STEPS):
-            pull = slope - known @ (hyperprior.of_scores(z) - parameters)
-            gradient = hyperprior.slopes_of_scores(z) * pull - z
-            step = np.linalg.solve(precision(z), gradient)
-            tried = (z + 0.5**k * step for k in range(HALVINGS))
-            z = next((there for there in tried if value(there) >= value(z)), z)
-        root = invert_lower(checked_cholesky("the curvature of the parameters", precision(z))).T
-        return cls(hyperprior, z, root)
-
-    def log_evidence(self, log_likelihood: float) -> float:
-        """Compute ln p(d) by Laplace's approximation, of ln p(d | theta) at the mean."""
-        volume = float(np.log(np.diagonal(self.root)).sum())
-        return log_likelihood + volume - 0.5 * float(self.mean @ self.mean)
+    z = hyperprior.scores(parameters)
+    for _ in range(STEPS):
+        pull = slope - known @ (hyperprior.of_scores(z) - parameters)
+        gradient = hyperprior.slopes_of_scores(z) * pull - z
+        step = np.linalg.solve(precision(z), gradient)
+        tried = (z + 0.5**k * step for k in range(HALVINGS))
+        z = next((there for there in tried if value(there) >= value(z)), z)
+    lower = checked_cholesky("the curvature of the parameters", precision(z))
+    return z, float(-np.log(np.diagonal(lower)).sum() - 0.5 * z @ z)
 
 
 # the maximum is found when the next step could not add more than this to ln p
@@ -169,7 +153,7 @@ class Learned:
     prior: Prior
     names: tuple[str, ...]
     parameters: Parameters
-    covariance: Float[np.ndarray, "parameters parameters"]
+    covariance: Square
     log_evidence: float
     steps: int
     noise_factor: float = field(default=1.0, kw_only=True)
@@ -222,7 +206,7 @@ def learn(
     InputError
         If S is not positive definite.
     """
-    rng, information = np.random.default_rng(seed), on_host(information)
+    rng = np.random.default_rng(seed)
     here = _at(family, information, family.hyperprior.start() if start is None else start)
     for steps in range(MAX_STEPS + 1):
         gradient, curvature = _slope(family, here, rng, SIMULATIONS)
@@ -252,7 +236,6 @@ def learn_whatever_fits(
     family, information, start, seed
         As for :func:`learn`.
     """
-    information = on_host(information)
     demanded = demanded_factor(information, family.expected())
     for factor in demanded * HIGHER:
         try:
@@ -331,9 +314,7 @@ def _uphill(
     )
 
 
-def _slope(
-    family: PriorFamily, here: _Point, rng: np.random.Generator, n: int
-) -> tuple[Parameters, Float[np.ndarray, "parameters parameters"]]:
+def _slope(family: PriorFamily, here: _Point, rng: Generator, n: int) -> tuple[Parameters, Square]:
     """Gradient of ln p(d, theta), and its expected curvature."""
     prior, posterior, hyperprior = here.posterior.prior, here.posterior, family.hyperprior
     unknown = np.asarray(inverse_from_cholesky(posterior.lower))
@@ -367,11 +348,7 @@ def _root(known: Square) -> Float[np.ndarray, "n k"]:
 
 
 def _learned(
-    family: PriorFamily,
-    information: Information,
-    here: _Point,
-    rng: np.random.Generator,
-    steps: int,
+    family: PriorFamily, information: Information, here: _Point, rng: Generator, steps: int
 ) -> Learned:
     _, curvature = _slope(family, here, rng, FINAL_SIMULATIONS)
     covariance = np.linalg.inv(curvature)
@@ -379,9 +356,9 @@ def _learned(
     def spread(rows: Float[np.ndarray, "rows parameters"]) -> Float[np.ndarray, " rows"]:
         return np.einsum("ij,ij->i", rows @ covariance, rows)
 
-    scores = NormalScores.around(family.hyperprior, here.parameters, covariance)
-    there = family.prior(family.at(family.hyperprior.of_scores(scores.mean)).covariance)
-    evidence = scores.log_evidence(float(information.posterior(there).log_evidence))
+    scores, log_volume = normal_scores(family.hyperprior, here.parameters, covariance)
+    there = family.prior(family.at(family.hyperprior.of_scores(scores)).covariance)
+    evidence = float(information.posterior(there).log_evidence) + log_volume
     prior = family.prior(family.averaged(here.parameters, spread))
     return Learned(prior, family.names, here.parameters, covariance, evidence, steps)
 
@@ -420,7 +397,6 @@ def draws_with_parameters(
     drawn = np.empty((n, information.n_modes))
     if not n:
         return drawn
-    information = on_host(information)
     root = np.linalg.cholesky(learned.covariance)
     sets = min(n, max(LEAST, -(-n // SHARED)))
 
@@ -434,11 +410,7 @@ def draws_with_parameters(
 
 
 def _under_drawn_parameters(
-    family: PriorFamily,
-    learned: Learned,
-    root: Float[np.ndarray, "parameters parameters"],
-    information: Information,
-    key: PRNGKeyArray,
+    family: PriorFamily, learned: Learned, root: Square, information: Information, key: PRNGKeyArray
 ) -> Posterior:
     for attempt in range(ATTEMPTS):
         z = jax.random.normal(jax.random.fold_in(key, attempt), (len(root),), dtype=jnp.float64)

@@ -30,7 +30,7 @@ from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.priors.families import Hyperprior, Member, Parameters, PriorFamily, SpectrumBasis
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, PointSource
 from lusee_bayes.sky.prior import PIVOT, DensePrior
-from lusee_bayes.sky.template import EmbeddedTemplate
+from lusee_bayes.sky.sky_source import EmbeddedTemplate
 
 # arrays that recur
 Covariates = Float[np.ndarray, " covariates"]
@@ -152,12 +152,7 @@ class SmoothedTemplate:
         alm = healpy.map2alm(pixels, lmax=TEMPLATE_LMAX, iter=3)
         return cls(alm, float(np.log(pixels).mean()))
 
-    def log(
-        self,
-        fwhm_deg: float,
-        theta: Float[np.ndarray, " points"],
-        phi: Float[np.ndarray, " points"],
-    ) -> Float[np.ndarray, " points"]:
+    def log(self, fwhm_deg: float, theta: Vector, phi: Vector) -> Vector:
         """ln of the smoothed template less its mean, in given directions."""
         beam = healpy.gauss_beam(np.radians(fwhm_deg), lmax=TEMPLATE_LMAX)
         alm = healpy.almxfl(self.alm, beam)
@@ -201,46 +196,6 @@ class LocalScales(PriorFamily):
     spectrum: SpectrumBasis
     bands: tuple[Band, ...]
     covariates: tuple[Covariates, Covariates]
-
-    @classmethod
-    def of(
-        cls,
-        template: EmbeddedTemplate,
-        transparent: EmbeddedTemplate,
-        lmax: int,
-        frequency_mhz: float,
-        sources: tuple[PointSource, ...] = BRIGHT_SOURCES,
-    ) -> LocalScales:
-        """Make the family.
-
-        Parameters
-        ----------
-        template : EmbeddedTemplate
-            T.
-        transparent : EmbeddedTemplate
-            The same sky where hardly anything is absorbed.
-        lmax : int
-        frequency_mhz : float
-            Of the sources' fluxes.
-        sources : tuple of PointSource
-            The catalogue.
-        """
-        smoothed = [SmoothedTemplate.of(each) for each in (template, transparent)]
-        bands = tuple(Band.of(window, *smoothed) for window in windows(lmax))
-        mean = template.modes(lmax)
-        monopole = np.zeros_like(mean)
-        monopole[0] = mean[0]
-        strength = RELATIVE_STRENGTH * np.exp(smoothed[0].mean_log)
-        return cls(
-            mean,
-            np.stack([SCALE_WIDTH * mean, MONOPOLE_WIDTH * monopole], axis=1),
-            np.reshape(
-                [source.modes(frequency_mhz, lmax) for source in sources], (-1, n_modes(lmax))
-            ).T,
-            SpectrumBasis.around(4.0 * np.pi * strength**2 / 100.0, lmax),
-            bands,
-            expected_covariates(),
-        )
 
     @property
     def hyperprior(self) -> Hyperprior:
@@ -388,8 +343,22 @@ def embedded_local_scales(
     frequency_mhz : float
     lmax : int
     sources : tuple of PointSource
-        That may be there.
+        The catalogue: those that may be there.
     """
     template = EmbeddedTemplate(frequency_mhz)
+    # the same sky where hardly anything is absorbed
     clear = EmbeddedTemplate(max(TRANSPARENT_MHZ, frequency_mhz))
-    return LocalScales.of(template, clear, lmax, frequency_mhz, sources)
+    smoothed = [SmoothedTemplate.of(each) for each in (template, clear)]
+    mean = template.modes(lmax)
+    monopole = np.zeros_like(mean)
+    monopole[0] = mean[0]
+    strength = RELATIVE_STRENGTH * np.exp(smoothed[0].mean_log)
+    modes = [source.modes(frequency_mhz, lmax) for source in sources]
+    return LocalScales(
+        mean,
+        np.stack([SCALE_WIDTH * mean, MONOPOLE_WIDTH * monopole], axis=1),
+        np.reshape(modes, (-1, n_modes(lmax))).T,
+        SpectrumBasis.around(4.0 * np.pi * strength**2 / 100.0, lmax),
+        tuple(Band.of(window, *smoothed) for window in windows(lmax)),
+        expected_covariates(),
+    )

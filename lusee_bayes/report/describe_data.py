@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,11 +29,11 @@ def describe_response(path: Path) -> list[str]:
     known = response.frequencies_mhz
     middle = float(known[len(known) // 2])
     kelvin = response.per_kelvin(middle)
-    emitted = response.background(middle, 1.0)[auto_indices()]
+    emitted = replace(response, moon_k=1.0).background(middle)[auto_indices()]
     return [
         f"the response of {N_ANTENNAS} coupled ports (luseepy)",
         *_grid_lines(response),
-        f"at {middle:g} MHz: impedance {_ohm(response.impedance[len(known) // 2][0, 0])}, "
+        f"at {middle:g} MHz: impedance {_ohm(response.impedance_ohm[len(known) // 2][0, 0])}, "
         f"1 K is {kelvin.min():.4g} to {kelvin.max():.4g} V^2/Hz behind the receivers",
         f"{float(emitted.mean()):.3f} of an auto comes from the Moon",
     ]
@@ -48,9 +49,9 @@ def describe_scalar_beam(path: Path) -> list[str]:
         *_grid_lines(beam),
         f"gain {beam.gain.min():.4g} to {beam.gain.max():.4g}",
     ]
-    if beam.impedance is not None:
-        lines.append(f"impedance {_ohm(beam.impedance[len(known) // 2])} at {middle:g} MHz")
-    ground = float(beam.background(middle, 1.0)[0])
+    if beam.impedance_ohm is not None:
+        lines.append(f"impedance {_ohm(beam.impedance_ohm[len(known) // 2])} at {middle:g} MHz")
+    ground = float(replace(beam, moon_k=1.0).background(middle)[0])
     lines.append(f"{ground:.3f} of the beam ends on the ground at {middle:g} MHz")
     return lines
 

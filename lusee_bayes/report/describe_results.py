@@ -10,13 +10,16 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core import formats
+from lusee_bayes.core.checks import counted
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.formats import opened_tree
-from lusee_bayes.core.trees import from_tree
+from lusee_bayes.core.trees import from_tree, opened_tree
 
 # a uniform sky of 1 K
 MONOPOLE = np.sqrt(4.0 * np.pi)
-HOLDS = ("posterior", "log_likelihood", "observed_data", "constant_data", "information")
+HOLDS = (
+    *("truth", "covariance", "independent_mean"),
+    *("posterior", "log_likelihood", "observed_data", "constant_data", "information"),
+)
 
 
 def describe_diagnostics(path: Path) -> list[str]:
@@ -29,8 +32,8 @@ def describe_diagnostics(path: Path) -> list[str]:
             if judged is None:
                 lines.append("the data fit as a whole and were not judged group by group")
                 continue
-            kinds, n = np.unique(judged["groups/kind"].values, return_counts=True)
-            counts = ", ".join(f"{k} {kind}s" for kind, k in zip(kinds, n, strict=True))
+            kinds, n = np.unique(judged.children["groups"].variables["kind"], return_counts=True)
+            counts = ", ".join(counted(k, kind) for kind, k in zip(kinds, n.tolist(), strict=True))
             lines += [str(judged.attrs["verdict"]), f"residuals by {counts}"]
     return lines
 
@@ -51,11 +54,11 @@ class _Skies:
 
 def describe_posterior(path: Path) -> list[str]:
     """A posterior at one frequency or at several."""
-    with opened_tree(path, formats.POSTERIOR, "a posterior of lusee-bayes map") as tree:
+    what = "a posterior of lusee-bayes map"
+    with opened_tree(path, formats.POSTERIOR, what) as tree:
         found = from_tree(_Skies, tree, str(path))
-        held = [name for name in ("truth", "covariance", "independent_mean") if name in tree]
-        held += [name for name in HOLDS if name in tree.children]
-        joint = "component_mean" in tree
+        held = [name for name in HOLDS if name in tree.variables or name in tree.children]
+        joint = "component_mean" in tree.variables
     if not found.mean.size:
         raise InputError(f"{path} holds no sky; make that map again")
     frequencies, (n, n_modes) = found.frequency, found.mean.shape

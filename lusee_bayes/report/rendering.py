@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 from markupsafe import Markup
 
 from lusee_bayes.core.checks import counted
@@ -48,6 +48,11 @@ def render(template: str, folder: Path, **context: Any) -> str:
     """
     pictures = {"picture": partial(picture, folder), "has_picture": partial(has_picture, folder)}
     return printable(ENVIRONMENT.get_template(template).render(context | pictures))
+
+
+def render_text(template: str, **context: Any) -> str:
+    """A file in Markdown of ``templates/``, which shows no pictures, as text."""
+    return ENVIRONMENT.get_template(template).render(context).rstrip() + "\n"
 
 
 def has_picture(folder: Path, name: str) -> bool:
@@ -91,7 +96,7 @@ def p_value(p: float, missing: str = "") -> str:
 
 ENVIRONMENT = Environment(
     loader=PackageLoader("lusee_bayes.report"),
-    autoescape=True,
+    autoescape=select_autoescape(),
     undefined=StrictUndefined,
     trim_blocks=True,
     lstrip_blocks=True,

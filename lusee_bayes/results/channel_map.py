@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Float, Int8
 
-from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels, on_host
+from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels
 from lusee_bayes.core.harmonics import (
     azimuth_functions,
     lmax_of,
@@ -29,7 +29,7 @@ from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.diagnosis import diagnose
 from lusee_bayes.experiment.experiment import Experiment, doubts, explained, infer, posterior_draws
 from lusee_bayes.experiment.rounds import Inference
-from lusee_bayes.experiment.unknowns import Unknowns, UnknownsReport, flux_table, pointing_report
+from lusee_bayes.experiment.unknowns import Unknowns, flux_table, pointing_report
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.judge.chi2 import LEVELS
 from lusee_bayes.judge.coverage import N_DRAWS, Counts
@@ -43,6 +43,7 @@ from lusee_bayes.judge.plausibility import about_information
 from lusee_bayes.judge.residuals import Residuals, residuals
 from lusee_bayes.judge.split import Split
 from lusee_bayes.linear.information import Information
+from lusee_bayes.linear.linear_gaussian import Solution
 from lusee_bayes.linear.posterior import Posterior, pixel_std, prior_pixel_std
 from lusee_bayes.results.channel import ChannelData, ChannelResult, Details, Judged
 from lusee_bayes.results.finished_runs import taken
@@ -91,16 +92,15 @@ def conditioned(
             information = earlier.with_more(made.information, data.digest())
             prior = own.model.prior
             posterior = information.posterior(prior)
+            information = information.recentred(posterior.mean)
             model = replace(own.model, prior=_given_earlier(earlier.information.posterior(prior)))
             made = Conditioned(
                 experiment,
                 own,
-                replace(own, posterior=posterior),
-                replace(own, model=model, posterior=model.condition(data.data)),
+                replace(own, solution=Solution(own.model, data.data, posterior, information)),
+                replace(own, solution=model.condition(data.data)),
                 (*earlier.digests, data.digest()),
-                information.recentred(np.asarray(posterior.mean)),
             )
-        jax.block_until_ready(made.found.posterior.white_mean)
         return made
 
 
@@ -128,8 +128,6 @@ class Conditioned:
         The model that predicts these data, with what earlier ones tell of the sky in its prior.
     digests : tuple of str
         Of all data.
-    given : Information or None
-        Of all data; None where there are no earlier ones.
     """
 
     experiment: Experiment
@@ -137,28 +135,26 @@ class Conditioned:
     found: Inference
     judged: Inference
     digests: tuple[str, ...]
-    given: Information | None = None
-
-    @cached_property
-    def information(self) -> Information:
-        """Of all data."""
-        known = self.own.information if self.given is None else self.given
-        return known or self.own.model.inform(self.experiment.data.data)[0]
-
-    @cached_property
-    def posterior(self) -> Posterior:
-        """Given all data, in NumPy's arrays."""
-        return on_host(self.found.posterior)
-
-    @cached_property
-    def covariance(self) -> ModesMatrix:
-        """Of the posterior, in K^2."""
-        return self.posterior.covariance()
 
     @property
-    def own_covariance(self) -> ModesMatrix:
-        """Of the posterior given these data alone, in K^2."""
-        return self.covariance if self.given is None else on_host(self.own.posterior).covariance()
+    def onto(self) -> bool:
+        """Whether there are earlier data."""
+        return self.found is not self.own
+
+    @property
+    def information(self) -> Information:
+        """Of all data."""
+        return self.found.solution.information
+
+    @property
+    def posterior(self) -> Posterior:
+        """Given all data."""
+        return self.found.posterior
+
+    @property
+    def covariance(self) -> ModesMatrix:
+        """Of the posterior, in K^2."""
+        return self.found.solution.covariance
 
     @cached_property
     def pixel_std(self) -> Pixels:
@@ -175,20 +171,13 @@ class Conditioned:
         covariance, nside = self.covariance, self.experiment.scenario.map_nside
         monopole = 1.0 / np.sqrt(4.0 * np.pi)
         with_monopole = 2.0 * modes_to_map(covariance[0], nside) - monopole * covariance[0, 0]
-        before = prior_pixel_std(on_host(self.found.model.prior), nside) ** 2
+        before = prior_pixel_std(self.found.model.prior, nside) ** 2
         return self.pixel_std**2 - monopole * with_monopole, before
 
     @cached_property
     def unknowns(self) -> Unknowns | None:
         """Receivers, ground and gain table given the sky, as these data alone tell of them."""
-        reference = np.asarray(self.own.posterior.mean)
-        return Unknowns.of(self.experiment, self.own, reference)
-
-    def chi2(self) -> float:
-        """Of these data under the model that predicts them, sky included."""
-        model, posterior = self.judged.model, self.judged.posterior
-        misfit = float(model.chi2(posterior.mean, self.experiment.data.data))
-        return misfit + float(posterior.prior_chi2())
+        return Unknowns.of(self.experiment, self.own)
 
     @cached_property
     def drawn(self) -> Float[np.ndarray, "n modes"]:
@@ -204,7 +193,7 @@ class Conditioned:
 
     def log_likelihood(self) -> Float[np.ndarray, " n"]:
         """ln p(d | m) of these data for every draw."""
-        model, data = on_host(self.own.model), self.experiment.data.data
+        model, data = self.own.model, self.experiment.data.data
         if not len(self.draws):
             return np.zeros(0)
         # factorised once: it takes far longer than a prediction where N couples times
@@ -215,10 +204,10 @@ class Conditioned:
 
     def of_all(self, known: ChannelData) -> ChannelData:
         """The same with number and chi^2 of all data: a joint posterior is given their sum."""
-        if self.given is None:
+        if not self.onto:
             return known
-        posterior, n_data = self.posterior, int(self.given.n_data)
-        chi2 = float(self.given.chi2(posterior.mean) + posterior.prior_chi2())
+        posterior, n_data = self.posterior, int(self.information.n_data)
+        chi2 = float(self.information.chi2(posterior.mean) + posterior.prior_chi2())
         instrument = Split.of(posterior, chi2, n_data).instrument
         return replace(known, n_data=n_data, instrument=instrument)
 
@@ -226,7 +215,7 @@ class Conditioned:
         """Draws less the mean for :class:`.Counts`, in K; None where no truth is known."""
         if self.experiment.data.truth is None:
             return None
-        return self.drawn[-N_DRAWS:] - np.asarray(self.posterior.mean)
+        return self.drawn[-N_DRAWS:] - self.posterior.mean
 
     def figures(self) -> dict[str, float | bool]:
         """What :func:`channel_result` takes besides: numbers, and whether C is kept."""
@@ -236,7 +225,7 @@ class Conditioned:
             "information_bits": float(posterior.information_bits()),
             "chi2": float(model.chi2(posterior.mean, data)),
             "chi2_expected": expected_chi2(self.judged.posterior, model.n_data),
-            "chi2_model": self.chi2(),
+            "chi2_model": self.judged.solution.chi2,
             "refinement": float(posterior.refinement),
             "covariance_kept": self.experiment.scenario.output.covariance,
         }
@@ -246,9 +235,9 @@ class Conditioned:
         with (stages or Stages())("standard deviations"):
             report = None
             if self.unknowns is not None:
-                mean = np.asarray(self.own.posterior.mean)
-                report = self.unknowns.report(mean, self.own_covariance)
-                report = replace(report, onto=self.given is not None)
+                own = self.own.solution
+                report = self.unknowns.report(own.posterior.mean, own.covariance)
+                report = replace(report, onto=self.onto)
             given = (known, self.posterior.mean, self.covariance, self.draws, self.log_likelihood())
             more = {"unknowns": report, "pixels": self.pixel_std, **self.figures()}
             return channel_result(*given, self.compared(), **more)
@@ -270,14 +259,15 @@ class Conditioned:
         experiment, own, stages = self.experiment, self.own, stages or Stages()
         scenario, data, learned = experiment.scenario, experiment.data, experiment.learned
         fluxes, pointing, diagnosis, left, judged = None, None, None, None, None
+        judge = self.judged.solution
         if experiment.setup.responses and scenario.sources.treatment != "ignored":
             with stages("fluxes"):
                 fluxes = flux_table(experiment, own)
         with stages("diagnostics"):
             if not (alone or thorough):
-                split = Split.of(self.judged.posterior, self.chi2(), own.model.n_data)
+                split = Split.of(judge.posterior, judge.chi2, own.model.n_data)
             if alone or thorough or split.instrument.p < DOUBTFUL:
-                left = residuals(self.judged.model, self.judged.posterior, data, self.chi2())
+                left = residuals(judge, data)
                 split, judged = left.split, self._judged(left)
             details = _details(self) if alone else None
         bad = judged is not None and judged.level == DOES_NOT_FIT
@@ -286,7 +276,7 @@ class Conditioned:
                 diagnosis = diagnose(experiment, own, left)
         if scenario.noise.pointing is not None or bad:
             with stages("clock and pointing"):
-                pointing = pointing_report(experiment, own, self.own_covariance)
+                pointing = pointing_report(experiment, own)
         fitting = experiment.fitting
         return ChannelData(
             frequency_mhz=scenario.frequency_mhz,
@@ -321,7 +311,7 @@ class Conditioned:
     def _judged(self, found: Residuals) -> Judged:
         """The residuals, with the verdict in words."""
         data = self.experiment.data
-        prior = on_host(self.found.model.prior)
+        prior = self.found.model.prior
         usual = 0.0 if prior.white_mean is None else prior.colour(prior.white_mean)
         expected = prior.variance() - np.diagonal(self.covariance)
         left, before = self.without_monopole
@@ -351,16 +341,10 @@ def channel_result(
     log_likelihood: Float[np.ndarray, " n"],
     compared: Float[np.ndarray, "more modes"] | None = None,
     *,
-    unknowns: UnknownsReport | None = None,
     pixels: Pixels | None = None,
-    independent: Modes | None = None,
-    log_evidence: float = np.nan,
-    information_bits: float = np.nan,
-    chi2: float,
-    chi2_expected: float,
-    chi2_model: float = np.nan,
-    refinement: float = np.nan,
     covariance_kept: bool = False,
+    information_bits: float = np.nan,
+    **figures: Any,
 ) -> ChannelResult:
     """The channel of a mean and a covariance.
 
@@ -376,14 +360,12 @@ def channel_result(
         Of the draws.
     compared : (more, modes) array, optional
         Draws less mean for :class:`.Counts`, where the truth is known, in K.
-    unknowns : UnknownsReport, optional
-        Receivers, ground and gain table.
     pixels : (pixels,) array, optional
         Standard deviations of pixels in K, where they are known already.
-    independent, log_evidence, information_bits, chi2, chi2_expected, chi2_model, refinement
-        See :class:`.ChannelResult`.
     covariance_kept : bool
         Keep the covariance with the result.
+    information_bits, **figures
+        Whatever else a :class:`.ChannelResult` has: ``chi2``, ``unknowns``, ``independent`` ...
     """
     mean, covariance = np.asarray(mean), np.asarray(covariance)
     nside = round(np.sqrt(known.highest_altitude.size / 12))
@@ -397,6 +379,7 @@ def channel_result(
     said = vars(known) | {"doubts": (*known.doubts, *about_information(information_bits))}
     return ChannelResult(
         **said,
+        **figures,
         mean=mean,
         std=np.sqrt(variance),
         prior_fraction=mean_over_m(share),
@@ -404,15 +387,8 @@ def channel_result(
         draws=np.asarray(draws),
         log_likelihood=np.asarray(log_likelihood),
         covariance=covariance if covariance_kept else None,
-        independent=None if independent is None else np.asarray(independent),
-        log_evidence=log_evidence,
         information_bits=information_bits,
-        chi2=chi2,
-        chi2_expected=chi2_expected,
-        chi2_model=chi2_model,
-        refinement=refinement,
         coverage=held,
-        unknowns=unknowns,
     )
 
 
@@ -420,7 +396,7 @@ def _details(channel: Conditioned) -> Details:
     """What a report shows of a single map beyond it."""
     setup, covariance = channel.experiment.setup, channel.covariance
     lmax, nside = setup.scenario.lmax, setup.scenario.map_nside
-    prior = on_host(channel.found.model.prior)
+    prior = channel.found.model.prior
     known, steps, widths = packed_resolution(covariance, prior)
     left, before = channel.without_monopole
     rows = region_rows(nside, lmax)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,30 +18,15 @@ from lusee_bayes.core import formats
 from lusee_bayes.core.arrays import Pixels
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import recover, user_path
-from lusee_bayes.core.formats import opened_tree
 from lusee_bayes.core.harmonics import mode_numbers, n_modes
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.reading import require_file
-from lusee_bayes.core.trees import from_tree, to_tree
+from lusee_bayes.core.trees import from_tree, opened_tree, to_tree
 from lusee_bayes.core.version import __version__, versions
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.information import Information
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.map_result import MapResult
-
-# FITS keys have eight letters
-VERSION_KEYS = {
-    "lusee_bayes": "V_LUSEE",
-    "commit": "V_COMMIT",
-    "jax": "V_JAX",
-    "numpyro": "V_NPYRO",
-    "arviz-stats": "V_ARVIZ",
-    "numpy": "V_NUMPY",
-    "scipy": "V_SCIPY",
-    "healpy": "V_HEALPY",
-    "astropy": "V_ASTRO",
-    "lunarsky": "V_LUNAR",
-}
 
 
 def cards(name: str, scenario: Scenario) -> dict[str, object]:
@@ -59,7 +45,11 @@ def cards(name: str, scenario: Scenario) -> dict[str, object]:
         "SITELAT": (site.lat_deg, "selenographic latitude in degrees"),
         "SCENHASH": text_hash(scenario.to_yaml()),
         "CREATOR": f"lusee_bayes {__version__}",
-        **{VERSION_KEYS[package]: (v, package) for package, v in versions().items()},
+        # FITS keys have eight letters
+        **{
+            f"V_{re.split('[-_]', name)[0][:6].upper()}": (v, name)
+            for name, v in versions().items()
+        },
     }
 
 
@@ -142,7 +132,7 @@ def posterior_tree(result: MapResult) -> xr.DataTree:
     axis = {"frequency": ("frequency", result.frequencies_mhz, {"units": "MHz"})}
     coords = {**axis, "ell": ("mode", ell), "m": ("mode", m)}
     unmapped = {"unmapped": "\n".join(result.gaps())} if result.unmapped else {}
-    attrs = {"format": formats.POSTERIOR, **about(scenario), **unmapped}
+    attrs = formats.header(formats.POSTERIOR) | about(scenario) | unmapped
     groups = {"/": xr.Dataset(variables, coords, attrs), **_observed(channels, axis)}
     draws, likely = result.stacked("draws"), result.stacked("log_likelihood")
     if draws.size:
@@ -247,7 +237,7 @@ def diagnostics_tree(result: MapResult) -> xr.DataTree:
         kept = replace(channel, draws=channel.draws[:0], log_likelihood=channel.log_likelihood[:0])
         kept = replace(kept, covariance=None, information=None)
         groups[f"{channel.frequency_mhz:.15g}"] = to_tree(kept)
-    root = xr.Dataset(attrs={"format": formats.DIAGNOSTICS, **about(result.scenario)})
+    root = xr.Dataset(attrs=formats.header(formats.DIAGNOSTICS) | about(result.scenario))
     return xr.DataTree(root, children=groups)
 
 
@@ -262,7 +252,6 @@ def read_channels(path: str | Path) -> tuple[ChannelResult, ...]:
 def about(scenario: Scenario) -> dict[str, object]:
     """What a file has to say of its numbers: frame, versions, scenario."""
     return {
-        "Conventions": "CF-1.11",
         "lmax": scenario.lmax,
         "frame": "galactic",
         "basis": "real orthonormal spherical harmonics, index ell^2 + ell + m",

@@ -194,17 +194,6 @@ class PriorComparison:
             **about_run(self.seconds),
         )
 
-    def as_markdown(self) -> str:
-        """priors.md."""
-        header, rows = self.table()
-        cells = [" | ".join(cell.replace("|", "\\|") for cell in row) for row in (header, *rows)]
-        rule = " | ".join(["---"] * len(header))
-        table = [f"| {line} |" for line in (cells[0], rule, *cells[1:])]
-        first, *others = self.lines()
-        notes = [f"- {one.name}: {one.words}" for one in self.priors]
-        lines = [f"# {self.name} under several priors", "", first, "", *table, ""]
-        return "\n".join([*lines, *others, "", *notes]) + "\n"
-
 
 def _row(one: PriorSummary, best: float) -> dict[str, object]:
     row: dict[str, object] = {
@@ -226,6 +215,7 @@ def _row(one: PriorSummary, best: float) -> dict[str, object]:
 def prior_table(priors: Sequence[PriorSummary]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Header and rows: a column for each prior."""
     header, first = ("", *(one.name for one in priors)), priors[0]
+    rows: list[tuple[str, ...]] = []
 
     def each(form: str, of: Callable[[PriorSummary], float]) -> list[str]:
         """A cell for each prior."""
@@ -235,33 +225,30 @@ def prior_table(priors: Sequence[PriorSummary]) -> tuple[tuple[str, ...], list[t
         values = [of(one) for one in priors]
         return [f"{value - max(values):.1f}" for value in values]
 
-    rows = [
-        ("ln evidence", *each(".1f", lambda one: one.log_evidence)),
-        ("less the best", *less_best(lambda one: one.log_evidence)),
-        ("parameters learned", *each("", lambda one: one.parameters)),
-    ]
+    def add(name: str, cells: list[str]) -> None:
+        rows.append((name, *cells))
+
+    add("ln evidence", each(".1f", lambda one: one.log_evidence))
+    add("less the best", less_best(lambda one: one.log_evidence))
+    add("parameters learned", each("", lambda one: one.parameters))
     for k, held in enumerate(first.held_out):
+        left_out = f"{held.kind}s left out"
         density = less_best(lambda one, k=k: one.held_out[k].log_density)
-        rows += [
-            (f"{held.kind}s left out: ln p less the best", *density),
-            (
-                f"{held.kind}s left out: chi2 of {held.n}",
-                *each(".0f", lambda one, k=k: one.held_out[k].chi2),
-            ),
-        ]
+        add(f"{left_out}: ln p less the best", density)
+        add(f"{left_out}: chi2 of {held.n}", each(".0f", lambda one, k=k: one.held_out[k].chi2))
     for key, words in (("instrument", "no sky explains"), ("rest", "of the sky")):
         parts = [getattr(one, key) for one in priors]
-        rows.append((f"chi2 {words}", *(f"{x.chi2:.0f} of {x.degrees:.0f}" for x in parts)))
+        add(f"chi2 {words}", [f"{x.chi2:.0f} of {x.degrees:.0f}" for x in parts])
     if not first.coverage:
         return header, rows
     for k, part in enumerate(first.coverage):
-        for level, name in ((0.68, "68% hold"), (0.95, "95% hold")):
+        for level in (0.68, 0.95):
             n = LEVELS.index(level)
             held = each(".1%", lambda one, k=k, n=n: one.coverage[k].held[n])
-            rows.append((f"{name}, {part.name}", *held))
-        rows.append((f"rms pull, {part.name}", *each(".2f", lambda one, k=k: one.coverage[k].rms)))
-    rows.append(("largest pull", *each(".1f", lambda one: one.coverage[-1].largest)))
-    rows.append(("rms error [K]", *each(",.0f", lambda one: one.errors[-1].rms_error_k)))
+            add(f"{level:.0%} hold, {part.name}", held)
+        add(f"rms pull, {part.name}", each(".2f", lambda one, k=k: one.coverage[k].rms))
+    add("largest pull", each(".1f", lambda one: one.coverage[-1].largest))
+    add("rms error [K]", each(",.0f", lambda one: one.errors[-1].rms_error_k))
     for ell in first.snr:
-        rows.append((f"SNR at ell {ell}", *each(".1f", lambda one, ell=ell: one.snr[ell])))
+        add(f"SNR at ell {ell}", each(".1f", lambda one, ell=ell: one.snr[ell]))
     return header, rows

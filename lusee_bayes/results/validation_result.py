@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lusee_bayes.judge.levels import LEVELS
 from lusee_bayes.results.sample_result import SampleResult
-from lusee_bayes.results.summaries import CheckSummary, ValidationSummary
+from lusee_bayes.results.summaries import ValidationSummary
 from lusee_bayes.sampling.validation import Check, Comparison, Ranks
 
 # what a comparison has mode by mode
@@ -54,48 +53,13 @@ class ValidationResult:
         verdict = "passed" if self.passed else "FAILED"
         return f"{verdict}: {sum(c.passed for c in checks)} of {len(checks)} checks hold"
 
-    def as_markdown(self) -> str:
-        """validation.md: the checks, how their thresholds come about, and coverage."""
-        ranks = self.ranks
-        lines = [
-            f"# Validation of {self.name}",
-            "",
-            "| check | value | allowed | | what it is |",
-            "| --- | --- | --- | --- | --- |",
-        ]
-        for check in self.checks:
-            verdict = "ok" if check.passed else "**failed**"
-            lines.append(
-                f"| {check.name} | {check.value:.4g} | {allowed(check)} | {verdict} | "
-                f"{check.meaning} |"
-            )
-        lines += [
-            "",
-            "Means, variances and calibration: a correct posterior fails each of them once in "
-            "1000 runs. Eigenvalues: against simulated exact chains with the same autocorrelation "
-            "from draw to draw. "
-            "R-hat: 1.01, or what the largest of so many modes reaches by chance. Effective sizes, "
-            "BFMI: the usual thresholds.",
-            "",
-            f"Coverage over {ranks.n_simulations} simulations (regions: distance from the mean; "
-            "else central intervals):",
-            "",
-            "| quantity | " + " | ".join(f"{p:.0%}" for p in LEVELS) + " |",
-            "| --- |" + " --- |" * len(LEVELS),
-        ]
-        for name, coverage in ranks.coverage().items():
-            lines.append(f"| {name} | " + " | ".join(f"{coverage[p]:.1%}" for p in LEVELS) + " |")
-        errors = " | ".join(f"{ranks.coverage_error(p):.1%}" for p in LEVELS)
-        lines.append(f"| standard error | {errors} |")
-        return "\n".join(lines) + "\n"
-
     def summary(self) -> ValidationSummary:
         """validation.json."""
         ranks = self.ranks
         levels = ranks.coverage().items()
         return ValidationSummary(
             passed=self.passed,
-            checks=[CheckSummary.model_validate(check) for check in self.checks],
+            checks=self.checks,
             modes={name: getattr(self.comparison, name).tolist() for name in OF_MODES},
             coverage={name: {f"{p:g}": x for p, x in shares.items()} for name, shares in levels},
             p_values=dict(zip(ranks.names, ranks.p_values().tolist(), strict=True)),

@@ -31,22 +31,20 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+import h5py
 import jax
 import numpy as np
-import xarray as xr
 from jaxtyping import Float, Int, PRNGKeyArray
 
-from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core import formats
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import replacing
 from lusee_bayes.core.formats import says
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.trees import from_tree, to_tree
+from lusee_bayes.core.trees import StoredTree, from_tree, write_tree
 from lusee_bayes.core.version import __version__
 from lusee_bayes.experiment.data_files import Data, anchored, digest_of
 from lusee_bayes.experiment.experiment import build, draw_key
-from lusee_bayes.experiment.positive import lmax_of_fields, positive_skies
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.unknowns import Unknowns
 from lusee_bayes.judge.coverage import N_DRAWS
@@ -104,21 +102,19 @@ class ChannelFiles:
 
     def write(self, scenario: Scenario, kind: str, value: Any) -> None:
         """Write a dataclass whole or not at all."""
-        with replacing(self.path(scenario, kind)) as partial:
-            tree = to_tree(value)
-            tree.attrs["identity"] = self.identity
-            tree.to_netcdf(partial, engine="h5netcdf")
+        path = self.path(scenario, kind)
+        write_tree(path, value, formats.CHANNEL, {"identity": self.identity})
 
     def read(self, scenario: Scenario, kind: str, of: type[T], part: str = "/") -> T:
         """Read what was written, or a part of it by its path."""
         path = self.path(scenario, kind)
-        with xr.open_datatree(path, engine="h5netcdf") as tree:
-            return from_tree(of, tree[part], str(path))
+        with h5py.File(path) as file:
+            return from_tree(of, StoredTree(file[part]), str(path))
 
     def arrays(self, scenario: Scenario, kind: str, *names: str) -> list[np.ndarray]:
         """Read some arrays of it, by their paths."""
-        with xr.open_datatree(self.path(scenario, kind), engine="h5netcdf") as tree:
-            return [np.asarray(tree[name]) for name in names]
+        with h5py.File(self.path(scenario, kind)) as file:
+            return [file[name][()] for name in names]
 
 
 def identity_of(scenario: Scenario, data: Data | None, *others: object) -> str:
@@ -209,7 +205,7 @@ class ChannelsInFiles:
             for number in numbers:
                 information = function(number, _information(files, channels[number]))
                 sums = summed_information(sums, prior, number, information)
-            return on_host(sums)
+            return sums
 
         # the same blocks, and the same tree of them, whatever carries out the tasks
         blocks = [
@@ -250,9 +246,9 @@ def positive_mode(scenario: Scenario, channels: ChannelsInFiles, stages: Stages)
         As :func:`.find_joint_mode`.
     """
     with stages("templates"):
-        skies = positive_skies(scenario)
+        skies = scenario.spectral.positive_skies(scenario.frequencies_mhz, scenario.lmax)
     silent = replace(channels, stages=Stages())
-    coarse = lmax_of_fields(scenario, min(scenario.lmax, COARSE_LMAX))
+    coarse = scenario.spectral.lmax_of_fields(min(scenario.lmax, COARSE_LMAX))
     with stages.progress("laws of the fields", MAX_ROUNDS) as report:
         laws = learn_laws(skies, silent, lmax_fields=coarse, report=report)
     with stages.progress("positive skies", MAX_ROUNDS) as report:
@@ -587,7 +583,7 @@ def map_channels(
         n_solved = max(n_draws, N_DRAWS) if known else n_draws
         components = solve_components(left, files, n_solved, engine, stages)
         # for workers of other processes
-        write = partial(_write_joint_sky, mapped, on_host(components), scenario, files)
+        write = partial(_write_joint_sky, mapped, components, scenario, files)
         engine.each(Tasks(write, numbers, names), stages, "joint skies")
     found = tuple(files.read(c, "result", ChannelResult) for c in mapped)
     seconds, tied_evidence = stages.seconds, {"tie_log_evidence": tie_log_evidence}
@@ -642,7 +638,7 @@ def _write_joint_sky(
         information.log_likelihood(skies),
         np.asarray(sky.draws) - np.asarray(sky.mean),
         unknowns=report,
-        independent=information.reference,
+        independent=np.asarray(information.reference),
         covariance_kept=scenario.output.covariance,
         **information.fit(sky.mean, sky.covariance),
     )

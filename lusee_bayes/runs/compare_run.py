@@ -10,15 +10,16 @@ from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import Data
 from lusee_bayes.experiment.experiment import Experiment, observed
-from lusee_bayes.experiment.rounds import about_sky, learned_prior, named_priors
+from lusee_bayes.experiment.rounds import about_sky, learned_prior, named_priors, rebuilds
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.judge.residuals import held_out
 from lusee_bayes.judge.split import Split
-from lusee_bayes.linear.information import Information
-from lusee_bayes.report.comparison_page import comparison_page
+from lusee_bayes.linear.linear_gaussian import Solution
 from lusee_bayes.report.figures.maps import curves_of_runs, maps_of_runs
 from lusee_bayes.report.figures.plans import priors
+from lusee_bayes.report.pages import comparison_page
+from lusee_bayes.report.rendering import render_text
 from lusee_bayes.results.channel_map import conditioned
 from lusee_bayes.results.finished_runs import FinishedRun, Provenance, comparison_rows, read_runs
 from lusee_bayes.results.prior_comparison import PriorComparison, UnderPrior
@@ -134,11 +135,11 @@ def run_compare_priors(
     with scenario_run(folder, COMPARE_PRIORS, scenario, data, replace=replace, **origin) as run:
         experiment = measured_experiment(scenario, data, stages, truth=truth, make=observed)
         with stages("data"):
-            information = about_sky(experiment.setup, experiment.data)
+            solution = about_sky(experiment.setup, experiment.data)
 
         def under(prior: str) -> UnderPrior:
             setup = experiment.setup.with_prior(sections[prior])
-            return _under(prior, setup, experiment, information)
+            return _under(prior, setup, experiment, solution)
 
         engine.work_in(run.path)
         found = engine.each(Tasks(under, list(sections), list(sections)), stages, "priors")
@@ -147,25 +148,27 @@ def run_compare_priors(
         return run.write(result, stages, provenance)
 
 
-def _under(name: str, setup: Setup, experiment: Experiment, information: Information) -> UnderPrior:
+def _under(name: str, setup: Setup, experiment: Experiment, solution: Solution) -> UnderPrior:
     """Map the data under one prior, or a family of them, and leave out groups of them."""
+    information = solution.information
     if setup.family is None:
         learned, evidence = None, float(information.posterior(setup.prior).log_evidence)
     else:
         learned = learned_prior(setup, setup.family, information)
         setup, evidence = replace(setup, prior=learned.prior), learned.log_evidence
-    mapped = replace(experiment, setup=setup, learned=learned)
+    known = None if rebuilds(setup) else solution
+    mapped = replace(experiment, setup=setup, learned=learned, solution=known)
     made = conditioned(mapped)
     channel = made.result(made.known(alone=False))
-    model, posterior = made.own.model, made.own.posterior
+    own = made.own.solution
     return UnderPrior(
         name,
         channel.prior,
         channel,
         evidence,
         0 if learned is None else len(learned.parameters),
-        held_out(model, posterior, mapped.data),
-        Split.of(posterior, channel.chi2_model, model.n_data),
+        held_out(own, mapped.data),
+        Split.of(own.posterior, channel.chi2_model, own.model.n_data),
     )
 
 
@@ -174,7 +177,7 @@ COMPARE_PRIORS = RunKind(
     "compare-priors",
     outputs=(
         model_file("priors.json", lambda result: result.summary()),
-        text_file("priors.md", lambda result: result.as_markdown()),
+        text_file("priors.md", lambda result: render_text("priors.md", result=result)),
         SCENARIO,
         rows_file("priors.csv", lambda result: result.rows()),
     ),

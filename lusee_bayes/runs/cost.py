@@ -21,7 +21,6 @@ from lusee_bayes.core.progress import Stages, gigabytes, memory_limit
 from lusee_bayes.experiment.data_files import Data, read_data
 from lusee_bayes.experiment.experiment import Experiment, build, with_truth
 from lusee_bayes.experiment.leave_out import ARRAYS, MOST_MEMORY
-from lusee_bayes.experiment.positive import lmax_of_fields
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.visibilities import Visibilities
 
@@ -145,7 +144,8 @@ def posterior_cost(scenario: Scenario, n_draws: int = 0, n_data: int | None = No
     if scenario.joint:
         n, squares = scenario.spectral.n_maps(scenario.frequencies_mhz) * n_modes, JOINT_SQUARES
         if scenario.spectral.model == "positive":
-            n, rounds = len(scenario.spectral.fields) * (lmax_of_fields(scenario) + 1) ** 2, ROUNDS
+            lmax = scenario.spectral.lmax_of_fields(scenario.lmax)
+            n, rounds = len(scenario.spectral.fields) * (lmax + 1) ** 2, ROUNDS
     squares = float(squares) * float(n) ** 2
     if scenario.joint:
         # the normal matrix of every channel is kept

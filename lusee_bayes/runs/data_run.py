@@ -17,9 +17,8 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import require_new, transaction, user_path
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming
-from lusee_bayes.experiment.data_files import Data, names_of_data, read_data
-from lusee_bayes.experiment.experiment import Experiment, simulated
-from lusee_bayes.experiment.flight_data import reduce_files
+from lusee_bayes.experiment.data_files import Data, names_of_data, read_data, reduce_files
+from lusee_bayes.experiment.experiment import Experiment, observed
 from lusee_bayes.experiment.flight_simulation import FlightSimulation, flight_of, simulate_flight
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.setup import require_fitting, set_up
@@ -84,7 +83,7 @@ def run_simulate(
             )
         channels = _at(scenario, frequencies_mhz).channels()
     experiments = [
-        simulated(channel, stages=Stages(stages.console, verbose=stages.verbose))
+        observed(channel, stages=Stages(stages.console, verbose=stages.verbose))
         for channel in channels
     ]
     data = [experiment.data for experiment in experiments]

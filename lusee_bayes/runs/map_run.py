@@ -9,8 +9,7 @@ import numpy as np
 
 from lusee_bayes.core.engine import Engine
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment.data_files import Data, are_sessions, reduced_of
-from lusee_bayes.experiment.flight_data import visibilities_of
+from lusee_bayes.experiment.data_files import Data, are_sessions, reduced_of, visibilities_of
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.flight.reduced import REDUCED, Reduced, write_reduced
 from lusee_bayes.report.figures import judgement, maps
@@ -37,7 +36,7 @@ from lusee_bayes.runs.folder import (
     scenario_run,
     table_file,
 )
-from lusee_bayes.sky.sky_files import write_alms
+from lusee_bayes.sky.sky_source import write_alms
 
 
 def run_map(

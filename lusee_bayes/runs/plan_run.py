@@ -96,7 +96,7 @@ def expected_inference(setup: Setup) -> Inference:
     """
     model, held = model_about(setup, Around())
     # the covariance is that of any data; these are the shortest to write
-    return Inference(model, held, model.condition(np.zeros(model.n_data)), 1, Around())
+    return Inference(model.condition(np.zeros(model.n_data)), held, 1, Around())
 
 
 def expected_offsets(found: Inference) -> dict[str, float]:
@@ -106,9 +106,7 @@ def expected_offsets(found: Inference) -> dict[str, float]:
     """
     if found.offsets is None:
         return {}
-    no_data = np.zeros(found.model.n_data)
-    columns = found.offsets.columns
-    amplitudes = template_amplitudes(found.model, found.posterior, no_data, columns)
+    amplitudes = template_amplitudes(found.solution, found.offsets.columns)
     return found.offsets.systematic.in_units(amplitudes.std)
 
 

@@ -10,7 +10,6 @@ import time
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-import jax
 import numpy as np
 import xarray as xr
 from numpyro.infer.hmc import HMCState
@@ -87,7 +86,6 @@ def sample_result(
     scenario, data = experiment.scenario, experiment.data
     with stages("posterior"):
         inference = infer(experiment)
-        jax.block_until_ready(inference.posterior.white_mean)
     identity = {
         "scenario": scenario.to_yaml(),
         "data": data.digest(),
@@ -156,7 +154,7 @@ def coordinates(
         return Whitening.of(inference.posterior)
     positive = arguments.get("log_normal")
     if positive is not None and set(latent) == set(positive.sites):
-        return coordinates_of(positive, inference.model.inform(data.data)[0])
+        return coordinates_of(positive, inference.solution.information)
     start = {SKY: inference.posterior.mean} if SKY in latent else {}
     arguments = {**arguments, "data": data.data}
     starts = 1 if SKY in latent else STARTS

@@ -9,10 +9,12 @@ from lusee_bayes.core.engine import Demand, Engine
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import Data
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
+from lusee_bayes.judge.levels import LEVELS
 from lusee_bayes.report.figures.sampling import comparison, rank_statistics
+from lusee_bayes.report.rendering import render_text
 from lusee_bayes.results.finished_runs import Provenance
 from lusee_bayes.results.sample_result import CHAINS
-from lusee_bayes.results.validation_result import ValidationResult
+from lusee_bayes.results.validation_result import ValidationResult, allowed
 from lusee_bayes.runs.cost import demand_of, measured_experiment, posterior_cost
 from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, model_file, text_file
 from lusee_bayes.runs.sample_run import RESUME, SAMPLE_OUTPUTS, sample_folder, sample_result
@@ -105,13 +107,17 @@ def _of_sampled(output: Output) -> Output:
     return Output(lambda result, folder: output.write(result.sampled, folder))
 
 
+def _as_markdown(result: ValidationResult) -> str:
+    return render_text("validation.md", result=result, allowed=allowed, levels=LEVELS)
+
+
 # what the folder of a validation holds; a new file is one line here
 VALIDATION = RunKind(
     "validate",
     outputs=(
         *map(_of_sampled, SAMPLE_OUTPUTS),
         model_file("validation.json", lambda result: result.summary()),
-        text_file("validation.md", lambda result: result.as_markdown()),
+        text_file("validation.md", _as_markdown),
     ),
     figures={
         "comparison": lambda result: comparison(result.comparison),

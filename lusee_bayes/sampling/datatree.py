@@ -129,8 +129,12 @@ def to_datatree(
         jax.tree.map(np.asarray, groups),
         dims=dims,
         check_conventions=False,  # more chains than draws is unusual, not wrong
-        attrs={"/": {"format": formats.SAMPLES, "program": program.name, **(attributes or {})}},
+        attrs={
+            "/": formats.header(formats.SAMPLES) | {"program": program.name, **(attributes or {})}
+        },
     )
+    for statistic in tree["sample_stats"].data_vars.values():
+        statistic.attrs["units"] = "1"
     predicted = tree["posterior_predictive"]
     predicted.dataset = predicted.dataset.assign_coords(draw=np.arange(n_draws)[::step])
     return _with_coordinates(tree, model, data)

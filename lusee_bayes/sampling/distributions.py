@@ -20,7 +20,7 @@ from jax.scipy.special import gammaln
 from jaxtyping import Float, PRNGKeyArray
 from numpyro import distributions as dist
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, DataVector
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.products import DataLayout
@@ -72,7 +72,7 @@ class Prediction(dist.Distribution):
     support = dist.constraints.real_vector
     pytree_data_fields = ("factor", "loc")
 
-    def __init__(self, loc: Float[Array, " data"], noise: Covariance | Factor):
+    def __init__(self, loc: DataVector, noise: Covariance | Factor):
         self.loc = loc
         self.factor = noise.factor() if isinstance(noise, Covariance) else noise
         super().__init__(event_shape=loc.shape)
@@ -82,7 +82,7 @@ class Prediction(dist.Distribution):
         """Compute the part of -ln p(d) that depends on d, of every row of an array."""
 
     @abstractmethod
-    def residual(self, value: Float[Array, " data"]) -> Float[Array, " data"]:
+    def residual(self, value: DataVector) -> DataVector:
         """Compute r, with J^T r the gradient of the misfit by the prediction, J that of r.
 
         J^T J is the misfit's curvature, as Gauss and Newton take it.
@@ -122,11 +122,11 @@ class CorrelatedNormal(Prediction):
         """Compute chi^2 / 2, of every row of an array."""
         return 0.5 * (self._white(value) ** 2).sum(0).reshape(value.shape[:-1])
 
-    def residual(self, value: Float[Array, " data"]) -> Float[Array, " data"]:
+    def residual(self, value: DataVector) -> DataVector:
         """Compute L^-1 (d - loc), N = L L^T."""
         return self.factor.whiten(value - self.loc)
 
-    def leave_one_out(self, value: Float[Array, " data"]) -> Float[Array, " data"]:
+    def leave_one_out(self, value: DataVector) -> DataVector:
         """Compute ln p(d_i | all other data) of every datum.
 
         With the precision P and the residual r it is N(d_i - [P r]_i / P_ii, 1 / P_ii).
@@ -145,9 +145,7 @@ class CorrelatedNormal(Prediction):
         return _leave_one_out(precise, (root**2).sum(0))
 
 
-def _leave_one_out(
-    precise: Float[Array, " data"], diagonal: Float[Array, " data"]
-) -> Float[Array, " data"]:
+def _leave_one_out(precise: DataVector, diagonal: DataVector) -> DataVector:
     """Log densities from P r and the diagonal of P."""
     return -0.5 * precise**2 / diagonal + 0.5 * jnp.log(diagonal) - HALF_LOG_2PI
 
@@ -188,11 +186,7 @@ class TimesStudentT(Prediction):
     pytree_data_fields = ("layout", "nu")
 
     def __init__(
-        self,
-        loc: Float[Array, " data"],
-        noise: Covariance | Factor,
-        layout: DataLayout,
-        nu: float | Float[Array, ""],
+        self, loc: DataVector, noise: Covariance | Factor, layout: DataLayout, nu: float | Array
     ):
         require_positive("nu of the Student-t", nu)
         if layout.size != loc.shape[0]:
@@ -231,7 +225,7 @@ class TimesStudentT(Prediction):
         """Compute the sum of (nu + n_t) / 2 ln(1 + chi^2_t / nu), of every row of an array."""
         return jnp.log1p(self._chi2(value) / self.nu) @ (self.nu + self._data_of_times()) / 2.0
 
-    def residual(self, value: Float[Array, " data"]) -> Float[Array, " data"]:
+    def residual(self, value: DataVector) -> DataVector:
         """Compute sqrt(w_t) L^-1 (d - loc), N = L L^T, with the weights w_t held."""
         held = jax.lax.stop_gradient(jnp.sqrt(self.weights(value)))
         grid = jnp.broadcast_to(held[None], (self.layout.n_products, self.layout.n_times))
@@ -285,7 +279,7 @@ class Marginal(dist.Distribution):
         flat = value.reshape(-1, value.shape[-1])
         return jax.vmap(solver.log_prob)(flat).reshape(value.shape[:-1])
 
-    def leave_one_out(self, value: Float[Array, " data"]) -> Float[Array, " data"]:
+    def leave_one_out(self, value: DataVector) -> DataVector:
         """Compute ln p(d_i | all other data) of every datum; see CorrelatedNormal."""
         solver = self.model.factorise()
         white = solver.surprise(value)

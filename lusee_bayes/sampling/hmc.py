@@ -30,7 +30,7 @@ from numpyro.infer import HMC, NUTS
 from numpyro.infer.hmc import HMCState
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import is_traced
+from lusee_bayes.core.checks import is_traced, require_positive
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.files import replacing
 from lusee_bayes.core.layouts import Layout
@@ -191,31 +191,29 @@ def whitened(program: Callable, whitening: Whitening) -> Callable:
         values, log_det = whitening.to_values(whitening.mean + whitening.root @ z)
         # the determinant of all coordinates is counted once, with the first site
         log_dets = dict.fromkeys(whitening.names, 0.0) | {first: whitening.log_det + log_det}
-        config = {name: _Given(values[name], log_dets[name]) for name in whitening.names}
+        config = {name: _given(values[name], log_dets[name]) for name in whitening.names}
         with numpyro.handlers.reparam(config=config):
             return program(*args, **kwargs)
 
     return model
 
 
-@dataclass(frozen=True)
-class _Given:
+def _given(value: Float[Array, "..."], log_det: float | Float[Array, ""]) -> Callable:
     """What makes a site with a given unconstrained value a deterministic one and its density.
 
     ``log_det``: of coordinates that the value was made of, added to the density.
     """
 
-    value: Float[Array, "..."]
-    log_det: float | Float[Array, ""]
-
-    def __call__(self, name, fn, obs):
+    def reparametrised(name, fn, obs):
         if obs is not None:
             raise InputError(f"the site '{name}' is observed; only latent sites can be whitened")
         transform = dist.biject_to(fn.support)
-        value = transform(self.value)
-        density = self.log_det + transform.log_abs_det_jacobian(self.value, value).sum()
-        numpyro.factor(f"{name}_density", fn.log_prob(value).sum() + density)
-        return None, value
+        site = transform(value)
+        density = log_det + transform.log_abs_det_jacobian(value, site).sum()
+        numpyro.factor(f"{name}_density", fn.log_prob(site).sum() + density)
+        return None, site
+
+    return reparametrised
 
 
 IDENTITY_LAYOUT = Layout("the description of an unfinished run (else delete its folder)")
@@ -252,13 +250,12 @@ class Chunk:
         kinds: dict[str, dict[str, np.ndarray]] = {"state": {}, "draws": {}}
         try:
             with reading(path, "a checkpoint"), path.open("rb") as file, np.load(file) as arrays:
-                for key in arrays.files:
+                for key in sorted(arrays.files):
                     kind, name = key.split(":", 1)
                     kinds[kind][name] = arrays[key]
         except InputError as error:
             raise InputError(f"{error}; delete it to go on from the one before") from error
-        state = [kinds["state"][name] for name in sorted(kinds["state"])]
-        return cls(_iteration(path), state, kinds["draws"])
+        return cls(_iteration(path), list(kinds["state"].values()), kinds["draws"])
 
 
 class Checkpoints:
@@ -284,29 +281,29 @@ class Checkpoints:
         self.folder = Path(folder)
         described = json.loads(json.dumps(identity))
         marker, paths = self.folder / IDENTITY, self._paths()
-        if marker.exists() and not resume:
+        if not marker.exists():
+            if paths:
+                raise InputError(
+                    f"'{self.folder}' holds draws, but no {IDENTITY} that says of which run; "
+                    "delete the folder"
+                )
+            with replacing(marker) as scratch:
+                scratch.write_text(json.dumps(described, indent=2) + "\n", encoding="utf-8")
+            return
+        if not resume:
             done = _iteration(paths[-1]) if paths else "no"
             raise InputError(
                 f"'{self.folder}' holds an unfinished run ({done} iterations done); go on with "
                 "--resume, or delete the folder"
             )
-        if marker.exists():
-            found = read_json(marker, IDENTITY_LAYOUT)
-            for name in sorted({*found, *described}):
-                if found.get(name) != described.get(name):
-                    raise InputError(
-                        f"the unfinished run in '{self.folder}' has another {name}: "
-                        f"{_short(found.get(name))}, now {_short(described.get(name))}; resume it "
-                        "with the same, or delete the folder"
-                    )
-        elif paths:
-            raise InputError(
-                f"'{self.folder}' holds draws, but no {IDENTITY} that says of which run; delete "
-                "the folder"
-            )
-        else:
-            with replacing(marker) as scratch:
-                scratch.write_text(json.dumps(described, indent=2) + "\n", encoding="utf-8")
+        found = read_json(marker, IDENTITY_LAYOUT)
+        for name in sorted({*found, *described}):
+            if found.get(name) != described.get(name):
+                raise InputError(
+                    f"the unfinished run in '{self.folder}' has another {name}: "
+                    f"{_short(found.get(name))}, now {_short(described.get(name))}; resume it with "
+                    "the same, or delete the folder"
+                )
 
     def _paths(self) -> list[Path]:
         return sorted(self.folder.glob(CHUNK_GLOB))
@@ -403,8 +400,7 @@ class Sampler:
                 raise InputError(f"{name} must be at least {least}, got {getattr(self, name)}")
         if not 0 < self.target_accept < 1:
             raise InputError(f"target_accept must lie in 0..1, got {self.target_accept}")
-        if not self.trajectory > 0:
-            raise InputError(f"trajectory must be positive, got {self.trajectory}")
+        require_positive("trajectory", self.trajectory)
         if self.algorithm not in ALGORITHMS:
             raise InputError(
                 f"unknown algorithm '{self.algorithm}'; {nearest(self.algorithm, ALGORITHMS)}"

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.lazy import dist, numpyro
-from lusee_bayes.sky.log_normal import LogNormalSky
+from lusee_bayes.sky.positive_skies import LogNormalSky
 from lusee_bayes.systematics.systematic import SKY
 
 # the sites: white unknowns of the sky, and what C_ell of its logarithm is made of
@@ -25,23 +25,21 @@ class LogNormalPrior(eqx.Module):
     Attributes
     ----------
     sky : LogNormalSky
-        With C_ell of ``amplitude`` and ``tilt``.
-    amplitude, tilt : () array
-        A and the tilt; their medians, if they are not known.
-    log_amplitude_std, tilt_std : () array or None
-        Standard deviations of ln A and of the tilt; None, both, if they are known.
+        With the expected C_ell.
+    expected : (2,) array
+        ln A and the tilt; their means, if they are not known.
+    std : (2,) array or None
+        Standard deviations of both; None if they are known.
 
     Raises
     ------
     InputError
-        If A or a standard deviation is not positive.
+        If a standard deviation is not positive.
     """
 
     sky: LogNormalSky
-    amplitude: Float[Array, ""]
-    tilt: Float[Array, ""]
-    log_amplitude_std: Float[Array, ""] | None = None
-    tilt_std: Float[Array, ""] | None = None
+    expected: Float[Array, "2"]
+    std: Float[Array, "2"] | None = None
 
     @classmethod
     def of(
@@ -49,7 +47,7 @@ class LogNormalPrior(eqx.Module):
         sky: LogNormalSky,
         amplitude: float,
         tilt: float,
-        uncertain: tuple[float, float] | None = None,
+        std: tuple[float, float] | None = None,
     ) -> LogNormalPrior:
         """Make it.
 
@@ -58,27 +56,28 @@ class LogNormalPrior(eqx.Module):
         sky : LogNormalSky
             Its C_ell beyond ell = 0 is replaced.
         amplitude, tilt : float
-        uncertain : (float, float), optional
+        std : (float, float), optional
             Standard deviations of ln A and of the tilt, if they are not known.
+
+        Raises
+        ------
+        InputError
+            If A or a standard deviation is not positive.
         """
-        stds = () if uncertain is None else tuple(np.asarray(float(std)) for std in uncertain)
+        require_positive("the amplitude of the logarithm of the sky", amplitude)
+        expected = np.array([np.log(amplitude), tilt])
         return cls(
-            sky.with_power_law(amplitude, tilt),
-            np.asarray(float(amplitude)),
-            np.asarray(float(tilt)),
-            *stds,
+            sky.with_power_law(amplitude, tilt), expected, None if std is None else np.array(std)
         )
 
     def __check_init__(self):
-        require_positive("the amplitude of the logarithm of the sky", self.amplitude)
-        if self.log_amplitude_std is not None:
-            require_positive("the standard deviation of ln A", self.log_amplitude_std)
-            require_positive("the standard deviation of the tilt", self.tilt_std)
+        if self.std is not None:
+            require_positive("the standard deviation of ln A or of the tilt", self.std)
 
     @property
     def samples_spectrum(self) -> bool:
         """Whether A and the tilt are unknowns."""
-        return self.log_amplitude_std is not None
+        return self.std is not None
 
     @property
     def sites(self) -> tuple[str, ...]:
@@ -98,9 +97,8 @@ class LogNormalPrior(eqx.Module):
         """
         sky = self.sky
         if self.samples_spectrum:
-            median = jnp.log(self.amplitude)
-            amplitude = numpyro.sample(AMPLITUDE, dist.LogNormal(median, self.log_amplitude_std))
-            tilt = numpyro.sample(TILT, dist.Normal(self.tilt, self.tilt_std))
-            sky = sky.with_power_law(amplitude, tilt)
+            amplitude, tilt = zip(self.expected, self.std, strict=True)
+            amplitude = numpyro.sample(AMPLITUDE, dist.LogNormal(*amplitude))
+            sky = sky.with_power_law(amplitude, numpyro.sample(TILT, dist.Normal(*tilt)))
         white = dist.Normal(jnp.zeros(sky.size), 1.0).to_event(1)
         return numpyro.deterministic(SKY, sky.modes(numpyro.sample(STRUCTURE, white)))

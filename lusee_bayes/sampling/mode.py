@@ -41,6 +41,13 @@ from lusee_bayes.sampling.hmc import Whitening
 from lusee_bayes.sampling.programs import latent_of, numpyro_promotion
 from lusee_bayes.systematics.systematic import MOST_COLLAPSED, Chart
 
+# arrays that recur
+Coordinates = Float[Array, " n"]
+Matrix = Float[Array, "n n"]
+Skies = Float[np.ndarray, "chains draws modes"]
+Quantity = Float[np.ndarray, "chains draws"]
+Region = Bool[np.ndarray, "_"]
+
 # step of the differences that give the Hessian, in standard deviations
 DIFFERENCE = 0.1
 # columns of the Jacobian at once: more would take more memory than time they save
@@ -76,21 +83,20 @@ class Potential(eqx.Module):
         parts = [np.full(int(np.prod(shape)), name in self.hold) for name, shape in sites]
         return np.flatnonzero(np.concatenate(parts))
 
-    def value(self, x: Float[Array, " n"], still: bool = False) -> Float[Array, ""]:
+    def value(self, x: Coordinates, still: bool = False) -> Float[Array, ""]:
         """Return it at x; ``still``: without derivatives by what is held."""
         values, log_det = self.shapes.to_values(x, self.hold if still else ())
         return potential_energy(self.program, (), self.arguments, values) - log_det
 
-    def residual(self, x: Float[Array, " n"], still: bool = False) -> Float[Array, " data"]:
+    def residual(self, x: Coordinates, still: bool = False) -> Float[Array, " data"]:
         """Return the residuals of all sites that predict, such as L^-1 (d - f(x)), N = L L^T."""
-        found = self._predictions(x, still)
-        return jnp.concatenate([fn.residual(value) for fn, value in found])
+        return jnp.concatenate([fn.residual(value) for fn, value in self._predictions(x, still)])
 
-    def misfit(self, x: Float[Array, " n"], still: bool = False) -> Float[Array, ""]:
+    def misfit(self, x: Coordinates, still: bool = False) -> Float[Array, ""]:
         """Return the misfit of all sites that predict, such as chi^2 / 2."""
         return sum((fn.misfit(value) for fn, value in self._predictions(x, still)), jnp.zeros(()))
 
-    def _predictions(self, x: Float[Array, " n"], still: bool) -> list[tuple[Prediction, Array]]:
+    def _predictions(self, x: Coordinates, still: bool) -> list[tuple[Prediction, Array]]:
         values, _ = self.shapes.to_values(x, self.hold if still else ())
         program = handlers.seed(self.program, 0)
         model = handlers.substitute(program, constrain_fn(program, (), self.arguments, values))
@@ -100,9 +106,7 @@ class Potential(eqx.Module):
             if site["type"] == "sample" and isinstance(site["fn"], Prediction)
         ]
 
-    def gradient_and_curvature(
-        self, x: Float[Array, " n"], scale: Float[Array, " n"]
-    ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    def gradient_and_curvature(self, x: Coordinates, scale: Coordinates) -> tuple[Array, Array]:
         """Return both at x; ``scale``: lengths over which the potential is a parabola.
 
         The curvature is that of Gauss and Newton where the program predicts the data, else the
@@ -129,9 +133,7 @@ class Potential(eqx.Module):
         of_prior = self._derivatives(jax.grad(prior), x)
         return slope(x), columns @ columns.T + 0.5 * (of_prior + of_prior.T)
 
-    def _derivatives(
-        self, f: Callable[..., Float[Array, " m"]], x: Float[Array, " n"]
-    ) -> Float[Array, "n m"]:
+    def _derivatives(self, f: Callable[..., Array], x: Coordinates) -> Float[Array, "n m"]:
         """The transposed Jacobian of f(x, still).
 
         Apart for what is held: charts need matrices that only scales change, and products of
@@ -148,7 +150,7 @@ class Potential(eqx.Module):
         )
 
 
-def root_of_inverse(curvature: Float[Array, "n n"], problem: Potential) -> tuple[Array, Array]:
+def root_of_inverse(curvature: Matrix, problem: Potential) -> tuple[Array, Array]:
     """Return R and whether all curvature is positive; R R^T inverts its absolute value."""
     if not problem.predicts:
         return _root_of_any_sign(curvature)
@@ -162,7 +164,7 @@ def root_of_inverse(curvature: Float[Array, "n n"], problem: Potential) -> tuple
     return jax.lax.cond(positive, lambda: (root, positive), lambda: _root_of_any_sign(curvature))
 
 
-def _root_of_any_sign(curvature: Float[Array, "n n"]) -> tuple[Array, Array]:
+def _root_of_any_sign(curvature: Matrix) -> tuple[Array, Array]:
     # in units of its own diagonal, since parameters come in any
     scale = 1.0 / jnp.sqrt(jnp.abs(jnp.diagonal(curvature)))
     values, vectors = jnp.linalg.eigh(curvature * scale[:, None] * scale[None])
@@ -271,7 +273,7 @@ def laplace_approximation(
     heights = jax.lax.map(problem.value, drawn)
     best = jnp.argsort(jnp.where(jnp.isnan(heights), jnp.inf, heights))[: starts - 1]
     places = jnp.concatenate([first[None], drawn[best]])
-    found = jax.lax.map(lambda x: _climb(problem, x, free, scale), places)
+    found = jax.lax.map(lambda place: _climb(problem, place, free, scale), places)
     weight = jnp.where(found.converged, found.log_evidence, -jnp.inf)
     return jax.tree.map(lambda leaf: leaf[jnp.argmax(weight)], found)
 
@@ -304,7 +306,7 @@ def _trace(program: Callable, arguments: dict, start: Mapping[str, Array]) -> di
     return handlers.trace(handlers.substitute(model, substitute_fn=place)).get_trace(**arguments)
 
 
-def _prior_scale(latent: dict) -> Float[Array, " n"]:
+def _prior_scale(latent: dict) -> Coordinates:
     """Standard deviations of the priors in the unconstrained coordinates, from draws."""
     scales = []
     for name, site in latent.items():
@@ -316,10 +318,7 @@ def _prior_scale(latent: dict) -> Float[Array, " n"]:
 
 @eqx.filter_jit
 def _climb(
-    problem: Potential,
-    first: Float[Array, " n"],
-    free: Float[Array, " n"],
-    scale: Float[Array, " n"],
+    problem: Potential, first: Coordinates, free: Coordinates, scale: Coordinates
 ) -> LaplaceApproximation:
     """Newton's method with halved steps; where the curvature is negative, its absolute value.
 
@@ -378,7 +377,7 @@ INTERVAL = 0.9
 
 
 def pixel_statistics(
-    skies: Float[np.ndarray, "chains draws modes"], nside: int, probability: float = INTERVAL
+    skies: Skies, nside: int, probability: float = INTERVAL
 ) -> dict[str, Float[np.ndarray, " pixels"]]:
     """Compute what the draws say of every pixel.
 
@@ -410,11 +409,11 @@ def pixel_statistics(
         values = flat @ matrix[first : first + CHUNK].T
         ends = np.quantile(values, tails, axis=0)
         parts.append([values.mean(0), values.std(0, ddof=1), *ends])
-    names = ("mean", "std", "lower", "upper")
-    return dict(zip(names, np.concatenate(parts, axis=1), strict=True))
+    columns = np.concatenate(parts, axis=1)
+    return dict(zip(("mean", "std", "lower", "upper"), columns, strict=True))
 
 
-def disc(nside: int, l_deg: float, b_deg: float, radius_deg: float) -> Bool[np.ndarray, " pixels"]:
+def disc(nside: int, l_deg: float, b_deg: float, radius_deg: float) -> Region:
     """Select the pixels within a radius of a Galactic direction.
 
     Parameters
@@ -431,9 +430,9 @@ def disc(nside: int, l_deg: float, b_deg: float, radius_deg: float) -> Bool[np.n
     InputError
         If no pixel lies within it.
     """
-    inside = np.zeros(healpy.nside2npix(nside), dtype=bool)
     centre = healpy.ang2vec(l_deg, b_deg, lonlat=True)
-    inside[healpy.query_disc(nside, centre, np.radians(radius_deg))] = True
+    pixels = healpy.query_disc(nside, centre, np.radians(radius_deg))
+    inside = np.isin(np.arange(healpy.nside2npix(nside)), pixels)
     if not inside.any():
         raise InputError(
             f"no pixel of NSIDE {nside} lies within {radius_deg:g} degrees of l = {l_deg:g}, b = "
@@ -442,20 +441,14 @@ def disc(nside: int, l_deg: float, b_deg: float, radius_deg: float) -> Bool[np.n
     return inside
 
 
-def region_brightness(
-    skies: Float[np.ndarray, "chains draws modes"], region: Bool[np.ndarray, " pixels"]
-) -> Float[np.ndarray, "chains draws"]:
+def region_brightness(skies: Skies, region: Region) -> Quantity:
     """Compute the mean brightness of a region for every draw, in K."""
     nside = healpy.npix2nside(len(region))
     row = pixel_matrix(nside, lmax_of(skies.shape[-1]))[region].mean(0)
     return skies @ row
 
 
-def probability_brighter(
-    skies: Float[np.ndarray, "chains draws modes"],
-    first: Bool[np.ndarray, " pixels"],
-    second: Bool[np.ndarray, " others"],
-) -> tuple[float, float]:
+def probability_brighter(skies: Skies, first: Region, second: Region) -> tuple[float, float]:
     """Compute the probability that one region is brighter on average than another.
 
     Parameters
@@ -486,12 +479,12 @@ def probability_brighter(
 
 
 def sky_quantities(
-    skies: Float[np.ndarray, "chains draws modes"],
+    skies: Skies,
     *,
     modes: Sequence[tuple[int, int]] = (),
     ells: Sequence[int] = (),
     pixels: Mapping[str, tuple[float, float]] | None = None,
-) -> dict[str, Float[np.ndarray, "chains draws"]]:
+) -> dict[str, Quantity]:
     """Compute chosen quantities of every draw, by name.
 
     Parameters
@@ -527,7 +520,7 @@ def sky_quantities(
     return columns
 
 
-def summary(quantities: Mapping[str, Float[np.ndarray, "chains draws"]]) -> pd.DataFrame:
+def summary(quantities: Mapping[str, Quantity]) -> pd.DataFrame:
     """Make ArviZ's summary, a row for each quantity.
 
     It has mean, standard deviation, 90 % interval, bulk and tail ESS, R-hat and Monte Carlo

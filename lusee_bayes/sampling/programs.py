@@ -14,6 +14,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -124,24 +125,21 @@ class Program:
             If the program asks for a piece that is not there, or for A alone where the data hold
             more than the sky.
         """
-        found, names = {}, inspect.signature(self.model).parameters
+        names = inspect.signature(self.model).parameters
         if "coupling" in names and "offset" not in names and model.offset is not None:
             raise InputError(
                 f"the program '{self.name}' asks for 'coupling' alone, and these data hold ground "
                 "or receivers besides the sky; add the argument 'offset', and coupling @ sky + "
                 "offset"
             )
+        pieces = {name: partial(make, model) for name, make in PIECES.items()} | dict(more or {})
         for name in names:
-            if name in PIECES:
-                found[name] = PIECES[name](model)
-            elif name != DATA:
-                if more is None or name not in more:
-                    raise InputError(
-                        f"the program '{self.name}' asks for '{name}', a piece of an experiment; "
-                        "give arguments() the experiment's pieces"
-                    )
-                found[name] = more[name]()
-        return found
+            if name != DATA and name not in pieces:
+                raise InputError(
+                    f"the program '{self.name}' asks for '{name}', a piece of an experiment; "
+                    "give arguments() the experiment's pieces"
+                )
+        return {name: pieces[name]() for name in names if name != DATA}
 
 
 def program_names() -> list[str]:
@@ -285,7 +283,7 @@ def collapsed_draws(
 
     def model():
         gaussian = program.model(**arguments, data=jnp.asarray(data))
-        exact = gaussian.condition(data).sample(numpyro.prng_key())
+        exact = gaussian.condition(data).posterior.sample(numpyro.prng_key())
         sky = numpyro.sample("drawn sky", dist.Delta(exact, event_dim=1))
         replicated = gaussian.predict(sky) + gaussian.noise.sample(numpyro.prng_key())
         numpyro.deterministic("drawn data", replicated)

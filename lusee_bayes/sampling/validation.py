@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -35,22 +36,26 @@ from arviz_stats.base import array_stats
 from jaxtyping import Bool, Float, Int, Key, PRNGKeyArray
 from scipy import stats
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, Vector
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.judge.levels import LEVELS
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
+from lusee_bayes.linear.linear_gaussian import LinearGaussian, Whitened
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.linear.solver import Solver
 from lusee_bayes.sampling.least import N_BINS, require_draws, require_simulations
+
+Skies = Float[np.ndarray, "chains draws modes"]
 
 # ranks among 99 draws take 100 values, so that LEVELS are met exactly
 N_DRAWS = 99
 
 # chance that a true posterior fails the verdict over all quantities
 FALSE_ALARM = 1e-3
+
+# single modes of a sky that are ranked, and random directions
+N_RANKED = 10
 
 # data sets worked on at once, and the numbers that their draws of the data may take up
 BATCH = 50
@@ -215,15 +220,13 @@ def calibrate_sky(
     posterior: LinearGaussian,
     *,
     n_simulations: int = 500,
-    n_modes: int = 10,
-    n_projections: int = 10,
     seed: int = 0,
     engine: Engine | None = None,
     stages: Stages | None = None,
 ) -> Ranks:
     """Calibrate the analytic posterior of the sky.
 
-    :class:`SkyQuantities` are ranked: single modes spread over the ells, random directions in
+    :func:`ranked_of_sky` are ranked: single modes spread over the ells, random directions in
     units of the prior, the distance from the mean in the posterior's metric, and the likelihood.
 
     Parameters
@@ -234,8 +237,6 @@ def calibrate_sky(
         The model that is conditioned on them; usually the same.
     n_simulations : int
         Number of data sets.
-    n_modes, n_projections : int
-        Number of single modes and of random directions.
     seed : int
         Of everything.
     engine, stages : optional
@@ -247,11 +248,13 @@ def calibrate_sky(
         For fewer than 100 data sets.
     """
     solver = posterior.factorise()
-    quantities = SkyQuantities.spread(solver, n_modes, n_projections, seed)
+    size, rng = solver.prior.size, np.random.default_rng(seed)
+    modes = np.unique(np.linspace(0, size - 1, min(N_RANKED, size)).astype(int))
+    directions = rng.standard_normal((N_RANKED, solver.prior.rank))
     ranks = calibrate(
         truth.sample,
         eqx.Partial(_sky_draws, solver),
-        quantities,
+        eqx.Partial(ranked_of_sky, solver, jnp.asarray(modes), jnp.asarray(directions)),
         n_simulations=n_simulations,
         seed=seed,
         batch=int(np.clip(MEMORY // (N_DRAWS * posterior.n_data), 1, BATCH)),
@@ -260,51 +263,44 @@ def calibrate_sky(
         stages=stages,
     )
     # modes by their number among all modes
-    numbers = {f"mode {i}": f"mode {mode}" for i, mode in enumerate(quantities.modes)}
+    numbers = {f"mode {i}": f"mode {mode}" for i, mode in enumerate(modes)}
     return replace(ranks, names=tuple(numbers.get(name, name) for name in ranks.names))
 
 
-def _sky_draws(solver: Solver, key: PRNGKeyArray, data: Array) -> Float[Array, "draws modes"]:
-    return solver.condition(data).sample(key, N_DRAWS)
+def _sky_draws(solver: Whitened, key: PRNGKeyArray, data: Array) -> Float[Array, "draws modes"]:
+    return solver.condition(data).posterior.sample(key, N_DRAWS)
 
 
-class SkyQuantities(eqx.Module):
-    """Quantities of a sky: modes, projections, distance from the mean, log likelihood.
+def ranked_of_sky(
+    solver: Whitened,
+    modes: Int[Array, " single"],
+    directions: Float[Array, "projections white"],
+    sky: Float[Array, " modes"],
+    data: Float[Array, " data"],
+) -> dict[str, Array]:
+    """Compute modes, projections, distance from the mean and log likelihood of a sky, given data.
 
-    Attributes
+    Parameters
     ----------
-    solver : Solver
+    solver : Whitened
         Of the model that is conditioned on the data.
-    modes : tuple of int
+    modes : (single,) array of int
         Numbers of the single modes.
     directions : (projections, white) array
         Directions in units of the prior.
+    sky : (modes,) array
+        In K.
+    data : (data,) array
+        In K.
     """
-
-    solver: Solver
-    modes: tuple[int, ...] = eqx.field(static=True)
-    directions: Float[Array, "projections white"]
-
-    @classmethod
-    def spread(cls, solver: Solver, n_modes: int, n_projections: int, seed: int) -> SkyQuantities:
-        """Choose modes from the lowest to the highest ell, and random directions."""
-        size = solver.prior.size
-        chosen = np.unique(np.linspace(0, size - 1, min(n_modes, size)).astype(int))
-        rng = np.random.default_rng(seed)
-        directions = rng.standard_normal((n_projections, solver.prior.rank))
-        return cls(solver, tuple(int(c) for c in chosen), jnp.asarray(directions))
-
-    def __call__(self, sky: Float[Array, " modes"], data: Float[Array, " data"]) -> dict:
-        """Compute the quantities of one sky, given the data."""
-        solver = self.solver
-        u = solver.prior.whiten(sky)
-        white = solver.factor.whiten(data if solver.offset is None else data - solver.offset)
-        return {
-            "mode": sky[np.array(self.modes)],
-            "projection": self.directions @ u,
-            "distance": (solver.condition(data).whiten(sky[None])[0] ** 2).sum(),
-            "log likelihood": -0.5 * ((white - solver.whitened @ u) ** 2).sum(),
-        }
+    offset, u = solver.model.offset, solver.model.prior.whiten(sky)
+    white = solver.factor.whiten(data if offset is None else data - offset)
+    return {
+        "mode": sky[modes],
+        "projection": directions @ u,
+        "distance": (solver.condition(data).posterior.whiten(sky[None])[0] ** 2).sum(),
+        "log likelihood": -0.5 * ((white - solver.whitened @ u) ** 2).sum(),
+    }
 
 
 MAX_RHAT = 1.01
@@ -382,7 +378,7 @@ class Comparison:
 
 
 def validate_draws(
-    draws: Float[np.ndarray, "chains draws modes"],
+    draws: Skies,
     posterior: Posterior,
     diverging: Bool[np.ndarray, "chains draws"],
     energy: Float[np.ndarray, "chains draws"],
@@ -416,18 +412,16 @@ def validate_draws(
     n_chains, _, n_modes = draws.shape
     std = np.asarray(posterior.std())
     deviations = (draws - np.asarray(posterior.mean)) / std
-    mean_z = deviations.mean((0, 1)) * np.sqrt(_ess(deviations, "mean"))
+    mean_z = deviations.mean((0, 1)) * np.sqrt(_ess(deviations, method="mean"))
     variance_ratio = (deviations**2).mean((0, 1))
-    ess_square = _ess(deviations**2, "mean")
+    ess_square = _ess(deviations**2, method="mean")
     variance_z = _chi2_z(variance_ratio, ess_square)
     white = np.asarray(posterior.whiten(draws.reshape(-1, n_modes))).reshape(draws.shape)
     eigenvalues = _eigenvalues(white)
     null = _null_eigenvalues(white, np.random.default_rng(seed))
     rhat = np.asarray(array_stats.rhat(draws, chain_axis=0, draw_axis=1, method="rank"))
-    # energy changes between draws over its variance (Betancourt 2016)
-    changes = (np.diff(energy, axis=1) ** 2).sum(1)
-    bfmi = changes / ((energy.T - energy.mean(1)).T ** 2).sum(1)
-    bulk, tail = _ess(draws, "bulk"), _ess(draws, "tail")
+    bfmi = array_stats.bfmi(energy, chain_axis=0, draw_axis=1)
+    bulk, tail = _ess(draws, method="bulk"), _ess(draws, method="tail", prob=(0.05, 0.95))
     limit = float(stats.norm.isf(FALSE_ALARM / (2 * n_modes)))
     spread = NULL_MARGIN * null.std(0, ddof=1)
     low, high = null.mean(0)[0] - spread[0], null.mean(0)[-1] + spread[-1]
@@ -455,26 +449,18 @@ def validate_draws(
         Check("BFMI", float(bfmi.min()), MIN_BFMI, np.inf,
               "smallest of all chains: how well energies are explored"),
     )  # fmt: skip
-    error, null_mean = np.sqrt(2.0 / ess_square), null.mean(0)
-    return Comparison(
-        mean_z, variance_ratio, error, eigenvalues, null_mean, rhat, bulk, tail, checks
-    )
+    of_modes = mean_z, variance_ratio, np.sqrt(2.0 / ess_square), eigenvalues, null.mean(0)
+    return Comparison(*of_modes, rhat, bulk, tail, checks)
 
 
 def _largest(values: Float[np.ndarray, " n"]) -> float:
     return float(values[np.argmax(np.abs(values))])
 
 
-def _ess(
-    draws: Float[np.ndarray, "chains draws modes"], method: str
-) -> Float[np.ndarray, " modes"]:
-    tails = (0.05, 0.95) if method == "tail" else None
-    return np.asarray(array_stats.ess(draws, chain_axis=0, draw_axis=1, method=method, prob=tails))
+_ess = partial(array_stats.ess, chain_axis=0, draw_axis=1)
 
 
-def _chi2_z(
-    ratio: Float[np.ndarray, " n"], dof: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, " n"]:
+def _chi2_z(ratio: Vector, dof: Vector) -> Vector:
     """Normal scores of variance ratios that are chi^2 over ``dof``: skewness counts at 5 sigma.
 
     Where the tail is too small for a float, by Wilson and Hilferty's cube root.
@@ -486,15 +472,13 @@ def _chi2_z(
     return np.where(upper, 1.0, -1.0) * score
 
 
-def _eigenvalues(white: Float[np.ndarray, "chains draws modes"]) -> Float[np.ndarray, " modes"]:
+def _eigenvalues(white: Skies) -> Float[np.ndarray, " modes"]:
     """Of the second moments about the analytic mean, rising."""
     flat = white.reshape(-1, white.shape[-1])
     return np.linalg.eigvalsh(flat.T @ flat / len(flat))
 
 
-def _null_eigenvalues(
-    white: Float[np.ndarray, "chains draws modes"], rng: np.random.Generator
-) -> Float[np.ndarray, "runs modes"]:
+def _null_eigenvalues(white: Skies, rng: np.random.Generator) -> Float[np.ndarray, "runs modes"]:
     """Eigenvalues of exact chains that turn from draw to draw as far as ``white`` does.
 
     In white coordinates a trajectory is a turn of all modes by one angle, x' = c x + s p with new

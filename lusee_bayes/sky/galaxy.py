@@ -37,6 +37,7 @@ from functools import lru_cache
 import numpy as np
 from jaxtyping import Float
 
+from lusee_bayes.core.arrays import Vector
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import require_nside, synthesis_matrix
 from lusee_bayes.core.lazy import coordinates, healpy
@@ -503,11 +504,21 @@ def brightness(synchrotron: np.ndarray, depth: np.ndarray, frequency_mhz: float)
     return synchrotron + thermal_emission(depth) + behind
 
 
-@lru_cache(maxsize=1)
-def _northern_slabs(nside: int) -> Slabs:
-    """Slabs of the northern hemisphere's pixels with the equator: the same at all frequencies."""
-    theta, phi = healpy.pix2ang(nside, np.arange(6 * nside**2 + 2 * nside))
-    return Slabs.towards(np.degrees(phi), 90.0 - np.degrees(theta))
+def _towards(theta: Vector, phi: Vector) -> tuple[Slabs, tuple[np.ndarray, np.ndarray]]:
+    """Lines of sight, the same at all frequencies, and the side and line of each direction."""
+    return _slabs(np.stack([theta, phi]).astype(np.float64).tobytes())
+
+
+@lru_cache(maxsize=2)
+def _slabs(points: bytes) -> tuple[Slabs, tuple[np.ndarray, np.ndarray]]:
+    theta, phi = np.frombuffer(points).reshape(2, -1)
+    # lines of sight above and below the plane share what is symmetric: each once for both
+    key = np.abs(0.5 * np.pi - theta).round(12) + 1j * phi.round(12)
+    _, first, line = np.unique(key, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    one = first[order]
+    slabs = Slabs.towards(np.degrees(phi[one]), 90.0 - np.degrees(theta[one]))
+    return slabs, ((theta > 0.5 * np.pi).astype(int), np.argsort(order)[line])
 
 
 @lru_cache(maxsize=1)
@@ -570,13 +581,38 @@ def galaxy_map(frequency_mhz: float, nside: int = 64, seed: int | None = 1) -> n
     if seed is not None and seed < 0:
         raise InputError(f"seed is {seed}, expected an integer >= 0; use 1, for example")
 
-    north = np.arange(6 * nside**2 + 2 * nside)  # with the equator, which is its own mirror
-    theta, phi = healpy.pix2ang(nside, north)
-    south = healpy.ang2pix(nside, np.pi - theta, phi)
-    synchrotron, depth = np.empty((2, 12 * nside**2))
-    pixels = np.stack([north, south])
-    synchrotron[pixels], depth[pixels] = _northern_slabs(nside).synchrotron(frequency_mhz)
-
+    slabs, places = _towards(*healpy.pix2ang(nside, np.arange(12 * nside**2)))
+    synchrotron, depth = (values[places] for values in slabs.synchrotron(frequency_mhz))
     if seed is not None:
         synchrotron *= np.exp(_fluctuations(nside, seed) - 0.5 * FLUCTUATION_RMS**2)
     return brightness(synchrotron, depth, frequency_mhz)
+
+
+def galactic_share(theta: Vector, phi: Vector) -> Vector:
+    """Compute the Galaxy's share of the embedded diffuse sky, where it is transparent.
+
+    The rest is the extragalactic background, which is the same everywhere.
+
+    Parameters
+    ----------
+    theta, phi : (points,) array
+        Galactic, in radians; theta from the north pole.
+    """
+    slabs, places = _towards(theta, phi)
+    synchrotron, depth = slabs.synchrotron(MAXIMUM_MHZ)
+    whole = brightness(synchrotron, depth, MAXIMUM_MHZ)
+    return (1.0 - background(MAXIMUM_MHZ) * np.exp(-depth) / whole)[places]
+
+
+def diffuse_brightness(frequency_mhz: float, theta: Vector, phi: Vector) -> Vector:
+    """Compute the diffuse sky without its random component in given directions, in K.
+
+    Parameters
+    ----------
+    frequency_mhz : float
+        Frequency in MHz, 1 to 50.
+    theta, phi : (points,) array
+        Galactic, in radians; theta from the north pole.
+    """
+    slabs, places = _towards(theta, phi)
+    return brightness(*slabs.synchrotron(frequency_mhz), frequency_mhz)[places]

@@ -1,6 +1,15 @@
-"""Positive skies of several frequencies: templates times the exponential of few fields.
+"""Positive skies: templates times the exponential of Gaussian fields, of one frequency or several.
 
-::
+**One frequency**, with point sources::
+
+    m = P[T exp(Y a)] + sum_j F_j g(eta_j) y(n_j),    a ~ N(0, C_ell),    eta_j ~ N(0, 1)
+
+T is a template, Y synthesis on a grid, P integration with the harmonics of the map, F_j the
+catalogued flux of a source in the direction n_j, and g(eta) = -ln Phi(-eta), so that its flux has
+an exponential distribution of mean F_j: it is positive and may be absent. The unknowns are white:
+u = (xi, eta) ~ N(0, 1) with a = C^(1/2) xi.
+
+**Several frequencies**::
 
     ln m_f = ln T_f + w phi_f,    phi_f = a_0 + a_1 ln x + a_2 ln^2 x - a_3 y^-2.1 + r_f,
     x = nu / nu_ref,    y = nu / nu_turnover,
@@ -13,12 +22,12 @@ exponent of a channel is linear in them, its sky is positive. About any exponent
 
     dm_f = W d(phi),    W_ij = int y_i w T_f exp(w phi) y_j dOmega.
 
-C_ell of the fields are power laws in ell, ::
+**Power laws in ell** are what is expected of the logarithm, ::
 
-    C_ell = A^2 ((ell + 1) / 10)^tilt
+    C_ell = A^2 ((ell + 1) / 10)^tilt,    ell > 0,
 
-of every field and of every channel's residual; the mean of a field over the sky has a width of its
-own. A and tilt may be learned: their logarithm and themselves are normal around what is expected.
+of every field, too, and of every channel's residual; the mean over the sky has a width of its own.
+A and tilt may be learned: their logarithm and themselves are normal around what is expected.
 """
 
 from __future__ import annotations
@@ -27,17 +36,250 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float
+from scipy.special import log_ndtr
 
+from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.checks import require_positive, require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import n_modes
+from lusee_bayes.core.harmonics import n_modes, per_mode
 from lusee_bayes.core.sphere_grid import SphereGrid
-from lusee_bayes.sky.galaxy import FREE_FREE_SLOPE
+from lusee_bayes.sky.galaxy import FREE_FREE_SLOPE, PointSource
 from lusee_bayes.sky.prior import PIVOT
+from lusee_bayes.sky.sky_source import Template
 from lusee_bayes.sky.spectral_prior import SpectralPrior, require_names
-from lusee_bayes.sky.template import Template
+
+# steps of Newton's method, of which each closes in on the root; longest change of a parameter
+NEWTON, REACH = 30, 2.0
+
+
+def deviation_spectrum(
+    lmax: int,
+    amplitude: float | Float[Array, ""],
+    tilt: float | Float[Array, ""],
+    level: Float[Array, "1"],
+) -> Float[Array, " ells"]:
+    """Compute C_ell = A^2 ((ell + 1) / 10)^tilt of the logarithm of a sky over its template.
+
+    Parameters
+    ----------
+    lmax : int
+    amplitude, tilt : float or () array
+        A and the slope.
+    level : (1,) array
+        C_0: 4 pi times the variance of the logarithm of the template's scale.
+
+    Returns
+    -------
+    (ells,) array
+        Without unit.
+    """
+    xp = namespace(amplitude, tilt, level)
+    ell = np.arange(1.0, lmax + 1.0)
+    return xp.concatenate([level, amplitude**2 * ((ell + 1.0) / 10.0) ** tilt])
+
+
+def slopes(lmax: int) -> Float[np.ndarray, "2 ells"]:
+    """Return d ln C_ell^(1/2) by ln A and by the tilt."""
+    ell = np.arange(lmax + 1.0)
+    return np.stack([np.ones(lmax + 1), 0.5 * np.log((ell + 1.0) / PIVOT)])
+
+
+def matching_step(
+    power: Float[np.ndarray, " n"],
+    known: Float[np.ndarray, " n"],
+    slope: Float[np.ndarray, "2 n"],
+    away: Float[np.ndarray, "2"],
+    narrow: Float[np.ndarray, "2"],
+) -> Float[np.ndarray, "2"]:
+    """Compute the change of ln A and the tilt after which modes have as much power as they should.
+
+    At the maximum of the evidence sum u^2 = sum (1 - var u) in units of the prior, for all that a
+    parameter changes (MacKay 1992, Neural Comp. 4, 415). This goes far where a slope does not.
+
+    Parameters
+    ----------
+    power, known : (n,) array
+        u^2, u being the posterior mean in units of the prior, and 1 - var u.
+    slope : (2, n) array
+        d ln C^(1/2) by ln A and by the tilt.
+    away, narrow : (2,) array
+        How far the parameters are from what is expected of them, and the inverse of its variance.
+    """
+    step = np.zeros(2)
+    for _ in range(NEWTON):
+        scaled = power * np.exp(-2.0 * (step @ slope))
+        gradient = slope @ (scaled - known) - narrow * (away + step)
+        curvature = 2.0 * (slope * np.maximum(scaled, known)) @ slope.T + np.diag(narrow)
+        step = step + np.linalg.solve(curvature, gradient)
+    return np.clip(step, -REACH, REACH)
+
+
+# band limit of the grid of one frequency: this many times that of the map, and at least so much,
+# since what the grid does not resolve of the template folds back into the map
+GRID, LEAST_GRID = 3, 96
+
+
+class LogNormalSky(eqx.Module):
+    """The sky as a function of white unknowns; see the module's equations.
+
+    Attributes
+    ----------
+    spectrum : (ells,) array
+        C_ell of the logarithm, without unit; of the map's lmax, which is what the data can tell
+        apart: twice that changes ln evidence by 0.4 and standard deviations by 0.4 %.
+    grid : SphereGrid
+        Where products are taken.
+    level : (rings, phi) array
+        T on the grid, in K.
+    source_modes : (sources, modes) array
+        F_j y(n_j), in K.
+    """
+
+    spectrum: Float[Array, " ells"]
+    grid: SphereGrid
+    level: Float[Array, "rings phi"]
+    source_modes: Float[Array, "sources modes"]
+
+    @classmethod
+    def of(
+        cls,
+        template: Template,
+        spectrum: Float[np.ndarray, " ells"],
+        frequency_mhz: float,
+        sources: tuple[PointSource, ...] = (),
+        *,
+        band: int | None = None,
+    ) -> LogNormalSky:
+        """Make it, in NumPy.
+
+        Parameters
+        ----------
+        template : Template
+            T.
+        spectrum : (ells,) array
+            C_ell of the logarithm; its lmax is the map's.
+        frequency_mhz : float
+            Of template and sources.
+        sources : tuple of PointSource
+        band : int, optional
+            Band limit of the grid; by default three times lmax, and at least 96.
+
+        Raises
+        ------
+        InputError
+            If the template is not positive everywhere, or the spectrum not at every ell.
+        """
+        lmax = len(spectrum) - 1
+        require_positive("the spectrum of the logarithm", spectrum)
+        grid = SphereGrid.of(lmax, max(GRID * lmax, LEAST_GRID) if band is None else band)
+        level = template.at(*grid.directions()).reshape(grid.shape)
+        require_positive("the template", level, "a log-normal sky is a positive template times exp")
+        modes = [source.modes(frequency_mhz, lmax) for source in sources]
+        return cls(
+            np.asarray(spectrum), grid, level, np.reshape(modes, (len(sources), n_modes(lmax)))
+        )
+
+    @property
+    def lmax(self) -> int:
+        """Highest ell of the map."""
+        return self.grid.lmax
+
+    @property
+    def n_modes(self) -> int:
+        """Number of modes of the map, and of xi."""
+        return n_modes(self.lmax)
+
+    @property
+    def size(self) -> int:
+        """Number of white unknowns: modes of the logarithm, then sources."""
+        return self.n_modes + len(self.source_modes)
+
+    def with_power_law(
+        self, amplitude: float | Float[Array, ""], tilt: float | Float[Array, ""]
+    ) -> LogNormalSky:
+        """Return the same with C_ell = A^2 ((ell + 1) / 10)^tilt for ell > 0.
+
+        Parameters
+        ----------
+        amplitude, tilt : float or () array
+            A and the slope.
+        """
+        level = self.spectrum[:1]
+        return replace(self, spectrum=deviation_spectrum(self.lmax, amplitude, tilt, level))
+
+    def power_law_slopes(self) -> Float[np.ndarray, "2 modes"]:
+        """Return the derivatives of ln C_ell^(1/2) by ln A and by the tilt, for every mode."""
+        slope = slopes(self.lmax)
+        slope[:, 0] = 0.0
+        return per_mode(slope)
+
+    def root(self) -> Float[Array, " unknowns"]:
+        """Return C^(1/2) of every mode of the logarithm, and 1 for every source."""
+        xp = namespace(self.spectrum)
+        return xp.concatenate([xp.sqrt(per_mode(self.spectrum)), np.ones(len(self.source_modes))])
+
+    def logarithm(self, white: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch modes"]:
+        """Compute a, the modes of ln(sky / T) without sources."""
+        root = self.root()[: self.n_modes]
+        return white[..., : self.n_modes] * root.reshape(*(1,) * (white.ndim - 1), -1)
+
+    def diffuse(self, white: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch rings phi"]:
+        """Compute T exp(Y a) on the grid, in K."""
+        xp = namespace(self, white)
+        field = xp.exp(self.grid.synthesise(self.logarithm(white)))
+        return field * self.level.reshape(*(1,) * (white.ndim - 1), *self.level.shape)
+
+    def source_factors(
+        self, white: Float[Array, "*batch unknowns"]
+    ) -> Float[Array, "*batch sources"]:
+        """Compute g(eta): fluxes of the sources over the catalogued ones."""
+        eta = white[..., self.n_modes :]
+        if namespace(white) is np:
+            return -log_ndtr(-eta)
+        return -jax.scipy.special.log_ndtr(-eta)
+
+    def modes(self, white: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch modes"]:
+        """Compute m.
+
+        Parameters
+        ----------
+        white : (..., unknowns) array
+            u.
+
+        Returns
+        -------
+        (..., modes) array
+            Real packed coefficients, Galactic, in K.
+        """
+        diffuse = self.grid.analyse(self.diffuse(white))
+        return diffuse + self.source_factors(white) @ self.source_modes
+
+    def jacobian(self, white: Float[np.ndarray, " unknowns"]) -> Float[np.ndarray, "modes _"]:
+        """Compute dm/du as a matrix, in NumPy.
+
+        Parameters
+        ----------
+        white : (unknowns,) array
+            u.
+
+        Returns
+        -------
+        (modes, unknowns) array
+            In K.
+        """
+        white, root = np.asarray(white), np.asarray(self.root())
+        matrix = np.empty((self.n_modes, self.size))
+        product = self.grid.product_matrix(np.asarray(self.diffuse(white)))
+        np.multiply(product, root[None, : self.n_modes], out=matrix[:, : self.n_modes])
+        eta = white[self.n_modes :]
+        # g' = phi(eta) / Phi(-eta)
+        slope = np.exp(-0.5 * eta**2 - log_ndtr(-eta)) / np.sqrt(2.0 * np.pi)
+        matrix[:, self.n_modes :] = np.asarray(self.source_modes).T * slope
+        return matrix
+
 
 # how fields enter the logarithm: x is frequency / reference, y frequency / turnover
 FIELDS = {
@@ -48,9 +290,9 @@ FIELDS = {
 }
 # what they are, for messages
 FIELDS_OF = "fields of the logarithm"
-# band limit of the grid: this many times that of the exponents, and at least so much: what the grid
-# does not resolve of a template folds back into the map, at 96 by 5 % of it in the plane
-GRID, LEAST_GRID = 3, 192
+# least band limit of their grid: what it does not resolve of a template folds back into the map, at
+# 96 by 5 % of it in the plane
+FIELDS_GRID = 192
 
 
 class PositiveSkies(eqx.Module):
@@ -141,7 +383,7 @@ class PositiveSkies(eqx.Module):
                 f"the lmax of the fields is {highest}, that of the maps {lmax}; give the fields as "
                 "many modes at least"
             )
-        grid = SphereGrid.of(highest, max(GRID * highest, LEAST_GRID) if band is None else band)
+        grid = SphereGrid.of(highest, max(GRID * highest, FIELDS_GRID) if band is None else band)
         at = grid.directions()
         levels = np.stack([template.at(*at).reshape(grid.shape) for template in templates])
         require_positive("the template", levels, "a sky whose logarithm is modelled has no holes")
@@ -270,10 +512,7 @@ class FieldLaws:
     def matched(
         self, found: Float[np.ndarray, "laws ells"], known: Float[np.ndarray, "laws ells"]
     ) -> FieldLaws:
-        """Compute the parameters under which the fields have as much power as they should.
-
-        At the maximum of the evidence sum_m u^2 = sum_m (1 - var u) in units of the prior, for
-        all that a parameter changes (MacKay 1992, Neural Comp. 4, 415).
+        """Compute the parameters of :func:`matching_step`, law by law.
 
         Parameters
         ----------
@@ -282,28 +521,11 @@ class FieldLaws:
         known : (fields + channels, ells) array
             sum_m (1 - var u).
         """
-        slope = slopes(found.shape[1] - 1)
+        slope, parameters = slopes(found.shape[1] - 1), self.parameters.copy()
         narrow = np.array([LOG_WIDTH, TILT_WIDTH]) ** -2.0
-        parameters = np.empty_like(self.parameters)
         for k, (power, left) in enumerate(zip(found, known, strict=True)):
             # the mean over the sky has a width that is given
-            ells = slice(1 if k < len(self.means) else 0, None)
-            step, s = np.zeros(2), slope[:, ells]
+            of = slice(1 if k < len(self.means) else 0, None)
             away = self.parameters[k] - self.expected[k]
-            for _ in range(NEWTON):
-                scaled = power[ells] * np.exp(-2.0 * (step @ s))
-                gradient = s @ (scaled - left[ells]) - narrow * (away + step)
-                curvature = 2.0 * (s * np.maximum(scaled, left[ells])) @ s.T + np.diag(narrow)
-                step = step + np.linalg.solve(curvature, gradient)
-            parameters[k] = self.parameters[k] + np.clip(step, -REACH, REACH)
+            parameters[k] += matching_step(power[of], left[of], slope[:, of], away, narrow)
         return replace(self, parameters=parameters)
-
-
-# steps of Newton's method, of which each closes in on the root; longest change of a parameter
-NEWTON, REACH = 30, 2.0
-
-
-def slopes(lmax: int) -> Float[np.ndarray, "2 ells"]:
-    """Return d ln C_ell^(1/2) by ln A and by the tilt."""
-    ell = np.arange(lmax + 1.0)
-    return np.stack([np.ones(lmax + 1), 0.5 * np.log((ell + 1.0) / PIVOT)])

@@ -609,28 +609,25 @@ def read_spectrum(path: str | Path, lmax: int) -> Float[np.ndarray, " ells"]:
         If the file cannot be read, a line is not two numbers, C_ell is negative or not finite, or
         zero at every ell, or an ell is missing or not in its place.
     """
-    rows: list[list[float]] = []
-    named = False
     require_whole("lmax", lmax, 0, LARGEST_LMAX)
-    text = read_text(path, SPECTRUM.what, "check prior.spectrum_file")
-    for number, line in enumerate(text.splitlines(), start=1):
-        words = line.split("#")[0].replace(",", " ").split()
-        if not words:
-            continue
-        try:
-            row = [float(word) for word in words]
-        except ValueError as error:
-            if not rows and not named:
-                named = True
-                continue
-            raise InputError(f"{path}: line {number} is '{line.strip()}', no numbers") from error
-        if len(row) != 2 or not row[0].is_integer():
-            raise InputError(
-                f"{path}: line {number} is '{line.strip()}', expected ell and C_ell in K^2"
-            )
-        rows.append(row)
-    if not rows:
+    text = read_text(path, SPECTRUM.what, "check prior.spectrum_file").splitlines()
+    split = [line.split("#")[0].replace(",", " ").split() for line in text]
+    lines = [(number, words) for number, words in enumerate(split, start=1) if words]
+    if lines and lines[0][1][0].isalpha():  # names of the columns
+        del lines[0]
+    if not lines:
         raise InputError(f"{path} holds no numbers; expected {SPECTRUM.what}")
+    rows = []
+    for number, words in lines:
+        try:
+            ell, power = map(float, words)
+            whole = ell.is_integer()
+        except ValueError:
+            whole = False
+        if not whole:
+            line = text[number - 1].strip()
+            raise InputError(f"{path}: line {number} is '{line}', expected ell and C_ell in K^2")
+        rows.append((ell, power))
     table = np.array(rows)
     columns = {"ell": table[:, 0].astype(np.int64), "C_ell": table[:, 1]}
     found = SPECTRUM.checked(path, columns, {}).arrays

@@ -1,6 +1,18 @@
-"""A sky at one frequency, and what can tell it: the embedded Galaxy, or a file.
+"""A sky at one frequency, and what can tell it: the embedded Galaxy, or a file; and templates.
 
-Skies are real harmonic coefficients in Galactic coordinates, in K.
+Skies are real harmonic coefficients in Galactic coordinates, in K. Files have one of three layouts.
+
+**Maps** are ULSA's HDF5 or HEALPix FITS.
+
+**Coefficients** are in healpy's packing. FITS, as healpy.write_alm makes it: columns
+index = ell^2 + ell + m + 1, real, imag, for m >= 0. NumPy's .npz: ``alm`` (frequency, coefficient)
+and ``freq`` in MHz. Galactic, K.
+
+**Cubes** are maps of many frequencies, in the layout of luseepy's ULSA file, which lowsky writes
+too. FITS: one primary image (frequency, pixel) of HEALPix maps, RING, Galactic, K; the header has
+FREQ_START, FREQ_END and FREQ_STEP in MHz. The file does not say its frame and order.
+
+**Templates** are skies that priors take their structure from.
 """
 
 from __future__ import annotations
@@ -11,16 +23,28 @@ from functools import lru_cache
 from pathlib import Path
 
 import equinox as eqx
+import h5py
 import numpy as np
+from astropy.io import fits
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import Described, number, require_array, require_whole
-from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import lmax_of, map_to_modes, power_spectrum
-from lusee_bayes.core.reading import require_file
-from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, PointSource, galaxy_map
-from lusee_bayes.sky.sky_files import SkyAlms, SkyCube, SkyFile, SkyMap
+from lusee_bayes.core.arrays import Array, Vector
+from lusee_bayes.core.checks import Described, number, require_array, require_finite, require_whole
+from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.files import replacing, user_path
+from lusee_bayes.core.formats import is_fits, opened, require_readable_hdf5
+from lusee_bayes.core.harmonics import (
+    from_healpy,
+    lmax_of,
+    map_to_modes,
+    n_modes,
+    power_spectrum,
+    to_healpy,
+)
+from lusee_bayes.core.layouts import Attribute, Layout, Variable
+from lusee_bayes.core.lazy import healpy
+from lusee_bayes.core.reading import naming, read_arrays, reading, require_file
+from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, PointSource, diffuse_brightness, galaxy_map
 
 
 class Sky(Described, eqx.Module):
@@ -69,6 +93,475 @@ class Sky(Described, eqx.Module):
     def spectrum(self) -> Float[Array, " ells"]:
         """C_ell in K^2, mean not subtracted."""
         return power_spectrum(self.modes)
+
+
+class SkyFile(ABC):
+    """The content of one file of sky maps or coefficients, whole and checked.
+
+    A new layout of files is a subclass, and one entry in
+    :data:`SKY_READERS`.
+    """
+
+    @classmethod
+    @abstractmethod
+    def recognises(cls, path: Path) -> bool:
+        """Tell whether an existing file has this layout.
+
+        Raises
+        ------
+        InputError
+            If finding out needs more of the file than can be read.
+        """
+
+    @classmethod
+    @abstractmethod
+    def read(cls, path: str | Path, dataset: str | None = None) -> SkyFile:
+        """Read a file of this layout.
+
+        Parameters
+        ----------
+        path : str or Path
+            The file.
+        dataset : str, optional
+            Which of its data sets to read, for layouts that have several.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be used. The message says what is wrong and how to mend it.
+        """
+
+    @abstractmethod
+    def modes_at(self, frequency_mhz: float, lmax: int) -> Float[np.ndarray, " modes"]:
+        """Compute the sky's coefficients at a frequency.
+
+        Parameters
+        ----------
+        frequency_mhz : float
+            Frequency in MHz. Layouts that do not say their frequency return the same sky at all.
+        lmax : int
+            Highest ell.
+
+        Returns
+        -------
+        (modes,) array
+            Real packed coefficients, Galactic, in K.
+
+        Raises
+        ------
+        InputError
+            If the file holds no sky at this frequency, or not up to this ell.
+        """
+
+    @abstractmethod
+    def summary(self) -> tuple[str, ...]:
+        """Say in a few lines what the file holds."""
+
+
+def modes_of_map(
+    path: str | Path, pixels: Float[np.ndarray, " pixels"], lmax: int
+) -> Float[np.ndarray, " modes"]:
+    """Coefficients of a file's map; an InputError names the file."""
+    with naming(path):
+        return map_to_modes(pixels, lmax)
+
+
+ULSA_DATASET = "smooth_absorb"
+# what healpy writes into pixels without a value; healpy itself takes a second to import
+UNSEEN = -1.6375e30
+
+
+@dataclass(frozen=True)
+class SkyMap(SkyFile):
+    """One HEALPix map, whose frequency the file does not say.
+
+    Attributes
+    ----------
+    path : str
+        The file, for messages.
+    pixels : (pixels,) array
+        RING, Galactic, in K.
+    """
+
+    path: str
+    pixels: Float[np.ndarray, " pixels"]
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        return h5py.is_hdf5(path) or is_fits(path)
+
+    @classmethod
+    def read(cls, path: str | Path, dataset: str | None = None) -> SkyMap:
+        """Read a map from HDF5 or FITS.
+
+        The FITS map is the first column of the first binary table. Its header must say
+        ORDERING = RING; COORDSYS, where present, must be Galactic, and the unit a temperature.
+
+        Parameters
+        ----------
+        path : str or Path
+            The file.
+        dataset : str, optional
+            Data set of an HDF5 file, by default ULSA's ``smooth_absorb``.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be used. The message says what is wrong and how to mend it.
+        """
+        path = user_path(path)
+        hdf5 = h5py.is_hdf5(path)
+        pixels = _read_hdf5(path, dataset or ULSA_DATASET) if hdf5 else _read_map(path)
+        _require_healpix(path, pixels.size)
+        unseen = pixels == UNSEEN
+        if unseen.any():
+            raise InputError(
+                f"{path}: {int(unseen.sum())} of {pixels.size} pixels are UNSEEN; give a full-sky "
+                "map"
+            )
+        return cls(str(path), pixels)
+
+    def modes_at(self, frequency_mhz: float, lmax: int) -> Float[np.ndarray, " modes"]:
+        return modes_of_map(self.path, self.pixels, lmax)
+
+    def summary(self) -> tuple[str, ...]:
+        pixels = self.pixels
+        return (
+            f"HEALPix sky map, NSIDE {round((pixels.size / 12) ** 0.5)}, RING, Galactic",
+            f"mean {pixels.mean():.6g} K, from {pixels.min():.4g} to {pixels.max():.4g} K",
+        )
+
+
+def _require_healpix(path: str | Path, n_pixels: int) -> None:
+    if not n_pixels or n_pixels != 12 * round((n_pixels / 12) ** 0.5) ** 2:
+        raise InputError(f"{path}: {n_pixels} values are not a HEALPix map of 12 NSIDE^2")
+
+
+def _layout(name: str) -> Layout:
+    return Layout("a HEALPix sky map", {name: Variable(("pixel",), unit="K")})
+
+
+def _read_hdf5(path: Path, dataset: str) -> np.ndarray:
+    require_readable_hdf5(path)
+    with reading(path, "a sky map in HDF5"), h5py.File(path) as file:
+        names = [name for name, item in file.items() if isinstance(item, h5py.Dataset)]
+        if dataset not in names:
+            raise InputError(
+                f"{path} has no dataset '{dataset}' (it has {', '.join(sorted(names))}); "
+                f"{nearest(dataset, names)} Set sky.dataset"
+            )
+        units = {f"{dataset}.units": file[dataset].attrs.get("units")}
+        return _layout(dataset).checked(path, {dataset: file[dataset]}, units).arrays[dataset]
+
+
+def _read_map(path: Path) -> np.ndarray:
+    with opened(path) as hdus:
+        tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU)]
+        if not tables:
+            raise InputError(
+                f"{path} has no binary table; expected a HEALPix FITS map (or ULSA HDF5)"
+            )
+        header, column = tables[0].header, tables[0].columns[0]
+        # healpy writes rows of 1024 pixels
+        given = {column.name: np.ravel(tables[0].data.field(0))}
+        units = {f"{column.name}.units": column.unit}
+        values = _layout(column.name).checked(path, given, units).arrays[column.name]
+    ordering = str(header.get("ORDERING", "absent")).strip().upper()
+    if ordering != "RING":
+        raise InputError(
+            f"{path}: ORDERING is {ordering}, expected RING; write it again with "
+            "healpy.write_map(..., nest=False), after healpy.reorder(m, n2r=True) if it is NESTED"
+        )
+    frame = str(header.get("COORDSYS", "G")).strip().upper()
+    if frame not in ("G", "GALACTIC"):
+        raise InputError(
+            f"{path}: COORDSYS is {frame}, expected G (Galactic); rotate the map with "
+            f"healpy.Rotator(coord=['{frame[:1]}', 'G'])"
+        )
+    return values
+
+
+COLUMNS = ("index", "real", "imag")
+TABLE = Layout(
+    "coefficients, as healpy.write_alm writes them",
+    {
+        "index": Variable(("coefficient",), "integer", low=1.0),
+        "real": Variable(("coefficient",), unit="K"),
+        "imag": Variable(("coefficient",), unit="K"),
+    },
+)
+NPZ = Layout(
+    "coefficients: freq (MHz) and alm (frequency, coefficient)",
+    {
+        "freq": Variable(("freq",), low=0.0, unit="MHz"),
+        "alm": Variable(("freq", "coefficient"), "complex"),
+    },
+)
+# far above what a run can hold
+LARGEST_LMAX = 4096
+
+
+@dataclass(frozen=True)
+class SkyAlms(SkyFile):
+    """Coefficients of one or several frequencies.
+
+    Attributes
+    ----------
+    path : str
+        The file, for messages.
+    frequencies_mhz : (frequencies,) array or None
+        None where the file does not say its frequency.
+    modes : (frequencies, modes) array
+        Real packed coefficients, Galactic, in K.
+    """
+
+    path: str
+    frequencies_mhz: Float[np.ndarray, " frequencies"] | None
+    modes: Float[np.ndarray, "frequencies modes"]
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        if path.suffix == ".npz":
+            return True
+        if not is_fits(path):
+            return False
+        with opened(path) as hdus:
+            tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU)]
+            names = tables[0].columns.names if tables else []
+            return set(COLUMNS) <= {name.lower() for name in names}
+
+    @classmethod
+    def read(cls, path: str | Path, dataset: str | None = None) -> SkyAlms:
+        """Read a file of coefficients.
+
+        Raises
+        ------
+        InputError
+            For a file that cannot be read, arrays that are missing or do not fit, coefficients
+            that do not fill an lmax, and numbers that are not finite.
+        """
+        path = user_path(path)
+        frequencies, alm = (
+            _read_npz(path) if path.suffix == ".npz" else (None, _read_alm_fits(path))
+        )
+        require_finite(f"{path}: the coefficients", np.stack([alm.real, alm.imag]))
+        return cls(str(path), frequencies, from_healpy(np.atleast_2d(alm)))
+
+    @property
+    def lmax(self) -> int:
+        """Highest ell of the coefficients."""
+        return lmax_of(self.modes.shape[1])
+
+    def modes_at(self, frequency_mhz: float, lmax: int) -> Float[np.ndarray, " modes"]:
+        if lmax > self.lmax:
+            raise InputError(
+                f"{self.path} has coefficients up to ell = {self.lmax}, not up to {lmax}; lower "
+                "lmax"
+            )
+        known, channel = self.frequencies_mhz, 0
+        if known is not None:
+            channel = int(np.argmin(np.abs(known - frequency_mhz)))
+            if not np.isclose(known[channel], frequency_mhz, rtol=1e-9):
+                raise InputError(
+                    f"{self.path} has no coefficients at {frequency_mhz:g} MHz (it has "
+                    f"{', '.join(f'{f:g}' for f in known)}); set sky.file_frequency_mhz to one of "
+                    "those, and they are scaled with sky.spectral_index"
+                )
+        return self.modes[channel, : n_modes(lmax)]
+
+    def summary(self) -> tuple[str, ...]:
+        known, means = self.frequencies_mhz, self.modes[:, 0] / np.sqrt(4.0 * np.pi)
+        skies = "one sky" if len(means) == 1 else f"{len(means)} skies"
+        frequencies = "" if known is None else f", {', '.join(f'{f:g}' for f in known)} MHz"
+        levels = f"{means[0]:.6g}" if len(means) == 1 else f"{means[0]:.6g} to {means[-1]:.6g}"
+        return (
+            f"coefficients of {skies} up to ell = {self.lmax}{frequencies}",
+            f"mean temperature {levels} K",
+        )
+
+
+def write_alms(path: str | Path, modes: Float[Array, " modes"], header: dict[str, object]) -> Path:
+    """Write coefficients as healpy.write_alm does, in float64.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file to write; it is replaced in one step.
+    modes : (modes,) array
+        Real packed coefficients, Galactic, in K.
+    header : dict
+        Further cards of the table's header.
+
+    Returns
+    -------
+    Path
+        The file.
+    """
+    alm = to_healpy(modes)
+    lmax = lmax_of(np.shape(modes)[-1])
+    ell, m = healpy.Alm.getlm(lmax)
+    columns = [
+        fits.Column("index", "J", array=ell**2 + ell + m + 1),
+        fits.Column("real", "D", "K", array=alm.real),
+        fits.Column("imag", "D", "K", array=alm.imag),
+    ]
+    table = fits.BinTableHDU.from_columns(columns, name="ALM")
+    ends = {"MAX-LPOL": (lmax, "highest ell"), "MAX-MPOL": (lmax, "highest m")}
+    table.header.update(ends | header)
+    with replacing(path) as partial:
+        fits.HDUList([fits.PrimaryHDU(), table]).writeto(partial)
+    return user_path(path)
+
+
+def _read_npz(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    found = read_arrays(path, NPZ, "check sky.file").arrays
+    alm = found["alm"]
+    if healpy.Alm.getlmax(alm.shape[1]) < 0:
+        raise InputError(
+            f"{path}: alm has {alm.shape[1]} coefficients, expected (lmax + 1) (lmax + 2) / 2"
+        )
+    return found["freq"], alm
+
+
+def _read_alm_fits(path: Path) -> np.ndarray:
+    with opened(path, "coefficients") as hdus:
+        table = next(hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU))
+        columns = {name: table.data.field(name) for name in COLUMNS}
+        units = {f"{one.name.lower()}.units": one.unit for one in table.columns}
+        found = TABLE.checked(path, columns, units).arrays
+    index, real, imag = (found[name] for name in COLUMNS)
+    ell = np.floor(np.sqrt(index - 1.0) + 1e-9).astype(int)
+    m = index - 1 - ell**2 - ell
+    # what does not fit into memory, or is written twice, fills no lmax either
+    once = index.max() <= LARGEST_LMAX**2 and len(set(index.tolist())) == len(index)
+    if not once or (m < 0).any() or (m > ell).any():
+        raise InputError(
+            f"{path}: index must be ell^2 + ell + m + 1, each once, with 0 <= m <= ell <= "
+            f"{LARGEST_LMAX}"
+        )
+    lmax = int(ell.max())
+    alm = np.full(healpy.Alm.getsize(lmax), np.nan + 0j)
+    alm[healpy.Alm.getidx(lmax, ell, m)] = real + 1j * imag
+    if np.isnan(alm).any():
+        raise InputError(
+            f"{path}: {int(np.isnan(alm).sum())} coefficients up to ell = {lmax} are missing or "
+            "not finite; write all m up to ell"
+        )
+    return alm
+
+
+STEPS = ("FREQ_START", "FREQ_END", "FREQ_STEP")
+CUBE = Layout(
+    "sky maps of many frequencies: an image (frequency, pixel)",
+    {"maps": Variable(("frequency", "pixel"), unit="K")},
+    {
+        "FREQ_START": Attribute(low=0.0, unit="MHz"),
+        "FREQ_END": Attribute(low=0.0, unit="MHz"),
+        "FREQ_STEP": Attribute(low=1e-6, unit="MHz"),
+    },
+)
+
+
+@dataclass(frozen=True)
+class SkyCube(SkyFile):
+    """Maps of several frequencies.
+
+    Attributes
+    ----------
+    path : str
+        The file, for messages.
+    frequencies_mhz : (frequencies,) array
+        Growing in equal steps.
+    pixels : (frequencies, pixels) array
+        HEALPix RING, Galactic, in K.
+    """
+
+    path: str
+    frequencies_mhz: Float[np.ndarray, " frequencies"]
+    pixels: Float[np.ndarray, "frequencies pixels"]
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        if not is_fits(path):
+            return False
+        with opened(path) as hdus:
+            return all(key in hdus[0].header for key in STEPS)
+
+    @classmethod
+    def read(cls, path: str | Path, dataset: str | None = None) -> SkyCube:
+        """Read a file of maps of many frequencies.
+
+        Raises
+        ------
+        InputError
+            For a truncated file, steps of frequency that do not fit the maps, maps that are not
+            HEALPix, and numbers that are not finite.
+        """
+        with opened(path, "sky maps of many frequencies") as hdus:
+            there = {} if hdus[0].data is None else {"maps": hdus[0].data}
+            header = dict(hdus[0].header)
+            found = CUBE.checked(path, there, header | {"maps.units": header.get("BUNIT")})
+        start, end, step = (found.values[key] for key in STEPS)
+        pixels = found.arrays["maps"]
+        count = round((end - start) / step) + 1
+        if len(pixels) != count:
+            raise InputError(
+                f"{path}: the image has shape {pixels.shape}, expected {count} maps for {start:g} "
+                f"to {end:g} MHz in steps of {step:g}"
+            )
+        _require_healpix(path, pixels.shape[1])
+        return cls(str(path), start + step * np.arange(count), pixels)
+
+    def map_at(self, frequency_mhz: float) -> Float[np.ndarray, " pixels"]:
+        """Return the map at a frequency; between two maps, by the power law of each pixel.
+
+        Parameters
+        ----------
+        frequency_mhz : float
+            Frequency in MHz.
+
+        Returns
+        -------
+        (pixels,) array
+            HEALPix RING, Galactic, in K.
+
+        Raises
+        ------
+        InputError
+            Outside the file's frequencies, or where a pixel between two frequencies is not
+            positive in both.
+        """
+        known = self.frequencies_mhz
+        if not known[0] <= frequency_mhz <= known[-1]:
+            raise InputError(
+                f"{self.path} has maps from {known[0]:g} to {known[-1]:g} MHz, not at "
+                f"{frequency_mhz:g}; set sky.file_frequency_mhz to one of those, and it is scaled "
+                "with sky.spectral_index"
+            )
+        above = int(np.searchsorted(known, frequency_mhz))
+        if known[above] == frequency_mhz:
+            return self.pixels[above]
+        low, high = self.pixels[above - 1], self.pixels[above]
+        if not ((low > 0) & (high > 0)).all():
+            raise InputError(
+                f"{self.path} has pixels that are not positive at {known[above - 1]:g} or "
+                f"{known[above]:g} MHz, between which there is no power law; take a frequency of "
+                "the file"
+            )
+        share = np.log(frequency_mhz / known[above - 1]) / np.log(known[above] / known[above - 1])
+        return low * (high / low) ** share
+
+    def modes_at(self, frequency_mhz: float, lmax: int) -> Float[np.ndarray, " modes"]:
+        return modes_of_map(self.path, self.map_at(frequency_mhz), lmax)
+
+    def summary(self) -> tuple[str, ...]:
+        known, pixels = self.frequencies_mhz, self.pixels
+        return (
+            f"{len(pixels)} HEALPix sky maps, NSIDE {healpy.npix2nside(pixels.shape[1])}, taken "
+            "to be RING and Galactic",
+            f"{known[0]:g} to {known[-1]:g} MHz, means {pixels[0].mean():.6g} to "
+            f"{pixels[-1].mean():.6g} K, least pixel {pixels.min():.4g} K",
+        )
 
 
 # the first that recognises a file reads it: every FITS file that is nothing else is a map
@@ -230,3 +723,46 @@ def sky_from_file(
         other frequencies.
     """
     return FileSource(path, dataset, file_frequency_mhz, spectral_index).at(frequency_mhz, lmax)
+
+
+class Template(ABC):
+    """A brightness temperature in every direction, at one frequency."""
+
+    @abstractmethod
+    def at(self, theta: Vector, phi: Vector) -> Vector:
+        """Compute it in Galactic directions.
+
+        Parameters
+        ----------
+        theta, phi : (points,) array
+            In radians; theta from the Galactic north pole.
+
+        Returns
+        -------
+        (points,) array
+            In K.
+        """
+
+
+@dataclass(frozen=True)
+class EmbeddedTemplate(Template):
+    """The embedded diffuse sky without its random component and without point sources.
+
+    Attributes
+    ----------
+    frequency_mhz : float
+        1 to 50 MHz.
+    """
+
+    frequency_mhz: float
+
+    def at(self, theta, phi):
+        return diffuse_brightness(self.frequency_mhz, theta, phi)
+
+    def pixels(self, nside: int) -> Float[np.ndarray, " pixels"]:
+        """Compute it at the centres of HEALPix RING pixels, in K."""
+        return galaxy_map(self.frequency_mhz, nside, seed=None)
+
+    def modes(self, lmax: int) -> Float[np.ndarray, " modes"]:
+        """Compute its real packed coefficients up to an ell, Galactic, in K."""
+        return np.asarray(GalaxySource(None, ()).at(self.frequency_mhz, lmax).modes)

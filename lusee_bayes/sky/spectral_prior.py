@@ -187,7 +187,7 @@ class SpectralPrior(Described, eqx.Module):
             jnp.asarray(frequencies),
             jnp.asarray(mixing),
             jnp.asarray(power_spectrum(maps)),
-            _residual_spectra(skies, left_over, residual),
+            _residual_spectra(*((left_over, 1.0) if residual is None else (skies, residual))),
             names,
         )
 
@@ -241,7 +241,7 @@ class SpectralPrior(Described, eqx.Module):
             jnp.asarray(frequencies),
             jnp.asarray(power_law[:, None] * vectors),
             jnp.asarray(values[:, None] * spectrum),
-            _residual_spectra(skies, None, residual),
+            _residual_spectra(skies, residual),
             tuple(f"principal {k}" for k in range(len(values))),
         )
 
@@ -290,14 +290,8 @@ class SpectralPrior(Described, eqx.Module):
         return skies + std * jax.random.normal(second, std.shape, dtype=jnp.float64)
 
 
-def _residual_spectra(
-    skies: np.ndarray, left_over: np.ndarray | None, residual: float | None
-) -> Float[Array, "channels ells"] | None:
-    """R^f_ell: of what a fit left over of the skies, or of a share of them."""
-    if residual is None:
-        if left_over is None:
-            raise InputError("give the rms of the residual over that of the sky")
-        return jnp.asarray(power_spectrum(left_over))
+def _residual_spectra(skies: np.ndarray, residual: float) -> Float[Array, "channels ells"] | None:
+    """R^f_ell: that of a share of the skies; None for no residual."""
     if residual < 0:
         raise InputError(f"the residual must not be negative, got {residual}")
     return None if residual == 0 else jnp.asarray(residual**2 * power_spectrum(skies))

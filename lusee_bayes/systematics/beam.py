@@ -18,12 +18,11 @@ from pydantic import Field
 from lusee_bayes.core.section import Positive, Section, Treatment, requires
 from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.beams.monopoles import parameter, with_values
-from lusee_bayes.instrument.beams.source import BeamSource, EmbeddedBeams
-from lusee_bayes.instrument.coupling import Coupling
-from lusee_bayes.instrument.instrument import Instrument
+from lusee_bayes.instrument.beams.source import BeamSource
+from lusee_bayes.instrument.coupling import Coupling, Instrument
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise import instrument_errors
-from lusee_bayes.systematics.context import Around, Context
+from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.sources import source_responses
 from lusee_bayes.systematics.systematic import Systematic, Truth, Unknown, Values
 
@@ -67,62 +66,62 @@ class BeamErrors(Systematic):
     first_order: ClassVar[bool] = False
 
     @classmethod
-    def build(cls, section: BeamErrorSection, context: Context, around: Around) -> BeamErrors:
+    def build(cls, section: BeamErrorSection, setup: Setup, around: Around) -> BeamErrors:
         if not section.parameters:
-            return BeamError(context.instrument.coupling_of(difference_of_beams(section, context)))
+            return BeamError(setup.instrument.coupling_of(difference_of_beams(section, setup)))
         sampled = section.treatment == "sampled"
-        instrument = context.prepared if sampled else context.instrument
+        instrument = setup.prepared if sampled else setup.instrument
         return InstrumentParameters.centred(instrument, section.parameters)
 
     @classmethod
-    def truth(cls, section: BeamErrorSection, context: Context, key: PRNGKeyArray) -> Truth:
+    def truth(cls, section: BeamErrorSection, setup: Setup, key: PRNGKeyArray) -> Truth:
         if not section.parameters:
             return {"beam_amplitude": 1.0}
-        unknowns = InstrumentParameters.centred(context.instrument, section.parameters).unknowns
+        unknowns = InstrumentParameters.centred(setup.instrument, section.parameters).unknowns
         keys = jax.random.split(cls.own_key(key), len(unknowns))
         return {u.name: float(u.prior().sample(k)) for u, k in zip(unknowns, keys, strict=True)}
 
     @classmethod
-    def moved(cls, section: BeamErrorSection, context: Context, values: Values) -> Context:
+    def moved(cls, section: BeamErrorSection, setup: Setup, values: Values) -> Setup:
         """With the true beams, what the ground then adds, and the responses to sources."""
         if not {"beam_amplitude", *section.parameters} & set(values):
-            return context
-        source, frequency_mhz = _true(section, context, values)
-        beams = source.beams(frequency_mhz, context.beams.lmax)
+            return setup
+        source, frequency_mhz = _true(section, setup, values)
+        beams = source.beams(frequency_mhz, setup.beams.lmax)
         emitted = np.asarray(source.background(frequency_mhz))
-        nominal = np.asarray(context.beam_source.background(context.frequency_mhz))
-        sources = context.scenario.sources.list
+        nominal = np.asarray(setup.beam_source.background(setup.frequency_mhz))
+        sources = setup.scenario.sources.list
         return replace(
-            context,
+            setup,
             beam_source=source,
             beams=beams,
-            coupling=context.instrument.coupling_of(beams),
-            background=context.background + (emitted - nominal),
-            responses=source_responses(sources, context.observation, source, frequency_mhz),
+            coupling=setup.instrument.coupling_of(beams),
+            background=setup.background + (emitted - nominal),
+            responses=source_responses(sources, setup.observation, source, frequency_mhz),
         )
 
     @classmethod
-    def in_data(cls, section, context, model, truth, key) -> LinearGaussian:
+    def in_data(cls, section, setup, model, truth, key) -> LinearGaussian:
         """The same: its A is that of the true beams."""
         return model
 
 
-def _true(section: BeamErrorSection, context: Context, values: Values) -> tuple[BeamSource, float]:
+def _true(section: BeamErrorSection, setup: Setup, values: Values) -> tuple[BeamSource, float]:
     """The antennas that have these values, and the frequency at which they are used."""
-    source, frequency_mhz = context.beam_source, context.frequency_mhz
+    source, frequency_mhz = setup.beam_source, setup.frequency_mhz
     if section.shift_mhz is not None:
         return source, frequency_mhz + section.shift_mhz
     if section.file is not None:
-        return context.source_of_file(section.file), frequency_mhz
+        return setup.source_of_file(section.file), frequency_mhz
     own = {name: values[name] for name in section.parameters}
-    return EmbeddedBeams(with_values(source.monopoles, own)), frequency_mhz
+    return with_values(source.monopoles, own), frequency_mhz
 
 
-def difference_of_beams(section: BeamErrorSection, context: Context) -> ProductBeams:
+def difference_of_beams(section: BeamErrorSection, setup: Setup) -> ProductBeams:
     """The direction to other beams, those of a shift or of a file."""
-    source, frequency_mhz = _true(section, context, {})
-    other = source.beams(frequency_mhz, context.beams.lmax)
-    return instrument_errors.difference(other, context.beams)
+    source, frequency_mhz = _true(section, setup, {})
+    other = source.beams(frequency_mhz, setup.beams.lmax)
+    return instrument_errors.difference(other, setup.beams)
 
 
 class BeamError(BeamErrors):
@@ -192,40 +191,35 @@ class InstrumentParameters(BeamErrors):
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
-        found = []
-        for name, std in self.widths.items():
-            low, high = parameter(name).low, parameter(name).high
-            found.append(Unknown(name, self.centres[name], std, low=low, high=high))
-        return tuple(found)
+        known = [(name, parameter(name), std) for name, std in self.widths.items()]
+        return tuple(
+            Unknown(n, self.centres[n], std, low=p.low, high=p.high) for n, p, std in known
+        )
 
     def effect(self, model, values):
         """A of antennas that have these values."""
         return replace(model, coupling=self.instrument.dense(values))
 
-    def directions(self) -> list[ProductBeams]:
-        """What one prior standard deviation of each does to the beams, to first order."""
-        known = self.instrument.frequency_mhz, self.instrument.lmax, self.instrument.monopoles
-        slopes = {name: instrument_errors.derivative(name, *known).modes for name in self.widths}
-        return [ProductBeams(std * slopes[name], known[0]) for name, std in self.widths.items()]
-
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Add dA S dA^T for every parameter to N, dA = std times the derivative of A."""
-        for direction in self.directions():
-            error = BeamError(self.instrument.coupling_of(direction))
-            model = error.marginalised(model)
+        known = self.instrument.frequency_mhz, self.instrument.lmax, self.instrument.monopoles
+        for name, std in self.widths.items():
+            slope = std * instrument_errors.derivative(name, *known).modes
+            direction = self.instrument.coupling_of(ProductBeams(slope, known[0]))
+            model = BeamError(direction).marginalised(model)
         return model
 
 
-def true_beams(context: Context) -> ProductBeams:
+def true_beams(setup: Setup) -> ProductBeams:
     """The beams that simulated data are taken with."""
-    section, key = context.scenario.noise.beam, jax.random.key(context.scenario.seed)
+    section, key = setup.scenario.noise.beam, jax.random.key(setup.scenario.seed)
     if section is None:
-        return context.beams
-    return BeamErrors.moved(section, context, BeamErrors.truth(section, context, key)).beams
+        return setup.beams
+    return BeamErrors.moved(section, setup, BeamErrors.truth(section, setup, key)).beams
 
 
-def beam_rms_difference(context: Context) -> float | None:
+def beam_rms_difference(setup: Setup) -> float | None:
     """RMS difference of the true beams and the model's, over the model's; None if the same."""
-    if context.scenario.noise.beam is None:
+    if setup.scenario.noise.beam is None:
         return None
-    return instrument_errors.rms_difference(true_beams(context), context.beams)
+    return instrument_errors.rms_difference(true_beams(setup), setup.beams)

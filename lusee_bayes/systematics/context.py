@@ -11,9 +11,8 @@ visibilities. What neither troubles is the map's own prediction, in rounds
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -23,15 +22,13 @@ from jaxtyping import Float
 from lusee_bayes.core.arrays import Array, DataVector, Grid, Modes
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.beams.monopoles import Receiver
-from lusee_bayes.instrument.beams.source import BeamSource
-from lusee_bayes.instrument.coupling import CouplingMatrix
-from lusee_bayes.instrument.instrument import Instrument
+from lusee_bayes.instrument.beams.source import BeamSource, Receiver
+from lusee_bayes.instrument.coupling import CouplingMatrix, Instrument
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
-from lusee_bayes.instrument.products import DataLayout, all_products, auto_indices
-from lusee_bayes.instrument.schedule import without_gaps
+from lusee_bayes.instrument.products import DataLayout, all_products, auto_indices, without_gaps
 from lusee_bayes.instrument.visibilities import Calibration, Visibilities
+from lusee_bayes.priors.families import PriorFamily
 from lusee_bayes.sky.prior import Prior
 from lusee_bayes.sky.sky_source import Sky
 
@@ -40,7 +37,7 @@ NoiseAbout = Literal["model", "measured", "posterior"]
 
 
 @dataclass(frozen=True)
-class Context(ABC):
+class Setup:
     """The pieces of d = A m + n that a scenario stands for.
 
     Attributes
@@ -70,6 +67,8 @@ class Context(ABC):
         Of data that are averages of a spectrometer's spectra; None for others.
     measured : bool
         Whether the data were given, so that their sky is not the modelled one.
+    family : PriorFamily or None
+        Of which data choose the prior; None for a prior that is given.
     """
 
     scenario: Any
@@ -86,10 +85,7 @@ class Context(ABC):
     receiver: Receiver | None = None
     calibration: Calibration | None = None
     measured: bool = False
-
-    @abstractmethod
-    def source_of_file(self, file: str) -> BeamSource:
-        """The beams of another file, behind the same receivers and turned as the scenario's."""
+    family: PriorFamily | None = None
 
     @property
     def frequency_mhz(self) -> float:
@@ -114,6 +110,34 @@ class Context(ABC):
         grid = (self.layout.n_products, self.layout.n_times)
         return self.layout.gather(np.broadcast_to(self.background[:, None], grid))
 
+    def source_of_file(self, file: str) -> BeamSource:
+        """The beams of another file, behind the same receivers and turned as the scenario's."""
+        return self.scenario.beam.of_file(file).source().behind(self.receiver)
+
+    def with_prior(self, section: Any) -> Setup:
+        """Return the same with another prior, or family of priors.
+
+        Parameters
+        ----------
+        section : PriorSection
+            The scenario's section, in place of its own.
+        """
+        scenario = self.scenario.model_copy(update={"prior": section})
+        prior, family = prior_and_family(scenario, self.sky)
+        return replace(self, scenario=scenario, prior=prior, family=family)
+
+    def under(self, sky: Sky) -> Setup:
+        """Point the instrument at another sky; the prior stays that of the scenario.
+
+        Parameters
+        ----------
+        sky : Sky
+            Of the same frequency and lmax.
+        """
+        complete = CouplingMatrix.build(self.beams, self.pointing)
+        change = complete.layout.scatter(complete @ (sky.modes - self.sky.modes))
+        return replace(self, sky=sky, signal=self.signal + change)
+
     @cached_property
     def prepared(self) -> Instrument:
         """The instrument, prepared for A to be made of many beams."""
@@ -128,9 +152,15 @@ class Context(ABC):
         return all(seen[k] for port, k in enumerate(auto_indices(n)) if port in used)
 
 
+def prior_and_family(scenario: Any, sky: Sky) -> tuple[Prior, PriorFamily | None]:
+    """The scenario's prior, or what is expected of it before there are data, and its family."""
+    family = scenario.prior.family(scenario.frequency_mhz, scenario.lmax)
+    return (scenario.prior.prior(sky) if family is None else family.expected()), family
+
+
 @dataclass(frozen=True)
 class Around:
-    """What a systematic may be built around, besides its context.
+    """What a systematic may be built around, besides its setup.
 
     Attributes
     ----------
@@ -153,19 +183,19 @@ class Around:
     freedom: DataVector | None = None
 
 
-def noise_visibilities(context: Context, around: Around, about: NoiseAbout) -> Grid:
+def noise_visibilities(setup: Setup, around: Around, about: NoiseAbout) -> Grid:
     """The visibilities that a term of N is built around, in K.
 
     Before there is a prediction it is the measured ones', or, if autos that noise depends on were
     never measured, the modelled sky's.
     """
     if about == "model" or around.data is None:
-        return context.signal
+        return setup.signal
     if about == "posterior" and around.visibilities is not None:
         return around.visibilities
-    if about == "posterior" and not context.has_autos:
-        return context.signal
-    return measured_visibilities(around.data, context.signal)
+    if about == "posterior" and not setup.has_autos:
+        return setup.signal
+    return measured_visibilities(around.data, setup.signal)
 
 
 def measured_visibilities(data: Visibilities, model: Grid) -> Grid:

@@ -19,7 +19,7 @@ from lusee_bayes.core.section import Positive, Section, Treatment, requires
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.instrument_errors import GainDrift, white_grid, with_gains
-from lusee_bayes.systematics.context import Around, Context, NoiseAbout, noise_visibilities
+from lusee_bayes.systematics.context import Around, NoiseAbout, Setup, noise_visibilities
 from lusee_bayes.systematics.systematic import (
     SKY,
     Chart,
@@ -126,66 +126,39 @@ class GainDrifts(Systematic):
     log_correlation_std: Float[Array, ""] | None = eqx.field(default=None, converter=scalar_or_none)
 
     @classmethod
-    def of(
-        cls,
-        drift: GainDrift,
-        visibilities: Float[Array, "products times"],
-        hours: Float[np.ndarray, " times"],
-        layout: DataLayout,
-        log_sigma_std: float | None = None,
-        log_correlation_std: float | None = None,
-    ) -> GainDrifts:
-        """Work out the grid and the bands that these drifts need.
-
-        Parameters
-        ----------
-        drift : GainDrift
-            Standard deviation and correlation time (medians, where uncertain).
-        visibilities : (products, times) array
-            Visibilities that the covariance is built around, in K.
-        hours : (times,) array
-            Sample times in hours, growing.
-        layout : DataLayout
-            The data.
-        log_sigma_std, log_correlation_std : float, optional
-            Prior standard deviations of the natural logarithms of the two; None where known.
-        """
-        middle, factor = float(drift.correlation_h), 1.0
-        if log_correlation_std is not None:
-            factor = float(np.exp(CORRELATION_REACH * log_correlation_std))
-        longest = GainDrift(drift.sigma, middle * max(factor, FACTOR))
-        grid = white_grid(
-            hours, middle / factor, middle * factor, per_correlation=PER_CORRELATION, margin=MARGIN
-        )
-        widths = drift.width(hours), longest.width(hours)
-        stds = log_sigma_std, log_correlation_std
-        hours, grid = jnp.asarray(hours), jnp.asarray(grid)
-        return cls(drift, visibilities, hours, grid, layout, *widths, *stds)
-
-    @classmethod
-    def build(cls, section: GainSection, context: Context, around: Around) -> GainDrifts:
-        return cls.of(
-            GainDrift(section.sigma, section.correlation_h),
-            noise_visibilities(context, around, gains_about(context)),
-            context.observation.hours,
-            context.layout,
+    def build(cls, section: GainSection, setup: Setup, around: Around) -> GainDrifts:
+        """Work out the grid and the bands that these drifts need."""
+        middle, log_std = section.correlation_h, section.log_correlation_std
+        factor = 1.0 if log_std is None else float(np.exp(CORRELATION_REACH * log_std))
+        drift = GainDrift(section.sigma, middle)
+        longest = GainDrift(section.sigma, middle * max(factor, FACTOR))
+        hours, ends = setup.observation.hours, (middle / factor, middle * factor)
+        grid = white_grid(hours, *ends, per_correlation=PER_CORRELATION, margin=MARGIN)
+        return cls(
+            drift,
+            noise_visibilities(setup, around, gains_about(setup)),
+            jnp.asarray(hours),
+            jnp.asarray(grid),
+            setup.layout,
+            drift.width(hours),
+            longest.width(hours),
             section.log_sigma_std,
-            section.log_correlation_std,
+            log_std,
         )
 
     @classmethod
-    def truth(cls, section: GainSection, context: Context, key: PRNGKeyArray) -> Truth:
+    def truth(cls, section: GainSection, setup: Setup, key: PRNGKeyArray) -> Truth:
         """The scales, where they are not known; their prior is the program's own."""
         with _HANDLERS, numpyro.handlers.seed(rng_seed=jax.random.fold_in(key, SCALE_DRAW)):
-            drift = cls.build(section, context, Around()).scales()
+            drift = cls.build(section, setup, Around()).scales()
         return {"gain_sigma": float(drift.sigma), "gain_correlation_h": float(drift.correlation_h)}
 
     @classmethod
-    def in_data(cls, section, context, model, truth, key) -> LinearGaussian:
+    def in_data(cls, section, setup, model, truth, key) -> LinearGaussian:
         """Multiply by one draw of the drifts."""
         drift = GainDrift(truth["gain_sigma"], truth["gain_correlation_h"])
-        gains = drift.sample(cls.own_key(key), context.observation.hours)
-        response = cls.build(section, context, Around()).response(gains)
+        gains = drift.sample(cls.own_key(key), setup.observation.hours)
+        response = cls.build(section, setup, Around()).response(gains)
         return multiplied(model, np.asarray(response))
 
     @property
@@ -272,10 +245,10 @@ class GainDrifts(Systematic):
         return self.effect(model, {"gains": self.histories(self.scales())})
 
 
-def gains_about(context: Context) -> NoiseAbout:
+def gains_about(setup: Setup) -> NoiseAbout:
     """Which visibilities the covariance of gain drifts is built around."""
-    chosen = context.scenario.noise.gain.visibilities
-    return chosen or ("posterior" if context.measured else "model")
+    chosen = setup.scenario.noise.gain.visibilities
+    return chosen or ("posterior" if setup.measured else "model")
 
 
 class GainCoordinates(Chart):

@@ -34,7 +34,7 @@ from lusee_bayes.core.arrays import Array, DataVector, Vector, namespace, on_dev
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.section import NOT_TINY, Section, Treatment
 from lusee_bayes.instrument.products import DataLayout, ports
-from lusee_bayes.systematics.context import Around, Context
+from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.systematic import Systematic, Unknown, multiplied
 
 # the site of the errors, in prior standard deviations
@@ -95,8 +95,8 @@ class GainTable(Systematic):
     freedom: Float[Array, " data"] | None = None
 
     @classmethod
-    def build(cls, section: GainTableSection, context: Context, around: Around) -> GainTable:
-        return cls(*table_errors(context), context.layout, around.freedom)
+    def build(cls, section: GainTableSection, setup: Setup, around: Around) -> GainTable:
+        return cls(*table_errors(setup), setup.layout, around.freedom)
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
@@ -148,7 +148,7 @@ def _volume_slopes(table: GainTable, z: Array) -> Array:
 
 
 def table_errors(
-    context: Context,
+    setup: Setup,
 ) -> tuple[tuple[str, ...], tuple[int, ...], Float[np.ndarray, "errors times"]]:
     """Names, ports and slopes of the errors that the data name, or of one for each port.
 
@@ -158,16 +158,16 @@ def table_errors(
         If the scenario and the data both say how large they are, or none of them, and for errors
         of more than 10 %.
     """
-    std, calibration = context.scenario.noise.gain_table.std, context.calibration
+    std, calibration = setup.scenario.noise.gain_table.std, setup.calibration
     named = calibration is not None and calibration.gain_slope is not None
     if named and std is not None:
         raise InputError(
             "the data say the errors of their gain table themselves; leave out noise.gain_table.std"
         )
     if not named:
-        if std is None and context.scenario.flight is not None:
+        if std is None and setup.scenario.flight is not None:
             # what it says of every level of every port: these data have one
-            std = context.scenario.flight.gain_std
+            std = setup.scenario.flight.gain_std
             if std is not None and std > LARGEST:
                 raise InputError(
                     f"flight.gain_std is {std:g}, and power gains that are off by more than "
@@ -179,8 +179,8 @@ def table_errors(
                 "the data say nothing of a gain table; give noise.gain_table.std, the relative "
                 "error of every port's power gain"
             )
-        ports = tuple(range(context.beam_source.n_ports))
-        slope = np.full((len(ports), context.layout.n_times), std)
+        ports = tuple(range(setup.beam_source.n_ports))
+        slope = np.full((len(ports), setup.layout.n_times), std)
         return tuple(f"gain_{port}" for port in ports), ports, slope
     # of levels that no port has at these times the data say nothing
     used = np.flatnonzero(calibration.gain_slope.any(1))

@@ -15,7 +15,7 @@ from pydantic import Field
 
 from lusee_bayes.core.arrays import Array, scalar
 from lusee_bayes.core.section import Positive, Section
-from lusee_bayes.systematics.context import Around, Context, NoiseAbout
+from lusee_bayes.systematics.context import Around, NoiseAbout, Setup
 from lusee_bayes.systematics.systematic import Scale, Unknown
 
 # in standard deviations of a common amplitude
@@ -73,7 +73,7 @@ class NoiseLevel(Scale):
         return None if scenario.noise.radiometer.log_factor_std is None else "sampled"
 
     @classmethod
-    def build(cls, section: RadiometerSection, context: Context, around: Around) -> NoiseLevel:
+    def build(cls, section: RadiometerSection, setup: Setup, around: Around) -> NoiseLevel:
         return cls(section.log_factor_std)
 
     @property
@@ -85,22 +85,22 @@ class NoiseLevel(Scale):
         return replace(model, noise=model.noise.scaled(values["noise_level"]))
 
 
-def radiometer_about(context: Context) -> NoiseAbout:
+def radiometer_about(setup: Setup) -> NoiseAbout:
     """Which visibilities set the level of the radiometer noise."""
-    chosen = context.scenario.noise.radiometer.temperature
-    if chosen is not None or not context.measured:
+    chosen = setup.scenario.noise.radiometer.temperature
+    if chosen is not None or not setup.measured:
         return chosen or "model"
-    harmless = context.has_autos and common_bias(context) < HARMLESS_BIAS
+    harmless = setup.has_autos and common_bias(setup) < HARMLESS_BIAS
     return "measured" if harmless else "posterior"
 
 
-def common_bias(context: Context) -> float:
+def common_bias(setup: Setup) -> float:
     """How far noise in measured visibilities moves a common amplitude, in standard deviations."""
-    section, observation = context.scenario.noise.radiometer, context.observation
-    if context.calibration is not None:
-        samples = np.asarray(context.calibration.n_averaged)
+    section, observation = setup.scenario.noise.radiometer, setup.observation
+    if setup.calibration is not None:
+        samples = np.asarray(setup.calibration.n_averaged)
     else:
         samples = section.bandwidth_hz * section.duty_cycle * np.asarray(observation.live_s)
-    n_antennas = context.beam_source.n_ports
+    n_antennas = setup.beam_source.n_ports
     ratio = section.factor * observation.n_times / float(np.median(samples))
     return float(4.0 * n_antennas * np.sqrt(ratio))

@@ -34,7 +34,7 @@ from lusee_bayes.instrument.pointing import (
     with_offsets,
 )
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.systematics.context import Around, Context
+from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.sources import SOURCE_NODES, expected_signal, source_responses
 from lusee_bayes.systematics.systematic import Systematic, Truth, Unknown, Values, with_added
 
@@ -150,52 +150,52 @@ class PointingOffsets(Systematic):
         return section.around == "posterior"
 
     @classmethod
-    def build(cls, section: PointingSection, context: Context, around: Around) -> PointingOffsets:
-        names = offset_names(section.kinds, context.observation.n_runs)
+    def build(cls, section: PointingSection, setup: Setup, around: Around) -> PointingOffsets:
+        names = offset_names(section.kinds, setup.observation.n_runs)
         stds = {name: float(getattr(section, offset_kind(name))) for name in names}
         values = around.values or {}
-        found = cls.of(context, stds, {name: values.get(name, 0.0) for name in names})
+        found = cls.of(setup, stds, {name: values.get(name, 0.0) for name in names})
         return replace(found, about_data=cls.in_rounds(section))
 
     @classmethod
     def of(
-        cls, context: Context, stds: Mapping[str, float], values: Mapping[str, float]
+        cls, setup: Setup, stds: Mapping[str, float], values: Mapping[str, float]
     ) -> PointingOffsets:
-        """Of a context that is moved to values, with these prior standard deviations."""
+        """Of a setup that is moved to values, with these prior standard deviations."""
         back = {name: -value for name, value in values.items() if name not in CLOCK}
-        observation = with_offsets(context.observation, back)
-        pointing = context.pointing.placed(observation)
+        observation = with_offsets(setup.observation, back)
+        pointing = setup.pointing.placed(observation)
         sources = None
-        if context.responses and context.scenario.sources.treatment != "ignored":
-            sources = MovingSources.of(context)
+        if setup.responses and setup.scenario.sources.treatment != "ignored":
+            sources = MovingSources.of(setup)
         found = cls(
             tuple(stds),
             np.array(list(stds.values())),
             np.array([values.get(name, 0.0) for name in CLOCK]),
             pointing,
-            context.observation.hours,
-            context.beams.modes,
+            setup.observation.hours,
+            setup.beams.modes,
             observation.lander_from_mcmf().T,
-            context.layout,
+            setup.layout,
             sources,
         )
         if sources is None:
             return found
-        # those of the context are there already
+        # those of the setup are there already
         orientation = found.orientation(dict.fromkeys(stds, 0.0) | dict(values))
-        known = np.asarray(sources.seen(orientation, context.layout))
+        known = np.asarray(sources.seen(orientation, setup.layout))
         return replace(found, sources=replace(sources, known=known))
 
     @classmethod
-    def moved(cls, section: PointingSection, context: Context, values: Values) -> Context:
+    def moved(cls, section: PointingSection, setup: Setup, values: Values) -> Setup:
         """Seen at other times, from other places: A, the responses to sources, and the signal."""
-        names = offset_names(section.kinds, context.observation.n_runs)
+        names = offset_names(section.kinds, setup.observation.n_runs)
         offsets = {name: value for name, value in values.items() if name in names}
-        return shifted(context, offsets) if offsets else context
+        return shifted(setup, offsets) if offsets else setup
 
     @classmethod
-    def truth(cls, section: PointingSection, context: Context, key: Any) -> Truth:
-        drawn = super().truth(section, context, key)
+    def truth(cls, section: PointingSection, setup: Setup, key: Any) -> Truth:
+        drawn = super().truth(section, setup, key)
         for name in section.true_values:
             if name not in drawn:
                 raise InputError(
@@ -205,14 +205,13 @@ class PointingOffsets(Systematic):
         return drawn | {name: float(value) for name, value in section.true_values.items()}
 
     @classmethod
-    def in_data(cls, section, context, model, truth, key):
+    def in_data(cls, section, setup, model, truth, key):
         """The same: its A is that of the offsets."""
         return model
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
-        pairs = zip(self.offsets, self.errors, strict=True)
-        return tuple(Unknown(name, 0.0, std) for name, std in pairs)
+        return tuple(map(Unknown, self.offsets, np.zeros(len(self.offsets)), self.errors))
 
     def turned(self, values: Values) -> Pointing:
         """The pointing of values by name."""
@@ -240,9 +239,8 @@ class PointingOffsets(Systematic):
         K_k of turns about its axes. What JAX differentiates, w(z), compiles in no time.
         """
         pointing = self.turned(self.values(centre))
-        parts = _orientation_and_slopes(*on_device((self, centre)))
-        orientation, slopes = np.asarray(parts[0]), np.asarray(parts[1])
-        turn = np.einsum("tji,tjkn->tikn", orientation, slopes)
+        orientation, slopes, of_sources = _slopes(*on_device((self, centre)))
+        turn = np.einsum("tji,tjkn->tikn", np.asarray(orientation), np.asarray(slopes))
         columns = 0.0
         for axis in range(3):
             blocks = (generators(ell)[axis] for ell in range(lmax_of(self.modes.shape[1]) + 1))
@@ -250,11 +248,7 @@ class PointingOffsets(Systematic):
             seen = CouplingMatrix.of_modes(beams, pointing, self.layout) @ np.asarray(sky)
             w = turn[:, (axis + 2) % 3, (axis + 1) % 3]
             columns = columns + seen[:, None] * w[np.asarray(self.layout.time)]
-        return (
-            columns
-            if self.sources is None
-            else columns + _source_slopes(*on_device((self, centre)))
-        )
+        return columns if self.sources is None else columns + np.asarray(of_sources)
 
     def orientation(self, values: Values) -> Float[Array, "times 3 3"]:
         """The rotation from the antennas' frame to the Moon-fixed one at every sample.
@@ -271,19 +265,15 @@ class PointingOffsets(Systematic):
 
 
 @eqx.filter_jit
-def _orientation_and_slopes(offsets: PointingOffsets, centre: Array) -> tuple[Array, Array]:
-    def orientation(z: Array) -> Array:
-        return offsets.orientation(offsets.values(z))
+def _slopes(offsets: PointingOffsets, centre: Array) -> tuple[Array, Array, Array | None]:
+    """The orientation, its derivative by the offsets, and that of what sources add."""
 
-    return orientation(centre), jax.jacfwd(orientation)(centre)
+    def seen(z: Array) -> tuple[Array, Array | None]:
+        orientation = offsets.orientation(offsets.values(z))
+        sources = offsets.sources
+        return orientation, None if sources is None else sources.seen(orientation, offsets.layout)
 
-
-@eqx.filter_jit
-def _source_slopes(offsets: PointingOffsets, centre: Array) -> Array:
-    def seen(z: Array) -> Array:
-        return offsets.sources.seen(offsets.orientation(offsets.values(z)), offsets.layout)
-
-    return jax.jacfwd(seen)(centre)
+    return seen(centre)[0], *jax.jacfwd(seen)(centre)
 
 
 def _about(axis: int, angle: float | Array) -> Float[Array, "*batch 3 3"]:
@@ -332,20 +322,20 @@ class MovingSources(eqx.Module):
     known: Float[Array, " data"] | None = None
 
     @classmethod
-    def of(cls, context: Context) -> MovingSources:
-        """The sources of a context."""
-        instants, sample, weight = context.observation.at_nodes(SOURCE_NODES)
-        sections = context.scenario.sources.list
+    def of(cls, setup: Setup) -> MovingSources:
+        """The sources of a setup."""
+        instants, sample, weight = setup.observation.at_nodes(SOURCE_NODES)
+        sections = setup.scenario.sources.list
         vectors = [np.broadcast_to(s.direction(instants), (len(sample), 3)) for s in sections]
         circular = np.array([s.stokes_v for s in sections])
         return cls(
             np.einsum("tij,stj->sti", instants.mcmf_from_galactic, np.stack(vectors)),
-            np.array([s.mean_flux(context.frequency_mhz) for s in sections]),
+            np.array([s.mean_flux(setup.frequency_mhz) for s in sections]),
             circular if circular.any() else None,
             sample,
             weight,
-            context.beam_source.monopoles,
-            context.beams.frequency_mhz,
+            setup.beam_source.monopoles,
+            setup.beams.frequency_mhz,
         )
 
     def seen(self, orientation: Float[Array, "times 3 3"], layout: DataLayout) -> DataVector:
@@ -362,25 +352,25 @@ class MovingSources(eqx.Module):
         return layout.gather(grid)
 
 
-def shifted(context: Context, values: Mapping[str, float]) -> Context:
-    """The context with another observation, and what follows: A, responses to sources, signal."""
+def shifted(setup: Setup, values: Mapping[str, float]) -> Setup:
+    """The setup with another observation, and what follows: A, responses to sources, signal."""
     given = ", ".join(f"{name} = {value:g}" for name, value in values.items() if value)
     with naming(f"noise.pointing, with {given or 'no offsets'}"):
-        observation = with_offsets(context.observation, values)
+        observation = with_offsets(setup.observation, values)
     if any(values.get(name) for name in CLOCK):
-        frame = np.asarray(context.pointing.pole_frame)
-        pointing = Pointing.of(observation, context.sky.lmax, pole_frame=frame)
+        frame = np.asarray(setup.pointing.pole_frame)
+        pointing = Pointing.of(observation, setup.sky.lmax, pole_frame=frame)
     else:  # the sky turns as before
-        pointing = context.pointing.placed(observation)
-    sources, frequency_mhz = context.scenario.sources.list, context.frequency_mhz
-    responses = source_responses(sources, observation, context.beam_source, frequency_mhz)
-    complete = CouplingMatrix.build(context.beams, pointing)
-    parts = complete, context.sky, context.background, responses
+        pointing = setup.pointing.placed(observation)
+    sources, frequency_mhz = setup.scenario.sources.list, setup.frequency_mhz
+    responses = source_responses(sources, observation, setup.beam_source, frequency_mhz)
+    complete = CouplingMatrix.build(setup.beams, pointing)
+    parts = complete, setup.sky, setup.background, responses
     return replace(
-        context,
+        setup,
         observation=observation,
-        instrument=replace(context.instrument, pointing=pointing),
-        coupling=replace(complete, layout=context.layout),
+        instrument=replace(setup.instrument, pointing=pointing),
+        coupling=replace(complete, layout=setup.layout),
         responses=responses,
         signal=expected_signal(sources, *parts),
     )

@@ -19,7 +19,7 @@ from lusee_bayes.core.arrays import Array, scalar
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.section import Positive, Section, requires
 from lusee_bayes.sky.prior import HarmonicPrior
-from lusee_bayes.systematics.context import Around, Context
+from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.systematic import Scale, Truth, Unknown, scalar_or_none
 
 # the ell at which the amplitude of the spectrum is defined, plus one
@@ -92,16 +92,16 @@ class PriorSpectrum(Scale):
         return "sampled" if scenario.prior.samples else None
 
     @classmethod
-    def build(cls, section: SpectrumSection, context: Context, around: Around) -> PriorSpectrum:
+    def build(cls, section: SpectrumSection, setup: Setup, around: Around) -> PriorSpectrum:
         stds = section.log_amplitude_std, section.tilt_std
         return cls(*stds, section.band_edges, section.log_band_std)
 
     @classmethod
-    def truth(cls, section: Any, context: Context, key: PRNGKeyArray) -> Truth:
+    def truth(cls, section: Any, setup: Setup, key: PRNGKeyArray) -> Truth:
         return {}
 
     @classmethod
-    def in_data(cls, section, context, model, truth, key):
+    def in_data(cls, section, setup, model, truth, key):
         return model
 
     @property

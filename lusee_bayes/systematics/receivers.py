@@ -13,13 +13,12 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 from pydantic import Field
 
-from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.section import Megahertz, Positive, Section, Seed, Treatment, requires
 from lusee_bayes.instrument.beams.source import BeamSource
 from lusee_bayes.instrument.products import auto_indices
-from lusee_bayes.systematics.context import Around, Context
-from lusee_bayes.systematics.systematic import Systematic, Truth, Unknown, with_added
+from lusee_bayes.systematics.context import Around, Setup
+from lusee_bayes.systematics.systematic import Temperatures, Truth
 
 # cosines and sines of which a smooth spectrum is made
 N_WAVES = 512
@@ -85,56 +84,30 @@ class ReceiverNoiseSection(Section):
         return self.power_v2_hz * rise / circuit.per_kelvin.diagonal().real
 
 
-class Receivers(Systematic):
-    """Powers of the receivers, with independent Gaussian priors.
-
-    Attributes
-    ----------
-    powers, errors : (ports,) array
-        Means and standard deviations of the priors, in K.
-    per_kelvin : (data, ports) array
-        What each kelvin adds to the data: 1 in the port's auto.
-    """
+class Receivers(Temperatures):
+    """Powers of the receivers, each in its port's auto."""
 
     key: ClassVar[str] = "noise.receiver"
     section: ClassVar[type[Section]] = ReceiverNoiseSection
     words: ClassVar[str] = "the receivers"
-    unit: ClassVar[str] = "K"
     draw: ClassVar[int] = 8
-    changes_coupling: ClassVar[bool] = False
-
-    powers: Float[Array, " ports"]
-    errors: Float[Array, " ports"]
-    per_kelvin: Float[Array, "data ports"]
 
     @classmethod
-    def build(cls, section: ReceiverNoiseSection, context: Context, around: Around) -> Receivers:
-        powers = section.powers(context.beam_source, context.frequency_mhz)
-        own = np.asarray(context.layout.product)[:, None] == auto_indices(len(powers))[None]
-        return cls(powers, section.relative_std * powers, own.astype(np.float64))
+    def build(cls, section: ReceiverNoiseSection, setup: Setup, around: Around) -> Receivers:
+        powers = section.powers(setup.beam_source, setup.frequency_mhz)
+        own = np.asarray(setup.layout.product)[:, None] == auto_indices(len(powers))[None]
+        sites = tuple(f"receiver_{port}_k" for port in range(len(powers)))
+        return cls(sites, powers, section.relative_std * powers, own.astype(np.float64))
 
     @classmethod
-    def truth(cls, section: ReceiverNoiseSection, context: Context, key: PRNGKeyArray) -> Truth:
+    def truth(cls, section: ReceiverNoiseSection, setup: Setup, key: PRNGKeyArray) -> Truth:
         if section.smooth_octaves is None:
-            return super().truth(section, context, key)
+            return super().truth(section, setup, key)
         shared = key if section.smooth_seed is None else jax.random.key(section.smooth_seed)
-        octave = float(np.log2(context.frequency_mhz))
-        receivers = cls.build(section, context, Around())
+        octave = float(np.log2(setup.frequency_mhz))
+        receivers = cls.build(section, setup, Around())
         own, n = jax.random.fold_in(shared, cls.draw), len(receivers.unknowns)
         return receivers.values(_smooth_spectra(own, n, octave / section.smooth_octaves))
-
-    @property
-    def unknowns(self) -> tuple[Unknown, ...]:
-        pairs = zip(self.powers, self.errors, strict=True)
-        return tuple(Unknown(f"receiver_{port}_k", *pair) for port, pair in enumerate(pairs))
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        return tuple(f"receiver {port}" for port in range(len(self.powers)))
-
-    def effect(self, model, values):
-        """Add what the powers differ from their means by."""
-        return with_added(model, self.per_kelvin @ (self.stacked(values) - self.powers))
 
 
 def _smooth_spectra(key: PRNGKeyArray, n_ports: int, x: float) -> Float[np.ndarray, " ports"]:

@@ -12,8 +12,8 @@ from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.section import Positive, Section, Treatment
 from lusee_bayes.instrument.beams.source import BeamSource
-from lusee_bayes.systematics.context import Around, Context
-from lusee_bayes.systematics.systematic import Systematic, Unknown, with_added
+from lusee_bayes.systematics.context import Around, Setup
+from lusee_bayes.systematics.systematic import Temperatures
 
 
 class RegolithSection(Section):
@@ -32,43 +32,20 @@ class RegolithSection(Section):
     treatment: Treatment = "marginalised"
 
 
-class RegolithTemperature(Systematic):
-    """Temperature of the ground, with a Gaussian prior.
-
-    Attributes
-    ----------
-    mean, std : () array
-        Of the prior, in K.
-    per_kelvin : (data,) array
-        What each kelvin adds to the data.
-    """
+class RegolithTemperature(Temperatures):
+    """Temperature of the ground."""
 
     key: ClassVar[str] = "noise.regolith"
     section: ClassVar[type[Section]] = RegolithSection
     words: ClassVar[str] = "the regolith"
-    unit: ClassVar[str] = "K"
-    labels: ClassVar[tuple[str, ...]] = ("regolith",)
     draw: ClassVar[int] = 9
-    changes_coupling: ClassVar[bool] = False
-
-    mean: Float[Array, ""]
-    std: Float[Array, ""]
-    per_kelvin: Float[Array, " data"]
 
     @classmethod
-    def build(cls, section: RegolithSection, context: Context, around: Around):
-        added = ground_per_kelvin(context.beam_source, context.beams.frequency_mhz)
-        seen = added[np.asarray(context.layout.product)]
-        mean = np.asarray(context.scenario.beam.moon_temperature_k)
-        return cls(mean, np.asarray(section.std_k), seen)
-
-    @property
-    def unknowns(self) -> tuple[Unknown, ...]:
-        return (Unknown("regolith_k", self.mean, self.std),)
-
-    def effect(self, model, values):
-        """Add what ground that is warmer than the mean emits."""
-        return with_added(model, self.per_kelvin * (values["regolith_k"] - self.mean))
+    def build(cls, section: RegolithSection, setup: Setup, around: Around):
+        added = ground_per_kelvin(setup.beam_source, setup.beams.frequency_mhz)
+        seen = added[np.asarray(setup.layout.product)]
+        mean = np.array([setup.scenario.beam.moon_temperature_k])
+        return cls(("regolith_k",), mean, np.array([section.std_k]), seen[:, None])
 
 
 def ground_per_kelvin(source: BeamSource, frequency_mhz: float) -> Float[Array, " products"]:

@@ -18,13 +18,13 @@ from lusee_bayes.core.arrays import Array, Grid, namespace, scalar
 from lusee_bayes.core.checks import require_finite, require_positive, require_shape
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.section import Positive, Section, Treatment, requires
+from lusee_bayes.instrument.beams.monopoles import source_response
 from lusee_bayes.instrument.beams.source import BeamSource
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.observation import BODIES, Observation, body_direction
-from lusee_bayes.instrument.source_response import source_response
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, galactic_unit_vector, kelvin_steradian
 from lusee_bayes.sky.sky_source import Sky
-from lusee_bayes.systematics.context import Around, Context
+from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.systematic import Systematic, Truth, Unknown, with_added
 
 CATALOGUE = {source.name: source for source in BRIGHT_SOURCES}
@@ -197,21 +197,21 @@ class PointSources(Systematic):
         return scenario.sources.treatment if scenario.sources.list else None
 
     @classmethod
-    def build(cls, section: SourcesSection, context: Context, around: Around) -> PointSources:
+    def build(cls, section: SourcesSection, setup: Setup, around: Around) -> PointSources:
         sources = []
-        for one, response in zip(section.list, context.responses, strict=True):
-            flux = one.mean_flux(context.frequency_mhz)
-            block = one.blocks(context.observation)
+        for one, response in zip(section.list, setup.responses, strict=True):
+            flux = one.mean_flux(setup.frequency_mhz)
+            block = one.blocks(setup.observation)
             of_blocks = [
                 np.where((block == b)[None], response, 0.0) for b in range(block.max() + 1)
             ]
-            columns = np.stack([context.layout.gather(seen) for seen in of_blocks], axis=1)
+            columns = np.stack([setup.layout.gather(seen) for seen in of_blocks], axis=1)
             sources.append(Source(columns, flux, one.relative_std * flux, one.name))
         return cls(tuple(sources))
 
     @classmethod
-    def truth(cls, section: SourcesSection, context: Context, key: PRNGKeyArray) -> Truth:
-        sources = cls.build(section, context, Around()).sources
+    def truth(cls, section: SourcesSection, setup: Setup, key: PRNGKeyArray) -> Truth:
+        sources = cls.build(section, setup, Around()).sources
         keys = jax.random.split(cls.own_key(key), len(sources))
         truth: Truth = {}
         for source, k in zip(sources, keys, strict=True):
@@ -252,11 +252,7 @@ def source_responses(
     first = np.searchsorted(sample, np.arange(observation.n_times))
     responses = (
         source_response(
-            instants,
-            one.direction(instants),
-            frequency_mhz,
-            beams.monopoles,
-            stokes_v=one.stokes_v,
+            instants, one.direction(instants), frequency_mhz, beams.monopoles, stokes_v=one.stokes_v
         )
         for one in sources
     )
@@ -281,7 +277,7 @@ def expected_signal(
     background : (products,) array
         In K.
     responses : tuple of (products, times) arrays
-        As in :class:`.Context`.
+        As in :class:`.Setup`.
     """
     signal = complete.layout.scatter(complete @ sky.modes) + background[:, None]
     for section, response in zip(sources, responses, strict=True):

@@ -44,7 +44,7 @@ from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import Covariance, DiagonalCovariance, LowRankCovariance
 from lusee_bayes.sky.prior import IndependentPrior
-from lusee_bayes.systematics.context import Around, Context
+from lusee_bayes.systematics.context import Around, Setup
 
 # where programs sample the sky
 SKY = "sky"
@@ -135,13 +135,26 @@ class Unknown:
         Raises
         ------
         InputError
-            As :func:`normal_within`.
+            If 0.25 % or more of the Gaussian lies outside the domain: the prior then allows what
+            cannot be.
         """
-        if np.isfinite([self.low, self.high]).any():
-            return normal_within(self.name, self.mean, self.std, self.low, self.high)
-        kind, mean = (dist.LogNormal, jnp.log) if self.log else (dist.Normal, jnp.asarray)
-        prior = kind(mean(scalar(self.mean)), scalar(self.std))
-        return prior if self.size is None else prior.expand([self.size]).to_event(1)
+        mean, std, low, high = self.mean, self.std, self.low, self.high
+        if np.isinf(low) and np.isinf(high):
+            kind, centre = (dist.LogNormal, jnp.log) if self.log else (dist.Normal, jnp.asarray)
+            prior = kind(centre(scalar(mean)), scalar(std))
+            return prior if self.size is None else prior.expand([self.size]).to_event(1)
+        require_positive(f"the prior standard deviation of {self.name}", std)
+        cdf = NormalDist().cdf
+        outside = cdf((low - mean) / std) + cdf((mean - high) / std)
+        if outside > 0.0025:
+            edge = f"at least {low:g}" if mean - low < high - mean else f"at most {high:g}"
+            raise InputError(
+                f"the prior of {self.name}, {mean:g} +- {std:g}, has {outside:.1%} of its weight "
+                f"outside what it can be ({edge}); give a smaller standard deviation or move the "
+                "mean"
+            )
+        ends = {name: end for name, end in (("low", low), ("high", high)) if np.isfinite(end)}
+        return dist.TruncatedNormal(mean, std, **ends)
 
     def at(self, z: float | Float[Array, "..."]) -> float | Float[Array, "..."]:
         """Compute values of numbers in prior standard deviations from the prior mean."""
@@ -207,14 +220,14 @@ class Systematic(eqx.Module):
         return None if section is None else section.treatment
 
     @classmethod
-    def build(cls, section: Any, context: Context, around: Around) -> Systematic:
+    def build(cls, section: Any, setup: Setup, around: Around) -> Systematic:
         """Build it from a scenario's section.
 
         Parameters
         ----------
         section : Section
             Of the type :attr:`section`.
-        context : Context
+        setup : Setup
             Where :attr:`Around.values` move others, with these.
         around : Around
             What it may be built around.
@@ -222,9 +235,9 @@ class Systematic(eqx.Module):
         raise NotImplementedError(f"{cls.__name__} has no scenario's section")
 
     @classmethod
-    def moved(cls, section: Any, context: Context, values: Values) -> Context:
-        """The context with an instrument that has these values; by default no other."""
-        return context
+    def moved(cls, section: Any, setup: Setup, values: Values) -> Setup:
+        """The setup with an instrument that has these values; by default no other."""
+        return setup
 
     @classmethod
     def in_rounds(cls, section: Any) -> bool:
@@ -232,17 +245,17 @@ class Systematic(eqx.Module):
         return cls.moves
 
     @classmethod
-    def truth(cls, section: Any, context: Context, key: PRNGKeyArray) -> Truth:
+    def truth(cls, section: Any, setup: Setup, key: PRNGKeyArray) -> Truth:
         """Draw the true values in simulated data from their priors.
 
         Parameters
         ----------
         section : Section
-        context : Context
+        setup : Setup
         key : PRNG key
             Of the scenario's seed.
         """
-        found = cls.build(section, context, Around())
+        found = cls.build(section, setup, Around())
         z = np.asarray(jax.random.normal(cls.own_key(key), (len(found.names),)))
         return {
             name: value if value.ndim else float(value) for name, value in found.values(z).items()
@@ -255,14 +268,14 @@ class Systematic(eqx.Module):
 
     @classmethod
     def in_data(
-        cls, section: Any, context: Context, model: LinearGaussian, truth: Truth, key: PRNGKeyArray
+        cls, section: Any, setup: Setup, model: LinearGaussian, truth: Truth, key: PRNGKeyArray
     ) -> LinearGaussian:
         """The model with the true values of simulated data.
 
         Parameters
         ----------
         section : Section
-        context : Context
+        setup : Setup
             Moved to all true values (:meth:`moved`), as the model's A is.
         model : LinearGaussian
             Without it.
@@ -271,7 +284,7 @@ class Systematic(eqx.Module):
         key : PRNG key
             Of the scenario's seed, for what else is drawn.
         """
-        found = cls.build(section, context, Around())
+        found = cls.build(section, setup, Around())
         return found.effect(model, {u.name: truth[u.name] for u in found.unknowns})
 
     # --- its unknowns ---
@@ -580,6 +593,42 @@ class AdditiveNoise(Systematic):
         return replace(model, noise=model.noise + self.covariance())
 
 
+class Temperatures(Systematic):
+    """Temperatures of what adds to the data, whatever the sky; independent Gaussian priors.
+
+    Their means are part of the background.
+
+    Attributes
+    ----------
+    sites : tuple of str
+        Their names, which end with ``_k``.
+    expectation, errors : (n,) array
+        Means and standard deviations of the priors, in K.
+    per_kelvin : (data, n) array
+        What each kelvin adds to the data.
+    """
+
+    unit: ClassVar[str] = "K"
+    changes_coupling: ClassVar[bool] = False
+
+    sites: tuple[str, ...] = eqx.field(static=True)
+    expectation: Float[Array, " n"]
+    errors: Float[Array, " n"]
+    per_kelvin: Float[Array, "data n"]
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        return tuple(map(Unknown, self.sites, self.expectation, self.errors))
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return tuple(name.removesuffix("_k").replace("_", " ") for name in self.sites)
+
+    def effect(self, model, values):
+        """Add what they differ from their means by."""
+        return with_added(model, self.per_kelvin @ (self.stacked(values) - self.expectation))
+
+
 class Scale(Systematic):
     """A systematic without a Gaussian term: marginalised, it stays at its median."""
 
@@ -611,39 +660,3 @@ def multiplied(model: LinearGaussian, response: DataVector) -> LinearGaussian:
 def scalar_or_none(value: float | Float[Array, ""] | None) -> Float[Array, ""] | None:
     """Convert a number like :func:`scalar`; None stays None."""
     return None if value is None else scalar(value)
-
-
-def normal_within(
-    name: str, mean: float, std: float, low: float = -np.inf, high: float = np.inf
-) -> dist.Distribution:
-    """Return N(mean, std), cut off at the ends of a parameter's domain.
-
-    Parameters
-    ----------
-    name : str
-        The parameter, for messages.
-    mean, std : float
-        Of the Gaussian, in the parameter's unit.
-    low, high : float
-        Ends of the domain.
-
-    Raises
-    ------
-    InputError
-        If 0.25 % or more of the Gaussian lies outside the domain: the prior then allows what
-        cannot be.
-    """
-    require_positive(f"the prior standard deviation of {name}", std)
-    cdf = NormalDist().cdf
-    outside = cdf((low - mean) / std) + cdf((mean - high) / std)
-    if outside > 0.0025:
-        edge = f"at least {low:g}" if mean - low < high - mean else f"at most {high:g}"
-        raise InputError(
-            f"the prior of {name}, {mean:g} +- {std:g}, has {outside:.1%} of its weight outside "
-            f"what it can be ({edge}); give a smaller standard deviation or move the mean"
-        )
-    if np.isinf(low) and np.isinf(high):
-        return dist.Normal(mean, std)
-    return dist.TruncatedNormal(
-        mean, std, low=None if np.isinf(low) else low, high=None if np.isinf(high) else high
-    )

@@ -9,5 +9,4 @@ from lusee_bayes.testing.contracts import check_coupling as check_coupling
 from lusee_bayes.testing.contracts import check_covariance as check_covariance
 from lusee_bayes.testing.contracts import check_prior as check_prior
 from lusee_bayes.testing.contracts import check_sky_source as check_sky_source
-from lusee_bayes.testing.contracts import check_slopes as check_slopes
 from lusee_bayes.testing.scenarios import small_scenario as small_scenario

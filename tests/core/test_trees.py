@@ -3,19 +3,20 @@
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, Literal
 
+import h5py
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
-from assertions import refuse
+from assertions import refuse, refused
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from jaxtyping import Bool, Float, Int8
+from jaxtyping import Bool, Float, Int8, Shaped
 
-from lusee_bayes.core.trees import from_tree, quantity, to_tree
+from lusee_bayes.core.trees import StoredTree, from_tree, opened_tree, quantity, to_tree, write_tree
 
 
 @dataclass(frozen=True)
@@ -158,6 +159,8 @@ def test_what_is_written_comes_back(tmp_path_factory, value):
     to_tree(value).to_netcdf(path, engine="h5netcdf")
     with xr.open_datatree(path, engine="h5netcdf", decode_times=False) as tree:
         assert same(value, from_tree(Everything, tree, str(path)))
+    with h5py.File(path) as file:
+        assert same(value, from_tree(Everything, StoredTree(file), str(path)))
 
 
 def example(**others: Any) -> Everything:
@@ -194,6 +197,59 @@ def test_a_file_is_one_that_others_can_read(tmp_path):
         assert list(tree["table"]["unknown"].values) == ["a", "b"]
 
 
+@dataclass(frozen=True)
+class Sky:
+    """Maps of two grids, and what is checked."""
+
+    pixels: Float[np.ndarray, "pixel channel"] = quantity("K", "a map")
+    coarse: Float[np.ndarray, " region"] = quantity("1")
+    names: Shaped[np.ndarray, " channel"] = quantity("1", checks={"choices": ("auto", "cross")})
+    mhz: Float[np.ndarray, " channel"] = quantity("MHz", checks={"grows": True, "unit": "MHz"})
+
+
+FORMAT = "lusee_bayes example 1"
+
+
+def sky(**others: Any) -> Sky:
+    maps = {"pixels": np.ones((192, 2)), "coarse": np.ones(12)}
+    return Sky(
+        **(maps | {"names": np.array(["auto", "cross"]), "mhz": np.array([20.0, 30.0])} | others)
+    )
+
+
+def test_pixels_have_a_grid(tmp_path):
+    """That of CF 1.13, of each resolution, which readers of the file do not need."""
+    path = write_tree(tmp_path / "sky.nc", sky(), FORMAT, {"frame": "galactic"})
+    with xr.open_dataset(path, engine="h5netcdf") as file:
+        assert (file.attrs["Conventions"], file.attrs["frame"]) == ("CF-1.13", "galactic")
+        for name, level in (("pixels", 2), ("coarse", 0)):
+            grid = file[file[name].attrs["grid_mapping"]].attrs
+            assert grid["grid_mapping_name"] == "healpix" and grid["indexing_scheme"] == "ring"
+            assert grid["refinement_level"] == level
+            index = file[f"{file[name].dims[0]}_index"]
+            assert index.attrs["standard_name"] == "healpix_index"
+            np.testing.assert_array_equal(index, np.arange(12 * 4**level))
+        assert "grid_mapping" not in file["mhz"].attrs
+    with opened_tree(path, FORMAT, "a sky") as tree:
+        assert same(sky(), from_tree(Sky, tree, str(path)))
+    with refused("its format is 'lusee_bayes example 1'"):
+        opened_tree(path, "lusee_bayes example 2", "a sky").__enter__()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"names": np.array(["auto", "sum"])}, "names is 'sum'"),
+        ({"mhz": np.array([30.0, 20.0])}, "mhz does not grow"),
+        ({"mhz": np.array([20.0, np.nan])}, "mhz holds NaN"),
+        ({"mhz": np.array([20e6, 30e6])}, "is this Hz"),
+    ],
+)
+def test_what_fields_ask_for_is_checked(changes, words):
+    with refused(words):
+        from_tree(Sky, to_tree(sky(**changes)), "a file")
+
+
 def test_what_is_absent_has_its_default():
     """As in a file of a version that did not have the field yet."""
     tree = to_tree(example())
@@ -226,29 +282,35 @@ DAMAGED = {
     "numbers for one": (lambda t: t.attrs.update(share=np.ones(2)), "expected a number"),
     "a number for text": (lambda t: t.attrs.update(name=3), "name is 3, expected text"),
     "not JSON": (lambda t: t.attrs.update(labels="{one"), "labels is '{one', expected JSON"),
-    "other JSON": (lambda t: t.attrs.update(labels="[1, 2]"), "labels is '[1, 2]'"),
-    "a list for an object": (lambda t: t.attrs.update(told="[]"), "told is '[]'"),
-    "a number for JSON": (lambda t: t.attrs.update(told=5), "told is 5, expected JSON"),
+    "other JSON": (
+        lambda t: t.attrs.update(labels="[1, 2]"),
+        "labels is '[1, 2]': Input should be a valid string",
+    ),
+    "a list for an object": (
+        lambda t: t.attrs.update(told="[]"),
+        "told is '[]': Input should be a valid dict",
+    ),
+    "a number for JSON": (lambda t: t.attrs.update(told=5), "told is 5, expected text"),
     "another shape": (
         lambda t: put(t, "sky", np.ones((4, 4)), "mode", "mode_2"),
-        "sky has 2 dimensions, expected 1 (mode)",
+        "sky has shape (4, 4), expected mode",
     ),
     "another size": (
         lambda t: put(t, "draws", np.ones((3, 5)), "draw", "other"),
-        "draws has 5 mode, other arrays of its group 4",
+        "draws has shape (3, 5), expected draw x 4 (mode)",
     ),
     "complex": (
         lambda t: put(t, "sky", np.ones(4, dtype=complex), "mode"),
-        "sky holds values of type complex128, expected float64",
+        "sky holds values of type complex128, expected real numbers",
     ),
     "floats for bytes": (
         lambda t: put(t, "steps", np.ones((4, 2)), "mode", "part"),
-        "steps holds values of type float64, expected int8",
+        "steps holds values of type float64, expected whole numbers",
     ),
-    "a column less": (lambda t: without(t["rows"], "n"), "a file: rows has no column n (it has "),
+    "a column less": (lambda t: without(t["rows"], "n"), "a file: rows has no n (it has "),
     "text in a column": (
         lambda t: put(t["rows"], "n", np.array(["a", "b"]), "rows_row"),
-        "rows.n is 'a', expected a whole number",
+        "rows: n holds values of type <U1, expected whole numbers",
     ),
     "a column of a frame less": (
         lambda t: without(t["table"], "value"),

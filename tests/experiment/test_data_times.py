@@ -302,7 +302,7 @@ class Maps:
 def map_of(scenario, data, observation):
     setup = set_up(scenario, replace(data, observation=observation))
     model = full_model(setup)
-    covariance = np.asarray(model.condition(np.zeros(model.n_data)).covariance())
+    covariance = np.asarray(model.condition(np.zeros(model.n_data)).posterior.covariance())
     bits = float(expected_inference(setup).posterior.information_bits())
     return Map(model, covariance, bits)
 

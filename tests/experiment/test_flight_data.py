@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from assertions import refuse
+from experiments import unknowns_report
 from naive_flight import naive_band
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.flight_data import per_kelvin_of, reduce_files
+from lusee_bayes.experiment.data_files import per_kelvin_of, reduce_files
 from lusee_bayes.experiment.flight_simulation import simulate_flight
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.experiment.unknowns import unknowns_report
 from lusee_bayes.flight.gain_model import synthetic_gains
 from lusee_bayes.flight.reduced import BURST, COMB, NO_DATA, SATURATED, USED
 from lusee_bayes.flight.session import CHANNEL_MHZ
@@ -293,7 +293,7 @@ def test_what_the_comb_spoils_and_nothing_else_is_left_out(mapped, truth):
     saturated = {(s, int(r)) for s, r in truth["saturated"]}
     names = [(s, int(r)) for s, r in zip(truth["session"], truth["row"], strict=True)]
     times = [name for name in names if name not in saturated]
-    flagged = [times[k] for k in np.flatnonzero(experiment.fitting.times)]
+    flagged = [times[k] for k in np.flatnonzero(experiment.fitting.flagged.all(axis=0))]
     assert flagged == comb
     assert "3 of 124 times" in experiment.fitting.remark
 

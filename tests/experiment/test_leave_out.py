@@ -63,7 +63,7 @@ def test_clean_data_are_left_as_they_are(experiment):
 def test_bad_times_are_found(experiment, times, strength):
     data = with_bursts(experiment, times, strength)
     found = fitting(experiment.setup, data, FALSE_ALARM)
-    assert np.flatnonzero(found.times).tolist() == times
+    assert np.flatnonzero(found.flagged.all(axis=0)).tolist() == times
     assert found.flagged.sum() == 16 * len(times)
     assert f"{len(times)} of 65 times" in found.remark
     # what is left is what clean data without these times are
@@ -147,7 +147,7 @@ def test_what_the_reduction_took_counts(experiment, lost, goes):
     data = with_bursts(experiment, times, 30.0)
     data = replace(data, calibration=Calibration(np.full(65, 1e6 * 7200.0), lost=lost))
     found = fitting(experiment.setup, data, FALSE_ALARM)
-    assert np.flatnonzero(found.times).tolist() == (times if goes else [])
+    assert np.flatnonzero(found.flagged.all(axis=0)).tolist() == (times if goes else [])
     assert found.remark.startswith("Flagged" if goes else TOO_MANY)
     assert found.share == pytest.approx(len(times) / 65.0 if goes else 0.0)
 
@@ -169,7 +169,7 @@ def test_what_does_not_fit_at_a_higher_lmax_either_is_flagged(experiment):
     fine = lb.build(experiment.scenario.model_copy(update={"lmax": 14}))
     data = with_bursts(fine, [20], 30.0)
     found = fitting(set_up(experiment.scenario, data), data, FALSE_ALARM)
-    assert np.flatnonzero(found.times).tolist() == [20] and found.flagged.sum() == 16
+    assert np.flatnonzero(found.flagged.all(axis=0)).tolist() == [20] and found.flagged.sum() == 16
     assert "lmax=14 fits" in found.remark and "1 of 65 times" in found.remark
 
 
@@ -186,7 +186,7 @@ def test_data_go_without_another_fit(experiment, monkeypatch):
     data = with_bursts(experiment, [7], 8.0)
     data = with_bursts(replace(experiment, data=data), [30, 44], 60.0)
     found = fitting(experiment.setup, data, FALSE_ALARM)
-    assert np.flatnonzero(found.times).tolist() == [7, 30, 44]
+    assert np.flatnonzero(found.flagged.all(axis=0)).tolist() == [7, 30, 44]
     assert len(calls) <= 3
 
 

@@ -105,8 +105,8 @@ def test_posteriors_of_gaussian_skies(naive, test_data, quadrature, calibrated):
     noise = np.sqrt(np.asarray(model.noise.diagonal()))
     data = skies @ matrix.T + noise * rng.standard_normal((N_DRAWS, len(noise)))
     solver = model.factorise()
-    means = jax.jit(jax.vmap(lambda d: solver.condition(d).mean))(jnp.asarray(data))
-    posterior = solver.condition(jnp.asarray(data[0]))
+    means = jax.jit(jax.vmap(lambda d: solver.condition(d).posterior.mean))(jnp.asarray(data))
+    posterior = solver.condition(jnp.asarray(data[0])).posterior
     scale = np.asarray(posterior.std())
     root = np.linalg.cholesky(np.asarray(posterior.covariance()) / np.outer(scale, scale))
     white = np.linalg.solve(root, ((skies - np.asarray(means)) / scale).T).T

@@ -75,7 +75,7 @@ def test_the_posteriors_own_prediction_has_settled():
     nothing = np.zeros(found.model.n_data)
     got = prediction(setup, found, nothing)
     np.testing.assert_allclose(got, predicted, rtol=0, atol=1e-12 * scale)
-    again = full_model(setup, Around(data, predicted)).condition(data.data)
+    again = full_model(setup, Around(data, predicted)).condition(data.data).posterior
     assert float(again.rms_shift_from(posterior)) < SETTLED
     # it did move on the way
     measured = inferred(GAIN, "noise.gain.visibilities=measured").posterior
@@ -174,9 +174,9 @@ class Hum(AdditiveNoise):
     root: jax.Array
 
     @classmethod
-    def build(cls, section, context, around) -> Hum:
-        root = patterns(context.layout.size, section.sigma_k)
-        return cls("hum", context.layout, jnp.asarray(root))
+    def build(cls, section, setup, around) -> Hum:
+        root = patterns(setup.layout.size, section.sigma_k)
+        return cls("hum", setup.layout, jnp.asarray(root))
 
     def covariance(self) -> lb.Covariance:
         return lb.LowRankCovariance(self.root, "the hum")
@@ -265,11 +265,11 @@ class Amplifier(lb.Systematic):
     key = "noise.hum"
 
     @classmethod
-    def truth(cls, section, context, key) -> Truth:
+    def truth(cls, section, setup, key) -> Truth:
         return {"factor": 3.0}
 
     @classmethod
-    def in_data(cls, section, context, model, truth, key):
+    def in_data(cls, section, setup, model, truth, key):
         return multiplied(model, np.full(model.n_data, truth["factor"]))
 
 

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from experiments import four_ports
+from experiments import four_ports, unknowns_report
 from reference_linear import white_posterior
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import radiometer, simulate, true_values
 from lusee_bayes.experiment.setup import Setup, set_up
-from lusee_bayes.experiment.unknowns import NullDirection, unknowns_report
+from lusee_bayes.experiment.unknowns import NullDirection
 from lusee_bayes.instrument.products import auto_indices
 from lusee_bayes.report.map_page import map_page
 from lusee_bayes.systematics.regolith import ground_per_kelvin

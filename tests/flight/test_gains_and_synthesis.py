@@ -51,7 +51,7 @@ def write_folder(folder, made, model="quadratic"):
         for port in range(4):
             name = f"{level}{port}"
             vectors = np.zeros((len(ANCHORS), len(ANCHORS)))
-            vectors[:, :2] = made.component[i, port].T
+            vectors[:, :2] = made.components[i, port].T
             np.save(folder / f"{name}_mean.npy", made.mean[i, port])
             np.save(folder / f"{name}_freqs.npy", made.anchor_mhz[i, port])
             np.save(folder / f"{name}_eigvecs.npy", vectors)
@@ -76,7 +76,7 @@ def test_gains_are_luseepys_recipe_written_out():
                 phi = [1.0, f, a, seen["SPE_1VAD8_V"][row], seen["VMON_1V2D"][row]]
                 phi += [seen["SPE_1VAD8_C"][row], f * f, a * a, f * a]
                 q = made.coefficient[i, port] @ np.array(phi)
-                at_anchors = made.mean[i, port] + q @ made.component[i, port]
+                at_anchors = made.mean[i, port] + q @ made.components[i, port]
                 # the spline of the sum, where the table sums splines
                 expected = CubicSpline(ANCHORS, at_anchors)(mhz)
                 np.testing.assert_allclose(found[row], expected, rtol=1e-12)
@@ -87,7 +87,7 @@ def test_there_is_no_gain_beyond_the_anchors():
     basis = made.basis("M", 1, np.array([0.05, 0.1, 70.1, 70.2]))
     assert np.isnan(basis[:, [0, 3]]).all()
     # at the first and the last anchor they are what the table holds there
-    ends = np.concatenate([made.mean[1, 1][None], made.component[1, 1]])[:, [0, -1]]
+    ends = np.concatenate([made.mean[1, 1][None], made.components[1, 1]])[:, [0, -1]]
     np.testing.assert_allclose(basis[:, 1:3], ends, rtol=1e-12)
 
 
@@ -97,7 +97,7 @@ def test_luseepys_folder_and_own_file_hold_the_same(tmp_path, model):
     folder = write_folder(tmp_path / "gain", made, model)
     own = write_gain_table(tmp_path / "gains.nc", made)
     for found in (read_gain_table(folder, model), read_gain_table(own)):
-        for name in ("anchor_mhz", "mean", "component", "coefficient"):
+        for name in ("anchor_mhz", "mean", "components", "coefficient"):
             np.testing.assert_array_equal(getattr(found, name), getattr(made, name))
     np.testing.assert_array_equal(read_gain_table(own).component_std, made.component_std)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from assertions import require_conventions
 from astropy.io import fits
 from changes import SCALE, byte_changes, change_bytes, change_items, item_changes, require_answer
 from hypothesis import given, settings
@@ -14,7 +15,7 @@ from hypothesis import strategies as st
 from layout_4 import write_layout_4
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.flight_data import reduce_files
+from lusee_bayes.experiment.data_files import reduce_files
 from lusee_bayes.flight.gain_model import read_gain_table
 from lusee_bayes.flight.reduced import read_reduced, write_reduced
 from lusee_bayes.flight.session_files import read_session
@@ -22,7 +23,7 @@ from lusee_bayes.report.describe import describe
 from lusee_bayes.results.map_files import read_channels, read_information
 from lusee_bayes.runs import folder as folder_module
 from lusee_bayes.runs import map_run
-from lusee_bayes.sky.sky_files import write_alms
+from lusee_bayes.sky.sky_source import write_alms
 from lusee_bayes.testing.scenarios import small_scenario
 
 FEW, MANY = 2, 150 * SCALE
@@ -73,6 +74,8 @@ READERS = {
     "gains.nc": (describe, read_gain_table),
 }
 
+# files of the package
+OWN = tuple(name for name in READERS if name.endswith(".nc"))
 LUSEEPYS = {
     "scalar_beam.fits": "synthetic_monopole_beam.fits",
     "response.fits": "synthetic_response_v3.fits",
@@ -144,6 +147,11 @@ def luseepys(tmp_path_factory, test_data) -> Path:
                 hdus[0].header.update({"FREQ_MIN": 9.0, "FREQ_MAX": 12.0, "FREQ_N": 4})
             hdus.writeto(folder / name)
     return folder
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_own_files_follow_the_conventions(name, files):
+    require_conventions(files / name)
 
 
 @pytest.mark.parametrize("n", [FEW, pytest.param(MANY, marks=pytest.mark.long)])

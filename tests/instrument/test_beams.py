@@ -21,8 +21,8 @@ from lusee_bayes.instrument.beams.fields import (
 )
 from lusee_bayes.instrument.beams.luseepy_files import (
     BandLimitedGrid,
+    ScalarBeam,
     cardinal_functions,
-    rectangle_rule,
 )
 from lusee_bayes.instrument.products import auto_indices, to_matrix, to_real
 
@@ -244,7 +244,9 @@ def test_the_rectangle_rule():
     """sin(theta) dtheta over [0, pi / 2] by hand: the sum falls short by a twelfth of the step
     squared (Euler and Maclaurin) on top of half the last ring."""
     n = 91
-    grid = rectangle_rule(np.linspace(0.0, np.pi / 2, n), 180)
+    fields = np.ones((1, n, 180), dtype=complex)
+    beam = ScalarBeam("", np.ones(1), np.linspace(0.0, np.pi / 2, n), fields, fields, np.ones(1))
+    grid = beam.luseepy_grid
     step = np.pi / 180
     assert float(grid.integrate(np.ones((1, n, 180)))[0]) == pytest.approx(
         2 * np.pi * (1.0 + step / 2 - step**2 / 12), rel=1e-9

@@ -29,7 +29,6 @@ from lusee_bayes.instrument.pointing import (
     with_offsets,
 )
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.instrument.source_response import antenna_directions
 from lusee_bayes.noise.radiometer import paper_variance
 
 
@@ -218,7 +217,7 @@ def test_a_leaning_lander_by_hand():
     np.testing.assert_allclose(up, [0, np.sin(np.radians(3)), np.cos(np.radians(3))], atol=1e-15)
     # a source in the zenith is seen 3 degrees South of the antennas' own
     zenith = north.zenith_galactic()
-    seen_at = antenna_directions(north, zenith)[0]
+    seen_at = north.antenna_directions(zenith)[0]
     expected = [0, -np.sin(np.radians(3)), np.cos(np.radians(3))]
     np.testing.assert_allclose(seen_at, expected, atol=1e-12)
 

@@ -20,7 +20,7 @@ from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import from_healpy
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.instrument.beams.luseepy_files import CONVENTIONS
-from lusee_bayes.instrument.beams.monopoles import CapacitorReceiver, JFETReceiver, read_receiver
+from lusee_bayes.instrument.beams.source import CapacitorReceiver, JFETReceiver, read_receiver
 from lusee_bayes.instrument.products import labels, to_matrix, to_real
 from lusee_bayes.testing.scenarios import small_scenario
 
@@ -66,9 +66,10 @@ def simulated(luseepy, test_data, frequency, times, *, fixed_axis=False) -> np.n
         sky = dict(file)
     modes = from_healpy(sky["alm"][list(sky["freq"]).index(frequency)])
     observation = replace(lb.read_waterfall(path).observation.select(times), fixed_axis=fixed_axis)
-    beams = response.beams(frequency, LMAX, grid=response.luseepy_grid)
+    response = replace(response, luseepy_quadrature=True, moon_k=MOON)
+    beams = response.beams(frequency, LMAX)
     seen = np.asarray(lb.CouplingMatrix.observe(beams, observation) @ modes)
-    moon = response.background(frequency, MOON)
+    moon = response.background(frequency)
     return volts(response, frequency, seen.reshape(16, -1) + moon[:, None])
 
 
@@ -107,10 +108,10 @@ def test_other_conventions_are_noticed(luseepy, test_data):
     signs = np.array([-1.0 if label[-1] == "I" else 1.0 for label in labels()])
     mirrored = np.r_[0, -1 : -response.n_phi : -1]
     flipped = replace(
-        response, h_theta=response.h_theta[..., mirrored], h_phi=-response.h_phi[..., mirrored]
+        response, e_theta=response.e_theta[..., mirrored], e_phi=-response.e_phi[..., mirrored]
     )
-    unloaded = replace(response, receiver=None)
-    moonless = right - volts(response, 25.0, response.background(25.0, MOON)[:, None])[:, 0]
+    unloaded, warm = replace(response, receiver=None), replace(response, moon_k=MOON)
+    moonless = right - volts(response, 25.0, warm.background(25.0)[:, None])[:, 0]
     wrong = [
         signs * right,
         right[::-1],
@@ -126,10 +127,10 @@ def test_other_conventions_are_noticed(luseepy, test_data):
 def test_sky_and_moon_of_one_temperature_are_an_enclosure(luseepy):
     """Short dipoles over a half-space: 1 K of both gives autos of 1 K. The file's Rsky is luseepy's
     quadrature (half a ring at the horizon), 2 degrees between samples."""
-    response = luseepy[0]
-    for grid, tolerance in ((response.luseepy_grid, 1e-6), (None, 1e-3)):
-        sky = np.asarray(response.beams(10.0, 4, grid=grid).modes)[:, 0] * np.sqrt(4 * np.pi)
-        total = np.asarray(to_matrix(jnp.asarray(sky + response.background(10.0, 1.0))[:, None]))
+    for luseepys, tolerance in ((True, 1e-6), (False, 1e-3)):
+        response = replace(luseepy[0], moon_k=1.0, luseepy_quadrature=luseepys)
+        sky = np.asarray(response.beams(10.0, 4).modes)[:, 0] * np.sqrt(4 * np.pi)
+        total = np.asarray(to_matrix(jnp.asarray(sky + response.background(10.0))[:, None]))
         np.testing.assert_allclose(total[..., 0].diagonal().real, 1.0, rtol=tolerance)
 
 
@@ -206,7 +207,7 @@ def test_between_frequencies_as_luseepy_does(tmp_path):
         pairs = sum(np.einsum("ip,jp,pm->ijm", h[:, k], h[:, k].conj(), harmonics)
                     for h in images.values())  # fmt: skip
         open_.append(Boltzmann * VACUUM * (1e6 * mhz / c) ** 2 * pairs)
-    za = between(response.impedance, part)
+    za = between(response.impedance_ohm, part)
     zl = JFETReceiver().load(f)
     m = zl @ np.linalg.inv(za + zl)
     expected = np.einsum("ai,ijm,bj->abm", m, between(open_, part), m.conj())
@@ -217,8 +218,8 @@ def test_between_frequencies_as_luseepy_does(tmp_path):
     splined = replace(response, interpolation="spline")
     splined = volts(splined, f, splined.beams(f, 3).modes)
     assert np.abs(np.asarray(to_matrix(splined)) - expected).max() > 1e-2 * largest
-    warm = 4 * Boltzmann * 250.0 * m @ between(response.moon_resistance, part) @ m.conj().T
-    got = volts(response, f, response.background(f, 250.0)[:, None])
+    warm = 4 * Boltzmann * 250.0 * m @ between(response.moon_ohm, part) @ m.conj().T
+    got = volts(response, f, replace(response, moon_k=250.0).background(f)[:, None])
     close(to_matrix(got)[..., 0], warm, 1e-12)
     enclosure = 4 * Boltzmann * m @ ((za + za.conj().T) / 2) @ m.conj().T
     np.testing.assert_allclose(response.per_kelvin(f), enclosure.diagonal().real, rtol=1e-12)
@@ -259,7 +260,7 @@ def test_receivers(tmp_path):
     np.testing.assert_allclose(measured.load(21.0), zl, rtol=1e-13)
     refuse(r"zl.fits has values from 10 to 30 MHz, not at 31", measured.load, 31.0)
     response = replace(lb.read_beam(write(tmp_path / "response.fits")), receiver=measured)
-    za = 0.95 * response.impedance[1] + 0.05 * response.impedance[2]
+    za = 0.95 * response.impedance_ohm[1] + 0.05 * response.impedance_ohm[2]
     np.testing.assert_allclose(
         response.circuit(21.0).loading, zl @ np.linalg.inv(za + zl), rtol=1e-12
     )
@@ -274,7 +275,7 @@ def test_losses_emit_at_the_antennas_temperature(tmp_path):
     response = lb.read_beam(write(tmp_path / "response.fits", change=lossy))
     m = response.circuit(20.0).loading
     expected = 4 * Boltzmann * 300.0 * 0.5 * m @ m.conj().T
-    got = volts(response, 20.0, response.background(20.0, 0.0, 300.0)[:, None])
+    got = volts(response, 20.0, replace(response, antenna_k=300.0).background(20.0)[:, None])
     close(to_matrix(got)[..., 0], expected, 1e-9)
 
 
@@ -284,8 +285,8 @@ def test_open_ports_and_turns(tmp_path):
     np.testing.assert_array_equal(open_.circuit(20.0).loading, np.eye(4))
     # a quarter turn makes East North: each port takes the place of the next
     plain, turned = (
-        np.asarray(to_matrix(volts(open_, 20.0, open_.beams(20.0, 5, turn_deg=turn).modes)))
-        for turn in (0.0, 90.0)
+        np.asarray(to_matrix(volts(open_, 20.0, beam.beams(20.0, 5).modes)))
+        for beam in (open_, replace(open_, turntable_offset_deg=90.0))
     )
     place = [1, 2, 3, 0]
     expected = plain[np.ix_(place, place)]
@@ -323,7 +324,7 @@ def test_a_scenario_with_a_response_and_a_warm_moon(tmp_path):
     warm, cold = lb.build(small_scenario(*given, cycles=0.05)), lb.build(cold_scenario)
     setup, data = warm.setup, warm.data
     np.testing.assert_array_equal(setup.beams.modes, lb.read_beam(path).beams(20.0, 6).modes)
-    moon = np.asarray(lb.read_beam(path).background(20.0, 5e4))
+    moon = np.asarray(replace(lb.read_beam(path), moon_k=5e4).background(20.0))
     np.testing.assert_array_equal(setup.background, moon)
     np.testing.assert_array_equal(cold.setup.background, 0.0)
     added = np.asarray(setup.signal) - np.asarray(cold.setup.signal)

@@ -12,9 +12,8 @@ from scipy.special import eval_legendre
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.beams.fields import STOKES, stokes_pairs
-from lusee_bayes.instrument.beams.monopoles import beams_towards
+from lusee_bayes.instrument.beams.monopoles import beams_towards, source_response
 from lusee_bayes.instrument.products import labels, to_matrix
-from lusee_bayes.instrument.source_response import antenna_directions, source_response
 
 FREQUENCY = 25.0
 SHORT = lb.Monopoles(lb.Regolith(1.0, 1.0, 0.0), length_m=1e-3, zenith_angle_deg=90.0)  # free space
@@ -177,7 +176,7 @@ def test_directions_agree_with_lunartopo_and_the_turntable():
         colatitude, lon = galactic_directions(theta, turned, o.times[k], o.lon_deg, o.lat_deg)
         galactic = vectors(colatitude, lon)[0]
         # lunarsky goes through the same kernel; what is left is rounding of three rotations
-        within(antenna_directions(o, galactic)[k], vectors(theta, phi)[0], 1e-10)
+        within(o.antenna_directions(galactic)[k], vectors(theta, phi)[0], 1e-10)
 
 
 def smoothed_source(n0, sigma, lmax):
@@ -263,7 +262,7 @@ def test_the_circularly_polarised_part_enters_by_the_v_beam():
     intensity, half = (
         np.asarray(source_response(o, galactic, FREQUENCY, stokes_v=v)) for v in (0.0, 0.5)
     )
-    circular = beams_towards(FREQUENCY, antenna_directions(o, galactic), stokes="V")
+    circular = beams_towards(FREQUENCY, o.antenna_directions(galactic), stokes="V")
     np.testing.assert_allclose(half - intensity, 0.5 * circular, rtol=0, atol=1e-15)
     slope = jax.grad(lambda v: jnp.sum(source_response(o, galactic, FREQUENCY, stokes_v=v)[2]))(
         jnp.asarray(0.0)

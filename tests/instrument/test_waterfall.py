@@ -121,7 +121,7 @@ def test_any_subset_and_order_of_products(tmp_path):
         ({"header": HEADER | {"LUNAR_DAY": 9900}}, "outside the ephemeris"),
         ({"header": HEADER | {"LUNAR_DAY": 1.5}}, "is 1.5, expected text"),
         ({"pairs": [[0, 0], [0, 4]]}, "combinations holds a value outside 0 to 3: 4"),
-        ({"pairs": [[0, 1], [1, 0]]}, "the same pair of ports twice"),
+        ({"pairs": [[0, 1], [1, 0]]}, "the product 01R is given more than once"),
         ({"data": np.zeros((12, 15, 2))}, r"data has 15 products, expected 16"),
         ({"data": np.full((12, 16, 2), np.inf)}, "infinity"),
         ({"frequencies": (10e6, 20e6)}, "is this Hz"),
@@ -358,7 +358,7 @@ twice = np.array([[2461000.0, 0.5], [2461000.0, 0.5], [2461000.0, 0.6]])
     ("changes", "message"),
     [
         ({"products": ["13I", "13X"]}, "no product '13X'"),
-        ({"products": ["13I", "13I"]}, "the same product twice"),
+        ({"products": ["13I", "13I"]}, "the product 13I is given more than once"),
         ({"products": ["13I", "31R"]}, "no product '31R'"),
         ({"products": ["13I", "00R", "11R"]}, r"data has shape \(5, 2, 2\), expected 5 \(time\)"),
         ({"header": {"BUNIT": "K"}}, r"BUNIT is 'K'; known: V\^2/Hz"),

@@ -153,7 +153,7 @@ def test_a_prior_that_correlates_modes(kind):
     model, data, *_ = observed("few", kind)
     model = replace(model, prior=correlated(model.prior))
     assert model.is_structured
-    found = model.condition(data.data)
+    found = model.condition(data.data).posterior
     inverse, sky, u = by_matrices(model, data)
     a, s, n = matrices(model)
     answer = posterior(a, s, n, (sky + n) @ u)
@@ -205,7 +205,7 @@ def test_densities_of_groups_are_what_the_covariance_of_the_data_says():
         "product": [data.layout.product == j for j in range(16)],
         "day": [day == j for j in np.unique(day)],
     }
-    for found in held_out(model, model.condition(data.data), data):
+    for found in held_out(model.condition(data.data), data):
         chosen = groups.pop(found.kind)
         expected = sum(log_density(every) - log_density(~inside) for inside in chosen)
         assert (found.groups, found.n) == (len(chosen), len(less))

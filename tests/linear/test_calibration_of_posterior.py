@@ -19,7 +19,7 @@ from scipy.stats import chi2, kstest
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.linear.solver import FORMS
+from lusee_bayes.linear.linear_gaussian import InData, InMap, Whitened
 
 LMAX, N_MODES, N_DRAWS, SEED = 8, 81, 4000, 20270115
 SPECTRUM = 1e8 * (1.0 + np.arange(LMAX + 1.0)) ** -2.5  # K^2; the monopole is 20000 K below
@@ -57,13 +57,15 @@ class Setup:
         added = rng.normal(size=(N_DRAWS, noise.size)) @ root.T
         return skies, skies @ np.asarray(self.coupling.dense()).T + added
 
-    def standardised(self, truth: lb.Covariance, assumed: lb.Covariance, form: str) -> np.ndarray:
+    def standardised(
+        self, truth: lb.Covariance, assumed: lb.Covariance, form: type[Whitened]
+    ) -> np.ndarray:
         """C^-1/2 (m - mean), shape (draws, modes), of data with noise ``truth``."""
         skies, data = self.simulate(truth)
         prior = lb.HarmonicPrior(jnp.asarray(SPECTRUM))
         solver = lb.LinearGaussian(self.coupling, prior, assumed).factorise(form)
-        means = jax.jit(jax.vmap(lambda d: solver.condition(d).mean))(jnp.asarray(data))
-        covariance = np.asarray(solver.condition(jnp.asarray(data[0])).covariance())
+        means = jax.jit(jax.vmap(lambda d: solver.condition(d).posterior.mean))(jnp.asarray(data))
+        covariance = np.asarray(solver.condition(jnp.asarray(data[0])).posterior.covariance())
         # in units of the prior: the monopole's variance is 1e-10 of it, the rest of order one
         root = np.linalg.cholesky(covariance / np.outer(PRIOR_STD, PRIOR_STD))
         return np.linalg.solve(root, ((skies - np.asarray(means)) / PRIOR_STD).T).T
@@ -81,14 +83,14 @@ def run_of(cycles: float) -> Setup:
 
 
 KINDS = ["paper", "exact", "dense", "diagonal+dense"]
-FEWER = [("map", "exact"), ("data", "exact"), ("data", "diagonal+dense")]
+FEWER = [(InMap, "exact"), (InData, "exact"), (InData, "diagonal+dense")]
 
 
 @pytest.mark.long
 @pytest.mark.essential
 @pytest.mark.parametrize(
     ("cycles", "form", "noise"),
-    [*product([0.1], FORMS, KINDS), *((0.015, form, noise) for form, noise in FEWER)],
+    [*product([0.1], [InMap, InData], KINDS), *((0.015, form, noise) for form, noise in FEWER)],
 )
 def test_the_posterior_covers_the_truth(cycles, form, noise):
     setup = run_of(cycles)
@@ -106,9 +108,9 @@ def test_the_same_check_notices_wrong_posteriors():
     blocks = np.array(exact.blocks)
     blocks[3] = np.diag(np.diag(blocks[3]))
     wrong = lb.TimeBlockCovariance(jnp.asarray(blocks), exact.layout)
-    assert p_value(setup.standardised(exact, wrong, "map")) < 1e-4
+    assert p_value(setup.standardised(exact, wrong, InMap)) < 1e-4
     with_gains, paper = setup.noise["diagonal+dense"], setup.noise["paper"]
-    assert p_value(setup.standardised(with_gains, paper, "map")) < 1e-100
+    assert p_value(setup.standardised(with_gains, paper, InMap)) < 1e-100
 
 
 # --- the full size: 5232 data, 2304 modes ---------------------------------------------------------
@@ -134,7 +136,7 @@ def test_both_forms_agree_at_the_fiducial_condition_number(form):
     scenario = lb.load_scenario("fiducial", [f"noise.radiometer.form={form}"])
     experiment = lb.build(scenario)
     model, data = full_model(experiment.setup), experiment.data
-    by_map, by_data = (model.condition(data.data, form=f) for f in ("map", "data"))
+    by_map, by_data = (model.condition(data.data, form=f).posterior for f in (InMap, InData))
     std = np.asarray(by_data.std())
     # the mean is refined to 1e-9 sigma in both; variances of the map form lose eps times their
     # inflation, about 1e-6 (Posterior.std)

@@ -17,6 +17,7 @@ from scipy.stats import multivariate_normal, ortho_group
 
 import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_host
+from lusee_bayes.linear.linear_gaussian import Form, FromInformation, InData, InMap
 from lusee_bayes.linear.posterior import Posterior, pixel_std, prior_pixel_std
 from lusee_bayes.runs.plan_run import informed_modes
 
@@ -46,16 +47,16 @@ def problem(n_data: int, *, turned: bool) -> tuple[lb.LinearGaussian, np.ndarray
 
 
 @lru_cache
-def solved(n_data: int, form: str, *, turned: bool) -> Posterior:
+def solved(n_data: int, form: type[Form], *, turned: bool) -> Posterior:
     model, data = problem(n_data, turned=turned)
-    return model.condition(jnp.asarray(data), form)
+    return model.condition(jnp.asarray(data), form).posterior
 
 
-SIZES = [(40, "map"), (40, "root"), (40, "structured"), (12, "data"), (12, "structured")]
+SIZES = [(40, InMap), (40, FromInformation), (12, InData), (12, FromInformation)]
 
 
 @pytest.mark.parametrize(
-    ("n_data", "form"), [(40, "map"), pytest.param(12, "data", marks=pytest.mark.long)]
+    ("n_data", "form"), [(40, InMap), pytest.param(12, InData, marks=pytest.mark.long)]
 )
 def test_a_turned_problem_has_the_turned_posterior(n_data, form):
     found, expected = (solved(n_data, form, turned=turned) for turned in (True, False))
@@ -100,7 +101,7 @@ def test_densities_and_coordinates():
     data = jnp.asarray(data)
     marginal = lb.Marginal(model).log_prob(data)
     np.testing.assert_allclose(marginal, model.log_prob(data), rtol=1e-12)
-    found = model.condition(data)
+    found = model.condition(data).posterior
     sign, log_det = np.linalg.slogdet(np.asarray(found.covariance()))
     assert sign == 1.0
     np.testing.assert_allclose(lb.Whitening.of(found).log_det, 0.5 * log_det, rtol=CLOSE)

@@ -14,6 +14,7 @@ from scipy.stats import multivariate_normal
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
+from lusee_bayes.linear.linear_gaussian import InData
 from lusee_bayes.systematics.context import Around
 
 N = 9
@@ -38,7 +39,7 @@ def random_parts():
 def test_likelihoods_and_sums_are_those_of_matrices():
     models, data = random_parts()
     skies = np.random.default_rng(5).normal(size=(6, N))
-    parts = [model.inform(d)[0] for model, d in zip(models, data, strict=True)]
+    parts = [model.condition(d).information for model, d in zip(models, data, strict=True)]
     expected = []
     for m, d in zip(models, data, strict=True):
         left = np.asarray(d) - np.array([m.predict(sky) for sky in skies])
@@ -64,7 +65,7 @@ PRIORS = {
 @pytest.mark.parametrize("kind", PRIORS)
 def test_the_posterior_of_a_sum_is_that_of_all_data(kind):
     models, data = random_parts()
-    first, second = (model.inform(d)[0] for model, d in zip(models, data, strict=True))
+    first, second = (m.condition(d).information for m, d in zip(models, data, strict=True))
     total = second + first
     a = np.concatenate([np.asarray(model.coupling.dense()) for model in models])
     noise = block_diag(*(np.asarray(model.noise.dense()) for model in models))
@@ -86,10 +87,10 @@ def test_the_posterior_of_a_sum_is_that_of_all_data(kind):
 
 def test_information_about_other_modes_is_not_added():
     models, data = random_parts()
-    whole, _ = models[0].inform(data[0])
+    whole = models[0].condition(data[0]).information
     coupling = lb.DenseCoupling(models[0].coupling.dense()[:, :4])
     prior = lb.HarmonicPrior(jnp.asarray(SPECTRUM[:2]))
-    few, _ = replace(models[0], coupling=coupling, prior=prior).inform(data[0])
+    few = replace(models[0], coupling=coupling, prior=prior).condition(data[0]).information
     refuse("the other reference sky", add, whole, few)
     refuse("needs a prior over the same modes", whole.posterior, prior)
 
@@ -102,9 +103,10 @@ def test_a_second_cycle_at_full_size(exact_tilt):
     data, parts = experiment.data, [of_run(experiment.data, run) for run in (0, 1)]
     models = [full_model(lb.build(scenario, part).setup, Around(part)) for part in parts]
     whole = full_model(experiment.setup, Around(data))
-    first, second = (model.inform(part.data)[0] for model, part in zip(models, parts, strict=True))
+    each = zip(models, parts, strict=True)
+    first, second = (model.condition(part.data).information for model, part in each)
     got = (second + first).posterior(whole.prior)
-    expected = whole.condition(data.data, form="root")
+    expected = whole.condition(data.data, InData).posterior
     # the mean's last step may be 1e-6 standard deviations, and the gradient of the earlier data at
     # the mean of the later ones is a small difference; variances lose 1e-6 (Posterior)
     assert_same_map(got, expected, 1e-5)

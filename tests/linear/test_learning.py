@@ -33,7 +33,7 @@ def information_of(sky, noise=30.0, seed=2, n_data=N_DATA, strength=1.0) -> lb.I
     data = coupling @ sky + noise * rng.standard_normal(n_data)
     prior = lb.HarmonicPrior(np.full(round(np.sqrt(len(sky))), 1e8))
     variance = lb.DiagonalCovariance(np.full(n_data, noise**2))
-    return lb.LinearGaussian(coupling, prior, variance).inform(data)[0]
+    return lb.LinearGaussian(coupling, prior, variance).condition(data).information
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,9 @@ def test_raised_information_is_that_of_raised_noise():
     coupling, data = rng.standard_normal((N_DATA, n)), 100.0 * rng.standard_normal(N_DATA)
     prior = lb.HarmonicPrior(np.full(LMAX + 1, 1e4))
     noise = (lb.DiagonalCovariance(np.full(N_DATA, variance)) for variance in (9.0, 63.0))
-    plain, expected = (lb.LinearGaussian(coupling, prior, n).inform(data)[0] for n in noise)
+    plain, expected = (
+        lb.LinearGaussian(coupling, prior, n).condition(data).information for n in noise
+    )
     raised, sky = plain.raised(7.0), rng.standard_normal(n)
     np.testing.assert_allclose(raised.matrix, expected.matrix, rtol=1e-12)
     assert float(raised.chi2(sky)) == pytest.approx(float(expected.chi2(sky)), rel=1e-10)

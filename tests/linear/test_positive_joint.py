@@ -19,7 +19,7 @@ from lusee_bayes.linear.positive_joint import (
     positive_sky,
 )
 from lusee_bayes.sky.positive_skies import FieldLaws, PositiveSkies
-from lusee_bayes.sky.template import Template
+from lusee_bayes.sky.sky_source import Template
 
 LMAX = 3
 N = n_modes(LMAX)
@@ -77,7 +77,7 @@ def observed(skies, laws, seed=0, noise=0.05, n_data=40):
 def information_of(a, sigma, d, wide):
     prior = lb.HarmonicPrior(jnp.full(LMAX + 1, wide))
     noise = lb.DiagonalCovariance(jnp.asarray(sigma**2))
-    return lb.LinearGaussian(jnp.asarray(a), prior, noise).inform(jnp.asarray(d))[0]
+    return lb.LinearGaussian(jnp.asarray(a), prior, noise).condition(jnp.asarray(d)).information
 
 
 def rough(skies, level=0.3):

@@ -28,8 +28,9 @@ from lusee_bayes.judge.measures import (
     signal_to_noise,
 )
 from lusee_bayes.linear import posterior as posterior_module
-from lusee_bayes.linear.solver import FORMS
+from lusee_bayes.linear.linear_gaussian import FromInformation, InData, InMap
 
+FORMS = (InMap, InData, FromInformation)
 SPECTRUM = np.array([4.0, 1.0, 0.5, 0.25])
 PER_MODE = np.repeat(SPECTRUM, [1, 3, 5, 7])
 SIZES = [30, 9]  # more and fewer data than the 16 modes
@@ -53,7 +54,7 @@ def problem(n_data, prior=None, blind=False):
 def conditioned(n_data, form, prior=None, blind=False):
     """The posterior, and the naive one."""
     model, d = problem(n_data, prior, blind)
-    return model.condition(d, form), posterior(*matrices(model), d)
+    return model.condition(d, form).posterior, posterior(*matrices(model), d)
 
 
 cases = pytest.mark.parametrize(("n_data", "form"), [(n, f) for n in SIZES for f in FORMS])
@@ -74,7 +75,7 @@ def test_what_it_says_of_itself(n_data, form):
 
 
 def test_std_of_does_not_depend_on_the_chunks(monkeypatch):
-    post, _ = conditioned(30, "map")
+    post, _ = conditioned(30, InMap)
     directions = jnp.asarray(np.random.default_rng(0).normal(size=(23, 16)))
     whole = np.asarray(post.std_of(directions))
     monkeypatch.setattr(posterior_module, "CHUNK", 5)  # 4 chunks of 5 and one of 3
@@ -92,7 +93,7 @@ def test_draws_have_the_posteriors_mean_and_covariance(n_data, form):
 
 
 def test_the_draw_test_notices_sqrt_two():
-    post, expected = conditioned(30, "map")
+    post, expected = conditioned(30, InMap)
     draws = np.asarray(post.sample(jax.random.key(0), 20_000))
     narrow = expected.mean + (draws - expected.mean) / np.sqrt(2)
     with pytest.raises(AssertionError, match="sample covariance off"):
@@ -149,7 +150,7 @@ def test_whitening_inverts_mean_plus_root_times_z(n_data, form):
 
 def test_whitening_in_a_traced_program():
     """Under jit the spectrum's values are not known; the check of them must not get in the way."""
-    post, _ = conditioned(9, "data")
+    post, _ = conditioned(9, InData)
     skies = post.sample(jax.random.key(6), 3)
     traced = jax.jit(lambda posterior, x: posterior.whiten(x))(post, skies)
     np.testing.assert_allclose(traced, post.whiten(skies), atol=TOL)
@@ -202,7 +203,7 @@ def test_expected_chi2_and_prior_fraction_per_ell():
     rng = np.random.default_rng(5)
     a, variance = rng.standard_normal((60, 16)), rng.uniform(0.5, 2.0, 60)
     noise, prior = (lb.DiagonalCovariance(jnp.asarray(variance)), lb.HarmonicPrior(SPECTRUM))
-    post = lb.LinearGaussian(jnp.asarray(a), prior, noise).condition(jnp.zeros(60))
+    post = lb.LinearGaussian(jnp.asarray(a), prior, noise).condition(jnp.zeros(60)).posterior
     inverse = np.linalg.inv(a * PER_MODE @ a.T + np.diag(variance))
     assert expected_chi2(post, 60) == pytest.approx(variance @ np.diag(inverse), rel=1e-10)
     left = 1.0 - np.einsum("di,de,ei->i", a, inverse, a) * PER_MODE
@@ -234,6 +235,6 @@ def test_rows_of_the_resolution_are_what_the_map_shows_of_each_source():
         solver = model.factorise(form)
         y, sources = np.random.default_rng(4).normal(size=(2, 5, 16))
         seen = (model.coupling @ jnp.asarray(source) for source in sources)
-        mapped = np.array([solver.condition(one).mean for one in seen])
-        rows = resolution_rows(solver.condition(data), y)
+        mapped = np.array([solver.condition(one).posterior.mean for one in seen])
+        rows = resolution_rows(solver.condition(data).posterior, y)
         np.testing.assert_allclose(rows @ sources.T, y @ mapped.T, atol=TOL)

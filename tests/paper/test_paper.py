@@ -8,7 +8,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 import xarray as xr
-from assertions import refuse
+from assertions import refuse, require_conventions
 from astropy import units as u
 from astropy.coordinates import SkyCoord
 from commands import table_of
@@ -28,7 +28,7 @@ TINY = ["lmax=6", "observation.step_s=43200"]
 def made_up(name, scenario):
     """A case as it is kept, of numbers that agree with the paper."""
     return synthetic(name, agrees=True).assign_attrs(
-        format=formats.PAPER_CASE, version=paper.__version__, scenario=scenario.to_yaml(),
+        **formats.header(formats.PAPER_CASE), scenario=scenario.to_yaml(),
         frequency_mhz=scenario.frequency_mhz, log_evidence=1.0, chi2=2.0, chi2_expected=3.0,
     )  # fmt: skip
 
@@ -100,6 +100,7 @@ def test_claims_have_every_column_filled(folder):
 def test_a_real_run_at_tiny_size(tmp_path):
     files = runs.run_paper(tmp_path, TINY).files
     assert all(path.is_file() for path in files)
+    require_conventions(tmp_path / "cases" / "fiducial.nc")
     rows = table_of(tmp_path / "cases.csv")
     assert float(rows[0]["rho_1"]) > 0.9  # one cycle knows the dipole
     assert rows[0]["rho_10"] == "beyond"
@@ -144,7 +145,7 @@ def test_only_what_changed_is_computed_again(four, tmp_path, computed, monkeypat
     assert computed[2:] == [changed]
     assert not np.array_equal(first["noise_x10"]["mean"], again["noise_x10"]["mean"])
     # numbers of another version of the package are not taken over
-    monkeypatch.setattr(paper, "__version__", "0.0.0")
+    monkeypatch.setattr(formats, "__version__", "0.0.0")
     monkeypatch.setattr(paper, "CASES", dict(list(paper.CASES.items())[:1]))
     run_cases(tmp_path)
     assert len(computed) == 4
@@ -253,6 +254,6 @@ def synthetic(name: str, agrees: bool) -> xr.Dataset:
 @pytest.mark.parametrize("agrees", [True, False])
 def test_every_claim_can_come_out_both_ways(agrees):
     cases = {name: synthetic(name, agrees) for name in paper.CASES}
-    verdicts = {claim.statement: claim.judge(cases) for claim in CLAIMS}
+    verdicts = {claim.paper: claim.verdict(cases) for claim in CLAIMS}
     wrong = {s: v for s, v in verdicts.items() if (v.agrees == "yes") != agrees}
     assert not wrong

@@ -14,8 +14,7 @@ from lusee_bayes.experiment.experiment import build, under_sky
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.judge.coverage import Counts, Coverage
 from lusee_bayes.judge.levels import LEVELS
-from lusee_bayes.sky.sky_files import write_alms
-from lusee_bayes.sky.sky_source import FileSource, GalaxySource
+from lusee_bayes.sky.sky_source import FileSource, GalaxySource, write_alms
 from lusee_bayes.testing.scenarios import small_scenario
 
 NSIDE, LMAX = 8, 6

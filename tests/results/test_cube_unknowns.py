@@ -5,14 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from experiments import four_ports
+from experiments import four_ports, unknowns_report
 from matplotlib.figure import Figure
 from reference_linear import white_posterior
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import per_mode
 from lusee_bayes.experiment.model import radiometer
-from lusee_bayes.experiment.unknowns import unknowns_report
 from lusee_bayes.report.map_page import map_page
 from lusee_bayes.runs import map_run
 from lusee_bayes.runs.channels import map_channels

@@ -21,6 +21,7 @@ from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.products import all_products
 from lusee_bayes.judge.measures import ell_cross
+from lusee_bayes.linear.linear_gaussian import InMap
 from lusee_bayes.results.forecast import Variation, forecast_rows
 from lusee_bayes.runs import plan_run
 from lusee_bayes.runs.plan_run import (
@@ -60,7 +61,7 @@ def simulated(variation):
     signals = skies @ model.coupling.dense().T
     keys = jax.random.split(jax.random.key(4), N_SETS)
     noise = map(model.noise.sample, keys)
-    posteriors = [solver.condition(s + n) for s, n in zip(signals, noise, strict=True)]
+    posteriors = [solver.condition(s + n).posterior for s, n in zip(signals, noise, strict=True)]
     means = np.stack([np.asarray(p.mean) for p in posteriors])
     return model, posteriors[0], np.asarray(skies), means
 
@@ -158,7 +159,7 @@ def test_an_ell_that_is_not_seen_and_one_without_power():
     a = jnp.eye(9)[:4]
     prior = lb.HarmonicPrior(jnp.asarray([0.0, 3.0, 2.0]))
     model = lb.LinearGaussian(a, prior, lb.DiagonalCovariance(jnp.ones(4)))
-    found = expected_snr_squared(model.factorise("map").condition(jnp.zeros(4)))
+    found = expected_snr_squared(model.factorise(InMap).condition(jnp.zeros(4)).posterior)
     assert np.isnan(found[0])
     np.testing.assert_allclose(found[1:], [3.0, 0.0], atol=1e-15)
 

@@ -11,7 +11,7 @@ from experiments import mapped
 import lusee_bayes as lb
 from lusee_bayes.experiment.rounds import NAMED
 from lusee_bayes.experiment.setup import set_up
-from lusee_bayes.sky.sky_files import write_alms
+from lusee_bayes.sky.sky_source import write_alms
 from lusee_bayes.testing.scenarios import small_scenario
 
 SIZES = {"lmax": 8, "cycles": 0.15}

@@ -12,19 +12,18 @@ from commands import posterior_of, refused, run, sky_draws_of, table_of
 from experiments import channels_of
 
 import lusee_bayes as lb
-from lusee_bayes.core import engines as engine_module
+from lusee_bayes.core import engine as engine_module
 from lusee_bayes.core.engine import ThisProcess
 from lusee_bayes.core.harmonics import modes_to_map, n_modes
 from lusee_bayes.core.reading import read_model
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.experiment.positive import lmax_of_fields, positive_skies
 from lusee_bayes.judge.measures import signal_to_noise
 from lusee_bayes.results.summaries import MapSummary
 from lusee_bayes.runs import channels, map_run
 from lusee_bayes.runs import folder as folder_module
 from lusee_bayes.runs.channels import map_channels
 from lusee_bayes.sampling.datatree import read_datatree
-from lusee_bayes.sky.sky_files import SkyCube
+from lusee_bayes.sky.sky_source import SkyCube
 from lusee_bayes.systematics.context import Around
 
 SMALL = ["--set", "lmax=4", "--set", "observation.runs.0.cycles=0.1"]
@@ -63,7 +62,7 @@ def test_independent_channels_are_maps_of_each_frequency(independent):
         experiment = lb.build(lb.load_scenario("fiducial", settings))
         data = experiment.data
         model = full_model(experiment.setup, Around(data))
-        expected = model.condition(data.data)
+        expected = model.condition(data.data).posterior
         here = channels.dataset.isel(frequency=number)
         assert_same_map(here, expected, 1e-6)
         np.testing.assert_array_equal(here["truth"], np.asarray(data.truth))
@@ -268,7 +267,8 @@ def test_files_of_a_run_agree_with_each_other(tmp_path, capsys):
     units = [channels[name].attrs["units"] for name in ("component_mean", "mean")]
     assert units == ["1", "K"]
     assert channels["component_mean"].shape == (2, n_modes(6))  # 1.5 times the maps' lmax
-    skies = positive_skies(scenario_of("spectral.sources=false"))
+    scenario = scenario_of("spectral.sources=false")
+    skies = scenario.spectral.positive_skies(scenario.frequencies_mhz, scenario.lmax)
     exponents = channels["mixing"].values @ channels["component_mean"].values
     for k, draws in enumerate(sky_draws_of(tmp_path / "out")):
         assert (skies.values(k, exponents[k]) > 0).all()
@@ -308,5 +308,6 @@ def test_joint_maps_of_low_frequencies_are_no_worse_than_independent_ones(tmp_pa
 
 
 def test_bad_input_is_refused_in_a_sentence():
-    refuse(r"lmax 80 have 13122 unknowns.*use lmax=69", lmax_of_fields, scenario_of("lmax=80"))
-    assert lmax_of_fields(scenario_of("lmax=60")) == 69
+    lmax_of_fields = scenario_of().spectral.lmax_of_fields
+    refuse(r"lmax 80 have 13122 unknowns.*use lmax=69", lmax_of_fields, 80)
+    assert lmax_of_fields(60) == 69

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 import lusee_bayes as lb
 from lusee_bayes.core.reading import parse_yaml
-from lusee_bayes.experiment.flight_data import reduce_files
+from lusee_bayes.experiment.data_files import reduce_files
 from lusee_bayes.flight.reduced import read_reduced, write_reduced
 from lusee_bayes.flight.session_files import read_session
 from lusee_bayes.report.figures.judgement import calibration

@@ -12,7 +12,7 @@ from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.results.sample_result import SampleResult
 from lusee_bayes.runs.sample_run import coordinates
 from lusee_bayes.sampling.programs import numpyro_promotion
-from lusee_bayes.sky import log_normal
+from lusee_bayes.sky import positive_skies
 from lusee_bayes.testing.scenarios import small_scenario
 
 LMAX = 4
@@ -25,7 +25,7 @@ WIDER = np.array([1.3, 1.3, *np.ones(n_modes(LMAX))])
 def coarse_grid():
     """A grid that resolves products of these lmax, of a template that need not be exact."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(log_normal, "LEAST_GRID", 24)
+        patch.setattr(positive_skies, "LEAST_GRID", 24)
         yield
 
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
-from assertions import refuse
+from assertions import refuse, require_conventions
 from reference_linear import assert_draws_follow, matrices, random_covariance
 from reference_linear import posterior as naive_posterior
 
@@ -61,7 +61,7 @@ def chains_of(sites):
 def drawn(setting):
     """(tree, chains) of the program sky."""
     model, data = setting
-    posterior = model.condition(data.data)
+    posterior = model.condition(data.data).posterior
     skies = np.asarray(posterior.sample(jax.random.key(3), N_CHAINS * N_DRAWS))
     chains = chains_of({"sky": skies.reshape(N_CHAINS, N_DRAWS, N_MODES)})
     tree = to_datatree(
@@ -78,7 +78,7 @@ def collapsed(setting):
     levels = np.exp(np.random.default_rng(8).uniform(-2.3, 2.3, (N_CHAINS, N_DRAWS)))
     chains = chains_of({"noise_level": levels})
     tree = to_datatree(
-        chains, lb.load_program("sky_marginal"), model, model.condition(data.data), data,
+        chains, lb.load_program("sky_marginal"), model, model.condition(data.data).posterior, data,
         n_predictive=N_CHAINS * N_DRAWS,
     )  # fmt: skip
     return tree, chains
@@ -150,7 +150,7 @@ def test_units_are_written_on_what_has_them(drawn):
     tree, _ = drawn
     for group in tree.children.values():
         for name, values in group.data_vars.items():
-            assert values.attrs.get("units") == (None if name in STATISTICS else "K"), name
+            assert values.attrs.get("units") == ("1" if name in STATISTICS else "K"), name
 
 
 def test_constants_against_the_textbook(drawn, setting, exact):
@@ -187,7 +187,7 @@ def test_posterior_predictive_follows_the_posterior(drawn, setting, exact):
 def test_predictive_groups_are_thinned_and_know_which_draws_they_belong_to(setting):
     """4 x 30 draws to about 10: every twelfth."""
     model, data = setting
-    posterior = model.condition(data.data)
+    posterior = model.condition(data.data).posterior
     skies = np.asarray(posterior.sample(jax.random.key(1), 120)).reshape(4, 30, N_MODES)
     program = lb.load_program("sky")
     # noise a million times smaller than the sky tells which sky the data belong to
@@ -211,7 +211,7 @@ def test_predictive_groups_are_thinned_and_know_which_draws_they_belong_to(setti
 def test_another_seed_makes_other_predictive_draws_and_real_data_have_no_truth(setting):
     model, data = setting
     real = lb.Visibilities(data.data, data.layout, data.observation, 25.0)
-    posterior = model.condition(data.data)
+    posterior = model.condition(data.data).posterior
     chains = chains_of({"sky": np.asarray(posterior.sample(jax.random.key(1), 8))[None]})
     first, other = (
         to_datatree(chains, lb.load_program("sky"), model, posterior, d, seed=seed, n_predictive=8)
@@ -294,6 +294,11 @@ def test_arviz_reads_the_tree(drawn):
     assert (np.abs(table["ess_bulk"] / skies[..., 0].size - 1) < 0.3).all()
     # 2000 independent draws of 4 chains: R-hat - 1 of order 1 / 500
     assert (table["r_hat"] < 1.01).all()
+
+
+def test_files_follow_the_conventions(drawn, tmp_path):
+    drawn[0].to_netcdf(tmp_path / "samples.nc", engine="h5netcdf")
+    require_conventions(tmp_path / "samples.nc")
 
 
 def test_files_that_are_no_samples_are_refused(setting, tmp_path):

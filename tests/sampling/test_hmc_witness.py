@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers
+from lusee_bayes.linear.linear_gaussian import InMap
 from lusee_bayes.sampling.hmc import Chains, Sampler, Whitening, sample
 from lusee_bayes.sampling.validation import Comparison, validate_draws
 
@@ -97,7 +98,7 @@ class Witness:
             prior or self.model.prior,
             lb.DenseCovariance(jnp.asarray(noise[keep][:, keep])),
         )
-        return model.condition(self.data.data[keep], "map")
+        return model.condition(self.data.data[keep], InMap).posterior
 
     def scaled(self, weight: np.ndarray) -> np.ndarray:
         """N with the rows and columns of every datum multiplied by ``weight``."""

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from assertions import refuse
 from scipy import optimize
 
 import lusee_bayes as lb
@@ -22,8 +23,8 @@ from lusee_bayes.sampling.log_normal_program import (
     straight_coordinates,
 )
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
-from lusee_bayes.sky.log_normal import LogNormalSky, deviation_spectrum
-from lusee_bayes.sky.template import EmbeddedTemplate
+from lusee_bayes.sky.positive_skies import LogNormalSky, deviation_spectrum
+from lusee_bayes.sky.sky_source import EmbeddedTemplate
 
 MHZ, LMAX, TILTED = 25.0, 3, -2.0
 LEVEL = np.array([4.0 * np.pi])
@@ -109,7 +110,8 @@ def test_the_gradient_vanishes_at_the_mode():
     sky, given = on_device((found.sky, found.information))
 
     def energy(u):
-        return 0.5 * (given.chi2(sky.modes(u)) + u @ u)
+        shift = sky.modes(u) - given.reference
+        return 0.5 * (shift @ (given.matrix @ shift) - 2.0 * given.vector @ shift + u @ u)
 
     slope = np.asarray(jax.jit(jax.grad(energy))(jnp.asarray(found.white)))
     # H^-1 measures it in standard deviations
@@ -177,8 +179,9 @@ def test_the_learned_spectrum_has_the_highest_evidence_and_its_curvature():
     top = log_posterior(best)
     for direction in np.linalg.cholesky(found.covariance).T:
         up, down = log_posterior(best + direction), log_posterior(best - direction)
-        # a parabola with this covariance falls by 1/2 on both sides
-        assert 0.5 * (up + down) - top == pytest.approx(-0.5, abs=0.1)
+        # a parabola of the Fisher information falls by 1/2; of 16 modes what these data say differs
+        # from it by sqrt(2 / 16) of that: two standard deviations
+        assert 0.5 * (up + down) - top == pytest.approx(-0.5, abs=0.35)
         assert 0.5 * (up - down) == pytest.approx(0.0, abs=0.1)
 
 
@@ -186,14 +189,10 @@ def test_the_learned_spectrum_has_the_highest_evidence_and_its_curvature():
 
 
 def test_refusals():
-    with pytest.raises(lb.InputError, match="the information has shape"):
-        find_mode(log_normal(0.1, lmax=2), information())
-    with pytest.raises(
-        lb.InputError, match="amplitude of the logarithm of the sky must be positive"
-    ):
-        LogNormalPrior.of(log_normal(0.1), 0.0, TILTED)
-    with pytest.raises(lb.InputError, match="standard deviation of the tilt must be positive"):
-        LogNormalPrior.of(log_normal(0.1), 0.1, TILTED, (1.0, 0.0))
+    refuse("the information has shape", find_mode, log_normal(0.1, lmax=2), information())
+    sky = log_normal(0.1)
+    refuse("amplitude of the logarithm of the sky", LogNormalPrior.of, sky, 0.0, TILTED)
+    refuse("of ln A or of the tilt must be", LogNormalPrior.of, sky, 0.1, TILTED, (1.0, 0.0))
 
 
 @pytest.mark.parametrize("widths", [None, (0.7, 0.5)])

@@ -194,11 +194,11 @@ def burst():
         layout=layout,
         gaussian=gaussian,
         dirty=dirty,
-        clean=gaussian.condition(np.asarray(clean.data.data)),
-        naive=gaussian.condition(dirty),
-        good=good,
+        clean=gaussian.condition(np.asarray(clean.data.data)).posterior,
+        naive=gaussian.condition(dirty).posterior,
+        good=good.posterior,
         chains=chains,
-        skies=chains.sites["sky"].reshape(-1, good.mean.shape[0]),
+        skies=chains.sites["sky"].reshape(-1, good.model.prior.size),
     )
 
 

@@ -24,8 +24,16 @@ from lusee_bayes.core.harmonics import (
 )
 from lusee_bayes.report.describe import describe
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
-from lusee_bayes.sky.sky_files import SkyAlms, SkyCube, SkyMap, write_alms
-from lusee_bayes.sky.sky_source import SKY_READERS, FileSource, GalaxySource, read_sky_file
+from lusee_bayes.sky.sky_source import (
+    SKY_READERS,
+    FileSource,
+    GalaxySource,
+    SkyAlms,
+    SkyCube,
+    SkyMap,
+    read_sky_file,
+    write_alms,
+)
 from lusee_bayes.testing.contracts import assert_refused, check_sky_source
 
 NSIDE, LMAX = 16, 8
@@ -242,7 +250,7 @@ BAD_MAPS = [
     ("COORDSYS is C, expected G", lambda to, x: write_fits(to, x, coord="C")),
     ("NaN or infinity: nan at .7", lambda to, x: write_fits(to, with_one(x, np.nan))),
     ("1 of 3072 pixels are UNSEEN", lambda to, x: write_fits(to, with_one(x, healpy.UNSEEN))),
-    ("unit is 'Jy', expected a temperature", lambda to, x: write_fits(to, x, "Jy")),
+    ("has the unit 'Jy', expected one of K", lambda to, x: write_fits(to, x, "Jy")),
     ("neither HDF5 nor FITS", lambda to, x: to.write_text("not a map")),
     ("did you mean 'smooth_absorp'", lambda to, x: write_hdf5(to, smooth_absorp=x)),
     ("not a HEALPix map", lambda to, x: write_hdf5(to, smooth_absorb=x[:-1])),

@@ -11,7 +11,7 @@ from dataclasses import replace
 import equinox as eqx
 import numpy as np
 import pytest
-from experiments import draw_within, four_ports
+from experiments import draw_within, four_ports, unknowns_report
 from numpyro import handlers
 from scipy import stats
 
@@ -20,7 +20,7 @@ from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.experiment.model import full_model, simulate, true_values
 from lusee_bayes.experiment.rounds import settled
 from lusee_bayes.experiment.setup import Setup, set_up
-from lusee_bayes.experiment.unknowns import SKY, unknowns_report
+from lusee_bayes.experiment.unknowns import SKY
 from lusee_bayes.judge.levels import LEVELS
 from lusee_bayes.linear.amplitudes import template_amplitudes
 from lusee_bayes.sampling.hmc import Sampler
@@ -155,7 +155,9 @@ def marginalised(arguments, data):
     around = data
     for _ in range(4):
         seen = drifts.layout.scatter(around)
-        posterior = replace(drifts, visibilities=seen).marginalised(gaussian).condition(data)
+        posterior = (
+            replace(drifts, visibilities=seen).marginalised(gaussian).condition(data).posterior
+        )
         around = gaussian.predict(posterior.mean)
     return posterior
 
@@ -265,7 +267,7 @@ def test_simulation_based_calibration(response_file):
         setup, experiment = drawn(first, seed)
         found, truth = settled(setup, experiment.data), true_values(setup)
         columns = np.concatenate([np.asarray(s.columns) for s in found.systematics], axis=1)
-        told = template_amplitudes(found.model, found.posterior, experiment.data.data, columns)
+        told = template_amplitudes(found.solution, columns)
         sky_covariance = np.asarray(found.posterior.covariance())
         expected = np.concatenate([s.expected for s in found.systematics])
         mean = np.concatenate([np.asarray(found.posterior.mean), expected + told.mean])

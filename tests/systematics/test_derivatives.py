@@ -50,7 +50,7 @@ def test_columns_are_the_derivative_of_the_effect(more):
     rng, values = np.random.default_rng(0), {}
     for _, systematic in systematics(setup):
         values |= systematic.in_units(rng.normal(size=len(systematic.names)))
-    model, sky = on_host(base_model(setup)), setup.sky.modes
+    model, sky = base_model(setup), setup.sky.modes
     for _, systematic in systematics(setup, Around(values=values)):
         expanded = on_host(Expanded.about(systematic, model, sky, values))
         expected = differences(systematic, model, sky, expanded.centre)
@@ -66,7 +66,7 @@ def test_about_values_a_is_that_of_the_shifted_observation():
     (_, nominal), *_ = systematics(setup)
     values = nominal.in_units(np.random.default_rng(1).normal(size=len(nominal.names)))
     (_, offsets), *_ = systematics(setup, Around(values=values))
-    model, sky = on_host(base_model(setup)), setup.sky.modes
+    model, sky = base_model(setup), setup.sky.modes
     got = np.asarray(offsets.effect(model, values).predict(sky))
     exact = np.asarray(moved(setup, values).coupling @ sky)
     np.testing.assert_allclose(got, exact, rtol=0, atol=1e-12 * np.abs(exact).max())

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from assertions import refused, within
-from experiments import density, four_ports, parts, program_arguments
+from experiments import density, four_ports, offset_posterior, parts, program_arguments
 from reference_linear import white_posterior
 from scipy.optimize import least_squares
 from scipy.stats import norm
@@ -22,7 +22,7 @@ from lusee_bayes.experiment.model import (
     true_signal,
     true_values,
 )
-from lusee_bayes.experiment.rounds import Inference, offset_posterior
+from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.instrument.products import all_products, labels
 from lusee_bayes.instrument.visibilities import Calibration
@@ -41,13 +41,16 @@ def warm(response_file) -> lb.Experiment:
     return lb.build(four_ports(response_file, RECEIVER % "marginalised", GROUND % "marginalised"))
 
 
+def ground(response_file, moon_k: float) -> np.ndarray:
+    return np.asarray(replace(lb.read_beam(response_file), moon_k=moon_k).background(20.0))
+
+
 def columns(response_file, n_times: int) -> np.ndarray:
     """What one standard deviation of each of the five adds to the data, made by hand."""
     grid = np.zeros((16, n_times, 5))
     for port, product in enumerate(AUTOS):
         grid[product, :, port] = 200.0
-    response = lb.read_beam(response_file)
-    warmer = response.background(20.0, 280.0) - response.background(20.0, 250.0)
+    warmer = ground(response_file, 280.0) - ground(response_file, 250.0)
     grid[:, :, 4] = warmer[:, None]
     return grid.reshape(-1, 5)
 
@@ -58,7 +61,7 @@ def joint(warm: lb.Experiment, response_file):
     t = columns(response_file, setup.layout.n_times)
     a = np.concatenate([np.asarray(setup.coupling.dense()), t], axis=1)
     prior = np.append(np.sqrt(np.asarray(setup.prior.variance())), np.ones(5))
-    constant = np.asarray(lb.read_beam(response_file).background(20.0, 250.0)).copy()
+    constant = ground(response_file, 250.0).copy()
     constant[AUTOS] += 2000.0
     noise = np.sqrt(np.asarray(radiometer(setup).diagonal()))
     rest = data - np.repeat(constant, setup.layout.n_times)
@@ -76,7 +79,7 @@ def test_marginalised_they_are_the_closed_form(warm, response_file):
     within(got / scale[sky, sky], expected.covariance[sky, sky] / scale[sky, sky], 1e-5)
     assert float(found.posterior.log_evidence) == pytest.approx(expected.log_prob, abs=1e-4)
     t = np.concatenate([np.asarray(s.columns) for s in found.systematics], axis=1)
-    told = template_amplitudes(found.model, found.posterior, warm.data.data, t)
+    told = template_amplitudes(found.solution, t)
     assert np.abs((told.mean - expected.mean[16:]) / std[16:]).max() < 1e-5
     blocks = [(told.covariance, slice(16, 21), slice(16, 21)), (told.with_sky, sky, slice(16, 21))]
     for block, rows, cols in blocks:
@@ -103,10 +106,10 @@ def test_powers_in_volts_and_their_slope(response_file):
     per_kelvin = lb.read_beam(response_file).per_kelvin(20.0)
     keys = "slope: -2, reference_mhz: 5"
     volts = set_up(four_ports(response_file, f"noise.receiver={{power_v2_hz: 1e-17, {keys}}}"))
-    ground = lb.read_beam(response_file).background(20.0, 250.0)[AUTOS]
-    np.testing.assert_allclose(volts.background[AUTOS] - ground, 1e-17 / 16 / per_kelvin, rtol=1e-9)
+    moon = ground(response_file, 250.0)[AUTOS]
+    np.testing.assert_allclose(volts.background[AUTOS] - moon, 1e-17 / 16 / per_kelvin, rtol=1e-9)
     kelvin = set_up(four_ports(response_file, f"noise.receiver={{power_k: 160, {keys}}}"))
-    np.testing.assert_allclose(kelvin.background[AUTOS] - ground, 10.0, rtol=1e-9)
+    np.testing.assert_allclose(kelvin.background[AUTOS] - moon, 10.0, rtol=1e-9)
 
 
 def test_receivers_of_antennas_that_know_no_volts():
@@ -142,7 +145,7 @@ def test_ignored_they_are_taken_for_their_means(warm, response_file):
     np.testing.assert_array_equal(found.noise.diagonal(), radiometer(setup).diagonal())
     np.testing.assert_array_equal(found.offset, setup.offset)
     # which the data contradict: a receiver off by 200 K is hundreds of standard deviations
-    chi2 = found.chi2(found.condition(warm.data.data).mean, warm.data.data)
+    chi2 = found.chi2(found.condition(warm.data.data).posterior.mean, warm.data.data)
     assert float(chi2) > 100 * found.n_data
 
 
@@ -266,8 +269,8 @@ def test_about_given_values_it_is_the_closed_form(experiment, response_file):
     values |= {f"receiver_{port}_k": 2000.0 + 200.0 * powers[port] for port in range(4)}
     sky = setup.sky.modes * rng.uniform(0.9, 1.1, 16)
     around = Around(data, values=values, sky=sky)
-    found = Inference(*model_about(setup, around), None, 1, around)
-    found = replace(found, posterior=found.model.condition(data.data))
+    model, systematics = model_about(setup, around)
+    found = Inference(model.condition(data.data), systematics, 1, around)
     linear = columns(response_file, 23)
     seen = np.asarray(setup.coupling.dense()) @ sky + np.asarray(setup.offset)
     seen = seen + linear[:, :4] @ powers
@@ -284,7 +287,7 @@ def test_about_given_values_it_is_the_closed_form(experiment, response_file):
     got, scale = np.asarray(found.posterior.covariance()), np.outer(std, std)
     within(got / scale[:16, :16], expected.covariance[:16, :16] / scale[:16, :16], 1e-5)
     t = np.concatenate([np.asarray(s.columns) for s in found.systematics], axis=1)
-    told = template_amplitudes(found.model, found.posterior, data.data, t)
+    told = template_amplitudes(found.solution, t)
     assert np.abs((told.mean - expected.mean[16:]) / std[16:]).max() < 1e-3
     within(told.covariance / scale[16:, 16:], expected.covariance[16:, 16:] / scale[16:, 16:], 1e-5)
 
@@ -340,21 +343,27 @@ def test_rounds_find_the_mode_and_the_first_order_does_not(experiment, response_
     std = np.sqrt(np.diag(np.linalg.inv(root.T @ root)))
 
     def off(it: Inference) -> np.ndarray:
-        told = [
-            s.expected + template_amplitudes(it.model, it.posterior, d, np.asarray(s.columns)).mean
-            for s in it.systematics
-        ]
+        told = [part.expected + it.amplitudes(part).mean for part in it.systematics]
         return np.concatenate([np.asarray(it.posterior.mean) / prior, *told]) - mode
 
     # every unknown, and every direction of them
     assert np.abs(off(found) / std).max() < 0.05
     assert np.abs(root @ off(found)).max() < 0.05
-    # about the sky of gains that are right
-    around = Around(experiment.data, sky=np.linalg.lstsq(a, d - offset, rcond=None)[0])
+    # first order leaves out what goes as the square of the way to the mode: about gains that are
+    # three prior standard deviations too high, three times as far as their prior means, it is wrong
+    # by a hundred times what is allowed; rounds lead to the mode from there, too
+    high = np.full(4, 3.0)
+    sky = np.linalg.lstsq(a, d / per_port(high) - offset, rcond=None)[0]
+    values = {f"gain_{port}": 0.01 * z for port, z in enumerate(high)}
+    around = replace(found.around, values=values, sky=sky)
+    ways = np.linalg.norm([mode[21:] - high, mode[21:]], axis=1)
+    assert ways[0] > 3.0 * ways[1]
     model, unknowns = model_about(setup, around)
-    first = Inference(model, unknowns, model.condition(d), 1, around)
-    assert np.abs(off(first) / std).max() > 0.5
-    assert np.abs(root @ off(first)).max() > 50.0
+    first = Inference(model.condition(d), unknowns, 1, around)
+    assert np.abs(off(first) / std).max() > 5.0
+    assert np.abs(root @ off(first)).max() > 5.0
+    again = lb.infer(replace(experiment, around=around))
+    assert np.abs(off(again) / std).max() < 0.05
     # the joint mode is another: each of 21 skies and powers gains by being 0.5 % smaller
     assert force.min() > 0.04
     joint = least_squares(residuals, mode, jacobian, args=(np.zeros(4),), **tight).x
@@ -379,8 +388,7 @@ def test_many_modes_do_not_pass_for_a_gain():
         data = simulate(setup)
         it = lb.infer(lb.Experiment(setup, data))
         gains = it.systematics[-1]
-        told = template_amplitudes(it.model, it.posterior, data.data, gains.columns)
-        found.append(gains.systematic.common @ (gains.expected + told.mean))
+        found.append(gains.systematic.common @ (gains.expected + it.amplitudes(gains).mean))
         assert gains.systematic.common @ gains.expected < -0.5
     assert np.std(found) < 0.25
     assert abs(np.mean(found)) < 0.1
@@ -396,7 +404,7 @@ def test_errors_that_data_name_are_found(response_file):
     slope = slopes(23)[:4]
     rms = [np.sqrt((s[s != 0] ** 2).mean()) for s in slope]
     np.testing.assert_allclose(table.systematic.stds, rms, rtol=1e-12)
-    told = template_amplitudes(found.model, found.posterior, data.data, table.columns)
+    told = found.amplitudes(table)
     off = (table.expected + told.mean - true_values(setup)["gain_table"]) / told.std
     assert np.abs(off).max() < 4.0
     # port 3 is right, so that the others are told from it
@@ -416,7 +424,7 @@ def test_clock_and_pointing_beside_it_settle_in_the_same_rounds(response_file):
     turntable = offset_posterior(found)[0]["turntable_deg"] / 0.05
     _, *rest = found.systematics
     linear = columns(response_file, 23)
-    told = [template_amplitudes(found.model, found.posterior, d, s.columns).mean for s in rest]
+    told = [found.amplitudes(part).mean for part in rest]
     told[-1] = told[-1] + rest[-1].expected
     x = np.concatenate([np.asarray(found.posterior.mean) / prior, *told, [turntable]])
 

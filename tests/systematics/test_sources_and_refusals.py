@@ -44,7 +44,7 @@ from lusee_bayes.systematics.sources import (
     SourceSection,
     source_responses,
 )
-from lusee_bayes.systematics.systematic import normal_within
+from lusee_bayes.systematics.systematic import Unknown
 from lusee_bayes.testing.scenarios import small_scenario
 
 # Cas A is up, For A has an amplitude for every two of the six samples, and the last lies near the
@@ -171,14 +171,14 @@ def test_the_sky_is_the_same_with_fluxes_in_the_noise_or_beside_it():
     """Both against the closed form: Lambda's condition of 1e10 costs 1e-6 of a variance; means are
     refined, to better than 1e-6 standard deviations."""
     setup, expected = setup_of(), answer()
-    marginal = full_model(setup).condition(data().data)
+    marginal = full_model(setup).condition(data().data).posterior
     sky = expected.std[:49]
     off = (np.asarray(marginal.mean) - expected.mean[:49]) / sky
     assert np.abs(off).max() < 1e-5
     np.testing.assert_allclose(np.asarray(marginal.std()), sky, rtol=1e-5)
     assert float(marginal.log_evidence) == pytest.approx(expected.log_prob, abs=1e-4)
     # the sources matter: with them in the data only, the sky is off by what can be seen
-    wrong = full_model(setup_of("ignored")).condition(data().data)
+    wrong = full_model(setup_of("ignored")).condition(data().data).posterior
     assert np.abs((np.asarray(wrong.mean) - expected.mean[:49]) / sky).max() > 1.0
 
 
@@ -372,13 +372,13 @@ def test_antennas_that_cannot_be_sampled(parameters, message):
 
 def test_the_nearer_end_is_named():
     with pytest.raises(lb.InputError, match="at most 180"):
-        normal_within("angle", 170.0, 20.0, 0.0, 180.0)
+        Unknown("angle", 170.0, 20.0, low=0.0, high=180.0).prior()
     # a quarter of a percent is allowed: 2.81 standard deviations
-    normal_within("angle", 180.0 - 2.82, 1.0, 0.0, 180.0)
+    Unknown("angle", 180.0 - 2.82, 1.0, low=0.0, high=180.0).prior()
     with pytest.raises(lb.InputError, match="0.3% of its weight"):
-        normal_within("angle", 180.0 - 2.80, 1.0, 0.0, 180.0)
+        Unknown("angle", 180.0 - 2.80, 1.0, low=0.0, high=180.0).prior()
     with pytest.raises(lb.InputError, match="standard deviation of angle must be positive"):
-        normal_within("angle", 1.0, 0.0)
+        Unknown("angle", 1.0, 0.0, low=0.0).prior()
 
 
 def test_bands_beyond_the_highest_ell():

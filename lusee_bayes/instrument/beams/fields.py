@@ -15,7 +15,7 @@ the first ring, by (h l)^3 / 43 of the pattern there.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import numpy as np
@@ -35,7 +35,14 @@ from lusee_bayes.core.checks import (
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import LARGEST_LMAX, SQRT2, lmax_of, mode_numbers, polar_functions
 from lusee_bayes.core.lazy import healpy
-from lusee_bayes.instrument.products import auto_indices, labels, to_real
+from lusee_bayes.instrument.products import antennas_of, auto_indices, labels, to_real
+
+# responses of antennas, and of pairs of them, in any directions
+Fields = Complex[Array, "antennas *directions"]
+Pairs = Complex[Array, "antennas antennas *directions"]
+Pattern = Complex[np.ndarray, "theta phi"]
+Angles = Float[np.ndarray, " theta"]
+Frequencies = Float[np.ndarray, " frequencies"]
 
 
 class HemisphereGrid(eqx.Module):
@@ -117,14 +124,8 @@ class HemisphereGrid(eqx.Module):
         ell, m = mode_numbers(lmax)
         xp = namespace(f)
         fourier = xp.fft.rfft(f, axis=-1)[..., : lmax + 1] * (2.0 * np.pi / self.n_phi)
-        parts = xp.concatenate(
-            [
-                SQRT2 * fourier.imag[..., :0:-1],
-                fourier.real[..., :1],
-                SQRT2 * fourier.real[..., 1:],
-            ],
-            axis=-1,
-        )
+        sines, cosines = SQRT2 * fourier.imag[..., :0:-1], SQRT2 * fourier.real[..., 1:]
+        parts = xp.concatenate([sines, fourier.real[..., :1], cosines], axis=-1)
         # for every order a product with its functions of theta, zero where there is no mode
         polar = np.zeros((2 * lmax + 1, len(self.theta), lmax + 1))
         polar[m + lmax, :, ell] = self.polar_weights(lmax).T
@@ -195,9 +196,7 @@ Interpolation = Literal["linear", "spline"]
 SAME_FREQUENCY_MHZ = 1e-6
 
 
-def neighbours(
-    path: str, known_mhz: Float[np.ndarray, " frequencies"], frequency_mhz: float
-) -> list[tuple[int, float]]:
+def neighbours(path: str, known_mhz: Frequencies, frequency_mhz: float) -> list[tuple[int, float]]:
     """Return the frequencies of a file that linear interpolation takes, and their weights.
 
     Parameters
@@ -234,7 +233,7 @@ def neighbours(
 
 def at_frequency(
     path: str,
-    known_mhz: Float[np.ndarray, " frequencies"],
+    known_mhz: Frequencies,
     frequency_mhz: float,
     *parts: np.ndarray,
     rule: Interpolation = "linear",
@@ -272,12 +271,7 @@ def at_frequency(
     return [np.asarray(spline(frequency_mhz)) for spline in splines]
 
 
-def on_grid(
-    rows: Complex[np.ndarray, "theta phi"],
-    theta: Float[np.ndarray, " theta"],
-    grid: HemisphereGrid,
-    angle_deg: float = 0.0,
-) -> Complex[np.ndarray, "grid_theta grid_phi"]:
+def on_grid(rows: Pattern, theta: Angles, grid: HemisphereGrid, angle_deg: float = 0.0) -> Array:
     """Interpolate a pattern to a grid: splines in theta, Fourier sums in phi.
 
     Parameters
@@ -310,18 +304,12 @@ def on_grid(
 STOKES = ("I", "Q", "U", "V")
 
 
-def stokes_beam(
-    fields: AntennaFields, stokes: str = "I"
-) -> Complex[Array, "antennas antennas theta phi"]:
+def stokes_beam(fields: AntennaFields, stokes: str = "I") -> Pairs:
     """Return :func:`stokes_pairs` of the fields, on their grid."""
     return stokes_pairs(fields.e_theta, fields.e_phi, stokes)
 
 
-def stokes_pairs(
-    e_theta: Complex[Array, "antennas *directions"],
-    e_phi: Complex[Array, "antennas *directions"],
-    stokes: str = "I",
-) -> Complex[Array, "antennas antennas *directions"]:
+def stokes_pairs(e_theta: Fields, e_phi: Fields, stokes: str = "I") -> Pairs:
     """Return the response of <s_i conj(s_j)> to one Stokes parameter of the sky, for every pair.
 
     With E = E_i, F = E_j::
@@ -389,15 +377,10 @@ class ProductBeams(Described, eqx.Module):
     def __check_init__(self):
         require_float64("the beam coefficients", self.modes)
         lmax_of(self.modes.shape[-1])
-        n = round(np.sqrt(self.modes.shape[0]))
-        if n * n != self.modes.shape[0]:
-            raise InputError(
-                f"{self.modes.shape[0]} products do not come from any number of antennas; "
-                "expected 1, 4, 9, 16, ..."
-            )
+        antennas_of(self.n_products)
 
     def description(self) -> tuple[str, ...]:
-        autos = self.modes[auto_indices(round(np.sqrt(self.n_products))), 0]
+        autos = self.modes[auto_indices(antennas_of(self.n_products)), 0]
         return (
             f"{self.n_products} products at {self.frequency_mhz:g} MHz, lmax = {self.lmax}",
             f"{self.modes.shape[1]} real coefficients each, topocentric, K per K: "
@@ -418,16 +401,11 @@ class ProductBeams(Described, eqx.Module):
     @property
     def labels(self) -> tuple[str, ...]:
         """Labels of the products, in order."""
-        return labels(round(np.sqrt(self.n_products)))
+        return labels(antennas_of(self.n_products))
 
 
 def product_beams(
-    fields: AntennaFields,
-    frequency_mhz: float,
-    lmax: int,
-    *,
-    stokes: str = "I",
-    normalise: bool = True,
+    fields: AntennaFields, frequency_mhz: float, lmax: int, **options: Any
 ) -> ProductBeams:
     """Return the beams of all products of the antennas.
 
@@ -436,10 +414,8 @@ def product_beams(
     fields : AntennaFields
     frequency_mhz : float
     lmax : int
-    stokes : {"I", "Q", "U", "V"}
-    normalise : bool
-        Scale the beams so that the Stokes I autos integrate to one on average, which makes
-        visibilities antenna temperatures in K. Otherwise the scale of the fields is kept.
+    **options
+        ``stokes`` and ``normalise``, as of :func:`product_modes`.
 
     Returns
     -------
@@ -448,16 +424,34 @@ def product_beams(
     Raises
     ------
     InputError
-        If the Stokes parameter is unknown or the grid is too coarse for ``lmax``.
+        As :func:`product_modes`.
     """
-    modes = product_modes(fields, lmax, stokes=stokes, normalise=normalise)
-    return ProductBeams(modes, float(frequency_mhz))
+    return ProductBeams(product_modes(fields, lmax, **options), float(frequency_mhz))
 
 
 def product_modes(
     fields: AntennaFields, lmax: int, *, stokes: str = "I", normalise: bool = True
 ) -> Float[Array, "products modes"]:
-    """Return the coefficients of :func:`product_beams`, a (products, modes) array."""
+    """Return the coefficients of the beams of all products of the antennas.
+
+    Parameters
+    ----------
+    fields : AntennaFields
+    lmax : int
+    stokes : {"I", "Q", "U", "V"}
+    normalise : bool
+        Scale the beams so that the Stokes I autos integrate to one on average, which makes
+        visibilities antenna temperatures in K. Otherwise the scale of the fields is kept.
+
+    Returns
+    -------
+    (products, modes) array
+
+    Raises
+    ------
+    InputError
+        If the Stokes parameter is unknown or the grid is too coarse for ``lmax``.
+    """
     patterns = to_real(stokes_beam(fields, stokes))
     if normalise:
         patterns = patterns / mean_auto_integral(fields)
@@ -472,9 +466,7 @@ def mean_auto_integral(fields: AntennaFields) -> Float[Array, ""]:
 
 
 def from_rings(
-    pixels: Inexact[np.ndarray, "*batch pixels"],
-    theta: Float[np.ndarray, " theta"],
-    phi: Float[np.ndarray, " phi"],
+    pixels: Inexact[np.ndarray, "*batch pixels"], theta: Angles, phi: Float[np.ndarray, " phi"]
 ) -> Inexact[np.ndarray, "*batch theta phi"]:
     """Interpolate scalar functions from HEALPix RING pixels to a grid above the horizon.
 
@@ -513,9 +505,8 @@ def from_rings(
         if m:
             parts.insert(1, np.zeros_like(known[..., :1, :]))
             nodes.insert(1, np.zeros(1))
-        spline = scipy.interpolate.CubicSpline(
-            np.concatenate(nodes), np.concatenate(parts, axis=-2), axis=-2
-        )
+        known = np.concatenate(parts, axis=-2)
+        spline = scipy.interpolate.CubicSpline(np.concatenate(nodes), known, axis=-2)
         spread[..., both] = spline(theta)
     values = spread @ np.exp(1j * orders[:, None] * phi[None])
     return values if np.iscomplexobj(pixels) else values.real

@@ -30,9 +30,9 @@ the frequencies of the file luseepy interpolates g and the integrals linearly, n
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +48,7 @@ from lusee_bayes.core.harmonics import mode_numbers, polar_functions
 from lusee_bayes.core.layouts import UNSTATED, Attribute, Layout, Variable
 from lusee_bayes.instrument.beams.fields import (
     SPEED_OF_LIGHT,
+    Angles,
     AntennaFields,
     HemisphereGrid,
     Interpolation,
@@ -57,7 +58,7 @@ from lusee_bayes.instrument.beams.fields import (
     on_grid,
     product_modes,
 )
-from lusee_bayes.instrument.beams.monopoles import Circuit, JFETReceiver, Receiver
+from lusee_bayes.instrument.beams.source import BeamSource, Circuit, JFETReceiver, Receiver
 from lusee_bayes.instrument.products import N_ANTENNAS, to_matrix, to_real
 
 # what this package assumes of the images, in lower case
@@ -112,11 +113,6 @@ def require_conventions(path: str | Path, said: Mapping[str, Any]) -> None:
             )
 
 
-def rectangle_rule(theta: Float[np.ndarray, " theta"], n_phi: int) -> HemisphereGrid:
-    """Return luseepy's rule for scalar beams: sin(theta) dtheta dphi, equal steps up to pi / 2."""
-    return HemisphereGrid(theta, np.sin(theta) * theta[1], n_phi)
-
-
 class BandLimitedGrid(HemisphereGrid):
     """luseepy's rule for responses: the pattern as a band-limited function on the whole sphere.
 
@@ -129,13 +125,11 @@ class BandLimitedGrid(HemisphereGrid):
     """
 
     @classmethod
-    def of(cls, theta: Float[np.ndarray, " theta"], n_phi: int) -> BandLimitedGrid:
+    def of(cls, theta: Angles, n_phi: int) -> BandLimitedGrid:
         """Return the rule for ``theta`` in equal steps from 0 to pi / 2, both included."""
-        n = len(theta)
-        nodes, weights = roots_legendre(4 * n)
-        even = weights @ cardinal_functions(np.arccos(nodes), 2 * n - 2, 0)[:, :n]
-        even[-1] /= 2.0
-        return cls(theta, even, n_phi)
+        # lambda_00 = 1 / sqrt(4 pi)
+        even = cls(theta, np.ones_like(theta), n_phi).polar_weights(0)[:, 0]
+        return cls(theta, even * np.sqrt(4.0 * np.pi), n_phi)
 
     def polar_weights(self, lmax: int) -> Float[np.ndarray, "theta modes"]:
         """Return the integrals of each sample's cardinal function times lambda_lm(theta)."""
@@ -154,9 +148,7 @@ class BandLimitedGrid(HemisphereGrid):
         return summed
 
 
-def cardinal_functions(
-    theta: Float[np.ndarray, " theta"], intervals: int, parity: int
-) -> Float[np.ndarray, "theta samples"]:
+def cardinal_functions(theta: Angles, intervals: int, parity: int) -> np.ndarray:
     """Return trigonometric polynomials that are 1 at one sample and 0 at the others.
 
     The samples are pi k / intervals, k = 0 .. intervals.
@@ -191,22 +183,22 @@ VACUUM_OHM = physical_constants["characteristic impedance of vacuum"][0]
 LENGTHS = ("H_theta", "H_phi")
 MATRICES = ("ZA", "Rsky", "Rmoon", "Rloss")
 AXES = ("freq", "theta", "phi")
-PARTS = ("real", "imag")
+
+
+def parts_of(*names: str) -> list[str]:
+    """Return the names of the images that hold real and imaginary parts."""
+    return [f"{name}_{part}" for name in names for part in ("real", "imag")]
+
+
 RESPONSE_LAYOUT = Layout(
     "a four-port response of luseepy, FITS version 3",
     {
         "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
         **{name: Variable((name,), grows=True, unit="deg") for name in AXES[1:]},
-        **{
-            f"{name}_{part}": Variable((N_ANTENNAS, *AXES), unit="m")
-            for name in LENGTHS
-            for part in PARTS
-        },
-        **{
-            f"{name}_{part}": Variable(("freq", N_ANTENNAS, N_ANTENNAS), unit="Ohm")
-            for name in MATRICES
-            for part in PARTS
-        },
+        **dict.fromkeys(parts_of(*LENGTHS), Variable((N_ANTENNAS, *AXES), unit="m")),
+        **dict.fromkeys(
+            parts_of(*MATRICES), Variable(("freq", N_ANTENNAS, N_ANTENNAS), unit="Ohm")
+        ),
     },
     dict.fromkeys((*CONVENTIONS, *SOURCES), Attribute("word", optional=True)),
 )
@@ -214,8 +206,8 @@ RESPONSE_LAYOUT = Layout(
 RESISTANCE_TOLERANCE = 1e-6
 
 
-@dataclass(frozen=True)
-class LuseepyBeam(ABC):
+@dataclass(frozen=True, eq=False)
+class LuseepyBeam(BeamSource):
     """What a file holds in directions of a grid, at several frequencies.
 
     Attributes
@@ -225,57 +217,58 @@ class LuseepyBeam(ABC):
     frequencies_mhz : (frequencies,) array
     theta : (theta,) array
         From 0 to pi / 2 in equal steps; azimuths are 2 pi k / n_phi.
+    e_theta, e_phi : (frequencies, ..., theta, phi) complex array
+        Response to the theta and phi components of the incident field.
     interpolation : {"linear", "spline"}
         Between the frequencies: luseepy's rule, products of fields linearly and so impedances, or
         cubic splines through fields and impedances.
+    turntable_offset_deg : float
+        How much further the turntable is than it says, from East towards North.
+    luseepy_quadrature : bool
+        Integrate with luseepy's own rule, for data that luseepy has made.
+    moon_k : float
+        Temperature of the ground in K.
     """
 
     path: str
     frequencies_mhz: Float[np.ndarray, " frequencies"]
-    theta: Float[np.ndarray, " theta"]
+    theta: Angles
+    e_theta: Complex[np.ndarray, "frequencies *ports theta phi"]
+    e_phi: Complex[np.ndarray, "frequencies *ports theta phi"]
     interpolation: Interpolation = field(default="linear", kw_only=True)
+    turntable_offset_deg: float = field(default=0.0, kw_only=True)
+    luseepy_quadrature: bool = field(default=False, kw_only=True)
+    moon_k: float = field(default=0.0, kw_only=True)
+
+    @property
+    def n_phi(self) -> int:
+        """Number of azimuths."""
+        return self.e_theta.shape[-1]
 
     @property
     @abstractmethod
-    def n_phi(self) -> int:
-        """Number of azimuths."""
+    def luseepy_grid(self) -> HemisphereGrid:
+        """The directions of the file with luseepy's rule."""
 
     @abstractmethod
-    def fields(self, frequency_mhz: float, **how: Any) -> AntennaFields:
-        """Return the fields of the ports; their products are beams per K and sr."""
-
-    @abstractmethod
-    def _linear(self, frequency_mhz: float, lmax: int, **how: Any) -> Float[np.ndarray, "_ modes"]:
+    def _linear(self, frequency_mhz: float, lmax: int, grid: HemisphereGrid) -> np.ndarray:
         """Coefficients of the beams of all products by luseepy's rule."""
 
-    def beams(self, frequency_mhz: float, lmax: int, **how: Any) -> ProductBeams:
-        """Return the beams of all products.
+    @property
+    def emits(self) -> bool:
+        return self.moon_k != 0.0
 
-        Parameters
-        ----------
-        frequency_mhz : float
-        lmax : int
-        **how
-            Arguments of :meth:`fields`.
-
-        Returns
-        -------
-        ProductBeams
-            In K per K.
-
-        Raises
-        ------
-        InputError
-            As of :meth:`fields`.
-        """
+    def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
+        # nodes integrate across the horizon exactly
+        exact = HemisphereGrid.gauss_legendre(2 * len(self.theta), self.n_phi)
+        grid = self.luseepy_grid if self.luseepy_quadrature else exact
         if self.interpolation == "spline":
-            modes = product_modes(self.fields(frequency_mhz, **how), lmax, normalise=False)
+            modes = product_modes(self.fields(frequency_mhz, grid), lmax, normalise=False)
         else:
-            modes = self._linear(frequency_mhz, lmax, **how)
+            modes = self._linear(frequency_mhz, lmax, grid)
         return ProductBeams(modes, float(frequency_mhz))
 
     def interpolated(self, frequency_mhz: float) -> Interpolation | None:
-        """Return how values at this frequency are interpolated; None where the file has it."""
         return self.interpolation if len(self._neighbours(frequency_mhz)) > 1 else None
 
     def _neighbours(self, frequency_mhz: float) -> list[tuple[int, float]]:
@@ -285,113 +278,86 @@ class LuseepyBeam(ABC):
         known, rule = self.frequencies_mhz, self.interpolation
         return at_frequency(self.path, known, frequency_mhz, *parts, rule=rule)
 
-    def _grid(self, grid: HemisphereGrid | None) -> HemisphereGrid:
-        """A grid, or by default nodes that integrate across the horizon exactly."""
-        return grid or HemisphereGrid.gauss_legendre(2 * len(self.theta), self.n_phi)
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PortResponse(LuseepyBeam):
-    """Coupled antennas at several frequencies.
+    """Four coupled ports at several frequencies, with their receivers.
 
     Attributes
     ----------
-    h_theta, h_phi : (frequencies, ports, theta, phi) complex array
-        Effective lengths in m.
-    impedance : (frequencies, ports, ports) complex array
-        ZA in Ohm.
-    moon_resistance, loss_resistance : (frequencies, ports, ports) complex array
-        Rmoon and Rloss in Ohm.
+    e_theta, e_phi : (frequencies, ports, theta, phi) complex array
+        Effective lengths H_theta and H_phi in m.
+    impedance_ohm : (frequencies, ports, ports) complex array
+        ZA.
+    moon_ohm, loss_ohm : (frequencies, ports, ports) complex array
+        Rmoon and Rloss.
     receiver : Receiver or None
         What is connected to the ports; None leaves them open.
+    receiver_said : bool
+        Whether these receivers are to be used for all data; else those that data say.
+    antenna_k : float
+        Temperature of the lossy antennas in K.
     """
 
-    h_theta: Complex[np.ndarray, "frequencies ports theta phi"]
-    h_phi: Complex[np.ndarray, "frequencies ports theta phi"]
-    impedance: Complex[np.ndarray, "frequencies ports ports"]
-    moon_resistance: Complex[np.ndarray, "frequencies ports ports"]
-    loss_resistance: Complex[np.ndarray, "frequencies ports ports"]
+    impedance_ohm: Complex[np.ndarray, "frequencies ports ports"]
+    moon_ohm: Complex[np.ndarray, "frequencies ports ports"]
+    loss_ohm: Complex[np.ndarray, "frequencies ports ports"]
     receiver: Receiver | None = JFETReceiver()
+    receiver_said: bool = True
+    antenna_k: float = 0.0
 
     @property
-    def n_phi(self) -> int:
-        return self.h_theta.shape[3]
+    def n_ports(self) -> int:
+        return N_ANTENNAS
 
     @property
     def luseepy_grid(self) -> BandLimitedGrid:
         """The directions of the file with the rule of luseepy's four-port engine."""
         return BandLimitedGrid.of(self.theta, self.n_phi)
 
+    @property
+    def emits(self) -> bool:
+        return self.moon_k != 0.0 or self.antenna_k != 0.0
+
+    def behind(self, receiver: Receiver | None) -> PortResponse:
+        given = receiver is None or self.receiver_said
+        return self if given else replace(self, receiver=receiver)
+
     def circuit(self, frequency_mhz: float) -> Circuit:
         """Return antennas and receivers. InputError outside the frequencies of the file."""
-        parts = (self.impedance, self.moon_resistance, self.loss_resistance)
+        parts = (self.impedance_ohm, self.moon_ohm, self.loss_ohm)
         return Circuit(frequency_mhz, *self._at(frequency_mhz, *parts), self.receiver)
 
     def per_kelvin(self, frequency_mhz: float) -> Float[np.ndarray, " ports"]:
         """Return U_aa, the V^2/Hz that an enclosure of 1 K makes at each receiver's input."""
         return self.circuit(frequency_mhz).per_kelvin.diagonal().real
 
-    def fields(self, frequency_mhz: float, **how: Any) -> AntennaFields:
+    def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
         """Return the fields of the ports; their products are beams in K per K and sr.
 
         Between the frequencies of the file this is so with splines only. With linear interpolation
         the fields themselves are interpolated here, for pictures; use :meth:`beams` for products.
-
-        Parameters
-        ----------
-        frequency_mhz : float
-        grid : HemisphereGrid, optional
-            By default nodes that integrate across the horizon exactly; ``luseepy_grid`` is the
-            rule of luseepy.
-        turn_deg : float
-            How far the instrument is turned, from East towards North.
-
-        Returns
-        -------
-        AntennaFields
-
-        Raises
-        ------
-        InputError
-            Outside the frequencies of the file.
         """
-        opened = self._open(self._at(frequency_mhz, self.h_theta, self.h_phi), **how)
+        opened = self._open(self._at(frequency_mhz, self.e_theta, self.e_phi), grid)
         mixing = self._mixing(frequency_mhz) / (SPEED_OF_LIGHT / (1e6 * frequency_mhz))
         parts = (np.tensordot(mixing, part, axes=1) for part in (opened.e_theta, opened.e_phi))
-        return AntennaFields(*parts, opened.grid)
+        return AntennaFields(*parts, grid)
 
-    def _linear(self, frequency_mhz, lmax, **how):
+    def _linear(self, frequency_mhz, lmax, grid):
         opened = np.zeros((N_ANTENNAS**2, (lmax + 1) ** 2))
         for k, weight in self._neighbours(frequency_mhz):
-            fields = self._open([self.h_theta[k], self.h_phi[k]], **how)
+            fields = self._open([self.e_theta[k], self.e_phi[k]], grid)
             wavelength = SPEED_OF_LIGHT / (1e6 * self.frequencies_mhz[k])
             opened += weight / wavelength**2 * product_modes(fields, lmax, normalise=False)
         mixing = self._mixing(frequency_mhz)
         seen = np.einsum("ai,ijm,bj->abm", mixing, to_matrix(opened), mixing.conj(), optimize=True)
         return to_real(seen)
 
-    def background(
-        self, frequency_mhz: float, moon_k: float, antenna_k: float = 0.0
-    ) -> Float[Array, " products"]:
-        """Return the visibilities without any sky: what the Moon and lossy antennas emit.
-
-        Parameters
-        ----------
-        frequency_mhz : float
-        moon_k, antenna_k : float
-            Temperatures of the Moon and of the antennas in K.
-
-        Returns
-        -------
-        (products,) array
-
-        Raises
-        ------
-        InputError
-            Outside the frequencies of the file.
-        """
+    def background(self, frequency_mhz: float) -> Float[Array, " products"]:
+        if not self.emits:
+            return super().background(frequency_mhz)
         circuit = self.circuit(frequency_mhz)
-        seen = circuit.emitted(moon_k * circuit.moon_ohm + antenna_k * circuit.loss_ohm)
+        seen = circuit.emitted(self.moon_k * circuit.moon_ohm + self.antenna_k * circuit.loss_ohm)
         root = np.sqrt(self.per_kelvin(frequency_mhz))
         return to_real(seen / (root[:, None] * root[None]))
 
@@ -401,11 +367,9 @@ class PortResponse(LuseepyBeam):
         scale = np.sqrt(2.0 * Boltzmann * VACUUM_OHM) / np.sqrt(self.per_kelvin(frequency_mhz))
         return scale[:, None] * self.circuit(frequency_mhz).loading
 
-    def _open(
-        self, parts: list[np.ndarray], *, grid: HemisphereGrid | None = None, turn_deg: float = 0.0
-    ) -> AntennaFields:
+    def _open(self, parts: list[np.ndarray], grid: HemisphereGrid) -> AntennaFields:
         """The effective lengths of one frequency on a grid, of ports that are open."""
-        grid = self._grid(grid)
+        turn_deg = self.turntable_offset_deg
         turned = (np.stack([on_grid(h, self.theta, grid, turn_deg) for h in p]) for p in parts)
         return AntennaFields(*turned, grid)
 
@@ -447,14 +411,14 @@ def read_response(path: str | Path) -> PortResponse:
     off = np.abs(sky + moon + loss - resistance).max() / np.abs(resistance).max()
     if off > RESISTANCE_TOLERANCE:
         raise InputError(
-            f"{path}: Rsky + Rmoon + Rloss differ from (ZA + ZA^H) / 2 by {off:.1g} of the "
-            "largest; expected equality"
+            f"{path}: Rsky + Rmoon + Rloss differ from (ZA + ZA^H) / 2, by {off:.1g} of it"
         )
     theta = np.linspace(0.0, np.pi / 2.0, len(theta_deg))
     return PortResponse(str(path), frequencies, theta, h_theta, h_phi, impedance, moon, loss)
 
 
-FIELDS = ("Etheta_real", "Etheta_imag", "EPhi_real", "EPhi_imag")
+FIELD_NAMES = ("Etheta", "EPhi")
+FIELDS = parts_of(*FIELD_NAMES)
 IMPEDANCE = ("Z_real", "Z_imag")
 FIELD, OHM = Variable(("freq", "theta", "phi")), Variable(("freq",), optional=True, unit="Ohm")
 SCALAR_LAYOUT = Layout(
@@ -478,9 +442,9 @@ ROTATIONS_DEG = (0.0, 90.0, 180.0, 270.0)
 TAPER_WIDTH = 0.03
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ScalarBeam(LuseepyBeam):
-    """The pattern of one arm at several frequencies.
+    """The pattern of one arm, used once for every port; nothing couples the arms.
 
     Attributes
     ----------
@@ -488,117 +452,72 @@ class ScalarBeam(LuseepyBeam):
         Fields in the unit of the file.
     gain : (frequencies,) array
         gain_conv of the file.
-    impedance : (frequencies,) complex array or None
-        Of the arm in Ohm; None where the file has none.
+    impedance_ohm : (frequencies,) complex array or None
+        Of the arm; None where the file has none.
+    taper : bool
+        Fade out towards the horizon as luseepy does.
+    rotations_deg : tuple of float
+        How far the pattern is turned for each port, from East towards North.
     """
 
-    e_theta: Complex[np.ndarray, "frequencies theta phi"]
-    e_phi: Complex[np.ndarray, "frequencies theta phi"]
     gain: Float[np.ndarray, " frequencies"]
-    impedance: Complex[np.ndarray, " frequencies"] | None = None
+    impedance_ohm: Complex[np.ndarray, " frequencies"] | None = None
+    taper: bool = True
+    rotations_deg: tuple[float, ...] = ROTATIONS_DEG
 
     @property
-    def n_phi(self) -> int:
-        return self.e_theta.shape[2]
+    def n_ports(self) -> int:
+        return len(self.rotations_deg)
 
     @property
     def luseepy_grid(self) -> HemisphereGrid:
-        """The directions of the file with luseepy's rule: sin(theta) dtheta dphi."""
-        return rectangle_rule(self.theta, self.n_phi)
+        """The directions of the file with sin(theta) dtheta dphi, in equal steps up to pi / 2."""
+        return HemisphereGrid(self.theta, np.sin(self.theta) * self.theta[1], self.n_phi)
 
-    def fields(self, frequency_mhz: float, **how: Any) -> AntennaFields:
-        """Return the fields of the arms; their products are beams in K per K.
+    def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
+        """Return the fields of the arms in sqrt(1 / sr); their products are beams in K per K.
 
         Between the frequencies of the file this is so with splines only. With linear interpolation
         the fields themselves are interpolated here, for pictures; use :meth:`beams` for products.
-
-        Parameters
-        ----------
-        frequency_mhz : float
-        grid : HemisphereGrid, optional
-            By default nodes that integrate across the horizon exactly; ``luseepy_grid`` is the
-            rule of luseepy.
-        taper : bool
-            Fade out towards the horizon as luseepy does.
-        rotations_deg : tuple of float
-            How far the pattern is turned for each port, from East towards North.
-
-        Returns
-        -------
-        AntennaFields
-            In sqrt(1 / sr).
-
-        Raises
-        ------
-        InputError
-            Outside the frequencies of the file.
         """
         *parts, gain = self._at(frequency_mhz, self.e_theta, self.e_phi, self.gain)
-        return self._put_up(parts, float(gain), **how)
+        return self._put_up(parts, float(gain), grid)
 
-    def _linear(self, frequency_mhz, lmax, **how):
+    def _linear(self, frequency_mhz, lmax, grid):
         (gain,) = self._at(frequency_mhz, self.gain)
         modes = 0
         for k, weight in self._neighbours(frequency_mhz):
-            fields = self._put_up([self.e_theta[k], self.e_phi[k]], float(gain), **how)
+            fields = self._put_up([self.e_theta[k], self.e_phi[k]], float(gain), grid)
             modes = modes + weight * product_modes(fields, lmax, normalise=False)
         return modes
 
-    def impedance_at(self, frequency_mhz: float) -> complex | None:
-        """Return the arm's impedance in Ohm, or None. InputError outside the file's frequencies."""
-        if self.impedance is None:
+    def impedance(self, frequency_mhz: float) -> complex | None:
+        if self.impedance_ohm is None:
             return None
-        (ohm,) = self._at(frequency_mhz, self.impedance)
+        (ohm,) = self._at(frequency_mhz, self.impedance_ohm)
         return complex(ohm)
 
-    def background(
-        self, frequency_mhz: float, moon_k: float, **how: Any
-    ) -> Float[Array, " products"]:
-        """Return the visibilities without any sky: what ground of ``moon_k`` kelvin emits.
+    def background(self, frequency_mhz: float) -> Float[Array, " products"]:
+        """Return the visibilities without any sky: what the ground emits.
 
         An auto receives from the ground the part of its beam that the sky leaves. Arms in an
         enclosure of one temperature are taken to be uncorrelated, as they are where nothing
         couples them, so that a cross receives the part of the sky with the opposite sign.
-
-        Parameters
-        ----------
-        frequency_mhz : float
-        moon_k : float
-            Temperature of the ground in K.
-        **how
-            Arguments of :meth:`fields`.
-
-        Returns
-        -------
-        (products,) array
-            In K.
-
-        Raises
-        ------
-        InputError
-            Outside the frequencies of the file.
         """
-        sky = np.sqrt(4.0 * np.pi) * self.beams(frequency_mhz, 0, **how).modes[:, 0]
-        n_ports = round(np.sqrt(len(sky)))
-        return moon_k * (to_real(np.eye(n_ports, dtype=np.complex128)) - sky)
+        if not self.emits:
+            return super().background(frequency_mhz)
+        sky = np.sqrt(4.0 * np.pi) * self.beams(frequency_mhz, 0).modes[:, 0]
+        return self.moon_k * (to_real(np.eye(self.n_ports, dtype=np.complex128)) - sky)
 
-    def _put_up(
-        self,
-        parts: list[np.ndarray],
-        gain: float,
-        *,
-        grid: HemisphereGrid | None = None,
-        taper: bool = True,
-        rotations_deg: tuple[float, ...] = ROTATIONS_DEG,
-    ) -> AntennaFields:
+    def _put_up(self, parts: list[np.ndarray], gain: float, grid: HemisphereGrid) -> AntennaFields:
         """The fields of one arm, one for each port, with the scale that the gain gives them."""
-        grid = self._grid(grid)
         scale = np.full(len(grid.theta), np.sqrt(2.0 * gain / (4.0 * np.pi)))
-        if taper:
+        if self.taper:
             below = np.arctan((grid.theta - np.pi / 2.0) / TAPER_WIDTH) / np.pi + 0.5
             scale = scale * (1.0 - below**2)
+        angles = [angle + self.turntable_offset_deg for angle in self.rotations_deg]
         turned = (
-            np.stack([on_grid(part, self.theta, grid, a) for a in rotations_deg]) * scale[:, None]
+            np.stack([on_grid(part, self.theta, grid, a) for a in angles]) * scale[:, None]
             for part in parts
         )
         return AntennaFields(*(x.astype(np.complex128) for x in turned), grid)
@@ -638,8 +557,7 @@ def read_scalar_beam(path: str | Path) -> ScalarBeam:
         )
     # the last azimuth is the first once more
     e_theta, e_phi = (
-        (images[real] + 1j * images[imaginary])[:, :, :-1]
-        for real, imaginary in (FIELDS[:2], FIELDS[2:])
+        (images[f"{name}_real"] + 1j * images[f"{name}_imag"])[..., :-1] for name in FIELD_NAMES
     )
     theta = np.linspace(0.0, np.pi / 2.0, sizes["theta"])
     z = images["Z_real"] + 1j * images["Z_imag"] if set(IMPEDANCE) <= set(images) else None

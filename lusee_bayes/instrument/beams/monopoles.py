@@ -1,4 +1,4 @@
-"""Monopoles on a lossy ground: fields, circuit, receiver and their parameters.
+"""Monopoles on a lossy ground: fields, beams and their parameters.
 
 This is the package's own antenna model: thin monopoles above layered ground. An arm of length L
 points outwards and up from the feed, at height h over the ground; its current is I(s) ~ sin k(L -
@@ -11,47 +11,47 @@ with u the arm, n' = n mirrored in the ground and e' the reflected polarisation.
 between arms, no lander: this is good enough for the paper's findings, and differentiable in all
 parameters.
 
-**Circuit.** Antennas of impedance matrix ZA with open-circuit voltages v make the voltages M v at
-the inputs of receivers of impedance ZL (Thevenin's theorem), M = ZL (ZA + ZL)^-1. ZL is that of
-luseepy's models of receivers.
-
 **Point sources** are blurred by harmonic coefficients up to lmax, but not by the field pattern
-itself (:func:`beams_towards`).
+itself (:func:`beams_towards`). One of x K sr in the direction n(t), in the frame of the antennas,
+gives V_k(t) = x B_k(n(t)) (:func:`source_response`). It rises and sets sharply, and it may move.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import ClassVar
+from typing import Any
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
-from scipy.constants import Boltzmann
 
 from lusee_bayes.core.arrays import Array, as_complex, compiled, namespace
 from lusee_bayes.core.checks import is_traced, require_array, require_finite, require_positive
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.core.formats import read_fits
-from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.instrument.beams.fields import (
     AntennaFields,
+    Fields,
     HemisphereGrid,
     ProductBeams,
-    at_frequency,
     mean_auto_integral,
     phasor,
     product_modes,
     stokes_pairs,
     wavenumber,
 )
-from lusee_bayes.instrument.products import N_ANTENNAS, to_real
+from lusee_bayes.instrument.beams.source import BeamSource
+from lusee_bayes.instrument.observation import Observation
+from lusee_bayes.instrument.products import to_real
 
 N_LAYERS = 8
 DEPTH_M = 100.0
+
+
+Frequency = float | Float[Array, ""]
+Vectors = Float[Array, "directions 3"]
+Angles = Float[Array, "*#directions"]
+Coefficients = Complex[Array, " theta"]
 
 
 def _array(x) -> Float[Array, "..."]:
@@ -94,14 +94,13 @@ class Regolith(eqx.Module):
     def permittivities(self) -> Complex[Array, " layers"]:
         """Return the complex relative permittivity of each layer from the top down."""
         rise = np.linspace(0.0, 1.0, N_LAYERS)
-        real = self.surface_permittivity + rise * (
-            self.deep_permittivity - self.surface_permittivity
-        )
+        top, bottom = self.surface_permittivity, self.deep_permittivity
+        real = top + rise * (bottom - top)
         return as_complex(real, -real * self.loss_tangent)
 
     def reflection(
-        self, cos_theta: Float[Array, " theta"], frequency_mhz: float | Float[Array, ""]
-    ) -> tuple[Complex[Array, " theta"], Complex[Array, " theta"]]:
+        self, cos_theta: Float[Array, " theta"], frequency_mhz: Frequency
+    ) -> tuple[Coefficients, Coefficients]:
         """Return the reflection coefficients for waves that arrive at zenith angle theta.
 
         By recursion over the interfaces from the bottom up, with Fresnel coefficients at each.
@@ -133,13 +132,11 @@ class Regolith(eqx.Module):
         roots = [xp.sqrt(e - sin2) for e in eps[1:]]
         vertical = [cosine] + [xp.where(root.imag > 0, -root, root) for root in roots]
         s, p = xp.zeros_like(vertical[0]), xp.zeros_like(vertical[0])
+        # nothing comes back from below the last interface: s = p = 0
         for upper in range(N_LAYERS - 1, -1, -1):
             q0, q1 = vertical[upper], vertical[upper + 1]
             y0, y1 = q0 * eps[upper + 1], q1 * eps[upper]
             fresnel_s, fresnel_p = (q0 - q1) / (q0 + q1), (y0 - y1) / (y0 + y1)
-            if upper == N_LAYERS - 1:  # nothing comes back from below the last interface
-                s, p = fresnel_s, fresnel_p
-                continue
             delay = xp.exp(-2j * thickness * q1)
             s = (fresnel_s + s * delay) / (1.0 + fresnel_s * s * delay)
             p = (fresnel_p + p * delay) / (1.0 + fresnel_p * p * delay)
@@ -150,7 +147,7 @@ class Regolith(eqx.Module):
 PORT_AZIMUTHS_DEG = (90.0, 0.0, -90.0, 180.0)
 
 
-class Monopoles(eqx.Module):
+class Monopoles(BeamSource, eqx.Module):
     """Identical arms with a common feed, at several azimuths; differentiable in all parameters.
 
     Attributes
@@ -188,9 +185,18 @@ class Monopoles(eqx.Module):
         require_positive("length_m", self.length_m)
         require_positive("height_m", self.height_m)
 
-    def fields(
-        self, frequency_mhz: float | Float[Array, ""], grid: HemisphereGrid
-    ) -> AntennaFields:
+    @property
+    def n_ports(self) -> int:
+        return self.azimuths_deg.size
+
+    @property
+    def monopoles(self) -> Monopoles:
+        return self
+
+    def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
+        return monopole_beams(frequency_mhz, lmax, self)
+
+    def fields(self, frequency_mhz: Frequency, grid: HemisphereGrid) -> AntennaFields:
         """Return the field patterns on a grid, with the phase centre at the feed for all arms."""
         require_positive("frequency_mhz", frequency_mhz)
         # an array, so that all frequencies share one program
@@ -199,11 +205,8 @@ class Monopoles(eqx.Module):
 
     @compiled
     def towards(
-        self,
-        frequency_mhz: float | Float[Array, ""],
-        theta: Float[Array, "*#directions"],
-        phi: Float[Array, "*#directions"],
-    ) -> tuple[Complex[Array, "antennas *directions"], Complex[Array, "antennas *directions"]]:
+        self, frequency_mhz: Frequency, theta: Angles, phi: Angles
+    ) -> tuple[Fields, Fields]:
         """Return the fields of every arm in directions above the horizon; phase centre: the feed.
 
         Parameters
@@ -226,9 +229,8 @@ class Monopoles(eqx.Module):
         # the arm along the horizontal direction of the wave, across it, and up
         along, across = xp.sin(tilt) * xp.cos(relative), -xp.sin(tilt) * xp.sin(relative)
         up = xp.cos(tilt)
-        s, p = (
-            r.reshape(cos.shape) for r in self.regolith.reflection(cos.reshape(-1), frequency_mhz)
-        )
+        reflected = self.regolith.reflection(cos.reshape(-1), frequency_mhz)
+        s, p = (r.reshape(cos.shape) for r in reflected)
         ground = phasor(-2.0 * k * self.height_m * cos)
         direct = self._current_integral(k, along * sin + up * cos)
         bounced = self._current_integral(k, along * sin - up * cos) * ground
@@ -238,9 +240,7 @@ class Monopoles(eqx.Module):
         e_phi = across.astype(direct.dtype) * (direct + s * bounced)
         return e_theta, e_phi
 
-    def _current_integral(
-        self, k: float | Float[Array, ""], projection: Float[Array, "antennas *directions"]
-    ) -> Complex[Array, "antennas *directions"]:
+    def _current_integral(self, k: Frequency, projection: Array) -> Fields:
         """int_0^L sin k(L - s) exp(i k s projection) ds.
 
         = (L / 2i) [exp(i b) sinc a - exp(-i a) sinc b],  a, b = k L (1 -+ projection) / 2:
@@ -296,11 +296,7 @@ def monopole_beams(
 
 @compiled
 def _modes(
-    frequency_mhz: Float[Array, ""],
-    lmax: int,
-    monopoles: Monopoles,
-    stokes: str,
-    nodes: tuple[int, int] | None,
+    frequency_mhz: Frequency, lmax: int, monopoles: Monopoles, stokes: str, nodes: Any
 ) -> Float[Array, "products modes"]:
     exact = HemisphereGrid.for_lmax
     grid = exact(lmax) if nodes is None else HemisphereGrid.gauss_legendre(*nodes)
@@ -362,199 +358,6 @@ def with_values(monopoles: Monopoles, values: Mapping[str, float | Float[Array, 
     return monopoles
 
 
-LOADS = ("ZL_real", "ZL_imag")
-LAYOUT = Layout(
-    "loads ZL of four receivers, as luseepy's four-port waterfalls hold them",
-    {
-        "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
-        **{name: Variable(("freq", N_ANTENNAS, N_ANTENNAS), unit="Ohm") for name in LOADS},
-    },
-)
-
-
-class Receiver(ABC):
-    """What is connected to the ports.
-
-    Attributes
-    ----------
-    luseepy_name : str
-        Of the class that luseepy has for it.
-    luseepy_parameters : dict of str
-        What that class takes, by its names: the names of the attributes here.
-    """
-
-    luseepy_name: ClassVar[str]
-    luseepy_parameters: ClassVar[dict[str, str]] = {}
-
-    @abstractmethod
-    def load(self, frequency_mhz: float) -> Complex[np.ndarray, "ports ports"]:
-        """Return ZL in Ohm. InputError at a frequency that the receiver does not know."""
-
-
-@dataclass(frozen=True)
-class JFETReceiver(Receiver):
-    """The preamplifier of each port, by the circuit that its input impedance follows:
-
-    ::
-
-        Z = series + skin w^power + i w L + parallel / (1 + i w parallel C)
-
-    Defaults are luseepy's fits to the four spare flight preamplifiers. Nothing couples them.
-
-    Attributes
-    ----------
-    capacitance_pf, inductance_nh : (ports,) tuple of float
-        C and L.
-    parallel_ohm, series_ohm : (ports,) tuple of float
-    skin_ohm, skin_power : (ports,) tuple of float
-        Skin effect, with w in rad/s.
-    """
-
-    luseepy_name: ClassVar[str] = "JFETReceiver"
-    luseepy_parameters: ClassVar[dict[str, str]] = {
-        "C_pf": "capacitance_pf", "L_nh": "inductance_nh", "Rp_ohm": "parallel_ohm",
-        "Rs_ohm": "series_ohm", "a": "skin_ohm", "n": "skin_power",
-    }  # fmt: skip
-
-    capacitance_pf: tuple[float, ...] = (33.79, 35.32, 34.89, 36.85)
-    inductance_nh: tuple[float, ...] = (35.0, 36.4, 34.7, 8.5)
-    parallel_ohm: tuple[float, ...] = (1101e3, 331e3, 288e3, 375e3)
-    series_ohm: tuple[float, ...] = (0.21, 2.16, 3.71, 1.65)
-    skin_ohm: tuple[float, ...] = (5.2e-12, 6.9e-20, 2.2e-38, 1.9e-16)
-    skin_power: tuple[float, ...] = (1.39, 2.26, 4.35, 1.88)
-
-    def load(self, frequency_mhz: float) -> Complex[np.ndarray, "ports ports"]:
-        w = 2.0e6 * np.pi * frequency_mhz
-        parallel = np.array(self.parallel_ohm)
-        z = np.array(self.series_ohm) + np.array(self.skin_ohm) * w ** np.array(self.skin_power)
-        z = z + 1j * w * 1e-9 * np.array(self.inductance_nh)
-        z = z + parallel / (1.0 + 1j * w * parallel * 1e-12 * np.array(self.capacitance_pf))
-        return np.diag(z)
-
-
-@dataclass(frozen=True)
-class CapacitorReceiver(Receiver):
-    """A capacitor at each port, Z = 1 / (i w C): luseepy's ``IdealCapacitorReceiver``.
-
-    Attributes
-    ----------
-    capacitance_pf : (ports,) tuple of float
-    """
-
-    luseepy_name: ClassVar[str] = "IdealCapacitorReceiver"
-    luseepy_parameters: ClassVar[dict[str, str]] = {"C_pf": "capacitance_pf"}
-
-    capacitance_pf: tuple[float, ...] = (30.0, 30.0, 30.0, 30.0)
-
-    def load(self, frequency_mhz: float) -> Complex[np.ndarray, "ports ports"]:
-        return np.diag(1.0 / (2.0e-6j * np.pi * frequency_mhz * np.array(self.capacitance_pf)))
-
-
-@dataclass(frozen=True)
-class MeasuredReceiver(Receiver):
-    """Loads that were measured, or that a file of data holds; they may couple the ports.
-
-    Attributes
-    ----------
-    path : str
-        The file, for error messages.
-    frequencies_mhz : (frequencies,) array
-    load_ohm : (frequencies, ports, ports) complex array
-        ZL; linear between these frequencies, as in luseepy.
-    """
-
-    luseepy_name: ClassVar[str] = "MeasuredReceiver"
-
-    path: str
-    frequencies_mhz: Float[np.ndarray, " frequencies"]
-    load_ohm: Complex[np.ndarray, "frequencies ports ports"]
-
-    def load(self, frequency_mhz: float) -> Complex[np.ndarray, "ports ports"]:
-        (ohm,) = at_frequency(self.path, self.frequencies_mhz, frequency_mhz, self.load_ohm)
-        return ohm
-
-
-def receiver_of(
-    path: str | Path, arrays: Mapping[str, np.ndarray], mhz: str, real: str, imaginary: str
-) -> MeasuredReceiver | None:
-    """Return the loads of a file's arrays with these names; None where it has none."""
-    if not {mhz, real, imaginary} <= set(arrays):
-        return None
-    return MeasuredReceiver(str(path), arrays[mhz], arrays[real] + 1j * arrays[imaginary])
-
-
-def read_receiver(path: str | Path) -> MeasuredReceiver:
-    """Read loads from a FITS file with the images ``freq`` (MHz), ``ZL_real``, ``ZL_imag`` (Ohm).
-
-    Parameters
-    ----------
-    path : str or Path
-        For instance a four-port waterfall.
-
-    Returns
-    -------
-    MeasuredReceiver
-
-    Raises
-    ------
-    InputError
-        For a missing or damaged file, or one that has no such images.
-    """
-    images = read_fits(path, LAYOUT, "check beam.receiver").arrays
-    return receiver_of(path, images, "freq", *LOADS)
-
-
-@dataclass(frozen=True)
-class Circuit:
-    """Antennas, what dissipates in them, and receivers.
-
-    Attributes
-    ----------
-    frequency_mhz : float
-    antenna_ohm : (ports, ports) complex array
-        ZA.
-    moon_ohm, loss_ohm : (ports, ports) complex array
-        Resistive parts of ZA: radiation into the Moon, losses in the antennas.
-    receiver : Receiver or None
-        None for open ports.
-    """
-
-    frequency_mhz: float
-    antenna_ohm: Complex[np.ndarray, "ports ports"]
-    moon_ohm: Complex[np.ndarray, "ports ports"]
-    loss_ohm: Complex[np.ndarray, "ports ports"]
-    receiver: Receiver | None
-
-    @property
-    def load_ohm(self) -> Complex[np.ndarray, "ports ports"] | None:
-        """ZL; None for open ports."""
-        return None if self.receiver is None else self.receiver.load(self.frequency_mhz)
-
-    @property
-    def resistance_ohm(self) -> Complex[np.ndarray, "ports ports"]:
-        """The whole resistive part, (ZA + ZA^H) / 2."""
-        return (self.antenna_ohm + self.antenna_ohm.conj().T) / 2.0
-
-    @property
-    def loading(self) -> Complex[np.ndarray, "ports ports"]:
-        """M = ZL (ZA + ZL)^-1; the identity for open ports."""
-        load_ohm = self.load_ohm
-        if load_ohm is None:
-            return np.eye(len(self.antenna_ohm), dtype=complex)
-        return np.linalg.solve((self.antenna_ohm + load_ohm).T, load_ohm.T).T
-
-    @property
-    def per_kelvin(self) -> Complex[np.ndarray, "ports ports"]:
-        """U = 4 k M (ZA + ZA^H) / 2 M^H, the V^2/Hz that an enclosure of 1 K makes."""
-        return self.emitted(self.resistance_ohm)
-
-    def emitted(
-        self, kelvin_ohm: Complex[np.ndarray, "ports ports"]
-    ) -> Complex[np.ndarray, "ports ports"]:
-        """Return the V^2/Hz at the receivers of resistances times their temperatures in K."""
-        return 4.0 * Boltzmann * self.loading @ kelvin_ohm @ self.loading.conj().T
-
-
 # rotations keep |n| = 1 to rounding; a vector that is further from it is a mistake
 UNIT_TOLERANCE = 1e-9
 
@@ -563,8 +366,8 @@ NORMALISATION_LMAX = 63
 
 
 def beams_towards(
-    frequency_mhz: float | Float[Array, ""],
-    directions: Float[Array, "directions 3"],
+    frequency_mhz: Frequency,
+    directions: Vectors,
     monopoles: Monopoles | None = None,
     *,
     stokes: str = "I",
@@ -616,10 +419,7 @@ def beams_towards(
 
 @compiled
 def _patterns(
-    frequency_mhz: Float[Array, ""],
-    directions: Float[Array, "directions 3"],
-    monopoles: Monopoles,
-    stokes: str,
+    frequency_mhz: Frequency, directions: Vectors, monopoles: Monopoles, stokes: str
 ) -> Float[Array, "products directions"]:
     visible = directions[:, 2] > 0.0
     # a visible direction replaces the hidden ones: its field and its slopes are finite
@@ -636,3 +436,49 @@ def _normalisation(frequency_mhz: Float[Array, ""], monopoles: Monopoles) -> Flo
     grid = HemisphereGrid.for_lmax(NORMALISATION_LMAX)
     e_theta, e_phi = monopoles.towards(frequency_mhz, grid.theta[:, None], grid.phi[None])
     return mean_auto_integral(AntennaFields(e_theta, e_phi, grid))
+
+
+def source_response(
+    observation: Observation,
+    galactic: Float[np.ndarray, "..."],
+    frequency_mhz: Frequency,
+    monopoles: Monopoles | None = None,
+    *,
+    stokes_v: float | Float[Array, ""] = 0.0,
+) -> Float[Array, "products times"]:
+    """Return the visibilities of a source of 1 K sr at every sample.
+
+    V_k(t) = B_k^I(n(t)) + stokes_v B_k^V(n(t)), since I = 1 K sr and V = stokes_v I. Multiply by
+    the flux in K sr, constant or (times,). Differentiable in ``monopoles`` and ``stokes_v``.
+
+    Parameters
+    ----------
+    observation : Observation
+    galactic : (3,) or (times, 3) array
+        As of :meth:`.Observation.antenna_directions`.
+    frequency_mhz : float
+    monopoles : Monopoles, optional
+        By default the paper's antennas.
+    stokes_v : float
+        V / I with the IAU's sign. Where it is positive, a receiver that looks towards the source
+        sees the electric field turn counter-clockwise (right-handed).
+
+    Returns
+    -------
+    (products, times) array
+        In K; zero while the source is below the horizon.
+
+    Raises
+    ------
+    InputError
+        As :meth:`.Observation.antenna_directions`; for vectors whose length is not one, a frequency
+        that is not positive, or ``|stokes_v| > 1``.
+    """
+    if not is_traced(stokes_v) and not abs(stokes_v) <= 1.0:
+        raise InputError(f"stokes_v is the fraction V / I, from -1 to 1, got {stokes_v}")
+    directions = observation.antenna_directions(galactic)
+    response = beams_towards(frequency_mhz, directions, monopoles)
+    if not is_traced(stokes_v) and stokes_v == 0.0:
+        return response
+    circular = beams_towards(frequency_mhz, directions, monopoles, stokes="V")
+    return response + stokes_v * circular

@@ -22,39 +22,39 @@ theta (``healpix``); azimuth is phi, from East towards North.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from astropy.io import fits
 from jaxtyping import Complex, Float, Inexact
 
 from lusee_bayes.core import formats
-from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import Described, listed
+from lusee_bayes.core.checks import Described, listed, require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing, user_path
 from lusee_bayes.core.formats import (
     UVBEAM_WORDS,
+    as_dataset,
     has_words,
     image_names,
     is_fits,
     read_fits,
     read_netcdf,
 )
-from lusee_bayes.core.layouts import Attribute, Content, Layout, Variable, require_mhz
+from lusee_bayes.core.layouts import Attribute, Kind, Layout, Variable
 from lusee_bayes.core.lazy import healpy, pyuvdata
 from lusee_bayes.core.reading import naming, reading, require_file
 from lusee_bayes.instrument.beams.fields import (
     AntennaFields,
     HemisphereGrid,
+    Pairs,
     ProductBeams,
     at_frequency,
     from_rings,
     on_grid,
-    stokes_beam,
 )
 from lusee_bayes.instrument.beams.luseepy_files import (
     PortResponse,
@@ -63,8 +63,11 @@ from lusee_bayes.instrument.beams.luseepy_files import (
     read_scalar_beam,
 )
 from lusee_bayes.instrument.beams.source import BeamSource
-from lusee_bayes.instrument.products import auto_indices, labels, to_matrix, to_real
+from lusee_bayes.instrument.products import antennas_of, auto_indices, labels, to_matrix, to_real
 
+# functions in the directions that were sampled, and on a grid
+Sampled = Inexact[np.ndarray, "n *directions"]
+OnGrid = Inexact[np.ndarray, "n theta phi"]
 # of angles in degrees that are written with few digits
 ANGLE_TOLERANCE = 1e-6
 
@@ -91,44 +94,36 @@ class Directions:
     nside: int = 0
 
     @classmethod
-    def of(cls, theta_deg: Any, phi_deg: Any, shape: tuple[int, ...], path: str) -> Directions:
+    def of(cls, theta_deg: Any, phi_deg: Any, n_last: int, path: str) -> Directions:
         """Return the directions of the last axes of arrays.
 
         Parameters
         ----------
         theta_deg, phi_deg : array or None
             See :func:`.sampled_beams`.
-        shape : tuple of int
-            Of the last axes.
+        n_last : int
+            Length of the last axis: the pixels, where there are no angles.
         path : str
             For messages.
 
         Raises
         ------
         InputError
-            If angles do not cover the hemisphere, or neither they nor pixels fit the shape.
+            If angles do not cover the hemisphere, or there are not the pixels of a map.
         """
-        if (theta_deg is None) != (phi_deg is None):
-            raise InputError(f"{path}: give both theta_deg and phi_deg, or neither for HEALPix")
         if theta_deg is None or phi_deg is None:
-            if len(shape) != 1 or not healpy.isnpixok(shape[0]):
+            if not healpy.isnpixok(n_last):
                 raise InputError(
-                    f"{path}: directions of shape {shape} are no HEALPix map of 12 NSIDE^2 pixels; "
-                    "give theta_deg and phi_deg for a grid"
+                    f"{path}: {n_last} directions are no HEALPix map of 12 NSIDE^2 pixels; give "
+                    "theta_deg and phi_deg for a grid"
                 )
-            return cls(None, 0, healpy.npix2nside(shape[0]))
-        theta, phi = (np.atleast_1d(np.asarray(x, dtype=np.float64)) for x in (theta_deg, phi_deg))
-        if shape != (len(theta), len(phi)):
-            raise InputError(
-                f"{path}: directions of shape {shape}, expected {len(theta)} theta x {len(phi)} phi"
-            )
+            return cls(None, 0, healpy.npix2nside(n_last))
+        theta, phi = theta_deg, phi_deg
         used = theta[theta < 90.0 - ANGLE_TOLERANCE]
-        steps = np.diff(theta)
-        covers = len(used) >= 4 and (steps > 0.0).all() and theta[0] >= 0.0
-        if not covers or max(theta[0], 90.0 - used[-1]) > steps[: len(used)].max():
+        if len(used) < 4 or max(used[0], 90.0 - used[-1]) > np.diff(theta)[: len(used)].max():
             raise InputError(
                 f"{path}: theta_deg runs from {theta[0]:g} to {theta[-1]:g} in {len(theta)} steps, "
-                "expected growing angles from the zenith (0) to the horizon (90), four at least"
+                "expected angles from the zenith (0) to the horizon (90), four at least"
             )
         n = len(phi) - int(len(phi) > 1 and abs(phi[-1] - 360.0) < ANGLE_TOLERANCE)
         if np.abs(phi[:n] - 360.0 * np.arange(n) / n).max() > ANGLE_TOLERANCE:
@@ -163,8 +158,7 @@ class Directions:
         bad = ~np.isfinite(kept)
         if bad.any():
             raise InputError(
-                f"{what} holds NaN or infinity in {int(bad.sum())} of {bad.size} places above the "
-                "horizon"
+                f"{what} holds NaN or infinity in {bad.sum()} of {bad.size} places in the sky"
             )
         return kept
 
@@ -174,9 +168,7 @@ class Directions:
         azimuths = 4 * self.nside if self.theta is None else self.n_phi
         return HemisphereGrid.gauss_legendre(2 * max(rings, lmax + 1), max(azimuths, 2 * lmax + 2))
 
-    def scalars_on(
-        self, values: Inexact[np.ndarray, "n *directions"], grid: HemisphereGrid, turn_deg: float
-    ) -> Inexact[np.ndarray, "n theta phi"]:
+    def scalars_on(self, values: Sampled, grid: HemisphereGrid, turn_deg: float) -> OnGrid:
         """Interpolate functions, turned from East towards North, to a grid."""
         if self.theta is None:
             return from_rings(values, grid.theta, grid.phi - np.radians(turn_deg))
@@ -184,12 +176,8 @@ class Directions:
         return np.stack(turned) if np.iscomplexobj(values) else np.stack(turned).real
 
     def vectors_on(
-        self,
-        e_theta: Complex[np.ndarray, "n *directions"],
-        e_phi: Complex[np.ndarray, "n *directions"],
-        grid: HemisphereGrid,
-        turn_deg: float,
-    ) -> tuple[Complex[np.ndarray, "n theta phi"], Complex[np.ndarray, "n theta phi"]]:
+        self, e_theta: Sampled, e_phi: Sampled, grid: HemisphereGrid, turn_deg: float
+    ) -> tuple[OnGrid, OnGrid]:
         """Interpolate theta and phi components of vectors, turned likewise, to a grid.
 
         Between pixels the components along three fixed axes are interpolated: those along theta
@@ -215,8 +203,8 @@ def _axes(theta: np.ndarray, phi: np.ndarray) -> tuple[list[np.ndarray], list[np
     )
 
 
-@dataclass(frozen=True, repr=False)
-class SampledBeams(Described):
+@dataclass(frozen=True, repr=False, eq=False)
+class SampledBeams(Described, BeamSource):
     """Fields of antennas, or beams of products, in directions of a grid or of HEALPix pixels.
 
     :func:`sampled_beams` makes them of arrays.
@@ -236,6 +224,11 @@ class SampledBeams(Described):
         autos are scaled to integrate to one on average.
     path : str
         Where they come from, for messages.
+    turntable_offset_deg : float
+        How much further the turntable is than it says, from East towards North.
+    normalise : bool or None
+        Scale the beams so that autos integrate to one on average; by default unless they are
+        absolute.
     """
 
     frequencies_mhz: Float[np.ndarray, " frequencies"]
@@ -245,6 +238,8 @@ class SampledBeams(Described):
     products: Float[np.ndarray, "frequencies products *directions"] | None = None
     absolute: bool = False
     path: str = "the beams"
+    turntable_offset_deg: float = 0.0
+    normalise: bool | None = None
 
     def description(self) -> tuple[str, ...]:
         kind = "E fields of" if self.products is None else "product beams of"
@@ -256,81 +251,30 @@ class SampledBeams(Described):
 
     @property
     def n_ports(self) -> int:
-        """Number of antennas."""
         if self.products is None:
             return self.e_theta.shape[1]
-        return round(np.sqrt(self.products.shape[1]))
+        return antennas_of(self.products.shape[1])
 
-    def fields(
-        self, frequency_mhz: float, grid: HemisphereGrid, turn_deg: float = 0.0
-    ) -> AntennaFields:
-        """Return the fields on a grid.
-
-        Parameters
-        ----------
-        frequency_mhz : float
-        grid : HemisphereGrid
-        turn_deg : float
-            How far the antennas are turned, from East towards North.
-
-        Returns
-        -------
-        AntennaFields
-
-        Raises
-        ------
-        InputError
-            Outside the frequencies, or for beams of products.
-        """
+    def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
         if self.products is not None:
             raise InputError(
                 f"{self.path} has beams of products, not the E fields of antennas, which this needs"
             )
         parts = self._at(frequency_mhz, self.e_theta, self.e_phi)
-        return AntennaFields(*self.directions.vectors_on(*parts, grid, turn_deg), grid)
+        turned = self.directions.vectors_on(*parts, grid, self.turntable_offset_deg)
+        return AntennaFields(*turned, grid)
 
-    def patterns(
-        self, frequency_mhz: float, grid: HemisphereGrid, turn_deg: float = 0.0
-    ) -> Complex[np.ndarray, "antennas antennas theta phi"]:
-        """Return the response of every pair to Stokes I on a grid; arguments as of :meth:`fields`.
-
-        Raises
-        ------
-        InputError
-            Outside the frequencies.
-        """
+    def patterns(self, frequency_mhz: float, grid: HemisphereGrid) -> Pairs:
         if self.products is None:
-            return np.asarray(stokes_beam(self.fields(frequency_mhz, grid, turn_deg)))
+            return super().patterns(frequency_mhz, grid)
         (beams,) = self._at(frequency_mhz, self.products)
-        return to_matrix(self.directions.scalars_on(beams, grid, turn_deg))
+        return to_matrix(self.directions.scalars_on(beams, grid, self.turntable_offset_deg))
 
     def _at(self, frequency_mhz: float, *parts: np.ndarray) -> list[np.ndarray]:
         return at_frequency(self.path, self.frequencies_mhz, frequency_mhz, *parts, rule="spline")
 
-    def beams(
-        self,
-        frequency_mhz: float,
-        lmax: int,
-        *,
-        turn_deg: float = 0.0,
-        normalise: bool | None = None,
-    ) -> ProductBeams:
-        """Return the beams of all products.
-
-        Parameters
-        ----------
-        frequency_mhz : float
-        lmax : int
-        turn_deg : float
-            How far the antennas are turned, from East towards North.
-        normalise : bool, optional
-            Scale them so that autos integrate to one on average; by default unless they are
-            absolute.
-
-        Returns
-        -------
-        ProductBeams
-            In K per K.
+    def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
+        """Return the beams of all products in K per K.
 
         Raises
         ------
@@ -339,13 +283,12 @@ class SampledBeams(Described):
             positive.
         """
         grid = self.directions.quadrature(lmax)
-        patterns = to_real(self.patterns(frequency_mhz, grid, turn_deg))
-        if not self.absolute if normalise is None else normalise:
+        patterns = to_real(self.patterns(frequency_mhz, grid))
+        if not self.absolute if self.normalise is None else self.normalise:
             scale = float(grid.integrate(patterns[auto_indices(self.n_ports)]).mean())
             if not scale > 0.0:
                 raise InputError(
-                    f"{self.path}: the autos integrate to {scale:g} sr on average above the "
-                    "horizon, expected a positive number"
+                    f"{self.path}: the autos integrate to {scale:g} sr on average, not above zero"
                 )
             patterns = patterns / scale
         return ProductBeams(grid.modes(patterns, lmax), float(frequency_mhz))
@@ -394,40 +337,26 @@ def sampled_beams(
     InputError
         If the arrays do not fit, are not finite above the horizon, or do not cover it.
     """
-    known = np.atleast_1d(np.asarray(frequencies_mhz, dtype=np.float64))
-    if known.ndim != 1 or not (known > 0.0).all() or not (np.diff(known) > 0.0).all():
-        raise InputError(f"{path}: frequencies_mhz must be positive and grow, got {known}")
-    require_mhz(f"{path}: frequencies_mhz", known)
-    fields = [one for one in (e_theta, e_phi) if one is not None]
-    if len(fields) not in (0, 2) or bool(fields) == (products is not None):
+    fields = {"e_theta": e_theta, "e_phi": e_phi} if products is None else {"products": products}
+    if (e_theta is None) != (e_phi is None) or (e_theta is None) == (products is None):
         raise InputError(f"{path}: give e_theta and e_phi, or products")
-    given = {"products": products} if products is not None else {"e_theta": e_theta, "e_phi": e_phi}
-    arrays = {}
-    for name, values in given.items():
-        kind = np.float64 if name == "products" else np.complex128
-        if name == "products" and np.iscomplexobj(values):
-            raise InputError(
-                f"{path}: products are complex; give real and imaginary parts as 01R, 01I, ..."
-            )
-        arrays[name] = np.asarray(values, dtype=kind)
-        arrays[name] = arrays[name][None] if np.ndim(frequencies_mhz) == 0 else arrays[name]
-    shape = next(iter(arrays.values())).shape
-    directions = Directions.of(theta_deg, phi_deg, shape[2:], path)
-    for name, values in arrays.items():
-        if values.shape != shape or len(values) != len(known):
-            raise InputError(
-                f"{path}: {name} has shape {values.shape}, expected frequencies ({len(known)}) x "
-                f"{'products' if name == 'products' else 'antennas'} x {directions.text}, and the "
-                "same for all arrays"
-            )
-        arrays[name] = directions.above(values, f"{path}: {name}")
-    n = round(np.sqrt(shape[1]))
-    if products is not None and n * n != shape[1]:
-        raise InputError(
-            f"{path}: {shape[1]} products do not come from any number of antennas; expected "
-            "1, 4, 9, 16, ..."
-        )
-    return SampledBeams(known, directions, **arrays, absolute=absolute, path=path)
+    if (theta_deg is None) != (phi_deg is None):
+        raise InputError(f"{path}: give both theta_deg and phi_deg, or neither for HEALPix")
+    grid = {} if theta_deg is None else {"theta_deg": theta_deg, "phi_deg": phi_deg}
+    alone = np.ndim(frequencies_mhz) == 0
+    arrays = {name: np.asarray(x)[None] if alone else np.asarray(x) for name, x in fields.items()}
+    arrays |= {name: np.atleast_1d(np.asarray(x, dtype=float)) for name, x in grid.items()}
+    arrays["frequency_mhz"] = np.atleast_1d(np.asarray(frequencies_mhz, dtype=float))
+    require_positive(f"{path}: frequency_mhz", arrays["frequency_mhz"])
+    kind = "complex" if products is None else "real"
+    given = layout(tuple(fields), bool(grid), kind).checked(path, arrays, {}).arrays
+    some = given[next(iter(fields))]
+    directions = Directions.of(given.get("theta_deg"), given.get("phi_deg"), some.shape[-1], path)
+    if products is not None:
+        with naming(path):
+            antennas_of(some.shape[1])
+    above = {name: directions.above(given[name], f"{path}: {name}") for name in fields}
+    return SampledBeams(given["frequency_mhz"], directions, **above, absolute=absolute, path=path)
 
 
 FIELDS = ("e_theta_real", "e_theta_imag", "e_phi_real", "e_phi_imag")
@@ -436,36 +365,21 @@ WHAT = "sampled beams"
 HINT = "lusee_bayes.write_sampled_beams makes one of sampled_beams(...)"
 
 
-def layout(*, fields: bool, grid: bool, upper: bool = False) -> Layout:
-    """Return what a file holds.
-
-    Parameters
-    ----------
-    fields : bool
-        Whether it has fields, not product beams.
-    grid : bool
-        Whether it has a grid, not HEALPix pixels.
-    upper : bool
-        Whether attributes are words of a FITS header.
-    """
+def layout(
+    names: tuple[str, ...], grid: bool, kind: Kind = "real", attributes: Any = None
+) -> Layout:
+    """Return what a file, or arrays, hold: these fields or beams on a grid or on HEALPix pixels."""
+    first = "product" if names[0] in ("products", POWER) else "antenna"
     directions = ("theta", "phi") if grid else ("pixel",)
-    first = "antenna" if fields else "product"
     # below the horizon there may be anything
-    values = Variable(("frequency", first, *directions), missing=True)
+    values = Variable(("frequency", first, *directions), kind, missing=True)
     angles = {
-        "theta_deg": Variable(("theta",), low=0.0, high=180.0, grows=True, unit="deg"),
-        "phi_deg": Variable(("phi",), low=0.0, high=360.0, grows=True, unit="deg"),
+        f"{name}_deg": Variable((name,), low=0.0, high=end, grows=True, unit="deg")
+        for name, end in (("theta", 180.0), ("phi", 360.0))
     }
-    attributes = {"absolute": Attribute("boolean"), "products": Attribute("text", optional=fields)}
-    return Layout(
-        WHAT,
-        {
-            "frequency_mhz": Variable(("frequency",), low=0.0, grows=True, unit="MHz"),
-            **dict.fromkeys(FIELDS if fields else (POWER,), values),
-            **(angles if grid else {}),
-        },
-        {name.upper() if upper else name: one for name, one in attributes.items()},
-    )
+    frequency = Variable(("frequency",), low=0.0, grows=True, unit="MHz")
+    arrays = {"frequency_mhz": frequency, **dict.fromkeys(names, values)}
+    return Layout(WHAT, arrays | (angles if grid else {}), attributes or {})
 
 
 def read_sampled_beams(path: str | Path) -> SampledBeams:
@@ -485,34 +399,27 @@ def read_sampled_beams(path: str | Path) -> SampledBeams:
         If the file is missing, damaged or of another kind, or not as declared.
     """
     path = user_path(path)
-    in_fits = path.is_file() and is_fits(path)
-
-    def read(declared: Layout) -> Content:
-        if in_fits:
-            return read_fits(path, declared, HINT)
-        return read_netcdf(path, formats.BEAMS, declared, HINT)
-
-    there = read(Layout(WHAT)).there
-    found = read(layout(fields=POWER not in there, grid="theta_deg" in there, upper=in_fits))
-    arrays, said = found.arrays, {key.lower(): value for key, value in found.values.items()}
-    given: dict[str, np.ndarray] = {}
+    if path.is_file() and is_fits(path):
+        read = partial(read_fits, path, hint=HINT)
+    else:
+        read = partial(read_netcdf, path, formats.BEAMS, hint=HINT)
+    there = read(layout=Layout(WHAT)).there
+    names = (POWER,) if POWER in there else FIELDS
+    said = {"absolute": Attribute("boolean")}
+    said |= {"products": Attribute("text")} if POWER in there else {}
+    found = read(layout=layout(names, "theta_deg" in there, attributes=said))
+    arrays, given = found.arrays, {}
     if POWER in arrays:
         with naming(path):
-            given["products"] = _in_order(arrays[POWER], said["products"])
+            given["products"] = _in_order(arrays[POWER], found.values["products"])
     else:
-        parts = [arrays[name] for name in FIELDS]
-        # set part by part: infinity times 1j would be NaN, with a warning
-        given["e_theta"], given["e_phi"] = np.empty((2, *parts[0].shape), dtype=complex)
-        given["e_theta"].real, given["e_theta"].imag = parts[0], parts[1]
-        given["e_phi"].real, given["e_phi"].imag = parts[2], parts[3]
-    return sampled_beams(
-        arrays["frequency_mhz"],
-        **given,
-        theta_deg=arrays.get("theta_deg"),
-        phi_deg=arrays.get("phi_deg"),
-        absolute=said["absolute"],
-        path=str(path),
-    )
+        for name in ("e_theta", "e_phi"):
+            # set part by part: infinity times 1j would be NaN, with a warning
+            given[name] = np.empty(arrays[FIELDS[0]].shape, dtype=complex)
+            given[name].real, given[name].imag = (arrays[f"{name}_{x}"] for x in ("real", "imag"))
+    angles = {name: arrays.get(name) for name in ("theta_deg", "phi_deg")}
+    options = {"absolute": found.values["absolute"], "path": str(path)}
+    return sampled_beams(arrays["frequency_mhz"], **given, **angles, **options)
 
 
 def write_sampled_beams(path: str | Path, beams: SampledBeams) -> Path:
@@ -527,80 +434,40 @@ def write_sampled_beams(path: str | Path, beams: SampledBeams) -> Path:
     -------
     Path
     """
-    path, fields = user_path(path), beams.products is None
-    grid = beams.directions.theta is not None
+    path, theta = user_path(path), beams.directions.theta
     arrays = {"frequency_mhz": beams.frequencies_mhz}
-    if fields:
+    said = {"format": formats.BEAMS, "absolute": int(beams.absolute)}
+    if beams.products is None:
         parts = (beams.e_theta.real, beams.e_theta.imag, beams.e_phi.real, beams.e_phi.imag)
         arrays |= dict(zip(FIELDS, parts, strict=True))
     else:
         arrays[POWER] = beams.products
-    if grid:
-        arrays["theta_deg"] = np.degrees(beams.directions.theta)
-        n = beams.directions.n_phi
-        arrays["phi_deg"] = 360.0 * np.arange(n) / n
-    said = {"format": formats.BEAMS, "absolute": int(beams.absolute)}
-    if not fields:
         said["products"] = ",".join(labels(beams.n_ports))
-    with replacing(path) as partial:
+    declared = layout(tuple(arrays)[1:], theta is not None)
+    if theta is not None:
+        arrays["theta_deg"], n = np.degrees(theta), beams.directions.n_phi
+        arrays["phi_deg"] = 360.0 * np.arange(n) / n
+    with replacing(path) as partly:
         if path.suffix.lower() in (".fits", ".fit"):
-            header = fits.Header([(key.upper(), value) for key, value in said.items()])
-            hdus = [fits.PrimaryHDU(header=header)]
-            hdus += [
-                fits.ImageHDU(np.ascontiguousarray(a), name=name) for name, a in arrays.items()
-            ]
-            fits.HDUList(hdus).writeto(partial)
+            hdus = [fits.PrimaryHDU(header=fits.Header(list(said.items())))]
+            hdus += [fits.ImageHDU(a.copy(), name=name) for name, a in arrays.items()]
+            fits.HDUList(hdus).writeto(partly)
         else:
-            declared = layout(fields=fields, grid=grid).variables
-            variables = {name: (declared[name].dims, one) for name, one in arrays.items()}
-            xr.Dataset(variables, attrs=said).to_netcdf(partial, engine="h5netcdf")
+            dataset = as_dataset(formats.BEAMS, declared, arrays, said)
+            dataset.to_netcdf(partly, engine="h5netcdf")
     return path
 
 
 def _in_order(beams: np.ndarray, products: str) -> np.ndarray:
     """Product beams in the package's order."""
     names = [name.strip() for name in products.split(",")]
-    expected = labels(round(np.sqrt(beams.shape[1])))
+    expected = labels(antennas_of(beams.shape[1]))
     if len(names) != beams.shape[1] or sorted(names) != sorted(expected):
         raise InputError(
             f"products is {products}, expected the names of its {beams.shape[1]} product beams: "
             f"{', '.join(expected)}"
         )
     return beams[:, [names.index(name) for name in expected]]
-
-
-@dataclass(frozen=True, eq=False)
-class SampledFileBeams(BeamSource):
-    """Fields of antennas or beams of products that are sampled in directions; nothing emits.
-
-    Attributes
-    ----------
-    sampled : SampledBeams
-    turntable_offset_deg : float
-        How much further the turntable is than it says, from East towards North.
-    normalise : bool or None
-        Scale the beams so that autos integrate to one on average; None for as the file says.
-    """
-
-    sampled: SampledBeams
-    turntable_offset_deg: float = 0.0
-    normalise: bool | None = None
-
-    @property
-    def n_ports(self) -> int:
-        return self.sampled.n_ports
-
-    def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
-        return self.sampled.fields(frequency_mhz, grid, self.turntable_offset_deg)
-
-    def patterns(
-        self, frequency_mhz: float, grid: HemisphereGrid
-    ) -> Complex[Array, "antennas antennas theta phi"]:
-        return self.sampled.patterns(frequency_mhz, grid, self.turntable_offset_deg)
-
-    def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
-        turn_deg, normalise = self.turntable_offset_deg, self.normalise
-        return self.sampled.beams(frequency_mhz, lmax, turn_deg=turn_deg, normalise=normalise)
 
 
 def read_uvbeam(path: str | Path) -> SampledBeams:
@@ -682,8 +549,7 @@ def from_uvbeam(beam: Any, *, conjugate: bool = False, path: str = "the UVBeam")
                 f"{n} of NSIDE {beam.nside}, in ring order"
             )
     fields = {"e_theta": along_theta, "e_phi": along_phi}
-    if conjugate:
-        fields = {name: one.conj() for name, one in fields.items()}
+    fields = {name: one.conj() if conjugate else one for name, one in fields.items()}
     return sampled_beams(np.asarray(beam.freq_array) / 1e6, **fields, **angles, path=path)
 
 

@@ -1,31 +1,231 @@
-"""Where the beams of an instrument come from: the embedded antennas, or a file of luseepy.
+"""Where the beams of an instrument come from, and what is connected to its ports.
 
-Every kind is one :class:`BeamSource`; what uses beams asks nothing about the kind. A new kind
-is one class here and one line in the test of the contract,
-:func:`lusee_bayes.testing.check_beam_source`.
+Every kind of beams is one :class:`BeamSource`: the embedded antennas, luseepy's files, or beams in
+directions. What uses beams asks nothing about the kind. A new kind is one class and one line in
+the test of the contract, :func:`lusee_bayes.testing.check_beam_source`.
+
+**Circuit.** Antennas of impedance matrix ZA with open-circuit voltages v make the voltages M v at
+the inputs of receivers of impedance ZL (Thevenin's theorem), M = ZL (ZA + ZL)^-1. ZL is that of
+luseepy's models of receivers.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Complex, Float
+from scipy.constants import Boltzmann
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.formats import read_fits
+from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.instrument.beams.fields import (
     AntennaFields,
     HemisphereGrid,
     Interpolation,
+    Pairs,
     ProductBeams,
+    at_frequency,
     stokes_beam,
 )
-from lusee_bayes.instrument.beams.luseepy_files import ROTATIONS_DEG, PortResponse, ScalarBeam
-from lusee_bayes.instrument.beams.monopoles import Circuit, Monopoles, Receiver, monopole_beams
 from lusee_bayes.instrument.products import N_ANTENNAS
+
+Ohms = Complex[np.ndarray, "ports ports"]
+LOADS = ("ZL_real", "ZL_imag")
+LOADS_LAYOUT = Layout(
+    "loads ZL of four receivers, as luseepy's four-port waterfalls hold them",
+    {
+        "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
+        **{name: Variable(("freq", N_ANTENNAS, N_ANTENNAS), unit="Ohm") for name in LOADS},
+    },
+)
+
+
+class Receiver(ABC):
+    """What is connected to the ports.
+
+    Attributes
+    ----------
+    luseepy_name : str
+        Of the class that luseepy has for it.
+    luseepy_parameters : dict of str
+        What that class takes, by its names: the names of the attributes here.
+    """
+
+    luseepy_name: ClassVar[str]
+    luseepy_parameters: ClassVar[dict[str, str]] = {}
+
+    @abstractmethod
+    def load(self, frequency_mhz: float) -> Ohms:
+        """Return ZL in Ohm. InputError at a frequency that the receiver does not know."""
+
+
+@dataclass(frozen=True)
+class JFETReceiver(Receiver):
+    """The preamplifier of each port, by the circuit that its input impedance follows:
+
+    ::
+
+        Z = series + skin w^power + i w L + parallel / (1 + i w parallel C)
+
+    Defaults are luseepy's fits to the four spare flight preamplifiers. Nothing couples them.
+
+    Attributes
+    ----------
+    capacitance_pf, inductance_nh : (ports,) tuple of float
+        C and L.
+    parallel_ohm, series_ohm : (ports,) tuple of float
+    skin_ohm, skin_power : (ports,) tuple of float
+        Skin effect, with w in rad/s.
+    """
+
+    luseepy_name: ClassVar[str] = "JFETReceiver"
+    luseepy_parameters: ClassVar[dict[str, str]] = {
+        "C_pf": "capacitance_pf", "L_nh": "inductance_nh", "Rp_ohm": "parallel_ohm",
+        "Rs_ohm": "series_ohm", "a": "skin_ohm", "n": "skin_power",
+    }  # fmt: skip
+
+    capacitance_pf: tuple[float, ...] = (33.79, 35.32, 34.89, 36.85)
+    inductance_nh: tuple[float, ...] = (35.0, 36.4, 34.7, 8.5)
+    parallel_ohm: tuple[float, ...] = (1101e3, 331e3, 288e3, 375e3)
+    series_ohm: tuple[float, ...] = (0.21, 2.16, 3.71, 1.65)
+    skin_ohm: tuple[float, ...] = (5.2e-12, 6.9e-20, 2.2e-38, 1.9e-16)
+    skin_power: tuple[float, ...] = (1.39, 2.26, 4.35, 1.88)
+
+    def load(self, frequency_mhz: float) -> Ohms:
+        w = 2.0e6 * np.pi * frequency_mhz
+        parallel = np.array(self.parallel_ohm)
+        z = np.array(self.series_ohm) + np.array(self.skin_ohm) * w ** np.array(self.skin_power)
+        z = z + 1j * w * 1e-9 * np.array(self.inductance_nh)
+        z = z + parallel / (1.0 + 1j * w * parallel * 1e-12 * np.array(self.capacitance_pf))
+        return np.diag(z)
+
+
+@dataclass(frozen=True)
+class CapacitorReceiver(Receiver):
+    """A capacitor at each port, Z = 1 / (i w C): luseepy's ``IdealCapacitorReceiver``.
+
+    Attributes
+    ----------
+    capacitance_pf : (ports,) tuple of float
+    """
+
+    luseepy_name: ClassVar[str] = "IdealCapacitorReceiver"
+    luseepy_parameters: ClassVar[dict[str, str]] = {"C_pf": "capacitance_pf"}
+
+    capacitance_pf: tuple[float, ...] = (30.0, 30.0, 30.0, 30.0)
+
+    def load(self, frequency_mhz: float) -> Ohms:
+        return np.diag(1.0 / (2.0e-6j * np.pi * frequency_mhz * np.array(self.capacitance_pf)))
+
+
+@dataclass(frozen=True)
+class MeasuredReceiver(Receiver):
+    """Loads that were measured, or that a file of data holds; they may couple the ports.
+
+    Attributes
+    ----------
+    path : str
+        The file, for error messages.
+    frequencies_mhz : (frequencies,) array
+    load_ohm : (frequencies, ports, ports) complex array
+        ZL; linear between these frequencies, as in luseepy.
+    """
+
+    luseepy_name: ClassVar[str] = "MeasuredReceiver"
+
+    path: str
+    frequencies_mhz: Float[np.ndarray, " frequencies"]
+    load_ohm: Complex[np.ndarray, "frequencies ports ports"]
+
+    def load(self, frequency_mhz: float) -> Ohms:
+        (ohm,) = at_frequency(self.path, self.frequencies_mhz, frequency_mhz, self.load_ohm)
+        return ohm
+
+
+def receiver_of(
+    path: str | Path, arrays: Mapping[str, np.ndarray], mhz: str, real: str, imaginary: str
+) -> MeasuredReceiver | None:
+    """Return the loads of a file's arrays with these names; None where it has none."""
+    if not {mhz, real, imaginary} <= set(arrays):
+        return None
+    return MeasuredReceiver(str(path), arrays[mhz], arrays[real] + 1j * arrays[imaginary])
+
+
+def read_receiver(path: str | Path) -> MeasuredReceiver:
+    """Read loads from a FITS file with the images ``freq`` (MHz), ``ZL_real``, ``ZL_imag`` (Ohm).
+
+    Parameters
+    ----------
+    path : str or Path
+        For instance a four-port waterfall.
+
+    Returns
+    -------
+    MeasuredReceiver
+
+    Raises
+    ------
+    InputError
+        For a missing or damaged file, or one that has no such images.
+    """
+    images = read_fits(path, LOADS_LAYOUT, "check beam.receiver").arrays
+    return receiver_of(path, images, "freq", *LOADS)
+
+
+@dataclass(frozen=True)
+class Circuit:
+    """Antennas, what dissipates in them, and receivers.
+
+    Attributes
+    ----------
+    frequency_mhz : float
+    antenna_ohm : (ports, ports) complex array
+        ZA.
+    moon_ohm, loss_ohm : (ports, ports) complex array
+        Resistive parts of ZA: radiation into the Moon, losses in the antennas.
+    receiver : Receiver or None
+        None for open ports.
+    """
+
+    frequency_mhz: float
+    antenna_ohm: Ohms
+    moon_ohm: Ohms
+    loss_ohm: Ohms
+    receiver: Receiver | None
+
+    @property
+    def load_ohm(self) -> Ohms | None:
+        """ZL; None for open ports."""
+        return None if self.receiver is None else self.receiver.load(self.frequency_mhz)
+
+    @property
+    def resistance_ohm(self) -> Ohms:
+        """The whole resistive part, (ZA + ZA^H) / 2."""
+        return (self.antenna_ohm + self.antenna_ohm.conj().T) / 2.0
+
+    @property
+    def loading(self) -> Ohms:
+        """M = ZL (ZA + ZL)^-1; the identity for open ports."""
+        load_ohm = self.load_ohm
+        if load_ohm is None:
+            return np.eye(len(self.antenna_ohm), dtype=complex)
+        return np.linalg.solve((self.antenna_ohm + load_ohm).T, load_ohm.T).T
+
+    @property
+    def per_kelvin(self) -> Ohms:
+        """U = 4 k M (ZA + ZA^H) / 2 M^H, the V^2/Hz that an enclosure of 1 K makes."""
+        return self.emitted(self.resistance_ohm)
+
+    def emitted(self, kelvin_ohm: Ohms) -> Ohms:
+        """Return the V^2/Hz at the receivers of resistances times their temperatures in K."""
+        return 4.0 * Boltzmann * self.loading @ kelvin_ohm @ self.loading.conj().T
 
 
 class BeamSource(ABC):
@@ -64,9 +264,7 @@ class BeamSource(ABC):
             If the source has no beams at this frequency, or no fields of antennas.
         """
 
-    def patterns(
-        self, frequency_mhz: float, grid: HemisphereGrid
-    ) -> Complex[Array, "antennas antennas theta phi"]:
+    def patterns(self, frequency_mhz: float, grid: HemisphereGrid) -> Pairs:
         """Return the response of every pair to Stokes I on a grid, in the unit of :meth:`fields`.
 
         Raises
@@ -151,149 +349,8 @@ class BeamSource(ABC):
         return self
 
     @property
-    def monopoles(self) -> Monopoles:
+    def monopoles(self) -> BeamSource:
         """The embedded antennas. InputError where the beams are those of a file."""
         raise InputError(
             "this needs the embedded antennas, which beam.file replaces; leave out beam.file"
         )
-
-
-@dataclass(frozen=True, eq=False)
-class EmbeddedBeams(BeamSource):
-    """The package's own antennas; their beams are scaled to the sky alone.
-
-    Attributes
-    ----------
-    antennas : Monopoles
-    """
-
-    antennas: Monopoles
-
-    @property
-    def n_ports(self) -> int:
-        return self.antennas.azimuths_deg.size
-
-    def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
-        return self.antennas.fields(frequency_mhz, grid)
-
-    def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
-        return monopole_beams(frequency_mhz, lmax, self.antennas)
-
-    @property
-    def monopoles(self) -> Monopoles:
-        return self.antennas
-
-
-@dataclass(frozen=True, eq=False)
-class ScalarFileBeams(BeamSource):
-    """One arm from a scalar beam file, at several azimuths; nothing couples the arms.
-
-    Attributes
-    ----------
-    beam : ScalarBeam
-    turntable_offset_deg : float
-        How much further the turntable is than it says, from East towards North.
-    taper : bool
-        Fade out towards the horizon as luseepy does.
-    rotations_deg : tuple of float
-        How far the pattern is turned for each port, from East towards North.
-    luseepy_quadrature : bool
-        Integrate with luseepy's own rule, for data that luseepy has made.
-    moon_k : float
-        Temperature of the ground in K.
-    """
-
-    beam: ScalarBeam
-    turntable_offset_deg: float = 0.0
-    taper: bool = True
-    rotations_deg: tuple[float, ...] = ROTATIONS_DEG
-    luseepy_quadrature: bool = False
-    moon_k: float = 0.0
-
-    @property
-    def n_ports(self) -> int:
-        return len(self.rotations_deg)
-
-    @property
-    def emits(self) -> bool:
-        return self.moon_k != 0.0
-
-    def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
-        return self.beam.fields(frequency_mhz, **(self._placement | {"grid": grid}))
-
-    def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
-        return self.beam.beams(frequency_mhz, lmax, **self._placement)
-
-    def background(self, frequency_mhz: float) -> Float[Array, " products"]:
-        if not self.emits:
-            return super().background(frequency_mhz)
-        return self.beam.background(frequency_mhz, self.moon_k, **self._placement)
-
-    def impedance(self, frequency_mhz: float) -> complex | None:
-        return self.beam.impedance_at(frequency_mhz)
-
-    def interpolated(self, frequency_mhz: float) -> Interpolation | None:
-        return self.beam.interpolated(frequency_mhz)
-
-    @property
-    def _placement(self) -> dict[str, Any]:
-        grid = self.beam.luseepy_grid if self.luseepy_quadrature else None
-        rotations = tuple(angle + self.turntable_offset_deg for angle in self.rotations_deg)
-        return {"grid": grid, "taper": self.taper, "rotations_deg": rotations}
-
-
-@dataclass(frozen=True, eq=False)
-class ResponseBeams(BeamSource):
-    """Four coupled ports from a response file, with their receivers.
-
-    Attributes
-    ----------
-    response : PortResponse
-    turntable_offset_deg : float
-        How much further the turntable is than it says, from East towards North.
-    luseepy_quadrature : bool
-        Integrate with luseepy's own rule, for data that luseepy has made.
-    moon_k, antenna_k : float
-        Temperatures of the ground and of the lossy antennas in K.
-    receiver_said : bool
-        Whether the response's receivers are to be used for all data; else those that data say.
-    """
-
-    response: PortResponse
-    turntable_offset_deg: float = 0.0
-    luseepy_quadrature: bool = False
-    moon_k: float = 0.0
-    antenna_k: float = 0.0
-    receiver_said: bool = True
-
-    @property
-    def n_ports(self) -> int:
-        return N_ANTENNAS
-
-    @property
-    def emits(self) -> bool:
-        return self.moon_k != 0.0 or self.antenna_k != 0.0
-
-    def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
-        return self.response.fields(frequency_mhz, grid=grid, turn_deg=self.turntable_offset_deg)
-
-    def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
-        grid = self.response.luseepy_grid if self.luseepy_quadrature else None
-        turn_deg = self.turntable_offset_deg
-        return self.response.beams(frequency_mhz, lmax, grid=grid, turn_deg=turn_deg)
-
-    def background(self, frequency_mhz: float) -> Float[Array, " products"]:
-        if not self.emits:
-            return super().background(frequency_mhz)
-        return self.response.background(frequency_mhz, self.moon_k, self.antenna_k)
-
-    def interpolated(self, frequency_mhz: float) -> Interpolation | None:
-        return self.response.interpolated(frequency_mhz)
-
-    def behind(self, receiver: Receiver | None) -> BeamSource:
-        if receiver is None or self.receiver_said:
-            return self
-        return replace(self, response=replace(self.response, receiver=receiver))
-
-    def circuit(self, frequency_mhz: float) -> Circuit:
-        return self.response.circuit(frequency_mhz)

@@ -17,6 +17,7 @@ from lusee_bayes.instrument.times import unannounced_leap_seconds
 from lusee_bayes.judge.chi2 import probability
 from lusee_bayes.report.figures.drawing import (
     BLUE,
+    COLOURS,
     DIVERGING,
     GREY,
     ORANGE,
@@ -171,11 +172,7 @@ def unknowns_by_frequency(result: MapResult) -> Figure | None:
     return figure
 
 
-# Okabe and Ito's colours, which colour-blind readers tell apart
-LEVEL_COLOURS = {"L": "#56B4E9", "M": "#0072B2", "H": "#CC79A7"}
-PORT_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
-# columns of pixels of an image of flags
-WATERFALL_COLUMNS = 800
+LEVEL_COLOURS = {"L": COLOURS[4], "M": BLUE, "H": COLOURS[3]}
 
 
 def time_line(reduced: Reduced) -> Figure:
@@ -284,7 +281,7 @@ def _gains(left: Axes, reduced: Reduced) -> None:
             (line,) = left.semilogy(
                 curves.frequencies_mhz,
                 gain,
-                color=PORT_COLOURS[port],
+                color=COLOURS[port],
                 ls={"L": ":", "M": "-", "H": "--"}[letter],
                 label=label,
             )

@@ -213,16 +213,34 @@ SHOWN = 3
 
 def channel_maps(cube: MapResult) -> Figure:
     """Posterior mean and standard deviation of a few channels from the lowest to the highest."""
-    n = len(cube.frequencies_mhz)
-    shown = np.unique(np.linspace(0, n - 1, min(n, SHOWN)).round().astype(int))
-    mean, pixel_std = cube.maps()["mean"], cube.stacked("pixel_std")
-    figure, rows = framed((12, 3.4 * len(shown) + 0.4), len(shown), 2, squeeze=False)
-    for k, (left, right) in zip(shown, rows, strict=True):
-        name = f"{cube.frequencies_mhz[k]:g} MHz"
-        options = {"altitude": cube.channels[k].highest_altitude, "shrink": 0.85}
-        spread = LogNorm(*seen_range(pixel_std[k], cube.channels[k].highest_altitude))
-        sky_panel(left, f"{name}: posterior mean", mean[k], temperatures(mean[k]), **options)
-        sky_panel(right, f"{name}: standard deviation", pixel_std[k], spread, **options)
+    n = len(cube.channels)
+    chosen = np.unique(np.linspace(0, n - 1, min(n, SHOWN)).round().astype(int))
+    channels = [cube.channels[k] for k in chosen]
+    return _rows_of_maps({f"{channel.frequency_mhz:g} MHz": channel for channel in channels})
+
+
+def maps_of_runs(runs: Sequence[FinishedRun]) -> Figure:
+    """Posterior mean and standard deviation of every run, each kind on one scale."""
+    channels = [run.channel for run in runs]
+    means = [modes_to_map(channel.mean, channel.nside) for channel in channels]
+    bounds = [seen_range(channel.pixel_std, channel.highest_altitude) for channel in channels]
+    spread = LogNorm(min(low for low, _ in bounds), max(high for _, high in bounds))
+    scales = temperatures(np.concatenate(means)), spread
+    return _rows_of_maps({run.name: run.channel for run in runs}, scales)
+
+
+def _rows_of_maps(
+    named: Mapping[str, ChannelResult], scales: tuple[LogNorm, LogNorm] | None = None
+) -> Figure:
+    """Mean and standard deviation side by side, on the same scales or each on its own."""
+    figure, rows = framed((12, 3.4 * len(named) + 0.4), len(named), 2, squeeze=False)
+    for (name, channel), (left, right) in zip(named.items(), rows, strict=True):
+        mean, std = modes_to_map(channel.mean, channel.nside), channel.pixel_std
+        altitude = channel.highest_altitude
+        options = {"altitude": altitude, "shrink": 0.85}
+        own = scales or (temperatures(mean), LogNorm(*seen_range(std, altitude)))
+        sky_panel(left, f"{name}: posterior mean", mean, own[0], **options)
+        sky_panel(right, f"{name}: standard deviation", std, own[1], **options)
     return figure
 
 
@@ -288,22 +306,6 @@ def chi2(cube: MapResult) -> Figure | None:
     if np.isfinite(ratio).all() and ratio.max() > 3.0:
         axes.set_yscale("log")
     axes.set(xlabel="frequency [MHz]", ylabel=r"$\chi^2$ / its mean if the model holds")
-    return figure
-
-
-def maps_of_runs(runs: Sequence[FinishedRun]) -> Figure:
-    """Posterior mean and standard deviation of every run, each kind on one scale."""
-    channels = [run.channel for run in runs]
-    means = [modes_to_map(channel.mean, channel.nside) for channel in channels]
-    scale = temperatures(np.concatenate(means))
-    bounds = [seen_range(channel.pixel_std, channel.highest_altitude) for channel in channels]
-    spread = LogNorm(min(low for low, _ in bounds), max(high for _, high in bounds))
-    figure, rows = framed((12, 3.4 * len(runs) + 0.4), len(runs), 2, squeeze=False)
-    for run, mean, (left, right) in zip(runs, means, rows, strict=True):
-        options = {"altitude": run.channel.highest_altitude, "shrink": 0.85}
-        sky_panel(left, f"{run.name}: mean", mean, scale, **options)
-        std = run.channel.pixel_std
-        sky_panel(right, f"{run.name}: standard deviation", std, spread, **options)
     return figure
 
 

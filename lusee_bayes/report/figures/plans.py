@@ -11,14 +11,12 @@ from matplotlib.ticker import MaxNLocator
 
 from lusee_bayes.core.harmonics import power_spectrum
 from lusee_bayes.judge.levels import LEVELS
-from lusee_bayes.report.figures.drawing import BLUE, COLOURS, GREY, LINES, ORANGE, framed
+from lusee_bayes.report.figures.drawing import COLOURS, GREY, LINES, framed
 from lusee_bayes.results.forecast import AS_GIVEN, Forecast
 from lusee_bayes.results.prior_comparison import PriorComparison
 
-# distinct without colour vision (Okabe-Ito) and by shape; again from the first after four
-STYLES = ((BLUE, "o"), (ORANGE, "s"), ("#009E73", "^"), ("#000000", "D"))
-
-
+# distinct without colour vision and by shape; again from the first after four
+STYLES = tuple(zip(COLOURS, "os^D", strict=False))
 # numbers of a forecast, with the words of their axes; one that is None is not reached
 PANELS = {
     "information_bits": "information about the sky [bits]",

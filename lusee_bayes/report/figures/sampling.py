@@ -18,6 +18,7 @@ from lusee_bayes.judge.levels import LEVELS
 from lusee_bayes.judge.measures import highest_altitude
 from lusee_bayes.report.figures.drawing import (
     BLUE,
+    COLOURS,
     DIVERGING,
     GREY,
     ORANGE,
@@ -120,10 +121,6 @@ def _vary(quantities: Iterable[Float[np.ndarray, "chains draws"]]) -> bool:
     )
 
 
-# four chains that are distinct without colour vision (Okabe-Ito), again from the first after that
-CHAIN_COLOURS = (BLUE, ORANGE, "#009E73", "#000000")
-
-
 def uncertainty(run: SampleResult) -> Figure:
     """Mean, standard deviation and 90 % interval of the drawn maps, and how skewed it is."""
     maps = run.maps
@@ -177,7 +174,7 @@ def traces(run: SampleResult) -> Figure:
         moved = np.ptp(draws) > 1e-12 * np.abs(draws).max()
         bins = np.histogram_bin_edges(draws, 40 if moved else 1)
         for number, chain in enumerate(draws):
-            colour = CHAIN_COLOURS[number % len(CHAIN_COLOURS)]
+            colour = COLOURS[number % len(COLOURS)]
             left.plot(chain, color=colour, lw=0.5, alpha=0.8)
             right.hist(
                 chain, bins, color=colour, histtype="step", density=True, label=f"chain {number}"
