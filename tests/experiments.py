@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpyro.infer.util import log_density
+from reference_linear import random_covariance
 
 import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_host
@@ -87,6 +88,15 @@ def offset_posterior(found: Inference) -> tuple[dict[str, float], np.ndarray]:
 def of_run(data: lb.Visibilities, run: int) -> lb.Visibilities:
     """The data of one run by themselves."""
     return at_times(data, data.observation.run == run)
+
+
+def correlated(prior: lb.Prior) -> lb.DensePrior:
+    """A prior with a mean and about this one's widths, whose modes are correlated."""
+    width = np.sqrt(np.asarray(prior.variance()))
+    rng = np.random.default_rng(6)
+    covariance = random_covariance(rng, len(width)) * width * width[:, None]
+    mean = 0.3 * width * rng.normal(size=len(width))
+    return lb.DensePrior.of_covariance(jnp.asarray(covariance), jnp.asarray(mean))
 
 
 def flagged(data: lb.Visibilities, flags: np.ndarray) -> lb.Visibilities:

@@ -3,15 +3,13 @@
 from dataclasses import replace
 from functools import lru_cache
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from experiments import flagged
-from reference_linear import matrices, posterior, random_covariance
+from experiments import correlated, flagged
+from reference_linear import matrices, posterior
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
-from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.judge import left_out
 from lusee_bayes.judge.left_out import KINDS, LeftOut, groups_of
 from lusee_bayes.judge.residuals import held_out
@@ -43,20 +41,16 @@ def limited(monkeypatch, limits):
         monkeypatch.setattr(left_out, name, value)
 
 
-def flags_of(layout: DataLayout) -> np.ndarray:
-    """A product that is missing, but for some times, a time, and single data."""
-    flags = np.zeros((layout.n_products, layout.n_times), dtype=bool)
-    flags[5, 3:] = flags[:, 7] = flags[2, 11] = flags[9, 0] = True
-    return flags
-
-
 @lru_cache
 def observed(size, kind, *more, gaps=False):
     """A model, its data, and K^-1 and the sky's part of K as matrices."""
     scenario = lb.load_scenario("fiducial", [*SIZES[size], NOISY, *NOISES[kind], *more])
     e = lb.build(scenario)
     if gaps:
-        e = lb.build(scenario, flagged(e.data, flags_of(e.data.layout)))
+        # a product but for some times, a time, and single data
+        flags = np.zeros((e.data.layout.n_products, e.data.layout.n_times), dtype=bool)
+        flags[5, 3:] = flags[:, 7] = flags[2, 11] = flags[9, 0] = True
+        e = lb.build(scenario, flagged(e.data, flags))
     model = full_model(e.setup)
     return model, e.data, *by_matrices(model, e.data)
 
@@ -157,18 +151,15 @@ def test_what_the_posterior_saves_and_means_over_windows():
 def test_a_prior_that_correlates_modes(kind):
     """And that has a mean: the posterior with structure in time, and what it leaves out."""
     model, data, *_ = observed("few", kind)
-    width = np.sqrt(np.asarray(model.prior.variance()))
-    rng = np.random.default_rng(6)
-    correlated = random_covariance(rng, len(width)) * width * width[:, None]
-    mean = 0.3 * width * rng.normal(size=len(width))
-    prior = lb.DensePrior.of_covariance(jnp.asarray(correlated), jnp.asarray(mean))
-    model = replace(model, prior=prior)
+    model = replace(model, prior=correlated(model.prior))
     assert model.is_structured
     found = model.condition(data.data).posterior
     inverse, sky, u = by_matrices(model, data)
     a, s, n = matrices(model)
     answer = posterior(a, s, n, (sky + n) @ u)
-    assert (np.abs(np.asarray(found.mean) - mean - answer.mean) / answer.std).max() < 1e-5
+    assert (
+        np.abs(np.asarray(found.mean - model.prior.mean) - answer.mean) / answer.std
+    ).max() < 1e-5
     np.testing.assert_allclose(found.std(), answer.std, rtol=1e-6)
     np.testing.assert_allclose(found.log_evidence, answer.log_prob, rtol=1e-7)
     check(LeftOut(model, data, posterior=found), data, inverse, sky, u, every_kind(data))

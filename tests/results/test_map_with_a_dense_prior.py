@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from experiments import mapped
-from reference_linear import matrices, random_covariance
+from experiments import correlated, mapped
+from reference_linear import matrices
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers
@@ -16,19 +16,12 @@ from lusee_bayes.testing.scenarios import small_scenario
 LMAX = 6
 
 
-def with_dense_prior(experiment: lb.Experiment) -> lb.Experiment:
-    width = np.sqrt(np.asarray(experiment.setup.prior.variance()))
-    rng = np.random.default_rng(0)
-    covariance = random_covariance(rng, len(width)) * width * width[:, None]
-    prior = lb.DensePrior.of_covariance(covariance, 0.2 * width * rng.normal(size=len(width)))
-    return replace(experiment, setup=replace(experiment.setup, prior=prior))
-
-
 @pytest.fixture(scope="module")
 def found():
     """The experiment conditioned on its data, and the channel."""
-    scenario = small_scenario(lmax=LMAX, cycles=0.1)
-    return mapped(with_dense_prior(lb.build(scenario)))
+    experiment = lb.build(small_scenario(lmax=LMAX, cycles=0.1))
+    setup = replace(experiment.setup, prior=correlated(experiment.setup.prior))
+    return mapped(replace(experiment, setup=setup))
 
 
 def test_the_channel_is_that_of_matrices(found):

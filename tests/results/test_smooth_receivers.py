@@ -9,6 +9,7 @@ import pytest
 from assertions import assert_same_map, refuse
 from experiments import four_ports
 from reference_linear import Answer, white_posterior
+from scipy.linalg import block_diag
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import radiometer, true_values
@@ -75,15 +76,12 @@ class Dense:
                 for port in range(N_PORTS):
                     at = N_MODES + port
                     unmixed[k * size + at, j * size + at] = root[k, j]
-        rows = []
-        for k in used:
-            row = np.zeros((len(self.rest[k]), n * size))
-            own = np.concatenate([self.couplings[k], self.templates[k]], axis=1)
-            row[:, k * size : (k + 1) * size] = own
-            rows.append(row)
-        noise = np.concatenate([self.noise[k] for k in used])
-        rest = np.concatenate([self.rest[k] for k in used])
-        white = white_posterior(np.concatenate(rows) @ unmixed, np.ones(n * size), noise, rest)
+        own = (np.concatenate(x, axis=1) for x in zip(self.couplings, self.templates, strict=True))
+        taken = np.repeat([k in used for k in range(n)], [len(rest) for rest in self.rest])
+        rows, noise, rest = (
+            x[taken] for x in (block_diag(*own), *map(np.concatenate, (self.noise, self.rest)))
+        )
+        white = white_posterior(rows @ unmixed, np.ones(n * size), noise, rest)
         covariance = unmixed @ white.covariance @ unmixed.T
         return Answer(unmixed @ white.mean, covariance, white.log_prob)
 
