@@ -386,12 +386,12 @@ class Visibilities(Described):
         said |= {"frequency_mhz": self.frequency_mhz, "jd1.scale": "utc", "jd2.scale": "utc"}
         said["window"] = kind if self.says_window else None
         dataset = as_dataset(formats.VISIBILITIES, LAYOUT, arrays, said)
-        time, bounds = ("time", _datetimes(seen.times), {}, ENCODING), {}
-        if windows is not None:
-            edges = _datetimes(later(seen.times[:, None], windows.bounds_s))
-            bounds = {"time_bounds": (("time", "bounds"), edges, {}, ENCODING)}
-            time = ("time", time[1], {"bounds": "time_bounds"}, ENCODING)
-        return dataset.assign(bounds).assign_coords(time=time)
+        dataset = dataset.assign_coords(time=("time", _datetimes(seen.times), {}, ENCODING))
+        if windows is None:
+            return dataset
+        dataset["time"].attrs["bounds"] = "time_bounds"
+        bounds = _datetimes(later(seen.times[:, None], windows.bounds_s))
+        return dataset.assign(time_bounds=(("time", "bounds"), bounds, {}, ENCODING))
 
     def write(self, path: str | Path, attrs: dict[str, str] | None = None) -> Path:
         """Write a netCDF file, whole or not at all.
@@ -411,7 +411,6 @@ class Visibilities(Described):
         return user_path(path)
 
 
-# what a file of visibilities holds
 # what files say of an observation, beside the arrays jd1, jd2, run and turntable_deg
 PLACE_AND_TIME = {
     "lon_deg": Attribute(low=-360.0, high=360.0),

@@ -276,8 +276,8 @@ FLAGS[:, 3] = True
 
 
 def test_a_complete_layout_runs_over_time_fastest():
-    layout = DataLayout(3, 5)
-    assert layout.size == 15
+    layout = DataLayout.from_flags(np.zeros((3, 5), dtype=bool))
+    assert layout.size == 15 and layout.index is None
     grid = np.arange(15.0).reshape(3, 5)
     d = layout.gather(jnp.asarray(grid))
     for k, value in enumerate(np.asarray(d)):
@@ -296,10 +296,6 @@ def test_flagged_samples_are_not_in_the_data():
     np.testing.assert_array_equal(layout.present, ~FLAGS)
     grid = np.random.default_rng(0).standard_normal((3, 5))
     np.testing.assert_array_equal(layout.gather(jnp.asarray(grid)), [grid[e] for e in expected])
-
-
-def test_no_flag_is_the_complete_layout():
-    assert DataLayout.from_flags(np.zeros((3, 5), dtype=bool)).index is None
 
 
 @pytest.mark.parametrize("rest", [(), (2,)])

@@ -462,6 +462,9 @@ def test_other_software_finds_bounds_as_the_cf_conventions_have_them(tmp_path):
         np.testing.assert_array_equal(found["time"], middles)
         assert found["time"].encoding["units"] == found["time_bounds"].encoding["units"]
         np.testing.assert_allclose(found["live_time"], HOUR, rtol=0, atol=1e-8)
+        assert found.attrs["Conventions"].startswith("CF-1.")
+        units = {str(name): u.Unit(one.attrs.get("units", "")) for name, one in found.items()}
+        assert (units["visibility"], units["jd1"], units["live_time"]) == (u.K, u.day, u.s)
     with xr.open_dataset(path, engine="h5netcdf", decode_times=False) as raw:
         assert raw["time"].attrs["bounds"] == "time_bounds"
         assert raw["time"].dtype == raw["time_bounds"].dtype
