@@ -19,10 +19,11 @@ With N = N_0 + T T^T, F = [T, A S^(1/2)], and D = N_0^-1, whose blocks are the d
     K_ss = c (1 - W W^T) c^T,    directions = |(1 - W W^T)^(-1/2) W L^-1|^2 over the sky's columns.
 
 Rows of A at times close to each other are combinations of those at a few of them, A_s = U A_few
-(:func:`.spanning_rows`), and so c^T U = q r gives W = q (r F_few L^-T): of a day of ten-minute
-samples an eighth of the rows is computed. Runs of at most ``SHARED`` times have one F_few, which is
-kept for all groups; where D couples products, and where A has no structure in time, Y L^-T of all
-data is kept.
+(:func:`.spanning_rows`), and so c^T U = q r gives W = q (r F_few L^-T). Of a day of ten-minute
+samples these are an eighth, and F_few of each of its days is in turn made of few rows of a stretch
+of ``DAYS`` days. L^-T and Q^-1 are applied to the rows of a stretch, once for all groups within it
+and for the diagonal of K^-1. Runs of at most ``SHARED`` times are one stretch; where D couples
+their products, and where A has no structure in time, Y L^-T of all data is kept.
 
 **A large group** is taken out of Q, without rows of A where A and N have structure in time::
 
@@ -46,7 +47,7 @@ from lusee_bayes.core.engine import in_threads, once
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import (
     cholesky,
-    invert_factorised,
+    invert_lower,
     solve_lower,
     spanning_rows,
     times_lower,
@@ -65,11 +66,11 @@ DENSE_BYTES = 1.2e9
 KEPT_BYTES = 5e8
 # steps that refine Q^-1 F^T D d, which loses what the normal equations lose
 REFINEMENTS = 2
-# runs of no more times have one F_few for all groups; in others, own entries of K^-1 have one for
-# so many times
-SHARED, NEAR = 1000, 144
+# runs of no more times are one stretch, others have stretches of so many days: measured for a year
+# of ten-minute samples, 7 or 30 days take a tenth longer
+SHARED, DAYS = 1000, 15
 # times whose rows are computed at once, and data that are a small group in any case
-CHUNK, QUICK = 64, 500
+CHUNK, QUICK = 16, 500
 
 # arrays by block of D (times, or one block of all data) and place in it (products, or data)
 Cells = Float[np.ndarray, "blocks places"]
@@ -171,12 +172,25 @@ class Chosen(NamedTuple):
     b: Float[np.ndarray, "n m 1"]
 
 
-class Near(NamedTuple):
-    """F at some times: of every product F_few L^-T and F_few Q^-1 of the sky, and U."""
+class Span(NamedTuple):
+    """Few of some times, and U: F at all of them is U F_few."""
 
+    few: Int[np.ndarray, " few"]
+    factors: Float[np.ndarray, "times few"]
+
+
+class Stretch(NamedTuple):
+    """F at some times, in order: of every product F_few L^-T and F_few Q^-1 of the sky, and U."""
+
+    times: Int[np.ndarray, " times"]
     half: Float[np.ndarray, "products few rank"]
     with_sky: Float[np.ndarray, "products few sky"]
     factors: Float[np.ndarray, "times few"]
+
+    def at(self, span: Span, times: Int[np.ndarray, " n"]) -> Stretch:
+        """F at some of its times, by few of them."""
+        combined = self.factors[np.searchsorted(self.times, span.few)]
+        return Stretch(times, combined @ self.half, combined @ self.with_sky, span.factors)
 
 
 class LeftOut:
@@ -223,15 +237,18 @@ class LeftOut:
         self._lower = self._factorised(None if gone is not None else on_host(posterior))
         self._u = self._weighted_residuals()
         self.u = self._layout.scatter(self._cells.gather(self._u.T))
-        self._kept, self._shared = None, None
+        self._kept, self._whole, self._days = None, None, {}
+        self._lost = np.full(self._u.shape, np.nan)
         if not self._summable:
             self._kept = self._halves(weigh(self._weights, self._rows(None)))
-        elif len(self._u) <= SHARED and 16 * self._u.size * len(self._lower) <= KEPT_BYTES:
-            shared = self._near(np.arange(len(self._u)), len(self._u))
-            if self._weights.ndim == 2:
-                self._shared = shared
-            else:
-                self._kept = self._expanded(shared)
+            return
+        self._day = self._data.observation.day
+        short = len(self._u) <= SHARED and 16 * self._u.size * len(self._lower) <= KEPT_BYTES
+        self._stretch_of = (self._day // DAYS) * (not short)
+        if short:
+            self._whole = self._stretch(0)
+            if self._weights.ndim == 3:
+                self._kept = self._expanded(self._whole)
 
     @classmethod
     def of(
@@ -266,13 +283,15 @@ class LeftOut:
         """
         return LeftOut(self._model, self._data, gone=gone | ~self.present)
 
-    def missed(self, group: GridFlags) -> Missed:
+    def missed(self, group: GridFlags, stretch: Stretch | None = None) -> Missed:
         """Leave out a group.
 
         Parameters
         ----------
         group : (products, times) array of bool
             With data.
+        stretch : Stretch, optional
+            With all times of the group; without it the rows of the group are computed.
 
         Returns
         -------
@@ -288,26 +307,47 @@ class LeftOut:
         root = roots(self._weights[blocks], cells[blocks])
         b = solve_roots(root, np.where(cells[where], self._u[where], 0.0)[..., None])
         chosen = Chosen(cells, blocks, places, cells[where], root, b)
-        small = self._small(chosen)
+        small = self._small(chosen, stretch)
         # all NaN where Q_s, or 1 - W W^T, has no root
         answer = self._taken_out(chosen) if small is None else self._among_data(chosen, *small)
         chi2, directions, log_det = answer
         return Missed(n, chi2, directions, log_det + 2.0 * float(np.log(diagonal_of(root)).sum()))
 
     def each(self, groups: Sequence[GridFlags]) -> list[Missed]:
-        """Leave out each of several groups, in threads."""
-        return in_threads(self.missed, groups)
+        """Leave out each of several groups, in threads; those of one stretch share its rows."""
+        batches: dict[int, list[int]] = {}
+        for k, group in enumerate(groups):
+            batches.setdefault(self._within(group, -k - 1), []).append(k)
+
+        def leave_out(number: int) -> list[Missed]:
+            stretch = self._judged_stretch(number) if number >= 0 else self._whole
+            return [self.missed(groups[k], stretch) for k in batches[number]]
+
+        found = zip(batches.values(), in_threads(leave_out, list(batches)), strict=True)
+        by_number = {
+            k: one for numbers, missed in found for k, one in zip(numbers, missed, strict=True)
+        }
+        return [by_number[k] for k in range(len(groups))]
+
+    def _within(self, group: GridFlags, neither: int) -> int:
+        """The number of the stretch that has all of a group; ``neither`` if none, or all data."""
+        if not self._summable or self._whole is not None:
+            return neither
+        stretches = self._stretch_of[group.any(axis=0)]
+        return int(stretches[0]) if stretches[0] == stretches[-1] else neither
 
     @once
     def inverse_diagonal(self) -> Grid:
         """The diagonal of K^-1, in 1/K^2; NaN where 64 bits do not tell it from nothing."""
         if self._kept is not None:
-            less = np.einsum("tkm,tkm->tk", self._kept[0], self._kept[0])
+            self._lost = np.einsum("tkm,tkm->tk", self._kept[0], self._kept[0])
+        elif self._whole is not None:
+            self._lost = self._lost_at(self._whole)
         else:
-            parts = pieces(np.arange(len(self._u)), NEAR)
-            less = np.concatenate(in_threads(self._lost_by_prediction, parts))
+            missing = np.unique(self._stretch_of[np.isnan(self._lost[:, 0])])
+            in_threads(self._judged_stretch, missing.tolist())
         own = diagonal_of(self._weights)
-        own = np.where(own > less, own - less, np.nan)
+        own = np.where(own > self._lost, own - self._lost, np.nan)
         return self._layout.scatter(self._cells.gather(own.T))
 
     # --- the model ----------------------------------------------------------------------------
@@ -406,48 +446,82 @@ class LeftOut:
         sky = solve_lower(self._lower, half, transpose=True)[self._n_templates :].T
         return half.T.reshape(rows.shape), sky.reshape(*rows.shape[:-1], -1)
 
-    def _near(self, times: Int[np.ndarray, " n"], most: int) -> Near | None:
-        """F of all products at these times; None if it takes more than ``most`` of them."""
-        if self._shared is not None:
-            return self._shared._replace(factors=self._shared.factors[times])
+    def _stretch(self, number: int) -> Stretch:
+        times = np.flatnonzero(self._stretch_of == number)
+        return self._computed(times, self._span(times, len(times)))
+
+    def _judged_stretch(self, number: int) -> Stretch:
+        """A stretch whose part of the diagonal of K^-1 is known, too."""
+        stretch = self._stretch(number)
+        self._lost[stretch.times] = self._lost_at(stretch)
+        return stretch
+
+    def _lost_at(self, stretch: Stretch) -> Cells:
+        """The diagonal of Y Q^-1 Y^T at the times of a stretch."""
+        times, half, _, factors = stretch
+        if self._weights.ndim == 2:
+            within = half @ half.swapaxes(1, 2)
+            return ((factors @ within) * factors).sum(-1).T * self._weights[times] ** 2
+        within, lost = np.einsum("krm,lsm->krls", half, half, optimize=True), []
+        for part in pieces(np.arange(len(times)), CHUNK):
+            u, weights = factors[part], self._weights[times[part]]
+            found = np.einsum("tr,krls,ts->tkl", u, within, u, optimize=True)
+            lost.append(((weights @ found) * weights).sum(-1))
+        return np.concatenate(lost)
+
+    def _computed(self, times: Int[np.ndarray, " n"], span: Span) -> Stretch:
+        parts = pieces(span.few, CHUNK)
+        halves = in_threads(lambda part: self._halves(self._rows(part).swapaxes(0, 1)), parts)
+        half, with_sky = (np.concatenate(x, axis=1) for x in zip(*halves, strict=True))
+        return Stretch(times, half, with_sky, span.factors)
+
+    def _span(self, times: Int[np.ndarray, " n"], most: int) -> Span | None:
+        """Few times that all of these are made of, day by day; None if it takes over ``most``."""
+        day = self._day[times]
+        parts = [self._span_of_day(times[day == number]) for number in np.unique(day)]
+        few = np.concatenate([part.few for part in parts])
+        again = self._spanning(few, most) if len(parts) > 1 else parts[0]
+        if again is None or len(again.few) > most:
+            return None
+        if len(parts) > 1:
+            edges = np.cumsum([len(part.few) for part in parts])[:-1]
+            mine = zip(parts, np.split(again.factors, edges), strict=True)
+            again = Span(again.few, np.concatenate([part.factors @ rest for part, rest in mine]))
+        return again
+
+    def _span_of_day(self, times: Int[np.ndarray, " n"]) -> Span:
+        """The same of times within a day, which is kept."""
+        key = times.tobytes()
+        if key not in self._days:
+            self._days[key] = self._spanning(times, len(times))
+        return self._days[key]
+
+    def _spanning(self, times: Int[np.ndarray, " n"], most: int) -> Span | None:
         pointing = self._model.coupling.pointing
         templates = self._t[times].reshape(len(times), -1)
         templates = templates / np.maximum(np.abs(templates).max(axis=0), 1e-300)
         features = [self._model.coupling.time_features(times), templates]
         run = np.searchsorted(pointing.run_starts, times, side="right")
-        few = spanning_rows(np.concatenate(features, axis=1), run, most)
-        if few is None:
-            return None
-        parts = pieces(times[few[0]], CHUNK)
-        halves = in_threads(lambda part: self._halves(self._rows(part).swapaxes(0, 1)), parts)
-        return Near(*(np.concatenate(x, axis=1) for x in zip(*halves, strict=True)), few[1])
+        found = spanning_rows(np.concatenate(features, axis=1), run, most)
+        return None if found is None else Span(times[found[0]], found[1])
 
-    def _expanded(self, near: Near) -> tuple[np.ndarray, np.ndarray]:
+    def _expanded(self, stretch: Stretch) -> tuple[np.ndarray, np.ndarray]:
         """Y L^-T and the columns of the sky of Y Q^-1 at all times."""
-        kept = tuple(np.empty((*self._u.shape, few.shape[-1])) for few in near[:2])
+        kept = tuple(np.empty((*self._u.shape, few.shape[-1])) for few in stretch[1:3])
 
         def fill(times: Int[np.ndarray, " n"]) -> None:
-            for whole, few in zip(kept, near[:2], strict=True):
-                rows = (near.factors[times] @ few).swapaxes(0, 1)
+            for whole, few in zip(kept, stretch[1:3], strict=True):
+                rows = (stretch.factors[times] @ few).swapaxes(0, 1)
                 whole[times] = weigh(self._weights[times], rows)
 
         in_threads(fill, pieces(np.arange(len(self._u)), CHUNK))
         return kept
 
-    def _lost_by_prediction(self, times: Int[np.ndarray, " n"]) -> Cells:
-        """The diagonal of Y Q^-1 Y^T at these times."""
-        half, _, factors = self._near(times, len(times))
-        weights = self._weights[times]
-        if weights.ndim == 2:
-            within = half @ half.swapaxes(1, 2)
-            return ((factors @ within) * factors).sum(-1).T * weights**2
-        within = np.einsum("krm,lsm->krls", half, half, optimize=True)
-        within = np.einsum("tr,krls,ts->tkl", factors, within, factors, optimize=True)
-        return ((weights @ within) * weights).sum(-1)
-
     # --- groups in the space of their data ----------------------------------------------------
 
-    def _small(self, chosen: Chosen) -> tuple[Rows, SkyRows, Vector] | None:
+    def _small(
+        self, chosen: Chosen, stretch: Stretch | None
+    ) -> tuple[Rows, SkyRows, Vector] | None:
         """q^T W, q^T W L^-1, and q^T c^-1 u_s; None for a large group."""
         cells, blocks, places, some, root, b = chosen
         rank = max(len(self._lower), QUICK)
@@ -461,9 +535,10 @@ class LeftOut:
         whole = independent or (cells[blocks] == self._on_cells(self.present)[blocks]).all()
         if not whole or len(blocks) > rank:
             return None
-        near = self._near(blocks, rank // len(places))
-        if near is None or len(places) * min(near.factors.shape) > rank:
+        span = self._span(blocks, rank // len(places))
+        if span is None or len(places) * min(span.factors.shape) > rank:
             return None
+        near = self._computed(blocks, span) if stretch is None else stretch.at(span, blocks)
         if independent:
             c, b = (root * some).T[..., None] * near.factors, b.swapaxes(0, 1)
         else:
@@ -471,7 +546,7 @@ class LeftOut:
             c, b = c.reshape(1, some.size, -1), b.reshape(1, -1, 1)
         q, r = np.linalg.qr(c)
         mine = slice(None) if len(places) == len(near.half) else places
-        halves = (x[mine].reshape(len(r), r.shape[-1], -1) for x in near[:2])
+        halves = (x[mine].reshape(len(r), r.shape[-1], -1) for x in near[1:3])
         w, with_sky = ((r @ x).reshape(-1, x.shape[-1]) for x in halves)
         return w, with_sky, (q.swapaxes(1, 2) @ b).ravel()
 
@@ -493,12 +568,12 @@ class LeftOut:
     @once
     def _trace(self) -> float:
         """tr Q^-1 of the sky."""
-        return self._trace_of_sky(self._lower.copy())
+        return self._trace_of_sky(self._lower)
 
     def _trace_of_sky(self, lower: Square) -> float:
-        """tr (L L^T)^-1 of the sky; overwrites L."""
-        invert_factorised(lower)
-        return float(np.diagonal(lower)[self._n_templates :].sum())
+        """tr (L L^T)^-1 of the sky."""
+        inverse = invert_lower(lower)[:, self._n_templates :]
+        return float(np.einsum("ij,ij->", inverse, inverse))
 
     def _taken_out(self, chosen: Chosen) -> Answer:
         """chi^2_s, directions and ln|Q_s| - ln|Q|."""

@@ -116,7 +116,7 @@ def test_it_is_what_matrices_say(size, kind, limits, monkeypatch):
 
 @pytest.mark.parametrize("kind", WITHIN_TIMES)
 def test_many_times_a_day(kind, monkeypatch):
-    limited(monkeypatch, {"SHARED": 0, "NEAR": 30})
+    limited(monkeypatch, {"SHARED": 0, "DAYS": 1})
     model, data, *expected = observed("often", kind)
     check(LeftOut(model, data), data, *expected, every_kind(data))
 
