@@ -172,7 +172,10 @@ def read_data(data: Data, scenario: Scenario) -> Visibilities:
     elif not _is_waterfall(path):
         data = _stamped(path, read_visibilities(path), timestamp)
     else:
-        data = _channel(path, scenario)
+        waterfall = read_waterfall(path)
+        data = waterfall.at(scenario.frequency_mhz, scenario.beam.n_ports)
+        if waterfall.per_kelvin is not None:
+            _require_same_instrument(waterfall, scenario)
         # samples of luseepy's simulators are instants; its layout cannot say that others are not
         if timestamp is not None:
             with naming(path):
@@ -223,14 +226,6 @@ def _stamped(path: str | Path, data: Visibilities, timestamp: Timestamp | None) 
             f"{path} says that its samples are {said}, the scenario that their times are "
             f"observation.timestamp={timestamp}; leave that out, or correct the file"
         )
-    return data
-
-
-def _channel(path: Path, scenario: Scenario) -> Visibilities:
-    waterfall = read_waterfall(path)
-    data = waterfall.at(scenario.frequency_mhz, scenario.beam.n_ports)
-    if waterfall.per_kelvin is not None:
-        _require_same_instrument(waterfall, scenario)
     return data
 
 

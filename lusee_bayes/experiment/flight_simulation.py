@@ -14,7 +14,6 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from lusee_bayes.core.arrays import Grid
 from lusee_bayes.core.engine import in_threads, processors
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
@@ -232,8 +231,17 @@ def simulate_flight(scenario: Scenario, stages: Stages | None = None) -> FlightS
     stages = stages or Stages()
     flight = flight_of(scenario)
     section = flight.simulated or FlightSimulatedSection()
-    _require_own_noise(scenario, flight)
-    step_s = scenario.observation.step_s
+    radiometer, step_s = scenario.noise.radiometer, scenario.observation.step_s
+    if radiometer.duty_cycle != 1.0 or radiometer.log_factor_std is not None:
+        raise InputError(
+            "the noise of spectra is that of the frames they average; leave out duty_cycle and "
+            "log_factor_std of noise.radiometer"
+        )
+    if flight.filter_taps:
+        raise InputError(
+            "channels of simulated spectra share no noise, and flight.filter_taps says that they "
+            "do; set it to 0"
+        )
     if step_s < FRAME_S:
         raise InputError(
             f"a frame of the spectrometer lasts {FRAME_S:g} s, and a sample {step_s:g} s; use a "
@@ -331,16 +339,13 @@ def true_visibilities(
             here = np.arange(n) // piece == start // piece
             part = observation.select(here)
             for number, (channel, scale) in enumerate(zip(channels, scales, strict=True)):
-                found[number, :, here] = (scale[:, None] * _true_kelvin(channel, part)).T
+                nothing = np.zeros(len(first) * part.n_times)
+                layout = DataLayout(len(first), part.n_times)
+                setup = set_up(channel, Visibilities(nothing, layout, part, channel.frequency_mhz))
+                kelvin = np.asarray(true_signal(setup, true_values(setup)))
+                found[number, :, here] = (scale[:, None] * kelvin).T
                 done(start * len(channels) + (number + 1) * part.n_times)
     return found
-
-
-def _true_kelvin(scenario: Scenario, observation: Observation) -> Grid:
-    layout = DataLayout(len(ports()[0]), observation.n_times)
-    nothing = Visibilities(np.zeros(layout.size), layout, observation, scenario.frequency_mhz)
-    setup = set_up(scenario, nothing)
-    return np.asarray(true_signal(setup, true_values(setup)))
 
 
 def _drawn_gains(
@@ -367,17 +372,3 @@ def _drawn_gains(
     generator = np.random.default_rng([scenario.seed, 3])
     gains, errors = draw_gains(table, flight.gain_std, generator)
     return table, gains, errors
-
-
-def _require_own_noise(scenario: Scenario, flight: FlightSection) -> None:
-    radiometer = scenario.noise.radiometer
-    if radiometer.duty_cycle != 1.0 or radiometer.log_factor_std is not None:
-        raise InputError(
-            "the noise of spectra is that of the frames they average; leave out duty_cycle and "
-            "log_factor_std of noise.radiometer"
-        )
-    if flight.filter_taps:
-        raise InputError(
-            "channels of simulated spectra share no noise, and flight.filter_taps says that they "
-            "do; set it to 0"
-        )

@@ -2,8 +2,8 @@
 
 They say where, when and with which turntable angles; the beams, and what is connected to their
 ports; and how sessions of the spectrometer become visibilities, or are simulated. Beams and
-receivers have one section for each kind, told by ``model``. A new kind of beams is a class here,
-with its :class:`BeamSource`, and its name in ``BEAM_SECTIONS``.
+receivers have one section for each kind, told by ``model``. A new kind of beams is a subclass of
+:class:`BaseBeamSection` here, with its :class:`BeamSource`, and its name in ``BEAM_SECTIONS``.
 """
 
 from __future__ import annotations
@@ -257,7 +257,7 @@ ReceiverSection = Annotated[
 ]
 
 
-class _BeamSection(Section):
+class BaseBeamSection(Section):
     """What all beams have in common."""
 
     def of_file(self, file: str) -> Any:
@@ -267,7 +267,7 @@ class _BeamSection(Section):
         return kind(file=file, **self.model_dump(include=shared))
 
 
-class MonopoleBeamSection(_BeamSection):
+class MonopoleBeamSection(BaseBeamSection):
     """The embedded antennas: four monopoles over layered regolith.
 
     Attributes
@@ -309,7 +309,7 @@ class MonopoleBeamSection(_BeamSection):
         return Monopoles(regolith=regolith, **self.model_dump(exclude={"model", *ground}))
 
 
-class _FileSection(_BeamSection):
+class _FileSection(BaseBeamSection):
     """What the beams of files have in common.
 
     Attributes

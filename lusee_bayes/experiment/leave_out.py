@@ -26,13 +26,13 @@ from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.lazy import special
 from lusee_bayes.core.progress import Stages, memory_limit
 from lusee_bayes.core.section import is_modelled
+from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.rounds import rebuilds, settled
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.products import DataLayout, auto_indices, ports
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.left_out import DataGroup, LeftOut, Missed, groups_of
 from lusee_bayes.judge.split import WIDER, Split
-from lusee_bayes.linear.linear_gaussian import Solution
 from lusee_bayes.systematics.context import Around, Setup
 
 # of the times beyond the limit, those within this share of the worst go in one round
@@ -179,23 +179,15 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Groups
     n, across = data.layout.size, is_modelled(setup.scenario.noise.gain)
     if 8.0 * ARRAYS * n * (setup.prior.size + n * across) > MOST_MEMORY * memory_limit():
         return None
-    if settle:
-        solution = _solved(setup, data)
-        model, wide = solution.model, Split.of(solution.posterior, 0.0, data.layout.size).wide
-        prior = wide.prior
-    else:
-        model, wide = model_about(setup, Around(data))[0], None
-        prior = model.prior.widened(WIDER)
-    left_out = LeftOut(replace(model, prior=prior), data, posterior=wide)
-    return GroupsCompared.of(left_out, data)
-
-
-def _solved(setup: Setup, data: Visibilities) -> Solution:
-    """Solve in as many rounds as N needs; in one where bad data let none settle."""
-    found = settled(setup, data)
-    if found.unsettled:
-        return model_about(setup, Around(data))[0].condition(data.data)
-    return found.solution
+    found = settled(setup, data) if settle else None
+    if found is not None and not found.unsettled:
+        model, posterior = found.model, found.posterior
+    else:  # bad data may let no rounds settle
+        model = full_model(setup, Around(data))
+        posterior = model.condition(data.data).posterior if settle else None
+    wide = None if posterior is None else Split.of(posterior, 0.0, data.layout.size).wide
+    prior = model.prior.widened(WIDER) if wide is None else wide.prior
+    return GroupsCompared.of(LeftOut(replace(model, prior=prior), data, posterior=wide), data)
 
 
 MAX_ROUNDS = 10
@@ -206,6 +198,10 @@ NOT_JUDGED = (
 TOO_MANY = (
     "More than a fifth of the data are inconsistent with the rest, so that none was flagged: "
     "noise, gains or beams are not those of the data."
+)
+KEPT = (
+    "Product {port}{port}R is inconsistent with the rest and was kept, since the noise of port "
+    "{port}'s other products depends on it: check the gain and the receiver of port {port}."
 )
 # where all rules together would take more, it is not the data but noise, gains or beams
 MOST = 0.2
@@ -429,7 +425,8 @@ class _Rules:
                 return result or first, ""
             of_groups = of_groups | group.data
             if self.broken(gone | of_groups, gone | of_groups):
-                return first, _about_auto(self.auto_alone(gone | of_groups))
+                port = self.auto_alone(gone | of_groups)
+                return first, "" if port is None else KEPT.format(port=port)
             groups, base = (*groups, group), start.without(of_groups)
 
     def remark(self, gone: GridFlags, groups: tuple[DataGroup, ...], share: float) -> str:
@@ -448,16 +445,6 @@ class _Rules:
             f"Noise alone would cause {2.0 * n * self.false_alarm:.2g} such flags of times or "
             "values."
         )
-
-
-def _about_auto(port: int | None) -> str:
-    if port is None:
-        return ""
-    return (
-        f"Product {port}{port}R is inconsistent with the rest and was kept, since the noise of "
-        f"port {port}'s other products depends on it: check the gain and the receiver of port "
-        f"{port}."
-    )
 
 
 def without(setup: Setup, data: Visibilities, gone: GridFlags) -> tuple[Setup, Visibilities]:

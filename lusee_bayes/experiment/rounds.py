@@ -23,7 +23,6 @@ from lusee_bayes.experiment.sky_sections import (
     LocalScalesPriorSection,
     PriorSection,
 )
-from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.measures import data_freedom
 from lusee_bayes.linear.amplitudes import Amplitudes, template_amplitudes
@@ -103,10 +102,7 @@ class Inference:
 
 
 def settled(
-    setup: Setup,
-    data: Visibilities,
-    start: Around | None = None,
-    known: Solution | None = None,
+    setup: Setup, data: Visibilities, start: Around | None = None, known: Solution | None = None
 ) -> Inference:
     """Condition the model on data, in as many rounds as its N needs.
 
@@ -213,10 +209,10 @@ def _start(setup: Setup, data: Visibilities) -> Around:
     if not any(cls.scales_sky for cls in first_order(setup)):
         return around
     model, held = model_about(setup, around, scaling=False)
-    columns = [np.zeros((model.n_data, 0))]
-    columns += [s.columns for s in held if isinstance(s, Expanded)]
+    columns = [s.columns for s in held if isinstance(s, Expanded)]
     solution = model.condition(data.data)
-    freedom = data_freedom(solution, np.concatenate(columns, axis=1))
+    nothing = np.zeros((model.n_data, 0))
+    freedom = data_freedom(solution, np.concatenate([nothing, *columns], axis=1))
     sky = solution.posterior.mean if setup.measured else None
     return Around(data, sky=sky, freedom=freedom)
 
@@ -256,14 +252,12 @@ def prediction(setup: Setup, found: Inference, solved: DataVector) -> Grid:
     solved : (data,) array
         N^-1 (d - A m), of the mean map.
     """
-    complete = CouplingMatrix.build(setup.beams, setup.pointing)
-    difference_of_skies = found.posterior.mean - setup.sky.modes
+    mean = replace(setup.sky, modes=found.posterior.mean)
     besides = np.zeros(len(solved))
     for part in found.expanded:
         if not part.changes_coupling:
             besides = besides + part.columns @ (part.columns.T @ solved)
-    grid = complete.layout.scatter(complete @ difference_of_skies)
-    return setup.signal + grid + setup.layout.scatter(besides)
+    return setup.under(mean).signal + setup.layout.scatter(besides)
 
 
 # the map and its prior are found together when the map moves by less than this, rms; a step of
@@ -407,12 +401,9 @@ def named_priors(
             f"--priors: {OF_TRUE_SKY} takes C_ell of the scenario's sky, which nobody knows of "
             "measured data; leave it out, or give --truth if the data are of that sky"
         )
-    return {name: _section(NAMED[name], scenario.prior) for name in names}
-
-
-def _section(named: PriorSection, own: PriorSection) -> PriorSection:
-    """The scenario's own section if it is of the kind of a named one."""
-    if own.model != named.model:
-        return named
+    own, named = scenario.prior, {name: NAMED[name] for name in names}
     # isotropic priors differ in where C_ell comes from
-    return own if own.model != "isotropic" or own.origin == named.origin else named
+    return {
+        name: own if (own.model, own.origin) == (one.model, one.origin) else one
+        for name, one in named.items()
+    }

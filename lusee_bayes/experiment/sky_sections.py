@@ -14,15 +14,7 @@ from pydantic import Field, model_validator
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
-from lusee_bayes.core.section import (
-    Megahertz,
-    Positive,
-    Section,
-    Seed,
-    kinds_of,
-    one_of,
-    requires,
-)
+from lusee_bayes.core.section import Megahertz, Positive, Section, Seed, kinds_of, one_of, requires
 from lusee_bayes.priors.families import IsotropicFamily, PriorFamily
 from lusee_bayes.priors.local_scales import embedded_local_scales
 from lusee_bayes.sampling.log_normal_prior import LogNormalPrior

@@ -191,27 +191,22 @@ class InstrumentParameters(BeamErrors):
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
-        found = []
-        for name, std in self.widths.items():
-            low, high = parameter(name).low, parameter(name).high
-            found.append(Unknown(name, self.centres[name], std, low=low, high=high))
-        return tuple(found)
+        known = [(name, parameter(name), std) for name, std in self.widths.items()]
+        return tuple(
+            Unknown(n, self.centres[n], std, low=p.low, high=p.high) for n, p, std in known
+        )
 
     def effect(self, model, values):
         """A of antennas that have these values."""
         return replace(model, coupling=self.instrument.dense(values))
 
-    def directions(self) -> list[ProductBeams]:
-        """What one prior standard deviation of each does to the beams, to first order."""
-        known = self.instrument.frequency_mhz, self.instrument.lmax, self.instrument.monopoles
-        slopes = {name: instrument_errors.derivative(name, *known).modes for name in self.widths}
-        return [ProductBeams(std * slopes[name], known[0]) for name, std in self.widths.items()]
-
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Add dA S dA^T for every parameter to N, dA = std times the derivative of A."""
-        for direction in self.directions():
-            error = BeamError(self.instrument.coupling_of(direction))
-            model = error.marginalised(model)
+        known = self.instrument.frequency_mhz, self.instrument.lmax, self.instrument.monopoles
+        for name, std in self.widths.items():
+            slope = std * instrument_errors.derivative(name, *known).modes
+            direction = self.instrument.coupling_of(ProductBeams(slope, known[0]))
+            model = BeamError(direction).marginalised(model)
         return model
 
 

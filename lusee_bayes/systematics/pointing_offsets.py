@@ -211,8 +211,7 @@ class PointingOffsets(Systematic):
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
-        pairs = zip(self.offsets, self.errors, strict=True)
-        return tuple(Unknown(name, 0.0, std) for name, std in pairs)
+        return tuple(map(Unknown, self.offsets, np.zeros(len(self.offsets)), self.errors))
 
     def turned(self, values: Values) -> Pointing:
         """The pointing of values by name."""

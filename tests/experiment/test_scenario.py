@@ -32,21 +32,23 @@ def test_the_fiducial_scenario_is_the_papers():
     # section "Simulating the data vector" of arXiv:2508.16773
     assert (scenario.frequency_mhz, scenario.lmax) == (25.0, 47)
     observation = scenario.observation
-    assert (observation.lon_deg, observation.lat_deg, observation.step_s) == (
-        182.258,
-        -23.814,
-        7200,
-    )
+    assert (observation.lon_deg, observation.lat_deg) == (182.258, -23.814)
+    assert observation.step_s == 7200
     assert [(r.cycles, r.turntable_deg) for r in observation.runs] == [(1.0, 0.0)]
     assert scenario.noise.radiometer.bandwidth_hz == 1e6
     assert scenario.noise.radiometer.form == "paper"
 
 
+def assert_kept(scenario, folder):
+    """Written and read again, a scenario is the same."""
+    (folder / "again.yaml").write_text(scenario.to_yaml())
+    assert load_scenario(folder / "again.yaml") == scenario
+
+
 @pytest.mark.parametrize("name", scenario_names())
 def test_a_resolved_scenario_is_the_same_scenario(name, tmp_path):
     scenario = load_scenario(name, ["seed=7", "observation.runs.0.turntable_deg=12.5"])
-    (tmp_path / "again.yaml").write_text(scenario.to_yaml())
-    assert load_scenario(tmp_path / "again.yaml") == scenario
+    assert_kept(scenario, tmp_path)
     assert scenario.seed == 7
     assert scenario.observation.runs[0].turntable_deg == 12.5
 
@@ -274,8 +276,7 @@ def test_what_an_old_scenario_says_of_beams_is_kept(tmp_path, scalar, response):
         found = old_scenario(tmp_path / "old.yaml", beam=beam, prior=prior)
         assert found.beam == kind(**beam) and found.beam.n_ports == n_ports
         assert found.prior == IsotropicPriorSection(**prior)
-        (tmp_path / "again.yaml").write_text(found.to_yaml())
-        assert load_scenario(tmp_path / "again.yaml") == found
+        assert_kept(found, tmp_path)
 
 
 def test_an_old_scenario_with_a_sky_from_a_file(tmp_path):
@@ -288,27 +289,23 @@ def test_an_old_scenario_with_a_sky_from_a_file(tmp_path):
     assert [source.name for source in found.sources.list] == ["Cas A"]
 
 
-@pytest.mark.parametrize(
-    ("text", "kind"),
-    [
-        ("sky: {file: x.fits}", FileSkySection),
-        ("sky: {model: galaxy, file: x.fits}", FileSkySection),
-        ("sky: {model: galaxy, file: null}", GalaxySection),
-        ("sky: {seed: 3}", GalaxySection),
-    ],
-)
-def test_the_sky_of_a_short_file(tmp_path, text, kind):
+def test_the_sky_of_a_short_file(tmp_path):
     path = tmp_path / "short.yaml"
-    path.write_text(text)
-    assert type(load_scenario(path).sky) is kind
+    for text, kind in (
+        ("{file: x.fits}", FileSkySection),
+        ("{model: galaxy, file: x.fits}", FileSkySection),
+        ("{model: galaxy, file: null}", GalaxySection),
+        ("{seed: 3}", GalaxySection),
+    ):
+        path.write_text(f"sky: {text}")
+        assert type(load_scenario(path).sky) is kind, text
 
 
 def test_a_prior_takes_the_place_of_another(tmp_path):
     """``--set`` leaves the keys of the kind that was there, which the other kind drops."""
     found = load_scenario("fiducial", ["prior.model=local_scales", "prior.sources=false"])
     assert found.prior == LocalScalesPriorSection(sources=False)
-    (tmp_path / "again.yaml").write_text(found.to_yaml())
-    assert load_scenario(tmp_path / "again.yaml") == found
+    assert_kept(found, tmp_path)
     plain = load_scenario("fiducial", ["prior.model=local_scales"])
     (tmp_path / "plain.yaml").write_text(plain.to_yaml())
     back = load_scenario(tmp_path / "plain.yaml", ["prior.model=isotropic"])

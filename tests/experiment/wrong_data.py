@@ -16,7 +16,6 @@ from made_skies import SmoothSky, SpottySky
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers, turn_about_z
 from lusee_bayes.experiment.model import radiometer
-from lusee_bayes.experiment.scenario import apply_override
 from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.instrument.products import labels
 
@@ -31,10 +30,7 @@ def scenario(lmax: int = 8, *overrides: str, frequency_mhz: float = 25.0) -> lb.
 
 def changed(scenario: lb.Scenario, *overrides: str) -> lb.Scenario:
     """A scenario with other entries, ``key.path=value`` as on the command line."""
-    tree = scenario.model_dump(mode="json")
-    for override in overrides:
-        apply_override(tree, override)
-    return lb.Scenario.model_validate(tree)
+    return lb.load_scenario(scenario, overrides)
 
 
 @dataclass(frozen=True)
@@ -77,11 +73,6 @@ def measured(
     )
 
 
-def mixed_by(data: lb.Visibilities, matrix: np.ndarray) -> lb.Visibilities:
-    """Each time's products, mixed: ``matrix @ products``."""
-    return replace(data, data=np.asarray(data.layout.gather(matrix @ np.asarray(data.grid()))))
-
-
 def port_matrix(ports: list[int]) -> np.ndarray:
     """Products of data whose port number i is labelled number k where ``ports[k] = i``."""
     matrix = np.zeros((16, 16))
@@ -116,29 +107,41 @@ def from_north(setup: Setup) -> lb.ProductBeams:
     return replace(setup.beams, modes=np.asarray(modes))
 
 
+Make = Callable[[lb.Scenario, lb.Sky, int], lb.Visibilities]
+
+
 @dataclass(frozen=True)
 class Wrong:
     """Wrong data: what is wrong, words of the proposal that names it, and how to make them."""
 
     name: str
     cause: str
-    make: Callable[[lb.Scenario, lb.Sky, int], lb.Visibilities]
+    make: Make
 
 
-def _mix(matrix: np.ndarray) -> Callable[[lb.Scenario, lb.Sky, int], lb.Visibilities]:
-    return lambda scenario, sky, seed: mixed_by(measured(scenario, sky, seed), matrix)
+def _on_grid(change: Callable[[np.ndarray], np.ndarray]) -> Make:
+    """Good data whose visibilities on the grid are changed."""
+
+    def make(scenario: lb.Scenario, sky: lb.Sky, seed: int) -> lb.Visibilities:
+        data = measured(scenario, sky, seed)
+        return replace(data, data=np.asarray(data.layout.gather(change(np.asarray(data.grid())))))
+
+    return make
 
 
-def _other(*overrides: str) -> Callable[[lb.Scenario, lb.Sky, int], lb.Visibilities]:
+def _mix(matrix: np.ndarray) -> Make:
+    """Each time's products, mixed: ``matrix @ products``."""
+    return _on_grid(lambda grid: matrix @ grid)
+
+
+def _other(*overrides: str) -> Make:
     """Taken as the scenario with overrides says, dated as without them."""
     return lambda scenario, sky, seed: measured(
         changed(scenario, *overrides), sky, seed, seen_by=scenario
     )
 
 
-def _beams(
-    beams: Callable[[Setup], lb.ProductBeams],
-) -> Callable[[lb.Scenario, lb.Sky, int], lb.Visibilities]:
+def _beams(beams: Callable[[Setup], lb.ProductBeams]) -> Make:
     return lambda scenario, sky, seed: measured(scenario, sky, seed, beams=beams)
 
 
@@ -165,32 +168,15 @@ def _opposite(scenario: lb.Scenario, sky: lb.Sky, seed: int) -> lb.Visibilities:
     return measured(here, sky, seed, seen_by=there)
 
 
-def _reversed(scenario: lb.Scenario, sky: lb.Sky, seed: int) -> lb.Visibilities:
-    data = measured(scenario, sky, seed)
-    return replace(data, data=np.asarray(data.layout.gather(np.asarray(data.grid())[:, ::-1])))
+def _one_time(factor: float, time: int) -> Make:
+    return _on_grid(lambda grid: grid * np.where(np.arange(grid.shape[1]) == time, factor, 1.0))
 
 
-def _one_time(factor: float, time: int) -> Callable[[lb.Scenario, lb.Sky, int], lb.Visibilities]:
-    def make(scenario: lb.Scenario, sky: lb.Sky, seed: int) -> lb.Visibilities:
-        data = measured(scenario, sky, seed)
-        grid = np.array(data.grid())
-        grid[:, time] *= factor
-        return replace(data, data=np.asarray(data.layout.gather(grid)))
-
-    return make
-
-
-def _noisier(factor: float) -> Callable[[lb.Scenario, lb.Sky, int], lb.Visibilities]:
-    return _other(f"noise.radiometer.factor={factor}")
-
-
-def _constant(kelvin: float) -> Callable[[lb.Scenario, lb.Sky, int], lb.Visibilities]:
+def _constant(kelvin: float) -> Make:
     autos = np.array([label[0] == label[1] for label in LABELS])
-
-    def make(scenario: lb.Scenario, sky: lb.Sky, seed: int) -> lb.Visibilities:
-        return measured(scenario, sky, seed, distort=lambda _, v: v + kelvin * autos[:, None])
-
-    return make
+    return lambda scenario, sky, seed: measured(
+        scenario, sky, seed, distort=lambda _, v: v + kelvin * autos[:, None]
+    )
 
 
 AUTOS = {f"p{label}": 1.1 for label in LABELS if label[0] == label[1]}
@@ -237,14 +223,14 @@ WRONG = (
     Wrong("13R has the other sign", "product 13R", _mix(diagonal(p13R=-1.0))),
     Wrong("port 2 3 % too high", "voltage of port 2", _mix(diagonal(**PORT_2))),
     Wrong("constant in the autos", "constant", _constant(200.0)),
-    Wrong("times reversed", "reversed", _reversed),
+    Wrong("times reversed", "reversed", _on_grid(lambda grid: grid[:, ::-1])),
     Wrong("one time 2 % too high", "all products at 2027-01-", _one_time(1.02, 37)),
     Wrong("one time 50 % too low", "all products at 2027-01-", _one_time(0.5, 60)),
     Wrong("latitude's sign", "latitude", _other("observation.lat_deg=23.814")),
     Wrong("beams of 1 MHz more", "neighbouring channel", _beams(shifted_by(1.0))),
     Wrong("beams of 1 MHz less", "neighbouring channel", _beams(shifted_by(-1.0))),
-    Wrong("noise 4 times as large", "noise variance", _noisier(4.0)),
-    Wrong("noise a quarter", "noise variance", _noisier(0.25)),
+    Wrong("noise 4 times as large", "noise variance", _other("noise.radiometer.factor=4")),
+    Wrong("noise a quarter", "noise variance", _other("noise.radiometer.factor=0.25")),
     Wrong("lmax too small", "beyond lmax", _finer),
     Wrong("another height", "height", _other("beam.height_m=1.8")),
 )

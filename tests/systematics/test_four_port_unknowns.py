@@ -343,10 +343,7 @@ def test_rounds_find_the_mode_and_the_first_order_does_not(experiment, response_
     std = np.sqrt(np.diag(np.linalg.inv(root.T @ root)))
 
     def off(it: Inference) -> np.ndarray:
-        told = [
-            s.expected + template_amplitudes(it.solution, np.asarray(s.columns)).mean
-            for s in it.systematics
-        ]
+        told = [part.expected + it.amplitudes(part).mean for part in it.systematics]
         return np.concatenate([np.asarray(it.posterior.mean) / prior, *told]) - mode
 
     # every unknown, and every direction of them
@@ -391,8 +388,7 @@ def test_many_modes_do_not_pass_for_a_gain():
         data = simulate(setup)
         it = lb.infer(lb.Experiment(setup, data))
         gains = it.systematics[-1]
-        told = template_amplitudes(it.solution, gains.columns)
-        found.append(gains.systematic.common @ (gains.expected + told.mean))
+        found.append(gains.systematic.common @ (gains.expected + it.amplitudes(gains).mean))
         assert gains.systematic.common @ gains.expected < -0.5
     assert np.std(found) < 0.25
     assert abs(np.mean(found)) < 0.1
@@ -408,7 +404,7 @@ def test_errors_that_data_name_are_found(response_file):
     slope = slopes(23)[:4]
     rms = [np.sqrt((s[s != 0] ** 2).mean()) for s in slope]
     np.testing.assert_allclose(table.systematic.stds, rms, rtol=1e-12)
-    told = template_amplitudes(found.solution, table.columns)
+    told = found.amplitudes(table)
     off = (table.expected + told.mean - true_values(setup)["gain_table"]) / told.std
     assert np.abs(off).max() < 4.0
     # port 3 is right, so that the others are told from it
@@ -428,7 +424,7 @@ def test_clock_and_pointing_beside_it_settle_in_the_same_rounds(response_file):
     turntable = offset_posterior(found)[0]["turntable_deg"] / 0.05
     _, *rest = found.systematics
     linear = columns(response_file, 23)
-    told = [template_amplitudes(found.solution, s.columns).mean for s in rest]
+    told = [found.amplitudes(part).mean for part in rest]
     told[-1] = told[-1] + rest[-1].expected
     x = np.concatenate([np.asarray(found.posterior.mean) / prior, *told, [turntable]])
 
