@@ -101,7 +101,7 @@ def map_command(
         One posterior for the skies of all channels, with the scenario's spectral prior.
     """
     from lusee_bayes.report.pages import REPORT
-    from lusee_bayes.runs.cost import demand_of_channels
+    from lusee_bayes.runs.cost import demand_of
     from lusee_bayes.runs.map_run import run_map
 
     loaded = options.load(
@@ -116,7 +116,7 @@ def map_command(
     several = bool(loaded.frequencies_mhz)
     if not several and engine != EngineOptions():
         raise InputError("--workers and --cluster share out channels; give --frequencies")
-    with engine.open(demand_of_channels(loaded)) if several else nullcontext() as opened:
+    with engine.open(demand_of(loaded)) if several else nullcontext() as opened:
         given = {"data": options.data, "truth": truth, "earlier": add, "thorough": diagnose}
         folder = options.folder(scenario)
         run = run_map(loaded, folder, engine=opened, **given, **options.running())
@@ -388,12 +388,12 @@ def plan_command(
     """
     from lusee_bayes.cli.tables import forecast_table
     from lusee_bayes.results.forecast import forecast_lines
-    from lusee_bayes.runs.cost import demand_of, posterior_cost
+    from lusee_bayes.runs.cost import demand_of
     from lusee_bayes.runs.plan_run import run_plan, variations_of
 
     sources, given = [scenario, *others], options.running()
     variations = variations_of(sources, options.set_, vary, given["stages"])
-    with engine.open(demand_of([posterior_cost(v.scenario) for v in variations])) as opened:
+    with engine.open(demand_of(*(v.scenario for v in variations))) as opened:
         run = run_plan(variations, options.output or Path("output/plan"), engine=opened, **given)
     by_source = [[f for f in run.result if f.variation.source == source] for source in sources]
     for forecasts in by_source:
@@ -459,11 +459,11 @@ def compare_priors_command(
     from lusee_bayes.cli.tables import priors_table
     from lusee_bayes.report.pages import REPORT
     from lusee_bayes.runs.compare_run import run_compare_priors
-    from lusee_bayes.runs.cost import demand_of, posterior_cost
+    from lusee_bayes.runs.cost import demand_of
 
     loaded = options.load(scenario, flight__clock=options.clock)
     names = None if priors is None else [n.strip() for n in priors.split(",") if n.strip()]
-    with engine.open(demand_of([posterior_cost(loaded)])) as opened:
+    with engine.open(demand_of(loaded)) as opened:
         run = run_compare_priors(
             loaded,
             options.folder(scenario, "-priors"),
@@ -581,10 +581,10 @@ def paper_command(
         Without them the embedded sky is used.
     """
     from lusee_bayes.paper.cases import paper_scenarios
-    from lusee_bayes.runs.cost import demand_of, posterior_cost
+    from lusee_bayes.runs.cost import demand_of
     from lusee_bayes.runs.paper_run import run_paper
 
-    demand = demand_of([posterior_cost(s) for s in paper_scenarios(skies=sky).values()])
+    demand = demand_of(*paper_scenarios(skies=sky).values())
     folder = options.output or Path("output/paper")
     with engine.open(demand) as opened:
         run = run_paper(folder, skies=sky, engine=opened, **options.running())

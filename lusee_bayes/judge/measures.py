@@ -262,7 +262,7 @@ def effective_resolution_deg(prior_fraction: Ells) -> float | None:
     return 180.0 / (int(beyond[0]) + 1) if beyond.size else None
 
 
-def expected_chi2(posterior: Posterior, n_data: int) -> float:
+def expected_chi2(posterior: Posterior, n_data: int, variance: Modes | None = None) -> float:
     """Compute the expectation of ``|L^-1 (d - A mean - offset)|^2``, N = L L^T, if the model holds.
 
     Parameters
@@ -271,12 +271,19 @@ def expected_chi2(posterior: Posterior, n_data: int) -> float:
         Of the data.
     n_data : int
         Number of data.
+    variance : (unknowns,) array, optional
+        Of the posterior, where it is known: with a prior of independent unknowns nothing needs to
+        be inverted then.
 
     Returns
     -------
     float
         N_data - rank + tr Lambda^-1.
     """
+    prior = posterior.prior
+    if variance is not None and prior.independent and posterior.basis is None:
+        power = np.asarray(prior.variance())
+        return float(n_data - (1.0 - variance[power > 0] / power[power > 0]).sum())
     inverse = invert_lower(np.asarray(posterior.lower))
     return float(n_data - len(inverse) + (inverse**2).sum())
 

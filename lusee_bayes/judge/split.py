@@ -36,7 +36,9 @@ class Split:
     wide: Posterior
 
     @classmethod
-    def of(cls, posterior: Posterior, chi2: float, n_data: int) -> Split:
+    def of(
+        cls, posterior: Posterior, chi2: float, n_data: int, expected: float | None = None
+    ) -> Split:
         """Split chi^2 of the data behind a posterior.
 
         Parameters
@@ -46,13 +48,15 @@ class Split:
         chi2 : float
             Of the data under the model, sky included.
         n_data : int
+        expected : float, optional
+            :func:`.expected_chi2`, where it is known.
 
         Raises
         ------
         InputError
             As :func:`widened`.
         """
-        known = n_data - expected_chi2(posterior, n_data)
+        known = n_data - (expected_chi2(posterior, n_data) if expected is None else expected)
         size = max(1.0, np.sqrt(float(posterior.prior_chi2()) / known)) if known > 0 else 1.0
         try:
             wide, less = widened(posterior, WIDER * size)

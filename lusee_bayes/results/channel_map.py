@@ -180,6 +180,12 @@ class Conditioned:
         return Unknowns.of(self.experiment, self.own)
 
     @cached_property
+    def expected(self) -> float:
+        """Of chi^2 of these data about the mean, if the model holds."""
+        variance = None if self.onto else np.diagonal(self.covariance)
+        return expected_chi2(self.judged.posterior, self.own.model.n_data, variance)
+
+    @cached_property
     def drawn(self) -> Float[np.ndarray, "n modes"]:
         """All draws that are needed, in K; parameters of the prior are drawn once for all."""
         known = self.experiment.data.truth is not None
@@ -224,7 +230,7 @@ class Conditioned:
             "log_evidence": float(posterior.log_evidence),
             "information_bits": float(posterior.information_bits()),
             "chi2": float(model.chi2(posterior.mean, data)),
-            "chi2_expected": expected_chi2(self.judged.posterior, model.n_data),
+            "chi2_expected": self.expected,
             "chi2_model": self.judged.solution.chi2,
             "refinement": float(posterior.refinement),
             "covariance_kept": self.experiment.scenario.output.covariance,
@@ -265,7 +271,7 @@ class Conditioned:
                 fluxes = flux_table(experiment, own)
         with stages("diagnostics"):
             if not (alone or thorough):
-                split = Split.of(judge.posterior, judge.chi2, own.model.n_data)
+                split = Split.of(judge.posterior, judge.chi2, own.model.n_data, self.expected)
             if alone or thorough or split.instrument.p < DOUBTFUL:
                 left = residuals(judge, data)
                 split, judged = left.split, self._judged(left)
@@ -384,7 +390,8 @@ def channel_result(
         std=np.sqrt(variance),
         prior_fraction=mean_over_m(share),
         pixel_std=width,
-        draws=np.asarray(draws),
+        # not a part of more draws, which would stay in memory with it
+        draws=np.array(draws),
         log_likelihood=np.asarray(log_likelihood),
         covariance=covariance if covariance_kept else None,
         information_bits=information_bits,

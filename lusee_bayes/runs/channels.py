@@ -16,9 +16,9 @@ means E and covariance V of z, becomes that given all data (:mod:`.amplitudes`) 
 since m depends on other channels through z alone, and so do ground and gains.
 
 Unfinished work is kept in files: ``DIR/channels/25.information.nc`` holds what its data say,
-``25.result.nc`` its posterior. So memory stays bounded, and an interrupted run goes on where it
-was. Files of other scenarios or data are made anew. A joint posterior adds up what the files of all
-channels say.
+``25.alone.nc`` its posterior given its own data, ``25.result.nc`` that given all. So memory stays
+bounded, and an interrupted run goes on where it was. Files of other scenarios or data are made
+anew. A joint posterior adds up what the files of all channels say.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import h5py
 import jax
 import numpy as np
-from jaxtyping import Float, Int, PRNGKeyArray
+from jaxtyping import Float, Int
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
@@ -60,12 +60,11 @@ from lusee_bayes.linear.joint import (
 from lusee_bayes.linear.positive_joint import (
     COARSE_LMAX,
     MAX_ROUNDS,
-    PositiveMode,
     find_joint_mode,
     learn_laws,
     positive_sky,
 )
-from lusee_bayes.results.channel import ChannelData, ChannelResult
+from lusee_bayes.results.channel import ChannelData, ChannelResult, SkyModes
 from lusee_bayes.results.channel_map import Conditioned, channel_result, conditioned
 from lusee_bayes.results.map_files import information_file, read_information
 from lusee_bayes.results.map_result import Components, MapResult
@@ -92,29 +91,31 @@ class ChannelFiles:
         self.folder = folder / CHANNELS
         self.identity = identity
 
-    def path(self, scenario: Scenario, kind: str) -> Path:
-        """Of the ``information`` or the ``result`` of a channel."""
-        return self.folder / f"{scenario.frequency_mhz:.15g}.{kind}.nc"
+    def path(self, channel: Scenario, kind: type) -> Path:
+        """Of what is kept of a channel, a dataclass such as :class:`ChannelInformation`."""
+        name = kind.__name__.removeprefix("Channel").lower()
+        return self.folder / f"{channel.frequency_mhz:.15g}.{name}.nc"
 
-    def has(self, scenario: Scenario, kind: str) -> bool:
-        """Whether it is there, whole and of this run."""
-        return says(self.path(scenario, kind), {"identity": self.identity})
+    def kept(self, channel: Scenario, kind: type[T], make: Callable[[], T]) -> T:
+        """What is there, whole and of this run; else what is made now, and written."""
+        path = self.path(channel, kind)
+        if says(path, {"identity": self.identity}):
+            return self.read(channel, kind)
+        made = make()
+        write_tree(path, made, formats.CHANNEL, {"identity": self.identity})
+        return made
 
-    def write(self, scenario: Scenario, kind: str, value: Any) -> None:
-        """Write a dataclass whole or not at all."""
-        path = self.path(scenario, kind)
-        write_tree(path, value, formats.CHANNEL, {"identity": self.identity})
-
-    def read(self, scenario: Scenario, kind: str, of: type[T], part: str = "/") -> T:
-        """Read what was written, or a part of it by its path."""
-        path = self.path(scenario, kind)
+    def read(self, channel: Scenario, kind: type[T]) -> T:
+        """Read what is kept."""
+        path = self.path(channel, kind)
         with h5py.File(path) as file:
-            return from_tree(of, StoredTree(file[part]), str(path))
+            return from_tree(kind, StoredTree(file), str(path))
 
-    def arrays(self, scenario: Scenario, kind: str, *names: str) -> list[np.ndarray]:
-        """Read some arrays of it, by their paths."""
-        with h5py.File(self.path(scenario, kind)) as file:
-            return [file[name][()] for name in names]
+    def information(self, channel: Scenario) -> Information:
+        """Of a :class:`ChannelInformation`, this part alone."""
+        path = self.path(channel, ChannelInformation)
+        with h5py.File(path) as file:
+            return from_tree(Information, StoredTree(file["information"]), str(path))
 
 
 def identity_of(scenario: Scenario, data: Data | None, *others: object) -> str:
@@ -150,6 +151,50 @@ class ChannelInformation:
     unknowns: Unknowns | None
     sky: Float[np.ndarray, " mode"]
 
+    @classmethod
+    def of(cls, made: Conditioned, known: ChannelData) -> ChannelInformation:
+        """Of all data of a channel, earlier ones included."""
+        sky = np.asarray(made.experiment.setup.sky.modes)
+        return cls(made.information, made.of_all(known), made.unknowns, sky)
+
+    def shared(self) -> tuple[SkyModes, SkyModes]:
+        """What the prior of all channels takes: the reference sky, and the model's."""
+        return np.asarray(self.information.reference), self.sky
+
+    def given(self, components: Components, number: int, scenario: Scenario) -> ChannelResult:
+        """The channel given all data.
+
+        Parameters
+        ----------
+        components : Components
+        number : int
+            Of the channel among those of the components.
+        scenario : Scenario
+            Of all channels.
+        """
+        information, key = self.information, draw_key(scenario)
+        draws, spread, n_draws = components.draws, components.spread, scenario.output.draws
+        if components.mode is not None:
+            sky = positive_sky(components.mode, number, information, spread, draws, key)
+        else:
+            means = (components.mean, spread, draws)
+            sky = channel_sky(components.prior, number, information, *means, key)
+        skies, report = np.asarray(sky.draws[:n_draws]), None
+        if self.unknowns is not None:
+            report = self.unknowns.report(sky.mean, sky.covariance, joint=True)
+        return channel_result(
+            self.known,
+            sky.mean,
+            sky.covariance,
+            skies,
+            information.log_likelihood(skies),
+            np.asarray(sky.draws) - np.asarray(sky.mean),
+            unknowns=report,
+            independent=np.asarray(information.reference),
+            covariance_kept=scenario.output.covariance,
+            **information.fit(sky.mean, sky.covariance),
+        )
+
 
 # channels that one task adds up, one after the other
 BLOCK = 4
@@ -184,10 +229,9 @@ class ChannelsInFiles:
         files, channels = self.files, self.channels
 
         def call(number: int) -> dict[str, np.ndarray]:
-            return function(number, _information(files, channels[number]))
+            return function(number, files.information(channels[number]))
 
-        numbers = range(len(channels))
-        tasks = Tasks(call, numbers, [names_of(channels[k : k + 1]) for k in numbers])
+        tasks = Tasks(call, range(len(channels)), [names_of((one,)) for one in channels])
         found = self.engine.each(tasks, self.stages, "joint sums")
         return {name: np.stack([np.asarray(one[name]) for one in found]) for name in shapes}
 
@@ -203,7 +247,7 @@ class ChannelsInFiles:
         def add(numbers: range) -> ComponentSums:
             sums = ComponentSums.empty(prior, reference)
             for number in numbers:
-                information = function(number, _information(files, channels[number]))
+                information = function(number, files.information(channels[number]))
                 sums = summed_information(sums, prior, number, information)
             return sums
 
@@ -225,74 +269,47 @@ def names_of(channels: tuple[Scenario, ...]) -> str:
     return f"{first} MHz" if len(channels) == 1 else f"{first} to {last} MHz"
 
 
-def _information(files: ChannelFiles, channel: Scenario) -> Information:
-    return files.read(channel, "information", Information, "information")
-
-
-def positive_mode(scenario: Scenario, channels: ChannelsInFiles, stages: Stages) -> PositiveMode:
-    """Find the most probable skies of all channels.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        Of positive joint skies.
-    channels : ChannelsInFiles
-    stages : Stages
-        Told what is being done.
-
-    Raises
-    ------
-    InputError
-        As :func:`.find_joint_mode`.
-    """
-    with stages("templates"):
-        skies = scenario.spectral.positive_skies(scenario.frequencies_mhz, scenario.lmax)
-    silent = replace(channels, stages=Stages())
-    coarse = scenario.spectral.lmax_of_fields(min(scenario.lmax, COARSE_LMAX))
-    with stages.progress("laws of the fields", MAX_ROUNDS) as report:
-        laws = learn_laws(skies, silent, lmax_fields=coarse, report=report)
-    with stages.progress("positive skies", MAX_ROUNDS) as report:
-        return find_joint_mode(skies, laws, silent, report=report)
-
-
 def solve_components(
-    scenario: Scenario, files: ChannelFiles, n_draws: int, engine: Engine, stages: Stages
+    scenario: Scenario, channels: ChannelsInFiles, shared: Sequence[tuple], n_draws: int
 ) -> Components:
-    """Work out the joint posterior from the files of all channels.
+    """Work out the joint posterior of all channels.
 
     Parameters
     ----------
     scenario : Scenario
-        Of several frequencies.
-    files : ChannelFiles
-        With the information of every channel.
+        Of the channels.
+    channels : ChannelsInFiles
+    shared : sequence of tuple
+        :meth:`.ChannelInformation.shared` of each.
     n_draws : int
         Draws of the component maps.
-    engine : Engine
-        What carries out the channels.
-    stages : Stages
-        Told what is being done.
 
     Raises
     ------
     InputError
         If data are too precise to be solved for, or positive skies do not settle.
     """
-    channels = scenario.channels()
-    at_hand, mode = ChannelsInFiles(channels, files, engine, stages), None
-    if scenario.spectral.model == "positive":
-        mode = positive_mode(scenario, at_hand, stages)
-        prior, posterior, chi2 = mode.prior, mode.posterior, mode.energy
+    spectral, stages, frequencies = scenario.spectral, channels.stages, scenario.frequencies_mhz
+    mode = None
+    if spectral.model == "positive":
+        with stages("templates"):
+            skies = spectral.positive_skies(frequencies, scenario.lmax)
+        silent = replace(channels, stages=Stages())
+        coarse = spectral.lmax_of_fields(min(scenario.lmax, COARSE_LMAX))
+        with stages.progress("laws of the fields", MAX_ROUNDS) as report:
+            laws = learn_laws(skies, silent, lmax_fields=coarse, report=report)
+        with stages.progress("positive skies", MAX_ROUNDS) as report:
+            mode = find_joint_mode(skies, laws, silent, report=report)
+        prior, posterior, chi2, moved = mode.prior, mode.posterior, mode.energy, mode.moved
     else:
-        names = ("information/reference", "sky")
-        small = [files.arrays(channel, "information", *names) for channel in channels]
-        reference, skies = map(np.array, zip(*small, strict=True))
-        prior = scenario.spectral.prior(np.array(scenario.frequencies_mhz), skies)
-        information = at_hand.summed(prior, reference, lambda _, information: information)
+        reference, skies = map(np.array, zip(*shared, strict=True))
+        prior = spectral.prior(np.array(frequencies), skies)
+        information = channels.summed(prior, reference, lambda _, information: information)
     with stages("joint posterior"):
         if mode is None:
             posterior = component_posterior(information, prior)
             chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
+            moved = float(posterior.refinement)
         shape = (prior.n_components, posterior.mean.shape[0] // prior.n_components)
         return Components(
             prior,
@@ -302,7 +319,7 @@ def solve_components(
             chi2,
             float(posterior.log_evidence),
             float(posterior.information_bits()),
-            float(posterior.refinement) if mode is None else mode.moved,
+            moved,
             mode=mode,
         )
 
@@ -319,7 +336,7 @@ class ChannelAlone:
     ----------
     known : ChannelData
     information : Information
-        Of its own data.
+        Of its own data, without earlier ones.
     unknowns : Unknowns
         Receivers, ground and gain table given the sky.
     mean, covariance : (modes,) and (modes, modes) array
@@ -342,10 +359,21 @@ class ChannelAlone:
     n_draws: int
     figures: dict[str, float | bool]
 
-    def receivers(self) -> tuple[Float[np.ndarray, " ports"], Float[np.ndarray, "ports ports"]]:
-        """E and V of the receivers' powers, in prior standard deviations."""
+    @classmethod
+    def of(cls, made: Conditioned, known: ChannelData) -> ChannelAlone:
+        """The posterior is given earlier data, too; what is judged are its own."""
+        mean, compared = made.posterior.mean, made.compared()
+        deviations = made.draws - mean
+        if compared is not None:
+            deviations = np.concatenate([deviations, compared])
+        own = made.own.solution.information
+        kept = made.covariance, deviations, len(made.draws), made.figures()
+        return cls(known, own, made.unknowns, mean, *kept)
+
+    def shared(self) -> tuple[Float[np.ndarray, " ports"], Float[np.ndarray, "ports ports"], int]:
+        """E and V of the receivers' powers, in prior standard deviations; how many draws."""
         told, own = self._told(), self._own()
-        return told.mean[own], told.covariance[np.ix_(own, own)]
+        return told.mean[own], told.covariance[np.ix_(own, own)], len(self.deviations)
 
     def _told(self) -> Amplitudes:
         return self.unknowns.amplitudes.integrated(self.mean, self.covariance)
@@ -354,24 +382,20 @@ class ChannelAlone:
         """Which unknowns are powers of receivers."""
         return np.flatnonzero([is_receiver(row["unknown"]) for row in self.unknowns.rows])
 
-    def tied(
-        self,
-        mean: Float[np.ndarray, " ports"],
-        covariance: Float[np.ndarray, "ports ports"],
-        draws: Float[np.ndarray, "all ports"],
-        key: PRNGKeyArray,
-    ) -> ChannelResult:
+    def given(self, tied: Tied, number: int, scenario: Scenario) -> ChannelResult:
         """The channel given all data.
 
         Parameters
         ----------
-        mean, covariance : (ports,) and (ports, ports) array
-            E' and V' of its receivers' powers.
-        draws : (all, ports) array
-            Of these, for ``deviations``.
-        key : PRNG key
-            For the powers that go with the channel's own draws.
+        tied : Tied
+            E', V' and draws of the powers of receivers.
+        number : int
+            Of the channel among those that are tied.
+        scenario : Scenario
+            Of the channel.
         """
+        mean, covariance, draws = tied.mean[number], tied.covariance[number], tied.draws[:, number]
+        key = jax.random.fold_in(draw_key(scenario), TIED + 1)
         told, own = self._told(), self._own()
         e, v = told.mean[own], told.covariance[np.ix_(own, own)]
         gain = np.linalg.solve(v, told.with_sky[:, own].T).T
@@ -415,47 +439,30 @@ def kernel(
     return np.exp(-0.5 * (x[:, None] - x[None]) ** 2)
 
 
-def tie_receivers(scenario: Scenario, channels: Sequence[Scenario], files: ChannelFiles) -> Tied:
+def tie_receivers(
+    scenario: Scenario, frequencies_mhz: Sequence[float], shared: Sequence[tuple]
+) -> Tied:
     """The receivers' powers given the data of all channels, from what is kept of each alone.
 
     Parameters
     ----------
     scenario : Scenario
-        Of several frequencies.
-    channels : sequence of Scenario
-        That could be mapped.
-    files : ChannelFiles
+        Of all channels.
+    frequencies_mhz : sequence of float
+        Of those that could be mapped.
+    shared : sequence of tuple
+        :meth:`.ChannelAlone.shared` of these.
 
     Raises
     ------
     InputError
         As :func:`.tie`.
     """
-    means, covariances, n_draws = [], [], 0
-    for channel in channels:
-        alone = files.read(channel, "alone", ChannelAlone)
-        mean, covariance = alone.receivers()
-        means.append(mean)
-        covariances.append(covariance)
-        n_draws = len(alone.deviations)
+    means, covariances, (n_draws, *_) = zip(*shared, strict=True)
     own = jax.random.fold_in(draw_key(scenario), TIED)
     normals = np.asarray(jax.random.normal(own, (n_draws, sum(map(len, means)))))
-    frequencies = np.array([channel.frequency_mhz for channel in channels])
-    ties = kernel(frequencies, scenario.noise.receiver.smooth_octaves)
+    ties = kernel(np.array(frequencies_mhz), scenario.noise.receiver.smooth_octaves)
     return tie(np.stack(means), np.stack(covariances), ties, normals)
-
-
-def _write_tied_sky(
-    channels: Sequence[Scenario], tied: Tied, files: ChannelFiles, number: int
-) -> None:
-    """Write the result of one channel, unless it is there."""
-    channel = channels[number]
-    if files.has(channel, "result"):
-        return
-    alone = files.read(channel, "alone", ChannelAlone)
-    key = jax.random.fold_in(draw_key(channel), TIED + 1)
-    found = alone.tied(tied.mean[number], tied.covariance[number], tied.draws[:, number], key)
-    files.write(channel, "result", found)
 
 
 def map_channels(
@@ -518,76 +525,63 @@ def map_channels(
         known = made.known(stages, alone=True, thorough=thorough)
         return MapResult(scenario, (made.result(known, stages),), seconds=stages.seconds)
     engine.work_in(folder)
-    n_draws = scenario.output.draws
     digest = None if kept is None else digest_of(kept)
     identity = identity_of(scenario, data, truth, digest, thorough)
     files = ChannelFiles(folder.resolve(), identity)
     channels = tuple(channel.anchored() for channel in scenario.channels())
-    names, tied = [names_of((channel,)) for channel in channels], scenario.ties_receivers
-    wanted = "information" if scenario.joint else "alone" if tied else "result"
+    kind = ChannelInformation if scenario.joint else ChannelAlone
+    alone = not scenario.joint and not scenario.ties_receivers
 
-    def observe(channel: Scenario) -> None:
-        if files.has(channel, wanted):
-            return
-        silent = Stages()
-        made = condition(channel, silent)
-        known = made.known(silent, alone=False, thorough=thorough)
-        if scenario.joint:
-            sky = np.asarray(made.experiment.setup.sky.modes)
-            known = made.of_all(known)
-            found = ChannelInformation(made.information, known, made.unknowns, sky)
-            files.write(channel, wanted, found)
-        elif tied:
-            compared = made.compared()
-            deviations = [
-                made.draws - made.posterior.mean,
-                *([] if compared is None else [compared]),
-            ]
-            alone = ChannelAlone(
-                known,
-                made.information,
-                made.unknowns,
-                made.posterior.mean,
-                made.covariance,
-                np.concatenate(deviations),
-                n_draws,
-                made.figures(),
-            )
-            files.write(channel, wanted, alone)
-        else:
-            files.write(channel, wanted, made.result(known, silent))
+    def observe(channel: Scenario) -> ChannelResult | tuple | InputError:
+        """Look at the data of a channel: its result, or what the result of all takes of it."""
 
-    def refusal(channel: Scenario) -> str:
+        def make() -> ChannelResult | ChannelInformation | ChannelAlone:
+            made = condition(channel, Stages())
+            known = made.known(alone=False, thorough=thorough)
+            return made.result(known) if alone else kind.of(made, known)
+
         try:
-            observe(channel)
+            kept = files.kept(channel, ChannelResult if alone else kind, make)
         except InputError as error:
-            return str(error)
-        return ""
+            return error
+        return kept if alone else kept.shared()
 
-    refusals = engine.each(Tasks(refusal, channels, names), stages, "channels")
-    unmapped = {c.frequency_mhz: r for c, r in zip(channels, refusals, strict=True) if r}
-    mapped = tuple(c for c in channels if c.frequency_mhz not in unmapped)
-    if not mapped:
+    names = [names_of((channel,)) for channel in channels]
+    found = engine.each(Tasks(observe, channels, names), stages, "channels")
+    by_channel = list(zip(channels, found, strict=True))
+    unmapped = {c.frequency_mhz: str(x) for c, x in by_channel if isinstance(x, InputError)}
+    if len(unmapped) == len(channels):
         raise InputError(f"no channel can be mapped: {_reasons(unmapped)}")
-    components, tie_log_evidence = None, 0.0
-    numbers, names = range(len(mapped)), [names_of((channel,)) for channel in mapped]
-    if tied:
-        receivers = tie_receivers(scenario, mapped, files)
-        tie_log_evidence = receivers.log_evidence
-        write = partial(_write_tied_sky, mapped, receivers, files)
-        engine.each(Tasks(write, numbers, names), stages, "smooth receivers")
+    mapped = [channel for channel in channels if channel.frequency_mhz not in unmapped]
+    found = [one for one in found if not isinstance(one, InputError)]
+    components, tied = None, None
     if scenario.joint:
         left = _without(unmapped, scenario)
+        at_hand = ChannelsInFiles(tuple(mapped), files, engine, stages)
         # coverage is compared with draws
-        known = data is None or truth
-        n_solved = max(n_draws, N_DRAWS) if known else n_draws
-        components = solve_components(left, files, n_solved, engine, stages)
-        # for workers of other processes
-        write = partial(_write_joint_sky, mapped, components, scenario, files)
-        engine.each(Tasks(write, numbers, names), stages, "joint skies")
-    found = tuple(files.read(c, "result", ChannelResult) for c in mapped)
-    seconds, tied_evidence = stages.seconds, {"tie_log_evidence": tie_log_evidence}
-    return MapResult(scenario, found, components, seconds, unmapped, **tied_evidence)
+        n_draws = max(scenario.output.draws, N_DRAWS if data is None or truth else 0)
+        components = solve_components(left, at_hand, found, n_draws)
+    elif scenario.ties_receivers:
+        tied = tie_receivers(scenario, [channel.frequency_mhz for channel in mapped], found)
+
+    def finish(number: int) -> ChannelResult:
+        """The result of a channel, given what all have in common."""
+        channel, common = mapped[number], components or tied
+        own = scenario if scenario.joint else channel
+
+        def make() -> ChannelResult:
+            return files.read(channel, kind).given(common, number, own)
+
+        return files.kept(channel, ChannelResult, make)
+
+    if not alone:
+        stage = "joint skies" if scenario.joint else "smooth receivers"
+        tasks = Tasks(finish, range(len(mapped)), [names_of((channel,)) for channel in mapped])
+        found = engine.each(tasks, stages, stage)
+    evidence = 0.0 if tied is None else tied.log_evidence
+    return MapResult(
+        scenario, tuple(found), components, stages.seconds, unmapped, tie_log_evidence=evidence
+    )
 
 
 def _without(unmapped: dict[float, str], scenario: Scenario) -> Scenario:
@@ -606,40 +600,3 @@ def _reasons(unmapped: dict[float, str]) -> str:
     for frequency, reason in unmapped.items():
         alike.setdefault(reason, []).append(f"{frequency:g}")
     return "; ".join(f"{', '.join(known)} MHz: {reason}" for reason, known in alike.items())
-
-
-def _write_joint_sky(
-    channels: tuple[Scenario, ...],
-    components: Components,
-    scenario: Scenario,
-    files: ChannelFiles,
-    number: int,
-) -> None:
-    channel, key, n_draws = channels[number], draw_key(scenario), scenario.output.draws
-    if files.has(channel, "result"):
-        return
-    alone = files.read(channel, "information", ChannelInformation)
-    information, draws = alone.information, components.draws
-    if components.mode is not None:
-        spread = np.asarray(components.spread)
-        sky = positive_sky(components.mode, number, information, spread, np.asarray(draws), key)
-    else:
-        means = (components.mean, components.spread, draws)
-        sky = channel_sky(components.prior, number, information, *means, key)
-    skies = np.asarray(sky.draws[:n_draws])
-    report = None
-    if alone.unknowns is not None:
-        report = alone.unknowns.report(sky.mean, sky.covariance, joint=True)
-    found = channel_result(
-        alone.known,
-        sky.mean,
-        sky.covariance,
-        skies,
-        information.log_likelihood(skies),
-        np.asarray(sky.draws) - np.asarray(sky.mean),
-        unknowns=report,
-        independent=np.asarray(information.reference),
-        covariance_kept=scenario.output.covariance,
-        **information.fit(sky.mean, sky.covariance),
-    )
-    files.write(channel, "result", found)

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import Data
 from lusee_bayes.experiment.experiment import Experiment, observed
@@ -31,10 +32,8 @@ from lusee_bayes.runs.folder import (
     RunOutcome,
     model_file,
     require_marginal,
-    require_single_frequency,
     rows_file,
     run_folder,
-    scenario_run,
     text_file,
 )
 
@@ -63,7 +62,7 @@ def run_compare(
         For fewer than two folders, or one that is not of a finished map run.
     """
     stages = stages or Stages()
-    with run_folder(folder, COMPARISON, {}, replace=replace, inputs=folders) as run:
+    with run_folder(folder, COMPARISON, None, None, *folders, replace=replace) as run:
         return run.write(read_runs(folders), stages)
 
 
@@ -127,12 +126,13 @@ def run_compare_priors(
     """
     scenario = load_scenario(scenario)
     engine, stages = engine or ThisProcess(side_by_side=1), stages or Stages()
-    require_single_frequency("compare-priors", bool(scenario.frequencies_mhz))
+    if not scenario.single:
+        raise InputError("compare-priors is for a single frequency; leave out frequencies_mhz")
     require_marginal("compare-priors", "set treatment=marginalised", scenario)
     sections = named_priors(priors, scenario, known_sky=data is None or truth)
     sections = {name: section.anchored() for name, section in sections.items()}
     origin = {"truth": truth or None, "priors": ",".join(sections)}
-    with scenario_run(folder, COMPARE_PRIORS, scenario, data, replace=replace, **origin) as run:
+    with run_folder(folder, COMPARE_PRIORS, scenario, data, replace=replace, **origin) as run:
         experiment = measured_experiment(scenario, data, stages, truth=truth, make=observed)
         with stages("data"):
             solution = about_sky(experiment.setup, experiment.data)

@@ -8,8 +8,8 @@ Factorisations of them take nearly all of the time.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from functools import lru_cache
 from math import ceil
 
@@ -83,20 +83,15 @@ class Cost:
         )
 
 
-def demand_of(costs: Sequence[Cost]) -> Demand:
-    """What independent posteriors take, one or more."""
-    return Demand(BASE_BYTES, max(cost.memory for cost in costs) - BASE_BYTES)
-
-
-def demand_of_channels(scenario: Scenario) -> Demand:
-    """What the channels of a scenario take, of several frequencies."""
-    demand = demand_of([posterior_cost(scenario.channels()[0])])
-    if not scenario.joint:
-        return demand
-    # sums over channels, of every pair of components, and another one that is added
-    count = scenario.spectral.n_maps(scenario.frequencies_mhz)
-    sums = 16.0 * (count * (count + 1) / 2) * (scenario.lmax + 1) ** 4
-    return replace(demand, task_bytes=demand.task_bytes + sums)
+def demand_of(*scenarios: Scenario, n_draws: int = 0) -> Demand:
+    """What independent posteriors take, or the channels of a scenario of several frequencies."""
+    alone = [one if one.single else one.channels()[0] for one in scenarios]
+    task_bytes = max(posterior_cost(one, n_draws).memory for one in alone) - BASE_BYTES
+    if scenarios[0].joint:
+        # sums over channels, of every pair of components, and another one that is added
+        count = scenarios[0].spectral.n_maps(scenarios[0].frequencies_mhz)
+        task_bytes += 16.0 * (count * (count + 1) / 2) * (scenarios[0].lmax + 1) ** 4
+    return Demand(BASE_BYTES, task_bytes)
 
 
 def duration(seconds: float) -> str:

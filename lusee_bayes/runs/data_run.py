@@ -30,7 +30,7 @@ from lusee_bayes.instrument.averaging import averaged, product_live_s
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.instrument.waterfalls import NO_ROOM, write_four_port, write_waterfall
 from lusee_bayes.runs.cost import require_fits, require_resources, simulation_cost
-from lusee_bayes.runs.folder import RunKind, inputs_of, scenario_run
+from lusee_bayes.runs.folder import RunKind, inputs_of, run_folder
 from lusee_bayes.runs.plan_run import expected_inference
 
 
@@ -239,7 +239,7 @@ def run_simulate_flight(
     _require_no_sessions(folder, replace)
     stages = stages or Stages()
     scenario = _at(scenario, frequencies_mhz)
-    with scenario_run(folder, FLIGHT, scenario, replace=replace) as run:
+    with run_folder(folder, FLIGHT, scenario, replace=replace) as run:
         made, place = simulate_flight(scenario, stages), run.path
         with transaction(place, FLIGHT.name, origin=run.origin) as stage:
             names = _write_flight(made, stage, place.resolve(), stages)

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -59,7 +59,7 @@ def origin_of(
     Returns
     -------
     dict
-        For :func:`.run_folder`.
+        For ``manifest.json``.
 
     Raises
     ------
@@ -77,13 +77,10 @@ def origin_of(
 
 
 def inputs_of(
-    scenario: Scenario, data: Data | None = None, *others: str | Path | None
+    scenario: Scenario | None, data: Data | None = None, *others: str | Path | None
 ) -> list[str | Path]:
-    """The files that a run reads: data, those that its scenario names, and others if given.
-
-    For :func:`.run_folder`.
-    """
-    tree = scenario.model_dump(mode="json")
+    """The files that a run reads: data, those that its scenario names, and others if given."""
+    tree = {} if scenario is None else scenario.model_dump(mode="json")
     named = [value for _, value in _entries(tree) if isinstance(value, str)]
     given = [] if data is None else files_of(data)
     return [*given, *filter(os.path.isfile, named), *filter(None, others)]
@@ -302,10 +299,11 @@ class RunFolder:
 def run_folder(
     folder: str | Path,
     kind: RunKind,
-    origin: Origin,
-    *,
+    scenario: Scenario | None = None,
+    data: Data | None = None,
+    *inputs: str | Path | None,
     replace: bool = False,
-    inputs: Iterable[str | Path] = (),
+    **others: object,
 ) -> Iterator[RunFolder]:
     """Open a folder for a run, and say what it holds if the run is interrupted.
 
@@ -313,12 +311,14 @@ def run_folder(
     ----------
     folder : path
     kind : RunKind
-    origin : mapping
-        What the results are made of (:func:`.origin_of`).
+    scenario : Scenario, optional
+    data : Visibilities, path, or sequence of them, optional
+    *inputs
+        Other files that the run reads, if given (:func:`inputs_of`): none is replaced.
     replace : bool
         Replace results of another run.
-    inputs : iterable of path
-        Files that the run reads (:func:`.inputs_of`), which are not to be replaced.
+    **others
+        What else determines the numbers (:func:`origin_of`).
 
     Yields
     ------
@@ -329,12 +329,13 @@ def run_folder(
     ------
     InputError
         If ``folder``, or what it would lie in, is a file; if another run works in it, or has left
-        its results there; if one of ``inputs`` is among the results that would be replaced.
+        its results there; if what the run reads is among the results that would be replaced.
     RunInterrupted
         Instead of KeyboardInterrupt.
     WorkersLost
         With what the folder holds added to its message.
     """
+    origin, read = origin_of(scenario, data, **others), inputs_of(scenario, data, *inputs)
     folder = user_path(folder)
     require_folder(folder)
     made = _made(folder)
@@ -344,7 +345,7 @@ def run_folder(
             if not replace:
                 require_own(folder, (kind.name, *kind.after), origin)
             else:
-                require_apart(folder, inputs)
+                require_apart(folder, read)
             before = _written_at(folder)
             use_compilation_cache()
             try:
@@ -381,37 +382,8 @@ def _state(folder: Path, before: int | None, kind: RunKind) -> str:
     if now is not None and now != before:
         return f"the new results in '{folder}' are complete"
     earlier = "no results are written" if now is None else "the earlier results are as they were"
-    if kind.unfinished and any((folder / kind.unfinished).glob("*")):
-        return f"{earlier} in '{folder}'; {kind.resume}"
-    return f"{earlier} in '{folder}'"
-
-
-def scenario_run(
-    folder: str | Path,
-    kind: RunKind,
-    scenario: Scenario,
-    data: Data | None = None,
-    *inputs: str | Path | None,
-    replace: bool = False,
-    **others: object,
-) -> AbstractContextManager[RunFolder]:
-    """Open a folder for a run of a scenario and data (:func:`run_folder`).
-
-    Parameters
-    ----------
-    folder : path
-    kind : RunKind
-    scenario : Scenario
-    data : Visibilities, path, or sequence of them, optional
-    *inputs
-        Other files that the run reads, if given (:func:`inputs_of`).
-    replace : bool
-        Replace results of another run.
-    **others
-        What else determines the numbers (:func:`origin_of`).
-    """
-    origin, files = origin_of(scenario, data, **others), inputs_of(scenario, data, *inputs)
-    return run_folder(folder, kind, origin, replace=replace, inputs=files)
+    resumed = kind.unfinished and any((folder / kind.unfinished).glob("*"))
+    return f"{earlier} in '{folder}'{f'; {kind.resume}' if resumed else ''}"
 
 
 def require_marginal(what: str, advice: str, scenario: Scenario) -> None:
@@ -421,9 +393,3 @@ def require_marginal(what: str, advice: str, scenario: Scenario) -> None:
             f"the scenario says that something is to be sampled, and {what} can only marginalise; "
             f"{advice}"
         )
-
-
-def require_single_frequency(name: str, given: bool) -> None:
-    """InputError where an option of single maps is given for several frequencies."""
-    if given:
-        raise InputError(f"{name} is for a single frequency; leave out frequencies_mhz")

@@ -33,7 +33,7 @@ from lusee_bayes.runs.folder import (
     netcdf_file,
     require_marginal,
     rows_file,
-    scenario_run,
+    run_folder,
     table_file,
 )
 from lusee_bayes.sky.sky_source import write_alms
@@ -91,7 +91,7 @@ def run_map(
     if not scenario.single:
         require_fits(cost := posterior_cost(scenario), scenario)
     origin = {"truth": truth or None, "earlier": earlier}
-    with scenario_run(folder, MAP, scenario, data, earlier, replace=replace, **origin) as run:
+    with run_folder(folder, MAP, scenario, data, earlier, replace=replace, **origin) as run:
         if not scenario.single:
             stages.say(cost.line())
         reduced = None if data is None else reduced_of(data, scenario, stages)

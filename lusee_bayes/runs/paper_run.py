@@ -62,7 +62,7 @@ def run_paper(
     """
     engine, stages = engine or ThisProcess(), stages or Stages()
     scenarios = paper_scenarios(overrides, skies)
-    with run_folder(folder, PAPER, {}, replace=replace) as run:
+    with run_folder(folder, PAPER, replace=replace) as run:
         engine.work_in(run.path)
         # workers may have other folders of their own
         home = run.path.resolve()

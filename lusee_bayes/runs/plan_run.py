@@ -8,7 +8,6 @@ as soon as it is made.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import time
 from collections.abc import Sequence
@@ -42,7 +41,7 @@ from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.report.figures.plans import forecasts
 from lusee_bayes.results.forecast import AS_GIVEN, Forecast, Variation, forecast_rows
 from lusee_bayes.runs.cost import duration, posterior_cost, require_fits
-from lusee_bayes.runs.folder import RunKind, RunOutcome, inputs_of, origin_of, rows_file, run_folder
+from lusee_bayes.runs.folder import RunKind, RunOutcome, inputs_of, rows_file, run_folder
 from lusee_bayes.systematics.context import Around
 
 
@@ -213,7 +212,13 @@ def default_variations(source: str, scenario: Scenario) -> list[Variation]:
     families = {AS_GIVEN: {AS_GIVEN: scenario}}
     if scenario.observation.schedule is None:
         families |= families_of_runs(scenario)
-    families["duty cycle"] = {f"{duty:g}": with_duty_cycle(scenario, duty) for duty in DUTY_CYCLES}
+    radiometer = scenario.noise.radiometer
+    families["duty cycle"] = {
+        f"{duty:g}": scenario.with_section(
+            "noise", radiometer=radiometer.model_copy(update={"duty_cycle": duty})
+        )
+        for duty in DUTY_CYCLES
+    }
     found = [
         Variation(source, family, name, varied)
         for family, members in families.items()
@@ -231,15 +236,16 @@ def default_variations(source: str, scenario: Scenario) -> list[Variation]:
 def families_of_runs(scenario: Scenario) -> dict[str, dict[str, Scenario]]:
     """The scenario with its runs turned, longer or shorter, or by night."""
     runs = scenario.observation.runs
-    turned = [runs_repeated(runs, n, TURN_DEG) for n in PARTS[1:]]
+    cycles = sum(run.cycles for run in runs)
+    turned = [changed(runs, times=n, turn_deg=TURN_DEG) for n in PARTS[1:]]
+    nights = [changed(runs, times=n, night_only=True) for n in PARTS[:2]]
     families = {
-        "turned, same time": {angles(r): r for r in (parted(runs, n) for n in PARTS)},
-        "turned, more time": {f"{length(r)}: {angles(r)}": r for r in turned},
-        "duration": {length(r): r for r in (lasting(runs, cycles) for cycles in CYCLES)},
-        "nights only": {
-            length(r): tuple(changed(run, night_only=True) for run in r)
-            for r in (runs_repeated(runs, n, 0.0) for n in PARTS[:2])
+        "turned, same time": {
+            angles(r): r for r in (changed(runs, 1.0 / n, n, TURN_DEG) for n in PARTS)
         },
+        "turned, more time": {f"{length(r)}: {angles(r)}": r for r in turned},
+        "duration": {length(r): r for r in (changed(runs, n / cycles) for n in CYCLES)},
+        "nights only": {length(r): r for r in nights},
     }
     return {
         family: {
@@ -250,36 +256,24 @@ def families_of_runs(scenario: Scenario) -> dict[str, dict[str, Scenario]]:
     }
 
 
-Runs = tuple[RunSection, ...]
+def changed(
+    runs: Sequence[RunSection],
+    factor: float = 1.0,
+    times: int = 1,
+    turn_deg: float = 0.0,
+    **values: Any,
+) -> tuple[RunSection, ...]:
+    """Runs that last ``factor`` times as long, and all of them again and again.
 
+    Each time they are turned by ``turn_deg`` more. ``values`` are others of every run.
+    """
 
-def changed(run: RunSection, **values: Any) -> RunSection:
-    """A run with other values, checked again."""
-    return RunSection(**{**run.model_dump(), **values})
+    def one(run: RunSection, number: int) -> RunSection:
+        turned = run.turntable_deg + number * turn_deg
+        own = {"cycles": run.cycles * factor, "turntable_deg": turned}
+        return RunSection(**run.model_dump() | values | own)
 
-
-def parted(runs: Sequence[RunSection], parts: int) -> Runs:
-    """Every run in equal parts, each turned by 30 degrees more than the one before."""
-    return tuple(
-        changed(run, cycles=run.cycles / parts, turntable_deg=run.turntable_deg + part * TURN_DEG)
-        for run in runs
-        for part in range(parts)
-    )
-
-
-def runs_repeated(runs: Sequence[RunSection], times: int, turn_deg: float) -> Runs:
-    """All runs so many times, each time turned by ``turn_deg`` more."""
-    return tuple(
-        changed(run, turntable_deg=run.turntable_deg + number * turn_deg)
-        for number in range(times)
-        for run in runs
-    )
-
-
-def lasting(runs: Sequence[RunSection], cycles: float) -> Runs:
-    """The runs, longer or shorter by one factor, so that they last ``cycles`` together."""
-    factor = cycles / sum(run.cycles for run in runs)
-    return tuple(changed(run, cycles=run.cycles * factor) for run in runs)
+    return tuple(one(run, number) for number in range(times) for run in runs)
 
 
 def angles(runs: Sequence[RunSection]) -> str:
@@ -291,12 +285,6 @@ def length(runs: Sequence[RunSection]) -> str:
     """How long they last, in words."""
     cycles = sum(run.cycles for run in runs)
     return f"{cycles:g} cycle{'' if cycles == 1.0 else 's'}"
-
-
-def with_duty_cycle(scenario: Scenario, duty_cycle: float) -> Scenario:
-    """The scenario with another duty cycle of the receivers."""
-    radiometer = scenario.noise.radiometer.model_copy(update={"duty_cycle": duty_cycle})
-    return scenario.with_section("noise", radiometer=radiometer)
 
 
 def kept_forecast(folder: Path, variation: Variation) -> Forecast:
@@ -316,7 +304,7 @@ def kept_forecast(folder: Path, variation: Variation) -> Forecast:
 def _digest(variation: Variation) -> str:
     """Of all that a forecast depends on."""
     parts = [variation.scenario.to_yaml(), list(variation.lost), __version__]
-    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:32]
+    return sha256(json.dumps(parts).encode()).hexdigest()[:32]
 
 
 def forecasts_of(
@@ -405,9 +393,8 @@ def run_plan(
             require_fits(posterior_cost(v.scenario), v.scenario)
     told = {f"{v.source}, {v.family}, {v.name}": v.scenario for v in variations}
     digests = {name: sha256(s.to_yaml().encode()).hexdigest()[:12] for name, s in told.items()}
-    origin = origin_of(**digests)
     inputs = [path for v in variations for path in inputs_of(v.scenario)]
-    with run_folder(folder, PLAN, origin, replace=replace, inputs=inputs) as run:
+    with run_folder(folder, PLAN, None, None, *inputs, replace=replace, **digests) as run:
         engine.work_in(run.path)
         made = (run.path / UNFINISHED).resolve()
         return run.write(forecasts_of(variations, made, engine, stages), stages)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import time
-from contextlib import AbstractContextManager
+from dataclasses import replace as replace_fields
 from pathlib import Path
 
 import numpy as np
@@ -32,12 +32,11 @@ from lusee_bayes.results.sample_result import CHAINS, SAMPLES, SampleResult
 from lusee_bayes.runs.cost import measured_experiment
 from lusee_bayes.runs.folder import (
     Output,
-    RunFolder,
     RunKind,
     RunOutcome,
     model_file,
     netcdf_file,
-    scenario_run,
+    run_folder,
     text_file,
 )
 from lusee_bayes.sampling.datatree import read_datatree, to_datatree
@@ -262,44 +261,33 @@ def run_sample(
     program = program or default_program(scenario)
     sampler = sampler or Sampler(seed=scenario.seed)
 
-    def one(
-        scenario: Scenario, folder: Path, stages: Stages
-    ) -> RunOutcome[tuple[SampleResult, ...]]:
-        with sample_folder(folder, SAMPLE, scenario, data, program, replace) as run:
+    given = {"replace": replace, "program": named(program)}
+
+    def one(scenario: Scenario, folder: Path, stages: Stages) -> RunOutcome[SampleResult]:
+        with run_folder(folder, SAMPLE, scenario, data, program.path, **given) as run:
             n_draws = sampler.chains * sampler.draws
             experiment = measured_experiment(scenario, data, stages, n_draws=n_draws)
             options = {"resume": resume, "stages": stages}
             result = sample_result(experiment, program, sampler, run.path, **options)
-            written = run.write(result, stages, Provenance.of_experiment(experiment, data))
-            return RunOutcome((result,), run.path, written.files)
+            return run.write(result, stages, Provenance.of_experiment(experiment, data))
 
     folder, stages = user_path(folder), stages or Stages()
-    if not scenario.frequencies_mhz:
-        return one(scenario, folder, stages)
-    with sample_folder(folder, CUBES, scenario, data, program, replace) as run:
+    if scenario.single:
+        made = one(scenario, folder, stages)
+        return replace_fields(made, result=(made.result,))
+    with run_folder(folder, CUBES, scenario, data, program.path, **given) as run:
         runs = []
         for channel in scenario.channels():
             where = run.path / f"{channel.frequency_mhz:.15g}MHz"
             runs.append(one(channel, where, Stages(stages.console, verbose=stages.verbose)))
-        results = tuple(result for each in runs for result in each.result)
-        cubes = run.write((scenario, results), stages)
-        return RunOutcome(
-            results, run.path, [*(f for each in runs for f in each.files), *cubes.files]
-        )
+        results = tuple(each.result for each in runs)
+        runs.append(run.write((scenario, results), stages))
+        return RunOutcome(results, run.path, [file for each in runs for file in each.files])
 
 
-def sample_folder(
-    folder: str | Path,
-    kind: RunKind,
-    scenario: Scenario,
-    data: Data | None,
-    program: Program,
-    replace: bool,
-) -> AbstractContextManager[RunFolder]:
-    """Open the folder of a run whose draws are those of a program (:func:`.scenario_run`)."""
-    named = f"{program.name} ({program.digest[:12]})"
-    given = {"replace": replace, "program": named}
-    return scenario_run(folder, kind, scenario, data, program.path, **given)
+def named(program: Program) -> str:
+    """What tells a program from others: its name, and a digest of its text."""
+    return f"{program.name} ({program.digest[:12]})"
 
 
 def _write_cubes(sampled: tuple[Scenario, tuple[SampleResult, ...]], folder: Path) -> None:

@@ -15,9 +15,9 @@ from lusee_bayes.report.rendering import render_text
 from lusee_bayes.results.finished_runs import Provenance
 from lusee_bayes.results.sample_result import CHAINS
 from lusee_bayes.results.validation_result import ValidationResult, allowed
-from lusee_bayes.runs.cost import demand_of, measured_experiment, posterior_cost
-from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, model_file, text_file
-from lusee_bayes.runs.sample_run import RESUME, SAMPLE_OUTPUTS, sample_folder, sample_result
+from lusee_bayes.runs.cost import demand_of, measured_experiment
+from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, model_file, run_folder, text_file
+from lusee_bayes.runs.sample_run import RESUME, SAMPLE_OUTPUTS, named, sample_result
 from lusee_bayes.sampling.hmc import Sampler
 from lusee_bayes.sampling.least import require_draws, require_simulations
 from lusee_bayes.sampling.programs import load_program
@@ -26,7 +26,7 @@ from lusee_bayes.sampling.validation import BATCH, N_DRAWS, calibrate_sky, valid
 
 def demand_of_calibration(scenario: Scenario) -> Demand:
     """What simulation-based calibration takes, in batches that use all processors."""
-    return replace_fields(demand_of([posterior_cost(scenario, BATCH * N_DRAWS)]), side_by_side=1)
+    return replace_fields(demand_of(scenario, n_draws=BATCH * N_DRAWS), side_by_side=1)
 
 
 def run_validate(
@@ -77,16 +77,17 @@ def run_validate(
     program = load_program("sky")
     require_simulations(simulations)
     require_draws(sampler.draws)
-    with sample_folder(folder, VALIDATION, scenario, data, program, replace) as run:
+    given = {"replace": replace, "program": named(program)}
+    with run_folder(folder, VALIDATION, scenario, data, program.path, **given) as run:
         n_draws = sampler.chains * sampler.draws
         experiment = measured_experiment(scenario, data, stages, n_draws=n_draws)
         options = {"resume": resume, "stages": stages}
-        sampled = sample_result(experiment, program, sampler, run.path, **options)
-        posterior, model = sampled.inference.posterior, sampled.inference.model
+        drawn = sample_result(experiment, program, sampler, run.path, **options)
+        posterior, model = drawn.inference.posterior, drawn.inference.model
         with stages("comparison"):
-            stats = sampled.tree["sample_stats"]
+            stats = drawn.tree["sample_stats"]
             found = validate_draws(
-                sampled.skies, posterior, stats["diverging"].values, stats["energy"].values
+                drawn.skies, posterior, stats["diverging"].values, stats["energy"].values
             )
         if engine is not None:
             engine.work_in(run.path)
@@ -98,9 +99,8 @@ def run_validate(
             engine=engine,
             stages=stages,
         )
-        result = ValidationResult(name, sampled, found, ranks)
-        provenance = Provenance.of_experiment(experiment, data)
-        return run.write(result, stages, provenance)
+        result = ValidationResult(name, drawn, found, ranks)
+        return run.write(result, stages, Provenance.of_experiment(experiment, data))
 
 
 def _of_sampled(output: Output) -> Output:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from assertions import assert_same_map, refuse
-from experiments import four_ports
+from experiments import channels_of, four_ports
 from reference_linear import Answer, white_posterior
 from scipy.linalg import block_diag
 
@@ -21,6 +21,7 @@ FREQUENCIES, OCTAVES = np.array([15.0, 20.0, 22.0]), 0.4
 RECEIVER = (
     f"noise.receiver={{power_k: 20000, slope: -2, relative_std: 0.5, smooth_octaves: {OCTAVES}}}"
 )
+NOT_SMOOTH = "noise.receiver={power_k: 20000, slope: -2, relative_std: 0.5}"
 GROUND = "noise.regolith={std_k: 2000}"
 # a tenth of the sky, so that the data leave something of the powers to the other channels
 NOISE = "noise.radiometer.factor=1e8"
@@ -232,3 +233,26 @@ def test_refused_in_one_sentence(response_file):
     given = response_file, "spectral={components: [power_law]}", RECEIVER
     refuse("with joint, leave it out", cube_of, *given, "joint=true")
     refuse("greater than 0", cube_of, *given, "noise.receiver.smooth_octaves=0")
+
+
+@pytest.mark.usefixtures("numbers_alone")
+def test_after_earlier_data_residuals_are_those_of_the_new_ones(response_file, tmp_path):
+    """No other frequency is near: what ties channels changes none of their numbers."""
+    given = (response_file, GROUND, "output={draws: 50, information: true}")
+    alone, tied = (
+        cube_of(*given, receiver, frequencies="[15, 20]")
+        for receiver in (NOT_SMOOTH, f"{NOT_SMOOTH[:-1]}, smooth_octaves: 0.01}}")
+    )
+    lb.run_map(alone, tmp_path / "first")
+    new = channels_of(alone.model_copy(update={"seed": 7}))
+    made = [
+        lb.run_map(scenario, tmp_path / name, data=new, earlier=tmp_path / "first").result
+        for name, scenario in (("alone", alone), ("tied", tied))
+    ]
+    for expected, got in zip(*(one.channels for one in made), strict=True):
+        assert got.n_data == expected.n_data == new[0].layout.size
+        for name in ("chi2", "chi2_expected", "chi2_model"):
+            assert getattr(got, name) == pytest.approx(getattr(expected, name), rel=1e-6)
+        # of 16 modes: half a chi^2 of 16 about the likelihood of the mean, 50 times
+        likely = [one.log_likelihood.mean() for one in (got, expected)]
+        assert likely[0] == pytest.approx(likely[1], abs=5.0)
