@@ -1,7 +1,6 @@
 """Commands as users give them, and what they leave."""
 
-from __future__ import annotations
-
+import csv
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +28,12 @@ def content(folder: Path) -> dict[str, bytes]:
     """Of all files but the lock, which nobody holds once its process is killed."""
     found = (path for path in folder.rglob("*") if path.is_file() and path.name != LOCK)
     return {str(path.relative_to(folder)): path.read_bytes() for path in found}
+
+
+def table_of(path: Path) -> list[dict[str, str]]:
+    """The rows of a CSV file."""
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def posterior_of(folder: Path) -> xr.DataTree:

@@ -1,7 +1,5 @@
 """Small experiments that the tests share: what was built once is there for all."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Writing FITS files of images as luseepy does, for tests of their readers."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -16,15 +16,9 @@ FLIGHT_ORDER += [f"{i}{j}{part}" for i in range(4) for j in range(i + 1, 4) for 
 def naive_gain(folder, level, port, seen, mhz):
     """luseepy's recipe, of its files, for one spectrum."""
     adc = seen["SPE_ADC0_T" if port < 2 else "SPE_ADC1_T"]
-    values = {
-        "1": 1.0,
-        **seen,
-        "THERM_FPGA*THERM_FPGA": seen["THERM_FPGA"] ** 2,
-        "SPE_ADC0_T*SPE_ADC0_T": adc**2,
-        "SPE_ADC1_T*SPE_ADC1_T": adc**2,
-        "THERM_FPGA*SPE_ADC0_T": seen["THERM_FPGA"] * adc,
-        "THERM_FPGA*SPE_ADC1_T": seen["THERM_FPGA"] * adc,
-    }
+    values = {"1": 1.0, **seen, "THERM_FPGA*THERM_FPGA": seen["THERM_FPGA"] ** 2}
+    for own in ("SPE_ADC0_T", "SPE_ADC1_T"):
+        values |= {f"{own}*{own}": adc**2, f"THERM_FPGA*{own}": seen["THERM_FPGA"] * adc}
     name, q = f"{level}{port}", {"PC1": 0.0, "PC2": 0.0}
     with (folder / "alpha_refit.csv").open() as file:
         for row in csv.DictReader(file):

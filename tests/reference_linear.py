@@ -8,8 +8,6 @@ Nothing here imports lusee_bayes. With K = A S A^T + N,
 cases in which float64 loses the answer.
 """
 
-from __future__ import annotations
-
 from decimal import Decimal, localcontext
 from typing import NamedTuple
 

@@ -17,10 +17,10 @@ import gc
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from importlib.util import find_spec
 from pathlib import Path
 from threading import RLock
@@ -160,7 +160,8 @@ class Engine(ABC):
         Raises
         ------
         Exception
-            The first that a task raises; those that wait are not begun.
+            That of the first task, in their order, that raises one; those that wait then are not
+            begun.
         WorkersLost
             If a task cannot be carried out because its workers fail.
         """
@@ -224,24 +225,17 @@ class ThisProcess(Engine):
 
     @contextmanager
     def _results(self, tasks: Tasks[T, R], stages: Stages, stage: str) -> Iterator[Iterator[R]]:
-        """What the function gives, in the order of the items, as soon as it is there."""
+        """What the function gives, in the order of the items."""
         n_threads = max(1, min(self.side_by_side, len(tasks.items)))
         with stages.progress(stage, len(tasks.items)) as done, threads(n_threads) as pool:
-            numbers = {
-                pool.submit(carry_out, tasks.function, item): number
-                for number, item in enumerate(tasks.items)
-            }
+            given = pool.map(partial(carry_out, tasks.function), tasks.items)
 
             def in_order() -> Iterator[R]:
-                early: dict[int, R] = {}
-                given = 0
-                for finished, future in enumerate(as_completed(numbers), start=1):
-                    number = numbers.pop(future)
-                    early[number] = future.result()
-                    done(finished, tasks.names[number])
-                    while given in early:
-                        yield early.pop(given)
-                        given += 1
+                for number, name in enumerate(tasks.names, start=1):
+                    # a list that is emptied: what was given is not kept here
+                    result = [next(given)]
+                    done(number, name)
+                    yield result.pop()
 
             try:
                 yield in_order()

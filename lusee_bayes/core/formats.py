@@ -100,7 +100,7 @@ VISIBILITIES = "lusee_bayes visibilities 1"
 POSTERIOR = "lusee_bayes posterior 2"
 SAMPLES = "lusee_bayes samples 1"
 BEAMS = "lusee_bayes beams 1"
-GAINS = "lusee_bayes gains 2"
+GAINS = "lusee_bayes gains 1"
 REDUCED = "lusee_bayes reduced spectra 2"
 DIAGNOSTICS = "lusee_bayes diagnostics 3"
 CHANNEL = "lusee_bayes unfinished channel 1"
@@ -133,9 +133,34 @@ def format_of(path: str | Path) -> str | None:
 CF = "CF-1.13"
 
 
+# dimensions that are the pixels of a HEALPix map in RING order
+HEALPIX = ("pixel", "pixels", "region")
+
+
 def header(format_: str) -> dict[str, str]:
     """Attributes of a file of the package: its format, conventions and version."""
     return {"Conventions": CF, "format": format_, "lusee_bayes_version": __version__}
+
+
+def with_grid(dataset: xr.Dataset) -> xr.Dataset:
+    """The same with the grid of all arrays in pixels, of whole maps, as CF 1.13 has it."""
+    for dim in {*HEALPIX} & {*dataset.dims}:
+        n = dataset.sizes[dim]
+        grid, index = f"{dim}_grid", f"{dim}_index"
+        for variable in dataset.variables.values():
+            if dim in variable.dims:
+                variable.attrs["grid_mapping"] = grid
+        mapping = {
+            "grid_mapping_name": "healpix",
+            "indexing_scheme": "ring",
+            "refinement_level": round(np.log2(n / 12) / 2),
+        }
+        indices = {"standard_name": "healpix_index", "units": "1"}
+        packed = {"zlib": True, "shuffle": True}
+        dataset = dataset.assign_coords(
+            {index: (dim, np.arange(n, dtype=np.int32), indices, packed)}
+        ).assign({grid: ((), np.int8(0), mapping)})
+    return dataset
 
 
 # what the CF conventions call times, and what bounds may leave to the variable that they bound
@@ -208,17 +233,16 @@ def as_dataset(
         Attributes, likewise; ``variable.attribute`` is one of a variable.
     """
     variables = {}
-    for name, array in arrays.items():
+    for name in (name for name, array in arrays.items() if array is not None):
         declared = layout.variables[name]
-        units = {"units": declared.unit} if declared.unit else {}
-        if array is not None:
-            variables[name] = (tuple(map(str, declared.dims)), array, units)
+        units = {"units": declared.unit or "1"} if declared.kind == "real" else {}
+        variables[name] = (tuple(map(str, declared.dims)), arrays[name], units)
     dataset = xr.Dataset(variables, attrs=header(format_))
     for name, value in values.items():
         variable, _, attribute = name.rpartition(".")
         if value is not None:
             (dataset[variable] if variable else dataset).attrs[attribute] = value
-    return dataset
+    return with_grid(dataset)
 
 
 def require_format(path: str | Path, format_: str, what: str, hint: str = "") -> Path:
@@ -328,11 +352,8 @@ def read_fits(path: str | Path, layout: Layout, hint: str = "") -> Content:
         arrays: dict[str, Any] = {}
         words = hdus[0].header
         declared = {name.lower(): name for name in (*layout.variables, *layout.attributes)}
-        said = {
-            declared.get(key.lower(), key): words[key]
-            for key in words
-            if key and not key.startswith(STRUCTURE)
-        }
+        keys = [key for key in words if key and not key.startswith(STRUCTURE)]
+        said = {declared.get(key.lower(), key): words[key] for key in keys}
 
         def put(name: str, array: Any, unit: str | None) -> None:
             name = declared.get(name.lower(), name.lower())

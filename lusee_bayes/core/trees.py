@@ -6,7 +6,7 @@ dataclasses with arrays are groups, and tuples of dataclasses of numbers and tex
 Whatever else JSON holds, other dataclasses too, is an attribute in JSON.
 
 Arrays say their unit and what they are with :func:`quantity`, as the CF conventions have it. Those
-on one of the dimensions :data:`HEALPIX` have the grid mapping of HEALPix of CF 1.13: a variable
+on one of the dimensions :data:`.HEALPIX` have the grid mapping of HEALPix of CF 1.13: a variable
 that names grid and order, and the index of every pixel.
 
 Files are written with xarray, and read with h5py, which takes a tenth of the time.
@@ -29,7 +29,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing, user_path
-from lusee_bayes.core.formats import header, require_format
+from lusee_bayes.core.formats import header, require_format, with_grid
 from lusee_bayes.core.layouts import Attribute, Layout, Unloaded, Unread, Variable
 from lusee_bayes.core.lazy import pandas as pd
 from lusee_bayes.core.lazy import xarray as xr
@@ -44,9 +44,6 @@ NUMBERS = {int: "integer", float: "real", bool: "boolean"}
 # what an array is declared as by the kind of its dtype, and how one that may have any numbers is
 KINDS = {"f": "real", "c": "complex", "i": "integer", "u": "integer", "b": "boolean", "U": "text"}
 ANY = {"missing": True, "low": -np.inf, "high": np.inf}
-GAPS = {"kind": "real"}
-# dimensions that are the pixels of a HEALPix map in RING order
-HEALPIX = ("pixel", "pixels", "region")
 # how netCDF marks arrays in HDF5 that stand for a dimension alone
 DIMENSION = b"This is a netCDF dimension but not a netCDF variable"
 
@@ -56,6 +53,7 @@ def quantity(
     long_name: str = "",
     *,
     checks: Mapping[str, Any] | None = None,
+    attributes: Mapping[str, Any] | None = None,
     packed: bool = False,
     **options: Any,
 ) -> Any:
@@ -70,13 +68,15 @@ def quantity(
     checks : mapping, optional
         What a file is checked for, as of :class:`.Variable`: ``low``, ``grows`` and others. By
         default there may be any numbers.
+    attributes : mapping, optional
+        Further ones of CF's, such as ``flag_meanings``.
     packed : bool
         Compress it in files.
     **options
         As of ``dataclasses.field``.
     """
     said = {"units": units, "long_name": long_name}
-    attributes = {name: words for name, words in said.items() if words}
+    attributes = {name: words for name, words in said.items() if words} | dict(attributes or {})
     encoding = {"zlib": True, "complevel": 1} if packed else {}
     metadata = {"attributes": attributes, "checks": checks or ANY, "encoding": encoding}
     return field(metadata=metadata, **options)
@@ -160,27 +160,6 @@ def write_tree(
     return user_path(path)
 
 
-def with_grid(dataset: xr.Dataset) -> xr.Dataset:
-    """The same with the grid of all arrays in pixels, of whole maps, as CF 1.13 has it."""
-    for dim in {*HEALPIX} & {*dataset.dims}:
-        n = dataset.sizes[dim]
-        grid, index = f"{dim}_grid", f"{dim}_index"
-        for variable in dataset.variables.values():
-            if dim in variable.dims:
-                variable.attrs["grid_mapping"] = grid
-        mapping = {
-            "grid_mapping_name": "healpix",
-            "indexing_scheme": "ring",
-            "refinement_level": round(np.log2(n / 12) / 2),
-        }
-        indices = {"standard_name": "healpix_index", "units": "1"}
-        packed = {"zlib": True, "shuffle": True}
-        dataset = dataset.assign_coords(
-            {index: (dim, np.arange(n, dtype=np.int32), indices, packed)}
-        ).assign({grid: ((), np.int8(0), mapping)})
-    return dataset
-
-
 class StoredTree:
     """A group of a netCDF file that is open, with what :func:`from_tree` looks at in a tree.
 
@@ -262,10 +241,9 @@ def from_tree(kind: type[T], tree: xr.DataTree | StoredTree, where: str) -> T:
     """
     kinds, found = _fields(kind), dict[str, Any]()
     empty = _json(where, tree.attrs.get(EMPTY, "{}"))
-    arrays, values = (
-        {n: k.declared for n, k in kinds.items() if k.declared and n not in empty and of(k)}
-        for of in (lambda k: k.what == "array", lambda k: k.what != "array")
-    )
+    said = {n: k for n, k in kinds.items() if k.declared is not None and n not in empty}
+    arrays = {name: one.declared for name, one in said.items() if one.what == "array"}
+    values = {name: one.declared for name, one in said.items() if one.what != "array"}
     content = Layout(kind.__name__, arrays, values).checked(where, tree.variables, tree.attrs)
     for name, one in kinds.items():
         place = f"{where}: {name}"
@@ -365,9 +343,10 @@ def _rows(kind: type[T], tree: xr.DataTree | StoredTree, where: str) -> Iterator
     if not tree.variables:
         return
     kinds = _fields(kind)
+    # gaps make whole numbers real
+    as_real = {name: {"kind": "real"} if one.optional else {} for name, one in kinds.items()}
     columns = {
-        # gaps make whole numbers real
-        name: replace(one.declared, dims=("row",), optional=False, **(GAPS if one.optional else {}))
+        name: replace(one.declared, dims=("row",), optional=False, **as_real[name])
         for name, one in kinds.items()
     }
     found = Layout(kind.__name__, columns).checked(where, tree.variables, {}).arrays

@@ -53,7 +53,7 @@ class GainModel:
         Frequencies, growing.
     mean : (levels, ports, anchors) array
         Counts for 1 nV^2/Hz.
-    component : (levels, ports, components, anchors) array
+    components : (levels, ports, components, anchors) array
         v_r, in the same unit.
     coefficient : (levels, ports, components, terms) array
         c_rk, in the order of phi.
@@ -68,13 +68,13 @@ class GainModel:
         "MHz", "frequencies of the gains", checks={"low": 0.0, "unit": "MHz"}
     )
     mean: Float[np.ndarray, "level port anchor"] = quantity(COUNTS, "mean gains", checks={})
-    component: Float[np.ndarray, "level port part anchor"] = quantity(
+    components: Float[np.ndarray, "level port component anchor"] = quantity(
         COUNTS, "components of gains", checks={}
     )
-    coefficient: Float[np.ndarray, "level port part term"] = quantity(
+    coefficient: Float[np.ndarray, "level port component term"] = quantity(
         "1", "strengths of components for telemetry", checks={}
     )
-    component_std: Float[np.ndarray, "level port part"] | None = quantity(
+    component_std: Float[np.ndarray, "level port component"] | None = quantity(
         "1", "errors of the strengths", checks={"low": 0.0}, default=None
     )
     kind: str = "made"
@@ -82,7 +82,7 @@ class GainModel:
     def __post_init__(self):
         require_shape(f"{self.path}: mean", self.mean, (len(LETTERS), PORTS, None))
         *lead, anchors = self.mean.shape
-        shapes = {"anchor_mhz": [anchors], "component": [N_COMPONENTS, anchors]}
+        shapes = {"anchor_mhz": [anchors], "components": [N_COMPONENTS, anchors]}
         for name, shape in (shapes | {"coefficient": [N_COMPONENTS, N_TERMS]}).items():
             require_shape(f"{self.path}: {name}", getattr(self, name), (*lead, *shape))
         if not (np.diff(self.anchor_mhz, axis=2) > 0.0).all():
@@ -95,7 +95,7 @@ class GainModel:
         return {
             (level, port): interpolate.CubicSpline(
                 self.anchor_mhz[level, port],
-                np.vstack([self.mean[level, port], self.component[level, port]]).T,
+                np.vstack([self.mean[level, port], self.components[level, port]]).T,
                 extrapolate=False,
             )
             for level in range(len(LETTERS))
@@ -135,7 +135,7 @@ class GainModel:
                 f"{self.path} says by how much its components may be off, and so does "
                 "flight.component_std; leave that out"
             )
-        return replace(self, component_std=np.broadcast_to(std, self.component.shape[:3]).copy())
+        return replace(self, component_std=np.broadcast_to(std, self.components.shape[:3]).copy())
 
     def strengths(
         self, level: str, port: int, telemetry: Mapping[str, Float[np.ndarray, " rows"]]
@@ -306,7 +306,8 @@ def read_gain_table(path: str | Path, model: str = "quadratic") -> GainModel:
     if path.is_dir():
         return _read_folder(path, model)
     with opened_tree(path, formats.GAINS, "a gain table", HINT) as tree:
-        return replace(from_tree(GainModel, tree, str(path)), path=str(path), kind="netCDF")
+        tree.attrs.update(path=str(path), kind="netCDF")
+        return from_tree(GainModel, tree, str(path))
 
 
 def write_gain_table(path: str | Path, table: GainModel) -> Path:

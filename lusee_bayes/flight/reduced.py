@@ -426,7 +426,13 @@ class _Saved:
     live_s: Float[np.ndarray, " spectrum"] | None = quantity("s", checks={"low": 0.0})
     turntable_deg: Float[np.ndarray, " state"] = quantity("degree", checks={})
     reason: UInt8[np.ndarray, "frequency spectrum"] = quantity(
-        "1", ", ".join(REASONS), checks={"low": 0.0, "high": len(REASONS) - 1.0}, packed=True
+        "1",
+        checks={"low": 0.0, "high": len(REASONS) - 1.0},
+        attributes={
+            "flag_values": np.arange(len(REASONS), dtype=np.uint8),
+            "flag_meanings": " ".join(reason.replace(" ", "_") for reason in REASONS),
+        },
+        packed=True,
     )
     line_share: Float32[np.ndarray, "frequency spectrum"] = quantity(
         "1", "flagged channels", checks=SHARE, packed=True

@@ -218,13 +218,11 @@ def averaged(data: Visibilities, to_s: float) -> Visibilities:
         nothing is left.
     """
     require_positive("the time to average over, in seconds,", to_s)
-    observation = data.observation
-    windows = observation.windows
+    observation, windows = data.observation, data.observation.windows
     if windows is None:
         raise InputError(
-            "the samples are instants, which have no mean over a time; average samples with "
-            "windows (observation.window=mean in a simulation, observation.timestamp for data "
-            "whose file does not say what its times are)"
+            "the samples are instants, which have no mean over a time; give samples with windows "
+            "(observation.window=mean in a simulation, observation.timestamp for other data)"
         )
     if to_s < observation.step_s - ROUNDING_S:
         raise InputError(
@@ -237,8 +235,8 @@ def averaged(data: Visibilities, to_s: float) -> Visibilities:
     left = np.flatnonzero(used)
     if not left.size:
         raise InputError(
-            f"nothing is left of the data in bins of {to_s:g} s: in none of them do the products "
-            "have samples in common; average over less"
+            f"nothing is left of the data in bins of {to_s:g} s, in which products have no samples "
+            "in common; average over less"
         )
     # bins of which something remains, counted anew
     bins, bin_of_left = np.unique(bin_of[left], return_inverse=True)
@@ -246,12 +244,9 @@ def averaged(data: Visibilities, to_s: float) -> Visibilities:
     grid = np.asarray(data.layout.scatter(data.data))[:, left] * weight
     first = np.searchsorted(bin_of_left, np.arange(len(bins)))
     layout = DataLayout.from_flags(~kept[:, bins])
-    return replace(
-        data,
-        data=layout.gather(np.add.reduceat(grid, first, axis=1)),
-        layout=layout,
-        observation=binned(observation, left, bin_of_left, to_s),
-    )
+    means = layout.gather(np.add.reduceat(grid, first, axis=1))
+    seen = binned(observation, left, bin_of_left, to_s)
+    return replace(data, data=means, layout=layout, observation=seen)
 
 
 def product_live_s(data: Visibilities) -> float:
@@ -343,12 +338,12 @@ def binned(
     offset = seconds[windows.sample]
     start, end = windows.start_s + offset, windows.end_s + offset
     bin_of_piece, share = bin_of_left[windows.sample], windows.live_s / (end - start)
-    gap = start[1:] - end[:-1]
     # the live time that the piece would have with the share of the one before
     differ = np.abs(np.diff(share)) * (end - start)[1:]
-    merged = (np.diff(bin_of_piece) == 0) & (gap <= ROUNDING_S) & (differ <= ROUNDING_S)
-    opens = np.append(True, ~merged)
-    at = np.flatnonzero(opens)
+    merged = (
+        (np.diff(bin_of_piece) == 0) & (start[1:] - end[:-1] <= ROUNDING_S) & (differ <= ROUNDING_S)
+    )
+    at = np.flatnonzero(np.append(True, ~merged))
     start, bin_of_piece = start[at], bin_of_piece[at]
     end = end[np.append(at[1:], len(end)) - 1]
     # pieces touch up to rounding
@@ -356,12 +351,6 @@ def binned(
     begin = np.searchsorted(bin_of_piece, np.arange(len(first)))
     last = np.append(begin[1:], len(start)) - 1
     middle = (start[begin] + end[last]) / 2.0
-    times = later(here.times[first], middle - seconds[first])
-    offset = middle[bin_of_piece]
-    return replace(
-        here,
-        times=times,
-        run=here.run[first],
-        step_s=to_s,
-        windows=Windows(bin_of_piece, start - offset, end - offset, live),
-    )
+    times, offset = later(here.times[first], middle - seconds[first]), middle[bin_of_piece]
+    windows = Windows(bin_of_piece, start - offset, end - offset, live)
+    return replace(here, times=times, run=here.run[first], step_s=to_s, windows=windows)

@@ -16,13 +16,9 @@ Time enters only through exp(i m phi) and the slow scalars u_j, beams only throu
 A with a vector never forms A, and nothing in it but the last sum grows with the number of times.
 
 **A as a linear function of the beams**, for fixed orientations and beams that change
-(:class:`BeamOperator`): row t of product k is b_k R(t), with R(t) block diagonal in ell: one
+(:class:`Instrument`): row t of product k is b_k R(t), with R(t) block diagonal in ell: one
 rotation matrix for each ell and sample, computed once. Then A costs 16 products with (2 ell + 1)^2
 numbers per ell and sample, and derivatives cost no more.
-
-**Sources** that are much smaller than the antennas' resolution need no harmonic expansion
-(:func:`source_response`): one of x K sr in the direction n(t), in the frame of the antennas, gives
-V_k(t) = x B_k(n(t)). It rises and sets sharply, and it may move.
 """
 
 from __future__ import annotations
@@ -37,13 +33,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lusee_bayes.core.arrays import Array, DataVector, Modes, compiled, namespace
-from lusee_bayes.core.checks import (
-    Described,
-    is_traced,
-    require_array,
-    require_float64,
-    require_shape,
-)
+from lusee_bayes.core.checks import Described, require_array, require_float64, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import (
     lmax_of,
@@ -54,14 +44,7 @@ from lusee_bayes.core.harmonics import (
     turn_about_z,
 )
 from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.beams.monopoles import (
-    Frequency,
-    Monopoles,
-    beams_towards,
-    monopole_beams,
-    parameter,
-    with_values,
-)
+from lusee_bayes.instrument.beams.monopoles import Monopoles, monopole_beams, parameter, with_values
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout
@@ -69,6 +52,7 @@ from lusee_bayes.instrument.products import DataLayout
 Matrix = Float[Array, "data unknowns"]
 ProductModes = Float[Array, "products modes"]
 BodyBeams = Float[Array, "runs products functions modes"]
+RowNumbers = Int[np.ndarray, " rows"]
 TimeModes = Float[Array, "products times modes"]
 # times whose data A^T d takes at once: it bounds the memory
 MOST_TIMES = 8192
@@ -356,8 +340,8 @@ class CouplingMatrix(Coupling):
         InputError
             If beams, pointing and layout differ in lmax, products or times.
         """
-        n_modes = sum(b.shape[0] for b in pointing.pole_from_galactic.blocks)
-        require_shape("the beam coefficients", beams.modes, (beams.n_products, n_modes))
+        size = n_modes(len(pointing.pole_from_galactic.blocks) - 1)
+        require_shape("the beam coefficients", beams.modes, (beams.n_products, size))
         if layout is None:
             layout = DataLayout(beams.n_products, pointing.n_times)
         if (layout.n_products, layout.n_times) != (beams.n_products, pointing.n_times):
@@ -441,9 +425,7 @@ class CouplingMatrix(Coupling):
             by_order=self.by_order + amplitude * direction.by_order,
         )
 
-    def rows(
-        self, product: Int[np.ndarray, " rows"], time: Int[np.ndarray, " rows"]
-    ) -> Float[Array, "rows modes"]:
+    def rows(self, product: RowNumbers, time: RowNumbers) -> Float[Array, "rows modes"]:
         """Compute chosen rows of A, flagged or not, without the response.
 
         Parameters
@@ -601,78 +583,36 @@ def _pairs(modes: Float[Array, "*batch modes"], lmax: int) -> Float[Array, "*bat
 
 # unit beams that are rotated at once
 CHUNK = 64
+Rotations = tuple[Float[Array, "_ times _"], ...]
 
 
-class BeamOperator(eqx.Module):
-    """R(t) of every sample, which rotates beams into Galactic coordinates, up to one lmax.
+def rotations_of(pointing: Pointing) -> Rotations:
+    """Compute R(t) of all samples, which rotates beams into Galactic coordinates.
 
-    Attributes
+    It takes 8 (lmax + 1)^3 4 / 3 bytes a sample: 54 MB for a month at lmax 24.
+
+    Parameters
     ----------
-    blocks : tuple of (2 ell + 1, times, 2 ell + 1) arrays
-        R(t) for every ell: topocentric orders first, Galactic orders last.
-    layout : DataLayout
-        The product and the time of every row of A.
+    pointing : Pointing
+        The orientations at every sample.
+
+    Returns
+    -------
+    tuple of (2 ell + 1, times, 2 ell + 1) arrays
+        For every ell up to the lmax of ``pointing``: topocentric orders first, Galactic orders
+        last.
     """
-
-    blocks: tuple[Float[Array, "_ times _"], ...]
-    layout: DataLayout
-
-    @classmethod
-    def of(cls, pointing: Pointing, layout: DataLayout) -> BeamOperator:
-        """Compute R(t) of all samples.
-
-        It takes 8 (lmax + 1)^3 4 / 3 bytes a sample: 54 MB for a month at lmax 24.
-
-        Parameters
-        ----------
-        pointing : Pointing
-            The orientations at every sample.
-        layout : DataLayout
-            Leaves out missing samples.
-
-        Returns
-        -------
-        BeamOperator
-            Up to the lmax of ``pointing``.
-        """
-        lmax = len(pointing.pole_from_galactic.blocks) - 1
-        size = n_modes(lmax)
-        blocks: list[list[Array]] = [[] for _ in range(lmax + 1)]
-        for start in range(0, size, CHUNK):
-            unit = jnp.eye(CHUNK, size, start)
-            rows = _turned(unit, pointing)
-            for ell in range(lmax + 1):
-                first, end = max(start, ell**2), min(start + CHUNK, (ell + 1) ** 2)
-                if first < end:
-                    inside = rows[first - start : end - start, :, ell**2 : (ell + 1) ** 2]
-                    blocks[ell].append(inside)
-        return cls(tuple(jnp.concatenate(parts) for parts in blocks), layout)
-
-    def coupling(self, beams: ProductBeams) -> Matrix:
-        """Compute A as a matrix.
-
-        Parameters
-        ----------
-        beams : ProductBeams
-            Of all products, up to the operator's lmax.
-
-        Returns
-        -------
-        (data, modes) array
-            A of these beams.
-
-        Raises
-        ------
-        InputError
-            If the beams have another lmax.
-        """
-        lmax = len(self.blocks) - 1
-        require_shape("the beam coefficients", beams.modes, (None, n_modes(lmax)))
-        parts = [
-            jnp.einsum("km,mtn->ktn", beams.modes[:, ell**2 : (ell + 1) ** 2], block)
-            for ell, block in enumerate(self.blocks)
-        ]
-        return self.layout.gather(jnp.concatenate(parts, axis=2))
+    lmax = len(pointing.pole_from_galactic.blocks) - 1
+    size = n_modes(lmax)
+    blocks: list[list[Array]] = [[] for _ in range(lmax + 1)]
+    for start in range(0, size, CHUNK):
+        rows = _turned(jnp.eye(CHUNK, size, start), pointing)
+        for ell in range(lmax + 1):
+            first, end = max(start, ell**2), min(start + CHUNK, (ell + 1) ** 2)
+            if first < end:
+                inside = rows[first - start : end - start, :, ell**2 : (ell + 1) ** 2]
+                blocks[ell].append(inside)
+    return tuple(jnp.concatenate(parts) for parts in blocks)
 
 
 @eqx.filter_jit
@@ -700,8 +640,8 @@ class Instrument(eqx.Module):
         Highest ell of the beams and the sky.
     nodes : (int, int) or None
         Of the grid on which beams are computed; see ``monopole_beams``.
-    operator : BeamOperator or None
-        The rotations of all samples, computed by :meth:`prepared`.
+    rotations : tuple of array or None
+        :func:`rotations_of` all samples, computed by :meth:`prepared`.
     """
 
     monopoles: Monopoles
@@ -710,7 +650,7 @@ class Instrument(eqx.Module):
     frequency_mhz: float = eqx.field(static=True)
     lmax: int = eqx.field(static=True)
     nodes: tuple[int, int] | None = eqx.field(static=True, default=None)
-    operator: BeamOperator | None = None
+    rotations: Rotations | None = None
 
     def prepared(self) -> Instrument:
         """Compute the rotations of all samples, as :meth:`dense` needs them.
@@ -718,9 +658,9 @@ class Instrument(eqx.Module):
         Returns
         -------
         Instrument
-            The same with its operator.
+            The same with them.
         """
-        return replace(self, operator=BeamOperator.of(self.pointing, self.layout))
+        return replace(self, rotations=rotations_of(self.pointing))
 
     def value(self, name: str) -> Float[Array, ""]:
         """Look up the present value of a parameter.
@@ -781,9 +721,14 @@ class Instrument(eqx.Module):
         InputError
             If the instrument was not prepared, or there is no parameter of that name.
         """
-        if self.operator is None:
+        if self.rotations is None:
             raise InputError("prepare the instrument first: instrument = instrument.prepared()")
-        return self.operator.coupling(self.beams(values))
+        beams = self.beams(values).modes
+        rows = [
+            jnp.einsum("km,mtn->ktn", beams[:, ell**2 : (ell + 1) ** 2], block)
+            for ell, block in enumerate(self.rotations)
+        ]
+        return self.layout.gather(jnp.concatenate(rows, axis=2))
 
     def coupling_of(self, beams: ProductBeams) -> CouplingMatrix:
         """Compute A of given beams, or dA of a difference of beams.
@@ -804,52 +749,3 @@ class Instrument(eqx.Module):
             If the beams have another lmax or other products.
         """
         return CouplingMatrix.build(beams, self.pointing, self.layout)
-
-
-def source_response(
-    observation: Observation,
-    galactic: Float[np.ndarray, "..."],
-    frequency_mhz: Frequency,
-    monopoles: Monopoles | None = None,
-    *,
-    stokes_v: float | Float[Array, ""] = 0.0,
-) -> Float[Array, "products times"]:
-    """Return the visibilities of a source of 1 K sr at every sample.
-
-    V_k(t) = B_k^I(n(t)) + stokes_v B_k^V(n(t)), since I = 1 K sr and V = stokes_v I. Multiply by
-    the flux in K sr, constant or (times,). Differentiable in ``monopoles`` and ``stokes_v``.
-
-    Parameters
-    ----------
-    observation : Observation
-    galactic : (3,) or (times, 3) array
-        As of :meth:`.Observation.antenna_directions`.
-    frequency_mhz : float
-    monopoles : Monopoles, optional
-        By default the paper's antennas.
-    stokes_v : float
-        V / I with the IAU's sign. Where it is positive, a receiver that looks towards the source
-        sees the electric field turn counter-clockwise (right-handed).
-
-    Returns
-    -------
-    (products, times) array
-        In K; zero while the source is below the horizon.
-
-    Raises
-    ------
-    InputError
-        As :meth:`.Observation.antenna_directions`; for vectors whose length is not one, a frequency
-        that is not positive, or ``|stokes_v| > 1``.
-    """
-    if not is_traced(stokes_v) and not abs(stokes_v) <= 1.0:
-        raise InputError(
-            f"stokes_v is the fraction V / I, from -1 to 1, got {stokes_v}; no wave is polarised "
-            "by more than all of itself"
-        )
-    directions = observation.antenna_directions(galactic)
-    response = beams_towards(frequency_mhz, directions, monopoles)
-    if not is_traced(stokes_v) and stokes_v == 0.0:
-        return response
-    circular = beams_towards(frequency_mhz, directions, monopoles, stokes="V")
-    return response + stokes_v * circular

@@ -104,8 +104,7 @@ class Observation(Described):
         require_finite("tilt_deg", np.array(self.tilt_deg))
         if self.times.shape != self.run.shape or self.times.ndim != 1 or not self.times.size:
             raise InputError(
-                f"times {self.times.shape} and run {self.run.shape} must be two lists of the "
-                "same length, with at least one sample"
+                f"times {self.times.shape} and run {self.run.shape} must be lists of one length"
             )
         back = np.flatnonzero(~(seconds_from(self.times[:-1], self.times[1:]) > 0.0))
         if back.size:
@@ -117,8 +116,7 @@ class Observation(Described):
         last = self.n_runs - 1
         if not counts_up(self.run) or self.run[-1] != last:
             raise InputError(
-                f"run must count 0, 1, ... up to {last} (one number for each turntable angle) "
-                "without going back"
+                f"run must count 0, 1, ... up to {last}, one for each turntable angle, never back"
             )
         require_ephemeris(self.times.jd)
         if self.windows is None:

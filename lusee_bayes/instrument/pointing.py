@@ -29,7 +29,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation as SpatialRotation
 
-from lusee_bayes.core.arrays import Array, namespace
+from lusee_bayes.core.arrays import Array, Times, namespace
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import Rotation
 from lusee_bayes.instrument.averaging import sufficient_nodes, windowed
@@ -37,6 +37,7 @@ from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.schedule import CYCLE_DAYS
 from lusee_bayes.instrument.times import Windows, later
 
+Tilts = Float[np.ndarray, "times 2"]
 # bound on the relative error of a mode at lmax, and least order for any lmax
 TILT_TOLERANCE = 1e-7
 LEAST_ORDER = 2
@@ -183,9 +184,7 @@ def mean_pole_frame(mcmf: Float[np.ndarray, "times 3 3"]) -> Float[np.ndarray, "
     return np.array([x, np.cross(z, x), z])
 
 
-def split(
-    rotations: Float[np.ndarray, "times 3 3"],
-) -> tuple[Float[np.ndarray, " times"], Float[np.ndarray, "times 2"]]:
+def split(rotations: Float[np.ndarray, "times 3 3"]) -> tuple[Times, Tilts]:
     """Split rotations exactly: R = exp(ex K_x + ey K_y) exp(phi K_z).
 
     Parameters
@@ -210,7 +209,7 @@ def split(
     return np.arctan2(about_z[:, 1, 0], about_z[:, 0, 0]), tilt
 
 
-def sufficient_order(tilt: Float[np.ndarray, "times 2"], lmax: int) -> int:
+def sufficient_order(tilt: Tilts, lmax: int) -> int:
     """Return the lowest order of the expansion in the tilt whose error is negligible.
 
     This is the lowest n >= LEAST_ORDER with ``(lmax |tilt|)^(n+1) / (n+1)! < TILT_TOLERANCE``.
@@ -316,9 +315,7 @@ def with_offsets(observation: Observation, values: Values) -> Observation:
     )
 
 
-def turned_by_offsets(
-    pointing: Pointing, hours: Float[Array, " times"], values: Values
-) -> Pointing:
+def turned_by_offsets(pointing: Pointing, hours: Array, values: Values) -> Pointing:
     """Return the pointing that offsets make of another, differentiable in them.
 
     Parameters

@@ -30,6 +30,10 @@ from lusee_bayes.core.checks import Described, is_traced
 from lusee_bayes.core.errors import InputError, nearest
 
 N_ANTENNAS = 4
+Products = Float[Array, "products *rest"]
+Hermitian = Complex[Array, "antennas antennas *rest"]
+ByTime = Float[Array, "times products all_columns"]
+Columns = Float[Array, "data *columns"]
 
 
 class Product(NamedTuple):
@@ -81,7 +85,7 @@ def ports(n_antennas: int = N_ANTENNAS) -> tuple[np.ndarray, np.ndarray, np.ndar
     return np.array(i), np.array(j), np.array(part) == "I"
 
 
-def to_real(matrix: Complex[Array, "antennas antennas *rest"]) -> Float[Array, "products *rest"]:
+def to_real(matrix: Hermitian) -> Products:
     """Return the products of a Hermitian matrix V_ij (first two axes), in luseepy's order."""
     i, j, imaginary = ports(matrix.shape[0])
     picked = matrix[i, j]
@@ -89,9 +93,7 @@ def to_real(matrix: Complex[Array, "antennas antennas *rest"]) -> Float[Array, "
     return namespace(matrix).where(imaginary, picked.imag, picked.real)
 
 
-def to_matrix(
-    products: Float[Array, "products *rest"],
-) -> Complex[Array, "antennas antennas *rest"]:
+def to_matrix(products: Products) -> Hermitian:
     """Return the Hermitian matrix V_ij of real products; inverse of :func:`to_real`."""
     xp, n = namespace(products), antennas_of(products.shape[0])
     at = {label: products[k] for k, label in enumerate(labels(n))}
@@ -167,8 +169,7 @@ def real_products(data: Any, products: Any, flags: Any, convention: str, n_anten
     if data.shape[1] != len(ports_and_parts):
         turned = "; transpose them" if data.shape[0] == len(ports_and_parts) else ""
         raise InputError(
-            f"the data have shape {data.shape}, expected (times, products) with "
-            f"{len(ports_and_parts)} products{turned}"
+            f"the data have shape {data.shape}, expected (times, {len(ports_and_parts)}){turned}"
         )
     absent = np.isnan(data) | masked | _flags(flags, data.shape)
     if np.isinf(data[~absent]).any():
@@ -214,26 +215,18 @@ def _columns(products: Any, is_complex: bool, n_antennas: int) -> list[tuple[int
     for name in products:
         found = NAME.fullmatch(name if isinstance(name, str) else "".join(map(str, name)))
         if not found:
-            raise InputError(
-                f"unknown product '{name}'; name the two ports, such as "
-                + ("'01'" if is_complex else "'01R' and '01I'")
-            )
+            example = "'01'" if is_complex else "'01R' and '01I'"
+            raise InputError(f"unknown product '{name}'; name the two ports, such as {example}")
         i, j, part = int(found[1]), int(found[2]), found[3].upper()
         if max(i, j) >= n_antennas:
             raise InputError(
-                f"the product '{name}' has port {max(i, j)}, but there are {n_antennas} ports "
-                f"(0 to {n_antennas - 1}); give n_antennas if there are more"
+                f"the product '{name}' has port {max(i, j)}, of ports 0 to {n_antennas - 1}; "
+                "give n_antennas if there are more"
             )
         if is_complex and part:
-            raise InputError(
-                f"the data are complex and the product is named '{name}'; name the ports alone "
-                f"('{i}{j}'), or give real and imaginary parts as two real columns"
-            )
+            raise InputError(f"the data are complex; name the ports of '{name}' alone, '{i}{j}'")
         if not is_complex and not part and i != j:
-            raise InputError(
-                f"the data are real and the product is named '{name}'; name the part, '{name}R' "
-                f"or '{name}I'"
-            )
+            raise InputError(f"the data are real; name the part of '{name}', {name}R or {name}I")
         if i == j and part == "I":
             raise InputError(f"there is no product '{name}': an auto is real")
         columns.append((i, j, part if is_complex else part or "R"))
@@ -282,8 +275,7 @@ def site_of(site: Any) -> tuple[float, float]:
         lon, lat = (float(x) for x in site)
     except (TypeError, ValueError) as error:
         raise InputError(
-            f"the site is {site!r}; give selenographic longitude and latitude in degrees, or a "
-            f"name: {', '.join(SITES)}"
+            f"the site is {site!r}; give longitude and latitude in degrees, or {', '.join(SITES)}"
         ) from error
     return lon, lat
 
@@ -423,16 +415,12 @@ class DataLayout(Described, eqx.Module):
         flat = placed(flat, self.index, data)
         return flat.reshape(self.n_products, self.n_times, *rest)
 
-    def by_time(
-        self, data: Float[Array, "data *columns"]
-    ) -> Float[Array, "times products all_columns"]:
+    def by_time(self, data: Columns) -> ByTime:
         """Return d with the products of one time together; missing samples are zero."""
         grid = self.scatter(data)
         return grid.reshape(*grid.shape[:2], -1).swapaxes(0, 1)
 
-    def from_times(
-        self, grid: Float[Array, "times products all_columns"], shape: tuple[int, ...]
-    ) -> Float[Array, "data *columns"]:
+    def from_times(self, grid: ByTime, shape: tuple[int, ...]) -> Columns:
         """Return the array of this shape that :meth:`by_time` has made ``grid`` of."""
         return self.gather(grid.swapaxes(0, 1)).reshape(shape)
 

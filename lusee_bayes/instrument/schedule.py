@@ -95,14 +95,10 @@ class Interval:
                 f"end {self.end} does not come after start {self.start}; exchange them"
             )
         if not np.isfinite(self.turntable_deg):
-            raise InputError(
-                f"turntable_deg is {self.turntable_deg}; give an angle in degrees, positive "
-                "from East towards North"
-            )
+            raise InputError(f"turntable_deg is {self.turntable_deg}; give an angle in degrees")
         if not 0.0 < self.duty_cycle <= 1.0:
             raise InputError(
-                f"duty_cycle is {self.duty_cycle:g}; give the fraction of the time that is "
-                "integrated, above 0 and up to 1, and leave out intervals in which nothing is"
+                f"duty_cycle is {self.duty_cycle:g}; give the fraction integrated, above 0, up to 1"
             )
 
     @cached_property
@@ -164,8 +160,7 @@ def cut_runs(runs: Sequence[Run], step_s: float) -> list[Cut]:
         n = int(length // step_s)
         if n < 1:
             raise InputError(
-                f"run {number} of {run.cycles} cycles holds no sample of {step_s} s; "
-                "lengthen it or shorten step_s"
+                f"run {number} of {run.cycles} cycles holds no sample of {step_s} s; shorten step_s"
             )
         steps = np.full(n, float(step_s))
         cuts.append(Cut(elapsed + step_s * np.arange(n), steps, steps, run, f"run {number}"))
@@ -308,8 +303,7 @@ def _of_commands(path: str, text: str) -> tuple[Interval, ...]:
             )
     if entries and entries[-1][2] == OBSERVING:
         raise InputError(
-            f"{entries[-1][0]}: the last entry is in the mode {OBSERVING}, and nothing says when "
-            "it ends; add an entry of another mode"
+            f"{entries[-1][0]}: the last entry, {OBSERVING}, has no end; add one of another mode"
         )
     return tuple(
         Interval(_date(start), _date(end), where=place)

@@ -213,6 +213,8 @@ def counts_up(numbers: Int[np.ndarray, " n"]) -> bool:
 
 # times of a Julian date in two parts are exact to less than a nanosecond, others to a few of them
 ROUNDING_S = 1e-6
+# for people they are written to the millisecond
+EYE_S = 0.01
 
 
 @dataclass(frozen=True, repr=False)
@@ -316,9 +318,7 @@ class Windows(Described):
             next.
         """
         if self.n_samples != len(times):
-            raise InputError(
-                f"there are windows of {self.n_samples} samples for {len(times)} times"
-            )
+            raise InputError(f"windows of {self.n_samples} samples for {len(times)} times")
         bounds = self.bounds_s
         length = bounds[:, 1] - bounds[:, 0]
         if (length > step_s * (1.0 + 1e-9) + ROUNDING_S).any():
@@ -333,6 +333,25 @@ class Windows(Described):
             raise InputError(
                 f"the windows of samples {first} and {first + 1} ({times[first].isot[:19]}) "
                 f"overlap by {-gaps[first]:g} s; give each stretch of time to one sample"
+            )
+
+    def require_bounds(self, times: Time, bounds: Any) -> None:
+        """Check that windows of samples at these times have these bounds, which people read.
+
+        Raises
+        ------
+        InputError
+            If they differ by more than a hundredth of a second.
+        """
+        seconds = seconds_from(times[:, None], utc_bounds(bounds, len(times)))
+        if self.n_samples != len(times):
+            return  # an Observation says so
+        off = np.abs(seconds - self.bounds_s).max(axis=1)
+        if (off > EYE_S).any():
+            first = int(np.argmax(off > EYE_S))
+            raise InputError(
+                f"time_bounds and the pieces of sample {first} differ by {off[first]:g} s; change "
+                "both, or leave out the variables of the pieces"
             )
 
     def select(self, keep: Bool[np.ndarray, " samples"]) -> Windows:
@@ -373,74 +392,62 @@ TO_MIDDLE = {"start": 0.5, "middle": 0.0, "end": -0.5}
 ROUNDED_S, ROUNDED_SHARE = 1e-3, 1e-4
 
 
-def stamped(
-    times: Time, timestamp: str, step_s: float, live_s: Times | None = None
-) -> tuple[Time, Windows | None]:
-    """Return the middles and the windows of samples that last for a step each.
+def windows_of(
+    times: Time,
+    timestamp: str,
+    step_s: float | None = None,
+    live_s: Times | None = None,
+    bounds: Any = None,
+) -> tuple[Time, float, Windows | None]:
+    """Return the middles, the step and the windows of samples.
 
     Parameters
     ----------
     times : (times,) Time
+        With bounds, anywhere within the samples.
     timestamp : {"start", "middle", "end", "instant"}
-        What they are.
-    step_s : float
-        Length of the windows, in seconds.
+        What they are; without bounds samples last for a step each.
+    step_s : float, optional
+        From sample to sample, in seconds; by default the median.
     live_s : (times,) array, optional
-        What was integrated in them, in seconds; all of the time by default.
+        What was integrated, in seconds; all of the time by default.
+    bounds : (times, 2) array of any kind of times, optional
+        Start and end of each.
 
     Returns
     -------
     Time
         The middles; for instants the times as they are.
+    float
+        The step in seconds.
     Windows or None
         None for instants.
 
     Raises
     ------
     InputError
-        For another timestamp, for instants with live times, and as :class:`.Windows`.
+        For another timestamp, for instants with live times or bounds, for a time outside its
+        bounds, without a step for a single sample, and as :class:`.Windows`.
     """
+    if bounds is not None and timestamp != "instant":
+        return _bounded(times, utc_bounds(bounds, len(times)), step_s, live_s)
+    step_s = step_of(times, step_s)
     if timestamp == "instant":
-        if live_s is not None:
-            raise InputError(
-                "instants have no live time; say whether the times are the start, middle or end "
-                "of the samples, or leave out the live time"
-            )
-        return times, None
+        if live_s is not None or bounds is not None:
+            what = "live time" if bounds is None else "bounds"
+            raise InputError(f"instants have no {what}; leave it out, or give another timestamp")
+        return times, step_s, None
     if timestamp not in TO_MIDDLE:
-        raise InputError(
-            f"unknown timestamp '{timestamp}'; {nearest(timestamp, [*TO_MIDDLE, 'instant'])}"
-        )
+        known = [*TO_MIDDLE, "instant"]
+        raise InputError(f"unknown timestamp '{timestamp}'; {nearest(timestamp, known)}")
     ones = np.ones(len(times))
     start, end = (step_s * (TO_MIDDLE[timestamp] + side) * ones for side in (-0.5, 0.5))
     return _windowed(times, start, end, step_s, live_s)
 
 
-def bounded(
-    times: Time,
-    bounds: Time,
-    step_s: float | None = None,
-    live_s: Times | None = None,
+def _bounded(
+    times: Time, bounds: Time, step_s: float | None, live_s: Times | None
 ) -> tuple[Time, float, Windows]:
-    """Return the middles, the step and the windows of samples whose start and end are known.
-
-    Parameters
-    ----------
-    times : (times,) Time
-        Anywhere within the samples.
-    bounds : (times, 2) Time
-        Start and end of each.
-    step_s : float, optional
-        In seconds; by default the median step from sample to sample.
-    live_s : (times,) array, optional
-        What was integrated, in seconds; all of the time by default.
-
-    Raises
-    ------
-    InputError
-        For a time outside its bounds, without a step for a single sample, and as
-        :class:`.Windows`.
-    """
     start, end = (seconds_from(times, bounds[:, k]) for k in (0, 1))
     length = end - start
     step = step_of(times, float(length[0]) if step_s is None and len(times) == 1 else step_s)
@@ -455,8 +462,7 @@ def bounded(
         )
     if step_s is None and step < length.max() <= step + rounding:
         step = float(length.max())
-    middles, windows = _windowed(times, start, end, step, live_s)
-    return middles, step, windows
+    return _windowed(times, start, end, step, live_s)
 
 
 def utc_bounds(bounds: Any, n_times: int) -> Time:
@@ -477,9 +483,7 @@ def utc_bounds(bounds: Any, n_times: int) -> Time:
     """
     bounds = bounds if isinstance(bounds, Time) else np.asarray(bounds)
     if bounds.shape != (n_times, 2):
-        raise InputError(
-            f"bounds have shape {bounds.shape}, expected ({n_times}, 2): starts and ends"
-        )
+        raise InputError(f"bounds have shape {bounds.shape}, expected ({n_times}, 2)")
     with naming("bounds, taken row by row"):
         return utc_times(bounds).reshape(n_times, 2)
 
@@ -489,12 +493,8 @@ def _rounding(step_s: float) -> float:
 
 
 def _windowed(
-    times: Time,
-    start_s: Times,
-    end_s: Times,
-    step_s: float,
-    live_s: Times | None,
-) -> tuple[Time, Windows]:
+    times: Time, start_s: Times, end_s: Times, step_s: float, live_s: Times | None
+) -> tuple[Time, float, Windows]:
     """Middles of windows of one piece each, and these, with overlaps by rounding cut off."""
     middles, half = later(times, (start_s + end_s) / 2.0), (end_s - start_s) / 2.0
     overlap = end_s[:-1] - start_s[1:] - np.diff(seconds_from(times[0], times))
@@ -504,4 +504,4 @@ def _windowed(
         length = end_s - start_s
         rounded = (live_s > length) & (live_s <= length + _rounding(step_s))
         live_s = np.where(rounded, length, live_s)
-    return middles, Windows.whole(start_s, end_s, live_s)
+    return middles, step_s, Windows.whole(start_s, end_s, live_s)

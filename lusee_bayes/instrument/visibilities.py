@@ -52,18 +52,7 @@ from lusee_bayes.instrument.products import (
     runs_of,
     site_of,
 )
-from lusee_bayes.instrument.times import (
-    JD_SCALES,
-    Windows,
-    bounded,
-    later,
-    seconds_from,
-    stamped,
-    step_of,
-    utc_bounds,
-    utc_of_jd,
-    utc_times,
-)
+from lusee_bayes.instrument.times import JD_SCALES, Windows, later, utc_of_jd, utc_times, windows_of
 
 PIECES = ("piece_sample", "piece_start_s", "piece_end_s", "piece_live_s")
 # times for people are written to the millisecond
@@ -72,14 +61,13 @@ ENCODING = {
     "calendar": "proleptic_gregorian",
     "dtype": "int64",
 }
-EYE_S = 0.01
 
 
 def _datetimes(times: Time) -> np.ndarray:
     return times.isot.astype("datetime64[ms]")
 
 
-def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None, bool]:
+def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None]:
     """Return what a file says of the windows of its samples.
 
     Parameters
@@ -94,8 +82,6 @@ def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None, boo
     Time
         The middles of the windows; the times as they are where there are none.
     Windows or None
-    bool
-        Whether the file says what its times are.
 
     Raises
     ------
@@ -116,31 +102,18 @@ def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None, boo
     if not lost:
         windows = Windows(*(here[name] for name in PIECES))
         if "time_bounds" in here:
-            _require_same(windows, times, here["time_bounds"])
-        return times, windows, True
+            windows.require_bounds(times, here["time_bounds"])
+        return times, windows
     if "time_bounds" in here:
-        bounds, step_s = utc_bounds(here["time_bounds"], len(times)), found.values["step_s"]
-        middles, _, windows = bounded(times, bounds, step_s, here.get("live_time"))
-        return middles, windows, True
+        step_s, live_s = found.values["step_s"], here.get("live_time")
+        middles, _, windows = windows_of(times, "middle", step_s, live_s, here["time_bounds"])
+        return middles, windows
     if given or said == "mean":
         what = "live_time" if given else "the attribute window = 'mean'"
         raise InputError(
             f"there is {what}, but no time_bounds; add the start and the end of every sample"
         )
-    return times, None, said == "instant"
-
-
-def _require_same(windows: Windows, times: Time, there: np.ndarray) -> None:
-    seconds = seconds_from(times[:, None], utc_bounds(there, len(times)))
-    if windows.n_samples != len(times):
-        return  # an Observation says so
-    off = np.abs(seconds - windows.bounds_s).max(axis=1)
-    if (off > EYE_S).any():
-        first = int(np.argmax(off > EYE_S))
-        raise InputError(
-            f"time_bounds and the pieces of sample {first} differ by {off[first]:g} s; change "
-            "both, or leave out the variables of the pieces"
-        )
+    return times, None
 
 
 @dataclass(frozen=True)
@@ -312,13 +285,7 @@ class Visibilities(Described):
         lon_deg, lat_deg = site_of(site)
         run, angles = runs_of(turntable_deg, len(utc))
         live_s = None if live_s is None else numbers_of_times("live_s", live_s, len(utc))
-        if bounds is None:
-            step_s = step_of(utc, step_s)
-            middles, windows = stamped(utc, timestamp, step_s, live_s)
-        elif timestamp == "instant":
-            raise InputError("instants have no bounds; leave out bounds, or timestamp='instant'")
-        else:
-            middles, step_s, windows = bounded(utc, utc_bounds(bounds, len(utc)), step_s, live_s)
+        middles, step_s, windows = windows_of(utc, timestamp, step_s, live_s, bounds)
         observation = Observation(lon_deg, lat_deg, middles, run, angles, step_s, windows=windows)
         layout = DataLayout.from_flags(np.isnan(values))
         return cls(layout.gather(values), layout, observation, float(frequency_mhz))
@@ -376,7 +343,7 @@ class Visibilities(Described):
         observation = self.observation
         if observation.windows is not None:
             raise InputError("the data have windows, so that their times are the middles of these")
-        times, windows = stamped(observation.times, timestamp, observation.step_s)
+        times, _, windows = windows_of(observation.times, timestamp, observation.step_s)
         seen = replace(observation, times=times, windows=windows)
         return replace(self, observation=seen, says_window=True)
 
@@ -516,7 +483,8 @@ def read_visibilities(path: str | Path) -> Visibilities:
     with naming(path):
         layout = DataLayout.from_flags(flags)
         utc = utc_of_jd(found)
-        times, windows, says_window = read_windows(found, utc)
+        times, windows = read_windows(found, utc)
+        says_window = windows is not None or found.values.get("window") == "instant"
         seen, mhz = observation_of(found, times, windows), found.values["frequency_mhz"]
         receiver = receiver_of(path, here, "load_frequency_mhz", *LOADS)
         truth = here.get("truth")

@@ -52,8 +52,6 @@ from lusee_bayes.instrument.products import (
     DataLayout,
     all_products,
     in_order,
-    labels,
-    ports,
     to_matrix,
 )
 from lusee_bayes.instrument.times import (
@@ -534,7 +532,7 @@ def write_four_port(
         )
     enclosure = np.array([circuit.per_kelvin for circuit in circuits])
     root = np.sqrt(enclosure.diagonal(axis1=1, axis2=2).real)
-    i, j, _ = ports()
+    i, j = np.array([(p.i, p.j) for p in all_products()]).T
     data = _kelvin(path, channels) * (root[:, i] * root[:, j]).T
     condition = np.linalg.cond([c.antenna_ohm + c.load_ohm for c in circuits])
     eigenvalues = _eigenvalues(data)
@@ -565,7 +563,7 @@ def write_four_port(
     hdus = [hdu for image in images for hdu in _hdus(*image)]
     clock = {"TIMESYS": "UTC", "TIMEUNIT": "d", "CLOCKSRC": "supplied", "SCALEASM": False}
     hdus[2].header.update(TIMEFMT="JD1+JD2", **clock)
-    label = fits.Column("label", "8A", unit="1", array=labels())
+    label = fits.Column("label", "8A", unit="1", array=[p.label for p in all_products()])
     table = fits.Header([("EXTNAME", "products")])
     hdus.insert(3, fits.BinTableHDU.from_columns([label], header=table))
     header = {

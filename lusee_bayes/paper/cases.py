@@ -12,9 +12,8 @@ import xarray as xr
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.formats import says
+from lusee_bayes.core.formats import says, with_grid
 from lusee_bayes.core.reading import require_file
-from lusee_bayes.core.trees import with_grid
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.experiment import build
 from lusee_bayes.experiment.model import radiometer

@@ -1,16 +1,78 @@
-"""report.html: one file that says of a run what a person wants to know of it."""
+"""report.html, one file that says of a run what a person wants to know of it, and comparisons."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.files import read_manifest, recover, replacing
-from lusee_bayes.report.comparison_page import priors_page
+from lusee_bayes.core.files import read_manifest, recover, replacing, require_files
+from lusee_bayes.core.layouts import Layout, Variable
+from lusee_bayes.core.reading import read_model, read_table
+from lusee_bayes.judge.convergence import FAR, FEW, warnings_of
 from lusee_bayes.report.map_page import map_page
-from lusee_bayes.report.sample_page import sample_page
+from lusee_bayes.report.rendering import render, render_run
+from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows, evidence_caveat
+from lusee_bayes.results.prior_comparison import PriorsSummary, prior_table
+from lusee_bayes.results.summaries import SamplingSummary, ValidationSummary
+
+ROWS = ("quantity",)
+SUMMARY_TABLE = Layout(
+    "a summary of draws",
+    {
+        "quantity": Variable(ROWS, "text"),
+        "mean": Variable(ROWS, finite=False),
+        "sd": Variable(ROWS, finite=False),
+        "r_hat": Variable(ROWS, missing=True),
+    },
+)
+
+
+def sample_page(folder: Path, name: str) -> str:
+    """The page as text, of the folder and the name of a run. InputError as :func:`.map_page`."""
+    require_files(folder, ("summary.csv", "sampling.json", "scenario.yaml"), "sample")
+    path, validation = folder / "sampling.json", folder / "validation.json"
+    sampling = read_model(path, SamplingSummary, "the figures of a sampled run")
+    quantities = read_table(folder / "summary.csv", SUMMARY_TABLE)
+    worst = float(np.nanmax(quantities["r_hat"], initial=-np.inf))
+    many, counts = FEW * sampling.chains * sampling.draws, {"divergences", "chains"}
+    checks = None
+    if validation.is_file():
+        checks = read_model(validation, ValidationSummary, "the checks of a validation").checks
+    return render_run(
+        "sample.html",
+        path,
+        sampling.model_dump(),
+        name=name,
+        quantities=quantities,
+        worst=worst if np.isfinite(worst) else None,
+        reasons=warnings_of(quantities, **sampling.model_dump(include=counts)),
+        bad=worst > FAR or sampling.divergences > many,
+        checks=checks,
+        failed=[not check.passed for check in checks or ()],
+    )
+
+
+def comparison_page(runs: Sequence[FinishedRun], folder: Path) -> str:
+    """The page as text; ``folder`` has the figures maps and curves."""
+    pairs = zip(comparison_rows(runs), runs, strict=True)
+    rows = [row | {"ell_cross": run.cross_in_words()} for row, run in pairs]
+    return render("comparison.html", folder, runs=runs, rows=rows, caveat=evidence_caveat(runs))
+
+
+def priors_page(folder: Path, name: str) -> str:
+    """The page as text, of the folder and the name of a run. InputError as :func:`.map_page`."""
+    require_files(folder, ("priors.json", "scenario.yaml", "figures/priors.png"), "compare-priors")
+    path = folder / "priors.json"
+    found = read_model(path, PriorsSummary, "a comparison of priors")
+    header, rows = prior_table(found.priors)
+    words = [(one.name, one.prior) for one in found.priors]
+    shown = {"header": header, "rows": rows, "words": words, "notes": found.notes}
+    return render_run("priors.html", path, found.model_dump(), name=name, **shown)
+
 
 REPORT = "report.html"
 # by the kind of run: the page as text, of a folder and the run's name

@@ -239,28 +239,25 @@ def _difference(first: FinishedRun, run: FinishedRun) -> str | None:
     return "has other values at the same times (another file, noise, sky or seed)"
 
 
+# figures of channels that are set side by side
+COMPARED = (
+    *("frequency_mhz", "n_data", "ell_cross", "resolution_deg", "information_bits"),
+    *("log_evidence", "chi2", "chi2_expected"),
+)
+
+
 def comparison_rows(runs: Sequence[FinishedRun]) -> list[dict[str, object]]:
     """One row for each run: the figures that say which map is better.
 
     The difference of ln evidence is None where data differ.
     """
-    keys = (
-        "frequency_mhz",
-        "n_data",
-        "ell_cross",
-        "resolution_deg",
-        "information_bits",
-        "log_evidence",
-        "chi2",
-        "chi2_expected",
-    )
     best = max(run.channel.log_evidence for run in runs)
     comparable = evidence_caveat(runs) is None
     return [
         {
             "run": run.name,
             "level": run.summary.level,
-            **{key: getattr(run.channel, key) for key in keys},
+            **{key: getattr(run.channel, key) for key in COMPARED},
             "log_evidence_less_best": run.channel.log_evidence - best if comparable else None,
             "instrument_p": run.channel.instrument.p,
             "prior_p": run.channel.judged.prior.p,

@@ -105,7 +105,7 @@ def forecast_rows(forecasts: Sequence[Forecast]) -> list[dict[str, object]]:
     """Rows of plan.csv; ``difference_bits`` is that to the same source's first variation."""
     rows = []
     for row in forecasts:
-        it = row.variation
+        it, resolution = row.variation, row.resolution_deg
         more = row.information_bits - baseline(forecasts, it.source).information_bits
         rows.append(
             {
@@ -118,9 +118,7 @@ def forecast_rows(forecasts: Sequence[Forecast]) -> list[dict[str, object]]:
                 "difference_bits": f"{more:.2f}",
                 "modes_snr_above_1": row.modes,
                 "ell_cross": "none" if row.ell_cross is None else row.ell_cross,
-                "resolution_deg": "none"
-                if row.resolution_deg is None
-                else f"{row.resolution_deg:.2f}",
+                "resolution_deg": "none" if resolution is None else f"{resolution:.2f}",
                 "clock_and_pointing": row.offsets_line().replace(",", ";"),
             }
         )

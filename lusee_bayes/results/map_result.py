@@ -6,7 +6,6 @@ maps.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from textwrap import wrap
@@ -29,13 +28,7 @@ from lusee_bayes.judge.chi2 import RULE, ChiSquare, Fit
 from lusee_bayes.judge.cube_fit import ChannelFits
 from lusee_bayes.linear.positive_joint import PositiveMode
 from lusee_bayes.results.channel import ChannelResult
-from lusee_bayes.results.summaries import (
-    ChannelSummary,
-    JointSummary,
-    JointTestSummary,
-    MapSummary,
-    PullSummary,
-)
+from lusee_bayes.results.summaries import JointSummary, MapSummary, PullSummary
 from lusee_bayes.sky.galaxy import LANDMARKS
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
@@ -72,15 +65,7 @@ class ChannelUnknowns:
     """
 
     reports: dict[float, UnknownsReport]
-    octaves: float | None = None
-
-    @classmethod
-    def of(
-        cls, channels: Iterable[ChannelResult], octaves: float | None = None
-    ) -> ChannelUnknowns | None:
-        """Of a run's channels; None if they have no such unknowns."""
-        reports = {c.frequency_mhz: c.unknowns for c in channels if c.unknowns is not None}
-        return cls(reports, octaves) if reports else None
+    octaves: float | None
 
     @property
     def table(self) -> pd.DataFrame:
@@ -265,7 +250,8 @@ class MapResult(Described):
         """Receivers, ground and gain table, where the model has them."""
         tied = self.scenario.ties_receivers
         octaves = self.scenario.noise.receiver.smooth_octaves if tied else None
-        return ChannelUnknowns.of(self.channels, octaves)
+        reports = {c.frequency_mhz: c.unknowns for c in self.channels if c.unknowns is not None}
+        return ChannelUnknowns(reports, octaves) if reports else None
 
     def table(self, name: str, part: str = "") -> pd.DataFrame | None:
         """A table of all channels, or a part of what they have by that name."""
@@ -377,7 +363,6 @@ class MapResult(Described):
 
     def summary(self) -> MapSummary:
         """Figures of summary.json."""
-        tests = [] if self.single else self.fits().tests()
         return MapSummary(
             frequencies_mhz=self.frequencies_mhz.tolist(),
             unmapped=self.gaps(),
@@ -389,10 +374,10 @@ class MapResult(Described):
             n_data=sum(channel.n_data for channel in self.channels),
             n_modes=len(self.channel.mean),
             doubts=self.doubts(),
-            tests=[JointTestSummary.model_validate(test) for test in tests],
+            tests=[] if self.single else self.fits().tests(),
             pulls=[] if self.single else self.pulls(),
             unknowns=[] if self.unknowns is None else self.unknowns.lines(),
-            channels=[ChannelSummary.model_validate(channel) for channel in self.channels],
+            channels=list(self.channels),
             **about_run(self.seconds),
         )
 

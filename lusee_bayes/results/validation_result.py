@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lusee_bayes.results.sample_result import SampleResult
-from lusee_bayes.results.summaries import CheckSummary, ValidationSummary
+from lusee_bayes.results.summaries import ValidationSummary
 from lusee_bayes.sampling.validation import Check, Comparison, Ranks
 
 # what a comparison has mode by mode
@@ -59,7 +59,7 @@ class ValidationResult:
         levels = ranks.coverage().items()
         return ValidationSummary(
             passed=self.passed,
-            checks=[CheckSummary.model_validate(check) for check in self.checks],
+            checks=self.checks,
             modes={name: getattr(self.comparison, name).tolist() for name in OF_MODES},
             coverage={name: {f"{p:g}": x for p, x in shares.items()} for name, shares in levels},
             p_values=dict(zip(ranks.names, ranks.p_values().tolist(), strict=True)),

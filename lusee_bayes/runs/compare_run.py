@@ -16,9 +16,9 @@ from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.judge.residuals import held_out
 from lusee_bayes.judge.split import Split
 from lusee_bayes.linear.linear_gaussian import Solution
-from lusee_bayes.report.comparison_page import comparison_page
 from lusee_bayes.report.figures.maps import curves_of_runs, maps_of_runs
 from lusee_bayes.report.figures.plans import priors
+from lusee_bayes.report.pages import comparison_page
 from lusee_bayes.report.rendering import render_text
 from lusee_bayes.results.channel_map import conditioned
 from lusee_bayes.results.finished_runs import FinishedRun, Provenance, comparison_rows, read_runs

@@ -281,29 +281,29 @@ class Checkpoints:
         self.folder = Path(folder)
         described = json.loads(json.dumps(identity))
         marker, paths = self.folder / IDENTITY, self._paths()
-        if marker.exists() and not resume:
+        if not marker.exists():
+            if paths:
+                raise InputError(
+                    f"'{self.folder}' holds draws, but no {IDENTITY} that says of which run; "
+                    "delete the folder"
+                )
+            with replacing(marker) as scratch:
+                scratch.write_text(json.dumps(described, indent=2) + "\n", encoding="utf-8")
+            return
+        if not resume:
             done = _iteration(paths[-1]) if paths else "no"
             raise InputError(
                 f"'{self.folder}' holds an unfinished run ({done} iterations done); go on with "
                 "--resume, or delete the folder"
             )
-        if marker.exists():
-            found = read_json(marker, IDENTITY_LAYOUT)
-            for name in sorted({*found, *described}):
-                if found.get(name) != described.get(name):
-                    raise InputError(
-                        f"the unfinished run in '{self.folder}' has another {name}: "
-                        f"{_short(found.get(name))}, now {_short(described.get(name))}; resume it "
-                        "with the same, or delete the folder"
-                    )
-        elif paths:
-            raise InputError(
-                f"'{self.folder}' holds draws, but no {IDENTITY} that says of which run; delete "
-                "the folder"
-            )
-        else:
-            with replacing(marker) as scratch:
-                scratch.write_text(json.dumps(described, indent=2) + "\n", encoding="utf-8")
+        found = read_json(marker, IDENTITY_LAYOUT)
+        for name in sorted({*found, *described}):
+            if found.get(name) != described.get(name):
+                raise InputError(
+                    f"the unfinished run in '{self.folder}' has another {name}: "
+                    f"{_short(found.get(name))}, now {_short(described.get(name))}; resume it with "
+                    "the same, or delete the folder"
+                )
 
     def _paths(self) -> list[Path]:
         return sorted(self.folder.glob(CHUNK_GLOB))

@@ -126,10 +126,6 @@ class Potential(eqx.Module):
             return self.value(x, still) - self.misfit(x, still)
 
         columns = self._derivatives(self.residual, x)
-        if self.shapes.chart is None:
-            # every site's prior is a product over its values
-            _, diagonal = jax.jvp(jax.grad(prior), (x,), (jnp.ones_like(x),))
-            return slope(x), columns @ columns.T + jnp.diag(jnp.abs(diagonal))
         of_prior = self._derivatives(jax.grad(prior), x)
         return slope(x), columns @ columns.T + 0.5 * (of_prior + of_prior.T)
 
@@ -157,9 +153,7 @@ def root_of_inverse(curvature: Matrix, problem: Potential) -> tuple[Array, Array
     lower = jnp.linalg.cholesky(curvature)
     unit = jnp.eye(curvature.shape[0])
     root = jax.scipy.linalg.solve_triangular(lower, unit, lower=True).T
-    if problem.shapes.chart is None:
-        return root, jnp.asarray(True)
-    # a prior in curved coordinates need not curve upwards everywhere
+    # priors need not curve upwards everywhere
     positive = jnp.isfinite(root).all()
     return jax.lax.cond(positive, lambda: (root, positive), lambda: _root_of_any_sign(curvature))
 

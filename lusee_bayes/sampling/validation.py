@@ -226,7 +226,7 @@ def calibrate_sky(
 ) -> Ranks:
     """Calibrate the analytic posterior of the sky.
 
-    :class:`SkyQuantities` are ranked: single modes spread over the ells, random directions in
+    :func:`ranked_of_sky` are ranked: single modes spread over the ells, random directions in
     units of the prior, the distance from the mean in the posterior's metric, and the likelihood.
 
     Parameters
@@ -248,11 +248,13 @@ def calibrate_sky(
         For fewer than 100 data sets.
     """
     solver = posterior.factorise()
-    quantities = SkyQuantities.spread(solver, N_RANKED, N_RANKED, seed)
+    size, rng = solver.prior.size, np.random.default_rng(seed)
+    modes = np.unique(np.linspace(0, size - 1, min(N_RANKED, size)).astype(int))
+    directions = rng.standard_normal((N_RANKED, solver.prior.rank))
     ranks = calibrate(
         truth.sample,
         eqx.Partial(_sky_draws, solver),
-        quantities,
+        eqx.Partial(ranked_of_sky, solver, jnp.asarray(modes), jnp.asarray(directions)),
         n_simulations=n_simulations,
         seed=seed,
         batch=int(np.clip(MEMORY // (N_DRAWS * posterior.n_data), 1, BATCH)),
@@ -261,7 +263,7 @@ def calibrate_sky(
         stages=stages,
     )
     # modes by their number among all modes
-    numbers = {f"mode {i}": f"mode {mode}" for i, mode in enumerate(quantities.modes)}
+    numbers = {f"mode {i}": f"mode {mode}" for i, mode in enumerate(modes)}
     return replace(ranks, names=tuple(numbers.get(name, name) for name in ranks.names))
 
 
@@ -269,44 +271,36 @@ def _sky_draws(solver: Whitened, key: PRNGKeyArray, data: Array) -> Float[Array,
     return solver.condition(data).posterior.sample(key, N_DRAWS)
 
 
-class SkyQuantities(eqx.Module):
-    """Quantities of a sky: modes, projections, distance from the mean, log likelihood.
+def ranked_of_sky(
+    solver: Whitened,
+    modes: Int[Array, " single"],
+    directions: Float[Array, "projections white"],
+    sky: Float[Array, " modes"],
+    data: Float[Array, " data"],
+) -> dict[str, Array]:
+    """Compute modes, projections, distance from the mean and log likelihood of a sky, given data.
 
-    Attributes
+    Parameters
     ----------
     solver : Whitened
         Of the model that is conditioned on the data.
-    modes : tuple of int
+    modes : (single,) array of int
         Numbers of the single modes.
     directions : (projections, white) array
         Directions in units of the prior.
+    sky : (modes,) array
+        In K.
+    data : (data,) array
+        In K.
     """
-
-    solver: Whitened
-    modes: tuple[int, ...] = eqx.field(static=True)
-    directions: Float[Array, "projections white"]
-
-    @classmethod
-    def spread(cls, solver: Whitened, n_modes: int, n_projections: int, seed: int) -> SkyQuantities:
-        """Choose modes from the lowest to the highest ell, and random directions."""
-        size = solver.model.prior.size
-        chosen = np.unique(np.linspace(0, size - 1, min(n_modes, size)).astype(int))
-        rng = np.random.default_rng(seed)
-        directions = rng.standard_normal((n_projections, solver.model.prior.rank))
-        return cls(solver, tuple(int(c) for c in chosen), jnp.asarray(directions))
-
-    def __call__(self, sky: Float[Array, " modes"], data: Float[Array, " data"]) -> dict:
-        """Compute the quantities of one sky, given the data."""
-        solver = self.solver
-        u = solver.model.prior.whiten(sky)
-        offset = solver.model.offset
-        white = solver.factor.whiten(data if offset is None else data - offset)
-        return {
-            "mode": sky[np.array(self.modes)],
-            "projection": self.directions @ u,
-            "distance": (solver.condition(data).posterior.whiten(sky[None])[0] ** 2).sum(),
-            "log likelihood": -0.5 * ((white - solver.whitened @ u) ** 2).sum(),
-        }
+    offset, u = solver.model.offset, solver.model.prior.whiten(sky)
+    white = solver.factor.whiten(data if offset is None else data - offset)
+    return {
+        "mode": sky[modes],
+        "projection": directions @ u,
+        "distance": (solver.condition(data).posterior.whiten(sky[None])[0] ** 2).sum(),
+        "log likelihood": -0.5 * ((white - solver.whitened @ u) ** 2).sum(),
+    }
 
 
 MAX_RHAT = 1.01

@@ -18,8 +18,9 @@ from lusee_bayes.core.arrays import Array, Grid, namespace, scalar
 from lusee_bayes.core.checks import require_finite, require_positive, require_shape
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.section import Positive, Section, Treatment, requires
+from lusee_bayes.instrument.beams.monopoles import source_response
 from lusee_bayes.instrument.beams.source import BeamSource
-from lusee_bayes.instrument.coupling import CouplingMatrix, source_response
+from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.observation import BODIES, Observation, body_direction
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, galactic_unit_vector, kelvin_steradian
 from lusee_bayes.sky.sky_source import Sky

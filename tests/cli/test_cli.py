@@ -1,7 +1,6 @@
 """The commands as a user meets them: files, figures, exit codes, messages."""
 
 import contextlib
-import csv
 import errno
 import hashlib
 import json
@@ -17,7 +16,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from astropy.io import fits
-from commands import content, posterior_of, refused, run, sky_draws_of
+from commands import content, posterior_of, refused, run, sky_draws_of, table_of
 
 import lusee_bayes
 from lusee_bayes.cli.options import ScenarioOptions
@@ -50,10 +49,8 @@ def test_map_writes_what_it_promises(folder):
 def test_the_files_agree_with_each_other(folder):
     posterior = posterior_of(folder)
     mean, std = posterior["mean"].values[0], posterior["std"].values[0]
-    np.testing.assert_array_equal(
-        posterior["ell"].values ** 2 + posterior["ell"].values + posterior["m"].values,
-        np.arange(81),
-    )
+    ell, m = posterior["ell"].values, posterior["m"].values
+    np.testing.assert_array_equal(ell**2 + ell + m, np.arange(81))
     covariance = posterior["covariance"].values[0]
     # rounding of products of numbers that span 1e10 in the covariance
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), std, rtol=1e-7)
@@ -70,8 +67,7 @@ def test_the_files_agree_with_each_other(folder):
     # sqrt(2) there and back again
     alm = healpy.read_alm(folder / "mean_alm.fits")
     np.testing.assert_allclose(from_healpy(alm), mean, rtol=4e-16)
-    with (folder / "spectra.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = table_of(folder / "spectra.csv")
     assert list(rows[0])[:8] == [
         "frequency_mhz", "ell", "rho", "snr", "cl_prior", "cl_mean", "cl_truth",
         "cl_posterior_variance",

@@ -1,7 +1,5 @@
 """What the terminal shows, help, and what a command waits for: libraries, programs to compile."""
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

@@ -3,8 +3,6 @@
 And what objects say of themselves: few lines with shapes, units, frequency and dates.
 """
 
-from __future__ import annotations
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp

@@ -1,7 +1,5 @@
 """The cache of compiled programs: shared, and switched off."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Tasks in threads: order, progress, failures, the tree of a sum, and what is shared."""
 
-from __future__ import annotations
-
 import gc
 import io
 import os
@@ -62,15 +60,15 @@ def test_so_many_are_carried_out_at_a_time():
         return k
 
     assert ThisProcess(2).each(tasks_of(meet, 6), Stages(), "s") == list(range(6))
-    now, most = [0], [0]
+    now = set()
 
-    def count(k):
-        now[0] += 1
-        most[0] = max(most[0], now[0])
-        now[0] -= 1
+    def alone(k):
+        now.add(k)
+        time.sleep(0.005)
+        assert now == {k}
+        now.remove(k)
 
-    ThisProcess(1).each(tasks_of(count, 5), Stages(), "s")
-    assert most == [1]
+    ThisProcess(1).each(tasks_of(alone, 5), Stages(), "s")
 
 
 def test_a_failure_ends_the_stage():

@@ -1,7 +1,5 @@
 """Real harmonics, and their rotations: against scipy, healpy, and the laws that they obey."""
 
-from __future__ import annotations
-
 from math import factorial
 
 import healpy

@@ -1,7 +1,5 @@
 """Products, factors and inverses of symmetric matrices against numpy."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import time

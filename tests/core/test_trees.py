@@ -1,7 +1,5 @@
 """Dataclasses as trees and files: what is written comes back, and what is damaged is told."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, Literal
 

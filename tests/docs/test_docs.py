@@ -4,8 +4,6 @@ Python and commands of each page run in order, in a folder of their own, with fe
 draws.
 """
 
-from __future__ import annotations
-
 import ast
 import os
 import re
@@ -99,9 +97,8 @@ def test_the_code_of_a_page_runs(page, tmp_path, monkeypatch, no_figures):
 @pytest.mark.long
 def test_the_commands_of_the_readme_run(tmp_path, monkeypatch, no_figures):
     monkeypatch.chdir(tmp_path)
-    code = "".join(text for kind, text in FENCES.findall((ROOT / "README.md").read_text())
-                   if kind == "sh")  # fmt: skip
-    lines = code.splitlines()
+    blocks = FENCES.findall((ROOT / "README.md").read_text())
+    lines = "".join(text for kind, text in blocks if kind == "sh").splitlines()
     # what only a shell does comes before the first command: the environment is activated
     assert lines.index(". .venv/bin/activate") < min(
         k for k, line in enumerate(lines) if line.startswith("lusee-bayes")
@@ -201,14 +198,9 @@ def test_the_worked_examples_pass_their_tests(tmp_path):
             changed = applied(path.read_text(), match["how"], match["line"], match["code"])
             path.write_text(changed)
     environment = os.environ | {"PYTHONPATH": str(tmp_path), "MPLBACKEND": "agg"}
-    found = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(tmp_path / "tests")],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests"]
+    options = {"cwd": tmp_path, "env": environment, "capture_output": True, "text": True}
+    found = subprocess.run(command, check=False, **options)
     assert found.returncode == 0, found.stdout[-3000:]
     assert "6 passed" in found.stdout
 
@@ -289,11 +281,8 @@ def test_both_faces_of_the_guides_systematic_have_one_evidence():
     made = {}
     exec("import jax\n" + code, made)
     rng = np.random.default_rng(1)
-    gaussian = lb.LinearGaussian(
-        jnp.asarray(rng.normal(size=(30, 9))),
-        lb.HarmonicPrior(jnp.ones(3)),
-        lb.DiagonalCovariance(jnp.full(30, 0.1)),
-    )
+    a, noise = jnp.asarray(rng.normal(size=(30, 9))), lb.DiagonalCovariance(jnp.full(30, 0.1))
+    gaussian = lb.LinearGaussian(a, lb.HarmonicPrior(jnp.ones(3)), noise)
     cable = made["CablePickup"](jnp.asarray(rng.normal(size=30)), 0.7)
     data = gaussian.sample(jax.random.key(0))[1] + 0.5 * cable.pattern
     program = lb.load_program("systematics")

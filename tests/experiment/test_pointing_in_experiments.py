@@ -23,7 +23,7 @@ from lusee_bayes.experiment.model import (
 )
 from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.experiment.unknowns import pointing_report
-from lusee_bayes.instrument.coupling import source_response
+from lusee_bayes.instrument.beams.monopoles import source_response
 from lusee_bayes.judge.residuals import residuals
 from lusee_bayes.sky.galaxy import galactic_unit_vector
 from lusee_bayes.systematics.context import Around

@@ -1,7 +1,5 @@
 """Sessions of luseepy, of layout 4 made by hand, and our own; files that are damaged or foreign."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Damage to files, drawn by hypothesis: bytes of any file, and items of HDF5, FITS and JSON."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -59,11 +57,8 @@ def change_bytes(path: Path, change: tuple[Any, ...]) -> None:
 @st.composite
 def item_changes(draw: st.DrawFn) -> tuple[Any, ...]:
     """An operation on one item of a file."""
-    kind = draw(
-        st.sampled_from(
-            ["delete", "rename", "value", "attribute", "drop attribute", "dtype", "shape", "fill"]
-        )
-    )
+    kinds = ["delete", "rename", "value", "attribute", "drop attribute", "dtype", "shape", "fill"]
+    kind = draw(st.sampled_from(kinds))
     return kind, draw(FRACTION), draw(VALUES), draw(FILLS), draw(st.integers(0, 5))
 
 

@@ -1,7 +1,5 @@
 """Inputs that nobody has thought of: a few in each run, many in the long one."""
 
-from __future__ import annotations
-
 from hypothesis import HealthCheck, Phase, settings
 
 settings.register_profile(

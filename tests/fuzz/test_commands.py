@@ -1,7 +1,5 @@
 """Whatever is typed: an answer, or one sentence and exit code 2, with nothing left behind."""
 
-from __future__ import annotations
-
 import os
 import re
 

@@ -1,7 +1,5 @@
 """Every file, damaged in every way, is read or refused in a sentence: no traceback, no hang."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -76,8 +74,8 @@ READERS = {
     "gains.nc": (describe, read_gain_table),
 }
 
-# files of the package by its one mapper
-OWN = ("posterior.nc", "information.nc", "cube.nc", "diagnostics.nc", "reduced.nc", "gains.nc")
+# files of the package
+OWN = tuple(name for name in READERS if name.endswith(".nc"))
 LUSEEPYS = {
     "scalar_beam.fits": "synthetic_monopole_beam.fits",
     "response.fits": "synthetic_response_v3.fits",

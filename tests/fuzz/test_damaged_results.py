@@ -1,7 +1,5 @@
 """Folders of results, damaged in every way: a report, a comparison, or a sentence."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 
@@ -36,11 +34,8 @@ def sampled(tmp_path_factory) -> Path:
 @pytest.mark.parametrize(
     ("kind", "n"),
     [
-        ("map", FEW),
-        ("cube", FEW),
-        pytest.param("map", MANY, marks=pytest.mark.long),
-        pytest.param("cube", MANY, marks=pytest.mark.long),
-        pytest.param("sample", MANY, marks=pytest.mark.long),
+        *(("map", FEW), ("cube", FEW)),
+        *(pytest.param(k, MANY, marks=pytest.mark.long) for k in ("map", "cube", "sample")),
     ],
 )
 def test_damaged_results(kind, n, tmp_path, request):

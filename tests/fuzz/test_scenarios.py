@@ -1,7 +1,5 @@
 """Scenarios of any content are taken or refused in a sentence, and come back as they were."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -15,7 +15,7 @@ from scipy.stats import norm, truncnorm
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import Rotation, n_modes, turn_about_z
-from lusee_bayes.instrument.coupling import BeamOperator, CouplingMatrix, DenseCoupling, as_coupling
+from lusee_bayes.instrument.coupling import CouplingMatrix, DenseCoupling, as_coupling
 from lusee_bayes.instrument.products import DataLayout, auto_indices, labels
 from lusee_bayes.systematics.beam import BeamError, InstrumentParameters
 from lusee_bayes.testing.contracts import check_coupling
@@ -255,11 +255,13 @@ def instrument(pointing, layout):
     return lb.Instrument(lb.Monopoles(), pointing, layout, FREQUENCY, LOW).prepared()
 
 
-def test_turned_blocks_are_the_coupling_matrix(pointing, layout):
+def test_turned_blocks_are_the_coupling_matrix(pointing, layout, monkeypatch):
     """For beams of every order, with flags and two runs; sums of 17 numbers in another order."""
     beams = lb.ProductBeams(jax.random.normal(jax.random.key(0), (16, 25)), FREQUENCY)
     expected = np.asarray(lb.CouplingMatrix.build(beams, pointing, layout).dense())
-    got = BeamOperator.of(pointing, layout).coupling(beams)
+    instrument = lb.Instrument(lb.Monopoles(), pointing, layout, FREQUENCY, LOW).prepared()
+    monkeypatch.setattr(lb.Instrument, "beams", lambda self, values: beams)
+    got = instrument.dense({})
     assert got.shape == (layout.size, 25)
     close(got, expected, 1e-13)
 
@@ -294,7 +296,7 @@ def test_a_of_placed_antennas_is_that_of_antennas_built_so(instrument, pointing,
 
 
 def test_a_that_was_not_prepared(instrument):
-    refuse("prepare the instrument first", replace(instrument, operator=None).dense, {})
+    refuse("prepare the instrument first", replace(instrument, rotations=None).dense, {})
 
 
 @pytest.fixture(scope="module")

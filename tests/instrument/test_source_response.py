@@ -12,8 +12,7 @@ from scipy.special import eval_legendre
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.beams.fields import STOKES, stokes_pairs
-from lusee_bayes.instrument.beams.monopoles import beams_towards
-from lusee_bayes.instrument.coupling import source_response
+from lusee_bayes.instrument.beams.monopoles import beams_towards, source_response
 from lusee_bayes.instrument.products import labels, to_matrix
 
 FREQUENCY = 25.0

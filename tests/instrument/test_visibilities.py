@@ -318,10 +318,6 @@ def test_scatter_is_the_transpose_of_gather(flags, rest):
         assert not back[flags].any()
 
 
-def test_nothing_left_is_an_error():
-    refuse("all 15 samples are flagged", DataLayout.from_flags, np.ones((3, 5), dtype=bool))
-
-
 # --- products -------------------------------------------------------------------------------------
 
 

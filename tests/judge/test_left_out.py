@@ -1,14 +1,13 @@
 """Groups of data left out, against A, S and N as matrices."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from experiments import flagged
-from reference_linear import matrices
+from reference_linear import matrices, posterior, random_covariance
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
@@ -59,10 +58,16 @@ def observed(size, kind, *more, gaps=False):
     if gaps:
         e = lb.build(scenario, flagged(e.data, flags_of(e.data.layout)))
     model = full_model(e.setup)
+    return model, e.data, *by_matrices(model, e.data)
+
+
+def by_matrices(model, data):
+    """K^-1, the sky's part of K, and K^-1 times the data minus their mean."""
     a, s, n = matrices(model)
     inverse = np.linalg.inv(a @ s @ a.T + n)
-    rest = np.asarray(e.data.data) - (0.0 if model.offset is None else np.asarray(model.offset))
-    return model, e.data, inverse, a @ s @ a.T, inverse @ rest
+    mean = 0.0 if model.offset is None else np.asarray(model.offset)
+    mean = mean if model.prior.mean is None else mean + a @ np.asarray(model.prior.mean)
+    return inverse, a @ s @ a.T, inverse @ (np.asarray(data.data) - mean)
 
 
 def check(found: LeftOut, data, inverse, sky, u, groups, chosen=None):
@@ -144,8 +149,29 @@ def test_what_the_posterior_saves_and_means_over_windows():
     assert data.observation.windows is not None
     check(LeftOut(model, data), data, *expected, every_kind(data))
     model, data, *expected = observed("few", "blocks and templates")
-    found = LeftOut(model, data, posterior=model.condition(data.data))
+    found = LeftOut(model, data, posterior=model.condition(data.data).posterior)
     check(found, data, *expected, every_kind(data))
+
+
+@pytest.mark.parametrize("kind", ["diagonal", "blocks", "templates"])
+def test_a_prior_that_correlates_modes(kind):
+    """And that has a mean: the posterior with structure in time, and what it leaves out."""
+    model, data, *_ = observed("few", kind)
+    width = np.sqrt(np.asarray(model.prior.variance()))
+    rng = np.random.default_rng(6)
+    correlated = random_covariance(rng, len(width)) * width * width[:, None]
+    mean = 0.3 * width * rng.normal(size=len(width))
+    prior = lb.DensePrior.of_covariance(jnp.asarray(correlated), jnp.asarray(mean))
+    model = replace(model, prior=prior)
+    assert model.is_structured
+    found = model.condition(data.data).posterior
+    inverse, sky, u = by_matrices(model, data)
+    a, s, n = matrices(model)
+    answer = posterior(a, s, n, (sky + n) @ u)
+    assert (np.abs(np.asarray(found.mean) - mean - answer.mean) / answer.std).max() < 1e-5
+    np.testing.assert_allclose(found.std(), answer.std, rtol=1e-6)
+    np.testing.assert_allclose(found.log_evidence, answer.log_prob, rtol=1e-7)
+    check(LeftOut(model, data, posterior=found), data, inverse, sky, u, every_kind(data))
 
 
 def test_all_data_have_nothing_to_be_compared_with():

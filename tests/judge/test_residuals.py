@@ -1,7 +1,5 @@
 """Residuals, chi^2 and their tests: by hand, and with something wrong on purpose."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax.numpy as jnp

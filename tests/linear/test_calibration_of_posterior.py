@@ -6,7 +6,8 @@ squares follow chi^2 with n_modes degrees of freedom. There are 4000 draws, so t
 the correlations of one time of 32 (chi^2 per mode 1.018) is still seen.
 """
 
-from __future__ import annotations
+from functools import cache
+from itertools import product
 
 import jax
 import jax.numpy as jnp
@@ -75,64 +76,41 @@ def p_value(standardised: np.ndarray) -> float:
     return kstest((standardised**2).sum(1), chi2(N_MODES).cdf).pvalue
 
 
-@pytest.fixture(scope="module")
-def beams():
-    return lb.monopole_beams(25.0, LMAX)
+@cache
+def run_of(cycles: float) -> Setup:
+    """512 data in 0.1 cycles; 64 in 0.015, fewer than modes."""
+    return Setup(lb.monopole_beams(25.0, LMAX), cycles)
 
 
-@pytest.fixture(scope="module")
-def long_run(beams):
-    """512 data."""
-    return Setup(beams, 0.1)
+KINDS = ["paper", "exact", "dense", "diagonal+dense"]
+FEWER = [(InMap, "exact"), (InData, "exact"), (InData, "diagonal+dense")]
 
 
-@pytest.fixture(scope="module")
-def short_run(beams):
-    """64 data, fewer than modes."""
-    return Setup(beams, 0.015)
-
-
-def assert_calibrated(z: np.ndarray):
+@pytest.mark.long
+@pytest.mark.essential
+@pytest.mark.parametrize(
+    ("cycles", "form", "noise"),
+    [*product([0.1], [InMap, InData], KINDS), *((0.015, form, noise) for form, noise in FEWER)],
+)
+def test_the_posterior_covers_the_truth(cycles, form, noise):
+    setup = run_of(cycles)
+    z = setup.standardised(setup.noise[noise], setup.noise[noise], form)
     assert p_value(z) > 0.01
     # chi^2 per mode: 1 within five times its scatter sqrt(2 / (draws x modes)) = 0.0025
     assert abs((z**2).mean() - 1.0) < 5 * np.sqrt(2 / z.size)
     assert_draws_follow(z, np.zeros(N_MODES), np.eye(N_MODES))
 
 
-@pytest.mark.long
-@pytest.mark.essential
-@pytest.mark.parametrize("noise", ["paper", "exact", "dense", "diagonal+dense"])
-@pytest.mark.parametrize("form", [InMap, InData])
-def test_more_data_than_modes(long_run, noise, form):
-    n = long_run.noise[noise]
-    assert_calibrated(long_run.standardised(n, n, form))
-
-
-@pytest.mark.long
-@pytest.mark.essential
-@pytest.mark.parametrize(
-    ("form", "noise"), [(InMap, "exact"), (InData, "exact"), (InData, "diagonal+dense")]
-)
-def test_fewer_data_than_modes(short_run, form, noise):
-    n = short_run.noise[noise]
-    assert_calibrated(short_run.standardised(n, n, form))
-
-
-# --- the same check on wrong posteriors: it must fail ---------------------------------------------
-
-
-def test_notices_correlations_missing_at_one_time_of_32(long_run):
-    exact = long_run.noise["exact"]
+def test_the_same_check_notices_wrong_posteriors():
+    """Correlations that are missing at one time of 32, and a gain term that is missing."""
+    setup = run_of(0.1)
+    exact = setup.noise["exact"]
     blocks = np.array(exact.blocks)
     blocks[3] = np.diag(np.diag(blocks[3]))
     wrong = lb.TimeBlockCovariance(jnp.asarray(blocks), exact.layout)
-    assert p_value(long_run.standardised(exact, wrong, InMap)) < 1e-4
-
-
-def test_notices_a_missing_gain_term(long_run):
-    noise = long_run.noise
-    z = long_run.standardised(noise["diagonal+dense"], noise["paper"], InMap)
-    assert p_value(z) < 1e-100
+    assert p_value(setup.standardised(exact, wrong, InMap)) < 1e-4
+    with_gains, paper = setup.noise["diagonal+dense"], setup.noise["paper"]
+    assert p_value(setup.standardised(with_gains, paper, InMap)) < 1e-100
 
 
 # --- the full size: 5232 data, 2304 modes ---------------------------------------------------------

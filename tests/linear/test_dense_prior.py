@@ -5,9 +5,6 @@ S' = Q S Q^T with an orthogonal Q, whose answers are Q times those of independen
 prior that happens to be diagonal.
 """
 
-from __future__ import annotations
-
-from dataclasses import replace
 from decimal import localcontext
 from functools import lru_cache
 
@@ -20,9 +17,7 @@ from scipy.stats import multivariate_normal, ortho_group
 
 import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_host
-from lusee_bayes.experiment.model import full_model
-from lusee_bayes.judge.left_out import LeftOut, groups_of
-from lusee_bayes.linear.linear_gaussian import Form, FromInformation, InData, InMap, form_of
+from lusee_bayes.linear.linear_gaussian import Form, FromInformation, InData, InMap
 from lusee_bayes.linear.posterior import Posterior, pixel_std, prior_pixel_std
 from lusee_bayes.runs.plan_run import informed_modes
 
@@ -127,60 +122,6 @@ def test_pixels_of_the_prior():
     np.testing.assert_allclose(prior_pixel_std(prior, 4), pixel_std(rest, 4), rtol=1e-12)
     same = lb.HarmonicPrior(SPECTRUM), lb.DensePrior.of_covariance(np.diag(PER_MODE))
     np.testing.assert_allclose(*(prior_pixel_std(one, 4) for one in same), rtol=1e-12)
-
-
-NOISES = {
-    "diagonal": (),
-    "blocks": ("noise.radiometer.form=exact",),
-    "templates": ("noise.beam={shift_mhz: 4}",),
-}
-
-
-@lru_cache
-def observed(noise: str):
-    """An experiment with structure in time, its model, and the model of a dense prior."""
-    # noise a thousand times larger than the telescope's, so that matrices by hand can be inverted
-    runs = "observation.runs=[{cycles: 0.04}, {cycles: 0.03, turntable_deg: 40}]"
-    given = ["lmax=5", runs, "noise.radiometer.factor=1e6", *NOISES[noise]]
-    experiment = lb.build(lb.load_scenario("fiducial", given))
-    model = full_model(experiment.setup)
-    width = np.sqrt(np.asarray(model.prior.variance()))
-    rng = np.random.default_rng(6)
-    correlated = random_covariance(rng, len(width)) * width * width[:, None]
-    mean = jnp.asarray(0.3 * width * rng.normal(size=len(width)))
-    dense = lb.DensePrior.of_covariance(jnp.asarray(correlated), mean)
-    return experiment, model, replace(model, prior=dense)
-
-
-@pytest.mark.parametrize("noise", NOISES)
-def test_structure_in_time_gives_what_matrices_give(noise):
-    experiment, _, model = observed(noise)
-    data = experiment.data.data
-    a, n = np.asarray(model.coupling.dense()), np.asarray(model.noise.dense())
-    s, mean = np.asarray(model.prior.covariance()), np.asarray(model.prior.mean)
-    assert form_of(model) is FromInformation
-    found = model.condition(data).posterior
-    shift = a @ mean if model.offset is None else a @ mean + np.asarray(model.offset)
-    answer = posterior(a, s, n, np.asarray(data) - shift)
-    # S over N is 1e8 at most, whose square root the matrices by hand lose
-    sigma = answer.std
-    assert (np.abs(np.asarray(found.mean) - mean - answer.mean) / sigma).max() < 1e-5
-    np.testing.assert_allclose(found.std(), sigma, rtol=1e-6)
-    np.testing.assert_allclose(found.log_evidence, answer.log_prob, rtol=1e-7)
-    left_out = LeftOut(model, experiment.data, posterior=found)
-    inverse = np.linalg.inv(a @ s @ a.T + n)
-    u = inverse @ (np.asarray(data) - shift)
-    of_sky = inverse @ a @ s @ a.T @ inverse
-    for group in groups_of(experiment.data):
-        inside = np.asarray(experiment.data.layout.gather(group.data))
-        block = inverse[np.ix_(inside, inside)]
-        missed = left_out.missed(group.data)
-        chi2 = u[inside] @ np.linalg.solve(block, u[inside])
-        # condition numbers of 1e8
-        assert missed.chi2 == pytest.approx(chi2, rel=1e-5)
-        assert missed.log_det == pytest.approx(np.linalg.slogdet(block)[1], rel=1e-6)
-        directions = np.trace(np.linalg.solve(block, of_sky[np.ix_(inside, inside)]))
-        assert missed.directions == pytest.approx(directions, rel=1e-5)
 
 
 def test_a_mean_far_from_the_reference_sky_is_exact():

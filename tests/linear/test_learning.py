@@ -1,7 +1,5 @@
 """Learning a prior's parameters against brute-force maximisation, and draws with their errors."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import jax

@@ -1,7 +1,5 @@
 """Beam errors: dA S dA^T by hand, derivatives by differences, rms by quadrature."""
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Radiometer noise: the paper's formula by a double loop, the exact form by simulated voltages."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

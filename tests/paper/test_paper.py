@@ -1,6 +1,5 @@
 """The paper's reproduction: resumable, complete, and judged by conditions that can fail."""
 
-import csv
 from dataclasses import replace
 from functools import cache
 
@@ -12,6 +11,7 @@ import xarray as xr
 from assertions import refuse, require_conventions
 from astropy import units as u
 from astropy.coordinates import SkyCoord
+from commands import table_of
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.harmonics import map_to_modes
@@ -79,16 +79,14 @@ def test_everything_is_written(folder):
     for figure in (folder / "figures").iterdir():
         assert matplotlib.image.imread(figure).std() > 0.01  # not blank
     assert {p.name for p in (folder / "cases").iterdir()} == {f"{n}.nc" for n in paper.CASES}
-    with (folder / "cases.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = table_of(folder / "cases.csv")
     assert [row["case"] for row in rows] == list(paper.CASES)
     assert (rows[0]["rho_10"], rows[0]["ell_cross"]) == ("0.95", "33")
 
 
 @pytest.mark.long
 def test_claims_have_every_column_filled(folder):
-    with (folder / "claims.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = table_of(folder / "claims.csv")
     assert len(rows) == len(CLAIMS) > 20
     for row in rows:
         assert set(row) == {"section", "paper", "obtained", "agrees", "reason"}
@@ -103,8 +101,7 @@ def test_a_real_run_at_tiny_size(tmp_path):
     files = runs.run_paper(tmp_path, TINY).files
     assert all(path.is_file() for path in files)
     require_conventions(tmp_path / "cases" / "fiducial.nc")
-    with (tmp_path / "cases.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = table_of(tmp_path / "cases.csv")
     assert float(rows[0]["rho_1"]) > 0.9  # one cycle knows the dipole
     assert rows[0]["rho_10"] == "beyond"
     for row in rows:

@@ -1,7 +1,5 @@
 """What every template may use: numbers, tables, pictures; what is missing is an error."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from jinja2 import UndefinedError

@@ -1,7 +1,5 @@
 """Reports: complete, self-contained, in agreement with the files, and in a real browser."""
 
-from __future__ import annotations
-
 import base64
 import json
 import re

@@ -3,8 +3,6 @@
 Scripts of a page are run in node, with a document that only keeps what is set.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -62,17 +60,10 @@ def run_page(page: str, tmp_path, commands: str) -> dict:
         r'<script type="application/json" id="viewer-data">(.*?)</script>', page, re.DOTALL
     )
     scripts = re.findall(r"<script>\n(.*?)\n</script>", page, re.DOTALL)
-    text = "\n".join(
-        [
-            STUB.replace("SIZES", json.dumps(SIZES)),
-            f"element('viewer-data').textContent = {json.dumps(data)};",
-            *scripts,
-            "const told = {};",
-            commands,
-            "require('fs').writeFileSync('told.json', JSON.stringify(told));",
-        ]
-    )
-    (tmp_path / "page.js").write_text(text)
+    given = f"element('viewer-data').textContent = {json.dumps(data)};"
+    last = "require('fs').writeFileSync('told.json', JSON.stringify(told));"
+    text = [STUB, given, *scripts, "const told = {};", commands, last]
+    (tmp_path / "page.js").write_text("\n".join(text).replace("SIZES", json.dumps(SIZES), 1))
     subprocess.run([NODE, "page.js"], cwd=tmp_path, check=True, timeout=120)
     return json.loads((tmp_path / "told.json").read_text())
 

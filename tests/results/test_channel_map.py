@@ -1,7 +1,5 @@
 """A channel's map: likelihoods of its draws, and which groups of its data are judged."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import arviz_base as az

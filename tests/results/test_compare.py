@@ -1,13 +1,10 @@
 """Finished runs side by side."""
 
-from __future__ import annotations
-
-import csv
 import json
 
 import matplotlib.image
 import pytest
-from commands import refused, run
+from commands import refused, run, table_of
 
 import lusee_bayes as lb
 from lusee_bayes.results.finished_runs import evidence_caveat, read_runs
@@ -33,8 +30,7 @@ def test_the_right_model_wins(runs, tmp_path, capsys):
     assert run("compare", runs / "fiducial", runs / "gain_1e-2", "-o", out) == 0
     told = capsys.readouterr().out
     assert "look at" in told and "Do not compare the evidences" not in told
-    with (out / "comparison.csv").open(newline="") as file:
-        rows = {row["run"]: row for row in csv.DictReader(file)}
+    rows = {row["run"]: row for row in table_of(out / "comparison.csv")}
     for name, row in rows.items():
         summary = json.loads((runs / name / "summary.json").read_text())
         assert float(row["log_evidence"]) == summary["log_evidence"]

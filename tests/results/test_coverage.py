@@ -1,7 +1,5 @@
 """Coverage and its scatter: by counting with loops, and against simulated skies."""
 
-from __future__ import annotations
-
 from statistics import NormalDist
 
 import healpy

@@ -1,7 +1,5 @@
 """The joint verdict over channels, against simulations and by hand."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Receivers, ground and gain table of runs of several frequencies."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A whole map under a prior that correlates modes: results, and its resolution."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

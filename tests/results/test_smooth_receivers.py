@@ -1,7 +1,5 @@
 """Receivers whose spectra are smooth: all channels' skies and receivers as one dense Gaussian."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -50,7 +48,7 @@ class Dense:
     prior: list[np.ndarray]
 
     @classmethod
-    def of(cls, scenario) -> Dense:
+    def of(cls, scenario):
         found = cls([], [], [], [], [])
         for channel in scenario.channels():
             experiment = lb.build(channel)

@@ -1,7 +1,5 @@
 """How strong a sky is compared with its prior: by hand, and for skies of the prior."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Data that are added to those of an earlier run: the map is that of all of them."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Averages of a file, and what they cost: as a user meets them, and against closed forms."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

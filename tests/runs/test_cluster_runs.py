@@ -1,7 +1,5 @@
 """Runs on a real cluster: a scheduler and three workers, started as a user starts them."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -80,14 +78,9 @@ class Cluster:
             self.kill(process)
 
     def _dask(self, *words) -> subprocess.Popen:
-        return subprocess.Popen(
-            [sys.executable, "-m", "dask", *words],
-            env=self.environment,
-            cwd=self.folder,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-        )
+        options = {"env": self.environment, "cwd": self.folder, "start_new_session": True}
+        command, nowhere = [sys.executable, "-m", "dask", *words], subprocess.DEVNULL
+        return subprocess.Popen(command, stdout=nowhere, stderr=nowhere, **options)
 
     @staticmethod
     def _wait(there):
@@ -201,9 +194,8 @@ def test_workers_of_a_killed_command_end_with_it(tmp_path):
         [sys.executable, "-m", "lusee_bayes.cli", *MAP, "--workers", "2", "-o", tmp_path, "-q"]
     )
     when_some_are_there(process, tmp_path)
-    started = subprocess.run(
-        ["ps", "-o", "pid=", "--ppid", str(process.pid)], capture_output=True, text=True
-    ).stdout.split()
+    command = ["ps", "-o", "pid=", "--ppid", str(process.pid)]
+    started = subprocess.run(command, capture_output=True, text=True).stdout.split()
     assert started
     process.kill()
     process.wait()

@@ -1,14 +1,11 @@
 """One data set under several priors: which it prefers, what the run leaves, and bad input."""
 
-from __future__ import annotations
-
-import csv
 import json
 
 import jax
 import numpy as np
 import pytest
-from commands import run
+from commands import run, table_of
 from experiments import mapped
 
 import lusee_bayes as lb
@@ -39,8 +36,7 @@ def test_what_a_run_leaves(finished, capsys):
     assert [one["name"] for one in found["priors"]] == PRIORS
     best = max(found["priors"], key=lambda one: one["log_evidence"])
     assert found["best"] == best["name"] and best["name"] in found["verdict"]
-    with (finished / "priors.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = table_of(finished / "priors.csv")
     for row, one in zip(rows, found["priors"], strict=True):
         assert row["prior"] == one["name"]
         assert float(row["log_evidence"]) == one["log_evidence"]

@@ -1,6 +1,5 @@
 """Runs of several frequencies from the command line: independent, joint, resumed, shared out."""
 
-import csv
 import json
 from dataclasses import replace
 
@@ -9,7 +8,7 @@ import numpy as np
 import pytest
 from assertions import assert_same_map, refuse
 from astropy.io import fits
-from commands import posterior_of, refused, run, sky_draws_of
+from commands import posterior_of, refused, run, sky_draws_of, table_of
 from experiments import channels_of
 
 import lusee_bayes as lb
@@ -107,8 +106,7 @@ def test_files_of_a_cube_agree_with_each_other(joint, capsys):
             expected = modes_to_map(channels[name].values[k], nside)
             np.testing.assert_allclose(read.map_at(20.0 + 5 * k), expected, rtol=1e-12)
     assert SkyCube.read(joint / "std.fits").pixels.shape == (3, healpy.nside2npix(nside))
-    with (joint / "spectra.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = table_of(joint / "spectra.csv")
     assert [float(r["frequency_mhz"]) for r in rows] == list(np.repeat([20.0, 25.0, 30.0], 5))
     for name, column in (("mean", "snr"), ("independent_mean", "snr_independent")):
         snr = signal_to_noise(channels[name].values[1], channels["truth"].values[1])

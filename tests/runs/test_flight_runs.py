@@ -1,7 +1,5 @@
 """simulate --flight, and map its sessions: the whole chain, and what a report says of it."""
 
-from __future__ import annotations
-
 import shlex
 import shutil
 from dataclasses import replace

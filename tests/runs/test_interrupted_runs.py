@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import h5py
@@ -46,7 +47,13 @@ sys.exit(main(arguments))
 MOMENTS = int(os.environ.get("LUSEE_BAYES_TEST_KILLS", "1"))
 TINY = ["lmax=3", "observation.step_s=43200"]
 ROOT = Path(__file__).resolve().parents[2]
-CACHE = ROOT / ".pytest_cache" / "xla" / "interrupted"
+ENVIRONMENT = {
+    "PYTHONPATH": str(ROOT),
+    "MPLBACKEND": "agg",
+    "JAX_COMPILATION_CACHE_DIR": str(ROOT / ".pytest_cache" / "xla" / "interrupted"),
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+    "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+}
 # by name: the command and the folder of its unfinished work
 COMMANDS = {
     "map": (["map", "fiducial", "--draws", "3"], None),
@@ -85,26 +92,24 @@ class Command:
         options = [a for s in self.settings for a in ("--set", s) if self.name != "paper"]
         # the earlier run has another seed
         arguments = [*self.arguments, *options, *more, "--force", "-q", "-o", str(folder)]
-        process = subprocess.Popen(
-            [sys.executable, "-c", DRIVER, " ".join(self.settings), *arguments],
-            env=os.environ
-            | {
-                "PYTHONPATH": str(ROOT),
-                "MPLBACKEND": "agg",
-                "JAX_COMPILATION_CACHE_DIR": str(CACHE),
-                "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-                "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
-            },
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+        command = [sys.executable, "-c", DRIVER, " ".join(self.settings), *arguments]
+        env, pipe = os.environ | ENVIRONMENT, subprocess.PIPE
+        process = subprocess.Popen(command, env=env, stdout=pipe, stderr=pipe, text=True)
         assert process.stdout.readline() == "started\n", process.communicate()[1]
         return process
 
     def resumed(self, folder: Path) -> list[str]:
         """--resume, where something was drawn."""
         return ["--resume"] if self.name == "sample" and (folder / "chains").exists() else []
+
+    def killed(self, folder: Path, moment: float) -> int:
+        """Kill it at this part of its time; the exit code."""
+        process = self.start(folder, *self.resumed(folder))
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(moment * self.seconds)
+        process.kill()
+        process.communicate()
+        return process.returncode
 
     def again(self, folder: Path) -> tuple[int, str]:
         """What a user does who sees the folder: the same command."""
@@ -117,14 +122,11 @@ def numbers(folder: Path) -> dict[str, np.ndarray]:
     """Every array of every netCDF file."""
     found = {}
     for path in sorted(folder.rglob("*.nc")):
+        items = []
         with h5py.File(path) as file:
-            file.visititems(
-                lambda name, it, path=path: (
-                    found.update({f"{path.relative_to(folder)}/{name}": it[()]})
-                    if isinstance(it, h5py.Dataset)
-                    else None
-                )
-            )
+            file.visititems(lambda _, item, items=items: items.append(item))
+            arrays = [item for item in items if isinstance(item, h5py.Dataset)]
+            found |= {f"{path.relative_to(folder)}{item.name}": item[()] for item in arrays}
     return found
 
 
@@ -184,24 +186,14 @@ def test_a_kill_at_any_moment(command, with_earlier, number, tmp_path):
     # each in its own part of the run
     random_part = random.Random(f"{it.name} {with_earlier} {number}").random()
     moment = (number + random_part) / MOMENTS
-    process = it.start(folder)
-    try:
-        process.wait(moment * it.seconds)
-    except subprocess.TimeoutExpired:
-        process.kill()
-    process.communicate()
-    assert process.returncode in (0, -signal.SIGKILL)
+    returncode = it.killed(folder, moment)
+    assert returncode in (0, -signal.SIGKILL)
     state = state_of(folder, it, earlier)
     print(f"{it.name}, earlier run {with_earlier}, at {moment:.2f} of its time: {state}")
-    assert process.returncode != 0 or state == "new"
+    assert returncode != 0 or state == "new"
     if state != "new":
         # and once more on the way, of which nothing is to be seen in the end
-        process = it.start(folder, *it.resumed(folder))
-        try:
-            process.wait(0.5 * it.seconds)
-        except subprocess.TimeoutExpired:
-            process.kill()
-        process.communicate()
+        it.killed(folder, 0.5)
         code, errors = it.again(folder)
         assert code == 0, errors
     assert_same_results(folder, it.folder)

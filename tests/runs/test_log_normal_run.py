@@ -1,7 +1,5 @@
 """Samples of positive skies as a user asks for them: the program log_normal."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

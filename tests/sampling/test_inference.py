@@ -15,6 +15,7 @@ import numpy as np
 import numpyro
 import pytest
 from arviz_stats.base import array_stats
+from assertions import refuse
 from experiments import draw_within
 from numpyro import distributions as dist
 from reference_linear import matrices, random_covariance, z_of
@@ -241,9 +242,7 @@ def test_the_marginal_program_finds_the_noise_level(gaussian, data, level_grid, 
     ],
 )
 def test_settings_that_cannot_be_used(settings, message):
-    with pytest.raises(lb.InputError) as caught:
-        Sampler(**settings)
-    assert str(caught.value) == message
+    refuse(message, Sampler, **settings)
 
 
 def test_the_number_of_draws_is_no_part_of_a_runs_identity():

@@ -258,3 +258,17 @@ def test_predictions_from_draws_of_z(gaussian, case):
     limit = z_of(2 * N_DATA)
     assert np.abs(delta.mean(0) / np.sqrt(variance / n)).max() < limit
     assert np.abs((delta**2).mean(0) / variance - 1.0).max() < limit * np.sqrt(2 / n)
+
+
+def test_the_gaussian_about_the_mode_of_a_linear_model_is_its_posterior():
+    """Of a prior that correlates modes: its curvature is no diagonal."""
+    rng = np.random.default_rng(8)
+    half, program = rng.standard_normal((9, 9)), lb.load_program("sky")
+    prior = lb.DensePrior.of_covariance(jnp.asarray(half @ half.T + np.eye(9)))
+    a, data = (jnp.asarray(rng.standard_normal(shape)) for shape in ((6, 9), 6))
+    model = lb.LinearGaussian(a, prior, lb.DiagonalCovariance(jnp.ones(6)))
+    found = lb.laplace_approximation(program.model, {**program.arguments(model), "data": data})
+    expected, root = model.condition(data), np.asarray(found.whitening.root)
+    np.testing.assert_allclose(found.whitening.mean, expected.mean, atol=1e-9)
+    np.testing.assert_allclose(root @ root.T, expected.covariance(), atol=1e-9)
+    assert float(found.log_evidence) == pytest.approx(float(expected.log_evidence), abs=1e-8)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from assertions import refuse
 from scipy import linalg, stats
 
 import lusee_bayes as lb
@@ -253,8 +254,7 @@ def test_badly_explored_energies_fail(truth):
 def test_draws_that_cannot_be_compared_are_refused(truth, broken, message):
     draws, energy = truth.draws(9)
     draws = broken(draws)
-    with pytest.raises(lb.InputError, match=message):
-        judge(draws, energy[:, : draws.shape[1]], truth.posterior)
+    refuse(message, judge, draws, energy[:, : draws.shape[1]], truth.posterior)
     # a hundred are enough to be judged
     assert judge(*truth.draws(9, draws=100), truth.posterior).eigenvalues.shape == (MODES,)
 

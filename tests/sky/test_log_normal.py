@@ -109,11 +109,8 @@ def test_power_law_slopes_are_derivatives_of_the_root(sky):
 
 def test_refusals():
     refuse("template must be positive", LogNormalSky.of, Waves(0.0), SPECTRUM, MHZ, band=20)
-    refuse("template must be positive", LogNormalSky.of, Waves(-1.0), SPECTRUM, MHZ, band=20)
-    for wrong in (0.0, -1.0):
-        spectrum = SPECTRUM.copy()
-        spectrum[3] = wrong
-        refuse("spectrum of the logarithm must", LogNormalSky.of, Waves(), spectrum, MHZ, band=20)
+    spectrum = np.where(np.arange(LMAX + 1) == 3, 0.0, SPECTRUM)
+    refuse("spectrum of the logarithm must", LogNormalSky.of, Waves(), spectrum, MHZ, band=20)
     refuse("does not hold harmonics", LogNormalSky.of, Waves(), SPECTRUM, MHZ, band=LMAX - 1)
 
 

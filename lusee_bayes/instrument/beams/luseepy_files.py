@@ -411,8 +411,7 @@ def read_response(path: str | Path) -> PortResponse:
     off = np.abs(sky + moon + loss - resistance).max() / np.abs(resistance).max()
     if off > RESISTANCE_TOLERANCE:
         raise InputError(
-            f"{path}: Rsky + Rmoon + Rloss differ from (ZA + ZA^H) / 2 by {off:.1g} of the "
-            "largest; expected equality"
+            f"{path}: Rsky + Rmoon + Rloss differ from (ZA + ZA^H) / 2, by {off:.1g} of it"
         )
     theta = np.linspace(0.0, np.pi / 2.0, len(theta_deg))
     return PortResponse(str(path), frequencies, theta, h_theta, h_phi, impedance, moon, loss)

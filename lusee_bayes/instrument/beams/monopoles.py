@@ -12,13 +12,15 @@ between arms, no lander: this is good enough for the paper's findings, and diffe
 parameters.
 
 **Point sources** are blurred by harmonic coefficients up to lmax, but not by the field pattern
-itself (:func:`beams_towards`).
+itself (:func:`beams_towards`). One of x K sr in the direction n(t), in the frame of the antennas,
+gives V_k(t) = x B_k(n(t)) (:func:`source_response`). It rises and sets sharply, and it may move.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -29,6 +31,7 @@ from lusee_bayes.core.checks import is_traced, require_array, require_finite, re
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.instrument.beams.fields import (
     AntennaFields,
+    Fields,
     HemisphereGrid,
     ProductBeams,
     mean_auto_integral,
@@ -38,6 +41,7 @@ from lusee_bayes.instrument.beams.fields import (
     wavenumber,
 )
 from lusee_bayes.instrument.beams.source import BeamSource
+from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import to_real
 
 N_LAYERS = 8
@@ -46,6 +50,8 @@ DEPTH_M = 100.0
 
 Frequency = float | Float[Array, ""]
 Vectors = Float[Array, "directions 3"]
+Angles = Float[Array, "*#directions"]
+Coefficients = Complex[Array, " theta"]
 
 
 def _array(x) -> Float[Array, "..."]:
@@ -94,7 +100,7 @@ class Regolith(eqx.Module):
 
     def reflection(
         self, cos_theta: Float[Array, " theta"], frequency_mhz: Frequency
-    ) -> tuple[Complex[Array, " theta"], Complex[Array, " theta"]]:
+    ) -> tuple[Coefficients, Coefficients]:
         """Return the reflection coefficients for waves that arrive at zenith angle theta.
 
         By recursion over the interfaces from the bottom up, with Fresnel coefficients at each.
@@ -126,13 +132,11 @@ class Regolith(eqx.Module):
         roots = [xp.sqrt(e - sin2) for e in eps[1:]]
         vertical = [cosine] + [xp.where(root.imag > 0, -root, root) for root in roots]
         s, p = xp.zeros_like(vertical[0]), xp.zeros_like(vertical[0])
+        # nothing comes back from below the last interface: s = p = 0
         for upper in range(N_LAYERS - 1, -1, -1):
             q0, q1 = vertical[upper], vertical[upper + 1]
             y0, y1 = q0 * eps[upper + 1], q1 * eps[upper]
             fresnel_s, fresnel_p = (q0 - q1) / (q0 + q1), (y0 - y1) / (y0 + y1)
-            if upper == N_LAYERS - 1:  # nothing comes back from below the last interface
-                s, p = fresnel_s, fresnel_p
-                continue
             delay = xp.exp(-2j * thickness * q1)
             s = (fresnel_s + s * delay) / (1.0 + fresnel_s * s * delay)
             p = (fresnel_p + p * delay) / (1.0 + fresnel_p * p * delay)
@@ -201,11 +205,8 @@ class Monopoles(BeamSource, eqx.Module):
 
     @compiled
     def towards(
-        self,
-        frequency_mhz: Frequency,
-        theta: Float[Array, "*#directions"],
-        phi: Float[Array, "*#directions"],
-    ) -> tuple[Complex[Array, "antennas *directions"], Complex[Array, "antennas *directions"]]:
+        self, frequency_mhz: Frequency, theta: Angles, phi: Angles
+    ) -> tuple[Fields, Fields]:
         """Return the fields of every arm in directions above the horizon; phase centre: the feed.
 
         Parameters
@@ -239,9 +240,7 @@ class Monopoles(BeamSource, eqx.Module):
         e_phi = across.astype(direct.dtype) * (direct + s * bounced)
         return e_theta, e_phi
 
-    def _current_integral(
-        self, k: Frequency, projection: Float[Array, "antennas *directions"]
-    ) -> Complex[Array, "antennas *directions"]:
+    def _current_integral(self, k: Frequency, projection: Array) -> Fields:
         """int_0^L sin k(L - s) exp(i k s projection) ds.
 
         = (L / 2i) [exp(i b) sinc a - exp(-i a) sinc b],  a, b = k L (1 -+ projection) / 2:
@@ -297,11 +296,7 @@ def monopole_beams(
 
 @compiled
 def _modes(
-    frequency_mhz: Float[Array, ""],
-    lmax: int,
-    monopoles: Monopoles,
-    stokes: str,
-    nodes: tuple[int, int] | None,
+    frequency_mhz: Frequency, lmax: int, monopoles: Monopoles, stokes: str, nodes: Any
 ) -> Float[Array, "products modes"]:
     exact = HemisphereGrid.for_lmax
     grid = exact(lmax) if nodes is None else HemisphereGrid.gauss_legendre(*nodes)
@@ -441,3 +436,49 @@ def _normalisation(frequency_mhz: Float[Array, ""], monopoles: Monopoles) -> Flo
     grid = HemisphereGrid.for_lmax(NORMALISATION_LMAX)
     e_theta, e_phi = monopoles.towards(frequency_mhz, grid.theta[:, None], grid.phi[None])
     return mean_auto_integral(AntennaFields(e_theta, e_phi, grid))
+
+
+def source_response(
+    observation: Observation,
+    galactic: Float[np.ndarray, "..."],
+    frequency_mhz: Frequency,
+    monopoles: Monopoles | None = None,
+    *,
+    stokes_v: float | Float[Array, ""] = 0.0,
+) -> Float[Array, "products times"]:
+    """Return the visibilities of a source of 1 K sr at every sample.
+
+    V_k(t) = B_k^I(n(t)) + stokes_v B_k^V(n(t)), since I = 1 K sr and V = stokes_v I. Multiply by
+    the flux in K sr, constant or (times,). Differentiable in ``monopoles`` and ``stokes_v``.
+
+    Parameters
+    ----------
+    observation : Observation
+    galactic : (3,) or (times, 3) array
+        As of :meth:`.Observation.antenna_directions`.
+    frequency_mhz : float
+    monopoles : Monopoles, optional
+        By default the paper's antennas.
+    stokes_v : float
+        V / I with the IAU's sign. Where it is positive, a receiver that looks towards the source
+        sees the electric field turn counter-clockwise (right-handed).
+
+    Returns
+    -------
+    (products, times) array
+        In K; zero while the source is below the horizon.
+
+    Raises
+    ------
+    InputError
+        As :meth:`.Observation.antenna_directions`; for vectors whose length is not one, a frequency
+        that is not positive, or ``|stokes_v| > 1``.
+    """
+    if not is_traced(stokes_v) and not abs(stokes_v) <= 1.0:
+        raise InputError(f"stokes_v is the fraction V / I, from -1 to 1, got {stokes_v}")
+    directions = observation.antenna_directions(galactic)
+    response = beams_towards(frequency_mhz, directions, monopoles)
+    if not is_traced(stokes_v) and stokes_v == 0.0:
+        return response
+    circular = beams_towards(frequency_mhz, directions, monopoles, stokes="V")
+    return response + stokes_v * circular

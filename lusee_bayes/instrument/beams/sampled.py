@@ -288,8 +288,7 @@ class SampledBeams(Described, BeamSource):
             scale = float(grid.integrate(patterns[auto_indices(self.n_ports)]).mean())
             if not scale > 0.0:
                 raise InputError(
-                    f"{self.path}: the autos integrate to {scale:g} sr on average above the "
-                    "horizon, expected a positive number"
+                    f"{self.path}: the autos integrate to {scale:g} sr on average, not above zero"
                 )
             patterns = patterns / scale
         return ProductBeams(grid.modes(patterns, lmax), float(frequency_mhz))
@@ -550,8 +549,7 @@ def from_uvbeam(beam: Any, *, conjugate: bool = False, path: str = "the UVBeam")
                 f"{n} of NSIDE {beam.nside}, in ring order"
             )
     fields = {"e_theta": along_theta, "e_phi": along_phi}
-    if conjugate:
-        fields = {name: one.conj() for name, one in fields.items()}
+    fields = {name: one.conj() if conjugate else one for name, one in fields.items()}
     return sampled_beams(np.asarray(beam.freq_array) / 1e6, **fields, **angles, path=path)
 
 
