@@ -13,7 +13,6 @@ from numpyro.infer.util import log_density
 from reference_linear import random_covariance
 
 import lusee_bayes as lb
-from lusee_bayes.core.arrays import on_host
 from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.experiment.model import full_model, radiometer, simulate
 from lusee_bayes.experiment.rounds import Inference
@@ -73,8 +72,7 @@ def at_times(data: lb.Visibilities, keep: np.ndarray) -> lb.Visibilities:
 
 def unknowns_report(experiment: lb.Experiment, found: Inference) -> UnknownsReport | None:
     """What data alone tell of receivers, ground and gain table."""
-    posterior = on_host(found.posterior)
-    unknowns = Unknowns.of(experiment, found, posterior.mean)
+    unknowns, posterior = Unknowns.of(experiment, found), found.posterior
     return None if unknowns is None else unknowns.report(posterior.mean, posterior.covariance())
 
 
