@@ -100,13 +100,11 @@ def map_command(
     joint
         One posterior for the skies of all channels, with the scenario's spectral prior.
     """
-    from lusee_bayes.report.pages import REPORT
     from lusee_bayes.runs.cost import demand_of
     from lusee_bayes.runs.map_run import run_map
 
     loaded = options.load(
         scenario,
-        flight__clock=options.clock,
         frequencies_mhz=frequencies,
         joint=joint,
         output__draws=draws,
@@ -120,7 +118,7 @@ def map_command(
         given = {"data": options.data, "truth": truth, "earlier": add, "thorough": diagnose}
         folder = options.folder(scenario)
         run = run_map(loaded, folder, engine=opened, **given, **options.running())
-    options.tell(*run.result.lines(), f"look at {run.folder / REPORT}", files=run.files)
+    options.tell(*run.result.lines(), f"look at {run.page}", files=run.files)
 
 
 @app.command(name="simulate")
@@ -285,11 +283,10 @@ def sample_command(
         Channels in MHz, as 10,25,30 or as first:last:step, one after the other: each in a folder of
         its own, and their maps together in cubes. With --resume, finished ones are taken over.
     """
-    from lusee_bayes.report.pages import REPORT
     from lusee_bayes.runs.sample_run import default_program, run_sample
     from lusee_bayes.sampling.programs import load_program
 
-    loaded = options.load(scenario, frequencies_mhz=frequencies, flight__clock=options.clock)
+    loaded = options.load(scenario, frequencies_mhz=frequencies)
     program = default_program(loaded) if model is None else load_program(model)
     run = run_sample(
         loaded,
@@ -303,7 +300,7 @@ def sample_command(
     several, lines = bool(loaded.frequencies_mhz), []
     for result in run.result:
         lines += [f"{result.experiment.scenario.frequency_mhz:g} MHz"] * several + result.lines()
-    there = f"the {REPORT} of every channel in {run.folder}" if several else run.folder / REPORT
+    there = f"the {run.page.name} of every channel in {run.folder}" if several else run.page
     options.tell(*lines, f"look at {there}", files=run.files)
 
 
@@ -336,9 +333,8 @@ def validate_command(
 
     require_simulations(simulations)
     require_draws(chains.draws)
-    loaded = options.load(scenario, flight__clock=options.clock)
+    loaded = options.load(scenario)
     from lusee_bayes.cli.tables import checks_table
-    from lusee_bayes.report.pages import REPORT
     from lusee_bayes.runs.validate_run import demand_of_calibration, run_validate
 
     with engine.open(demand_of_calibration(loaded)) as opened:
@@ -353,7 +349,7 @@ def validate_command(
             engine=opened,
             **options.running(),
         )
-    verdict = f"{run.result.headline()}; look at {run.folder / REPORT}"
+    verdict = f"{run.result.headline()}; look at {run.page}"
     options.tell(verdict, files=run.files, table=checks_table(run.result.checks))
     return 0 if run.result.passed else 1
 
@@ -457,11 +453,10 @@ def compare_priors_command(
         own section counts for the prior of its kind.
     """
     from lusee_bayes.cli.tables import priors_table
-    from lusee_bayes.report.pages import REPORT
     from lusee_bayes.runs.compare_run import run_compare_priors
     from lusee_bayes.runs.cost import demand_of
 
-    loaded = options.load(scenario, flight__clock=options.clock)
+    loaded = options.load(scenario)
     names = None if priors is None else [n.strip() for n in priors.split(",") if n.strip()]
     with engine.open(demand_of(loaded)) as opened:
         run = run_compare_priors(
@@ -474,7 +469,7 @@ def compare_priors_command(
             engine=opened,
             **options.running(),
         )
-    lines = [*run.result.lines(), f"look at {run.folder / REPORT}"]
+    lines = [*run.result.lines(), f"look at {run.page}"]
     options.tell(*lines, files=run.files, table=priors_table(run.result))
 
 

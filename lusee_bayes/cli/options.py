@@ -125,7 +125,8 @@ class Options:
         console = Console(quiet=self.quiet, soft_wrap=True)
         say(console, *(f"  {path}" for path in files))
         if table is not None:
-            show(console, table)
+            # within the width of the terminal: its cells are wrapped
+            console.print(table, soft_wrap=False)
         say(console, *lines)
 
 
@@ -192,6 +193,10 @@ class DataOptions(ScenarioOptions):
     data: Annotated[tuple[Path, ...] | None, Many] = None
     clock: str | None = None
 
+    def load(self, source: str, **entries: object) -> Scenario:
+        """As :meth:`ScenarioOptions.load`, with the clock."""
+        return super().load(source, flight__clock=self.clock, **entries)
+
 
 @Parameter(name="*")
 @dataclass(frozen=True)
@@ -250,8 +255,3 @@ def say(console: Console, *lines: object) -> None:
     """Print lines as they are."""
     for line in lines:
         console.print(str(line), highlight=False, markup=False)
-
-
-def show(console: Console, table: Table) -> None:
-    """Print a table within the width of the terminal: its cells are wrapped."""
-    console.print(table, soft_wrap=False)

@@ -390,8 +390,7 @@ def channel_result(
         std=np.sqrt(variance),
         prior_fraction=mean_over_m(share),
         pixel_std=width,
-        # not a part of more draws, which would stay in memory with it
-        draws=np.array(draws),
+        draws=np.asarray(draws),
         log_likelihood=np.asarray(log_likelihood),
         covariance=covariance if covariance_kept else None,
         information_bits=information_bits,

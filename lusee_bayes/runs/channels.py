@@ -529,11 +529,11 @@ def map_channels(
     identity = identity_of(scenario, data, truth, digest, thorough)
     files = ChannelFiles(folder.resolve(), identity)
     channels = tuple(channel.anchored() for channel in scenario.channels())
-    kind = ChannelInformation if scenario.joint else ChannelAlone
     alone = not scenario.joint and not scenario.ties_receivers
+    kind = ChannelResult if alone else ChannelInformation if scenario.joint else ChannelAlone
 
-    def observe(channel: Scenario) -> ChannelResult | tuple | InputError:
-        """Look at the data of a channel: its result, or what the result of all takes of it."""
+    def observe(channel: Scenario) -> tuple | str:
+        """Look at the data of a channel: what the others need of it, or why it cannot be mapped."""
 
         def make() -> ChannelResult | ChannelInformation | ChannelAlone:
             made = condition(channel, Stages())
@@ -541,46 +541,46 @@ def map_channels(
             return made.result(known) if alone else kind.of(made, known)
 
         try:
-            kept = files.kept(channel, ChannelResult if alone else kind, make)
+            kept = files.kept(channel, kind, make)
         except InputError as error:
-            return error
-        return kept if alone else kept.shared()
+            return str(error)
+        return () if alone else kept.shared()
 
     names = [names_of((channel,)) for channel in channels]
     found = engine.each(Tasks(observe, channels, names), stages, "channels")
     by_channel = list(zip(channels, found, strict=True))
-    unmapped = {c.frequency_mhz: str(x) for c, x in by_channel if isinstance(x, InputError)}
+    unmapped = {channel.frequency_mhz: why for channel, why in by_channel if isinstance(why, str)}
     if len(unmapped) == len(channels):
         raise InputError(f"no channel can be mapped: {_reasons(unmapped)}")
-    mapped = [channel for channel in channels if channel.frequency_mhz not in unmapped]
-    found = [one for one in found if not isinstance(one, InputError)]
+    mapped, shared = zip(*(one for one in by_channel if not isinstance(one[1], str)), strict=True)
     components, tied = None, None
     if scenario.joint:
         left = _without(unmapped, scenario)
-        at_hand = ChannelsInFiles(tuple(mapped), files, engine, stages)
+        at_hand = ChannelsInFiles(mapped, files, engine, stages)
         # coverage is compared with draws
         n_draws = max(scenario.output.draws, N_DRAWS if data is None or truth else 0)
-        components = solve_components(left, at_hand, found, n_draws)
-    elif scenario.ties_receivers:
-        tied = tie_receivers(scenario, [channel.frequency_mhz for channel in mapped], found)
+        components = solve_components(left, at_hand, shared, n_draws)
+    elif not alone:
+        tied = tie_receivers(scenario, [channel.frequency_mhz for channel in mapped], shared)
 
-    def finish(number: int) -> ChannelResult:
-        """The result of a channel, given what all have in common."""
+    def finish(number: int) -> None:
+        """Write the result of a channel, given what all have in common."""
         channel, common = mapped[number], components or tied
         own = scenario if scenario.joint else channel
 
         def make() -> ChannelResult:
             return files.read(channel, kind).given(common, number, own)
 
-        return files.kept(channel, ChannelResult, make)
+        files.kept(channel, ChannelResult, make)
 
     if not alone:
         stage = "joint skies" if scenario.joint else "smooth receivers"
         tasks = Tasks(finish, range(len(mapped)), [names_of((channel,)) for channel in mapped])
-        found = engine.each(tasks, stages, stage)
+        engine.each(tasks, stages, stage)
+    results = tuple(files.read(channel, ChannelResult) for channel in mapped)
     evidence = 0.0 if tied is None else tied.log_evidence
     return MapResult(
-        scenario, tuple(found), components, stages.seconds, unmapped, tie_log_evidence=evidence
+        scenario, results, components, stages.seconds, unmapped, tie_log_evidence=evidence
     )
 
 

@@ -157,6 +157,11 @@ class RunOutcome(Generic[Result]):
     folder: Path
     files: list[Path]
 
+    @property
+    def page(self) -> Path:
+        """The page for people, of runs that have one."""
+        return self.folder / REPORT
+
 
 @dataclass(frozen=True)
 class Output:

@@ -209,51 +209,35 @@ def default_variations(source: str, scenario: Scenario) -> list[Variation]:
 
     A schedule keeps its dates and angles.
     """
-    families = {AS_GIVEN: {AS_GIVEN: scenario}}
-    if scenario.observation.schedule is None:
-        families |= families_of_runs(scenario)
-    radiometer = scenario.noise.radiometer
-    families["duty cycle"] = {
-        f"{duty:g}": scenario.with_section(
-            "noise", radiometer=radiometer.model_copy(update={"duty_cycle": duty})
-        )
-        for duty in DUTY_CYCLES
-    }
-    found = [
-        Variation(source, family, name, varied)
-        for family, members in families.items()
-        for name, varied in members.items()
-    ]
-    n_ports = scenario.beam.n_ports
-    if n_ports > 1:
-        found += [
-            Variation(source, "antenna lost", f"port {port}", scenario, (port,))
-            for port in range(n_ports)
-        ]
-    return found
-
-
-def families_of_runs(scenario: Scenario) -> dict[str, dict[str, Scenario]]:
-    """The scenario with its runs turned, longer or shorter, or by night."""
-    runs = scenario.observation.runs
-    cycles = sum(run.cycles for run in runs)
-    turned = [changed(runs, times=n, turn_deg=TURN_DEG) for n in PARTS[1:]]
-    nights = [changed(runs, times=n, night_only=True) for n in PARTS[:2]]
-    families = {
-        "turned, same time": {
-            angles(r): r for r in (changed(runs, 1.0 / n, n, TURN_DEG) for n in PARTS)
-        },
-        "turned, more time": {f"{length(r)}: {angles(r)}": r for r in turned},
-        "duration": {length(r): r for r in (changed(runs, n / cycles) for n in CYCLES)},
-        "nights only": {length(r): r for r in nights},
-    }
-    return {
-        family: {
-            name: scenario.with_section("observation", runs=varied)
-            for name, varied in members.items()
+    observation, radiometer = scenario.observation, scenario.noise.radiometer
+    found, runs = {(AS_GIVEN, AS_GIVEN): scenario}, observation.runs
+    families: dict[str, list[tuple[str, Runs]]] = {}
+    if observation.schedule is None:
+        total = sum(run.cycles for run in runs)
+        parted = [changed(runs, 1.0 / n, n, TURN_DEG) for n in PARTS]
+        turned = [changed(runs, times=n, turn_deg=TURN_DEG) for n in PARTS[1:]]
+        lasting = [changed(runs, cycles / total) for cycles in CYCLES]
+        nights = [changed(runs, times=n, night_only=True) for n in PARTS[:2]]
+        families = {
+            "turned, same time": [(angles(r), r) for r in parted],
+            "turned, more time": [(f"{length(r)}: {angles(r)}", r) for r in turned],
+            "duration": [(length(r), r) for r in lasting],
+            "nights only": [(length(r), r) for r in nights],
         }
-        for family, members in families.items()
-    }
+    for family, members in families.items():
+        for name, varied in members:
+            found[family, name] = scenario.with_section("observation", runs=varied)
+    for duty in DUTY_CYCLES:
+        section = radiometer.model_copy(update={"duty_cycle": duty})
+        varied = scenario.with_section("noise", radiometer=section)
+        found["duty cycle", f"{duty:g}"] = varied
+    variations = [Variation(source, *named, varied) for named, varied in found.items()]
+    ports = range(scenario.beam.n_ports if scenario.beam.n_ports > 1 else 0)
+    lost = [Variation(source, "antenna lost", f"port {k}", scenario, (k,)) for k in ports]
+    return variations + lost
+
+
+Runs = tuple[RunSection, ...]
 
 
 def changed(
@@ -262,7 +246,7 @@ def changed(
     times: int = 1,
     turn_deg: float = 0.0,
     **values: Any,
-) -> tuple[RunSection, ...]:
+) -> Runs:
     """Runs that last ``factor`` times as long, and all of them again and again.
 
     Each time they are turned by ``turn_deg`` more. ``values`` are others of every run.
