@@ -115,7 +115,7 @@ def map_command(
     if not several and engine != EngineOptions():
         raise InputError("--workers and --cluster share out channels; give --frequencies")
     with engine.open(demand_of(loaded)) if several else nullcontext() as opened:
-        given = {"data": options.data, "truth": truth, "earlier": add, "thorough": diagnose}
+        given = {"truth": truth, "earlier": add, "thorough": diagnose}
         folder = options.folder(scenario)
         run = run_map(loaded, folder, engine=opened, **given, **options.running())
     options.tell(*run.result.lines(), f"look at {run.page}", files=run.files)
@@ -292,9 +292,7 @@ def sample_command(
         loaded,
         options.folder(scenario, f"-{program.name}"),
         program=program,
-        sampler=chains.sampler(loaded.seed, algorithm),
-        data=options.data,
-        resume=chains.resume,
+        **chains.running(loaded.seed, algorithm),
         **options.running(),
     )
     several, lines = bool(loaded.frequencies_mhz), []
@@ -342,11 +340,9 @@ def validate_command(
             loaded,
             options.folder(scenario, "-validation"),
             name=Path(scenario).stem,
-            sampler=chains.sampler(loaded.seed),
             simulations=simulations,
-            data=options.data,
-            resume=chains.resume,
             engine=opened,
+            **chains.running(loaded.seed),
             **options.running(),
         )
     verdict = f"{run.result.headline()}; look at {run.page}"
@@ -463,7 +459,6 @@ def compare_priors_command(
             loaded,
             options.folder(scenario, "-priors"),
             names,
-            data=options.data,
             truth=truth,
             name=Path(scenario).stem,
             engine=opened,

@@ -23,8 +23,6 @@ from lusee_bayes.core.progress import Stages
 if TYPE_CHECKING:
     from lusee_bayes.core.engine import Demand, Engine
     from lusee_bayes.experiment.scenario import Scenario
-    from lusee_bayes.sampling.hmc import Sampler
-
 
 # a number and its unit
 DURATION = re.compile(r"\s*([0-9]*\.?[0-9]+(?:e[+-]?[0-9]+)?)\s*(s|min|h|d)\s*", re.ASCII)
@@ -115,7 +113,7 @@ class Options:
     quiet: Quiet = False
     verbose: Annotated[bool, Parameter(name=["--verbose", "-v"], negative="")] = False
 
-    def running(self) -> dict[str, bool | Stages]:
+    def running(self) -> dict[str, Any]:
         """What every run takes."""
         stages = Stages(Console(quiet=self.quiet, soft_wrap=True), verbose=self.verbose)
         return {"replace": self.force, "stages": stages}
@@ -196,6 +194,10 @@ class DataOptions(ScenarioOptions):
         """As :meth:`ScenarioOptions.load`, with the clock."""
         return super().load(source, flight__clock=self.clock, **entries)
 
+    def running(self) -> dict[str, Any]:
+        """What every run takes, and the data."""
+        return super().running() | {"data": self.data}
+
 
 @Parameter(name="*")
 @dataclass(frozen=True)
@@ -243,11 +245,12 @@ class ChainOptions:
     draws: Count = 1000
     warmup: Number = 150
 
-    def sampler(self, seed: int, algorithm: Literal["nuts", "hmc"] = "nuts") -> Sampler:
-        """What draws them."""
+    def running(self, seed: int, algorithm: Literal["nuts", "hmc"] = "nuts") -> dict[str, Any]:
+        """What every run takes that samples."""
         from lusee_bayes.sampling.hmc import Sampler
 
-        return Sampler(self.chains, self.warmup, self.draws, seed, algorithm)
+        sampler = Sampler(self.chains, self.warmup, self.draws, seed, algorithm)
+        return {"sampler": sampler, "resume": self.resume}
 
 
 def say(console: Console, *lines: object) -> None:

@@ -69,28 +69,25 @@ def run_simulate(
         waterfall cannot hold.
     """
     scenario = load_scenario(scenario)
-    path, channels = user_path(path), (scenario,)
-    stages = stages or Stages()
+    path, stages = user_path(path), stages or Stages()
     require_new(path, replace=replace, inputs=inputs_of(scenario))
-    if path.suffix == ".fits" and scenario.observation.window != "instant":
+    is_waterfall = path.suffix == ".fits"
+    if is_waterfall and scenario.observation.window != "instant":
         raise InputError(f"{path}: {NO_ROOM}")
+    if frequencies_mhz and not is_waterfall:
+        raise InputError(
+            f"'{path}': netCDF files hold one frequency; with --frequencies, give -o a name "
+            "that ends in .fits"
+        )
     require_fits(simulation_cost(scenario, max(1, len(frequencies_mhz))), scenario)
-    if frequencies_mhz:
-        if path.suffix != ".fits":
-            raise InputError(
-                f"'{path}': netCDF files hold one frequency; with --frequencies, give -o a name "
-                "that ends in .fits"
-            )
-        channels = _at(scenario, frequencies_mhz).channels()
-    experiments = [
-        observed(channel, stages=Stages(stages.console, verbose=stages.verbose))
-        for channel in channels
-    ]
+    channels = _at(scenario, frequencies_mhz).channels() if frequencies_mhz else (scenario,)
+    each = Stages(stages.console, verbose=stages.verbose)
+    experiments = [observed(channel, stages=each) for channel in channels]
     data = [experiment.data for experiment in experiments]
-    if path.suffix != ".fits":
+    if is_waterfall:
+        _write_waterfall(path, experiments, scenario)
+    else:
         data[0].write(path, {"scenario": scenario.to_yaml()})
-        return data
-    _write_waterfall(path, experiments, scenario)
     return data
 
 

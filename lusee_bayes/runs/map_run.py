@@ -96,16 +96,8 @@ def run_map(
             stages.say(cost.line())
         reduced = None if data is None else reduced_of(data, scenario, stages)
         given = _given(data, reduced, scenario, run.path)
-        made = map_channels(
-            scenario,
-            run.path,
-            data=given,
-            truth=truth,
-            earlier=earlier,
-            thorough=thorough,
-            engine=engine,
-            stages=stages,
-        )
+        more = {"truth": truth, "earlier": earlier, "thorough": thorough, "engine": engine}
+        made = map_channels(scenario, run.path, data=given, stages=stages, **more)
         known, times = made.stacked("truth") is not None, made.channel.taken
         provenance = Provenance.of(scenario, times, data, known_sky=known)
         made = replace_fields(made, reduced=reduced and _as_used(reduced, made))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -89,11 +88,7 @@ def run_paper(
 def _write_cases(computed: _Computed, folder: Path) -> None:
     (folder / CASES).mkdir()
     for name, path in computed.paths.items():
-        target = folder / CASES / f"{name}.nc"
-        try:
-            os.link(path, target)
-        except OSError:  # not every file system has links
-            shutil.copy2(path, target)
+        shutil.copy2(path, folder / CASES / f"{name}.nc")
 
 
 # what the folder of the paper's run holds; a new file is one line here
