@@ -149,16 +149,16 @@ def simulate_command(
     flight
         Write sessions of the spectrometer, as they come from the lander (flight.simulated).
     """
-    loaded = options.load(scenario)
-    given = {"frequencies_mhz": frequencies or (), **options.running()}
     from lusee_bayes.runs.data_run import run_simulate, run_simulate_flight
 
+    loaded = options.load(scenario, frequencies_mhz=frequencies)
     if flight:
-        files = run_simulate_flight(loaded, options.output or Path("flight"), **given)
+        place = options.output or Path("flight")
+        files = run_simulate_flight(loaded, place, **options.running())
         options.tell(*files.lines())
         return
     path = options.output or Path("data.nc")
-    data = run_simulate(loaded, path, **given)
+    data = run_simulate(loaded, path, **options.running())
     options.tell(
         f"{sum(d.layout.size for d in data)} visibilities of {data[0].layout.n_products} products "
         f"at {', '.join(f'{d.frequency_mhz:g}' for d in data)} MHz -> {path}",
@@ -327,14 +327,10 @@ def validate_command(
     simulations
         Data sets for simulation-based calibration.
     """
-    from lusee_bayes.sampling.least import require_draws, require_simulations
-
-    require_simulations(simulations)
-    require_draws(chains.draws)
-    loaded = options.load(scenario)
     from lusee_bayes.cli.tables import checks_table
     from lusee_bayes.runs.validate_run import demand_of_calibration, run_validate
 
+    loaded = options.load(scenario)
     with engine.open(demand_of_calibration(loaded)) as opened:
         run = run_validate(
             loaded,

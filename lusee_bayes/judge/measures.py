@@ -285,7 +285,7 @@ def expected_chi2(posterior: Posterior, n_data: int, variance: Modes | None = No
         power = np.asarray(prior.variance())
         return float(n_data - (1.0 - variance[power > 0] / power[power > 0]).sum())
     inverse = invert_lower(np.asarray(posterior.lower))
-    return float(n_data - len(inverse) + (inverse**2).sum())
+    return float(n_data - len(inverse) + np.vdot(inverse, inverse))
 
 
 def highest_altitude(observation: Observation, nside: int) -> Pixels:

@@ -100,7 +100,11 @@ def widened(posterior: Posterior, factor: float) -> tuple[Posterior, float]:
     off = posterior.white_mean - (0.0 if prior.white_mean is None else prior.white_mean)
     # with a basis, outside of its span the posterior is the prior
     inside = off if posterior.basis is None else posterior.basis.T @ off
-    precision = factor**2 * times_lower(lower, lower, transpose=True)
+    precision = times_lower(lower, lower, transpose=True)
+    precision *= factor**2
+    log_det = log_det_of(lower)
+    # as large as what follows
+    del lower
     precision[np.diag_indices(len(precision))] -= factor**2 - 1.0
     root = cholesky(precision, overwrite=True)
     if not np.isfinite(np.diagonal(root)).all():
@@ -112,7 +116,7 @@ def widened(posterior: Posterior, factor: float) -> tuple[Posterior, float]:
     step = (factor**2 - 1.0) * solve_lower(root, half, transpose=True)[:, 0]
     less = (1.0 - factor**-2) * float(inside @ (inside + step))
     moved = step if posterior.basis is None else posterior.basis @ step
-    log_evidence = posterior.log_evidence + 0.5 * (less + log_det_of(lower) - log_det_of(root))
+    log_evidence = posterior.log_evidence + 0.5 * (less + log_det - log_det_of(root))
     wide = Posterior(
         prior.widened(factor),
         (posterior.white_mean + moved) / factor,

@@ -38,7 +38,6 @@ def run_simulate(
     scenario: Scenario | str | Path,
     path: str | Path,
     *,
-    frequencies_mhz: Sequence[float] = (),
     replace: bool = False,
     stages: Stages | None = None,
 ) -> list[Visibilities]:
@@ -47,11 +46,10 @@ def run_simulate(
     Parameters
     ----------
     scenario : Scenario, or its file or name
+        Of one frequency, or of those of a waterfall; the noise of each has a seed of its own, one
+        more than that of the channel before.
     path : path
         The file: netCDF, or luseepy's waterfall if the name ends in ``.fits``.
-    frequencies_mhz : sequence of float
-        Channels of a waterfall; the noise of each has a seed of its own, one more than that of the
-        channel before. None for the scenario's frequency alone.
     replace : bool
         Replace the file if it is there already.
     stages : Stages, optional
@@ -74,13 +72,13 @@ def run_simulate(
     is_waterfall = path.suffix == ".fits"
     if is_waterfall and scenario.observation.window != "instant":
         raise InputError(f"{path}: {NO_ROOM}")
-    if frequencies_mhz and not is_waterfall:
+    if scenario.frequencies_mhz and not is_waterfall:
         raise InputError(
-            f"'{path}': netCDF files hold one frequency; with --frequencies, give -o a name "
-            "that ends in .fits"
+            f"'{path}': netCDF files hold one frequency; for frequencies_mhz (--frequencies), give "
+            "-o a name that ends in .fits"
         )
-    require_fits(simulation_cost(scenario, max(1, len(frequencies_mhz))), scenario)
-    channels = _at(scenario, frequencies_mhz).channels() if frequencies_mhz else (scenario,)
+    channels = (scenario,) if scenario.single else scenario.channels()
+    require_fits(simulation_cost(scenario, len(channels)), scenario)
     each = Stages(stages.console, verbose=stages.verbose)
     experiments = [observed(channel, stages=each) for channel in channels]
     data = [experiment.data for experiment in experiments]
@@ -89,11 +87,6 @@ def run_simulate(
     else:
         data[0].write(path, {"scenario": scenario.to_yaml()})
     return data
-
-
-def _at(scenario: Scenario, frequencies_mhz: Sequence[float]) -> Scenario:
-    several = {"frequencies_mhz": tuple(frequencies_mhz)} if frequencies_mhz else {}
-    return scenario.model_copy(update=several)
 
 
 def _write_waterfall(path: Path, experiments: Sequence[Experiment], scenario: Scenario) -> None:
@@ -206,7 +199,6 @@ def run_simulate_flight(
     scenario: Scenario | str | Path,
     folder: str | Path,
     *,
-    frequencies_mhz: Sequence[float] = (),
     replace: bool = False,
     stages: Stages | None = None,
 ) -> FlightFiles:
@@ -220,8 +212,6 @@ def run_simulate_flight(
         Takes ``session_000.h5``, ... , ``truth.npz`` with what is in which spectrum,
         ``scenario.yaml``, and ``gains.nc`` and ``clock.json`` where the scenario has no gain table
         and the files no clock.
-    frequencies_mhz : sequence of float
-        In place of the scenario's.
     replace : bool
         Replace sessions that are in the folder already.
     stages : Stages, optional
@@ -232,10 +222,12 @@ def run_simulate_flight(
     InputError
         As :func:`.simulate_flight`, and if the folder holds sessions already, or cannot be written.
     """
-    scenario, folder = load_scenario(scenario), user_path(folder)
-    _require_no_sessions(folder, replace)
-    stages = stages or Stages()
-    scenario = _at(scenario, frequencies_mhz)
+    scenario, folder, stages = load_scenario(scenario), user_path(folder), stages or Stages()
+    if not replace and (there := sorted(folder.glob("session_*"))):
+        raise InputError(
+            f"'{folder}' holds sessions already ({there[0].name}); give -o another folder, or "
+            "--force"
+        )
     with run_folder(folder, FLIGHT, scenario, replace=replace) as run:
         made, place = simulate_flight(scenario, stages), run.path
         with transaction(place, FLIGHT.name, origin=run.origin) as stage:
@@ -259,15 +251,6 @@ def _write_flight(made: FlightSimulation, stage: Path, folder: Path, stages: Sta
             blocks = _told(made.blocks(session), session.start, done)
             write_session(stage / name, made.rows(session), blocks, kind=made.section.kind)
     return names
-
-
-def _require_no_sessions(folder: Path, replace: bool) -> None:
-    """InputError where simulated sessions would take the place of others."""
-    found = sorted(path.name for path in folder.glob("session_*"))
-    if found and not replace:
-        raise InputError(
-            f"'{folder}' holds sessions already ({found[0]}); give -o another folder, or --force"
-        )
 
 
 def _told(
