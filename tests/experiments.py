@@ -22,6 +22,7 @@ from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.results.channel_map import Conditioned, conditioned
 from lusee_bayes.results.map_files import SavedInformation
 from lusee_bayes.sampling.programs import WHITE_SUFFIX, Program, latent_sites, numpyro_promotion
+from lusee_bayes.sky.prior import Prior
 from lusee_bayes.systematics.context import Around
 from lusee_bayes.testing.scenarios import small_scenario
 
@@ -88,7 +89,7 @@ def of_run(data: lb.Visibilities, run: int) -> lb.Visibilities:
     return at_times(data, data.observation.run == run)
 
 
-def correlated(prior: lb.Prior) -> lb.DensePrior:
+def correlated(prior: Prior) -> lb.DensePrior:
     """A prior with a mean and about this one's widths, whose modes are correlated."""
     width = np.sqrt(np.asarray(prior.variance()))
     rng = np.random.default_rng(6)
