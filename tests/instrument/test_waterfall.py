@@ -277,7 +277,7 @@ def test_simulate_writes_it_and_map_reads_it(tmp_path):
         (["-o", "w.fits", "--frequencies", "20,10"], "expected growing MHz"),
         (["-o", "w.fits", "--frequencies", "ten"], "expected growing MHz"),
         (["-o", "w.fits", "--frequencies", "5:50:0"], "expected growing MHz"),
-        (["-o", "w.fits", "--frequencies", "40:60:10"], "frequency_mhz"),
+        (["-o", "w.fits", "--frequencies", "40:60:10"], "frequencies_mhz.2 is 60"),
     ],
 )
 def test_channels_that_cannot_be_written(tmp_path, monkeypatch, capsys, arguments, message):
