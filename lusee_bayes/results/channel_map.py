@@ -271,10 +271,11 @@ class Conditioned:
                 fluxes = flux_table(experiment, own)
         with stages("diagnostics"):
             if not (alone or thorough):
-                split = Split.of(judge.posterior, judge.chi2, own.model.n_data, self.expected)
-            if alone or thorough or split.instrument.p < DOUBTFUL:
+                given = judge.posterior, judge.chi2, own.model.n_data, self.expected
+                instrument = Split.of(*given).instrument
+            if alone or thorough or instrument.p < DOUBTFUL:
                 left = residuals(judge, data)
-                split, judged = left.split, self._judged(left)
+                instrument, judged = left.split.instrument, self._judged(left)
             details = _details(self) if alone else None
         bad = judged is not None and judged.level == DOES_NOT_FIT
         if bad or (thorough and left is not None):
@@ -299,7 +300,7 @@ class Conditioned:
             prior_std=np.sqrt(np.asarray(own.model.prior.variance())),
             truth=None if data.truth is None else np.asarray(data.truth),
             highest_altitude=highest_altitude(data.observation, scenario.map_nside),
-            instrument=split.instrument,
+            instrument=instrument,
             prior=prior_sentence(experiment),
             parameters=() if learned is None else tuple(learned.as_rows()),
             log_evidence_learned=None if learned is None else learned.log_evidence,

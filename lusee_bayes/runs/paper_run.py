@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import xarray as xr
@@ -18,14 +16,6 @@ from lusee_bayes.paper.figures import FIGURES
 from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, rows_file, run_folder, text_file
 
 CASES, UNFINISHED = "cases", "unfinished-cases"
-
-
-@dataclass(frozen=True)
-class _Computed:
-    """The cases, and the file in which each is."""
-
-    cases: Cases
-    paths: dict[str, Path]
 
 
 def run_paper(
@@ -80,15 +70,14 @@ def run_paper(
 
         names = list(scenarios)
         engine.each(Tasks(compute, names, names), stages, "cases")
-        paths = {name: path_of(name) for name in names}
-        cases = {name: xr.load_dataset(path, engine="h5netcdf") for name, path in paths.items()}
-        return RunOutcome(cases, run.path, run.write(_Computed(cases, paths), stages).files)
+        cases = {name: xr.load_dataset(path_of(name), engine="h5netcdf") for name in names}
+        return run.write(cases, stages)
 
 
-def _write_cases(computed: _Computed, folder: Path) -> None:
+def _write_cases(cases: Cases, folder: Path) -> None:
     (folder / CASES).mkdir()
-    for name, path in computed.paths.items():
-        shutil.copy2(path, folder / CASES / f"{name}.nc")
+    for name, case in cases.items():
+        case.to_netcdf(folder / CASES / f"{name}.nc", engine="h5netcdf")
 
 
 # what the folder of the paper's run holds; a new file is one line here
@@ -96,13 +85,11 @@ PAPER = RunKind(
     "paper",
     outputs=(
         Output(_write_cases),
-        rows_file("cases.csv", lambda computed: case_table(computed.cases)),
-        rows_file("claims.csv", lambda computed: claim_table(computed.cases)),
-        text_file("claims.md", lambda computed: claims_as_markdown(claim_table(computed.cases))),
+        rows_file("cases.csv", case_table),
+        rows_file("claims.csv", lambda cases: claim_table(cases)),
+        text_file("claims.md", lambda cases: claims_as_markdown(claim_table(cases))),
     ),
-    figures={
-        name: lambda computed, draw=draw: draw(computed.cases) for name, draw in FIGURES.items()
-    },
+    figures=FIGURES,
     unfinished=UNFINISHED,
     resume="the same command continues from the finished cases",
 )
