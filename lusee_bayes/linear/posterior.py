@@ -250,7 +250,7 @@ def _require_precise(rounding: Float[Array, ""]) -> None:
         raise InputError(
             f"standard deviations of the map-space form would be wrong by {rounding:.1g} of "
             f"themselves (accepted: {PRECISION:g}): the data are too precise for the normal "
-            "equations; use form='data'"
+            "equations; use form=InData"
         )
 
 

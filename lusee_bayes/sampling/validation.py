@@ -248,9 +248,9 @@ def calibrate_sky(
         For fewer than 100 data sets.
     """
     solver = posterior.factorise()
-    size, rng = solver.prior.size, np.random.default_rng(seed)
+    size, rng = solver.model.prior.size, np.random.default_rng(seed)
     modes = np.unique(np.linspace(0, size - 1, min(N_RANKED, size)).astype(int))
-    directions = rng.standard_normal((N_RANKED, solver.prior.rank))
+    directions = rng.standard_normal((N_RANKED, solver.model.prior.rank))
     ranks = calibrate(
         truth.sample,
         eqx.Partial(_sky_draws, solver),

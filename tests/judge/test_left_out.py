@@ -13,6 +13,7 @@ from lusee_bayes.experiment.model import full_model
 from lusee_bayes.judge import left_out
 from lusee_bayes.judge.left_out import KINDS, LeftOut, groups_of
 from lusee_bayes.judge.residuals import held_out
+from lusee_bayes.linear.linear_gaussian import FromInformation, form_of
 
 # noise a thousand times larger than the telescope's: what matrices lose to cancellation is then
 # below the tolerances
@@ -152,7 +153,7 @@ def test_a_prior_that_correlates_modes(kind):
     """And that has a mean: the posterior with structure in time, and what it leaves out."""
     model, data, *_ = observed("few", kind)
     model = replace(model, prior=correlated(model.prior))
-    assert model.is_structured
+    assert form_of(model) is FromInformation
     found = model.condition(data.data).posterior
     inverse, sky, u = by_matrices(model, data)
     a, s, n = matrices(model)
