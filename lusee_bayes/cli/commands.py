@@ -327,10 +327,14 @@ def validate_command(
     simulations
         Data sets for simulation-based calibration.
     """
+    from lusee_bayes.sampling.least import require_draws, require_simulations
+
+    require_simulations(simulations)
+    require_draws(chains.draws)
+    loaded = options.load(scenario)
     from lusee_bayes.cli.tables import checks_table
     from lusee_bayes.runs.validate_run import demand_of_calibration, run_validate
 
-    loaded = options.load(scenario)
     with engine.open(demand_of_calibration(loaded)) as opened:
         run = run_validate(
             loaded,
