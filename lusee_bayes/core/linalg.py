@@ -277,10 +277,13 @@ def precise_residual(
     return ((vector - head @ top) - head @ (x - top)) - (matrix - head) @ x
 
 
-def invert_lower(lower: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Return L^-1 for lower triangular L; entries above the diagonal are not read."""
+def invert_lower(lower: Float[Array, "n n"], *, overwrite: bool = False) -> Float[Array, "n n"]:
+    """Return L^-1 for lower triangular L; entries above the diagonal are not read.
+
+    With ``overwrite`` it takes the place of NumPy's L, which has zeros above the diagonal.
+    """
     if namespace(lower) is np:
-        inverse = np.tril(lower)
+        inverse = lower if overwrite else np.tril(lower)
         _in_place("dtrtri", b"UN", inverse)
         return inverse
     n = lower.shape[0]
@@ -307,8 +310,8 @@ def inverse_from_cholesky(lower: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def spanning_rows(
-    matrix: Float[np.ndarray, "rows columns"], kind: np.ndarray, most: int
-) -> tuple[np.ndarray, Float[np.ndarray, "rows few"]] | None:
+    matrix: Float[np.ndarray, "rows columns"], kind: np.ndarray
+) -> tuple[np.ndarray, Float[np.ndarray, "rows few"]]:
     """Find few rows of a matrix that all of its rows are combinations of.
 
     Parameters
@@ -316,13 +319,11 @@ def spanning_rows(
     matrix : (rows, columns) array
     kind : (rows,) array
         Rows are combined with those of their kind only.
-    most : int
-        More rows are not looked for.
 
     Returns
     -------
     (few,) array of int
-        Which rows; or None, in place of both, where more would be needed.
+        Which rows.
     (rows, few) array
         Factors: the product with the few rows is the matrix, to ``SPANNED`` of its largest row.
     """
@@ -331,8 +332,6 @@ def spanning_rows(
     picked, along = [], []
     least = SPANNED**2 * (rest**2).sum(axis=1).max()
     while (squares := (rest**2).sum(axis=1)).max() > least:
-        if len(picked) == most:
-            return None
         k = int(squares.argmax())
         unit = rest[k] / np.sqrt(squares[k])
         # not by BLAS, whose threads would wait for each other every time

@@ -41,6 +41,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
+from scipy.linalg import block_diag
 
 from lusee_bayes.core.arrays import Grid, GridFlags, Square, Vector, on_host
 from lusee_bayes.core.engine import in_threads, once
@@ -187,10 +188,9 @@ class Stretch(NamedTuple):
     with_sky: Float[np.ndarray, "products few sky"]
     factors: Float[np.ndarray, "times few"]
 
-    def at(self, span: Span, times: Int[np.ndarray, " n"]) -> Stretch:
-        """F at some of its times, by few of them."""
-        combined = self.factors[np.searchsorted(self.times, span.few)]
-        return Stretch(times, combined @ self.half, combined @ self.with_sky, span.factors)
+    def factors_at(self, times: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n few"]:
+        """U at some of its times."""
+        return self.factors[np.searchsorted(self.times, times)]
 
 
 class LeftOut:
@@ -237,7 +237,7 @@ class LeftOut:
         self._lower = self._factorised(None if gone is not None else on_host(posterior))
         self._u = self._weighted_residuals()
         self.u = self._layout.scatter(self._cells.gather(self._u.T))
-        self._kept, self._whole, self._days = None, None, {}
+        self._kept, self._whole, self._spans = None, None, {}
         self._lost = np.full(self._u.shape, np.nan)
         if not self._summable:
             self._kept = self._halves(weigh(self._weights, self._rows(None)))
@@ -245,10 +245,10 @@ class LeftOut:
         self._day = self._data.observation.day
         short = len(self._u) <= SHARED and 16 * self._u.size * len(self._lower) <= KEPT_BYTES
         self._stretch_of = (self._day // DAYS) * (not short)
-        if short:
+        if short and self._weights.ndim == 2:
             self._whole = self._stretch(0)
-            if self._weights.ndim == 3:
-                self._kept = self._expanded(self._whole)
+        elif short:
+            self._kept = self._halves_at(np.arange(len(self._u)), self._weights)
 
     @classmethod
     def of(
@@ -320,7 +320,7 @@ class LeftOut:
             batches.setdefault(self._within(group, -k - 1), []).append(k)
 
         def leave_out(number: int) -> list[Missed]:
-            stretch = self._judged_stretch(number) if number >= 0 else self._whole
+            stretch = self._stretch(number) if number >= 0 else self._whole
             return [self.missed(groups[k], stretch) for k in batches[number]]
 
         found = zip(batches.values(), in_threads(leave_out, list(batches)), strict=True)
@@ -341,11 +341,9 @@ class LeftOut:
         """The diagonal of K^-1, in 1/K^2; NaN where 64 bits do not tell it from nothing."""
         if self._kept is not None:
             self._lost = np.einsum("tkm,tkm->tk", self._kept[0], self._kept[0])
-        elif self._whole is not None:
-            self._lost = self._lost_at(self._whole)
         else:
             missing = np.unique(self._stretch_of[np.isnan(self._lost[:, 0])])
-            in_threads(self._judged_stretch, missing.tolist())
+            in_threads(self._stretch, missing.tolist())
         own = diagonal_of(self._weights)
         own = np.where(own > self._lost, own - self._lost, np.nan)
         return self._layout.scatter(self._cells.gather(own.T))
@@ -447,75 +445,60 @@ class LeftOut:
         return half.T.reshape(rows.shape), sky.reshape(*rows.shape[:-1], -1)
 
     def _stretch(self, number: int) -> Stretch:
+        """F at the times of a stretch; the diagonal of Y Q^-1 Y^T there is kept."""
         times = np.flatnonzero(self._stretch_of == number)
-        return self._computed(times, self._span(times, len(times)))
-
-    def _judged_stretch(self, number: int) -> Stretch:
-        """A stretch whose part of the diagonal of K^-1 is known, too."""
-        stretch = self._stretch(number)
-        self._lost[stretch.times] = self._lost_at(stretch)
+        stretch = self._stretch_at(times, self._span(times))
+        half, factors, weights = stretch.half, stretch.factors, self._weights[times]
+        if weights.ndim == 2:
+            within = half @ half.swapaxes(1, 2)
+            self._lost[times] = ((factors @ within) * factors).sum(-1).T * weights**2
+            return stretch
+        within = np.einsum("krm,lsm->krls", half, half, optimize=True)
+        for part in pieces(np.arange(len(times)), CHUNK):
+            u = factors[part]
+            found = np.einsum("tr,krls,ts->tkl", u, within, u, optimize=True)
+            self._lost[times[part]] = ((weights[part] @ found) * weights[part]).sum(-1)
         return stretch
 
-    def _lost_at(self, stretch: Stretch) -> Cells:
-        """The diagonal of Y Q^-1 Y^T at the times of a stretch."""
-        times, half, _, factors = stretch
-        if self._weights.ndim == 2:
-            within = half @ half.swapaxes(1, 2)
-            return ((factors @ within) * factors).sum(-1).T * self._weights[times] ** 2
-        within, lost = np.einsum("krm,lsm->krls", half, half, optimize=True), []
-        for part in pieces(np.arange(len(times)), CHUNK):
-            u, weights = factors[part], self._weights[times[part]]
-            found = np.einsum("tr,krls,ts->tkl", u, within, u, optimize=True)
-            lost.append(((weights @ found) * weights).sum(-1))
-        return np.concatenate(lost)
+    def _stretch_at(self, times: Int[np.ndarray, " n"], span: Span) -> Stretch:
+        return Stretch(times, *(x.swapaxes(0, 1) for x in self._halves_at(span.few)), span.factors)
 
-    def _computed(self, times: Int[np.ndarray, " n"], span: Span) -> Stretch:
-        parts = pieces(span.few, CHUNK)
-        halves = in_threads(lambda part: self._halves(self._rows(part).swapaxes(0, 1)), parts)
-        half, with_sky = (np.concatenate(x, axis=1) for x in zip(*halves, strict=True))
-        return Stretch(times, half, with_sky, span.factors)
+    def _halves_at(
+        self, times: Int[np.ndarray, " n"], weights: Weights | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """F L^-T and the columns of the sky of F Q^-1 at some times; with weights, of D F."""
+        shape, rank = (len(times), self._layout.n_products), len(self._lower)
+        half, sky = np.empty((*shape, rank)), np.empty((*shape, rank - self._n_templates))
 
-    def _span(self, times: Int[np.ndarray, " n"], most: int) -> Span | None:
-        """Few times that all of these are made of, day by day; None if it takes over ``most``."""
-        day = self._day[times]
-        parts = [self._span_of_day(times[day == number]) for number in np.unique(day)]
-        few = np.concatenate([part.few for part in parts])
-        again = self._spanning(few, most) if len(parts) > 1 else parts[0]
-        if again is None or len(again.few) > most:
-            return None
-        if len(parts) > 1:
-            edges = np.cumsum([len(part.few) for part in parts])[:-1]
-            mine = zip(parts, np.split(again.factors, edges), strict=True)
-            again = Span(again.few, np.concatenate([part.factors @ rest for part, rest in mine]))
-        return again
+        def fill(part: Int[np.ndarray, " n"]) -> None:
+            rows = self._rows(times[part])
+            rows = rows if weights is None else weigh(weights[part], rows)
+            half[part], sky[part] = self._halves(rows)
 
-    def _span_of_day(self, times: Int[np.ndarray, " n"]) -> Span:
-        """The same of times within a day, which is kept."""
+        in_threads(fill, pieces(np.arange(len(times)), CHUNK))
+        return half, sky
+
+    def _span(self, times: Int[np.ndarray, " n"]) -> Span:
+        """Few times that all of these are made of: first of every day, and then of all."""
         key = times.tobytes()
-        if key not in self._days:
-            self._days[key] = self._spanning(times, len(times))
-        return self._days[key]
+        if key not in self._spans:
+            days = np.split(times, np.flatnonzero(np.diff(self._day[times])) + 1)
+            if len(days) == 1:
+                self._spans[key] = self._spanning(times)
+            else:
+                every = [self._span(day) for day in days]
+                few, again = self._spanning(np.concatenate([span.few for span in every]))
+                self._spans[key] = Span(few, block_diag(*(span.factors for span in every)) @ again)
+        return self._spans[key]
 
-    def _spanning(self, times: Int[np.ndarray, " n"], most: int) -> Span | None:
+    def _spanning(self, times: Int[np.ndarray, " n"]) -> Span:
         pointing = self._model.coupling.pointing
         templates = self._t[times].reshape(len(times), -1)
         templates = templates / np.maximum(np.abs(templates).max(axis=0), 1e-300)
         features = [self._model.coupling.time_features(times), templates]
         run = np.searchsorted(pointing.run_starts, times, side="right")
-        found = spanning_rows(np.concatenate(features, axis=1), run, most)
-        return None if found is None else Span(times[found[0]], found[1])
-
-    def _expanded(self, stretch: Stretch) -> tuple[np.ndarray, np.ndarray]:
-        """Y L^-T and the columns of the sky of Y Q^-1 at all times."""
-        kept = tuple(np.empty((*self._u.shape, few.shape[-1])) for few in stretch[1:3])
-
-        def fill(times: Int[np.ndarray, " n"]) -> None:
-            for whole, few in zip(kept, stretch[1:3], strict=True):
-                rows = (stretch.factors[times] @ few).swapaxes(0, 1)
-                whole[times] = weigh(self._weights[times], rows)
-
-        in_threads(fill, pieces(np.arange(len(self._u)), CHUNK))
-        return kept
+        few, factors = spanning_rows(np.concatenate(features, axis=1), run)
+        return Span(times[few], factors)
 
     # --- groups in the space of their data ----------------------------------------------------
 
@@ -535,19 +518,20 @@ class LeftOut:
         whole = independent or (cells[blocks] == self._on_cells(self.present)[blocks]).all()
         if not whole or len(blocks) > rank:
             return None
-        span = self._span(blocks, rank // len(places))
-        if span is None or len(places) * min(span.factors.shape) > rank:
+        span = self._span(blocks)
+        if len(places) * min(span.factors.shape) > rank:
             return None
-        near = self._computed(blocks, span) if stretch is None else stretch.at(span, blocks)
+        stretch = self._stretch_at(blocks, span) if stretch is None else stretch
         if independent:
-            c, b = (root * some).T[..., None] * near.factors, b.swapaxes(0, 1)
+            c, b = (root * some).T[..., None] * span.factors, b.swapaxes(0, 1)
         else:
-            c = np.einsum("tkj,tr->tjkr", root * some[..., None], near.factors)
+            c = np.einsum("tkj,tr->tjkr", root * some[..., None], span.factors)
             c, b = c.reshape(1, some.size, -1), b.reshape(1, -1, 1)
         q, r = np.linalg.qr(c)
-        mine = slice(None) if len(places) == len(near.half) else places
-        halves = (x[mine].reshape(len(r), r.shape[-1], -1) for x in near[1:3])
-        w, with_sky = ((r @ x).reshape(-1, x.shape[-1]) for x in halves)
+        combined = stretch.factors_at(span.few)
+        mine = slice(None) if len(places) == len(stretch.half) else places
+        few = ((combined @ x[mine]).reshape(len(r), r.shape[-1], -1) for x in stretch[1:3])
+        w, with_sky = ((r @ x).reshape(-1, x.shape[-1]) for x in few)
         return w, with_sky, (q.swapaxes(1, 2) @ b).ravel()
 
     def _among_data(self, chosen: Chosen, w: Rows, with_sky: SkyRows, inside: Vector) -> Answer:
@@ -568,11 +552,11 @@ class LeftOut:
     @once
     def _trace(self) -> float:
         """tr Q^-1 of the sky."""
-        return self._trace_of_sky(self._lower)
+        return self._trace_of_sky(self._lower.copy())
 
     def _trace_of_sky(self, lower: Square) -> float:
-        """tr (L L^T)^-1 of the sky."""
-        inverse = invert_lower(lower)[:, self._n_templates :]
+        """tr (L L^T)^-1 of the sky; overwrites L."""
+        inverse = invert_lower(lower, overwrite=True)[:, self._n_templates :]
         return float(np.einsum("ij,ij->", inverse, inverse))
 
     def _taken_out(self, chosen: Chosen) -> Answer:

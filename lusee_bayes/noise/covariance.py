@@ -28,13 +28,14 @@ matrix products to run at full speed and small enough to follow the edge of the 
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.arrays import Array, compiled, namespace
 from lusee_bayes.core.checks import (
@@ -192,8 +193,10 @@ class Covariance(Described, eqx.Module):
         return total
 
 
-def _as_columns(x: Float[Array, "data *columns"]) -> Float[Array, "data all_columns"]:
-    return x.reshape(x.shape[0], -1)
+def _log_det(lower: Float[Array, "*batch n n"]) -> Float[Array, ""]:
+    """ln|L L^T|, of all blocks together."""
+    xp = namespace(lower)
+    return 2.0 * xp.log(xp.diagonal(lower, axis1=-2, axis2=-1)).sum()
 
 
 class CholeskyFactor(Factor):
@@ -202,22 +205,47 @@ class CholeskyFactor(Factor):
     Attributes
     ----------
     lower : (data, data) array
-        L; only the lower triangle is read.
+        L, with zeros above the diagonal.
     """
 
-    lower: Float[Array, "data data"]
+    lower: Float[Array, "*batch n n"]
+
+    def _columns(self, x: Float[Array, "data *columns"]) -> Float[Array, "*batch n all_columns"]:
+        return x.reshape(x.shape[0], -1)
+
+    def _data(self, columns: Array, shape: tuple[int, ...]) -> Float[Array, "data *columns"]:
+        return columns.reshape(shape)
 
     def whiten(self, x):
-        return solve_lower(self.lower, _as_columns(x), transpose=False).reshape(x.shape)
+        return self._data(solve_lower(self.lower, self._columns(x), transpose=False), x.shape)
 
     def whiten_transpose(self, x):
-        return solve_lower(self.lower, _as_columns(x), transpose=True).reshape(x.shape)
+        return self._data(solve_lower(self.lower, self._columns(x), transpose=True), x.shape)
 
     def colour(self, z):
-        return jnp.tril(self.lower) @ z
+        return self._data(namespace(self).tril(self.lower) @ self._columns(z), z.shape)
 
     def log_det(self):
-        return 2.0 * jnp.log(jnp.diagonal(self.lower)).sum()
+        return _log_det(self.lower)
+
+
+class TimeBlockFactor(CholeskyFactor):
+    """The Cholesky factors of the blocks of all times.
+
+    Attributes
+    ----------
+    lower : (times, products, products) array
+    layout : DataLayout
+    """
+
+    couples_times: ClassVar[bool] = False
+    layout: DataLayout
+
+    def _columns(self, x):
+        return self.layout.by_time(x)
+
+    def _data(self, columns, shape):
+        return self.layout.from_times(columns, shape)
 
 
 class DenseCovariance(Covariance):
@@ -494,39 +522,7 @@ class LowRankFactor(Factor):
         return self.base.colour(shrunk + self.v @ (self.v.T @ shrunk))
 
     def log_det(self):
-        xp = namespace(self)
-        return self.base.log_det() + 2.0 * xp.log(xp.diagonal(self.lower)).sum()
-
-
-class TimeBlockFactor(Factor):
-    """The Cholesky factors of the blocks.
-
-    Attributes
-    ----------
-    lower : (times, products, products) array
-    layout : DataLayout
-    """
-
-    couples_times: ClassVar[bool] = False
-    lower: Float[Array, "times products products"]
-    layout: DataLayout
-
-    def whiten(self, x):
-        white = solve_lower(self.lower, self.layout.by_time(x), transpose=False)
-        return self.layout.from_times(white, x.shape)
-
-    def whiten_transpose(self, x):
-        white = solve_lower(self.lower, self.layout.by_time(x), transpose=True)
-        return self.layout.from_times(white, x.shape)
-
-    def colour(self, z):
-        return self.layout.from_times(
-            namespace(self).tril(self.lower) @ self.layout.by_time(z), z.shape
-        )
-
-    def log_det(self):
-        xp = namespace(self)
-        return 2.0 * xp.log(xp.diagonal(self.lower, axis1=1, axis2=2)).sum()
+        return self.base.log_det() + _log_det(self.lower)
 
 
 class _OverLayout(Covariance):
@@ -621,8 +617,7 @@ class TimeBandedFactor(Factor):
     """The Cholesky factor of a banded covariance, in block rows.
 
     Its products are compiled: outside of a program, JAX compiles a loop anew in every call. The
-    last block row is padded with rows of the unit matrix. Whitened entries are in order of time,
-    which spares a transposition of every matrix that is whitened.
+    last block row is padded with rows of the unit matrix.
 
     Attributes
     ----------
@@ -640,83 +635,50 @@ class TimeBandedFactor(Factor):
     inverse: Float[Array, "blocks rows rows"]
     layout: DataLayout
 
-    def _pad(self, flat: Float[Array, "entries columns"]) -> Float[Array, "blocks rows columns"]:
-        n, rows = self.diagonal.shape[:2]
-        flat = jnp.pad(flat, ((0, n * rows - flat.shape[0]), (0, 0)))
-        return flat.reshape(n, rows, -1)
-
-    def _from_data(self, x: Float[Array, "data *columns"]) -> Float[Array, "blocks rows last"]:
-        grid = self.layout.by_time(x)
-        return self._pad(grid.reshape(grid.shape[0] * grid.shape[1], -1))
-
-    def _to_data(self, blocks: Array, shape: tuple[int, ...]) -> Float[Array, "data *columns"]:
-        flat = blocks.reshape(-1, blocks.shape[-1])
-        n_times, n_products = self.layout.n_times, self.layout.n_products
-        grid = flat[: n_times * n_products].reshape(n_times, n_products, -1)
-        return self.layout.from_times(grid, shape)
-
-    def _in_time_order(self) -> Int[Array, " data"] | None:
-        """Positions of the samples that are not missing, with products running fastest."""
-        if self.layout.index is None:
-            return None
-        return jnp.flatnonzero(self.layout.present.T.ravel(), size=self.layout.size)
-
-    def _from_white(self, z: Float[Array, "data *columns"]) -> Float[Array, "blocks rows last"]:
-        flat, where = z.reshape(z.shape[0], -1), self._in_time_order()
-        if where is not None:
-            n = self.layout.n_times * self.layout.n_products
-            flat = jnp.zeros((n, flat.shape[1])).at[where].set(flat)
-        return self._pad(flat)
-
-    def _to_white(self, blocks: Array, shape: tuple[int, ...]) -> Float[Array, "data *columns"]:
-        flat, where = blocks.reshape(-1, blocks.shape[-1]), self._in_time_order()
-        n = self.layout.n_times * self.layout.n_products
-        return (flat[:n] if where is None else flat[where]).reshape(shape)
-
-    def _window(self, columns: int) -> Float[Array, "window columns"]:
-        return jnp.zeros((self.left.shape[2], columns))
+    def _swept(
+        self, step: Callable, across: Array, x: Float[Array, "data *columns"], reverse: bool = False
+    ) -> Float[Array, "data *columns"]:
+        """x with a step for each block row: of what it hands on, and L before and in its row."""
+        (n, rows, window), layout = self.left.shape, self.layout
+        grid = layout.by_time(x)
+        flat = grid.reshape(layout.n_times * layout.n_products, -1)
+        padded = jnp.pad(flat, ((0, n * rows - len(flat)), (0, 0)))
+        start = jnp.zeros((window, flat.shape[1]))
+        parts = (self.left, across, padded.reshape(n, rows, -1))
+        _, found = jax.lax.scan(step, start, parts, reverse=reverse)
+        found = found.reshape(n * rows, -1)[: len(flat)]
+        return layout.from_times(found.reshape(grid.shape), x.shape)
 
     @eqx.filter_jit
     def whiten(self, x):
-        blocks, rows = self._from_data(x), self.diagonal.shape[1]
-
         def step(window, row):
             left, inverse, block = row
             solved = inverse @ (block - left @ window)
-            return jnp.concatenate([window[rows:], solved]), solved
+            return jnp.concatenate([window[len(block) :], solved]), solved
 
-        start = self._window(blocks.shape[-1])
-        _, solved = jax.lax.scan(step, start, (self.left, self.inverse, blocks))
-        return self._to_white(solved, x.shape)
+        return self._swept(step, self.inverse, x)
 
     @eqx.filter_jit
     def whiten_transpose(self, x):
-        blocks, rows = self._from_white(x), self.diagonal.shape[1]
-
         def step(pending, row):
             left, inverse, block = row
-            solved = inverse.T @ (block - pending[-rows:])
-            pending = jnp.concatenate([jnp.zeros((rows, block.shape[-1])), pending[:-rows]])
+            solved = inverse.T @ (block - pending[-len(block) :])
+            pending = jnp.concatenate([jnp.zeros_like(block), pending[: -len(block)]])
             return pending + left.T @ solved, solved
 
-        start = self._window(blocks.shape[-1])
-        _, solved = jax.lax.scan(step, start, (self.left, self.inverse, blocks), reverse=True)
-        return self._to_data(solved, x.shape)
+        return self._swept(step, self.inverse, x, reverse=True)
 
     @eqx.filter_jit
     def colour(self, z):
-        blocks, rows = self._from_white(z), self.diagonal.shape[1]
-
         def step(window, row):
             left, diagonal, block = row
-            return jnp.concatenate([window[rows:], block]), diagonal @ block + left @ window
+            coloured = diagonal @ block + left @ window
+            return jnp.concatenate([window[len(block) :], block]), coloured
 
-        start = self._window(blocks.shape[-1])
-        _, coloured = jax.lax.scan(step, start, (self.left, self.diagonal, blocks))
-        return self._to_data(coloured, z.shape)
+        return self._swept(step, self.diagonal, z)
 
     def log_det(self):
-        return 2.0 * jnp.log(jnp.diagonal(self.diagonal, axis1=1, axis2=2)).sum()
+        return _log_det(self.diagonal)
 
 
 class TimeBandedCovariance(_OverLayout):
