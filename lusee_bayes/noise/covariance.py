@@ -196,7 +196,7 @@ class Covariance(Described, eqx.Module):
 def _log_det(lower: Float[Array, "*batch n n"]) -> Float[Array, ""]:
     """ln|L L^T|, of all blocks together."""
     xp = namespace(lower)
-    return 2.0 * xp.log(xp.diagonal(lower, axis1=-2, axis2=-1)).sum()
+    return xp.asarray(2.0 * xp.log(xp.diagonal(lower, axis1=-2, axis2=-1)).sum())
 
 
 class CholeskyFactor(Factor):
