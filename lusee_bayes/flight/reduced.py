@@ -398,41 +398,51 @@ def _one_run_an_angle(observation: Observation) -> Observation:
 
 
 HINT = "make it with: lusee-bayes reduce SCENARIO SESSION..."
-CURVE_DIMS = ("level_3", "port", "curve")
-BAND_DIMS, GAIN_DIMS = ("frequency", "product", "bin"), ("frequency", "port", "bin")
 # what a run calls its file of them
 REDUCED = "reduced.nc"
+F, ROW, LEVELS = "frequency", "spectrum", len(LETTERS)
+# what lengths that are given are called in files
+LENGTHS = {PORTS: "port", LEVELS: "level_3"}
+
+
+def _at(place: str, *dims: str | int, **rules: Any) -> tuple[str, Variable]:
+    """Where a :class:`Reduced` has an array, and what a file has to hold of it."""
+    return place, Variable(dims, **rules)
+
+
+ARRAYS = {
+    F: _at("frequencies_mhz", F, low=0.0, grows=True, unit="MHz"),
+    "visibility": _at("values", F, "product", "bin", missing=True, unit="V^2/Hz"),
+    "before_flags": _at("before", F, "product", "bin", missing=True, unit="V^2/Hz"),
+    "n_averaged": _at("n_averaged", F, "bin", low=0.0),
+    "level": _at("level", "bin", PORTS, kind="text", choices=(*LETTERS, NO_LEVEL)),
+    "gain": _at("gain", F, PORTS, "bin", missing=True),
+    "gain_slope": _at("slope", F, PORTS, "component", "bin", missing=True),
+    "component_std": _at("component_std", LEVELS, PORTS, "component", low=0.0, optional=True),
+    "curve_mhz": _at("curves.frequencies_mhz", "curve", low=0.0, grows=True, unit="MHz"),
+    "curve_gain": _at("curves.gain", LEVELS, PORTS, "curve", missing=True),
+    "curve_std": _at("curves.std", LEVELS, PORTS, "curve", missing=True),
+    "scatter": _at("scatter", F, missing=True),
+    "line_scatter": _at("line_scatter", F, missing=True),
+    "curvature": _at("curvature", F, missing=True),
+    "jd1": _at("observation.times.jd1", ROW),
+    "jd2": _at("observation.times.jd2", ROW),
+    "run": _at("observation.run", ROW, kind="integer", low=0.0),
+    "bin_of": _at("bin_of", ROW, kind="integer", low=0.0),
+    "window_start_s": _at("observation.windows.start_s", ROW, optional=True),
+    "window_end_s": _at("observation.windows.end_s", ROW, optional=True),
+    "live_s": _at("observation.windows.live_s", ROW, low=0.0, optional=True),
+    "turntable_deg": _at("observation.turntable_deg", "run_number"),
+    "reason": _at("reason", F, ROW, kind="integer", low=0.0, high=len(REASONS) - 1.0),
+    "line_share": _at("lines", F, ROW, low=0.0, high=1.0),
+}
+STORED_AS = {"before_flags": np.float32, "level": object, "run": np.int32, "bin_of": np.int32}
+COUNTS, UTC = {"units": "count / (nV^2/Hz)"}, {"scale": "utc"}
+SAID = {"gain": COUNTS, "curve_gain": COUNTS, "curve_std": COUNTS, "jd1": UTC, "jd2": UTC}
+SAID["reason"] = {"flag_meanings": ", ".join(REASONS)}
 LAYOUT = Layout(
     "reduced spectra",
-    {
-        "frequency": Variable(("frequency",), low=0.0, grows=True, unit="MHz"),
-        "product": Variable(("product",), "text"),
-        "visibility": Variable(BAND_DIMS, missing=True, unit="V^2/Hz"),
-        "before_flags": Variable(BAND_DIMS, missing=True, unit="V^2/Hz"),
-        "n_averaged": Variable(("frequency", "bin"), low=0.0),
-        "level": Variable(("bin", PORTS), "text", choices=(*LETTERS, NO_LEVEL)),
-        "gain": Variable(GAIN_DIMS, missing=True),
-        "gain_slope": Variable(("frequency", "port", "component", "bin"), missing=True),
-        "component_std": Variable((len(LETTERS), PORTS, "component"), low=0.0, optional=True),
-        "curve_mhz": Variable(("curve",), low=0.0, grows=True),
-        "curve_gain": Variable((len(LETTERS), PORTS, "curve"), missing=True),
-        "curve_std": Variable((len(LETTERS), PORTS, "curve"), missing=True),
-        "scatter": Variable(("frequency",), missing=True),
-        "line_scatter": Variable(("frequency",), missing=True),
-        "curvature": Variable(("frequency",), missing=True),
-        "jd1": Variable(("spectrum",)),
-        "jd2": Variable(("spectrum",)),
-        "run": Variable(("spectrum",), "integer", low=0.0),
-        "bin_of": Variable(("spectrum",), "integer", low=0.0),
-        "window_start_s": Variable(("spectrum",), optional=True),
-        "window_end_s": Variable(("spectrum",), optional=True),
-        "live_s": Variable(("spectrum",), low=0.0, optional=True),
-        "turntable_deg": Variable(("run_number",)),
-        "reason": Variable(
-            ("frequency", "spectrum"), "integer", low=0.0, high=float(len(REASONS) - 1)
-        ),
-        "line_share": Variable(("frequency", "spectrum"), low=0.0, high=1.0),
-    },
+    {"product": Variable(("product",), "text")} | {name: one for name, (_, one) in ARRAYS.items()},
     {
         **PLACE_AND_TIME,
         "bandwidth_mhz": Attribute(low=0.0),
@@ -455,46 +465,26 @@ def write_reduced(path: str | Path, reduced: Reduced, scenario: str = "") -> Pat
     scenario : str
         Text of the scenario that they were reduced with.
     """
-    seen, meanings = reduced.observation, {"flag_meanings": ", ".join(REASONS)}
-    variables = {
-        "visibility": (BAND_DIMS, reduced.values, {"units": "V^2/Hz"}),
-        "before_flags": (BAND_DIMS, reduced.before.astype(np.float32), {"units": "V^2/Hz"}),
-        "n_averaged": (("frequency", "bin"), reduced.n_averaged),
-        "level": (("bin", "port"), reduced.level.astype(object)),
-        "gain": (GAIN_DIMS, reduced.gain, {"units": "count / (nV^2/Hz)"}),
-        "gain_slope": (("frequency", "port", "component", "bin"), reduced.slope),
-        "curve_mhz": (("curve",), reduced.curves.frequencies_mhz, {"units": "MHz"}),
-        "curve_gain": (CURVE_DIMS, reduced.curves.gain, {"units": "count / (nV^2/Hz)"}),
-        "curve_std": (CURVE_DIMS, reduced.curves.std, {"units": "count / (nV^2/Hz)"}),
-        "scatter": (("frequency",), reduced.scatter),
-        "line_scatter": (("frequency",), reduced.line_scatter),
-        "curvature": (("frequency",), reduced.curvature),
-        "jd1": (("spectrum",), seen.times.jd1, {"scale": "utc"}),
-        "jd2": (("spectrum",), seen.times.jd2, {"scale": "utc"}),
-        "run": (("spectrum",), seen.run.astype(np.int32)),
-        "bin_of": (("spectrum",), reduced.bin_of.astype(np.int32)),
-        "turntable_deg": (("run_number",), np.array(seen.turntable_deg)),
-        "reason": (("frequency", "spectrum"), reduced.reason, meanings),
-        "line_share": (("frequency", "spectrum"), reduced.lines),
-    }
-    if seen.windows is not None:
-        variables |= {
-            "window_start_s": (("spectrum",), seen.windows.start_s),
-            "window_end_s": (("spectrum",), seen.windows.end_s),
-            "live_s": (("spectrum",), seen.windows.live_s),
-        }
-    if reduced.component_std is not None:
-        variables["component_std"] = (("level_3", "port", "component"), reduced.component_std)
-    numbers = {"average_s": reduced.average_s, "gain_std": reduced.gain_std}
+    variables = {}
+    for name, (place, variable) in ARRAYS.items():
+        value = reduced
+        for part in place.split("."):
+            value = None if value is None else getattr(value, part)
+        if value is not None:
+            dims = [LENGTHS.get(dim, dim) for dim in variable.dims]
+            units = {"units": variable.unit} if variable.unit else {}
+            stored = np.asarray(value, dtype=STORED_AS.get(name))
+            variables[name] = (dims, stored, units | SAID.get(name, {}))
+    seen, names = reduced.observation, ("bandwidth_mhz", "average_s", "gain_std")
+    numbers = {name: getattr(reduced, name) for name in names}
     dataset = xr.Dataset(
         variables,
-        coords={"frequency": reduced.frequencies_mhz, "product": list(labels())},
+        coords={"product": list(labels())},
         attrs={
             "format": formats.REDUCED,
             "lon_deg": seen.lon_deg,
             "lat_deg": seen.lat_deg,
             "step_s": seen.step_s,
-            "bandwidth_mhz": reduced.bandwidth_mhz,
             "sessions": json.dumps([dict(one) for one in reduced.sessions]),
             "recipe": json.dumps(dict(reduced.recipe)),
             "scenario": scenario,
@@ -525,11 +515,10 @@ def read_reduced(path: str | Path) -> Reduced:
     here, said = found.arrays, found.values
     if tuple(map(str, here["product"])) != labels():
         raise InputError(f"{path} has other products than {', '.join(labels())}")
-    texts = {"sessions": said["sessions"], "recipe": said.get("recipe", "{}")}
     told: dict[str, Any] = {}
-    for name, text in texts.items():
+    for name in ("sessions", "recipe"):
         try:
-            told[name] = json.loads(text)
+            told[name] = json.loads(said.get(name, "{}"))
         except json.JSONDecodeError as error:
             raise InputError(f"{path}: the attribute {name} is no JSON: {error}") from error
     windows = None
@@ -541,24 +530,18 @@ def read_reduced(path: str | Path) -> Reduced:
         observation = observation_of(found, utc_of_jd(found), windows)
     if here["bin_of"].max() >= found.sizes["bin"]:
         raise InputError(f"{path}: bin_of goes beyond the {found.sizes['bin']} bins")
+    own = {place: here.get(name) for name, (place, _) in ARRAYS.items() if "." not in place}
+    bend, scatter = own.pop("curvature")[:, None, None], own.pop("scatter")[:, None]
     return Reduced(
-        frequencies_mhz=here["frequency"],
+        bend=bend,
+        span_scatter=scatter,
+        slab_scatter=own.pop("line_scatter")[:, None],
+        reason=own.pop("reason").astype(np.uint8),
+        lines=own.pop("lines").astype(np.float32),
+        **own,
         bandwidth_mhz=said["bandwidth_mhz"],
         observation=observation,
-        bin_of=here["bin_of"],
         average_s=said.get("average_s"),
-        reason=here["reason"].astype(np.uint8),
-        values=here["visibility"],
-        before=here["before_flags"],
-        n_averaged=here["n_averaged"],
-        level=here["level"],
-        gain=here["gain"],
-        slope=here["gain_slope"],
-        bend=here["curvature"][:, None, None],
-        span_scatter=here["scatter"][:, None],
-        slab_scatter=here["line_scatter"][:, None],
-        lines=here["line_share"].astype(np.float32),
-        component_std=here.get("component_std"),
         gain_std=said.get("gain_std"),
         curves=Curves(here["curve_mhz"], here["curve_gain"], here["curve_std"]),
         sessions=tuple(told["sessions"]),
