@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core import formats
+from lusee_bayes.core.checks import counted
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.formats import opened_tree
 from lusee_bayes.core.trees import from_tree
@@ -30,7 +31,7 @@ def describe_diagnostics(path: Path) -> list[str]:
                 lines.append("the data fit as a whole and were not judged group by group")
                 continue
             kinds, n = np.unique(judged["groups/kind"].values, return_counts=True)
-            counts = ", ".join(f"{k} {kind}s" for kind, k in zip(kinds, n, strict=True))
+            counts = ", ".join(map(counted, n.tolist(), kinds.tolist()))
             lines += [str(judged.attrs["verdict"]), f"residuals by {counts}"]
     return lines
 
