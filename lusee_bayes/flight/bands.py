@@ -175,14 +175,21 @@ def point_weights(
     (rows,) array of bool
         Whether there are enough points.
     """
-    terms = basis.shape[1]
+    inverse, possible = inverse_normals(basis, good)
+    return np.where(good & possible[:, None], inverse[:, 0] @ basis.T, 0.0), possible
+
+
+def inverse_normals(
+    basis: Float[np.ndarray, "points terms"], good: Bool[np.ndarray, "rows points"]
+) -> tuple[Float[np.ndarray, "rows terms terms"], Bool[np.ndarray, " rows"]]:
+    """Return the inverse normal matrix of the curve through the good points of every row.
+
+    Also whether there are enough points; it is the unit matrix where there are not.
+    """
     normal = np.einsum("rk,ka,kb->rab", good.astype(float), basis, basis, optimize=True)
-    possible = good.sum(axis=1) > terms
-    normal[~possible] = np.eye(terms)
-    unit = np.zeros((terms, 1))
-    unit[0] = 1.0
-    solved = np.linalg.solve(normal, np.broadcast_to(unit, (len(good), terms, 1)))[..., 0]
-    return np.where(good & possible[:, None], solved @ basis.T, 0.0), possible
+    possible = good.sum(axis=1) > basis.shape[1]
+    normal[~possible] = np.eye(basis.shape[1])
+    return np.linalg.inv(normal), possible
 
 
 Taper = Literal["rectangular", "hann", "hamming", "blackman"]

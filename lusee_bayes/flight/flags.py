@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float
 from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.lazy import special
 from lusee_bayes.core.reading import read_table
-from lusee_bayes.flight.bands import ChannelBand
+from lusee_bayes.flight.bands import ChannelBand, inverse_normals
 from lusee_bayes.flight.session import CHANNEL_MHZ, Averaging
 
 # of spectra in bands: of rows, autos and points of a curve; in time: of one span, rows as points
@@ -144,10 +144,7 @@ def fitted_curves(
     values, kept, basis
         As :func:`distances`.
     """
-    terms = basis.shape[1]
-    normal = np.einsum("rk,ka,kb->rab", kept.astype(float), basis, basis, optimize=True)
-    normal[kept.sum(axis=1) <= terms] = np.eye(terms)
-    inverse = np.linalg.inv(normal)
+    inverse, _ = inverse_normals(basis, kept)
     pulled = np.einsum("rpk,ka->rpa", np.where(kept[:, None], values, 0.0), basis)
     curve = np.einsum("rab,rpb,ka->rpk", inverse, pulled, basis, optimize=True)
     leverage = np.einsum("rab,ka,kb->rk", inverse, basis, basis, optimize=True)

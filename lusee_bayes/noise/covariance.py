@@ -35,7 +35,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Bool, Float, PRNGKeyArray
 
 from lusee_bayes.core.arrays import Array, compiled, namespace
 from lusee_bayes.core.checks import (
@@ -183,8 +183,7 @@ class Covariance(Described, eqx.Module):
                 "build both terms for the same observation and flags"
             )
         total = self.absorb(other)
-        if total is None:
-            total = other.absorb(self)
+        total = other.absorb(self) if total is None else total
         if total is None:
             raise InputError(
                 f"{type(self).__name__} and {type(other).__name__} have no common structure; "
@@ -205,7 +204,7 @@ class CholeskyFactor(Factor):
     Attributes
     ----------
     lower : (data, data) array
-        L, with zeros above the diagonal.
+        L; only the lower triangle is read.
     """
 
     lower: Float[Array, "*batch n n"]
@@ -501,13 +500,10 @@ class LowRankFactor(Factor):
         """B x, or B^T x with ``transpose``."""
         columns = x.reshape(x.shape[0], -1)
         inner = self.v.T @ columns
-        plus_one = self.lower + np.eye(self.lower.shape[0])
-        if transpose:
-            inner = solve_lower(self.lower, inner, transpose=False)
-            inner = solve_lower(plus_one, inner, transpose=True)
-        else:
-            inner = solve_lower(plus_one, inner, transpose=False)
-            inner = solve_lower(self.lower, inner, transpose=True)
+        roots = self.lower, self.lower + np.eye(self.lower.shape[0])
+        first, second = roots if transpose else roots[::-1]
+        inner = solve_lower(first, inner, transpose=False)
+        inner = solve_lower(second, inner, transpose=True)
         return (columns - self.v @ inner).reshape(x.shape)
 
     def whiten(self, x):
@@ -563,9 +559,7 @@ class TimeBlockCovariance(_OverLayout):
         n = layout.n_products
         require_shape("the noise blocks", blocks, (layout.n_times, n, n))
         if layout.index is not None:
-            present = layout.present.T
-            both = present[:, :, None] & present[:, None, :]
-            blocks = namespace(blocks, layout).where(both, blocks, np.eye(n)[None])
+            blocks = namespace(blocks, layout).where(_both(layout), blocks, np.eye(n)[None])
         require_finite("the noise blocks", blocks)
         require_symmetric("the noise covariance of one time", blocks)
         self.blocks = blocks
@@ -600,12 +594,16 @@ class TimeBlockCovariance(_OverLayout):
         return TimeBlockCovariance(factor * self.blocks, self.layout)
 
 
+def _both(layout: DataLayout) -> Bool[Array, "times products products"]:
+    """Whether both of two products are there at a time."""
+    present = layout.present.T
+    return present[:, :, None] & present[:, None, :]
+
+
 @compiled
 def _inverse_blocks(noise: TimeBlockCovariance) -> Float[Array, "products products times"]:
-    present = noise.layout.present.T
-    both = present[:, :, None] & present[:, None, :]
     xp = namespace(noise)
-    return xp.moveaxis(xp.where(both, xp.linalg.inv(noise.blocks), 0.0), 0, 2)
+    return xp.moveaxis(xp.where(_both(noise.layout), xp.linalg.inv(noise.blocks), 0.0), 0, 2)
 
 
 # rows of a block: measured at 16 products and a band of 43 times, whitening 5232 x 2304 on two
