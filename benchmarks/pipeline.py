@@ -21,6 +21,7 @@ from scipy.linalg.lapack import dpotrf
 import lusee_bayes as lb
 from lusee_bayes.core.progress import peak_memory_gb
 from lusee_bayes.experiment.model import full_model
+from lusee_bayes.instrument.pointing import Pointing
 
 
 def timed(work: Callable[[], object], repeats: int) -> tuple[float, float]:
@@ -49,8 +50,8 @@ def main() -> None:
     section, source = scenario.observation, scenario.beam.source()
     measure("rotations (lunarsky)", lambda: section.observation().mcmf_from_galactic)
     observation = section.observation()
-    measure("pointing", lambda: lb.Pointing.of(observation, scenario.lmax))
-    pointing = lb.Pointing.of(observation, scenario.lmax)
+    measure("pointing", lambda: Pointing.of(observation, scenario.lmax))
+    pointing = Pointing.of(observation, scenario.lmax)
     measure("b_lm", lambda: source.beams(scenario.frequency_mhz, scenario.lmax).modes)
     experiment = lb.build(scenario)
     setup, data = experiment.setup, experiment.data

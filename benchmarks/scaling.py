@@ -31,6 +31,7 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import tilt_powers
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.linear.joint import ComponentSums, summed_information
 from lusee_bayes.linear.normal_matrix import normal_matrix
 from lusee_bayes.noise.radiometer import radiometer_noise
@@ -65,7 +66,7 @@ def normal(cycles: float, step_s: float, lmax: int, order: int | None, dense: bo
     observation = lb.Observation.from_runs(runs, step_s=step_s)
 
     def coupling_of(order: int | None):
-        pointing = lb.Pointing.of(observation, lmax, order)
+        pointing = Pointing.of(observation, lmax, order)
         return lb.CouplingMatrix.build(setup.beams, pointing)
 
     coupling, sky = coupling_of(order), setup.sky.modes

@@ -25,6 +25,7 @@ import lusee_bayes as lb
 from lusee_bayes.core.progress import peak_memory_gb
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.noise.covariance import DenseCovariance
 
 console = Console(width=100)
 
@@ -53,7 +54,7 @@ def routes(repeats: int) -> None:
     model, data = fiducial()
     banded = median_seconds(lambda: model.condition(data).posterior.white_mean, repeats)
     matrix = model.noise.dense()
-    full = lb.LinearGaussian(model.coupling, model.prior, lb.DenseCovariance(matrix))
+    full = lb.LinearGaussian(model.coupling, model.prior, DenseCovariance(matrix))
     dense = median_seconds(lambda: full.condition(data).posterior.white_mean, repeats)
     n = np.asfortranarray(matrix)
     lower = np.asfortranarray(dpotrf(n, lower=1)[0])

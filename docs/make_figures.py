@@ -22,6 +22,7 @@ from lusee_bayes.core.harmonics import modes_to_map, power_spectrum
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import base_model, true_values
 from lusee_bayes.experiment.rounds import Inference
+from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.judge.measures import ell_cross, signal_to_noise
 from lusee_bayes.report.figures.drawing import BLUE, ORANGE, colour_bar, mollweide, shown
 from lusee_bayes.report.figures.maps import channel_map
@@ -46,7 +47,7 @@ def fixed_axis() -> None:
     experiment = lb.build(scenario)
     found, data, sky = lb.infer(experiment), experiment.data.data, experiment.setup.sky.modes
     beams, observation = experiment.setup.beams, experiment.setup.observation
-    exact = lb.CouplingMatrix.build(beams, lb.Pointing.of(observation, scenario.lmax, order=6))
+    exact = lb.CouplingMatrix.build(beams, Pointing.of(observation, scenario.lmax, order=6))
     sigma = np.sqrt(np.asarray(found.model.noise.diagonal()))
     truth = exact @ sky
     reference = signal_to_noise(found.posterior.mean, sky)
@@ -55,7 +56,7 @@ def fixed_axis() -> None:
     lines = {}
     for order, name in enumerate(["fixed at its mean", "wanders, first order", "second order"]):
         coupling = lb.CouplingMatrix.build(
-            beams, lb.Pointing.of(observation, scenario.lmax, order=order)
+            beams, Pointing.of(observation, scenario.lmax, order=order)
         )
         error = np.abs((coupling @ sky - truth) / sigma)
         model = lb.LinearGaussian(coupling, found.model.prior, found.model.noise)

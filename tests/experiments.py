@@ -13,16 +13,19 @@ from numpyro.infer.util import log_density
 from reference_linear import random_covariance
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.experiment import program_pieces
+from lusee_bayes.experiment.experiment import Experiment, program_pieces
 from lusee_bayes.experiment.model import full_model, radiometer, simulate
 from lusee_bayes.experiment.rounds import Inference
+from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.unknowns import Unknowns, UnknownsReport
 from lusee_bayes.instrument.products import DataLayout
+from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.channel_map import Conditioned, conditioned
 from lusee_bayes.results.map_files import SavedInformation
+from lusee_bayes.sampling.hmc import whitened
 from lusee_bayes.sampling.programs import WHITE_SUFFIX, Program, latent_sites, numpyro_promotion
-from lusee_bayes.sky.prior import Prior
+from lusee_bayes.sky.prior import DensePrior, Prior
 from lusee_bayes.systematics.context import Around
 from lusee_bayes.testing.scenarios import small_scenario
 
@@ -32,7 +35,7 @@ NOT_IN_SETUP = ("noise.gain", "noise.radiometer", "noise.beam", "noise.pointing"
 
 
 @lru_cache
-def small_experiment(*overrides: str, lmax: int = 6, cycles: float = 0.02) -> lb.Experiment:
+def small_experiment(*overrides: str, lmax: int = 6, cycles: float = 0.02) -> Experiment:
     """The experiment of :func:`small_scenario`, with simulated data."""
     scenario = small_scenario(*overrides, lmax=lmax, cycles=cycles)
     in_setup = tuple(o for o in overrides if not o.startswith(NOT_IN_SETUP))
@@ -40,10 +43,10 @@ def small_experiment(*overrides: str, lmax: int = 6, cycles: float = 0.02) -> lb
         return lb.build(scenario)
     built = small_experiment(*in_setup, lmax=lmax, cycles=cycles).setup
     setup = replace(built, scenario=scenario)
-    return lb.Experiment(setup, simulate(setup))
+    return Experiment(setup, simulate(setup))
 
 
-def four_ports(response: Path, *overrides: str) -> lb.Scenario:
+def four_ports(response: Path, *overrides: str) -> Scenario:
     """A cycle in 23 samples of four ports over warm ground: 16 modes, noise of 1e-5."""
     plain = ["lmax=3", "frequency_mhz=20", "observation.step_s=1e5"]
     noise = ["noise.radiometer.bandwidth_hz=1e5", "prior={model: isotropic, spectrum: sky}"]
@@ -52,14 +55,14 @@ def four_ports(response: Path, *overrides: str) -> lb.Scenario:
 
 
 def mapped(
-    experiment: lb.Experiment, earlier: SavedInformation | None = None, *, thorough: bool = False
-) -> tuple[Conditioned, lb.ChannelResult]:
+    experiment: Experiment, earlier: SavedInformation | None = None, *, thorough: bool = False
+) -> tuple[Conditioned, ChannelResult]:
     """What a map run finds of one frequency, without its folder."""
     made = conditioned(experiment, earlier)
     return made, made.result(made.known(thorough=thorough))
 
 
-def channels_of(scenario: lb.Scenario) -> list[lb.Visibilities]:
+def channels_of(scenario: Scenario) -> list[lb.Visibilities]:
     """The data of every channel."""
     return [lb.build(channel).data for channel in scenario.channels() or (scenario,)]
 
@@ -71,7 +74,7 @@ def at_times(data: lb.Visibilities, keep: np.ndarray) -> lb.Visibilities:
     return replace(data, data=flat, layout=layout, observation=observation)
 
 
-def unknowns_report(experiment: lb.Experiment, found: Inference) -> UnknownsReport | None:
+def unknowns_report(experiment: Experiment, found: Inference) -> UnknownsReport | None:
     """What data alone tell of receivers, ground and gain table."""
     unknowns, posterior = Unknowns.of(experiment, found), found.posterior
     return None if unknowns is None else unknowns.report(posterior.mean, posterior.covariance())
@@ -89,13 +92,13 @@ def of_run(data: lb.Visibilities, run: int) -> lb.Visibilities:
     return at_times(data, data.observation.run == run)
 
 
-def correlated(prior: Prior) -> lb.DensePrior:
+def correlated(prior: Prior) -> DensePrior:
     """A prior with a mean and about this one's widths, whose modes are correlated."""
     width = np.sqrt(np.asarray(prior.variance()))
     rng = np.random.default_rng(6)
     covariance = random_covariance(rng, len(width)) * width * width[:, None]
     mean = 0.3 * width * rng.normal(size=len(width))
-    return lb.DensePrior.of_covariance(jnp.asarray(covariance), jnp.asarray(mean))
+    return DensePrior.of_covariance(jnp.asarray(covariance), jnp.asarray(mean))
 
 
 def flagged(data: lb.Visibilities, flags: np.ndarray) -> lb.Visibilities:
@@ -111,7 +114,7 @@ def scaled_product(data: lb.Visibilities, product: int, factor: float) -> lb.Vis
     return replace(data, data=data.layout.gather(jnp.asarray(grid)))
 
 
-def program_arguments(program: Program, experiment: lb.Experiment) -> dict[str, Any]:
+def program_arguments(program: Program, experiment: Experiment) -> dict[str, Any]:
     """All that a program asks for, and the data."""
     model = full_model(experiment.setup, Around(experiment.data))
     arguments = program.arguments(model, program_pieces(experiment))
@@ -140,7 +143,7 @@ def draw_within(program, arguments, key, sampler, whitening=None, thin=1) -> dic
 
     The sampler's ``chains`` and ``seed`` are not used.
     """
-    run = program if whitening is None else lb.whitened(program, whitening)
+    run = program if whitening is None else whitened(program, whitening)
     white = set() if whitening is None else set(whitening.names)
     all_white = set(latent_sites(program, arguments)) == white
     dynamic, static = eqx.partition(arguments, eqx.is_array)

@@ -23,6 +23,9 @@ from lusee_bayes.experiment.data_files import digest_of, items_of
 from lusee_bayes.experiment.model import full_model, simulate
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.averaging import averaged
+from lusee_bayes.instrument.schedule import read_schedule
+from lusee_bayes.instrument.visibilities import read_visibilities
+from lusee_bayes.instrument.waterfalls import write_waterfall
 from lusee_bayes.runs.cost import posterior_cost, simulation_cost
 from lusee_bayes.runs.plan_run import default_variations, expected_inference, forecast
 from lusee_bayes.testing.contracts import assert_refused
@@ -57,7 +60,7 @@ def test_data_come_as_paths_or_in_memory(tmp_path, monkeypatch):
     """A string, ~ of a user, several frequencies: the same data by every way."""
     monkeypatch.setenv("HOME", str(tmp_path))
     path, _ = file_of(tmp_path, "mean")
-    read = lb.read_visibilities(path)
+    read = read_visibilities(path)
     for given in (path, str(path), "~/data.nc", [str(path)], read, (read,)):
         found = lb.read_data(given, scenario())
         assert found.digest() == read.digest() == digest_of(found)
@@ -131,9 +134,9 @@ def test_what_is_unclear_or_contradicts_is_refused(tmp_path, window, timestamp, 
 
 
 def test_no_experiment_of_data_with_unclear_times_or_a_fixed_axis_in_windows(tmp_path):
-    data = lb.read_visibilities(file_of(tmp_path, None)[0])
+    data = read_visibilities(file_of(tmp_path, None)[0])
     refuse("do not say what their times are; use data.stamped", set_up, scenario(), data)
-    data = lb.read_visibilities(file_of(tmp_path, "mean")[0])
+    data = read_visibilities(file_of(tmp_path, "mean")[0])
     with pytest.raises(lb.InputError, match="means over windows.*leave out observation.fixed_axis"):
         set_up(scenario("observation.fixed_axis=true"), data)
 
@@ -165,7 +168,7 @@ def test_waterfalls_are_instants_unless_the_scenario_says_other(tmp_path):
 def test_waterfalls_have_no_room_for_windows(tmp_path):
     experiment = lb.build(scenario("observation.window=mean"))
     with pytest.raises(lb.InputError, match=r"no room for windows.*observation\.window=instant"):
-        lb.write_waterfall(tmp_path / "w.fits", 2 * [experiment.data])
+        write_waterfall(tmp_path / "w.fits", 2 * [experiment.data])
     assert not list(tmp_path.iterdir())
 
 
@@ -194,7 +197,7 @@ def given(path):
 def test_a_schedule_is_simulated_and_mapped(path, given, tmp_path):
     scenario = lb.load_scenario("fiducial", given)
     observation = scenario.observation.observation()
-    expected = lb.Observation.from_schedule(lb.read_schedule(path), step_s=STEP_S)
+    expected = lb.Observation.from_schedule(read_schedule(path), step_s=STEP_S)
     np.testing.assert_array_equal(observation.times.jd, expected.times.jd)
     np.testing.assert_array_equal(observation.live_s, expected.live_s)
     # 3 days, 47.5 hours and 5.5 days in steps of 20000 s: 13, 9 and 24 of them

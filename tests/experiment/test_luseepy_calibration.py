@@ -23,6 +23,7 @@ from lusee_bayes.core.harmonics import from_healpy
 from lusee_bayes.experiment.model import base_model
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.products import DataLayout
+from lusee_bayes.instrument.waterfalls import read_waterfall
 
 pytestmark = pytest.mark.long
 SITE = {"lon_deg": 182.258, "lat_deg": -23.814}
@@ -87,7 +88,7 @@ def test_posteriors_of_gaussian_skies(naive, test_data, quadrature, calibrated):
     chi^2 follows its distribution with luseepy's rule, and does not with the exact quadrature."""
     lmax, every = 6, 10
     beam = test_data / "luseepy" / "synthetic_monopole_beam.fits"
-    waterfall = lb.read_waterfall(test_data / "luseepy" / "waterfall_exact_engine.fits")
+    waterfall = read_waterfall(test_data / "luseepy" / "waterfall_exact_engine.fits")
     keep = np.arange(328) % every == 0
     observation = waterfall.observation.select(keep)
     overrides = [f"frequency_mhz={FREQUENCY}", f"lmax={lmax}", f"beam.file={beam}"]

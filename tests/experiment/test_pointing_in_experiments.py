@@ -12,7 +12,7 @@ from scipy import stats
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.diagnosis import diagnose
-from lusee_bayes.experiment.experiment import program_pieces
+from lusee_bayes.experiment.experiment import Experiment, program_pieces
 from lusee_bayes.experiment.model import (
     base_model,
     full_model,
@@ -52,7 +52,7 @@ def known_sky():
     """The sky to 0.1 %, so that the data tell the clock, too."""
     pointing = f"noise.pointing={{{PRIORS}, true_values: {{{OFF}}}}}"
     setup = about_a_mean(set_up(scenario_of(TWO_RUNS, pointing, lmax=8, step_s=43200.0)), 1e-6, 3)
-    return lb.Experiment(setup, simulate(setup))
+    return Experiment(setup, simulate(setup))
 
 
 def test_a_clock_and_a_turntable_that_are_off_are_found(known_sky):
@@ -81,7 +81,7 @@ def test_a_clock_and_a_turntable_that_are_off_are_found(known_sky):
         update={"noise": known_sky.setup.scenario.noise.model_copy(update={"pointing": None})}
     )
     setup = replace(known_sky.setup, scenario=straight)
-    plain = lb.Experiment(setup, simulate(setup))
+    plain = Experiment(setup, simulate(setup))
     known = lb.infer(plain)
     expected = (known.posterior.mean - setup.sky.modes) / known.posterior.std()
     assert np.mean(pull**2) == pytest.approx(np.mean(expected**2), abs=0.2)
@@ -97,7 +97,7 @@ def test_ignored_the_report_points_at_it(known_sky):
     section = known_sky.setup.scenario.noise.pointing.model_copy(update={"treatment": "ignored"})
     noise = known_sky.setup.scenario.noise.model_copy(update={"pointing": section})
     scenario = known_sky.setup.scenario.model_copy(update={"noise": noise})
-    experiment = lb.Experiment(replace(known_sky.setup, scenario=scenario), known_sky.data)
+    experiment = Experiment(replace(known_sky.setup, scenario=scenario), known_sky.data)
     found = lb.infer(experiment)
     assert found.solution.chi2 > 2 * found.model.n_data
     report = pointing_report(experiment, found)
@@ -119,7 +119,7 @@ def test_where_nothing_is_off_the_report_is_silent():
     none = "true_values: {clock_s: 0, turntable_0_deg: 0, turntable_1_deg: 0}"
     nothing = f"noise.pointing={{clock_s: 60, turntable_deg: 0.3, {none}, treatment: ignored}}"
     setup = about_a_mean(set_up(scenario_of(TWO_RUNS, nothing, lmax=6, step_s=86400.0)), 1e-2, 5)
-    experiment = lb.Experiment(setup, simulate(setup))
+    experiment = Experiment(setup, simulate(setup))
     found = lb.infer(experiment)
     told = diagnosis(experiment, found)
     assert told.fits and "fit as they are" in " ".join(told.sentences())
@@ -212,7 +212,7 @@ def test_simulation_based_calibration():
         sky = replace(first.sky, modes=first.sky.modes + draw)
         scenario = first.scenario.model_copy(update={"seed": seed})
         setup = replace(first.under(sky), scenario=scenario, prior=prior)
-        experiment = lb.Experiment(setup, simulate(setup))
+        experiment = Experiment(setup, simulate(setup))
         found = lb.infer(experiment)
         mean, covariance = offset_posterior(found)
         truth = true_values(setup)

@@ -14,7 +14,7 @@ from experiments import small_experiment
 import lusee_bayes as lb
 from lusee_bayes.core.section import Positive, Section, Treatment
 from lusee_bayes.experiment import model as model_module
-from lusee_bayes.experiment.experiment import build
+from lusee_bayes.experiment.experiment import Experiment, build
 from lusee_bayes.experiment.model import (
     full_model,
     model_to_sample,
@@ -23,13 +23,14 @@ from lusee_bayes.experiment.model import (
     systematics,
     true_values,
 )
-from lusee_bayes.experiment.rounds import SETTLED, prediction
+from lusee_bayes.experiment.rounds import SETTLED, Inference, prediction
+from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import Setup
-from lusee_bayes.noise.covariance import LowRankUpdate
+from lusee_bayes.noise.covariance import Covariance, LowRankCovariance, LowRankUpdate
 from lusee_bayes.systematics.beam import beam_rms_difference, difference_of_beams, true_beams
 from lusee_bayes.systematics.context import Around
 from lusee_bayes.systematics.registered import SYSTEMATICS, NoiseSection
-from lusee_bayes.systematics.systematic import AdditiveNoise, Truth, multiplied
+from lusee_bayes.systematics.systematic import AdditiveNoise, Systematic, Truth, multiplied
 from lusee_bayes.testing.scenarios import small_scenario
 
 GAIN = "noise.gain.sigma=0.01"
@@ -37,12 +38,12 @@ SHIFT = "noise.beam.shift_mhz=4"
 PARAMETERS = "noise.beam.parameters={length_m: 0.1, zenith_angle_deg: 2.0}"
 
 
-def experiment(*overrides: str) -> lb.Experiment:
+def experiment(*overrides: str) -> Experiment:
     return small_experiment(*overrides, cycles=0.2)
 
 
 @lru_cache
-def inferred(*overrides: str) -> lb.Inference:
+def inferred(*overrides: str) -> Inference:
     return lb.infer(experiment(*overrides))
 
 
@@ -159,7 +160,7 @@ class NoiseWithHum(NoiseSection):
     hum: HumSection | None = None
 
 
-class ScenarioWithHum(lb.Scenario):
+class ScenarioWithHum(Scenario):
     """A scenario that can say so."""
 
     noise: NoiseWithHum = NoiseWithHum()
@@ -178,8 +179,8 @@ class Hum(AdditiveNoise):
         root = patterns(setup.layout.size, section.sigma_k)
         return cls("hum", setup.layout, jnp.asarray(root))
 
-    def covariance(self) -> lb.Covariance:
-        return lb.LowRankCovariance(self.root, "the hum")
+    def covariance(self) -> Covariance:
+        return LowRankCovariance(self.root, "the hum")
 
 
 def patterns(n_data: int, sigma_k: float) -> np.ndarray:
@@ -193,7 +194,7 @@ def registered(monkeypatch, tiny_experiment):
     monkeypatch.setattr(model_module, "SYSTEMATICS", (*SYSTEMATICS, Hum))
 
 
-def with_hum(**section) -> lb.Scenario:
+def with_hum(**section) -> Scenario:
     """The small scenario with the hum, if there is one."""
     tree = small_experiment().scenario.model_dump()
     tree["noise"]["hum"] = section or None
@@ -259,7 +260,7 @@ def test_simulated_data_hold_it_whatever_its_treatment(registered):
 # --- a term with values of its own ----------------------------------------------------------------
 
 
-class Amplifier(lb.Systematic):
+class Amplifier(Systematic):
     """A factor that simulated data hold and the model does not know."""
 
     key = "noise.hum"
@@ -277,7 +278,7 @@ def test_systematics_act_in_their_order(monkeypatch):
     """What comes before the amplifier is amplified with the sky; radiometer noise never is."""
     setup = setup_with(sigma_k=100.0)
 
-    def simulated(*more: type[lb.Systematic]) -> np.ndarray:
+    def simulated(*more: type[Systematic]) -> np.ndarray:
         monkeypatch.setattr(model_module, "SYSTEMATICS", (*SYSTEMATICS, *more))
         known = {Hum: "hum_noise", Amplifier: "factor"}
         assert set(true_values(setup)) == {known[systematic] for systematic in more}

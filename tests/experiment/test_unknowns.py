@@ -12,6 +12,7 @@ from experiments import four_ports, unknowns_report
 from reference_linear import white_posterior
 
 import lusee_bayes as lb
+from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import radiometer, simulate, true_values
 from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.experiment.unknowns import NullDirection
@@ -25,11 +26,11 @@ COLUMNS = ["unknown", "unit", "value", "std", "prior", "prior_std"]
 
 
 @pytest.fixture(scope="module")
-def experiment(response_file) -> lb.Experiment:
+def experiment(response_file) -> Experiment:
     return lb.build(four_ports(response_file, RECEIVER, GROUND, TABLE))
 
 
-def joint(experiment: lb.Experiment):
+def joint(experiment: Experiment):
     """Sky and unknowns of the model about what the data told, as one Gaussian in NumPy."""
     found, setup = lb.infer(experiment), experiment.setup
     table = found.systematics[-1]
@@ -190,7 +191,7 @@ def test_receivers_and_ground_that_are_not_known_cost_the_monopole_alone(respons
         scenario = first.scenario.model_copy(update={"seed": seed})
         setup = replace(first, sky=replace(first.sky, modes=modes), scenario=scenario)
         data = simulate(setup)
-        unknown, told = (lb.infer(lb.Experiment(s, data)).posterior for s in (setup, known(setup)))
+        unknown, told = (lb.infer(Experiment(s, data)).posterior for s in (setup, known(setup)))
         off = np.asarray(unknown.mean) - np.asarray(told.mean)
         moved.append(off / np.asarray(unknown.std()))
     moved = np.abs(moved)
@@ -200,5 +201,5 @@ def test_receivers_and_ground_that_are_not_known_cost_the_monopole_alone(respons
     wrong = known(first)
     wrong = replace(wrong, scenario=wrong.scenario.model_copy(update={"seed": 19}))
     wrong = replace(wrong, background=first.background)
-    off = np.asarray(lb.infer(lb.Experiment(wrong, data)).posterior.mean) - np.asarray(unknown.mean)
+    off = np.asarray(lb.infer(Experiment(wrong, data)).posterior.mean) - np.asarray(unknown.mean)
     assert np.abs(off / np.asarray(unknown.std()))[1:].max() > 1.0

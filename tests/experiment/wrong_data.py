@@ -16,25 +16,28 @@ from made_skies import SmoothSky, SpottySky
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers, turn_about_z
 from lusee_bayes.experiment.model import radiometer
+from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import Setup, set_up
+from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.products import labels
+from lusee_bayes.sky.sky_source import SkySource
 
 LABELS = labels(4)
 
 
-def scenario(lmax: int = 8, *overrides: str, frequency_mhz: float = 25.0) -> lb.Scenario:
+def scenario(lmax: int = 8, *overrides: str, frequency_mhz: float = 25.0) -> Scenario:
     """One cycle of 110 samples with every default, at one turntable angle."""
     sizes = {"frequency_mhz": frequency_mhz, "lmax": lmax, "observation.step_s": 21460.0}
-    return changed(lb.Scenario(), *(f"{k}={v}" for k, v in sizes.items()), *overrides)
+    return changed(Scenario(), *(f"{k}={v}" for k, v in sizes.items()), *overrides)
 
 
-def changed(scenario: lb.Scenario, *overrides: str) -> lb.Scenario:
+def changed(scenario: Scenario, *overrides: str) -> Scenario:
     """A scenario with other entries, ``key.path=value`` as on the command line."""
     return lb.load_scenario(scenario, overrides)
 
 
 @dataclass(frozen=True)
-class Mixed(lb.SkySource):
+class Mixed(SkySource):
     """A smooth and a spotty sky, half and half: bright, positive, not the Galaxy."""
 
     seed: int = 1
@@ -45,13 +48,13 @@ class Mixed(lb.SkySource):
 
 
 def measured(
-    truth: lb.Scenario,
+    truth: Scenario,
     sky: lb.Sky,
     seed: int = 1,
     *,
-    beams: Callable[[Setup], lb.ProductBeams] = lambda setup: setup.beams,
+    beams: Callable[[Setup], ProductBeams] = lambda setup: setup.beams,
     distort: Callable[[Setup, np.ndarray], np.ndarray] = lambda setup, v: v,
-    seen_by: lb.Scenario | None = None,
+    seen_by: Scenario | None = None,
 ) -> lb.Visibilities:
     """Data that ``truth`` describes, of a sky, with their noise; dated as ``seen_by`` says.
 
@@ -95,19 +98,19 @@ def exchanged(one: str, other: str) -> np.ndarray:
     return np.eye(16)[order]
 
 
-def mirrored(setup: Setup) -> lb.ProductBeams:
+def mirrored(setup: Setup) -> ProductBeams:
     """Beams with azimuth counted the other way: phi to -phi."""
     _, m = mode_numbers(setup.beams.lmax)
     return replace(setup.beams, modes=np.asarray(setup.beams.modes) * np.where(m < 0, -1.0, 1.0))
 
 
-def from_north(setup: Setup) -> lb.ProductBeams:
+def from_north(setup: Setup) -> ProductBeams:
     """Beams whose phi was counted from North towards East: phi to 90 degrees - phi."""
     modes = turn_about_z(np.asarray(mirrored(setup).modes), np.pi / 2.0)
     return replace(setup.beams, modes=np.asarray(modes))
 
 
-Make = Callable[[lb.Scenario, lb.Sky, int], lb.Visibilities]
+Make = Callable[[Scenario, lb.Sky, int], lb.Visibilities]
 
 
 @dataclass(frozen=True)
@@ -122,7 +125,7 @@ class Wrong:
 def _on_grid(change: Callable[[np.ndarray], np.ndarray]) -> Make:
     """Good data whose visibilities on the grid are changed."""
 
-    def make(scenario: lb.Scenario, sky: lb.Sky, seed: int) -> lb.Visibilities:
+    def make(scenario: Scenario, sky: lb.Sky, seed: int) -> lb.Visibilities:
         data = measured(scenario, sky, seed)
         return replace(data, data=np.asarray(data.layout.gather(change(np.asarray(data.grid())))))
 
@@ -141,18 +144,18 @@ def _other(*overrides: str) -> Make:
     )
 
 
-def _beams(beams: Callable[[Setup], lb.ProductBeams]) -> Make:
+def _beams(beams: Callable[[Setup], ProductBeams]) -> Make:
     return lambda scenario, sky, seed: measured(scenario, sky, seed, beams=beams)
 
 
-def shifted_by(mhz: float) -> Callable[[Setup], lb.ProductBeams]:
+def shifted_by(mhz: float) -> Callable[[Setup], ProductBeams]:
     """Beams of a neighbouring channel."""
     return lambda setup: setup.beam_source.beams(
         setup.scenario.frequency_mhz + mhz, setup.scenario.lmax
     )
 
 
-def _finer(scenario: lb.Scenario, sky: lb.Sky, seed: int) -> lb.Visibilities:
+def _finer(scenario: Scenario, sky: lb.Sky, seed: int) -> lb.Visibilities:
     """Of a sky with structure to lmax + 8."""
     finer = changed(scenario, f"lmax={scenario.lmax + 8}")
     whole = Mixed(seed).at(scenario.frequency_mhz, finer.lmax)
@@ -160,7 +163,7 @@ def _finer(scenario: lb.Scenario, sky: lb.Sky, seed: int) -> lb.Visibilities:
     return replace(data, truth=whole.modes[: len(sky.modes)])
 
 
-def _opposite(scenario: lb.Scenario, sky: lb.Sky, seed: int) -> lb.Visibilities:
+def _opposite(scenario: Scenario, sky: lb.Sky, seed: int) -> lb.Visibilities:
     """Taken at -20 degrees, dated as at 20."""
     here, there = (
         changed(scenario, f"observation.runs.0.turntable_deg={angle}") for angle in (-20, 20)

@@ -19,6 +19,9 @@ from lusee_bayes.experiment.data_files import reduce_files
 from lusee_bayes.flight.gain_model import read_gain_table
 from lusee_bayes.flight.reduced import read_reduced, write_reduced
 from lusee_bayes.flight.session_files import read_session
+from lusee_bayes.instrument.beams.sampled import read_beam, write_sampled_beams
+from lusee_bayes.instrument.visibilities import read_visibilities
+from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
 from lusee_bayes.report.describe import describe
 from lusee_bayes.results.map_files import read_channels, read_information
 from lusee_bayes.runs import folder as folder_module
@@ -49,15 +52,15 @@ def read_spectra(path: Path) -> object:
 
 
 READERS = {
-    "visibilities.nc": (describe, lb.read_visibilities),
-    "windows.nc": (describe, lb.read_visibilities),
-    "waterfall.fits": (describe, lb.read_waterfall, read_any_data),
-    "four_port.fits": (describe, lb.read_waterfall),
-    "scalar_beam.fits": (describe, lambda path: lb.read_beam(path).beams(10.0, 2)),
-    "response.fits": (describe, lambda path: lb.read_beam(path).beams(10.0, 2)),
-    "sampled_fields.nc": (describe, lambda path: lb.read_beam(path).beams(25.0, 2)),
-    "sampled_fields.fits": (describe, lambda path: lb.read_beam(path).beams(25.0, 2)),
-    "sampled_products.nc": (describe, lambda path: lb.read_beam(path).beams(25.0, 2)),
+    "visibilities.nc": (describe, read_visibilities),
+    "windows.nc": (describe, read_visibilities),
+    "waterfall.fits": (describe, read_waterfall, read_any_data),
+    "four_port.fits": (describe, read_waterfall),
+    "scalar_beam.fits": (describe, lambda path: read_beam(path).beams(10.0, 2)),
+    "response.fits": (describe, lambda path: read_beam(path).beams(10.0, 2)),
+    "sampled_fields.nc": (describe, lambda path: read_beam(path).beams(25.0, 2)),
+    "sampled_fields.fits": (describe, lambda path: read_beam(path).beams(25.0, 2)),
+    "sampled_products.nc": (describe, lambda path: read_beam(path).beams(25.0, 2)),
     "posterior.nc": (describe,),
     "information.nc": (describe, read_kept),
     "cube.nc": (describe,),
@@ -91,14 +94,14 @@ def files(tmp_path_factory, small_map, small_cube) -> Path:
     experiment.data.write(folder / "visibilities.nc")
     experiment.data.stamped("start").write(folder / "windows.nc")
     channels = [replace(experiment.data, frequency_mhz=f) for f in (20.0, 25.0)]
-    lb.write_waterfall(folder / "waterfall.fits", channels, np.array([1 + 1j, 1 + 2j]), "")
+    write_waterfall(folder / "waterfall.fits", channels, np.array([1 + 1j, 1 + 2j]), "")
     theta, phi = np.linspace(0.0, 90.0, 7), np.arange(0.0, 360.0, 45.0)
     fields = np.ones((4, 7, 8), dtype=complex)
     sampled = lb.sampled_beams(25.0, e_theta=fields, e_phi=fields, theta_deg=theta, phi_deg=phi)
-    lb.write_sampled_beams(folder / "sampled_fields.nc", sampled)
-    lb.write_sampled_beams(folder / "sampled_fields.fits", sampled)
+    write_sampled_beams(folder / "sampled_fields.nc", sampled)
+    write_sampled_beams(folder / "sampled_fields.fits", sampled)
     products = lb.sampled_beams([20.0, 30.0], products=np.ones((2, 4, 48)))
-    lb.write_sampled_beams(folder / "sampled_products.nc", products)
+    write_sampled_beams(folder / "sampled_products.nc", products)
     with pytest.MonkeyPatch.context() as patch:
         # neither figures nor a page, which take longer than the map
         patch.setattr(map_run, "MAP", replace(map_run.MAP, figures={}))

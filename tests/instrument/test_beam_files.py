@@ -23,7 +23,11 @@ from lusee_bayes.experiment.model import true_signal, true_values
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, product_beams
 from lusee_bayes.instrument.beams.luseepy_files import FIELDS, ScalarBeam
+from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith
+from lusee_bayes.instrument.beams.sampled import read_beam
+from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import labels
+from lusee_bayes.instrument.waterfalls import read_waterfall
 from lusee_bayes.systematics.beam import beam_rms_difference, difference_of_beams, true_beams
 from lusee_bayes.testing.scenarios import small_scenario
 
@@ -45,10 +49,10 @@ def luseepy(test_data):
     times = start + 7200.0 * np.arange(len(data)) * u.s
     observation = lb.Observation(182.258, -23.814, times, np.zeros(len(data), int), (0.0,), 7200.0)
     return (
-        lb.read_beam(folder / "synthetic_monopole_beam.fits"),
+        read_beam(folder / "synthetic_monopole_beam.fits"),
         {f: data[:, :, k].T for k, f in enumerate(frequencies)},
         {f: from_healpy(alm) for f, alm in zip(sky["freq"], sky["alm"], strict=True)},
-        lb.Pointing.of(observation, LMAX, order=6),
+        Pointing.of(observation, LMAX, order=6),
     )
 
 
@@ -75,7 +79,7 @@ def test_the_waterfall_of_luseepys_default_engine(luseepy, test_data):
     with fits.open(test_data / "luseepy" / "waterfall_fixed_axis_engine.fits") as hdus:
         expected = hdus["data"].data[:, :, list(hdus["freq"].data).index(25.0)].T
     beam, _, sky, _ = luseepy
-    observation = lb.read_waterfall(test_data / "luseepy" / "waterfall_fixed_axis_engine.fits")
+    observation = read_waterfall(test_data / "luseepy" / "waterfall_fixed_axis_engine.fits")
     observation = replace(observation.observation, fixed_axis=True)
     beams = replace(beam, luseepy_quadrature=True).beams(25.0, LMAX)
     seen = lb.CouplingMatrix.observe(beams, observation) @ sky[25.0]
@@ -129,8 +133,8 @@ def test_what_the_rectangle_rule_costs(luseepy):
 def test_the_embedded_antennas_agree_with_the_file_in_shape(luseepy):
     """Both are a 3 m arm, 75 degrees from the zenith, 2 m over ground; that of the file has one
     layer of permittivity 3.7."""
-    ground = lb.Regolith(3.7, 3.7, 0.01)
-    ours = lb.monopole_beams(10.0, 12, lb.Monopoles(ground)).modes
+    ground = Regolith(3.7, 3.7, 0.01)
+    ours = lb.monopole_beams(10.0, 12, Monopoles(ground)).modes
     # ports of luseepy: North, West, South, East; ours: North, East, South, West
     beam = replace(luseepy[0], taper=False, rotations_deg=(0.0, -90.0, 180.0, 90.0))
     theirs = beam.beams(10.0, 12).modes
@@ -165,7 +169,7 @@ def write(path, *, without=(), change=None, header=None):
 
 def test_between_frequencies_and_directions(tmp_path):
     """Cubic splines over steps of 10 MHz and 2 degrees of a pattern known everywhere."""
-    beam = replace(lb.read_beam(write(tmp_path / "beam.fits")), interpolation="spline")
+    beam = replace(read_beam(write(tmp_path / "beam.fits")), interpolation="spline")
     assert beam.n_phi == 60
     arms = replace(beam, taper=False, rotations_deg=(0.0, 33.0))
     grid = HemisphereGrid.gauss_legendre(92, 60)
@@ -193,7 +197,7 @@ def test_between_frequencies_as_luseepy_does(tmp_path):
 
     The exact grid's nodes are between the file's directions, where splines are good to 5e-6.
     """
-    beam = lb.read_beam(write(tmp_path / "beam.fits"))
+    beam = read_beam(write(tmp_path / "beam.fits"))
     angles = (0.0, 33.0)
     theta, phi, solid_angle = hemisphere(40, 90)
     harmonics = real_harmonics(theta, phi, 4) * solid_angle[:, None]
@@ -248,14 +252,14 @@ def point_pattern(theta, phi, f):
     ],
 )  # fmt: skip
 def test_files_that_cannot_be_used(tmp_path, options, message):
-    refuse(message, lb.read_beam, write(tmp_path / "beam.fits", **options))
+    refuse(message, read_beam, write(tmp_path / "beam.fits", **options))
 
 
 def test_missing_and_other_files(tmp_path):
-    refuse(r"no beam file at .*check beam\.file", lb.read_beam, tmp_path / "none.fits")
+    refuse(r"no beam file at .*check beam\.file", read_beam, tmp_path / "none.fits")
     path = tmp_path / "beam.fits"
     path.write_text("no FITS at all")
-    refuse("cannot be read as a scalar beam .*: it is no FITS file$", lb.read_beam, path)
+    refuse("cannot be read as a scalar beam .*: it is no FITS file$", read_beam, path)
 
 
 # --- in a scenario ----------------------------------------------------------------------------
@@ -264,7 +268,7 @@ def test_missing_and_other_files(tmp_path):
 def test_a_scenario_with_a_file(tmp_path):
     path = write(tmp_path / "beam.fits")
     setup = set_up(small_scenario(f"beam.file={path}", "beam.turntable_offset_deg=7"))
-    expected = replace(lb.read_beam(path), rotations_deg=(7.0, 97.0, 187.0, 277.0)).beams(25.0, 6)
+    expected = replace(read_beam(path), rotations_deg=(7.0, 97.0, 187.0, 277.0)).beams(25.0, 6)
     np.testing.assert_array_equal(setup.beams.modes, expected.modes)
     # the resolved scenario is one that can be read again
     again = tmp_path / "resolved.yaml"
@@ -288,9 +292,9 @@ def test_a_second_file_as_the_true_beams(tmp_path):
     np.testing.assert_allclose(signal, 1.01**2 * modelled, rtol=0, atol=1e-9 * modelled.max())
     # against the embedded antennas, and a shift in frequency of a file
     setup = set_up(small_scenario(f"noise.beam.file={other}"))
-    np.testing.assert_array_equal(true_beams(setup).modes, lb.read_beam(other).beams(25.0, 6).modes)
+    np.testing.assert_array_equal(true_beams(setup).modes, read_beam(other).beams(25.0, 6).modes)
     setup = set_up(small_scenario(f"beam.file={path}", "noise.beam.shift_mhz=5"))
-    np.testing.assert_array_equal(true_beams(setup).modes, lb.read_beam(path).beams(30.0, 6).modes)
+    np.testing.assert_array_equal(true_beams(setup).modes, read_beam(path).beams(30.0, 6).modes)
 
 
 @pytest.mark.parametrize(

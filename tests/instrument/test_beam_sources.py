@@ -9,6 +9,9 @@ import pytest
 from assertions import refuse
 
 import lusee_bayes as lb
+from lusee_bayes.instrument.beams.monopoles import Monopoles
+from lusee_bayes.instrument.beams.sampled import read_beam
+from lusee_bayes.instrument.beams.source import BeamSource
 from lusee_bayes.testing.contracts import check_beam_source
 
 FREQUENCY, LMAX, TURNED_DEG = 25.0, 6, 30.0
@@ -17,16 +20,16 @@ FREQUENCY, LMAX, TURNED_DEG = 25.0, 6, 30.0
 @pytest.fixture(scope="module")
 def scalar(test_data):
     """The beam of one arm: synthetic, in steps of 1 degree."""
-    return lb.read_beam(test_data / "luseepy" / "synthetic_monopole_beam.fits")
+    return read_beam(test_data / "luseepy" / "synthetic_monopole_beam.fits")
 
 
 @pytest.fixture(scope="module")
 def response(test_data):
     """Short dipoles with luseepy's receivers, in steps of 2 degrees."""
-    return lb.read_beam(test_data / "luseepy" / "synthetic_response_v3.fits")
+    return read_beam(test_data / "luseepy" / "synthetic_response_v3.fits")
 
 
-def further(source: lb.BeamSource, angle_deg: float) -> lb.BeamSource:
+def further(source: BeamSource, angle_deg: float) -> BeamSource:
     """The same antennas, turned from East towards North."""
     return replace(source, turntable_offset_deg=source.turntable_offset_deg + angle_deg)
 
@@ -37,7 +40,7 @@ def further(source: lb.BeamSource, angle_deg: float) -> lb.BeamSource:
 SPLINES, LUSEEPY = 1e-9, 1e-3
 
 
-def check(source: lb.BeamSource, quadrature: float) -> None:
+def check(source: BeamSource, quadrature: float) -> None:
     check_beam_source(
         source,
         further(source, TURNED_DEG),
@@ -49,7 +52,7 @@ def check(source: lb.BeamSource, quadrature: float) -> None:
 
 
 def test_embedded_beams():
-    source = lb.Monopoles(turntable_offset_deg=4.0)
+    source = Monopoles(turntable_offset_deg=4.0)
     check(source, 1e-12)
     assert not source.emits
     assert source.impedance(FREQUENCY) is None

@@ -15,6 +15,7 @@ from lusee_bayes.core.harmonics import mode_numbers, n_modes, polar_functions, s
 from lusee_bayes.instrument.beams.fields import (
     AntennaFields,
     HemisphereGrid,
+    ProductBeams,
     mean_auto_integral,
     product_beams,
     stokes_beam,
@@ -192,8 +193,8 @@ def test_unknown_stokes_and_products_are_refused():
     with pytest.raises(lb.InputError, match="unknown Stokes parameter 'W'; known: I, Q, U, V"):
         stokes_beam(short_dipole([0, 0, 1]), "W")
     with pytest.raises(lb.InputError, match="3 products do not come from any number of antennas"):
-        lb.ProductBeams(np.zeros((3, 4)), 10.0)
-    refuse("5 coefficients do not fill any lmax", lb.ProductBeams, np.zeros((4, 5)), 10.0)
+        ProductBeams(np.zeros((3, 4)), 10.0)
+    refuse("5 coefficients do not fill any lmax", ProductBeams, np.zeros((4, 5)), 10.0)
 
 
 # --- luseepy's quadrature rules, against closed forms ---------------------------------------------

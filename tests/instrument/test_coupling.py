@@ -15,7 +15,10 @@ from scipy.stats import norm, truncnorm
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import Rotation, n_modes, turn_about_z
-from lusee_bayes.instrument.coupling import CouplingMatrix, DenseCoupling, as_coupling
+from lusee_bayes.instrument.beams.fields import ProductBeams
+from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith
+from lusee_bayes.instrument.coupling import CouplingMatrix, DenseCoupling, Instrument, as_coupling
+from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout, auto_indices, labels
 from lusee_bayes.systematics.beam import BeamError, InstrumentParameters
 from lusee_bayes.testing.contracts import check_coupling
@@ -26,7 +29,7 @@ SITE = {"lon_deg": 182.258, "lat_deg": -23.814}
 
 def random_beams(seed, lmax=LMAX, n_products=16):
     modes = np.random.default_rng(seed).standard_normal((n_products, n_modes(lmax)))
-    return lb.ProductBeams(modes, 25.0)
+    return ProductBeams(modes, 25.0)
 
 
 def two_runs():
@@ -49,7 +52,7 @@ def test_visibilities_agree_with_an_integral_over_the_sky_in_lunartopo(lmax, tur
     got = np.asarray(got).reshape(16, -1)
     grid = theta, phi, solid_angle = hemisphere(32, 64)
     # the antennas one direction at a time, reflection included
-    s, p = lb.Monopoles().regolith.reflection(np.cos(theta), frequency)
+    s, p = Monopoles().regolith.reflection(np.cos(theta), frequency)
     ground = [(complex(x), complex(y)) for x, y in zip(s, p, strict=True)]
     antenna = {"frequency_mhz": frequency, "length": 3.0, "height": 2.0, "steps": 121}
     arms = vectors(np.full(4, np.radians(75.0)), np.radians([90.0, 0.0, 270.0, 180.0]))
@@ -78,7 +81,7 @@ def flagged_coupling():
     """Two runs of random beams with three samples in ten missing."""
     o = two_runs()
     layout = DataLayout.from_flags(np.random.default_rng(6).random((16, o.n_times)) < 0.3)
-    return CouplingMatrix.build(random_beams(5, 2), lb.Pointing.of(o, 2), layout)
+    return CouplingMatrix.build(random_beams(5, 2), Pointing.of(o, 2), layout)
 
 
 def by_rows(coupling):
@@ -142,9 +145,7 @@ def test_dense_rows_are_each_times_own_rotation(coupling):
 def test_flagged_samples_are_left_out(coupling):
     o = two_runs()
     flags = np.random.default_rng(8).random((16, o.n_times)) < 0.3
-    some = CouplingMatrix.build(
-        random_beams(1), lb.Pointing.of(o, LMAX), DataLayout.from_flags(flags)
-    )
+    some = CouplingMatrix.build(random_beams(1), Pointing.of(o, LMAX), DataLayout.from_flags(flags))
     keep = ~flags.ravel()
     assert some.shape == (keep.sum(), n_modes(LMAX))
     np.testing.assert_array_equal(some.dense(), np.asarray(coupling.dense())[keep])
@@ -175,7 +176,7 @@ def test_the_moons_axis_is_not_fixed(cycles, lmax, monkeypatch):
     beams, sky = lb.monopole_beams(25.0, lmax), steep_sky(lmax)
 
     def visibilities_at(order=None):
-        pointing = lb.Pointing.of(o, lmax, order)
+        pointing = Pointing.of(o, lmax, order)
         return np.asarray(CouplingMatrix.build(beams, pointing) @ sky)
 
     monkeypatch.setattr("lusee_bayes.instrument.averaging.TOLERANCE", 1e-14)
@@ -200,12 +201,12 @@ def test_the_moons_axis_is_not_fixed(cycles, lmax, monkeypatch):
 
 def test_differentiable_in_the_beams():
     o = two_runs()
-    pointing = lb.Pointing.of(o, LMAX)
+    pointing = Pointing.of(o, LMAX)
     sky = jnp.asarray(steep_sky(LMAX, monopole=1.0))
     weights = jnp.asarray(np.random.default_rng(9).standard_normal(16 * o.n_times))
 
     def f(modes):
-        return weights @ (CouplingMatrix.build(lb.ProductBeams(modes, 25.0), pointing) @ sky)
+        return weights @ (CouplingMatrix.build(ProductBeams(modes, 25.0), pointing) @ sky)
 
     modes, direction = random_beams(1).modes, random_beams(2).modes
     slope = jnp.sum(jax.jit(jax.grad(f))(modes) * direction)
@@ -214,7 +215,7 @@ def test_differentiable_in_the_beams():
 
 
 def test_bad_input_is_refused():
-    pointing = lb.Pointing.of(two_runs(), LMAX)
+    pointing = Pointing.of(two_runs(), LMAX)
     with refused(r"the beam coefficients has shape \(16, 36\), expected"):
         CouplingMatrix.build(random_beams(0, lmax=5), pointing)
     with pytest.raises(lb.InputError, match="the data layout has 4 products x 7 times"):
@@ -240,7 +241,7 @@ STDS = {"surface_permittivity": 0.3, "zenith_angle_deg": 2.0, "turntable_offset_
 def pointing():
     """Two runs at two turntable angles: 18 samples."""
     observation = lb.Observation.from_runs([lb.Run(0.3, 0.0), lb.Run(0.4, 40.0)], step_s=86400.0)
-    return lb.Pointing.of(observation, LOW)
+    return Pointing.of(observation, LOW)
 
 
 @pytest.fixture(scope="module")
@@ -252,15 +253,15 @@ def layout(pointing):
 
 @pytest.fixture(scope="module")
 def instrument(pointing, layout):
-    return lb.Instrument(lb.Monopoles(), pointing, layout, FREQUENCY, LOW).prepared()
+    return Instrument(Monopoles(), pointing, layout, FREQUENCY, LOW).prepared()
 
 
 def test_turned_blocks_are_the_coupling_matrix(pointing, layout, monkeypatch):
     """For beams of every order, with flags and two runs; sums of 17 numbers in another order."""
-    beams = lb.ProductBeams(jax.random.normal(jax.random.key(0), (16, 25)), FREQUENCY)
+    beams = ProductBeams(jax.random.normal(jax.random.key(0), (16, 25)), FREQUENCY)
     expected = np.asarray(lb.CouplingMatrix.build(beams, pointing, layout).dense())
-    instrument = lb.Instrument(lb.Monopoles(), pointing, layout, FREQUENCY, LOW).prepared()
-    monkeypatch.setattr(lb.Instrument, "beams", lambda self, values: beams)
+    instrument = Instrument(Monopoles(), pointing, layout, FREQUENCY, LOW).prepared()
+    monkeypatch.setattr(Instrument, "beams", lambda self, values: beams)
     got = instrument.dense({})
     assert got.shape == (layout.size, 25)
     close(got, expected, 1e-13)
@@ -276,8 +277,8 @@ def test_a_of_placed_antennas_is_that_of_antennas_built_so(instrument, pointing,
         "deep_permittivity": 6.5,
         "loss_tangent": 0.02,
     }
-    antennas = lb.Monopoles(
-        lb.Regolith(3.5, 6.5, 0.02),
+    antennas = Monopoles(
+        Regolith(3.5, 6.5, 0.02),
         length_m=3.1,
         height_m=1.7,
         zenith_angle_deg=73.0,
@@ -347,14 +348,14 @@ def test_marginalised_parameters_are_derivatives_of_a(instrument, base):
 def test_the_amplitude_of_a_beam_error(instrument, base):
     other = lb.monopole_beams(29.0, LOW)
     own = instrument.beams()
-    direction = lb.ProductBeams(other.modes - own.modes, FREQUENCY)
+    direction = ProductBeams(other.modes - own.modes, FREQUENCY)
     error = BeamError(instrument.coupling_of(direction))
     sky = base.prior.sample(jax.random.key(3))
     for amplitude in (0.0, 0.7, 1.0):
         value = {"beam_amplitude": jnp.asarray(amplitude)}
         with handlers.trace() as trace, handlers.seed(rng_seed=0), handlers.substitute(data=value):
             model = error.sampled(base)
-        mixed = lb.ProductBeams((1 - amplitude) * own.modes + amplitude * other.modes, FREQUENCY)
+        mixed = ProductBeams((1 - amplitude) * own.modes + amplitude * other.modes, FREQUENCY)
         expected = instrument.coupling_of(mixed)
         # linear in the beams, as a product and as a matrix
         scale = np.abs(np.asarray(expected @ sky)).max()

@@ -11,12 +11,12 @@ from reference import SPEED_OF_LIGHT, arm_response, layered_reflection, vectors
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import turn_about_z
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, stokes_beam
-from lusee_bayes.instrument.beams.monopoles import PORT_AZIMUTHS_DEG
+from lusee_bayes.instrument.beams.monopoles import PORT_AZIMUTHS_DEG, Monopoles, Regolith
 from lusee_bayes.instrument.products import to_matrix
 
 GRID = HemisphereGrid.gauss_legendre(6, 8)
-NO_GROUND = lb.Regolith(1.0, 1.0, 0.0)
-CONDUCTOR = lb.Regolith(4.0, 4.0, 1e16)
+NO_GROUND = Regolith(1.0, 1.0, 0.0)
+CONDUCTOR = Regolith(4.0, 4.0, 1e16)
 
 
 def arms(zenith_angle_deg):
@@ -29,7 +29,7 @@ def arms(zenith_angle_deg):
     [(1.0, {}), (25.0, {}), (50.0, {"zenith_angle_deg": 100.0, "height_m": 0.7, "length_m": 2.5})],
 )
 def test_fields_agree_with_a_sum_along_the_arms(frequency, options):
-    m = lb.Monopoles(**options)
+    m = Monopoles(**options)
     fields = m.fields(frequency, GRID)
     s, p = m.regolith.reflection(np.cos(GRID.theta), frequency)
     scale = np.abs(fields.e_theta).max()
@@ -52,7 +52,7 @@ def test_fields_agree_with_a_sum_along_the_arms(frequency, options):
 
 def test_a_vertical_arm_over_a_conductor_has_its_image():
     frequency, height = 30.0, 1.5
-    m = lb.Monopoles(CONDUCTOR, length_m=1e-4, zenith_angle_deg=0.0, height_m=height)
+    m = Monopoles(CONDUCTOR, length_m=1e-4, zenith_angle_deg=0.0, height_m=height)
     k = 2e6 * np.pi * frequency / SPEED_OF_LIGHT
     e_theta = np.asarray(m.fields(frequency, GRID).e_theta[2])
     array_factor = 2 * np.cos(k * height * np.cos(GRID.theta))
@@ -63,14 +63,14 @@ def test_a_vertical_arm_over_a_conductor_has_its_image():
 
 def test_ports_point_north_east_south_west():
     # a short arm in free space sees least along itself
-    m = lb.Monopoles(NO_GROUND, length_m=1e-3, zenith_angle_deg=90.0)
+    m = Monopoles(NO_GROUND, length_m=1e-3, zenith_angle_deg=90.0)
     grid = HemisphereGrid(np.array([np.pi / 2 - 1e-5]), np.ones(1), 4)  # E, N, W, S
     power = np.asarray(stokes_beam(m.fields(1.0, grid)))[range(4), range(4), 0].real
     horizon = {"E": 0, "N": 1, "W": 2, "S": 3}
     for port, (along, across) in enumerate(["NE", "EN", "SE", "WN"]):
         assert power[port, horizon[along]] < 1e-8 * power[port, horizon[across]]
     # and the tip side: the arm's phase centre lies towards its tip, the wave from there is ahead
-    phase = np.asarray(lb.Monopoles(NO_GROUND, length_m=1.0).fields(25.0, grid).e_theta)[:, 0]
+    phase = np.asarray(Monopoles(NO_GROUND, length_m=1.0).fields(25.0, grid).e_theta)[:, 0]
     for port, tip in enumerate("NESW"):
         angles = np.angle(phase[port] / phase[port].sum())
         assert np.argmax(angles) == horizon[tip]
@@ -121,9 +121,9 @@ def test_coefficients_do_not_change_when_the_nodes_double(frequency, lmax):
 
 
 def test_bad_parameters_are_refused():
-    refuse(r"length_m must be positive, got 0.0", lb.Monopoles, length_m=0.0)
-    refuse(r"height_m must be positive, got -1.0", lb.Monopoles, height_m=-1.0)
-    refuse(r"frequency_mhz must be positive, got 0.0", lb.Monopoles().fields, 0.0, GRID)
+    refuse(r"length_m must be positive, got 0.0", Monopoles, length_m=0.0)
+    refuse(r"height_m must be positive, got -1.0", Monopoles, height_m=-1.0)
+    refuse(r"frequency_mhz must be positive, got 0.0", Monopoles().fields, 0.0, GRID)
 
 
 # --- reflection by the ground ---------------------------------------------------------------------
@@ -133,11 +133,11 @@ COSINES = np.cos(np.radians([0.0, 20.0, 45.0, 70.0, 85.0, 89.9]))
 
 
 def uniform(permittivity, loss_tangent):
-    return lb.Regolith(permittivity, permittivity, loss_tangent)
+    return Regolith(permittivity, permittivity, loss_tangent)
 
 
 def test_permittivity_rises_linearly_over_the_layers():
-    eps = np.asarray(lb.Regolith(3.7, 6.1, 0.01).permittivities())
+    eps = np.asarray(Regolith(3.7, 6.1, 0.01).permittivities())
     np.testing.assert_allclose(eps.real, 3.7 + 2.4 * np.arange(8) / 7, rtol=1e-15)
     np.testing.assert_allclose(eps.imag, -0.01 * eps.real, rtol=1e-15)
 
@@ -163,7 +163,7 @@ def test_uniform_ground_obeys_fresnel(eps, loss, atol):
 
 
 def test_grazing_incidence_reflects_everything_with_reversed_sign():
-    s, p = lb.Regolith().reflection(np.array([1e-9]), 25.0)
+    s, p = Regolith().reflection(np.array([1e-9]), 25.0)
     # 2 eps cos theta / n: 4e-9
     np.testing.assert_allclose(s, -1.0, rtol=0, atol=1e-8)
     np.testing.assert_allclose(p, -1.0, rtol=0, atol=1e-8)
@@ -172,7 +172,7 @@ def test_grazing_incidence_reflects_everything_with_reversed_sign():
 @pytest.mark.parametrize("seed", range(5))
 def test_no_more_comes_back_than_arrives(seed):
     rng = np.random.default_rng(seed)
-    ground = lb.Regolith(rng.uniform(1, 10), rng.uniform(1, 10), 10 ** rng.uniform(-4, 1))
+    ground = Regolith(rng.uniform(1, 10), rng.uniform(1, 10), 10 ** rng.uniform(-4, 1))
     for frequency in (1.0, 7.0, 50.0):
         s, p = ground.reflection(rng.uniform(0, 1, 50), frequency)
         assert np.abs(s).max() <= 1.0
@@ -182,7 +182,7 @@ def test_no_more_comes_back_than_arrives(seed):
 @pytest.mark.parametrize("frequency", [1.0, 5.0, 25.0])
 @pytest.mark.parametrize("ground", [(3.7, 6.1, 0.01), (8.0, 2.0, 0.02), (1.5, 9.0, 0.0)])
 def test_layers_agree_with_characteristic_matrices(ground, frequency):
-    regolith = lb.Regolith(*ground)
+    regolith = Regolith(*ground)
     s, p = regolith.reflection(COSINES, frequency)
     eps = np.asarray(regolith.permittivities())
     for k, cosine in enumerate(COSINES):
@@ -193,9 +193,9 @@ def test_layers_agree_with_characteristic_matrices(ground, frequency):
 
 @pytest.mark.parametrize("bad", [(0.0, 6.1), (3.7, -1.0), (np.nan, 6.1)])
 def test_permittivities_are_positive(bad):
-    refuse("permittivity must be positive", lb.Regolith, *bad)
-    assert lb.Regolith(jnp.asarray(2.0)).surface_permittivity == 2.0
+    refuse("permittivity must be positive", Regolith, *bad)
+    assert Regolith(jnp.asarray(2.0)).surface_permittivity == 2.0
 
 
 def test_a_ground_that_amplifies_is_refused():
-    refuse("loss_tangent must not be negative, got -0.01", lb.Regolith, loss_tangent=-0.01)
+    refuse("loss_tangent must not be negative, got -0.01", Regolith, loss_tangent=-0.01)

@@ -21,6 +21,7 @@ from lusee_bayes.instrument.pointing import (
     LEAST_ORDER,
     OFFSETS,
     TILT_TOLERANCE,
+    Pointing,
     mean_pole_frame,
     offset_names,
     split,
@@ -87,12 +88,12 @@ def test_sufficient_order_is_the_lowest_that_bounds_the_series(size, lmax):
 
 def test_a_negative_order_is_refused():
     with refused("order of the tilt expansion must be 0, 1, ..., got -1"):
-        lb.Pointing.of(lb.Observation.from_runs([lb.Run(0.1)]), 3, order=-1)
+        Pointing.of(lb.Observation.from_runs([lb.Run(0.1)]), 3, order=-1)
 
 
 def test_runs_and_fixed_rotations():
     o = lb.Observation.from_runs([lb.Run(0.1, 0.0), lb.Run(0.2, 90.0)])
-    p = lb.Pointing.of(o, 3, order=1)
+    p = Pointing.of(o, 3, order=1)
     assert p.n_times == o.n_times
     assert p.order == 1
     for number, span in p.runs():
@@ -111,7 +112,7 @@ def test_functions_and_factors_expand_the_transposed_tilt(monkeypatch):
     monkeypatch.setattr("lusee_bayes.instrument.averaging.TOLERANCE", 1e-15)
     lmax, order = 3, 6
     o = lb.Observation.from_runs([lb.Run(0.05)])
-    p = lb.Pointing.of(o, lmax, order=order)
+    p = Pointing.of(o, lmax, order=order)
     # instants: every order m alike, and nothing imaginary
     factors = np.asarray(p.factors)
     np.testing.assert_allclose(factors[..., 1], 0.0, atol=1e-15)
@@ -172,8 +173,8 @@ def test_turns_about_horizontal_axes(axis):
 def test_inside_a_compiled_function_as_exactly_shifted(names):
     o, beams = two_runs(), lb.monopole_beams(25.0, LMAX)
     values = {name: VALUES[name] for name in names}
-    exact = seen(lb.Pointing.of(with_offsets(o, values), LMAX), beams)
-    nominal = lb.Pointing.of(o, LMAX)
+    exact = seen(Pointing.of(with_offsets(o, values), LMAX), beams)
+    nominal = Pointing.of(o, LMAX)
     got = seen(turned_by_offsets(nominal, o.hours, values), beams)
     before = seen(nominal, beams)
     moved = np.abs((exact - before) / sigma(exact, o)).max()
@@ -187,7 +188,7 @@ def test_inside_a_compiled_function_as_exactly_shifted(names):
 @pytest.mark.long
 def test_offsets_are_differentiable():
     o, beams = two_runs(), lb.monopole_beams(25.0, 2)
-    nominal = lb.Pointing.of(o, 2)
+    nominal = Pointing.of(o, 2)
     a = jnp.asarray(steep_sky(2))
     names = list(VALUES)
 

@@ -20,8 +20,11 @@ from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import from_healpy
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.instrument.beams.luseepy_files import CONVENTIONS
+from lusee_bayes.instrument.beams.sampled import read_beam
 from lusee_bayes.instrument.beams.source import CapacitorReceiver, JFETReceiver, read_receiver
 from lusee_bayes.instrument.products import labels, to_matrix, to_real
+from lusee_bayes.instrument.visibilities import read_visibilities
+from lusee_bayes.instrument.waterfalls import read_waterfall, write_four_port
 from lusee_bayes.testing.scenarios import small_scenario
 
 VACUUM = physical_constants["characteristic impedance of vacuum"][0]
@@ -38,7 +41,7 @@ def luseepy(test_data):
     path = folder / "four_port_covariance.fits"
     with fits.open(path) as hdus:
         images = {hdu.name.lower(): np.array(hdu.data) for hdu in hdus}
-    return lb.read_beam(folder / "synthetic_response_v3.fits"), path, images
+    return read_beam(folder / "synthetic_response_v3.fits"), path, images
 
 
 def matrix(images, name, channel) -> np.ndarray:
@@ -65,7 +68,7 @@ def simulated(luseepy, test_data, frequency, times, *, fixed_axis=False) -> np.n
     with np.load(test_data / "luseepy" / "sky_alm.npz") as file:
         sky = dict(file)
     modes = from_healpy(sky["alm"][list(sky["freq"]).index(frequency)])
-    observation = replace(lb.read_waterfall(path).observation.select(times), fixed_axis=fixed_axis)
+    observation = replace(read_waterfall(path).observation.select(times), fixed_axis=fixed_axis)
     response = replace(response, luseepy_quadrature=True, moon_k=MOON)
     beams = response.beams(frequency, LMAX)
     seen = np.asarray(lb.CouplingMatrix.observe(beams, observation) @ modes)
@@ -193,7 +196,7 @@ def between(values, part):
 def test_between_frequencies_as_luseepy_does(tmp_path):
     """ZA, resistances and the integrals of open ports over lambda^2 go straight from 20 to 40 MHz;
     M is that of the ZA in between."""
-    response = lb.read_beam(write(tmp_path / "response.fits", change=varied))
+    response = read_beam(write(tmp_path / "response.fits", change=varied))
     f, part = 27.0, 0.35
     theta, phi, solid_angle = hemisphere(20, 40)
     harmonics = real_harmonics(theta, phi, 3) * solid_angle[:, None]
@@ -259,7 +262,7 @@ def test_receivers(tmp_path):
     zl = 0.45 * loads[0] + 0.55 * loads[1]
     np.testing.assert_allclose(measured.load(21.0), zl, rtol=1e-13)
     refuse(r"zl.fits has values from 10 to 30 MHz, not at 31", measured.load, 31.0)
-    response = replace(lb.read_beam(write(tmp_path / "response.fits")), receiver=measured)
+    response = replace(read_beam(write(tmp_path / "response.fits")), receiver=measured)
     za = 0.95 * response.impedance_ohm[1] + 0.05 * response.impedance_ohm[2]
     np.testing.assert_allclose(
         response.circuit(21.0).loading, zl @ np.linalg.inv(za + zl), rtol=1e-12
@@ -272,7 +275,7 @@ def test_losses_emit_at_the_antennas_temperature(tmp_path):
             images["Rloss"] = np.tile(0.5 * np.eye(4), (3, 1, 1))
             images["ZA"] = images["ZA"] + images["Rloss"]
 
-    response = lb.read_beam(write(tmp_path / "response.fits", change=lossy))
+    response = read_beam(write(tmp_path / "response.fits", change=lossy))
     m = response.circuit(20.0).loading
     expected = 4 * Boltzmann * 300.0 * 0.5 * m @ m.conj().T
     got = volts(response, 20.0, replace(response, antenna_k=300.0).background(20.0)[:, None])
@@ -280,7 +283,7 @@ def test_losses_emit_at_the_antennas_temperature(tmp_path):
 
 
 def test_open_ports_and_turns(tmp_path):
-    response = lb.read_beam(write(tmp_path / "response.fits"))
+    response = read_beam(write(tmp_path / "response.fits"))
     open_ = replace(response, receiver=None)
     np.testing.assert_array_equal(open_.circuit(20.0).loading, np.eye(4))
     # a quarter turn makes East North: each port takes the place of the next
@@ -311,7 +314,7 @@ def test_open_ports_and_turns(tmp_path):
     ],
 )  # fmt: skip
 def test_files_that_cannot_be_used(tmp_path, options, message):
-    refuse(message, lb.read_beam, write(tmp_path / "response.fits", **options))
+    refuse(message, read_beam, write(tmp_path / "response.fits", **options))
 
 
 # --- in scenarios -------------------------------------------------------------------------------
@@ -323,8 +326,8 @@ def test_a_scenario_with_a_response_and_a_warm_moon(tmp_path):
     cold_scenario = small_scenario(*given[:-1], cycles=0.05)
     warm, cold = lb.build(small_scenario(*given, cycles=0.05)), lb.build(cold_scenario)
     setup, data = warm.setup, warm.data
-    np.testing.assert_array_equal(setup.beams.modes, lb.read_beam(path).beams(20.0, 6).modes)
-    moon = np.asarray(replace(lb.read_beam(path), moon_k=5e4).background(20.0))
+    np.testing.assert_array_equal(setup.beams.modes, read_beam(path).beams(20.0, 6).modes)
+    moon = np.asarray(replace(read_beam(path), moon_k=5e4).background(20.0))
     np.testing.assert_array_equal(setup.background, moon)
     np.testing.assert_array_equal(cold.setup.background, 0.0)
     added = np.asarray(setup.signal) - np.asarray(cold.setup.signal)
@@ -373,7 +376,7 @@ def test_luseepys_data_in_kelvin(luseepy):
 def test_short_dipoles_see_no_even_ell_above_two(tmp_path):
     """Their products are polynomials of degree 2 cut at the horizon: (P + P sign(z)) / 2, of which
     the first part ends at ell = 2 and the second is odd."""
-    modes = np.asarray(lb.read_beam(write(tmp_path / "response.fits")).beams(20.0, 9).modes)
+    modes = np.asarray(read_beam(write(tmp_path / "response.fits")).beams(20.0, 9).modes)
     ell = np.floor(np.sqrt(np.arange(100))).astype(int)
     even, odd = (np.abs(modes[:, (ell > 2) & (ell % 2 == p)]).max() for p in (0, 1))
     assert even < 1e-6 * odd
@@ -426,7 +429,7 @@ def test_headers_that_contradict_the_reader_are_refused(tmp_path, words):
     for key, value in words.items():
         fits.setval(path, f"HIERARCH {key}", value=value)
     with pytest.raises(lb.InputError, match="|".join([*words, "unit"])) as refused:
-        lb.read_beam(path)
+        read_beam(path)
     assert "expected" in str(refused.value) or "known" in str(refused.value)
 
 
@@ -438,7 +441,7 @@ def test_headers_that_state_what_the_reader_assumes_are_read(luseepy, tmp_path):
     for words in (converted, dict.fromkeys(converted, "UNKNOWN")):
         for key, value in words.items():
             fits.setval(path, f"HIERARCH {key}", value=value)
-        lb.read_beam(path)
+        read_beam(path)
 
 
 # --- waterfalls in luseepy's layout of four ports -------------------------------------------------
@@ -457,10 +460,10 @@ LAYOUT = [
 def test_luseepys_four_ports_are_written_back(luseepy, tmp_path):
     """Its data through K and back; every image and word that it has, in its place."""
     response, original, _ = luseepy
-    waterfall = lb.read_waterfall(original)
+    waterfall = read_waterfall(original)
     channels = [waterfall.at(f) for f in waterfall.frequencies_mhz]
     circuits = [response.circuit(f) for f in waterfall.frequencies_mhz]
-    path = lb.write_four_port(
+    path = write_four_port(
         tmp_path / "w.fits", channels, circuits, moon_k=250.0, response=response.path
     )
     with fits.open(path) as ours, fits.open(original) as theirs:
@@ -492,7 +495,7 @@ def test_luseepys_four_ports_are_written_back(luseepy, tmp_path):
         assert json.loads(ours["receiver_params"].data.tobytes()) == json.loads(
             theirs["receiver_params"].data.tobytes()
         )
-    back = lb.read_waterfall(path)
+    back = read_waterfall(path)
     # a multiplication and a division by the same number
     np.testing.assert_allclose(back.grid, waterfall.grid, rtol=3e-16, atol=0)
     assert (back.moon_k, back.antenna_k, back.interpolation) == (250.0, 0.0, "linear-native-alm")
@@ -502,7 +505,7 @@ def test_luseepys_four_ports_are_written_back(luseepy, tmp_path):
 
 def test_gaps_are_written(luseepy, tmp_path):
     response, original, _ = luseepy
-    waterfall = lb.read_waterfall(original)
+    waterfall = read_waterfall(original)
     keep = np.arange(328) % 7 < 3
     grid = waterfall.grid[:, keep, :1].copy()
     grid[3, 2] = np.nan
@@ -513,8 +516,8 @@ def test_gaps_are_written(luseepy, tmp_path):
         observation=waterfall.observation.select(keep),
         per_kelvin=waterfall.per_kelvin[:1],
     )
-    path = lb.write_four_port(tmp_path / "w.fits", [part.at(5.0)], [response.circuit(5.0)])
-    back = lb.read_waterfall(path)
+    path = write_four_port(tmp_path / "w.fits", [part.at(5.0)], [response.circuit(5.0)])
+    back = read_waterfall(path)
     np.testing.assert_allclose(back.grid, grid, rtol=3e-16, atol=0)
     assert not (back.observation.times - part.observation.times).to_value("s").any()
     with fits.open(path) as hdus:
@@ -524,10 +527,10 @@ def test_gaps_are_written(luseepy, tmp_path):
 
 def test_open_ports_have_no_loads_to_write(luseepy, tmp_path):
     response, original, _ = luseepy
-    channel = lb.read_waterfall(original).at(5.0)
+    channel = read_waterfall(original).at(5.0)
     with pytest.raises(lb.InputError, match="the ports are open; give another beam.receiver"):
         circuit = replace(response, receiver=None).circuit(5.0)
-        lb.write_four_port(tmp_path / "w.fits", [channel], [circuit])
+        write_four_port(tmp_path / "w.fits", [channel], [circuit])
     assert not list(tmp_path.iterdir())
 
 
@@ -557,7 +560,7 @@ def test_simulated_and_mapped_between_the_responses_frequencies(luseepy, tmp_pat
                                          f"beam.receiver={capacitor}"])  # fmt: skip
     np.testing.assert_allclose(data.grid(), lb.build(sure).data.grid(), rtol=1e-14)
     # and through the package's own files
-    own = lb.read_visibilities(data.write(tmp_path / "own.nc"))
+    own = read_visibilities(data.write(tmp_path / "own.nc"))
     np.testing.assert_array_equal(own.receiver.load(f), data.receiver.load(f))
     np.testing.assert_array_equal(lb.build(scenario, own).setup.beams.modes, setup.beams.modes)
 

@@ -15,6 +15,8 @@ from reference import unit_vectors
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, from_rings, wavenumber
+from lusee_bayes.instrument.beams.monopoles import Monopoles
+from lusee_bayes.instrument.beams.sampled import from_uvbeam, read_beam, write_sampled_beams
 from lusee_bayes.instrument.products import labels, to_real
 from lusee_bayes.report.describe import describe
 from lusee_bayes.testing.contracts import check_beam_source
@@ -67,7 +69,7 @@ KINDS = {
 
 @cache
 def embedded(kind, frequency_mhz=FREQUENCY):
-    return KINDS[kind](lb.Monopoles(), frequency_mhz)
+    return KINDS[kind](Monopoles(), frequency_mhz)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -164,8 +166,8 @@ def test_files_come_back(tmp_path, kind, suffix):
         for name, values in one.items()
     }
     made = lb.sampled_beams([20.0, 30.0], **arrays, absolute=True)
-    path = lb.write_sampled_beams(tmp_path / f"mine.{suffix}", made)
-    again = lb.read_beam(path)
+    path = write_sampled_beams(tmp_path / f"mine.{suffix}", made)
+    again = read_beam(path)
     assert again.absolute
     np.testing.assert_array_equal(again.frequencies_mhz, [20.0, 30.0])
     # the grid's angles go through degrees and back: one rounding
@@ -180,7 +182,7 @@ def test_files_come_back(tmp_path, kind, suffix):
 
 def test_a_scenario_takes_the_file(tmp_path):
     path = tmp_path / "mine.nc"
-    lb.write_sampled_beams(path, lb.sampled_beams(FREQUENCY, **embedded("pixels")))
+    write_sampled_beams(path, lb.sampled_beams(FREQUENCY, **embedded("pixels")))
     scenario = small_scenario(f"beam.file={path}")
     assert scenario.beam.model == "sampled"
     assert (scenario.beam.n_ports, scenario.beam.label) == (4, "mine.nc")
@@ -193,16 +195,16 @@ def test_a_scenario_takes_the_file(tmp_path):
 def test_product_beams_of_a_file_may_be_in_any_order(tmp_path):
     path = tmp_path / "mine.nc"
     made = lb.sampled_beams(FREQUENCY, **embedded("products on pixels"))
-    lb.write_sampled_beams(path, made)
+    write_sampled_beams(path, made)
     order = np.random.default_rng(0).permutation(16)
     with xr.open_dataset(path, engine="h5netcdf") as file:
         shuffled = file.load().isel(product=order)
     shuffled.attrs["products"] = ", ".join(labels()[k] for k in order)
     shuffled.to_netcdf(path, engine="h5netcdf")
-    np.testing.assert_array_equal(lb.read_beam(path).products, made.products)
+    np.testing.assert_array_equal(read_beam(path).products, made.products)
     shuffled.attrs["products"] = "00R, 01R"
     shuffled.to_netcdf(path, engine="h5netcdf")
-    refuse(r"mine\.nc: products is 00R, 01R, expected the names", lb.read_beam, path)
+    refuse(r"mine\.nc: products is 00R, 01R, expected the names", read_beam, path)
 
 
 @pytest.mark.parametrize("kind", ["pixels", "grid"])
@@ -287,7 +289,7 @@ DAMAGE = {
 @pytest.mark.parametrize("suffix", ["nc", "fits"])
 def test_damaged_files_are_refused(tmp_path, change, suffix):
     path = tmp_path / f"mine.{suffix}"
-    lb.write_sampled_beams(path, lb.sampled_beams(FREQUENCY, **embedded("grid")))
+    write_sampled_beams(path, lb.sampled_beams(FREQUENCY, **embedded("grid")))
     if change == "cut":
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     elif suffix == "fits":
@@ -298,7 +300,7 @@ def test_damaged_files_are_refused(tmp_path, change, suffix):
         with xr.open_dataset(path, engine="h5netcdf") as file:
             found = DAMAGE[change][0](file.load())
         found.to_netcdf(path, engine="h5netcdf")
-    refuse(str(path), lb.read_beam, path)
+    refuse(str(path), read_beam, path)
 
 
 # --- pyuvdata -------------------------------------------------------------------------------------
@@ -321,10 +323,10 @@ def uvbeam(coordinates: str):
     }
     if coordinates == "healpix":
         options |= {"nside": NSIDE}
-        given = [on_pixels(lb.Monopoles(), f) for f in (20.0, 30.0)]
+        given = [on_pixels(Monopoles(), f) for f in (20.0, 30.0)]
     else:
         options |= {"axis1_array": np.radians(PHI_DEG), "axis2_array": np.radians(THETA_DEG)}
-        given = [on_grid(lb.Monopoles(), f) for f in (20.0, 30.0)]
+        given = [on_grid(Monopoles(), f) for f in (20.0, 30.0)]
     # (vector: along phi, along theta; feed; frequency; directions)
     options["data_array"] = np.stack(
         [np.stack([one[name][:2] for one in given], axis=1) for name in ("e_phi", "e_theta")]
@@ -337,17 +339,17 @@ def uvbeam(coordinates: str):
 def test_a_uvbeam_is_its_fields(tmp_path, coordinates):
     beam = uvbeam(coordinates)
     expected = np.asarray(lb.monopole_beams(20.0, LMAX).modes)[[0, 1, 2, 7]]
-    found = lb.from_uvbeam(beam)
+    found = from_uvbeam(beam)
     assert found.n_ports == 2
     path = tmp_path / "uv.fits"
     beam.write_beamfits(str(path))
     scenario = small_scenario(f"beam.file={path}")
     for made in (found.beams(20.0, LMAX), scenario.beam.source().beams(20.0, LMAX)):
         assert np.abs(made.modes - expected).max() < SPLINES * np.abs(expected).max()
-    conjugate = lb.from_uvbeam(beam, conjugate=True).beams(20.0, LMAX).modes
+    conjugate = from_uvbeam(beam, conjugate=True).beams(20.0, LMAX).modes
     np.testing.assert_allclose(conjugate[2], -found.beams(20.0, LMAX).modes[2], atol=1e-15)
     beam.efield_to_power()
-    refuse("give one of type efield", lb.from_uvbeam, beam)
+    refuse("give one of type efield", from_uvbeam, beam)
 
 
 def test_without_pyuvdata_its_files_are_refused_with_what_to_install(tmp_path, monkeypatch):
@@ -356,4 +358,4 @@ def test_without_pyuvdata_its_files_are_refused_with_what_to_install(tmp_path, m
     hdu.header["NORMSTD"], hdu.header["FEEDLIST"] = "physical", "[x, y]"
     hdu.writeto(path)
     monkeypatch.setattr("lusee_bayes.instrument.beams.sampled.find_spec", lambda name: None)
-    refuse(r"pip install '\.\[uvdata\]'", lb.read_beam, path)
+    refuse(r"pip install '\.\[uvdata\]'", read_beam, path)

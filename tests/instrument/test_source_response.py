@@ -12,11 +12,16 @@ from scipy.special import eval_legendre
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.beams.fields import STOKES, stokes_pairs
-from lusee_bayes.instrument.beams.monopoles import beams_towards, source_response
+from lusee_bayes.instrument.beams.monopoles import (
+    Monopoles,
+    Regolith,
+    beams_towards,
+    source_response,
+)
 from lusee_bayes.instrument.products import labels, to_matrix
 
 FREQUENCY = 25.0
-SHORT = lb.Monopoles(lb.Regolith(1.0, 1.0, 0.0), length_m=1e-3, zenith_angle_deg=90.0)  # free space
+SHORT = Monopoles(Regolith(1.0, 1.0, 0.0), length_m=1e-3, zenith_angle_deg=90.0)  # free space
 ZENITH = np.array([[0.0, 0.0, 1.0]])
 
 
@@ -78,7 +83,7 @@ def test_gradients_are_finite_and_right_with_sources_below_the_horizon():
     def f(monopoles, directions):
         return jnp.sum(weights * beams_towards(FREQUENCY, directions, monopoles))
 
-    m = lb.Monopoles()
+    m = Monopoles()
     slopes = eqx.filter_grad(f)(m, jnp.asarray(directions))
     leaves = jax.tree.leaves(slopes)
     assert len(leaves) == len(jax.tree.leaves(m))

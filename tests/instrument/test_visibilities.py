@@ -21,6 +21,7 @@ from lusee_bayes.instrument.products import (
     to_matrix,
     to_real,
 )
+from lusee_bayes.instrument.visibilities import read_visibilities
 
 
 @pytest.fixture
@@ -34,7 +35,7 @@ def data():
 
 
 def test_round_trip_is_exact(data, tmp_path):
-    again = lb.read_visibilities(data.write(tmp_path / "data.nc"))
+    again = read_visibilities(data.write(tmp_path / "data.nc"))
     np.testing.assert_array_equal(again.data, data.data)
     np.testing.assert_array_equal(again.layout.index, data.layout.index)
     np.testing.assert_array_equal(again.truth, data.truth)
@@ -83,14 +84,14 @@ def nan(dataset):
 def test_bad_files_are_refused(data, tmp_path, change, message):
     path = tmp_path / "bad.nc"
     altered(change)(data, path)
-    refuse(message, lb.read_visibilities, path)
+    refuse(message, read_visibilities, path)
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("mK", 1e-3), ("kK", 1e3), ("", 1.0)])
 def test_temperatures_in_other_units_are_converted(data, tmp_path, unit, factor):
     path = tmp_path / "other.nc"
     altered(lambda d: d["visibility"].attrs.update(units=unit))(data, path)
-    np.testing.assert_allclose(lb.read_visibilities(path).data, factor * data.data, rtol=1e-15)
+    np.testing.assert_allclose(read_visibilities(path).data, factor * data.data, rtol=1e-15)
 
 
 # TAI - UTC is 37 s since 2017, TT - TAI 32.184 s, TDB - TT less than 2 ms
@@ -100,14 +101,14 @@ def test_temperatures_in_other_units_are_converted(data, tmp_path, unit, factor)
 def test_times_in_other_scales_are_brought_to_utc(data, tmp_path, scale, s):
     path = tmp_path / "other.nc"
     altered(lambda d: [d[k].attrs.update(scale=scale) for k in ("jd1", "jd2")] and d)(data, path)
-    moved = (data.observation.times - lb.read_visibilities(path).observation.times).sec
+    moved = (data.observation.times - read_visibilities(path).observation.times).sec
     np.testing.assert_allclose(moved, s, rtol=0, atol=2e-3)
 
 
 def test_other_files_are_refused(tmp_path):
-    refuse("no data at .*lusee-bayes simulate", lb.read_visibilities, tmp_path / "none.nc")
+    refuse("no data at .*lusee-bayes simulate", read_visibilities, tmp_path / "none.nc")
     (tmp_path / "text.nc").write_text("hello")
-    refuse("not a file of visibilities", lb.read_visibilities, tmp_path / "text.nc")
+    refuse("not a file of visibilities", read_visibilities, tmp_path / "text.nc")
 
 
 def test_lengths_must_fit(data):
@@ -223,7 +224,7 @@ def test_angles_are_runs_and_sites_are_places(tmp_path):
     np.testing.assert_array_equal(observation.run, [0, 0, 1, 1, 2])
     assert observation.turntable_deg == (0.0, 30.0, 0.0)
     assert (observation.lon_deg, observation.lat_deg, observation.step_s) == (10.0, 5.0, 600.0)
-    again = lb.read_visibilities(made.write(tmp_path / "mine.nc"))
+    again = read_visibilities(made.write(tmp_path / "mine.nc"))
     assert again.digest() == made.digest()
     assert again.observation.turntable_deg == (0.0, 30.0, 0.0)
 

@@ -21,6 +21,7 @@ from lusee_bayes.cli.options import parse_frequencies
 from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.products import DataLayout, labels
+from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
 from lusee_bayes.report.describe import describe
 
 PAIRS = [[i, j] for i in range(4) for j in range(i, 4)]
@@ -44,7 +45,7 @@ def write(path, data=None, pairs=PAIRS, header=HEADER, frequencies=(10.0, 20.0),
 
 
 def test_every_sample_is_in_its_place(tmp_path):
-    waterfall = lb.read_waterfall(write(tmp_path / "w.fits"))
+    waterfall = read_waterfall(write(tmp_path / "w.fits"))
     data = waterfall.at(20.0)
     assert data.frequency_mhz == 20.0 and data.n_missing == 0
     expected = 100.0 * np.arange(16)[:, None] + np.arange(12)[None] + 0.1
@@ -68,7 +69,7 @@ def test_every_sample_is_in_its_place(tmp_path):
 )
 def test_ranges_of_time(tmp_path, lunar_day, first):
     path = write(tmp_path / "w.fits", header=HEADER | {"LUNAR_DAY": lunar_day})
-    observation = lb.read_waterfall(path).observation
+    observation = read_waterfall(path).observation
     assert observation.times[0].isot == first
     np.testing.assert_allclose(observation.hours, 2.0 * np.arange(12), rtol=0, atol=1e-6)
 
@@ -81,9 +82,7 @@ def test_lunar_days_begin_at_noon_on_the_far_side(tmp_path):
     found = []
     for number, new_moon in zip((2500, "2501", 2502, 2503, 2504), new_moons, strict=True):
         path = tmp_path / f"{number}.fits"
-        found.append(
-            lb.read_waterfall(write(path, header=HEADER | {"LUNAR_DAY": number})).observation
-        )
+        found.append(read_waterfall(write(path, header=HEADER | {"LUNAR_DAY": number})).observation)
         off = (found[-1].times[0] - Time(f"2025-{new_moon}", scale="utc")).to_value(u.hour)
         assert abs(off) < 14.0
     days = np.diff([o.times[0].jd for o in found])
@@ -99,7 +98,7 @@ def test_lunar_days_begin_at_noon_on_the_far_side(tmp_path):
 
 def test_any_subset_and_order_of_products(tmp_path):
     """Columns follow the pairs; a pair the other way round is conjugated."""
-    data = lb.read_waterfall(write(tmp_path / "w.fits", pairs=[[2, 2], [3, 1], [0, 0]])).at(10.0)
+    data = read_waterfall(write(tmp_path / "w.fits", pairs=[[2, 2], [3, 1], [0, 0]])).at(10.0)
     place = {label: k for k, label in enumerate(labels())}
     grid, time = data.grid(), np.arange(12)
     assert data.n_missing == 12 * 12
@@ -131,7 +130,7 @@ def test_any_subset_and_order_of_products(tmp_path):
     ],
 )
 def test_files_that_cannot_be_used(tmp_path, options, message):
-    refuse(message, lb.read_waterfall, write(tmp_path / "w.fits", **options))
+    refuse(message, read_waterfall, write(tmp_path / "w.fits", **options))
 
 
 def test_missing_channels_files_and_ends(tmp_path):
@@ -218,8 +217,8 @@ def test_what_is_written_is_read_back_bit_by_bit(tmp_path):
     flags[3, 2], flags[:, 5] = True, True
     layout = DataLayout.from_flags(flags)
     two = replace(two, layout=layout, data=layout.gather(two.layout.scatter(two.data)))
-    path = lb.write_waterfall(tmp_path / "w.fits", [one, two], np.array([3.0 - 40j, 4.0 - 30j]))
-    waterfall = lb.read_waterfall(path)
+    path = write_waterfall(tmp_path / "w.fits", [one, two], np.array([3.0 - 40j, 4.0 - 30j]))
+    waterfall = read_waterfall(path)
     for given in (one, two):
         back = waterfall.at(given.frequency_mhz)
         np.testing.assert_array_equal(back.grid(), given.grid())
@@ -245,7 +244,7 @@ def test_what_is_written_is_read_back_bit_by_bit(tmp_path):
     ],
 )
 def test_what_luseepys_layout_cannot_hold(tmp_path, runs, message):
-    refuse(message, lb.write_waterfall, tmp_path / "w.fits", 2 * [random_channel(runs)])
+    refuse(message, write_waterfall, tmp_path / "w.fits", 2 * [random_channel(runs)])
     assert not list(tmp_path.iterdir())
 
 
@@ -308,9 +307,9 @@ def test_another_site_and_other_ports(tmp_path):
 
 
 def test_products_that_the_beams_cannot_supply(tmp_path):
-    waterfall = lb.read_waterfall(write(tmp_path / "w.fits"))
+    waterfall = read_waterfall(write(tmp_path / "w.fits"))
     refuse("has the product 02R, but the beams are those of 2 ports", waterfall.at, 10.0, n_ports=2)
-    few = lb.read_waterfall(write(tmp_path / "few.fits", pairs=[[0, 0], [0, 1], [1, 1]]))
+    few = read_waterfall(write(tmp_path / "few.fits", pairs=[[0, 0], [0, 1], [1, 1]]))
     data = few.at(10.0, n_ports=2)
     assert (data.layout.n_products, data.n_missing) == (4, 0)
     np.testing.assert_array_equal(data.grid()[:, 3], 100.0 * np.arange(4) + 3.0)
@@ -341,7 +340,7 @@ def four_port(path, **changes):
 
 
 def test_four_port_columns_are_where_the_table_says(tmp_path):
-    waterfall = lb.read_waterfall(four_port(tmp_path / "w.fits"))
+    waterfall = read_waterfall(four_port(tmp_path / "w.fits"))
     place = {label: k for k, label in enumerate(labels())}
     np.testing.assert_array_equal(waterfall.grid[place["13I"], :, 1], np.arange(1, 20, 4) / 4.0)
     np.testing.assert_array_equal(waterfall.grid[place["00R"], :, 0], np.arange(2, 20, 4) / 4.0)
@@ -371,4 +370,4 @@ twice = np.array([[2461000.0, 0.5], [2461000.0, 0.5], [2461000.0, 0.6]])
     ],
 )
 def test_four_port_files_that_cannot_be_used(tmp_path, changes, message):
-    refuse(message, lb.read_waterfall, four_port(tmp_path / "w.fits", **changes))
+    refuse(message, read_waterfall, four_port(tmp_path / "w.fits", **changes))

@@ -18,8 +18,10 @@ from reference import steep_sky
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import Rotation
 from lusee_bayes.instrument.averaging import averaged, product_live_s, sufficient_nodes
+from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.instrument.times import Windows, unannounced_leap_seconds
+from lusee_bayes.instrument.visibilities import read_visibilities
 from lusee_bayes.noise.radiometer import paper_variance
 from lusee_bayes.report.describe import describe
 
@@ -291,7 +293,7 @@ def test_equals_the_mean_of_200_instants(step_s, filled, lmax):
             times = o.times[k] + offsets * u.s
         run = np.zeros(len(times), dtype=int)
         instants = replace(o, times=times, run=run, windows=None)
-        pointing = lb.Pointing.of(instants, lmax, order=4)
+        pointing = Pointing.of(instants, lmax, order=4)
         v = np.asarray(lb.CouplingMatrix.build(beams, pointing) @ sky).reshape(16, -1)
         expected[:, k] = v @ weights
     off = (got - expected) / sigma_of(expected, o)
@@ -338,11 +340,11 @@ def test_equals_the_mean_of_20_instants_by_lunarsky(step_s, filled, lmax):
 def test_a_fixed_axis_gives_a_factor_for_each_order():
     """sin(m h) / (m h), h half of the angle of a window, where nothing wanders."""
     o = lb.Observation.from_runs([lb.Run(0.2)], step_s=7200.0, window="mean")
-    p = lb.Pointing.of(o, 30, order=0)
+    p = Pointing.of(o, 30, order=0)
     # the Moon's own turn, from its orientations at the ends of the windows
     with unannounced_leap_seconds():
         edges = replace(o, times=o.times - 3600.0 * u.s, windows=None)
-    half = np.diff(np.unwrap(np.asarray(lb.Pointing.of(edges, 2).azimuth))) / 2.0
+    half = np.diff(np.unwrap(np.asarray(Pointing.of(edges, 2).azimuth))) / 2.0
     got = np.asarray(p.functions)[:-1] @ np.asarray(p.factors)[:, 0, :, 0]
     m = np.arange(31)
     # what functions of time leave out
@@ -436,7 +438,7 @@ def data():
 
 
 def test_windows_come_back_to_the_last_bit(data, tmp_path):
-    again = lb.read_visibilities(data.write(tmp_path / "data.nc"))
+    again = read_visibilities(data.write(tmp_path / "data.nc"))
     for name in ("sample", "start_s", "end_s", "live_s"):
         there, here = (getattr(d.observation.windows, name) for d in (data, again))
         np.testing.assert_array_equal(here, there)
@@ -497,7 +499,7 @@ def test_bounds_of_other_software_are_windows(tmp_path, units):
     path = rewritten(made(timestamp="start"), tmp_path / "foreign.nc", foreign)
     with xr.open_dataset(path, engine="h5netcdf", decode_times=False) as raw:
         assert "units" not in raw["time_bounds"].attrs
-    again = lb.read_visibilities(path)
+    again = read_visibilities(path)
     expected = HOUR * np.stack([np.arange(4), np.arange(1, 5)], axis=1)
     # days in double precision since New Year: 3e-7 s, and a Julian date in two parts
     np.testing.assert_allclose(bounds_of(again.observation), expected, rtol=0, atol=1e-6)
@@ -510,7 +512,7 @@ def test_instants_and_silent_files(data, tmp_path):
     instants = made(timestamp="instant")
     assert instants.observation.windows is None
     path = instants.write(tmp_path / "instants.nc")
-    again = lb.read_visibilities(path)
+    again = read_visibilities(path)
     assert again.says_window and again.observation.windows is None
     assert "times are instants" in describe(path)
 
@@ -519,11 +521,11 @@ def test_instants_and_silent_files(data, tmp_path):
         return dataset
 
     path = rewritten(instants, tmp_path / "silent.nc", silent)
-    again = lb.read_visibilities(path)
+    again = read_visibilities(path)
     assert not again.says_window and again.observation.windows is None
     assert "does not say what its times are" in describe(path)
     # what does not say it does not learn it by being written
-    assert not lb.read_visibilities(again.write(tmp_path / "again.nc")).says_window
+    assert not read_visibilities(again.write(tmp_path / "again.nc")).says_window
     assert "it is not known what the times are" in repr(again)
     assert "not known" not in repr(instants)
     started = again.stamped("start")
@@ -593,7 +595,7 @@ def bounds_alone(change):
 def test_windows_that_a_file_cannot_have(tmp_path, change, words):
     path = rewritten(made(), tmp_path / "bad.nc", change)
     with pytest.raises(lb.InputError) as caught:
-        lb.read_visibilities(path)
+        read_visibilities(path)
     assert words in str(caught.value)
     assert str(caught.value).startswith(str(path))
     assert "\n" not in str(caught.value)

@@ -10,6 +10,7 @@ from reference_linear import matrices, posterior
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
+from lusee_bayes.instrument.coupling import DenseCoupling
 from lusee_bayes.judge import left_out
 from lusee_bayes.judge.left_out import KINDS, LeftOut, groups_of
 from lusee_bayes.judge.residuals import held_out
@@ -134,7 +135,7 @@ def test_missing_data(kind, limits, monkeypatch):
 def test_a_matrix_without_structure_in_time(kind, monkeypatch):
     limited(monkeypatch, {"QUICK": 0})
     model, data, *expected = observed("many", kind)
-    model = replace(model, coupling=lb.DenseCoupling(model.coupling.dense()))
+    model = replace(model, coupling=DenseCoupling(model.coupling.dense()))
     check(LeftOut(model, data), data, *expected, every_kind(data))
 
 

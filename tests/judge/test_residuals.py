@@ -12,11 +12,14 @@ from scipy.stats import chi2
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
+from lusee_bayes.instrument.coupling import DenseCoupling
 from lusee_bayes.judge.chi2 import FALSE_ALARM, ChiSquare, stands_out, two_sided
 from lusee_bayes.judge.measures import data_freedom, preferences
 from lusee_bayes.judge.residuals import residuals
 from lusee_bayes.judge.split import WIDER, Split, widened
 from lusee_bayes.linear.linear_gaussian import FromInformation, InData, InMap
+from lusee_bayes.noise.covariance import DenseCovariance, LowRankCovariance
+from lusee_bayes.sky.prior import DensePrior
 
 RUNS = "observation.runs=[{cycles: 0.03}, {cycles: 0.03, turntable_deg: 40}, {cycles: 0.02}]"
 
@@ -152,7 +155,7 @@ def test_one_group_is_everything():
 def test_precise_data_of_one_day_are_judged_by_product():
     """A as a matrix: K^-1 of all data, which nothing predicts, has no root in 64 bits."""
     model, data = simulated("noise.radiometer.factor=1e-6", "observation.runs=[{cycles: 0.03}]")
-    model = replace(model, coupling=lb.DenseCoupling(model.coupling.dense()))
+    model = replace(model, coupling=DenseCoupling(model.coupling.dense()))
     found = judged(model, data)
     assert found.level() == "consistent"
     # N(0, 1) or narrower: one of 1e5 data is beyond 5
@@ -219,9 +222,9 @@ def model_of(n_data=60, prior="harmonic", seed=1):
         s = lb.HarmonicPrior(spectrum)
     else:
         root = np.tril(0.1 * rng.standard_normal((N_MODES, N_MODES)), -1) + np.eye(N_MODES)
-        s = lb.DensePrior(jnp.asarray(root), mean=jnp.asarray(rng.standard_normal(N_MODES)))
+        s = DensePrior(jnp.asarray(root), mean=jnp.asarray(rng.standard_normal(N_MODES)))
     noise = rng.standard_normal((n_data, n_data))
-    n = lb.DenseCovariance(jnp.asarray(noise @ noise.T / n_data + np.eye(n_data)))
+    n = DenseCovariance(jnp.asarray(noise @ noise.T / n_data + np.eye(n_data)))
     return lb.LinearGaussian(jnp.asarray(a), s, n, jnp.asarray(rng.standard_normal(n_data)))
 
 
@@ -305,7 +308,7 @@ def test_no_sky_makes_the_instrument_look_wrong():
 def test_noise_that_is_wrong_is_no_matter_of_the_prior():
     """Data with 1.5 times the noise variance."""
     model = model_of(n_data=200)
-    noise = lb.DenseCovariance(1.5 * model.noise.dense())
+    noise = DenseCovariance(1.5 * model.noise.dense())
     truth = lb.LinearGaussian(model.coupling, model.prior, noise, model.offset)
     instrument, _ = p_values(model, 1.0, n=10, truth=truth).T
     assert np.median(instrument) < 1e-3
@@ -358,9 +361,9 @@ def test_amplitudes_errors_and_gains(low_rank):
     a = rng.standard_normal((N_DATA, (LMAX + 1) ** 2))
     noise = lb.DiagonalCovariance(rng.uniform(0.5, 2.0, N_DATA))
     if low_rank:
-        noise = noise + lb.LowRankCovariance(rng.standard_normal((N_DATA, 2)))
+        noise = noise + LowRankCovariance(rng.standard_normal((N_DATA, 2)))
     prior = lb.HarmonicPrior(np.full(LMAX + 1, 4.0), mean=rng.standard_normal((LMAX + 1) ** 2))
-    model = lb.LinearGaussian(lb.DenseCoupling(a), prior, noise, rng.standard_normal(N_DATA))
+    model = lb.LinearGaussian(DenseCoupling(a), prior, noise, rng.standard_normal(N_DATA))
     data = 3.0 * rng.standard_normal(N_DATA)
     # the last one is a sky that the prior allows, but for a small part
     templates = rng.standard_normal((N_DATA, N))
@@ -385,7 +388,7 @@ def test_what_the_sky_takes_up_is_not_told():
     rng = np.random.default_rng(9)
     a = rng.standard_normal((N_DATA, (LMAX + 1) ** 2))
     prior = lb.HarmonicPrior(np.full(LMAX + 1, 1e14))
-    model = lb.LinearGaussian(lb.DenseCoupling(a), prior, lb.DiagonalCovariance(np.ones(N_DATA)))
+    model = lb.LinearGaussian(DenseCoupling(a), prior, lb.DiagonalCovariance(np.ones(N_DATA)))
     data = rng.standard_normal(N_DATA)
     template = a @ rng.standard_normal((a.shape[1], 1))
     got = preferences(model.condition(data), template)
@@ -404,8 +407,8 @@ def test_it_is_the_diagonal_of_a_product_of_matrices(monkeypatch, dense):
     rng = np.random.default_rng(0)
     a, v, other = rng.normal(size=(30, 9)), rng.normal(size=(30, 2)), rng.normal(size=(30, 1))
     spectrum, n = np.array([4.0, 1.0, 0.3]), rng.uniform(0.5, 2.0, 30)
-    noise = lb.DiagonalCovariance(n) + lb.LowRankCovariance(v) + lb.LowRankCovariance(other)
-    model = lb.LinearGaussian(lb.DenseCoupling(a), lb.HarmonicPrior(spectrum), noise)
+    noise = lb.DiagonalCovariance(n) + LowRankCovariance(v) + LowRankCovariance(other)
+    model = lb.LinearGaussian(DenseCoupling(a), lb.HarmonicPrior(spectrum), noise)
     signal = a @ np.diag(np.repeat(spectrum, [1, 3, 5])) @ a.T + v @ v.T
     whole = signal + np.diag(n) + other @ other.T
     expected = np.diag(signal @ np.linalg.inv(whole))

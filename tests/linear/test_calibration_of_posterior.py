@@ -20,6 +20,7 @@ from scipy.stats import chi2, kstest
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.linear.linear_gaussian import InData, InMap, Whitened
+from lusee_bayes.noise.covariance import Covariance, DenseCovariance, TimeBlockCovariance
 
 LMAX, N_MODES, N_DRAWS, SEED = 8, 81, 4000, 20270115
 SPECTRUM = 1e8 * (1.0 + np.arange(LMAX + 1.0)) ** -2.5  # K^2; the monopole is 20000 K below
@@ -41,15 +42,15 @@ class Setup:
         hours = observation.hours[layout.time]
         kernel = np.exp(-((hours[:, None] - hours[None]) ** 2) / (2 * 10.0**2))
         signal = np.asarray(fiducial)
-        gain = lb.DenseCovariance(jnp.asarray(1e-10 * np.outer(signal, signal) * kernel), "gain")
+        gain = DenseCovariance(jnp.asarray(1e-10 * np.outer(signal, signal) * kernel), "gain")
         self.noise = {
             "paper": paper,
             "exact": exact,
-            "dense": lb.DenseCovariance(exact.dense() + gain.dense()),
+            "dense": DenseCovariance(exact.dense() + gain.dense()),
             "diagonal+dense": paper + gain,
         }
 
-    def simulate(self, noise: lb.Covariance):
+    def simulate(self, noise: Covariance):
         """(skies, data) of N_DRAWS skies from the prior and noise from N, by numpy."""
         rng = np.random.default_rng(SEED)
         skies = rng.normal(size=(N_DRAWS, N_MODES)) * PRIOR_STD
@@ -58,7 +59,7 @@ class Setup:
         return skies, skies @ np.asarray(self.coupling.dense()).T + added
 
     def standardised(
-        self, truth: lb.Covariance, assumed: lb.Covariance, form: type[Whitened]
+        self, truth: Covariance, assumed: Covariance, form: type[Whitened]
     ) -> np.ndarray:
         """C^-1/2 (m - mean), shape (draws, modes), of data with noise ``truth``."""
         skies, data = self.simulate(truth)
@@ -107,7 +108,7 @@ def test_the_same_check_notices_wrong_posteriors():
     exact = setup.noise["exact"]
     blocks = np.array(exact.blocks)
     blocks[3] = np.diag(np.diag(blocks[3]))
-    wrong = lb.TimeBlockCovariance(jnp.asarray(blocks), exact.layout)
+    wrong = TimeBlockCovariance(jnp.asarray(blocks), exact.layout)
     assert p_value(setup.standardised(exact, wrong, InMap)) < 1e-4
     with_gains, paper = setup.noise["diagonal+dense"], setup.noise["paper"]
     assert p_value(setup.standardised(with_gains, paper, InMap)) < 1e-100

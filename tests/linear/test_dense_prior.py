@@ -17,9 +17,14 @@ from scipy.stats import multivariate_normal, ortho_group
 
 import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_host
+from lusee_bayes.instrument.coupling import DenseCoupling
+from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.linear_gaussian import Form, FromInformation, InData, InMap
 from lusee_bayes.linear.posterior import Posterior, pixel_std, prior_pixel_std
+from lusee_bayes.noise.covariance import DenseCovariance
+from lusee_bayes.noise.instrument_errors import beam_error_noise
 from lusee_bayes.runs.plan_run import informed_modes
+from lusee_bayes.sky.prior import DensePrior
 
 N = 25
 RNG = np.random.default_rng(3)
@@ -39,11 +44,11 @@ def problem(n_data: int, *, turned: bool) -> tuple[lb.LinearGaussian, np.ndarray
     sky = MEAN + np.sqrt(PER_MODE) * rng.normal(size=N)
     data = a @ sky + np.linalg.cholesky(noise) @ rng.normal(size=n_data)
     if turned:
-        prior = lb.DensePrior.of_covariance(jnp.asarray(S), jnp.asarray(TURN @ MEAN))
+        prior = DensePrior.of_covariance(jnp.asarray(S), jnp.asarray(TURN @ MEAN))
         a = a @ TURN.T
     else:
         prior = lb.HarmonicPrior(jnp.asarray(SPECTRUM), mean=jnp.asarray(MEAN))
-    return lb.LinearGaussian(jnp.asarray(a), prior, lb.DenseCovariance(jnp.asarray(noise))), data
+    return lb.LinearGaussian(jnp.asarray(a), prior, DenseCovariance(jnp.asarray(noise))), data
 
 
 @lru_cache
@@ -110,17 +115,17 @@ def test_densities_and_coordinates():
 def test_a_beam_error_holds_the_correlated_sky():
     direction = RNG.normal(size=(12, N))
     prior = problem(40, turned=True)[0].prior
-    found = lb.beam_error_noise(lb.DenseCoupling(jnp.asarray(direction)), prior).dense()
+    found = beam_error_noise(DenseCoupling(jnp.asarray(direction)), prior).dense()
     moment = S + np.outer(TURN @ MEAN, TURN @ MEAN)
     np.testing.assert_allclose(found, direction @ moment @ direction.T, rtol=1e-10)
 
 
 def test_pixels_of_the_prior():
-    prior = lb.DensePrior.of_covariance(S)
+    prior = DensePrior.of_covariance(S)
     rest = S.copy()
     rest[0] = rest[:, 0] = 0.0
     np.testing.assert_allclose(prior_pixel_std(prior, 4), pixel_std(rest, 4), rtol=1e-12)
-    same = lb.HarmonicPrior(SPECTRUM), lb.DensePrior.of_covariance(np.diag(PER_MODE))
+    same = lb.HarmonicPrior(SPECTRUM), DensePrior.of_covariance(np.diag(PER_MODE))
     np.testing.assert_allclose(*(prior_pixel_std(one, 4) for one in same), rtol=1e-12)
 
 
@@ -129,11 +134,11 @@ def test_a_mean_far_from_the_reference_sky_is_exact():
     rng = np.random.default_rng(1)
     a = rng.normal(size=(60, N)) * np.geomspace(1.0, 1e6, N) @ TURN.T
     other = ortho_group.rvs(N, random_state=3)
-    prior = lb.DensePrior.of_covariance(other * np.geomspace(1.0, 1e-2, N) @ other.T)
+    prior = DensePrior.of_covariance(other * np.geomspace(1.0, 1e-2, N) @ other.T)
     data = a @ (prior.root @ rng.normal(size=N)) + rng.normal(size=60)
     matrix, vector, zero = a.T @ a, a.T @ data, np.zeros(())
     misfit, n_data = np.asarray(data @ data), np.asarray(60.0)
-    information = lb.Information(matrix, vector, np.zeros(N), misfit, zero, n_data)
+    information = Information(matrix, vector, np.zeros(N), misfit, zero, n_data)
     found = information.posterior(prior)
     assert float(found.refinement) < 1e-6
     with localcontext(prec=60):

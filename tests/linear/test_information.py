@@ -14,7 +14,10 @@ from scipy.stats import multivariate_normal
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
+from lusee_bayes.instrument.coupling import DenseCoupling
 from lusee_bayes.linear.linear_gaussian import InData
+from lusee_bayes.noise.covariance import DenseCovariance
+from lusee_bayes.sky.prior import DensePrior
 from lusee_bayes.systematics.context import Around
 
 N = 9
@@ -29,7 +32,7 @@ def random_parts():
     prior = lb.HarmonicPrior(jnp.asarray(SPECTRUM))
     models, data = [], []
     for n in (20, 7):
-        noise = lb.DenseCovariance(jnp.asarray(random_covariance(rng, n)))
+        noise = DenseCovariance(jnp.asarray(random_covariance(rng, n)))
         a, offset = (jnp.asarray(rng.normal(size=size)) for size in ((n, N), n))
         models.append(lb.LinearGaussian(a, prior, noise, offset))
         data.append(jnp.asarray(3.0 * rng.normal(size=n)))
@@ -56,7 +59,7 @@ def test_likelihoods_and_sums_are_those_of_matrices():
 PRIORS = {
     "half": lambda: lb.HarmonicPrior(jnp.asarray(0.5 * SPECTRUM)),
     "zero": lambda: lb.HarmonicPrior(jnp.asarray([4.0, 0.0, 0.5])),
-    "correlated": lambda: lb.DensePrior.of_covariance(
+    "correlated": lambda: DensePrior.of_covariance(
         random_covariance(np.random.default_rng(6), N), np.linspace(-1.0, 2.0, N)
     ),
 }
@@ -88,7 +91,7 @@ def test_the_posterior_of_a_sum_is_that_of_all_data(kind):
 def test_information_about_other_modes_is_not_added():
     models, data = random_parts()
     whole = models[0].condition(data[0]).information
-    coupling = lb.DenseCoupling(models[0].coupling.dense()[:, :4])
+    coupling = DenseCoupling(models[0].coupling.dense()[:, :4])
     prior = lb.HarmonicPrior(jnp.asarray(SPECTRUM[:2]))
     few = replace(models[0], coupling=coupling, prior=prior).condition(data[0]).information
     refuse("the other reference sky", add, whole, few)

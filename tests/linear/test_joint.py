@@ -10,7 +10,8 @@ from scipy.linalg import block_diag
 
 import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_device, on_host
-from lusee_bayes.linear.joint import channel_sky, paired
+from lusee_bayes.linear.joint import channel_sky, paired, solve_directly
+from lusee_bayes.sky.spectral_prior import SpectralPrior
 
 FREQUENCIES = np.array([10.0, 17.0, 25.0, 40.0])
 LMAX, N_MODES = 2, 9
@@ -25,7 +26,7 @@ def skies(seed=0):
     return 100.0 * rng.standard_normal(N_MODES) * np.exp(tilt * x) * (1.0 + own)
 
 
-components, kernel = lb.SpectralPrior.components, lb.SpectralPrior.kernel
+components, kernel = SpectralPrior.components, SpectralPrior.kernel
 PRIORS = {
     "components": lambda: components(FREQUENCIES, skies(), ("power_law", "turnover")),
     "kernel": lambda: kernel(FREQUENCIES, skies(), length=0.8, residual=0.05),
@@ -109,7 +110,7 @@ def case(request):
 def test_the_direct_solution_is_the_textbooks(case, place):
     """Of NumPy's arrays and of JAX's."""
     prior, channels, reference, (mean, covariance, evidence) = case
-    found = lb.solve_directly(place(prior), channels, reference)
+    found = solve_directly(place(prior), channels, reference)
     np.testing.assert_allclose(found.log_evidence, evidence, rtol=1e-8)
     std = np.sqrt(np.diag(covariance)).reshape(-1, N_MODES)
     maps = found.mean.reshape(prior.n_components, N_MODES)
@@ -138,7 +139,7 @@ def test_skies_that_do_not_obey_the_prior_are_told():
         data = drawn(obeys, made)
         channels, reference = information_from(made, data)
         for prior_name, prior in (("true", true), ("wrong", wrong)):
-            solved = lb.solve_directly(prior, channels, reference)
+            solved = solve_directly(prior, channels, reference)
             maps = solved.mean.reshape(prior.n_components, N_MODES)
             spread = paired(solved.covariance(), prior)
             none = jnp.zeros((0, prior.n_components, N_MODES))
@@ -197,4 +198,4 @@ def test_bad_priors_and_channels_are_refused():
     prior = PRIORS["kernel"]()
     made = models(prior)
     channels, reference = information_from(made, [np.zeros(m.n_data) for m in made])
-    refuse("3 channels, the prior is for 4", lb.solve_directly, prior, channels[:3], reference)
+    refuse("3 channels, the prior is for 4", solve_directly, prior, channels[:3], reference)

@@ -10,7 +10,7 @@ from scipy import integrate, stats
 from scipy.optimize import minimize
 
 import lusee_bayes as lb
-from lusee_bayes.linear.information import integrated_out
+from lusee_bayes.linear.information import Information, integrated_out
 from lusee_bayes.priors.families import FREEDOM, Hyperprior, IsotropicFamily
 from lusee_bayes.priors.learning import (
     ROUNDING,
@@ -22,11 +22,12 @@ from lusee_bayes.priors.learning import (
     learn_whatever_fits,
 )
 from lusee_bayes.priors.local_scales import embedded_local_scales
+from lusee_bayes.sky.prior import DensePrior
 
 LMAX, N_DATA = 6, 120
 
 
-def information_of(sky, noise=30.0, seed=2, n_data=N_DATA, strength=1.0) -> lb.Information:
+def information_of(sky, noise=30.0, seed=2, n_data=N_DATA, strength=1.0) -> Information:
     """Of data of a sky through a random A."""
     rng = np.random.default_rng(seed)
     coupling = strength * rng.standard_normal((n_data, len(sky))) / np.sqrt(len(sky))
@@ -39,7 +40,7 @@ def information_of(sky, noise=30.0, seed=2, n_data=N_DATA, strength=1.0) -> lb.I
 @dataclass(frozen=True)
 class Case:
     family: IsotropicFamily
-    information: lb.Information
+    information: Information
     truth: np.ndarray
 
 
@@ -258,7 +259,7 @@ def one_parameter():
     noise = np.geomspace(0.1, 10.0, SIZE) * SCALE
     seen = 2.0 * SCALE * np.ones(SIZE)
     unknown = np.asarray(0.0)
-    information = lb.Information(
+    information = Information(
         np.diag(noise**-2.0), seen / noise**2, np.zeros(SIZE), unknown, unknown, unknown
     )
     prior = family.prior(family.at(np.array([0.4])).covariance)
@@ -286,12 +287,12 @@ def test_draws_are_those_of_the_integral_over_the_parameter(one_parameter):
             assert abs(level - expected) < 4.0 * error
 
 
-def weakly_known(family: IsotropicFamily, std: float) -> tuple[Learned, lb.Information]:
+def weakly_known(family: IsotropicFamily, std: float) -> tuple[Learned, Information]:
     """Parameters known to so much, and the information of data that hardly tell the sky."""
     theta = family.hyperprior.start()
     prior = family.prior(family.at(theta).covariance)
     matrix, one = np.eye(SIZE) * 1e-8, np.ones(())
-    information = lb.Information(matrix, np.ones(SIZE), np.zeros(SIZE), one, one, one)
+    information = Information(matrix, np.ones(SIZE), np.zeros(SIZE), one, one, one)
     return Learned(prior, (), theta, std**2 * np.eye(len(theta)), 0.0, 0), information
 
 
@@ -307,7 +308,7 @@ class Hopeless(Strength):
     """No theta has an S."""
 
     def prior(self, covariance):
-        return lb.DensePrior.of_covariance(-covariance)
+        return DensePrior.of_covariance(-covariance)
 
 
 def test_parameters_without_a_covariance_are_drawn_anew_and_then_refused():

@@ -20,6 +20,8 @@ import lusee_bayes as lb
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.linear.information import CONVERGENCE
 from lusee_bayes.linear.linear_gaussian import FromInformation, InData, InMap, form_of
+from lusee_bayes.noise.covariance import DenseCovariance, TimeBlockCovariance
+from lusee_bayes.sky.prior import PixelPrior
 
 FORMS = (InMap, InData, FromInformation)
 LMAX, N_MODES = 3, 16
@@ -42,8 +44,8 @@ def noise_terms(n_data: int):
     layout = DataLayout(3, n_data // 3)
     diagonal = lb.DiagonalCovariance(jnp.asarray(rng.uniform(0.5, 2.0, n_data)))
     blocks = np.stack([random_covariance(rng, 3) for _ in range(layout.n_times)])
-    time_blocks = lb.TimeBlockCovariance(jnp.asarray(blocks), layout)
-    dense = lb.DenseCovariance(jnp.asarray(random_covariance(rng, n_data)))
+    time_blocks = TimeBlockCovariance(jnp.asarray(blocks), layout)
+    dense = DenseCovariance(jnp.asarray(random_covariance(rng, n_data)))
     return {
         "diagonal": diagonal,
         "blocks": time_blocks,
@@ -162,7 +164,7 @@ def test_form_is_picked_from_the_sizes():
     assert form_of(tall) is FromInformation
     assert form_of(wide) is form_of(wide, transformed=True) is InData
     # what JAX has to transform, or is over pixels, has no closed form in NumPy
-    pixels = lb.PixelPrior(jnp.asarray(SPECTRUM), 2)
+    pixels = PixelPrior(jnp.asarray(SPECTRUM), 2)
     over_pixels = lb.LinearGaussian(pixels.coupling(tall.coupling.dense()), pixels, tall.noise)
     assert form_of(tall, transformed=True) is form_of(over_pixels) is InMap
     assert tall.factorise().basis is None
@@ -364,7 +366,7 @@ def test_bad_parts_are_refused(small):
         refuse(words, lb.LinearGaussian, *given)
     with pytest.raises((lb.InputError, TypeCheckError), match="offset"):  # types are checked first
         lb.LinearGaussian(a, prior, noise, jnp.ones(8))
-    bad = lb.DenseCovariance(jnp.eye(9).at[0, 0].set(-2.0), "the gain term")
+    bad = DenseCovariance(jnp.eye(9).at[0, 0].set(-2.0), "the gain term")
     condition = lb.LinearGaussian(a, prior, bad).condition
     refuse("the gain term is not positive definite.*is -2 ", condition, d)
 

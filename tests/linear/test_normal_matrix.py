@@ -12,11 +12,19 @@ import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_device, on_host
 from lusee_bayes.core.harmonics import pixel_matrix
 from lusee_bayes.instrument.averaging import windowed
+from lusee_bayes.instrument.beams.fields import ProductBeams
+from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.linear import information
 from lusee_bayes.linear.linear_gaussian import FromInformation, InMap, form_of
 from lusee_bayes.linear.normal_matrix import CHUNK, normal_matrix, summed, time_sums
 from lusee_bayes.linear.posterior import pixel_std
+from lusee_bayes.noise.covariance import (
+    DenseCovariance,
+    LowRankCovariance,
+    TimeBandedCovariance,
+    TimeBlockCovariance,
+)
 
 LMAX, N_PRODUCTS = 5, 4
 # the first and the last run see the sky through the same beams
@@ -31,9 +39,9 @@ def setting(order=2, missing=True, step_s=40000.0):
     if missing:
         flags[1, 4], flags[:, 9], flags[0, -1] = True, True, True
     layout = DataLayout.from_flags(flags)
-    beams = lb.ProductBeams(jnp.asarray(rng.standard_normal((N_PRODUCTS, (LMAX + 1) ** 2))), 25.0)
+    beams = ProductBeams(jnp.asarray(rng.standard_normal((N_PRODUCTS, (LMAX + 1) ** 2))), 25.0)
     # a pole that wanders a hundred times further than the Moon's: the tilt is not to be missed
-    pointing = lb.Pointing.of(o, LMAX, order)
+    pointing = Pointing.of(o, LMAX, order)
     times, once = np.arange(o.n_times), np.ones(o.n_times)
     wandering = 0.05 * rng.standard_normal((o.n_times, 2))
     azimuth, *rest = windowed(times, once, np.asarray(pointing.azimuth), wandering, order, LMAX)
@@ -49,10 +57,10 @@ def noise_of(kind, layout):
     roots = rng.standard_normal((layout.n_times, N_PRODUCTS, 2 * N_PRODUCTS))
     blocks = jnp.asarray(roots @ np.swapaxes(roots, 1, 2))
     if kind == "blocks":
-        return lb.TimeBlockCovariance(blocks, layout)
+        return TimeBlockCovariance(blocks, layout)
     if kind == "templates":
         root = jnp.asarray(rng.standard_normal((layout.size, 2)))
-        return lb.TimeBlockCovariance(blocks, layout) + lb.LowRankCovariance(root)
+        return TimeBlockCovariance(blocks, layout) + LowRankCovariance(root)
     # sums of what neighbouring times share: positive by construction
     shared = 0.3 * rng.standard_normal((layout.n_times + 2, N_PRODUCTS, N_PRODUCTS))
     band = np.zeros((layout.n_times, 3, N_PRODUCTS, N_PRODUCTS))
@@ -60,7 +68,7 @@ def noise_of(kind, layout):
         for t in range(w, layout.n_times):
             band[t, w] = sum(shared[t - w + k] @ shared[t - w + k].T for k in range(w, 3)) * 0.3
     band[:, 0] += np.asarray(blocks)
-    return lb.TimeBandedCovariance(jnp.asarray(band), layout)
+    return TimeBandedCovariance(jnp.asarray(band), layout)
 
 
 @pytest.mark.parametrize("place", [on_host, on_device])
@@ -111,8 +119,8 @@ def test_what_has_no_structure_is_refused():
     coupling = setting()
     layout = coupling.layout
     diagonal = noise_of("diagonal", layout)
-    dense = lb.DenseCovariance(diagonal.dense())
-    for noise in (dense, dense + lb.LowRankCovariance(jnp.ones((layout.size, 1)))):
+    dense = DenseCovariance(diagonal.dense())
+    for noise in (dense, dense + LowRankCovariance(jnp.ones((layout.size, 1)))):
         refuse("no structure in time", normal_matrix, coupling, noise)
     response = coupling.with_response(jnp.ones(layout.size))
     refuse("response of its own", normal_matrix, response, diagonal)
@@ -124,7 +132,7 @@ def model(kind="diagonal"):
     prior = lb.HarmonicPrior(jnp.asarray(10.0 / (1.0 + np.arange(LMAX + 1.0)) ** 2))
     noise = noise_of("diagonal", coupling.layout)
     if kind == "low rank":
-        noise = noise + lb.LowRankCovariance(jnp.ones((coupling.layout.size, 1)))
+        noise = noise + LowRankCovariance(jnp.ones((coupling.layout.size, 1)))
     offset = jnp.asarray(np.linspace(0, 1, coupling.layout.size)) if kind == "offset" else None
     return lb.LinearGaussian(coupling, prior, noise, offset)
 

@@ -11,6 +11,7 @@ from scipy import optimize, stats
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import n_modes, synthesis_matrix
+from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.joint import paired
 from lusee_bayes.linear.positive_joint import (
     ChannelsInMemory,
@@ -231,5 +232,5 @@ def test_bad_input_is_refused_in_a_sentence():
 
     refuse("the template", build, FREQUENCIES, [Hole(f) for f in FREQUENCIES], LMAX)
     skies = skies_of(FREQUENCIES[:1], ("level",))
-    other = lb.Information(*(np.zeros(s) for s in ((4, 4), 4, 4, (), (), ())))
+    other = Information(*(np.zeros(s) for s in ((4, 4), 4, 4, (), (), ())))
     refuse("the patterns", linearised, skies, 0, other, np.zeros(N))

@@ -29,6 +29,8 @@ from lusee_bayes.judge.measures import (
 )
 from lusee_bayes.linear import posterior as posterior_module
 from lusee_bayes.linear.linear_gaussian import FromInformation, InData, InMap
+from lusee_bayes.noise.covariance import DenseCovariance
+from lusee_bayes.sky.prior import PixelPrior
 
 FORMS = (InMap, InData, FromInformation)
 SPECTRUM = np.array([4.0, 1.0, 0.5, 0.25])
@@ -47,8 +49,8 @@ def problem(n_data, prior=None, blind=False):
     n, d = random_covariance(rng, n_data), rng.normal(size=n_data)
     prior = lb.HarmonicPrior(jnp.asarray(SPECTRUM)) if prior is None else prior
     a = jnp.asarray(a)
-    a = prior.coupling(a) if isinstance(prior, lb.PixelPrior) else a
-    return lb.LinearGaussian(a, prior, lb.DenseCovariance(jnp.asarray(n))), jnp.asarray(d)
+    a = prior.coupling(a) if isinstance(prior, PixelPrior) else a
+    return lb.LinearGaussian(a, prior, DenseCovariance(jnp.asarray(n))), jnp.asarray(d)
 
 
 def conditioned(n_data, form, prior=None, blind=False):
@@ -120,7 +122,7 @@ def test_the_root_times_its_transpose_is_the_covariance(n_data, form):
 
 
 SINGULAR = [
-    (lb.PixelPrior(jnp.asarray(SPECTRUM), 2), (48, 16), "prior over pixels is singular"),
+    (PixelPrior(jnp.asarray(SPECTRUM), 2), (48, 16), "prior over pixels is singular"),
     (lb.HarmonicPrior(jnp.asarray([4.0, 0.0, 0.5, 0.25])), (16, 16), "zero at ell = 1 and has no"),
 ]
 

@@ -7,9 +7,17 @@ from assertions import close, refuse
 from reference import real_harmonics
 
 import lusee_bayes as lb
-from lusee_bayes.instrument.beams.monopoles import with_values
+from lusee_bayes.instrument.beams.fields import ProductBeams
+from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith, with_values
+from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.noise.instrument_errors import derivative, difference, rms_difference
+from lusee_bayes.noise.instrument_errors import (
+    beam_error_noise,
+    derivative,
+    difference,
+    rms_difference,
+)
+from lusee_bayes.sky.prior import PixelPrior
 
 LMAX, FREQUENCY = 4, 25.0
 START = {
@@ -23,11 +31,11 @@ START = {
 }
 
 
-def antennas(**changes) -> lb.Monopoles:
+def antennas(**changes) -> Monopoles:
     """Built from scratch with some parameters changed."""
     p = START | changes
-    return lb.Monopoles(
-        regolith=lb.Regolith(p["surface_permittivity"], p["deep_permittivity"], p["loss_tangent"]),
+    return Monopoles(
+        regolith=Regolith(p["surface_permittivity"], p["deep_permittivity"], p["loss_tangent"]),
         length_m=p["length_m"],
         zenith_angle_deg=p["zenith_angle_deg"],
         height_m=p["height_m"],
@@ -46,7 +54,7 @@ def shifted():
 
 
 def test_the_term_is_da_s_da(beams, shifted):
-    pointing = lb.Pointing.of(lb.Observation.from_runs([lb.Run(0.02)]), LMAX)
+    pointing = Pointing.of(lb.Observation.from_runs([lb.Run(0.02)]), LMAX)
     flags = np.zeros((16, pointing.n_times), dtype=bool)
     flags[2, 1] = flags[:, 4] = True
     layout = DataLayout.from_flags(flags)
@@ -58,13 +66,13 @@ def test_the_term_is_da_s_da(beams, shifted):
     spectrum = 1e8 / (1.0 + np.arange(LMAX + 1.0)) ** 2
     per_mode = np.repeat(spectrum, 2 * np.arange(LMAX + 1) + 1)
     expected = error * per_mode @ error.T
-    got = lb.beam_error_noise(direction, lb.HarmonicPrior(jnp.asarray(spectrum)))
+    got = beam_error_noise(direction, lb.HarmonicPrior(jnp.asarray(spectrum)))
     # the difference of two A of ten times its size, each good to a few eps
     atol = 1e-13 * np.abs(expected).max()
     np.testing.assert_allclose(got.dense(), expected, rtol=0, atol=atol)
     np.testing.assert_allclose(got.diagonal(), np.diag(expected), rtol=0, atol=atol)
     # a prior that is not diagonal, whose unknowns are pixels of the same skies
-    prior = lb.PixelPrior(jnp.asarray(spectrum), 2)
+    prior = PixelPrior(jnp.asarray(spectrum), 2)
     on_pixels = prior.coupling(direction.dense())
     full = np.asarray(on_pixels) @ np.asarray(prior.covariance()) @ np.asarray(on_pixels).T
     close(full, expected, 1e-11)
@@ -103,14 +111,14 @@ def test_rms_difference_is_that_over_directions(beams, shifted):
     assert got == pytest.approx(expected, rel=1e-12)
     assert 0.02 < got < 0.5
     assert rms_difference(beams, beams) == 0.0
-    double = lb.ProductBeams(3.0 * beams.modes, FREQUENCY)
+    double = ProductBeams(3.0 * beams.modes, FREQUENCY)
     assert rms_difference(double, beams) == pytest.approx(2.0, rel=1e-14)
     assert rms_difference(beams, double) == pytest.approx(2.0 / 3.0, rel=1e-14)
 
 
 @pytest.mark.parametrize("shape", [(16, 36), (9, 25)])
 def test_beams_that_do_not_match_are_refused(beams, shape):
-    other = lb.ProductBeams(jnp.ones(shape), FREQUENCY)
+    other = ProductBeams(jnp.ones(shape), FREQUENCY)
     message = rf"coefficients has shape \({shape[0]}, {shape[1]}\), expected \(16, 25\)"
     for use in (difference, rms_difference):
         refuse(message, use, other, beams)

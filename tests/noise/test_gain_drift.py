@@ -9,6 +9,7 @@ from reference_linear import assert_draws_follow, z_of
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.products import DataLayout
+from lusee_bayes.noise.covariance import TimeBandedCovariance
 from lusee_bayes.noise.instrument_errors import GainDrift, with_gains
 
 # a gap of 27 hours, and of 190, beyond which nothing is correlated
@@ -67,7 +68,7 @@ def gappy(n_antennas):
     return flags
 
 
-def term(drift, d, hours, flags, width=None) -> lb.TimeBandedCovariance:
+def term(drift, d, hours, flags, width=None) -> TimeBandedCovariance:
     return drift.covariance(jnp.asarray(d), hours, DataLayout.from_flags(flags), width)
 
 

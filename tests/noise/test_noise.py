@@ -9,6 +9,7 @@ from reference_linear import z_of
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.products import DataLayout, to_matrix, to_real
+from lusee_bayes.noise.covariance import TimeBlockCovariance
 from lusee_bayes.noise.radiometer import exact_blocks, paper_variance, sample_covariances
 
 N_ANTENNAS, N_PRODUCTS, N_TIMES = 4, 16, 3
@@ -87,7 +88,7 @@ def test_exact_form_is_what_complex_gaussian_voltages_do():
 
 def test_exact_variances_have_closed_forms():
     cov = noise("exact")
-    assert isinstance(cov, lb.TimeBlockCovariance)
+    assert isinstance(cov, TimeBlockCovariance)
     variance = np.asarray(cov.diagonal()).reshape(N_PRODUCTS, N_TIMES) * BANDWIDTH * STEP
     autos = np.diagonal(T, axis1=1, axis2=2).real.T
     np.testing.assert_allclose(variance[AUTOS], autos**2, rtol=1e-14)

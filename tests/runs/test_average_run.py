@@ -10,6 +10,8 @@ from experiments import flagged
 import lusee_bayes as lb
 from lusee_bayes.cli.options import parse_duration
 from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.instrument.averaging import averaged
+from lusee_bayes.instrument.visibilities import read_visibilities
 from lusee_bayes.testing.scenarios import small_scenario
 
 LMAX = 5
@@ -37,7 +39,7 @@ def test_the_mean_of_a_signal_is_the_signal_of_the_mean(data):
     some = flagged(data, flags)
     setup = set_up(scenario(), some)
     signal = replace(some, data=some.layout.gather(np.asarray(setup.signal)))
-    coarse = lb.averaged(signal, 4 * 1800.0)
+    coarse = averaged(signal, 4 * 1800.0)
     assert 0 < coarse.layout.size < signal.layout.size
     seen = set_up(scenario(), coarse)
     expected = coarse.layout.gather(np.asarray(seen.signal))
@@ -68,8 +70,8 @@ def test_the_command_writes_averages_and_says_what_they_cost(path, tmp_path, cap
     assert "live time lost where products have different flags: 0.00%" in said
     assert "information about the map: " in said and " lost" in said
     assert f"160 visibilities -> {out}" in said
-    found = lb.read_visibilities(out)
-    assert found.digest() == lb.averaged(lb.read_visibilities(path), 7200.0).digest()
+    found = read_visibilities(out)
+    assert found.digest() == averaged(read_visibilities(path), 7200.0).digest()
     there = refused(capsys, "average", path, "--to", "4h", "-o", out, *given)
     assert "is there already; give -o another name, or --force" in there
     long, again = tmp_path / "long.nc", tmp_path / "again.nc"
@@ -78,10 +80,10 @@ def test_the_command_writes_averages_and_says_what_they_cost(path, tmp_path, cap
     command = ["average", path, "-o", again, "--no-information", "--to"]
     assert run(*command, "120min") == 0
     assert "information" not in capsys.readouterr().out
-    assert lb.read_visibilities(again).digest() == found.digest()
-    assert lb.read_visibilities(out).digest() == found.digest()
+    assert read_visibilities(again).digest() == found.digest()
+    assert read_visibilities(out).digest() == found.digest()
     assert run(*command, "4h", "--force") == 0
-    assert lb.read_visibilities(again).digest() != found.digest()
+    assert read_visibilities(again).digest() != found.digest()
 
 
 def test_what_flags_cost_is_said(data, tmp_path):

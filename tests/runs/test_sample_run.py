@@ -26,6 +26,7 @@ from reference_linear import z_of
 import lusee_bayes as lb
 from lusee_bayes.core.files import LOCK
 from lusee_bayes.core.harmonics import modes_to_map
+from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.runs import sample_run, validate_run
 from lusee_bayes.runs.sample_run import sample_result
 from lusee_bayes.sampling import hmc
@@ -204,7 +205,7 @@ def test_resuming_another_run_is_refused_and_the_difference_named(
         data = replace(data, data=data.data * (1.0 + change["data"]))
     sampler = replace(SAMPLER, **change.get("sampler", {}))
     before = content(killed)
-    given = lb.Experiment(setup, data), program, sampler, killed
+    given = Experiment(setup, data), program, sampler, killed
     refuse(message, sample_result, *given, resume=True)
     assert content(killed) == before
 

@@ -23,7 +23,14 @@ from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.judge.levels import LEVELS
-from lusee_bayes.sampling.validation import FALSE_ALARM, N_DRAWS, Ranks, ranked_of_sky
+from lusee_bayes.sampling.validation import (
+    FALSE_ALARM,
+    N_DRAWS,
+    Ranks,
+    calibrate,
+    calibrate_sky,
+    ranked_of_sky,
+)
 
 SMALL = ("lmax=6", "observation.runs.0.cycles=0.02")
 NOISES = {
@@ -149,7 +156,7 @@ def test_ranks_count_the_draws_below_the_truth():
         return {"x": jnp.stack([shuffled, grid, grid], axis=1), "y": shuffled}
 
     stages = Counting()
-    ranks = lb.calibrate(
+    ranks = calibrate(
         simulate, draw, lambda sky, data: sky, n_simulations=130, batch=60, stages=stages
     )
     assert ranks.names == ("x 0", "x 1", "x 2", "y")
@@ -188,7 +195,7 @@ S = 0.7
 
 def conjugate(shift=0.0, scale=1.0, s=S, simulations=500, **options) -> Ranks:
     model = Conjugate(*(jnp.asarray(float(x)) for x in (shift, scale, s)))
-    return lb.calibrate(
+    return calibrate(
         model.simulate,
         model.draw,
         model.quantities,
@@ -251,7 +258,7 @@ def test_too_few_data_sets_are_refused():
     refuse("at least 100 simulations, .*got 99", conjugate, simulations=99)
     assert conjugate(simulations=100).n_simulations == 100
     with pytest.raises(lb.InputError, match="at least 100 simulations, .*got 20"):
-        lb.calibrate_sky(random_model(True), random_model(True), n_simulations=20)
+        calibrate_sky(random_model(True), random_model(True), n_simulations=20)
 
 
 # --- calibrate_sky ----------------------------------------------------------------------------
@@ -260,7 +267,7 @@ def test_too_few_data_sets_are_refused():
 @pytest.mark.long
 @EVERY_NOISE
 def test_the_sky_is_calibrated(noise):
-    ranks = lb.calibrate_sky(model(noise), model(noise), seed=1)
+    ranks = calibrate_sky(model(noise), model(noise), seed=1)
     assert ranks.n_simulations == 500
     assert ranks.passed, p_values(ranks)
     assert len(ranks.names) == len(set(ranks.names)) == 22
@@ -302,10 +309,10 @@ def test_what_is_ranked_of_a_sky():
 
 @pytest.mark.long
 def test_fewer_data_than_modes_with_an_offset():
-    ranks = lb.calibrate_sky(random_model(True), random_model(True))
+    ranks = calibrate_sky(random_model(True), random_model(True))
     assert ranks.passed, p_values(ranks)
     assert {f"mode {i}" for i in range(9)} < set(ranks.names)
-    assert not lb.calibrate_sky(random_model(True), random_model(False)).passed
+    assert not calibrate_sky(random_model(True), random_model(False)).passed
 
 
 @pytest.mark.long
@@ -314,7 +321,7 @@ def test_fewer_data_than_modes_with_an_offset():
 def test_a_noise_off_by_sqrt_2_is_noticed(noise, factor):
     truth = model(noise)
     wrong = lb.LinearGaussian(truth.coupling, truth.prior, truth.noise.scaled(factor))
-    ranks = lb.calibrate_sky(truth, wrong, seed=1)
+    ranks = calibrate_sky(truth, wrong, seed=1)
     assert not ranks.passed
     p = p_values(ranks)
     assert max(p["distance"], p["log likelihood"]) < 1e-8

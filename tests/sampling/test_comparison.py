@@ -15,6 +15,7 @@ from reference_linear import random_covariance
 from scipy.stats import multivariate_normal, norm
 
 import lusee_bayes as lb
+from lusee_bayes.noise.covariance import DenseCovariance
 from lusee_bayes.sampling import evidence as comparison
 from lusee_bayes.sampling.programs import Program
 
@@ -83,7 +84,7 @@ class Case:
             "coupling": jnp.asarray(self.a),
             "offset": jnp.zeros(len(self.a)),
             "prior": lb.HarmonicPrior(jnp.asarray(self.spectrum)),
-            "noise": lb.DenseCovariance(jnp.asarray(self.n)),
+            "noise": DenseCovariance(jnp.asarray(self.n)),
         }
 
 
@@ -228,7 +229,7 @@ def test_leaving_one_datum_out(n_data, shifted):
     model = lb.LinearGaussian(
         jnp.asarray(it.a),
         lb.HarmonicPrior(jnp.asarray(it.spectrum)),
-        lb.DenseCovariance(jnp.asarray(it.n)),
+        DenseCovariance(jnp.asarray(it.n)),
         jnp.asarray(offset) if shifted else None,
     )
     assert (model.factorise().basis is None) == (n_data == 30)

@@ -17,6 +17,7 @@ from reference_linear import posterior as naive_posterior
 import lusee_bayes as lb
 from lusee_bayes.core import formats
 from lusee_bayes.instrument.products import DataLayout
+from lusee_bayes.noise.covariance import DenseCovariance
 from lusee_bayes.sampling.datatree import read_datatree, to_datatree
 from lusee_bayes.sampling.hmc import STATISTICS, Chains
 
@@ -36,7 +37,7 @@ def setting():
     model = lb.LinearGaussian(
         jnp.asarray(rng.normal(size=(layout.size, N_MODES))),
         lb.HarmonicPrior(jnp.asarray([4.0, 1.0, 0.5])),
-        lb.DenseCovariance(jnp.asarray(random_covariance(rng, layout.size))),
+        DenseCovariance(jnp.asarray(random_covariance(rng, layout.size))),
     )
     truth, values = model.sample(jax.random.key(2))
     observation = lb.Observation.from_runs([lb.Run(cycles=N_TIMES / 327.5)])

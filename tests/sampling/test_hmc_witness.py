@@ -18,9 +18,13 @@ from jaxtyping import Array, Float
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers
+from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.linear.linear_gaussian import InMap
+from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.noise.covariance import DenseCovariance
 from lusee_bayes.sampling.hmc import Chains, Sampler, Whitening, sample
 from lusee_bayes.sampling.validation import Comparison, validate_draws
+from lusee_bayes.sky.prior import DensePrior
 
 NOISES = {
     "paper": ("fiducial",),
@@ -38,7 +42,7 @@ LMAX, N_MODES, DRAWS, TIME = 6, 49, 2000, 2
 
 
 def drawn(
-    model: lb.LinearGaussian, data: lb.Visibilities, coordinates: lb.Posterior, **options
+    model: lb.LinearGaussian, data: lb.Visibilities, coordinates: Posterior, **options
 ) -> Chains:
     program = lb.load_program("sky")
     arguments = {**program.arguments(model), "data": data.data}
@@ -51,10 +55,10 @@ def drawn(
 class Witness:
     """An experiment's posterior and four chains of draws of the same."""
 
-    experiment: lb.Experiment
+    experiment: Experiment
     data: lb.Visibilities
     model: lb.LinearGaussian
-    posterior: lb.Posterior
+    posterior: Posterior
     chains: Chains
 
     @classmethod
@@ -67,7 +71,7 @@ class Witness:
         assert model.coupling.shape == (96, N_MODES)
         return cls(experiment, data, model, posterior, drawn(model, data, posterior))
 
-    def judge(self, posterior: lb.Posterior, draws: int = DRAWS, first: int = 0) -> Comparison:
+    def judge(self, posterior: Posterior, draws: int = DRAWS, first: int = 0) -> Comparison:
         some = slice(first, first + draws)
         skies = self.chains.sites["sky"][:, some]
         diverging, energy = (
@@ -75,7 +79,7 @@ class Witness:
         )
         return validate_draws(skies, posterior, diverging, energy)
 
-    def failed_of(self, wrong: lb.Posterior, draws: int = DRAWS // 4, first: int = 0) -> set[str]:
+    def failed_of(self, wrong: Posterior, draws: int = DRAWS // 4, first: int = 0) -> set[str]:
         """What fails of ``wrong`` about the true mean: only C can be to blame.
 
         A quarter of the draws is enough for most, and takes a quarter of the time.
@@ -90,13 +94,13 @@ class Witness:
         prior: lb.HarmonicPrior | None = None,
         noise: np.ndarray | None = None,
         keep: np.ndarray | slice = slice(None),
-    ) -> lb.Posterior:
+    ) -> Posterior:
         """The posterior with another prior, another N, or of the rows ``keep`` only."""
         noise = np.asarray(self.model.noise.dense()) if noise is None else noise
         model = lb.LinearGaussian(
             self.model.coupling.dense()[keep],
             prior or self.model.prior,
-            lb.DenseCovariance(jnp.asarray(noise[keep][:, keep])),
+            DenseCovariance(jnp.asarray(noise[keep][:, keep])),
         )
         return model.condition(self.data.data[keep], InMap).posterior
 
@@ -161,7 +165,7 @@ def test_hmc_finds_it_where_the_prior_correlates_modes():
     assert left.min() < 0.1 and left.max() > 0.3
     # without its correlations, or a standard deviation elsewhere, the prior is another one
     variances = jnp.diag(w.model.prior.variance())
-    alone = lb.DensePrior.of_covariance(variances, jnp.asarray(w.model.prior.mean))
+    alone = DensePrior.of_covariance(variances, jnp.asarray(w.model.prior.mean))
     assert not w.judge(w.condition(prior=alone)).passed
     elsewhere = replace(w.model.prior, mean=w.model.prior.mean + jnp.sqrt(jnp.diag(variances)))
     assert "mean" in failed(w.judge(w.condition(prior=elsewhere)))

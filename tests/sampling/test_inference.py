@@ -23,6 +23,7 @@ from reference_linear import posterior as naive_posterior
 from scipy.stats import lognorm, multivariate_normal
 
 import lusee_bayes as lb
+from lusee_bayes.noise.covariance import DenseCovariance
 from lusee_bayes.sampling import hmc as inference
 from lusee_bayes.sampling.hmc import CHUNK, STATISTICS, Checkpoints, Sampler, sample
 from lusee_bayes.sampling.programs import latent_sites
@@ -39,7 +40,7 @@ def small_model() -> lb.LinearGaussian:
     return lb.LinearGaussian(
         jnp.asarray(coupling),
         lb.HarmonicPrior(jnp.asarray([4.0, 1.0, 2.0])),
-        lb.DenseCovariance(jnp.asarray(random_covariance(rng, N_DATA))),
+        DenseCovariance(jnp.asarray(random_covariance(rng, N_DATA))),
     )
 
 

@@ -18,6 +18,7 @@ from reference_linear import posterior, random_covariance, z_of
 from scipy.stats import lognorm, norm
 
 import lusee_bayes as lb
+from lusee_bayes.noise.covariance import DenseCovariance
 from lusee_bayes.sampling.programs import collapsed_draws
 
 PROGRAM = lb.load_program("prior_amplitude")
@@ -58,7 +59,7 @@ class Case:
             "coupling": jnp.asarray(self.a),
             "offset": jnp.zeros(len(self.a)),
             "prior": lb.HarmonicPrior(jnp.asarray(self.base)),
-            "noise": lb.DenseCovariance(jnp.asarray(self.n)),
+            "noise": DenseCovariance(jnp.asarray(self.n)),
             "data": jnp.asarray(self.data),
         }
 

@@ -20,6 +20,7 @@ import lusee_bayes
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
 from lusee_bayes.experiment.experiment import program_pieces
+from lusee_bayes.noise.covariance import DenseCovariance
 from lusee_bayes.sampling.programs import (
     collapsed_draws,
     is_collapsed,
@@ -58,7 +59,7 @@ def gaussian():
     return lb.LinearGaussian(
         jnp.asarray(rng.standard_normal((N_DATA, 9))),
         lb.HarmonicPrior(jnp.asarray(SPECTRUM)),
-        lb.DenseCovariance(jnp.asarray(3.0 * random_covariance(rng, N_DATA))),
+        DenseCovariance(jnp.asarray(3.0 * random_covariance(rng, N_DATA))),
     )
 
 

@@ -20,7 +20,10 @@ from scipy.stats import multivariate_normal
 
 import lusee_bayes as lb
 from lusee_bayes.linear.linear_gaussian import FromInformation, InData, InMap
+from lusee_bayes.noise.covariance import DenseCovariance
+from lusee_bayes.sampling.hmc import whitened
 from lusee_bayes.sampling.programs import numpyro_promotion
+from lusee_bayes.sky.prior import DensePrior, PixelPrior
 
 LMAX = 2
 N_DATA = 30
@@ -38,7 +41,7 @@ def gaussian():
     return lb.LinearGaussian(
         jnp.asarray(rng.standard_normal((N_DATA, (LMAX + 1) ** 2))),
         lb.HarmonicPrior(jnp.asarray([4.0, 1.0, 0.5])),
-        lb.DenseCovariance(jnp.asarray(root @ root.T / N_DATA + np.eye(N_DATA))),
+        DenseCovariance(jnp.asarray(root @ root.T / N_DATA + np.eye(N_DATA))),
     )
 
 
@@ -77,7 +80,7 @@ def test_batches_and_draws(gaussian):
 def test_priors_without_density_are_refused():
     spectrum = jnp.asarray([1.0, 0.0])
     refuse("zero at ell = 1", lb.SkyPrior, lb.HarmonicPrior(spectrum))
-    refuse("over pixels is singular: it has no density", lb.SkyPrior, lb.PixelPrior(spectrum, 1))
+    refuse("over pixels is singular: it has no density", lb.SkyPrior, PixelPrior(spectrum, 1))
 
 
 def test_handlers_and_predictive(gaussian):
@@ -141,7 +144,7 @@ def test_the_log_determinant_is_that_of_the_root(gaussian, n_data, form):
     few = lb.LinearGaussian(
         gaussian.coupling.dense()[:n_data],
         gaussian.prior,
-        lb.DenseCovariance(gaussian.noise.matrix[:n_data, :n_data]),
+        DenseCovariance(gaussian.noise.matrix[:n_data, :n_data]),
     )
     posterior = few.condition(few.sample(jax.random.key(1))[1], form).posterior
     whitening = lb.Whitening.of(posterior)
@@ -155,7 +158,7 @@ def test_the_log_determinant_is_that_of_the_root(gaussian, n_data, form):
 
 def test_a_prior_without_density_has_no_white_coordinates():
     spectrum = jnp.asarray([1.0, 0.0])
-    for prior in (lb.HarmonicPrior(spectrum), lb.PixelPrior(jnp.asarray([1.0, 0.5]), 1)):
+    for prior in (lb.HarmonicPrior(spectrum), PixelPrior(jnp.asarray([1.0, 0.5]), 1)):
         a = jnp.asarray(np.random.default_rng(0).standard_normal((3, prior.size)))
         model = lb.LinearGaussian(a, prior, lb.DiagonalCovariance(jnp.ones(3)))
         refuse("has no density", lb.Whitening.of, model.condition(jnp.ones(3)).posterior)
@@ -173,7 +176,7 @@ def test_the_density_of_z_is_the_programs_own_times_the_determinant(gaussian, ca
             sky = whitening.mean + whitening.root @ z
             plain = joint(model, arguments, {"sky": sky, **others})
             expected = plain + np.linalg.slogdet(np.asarray(whitening.root))[1]
-            model_of_z = lb.whitened(model, whitening)
+            model_of_z = whitened(model, whitening)
             got = joint(model_of_z, arguments, {"sky_white": z, **others})
             # terms up to 1e4, summed in another order: 1e4 x 10 x eps
             assert got == pytest.approx(expected, abs=1e-11, rel=1e-13)
@@ -190,15 +193,13 @@ def test_z_is_standard_normal_where_the_coordinates_are_the_posteriors(gaussian,
     for factor in (0.0, 1.0, -5.0):
         at = factor * np.asarray(z)
         expected = evidence + multivariate_normal(cov=np.eye(9)).logpdf(at)
-        got = joint(
-            lb.whitened(program("sky"), whitening), arguments, {"sky_white": jnp.asarray(at)}
-        )
+        got = joint(whitened(program("sky"), whitening), arguments, {"sky_white": jnp.asarray(at)})
         assert got == pytest.approx(expected, rel=1e-11)
 
 
 def test_sites_of_a_whitened_program(case, z):
     arguments, whitening = case
-    model = lb.whitened(program("sky"), whitening)
+    model = whitened(program("sky"), whitening)
     trace = handlers.trace(handlers.substitute(model, {"sky_white": z})).get_trace(**arguments)
     assert set(trace) == {"sky_white", "sky_density", "sky", "data"}
     white, sky = trace["sky_white"], trace["sky"]
@@ -216,7 +217,7 @@ def test_sites_of_a_whitened_program(case, z):
 def test_other_sites_are_left_alone(case, z):
     arguments, whitening = case
     values = {"sky_white": z, "amplitude": jnp.asarray(0.7)}
-    model = lb.whitened(strong_sky, whitening)
+    model = whitened(strong_sky, whitening)
     trace = handlers.trace(handlers.substitute(model, values)).get_trace(**arguments)
     assert isinstance(trace["amplitude"]["fn"], dist.LogNormal)
     assert float(trace["amplitude"]["value"]) == 0.7
@@ -236,7 +237,7 @@ def test_an_observed_sky_is_not_whitened(case, z, how):
 
     model = observed if how == "obs" else handlers.condition(program("sky"), {"sky": z})
     with pytest.raises(lb.InputError, match="the site 'sky' is observed; only latent sites"):
-        handlers.substitute(lb.whitened(model, whitening), {"sky_white": z})(**arguments)
+        handlers.substitute(whitened(model, whitening), {"sky_white": z})(**arguments)
 
 
 def test_predictions_from_draws_of_z(gaussian, case):
@@ -247,7 +248,7 @@ def test_predictions_from_draws_of_z(gaussian, case):
     z = jax.random.normal(jax.random.key(3), (n, 9), dtype=jnp.float64)
     free = {**arguments, "data": None}
     with numpyro_promotion():
-        drawn = Predictive(lb.whitened(program("sky"), whitening), {"sky_white": z})(
+        drawn = Predictive(whitened(program("sky"), whitening), {"sky_white": z})(
             jax.random.key(4), **free
         )
     expected = np.asarray(whitening.mean) + np.asarray(z) @ np.asarray(whitening.root).T
@@ -264,7 +265,7 @@ def test_the_gaussian_about_the_mode_of_a_linear_model_is_its_posterior():
     """Of a prior that correlates modes: its curvature is no diagonal."""
     rng = np.random.default_rng(8)
     half, program = rng.standard_normal((9, 9)), lb.load_program("sky")
-    prior = lb.DensePrior.of_covariance(jnp.asarray(half @ half.T + np.eye(9)))
+    prior = DensePrior.of_covariance(jnp.asarray(half @ half.T + np.eye(9)))
     a, data = (jnp.asarray(rng.standard_normal(shape)) for shape in ((6, 9), 6))
     model = lb.LinearGaussian(a, prior, lb.DiagonalCovariance(jnp.ones(6)))
     found = lb.laplace_approximation(program.model, {**program.arguments(model), "data": data})

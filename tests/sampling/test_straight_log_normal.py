@@ -12,8 +12,8 @@ import pytest
 from assertions import refuse
 from scipy import optimize
 
-import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_device
+from lusee_bayes.linear.information import Information
 from lusee_bayes.sampling.log_normal_prior import AMPLITUDE, STRUCTURE, TILT, LogNormalPrior
 from lusee_bayes.sampling.log_normal_program import (
     LogNormalMode,
@@ -24,6 +24,7 @@ from lusee_bayes.sampling.log_normal_program import (
 )
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
 from lusee_bayes.sky.positive_skies import LogNormalSky, deviation_spectrum
+from lusee_bayes.sky.prior import DensePrior
 from lusee_bayes.sky.sky_source import EmbeddedTemplate
 
 MHZ, LMAX, TILTED = 25.0, 3, -2.0
@@ -35,12 +36,12 @@ def log_normal(amplitude, lmax=LMAX, level=LEVEL, sources=()) -> LogNormalSky:
     return LogNormalSky.of(EmbeddedTemplate(MHZ), spectrum, MHZ, sources, band=16)
 
 
-def informed(truth: np.ndarray) -> lb.Information:
+def informed(truth: np.ndarray) -> Information:
     """What data say that know combinations of 16 modes to 10 to 1e5 K; the template's is 1e5 K."""
     rng = np.random.default_rng(1)
     rotation = np.linalg.qr(rng.standard_normal((16, 16)))[0]
     precision = np.geomspace(1e-2, 1e-10, 16)
-    return lb.Information(
+    return Information(
         (rotation * precision) @ rotation.T,
         rotation @ (np.sqrt(precision) * rng.standard_normal(16)),
         truth,
@@ -51,7 +52,7 @@ def informed(truth: np.ndarray) -> lb.Information:
 
 
 @lru_cache
-def information(amplitude: float = 0.03) -> lb.Information:
+def information(amplitude: float = 0.03) -> Information:
     """Of a sky that departs from the template by 10 % on large scales."""
     sky = log_normal(amplitude, sources=BRIGHT_SOURCES[:1])
     return informed(sky.modes(np.random.default_rng(2).standard_normal(sky.size)))
@@ -71,7 +72,7 @@ def two_unknowns():
     sky = log_normal(0.1, lmax=0, sources=BRIGHT_SOURCES[:1])
     value = 1.5 * sky.modes(np.zeros(2))
     precision = float((0.05 * value[0]) ** -2)
-    given = lb.Information(
+    given = Information(
         np.array([[precision]]),
         np.zeros(1),
         value,
@@ -96,7 +97,7 @@ def test_small_deviations_have_the_posterior_of_a_gaussian_sky():
     """s of 1e-4: exp(s) - 1 - s is 1e-8, of skies that the data know to 1e-5."""
     sky = log_normal(1e-4, level=np.array([1e-8]))
     root = sky.jacobian(np.zeros(sky.size))
-    prior = lb.DensePrior.of_covariance(root @ root.T, sky.modes(np.zeros(sky.size)))
+    prior = DensePrior.of_covariance(root @ root.T, sky.modes(np.zeros(sky.size)))
     given = informed(sky.modes(np.random.default_rng(0).standard_normal(sky.size)))
     expected, found = given.posterior(prior), find_mode(sky, given)
     std = np.asarray(expected.std())

@@ -13,6 +13,7 @@ from scipy import stats
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.products import DataLayout, auto_indices
+from lusee_bayes.noise.covariance import DenseCovariance
 from lusee_bayes.runs.sample_run import coordinates, sample_result
 from lusee_bayes.sampling.programs import numpyro_promotion
 
@@ -120,7 +121,7 @@ def test_draws_follow_their_law(case):
 
 
 def test_noise_that_couples_times_is_refused(case):
-    dense = lb.DenseCovariance(jnp.asarray(case.noise.dense()))
+    dense = DenseCovariance(jnp.asarray(case.noise.dense()))
     with pytest.raises(lb.InputError, match="couples no two times, not DenseCovariance") as error:
         lb.TimesStudentT(case.loc, dense, case.layout, 4.0)
     assert "\n" not in str(error.value)

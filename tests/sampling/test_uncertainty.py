@@ -13,6 +13,7 @@ from scipy.stats import norm
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
+from lusee_bayes.noise.covariance import DenseCovariance
 from lusee_bayes.sampling import mode
 from lusee_bayes.sampling.mode import (
     disc,
@@ -35,7 +36,7 @@ def gaussian():
     model = lb.LinearGaussian(
         jnp.asarray(rng.normal(size=(10, N_MODES))),
         lb.HarmonicPrior(jnp.asarray([4.0, 2.0, 1.0, 0.5])),
-        lb.DenseCovariance(jnp.asarray(random_covariance(rng, 10))),
+        DenseCovariance(jnp.asarray(random_covariance(rng, 10))),
     )
     _, data = model.sample(jax.random.key(0))
     return model.condition(data).posterior, naive_posterior(*matrices(model), data)

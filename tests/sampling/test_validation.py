@@ -13,6 +13,8 @@ from scipy import linalg, stats
 
 import lusee_bayes as lb
 from lusee_bayes.linear.linear_gaussian import Form, InData, InMap
+from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.noise.covariance import DenseCovariance
 from lusee_bayes.sampling import validation
 from lusee_bayes.sampling.validation import FALSE_ALARM, NULL_RUNS, Check, validate_draws
 
@@ -56,7 +58,7 @@ class Truth:
         self.mean, self.covariance = gain @ data, s - gain @ a @ s
         self.root = np.linalg.cholesky(self.covariance)
         self.std = np.sqrt(np.diag(self.covariance))
-        prior, noise = lb.HarmonicPrior(jnp.asarray(spectrum)), lb.DenseCovariance(jnp.asarray(n))
+        prior, noise = lb.HarmonicPrior(jnp.asarray(spectrum)), DenseCovariance(jnp.asarray(n))
         model = lb.LinearGaussian(jnp.asarray(a), prior, noise)
         self.posterior = model.condition(jnp.asarray(data), form).posterior
 
@@ -65,12 +67,12 @@ class Truth:
         return self.mean + white @ self.root.T, energy
 
 
-def wrong_posterior(mean: np.ndarray, covariance: np.ndarray) -> lb.Posterior:
+def wrong_posterior(mean: np.ndarray, covariance: np.ndarray) -> Posterior:
     """N(mean, covariance), whatever they are: the prior is one, Lambda the covariance's inverse."""
     lower = np.linalg.cholesky(np.linalg.inv(covariance))
     prior = lb.HarmonicPrior(jnp.ones(LMAX + 1))
     zero = jnp.zeros(())
-    return lb.Posterior(prior, jnp.asarray(mean), jnp.asarray(lower), None, zero, zero)
+    return Posterior(prior, jnp.asarray(mean), jnp.asarray(lower), None, zero, zero)
 
 
 def judge(draws, energy, posterior, diverging=None, seed=0):

@@ -16,6 +16,7 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.sky import galaxy
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
+from lusee_bayes.sky.prior import PixelPrior
 
 NSIDE = 64
 
@@ -314,7 +315,7 @@ def test_bad_input_is_named(arguments, word):
         lambda n: galaxy.galaxy_map(25.0, nside=n),
         lambda n: lb.monopole_beams(25.0, n),
         lambda n: modes_to_map(np.zeros(16), n),
-        lambda n: lb.PixelPrior(np.ones(4), n),
+        lambda n: PixelPrior(np.ones(4), n),
     ],
     ids=["sky", "map", "beams", "synthesis", "prior"],
 )

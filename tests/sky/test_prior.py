@@ -19,11 +19,13 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import n_modes, per_mode, synthesis_matrix
 from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.experiment.model import base_model
+from lusee_bayes.instrument.coupling import DenseCoupling
 from lusee_bayes.judge.residuals import residuals
 from lusee_bayes.linear.linear_gaussian import FromInformation, InData, InMap
+from lusee_bayes.noise.instrument_errors import beam_error_noise
 from lusee_bayes.priors.families import Hyperprior, IsotropicFamily, PriorFamily
 from lusee_bayes.priors.local_scales import embedded_local_scales, windows
-from lusee_bayes.sky.prior import IndependentPrior
+from lusee_bayes.sky.prior import DensePrior, IndependentPrior, PixelPrior
 from lusee_bayes.testing.contracts import check_prior
 
 SPECTRUM = np.array([4.0, 1.0, 0.0, 0.25])  # nothing at ell = 2
@@ -48,7 +50,7 @@ def harmonic():
 
 @pytest.fixture(scope="module")
 def pixel():
-    return lb.PixelPrior(jnp.asarray(SPECTRUM), NSIDE)
+    return PixelPrior(jnp.asarray(SPECTRUM), NSIDE)
 
 
 def dense_covariance() -> np.ndarray:
@@ -65,9 +67,9 @@ KINDS = {
         HOLES,
     ),
     "independent": lambda: (IndependentPrior(jnp.asarray(ROOT)), np.diag(ROOT**2)),
-    "pixels": lambda: (lb.PixelPrior(jnp.asarray(SPECTRUM), NSIDE), pixel_covariance()),
+    "pixels": lambda: (PixelPrior(jnp.asarray(SPECTRUM), NSIDE), pixel_covariance()),
     "dense about a mean": lambda: (
-        lb.DensePrior.of_covariance(jnp.asarray(dense_covariance()), jnp.asarray(MEAN)),
+        DensePrior.of_covariance(jnp.asarray(dense_covariance()), jnp.asarray(MEAN)),
         dense_covariance(),
         MEAN,
     ),
@@ -80,16 +82,16 @@ def test_every_prior_keeps_the_contract(kind):
 
 
 def test_the_contract_notices_a_wrong_prior():
-    class Transposed(lb.DensePrior):
+    class Transposed(DensePrior):
         def colour_columns(self, a):
             return a @ self.root.T
 
-    class Uncentred(lb.DensePrior):
+    class Uncentred(DensePrior):
         @property
         def white_mean(self):
             return None if self.mean is None else self.mean
 
-    prior = lb.DensePrior.of_covariance(dense_covariance(), MEAN)
+    prior = DensePrior.of_covariance(dense_covariance(), MEAN)
     for wrong in (Transposed, Uncentred):
         with pytest.raises(AssertionError):
             check_prior(wrong(prior.root, mean=prior.mean), dense_covariance(), MEAN)
@@ -101,14 +103,14 @@ def test_covariances_that_cannot_be_are_refused():
     covariance = dense_covariance()
     skewed, singular = covariance.copy(), covariance - 10.0 * np.eye(16)
     skewed[3, 1] += 1e-6
-    refuse(r"not symmetric: S\[1, 3\] = .*S\[3, 1\]", lb.DensePrior.of_covariance, skewed)
-    refuse("definite: its lowest eigenvalue is -", lb.DensePrior.of_covariance, jnp.array(singular))
-    refuse("lower triangular with a positive diagonal", lb.DensePrior, covariance)
-    refuse("the prior mean has shape", lb.DensePrior.of_covariance, covariance, np.zeros(9))
-    refuse("the prior covariance holds NaN", lb.DensePrior.of_covariance, np.full((4, 4), np.nan))
+    refuse(r"not symmetric: S\[1, 3\] = .*S\[3, 1\]", DensePrior.of_covariance, skewed)
+    refuse("definite: its lowest eigenvalue is -", DensePrior.of_covariance, jnp.array(singular))
+    refuse("lower triangular with a positive diagonal", DensePrior, covariance)
+    refuse("the prior mean has shape", DensePrior.of_covariance, covariance, np.zeros(9))
+    refuse("the prior covariance holds NaN", DensePrior.of_covariance, np.full((4, 4), np.nan))
 
 
-@pytest.mark.parametrize("build", [lb.HarmonicPrior, lambda s: lb.PixelPrior(s, NSIDE)])
+@pytest.mark.parametrize("build", [lb.HarmonicPrior, lambda s: PixelPrior(s, NSIDE)])
 def test_bad_spectra_are_refused(build):
     refuse(r"negative at ell = 2: C_ell = -0\.5", build, jnp.array([1.0, 1.0, -0.5, -1.0]))
     refuse(r"prior spectrum holds NaN .*\(1,\)", build, jnp.array([1.0, jnp.nan]))
@@ -117,7 +119,7 @@ def test_bad_spectra_are_refused(build):
 
 def test_too_few_pixels_are_refused():
     words = "NSIDE 1 has 12 pixels, too few for the 16 modes of lmax"
-    refuse(words, lb.PixelPrior, jnp.asarray(SPECTRUM), 1)
+    refuse(words, PixelPrior, jnp.asarray(SPECTRUM), 1)
 
 
 def test_pixel_coupling_sees_the_same_sky(pixel):
@@ -241,11 +243,11 @@ def test_a_dense_prior_of_any_root():
     rng = np.random.default_rng(8)
     for columns in (6, 9):
         root = rng.normal(size=(6, columns)) * np.geomspace(1.0, 1e-7, 6)[:, None]
-        prior = lb.DensePrior.of_root(root, np.arange(6.0))
+        prior = DensePrior.of_root(root, np.arange(6.0))
         np.testing.assert_array_equal(prior.root, np.tril(prior.root))
         np.testing.assert_allclose(prior.covariance(), root @ root.T, rtol=1e-9)
         np.testing.assert_array_equal(prior.mean, np.arange(6.0))
-    refuse("positive diagonal", lb.DensePrior.of_root, np.zeros((3, 3)))
+    refuse("positive diagonal", DensePrior.of_root, np.zeros((3, 3)))
 
 
 def test_draws_and_densities():
@@ -269,7 +271,7 @@ def test_draws_and_densities():
 
 def test_a_beam_error_holds_the_mean_sky():
     direction = RNG.normal(size=(24, 16))
-    found = lb.beam_error_noise(lb.DenseCoupling(jnp.asarray(direction)), model().prior).dense()
+    found = beam_error_noise(DenseCoupling(jnp.asarray(direction)), model().prior).dense()
     second_moment = np.diag(VARIANCES) + np.outer(SKY_MEAN, SKY_MEAN)
     np.testing.assert_allclose(found, direction @ second_moment @ direction.T, atol=1e-10)
 

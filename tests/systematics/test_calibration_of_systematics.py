@@ -16,7 +16,7 @@ from numpyro import handlers
 from scipy import stats
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.experiment import program_pieces
+from lusee_bayes.experiment.experiment import Experiment, program_pieces
 from lusee_bayes.experiment.model import full_model, simulate, true_values
 from lusee_bayes.experiment.rounds import settled
 from lusee_bayes.experiment.setup import Setup, set_up
@@ -246,13 +246,13 @@ UNKNOWN = (
 MODES = (0, 2, 3, 6, 8, 12)
 
 
-def drawn(first: Setup, seed: int) -> tuple[Setup, lb.Experiment]:
+def drawn(first: Setup, seed: int) -> tuple[Setup, Experiment]:
     """The setup with a sky drawn from its prior, and data of it; N is that of the model sky."""
     z = np.random.default_rng(seed).standard_normal(first.prior.size)
     sky = replace(first.sky, modes=np.asarray(first.prior.colour(z)) + first.prior.mean)
     scenario = first.scenario.model_copy(update={"seed": seed})
     setup = replace(first, sky=sky, scenario=scenario)
-    return setup, lb.Experiment(setup, simulate(setup))
+    return setup, Experiment(setup, simulate(setup))
 
 
 @pytest.mark.long

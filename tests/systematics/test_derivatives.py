@@ -8,6 +8,7 @@ import pytest
 import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_host
 from lusee_bayes.experiment.model import base_model, moved, systematics
+from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.pointing import CLOCK
 from lusee_bayes.systematics.context import Around
@@ -23,7 +24,7 @@ TABLE = ["noise.receiver={power_k: 500}", "noise.gain_table={std: 0.02}"]
 OTHERS = [*TABLE, "sources.list=[{name: Cas A, block_h: 50}]", "sky.sources=false"]
 
 
-def scenario(*more: str) -> lb.Scenario:
+def scenario(*more: str) -> Scenario:
     given = ["lmax=5", "observation.step_s=43200", RUNS, *more]
     return lb.load_scenario("fiducial", [*given, "prior={model: isotropic, spectrum: sky}"])
 

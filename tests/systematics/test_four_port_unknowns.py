@@ -13,6 +13,7 @@ from scipy.optimize import least_squares
 from scipy.stats import norm
 
 import lusee_bayes as lb
+from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import (
     full_model,
     model_about,
@@ -24,6 +25,7 @@ from lusee_bayes.experiment.model import (
 )
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.setup import Setup, set_up
+from lusee_bayes.instrument.beams.sampled import read_beam
 from lusee_bayes.instrument.products import all_products, labels
 from lusee_bayes.instrument.visibilities import Calibration
 from lusee_bayes.linear.amplitudes import template_amplitudes
@@ -37,12 +39,12 @@ AUTOS = [labels().index(f"{port}{port}R") for port in range(4)]
 
 
 @pytest.fixture(scope="module")
-def warm(response_file) -> lb.Experiment:
+def warm(response_file) -> Experiment:
     return lb.build(four_ports(response_file, RECEIVER % "marginalised", GROUND % "marginalised"))
 
 
 def ground(response_file, moon_k: float) -> np.ndarray:
-    return np.asarray(replace(lb.read_beam(response_file), moon_k=moon_k).background(20.0))
+    return np.asarray(replace(read_beam(response_file), moon_k=moon_k).background(20.0))
 
 
 def columns(response_file, n_times: int) -> np.ndarray:
@@ -55,7 +57,7 @@ def columns(response_file, n_times: int) -> np.ndarray:
     return grid.reshape(-1, 5)
 
 
-def joint(warm: lb.Experiment, response_file):
+def joint(warm: Experiment, response_file):
     """Sky and the five together: 21 unknowns with independent priors."""
     setup, data = warm.setup, np.asarray(warm.data.data)
     t = columns(response_file, setup.layout.n_times)
@@ -103,7 +105,7 @@ def test_the_mean_receiver_sets_the_noise_and_the_offset(warm, response_file):
 
 def test_powers_in_volts_and_their_slope(response_file):
     """P / U_aa at the receiver's input, and a power law in frequency: (20 / 5)^-2 = 1/16."""
-    per_kelvin = lb.read_beam(response_file).per_kelvin(20.0)
+    per_kelvin = read_beam(response_file).per_kelvin(20.0)
     keys = "slope: -2, reference_mhz: 5"
     volts = set_up(four_ports(response_file, f"noise.receiver={{power_v2_hz: 1e-17, {keys}}}"))
     moon = ground(response_file, 250.0)[AUTOS]
@@ -224,7 +226,7 @@ def per_port(z: np.ndarray, n_times: int = 23) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def experiment(response_file) -> lb.Experiment:
+def experiment(response_file) -> Experiment:
     return lb.build(four_ports(response_file, *UNKNOWN, "seed=5"))
 
 
@@ -386,7 +388,7 @@ def test_many_modes_do_not_pass_for_a_gain():
         sky = replace(first.sky, modes=np.asarray(first.prior.colour(z)))
         setup = replace(first, sky=sky, scenario=scenario)
         data = simulate(setup)
-        it = lb.infer(lb.Experiment(setup, data))
+        it = lb.infer(Experiment(setup, data))
         gains = it.systematics[-1]
         found.append(gains.systematic.common @ (gains.expected + it.amplitudes(gains).mean))
         assert gains.systematic.common @ gains.expected < -0.5
@@ -397,7 +399,7 @@ def test_many_modes_do_not_pass_for_a_gain():
 def test_errors_that_data_name_are_found(response_file):
     setup = calibrated(set_up(four_ports(response_file, "noise.gain_table={}")))
     data = replace(simulate(setup), calibration=setup.calibration)
-    experiment = lb.Experiment(setup, data)
+    experiment = Experiment(setup, data)
     found = lb.infer(experiment)
     (table,) = found.systematics
     assert table.systematic.names == ("gain_M0_PC1", "gain_M0_PC2", "gain_L3_PC1", "gain_M1_PC1")

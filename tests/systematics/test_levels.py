@@ -19,6 +19,7 @@ import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model, model_to_sample, radiometer, true_values
 from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.instrument.products import DataLayout
+from lusee_bayes.noise.covariance import Covariance, DenseCovariance, LowRankCovariance
 from lusee_bayes.noise.instrument_errors import difference
 from lusee_bayes.sampling.programs import numpyro_promotion
 from lusee_bayes.systematics.context import Around
@@ -47,7 +48,7 @@ class Case:
         self.model = lb.LinearGaussian(
             jnp.asarray(self.a),
             lb.HarmonicPrior(jnp.asarray(self.spectrum)),
-            lb.DenseCovariance(jnp.asarray(self.n)),
+            DenseCovariance(jnp.asarray(self.n)),
         )
 
     def evidence(self, factors=1.0, level=1.0, more=0.0, mean=0.0) -> float:
@@ -228,8 +229,8 @@ class Pickup(AdditiveNoise):
 
     patterns: jax.Array
 
-    def covariance(self) -> lb.Covariance:
-        return lb.LowRankCovariance(self.patterns, "the pickup")
+    def covariance(self) -> Covariance:
+        return LowRankCovariance(self.patterns, "the pickup")
 
 
 class Correlated(AdditiveNoise):
@@ -237,10 +238,10 @@ class Correlated(AdditiveNoise):
 
     hours: jax.Array
 
-    def covariance(self) -> lb.Covariance:
+    def covariance(self) -> Covariance:
         lag = self.hours[:, None] - self.hours[None]
         kernel = jnp.exp(-jnp.abs(lag) / 3.0)
-        return lb.DenseCovariance(jnp.kron(jnp.eye(self.layout.n_products), kernel), "the hum")
+        return DenseCovariance(jnp.kron(jnp.eye(self.layout.n_products), kernel), "the hum")
 
 
 @pytest.fixture(scope="module")

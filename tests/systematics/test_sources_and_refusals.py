@@ -23,6 +23,7 @@ from scipy.stats import chi2, norm
 
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
+from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import (
     base_model,
     full_model,
@@ -66,9 +67,9 @@ def setup_of(treatment: str = "marginalised") -> Setup:
 
 
 @lru_cache
-def experiment(treatment: str = "marginalised") -> lb.Experiment:
+def experiment(treatment: str = "marginalised") -> Experiment:
     setup = setup_of(treatment)
-    return lb.Experiment(setup, simulate(setup))
+    return Experiment(setup, simulate(setup))
 
 
 def data(treatment: str = "marginalised"):
@@ -303,9 +304,9 @@ def setup_with(*overrides: str) -> Setup:
     return replace(small_experiment(CAS_A).setup, scenario=small_scenario(CAS_A, *overrides))
 
 
-def experiment_with(*overrides: str) -> lb.Experiment:
+def experiment_with(*overrides: str) -> Experiment:
     setup = setup_with(*overrides)
-    return lb.Experiment(setup, simulate(setup))
+    return Experiment(setup, simulate(setup))
 
 
 # --- sources --------------------------------------------------------------------------------------

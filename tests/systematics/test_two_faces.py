@@ -14,8 +14,9 @@ from reference_linear import exact_posterior
 from scipy.stats import lognorm, loguniform, norm, truncnorm, uniform
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.experiment import program_pieces
+from lusee_bayes.experiment.experiment import Experiment, program_pieces
 from lusee_bayes.experiment.model import full_model, radiometer
+from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith
 from lusee_bayes.instrument.products import all_products
 from lusee_bayes.systematics.context import Around
 from lusee_bayes.systematics.gain_drifts import GainDrifts
@@ -26,7 +27,7 @@ PAIRS = [(0, 0), (0, 1), (0, 1), (0, 2), (0, 2), (0, 3), (0, 3), (1, 1), (1, 2),
          (1, 3), (2, 2), (2, 3), (2, 3), (3, 3)]  # fmt: skip
 
 
-def experiment(sigma=1e-3, treatment="sampled", around="model") -> lb.Experiment:
+def experiment(sigma=1e-3, treatment="sampled", around="model") -> Experiment:
     return small_experiment(GAINS % (sigma, treatment, around))
 
 
@@ -203,7 +204,7 @@ def test_the_instruments_program():
         "zenith_angle_deg": 76.5,
         "noise_level": 1.7,
     }
-    antennas = lb.Monopoles(lb.Regolith(3.4, 6.6, 0.02), zenith_angle_deg=76.5)
+    antennas = Monopoles(Regolith(3.4, 6.6, 0.02), zenith_angle_deg=76.5)
     a = lb.CouplingMatrix.build(lb.monopole_beams(25.0, 4, antennas), setup.pointing).dense()
     noise = np.diag(1.7 * np.asarray(radiometer(setup).diagonal()))
     s = np.asarray(setup.prior.variance())
