@@ -93,12 +93,12 @@ def conditioned(
             prior = own.model.prior
             posterior = information.posterior(prior)
             information = information.recentred(posterior.mean)
-            model = replace(own.model, prior=_given_earlier(earlier.information.posterior(prior)))
+            before = _given_earlier(earlier.information.posterior(prior))
             made = Conditioned(
                 experiment,
                 own,
                 replace(own, solution=Solution(own.model, data.data, posterior, information)),
-                replace(own, solution=model.condition(data.data)),
+                replace(own, solution=own.solution.under(before)),
                 (*earlier.digests, data.digest()),
             )
         return made
