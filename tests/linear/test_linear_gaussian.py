@@ -212,8 +212,10 @@ def test_real_experiment_to_sixty_digits(instrument, form):
     exact = exact_posterior(a, variance, np.asarray(model.noise.dense()), d)
     post = model.condition(d, form).posterior
     assert np.abs((np.asarray(post.mean) - exact.mean) / exact.std).max() < 1e-9
-    assert np.abs(np.asarray(post.std()) / exact.std - 1.0).max() < 1e-7
-    assert float(post.log_evidence) == pytest.approx(exact.log_prob, abs=1e-6)
+    # A^T N^-1 A holds the condition number times eps, 2e-6, of what is known least
+    lost = 2e-6 if form is FromInformation else 1e-7
+    assert np.abs(np.asarray(post.std()) / exact.std - 1.0).max() < lost
+    assert float(post.log_evidence) == pytest.approx(exact.log_prob, abs=10 * lost)
 
 
 # --- high signal-to-noise ------------------------------------------------------------------------
@@ -237,9 +239,11 @@ def graded(n_data: int, largest: float, lmax=5, seed=1):
     return model, jnp.asarray(d), exact_posterior(a, prior, np.diag(variance), d)
 
 
-# What float64 reaches, with ten times to spare. The mean is refined, so both forms keep it to
-# eps x largest. The Cholesky factor of 1 + W^T W has absolute errors eps x largest^2 where Lambda
-# may be 1: the map form's std and ln p lose that much. The data form's triangle is graded, rows of
+# What float64 reaches, with ten times to spare. The mean is refined, so all forms keep it to
+# eps x largest, and through the information, whose gradient is in 1/K and has to be coloured by
+# the prior and whitened again, to three times that. The Cholesky factor of 1 + W^T W has absolute
+# errors eps x largest^2 where Lambda may be 1: std and ln p of the forms on the sky's side lose
+# that much. The data form's triangle is graded, rows of
 # every size keep their own relative accuracy, and it loses only eps x largest.
 @pytest.mark.long
 @pytest.mark.essential
@@ -252,7 +256,8 @@ def test_high_signal_to_noise_to_sixty_digits(form, n_data, largest):
     eps = np.finfo(float).eps
     linear, squared = 1e-13 + 10 * eps * largest, 1e-12 + 10 * eps * largest**2
     lost = squared if form is not InData else linear
-    assert np.abs((np.asarray(post.mean) - exact.mean) / exact.std).max() < linear
+    refined = linear if form is not FromInformation else 3 * linear
+    assert np.abs((np.asarray(post.mean) - exact.mean) / exact.std).max() < refined
     assert np.abs(np.asarray(post.std()) / exact.std - 1.0).max() < lost
     assert float(post.log_evidence) == pytest.approx(exact.log_prob, abs=10 * lost)
     assert float(post.refinement) <= CONVERGENCE
