@@ -473,8 +473,7 @@ class Whitened(Form):
         require_array("the data", data, (self.model.n_data,))
         data = jnp.asarray(data)
         u, log_evidence, moved = _solve(self, data)
-        traced = is_traced(moved)
-        if not traced and not float(moved) <= CONVERGENCE:
+        if not is_traced(moved) and not float(moved) <= CONVERGENCE:
             raise InputError(
                 f"the posterior mean did not converge: after {MAX_REFINEMENTS} refinements it "
                 f"still moves by {float(moved):.2g} standard deviations (accepted: "
@@ -483,6 +482,8 @@ class Whitened(Form):
         prior = self.model.prior
         posterior = Posterior(prior, u, self.lower, self.basis, log_evidence, moved)
         parts = self.model, data, posterior
+        # where the evidence is differentiated outside of a program, the last step is known
+        traced = is_traced(*jax.tree.leaves(parts))
         return Solution(*(parts if traced else on_host(parts)))
 
     def surprise(self, data: DataVector) -> DataVector:

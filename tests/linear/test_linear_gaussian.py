@@ -316,7 +316,6 @@ def expected_slopes(model, d):
     return np.array(of_ell), log_prob_slope(a, s, n, y, 0 * s, n)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.grad])
 @pytest.mark.parametrize("n_data", [30, 9])
 def test_slopes_of_the_evidence(derivative, n_data):
