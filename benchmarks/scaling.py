@@ -29,8 +29,7 @@ from scipy.linalg.blas import dsyrk
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import tilt_powers
-from lusee_bayes.experiment.model import full_model
-from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.experiment.model import full_model, set_up
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.linear.joint import ComponentSums, summed_information
 from lusee_bayes.linear.normal_matrix import normal_matrix

@@ -23,8 +23,7 @@ from scipy.linalg.lapack import dpotrf
 
 import lusee_bayes as lb
 from lusee_bayes.core.progress import peak_memory_gb
-from lusee_bayes.experiment.model import full_model
-from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.experiment.model import full_model, set_up
 from lusee_bayes.noise.covariance import DenseCovariance
 
 console = Console(width=100)

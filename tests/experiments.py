@@ -17,7 +17,6 @@ from lusee_bayes.experiment.experiment import Experiment, program_pieces
 from lusee_bayes.experiment.model import full_model, radiometer, simulate
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.unknowns import Unknowns, UnknownsReport
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.results.channel import ChannelResult
@@ -26,7 +25,7 @@ from lusee_bayes.results.map_files import SavedInformation
 from lusee_bayes.sampling.hmc import whitened
 from lusee_bayes.sampling.programs import WHITE_SUFFIX, Program, latent_sites, numpyro_promotion
 from lusee_bayes.sky.prior import DensePrior, Prior
-from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.testing.scenarios import small_scenario
 
 # nothing of these enters a setup (test_experiment.py checks it), only the data and N; the mean of

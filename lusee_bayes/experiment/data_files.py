@@ -15,19 +15,16 @@ from lusee_bayes.core.files import user_path
 from lusee_bayes.core.formats import format_of, image_names, is_fits, is_session
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming, require_file
-from lusee_bayes.experiment.instrument_sections import FlightSection
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.flight.bands import shared_noise
 from lusee_bayes.flight.clock import read_clock
 from lusee_bayes.flight.flags import NO_LINES, read_lines
 from lusee_bayes.flight.gain_model import GainModel, read_gain_table
-from lusee_bayes.flight.recipe import Recipe
+from lusee_bayes.flight.recipe import FlightSection, Recipe
 from lusee_bayes.flight.reduced import Reduced, read_reduced
 from lusee_bayes.flight.reduction import reduce_sessions
 from lusee_bayes.flight.session_files import read_session
 from lusee_bayes.instrument.averaging import averaged
 from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ
-from lusee_bayes.instrument.products import CONVENTIONS
 from lusee_bayes.instrument.times import Timestamp
 from lusee_bayes.instrument.visibilities import HINT, Visibilities, read_visibilities
 from lusee_bayes.instrument.waterfalls import INTERPOLATIONS, Waterfall, read_waterfall
@@ -342,20 +339,15 @@ def recipe_of(scenario: Scenario) -> Recipe:
             "the integrations; use --set observation.timestamp=middle (or start, end, instant)"
         )
     here = scenario.observation
-    as_given = {"degree", "turntable_deg", "comb", "false_alarm", "gain_std"}
     return Recipe(
+        section,
         gain_table_of(section),
-        section.bin_origin,
         timestamp,
         scenario.frequencies_mhz or (scenario.frequency_mhz,),
-        section.bandwidth_hz / 1e6,
-        average_s=here.average_s,
-        shared_noise=shared_noise(section.filter_taps, section.filter_window),
-        sign=int(CONVENTIONS[section.convention]),
-        lines=NO_LINES if section.lines is None else read_lines(section.lines),
-        clock=None if section.clock is None else read_clock(section.clock),
-        site=(here.lon_deg, here.lat_deg) if section.site == "scenario" else None,
-        **section.model_dump(include=as_given),
+        here.average_s,
+        NO_LINES if section.lines is None else read_lines(section.lines),
+        None if section.clock is None else read_clock(section.clock),
+        (here.lon_deg, here.lat_deg) if section.site == "scenario" else None,
     )
 
 

@@ -22,10 +22,9 @@ from lusee_bayes.core.checks import Described
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.leave_out import Fitting, fitting, without
-from lusee_bayes.experiment.model import model_to_sample, radiometer, simulate
+from lusee_bayes.experiment.model import model_to_sample, radiometer, set_up, simulate
 from lusee_bayes.experiment.rounds import Inference, rebuilds, settled, with_learned_prior
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.instrument.coupling import Instrument
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.plausibility import require_plausible
@@ -35,7 +34,7 @@ from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.priors.learning import Learned, draws_with_parameters
 from lusee_bayes.sky.sky_source import SkySource
 from lusee_bayes.systematics.beam import BeamErrors
-from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.gain_drifts import GainDrifts
 from lusee_bayes.systematics.sources import PointSources
 from lusee_bayes.systematics.systematic import Systematic

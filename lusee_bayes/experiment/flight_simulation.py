@@ -18,17 +18,16 @@ from lusee_bayes.core.engine import in_threads, processors
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import gain_table_of, per_kelvin_of
-from lusee_bayes.experiment.instrument_sections import FlightSection, FlightSimulatedSection
-from lusee_bayes.experiment.model import true_signal, true_values
+from lusee_bayes.experiment.model import set_up, true_signal, true_values
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.flight import synthesis
 from lusee_bayes.flight.clock import DAY_S, MJD_ZERO, Clock
 from lusee_bayes.flight.gain_model import GainModel, draw_gains, synthetic_gains
+from lusee_bayes.flight.recipe import FlightSection, FlightSimulatedSection
 from lusee_bayes.flight.session import ADC_HIGH, ADC_LOW, FRAME_S, PORTS, BinOrigin, channel_mhz
 from lusee_bayes.flight.session_files import SessionRows
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.products import CONVENTIONS, DataLayout, ports, to_matrix, to_real
+from lusee_bayes.instrument.products import DataLayout, ports, to_matrix, to_real
 from lusee_bayes.instrument.times import Windows
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.noise.radiometer import sample_covariances
@@ -197,8 +196,8 @@ class FlightSimulation:
         return {levels: synthesis.bit_slices(one) for levels, one in counts.items()}
 
     def _counting(self, levels: str) -> synthesis.Counting:
-        sign = int(CONVENTIONS[flight_of(self.scenario).convention])
-        return synthesis.Counting(self.gains, levels, self.section.navgf, self.origin, sign)
+        known = self.section.navgf, self.origin, flight_of(self.scenario).sign
+        return synthesis.Counting(self.gains, levels, *known)
 
     def _telemetry(self, rows: slice) -> Mapping[str, Float[np.ndarray, " _"]]:
         turns = 2.0 * np.pi * self.observation.hours[rows]
@@ -252,9 +251,7 @@ def simulate_flight(scenario: Scenario, stages: Stages | None = None) -> FlightS
     observation = spectra_observation(scenario, FRAME_S * 2.0**shift)
     origin = flight.bin_origin or "centre"
     hours = observation.hours - observation.hours[0]
-    made = synthesis.Disturbances.drawn(
-        hours, step_s, origin, scenario.seed, **section.disturbances()
-    )
+    made = synthesis.Disturbances.drawn(section, hours, step_s, origin, scenario.seed)
     nodes = np.array(scenario.frequencies_mhz or (scenario.frequency_mhz,))
     sky = nodes, true_visibilities(scenario, observation, stages)
     mjd = float(np.floor(observation.times[0].mjd)) - CLOCK_DAYS

@@ -1,9 +1,10 @@
-"""Sections of a scenario on the instrument and its data.
+"""Sections of a scenario on the instrument.
 
 They say where, when and with which turntable angles; the beams, and what is connected to their
-ports; and how sessions of the spectrometer become visibilities, or are simulated. Beams and
-receivers have one section for each kind, told by ``model``. A new kind of beams is a subclass of
-:class:`BaseBeamSection` here, with its :class:`BeamSource`, and its name in ``BEAM_SECTIONS``.
+ports. How sessions of the spectrometer become visibilities is a section of
+:mod:`lusee_bayes.flight.recipe`. Beams and receivers have one section for each kind, told by
+``model``. A new kind of beams is a subclass of :class:`BaseBeamSection` here, with its
+:class:`BeamSource`, and its name in ``BEAM_SECTIONS``.
 """
 
 from __future__ import annotations
@@ -19,7 +20,6 @@ from pydantic import BeforeValidator, Field, model_validator
 from lusee_bayes.core.section import (
     LARGEST,
     Angle,
-    Frequency,
     Positive,
     Section,
     Temperature,
@@ -469,154 +469,3 @@ def _complete_beam(tree: dict[str, Any]) -> None:
 
 
 BeamSection = one_of(BEAM_SECTIONS, _complete_beam)
-
-
-Share = Annotated[float, Field(ge=0, le=0.5)]
-Levels = Annotated[str, Field(pattern="^[LMH]{4}$")]
-
-
-class FlightSimulatedSection(Section):
-    """Sessions that ``simulate --flight`` writes; by default nothing disturbs them.
-
-    Attributes
-    ----------
-    kind : {"hdf5", "fits"}
-        Of file.
-    navgf : {1, 2, 3, 4}
-        Averaging over channels.
-    levels : str
-        Gains of the four ports, of L, M and H.
-    session_h : float
-        Length of a session.
-    clock : {"known", "unknown"}
-        Whether the files say which UTC their clock stands for; if not, a clock file does.
-    radiometer : bool
-        Add the radiometer noise of every channel.
-    switch_h : float
-        When the gains change to ``switch_levels``, from the beginning of the observation.
-    switch_levels : str
-        Gains from then on.
-    absent_share : float
-        Share of the spectra that lack one of the products.
-    saturated_share : float
-        Share of the spectra in which the ADCs are at their ends.
-    tones_mhz : tuple of float
-        Frequencies of tones, each in one channel.
-    tone_share : float
-        Share of the spectra that have the tones.
-    tone_factor : float
-        Power of a tone, in multiples of the radiometer noise of a channel.
-    comb_share : float
-        Share of the spectra in which the calibrator's comb is on.
-    comb_factor : float
-        Power of each of its lines, in multiples of the radiometer noise of a channel.
-    burst_every_h : float
-        Mean time from burst to burst, as those of Jupiter and the Sun.
-    burst_s : float
-        Length of the longest; the shortest last for a spectrum.
-    burst_factor : float
-        Power of a burst, in multiples of the radiometer noise of a spectrum in 1 MHz.
-    """
-
-    kind: Literal["hdf5", "fits"] = "hdf5"
-    navgf: Literal[1, 2, 3, 4] = 1
-    levels: Levels = "MMMM"
-    session_h: Positive = 24.0
-    clock: Literal["known", "unknown"] = "known"
-    radiometer: bool = True
-    switch_h: Positive | None = None
-    switch_levels: Levels = "LLLL"
-    absent_share: Share = 0.0
-    saturated_share: Share = 0.0
-    tones_mhz: Annotated[tuple[Frequency, ...], Field(max_length=100)] = ()
-    tone_share: Share = 0.1
-    tone_factor: Positive = 30.0
-    comb_share: Share = 0.0
-    comb_factor: Positive = 3.0
-    # a month with a burst every 4 s takes 10 s to draw
-    burst_every_h: Annotated[float, Field(ge=1e-3, le=LARGEST)] | None = None
-    burst_s: Positive = 600.0
-    burst_factor: Positive = 30.0
-
-    def disturbances(self) -> dict[str, Any]:
-        """Return gains and disturbances, as :meth:`.Disturbances.drawn` takes them."""
-        return self.model_dump(exclude={"kind", "session_h", "clock", "radiometer"})
-
-
-# probabilities of a false alarm
-Rare = Annotated[float, Field(ge=1e-12, le=0.1)]
-
-
-class FlightSection(Section):
-    """How sessions of the spectrometer become visibilities, where --data are sessions.
-
-    Attributes
-    ----------
-    gain_table : str
-        Folder of luseepy's gain model, or a gain table in netCDF.
-    gain_model : {"quadratic", "linear"}
-        Which coefficients of luseepy's folder.
-    component_std : tuple of float
-        Standard deviations of the strengths of the two components of the gains, of each level of
-        each port on its own, where the gain table does not have them.
-    gain_std : float
-        Standard deviation of the power gain of each level of each port, relative, besides; of each
-        port, if simulated with ``noise.gain_table`` as anything but sessions.
-    bin_origin : {"centre", "edge"}
-        What of channel k lies at k times 25 kHz. It is not settled, and has to be said.
-    clock : str
-        Clock reference in JSON, for files with no absolute time, or to correct the UTC that they
-        state.
-    site : {"file", "scenario"}
-        Whose site counts: luseepy writes one that nobody has established if it is told none.
-    bandwidth_hz : float
-        Width of the band about the frequency of a map.
-    degree : int
-        Of the polynomial that is fitted to the spectrum in the band, and taken in its middle.
-    filter_taps : int
-        Taps of the filter bank: how much noise neighbouring channels share; 0 for none.
-    filter_window : {"rectangular", "hann", "hamming", "blackman"}
-        Its window.
-    convention : {"s_i conj(s_j)", "conj(s_i) s_j"}
-        What the complex products are the mean of.
-    per_kelvin_v2_hz : float
-        V^2/Hz that 1 K makes at each port, for beams that know no volts.
-    turntable_deg : float
-        Angle of the turntable, from East towards North.
-    lines : str
-        CSV table of known lines: frequency_mhz, source.
-    comb : {"found", "always", "never"}
-        Whether the calibrator's comb is looked for in every spectrum, or known to be on or off.
-    false_alarm : float
-        Chance that a value of pure noise is flagged, of each kind of test.
-    leave_out : bool
-        Flag bins of time, single values, products and days that do not fit what all others predict
-        for them.
-    simulated : FlightSimulatedSection
-        Sessions that are simulated, and what disturbs them.
-    """
-
-    gain_table: str | None = None
-    gain_model: Literal["quadratic", "linear"] = "quadratic"
-    component_std: Annotated[tuple[Positive, ...], Field(min_length=2, max_length=2)] | None = None
-    gain_std: Positive | None = None
-    bin_origin: Literal["centre", "edge"] | None = None
-    clock: str | None = None
-    site: Literal["file", "scenario"] = "file"
-    bandwidth_hz: Positive = 1.0e6
-    degree: Annotated[int, Field(ge=0, le=6)] = 2
-    filter_taps: Annotated[int, Field(ge=0, le=64)] = 0
-    filter_window: Literal["rectangular", "hann", "hamming", "blackman"] = "hann"
-    convention: Literal["s_i conj(s_j)", "conj(s_i) s_j"] = "s_i conj(s_j)"
-    per_kelvin_v2_hz: Positive | None = None
-    turntable_deg: Angle = 0.0
-    lines: str | None = None
-    comb: Literal["found", "always", "never"] = "found"
-    false_alarm: Rare = 1e-4
-    leave_out: bool = True
-    simulated: FlightSimulatedSection | None = None
-
-    _gains_are_positive = requires(
-        lambda section: section.gain_std is None or section.gain_std < 1.0,
-        "gain_std is relative to the gain; give a number below 1",
-    )

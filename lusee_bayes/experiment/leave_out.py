@@ -26,9 +26,8 @@ from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.lazy import special
 from lusee_bayes.core.progress import Stages, memory_limit
 from lusee_bayes.core.section import is_modelled
-from lusee_bayes.experiment.model import full_model
+from lusee_bayes.experiment.model import full_model, set_up
 from lusee_bayes.experiment.rounds import rebuilds, settled
-from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.products import DataLayout, auto_indices, ports
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.left_out import DataGroup, LeftOut, Missed, groups_of

@@ -21,7 +21,6 @@ from lusee_bayes.core.reading import as_yaml, parse_yaml, read_yaml
 from lusee_bayes.core.section import Frequency, Section, Seed, is_modelled
 from lusee_bayes.experiment.instrument_sections import (
     BeamSection,
-    FlightSection,
     MonopoleBeamSection,
     ObservationSection,
 )
@@ -34,6 +33,7 @@ from lusee_bayes.experiment.sky_sections import (
     SkySection,
     SpectralSection,
 )
+from lusee_bayes.flight.recipe import FlightSection
 from lusee_bayes.systematics.registered import SYSTEMATICS, NoiseSection
 from lusee_bayes.systematics.sources import SourcesSection
 

@@ -1,4 +1,7 @@
-"""How sessions are reduced, and all their spectra in the order of their times."""
+"""How sessions are reduced or simulated, and all their spectra in the order of their times.
+
+The section ``flight`` of a scenario is here; a recipe is what it stands for, with its files read.
+"""
 
 from __future__ import annotations
 
@@ -6,21 +9,181 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from astropy.time import Time
 from jaxtyping import Int
+from pydantic import Field
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.reading import naming
+from lusee_bayes.core.section import LARGEST, Angle, Frequency, Positive, Section, requires
+from lusee_bayes.flight.bands import Taper
 from lusee_bayes.flight.clock import Clock, clock_of
 from lusee_bayes.flight.flags import NO_LINES, KnownLines
 from lusee_bayes.flight.gain_model import GainModel
 from lusee_bayes.flight.session import BinOrigin, Session
 from lusee_bayes.instrument.averaging import bins_of
 from lusee_bayes.instrument.observation import Observation
+from lusee_bayes.instrument.products import CONVENTIONS
 from lusee_bayes.instrument.times import TO_MIDDLE, Timestamp, Windows, later
+
+Share = Annotated[float, Field(ge=0, le=0.5)]
+Levels = Annotated[str, Field(pattern="^[LMH]{4}$")]
+
+
+class FlightSimulatedSection(Section):
+    """Sessions that ``simulate --flight`` writes; by default nothing disturbs them.
+
+    Attributes
+    ----------
+    kind : {"hdf5", "fits"}
+        Of file.
+    navgf : {1, 2, 3, 4}
+        Averaging over channels.
+    levels : str
+        Gains of the four ports, of L, M and H.
+    session_h : float
+        Length of a session.
+    clock : {"known", "unknown"}
+        Whether the files say which UTC their clock stands for; if not, a clock file does.
+    radiometer : bool
+        Add the radiometer noise of every channel.
+    switch_h : float
+        When the gains change to ``switch_levels``, from the beginning of the observation.
+    switch_levels : str
+        Gains from then on.
+    absent_share : float
+        Share of the spectra that lack one of the products.
+    saturated_share : float
+        Share of the spectra in which the ADCs are at their ends.
+    tones_mhz : tuple of float
+        Frequencies of tones, each in one channel.
+    tone_share : float
+        Share of the spectra that have the tones.
+    tone_factor : float
+        Power of a tone, in multiples of the radiometer noise of a channel.
+    comb_share : float
+        Share of the spectra in which the calibrator's comb is on.
+    comb_factor : float
+        Power of each of its lines, in multiples of the radiometer noise of a channel.
+    burst_every_h : float
+        Mean time from burst to burst, as those of Jupiter and the Sun.
+    burst_s : float
+        Length of the longest; the shortest last for a spectrum.
+    burst_factor : float
+        Power of a burst, in multiples of the radiometer noise of a spectrum in 1 MHz.
+    """
+
+    kind: Literal["hdf5", "fits"] = "hdf5"
+    navgf: Literal[1, 2, 3, 4] = 1
+    levels: Levels = "MMMM"
+    session_h: Positive = 24.0
+    clock: Literal["known", "unknown"] = "known"
+    radiometer: bool = True
+    switch_h: Positive | None = None
+    switch_levels: Levels = "LLLL"
+    absent_share: Share = 0.0
+    saturated_share: Share = 0.0
+    tones_mhz: Annotated[tuple[Frequency, ...], Field(max_length=100)] = ()
+    tone_share: Share = 0.1
+    tone_factor: Positive = 30.0
+    comb_share: Share = 0.0
+    comb_factor: Positive = 3.0
+    # a month with a burst every 4 s takes 10 s to draw
+    burst_every_h: Annotated[float, Field(ge=1e-3, le=LARGEST)] | None = None
+    burst_s: Positive = 600.0
+    burst_factor: Positive = 30.0
+
+
+# probabilities of a false alarm
+Rare = Annotated[float, Field(ge=1e-12, le=0.1)]
+
+
+class FlightSection(Section):
+    """How sessions of the spectrometer become visibilities, where --data are sessions.
+
+    Attributes
+    ----------
+    gain_table : str
+        Folder of luseepy's gain model, or a gain table in netCDF.
+    gain_model : {"quadratic", "linear"}
+        Which coefficients of luseepy's folder.
+    component_std : tuple of float
+        Standard deviations of the strengths of the two components of the gains, of each level of
+        each port on its own, where the gain table does not have them.
+    gain_std : float
+        Standard deviation of the power gain of each level of each port, relative, besides; of each
+        port, if simulated with ``noise.gain_table`` as anything but sessions.
+    bin_origin : {"centre", "edge"}
+        What of channel k lies at k times 25 kHz. It is not settled, and has to be said.
+    clock : str
+        Clock reference in JSON, for files with no absolute time, or to correct the UTC that they
+        state.
+    site : {"file", "scenario"}
+        Whose site counts: luseepy writes one that nobody has established if it is told none.
+    bandwidth_hz : float
+        Width of the band about the frequency of a map.
+    degree : int
+        Of the polynomial that is fitted to the spectrum in the band, and taken in its middle.
+    filter_taps : int
+        Taps of the filter bank: how much noise neighbouring channels share; 0 for none.
+    filter_window : {"rectangular", "hann", "hamming", "blackman"}
+        Its window.
+    convention : {"s_i conj(s_j)", "conj(s_i) s_j"}
+        What the complex products are the mean of.
+    per_kelvin_v2_hz : float
+        V^2/Hz that 1 K makes at each port, for beams that know no volts.
+    turntable_deg : float
+        Angle of the turntable, from East towards North.
+    lines : str
+        CSV table of known lines: frequency_mhz, source.
+    comb : {"found", "always", "never"}
+        Whether the calibrator's comb is looked for in every spectrum, or known to be on or off.
+    false_alarm : float
+        Chance that a value of pure noise is flagged, of each kind of test.
+    leave_out : bool
+        Flag bins of time, single values, products and days that do not fit what all others predict
+        for them.
+    simulated : FlightSimulatedSection
+        Sessions that are simulated, and what disturbs them.
+    """
+
+    gain_table: str | None = None
+    gain_model: Literal["quadratic", "linear"] = "quadratic"
+    component_std: Annotated[tuple[Positive, ...], Field(min_length=2, max_length=2)] | None = None
+    gain_std: Positive | None = None
+    bin_origin: BinOrigin | None = None
+    clock: str | None = None
+    site: Literal["file", "scenario"] = "file"
+    bandwidth_hz: Positive = 1.0e6
+    degree: Annotated[int, Field(ge=0, le=6)] = 2
+    filter_taps: Annotated[int, Field(ge=0, le=64)] = 0
+    filter_window: Taper = "hann"
+    convention: Literal["s_i conj(s_j)", "conj(s_i) s_j"] = "s_i conj(s_j)"
+    per_kelvin_v2_hz: Positive | None = None
+    turntable_deg: Angle = 0.0
+    lines: str | None = None
+    comb: Literal["found", "always", "never"] = "found"
+    false_alarm: Rare = 1e-4
+    leave_out: bool = True
+    simulated: FlightSimulatedSection | None = None
+
+    _gains_are_positive = requires(
+        lambda section: section.gain_std is None or section.gain_std < 1.0,
+        "gain_std is relative to the gain; give a number below 1",
+    )
+
+    @property
+    def bandwidth_mhz(self) -> float:
+        """Width of the band."""
+        return self.bandwidth_hz / 1e6
+
+    @property
+    def sign(self) -> int:
+        """Turns the imaginary parts of the spectrometer into those of <s_i conj(s_j)>."""
+        return int(CONVENTIONS[self.convention])
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,63 +192,40 @@ class Recipe:
 
     Attributes
     ----------
+    section : FlightSection
+        With a ``bin_origin``.
     table : GainModel
-    origin : {"centre", "edge"}
-        What of channel k lies at k times 25 kHz.
     timestamp : {"start", "middle", "end", "instant"}
         What the times of spectra are.
     frequencies_mhz : tuple of float
         Middles of the bands.
-    bandwidth_mhz : float
-    degree : int
-        Of the polynomial over a band (:mod:`.bands`).
     average_s : float or None
         Length of averages in time; None for spectra as they are.
-    shared_noise : tuple of float
-        Of neighbouring channels (:func:`.shared_noise`).
-    sign : {1, -1}
-        Turns the imaginary parts of the spectrometer into those of <s_i conj(s_j)>.
-    turntable_deg : float
-        From East towards North.
     lines : KnownLines
-    comb : {"found", "always", "never"}
-        Whether the calibrator's comb is looked for, or known to be on or off.
-    false_alarm : float
-        Chance that a value of pure noise is flagged, for each kind of test.
-    gain_std : float or None
-        By how much every level of every port may be off, relative to its power gain, the same at
-        all frequencies of a band; None if it is not known.
     clock : Clock or None
         From outside.
     site : (float, float) or None
         Longitude and latitude in degrees, in place of those of the files.
     """
 
+    section: FlightSection
     table: GainModel
-    origin: BinOrigin
     timestamp: Timestamp
     frequencies_mhz: tuple[float, ...]
-    bandwidth_mhz: float = 1.0
-    degree: int = 2
     average_s: float | None = None
-    shared_noise: tuple[float, ...] = (1.0,)
-    sign: int = 1
-    turntable_deg: float = 0.0
     lines: KnownLines = NO_LINES
-    comb: Literal["found", "always", "never"] = "found"
-    false_alarm: float = 1e-4
-    gain_std: float | None = None
     clock: Clock | None = None
     site: tuple[float, float] | None = None
 
     def words(self) -> dict[str, str]:
         """Return how sessions are reduced, a line for each choice."""
-        bin_part = {"centre": "centre", "edge": "lower edge"}[self.origin]
+        section = self.section
+        bin_part = {"centre": "centre", "edge": "lower edge"}[section.bin_origin]
         times = "instants" if self.timestamp == "instant" else f"{self.timestamp} of integrations"
         return {
             "gain table": f"{Path(self.table.path).name} ({self.table.kind})",
             "frequencies": f"the {bin_part} of channel k is at k times 25 kHz",
-            "bands": f"polynomial of degree {self.degree} over {self.bandwidth_mhz:g} MHz",
+            "bands": f"polynomial of degree {section.degree} over {section.bandwidth_mhz:g} MHz",
             "times": times,
             "site": "of the scenario" if self.site else "of the sessions",
         }
@@ -172,7 +312,7 @@ def timeline(sessions: Sequence[Session], recipe: Recipe) -> Timeline:
         windows = Windows.whole(-window / 2.0, window / 2.0, share * window)
     state = _states(ordered)
     with naming(", ".join(str(s.path) for s in ordered)):
-        angles = (recipe.turntable_deg,) * (int(state[-1]) + 1)
+        angles = (recipe.section.turntable_deg,) * (int(state[-1]) + 1)
         longest = float(window.max())
         observation = Observation(lon, lat, times, state, angles, longest, windows=windows)
     bin_of = np.arange(len(state))

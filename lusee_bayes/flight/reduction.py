@@ -22,7 +22,7 @@ from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming
-from lusee_bayes.flight.bands import ChannelBand
+from lusee_bayes.flight.bands import ChannelBand, shared_noise
 from lusee_bayes.flight.flags import (
     COMB_LIMIT,
     burst_flags,
@@ -118,7 +118,7 @@ def reduce_sessions(
             for start in starts:
                 slab = _slab(line, recipe, states, piece.start + start, next(counts))
                 in_threads(partial(slab, spectra, start), numbers)
-            finish = partial(_finish, spectra, whole, piece, recipe.false_alarm)
+            finish = partial(_finish, spectra, whole, piece, recipe.section.false_alarm)
             spans.append(np.stack(in_threads(finish, numbers)))
             slabs.append(spectra.slab_scatter)
             done(piece.stop)
@@ -138,11 +138,11 @@ def _in_common(line: Timeline, recipe: Recipe) -> dict[str, Any]:
     }
     return {
         "frequencies_mhz": np.array(recipe.frequencies_mhz),
-        "bandwidth_mhz": recipe.bandwidth_mhz,
+        "bandwidth_mhz": recipe.section.bandwidth_mhz,
         "average_s": recipe.average_s,
         "component_std": recipe.table.component_std,
-        "gain_std": recipe.gain_std,
-        "curves": gain_curves(recipe.table, recipe.gain_std, levels, telemetry),
+        "gain_std": recipe.section.gain_std,
+        "curves": gain_curves(recipe.table, recipe.section.gain_std, levels, telemetry),
         "sessions": tuple(_said_of(s, recipe) for s in line.sessions),
         "recipe": recipe.words(),
     }
@@ -221,7 +221,9 @@ class State:
         InputError
             If a band has too few bins.
         """
-        averaging, middles = AVERAGING[navgf], channel_mhz(recipe.origin)
+        section, averaging = recipe.section, AVERAGING[navgf]
+        middles = channel_mhz(section.bin_origin)
+        shared = shared_noise(section.filter_taps, section.filter_window)
         channels = averaging.channels()
         basis = np.full((PORTS, 3, averaging.n_bins), np.nan)
         for port, level in enumerate(levels):
@@ -229,13 +231,11 @@ class State:
                 splines = recipe.table.basis(level, port, middles)
                 basis[port] = splines[:, channels].mean(axis=2)
         bands = tuple(
-            ChannelBand.of(
-                f, recipe.bandwidth_mhz, recipe.degree, averaging, middles, recipe.shared_noise
-            )
+            ChannelBand.of(f, section.bandwidth_mhz, section.degree, averaging, middles, shared)
             for f in recipe.frequencies_mhz
         )
         known = recipe.lines.bins(averaging, middles)
-        if recipe.comb == "always":
+        if section.comb == "always":
             known = known | comb_bins(averaging)
         return cls(recipe, navgf, levels, bands, basis, known)
 
@@ -267,9 +267,11 @@ class State:
             Where the file says that the notch filter was on.
         """
         averaging, comb = AVERAGING[self.navgf], notched
-        if self.recipe.comb == "found":
+        if self.recipe.section.comb == "found":
             autos = counts[:, :PORTS].astype(np.float64)
-            strength = comb_strength(autos, frames, averaging, channel_mhz(self.recipe.origin))
+            strength = comb_strength(
+                autos, frames, averaging, channel_mhz(self.recipe.section.bin_origin)
+            )
             comb = comb | (np.abs(strength) > COMB_LIMIT)
         return self.known | (comb[:, None] & comb_bins(averaging))
 
@@ -319,7 +321,7 @@ def _calibrate(
     raw = counts[:, OF_FLIGHT, at].astype(np.float64)
     factor = NANO2 * averaging.divisor / averaging.members
     channels = raw * factor / (root[:, FIRST_PORT] * root[:, SECOND_PORT])
-    if recipe.sign < 0:
+    if recipe.section.sign < 0:
         channels[:, IMAGINARY] *= -1.0
     finite = np.isfinite(channels)
     present = finite.any(axis=2)
@@ -329,7 +331,7 @@ def _calibrate(
     # products without an auto of their own do not tell lines
     there = finite[:, AUTOS]
     filled = np.where(there, channels[:, AUTOS], 0.0)
-    found, z = line_flags(band, filled, frames, good, threshold(recipe.false_alarm, PORTS))
+    found, z = line_flags(band, filled, frames, good, threshold(recipe.section.false_alarm, PORTS))
     kept = good & ~found
     mean_auto = filled.sum(axis=1) / np.maximum(there.sum(axis=1), 1)
     clean = np.where(finite, channels, 0.0)

@@ -21,6 +21,7 @@ from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.flight.flags import COMB_FIRST, COMB_SPACING
 from lusee_bayes.flight.gain_model import LETTERS, NANO2, GainModel
+from lusee_bayes.flight.recipe import FlightSimulatedSection
 from lusee_bayes.flight.session import (
     AUTOS,
     AVERAGING,
@@ -254,6 +255,8 @@ class Disturbances:
 
     Attributes
     ----------
+    section : FlightSimulatedSection
+        How strong they are.
     level : (rows, ports) array of str
         Of the gains.
     absent : (rows, 16) array of bool
@@ -264,10 +267,9 @@ class Disturbances:
     burst : (rows,) array of bool
     phase : (rows, ports) array
         Of bursts at the ports, in radians.
-    tone_factor, comb_factor, burst_factor : float
-        How strong they are (:meth:`drawn`).
     """
 
+    section: FlightSimulatedSection
     level: Shaped[np.ndarray, "rows ports"]
     absent: Bool[np.ndarray, "rows products"]
     saturated: Bool[np.ndarray, " rows"]
@@ -276,37 +278,22 @@ class Disturbances:
     comb: Bool[np.ndarray, " rows"]
     burst: Bool[np.ndarray, " rows"]
     phase: Float[np.ndarray, "rows ports"]
-    tone_factor: float
-    comb_factor: float
-    burst_factor: float
 
     @classmethod
     def drawn(
         cls,
+        section: FlightSimulatedSection,
         hours: Float[np.ndarray, " rows"],
         step_s: float,
         origin: BinOrigin,
         seed: int,
-        *,
-        navgf: int = 1,
-        levels: str = "MMMM",
-        switch_h: float | None = None,
-        switch_levels: str = "LLLL",
-        absent_share: float = 0.0,
-        saturated_share: float = 0.0,
-        tones_mhz: tuple[float, ...] = (),
-        tone_share: float = 0.1,
-        tone_factor: float = 30.0,
-        comb_share: float = 0.0,
-        comb_factor: float = 3.0,
-        burst_every_h: float | None = None,
-        burst_s: float = 600.0,
-        burst_factor: float = 30.0,
     ) -> Disturbances:
-        """Draw them; by default there are none.
+        """Draw them.
 
         Parameters
         ----------
+        section : FlightSimulatedSection
+            What disturbs the spectra.
         hours : (rows,) array
             Of the spectra, since the first.
         step_s : float
@@ -314,23 +301,6 @@ class Disturbances:
         origin : {"centre", "edge"}
             What of channel k lies at k times 25 kHz.
         seed : int
-        navgf : int
-            Averaging over channels.
-        levels, switch_levels : str
-            Gains of the four ports, and from ``switch_h`` on.
-        switch_h : float or None
-        absent_share, saturated_share, tone_share, comb_share : float
-            Shares of the spectra that lack a product, are saturated, have the tones and the comb.
-        tones_mhz : tuple of float
-            Each in one channel.
-        tone_factor, comb_factor : float
-            Powers of a line, in multiples of the radiometer noise of a channel.
-        burst_every_h : float or None
-            Mean time from burst to burst; None for none.
-        burst_s : float
-            Length of the longest; the shortest last for a spectrum.
-        burst_factor : float
-            Power of a burst, in multiples of the radiometer noise of a spectrum in 1 MHz.
 
         Raises
         ------
@@ -338,30 +308,31 @@ class Disturbances:
             If a tone is in a channel that no bin holds.
         """
         n, generator = len(hours), np.random.default_rng([seed, 1])
-        level = np.array([list(levels)] * n, dtype="U1")
-        if switch_h is not None:
-            level[hours >= switch_h] = list(switch_levels)
+        level = np.array([list(section.levels)] * n, dtype="U1")
+        if section.switch_h is not None:
+            level[hours >= section.switch_h] = list(section.switch_levels)
         absent = np.zeros((n, len(FLIGHT_PRODUCTS)), dtype=bool)
-        for row in np.flatnonzero(_drawn_stretches(generator, n, absent_share, 1)):
+        for row in np.flatnonzero(_drawn_stretches(generator, n, section.absent_share, 1)):
             absent[row, generator.integers(len(FLIGHT_PRODUCTS))] = True
-        saturated = _drawn_stretches(generator, n, saturated_share, 1)
-        tones = _tone_channels(tones_mhz, navgf, origin)
-        tone = _drawn_stretches(generator, n, tone_share if tones_mhz else 0.0, STRETCH)
-        comb = _drawn_stretches(generator, n, comb_share, STRETCH)
+        saturated = _drawn_stretches(generator, n, section.saturated_share, 1)
+        tones = _tone_channels(section.tones_mhz, section.navgf, origin)
+        tone = _drawn_stretches(
+            generator, n, section.tone_share if section.tones_mhz else 0.0, STRETCH
+        )
+        comb = _drawn_stretches(generator, n, section.comb_share, STRETCH)
         burst, phase = np.zeros(n, dtype=bool), np.zeros((n, PORTS))
         at = 0.0
-        while burst_every_h is not None:
-            at += generator.exponential(burst_every_h)
+        while section.burst_every_h is not None:
+            at += generator.exponential(section.burst_every_h)
             if at > hours[-1]:
                 break
-            length_s = step_s * max(burst_s / step_s, 1.0) ** generator.uniform()
+            length_s = step_s * max(section.burst_s / step_s, 1.0) ** generator.uniform()
             # at least one spectrum, up to the end of the burst
             first = int(np.searchsorted(hours, at))
             here = slice(first, max(first + 1, np.searchsorted(hours, at + length_s / 3600.0)))
             burst[here] = True
             phase[here] = generator.uniform(0.0, 2.0 * np.pi, PORTS)
-        factors = tone_factor, comb_factor, burst_factor
-        return cls(level, absent, saturated, tone, tones, comb, burst, phase, *factors)
+        return cls(section, level, absent, saturated, tone, tones, comb, burst, phase)
 
     def add(
         self, t: Complex[np.ndarray, "antennas antennas rows channels"], rows: slice, frames: float
@@ -378,13 +349,13 @@ class Disturbances:
         """
         level = np.einsum("iirc->rc", t).real / (PORTS * np.sqrt(frames))
         comb = np.arange(N_CHANNELS) % COMB_SPACING == COMB_FIRST
-        lines = self.tone_factor * (self.tone[rows, None] & self.tone_channel)
-        lines = lines + self.comb_factor * (self.comb[rows, None] & comb)
+        lines = self.section.tone_factor * (self.tone[rows, None] & self.tone_channel)
+        lines = lines + self.section.comb_factor * (self.comb[rows, None] & comb)
         t += level * lines
         here = np.flatnonzero(self.burst[rows])
         if here.size:
             wave = np.exp(1j * self.phase[rows][here]).T
-            power = level[here] * self.burst_factor / np.sqrt(BURST_CHANNELS)
+            power = level[here] * self.section.burst_factor / np.sqrt(BURST_CHANNELS)
             t[:, :, here] += wave[:, None, :, None] * wave.conj()[None, :, :, None] * power
 
     def truth(self) -> dict[str, np.ndarray]:

@@ -13,7 +13,6 @@ from lusee_bayes.experiment.data_files import Data
 from lusee_bayes.experiment.experiment import Experiment, observed
 from lusee_bayes.experiment.rounds import about_sky, learned_prior, named_priors, rebuilds
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
-from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.judge.residuals import held_out
 from lusee_bayes.judge.split import Split
 from lusee_bayes.linear.linear_gaussian import Solution
@@ -36,6 +35,7 @@ from lusee_bayes.runs.folder import (
     run_folder,
     text_file,
 )
+from lusee_bayes.systematics.context import Setup
 
 
 def run_compare(

@@ -20,8 +20,8 @@ from lusee_bayes.core.reading import naming
 from lusee_bayes.experiment.data_files import Data, names_of_data, read_data, reduce_files
 from lusee_bayes.experiment.experiment import Experiment, observed
 from lusee_bayes.experiment.flight_simulation import FlightSimulation, flight_of, simulate_flight
+from lusee_bayes.experiment.model import require_fitting, set_up
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
-from lusee_bayes.experiment.setup import require_fitting, set_up
 from lusee_bayes.flight.clock import Clock
 from lusee_bayes.flight.gain_model import write_gain_table
 from lusee_bayes.flight.reduced import Reduced, write_reduced

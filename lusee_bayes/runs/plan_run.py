@@ -30,10 +30,9 @@ from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming, parse_yaml
 from lusee_bayes.core.version import __version__
 from lusee_bayes.experiment.instrument_sections import RunSection
-from lusee_bayes.experiment.model import model_about
+from lusee_bayes.experiment.model import model_about, set_up
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
-from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.instrument.products import DataLayout, all_products
 from lusee_bayes.judge.measures import effective_resolution_deg, prior_fraction_per_ell
 from lusee_bayes.linear.amplitudes import template_amplitudes
@@ -42,7 +41,7 @@ from lusee_bayes.report.figures.plans import forecasts
 from lusee_bayes.results.forecast import AS_GIVEN, Forecast, Variation, forecast_rows
 from lusee_bayes.runs.cost import duration, posterior_cost, require_fits
 from lusee_bayes.runs.folder import RunKind, RunOutcome, inputs_of, rows_file, run_folder
-from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.context import Around, Setup
 
 
 def expected_snr_squared(posterior: Posterior) -> Float[np.ndarray, " ells"]:

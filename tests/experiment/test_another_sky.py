@@ -24,9 +24,8 @@ from lusee_bayes.experiment.diagnosis import (
     port_mixing,
 )
 from lusee_bayes.experiment.experiment import doubts
-from lusee_bayes.experiment.model import full_model, radiometer, simulate
+from lusee_bayes.experiment.model import full_model, radiometer, set_up, simulate
 from lusee_bayes.experiment.rounds import learned_prior, settled
-from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.experiment.sky_sections import FileSkySection
 from lusee_bayes.instrument.products import DataLayout, to_matrix, to_real
 from lusee_bayes.judge.residuals import residuals

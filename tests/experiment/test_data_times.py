@@ -20,8 +20,7 @@ from scipy.linalg import eigh
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.data_files import digest_of, items_of
-from lusee_bayes.experiment.model import full_model, simulate
-from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.experiment.model import full_model, set_up, simulate
 from lusee_bayes.instrument.averaging import averaged
 from lusee_bayes.instrument.schedule import read_schedule
 from lusee_bayes.instrument.visibilities import read_visibilities

@@ -13,8 +13,9 @@ from naive_flight import naive_band
 import lusee_bayes as lb
 from lusee_bayes.experiment.data_files import per_kelvin_of, reduce_files
 from lusee_bayes.experiment.flight_simulation import simulate_flight
-from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.experiment.model import set_up
 from lusee_bayes.flight.gain_model import synthetic_gains
+from lusee_bayes.flight.recipe import FlightSimulatedSection
 from lusee_bayes.flight.reduced import BURST, COMB, NO_DATA, SATURATED, USED
 from lusee_bayes.flight.session import CHANNEL_MHZ
 from lusee_bayes.flight.session_files import read_session
@@ -206,7 +207,8 @@ def test_a_tone_that_no_bin_holds_is_refused():
 
     def drawn(channel):
         tones = (0.025 * channel,)
-        return Disturbances.drawn(np.arange(20.0), 3600.0, "centre", 1, navgf=3, tones_mhz=tones)
+        section = FlightSimulatedSection(navgf=3, tones_mhz=tones)
+        return Disturbances.drawn(section, np.arange(20.0), 3600.0, "centre", 1)
 
     for channel in (1000, 1001, 1002):
         assert np.flatnonzero(drawn(channel).tone_channel).tolist() == [channel]

@@ -13,8 +13,7 @@ import lusee_bayes as lb
 from lusee_bayes.experiment import leave_out
 from lusee_bayes.experiment.experiment import explained
 from lusee_bayes.experiment.leave_out import NOT_JUDGED, TOO_MANY, fitting, without
-from lusee_bayes.experiment.model import radiometer
-from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.experiment.model import radiometer, set_up
 from lusee_bayes.instrument.visibilities import Calibration
 from lusee_bayes.judge.left_out import LeftOut
 from lusee_bayes.judge.plausibility import SIGNIFICANT, about_information, require_plausible

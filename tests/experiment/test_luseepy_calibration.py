@@ -20,8 +20,7 @@ from scipy.stats import chi2, kstest
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import from_healpy
-from lusee_bayes.experiment.model import base_model
-from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.experiment.model import base_model, set_up
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.instrument.waterfalls import read_waterfall
 

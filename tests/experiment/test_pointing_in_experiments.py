@@ -18,15 +18,15 @@ from lusee_bayes.experiment.model import (
     full_model,
     model_about,
     radiometer,
+    set_up,
     simulate,
     true_values,
 )
-from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.experiment.unknowns import pointing_report
 from lusee_bayes.instrument.beams.monopoles import source_response
 from lusee_bayes.judge.residuals import residuals
 from lusee_bayes.sky.galaxy import galactic_unit_vector
-from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.pointing_offsets import PointingOffsets, shifted
 
 TWO_RUNS = "observation.runs=[{cycles: 1}, {cycles: 1, turntable_deg: 30}]"

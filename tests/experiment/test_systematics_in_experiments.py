@@ -25,10 +25,9 @@ from lusee_bayes.experiment.model import (
 )
 from lusee_bayes.experiment.rounds import SETTLED, Inference, prediction
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.noise.covariance import Covariance, LowRankCovariance, LowRankUpdate
 from lusee_bayes.systematics.beam import beam_rms_difference, difference_of_beams, true_beams
-from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.registered import SYSTEMATICS, NoiseSection
 from lusee_bayes.systematics.systematic import AdditiveNoise, Systematic, Truth, multiplied
 from lusee_bayes.testing.scenarios import small_scenario

@@ -13,11 +13,11 @@ from reference_linear import white_posterior
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.model import radiometer, simulate, true_values
-from lusee_bayes.experiment.setup import Setup, set_up
+from lusee_bayes.experiment.model import radiometer, set_up, simulate, true_values
 from lusee_bayes.experiment.unknowns import NullDirection
 from lusee_bayes.instrument.products import auto_indices
 from lusee_bayes.report.map_page import map_page
+from lusee_bayes.systematics.context import Setup
 from lusee_bayes.systematics.regolith import ground_per_kelvin
 
 RECEIVER, GROUND = "noise.receiver={power_k: 2000}", "noise.regolith={std_k: 30}"

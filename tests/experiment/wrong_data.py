@@ -15,12 +15,12 @@ from made_skies import SmoothSky, SpottySky
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers, turn_about_z
-from lusee_bayes.experiment.model import radiometer
+from lusee_bayes.experiment.model import radiometer, set_up
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.products import labels
 from lusee_bayes.sky.sky_source import SkySource
+from lusee_bayes.systematics.context import Setup
 
 LABELS = labels(4)
 

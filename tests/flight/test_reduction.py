@@ -8,9 +8,9 @@ from assertions import refuse
 from naive_flight import FLIGHT_ORDER, naive_band
 
 from lusee_bayes.flight import reduction
-from lusee_bayes.flight.flags import KnownLines
+from lusee_bayes.flight.flags import NO_LINES, KnownLines
 from lusee_bayes.flight.gain_model import read_gain_table
-from lusee_bayes.flight.recipe import Recipe
+from lusee_bayes.flight.recipe import FlightSection, Recipe
 from lusee_bayes.flight.reduced import (
     BURST,
     COMB,
@@ -50,9 +50,9 @@ def sessions(flight, names="abcd"):
     return [read_session(flight / f"session_{name}.h5") for name in names]
 
 
-def recipe(table, **changes):
-    given = {"origin": "centre", "timestamp": "instant", "frequencies_mhz": F} | changes
-    return Recipe(table, **given)
+def recipe(table, timestamp="instant", average_s=None, lines=NO_LINES, **section):
+    section = FlightSection(bin_origin="centre", **section)
+    return Recipe(section, table, timestamp, F, average_s, lines)
 
 
 @pytest.fixture(scope="module")

@@ -19,8 +19,7 @@ import lusee_bayes as lb
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import from_healpy
 from lusee_bayes.experiment.experiment import program_pieces
-from lusee_bayes.experiment.model import true_signal, true_values
-from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.experiment.model import set_up, true_signal, true_values
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, product_beams
 from lusee_bayes.instrument.beams.luseepy_files import FIELDS, ScalarBeam
 from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith

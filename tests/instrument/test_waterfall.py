@@ -19,7 +19,7 @@ import lusee_bayes as lb
 from lusee_bayes.cli.main import main
 from lusee_bayes.cli.options import parse_frequencies
 from lusee_bayes.core.reading import parse_yaml
-from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.experiment.model import set_up
 from lusee_bayes.instrument.products import DataLayout, labels
 from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
 from lusee_bayes.report.describe import describe

@@ -17,8 +17,7 @@ import lusee_bayes as lb
 from lusee_bayes.core.engine import ThisProcess
 from lusee_bayes.core.harmonics import sum_over_m
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.experiment.model import full_model
-from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.experiment.model import full_model, set_up
 from lusee_bayes.instrument.products import all_products
 from lusee_bayes.judge.measures import ell_cross
 from lusee_bayes.linear.linear_gaussian import InMap

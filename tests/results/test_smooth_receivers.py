@@ -12,8 +12,7 @@ from reference_linear import Answer, white_posterior
 from scipy.linalg import block_diag
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.model import radiometer, true_values
-from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.experiment.model import radiometer, set_up, true_values
 from lusee_bayes.runs import channels
 from lusee_bayes.runs.channels import map_channels
 

@@ -9,7 +9,7 @@ from experiments import flagged
 
 import lusee_bayes as lb
 from lusee_bayes.cli.options import parse_duration
-from lusee_bayes.experiment.setup import set_up
+from lusee_bayes.experiment.model import set_up
 from lusee_bayes.instrument.averaging import averaged
 from lusee_bayes.instrument.visibilities import read_visibilities
 from lusee_bayes.testing.scenarios import small_scenario

@@ -9,8 +9,8 @@ from commands import run, table_of
 from experiments import mapped
 
 import lusee_bayes as lb
+from lusee_bayes.experiment.model import set_up
 from lusee_bayes.experiment.rounds import NAMED
-from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.sky.sky_source import write_alms
 from lusee_bayes.testing.scenarios import small_scenario
 

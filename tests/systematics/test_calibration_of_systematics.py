@@ -17,15 +17,15 @@ from scipy import stats
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.experiment import Experiment, program_pieces
-from lusee_bayes.experiment.model import full_model, simulate, true_values
+from lusee_bayes.experiment.model import full_model, set_up, simulate, true_values
 from lusee_bayes.experiment.rounds import settled
-from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.experiment.unknowns import SKY
 from lusee_bayes.judge.levels import LEVELS
 from lusee_bayes.linear.amplitudes import template_amplitudes
 from lusee_bayes.sampling.hmc import Sampler
 from lusee_bayes.sampling.programs import numpyro_promotion
 from lusee_bayes.sampling.validation import FALSE_ALARM, N_DRAWS, Ranks, calibrate
+from lusee_bayes.systematics.context import Setup
 from lusee_bayes.systematics.gain_drifts import SCALES
 from lusee_bayes.systematics.gain_table import COMMON_GAIN
 from lusee_bayes.systematics.systematic import Chart

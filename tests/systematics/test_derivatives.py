@@ -7,9 +7,8 @@ import pytest
 
 import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_host
-from lusee_bayes.experiment.model import base_model, moved, systematics
+from lusee_bayes.experiment.model import base_model, moved, set_up, systematics
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.setup import set_up
 from lusee_bayes.instrument.pointing import CLOCK
 from lusee_bayes.systematics.context import Around
 from lusee_bayes.systematics.systematic import Expanded

@@ -19,17 +19,17 @@ from lusee_bayes.experiment.model import (
     model_about,
     moved,
     radiometer,
+    set_up,
     simulate,
     true_signal,
     true_values,
 )
 from lusee_bayes.experiment.rounds import Inference
-from lusee_bayes.experiment.setup import Setup, set_up
 from lusee_bayes.instrument.beams.sampled import read_beam
 from lusee_bayes.instrument.products import all_products, labels
 from lusee_bayes.instrument.visibilities import Calibration
 from lusee_bayes.linear.amplitudes import template_amplitudes
-from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.gain_table import table_errors
 from lusee_bayes.testing.scenarios import small_scenario
 

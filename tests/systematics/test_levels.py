@@ -17,12 +17,11 @@ from scipy.stats import lognorm, multivariate_normal, norm
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model, model_to_sample, radiometer, true_values
-from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.noise.covariance import Covariance, DenseCovariance, LowRankCovariance
 from lusee_bayes.noise.instrument_errors import difference
 from lusee_bayes.sampling.programs import numpyro_promotion
-from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.noise_level import NoiseLevel
 from lusee_bayes.systematics.prior_spectrum import PriorSpectrum
 from lusee_bayes.systematics.sources import PointSources, Source

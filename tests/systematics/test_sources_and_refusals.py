@@ -33,11 +33,10 @@ from lusee_bayes.experiment.model import (
     systematics,
     true_values,
 )
-from lusee_bayes.experiment.setup import Setup
 from lusee_bayes.experiment.unknowns import flux_table
 from lusee_bayes.sampling.programs import latent_sites
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
-from lusee_bayes.systematics.context import Around
+from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.prior_spectrum import PriorSpectrum
 from lusee_bayes.systematics.sources import (
     PointSources,
