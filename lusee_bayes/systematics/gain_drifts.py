@@ -126,25 +126,46 @@ class GainDrifts(Systematic):
     log_correlation_std: Float[Array, ""] | None = eqx.field(default=None, converter=scalar_or_none)
 
     @classmethod
-    def build(cls, section: GainSection, setup: Setup, around: Around) -> GainDrifts:
-        """Work out the grid and the bands that these drifts need."""
-        middle, log_std = section.correlation_h, section.log_correlation_std
+    def of(
+        cls,
+        drift: GainDrift,
+        visibilities: Float[Array, "products times"],
+        hours: Float[np.ndarray, " times"],
+        layout: DataLayout,
+        log_sigma_std: float | None = None,
+        log_correlation_std: float | None = None,
+    ) -> GainDrifts:
+        """Work out the grid and the bands that these drifts need.
+
+        Parameters
+        ----------
+        drift : GainDrift
+            Standard deviation and correlation time (medians, where uncertain).
+        visibilities : (products, times) array
+            Visibilities that the covariance is built around, in K.
+        hours : (times,) array
+            Sample times in hours, growing.
+        layout : DataLayout
+            The data.
+        log_sigma_std, log_correlation_std : float, optional
+            Prior standard deviations of the natural logarithms of the two; None where known.
+        """
+        middle, log_std = float(drift.correlation_h), log_correlation_std
         factor = 1.0 if log_std is None else float(np.exp(CORRELATION_REACH * log_std))
-        drift = GainDrift(section.sigma, middle)
-        longest = GainDrift(section.sigma, middle * max(factor, FACTOR))
-        hours, ends = setup.observation.hours, (middle / factor, middle * factor)
+        longest = GainDrift(drift.sigma, middle * max(factor, FACTOR))
+        ends = middle / factor, middle * factor
         grid = white_grid(hours, *ends, per_correlation=PER_CORRELATION, margin=MARGIN)
+        widths, stds = (drift.width(hours), longest.width(hours)), (log_sigma_std, log_std)
         return cls(
-            drift,
-            noise_visibilities(setup, around, gains_about(setup)),
-            jnp.asarray(hours),
-            jnp.asarray(grid),
-            setup.layout,
-            drift.width(hours),
-            longest.width(hours),
-            section.log_sigma_std,
-            log_std,
+            drift, visibilities, jnp.asarray(hours), jnp.asarray(grid), layout, *widths, *stds
         )
+
+    @classmethod
+    def build(cls, section: GainSection, setup: Setup, around: Around) -> GainDrifts:
+        drift = GainDrift(section.sigma, section.correlation_h)
+        visibilities = noise_visibilities(setup, around, gains_about(setup))
+        stds = section.log_sigma_std, section.log_correlation_std
+        return cls.of(drift, visibilities, setup.observation.hours, setup.layout, *stds)
 
     @classmethod
     def truth(cls, section: GainSection, setup: Setup, key: PRNGKeyArray) -> Truth:

@@ -414,7 +414,8 @@ def test_half_the_covariance_is_found_out_with_exit_code_1(validated, tmp_path, 
         half = eqx.tree_at(lambda p: p.lower, posterior, np.sqrt(2) * posterior.lower)
         ratio = half.covariance() / posterior.covariance()
         np.testing.assert_allclose(ratio, 0.5, rtol=1e-6)
-        return replace(found, inference=replace(found.inference, posterior=half))
+        solution = replace(found.inference.solution, posterior=half)
+        return replace(found, inference=replace(found.inference, solution=solution))
 
     monkeypatch.setattr(validate_run, "sample_result", with_half_the_covariance)
     arguments = [*SMALL, *SETTINGS, "--simulations", "100", "-q", "-o", folder, "--resume"]
