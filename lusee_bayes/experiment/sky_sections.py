@@ -7,6 +7,7 @@ with its :class:`SkySource` or :class:`Prior`, and its name in ``SKY_SECTIONS`` 
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -18,7 +19,7 @@ from lusee_bayes.core.section import Megahertz, Positive, Section, Seed, kinds_o
 from lusee_bayes.priors.families import IsotropicFamily, PriorFamily
 from lusee_bayes.priors.local_scales import embedded_local_scales
 from lusee_bayes.sampling.log_normal_prior import LogNormalPrior
-from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, galactic_share
+from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, diffuse_brightness, galactic_share
 from lusee_bayes.sky.positive_skies import (
     FIELDS,
     FIELDS_OF,
@@ -27,7 +28,7 @@ from lusee_bayes.sky.positive_skies import (
     deviation_spectrum,
 )
 from lusee_bayes.sky.prior import HarmonicPrior, Prior, read_mean, read_spectrum
-from lusee_bayes.sky.sky_source import EmbeddedTemplate, FileSource, GalaxySource, Sky, SkySource
+from lusee_bayes.sky.sky_source import FileSource, GalaxySource, Sky, SkySource, galaxy_sky
 from lusee_bayes.sky.spectral_prior import SpectralPrior, check_components, require_names
 from lusee_bayes.systematics.prior_spectrum import SpectrumSection
 
@@ -163,9 +164,8 @@ class IsotropicPriorSection(SpectrumSection):
         """The family that data choose a prior of, up to an ell; None if C_ell is given."""
         if not self.is_learned:
             return None
-        # the mean of the embedded sky, in K
-        mean = EmbeddedTemplate(frequency_mhz).modes(0)[0] / np.sqrt(4.0 * np.pi)
-        return IsotropicFamily.around(float(mean), lmax)
+        mean = galaxy_sky(frequency_mhz, 0, seed=None, sources=()).mean_temperature
+        return IsotropicFamily.around(mean, lmax)
 
     def prior(self, sky: Sky) -> Prior:
         """S, and the mean, at the frequency and up to the lmax of a model sky."""
@@ -264,15 +264,15 @@ class LogNormalSection(Section):
 
     def prior(self, frequency_mhz: float, lmax: int) -> LogNormalPrior:
         """The prior up to an ell."""
-        amplitude, tilt, widths = AMPLITUDE, TILT, (LOG_AMPLITUDE_STD, TILT_STD)
+        amplitude, tilt, std = AMPLITUDE, TILT, np.array([LOG_AMPLITUDE_STD, TILT_STD])
         if self.amplitude is not None and self.tilt is not None:
-            amplitude, tilt, widths = self.amplitude, self.tilt, None
+            amplitude, tilt, std = self.amplitude, self.tilt, None
         level = np.array([4.0 * np.pi * self.scale_std**2])
         spectrum = deviation_spectrum(lmax, amplitude, tilt, level)
         sources = BRIGHT_SOURCES if self.sources else ()
-        template = EmbeddedTemplate(frequency_mhz)
+        template = partial(diffuse_brightness, frequency_mhz)
         sky = LogNormalSky.of(template, spectrum, frequency_mhz, sources)
-        return LogNormalPrior.of(sky, amplitude, tilt, widths)
+        return LogNormalPrior(sky, np.array([np.log(amplitude), tilt]), std)
 
 
 # highest ell of fields of the logarithm, over that of the map
@@ -374,7 +374,7 @@ class SpectralSection(Section):
             )
         return PositiveSkies.of(
             np.array(frequencies_mhz),
-            [EmbeddedTemplate(f) for f in frequencies_mhz],
+            [partial(diffuse_brightness, f) for f in frequencies_mhz],
             lmax,
             self.fields,
             **self.model_dump(include={"reference_mhz", "turnover_mhz"}),

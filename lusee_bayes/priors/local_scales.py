@@ -28,9 +28,9 @@ from lusee_bayes.core.harmonics import n_modes, per_mode, sum_over_m, synthesis_
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.priors.families import Hyperprior, Member, Parameters, PriorFamily, SpectrumBasis
-from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, PointSource
+from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, PointSource, galaxy_map
 from lusee_bayes.sky.prior import PIVOT, DensePrior
-from lusee_bayes.sky.sky_source import EmbeddedTemplate
+from lusee_bayes.sky.sky_source import galaxy_sky
 
 # arrays that recur
 Covariates = Float[np.ndarray, " covariates"]
@@ -146,9 +146,9 @@ class SmoothedTemplate:
     mean_log: float
 
     @classmethod
-    def of(cls, template: EmbeddedTemplate) -> SmoothedTemplate:
-        """Analyse a template."""
-        pixels = template.pixels(TEMPLATE_NSIDE)
+    def of(cls, frequency_mhz: float) -> SmoothedTemplate:
+        """Analyse the embedded diffuse sky, without its random component, at a frequency in MHz."""
+        pixels = galaxy_map(frequency_mhz, TEMPLATE_NSIDE, seed=None)
         alm = healpy.map2alm(pixels, lmax=TEMPLATE_LMAX, iter=3)
         return cls(alm, float(np.log(pixels).mean()))
 
@@ -345,11 +345,10 @@ def embedded_local_scales(
     sources : tuple of PointSource
         The catalogue: those that may be there.
     """
-    template = EmbeddedTemplate(frequency_mhz)
-    # the same sky where hardly anything is absorbed
-    clear = EmbeddedTemplate(max(TRANSPARENT_MHZ, frequency_mhz))
-    smoothed = [SmoothedTemplate.of(each) for each in (template, clear)]
-    mean = template.modes(lmax)
+    # the template, and the same sky where hardly anything is absorbed
+    clear_mhz = max(TRANSPARENT_MHZ, frequency_mhz)
+    smoothed = [SmoothedTemplate.of(mhz) for mhz in (frequency_mhz, clear_mhz)]
+    mean = np.asarray(galaxy_sky(frequency_mhz, lmax, seed=None, sources=()).modes)
     monopole = np.zeros_like(mean)
     monopole[0] = mean[0]
     strength = RELATIVE_STRENGTH * np.exp(smoothed[0].mean_log)

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import require_positive
+from lusee_bayes.core.checks import require_array, require_positive
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.sky.positive_skies import LogNormalSky
 from lusee_bayes.systematics.systematic import SKY
@@ -25,7 +24,7 @@ class LogNormalPrior(eqx.Module):
     Attributes
     ----------
     sky : LogNormalSky
-        With the expected C_ell.
+        With the expected C_ell, which are sampled beyond ell = 0 where they are not known.
     expected : (2,) array
         ln A and the tilt; their means, if they are not known.
     std : (2,) array or None
@@ -34,43 +33,15 @@ class LogNormalPrior(eqx.Module):
     Raises
     ------
     InputError
-        If a standard deviation is not positive.
+        If ln A or the tilt is not finite, or a standard deviation not positive.
     """
 
     sky: LogNormalSky
     expected: Float[Array, "2"]
     std: Float[Array, "2"] | None = None
 
-    @classmethod
-    def of(
-        cls,
-        sky: LogNormalSky,
-        amplitude: float,
-        tilt: float,
-        std: tuple[float, float] | None = None,
-    ) -> LogNormalPrior:
-        """Make it.
-
-        Parameters
-        ----------
-        sky : LogNormalSky
-            Its C_ell beyond ell = 0 is replaced.
-        amplitude, tilt : float
-        std : (float, float), optional
-            Standard deviations of ln A and of the tilt, if they are not known.
-
-        Raises
-        ------
-        InputError
-            If A or a standard deviation is not positive.
-        """
-        require_positive("the amplitude of the logarithm of the sky", amplitude)
-        expected = np.array([np.log(amplitude), tilt])
-        return cls(
-            sky.with_power_law(amplitude, tilt), expected, None if std is None else np.array(std)
-        )
-
     def __check_init__(self):
+        require_array("ln A and the tilt of the sky", self.expected, (2,))
         if self.std is not None:
             require_positive("the standard deviation of ln A or of the tilt", self.std)
 

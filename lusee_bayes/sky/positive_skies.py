@@ -41,15 +41,17 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import log_ndtr
 
-from lusee_bayes.core.arrays import Array, namespace
+from lusee_bayes.core.arrays import Array, Vector, namespace
 from lusee_bayes.core.checks import require_positive, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes, per_mode
 from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.sky.galaxy import FREE_FREE_SLOPE, PointSource
 from lusee_bayes.sky.prior import PIVOT
-from lusee_bayes.sky.sky_source import Template
 from lusee_bayes.sky.spectral_prior import SpectralPrior, require_names
+
+# a brightness temperature in K, of Galactic theta and phi in radians
+Template = Callable[[Vector, Vector], Vector]
 
 # steps of Newton's method, of which each closes in on the root; longest change of a parameter
 NEWTON, REACH = 30, 2.0
@@ -157,8 +159,9 @@ class LogNormalSky(eqx.Module):
 
         Parameters
         ----------
-        template : Template
-            T.
+        template : callable
+            T in K, of Galactic theta and phi in radians, such as
+            :func:`.diffuse_brightness` at the frequency.
         spectrum : (ells,) array
             C_ell of the logarithm; its lmax is the map's.
         frequency_mhz : float
@@ -175,7 +178,7 @@ class LogNormalSky(eqx.Module):
         lmax = len(spectrum) - 1
         require_positive("the spectrum of the logarithm", spectrum)
         grid = SphereGrid.of(lmax, max(GRID * lmax, LEAST_GRID) if band is None else band)
-        level = template.at(*grid.directions()).reshape(grid.shape)
+        level = template(*grid.directions()).reshape(grid.shape)
         require_positive("the template", level, "a log-normal sky is a positive template times exp")
         modes = [source.modes(frequency_mhz, lmax) for source in sources]
         return cls(
@@ -221,15 +224,12 @@ class LogNormalSky(eqx.Module):
         xp = namespace(self.spectrum)
         return xp.concatenate([xp.sqrt(per_mode(self.spectrum)), np.ones(len(self.source_modes))])
 
-    def logarithm(self, white: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch modes"]:
-        """Compute a, the modes of ln(sky / T) without sources."""
-        root = self.root()[: self.n_modes]
-        return white[..., : self.n_modes] * root.reshape(*(1,) * (white.ndim - 1), -1)
-
     def diffuse(self, white: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch rings phi"]:
         """Compute T exp(Y a) on the grid, in K."""
         xp = namespace(self, white)
-        field = xp.exp(self.grid.synthesise(self.logarithm(white)))
+        root = self.root()[: self.n_modes]
+        logarithm = white[..., : self.n_modes] * root.reshape(*(1,) * (white.ndim - 1), -1)
+        field = xp.exp(self.grid.synthesise(logarithm))
         return field * self.level.reshape(*(1,) * (white.ndim - 1), *self.level.shape)
 
     def source_factors(
@@ -347,8 +347,8 @@ class PositiveSkies(eqx.Module):
         ----------
         frequencies_mhz : (channels,) array
             Frequencies in MHz.
-        templates : sequence of Template
-            T_f, in the same order.
+        templates : sequence of callable
+            T_f in K, in the same order; each of theta and phi, as ``weight``.
         lmax : int
             Of the maps.
         names : tuple of str
@@ -385,7 +385,7 @@ class PositiveSkies(eqx.Module):
             )
         grid = SphereGrid.of(highest, max(GRID * highest, FIELDS_GRID) if band is None else band)
         at = grid.directions()
-        levels = np.stack([template.at(*at).reshape(grid.shape) for template in templates])
+        levels = np.stack([template(*at).reshape(grid.shape) for template in templates])
         require_positive("the template", levels, "a sky whose logarithm is modelled has no holes")
         strength = np.ones(grid.shape) if weight is None else weight(*at).reshape(grid.shape)
         require_positive("the weight of the fields", strength)

@@ -1,4 +1,4 @@
-"""A sky at one frequency, and what can tell it: the embedded Galaxy, or a file; and templates.
+"""A sky at one frequency, and what can tell it: the embedded Galaxy, or a file.
 
 Skies are real harmonic coefficients in Galactic coordinates, in K. Files have one of three layouts.
 
@@ -11,8 +11,6 @@ and ``freq`` in MHz. Galactic, K.
 **Cubes** are maps of many frequencies, in the layout of luseepy's ULSA file, which lowsky writes
 too. FITS: one primary image (frequency, pixel) of HEALPix maps, RING, Galactic, K; the header has
 FREQ_START, FREQ_END and FREQ_STEP in MHz. The file does not say its frame and order.
-
-**Templates** are skies that priors take their structure from.
 """
 
 from __future__ import annotations
@@ -28,12 +26,13 @@ import numpy as np
 from astropy.io import fits
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array, Vector
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import Described, number, require_array, require_finite, require_whole
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.files import replacing, user_path
 from lusee_bayes.core.formats import is_fits, opened, require_readable_hdf5
 from lusee_bayes.core.harmonics import (
+    LARGEST_LMAX,
     from_healpy,
     lmax_of,
     map_to_modes,
@@ -44,7 +43,7 @@ from lusee_bayes.core.harmonics import (
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.reading import naming, read_arrays, reading, require_file
-from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, PointSource, diffuse_brightness, galaxy_map
+from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, PointSource, galaxy_map
 
 
 class Sky(Described, eqx.Module):
@@ -297,8 +296,6 @@ NPZ = Layout(
         "alm": Variable(("freq", "coefficient"), "complex"),
     },
 )
-# far above what a run can hold
-LARGEST_LMAX = 4096
 
 
 @dataclass(frozen=True)
@@ -692,7 +689,7 @@ def galaxy_sky(
     frequency_mhz: float,
     lmax: int = 47,
     *,
-    seed: int = 1,
+    seed: int | None = 1,
     sources: tuple[PointSource, ...] = BRIGHT_SOURCES,
 ) -> Sky:
     """Compute the embedded sky at one frequency; see :class:`GalaxySource`.
@@ -723,46 +720,3 @@ def sky_from_file(
         other frequencies.
     """
     return FileSource(path, dataset, file_frequency_mhz, spectral_index).at(frequency_mhz, lmax)
-
-
-class Template(ABC):
-    """A brightness temperature in every direction, at one frequency."""
-
-    @abstractmethod
-    def at(self, theta: Vector, phi: Vector) -> Vector:
-        """Compute it in Galactic directions.
-
-        Parameters
-        ----------
-        theta, phi : (points,) array
-            In radians; theta from the Galactic north pole.
-
-        Returns
-        -------
-        (points,) array
-            In K.
-        """
-
-
-@dataclass(frozen=True)
-class EmbeddedTemplate(Template):
-    """The embedded diffuse sky without its random component and without point sources.
-
-    Attributes
-    ----------
-    frequency_mhz : float
-        1 to 50 MHz.
-    """
-
-    frequency_mhz: float
-
-    def at(self, theta, phi):
-        return diffuse_brightness(self.frequency_mhz, theta, phi)
-
-    def pixels(self, nside: int) -> Float[np.ndarray, " pixels"]:
-        """Compute it at the centres of HEALPix RING pixels, in K."""
-        return galaxy_map(self.frequency_mhz, nside, seed=None)
-
-    def modes(self, lmax: int) -> Float[np.ndarray, " modes"]:
-        """Compute its real packed coefficients up to an ell, Galactic, in K."""
-        return np.asarray(GalaxySource(None, ()).at(self.frequency_mhz, lmax).modes)

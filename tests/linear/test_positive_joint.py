@@ -1,6 +1,7 @@
 """Positive joint skies: mode and Gaussian against scipy and one big model of all channels."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -20,22 +21,16 @@ from lusee_bayes.linear.positive_joint import (
     positive_sky,
 )
 from lusee_bayes.sky.positive_skies import FieldLaws, PositiveSkies
-from lusee_bayes.sky.sky_source import Template
 
 LMAX = 3
 N = n_modes(LMAX)
 FREQUENCIES = np.array([5.0, 9.0, 16.0, 30.0])
 
 
-@dataclass(frozen=True)
-class Band(Template):
+def band(frequency_mhz, theta, phi):
     """A bright band along the equator, so smooth that grids hold it."""
-
-    frequency_mhz: float
-
-    def at(self, theta, phi):
-        scale = 100.0 * (self.frequency_mhz / 20.0) ** -2.5
-        return scale * np.exp(-1.5 * np.cos(theta) ** 2 + 0.4 * np.sin(theta) * np.cos(phi))
+    scale = 100.0 * (frequency_mhz / 20.0) ** -2.5
+    return scale * np.exp(-1.5 * np.cos(theta) ** 2 + 0.4 * np.sin(theta) * np.cos(phi))
 
 
 def weight(theta, phi):
@@ -45,7 +40,7 @@ def weight(theta, phi):
 def skies_of(frequencies, names, n_sources=0):
     points = synthesis_matrix(np.array([0.4, 1.9]), np.array([2.0, 4.0]), LMAX)[:n_sources]
     sources = np.stack([20.0 * (f / 20.0) ** -2.5 * points for f in frequencies])
-    templates = [Band(f) for f in frequencies]
+    templates = [partial(band, f) for f in frequencies]
     return PositiveSkies.of(
         frequencies, templates, LMAX, names, sources=sources, weight=weight, band=24
     )
@@ -98,7 +93,7 @@ def test_the_mode_of_one_channel_is_that_of_a_direct_minimisation():
     prior = laws.prior(skies)
     ((a, sigma, d, information),) = observed(skies, laws)
     theta, phi, y, weights = quadrature()
-    template = Band(16.0).at(theta, phi)
+    template = band(16.0, theta, phi)
     root, rest = np.asarray(prior.roots)[0], np.asarray(prior.residual_root(0))
 
     def residuals(white):
@@ -135,7 +130,7 @@ def test_the_gaussian_is_that_of_one_big_model(case):
     wide[: fields * N] = np.asarray(prior.roots).ravel()
     strength = weight(theta, phi)
     for k in range(len(seen)):
-        level = Band(FREQUENCIES[k]).at(theta, phi) * np.exp(strength * (y @ mode.exponents[k]))
+        level = band(FREQUENCIES[k], theta, phi) * np.exp(strength * (y @ mode.exponents[k]))
         slope = y.T @ ((weights * strength * level)[:, None] * y)
         matrix = np.zeros((N, size))
         for c in range(fields):
@@ -221,16 +216,13 @@ def test_learned_laws_maximise_the_evidence():
 
 def test_bad_input_is_refused_in_a_sentence():
     refuse("unknown field 'indx'; did you mean 'index'", skies_of, FREQUENCIES, ("level", "indx"))
-    one, build, every = FREQUENCIES[:1], PositiveSkies.of, [Band(f) for f in FREQUENCIES]
+    one, build, every = FREQUENCIES[:1], PositiveSkies.of, [partial(band, f) for f in FREQUENCIES]
     refuse("2 fields .* need at least as many channels", skies_of, one, ("level", "index"))
-    refuse("1 templates for 4 frequencies", build, FREQUENCIES, [Band(5.0)], LMAX)
+    refuse("1 templates for 4 frequencies", build, FREQUENCIES, [partial(band, 5.0)], LMAX)
     refuse("fields is 2, that of the maps 3", build, FREQUENCIES, every, LMAX, lmax_fields=2)
 
-    class Hole(Band):
-        def at(self, theta, phi):
-            return super().at(theta, phi) - 50.0
-
-    refuse("the template", build, FREQUENCIES, [Hole(f) for f in FREQUENCIES], LMAX)
+    holes = [lambda theta, phi, f=f: band(f, theta, phi) - 50.0 for f in FREQUENCIES]
+    refuse("the template", build, FREQUENCIES, holes, LMAX)
     skies = skies_of(FREQUENCIES[:1], ("level",))
     other = Information(*(np.zeros(s) for s in ((4, 4), 4, 4, (), (), ())))
     refuse("the patterns", linearised, skies, 0, other, np.zeros(N))

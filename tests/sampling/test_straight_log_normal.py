@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -22,10 +22,9 @@ from lusee_bayes.sampling.log_normal_program import (
     learn_spectrum,
     straight_coordinates,
 )
-from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
+from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, diffuse_brightness
 from lusee_bayes.sky.positive_skies import LogNormalSky, deviation_spectrum
 from lusee_bayes.sky.prior import DensePrior
-from lusee_bayes.sky.sky_source import EmbeddedTemplate
 
 MHZ, LMAX, TILTED = 25.0, 3, -2.0
 LEVEL = np.array([4.0 * np.pi])
@@ -33,7 +32,13 @@ LEVEL = np.array([4.0 * np.pi])
 
 def log_normal(amplitude, lmax=LMAX, level=LEVEL, sources=()) -> LogNormalSky:
     spectrum = deviation_spectrum(lmax, amplitude, TILTED, level)
-    return LogNormalSky.of(EmbeddedTemplate(MHZ), spectrum, MHZ, sources, band=16)
+    return LogNormalSky.of(partial(diffuse_brightness, MHZ), spectrum, MHZ, sources, band=16)
+
+
+def log_normal_prior(amplitude, widths) -> LogNormalPrior:
+    expected = np.array([np.log(amplitude), TILTED])
+    std = None if widths is None else np.array(widths)
+    return LogNormalPrior(log_normal(amplitude), expected, std)
 
 
 def informed(truth: np.ndarray) -> Information:
@@ -165,7 +170,7 @@ def test_energies_are_those_of_a_gaussian_in_straight_coordinates_only():
 
 
 def test_the_learned_spectrum_has_the_highest_evidence_and_its_curvature():
-    prior = LogNormalPrior.of(log_normal(0.02), 0.02, TILTED, (0.7, 0.5))
+    prior = log_normal_prior(0.02, (0.7, 0.5))
     found = learn_spectrum(prior, information())
     best = found.power_law
     centre, std = np.array([np.log(0.02), TILTED]), np.array([0.7, 0.5])
@@ -192,13 +197,15 @@ def test_the_learned_spectrum_has_the_highest_evidence_and_its_curvature():
 def test_refusals():
     refuse("the information has shape", find_mode, log_normal(0.1, lmax=2), information())
     sky = log_normal(0.1)
-    refuse("amplitude of the logarithm of the sky", LogNormalPrior.of, sky, 0.0, TILTED)
-    refuse("of ln A or of the tilt must be", LogNormalPrior.of, sky, 0.1, TILTED, (1.0, 0.0))
+    refuse(
+        "ln A and the tilt of the sky holds NaN", LogNormalPrior, sky, np.array([-np.inf, TILTED])
+    )
+    refuse("of ln A or of the tilt must be", log_normal_prior, 0.1, (1.0, 0.0))
 
 
 @pytest.mark.parametrize("widths", [None, (0.7, 0.5)])
 def test_coordinates_are_those_of_the_sites_that_are_sampled(widths):
-    prior = LogNormalPrior.of(log_normal(0.02), 0.02, TILTED, widths)
+    prior = log_normal_prior(0.02, widths)
     coordinates = coordinates_of(prior, information())
     assert coordinates.names == prior.sites
     assert coordinates.chart.names == (STRUCTURE, AMPLITUDE, TILT)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import partial
 
 import healpy
 import jax
@@ -15,28 +15,23 @@ from scipy import stats
 from lusee_bayes.core.arrays import on_device
 from lusee_bayes.core.harmonics import map_to_modes, n_modes, synthesis_matrix
 from lusee_bayes.core.sphere_grid import SphereGrid
-from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, galaxy_map
+from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, diffuse_brightness, galaxy_map
 from lusee_bayes.sky.positive_skies import LogNormalSky, deviation_spectrum
-from lusee_bayes.sky.sky_source import EmbeddedTemplate, Template
+from lusee_bayes.sky.sky_source import galaxy_sky
 
 LMAX, MHZ = 5, 25.0
 LEVEL = np.array([0.5])
 SPECTRUM = deviation_spectrum(LMAX, 0.2, -2.0, LEVEL)
 
 
-@dataclass(frozen=True)
-class Waves(Template):
+def waves(theta, phi, lowest=1000.0):
     """A positive template that no low degree holds."""
-
-    lowest: float = 1000.0
-
-    def at(self, theta, phi):
-        return self.lowest * np.exp(1.0 + np.cos(3.0 * theta) + np.sin(theta) * np.sin(phi))
+    return lowest * np.exp(1.0 + np.cos(3.0 * theta) + np.sin(theta) * np.sin(phi))
 
 
 @pytest.fixture(scope="module")
 def sky() -> LogNormalSky:
-    return LogNormalSky.of(Waves(), SPECTRUM, MHZ, BRIGHT_SOURCES[:2], band=40)
+    return LogNormalSky.of(waves, SPECTRUM, MHZ, BRIGHT_SOURCES[:2], band=40)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +47,7 @@ def by_quadrature(sky: LogNormalSky, white: np.ndarray) -> np.ndarray:
     harmonics = synthesis_matrix(theta, phi, LMAX)
     ell = np.floor(np.sqrt(np.arange(n_modes(LMAX)))).astype(int)
     logarithm = harmonics @ (np.sqrt(np.asarray(sky.spectrum)[ell]) * white[: n_modes(LMAX)])
-    field = Waves().at(theta, phi) * np.exp(logarithm) * np.repeat(w, 130) * 2.0 * np.pi / 130
+    field = waves(theta, phi) * np.exp(logarithm) * np.repeat(w, 130) * 2.0 * np.pi / 130
     modes = harmonics.T @ field
     for source, eta in zip(BRIGHT_SOURCES[:2], white[n_modes(LMAX) :], strict=True):
         factor = stats.expon.ppf(stats.norm.cdf(eta))
@@ -108,23 +103,24 @@ def test_power_law_slopes_are_derivatives_of_the_root(sky):
 
 
 def test_refusals():
-    refuse("template must be positive", LogNormalSky.of, Waves(0.0), SPECTRUM, MHZ, band=20)
+    nothing = partial(waves, lowest=0.0)
+    refuse("template must be positive", LogNormalSky.of, nothing, SPECTRUM, MHZ, band=20)
     spectrum = np.where(np.arange(LMAX + 1) == 3, 0.0, SPECTRUM)
-    refuse("spectrum of the logarithm must", LogNormalSky.of, Waves(), spectrum, MHZ, band=20)
-    refuse("does not hold harmonics", LogNormalSky.of, Waves(), SPECTRUM, MHZ, band=LMAX - 1)
+    refuse("spectrum of the logarithm must", LogNormalSky.of, waves, spectrum, MHZ, band=20)
+    refuse("does not hold harmonics", LogNormalSky.of, waves, SPECTRUM, MHZ, band=LMAX - 1)
 
 
 def test_the_embedded_template_is_the_sky_without_its_random_part():
-    template = EmbeddedTemplate(25.0)
-    smooth = template.modes(8)
+    smooth = galaxy_sky(25.0, 8, seed=None, sources=()).modes
+    pixels = galaxy_map(25.0, 64, seed=None)
     # with it, synchrotron emission, most of the sky's, is multiplied by exp(g), of rms 5 %
-    ratio = galaxy_map(25.0, 64, seed=3) / template.pixels(64)
+    ratio = galaxy_map(25.0, 64, seed=3) / pixels
     assert abs(ratio.mean() - 1.0) < 0.01
     assert 0.02 < np.log(ratio).std() < 0.05
     # its values in directions, and on pixels, are those of the same sky, whose edges are sharp
     grid = SphereGrid.of(8, 128)
-    values = template.at(*grid.directions()).reshape(grid.shape)
+    values = diffuse_brightness(25.0, *grid.directions()).reshape(grid.shape)
     np.testing.assert_allclose(grid.analyse(values), smooth, atol=1e-3 * smooth[0])
-    np.testing.assert_allclose(map_to_modes(template.pixels(64), 8), smooth, rtol=1e-9)
-    at = template.at(*healpy.pix2ang(16, np.arange(healpy.nside2npix(16))))
-    np.testing.assert_allclose(at, template.pixels(16), rtol=1e-9)
+    np.testing.assert_allclose(map_to_modes(pixels, 8), smooth, rtol=1e-9)
+    at = diffuse_brightness(25.0, *healpy.pix2ang(16, np.arange(healpy.nside2npix(16))))
+    np.testing.assert_allclose(at, galaxy_map(25.0, 16, seed=None), rtol=1e-9)
