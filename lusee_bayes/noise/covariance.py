@@ -35,7 +35,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, PRNGKeyArray
+from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.arrays import Array, compiled, namespace
 from lusee_bayes.core.checks import (
@@ -534,6 +534,18 @@ class _OverLayout(Covariance):
         return self.mv(namespace(self).eye(self.size))
 
 
+def _masked(
+    band: Float[Array, "times widths products products"], layout: DataLayout
+) -> Float[Array, "times widths products products"]:
+    """The band with blocks before the first time, and missing samples, as of the unit matrix."""
+    n_times, widths, products = band.shape[:3]
+    time, back = np.arange(n_times)[:, None], np.arange(widths)[None]
+    row = layout.present.T
+    column = row[np.maximum(time - back, 0)] & (time >= back)[:, :, None]
+    unit = np.eye(products) * (back == 0)[:, :, None, None]
+    return namespace(band, layout).where(row[:, None, :, None] & column[:, :, None], band, unit)
+
+
 class TimeBlockCovariance(_OverLayout):
     """N with one block for each time.
 
@@ -558,8 +570,7 @@ class TimeBlockCovariance(_OverLayout):
         require_float64("the noise blocks", blocks)
         n = layout.n_products
         require_shape("the noise blocks", blocks, (layout.n_times, n, n))
-        if layout.index is not None:
-            blocks = namespace(blocks, layout).where(_both(layout), blocks, np.eye(n)[None])
+        blocks = _masked(blocks[:, None], layout)[:, 0]
         require_finite("the noise blocks", blocks)
         require_symmetric("the noise covariance of one time", blocks)
         self.blocks = blocks
@@ -594,16 +605,11 @@ class TimeBlockCovariance(_OverLayout):
         return TimeBlockCovariance(factor * self.blocks, self.layout)
 
 
-def _both(layout: DataLayout) -> Bool[Array, "times products products"]:
-    """Whether both of two products are there at a time."""
-    present = layout.present.T
-    return present[:, :, None] & present[:, None, :]
-
-
 @compiled
 def _inverse_blocks(noise: TimeBlockCovariance) -> Float[Array, "products products times"]:
-    xp = namespace(noise)
-    return xp.moveaxis(xp.where(_both(noise.layout), xp.linalg.inv(noise.blocks), 0.0), 0, 2)
+    xp, present = namespace(noise), noise.layout.present.T
+    both = present[:, :, None] & present[:, None, :]
+    return xp.moveaxis(xp.where(both, xp.linalg.inv(noise.blocks), 0.0), 0, 2)
 
 
 # rows of a block: measured at 16 products and a band of 43 times, whitening 5232 x 2304 on two
@@ -711,7 +717,7 @@ class TimeBandedCovariance(_OverLayout):
         require_float64(name, band)
         n = layout.n_products
         require_shape(name, band, (layout.n_times, None, n, n))
-        band = _mask(band, layout)
+        band = _masked(band, layout)
         require_finite(name, band)
         require_symmetric(f"{name} within one time", band[:, 0])
         self.band = band
@@ -783,20 +789,6 @@ class TimeBandedCovariance(_OverLayout):
 
     def scaled(self, factor):
         return TimeBandedCovariance(factor * self.band, self.layout, self.name)
-
-
-def _mask(band: Array, layout: DataLayout) -> Array:
-    """Set blocks before the first time, and missing samples, to those of the unit matrix."""
-    n_times, widths = band.shape[:2]
-    inside = np.arange(n_times)[:, None] >= np.arange(widths)[None]
-    if layout.index is None and inside.all():
-        return band
-    present = layout.present.T
-    earlier = np.maximum(np.arange(n_times)[:, None] - np.arange(widths)[None], 0)
-    both = present[:, None, :, None] & present[earlier][:, :, None, :]
-    band = jnp.where(both & jnp.asarray(inside)[:, :, None, None], band, 0.0)
-    unit = jnp.eye(layout.n_products)[None] * (~present)[:, :, None].astype(band.dtype)
-    return band.at[:, 0].add(unit)
 
 
 def _block_rows(band: Array) -> tuple[Array, Array]:
