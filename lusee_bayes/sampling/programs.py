@@ -167,12 +167,8 @@ def load_program(source: str | Path) -> Program:
     # compiled from the text that is hashed, never from a cache of an earlier one; dataclasses look
     # their module up by name
     sys.modules[module.__name__] = module
-    try:
+    with _blaming(f"the program '{path}'", "when it is loaded"):
         exec(compile(text, printable(str(path)), "exec", dont_inherit=True), module.__dict__)
-    except (Exception, SystemExit) as error:  # whatever a user's file may raise: not our failure
-        del sys.modules[module.__name__]
-        kind = type(error).__name__
-        raise InputError(f"the program '{path}' does not run: {kind}: {error}") from error
     model = getattr(module, "model", None)
     if not callable(model):
         raise InputError(
@@ -375,16 +371,12 @@ def _blaming(who: str, doing: str) -> Iterator[None]:
     """Whatever a user's program may raise: it is not our failure, and it is said in a sentence."""
     try:
         yield
-    except InputError:
-        raise
     except (Exception, SystemExit) as error:
         frames = traceback.extract_tb(error.__traceback__)
         own = [frame.lineno for frame in frames if f"'{frame.filename}'" in who]
         at = f" (line {own[-1]})" if own else ""
-        text = " ".join(str(error).split())
-        text = text if len(text) <= 300 else f"{text[:297]}..."
         kind = type(error).__name__
-        raise InputError(f"{who} fails {doing}{at}: {kind}: {text}") from error
+        raise InputError(f"{who} fails {doing}{at}: {kind}: {error}") from error
 
 
 def _require_site(name: str, site: dict[str, Any], latent: bool, who: str) -> None:

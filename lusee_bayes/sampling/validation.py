@@ -41,6 +41,7 @@ from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
+from lusee_bayes.judge.convergence import AGREE, PER_CHAIN
 from lusee_bayes.judge.levels import LEVELS
 from lusee_bayes.linear.linear_gaussian import LinearGaussian, Whitened
 from lusee_bayes.linear.posterior import Posterior
@@ -303,8 +304,6 @@ def ranked_of_sky(
     }
 
 
-MAX_RHAT = 1.01
-MIN_ESS_PER_CHAIN = 100
 MIN_BFMI = 0.3
 
 # simulated chains for the eigenvalues that chance allows; their extremes scatter little, so that a
@@ -426,11 +425,11 @@ def validate_draws(
     spread = NULL_MARGIN * null.std(0, ddof=1)
     low, high = null.mean(0)[0] - spread[0], null.mean(0)[-1] + spread[-1]
     total = NULL_MARGIN * float(null.mean(1).std(ddof=1))
-    ess_floor = float(MIN_ESS_PER_CHAIN * n_chains)
+    ess_floor = float(PER_CHAIN * n_chains)
     # R-hat^2 - 1 of m half chains is chi^2 with m - 1 degrees over ESS: the largest of many modes
     halves = 2 * n_chains
     chance = stats.chi2.isf(FALSE_ALARM / n_modes, halves - 1) / np.median(ess_square)
-    rhat_limit = max(MAX_RHAT, float(np.sqrt(1.0 + halves / (halves - 1) * chance)))
+    rhat_limit = max(AGREE, float(np.sqrt(1.0 + halves / (halves - 1) * chance)))
     checks = (
         Check("mean", _largest(mean_z), -limit, limit,
               "largest difference of a mode's means, in Monte Carlo errors"),

@@ -150,13 +150,13 @@ def test_no_such_program(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message", "more"),
     [
-        ("def model(:\n", "does not run", "line 1"),
-        ("import nowhere_to_be_found\n", "does not run", "nowhere_to_be_found"),
-        ("scale = 1 / 0\n", "does not run", "division by zero"),
-        ("raise RuntimeError('no device')\n", "does not run", "no device"),
-        ("open('/nonexistent/table.txt')\n", "does not run", "/nonexistent/table.txt"),
-        ("{}['missing key']\n", "does not run", "missing key"),
-        ("assert 1 > 2, 'not so'\n", "does not run", "not so"),
+        ("def model(:\n", "fails when it is loaded", "line 1"),
+        ("import nowhere_to_be_found\n", "fails when it is loaded", "nowhere_to_be_found"),
+        ("scale = 1 / 0\n", "fails when it is loaded", "division by zero"),
+        ("raise RuntimeError('no device')\n", "fails when it is loaded", "no device"),
+        ("open('/nonexistent/table.txt')\n", "fails when it is loaded", "/nonexistent/table.txt"),
+        ("{}['missing key']\n", "fails when it is loaded", "missing key"),
+        ("assert 1 > 2, 'not so'\n", "fails when it is loaded", "not so"),
         *(
             (text, "has no function 'model'", "def model(")
             for text in ("x = 1\n", "model = 3\n", "def Model(data=None):\n    pass\n")
@@ -457,7 +457,7 @@ def test_programs_without_a_sky_or_unknowns_are_refused(text, message, write, pi
 def test_arguments_are_given_by_name(argument, tmp_path):
     path = tmp_path / "bad.py"
     path.write_text(f"def model({argument}data=None):\n    pass\n")
-    refuse("does not run|by position, or as many as come", lb.load_program, path)
+    refuse("fails when it is loaded|by position, or as many as come", lb.load_program, path)
 
 
 def test_a_density_that_is_nan_names_the_program(tmp_path, capsys):
