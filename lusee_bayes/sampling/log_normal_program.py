@@ -309,13 +309,14 @@ def learn_spectrum(prior: LogNormalPrior, information: Information) -> LogNormal
     for _ in range(SPECTRUM_STEPS + 1):
         sky = sky.with_power_law(np.exp(theta[0]), theta[1])
         mode = find_mode(sky, information, start)
-        slope, fisher = _slope_and_fisher(mode)
+        slope, fisher, known = _evidence_about(mode)
         slope, fisher = slope - narrow * (theta - centre), fisher + np.diag(narrow)
         step = np.linalg.solve(fisher, slope)
         if np.sqrt(slope @ step) < SPECTRUM_SETTLED:
             return replace(mode, power_law=theta, covariance=np.linalg.inv(fisher))
         if np.abs(step).max() > NEAR:
-            step = _matched(mode, theta - centre, narrow)
+            power = mode.white[: sky.n_modes] ** 2
+            step = matching_step(power, known, sky.power_law_slopes(), theta - centre, narrow)
         # near by, the logarithm stays as it is: the data know it
         theta = theta + step
         ratio = sky.root() / sky.with_power_law(np.exp(theta[0]), theta[1]).root()
@@ -327,20 +328,13 @@ def learn_spectrum(prior: LogNormalPrior, information: Information) -> LogNormal
     )
 
 
-def _slope_and_fisher(mode: LogNormalMode) -> tuple[Pair, PairMatrix]:
+def _evidence_about(mode: LogNormalMode) -> tuple[Pair, PairMatrix, Unknowns]:
+    """Slope of the evidence, Fisher information, and 1 - (H^-1)_ii of every mode of the map."""
     sky, slopes = mode.sky, mode.sky.power_law_slopes()
     left = inverse_from_cholesky(mode.lower)[: sky.n_modes, : sky.n_modes]
     slope = slopes @ (mode.white[: sky.n_modes] ** 2 + np.diagonal(left) - 1.0)
     known = np.eye(sky.n_modes) - left
-    return slope, 2.0 * slopes @ (known**2 @ slopes.T)
-
-
-def _matched(mode: LogNormalMode, away: Pair, narrow: Pair) -> Pair:
-    """The step of :func:`.matching_step`, each mode for itself."""
-    sky = mode.sky
-    known = 1.0 - np.diagonal(inverse_from_cholesky(mode.lower))[: sky.n_modes]
-    power = mode.white[: sky.n_modes] ** 2
-    return matching_step(power, known, sky.power_law_slopes(), away, narrow)
+    return slope, 2.0 * slopes @ (known**2 @ slopes.T), np.diagonal(known)
 
 
 def coordinates_of(prior: LogNormalPrior, information: Information) -> Whitening:
