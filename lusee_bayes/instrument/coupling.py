@@ -28,6 +28,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
@@ -702,6 +703,29 @@ class Instrument(eqx.Module):
         """
         antennas = with_values(self.monopoles, values or {})
         return monopole_beams(self.frequency_mhz, self.lmax, antennas, nodes=self.nodes)
+
+    def derivative(self, name: str) -> ProductBeams:
+        """Compute the derivative of :meth:`beams` in a parameter, the others held.
+
+        Parameters
+        ----------
+        name : str
+            One of ``beams.PARAMETERS``.
+
+        Returns
+        -------
+        ProductBeams
+            In K per K and unit of the parameter.
+
+        Raises
+        ------
+        InputError
+            If there is no such parameter; the message names the nearest.
+        """
+        value = self.value(name)
+        one = (jnp.ones_like(value),)
+        _, slope = jax.jvp(lambda v: self.beams({name: v}).modes, (value,), one)
+        return ProductBeams(slope, self.frequency_mhz)
 
     def dense(self, values: Mapping[str, Float[Array, ""]]) -> Float[Array, "data modes"]:
         """Compute A as a matrix, of a :meth:`prepared` instrument.

@@ -42,7 +42,6 @@ from lusee_bayes.core.checks import (
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky
 from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.beams.monopoles import Monopoles, monopole_beams, parameter, with_values
 from lusee_bayes.instrument.coupling import Coupling
 from lusee_bayes.instrument.products import DataLayout, ports
 from lusee_bayes.noise.covariance import LowRankCovariance, TimeBandedCovariance
@@ -304,37 +303,6 @@ def difference(true: ProductBeams, model: ProductBeams) -> ProductBeams:
     """
     require_shape("the other beam's coefficients", true.modes, model.modes.shape)
     return ProductBeams(true.modes - model.modes, model.frequency_mhz)
-
-
-def derivative(name: str, frequency_mhz: float, lmax: int, monopoles: Monopoles) -> ProductBeams:
-    """Return the derivative of the beams in a parameter of the embedded antennas.
-
-    Parameters
-    ----------
-    name : str
-        One of ``beams.PARAMETERS``.
-    frequency_mhz : float
-    lmax : int
-    monopoles : Monopoles
-        Where to take the derivative.
-
-    Returns
-    -------
-    ProductBeams
-        In K per K and unit of the parameter.
-
-    Raises
-    ------
-    InputError
-        If the parameter is unknown.
-    """
-
-    def modes(value: Float[Array, ""]) -> Float[Array, "products modes"]:
-        return monopole_beams(frequency_mhz, lmax, with_values(monopoles, {name: value})).modes
-
-    value = parameter(name).where(monopoles)
-    _, slope = jax.jvp(modes, (value,), (jnp.ones_like(value),))
-    return ProductBeams(slope, float(frequency_mhz))
 
 
 def rms_difference(true: ProductBeams, model: ProductBeams) -> float:

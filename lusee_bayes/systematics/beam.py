@@ -202,10 +202,10 @@ class InstrumentParameters(BeamErrors):
 
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Add dA S dA^T for every parameter to N, dA = std times the derivative of A."""
-        known = self.instrument.frequency_mhz, self.instrument.lmax, self.instrument.monopoles
         for name, std in self.widths.items():
-            slope = std * instrument_errors.derivative(name, *known).modes
-            direction = self.instrument.coupling_of(ProductBeams(slope, known[0]))
+            slope = std * self.instrument.derivative(name).modes
+            beams = ProductBeams(slope, self.instrument.frequency_mhz)
+            direction = self.instrument.coupling_of(beams)
             model = BeamError(direction).marginalised(model)
         return model
 

@@ -16,7 +16,7 @@ from scipy.stats import norm, truncnorm
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import Rotation, n_modes, turn_about_z
 from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith
+from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith, with_values
 from lusee_bayes.instrument.coupling import CouplingMatrix, DenseCoupling, Instrument, as_coupling
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout, auto_indices, labels
@@ -294,6 +294,56 @@ def test_a_of_placed_antennas_is_that_of_antennas_built_so(instrument, pointing,
         others = placed | {name: instrument.value(name)}
         away = np.abs(np.asarray(instrument.dense(others)) - expected).max()
         assert away > 1e-4 * np.abs(expected).max(), (name, value)
+
+
+START = {
+    "length_m": 3.0,
+    "zenith_angle_deg": 75.0,
+    "height_m": 2.0,
+    "surface_permittivity": 3.7,
+    "deep_permittivity": 6.1,
+    "loss_tangent": 0.01,
+    "turntable_offset_deg": 10.0,
+}
+
+
+def antennas(**changes) -> Monopoles:
+    """Built from scratch with some parameters changed."""
+    p = START | changes
+    return Monopoles(
+        regolith=Regolith(p["surface_permittivity"], p["deep_permittivity"], p["loss_tangent"]),
+        length_m=p["length_m"],
+        zenith_angle_deg=p["zenith_angle_deg"],
+        height_m=p["height_m"],
+        turntable_offset_deg=p["turntable_offset_deg"],
+    )
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("parameter", START)
+def test_derivatives_are_those_of_finite_differences(pointing, layout, parameter):
+    """Central differences with a relative step of 1e-5.
+
+    The deep layers' echoes turn by some 20 radians per unit of permittivity: (20 h)^2 / 6 = 2e-7
+    of the slope, and rounding leaves eps / h = 2e-11 of the beams.
+    """
+    instrument = Instrument(antennas(), pointing, layout, FREQUENCY, LOW)
+    got = instrument.derivative(parameter)
+    assert got.frequency_mhz == FREQUENCY
+    step = 1e-5 * START[parameter]
+    up, down = (
+        lb.monopole_beams(FREQUENCY, LOW, antennas(**{parameter: START[parameter] + s})).modes
+        for s in (step, -step)
+    )
+    expected = (np.asarray(up) - np.asarray(down)) / (2.0 * step)
+    assert np.abs(expected).max() > 0
+    close(got.modes, expected, 1e-6)
+
+
+def test_unknown_parameters_name_the_nearest(instrument):
+    words = "unknown beam parameter 'lenght_m'; did you mean 'length_m'"
+    refuse(words, instrument.derivative, "lenght_m")
+    refuse(words, with_values, instrument.monopoles, {"lenght_m": 0.1})
 
 
 def test_a_that_was_not_prepared(instrument):
