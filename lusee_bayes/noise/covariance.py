@@ -1,8 +1,8 @@
 """N: what every kind of covariance of the noise answers, and the kinds.
 
-A :class:`Covariance` describes N by its product with a vector, its dense form and its diagonal.
-:meth:`Covariance.factor` does the expensive part once and returns a :class:`Factor`, a square root
-N = L L^T that whitens vectors (L^-1 x), colours them (L z) and solves with N.
+A :class:`Covariance` describes N by its dense form and its diagonal. :meth:`Covariance.factor` does
+the expensive part once and returns a :class:`Factor`, a square root N = L L^T that whitens vectors
+(L^-1 x), colours them (L z) and solves with N.
 
 A new structure is one file: implement the abstract methods here, and ``absorb`` for the sums that
 keep the structure. ``a + b`` tries whether either side can absorb the other.
@@ -99,10 +99,6 @@ class Covariance(Described, eqx.Module):
     @abstractmethod
     def size(self) -> int:
         """Number of data."""
-
-    @abstractmethod
-    def mv(self, x: Float[Array, "data *columns"]) -> Float[Array, "data *columns"]:
-        """Return N x, for a vector or for every column of a matrix."""
 
     @abstractmethod
     def diagonal(self) -> Float[Array, " data"]:
@@ -274,9 +270,6 @@ class DenseCovariance(Covariance):
     def size(self) -> int:
         return self.matrix.shape[0]
 
-    def mv(self, x):
-        return self.matrix @ x
-
     def diagonal(self):
         return jnp.diagonal(self.matrix)
 
@@ -347,9 +340,6 @@ class DiagonalCovariance(Covariance):
     def size(self) -> int:
         return self.variance.shape[0]
 
-    def mv(self, x):
-        return x * _down(self.variance, x)
-
     def diagonal(self):
         return self.variance
 
@@ -404,9 +394,6 @@ class LowRankCovariance(Covariance):
     def colour(self, z):
         return self.root @ z
 
-    def mv(self, x):
-        return self.root @ (self.root.T @ x)
-
     def diagonal(self):
         return (self.root**2).sum(1)
 
@@ -451,9 +438,6 @@ class LowRankUpdate(Covariance):
     @property
     def size(self) -> int:
         return self.base.size
-
-    def mv(self, x):
-        return self.base.mv(x) + self.update.mv(x)
 
     def diagonal(self):
         return self.base.diagonal() + self.update.diagonal()
@@ -530,9 +514,6 @@ class _OverLayout(Covariance):
     def size(self) -> int:
         return self.layout.size
 
-    def dense(self):
-        return self.mv(namespace(self).eye(self.size))
-
 
 def _masked(
     band: Float[Array, "times widths products products"], layout: DataLayout
@@ -576,8 +557,9 @@ class TimeBlockCovariance(_OverLayout):
         self.blocks = blocks
         self.layout = layout
 
-    def mv(self, x):
-        return self.layout.from_times(self.blocks @ self.layout.by_time(x), x.shape)
+    def dense(self):
+        unit = namespace(self).eye(self.size)
+        return self.layout.from_times(self.blocks @ self.layout.by_time(unit), unit.shape)
 
     def diagonal(self):
         return self.layout.gather(namespace(self).diagonal(self.blocks, axis1=1, axis2=2).T)
@@ -729,8 +711,9 @@ class TimeBandedCovariance(_OverLayout):
         """Largest distance in samples at which two times are coupled."""
         return self.band.shape[1] - 1
 
-    def mv(self, x):
-        grid = self.layout.by_time(x)
+    def dense(self):
+        unit = namespace(self).eye(self.size)
+        grid = self.layout.by_time(unit)
 
         def add(w, total):
             block = jax.lax.dynamic_index_in_dim(self.band, w, 1, keepdims=False)
@@ -739,7 +722,7 @@ class TimeBandedCovariance(_OverLayout):
             return total + earlier + jnp.where(w > 0, 1.0, 0.0) * later
 
         total = jax.lax.fori_loop(0, self.band.shape[1], add, jnp.zeros_like(grid))
-        return self.layout.from_times(total, x.shape)
+        return self.layout.from_times(total, unit.shape)
 
     def diagonal(self):
         return self.layout.gather(jnp.diagonal(self.band[:, 0], axis1=1, axis2=2).T)
