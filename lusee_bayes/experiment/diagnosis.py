@@ -233,9 +233,7 @@ class UnderAnySky:
     def of(cls, setup: Setup, data: Visibilities, model: LinearGaussian) -> UnderAnySky:
         """Under a prior that allows any sky, as bright as the data ask for."""
         prior = setup.prior if setup.family is None else setup.family.expected()
-        power = np.asarray(prior.variance())
-        if prior.white_mean is not None:
-            power = power + np.asarray(prior.colour(prior.white_mean)) ** 2
+        power = np.asarray(prior.variance() + prior.colour(prior.white_mean) ** 2)
         autos = auto_indices(setup.beam_source.n_ports)
         modelled = float(np.median(np.asarray(setup.signal)[autos]))
         brighter = np.nanmedian(np.asarray(data.grid())[autos]) / modelled

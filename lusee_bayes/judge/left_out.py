@@ -389,8 +389,7 @@ class LeftOut:
         """u = D (d - E[d] - F z), with z = Q^-1 F^T D (d - E[d])."""
         model, z = self._model, np.zeros(len(self._lower))
         rest = np.asarray(self._data.data) - (0.0 if model.offset is None else model.offset)
-        if model.prior.white_mean is not None:
-            rest = rest - model.coupling @ model.prior.colour(model.prior.white_mean)
+        rest = rest - model.coupling @ model.prior.colour(model.prior.white_mean)
         n, weighted = self._n_templates, weigh(self._weights, self._by_cell(rest[:, None]))
         for _ in range(1 + REFINEMENTS):
             step = (self._pull(weighted)[:, 0] - z)[:, None]

@@ -97,7 +97,7 @@ def widened(posterior: Posterior, factor: float) -> tuple[Posterior, float]:
         If Lambda_k cannot be factorised.
     """
     prior, lower = posterior.prior, np.tril(posterior.lower)
-    off = posterior.white_mean - (0.0 if prior.white_mean is None else prior.white_mean)
+    off = posterior.white_mean - prior.white_mean
     # with a basis, outside of its span the posterior is the prior
     inside = off if posterior.basis is None else posterior.basis.T @ off
     precision = times_lower(lower, lower, transpose=True)

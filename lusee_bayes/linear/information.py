@@ -271,8 +271,7 @@ class Information(Described, eqx.Module):
         moved : float
             The last step, in posterior standard deviations.
         """
-        start = prior.whiten(self.reference)
-        expected = np.zeros_like(start) if prior.white_mean is None else prior.white_mean
+        start, expected = prior.whiten(self.reference), prior.white_mean
         here, correction = self.recentred(prior.colour(start)), np.zeros_like(start)
         moved, before, count = np.inf, np.inf, 0
         while unfinished(moved, before, count, most):
@@ -309,9 +308,9 @@ def precision_root(matrix: ModesMatrix, prior: Prior) -> ModesMatrix:
     Raises
     ------
     InputError
-        If it is over pixels or has another size.
+        If it has another size.
     """
-    if not prior.invertible or prior.size != len(matrix):
+    if prior.size != len(matrix):
         raise InputError(
             f"information about {len(matrix)} modes needs a prior over the same modes, got "
             f"{type(prior).__name__} over {prior.size} unknowns"

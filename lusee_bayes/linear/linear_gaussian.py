@@ -332,9 +332,9 @@ def form_of(model: LinearGaussian, *, transformed: bool = False) -> type[Form]:
     type
         The cheapest of the forms that can be used.
     """
-    if model.n_data < model.prior.rank:
+    if model.n_data < model.prior.size:
         return InData
-    return InMap if transformed or not model.prior.invertible else FromInformation
+    return InMap if transformed else FromInformation
 
 
 class Form(eqx.Module):
@@ -499,9 +499,9 @@ class Whitened(Form):
         (data,) array
             White data, of which the model says N(0, 1 + W W^T).
         """
-        offset, mean = self.model.offset, self.model.prior.white_mean
+        offset = self.model.offset
         white = self.factor.whiten(data if offset is None else data - offset)
-        return white if mean is None else white - self.whitened @ mean
+        return white - self.whitened @ self.model.prior.white_mean
 
     def half(self) -> Float[Array, "rank data"]:
         """Compute H with (A S A^T + N)^-1 = L^-T (1 - H^T H) L^-1.
@@ -612,5 +612,4 @@ def _solve(solver: Whitened, data: DataVector) -> tuple[Array, Array, Array]:
         + white.shape[0] * np.log(2.0 * np.pi)
     )
     # u was that of the sky's deviation from the prior's mean
-    mean = solver.model.prior.white_mean
-    return u if mean is None else u + mean, log_evidence, moved
+    return u + solver.model.prior.white_mean, log_evidence, moved

@@ -137,7 +137,7 @@ class Posterior(Described, eqx.Module):
         (unknowns, white) array
             In K.
         """
-        return _times_root(self, namespace(self).eye(self.prior.rank)).T
+        return _times_root(self, namespace(self).eye(self.prior.size)).T
 
     def whiten(self, skies: Float[Array, "n unknowns"]) -> Float[Array, "n white"]:
         """Compute z = R^-1 (m - mean): standard normals, if the skies are draws of this posterior.
@@ -155,7 +155,7 @@ class Posterior(Described, eqx.Module):
         Raises
         ------
         InputError
-            If the prior is over pixels or has C_ell = 0: then R has no inverse.
+            If the prior has C_ell = 0: then R has no inverse.
         """
         self.prior.require_density()
         return _whiten(self, namespace(self).asarray(skies))
@@ -175,7 +175,7 @@ class Posterior(Described, eqx.Module):
         (unknowns,) or (n, unknowns) array
             One draw, or with ``n`` that many, in K.
         """
-        z = jax.random.normal(key, (1 if n is None else n, self.prior.rank), dtype=jnp.float64)
+        z = jax.random.normal(key, (1 if n is None else n, self.prior.size), dtype=jnp.float64)
         if namespace(self) is np:
             z = np.asarray(z)
         draws = self.mean[None] + _times_root(self, z)
@@ -209,8 +209,7 @@ class Posterior(Described, eqx.Module):
         () array
             In prior standard deviations, squared.
         """
-        expected = self.prior.white_mean
-        u = self.white_mean if expected is None else self.white_mean - expected
+        u = self.white_mean - self.prior.white_mean
         return namespace(self).asarray(u @ u)
 
     def rms_shift_from(self, other: Posterior) -> Float[Array, ""]:
@@ -273,7 +272,7 @@ def _rounding(posterior: Posterior, variance: Float[Array, " white"]) -> Float[A
 def _std(posterior: Posterior) -> tuple[Float[Array, " unknowns"], Float[Array, ""]]:
     """Standard deviations of m, and the :func:`_rounding` of those of u."""
     xp, basis = namespace(posterior), posterior.basis
-    eye = xp.eye(posterior.prior.rank)
+    eye = xp.eye(posterior.prior.size)
     # the rows of H, where H^T H is the covariance of u
     rows = solve_lower(posterior.lower, eye if basis is None else basis.T, transpose=False)
     if basis is not None:
@@ -299,7 +298,7 @@ def _std_of(posterior: Posterior, directions: Float[Array, "n unknowns"]) -> Flo
 @compiled
 def _covariance(posterior: Posterior) -> tuple[Float[Array, "unknowns unknowns"], Float[Array, ""]]:
     """C, and the :func:`_rounding` of its diagonal."""
-    xp, rank = namespace(posterior), posterior.prior.rank
+    xp, rank = namespace(posterior), posterior.prior.size
     if posterior.basis is None:
         white = inverse_from_cholesky(posterior.lower)
     else:

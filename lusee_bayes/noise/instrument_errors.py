@@ -288,7 +288,7 @@ def beam_error_noise(direction: Coupling, prior: Prior) -> LowRankCovariance:
         In K^2.
     """
     columns = prior.colour_columns(direction.dense())
-    if prior.white_mean is not None:
+    if prior.mean is not None:
         columns = jnp.concatenate([columns, (columns @ prior.white_mean)[:, None]], axis=1)
     return LowRankCovariance(columns, "the beam-error covariance")
 

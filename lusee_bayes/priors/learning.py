@@ -320,10 +320,7 @@ def _slope(family: PriorFamily, here: _Point, rng: Generator, n: int) -> tuple[P
     unknown = np.asarray(inverse_from_cholesky(posterior.lower))
     known = np.eye(len(unknown)) - unknown
     expected = prior.whiten_columns(prior.whiten_columns(known).T)
-    deviation = posterior.white_mean
-    if prior.white_mean is not None:
-        deviation = deviation - prior.white_mean
-    pull = prior.whiten_columns(deviation[None]).T
+    pull = prior.whiten_columns((posterior.white_mean - prior.white_mean)[None]).T
     found = here.member.forms(pull)[:, 0] - here.member.traces(expected)
     root = _root(known)
     drawn = prior.whiten_columns((root @ rng.standard_normal((len(root), n))).T).T

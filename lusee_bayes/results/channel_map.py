@@ -319,10 +319,11 @@ class Conditioned:
         """The residuals, with the verdict in words."""
         data = self.experiment.data
         prior = self.found.model.prior
-        usual = 0.0 if prior.white_mean is None else prior.colour(prior.white_mean)
         expected = prior.variance() - np.diagonal(self.covariance)
         left, before = self.without_monopole
-        strong = strengths(self.posterior.mean - usual, expected, before - left)
+        strong = strengths(
+            self.posterior.mean - prior.colour(prior.white_mean), expected, before - left
+        )
         fit = found.fit(strengths_in_words(strong))
 
         def on_grid(values: np.ndarray) -> np.ndarray:

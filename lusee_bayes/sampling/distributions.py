@@ -61,8 +61,7 @@ class SkyPrior(dist.Distribution):
     def log_prob(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
         """Compute ln p(m) of one sky, or of every row of an array of skies."""
         u = self.prior.whiten(value)
-        if self.prior.white_mean is not None:
-            u = u - self.prior.white_mean.reshape(*(1,) * (value.ndim - 1), -1)
+        u = u - self.prior.white_mean.reshape(*(1,) * (value.ndim - 1), -1)
         return -0.5 * (u**2).sum(-1) - self.prior.log_det() - self.prior.size * HALF_LOG_2PI
 
 

@@ -251,7 +251,7 @@ def calibrate_sky(
     solver = posterior.factorise()
     size, rng = solver.model.prior.size, np.random.default_rng(seed)
     modes = np.unique(np.linspace(0, size - 1, min(N_RANKED, size)).astype(int))
-    directions = rng.standard_normal((N_RANKED, solver.model.prior.rank))
+    directions = rng.standard_normal((N_RANKED, size))
     ranks = calibrate(
         truth.sample,
         eqx.Partial(_sky_draws, solver),

@@ -5,15 +5,15 @@ u = G^-1 m ~ N(G^-1 mu, 1). S itself is never inverted, so a mode without varian
 known to be zero, not an error.
 
 Kinds: correlated coefficients, S = G G^T as a matrix; independent unknowns, S = diag(root^2); an
-isotropic Gaussian sky in real harmonic coefficients, S = diag(C_ell), or in HEALPix pixels,
-S = Y diag(C_ell) Y^T. C_ell can be read from a text file, a mean sky from a FITS map.
+isotropic Gaussian sky in real harmonic coefficients, S = diag(C_ell). C_ell can be read from a
+text file, a mean sky from a FITS map.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from pathlib import Path
-from typing import ClassVar, NoReturn
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -24,7 +24,7 @@ from jaxtyping import Float, PRNGKeyArray
 from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.checks import Described, extent, is_traced, require_array, require_whole
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import LARGEST_LMAX, n_modes, per_mode, pixel_matrix
+from lusee_bayes.core.harmonics import LARGEST_LMAX, n_modes, per_mode
 from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.linalg import (
     checked_cholesky,
@@ -46,29 +46,21 @@ class Prior(Described, eqx.Module):
 
     Attributes
     ----------
-    invertible : bool
-        Whether m tells u, but for unknowns without variance: :meth:`whiten` needs it.
     independent : bool
         Whether S is diagonal; it may save work.
     """
 
-    invertible: ClassVar[bool] = True
     independent: ClassVar[bool] = False
-    # kinds that have one make it a field
+    # kinds that have one make it a field; None is zero
     mean: ClassVar[None] = None
 
     def description(self) -> tuple[str, ...]:
-        return (f"{self.size} unknowns of {self.rank} independent normals",)
+        return (f"{self.size} unknowns",)
 
     @property
     @abstractmethod
     def size(self) -> int:
         """Number of unknowns in m."""
-
-    @property
-    def rank(self) -> int:
-        """Number of independent normals behind them."""
-        return self.size
 
     @abstractmethod
     def colour(self, u: Float[Array, "*batch white"]) -> Float[Array, "*batch unknowns"]:
@@ -80,17 +72,11 @@ class Prior(Described, eqx.Module):
 
     @abstractmethod
     def whiten(self, m: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch white"]:
-        """Compute G^-1 m, on the last axis; zero for unknowns without variance.
-
-        Raises
-        ------
-        InputError
-            If G has no inverse (:attr:`invertible`).
-        """
+        """Compute G^-1 m, on the last axis; zero for unknowns without variance."""
 
     @abstractmethod
     def whiten_columns(self, a: Float[Array, "rows white"]) -> Float[Array, "rows unknowns"]:
-        """Compute A G^-1, the inverse of :meth:`colour_columns`; as :meth:`whiten`."""
+        """Compute A G^-1, the inverse of :meth:`colour_columns`."""
 
     @abstractmethod
     def sandwich(self, matrix: Float[Array, "unknowns unknowns"]) -> Float[Array, "white white"]:
@@ -132,9 +118,9 @@ class Prior(Described, eqx.Module):
         """Raise an InputError if S is singular, so that m has no density."""
 
     @property
-    def white_mean(self) -> Float[Array, " white"] | None:
-        """Mean of u; None for zero."""
-        return None if self.mean is None else self.whiten(self.mean)
+    def white_mean(self) -> Float[Array, " white"]:
+        """Mean of u."""
+        return namespace(self).zeros(self.size) if self.mean is None else self.whiten(self.mean)
 
     def sample(self, key: PRNGKeyArray, n: int | None = None) -> Float[Array, "..."]:
         """Draw skies from the prior.
@@ -151,11 +137,9 @@ class Prior(Described, eqx.Module):
         (unknowns,) or (n, unknowns) array
             In K.
         """
-        shape = (self.rank,) if n is None else (n, self.rank)
+        shape = (self.size,) if n is None else (n, self.size)
         u = jax.random.normal(key, shape, dtype=jnp.float64)
-        if self.white_mean is not None:
-            u = u + self.white_mean.reshape(*(1,) * (u.ndim - 1), -1)
-        return self.colour(u)
+        return self.colour(u + self.white_mean.reshape(*(1,) * (u.ndim - 1), -1))
 
 
 # largest difference of S_ij and S_ji, in prior standard deviations of both
@@ -465,106 +449,6 @@ class HarmonicPrior(DiagonalPrior):
             raise InputError(
                 f"the prior spectrum is zero at ell = {ell} and has no density; drop that ell"
             )
-
-
-class PixelPrior(Prior):
-    """The same isotropic sky in HEALPix RING pixels: m = Y a, S = Y diag(C_ell) Y^T.
-
-    S has rank (lmax + 1)^2 at most. Use it with :meth:`coupling`, which turns a harmonic A into
-    one that acts on pixels.
-
-    Parameters
-    ----------
-    spectrum : (ells,) array
-        C_ell in K^2 for ell = 0..lmax.
-    nside : int
-        NSIDE of the pixels.
-
-    Attributes
-    ----------
-    spectrum : (ells,) array
-        C_ell in K^2.
-    synthesis : (pixels, modes) array
-        Y.
-
-    Raises
-    ------
-    InputError
-        If the pixels are fewer than the modes, or the spectrum cannot be one.
-    """
-
-    invertible: ClassVar[bool] = False
-
-    spectrum: Float[Array, " ells"]
-    synthesis: Float[Array, "pixels modes"]
-
-    def __init__(self, spectrum: Float[Array, " ells"], nside: int):
-        require_spectrum(spectrum)
-        lmax = spectrum.shape[0] - 1
-        if 12 * nside**2 < n_modes(lmax):
-            raise InputError(
-                f"NSIDE {nside} has {12 * nside**2} pixels, too few for the {n_modes(lmax)} modes "
-                f"of lmax = {lmax}; raise NSIDE or lower lmax"
-            )
-        self.spectrum = spectrum
-        self.synthesis = jnp.asarray(pixel_matrix(nside, lmax))
-
-    @property
-    def size(self) -> int:
-        return self.synthesis.shape[0]
-
-    @property
-    def rank(self) -> int:
-        return self.synthesis.shape[1]
-
-    def colour(self, u):
-        return HarmonicPrior(self.spectrum).colour(u) @ self.synthesis.T
-
-    def colour_columns(self, a):
-        return HarmonicPrior(self.spectrum).colour_columns(a @ self.synthesis)
-
-    def whiten(self, m):
-        self._refuse()
-
-    def whiten_columns(self, a):
-        self._refuse()
-
-    def sandwich(self, matrix):
-        return self.colour_columns(self.colour_columns(matrix).T)
-
-    def widened(self, factor):
-        return eqx.tree_at(lambda prior: prior.spectrum, self, self.spectrum * factor**2)
-
-    def variance(self):
-        return self.synthesis**2 @ per_mode(self.spectrum)
-
-    def covariance(self):
-        root = self.colour(jnp.eye(self.rank))
-        return root.T @ root
-
-    def log_det(self):
-        self.require_density()
-
-    def require_density(self) -> None:
-        self._refuse()
-
-    def _refuse(self) -> NoReturn:
-        raise InputError(
-            "a prior over pixels is singular: it has no density, and pixels do not tell their "
-            "coefficients; use a prior over harmonic coefficients"
-        )
-
-    def coupling(self, harmonic: Float[Array, "data modes"]) -> Float[Array, "data pixels"]:
-        """Turn A into one that acts on pixels.
-
-        A_pix = A Y^+, so that A_pix Y a = A a for every band-limited sky.
-
-        Parameters
-        ----------
-        harmonic : (data, modes) array
-            A.
-        """
-        return harmonic @ jnp.asarray(np.linalg.pinv(np.asarray(self.synthesis)))
 
 
 SPECTRUM = Layout(

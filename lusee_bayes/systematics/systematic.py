@@ -437,9 +437,8 @@ class Systematic(eqx.Module):
         LinearGaussian
             The model averaged over its prior.
         """
-        prior = model.prior
-        mean = prior.white_mean if prior.white_mean is not None else np.zeros(prior.rank)
-        return Expanded.about(self, model, prior.colour(mean)).marginalised(model)
+        sky = model.prior.colour(model.prior.white_mean)
+        return Expanded.about(self, model, sky).marginalised(model)
 
     def sampled(self, model: LinearGaussian) -> LinearGaussian:
         """Sample its unknowns; call this inside a NumPyro program.

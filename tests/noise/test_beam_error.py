@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from assertions import close, refuse
 from reference import real_harmonics
+from reference_linear import random_covariance
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.beams.fields import ProductBeams
@@ -16,7 +17,7 @@ from lusee_bayes.noise.instrument_errors import (
     difference,
     rms_difference,
 )
-from lusee_bayes.sky.prior import PixelPrior
+from lusee_bayes.sky.prior import DensePrior
 
 LMAX, FREQUENCY = 4, 25.0
 ANTENNAS = Monopoles(
@@ -56,11 +57,12 @@ def test_the_term_is_da_s_da(beams, shifted):
     atol = 1e-13 * np.abs(expected).max()
     np.testing.assert_allclose(got.dense(), expected, rtol=0, atol=atol)
     np.testing.assert_allclose(got.diagonal(), np.diag(expected), rtol=0, atol=atol)
-    # a prior that is not diagonal, whose unknowns are pixels of the same skies
-    prior = PixelPrior(jnp.asarray(spectrum), 2)
-    on_pixels = prior.coupling(direction.dense())
-    full = np.asarray(on_pixels) @ np.asarray(prior.covariance()) @ np.asarray(on_pixels).T
-    close(full, expected, 1e-11)
+    # a prior that correlates modes, about a mean sky
+    root = np.sqrt(per_mode)
+    s = root[:, None] * random_covariance(np.random.default_rng(1), len(root)) * root
+    got = beam_error_noise(direction, DensePrior.of_covariance(s, root))
+    seen = error @ root
+    close(got.dense(), error @ s @ error.T + np.outer(seen, seen), 1e-11)
 
 
 def test_rms_difference_is_that_over_directions(beams, shifted):

@@ -23,7 +23,7 @@ from lusee_bayes.linear.linear_gaussian import FromInformation, InData, InMap
 from lusee_bayes.noise.covariance import DenseCovariance
 from lusee_bayes.sampling.hmc import whitened
 from lusee_bayes.sampling.programs import numpyro_promotion
-from lusee_bayes.sky.prior import DensePrior, PixelPrior
+from lusee_bayes.sky.prior import DensePrior
 
 LMAX = 2
 N_DATA = 30
@@ -80,7 +80,6 @@ def test_batches_and_draws(gaussian):
 def test_priors_without_density_are_refused():
     spectrum = jnp.asarray([1.0, 0.0])
     refuse("zero at ell = 1", lb.SkyPrior, lb.HarmonicPrior(spectrum))
-    refuse("over pixels is singular: it has no density", lb.SkyPrior, PixelPrior(spectrum, 1))
 
 
 def test_handlers_and_predictive(gaussian):
@@ -157,11 +156,10 @@ def test_the_log_determinant_is_that_of_the_root(gaussian, n_data, form):
 
 
 def test_a_prior_without_density_has_no_white_coordinates():
-    spectrum = jnp.asarray([1.0, 0.0])
-    for prior in (lb.HarmonicPrior(spectrum), PixelPrior(jnp.asarray([1.0, 0.5]), 1)):
-        a = jnp.asarray(np.random.default_rng(0).standard_normal((3, prior.size)))
-        model = lb.LinearGaussian(a, prior, lb.DiagonalCovariance(jnp.ones(3)))
-        refuse("has no density", lb.Whitening.of, model.condition(jnp.ones(3)).posterior)
+    prior = lb.HarmonicPrior(jnp.asarray([1.0, 0.0]))
+    a = jnp.asarray(np.random.default_rng(0).standard_normal((3, prior.size)))
+    model = lb.LinearGaussian(a, prior, lb.DiagonalCovariance(jnp.ones(3)))
+    refuse("has no density", lb.Whitening.of, model.condition(jnp.ones(3)).posterior)
 
 
 def test_the_density_of_z_is_the_programs_own_times_the_determinant(gaussian, case, z):

@@ -16,7 +16,6 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.sky import galaxy
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
-from lusee_bayes.sky.prior import PixelPrior
 
 NSIDE = 64
 
@@ -315,9 +314,8 @@ def test_bad_input_is_named(arguments, word):
         lambda n: galaxy.galaxy_map(25.0, nside=n),
         lambda n: lb.monopole_beams(25.0, n),
         lambda n: modes_to_map(np.zeros(16), n),
-        lambda n: PixelPrior(np.ones(4), n),
     ],
-    ids=["sky", "map", "beams", "synthesis", "prior"],
+    ids=["sky", "map", "beams", "synthesis"],
 )
 def test_sizes_that_would_end_the_process_are_refused(call, value):
     """healpy's C code aborts for some of them."""

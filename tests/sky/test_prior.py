@@ -1,4 +1,4 @@
-"""Priors on the sky: S in coefficients and in pixels, priors with a mean, families of priors."""
+"""Priors on the sky: S in coefficients, priors with a mean, families of priors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from scipy.special import eval_legendre
 from scipy.stats import multivariate_normal
 
 import lusee_bayes as lb
-from lusee_bayes.core.harmonics import n_modes, per_mode, synthesis_matrix
+from lusee_bayes.core.harmonics import n_modes, per_mode, pixel_matrix, synthesis_matrix
 from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.experiment.model import base_model
 from lusee_bayes.instrument.coupling import DenseCoupling
@@ -25,7 +25,7 @@ from lusee_bayes.linear.linear_gaussian import FromInformation, InData, InMap
 from lusee_bayes.noise.instrument_errors import beam_error_noise
 from lusee_bayes.priors.families import Hyperprior, IsotropicFamily, PriorFamily
 from lusee_bayes.priors.local_scales import embedded_local_scales, windows
-from lusee_bayes.sky.prior import DensePrior, IndependentPrior, PixelPrior
+from lusee_bayes.sky.prior import DensePrior, IndependentPrior
 from lusee_bayes.testing.contracts import check_prior
 
 SPECTRUM = np.array([4.0, 1.0, 0.0, 0.25])  # nothing at ell = 2
@@ -48,11 +48,6 @@ def harmonic():
     return lb.HarmonicPrior(jnp.asarray(SPECTRUM))
 
 
-@pytest.fixture(scope="module")
-def pixel():
-    return PixelPrior(jnp.asarray(SPECTRUM), NSIDE)
-
-
 def dense_covariance() -> np.ndarray:
     return random_covariance(np.random.default_rng(4), 16, scale=3.0)
 
@@ -67,7 +62,6 @@ KINDS = {
         HOLES,
     ),
     "independent": lambda: (IndependentPrior(jnp.asarray(ROOT)), np.diag(ROOT**2)),
-    "pixels": lambda: (PixelPrior(jnp.asarray(SPECTRUM), NSIDE), pixel_covariance()),
     "dense about a mean": lambda: (
         DensePrior.of_covariance(jnp.asarray(dense_covariance()), jnp.asarray(MEAN)),
         dense_covariance(),
@@ -89,7 +83,7 @@ def test_the_contract_notices_a_wrong_prior():
     class Uncentred(DensePrior):
         @property
         def white_mean(self):
-            return None if self.mean is None else self.mean
+            return self.mean
 
     prior = DensePrior.of_covariance(dense_covariance(), MEAN)
     for wrong in (Transposed, Uncentred):
@@ -110,54 +104,23 @@ def test_covariances_that_cannot_be_are_refused():
     refuse("the prior covariance holds NaN", DensePrior.of_covariance, np.full((4, 4), np.nan))
 
 
-@pytest.mark.parametrize("build", [lb.HarmonicPrior, lambda s: PixelPrior(s, NSIDE)])
-def test_bad_spectra_are_refused(build):
+def test_bad_spectra_are_refused():
+    build = lb.HarmonicPrior
     refuse(r"negative at ell = 2: C_ell = -0\.5", build, jnp.array([1.0, 1.0, -0.5, -1.0]))
     refuse(r"prior spectrum holds NaN .*\(1,\)", build, jnp.array([1.0, jnp.nan]))
     refuse("spectrum must be a float64 array.*float32", build, jnp.ones(3, dtype=jnp.float32))
 
 
-def test_too_few_pixels_are_refused():
-    words = "NSIDE 1 has 12 pixels, too few for the 16 modes of lmax"
-    refuse(words, PixelPrior, jnp.asarray(SPECTRUM), 1)
-
-
-def test_pixel_coupling_sees_the_same_sky(pixel):
-    rng = np.random.default_rng(2)
-    a, sky = rng.normal(size=(9, 16)), rng.normal(size=16)
-    on_pixels = pixel.coupling(jnp.asarray(a))
-    assert on_pixels.shape == (9, 48)
-    # healpy synthesises the map; A_pix on it must give A on the coefficients
-    alm = np.zeros(hp.Alm.getsize(LMAX), dtype=complex)
-    for ell in range(LMAX + 1):
-        centre = ell * (ell + 1)
-        alm[hp.Alm.getidx(LMAX, ell, 0)] = sky[centre]
-        for m in range(1, ell + 1):
-            value = (sky[centre + m] + 1j * sky[centre - m]) / np.sqrt(2)
-            alm[hp.Alm.getidx(LMAX, ell, m)] = value
-    pixels = hp.alm2map(alm, NSIDE, lmax=LMAX)
-    # 48 terms of order one, and Y^+ is of condition number below 2
-    np.testing.assert_allclose(np.asarray(on_pixels) @ pixels, a @ sky, atol=1e-12)
-
-
-def test_posterior_in_pixels_is_the_synthesised_harmonic_one(pixel, harmonic):
-    n_data, rng = 24, np.random.default_rng(3)
-    a, d = rng.normal(size=(n_data, 16)), jnp.asarray(rng.normal(size=n_data))
-    variance = rng.uniform(0.5, 2.0, n_data)
+def test_pixels_of_an_isotropic_sky_are_those_of_the_addition_theorem(harmonic):
+    rng, y = np.random.default_rng(3), pixel_matrix(NSIDE, LMAX)
+    np.testing.assert_allclose(y * PER_MODE @ y.T, pixel_covariance(), atol=1e-14)
+    a, d, variance = rng.normal(size=(24, 16)), rng.normal(size=24), rng.uniform(0.5, 2.0, 24)
     noise = lb.DiagonalCovariance(jnp.asarray(variance))
-    on_coefficients = lb.LinearGaussian(jnp.asarray(a), harmonic, noise).condition(d).posterior
-    a_pixels = pixel.coupling(jnp.asarray(a))
-    on_pixels = lb.LinearGaussian(a_pixels, pixel, noise).condition(d).posterior
-    y = np.asarray(pixel.synthesis)
-    # numbers of order one through Y and Y^+ and a posterior of condition number below 1e3
-    np.testing.assert_allclose(on_pixels.mean, y @ np.asarray(on_coefficients.mean), atol=1e-12)
-    expected = y @ np.asarray(on_coefficients.covariance()) @ y.T
-    np.testing.assert_allclose(on_pixels.covariance(), expected, atol=1e-12)
-    assert float(on_pixels.log_evidence) == pytest.approx(float(on_coefficients.log_evidence))
-    naive = posterior(a_pixels, pixel_covariance(), np.diag(variance), d)
-    np.testing.assert_allclose(on_pixels.mean, naive.mean, atol=1e-12)
-    np.testing.assert_allclose(on_pixels.std(), naive.std, rtol=1e-11)
-    np.testing.assert_allclose(on_coefficients.std_of(pixel.synthesis), naive.std, rtol=1e-11)
+    found = lb.LinearGaussian(jnp.asarray(a), harmonic, noise).condition(jnp.asarray(d)).posterior
+    # A Y^+ sees a sky of pixels; numbers of order one, and a posterior of condition below 1e3
+    naive = posterior(a @ np.linalg.pinv(y), pixel_covariance(), np.diag(variance), d)
+    np.testing.assert_allclose(y @ np.asarray(found.mean), naive.mean, atol=1e-12)
+    np.testing.assert_allclose(found.std_of(y), naive.std, rtol=1e-11)
 
 
 def test_a_prior_can_be_built_inside_jit_from_known_numbers():
