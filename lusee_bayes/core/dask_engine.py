@@ -29,16 +29,8 @@ import dask
 import distributed
 from distributed.scheduler import NoWorkerError
 
+from lusee_bayes.core import engine
 from lusee_bayes.core.arrays import use_compilation_cache
-from lusee_bayes.core.engine import (
-    Demand,
-    Engine,
-    Tasks,
-    carry_out,
-    merged_as_tree,
-    processors,
-    threads,
-)
 from lusee_bayes.core.errors import InputError, WorkersLost
 from lusee_bayes.core.files import scratch_folder
 from lusee_bayes.core.progress import Stages, gigabytes, memory_limit
@@ -56,7 +48,7 @@ ANSWER_S = 10.0
 _reading = Lock()
 
 
-class DaskEngine(Engine):
+class DaskEngine(engine.Engine):
     """Carries tasks out on the workers of a Dask cluster.
 
     The workers have this package and share a disk with this process: tasks write into the run's
@@ -70,7 +62,7 @@ class DaskEngine(Engine):
         What the tasks take; workers whose memory would not suffice are refused.
     """
 
-    def __init__(self, client: distributed.Client, demand: Demand | None = None):
+    def __init__(self, client: distributed.Client, demand: engine.Demand | None = None):
         self.client = client
         self._demand = demand
         self._folder: Path | None = None
@@ -84,7 +76,7 @@ class DaskEngine(Engine):
             if answer is not None:
                 raise InputError(f"worker {worker}: {answer}")
 
-    def each(self, tasks: Tasks[T, R], stages: Stages, stage: str) -> list[R]:
+    def each(self, tasks: engine.Tasks[T, R], stages: Stages, stage: str) -> list[R]:
         found: list[Any] = [None] * len(tasks.items)
         with self._submitted(tasks, None, stages, stage) as (_, futures, numbers):
             for future in self._finished(futures, numbers, tasks.names, stages, stage):
@@ -92,12 +84,12 @@ class DaskEngine(Engine):
         return found
 
     def reduced(
-        self, tasks: Tasks[T, R], merge: Callable[[R, R], R], stages: Stages, stage: str
+        self, tasks: engine.Tasks[T, R], merge: Callable[[R, R], R], stages: Stages, stage: str
     ) -> R:
         with self._submitted(tasks, merge, stages, stage) as (job, futures, numbers):
             # before other tasks, so that few parts wait
             merged = partial(self._submit, run_merge, job, priority=1)
-            total = merged_as_tree(iter(futures), len(futures), merged)
+            total = engine.merged_as_tree(iter(futures), len(futures), merged)
             # what the tasks give is left with the workers
             for future in self._finished(futures, numbers, tasks.names, stages, stage):
                 if future.status != "finished":
@@ -128,7 +120,11 @@ class DaskEngine(Engine):
 
     @contextmanager
     def _submitted(
-        self, tasks: Tasks[T, R], merge: Callable[[R, R], R] | None, stages: Stages, stage: str
+        self,
+        tasks: engine.Tasks[T, R],
+        merge: Callable[[R, R], R] | None,
+        stages: Stages,
+        stage: str,
     ) -> Iterator[tuple[Path, list[distributed.Future], dict[str, int]]]:
         """Give all tasks to the workers, and say in a sentence which of them end.
 
@@ -176,7 +172,7 @@ class DaskEngine(Engine):
 def run_task(job: Path, number: int) -> Any:
     """Call the function of a job with one of its items."""
     function, items, _ = read_job(job)
-    return carry_out(function, items[number])
+    return engine.carry_out(function, items[number])
 
 
 def run_merge(job: Path, one: Any, other: Any) -> Any:
@@ -210,7 +206,7 @@ def code_versions() -> str:
 
 
 def refusal_of(
-    wanted: str, folder: Path, demand: Demand | None, dask_worker: distributed.Worker
+    wanted: str, folder: Path, demand: engine.Demand | None, dask_worker: distributed.Worker
 ) -> str | None:
     """Why a worker cannot do what a command asks for, in one sentence; None if it can.
 
@@ -242,7 +238,7 @@ def refusal_of(
 
 
 @contextmanager
-def own_workers(n: int, demand: Demand) -> Iterator[distributed.LocalCluster]:
+def own_workers(n: int, demand: engine.Demand) -> Iterator[distributed.LocalCluster]:
     """A cluster of this machine alone, whose processors and memory its workers share.
 
     Raises
@@ -250,7 +246,7 @@ def own_workers(n: int, demand: Demand) -> Iterator[distributed.LocalCluster]:
     InputError
         If they do not fit into the memory.
     """
-    side_by_side = min(demand.side_by_side, max(1, processors() // n))
+    side_by_side = min(demand.side_by_side, max(1, engine.processors() // n))
     needed = n * demand.process_bytes(side_by_side)
     if needed > memory_limit():
         raise InputError(
@@ -262,7 +258,7 @@ def own_workers(n: int, demand: Demand) -> Iterator[distributed.LocalCluster]:
         # size from which every array is new memory that the system clears: a third more time for a
         # channel; this is the largest size
         f"{ENVIRONMENT}.MALLOC_MMAP_THRESHOLD_": 32 << 20,
-        f"{ENVIRONMENT}.OPENBLAS_NUM_THREADS": max(1, processors() // (n * side_by_side)),
+        f"{ENVIRONMENT}.OPENBLAS_NUM_THREADS": max(1, engine.processors() // (n * side_by_side)),
         # no worker has tasks that wait for others
         "distributed.scheduler.worker-saturation": 1.0,
     }
@@ -285,7 +281,7 @@ def own_workers(n: int, demand: Demand) -> Iterator[distributed.LocalCluster]:
 
 
 @contextmanager
-def connected(place: str | distributed.LocalCluster, demand: Demand) -> Iterator[DaskEngine]:
+def connected(place: str | distributed.LocalCluster, demand: engine.Demand) -> Iterator[DaskEngine]:
     """The engine of a cluster, which is connected to during the block.
 
     Parameters
@@ -318,7 +314,7 @@ def _require_answer(address: str) -> None:
 
     try:
         # in a thread: this one may have a loop that runs, as in a notebook
-        with threads(1) as pool:
+        with engine.threads(1) as pool:
             pool.submit(asyncio.run, ask()).result()
     except (OSError, ValueError, TypeError, MemoryError) as error:
         # TypeError: TLS without certificates; MemoryError: Dask reads the length of a message from

@@ -11,17 +11,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from lusee_bayes.core import harmonics
 from lusee_bayes.core.arrays import Array, as_complex, namespace
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import (
-    SQRT2,
-    azimuth_functions,
-    lmax_of,
-    mode_numbers,
-    n_modes,
-    order_products,
-)
 from lusee_bayes.core.lazy import special
 from lusee_bayes.core.linalg import mirrored
 
@@ -72,7 +65,7 @@ class SphereGrid(eqx.Module):
         # ells, orders, rings
         table = special.sph_legendre_p_all(lmax, lmax, theta)[0][:, : lmax + 1]
         table = np.ascontiguousarray(table.transpose(1, 2, 0))
-        table[1:] *= SQRT2
+        table[1:] *= harmonics.SQRT2
         return cls(theta, weights * (2.0 * np.pi / n_phi), table, n_phi)
 
     @property
@@ -103,7 +96,7 @@ class SphereGrid(eqx.Module):
             For coefficients of another lmax.
         """
         batch = modes.shape[:-1]
-        require_shape("the coefficients", modes, (*batch, n_modes(self.lmax)))
+        require_shape("the coefficients", modes, (*batch, harmonics.n_modes(self.lmax)))
         xp, lmax = namespace(modes, self.legendre), self.lmax
         order, ell = np.mgrid[: lmax + 1, : lmax + 1]
         plus = np.where(ell >= order, ell * (ell + 1) + order, 0)
@@ -141,9 +134,9 @@ class SphereGrid(eqx.Module):
         columns = both.reshape(-1, self.shape[0], lmax + 1).transpose(2, 1, 0)
         table = (self.legendre.transpose(0, 2, 1) @ columns).transpose(2, 0, 1)
         cosine, sine = table.reshape(2, -1, lmax + 1, lmax + 1)
-        ell, m = mode_numbers(lmax)
+        ell, m = harmonics.mode_numbers(lmax)
         picked = xp.where((m >= 0)[None], cosine[:, np.abs(m), ell], sine[:, np.abs(m), ell])
-        return picked.reshape(*batch, n_modes(lmax))
+        return picked.reshape(*batch, harmonics.n_modes(lmax))
 
     def product_matrix(
         self, field: Float[np.ndarray, "rings phi"], lmax: int | None = None
@@ -176,7 +169,7 @@ class SphereGrid(eqx.Module):
         square = lmax == highest
         fourier = np.fft.fft(np.asarray(field) * np.asarray(self.weights)[:, None], axis=1).T
         transposed = np.ascontiguousarray(table[: lmax + 1, :, : lmax + 1].transpose(0, 2, 1))
-        matrix = np.empty((n_modes(lmax), n_modes(highest)))
+        matrix = np.empty((harmonics.n_modes(lmax), harmonics.n_modes(highest)))
         for m in range(highest + 1):
             others = np.arange(m if square else 0, lmax + 1)
             low, high = fourier[others - m], fourier[(others + m) % self.n_phi]
@@ -208,7 +201,7 @@ class SphereGrid(eqx.Module):
         matrix : (modes, modes) array
             C, symmetric, of harmonics up to any lmax.
         """
-        between = order_products(matrix, np.asarray(self.theta))
+        between = harmonics.order_products(matrix, np.asarray(self.theta))
         phi = 2.0 * np.pi * np.arange(self.n_phi) / self.n_phi
-        azimuth = azimuth_functions(phi, lmax_of(matrix.shape[0]))
+        azimuth = harmonics.azimuth_functions(phi, harmonics.lmax_of(matrix.shape[0]))
         return ((azimuth @ between) * azimuth).sum(2)

@@ -16,13 +16,9 @@ from lusee_bayes.core.arrays import DataVector, Grid, Vector
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.section import is_modelled
+from lusee_bayes.experiment import sky_sections
 from lusee_bayes.experiment.model import full_model, model_about, moved
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.sky_sections import (
-    IsotropicPriorSection,
-    LocalScalesPriorSection,
-    PriorSection,
-)
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.measures import data_freedom
 from lusee_bayes.linear.amplitudes import Amplitudes, template_amplitudes
@@ -356,16 +352,16 @@ def learned_prior(
 
 # takes C_ell of the scenario's sky, which only simulations know
 OF_TRUE_SKY = "isotropic-sky"
-NAMED: dict[str, PriorSection] = {
-    "isotropic": IsotropicPriorSection(),
-    OF_TRUE_SKY: IsotropicPriorSection(spectrum="sky"),
-    "local_scales": LocalScalesPriorSection(),
+NAMED: dict[str, sky_sections.PriorSection] = {
+    "isotropic": sky_sections.IsotropicPriorSection(),
+    OF_TRUE_SKY: sky_sections.IsotropicPriorSection(spectrum="sky"),
+    "local_scales": sky_sections.LocalScalesPriorSection(),
 }
 
 
 def named_priors(
     names: Sequence[str] | None, scenario: Scenario, *, known_sky: bool
-) -> dict[str, PriorSection]:
+) -> dict[str, sky_sections.PriorSection]:
     """Find the sections of priors.
 
     The scenario's own section is taken where it is of the kind that is named, so that a template

@@ -19,20 +19,7 @@ from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.files import user_path
 from lusee_bayes.core.reading import as_yaml, parse_yaml, read_yaml
 from lusee_bayes.core.section import Frequency, Section, Seed, is_modelled
-from lusee_bayes.experiment.instrument_sections import (
-    BeamSection,
-    MonopoleBeamSection,
-    ObservationSection,
-)
-from lusee_bayes.experiment.sky_sections import (
-    GalaxySection,
-    IsotropicPriorSection,
-    LocalScalesPriorSection,
-    LogNormalSection,
-    PriorSection,
-    SkySection,
-    SpectralSection,
-)
+from lusee_bayes.experiment import instrument_sections, sky_sections
 from lusee_bayes.flight.recipe import FlightSection
 from lusee_bayes.systematics.registered import SYSTEMATICS, NoiseSection
 from lusee_bayes.systematics.sources import SourcesSection
@@ -203,14 +190,14 @@ class Scenario(Section):
     joint: bool = False
     lmax: Annotated[int, Field(ge=1, le=383)] = 47
     nside: Annotated[int, Field(ge=1, le=8192)] | None = None
-    observation: ObservationSection = ObservationSection()
-    beam: BeamSection = MonopoleBeamSection()
-    sky: SkySection = GalaxySection()
-    prior: PriorSection = LocalScalesPriorSection()
+    observation: instrument_sections.ObservationSection = instrument_sections.ObservationSection()
+    beam: instrument_sections.BeamSection = instrument_sections.MonopoleBeamSection()
+    sky: sky_sections.SkySection = sky_sections.GalaxySection()
+    prior: sky_sections.PriorSection = sky_sections.LocalScalesPriorSection()
     noise: NoiseSection = NoiseSection()
     sources: SourcesSection = SourcesSection()
-    spectral: SpectralSection = SpectralSection()
-    log_normal: LogNormalSection = LogNormalSection()
+    spectral: sky_sections.SpectralSection = sky_sections.SpectralSection()
+    log_normal: sky_sections.LogNormalSection = sky_sections.LogNormalSection()
     flight: FlightSection | None = None
     output: OutputSection = OutputSection()
     seed: Seed = 1
@@ -288,7 +275,7 @@ class Scenario(Section):
         """The scenario of every channel; draws of each have a seed of their own, one further."""
         alone: dict[str, Any] = {"frequencies_mhz": (), "joint": False}
         if self.joint:  # theirs is the spectral prior, of the sky's own C_ell
-            alone["prior"] = IsotropicPriorSection(spectrum="sky")
+            alone["prior"] = sky_sections.IsotropicPriorSection(spectrum="sky")
         receiver = self.noise.receiver
         if receiver is not None and receiver.smooth_octaves is not None:
             # one function, of which each channel sees a value

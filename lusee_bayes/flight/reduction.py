@@ -22,29 +22,10 @@ from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming
+from lusee_bayes.flight import flags, reduced
 from lusee_bayes.flight.bands import ChannelBand, shared_noise
-from lusee_bayes.flight.flags import (
-    COMB_LIMIT,
-    burst_flags,
-    comb_bins,
-    comb_strength,
-    line_flags,
-    robust_scale,
-    threshold,
-)
 from lusee_bayes.flight.gain_model import NANO2, gain_curves
 from lusee_bayes.flight.recipe import Recipe, Timeline, timeline
-from lusee_bayes.flight.reduced import (
-    BURST,
-    COMB,
-    CORRECTED,
-    NO_DATA,
-    PRODUCT,
-    SATURATED,
-    TOO_MANY,
-    USED,
-    Reduced,
-)
 from lusee_bayes.flight.session import (
     AUTOS,
     AVERAGING,
@@ -67,7 +48,7 @@ SLAB, PIECE = 128, 1024
 
 def reduce_sessions(
     sessions: Sequence[Session], recipe: Recipe, stages: Stages | None = None
-) -> Reduced:
+) -> reduced.Reduced:
     """Reduce sessions.
 
     Parameters
@@ -93,7 +74,7 @@ def reduce_sessions(
     like = _in_common(line, recipe)
     level = np.concatenate([s.level for s in line.sessions])
     first = np.searchsorted(line.bin_of, np.arange(line.n_bins))
-    whole = Reduced.blank(like, line.observation, line.bin_of, level[first])
+    whole = reduced.Reduced.blank(like, line.observation, line.bin_of, level[first])
     numbers = range(len(recipe.frequencies_mhz))
     spans, slabs = [], []
     with (
@@ -108,7 +89,7 @@ def reduce_sessions(
             keep = np.zeros(len(level), dtype=bool)
             keep[piece] = True
             starts = range(0, int(keep.sum()), SLAB)
-            spectra = Reduced.blank(
+            spectra = reduced.Reduced.blank(
                 like,
                 line.observation.select(keep),
                 np.arange(keep.sum()),
@@ -236,7 +217,7 @@ class State:
         )
         known = recipe.lines.bins(averaging, middles)
         if section.comb == "always":
-            known = known | comb_bins(averaging)
+            known = known | flags.comb_bins(averaging)
         return cls(recipe, navgf, levels, bands, basis, known)
 
     def strengths(
@@ -269,16 +250,16 @@ class State:
         averaging, comb = AVERAGING[self.navgf], notched
         if self.recipe.section.comb == "found":
             autos = counts[:, :PORTS].astype(np.float64)
-            strength = comb_strength(
+            strength = flags.comb_strength(
                 autos, frames, averaging, channel_mhz(self.recipe.section.bin_origin)
             )
-            comb = comb | (np.abs(strength) > COMB_LIMIT)
-        return self.known | (comb[:, None] & comb_bins(averaging))
+            comb = comb | (np.abs(strength) > flags.COMB_LIMIT)
+        return self.known | (comb[:, None] & flags.comb_bins(averaging))
 
 
 def _slab(
     line: Timeline, recipe: Recipe, states: dict[Any, State], start: int, counts: np.ndarray
-) -> Callable[[Reduced, int, int], None]:
+) -> Callable[[reduced.Reduced, int, int], None]:
     """What puts the counts of some spectra, from a row on, into a band."""
     session, first = line.sessions[int(line.session[start])], int(line.row[start])
     here = slice(first, first + len(counts))
@@ -306,7 +287,7 @@ def _calibrate(
     strengths: Float[np.ndarray, "rows ports 3"],
     lines: Bool[np.ndarray, "rows bins"],
     saturated: Bool[np.ndarray, " rows"],
-    spectra: Reduced,
+    spectra: reduced.Reduced,
     start: int,
     number: int,
 ) -> None:
@@ -331,24 +312,26 @@ def _calibrate(
     # products without an auto of their own do not tell lines
     there = finite[:, AUTOS]
     filled = np.where(there, channels[:, AUTOS], 0.0)
-    found, z = line_flags(band, filled, frames, good, threshold(recipe.section.false_alarm, PORTS))
+    found, z = flags.line_flags(
+        band, filled, frames, good, flags.threshold(recipe.section.false_alarm, PORTS)
+    )
     kept = good & ~found
     mean_auto = filled.sum(axis=1) / np.maximum(there.sum(axis=1), 1)
     clean = np.where(finite, channels, 0.0)
     values, variance, further = band.values(clean, mean_auto, kept)
     before, _, _ = band.values(clean, mean_auto, whole)
     reason = spectra.reason[number, rows]
-    reason[~np.isfinite(variance)] = TOO_MANY
-    reason[~good.any(axis=1)] = COMB
-    reason[~whole.any(axis=1)] = NO_DATA
-    reason[saturated] = SATURATED
+    reason[~np.isfinite(variance)] = reduced.TOO_MANY
+    reason[~good.any(axis=1)] = reduced.COMB
+    reason[~whole.any(axis=1)] = reduced.NO_DATA
+    reason[saturated] = reduced.SATURATED
     spectra.values[number, :, rows] = np.where(present, values, np.nan).T
     spectra.before[number, :, rows] = np.where(present, before, np.nan).T
     spectra.n_averaged[number, rows] = frames / variance
     noise = spectra.noise(number)[:, rows]
     spectra.bend[number, :, rows] = _over(further[:, AUTOS].T, noise)
     spectra.lines[number, rows] = 1.0 - kept.sum(axis=1) / len(band.basis)
-    spectra.slab_scatter[number, start // SLAB] = robust_scale(z[:, 0], kept)
+    spectra.slab_scatter[number, start // SLAB] = flags.robust_scale(z[:, 0], kept)
     middle = band.basis[:, 0] / len(band.basis)
     centre = np.einsum("rpk,k->pr", gain, middle)
     spectra.gain[number, :, rows] = centre
@@ -363,7 +346,7 @@ def _over(values: Float[np.ndarray, "*n"], noise: Float[np.ndarray, "*n"]) -> np
 
 
 def _finish(
-    spectra: Reduced, whole: Reduced, rows: slice, false_alarm: float, number: int
+    spectra: reduced.Reduced, whole: reduced.Reduced, rows: slice, false_alarm: float, number: int
 ) -> Float[np.ndarray, " spans"]:
     """Flag bursts in a band of a piece, and put the means of its bins into the whole.
 
@@ -379,9 +362,9 @@ def _finish(
     bins = slice(first, first + n)
     live = spectra.observation.live_s
     reason, values = spectra.reason[number], spectra.values[number]
-    good = reason == USED
+    good = reason == reduced.USED
     kept, used = by_the_rule(np.isfinite(values) & good, bin_of, live)
-    reason[good & ~used] = PRODUCT
+    reason[good & ~used] = reduced.PRODUCT
     whole.reason[number, rows] = reason
     whole.lines[number, rows] = spectra.lines[number]
     # each spectrum has the weight of its live time, in what is not flagged and in all of it
@@ -401,7 +384,9 @@ def _finish(
     return scatter
 
 
-def _flag_bursts(spectra: Reduced, false_alarm: float, number: int) -> Float[np.ndarray, " spans"]:
+def _flag_bursts(
+    spectra: reduced.Reduced, false_alarm: float, number: int
+) -> Float[np.ndarray, " spans"]:
     """Flag spectra that do not fit those before and after; the scatter over the noise, by span."""
     times = spectra.observation.times
     seconds = seconds_from(times[0], times)
@@ -410,9 +395,11 @@ def _flag_bursts(spectra: Reduced, false_alarm: float, number: int) -> Float[np.
     there = np.isfinite(autos)
     noise = np.where(there & (noise > 0.0), noise, np.inf)
     reason = spectra.reason[number]
-    good = reason == USED
-    burst, scatter = burst_flags(seconds, np.where(there, autos, 0.0), noise, good, false_alarm)
-    reason[burst] = BURST
+    good = reason == reduced.USED
+    burst, scatter = flags.burst_flags(
+        seconds, np.where(there, autos, 0.0), noise, good, false_alarm
+    )
+    reason[burst] = reduced.BURST
     return scatter
 
 
@@ -438,7 +425,7 @@ def _said_of(session: Session, recipe: Recipe) -> Mapping[str, Any]:
     if session.clock is None:
         whose = "clock file"
     elif recipe.clock is not None and recipe.clock.stated is not None:
-        whose = CORRECTED
+        whose = reduced.CORRECTED
     return {
         "file": str(session.path),
         "kind": session.kind,

@@ -19,23 +19,10 @@ from scipy.interpolate import CubicSpline
 
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.flight import session
 from lusee_bayes.flight.flags import COMB_FIRST, COMB_SPACING
 from lusee_bayes.flight.gain_model import LETTERS, NANO2, GainModel
 from lusee_bayes.flight.recipe import FlightSimulatedSection
-from lusee_bayes.flight.session import (
-    AUTOS,
-    AVERAGING,
-    CHANNEL_MHZ,
-    FIRST_PORT,
-    FLIGHT_PRODUCTS,
-    IMAGINARY,
-    N_CHANNELS,
-    OF_FLIGHT,
-    PORTS,
-    SECOND_PORT,
-    BinOrigin,
-    channel_mhz,
-)
 from lusee_bayes.instrument.products import to_matrix, to_real
 
 INDEX = -2.5
@@ -105,9 +92,9 @@ class ChannelSpectra:
         InputError
             If an auto is not positive, or a matrix of visibilities not positive definite.
         """
-        autos = known[:, AUTOS]
+        autos = known[:, session.AUTOS]
         require_positive("the autos of the visibilities", autos)
-        scale = np.sqrt(autos[:, FIRST_PORT] * autos[:, SECOND_PORT])
+        scale = np.sqrt(autos[:, session.FIRST_PORT] * autos[:, session.SECOND_PORT])
         matrices = np.moveaxis(to_matrix(np.moveaxis(known / scale, 1, 0)), (0, 1), (-2, -1))
         try:
             factors = np.linalg.cholesky(matrices)
@@ -117,7 +104,7 @@ class ChannelSpectra:
                 "correlated; check beams and sky"
             ) from error
         low = _at_channels(self.correlations, factors)
-        ports = np.arange(len(AUTOS))
+        ports = np.arange(len(session.AUTOS))
         low[ports, ports] = np.exp(
             _at_channels(self.correlations, np.log(factors[..., ports, ports].real))
         )
@@ -166,7 +153,7 @@ class Counting:
     table: GainModel
     levels: str
     navgf: int
-    origin: BinOrigin
+    origin: session.BinOrigin
     sign: int = 1
 
     @cached_property
@@ -174,7 +161,7 @@ class Counting:
         found = []
         for port, level in enumerate(self.levels):
             anchors = self.table.anchor_mhz[LETTERS.index(level), port]
-            inside = np.clip(channel_mhz(self.origin), anchors[0], anchors[-1])
+            inside = np.clip(session.channel_mhz(self.origin), anchors[0], anchors[-1])
             found.append(self.table.basis(level, port, inside))
         return np.array(found)
 
@@ -197,18 +184,18 @@ class Counting:
             In the spectrometer's order.
         """
         root = []
-        for port in range(PORTS):
+        for port in range(session.PORTS):
             q = self.table.strengths(self.levels[port], port, telemetry)
             gain = self._basis[port, 0] + q @ self._basis[port, 1:]
             # where a table has none, nothing is sent
             root.append(np.sqrt(np.maximum(gain, 0.0)))
-        averaging = AVERAGING[self.navgf]
+        averaging = session.AVERAGING[self.navgf]
         members = averaging.channels()
         found = np.empty((spectra.shape[1], len(spectra), averaging.n_bins))
         for k, product in enumerate(spectra):
-            counts = product * (root[FIRST_PORT[k]] * root[SECOND_PORT[k]]) / NANO2
+            counts = product * (root[session.FIRST_PORT[k]] * root[session.SECOND_PORT[k]]) / NANO2
             counts = counts[:, members].sum(axis=2) / averaging.divisor
-            found[:, OF_FLIGHT[k]] = counts * (self.sign if IMAGINARY[k] else 1)
+            found[:, session.OF_FLIGHT[k]] = counts * (self.sign if session.IMAGINARY[k] else 1)
         return found
 
 
@@ -221,8 +208,8 @@ def bit_slices(counts: Float[np.ndarray, "rows products bins"]) -> Int[np.ndarra
         In the spectrometer's order. Crosses have a slice by their autos, which bound them.
     """
     top = np.empty(counts.shape[1])
-    largest = np.abs(counts[0, OF_FLIGHT[AUTOS]]).max(axis=1)
-    top[OF_FLIGHT] = np.sqrt(largest[FIRST_PORT] * largest[SECOND_PORT])
+    largest = np.abs(counts[0, session.OF_FLIGHT[session.AUTOS]]).max(axis=1)
+    top[session.OF_FLIGHT] = np.sqrt(largest[session.FIRST_PORT] * largest[session.SECOND_PORT])
     bits = np.ceil(np.log2(top)) + REFERENCE - BITS
     return np.clip(bits, 0, REFERENCE).astype(np.int64)
 
@@ -246,7 +233,7 @@ STRETCH = 5
 # a saturated spectrum has so many times its counts
 SATURATED_FACTOR = 40.0
 # bursts are measured against the noise in so many channels
-BURST_CHANNELS = 1.0 / CHANNEL_MHZ
+BURST_CHANNELS = 1.0 / session.CHANNEL_MHZ
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,7 +272,7 @@ class Disturbances:
         section: FlightSimulatedSection,
         hours: Float[np.ndarray, " rows"],
         step_s: float,
-        origin: BinOrigin,
+        origin: session.BinOrigin,
         seed: int,
     ) -> Disturbances:
         """Draw them.
@@ -311,16 +298,16 @@ class Disturbances:
         level = np.array([list(section.levels)] * n, dtype="U1")
         if section.switch_h is not None:
             level[hours >= section.switch_h] = list(section.switch_levels)
-        absent = np.zeros((n, len(FLIGHT_PRODUCTS)), dtype=bool)
+        absent = np.zeros((n, len(session.FLIGHT_PRODUCTS)), dtype=bool)
         for row in np.flatnonzero(_drawn_stretches(generator, n, section.absent_share, 1)):
-            absent[row, generator.integers(len(FLIGHT_PRODUCTS))] = True
+            absent[row, generator.integers(len(session.FLIGHT_PRODUCTS))] = True
         saturated = _drawn_stretches(generator, n, section.saturated_share, 1)
         tones = _tone_channels(section.tones_mhz, section.navgf, origin)
         tone = _drawn_stretches(
             generator, n, section.tone_share if section.tones_mhz else 0.0, STRETCH
         )
         comb = _drawn_stretches(generator, n, section.comb_share, STRETCH)
-        burst, phase = np.zeros(n, dtype=bool), np.zeros((n, PORTS))
+        burst, phase = np.zeros(n, dtype=bool), np.zeros((n, session.PORTS))
         at = 0.0
         while section.burst_every_h is not None:
             at += generator.exponential(section.burst_every_h)
@@ -331,7 +318,7 @@ class Disturbances:
             first = int(np.searchsorted(hours, at))
             here = slice(first, max(first + 1, np.searchsorted(hours, at + length_s / 3600.0)))
             burst[here] = True
-            phase[here] = generator.uniform(0.0, 2.0 * np.pi, PORTS)
+            phase[here] = generator.uniform(0.0, 2.0 * np.pi, session.PORTS)
         return cls(section, level, absent, saturated, tone, tones, comb, burst, phase)
 
     def add(
@@ -347,8 +334,8 @@ class Disturbances:
         frames : float
             Frames that each averages.
         """
-        level = np.einsum("iirc->rc", t).real / (PORTS * np.sqrt(frames))
-        comb = np.arange(N_CHANNELS) % COMB_SPACING == COMB_FIRST
+        level = np.einsum("iirc->rc", t).real / (session.PORTS * np.sqrt(frames))
+        comb = np.arange(session.N_CHANNELS) % COMB_SPACING == COMB_FIRST
         lines = self.section.tone_factor * (self.tone[rows, None] & self.tone_channel)
         lines = lines + self.section.comb_factor * (self.comb[rows, None] & comb)
         t += level * lines
@@ -365,11 +352,14 @@ class Disturbances:
 
 
 def _tone_channels(
-    tones_mhz: tuple[float, ...], navgf: int, origin: BinOrigin
+    tones_mhz: tuple[float, ...], navgf: int, origin: session.BinOrigin
 ) -> Bool[np.ndarray, " channels"]:
     """The channels nearest to the tones. InputError if the averaging leaves one of them out."""
-    mhz, tones, kept = channel_mhz(origin), *(np.zeros(N_CHANNELS, dtype=bool) for _ in range(2))
-    kept[AVERAGING[navgf].channels()] = True
+    mhz, tones, kept = (
+        session.channel_mhz(origin),
+        *(np.zeros(session.N_CHANNELS, dtype=bool) for _ in range(2)),
+    )
+    kept[session.AVERAGING[navgf].channels()] = True
     for tone_mhz in tones_mhz:
         far = np.abs(mhz - tone_mhz)
         channel = int(far.argmin())

@@ -28,13 +28,7 @@ from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import pandas
 from lusee_bayes.core.reading import naming, parse_yaml, read_text, reading
-from lusee_bayes.instrument.times import (
-    ROUNDING_S,
-    require_ephemeris,
-    seconds_from,
-    unannounced_leap_seconds,
-    utc_from_text,
-)
+from lusee_bayes.instrument import times
 
 # a sidereal month
 CYCLE_DAYS = 27.321661
@@ -90,7 +84,7 @@ class Interval:
     where: str = field(default="", compare=False)
 
     def __post_init__(self):
-        if not self.length_s > ROUNDING_S:
+        if not self.length_s > times.ROUNDING_S:
             raise InputError(
                 f"end {self.end} does not come after start {self.start}; exchange them"
             )
@@ -109,15 +103,15 @@ class Interval:
     @cached_property
     def length_s(self) -> float:
         """Length in seconds, the time without integration among them."""
-        return float(seconds_from(self.start_time, self._date("end", self.end)))
+        return float(times.seconds_from(self.start_time, self._date("end", self.end)))
 
     def n_samples(self, step_s: float) -> int:
         """Count the samples of a step, by day and night; the last one may be shorter."""
-        return max(1, int(np.ceil((self.length_s - ROUNDING_S) / step_s)))
+        return max(1, int(np.ceil((self.length_s - times.ROUNDING_S) / step_s)))
 
     def _date(self, name: str, text: str) -> Time:
         # astropy knows no Z, which ISO has for UTC
-        return utc_from_text(name, text.removesuffix("Z"))
+        return times.utc_from_text(name, text.removesuffix("Z"))
 
 
 @dataclass(frozen=True)
@@ -181,7 +175,7 @@ def cut_intervals(intervals: Sequence[Interval], step_s: float) -> list[Cut]:
     for name, interval in named_in_order(intervals):
         begins = step_s * np.arange(interval.n_samples(step_s))
         length = np.diff(begins, append=interval.length_s)
-        start = seconds_from(intervals[0].start_time, interval.start_time) + begins
+        start = times.seconds_from(intervals[0].start_time, interval.start_time) + begins
         cuts.append(Cut(start, length, interval.duty_cycle * length, interval, name))
     return cuts
 
@@ -198,14 +192,14 @@ def named_in_order(intervals: Sequence[Interval]) -> list[tuple[str, Interval]]:
         raise InputError("a schedule needs at least one interval, got none")
     named = [(one.where or f"interval {number}", one) for number, one in enumerate(intervals)]
     for (_, before), (name, after) in pairwise(named):
-        ahead = seconds_from(before.start_time, after.start_time)
+        ahead = times.seconds_from(before.start_time, after.start_time)
         if ahead < 0.0:
             raise InputError(
                 f"{name}: the interval from {after.start} begins before the one that "
                 f"precedes it, from {before.start}; sort the intervals by their start"
             )
         overlap = before.length_s - ahead
-        if overlap > ROUNDING_S:
+        if overlap > times.ROUNDING_S:
             raise InputError(
                 f"{name}: the interval from {after.start} begins {overlap:g} s before "
                 f"the one that precedes it ends, {before.end}; give each stretch of time once"
@@ -322,11 +316,11 @@ def _command(place: str, entry: object) -> tuple[str, float, str]:
             "61050.8) and a mode in each entry"
         ) from error
     with naming(place):
-        require_ephemeris(np.array([start + 2400000.5]))
+        times.require_ephemeris(np.array([start + 2400000.5]))
     return place, start, mode
 
 
 def _date(mjd: float) -> str:
     """To the microsecond, which is all that a double holds of it."""
-    with unannounced_leap_seconds():
+    with times.unannounced_leap_seconds():
         return str(Time(mjd, format="mjd", scale="utc", precision=6).isot)

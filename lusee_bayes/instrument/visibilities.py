@@ -23,17 +23,8 @@ import xarray as xr
 from astropy.time import Time
 from jaxtyping import Float, Int
 
-from lusee_bayes.core import formats
+from lusee_bayes.core import checks, formats
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import (
-    Described,
-    extent,
-    listed,
-    require_array,
-    require_finite,
-    require_positive,
-    require_shape,
-)
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing, user_path
 from lusee_bayes.core.formats import as_dataset, read_netcdf
@@ -148,14 +139,14 @@ class Calibration:
     lost: float = 0.0
 
     def __post_init__(self):
-        require_positive("the number of samples averaged", self.n_averaged)
+        checks.require_positive("the number of samples averaged", self.n_averaged)
         n, times = len(self.gain_names), len(self.n_averaged)
         if (self.gain_port is None) != (n == 0) or (self.gain_slope is None) != (n == 0):
             raise InputError("errors of the gain table need names, ports and slopes")
         if n:
-            require_shape("gain_port", self.gain_port, (n,))
-            require_shape("gain_slope", self.gain_slope, (n, times))
-            require_finite("gain_slope", self.gain_slope)
+            checks.require_shape("gain_port", self.gain_port, (n,))
+            checks.require_shape("gain_slope", self.gain_slope, (n, times))
+            checks.require_finite("gain_slope", self.gain_slope)
 
 
 LOADS, LOAD = ("load_ohm_real", "load_ohm_imag"), ("load_frequency", "port", "port_2")
@@ -164,7 +155,7 @@ HINT = "make some with: lusee-bayes simulate SCENARIO"
 
 
 @dataclass(frozen=True, repr=False)
-class Visibilities(Described):
+class Visibilities(checks.Described):
     """Measured or simulated data.
 
     Attributes
@@ -202,14 +193,16 @@ class Visibilities(Described):
     calibration: Calibration | None = None
 
     def __post_init__(self):
-        require_array("the data", self.data, (self.layout.size,))
+        checks.require_array("the data", self.data, (self.layout.size,))
         seen = self.observation
         if self.layout.n_times != seen.n_times:
             n_times = self.layout.n_times
             raise InputError(f"the data have {n_times} times, the observation {seen.n_times}")
         if self.calibration is not None:
             n_averaged = self.calibration.n_averaged
-            require_shape("n_averaged of the calibration", n_averaged, (self.layout.n_times,))
+            checks.require_shape(
+                "n_averaged of the calibration", n_averaged, (self.layout.n_times,)
+            )
 
     @classmethod
     def from_arrays(
@@ -280,7 +273,7 @@ class Visibilities(Described):
             raise InputError(
                 f"there are {len(utc)} times for data of {values.shape[1]} times (their first axis)"
             )
-        require_positive("frequency_mhz", frequency_mhz)
+        checks.require_positive("frequency_mhz", frequency_mhz)
         require_mhz("frequency_mhz", frequency_mhz)
         lon_deg, lat_deg = site_of(site)
         run, angles = runs_of(turntable_deg, len(utc))
@@ -298,7 +291,7 @@ class Visibilities(Described):
         return (
             f"{self.layout.n_products} products x {self.layout.n_times} times at "
             f"{self.frequency_mhz:g} MHz, {self.layout.size} data{missing}",
-            f"{extent(self.data, 'K')}{truth}; products {listed(self.labels)}",
+            f"{checks.extent(self.data, 'K')}{truth}; products {checks.listed(self.labels)}",
             f"{dates[0]}, at {first}{unsaid}",
         )
 
@@ -478,7 +471,7 @@ def read_visibilities(path: str | Path) -> Visibilities:
         )
     flags = here["flag"]
     values = np.where(flags, 0.0, here["visibility"])
-    require_finite(f"{path}: visibility (where not flagged)", values)
+    checks.require_finite(f"{path}: visibility (where not flagged)", values)
     with naming(path):
         layout = DataLayout.from_flags(flags)
         utc = utc_of_jd(found)

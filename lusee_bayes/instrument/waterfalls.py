@@ -44,16 +44,10 @@ from lusee_bayes.core.formats import image_names, read_fits
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.core.version import __version__
+from lusee_bayes.instrument import products
 from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ, Interpolation
 from lusee_bayes.instrument.beams.source import LOADS, Circuit, MeasuredReceiver, receiver_of
 from lusee_bayes.instrument.observation import Observation, body_direction
-from lusee_bayes.instrument.products import (
-    N_ANTENNAS,
-    DataLayout,
-    all_products,
-    in_order,
-    to_matrix,
-)
 from lusee_bayes.instrument.times import (
     ROUNDING_S,
     later,
@@ -125,7 +119,7 @@ class Waterfall:
             )
         return nearest
 
-    def at(self, frequency_mhz: float, n_ports: int = N_ANTENNAS) -> Visibilities:
+    def at(self, frequency_mhz: float, n_ports: int = products.N_ANTENNAS) -> Visibilities:
         """Return one channel, without the samples that are missing or not finite.
 
         Parameters
@@ -146,15 +140,16 @@ class Waterfall:
         channel = self.channel(frequency_mhz)
         values = self.grid[:, :, channel]
         present = np.isfinite(values)
-        within = np.array([p.j < n_ports for p in all_products()])
+        within = np.array([p.j < n_ports for p in products.all_products()])
         if present[~within].any():
             first = int(np.argmax(present.any(1) & ~within))
+            label = products.all_products()[first].label
             raise InputError(
-                f"{self.path} has the product {all_products()[first].label}, but the beams are "
-                f"those of {n_ports} ports; give beam.rotations_deg an angle for every port"
+                f"{self.path} has the product {label}, but the beams are those of {n_ports} ports; "
+                "give beam.rotations_deg an angle for every port"
             )
         with naming(f"{self.path} at {frequency_mhz:g} MHz"):
-            layout = DataLayout.from_flags(~present[within])
+            layout = products.DataLayout.from_flags(~present[within])
         data, mhz = layout.gather(values[within]), float(self.frequencies_mhz[channel])
         return Visibilities(data, layout, self.observation, mhz, receiver=self.receiver)
 
@@ -232,7 +227,7 @@ SCALAR_WATERFALL = Layout(
         "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
         # NaN where a sample is missing
         "data": Variable(("time", "product", "freq"), finite=False, unit="K"),
-        "combinations": Variable(("pair", 2), "integer", low=0.0, high=N_ANTENNAS - 1.0),
+        "combinations": Variable(("pair", 2), "integer", low=0.0, high=products.N_ANTENNAS - 1.0),
     },
     {"LUNAR_DAY": Attribute("word"), **SITE_AND_STEP},
 )
@@ -268,7 +263,7 @@ def read_scalar(path: Path) -> Waterfall:
     with naming(path):
         said, values = found.values, np.moveaxis(data, 1, 0)
         signed = zip(columns, values, strict=True)
-        grid = in_order([(label, sign * one) for (label, sign), one in signed])
+        grid = products.in_order([(label, sign * one) for (label, sign), one in signed])
         first, seconds = start_of(said["LUNAR_DAY"]), said["DELTAT_SEC"] * np.arange(len(data))
         require_ephemeris(first.jd + seconds[-1:] / 86400.0)
         observation = _observation(later(first, seconds), said)
@@ -291,9 +286,12 @@ FOUR_PORT_WATERFALL = Layout(
         "products.label": Variable(("product",), "text"),
         # NaN where a sample is missing
         "data": Variable(("time", "product", "freq"), finite=False, unit=UNIT),
-        "blackbody_normalization_real": Variable(("freq", N_ANTENNAS, N_ANTENNAS)),
+        "blackbody_normalization_real": Variable(
+            ("freq", products.N_ANTENNAS, products.N_ANTENNAS)
+        ),
         **dict.fromkeys(
-            LOADS, Variable(("freq", N_ANTENNAS, N_ANTENNAS), optional=True, unit="Ohm")
+            LOADS,
+            Variable(("freq", products.N_ANTENNAS, products.N_ANTENNAS), optional=True, unit="Ohm"),
         ),
     },
     {
@@ -330,11 +328,11 @@ def read_four_port(path: Path) -> Waterfall:
     per_kelvin = images["blackbody_normalization_real"].diagonal(axis1=1, axis2=2)
     require_positive(f"{path}: the diagonal of blackbody_normalization_real", per_kelvin)
     root = np.sqrt(per_kelvin)
-    scales = {p.label: root[:, p.i] * root[:, p.j] for p in all_products()}
+    scales = {p.label: root[:, p.i] * root[:, p.j] for p in products.all_products()}
     names = [str(label).strip() for label in images["products.label"]]
     named = zip(names, np.moveaxis(images["data"], 1, 0), strict=True)
     with naming(path):
-        grid = in_order([(name, volts / scales.get(name, 1.0)) for name, volts in named])
+        grid = products.in_order([(name, volts / scales.get(name, 1.0)) for name, volts in named])
         scale = scale_of("TIMESYS", said.get("TIMESYS", "UTC"))
         observation = _observation(utc_of(*images["time"].T, scale), said)
     warm = {"moon_k": said["TMOON_K"], "antenna_k": said.get("TANT_K", 0.0)}
@@ -413,10 +411,10 @@ def write_waterfall(
             f"{path}: luseepy's waterfalls have a sample every {first.step_s:g} s without gaps; "
             f"{HINT}"
         )
-    pairs = np.array([(p.i, p.j) for p in all_products() if p.part == "R"])
+    pairs = np.array([(p.i, p.j) for p in products.all_products() if p.part == "R"])
     z = np.full(len(channels), np.nan + 1j * np.nan) if impedance_ohm is None else impedance_ohm
     images = {"data": data, "freq": _frequencies(channels), "combinations": pairs}
-    for port in range(N_ANTENNAS):
+    for port in range(products.N_ANTENNAS):
         images |= {f"ZRe_{port}": z.real.copy(), f"ZIm_{port}": z.imag.copy()}
     hdus = [fits.ImageHDU(image, name=name) for name, image in images.items()]
     return _write(path, hdus, {"VERSION": 0.1} | _site_and_times(first), scenario)
@@ -440,8 +438,8 @@ def _kelvin(
                 f"{path}: luseepy's waterfalls have no turntable angles, the data have "
                 f"{observation.turntable_deg}; {HINT}"
             )
-        if channel.layout.n_products != N_ANTENNAS**2:
-            raise InputError(f"{path}: expected {N_ANTENNAS**2} products; {HINT}")
+        if channel.layout.n_products != products.N_ANTENNAS**2:
+            raise InputError(f"{path}: expected {products.N_ANTENNAS**2} products; {HINT}")
         if observation.n_times != len(times) or (observation.times != times).any():
             raise InputError(f"{path}: the channels have different times; {HINT}")
     return np.moveaxis(np.stack([channel.grid() for channel in channels], axis=-1), 0, 1)
@@ -532,7 +530,7 @@ def write_four_port(
         )
     enclosure = np.array([circuit.per_kelvin for circuit in circuits])
     root = np.sqrt(enclosure.diagonal(axis1=1, axis2=2).real)
-    i, j = np.array([(p.i, p.j) for p in all_products()]).T
+    i, j = np.array([(p.i, p.j) for p in products.all_products()]).T
     data = _kelvin(path, channels) * (root[:, i] * root[:, j]).T
     condition = np.linalg.cond([c.antenna_ohm + c.load_ohm for c in circuits])
     eigenvalues = _eigenvalues(data)
@@ -563,7 +561,7 @@ def write_four_port(
     hdus = [hdu for image in images for hdu in _hdus(*image)]
     clock = {"TIMESYS": "UTC", "TIMEUNIT": "d", "CLOCKSRC": "supplied", "SCALEASM": False}
     hdus[2].header.update(TIMEFMT="JD1+JD2", **clock)
-    label = fits.Column("label", "8A", unit="1", array=[p.label for p in all_products()])
+    label = fits.Column("label", "8A", unit="1", array=[p.label for p in products.all_products()])
     table = fits.Header([("EXTNAME", "products")])
     hdus.insert(3, fits.BinTableHDU.from_columns([label], header=table))
     header = {
@@ -603,7 +601,7 @@ def _eigenvalues(
     data: Float[np.ndarray, "times products frequencies"],
 ) -> Float[np.ndarray, "times frequencies ports"]:
     """Of the covariance of the ports at every time; NaN where a product is missing."""
-    covariance = np.moveaxis(to_matrix(np.moveaxis(data, 1, 0)), (0, 1), (2, 3))
+    covariance = np.moveaxis(products.to_matrix(np.moveaxis(data, 1, 0)), (0, 1), (2, 3))
     complete = np.isfinite(data).all(1)
     values = np.full((*complete.shape, covariance.shape[-1]), np.nan)
     values[complete] = np.linalg.eigvalsh(covariance[complete])

@@ -43,16 +43,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 from scipy.linalg import block_diag
 
+from lusee_bayes.core import linalg
 from lusee_bayes.core.arrays import Grid, GridFlags, Square, Vector, on_host
 from lusee_bayes.core.engine import in_threads, once
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.linalg import (
-    cholesky,
-    invert_lower,
-    solve_lower,
-    spanning_rows,
-    times_lower,
-)
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.split import log_det_of
@@ -369,14 +363,14 @@ class LeftOut:
         if posterior is None or posterior.basis is not None:
             normal = self._gram(self._weights)
             normal[np.diag_indices_from(normal)] += 1.0
-            lower = cholesky(normal, overwrite=True)
+            lower = linalg.cholesky(normal, overwrite=True)
         else:
             n = self._n_templates
             across = self._pull(weigh(self._weights, self._t))
             across[:n] += np.eye(n)
             lower = np.zeros((len(across),) * 2)
             lower[:n, :n] = np.linalg.cholesky(across[:n])
-            lower[n:, :n] = solve_lower(lower[:n, :n], across[n:].T, transpose=False).T
+            lower[n:, :n] = linalg.solve_lower(lower[:n, :n], across[n:].T, transpose=False).T
             lower[n:, n:] = np.tril(posterior.lower)
         if not np.isfinite(np.diagonal(lower)).all():
             raise InputError(
@@ -393,8 +387,8 @@ class LeftOut:
         n, weighted = self._n_templates, weigh(self._weights, self._by_cell(rest[:, None]))
         for _ in range(1 + REFINEMENTS):
             step = (self._pull(weighted)[:, 0] - z)[:, None]
-            half = solve_lower(self._lower, step, transpose=False)
-            z = z + solve_lower(self._lower, half, transpose=True)[:, 0]
+            half = linalg.solve_lower(self._lower, step, transpose=False)
+            z = z + linalg.solve_lower(self._lower, half, transpose=True)[:, 0]
             seen = self._templates @ z[:n] + model.coupling @ model.prior.colour(z[n:])
             weighted = weigh(self._weights, self._by_cell((rest - seen)[:, None]))
         return weighted[..., 0]
@@ -439,8 +433,8 @@ class LeftOut:
     def _halves(self, rows: Float[np.ndarray, "*cells rank"]) -> tuple[np.ndarray, np.ndarray]:
         """Rows x L^-T, and of x Q^-1 the columns of the sky."""
         flat = rows.reshape(-1, rows.shape[-1])
-        half = solve_lower(self._lower, flat.T, transpose=False)
-        sky = solve_lower(self._lower, half, transpose=True)[self._n_templates :].T
+        half = linalg.solve_lower(self._lower, flat.T, transpose=False)
+        sky = linalg.solve_lower(self._lower, half, transpose=True)[self._n_templates :].T
         return half.T.reshape(rows.shape), sky.reshape(*rows.shape[:-1], -1)
 
     def _stretch(self, number: int) -> Stretch:
@@ -496,7 +490,7 @@ class LeftOut:
         templates = templates / np.maximum(np.abs(templates).max(axis=0), 1e-300)
         features = [self._model.coupling.time_features(times), templates]
         run = np.searchsorted(pointing.run_starts, times, side="right")
-        few, factors = spanning_rows(np.concatenate(features, axis=1), run)
+        few, factors = linalg.spanning_rows(np.concatenate(features, axis=1), run)
         return Span(times[few], factors)
 
     # --- groups in the space of their data ----------------------------------------------------
@@ -535,8 +529,8 @@ class LeftOut:
 
     def _among_data(self, chosen: Chosen, w: Rows, with_sky: SkyRows, inside: Vector) -> Answer:
         """chi^2_s, directions and ln|1 - W W^T|."""
-        lower = cholesky(np.eye(len(w)) - w @ w.T, overwrite=True)
-        solved = solve_lower(lower, np.column_stack([inside, with_sky]), transpose=False)
+        lower = linalg.cholesky(np.eye(len(w)) - w @ w.T, overwrite=True)
+        solved = linalg.solve_lower(lower, np.column_stack([inside, with_sky]), transpose=False)
         chi2, directions = (float((x**2).sum()) for x in (solved[:, 0], solved[:, 1:]))
         outside = float((chosen.b**2).sum() - (inside**2).sum())
         return outside + chi2, directions, log_det_of(lower)
@@ -546,7 +540,7 @@ class LeftOut:
     @once
     def _normal(self) -> Square:
         """Q."""
-        return times_lower(self._lower, self._lower, transpose=True)
+        return linalg.times_lower(self._lower, self._lower, transpose=True)
 
     @once
     def _trace(self) -> float:
@@ -555,7 +549,7 @@ class LeftOut:
 
     def _trace_of_sky(self, lower: Square) -> float:
         """tr (L L^T)^-1 of the sky; overwrites L."""
-        inverse = invert_lower(lower, overwrite=True)[:, self._n_templates :]
+        inverse = linalg.invert_lower(lower, overwrite=True)[:, self._n_templates :]
         return float(np.einsum("ij,ij->", inverse, inverse))
 
     def _taken_out(self, chosen: Chosen) -> Answer:
@@ -565,8 +559,8 @@ class LeftOut:
         mean[where] = solve_roots(chosen.root, chosen.b, transpose=True)
         h = self._pull(weigh(self._weights, mean))
         gram = self._gram(lost_weights(self._weights, chosen.cells))
-        lower = cholesky(np.subtract(self._normal, gram, out=gram), overwrite=True)
-        h = solve_lower(lower, h, transpose=False)
+        lower = linalg.cholesky(np.subtract(self._normal, gram, out=gram), overwrite=True)
+        h = linalg.solve_lower(lower, h, transpose=False)
         log_det = log_det_of(lower) - log_det_of(self._lower)
         directions = self._trace_of_sky(lower) - self._trace
         return float((chosen.b**2).sum() + (h**2).sum()), directions, log_det

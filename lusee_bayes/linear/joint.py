@@ -22,16 +22,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
+from lusee_bayes.core import linalg
 from lusee_bayes.core.arrays import Array, Modes, ModesMatrix, on_host
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.linalg import (
-    cholesky,
-    inverse_from_cholesky,
-    scaled,
-    solve_lower,
-    symmetric_product,
-)
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.prior import IndependentPrior
@@ -62,14 +56,14 @@ def common_part(information: Information, residual_root: Modes | None) -> Inform
     if residual_root is None:
         return information
     lower = residual_lower(information, residual_root)
-    inverse = inverse_from_cholesky(lower)
+    inverse = linalg.inverse_from_cholesky(lower)
     gradient = residual_root * information.vector
     solved = inverse @ gradient
     log_det = 2.0 * np.log(np.diagonal(lower)).sum()
     matrix = -inverse
     matrix[np.diag_indices_from(matrix)] += 1.0
     return Information(
-        scaled(matrix, 1.0 / residual_root, overwrite=True),
+        linalg.scaled(matrix, 1.0 / residual_root, overwrite=True),
         solved / residual_root,
         information.reference,
         np.asarray(information.misfit - gradient @ solved),
@@ -80,9 +74,9 @@ def common_part(information: Information, residual_root: Modes | None) -> Inform
 
 def residual_lower(information: Information, residual_root: Modes) -> ModesMatrix:
     """L L^T = 1 + P."""
-    normal = scaled(information.matrix, residual_root)
+    normal = linalg.scaled(information.matrix, residual_root)
     normal[np.diag_indices_from(normal)] += 1.0
-    return cholesky(normal, overwrite=True)
+    return linalg.cholesky(normal, overwrite=True)
 
 
 class ComponentSums(eqx.Module):
@@ -349,14 +343,14 @@ def channel_sky(
         # of the mean and of every draw: the residual's mean, given the common part
         common = np.concatenate([mean[None], skies])
         pull = information.vector - (common - information.reference) @ information.matrix
-        half = solve_lower(lower, (residual_root * pull).T, transpose=False)
+        half = linalg.solve_lower(lower, (residual_root * pull).T, transpose=False)
         # a draw deviates from it by L^-T z
         half[:, 1:] += z.T
-        whole = common + residual_root * solve_lower(lower, half, transpose=True).T
+        whole = common + residual_root * linalg.solve_lower(lower, half, transpose=True).T
         mean, skies = whole[0], whole[1:]
         if covariance is not None:
-            inverse = inverse_from_cholesky(lower)
-            white = scaled(covariance, 1.0 / residual_root, overwrite=True)
-            white = symmetric_product(inverse @ white, inverse) + inverse
-            covariance = scaled(white, residual_root, overwrite=True)
+            inverse = linalg.inverse_from_cholesky(lower)
+            white = linalg.scaled(covariance, 1.0 / residual_root, overwrite=True)
+            white = linalg.symmetric_product(inverse @ white, inverse) + inverse
+            covariance = linalg.scaled(white, residual_root, overwrite=True)
     return ChannelSky(mean, covariance, skies, information.chi2(mean))

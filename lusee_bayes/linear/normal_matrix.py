@@ -32,13 +32,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import Rotation, mode_numbers
 from lusee_bayes.core.linalg import checked_cholesky, gram_matrix, mirrored, solve_lower
 from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix, turned_about_pole
-from lusee_bayes.noise.covariance import (
-    Covariance,
-    DiagonalCovariance,
-    LowRankUpdate,
-    TimeBandedCovariance,
-    TimeBlockCovariance,
-)
+from lusee_bayes.noise import covariance
 
 # arrays that recur
 Beams = Float[np.ndarray, "orders products 2 functions degrees"]
@@ -173,7 +167,7 @@ def _weighted(
     return [(x @ beams).reshape(n_orders, -1, n) for x in factors]
 
 
-def normal_matrix(coupling: Coupling, noise: Covariance) -> ModesMatrix:
+def normal_matrix(coupling: Coupling, noise: covariance.Covariance) -> ModesMatrix:
     """Compute A^T N^-1 A without forming A.
 
     Exact for the coupling's own functions of time. JAX's arrays are copied to the host, so that it
@@ -208,7 +202,7 @@ def normal_matrix(coupling: Coupling, noise: Covariance) -> ModesMatrix:
     return NORMAL_MATRICES[type(noise)](*on_host((coupling, noise)))
 
 
-def has_structure(coupling: Coupling, noise: Covariance) -> bool:
+def has_structure(coupling: Coupling, noise: covariance.Covariance) -> bool:
     """Tell whether :func:`normal_matrix` can be used.
 
     Parameters
@@ -226,7 +220,7 @@ def has_structure(coupling: Coupling, noise: Covariance) -> bool:
     return coupling.has_time_structure and type(_base(noise)) in NORMAL_MATRICES
 
 
-def is_within_times(noise: Covariance) -> bool:
+def is_within_times(noise: covariance.Covariance) -> bool:
     """Tell whether noise couples no two times, but for templates.
 
     Parameters
@@ -242,15 +236,15 @@ def is_within_times(noise: Covariance) -> bool:
     return NORMAL_MATRICES.get(type(_base(noise))) is _within_times
 
 
-def _base(noise: Covariance) -> Covariance:
-    return noise.base if isinstance(noise, LowRankUpdate) else noise
+def _base(noise: covariance.Covariance) -> covariance.Covariance:
+    return noise.base if isinstance(noise, covariance.LowRankUpdate) else noise
 
 
-def _within_times(coupling: CouplingMatrix, noise: Covariance) -> ModesMatrix:
+def _within_times(coupling: CouplingMatrix, noise: covariance.Covariance) -> ModesMatrix:
     return summed(coupling, noise.time_weights(coupling.layout))
 
 
-def _with_templates(coupling: CouplingMatrix, noise: LowRankUpdate) -> ModesMatrix:
+def _with_templates(coupling: CouplingMatrix, noise: covariance.LowRankUpdate) -> ModesMatrix:
     """With N_0 + T T^T: A^T D A - V^T (1 + T^T D T)^-1 V, V = T^T D A, D = N_0^-1."""
     base = noise.base.factor()
     weighted = np.asarray(base.solve(noise.update.root))
@@ -312,7 +306,7 @@ def _turned(
 STREAMED = 1024
 
 
-def _streamed(coupling: CouplingMatrix, noise: TimeBandedCovariance) -> ModesMatrix:
+def _streamed(coupling: CouplingMatrix, noise: covariance.TimeBandedCovariance) -> ModesMatrix:
     """For time-banded noise: A is made, whitened and summed one block row of N after the other."""
     pointing, layout, factor = coupling.pointing, coupling.layout, on_host(noise.factor())
     n_blocks, rows, window = factor.left.shape
@@ -338,9 +332,9 @@ def _streamed(coupling: CouplingMatrix, noise: TimeBandedCovariance) -> ModesMat
 
 
 # how A^T N^-1 A is summed for each structure of N in time; those without an entry need A itself
-NORMAL_MATRICES: dict[type[Covariance], Callable[..., ModesMatrix]] = {
-    DiagonalCovariance: _within_times,
-    TimeBlockCovariance: _within_times,
-    TimeBandedCovariance: _streamed,
-    LowRankUpdate: _with_templates,
+NORMAL_MATRICES: dict[type[covariance.Covariance], Callable[..., ModesMatrix]] = {
+    covariance.DiagonalCovariance: _within_times,
+    covariance.TimeBlockCovariance: _within_times,
+    covariance.TimeBandedCovariance: _streamed,
+    covariance.LowRankUpdate: _with_templates,
 }

@@ -14,16 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
+from lusee_bayes.core import harmonics
 from lusee_bayes.core.arrays import Array, ModesMatrix, Pixels, compiled, namespace
 from lusee_bayes.core.checks import Described, is_traced, number
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import (
-    azimuth_functions,
-    lmax_of,
-    modes_by_order,
-    order_products,
-    polar_functions,
-)
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.linalg import inverse_from_cholesky, solve_lower
 from lusee_bayes.sky.prior import Prior
@@ -345,8 +339,8 @@ def pixel_std(covariance: ModesMatrix, nside: int) -> Pixels:
         In K, in RING order.
     """
     covariance = np.asarray(covariance)
-    heights, place, azimuth = _rings(nside, lmax_of(covariance.shape[0]))
-    between = order_products(covariance, heights)
+    heights, place, azimuth = _rings(nside, harmonics.lmax_of(covariance.shape[0]))
+    between = harmonics.order_products(covariance, heights)
     return np.sqrt(_on_pixels(((azimuth @ between) * azimuth).sum(2), place))
 
 
@@ -371,10 +365,10 @@ def prior_pixel_std(prior: Prior, nside: int) -> Pixels:
         return pixel_std(covariance, nside)
     variance = np.array(prior.variance())
     variance[0] = 0.0
-    lmax = lmax_of(len(variance))
+    lmax = harmonics.lmax_of(len(variance))
     heights, place, azimuth = _rings(nside, lmax)
-    by_order, first = modes_by_order(lmax)
-    weighted = polar_functions(heights, lmax) ** 2 * variance
+    by_order, first = harmonics.modes_by_order(lmax)
+    weighted = harmonics.polar_functions(heights, lmax) ** 2 * variance
     of_orders = np.add.reduceat(weighted[:, by_order], first, axis=1)
     return np.sqrt(_on_pixels((azimuth**2 @ of_orders[:, :, None])[:, :, 0], place))
 
@@ -388,7 +382,7 @@ def _rings(nside: int, lmax: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     theta, phi = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)))
     heights, first, count = np.unique(theta, return_index=True, return_counts=True)
     place = np.minimum(np.arange(count.max())[None], count[:, None] - 1) + first[:, None]
-    return heights, place, azimuth_functions(phi, lmax)[place]
+    return heights, place, harmonics.azimuth_functions(phi, lmax)[place]
 
 
 def _on_pixels(values: Float[np.ndarray, "rings longest"], place: np.ndarray) -> Pixels:

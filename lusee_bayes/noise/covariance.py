@@ -37,17 +37,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
+from lusee_bayes.core import checks
 from lusee_bayes.core.arrays import Array, compiled, namespace
-from lusee_bayes.core.checks import (
-    Described,
-    is_traced,
-    require_array,
-    require_finite,
-    require_float64,
-    require_positive,
-    require_shape,
-    require_symmetric,
-)
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky, solve_lower
 from lusee_bayes.instrument.products import DataLayout
@@ -89,7 +80,7 @@ class Factor(eqx.Module):
         return self.whiten_transpose(self.whiten(x))
 
 
-class Covariance(Described, eqx.Module):
+class Covariance(checks.Described, eqx.Module):
     """A symmetric positive definite matrix N over the entries of the data vector, in K^2."""
 
     def description(self) -> tuple[str, ...]:
@@ -167,7 +158,7 @@ class Covariance(Described, eqx.Module):
     def sample(self, key: PRNGKeyArray, n: int | None = None) -> Float[Array, "..."]:
         """Draw from N(0, N): a (data,) array, or an (n, data) one with ``n``."""
         z = jax.random.normal(key, (self.rank, 1 if n is None else n), dtype=jnp.float64)
-        if namespace(self) is np and not is_traced(z):
+        if namespace(self) is np and not checks.is_traced(z):
             z = np.asarray(z)
         draws = self.colour(z).T
         return draws[0] if n is None else draws
@@ -263,8 +254,8 @@ class DenseCovariance(Covariance):
     name: str = eqx.field(static=True, default="the dense covariance")
 
     def __check_init__(self):
-        require_array(self.name, self.matrix, (self.matrix.shape[0],) * 2)
-        require_symmetric(self.name, self.matrix)
+        checks.require_array(self.name, self.matrix, (self.matrix.shape[0],) * 2)
+        checks.require_symmetric(self.name, self.matrix)
 
     @property
     def size(self) -> int:
@@ -332,9 +323,9 @@ class DiagonalCovariance(Covariance):
     variance: Float[Array, " data"]
 
     def __check_init__(self):
-        require_float64("the noise variance", self.variance)
-        require_shape("the noise variance", self.variance, (None,))
-        require_positive("the noise variance", self.variance)
+        checks.require_float64("the noise variance", self.variance)
+        checks.require_shape("the noise variance", self.variance, (None,))
+        checks.require_positive("the noise variance", self.variance)
 
     @property
     def size(self) -> int:
@@ -381,7 +372,7 @@ class LowRankCovariance(Covariance):
     name: str = eqx.field(static=True, default="the low-rank term")
 
     def __check_init__(self):
-        require_array(self.name, self.root, (None, None))
+        checks.require_array(self.name, self.root, (None, None))
 
     @property
     def size(self) -> int:
@@ -417,7 +408,7 @@ class LowRankCovariance(Covariance):
         return LowRankUpdate(other, self)
 
     def scaled(self, factor):
-        require_positive("the factor of a low-rank term", factor)
+        checks.require_positive("the factor of a low-rank term", factor)
         return LowRankCovariance(namespace(self, factor).sqrt(factor) * self.root, self.name)
 
 
@@ -548,12 +539,12 @@ class TimeBlockCovariance(_OverLayout):
     blocks: Float[Array, "times products products"]
 
     def __init__(self, blocks: Float[Array, "times products products"], layout: DataLayout):
-        require_float64("the noise blocks", blocks)
+        checks.require_float64("the noise blocks", blocks)
         n = layout.n_products
-        require_shape("the noise blocks", blocks, (layout.n_times, n, n))
+        checks.require_shape("the noise blocks", blocks, (layout.n_times, n, n))
         blocks = _masked(blocks[:, None], layout)[:, 0]
-        require_finite("the noise blocks", blocks)
-        require_symmetric("the noise covariance of one time", blocks)
+        checks.require_finite("the noise blocks", blocks)
+        checks.require_symmetric("the noise covariance of one time", blocks)
         self.blocks = blocks
         self.layout = layout
 
@@ -696,12 +687,12 @@ class TimeBandedCovariance(_OverLayout):
         layout: DataLayout,
         name: str = "the time-banded covariance",
     ):
-        require_float64(name, band)
+        checks.require_float64(name, band)
         n = layout.n_products
-        require_shape(name, band, (layout.n_times, None, n, n))
+        checks.require_shape(name, band, (layout.n_times, None, n, n))
         band = _masked(band, layout)
-        require_finite(name, band)
-        require_symmetric(f"{name} within one time", band[:, 0])
+        checks.require_finite(name, band)
+        checks.require_symmetric(f"{name} within one time", band[:, 0])
         self.band = band
         self.layout = layout
         self.name = name
@@ -729,7 +720,7 @@ class TimeBandedCovariance(_OverLayout):
 
     def factor(self):
         left, diagonal = _cholesky(*_block_rows(self.band))
-        if not is_traced(diagonal):
+        if not checks.is_traced(diagonal):
             self._require_positive(diagonal)
         unit = jnp.broadcast_to(jnp.eye(diagonal.shape[1]), diagonal.shape)
         inverse = solve_lower(diagonal, unit, transpose=False)

@@ -30,15 +30,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
+from lusee_bayes.core import checks
 from lusee_bayes.core.arrays import Array, scalar
-from lusee_bayes.core.checks import (
-    is_traced,
-    require_array,
-    require_float64,
-    require_positive,
-    require_shape,
-    require_symmetric,
-)
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky
 from lusee_bayes.instrument.beams.fields import ProductBeams
@@ -73,15 +66,15 @@ def template_noise(
     InputError
         For templates of the wrong length, and for a P that is not positive definite.
     """
-    require_array("the templates", templates, (layout.size, None))
-    require_float64("the templates' prior", prior)
+    checks.require_array("the templates", templates, (layout.size, None))
+    checks.require_float64("the templates' prior", prior)
     n = templates.shape[1]
     if prior.ndim == 1:
-        require_shape("the templates' prior", prior, (n,))
-        require_positive("the templates' prior variance", prior)
+        checks.require_shape("the templates' prior", prior, (n,))
+        checks.require_positive("the templates' prior variance", prior)
         return LowRankCovariance(templates * jnp.sqrt(prior)[None], "the templates")
-    require_array("the templates' prior", prior, (n, n))
-    require_symmetric("the templates' prior", prior)
+    checks.require_array("the templates' prior", prior, (n, n))
+    checks.require_symmetric("the templates' prior", prior)
     root = jnp.tril(checked_cholesky("the templates' prior", prior))
     return LowRankCovariance(templates @ root, "the templates")
 
@@ -112,8 +105,8 @@ class GainDrift(eqx.Module):
     correlation_h: Float[Array, ""] = eqx.field(default=10.0, converter=scalar)
 
     def __check_init__(self):
-        require_positive("the gain drift's sigma", self.sigma)
-        require_positive("the gain drift's correlation time in hours", self.correlation_h)
+        checks.require_positive("the gain drift's sigma", self.sigma)
+        checks.require_positive("the gain drift's correlation time in hours", self.correlation_h)
 
     def kernel(self, lag_h: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return C_g at lags in hours."""
@@ -156,9 +149,9 @@ class GainDrift(eqx.Module):
         InputError
             If shapes do not fit, visibilities are not finite or times do not grow.
         """
-        require_array("the visibilities", visibilities, (layout.n_products, layout.n_times))
-        require_shape("hours", hours, (layout.n_times,))
-        if not is_traced(hours) and not (np.diff(hours) > 0).all():
+        checks.require_array("the visibilities", visibilities, (layout.n_products, layout.n_times))
+        checks.require_shape("hours", hours, (layout.n_times,))
+        if not checks.is_traced(hours) and not (np.diff(hours) > 0).all():
             raise InputError("the sample times (hours) must grow from one to the next")
         width = self.width(hours) if width is None else width
         earlier = np.arange(layout.n_times)[:, None] - np.arange(width + 1)[None]
@@ -301,7 +294,7 @@ def difference(true: ProductBeams, model: ProductBeams) -> ProductBeams:
     InputError
         If their shapes differ.
     """
-    require_shape("the other beam's coefficients", true.modes, model.modes.shape)
+    checks.require_shape("the other beam's coefficients", true.modes, model.modes.shape)
     return ProductBeams(true.modes - model.modes, model.frequency_mhz)
 
 

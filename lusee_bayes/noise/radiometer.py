@@ -20,14 +20,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Complex, Float
 
+from lusee_bayes.core import checks
 from lusee_bayes.core.arrays import Array, compiled, namespace
-from lusee_bayes.core.checks import (
-    is_traced,
-    require_finite,
-    require_float64,
-    require_positive,
-    require_shape,
-)
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.instrument.products import DataLayout, auto_indices, ports, to_matrix, without_gaps
 from lusee_bayes.noise.covariance import Covariance, DiagonalCovariance, TimeBlockCovariance
@@ -140,22 +134,22 @@ def radiometer_noise(
         raise InputError(f"unknown radiometer form '{form}'; {nearest(form, RADIOMETER_FORMS)}")
     given = {"bandwidth_hz": bandwidth_hz, "step_s": step_s, "factor": factor}
     for name, value in (given | {"duty_cycle": duty_cycle}).items():
-        require_positive(f"the radiometer's {name}", value)
-    if not is_traced(duty_cycle) and duty_cycle > 1.0:
+        checks.require_positive(f"the radiometer's {name}", value)
+    if not checks.is_traced(duty_cycle) and duty_cycle > 1.0:
         raise InputError(f"the radiometer's duty_cycle must not exceed 1, got {duty_cycle}")
-    require_float64("the visibilities", visibilities)
-    require_shape("the visibilities", visibilities, (layout.n_products, layout.n_times))
+    checks.require_float64("the visibilities", visibilities)
+    checks.require_shape("the visibilities", visibilities, (layout.n_products, layout.n_times))
     visibilities = without_gaps(visibilities, layout)
-    require_finite("the visibilities", visibilities)
+    checks.require_finite("the visibilities", visibilities)
     autos = visibilities[auto_indices(round(np.sqrt(layout.n_products)))]
-    require_positive(
+    checks.require_positive(
         "the antenna temperature (autos of the visibilities)",
         autos,
         "noise levels are taken from it; use a sky with a positive mean",
     )
     scale = factor / (bandwidth_hz * step_s * duty_cycle)
     if np.ndim(scale):
-        require_shape("the radiometer's step_s", scale, (layout.n_times,))
+        checks.require_shape("the radiometer's step_s", scale, (layout.n_times,))
     else:
         scale = namespace(scale, visibilities).full(layout.n_times, scale)
     if form == "paper":

@@ -14,17 +14,7 @@ from lusee_bayes.core.harmonics import lmax_of
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.paper.claims import FREQUENCIES, SHOWN_FREQUENCIES, TABLE, Cases, frequency_case
-from lusee_bayes.report.figures.drawing import (
-    BLUE,
-    DIVERGING,
-    GREY,
-    framed,
-    mollweide,
-    orthographic,
-    shown,
-    taper_fwhm_deg,
-    temperatures,
-)
+from lusee_bayes.report.figures import drawing
 
 # the paper's colours by group, of lightness different enough for colour-blind readers; the lines
 # within a group differ in style
@@ -43,12 +33,12 @@ MAP_CASES = (
 
 def beam_panels(cases: Cases) -> Figure:
     """Figure 2: an auto and two crosses at five frequencies, each over its peak."""
-    figure, panels = framed((13, 8), 3, len(SHOWN_FREQUENCIES))
+    figure, panels = drawing.framed((13, 8), 3, len(SHOWN_FREQUENCIES))
     for column, frequency in enumerate(SHOWN_FREQUENCIES):
         beam = cases[frequency_case(frequency)]["beam"]
         grid = HemisphereGrid.gauss_legendre(beam.sizes["theta"], beam.sizes["phi"])
         for row, name in enumerate(beam["pattern"].values):
-            image = orthographic(panels[row, column], grid, np.abs(beam.values[row]))
+            image = drawing.orthographic(panels[row, column], grid, np.abs(beam.values[row]))
             panels[0, column].set_title(f"{frequency} MHz")
             panels[row, 0].set_ylabel(str(name))
     figure.colorbar(image, ax=panels, label="beam / its peak", shrink=0.6)
@@ -60,10 +50,10 @@ def data_by_product(cases: Cases) -> Figure:
     """Figure 3: the products at 25 MHz side by side, time running within each."""
     data = cases["fiducial"]["data"]
     n_products, n_times = data.shape
-    figure, axes = framed((11, 4))
+    figure, axes = drawing.framed((11, 4))
     for k, series in enumerate(data.values):
-        axes.plot(k * n_times + np.arange(n_times), series, color=BLUE, lw=1.0)
-        axes.axvline(k * n_times, color=GREY, lw=0.4)
+        axes.plot(k * n_times + np.arange(n_times), series, color=drawing.BLUE, lw=1.0)
+        axes.axvline(k * n_times, color=drawing.GREY, lw=0.4)
     centres = (np.arange(n_products) + 0.5) * n_times
     axes.set_xticks(centres, [str(name) for name in data["product"].values], fontsize=8)
     axes.tick_params(axis="x", length=0)
@@ -85,30 +75,32 @@ def frequency_maps(cases: Cases) -> Figure:
         mean, truth = (drawn(case, name) for name in ("mean", "truth"))
         percent = 100.0 * (mean - truth) / truth.mean()
         limit = float(np.percentile(np.abs(percent), 99.0))
-        norm = temperatures(truth)
+        norm = drawing.temperatures(truth)
         seen, signed = case["highest_altitude"].values, Normalize(-limit, limit)
         rows = [
             ("truth", truth, norm, "inferno", None),
             ("posterior mean", mean, norm, "inferno", seen),
-            ("difference", percent, signed, DIVERGING, seen),
+            ("difference", percent, signed, drawing.DIVERGING, seen),
         ]
         for row, (name, pixels, scale, cmap, altitude) in enumerate(rows):
             axes = figure.add_subplot(3, columns, row * columns + column + 1)
-            image = mollweide(axes, pixels, norm=scale, cmap=cmap, highest_altitude=altitude)
+            image = drawing.mollweide(
+                axes, pixels, norm=scale, cmap=cmap, highest_altitude=altitude
+            )
             axes.set_title(f"{frequency} MHz, {name}", fontsize=10)
             axes.set_xticklabels([])
             axes.set_yticklabels([])
             flat_bar(figure, axes, image, "K" if row < 2 else "% of the mean sky")
     figure.suptitle(
         "Galactic coordinates, longitude grows to the left; dashed: never observed; drawn through "
-        f"a beam of {taper_fwhm_deg(lmax_of(case.sizes['mode'])):.1f}° (FWHM)"
+        f"a beam of {drawing.taper_fwhm_deg(lmax_of(case.sizes['mode'])):.1f}° (FWHM)"
     )
     return figure
 
 
 def drawn(case: xr.Dataset, name: str) -> Float[np.ndarray, " pixels"]:
     """Map of ``mean`` or ``truth`` as reports draw it, through the beam of the taper."""
-    return shown(case[f"{name}_modes"].values, healpy.npix2nside(case.sizes["pixel"]))
+    return drawing.shown(case[f"{name}_modes"].values, healpy.npix2nside(case.sizes["pixel"]))
 
 
 def flat_bar(figure: Figure, axes: Axes | list[Axes], image, unit: str) -> None:
@@ -133,7 +125,7 @@ def flat_bar(figure: Figure, axes: Axes | list[Axes], image, unit: str) -> None:
 
 def by_frequency(cases: Cases, metric: str) -> Figure:
     """Figures 5, 6: rho_ell or SNR_ell, one curve for each frequency, from dark (low) to light."""
-    figure, axes = framed((8, 4.8))
+    figure, axes = drawing.framed((8, 4.8))
     shades = colormaps["viridis"](np.linspace(0.0, 0.92, len(FREQUENCIES)))
     for k, (frequency, shade) in enumerate(zip(FREQUENCIES, shades, strict=True)):
         curve = cases[frequency_case(frequency)][metric]
@@ -155,7 +147,7 @@ def dress(axes: Axes, metric: str, lmax: int) -> None:
         axes.set(ylabel=r"$\mathrm{SNR}_\ell$", yscale="log")
         levels = (1.0,)
     for level in levels:
-        axes.axhline(level, color=GREY, lw=0.7, ls=":", zorder=0)
+        axes.axhline(level, color=drawing.GREY, lw=0.7, ls=":", zorder=0)
 
 
 def by_scenario(cases: Cases, metric: str) -> Figure:
@@ -163,7 +155,7 @@ def by_scenario(cases: Cases, metric: str) -> Figure:
 
     The fiducial one is black in all of them.
     """
-    figure, panels = framed((12, 8), 2, 2, sharex=True, sharey=True)
+    figure, panels = drawing.framed((12, 8), 2, 2, sharex=True, sharey=True)
     for axes, (title, colour) in zip(panels.flat, COLOURS.items(), strict=True):
         curve = cases["fiducial"][metric]
         axes.plot(curve["ell"][1:], curve[1:], color="black", lw=1.6, label="fiducial")
@@ -192,7 +184,7 @@ def _title(name: str) -> str:
 def scenario_maps(cases: Cases) -> Figure:
     """Figure 9: the true sky at 25 MHz and the map of every scenario, in the same colours."""
     truth = drawn(cases["fiducial"], "truth")
-    norm = temperatures(truth)
+    norm = drawing.temperatures(truth)
     figure = Figure(figsize=(13, 11), layout="constrained")
     panels = [("truth", truth, None)] + [
         (_title(name), drawn(cases[name], "mean"), cases[name]["highest_altitude"].values)
@@ -200,7 +192,7 @@ def scenario_maps(cases: Cases) -> Figure:
     ]
     for position, (title, pixels, altitude) in enumerate(panels, 1):
         axes = figure.add_subplot(4, 3, position)
-        image = mollweide(axes, pixels, norm=norm, highest_altitude=altitude)
+        image = drawing.mollweide(axes, pixels, norm=norm, highest_altitude=altitude)
         axes.set_title(title, fontsize=11)
         axes.set_xticklabels([])
         axes.set_yticklabels([])
@@ -208,7 +200,7 @@ def scenario_maps(cases: Cases) -> Figure:
     lmax = lmax_of(cases["fiducial"].sizes["mode"])
     figure.suptitle(
         "Maps at 25 MHz, Galactic coordinates; dashed: never observed; drawn through a beam of "
-        f"{taper_fwhm_deg(lmax):.1f}° (FWHM)"
+        f"{drawing.taper_fwhm_deg(lmax):.1f}° (FWHM)"
     )
     return figure
 

@@ -11,12 +11,7 @@ from jaxtyping import Float
 from lusee_bayes.flight.gain_model import read_gain_table
 from lusee_bayes.flight.reduced import read_reduced
 from lusee_bayes.flight.session_files import read_session
-from lusee_bayes.instrument.beams.luseepy_files import (
-    PortResponse,
-    ScalarBeam,
-    read_response,
-    read_scalar_beam,
-)
+from lusee_bayes.instrument.beams import luseepy_files
 from lusee_bayes.instrument.beams.sampled import read_sampled
 from lusee_bayes.instrument.products import N_ANTENNAS, auto_indices, labels
 from lusee_bayes.instrument.visibilities import Visibilities, read_visibilities
@@ -25,7 +20,7 @@ from lusee_bayes.instrument.waterfalls import read_waterfall
 
 def describe_response(path: Path) -> list[str]:
     """A four-port response."""
-    response = read_response(path)
+    response = luseepy_files.read_response(path)
     known = response.frequencies_mhz
     middle = float(known[len(known) // 2])
     kelvin = response.per_kelvin(middle)
@@ -41,7 +36,7 @@ def describe_response(path: Path) -> list[str]:
 
 def describe_scalar_beam(path: Path) -> list[str]:
     """A scalar beam."""
-    beam = read_scalar_beam(path)
+    beam = luseepy_files.read_scalar_beam(path)
     known = beam.frequencies_mhz
     middle = float(known[len(known) // 2])
     lines = [
@@ -61,7 +56,7 @@ def describe_sampled_beams(path: Path) -> list[str]:
     return [str(read_sampled(path))]
 
 
-def _grid_lines(beam: ScalarBeam | PortResponse) -> list[str]:
+def _grid_lines(beam: luseepy_files.ScalarBeam | luseepy_files.PortResponse) -> list[str]:
     known = beam.frequencies_mhz
     return [
         f"{len(known)} frequencies from {known[0]:g} to {known[-1]:g} MHz",

@@ -19,14 +19,9 @@ from lusee_bayes.core.harmonics import modes_to_map, power_spectrum
 from lusee_bayes.core.trees import quantity
 from lusee_bayes.experiment.diagnosis import Diagnosis
 from lusee_bayes.experiment.unknowns import PointingReport, UnknownsReport
+from lusee_bayes.judge import measures
 from lusee_bayes.judge.chi2 import ChiSquare, Level
 from lusee_bayes.judge.coverage import Coverage, latitudes
-from lusee_bayes.judge.measures import (
-    correlation,
-    effective_resolution_deg,
-    ell_cross,
-    signal_to_noise,
-)
 from lusee_bayes.judge.residuals import Group
 from lusee_bayes.linear.information import Information
 
@@ -257,25 +252,25 @@ class ChannelResult(ChannelData, Described):
         """SNR_ell of the map, or of another mean; None where the truth is not known."""
         if self.truth is None:
             return None
-        return signal_to_noise(self.mean if mean is None else mean, self.truth)
+        return measures.signal_to_noise(self.mean if mean is None else mean, self.truth)
 
     @property
     def ell_cross(self) -> int | None:
         """First ell >= 1 with SNR < 1; None if there is none, or no truth."""
         snr = self.snr()
-        return None if snr is None else ell_cross(snr)
+        return None if snr is None else measures.ell_cross(snr)
 
     @property
     def resolution_deg(self) -> float | None:
         """180 degrees over the first ell of which the prior supplies more than half."""
-        return effective_resolution_deg(self.prior_fraction)
+        return measures.effective_resolution_deg(self.prior_fraction)
 
     def spectra(self) -> dict[str, Shaped[np.ndarray, " ells"]]:
         """Columns of spectra.csv; rho, snr and cl_truth only where the truth is known."""
         truth, alone = self.truth, self.independent
         columns = {
             "ell": np.arange(len(self.prior_fraction)),
-            "rho": None if truth is None else correlation(self.mean, truth),
+            "rho": None if truth is None else measures.correlation(self.mean, truth),
             "snr": self.snr(),
             "cl_prior": power_spectrum(self.prior_std),
             "cl_mean": power_spectrum(self.mean),

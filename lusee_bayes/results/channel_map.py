@@ -15,15 +15,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int8
 
+from lusee_bayes.core import harmonics
 from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels
-from lusee_bayes.core.harmonics import (
-    azimuth_functions,
-    lmax_of,
-    mean_over_m,
-    mode_numbers,
-    modes_to_map,
-    polar_functions,
-)
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.diagnosis import diagnose
@@ -31,14 +24,9 @@ from lusee_bayes.experiment.experiment import Experiment, doubts, explained, inf
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.unknowns import Unknowns, flux_table, pointing_report
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
+from lusee_bayes.judge import measures
 from lusee_bayes.judge.chi2 import LEVELS
 from lusee_bayes.judge.coverage import N_DRAWS, Counts
-from lusee_bayes.judge.measures import (
-    expected_chi2,
-    highest_altitude,
-    strengths,
-    strengths_in_words,
-)
 from lusee_bayes.judge.plausibility import about_information
 from lusee_bayes.judge.residuals import Residuals, residuals
 from lusee_bayes.judge.split import Split
@@ -170,7 +158,9 @@ class Conditioned:
         """
         covariance, nside = self.covariance, self.experiment.scenario.map_nside
         monopole = 1.0 / np.sqrt(4.0 * np.pi)
-        with_monopole = 2.0 * modes_to_map(covariance[0], nside) - monopole * covariance[0, 0]
+        with_monopole = (
+            2.0 * harmonics.modes_to_map(covariance[0], nside) - monopole * covariance[0, 0]
+        )
         before = prior_pixel_std(self.found.model.prior, nside) ** 2
         return self.pixel_std**2 - monopole * with_monopole, before
 
@@ -183,7 +173,7 @@ class Conditioned:
     def expected(self) -> float:
         """Of chi^2 of these data about the mean, if the model holds."""
         variance = None if self.onto else np.diagonal(self.covariance)
-        return expected_chi2(self.judged.posterior, self.own.model.n_data, variance)
+        return measures.expected_chi2(self.judged.posterior, self.own.model.n_data, variance)
 
     @cached_property
     def drawn(self) -> Float[np.ndarray, "n modes"]:
@@ -299,7 +289,7 @@ class Conditioned:
             flagged_share=0.0 if fitting is None else fitting.share,
             prior_std=np.sqrt(np.asarray(own.model.prior.variance())),
             truth=None if data.truth is None else np.asarray(data.truth),
-            highest_altitude=highest_altitude(data.observation, scenario.map_nside),
+            highest_altitude=measures.highest_altitude(data.observation, scenario.map_nside),
             instrument=instrument,
             prior=prior_sentence(experiment),
             parameters=() if learned is None else tuple(learned.as_rows()),
@@ -321,10 +311,10 @@ class Conditioned:
         prior = self.found.model.prior
         expected = prior.variance() - np.diagonal(self.covariance)
         left, before = self.without_monopole
-        strong = strengths(
+        strong = measures.strengths(
             self.posterior.mean - prior.colour(prior.white_mean), expected, before - left
         )
-        fit = found.fit(strengths_in_words(strong))
+        fit = found.fit(measures.strengths_in_words(strong))
 
         def on_grid(values: np.ndarray) -> np.ndarray:
             return np.where(data.layout.present, data.layout.scatter(values), np.nan)
@@ -390,7 +380,7 @@ def channel_result(
         **figures,
         mean=mean,
         std=np.sqrt(variance),
-        prior_fraction=mean_over_m(share),
+        prior_fraction=harmonics.mean_over_m(share),
         pixel_std=width,
         draws=np.asarray(draws),
         log_likelihood=np.asarray(log_likelihood),
@@ -460,8 +450,8 @@ def packed_resolution(
         D, in K.
     """
     variance = np.asarray(prior.variance())
-    ell, _ = mode_numbers(lmax_of(len(variance)))
-    width = np.sqrt(variance if prior.independent else mean_over_m(variance)[ell])
+    ell, _ = harmonics.mode_numbers(harmonics.lmax_of(len(variance)))
+    width = np.sqrt(variance if prior.independent else harmonics.mean_over_m(variance)[ell])
     power = width > 0
     # row by row, D^-1 C S^-1 D
     left = prior.whiten_columns(prior.whiten(covariance))
@@ -498,8 +488,8 @@ def region_rows(nside: int, lmax: int) -> Float[np.ndarray, "regions modes"]:
     by_part = np.argsort(part, kind="stable")
     _, first = np.unique(part[by_part], return_index=True)
     parts = by_part[first]
-    sums = np.add.reduceat(azimuth_functions(phi, lmax)[by_part], first)
-    _, m = mode_numbers(lmax)
-    rows = polar_functions(heights, lmax)[ring[parts]] * sums[:, m + lmax]
+    sums = np.add.reduceat(harmonics.azimuth_functions(phi, lmax)[by_part], first)
+    _, m = harmonics.mode_numbers(lmax)
+    rows = harmonics.polar_functions(heights, lmax)[ring[parts]] * sums[:, m + lmax]
     _, first = np.unique(of[parts], return_index=True)
     return np.add.reduceat(rows, first) / np.bincount(of)[:, None]

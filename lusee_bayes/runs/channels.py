@@ -48,22 +48,9 @@ from lusee_bayes.experiment.experiment import build, draw_key
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.unknowns import Unknowns
 from lusee_bayes.judge.coverage import N_DRAWS
+from lusee_bayes.linear import joint, positive_joint
 from lusee_bayes.linear.amplitudes import Amplitudes, Tied, information_given, tie, told_by_others
 from lusee_bayes.linear.information import Information
-from lusee_bayes.linear.joint import (
-    ComponentSums,
-    channel_sky,
-    component_posterior,
-    paired,
-    summed_information,
-)
-from lusee_bayes.linear.positive_joint import (
-    COARSE_LMAX,
-    MAX_ROUNDS,
-    find_joint_mode,
-    learn_laws,
-    positive_sky,
-)
 from lusee_bayes.results.channel import ChannelData, ChannelResult, SkyModes
 from lusee_bayes.results.channel_map import Conditioned, channel_result, conditioned
 from lusee_bayes.results.map_files import information_file, read_information
@@ -175,10 +162,12 @@ class ChannelInformation:
         information, key = self.information, draw_key(scenario)
         draws, spread, n_draws = components.draws, components.spread, scenario.output.draws
         if components.mode is not None:
-            sky = positive_sky(components.mode, number, information, spread, draws, key)
+            sky = positive_joint.positive_sky(
+                components.mode, number, information, spread, draws, key
+            )
         else:
             means = (components.mean, spread, draws)
-            sky = channel_sky(components.prior, number, information, *means, key)
+            sky = joint.channel_sky(components.prior, number, information, *means, key)
         skies, report = np.asarray(sky.draws[:n_draws]), None
         if self.unknowns is not None:
             report = self.unknowns.report(sky.mean, sky.covariance, joint=True)
@@ -244,11 +233,11 @@ class ChannelsInFiles:
         """What a function of every channel's information says of the component maps."""
         files, channels = self.files, self.channels
 
-        def add(numbers: range) -> ComponentSums:
-            sums = ComponentSums.empty(prior, reference)
+        def add(numbers: range) -> joint.ComponentSums:
+            sums = joint.ComponentSums.empty(prior, reference)
             for number in numbers:
                 information = function(number, files.information(channels[number]))
-                sums = summed_information(sums, prior, number, information)
+                sums = joint.summed_information(sums, prior, number, information)
             return sums
 
         # the same blocks, and the same tree of them, whatever carries out the tasks
@@ -259,7 +248,7 @@ class ChannelsInFiles:
         names = [names_of(channels[block.start : block.stop]) for block in blocks]
         tasks = Tasks(add, blocks, names)
         return self.engine.reduced(
-            tasks, ComponentSums.plus, self.stages, "joint sums"
+            tasks, joint.ComponentSums.plus, self.stages, "joint sums"
         ).information()
 
 
@@ -295,11 +284,11 @@ def solve_components(
         with stages("templates"):
             skies = spectral.positive_skies(frequencies, scenario.lmax)
         silent = replace(channels, stages=Stages())
-        coarse = spectral.lmax_of_fields(min(scenario.lmax, COARSE_LMAX))
-        with stages.progress("laws of the fields", MAX_ROUNDS) as report:
-            laws = learn_laws(skies, silent, lmax_fields=coarse, report=report)
-        with stages.progress("positive skies", MAX_ROUNDS) as report:
-            mode = find_joint_mode(skies, laws, silent, report=report)
+        coarse = spectral.lmax_of_fields(min(scenario.lmax, positive_joint.COARSE_LMAX))
+        with stages.progress("laws of the fields", positive_joint.MAX_ROUNDS) as report:
+            laws = positive_joint.learn_laws(skies, silent, lmax_fields=coarse, report=report)
+        with stages.progress("positive skies", positive_joint.MAX_ROUNDS) as report:
+            mode = positive_joint.find_joint_mode(skies, laws, silent, report=report)
         prior, posterior, chi2, moved = mode.prior, mode.posterior, mode.energy, mode.moved
     else:
         reference, skies = map(np.array, zip(*shared, strict=True))
@@ -307,14 +296,14 @@ def solve_components(
         information = channels.summed(prior, reference, lambda _, information: information)
     with stages("joint posterior"):
         if mode is None:
-            posterior = component_posterior(information, prior)
+            posterior = joint.component_posterior(information, prior)
             chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
             moved = float(posterior.refinement)
         shape = (prior.n_components, posterior.mean.shape[0] // prior.n_components)
         return Components(
             prior,
             posterior.mean.reshape(shape),
-            jax.block_until_ready(paired(posterior.covariance(), prior)),
+            jax.block_until_ready(joint.paired(posterior.covariance(), prior)),
             posterior.sample(draw_key(scenario), n_draws).reshape(n_draws, *shape),
             chi2,
             float(posterior.log_evidence),

@@ -13,14 +13,8 @@ from lusee_bayes.experiment.data_files import Data, are_sessions, reduced_of, vi
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.flight.reduced import REDUCED, Reduced, write_reduced
 from lusee_bayes.report.figures import judgement, maps
+from lusee_bayes.results import map_files
 from lusee_bayes.results.finished_runs import Provenance
-from lusee_bayes.results.map_files import (
-    cards,
-    diagnostics_tree,
-    posterior_tree,
-    write_cubes,
-    write_maps,
-)
 from lusee_bayes.results.map_result import MapResult
 from lusee_bayes.runs.channels import CHANNELS, map_channels
 from lusee_bayes.runs.cost import posterior_cost, require_fits
@@ -132,13 +126,13 @@ def _as_used(reduced: Reduced, result: MapResult) -> Reduced:
 
 def _write_maps(result: MapResult, folder: Path) -> None:
     if result.single:
-        write_maps(folder, result.channel.maps(), result.scenario)
+        map_files.write_maps(folder, result.channel.maps(), result.scenario)
     else:
-        write_cubes(folder, result.maps(), result.frequencies_mhz, result.scenario)
+        map_files.write_cubes(folder, result.maps(), result.frequencies_mhz, result.scenario)
 
 
 def _write_coefficients(result: MapResult, folder: Path) -> None:
-    header = cards("mean", result.scenario)
+    header = map_files.cards("mean", result.scenario)
     write_alms(folder / "mean_alm.fits", result.channel.mean, header)
 
 
@@ -146,8 +140,8 @@ def _write_coefficients(result: MapResult, folder: Path) -> None:
 MAP = RunKind(
     "map",
     outputs=(
-        netcdf_file("posterior.nc", posterior_tree),
-        netcdf_file("diagnostics.nc", diagnostics_tree),
+        netcdf_file("posterior.nc", map_files.posterior_tree),
+        netcdf_file("diagnostics.nc", map_files.diagnostics_tree),
         Output(_write_maps),
         Output(_write_coefficients, wanted=lambda result: result.single),
         rows_file("spectra.csv", lambda result: result.spectra()),

@@ -18,14 +18,8 @@ from lusee_bayes.core.reading import reading
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.sampling import programs
 from lusee_bayes.sampling.hmc import Chains
-from lusee_bayes.sampling.programs import (
-    DATA,
-    Program,
-    collapsed_draws,
-    is_collapsed,
-    numpyro_promotion,
-)
 from lusee_bayes.systematics.systematic import SKY
 
 # what a file of samples holds at least
@@ -50,7 +44,7 @@ GROUPS = Layout(
 
 def to_datatree(
     chains: Chains,
-    program: Program,
+    program: programs.Program,
     model: LinearGaussian,
     posterior: Posterior,
     data: Visibilities,
@@ -96,15 +90,15 @@ def to_datatree(
     n_chains, n_draws = next(iter(sites.values())).shape[:2]
     step = max(1, n_chains * n_draws // n_predictive)
     thinned = {name: values[:, ::step] for name, values in sites.items()}
-    with numpyro_promotion():
+    with programs.numpyro_promotion():
         prior = Predictive(program.model, num_samples=n_predictive)(keys[1], **arguments)
-        if is_collapsed(program, arguments, data.data):
+        if programs.is_collapsed(program, arguments, data.data):
             given = (program, arguments, data.data)
-            sites[SKY] = collapsed_draws(*given, sites, keys[0])
-            replicated = collapsed_draws(*given, thinned, keys[2], sites[SKY][:, ::step])
+            sites[SKY] = programs.collapsed_draws(*given, sites, keys[0])
+            replicated = programs.collapsed_draws(*given, thinned, keys[2], sites[SKY][:, ::step])
         else:
-            again = Predictive(program.model, thinned, batch_ndims=2, return_sites=[DATA])
-            replicated = again(keys[2], **arguments)[DATA]
+            again = Predictive(program.model, thinned, batch_ndims=2, return_sites=[programs.DATA])
+            replicated = again(keys[2], **arguments)[programs.DATA]
     constants = {
         "prior_std": np.sqrt(model.prior.variance()),
         "analytic_mean": posterior.mean,
@@ -112,7 +106,7 @@ def to_datatree(
     }
     if data.truth is not None:
         constants["truth"] = data.truth
-    dims = {DATA: ["datum"], **{name: ["mode"] for name in (SKY, *constants)}}
+    dims = {programs.DATA: ["datum"], **{name: ["mode"] for name in (SKY, *constants)}}
     if sites.get("gains", np.empty(0)).ndim == 4:
         dims["gains"] = ["antenna", "sample"]
     constants |= {f"true_{name}": value for name, value in (truth or {}).items() if name in sites}
@@ -120,9 +114,9 @@ def to_datatree(
         "posterior": sites,
         "sample_stats": chains.statistics,
         "prior": {name: values[None] for name, values in prior.items() if name in sites},
-        "prior_predictive": {DATA: prior[DATA][None]},
-        "posterior_predictive": {DATA: replicated},
-        "observed_data": {DATA: data.data},
+        "prior_predictive": {programs.DATA: prior[programs.DATA][None]},
+        "posterior_predictive": {programs.DATA: replicated},
+        "observed_data": {programs.DATA: data.data},
         "constant_data": constants,
     }
     tree = arviz_base.from_dict(

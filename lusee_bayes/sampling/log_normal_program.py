@@ -47,15 +47,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import block_diag
 
+from lusee_bayes.core import linalg
 from lusee_bayes.core.arrays import Array, on_device, on_host
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.linalg import (
-    checked_cholesky,
-    inverse_from_cholesky,
-    solve_lower,
-    symmetric_product,
-)
 from lusee_bayes.linear.information import Information
 from lusee_bayes.sampling.hmc import Whitening
 from lusee_bayes.sampling.log_normal_prior import AMPLITUDE, STRUCTURE, TILT, LogNormalPrior
@@ -239,19 +234,19 @@ def find_mode(
     here, moved, damping, least = information.recentred(sky.modes(white)), np.inf, 0.0, 0.0
     for steps in range(MAX_STEPS + 1):
         jacobian = sky.jacobian(white)
-        curvature = symmetric_product(jacobian.T @ here.matrix, jacobian)
+        curvature = linalg.symmetric_product(jacobian.T @ here.matrix, jacobian)
         curvature[np.diag_indices(len(curvature))] += 1.0
-        lower = checked_cholesky("the curvature of the posterior", curvature)
+        lower = linalg.checked_cholesky("the curvature of the posterior", curvature)
         slope = white - jacobian.T @ here.vector
-        half = solve_lower(lower, slope[:, None], transpose=False)
+        half = linalg.solve_lower(lower, slope[:, None], transpose=False)
         moved = float(np.linalg.norm(half))
         if moved < (SETTLED if steps < PATIENCE else ROUGH):
             return LogNormalMode(sky, here, white, jacobian, lower)
         if damping:
             damped = curvature + damping * np.eye(sky.size)
-            lower = checked_cholesky("the damped curvature", damped)
-            half = solve_lower(lower, slope[:, None], transpose=False)
-        step, energy = solve_lower(lower, half, transpose=True)[:, 0], _energy(here, white)
+            lower = linalg.checked_cholesky("the damped curvature", damped)
+            half = linalg.solve_lower(lower, slope[:, None], transpose=False)
+        step, energy = linalg.solve_lower(lower, half, transpose=True)[:, 0], _energy(here, white)
         white, here = _descended(sky, here, white, step, moved < SHORT)
         promised = float(2.0 * step @ slope - step @ curvature @ step)
         gained = (energy - _energy(here, white)) / max(promised, ROUNDING)
@@ -331,7 +326,7 @@ def learn_spectrum(prior: LogNormalPrior, information: Information) -> LogNormal
 def _evidence_about(mode: LogNormalMode) -> tuple[Pair, PairMatrix, Unknowns]:
     """Slope of the evidence, Fisher information, and 1 - (H^-1)_ii of every mode of the map."""
     sky, slopes = mode.sky, mode.sky.power_law_slopes()
-    left = inverse_from_cholesky(mode.lower)[: sky.n_modes, : sky.n_modes]
+    left = linalg.inverse_from_cholesky(mode.lower)[: sky.n_modes, : sky.n_modes]
     slope = slopes @ (mode.white[: sky.n_modes] ** 2 + np.diagonal(left) - 1.0)
     known = np.eye(sky.n_modes) - left
     return slope, 2.0 * slopes @ (known**2 @ slopes.T), np.diagonal(known)

@@ -21,19 +21,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
+from lusee_bayes.core import linalg
 from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.checks import Described, extent, is_traced, require_array, require_whole
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import LARGEST_LMAX, n_modes, per_mode
 from lusee_bayes.core.layouts import Layout, Variable
-from lusee_bayes.core.linalg import (
-    checked_cholesky,
-    outer_sandwich,
-    sandwich,
-    scaled,
-    solve_lower,
-    times_lower,
-)
 from lusee_bayes.core.reading import read_text, require_file
 from lusee_bayes.sky.sky_source import read_sky_file
 
@@ -207,7 +200,7 @@ class DensePrior(Prior):
         require_array("the prior covariance", covariance, (len(covariance), len(covariance)))
         if not is_traced(covariance):
             _require_symmetric_prior(np.asarray(covariance))
-        return cls(checked_cholesky("the prior covariance", covariance), mean=mean)
+        return cls(linalg.checked_cholesky("the prior covariance", covariance), mean=mean)
 
     @classmethod
     def of_root(
@@ -245,23 +238,25 @@ class DensePrior(Prior):
         return self.root.shape[0]
 
     def colour(self, u):
-        return times_lower(u.reshape(-1, self.size), self.root, transpose=True).reshape(u.shape)
+        return linalg.times_lower(u.reshape(-1, self.size), self.root, transpose=True).reshape(
+            u.shape
+        )
 
     def colour_columns(self, a):
-        return times_lower(a, self.root, transpose=False)
+        return linalg.times_lower(a, self.root, transpose=False)
 
     def whiten(self, m):
         flat = m.reshape(-1, self.size)
-        return solve_lower(self.root, flat.T, transpose=False).T.reshape(m.shape)
+        return linalg.solve_lower(self.root, flat.T, transpose=False).T.reshape(m.shape)
 
     def whiten_columns(self, a):
-        return solve_lower(self.root, a.T, transpose=True).T
+        return linalg.solve_lower(self.root, a.T, transpose=True).T
 
     def sandwich(self, matrix):
-        return sandwich(matrix, self.root)
+        return linalg.sandwich(matrix, self.root)
 
     def colour_covariance(self, white):
-        return outer_sandwich(white, self.root)
+        return linalg.outer_sandwich(white, self.root)
 
     def widened(self, factor):
         return DensePrior(self.root * factor, mean=self.mean)
@@ -271,7 +266,7 @@ class DensePrior(Prior):
         return xp.einsum("ij,ij->i", self.root, self.root)
 
     def covariance(self):
-        product = times_lower(self.root, self.root, transpose=True)
+        product = linalg.times_lower(self.root, self.root, transpose=True)
         return (product + product.T) / 2.0
 
     def log_det(self):
@@ -322,10 +317,10 @@ class DiagonalPrior(Prior):
         return self.whiten(a)
 
     def sandwich(self, matrix):
-        return scaled(matrix, self.widths)
+        return linalg.scaled(matrix, self.widths)
 
     def colour_covariance(self, white):
-        return scaled(white, self.widths, overwrite=True)
+        return linalg.scaled(white, self.widths, overwrite=True)
 
     def variance(self):
         return self.widths**2

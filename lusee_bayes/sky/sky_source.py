@@ -26,20 +26,12 @@ import numpy as np
 from astropy.io import fits
 from jaxtyping import Float
 
+from lusee_bayes.core import harmonics
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import Described, number, require_array, require_finite, require_whole
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.files import replacing, user_path
 from lusee_bayes.core.formats import is_fits, opened, require_readable_hdf5
-from lusee_bayes.core.harmonics import (
-    LARGEST_LMAX,
-    from_healpy,
-    lmax_of,
-    map_to_modes,
-    n_modes,
-    power_spectrum,
-    to_healpy,
-)
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.reading import naming, read_arrays, reading, require_file
@@ -70,7 +62,7 @@ class Sky(Described, eqx.Module):
 
     def __check_init__(self):
         require_array("the sky", self.modes)
-        lmax_of(self.modes.shape[-1])
+        harmonics.lmax_of(self.modes.shape[-1])
 
     def description(self) -> tuple[str, ...]:
         mean = number(self.modes[0] / np.sqrt(4.0 * np.pi))
@@ -82,7 +74,7 @@ class Sky(Described, eqx.Module):
     @property
     def lmax(self) -> int:
         """Highest ell of the coefficients."""
-        return lmax_of(self.modes.shape[-1])
+        return harmonics.lmax_of(self.modes.shape[-1])
 
     @property
     def mean_temperature(self) -> float:
@@ -91,7 +83,7 @@ class Sky(Described, eqx.Module):
 
     def spectrum(self) -> Float[Array, " ells"]:
         """C_ell in K^2, mean not subtracted."""
-        return power_spectrum(self.modes)
+        return harmonics.power_spectrum(self.modes)
 
 
 class SkyFile(ABC):
@@ -162,7 +154,7 @@ def modes_of_map(
 ) -> Float[np.ndarray, " modes"]:
     """Coefficients of a file's map; an InputError names the file."""
     with naming(path):
-        return map_to_modes(pixels, lmax)
+        return harmonics.map_to_modes(pixels, lmax)
 
 
 ULSA_DATASET = "smooth_absorb"
@@ -342,12 +334,12 @@ class SkyAlms(SkyFile):
             _read_npz(path) if path.suffix == ".npz" else (None, _read_alm_fits(path))
         )
         require_finite(f"{path}: the coefficients", np.stack([alm.real, alm.imag]))
-        return cls(str(path), frequencies, from_healpy(np.atleast_2d(alm)))
+        return cls(str(path), frequencies, harmonics.from_healpy(np.atleast_2d(alm)))
 
     @property
     def lmax(self) -> int:
         """Highest ell of the coefficients."""
-        return lmax_of(self.modes.shape[1])
+        return harmonics.lmax_of(self.modes.shape[1])
 
     def modes_at(self, frequency_mhz: float, lmax: int) -> Float[np.ndarray, " modes"]:
         if lmax > self.lmax:
@@ -364,7 +356,7 @@ class SkyAlms(SkyFile):
                     f"{', '.join(f'{f:g}' for f in known)}); set sky.file_frequency_mhz to one of "
                     "those, and they are scaled with sky.spectral_index"
                 )
-        return self.modes[channel, : n_modes(lmax)]
+        return self.modes[channel, : harmonics.n_modes(lmax)]
 
     def summary(self) -> tuple[str, ...]:
         known, means = self.frequencies_mhz, self.modes[:, 0] / np.sqrt(4.0 * np.pi)
@@ -394,8 +386,8 @@ def write_alms(path: str | Path, modes: Float[Array, " modes"], header: dict[str
     Path
         The file.
     """
-    alm = to_healpy(modes)
-    lmax = lmax_of(np.shape(modes)[-1])
+    alm = harmonics.to_healpy(modes)
+    lmax = harmonics.lmax_of(np.shape(modes)[-1])
     ell, m = healpy.Alm.getlm(lmax)
     columns = [
         fits.Column("index", "J", array=ell**2 + ell + m + 1),
@@ -430,11 +422,11 @@ def _read_alm_fits(path: Path) -> np.ndarray:
     ell = np.floor(np.sqrt(index - 1.0) + 1e-9).astype(int)
     m = index - 1 - ell**2 - ell
     # what does not fit into memory, or is written twice, fills no lmax either
-    once = index.max() <= LARGEST_LMAX**2 and len(set(index.tolist())) == len(index)
+    once = index.max() <= harmonics.LARGEST_LMAX**2 and len(set(index.tolist())) == len(index)
     if not once or (m < 0).any() or (m > ell).any():
         raise InputError(
             f"{path}: index must be ell^2 + ell + m + 1, each once, with 0 <= m <= ell <= "
-            f"{LARGEST_LMAX}"
+            f"{harmonics.LARGEST_LMAX}"
         )
     lmax = int(ell.max())
     alm = np.full(healpy.Alm.getsize(lmax), np.nan + 0j)
@@ -591,7 +583,7 @@ def _galaxy_modes(frequency_mhz: float, seed: int | None, lmax: int) -> np.ndarr
     """Compute the diffuse sky's coefficients, read-only: variations of a scenario share one sky."""
     require_whole("lmax", lmax, 0, 383)
     nside = 64 if lmax <= 95 else 128
-    modes = map_to_modes(galaxy_map(frequency_mhz, nside=nside, seed=seed), lmax)
+    modes = harmonics.map_to_modes(galaxy_map(frequency_mhz, nside=nside, seed=seed), lmax)
     modes.flags.writeable = False
     return modes
 

@@ -18,14 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
+from lusee_bayes.core import checks
 from lusee_bayes.core.arrays import Array, namespace
-from lusee_bayes.core.checks import (
-    Described,
-    extent,
-    listed,
-    require_array,
-    require_positive,
-)
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import per_mode, power_spectrum
 
@@ -93,7 +87,7 @@ def check_components(names: tuple[str, ...], n_channels: int, residual: float | 
         )
 
 
-class SpectralPrior(Described, eqx.Module):
+class SpectralPrior(checks.Described, eqx.Module):
     """N(0, S) over the skies of all channels; see the module's equations.
 
     Attributes
@@ -128,12 +122,12 @@ class SpectralPrior(Described, eqx.Module):
             ("the mixing", self.mixing, (None, None)),
             ("the components' spectra", self.spectra, (components, None)),
         ):
-            require_array(name, values, shape)
-        require_positive("the components' C_ell", self.spectra)
+            checks.require_array(name, values, shape)
+        checks.require_positive("the components' C_ell", self.spectra)
         if self.residual is not None:
             name, hint = "the residual spectra", "leave them out if there is no residual"
-            require_array(name, self.residual, (channels, self.spectra.shape[1]))
-            require_positive(name, self.residual, hint)
+            checks.require_array(name, self.residual, (channels, self.spectra.shape[1]))
+            checks.require_positive(name, self.residual, hint)
 
     @classmethod
     def components(
@@ -228,7 +222,7 @@ class SpectralPrior(Described, eqx.Module):
         InputError
             For a length that is not positive, and a negative residual.
         """
-        require_positive("the kernel's length in ln frequency", length)
+        checks.require_positive("the kernel's length in ln frequency", length)
         frequencies, skies = np.asarray(frequencies_mhz), np.asarray(skies)
         log_x = np.log(frequencies / reference_mhz)
         power_law = np.exp(index * log_x)
@@ -248,9 +242,10 @@ class SpectralPrior(Described, eqx.Module):
     def description(self) -> tuple[str, ...]:
         residual = "no residual" if self.residual is None else "a residual in each"
         return (
-            f"{self.n_channels} channels, {extent(self.frequencies_mhz, 'MHz')}, "
+            f"{self.n_channels} channels, {checks.extent(self.frequencies_mhz, 'MHz')}, "
             f"lmax = {self.lmax}",
-            f"{self.n_components} component maps ({listed(self.names)}), {residual}; Galactic, K",
+            f"{self.n_components} component maps ({checks.listed(self.names)}), {residual}; "
+            "Galactic, K",
         )
 
     @property

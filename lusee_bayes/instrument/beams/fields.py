@@ -23,15 +23,8 @@ import scipy
 from jaxtyping import Complex, Float, Inexact
 from scipy.special import roots_legendre
 
+from lusee_bayes.core import checks
 from lusee_bayes.core.arrays import Array, as_complex, namespace
-from lusee_bayes.core.checks import (
-    Described,
-    extent,
-    listed,
-    require_float64,
-    require_shape,
-    require_whole,
-)
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import LARGEST_LMAX, SQRT2, lmax_of, mode_numbers, polar_functions
 from lusee_bayes.core.lazy import healpy
@@ -78,7 +71,7 @@ class HemisphereGrid(eqx.Module):
         doubles (tests/instrument/test_monopoles.py). A loss tangent below 0.001 needs more nodes,
         since echoes from deep layers then vary quickly with the angle.
         """
-        require_whole("lmax", lmax, 0, LARGEST_LMAX)
+        checks.require_whole("lmax", lmax, 0, LARGEST_LMAX)
         n = max(lmax, 63) + 1
         return cls.gauss_legendre(2 * n, 2 * n)
 
@@ -116,7 +109,7 @@ class HemisphereGrid(eqx.Module):
         InputError
             If ``f`` does not fit the grid, or its azimuths are too few for ``lmax``.
         """
-        require_shape("the field", f, (*f.shape[:-2], len(self.theta), self.n_phi))
+        checks.require_shape("the field", f, (*f.shape[:-2], len(self.theta), self.n_phi))
         if self.n_phi <= 2 * lmax:
             raise InputError(
                 f"{self.n_phi} azimuths cannot resolve lmax = {lmax}; give more than {2 * lmax}"
@@ -147,7 +140,7 @@ def phasor(angle: Float[Array, "..."]) -> Complex[Array, "..."]:
     return as_complex(xp.cos(angle), xp.sin(angle))
 
 
-class AntennaFields(Described, eqx.Module):
+class AntennaFields(checks.Described, eqx.Module):
     """Complex response of each antenna to a wave arriving from each direction of a grid.
 
     Frame: topocentric, theta from the zenith, phi from East towards North. The time convention is
@@ -167,8 +160,8 @@ class AntennaFields(Described, eqx.Module):
 
     def __check_init__(self):
         expected = (None, len(self.grid.theta), self.grid.n_phi)
-        require_shape("e_theta", self.e_theta, expected)
-        require_shape("e_phi", self.e_phi, (self.e_theta.shape[0], *expected[1:]))
+        checks.require_shape("e_theta", self.e_theta, expected)
+        checks.require_shape("e_phi", self.e_phi, (self.e_theta.shape[0], *expected[1:]))
         for name in ("e_theta", "e_phi"):
             if getattr(self, name).dtype != np.complex128:
                 raise InputError(
@@ -354,7 +347,7 @@ def stokes_pairs(e_theta: Fields, e_phi: Fields, stokes: str = "I") -> Pairs:
     return 1j * (ep * ft - et * fp) / 2.0
 
 
-class ProductBeams(Described, eqx.Module):
+class ProductBeams(checks.Described, eqx.Module):
     """Harmonic coefficients of the beam of every product, in the topocentric frame.
 
     Beams are zero below the horizon.
@@ -375,17 +368,18 @@ class ProductBeams(Described, eqx.Module):
     frequency_mhz: float = eqx.field(static=True)
 
     def __check_init__(self):
-        require_float64("the beam coefficients", self.modes)
+        checks.require_float64("the beam coefficients", self.modes)
         lmax_of(self.modes.shape[-1])
         antennas_of(self.n_products)
 
     def description(self) -> tuple[str, ...]:
         autos = self.modes[auto_indices(antennas_of(self.n_products)), 0]
+        integrals = autos * np.sqrt(4.0 * np.pi)
         return (
             f"{self.n_products} products at {self.frequency_mhz:g} MHz, lmax = {self.lmax}",
             f"{self.modes.shape[1]} real coefficients each, topocentric, K per K: "
-            f"{listed(self.labels)}",
-            f"integrals of the autos over the sky {extent(autos * np.sqrt(4.0 * np.pi), 'sr K/K')}",
+            f"{checks.listed(self.labels)}",
+            f"integrals of the autos over the sky {checks.extent(integrals, 'sr K/K')}",
         )
 
     @property
