@@ -29,8 +29,7 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.experiment.experiment import posterior_draws, under_sky
 from lusee_bayes.experiment.model import set_up
-from lusee_bayes.judge.coverage import Counts
-from lusee_bayes.judge.levels import LEVELS
+from lusee_bayes.judge.coverage import LEVELS, Counts
 from lusee_bayes.report.figures.drawing import BLUE, DIVERGING, GREY, ORANGE, colour_bar, mollweide
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.channel_map import conditioned

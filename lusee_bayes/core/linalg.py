@@ -26,7 +26,7 @@ from jaxtyping import Float
 from scipy.linalg import cython_blas, cython_lapack
 
 from lusee_bayes.core.arrays import Array, namespace, placed
-from lusee_bayes.core.checks import is_traced
+from lusee_bayes.core.checks import is_traced, require_float64
 from lusee_bayes.core.errors import InputError
 
 
@@ -47,63 +47,14 @@ def _routine(name: str) -> Callable[..., None]:
 
 def _in_place(name: str, letters: bytes, matrix: Float[np.ndarray, "n n"]) -> int:
     """Call a routine with the arguments letters, n, matrix, n, info; return info."""
-    _require(matrix, matrix.flags.c_contiguous, "C")
+    require_float64("the matrix", matrix)
+    if not matrix.flags.c_contiguous:
+        raise ValueError("LAPACK needs the matrix in C order")
     n, info = ctypes.c_int(len(matrix)), ctypes.c_int(0)
     words = [ctypes.c_char_p(letters[k : k + 1]) for k in range(len(letters))]
     pointers = (ctypes.byref(n), matrix.ctypes.data, ctypes.byref(n), ctypes.byref(info))
     _routine(name)(*words, *pointers)
     return info.value
-
-
-def factorise_in_place(matrix: Float[np.ndarray, "n n"]) -> bool:
-    """Put L, with L L^T the matrix, into its lower triangle, and zeros above.
-
-    Parameters
-    ----------
-    matrix : (n, n) array
-        Symmetric, in C order; only the lower triangle is read.
-
-    Returns
-    -------
-    bool
-        Whether there is one; if not, the matrix is spoilt.
-    """
-    found = _in_place("dpotrf", b"U", matrix) == 0
-    for row in range(len(matrix)):
-        matrix[row, row + 1 :] = 0.0
-    return found
-
-
-def invert_factorised(lower: Float[np.ndarray, "n n"]) -> None:
-    """Put (L L^T)^-1 into the lower triangle of L, in C order; above it nothing is changed."""
-    _in_place("dpotri", b"U", lower)
-
-
-def solve_triangle(
-    lower: Float[np.ndarray, "n n"], columns: Float[np.ndarray, "n columns"], *, transpose: bool
-) -> None:
-    """Put L^-1 x, or L^-T x, into x.
-
-    Parameters
-    ----------
-    lower : (n, n) array
-        L in C order; above the diagonal nothing is read.
-    columns : (n, columns) array
-        x in Fortran's order.
-    transpose : bool
-    """
-    _require(lower, lower.flags.c_contiguous, "C")
-    _require(columns, columns.flags.f_contiguous, "Fortran's")
-    n, n_columns = (ctypes.byref(ctypes.c_int(k)) for k in columns.shape)
-    words = [ctypes.c_char_p(letter) for letter in (b"L", b"U", b"N" if transpose else b"T", b"N")]
-    one, stride = ctypes.byref(ctypes.c_double(1.0)), ctypes.byref(ctypes.c_int(max(1, len(lower))))
-    matrices = lower.ctypes.data, stride, columns.ctypes.data, stride
-    _routine("dtrsm")(*words, n, n_columns, one, *matrices)
-
-
-def _require(matrix: np.ndarray, ordered: bool, order: str) -> None:
-    if matrix.dtype != np.float64 or not ordered:
-        raise ValueError(f"LAPACK needs float64 in {order} order, got {matrix.dtype}")
 
 
 # strips into which a triangle is split: measured for W^T W at 5232 x 2304 on two cores, 4 strips
@@ -135,7 +86,11 @@ def cholesky(
         if matrix.ndim > 2:
             return np.stack([cholesky(block) for block in matrix])
         lower = np.ascontiguousarray(matrix) if overwrite else matrix.copy(order="C")
-        return lower if factorise_in_place(lower) else np.full(matrix.shape, np.nan)
+        if _in_place("dpotrf", b"U", lower) != 0:
+            return np.full(matrix.shape, np.nan)
+        for row in range(len(lower)):
+            lower[row, row + 1 :] = 0.0
+        return lower
     return jax.lax.linalg.cholesky(matrix, symmetrize_input=False)
 
 
@@ -177,8 +132,14 @@ def solve_lower(
     if namespace(lower, x) is np:
         if lower.ndim > 2:
             return np.linalg.solve(lower.swapaxes(-1, -2) if transpose else lower, x)
-        solved = np.array(x, order="F")
-        solve_triangle(np.ascontiguousarray(lower), solved, transpose=transpose)
+        lower, solved = np.ascontiguousarray(lower), np.array(x, order="F")
+        require_float64("the triangle", lower)
+        require_float64("the right-hand side", solved)
+        words = [ctypes.c_char_p(word) for word in (b"L", b"U", b"N" if transpose else b"T", b"N")]
+        n, n_columns = (ctypes.byref(ctypes.c_int(k)) for k in solved.shape)
+        one, stride = ctypes.c_double(1.0), ctypes.byref(ctypes.c_int(max(1, len(lower))))
+        matrices = lower.ctypes.data, stride, solved.ctypes.data, stride
+        _routine("dtrsm")(*words, n, n_columns, ctypes.byref(one), *matrices)
         return solved
     return jax.lax.linalg.triangular_solve(
         lower, x, left_side=True, lower=True, transpose_a=transpose
@@ -300,7 +261,7 @@ def inverse_from_cholesky(lower: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Return (L L^T)^-1 for lower triangular L, symmetric to the last bit."""
     if namespace(lower) is np:
         inverse = lower.copy(order="C")
-        invert_factorised(inverse)
+        _in_place("dpotri", b"U", inverse)
         return mirrored(inverse)
     x = invert_lower(lower)
     # columns of L^-1 begin at their own row

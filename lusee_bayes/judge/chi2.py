@@ -34,6 +34,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from pydantic import computed_field
 
 from lusee_bayes.core.lazy import special
 
@@ -51,7 +52,7 @@ RULE = (
 
 @dataclass(frozen=True)
 class ChiSquare:
-    """A chi^2 with its degrees of freedom, which need not be whole.
+    """A chi^2 with its degrees of freedom, which need not be whole; ``p`` goes into JSON, too.
 
     Attributes
     ----------
@@ -61,6 +62,7 @@ class ChiSquare:
     chi2: float
     degrees: float
 
+    @computed_field
     @property
     def p(self) -> float:
         """Probability of a chi^2 as far out on its side, if the model holds."""

@@ -18,8 +18,10 @@ from lusee_bayes.core.arrays import Draws, Modes, Pixels
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.harmonics import columns_to_maps, lmax_of, mode_numbers
 from lusee_bayes.core.lazy import healpy, special
-from lusee_bayes.judge.levels import LEVELS, NAMES
 
+# of the central intervals that are counted, and their names in files
+LEVELS = (0.50, 0.68, 0.90, 0.95)
+NAMES = tuple(f"{100 * level:.0f}" for level in LEVELS)
 REST = ("rms", "rms_scatter", "largest", "allowed")
 # draws that tell the scatter: it is then known to 4 %
 N_DRAWS = 300

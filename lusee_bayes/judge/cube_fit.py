@@ -74,10 +74,19 @@ class ChannelFits:
     rest: ChiSquare
     joint: bool = False
 
+    @property
+    def by_channel(self) -> list[ChiSquare]:
+        """That of every channel."""
+        return list(map(ChiSquare, self.chi2.tolist(), self.degrees.tolist()))
+
+    @property
+    def total(self) -> ChiSquare:
+        """That of all channels together."""
+        return ChiSquare(float(self.chi2.sum()), float(self.degrees.sum()))
+
     def p(self) -> Float[np.ndarray, " channels"]:
         """Probability of every channel's chi^2, two-sided."""
-        pairs = zip(self.chi2.tolist(), self.degrees.tolist(), strict=True)
-        return np.array([ChiSquare(*pair).p for pair in pairs])
+        return np.array([one.p for one in self.by_channel])
 
     def extremes(self) -> list[int]:
         """Channels that stand out among all of them, the least probable first."""
@@ -91,11 +100,9 @@ class ChannelFits:
         least = int(np.argmin(p))
         above = int((chdtrc(self.degrees, self.chi2) < 0.5).sum())
         signs = min(1.0, 2.0 * float(bdtr(min(above, n - above), n, 0.5)))
-        total = ChiSquare(float(self.chi2.sum()), float(self.degrees.sum()))
-        furthest = ChiSquare(float(self.chi2[least]), float(self.degrees[least]))
-        where = f"{self.frequencies_mhz[least]:g} MHz, {furthest.found()}"
+        where = f"{self.frequencies_mhz[least]:g} MHz, {self.by_channel[least].found()}"
         return [
-            JointTest("sum over all channels", total.p, 1, total.found()),
+            JointTest("sum over all channels", self.total.p, 1, self.total.found()),
             JointTest("channels above the median", signs, 1, f"{above} of {n}"),
             JointTest("channel furthest out", float(p[least]), n, where),
             JointTest("prior", self.rest.p, 1, self.rest.found(), of_prior=True),
@@ -135,9 +142,7 @@ class ChannelFits:
         """Whether all channels together, or the one furthest out if that is less probable, have
         too small a chi^2.
         """
-        parts = [ChiSquare(*pair) for pair in zip(self.chi2, self.degrees, strict=True)]
-        parts.append(ChiSquare(float(self.chi2.sum()), float(self.degrees.sum())))
-        return min(parts, key=lambda part: part.p).too_small
+        return min([*self.by_channel, self.total], key=lambda one: one.p).too_small
 
     def _advice(self, level: Level) -> list[str]:
         if level == "does not fit" and self._too_quiet():

@@ -15,8 +15,7 @@ from pydantic import BaseModel, Field, model_validator
 from lusee_bayes.core.progress import about_run
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.judge.chi2 import ChiSquare
-from lusee_bayes.judge.coverage import Coverage
-from lusee_bayes.judge.levels import LEVELS
+from lusee_bayes.judge.coverage import LEVELS, Coverage
 from lusee_bayes.judge.residuals import HeldOut
 from lusee_bayes.judge.split import Split
 from lusee_bayes.results.channel import (
@@ -215,7 +214,7 @@ def _row(one: PriorSummary, best: float) -> dict[str, object]:
 def prior_table(priors: Sequence[PriorSummary]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Header and rows: a column for each prior."""
     header, first = ("", *(one.name for one in priors)), priors[0]
-    rows: list[tuple[str, ...]] = []
+    rows: dict[str, list[str]] = {}
 
     def each(form: str, of: Callable[[PriorSummary], float]) -> list[str]:
         """A cell for each prior."""
@@ -225,30 +224,26 @@ def prior_table(priors: Sequence[PriorSummary]) -> tuple[tuple[str, ...], list[t
         values = [of(one) for one in priors]
         return [f"{value - max(values):.1f}" for value in values]
 
-    def add(name: str, cells: list[str]) -> None:
-        rows.append((name, *cells))
-
-    add("ln evidence", each(".1f", lambda one: one.log_evidence))
-    add("less the best", less_best(lambda one: one.log_evidence))
-    add("parameters learned", each("", lambda one: one.parameters))
+    rows["ln evidence"] = each(".1f", lambda one: one.log_evidence)
+    rows["less the best"] = less_best(lambda one: one.log_evidence)
+    rows["parameters learned"] = each("", lambda one: one.parameters)
     for k, held in enumerate(first.held_out):
         left_out = f"{held.kind}s left out"
         density = less_best(lambda one, k=k: one.held_out[k].log_density)
-        add(f"{left_out}: ln p less the best", density)
-        add(f"{left_out}: chi2 of {held.n}", each(".0f", lambda one, k=k: one.held_out[k].chi2))
+        rows[f"{left_out}: ln p less the best"] = density
+        rows[f"{left_out}: chi2 of {held.n}"] = each(".0f", lambda one, k=k: one.held_out[k].chi2)
     for key, words in (("instrument", "no sky explains"), ("rest", "of the sky")):
         parts = [getattr(one, key) for one in priors]
-        add(f"chi2 {words}", [f"{x.chi2:.0f} of {x.degrees:.0f}" for x in parts])
-    if not first.coverage:
-        return header, rows
+        rows[f"chi2 {words}"] = [f"{x.chi2:.0f} of {x.degrees:.0f}" for x in parts]
     for k, part in enumerate(first.coverage):
         for level in (0.68, 0.95):
             n = LEVELS.index(level)
             held = each(".1%", lambda one, k=k, n=n: one.coverage[k].held[n])
-            add(f"{level:.0%} hold, {part.name}", held)
-        add(f"rms pull, {part.name}", each(".2f", lambda one, k=k: one.coverage[k].rms))
-    add("largest pull", each(".1f", lambda one: one.coverage[-1].largest))
-    add("rms error [K]", each(",.0f", lambda one: one.errors[-1].rms_error_k))
+            rows[f"{level:.0%} hold, {part.name}"] = held
+        rows[f"rms pull, {part.name}"] = each(".2f", lambda one, k=k: one.coverage[k].rms)
+    if first.coverage:
+        rows["largest pull"] = each(".1f", lambda one: one.coverage[-1].largest)
+        rows["rms error [K]"] = each(",.0f", lambda one: one.errors[-1].rms_error_k)
     for ell in first.snr:
-        add(f"SNR at ell {ell}", each(".1f", lambda one, ell=ell: one.snr[ell]))
-    return header, rows
+        rows[f"SNR at ell {ell}"] = each(".1f", lambda one, ell=ell: one.snr[ell])
+    return header, [(name, *cells) for name, cells in rows.items()]

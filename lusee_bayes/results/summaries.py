@@ -8,16 +8,8 @@ from pydantic import BaseModel, field_validator
 
 from lusee_bayes.experiment.diagnosis import Diagnosis
 from lusee_bayes.experiment.unknowns import PointingReport, UnknownsReport
-from lusee_bayes.judge.chi2 import Level
+from lusee_bayes.judge.chi2 import ChiSquare, Level
 from lusee_bayes.judge.coverage import Coverage
-
-
-class ChiSquareSummary(BaseModel, from_attributes=True):
-    """A chi^2 in summary.json, with its expectation and its probability."""
-
-    chi2: float
-    degrees: float
-    p: float
 
 
 class JudgedSummary(BaseModel, from_attributes=True):
@@ -25,7 +17,7 @@ class JudgedSummary(BaseModel, from_attributes=True):
 
     level: Level
     verdict: str
-    prior: ChiSquareSummary
+    prior: ChiSquare
     extremes: list[str]
     suspects: list[str]
 
@@ -34,7 +26,7 @@ class ChannelSummary(BaseModel, from_attributes=True):
     """Figures of a channel in summary.json; null where they are not known."""
 
     frequency_mhz: float
-    instrument: ChiSquareSummary
+    instrument: ChiSquare
     judged: JudgedSummary | None
     diagnosis: Diagnosis | None
     ell_cross: int | None

@@ -9,7 +9,7 @@ from lusee_bayes.core.engine import Demand, Engine
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import Data
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
-from lusee_bayes.judge.levels import LEVELS
+from lusee_bayes.judge.coverage import LEVELS
 from lusee_bayes.report.figures.sampling import comparison, rank_statistics
 from lusee_bayes.report.rendering import render_text
 from lusee_bayes.results.finished_runs import Provenance

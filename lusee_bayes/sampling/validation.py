@@ -42,7 +42,7 @@ from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.judge.convergence import AGREE, PER_CHAIN
-from lusee_bayes.judge.levels import LEVELS
+from lusee_bayes.judge.coverage import LEVELS
 from lusee_bayes.linear.linear_gaussian import LinearGaussian, Whitened
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sampling.least import N_BINS, require_draws, require_simulations

@@ -12,8 +12,7 @@ from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
 from lusee_bayes.core.trees import from_tree, to_tree
 from lusee_bayes.experiment.experiment import build, under_sky
 from lusee_bayes.experiment.model import set_up
-from lusee_bayes.judge.coverage import Counts, Coverage
-from lusee_bayes.judge.levels import LEVELS
+from lusee_bayes.judge.coverage import LEVELS, Counts, Coverage
 from lusee_bayes.sky.sky_source import FileSource, GalaxySource, write_alms
 from lusee_bayes.testing.scenarios import small_scenario
 

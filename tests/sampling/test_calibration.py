@@ -21,7 +21,7 @@ from scipy import stats
 import lusee_bayes as lb
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.model import full_model, set_up
-from lusee_bayes.judge.levels import LEVELS
+from lusee_bayes.judge.coverage import LEVELS
 from lusee_bayes.sampling.validation import (
     FALSE_ALARM,
     N_DRAWS,

@@ -20,7 +20,7 @@ from lusee_bayes.experiment.experiment import Experiment, program_pieces
 from lusee_bayes.experiment.model import full_model, set_up, simulate, true_values
 from lusee_bayes.experiment.rounds import settled
 from lusee_bayes.experiment.unknowns import SKY
-from lusee_bayes.judge.levels import LEVELS
+from lusee_bayes.judge.coverage import LEVELS
 from lusee_bayes.linear.amplitudes import template_amplitudes
 from lusee_bayes.sampling.hmc import Sampler
 from lusee_bayes.sampling.programs import numpyro_promotion

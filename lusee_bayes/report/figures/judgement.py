@@ -178,10 +178,12 @@ LEVEL_COLOURS = {"L": COLOURS[4], "M": BLUE, "H": COLOURS[3]}
 def time_line(reduced: Reduced) -> Figure:
     """Draw the gain of every port and what was flagged, over time."""
     days = _days(reduced)
-    reasons = [k for k in range(1, len(REASONS)) if (reduced.reason == k).any()]
-    lines = bool((reduced.lines > 0).any())
-    names = [REASONS[k] for k in reasons] + (["some channels"] if lines else [])
-    size, heights = (12, 3.4 + 0.25 * len(names)), (4, max(len(names), 1))
+    flags = {name: (reduced.reason == k).any(axis=0) for k, name in enumerate(REASONS) if k}
+    flags = {name: flagged for name, flagged in flags.items() if flagged.any()}
+    if (reduced.lines > 0).any():
+        flags["some channels"] = ((reduced.lines > 0) & (reduced.reason == USED)).any(axis=0)
+    n_rows = max(len(flags), 1)
+    size, heights = (12, 3.4 + 0.25 * len(flags)), (4, n_rows)
     figure, (top, bottom) = framed(size, 2, sharex=True, height_ratios=heights)
     level = reduced.level[reduced.bin_of]
     n_ports = level.shape[1]
@@ -198,18 +200,15 @@ def time_line(reduced: Reduced) -> Figure:
     top.legend(handles=handles, loc="upper right", ncols=3, frameon=False)
     top.set(yticks=range(n_ports), ylabel="port", ylim=(n_ports - 0.5, -1.2))
     top.set_title("Gain of every port")
-    marks = [(reduced.reason == k).any(axis=0) for k in reasons]
-    if lines:
-        marks.append(((reduced.lines > 0) & (reduced.reason == USED)).any(axis=0))
-    for row, flagged in enumerate(marks):
+    for row, flagged in enumerate(flags.values()):
         bottom.plot(days[flagged], np.full(flagged.sum(), row), "|", ms=9, color=ORANGE)
     bottom.set(
-        yticks=range(len(names)),
-        yticklabels=names,
-        ylim=(max(len(names), 1) - 0.5, -0.5),
+        yticks=range(len(flags)),
+        yticklabels=list(flags),
+        ylim=(n_rows - 0.5, -0.5),
         xlabel=f"days since {_first(reduced)} UTC",
     )
-    bottom.set_title("Flagged in at least one band" if names else "Nothing is flagged")
+    bottom.set_title("Flagged in at least one band" if flags else "Nothing is flagged")
     return figure
 
 

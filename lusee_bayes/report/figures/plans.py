@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from lusee_bayes.core.harmonics import power_spectrum
-from lusee_bayes.judge.levels import LEVELS
+from lusee_bayes.judge.coverage import LEVELS
 from lusee_bayes.report.figures.drawing import COLOURS, GREY, LINES, framed
 from lusee_bayes.results.forecast import AS_GIVEN, Forecast
 from lusee_bayes.results.prior_comparison import PriorComparison

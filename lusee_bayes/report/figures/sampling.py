@@ -14,7 +14,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from lusee_bayes.core.harmonics import mode_numbers
-from lusee_bayes.judge.levels import LEVELS
+from lusee_bayes.judge.coverage import LEVELS
 from lusee_bayes.judge.measures import highest_altitude
 from lusee_bayes.report.figures.drawing import (
     BLUE,
@@ -35,6 +35,8 @@ from lusee_bayes.sampling.least import N_BINS
 from lusee_bayes.sampling.validation import Comparison, Ranks
 from lusee_bayes.systematics.systematic import SKY
 
+# of a value for every mode
+DOTS = {"ls": "", "marker": ".", "ms": 3, "color": BLUE}
 # quantities in the figures, the first of a run's list
 N_RANKS, N_PAIRS = 8, 5
 # draws of a chain from which ranks and densities can be estimated
@@ -103,11 +105,10 @@ def against_analytic(tree: xr.DataTree) -> Figure:
     mean, std = constants["analytic_mean"].values, constants["analytic_std"].values
     flat = skies.reshape(-1, skies.shape[-1])
     figure, (left, right) = framed((11, 4), 1, 2)
-    dots = {"ls": "", "marker": ".", "ms": 3, "color": BLUE}
-    left.plot((flat.mean(axis=0) - mean) / std, **dots)
+    left.plot((flat.mean(axis=0) - mean) / std, **DOTS)
     left.axhline(0.0, color=GREY, lw=0.8)
     left.set(xlabel="mode", ylabel="difference [standard deviations]", title="Means")
-    right.plot(flat.std(axis=0, ddof=1) / std, **dots)
+    right.plot(flat.std(axis=0, ddof=1) / std, **DOTS)
     right.axhline(1.0, color=GREY, lw=0.8)
     right.set(xlabel="mode", ylabel="draws / analytic", title="Standard deviations")
     figure.suptitle("Draws against the analytic posterior, mode by mode")
@@ -196,15 +197,14 @@ def comparison(result: Comparison) -> Figure:
     figure, ((means, variances), (covariance, sizes)) = framed((11, 7), 2, 2)
     ell, _ = mode_numbers(round(np.sqrt(len(result.mean_z))) - 1)
     limit = result.checks[0].upper
-    dots = {"ls": "", "marker": ".", "ms": 3, "color": BLUE}
-    means.plot(result.mean_z, **dots)
+    means.plot(result.mean_z, **DOTS)
     for bound in (-limit, limit):
         means.axhline(bound, color=ORANGE, ls="--", lw=1)
     means.set(
         xlabel="mode", ylabel="difference of means [Monte Carlo error]", title="Means of every mode"
     )
     variances.errorbar(
-        np.arange(len(ell)), result.variance_ratio, result.variance_error, elinewidth=0.3, **dots
+        np.arange(len(ell)), result.variance_ratio, result.variance_error, elinewidth=0.3, **DOTS
     )
     variances.axhline(1.0, color=GREY, lw=0.8)
     variances.set(xlabel="mode", ylabel="variance: draws / analytic", title="Variances")
@@ -217,8 +217,8 @@ def comparison(result: Comparison) -> Figure:
         title="Covariance in analytic coordinates",
     )
     covariance.legend(frameon=False)
-    sizes.semilogy(result.ess_bulk, label="bulk", **dots)
-    sizes.semilogy(result.ess_tail, label="tail", **(dots | {"color": ORANGE}))
+    sizes.semilogy(result.ess_bulk, label="bulk", **DOTS)
+    sizes.semilogy(result.ess_tail, label="tail", **(DOTS | {"color": ORANGE}))
     sizes.set(xlabel="mode", ylabel="effective sample size", title="Effective sample sizes")
     sizes.legend(frameon=False)
     figure.suptitle(
