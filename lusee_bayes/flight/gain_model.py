@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from lusee_bayes.core import formats
-from lusee_bayes.core.checks import require_positive, require_shape
+from lusee_bayes.core.checks import Described, extent, require_positive, require_shape
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.files import user_path
 from lusee_bayes.core.layouts import Layout, Variable, require_mhz
@@ -41,8 +41,8 @@ NANO2 = 1e-18
 COUNTS = "count Hz nV-2"
 
 
-@dataclass(frozen=True, eq=False)
-class GainModel:
+@dataclass(frozen=True, eq=False, repr=False)
+class GainModel(Described):
     """Gains of all levels and ports.
 
     Attributes
@@ -78,6 +78,13 @@ class GainModel:
         "1", "errors of the strengths", checks={"low": 0.0}, default=None
     )
     kind: str = "made"
+
+    def description(self) -> tuple[str, ...]:
+        return (
+            f"levels {', '.join(LETTERS)} of {PORTS} ports, {extent(self.anchor_mhz, 'MHz')}, mean "
+            f"{np.median(self.mean):.3g} counts for 1 nV^2/Hz",
+            f"errors {'not ' if self.component_std is None else ''}known",
+        )
 
     def __post_init__(self):
         require_shape(f"{self.path}: mean", self.mean, (len(LETTERS), PORTS, None))

@@ -190,6 +190,13 @@ class Reduced(Described):
             f"{counted(len(self.sessions), 'session')} in {counted(self.values.shape[2], 'bin')}",
             f"{counted(len(f), 'band')} of {self.bandwidth_mhz:g} MHz at {between}",
             f"{used.mean():.2%} of the spectra are used",
+            *self.observation.description(),
+            *(f"{name}: {text}" for name, text in self.recipe.items()),
+            *self.notes(),
+            *(
+                f"{f:g} MHz: {_percent(self.shares(band))}"
+                for band, f in enumerate(self.frequencies_mhz)
+            ),
         )
 
     def notes(self) -> tuple[str, ...]:
@@ -253,8 +260,8 @@ class Reduced(Described):
     def flag_line(self, band: int | None = None, misfit: float = 0.0) -> str:
         """Say how much was flagged, as :meth:`flagged`."""
         found = self.flagged(band, misfit)
-        rules = ", ".join(f"{name} {share:.2%}" for name, share in found.items())
-        return f"flagged {sum(found.values()):.2%} of the values" + (f": {rules}" if rules else "")
+        rules = f": {_percent(found)}" if found else ""
+        return f"flagged {sum(found.values()):.2%} of the values{rules}"
 
     def doubts(self, band: int) -> tuple[str, ...]:
         """Return what is doubtful about a band, a sentence each."""
@@ -368,6 +375,10 @@ class Reduced(Described):
         reason[band, bins[self.bin_of] & (reason[band] == USED)] = NO_FIT
         changed = {"values": values, "n_averaged": n_averaged, "reason": reason}
         return replace(self, **changed)
+
+
+def _percent(shares: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} {share:.2%}" for name, share in shares.items())
 
 
 def _medians(found: Float[np.ndarray, "bands parts"]) -> Float[np.ndarray, " bands"]:

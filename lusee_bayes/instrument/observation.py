@@ -132,14 +132,12 @@ class Observation(Described):
         with unannounced_leap_seconds():
             first, last = self.times[0].isot[:19], self.times[-1].isot[:19]
         angles = listed(tuple(f"{angle:g}" for angle in self.turntable_deg))
-        kind = ", samples taken as instants"
-        if self.windows is not None:
-            kind = f", live for {self.live_s.sum() / 86400.0:.3g} days"
+        samples = "times are instants" if self.windows is None else self.windows.description()[0]
         axis = ", with a fixed axis of the Moon" if self.fixed_axis else ""
         return (
             f"longitude {self.lon_deg:g}, latitude {self.lat_deg:g} degrees{axis}",
             f"{first} to {last} UTC, {self.n_times} samples of {self.step_s:g} s",
-            f"{self.n_runs} run{'s' * (self.n_runs > 1)}, turntable at {angles} degrees{kind}",
+            f"{self.n_runs} run{'s' * (self.n_runs > 1)}, turntable at {angles} degrees; {samples}",
         )
 
     @classmethod

@@ -284,15 +284,16 @@ class Visibilities(checks.Described):
         return cls(layout.gather(values), layout, observation, float(frequency_mhz))
 
     def description(self) -> tuple[str, ...]:
-        first, *dates = self.observation.description()
         missing = f", {self.n_missing} absent" if self.n_missing else ""
-        unsaid = "" if self.says_window else "; it is not known what the times are"
         truth = "" if self.truth is None else f"; simulated, lmax = {lmax_of(len(self.truth))}"
+        unsaid = ["it is not known what the times are: --set observation.timestamp=..."]
+        unsaid = [] if self.says_window else unsaid
         return (
             f"{self.layout.n_products} products x {self.layout.n_times} times at "
             f"{self.frequency_mhz:g} MHz, {self.layout.size} data{missing}",
             f"{checks.extent(self.data, 'K')}{truth}; products {checks.listed(self.labels)}",
-            f"{dates[0]}, at {first}{unsaid}",
+            *self.observation.description(),
+            *unsaid,
         )
 
     @property

@@ -37,7 +37,7 @@ from astropy.io import fits
 from astropy.time import Time
 from jaxtyping import Complex, Float
 
-from lusee_bayes.core.checks import require_positive
+from lusee_bayes.core.checks import Described, extent, require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing, user_path
 from lusee_bayes.core.formats import image_names, read_fits
@@ -67,8 +67,8 @@ SITE_AND_STEP = {
 }
 
 
-@dataclass(frozen=True)
-class Waterfall:
+@dataclass(frozen=True, repr=False)
+class Waterfall(Described):
     """Visibilities of several frequencies.
 
     Attributes
@@ -100,6 +100,20 @@ class Waterfall:
     antenna_k: float = 0.0
     receiver: MeasuredReceiver | None = None
     interpolation: str | None = None
+
+    def description(self) -> tuple[str, ...]:
+        here = ~np.isnan(self.grid).all((1, 2))
+        names = [name for name, there in zip(products.labels(), here, strict=True) if there]
+        lines = (
+            f"{len(names)} products ({' '.join(names)}) x {self.observation.n_times} times, "
+            f"{np.isnan(self.grid[here]).sum()} samples missing",
+            f"channels at {', '.join(f'{f:.9g}' for f in self.frequencies_mhz)} MHz",
+            *self.observation.description(),
+        )
+        if self.per_kelvin is None:
+            return lines
+        volts = extent(self.per_kelvin, "V^2/Hz")
+        return *lines, f"1 K is {volts}; with the emission of the Moon at {self.moon_k:.15g} K"
 
     def channel(self, frequency_mhz: float) -> int:
         """Return the number of the channel at a frequency.

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from pkgutil import resolve_name
 
-from lusee_bayes.core import formats
-from lusee_bayes.core.formats import has_words, image_names, is_fits
-from lusee_bayes.core.reading import require_file
+import numpy as np
+from jaxtyping import Float
 
-# the package's own netCDF files, by their attribute ``format``. What describes a kind is named by
-# path and imported when there is such a file: each needs libraries that others do not
-OWN_FORMATS = {
-    formats.VISIBILITIES: "describe_data:describe_visibilities",
-    formats.POSTERIOR: "describe_results:describe_posterior",
-    formats.BEAMS: "describe_data:describe_sampled_beams",
-    formats.DIAGNOSTICS: "describe_results:describe_diagnostics",
-    formats.SAMPLES: "describe_runs:describe_samples",
-    formats.REDUCED: "describe_data:describe_reduced",
-    formats.GAINS: "describe_data:describe_gains",
-}
+from lusee_bayes.core import formats
+from lusee_bayes.core.checks import counted
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.files import read_manifest, recover
+from lusee_bayes.core.formats import has_words, image_names, is_fits, opened
+from lusee_bayes.core.layouts import Layout
+from lusee_bayes.core.reading import read_json, require_file
+from lusee_bayes.core.trees import from_tree, opened_tree
 
 
 def _has_image(*names: str) -> Callable[[Path], bool]:
@@ -28,20 +26,173 @@ def _has_image(*names: str) -> Callable[[Path], bool]:
     return lambda path: is_fits(path) and bool(set(names) & set(image_names(path)))
 
 
-# other files: how each kind is recognised; what is none of them is a sky
+SAMPLED = "instrument.beams.sampled:read_sampled"
+# what reads the package's own netCDF files, by their attribute ``format``, and how other files are
+# recognised; what is none of them is a sky. Readers are named by path and imported when there is
+# such a file: each needs libraries that others do not
+READERS = {
+    formats.VISIBILITIES: "instrument.visibilities:read_visibilities",
+    formats.BEAMS: SAMPLED,
+    formats.REDUCED: "flight.reduced:read_reduced",
+    formats.GAINS: "flight.gain_model:read_gain_table",
+}
 KINDS: tuple[tuple[Callable[[Path], bool], str], ...] = (
-    (_has_image("h_theta_real"), "describe_data:describe_response"),
-    (_has_image("etheta_real"), "describe_data:describe_scalar_beam"),
-    (_has_image("e_theta_real", "product_beam"), "describe_data:describe_sampled_beams"),
-    (lambda path: has_words(path, formats.UVBEAM_WORDS), "describe_data:describe_sampled_beams"),
-    (_has_image("combinations", "products"), "describe_data:describe_waterfall"),
-    (formats.is_session, "describe_data:describe_session"),
-    (lambda path: True, "describe_sky:describe_sky"),
+    (_has_image("h_theta_real"), "instrument.beams.luseepy_files:read_response"),
+    (_has_image("etheta_real"), "instrument.beams.luseepy_files:read_scalar_beam"),
+    (_has_image("e_theta_real", "product_beam"), SAMPLED),
+    (lambda path: has_words(path, formats.UVBEAM_WORDS), SAMPLED),
+    (_has_image("combinations", "products"), "instrument.waterfalls:read_waterfall"),
+    (formats.is_session, "flight.session_files:read_session"),
+    (lambda path: True, "sky.sky_source:read_sky_file"),
 )
+
+
+# a uniform sky of 1 K
+MONOPOLE = np.sqrt(4.0 * np.pi)
+HOLDS = (
+    *("truth", "covariance", "independent_mean"),
+    *("posterior", "log_likelihood", "observed_data", "constant_data", "information"),
+)
+
+
+def describe_diagnostics(path: Path) -> list[str]:
+    """The diagnostics of a map."""
+    lines = []
+    with opened_tree(path, formats.DIAGNOSTICS, "diagnostics of lusee-bayes map") as tree:
+        for frequency, channel in sorted(tree.children.items(), key=lambda one: float(one[0])):
+            lines.append(f"diagnostics of a map at {frequency} MHz")
+            judged = channel.children.get("judged")
+            if judged is None:
+                lines.append("the data fit as a whole and were not judged group by group")
+                continue
+            kinds, n = np.unique(judged.children["groups"].variables["kind"], return_counts=True)
+            counts = ", ".join(counted(k, kind) for kind, k in zip(kinds, n.tolist(), strict=True))
+            lines += [str(judged.attrs["verdict"]), f"residuals by {counts}"]
+    return lines
+
+
+@dataclass(frozen=True)
+class _Skies:
+    """What is said of a posterior: skies in K, where they are, and where they come from."""
+
+    frequency: Float[np.ndarray, " frequency"]
+    mean: Float[np.ndarray, "frequency mode"]
+    std: Float[np.ndarray, "frequency mode"]
+    prior_std: Float[np.ndarray, "frequency mode"]
+    lmax: int
+    frame: str
+    versions: dict[str, str]
+    unmapped: str = ""
+
+
+def describe_posterior(path: Path) -> list[str]:
+    """A posterior at one frequency or at several."""
+    what = "a posterior of lusee-bayes map"
+    with opened_tree(path, formats.POSTERIOR, what) as tree:
+        found = from_tree(_Skies, tree, str(path))
+        held = [name for name in HOLDS if name in tree.variables or name in tree.children]
+        joint = "component_mean" in tree.variables
+    if not found.mean.size:
+        raise InputError(f"{path} holds no sky; make that map again")
+    frequencies, (n, n_modes) = found.frequency, found.mean.shape
+    at = f"{frequencies[0]:g} MHz"
+    if n > 1:
+        kind = "one posterior for all" if joint else "each on its own"
+        at = f"{n} frequencies from {frequencies[0]:g} to {frequencies[-1]:g} MHz, {kind}"
+    temperature = [
+        f"{m:.6g} K +- {s:.3g} K"
+        for m, s in zip(found.mean[:, 0] / MONOPOLE, found.std[:, 0] / MONOPOLE, strict=True)
+    ]
+    known = (found.std < 0.5 * found.prior_std).sum(axis=1)
+    return [
+        f"posterior over {n_modes} modes (lmax {found.lmax}) at {at}, {found.frame}",
+        f"mean temperature {' to '.join(dict.fromkeys((temperature[0], temperature[-1])))}",
+        f"{' to '.join(dict.fromkeys((str(known.min()), str(known.max()))))} modes known to better "
+        "than half their prior width",
+        *found.unmapped.splitlines(),
+        f"also holds: {', '.join(held) or 'nothing else'}",
+        f"versions: {json.dumps(found.versions)}",
+    ]
+
+
+def describe_samples(path: Path) -> list[str]:
+    """Draws of a program."""
+    # most of what info describes needs no sampler
+    tree = resolve_name("lusee_bayes.sampling.datatree:read_datatree")(path)
+    posterior, statistics = tree["posterior"], tree["sample_stats"]
+    sites = ", ".join(f"{name} {v.shape[2:]}" for name, v in posterior.data_vars.items())
+    return [
+        f"{posterior.sizes['chain']} x {posterior.sizes['draw']} draws of the program "
+        f"{tree.attrs['program']} at {float(tree.attrs['frequency_mhz']):g} MHz",
+        f"sites: {sites}",
+        f"{int(statistics['diverging'].sum())} divergences, "
+        f"{float(statistics['n_steps'].mean()):.1f} steps a trajectory",
+        f"groups: {', '.join(tree.children)}",
+    ]
+
+
+FIGURES = ("summary.json", "sampling.json", "priors.json")
+
+
+def describe_folder(folder: Path) -> list[str]:
+    """A finished run: its kind, where it comes from, its verdict, its files.
+
+    Raises
+    ------
+    InputError
+        If no run has written the folder.
+    """
+    recover(folder)
+    manifest = read_manifest(folder)
+    if manifest is None:
+        raise InputError(
+            f"'{folder}' is a folder that no run has written: it has no manifest.json; give a file "
+            "or the folder of a finished run"
+        )
+    lines = [f"results of lusee-bayes {manifest['kind']}"]
+    found = resolve_name("lusee_bayes.results.finished_runs:Provenance").read(folder)
+    if found is not None:
+        lines += [
+            f"data: {found.data_line()}",
+            f"{found.first} to {found.last} UTC, {found.n_times} times, site {found.lon_deg:g}, "
+            f"{found.lat_deg:g} degrees",
+            f"up to ell = {found.lmax}; made {found.made} UTC by lusee_bayes {found.version}",
+        ]
+        lines += [f"command: {found.command}"] if found.command else []
+    for name in FIGURES:
+        if (folder / name).is_file():
+            figures = read_json(folder / name, Layout("the figures of a run"))
+            lines += [str(figures["verdict"])] if "verdict" in figures else []
+    names = sorted(str(name) for name in manifest["files"])
+    return [*lines, f"files: {', '.join(names)}"]
+
+
+def _cards(path: Path) -> list[str]:
+    """What a FITS file of the package says of itself."""
+    with opened(path) as hdus:
+        headers = [hdu.header for hdu in hdus if "SCENHASH" in hdu.header]
+        if not headers:
+            return []
+        (header, *_) = headers
+        at = f" at {header['FREQ']:g} MHz" if "FREQ" in header else ""
+        return [
+            f"{header['CONTENT']} of the posterior{at} up to ell = {header['LMAX']}, beam "
+            f"{header['BEAM']}, site {header['SITELON']:g}, {header['SITELAT']:g} degrees",
+            f"{header['CREATOR']}, scenario {header['SCENHASH'][:12]}",
+        ]
+
+
+DESCRIBED: dict[str, Callable[[Path], list[str]]] = {
+    formats.POSTERIOR: describe_posterior,
+    formats.DIAGNOSTICS: describe_diagnostics,
+    formats.SAMPLES: describe_samples,
+}
 
 
 def describe(path: str | Path) -> str:
     """A few lines on a file (visibilities, a posterior, samples, beams, a sky), or a run's folder.
+
+    Of most files, what the object says of itself that they hold.
 
     Raises
     ------
@@ -49,11 +200,15 @@ def describe(path: str | Path) -> str:
         If the file is missing, or of none of these kinds; for a folder that no run has written.
     """
     if Path(path).is_dir():
-        path, kind = Path(path), "describe_runs:describe_folder"
+        lines = describe_folder(Path(path))
     else:
         path = require_file(path, "file")
-        kind = OWN_FORMATS.get(formats.format_of(path) or "")
-        if kind is None:
-            kind = next(kind for recognises, kind in KINDS if recognises(path))
-    first, *further = resolve_name(f"lusee_bayes.report.{kind}")(path)
+        kind = formats.format_of(path) or ""
+        if kind in DESCRIBED:
+            lines = DESCRIBED[kind](path)
+        else:
+            reader = READERS.get(kind) or next(name for is_one, name in KINDS if is_one(path))
+            lines = [repr(resolve_name(f"lusee_bayes.{reader}")(path))]
+            lines += _cards(path) if is_fits(path) else []
+    first, *further = lines
     return "\n".join([f"{path}: {first}", *(f"  {line}" for line in further)])

@@ -86,7 +86,7 @@ class Sky(Described, eqx.Module):
         return harmonics.power_spectrum(self.modes)
 
 
-class SkyFile(ABC):
+class SkyFile(Described, ABC):
     """The content of one file of sky maps or coefficients, whole and checked.
 
     A new layout of files is a subclass, and one entry in
@@ -144,10 +144,6 @@ class SkyFile(ABC):
             If the file holds no sky at this frequency, or not up to this ell.
         """
 
-    @abstractmethod
-    def summary(self) -> tuple[str, ...]:
-        """Say in a few lines what the file holds."""
-
 
 def modes_of_map(
     path: str | Path, pixels: Float[np.ndarray, " pixels"], lmax: int
@@ -162,7 +158,7 @@ ULSA_DATASET = "smooth_absorb"
 UNSEEN = -1.6375e30
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class SkyMap(SkyFile):
     """One HEALPix map, whose frequency the file does not say.
 
@@ -215,7 +211,7 @@ class SkyMap(SkyFile):
     def modes_at(self, frequency_mhz: float, lmax: int) -> Float[np.ndarray, " modes"]:
         return modes_of_map(self.path, self.pixels, lmax)
 
-    def summary(self) -> tuple[str, ...]:
+    def description(self) -> tuple[str, ...]:
         pixels = self.pixels
         return (
             f"HEALPix sky map, NSIDE {round((pixels.size / 12) ** 0.5)}, RING, Galactic",
@@ -290,7 +286,7 @@ NPZ = Layout(
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class SkyAlms(SkyFile):
     """Coefficients of one or several frequencies.
 
@@ -358,7 +354,7 @@ class SkyAlms(SkyFile):
                 )
         return self.modes[channel, : harmonics.n_modes(lmax)]
 
-    def summary(self) -> tuple[str, ...]:
+    def description(self) -> tuple[str, ...]:
         known, means = self.frequencies_mhz, self.modes[:, 0] / np.sqrt(4.0 * np.pi)
         skies = "one sky" if len(means) == 1 else f"{len(means)} skies"
         frequencies = "" if known is None else f", {', '.join(f'{f:g}' for f in known)} MHz"
@@ -451,7 +447,7 @@ CUBE = Layout(
 )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class SkyCube(SkyFile):
     """Maps of several frequencies.
 
@@ -543,7 +539,7 @@ class SkyCube(SkyFile):
     def modes_at(self, frequency_mhz: float, lmax: int) -> Float[np.ndarray, " modes"]:
         return modes_of_map(self.path, self.map_at(frequency_mhz), lmax)
 
-    def summary(self) -> tuple[str, ...]:
+    def description(self) -> tuple[str, ...]:
         known, pixels = self.frequencies_mhz, self.pixels
         return (
             f"{len(pixels)} HEALPix sky maps, NSIDE {healpy.npix2nside(pixels.shape[1])}, taken "

@@ -134,7 +134,7 @@ def test_names_of_files_keep_their_capitals():
 def test_info_recognises_its_files(folder, tmp_path, capsys):
     run("simulate", "fiducial", *SMALL, "-o", tmp_path / "data.nc", "-q")
     for path, words in [
-        (tmp_path / "data.nc", "visibilities at 25 MHz"),
+        (tmp_path / "data.nc", "Visibilities: 16 products x"),
         (folder / "posterior.nc", "posterior over 81 modes"),
         (folder / "mean.fits", "HEALPix sky map, NSIDE 8"),
         (folder / "mean.fits", "mean of the posterior at 25 MHz up to ell = 8"),

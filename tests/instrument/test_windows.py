@@ -523,7 +523,7 @@ def test_instants_and_silent_files(data, tmp_path):
     path = rewritten(instants, tmp_path / "silent.nc", silent)
     again = read_visibilities(path)
     assert not again.says_window and again.observation.windows is None
-    assert "does not say what its times are" in describe(path)
+    assert "not known what the times are" in describe(path)
     # what does not say it does not learn it by being written
     assert not read_visibilities(again.write(tmp_path / "again.nc")).says_window
     assert "it is not known what the times are" in repr(again)
@@ -535,7 +535,7 @@ def test_instants_and_silent_files(data, tmp_path):
 
 def test_info_says_windows_and_live_share(data, tmp_path):
     path = made(timestamp="end", live_s=[900.0] * 4).write(tmp_path / "data.nc")
-    assert "times are middles of windows of 3600 s, live for 25.0% of them" in describe(path)
+    assert "4 windows in 4 pieces, live for 900 to 900 s, 25.0% of the time" in describe(path)
     text = describe(data.write(tmp_path / "pieces.nc"))
     assert f"in {len(data.observation.windows.sample)} pieces" in text
 

@@ -143,7 +143,7 @@ def test_exactly_one_reader_reads_a_file(layout, tmp_path, modes):
     found = next(reader for reader in SKY_READERS if reader.recognises(path))
     assert found is layout[2]
     assert isinstance(read_sky_file(path, dataset), found)
-    assert all(line.strip() for line in read_sky_file(path, dataset).summary())
+    assert all(line.strip() for line in read_sky_file(path, dataset).description())
 
 
 def test_the_galaxy_keeps_the_contract():

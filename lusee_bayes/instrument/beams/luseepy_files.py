@@ -42,6 +42,7 @@ from scipy.constants import Boltzmann, physical_constants
 from scipy.special import roots_legendre
 
 from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.checks import Described, counted, extent
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.formats import read_fits
 from lusee_bayes.core.harmonics import mode_numbers, polar_functions
@@ -59,7 +60,7 @@ from lusee_bayes.instrument.beams.fields import (
     product_modes,
 )
 from lusee_bayes.instrument.beams.source import BeamSource, Circuit, JFETReceiver, Receiver
-from lusee_bayes.instrument.products import N_ANTENNAS, to_matrix, to_real
+from lusee_bayes.instrument.products import N_ANTENNAS, auto_indices, to_matrix, to_real
 
 # what this package assumes of the images, in lower case
 CONVENTIONS: Mapping[str, str] = {
@@ -206,8 +207,8 @@ RESPONSE_LAYOUT = Layout(
 RESISTANCE_TOLERANCE = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
-class LuseepyBeam(BeamSource):
+@dataclass(frozen=True, eq=False, repr=False)
+class LuseepyBeam(Described, BeamSource):
     """What a file holds in directions of a grid, at several frequencies.
 
     Attributes
@@ -239,6 +240,16 @@ class LuseepyBeam(BeamSource):
     turntable_offset_deg: float = field(default=0.0, kw_only=True)
     luseepy_quadrature: bool = field(default=False, kw_only=True)
     moon_k: float = field(default=0.0, kw_only=True)
+
+    def description(self) -> tuple[str, ...]:
+        known = self.frequencies_mhz
+        middle = float(known[len(known) // 2])
+        autos = replace(self, moon_k=1.0).background(middle)[auto_indices(self.n_ports)]
+        return (
+            f"{counted(self.n_ports, 'port')}, {extent(known, 'MHz')} ({len(known)} frequencies)",
+            f"{len(self.theta)} angles from the zenith to the horizon, {self.n_phi} azimuths",
+            f"{autos.mean():.3f} of an auto at {middle:g} MHz comes from the ground",
+        )
 
     @property
     def n_phi(self) -> int:
@@ -279,7 +290,7 @@ class LuseepyBeam(BeamSource):
         return at_frequency(self.path, known, frequency_mhz, *parts, rule=rule)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PortResponse(LuseepyBeam):
     """Four coupled ports at several frequencies, with their receivers.
 
@@ -322,6 +333,11 @@ class PortResponse(LuseepyBeam):
     def behind(self, receiver: Receiver | None) -> PortResponse:
         given = receiver is None or self.receiver_said
         return self if given else replace(self, receiver=receiver)
+
+    def description(self) -> tuple[str, ...]:
+        known = self.frequencies_mhz
+        kelvin = self.per_kelvin(float(known[len(known) // 2]))
+        return *super().description(), f"1 K is {extent(kelvin, 'V^2/Hz')} behind the receivers"
 
     def circuit(self, frequency_mhz: float) -> Circuit:
         """Return antennas and receivers. InputError outside the frequencies of the file."""
@@ -442,7 +458,7 @@ ROTATIONS_DEG = (0.0, 90.0, 180.0, 270.0)
 TAPER_WIDTH = 0.03
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ScalarBeam(LuseepyBeam):
     """The pattern of one arm, used once for every port; nothing couples the arms.
 
