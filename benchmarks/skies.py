@@ -29,16 +29,17 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.experiment.experiment import posterior_draws, under_sky
 from lusee_bayes.experiment.model import set_up
+from lusee_bayes.experiment.sky_sections import FileSkySection, GalaxySection
 from lusee_bayes.judge.coverage import LEVELS, Counts
 from lusee_bayes.report.figures.drawing import BLUE, DIVERGING, GREY, ORANGE, colour_bar, mollweide
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.channel_map import conditioned
-from lusee_bayes.sky.sky_source import FileSource, GalaxySource, SkySource
+from lusee_bayes.sky.sky_source import SkySource
 
 # each takes a seed
 NAMED: dict[str, Callable[[int], SkySource]] = {
-    "embedded": lambda seed: GalaxySource(seed, ()),
-    "embedded+sources": GalaxySource,
+    "embedded": lambda seed: GalaxySection(seed=seed, sources=False),
+    "embedded+sources": lambda seed: GalaxySection(seed=seed),
     "smooth": SmoothSky,
     "spotty": SpottySky,
 }
@@ -93,7 +94,8 @@ def find_sky(text: str) -> tuple[str, SkySource]:
         return f"{name}:{number}", NAMED[name](number)
     file, _, frequency = text.partition("@")
     path = Path(file).absolute()
-    return path.stem, FileSource(path, file_frequency_mhz=float(frequency) if frequency else None)
+    given = {"file_frequency_mhz": float(frequency)} if frequency else {}
+    return path.stem, FileSkySection(file=str(path), **given)
 
 
 def draw(mapped: list[Mapped], frequency_mhz: float) -> Figure:

@@ -62,7 +62,7 @@ def set_up(
     if data is not None:
         require_fitting(data, scenario)
     with stages("sky"):
-        sky = scenario.sky.source().at(scenario.frequency_mhz, scenario.lmax)
+        sky = scenario.sky.at(scenario.frequency_mhz, scenario.lmax)
         prior, family = prior_and_family(scenario, sky)
     with stages("orientation"):
         if data is None:

@@ -1,7 +1,7 @@
 """Sections of a scenario on skies and priors.
 
 Sky and prior have one section for each kind, selected by ``model``. A new kind is a class here,
-with its :class:`SkySource` or :class:`Prior`, and its name in ``SKY_SECTIONS`` or
+which is a :class:`SkySource` or has a :class:`Prior`, and its name in ``SKY_SECTIONS`` or
 ``PRIOR_SECTIONS``. The prior on skies of several frequencies has a section of its own.
 """
 
@@ -28,12 +28,12 @@ from lusee_bayes.sky.positive_skies import (
     deviation_spectrum,
 )
 from lusee_bayes.sky.prior import HarmonicPrior, Prior, read_mean, read_spectrum
-from lusee_bayes.sky.sky_source import FileSource, GalaxySource, Sky, SkySource, galaxy_sky
+from lusee_bayes.sky.sky_source import Sky, SkySource, galaxy_sky, sky_from_file
 from lusee_bayes.sky.spectral_prior import SpectralPrior, check_components, require_names
 from lusee_bayes.systematics.prior_spectrum import SpectrumSection
 
 
-class GalaxySection(Section):
+class GalaxySection(Section, SkySource):
     """The embedded Galaxy.
 
     Attributes
@@ -48,12 +48,12 @@ class GalaxySection(Section):
     seed: Seed = 1
     sources: bool = True
 
-    def source(self) -> SkySource:
-        """The embedded Galaxy with these sources."""
-        return GalaxySource(self.seed, BRIGHT_SOURCES if self.sources else ())
+    def at(self, frequency_mhz: float, lmax: int) -> Sky:
+        sources = BRIGHT_SOURCES if self.sources else ()
+        return galaxy_sky(frequency_mhz, lmax, seed=self.seed, sources=sources)
 
 
-class FileSkySection(Section):
+class FileSkySection(Section, SkySource):
     """A sky from a file: ULSA's HDF5, HEALPix FITS, luseepy's FITS of many maps, coefficients.
 
     Attributes
@@ -77,9 +77,9 @@ class FileSkySection(Section):
     file_frequency_mhz: Megahertz | None = None
     spectral_index: Annotated[float, Field(ge=-20, le=20)] = -2.5
 
-    def source(self) -> SkySource:
-        """The file."""
-        return FileSource(self.file, **self.model_dump(exclude={"model", "file"}))
+    def at(self, frequency_mhz: float, lmax: int) -> Sky:
+        given = self.model_dump(exclude={"model", "file"})
+        return sky_from_file(self.file, frequency_mhz, lmax, **given)
 
 
 SKY_SECTIONS = kinds_of(GalaxySection, FileSkySection)

@@ -584,70 +584,6 @@ def _galaxy_modes(frequency_mhz: float, seed: int | None, lmax: int) -> np.ndarr
     return modes
 
 
-@dataclass(frozen=True)
-class GalaxySource(SkySource):
-    """The embedded sky: diffuse Galaxy, extragalactic background and bright sources.
-
-    Attributes
-    ----------
-    seed : int or None
-        Chooses the random small-scale structure, which is the same at all frequencies; None leaves
-        it out.
-    sources : tuple of PointSource
-        The sources that are added to the diffuse sky.
-    """
-
-    seed: int | None = 1
-    sources: tuple[PointSource, ...] = BRIGHT_SOURCES
-
-    def at(self, frequency_mhz: float, lmax: int) -> Sky:
-        modes = _galaxy_modes(float(frequency_mhz), self.seed, lmax)
-        for source in self.sources:
-            modes = modes + source.modes(frequency_mhz, lmax)
-        return Sky(modes, float(frequency_mhz), "embedded Galaxy")
-
-
-@dataclass(frozen=True)
-class FileSource(SkySource):
-    """The sky of a file of one of the layouts in :data:`SKY_READERS`.
-
-    Attributes
-    ----------
-    path : str or Path
-        The file.
-    dataset : str, optional
-        Which of its data sets to read, for layouts that have several.
-    file_frequency_mhz : float, optional
-        The frequency in MHz that the file was made for, or at which it is read. The sky is then
-        scaled by (frequency / file frequency)^spectral_index. By default the file is read at
-        the frequency asked for.
-    spectral_index : float
-        Index of that power law.
-
-    Raises
-    ------
-    InputError
-        If ``file_frequency_mhz`` is not positive.
-    """
-
-    path: str | Path
-    dataset: str | None = None
-    file_frequency_mhz: float | None = None
-    spectral_index: float = -2.5
-
-    def __post_init__(self):
-        if self.file_frequency_mhz is not None and not self.file_frequency_mhz > 0:
-            raise InputError(f"file_frequency_mhz must be positive, got {self.file_frequency_mhz}")
-
-    def at(self, frequency_mhz: float, lmax: int) -> Sky:
-        read_at, scale = float(frequency_mhz), 1.0
-        if self.file_frequency_mhz is not None:
-            read_at = float(self.file_frequency_mhz)
-            scale = (frequency_mhz / read_at) ** self.spectral_index
-        modes = read_sky_file(self.path, self.dataset).modes_at(read_at, lmax)
-        return Sky(scale * modes, float(frequency_mhz), Path(self.path).name)
-
-
 def read_sky_file(path: str | Path, dataset: str | None = None) -> SkyFile:
     """Read a file of skies, of whichever layout.
 
@@ -680,14 +616,27 @@ def galaxy_sky(
     seed: int | None = 1,
     sources: tuple[PointSource, ...] = BRIGHT_SOURCES,
 ) -> Sky:
-    """Compute the embedded sky at one frequency; see :class:`GalaxySource`.
+    """Compute the embedded sky: diffuse Galaxy, extragalactic background and bright sources.
+
+    Parameters
+    ----------
+    frequency_mhz : float
+    lmax : int
+    seed : int or None
+        Chooses the random small-scale structure, which is the same at all frequencies; None leaves
+        it out.
+    sources : tuple of PointSource
+        The sources that are added to the diffuse sky.
 
     Raises
     ------
     InputError
         Outside 1 to 50 MHz.
     """
-    return GalaxySource(seed, sources).at(frequency_mhz, lmax)
+    modes = _galaxy_modes(float(frequency_mhz), seed, lmax)
+    for source in sources:
+        modes = modes + source.modes(frequency_mhz, lmax)
+    return Sky(modes, float(frequency_mhz), "embedded Galaxy")
 
 
 def sky_from_file(
@@ -699,12 +648,32 @@ def sky_from_file(
     file_frequency_mhz: float | None = None,
     spectral_index: float = -2.5,
 ) -> Sky:
-    """Read the sky of a file at one frequency; see :class:`FileSource`.
+    """Read the sky of a file of one of the layouts in :data:`SKY_READERS`.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    frequency_mhz : float
+    lmax : int
+    dataset : str, optional
+        Which of its data sets to read, for layouts that have several.
+    file_frequency_mhz : float, optional
+        The frequency in MHz that the file was made for, or at which it is read. The sky is then
+        scaled by (frequency / file frequency)^spectral_index. By default the file is read at
+        the frequency asked for.
+    spectral_index : float
+        Index of that power law.
 
     Raises
     ------
     InputError
         For files that are missing, unreadable, in another order or frame, hold NaN, or have
-        other frequencies.
+        other frequencies; if ``file_frequency_mhz`` is not positive.
     """
-    return FileSource(path, dataset, file_frequency_mhz, spectral_index).at(frequency_mhz, lmax)
+    read_at = frequency_mhz if file_frequency_mhz is None else file_frequency_mhz
+    if not read_at > 0:
+        raise InputError(f"file_frequency_mhz must be positive, got {read_at}")
+    modes = read_sky_file(path, dataset).modes_at(float(read_at), lmax)
+    scale = (frequency_mhz / read_at) ** spectral_index
+    return Sky(scale * modes, float(frequency_mhz), Path(path).name)

@@ -125,7 +125,7 @@ def test_the_default_path_with_drifts(sigma, test_data):
     that it knows best, where the prior hardly matters, they are what is claimed.
     """
     file = test_data / "ulsa" / "exp10.0MHz_sky_map_with_absorption.hdf5"
-    sky = FileSkySection(file=str(file)).source().at(10.0, 12)
+    sky = FileSkySection(file=str(file)).at(10.0, 12)
     scenario = wrong_data.scenario(12, f"noise.gain={{sigma: {sigma}}}", frequency_mhz=10.0)
     total, known = 0.0, 0
     for seed in (1, 2, 3):

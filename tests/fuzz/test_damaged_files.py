@@ -34,7 +34,7 @@ FEW, MANY = 2, 150 * SCALE
 
 def read_sky(path: Path) -> object:
     overrides = ["lmax=2", f"sky={{model: file, file: '{path}'}}"]
-    return lb.load_scenario("fiducial", overrides).sky.source().at(25.0, 2)
+    return lb.load_scenario("fiducial", overrides).sky.at(25.0, 2)
 
 
 def read_any_data(path: Path) -> object:

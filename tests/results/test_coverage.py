@@ -12,8 +12,9 @@ from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
 from lusee_bayes.core.trees import from_tree, to_tree
 from lusee_bayes.experiment.experiment import build, under_sky
 from lusee_bayes.experiment.model import set_up
+from lusee_bayes.experiment.sky_sections import FileSkySection, GalaxySection
 from lusee_bayes.judge.coverage import LEVELS, Counts, Coverage
-from lusee_bayes.sky.sky_source import FileSource, GalaxySource, write_alms
+from lusee_bayes.sky.sky_source import write_alms
 from lusee_bayes.testing.scenarios import small_scenario
 
 NSIDE, LMAX = 8, 6
@@ -126,7 +127,7 @@ def test_skies_of_the_prior_are_covered_within_the_printed_errors(tmp_path):
         # antennas have to be warm
         sky[0] = setup.sky.modes[0]
         path = write_alms(tmp_path / f"{seed}.fits", sky, {})
-        made, channel = mapped(under_sky(setup, FileSource(path), seed))
+        made, channel = mapped(under_sky(setup, FileSkySection(file=str(path)), seed))
         drawn = made.compared()
         error = channel.truth - channel.mean
         for factor, found in far.items():
@@ -143,7 +144,7 @@ def test_a_given_sky_is_in_the_data_alone():
     """Noise and data are those of the scenario with this sky; the prior is that of its own sky."""
     sizes = {"lmax": 8, "cycles": 0.15}
     expected = build(small_scenario("sky.seed=4", "seed=9", **sizes))
-    found = under_sky(set_up(small_scenario(**sizes)), GalaxySource(4, ()), seed=9)
+    found = under_sky(set_up(small_scenario(**sizes)), GalaxySection(seed=4, sources=False), seed=9)
     rounding = 1e-12 * np.abs(expected.data.data).max()
     np.testing.assert_allclose(found.data.data, expected.data.data, rtol=0, atol=rounding)
     np.testing.assert_allclose(found.setup.signal, expected.setup.signal, rtol=0, atol=rounding)

@@ -22,12 +22,11 @@ from lusee_bayes.core.harmonics import (
     synthesis_matrix,
     to_healpy,
 )
+from lusee_bayes.experiment.sky_sections import FileSkySection, GalaxySection
 from lusee_bayes.report.describe import describe
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
 from lusee_bayes.sky.sky_source import (
     SKY_READERS,
-    FileSource,
-    GalaxySource,
     SkyAlms,
     SkyCube,
     SkyMap,
@@ -112,7 +111,7 @@ def written(layout, folder, modes):
 @of_every_layout
 def test_files_keep_the_contract(layout, tmp_path, modes):
     path, dataset = written(layout, tmp_path, modes)
-    source = FileSource(path, dataset)
+    source = FileSkySection(file=str(path), dataset=dataset)
     check_sky_source(
         source,
         frequency_mhz=25.0,
@@ -128,12 +127,13 @@ def test_files_keep_the_contract(layout, tmp_path, modes):
 @of_every_layout
 def test_files_are_scaled_from_their_frequency(layout, tmp_path, modes):
     path, dataset = written(layout, tmp_path, modes)
-    there = FileSource(path, dataset).at(25.0, LMAX)
-    scaled = FileSource(path, dataset, 25.0, -2.1).at(10.0, LMAX)
+    there = lb.sky_from_file(path, 25.0, LMAX, dataset=dataset)
+    made_for = {"dataset": dataset, "file_frequency_mhz": 25.0}
+    scaled = lb.sky_from_file(path, 10.0, LMAX, **made_for, spectral_index=-2.1)
     assert scaled.frequency_mhz == 10.0
     np.testing.assert_allclose(scaled.modes, np.asarray(there.modes) * 0.4**-2.1, rtol=1e-13)
-    # the function of one frequency, and the paper's index by default
-    again = lb.sky_from_file(path, 10.0, LMAX, dataset=dataset, file_frequency_mhz=25.0)
+    # the paper's index by default
+    again = lb.sky_from_file(path, 10.0, LMAX, **made_for)
     np.testing.assert_allclose(again.modes, np.asarray(there.modes) * 0.4**-2.5, rtol=1e-13)
 
 
@@ -148,7 +148,7 @@ def test_exactly_one_reader_reads_a_file(layout, tmp_path, modes):
 
 def test_the_galaxy_keeps_the_contract():
     # the Galaxy's map of NSIDE 64 has power above lmax: up to 2.1e-5 between 8 and 48
-    source = GalaxySource()
+    source = GalaxySection()
     check_sky_source(source, frequency_mhz=25.0, lmax=16, slice_rtol=1e-4, missing_mhz=60.0)
     assert_refused(lambda: source.at(0.5, 16))
 
@@ -197,9 +197,9 @@ def test_the_spotty_sky_has_a_steep_number_count():
 def test_a_file_is_there_and_its_frequency_positive():
     for frequency in (0.0, -3.0, np.nan):
         with refused("file_frequency_mhz must be positive"):
-            FileSource("nowhere.fits", file_frequency_mhz=frequency)
+            lb.sky_from_file("nowhere.fits", 25.0, LMAX, file_frequency_mhz=frequency)
     with refused("no sky map at 'nowhere.fits'; check sky.file"):
-        FileSource("nowhere.fits").at(25.0, LMAX)
+        lb.sky_from_file("nowhere.fits", 25.0, LMAX)
 
 
 @pytest.fixture
@@ -294,7 +294,7 @@ def test_fifty_maps_and_what_is_between_them(tmp_path, maps):
 def test_a_scenario_with_a_cube(tmp_path, maps):
     path = write_cube(tmp_path / "cube.fits", maps)
     scenario = lb.load_scenario("fiducial", ["lmax=4", f"sky.file={path}"])
-    sky = scenario.sky.source().at(scenario.frequency_mhz, scenario.lmax)
+    sky = scenario.sky.at(scenario.frequency_mhz, scenario.lmax)
     one = tmp_path / "one.fits"
     healpy.write_map(one, maps[24], dtype=np.float64, column_units="K", coord="G")
     np.testing.assert_array_equal(sky.modes, lb.sky_from_file(one, 25.0, 4).modes)
