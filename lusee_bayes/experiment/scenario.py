@@ -292,6 +292,14 @@ class Scenario(Section):
         """Whether something besides the sky is to be sampled."""
         return "sampled" in {cls.treatment(self) for cls in SYSTEMATICS}
 
+    def require_marginal(self, what: str, advice: str) -> None:
+        """InputError where what makes maps is to sample something."""
+        if self.samples:
+            raise InputError(
+                f"the scenario says that something is to be sampled, and {what} can only "
+                f"marginalise; {advice}"
+            )
+
     @property
     def map_nside(self) -> int:
         """NSIDE of maps that leave the program: at least two pixels for each ell."""

@@ -30,7 +30,6 @@ from lusee_bayes.runs.folder import (
     RunKind,
     RunOutcome,
     model_file,
-    require_marginal,
     rows_file,
     run_folder,
     text_file,
@@ -128,7 +127,7 @@ def run_compare_priors(
     engine, stages = engine or ThisProcess(side_by_side=1), stages or Stages()
     if not scenario.single:
         raise InputError("compare-priors is for a single frequency; leave out frequencies_mhz")
-    require_marginal("compare-priors", "set treatment=marginalised", scenario)
+    scenario.require_marginal("compare-priors", "set treatment=marginalised")
     sections = named_priors(priors, scenario, known_sky=data is None or truth)
     sections = {name: section.anchored() for name, section in sections.items()}
     origin = {"truth": truth or None, "priors": ",".join(sections)}

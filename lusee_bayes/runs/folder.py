@@ -389,12 +389,3 @@ def _state(folder: Path, before: int | None, kind: RunKind) -> str:
     earlier = "no results are written" if now is None else "the earlier results are as they were"
     resumed = kind.unfinished and any((folder / kind.unfinished).glob("*"))
     return f"{earlier} in '{folder}'{f'; {kind.resume}' if resumed else ''}"
-
-
-def require_marginal(what: str, advice: str, scenario: Scenario) -> None:
-    """InputError where what makes maps is to sample something."""
-    if scenario.samples:
-        raise InputError(
-            f"the scenario says that something is to be sampled, and {what} can only marginalise; "
-            f"{advice}"
-        )

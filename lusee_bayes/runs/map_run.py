@@ -25,7 +25,6 @@ from lusee_bayes.runs.folder import (
     RunOutcome,
     model_file,
     netcdf_file,
-    require_marginal,
     rows_file,
     run_folder,
     table_file,
@@ -81,7 +80,7 @@ def run_map(
     """
     scenario = load_scenario(scenario)
     stages = stages or Stages()
-    require_marginal("a map", "use: lusee-bayes sample", scenario)
+    scenario.require_marginal("a map", "use: lusee-bayes sample")
     if not scenario.single:
         require_fits(cost := posterior_cost(scenario), scenario)
     origin = {"truth": truth or None, "earlier": earlier}
