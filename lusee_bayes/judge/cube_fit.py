@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from pydantic import computed_field
 from scipy.special import bdtr, chdtrc
 
 from lusee_bayes.judge.chi2 import LEVELS, ChiSquare, Fit, Level, in_brief, probability, stands_out
@@ -45,6 +46,7 @@ class JointTest:
     found: str
     of_prior: bool = False
 
+    @computed_field
     @property
     def level(self) -> Level:
         """The verdict of this test, one of four."""

@@ -10,6 +10,7 @@ from lusee_bayes.experiment.diagnosis import Diagnosis
 from lusee_bayes.experiment.unknowns import PointingReport, UnknownsReport
 from lusee_bayes.judge.chi2 import ChiSquare, Level
 from lusee_bayes.judge.coverage import Coverage
+from lusee_bayes.judge.cube_fit import JointTest
 
 
 class JudgedSummary(BaseModel, from_attributes=True):
@@ -76,16 +77,6 @@ class JointSummary(BaseModel, from_attributes=True):
     refinement: float
 
 
-class JointTestSummary(BaseModel, from_attributes=True):
-    """A joint test of all channels in summary.json."""
-
-    name: str
-    found: str
-    p: float
-    n: int
-    level: Level
-
-
 class PullSummary(BaseModel):
     """How far the spectrum of a direction is from the truth, in standard deviations."""
 
@@ -108,7 +99,7 @@ class MapSummary(BaseModel):
     n_data: int
     n_modes: int
     doubts: list[str]
-    tests: list[JointTestSummary]
+    tests: list[JointTest]
     pulls: list[PullSummary]
     unknowns: list[str]
     channels: list[ChannelSummary]
