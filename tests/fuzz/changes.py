@@ -72,10 +72,11 @@ def _changed(array: np.ndarray, change: tuple[Any, ...]) -> np.ndarray:
             flat = changed.reshape(-1)
             flat[: max(1, flat.size >> number)] = fill
             return changed
-        if kind == "shape":
+        if kind == "shape" and array.ndim:
             options = [array.T, array[..., None], array.reshape(-1), array[:0], array[..., :1]]
-            options += [np.concatenate([array, array])] if array.ndim else [array.reshape(1, 1)]
-            return options[number % len(options)] if array.ndim else np.asarray([value])
+            return [*options, np.concatenate([array, array])][number % 6]
+        if kind == "shape":
+            return np.asarray([value])
         if kind == "dtype" and array.dtype.kind in "fiuc":
             types = ["S4", "f4", "i4", "i1", "c16", "?"]
             real = array.real if array.dtype.kind == "c" else array
