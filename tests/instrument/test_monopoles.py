@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from assertions import close, refuse, within
-from reference import arm_response, layered_reflection, vectors
+from reference import SPEED_OF_LIGHT, arm_response, layered_reflection, vectors
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
@@ -41,6 +41,17 @@ def test_fields_agree_with_a_sum_along_the_arms(frequency, options):
                 got = fields.e_theta[port, t, f], fields.e_phi[port, t, f]
                 # Simpson's rule with 4000 steps of k h < 1e-3: 1e-13 of the integral
                 np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12 * scale)
+
+
+def test_a_vertical_arm_over_a_conductor_has_its_image():
+    frequency, height, conductor = 30.0, 1.5, Regolith(4.0, 4.0, 1e16)
+    m = Monopoles(conductor, length_m=1e-4, zenith_angle_deg=0.0, height_m=height)
+    k = 2e6 * np.pi * frequency / SPEED_OF_LIGHT
+    e_theta = np.asarray(m.fields(frequency, GRID).e_theta[2])
+    array_factor = 2 * np.cos(k * height * np.cos(GRID.theta))
+    expected = np.abs(np.sin(GRID.theta) * array_factor) * k * 1e-8 / 2
+    # the arm itself is k L = 6e-5 radians long
+    within(np.abs(e_theta), np.tile(expected[:, None], (1, 8)), 1e-4 * expected.max())
 
 
 @pytest.mark.long
