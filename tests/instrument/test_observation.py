@@ -215,7 +215,7 @@ def test_jupiter_is_where_the_almanac_had_it():
     ("body", "message"),
     [
         ("satrun", "did you mean 'Saturn'"),
-        ("moon", "known: Earth, Jupiter, Mars, Mercury"),
+        ("moon", "known: Earth, Jupiter, Mars, Mercury, Neptune, Saturn, Sun, Uranus, Venus"),
     ],
 )
 def test_unknown_bodies_are_refused(body, message):
