@@ -21,11 +21,10 @@ from lusee_bayes.core.harmonics import from_healpy
 from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.experiment.model import set_up, true_signal, true_values
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, product_beams
-from lusee_bayes.instrument.beams.luseepy_files import FIELDS, ScalarBeam
+from lusee_bayes.instrument.beams.luseepy_files import FIELDS
 from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith
 from lusee_bayes.instrument.beams.sampled import read_beam
 from lusee_bayes.instrument.pointing import Pointing
-from lusee_bayes.instrument.products import labels
 from lusee_bayes.instrument.waterfalls import read_waterfall
 from lusee_bayes.systematics.beam import beam_rms_difference, difference_of_beams, true_beams
 from lusee_bayes.testing.scenarios import small_scenario
@@ -85,32 +84,6 @@ def test_the_waterfall_of_luseepys_default_engine(luseepy, test_data):
     assert off(np.asarray(seen).reshape(16, -1), expected) < 1e-7
 
 
-def test_azimuth_the_other_way_conjugated_crosses_and_permuted_ports_are_noticed(luseepy):
-    beam, waterfall, _, _ = luseepy
-    rule, expected = {"luseepy_quadrature": True}, waterfall[25.0]
-    mirrored = np.r_[0, -1:-180:-1]
-    other = ScalarBeam(
-        "mirrored",
-        beam.frequencies_mhz,
-        beam.theta,
-        beam.e_theta[:, :, mirrored],
-        -beam.e_phi[:, :, mirrored],
-        beam.gain,
-    )
-    turned = (0.0, -90.0, -180.0, -270.0)
-    wrong = [
-        visibilities((other, *luseepy[1:]), 25.0, **rule),
-        visibilities(luseepy, 25.0, **rule, rotations_deg=turned),
-        visibilities(luseepy, 25.0, **rule, taper=False),
-    ]
-    right = visibilities(luseepy, 25.0, **rule)
-    signs = np.array([-1.0 if label[-1] == "I" else 1.0 for label in labels(PORTS)])
-    wrong.append(signs[:, None] * right)
-    wrong.append(right[::-1])
-    for case in wrong:
-        assert off(case, expected) > 1e-4
-
-
 @pytest.mark.long
 def test_what_the_rectangle_rule_costs(luseepy):
     """h^2 / 12 times the slopes of the beam at zenith and horizon (Euler and Maclaurin): 1.6e-4 of
@@ -144,17 +117,17 @@ def test_the_embedded_antennas_agree_with_the_file_in_shape(luseepy):
 # --- synthetic files --------------------------------------------------------------------------
 
 
-def write(path, *, without=(), change=None, header=None):
+def write(path, *, change=None, header=None):
     frequencies = (10.0, 20.0, 30.0, 40.0, 50.0)
     theta, phi = np.radians(np.linspace(0, 90, 46)), np.radians(np.linspace(0, 360, 61))
-    fields = np.array([point_pattern(theta[:, None], phi[None], f) for f in frequencies]).swapaxes(
-        0, 1
+    e_theta, e_phi = np.moveaxis(
+        [point_pattern(theta[:, None], phi[None], f) for f in frequencies], 1, 0
     )
     images = {
-        "Etheta_real": fields[0].real,
-        "Etheta_imag": fields[0].imag,
-        "EPhi_real": fields[1].real,
-        "EPhi_imag": fields[1].imag,
+        "Etheta_real": e_theta.real,
+        "Etheta_imag": e_theta.imag,
+        "EPhi_real": e_phi.real,
+        "EPhi_imag": e_phi.imag,
         "gain_conv": 100.0 / np.array(frequencies),
         "freq": np.array(frequencies),
     }
@@ -162,8 +135,7 @@ def write(path, *, without=(), change=None, header=None):
         change(images)
     head = {"THETA_MIN": 0.0, "THETA_MAX": 90.0, "THETA_N": 46}
     head |= {"PHI_MIN": 0.0, "PHI_MAX": 360.0, "PHI_N": 61} | (header or {})
-    kept = {name: image for name, image in images.items() if name not in without}
-    return write_images(path, kept, head)
+    return write_images(path, images, head)
 
 
 def test_between_frequencies_and_directions(tmp_path):
@@ -237,14 +209,9 @@ def point_pattern(theta, phi, f):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"without": ("EPhi_imag",)}, "has no EPhi_imag"),
-        ({"change": lambda i: i.update(EPhi_imag=i["EPhi_imag"][:, :-1])},
-         r"EPhi_imag has shape \(5, 45, 61\), expected 5 \(freq\) x 46"),
-        ({"change": lambda i: i.update(freq=i["freq"][::-1].copy())},
-         "freq does not grow: 40 follows 50"),
-        ({"change": lambda i: i["EPhi_real"].__setitem__((1, 2, 3), np.nan)}, "EPhi_real"),
-        ({"change": lambda i: i.update(gain_conv=i["gain_conv"][:-1])},
-         r"gain_conv has shape \(4,\), expected 5 \(freq\)"),
+        ({"change": lambda i: i.update(EPhi_imag=i["EPhi_imag"][:, :-1])}, "EPhi_imag has shape"),
+        ({"change": lambda i: i.update(freq=i["freq"][::-1].copy())}, "freq does not grow"),
+        ({"change": lambda i: i.update(gain_conv=i["gain_conv"][:-1])}, "gain_conv has shape"),
         ({"header": {"THETA_MAX": 180.0}}, "theta 0 to 180"),
         ({"header": {"TIMECONV": "e-iwt"}}, "TIMECONV"),
         ({"change": lambda images: images["freq"].__imul__(1e6)}, "is this Hz"),
@@ -269,10 +236,6 @@ def test_a_scenario_with_a_file(tmp_path):
     setup = set_up(small_scenario(f"beam.file={path}", "beam.turntable_offset_deg=7"))
     expected = replace(read_beam(path), rotations_deg=(7.0, 97.0, 187.0, 277.0)).beams(25.0, 6)
     np.testing.assert_array_equal(setup.beams.modes, expected.modes)
-    # the resolved scenario is one that can be read again
-    again = tmp_path / "resolved.yaml"
-    again.write_text(setup.scenario.to_yaml())
-    assert lb.load_scenario(again) == setup.scenario
 
 
 def test_a_second_file_as_the_true_beams(tmp_path):

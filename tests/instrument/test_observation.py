@@ -16,10 +16,10 @@ from astropy.coordinates import (
 )
 from astropy.time import Time
 from lunarsky import MCMF, LunarTopo, MoonLocation
-from reference import galactic_directions, is_dark, vectors
+from reference import galactic_directions, vectors
 
 import lusee_bayes as lb
-from lusee_bayes.instrument.observation import BODIES, MOON_RADIUS_KM, body_direction
+from lusee_bayes.instrument.observation import MOON_RADIUS_KM, body_direction
 from lusee_bayes.instrument.schedule import CYCLE_DAYS
 from lusee_bayes.instrument.times import unannounced_leap_seconds
 
@@ -40,45 +40,27 @@ def test_the_fiducial_cycle_and_three_of_them():
     np.testing.assert_allclose(starts, 24 * CYCLE_DAYS * np.arange(3), rtol=0, atol=1e-6)
 
 
-def test_runs_of_any_length_follow_one_another():
-    runs = [lb.Run(0.25, 10.0), lb.Run(0.5, -20.0)]
-    o = lb.Observation.from_runs(runs, start="2026-06-01", step_s=3600.0)
-    np.testing.assert_array_equal(np.bincount(o.run), [163, 327])  # floor(cycles 655.72)
-    assert o.turntable_deg == (10.0, -20.0)
-    assert o.hours[163] == pytest.approx(0.25 * CYCLE_DAYS * 24, abs=1e-6)
-
-
 @pytest.mark.parametrize("seed", [0, 1])
 def test_directions_agree_with_lunartopo(seed):
     rng = np.random.default_rng(seed)
     o = lb.Observation.from_runs(
-        [lb.Run(0.6), lb.Run(0.5)],
+        [lb.Run(0.6, 35.0), lb.Run(0.5, -110.0)],
         start=["2027-01-15T00:00:00", "1999-03-04T05:06:07"][seed],
         lon_deg=rng.uniform(-180, 360),
         lat_deg=rng.uniform(-90, 90),
     )
     to_topo = o.topocentric_from_mcmf() @ o.mcmf_from_galactic
     theta, phi = np.arccos(rng.uniform(-1, 1, 40)), rng.uniform(0, 2 * np.pi, 40)
-    topo = vectors(theta, phi).T
+    seen = vectors(theta, phi)
     for k in rng.integers(0, o.n_times, 5):
-        colatitude, longitude = galactic_directions(theta, phi, o.times[k], o.lon_deg, o.lat_deg)
-        there = vectors(colatitude, longitude).T
+        there = vectors(*galactic_directions(theta, phi, o.times[k], o.lon_deg, o.lat_deg))
         # lunarsky goes through the same kernel; what is left is rounding of three rotations
-        np.testing.assert_allclose(to_topo[k] @ there, topo, rtol=0, atol=1e-10)
-
-
-def test_the_rotations_are_rotations_and_the_moon_turns():
-    o = lb.Observation.from_runs([lb.Run(1.0)])
-    r = o.mcmf_from_galactic
-    within(r @ r.swapaxes(1, 2), np.tile(np.eye(3), (327, 1, 1)), 1e-13)
-    np.testing.assert_allclose(np.linalg.det(r), 1.0, rtol=0, atol=1e-13)
-    # after one sidereal month the Moon is back where it was, to 0.1 degrees (its rotation is
-    # uniform to that: physical libration); the last of 327 samples is 1.86 steps before that
-    turn = np.degrees(np.arccos((np.trace(r[-1] @ r[0].T) - 1) / 2))
-    assert turn == pytest.approx(360.0 * (1 - 326 * 7200 / (CYCLE_DAYS * 86400)), abs=0.1)
-    # it turns from x towards y, so the sky turns the other way, 360 degrees in 327.86 steps
-    step = r[1] @ r[0].T
-    assert np.degrees(np.arctan2(step[0, 1], step[0, 0])) == pytest.approx(1.098, abs=0.01)
+        within(to_topo[k] @ there.T, seen.T, 1e-10)
+        # of antennas on the turntable
+        turned = phi[:1] + np.radians(o.turntable_deg[o.run[k]])
+        site = o.times[k], o.lon_deg, o.lat_deg
+        there = vectors(*galactic_directions(theta[:1], turned, *site))[0]
+        within(o.antenna_directions(there)[k], seen[0], 1e-10)
 
 
 def test_sun_altitude_agrees_with_lunarsky():
@@ -93,18 +75,6 @@ def test_sun_altitude_agrees_with_lunarsky():
     np.testing.assert_allclose(got, by_frame, rtol=0, atol=1e-7)
 
 
-def test_night_only_keeps_the_samples_with_the_sun_down():
-    everything = lb.Observation.from_runs([lb.Run(1.0), lb.Run(1.0)])
-    mixed = lb.Observation.from_runs([lb.Run(1.0), lb.Run(1.0, night_only=True)])
-    dark = is_dark(everything.times, everything.lon_deg, everything.lat_deg)
-    keep = (everything.run == 0) | dark
-    np.testing.assert_array_equal(mixed.times.jd, everything.times[keep].jd)
-    np.testing.assert_array_equal(mixed.run, everything.run[keep])
-    # half of a synodic month is 14.77 days: 177 samples of two hours
-    nights = np.sum(mixed.run == 1)
-    assert 140 < nights < 180
-
-
 @pytest.mark.parametrize(
     ("start", "at"),
     [
@@ -114,8 +84,8 @@ def test_night_only_keeps_the_samples_with_the_sun_down():
     ],
 )
 def test_times_outside_the_ephemeris_are_refused(start, at):
-    with pytest.raises(lb.InputError, match=rf"outside the ephemeris \(1900-2050\): {at}"):
-        lb.Observation.from_runs([lb.Run(1.0)], start=start)
+    words = f"outside the ephemeris (1900-2050): {at}"
+    refuse(words, lb.Observation.from_runs, [lb.Run(1.0)], start=start)
 
 
 @pytest.mark.parametrize("start", ["1900-01-02T00:00:00", "2049-11-20T00:00:00"])
@@ -135,10 +105,7 @@ def test_times_inside_the_ephemeris_work(start):
         ({"runs": [lb.Run(turntable_deg=float("nan"))]}, "turntable_deg holds NaN"),
         ({"runs": [lb.Run(-1.0)]}, "length in cycles of run 0 must be positive, got -1.0"),
         # the Sun is up for two weeks from 1 February 2027 at this site
-        (
-            {"runs": [lb.Run(0.1, night_only=True)], "start": "2027-02-05T00:00:00"},
-            "holds no lunar night",
-        ),
+        ({"runs": [lb.Run(0.1, night_only=True)], "start": "2027-02-05"}, "holds no lunar night"),
     ],
 )
 def test_bad_input_is_refused(options, message):
@@ -180,7 +147,7 @@ def dates(*isot, lon_deg=182.258, lat_deg=-23.814):
 def by_erfa_and_lunartopo(planet, time, lon_deg, lat_deg):
     """East, North, up of a planet of plan94, the Sun (0) or the Earth (3), at one time.
 
-    ERFA's series, light time by bisection, lunarsky's MCMF -> LunarTopo with a finite distance.
+    ERFA's series, light time by repetition, lunarsky's MCMF -> LunarTopo with a finite distance.
     """
     with unannounced_leap_seconds():
         tdb = time.tdb
@@ -213,16 +180,11 @@ def by_erfa_and_lunartopo(planet, time, lon_deg, lat_deg):
             )
             return centred.transform_to(here).cartesian.xyz.to_value(u.km).ravel()
 
-    early, late = 0.0, 40000.0
-    while late - early > 1e-4:
-        middle = (early + late) / 2.0
-        if np.linalg.norm(seen(middle)) > LIGHT * middle:
-            early = middle
-        else:
-            late = middle
-    north, east, up = seen(late)  # azimuth counts from North towards East
-    distance = np.linalg.norm([east, north, up])
-    return np.array([east, north, up]) / distance
+    seconds = 0.0
+    for _ in range(5):  # each of which is 1e-4 of the one before
+        seconds = np.linalg.norm(seen(seconds)) / LIGHT
+    north, east, up = seen(seconds)  # azimuth counts from North towards East
+    return np.array([east, north, up]) / np.linalg.norm([east, north, up])
 
 
 @pytest.mark.parametrize(
@@ -239,13 +201,6 @@ def test_directions_agree_with_erfa_and_lunartopo(body, planet):
         assert angle(got[k], expected) < 1e-3 * ARCSECOND
 
 
-def test_the_sun_is_where_the_observation_says():
-    observation = lb.Observation.from_runs([lb.Run(1.0)], step_s=40000.0)
-    up = np.sum(observation.zenith_galactic() * body_direction("Sun", observation), axis=1)
-    # 1737 km at 1 au are 2.4 arcseconds, the barycentric Sun moves 0.01 km/s x 499 s = 0.01
-    within(np.degrees(np.arcsin(up)), observation.sun_altitude_deg(), 2.5 / 3600)
-
-
 def test_jupiter_is_where_the_almanac_had_it():
     # opposition of 10 January 2026, in Gemini near Pollux: RA 7h 23m, Dec 22
     observation = dates("2026-01-10T00:00:00")
@@ -256,20 +211,11 @@ def test_jupiter_is_where_the_almanac_had_it():
     assert angle(gal, -body_direction("Sun", observation))[0] < np.radians(1.5)
 
 
-def test_every_body_is_known_in_any_case():
-    observation = dates("2027-01-15T00:00:00")
-    for body in BODIES:
-        vector = body_direction(body.upper(), observation)
-        np.testing.assert_allclose(np.linalg.norm(vector, axis=1), 1.0, rtol=0, atol=1e-15)
-
-
 @pytest.mark.parametrize(
     ("body", "message"),
     [
-        ("Jupitre", "unknown body 'Jupitre' in the sky of the Moon; did you mean 'Jupiter'?"),
         ("satrun", "did you mean 'Saturn'"),
-        ("xyz", "known: Earth, Jupiter, Mars"),
-        ("moon", "unknown body 'moon'"),
+        ("moon", "known: Earth, Jupiter, Mars, Mercury, Neptune, Saturn, Sun, Uranus, Venus"),
     ],
 )
 def test_unknown_bodies_are_refused(body, message):

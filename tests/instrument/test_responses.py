@@ -103,28 +103,9 @@ def test_all_products_in_volts(luseepy, test_data, channel):
     assert 5e-5 < off(true, expected) < 5e-4
 
 
-def test_other_conventions_are_noticed(luseepy, test_data):
-    response, _, images = luseepy
-    first = np.arange(328) == 0
-    expected = images["data"][0, :, 2]
-    right = simulated(luseepy, test_data, 25.0, first)[:, 0]
-    signs = np.array([-1.0 if label[-1] == "I" else 1.0 for label in labels()])
-    mirrored = np.r_[0, -1 : -response.n_phi : -1]
-    flipped = replace(
-        response, e_theta=response.e_theta[..., mirrored], e_phi=-response.e_phi[..., mirrored]
-    )
-    unloaded, warm = replace(response, receiver=None), replace(response, moon_k=MOON)
-    moonless = right - volts(response, 25.0, warm.background(25.0)[:, None])[:, 0]
-    wrong = [
-        signs * right,
-        right[::-1],
-        moonless,
-        simulated((flipped, *luseepy[1:]), test_data, 25.0, first)[:, 0],
-        simulated((unloaded, *luseepy[1:]), test_data, 25.0, first)[:, 0],
-    ]
-    assert off(right, expected) < 3e-8
-    for case in wrong:
-        assert off(case, expected) > 1e-4
+def test_all_products_of_the_first_sample(luseepy, test_data):
+    first = simulated(luseepy, test_data, 25.0, np.arange(328) == 0)[:, 0]
+    assert off(first, luseepy[2]["data"][0, :, 2]) < 3e-8
 
 
 def test_sky_and_moon_of_one_temperature_are_an_enclosure(luseepy):
@@ -154,13 +135,14 @@ def short_dipoles(theta, phi, length):
     )
 
 
-def write(path, *, without=(), change=None, frequencies=(10.0, 20.0, 40.0)):
+def write(path, *, change=lambda images: None):
+    frequencies = np.array([10.0, 20.0, 40.0])
     theta, phi = np.linspace(0, 90, 31), np.linspace(0, 360, 121)
     h_theta, h_phi, arms = short_dipoles(np.radians(theta), np.radians(phi), 1.5)
     # over a hemisphere dipoles radiate half as much as over the sphere: 2 pi / 3 arm.arm'
     sky = [VACUUM / (4 * (c / (1e6 * f)) ** 2) * 4 * np.pi / 3 * arms.T @ arms for f in frequencies]
     sky = np.array(sky)
-    reactance = -100j * np.eye(4)[None] * (10.0 / np.array(frequencies))[:, None, None]
+    reactance = -100j * np.eye(4)[None] * (10.0 / frequencies)[:, None, None]
     images = {
         "H_theta": np.repeat(h_theta[:, None], len(frequencies), 1) * (1 + 0.3j),
         "H_phi": np.repeat(h_phi[:, None], len(frequencies), 1) * (1 + 0.3j),
@@ -169,16 +151,14 @@ def write(path, *, without=(), change=None, frequencies=(10.0, 20.0, 40.0)):
         "Rmoon": 1.09 * sky,
         "Rloss": 0.0 * sky,
     }
-    if change is not None:
-        change(images)
+    change(images)
     flat = {}
     for name, values in images.items():
         flat[f"{name}_real"] = np.real(values).astype(np.float32)
         flat[f"{name}_imag"] = np.imag(values).astype(np.float32)
-    flat |= {"freq": np.array(frequencies), "theta": theta, "phi": phi}
-    if change is not None:
-        change(flat)
-    return write_images(path, {k: v for k, v in flat.items() if k not in without}, {"VERSION": 3})
+    flat |= {"freq": frequencies, "theta": theta, "phi": phi}
+    change(flat)
+    return write_images(path, flat, {"VERSION": 3})
 
 
 def varied(images):
@@ -262,7 +242,9 @@ def test_receivers(tmp_path):
     zl = 0.45 * loads[0] + 0.55 * loads[1]
     np.testing.assert_allclose(measured.load(21.0), zl, rtol=1e-13)
     refuse(r"zl.fits has values from 10 to 30 MHz, not at 31", measured.load, 31.0)
-    response = replace(read_beam(write(tmp_path / "response.fits")), receiver=measured)
+    open_ = replace(read_beam(write(tmp_path / "response.fits")), receiver=None)
+    np.testing.assert_array_equal(open_.circuit(20.0).loading, np.eye(4))
+    response = replace(open_, receiver=measured)
     za = 0.95 * response.impedance_ohm[1] + 0.05 * response.impedance_ohm[2]
     np.testing.assert_allclose(
         response.circuit(21.0).loading, zl @ np.linalg.inv(za + zl), rtol=1e-12
@@ -282,39 +264,21 @@ def test_losses_emit_at_the_antennas_temperature(tmp_path):
     close(to_matrix(got)[..., 0], expected, 1e-9)
 
 
-def test_open_ports_and_turns(tmp_path):
-    response = read_beam(write(tmp_path / "response.fits"))
-    open_ = replace(response, receiver=None)
-    np.testing.assert_array_equal(open_.circuit(20.0).loading, np.eye(4))
-    # a quarter turn makes East North: each port takes the place of the next
-    plain, turned = (
-        np.asarray(to_matrix(volts(open_, 20.0, beam.beams(20.0, 5).modes)))
-        for beam in (open_, replace(open_, turntable_offset_deg=90.0))
-    )
-    place = [1, 2, 3, 0]
-    expected = plain[np.ix_(place, place)]
-    np.testing.assert_allclose(turned, expected, rtol=0, atol=1e-6 * np.abs(plain).max())
-
-
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("name", "change", "message"),
     [
-        ({"without": ("H_phi_imag",)}, "has no H_phi_imag"),
-        ({"without": ("Rmoon_real",)}, "has no Rmoon_real"),
-        ({"change": lambda i: i.update(freq=i["freq"][::-1].copy()) if "freq" in i else None},
-         "freq does not grow: 20 follows 40"),
-        ({"change": lambda i: i.update(ZA_real=i["ZA_real"][:, :3]) if "ZA_real" in i else None},
-         r"ZA_real has shape \(3, 3, 4\)"),
-        ({"change": lambda i: i.update(Rmoon=2 * i["Rmoon"]) if "Rmoon" in i else None},
-         "Rsky . Rmoon . Rloss differ"),
-        ({"change": lambda i: i.update(theta=2 * i["theta"]) if "theta" in i else None},
-         "theta goes from 0 to 180 degrees"),
-        ({"change": lambda i: i.update(H_phi=np.nan * i["H_phi"]) if "H_phi" in i else None},
-         "H_phi_real"),
+        ("freq", lambda f: f[::-1].copy(), "freq does not grow"),
+        ("ZA_real", lambda za: za[:, :3], "ZA_real has shape"),
+        ("Rmoon", lambda r: 2 * r, "Rsky . Rmoon . Rloss differ"),
+        ("theta", lambda theta: 2 * theta, "theta goes from 0 to 180 degrees"),
     ],
-)  # fmt: skip
-def test_files_that_cannot_be_used(tmp_path, options, message):
-    refuse(message, read_beam, write(tmp_path / "response.fits", **options))
+)
+def test_files_that_cannot_be_used(tmp_path, name, change, message):
+    def changed(images):
+        if name in images:
+            images[name] = change(images[name])
+
+    refuse(message, read_beam, write(tmp_path / "response.fits", change=changed))
 
 
 # --- in scenarios -------------------------------------------------------------------------------
@@ -371,15 +335,6 @@ def test_luseepys_data_in_kelvin(luseepy):
         i, j = int(label[0]), int(label[1])
         expected = images["data"][:, place, 1] / np.sqrt(enclosure[i] * enclosure[j])
         np.testing.assert_allclose(data.grid()[place], expected, rtol=1e-14)
-
-
-def test_short_dipoles_see_no_even_ell_above_two(tmp_path):
-    """Their products are polynomials of degree 2 cut at the horizon: (P + P sign(z)) / 2, of which
-    the first part ends at ell = 2 and the second is odd."""
-    modes = np.asarray(read_beam(write(tmp_path / "response.fits")).beams(20.0, 9).modes)
-    ell = np.floor(np.sqrt(np.arange(100))).astype(int)
-    even, odd = (np.abs(modes[:, (ell > 2) & (ell % 2 == p)]).max() for p in (0, 1))
-    assert even < 1e-6 * odd
 
 
 @pytest.mark.long
@@ -448,13 +403,6 @@ def test_headers_that_state_what_the_reader_assumes_are_read(luseepy, tmp_path):
 
 
 MATRICES = ("ZA", "ZL", "M", "Rsky", "Rmoon", "Rloss", "blackbody_normalization")
-LAYOUT = [
-    *("data", "freq", "time", "products"),
-    *(f"{name}_{part}" for name in MATRICES for part in ("real", "imag")),
-    "loading_condition_number",
-    *(f"covariance_antihermitian_{kind}" for kind in ("absolute", "relative")),
-    *("covariance_eigenvalues", "covariance_minimum_eigenvalue_ratio", "receiver_params"),
-]
 
 
 def test_luseepys_four_ports_are_written_back(luseepy, tmp_path):
@@ -467,7 +415,6 @@ def test_luseepys_four_ports_are_written_back(luseepy, tmp_path):
         tmp_path / "w.fits", channels, circuits, moon_k=250.0, response=response.path
     )
     with fits.open(path) as ours, fits.open(original) as theirs:
-        assert [hdu.header["EXTNAME"] for hdu in ours] == LAYOUT
         assert [hdu.header["EXTNAME"] for hdu in ours] == [h.header["EXTNAME"] for h in theirs]
         for one, other in zip(ours, theirs, strict=True):
             assert one.header.get("BUNIT") == other.header.get("BUNIT")
@@ -528,9 +475,8 @@ def test_gaps_are_written(luseepy, tmp_path):
 def test_open_ports_have_no_loads_to_write(luseepy, tmp_path):
     response, original, _ = luseepy
     channel = read_waterfall(original).at(5.0)
-    with pytest.raises(lb.InputError, match="the ports are open; give another beam.receiver"):
-        circuit = replace(response, receiver=None).circuit(5.0)
-        write_four_port(tmp_path / "w.fits", [channel], [circuit])
+    circuit, path = replace(response, receiver=None).circuit(5.0), tmp_path / "w.fits"
+    refuse("ports are open; give another beam.rec", write_four_port, path, [channel], [circuit])
     assert not list(tmp_path.iterdir())
 
 
@@ -574,16 +520,13 @@ def test_simulated_and_mapped_between_the_responses_frequencies(luseepy, tmp_pat
 
     # other receivers, another rule
     for override, message in (
-        (
-            "beam.receiver=jfet",
-            "leave out beam.receiver, so that the loads ZL in the data are used",
-        ),
+        ("beam.receiver=jfet", "leave out beam.receiver"),
         ("beam.interpolation=spline", "use --set beam.interpolation=linear"),
     ):
         refuse(message, lb.read_data, path, lb.load_scenario("fiducial", [*given, override]))
     assert simulate("beam.interpolation=spline") == 0
-    with pytest.raises(lb.InputError, match="use --set beam.interpolation=spline"):
-        lb.read_data(path, lb.load_scenario("fiducial", given))
+    words = "use --set beam.interpolation=spline"
+    refuse(words, lb.read_data, path, lb.load_scenario("fiducial", given))
     lb.read_data(path, lb.load_scenario("fiducial", [*given, "beam.interpolation=spline"]))
     # where the response has the frequency nothing is interpolated
     lb.read_data(path, lb.load_scenario("fiducial", [*given, "frequency_mhz=10"]))

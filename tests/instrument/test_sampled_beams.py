@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
+import h5py
 import healpy
 import numpy as np
 import pytest
@@ -239,17 +240,10 @@ def nan_at_the_zenith():
         (lambda: embedded("grid") | {"phi_deg": PHI_DEG + 1.0}, "expected 360 k / n"),
         (lambda: embedded("grid") | {"theta_deg": THETA_DEG / 2}, "to the horizon"),
         (lambda: embedded("grid") | {"theta_deg": THETA_DEG[::-1]}, "theta_deg does not grow"),
-        (
-            lambda: embedded("grid") | {"theta_deg": THETA_DEG[1:]},
-            "theta_deg has shape",
-        ),
         (lambda: embedded("grid") | {"e_phi": np.zeros((3, 31, 60))}, "e_phi has shape"),
         (lambda: {"products": np.zeros((16, 50))}, "no HEALPix map"),
         (lambda: {"products": np.zeros((5, 48))}, "5 products do not come from"),
-        (
-            lambda: {"products": np.zeros((16, 48), dtype=complex)},
-            "products holds values of type complex128, expected real",
-        ),
+        (lambda: {"products": np.zeros((16, 48), dtype=complex)}, "type complex128, expected real"),
         (nan_at_the_zenith, "NaN or infinity in 1 of"),
     ],
 )
@@ -260,46 +254,20 @@ def test_arrays_that_are_no_beams_are_refused(given, words):
 def test_what_cannot_be_computed_is_refused():
     zero = lb.sampled_beams(FREQUENCY, products=np.zeros((16, 12 * 4**2)))
     refuse("autos integrate to 0 sr", zero.beams, FREQUENCY, 2)
-    with pytest.raises(lb.InputError, match="beams of products, not the E fields"):
-        zero.fields(FREQUENCY, HemisphereGrid.for_lmax(2))
-    with pytest.raises(lb.InputError, match="frequency_mhz does not grow"):
-        lb.sampled_beams([20.0, 10.0], products=np.zeros((2, 16, 48)))
+    refuse("not the E fields", zero.fields, FREQUENCY, HemisphereGrid.for_lmax(2))
+    two = np.zeros((2, 16, 48))
+    refuse("frequency_mhz does not grow", lb.sampled_beams, [20.0, 10.0], products=two)
 
 
-DAMAGE = {
-    "no e_phi": (lambda f: f.drop_vars("e_phi_imag"), lambda h: h.pop("E_PHI_IMAG")),
-    "no absolute": (
-        lambda f: f.drop_attrs(deep=False).assign_attrs(
-            {name: value for name, value in f.attrs.items() if name != "absolute"}
-        ),
-        lambda h: h[0].header.remove("ABSOLUTE"),
-    ),
-    "text": (
-        lambda f: f.assign_attrs(absolute="yes"),
-        lambda h: h[0].header.update(ABSOLUTE="yes"),
-    ),
-    "Hz": (
-        lambda f: f.assign(frequency_mhz=1e6 * f["frequency_mhz"]),
-        lambda h: h["FREQUENCY_MHZ"].data.__imul__(1e6),
-    ),
-}
-
-
-@pytest.mark.parametrize("change", [*DAMAGE, "cut"])
 @pytest.mark.parametrize("suffix", ["nc", "fits"])
-def test_damaged_files_are_refused(tmp_path, change, suffix):
-    path = tmp_path / f"mine.{suffix}"
-    write_sampled_beams(path, lb.sampled_beams(FREQUENCY, **embedded("grid")))
-    if change == "cut":
-        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    elif suffix == "fits":
-        with fits.open(path, memmap=False) as hdus:
-            DAMAGE[change][1](hdus)
-            hdus.writeto(path, overwrite=True)
+def test_a_file_has_to_say_whether_its_scale_is_absolute(tmp_path, suffix):
+    path, made = tmp_path / f"mine.{suffix}", lb.sampled_beams(FREQUENCY, **embedded("grid"))
+    write_sampled_beams(path, made)
+    if suffix == "fits":
+        fits.delval(path, "ABSOLUTE")
     else:
-        with xr.open_dataset(path, engine="h5netcdf") as file:
-            found = DAMAGE[change][0](file.load())
-        found.to_netcdf(path, engine="h5netcdf")
+        with h5py.File(path, "r+") as file:
+            del file.attrs["absolute"]
     refuse(str(path), read_beam, path)
 
 

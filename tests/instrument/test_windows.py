@@ -10,14 +10,12 @@ import numpy as np
 import pytest
 import xarray as xr
 from assertions import refuse, refused, within
-from astropy.coordinates import ICRS, CartesianRepresentation, Galactic
 from astropy.time import Time
-from lunarsky import LunarTopo, MoonLocation
-from reference import steep_sky
+from reference import galactic_directions, steep_sky, vectors
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import Rotation
-from lusee_bayes.instrument.averaging import averaged, product_live_s, sufficient_nodes
+from lusee_bayes.instrument.averaging import averaged, product_live_s
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.instrument.times import Windows, unannounced_leap_seconds
@@ -32,21 +30,24 @@ STEP = 600.0
 RUNS = [lb.Run(0.004), lb.Run(0.003, turntable_deg=30.0)]
 
 
+def windows_of(pieces):
+    """Of (sample, start, end, live time) of every piece."""
+    sample, *rest = (np.array(column) for column in zip(*pieces, strict=True))
+    return Windows(sample, *rest)
+
+
 def observed(keep=None, windows="odd", runs=RUNS):
     """15 and 11 samples; every third is made of two pieces."""
     observation = lb.Observation.from_runs(runs, step_s=STEP, window="mean")
     rng = np.random.default_rng(7)
     n = observation.n_times
     if windows == "odd":
-        sample, start, end, live = [], [], [], []
+        found = []
         for k in range(n):
             pieces = [(-300.0, -100.0), (-40.0, 300.0)] if k % 3 == 0 else [(-300.0, 300.0)]
             share = 1.0 if k % 2 else rng.uniform(0.2, 1.0)
-            for a, b in pieces:
-                sample, start, end = [*sample, k], [*start, a], [*end, b]
-                live.append(share * (b - a))
-        made = Windows(np.array(sample), np.array(start), np.array(end), np.array(live))
-        observation = replace(observation, windows=made)
+            found += [(k, a, b, share * (b - a)) for a, b in pieces]
+        observation = replace(observation, windows=windows_of(found))
     return observation if keep is None else observation.select(keep)
 
 
@@ -112,6 +113,7 @@ def naive(data, to_s):
 
 CASES = {
     "whole": (observed(), 0.0),
+    "a run lost": (observed(), np.where(observed().run == 0, 1.0, 0.1)),
     "flags": (observed(), 0.15),
     "many flags": (observed(), 0.55),
     "gaps": (observed(np.arange(26) % 7 != 3), 0.1),
@@ -209,16 +211,6 @@ def test_bins_of_which_nothing_remains_are_dropped():
         refuse("nothing is left of the data in bins of 2400 s", averaged, data, 4 * STEP)
 
 
-def test_a_run_of_which_nothing_remains_is_gone():
-    observation = observed()
-    flags = np.zeros((16, observation.n_times), dtype=bool)
-    flags[:, observation.run == 0] = True
-    layout = DataLayout.from_flags(flags)
-    data = lb.Visibilities(np.ones(layout.size), layout, observation, 25.0)
-    found = averaged(data, 3 * STEP).observation
-    assert found.turntable_deg == (30.0,) and set(found.run) == {0}
-
-
 @pytest.mark.parametrize(
     ("windows", "to_s", "words"),
     [
@@ -240,18 +232,15 @@ def test_what_cannot_be_averaged(windows, to_s, words):
 def partly_filled(n, step_s, seed=1):
     """Whole windows, windows that end early, and windows with one or two gaps."""
     rng = np.random.default_rng(seed)
-    sample, start, end, live = [], [], [], []
+    found = []
     for k in range(n):
         edges = np.sort(rng.uniform(-0.5, 0.5, 2 * (k % 4))) * step_s
         edges = np.concatenate([[-step_s / 2], edges, [step_s / 2]])
         if k % 4 == 1:  # one piece, without its end
             edges = edges[:2]
         for first, last in zip(edges[::2], edges[1::2], strict=True):
-            sample.append(k)
-            start.append(first)
-            end.append(last)
-            live.append(rng.uniform(0.3, 1.0) * (last - first))
-    return Windows(np.array(sample), np.array(start), np.array(end), np.array(live))
+            found.append((k, first, last, rng.uniform(0.3, 1.0) * (last - first)))
+    return windows_of(found)
 
 
 def observation(step_s, filled):
@@ -304,20 +293,6 @@ def test_equals_the_mean_of_200_instants(step_s, filled, lmax):
     assert wrong > {10.0: 1e-8, 600.0: 1e-4, 7200.0: 0.1, 43200.0: 10.0}[step_s]
 
 
-def antenna_frame(o, time):
-    """From Galactic axes to those of the turned antennas, by lunarsky's LunarTopo."""
-    site = MoonLocation.from_selenodetic(o.lon_deg * u.deg, o.lat_deg * u.deg, 0.0 * u.m)
-    axes = Galactic(CartesianRepresentation(np.eye(3))).transform_to(ICRS())
-    with unannounced_leap_seconds():
-        there = axes.transform_to(LunarTopo(obstime=time, location=site))
-    east, north, up = np.sin(there.az), np.cos(there.az), np.sin(there.alt)
-    flat = np.cos(there.alt)
-    topocentric = np.array([(flat * east).value, (flat * north).value, up.value])
-    psi = np.radians(o.turntable_deg[0])
-    back = np.array([[np.cos(psi), np.sin(psi), 0], [-np.sin(psi), np.cos(psi), 0], [0, 0, 1]])
-    return back @ topocentric
-
-
 @pytest.mark.parametrize(
     ("step_s", "filled", "lmax"),
     [(7200.0, False, 12), pytest.param(43200.0, True, 47, marks=pytest.mark.long)],
@@ -325,39 +300,20 @@ def antenna_frame(o, time):
 def test_equals_the_mean_of_20_instants_by_lunarsky(step_s, filled, lmax):
     o, beams, sky = observation(step_s, filled), lb.monopole_beams(25.0, lmax), steep_sky(lmax)
     got = np.asarray(lb.CouplingMatrix.observe(beams, o) @ sky).reshape(16, -1)
+    # the axes of the turned antennas: x, y and z
+    theta = np.radians([90.0, 90.0, 0.0])
+    phi = np.radians(np.array([0.0, 90.0, 0.0]) + o.turntable_deg[0])
     for k in (1, 2, 7):
         offsets, weights = nodes_of(o.windows, k, 20)
         expected = 0.0
         for offset, weight in zip(offsets, weights, strict=True):
             with unannounced_leap_seconds():
                 time = o.times[k] + offset * u.s
-            turned = Rotation.from_matrix(antenna_frame(o, time), lmax)(sky)
+            there = vectors(*galactic_directions(theta, phi, time, o.lon_deg, o.lat_deg))
+            turned = Rotation.from_matrix(there, lmax)(sky)
             expected = expected + weight * (np.asarray(beams.modes) @ turned)
         sigma = sigma_of(np.asarray(expected)[:, None], replace(o.select(np.arange(8) == k)))
         assert np.abs((got[:, k] - expected) / sigma[:, 0]).max() < 1e-6
-
-
-def test_a_fixed_axis_gives_a_factor_for_each_order():
-    """sin(m h) / (m h), h half of the angle of a window, where nothing wanders."""
-    o = lb.Observation.from_runs([lb.Run(0.2)], step_s=7200.0, window="mean")
-    p = Pointing.of(o, 30, order=0)
-    # the Moon's own turn, from its orientations at the ends of the windows
-    with unannounced_leap_seconds():
-        edges = replace(o, times=o.times - 3600.0 * u.s, windows=None)
-    half = np.diff(np.unwrap(np.asarray(Pointing.of(edges, 2).azimuth))) / 2.0
-    got = np.asarray(p.functions)[:-1] @ np.asarray(p.factors)[:, 0, :, 0]
-    m = np.arange(31)
-    # what functions of time leave out
-    np.testing.assert_allclose(got, np.sinc(m * half[:, None] / np.pi), rtol=0, atol=1e-8)
-    # one function is all but exact: the rate of the turn varies by 1e-4
-    alone = np.asarray(p.functions)[:-1, :1] * np.asarray(p.factors)[0, 0, :, 0]
-    np.testing.assert_allclose(alone, got, rtol=0, atol=1e-4 * (30 * half.max()) ** 2)
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-3, 0.3, 3.0])
-def test_nodes_suffice(angle):
-    x, w = np.polynomial.legendre.leggauss(sufficient_nodes(angle))
-    assert w @ np.cos(angle * x) / 2 == pytest.approx(np.sinc(angle / np.pi), abs=2e-15 + 1e-14)
 
 
 @pytest.mark.parametrize(
@@ -384,26 +340,6 @@ def test_windows_that_samples_cannot_have():
         replace(o, windows=Windows.whole(-3600 * n, 3600 * n + 600 * (o.hours == 0)), step_s=8e3)
     refuse("windows of 3 samples for 16 times", replace, o, windows=Windows.whole(-n[:3], n[:3]))
     refuse("samples are instants; use observation.window=instant", replace, o, fixed_axis=True)
-
-
-def test_nodes_and_live_times():
-    w = partly_filled(9, 100.0)
-    sample, offset, weight = w.nodes(3)
-    np.testing.assert_allclose(np.bincount(sample, weight), 1.0, rtol=1e-14)
-    for k in range(9):
-        pieces = w.sample == k
-        assert w.live_per_sample_s[k] == pytest.approx(w.live_s[pieces].sum(), rel=1e-14)
-        np.testing.assert_array_equal(
-            w.bounds_s[k], [w.start_s[pieces].min(), w.end_s[pieces].max()]
-        )
-        # the mean of t^2 over the pieces, by hand
-        exact = (w.end_s**3 - w.start_s**3) / 3 / (w.end_s - w.start_s) * w.live_s
-        exact = exact[pieces].sum() / w.live_s[pieces].sum()
-        assert weight[sample == k] @ offset[sample == k] ** 2 == pytest.approx(exact, rel=1e-12)
-    keep = np.arange(9) % 3 == 0
-    some = w.select(keep)
-    np.testing.assert_array_equal(some.live_per_sample_s, w.live_per_sample_s[keep])
-    assert "3 windows in" in repr(some)
 
 
 # --- windows in files and in arrays ---------------------------------------------------------------
@@ -582,11 +518,9 @@ def bounds_alone(change):
         (attribute("window", "instant"), "says that the samples are instants, and piece_sample"),
         (attribute("window", "means"), "window is 'means'; did you mean 'mean'"),
         (shifted_bounds, "time_bounds and the pieces of sample 0 differ by 30 s"),
-        (changed("piece_end_s", -2000.0), "sample 1 ends -2000 s from its time, not after"),
         (changed("piece_start_s", np.nan), "piece_start_s holds NaN"),
         (changed("piece_sample", 0), "at least one piece for each"),
         (changed("piece_live_s", 4000.0), "sample 1 was live for 4000 s of a window of 3600 s"),
-        (bounds_alone(changed("live_time", 4000.0)), "sample 1 was live for 4000 s"),
         (bounds_alone(changed("live_time", -1.0)), "sample 1 has a live time of -1 s"),
         (bounds_alone(changed("time_bounds", np.datetime64("NaT"))), "time_bounds holds no time"),
         (bounds_alone(numbers), "time_bounds holds values of type float64, expected times"),
@@ -594,11 +528,9 @@ def bounds_alone(change):
 )
 def test_windows_that_a_file_cannot_have(tmp_path, change, words):
     path = rewritten(made(), tmp_path / "bad.nc", change)
-    with pytest.raises(lb.InputError) as caught:
+    with refused(words) as caught:
         read_visibilities(path)
-    assert words in str(caught.value)
     assert str(caught.value).startswith(str(path))
-    assert "\n" not in str(caught.value)
 
 
 # --- arrays -------------------------------------------------------------------------------------
@@ -674,9 +606,7 @@ PAIRS = [[s, s + timedelta(seconds=HOUR)] for s in STARTS]
         ({"timestamp": "instant", "live_s": [1.0] * 4}, "instants have no live time"),
         ({"timestamp": "instant", "bounds": PAIRS}, "instants have no bounds"),
         ({"live_s": [1.0] * 3}, "live_s has shape (3,); give one finite number, or one for each"),
-        ({"live_s": [1.0, 2.0, np.nan, 3.0]}, "or one for each of 4 times"),
         ({"live_s": "all"}, "live_s is 'all'; give one finite number"),
-        ({"live_s": [1.0, 2.0, 3700.0, 3.0]}, "sample 2 was live for 3700 s of a window of 3600"),
         ({"live_s": [1.0, 0.0, 1.0, 3.0]}, "leave out samples in which nothing was integrated"),
         ({"step_s": 4000.0}, "windows of samples 0 and 1 (2027-01-15T00:00:00) overlap by 400 s"),
         ({"bounds": PAIRS[:3]}, "bounds have shape (3, 2), expected (4, 2)"),
@@ -684,10 +614,6 @@ PAIRS = [[s, s + timedelta(seconds=HOUR)] for s in STARTS]
         ({"bounds": [pair[::-1] for pair in PAIRS]}, "windows need a start and then an end"),
         ({"bounds": PAIRS[::-1]}, "the time of sample 0 (2027-01-15T00:00:00) is not within"),
         ({"bounds": PAIRS, "step_s": 1800.0}, "lasts 3600 s, longer than the step of 1800 s"),
-        (
-            {"bounds": [[a, b + timedelta(seconds=500)] for a, b in PAIRS], "step_s": 4100.0},
-            "overlap by 500 s",
-        ),
     ],
 )
 def test_what_is_wrong_is_said_in_a_sentence(options, words):

@@ -68,8 +68,8 @@ PRIORS = {
 @pytest.mark.parametrize("kind", PRIORS)
 def test_the_posterior_of_a_sum_is_that_of_all_data(kind):
     models, data = random_parts()
-    first, second = (m.condition(d).information for m, d in zip(models, data, strict=True))
-    total = second + first
+    solutions = [model.condition(d) for model, d in zip(models, data, strict=True)]
+    total = solutions[1].information + solutions[0].information
     a = np.concatenate([np.asarray(model.coupling.dense()) for model in models])
     noise = block_diag(*(np.asarray(model.noise.dense()) for model in models))
     offset = np.concatenate([np.asarray(model.offset) for model in models])
@@ -84,6 +84,10 @@ def test_the_posterior_of_a_sum_is_that_of_all_data(kind):
     residual = every - offset - a @ (answer.mean + mean)
     told = total.fit(np.asarray(found.mean), np.asarray(found.covariance()))
     assert told["chi2"] == pytest.approx(residual @ np.linalg.solve(noise, residual), rel=TOL)
+    for solution in solutions:
+        under, alone = solution.under(prior).posterior, solution.information.posterior(prior)
+        np.testing.assert_allclose(under.mean, alone.mean, atol=TOL)
+        np.testing.assert_allclose(under.log_evidence, alone.log_evidence, rtol=TOL)
     seen = a.T @ np.linalg.solve(noise, a)
     assert told["chi2_expected"] == pytest.approx(27 - np.vdot(seen, answer.covariance), rel=TOL)
 

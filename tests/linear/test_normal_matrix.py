@@ -166,19 +166,6 @@ def test_inside_a_transformation_the_form_is_one_in_jax():
         np.testing.assert_allclose(mean, expected, rtol=0, atol=1e-11)
 
 
-def test_information_under_another_prior():
-    gaussian = model()
-    data = jnp.asarray(np.random.default_rng(2).standard_normal(gaussian.n_data))
-    solution = gaussian.condition(data)
-    spectrum = np.asarray(gaussian.prior.spectrum) * 0.1
-    spectrum[3] = 0.0  # an ell that is known to be zero
-    other = lb.HarmonicPrior(jnp.asarray(spectrum))
-    expected = replace(gaussian, prior=other).condition(data, InMap).posterior
-    for got in (solution.information.posterior(other), solution.under(other).posterior):
-        np.testing.assert_allclose(got.mean, expected.mean, rtol=0, atol=1e-11)
-        np.testing.assert_allclose(got.log_evidence, expected.log_evidence, rtol=1e-11)
-
-
 @pytest.mark.parametrize("kind", ["diagonal", "low rank"])
 def test_the_matrix_is_not_formed_where_there_is_structure(kind, monkeypatch):
     gaussian = model(kind)

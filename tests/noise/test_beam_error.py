@@ -9,24 +9,14 @@ from reference_linear import random_covariance
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith
+from lusee_bayes.instrument.beams.monopoles import Monopoles
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.noise.instrument_errors import (
-    beam_error_noise,
-    difference,
-    rms_difference,
-)
+from lusee_bayes.noise.instrument_errors import beam_error_noise, difference, rms_difference
 from lusee_bayes.sky.prior import DensePrior
 
 LMAX, FREQUENCY = 4, 25.0
-ANTENNAS = Monopoles(
-    Regolith(3.7, 6.1, 0.01),
-    length_m=3.0,
-    zenith_angle_deg=75.0,
-    height_m=2.0,
-    turntable_offset_deg=10.0,
-)
+ANTENNAS = Monopoles(turntable_offset_deg=10.0)
 
 
 @pytest.fixture(scope="module")

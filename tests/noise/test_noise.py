@@ -98,17 +98,6 @@ def test_exact_variances_have_closed_forms():
     np.testing.assert_allclose(variance[4], (auto - v.real**2 + v.imag**2) / 2, rtol=1e-13)
 
 
-def test_a_fully_polarised_point_leaves_no_noise_in_one_direction():
-    """T of rank one: all products follow from one power, and blocks have rank one."""
-    e = np.array([1.0, 0.5 + 1j, -0.3j, 2.0])
-    t = np.outer(e, e.conj())
-    v = jnp.asarray(real_products(t)[:, None])
-    eigenvalues = np.linalg.eigvalsh(np.asarray(exact_blocks(v))[0])
-    # |s|^2 of one complex Gaussian: dV = e e^H (|s|^2 - 1), of variance one
-    assert eigenvalues[-1] == pytest.approx((real_products(t) ** 2).sum(), rel=1e-13)
-    assert np.abs(eigenvalues[:-1]).max() < 1e-13 * eigenvalues[-1]
-
-
 @pytest.mark.parametrize("form", ["paper", "exact"])
 def test_scalings(form):
     base = np.asarray(noise(form).dense())

@@ -14,19 +14,18 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro
 import pytest
-from arviz_stats.base import array_stats
 from assertions import refuse
 from experiments import draw_within
 from numpyro import distributions as dist
 from reference_linear import matrices, random_covariance, z_of
 from reference_linear import posterior as naive_posterior
 from scipy.stats import lognorm, multivariate_normal
+from small_models import assert_mean
 
 import lusee_bayes as lb
 from lusee_bayes.noise.covariance import DenseCovariance
 from lusee_bayes.sampling import hmc as inference
 from lusee_bayes.sampling.hmc import CHUNK, STATISTICS, Checkpoints, Sampler, sample
-from lusee_bayes.sampling.programs import latent_sites
 
 ROOT = Path(lb.__file__).resolve().parents[1]
 TESTS = Path(__file__).parent
@@ -83,18 +82,6 @@ def hmc(gaussian, data):
     wrong = lb.Whitening.of(other.condition(-data).posterior)
     sampler = Sampler(chains=4, warmup=150, draws=1500, algorithm="hmc", trajectory=1.2)
     return sky_chains(gaussian, data, sampler, wrong), wrong
-
-
-def assert_mean(draws, expected, what):
-    """Mean of every column (chains, draws, columns), in Monte Carlo errors by ArviZ's ESS.
-
-    ESS itself scatters by a tenth at these lengths, hence a tenth on top of the false alarm rate's.
-    """
-    ess = array_stats.ess(draws, chain_axis=0, draw_axis=1, method="mean")
-    assert ess.min() > 150, f"{what}: too few effective draws to judge"
-    error = draws.std((0, 1)) / np.sqrt(ess)
-    z = np.abs(draws.mean((0, 1)) - expected) / error
-    assert z.max() < 1.1 * z_of(z.size), f"{what} off by {z.max():.1f} Monte Carlo errors"
 
 
 def assert_follows(draws, answer):
@@ -236,9 +223,7 @@ def test_the_marginal_program_finds_the_noise_level(gaussian, data, level_grid, 
         ({"warmup": 19}, "warmup must be at least 20, got 19"),
         ({"draws": 0}, "draws must be at least 1, got 0"),
         ({"target_accept": 1.0}, r"target_accept must lie in 0..1, got 1.0"),
-        ({"target_accept": float("nan")}, r"target_accept must lie in 0..1, got nan"),
         ({"trajectory": 0.0}, "trajectory must be positive, got 0.0"),
-        ({"trajectory": float("nan")}, "trajectory must be positive, got nan"),
         ({"algorithm": "nut"}, "unknown algorithm 'nut'; did you mean 'nuts'?"),
     ],
 )
@@ -261,15 +246,8 @@ def test_the_number_of_draws_is_no_part_of_a_runs_identity():
 @pytest.mark.parametrize("site", ["data", "skies"])
 def test_a_site_to_whiten_that_the_program_does_not_sample(gaussian, data, site):
     whitening = lb.Whitening.of(gaussian.condition(data).posterior, site)
-    arguments = arguments_of(gaussian, data)
-    with pytest.raises(lb.InputError, match=f"no latent site '{site}' to whiten; it has sky"):
-        sample(lb.load_program("sky").model, arguments, Sampler(), whitening)
-
-
-def test_latent_sites_are_those_sampled_and_not_observed(gaussian, data):
-    arguments = {"coupling": gaussian.coupling, "prior": gaussian.prior, "scale": jnp.asarray(1.0)}
-    assert latent_sites(noisy_sky, arguments | {"data": data}) == ["level", "sky"]
-    assert latent_sites(noisy_sky, arguments) == ["level", "sky", "data"]
+    words = f"no latent site '{site}' to whiten; it has sky"
+    refuse(words, sky_chains, gaussian, data, Sampler(), whitening)
 
 
 # ---- draws do not depend on how they were kept. A curved little posterior, whose diagonal metric

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -11,16 +12,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from assertions import refuse
+from assertions import refuse, refused
 from numpyro import handlers
 from numpyro.infer.util import log_density
-from reference_linear import assert_draws_follow, posterior, random_covariance
+from reference_linear import assert_draws_follow, posterior
+from small_models import random_gaussian
 
 import lusee_bayes
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
 from lusee_bayes.experiment.experiment import program_pieces
-from lusee_bayes.noise.covariance import DenseCovariance
 from lusee_bayes.sampling.programs import (
     collapsed_draws,
     is_collapsed,
@@ -55,12 +56,7 @@ def model(coupling, prior, noise, data=None):
 
 @pytest.fixture(scope="module")
 def gaussian():
-    rng = np.random.default_rng(11)
-    return lb.LinearGaussian(
-        jnp.asarray(rng.standard_normal((N_DATA, 9))),
-        lb.HarmonicPrior(jnp.asarray(SPECTRUM)),
-        DenseCovariance(jnp.asarray(3.0 * random_covariance(rng, N_DATA))),
-    )
+    return random_gaussian(SPECTRUM, N_DATA, 11, noise=3.0)
 
 
 @pytest.fixture
@@ -132,19 +128,12 @@ def test_a_program_has_its_own_future_imports_only(write):
 # --- and refusing them ----------------------------------------------------------------------------
 
 
-def assert_one_sentence(error, *parts):
-    message = str(error.value)
-    assert "\n" not in message and len(message) < 300
-    for part in parts:
-        assert part in message
-
-
 def test_no_such_program(tmp_path):
     missing = tmp_path / "missing.py"
     for source in ("sky_margnal", missing, tmp_path):
-        with pytest.raises(lb.InputError, match="no program") as error:
+        with refused("no program") as error:
             lb.load_program(source)
-        assert_one_sentence(error, str(source), "sky_marginal", "prior_amplitude")
+        assert str(source) in str(error.value) and "sky_marginal" in str(error.value)
 
 
 @pytest.mark.parametrize(
@@ -152,10 +141,7 @@ def test_no_such_program(tmp_path):
     [
         ("def model(:\n", "fails when it is loaded", "line 1"),
         ("import nowhere_to_be_found\n", "fails when it is loaded", "nowhere_to_be_found"),
-        ("scale = 1 / 0\n", "fails when it is loaded", "division by zero"),
-        ("raise RuntimeError('no device')\n", "fails when it is loaded", "no device"),
         ("open('/nonexistent/table.txt')\n", "fails when it is loaded", "/nonexistent/table.txt"),
-        ("{}['missing key']\n", "fails when it is loaded", "missing key"),
         ("assert 1 > 2, 'not so'\n", "fails when it is loaded", "not so"),
         *(
             (text, "has no function 'model'", "def model(")
@@ -170,9 +156,10 @@ def test_no_such_program(tmp_path):
 )
 def test_files_that_are_no_programs(write, text, message, more):
     path = write(text)
-    with pytest.raises(lb.InputError, match=message) as error:
+    with refused(message) as error:
         lb.load_program(path)
-    assert_one_sentence(error, str(path), more)
+    assert str(path) in str(error.value) and more in str(error.value)
+    assert len(str(error.value)) < 300
     refuse("give the path of a Python file", lb.load_program, write(text, "mine.txt"))
 
 
@@ -229,9 +216,8 @@ def test_what_is_seen_without_a_sky_shifts_the_data(gaussian, name):
 def test_a_program_that_would_forget_the_offset_is_refused(gaussian, write):
     program = lb.load_program(write("def model(coupling, data=None):\n    pass\n"))
     program.arguments(gaussian)
-    with pytest.raises(lb.InputError, match="add the argument 'offset'") as error:
-        program.arguments(replace(gaussian, offset=jnp.asarray(OFFSET)))
-    assert_one_sentence(error, "'mine'")
+    shifted = replace(gaussian, offset=jnp.asarray(OFFSET))
+    refuse("'mine'.* add the argument 'offset'", program.arguments, shifted)
 
 
 # --- draws from collapsed programs ----------------------------------------------------------------
@@ -283,32 +269,6 @@ def test_skies_at_fixed_sites_follow_the_analytic_posterior(gaussian, collapsed,
     assert_draws_follow(skies.reshape(-1, 9), expected.mean, expected.covariance)
 
 
-def test_every_draw_has_its_own_sites(gaussian, collapsed):
-    """The sites of draw (c, d) shape the sky of draw (c, d), and each has its own random numbers.
-
-    With levels 1e-12 the sky is the least squares solution, with 1e12 a draw of the prior.
-    """
-    program = collapsed["sky_marginal"][0]
-    data = np.asarray(gaussian.sample(jax.random.key(3))[1])
-    levels = np.full((3, 4), 1e12)
-    known = [(0, 1), (2, 0), (2, 3)]
-    for at in known:
-        levels[at] = 1e-12
-    arguments = program.arguments(gaussian)
-    skies = collapsed_draws(program, arguments, data, {"noise_level": levels}, jax.random.key(4))
-    white = np.linalg.inv(np.linalg.cholesky(np.asarray(gaussian.noise.dense())))
-    best = np.linalg.lstsq(white @ np.asarray(gaussian.coupling.dense()), white @ data)[0]
-    near = np.abs(skies - best).max(2)
-    # noise of 1e-6, against skies of order one
-    assert {(int(c), int(d)) for c, d in np.argwhere(near < 1e-3)} == set(known)
-    others = skies[levels > 1]
-    assert np.unique(others[:, 0]).size == len(others)
-    again = collapsed_draws(program, arguments, data, {"noise_level": levels}, jax.random.key(4))
-    np.testing.assert_array_equal(again, skies)
-    other = collapsed_draws(program, arguments, data, {"noise_level": levels}, jax.random.key(5))
-    assert (other[levels > 1] != others).all()
-
-
 @each
 def test_replicated_data_are_the_skies_seen_with_new_noise(gaussian, collapsed, name):
     program, values, _, n, offset = collapsed[name]
@@ -320,19 +280,6 @@ def test_replicated_data_are_the_skies_seen_with_new_noise(gaussian, collapsed, 
     mean = np.asarray(gaussian.coupling.dense()) @ sky + offset
     assert_draws_follow(seen.reshape(-1, N_DATA), mean, n)
     # noise sqrt(1.2) too strong, or a mean 0.1 standard deviations off, would be seen
-
-
-def test_each_sky_is_seen_in_its_own_place(gaussian, collapsed):
-    """Two skies far apart, in chain 0 and 1."""
-    program, values, *_ = collapsed["sky_marginal"]
-    data = np.asarray(gaussian.sample(jax.random.key(8))[1])
-    skies = np.stack([np.full((3, 9), 1e6), np.full((3, 9), -2e6)])
-    seen = collapsed_draws(
-        program, program.arguments(gaussian), data, repeated(values, (2, 3)), jax.random.key(9),
-        skies,
-    )  # fmt: skip
-    # noise of order one on data of order 1e6
-    np.testing.assert_allclose(seen, skies @ np.asarray(gaussian.coupling.dense()).T, atol=20.0)
 
 
 # --- programs that cannot be sampled --------------------------------------------------------------
@@ -420,37 +367,18 @@ def test_the_packages_programs_pass(name, pieces):
     assert check(name, pieces)
 
 
-@pytest.mark.parametrize("name", BAD)
-def test_bad_programs_are_one_sentence(name, tmp_path, pieces):
-    body, message = BAD[name]
-    path = tmp_path / "bad.py"
-    path.write_text(HEAD + body)
-    with pytest.raises(lb.InputError, match=message) as caught:
-        check(path, pieces)
-    assert "\n" not in str(caught.value) and "bad.py" in str(caught.value)
+TEXTS = {name: (HEAD + body, message) for name, (body, message) in BAD.items()}
+TEXTS["no sky"] = (HEAD + GOOD).replace('"sky"', '"mine"'), "has no site 'sky'"
+KNOWN = re.sub(r'numpyro.sample\("(slope|gains)".*', "jnp.ones(1)", OFFSET_PROGRAM)
+TEXTS["no unknowns"] = KNOWN, "samples nothing"
 
 
-NO_LATENT = """
-import numpyro
-import lusee_bayes as lb
-
-
-def model(coupling, prior, noise, data=None):
-    gaussian = lb.LinearGaussian(coupling, prior, noise)
-    numpyro.sample("data", lb.Marginal(gaussian), obs=data)
-    return gaussian
-"""
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ((HEAD + GOOD).replace('"sky"', '"mine"'), "has no site 'sky'"),
-        (NO_LATENT, "samples nothing"),
-    ],
-)
-def test_programs_without_a_sky_or_unknowns_are_refused(text, message, write, pieces):
-    refuse(message, check, write(text), pieces)
+@pytest.mark.parametrize("name", TEXTS)
+def test_bad_programs_are_one_sentence(name, write, pieces):
+    text, message = TEXTS[name]
+    with refused(message) as caught:
+        check(write(text, "bad.py"), pieces)
+    assert "bad.py" in str(caught.value)
 
 
 @pytest.mark.parametrize("argument", ["coupling, /, ", "*, coupling, *noise, ", "**others, "])

@@ -2,18 +2,16 @@
 
 import healpy
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from arviz_stats.base import array_stats
 from assertions import refuse
-from reference_linear import matrices, random_covariance, z_of
+from reference_linear import matrices, z_of
 from reference_linear import posterior as naive_posterior
 from scipy.stats import norm
+from small_models import random_gaussian
 
-import lusee_bayes as lb
 from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
-from lusee_bayes.noise.covariance import DenseCovariance
 from lusee_bayes.sampling import mode
 from lusee_bayes.sampling.mode import (
     disc,
@@ -32,12 +30,7 @@ N = N_CHAINS * N_DRAWS
 @pytest.fixture(scope="module")
 def gaussian():
     """(posterior of the package, textbook answer): sixteen modes, ten data."""
-    rng = np.random.default_rng(3)
-    model = lb.LinearGaussian(
-        jnp.asarray(rng.normal(size=(10, N_MODES))),
-        lb.HarmonicPrior(jnp.asarray([4.0, 2.0, 1.0, 0.5])),
-        DenseCovariance(jnp.asarray(random_covariance(rng, 10))),
-    )
+    model = random_gaussian([4.0, 2.0, 1.0, 0.5], 10, 3)
     _, data = model.sample(jax.random.key(0))
     return model.condition(data).posterior, naive_posterior(*matrices(model), data)
 

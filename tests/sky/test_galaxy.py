@@ -124,15 +124,6 @@ def test_pattern_is_ulsas(ulsa_map, frequency_mhz, floor):
     assert np.corrcoef(ours, theirs)[0, 1] > floor
 
 
-def test_free_free_shadow_of_the_plane():
-    # Opaque plane at 1 MHz, transparent at 30 MHz: the contrast changes sides.
-    lon, lat = hp.pix2ang(NSIDE, np.arange(12 * NSIDE**2), lonlat=True)
-    inner = (np.abs(lat) < 5.0) & (np.abs((lon + 180.0) % 360.0 - 180.0) < 40.0)
-    low, high = galaxy.galaxy_map(1.0, NSIDE), galaxy.galaxy_map(30.0, NSIDE)
-    assert low[inner].mean() < 0.7 * low[np.abs(lat) > 40.0].mean()
-    assert high[inner].mean() > 3.0 * high[np.abs(lat) > 40.0].mean()
-
-
 # --- the line-of-sight integral ---------------------------------------------------------------
 
 
@@ -162,17 +153,6 @@ def test_with_electrons_the_integral_is_that_of_tiny_steps(
     assert got == pytest.approx(np.sum(source * np.exp(slab / 2 - np.cumsum(slab))), rel=tolerance)
     # A step misses the edge of a region by half its length, of a path of about 1 kpc.
     assert depth == pytest.approx(slab.sum(), rel=1e-3)
-
-
-@pytest.mark.parametrize("lon_deg, lat_deg", DIRECTIONS)
-def test_optically_thick_limit_is_the_local_source_function(lon_deg, lat_deg):
-    # All that is seen lies within the first node, 2 pc, where j changes by less than 1e-3.
-    electrons, frequency_mhz = 1e12, 5.0
-    got, _ = one_line(lon_deg, lat_deg, frequency_mhz, electrons)
-    kappa = 1e3 * electrons * galaxy.absorption_per_emission_measure(frequency_mhz)
-    local = n_squared(np.zeros(1), 0.0, 0.0)[0]
-    want = emissivity(0.0, lon_deg, lat_deg, frequency_mhz) / (kappa * local)
-    assert got == pytest.approx(want, rel=2e-3)
 
 
 # --- the gas's own emission -------------------------------------------------------------------
@@ -231,26 +211,7 @@ def test_absorption_coefficient_against_the_altenhoff_law():
     assert ratio == pytest.approx(100.0 * 17.383 / 15.081, rel=1e-3)
 
 
-def test_chord_through_a_sphere():
-    # Centre 2 kpc away, radius 1: straight on [1, 3]; at 20 degrees the cosine rule; behind, none.
-    sphere = galaxy.Region("test", (0.0, 6.5, 0.0), (1.0, 1.0, 1.0), 30.0, 1.0)
-    angle = np.radians([0.0, 20.0, 180.0])
-    direction = np.stack([np.sin(angle), -np.cos(angle), np.zeros(3)], axis=-1)
-    enter, leave = sphere.chord(direction)
-    half = np.sqrt(1.0 - 4.0 * np.sin(angle[1]) ** 2)
-    np.testing.assert_allclose(enter, [1.0, 2.0 * np.cos(angle[1]) - half, 0.0], atol=1e-12)
-    np.testing.assert_allclose(leave, [3.0, 2.0 * np.cos(angle[1]) + half, 0.0], atol=1e-12)
-
-
 # --- the map ----------------------------------------------------------------------------------
-
-
-def test_transparent_sky_scales_as_its_two_power_laws(monkeypatch):
-    # Without electrons T = G (nu/408)^-2.51 + 1.2 (nu/1000)^-2.58 exactly: rounding only.
-    per_measure = "absorption_per_emission_measure"
-    monkeypatch.setattr(galaxy, per_measure, lambda frequency_mhz: 0.0)
-    low, high = (galaxy.galaxy_map(f, 16) - 1.2 * (f / 1e3) ** -2.58 for f in (2.0, 40.0))
-    np.testing.assert_allclose(low / high, (2.0 / 40.0) ** -2.51, rtol=1e-9)
 
 
 def test_pixel_order_is_galactic_ring():
