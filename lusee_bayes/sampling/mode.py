@@ -24,7 +24,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
-from arviz_stats.base import array_stats
 from jaxtyping import Bool, Float, Int
 from numpyro import distributions as dist
 from numpyro import handlers
@@ -32,10 +31,8 @@ from numpyro.infer import init_to_median
 from numpyro.infer.util import constrain_fn, potential_energy
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, pixel_matrix, power_spectrum, synthesis_matrix
-from lusee_bayes.core.lazy import healpy
 from lusee_bayes.sampling.distributions import HALF_LOG_2PI, Prediction
 from lusee_bayes.sampling.hmc import Whitening
 from lusee_bayes.sampling.programs import latent_of, numpyro_promotion
@@ -405,71 +402,6 @@ def pixel_statistics(
         parts.append([values.mean(0), values.std(0, ddof=1), *ends])
     columns = np.concatenate(parts, axis=1)
     return dict(zip(("mean", "std", "lower", "upper"), columns, strict=True))
-
-
-def disc(nside: int, l_deg: float, b_deg: float, radius_deg: float) -> Region:
-    """Select the pixels within a radius of a Galactic direction.
-
-    Parameters
-    ----------
-    nside : int
-        NSIDE of the pixels.
-    l_deg, b_deg : float
-        Galactic longitude and latitude in degrees.
-    radius_deg : float
-        The radius in degrees.
-
-    Raises
-    ------
-    InputError
-        If no pixel lies within it.
-    """
-    centre = healpy.ang2vec(l_deg, b_deg, lonlat=True)
-    pixels = healpy.query_disc(nside, centre, np.radians(radius_deg))
-    inside = np.isin(np.arange(healpy.nside2npix(nside)), pixels)
-    if not inside.any():
-        raise InputError(
-            f"no pixel of NSIDE {nside} lies within {radius_deg:g} degrees of l = {l_deg:g}, b = "
-            f"{b_deg:g}; pixels are {healpy.nside2resol(nside, arcmin=True) / 60:.1f} degrees wide"
-        )
-    return inside
-
-
-def region_brightness(skies: Skies, region: Region) -> Quantity:
-    """Compute the mean brightness of a region for every draw, in K."""
-    nside = healpy.npix2nside(len(region))
-    row = pixel_matrix(nside, lmax_of(skies.shape[-1]))[region].mean(0)
-    return skies @ row
-
-
-def probability_brighter(skies: Skies, first: Region, second: Region) -> tuple[float, float]:
-    """Compute the probability that one region is brighter on average than another.
-
-    Parameters
-    ----------
-    skies : (chains, draws, modes) array
-        Draws, in K.
-    first, second : (pixels,) array of bool
-        The regions, of one NSIDE.
-
-    Returns
-    -------
-    probability, error : float
-        That the first is brighter, and its Monte Carlo error.
-
-    Raises
-    ------
-    InputError
-        For regions of different NSIDE.
-    """
-    require_shape("the second region", second, first.shape)
-    brighter = region_brightness(skies, first) > region_brightness(skies, second)
-    share = float(brighter.mean())
-    if share in (0.0, 1.0):
-        # no draw says otherwise: the rule of three bounds what n independent ones could miss
-        return share, 3.0 / brighter.size
-    error = array_stats.mcse(brighter.astype(float), chain_axis=0, draw_axis=1, method="mean")
-    return share, float(error)
 
 
 def sky_quantities(

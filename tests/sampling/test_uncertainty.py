@@ -14,10 +14,7 @@ from small_models import random_gaussian
 from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
 from lusee_bayes.sampling import mode
 from lusee_bayes.sampling.mode import (
-    disc,
     pixel_statistics,
-    probability_brighter,
-    region_brightness,
     sky_quantities,
     summary,
 )
@@ -84,71 +81,6 @@ def test_pixels_do_not_depend_on_how_many_are_held_at_once(skies, monkeypatch):
         np.testing.assert_allclose(values, whole[name], rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("l_deg", "b_deg", "radius_deg"), [(0.0, 0.0, 20.0), (250.0, -70.0, 35.0), (10.0, 90.0, 12.0)]
-)
-def test_a_disc_holds_the_pixels_within_its_radius(l_deg, b_deg, radius_deg):
-    """By the spherical law of cosines at pixel centres."""
-    longitude, latitude = (np.radians(x) for x in healpy.pix2ang(8, np.arange(768), lonlat=True))
-    l_rad, b_rad = np.radians([l_deg, b_deg])
-    cosine = np.sin(latitude) * np.sin(b_rad) + np.cos(latitude) * np.cos(b_rad) * np.cos(
-        longitude - l_rad
-    )
-    expected = cosine >= np.cos(np.radians(radius_deg))
-    assert 0 < expected.sum() < 768
-    np.testing.assert_array_equal(disc(8, l_deg, b_deg, radius_deg), expected)
-
-
-def test_a_disc_smaller_than_a_pixel_is_refused():
-    refuse("no pixel of NSIDE 2 lies within 1 degrees of l = 3, b", disc, 2, 3.0, 4.0, 1.0)
-
-
-def test_the_brightness_of_a_region_is_the_mean_of_its_pixels(skies):
-    region = disc(NSIDE, 40.0, 20.0, 30.0)
-    got = region_brightness(skies[:, :3], region)
-    for index in np.ndindex(4, 3):
-        expected = modes_to_map(skies[index], NSIDE)[region].mean()
-        # healpy's own rounding
-        assert got[index] == pytest.approx(expected, rel=1e-10, abs=1e-12)
-
-
-@pytest.mark.parametrize(
-    "centres", [((0.0, 0.0), (180.0, 0.0)), ((90.0, 30.0), (270.0, -30.0)), ((0, 60), (0, 20))]
-)
-def test_the_probability_of_being_brighter_is_the_gaussian_one(gaussian, skies, centres):
-    """Phi of the difference of the means over the difference's standard deviation."""
-    mean, _, covariance = pixel_posterior(gaussian[1])
-    first, second = (disc(NSIDE, float(l_), float(b), 25.0) for l_, b in centres)
-    weights = first / first.sum() - second / second.sum()
-    expected = norm.cdf(weights @ mean / np.sqrt(weights @ covariance @ weights))
-    assert 0.01 < expected < 0.99
-    share, error = probability_brighter(skies, first, second)
-    # a share of N independent draws, binomial
-    assert error == pytest.approx(np.sqrt(expected * (1 - expected) / N), rel=0.15)
-    assert abs(share - expected) < z_of(1) * np.sqrt(expected * (1 - expected) / N)
-    assert probability_brighter(skies, second, first)[0] == pytest.approx(1 - share, abs=1e-12)
-
-
-def test_the_error_of_a_probability_knows_that_draws_hang_together(gaussian):
-    """Every draw ten times over: the error is that of a tenth of the draws."""
-    draws = np.asarray(gaussian[0].sample(jax.random.key(2), 2000)).reshape(4, 500, N_MODES)
-    regions = disc(NSIDE, 0.0, 60.0, 25.0), disc(NSIDE, 0.0, 20.0, 25.0)
-    share, error = probability_brighter(draws, *regions)
-    repeated_share, repeated_error = probability_brighter(np.repeat(draws, 10, axis=1), *regions)
-    assert repeated_share == pytest.approx(share, abs=1e-12)
-    # ArviZ's estimate of ESS is good to a few per cent here; without it the ratio would be 0.32
-    assert repeated_error == pytest.approx(error, rel=0.15)
-
-
-def test_a_difference_that_no_draw_doubts_keeps_an_error(skies):
-    """The rule of three: with N draws of one kind the rest is below 3 / N at 95 %."""
-    bright = skies.copy()
-    bright[..., 2] = 1e6  # ell = 1, m = 0: brighter towards the north pole
-    north, south = disc(NSIDE, 0.0, 90.0, 20.0), disc(NSIDE, 0.0, -90.0, 20.0)
-    assert probability_brighter(bright, north, south) == (1.0, 3 / N)
-    assert probability_brighter(bright, south, north) == (0.0, 3 / N)
-
-
 def test_quantities_against_direct_computation(skies):
     few = skies[:, :5]
     places = {"somewhere": (33.0, -21.0), "pole": (0.0, 90.0)}
@@ -189,9 +121,6 @@ def test_what_has_no_pixels_and_no_interval_is_refused(skies):
     for probability in (0.0, 1.0, -0.1, 90.0, float("nan")):
         refuse("interval must lie in 0..1", pixel_statistics, skies, NSIDE, probability)
     refuse("15 coefficients do not fill any lmax", pixel_statistics, np.zeros((1, 2, 15)), NSIDE)
-    first, second = (disc(nside, 0.0, 0.0, 30.0) for nside in (4, 8))
-    words = r"second region has shape \(768,\), expected \(192,\)"
-    refuse(words, probability_brighter, skies, first, second)
 
 
 def test_the_summary_has_a_row_for_each_quantity_with_its_own_numbers(gaussian, skies):
