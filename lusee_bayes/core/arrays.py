@@ -33,6 +33,7 @@ Array = jax.Array | np.ndarray
 DataVector = Float[Array, " data"]
 Grid = Float[Array, "products times"]
 Times = Float[np.ndarray, " times"]
+Rows = Float[np.ndarray, " rows"]
 GridFlags = Bool[np.ndarray, "products times"]
 TimeFlags = Bool[np.ndarray, " times"]
 Modes = Float[Array, " modes"]

@@ -287,9 +287,6 @@ def says(path: Path, attributes: Mapping[str, str]) -> bool:
         return False
 
 
-# kinds of numbers that images hold, by BITPIX
-IMAGE_DTYPES = {8: "u1", 16: "i2", 32: "i4", 64: "i8", -32: "f4", -64: "f8"}
-
 # words that say how a file is built
 STRUCTURE = ("SIMPLE", "BITPIX", "NAXIS", "EXTEND", "COMMENT", "HISTORY")
 
@@ -366,10 +363,14 @@ def read_fits(path: str | Path, layout: Layout, hint: str = "") -> Content:
                 for number, column in enumerate(hdu.columns):
                     put(f"{hdu.name}.{column.name}", hdu.data.field(number), column.unit)
             elif hdu.header.get("NAXIS", 0):
-                dtype = np.dtype(IMAGE_DTYPES[hdu.header["BITPIX"]])
-                image = Unloaded(tuple(hdu.shape), dtype, partial(getattr, hdu, "data"))
-                put(hdu.name, image, hdu.header.get("BUNIT"))
+                put(hdu.name, unread_image(hdu), hdu.header.get("BUNIT"))
         return layout.checked(path, arrays, said)
+
+
+def unread_image(hdu: fits.ImageHDU) -> Unloaded:
+    """The image of an open FITS file."""
+    dtype = np.dtype(fits.BITPIX2DTYPE[hdu.header["BITPIX"]])
+    return Unloaded(tuple(hdu.shape), dtype, partial(getattr, hdu, "data"))
 
 
 @contextmanager
