@@ -37,6 +37,8 @@ Rows = Float[np.ndarray, " rows"]
 GridFlags = Bool[np.ndarray, "products times"]
 TimeFlags = Bool[np.ndarray, " times"]
 Modes = Float[Array, " modes"]
+# of one field, or of any number of fields
+Fields = Float[Array, "*batch modes"]
 ModesMatrix = Float[Array, "modes modes"]
 Draws = Float[np.ndarray, "draws modes"]
 Ells = Float[np.ndarray, " ells"]

@@ -367,7 +367,7 @@ def read_fits(path: str | Path, layout: Layout, hint: str = "") -> Content:
         return layout.checked(path, arrays, said)
 
 
-def unread_image(hdu: fits.ImageHDU) -> Unloaded:
+def unread_image(hdu: fits.PrimaryHDU | fits.ImageHDU) -> Unloaded:
     """The image of an open FITS file."""
     dtype = np.dtype(fits.BITPIX2DTYPE[hdu.header["BITPIX"]])
     return Unloaded(tuple(hdu.shape), dtype, partial(getattr, hdu, "data"))
@@ -403,11 +403,8 @@ def is_session(path: str | Path) -> bool:
     InputError
         If there is no file, or it is damaged.
     """
-    path = require_file(path, "data")
-    if is_fits(path):
-        return has_words(path, ["LAYOUTV"])
-    with reading(path, "a session in HDF5"):
-        if not h5py.is_hdf5(path):
-            return False
-        with h5py.File(path) as file:
-            return "layout_version" in file.attrs
+    with reading(path, "a session in HDF5") as place:
+        if h5py.is_hdf5(place):
+            with h5py.File(place) as file:
+                return "layout_version" in file.attrs
+    return has_words(place, ["LAYOUTV"])

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core import harmonics
-from lusee_bayes.core.arrays import Array, as_complex, namespace
+from lusee_bayes.core.arrays import Array, Fields, as_complex, namespace
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import special
@@ -83,7 +83,7 @@ class SphereGrid(eqx.Module):
         phi = 2.0 * np.pi * np.arange(self.n_phi) / self.n_phi
         return np.repeat(np.asarray(self.theta), self.n_phi), np.tile(phi, self.shape[0])
 
-    def synthesise(self, modes: Float[Array, "*batch modes"]) -> Float[Array, "*batch rings phi"]:
+    def synthesise(self, modes: Fields) -> Float[Array, "*batch rings phi"]:
         """Compute the fields of real packed coefficients at the grid's points.
 
         Parameters
@@ -107,12 +107,11 @@ class SphereGrid(eqx.Module):
         columns = both.reshape(-1, lmax + 1, lmax + 1).transpose(1, 2, 0)
         rings = (self.legendre @ columns).transpose(2, 1, 0).reshape(2, *batch, -1, lmax + 1)
         factor = np.where(np.arange(lmax + 1) > 0, 0.5, 1.0) * self.n_phi
-        row = (*(1,) * (len(batch) + 1), -1)
         sine = factor * (np.arange(lmax + 1) > 0)
-        amplitude = as_complex(rings[0] * factor.reshape(row), rings[1] * sine.reshape(row))
+        amplitude = as_complex(rings[0] * factor, rings[1] * sine)
         return xp.fft.irfft(amplitude, n=self.n_phi, axis=-1)
 
-    def analyse(self, field: Float[Array, "*batch rings phi"]) -> Float[Array, "*batch modes"]:
+    def analyse(self, field: Float[Array, "*batch rings phi"]) -> Fields:
         """Integrate fields with every harmonic: coefficients of their part up to lmax.
 
         Parameters
@@ -128,8 +127,7 @@ class SphereGrid(eqx.Module):
         batch = field.shape[:-2]
         require_shape("the field", field, (*batch, *self.shape))
         xp, lmax = namespace(field, self.legendre), self.lmax
-        weights = self.weights.reshape(*(1,) * len(batch), -1, 1)
-        amplitude = xp.fft.rfft(field * weights, axis=-1)[..., : lmax + 1]
+        amplitude = xp.fft.rfft(field * self.weights[:, None], axis=-1)[..., : lmax + 1]
         both = xp.stack([amplitude.real, amplitude.imag])
         columns = both.reshape(-1, self.shape[0], lmax + 1).transpose(2, 1, 0)
         table = (self.legendre.transpose(0, 2, 1) @ columns).transpose(2, 0, 1)

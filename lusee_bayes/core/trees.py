@@ -263,9 +263,7 @@ def from_tree(kind: type[T], tree: xr.DataTree | StoredTree, where: str) -> T:
     return kind(**found)
 
 
-@lru_cache(maxsize=128)
-def _checker(kind: Any) -> TypeAdapter:
-    return TypeAdapter(kind)
+_checker = lru_cache(maxsize=128)(TypeAdapter)
 
 
 def _for_json(value: Any) -> Any:

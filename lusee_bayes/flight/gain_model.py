@@ -32,11 +32,7 @@ from lusee_bayes.core.trees import from_tree, opened_tree, quantity, write_tree
 from lusee_bayes.flight.session import LETTERS, PORTS, TELEMETRY, PortLevels, Telemetry
 
 # levels of ports by their names, as M0, and where arrays have them
-PLACES = {
-    f"{level}{port}": (number, port)
-    for number, level in enumerate(LETTERS)
-    for port in range(PORTS)
-}
+PLACES = {f"{x}{port}": (k, port) for k, x in enumerate(LETTERS) for port in range(PORTS)}
 LEAD, N_COMPONENTS, N_TERMS = (len(LETTERS), PORTS), 2, 9
 # one nV^2/Hz
 NANO2 = 1e-18
@@ -315,7 +311,7 @@ def _read_folder(folder: Path, model: str) -> GainModel:
             raise InputError(f"{folder}: gains have different numbers of frequencies, {shapes}")
         found.append(np.reshape(arrays, (*LEAD, *arrays[0].shape)))
     mhz, mean, vectors = found
-    components = vectors[..., :N_COMPONENTS].swapaxes(2, 3)
+    components = vectors.swapaxes(2, 3)
     coefficients = _coefficients(folder / COEFFICIENTS, model)
     kind = f"luseepy's gain model, {model} coefficients"
     return GainModel(str(folder), mhz, mean, components, coefficients, kind=kind)
@@ -331,7 +327,7 @@ def _gain_array(path: Path) -> np.ndarray:
     if values.ndim != (2 if two else 1) or (two and values.shape[1] < N_COMPONENTS):
         expected = "a matrix" if two else "a list"
         raise InputError(f"{path} has shape {values.shape}, expected {expected}")
-    return values.astype(np.float64)
+    return (values[:, :N_COMPONENTS] if two else values).astype(np.float64)
 
 
 def _coefficients(path: Path, model: str) -> np.ndarray:

@@ -21,7 +21,6 @@ from lusee_bayes.core.reading import naming
 from lusee_bayes.core.section import LARGEST, Angle, Frequency, Positive, Section, requires
 from lusee_bayes.flight.bands import Taper
 from lusee_bayes.flight.clock import Clock, clock_of
-from lusee_bayes.flight.flags import NO_LINES, KnownLines
 from lusee_bayes.flight.gain_model import GainModel
 from lusee_bayes.flight.session import BinOrigin, Session
 from lusee_bayes.instrument.averaging import bins_of
@@ -201,7 +200,8 @@ class Recipe:
         Middles of the bands.
     average_s : float or None
         Length of averages in time; None for spectra as they are.
-    lines : KnownLines
+    lines_mhz : tuple of float
+        Frequencies of known lines.
     clock : Clock or None
         From outside.
     site : (float, float) or None
@@ -213,7 +213,7 @@ class Recipe:
     timestamp: Timestamp
     frequencies_mhz: tuple[float, ...]
     average_s: float | None = None
-    lines: KnownLines = NO_LINES
+    lines_mhz: tuple[float, ...] = ()
     clock: Clock | None = None
     site: tuple[float, float] | None = None
 

@@ -28,7 +28,7 @@ from lusee_bayes.instrument.products import auto_indices, labels, ports
 RowCounts = Int[np.ndarray, " rows"]
 PortCounts = Int[np.ndarray, "rows ports"]
 PortLevels = Shaped[np.ndarray, "rows ports"]
-Channels = Float[np.ndarray, " channels"]
+Middles = Float[np.ndarray, " channels"]
 Telemetry = Mapping[str, Rows]
 
 N_CHANNELS = 2048
@@ -85,7 +85,7 @@ class Averaging:
 AVERAGING = {1: Averaging(1, 1), 2: Averaging(2, 2), 3: Averaging(4, 3), 4: Averaging(4, 4)}
 
 
-def channel_mhz(origin: BinOrigin) -> Channels:
+def channel_mhz(origin: BinOrigin) -> Middles:
     """Return the middle of every channel in MHz.
 
     Parameters
