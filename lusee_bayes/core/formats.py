@@ -403,8 +403,9 @@ def is_session(path: str | Path) -> bool:
     InputError
         If there is no file, or it is damaged.
     """
-    with reading(path, "a session in HDF5") as place:
-        if h5py.is_hdf5(place):
-            with h5py.File(place) as file:
+    path = require_file(path, "data")
+    with reading(path, "a session in HDF5"):
+        if h5py.is_hdf5(path):
+            with h5py.File(path) as file:
                 return "layout_version" in file.attrs
-    return has_words(place, ["LAYOUTV"])
+    return has_words(path, ["LAYOUTV"])

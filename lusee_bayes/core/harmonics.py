@@ -384,7 +384,8 @@ def turn_about_z(modes: Fields, angle: float | Float[Array, ""]) -> Fields:
     mirrored = modes[..., ell * (ell + 1) - m]
     xp = namespace(modes, angle)
     angles = m.astype(np.float64) * angle
-    return modes * xp.cos(angles) + mirrored * xp.sin(angles)
+    shape = (1,) * (modes.ndim - 1) + (-1,)
+    return modes * xp.cos(angles).reshape(shape) + mirrored * xp.sin(angles).reshape(shape)
 
 
 def turn_about(axis: int, modes: Fields, angle: float | Float[Array, ""]) -> Fields:
@@ -423,8 +424,9 @@ def _horizontal_generators(lmax: int) -> tuple[np.ndarray, np.ndarray]:
 def apply_generator(modes: Fields, axis: int) -> Fields:
     """Return K_x (axis 0) or K_y (axis 1) times packed modes, in time linear in their number."""
     columns, weights = _horizontal_generators(round(np.sqrt(modes.shape[-1])) - 1)
-    parts = [weights[axis, :, i] * modes[..., columns[axis, :, i]] for i in (0, 1)]
-    return parts[0] + parts[1]
+    shape = (1,) * (modes.ndim - 1) + (-1,)
+    first, second = (weights[axis, :, i].reshape(shape) for i in (0, 1))
+    return first * modes[..., columns[axis, :, 0]] + second * modes[..., columns[axis, :, 1]]
 
 
 def tilts(modes: Fields, order: int) -> list[Fields]:

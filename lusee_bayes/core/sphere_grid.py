@@ -107,8 +107,9 @@ class SphereGrid(eqx.Module):
         columns = both.reshape(-1, lmax + 1, lmax + 1).transpose(1, 2, 0)
         rings = (self.legendre @ columns).transpose(2, 1, 0).reshape(2, *batch, -1, lmax + 1)
         factor = np.where(np.arange(lmax + 1) > 0, 0.5, 1.0) * self.n_phi
+        row = (*(1,) * (len(batch) + 1), -1)
         sine = factor * (np.arange(lmax + 1) > 0)
-        amplitude = as_complex(rings[0] * factor, rings[1] * sine)
+        amplitude = as_complex(rings[0] * factor.reshape(row), rings[1] * sine.reshape(row))
         return xp.fft.irfft(amplitude, n=self.n_phi, axis=-1)
 
     def analyse(self, field: Float[Array, "*batch rings phi"]) -> Fields:
@@ -127,7 +128,8 @@ class SphereGrid(eqx.Module):
         batch = field.shape[:-2]
         require_shape("the field", field, (*batch, *self.shape))
         xp, lmax = namespace(field, self.legendre), self.lmax
-        amplitude = xp.fft.rfft(field * self.weights[:, None], axis=-1)[..., : lmax + 1]
+        weights = self.weights.reshape(*(1,) * len(batch), -1, 1)
+        amplitude = xp.fft.rfft(field * weights, axis=-1)[..., : lmax + 1]
         both = xp.stack([amplitude.real, amplitude.imag])
         columns = both.reshape(-1, self.shape[0], lmax + 1).transpose(2, 1, 0)
         table = (self.legendre.transpose(0, 2, 1) @ columns).transpose(2, 0, 1)

@@ -49,8 +49,6 @@ class ChannelBand:
 
     Attributes
     ----------
-    frequency_mhz : float
-        The middle.
     first, last : int
         Bins first to last - 1 lie within the band, with all their channels.
     basis : (bins, terms) array
@@ -62,7 +60,6 @@ class ChannelBand:
         Covariance of the noise of the bins for a flat spectrum of 1 and one frame.
     """
 
-    frequency_mhz: float
     first: int
     last: int
     basis: Float[np.ndarray, "bins terms"]
@@ -114,7 +111,7 @@ class ChannelBand:
         apart = np.abs(channels[first:last, :, None, None] - channels[None, None, first:last])
         known = np.array([*shared_noise, 0.0])
         shared = known[np.minimum(apart, len(known) - 1)].mean(axis=(1, 3))
-        return cls(frequency_mhz, first, last, finer[:, : degree + 1], finer, shared)
+        return cls(first, last, finer[:, : degree + 1], finer, shared)
 
     def values(
         self,

@@ -331,9 +331,8 @@ def _spans(seconds: Rows) -> list[np.ndarray]:
 def _one_span(
     seconds: Rows, autos: Levels, noise: Levels, good: RowFlags, limit: float
 ) -> tuple[RowFlags, float]:
-    x = np.polynomial.chebyshev.chebvander(
-        2.0 * (seconds - seconds[0]) / max(seconds[-1] - seconds[0], 1.0) - 1.0, DEGREE
-    )
+    t = 2.0 * (seconds - seconds[0]) / max(seconds[-1] - seconds[0], 1.0) - 1.0
+    x = np.polynomial.chebyshev.chebvander(t, DEGREE)
     values = np.where(good[:, None], autos, 0.0).T[None]
     sigma = np.where(good[:, None], noise, 1.0).T[None]
     # noise from spectrum to spectrum, which a burst changes at its ends alone

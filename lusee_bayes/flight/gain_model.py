@@ -339,10 +339,8 @@ def _coefficients(path: Path, model: str) -> np.ndarray:
         for k, term in enumerate(_terms(place[1]))
     }
     found, seen = np.zeros((*LEAD, N_COMPONENTS, N_TERMS)), set()
-    names = ("gain_setting", "component", "model", "term", "alpha_refit")
-    for number, (setting, component, family, term, value) in enumerate(
-        zip(*(columns[name] for name in names), strict=True), start=2
-    ):
+    rows = zip(*(columns[name] for name in CSV.variables), strict=True)
+    for number, (setting, component, family, term, value) in enumerate(rows, start=2):
         if str(family).strip().lower() != model:
             continue
         name = f"{setting.strip().upper()} {component.strip().upper()} {term.strip()}"

@@ -193,10 +193,7 @@ class Reduced(Described):
             *self.observation.description(),
             *(f"{name}: {text}" for name, text in self.recipe.items()),
             *self.notes(),
-            *(
-                f"{f:g} MHz: {_percent(self.shares(band))}"
-                for band, f in enumerate(self.frequencies_mhz)
-            ),
+            *(f"{mhz:g} MHz: {_percent(self.shares(band))}" for band, mhz in enumerate(f)),
         )
 
     def notes(self) -> tuple[str, ...]:
