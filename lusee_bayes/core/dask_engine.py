@@ -70,9 +70,8 @@ class DaskEngine(engine.Engine):
 
     def work_in(self, folder: Path) -> None:
         self._folder = folder.resolve()
-        answers = self.client.run(
-            refusal_of, code_versions(), self._folder, self._demand, on_error="return"
-        )
+        asked = code_versions(), self._folder, self._demand
+        answers = self.client.run(refusal_of, *asked, on_error="return")
         for worker, answer in answers.items():
             if answer is not None:
                 raise InputError(f"worker {worker}: {answer}")

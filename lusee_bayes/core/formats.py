@@ -157,9 +157,8 @@ def with_grid(dataset: xr.Dataset) -> xr.Dataset:
         }
         indices = {"standard_name": "healpix_index", "units": "1"}
         packed = {"zlib": True, "shuffle": True}
-        dataset = dataset.assign_coords(
-            {index: (dim, np.arange(n, dtype=np.int32), indices, packed)}
-        ).assign({grid: ((), np.int8(0), mapping)})
+        numbers = dim, np.arange(n, dtype=np.int32), indices, packed
+        dataset = dataset.assign_coords({index: numbers}).assign({grid: ((), np.int8(0), mapping)})
     return dataset
 
 

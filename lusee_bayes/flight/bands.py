@@ -29,13 +29,14 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
-from lusee_bayes.core.arrays import Rows
+from lusee_bayes.core.arrays import RowFlags, Rows
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.flight.session import Averaging, Middles
 
 # spectra in bands: what rows have at points of a curve, and the terms that the curve is made of;
 # values of a band
 Points = Bool[np.ndarray, "rows points"]
+PointValues = Float[np.ndarray, "rows points"]
 Basis = Float[np.ndarray, "points terms"]
 Values = Float[np.ndarray, "rows products"]
 # a spectrum with so many flags that its value has this many times the variance is not used
@@ -156,9 +157,7 @@ class ChannelBand:
         return values, np.where(usable, variance, np.inf), further
 
 
-def point_weights(
-    basis: Basis, good: Points
-) -> tuple[Float[np.ndarray, "rows points"], Bool[np.ndarray, " rows"]]:
+def point_weights(basis: Basis, good: Points) -> tuple[PointValues, RowFlags]:
     """Return the weights by which a least-squares polynomial is evaluated in the middle.
 
     Parameters
@@ -180,7 +179,7 @@ def point_weights(
 
 def inverse_normals(
     basis: Basis, good: Points
-) -> tuple[Float[np.ndarray, "rows terms terms"], Bool[np.ndarray, " rows"]]:
+) -> tuple[Float[np.ndarray, "rows terms terms"], RowFlags]:
     """Return the inverse normal matrix of the curve through the good points of every row.
 
     Also whether there are enough points; it is the unit matrix where there are not.

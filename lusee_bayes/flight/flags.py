@@ -24,18 +24,17 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from lusee_bayes.core.arrays import Rows
+from lusee_bayes.core.arrays import RowFlags, Rows
 from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.lazy import special
 from lusee_bayes.core.reading import read_table
-from lusee_bayes.flight.bands import Basis, ChannelBand, Points, inverse_normals
+from lusee_bayes.flight.bands import Basis, ChannelBand, Points, PointValues, inverse_normals
 from lusee_bayes.flight.session import CHANNEL_MHZ, Averaging, Middles
 
 # of spectra in bands: of rows, autos and points of a curve; in time: of one span, rows as points
 Autos = Float[np.ndarray, "rows autos points"]
 BinFlags = Bool[np.ndarray, " bins"]
 Bins = Bool[np.ndarray, "rows bins"]
-RowFlags = Bool[np.ndarray, " rows"]
 Spectra = Float[np.ndarray, "rows ports bins"]
 Levels = Float[np.ndarray, "rows ports"]
 Span = Bool[np.ndarray, " span"]
@@ -132,9 +131,7 @@ def distances(values: Autos, noise: Autos, good: Points, kept: Points, basis: Ba
     return np.where(good[:, None], (values - curve) / scale, 0.0)
 
 
-def fitted_curves(
-    values: Autos, kept: Points, basis: Basis
-) -> tuple[Autos, Float[np.ndarray, "rows points"]]:
+def fitted_curves(values: Autos, kept: Points, basis: Basis) -> tuple[Autos, PointValues]:
     """Return the curve through some points, and its variance in units of that of a point.
 
     Parameters
@@ -149,7 +146,7 @@ def fitted_curves(
     return curve, leverage
 
 
-def robust_scale(z: Float[np.ndarray, "rows points"], good: Points) -> float:
+def robust_scale(z: PointValues, good: Points) -> float:
     """Return the standard deviation of distances by their median; NaN if there are none."""
     return float(MAD * np.median(np.abs(z[good]))) if good.any() else np.nan
 

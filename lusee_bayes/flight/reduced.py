@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -24,6 +24,9 @@ from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import DataLayout, labels, runs_of
 from lusee_bayes.instrument.times import Windows, utc_of
 from lusee_bayes.instrument.visibilities import Calibration, Visibilities
+
+# bins of which something is left
+Left = Int[np.ndarray, " left"]
 
 # why a spectrum is not used in a band; the first is that it is
 REASONS = (
@@ -224,7 +227,7 @@ class Reduced(Described):
             )
         return nearest
 
-    def bins_at(self, band: int) -> Int[np.ndarray, " left"]:
+    def bins_at(self, band: int) -> Left:
         """Return the bins of which a band has something left: the times of :meth:`at`."""
         return np.flatnonzero(np.isfinite(self.values[band]).any(axis=0))
 
@@ -327,33 +330,24 @@ class Reduced(Described):
             calibration=self._calibration(band, bins),
         )
 
-    def _calibration(self, band: int, bins: Int[np.ndarray, " left"]) -> Calibration:
-        names, ports, slopes = [], [], []
-        lost = float(sum(self.flagged(band).values()))
-        for place, (_, port) in PLACES.items():
-            here = self.level[bins, port] == place[0]
-            for name, slope in self._errors(band, bins, place):
-                if here.any() and np.any(slope[here]):
-                    names.append(name)
-                    ports.append(port)
-                    slopes.append(np.where(here, slope, 0.0))
-        n_averaged = self.n_averaged[band, bins]
-        if not names:
+    def _calibration(self, band: int, bins: Left) -> Calibration:
+        found = {n: x for place in PLACES for n, x in self._errors(band, bins, place) if x.any()}
+        n_averaged, lost = self.n_averaged[band, bins], float(sum(self.flagged(band).values()))
+        if not found:
             return Calibration(n_averaged, lost=lost)
-        return Calibration(n_averaged, tuple(names), np.array(ports), np.array(slopes), lost)
+        ports, slopes = [PLACES[name[:2]][1] for name in found], list(found.values())
+        return Calibration(n_averaged, tuple(found), np.array(ports), np.array(slopes), lost)
 
-    def _errors(
-        self, band: int, bins: Int[np.ndarray, " left"], place: str
-    ) -> list[tuple[str, Float[np.ndarray, " left"]]]:
-        """What may be off about a level of a port, by one standard deviation."""
-        found = []
+    def _errors(self, band: int, bins: Left, place: str) -> Iterator[tuple[str, np.ndarray]]:
+        """What may be off about a level of a port, by one standard deviation, where it has it."""
+        port = PLACES[place][1]
+        here = self.level[bins, port] == place[0]
         if self.gain_std is not None:
-            found.append((place, np.full(len(bins), self.gain_std)))
+            yield place, np.where(here, self.gain_std, 0.0)
         if self.component_std is not None:
-            std = self.component_std[PLACES[place]]
-            slope = self.slope[band, PLACES[place][1]][:, bins]
-            found += [(f"{place} PC{r + 1}", std[r] * slope[r]) for r in range(len(std))]
-        return found
+            slopes = self.component_std[PLACES[place]][:, None] * self.slope[band, port][:, bins]
+            for number, slope in enumerate(slopes, start=1):
+                yield f"{place} PC{number}", np.where(here, slope, 0.0)
 
     def without(self, band: int, gone: Bool[np.ndarray, "products bins"]) -> Reduced:
         """Return the same without some values of a band, which do not fit the map."""

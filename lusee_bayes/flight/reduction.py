@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from lusee_bayes.core.arrays import Rows
+from lusee_bayes.core.arrays import RowFlags, Rows
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
@@ -220,7 +220,7 @@ class State:
                 found[:, port, 1:] = self.recipe.table.strengths(level, port, telemetry)
         return found
 
-    def lines(self, counts: Counts, frames: Rows, notched: flags.RowFlags) -> flags.Bins:
+    def lines(self, counts: Counts, frames: Rows, notched: RowFlags) -> flags.Bins:
         """Return the bins with known lines, or of the comb where it is on.
 
         Parameters
@@ -269,7 +269,7 @@ def _calibrate(
     frames: Rows,
     strengths: Strengths,
     lines: flags.Bins,
-    saturated: flags.RowFlags,
+    saturated: RowFlags,
     spectra: reduced.Reduced,
     start: int,
     number: int,

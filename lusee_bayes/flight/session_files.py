@@ -222,11 +222,7 @@ class SessionRows(Recorded):
 
 
 def write_session(
-    path: str | Path,
-    rows: SessionRows,
-    blocks: Iterable[Counts],
-    *,
-    kind: str = "hdf5",
+    path: str | Path, rows: SessionRows, blocks: Iterable[Counts], *, kind: str = "hdf5"
 ) -> Path:
     """Write a session whole or not at all.
 

@@ -16,15 +16,17 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Float32, Int, Shaped
 from scipy.interpolate import CubicSpline
 
+from lusee_bayes.core.arrays import RowFlags
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.flight import session
-from lusee_bayes.flight.flags import COMB_FIRST, COMB_SPACING, RowFlags
+from lusee_bayes.flight.flags import COMB_FIRST, COMB_SPACING
 from lusee_bayes.flight.gain_model import LETTERS, NANO2, GainModel
 from lusee_bayes.flight.recipe import FlightSimulatedSection
 from lusee_bayes.instrument.products import to_matrix, to_real
 
-# counts before they are rounded; of the voltages of antennas
+# spectra; counts before they are rounded; of the voltages of antennas
+AllChannels = Float[np.ndarray, "products rows channels"]
 Counts = Float[np.ndarray, "rows products bins"]
 Covariances = Complex[np.ndarray, "antennas antennas rows channels"]
 INDEX = -2.5
@@ -79,9 +81,7 @@ class ChannelSpectra:
         autos = values + (at - held)[:, None] * spline(inside, 1)
         return cls(autos, np.zeros(len(at)), values)
 
-    def __call__(
-        self, known: Float[np.ndarray, "nodes products rows"]
-    ) -> Float[np.ndarray, "products rows channels"]:
+    def __call__(self, known: Float[np.ndarray, "nodes products rows"]) -> AllChannels:
         """Return visibilities in all channels.
 
         Parameters
@@ -166,11 +166,7 @@ class Counting:
             found.append(self.table.basis(level, port, inside))
         return np.array(found)
 
-    def __call__(
-        self,
-        spectra: Float[np.ndarray, "products rows channels"],
-        telemetry: session.Telemetry,
-    ) -> Counts:
+    def __call__(self, spectra: AllChannels, telemetry: session.Telemetry) -> Counts:
         """Return counts before they are rounded.
 
         Parameters
