@@ -152,11 +152,10 @@ def _read_ahead(
         for start in range(piece.start, piece.stop, SLAB)
     ]
     following: Future[np.ndarray] = ahead.submit(counts, slabs[0])
-    for after in [*slabs[1:], None]:
-        read = following.result()
-        if after is not None:
-            following = ahead.submit(counts, after)
+    for rows in slabs[1:]:
+        read, following = following.result(), ahead.submit(counts, rows)
         yield read
+    yield following.result()
 
 
 @dataclass(frozen=True, eq=False)

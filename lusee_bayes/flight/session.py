@@ -322,15 +322,13 @@ def session_of(path: Path, found: Content, arrays: Mapping[str, Unread], **other
     none = np.zeros((n, PORTS), dtype=np.int64)
     said = found.values.get("session_invariants.software_version", "unknown")
     shift2 = rows[f"{META}/Navg2_shift"]
-    share = np.ones(n)
-    if (weight := rows.get(f"{META}/weight")) is not None:
-        share = np.minimum(weight / 2.0**shift2, 1.0)
+    averaged = 2.0**shift2
     return Session(
         path=path,
         raw_s=rows["spectra/raw_times"],
         navgf=rows[f"{META}/Navgf"],
         navg_shift=rows[f"{META}/Navg1_shift"] + shift2,
-        share=share,
+        share=np.minimum(rows.get(f"{META}/weight", averaged) / averaged, 1.0),
         level=_levels(path, arrays, n),
         adc_low=rows[f"{META}/adc_min"],
         adc_high=rows[f"{META}/adc_max"],
@@ -338,9 +336,7 @@ def session_of(path: Path, found: Content, arrays: Mapping[str, Unread], **other
         + rows.get(f"{META}/adc_invalid_count_max", none),
         errors=rows.get(f"{META}/errors", none[:, 0]),
         notch=rows.get(f"{META}/notch"),
-        telemetry={
-            name: rows[f"telemetry/{name}"] for name in TELEMETRY if f"telemetry/{name}" in rows
-        },
+        telemetry={x: rows[name] for x in TELEMETRY if (name := f"telemetry/{x}") in rows},
         lon_deg=found.values["constants.lun_long_deg"],
         lat_deg=found.values["constants.lun_lat_deg"],
         # as versions of the flight software are written: 0x307 for the number 775
@@ -363,14 +359,11 @@ def _levels(path: Path, arrays: Mapping[str, Unread], n: int) -> PortLevels:
         codes = np.array([list(row.decode().ljust(PORTS)) for row in codes], dtype="U1")
     if codes.shape != (n, PORTS):
         raise InputError(f"{path}: {name} has shape {codes.shape}, expected ({n}, {PORTS})")
-    levels = np.full((n, PORTS), NO_LEVEL, dtype="U1")
-    if codes.dtype.kind in "iu":
-        for level, code in CODES.items():
-            levels[codes == code] = level
-    elif codes.dtype.kind in "SU":
-        letters = codes.astype("U1")
-        known = np.isin(letters, LETTERS)
-        levels[known] = letters[known]
-    else:
+    if codes.dtype.kind not in "iuSU":
         raise InputError(f"{path}: {name} holds {codes.dtype}, expected gain codes or letters")
+    in_letters = codes.dtype.kind in "SU"
+    codes = codes.astype("U1") if in_letters else codes
+    levels = np.full((n, PORTS), NO_LEVEL, dtype="U1")
+    for level, code in CODES.items():
+        levels[codes == (level if in_letters else code)] = level
     return levels
