@@ -18,7 +18,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from functools import lru_cache, partial
 from pathlib import Path
 from threading import Lock
@@ -137,7 +137,9 @@ class DaskEngine(engine.Engine):
                 cloudpickle.dump((os.getpid(), tasks.function, tasks.items, merge), file)
             futures = [self._submit(run_task, job, number) for number in range(len(tasks.items))]
             numbers |= {future.key: number for number, future in enumerate(futures)}
-            yield job, futures, finished()
+            # closed at once if something is raised
+            with closing(finished()) as by_number:
+                yield job, futures, by_number
         except distributed.KilledWorker as error:
             number = numbers.get(str(error.task))
             what = "a sum" if number is None else tasks.names[number]
