@@ -33,9 +33,13 @@ Array = jax.Array | np.ndarray
 DataVector = Float[Array, " data"]
 Grid = Float[Array, "products times"]
 Times = Float[np.ndarray, " times"]
+Rows = Float[np.ndarray, " rows"]
+RowFlags = Bool[np.ndarray, " rows"]
 GridFlags = Bool[np.ndarray, "products times"]
 TimeFlags = Bool[np.ndarray, " times"]
 Modes = Float[Array, " modes"]
+# of one field, or of any number of fields
+Fields = Float[Array, "*batch modes"]
 ModesMatrix = Float[Array, "modes modes"]
 Draws = Float[np.ndarray, "draws modes"]
 Ells = Float[np.ndarray, " ells"]

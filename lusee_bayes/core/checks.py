@@ -83,9 +83,7 @@ def require_shape(name: str, array: Any, shape: tuple[int | None, ...]) -> None:
         If the shape differs.
     """
     got = tuple(array.shape)
-    fits = len(got) == len(shape) and all(
-        s is None or s == g for s, g in zip(shape, got, strict=True)
-    )
+    fits = len(got) == len(shape) and all(s in (None, g) for s, g in zip(shape, got, strict=True))
     if not fits:
         expected = str(shape).replace("None", "any")
         raise InputError(f"{name} has shape {got}, expected {expected}")

@@ -16,9 +16,9 @@ import pickle
 import shutil
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from functools import lru_cache, partial
 from pathlib import Path
 from threading import Lock
@@ -31,6 +31,7 @@ from distributed.scheduler import NoWorkerError
 
 from lusee_bayes.core import engine
 from lusee_bayes.core.arrays import use_compilation_cache
+from lusee_bayes.core.engine import Merge, Tasks
 from lusee_bayes.core.errors import InputError, WorkersLost
 from lusee_bayes.core.files import scratch_folder
 from lusee_bayes.core.progress import Stages, gigabytes, memory_limit
@@ -69,29 +70,26 @@ class DaskEngine(engine.Engine):
 
     def work_in(self, folder: Path) -> None:
         self._folder = folder.resolve()
-        answers = self.client.run(
-            refusal_of, code_versions(), self._folder, self._demand, on_error="return"
-        )
+        asked = code_versions(), self._folder, self._demand
+        answers = self.client.run(refusal_of, *asked, on_error="return")
         for worker, answer in answers.items():
             if answer is not None:
                 raise InputError(f"worker {worker}: {answer}")
 
-    def each(self, tasks: engine.Tasks[T, R], stages: Stages, stage: str) -> list[R]:
+    def each(self, tasks: Tasks[T, R], stages: Stages, stage: str) -> list[R]:
         found: list[Any] = [None] * len(tasks.items)
-        with self._submitted(tasks, None, stages, stage) as (_, futures, numbers):
-            for future in self._finished(futures, numbers, tasks.names, stages, stage):
-                found[numbers[future.key]] = future.result()
+        with self._submitted(tasks, None, stages, stage) as (_, _, finished):
+            for number, future in finished:
+                found[number] = future.result()
         return found
 
-    def reduced(
-        self, tasks: engine.Tasks[T, R], merge: Callable[[R, R], R], stages: Stages, stage: str
-    ) -> R:
-        with self._submitted(tasks, merge, stages, stage) as (job, futures, numbers):
+    def reduced(self, tasks: Tasks[T, R], merge: Merge[R], stages: Stages, stage: str) -> R:
+        with self._submitted(tasks, merge, stages, stage) as (job, futures, finished):
             # before other tasks, so that few parts wait
             merged = partial(self._submit, run_merge, job, priority=1)
             total = engine.merged_as_tree(iter(futures), len(futures), merged)
             # what the tasks give is left with the workers
-            for future in self._finished(futures, numbers, tasks.names, stages, stage):
+            for _, future in finished:
                 if future.status != "finished":
                     future.result()
             return total.result()
@@ -99,37 +97,15 @@ class DaskEngine(engine.Engine):
     def _submit(self, *call: Any, **options: Any) -> distributed.Future:
         return self.client.submit(*call, pure=False, retries=REPEATS, **options)
 
-    def _finished(
-        self,
-        futures: list[distributed.Future],
-        numbers: Mapping[str, int],
-        names: Sequence[str],
-        stages: Stages,
-        stage: str,
-    ) -> Iterator[distributed.Future]:
-        """Futures as they finish, well or not; the list is emptied, so that results are freed."""
-        waiting, n = distributed.as_completed(futures, loop=self.client.loop), len(futures)
-        futures.clear()
-        try:
-            with stages.progress(stage, n) as done:
-                for finished, future in enumerate(waiting, start=1):
-                    yield future
-                    done(finished, names[numbers[future.key]])
-        finally:
-            waiting.clear()
-
     @contextmanager
     def _submitted(
-        self,
-        tasks: engine.Tasks[T, R],
-        merge: Callable[[R, R], R] | None,
-        stages: Stages,
-        stage: str,
-    ) -> Iterator[tuple[Path, list[distributed.Future], dict[str, int]]]:
+        self, tasks: Tasks[T, R], merge: Merge[R] | None, stages: Stages, stage: str
+    ) -> Iterator[tuple[Path, list[distributed.Future], Iterator[tuple[int, distributed.Future]]]]:
         """Give all tasks to the workers, and say in a sentence which of them end.
 
-        Yields the file with what the tasks share, where the workers see it, their futures, and
-        their numbers by the futures' keys.
+        Yields the file with what the tasks share, where the workers see it; their futures; and
+        these again with their numbers as they finish, well or not. Then the list is emptied, so
+        that results are freed.
         """
         if self._folder is None:
             raise RuntimeError("the engine is not told where to work: call work_in first")
@@ -144,13 +120,26 @@ class DaskEngine(engine.Engine):
                     ended = f"worker {said['worker']} ended"
                     stages.say(f"  {ended}; given to others: {', '.join(again)}")
 
+        def finished() -> Iterator[tuple[int, distributed.Future]]:
+            waiting = distributed.as_completed(futures, loop=self.client.loop)
+            futures.clear()
+            try:
+                with stages.progress(stage, len(tasks.items)) as done:
+                    for n_done, future in enumerate(waiting, start=1):
+                        yield numbers[future.key], future
+                        done(n_done, tasks.names[numbers[future.key]])
+            finally:
+                waiting.clear()
+
         self.client.subscribe_topic("all", note)
         try:
             with job.open("wb") as file:
                 cloudpickle.dump((os.getpid(), tasks.function, tasks.items, merge), file)
             futures = [self._submit(run_task, job, number) for number in range(len(tasks.items))]
             numbers |= {future.key: number for number, future in enumerate(futures)}
-            yield job, futures, numbers
+            # closed at once if something is raised
+            with closing(finished()) as by_number:
+                yield job, futures, by_number
         except distributed.KilledWorker as error:
             number = numbers.get(str(error.task))
             what = "a sum" if number is None else tasks.names[number]

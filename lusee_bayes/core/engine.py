@@ -36,6 +36,8 @@ MOST = 8
 
 T = TypeVar("T")
 R = TypeVar("R")
+# of two results
+Merge = Callable[[R, R], R]
 
 
 def processors() -> int:
@@ -167,9 +169,7 @@ class Engine(ABC):
         """
 
     @abstractmethod
-    def reduced(
-        self, tasks: Tasks[T, R], merge: Callable[[R, R], R], stages: Stages, stage: str
-    ) -> R:
+    def reduced(self, tasks: Tasks[T, R], merge: Merge[R], stages: Stages, stage: str) -> R:
         """Carry out all tasks, and merge what they give: neighbours first, as a tree.
 
         Parameters
@@ -214,9 +214,7 @@ class ThisProcess(Engine):
         with self._results(tasks, stages, stage) as results:
             return list(results)
 
-    def reduced(
-        self, tasks: Tasks[T, R], merge: Callable[[R, R], R], stages: Stages, stage: str
-    ) -> R:
+    def reduced(self, tasks: Tasks[T, R], merge: Merge[R], stages: Stages, stage: str) -> R:
         with self._results(tasks, stages, stage) as results:
             return merged_as_tree(results, len(tasks.items), merge)
 
@@ -251,7 +249,7 @@ def carry_out(function: Callable[[T], R], item: T) -> R:
         gc.collect()
 
 
-def merged_as_tree(parts: Iterator[R], n: int, merge: Callable[[R, R], R]) -> R:
+def merged_as_tree(parts: Iterator[R], n: int, merge: Merge[R]) -> R:
     """Merge n parts as they come: neighbours first, then their neighbours.
 
     Which with which depends on n alone. Besides the last part, one for each level is kept.

@@ -259,10 +259,8 @@ def transaction(
         files = sorted(str(p.relative_to(stage)) for p in stage.rglob("*") if p.is_file())
         for name in files:
             _require_free(folder / name)
-        manifest = _Manifest(
-            kind=kind, files=files, discard=list(discard), origin=dict(origin or {})
-        )
-        (stage / MANIFEST).write_text(manifest.model_dump_json(indent=2) + "\n", encoding="utf-8")
+        said = _Manifest(kind=kind, files=files, discard=list(discard), origin=dict(origin or {}))
+        (stage / MANIFEST).write_text(said.model_dump_json(indent=2) + "\n", encoding="utf-8")
         os.replace(stage, folder / COMMITTED)
         recover(folder)
     finally:

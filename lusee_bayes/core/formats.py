@@ -157,9 +157,8 @@ def with_grid(dataset: xr.Dataset) -> xr.Dataset:
         }
         indices = {"standard_name": "healpix_index", "units": "1"}
         packed = {"zlib": True, "shuffle": True}
-        dataset = dataset.assign_coords(
-            {index: (dim, np.arange(n, dtype=np.int32), indices, packed)}
-        ).assign({grid: ((), np.int8(0), mapping)})
+        numbers = dim, np.arange(n, dtype=np.int32), indices, packed
+        dataset = dataset.assign_coords({index: numbers}).assign({grid: ((), np.int8(0), mapping)})
     return dataset
 
 
@@ -287,9 +286,6 @@ def says(path: Path, attributes: Mapping[str, str]) -> bool:
         return False
 
 
-# kinds of numbers that images hold, by BITPIX
-IMAGE_DTYPES = {8: "u1", 16: "i2", 32: "i4", 64: "i8", -32: "f4", -64: "f8"}
-
 # words that say how a file is built
 STRUCTURE = ("SIMPLE", "BITPIX", "NAXIS", "EXTEND", "COMMENT", "HISTORY")
 
@@ -366,10 +362,14 @@ def read_fits(path: str | Path, layout: Layout, hint: str = "") -> Content:
                 for number, column in enumerate(hdu.columns):
                     put(f"{hdu.name}.{column.name}", hdu.data.field(number), column.unit)
             elif hdu.header.get("NAXIS", 0):
-                dtype = np.dtype(IMAGE_DTYPES[hdu.header["BITPIX"]])
-                image = Unloaded(tuple(hdu.shape), dtype, partial(getattr, hdu, "data"))
-                put(hdu.name, image, hdu.header.get("BUNIT"))
+                put(hdu.name, unread_image(hdu), hdu.header.get("BUNIT"))
         return layout.checked(path, arrays, said)
+
+
+def unread_image(hdu: fits.PrimaryHDU | fits.ImageHDU) -> Unloaded:
+    """The image of an open FITS file."""
+    dtype = np.dtype(fits.BITPIX2DTYPE[hdu.header["BITPIX"]])
+    return Unloaded(tuple(hdu.shape), dtype, partial(getattr, hdu, "data"))
 
 
 @contextmanager
@@ -403,10 +403,8 @@ def is_session(path: str | Path) -> bool:
         If there is no file, or it is damaged.
     """
     path = require_file(path, "data")
-    if is_fits(path):
-        return has_words(path, ["LAYOUTV"])
     with reading(path, "a session in HDF5"):
-        if not h5py.is_hdf5(path):
-            return False
-        with h5py.File(path) as file:
-            return "layout_version" in file.attrs
+        if h5py.is_hdf5(path):
+            with h5py.File(path) as file:
+                return "layout_version" in file.attrs
+    return has_words(path, ["LAYOUTV"])

@@ -29,12 +29,14 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
 
-from lusee_bayes.core.arrays import Array, namespace
+from lusee_bayes.core.arrays import Array, Fields, namespace
 from lusee_bayes.core.checks import require_finite, require_whole
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import healpy, special
 
 SQRT2 = np.sqrt(2.0)
+Angles = Float[np.ndarray, " points"]
+AtPoints = Float[np.ndarray, "points modes"]
 # beyond these, indices and memory of libraries in C give out
 LARGEST_LMAX, LARGEST_NSIDE = 2047, 2048
 
@@ -141,25 +143,20 @@ def _polar_functions(theta: tuple[float, ...], lmax: int) -> np.ndarray:
     return np.ascontiguousarray(table[ell, np.abs(m)].T)
 
 
-def polar_functions(
-    theta: Float[np.ndarray, " theta"], lmax: int
-) -> Float[np.ndarray, "theta modes"]:
+def polar_functions(theta: Angles, lmax: int) -> AtPoints:
     """Return lambda_lm(theta), the Y_lm at azimuth zero, for ``|m|`` of every packed mode."""
     return _polar_functions(tuple(np.asarray(theta, dtype=float).ravel()), lmax)
 
 
-def azimuth_functions(phi: Float[np.ndarray, " phi"], lmax: int) -> Float[np.ndarray, "phi orders"]:
+def azimuth_functions(phi: Angles, lmax: int) -> Float[np.ndarray, "points orders"]:
     """Return the azimuthal factor of y for m = -lmax..lmax: -sqrt(2) sin, 1, sqrt(2) cos."""
     m = np.arange(1, lmax + 1)
     angle = np.asarray(phi, dtype=float)[:, None] * m
-    return np.concatenate(
-        [-SQRT2 * np.sin(angle)[:, ::-1], np.ones((len(angle), 1)), SQRT2 * np.cos(angle)], axis=1
-    )
+    sine, cosine = -SQRT2 * np.sin(angle)[:, ::-1], SQRT2 * np.cos(angle)
+    return np.concatenate([sine, np.ones((len(angle), 1)), cosine], axis=1)
 
 
-def synthesis_matrix(
-    theta: Float[np.ndarray, " points"], phi: Float[np.ndarray, " points"], lmax: int
-) -> Float[np.ndarray, "points modes"]:
+def synthesis_matrix(theta: Angles, phi: Angles, lmax: int) -> AtPoints:
     """Return the real harmonics in given directions: f(theta_i, phi_i) = sum_c matrix[i, c] a_c.
 
     Each distinct theta is computed once, so that HEALPix rings are cheap.
@@ -208,31 +205,31 @@ def columns_to_maps(
     return maps
 
 
-def sum_over_m(values: Float[Array, "*batch modes"]) -> Float[np.ndarray, "*batch ells"]:
+def sum_over_m(values: Fields) -> Float[np.ndarray, "*batch ells"]:
     """Sum a quantity that is given per mode over the modes of each ell = 0..lmax."""
     lmax = lmax_of(values.shape[-1])
     return np.add.reduceat(np.asarray(values), np.arange(lmax + 1) ** 2, axis=-1)
 
 
-def mean_over_m(values: Float[Array, "*batch modes"]) -> Float[np.ndarray, "*batch ells"]:
+def mean_over_m(values: Fields) -> Float[np.ndarray, "*batch ells"]:
     """Average a quantity that is given per mode over the modes of each ell = 0..lmax."""
     return sum_over_m(values) / (2.0 * np.arange(lmax_of(values.shape[-1]) + 1) + 1.0)
 
 
-def power_spectrum(modes: Float[Array, "*batch modes"]) -> Float[np.ndarray, "*batch ells"]:
+def power_spectrum(modes: Fields) -> Float[np.ndarray, "*batch ells"]:
     """Return C_ell = sum_m a_lm^2 / (2 ell + 1) for ell = 0..lmax; the mean is not subtracted."""
     return mean_over_m(np.asarray(modes) ** 2)
 
 
-def per_mode(spectrum: Float[Array, "*batch ells"]) -> Float[Array, "*batch modes"]:
+def per_mode(spectrum: Float[Array, "*batch ells"]) -> Fields:
     """Repeat a quantity that is given per ell for every mode of that ell."""
     ell, _ = mode_numbers(spectrum.shape[-1] - 1)
     return spectrum[..., ell]
 
 
 def order_products(
-    matrix: Float[np.ndarray, "modes modes"], heights: Float[np.ndarray, " rings"]
-) -> Float[np.ndarray, "rings orders orders"]:
+    matrix: Float[np.ndarray, "modes modes"], heights: Angles
+) -> Float[np.ndarray, "points orders orders"]:
     """Compute B of every ring, with y^T C y = f(phi)^T B f(phi), f the azimuth functions.
 
     Parameters
@@ -260,9 +257,7 @@ def order_products(
         begin, starts = rows[0], first[order:] - rows[0]
         here = matrix[by_order[rows]].take(by_order[begin:], axis=1)
         here[:, len(rows) :] *= 2.0
-        even_part, odd_part = (
-            polar[:, rows[some]] @ here[some] for some in (~odd[rows], odd[rows])
-        )
+        even_part, odd_part = (polar[:, rows[x]] @ here[x] for x in (~odd[rows], odd[rows]))
         # the equator is its own mirror image
         north, south = both[order, : len(polar)], both[order, ::-1][: len(polar)]
         total = even_part + odd_part
@@ -347,7 +342,7 @@ class Rotation(eqx.Module):
         """The inverse rotation."""
         return Rotation(tuple(b.T for b in self.blocks))
 
-    def __call__(self, modes: Float[Array, "*batch modes"]) -> Float[Array, "*batch modes"]:
+    def __call__(self, modes: Fields) -> Fields:
         """Turn the field, or fields, with these coefficients."""
         turned = [
             modes[..., ell**2 : (ell + 1) ** 2] @ block.T for ell, block in enumerate(self.blocks)
@@ -371,9 +366,7 @@ def euler_zyz(matrix: Float[np.ndarray, "3 3"]) -> tuple[float, float, float]:
     return first, tilt, np.arctan2(sideways @ matrix[:, 0], along @ matrix[:, 0])
 
 
-def turn_about_z(
-    modes: Float[Array, "*batch modes"], angle: float | Float[Array, ""]
-) -> Float[Array, "*batch modes"]:
+def turn_about_z(modes: Fields, angle: float | Float[Array, ""]) -> Fields:
     """Turn fields about z.
 
     Parameters
@@ -387,19 +380,15 @@ def turn_about_z(
     -------
     (..., modes) array
     """
-    lmax = round(np.sqrt(modes.shape[-1])) - 1
-    ell, m = mode_numbers(lmax)
+    ell, m = mode_numbers(round(np.sqrt(modes.shape[-1])) - 1)
     mirrored = modes[..., ell * (ell + 1) - m]
     xp = namespace(modes, angle)
     angles = m.astype(np.float64) * angle
-    cosine, sine = xp.cos(angles), xp.sin(angles)
     shape = (1,) * (modes.ndim - 1) + (-1,)
-    return modes * cosine.reshape(shape) + mirrored * sine.reshape(shape)
+    return modes * xp.cos(angles).reshape(shape) + mirrored * xp.sin(angles).reshape(shape)
 
 
-def turn_about(
-    axis: int, modes: Float[Array, "*batch modes"], angle: float | Float[Array, ""]
-) -> Float[Array, "*batch modes"]:
+def turn_about(axis: int, modes: Fields, angle: float | Float[Array, ""]) -> Fields:
     """Turn fields about x (axis 0), from y towards z, or about y (1), from z towards x.
 
     Else as :func:`turn_about_z`.
@@ -432,7 +421,7 @@ def _horizontal_generators(lmax: int) -> tuple[np.ndarray, np.ndarray]:
     return columns, weights
 
 
-def apply_generator(modes: Float[Array, "*batch modes"], axis: int) -> Float[Array, "*batch modes"]:
+def apply_generator(modes: Fields, axis: int) -> Fields:
     """Return K_x (axis 0) or K_y (axis 1) times packed modes, in time linear in their number."""
     columns, weights = _horizontal_generators(round(np.sqrt(modes.shape[-1])) - 1)
     shape = (1,) * (modes.ndim - 1) + (-1,)
@@ -440,7 +429,7 @@ def apply_generator(modes: Float[Array, "*batch modes"], axis: int) -> Float[Arr
     return first * modes[..., columns[axis, :, 0]] + second * modes[..., columns[axis, :, 1]]
 
 
-def tilts(modes: Float[Array, "*batch modes"], order: int) -> list[Float[Array, "*batch modes"]]:
+def tilts(modes: Fields, order: int) -> list[Fields]:
     """Return the Taylor terms W_ab of a tilt, in the order of :func:`tilt_powers`.
 
     ::

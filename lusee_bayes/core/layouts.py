@@ -223,27 +223,20 @@ class Layout:
             if values.get(name) is not None
         }
         here = {name: declared for name, declared in self.variables.items() if name in arrays}
-        for name, declared in here.items():
-            _require_kind(f"{path}: {name}", arrays[name], declared)
         sizes: dict[str, int] = {}
         for name, declared in here.items():
-            _require_dims(f"{path}: {name}", tuple(arrays[name].shape), declared, sizes)
+            _require_form(f"{path}: {name}", arrays[name], declared, sizes)
         n_bytes = sum(8 * int(np.prod(arrays[n].shape, dtype=object)) for n in here)
         if n_bytes > memory_limit():
             raise InputError(
                 f"{path} says that it holds {gigabytes(n_bytes)} of numbers; this machine has "
                 f"{gigabytes(memory_limit())} of memory"
             )
-        factors = {
-            name: factor_to(f"{path}: {name}", declared.unit, values.get(f"{name}.units"))
-            for name, declared in here.items()
-        }
-        read = {
-            name: _checked_array(
-                f"{path}: {name}", np.asarray(arrays[name]), declared, factors[name]
-            )
-            for name, declared in here.items()
-        }
+        read = {}
+        for name, declared in here.items():
+            factor = factor_to(f"{path}: {name}", declared.unit, values.get(f"{name}.units"))
+            array = np.asarray(arrays[name])
+            read[name] = _checked_array(f"{path}: {name}", array, declared, factor)
         return Content(read, found, sizes, frozenset(map(str, arrays)))
 
     def _require_names(self, path: str | Path, *there: Mapping[str, Any]) -> None:
@@ -255,16 +248,13 @@ class Layout:
                 raise InputError(f"{path} has no {name} ({known}); expected {self.what}")
 
 
-def _require_kind(where: str, array: Unread, declared: Variable) -> None:
+def _require_form(where: str, array: Unread, declared: Variable, sizes: dict[str, int]) -> None:
+    """InputError for another kind or shape than declared; lengths that are new become known."""
     kind, (allowed, _, words) = np.dtype(array.dtype).kind, KINDS[declared.kind]
     # text of any length is kept as objects
     if kind not in allowed and not (declared.kind == "text" and kind == "O"):
         raise InputError(f"{where} holds values of type {array.dtype}, expected {words}")
-
-
-def _require_dims(
-    where: str, shape: tuple[int, ...], declared: Variable, sizes: dict[str, int]
-) -> None:
+    shape = tuple(array.shape)
     expected = [sizes.get(d) if isinstance(d, str) else d for d in declared.dims]
     fits = len(shape) == len(expected) and all(
         e is None or e == n for e, n in zip(expected, shape, strict=True)
@@ -288,7 +278,7 @@ def _checked_array(where: str, values: np.ndarray, declared: Variable, factor: f
         return texts
     if declared.kind == "time":
         if np.isnat(values).any():
-            first = tuple(int(i) for i in np.argwhere(np.isnat(values))[0])
+            first = tuple(np.argwhere(np.isnat(values))[0].tolist())
             raise InputError(f"{where} holds no time at {first}")
         return values.astype("datetime64[ns]")
     if declared.kind == "boolean" and not np.isin(values, (0, 1)).all():
@@ -321,7 +311,7 @@ def _range(declared: Variable) -> str:
 
 def _require_none(where: str, values: np.ndarray, bad: np.ndarray, what: str) -> None:
     if bad.any():
-        first = tuple(int(i) for i in np.argwhere(np.atleast_1d(bad))[0])
+        first = tuple(np.argwhere(np.atleast_1d(bad))[0].tolist())
         value = values[first] if values.ndim else values
         raise InputError(
             f"{where} holds {what}: {value:g} at {first}, {int(bad.sum())} of {bad.size} in all"

@@ -29,20 +29,23 @@ from lusee_bayes.core.arrays import Array, namespace, placed
 from lusee_bayes.core.checks import is_traced, require_float64
 from lusee_bayes.core.errors import InputError
 
+Matrix = Float[Array, "n n"]
+# a matrix, or a stack of them, and what they are multiplied with
+Matrices = Float[Array, "*batch n n"]
+Columns = Float[Array, "*batch n columns"]
+Tall = Float[Array, "rows n"]
+
 
 @lru_cache
 def _routine(name: str) -> Callable[..., None]:
     """A routine of LAPACK or BLAS, all of whose arguments are pointers."""
     module = cython_lapack if name in cython_lapack.__pyx_capi__ else cython_blas
     capsule = module.__pyx_capi__[name]
-    api = ctypes.pythonapi
-    api.PyCapsule_GetName.restype = ctypes.c_char_p
-    api.PyCapsule_GetName.argtypes = [ctypes.py_object]
-    api.PyCapsule_GetPointer.restype = ctypes.c_void_p
-    api.PyCapsule_GetPointer.argtypes = [ctypes.py_object, ctypes.c_char_p]
-    address = api.PyCapsule_GetPointer(capsule, api.PyCapsule_GetName(capsule))
-    n_arguments = api.PyCapsule_GetName(capsule).count(b"*")
-    return ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * n_arguments)(address)
+    name_of = ctypes.PYFUNCTYPE(ctypes.c_char_p, ctypes.py_object)
+    pointer_of = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c_char_p)
+    declared = name_of(("PyCapsule_GetName", ctypes.pythonapi))(capsule)
+    address = pointer_of(("PyCapsule_GetPointer", ctypes.pythonapi))(capsule, declared)
+    return ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * declared.count(b"*"))(address)
 
 
 def _in_place(name: str, letters: bytes, matrix: Float[np.ndarray, "n n"]) -> int:
@@ -75,9 +78,7 @@ SPANNED = 1e-12
 MAX_SUBSTITUTED = 160
 
 
-def cholesky(
-    matrix: Float[Array, "*batch n n"], *, overwrite: bool = False
-) -> Float[Array, "*batch n n"]:
+def cholesky(matrix: Matrices, *, overwrite: bool = False) -> Matrices:
     """Return the lower Cholesky factor, NaN where there is none; reads the lower triangle only.
 
     With ``overwrite`` it takes the place of NumPy's matrix.
@@ -94,7 +95,7 @@ def cholesky(
     return jax.lax.linalg.cholesky(matrix, symmetrize_input=False)
 
 
-def checked_cholesky(name: str, matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
+def checked_cholesky(name: str, matrix: Matrices) -> Matrices:
     """Return the lower Cholesky factor of a matrix, or of each of a stack.
 
     Parameters
@@ -125,9 +126,7 @@ def checked_cholesky(name: str, matrix: Float[Array, "*batch n n"]) -> Float[Arr
     return lower
 
 
-def solve_lower(
-    lower: Float[Array, "*batch n n"], x: Float[Array, "*batch n columns"], *, transpose: bool
-) -> Float[Array, "*batch n columns"]:
+def solve_lower(lower: Matrices, x: Columns, *, transpose: bool) -> Columns:
     """Return L^-1 x, or L^-T x with ``transpose``, for lower triangular L."""
     if namespace(lower, x) is np:
         if lower.ndim > 2:
@@ -141,9 +140,8 @@ def solve_lower(
         matrices = lower.ctypes.data, stride, solved.ctypes.data, stride
         _routine("dtrsm")(*words, n, n_columns, ctypes.byref(one), *matrices)
         return solved
-    return jax.lax.linalg.triangular_solve(
-        lower, x, left_side=True, lower=True, transpose_a=transpose
-    )
+    sides = {"left_side": True, "lower": True, "transpose_a": transpose}
+    return jax.lax.linalg.triangular_solve(lower, x, **sides)
 
 
 def gram_matrix(w: Float[Array, "rows columns"]) -> Float[Array, "columns columns"]:
@@ -153,9 +151,7 @@ def gram_matrix(w: Float[Array, "rows columns"]) -> Float[Array, "columns column
     return symmetric_product(w.T, w)
 
 
-def symmetric_product(
-    left: Float[Array, "n inner"], right: Float[Array, "inner n"]
-) -> Float[Array, "n n"]:
+def symmetric_product(left: Float[Array, "n inner"], right: Float[Array, "inner n"]) -> Matrix:
     """Return the product of two matrices that is known to be symmetric.
 
     Only the lower triangle is computed, so that the result is symmetric to the last bit.
@@ -169,9 +165,7 @@ def symmetric_product(
     return _from_strips([left[first:end] @ right[:, :end] for first, end in _strips(n)])
 
 
-def scaled(
-    matrix: Float[Array, "n n"], scale: Float[Array, " n"], *, overwrite: bool = False
-) -> Float[Array, "n n"]:
+def scaled(matrix: Matrix, scale: Float[Array, " n"], *, overwrite: bool = False) -> Matrix:
     """Return M_ij s_i s_j; with ``overwrite`` NumPy's M becomes it."""
     if namespace(matrix, scale) is not np:
         return scale[:, None] * matrix * scale[None]
@@ -180,9 +174,7 @@ def scaled(
     return product
 
 
-def times_lower(
-    x: Float[Array, "rows n"], lower: Float[Array, "n n"], *, transpose: bool
-) -> Float[Array, "rows n"]:
+def times_lower(x: Tall, lower: Matrix, *, transpose: bool) -> Tall:
     """Return x L, or x L^T with ``transpose``, for lower triangular L with zeros above."""
     if x.shape[0] < FEW_ROWS:
         return x @ (lower.T if transpose else lower)
@@ -194,7 +186,7 @@ def times_lower(
     return namespace(x, lower).concatenate(parts, axis=1)
 
 
-def sandwich(matrix: Float[Array, "n n"], lower: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def sandwich(matrix: Matrix, lower: Matrix) -> Matrix:
     """Return L^T M L for symmetric M and lower triangular L, symmetric to the last bit.
 
     Of M L only the lower triangle is needed.
@@ -208,14 +200,14 @@ def sandwich(matrix: Float[Array, "n n"], lower: Float[Array, "n n"]) -> Float[A
     return _from_strips(rows)
 
 
-def outer_sandwich(matrix: Float[Array, "n n"], lower: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def outer_sandwich(matrix: Matrix, lower: Matrix) -> Matrix:
     """Return L M L^T for symmetric M and lower triangular L, symmetric to the last bit."""
     # with rows and columns in reverse order it is the other one
     return _reversed(sandwich(_reversed(matrix), _reversed(lower.T)))
 
 
 def precise_residual(
-    vector: Float[Array, " rows"], matrix: Float[Array, "rows n"], x: Float[Array, " n"]
+    vector: Float[Array, " rows"], matrix: Tall, x: Float[Array, " n"]
 ) -> Float[Array, " rows"]:
     """Return v - M x, as if products were summed with half as many digits more.
 
@@ -238,7 +230,7 @@ def precise_residual(
     return ((vector - head @ top) - head @ (x - top)) - (matrix - head) @ x
 
 
-def invert_lower(lower: Float[Array, "n n"], *, overwrite: bool = False) -> Float[Array, "n n"]:
+def invert_lower(lower: Matrix, *, overwrite: bool = False) -> Matrix:
     """Return L^-1 for lower triangular L; entries above the diagonal are not read.
 
     With ``overwrite`` it takes the place of NumPy's L, which has zeros above the diagonal.
@@ -257,7 +249,7 @@ def invert_lower(lower: Float[Array, "n n"], *, overwrite: bool = False) -> Floa
     return jnp.concatenate([top, jnp.concatenate([between, last], axis=1)])
 
 
-def inverse_from_cholesky(lower: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def inverse_from_cholesky(lower: Matrix) -> Matrix:
     """Return (L L^T)^-1 for lower triangular L, symmetric to the last bit."""
     if namespace(lower) is np:
         inverse = lower.copy(order="C")
@@ -265,9 +257,7 @@ def inverse_from_cholesky(lower: Float[Array, "n n"]) -> Float[Array, "n n"]:
         return mirrored(inverse)
     x = invert_lower(lower)
     # columns of L^-1 begin at their own row
-    return _from_strips(
-        [x[first:, first:end].T @ x[first:, :end] for first, end in _strips(x.shape[0])]
-    )
+    return _from_strips([x[a:, a:b].T @ x[a:, :b] for a, b in _strips(x.shape[0])])
 
 
 def spanning_rows(
@@ -314,7 +304,7 @@ def mirrored(lower: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     return lower
 
 
-def _reversed(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def _reversed(matrix: Matrix) -> Matrix:
     """Rows and columns in reverse order; BLAS has no negative strides."""
     turned = matrix[::-1, ::-1]
     return np.ascontiguousarray(turned) if namespace(matrix) is np else turned
@@ -325,7 +315,7 @@ def _strips(n: int, blocks: int = N_BLOCKS) -> Iterator[tuple[int, int]]:
     return pairwise(np.linspace(0, n, min(blocks, n) + 1).astype(int).tolist())
 
 
-def _from_strips(strips: list[Float[Array, "_ _"]]) -> Float[Array, "n n"]:
+def _from_strips(strips: list[Float[Array, "_ _"]]) -> Matrix:
     """The symmetric matrix whose rows, up to their diagonal block, are these."""
     n = strips[-1].shape[1]
     if namespace(strips) is np:

@@ -13,16 +13,9 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 
+from rich import progress as bars
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 from lusee_bayes.core.version import versions
 
@@ -88,14 +81,14 @@ class Stages:
             yield self._lines(name, total)
         else:
             columns = (
-                TextColumn("{task.description}", markup=False),
-                BarColumn(),
-                MofNCompleteColumn(),
-                TimeElapsedColumn(),
-                TimeRemainingColumn(),
-                TextColumn("{task.fields[remark]}", markup=False),
+                bars.TextColumn("{task.description}", markup=False),
+                bars.BarColumn(),
+                bars.MofNCompleteColumn(),
+                bars.TimeElapsedColumn(),
+                bars.TimeRemainingColumn(),
+                bars.TextColumn("{task.fields[remark]}", markup=False),
             )
-            with Progress(*columns, console=self.console, transient=True) as bar:
+            with bars.Progress(*columns, console=self.console, transient=True) as bar:
                 task = bar.add_task(name, total=total, remark="")
                 yield lambda done, remark="": bar.update(task, completed=done, remark=remark)
         self._finish(name, start)

@@ -108,17 +108,16 @@ def requires(holds: Callable[[Any], Any], message: str) -> Any:
     return model_validator(mode="after")(checked)
 
 
+# the kinds that a section comes in, by what their model says
+Kinds = Mapping[str, type[Section]]
+
+
 def kinds_of(*sections: type[Section]) -> dict[str, type[Section]]:
-    """The kinds that a section comes in, by what their ``model`` says."""
+    """The kinds that a section comes in."""
     return {section.model_fields["model"].default: section for section in sections}
 
 
-def one_of(
-    kinds: Mapping[str, type[Section]],
-    complete: Callable[[dict[str, Any]], None],
-    *,
-    strict: bool = True,
-) -> Any:
+def one_of(kinds: Kinds, complete: Callable[[dict[str, Any]], None], *, strict: bool = True) -> Any:
     """The type of a section that comes in kinds.
 
     Parameters
@@ -147,9 +146,7 @@ def is_modelled(section: Any) -> bool:
     return section is not None and section.treatment != "ignored"
 
 
-def without_other_kinds(
-    tree: dict[str, Any], kinds: Mapping[str, type[Section]], *, strict: bool
-) -> dict[str, Any]:
+def without_other_kinds(tree: dict[str, Any], kinds: Kinds, *, strict: bool) -> dict[str, Any]:
     """A section's entries without those that only other kinds of it have.
 
     Scenarios that were written with all keys, or in which one kind is put in another's place by

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core import harmonics
-from lusee_bayes.core.arrays import Array, as_complex, namespace
+from lusee_bayes.core.arrays import Array, Fields, as_complex, namespace
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import special
@@ -83,7 +83,7 @@ class SphereGrid(eqx.Module):
         phi = 2.0 * np.pi * np.arange(self.n_phi) / self.n_phi
         return np.repeat(np.asarray(self.theta), self.n_phi), np.tile(phi, self.shape[0])
 
-    def synthesise(self, modes: Float[Array, "*batch modes"]) -> Float[Array, "*batch rings phi"]:
+    def synthesise(self, modes: Fields) -> Float[Array, "*batch rings phi"]:
         """Compute the fields of real packed coefficients at the grid's points.
 
         Parameters
@@ -112,7 +112,7 @@ class SphereGrid(eqx.Module):
         amplitude = as_complex(rings[0] * factor.reshape(row), rings[1] * sine.reshape(row))
         return xp.fft.irfft(amplitude, n=self.n_phi, axis=-1)
 
-    def analyse(self, field: Float[Array, "*batch rings phi"]) -> Float[Array, "*batch modes"]:
+    def analyse(self, field: Float[Array, "*batch rings phi"]) -> Fields:
         """Integrate fields with every harmonic: coefficients of their part up to lmax.
 
         Parameters

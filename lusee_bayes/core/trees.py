@@ -190,8 +190,7 @@ class StoredTree:
     @cached_property
     def children(self) -> dict[str, StoredTree]:
         """Groups in this one."""
-        items = ((name, x) for name, x in self._group.items() if isinstance(x, h5py.Group))
-        return {name: StoredTree(group) for name, group in items}
+        return {n: StoredTree(x) for n, x in self._group.items() if isinstance(x, h5py.Group)}
 
 
 def _stored(variable: h5py.Dataset) -> np.ndarray:
@@ -263,9 +262,7 @@ def from_tree(kind: type[T], tree: xr.DataTree | StoredTree, where: str) -> T:
     return kind(**found)
 
 
-@lru_cache(maxsize=128)
-def _checker(kind: Any) -> TypeAdapter:
-    return TypeAdapter(kind)
+_checker = lru_cache(maxsize=128)(TypeAdapter)
 
 
 def _for_json(value: Any) -> Any:

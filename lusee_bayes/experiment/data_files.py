@@ -17,7 +17,7 @@ from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.flight.clock import read_clock
-from lusee_bayes.flight.flags import NO_LINES, read_lines
+from lusee_bayes.flight.flags import read_lines
 from lusee_bayes.flight.gain_model import GainModel, read_gain_table
 from lusee_bayes.flight.recipe import FlightSection, Recipe
 from lusee_bayes.flight.reduced import Reduced, read_reduced
@@ -345,7 +345,7 @@ def recipe_of(scenario: Scenario) -> Recipe:
         timestamp,
         scenario.frequencies_mhz or (scenario.frequency_mhz,),
         here.average_s,
-        NO_LINES if section.lines is None else read_lines(section.lines),
+        () if section.lines is None else read_lines(section.lines),
         None if section.clock is None else read_clock(section.clock),
         (here.lon_deg, here.lat_deg) if section.site == "scenario" else None,
     )

@@ -29,9 +29,16 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float
 
+from lusee_bayes.core.arrays import RowFlags, Rows
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.flight.session import Averaging
+from lusee_bayes.flight.session import Averaging, Middles
 
+# spectra in bands: what rows have at points of a curve, and the terms that the curve is made of;
+# values of a band
+Points = Bool[np.ndarray, "rows points"]
+PointValues = Float[np.ndarray, "rows points"]
+Basis = Float[np.ndarray, "points terms"]
+Values = Float[np.ndarray, "rows products"]
 # a spectrum with so many flags that its value has this many times the variance is not used
 MOST_VARIANCE = 4.0
 ROUNDING_MHZ = 1e-9
@@ -43,8 +50,6 @@ class ChannelBand:
 
     Attributes
     ----------
-    frequency_mhz : float
-        The middle.
     first, last : int
         Bins first to last - 1 lie within the band, with all their channels.
     basis : (bins, terms) array
@@ -56,7 +61,6 @@ class ChannelBand:
         Covariance of the noise of the bins for a flat spectrum of 1 and one frame.
     """
 
-    frequency_mhz: float
     first: int
     last: int
     basis: Float[np.ndarray, "bins terms"]
@@ -70,7 +74,7 @@ class ChannelBand:
         bandwidth_mhz: float,
         degree: int,
         averaging: Averaging,
-        middles_mhz: Float[np.ndarray, " channels"],
+        middles_mhz: Middles,
         shared_noise: tuple[float, ...] = (1.0,),
     ) -> ChannelBand:
         """Find the bins of a band.
@@ -78,7 +82,7 @@ class ChannelBand:
         Parameters
         ----------
         frequency_mhz, bandwidth_mhz : float
-            Channels with their middles within the bandwidth, ends included.
+            Middles with their middles within the bandwidth, ends included.
         degree : int
             Of the polynomial.
         averaging : Averaging
@@ -108,18 +112,14 @@ class ChannelBand:
         apart = np.abs(channels[first:last, :, None, None] - channels[None, None, first:last])
         known = np.array([*shared_noise, 0.0])
         shared = known[np.minimum(apart, len(known) - 1)].mean(axis=(1, 3))
-        return cls(frequency_mhz, first, last, finer[:, : degree + 1], finer, shared)
+        return cls(first, last, finer[:, : degree + 1], finer, shared)
 
     def values(
         self,
         spectra: Float[np.ndarray, "rows products bins"],
         autos: Float[np.ndarray, "rows bins"],
         good: Bool[np.ndarray, "rows bins"],
-    ) -> tuple[
-        Float[np.ndarray, "rows products"],
-        Float[np.ndarray, " rows"],
-        Float[np.ndarray, "rows products"],
-    ]:
+    ) -> tuple[Values, Rows, Values]:
         """Return the spectrum at the middle.
 
         Parameters
@@ -151,15 +151,13 @@ class ChannelBand:
         whole, _ = point_weights(self.basis, np.ones((1, len(self.basis)), dtype=bool))
         at_best = float((whole @ self.shared @ whole.T)[0, 0])
         usable = possible & (middle > 0.0) & (variance <= MOST_VARIANCE * at_best)
-        variance = np.where(usable, variance, np.inf)
         clean = np.where(good[:, None], spectra, 0.0)
         values = np.einsum("rpk,rk->rp", clean, weights)
-        return values, variance, np.einsum("rpk,rk->rp", clean, finer) - values
+        further = np.einsum("rpk,rk->rp", clean, finer) - values
+        return values, np.where(usable, variance, np.inf), further
 
 
-def point_weights(
-    basis: Float[np.ndarray, "points terms"], good: Bool[np.ndarray, "rows points"]
-) -> tuple[Float[np.ndarray, "rows points"], Bool[np.ndarray, " rows"]]:
+def point_weights(basis: Basis, good: Points) -> tuple[PointValues, RowFlags]:
     """Return the weights by which a least-squares polynomial is evaluated in the middle.
 
     Parameters
@@ -180,8 +178,8 @@ def point_weights(
 
 
 def inverse_normals(
-    basis: Float[np.ndarray, "points terms"], good: Bool[np.ndarray, "rows points"]
-) -> tuple[Float[np.ndarray, "rows terms terms"], Bool[np.ndarray, " rows"]]:
+    basis: Basis, good: Points
+) -> tuple[Float[np.ndarray, "rows terms terms"], RowFlags]:
     """Return the inverse normal matrix of the curve through the good points of every row.
 
     Also whether there are enough points; it is the unit matrix where there are not.
@@ -233,15 +231,10 @@ def shared_noise(taps: int, taper: Taper) -> tuple[float, ...]:
     if taps == 0:
         return (1.0,)
     h = impulse_response(taps, taper)
-    found = np.zeros(REACH + 1)
-    for shift in range(-taps + 1, taps):
-        overlap = np.zeros_like(h)
-        if shift >= 0:
-            overlap[shift * FRAME :] = h[shift * FRAME :] * h[: len(h) - shift * FRAME]
-        else:
-            overlap[: shift * FRAME] = h[: shift * FRAME] * h[-shift * FRAME :]
+    found, padded = np.zeros(REACH + 1), np.pad(h, len(h))
+    for start in range(FRAME, 2 * len(h), FRAME):
         # frames fold onto one: exp(2 pi i d n / N) has their period
-        folded = overlap.reshape(taps, FRAME).sum(axis=0)
+        folded = (h * padded[start : start + len(h)]).reshape(taps, FRAME).sum(axis=0)
         found += np.abs(np.fft.fft(folded)[: REACH + 1]) ** 2
     return tuple((found / (h @ h) ** 2).tolist())
 

@@ -25,8 +25,8 @@ from typing import Any
 
 import numpy as np
 from astropy.time import Time
-from jaxtyping import Float
 
+from lusee_bayes.core.arrays import Times
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.layouts import Attribute, Layout
 from lusee_bayes.core.reading import naming, read_json
@@ -87,7 +87,7 @@ class Clock:
     rate: float = 1.0
     stated: Time | None = None
 
-    def utc(self, raw_s: Float[np.ndarray, " times"]) -> Time:
+    def utc(self, raw_s: Times) -> Time:
         """Return UTC at readings of the clock.
 
         Parameters
@@ -115,11 +115,10 @@ class Clock:
         """Return the clock of a session by what it says itself, corrected by this one."""
         with unannounced_leap_seconds():
             since_s = float((self.stated - said.utc(np.array([said.raw_s]))[0]).sec)
-        return replace(
-            self, raw_s=said.raw_s + since_s / said.rate, rate=self.rate * said.rate, stated=None
-        )
+        raw_s = said.raw_s + since_s / said.rate
+        return replace(self, raw_s=raw_s, rate=self.rate * said.rate, stated=None)
 
-    def differs_s(self, other: Clock, raw_s: Float[np.ndarray, " times"]) -> float:
+    def differs_s(self, other: Clock, raw_s: Times) -> float:
         """Return by how many seconds two clocks differ at most at some readings."""
         ends = np.array([raw_s.min(), raw_s.max()])
         with unannounced_leap_seconds():
@@ -195,9 +194,7 @@ def _require_known(where: str | Path, found: dict[str, Any], known: Iterable[str
         raise InputError(f"{where}: unknown entry '{key}'; {hint}")
 
 
-def clock_of(
-    path: str | Path, said: Clock | None, given: Clock | None, raw_s: Float[np.ndarray, " times"]
-) -> Clock:
+def clock_of(path: str | Path, said: Clock | None, given: Clock | None, raw_s: Times) -> Clock:
     """Return the clock of a session: its own, a clock file's, or its own as corrected by the file.
 
     A clock file that does not correct the session's clock must not contradict it.

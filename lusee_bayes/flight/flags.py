@@ -19,27 +19,24 @@ where that is more.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from lusee_bayes.core.arrays import RowFlags, Rows
 from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.lazy import special
 from lusee_bayes.core.reading import read_table
-from lusee_bayes.flight.bands import ChannelBand, inverse_normals
-from lusee_bayes.flight.session import CHANNEL_MHZ, Averaging
+from lusee_bayes.flight.bands import Basis, ChannelBand, Points, PointValues, inverse_normals
+from lusee_bayes.flight.session import CHANNEL_MHZ, Averaging, Middles
 
 # of spectra in bands: of rows, autos and points of a curve; in time: of one span, rows as points
 Autos = Float[np.ndarray, "rows autos points"]
-Points = Bool[np.ndarray, "rows points"]
-Basis = Float[np.ndarray, "points terms"]
-Rows = Float[np.ndarray, " rows"]
+BinFlags = Bool[np.ndarray, " bins"]
 Bins = Bool[np.ndarray, "rows bins"]
 Spectra = Float[np.ndarray, "rows ports bins"]
 Levels = Float[np.ndarray, "rows ports"]
-Seconds = Float[np.ndarray, " span"]
 Span = Bool[np.ndarray, " span"]
 OneRow = Float[np.ndarray, "1 ports span"]
 Distances = Float[np.ndarray, "ports span"]
@@ -134,9 +131,7 @@ def distances(values: Autos, noise: Autos, good: Points, kept: Points, basis: Ba
     return np.where(good[:, None], (values - curve) / scale, 0.0)
 
 
-def fitted_curves(
-    values: Autos, kept: Points, basis: Basis
-) -> tuple[Autos, Float[np.ndarray, "rows points"]]:
+def fitted_curves(values: Autos, kept: Points, basis: Basis) -> tuple[Autos, PointValues]:
     """Return the curve through some points, and its variance in units of that of a point.
 
     Parameters
@@ -151,7 +146,7 @@ def fitted_curves(
     return curve, leverage
 
 
-def robust_scale(z: Float[np.ndarray, "rows points"], good: Points) -> float:
+def robust_scale(z: PointValues, good: Points) -> float:
     """Return the standard deviation of distances by their median; NaN if there are none."""
     return float(MAD * np.median(np.abs(z[good]))) if good.any() else np.nan
 
@@ -175,33 +170,13 @@ TABLE = Layout(
 )
 
 
-@dataclass(frozen=True)
-class KnownLines:
-    """Lines that are there all of the time.
-
-    Attributes
-    ----------
-    frequency_mhz : (lines,) array
-    source : tuple of str
-        Who says so.
-    """
-
-    frequency_mhz: Float[np.ndarray, " lines"]
-    source: tuple[str, ...]
-
-    def bins(
-        self, averaging: Averaging, middles_mhz: Float[np.ndarray, " channels"]
-    ) -> Bool[np.ndarray, " bins"]:
-        """Return the bins that hold a line, or a channel beside one."""
-        near = np.abs(middles_mhz[:, None] - self.frequency_mhz) <= BESIDE_MHZ
-        return near.any(axis=1)[averaging.channels()].any(axis=1)
-
-
-NO_LINES = KnownLines(np.zeros(0), ())
-
-
-def read_lines(path: str | Path) -> KnownLines:
+def read_lines(path: str | Path) -> tuple[float, ...]:
     """Read a CSV table of lines: ``frequency_mhz``, and the ``source`` of each.
+
+    Returns
+    -------
+    tuple of float
+        The frequencies, in MHz, of lines that are there all of the time.
 
     Raises
     ------
@@ -209,17 +184,21 @@ def read_lines(path: str | Path) -> KnownLines:
         If it cannot be read.
     """
     found = read_table(path, TABLE, "write a line 'frequency_mhz,source' and one for each")
-    return KnownLines(found["frequency_mhz"], tuple(map(str, found["source"])))
+    return tuple(found["frequency_mhz"].tolist())
 
 
-def comb_bins(averaging: Averaging) -> Bool[np.ndarray, " bins"]:
+def line_bins(lines_mhz: tuple[float, ...], averaging: Averaging, middles_mhz: Middles) -> BinFlags:
+    """Return the bins that hold a known line, or a channel beside one."""
+    near = np.abs(middles_mhz[:, None] - np.array(lines_mhz)) <= BESIDE_MHZ
+    return near.any(axis=1)[averaging.channels()].any(axis=1)
+
+
+def comb_bins(averaging: Averaging) -> BinFlags:
     """Return the bins that hold a channel of the comb."""
     return (averaging.channels() % COMB_SPACING == COMB_FIRST).any(axis=1)
 
 
-def comb_strength(
-    autos: Spectra, frames: Rows, averaging: Averaging, middles_mhz: Float[np.ndarray, " channels"]
-) -> Rows:
+def comb_strength(autos: Spectra, frames: Rows, averaging: Averaging, middles_mhz: Middles) -> Rows:
     """Return by how many standard deviations the comb's channels differ from their neighbours.
 
     Parameters
@@ -293,14 +272,9 @@ LEAST = 16
 LENGTHS = (1, 2, 4, 8, 16)
 
 
-def n_tests(ports: int) -> int:
-    """Return how many tests a spectrum has to pass."""
-    return ports * len(LENGTHS)
-
-
 def burst_flags(
-    seconds: Rows, autos: Levels, noise: Levels, good: Bool[np.ndarray, " rows"], false_alarm: float
-) -> tuple[Bool[np.ndarray, " rows"], Float[np.ndarray, " spans"]]:
+    seconds: Rows, autos: Levels, noise: Levels, good: RowFlags, false_alarm: float
+) -> tuple[RowFlags, Float[np.ndarray, " spans"]]:
     """Find spectra off a smooth curve in time.
 
     Parameters
@@ -324,7 +298,7 @@ def burst_flags(
         spectra.
     """
     flagged, scatter = np.zeros(len(seconds), dtype=bool), []
-    limit = threshold(false_alarm, n_tests(autos.shape[1]))
+    limit = threshold(false_alarm, autos.shape[1] * len(LENGTHS))
     autos = _filled(seconds, autos, np.isfinite(noise) & good[:, None])
     for at in _spans(seconds):
         scale = np.nan
@@ -352,15 +326,10 @@ def _spans(seconds: Rows) -> list[np.ndarray]:
 
 
 def _one_span(
-    seconds: Seconds,
-    autos: Float[np.ndarray, "span ports"],
-    noise: Float[np.ndarray, "span ports"],
-    good: Span,
-    limit: float,
-) -> tuple[Span, float]:
-    x = np.polynomial.chebyshev.chebvander(
-        2.0 * (seconds - seconds[0]) / max(seconds[-1] - seconds[0], 1.0) - 1.0, DEGREE
-    )
+    seconds: Rows, autos: Levels, noise: Levels, good: RowFlags, limit: float
+) -> tuple[RowFlags, float]:
+    t = 2.0 * (seconds - seconds[0]) / max(seconds[-1] - seconds[0], 1.0) - 1.0
+    x = np.polynomial.chebyshev.chebvander(t, DEGREE)
     values = np.where(good[:, None], autos, 0.0).T[None]
     sigma = np.where(good[:, None], noise, 1.0).T[None]
     # noise from spectrum to spectrum, which a burst changes at its ends alone

@@ -14,14 +14,12 @@ counts / sqrt(G_a G_b).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from math import prod
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Float
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.checks import Described, extent, require_positive, require_shape
@@ -31,10 +29,11 @@ from lusee_bayes.core.layouts import Layout, Variable, require_mhz
 from lusee_bayes.core.lazy import interpolate
 from lusee_bayes.core.reading import read_table, reading, require_file
 from lusee_bayes.core.trees import from_tree, opened_tree, quantity, write_tree
-from lusee_bayes.flight.session import LEVELS, PORTS, TELEMETRY
+from lusee_bayes.flight.session import LETTERS, PORTS, TELEMETRY, PortLevels, Telemetry
 
-LETTERS = tuple(LEVELS.values())
-N_COMPONENTS, N_TERMS = 2, 9
+# levels of ports by their names, as M0, and where arrays have them
+PLACES = {f"{x}{port}": (k, port) for k, x in enumerate(LETTERS) for port in range(PORTS)}
+LEAD, N_COMPONENTS, N_TERMS = (len(LETTERS), PORTS), 2, 9
 # one nV^2/Hz
 NANO2 = 1e-18
 # of gains: counts for one nV^2/Hz
@@ -87,27 +86,15 @@ class GainModel(Described):
         )
 
     def __post_init__(self):
-        require_shape(f"{self.path}: mean", self.mean, (len(LETTERS), PORTS, None))
-        *lead, anchors = self.mean.shape
+        require_shape(f"{self.path}: mean", self.mean, (*LEAD, None))
+        anchors = self.mean.shape[2]
         shapes = {"anchor_mhz": [anchors], "components": [N_COMPONENTS, anchors]}
         for name, shape in (shapes | {"coefficient": [N_COMPONENTS, N_TERMS]}).items():
-            require_shape(f"{self.path}: {name}", getattr(self, name), (*lead, *shape))
+            require_shape(f"{self.path}: {name}", getattr(self, name), (*LEAD, *shape))
         if not (np.diff(self.anchor_mhz, axis=2) > 0.0).all():
             raise InputError(f"{self.path}: the frequencies of the gains do not grow")
         require_mhz(f"{self.path}: the frequencies of the gains", self.anchor_mhz)
         require_positive(f"{self.path}: the mean gain", self.mean, "give counts for 1 nV^2/Hz")
-
-    @cached_property
-    def _splines(self) -> dict[tuple[int, int], interpolate.CubicSpline]:
-        return {
-            (level, port): interpolate.CubicSpline(
-                self.anchor_mhz[level, port],
-                np.vstack([self.mean[level, port], self.components[level, port]]).T,
-                extrapolate=False,
-            )
-            for level in range(len(LETTERS))
-            for port in range(PORTS)
-        }
 
     def basis(
         self, level: str, port: int, frequencies_mhz: Float[np.ndarray, " frequencies"]
@@ -125,7 +112,10 @@ class GainModel(Described):
         (3, frequencies) array
             Counts for 1 nV^2/Hz; NaN where the table has no gain.
         """
-        return self._splines[LETTERS.index(level), port](frequencies_mhz).T
+        place = LETTERS.index(level), port
+        known = np.vstack([self.mean[place], self.components[place]])
+        spline = interpolate.CubicSpline(self.anchor_mhz[place], known.T, extrapolate=False)
+        return spline(frequencies_mhz).T
 
     def with_component_std(self, std: tuple[float, ...] | None) -> GainModel:
         """Return the same with errors of the components of each level of each port, if any.
@@ -145,7 +135,7 @@ class GainModel(Described):
         return replace(self, component_std=np.broadcast_to(std, self.components.shape[:3]).copy())
 
     def strengths(
-        self, level: str, port: int, telemetry: Mapping[str, Float[np.ndarray, " rows"]]
+        self, level: str, port: int, telemetry: Telemetry
     ) -> Float[np.ndarray, "rows components"]:
         """Return q_1 and q_2 for telemetry.
 
@@ -161,22 +151,15 @@ class GainModel(Described):
         InputError
             If something of it is missing.
         """
-        phi = _telemetry_terms(port, telemetry)
-        return phi @ self.coefficient[LETTERS.index(level), port].T
-
-
-def _telemetry_terms(
-    port: int, telemetry: Mapping[str, Float[np.ndarray, " rows"]]
-) -> Float[np.ndarray, "rows terms"]:
-    lacking = [name for name in TELEMETRY if name not in telemetry]
-    if lacking:
-        raise InputError(
-            f"the telemetry lacks {', '.join(lacking)}, by which the gain table predicts gains; "
-            "ingest the session with its telemetry, interpolated to the spectra"
-        )
-    known = {"1": np.ones_like(telemetry[TELEMETRY[0]]), **telemetry}
-    terms = [prod(known[name] for name in term.split("*")) for term in _terms(port)]
-    return np.stack(terms, axis=1)
+        lacking = [name for name in TELEMETRY if name not in telemetry]
+        if lacking:
+            raise InputError(
+                f"the telemetry lacks {', '.join(lacking)}, by which the gain table predicts "
+                "gains; ingest the session with its telemetry, interpolated to the spectra"
+            )
+        known = {"1": np.ones_like(telemetry[TELEMETRY[0]]), **telemetry}
+        phi = [prod(known[name] for name in term.split("*")) for term in _terms(port)]
+        return np.stack(phi, axis=1) @ self.coefficient[LETTERS.index(level), port].T
 
 
 # first and last frequency of curves, and how many
@@ -202,10 +185,7 @@ class Curves:
 
 
 def gain_curves(
-    table: GainModel,
-    gain_std: float | None,
-    levels: Shaped[np.ndarray, "rows ports"],
-    telemetry: Mapping[str, Float[np.ndarray, " rows"]],
+    table: GainModel, gain_std: float | None, levels: PortLevels, telemetry: Telemetry
 ) -> Curves:
     """Return the gains of every level of every port that some spectrum has.
 
@@ -218,18 +198,18 @@ def gain_curves(
     telemetry : mapping of str to (rows,) array
     """
     mhz = np.linspace(*CURVE_MHZ)
-    shape = (len(LETTERS), PORTS, len(mhz))
-    gain, std = np.full(shape, np.nan), np.zeros(shape)
+    gain, std = np.full((*LEAD, len(mhz)), np.nan), np.zeros((*LEAD, len(mhz)))
     mean = {name: np.array([values.mean()]) for name, values in telemetry.items()}
-    for number, level in enumerate(LETTERS):
-        for port in np.flatnonzero((levels == level).any(axis=0)).tolist():
-            basis = table.basis(level, port, mhz)
-            gain[number, port] = basis[0] + table.strengths(level, port, mean)[0] @ basis[1:]
-            variance = (gain_std or 0.0) ** 2 * np.square(gain[number, port])
-            if table.component_std is not None:
-                components = table.component_std[number, port][:, None] * basis[1:]
-                variance = variance + np.square(components).sum(axis=0)
-            std[number, port] = np.sqrt(variance)
+    for (level, _), place in PLACES.items():
+        if not (levels[:, place[1]] == level).any():
+            continue
+        basis = table.basis(level, place[1], mhz)
+        gain[place] = basis[0] + table.strengths(level, place[1], mean)[0] @ basis[1:]
+        variance = (gain_std or 0.0) ** 2 * np.square(gain[place])
+        if table.component_std is not None:
+            components = table.component_std[place][:, None] * basis[1:]
+            variance = variance + np.square(components).sum(axis=0)
+        std[place] = np.sqrt(variance)
     return Curves(mhz, gain, std)
 
 
@@ -263,23 +243,21 @@ def draw_gains(
     """
     mean, coefficient = table.mean.copy(), table.coefficient.copy()
     errors: dict[str, float] = {}
-    for number, level in enumerate(LETTERS):
-        for port in range(PORTS):
-            name, place = f"{level}{port}", (number, port)
-            if gain_std is not None:
-                errors[name] = float(generator.standard_normal())
-                factor = 1.0 + gain_std * errors[name]
-                if factor <= 0.0:
-                    raise InputError(
-                        f"with a standard deviation of {gain_std:g} of itself the gain of {name} "
-                        "was drawn below zero; give a smaller flight.gain_std"
-                    )
-                mean[place] *= factor
-                coefficient[place] *= factor
-            if table.component_std is not None:
-                for r in range(N_COMPONENTS):
-                    z = errors[f"{name} PC{r + 1}"] = float(generator.standard_normal())
-                    coefficient[(*place, r, 0)] += table.component_std[(*place, r)] * z
+    for name, place in PLACES.items():
+        if gain_std is not None:
+            errors[name] = float(generator.standard_normal())
+            factor = 1.0 + gain_std * errors[name]
+            if factor <= 0.0:
+                raise InputError(
+                    f"with a standard deviation of {gain_std:g} of itself the gain of {name} "
+                    "was drawn below zero; give a smaller flight.gain_std"
+                )
+            mean[place] *= factor
+            coefficient[place] *= factor
+        if table.component_std is not None:
+            for r in range(N_COMPONENTS):
+                z = errors[f"{name} PC{r + 1}"] = float(generator.standard_normal())
+                coefficient[(*place, r, 0)] += table.component_std[(*place, r)] * z
     return replace(table, mean=mean, coefficient=coefficient), errors
 
 
@@ -325,25 +303,18 @@ def write_gain_table(path: str | Path, table: GainModel) -> Path:
 def _read_folder(folder: Path, model: str) -> GainModel:
     if model not in MODELS:
         raise InputError(f"unknown model of gains '{model}'; {nearest(model, MODELS)}")
-    arrays = {
-        name: [
-            [_gain_array(folder / f"{level}{port}_{name}.npy") for port in range(PORTS)]
-            for level in LETTERS
-        ]
-        for name in ("freqs", "mean", "eigvecs")
-    }
-    vectors = [[v[:, :N_COMPONENTS].T for v in row] for row in arrays["eigvecs"]]
-    shapes = {v.shape for row in arrays["mean"] for v in row}
-    if len(shapes) > 1:
-        raise InputError(f"{folder}: gains have different numbers of frequencies, {shapes}")
-    return GainModel(
-        str(folder),
-        np.array(arrays["freqs"]),
-        np.array(arrays["mean"]),
-        np.array(vectors),
-        _coefficients(folder / COEFFICIENTS, model),
-        kind=f"luseepy's gain model, {model} coefficients",
-    )
+    found = []
+    for name in ("freqs", "mean", "eigvecs"):
+        arrays = [_gain_array(folder / f"{place}_{name}.npy") for place in PLACES]
+        shapes = {values.shape for values in arrays}
+        if len(shapes) > 1:
+            raise InputError(f"{folder}: gains have different numbers of frequencies, {shapes}")
+        found.append(np.reshape(arrays, (*LEAD, *arrays[0].shape)))
+    mhz, mean, vectors = found
+    components = vectors.swapaxes(2, 3)
+    coefficients = _coefficients(folder / COEFFICIENTS, model)
+    kind = f"luseepy's gain model, {model} coefficients"
+    return GainModel(str(folder), mhz, mean, components, coefficients, kind=kind)
 
 
 def _gain_array(path: Path) -> np.ndarray:
@@ -356,23 +327,20 @@ def _gain_array(path: Path) -> np.ndarray:
     if values.ndim != (2 if two else 1) or (two and values.shape[1] < N_COMPONENTS):
         expected = "a matrix" if two else "a list"
         raise InputError(f"{path} has shape {values.shape}, expected {expected}")
-    return values.astype(np.float64)
+    return (values[:, :N_COMPONENTS] if two else values).astype(np.float64)
 
 
 def _coefficients(path: Path, model: str) -> np.ndarray:
     columns = read_table(path, CSV, HINT)
     places = {
-        f"{level}{port} PC{r + 1} {term}": (i, port, r, k)
-        for i, level in enumerate(LETTERS)
-        for port in range(PORTS)
+        f"{name} PC{r + 1} {term}": (*place, r, k)
+        for name, place in PLACES.items()
         for r in range(N_COMPONENTS)
-        for k, term in enumerate(_terms(port))
+        for k, term in enumerate(_terms(place[1]))
     }
-    found, seen = np.zeros((len(LETTERS), PORTS, N_COMPONENTS, N_TERMS)), set()
-    names = ("gain_setting", "component", "model", "term", "alpha_refit")
-    for number, (setting, component, family, term, value) in enumerate(
-        zip(*(columns[name] for name in names), strict=True), start=2
-    ):
+    found, seen = np.zeros((*LEAD, N_COMPONENTS, N_TERMS)), set()
+    rows = zip(*(columns[name] for name in CSV.variables), strict=True)
+    for number, (setting, component, family, term, value) in enumerate(rows, start=2):
         if str(family).strip().lower() != model:
             continue
         name = f"{setting.strip().upper()} {component.strip().upper()} {term.strip()}"
@@ -411,24 +379,16 @@ TERMS = np.array(
 LOW_MHZ, HIGH_MHZ = 0.2, 80.0
 
 
-def synthetic_gains(path: str = "made up") -> GainModel:
-    """Return the table.
-
-    Parameters
-    ----------
-    path : str
-        Where it will be, for messages.
-    """
-    lead = (len(LETTERS), PORTS)
+def synthetic_gains() -> GainModel:
+    """Return a table that is made up."""
     f = ANCHORS_MHZ
     shape = (f / (f + LOW_MHZ)) ** 2 / (1.0 + (f / HIGH_MHZ) ** 2)
     ports = 1.0 + 0.04 * np.arange(PORTS)
-    mean: Float[np.ndarray, "levels ports anchors"] = (
-        np.array([MEAN[level] for level in LETTERS])[:, None, None] * ports[:, None] * shape
-    )
+    mean = np.array([MEAN[level] for level in LETTERS])[:, None, None] * ports[:, None] * shape
     slope = np.log(f / 20.0) / 5.0
     component = np.stack([mean, mean * slope], axis=2)
     # every level and port has a law of its own
-    factor = 1.0 + 0.1 * np.arange(len(LETTERS) * PORTS).reshape(*lead, 1, 1)
-    coefficient = np.broadcast_to(TERMS, (*lead, N_COMPONENTS, N_TERMS)) * factor
-    return GainModel(path, np.broadcast_to(f, (*lead, len(f))).copy(), mean, component, coefficient)
+    factor = 1.0 + 0.1 * np.arange(len(PLACES)).reshape(*LEAD, 1, 1)
+    coefficient = np.broadcast_to(TERMS, (*LEAD, N_COMPONENTS, N_TERMS)) * factor
+    mhz = np.broadcast_to(f, mean.shape).copy()
+    return GainModel("made up", mhz, mean, component, coefficient)

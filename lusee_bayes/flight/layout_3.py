@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,8 @@ import numpy as np
 from astropy.io import fits
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.formats import IMAGE_DTYPES
-from lusee_bayes.core.layouts import Attribute, Content, Layout, Unloaded, Unread
+from lusee_bayes.core.formats import unread_image
+from lusee_bayes.core.layouts import Attribute, Content, Layout, Unread
 from lusee_bayes.flight.clock import DAY_S, MJD_ZERO, SAME_S, Clock
 from lusee_bayes.flight.session import META, ROWS, SAID, TELEMETRY, Opener, Session, session_of
 from lusee_bayes.instrument.times import scale_of
@@ -32,21 +31,17 @@ TABLES = {"SPECTRA_TIMES": "spectra", "SPECTRA_META": META, "SPEC_INTERP": "tele
 # columns and words that have another name there
 COLUMNS = {"spectra/RAW_TIME": "spectra/raw_times", "spectra/MJD_TIME": "spectra/mjd_times"}
 WORDS = {
-    "CONSTANTS": {
-        "LUN_LAT": "constants.lun_lat_deg",
-        "LUN_LON": "constants.lun_long_deg",
-        "RAWSHFT": "constants.raw_time_subtract_seconds",
-        "MJDOFF": "constants.mjd_epoch_offset_days",
-        "TIMESYS": "constants.time_scale",
-    },
-    "SESSION_INV": {"SW_VERS": "session_invariants.software_version"},
-    "SPECTRA": {
-        "BUNIT": "spectra/data.units",
-        "REPRESENTATION": "spectra/data.representation",
-        "BITSREST": "spectra/data.bitslice_restored",
-        "BITSREF": "spectra/data.bitslice_reference",
-        "NORMVER": "spectra/data.normalization_version",
-    },
+    ("CONSTANTS", "LUN_LAT"): "constants.lun_lat_deg",
+    ("CONSTANTS", "LUN_LON"): "constants.lun_long_deg",
+    ("CONSTANTS", "RAWSHFT"): "constants.raw_time_subtract_seconds",
+    ("CONSTANTS", "MJDOFF"): "constants.mjd_epoch_offset_days",
+    ("CONSTANTS", "TIMESYS"): "constants.time_scale",
+    ("SESSION_INV", "SW_VERS"): "session_invariants.software_version",
+    ("SPECTRA", "BUNIT"): "spectra/data.units",
+    ("SPECTRA", "REPRESENTATION"): "spectra/data.representation",
+    ("SPECTRA", "BITSREST"): "spectra/data.bitslice_restored",
+    ("SPECTRA", "BITSREF"): "spectra/data.bitslice_reference",
+    ("SPECTRA", "NORMVER"): "spectra/data.normalization_version",
 }
 
 
@@ -101,22 +96,15 @@ def session_of_fits(path: Path, hdus: fits.HDUList, opener: Opener) -> Session:
     names = [hdu.name for hdu in hdus]
     if "SPECTRA" not in names:
         raise no_spectra(path, "image SPECTRA", names[1:])
-    cube = hdus["SPECTRA"]
-    dtype = np.dtype(IMAGE_DTYPES[cube.header["BITPIX"]])
-    unread = Unloaded(tuple(cube.shape), dtype, partial(getattr, cube, "data"))
-    arrays: dict[str, Unread] = {"spectra/data": unread}
-    for table, place in TABLES.items():
-        if table not in names:
-            continue
+    arrays: dict[str, Unread] = {"spectra/data": unread_image(hdus["SPECTRA"])}
+    for table in [table for table in TABLES if table in names]:
         for column in hdus[table].columns.names:
-            name = f"{place}/{column}"
+            name = f"{TABLES[table]}/{column}"
             arrays[COLUMNS.get(name, name)] = np.asarray(hdus[table].data[column])
     values: dict[str, Any] = {
         ours: hdus[hdu].header[word]
-        for hdu, words in WORDS.items()
-        if hdu in names
-        for word, ours in words.items()
-        if word in hdus[hdu].header
+        for (hdu, word), ours in WORDS.items()
+        if hdu in names and word in hdus[hdu].header
     }
     return _checked_session(path, "FITS", arrays, values, opener)
 
@@ -137,7 +125,8 @@ def _checked_session(
     path: Path, kind: str, arrays: dict[str, Any], values: dict[str, Any], opener: Opener
 ) -> Session:
     found = LAYOUT_3.checked(path, arrays, values)
-    return session_of(path, 3, kind, found, arrays, _clock_by_epoch(path, found), opener)
+    clock = _clock_by_epoch(path, found)
+    return session_of(path, found, arrays, layout=3, kind=kind, clock=clock, opener=opener)
 
 
 def _clock_by_epoch(path: Path, found: Content) -> Clock | None:

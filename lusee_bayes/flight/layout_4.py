@@ -12,8 +12,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 from astropy.time import Time
-from jaxtyping import Float
 
+from lusee_bayes.core.arrays import Rows, Times
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.layouts import Layout, Unread
 from lusee_bayes.flight.clock import Clock
@@ -73,7 +73,8 @@ def session_of_4(path: Path, file: h5py.File, opener: Opener) -> Session:
         for group, name in UNUSED.items()
         if group in file
     }
-    return session_of(path, 4, "HDF5", found, arrays, clock, opener, unused)
+    others = {"layout": 4, "kind": "HDF5", "clock": clock, "unused": unused}
+    return session_of(path, found, arrays, opener=opener, **others)
 
 
 def _dataset(file: h5py.File, path: str) -> Unread | None:
@@ -153,9 +154,7 @@ def _anchors(file: h5py.File) -> dict[str, float]:
     return dict(zip(np.asarray(names).tolist(), values, strict=True))
 
 
-def _telemetry_at_rows(
-    path: Path, file: h5py.File, clock: Clock, raw_s: Float[np.ndarray, " rows"]
-) -> dict[str, Unread]:
+def _telemetry_at_rows(path: Path, file: h5py.File, clock: Clock, raw_s: Rows) -> dict[str, Unread]:
     """Telemetry at the times of the spectra, where both clocks have a reference."""
     anchor = _anchors(file).get("dcb")
     if anchor is None or "telemetry" not in file:
@@ -181,12 +180,7 @@ def _telemetry_at_rows(
     }
 
 
-def _interpolated_to(
-    where: str,
-    raw_s: Float[np.ndarray, " rows"],
-    times_s: Float[np.ndarray, " times"],
-    values: Float[np.ndarray, " times"],
-) -> Float[np.ndarray, " rows"]:
+def _interpolated_to(where: str, raw_s: Rows, times_s: Times, values: Times) -> Rows:
     """Interpolate telemetry linearly to the times of spectra, both of one clock.
 
     Raises

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from astropy.time import Time
 from jaxtyping import Int
 from pydantic import Field
 
@@ -21,13 +20,12 @@ from lusee_bayes.core.reading import naming
 from lusee_bayes.core.section import LARGEST, Angle, Frequency, Positive, Section, requires
 from lusee_bayes.flight.bands import Taper
 from lusee_bayes.flight.clock import Clock, clock_of
-from lusee_bayes.flight.flags import NO_LINES, KnownLines
 from lusee_bayes.flight.gain_model import GainModel
 from lusee_bayes.flight.session import BinOrigin, Session
 from lusee_bayes.instrument.averaging import bins_of
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import CONVENTIONS
-from lusee_bayes.instrument.times import TO_MIDDLE, Timestamp, Windows, later
+from lusee_bayes.instrument.times import TO_MIDDLE, Timestamp, Windows, later, utc_of
 
 Share = Annotated[float, Field(ge=0, le=0.5)]
 Levels = Annotated[str, Field(pattern="^[LMH]{4}$")]
@@ -201,7 +199,8 @@ class Recipe:
         Middles of the bands.
     average_s : float or None
         Length of averages in time; None for spectra as they are.
-    lines : KnownLines
+    lines_mhz : tuple of float
+        Frequencies of known lines.
     clock : Clock or None
         From outside.
     site : (float, float) or None
@@ -213,7 +212,7 @@ class Recipe:
     timestamp: Timestamp
     frequencies_mhz: tuple[float, ...]
     average_s: float | None = None
-    lines: KnownLines = NO_LINES
+    lines_mhz: tuple[float, ...] = ()
     clock: Clock | None = None
     site: tuple[float, float] | None = None
 
@@ -296,16 +295,11 @@ def timeline(sessions: Sequence[Session], recipe: Recipe) -> Timeline:
                 f"({times_b[0].isot[:19]} to {times_b[-1].isot[:19]}) overlap in time; give each "
                 "spectrum once"
             )
-    lon, lat = _site([s for s, _ in found]) if recipe.site is None else recipe.site
     ordered = tuple(s for s, _ in found)
+    lon, lat = _site(ordered) if recipe.site is None else recipe.site
     window = np.concatenate([s.window_s for s in ordered])
     share = np.concatenate([s.share for s in ordered])
-    times = Time(
-        np.concatenate([t.jd1 for _, t in found]),
-        np.concatenate([t.jd2 for _, t in found]),
-        format="jd",
-        scale="utc",
-    )
+    times = utc_of(*(np.concatenate([getattr(t, n) for _, t in found]) for n in ("jd1", "jd2")))
     windows = None
     if recipe.timestamp != "instant":
         times = later(times, TO_MIDDLE[recipe.timestamp] * window)
@@ -340,10 +334,7 @@ def _states(sessions: Sequence[Session]) -> Int[np.ndarray, " rows"]:
     """Numbers that grow wherever session, gains or averaging change."""
     changes = []
     for session in sessions:
-        same = (
-            (np.diff(session.navgf) == 0)
-            & (np.diff(session.navg_shift) == 0)
-            & (session.level[1:] == session.level[:-1]).all(axis=1)
-        )
-        changes.append(np.concatenate([[True], ~same]))
+        # as text, which the levels are
+        state = np.column_stack([session.navgf, session.navg_shift, session.level])
+        changes.append(np.append(True, (state[1:] != state[:-1]).any(axis=1)))
     return np.cumsum(np.concatenate(changes)) - 1

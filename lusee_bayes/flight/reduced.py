@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +16,7 @@ from lusee_bayes.core.checks import Described, counted, require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.reading import naming
 from lusee_bayes.core.trees import from_tree, opened_tree, quantity, write_tree
-from lusee_bayes.flight.gain_model import COUNTS, LETTERS, N_COMPONENTS, Curves
+from lusee_bayes.flight.gain_model import COUNTS, LEAD, LETTERS, N_COMPONENTS, PLACES, Curves
 from lusee_bayes.flight.session import AUTOS, FIRST_PORT, N_PRODUCTS, NO_LEVEL, PORTS, SECOND_PORT
 from lusee_bayes.instrument.averaging import binned
 from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ
@@ -24,6 +24,9 @@ from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import DataLayout, labels, runs_of
 from lusee_bayes.instrument.times import Windows, utc_of
 from lusee_bayes.instrument.visibilities import Calibration, Visibilities
+
+# bins of which something is left
+Left = Int[np.ndarray, " left"]
 
 # why a spectrum is not used in a band; the first is that it is
 REASONS = (
@@ -193,10 +196,7 @@ class Reduced(Described):
             *self.observation.description(),
             *(f"{name}: {text}" for name, text in self.recipe.items()),
             *self.notes(),
-            *(
-                f"{f:g} MHz: {_percent(self.shares(band))}"
-                for band, f in enumerate(self.frequencies_mhz)
-            ),
+            *(f"{mhz:g} MHz: {_percent(self.shares(band))}" for band, mhz in enumerate(f)),
         )
 
     def notes(self) -> tuple[str, ...]:
@@ -227,18 +227,18 @@ class Reduced(Described):
             )
         return nearest
 
-    def bins_at(self, band: int) -> Int[np.ndarray, " left"]:
+    def bins_at(self, band: int) -> Left:
         """Return the bins of which a band has something left: the times of :meth:`at`."""
         return np.flatnonzero(np.isfinite(self.values[band]).any(axis=0))
 
     def shares(self, band: int) -> dict[str, float]:
         """Return the share of the spectra that are used, and that are not for each reason."""
-        counts = np.bincount(self.reason[band], minlength=len(REASONS)) / self.reason.shape[1]
-        return {
-            name: float(share)
-            for k, (name, share) in enumerate(zip(REASONS, counts, strict=True))
-            if share or not k
-        }
+        shares = self._counts(band) / self.reason.shape[1]
+        return {name: float(shares[k]) for k, name in enumerate(REASONS) if shares[k] or not k}
+
+    def _counts(self, band: int | None) -> Int[np.ndarray, " reasons"]:
+        rows = self.reason if band is None else self.reason[band]
+        return np.bincount(rows.ravel(), minlength=len(REASONS))
 
     def flagged(self, band: int | None = None, misfit: float = 0.0) -> dict[str, float]:
         """Return the share that each rule has flagged of the values that there were.
@@ -250,8 +250,7 @@ class Reduced(Described):
         misfit : float
             Share of the values left by the other rules that does not fit the map.
         """
-        rows = self.reason if band is None else self.reason[band]
-        counts = np.bincount(rows.ravel(), minlength=len(REASONS))
+        counts = self._counts(band)
         counts[[USED, NO_DATA]] = counts[USED] + counts[NO_FIT], 0
         shares = counts / max(counts.sum() - counts[NO_FIT], 1)
         shares[NO_FIT] = misfit * shares[USED]
@@ -308,22 +307,17 @@ class Reduced(Described):
         present = np.isfinite(self.values[band])
         bins = self.bins_at(band)
         if not bins.size:
-            counts = ", ".join(
-                f"{name} {int((self.reason[band] == k).sum())}"
-                for k, name in enumerate(REASONS)
-                if k and (self.reason[band] == k).any()
-            )
+            counts = zip(REASONS[1:], self._counts(band)[1:], strict=True)
             raise InputError(
                 f"nothing is left of the spectra at {frequency_mhz:g} MHz: of "
-                f"{self.reason.shape[1]}, {counts}"
+                f"{self.reason.shape[1]}, {', '.join(f'{name} {n}' for name, n in counts if n)}"
             )
-        left = np.flatnonzero((self.reason[band] == USED) & np.isin(self.bin_of, bins))
-        _, bin_of_left = np.unique(self.bin_of[left], return_inverse=True)
+        keep = (self.reason[band] == USED) & np.isin(self.bin_of, bins)
         if self.average_s is None:
-            keep = np.zeros(len(self.bin_of), dtype=bool)
-            keep[left] = True
             observation = self.observation.select(keep)
         else:
+            _, bin_of_left = np.unique(self.bin_of[keep], return_inverse=True)
+            left = np.flatnonzero(keep)
             observation = binned(self.observation, left, bin_of_left, self.average_s)
         scale = np.sqrt(per_kelvin[FIRST_PORT] * per_kelvin[SECOND_PORT])
         values = np.where(present, self.values[band], 0.0)[:, bins] / scale[:, None]
@@ -336,35 +330,24 @@ class Reduced(Described):
             calibration=self._calibration(band, bins),
         )
 
-    def _calibration(self, band: int, bins: Int[np.ndarray, " left"]) -> Calibration:
-        names, ports, slopes = [], [], []
-        lost = float(sum(self.flagged(band).values()))
-        levels = self.level[bins]
-        for level in LETTERS:
-            for port in range(levels.shape[1]):
-                here = levels[:, port] == level
-                for name, slope in self._errors(band, bins, level, port):
-                    if here.any() and np.any(slope[here]):
-                        names.append(name)
-                        ports.append(port)
-                        slopes.append(np.where(here, slope, 0.0))
-        n_averaged = self.n_averaged[band, bins]
-        if not names:
+    def _calibration(self, band: int, bins: Left) -> Calibration:
+        found = {n: x for place in PLACES for n, x in self._errors(band, bins, place) if x.any()}
+        n_averaged, lost = self.n_averaged[band, bins], float(sum(self.flagged(band).values()))
+        if not found:
             return Calibration(n_averaged, lost=lost)
-        return Calibration(n_averaged, tuple(names), np.array(ports), np.array(slopes), lost)
+        ports, slopes = [PLACES[name[:2]][1] for name in found], list(found.values())
+        return Calibration(n_averaged, tuple(found), np.array(ports), np.array(slopes), lost)
 
-    def _errors(
-        self, band: int, bins: Int[np.ndarray, " left"], level: str, port: int
-    ) -> list[tuple[str, Float[np.ndarray, " left"]]]:
-        """What may be off about a level of a port, by one standard deviation."""
-        found = []
+    def _errors(self, band: int, bins: Left, place: str) -> Iterator[tuple[str, np.ndarray]]:
+        """What may be off about a level of a port, by one standard deviation, where it has it."""
+        port = PLACES[place][1]
+        here = self.level[bins, port] == place[0]
         if self.gain_std is not None:
-            found.append((f"{level}{port}", np.full(len(bins), self.gain_std)))
+            yield place, np.where(here, self.gain_std, 0.0)
         if self.component_std is not None:
-            std = self.component_std[LETTERS.index(level), port]
-            slope = self.slope[band, port][:, bins]
-            found += [(f"{level}{port} PC{r + 1}", std[r] * slope[r]) for r in range(len(std))]
-        return found
+            slopes = self.component_std[PLACES[place]][:, None] * self.slope[band, port][:, bins]
+            for number, slope in enumerate(slopes, start=1):
+                yield f"{place} PC{number}", np.where(here, slope, 0.0)
 
     def without(self, band: int, gone: Bool[np.ndarray, "products bins"]) -> Reduced:
         """Return the same without some values of a band, which do not fit the map."""
@@ -373,8 +356,7 @@ class Reduced(Described):
         bins = ~np.isfinite(values[band]).any(axis=0)
         n_averaged[band, bins] = 0.0
         reason[band, bins[self.bin_of] & (reason[band] == USED)] = NO_FIT
-        changed = {"values": values, "n_averaged": n_averaged, "reason": reason}
-        return replace(self, **changed)
+        return replace(self, values=values, n_averaged=n_averaged, reason=reason)
 
 
 def _percent(shares: Mapping[str, float]) -> str:
@@ -459,6 +441,13 @@ class _Saved:
     scenario: str = ""
 
 
+# names in files, and those of the same in Reduced
+NAMES = {"frequency": "frequencies_mhz", "visibility": "values", "gain_slope": "slope"}
+NAMES |= {"line_share": "lines"}
+SAME = ("n_averaged", "level", "gain", "component_std", "gain_std", "curves", "bin_of", "reason")
+NAMES |= {name: name for name in (*SAME, "bandwidth_mhz", "average_s", "sessions", "recipe")}
+
+
 def write_reduced(path: str | Path, reduced: Reduced, scenario: str = "") -> Path:
     """Write reduced spectra, whole or not at all.
 
@@ -470,27 +459,22 @@ def write_reduced(path: str | Path, reduced: Reduced, scenario: str = "") -> Pat
         Text of the scenario that they were reduced with.
     """
     seen, windows = reduced.observation, reduced.observation.windows
-    same = ("n_averaged", "level", "gain", "component_std", "curves", "scatter", "line_scatter")
-    same += ("curvature", "bin_of", "reason", "bandwidth_mhz", "average_s", "gain_std")
     saved = _Saved(
-        frequency=reduced.frequencies_mhz,
         product=np.array(labels()),
-        visibility=reduced.values,
         before_flags=reduced.before.astype(np.float32),
-        gain_slope=reduced.slope,
+        scatter=reduced.scatter,
+        line_scatter=reduced.line_scatter,
+        curvature=reduced.curvature,
         jd1=seen.times.jd1,
         jd2=seen.times.jd2,
         run=np.asarray(seen.run),
         turntable_deg=np.array(seen.turntable_deg),
-        line_share=reduced.lines,
         window_start_s=None if windows is None else windows.start_s,
         window_end_s=None if windows is None else windows.end_s,
         live_s=None if windows is None else windows.live_s,
-        sessions=tuple(dict(one) for one in reduced.sessions),
-        recipe=dict(reduced.recipe),
         scenario=scenario,
         **{name: getattr(seen, name) for name in ("lon_deg", "lat_deg", "step_s")},
-        **{name: getattr(reduced, name) for name in same},
+        **{name: getattr(reduced, ours) for name, ours in NAMES.items()},
     )
     return write_tree(path, saved, formats.REDUCED)
 
@@ -513,9 +497,9 @@ def read_reduced(path: str | Path) -> Reduced:
         raise InputError(f"{path} has other products than {', '.join(labels())}")
     with naming(path):
         require_shape("level", saved.level, (None, PORTS))
-        require_shape("curves", saved.curves.gain, (len(LETTERS), PORTS, None))
+        require_shape("curves", saved.curves.gain, (*LEAD, None))
         if saved.component_std is not None:
-            require_shape("component_std", saved.component_std, (len(LETTERS), PORTS, None))
+            require_shape("component_std", saved.component_std, (*LEAD, None))
         windows = None
         if saved.window_start_s is not None and saved.window_end_s is not None:
             windows = Windows.whole(saved.window_start_s, saved.window_end_s, saved.live_s)
@@ -524,17 +508,11 @@ def read_reduced(path: str | Path) -> Reduced:
         observation = Observation(*place, times, *runs, windows=windows)
     if saved.bin_of.max() >= saved.n_averaged.shape[1]:
         raise InputError(f"{path}: bin_of goes beyond the {saved.n_averaged.shape[1]} bins")
-    same = ("bandwidth_mhz", "bin_of", "average_s", "reason", "n_averaged", "level", "gain")
-    same += ("component_std", "gain_std", "curves", "sessions", "recipe")
     return Reduced(
-        frequencies_mhz=saved.frequency,
         observation=observation,
-        values=saved.visibility,
         before=saved.before_flags.astype(np.float64),
-        slope=saved.gain_slope,
         bend=saved.curvature[:, None, None],
         span_scatter=saved.scatter[:, None],
         slab_scatter=saved.line_scatter[:, None],
-        lines=saved.line_share,
-        **{name: getattr(saved, name) for name in same},
+        **{ours: getattr(saved, name) for name, ours in NAMES.items()},
     )

@@ -16,38 +16,30 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32
 
+from lusee_bayes.core.arrays import RowFlags, Rows
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming
-from lusee_bayes.flight import flags, reduced
+from lusee_bayes.flight import flags, reduced, session
 from lusee_bayes.flight.bands import ChannelBand, shared_noise
 from lusee_bayes.flight.gain_model import NANO2, gain_curves
 from lusee_bayes.flight.recipe import Recipe, Timeline, timeline
-from lusee_bayes.flight.session import (
-    AUTOS,
-    AVERAGING,
-    FIRST_PORT,
-    IMAGINARY,
-    NO_LEVEL,
-    OF_FLIGHT,
-    PORTS,
-    SECOND_PORT,
-    Read,
-    Session,
-    channel_mhz,
-)
 from lusee_bayes.instrument.averaging import by_the_rule
 from lusee_bayes.instrument.times import seconds_from
 
 # spectra that are worked on at once, and at least how many make a piece between two bins
 SLAB, PIECE = 128, 1024
+# of some spectra
+Counts = Float32[np.ndarray, "rows products channels"]
+Strengths = Float[np.ndarray, "rows ports 3"]
+Scatter = Float[np.ndarray, " spans"]
 
 
 def reduce_sessions(
-    sessions: Sequence[Session], recipe: Recipe, stages: Stages | None = None
+    sessions: Sequence[session.Session], recipe: Recipe, stages: Stages | None = None
 ) -> reduced.Reduced:
     """Reduce sessions.
 
@@ -71,8 +63,8 @@ def reduce_sessions(
             f"the spectra are to be averaged over {recipe.average_s:g} s, and last for "
             f"{line.observation.step_s:g} s; use a longer observation.average_s, or none"
         )
-    like = _in_common(line, recipe)
     level = np.concatenate([s.level for s in line.sessions])
+    like = _in_common(line, recipe, level)
     first = np.searchsorted(line.bin_of, np.arange(line.n_bins))
     whole = reduced.Reduced.blank(like, line.observation, line.bin_of, level[first])
     numbers = range(len(recipe.frequencies_mhz))
@@ -110,9 +102,8 @@ def reduce_sessions(
     )
 
 
-def _in_common(line: Timeline, recipe: Recipe) -> dict[str, Any]:
+def _in_common(line: Timeline, recipe: Recipe, level: session.PortLevels) -> dict[str, Any]:
     """What does not depend on the spectra."""
-    levels = np.concatenate([s.level for s in line.sessions])
     telemetry = {
         name: np.concatenate([s.telemetry[name] for s in line.sessions])
         for name in line.sessions[0].telemetry
@@ -123,7 +114,7 @@ def _in_common(line: Timeline, recipe: Recipe) -> dict[str, Any]:
         "average_s": recipe.average_s,
         "component_std": recipe.table.component_std,
         "gain_std": recipe.section.gain_std,
-        "curves": gain_curves(recipe.table, recipe.section.gain_std, levels, telemetry),
+        "curves": gain_curves(recipe.table, recipe.section.gain_std, level, telemetry),
         "sessions": tuple(_said_of(s, recipe) for s in line.sessions),
         "recipe": recipe.words(),
     }
@@ -146,14 +137,14 @@ def _read_ahead(
     ahead: ThreadPoolExecutor, files: ExitStack, line: Timeline, pieces: list[slice]
 ) -> Iterator[np.ndarray]:
     """Counts of every slab of every piece; the next are read meanwhile."""
-    reads: dict[int, Read] = {}
+    reads: dict[int, session.Read] = {}
 
     def counts(rows: slice) -> np.ndarray:
-        session = int(line.session[rows.start])
-        if session not in reads:
-            reads[session] = files.enter_context(line.sessions[session].spectra())
+        number = int(line.session[rows.start])
+        if number not in reads:
+            reads[number] = files.enter_context(line.sessions[number].spectra())
         first = int(line.row[rows.start])
-        return reads[session](first, first + rows.stop - rows.start)
+        return reads[number](first, first + rows.stop - rows.start)
 
     slabs = [
         slice(start, min(start + SLAB, piece.stop))
@@ -161,11 +152,10 @@ def _read_ahead(
         for start in range(piece.start, piece.stop, SLAB)
     ]
     following: Future[np.ndarray] = ahead.submit(counts, slabs[0])
-    for after in [*slabs[1:], None]:
-        read = following.result()
-        if after is not None:
-            following = ahead.submit(counts, after)
+    for rows in slabs[1:]:
+        read, following = following.result(), ahead.submit(counts, rows)
         yield read
+    yield following.result()
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,41 +192,34 @@ class State:
         InputError
             If a band has too few bins.
         """
-        section, averaging = recipe.section, AVERAGING[navgf]
-        middles = channel_mhz(section.bin_origin)
+        section, averaging = recipe.section, session.AVERAGING[navgf]
+        middles = session.channel_mhz(section.bin_origin)
         shared = shared_noise(section.filter_taps, section.filter_window)
         channels = averaging.channels()
-        basis = np.full((PORTS, 3, averaging.n_bins), np.nan)
+        basis = np.full((session.PORTS, 3, averaging.n_bins), np.nan)
         for port, level in enumerate(levels):
-            if level != NO_LEVEL:
+            if level != session.NO_LEVEL:
                 splines = recipe.table.basis(level, port, middles)
                 basis[port] = splines[:, channels].mean(axis=2)
         bands = tuple(
             ChannelBand.of(f, section.bandwidth_mhz, section.degree, averaging, middles, shared)
             for f in recipe.frequencies_mhz
         )
-        known = recipe.lines.bins(averaging, middles)
+        known = flags.line_bins(recipe.lines_mhz, averaging, middles)
         if section.comb == "always":
             known = known | flags.comb_bins(averaging)
         return cls(recipe, navgf, levels, bands, basis, known)
 
-    def strengths(
-        self, telemetry: Mapping[str, Float[np.ndarray, " rows"]], n_rows: int
-    ) -> Float[np.ndarray, "rows ports 3"]:
+    def strengths(self, telemetry: session.Telemetry, n_rows: int) -> Strengths:
         """Return 1, q_1 and q_2 of every port; NaN where it has no level."""
-        found = np.full((n_rows, PORTS, 3), np.nan)
+        found = np.full((n_rows, session.PORTS, 3), np.nan)
         for port, level in enumerate(self.levels):
-            if level != NO_LEVEL:
+            if level != session.NO_LEVEL:
                 found[:, port, 0] = 1.0
                 found[:, port, 1:] = self.recipe.table.strengths(level, port, telemetry)
         return found
 
-    def lines(
-        self,
-        counts: Float32[np.ndarray, "rows products channels"],
-        frames: Float[np.ndarray, " rows"],
-        notched: Bool[np.ndarray, " rows"],
-    ) -> Bool[np.ndarray, "rows bins"]:
+    def lines(self, counts: Counts, frames: Rows, notched: RowFlags) -> flags.Bins:
         """Return the bins with known lines, or of the comb where it is on.
 
         Parameters
@@ -247,12 +230,11 @@ class State:
         notched : (rows,) array of bool
             Where the file says that the notch filter was on.
         """
-        averaging, comb = AVERAGING[self.navgf], notched
+        averaging, comb = session.AVERAGING[self.navgf], notched
         if self.recipe.section.comb == "found":
-            autos = counts[:, :PORTS].astype(np.float64)
-            strength = flags.comb_strength(
-                autos, frames, averaging, channel_mhz(self.recipe.section.bin_origin)
-            )
+            autos = counts[:, : session.PORTS].astype(np.float64)
+            middles = session.channel_mhz(self.recipe.section.bin_origin)
+            strength = flags.comb_strength(autos, frames, averaging, middles)
             comb = comb | (np.abs(strength) > flags.COMB_LIMIT)
         return self.known | (comb[:, None] & flags.comb_bins(averaging))
 
@@ -261,60 +243,58 @@ def _slab(
     line: Timeline, recipe: Recipe, states: dict[Any, State], start: int, counts: np.ndarray
 ) -> Callable[[reduced.Reduced, int, int], None]:
     """What puts the counts of some spectra, from a row on, into a band."""
-    session, first = line.sessions[int(line.session[start])], int(line.row[start])
+    source, first = line.sessions[int(line.session[start])], int(line.row[start])
     here = slice(first, first + len(counts))
-    key = (int(session.navgf[first]), tuple(str(level) for level in session.level[first]))
+    key = (int(source.navgf[first]), tuple(str(level) for level in source.level[first]))
     if key not in states:
         states[key] = State.of(recipe, *key)
     state = states[key]
-    telemetry = {name: values[here] for name, values in session.telemetry.items()}
+    telemetry = {name: values[here] for name, values in source.telemetry.items()}
     notched = np.zeros(len(counts), dtype=bool)
-    if session.notch is not None:
+    if source.notch is not None:
         # the mean of the comb's channels is subtracted, unless bit 4 says that it is not
-        notch = session.notch[here]
+        notch = source.notch[here]
         notched = ((notch & 0b111) > 0) & ((notch & 0b10000) == 0)
-    with naming(session.path):
+    with naming(source.path):
         strengths = state.strengths(telemetry, len(counts))
-    frames = session.frames[here]
+    frames = source.frames[here]
     lines = state.lines(counts, frames, notched)
-    return partial(_calibrate, state, counts, frames, strengths, lines, session.saturated[here])
+    return partial(_calibrate, state, counts, frames, strengths, lines, source.saturated[here])
 
 
 def _calibrate(
     state: State,
-    counts: Float32[np.ndarray, "rows products channels"],
-    frames: Float[np.ndarray, " rows"],
-    strengths: Float[np.ndarray, "rows ports 3"],
-    lines: Bool[np.ndarray, "rows bins"],
-    saturated: Bool[np.ndarray, " rows"],
+    counts: Counts,
+    frames: Rows,
+    strengths: Strengths,
+    lines: flags.Bins,
+    saturated: RowFlags,
     spectra: reduced.Reduced,
     start: int,
     number: int,
 ) -> None:
     """Calibrate, flag and average the channels of a band, into spectra from ``start`` on."""
-    recipe, band, averaging = state.recipe, state.bands[number], AVERAGING[state.navgf]
-    rows = slice(start, start + len(counts))
-    at = slice(band.first, band.last)
+    recipe, band, averaging = state.recipe, state.bands[number], session.AVERAGING[state.navgf]
+    rows, at = slice(start, start + len(counts)), slice(band.first, band.last)
     basis = state.basis[:, :, at]
     gain = np.einsum("rpc,pck->rpk", strengths, basis)
     with np.errstate(invalid="ignore"):
         root = np.sqrt(np.where(gain > 0.0, gain, np.nan))
-    raw = counts[:, OF_FLIGHT, at].astype(np.float64)
-    factor = NANO2 * averaging.divisor / averaging.members
-    channels = raw * factor / (root[:, FIRST_PORT] * root[:, SECOND_PORT])
+    raw = counts[:, session.OF_FLIGHT, at].astype(np.float64)
+    factor = NANO2 * averaging.stride / averaging.members
+    channels = raw * factor / (root[:, session.FIRST_PORT] * root[:, session.SECOND_PORT])
     if recipe.section.sign < 0:
-        channels[:, IMAGINARY] *= -1.0
+        channels[:, session.IMAGINARY] *= -1.0
     finite = np.isfinite(channels)
     present = finite.any(axis=2)
+    there = finite[:, session.AUTOS]
     # where a product is there, all of it has to be
-    whole = (finite | ~present[..., None]).all(axis=1) & present[:, AUTOS].any(axis=1)[:, None]
+    whole = (finite | ~present[..., None]).all(axis=1) & there.any(axis=(1, 2))[:, None]
     good = whole & ~lines[:, at] & ~saturated[:, None]
     # products without an auto of their own do not tell lines
-    there = finite[:, AUTOS]
-    filled = np.where(there, channels[:, AUTOS], 0.0)
-    found, z = flags.line_flags(
-        band, filled, frames, good, flags.threshold(recipe.section.false_alarm, PORTS)
-    )
+    filled = np.where(there, channels[:, session.AUTOS], 0.0)
+    limit = flags.threshold(recipe.section.false_alarm, session.PORTS)
+    found, z = flags.line_flags(band, filled, frames, good, limit)
     kept = good & ~found
     mean_auto = filled.sum(axis=1) / np.maximum(there.sum(axis=1), 1)
     clean = np.where(finite, channels, 0.0)
@@ -329,7 +309,7 @@ def _calibrate(
     spectra.before[number, :, rows] = np.where(present, before, np.nan).T
     spectra.n_averaged[number, rows] = frames / variance
     noise = spectra.noise(number)[:, rows]
-    spectra.bend[number, :, rows] = _over(further[:, AUTOS].T, noise)
+    spectra.bend[number, :, rows] = _over(further[:, session.AUTOS].T, noise)
     spectra.lines[number, rows] = 1.0 - kept.sum(axis=1) / len(band.basis)
     spectra.slab_scatter[number, start // SLAB] = flags.robust_scale(z[:, 0], kept)
     middle = band.basis[:, 0] / len(band.basis)
@@ -347,7 +327,7 @@ def _over(values: Float[np.ndarray, "*n"], noise: Float[np.ndarray, "*n"]) -> np
 
 def _finish(
     spectra: reduced.Reduced, whole: reduced.Reduced, rows: slice, false_alarm: float, number: int
-) -> Float[np.ndarray, " spans"]:
+) -> Scatter:
     """Flag bursts in a band of a piece, and put the means of its bins into the whole.
 
     Returns
@@ -357,8 +337,7 @@ def _finish(
     """
     scatter = _flag_bursts(spectra, false_alarm, number)
     bin_of = whole.bin_of[rows] - whole.bin_of[rows.start]
-    n = int(bin_of[-1]) + 1
-    first = int(whole.bin_of[rows.start])
+    n, first = int(bin_of[-1]) + 1, int(whole.bin_of[rows.start])
     bins = slice(first, first + n)
     live = spectra.observation.live_s
     reason, values = spectra.reason[number], spectra.values[number]
@@ -384,30 +363,23 @@ def _finish(
     return scatter
 
 
-def _flag_bursts(
-    spectra: reduced.Reduced, false_alarm: float, number: int
-) -> Float[np.ndarray, " spans"]:
+def _flag_bursts(spectra: reduced.Reduced, false_alarm: float, number: int) -> Scatter:
     """Flag spectra that do not fit those before and after; the scatter over the noise, by span."""
     times = spectra.observation.times
     seconds = seconds_from(times[0], times)
-    autos, noise = spectra.values[number, AUTOS].T, spectra.noise(number).T
+    autos, noise = spectra.values[number, session.AUTOS].T, spectra.noise(number).T
     # what is absent neither stands out nor tells
     there = np.isfinite(autos)
-    noise = np.where(there & (noise > 0.0), noise, np.inf)
+    autos, noise = np.where(there, autos, 0.0), np.where(there & (noise > 0.0), noise, np.inf)
     reason = spectra.reason[number]
     good = reason == reduced.USED
-    burst, scatter = flags.burst_flags(
-        seconds, np.where(there, autos, 0.0), noise, good, false_alarm
-    )
+    burst, scatter = flags.burst_flags(seconds, autos, noise, good, false_alarm)
     reason[burst] = reduced.BURST
     return scatter
 
 
 def _means(
-    values: Float[np.ndarray, "... rows"],
-    weights: Float[np.ndarray, " rows"],
-    bin_of: Int[np.ndarray, " rows"],
-    n: int,
+    values: Float[np.ndarray, "... rows"], weights: Rows, bin_of: session.RowCounts, n: int
 ) -> Float[np.ndarray, "... bins"]:
     """Weighted means of the finite values of each bin; NaN where it has none."""
     rows = np.moveaxis(values, -1, 0)
@@ -420,27 +392,27 @@ def _means(
         return np.moveaxis(summed / total, 0, -1)
 
 
-def _said_of(session: Session, recipe: Recipe) -> Mapping[str, Any]:
-    clock, whose = recipe.clock or session.clock, "session"
-    if session.clock is None:
+def _said_of(source: session.Session, recipe: Recipe) -> Mapping[str, Any]:
+    clock, whose = recipe.clock or source.clock, "session"
+    if source.clock is None:
         whose = "clock file"
     elif recipe.clock is not None and recipe.clock.stated is not None:
         whose = reduced.CORRECTED
     return {
-        "file": str(session.path),
-        "kind": session.kind,
-        "layout": session.layout,
-        "spectra": session.n_rows,
-        "software": session.software,
-        "navgf": sorted({int(n) for n in session.navgf}),
-        "levels": sorted({"".join(row) for row in session.level}),
-        "window_s": float(session.window_s.max()),
-        "saturated": int(session.saturated.sum()),
-        "errors": int((session.errors != 0).sum()),
+        "file": str(source.path),
+        "kind": source.kind,
+        "layout": source.layout,
+        "spectra": source.n_rows,
+        "software": source.software,
+        "navgf": sorted({int(n) for n in source.navgf}),
+        "levels": sorted({"".join(row) for row in source.level}),
+        "window_s": float(source.window_s.max()),
+        "saturated": int(source.saturated.sum()),
+        "errors": int((source.errors != 0).sum()),
         "clock": whose,
         "clock_file": None if recipe.clock is None else Path(recipe.clock.source).name,
         "scale": None if clock is None else clock.scale,
         "rate": 1.0 if clock is None else clock.rate,
-        "first_s": float(session.raw_s[0]),
-        "last_s": float(session.raw_s[-1]),
+        "first_s": float(source.raw_s[0]),
+        "last_s": float(source.raw_s[-1]),
     }

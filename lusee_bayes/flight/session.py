@@ -11,11 +11,12 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Shaped
 
+from lusee_bayes.core.arrays import Rows
 from lusee_bayes.core.checks import Described, counted
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.layouts import Attribute, Content, Unread, Variable
@@ -23,13 +24,21 @@ from lusee_bayes.core.reading import reading
 from lusee_bayes.flight.clock import Clock
 from lusee_bayes.instrument.products import auto_indices, labels, ports
 
+# what each spectrum has, and each port of it; all channels; telemetry at the times of spectra
+RowCounts = Int[np.ndarray, " rows"]
+PortCounts = Int[np.ndarray, "rows ports"]
+PortLevels = Shaped[np.ndarray, "rows ports"]
+Middles = Float[np.ndarray, " channels"]
+Telemetry = Mapping[str, Rows]
+
 N_CHANNELS = 2048
 CHANNEL_MHZ = 0.025
 FRAME_S = 4096 / 102.4e6
 # the ends of what an ADC of 14 bits gives
 ADC_LOW, ADC_HIGH = -8192, 8191
 # gain states of the flight software (gain_state of core_loop.h) that the gain table knows
-LEVELS = {0: "L", 1: "M", 2: "H"}
+CODES = {"L": 0, "M": 1, "H": 2}
+LETTERS = tuple(CODES)
 NO_LEVEL = "-"
 PORTS = 4
 
@@ -54,16 +63,13 @@ class Averaging:
     Attributes
     ----------
     stride : int
-        Bin i begins at channel stride * i.
+        Bin i begins at channel stride * i; a sum is divided by it.
     members : int
         So many channels from there on are summed.
-    divisor : int
-        What the sum is divided by.
     """
 
     stride: int
     members: int
-    divisor: int
 
     @property
     def n_bins(self) -> int:
@@ -76,15 +82,10 @@ class Averaging:
 
 
 # of Navgf = 3, which leaves out every fourth channel, the sum of three is divided by four
-AVERAGING = {
-    1: Averaging(1, 1, 1),
-    2: Averaging(2, 2, 2),
-    3: Averaging(4, 3, 4),
-    4: Averaging(4, 4, 4),
-}
+AVERAGING = {1: Averaging(1, 1), 2: Averaging(2, 2), 3: Averaging(4, 3), 4: Averaging(4, 4)}
 
 
-def channel_mhz(origin: BinOrigin) -> Float[np.ndarray, " channels"]:
+def channel_mhz(origin: BinOrigin) -> Middles:
     """Return the middle of every channel in MHz.
 
     Parameters
@@ -102,8 +103,52 @@ Read = Callable[[int, int], Float32[np.ndarray, "rows products channels"]]
 Opener = Callable[[], AbstractContextManager[Read]]
 
 
-@dataclass(frozen=True, repr=False, eq=False)
-class Session(Described):
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Recorded:
+    """What a session that is read, and one that is written, say of their spectra.
+
+    Attributes
+    ----------
+    raw_s : (rows,) array
+        The mission clock, in seconds.
+    navgf : (rows,) array of int
+        Averaging over channels (:data:`.AVERAGING`).
+    navg_shift : (rows,) array of int
+        Logarithm of the number of frames that a spectrum averages, to base 2.
+    level : (rows, ports) array of str
+        Of the gain: L, M, H, or "-" where the gain table has none.
+    adc_low, adc_high : (rows, ports) array of int
+        Extremes of the ADC.
+    adc_invalid : (rows, ports) array of int
+        How many of its samples were out of range.
+    telemetry : mapping of str to (rows,) array
+        At the times of the spectra; some of :data:`TELEMETRY`.
+    clock : Clock or None
+        None if the file does not say which UTC the clock stands for.
+    lon_deg, lat_deg : float
+        Of the site, as the file has it.
+    """
+
+    raw_s: Rows
+    navgf: RowCounts
+    navg_shift: RowCounts
+    level: PortLevels
+    adc_low: PortCounts
+    adc_high: PortCounts
+    adc_invalid: PortCounts
+    telemetry: Telemetry
+    clock: Clock | None
+    lon_deg: float
+    lat_deg: float
+
+    @property
+    def n_rows(self) -> int:
+        """Number of spectra."""
+        return len(self.raw_s)
+
+
+@dataclass(frozen=True, repr=False, eq=False, kw_only=True)
+class Session(Described, Recorded):
     """A session; its spectra stay in the file.
 
     Attributes
@@ -113,30 +158,12 @@ class Session(Described):
         Version of luseepy's layout.
     kind : str
         HDF5 or FITS.
-    raw_s : (rows,) array
-        The mission clock, in seconds.
-    navgf : (rows,) array of int
-        Averaging over channels (:data:`.AVERAGING`).
-    navg_shift : (rows,) array of int
-        Logarithm of the number of frames that a spectrum averages, to base 2.
     share : (rows,) array
-        The share of them that was not rejected; 1 where the file does not say.
-    level : (rows, ports) array of str
-        Of the gain: L, M, H, or "-" where the gain table has none.
-    adc_low, adc_high : (rows, ports) array of int
-        Extremes of the ADC.
-    adc_invalid : (rows, ports) array of int
-        How many of its samples were out of range.
+        The share of the frames that was not rejected; 1 where the file does not say.
     errors : (rows,) array of int
         What the flight software says of itself.
     notch : (rows,) array of int or None
         Whether the average of every fourth channel is subtracted; None where the file does not say.
-    telemetry : mapping of str to (rows,) array
-        At the times of the spectra; some of :data:`TELEMETRY`.
-    clock : Clock or None
-        None if the file does not say which UTC the clock stands for.
-    lon_deg, lat_deg : float
-        Of the site, as the file has it.
     software : str
         Version of the flight software, as 0x307.
     opener : callable
@@ -148,20 +175,9 @@ class Session(Described):
     path: Path
     layout: int
     kind: str
-    raw_s: Float[np.ndarray, " rows"]
-    navgf: Int[np.ndarray, " rows"]
-    navg_shift: Int[np.ndarray, " rows"]
-    share: Float[np.ndarray, " rows"]
-    level: Shaped[np.ndarray, "rows ports"]
-    adc_low: Int[np.ndarray, "rows ports"]
-    adc_high: Int[np.ndarray, "rows ports"]
-    adc_invalid: Int[np.ndarray, "rows ports"]
-    errors: Int[np.ndarray, " rows"]
-    notch: Int[np.ndarray, " rows"] | None
-    telemetry: Mapping[str, Float[np.ndarray, " rows"]]
-    clock: Clock | None
-    lon_deg: float
-    lat_deg: float
+    share: Rows
+    errors: RowCounts
+    notch: RowCounts | None
     software: str
     opener: Opener
     unused: Mapping[str, int] = field(default_factory=dict)
@@ -180,17 +196,12 @@ class Session(Described):
                 raise InputError(f"{self.path}: Navgf is {value}; the flight software has {known}")
 
     @property
-    def n_rows(self) -> int:
-        """Number of spectra."""
-        return len(self.raw_s)
-
-    @property
-    def frames(self) -> Float[np.ndarray, " rows"]:
+    def frames(self) -> Rows:
         """How many frames each spectrum averages."""
         return self.share * 2.0**self.navg_shift
 
     @property
-    def window_s(self) -> Float[np.ndarray, " rows"]:
+    def window_s(self) -> Rows:
         """From the beginning to the end of each integration, in seconds."""
         return FRAME_S * 2.0**self.navg_shift
 
@@ -220,10 +231,8 @@ class Session(Described):
             ends = self.clock.utc(self.raw_s[[0, -1]])
             clock = f"{ends[0].isot[:19]} to {ends[1].isot[:19]} UTC, clock in {self.clock.scale}"
         averaged = ", ".join(map(str, np.unique(self.navgf)))
-        window = self.window_s
-        length = f"{window.min():.6g}" + (
-            "" if np.ptp(window) == 0.0 else f" to {window.max():.6g}"
-        )
+        lengths = dict.fromkeys((self.window_s.min(), self.window_s.max()))
+        length = " to ".join(f"{length:.6g}" for length in lengths)
         notch = "not said" if self.notch is None else f"{int((self.notch > 0).sum())} with it"
         lacking = [name for name in TELEMETRY if name not in self.telemetry]
         unused = [f"{name} ({counted(n, 'row')})" for name, n in self.unused.items()]
@@ -280,34 +289,18 @@ SAID = {
 }
 
 
-def session_of(
-    path: Path,
-    version: int,
-    kind: str,
-    found: Content,
-    arrays: Mapping[str, Unread],
-    clock: Clock | None,
-    opener: Opener,
-    unused: Mapping[str, int] | None = None,
-) -> Session:
+def session_of(path: Path, found: Content, arrays: Mapping[str, Unread], **others: Any) -> Session:
     """Make a session of what a file holds.
 
     Parameters
     ----------
     path : Path
-    version : int
-        Of the layout.
-    kind : str
-        HDF5 or FITS.
     found : Content
         Of :data:`ROWS` and :data:`SAID`.
     arrays : mapping of str to array
         All that is there, by names as in :data:`ROWS`, not yet read.
-    clock : Clock or None
-    opener : callable
-        Opens the spectra.
-    unused : mapping of str to int, optional
-        Rows of other families of data.
+    **others
+        Of :class:`Session`, what these do not hold: layout, kind, clock and how it is opened.
 
     Raises
     ------
@@ -329,17 +322,13 @@ def session_of(
     none = np.zeros((n, PORTS), dtype=np.int64)
     said = found.values.get("session_invariants.software_version", "unknown")
     shift2 = rows[f"{META}/Navg2_shift"]
-    share = np.ones(n)
-    if (weight := rows.get(f"{META}/weight")) is not None:
-        share = np.minimum(weight / 2.0**shift2, 1.0)
+    averaged = 2.0**shift2
     return Session(
         path=path,
-        layout=version,
-        kind=kind,
         raw_s=rows["spectra/raw_times"],
         navgf=rows[f"{META}/Navgf"],
         navg_shift=rows[f"{META}/Navg1_shift"] + shift2,
-        share=share,
+        share=np.minimum(rows.get(f"{META}/weight", averaged) / averaged, 1.0),
         level=_levels(path, arrays, n),
         adc_low=rows[f"{META}/adc_min"],
         adc_high=rows[f"{META}/adc_max"],
@@ -347,20 +336,16 @@ def session_of(
         + rows.get(f"{META}/adc_invalid_count_max", none),
         errors=rows.get(f"{META}/errors", none[:, 0]),
         notch=rows.get(f"{META}/notch"),
-        telemetry={
-            name: rows[f"telemetry/{name}"] for name in TELEMETRY if f"telemetry/{name}" in rows
-        },
-        clock=clock,
+        telemetry={x: rows[name] for x in TELEMETRY if (name := f"telemetry/{x}") in rows},
         lon_deg=found.values["constants.lun_long_deg"],
         lat_deg=found.values["constants.lun_lat_deg"],
         # as versions of the flight software are written: 0x307 for the number 775
         software=f"{int(said):#x}" if said.isascii() and said.isdigit() else said,
-        opener=opener,
-        unused=unused or {},
+        **others,
     )
 
 
-def _levels(path: Path, arrays: Mapping[str, Unread], n: int) -> Shaped[np.ndarray, "rows ports"]:
+def _levels(path: Path, arrays: Mapping[str, Unread], n: int) -> PortLevels:
     """Gain levels, of the flight software's numbers or of letters."""
     name = f"{META}/actual_gain"
     if name not in arrays:
@@ -374,14 +359,11 @@ def _levels(path: Path, arrays: Mapping[str, Unread], n: int) -> Shaped[np.ndarr
         codes = np.array([list(row.decode().ljust(PORTS)) for row in codes], dtype="U1")
     if codes.shape != (n, PORTS):
         raise InputError(f"{path}: {name} has shape {codes.shape}, expected ({n}, {PORTS})")
-    levels = np.full((n, PORTS), NO_LEVEL, dtype="U1")
-    if codes.dtype.kind in "iu":
-        for code, level in LEVELS.items():
-            levels[codes == code] = level
-    elif codes.dtype.kind in "SU":
-        letters = codes.astype("U1")
-        known = np.isin(letters, list(LEVELS.values()))
-        levels[known] = letters[known]
-    else:
+    if codes.dtype.kind not in "iuSU":
         raise InputError(f"{path}: {name} holds {codes.dtype}, expected gain codes or letters")
+    in_letters = codes.dtype.kind in "SU"
+    codes = codes.astype("U1") if in_letters else codes
+    levels = np.full((n, PORTS), NO_LEVEL, dtype="U1")
+    for level, code in CODES.items():
+        levels[codes == (level if in_letters else code)] = level
     return levels

@@ -16,17 +16,19 @@ from typing import Any
 import h5py
 import numpy as np
 from astropy.io import fits
-from jaxtyping import Float, Float32, Int, Shaped
+from jaxtyping import Float, Float32, Int
 
+from lusee_bayes.core.arrays import Rows
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing, user_path
 from lusee_bayes.core.formats import is_fits, opened, require_readable_hdf5
 from lusee_bayes.core.reading import reading, require_file
-from lusee_bayes.flight.clock import DAY_S, MJD_ZERO, Clock
+from lusee_bayes.flight.clock import DAY_S, MJD_ZERO
 from lusee_bayes.flight.layout_3 import INTERPOLATED, UNKNOWN, session_of_fits, session_of_hdf5
 from lusee_bayes.flight.layout_4 import session_of_4
-from lusee_bayes.flight.session import LEVELS, META, N_CHANNELS, N_PRODUCTS, PORTS, Read, Session
+from lusee_bayes.flight.session import CODES, META, N_CHANNELS, N_PRODUCTS, Read, Recorded, Session
 
+Counts = Float32[np.ndarray, "_ products _"]
 HDF5, FITS = (f"a session of lusee.ingest in {kind}" for kind in ("HDF5", "FITS"))
 NEWEST = 4
 
@@ -128,8 +130,8 @@ def guessed_chunks(n_rows: int) -> tuple[int, ...]:
 
 
 def whole_spectra(
-    path: Path, blocks: Iterable[Float32[np.ndarray, "_ products _"]], n_rows: int
-) -> Iterator[tuple[int, Float32[np.ndarray, "_ products channels"]]]:
+    path: Path, blocks: Iterable[Counts], n_rows: int
+) -> Iterator[tuple[int, Counts]]:
     """Yield the first row and the counts of every block, with all 2048 channels.
 
     Raises
@@ -155,59 +157,26 @@ def whole_spectra(
 
 # of the frames, so many are averaged by the hardware, as a power of two; software does the rest
 NAVG1_SHIFT = 14
-CODES = {level: code for code, level in LEVELS.items()}
 # the offset between two samples of an ADC that have no signal
 ADC_MEAN = 0.3
 
 
-@dataclass(frozen=True, eq=False)
-class SessionRows:
-    """A session without its spectra.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SessionRows(Recorded):
+    """A session without its spectra; all its gains are in the gain table.
 
     Attributes
     ----------
-    raw_s : (rows,) array
-        The mission clock, in seconds.
-    navgf : (rows,) array of int
-        Averaging over channels (:data:`.AVERAGING`).
-    navg_shift : (rows,) array of int
-        Logarithm of the number of frames that a spectrum averages, to base 2.
-    level : (rows, ports) array of str
-        Of the gain: L, M, H.
     bitslice : (rows, 16) array of int
         Counts are multiples of 2^(bitslice - 31).
-    adc_low, adc_high, adc_invalid : (rows, ports) array of int
-        Extremes of the ADC, and how many of its samples were out of range.
     adc_rms : (rows, ports) array
-    telemetry : mapping of str to (rows,) array
-        At the times of the spectra.
-    clock : Clock or None
-        None for a file that is not to say which UTC the clock stands for.
-    lon_deg, lat_deg : float
-        Of the site.
     software : int
         Version of the flight software.
     """
 
-    raw_s: Float[np.ndarray, " rows"]
-    navgf: Int[np.ndarray, " rows"]
-    navg_shift: Int[np.ndarray, " rows"]
-    level: Shaped[np.ndarray, "rows ports"]
     bitslice: Int[np.ndarray, "rows products"]
-    adc_low: Int[np.ndarray, "rows ports"]
-    adc_high: Int[np.ndarray, "rows ports"]
-    adc_invalid: Int[np.ndarray, "rows ports"]
     adc_rms: Float[np.ndarray, "rows ports"]
-    telemetry: Mapping[str, Float[np.ndarray, " rows"]]
-    clock: Clock | None
-    lon_deg: float
-    lat_deg: float
     software: int
-
-    @property
-    def n_rows(self) -> int:
-        """Number of spectra."""
-        return len(self.raw_s)
 
     def metadata(self) -> dict[str, np.ndarray]:
         """Return the fields of every spectrum, by the names of layout 3."""
@@ -226,7 +195,7 @@ class SessionRows:
             "gain": gain,
             "adc_min": self.adc_low,
             "adc_max": self.adc_high,
-            "adc_mean": np.full((self.n_rows, PORTS), ADC_MEAN),
+            "adc_mean": np.full_like(self.adc_rms, ADC_MEAN),
             "adc_rms": self.adc_rms,
             "adc_invalid_count_min": self.adc_invalid,
             "adc_invalid_count_max": np.zeros_like(self.adc_invalid),
@@ -246,18 +215,14 @@ class SessionRows:
         mjd = (self.clock.jd1 - MJD_ZERO) + self.clock.jd2
         return self.clock.raw_s, mjd, self.clock.scale, "mission_counter"
 
-    def mjd(self) -> Float[np.ndarray, " rows"]:
+    def mjd(self) -> Rows:
         """Return the column of MJD that luseepy computes of the clock."""
         raw_s, mjd, _, _ = self.clock_words()
         return (self.raw_s - raw_s) / DAY_S + mjd
 
 
 def write_session(
-    path: str | Path,
-    rows: SessionRows,
-    blocks: Iterable[Float32[np.ndarray, "_ products _"]],
-    *,
-    kind: str = "hdf5",
+    path: str | Path, rows: SessionRows, blocks: Iterable[Counts], *, kind: str = "hdf5"
 ) -> Path:
     """Write a session whole or not at all.
 
@@ -291,9 +256,7 @@ RECORD = 2880
 FORMATS = {"i": "K", "f": "D"}
 
 
-def _write_session_fits(
-    path: Path, rows: SessionRows, blocks: Iterable[Float32[np.ndarray, "_ products _"]]
-) -> None:
+def _write_session_fits(path: Path, rows: SessionRows, blocks: Iterable[Counts]) -> None:
     _fits_header(rows).writeto(path)
     with path.open("ab") as file:
         file.write(_cube_header(rows.n_rows).tostring().encode("ascii"))
@@ -357,9 +320,7 @@ CUBE = {
 }
 
 
-def _write_session_hdf5(
-    path: Path, rows: SessionRows, blocks: Iterable[Float32[np.ndarray, "_ products _"]]
-) -> None:
+def _write_session_hdf5(path: Path, rows: SessionRows, blocks: Iterable[Counts]) -> None:
     chunks = guessed_chunks(rows.n_rows)
     with h5py.File(path, "w", **cache_for(chunks)) as file:
         _write_all_but_spectra(file, rows)
@@ -380,17 +341,13 @@ def _write_all_but_spectra(file: h5py.File, rows: SessionRows) -> None:
     constants.update(time_scale=scale, clock_source=source)
     if rows.clock is not None:
         constants["clock_epoch_isot"] = rows.clock.isot
-    spectra = file.create_group("spectra")
-    spectra.attrs["count"] = np.int64(rows.n_rows)
-    number = np.arange(rows.n_rows)
-    times = {"mjd_times": rows.mjd(), "raw_times": rows.raw_s}
-    for name, values in {"unique_ids": number, "original_indices": number, **times}.items():
-        spectra.create_dataset(name, data=values, **PACKED)
-    metadata = file.create_group(META)
-    for name, values in rows.metadata().items():
-        metadata.create_dataset(name, data=values, **PACKED)
-    metadata["actual_bitslice"].attrs["applied_to_spectra"] = np.int64(1)
-    metadata["actual_bitslice"].attrs["reference_bit"] = np.int64(31)
-    telemetry = file.create_group(INTERPOLATED)
-    for name, values in {"time": rows.raw_s, "mjd_time": rows.mjd(), **rows.telemetry}.items():
-        telemetry.create_dataset(name, data=values, **PACKED)
+    number, raw_s, mjd = np.arange(rows.n_rows), rows.raw_s, rows.mjd()
+    times = {"unique_ids": number, "original_indices": number, "mjd_times": mjd, "raw_times": raw_s}
+    telemetry = {"time": raw_s, "mjd_time": mjd, **rows.telemetry}
+    groups = {"spectra": times, META: rows.metadata(), INTERPOLATED: telemetry}
+    for group, arrays in groups.items():
+        for name, values in arrays.items():
+            file.create_dataset(f"{group}/{name}", data=values, **PACKED)
+    file["spectra"].attrs["count"] = np.int64(rows.n_rows)
+    bitslice = {"applied_to_spectra": np.int64(1), "reference_bit": np.int64(31)}
+    file[f"{META}/actual_bitslice"].attrs.update(bitslice)

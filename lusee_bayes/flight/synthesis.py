@@ -9,7 +9,6 @@ constant; a single known frequency makes power laws of index -2.5.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -17,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Float32, Int, Shaped
 from scipy.interpolate import CubicSpline
 
+from lusee_bayes.core.arrays import RowFlags
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.flight import session
@@ -25,6 +25,10 @@ from lusee_bayes.flight.gain_model import LETTERS, NANO2, GainModel
 from lusee_bayes.flight.recipe import FlightSimulatedSection
 from lusee_bayes.instrument.products import to_matrix, to_real
 
+# spectra; counts before they are rounded; of the voltages of antennas
+AllChannels = Float[np.ndarray, "products rows channels"]
+Counts = Float[np.ndarray, "rows products bins"]
+Covariances = Complex[np.ndarray, "antennas antennas rows channels"]
 INDEX = -2.5
 # below this share of the lowest known frequency spectra are held: what would rise further there
 # would be rounded coarsely elsewhere
@@ -54,7 +58,7 @@ class ChannelSpectra:
 
     @classmethod
     def of(
-        cls, nodes_mhz: Float[np.ndarray, " nodes"], channels_mhz: Float[np.ndarray, " channels"]
+        cls, nodes_mhz: Float[np.ndarray, " nodes"], channels_mhz: session.Middles
     ) -> ChannelSpectra:
         """Prepare the interpolation.
 
@@ -77,9 +81,7 @@ class ChannelSpectra:
         autos = values + (at - held)[:, None] * spline(inside, 1)
         return cls(autos, np.zeros(len(at)), values)
 
-    def __call__(
-        self, known: Float[np.ndarray, "nodes products rows"]
-    ) -> Float[np.ndarray, "products rows channels"]:
+    def __call__(self, known: Float[np.ndarray, "nodes products rows"]) -> AllChannels:
         """Return visibilities in all channels.
 
         Parameters
@@ -105,9 +107,8 @@ class ChannelSpectra:
             ) from error
         low = _at_channels(self.correlations, factors)
         ports = np.arange(len(session.AUTOS))
-        low[ports, ports] = np.exp(
-            _at_channels(self.correlations, np.log(factors[..., ports, ports].real))
-        )
+        diagonal = np.log(factors[..., ports, ports].real)
+        low[ports, ports] = np.exp(_at_channels(self.correlations, diagonal))
         # rows of length one make correlation coefficients
         logs = _at_channels(self.autos, np.log(np.moveaxis(autos, 1, -1)))
         length = np.sqrt((np.abs(low) ** 2).sum(axis=1))
@@ -165,11 +166,7 @@ class Counting:
             found.append(self.table.basis(level, port, inside))
         return np.array(found)
 
-    def __call__(
-        self,
-        spectra: Float[np.ndarray, "products rows channels"],
-        telemetry: Mapping[str, Float[np.ndarray, " rows"]],
-    ) -> Float[np.ndarray, "rows products bins"]:
+    def __call__(self, spectra: AllChannels, telemetry: session.Telemetry) -> Counts:
         """Return counts before they are rounded.
 
         Parameters
@@ -194,12 +191,12 @@ class Counting:
         found = np.empty((spectra.shape[1], len(spectra), averaging.n_bins))
         for k, product in enumerate(spectra):
             counts = product * (root[session.FIRST_PORT[k]] * root[session.SECOND_PORT[k]]) / NANO2
-            counts = counts[:, members].sum(axis=2) / averaging.divisor
+            counts = counts[:, members].sum(axis=2) / averaging.stride
             found[:, session.OF_FLIGHT[k]] = counts * (self.sign if session.IMAGINARY[k] else 1)
         return found
 
 
-def bit_slices(counts: Float[np.ndarray, "rows products bins"]) -> Int[np.ndarray, " products"]:
+def bit_slices(counts: Counts) -> Int[np.ndarray, " products"]:
     """Return the slices for spectra like the first of some.
 
     Parameters
@@ -215,7 +212,7 @@ def bit_slices(counts: Float[np.ndarray, "rows products bins"]) -> Int[np.ndarra
 
 
 def rounded(
-    counts: Float[np.ndarray, "rows products bins"], bitslice: Int[np.ndarray, "rows products"]
+    counts: Counts, bitslice: Int[np.ndarray, "rows products"]
 ) -> Float32[np.ndarray, "rows products bins"]:
     """Return multiples of 2^(slice - 31).
 
@@ -259,11 +256,11 @@ class Disturbances:
     section: FlightSimulatedSection
     level: Shaped[np.ndarray, "rows ports"]
     absent: Bool[np.ndarray, "rows products"]
-    saturated: Bool[np.ndarray, " rows"]
-    tone: Bool[np.ndarray, " rows"]
+    saturated: RowFlags
+    tone: RowFlags
     tone_channel: Bool[np.ndarray, " channels"]
-    comb: Bool[np.ndarray, " rows"]
-    burst: Bool[np.ndarray, " rows"]
+    comb: RowFlags
+    burst: RowFlags
     phase: Float[np.ndarray, "rows ports"]
 
     @classmethod
@@ -303,9 +300,8 @@ class Disturbances:
             absent[row, generator.integers(len(session.FLIGHT_PRODUCTS))] = True
         saturated = _drawn_stretches(generator, n, section.saturated_share, 1)
         tones = _tone_channels(section.tones_mhz, section.navgf, origin)
-        tone = _drawn_stretches(
-            generator, n, section.tone_share if section.tones_mhz else 0.0, STRETCH
-        )
+        tone_share = section.tone_share if section.tones_mhz else 0.0
+        tone = _drawn_stretches(generator, n, tone_share, STRETCH)
         comb = _drawn_stretches(generator, n, section.comb_share, STRETCH)
         burst, phase = np.zeros(n, dtype=bool), np.zeros((n, session.PORTS))
         at = 0.0
@@ -321,9 +317,7 @@ class Disturbances:
             phase[here] = generator.uniform(0.0, 2.0 * np.pi, session.PORTS)
         return cls(section, level, absent, saturated, tone, tones, comb, burst, phase)
 
-    def add(
-        self, t: Complex[np.ndarray, "antennas antennas rows channels"], rows: slice, frames: float
-    ) -> None:
+    def add(self, t: Covariances, rows: slice, frames: float) -> None:
         """Add tones, comb and bursts to the covariance of the voltages of some spectra, in place.
 
         Parameters
@@ -355,10 +349,8 @@ def _tone_channels(
     tones_mhz: tuple[float, ...], navgf: int, origin: session.BinOrigin
 ) -> Bool[np.ndarray, " channels"]:
     """The channels nearest to the tones. InputError if the averaging leaves one of them out."""
-    mhz, tones, kept = (
-        session.channel_mhz(origin),
-        *(np.zeros(session.N_CHANNELS, dtype=bool) for _ in range(2)),
-    )
+    mhz = session.channel_mhz(origin)
+    tones, kept = np.zeros((2, session.N_CHANNELS), dtype=bool)
     kept[session.AVERAGING[navgf].channels()] = True
     for tone_mhz in tones_mhz:
         far = np.abs(mhz - tone_mhz)
@@ -374,9 +366,7 @@ def _tone_channels(
     return tones
 
 
-def _drawn_stretches(
-    generator: np.random.Generator, n: int, share: float, length: int
-) -> Bool[np.ndarray, " rows"]:
+def _drawn_stretches(generator: np.random.Generator, n: int, share: float, length: int) -> RowFlags:
     """About this share of the spectra, in stretches."""
     found = np.zeros(n, dtype=bool)
     if share == 0.0:

@@ -6,11 +6,10 @@ import pytest
 from lusee_bayes.flight.bands import FRAME, ChannelBand, impulse_response, shared_noise
 from lusee_bayes.flight.flags import (
     COMB_LIMIT,
-    NO_LINES,
-    KnownLines,
     burst_flags,
     comb_bins,
     comb_strength,
+    line_bins,
     line_flags,
     read_lines,
     threshold,
@@ -102,14 +101,14 @@ def test_a_notch_is_a_comb_below_and_a_strong_line_is_none():
 
 
 def test_known_lines_take_the_channels_about_them(tmp_path):
-    lines = KnownLines(np.array([20.8875]), ("rover",))
+    lines = (20.8875,)
     # half-way between channels 835 and 836
-    assert np.flatnonzero(lines.bins(AVERAGING[1], MHZ)).tolist() == [834, 835, 836, 837]
-    assert np.flatnonzero(lines.bins(AVERAGING[4], MHZ)).tolist() == [208, 209]
-    assert not NO_LINES.bins(AVERAGING[1], MHZ).any()
+    assert np.flatnonzero(line_bins(lines, AVERAGING[1], MHZ)).tolist() == [834, 835, 836, 837]
+    assert np.flatnonzero(line_bins(lines, AVERAGING[4], MHZ)).tolist() == [208, 209]
+    assert not line_bins((), AVERAGING[1], MHZ).any()
     path = tmp_path / "lines.csv"
     path.write_text("frequency_mhz,source\n20.8875,rover\n")
-    np.testing.assert_array_equal(read_lines(path).frequency_mhz, [20.8875])
+    assert read_lines(path) == lines
     path.write_text("frequency,source\n20.8875,rover\n")
     assert_refused(lambda: read_lines(path))
 

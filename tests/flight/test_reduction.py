@@ -8,7 +8,6 @@ from assertions import refuse
 from naive_flight import FLIGHT_ORDER, naive_band
 
 from lusee_bayes.flight import reduction
-from lusee_bayes.flight.flags import NO_LINES, KnownLines
 from lusee_bayes.flight.gain_model import read_gain_table
 from lusee_bayes.flight.recipe import FlightSection, Recipe
 from lusee_bayes.flight.reduced import (
@@ -50,7 +49,7 @@ def sessions(flight, names="abcd"):
     return [read_session(flight / f"session_{name}.h5") for name in names]
 
 
-def recipe(table, timestamp="instant", average_s=None, lines=NO_LINES, **section):
+def recipe(table, timestamp="instant", average_s=None, lines=(), **section):
     section = FlightSection(bin_origin="centre", **section)
     return Recipe(section, table, timestamp, F, average_s, lines)
 
@@ -118,9 +117,8 @@ def test_the_notch_and_the_comb_take_whole_spectra_where_they_are_known(flight, 
 
 
 def test_known_lines_are_left_out(flight, table):
-    lines = KnownLines(np.array([10.0]), ("made up",))
     clean = reduce_sessions(sessions(flight, "a"), recipe(table))
-    found = reduce_sessions(sessions(flight, "a"), recipe(table, lines=lines))
+    found = reduce_sessions(sessions(flight, "a"), recipe(table, lines=(10.0,)))
     np.testing.assert_allclose(found.lines[0], 3.0 / 41.0, rtol=1e-6)
     assert not found.lines[1].any()
     assert (found.n_averaged[0] < clean.n_averaged[0]).all()
