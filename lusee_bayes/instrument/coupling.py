@@ -36,14 +36,7 @@ from jaxtyping import Float, Int
 from lusee_bayes.core.arrays import Array, DataVector, Modes, compiled, namespace
 from lusee_bayes.core.checks import Described, require_array, require_float64, require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import (
-    lmax_of,
-    mode_numbers,
-    n_modes,
-    tilts,
-    turn_about,
-    turn_about_z,
-)
+from lusee_bayes.core.harmonics import lmax_of, mode_numbers, tilts, turn_about, turn_about_z
 from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.beams.monopoles import Monopoles, monopole_beams, parameter, with_values
 from lusee_bayes.instrument.observation import Observation
@@ -341,7 +334,7 @@ class CouplingMatrix(Coupling):
         InputError
             If beams, pointing and layout differ in lmax, products or times.
         """
-        size = n_modes(len(pointing.pole_from_galactic.blocks) - 1)
+        size = len(pointing.pole_from_galactic.blocks) ** 2
         require_shape("the beam coefficients", beams.modes, (beams.n_products, size))
         if layout is None:
             layout = DataLayout(beams.n_products, pointing.n_times)
@@ -354,7 +347,7 @@ class CouplingMatrix(Coupling):
 
     @classmethod
     def of_modes(
-        cls, modes: Float[Array, "beams modes"], pointing: Pointing, layout: DataLayout
+        cls, modes: ProductModes, pointing: Pointing, layout: DataLayout
     ) -> CouplingMatrix:
         """Build A of any number of beams from their coefficients; nothing is checked.
 
@@ -417,8 +410,7 @@ class CouplingMatrix(Coupling):
     def plus(self, amplitude, direction):
         _require_bare(direction)
         if not isinstance(direction, CouplingMatrix):
-            dense = DenseCoupling(self._matrix(), response=self.response)
-            return dense.plus(amplitude, direction)
+            return DenseCoupling(self._matrix(), response=self.response).plus(amplitude, direction)
         self.layout.require_same(direction.layout)
         return replace(
             self,
@@ -470,8 +462,7 @@ class CouplingMatrix(Coupling):
         (n, features) array
             cos m phi(t) and sin m phi(t) times every u_j(t).
         """
-        angle = self.pointing.azimuth[times, None] * np.arange(self.lmax + 1.0)
-        waves = np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
+        waves = np.concatenate(_phases(self.pointing.azimuth[times], self.lmax), axis=1)
         return (self.pointing.functions[times][:, :, None] * waves[:, None]).reshape(len(times), -1)
 
     @compiled
@@ -489,7 +480,7 @@ class CouplingMatrix(Coupling):
         zero_order = np.arange(self.lmax + 1)[None] == 0
         crossed = xp.concatenate([minus, -xp.where(zero_order, 0.0, plus)])
         both = xp.stack([pairs.T, crossed.T], axis=-1)
-        cosine, sine = _phases(self.pointing, self.lmax)
+        cosine, sine = _phases(self.pointing.azimuth, self.lmax)
         functions = self.pointing.functions
         grids = []
         for run, span in self.pointing.runs():
@@ -504,7 +495,7 @@ class CouplingMatrix(Coupling):
         """The transpose of :func:`_forward`, step by step."""
         n = self.lmax + 1
         grid = self.layout.scatter(data)
-        cosine, sine = _phases(self.pointing, self.lmax)
+        cosine, sine = _phases(self.pointing.azimuth, self.lmax)
         functions = self.pointing.functions
         both = 0.0
         for run, span in self.pointing.runs():
@@ -544,19 +535,17 @@ def turned_about_pole(beams: TimeModes, azimuth: Float[Array, " times"]) -> Time
     (products, times, modes) array
         Coefficients in the mean-pole frame.
     """
-    _, m = mode_numbers(lmax_of(beams.shape[-1]))
+    lmax = lmax_of(beams.shape[-1])
+    _, m = mode_numbers(lmax)
     mirrored = beams[..., np.arange(len(m)) - 2 * m]
-    xp = namespace(beams, azimuth)
-    angle = azimuth[:, None] * np.arange(0.0, m.max() + 1.0)[None]
-    cosine, sine = xp.cos(angle), xp.sin(angle)
+    cosine, sine = _phases(azimuth, lmax)
     signed = sine[:, np.abs(m)] * np.sign(m).astype(np.float64)[None]
     return beams * cosine[None, :, np.abs(m)] - mirrored * signed[None]
 
 
-def _phases(pointing: Pointing, lmax: int) -> tuple[Array, Array]:
+def _phases(azimuth: Float[Array, " times"], lmax: int) -> tuple[Array, Array]:
     """cos m phi(t) and sin m phi(t), each (times, orders)."""
-    xp = namespace(pointing.azimuth)
-    angle = pointing.azimuth[:, None] * np.arange(lmax + 1.0)[None]
+    xp, angle = namespace(azimuth), azimuth[:, None] * np.arange(lmax + 1.0)[None]
     return xp.cos(angle), xp.sin(angle)
 
 
@@ -603,12 +592,11 @@ def rotations_of(pointing: Pointing) -> Rotations:
         For every ell up to the lmax of ``pointing``: topocentric orders first, Galactic orders
         last.
     """
-    lmax = len(pointing.pole_from_galactic.blocks) - 1
-    size = n_modes(lmax)
-    blocks: list[list[Array]] = [[] for _ in range(lmax + 1)]
-    for start in range(0, size, CHUNK):
-        rows = _turned(jnp.eye(CHUNK, size, start), pointing)
-        for ell in range(lmax + 1):
+    n_ells = len(pointing.pole_from_galactic.blocks)
+    blocks: list[list[Array]] = [[] for _ in range(n_ells)]
+    for start in range(0, n_ells**2, CHUNK):
+        rows = _turned(jnp.eye(CHUNK, n_ells**2, start), pointing)
+        for ell in range(n_ells):
             first, end = max(start, ell**2), min(start + CHUNK, (ell + 1) ** 2)
             if first < end:
                 inside = rows[first - start : end - start, :, ell**2 : (ell + 1) ** 2]

@@ -23,6 +23,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -32,7 +33,7 @@ from scipy.spatial.transform import Rotation as SpatialRotation
 from lusee_bayes.core.arrays import Array, Times, namespace
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import Rotation
-from lusee_bayes.instrument.averaging import sufficient_nodes, windowed
+from lusee_bayes.instrument.averaging import sufficient_nodes, terms_of_exponential, windowed
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.schedule import CYCLE_DAYS
 from lusee_bayes.instrument.times import Windows, later
@@ -86,11 +87,7 @@ class Pointing(eqx.Module):
 
     @classmethod
     def of(
-        cls,
-        observation: Observation,
-        lmax: int,
-        order: int | None = None,
-        pole_frame: Float[np.ndarray, "3 3"] | None = None,
+        cls, observation: Observation, lmax: int, order: int | None = None, pole_frame: Any = None
     ) -> Pointing:
         """Return the pointing of every sample of an observation.
 
@@ -215,11 +212,7 @@ def sufficient_order(tilt: Tilts, lmax: int) -> int:
     This is the lowest n >= LEAST_ORDER with ``(lmax |tilt|)^(n+1) / (n+1)! < TILT_TOLERANCE``.
     """
     size = lmax * float(np.hypot(tilt[:, 0], tilt[:, 1]).max())
-    order, neglected = 0, size
-    while neglected > TILT_TOLERANCE:
-        order += 1
-        neglected *= size / (order + 1)
-    return max(order, LEAST_ORDER)
+    return max(terms_of_exponential(size, TILT_TOLERANCE) - 1, LEAST_ORDER)
 
 
 # of every offset, what it is

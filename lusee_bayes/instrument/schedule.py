@@ -98,20 +98,16 @@ class Interval:
     @cached_property
     def start_time(self) -> Time:
         """The start, in UTC."""
-        return self._date("start", self.start)
+        return times.utc_from_text("start", self.start)
 
     @cached_property
     def length_s(self) -> float:
         """Length in seconds, the time without integration among them."""
-        return float(times.seconds_from(self.start_time, self._date("end", self.end)))
+        return float(times.seconds_from(self.start_time, times.utc_from_text("end", self.end)))
 
     def n_samples(self, step_s: float) -> int:
         """Count the samples of a step, by day and night; the last one may be shorter."""
         return max(1, int(np.ceil((self.length_s - times.ROUNDING_S) / step_s)))
-
-    def _date(self, name: str, text: str) -> Time:
-        # astropy knows no Z, which ISO has for UTC
-        return times.utc_from_text(name, text.removesuffix("Z"))
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import lru_cache
 from typing import Any, Literal
 
 import astropy.units as u
@@ -38,6 +37,7 @@ from lusee_bayes.core.reading import naming
 
 Numbers, Nodes = Int[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]
 EPHEMERIS_YEARS = (1900, 2050)
+EPHEMERIS_JD = [float(Time(f"{year}-01-01", scale="tdb").jd) for year in EPHEMERIS_YEARS]
 # scales of time that files may state
 SCALES = ("utc", "tai", "tt", "tdb")
 # what a file of Julian dates in two parts, jd1 and jd2, may state of them
@@ -74,7 +74,8 @@ def utc_from_text(name: str, text: str) -> Time:
     """
     try:
         with unannounced_leap_seconds():
-            time = Time(text, scale="utc")
+            # astropy knows no Z, which ISO has for UTC
+            time = Time(text.removesuffix("Z"), scale="utc")
     except (ValueError, TypeError) as error:
         raise InputError(
             f"{name} '{text}' is not a date; write it as 2027-01-15T00:00:00"
@@ -91,7 +92,7 @@ def require_ephemeris(jd: Times) -> None:
     InputError
         If one does not.
     """
-    first, last = _ephemeris_jd()
+    first, last = EPHEMERIS_JD
     outside = ~((jd >= first) & (jd <= last))
     if not outside.any():
         return
@@ -104,11 +105,6 @@ def require_ephemeris(jd: Times) -> None:
         f"sample times run outside the ephemeris ({EPHEMERIS_YEARS[0]}-{EPHEMERIS_YEARS[1]}): "
         f"{date}; give a start inside it"
     )
-
-
-@lru_cache(maxsize=1)
-def _ephemeris_jd() -> tuple[float, ...]:
-    return tuple(float(Time(f"{year}-01-01", scale="tdb").jd) for year in EPHEMERIS_YEARS)
 
 
 def utc_of(jd1: Times, jd2: Times, scale: str = "utc") -> Time:
@@ -390,6 +386,8 @@ Timestamp = Literal["start", "middle", "end", "instant"]
 TO_MIDDLE = {"start": 0.5, "middle": 0.0, "end": -0.5}
 # overlaps up to these are rounding of times: in seconds, and as a share of the step
 ROUNDED_S, ROUNDED_SHARE = 1e-3, 1e-4
+# middles, step and windows of samples
+Windowed = tuple[Time, float, Windows | None]
 
 
 def windows_of(
@@ -398,7 +396,7 @@ def windows_of(
     step_s: float | None = None,
     live_s: Times | None = None,
     bounds: Any = None,
-) -> tuple[Time, float, Windows | None]:
+) -> Windowed:
     """Return the middles, the step and the windows of samples.
 
     Parameters
@@ -445,9 +443,7 @@ def windows_of(
     return _windowed(times, start, end, step_s, live_s)
 
 
-def _bounded(
-    times: Time, bounds: Time, step_s: float | None, live_s: Times | None
-) -> tuple[Time, float, Windows]:
+def _bounded(times: Time, bounds: Time, step_s: float | None, live_s: Times | None) -> Windowed:
     start, end = (seconds_from(times, bounds[:, k]) for k in (0, 1))
     length = end - start
     step = step_of(times, float(length[0]) if step_s is None and len(times) == 1 else step_s)
@@ -494,7 +490,7 @@ def _rounding(step_s: float) -> float:
 
 def _windowed(
     times: Time, start_s: Times, end_s: Times, step_s: float, live_s: Times | None
-) -> tuple[Time, float, Windows]:
+) -> Windowed:
     """Middles of windows of one piece each, and these, with overlaps by rounding cut off."""
     middles, half = later(times, (start_s + end_s) / 2.0), (end_s - start_s) / 2.0
     overlap = end_s[:-1] - start_s[1:] - np.diff(seconds_from(times[0], times))

@@ -184,6 +184,7 @@ VACUUM_OHM = physical_constants["characteristic impedance of vacuum"][0]
 LENGTHS = ("H_theta", "H_phi")
 MATRICES = ("ZA", "Rsky", "Rmoon", "Rloss")
 AXES = ("freq", "theta", "phi")
+MATRIX = Variable(("freq", N_ANTENNAS, N_ANTENNAS), unit="Ohm")
 
 
 def parts_of(*names: str) -> list[str]:
@@ -197,9 +198,7 @@ RESPONSE_LAYOUT = Layout(
         "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
         **{name: Variable((name,), grows=True, unit="deg") for name in AXES[1:]},
         **dict.fromkeys(parts_of(*LENGTHS), Variable((N_ANTENNAS, *AXES), unit="m")),
-        **dict.fromkeys(
-            parts_of(*MATRICES), Variable(("freq", N_ANTENNAS, N_ANTENNAS), unit="Ohm")
-        ),
+        **dict.fromkeys(parts_of(*MATRICES), MATRIX),
     },
     dict.fromkeys((*CONVENTIONS, *SOURCES), Attribute("word", optional=True)),
 )

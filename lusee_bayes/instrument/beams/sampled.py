@@ -35,15 +35,6 @@ from lusee_bayes.core import formats
 from lusee_bayes.core.checks import Described, listed, require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing, user_path
-from lusee_bayes.core.formats import (
-    UVBEAM_WORDS,
-    as_dataset,
-    has_words,
-    image_names,
-    is_fits,
-    read_fits,
-    read_netcdf,
-)
 from lusee_bayes.core.layouts import Attribute, Kind, Layout, Variable
 from lusee_bayes.core.lazy import healpy, pyuvdata
 from lusee_bayes.core.reading import naming, reading, require_file
@@ -56,12 +47,7 @@ from lusee_bayes.instrument.beams.fields import (
     from_rings,
     on_grid,
 )
-from lusee_bayes.instrument.beams.luseepy_files import (
-    PortResponse,
-    ScalarBeam,
-    read_response,
-    read_scalar_beam,
-)
+from lusee_bayes.instrument.beams.luseepy_files import read_response, read_scalar_beam
 from lusee_bayes.instrument.beams.source import BeamSource
 from lusee_bayes.instrument.products import antennas_of, auto_indices, labels, to_matrix, to_real
 
@@ -399,10 +385,10 @@ def read_sampled_beams(path: str | Path) -> SampledBeams:
         If the file is missing, damaged or of another kind, or not as declared.
     """
     path = user_path(path)
-    if path.is_file() and is_fits(path):
-        read = partial(read_fits, path, hint=HINT)
+    if path.is_file() and formats.is_fits(path):
+        read = partial(formats.read_fits, path, hint=HINT)
     else:
-        read = partial(read_netcdf, path, formats.BEAMS, hint=HINT)
+        read = partial(formats.read_netcdf, path, formats.BEAMS, hint=HINT)
     there = read(layout=Layout(WHAT)).there
     names = (POWER,) if POWER in there else FIELDS
     said = {"absolute": Attribute("boolean")}
@@ -453,7 +439,7 @@ def write_sampled_beams(path: str | Path, beams: SampledBeams) -> Path:
             hdus += [fits.ImageHDU(a.copy(), name=name) for name, a in arrays.items()]
             fits.HDUList(hdus).writeto(partly)
         else:
-            dataset = as_dataset(formats.BEAMS, declared, arrays, said)
+            dataset = formats.as_dataset(formats.BEAMS, declared, arrays, said)
             dataset.to_netcdf(partly, engine="h5netcdf")
     return path
 
@@ -553,7 +539,7 @@ def from_uvbeam(beam: Any, *, conjugate: bool = False, path: str = "the UVBeam")
     return sampled_beams(np.asarray(beam.freq_array) / 1e6, **fields, **angles, path=path)
 
 
-def read_beam(path: str | Path) -> ScalarBeam | PortResponse | SampledBeams:
+def read_beam(path: str | Path) -> BeamSource:
     """Read a beam file of whichever kind.
 
     luseepy's scalar beams (FITS version 2) and responses (version 3), sampled beams
@@ -565,7 +551,8 @@ def read_beam(path: str | Path) -> ScalarBeam | PortResponse | SampledBeams:
 
     Returns
     -------
-    ScalarBeam, PortResponse or SampledBeams
+    BeamSource
+        ScalarBeam, PortResponse or SampledBeams.
 
     Raises
     ------
@@ -588,10 +575,10 @@ def beam_kind(path: str | Path) -> str:
         path = require_file(path, "beam file")
     except InputError:
         return "luseepy"
-    in_fits = is_fits(path)
-    names = set(image_names(path)) if in_fits else set()
+    in_fits = formats.is_fits(path)
+    names = set(formats.image_names(path)) if in_fits else set()
     own = names & {FIELDS[0], POWER} if in_fits else formats.format_of(path) == formats.BEAMS
-    if own or has_words(path, UVBEAM_WORDS):
+    if own or formats.has_words(path, formats.UVBEAM_WORDS):
         return "sampled"
     return "response" if "h_theta_real" in names else "luseepy"
 
@@ -605,7 +592,8 @@ def read_sampled(path: str | Path) -> SampledBeams:
         As :func:`read_sampled_beams` and :func:`read_uvbeam`.
     """
     path = require_file(path, "beam file", "check beam.file")
-    return read_uvbeam(path) if has_words(path, UVBEAM_WORDS) else read_sampled_beams(path)
+    is_uvbeam = formats.has_words(path, formats.UVBEAM_WORDS)
+    return read_uvbeam(path) if is_uvbeam else read_sampled_beams(path)
 
 
 READERS = {"sampled": read_sampled, "response": read_response, "luseepy": read_scalar_beam}

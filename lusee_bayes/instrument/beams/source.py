@@ -39,12 +39,13 @@ from lusee_bayes.instrument.beams.fields import (
 from lusee_bayes.instrument.products import N_ANTENNAS
 
 Ohms = Complex[np.ndarray, "ports ports"]
-LOADS = ("ZL_real", "ZL_imag")
+# matrices of the ports at every frequency
+LOADS, BY_PORTS = ("ZL_real", "ZL_imag"), ("freq", N_ANTENNAS, N_ANTENNAS)
 LOADS_LAYOUT = Layout(
     "loads ZL of four receivers, as luseepy's four-port waterfalls hold them",
     {
         "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
-        **{name: Variable(("freq", N_ANTENNAS, N_ANTENNAS), unit="Ohm") for name in LOADS},
+        **dict.fromkeys(LOADS, Variable(BY_PORTS, unit="Ohm")),
     },
 )
 
