@@ -86,7 +86,6 @@ class Coupling(Described, eqx.Module):
     def _matrix(self) -> Matrix:
         """A as a matrix, as all of the following without the response."""
 
-    @abstractmethod
     def plus(self, amplitude: Float[Array, ""], direction: Coupling) -> Coupling:
         """Add a multiple of another coupling matrix: R (A + amplitude dA), with the response R.
 
@@ -107,6 +106,10 @@ class Coupling(Described, eqx.Module):
         InputError
             If ``direction`` has a response, or is of other data or unknowns.
         """
+        require_shape("the direction", direction, self.shape)
+        if direction.response is not None:
+            raise InputError("the direction must have no response of its own")
+        return DenseCoupling(self._matrix() + amplitude * direction.dense(), response=self.response)
 
     @abstractmethod
     def _forward(self, sky: Modes) -> DataVector:
@@ -263,21 +266,11 @@ class DenseCoupling(Coupling):
     def _matrix(self):
         return self.matrix
 
-    def plus(self, amplitude, direction):
-        require_shape("the direction", direction, self.shape)
-        _require_bare(direction)
-        return DenseCoupling(self.matrix + amplitude * direction.dense(), response=self.response)
-
     def _forward(self, sky):
         return self.matrix @ sky
 
     def _backward(self, data):
         return self.matrix.T @ data
-
-
-def _require_bare(direction: Coupling) -> None:
-    if direction.response is not None:
-        raise InputError("the direction must have no response of its own")
 
 
 def as_coupling(coupling: Coupling | Array) -> Coupling:
@@ -408,9 +401,8 @@ class CouplingMatrix(Coupling):
         return self.response is None
 
     def plus(self, amplitude, direction):
-        _require_bare(direction)
-        if not isinstance(direction, CouplingMatrix):
-            return DenseCoupling(self._matrix(), response=self.response).plus(amplitude, direction)
+        if not isinstance(direction, CouplingMatrix) or direction.response is not None:
+            return super().plus(amplitude, direction)
         self.layout.require_same(direction.layout)
         return replace(
             self,

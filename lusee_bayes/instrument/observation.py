@@ -460,3 +460,68 @@ def _barycentric_km(body: str, at: Time) -> Vectors:
         place = get_body_barycentric(body, at, ephemeris="builtin").xyz.to_value(u.km)
     axes = ICRS(CartesianRepresentation(np.eye(3))).transform_to(Galactic())
     return (axes.cartesian.xyz.value @ place).T
+
+
+# sites by name: selenographic longitude and latitude in degrees
+SITES = {"LuSEE-Night": (182.258, -23.814)}
+
+
+def site_of(site: Any) -> tuple[float, float]:
+    """Return longitude and latitude in degrees of a pair, or of a site of ``SITES`` by name.
+
+    Raises
+    ------
+    InputError
+        If it is neither.
+    """
+    if isinstance(site, str):
+        known = {name.lower(): place for name, place in SITES.items()}
+        if site.lower() not in known:
+            raise InputError(
+                f"unknown site '{site}'; {nearest(site, SITES)} (or give two angles in degrees)"
+            )
+        return known[site.lower()]
+    try:
+        lon, lat = (float(x) for x in site)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"the site is {site!r}; give longitude and latitude in degrees, or {', '.join(SITES)}"
+        ) from error
+    return lon, lat
+
+
+def numbers_of_times(name: str, values: Any, n_times: int) -> Times:
+    """Return a finite number for each time, of as many or of one that stands for all.
+
+    Raises
+    ------
+    InputError
+        If there are others; with the name.
+    """
+    expected = f"give one finite number, or one for each of {n_times} times"
+    try:
+        numbers = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} is {values!r}; {expected}") from error
+    if numbers.shape not in ((), (n_times,)) or not np.isfinite(numbers).all():
+        raise InputError(f"{name} has shape {numbers.shape}; {expected}")
+    return np.broadcast_to(numbers, (n_times,))
+
+
+def runs_of(turntable_deg: Any, n_times: int) -> tuple[np.ndarray, tuple[float, ...]]:
+    """Return the run of each sample, and the turntable angle of each run.
+
+    Parameters
+    ----------
+    turntable_deg : float or (times,) array
+        A new run begins where the angle changes.
+    n_times : int
+
+    Raises
+    ------
+    InputError
+        If there are neither one angle nor as many as times, or they are not finite.
+    """
+    angles = numbers_of_times("turntable_deg", turntable_deg, n_times)
+    run = np.concatenate([[0], np.cumsum(np.diff(angles) != 0.0)]).astype(np.int64)
+    return run, tuple(angles[np.searchsorted(run, np.arange(run[-1] + 1))].tolist())

@@ -18,6 +18,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import combinations_with_replacement
 from operator import attrgetter
 from typing import Any, NamedTuple
 
@@ -25,7 +26,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int, Shaped
 
-from lusee_bayes.core.arrays import Array, Grid, GridFlags, Times, as_complex, namespace, placed
+from lusee_bayes.core.arrays import Array, Grid, GridFlags, as_complex, namespace, placed
 from lusee_bayes.core.checks import Described, is_traced
 from lusee_bayes.core.errors import InputError, nearest
 
@@ -52,17 +53,18 @@ class Product(NamedTuple):
 @lru_cache
 def all_products(n_antennas: int = N_ANTENNAS) -> tuple[Product, ...]:
     """Return the n^2 real products of ``n_antennas`` antennas, in luseepy's order."""
-    return tuple(
-        Product(i, j, part)
-        for i in range(n_antennas)
-        for j in range(i, n_antennas)
-        for part in (("R",) if i == j else ("R", "I"))
-    )
+    pairs = combinations_with_replacement(range(n_antennas), 2)
+    return tuple(Product(i, j, part) for i, j in pairs for part in ("R" if i == j else "RI"))
 
 
 def labels(n_antennas: int = N_ANTENNAS) -> tuple[str, ...]:
     """Return the labels of :func:`all_products`."""
     return tuple(p.label for p in all_products(n_antennas))
+
+
+def labels_of(n_products: int) -> tuple[str, ...]:
+    """Return the labels of so many products. InputError if no number of antennas has as many."""
+    return labels(antennas_of(n_products))
 
 
 def antennas_of(n_products: int) -> int:
@@ -107,8 +109,6 @@ def to_matrix(products: Products) -> Hermitian:
 
 # what an imaginary part can be that of, and the sign that turns it into <s_i conj(s_j)>
 CONVENTIONS = {"s_i conj(s_j)": 1.0, "conj(s_i) s_j": -1.0}
-# sites by name: selenographic longitude and latitude in degrees
-SITES = {"LuSEE-Night": (182.258, -23.814)}
 # an auto is real; rounding of 32-bit numbers is below this share of it
 AUTO_TOLERANCE = 1e-5
 NAME = re.compile(r"\s*(\d)\s*[-_x, ]?\s*(\d)\s*([RI]?)\s*", re.IGNORECASE)
@@ -230,8 +230,6 @@ def _columns(products: Any, is_complex: bool, n_antennas: int) -> list[tuple[int
         if i == j and part == "I":
             raise InputError(f"there is no product '{name}': an auto is real")
         columns.append((i, j, part if is_complex else part or "R"))
-        if columns[-1] in columns[:-1]:
-            raise InputError(f"the product '{name}' is given more than once; name each once")
     return columns
 
 
@@ -254,67 +252,6 @@ def _require_real(pair: str, auto: np.ndarray) -> None:
         raise InputError(
             f"the auto {pair} is {auto[bad[0]]:.6g} at time {bad[0]}, not real; check the names"
         )
-
-
-def site_of(site: Any) -> tuple[float, float]:
-    """Return longitude and latitude in degrees of a pair, or of a site of ``SITES`` by name.
-
-    Raises
-    ------
-    InputError
-        If it is neither.
-    """
-    if isinstance(site, str):
-        known = {name.lower(): place for name, place in SITES.items()}
-        if site.lower() not in known:
-            raise InputError(
-                f"unknown site '{site}'; {nearest(site, SITES)} (or give two angles in degrees)"
-            )
-        return known[site.lower()]
-    try:
-        lon, lat = (float(x) for x in site)
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            f"the site is {site!r}; give longitude and latitude in degrees, or {', '.join(SITES)}"
-        ) from error
-    return lon, lat
-
-
-def numbers_of_times(name: str, values: Any, n_times: int) -> Times:
-    """Return a finite number for each time, of as many or of one that stands for all.
-
-    Raises
-    ------
-    InputError
-        If there are others; with the name.
-    """
-    expected = f"give one finite number, or one for each of {n_times} times"
-    try:
-        numbers = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name} is {values!r}; {expected}") from error
-    if numbers.shape not in ((), (n_times,)) or not np.isfinite(numbers).all():
-        raise InputError(f"{name} has shape {numbers.shape}; {expected}")
-    return np.broadcast_to(numbers, (n_times,))
-
-
-def runs_of(turntable_deg: Any, n_times: int) -> tuple[np.ndarray, tuple[float, ...]]:
-    """Return the run of each sample, and the turntable angle of each run.
-
-    Parameters
-    ----------
-    turntable_deg : float or (times,) array
-        A new run begins where the angle changes.
-    n_times : int
-
-    Raises
-    ------
-    InputError
-        If there are neither one angle nor as many as times, or they are not finite.
-    """
-    angles = numbers_of_times("turntable_deg", turntable_deg, n_times)
-    run = np.concatenate([[0], np.cumsum(np.diff(angles) != 0.0)]).astype(np.int64)
-    return run, tuple(angles[np.searchsorted(run, np.arange(run[-1] + 1))].tolist())
 
 
 class DataLayout(Described, eqx.Module):

@@ -256,24 +256,24 @@ def _of_table(path: str, text: str) -> tuple[Interval, ...]:
             f"{path} has the columns {', '.join(table.columns)}; a schedule has "
             f"{', '.join(sorted(REQUIRED))}, and may have {' and '.join(sorted(OPTIONAL))}"
         )
-    intervals = []
-    for number, row in enumerate(table.to_dict("records"), start=1):
-        with naming(place := f"{path}, row {number}"):
-            intervals.append(_interval(place, row))
-    return tuple(intervals)
+    rows = enumerate(table.to_dict("records"), start=1)
+    return tuple(_interval(f"{path}, row {number}", row) for number, row in rows)
 
 
 def _interval(place: str, row: dict[str, str]) -> Interval:
-    numbers = {}
-    for name, default in (("turntable_deg", ""), ("duty_cycle", "1")):
-        try:
-            numbers[name] = float(row.get(name) or default)
-        except ValueError as error:
-            raise InputError(f"{name} is '{row[name]}', not a number") from error
-    night = (row.get("night_only", "").strip() or "false").lower()
-    if night not in ("true", "false"):
-        raise InputError(f"night_only is '{night}'; write true or false")
-    return Interval(row["start"], row["end"], **numbers, night_only=night == "true", where=place)
+    with naming(place):
+        numbers = {}
+        for name, default in (("turntable_deg", ""), ("duty_cycle", "1")):
+            try:
+                numbers[name] = float(row.get(name) or default)
+            except ValueError as error:
+                raise InputError(f"{name} is '{row[name]}', not a number") from error
+        night = (row.get("night_only", "").strip() or "false").lower()
+        if night not in ("true", "false"):
+            raise InputError(f"night_only is '{night}'; write true or false")
+        return Interval(
+            row["start"], row["end"], **numbers, night_only=night == "true", where=place
+        )
 
 
 def _of_commands(path: str, text: str) -> tuple[Interval, ...]:

@@ -21,6 +21,7 @@ import equinox as eqx
 import numpy as np
 import scipy
 from jaxtyping import Complex, Float, Inexact
+from scipy.constants import speed_of_light
 from scipy.special import roots_legendre
 
 from lusee_bayes.core import checks
@@ -28,7 +29,7 @@ from lusee_bayes.core.arrays import Array, as_complex, namespace
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import LARGEST_LMAX, SQRT2, lmax_of, mode_numbers, polar_functions
 from lusee_bayes.core.lazy import healpy
-from lusee_bayes.instrument.products import antennas_of, auto_indices, labels, to_real
+from lusee_bayes.instrument.products import antennas_of, auto_indices, labels_of, to_real
 
 # responses of antennas, and of pairs of them, in any directions
 Fields = Complex[Array, "antennas *directions"]
@@ -126,12 +127,9 @@ class HemisphereGrid(eqx.Module):
         return xp.moveaxis(by_order[m + lmax, :, ell], 0, -1).reshape(*f.shape[:-2], -1)
 
 
-SPEED_OF_LIGHT = 299792458.0  # m/s
-
-
 def wavenumber(frequency_mhz: float | Float[Array, ""]) -> float | Float[Array, ""]:
     """Return k = 2 pi / wavelength, in 1/m."""
-    return 2.0e6 * np.pi * frequency_mhz / SPEED_OF_LIGHT
+    return 2.0e6 * np.pi * frequency_mhz / speed_of_light
 
 
 def phasor(angle: Float[Array, "..."]) -> Complex[Array, "..."]:
@@ -159,13 +157,12 @@ class AntennaFields(checks.Described, eqx.Module):
     grid: HemisphereGrid
 
     def __check_init__(self):
-        expected = (None, len(self.grid.theta), self.grid.n_phi)
-        checks.require_shape("e_theta", self.e_theta, expected)
-        checks.require_shape("e_phi", self.e_phi, (self.e_theta.shape[0], *expected[1:]))
-        for name in ("e_theta", "e_phi"):
-            if getattr(self, name).dtype != np.complex128:
+        expected = (self.n_antennas, len(self.grid.theta), self.grid.n_phi)
+        for name, field in (("e_theta", self.e_theta), ("e_phi", self.e_phi)):
+            checks.require_shape(name, field, expected)
+            if field.dtype != np.complex128:
                 raise InputError(
-                    f"{name} must be a complex128 array, got {getattr(self, name).dtype}; "
+                    f"{name} must be a complex128 array, got {field.dtype}; "
                     "convert it with numpy.asarray(x, dtype=numpy.complex128)"
                 )
 
@@ -395,7 +392,7 @@ class ProductBeams(checks.Described, eqx.Module):
     @property
     def labels(self) -> tuple[str, ...]:
         """Labels of the products, in order."""
-        return labels(antennas_of(self.n_products))
+        return labels_of(self.n_products)
 
 
 def product_beams(

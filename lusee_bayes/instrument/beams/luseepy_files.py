@@ -38,7 +38,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Complex, Float
-from scipy.constants import Boltzmann, physical_constants
+from scipy.constants import Boltzmann, physical_constants, speed_of_light
 from scipy.special import roots_legendre
 
 from lusee_bayes.core.arrays import Array
@@ -48,7 +48,6 @@ from lusee_bayes.core.formats import read_fits
 from lusee_bayes.core.harmonics import mode_numbers, polar_functions
 from lusee_bayes.core.layouts import UNSTATED, Attribute, Layout, Variable
 from lusee_bayes.instrument.beams.fields import (
-    SPEED_OF_LIGHT,
     Angles,
     AntennaFields,
     HemisphereGrid,
@@ -354,7 +353,7 @@ class PortResponse(LuseepyBeam):
         the fields themselves are interpolated here, for pictures; use :meth:`beams` for products.
         """
         opened = self._open(self._at(frequency_mhz, self.e_theta, self.e_phi), grid)
-        mixing = self._mixing(frequency_mhz) / (SPEED_OF_LIGHT / (1e6 * frequency_mhz))
+        mixing = self._mixing(frequency_mhz) / (speed_of_light / (1e6 * frequency_mhz))
         parts = (np.tensordot(mixing, part, axes=1) for part in (opened.e_theta, opened.e_phi))
         return AntennaFields(*parts, grid)
 
@@ -362,7 +361,7 @@ class PortResponse(LuseepyBeam):
         opened = np.zeros((N_ANTENNAS**2, (lmax + 1) ** 2))
         for k, weight in self._neighbours(frequency_mhz):
             fields = self._open([self.e_theta[k], self.e_phi[k]], grid)
-            wavelength = SPEED_OF_LIGHT / (1e6 * self.frequencies_mhz[k])
+            wavelength = speed_of_light / (1e6 * self.frequencies_mhz[k])
             opened += weight / wavelength**2 * product_modes(fields, lmax, normalise=False)
         mixing = self._mixing(frequency_mhz)
         seen = np.einsum("ai,ijm,bj->abm", mixing, to_matrix(opened), mixing.conj(), optimize=True)

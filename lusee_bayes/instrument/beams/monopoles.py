@@ -353,8 +353,7 @@ def with_values(monopoles: Monopoles, values: Mapping[str, float | Float[Array, 
         If a name is unknown.
     """
     for name, value in values.items():
-        value = namespace(value).asarray(value, dtype=np.float64)
-        monopoles = eqx.tree_at(parameter(name).where, monopoles, value)
+        monopoles = eqx.tree_at(parameter(name).where, monopoles, _array(value))
     return monopoles
 
 
@@ -434,8 +433,7 @@ def _patterns(
 @compiled
 def _normalisation(frequency_mhz: Float[Array, ""], monopoles: Monopoles) -> Float[Array, ""]:
     grid = HemisphereGrid.for_lmax(NORMALISATION_LMAX)
-    e_theta, e_phi = monopoles.towards(frequency_mhz, grid.theta[:, None], grid.phi[None])
-    return mean_auto_integral(AntennaFields(e_theta, e_phi, grid))
+    return mean_auto_integral(monopoles.fields(frequency_mhz, grid))
 
 
 def source_response(

@@ -80,13 +80,13 @@ class Directions:
     nside: int = 0
 
     @classmethod
-    def of(cls, theta_deg: Any, phi_deg: Any, n_last: int, path: str) -> Directions:
+    def of(cls, theta: Any, phi: Any, n_last: int, path: str) -> Directions:
         """Return the directions of the last axes of arrays.
 
         Parameters
         ----------
-        theta_deg, phi_deg : array or None
-            See :func:`.sampled_beams`.
+        theta, phi : array or None
+            In degrees; see :func:`.sampled_beams`.
         n_last : int
             Length of the last axis: the pixels, where there are no angles.
         path : str
@@ -97,14 +97,13 @@ class Directions:
         InputError
             If angles do not cover the hemisphere, or there are not the pixels of a map.
         """
-        if theta_deg is None or phi_deg is None:
+        if theta is None or phi is None:
             if not healpy.isnpixok(n_last):
                 raise InputError(
                     f"{path}: {n_last} directions are no HEALPix map of 12 NSIDE^2 pixels; give "
                     "theta_deg and phi_deg for a grid"
                 )
             return cls(None, 0, healpy.npix2nside(n_last))
-        theta, phi = theta_deg, phi_deg
         used = theta[theta < 90.0 - ANGLE_TOLERANCE]
         if len(used) < 4 or max(used[0], 90.0 - used[-1]) > np.diff(theta)[: len(used)].max():
             raise InputError(
@@ -134,7 +133,6 @@ class Directions:
         InputError
             If one is not finite.
         """
-        kept = values
         if self.theta is not None:
             kept = values[..., : len(self.theta), : self.n_phi]
         else:
@@ -400,9 +398,9 @@ def read_sampled_beams(path: str | Path) -> SampledBeams:
             given["products"] = _in_order(arrays[POWER], found.values["products"])
     else:
         for name in ("e_theta", "e_phi"):
-            # set part by part: infinity times 1j would be NaN, with a warning
-            given[name] = np.empty(arrays[FIELDS[0]].shape, dtype=complex)
-            given[name].real, given[name].imag = (arrays[f"{name}_{x}"] for x in ("real", "imag"))
+            # infinity times 1j would be NaN, with a warning
+            parts = np.stack([arrays[f"{name}_{part}"] for part in ("real", "imag")], axis=-1)
+            given[name] = parts.view(complex)[..., 0]
     angles = {name: arrays.get(name) for name in ("theta_deg", "phi_deg")}
     options = {"absolute": found.values["absolute"], "path": str(path)}
     return sampled_beams(arrays["frequency_mhz"], **given, **angles, **options)
