@@ -281,12 +281,11 @@ class _LuseepySection(_FileSection):
 
     def asked(self) -> dict[str, Any]:
         """What is asked of every file, as its beams take it."""
-        return {
-            "interpolation": self.interpolation,
-            "turntable_offset_deg": self.turntable_offset_deg,
+        own = {
             "luseepy_quadrature": self.quadrature == "luseepy",
             "moon_k": self.moon_temperature_k,
         }
+        return own | self.model_dump(include={"interpolation", "turntable_offset_deg"})
 
 
 class ScalarBeamSection(_LuseepySection):
@@ -317,8 +316,8 @@ class ScalarBeamSection(_LuseepySection):
 
     def source(self) -> BeamSource:
         """The pattern of the file, turned to every angle."""
-        beam, ports = read_scalar_beam(self.file), self.rotations_deg
-        return replace(beam, taper=self.taper, rotations_deg=ports, **self.asked())
+        beam, own = read_scalar_beam(self.file), self.model_dump(include={"taper", "rotations_deg"})
+        return replace(beam, **own, **self.asked())
 
 
 class ResponseSection(_LuseepySection):
@@ -372,7 +371,7 @@ class SampledBeamSection(_FileSection):
 
     def source(self) -> BeamSource:
         """The beams of the file."""
-        asked = {"turntable_offset_deg": self.turntable_offset_deg, "normalise": self.normalise}
+        asked = self.model_dump(exclude={"model", "file"})
         return replace(read_sampled(self.file), **asked)
 
 

@@ -75,18 +75,13 @@ def sufficient_nodes(angle: float) -> int:
         The lowest number whose mean of cos(angle x) over -1 < x < 1 errs by less than 1e-14 (from
         the remainder of the quadrature).
     """
-    n = 1
-    while _quadrature_error(n, angle) > ROUNDING:
+    n, error, smallest = 0, 1.0, np.finfo(np.float64).tiny
+    while error > ROUNDING:
         n += 1
+        # half of 2^(2n+1) n!^4 / ((2n+1) (2n)!^3) times the largest 2n-th derivative
+        log = 2 * n * np.log(2.0 * max(angle, smallest)) + 4 * lgamma(n + 1) - 3 * lgamma(2 * n + 1)
+        error = np.exp(log) / (2 * n + 1)
     return n
-
-
-def _quadrature_error(n: int, angle: float) -> float:
-    """Half of 2^(2n+1) n!^4 / ((2n+1) (2n)!^3) times the largest 2n-th derivative."""
-    if angle == 0.0:
-        return 0.0
-    log = 2 * n * np.log(2.0 * angle) + 4 * lgamma(n + 1) - 3 * lgamma(2 * n + 1)
-    return float(np.exp(log) / (2 * n + 1))
 
 
 def windowed(

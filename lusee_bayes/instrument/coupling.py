@@ -381,11 +381,8 @@ class CouplingMatrix(Coupling):
         return cls.build(beams, Pointing.of(observation, beams.lmax))
 
     def description(self) -> tuple[str, ...]:
-        return (
-            *super().description(),
-            *self.layout.description(),
-            "never formed: beams, pointing and a turn for each order m",
-        )
+        how = "never formed: beams, pointing and a turn for each order m"
+        return *super().description(), *self.layout.description(), how
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -404,11 +401,9 @@ class CouplingMatrix(Coupling):
         if not isinstance(direction, CouplingMatrix) or direction.response is not None:
             return super().plus(amplitude, direction)
         self.layout.require_same(direction.layout)
-        return replace(
-            self,
-            body_beams=self.body_beams + amplitude * direction.body_beams,
-            by_order=self.by_order + amplitude * direction.by_order,
-        )
+        body = self.body_beams + amplitude * direction.body_beams
+        by_order = self.by_order + amplitude * direction.by_order
+        return replace(self, body_beams=body, by_order=by_order)
 
     def rows(self, product: RowNumbers, time: RowNumbers) -> Float[Array, "rows modes"]:
         """Compute chosen rows of A, flagged or not, without the response.
@@ -728,10 +723,9 @@ class Instrument(eqx.Module):
         if self.rotations is None:
             raise InputError("prepare the instrument first: instrument = instrument.prepared()")
         beams = self.beams(values).modes
-        rows = [
-            jnp.einsum("km,mtn->ktn", beams[:, ell**2 : (ell + 1) ** 2], block)
-            for ell, block in enumerate(self.rotations)
-        ]
+        ells = jnp.split(beams, np.arange(1, len(self.rotations)) ** 2, axis=1)
+        pairs = zip(ells, self.rotations, strict=True)
+        rows = [jnp.einsum("km,mtn->ktn", part, block) for part, block in pairs]
         return self.layout.gather(jnp.concatenate(rows, axis=2))
 
     def coupling_of(self, beams: ProductBeams) -> CouplingMatrix:

@@ -262,14 +262,10 @@ class Observation(checks.Described):
         InputError
             If no sample is kept.
         """
-        runs, renumbered = np.unique(self.run[keep], return_inverse=True)
-        return replace(
-            self,
-            times=self.times[keep],
-            run=renumbered,
-            turntable_deg=tuple(self.turntable_deg[run] for run in runs),
-            windows=None if self.windows is None else self.windows.select(keep),
-        )
+        runs, run = np.unique(self.run[keep], return_inverse=True)
+        angles = tuple(self.turntable_deg[number] for number in runs)
+        windows = None if self.windows is None else self.windows.select(keep)
+        return replace(self, times=self.times[keep], run=run, turntable_deg=angles, windows=windows)
 
     @property
     def n_times(self) -> int:
@@ -439,8 +435,7 @@ def body_direction(body: str, observation: Observation) -> Vectors:
     InputError
         If the body is unknown.
     """
-    known = {name.lower(): name for name in BODIES}
-    if body.lower() not in known:
+    if body.capitalize() not in BODIES:
         hint = nearest(body.capitalize(), BODIES)
         raise InputError(f"unknown body '{body}' in the sky of the Moon; {hint}")
     with times.unannounced_leap_seconds():

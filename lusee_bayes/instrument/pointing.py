@@ -124,19 +124,10 @@ class Pointing(eqx.Module):
         azimuth, tilt = split(mcmf @ pole_frame.T)
         if order is None:
             order = sufficient_order(tilt, lmax)
-        azimuth, functions, factors = windowed(sample, weight, azimuth, tilt, order, lmax)
-        starts = np.searchsorted(observation.run, np.arange(observation.n_runs + 1))
-        return cls(
-            azimuth=azimuth,
-            functions=functions,
-            factors=factors,
-            pole_frame=pole_frame,
-            pole_from_galactic=_rotation(pole_frame, lmax),
-            mcmf_from_lander=_rotation(observation.lander_from_mcmf().T, lmax),
-            turntable=np.radians(np.array(observation.turntable_deg, dtype=np.float64)),
-            run_starts=tuple(int(s) for s in starts),
-            order=order,
-        )
+        of_time = windowed(sample, weight, azimuth, tilt, order, lmax)
+        starts = np.searchsorted(observation.run, np.arange(observation.n_runs + 1)).tolist()
+        frames = pole_frame, _rotation(pole_frame, lmax), *_lander(observation, lmax)
+        return cls(*of_time, *frames, run_starts=tuple(starts), order=order)
 
     def placed(self, observation: Observation) -> Pointing:
         """Return the pointing of an observation at the same times and windows, but elsewhere.
@@ -147,9 +138,8 @@ class Pointing(eqx.Module):
             With its own site, lean and turntable angles.
         """
         lmax = len(self.mcmf_from_lander.blocks) - 1
-        lander = _rotation(observation.lander_from_mcmf().T, lmax)
-        angles = np.radians(np.array(observation.turntable_deg, dtype=np.float64))
-        return replace(self, mcmf_from_lander=lander, turntable=angles)
+        lander, turntable = _lander(observation, lmax)
+        return replace(self, mcmf_from_lander=lander, turntable=turntable)
 
     @property
     def n_times(self) -> int:
@@ -160,6 +150,12 @@ class Pointing(eqx.Module):
         """Return the number of each run and the slice of its samples."""
         bounds = zip(self.run_starts[:-1], self.run_starts[1:], strict=True)
         return [(number, slice(first, end)) for number, (first, end) in enumerate(bounds)]
+
+
+def _lander(observation: Observation, lmax: int) -> tuple[Rotation, Array]:
+    """The rotation from the lander to the Moon, and the turntable's angles in radians."""
+    angles = np.array(observation.turntable_deg, dtype=np.float64)
+    return _rotation(observation.lander_from_mcmf().T, lmax), np.radians(angles)
 
 
 def _rotation(matrix: Float[np.ndarray, "3 3"], lmax: int) -> Rotation:
@@ -215,18 +211,12 @@ def sufficient_order(tilt: Tilts, lmax: int) -> int:
     return max(terms_of_exponential(size, TILT_TOLERANCE) - 1, LEAST_ORDER)
 
 
-# of every offset, what it is
-OFFSETS = {
-    "clock_s": "later than the data say, in seconds",
-    "clock_drift_s_per_day": "and later by so much more every day from the first sample on",
-    "turntable_deg": "turntable, from East towards North, of every run",
-    "lon_deg": "longitude of the site",
-    "lat_deg": "latitude of the site",
-    "tilt_east_deg": "lean of the lander towards East",
-    "tilt_north_deg": "lean of the lander towards North",
-}
+# later than the data say, in seconds, and later by so much more every day from the first sample on
 CLOCK = ("clock_s", "clock_drift_s_per_day")
+# lean of the lander towards East and towards North
 TILTS = ("tilt_east_deg", "tilt_north_deg")
+# these, the turntable of every run, from East towards North, and the site
+OFFSETS = (*CLOCK, "turntable_deg", "lon_deg", "lat_deg", *TILTS)
 # by which the Moon turns against the sky, as azimuths of the sky count it, in radians per hour
 TURN_PER_HOUR = -2.0 * np.pi / (CYCLE_DAYS * 24.0)
 
@@ -239,7 +229,7 @@ def offset_names(kinds: tuple[str, ...], n_runs: int) -> tuple[str, ...]:
     Parameters
     ----------
     kinds : tuple of str
-        Keys of ``OFFSETS``.
+        Some of ``OFFSETS``.
     n_runs : int
         Number of runs.
 
@@ -262,7 +252,7 @@ def offset_names(kinds: tuple[str, ...], n_runs: int) -> tuple[str, ...]:
 
 
 def offset_kind(name: str) -> str:
-    """Return the key of ``OFFSETS`` that an offset's name belongs to."""
+    """Return the kind of ``OFFSETS`` that an offset's name belongs to."""
     return "turntable_deg" if name.startswith("turntable_") else name
 
 
@@ -335,10 +325,6 @@ def turned_by_offsets(pointing: Pointing, hours: Array, values: Values) -> Point
     lon = given.get("lon_deg", zero) * radians - TURN_PER_HOUR * late_h
     rest = [given.get(name, zero) * radians for name in ("lat_deg", *TILTS)]
     names = _of_runs(len(pointing.run_starts) - 1)
-    turntable = xp.stack([given.get(name, zero) * radians for name in names])
-    return replace(
-        pointing,
-        azimuth=pointing.azimuth + TURN_PER_HOUR * drift * hours,
-        turntable=pointing.turntable + turntable,
-        turns=xp.stack([lon, *rest]),
-    )
+    turntable = pointing.turntable + xp.stack([given.get(name, zero) * radians for name in names])
+    azimuth = pointing.azimuth + TURN_PER_HOUR * drift * hours
+    return replace(pointing, azimuth=azimuth, turntable=turntable, turns=xp.stack([lon, *rest]))

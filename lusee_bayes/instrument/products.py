@@ -230,6 +230,8 @@ def _columns(products: Any, is_complex: bool, n_antennas: int) -> list[tuple[int
         if i == j and part == "I":
             raise InputError(f"there is no product '{name}': an auto is real")
         columns.append((i, j, part if is_complex else part or "R"))
+        if columns[-1] in columns[:-1]:
+            raise InputError(f"the product '{name}' is given more than once; name each once")
     return columns
 
 
@@ -396,9 +398,8 @@ def without_gaps(visibilities: Grid, layout: DataLayout) -> Grid:
     products = all_products(antennas_of(layout.n_products))
     times, measured = np.arange(layout.n_times), present.any(1)
     for gaps, row in zip(absent, values, strict=True):
-        if gaps.any():
-            known = ~gaps
-            row[gaps] = np.interp(times[gaps], times[known], row[known]) if known.any() else 0.0
+        known = ~gaps
+        row[gaps] = np.interp(times[gaps], times[known], row[known]) if known.any() else 0.0
     autos = np.array([p.i == p.j for p in products])
     unused = np.flatnonzero(autos & absent.all(1))
     for auto in (products[k] for k in unused):
@@ -409,6 +410,5 @@ def without_gaps(visibilities: Grid, layout: DataLayout) -> Grid:
                     f"{product.label} depends on it; give modelled visibilities of all samples, "
                     "such as the signal of a CouplingMatrix without flags"
                 )
-    if unused.size:
-        values[unused] = values[autos & ~absent.all(1)].mean(0)
+    values[unused] = values[autos & ~absent.all(1)].mean(0)
     return namespace(visibilities).asarray(values)

@@ -30,7 +30,7 @@ from astropy.time import Time
 from jaxtyping import Bool, Float, Int
 
 from lusee_bayes.core.arrays import Times
-from lusee_bayes.core.checks import Described, require_finite
+from lusee_bayes.core.checks import Described, extent, require_finite
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.layouts import Attribute, Content
 from lusee_bayes.core.reading import naming
@@ -279,10 +279,8 @@ class Windows(Described):
     def description(self) -> tuple[str, ...]:
         live, bounds = self.live_per_sample_s, self.bounds_s
         share = live.sum() / (bounds[:, 1] - bounds[:, 0]).sum()
-        return (
-            f"{self.n_samples} windows in {len(self.sample)} pieces, live for {live.min():g} to "
-            f"{live.max():g} s, {share:.1%} of the time",
-        )
+        pieces = f"{self.n_samples} windows in {len(self.sample)} pieces"
+        return (f"{pieces}, live for {extent(live, 's', 'g')}, {share:.1%} of the time",)
 
     @property
     def n_samples(self) -> int:

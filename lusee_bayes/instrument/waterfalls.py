@@ -299,9 +299,8 @@ FOUR_PORT_WATERFALL = Layout(
         **SITE_AND_STEP,
         "TMOON_K": Attribute(low=0.0),
         "TANT_K": Attribute(low=0.0, optional=True),
-        "TIMESYS": Attribute("text", optional=True),
+        **dict.fromkeys(("TIMESYS", "FREQINT"), Attribute("text", optional=True)),
         "TIMEUNIT": Attribute("text", choices=("d",), optional=True),
-        "FREQINT": Attribute("text", optional=True),
         "BUNIT": Attribute("text", choices=(UNIT,)),
     },
 )
@@ -336,10 +335,9 @@ def read_four_port(path: Path) -> Waterfall:
         grid = products.in_order([(name, volts / scales.get(name, 1.0)) for name, volts in named])
         scale = times.scale_of("TIMESYS", said.get("TIMESYS", "UTC"))
         observation = _observation(times.utc_of(*images["time"].T, scale), said)
-    warm = {"moon_k": said["TMOON_K"], "antenna_k": said.get("TANT_K", 0.0)}
-    loads, rule = source.receiver_of(path, images, "freq", *source.LOADS), said.get("FREQINT")
-    known = {"per_kelvin": per_kelvin, "receiver": loads, "interpolation": rule}
-    return Waterfall(str(path), grid, images["freq"], observation, **known, **warm)
+    loads = source.receiver_of(path, images, "freq", *source.LOADS)
+    known = per_kelvin, said["TMOON_K"], said.get("TANT_K", 0.0), loads, said.get("FREQINT")
+    return Waterfall(str(path), grid, images["freq"], observation, *known)
 
 
 def read_waterfall(path: str | Path) -> Waterfall:

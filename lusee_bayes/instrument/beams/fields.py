@@ -21,11 +21,10 @@ import equinox as eqx
 import numpy as np
 import scipy
 from jaxtyping import Complex, Float, Inexact
-from scipy.constants import speed_of_light
 from scipy.special import roots_legendre
 
 from lusee_bayes.core import checks
-from lusee_bayes.core.arrays import Array, as_complex, namespace
+from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import LARGEST_LMAX, SQRT2, lmax_of, mode_numbers, polar_functions
 from lusee_bayes.core.lazy import healpy
@@ -125,17 +124,6 @@ class HemisphereGrid(eqx.Module):
         polar[m + lmax, :, ell] = self.polar_weights(lmax).T
         by_order = xp.moveaxis(parts, -1, 0).reshape(2 * lmax + 1, -1, len(self.theta)) @ polar
         return xp.moveaxis(by_order[m + lmax, :, ell], 0, -1).reshape(*f.shape[:-2], -1)
-
-
-def wavenumber(frequency_mhz: float | Float[Array, ""]) -> float | Float[Array, ""]:
-    """Return k = 2 pi / wavelength, in 1/m."""
-    return 2.0e6 * np.pi * frequency_mhz / speed_of_light
-
-
-def phasor(angle: Float[Array, "..."]) -> Complex[Array, "..."]:
-    """Return exp(i angle)."""
-    xp = namespace(angle)
-    return as_complex(xp.cos(angle), xp.sin(angle))
 
 
 class AntennaFields(checks.Described, eqx.Module):
@@ -491,12 +479,11 @@ def from_rings(
         enough = np.flatnonzero(sizes > 2 * m)
         both = 2 * nside - 1 + np.unique([-m, m])
         known = series[..., enough, :][..., both]
-        parts = [(-1.0) ** m * known[..., ::-1, :], known]
-        nodes = [-ring_theta[enough][::-1], ring_theta[enough]]
-        if m:
-            parts.insert(1, np.zeros_like(known[..., :1, :]))
-            nodes.insert(1, np.zeros(1))
-        known = np.concatenate(parts, axis=-2)
+        # at the zenith every order but 0 is zero
+        zenith = np.zeros(min(m, 1))
+        none = np.zeros_like(known[..., : zenith.size, :])
+        nodes = [-ring_theta[enough][::-1], zenith, ring_theta[enough]]
+        known = np.concatenate([(-1.0) ** m * known[..., ::-1, :], none, known], axis=-2)
         spline = scipy.interpolate.CubicSpline(np.concatenate(nodes), known, axis=-2)
         spread[..., both] = spline(theta)
     values = spread @ np.exp(1j * orders[:, None] * phi[None])

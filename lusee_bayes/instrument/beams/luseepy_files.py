@@ -34,7 +34,7 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -263,10 +263,6 @@ class LuseepyBeam(Described, BeamSource):
     def _linear(self, frequency_mhz: float, lmax: int, grid: HemisphereGrid) -> np.ndarray:
         """Coefficients of the beams of all products by luseepy's rule."""
 
-    @property
-    def emits(self) -> bool:
-        return self.moon_k != 0.0
-
     def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
         # nodes integrate across the horizon exactly
         exact = HemisphereGrid.gauss_legendre(2 * len(self.theta), self.n_phi)
@@ -308,6 +304,8 @@ class PortResponse(LuseepyBeam):
         Temperature of the lossy antennas in K.
     """
 
+    n_ports: ClassVar[int] = N_ANTENNAS
+
     impedance_ohm: Complex[np.ndarray, "frequencies ports ports"]
     moon_ohm: Complex[np.ndarray, "frequencies ports ports"]
     loss_ohm: Complex[np.ndarray, "frequencies ports ports"]
@@ -316,17 +314,9 @@ class PortResponse(LuseepyBeam):
     antenna_k: float = 0.0
 
     @property
-    def n_ports(self) -> int:
-        return N_ANTENNAS
-
-    @property
     def luseepy_grid(self) -> BandLimitedGrid:
         """The directions of the file with the rule of luseepy's four-port engine."""
         return BandLimitedGrid.of(self.theta, self.n_phi)
-
-    @property
-    def emits(self) -> bool:
-        return self.moon_k != 0.0 or self.antenna_k != 0.0
 
     def behind(self, receiver: Receiver | None) -> PortResponse:
         given = receiver is None or self.receiver_said
@@ -368,7 +358,7 @@ class PortResponse(LuseepyBeam):
         return to_real(seen)
 
     def background(self, frequency_mhz: float) -> Float[Array, " products"]:
-        if not self.emits:
+        if self.moon_k == self.antenna_k == 0.0:
             return super().background(frequency_mhz)
         circuit = self.circuit(frequency_mhz)
         seen = circuit.emitted(self.moon_k * circuit.moon_ohm + self.antenna_k * circuit.loss_ohm)
@@ -518,7 +508,7 @@ class ScalarBeam(LuseepyBeam):
         enclosure of one temperature are taken to be uncorrelated, as they are where nothing
         couples them, so that a cross receives the part of the sky with the opposite sign.
         """
-        if not self.emits:
+        if self.moon_k == 0.0:
             return super().background(frequency_mhz)
         sky = np.sqrt(4.0 * np.pi) * self.beams(frequency_mhz, 0).modes[:, 0]
         return self.moon_k * (to_real(np.eye(self.n_ports, dtype=np.complex128)) - sky)
@@ -530,11 +520,8 @@ class ScalarBeam(LuseepyBeam):
             below = np.arctan((grid.theta - np.pi / 2.0) / TAPER_WIDTH) / np.pi + 0.5
             scale = scale * (1.0 - below**2)
         angles = [angle + self.turntable_offset_deg for angle in self.rotations_deg]
-        turned = (
-            np.stack([on_grid(part, self.theta, grid, a) for a in angles]) * scale[:, None]
-            for part in parts
-        )
-        return AntennaFields(*(x.astype(np.complex128) for x in turned), grid)
+        turned = [np.stack([on_grid(p, self.theta, grid, a) for a in angles]) for p in parts]
+        return AntennaFields(*((x * scale[:, None]).astype(np.complex128) for x in turned), grid)
 
 
 def read_scalar_beam(path: str | Path) -> ScalarBeam:

@@ -228,10 +228,9 @@ class SampledBeams(Described, BeamSource):
     def description(self) -> tuple[str, ...]:
         kind = "E fields of" if self.products is None else "product beams of"
         scale = "K per K" if self.absolute else "to be scaled so that autos integrate to one"
-        return (
-            f"{kind} {self.n_ports} antennas, {self.directions.text}",
-            f"at {listed(tuple(f'{f:g}' for f in self.frequencies_mhz))} MHz; {scale}",
-        )
+        known = listed(tuple(f"{f:g}" for f in self.frequencies_mhz))
+        what = f"{kind} {self.n_ports} antennas, {self.directions.text}"
+        return what, f"at {known} MHz; {scale}"
 
     @property
     def n_ports(self) -> int:
@@ -349,21 +348,17 @@ WHAT = "sampled beams"
 HINT = "lusee_bayes.write_sampled_beams makes one of sampled_beams(...)"
 
 
-def layout(
-    names: tuple[str, ...], grid: bool, kind: Kind = "real", attributes: Any = None
-) -> Layout:
+def layout(names: tuple[str, ...], grid: bool, kind: Kind = "real", said: Any = None) -> Layout:
     """Return what a file, or arrays, hold: these fields or beams on a grid or on HEALPix pixels."""
     first = "product" if names[0] in ("products", POWER) else "antenna"
     directions = ("theta", "phi") if grid else ("pixel",)
     # below the horizon there may be anything
     values = Variable(("frequency", first, *directions), kind, missing=True)
-    angles = {
-        f"{name}_deg": Variable((name,), low=0.0, high=end, grows=True, unit="deg")
-        for name, end in (("theta", 180.0), ("phi", 360.0))
-    }
+    angle = partial(Variable, low=0.0, grows=True, unit="deg")
+    angles = {"theta_deg": angle(("theta",), high=180.0), "phi_deg": angle(("phi",), high=360.0)}
     frequency = Variable(("frequency",), low=0.0, grows=True, unit="MHz")
     arrays = {"frequency_mhz": frequency, **dict.fromkeys(names, values)}
-    return Layout(WHAT, arrays | (angles if grid else {}), attributes or {})
+    return Layout(WHAT, arrays | (angles if grid else {}), said or {})
 
 
 def read_sampled_beams(path: str | Path) -> SampledBeams:
@@ -391,7 +386,7 @@ def read_sampled_beams(path: str | Path) -> SampledBeams:
     names = (POWER,) if POWER in there else FIELDS
     said = {"absolute": Attribute("boolean")}
     said |= {"products": Attribute("text")} if POWER in there else {}
-    found = read(layout=layout(names, "theta_deg" in there, attributes=said))
+    found = read(layout=layout(names, "theta_deg" in there, said=said))
     arrays, given = found.arrays, {}
     if POWER in arrays:
         with naming(path):

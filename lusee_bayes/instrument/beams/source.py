@@ -274,11 +274,6 @@ class BeamSource(ABC):
     def n_ports(self) -> int:
         """Number of ports; there are n_ports^2 real products."""
 
-    @property
-    def emits(self) -> bool:
-        """Whether ground or antennas emit, so that :meth:`background` is not zero."""
-        return False
-
     @abstractmethod
     def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
         """Return the field patterns of all ports on a grid.
