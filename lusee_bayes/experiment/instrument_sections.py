@@ -281,10 +281,8 @@ class _LuseepySection(_FileSection):
 
     def asked(self) -> dict[str, Any]:
         """What is asked of every file, as its beams take it."""
-        own = {
-            "luseepy_quadrature": self.quadrature == "luseepy",
-            "moon_k": self.moon_temperature_k,
-        }
+        luseepys = self.quadrature == "luseepy"
+        own = {"luseepy_quadrature": luseepys, "moon_k": self.moon_temperature_k}
         return own | self.model_dump(include={"interpolation", "turntable_offset_deg"})
 
 

@@ -44,7 +44,7 @@ from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout
 
 Matrix = Float[Array, "data unknowns"]
-ProductModes = Float[Array, "products modes"]
+BeamModes = Float[Array, "products modes"]
 BodyBeams = Float[Array, "runs products functions modes"]
 RowNumbers = Int[np.ndarray, " rows"]
 TimeModes = Float[Array, "products times modes"]
@@ -189,7 +189,7 @@ class Coupling(Described, eqx.Module):
 
 
 @compiled
-def body_beams(modes: ProductModes, pointing: Pointing) -> BodyBeams:
+def body_beams(modes: BeamModes, pointing: Pointing) -> BodyBeams:
     """Turn beams into the Moon-fixed frame, as every function of time of the pointing sees them.
 
     Parameters
@@ -210,7 +210,7 @@ def body_beams(modes: ProductModes, pointing: Pointing) -> BodyBeams:
     return xp.stack(runs)
 
 
-def _on_the_moon(modes: ProductModes, pointing: Pointing) -> Array:
+def _on_the_moon(modes: BeamModes, pointing: Pointing) -> Array:
     """Beams of the lander in the Moon-fixed frame, with the pointing's further turns."""
     if pointing.turns is None:
         return pointing.mcmf_from_lander(modes)
@@ -339,9 +339,7 @@ class CouplingMatrix(Coupling):
         return cls.of_modes(beams.modes, pointing, layout)
 
     @classmethod
-    def of_modes(
-        cls, modes: ProductModes, pointing: Pointing, layout: DataLayout
-    ) -> CouplingMatrix:
+    def of_modes(cls, modes: BeamModes, pointing: Pointing, layout: DataLayout) -> CouplingMatrix:
         """Build A of any number of beams from their coefficients; nothing is checked.
 
         Parameters
@@ -592,7 +590,7 @@ def rotations_of(pointing: Pointing) -> Rotations:
 
 
 @eqx.filter_jit
-def _turned(beams: ProductModes, pointing: Pointing) -> TimeModes:
+def _turned(beams: BeamModes, pointing: Pointing) -> TimeModes:
     """Rows of A of any number of beams, without a response and with nothing missing."""
     layout = DataLayout(beams.shape[0], pointing.n_times)
     coupling = CouplingMatrix.of_modes(beams, pointing, layout)
@@ -698,8 +696,7 @@ class Instrument(eqx.Module):
             If there is no such parameter; the message names the nearest.
         """
         value = self.value(name)
-        one = (jnp.ones_like(value),)
-        _, slope = jax.jvp(lambda v: self.beams({name: v}).modes, (value,), one)
+        _, slope = jax.jvp(lambda v: self.beams({name: v}).modes, (value,), (jnp.ones_like(value),))
         return ProductBeams(slope, self.frequency_mhz)
 
     def dense(self, values: Mapping[str, Float[Array, ""]]) -> Float[Array, "data modes"]:

@@ -4,6 +4,9 @@ Frames: Galactic (of the sky), MCMF (fixed to the Moon, from lunarsky), topocent
 y North, z up). Orientations come from lunarsky's own coordinate transformation at every time:
 nothing assumes that the Moon turns about a fixed axis, unless ``fixed_axis`` asks for it.
 
+Sites and turntable angles of arrays are said in many ways: :func:`site_of` and :func:`runs_of` take
+them.
+
 Where the Sun, the Earth and the planets stand, seen from the lander, comes from ERFA's analytical
 series (astropy's ``builtin``; nothing is downloaded): the Earth to 1e-7 au and the Moon to 10
 arcseconds, the Sun as good as the Earth, Jupiter, Saturn and Uranus to 90 arcseconds, the other
@@ -33,7 +36,8 @@ from lusee_bayes.instrument import times
 from lusee_bayes.instrument.schedule import Cut, Interval, Run, cut_intervals, cut_runs
 
 Vectors, Turn = Float[np.ndarray, "times 3"], Float[np.ndarray, "3 3"]
-ONE_CYCLE, Window = (Run(),), Literal["instant", "mean"]
+Window = Literal["instant", "mean"]
+ONE_CYCLE = (Run(),)
 # period after which the sky repeats itself in luseepy's engine croissant
 LUSEEPY_MONTH_HOURS = 655.72
 
@@ -167,6 +171,7 @@ class Observation(checks.Described):
         """
         cuts, t0 = cut_runs(runs, step_s), times.utc_from_text("start", start)
         place = {"lon_deg": lon_deg, "lat_deg": lat_deg, "step_s": step_s, "fixed_axis": fixed_axis}
+        place["turntable_deg"] = tuple(run.turntable_deg for run in runs)
         return cls._of_cuts(cuts, t0, np.arange(len(runs)), window, **place)
 
     @classmethod
@@ -207,10 +212,10 @@ class Observation(checks.Described):
             For intervals that overlap or are not in order, for a duty cycle of instants, and where
             an interval of nights holds none.
         """
-        cuts = cut_intervals(intervals, step_s)
-        turned = np.diff([one.turntable_deg for one in intervals], prepend=np.nan) != 0.0
+        cuts, angles = cut_intervals(intervals, step_s), [one.turntable_deg for one in intervals]
         place = {"lon_deg": lon_deg, "lat_deg": lat_deg, "step_s": step_s, "fixed_axis": fixed_axis}
-        return cls._of_cuts(cuts, intervals[0].start_time, np.cumsum(turned) - 1, window, **place)
+        number, place["turntable_deg"] = runs_of(angles, len(intervals))
+        return cls._of_cuts(cuts, intervals[0].start_time, number, window, **place)
 
     @classmethod
     def _of_cuts(
@@ -233,9 +238,8 @@ class Observation(checks.Described):
                 "samples that are instants have no duty cycle; take windows "
                 "(observation.window=mean), or leave out the schedule's duty_cycle"
             )
-        angles = tuple(cuts[k].of.turntable_deg for k in np.unique(number, return_index=True)[1])
-        at, run = times.later(t0, times_s), number[cut_of]
-        observation = cls(times=at, run=run, turntable_deg=angles, windows=windows, **place)
+        at = times.later(t0, times_s)
+        observation = cls(times=at, run=number[cut_of], windows=windows, **place)
         night_only = np.array([cut.of.night_only for cut in cuts])
         if not night_only.any():
             return observation
@@ -280,9 +284,8 @@ class Observation(checks.Described):
     @property
     def live_s(self) -> Times:
         """Integration time of every sample, in seconds."""
-        if self.windows is None:
-            return np.full(self.n_times, float(self.step_s))
-        return self.windows.live_per_sample_s
+        steps = np.full(self.n_times, float(self.step_s))
+        return steps if self.windows is None else self.windows.live_per_sample_s
 
     def at_nodes(self, n: int) -> tuple[Observation, times.Numbers, times.Nodes]:
         """Return the observation at instants whose weighted means are those over the windows.

@@ -113,11 +113,10 @@ class Pointing(eqx.Module):
         """
         if order is not None and order < 0:
             raise InputError(f"the order of the tilt expansion must be 0, 1, ..., got {order}")
-        angle = 0.0
-        if observation.windows is not None:
-            longest = (observation.windows.end_s - observation.windows.start_s).max()
-            angle = lmax * FASTEST_TURN * float(longest) / 2.0
-        instants, sample, weight = observation.at_nodes(sufficient_nodes(angle))
+        windows = observation.windows
+        longest = 0.0 if windows is None else float((windows.end_s - windows.start_s).max())
+        n = sufficient_nodes(lmax * FASTEST_TURN * longest / 2.0)
+        instants, sample, weight = observation.at_nodes(n)
         mcmf = instants.mcmf_from_galactic
         if pole_frame is None:
             pole_frame = mean_pole_frame(mcmf)

@@ -4,9 +4,9 @@ Voltages s_i give V_ij = <s_i conj(s_j)>: one real number for each antenna (auto
 each pair (Re, Im). They are ordered and labelled as in luseepy:
 ``00R, 01R, 01I, 02R, 02I, 03R, 03I, 11R, 12R, ... 33R``, n^2 real products in all.
 
-Arrays of measured correlations come as instruments and their software have them: names of products,
-signs of imaginary parts, sites and angles are said in many ways, which
-:meth:`.Visibilities.from_arrays` takes through the functions of this module.
+Arrays of measured correlations come as instruments and their software have them: names of products
+and signs of imaginary parts are said in many ways, which :meth:`.Visibilities.from_arrays` takes
+through the functions of this module.
 
 A :class:`DataLayout` says where each entry of the data vector d belongs: which product, which time.
 d is stacked product by product with time running fastest. Samples that are flagged or were never
@@ -317,9 +317,7 @@ class DataLayout(Described, eqx.Module):
         return self.scatter(namespace(self.index).ones(self.size, dtype=bool))
 
     def _positions(self) -> np.ndarray:
-        if self.index is None:
-            return np.arange(self.size)
-        return np.asarray(self.index)
+        return np.arange(self.size) if self.index is None else np.asarray(self.index)
 
     def require_same(self, other: DataLayout) -> None:
         """Check that another layout holds the same samples, where both are known.

@@ -19,6 +19,7 @@ from functools import cached_property, lru_cache
 from io import StringIO
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from astropy.time import Time
@@ -262,18 +263,16 @@ def _of_table(path: str, text: str) -> tuple[Interval, ...]:
 
 def _interval(place: str, row: dict[str, str]) -> Interval:
     with naming(place):
-        numbers = {}
+        known: dict[str, Any] = {"where": place}
         for name, default in (("turntable_deg", ""), ("duty_cycle", "1")):
             try:
-                numbers[name] = float(row.get(name) or default)
+                known[name] = float(row.get(name) or default)
             except ValueError as error:
                 raise InputError(f"{name} is '{row[name]}', not a number") from error
         night = (row.get("night_only", "").strip() or "false").lower()
         if night not in ("true", "false"):
             raise InputError(f"night_only is '{night}'; write true or false")
-        return Interval(
-            row["start"], row["end"], **numbers, night_only=night == "true", where=place
-        )
+        return Interval(row["start"], row["end"], night_only=night == "true", **known)
 
 
 def _of_commands(path: str, text: str) -> tuple[Interval, ...]:

@@ -384,16 +384,14 @@ Timestamp = Literal["start", "middle", "end", "instant"]
 TO_MIDDLE = {"start": 0.5, "middle": 0.0, "end": -0.5}
 # overlaps up to these are rounding of times: in seconds, and as a share of the step
 ROUNDED_S, ROUNDED_SHARE = 1e-3, 1e-4
+# what need not be given: from sample to sample, and what of it was integrated, in seconds
+Step, Live = float | None, Times | None
 # middles, step and windows of samples
 Windowed = tuple[Time, float, Windows | None]
 
 
 def windows_of(
-    times: Time,
-    timestamp: str,
-    step_s: float | None = None,
-    live_s: Times | None = None,
-    bounds: Any = None,
+    times: Time, timestamp: str, step_s: Step = None, live_s: Live = None, bounds: Any = None
 ) -> Windowed:
     """Return the middles, the step and the windows of samples.
 
@@ -441,7 +439,7 @@ def windows_of(
     return _windowed(times, start, end, step_s, live_s)
 
 
-def _bounded(times: Time, bounds: Time, step_s: float | None, live_s: Times | None) -> Windowed:
+def _bounded(times: Time, bounds: Time, step_s: Step, live_s: Live) -> Windowed:
     start, end = (seconds_from(times, bounds[:, k]) for k in (0, 1))
     length = end - start
     step = step_of(times, float(length[0]) if step_s is None and len(times) == 1 else step_s)
@@ -486,9 +484,7 @@ def _rounding(step_s: float) -> float:
     return max(ROUNDED_S, ROUNDED_SHARE * step_s)
 
 
-def _windowed(
-    times: Time, start_s: Times, end_s: Times, step_s: float, live_s: Times | None
-) -> Windowed:
+def _windowed(times: Time, start_s: Times, end_s: Times, step_s: float, live_s: Live) -> Windowed:
     """Middles of windows of one piece each, and these, with overlaps by rounding cut off."""
     middles, half = later(times, (start_s + end_s) / 2.0), (end_s - start_s) / 2.0
     overlap = end_s[:-1] - start_s[1:] - np.diff(seconds_from(times[0], times))

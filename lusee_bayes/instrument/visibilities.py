@@ -38,11 +38,8 @@ from lusee_bayes.instrument.times import JD_SCALES, Windows, later, utc_of_jd, u
 
 PIECES = ("piece_sample", "piece_start_s", "piece_end_s", "piece_live_s")
 # times for people are written to the millisecond
-ENCODING = {
-    "units": "milliseconds since 1970-01-01",
-    "calendar": "proleptic_gregorian",
-    "dtype": "int64",
-}
+SINCE = "milliseconds since 1970-01-01"
+ENCODING = {"units": SINCE, "calendar": "proleptic_gregorian", "dtype": "int64"}
 
 
 def _datetimes(times: Time) -> np.ndarray:
@@ -262,11 +259,10 @@ class Visibilities(checks.Described):
             )
         checks.require_positive("frequency_mhz", frequency_mhz)
         require_mhz("frequency_mhz", frequency_mhz)
-        lon_deg, lat_deg = site_of(site)
         run, angles = runs_of(turntable_deg, len(utc))
         live_s = None if live_s is None else numbers_of_times("live_s", live_s, len(utc))
         middles, step_s, windows = windows_of(utc, timestamp, step_s, live_s, bounds)
-        observation = Observation(lon_deg, lat_deg, middles, run, angles, step_s, windows=windows)
+        observation = Observation(*site_of(site), middles, run, angles, step_s, windows=windows)
         layout = DataLayout.from_flags(np.isnan(values))
         return cls(layout.gather(values), layout, observation, float(frequency_mhz))
 

@@ -147,9 +147,9 @@ class Waterfall(Described):
         values = self.grid[:, :, channel]
         present = np.isfinite(values)
         within = np.array([p.j < n_ports for p in products.all_products()])
-        if present[~within].any():
-            first = int(np.argmax(present.any(1) & ~within))
-            label = products.all_products()[first].label
+        beyond = present.any(1) & ~within
+        if beyond.any():
+            label = products.labels()[int(np.argmax(beyond))]
             raise InputError(
                 f"{self.path} has the product {label}, but the beams are those of {n_ports} ports; "
                 "give beam.rotations_deg an angle for every port"
@@ -583,10 +583,8 @@ def _hdus(name: str, values: Any, unit: str) -> list[fits.ImageHDU]:
     parts = {name: np.asarray(values)}
     if np.iscomplexobj(values):
         parts = {f"{name}_real": np.real(values).copy(), f"{name}_imag": np.imag(values).copy()}
-    return [
-        fits.ImageHDU(part, fits.Header([("EXTNAME", key), ("BUNIT", unit)]))
-        for key, part in parts.items()
-    ]
+    headers = [fits.Header([("EXTNAME", key), ("BUNIT", unit)]) for key in parts]
+    return list(map(fits.ImageHDU, parts.values(), headers))
 
 
 def _eigenvalues(data: ByTime) -> Float[np.ndarray, "times frequencies ports"]:

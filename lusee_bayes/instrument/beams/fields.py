@@ -145,7 +145,7 @@ class AntennaFields(checks.Described, eqx.Module):
     grid: HemisphereGrid
 
     def __check_init__(self):
-        expected = (self.n_antennas, len(self.grid.theta), self.grid.n_phi)
+        expected = (*self.e_theta.shape[:1], len(self.grid.theta), self.grid.n_phi)
         for name, field in (("e_theta", self.e_theta), ("e_phi", self.e_phi)):
             checks.require_shape(name, field, expected)
             if field.dtype != np.complex128:
@@ -155,11 +155,10 @@ class AntennaFields(checks.Described, eqx.Module):
                 )
 
     def description(self) -> tuple[str, ...]:
-        return (
-            f"E_theta and E_phi of {self.n_antennas} antennas, complex",
-            f"{len(self.grid.theta)} angles from zenith to horizon x {self.grid.n_phi} azimuths, "
-            "from East towards North",
-        )
+        n_theta, n_phi = len(self.grid.theta), self.grid.n_phi
+        angles = f"{n_theta} angles from zenith to horizon x {n_phi} azimuths"
+        what = f"E_theta and E_phi of {self.n_antennas} antennas, complex"
+        return what, f"{angles}, from East towards North"
 
     @property
     def n_antennas(self) -> int:

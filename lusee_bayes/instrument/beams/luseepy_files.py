@@ -556,10 +556,9 @@ def read_scalar_beam(path: str | Path) -> ScalarBeam:
             f"{path}: the fields have {sizes['theta']} x {sizes['phi']} directions, the header "
             f"says {said['THETA_N']} x {said['PHI_N']} (THETA_N, PHI_N)"
         )
+    pair = [images[f"{name}_real"] + 1j * images[f"{name}_imag"] for name in FIELD_NAMES]
     # the last azimuth is the first once more
-    e_theta, e_phi = (
-        (images[f"{name}_real"] + 1j * images[f"{name}_imag"])[..., :-1] for name in FIELD_NAMES
-    )
+    e_theta, e_phi = (part[..., :-1] for part in pair)
     theta = np.linspace(0.0, np.pi / 2.0, sizes["theta"])
     z = images["Z_real"] + 1j * images["Z_imag"] if set(IMPEDANCE) <= set(images) else None
     return ScalarBeam(str(path), images["freq"], theta, e_theta, e_phi, images["gain_conv"], z)

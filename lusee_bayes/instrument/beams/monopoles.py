@@ -307,8 +307,7 @@ def monopole_beams(
 def _modes(
     frequency_mhz: Frequency, lmax: int, monopoles: Monopoles, stokes: str, nodes: Any
 ) -> Float[Array, "products modes"]:
-    exact = HemisphereGrid.for_lmax
-    grid = exact(lmax) if nodes is None else HemisphereGrid.gauss_legendre(*nodes)
+    grid = HemisphereGrid.gauss_legendre(*nodes) if nodes else HemisphereGrid.for_lmax(lmax)
     return product_modes(monopoles.fields(frequency_mhz, grid), lmax, stokes=stokes)
 
 
@@ -487,5 +486,4 @@ def source_response(
     response = beams_towards(frequency_mhz, directions, monopoles)
     if not is_traced(stokes_v) and stokes_v == 0.0:
         return response
-    circular = beams_towards(frequency_mhz, directions, monopoles, stokes="V")
-    return response + stokes_v * circular
+    return response + stokes_v * beams_towards(frequency_mhz, directions, monopoles, stokes="V")

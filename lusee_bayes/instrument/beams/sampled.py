@@ -118,13 +118,6 @@ class Directions:
             )
         return cls(np.radians(used), n)
 
-    @property
-    def text(self) -> str:
-        """What they are, in words."""
-        if self.theta is None:
-            return f"HEALPix pixels of NSIDE {self.nside}"
-        return f"{len(self.theta)} theta x {self.n_phi} phi"
-
     def above(self, values: np.ndarray, what: str) -> np.ndarray:
         """Return the values in these directions of those in all directions that were given.
 
@@ -181,10 +174,8 @@ class Directions:
 def _axes(theta: np.ndarray, phi: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """East, North and up components of the unit vectors along theta and phi."""
     zero = np.zeros(np.broadcast_shapes(theta.shape, phi.shape))
-    return (
-        [np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), zero - np.sin(theta)],
-        [zero - np.sin(phi), zero + np.cos(phi), zero],
-    )
+    along_theta = [np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), zero - np.sin(theta)]
+    return along_theta, [zero - np.sin(phi), zero + np.cos(phi), zero]
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -229,8 +220,10 @@ class SampledBeams(Described, BeamSource):
         kind = "E fields of" if self.products is None else "product beams of"
         scale = "K per K" if self.absolute else "to be scaled so that autos integrate to one"
         known = listed(tuple(f"{f:g}" for f in self.frequencies_mhz))
-        what = f"{kind} {self.n_ports} antennas, {self.directions.text}"
-        return what, f"at {known} MHz; {scale}"
+        at, where = self.directions, f"HEALPix pixels of NSIDE {self.directions.nside}"
+        if at.theta is not None:
+            where = f"{len(at.theta)} theta x {at.n_phi} phi"
+        return f"{kind} {self.n_ports} antennas, {where}", f"at {known} MHz; {scale}"
 
     @property
     def n_ports(self) -> int:

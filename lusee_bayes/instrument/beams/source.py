@@ -68,6 +68,10 @@ class Receiver(ABC):
     def load(self, frequency_mhz: float) -> Ohms:
         """Return ZL in Ohm. InputError at a frequency that the receiver does not know."""
 
+    def receiver(self) -> Receiver:
+        """The receiver: those that parameters determine are sections of a scenario themselves."""
+        return self
+
 
 def _each_port(value: Any) -> Any:
     """One number stands for all ports."""
@@ -83,15 +87,7 @@ def _ports(entry: Any) -> Any:
 NotNegative = Annotated[float, Field(ge=0, le=LARGEST)]
 
 
-class ModelledReceiver(Section, Receiver):
-    """A receiver that its parameters determine, which are a section of a scenario as they are."""
-
-    def receiver(self) -> Receiver:
-        """The receiver."""
-        return self
-
-
-class JFETReceiver(ModelledReceiver):
+class JFETReceiver(Section, Receiver):
     """luseepy's preamplifiers; every entry is one number, or one for each port.
 
     Their input impedance follows the circuit ::
@@ -139,7 +135,7 @@ class JFETReceiver(ModelledReceiver):
         return np.diag(z)
 
 
-class CapacitorReceiver(ModelledReceiver):
+class CapacitorReceiver(Section, Receiver):
     """Capacitors: one number, or one for each port.
 
     Their impedance is Z = 1 / (i w C); luseepy's ``IdealCapacitorReceiver``.
