@@ -145,9 +145,10 @@ class AntennaFields(checks.Described, eqx.Module):
     grid: HemisphereGrid
 
     def __check_init__(self):
-        expected = (*self.e_theta.shape[:1], len(self.grid.theta), self.grid.n_phi)
+        expected = (None, len(self.grid.theta), self.grid.n_phi)
         for name, field in (("e_theta", self.e_theta), ("e_phi", self.e_phi)):
             checks.require_shape(name, field, expected)
+            expected = field.shape
             if field.dtype != np.complex128:
                 raise InputError(
                     f"{name} must be a complex128 array, got {field.dtype}; "
