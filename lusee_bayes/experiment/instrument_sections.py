@@ -18,7 +18,6 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BeforeValidator, Field, model_validator
 
 from lusee_bayes.core.section import (
-    LARGEST,
     Angle,
     Positive,
     Section,
@@ -154,70 +153,6 @@ def _observation(section: ObservationSection, intervals: tuple[Interval, ...]) -
     return Observation.from_runs(runs, start=section.start, **common)
 
 
-def _each_port(value: Any) -> Any:
-    """One number stands for all ports."""
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    return (value,) * N_ANTENNAS if number else value
-
-
-def _ports(entry: Any) -> Any:
-    four = Field(min_length=N_ANTENNAS, max_length=N_ANTENNAS)
-    return Annotated[tuple[entry, ...], four, BeforeValidator(_each_port)]
-
-
-NotNegative = Annotated[float, Field(ge=0, le=LARGEST)]
-_JFET, _CAPACITOR = JFETReceiver(), CapacitorReceiver()
-
-
-class JFETSection(Section):
-    """luseepy's preamplifiers; every entry is one number, or one for each port.
-
-    Attributes
-    ----------
-    capacitance_pf : tuple of float
-        Capacitance.
-    inductance_nh : tuple of float
-        Inductance.
-    parallel_ohm : tuple of float
-        Parallel resistance.
-    series_ohm : tuple of float
-        Series resistance.
-    skin_ohm : tuple of float
-        Resistance of the skin effect.
-    skin_power : tuple of float
-        Power of the frequency in the skin effect.
-    """
-
-    model: Literal["jfet"] = "jfet"
-    capacitance_pf: _ports(Positive) = _JFET.capacitance_pf
-    inductance_nh: _ports(NotNegative) = _JFET.inductance_nh
-    parallel_ohm: _ports(Positive) = _JFET.parallel_ohm
-    series_ohm: _ports(NotNegative) = _JFET.series_ohm
-    skin_ohm: _ports(NotNegative) = _JFET.skin_ohm
-    skin_power: _ports(Annotated[float, Field(ge=-10, le=10)]) = _JFET.skin_power
-
-    def receiver(self) -> Receiver:
-        """The receiver."""
-        return JFETReceiver(**self.model_dump(exclude={"model"}))
-
-
-class CapacitorSection(Section):
-    """Capacitors: one number, or one for each port.
-
-    Attributes
-    ----------
-    capacitance_pf : tuple of float
-        Capacitance.
-    """
-
-    model: Literal["capacitor"] = "capacitor"
-    capacitance_pf: _ports(Positive) = _CAPACITOR.capacitance_pf
-
-    def receiver(self) -> Receiver | None:
-        """The receiver, or None for open ports."""
-        return CapacitorReceiver(self.capacitance_pf)
-
-
 class ReceiverFileSection(Section):
     """Loads from a file: images ``freq``, ``ZL_real`` and ``ZL_imag``.
 
@@ -251,7 +186,7 @@ def _named(value: Any) -> Any:
 
 
 ReceiverSection = Annotated[
-    JFETSection | CapacitorSection | ReceiverFileSection | OpenSection,
+    JFETReceiver | CapacitorReceiver | ReceiverFileSection | OpenSection,
     Field(discriminator="model"),
     BeforeValidator(_named),
 ]
@@ -346,12 +281,9 @@ class _LuseepySection(_FileSection):
 
     def asked(self) -> dict[str, Any]:
         """What is asked of every file, as its beams take it."""
-        return {
-            "interpolation": self.interpolation,
-            "turntable_offset_deg": self.turntable_offset_deg,
-            "luseepy_quadrature": self.quadrature == "luseepy",
-            "moon_k": self.moon_temperature_k,
-        }
+        luseepys = self.quadrature == "luseepy"
+        own = {"luseepy_quadrature": luseepys, "moon_k": self.moon_temperature_k}
+        return own | self.model_dump(include={"interpolation", "turntable_offset_deg"})
 
 
 class ScalarBeamSection(_LuseepySection):
@@ -382,8 +314,8 @@ class ScalarBeamSection(_LuseepySection):
 
     def source(self) -> BeamSource:
         """The pattern of the file, turned to every angle."""
-        beam, ports = read_scalar_beam(self.file), self.rotations_deg
-        return replace(beam, taper=self.taper, rotations_deg=ports, **self.asked())
+        beam, own = read_scalar_beam(self.file), self.model_dump(include={"taper", "rotations_deg"})
+        return replace(beam, **own, **self.asked())
 
 
 class ResponseSection(_LuseepySection):
@@ -437,7 +369,7 @@ class SampledBeamSection(_FileSection):
 
     def source(self) -> BeamSource:
         """The beams of the file."""
-        asked = {"turntable_offset_deg": self.turntable_offset_deg, "normalise": self.normalise}
+        asked = self.model_dump(exclude={"model", "file"})
         return replace(read_sampled(self.file), **asked)
 
 

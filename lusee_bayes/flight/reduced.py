@@ -20,8 +20,8 @@ from lusee_bayes.flight.gain_model import COUNTS, LEAD, LETTERS, N_COMPONENTS, P
 from lusee_bayes.flight.session import AUTOS, FIRST_PORT, N_PRODUCTS, NO_LEVEL, PORTS, SECOND_PORT
 from lusee_bayes.instrument.averaging import binned
 from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ
-from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.products import DataLayout, labels, runs_of
+from lusee_bayes.instrument.observation import Observation, runs_of
+from lusee_bayes.instrument.products import DataLayout, labels
 from lusee_bayes.instrument.times import Windows, utc_of
 from lusee_bayes.instrument.visibilities import Calibration, Visibilities
 

@@ -52,6 +52,7 @@ Functions = Float[np.ndarray, "times functions"]
 Factors = Float[np.ndarray, "functions powers orders 2"]
 Moments = Float[np.ndarray, "times moments"]
 Series = Float[np.ndarray, "moments columns"]
+BinFlags, Bounds = Bool[np.ndarray, "products bins"], Float[np.ndarray, "times 2"]
 
 # of what is left out of any sample, relative to its visibility if what a beam sees of the sky falls
 # with ell to this power: less than 1e-6 of the radiometer noise in the fiducial case
@@ -74,18 +75,13 @@ def sufficient_nodes(angle: float) -> int:
         The lowest number whose mean of cos(angle x) over -1 < x < 1 errs by less than 1e-14 (from
         the remainder of the quadrature).
     """
-    n = 1
-    while _quadrature_error(n, angle) > ROUNDING:
+    n, error, smallest = 0, 1.0, np.finfo(np.float64).tiny
+    while error > ROUNDING:
         n += 1
+        # half of 2^(2n+1) n!^4 / ((2n+1) (2n)!^3) times the largest 2n-th derivative
+        log = 2 * n * np.log(2.0 * max(angle, smallest)) + 4 * lgamma(n + 1) - 3 * lgamma(2 * n + 1)
+        error = np.exp(log) / (2 * n + 1)
     return n
-
-
-def _quadrature_error(n: int, angle: float) -> float:
-    """Half of 2^(2n+1) n!^4 / ((2n+1) (2n)!^3) times the largest 2n-th derivative."""
-    if angle == 0.0:
-        return 0.0
-    log = 2 * n * np.log(2.0 * angle) + 4 * lgamma(n + 1) - 3 * lgamma(2 * n + 1)
-    return float(np.exp(log) / (2 * n + 1))
 
 
 def windowed(
@@ -124,7 +120,7 @@ def windowed(
     mean = np.add.reduceat(weight * delta, first)
     delta = delta - mean[sample]
     largest = float(np.abs(delta).max())
-    n_moments = _sufficient_moments(lmax * largest)
+    n_moments = terms_of_exponential(lmax * largest, ROUNDING)
     scaled = delta / (largest or 1.0)
     powers = tilt_powers(order)
     ex, ey = -tilt[:, 0], -tilt[:, 1]
@@ -143,12 +139,12 @@ def windowed(
     return azimuth[first] + mean, functions, factors
 
 
-def _sufficient_moments(angle: float) -> int:
-    """How many terms of exp(i x) are needed up to |x| = angle."""
-    n, term = 1, angle
-    while term > ROUNDING:
+def terms_of_exponential(size: float, tolerance: float) -> int:
+    """Return how many terms of exp(x) are needed up to ``|x|`` = size: size^n / n! < tolerance."""
+    n, term = 1, size
+    while term > tolerance:
         n += 1
-        term *= angle / n
+        term *= size / n
     return n
 
 
@@ -254,9 +250,7 @@ def product_live_s(data: Visibilities) -> float:
     return float(data.observation.live_s[data.layout.time].sum())
 
 
-def bins_of(
-    observation: Observation, bounds_s: Float[np.ndarray, "times 2"], to_s: float
-) -> Samples:
+def bins_of(observation: Observation, bounds_s: Bounds, to_s: float) -> Samples:
     """Return the number of the bin of every sample.
 
     Parameters
@@ -292,9 +286,7 @@ def bins_of(
     return bin_of
 
 
-def by_the_rule(
-    present: GridFlags, bin_of: Samples, live_s: Times
-) -> tuple[Bool[np.ndarray, "products bins"], TimeFlags]:
+def by_the_rule(present: GridFlags, bin_of: Samples, live_s: Times) -> tuple[BinFlags, TimeFlags]:
     """Return which products each bin has, and which samples it is made of.
 
     Parameters
@@ -315,9 +307,7 @@ def by_the_rule(
     return kept, used
 
 
-def binned(
-    observation: Observation, left: Samples, bin_of_left: Samples, to_s: float
-) -> Observation:
+def binned(observation: Observation, left: Samples, bin_of: Samples, to_s: float) -> Observation:
     """Return the times and windows of bins.
 
     Parameters
@@ -326,24 +316,22 @@ def binned(
         Of samples with windows.
     left : (samples,) array of int
         The samples that the bins are made of.
-    bin_of_left : (samples,) array of int
+    bin_of : (samples,) array of int
         The bin of each of them: 0, 1, ... without a gap.
     to_s : float
         Length of the bins, in seconds.
     """
-    first = np.searchsorted(bin_of_left, np.arange(bin_of_left[-1] + 1))
+    first = np.searchsorted(bin_of, np.arange(bin_of[-1] + 1))
     here = observation.select(np.isin(np.arange(observation.n_times), left))
     windows = here.windows
     seconds = seconds_from(here.times[0], here.times)
     offset = seconds[windows.sample]
     start, end = windows.start_s + offset, windows.end_s + offset
-    bin_of_piece, share = bin_of_left[windows.sample], windows.live_s / (end - start)
+    bin_of_piece, share = bin_of[windows.sample], windows.live_s / (end - start)
     # the live time that the piece would have with the share of the one before
     differ = np.abs(np.diff(share)) * (end - start)[1:]
-    merged = (
-        (np.diff(bin_of_piece) == 0) & (start[1:] - end[:-1] <= ROUNDING_S) & (differ <= ROUNDING_S)
-    )
-    at = np.flatnonzero(np.append(True, ~merged))
+    same, touching = np.diff(bin_of_piece) == 0, start[1:] - end[:-1] <= ROUNDING_S
+    at = np.flatnonzero(np.append(True, ~(same & touching & (differ <= ROUNDING_S))))
     start, bin_of_piece = start[at], bin_of_piece[at]
     end = end[np.append(at[1:], len(end)) - 1]
     # pieces touch up to rounding

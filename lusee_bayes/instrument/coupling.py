@@ -36,14 +36,7 @@ from jaxtyping import Float, Int
 from lusee_bayes.core.arrays import Array, DataVector, Modes, compiled, namespace
 from lusee_bayes.core.checks import Described, require_array, require_float64, require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import (
-    lmax_of,
-    mode_numbers,
-    n_modes,
-    tilts,
-    turn_about,
-    turn_about_z,
-)
+from lusee_bayes.core.harmonics import lmax_of, mode_numbers, tilts, turn_about, turn_about_z
 from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.beams.monopoles import Monopoles, monopole_beams, parameter, with_values
 from lusee_bayes.instrument.observation import Observation
@@ -51,7 +44,7 @@ from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout
 
 Matrix = Float[Array, "data unknowns"]
-ProductModes = Float[Array, "products modes"]
+BeamModes = Float[Array, "products modes"]
 BodyBeams = Float[Array, "runs products functions modes"]
 RowNumbers = Int[np.ndarray, " rows"]
 TimeModes = Float[Array, "products times modes"]
@@ -93,7 +86,6 @@ class Coupling(Described, eqx.Module):
     def _matrix(self) -> Matrix:
         """A as a matrix, as all of the following without the response."""
 
-    @abstractmethod
     def plus(self, amplitude: Float[Array, ""], direction: Coupling) -> Coupling:
         """Add a multiple of another coupling matrix: R (A + amplitude dA), with the response R.
 
@@ -114,6 +106,10 @@ class Coupling(Described, eqx.Module):
         InputError
             If ``direction`` has a response, or is of other data or unknowns.
         """
+        require_shape("the direction", direction, self.shape)
+        if direction.response is not None:
+            raise InputError("the direction must have no response of its own")
+        return DenseCoupling(self._matrix() + amplitude * direction.dense(), response=self.response)
 
     @abstractmethod
     def _forward(self, sky: Modes) -> DataVector:
@@ -193,7 +189,7 @@ class Coupling(Described, eqx.Module):
 
 
 @compiled
-def body_beams(modes: ProductModes, pointing: Pointing) -> BodyBeams:
+def body_beams(modes: BeamModes, pointing: Pointing) -> BodyBeams:
     """Turn beams into the Moon-fixed frame, as every function of time of the pointing sees them.
 
     Parameters
@@ -214,7 +210,7 @@ def body_beams(modes: ProductModes, pointing: Pointing) -> BodyBeams:
     return xp.stack(runs)
 
 
-def _on_the_moon(modes: ProductModes, pointing: Pointing) -> Array:
+def _on_the_moon(modes: BeamModes, pointing: Pointing) -> Array:
     """Beams of the lander in the Moon-fixed frame, with the pointing's further turns."""
     if pointing.turns is None:
         return pointing.mcmf_from_lander(modes)
@@ -270,21 +266,11 @@ class DenseCoupling(Coupling):
     def _matrix(self):
         return self.matrix
 
-    def plus(self, amplitude, direction):
-        require_shape("the direction", direction, self.shape)
-        _require_bare(direction)
-        return DenseCoupling(self.matrix + amplitude * direction.dense(), response=self.response)
-
     def _forward(self, sky):
         return self.matrix @ sky
 
     def _backward(self, data):
         return self.matrix.T @ data
-
-
-def _require_bare(direction: Coupling) -> None:
-    if direction.response is not None:
-        raise InputError("the direction must have no response of its own")
 
 
 def as_coupling(coupling: Coupling | Array) -> Coupling:
@@ -341,7 +327,7 @@ class CouplingMatrix(Coupling):
         InputError
             If beams, pointing and layout differ in lmax, products or times.
         """
-        size = n_modes(len(pointing.pole_from_galactic.blocks) - 1)
+        size = len(pointing.pole_from_galactic.blocks) ** 2
         require_shape("the beam coefficients", beams.modes, (beams.n_products, size))
         if layout is None:
             layout = DataLayout(beams.n_products, pointing.n_times)
@@ -353,9 +339,7 @@ class CouplingMatrix(Coupling):
         return cls.of_modes(beams.modes, pointing, layout)
 
     @classmethod
-    def of_modes(
-        cls, modes: Float[Array, "beams modes"], pointing: Pointing, layout: DataLayout
-    ) -> CouplingMatrix:
+    def of_modes(cls, modes: BeamModes, pointing: Pointing, layout: DataLayout) -> CouplingMatrix:
         """Build A of any number of beams from their coefficients; nothing is checked.
 
         Parameters
@@ -395,11 +379,8 @@ class CouplingMatrix(Coupling):
         return cls.build(beams, Pointing.of(observation, beams.lmax))
 
     def description(self) -> tuple[str, ...]:
-        return (
-            *super().description(),
-            *self.layout.description(),
-            "never formed: beams, pointing and a turn for each order m",
-        )
+        how = "never formed: beams, pointing and a turn for each order m"
+        return *super().description(), *self.layout.description(), how
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -415,16 +396,12 @@ class CouplingMatrix(Coupling):
         return self.response is None
 
     def plus(self, amplitude, direction):
-        _require_bare(direction)
-        if not isinstance(direction, CouplingMatrix):
-            dense = DenseCoupling(self._matrix(), response=self.response)
-            return dense.plus(amplitude, direction)
+        if not isinstance(direction, CouplingMatrix) or direction.response is not None:
+            return super().plus(amplitude, direction)
         self.layout.require_same(direction.layout)
-        return replace(
-            self,
-            body_beams=self.body_beams + amplitude * direction.body_beams,
-            by_order=self.by_order + amplitude * direction.by_order,
-        )
+        body = self.body_beams + amplitude * direction.body_beams
+        by_order = self.by_order + amplitude * direction.by_order
+        return replace(self, body_beams=body, by_order=by_order)
 
     def rows(self, product: RowNumbers, time: RowNumbers) -> Float[Array, "rows modes"]:
         """Compute chosen rows of A, flagged or not, without the response.
@@ -470,8 +447,7 @@ class CouplingMatrix(Coupling):
         (n, features) array
             cos m phi(t) and sin m phi(t) times every u_j(t).
         """
-        angle = self.pointing.azimuth[times, None] * np.arange(self.lmax + 1.0)
-        waves = np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
+        waves = np.concatenate(_phases(self.pointing.azimuth[times], self.lmax), axis=1)
         return (self.pointing.functions[times][:, :, None] * waves[:, None]).reshape(len(times), -1)
 
     @compiled
@@ -489,7 +465,7 @@ class CouplingMatrix(Coupling):
         zero_order = np.arange(self.lmax + 1)[None] == 0
         crossed = xp.concatenate([minus, -xp.where(zero_order, 0.0, plus)])
         both = xp.stack([pairs.T, crossed.T], axis=-1)
-        cosine, sine = _phases(self.pointing, self.lmax)
+        cosine, sine = _phases(self.pointing.azimuth, self.lmax)
         functions = self.pointing.functions
         grids = []
         for run, span in self.pointing.runs():
@@ -504,7 +480,7 @@ class CouplingMatrix(Coupling):
         """The transpose of :func:`_forward`, step by step."""
         n = self.lmax + 1
         grid = self.layout.scatter(data)
-        cosine, sine = _phases(self.pointing, self.lmax)
+        cosine, sine = _phases(self.pointing.azimuth, self.lmax)
         functions = self.pointing.functions
         both = 0.0
         for run, span in self.pointing.runs():
@@ -544,19 +520,17 @@ def turned_about_pole(beams: TimeModes, azimuth: Float[Array, " times"]) -> Time
     (products, times, modes) array
         Coefficients in the mean-pole frame.
     """
-    _, m = mode_numbers(lmax_of(beams.shape[-1]))
+    lmax = lmax_of(beams.shape[-1])
+    _, m = mode_numbers(lmax)
     mirrored = beams[..., np.arange(len(m)) - 2 * m]
-    xp = namespace(beams, azimuth)
-    angle = azimuth[:, None] * np.arange(0.0, m.max() + 1.0)[None]
-    cosine, sine = xp.cos(angle), xp.sin(angle)
+    cosine, sine = _phases(azimuth, lmax)
     signed = sine[:, np.abs(m)] * np.sign(m).astype(np.float64)[None]
     return beams * cosine[None, :, np.abs(m)] - mirrored * signed[None]
 
 
-def _phases(pointing: Pointing, lmax: int) -> tuple[Array, Array]:
+def _phases(azimuth: Float[Array, " times"], lmax: int) -> tuple[Array, Array]:
     """cos m phi(t) and sin m phi(t), each (times, orders)."""
-    xp = namespace(pointing.azimuth)
-    angle = pointing.azimuth[:, None] * np.arange(lmax + 1.0)[None]
+    xp, angle = namespace(azimuth), azimuth[:, None] * np.arange(lmax + 1.0)[None]
     return xp.cos(angle), xp.sin(angle)
 
 
@@ -603,12 +577,11 @@ def rotations_of(pointing: Pointing) -> Rotations:
         For every ell up to the lmax of ``pointing``: topocentric orders first, Galactic orders
         last.
     """
-    lmax = len(pointing.pole_from_galactic.blocks) - 1
-    size = n_modes(lmax)
-    blocks: list[list[Array]] = [[] for _ in range(lmax + 1)]
-    for start in range(0, size, CHUNK):
-        rows = _turned(jnp.eye(CHUNK, size, start), pointing)
-        for ell in range(lmax + 1):
+    n_ells = len(pointing.pole_from_galactic.blocks)
+    blocks: list[list[Array]] = [[] for _ in range(n_ells)]
+    for start in range(0, n_ells**2, CHUNK):
+        rows = _turned(jnp.eye(CHUNK, n_ells**2, start), pointing)
+        for ell in range(n_ells):
             first, end = max(start, ell**2), min(start + CHUNK, (ell + 1) ** 2)
             if first < end:
                 inside = rows[first - start : end - start, :, ell**2 : (ell + 1) ** 2]
@@ -617,7 +590,7 @@ def rotations_of(pointing: Pointing) -> Rotations:
 
 
 @eqx.filter_jit
-def _turned(beams: ProductModes, pointing: Pointing) -> TimeModes:
+def _turned(beams: BeamModes, pointing: Pointing) -> TimeModes:
     """Rows of A of any number of beams, without a response and with nothing missing."""
     layout = DataLayout(beams.shape[0], pointing.n_times)
     coupling = CouplingMatrix.of_modes(beams, pointing, layout)
@@ -723,8 +696,7 @@ class Instrument(eqx.Module):
             If there is no such parameter; the message names the nearest.
         """
         value = self.value(name)
-        one = (jnp.ones_like(value),)
-        _, slope = jax.jvp(lambda v: self.beams({name: v}).modes, (value,), one)
+        _, slope = jax.jvp(lambda v: self.beams({name: v}).modes, (value,), (jnp.ones_like(value),))
         return ProductBeams(slope, self.frequency_mhz)
 
     def dense(self, values: Mapping[str, Float[Array, ""]]) -> Float[Array, "data modes"]:
@@ -748,10 +720,9 @@ class Instrument(eqx.Module):
         if self.rotations is None:
             raise InputError("prepare the instrument first: instrument = instrument.prepared()")
         beams = self.beams(values).modes
-        rows = [
-            jnp.einsum("km,mtn->ktn", beams[:, ell**2 : (ell + 1) ** 2], block)
-            for ell, block in enumerate(self.rotations)
-        ]
+        ells = jnp.split(beams, np.arange(1, len(self.rotations)) ** 2, axis=1)
+        pairs = zip(ells, self.rotations, strict=True)
+        rows = [jnp.einsum("km,mtn->ktn", part, block) for part, block in pairs]
         return self.layout.gather(jnp.concatenate(rows, axis=2))
 
     def coupling_of(self, beams: ProductBeams) -> CouplingMatrix:

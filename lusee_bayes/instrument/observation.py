@@ -4,6 +4,9 @@ Frames: Galactic (of the sky), MCMF (fixed to the Moon, from lunarsky), topocent
 y North, z up). Orientations come from lunarsky's own coordinate transformation at every time:
 nothing assumes that the Moon turns about a fixed axis, unless ``fixed_axis`` asks for it.
 
+Sites and turntable angles of arrays are said in many ways: :func:`site_of` and :func:`runs_of` take
+them.
+
 Where the Sun, the Earth and the planets stand, seen from the lander, comes from ERFA's analytical
 series (astropy's ``builtin``; nothing is downloaded): the Earth to 1e-7 au and the Moon to 10
 arcseconds, the Sun as good as the Earth, Jupiter, Saturn and Uranus to 90 arcseconds, the other
@@ -15,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import astropy.units as u
 import numpy as np
@@ -26,36 +29,21 @@ from jaxtyping import Bool, Float, Int
 from lunarsky import MCMF
 from scipy.spatial.transform import Rotation as SpatialRotation
 
+from lusee_bayes.core import checks
 from lusee_bayes.core.arrays import Times
-from lusee_bayes.core.checks import (
-    Described,
-    listed,
-    require_array,
-    require_finite,
-    require_positive,
-)
 from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.instrument import times
 from lusee_bayes.instrument.schedule import Cut, Interval, Run, cut_intervals, cut_runs
-from lusee_bayes.instrument.times import (
-    Nodes,
-    Numbers,
-    Windows,
-    counts_up,
-    later,
-    require_ephemeris,
-    seconds_from,
-    unannounced_leap_seconds,
-    utc_from_text,
-)
 
 Vectors, Turn = Float[np.ndarray, "times 3"], Float[np.ndarray, "3 3"]
+Window = Literal["instant", "mean"]
 ONE_CYCLE = (Run(),)
 # period after which the sky repeats itself in luseepy's engine croissant
 LUSEEPY_MONTH_HOURS = 655.72
 
 
 @dataclass(frozen=True, repr=False)
-class Observation(Described):
+class Observation(checks.Described):
     """The samples of one or more runs at one site.
 
     Attributes
@@ -93,20 +81,21 @@ class Observation(Described):
     turntable_deg: tuple[float, ...]
     step_s: float
     fixed_axis: bool = False
-    windows: Windows | None = None
+    windows: times.Windows | None = None
     tilt_deg: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self):
         if not -90.0 <= self.lat_deg <= 90.0:
             raise InputError(f"lat_deg must lie in -90..90, got {self.lat_deg}")
-        require_positive("step_s", self.step_s)
-        require_finite("lon_deg and turntable_deg", np.array([self.lon_deg, *self.turntable_deg]))
-        require_finite("tilt_deg", np.array(self.tilt_deg))
+        checks.require_positive("step_s", self.step_s)
+        angles = np.array([self.lon_deg, *self.turntable_deg])
+        checks.require_finite("lon_deg and turntable_deg", angles)
+        checks.require_finite("tilt_deg", np.array(self.tilt_deg))
         if self.times.shape != self.run.shape or self.times.ndim != 1 or not self.times.size:
             raise InputError(
                 f"times {self.times.shape} and run {self.run.shape} must be lists of one length"
             )
-        back = np.flatnonzero(~(seconds_from(self.times[:-1], self.times[1:]) > 0.0))
+        back = np.flatnonzero(~(times.seconds_from(self.times[:-1], self.times[1:]) > 0.0))
         if back.size:
             before, after = self.times[back[0]].isot, self.times[back[0] + 1].isot
             raise InputError(
@@ -114,11 +103,11 @@ class Observation(Described):
                 f"not come after sample {back[0]} ({before}); sort them, and give each time once"
             )
         last = self.n_runs - 1
-        if not counts_up(self.run) or self.run[-1] != last:
+        if not times.counts_up(self.run) or self.run[-1] != last:
             raise InputError(
                 f"run must count 0, 1, ... up to {last}, one for each turntable angle, never back"
             )
-        require_ephemeris(self.times.jd)
+        times.require_ephemeris(self.times.jd)
         if self.windows is None:
             return
         if self.fixed_axis:
@@ -129,9 +118,9 @@ class Observation(Described):
         self.windows.require_fitting(self.times, self.step_s)
 
     def description(self) -> tuple[str, ...]:
-        with unannounced_leap_seconds():
+        with times.unannounced_leap_seconds():
             first, last = self.times[0].isot[:19], self.times[-1].isot[:19]
-        angles = listed(tuple(f"{angle:g}" for angle in self.turntable_deg))
+        angles = checks.listed(tuple(f"{angle:g}" for angle in self.turntable_deg))
         samples = "times are instants" if self.windows is None else self.windows.description()[0]
         axis = ", with a fixed axis of the Moon" if self.fixed_axis else ""
         return (
@@ -150,7 +139,7 @@ class Observation(Described):
         lon_deg: float = 182.258,
         lat_deg: float = -23.814,
         fixed_axis: bool = False,
-        window: Literal["instant", "mean"] = "instant",
+        window: Window = "instant",
     ) -> Observation:
         """Return an observation of runs that follow one another; defaults as in the paper.
 
@@ -180,9 +169,10 @@ class Observation(Described):
         InputError
             For a bad date, step or length, and for a run without samples.
         """
-        cuts, site = cut_runs(runs, step_s), (lon_deg, lat_deg)
-        t0, number = utc_from_text("start", start), np.arange(len(runs))
-        return cls._of_cuts(cuts, t0, number, window, site, step_s, fixed_axis)
+        cuts, t0 = cut_runs(runs, step_s), times.utc_from_text("start", start)
+        place = {"lon_deg": lon_deg, "lat_deg": lat_deg, "step_s": step_s, "fixed_axis": fixed_axis}
+        place["turntable_deg"] = tuple(run.turntable_deg for run in runs)
+        return cls._of_cuts(cuts, t0, np.arange(len(runs)), window, **place)
 
     @classmethod
     def from_schedule(
@@ -193,7 +183,7 @@ class Observation(Described):
         lon_deg: float = 182.258,
         lat_deg: float = -23.814,
         fixed_axis: bool = False,
-        window: Literal["instant", "mean"] = "mean",
+        window: Window = "mean",
     ) -> Observation:
         """Return an observation of the intervals of a schedule.
 
@@ -222,21 +212,14 @@ class Observation(Described):
             For intervals that overlap or are not in order, for a duty cycle of instants, and where
             an interval of nights holds none.
         """
-        cuts, site = cut_intervals(intervals, step_s), (lon_deg, lat_deg)
-        turned = np.diff([one.turntable_deg for one in intervals], prepend=np.nan) != 0.0
-        t0, number = intervals[0].start_time, np.cumsum(turned) - 1
-        return cls._of_cuts(cuts, t0, number, window, site, step_s, fixed_axis)
+        cuts, angles = cut_intervals(intervals, step_s), [one.turntable_deg for one in intervals]
+        place = {"lon_deg": lon_deg, "lat_deg": lat_deg, "step_s": step_s, "fixed_axis": fixed_axis}
+        number, place["turntable_deg"] = runs_of(angles, len(intervals))
+        return cls._of_cuts(cuts, intervals[0].start_time, number, window, **place)
 
     @classmethod
     def _of_cuts(
-        cls,
-        cuts: Sequence[Cut],
-        t0: Time,
-        number: Int[np.ndarray, " cuts"],
-        window: Literal["instant", "mean"],
-        site: tuple[float, float],
-        step_s: float,
-        fixed_axis: bool,
+        cls, cuts: Sequence[Cut], t0: Time, number: times.Numbers, window: Window, **place: Any
     ) -> Observation:
         """Of the samples of cuts, by night alone where asked for; ``number``: the run of each.
 
@@ -244,27 +227,26 @@ class Observation(Described):
         """
         parts = [(cut.start_s, cut.length_s, cut.live_s) for cut in cuts]
         times_s, length_s, live_s = (np.concatenate(part) for part in zip(*parts, strict=True))
-        require_ephemeris(np.array([t0.jd + times_s[-1] / 86400.0]))
+        times.require_ephemeris(np.array([t0.jd + times_s[-1] / 86400.0]))
         cut_of = np.repeat(np.arange(len(cuts)), [len(cut.start_s) for cut in cuts])
         windows = None
         if window == "mean":
             half = length_s / 2.0
-            times_s, windows = times_s + half, Windows.whole(-half, half, live_s)
+            times_s, windows = times_s + half, times.Windows.whole(-half, half, live_s)
         elif (live_s < length_s).any():
             raise InputError(
                 "samples that are instants have no duty cycle; take windows "
                 "(observation.window=mean), or leave out the schedule's duty_cycle"
             )
-        angles = tuple(cuts[k].of.turntable_deg for k in np.unique(number, return_index=True)[1])
-        times, run = later(t0, times_s), number[cut_of]
-        observation = cls(*site, times, run, angles, step_s, fixed_axis, windows)
+        at = times.later(t0, times_s)
+        observation = cls(times=at, run=number[cut_of], windows=windows, **place)
         night_only = np.array([cut.of.night_only for cut in cuts])
         if not night_only.any():
             return observation
         dark = observation.sun_altitude_deg() < 0.0
         if windows is not None and isinstance(cuts[0].of, Interval):
             for offset_s in windows.bounds_s.T:
-                at_end = replace(observation, times=later(times, offset_s), windows=None)
+                at_end = replace(observation, times=times.later(at, offset_s), windows=None)
                 dark &= at_end.sun_altitude_deg() < 0.0
         keep = dark | ~night_only[cut_of]
         for k, cut in enumerate(cuts):
@@ -284,14 +266,10 @@ class Observation(Described):
         InputError
             If no sample is kept.
         """
-        runs, renumbered = np.unique(self.run[keep], return_inverse=True)
-        return replace(
-            self,
-            times=self.times[keep],
-            run=renumbered,
-            turntable_deg=tuple(self.turntable_deg[run] for run in runs),
-            windows=None if self.windows is None else self.windows.select(keep),
-        )
+        runs, run = np.unique(self.run[keep], return_inverse=True)
+        angles = tuple(self.turntable_deg[number] for number in runs)
+        windows = None if self.windows is None else self.windows.select(keep)
+        return replace(self, times=self.times[keep], run=run, turntable_deg=angles, windows=windows)
 
     @property
     def n_times(self) -> int:
@@ -306,11 +284,10 @@ class Observation(Described):
     @property
     def live_s(self) -> Times:
         """Integration time of every sample, in seconds."""
-        if self.windows is None:
-            return np.full(self.n_times, float(self.step_s))
-        return self.windows.live_per_sample_s
+        steps = np.full(self.n_times, float(self.step_s))
+        return steps if self.windows is None else self.windows.live_per_sample_s
 
-    def at_nodes(self, n: int) -> tuple[Observation, Numbers, Nodes]:
+    def at_nodes(self, n: int) -> tuple[Observation, times.Numbers, times.Nodes]:
         """Return the observation at instants whose weighted means are those over the windows.
 
         Parameters
@@ -330,14 +307,13 @@ class Observation(Described):
         if self.windows is None:
             return self, np.arange(self.n_times), np.ones(self.n_times)
         sample, offset_s, weight = self.windows.nodes(n)
-        times = later(self.times[sample], offset_s)
-        instants = replace(self, times=times, run=self.run[sample], windows=None)
-        return instants, sample, weight
+        at, run = times.later(self.times[sample], offset_s), self.run[sample]
+        return replace(self, times=at, run=run, windows=None), sample, weight
 
     @cached_property
     def hours(self) -> Times:
         """Hours since the first sample."""
-        with unannounced_leap_seconds():
+        with times.unannounced_leap_seconds():
             tdb = self.times.tdb
         return (tdb - tdb[0]).to_value(u.hour)
 
@@ -401,7 +377,8 @@ class Observation(Described):
         InputError
             Unless ``galactic`` is a finite float64 array of such a shape.
         """
-        require_array("galactic", galactic, (3,) if galactic.ndim == 1 else (self.n_times, 3))
+        shape = (3,) if galactic.ndim == 1 else (self.n_times, 3)
+        checks.require_array("galactic", galactic, shape)
         vectors = np.broadcast_to(galactic, (self.n_times, 3))
         mcmf = np.einsum("tij,tj->ti", self.mcmf_from_galactic, vectors)
         topocentric_from_mcmf = self.topocentric_from_mcmf()
@@ -418,15 +395,15 @@ class Observation(Described):
         return np.degrees(np.arcsin(height / np.linalg.norm(sun, axis=1)))
 
 
-def mcmf_from_galactic(times: Time) -> Float[np.ndarray, "times 3 3"]:
+def mcmf_from_galactic(at: Time) -> Float[np.ndarray, "times 3 3"]:
     """Return the rotations that take Galactic unit vectors to MCMF ones.
 
     The three Galactic axes go through lunarsky's ICRS -> MCMF transformation in one call.
     """
     axes = Galactic(CartesianRepresentation(np.eye(3)[:, :, None])).transform_to(ICRS())
     icrs = ICRS(CartesianRepresentation(axes.cartesian.xyz.value))
-    with unannounced_leap_seconds():
-        turned = icrs.transform_to(MCMF(obstime=times))
+    with times.unannounced_leap_seconds():
+        turned = icrs.transform_to(MCMF(obstime=at))
     return np.moveaxis(turned.cartesian.xyz.value, 2, 0)
 
 
@@ -461,11 +438,10 @@ def body_direction(body: str, observation: Observation) -> Vectors:
     InputError
         If the body is unknown.
     """
-    known = {name.lower(): name for name in BODIES}
-    if body.lower() not in known:
+    if body.capitalize() not in BODIES:
         hint = nearest(body.capitalize(), BODIES)
         raise InputError(f"unknown body '{body}' in the sky of the Moon; {hint}")
-    with unannounced_leap_seconds():
+    with times.unannounced_leap_seconds():
         arrival = observation.times.tdb
     lander = _barycentric_km("moon", arrival) + MOON_RADIUS_KM * observation.zenith_galactic()
     light_time = np.zeros(observation.n_times)
@@ -476,9 +452,74 @@ def body_direction(body: str, observation: Observation) -> Vectors:
     return vector / np.linalg.norm(vector, axis=1, keepdims=True)
 
 
-def _barycentric_km(body: str, times: Time) -> Vectors:
+def _barycentric_km(body: str, at: Time) -> Vectors:
     """Place from the barycentre of the Solar System along Galactic axes."""
-    with unannounced_leap_seconds():
-        place = get_body_barycentric(body, times, ephemeris="builtin").xyz.to_value(u.km)
+    with times.unannounced_leap_seconds():
+        place = get_body_barycentric(body, at, ephemeris="builtin").xyz.to_value(u.km)
     axes = ICRS(CartesianRepresentation(np.eye(3))).transform_to(Galactic())
     return (axes.cartesian.xyz.value @ place).T
+
+
+# sites by name: selenographic longitude and latitude in degrees
+SITES = {"LuSEE-Night": (182.258, -23.814)}
+
+
+def site_of(site: Any) -> tuple[float, float]:
+    """Return longitude and latitude in degrees of a pair, or of a site of ``SITES`` by name.
+
+    Raises
+    ------
+    InputError
+        If it is neither.
+    """
+    if isinstance(site, str):
+        known = {name.lower(): place for name, place in SITES.items()}
+        if site.lower() not in known:
+            raise InputError(
+                f"unknown site '{site}'; {nearest(site, SITES)} (or give two angles in degrees)"
+            )
+        return known[site.lower()]
+    try:
+        lon, lat = (float(x) for x in site)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"the site is {site!r}; give longitude and latitude in degrees, or {', '.join(SITES)}"
+        ) from error
+    return lon, lat
+
+
+def numbers_of_times(name: str, values: Any, n_times: int) -> Times:
+    """Return a finite number for each time, of as many or of one that stands for all.
+
+    Raises
+    ------
+    InputError
+        If there are others; with the name.
+    """
+    expected = f"give one finite number, or one for each of {n_times} times"
+    try:
+        numbers = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} is {values!r}; {expected}") from error
+    if numbers.shape not in ((), (n_times,)) or not np.isfinite(numbers).all():
+        raise InputError(f"{name} has shape {numbers.shape}; {expected}")
+    return np.broadcast_to(numbers, (n_times,))
+
+
+def runs_of(turntable_deg: Any, n_times: int) -> tuple[np.ndarray, tuple[float, ...]]:
+    """Return the run of each sample, and the turntable angle of each run.
+
+    Parameters
+    ----------
+    turntable_deg : float or (times,) array
+        A new run begins where the angle changes.
+    n_times : int
+
+    Raises
+    ------
+    InputError
+        If there are neither one angle nor as many as times, or they are not finite.
+    """
+    angles = numbers_of_times("turntable_deg", turntable_deg, n_times)
+    run = np.concatenate([[0], np.cumsum(np.diff(angles) != 0.0)]).astype(np.int64)
+    return run, tuple(angles[np.searchsorted(run, np.arange(run[-1] + 1))].tolist())

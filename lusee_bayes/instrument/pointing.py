@@ -23,6 +23,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -32,7 +33,7 @@ from scipy.spatial.transform import Rotation as SpatialRotation
 from lusee_bayes.core.arrays import Array, Times, namespace
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import Rotation
-from lusee_bayes.instrument.averaging import sufficient_nodes, windowed
+from lusee_bayes.instrument.averaging import sufficient_nodes, terms_of_exponential, windowed
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.schedule import CYCLE_DAYS
 from lusee_bayes.instrument.times import Windows, later
@@ -86,11 +87,7 @@ class Pointing(eqx.Module):
 
     @classmethod
     def of(
-        cls,
-        observation: Observation,
-        lmax: int,
-        order: int | None = None,
-        pole_frame: Float[np.ndarray, "3 3"] | None = None,
+        cls, observation: Observation, lmax: int, order: int | None = None, pole_frame: Any = None
     ) -> Pointing:
         """Return the pointing of every sample of an observation.
 
@@ -116,30 +113,20 @@ class Pointing(eqx.Module):
         """
         if order is not None and order < 0:
             raise InputError(f"the order of the tilt expansion must be 0, 1, ..., got {order}")
-        angle = 0.0
-        if observation.windows is not None:
-            longest = (observation.windows.end_s - observation.windows.start_s).max()
-            angle = lmax * FASTEST_TURN * float(longest) / 2.0
-        instants, sample, weight = observation.at_nodes(sufficient_nodes(angle))
+        windows = observation.windows
+        longest = 0.0 if windows is None else float((windows.end_s - windows.start_s).max())
+        n = sufficient_nodes(lmax * FASTEST_TURN * longest / 2.0)
+        instants, sample, weight = observation.at_nodes(n)
         mcmf = instants.mcmf_from_galactic
         if pole_frame is None:
             pole_frame = mean_pole_frame(mcmf)
         azimuth, tilt = split(mcmf @ pole_frame.T)
         if order is None:
             order = sufficient_order(tilt, lmax)
-        azimuth, functions, factors = windowed(sample, weight, azimuth, tilt, order, lmax)
-        starts = np.searchsorted(observation.run, np.arange(observation.n_runs + 1))
-        return cls(
-            azimuth=azimuth,
-            functions=functions,
-            factors=factors,
-            pole_frame=pole_frame,
-            pole_from_galactic=_rotation(pole_frame, lmax),
-            mcmf_from_lander=_rotation(observation.lander_from_mcmf().T, lmax),
-            turntable=np.radians(np.array(observation.turntable_deg, dtype=np.float64)),
-            run_starts=tuple(int(s) for s in starts),
-            order=order,
-        )
+        of_time = windowed(sample, weight, azimuth, tilt, order, lmax)
+        starts = np.searchsorted(observation.run, np.arange(observation.n_runs + 1)).tolist()
+        frames = pole_frame, _rotation(pole_frame, lmax), *_lander(observation, lmax)
+        return cls(*of_time, *frames, run_starts=tuple(starts), order=order)
 
     def placed(self, observation: Observation) -> Pointing:
         """Return the pointing of an observation at the same times and windows, but elsewhere.
@@ -150,9 +137,8 @@ class Pointing(eqx.Module):
             With its own site, lean and turntable angles.
         """
         lmax = len(self.mcmf_from_lander.blocks) - 1
-        lander = _rotation(observation.lander_from_mcmf().T, lmax)
-        angles = np.radians(np.array(observation.turntable_deg, dtype=np.float64))
-        return replace(self, mcmf_from_lander=lander, turntable=angles)
+        lander, turntable = _lander(observation, lmax)
+        return replace(self, mcmf_from_lander=lander, turntable=turntable)
 
     @property
     def n_times(self) -> int:
@@ -163,6 +149,12 @@ class Pointing(eqx.Module):
         """Return the number of each run and the slice of its samples."""
         bounds = zip(self.run_starts[:-1], self.run_starts[1:], strict=True)
         return [(number, slice(first, end)) for number, (first, end) in enumerate(bounds)]
+
+
+def _lander(observation: Observation, lmax: int) -> tuple[Rotation, Array]:
+    """The rotation from the lander to the Moon, and the turntable's angles in radians."""
+    angles = np.array(observation.turntable_deg, dtype=np.float64)
+    return _rotation(observation.lander_from_mcmf().T, lmax), np.radians(angles)
 
 
 def _rotation(matrix: Float[np.ndarray, "3 3"], lmax: int) -> Rotation:
@@ -215,25 +207,15 @@ def sufficient_order(tilt: Tilts, lmax: int) -> int:
     This is the lowest n >= LEAST_ORDER with ``(lmax |tilt|)^(n+1) / (n+1)! < TILT_TOLERANCE``.
     """
     size = lmax * float(np.hypot(tilt[:, 0], tilt[:, 1]).max())
-    order, neglected = 0, size
-    while neglected > TILT_TOLERANCE:
-        order += 1
-        neglected *= size / (order + 1)
-    return max(order, LEAST_ORDER)
+    return max(terms_of_exponential(size, TILT_TOLERANCE) - 1, LEAST_ORDER)
 
 
-# of every offset, what it is
-OFFSETS = {
-    "clock_s": "later than the data say, in seconds",
-    "clock_drift_s_per_day": "and later by so much more every day from the first sample on",
-    "turntable_deg": "turntable, from East towards North, of every run",
-    "lon_deg": "longitude of the site",
-    "lat_deg": "latitude of the site",
-    "tilt_east_deg": "lean of the lander towards East",
-    "tilt_north_deg": "lean of the lander towards North",
-}
+# later than the data say, in seconds, and later by so much more every day from the first sample on
 CLOCK = ("clock_s", "clock_drift_s_per_day")
+# lean of the lander towards East and towards North
 TILTS = ("tilt_east_deg", "tilt_north_deg")
+# these, the turntable of every run, from East towards North, and the site
+OFFSETS = (*CLOCK, "turntable_deg", "lon_deg", "lat_deg", *TILTS)
 # by which the Moon turns against the sky, as azimuths of the sky count it, in radians per hour
 TURN_PER_HOUR = -2.0 * np.pi / (CYCLE_DAYS * 24.0)
 
@@ -246,7 +228,7 @@ def offset_names(kinds: tuple[str, ...], n_runs: int) -> tuple[str, ...]:
     Parameters
     ----------
     kinds : tuple of str
-        Keys of ``OFFSETS``.
+        Some of ``OFFSETS``.
     n_runs : int
         Number of runs.
 
@@ -269,7 +251,7 @@ def offset_names(kinds: tuple[str, ...], n_runs: int) -> tuple[str, ...]:
 
 
 def offset_kind(name: str) -> str:
-    """Return the key of ``OFFSETS`` that an offset's name belongs to."""
+    """Return the kind of ``OFFSETS`` that an offset's name belongs to."""
     return "turntable_deg" if name.startswith("turntable_") else name
 
 
@@ -342,10 +324,6 @@ def turned_by_offsets(pointing: Pointing, hours: Array, values: Values) -> Point
     lon = given.get("lon_deg", zero) * radians - TURN_PER_HOUR * late_h
     rest = [given.get(name, zero) * radians for name in ("lat_deg", *TILTS)]
     names = _of_runs(len(pointing.run_starts) - 1)
-    turntable = xp.stack([given.get(name, zero) * radians for name in names])
-    return replace(
-        pointing,
-        azimuth=pointing.azimuth + TURN_PER_HOUR * drift * hours,
-        turntable=pointing.turntable + turntable,
-        turns=xp.stack([lon, *rest]),
-    )
+    turntable = pointing.turntable + xp.stack([given.get(name, zero) * radians for name in names])
+    azimuth = pointing.azimuth + TURN_PER_HOUR * drift * hours
+    return replace(pointing, azimuth=azimuth, turntable=turntable, turns=xp.stack([lon, *rest]))

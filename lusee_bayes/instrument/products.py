@@ -4,9 +4,9 @@ Voltages s_i give V_ij = <s_i conj(s_j)>: one real number for each antenna (auto
 each pair (Re, Im). They are ordered and labelled as in luseepy:
 ``00R, 01R, 01I, 02R, 02I, 03R, 03I, 11R, 12R, ... 33R``, n^2 real products in all.
 
-Arrays of measured correlations come as instruments and their software have them: names of products,
-signs of imaginary parts, sites and angles are said in many ways, which
-:meth:`.Visibilities.from_arrays` takes through the functions of this module.
+Arrays of measured correlations come as instruments and their software have them: names of products
+and signs of imaginary parts are said in many ways, which :meth:`.Visibilities.from_arrays` takes
+through the functions of this module.
 
 A :class:`DataLayout` says where each entry of the data vector d belongs: which product, which time.
 d is stacked product by product with time running fastest. Samples that are flagged or were never
@@ -18,6 +18,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from functools import lru_cache
+from itertools import combinations_with_replacement
 from operator import attrgetter
 from typing import Any, NamedTuple
 
@@ -25,7 +26,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int, Shaped
 
-from lusee_bayes.core.arrays import Array, Grid, GridFlags, Times, as_complex, namespace, placed
+from lusee_bayes.core.arrays import Array, Grid, GridFlags, as_complex, namespace, placed
 from lusee_bayes.core.checks import Described, is_traced
 from lusee_bayes.core.errors import InputError, nearest
 
@@ -52,17 +53,18 @@ class Product(NamedTuple):
 @lru_cache
 def all_products(n_antennas: int = N_ANTENNAS) -> tuple[Product, ...]:
     """Return the n^2 real products of ``n_antennas`` antennas, in luseepy's order."""
-    return tuple(
-        Product(i, j, part)
-        for i in range(n_antennas)
-        for j in range(i, n_antennas)
-        for part in (("R",) if i == j else ("R", "I"))
-    )
+    pairs = combinations_with_replacement(range(n_antennas), 2)
+    return tuple(Product(i, j, part) for i, j in pairs for part in ("R" if i == j else "RI"))
 
 
 def labels(n_antennas: int = N_ANTENNAS) -> tuple[str, ...]:
     """Return the labels of :func:`all_products`."""
     return tuple(p.label for p in all_products(n_antennas))
+
+
+def labels_of(n_products: int) -> tuple[str, ...]:
+    """Return the labels of so many products. InputError if no number of antennas has as many."""
+    return labels(antennas_of(n_products))
 
 
 def antennas_of(n_products: int) -> int:
@@ -107,8 +109,6 @@ def to_matrix(products: Products) -> Hermitian:
 
 # what an imaginary part can be that of, and the sign that turns it into <s_i conj(s_j)>
 CONVENTIONS = {"s_i conj(s_j)": 1.0, "conj(s_i) s_j": -1.0}
-# sites by name: selenographic longitude and latitude in degrees
-SITES = {"LuSEE-Night": (182.258, -23.814)}
 # an auto is real; rounding of 32-bit numbers is below this share of it
 AUTO_TOLERANCE = 1e-5
 NAME = re.compile(r"\s*(\d)\s*[-_x, ]?\s*(\d)\s*([RI]?)\s*", re.IGNORECASE)
@@ -256,67 +256,6 @@ def _require_real(pair: str, auto: np.ndarray) -> None:
         )
 
 
-def site_of(site: Any) -> tuple[float, float]:
-    """Return longitude and latitude in degrees of a pair, or of a site of ``SITES`` by name.
-
-    Raises
-    ------
-    InputError
-        If it is neither.
-    """
-    if isinstance(site, str):
-        known = {name.lower(): place for name, place in SITES.items()}
-        if site.lower() not in known:
-            raise InputError(
-                f"unknown site '{site}'; {nearest(site, SITES)} (or give two angles in degrees)"
-            )
-        return known[site.lower()]
-    try:
-        lon, lat = (float(x) for x in site)
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            f"the site is {site!r}; give longitude and latitude in degrees, or {', '.join(SITES)}"
-        ) from error
-    return lon, lat
-
-
-def numbers_of_times(name: str, values: Any, n_times: int) -> Times:
-    """Return a finite number for each time, of as many or of one that stands for all.
-
-    Raises
-    ------
-    InputError
-        If there are others; with the name.
-    """
-    expected = f"give one finite number, or one for each of {n_times} times"
-    try:
-        numbers = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name} is {values!r}; {expected}") from error
-    if numbers.shape not in ((), (n_times,)) or not np.isfinite(numbers).all():
-        raise InputError(f"{name} has shape {numbers.shape}; {expected}")
-    return np.broadcast_to(numbers, (n_times,))
-
-
-def runs_of(turntable_deg: Any, n_times: int) -> tuple[np.ndarray, tuple[float, ...]]:
-    """Return the run of each sample, and the turntable angle of each run.
-
-    Parameters
-    ----------
-    turntable_deg : float or (times,) array
-        A new run begins where the angle changes.
-    n_times : int
-
-    Raises
-    ------
-    InputError
-        If there are neither one angle nor as many as times, or they are not finite.
-    """
-    angles = numbers_of_times("turntable_deg", turntable_deg, n_times)
-    run = np.concatenate([[0], np.cumsum(np.diff(angles) != 0.0)]).astype(np.int64)
-    return run, tuple(angles[np.searchsorted(run, np.arange(run[-1] + 1))].tolist())
-
-
 class DataLayout(Described, eqx.Module):
     """The product and the time of every entry of d.
 
@@ -378,9 +317,7 @@ class DataLayout(Described, eqx.Module):
         return self.scatter(namespace(self.index).ones(self.size, dtype=bool))
 
     def _positions(self) -> np.ndarray:
-        if self.index is None:
-            return np.arange(self.size)
-        return np.asarray(self.index)
+        return np.arange(self.size) if self.index is None else np.asarray(self.index)
 
     def require_same(self, other: DataLayout) -> None:
         """Check that another layout holds the same samples, where both are known.
@@ -459,9 +396,8 @@ def without_gaps(visibilities: Grid, layout: DataLayout) -> Grid:
     products = all_products(antennas_of(layout.n_products))
     times, measured = np.arange(layout.n_times), present.any(1)
     for gaps, row in zip(absent, values, strict=True):
-        if gaps.any():
-            known = ~gaps
-            row[gaps] = np.interp(times[gaps], times[known], row[known]) if known.any() else 0.0
+        known = ~gaps
+        row[gaps] = np.interp(times[gaps], times[known], row[known]) if known.any() else 0.0
     autos = np.array([p.i == p.j for p in products])
     unused = np.flatnonzero(autos & absent.all(1))
     for auto in (products[k] for k in unused):
@@ -472,6 +408,5 @@ def without_gaps(visibilities: Grid, layout: DataLayout) -> Grid:
                     f"{product.label} depends on it; give modelled visibilities of all samples, "
                     "such as the signal of a CouplingMatrix without flags"
                 )
-    if unused.size:
-        values[unused] = values[autos & ~absent.all(1)].mean(0)
+    values[unused] = values[autos & ~absent.all(1)].mean(0)
     return namespace(visibilities).asarray(values)

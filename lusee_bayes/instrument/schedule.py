@@ -19,6 +19,7 @@ from functools import cached_property, lru_cache
 from io import StringIO
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from astropy.time import Time
@@ -98,20 +99,16 @@ class Interval:
     @cached_property
     def start_time(self) -> Time:
         """The start, in UTC."""
-        return self._date("start", self.start)
+        return times.utc_from_text("start", self.start)
 
     @cached_property
     def length_s(self) -> float:
         """Length in seconds, the time without integration among them."""
-        return float(times.seconds_from(self.start_time, self._date("end", self.end)))
+        return float(times.seconds_from(self.start_time, times.utc_from_text("end", self.end)))
 
     def n_samples(self, step_s: float) -> int:
         """Count the samples of a step, by day and night; the last one may be shorter."""
         return max(1, int(np.ceil((self.length_s - times.ROUNDING_S) / step_s)))
-
-    def _date(self, name: str, text: str) -> Time:
-        # astropy knows no Z, which ISO has for UTC
-        return times.utc_from_text(name, text.removesuffix("Z"))
 
 
 @dataclass(frozen=True)
@@ -260,24 +257,22 @@ def _of_table(path: str, text: str) -> tuple[Interval, ...]:
             f"{path} has the columns {', '.join(table.columns)}; a schedule has "
             f"{', '.join(sorted(REQUIRED))}, and may have {' and '.join(sorted(OPTIONAL))}"
         )
-    intervals = []
-    for number, row in enumerate(table.to_dict("records"), start=1):
-        with naming(place := f"{path}, row {number}"):
-            intervals.append(_interval(place, row))
-    return tuple(intervals)
+    rows = enumerate(table.to_dict("records"), start=1)
+    return tuple(_interval(f"{path}, row {number}", row) for number, row in rows)
 
 
 def _interval(place: str, row: dict[str, str]) -> Interval:
-    numbers = {}
-    for name, default in (("turntable_deg", ""), ("duty_cycle", "1")):
-        try:
-            numbers[name] = float(row.get(name) or default)
-        except ValueError as error:
-            raise InputError(f"{name} is '{row[name]}', not a number") from error
-    night = (row.get("night_only", "").strip() or "false").lower()
-    if night not in ("true", "false"):
-        raise InputError(f"night_only is '{night}'; write true or false")
-    return Interval(row["start"], row["end"], **numbers, night_only=night == "true", where=place)
+    with naming(place):
+        known: dict[str, Any] = {"where": place}
+        for name, default in (("turntable_deg", ""), ("duty_cycle", "1")):
+            try:
+                known[name] = float(row.get(name) or default)
+            except ValueError as error:
+                raise InputError(f"{name} is '{row[name]}', not a number") from error
+        night = (row.get("night_only", "").strip() or "false").lower()
+        if night not in ("true", "false"):
+            raise InputError(f"night_only is '{night}'; write true or false")
+        return Interval(row["start"], row["end"], night_only=night == "true", **known)
 
 
 def _of_commands(path: str, text: str) -> tuple[Interval, ...]:

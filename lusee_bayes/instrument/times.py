@@ -21,7 +21,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from functools import lru_cache
 from typing import Any, Literal
 
 import astropy.units as u
@@ -31,13 +30,14 @@ from astropy.time import Time
 from jaxtyping import Bool, Float, Int
 
 from lusee_bayes.core.arrays import Times
-from lusee_bayes.core.checks import Described, require_finite
+from lusee_bayes.core.checks import Described, extent, require_finite
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.layouts import Attribute, Content
 from lusee_bayes.core.reading import naming
 
 Numbers, Nodes = Int[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]
 EPHEMERIS_YEARS = (1900, 2050)
+EPHEMERIS_JD = [float(Time(f"{year}-01-01", scale="tdb").jd) for year in EPHEMERIS_YEARS]
 # scales of time that files may state
 SCALES = ("utc", "tai", "tt", "tdb")
 # what a file of Julian dates in two parts, jd1 and jd2, may state of them
@@ -74,7 +74,8 @@ def utc_from_text(name: str, text: str) -> Time:
     """
     try:
         with unannounced_leap_seconds():
-            time = Time(text, scale="utc")
+            # astropy knows no Z, which ISO has for UTC
+            time = Time(text.removesuffix("Z"), scale="utc")
     except (ValueError, TypeError) as error:
         raise InputError(
             f"{name} '{text}' is not a date; write it as 2027-01-15T00:00:00"
@@ -91,7 +92,7 @@ def require_ephemeris(jd: Times) -> None:
     InputError
         If one does not.
     """
-    first, last = _ephemeris_jd()
+    first, last = EPHEMERIS_JD
     outside = ~((jd >= first) & (jd <= last))
     if not outside.any():
         return
@@ -104,11 +105,6 @@ def require_ephemeris(jd: Times) -> None:
         f"sample times run outside the ephemeris ({EPHEMERIS_YEARS[0]}-{EPHEMERIS_YEARS[1]}): "
         f"{date}; give a start inside it"
     )
-
-
-@lru_cache(maxsize=1)
-def _ephemeris_jd() -> tuple[float, ...]:
-    return tuple(float(Time(f"{year}-01-01", scale="tdb").jd) for year in EPHEMERIS_YEARS)
 
 
 def utc_of(jd1: Times, jd2: Times, scale: str = "utc") -> Time:
@@ -283,10 +279,8 @@ class Windows(Described):
     def description(self) -> tuple[str, ...]:
         live, bounds = self.live_per_sample_s, self.bounds_s
         share = live.sum() / (bounds[:, 1] - bounds[:, 0]).sum()
-        return (
-            f"{self.n_samples} windows in {len(self.sample)} pieces, live for {live.min():g} to "
-            f"{live.max():g} s, {share:.1%} of the time",
-        )
+        pieces = f"{self.n_samples} windows in {len(self.sample)} pieces"
+        return (f"{pieces}, live for {extent(live, 's', 'g')}, {share:.1%} of the time",)
 
     @property
     def n_samples(self) -> int:
@@ -390,15 +384,15 @@ Timestamp = Literal["start", "middle", "end", "instant"]
 TO_MIDDLE = {"start": 0.5, "middle": 0.0, "end": -0.5}
 # overlaps up to these are rounding of times: in seconds, and as a share of the step
 ROUNDED_S, ROUNDED_SHARE = 1e-3, 1e-4
+# what need not be given: from sample to sample, and what of it was integrated, in seconds
+Step, Live = float | None, Times | None
+# middles, step and windows of samples
+Windowed = tuple[Time, float, Windows | None]
 
 
 def windows_of(
-    times: Time,
-    timestamp: str,
-    step_s: float | None = None,
-    live_s: Times | None = None,
-    bounds: Any = None,
-) -> tuple[Time, float, Windows | None]:
+    times: Time, timestamp: str, step_s: Step = None, live_s: Live = None, bounds: Any = None
+) -> Windowed:
     """Return the middles, the step and the windows of samples.
 
     Parameters
@@ -445,9 +439,7 @@ def windows_of(
     return _windowed(times, start, end, step_s, live_s)
 
 
-def _bounded(
-    times: Time, bounds: Time, step_s: float | None, live_s: Times | None
-) -> tuple[Time, float, Windows]:
+def _bounded(times: Time, bounds: Time, step_s: Step, live_s: Live) -> Windowed:
     start, end = (seconds_from(times, bounds[:, k]) for k in (0, 1))
     length = end - start
     step = step_of(times, float(length[0]) if step_s is None and len(times) == 1 else step_s)
@@ -492,9 +484,7 @@ def _rounding(step_s: float) -> float:
     return max(ROUNDED_S, ROUNDED_SHARE * step_s)
 
 
-def _windowed(
-    times: Time, start_s: Times, end_s: Times, step_s: float, live_s: Times | None
-) -> tuple[Time, float, Windows]:
+def _windowed(times: Time, start_s: Times, end_s: Times, step_s: float, live_s: Live) -> Windowed:
     """Middles of windows of one piece each, and these, with overlaps by rounding cut off."""
     middles, half = later(times, (start_s + end_s) / 2.0), (end_s - start_s) / 2.0
     overlap = end_s[:-1] - start_s[1:] - np.diff(seconds_from(times[0], times))

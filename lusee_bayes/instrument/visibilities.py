@@ -32,26 +32,14 @@ from lusee_bayes.core.harmonics import lmax_of, n_modes
 from lusee_bayes.core.layouts import Attribute, Content, Layout, Variable, require_mhz
 from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.instrument.beams.source import MeasuredReceiver, receiver_of
-from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.products import (
-    N_ANTENNAS,
-    DataLayout,
-    antennas_of,
-    labels,
-    numbers_of_times,
-    real_products,
-    runs_of,
-    site_of,
-)
+from lusee_bayes.instrument.observation import Observation, numbers_of_times, runs_of, site_of
+from lusee_bayes.instrument.products import N_ANTENNAS, DataLayout, labels_of, real_products
 from lusee_bayes.instrument.times import JD_SCALES, Windows, later, utc_of_jd, utc_times, windows_of
 
 PIECES = ("piece_sample", "piece_start_s", "piece_end_s", "piece_live_s")
 # times for people are written to the millisecond
-ENCODING = {
-    "units": "milliseconds since 1970-01-01",
-    "calendar": "proleptic_gregorian",
-    "dtype": "int64",
-}
+SINCE = "milliseconds since 1970-01-01"
+ENCODING = {"units": SINCE, "calendar": "proleptic_gregorian", "dtype": "int64"}
 
 
 def _datetimes(times: Time) -> np.ndarray:
@@ -194,15 +182,11 @@ class Visibilities(checks.Described):
 
     def __post_init__(self):
         checks.require_array("the data", self.data, (self.layout.size,))
-        seen = self.observation
-        if self.layout.n_times != seen.n_times:
-            n_times = self.layout.n_times
+        n_times, seen = self.layout.n_times, self.observation
+        if n_times != seen.n_times:
             raise InputError(f"the data have {n_times} times, the observation {seen.n_times}")
-        if self.calibration is not None:
-            n_averaged = self.calibration.n_averaged
-            checks.require_shape(
-                "n_averaged of the calibration", n_averaged, (self.layout.n_times,)
-            )
+        if (said := self.calibration) is not None:
+            checks.require_shape("n_averaged of the calibration", said.n_averaged, (n_times,))
 
     @classmethod
     def from_arrays(
@@ -275,11 +259,10 @@ class Visibilities(checks.Described):
             )
         checks.require_positive("frequency_mhz", frequency_mhz)
         require_mhz("frequency_mhz", frequency_mhz)
-        lon_deg, lat_deg = site_of(site)
         run, angles = runs_of(turntable_deg, len(utc))
         live_s = None if live_s is None else numbers_of_times("live_s", live_s, len(utc))
         middles, step_s, windows = windows_of(utc, timestamp, step_s, live_s, bounds)
-        observation = Observation(lon_deg, lat_deg, middles, run, angles, step_s, windows=windows)
+        observation = Observation(*site_of(site), middles, run, angles, step_s, windows=windows)
         layout = DataLayout.from_flags(np.isnan(values))
         return cls(layout.gather(values), layout, observation, float(frequency_mhz))
 
@@ -304,7 +287,7 @@ class Visibilities(checks.Described):
     @property
     def labels(self) -> tuple[str, ...]:
         """Labels of the products, in order."""
-        return labels(antennas_of(self.layout.n_products))
+        return labels_of(self.layout.n_products)
 
     def digest(self) -> str:
         """Return a hash of data, layout, times and windows, which tells data sets apart."""
@@ -345,10 +328,8 @@ class Visibilities(checks.Described):
         """Return the same with the truth of a map of this lmax: cut, or zero above its own."""
         if self.truth is None or len(self.truth) == n_modes(lmax):
             return self
-        truth = np.zeros(n_modes(lmax))
-        known = np.asarray(self.truth)[: len(truth)]
-        truth[: len(known)] = known
-        return replace(self, truth=truth)
+        known = np.asarray(self.truth)[: n_modes(lmax)]
+        return replace(self, truth=np.pad(known, (0, n_modes(lmax) - len(known))))
 
     def to_dataset(self) -> xr.Dataset:
         """Return a Dataset with dims product, time and run_number.
@@ -405,13 +386,6 @@ class Visibilities(checks.Described):
         return user_path(path)
 
 
-# what files say of an observation, beside the arrays jd1, jd2, run and turntable_deg
-PLACE_AND_TIME = {
-    "lon_deg": Attribute(low=-360.0, high=360.0),
-    "lat_deg": Attribute(low=-90.0, high=90.0),
-    "step_s": Attribute(low=0.0),
-    **JD_SCALES,
-}
 LAYOUT = Layout(
     "visibilities",
     {
@@ -432,17 +406,13 @@ LAYOUT = Layout(
     },
     {
         "frequency_mhz": Attribute(low=0.0, unit="MHz"),
-        **PLACE_AND_TIME,
+        "lon_deg": Attribute(low=-360.0, high=360.0),
+        "lat_deg": Attribute(low=-90.0, high=90.0),
+        "step_s": Attribute(low=0.0),
+        **JD_SCALES,
         "window": Attribute("text", choices=("mean", "instant"), optional=True),
     },
 )
-
-
-def observation_of(found: Content, times: Time, windows: Windows | None) -> Observation:
-    """Return the observation of a file that has :data:`PLACE_AND_TIME`; InputError if none."""
-    here, said = found.arrays, found.values
-    runs = here["run"], tuple(here["turntable_deg"].tolist()), said["step_s"]
-    return Observation(said["lon_deg"], said["lat_deg"], times, *runs, windows=windows)
 
 
 def read_visibilities(path: str | Path) -> Visibilities:
@@ -464,8 +434,8 @@ def read_visibilities(path: str | Path) -> Visibilities:
     """
     require_file(path, "data", HINT)
     found = read_netcdf(path, formats.VISIBILITIES, LAYOUT, HINT)
-    here = found.arrays
-    products, expected = tuple(map(str, here["product"])), labels(antennas_of(len(here["product"])))
+    here, said = found.arrays, found.values
+    products, expected = tuple(map(str, here["product"])), labels_of(len(here["product"]))
     if products != expected:
         raise InputError(
             f"{path} has products {', '.join(products)}; expected {', '.join(expected)}"
@@ -477,8 +447,9 @@ def read_visibilities(path: str | Path) -> Visibilities:
         layout = DataLayout.from_flags(flags)
         utc = utc_of_jd(found)
         times, windows = read_windows(found, utc)
-        says_window = windows is not None or found.values.get("window") == "instant"
-        seen, mhz = observation_of(found, times, windows), found.values["frequency_mhz"]
+        says_window = windows is not None or said.get("window") == "instant"
+        runs = here["run"], tuple(here["turntable_deg"].tolist()), said["step_s"]
+        seen = Observation(said["lon_deg"], said["lat_deg"], times, *runs, windows=windows)
         receiver = receiver_of(path, here, "load_frequency_mhz", *LOADS)
-        truth = here.get("truth")
-        return Visibilities(layout.gather(values), layout, seen, mhz, truth, receiver, says_window)
+        known = said["frequency_mhz"], here.get("truth"), receiver, says_window
+        return Visibilities(layout.gather(values), layout, seen, *known)

@@ -44,21 +44,13 @@ from lusee_bayes.core.formats import image_names, read_fits
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.core.version import __version__
-from lusee_bayes.instrument import products
+from lusee_bayes.instrument import products, times
+from lusee_bayes.instrument.beams import source
 from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ, Interpolation
-from lusee_bayes.instrument.beams.source import LOADS, Circuit, MeasuredReceiver, receiver_of
 from lusee_bayes.instrument.observation import Observation, body_direction
-from lusee_bayes.instrument.times import (
-    ROUNDING_S,
-    later,
-    require_ephemeris,
-    scale_of,
-    seconds_from,
-    utc_from_text,
-    utc_of,
-)
 from lusee_bayes.instrument.visibilities import Visibilities
 
+ByTime, Hdu = Float[np.ndarray, "times products frequencies"], fits.ImageHDU | fits.BinTableHDU
 # words of the header that both kinds of files have
 SITE_AND_STEP = {
     "LUN_LONG_DEG": Attribute(low=-360.0, high=360.0),
@@ -98,7 +90,7 @@ class Waterfall(Described):
     per_kelvin: Float[np.ndarray, "frequencies ports"] | None = None
     moon_k: float = 0.0
     antenna_k: float = 0.0
-    receiver: MeasuredReceiver | None = None
+    receiver: source.MeasuredReceiver | None = None
     interpolation: str | None = None
 
     def description(self) -> tuple[str, ...]:
@@ -155,9 +147,9 @@ class Waterfall(Described):
         values = self.grid[:, :, channel]
         present = np.isfinite(values)
         within = np.array([p.j < n_ports for p in products.all_products()])
-        if present[~within].any():
-            first = int(np.argmax(present.any(1) & ~within))
-            label = products.all_products()[first].label
+        beyond = present.any(1) & ~within
+        if beyond.any():
+            label = products.labels()[int(np.argmax(beyond))]
             raise InputError(
                 f"{self.path} has the product {label}, but the beams are those of {n_ports} ports; "
                 "give beam.rotations_deg an angle for every port"
@@ -193,9 +185,8 @@ def start_of(text: str) -> Time:
     if named := YEAR.fullmatch(word):
         kind, year = named[1], int(named[2])
         year += 2000 if year < 100 else 0
-        return utc_from_text(
-            "LUNAR_DAY", f"{year:04d}-01-01T01:00" if kind == "CY" else f"{year - 1:04d}-10-01"
-        )
+        begins = f"{year:04d}-01-01T01:00" if kind == "CY" else f"{year - 1:04d}-10-01"
+        return times.utc_from_text("LUNAR_DAY", begins)
     if LUNAR_DAY.fullmatch(word):
         return _noon(int(word))
     first, to, _ = word.partition(" to ")
@@ -204,12 +195,13 @@ def start_of(text: str) -> Time:
             f"LUNAR_DAY '{text}' is not a date to a date (2027-01-15 00:00:00 to 2027-02-01), a "
             "year (CY2027, FY27) or the number of a lunar day (2700)"
         )
-    return utc_from_text("LUNAR_DAY", first)
+    return times.utc_from_text("LUNAR_DAY", first)
 
 
 def _noon(number: int) -> Time:
     year, place = 2000 + number // 100, number % 100
-    new_year, next_year = (utc_from_text("LUNAR_DAY", f"{y}-01-01").jd for y in (year, year + 1))
+    years = (f"{year}-01-01", f"{year + 1}-01-01")
+    new_year, next_year = (times.utc_from_text("LUNAR_DAY", first).jd for first in years)
     days = np.arange(new_year, next_year + DAYS_AFTER_NEW_YEAR)
     height = _sun_height(days)
     highest = (height[1:-1] > height[:-2]) & (height[1:-1] > height[2:])
@@ -225,13 +217,13 @@ def _noon(number: int) -> Time:
             f"LUNAR_DAY {number}: expected a number from {number - place}, the first lunar day of "
             f"{year}; 12 or 13 of them begin in a year"
         )
-    return utc_of(np.array([noon]), np.zeros(1))[0]
+    return times.utc_of(np.array([noon]), np.zeros(1))[0]
 
 
 def _sun_height(jd: Float[np.ndarray, " times"]) -> Float[np.ndarray, " times"]:
     """Sine of the Sun's altitude in the middle of the far side."""
     zeros = np.zeros(len(jd), dtype=int)
-    there = Observation(180.0, 0.0, utc_of(jd, np.zeros(len(jd))), zeros, (0.0,), 1.0)
+    there = Observation(180.0, 0.0, times.utc_of(jd, np.zeros(len(jd))), zeros, (0.0,), 1.0)
     return np.einsum("ti,ti->t", body_direction("Sun", there), there.zenith_galactic())
 
 
@@ -279,14 +271,14 @@ def read_scalar(path: Path) -> Waterfall:
         signed = zip(columns, values, strict=True)
         grid = products.in_order([(label, sign * one) for (label, sign), one in signed])
         first, seconds = start_of(said["LUNAR_DAY"]), said["DELTAT_SEC"] * np.arange(len(data))
-        require_ephemeris(first.jd + seconds[-1:] / 86400.0)
-        observation = _observation(later(first, seconds), said)
+        times.require_ephemeris(first.jd + seconds[-1:] / 86400.0)
+        observation = _observation(times.later(first, seconds), said)
     return Waterfall(str(path), grid, found.arrays["freq"], observation)
 
 
-def _observation(times: Time, said: Mapping[str, Any]) -> Observation:
-    site, run = (said["LUN_LONG_DEG"], said["LUN_LAT_DEG"]), np.zeros(len(times), dtype=int)
-    return Observation(*site, times, run, (0.0,), said["DELTAT_SEC"])
+def _observation(at: Time, said: Mapping[str, Any]) -> Observation:
+    site, run = (said["LUN_LONG_DEG"], said["LUN_LAT_DEG"]), np.zeros(len(at), dtype=int)
+    return Observation(*site, at, run, (0.0,), said["DELTAT_SEC"])
 
 
 UNIT = "V^2/Hz"
@@ -300,21 +292,15 @@ FOUR_PORT_WATERFALL = Layout(
         "products.label": Variable(("product",), "text"),
         # NaN where a sample is missing
         "data": Variable(("time", "product", "freq"), finite=False, unit=UNIT),
-        "blackbody_normalization_real": Variable(
-            ("freq", products.N_ANTENNAS, products.N_ANTENNAS)
-        ),
-        **dict.fromkeys(
-            LOADS,
-            Variable(("freq", products.N_ANTENNAS, products.N_ANTENNAS), optional=True, unit="Ohm"),
-        ),
+        "blackbody_normalization_real": Variable(source.BY_PORTS),
+        **dict.fromkeys(source.LOADS, Variable(source.BY_PORTS, optional=True, unit="Ohm")),
     },
     {
         **SITE_AND_STEP,
         "TMOON_K": Attribute(low=0.0),
         "TANT_K": Attribute(low=0.0, optional=True),
-        "TIMESYS": Attribute("text", optional=True),
+        **dict.fromkeys(("TIMESYS", "FREQINT"), Attribute("text", optional=True)),
         "TIMEUNIT": Attribute("text", choices=("d",), optional=True),
-        "FREQINT": Attribute("text", optional=True),
         "BUNIT": Attribute("text", choices=(UNIT,)),
     },
 )
@@ -347,12 +333,11 @@ def read_four_port(path: Path) -> Waterfall:
     named = zip(names, np.moveaxis(images["data"], 1, 0), strict=True)
     with naming(path):
         grid = products.in_order([(name, volts / scales.get(name, 1.0)) for name, volts in named])
-        scale = scale_of("TIMESYS", said.get("TIMESYS", "UTC"))
-        observation = _observation(utc_of(*images["time"].T, scale), said)
-    warm = {"moon_k": said["TMOON_K"], "antenna_k": said.get("TANT_K", 0.0)}
-    loads, rule = receiver_of(path, images, "freq", *LOADS), said.get("FREQINT")
-    known = {"per_kelvin": per_kelvin, "receiver": loads, "interpolation": rule}
-    return Waterfall(str(path), grid, images["freq"], observation, **known, **warm)
+        scale = times.scale_of("TIMESYS", said.get("TIMESYS", "UTC"))
+        observation = _observation(times.utc_of(*images["time"].T, scale), said)
+    loads = source.receiver_of(path, images, "freq", *source.LOADS)
+    known = per_kelvin, said["TMOON_K"], said.get("TANT_K", 0.0), loads, said.get("FREQINT")
+    return Waterfall(str(path), grid, images["freq"], observation, *known)
 
 
 def read_waterfall(path: str | Path) -> Waterfall:
@@ -419,8 +404,8 @@ def write_waterfall(
             f"{path}: luseepy's reader takes at least two channels; give --frequencies, or {HINT}"
         )
     data = _kelvin(path, channels)
-    seconds = seconds_from(first.times[0], first.times)
-    if np.abs(seconds - first.step_s * np.arange(first.n_times)).max() > ROUNDING_S:
+    seconds = times.seconds_from(first.times[0], first.times)
+    if np.abs(seconds - first.step_s * np.arange(first.n_times)).max() > times.ROUNDING_S:
         raise InputError(
             f"{path}: luseepy's waterfalls have a sample every {first.step_s:g} s without gaps; "
             f"{HINT}"
@@ -438,11 +423,9 @@ def _frequencies(channels: Sequence[Visibilities]) -> Float[np.ndarray, " freque
     return np.array([channel.frequency_mhz for channel in channels])
 
 
-def _kelvin(
-    path: Path, channels: Sequence[Visibilities]
-) -> Float[np.ndarray, "times products frequencies"]:
+def _kelvin(path: Path, channels: Sequence[Visibilities]) -> ByTime:
     """Samples of all channels, NaN where they are missing; InputError if there is no room."""
-    times = channels[0].observation.times
+    first = channels[0].observation
     for channel in channels:
         observation = channel.observation
         if observation.windows is not None:
@@ -454,7 +437,7 @@ def _kelvin(
             )
         if channel.layout.n_products != products.N_ANTENNAS**2:
             raise InputError(f"{path}: expected {products.N_ANTENNAS**2} products; {HINT}")
-        if observation.n_times != len(times) or (observation.times != times).any():
+        if observation.n_times != first.n_times or (observation.times != first.times).any():
             raise InputError(f"{path}: the channels have different times; {HINT}")
     return np.moveaxis(np.stack([channel.grid() for channel in channels], axis=-1), 0, 1)
 
@@ -462,7 +445,7 @@ def _kelvin(
 def _site_and_times(observation: Observation) -> dict[str, Any]:
     """The words of the header that say where and when."""
     # luseepy counts steps up to the end: half a step less leaves no room for rounding
-    last = later(observation.times[-1], -0.5 * observation.step_s)
+    last = times.later(observation.times[-1], -0.5 * observation.step_s)
     ends = [Time(t, format="iso", precision=9).value for t in (observation.times[0], last)]
     return {
         "LUNAR_DAY": " to ".join(ends),
@@ -473,15 +456,10 @@ def _site_and_times(observation: Observation) -> dict[str, Any]:
     }
 
 
-def _write(
-    path: Path,
-    hdus: Sequence[fits.ImageHDU | fits.BinTableHDU],
-    header: Mapping[str, Any],
-    scenario: str | None,
-) -> Path:
+def _write(path: Path, hdus: list[Hdu], header: dict[str, Any], scenario: str | None) -> Path:
     """Write a FITS file, whole or not at all; the first image, ``data``, becomes the primary."""
     primary = fits.PrimaryHDU(hdus[0].data)
-    for key, value in ({"EXTNAME": "data"} | dict(header)).items():
+    for key, value in ({"EXTNAME": "data"} | header).items():
         primary.header[key if len(key) <= 8 else f"HIERARCH {key}"] = value
     primary.header["CREATOR"] = f"lusee_bayes {__version__}"
     written = fits.HDUList([primary, *hdus[1:]])
@@ -496,7 +474,7 @@ def _write(
 def write_four_port(
     path: str | Path,
     channels: Sequence[Visibilities],
-    circuits: Sequence[Circuit],
+    circuits: Sequence[source.Circuit],
     *,
     moon_k: float = 0.0,
     antenna_k: float = 0.0,
@@ -605,15 +583,11 @@ def _hdus(name: str, values: Any, unit: str) -> list[fits.ImageHDU]:
     parts = {name: np.asarray(values)}
     if np.iscomplexobj(values):
         parts = {f"{name}_real": np.real(values).copy(), f"{name}_imag": np.imag(values).copy()}
-    return [
-        fits.ImageHDU(part, fits.Header([("EXTNAME", key), ("BUNIT", unit)]))
-        for key, part in parts.items()
-    ]
+    headers = [fits.Header([("EXTNAME", key), ("BUNIT", unit)]) for key in parts]
+    return list(map(fits.ImageHDU, parts.values(), headers))
 
 
-def _eigenvalues(
-    data: Float[np.ndarray, "times products frequencies"],
-) -> Float[np.ndarray, "times frequencies ports"]:
+def _eigenvalues(data: ByTime) -> Float[np.ndarray, "times frequencies ports"]:
     """Of the covariance of the ports at every time; NaN where a product is missing."""
     covariance = np.moveaxis(products.to_matrix(np.moveaxis(data, 1, 0)), (0, 1), (2, 3))
     complete = np.isfinite(data).all(1)

@@ -232,7 +232,7 @@ def test_receivers(tmp_path):
     ]
     np.testing.assert_allclose(JFETReceiver(**preamplifiers).load(20.0), np.diag(z), rtol=1e-13)
     z = [1.0 / (1j * w * cap * 1e-12) for cap in (30.0, 40.0, 35.0, 20.0)]
-    capacitors = CapacitorReceiver((30.0, 40.0, 35.0, 20.0))
+    capacitors = CapacitorReceiver(capacitance_pf=(30.0, 40.0, 35.0, 20.0))
     np.testing.assert_allclose(capacitors.load(20.0), np.diag(z), rtol=1e-13)
     # measured, coupled loads: straight lines between the frequencies, none beyond
     rng = np.random.default_rng(2)

@@ -15,8 +15,8 @@ from astropy.io import fits
 from reference import unit_vectors
 
 import lusee_bayes as lb
-from lusee_bayes.instrument.beams.fields import HemisphereGrid, from_rings, wavenumber
-from lusee_bayes.instrument.beams.monopoles import Monopoles
+from lusee_bayes.instrument.beams.fields import HemisphereGrid, from_rings
+from lusee_bayes.instrument.beams.monopoles import Monopoles, wavenumber
 from lusee_bayes.instrument.beams.sampled import from_uvbeam, read_beam, write_sampled_beams
 from lusee_bayes.instrument.products import labels, to_real
 from lusee_bayes.report.describe import describe

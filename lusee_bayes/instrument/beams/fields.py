@@ -24,11 +24,11 @@ from jaxtyping import Complex, Float, Inexact
 from scipy.special import roots_legendre
 
 from lusee_bayes.core import checks
-from lusee_bayes.core.arrays import Array, as_complex, namespace
+from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import LARGEST_LMAX, SQRT2, lmax_of, mode_numbers, polar_functions
 from lusee_bayes.core.lazy import healpy
-from lusee_bayes.instrument.products import antennas_of, auto_indices, labels, to_real
+from lusee_bayes.instrument.products import antennas_of, auto_indices, labels_of, to_real
 
 # responses of antennas, and of pairs of them, in any directions
 Fields = Complex[Array, "antennas *directions"]
@@ -126,20 +126,6 @@ class HemisphereGrid(eqx.Module):
         return xp.moveaxis(by_order[m + lmax, :, ell], 0, -1).reshape(*f.shape[:-2], -1)
 
 
-SPEED_OF_LIGHT = 299792458.0  # m/s
-
-
-def wavenumber(frequency_mhz: float | Float[Array, ""]) -> float | Float[Array, ""]:
-    """Return k = 2 pi / wavelength, in 1/m."""
-    return 2.0e6 * np.pi * frequency_mhz / SPEED_OF_LIGHT
-
-
-def phasor(angle: Float[Array, "..."]) -> Complex[Array, "..."]:
-    """Return exp(i angle)."""
-    xp = namespace(angle)
-    return as_complex(xp.cos(angle), xp.sin(angle))
-
-
 class AntennaFields(checks.Described, eqx.Module):
     """Complex response of each antenna to a wave arriving from each direction of a grid.
 
@@ -160,21 +146,20 @@ class AntennaFields(checks.Described, eqx.Module):
 
     def __check_init__(self):
         expected = (None, len(self.grid.theta), self.grid.n_phi)
-        checks.require_shape("e_theta", self.e_theta, expected)
-        checks.require_shape("e_phi", self.e_phi, (self.e_theta.shape[0], *expected[1:]))
-        for name in ("e_theta", "e_phi"):
-            if getattr(self, name).dtype != np.complex128:
+        for name, field in (("e_theta", self.e_theta), ("e_phi", self.e_phi)):
+            checks.require_shape(name, field, expected)
+            expected = field.shape
+            if field.dtype != np.complex128:
                 raise InputError(
-                    f"{name} must be a complex128 array, got {getattr(self, name).dtype}; "
+                    f"{name} must be a complex128 array, got {field.dtype}; "
                     "convert it with numpy.asarray(x, dtype=numpy.complex128)"
                 )
 
     def description(self) -> tuple[str, ...]:
-        return (
-            f"E_theta and E_phi of {self.n_antennas} antennas, complex",
-            f"{len(self.grid.theta)} angles from zenith to horizon x {self.grid.n_phi} azimuths, "
-            "from East towards North",
-        )
+        n_theta, n_phi = len(self.grid.theta), self.grid.n_phi
+        angles = f"{n_theta} angles from zenith to horizon x {n_phi} azimuths"
+        what = f"E_theta and E_phi of {self.n_antennas} antennas, complex"
+        return what, f"{angles}, from East towards North"
 
     @property
     def n_antennas(self) -> int:
@@ -395,7 +380,7 @@ class ProductBeams(checks.Described, eqx.Module):
     @property
     def labels(self) -> tuple[str, ...]:
         """Labels of the products, in order."""
-        return labels(antennas_of(self.n_products))
+        return labels_of(self.n_products)
 
 
 def product_beams(
@@ -494,12 +479,11 @@ def from_rings(
         enough = np.flatnonzero(sizes > 2 * m)
         both = 2 * nside - 1 + np.unique([-m, m])
         known = series[..., enough, :][..., both]
-        parts = [(-1.0) ** m * known[..., ::-1, :], known]
-        nodes = [-ring_theta[enough][::-1], ring_theta[enough]]
-        if m:
-            parts.insert(1, np.zeros_like(known[..., :1, :]))
-            nodes.insert(1, np.zeros(1))
-        known = np.concatenate(parts, axis=-2)
+        # at the zenith every order but 0 is zero
+        zenith = np.zeros(min(m, 1))
+        none = np.zeros_like(known[..., : zenith.size, :])
+        nodes = [-ring_theta[enough][::-1], zenith, ring_theta[enough]]
+        known = np.concatenate([(-1.0) ** m * known[..., ::-1, :], none, known], axis=-2)
         spline = scipy.interpolate.CubicSpline(np.concatenate(nodes), known, axis=-2)
         spread[..., both] = spline(theta)
     values = spread @ np.exp(1j * orders[:, None] * phi[None])

@@ -34,11 +34,11 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Complex, Float
-from scipy.constants import Boltzmann, physical_constants
+from scipy.constants import Boltzmann, physical_constants, speed_of_light
 from scipy.special import roots_legendre
 
 from lusee_bayes.core.arrays import Array
@@ -48,7 +48,6 @@ from lusee_bayes.core.formats import read_fits
 from lusee_bayes.core.harmonics import mode_numbers, polar_functions
 from lusee_bayes.core.layouts import UNSTATED, Attribute, Layout, Variable
 from lusee_bayes.instrument.beams.fields import (
-    SPEED_OF_LIGHT,
     Angles,
     AntennaFields,
     HemisphereGrid,
@@ -184,6 +183,7 @@ VACUUM_OHM = physical_constants["characteristic impedance of vacuum"][0]
 LENGTHS = ("H_theta", "H_phi")
 MATRICES = ("ZA", "Rsky", "Rmoon", "Rloss")
 AXES = ("freq", "theta", "phi")
+MATRIX = Variable(("freq", N_ANTENNAS, N_ANTENNAS), unit="Ohm")
 
 
 def parts_of(*names: str) -> list[str]:
@@ -197,9 +197,7 @@ RESPONSE_LAYOUT = Layout(
         "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
         **{name: Variable((name,), grows=True, unit="deg") for name in AXES[1:]},
         **dict.fromkeys(parts_of(*LENGTHS), Variable((N_ANTENNAS, *AXES), unit="m")),
-        **dict.fromkeys(
-            parts_of(*MATRICES), Variable(("freq", N_ANTENNAS, N_ANTENNAS), unit="Ohm")
-        ),
+        **dict.fromkeys(parts_of(*MATRICES), MATRIX),
     },
     dict.fromkeys((*CONVENTIONS, *SOURCES), Attribute("word", optional=True)),
 )
@@ -265,10 +263,6 @@ class LuseepyBeam(Described, BeamSource):
     def _linear(self, frequency_mhz: float, lmax: int, grid: HemisphereGrid) -> np.ndarray:
         """Coefficients of the beams of all products by luseepy's rule."""
 
-    @property
-    def emits(self) -> bool:
-        return self.moon_k != 0.0
-
     def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
         # nodes integrate across the horizon exactly
         exact = HemisphereGrid.gauss_legendre(2 * len(self.theta), self.n_phi)
@@ -310,6 +304,8 @@ class PortResponse(LuseepyBeam):
         Temperature of the lossy antennas in K.
     """
 
+    n_ports: ClassVar[int] = N_ANTENNAS
+
     impedance_ohm: Complex[np.ndarray, "frequencies ports ports"]
     moon_ohm: Complex[np.ndarray, "frequencies ports ports"]
     loss_ohm: Complex[np.ndarray, "frequencies ports ports"]
@@ -318,17 +314,9 @@ class PortResponse(LuseepyBeam):
     antenna_k: float = 0.0
 
     @property
-    def n_ports(self) -> int:
-        return N_ANTENNAS
-
-    @property
     def luseepy_grid(self) -> BandLimitedGrid:
         """The directions of the file with the rule of luseepy's four-port engine."""
         return BandLimitedGrid.of(self.theta, self.n_phi)
-
-    @property
-    def emits(self) -> bool:
-        return self.moon_k != 0.0 or self.antenna_k != 0.0
 
     def behind(self, receiver: Receiver | None) -> PortResponse:
         given = receiver is None or self.receiver_said
@@ -355,7 +343,7 @@ class PortResponse(LuseepyBeam):
         the fields themselves are interpolated here, for pictures; use :meth:`beams` for products.
         """
         opened = self._open(self._at(frequency_mhz, self.e_theta, self.e_phi), grid)
-        mixing = self._mixing(frequency_mhz) / (SPEED_OF_LIGHT / (1e6 * frequency_mhz))
+        mixing = self._mixing(frequency_mhz) / (speed_of_light / (1e6 * frequency_mhz))
         parts = (np.tensordot(mixing, part, axes=1) for part in (opened.e_theta, opened.e_phi))
         return AntennaFields(*parts, grid)
 
@@ -363,14 +351,14 @@ class PortResponse(LuseepyBeam):
         opened = np.zeros((N_ANTENNAS**2, (lmax + 1) ** 2))
         for k, weight in self._neighbours(frequency_mhz):
             fields = self._open([self.e_theta[k], self.e_phi[k]], grid)
-            wavelength = SPEED_OF_LIGHT / (1e6 * self.frequencies_mhz[k])
+            wavelength = speed_of_light / (1e6 * self.frequencies_mhz[k])
             opened += weight / wavelength**2 * product_modes(fields, lmax, normalise=False)
         mixing = self._mixing(frequency_mhz)
         seen = np.einsum("ai,ijm,bj->abm", mixing, to_matrix(opened), mixing.conj(), optimize=True)
         return to_real(seen)
 
     def background(self, frequency_mhz: float) -> Float[Array, " products"]:
-        if not self.emits:
+        if self.moon_k == self.antenna_k == 0.0:
             return super().background(frequency_mhz)
         circuit = self.circuit(frequency_mhz)
         seen = circuit.emitted(self.moon_k * circuit.moon_ohm + self.antenna_k * circuit.loss_ohm)
@@ -520,7 +508,7 @@ class ScalarBeam(LuseepyBeam):
         enclosure of one temperature are taken to be uncorrelated, as they are where nothing
         couples them, so that a cross receives the part of the sky with the opposite sign.
         """
-        if not self.emits:
+        if self.moon_k == 0.0:
             return super().background(frequency_mhz)
         sky = np.sqrt(4.0 * np.pi) * self.beams(frequency_mhz, 0).modes[:, 0]
         return self.moon_k * (to_real(np.eye(self.n_ports, dtype=np.complex128)) - sky)
@@ -532,11 +520,8 @@ class ScalarBeam(LuseepyBeam):
             below = np.arctan((grid.theta - np.pi / 2.0) / TAPER_WIDTH) / np.pi + 0.5
             scale = scale * (1.0 - below**2)
         angles = [angle + self.turntable_offset_deg for angle in self.rotations_deg]
-        turned = (
-            np.stack([on_grid(part, self.theta, grid, a) for a in angles]) * scale[:, None]
-            for part in parts
-        )
-        return AntennaFields(*(x.astype(np.complex128) for x in turned), grid)
+        turned = [np.stack([on_grid(p, self.theta, grid, a) for a in angles]) for p in parts]
+        return AntennaFields(*((x * scale[:, None]).astype(np.complex128) for x in turned), grid)
 
 
 def read_scalar_beam(path: str | Path) -> ScalarBeam:
@@ -571,10 +556,9 @@ def read_scalar_beam(path: str | Path) -> ScalarBeam:
             f"{path}: the fields have {sizes['theta']} x {sizes['phi']} directions, the header "
             f"says {said['THETA_N']} x {said['PHI_N']} (THETA_N, PHI_N)"
         )
+    pair = [images[f"{name}_real"] + 1j * images[f"{name}_imag"] for name in FIELD_NAMES]
     # the last azimuth is the first once more
-    e_theta, e_phi = (
-        (images[f"{name}_real"] + 1j * images[f"{name}_imag"])[..., :-1] for name in FIELD_NAMES
-    )
+    e_theta, e_phi = (part[..., :-1] for part in pair)
     theta = np.linspace(0.0, np.pi / 2.0, sizes["theta"])
     z = images["Z_real"] + 1j * images["Z_imag"] if set(IMPEDANCE) <= set(images) else None
     return ScalarBeam(str(path), images["freq"], theta, e_theta, e_phi, images["gain_conv"], z)

@@ -25,6 +25,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
+from scipy.constants import speed_of_light
 
 from lusee_bayes.core.arrays import Array, as_complex, compiled, namespace
 from lusee_bayes.core.checks import is_traced, require_array, require_finite, require_positive
@@ -35,10 +36,8 @@ from lusee_bayes.instrument.beams.fields import (
     HemisphereGrid,
     ProductBeams,
     mean_auto_integral,
-    phasor,
     product_modes,
     stokes_pairs,
-    wavenumber,
 )
 from lusee_bayes.instrument.beams.source import BeamSource
 from lusee_bayes.instrument.observation import Observation
@@ -52,6 +51,17 @@ Frequency = float | Float[Array, ""]
 Vectors = Float[Array, "directions 3"]
 Angles = Float[Array, "*#directions"]
 Coefficients = Complex[Array, " theta"]
+
+
+def wavenumber(frequency_mhz: Frequency) -> Frequency:
+    """Return k = 2 pi / wavelength, in 1/m."""
+    return 2.0e6 * np.pi * frequency_mhz / speed_of_light
+
+
+def phasor(angle: Float[Array, "..."]) -> Complex[Array, "..."]:
+    """Return exp(i angle)."""
+    xp = namespace(angle)
+    return as_complex(xp.cos(angle), xp.sin(angle))
 
 
 def _array(x) -> Float[Array, "..."]:
@@ -179,9 +189,8 @@ class Monopoles(BeamSource, eqx.Module):
     turntable_offset_deg: Float[Array, ""] = eqx.field(default=0.0, converter=_array)
 
     def __check_init__(self):
-        require_finite("zenith_angle_deg", self.zenith_angle_deg)
-        require_finite("azimuths_deg", self.azimuths_deg)
-        require_finite("turntable_offset_deg", self.turntable_offset_deg)
+        for name in ("zenith_angle_deg", "azimuths_deg", "turntable_offset_deg"):
+            require_finite(name, getattr(self, name))
         require_positive("length_m", self.length_m)
         require_positive("height_m", self.height_m)
 
@@ -298,8 +307,7 @@ def monopole_beams(
 def _modes(
     frequency_mhz: Frequency, lmax: int, monopoles: Monopoles, stokes: str, nodes: Any
 ) -> Float[Array, "products modes"]:
-    exact = HemisphereGrid.for_lmax
-    grid = exact(lmax) if nodes is None else HemisphereGrid.gauss_legendre(*nodes)
+    grid = HemisphereGrid.gauss_legendre(*nodes) if nodes else HemisphereGrid.for_lmax(lmax)
     return product_modes(monopoles.fields(frequency_mhz, grid), lmax, stokes=stokes)
 
 
@@ -353,8 +361,7 @@ def with_values(monopoles: Monopoles, values: Mapping[str, float | Float[Array, 
         If a name is unknown.
     """
     for name, value in values.items():
-        value = namespace(value).asarray(value, dtype=np.float64)
-        monopoles = eqx.tree_at(parameter(name).where, monopoles, value)
+        monopoles = eqx.tree_at(parameter(name).where, monopoles, _array(value))
     return monopoles
 
 
@@ -434,8 +441,7 @@ def _patterns(
 @compiled
 def _normalisation(frequency_mhz: Float[Array, ""], monopoles: Monopoles) -> Float[Array, ""]:
     grid = HemisphereGrid.for_lmax(NORMALISATION_LMAX)
-    e_theta, e_phi = monopoles.towards(frequency_mhz, grid.theta[:, None], grid.phi[None])
-    return mean_auto_integral(AntennaFields(e_theta, e_phi, grid))
+    return mean_auto_integral(monopoles.fields(frequency_mhz, grid))
 
 
 def source_response(
@@ -480,5 +486,4 @@ def source_response(
     response = beams_towards(frequency_mhz, directions, monopoles)
     if not is_traced(stokes_v) and stokes_v == 0.0:
         return response
-    circular = beams_towards(frequency_mhz, directions, monopoles, stokes="V")
-    return response + stokes_v * circular
+    return response + stokes_v * beams_towards(frequency_mhz, directions, monopoles, stokes="V")

@@ -35,15 +35,6 @@ from lusee_bayes.core import formats
 from lusee_bayes.core.checks import Described, listed, require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing, user_path
-from lusee_bayes.core.formats import (
-    UVBEAM_WORDS,
-    as_dataset,
-    has_words,
-    image_names,
-    is_fits,
-    read_fits,
-    read_netcdf,
-)
 from lusee_bayes.core.layouts import Attribute, Kind, Layout, Variable
 from lusee_bayes.core.lazy import healpy, pyuvdata
 from lusee_bayes.core.reading import naming, reading, require_file
@@ -56,12 +47,7 @@ from lusee_bayes.instrument.beams.fields import (
     from_rings,
     on_grid,
 )
-from lusee_bayes.instrument.beams.luseepy_files import (
-    PortResponse,
-    ScalarBeam,
-    read_response,
-    read_scalar_beam,
-)
+from lusee_bayes.instrument.beams.luseepy_files import read_response, read_scalar_beam
 from lusee_bayes.instrument.beams.source import BeamSource
 from lusee_bayes.instrument.products import antennas_of, auto_indices, labels, to_matrix, to_real
 
@@ -94,13 +80,13 @@ class Directions:
     nside: int = 0
 
     @classmethod
-    def of(cls, theta_deg: Any, phi_deg: Any, n_last: int, path: str) -> Directions:
+    def of(cls, theta: Any, phi: Any, n_last: int, path: str) -> Directions:
         """Return the directions of the last axes of arrays.
 
         Parameters
         ----------
-        theta_deg, phi_deg : array or None
-            See :func:`.sampled_beams`.
+        theta, phi : array or None
+            In degrees; see :func:`.sampled_beams`.
         n_last : int
             Length of the last axis: the pixels, where there are no angles.
         path : str
@@ -111,14 +97,13 @@ class Directions:
         InputError
             If angles do not cover the hemisphere, or there are not the pixels of a map.
         """
-        if theta_deg is None or phi_deg is None:
+        if theta is None or phi is None:
             if not healpy.isnpixok(n_last):
                 raise InputError(
                     f"{path}: {n_last} directions are no HEALPix map of 12 NSIDE^2 pixels; give "
                     "theta_deg and phi_deg for a grid"
                 )
             return cls(None, 0, healpy.npix2nside(n_last))
-        theta, phi = theta_deg, phi_deg
         used = theta[theta < 90.0 - ANGLE_TOLERANCE]
         if len(used) < 4 or max(used[0], 90.0 - used[-1]) > np.diff(theta)[: len(used)].max():
             raise InputError(
@@ -133,13 +118,6 @@ class Directions:
             )
         return cls(np.radians(used), n)
 
-    @property
-    def text(self) -> str:
-        """What they are, in words."""
-        if self.theta is None:
-            return f"HEALPix pixels of NSIDE {self.nside}"
-        return f"{len(self.theta)} theta x {self.n_phi} phi"
-
     def above(self, values: np.ndarray, what: str) -> np.ndarray:
         """Return the values in these directions of those in all directions that were given.
 
@@ -148,7 +126,6 @@ class Directions:
         InputError
             If one is not finite.
         """
-        kept = values
         if self.theta is not None:
             kept = values[..., : len(self.theta), : self.n_phi]
         else:
@@ -197,10 +174,8 @@ class Directions:
 def _axes(theta: np.ndarray, phi: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """East, North and up components of the unit vectors along theta and phi."""
     zero = np.zeros(np.broadcast_shapes(theta.shape, phi.shape))
-    return (
-        [np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), zero - np.sin(theta)],
-        [zero - np.sin(phi), zero + np.cos(phi), zero],
-    )
+    along_theta = [np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), zero - np.sin(theta)]
+    return along_theta, [zero - np.sin(phi), zero + np.cos(phi), zero]
 
 
 @dataclass(frozen=True, repr=False, eq=False)
@@ -244,10 +219,11 @@ class SampledBeams(Described, BeamSource):
     def description(self) -> tuple[str, ...]:
         kind = "E fields of" if self.products is None else "product beams of"
         scale = "K per K" if self.absolute else "to be scaled so that autos integrate to one"
-        return (
-            f"{kind} {self.n_ports} antennas, {self.directions.text}",
-            f"at {listed(tuple(f'{f:g}' for f in self.frequencies_mhz))} MHz; {scale}",
-        )
+        known = listed(tuple(f"{f:g}" for f in self.frequencies_mhz))
+        at, where = self.directions, f"HEALPix pixels of NSIDE {self.directions.nside}"
+        if at.theta is not None:
+            where = f"{len(at.theta)} theta x {at.n_phi} phi"
+        return f"{kind} {self.n_ports} antennas, {where}", f"at {known} MHz; {scale}"
 
     @property
     def n_ports(self) -> int:
@@ -365,21 +341,17 @@ WHAT = "sampled beams"
 HINT = "lusee_bayes.write_sampled_beams makes one of sampled_beams(...)"
 
 
-def layout(
-    names: tuple[str, ...], grid: bool, kind: Kind = "real", attributes: Any = None
-) -> Layout:
+def layout(names: tuple[str, ...], grid: bool, kind: Kind = "real", said: Any = None) -> Layout:
     """Return what a file, or arrays, hold: these fields or beams on a grid or on HEALPix pixels."""
     first = "product" if names[0] in ("products", POWER) else "antenna"
     directions = ("theta", "phi") if grid else ("pixel",)
     # below the horizon there may be anything
     values = Variable(("frequency", first, *directions), kind, missing=True)
-    angles = {
-        f"{name}_deg": Variable((name,), low=0.0, high=end, grows=True, unit="deg")
-        for name, end in (("theta", 180.0), ("phi", 360.0))
-    }
+    angle = partial(Variable, low=0.0, grows=True, unit="deg")
+    angles = {"theta_deg": angle(("theta",), high=180.0), "phi_deg": angle(("phi",), high=360.0)}
     frequency = Variable(("frequency",), low=0.0, grows=True, unit="MHz")
     arrays = {"frequency_mhz": frequency, **dict.fromkeys(names, values)}
-    return Layout(WHAT, arrays | (angles if grid else {}), attributes or {})
+    return Layout(WHAT, arrays | (angles if grid else {}), said or {})
 
 
 def read_sampled_beams(path: str | Path) -> SampledBeams:
@@ -399,24 +371,24 @@ def read_sampled_beams(path: str | Path) -> SampledBeams:
         If the file is missing, damaged or of another kind, or not as declared.
     """
     path = user_path(path)
-    if path.is_file() and is_fits(path):
-        read = partial(read_fits, path, hint=HINT)
+    if path.is_file() and formats.is_fits(path):
+        read = partial(formats.read_fits, path, hint=HINT)
     else:
-        read = partial(read_netcdf, path, formats.BEAMS, hint=HINT)
+        read = partial(formats.read_netcdf, path, formats.BEAMS, hint=HINT)
     there = read(layout=Layout(WHAT)).there
     names = (POWER,) if POWER in there else FIELDS
     said = {"absolute": Attribute("boolean")}
     said |= {"products": Attribute("text")} if POWER in there else {}
-    found = read(layout=layout(names, "theta_deg" in there, attributes=said))
+    found = read(layout=layout(names, "theta_deg" in there, said=said))
     arrays, given = found.arrays, {}
     if POWER in arrays:
         with naming(path):
             given["products"] = _in_order(arrays[POWER], found.values["products"])
     else:
         for name in ("e_theta", "e_phi"):
-            # set part by part: infinity times 1j would be NaN, with a warning
-            given[name] = np.empty(arrays[FIELDS[0]].shape, dtype=complex)
-            given[name].real, given[name].imag = (arrays[f"{name}_{x}"] for x in ("real", "imag"))
+            # infinity times 1j would be NaN, with a warning
+            parts = np.stack([arrays[f"{name}_{part}"] for part in ("real", "imag")], axis=-1)
+            given[name] = parts.view(complex)[..., 0]
     angles = {name: arrays.get(name) for name in ("theta_deg", "phi_deg")}
     options = {"absolute": found.values["absolute"], "path": str(path)}
     return sampled_beams(arrays["frequency_mhz"], **given, **angles, **options)
@@ -453,7 +425,7 @@ def write_sampled_beams(path: str | Path, beams: SampledBeams) -> Path:
             hdus += [fits.ImageHDU(a.copy(), name=name) for name, a in arrays.items()]
             fits.HDUList(hdus).writeto(partly)
         else:
-            dataset = as_dataset(formats.BEAMS, declared, arrays, said)
+            dataset = formats.as_dataset(formats.BEAMS, declared, arrays, said)
             dataset.to_netcdf(partly, engine="h5netcdf")
     return path
 
@@ -553,7 +525,7 @@ def from_uvbeam(beam: Any, *, conjugate: bool = False, path: str = "the UVBeam")
     return sampled_beams(np.asarray(beam.freq_array) / 1e6, **fields, **angles, path=path)
 
 
-def read_beam(path: str | Path) -> ScalarBeam | PortResponse | SampledBeams:
+def read_beam(path: str | Path) -> BeamSource:
     """Read a beam file of whichever kind.
 
     luseepy's scalar beams (FITS version 2) and responses (version 3), sampled beams
@@ -565,7 +537,8 @@ def read_beam(path: str | Path) -> ScalarBeam | PortResponse | SampledBeams:
 
     Returns
     -------
-    ScalarBeam, PortResponse or SampledBeams
+    BeamSource
+        ScalarBeam, PortResponse or SampledBeams.
 
     Raises
     ------
@@ -588,10 +561,10 @@ def beam_kind(path: str | Path) -> str:
         path = require_file(path, "beam file")
     except InputError:
         return "luseepy"
-    in_fits = is_fits(path)
-    names = set(image_names(path)) if in_fits else set()
+    in_fits = formats.is_fits(path)
+    names = set(formats.image_names(path)) if in_fits else set()
     own = names & {FIELDS[0], POWER} if in_fits else formats.format_of(path) == formats.BEAMS
-    if own or has_words(path, UVBEAM_WORDS):
+    if own or formats.has_words(path, formats.UVBEAM_WORDS):
         return "sampled"
     return "response" if "h_theta_real" in names else "luseepy"
 
@@ -605,7 +578,8 @@ def read_sampled(path: str | Path) -> SampledBeams:
         As :func:`read_sampled_beams` and :func:`read_uvbeam`.
     """
     path = require_file(path, "beam file", "check beam.file")
-    return read_uvbeam(path) if has_words(path, UVBEAM_WORDS) else read_sampled_beams(path)
+    is_uvbeam = formats.has_words(path, formats.UVBEAM_WORDS)
+    return read_uvbeam(path) if is_uvbeam else read_sampled_beams(path)
 
 
 READERS = {"sampled": read_sampled, "response": read_response, "luseepy": read_scalar_beam}

@@ -15,16 +15,18 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from jaxtyping import Complex, Float
+from pydantic import BeforeValidator, Field
 from scipy.constants import Boltzmann
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.formats import read_fits
 from lusee_bayes.core.layouts import Layout, Variable
+from lusee_bayes.core.section import LARGEST, Positive, Section
 from lusee_bayes.instrument.beams.fields import (
     AntennaFields,
     HemisphereGrid,
@@ -37,12 +39,13 @@ from lusee_bayes.instrument.beams.fields import (
 from lusee_bayes.instrument.products import N_ANTENNAS
 
 Ohms = Complex[np.ndarray, "ports ports"]
-LOADS = ("ZL_real", "ZL_imag")
+# matrices of the ports at every frequency
+LOADS, BY_PORTS = ("ZL_real", "ZL_imag"), ("freq", N_ANTENNAS, N_ANTENNAS)
 LOADS_LAYOUT = Layout(
     "loads ZL of four receivers, as luseepy's four-port waterfalls hold them",
     {
         "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
-        **{name: Variable(("freq", N_ANTENNAS, N_ANTENNAS), unit="Ohm") for name in LOADS},
+        **dict.fromkeys(LOADS, Variable(BY_PORTS, unit="Ohm")),
     },
 )
 
@@ -65,24 +68,48 @@ class Receiver(ABC):
     def load(self, frequency_mhz: float) -> Ohms:
         """Return ZL in Ohm. InputError at a frequency that the receiver does not know."""
 
+    def receiver(self) -> Receiver:
+        """The receiver: those that parameters determine are sections of a scenario themselves."""
+        return self
 
-@dataclass(frozen=True)
-class JFETReceiver(Receiver):
-    """The preamplifier of each port, by the circuit that its input impedance follows:
 
-    ::
+def _each_port(value: Any) -> Any:
+    """One number stands for all ports."""
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    return (value,) * N_ANTENNAS if number else value
 
-        Z = series + skin w^power + i w L + parallel / (1 + i w parallel C)
+
+def _ports(entry: Any) -> Any:
+    four = Field(min_length=N_ANTENNAS, max_length=N_ANTENNAS)
+    return Annotated[tuple[entry, ...], four, BeforeValidator(_each_port)]
+
+
+NotNegative = Annotated[float, Field(ge=0, le=LARGEST)]
+
+
+class JFETReceiver(Section, Receiver):
+    """luseepy's preamplifiers; every entry is one number, or one for each port.
+
+    Their input impedance follows the circuit ::
+
+        Z = series + skin w^power + i w L + parallel / (1 + i w parallel C),    w in rad/s
 
     Defaults are luseepy's fits to the four spare flight preamplifiers. Nothing couples them.
 
     Attributes
     ----------
-    capacitance_pf, inductance_nh : (ports,) tuple of float
-        C and L.
-    parallel_ohm, series_ohm : (ports,) tuple of float
-    skin_ohm, skin_power : (ports,) tuple of float
-        Skin effect, with w in rad/s.
+    capacitance_pf : tuple of float
+        Capacitance.
+    inductance_nh : tuple of float
+        Inductance.
+    parallel_ohm : tuple of float
+        Parallel resistance.
+    series_ohm : tuple of float
+        Series resistance.
+    skin_ohm : tuple of float
+        Resistance of the skin effect.
+    skin_power : tuple of float
+        Power of the frequency in the skin effect.
     """
 
     luseepy_name: ClassVar[str] = "JFETReceiver"
@@ -91,12 +118,13 @@ class JFETReceiver(Receiver):
         "Rs_ohm": "series_ohm", "a": "skin_ohm", "n": "skin_power",
     }  # fmt: skip
 
-    capacitance_pf: tuple[float, ...] = (33.79, 35.32, 34.89, 36.85)
-    inductance_nh: tuple[float, ...] = (35.0, 36.4, 34.7, 8.5)
-    parallel_ohm: tuple[float, ...] = (1101e3, 331e3, 288e3, 375e3)
-    series_ohm: tuple[float, ...] = (0.21, 2.16, 3.71, 1.65)
-    skin_ohm: tuple[float, ...] = (5.2e-12, 6.9e-20, 2.2e-38, 1.9e-16)
-    skin_power: tuple[float, ...] = (1.39, 2.26, 4.35, 1.88)
+    model: Literal["jfet"] = "jfet"
+    capacitance_pf: _ports(Positive) = (33.79, 35.32, 34.89, 36.85)
+    inductance_nh: _ports(NotNegative) = (35.0, 36.4, 34.7, 8.5)
+    parallel_ohm: _ports(Positive) = (1101e3, 331e3, 288e3, 375e3)
+    series_ohm: _ports(NotNegative) = (0.21, 2.16, 3.71, 1.65)
+    skin_ohm: _ports(NotNegative) = (5.2e-12, 6.9e-20, 2.2e-38, 1.9e-16)
+    skin_power: _ports(Annotated[float, Field(ge=-10, le=10)]) = (1.39, 2.26, 4.35, 1.88)
 
     def load(self, frequency_mhz: float) -> Ohms:
         w = 2.0e6 * np.pi * frequency_mhz
@@ -107,19 +135,22 @@ class JFETReceiver(Receiver):
         return np.diag(z)
 
 
-@dataclass(frozen=True)
-class CapacitorReceiver(Receiver):
-    """A capacitor at each port, Z = 1 / (i w C): luseepy's ``IdealCapacitorReceiver``.
+class CapacitorReceiver(Section, Receiver):
+    """Capacitors: one number, or one for each port.
+
+    Their impedance is Z = 1 / (i w C); luseepy's ``IdealCapacitorReceiver``.
 
     Attributes
     ----------
-    capacitance_pf : (ports,) tuple of float
+    capacitance_pf : tuple of float
+        Capacitance.
     """
 
     luseepy_name: ClassVar[str] = "IdealCapacitorReceiver"
     luseepy_parameters: ClassVar[dict[str, str]] = {"C_pf": "capacitance_pf"}
 
-    capacitance_pf: tuple[float, ...] = (30.0, 30.0, 30.0, 30.0)
+    model: Literal["capacitor"] = "capacitor"
+    capacitance_pf: _ports(Positive) = (30.0, 30.0, 30.0, 30.0)
 
     def load(self, frequency_mhz: float) -> Ohms:
         return np.diag(1.0 / (2.0e-6j * np.pi * frequency_mhz * np.array(self.capacitance_pf)))
@@ -238,11 +269,6 @@ class BeamSource(ABC):
     @abstractmethod
     def n_ports(self) -> int:
         """Number of ports; there are n_ports^2 real products."""
-
-    @property
-    def emits(self) -> bool:
-        """Whether ground or antennas emit, so that :meth:`background` is not zero."""
-        return False
 
     @abstractmethod
     def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
