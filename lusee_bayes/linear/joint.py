@@ -349,8 +349,9 @@ def channel_sky(
         whole = common + residual_root * linalg.solve_lower(lower, half, transpose=True).T
         mean, skies = whole[0], whole[1:]
         if covariance is not None:
-            inverse = linalg.inverse_from_cholesky(lower)
             white = linalg.scaled(covariance, 1.0 / residual_root, overwrite=True)
-            white = linalg.symmetric_product(inverse @ white, inverse) + inverse
+            white = linalg.whitened(white, lower)
+            white[np.diag_indices(n_modes)] += 1.0
+            white = linalg.sandwich(white, linalg.invert_lower(lower, overwrite=True))
             covariance = linalg.scaled(white, residual_root, overwrite=True)
     return ChannelSky(mean, covariance, skies, information.chi2(mean))

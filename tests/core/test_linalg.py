@@ -31,6 +31,7 @@ from lusee_bayes.core.linalg import (
     spanning_rows,
     symmetric_product,
     times_lower,
+    whitened,
 )
 
 
@@ -174,6 +175,10 @@ def test_products_with_a_triangle(n, xp):
     ):
         close(found, expected)
         np.testing.assert_array_equal(found, np.asarray(found).T)
+    inverse = np.linalg.inv(lower)
+    # entries of the inverse grow with n
+    scale = np.abs(inverse).max() ** 2
+    close(whitened(matrix, lower) / scale, inverse @ matrix @ inverse.T / scale)
 
 
 @ARRAYS
