@@ -19,6 +19,7 @@ from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.unknowns import Unknowns, UnknownsReport
 from lusee_bayes.instrument.products import DataLayout
+from lusee_bayes.linear.amplitudes import template_amplitudes
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.channel_map import Conditioned, conditioned
 from lusee_bayes.results.map_files import SavedInformation
@@ -128,6 +129,39 @@ def density(
     with numpyro_promotion():
         got, trace = log_density(program.model, (), arguments, values)
     return float(got), trace
+
+
+def density_of(
+    experiment: Experiment, values: dict[str, Any], program: str = "systematics"
+) -> float:
+    """ln p of everything by a program of an experiment; no site may be left to chance."""
+    asked = lb.load_program(program)
+    got, trace = density(asked, program_arguments(asked, experiment), values)
+    assert set(trace) == {*values, "data"}
+    return got
+
+
+def with_known_sky(setup: Setup, scale: float) -> Setup:
+    """The setup with a prior about its own sky, of a part of its C_ell."""
+    spectrum = scale * np.asarray(setup.prior.spectrum)
+    return replace(setup, prior=lb.HarmonicPrior(spectrum, mean=setup.sky.modes))
+
+
+def drawn(first: Setup, seed: int) -> Experiment:
+    """Data of a sky that is drawn from the prior; N is that of the model sky."""
+    z = np.random.default_rng(seed).standard_normal(first.prior.size)
+    sky = replace(first.sky, modes=np.asarray(first.prior.colour(z)) + first.prior.mean)
+    scenario = first.scenario.model_copy(update={"seed": seed})
+    setup = replace(first, sky=sky, scenario=scenario)
+    return Experiment(setup, simulate(setup))
+
+
+def sky_and_amplitudes(found: Inference) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of the sky and of what all templates are multiplied by, together."""
+    columns = np.concatenate([np.asarray(s.columns) for s in found.systematics], axis=1)
+    told, sky = template_amplitudes(found.solution, columns), found.posterior.covariance()
+    covariance = np.block([[np.asarray(sky), told.with_sky], [told.with_sky.T, told.covariance]])
+    return np.concatenate([np.asarray(found.posterior.mean), told.mean]), covariance
 
 
 def parts(setup: Setup) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

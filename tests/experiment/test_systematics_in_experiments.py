@@ -46,20 +46,6 @@ def inferred(*overrides: str) -> Inference:
     return lb.infer(experiment(*overrides))
 
 
-# --- marginalised or ignored ------------------------------------------------------------------
-
-
-def test_gains_that_are_ignored_are_not_in_the_model_nor_in_the_signal():
-    plain = experiment().setup
-    ignoring = full_model(experiment(GAIN, "noise.gain.treatment=ignored").setup)
-    # by JAX here, by NumPy there: sums in another order
-    found, rows = ignoring.coupling.dense(), plain.coupling.dense()
-    np.testing.assert_allclose(found, rows, rtol=0, atol=1e-15)
-    assert isinstance(ignoring.noise, lb.DiagonalCovariance)
-    built = build(small_scenario(GAIN, cycles=0.2)).setup
-    np.testing.assert_array_equal(built.signal, plain.signal)
-
-
 # --- what the gain term is built around -------------------------------------------------------
 
 
@@ -232,6 +218,9 @@ def test_sampled_it_is_left_to_the_program(registered):
     base, (term,) = model_to_sample(setup, Around(small_experiment().data))
     assert isinstance(term, Hum)
     np.testing.assert_array_equal(base.noise.diagonal(), radiometer(setup).diagonal())
+    # in the model of first order it is in N all the same
+    marginalised = full_model(setup_with(treatment="marginalised")).noise.dense()
+    np.testing.assert_array_equal(full_model(setup).noise.dense(), marginalised)
 
 
 def test_simulated_data_hold_it_whatever_its_treatment(registered):

@@ -90,6 +90,19 @@ WRONG = [
     ("map fiducial --set observation.start=2051-01-01", "outside the ephemeris"),
     ("map fiducial --set sky.file=gone.fits", "no sky map at 'gone.fits'"),
     ("simulate fiducial --flight --set flight.gain_table=nowhere.nc", "nowhere.nc"),
+    # what is to be sampled
+    *(
+        (f"map fiducial --set sky.sources=false --set {sampled}", "marginalise; .* sample$")
+        for sampled in (
+            'sources={"list":[{"name":"Jupiter"}],"treatment":"sampled"}',
+            "noise.gain.treatment=sampled",
+            'noise.beam={"shift_mhz":4,"treatment":"sampled"}',
+            "noise.radiometer.log_factor_std=0.5",
+            "prior.tilt_std=0.5",
+            "prior.log_amplitude_std=0.5",
+            "prior.band_edges=[2,4]",
+        )
+    ),
     # data, programs, results
     ("map fiducial --data pipe", IS_PIPE),
     ("map fiducial --data .", "is a folder"),

@@ -11,21 +11,26 @@ from dataclasses import replace
 import equinox as eqx
 import numpy as np
 import pytest
-from experiments import draw_within, four_ports, unknowns_report
+from experiments import (
+    draw_within,
+    drawn,
+    four_ports,
+    sky_and_amplitudes,
+    unknowns_report,
+    with_known_sky,
+)
 from numpyro import handlers
 from scipy import stats
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.experiment import Experiment, program_pieces
-from lusee_bayes.experiment.model import full_model, set_up, simulate, true_values
+from lusee_bayes.experiment.experiment import program_pieces
+from lusee_bayes.experiment.model import full_model, set_up, true_values
 from lusee_bayes.experiment.rounds import settled
 from lusee_bayes.experiment.unknowns import SKY
 from lusee_bayes.judge.levels import LEVELS
-from lusee_bayes.linear.amplitudes import template_amplitudes
 from lusee_bayes.sampling.hmc import Sampler
 from lusee_bayes.sampling.programs import numpyro_promotion
 from lusee_bayes.sampling.validation import FALSE_ALARM, N_DRAWS, Ranks, calibrate
-from lusee_bayes.systematics.context import Setup
 from lusee_bayes.systematics.gain_drifts import SCALES
 from lusee_bayes.systematics.gain_table import COMMON_GAIN
 from lusee_bayes.systematics.systematic import Chart
@@ -246,32 +251,18 @@ UNKNOWN = (
 MODES = (0, 2, 3, 6, 8, 12)
 
 
-def drawn(first: Setup, seed: int) -> tuple[Setup, Experiment]:
-    """The setup with a sky drawn from its prior, and data of it; N is that of the model sky."""
-    z = np.random.default_rng(seed).standard_normal(first.prior.size)
-    sky = replace(first.sky, modes=np.asarray(first.prior.colour(z)) + first.prior.mean)
-    scenario = first.scenario.model_copy(update={"seed": seed})
-    setup = replace(first, sky=sky, scenario=scenario)
-    return setup, Experiment(setup, simulate(setup))
-
-
 @pytest.mark.long
 def test_simulation_based_calibration(response_file):
-    first = set_up(four_ports(response_file, *UNKNOWN))
     # known to a fifth, so that no sky is without a signal
-    spectrum = 0.04 * np.asarray(first.prior.spectrum)
-    first = replace(first, prior=lb.HarmonicPrior(spectrum, mean=first.sky.modes))
+    first = with_known_sky(set_up(four_ports(response_file, *UNKNOWN)), 0.04)
     sky_std = np.sqrt(np.asarray(first.prior.variance()))
     ranks, null, shares = [], [], []
     for seed in range(N):
-        setup, experiment = drawn(first, seed)
+        experiment = drawn(first, seed)
+        setup = experiment.setup
         found, truth = settled(setup, experiment.data), true_values(setup)
-        columns = np.concatenate([np.asarray(s.columns) for s in found.systematics], axis=1)
-        told = template_amplitudes(found.solution, columns)
-        sky_covariance = np.asarray(found.posterior.covariance())
-        expected = np.concatenate([s.expected for s in found.systematics])
-        mean = np.concatenate([np.asarray(found.posterior.mean), expected + told.mean])
-        covariance = np.block([[sky_covariance, told.with_sky], [told.with_sky.T, told.covariance]])
+        mean, covariance = sky_and_amplitudes(found)
+        mean[16:] += np.concatenate([s.expected for s in found.systematics])
         rng = np.random.default_rng((seed, 1))
         draws = rng.multivariate_normal(mean, covariance, N_DRAWS, method="cholesky")
         z = [(truth[f"receiver_{port}_k"] - 2000.0) / 200.0 for port in range(4)]
