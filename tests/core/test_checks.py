@@ -12,15 +12,12 @@ from assertions import refuse, refused
 
 import lusee_bayes as lb
 from lusee_bayes.core.checks import (
-    Described,
     is_traced,
-    listed,
     require_finite,
     require_float64,
     require_positive,
     require_shape,
 )
-from lusee_bayes.core.errors import nearest
 
 
 @pytest.mark.parametrize(
@@ -84,21 +81,6 @@ def test_inside_a_transformation_values_pass_and_dtypes_do_not():
     assert seen == [True]
     assert not is_traced(jnp.ones(2), 1.0)
     refuse("float32", f, jnp.ones(2, dtype=jnp.float32))
-
-
-def test_nearest_names_the_close_one_or_all():
-    assert nearest("papr", ["paper", "exact"]) == "did you mean 'paper'?"
-    assert nearest("zzz", ["paper", "exact"]) == "known: exact, paper"
-
-
-class Shown(Described):
-    def description(self):
-        return "T < 3 K & more", "second"
-
-
-def test_the_representation_is_the_description():
-    assert repr(Shown()) == "Shown: T < 3 K & more\n  second"
-    assert listed(tuple("abcdefghijkl")) == "a, b, c, d, ..., k, l"
 
 
 def objects(small_map):

@@ -24,7 +24,6 @@ from lusee_bayes.core.files import (
     read_manifest,
     recover,
     replacing,
-    require_folder,
     transaction,
 )
 
@@ -187,8 +186,7 @@ def test_a_failing_rename_leaves_the_folder_as_it_was(folder, monkeypatch):
     monkeypatch.setattr(os, "replace", fail)
     with pytest.raises(OSError, match="full"):
         finished(folder, NEW)
-    assert content(folder) == before
-    assert not list(folder.glob(".*"))
+    assert content(folder) == before and not list(folder.glob(".*"))
 
 
 def test_own_files_stay_and_those_of_the_earlier_run_go(folder):
@@ -325,10 +323,3 @@ def test_a_lock_ends_with_its_process(tmp_path, elsewhere):
         with locked(tmp_path):
             assert (tmp_path / LOCK).exists()
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("name", ["new", "new/inside", ".", "folder"])
-def test_folders_that_can_be_written_into(name, tmp_path):
-    (tmp_path / "folder").mkdir()
-    require_folder(tmp_path / name)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["folder"]  # nothing is made

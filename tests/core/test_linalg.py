@@ -97,9 +97,8 @@ def test_checked_cholesky_names_what_has_no_factor():
     """One of a stack is enough; its lowest eigenvalue is 1 - 2."""
     bad = np.array([[1.0, 2.0], [2.0, 1.0]])
     stack = jnp.asarray(np.stack([np.eye(2), bad]))
-    refuse(
-        "the noise is .* eigenvalue is -1 .largest entry 2", checked_cholesky, "the noise", stack
-    )
+    words = "the noise is .* eigenvalue is -1 .largest entry 2"
+    refuse(words, checked_cholesky, "the noise", stack)
     # values are not known there
     assert np.isnan(jax.jit(lambda m: checked_cholesky("the noise", m))(stack)[1]).any()
 
