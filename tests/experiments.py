@@ -3,7 +3,7 @@
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import equinox as eqx
 import jax
@@ -169,6 +169,29 @@ def parts(setup: Setup) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     variances = setup.prior.variance(), radiometer(setup).diagonal()
     prior, noise = (np.sqrt(np.asarray(variance)) for variance in variances)
     return np.asarray(setup.coupling.dense()), prior, noise
+
+
+class DenseChannels(NamedTuple):
+    """Matrices and vectors of every channel of a scenario, with the templates of its unknowns."""
+
+    couplings: list[np.ndarray]
+    templates: list[np.ndarray]
+    noise: list[np.ndarray]
+    rest: list[np.ndarray]
+    prior: list[np.ndarray]
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> Self:
+        found = cls([], [], [], [], [])
+        for channel in scenario.channels():
+            experiment = lb.build(channel)
+            setup, systematics = experiment.setup, lb.infer(experiment).systematics
+            a, prior, noise = parts(setup)
+            t = np.concatenate([np.asarray(s.columns) for s in systematics], axis=1)
+            rest = np.asarray(experiment.data.data) - np.asarray(setup.offset)
+            for all_channels, own in zip(found, (a, t, noise, rest, prior), strict=True):
+                all_channels.append(own)
+        return found
 
 
 def draw_within(program, arguments, key, sampler, whitening=None, thin=1) -> dict[str, Any]:

@@ -168,9 +168,13 @@ def reduced(of_two_bands):
     return reduce_files(sessions, scenario)
 
 
+def page_of(reduced, folder):
+    write_reduced(folder / "reduced.nc", reduced)
+    return render("flight.html", folder, flight=flight_section(folder))
+
+
 def test_the_section_says_how_spectra_were_reduced(reduced, tmp_path):
-    write_reduced(tmp_path / "reduced.nc", reduced)
-    page = render("flight.html", tmp_path, flight=flight_section(tmp_path))
+    page = page_of(reduced, tmp_path)
     for told in (
         "gains.nc (netCDF)",
         "the centre of channel k is at k times 25 kHz",
@@ -187,9 +191,7 @@ def test_files_of_older_versions_are_described_as_far_as_they_say_it(reduced, tm
     new = ("scale", "rate", "clock_file")
     (session,) = reduced.sessions
     session = {name: value for name, value in session.items() if name not in new}
-    older = replace(reduced, sessions=(session,), recipe={})
-    write_reduced(tmp_path / "reduced.nc", older)
-    page = render("flight.html", tmp_path, flight=flight_section(tmp_path))
+    page = page_of(replace(reduced, sessions=(session,), recipe={}), tmp_path)
     assert "longitude 182.258°, latitude -23.814°<" in page
     assert "of the clock file" in page and "0x307" in page
     assert read_reduced(tmp_path / "reduced.nc").notes() == ()
