@@ -4,9 +4,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from decimal import localcontext
 from functools import partial
-from threading import Event, Thread
 
 import jax
 import jax.numpy as jnp
@@ -133,23 +133,14 @@ def test_factors_are_clean_and_in_place_on_request():
 
 def longest_pause(work: Callable[[], None]) -> float:
     """The longest time for which this thread stood still while another worked, over the work's."""
-    started, took = Event(), []
-
-    def timed() -> None:
-        started.set()
-        begin = time.perf_counter()
-        work()
-        took.append(time.perf_counter() - begin)
-
-    worker, longest = Thread(target=timed), 0.0
-    worker.start()
-    started.wait()
-    before = time.perf_counter()
-    while not took:
-        now = time.perf_counter()
-        longest, before = max(longest, now - before), now
-    worker.join()
-    return longest / took[0]
+    start = before = time.perf_counter()
+    longest = 0.0
+    with ThreadPoolExecutor(1) as pool:
+        done = pool.submit(work)
+        while not done.done():
+            now = time.perf_counter()
+            longest, before = max(longest, now - before), now
+    return longest / (before - start)
 
 
 def test_other_threads_go_on_meanwhile():

@@ -7,8 +7,6 @@ their map differs from that of the fine samples with the covariance C_avg - C_fi
 ``log2 det(C_avg C_fine^-1) / 2`` bits are lost.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -225,21 +223,6 @@ def test_a_plan_keeps_the_dates_of_a_schedule(given):
     # 3 days and 47.5 hours at half duty, and 5.5 days
     live = (3.0 + 47.5 / 24.0) / 2.0 + 5.5
     assert forecast(variations[0]).days == pytest.approx(live, abs=1e-9)
-
-
-def test_half_duty_in_the_schedule_is_half_duty_of_the_receivers(given, path):
-    """Live time is what noise goes by, whoever says that it is half of the time."""
-    header, *rows = TABLE.splitlines()
-    said = {}
-    for duty, of_receivers in (("0.5", 1.0), ("1", 0.5)):
-        lines = [f"{row.rpartition(',')[0]},{duty}" for row in rows]
-        path.write_text("\n".join([header, *lines]))
-        overrides = [*given, f"noise.radiometer.duty_cycle={of_receivers}"]
-        scenario = lb.load_scenario("fiducial", overrides)
-        said[duty] = forecast(default_variations("fiducial", scenario)[0])
-    # the same numbers but for products of 0.5, which are exact
-    assert said["0.5"].information_bits == pytest.approx(said["1"].information_bits, rel=1e-9)
-    assert said["1"].days == pytest.approx(2.0 * said["0.5"].days, rel=1e-12)
 
 
 def test_what_is_wrong_with_the_file_is_said(given, path):

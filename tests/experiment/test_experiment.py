@@ -1,7 +1,5 @@
 """From a scenario to data, and from data to a map that recovers a sky."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import healpy

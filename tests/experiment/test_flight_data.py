@@ -1,7 +1,5 @@
 """Data of the spectrometer: from a sky to counts and back; maps of files and of data in kelvin."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

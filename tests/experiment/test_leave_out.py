@@ -1,7 +1,5 @@
 """Times that do not fit what all others predict are found, and no others."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import jax

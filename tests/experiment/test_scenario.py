@@ -1,7 +1,5 @@
 """Scenarios: keys, defaults, overrides, round trip, sections in kinds, and errors that help."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

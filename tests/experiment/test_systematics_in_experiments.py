@@ -1,7 +1,5 @@
 """Systematics from scenario to map: marginalised they cost little, ignored they ruin everything."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 
@@ -155,7 +153,7 @@ class Hum(AdditiveNoise):
     root: jax.Array
 
     @classmethod
-    def build(cls, section, setup, around) -> Hum:
+    def build(cls, section, setup, around):
         root = patterns(setup.layout.size, section.sigma_k)
         return cls("hum", setup.layout, jnp.asarray(root))
 

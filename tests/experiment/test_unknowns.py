@@ -1,7 +1,5 @@
 """The table of receivers, ground and gain table, and the direction that data cannot tell."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -4,8 +4,6 @@ Each is made with what was really so (another turntable angle, other antennas, a
 by changing good data, and then says of itself what a scenario without the mistake expects.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations

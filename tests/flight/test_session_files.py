@@ -18,8 +18,6 @@ from lusee_bayes.flight.clock import Clock
 from lusee_bayes.flight.session import FLIGHT_PRODUCTS, OF_FLIGHT, TELEMETRY
 from lusee_bayes.flight.session_files import (
     SessionRows,
-    cache_for,
-    guessed_chunks,
     read_session,
     write_session,
 )
@@ -232,19 +230,6 @@ def test_what_is_no_session_leaves_nothing_behind(tmp_path, kind, blocks, text):
     refuse(text, write_session, tmp_path / "s", some_rows(), blocks, kind=kind)
     assert not list(tmp_path.iterdir())
     refuse("not as netcdf", write_session, tmp_path / "s", some_rows(), [], kind="netcdf")
-
-
-def test_a_file_has_the_chunks_that_luseepy_makes_and_they_stay_in_memory(tmp_path):
-    path = write_session(tmp_path / "s", some_rows(), [written_counts()])
-    with h5py.File(path) as file:
-        cube = file["spectra/data"]
-        assert (cube.compression, cube.compression_opts) == ("gzip", 1)
-        assert cube.chunks == guessed_chunks(ROWS)
-    long = guessed_chunks(57_000)
-    assert long[0] > 256
-    needed = long[0] * 16 * 2048 * 4
-    assert needed <= cache_for(long)["rdcc_nbytes"] < 2 * needed
-    assert cache_for(None) == {}
 
 
 # --- what cannot be -------------------------------------------------------------------------------

@@ -4,8 +4,6 @@ Truths are drawn from a program's own priors, data from the truths (by the progr
 draws from the posterior by Hamiltonian Monte Carlo about the mode found for each data set.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import equinox as eqx

@@ -1,7 +1,5 @@
 """Receivers, ground and gain table: templates of N about what data tell, or sites, by hand."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -3,8 +3,6 @@
 Small dense models against scipy; a scenario's own, of condition 1e12, against decimal arithmetic.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -5,8 +5,6 @@ The oracle takes A, N_0 and the responses as matrices and works in decimal arith
 antennas, priors and treatments: one clear sentence each.
 """
 
-from __future__ import annotations
-
 import csv
 from dataclasses import replace
 from functools import lru_cache
@@ -14,7 +12,7 @@ from functools import lru_cache
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from assertions import close, refuse
+from assertions import refuse
 from experiments import density_of, program_arguments, small_experiment
 from numpyro import handlers
 from reference_linear import exact_posterior
@@ -35,12 +33,10 @@ from lusee_bayes.experiment.model import (
 from lusee_bayes.experiment.unknowns import flux_table
 from lusee_bayes.sampling.programs import latent_sites
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
-from lusee_bayes.systematics.context import Around, Setup
+from lusee_bayes.systematics.context import Setup
 from lusee_bayes.systematics.prior_spectrum import PriorSpectrum
 from lusee_bayes.systematics.sources import (
-    PointSources,
     Source,
-    source_responses,
 )
 from lusee_bayes.systematics.systematic import Unknown
 from lusee_bayes.testing.scenarios import small_scenario
@@ -104,58 +100,7 @@ def answer():
     return exact_posterior(both, variance, noise, np.asarray(experiment().data.data) - t @ mean)
 
 
-# --- responses ------------------------------------------------------------------------------------
-
-
-def test_the_columns_and_the_priors():
-    setup = setup_of()
-    sources = PointSources.build(setup.scenario.sources, setup, Around())
-    t, (mean, std) = columns(), priors()
-    np.testing.assert_array_equal(sources.columns(), t)
-    # constants of nature of CODATA 2018 on both sides
-    np.testing.assert_allclose(sources.means, mean, rtol=1e-12)
-    np.testing.assert_allclose(sources.stds, std, rtol=1e-12)
-    assert [s.n_blocks for s in sources.sources] == [1, 3, 1]
-    assert [u.name for u in sources.unknowns] == SITES
-
-
-def test_the_circularly_polarised_part_enters_linearly():
-    """An auto sees the power in one polarisation, so it never is negative, whatever V is."""
-    e = setup_of()
-    fornax = "ra_deg: 50.67, dec_deg: -37.21, flux_jy: 1"
-    circular = [f"{{name: V {v}, stokes_v: {v}, {fornax}}}" for v in (0.0, 1.0, -1.0, 0.3)]
-    scenario = small_scenario(f"sources.list=[{', '.join(circular)}]")
-    found = source_responses(scenario.sources.list, e.observation, scenario.beam.source(), 25.0)
-    none, right, left, some = (np.asarray(r) for r in found)
-    largest = np.abs(none).max()
-    slope = 0.5 * (right - left)
-    assert np.abs(slope).max() > 0.1 * largest
-    # rounding of sums of three numbers
-    np.testing.assert_allclose(0.5 * (right + left), none, rtol=0, atol=1e-14 * largest)
-    np.testing.assert_allclose(some, none + 0.3 * slope, rtol=0, atol=1e-14 * largest)
-    for auto in (0, 7, 12, 15):
-        assert (right[auto] >= -1e-14 * largest).all()
-        assert (left[auto] >= -1e-14 * largest).all()
-
-
 # --- marginalised ---------------------------------------------------------------------------------
-
-
-def test_marginalised_they_are_in_the_noise_and_the_offset():
-    setup = setup_of()
-    base, sources = base_model(setup), PointSources.build(setup.scenario.sources, setup, Around())
-    model = sources.marginalised(base)
-    t, (mean, std) = columns(), priors()
-    expected = np.diag(np.asarray(base.noise.diagonal())) + (t * std**2) @ t.T
-    close(model.noise.dense(), expected, 1e-14)
-    close(model.offset, t @ mean, 1e-13)
-    # an offset that is there already stays
-    twice = sources.marginalised(replace(base, offset=jnp.ones(96)))
-    np.testing.assert_allclose(twice.offset, 1.0 + model.offset, rtol=1e-14)
-    # it is what the experiment itself makes, there by NumPy and here by JAX
-    whole = full_model(setup)
-    close(whole.noise.dense(), np.asarray(model.noise.dense()), 1e-14)
-    close(whole.offset, np.asarray(model.offset), 1e-14)
 
 
 @pytest.mark.long
