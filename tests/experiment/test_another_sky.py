@@ -16,14 +16,7 @@ from scipy import linalg, stats
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import lmax_of, synthesis_matrix
-from lusee_bayes.experiment.diagnosis import (
-    MixedProducts,
-    UnderAnySky,
-    data_mistakes,
-    diagnose,
-    model_mistakes,
-    port_mixing,
-)
+from lusee_bayes.experiment import diagnosis
 from lusee_bayes.experiment.experiment import doubts
 from lusee_bayes.experiment.model import full_model, radiometer, set_up, simulate
 from lusee_bayes.experiment.rounds import learned_prior, settled
@@ -178,7 +171,7 @@ def diagnosed(wrong, scenario=None):
     experiment = lb.build(scenario, data)
     found = lb.infer(experiment)
     left = residuals(found.solution, data)
-    return left, diagnose(experiment, found, left)
+    return left, diagnosis.diagnose(experiment, found, left)
 
 
 def is_named(wrong, found):
@@ -231,7 +224,7 @@ def test_chi2_of_mixed_data_is_that_of_matrices():
     experiment = lb.build(scenario, data)
     model = lb.infer(experiment).model
     spectrum = 1e2 * np.asarray(setup.sky.spectrum())
-    here = UnderAnySky(setup, data, model, spectrum)
+    here = diagnosis.UnderAnySky(setup, data, model, spectrum)
     base, posterior = here.wide(model.coupling)
     a, s = np.asarray(model.coupling.dense()), np.asarray(lb.HarmonicPrior(spectrum).variance())
     inverse = np.linalg.inv(a @ np.diag(s) @ a.T + np.asarray(model.noise.dense()))
@@ -242,7 +235,7 @@ def test_chi2_of_mixed_data_is_that_of_matrices():
 
     grid = np.asarray(data.grid())
     assert base.chi2 == pytest.approx(expected(grid), rel=1e-4)
-    mixed = MixedProducts.of(here, posterior)
+    mixed = diagnosis.MixedProducts.of(here, posterior)
     tried = list(mixed.tried())
     for chi2, mistake in tried[:40:5] + tried[-40::7]:
         right = expected(mistake.undone(grid))
@@ -257,15 +250,15 @@ def test_mixings_are_those_of_voltages():
     ports, signs = (2, 0, 3, 1), (1.0, -1.0, 1.0, 1.0)
     order, c = np.array(ports), np.array(signs)
     expected = to_real((c[:, None] * c[None])[..., None] * v[order][:, order])
-    np.testing.assert_allclose(port_mixing(ports, signs) @ real, np.asarray(expected))
-    *_, mixing = next(data_mistakes(4))
+    np.testing.assert_allclose(diagnosis.port_mixing(ports, signs) @ real, np.asarray(expected))
+    *_, mixing = next(diagnosis.data_mistakes(4))
     np.testing.assert_allclose(mixing @ real, np.asarray(to_real(v.conj())))
 
 
 def test_beams_of_other_azimuths():
     """B(theta, -phi), and B(theta, 90 degrees - phi), at some directions."""
     setup = set_up(wrong_data.scenario(6))
-    found = {m.words: m.beams for m in model_mistakes(setup) if "azimuth" in m.words}
+    found = {m.words: m.beams for m in diagnosis.model_mistakes(setup) if "azimuth" in m.words}
     theta, phi = np.array([0.3, 0.8, 1.2]), np.array([0.1, 2.0, 4.0])
 
     def at(beams, phi):

@@ -136,17 +136,10 @@ def test_no_experiment_of_data_with_unclear_times_or_a_fixed_axis_in_windows(tmp
 
 
 def test_waterfalls_are_instants_unless_the_scenario_says_other(tmp_path):
-    header = {
-        "LUNAR_DAY": "2027-02-01 00:00:00 to 2027-02-02 00:00:00",
-        "DELTAT_SEC": STEP,
-        "LUN_LAT_DEG": -23.814,
-        "LUN_LONG_DEG": 182.258,
-    }
-    images = {
-        "data": np.full((12, 16, 1), 3e4),
-        "freq": np.array([25.0]),
-        "combinations": np.array([[i, j] for i in range(4) for j in range(i, 4)]),
-    }
+    header = {"LUNAR_DAY": "2027-02-01 00:00:00 to 2027-02-02 00:00:00", "DELTAT_SEC": STEP}
+    header |= {"LUN_LAT_DEG": -23.814, "LUN_LONG_DEG": 182.258}
+    pairs = np.array([[i, j] for i in range(4) for j in range(i, 4)])
+    images = {"data": np.full((12, 16, 1), 3e4), "freq": np.array([25.0]), "combinations": pairs}
     path = write_images(tmp_path / "w.fits", images, header)
     found = lb.read_data(path, scenario())
     assert found.observation.windows is None and found.says_window

@@ -13,7 +13,7 @@ from experiments import small_experiment
 import lusee_bayes as lb
 from lusee_bayes.core.section import Positive, Section, Treatment
 from lusee_bayes.experiment import model as model_module
-from lusee_bayes.experiment.experiment import Experiment, build
+from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import (
     full_model,
     model_to_sample,
@@ -29,7 +29,6 @@ from lusee_bayes.systematics.beam import beam_rms_difference, difference_of_beam
 from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.registered import SYSTEMATICS, NoiseSection
 from lusee_bayes.systematics.systematic import AdditiveNoise, Systematic, Truth, multiplied
-from lusee_bayes.testing.scenarios import small_scenario
 
 GAIN = "noise.gain.sigma=0.01"
 SHIFT = "noise.beam.shift_mhz=4"
@@ -104,20 +103,6 @@ def test_a_shifted_beam_is_that_of_the_other_frequency():
     sigma = np.sqrt(np.asarray(radiometer(setup).diagonal()))
     z = np.asarray(data.data - seen) / sigma
     assert abs((z**2).sum() - z.size) < 5 * np.sqrt(2 * z.size)
-
-
-# --- scenarios --------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("term", [GAIN, PARAMETERS])
-def test_the_seed_decides_every_draw(term):
-    data = experiment(term).data.data
-    np.testing.assert_array_equal(data, build(small_scenario(term, cycles=0.2)).data.data)
-    other = experiment(term, "seed=2")
-    difference_of_seeds = np.abs(np.asarray(other.data.data - data))
-    # by much more than radiometer noise: the systematic is drawn anew
-    level = np.sqrt(np.asarray(radiometer(other.setup).diagonal())).max()
-    assert difference_of_seeds.max() > 20 * level
 
 
 # --- a new noise term of a scenario: in N, in simulated data, among what is sampled ---------------

@@ -154,10 +154,8 @@ def test_runs_without_them_are_as_before(small_map):
 def known(setup: Setup) -> Setup:
     """The same with receivers and ground that are known to be the truth."""
     noise, truth = setup.scenario.noise, true_values(setup)
-    fixed = {
-        name: getattr(noise, name).model_copy(update={"treatment": "ignored"})
-        for name in ("receiver", "regolith")
-    }
+    ignored = {"treatment": "ignored"}
+    fixed = {k: getattr(noise, k).model_copy(update=ignored) for k in ("receiver", "regolith")}
     scenario = setup.scenario.model_copy(update={"noise": noise.model_copy(update=fixed)})
     background = np.array(setup.beam_source.background(20.0))
     background += (truth["regolith_k"] - 250.0) * ground_per_kelvin(setup.beam_source, 20.0)

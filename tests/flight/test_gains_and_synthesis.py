@@ -6,21 +6,13 @@ import xarray as xr
 from assertions import refuse
 from naive_flight import naive_gain
 
-from lusee_bayes.flight.gain_model import (
-    GainModel,
-    read_gain_table,
-    write_gain_table,
-)
+from lusee_bayes.flight.gain_model import GainModel, read_gain_table, write_gain_table
 from lusee_bayes.flight.session import OF_FLIGHT, channel_mhz
 from lusee_bayes.flight.synthesis import ChannelSpectra, bit_slices, rounded
 from lusee_bayes.instrument.products import to_matrix, to_real
 from lusee_bayes.testing.contracts import assert_refused
 
 ANCHORS = np.array([0.1, 1.1, 5.1, 10.1, 20.1, 30.1, 50.1, 70.1])
-TERMS = {
-    0: ("1", "THERM_FPGA", "SPE_ADC0_T", "SPE_1VAD8_V", "VMON_1V2D", "SPE_1VAD8_C"),
-    1: ("1", "THERM_FPGA", "SPE_ADC1_T", "SPE_1VAD8_V", "VMON_1V2D", "SPE_1VAD8_C"),
-}
 
 
 def telemetry(n=5):
@@ -54,8 +46,9 @@ def write_folder(folder, made, model="quadratic"):
             np.save(folder / f"{name}_mean.npy", made.mean[i, port])
             np.save(folder / f"{name}_freqs.npy", made.anchor_mhz[i, port])
             np.save(folder / f"{name}_eigvecs.npy", vectors)
-            fpga, adc = "THERM_FPGA", TERMS[port // 2][2]
-            terms = (*TERMS[port // 2], f"{fpga}*{fpga}", f"{adc}*{adc}", f"{fpga}*{adc}")
+            fpga, adc = "THERM_FPGA", f"SPE_ADC{port // 2}_T"
+            terms = ["1", fpga, adc, "SPE_1VAD8_V", "VMON_1V2D", "SPE_1VAD8_C"]
+            terms += [f"{fpga}*{fpga}", f"{adc}*{adc}", f"{fpga}*{adc}"]
             for r in range(2):
                 for term, value in zip(terms, made.coefficient[i, port, r], strict=True):
                     lines.append(f"{name},PC{r + 1},{model},{term},{float(value)!r}")

@@ -4,20 +4,12 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import changes
 import h5py
 import numpy as np
 import pytest
 from assertions import require_conventions
 from astropy.io import fits
-from changes import (
-    CHANGE,
-    SCALE,
-    byte_changes,
-    change_bytes,
-    change_items,
-    item_changes,
-    require_answer,
-)
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from layout_4 import write_layout_4
@@ -39,7 +31,7 @@ from lusee_bayes.runs import map_run
 from lusee_bayes.sky.sky_source import write_alms
 from lusee_bayes.testing.scenarios import small_scenario
 
-FEW, MANY = 2, 150 * SCALE
+FEW, MANY = 2, 150 * changes.SCALE
 
 
 def read_sky(path: Path) -> object:
@@ -153,10 +145,9 @@ def luseepys(tmp_path_factory, test_data) -> Path:
     for name, source in LUSEEPYS.items():
         with fits.open(test_data / "luseepy" / source) as opened:
             hdus = fits.HDUList([hdu.copy() for hdu in opened])
-            for hdu in hdus:
-                if source == "synthetic_monopole_beam.fits" and hdu.shape[:1] == (50,):
+            if name == "scalar_beam.fits":
+                for hdu in (one for one in hdus if one.shape[:1] == (50,)):
                     hdu.data = hdu.data[8:12]
-            if source == "synthetic_monopole_beam.fits":
                 hdus[0].header.update({"FREQ_MIN": 9.0, "FREQ_MAX": 12.0, "FREQ_N": 4})
             hdus.writeto(folder / name)
     return folder
@@ -182,18 +173,18 @@ def test_damaged_files(name, n, tmp_path, request):
             apply(target, one)
         before = sorted(tmp_path.iterdir())
         for reader in READERS[name]:
-            require_answer(lambda reader=reader: reader(target))
+            changes.require_answer(lambda reader=reader: reader(target))
         assert sorted(tmp_path.iterdir()) == before
 
     @settings(max_examples=n)
-    @given(st.lists(byte_changes(), min_size=1, max_size=3))
+    @given(st.lists(changes.byte_changes(), min_size=1, max_size=3))
     def damaged_bytes(change):
-        read(change, change_bytes)
+        read(change, changes.change_bytes)
 
     @settings(max_examples=n)
-    @given(st.lists(item_changes(), min_size=1, max_size=2))
+    @given(st.lists(changes.item_changes(), min_size=1, max_size=2))
     def damaged_items(change):
-        read(change, change_items)
+        read(change, changes.change_items)
 
     damaged_bytes()
     if source.suffix != ".npz":
@@ -203,7 +194,7 @@ def test_damaged_files(name, n, tmp_path, request):
 # --- folders of results: a report, a comparison, or a sentence ------------------------------------
 
 
-OF_RESULTS = 60 * SCALE
+OF_RESULTS = 60 * changes.SCALE
 
 
 @pytest.fixture(scope="session")
@@ -238,26 +229,26 @@ def test_damaged_results(kind, n, tmp_path, request):
             path.unlink()
         else:
             apply(path, change)
-        require_answer(lambda: write_report(folder))
+        changes.require_answer(lambda: write_report(folder))
         if kind == "map":
             runs = [source, folder]
-            require_answer(lambda: read_runs(runs))
+            changes.require_answer(lambda: read_runs(runs))
         shutil.copy(source / name, path)
 
     @settings(max_examples=n)
-    @given(files, byte_changes())
+    @given(files, changes.byte_changes())
     def damaged_bytes(name, change):
-        check(name, change, change_bytes)
+        check(name, change, changes.change_bytes)
 
     @settings(max_examples=n)
-    @given(files.filter(lambda name: Path(name).suffix in CHANGE), item_changes())
+    @given(files.filter(lambda name: Path(name).suffix in changes.CHANGE), changes.item_changes())
     def damaged_items(name, change):
-        check(name, change, change_items)
+        check(name, change, changes.change_items)
 
     for name in names:
         check(name, None, None)
         if n > FEW:
-            check(name, ("cut", 0.0, 1, b""), change_bytes)
-            check(name, ("insert", 0.0, 1, b"\0\xff\xfe"), change_bytes)
+            check(name, ("cut", 0.0, 1, b""), changes.change_bytes)
+            check(name, ("insert", 0.0, 1, b"\0\xff\xfe"), changes.change_bytes)
     damaged_bytes()
     damaged_items()

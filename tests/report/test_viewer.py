@@ -152,16 +152,12 @@ def test_what_a_direction_and_the_pointer_tell(page, tmp_path):
 
 
 LMAX = 8
-SMALL = [
-    f"lmax={LMAX}",
-    "observation.runs=[{cycles: 0.1}, {cycles: 0.1, turntable_deg: 30}]",
-    "prior.model=local_scales",
-]
+RUNS = "observation.runs=[{cycles: 0.1}, {cycles: 0.1, turntable_deg: 30}]"
 
 
 @pytest.fixture(scope="module")
 def correlated(tmp_path_factory):
-    scenario = lb.load_scenario("fiducial", SMALL)
+    scenario = lb.load_scenario("fiducial", [f"lmax={LMAX}", RUNS, "prior.model=local_scales"])
     return lb.run_map(scenario, tmp_path_factory.mktemp("correlated") / "map")
 
 
@@ -210,7 +206,7 @@ def test_keys_move_the_direction_and_parts_are_those_that_the_page_has(which, re
     page = (request.getfixturevalue(which).folder / "report.html").read_text()
     many = which == "small_cube"
     assert ('id="viewer-channel"' in page, 'id="viewer-spectrum"' in page) == (many, many)
-    assert ('id="viewer-psf"' in page) != many
+    assert ('id="viewer-psf"' in page) != many and ('class="channel"' in page) == many
     told = run_page(
         page,
         tmp_path,

@@ -60,11 +60,6 @@ def test_likelihoods_of_draws_are_those_of_matrices(noise):
     assert len(expected) == 4 and np.ptp(expected) > 0.1
 
 
-def test_none_are_worked_out_for_no_draws():
-    _, channel = mapped(small_experiment())
-    assert channel.draws.shape == (0, 49) and channel.log_likelihood.shape == (0,)
-
-
 def test_arviz_opens_a_posterior(small_cube):
     """With the groups and dimensions of ArviZ, and the likelihood of every channel's draws."""
     tree = posterior_of(small_cube.folder)

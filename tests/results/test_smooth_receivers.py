@@ -21,10 +21,8 @@ from lusee_bayes.runs import channels, map_run
 from lusee_bayes.runs.channels import map_channels
 
 FREQUENCIES, OCTAVES = np.array([15.0, 20.0, 22.0]), 0.4
-RECEIVER = (
-    f"noise.receiver={{power_k: 20000, slope: -2, relative_std: 0.5, smooth_octaves: {OCTAVES}}}"
-)
 NOT_SMOOTH = "noise.receiver={power_k: 20000, slope: -2, relative_std: 0.5}"
+RECEIVER = f"{NOT_SMOOTH[:-1]}, smooth_octaves: {OCTAVES}}}"
 GROUND = "noise.regolith={std_k: 2000}"
 # a tenth of the sky, so that the data leave something of the powers to the other channels
 NOISE = "noise.radiometer.factor=1e8"

@@ -14,12 +14,8 @@ from lusee_bayes.results.map_files import information_file, read_information
 from lusee_bayes.runs import map_run
 
 # N of the parts is that of the whole: about the model, and not about each one's data
-SIZES = [
-    "lmax=4",
-    "observation.runs=[{cycles: 0.1}, {cycles: 0.1, turntable_deg: 30}]",
-    "noise.radiometer.temperature=model",
-    "output.information=true",
-]
+SIZES = ["lmax=4", "observation.runs=[{cycles: 0.1}, {cycles: 0.1, turntable_deg: 30}]"]
+SIZES += ["noise.radiometer.temperature=model", "output.information=true"]
 GIVEN, LEARNED = "prior={model: isotropic, spectrum: sky}", "prior={model: isotropic}"
 CUBE = "frequencies_mhz=[20, 25, 30]"
 JOINT = ["joint=true", "spectral.components=[power_law]"]

@@ -21,14 +21,8 @@ from lusee_bayes.report.map_page import flight_section
 from lusee_bayes.report.rendering import render
 from lusee_bayes.runs.data_run import reduced_lines, run_simulate_flight
 
-SET = [
-    "lmax=3",
-    "frequency_mhz=20",
-    "observation.step_s=900",
-    "observation.runs=[{cycles: 0.003}]",
-    "noise.radiometer.form=exact",
-    "flight={per_kelvin_v2_hz: 1e-21}",
-]
+SET = ["lmax=3", "frequency_mhz=20", "observation.step_s=900", "observation.runs=[{cycles: 0.003}]"]
+SET += ["noise.radiometer.form=exact", "flight={per_kelvin_v2_hz: 1e-21}"]
 
 
 def simulate(folder, *more, force=False):

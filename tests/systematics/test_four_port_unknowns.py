@@ -133,17 +133,6 @@ def test_simulated_data_hold_them_whatever_their_treatment(warm, response_file, 
     assert not set(true_values(reseeded).values()) & set(truth.values())
 
 
-def test_ignored_they_are_taken_for_their_means(warm, response_file):
-    given = four_ports(response_file, RECEIVER % "ignored", GROUND % "ignored")
-    setup = replace(warm.setup, scenario=given)
-    found = full_model(setup)
-    np.testing.assert_array_equal(found.noise.diagonal(), radiometer(setup).diagonal())
-    np.testing.assert_array_equal(found.offset, setup.offset)
-    # which the data contradict: a receiver off by 200 K is hundreds of standard deviations
-    chi2 = found.chi2(found.condition(warm.data.data).posterior.mean, warm.data.data)
-    assert float(chi2) > 100 * found.n_data
-
-
 def test_ground_at_zero_kelvin_has_a_template_all_the_same(response_file):
     cold = set_up(four_ports(response_file, "beam.moon_temperature_k=0", GROUND % "marginalised"))
     assert cold.offset is None
@@ -233,21 +222,6 @@ def test_simulated_data_hold_the_errors_that_data_name(named):
     factors = by_hand(z, PORTS[:4], slopes(23)[:4])
     plain = np.asarray(named.layout.gather(named.signal))
     np.testing.assert_allclose(seen, factors * plain, rtol=1e-9, atol=1e-9)
-
-
-@pytest.mark.parametrize("treatment", ["marginalised", "sampled", "ignored"])
-def test_simulated_data_hold_one_error_for_each_port(experiment, response_file, treatment):
-    """Receivers and ground pass through the gains, too."""
-    scenario = four_ports(response_file, *UNKNOWN[:2], TABLE % treatment, "seed=5")
-    setup = replace(experiment.setup, scenario=scenario)
-    truth = true_values(setup)
-    z = truth["gain_table"]
-    assert z.shape == (4,)
-    assert 0.01 < np.abs(z).min() < np.abs(z).max() < 4.0
-    none = true_signal(setup, truth | {"gain_table": np.zeros(4)})
-    seen = np.asarray(setup.layout.gather(true_signal(setup, truth)))
-    expected = per_port(z) * np.asarray(setup.layout.gather(none))
-    np.testing.assert_allclose(seen, expected, rtol=1e-9, atol=1e-9)
 
 
 # --- marginalised ---------------------------------------------------------------------------------

@@ -23,11 +23,7 @@ from lusee_bayes.systematics.context import Around
 from lusee_bayes.systematics.noise_level import NoiseLevel
 from lusee_bayes.systematics.prior_spectrum import PriorSpectrum
 from lusee_bayes.systematics.sources import PointSources, Source
-from lusee_bayes.systematics.systematic import (
-    MOST_COLLAPSED,
-    AdditiveNoise,
-    Marginalised,
-)
+from lusee_bayes.systematics.systematic import MOST_COLLAPSED, AdditiveNoise, Marginalised
 
 LMAX, N_DATA = 4, 40
 ELLS = np.arange(LMAX + 1)
@@ -42,11 +38,8 @@ class Case:
         self.a, self.spectrum = rng.normal(size=(N_DATA, 25)), 4.0 / (1.0 + ELLS)
         self.n = 3.0 * random_covariance(rng, N_DATA)
         self.data = 3.0 * rng.normal(size=N_DATA)
-        self.model = lb.LinearGaussian(
-            jnp.asarray(self.a),
-            lb.HarmonicPrior(jnp.asarray(self.spectrum)),
-            DenseCovariance(jnp.asarray(self.n)),
-        )
+        prior, noise = lb.HarmonicPrior(self.spectrum), DenseCovariance(jnp.asarray(self.n))
+        self.model = lb.LinearGaussian(jnp.asarray(self.a), prior, noise)
 
     def evidence(self, factors=1.0, level=1.0, more=0.0, mean=0.0) -> float:
         """ln N(d; mean, A S A^T + level N + more) with C_ell times ``factors``."""
@@ -217,10 +210,8 @@ def model():
 def terms():
     layout = DataLayout(N_PRODUCTS, N_TIMES)
     patterns = np.random.default_rng(1).normal(size=(layout.size, 2))
-    return [
-        Pickup("pickup", layout, jnp.asarray(patterns)),
-        Correlated("hum", layout, jnp.arange(float(N_TIMES))),
-    ]
+    hum = Correlated("hum", layout, jnp.arange(float(N_TIMES)))
+    return [Pickup("pickup", layout, jnp.asarray(patterns)), hum]
 
 
 @pytest.mark.parametrize("term", terms(), ids=lambda term: term.name)

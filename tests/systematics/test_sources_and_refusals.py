@@ -35,9 +35,7 @@ from lusee_bayes.sampling.programs import latent_sites
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
 from lusee_bayes.systematics.context import Setup
 from lusee_bayes.systematics.prior_spectrum import PriorSpectrum
-from lusee_bayes.systematics.sources import (
-    Source,
-)
+from lusee_bayes.systematics.sources import Source
 from lusee_bayes.systematics.systematic import Unknown
 from lusee_bayes.testing.scenarios import small_scenario
 
