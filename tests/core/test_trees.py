@@ -148,6 +148,12 @@ def everything(draw) -> Everything:
 
 @given(everything())
 @settings(max_examples=100, deadline=None)
+def test_what_is_laid_out_comes_back(value):
+    assert same(value, from_tree(Everything, to_tree(value), "a tree"))
+
+
+@given(everything())
+@settings(max_examples=25, deadline=None)
 def test_what_is_written_comes_back(tmp_path_factory, value):
     path = tmp_path_factory.mktemp("trees") / "value.nc"
     to_tree(value).to_netcdf(path, engine="h5netcdf")
