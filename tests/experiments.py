@@ -3,7 +3,7 @@
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import equinox as eqx
 import jax
@@ -19,6 +19,7 @@ from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.unknowns import Unknowns, UnknownsReport
 from lusee_bayes.instrument.products import DataLayout
+from lusee_bayes.linear.amplitudes import template_amplitudes
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.channel_map import Conditioned, conditioned
 from lusee_bayes.results.map_files import SavedInformation
@@ -130,11 +131,67 @@ def density(
     return float(got), trace
 
 
+def density_of(
+    experiment: Experiment, values: dict[str, Any], program: str = "systematics"
+) -> float:
+    """ln p of everything by a program of an experiment; no site may be left to chance."""
+    asked = lb.load_program(program)
+    got, trace = density(asked, program_arguments(asked, experiment), values)
+    assert set(trace) == {*values, "data"}
+    return got
+
+
+def with_known_sky(setup: Setup, scale: float) -> Setup:
+    """The setup with a prior about its own sky, of a part of its C_ell."""
+    spectrum = scale * np.asarray(setup.prior.spectrum)
+    return replace(setup, prior=lb.HarmonicPrior(spectrum, mean=setup.sky.modes))
+
+
+def drawn(first: Setup, seed: int) -> Experiment:
+    """Data of a sky that is drawn from the prior; N is that of the model sky."""
+    z = np.random.default_rng(seed).standard_normal(first.prior.size)
+    sky = replace(first.sky, modes=np.asarray(first.prior.colour(z)) + first.prior.mean)
+    scenario = first.scenario.model_copy(update={"seed": seed})
+    setup = replace(first, sky=sky, scenario=scenario)
+    return Experiment(setup, simulate(setup))
+
+
+def sky_and_amplitudes(found: Inference) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of the sky and of what all templates are multiplied by, together."""
+    columns = np.concatenate([np.asarray(s.columns) for s in found.systematics], axis=1)
+    told, sky = template_amplitudes(found.solution, columns), found.posterior.covariance()
+    covariance = np.block([[np.asarray(sky), told.with_sky], [told.with_sky.T, told.covariance]])
+    return np.concatenate([np.asarray(found.posterior.mean), told.mean]), covariance
+
+
 def parts(setup: Setup) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A, and the standard deviations of the prior and of radiometer noise."""
     variances = setup.prior.variance(), radiometer(setup).diagonal()
     prior, noise = (np.sqrt(np.asarray(variance)) for variance in variances)
     return np.asarray(setup.coupling.dense()), prior, noise
+
+
+class DenseChannels(NamedTuple):
+    """Matrices and vectors of every channel of a scenario, with the templates of its unknowns."""
+
+    couplings: list[np.ndarray]
+    templates: list[np.ndarray]
+    noise: list[np.ndarray]
+    rest: list[np.ndarray]
+    prior: list[np.ndarray]
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> Self:
+        found = cls([], [], [], [], [])
+        for channel in scenario.channels():
+            experiment = lb.build(channel)
+            setup, systematics = experiment.setup, lb.infer(experiment).systematics
+            a, prior, noise = parts(setup)
+            t = np.concatenate([np.asarray(s.columns) for s in systematics], axis=1)
+            rest = np.asarray(experiment.data.data) - np.asarray(setup.offset)
+            for all_channels, own in zip(found, (a, t, noise, rest, prior), strict=True):
+                all_channels.append(own)
+        return found
 
 
 def draw_within(program, arguments, key, sampler, whitening=None, thin=1) -> dict[str, Any]:

@@ -30,8 +30,12 @@ def naive_gain(folder, level, port, seen, mhz):
     return CubicSpline(anchors, mean + q["PC1"] * vectors[:, 0] + q["PC2"] * vectors[:, 1])(mhz)
 
 
-def naive_band(flight, name, row, f):
-    """A parabola through the channels of a band of 1 MHz, product by product, in V^2/Hz."""
+def naive_band(flight, name, row, f, comb=False):
+    """A parabola through the channels of a band of 1 MHz, product by product, in V^2/Hz.
+
+    Without the channels of the comb where it is on. And the number of independent samples behind
+    each value, for a flat spectrum.
+    """
     with h5py.File(flight / f"session_{name}.h5") as file:
         counts = file["spectra/data"][row].astype(float)
         codes = file["spectra/metadata/actual_gain"][row]
@@ -41,6 +45,8 @@ def naive_band(flight, name, row, f):
     channels = stride * np.arange(2048 // stride)[:, None] + np.arange(stride)
     x = 0.025 * channels - f
     within = (np.abs(x) <= 0.5 + 1e-9).all(axis=1)
+    if comb:
+        within &= (channels % 4 != 2).all(axis=1)
     gains = [
         naive_gain(flight / "gain", "LMH"[codes[p]], p, seen, 0.025 * channels[within]).mean(axis=1)
         for p in range(4)
@@ -51,4 +57,5 @@ def naive_band(flight, name, row, f):
     for label, spectrum in zip(FLIGHT_ORDER, counts[:, np.flatnonzero(within)], strict=True):
         gain = np.sqrt(gains[int(label[0])] * gains[int(label[1])])
         found[label] = weights @ (spectrum * 1e-18 / gain)
-    return np.array([found[label] for label in labels()])
+    values = np.array([found[label] for label in labels()])
+    return values, 2.0**25 * stride / (weights @ weights)

@@ -4,8 +4,13 @@ import contextlib
 import errno
 import hashlib
 import json
+import os
+import re
+import shlex
 import shutil
 import signal
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,14 +22,21 @@ import pytest
 import xarray as xr
 from astropy.io import fits
 from commands import content, posterior_of, refused, run, sky_draws_of, table_of
+from rich.console import Console
 
 import lusee_bayes
-from lusee_bayes.cli.options import ScenarioOptions
+from lusee_bayes.cli.commands import app
+from lusee_bayes.cli.options import ScenarioOptions, show
+from lusee_bayes.cli.tables import checks_table, comparison_table
+from lusee_bayes.core.arrays import SWITCH
 from lusee_bayes.core.harmonics import from_healpy, modes_to_map, pixel_matrix
+from lusee_bayes.core.version import COMMAND
 from lusee_bayes.experiment.scenario import OutputSection
+from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows, evidence_caveat
 from lusee_bayes.results.map_result import MapResult
 from lusee_bayes.runs import map_run as runs
 from lusee_bayes.runs.folder import Output
+from lusee_bayes.sampling.validation import Check
 
 SMALL = ["--set", "lmax=6", "--set", "observation.runs.0.cycles=0.1"]
 
@@ -36,11 +48,9 @@ def folder(small_map):
 
 
 def test_map_writes_what_it_promises(folder):
-    assert {p.name for p in folder.iterdir()} == {
-        "posterior.nc", "mean.fits", "mean_alm.fits", "std.fits", "truth.fits", "residual.fits",
-        "spectra.csv", "summary.json", "scenario.yaml", "diagnostics.nc", "report.html", "figures",
-        "manifest.json", "provenance.json",
-    }  # fmt: skip
+    files = "posterior.nc mean.fits mean_alm.fits std.fits truth.fits residual.fits spectra.csv "
+    files += "summary.json scenario.yaml diagnostics.nc report.html figures manifest.json"
+    assert {p.name for p in folder.iterdir()} == {*files.split(), "provenance.json"}
     for figure in ("maps", "data_vector", "beams", "fidelity", "spectra", "draws", "residuals"):
         image = matplotlib.image.imread(folder / "figures" / f"{figure}.png")
         assert image.std() > 0.01  # not blank
@@ -68,10 +78,8 @@ def test_the_files_agree_with_each_other(folder):
     alm = healpy.read_alm(folder / "mean_alm.fits")
     np.testing.assert_allclose(from_healpy(alm), mean, rtol=4e-16)
     rows = table_of(folder / "spectra.csv")
-    assert list(rows[0])[:8] == [
-        "frequency_mhz", "ell", "rho", "snr", "cl_prior", "cl_mean", "cl_truth",
-        "cl_posterior_variance",
-    ]  # fmt: skip
+    columns = "frequency_mhz ell rho snr cl_prior cl_mean cl_truth cl_posterior_variance"
+    assert list(rows[0])[:8] == columns.split()
     assert float(rows[2]["cl_posterior_variance"]) == pytest.approx(np.mean(std[4:9] ** 2))
     summary = json.loads((folder / "summary.json").read_text())
     assert (summary["n_data"], summary["n_modes"]) == (16 * 64, 81)
@@ -82,9 +90,8 @@ def test_headers_say_where_the_numbers_come_from(folder):
     for name in ("mean", "std", "truth", "residual", "mean_alm"):
         with fits.open(folder / f"{name}.fits") as hdus:
             header = hdus[1].header
-        said = {key: header[key] for key in ("CONTENT", "FREQ", "LMAX", "FRAME", "BEAM")}
-        content = name.removesuffix("_alm")
-        assert list(said.values()) == [content, 25.0, 8, "galactic", "monopole"]
+        said = [header[key] for key in ("CONTENT", "FREQ", "LMAX", "FRAME", "BEAM")]
+        assert said == [name.removesuffix("_alm"), 25.0, 8, "galactic", "monopole"]
         assert (header["SITELON"], header["SITELAT"]) == (182.258, -23.814)
         assert header["SCENHASH"] == hashlib.sha256(text.encode()).hexdigest()
         assert header["CREATOR"] == f"lusee_bayes {lusee_bayes.__version__}"
@@ -131,18 +138,22 @@ def test_names_of_files_keep_their_capitals():
     assert (loaded.flight.clock, loaded.lmax) == ("Of/A Clock.JSON", 6)
 
 
-def test_info_recognises_its_files(folder, tmp_path, capsys):
+def test_info_recognises_files_and_folders(small_map, folder, tmp_path, capsys):
     run("simulate", "fiducial", *SMALL, "-o", tmp_path / "data.nc", "-q")
+    (days,) = {len(c.judged.of_kind("day")) for c in small_map.result.channels}
+    simulated = "results of lusee-bayes map", "simulated by this run, seed 1"
     for path, words in [
-        (tmp_path / "data.nc", "Visibilities: 16 products x"),
-        (folder / "posterior.nc", "posterior over 81 modes"),
-        (folder / "mean.fits", "HEALPix sky map, NSIDE 8"),
-        (folder / "mean.fits", "mean of the posterior at 25 MHz up to ell = 8"),
-        (folder / "diagnostics.nc", "residuals by 6 days, 16 products, 2 turntable angles"),
-        (folder / "mean_alm.fits", "coefficients of one sky up to ell = 8"),
+        (tmp_path / "data.nc", ["Visibilities: 16 products x"]),
+        (folder / "posterior.nc", ["posterior over 81 modes"]),
+        (folder / "mean.fits", ["HEALPix sky map, NSIDE 8", "mean of the posterior at 25 MHz up"]),
+        (folder / "diagnostics.nc", [f"residuals by {days} days, 16 products, 2 turntable angles"]),
+        (folder / "mean_alm.fits", ["coefficients of one sky up to ell = 8"]),
+        (folder, [*simulated, small_map.result.verdict(), "mean_alm.fits"]),
     ]:
         assert run("info", path) == 0
-        assert words in capsys.readouterr().out
+        told = capsys.readouterr().out
+        assert all(word in told for word in words), told
+    assert "a folder that no run has written" in refused(capsys, "info", tmp_path)
 
 
 def test_the_users_folder_stands_for_a_tilde_everywhere(tmp_path, monkeypatch, capsys):
@@ -252,3 +263,214 @@ def test_names_that_are_no_text_are_shown_by_their_escapes(small_map, tmp_path, 
     assert r"a\udcff" in shown and "b[red]" in shown
     page = (tmp_path / "c\udcff" / "comparison.html").read_bytes().decode("utf-8")
     assert r"a\udcff" in page
+
+
+# --- the terminal, help, and what a command waits for ---------------------------------------------
+
+
+@pytest.fixture
+def finished(small_map):
+    return FinishedRun.read(small_map.folder)
+
+
+def printed(table) -> list[str]:
+    console = Console(width=80, soft_wrap=True, record=True, quiet=False, force_terminal=False)
+    with console.capture() as captured:
+        show(console, table)
+    return captured.get().splitlines()
+
+
+def with_data(run, name, change):
+    """The same run with other data."""
+    channel = replace(run.channel, data=change(run.channel.data))
+    return replace(run, name=name, channels=(channel,))
+
+
+@pytest.mark.parametrize(("arguments", "code"), [(["keys"], 0), (["map", "no.yaml"], 2)])
+def test_what_a_program_calls_next_is_not_said_to_be_of_a_command_before(arguments, code, capsys):
+    assert run(*arguments) == code
+    assert COMMAND.get() == ""
+
+
+def test_tables_fit_eighty_columns(finished):
+    others = [
+        replace(finished, name="a run with a name that is longer than it had better be " * 2),
+        replace(finished, name="unknown", channels=(replace(finished.channel, truth=None),)),
+    ]
+    lines = printed(comparison_table([finished, *others]))
+    assert max(map(len, lines)) <= 80
+    assert "None" not in "".join(lines) and "> 8" in "".join(lines)
+    check = Check("a check", 1.0, 0.0, 2.0, "what it is, in a long sentence " * 6)
+    assert max(map(len, printed(checks_table([check])))) <= 80
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda d: d + 1.0, "other values at the same times"),
+        (lambda d: 4e-24 * d, "the same data in another unit (times 4e-24)"),
+        (lambda d: np.where(np.arange(d.shape[1]) > 3, d, np.nan), "samples instead of"),
+    ],
+)
+def test_evidences_of_other_data_are_not_compared(finished, change, reason):
+    same = with_data(finished, "same", lambda d: d)
+    assert evidence_caveat([finished, same]) is None
+    assert comparison_rows([finished, same])[0]["log_evidence_less_best"] == 0.0
+    other = with_data(finished, "other", change)
+    assert reason in evidence_caveat([finished, same, other])
+    assert "same has" not in evidence_caveat([finished, same, other])
+    assert comparison_rows([finished, other])[0]["log_evidence_less_best"] is None
+    ten = replace(finished, name="ten", channels=(replace(finished.channel, frequency_mhz=10.0),))
+    assert "ten is at 10 MHz instead of 25" in evidence_caveat([finished, ten])
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [("--simulations=50", "at least 100 simulations"), ("--draws=20", "100 draws of each chain")],
+)
+def test_options_are_checked_before_anything_is_loaded(option, message, tmp_path):
+    """Not even a scenario that does not exist is looked for, nor JAX imported."""
+    code = "import sys; from lusee_bayes.cli.main import main; code = main(sys.argv[1:]); "
+    code += "print('jax' in sys.modules); raise SystemExit(code)"
+    command = [sys.executable, "-c", code, "validate", "no such scenario", option]
+    found = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
+    assert found.returncode == 2 and message in found.stderr
+    assert found.stdout.strip() == "False"
+    assert not list(tmp_path.iterdir())
+
+
+COMMANDS = [name for name in app if not name.startswith("-")]
+EXAMPLES = [
+    (name, line)
+    for name in COMMANDS
+    for line in re.findall(r"^ *- ``(.*)``$", app[name].default_command.__doc__, re.MULTILINE)
+]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_shows_the_examples(name, capsys):
+    assert run(name, "--help") == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    examples = [line for its, line in EXAMPLES if its == name]
+    assert "Examples" in shown and examples
+    assert all(example in shown for example in examples)
+
+
+@pytest.mark.parametrize(("name", "line"), EXAMPLES, ids=[line for _, line in EXAMPLES])
+def test_examples_are_of_the_command_and_can_be_parsed(name, line):
+    program, *arguments = shlex.split(line)
+    assert (program, arguments[0]) == ("lusee-bayes", name)
+    # an unknown option or a value of the wrong type raises
+    command, *_ = app.parse_args(arguments, exit_on_error=False, print_error=False)
+    assert command.__name__ == f"{name.replace('-', '_')}_command"
+
+
+def test_keys_are_listed(capsys):
+    assert run("keys", "noise.gain") == 0
+    shown = capsys.readouterr().out
+    assert "noise.gain.correlation_h = 10.0\n    Correlation time\n" in shown
+    assert "number, > 0 [h]" in shown
+    assert run("keys", "--markdown", "lmax") == 0
+    assert "| `lmax` |" in capsys.readouterr().out
+    assert "no key 'lmx'; did you mean 'lmax'?" in refused(capsys, "keys", "lmx")
+
+
+# as without the extra "cluster": xarray imports Dask where it is there, and Dask SciPy
+PROGRAM = """
+import sys
+sys.modules["dask"] = None
+from lusee_bayes.cli.main import main
+counted = []
+if {count}:
+    import jax
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda name, *_, **__: counted.append(name)
+    )
+assert main({arguments!r}) == 0
+print(len([name for name in counted if "backend_compile" in name]), *sys.modules)
+"""
+
+
+def outcome(*arguments, count=False):
+    """The number of programs compiled, and the modules imported."""
+    program = PROGRAM.format(count=count, arguments=[str(a) for a in arguments])
+    environment = {name: v for name, v in os.environ.items() if not name.startswith("JAX")}
+    environment["LUSEE_BAYES_CACHE"] = "off"
+    command = [sys.executable, "-c", program]
+    found = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+    n, *modules = found.stdout.splitlines()[-1].split()
+    return int(n), set(modules)
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["map", "--help"], ["--version"]])
+def test_help_waits_for_no_library(arguments):
+    _, modules = outcome(*arguments)
+    assert not modules & {"jax", "numpy", "astropy", "healpy", "matplotlib", "xarray", "pydantic"}
+
+
+@pytest.mark.parametrize(
+    ("name", "spared"),
+    [
+        ("posterior.nc", {"jax", "healpy", "matplotlib", "scipy"}),
+        ("diagnostics.nc", {"jax", "healpy", "matplotlib", "scipy"}),
+        ("mean.fits", {"numpyro", "xarray", "lunarsky", "scipy.stats", "healpy", "matplotlib"}),
+    ],
+)
+def test_info_waits_for_no_more_than_its_file(name, spared, small_map):
+    _, modules = outcome("info", small_map.folder / name)
+    assert not modules & spared
+
+
+def test_a_map_compiles_little_and_imports_no_sampler(tmp_path):
+    small = ("--set", "lmax=8", "--set", "observation.runs.0.cycles=0.2")
+    n, modules = outcome("map", "fiducial", *small, "-o", tmp_path / "map", "-q", count=True)
+    # single random numbers, most of them; none of it grows with the map
+    assert 0 < n <= 60
+    assert not modules & {"numpyro", "arviz_stats", "scipy.stats", "scipy.optimize"}
+
+
+# --- the cache of compiled programs: shared, and switched off -------------------------------------
+
+# one program, compiled anew or found; says which
+COMPILING = """
+import jax
+from lusee_bayes.core.arrays import use_compilation_cache
+found = []
+jax.monitoring.register_event_listener(lambda name, **_: found.append(name))
+use_compilation_cache()
+x = jax.jit(lambda x: (x * 2.0 + 1.0).sum())(jax.numpy.arange(7.0))
+print(sum("cache_hits" in name for name in found), flush=True)
+"""
+
+
+def compiled(cache, *without):
+    """What the program says, in an environment without variables that begin so."""
+    own = {k: v for k, v in os.environ.items() if not k.startswith(("JAX", *without))}
+    command, env = [sys.executable, "-c", COMPILING], own | {SWITCH: str(cache)}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=env)
+    return done.stdout, done.stderr
+
+
+def kept(cache):
+    return sorted(path.name for path in cache.rglob("*-cache"))
+
+
+def test_what_one_process_compiles_the_next_one_finds(tmp_path):
+    assert compiled(tmp_path)[0] == "0\n"
+    programs = kept(tmp_path)
+    assert programs
+    assert int(compiled(tmp_path)[0]) >= 1
+    assert kept(tmp_path) == programs
+    # JAX sets a level of messages at which XLA warns of every program that it finds: a program
+    # that imports JAX first sees no such warnings
+    assert compiled(tmp_path, "TF_CPP") == ("0\n", "")
+
+
+@pytest.mark.long
+def test_it_can_be_switched_off_and_do_without(tmp_path):
+    assert compiled("off")[0] == "0\n"
+    # a place that cannot be written to: programs are compiled anew, and nothing is said
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder")
+    assert compiled(blocked)[0] == "0\n"
+    assert blocked.read_text() == "not a folder"

@@ -86,6 +86,18 @@ def test_a_failure_of_ours_ends_the_stage_as_it_is(engine):
         engine.each(tasks_of(wrong, 1), Stages(), "s")
     assert "wrong" in [frame.name for frame in caught.traceback]
 
+    class Two(Exception):
+        """What cannot be sent arrives in words."""
+
+        def __init__(self, a, b):
+            super().__init__(f"{a} and {b}")
+
+    def unsent(k):
+        raise Two("one", "other")
+
+    with pytest.raises(Exception, match="one and other"):
+        engine.each(tasks_of(unsent, 1), Stages(), "s")
+
 
 def attempts(folder: Path, k: int) -> int:
     """How often a task has been begun, this time included."""
@@ -173,18 +185,6 @@ def test_workers_that_cannot_do_it_are_refused(engine, tmp_path, monkeypatch):
         refuse("has lusee_bayes .*, the command lusee_bayes 0.0", new.work_in, tmp_path)
     with pytest.raises(RuntimeError, match="call work_in first"):
         DaskEngine(engine.client).each(tasks_of(abs, 1), Stages(), "s")
-
-
-def test_errors_that_cannot_be_sent_arrive_in_words(engine):
-    class Two(Exception):
-        def __init__(self, a, b):
-            super().__init__(f"{a} and {b}")
-
-    def fail(k):
-        raise Two("one", "other")
-
-    with pytest.raises(Exception, match="one and other"):
-        engine.each(tasks_of(fail, 1), Stages(), "s")
 
 
 def test_threads_of_this_process_leave_it_as_it_is(tmp_path):

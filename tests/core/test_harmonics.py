@@ -3,7 +3,6 @@
 from math import factorial
 
 import healpy
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -37,10 +36,8 @@ def test_packing_is_ell_squared_plus_ell_plus_m():
 
 def test_many_maps_at_once_are_those_of_healpy():
     modes = np.random.default_rng(5).standard_normal((h.n_modes(LMAX), 3))
-    maps = h.columns_to_maps(modes, 4)
-    for column in range(3):
-        expected = h.modes_to_map(modes[:, column], 4)
-        within(maps[:, column], expected, 1e-12)
+    expected = np.stack([h.modes_to_map(column, 4) for column in modes.T], axis=1)
+    within(h.columns_to_maps(modes, 4), expected, 1e-12)
 
 
 @pytest.mark.parametrize("n", [0, 2, 3, 2303])
@@ -48,22 +45,13 @@ def test_a_number_that_is_no_square_is_refused(n):
     refuse(f"{n} coefficients", h.lmax_of, n)
 
 
-def test_coefficients_are_the_parts_of_healpys():
-    alm = random_alm(np.random.default_rng(0), LMAX)
-    modes = h.from_healpy(alm)
-    for ell in range(LMAX + 1):
-        centre = ell * (ell + 1)
-        assert modes[centre] == alm[healpy.Alm.getidx(LMAX, ell, 0)].real
-        for m in range(1, ell + 1):
-            a = alm[healpy.Alm.getidx(LMAX, ell, m)]
-            np.testing.assert_allclose(modes[centre + m], np.sqrt(2) * a.real, rtol=1e-15)
-            np.testing.assert_allclose(modes[centre - m], np.sqrt(2) * a.imag, rtol=1e-15)
-
-
 @pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
-def test_from_healpy_keeps_leading_axes(batch):
-    alm = random_alm(np.random.default_rng(1), LMAX, *batch)
-    modes = h.from_healpy(alm)
+def test_coefficients_are_the_parts_of_healpys(batch):
+    alm = random_alm(np.random.default_rng(0), LMAX, *batch)
+    modes, (ell, m) = h.from_healpy(alm), h.mode_numbers(LMAX)
+    a = alm[..., healpy.Alm.getidx(LMAX, ell, np.abs(m))]
+    expected = np.where(m < 0, a.imag, a.real) * np.where(m == 0, 1.0, np.sqrt(2))
+    np.testing.assert_allclose(modes, expected, rtol=1e-15)
     for index in np.ndindex(batch):
         back = h.to_healpy(jnp.asarray(modes[index]))
         np.testing.assert_allclose(back, alm[index], rtol=1e-15)
@@ -201,12 +189,6 @@ def test_turn_about_z(angle):
     _, m = healpy.Alm.getlm(TURNED)
     expected = from_healpy(to_healpy(a[0]) * np.exp(-1j * m * angle))
     within(h.turn_about_z(a, angle)[0], expected, 1e-12)
-
-
-def test_turn_about_z_differentiates_to_its_generator():
-    a = random_modes(9)
-    _, slope = jax.jvp(lambda x: h.turn_about_z(a, x), (jnp.asarray(0.0),), (jnp.asarray(1.0),))
-    within(slope, dense_generators(TURNED)[2] @ np.asarray(a), 1e-13)
 
 
 def test_generators_are_an_angular_momentum():

@@ -4,9 +4,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from decimal import localcontext
 from functools import partial
-from threading import Event, Thread
 
 import jax
 import jax.numpy as jnp
@@ -16,23 +16,7 @@ from assertions import refuse
 from reference_linear import exact
 from scipy.linalg.lapack import dpotri
 
-from lusee_bayes.core.linalg import (
-    MAX_SUBSTITUTED,
-    N_BLOCKS,
-    checked_cholesky,
-    cholesky,
-    gram_matrix,
-    inverse_from_cholesky,
-    invert_lower,
-    outer_sandwich,
-    precise_residual,
-    sandwich,
-    solve_lower,
-    spanning_rows,
-    symmetric_product,
-    times_lower,
-    whitened,
-)
+from lusee_bayes.core import linalg as la
 
 
 def spd(n: int, *batch: int) -> np.ndarray:
@@ -45,11 +29,11 @@ ARRAYS = pytest.mark.parametrize("xp", [np, jnp], ids=["numpy", "jax"])
 
 
 # as many columns as blocks, fewer, and numbers that do not split evenly
-@pytest.mark.parametrize("columns", [1, N_BLOCKS - 1, N_BLOCKS, N_BLOCKS + 1, 31])
+@pytest.mark.parametrize("columns", [1, la.N_BLOCKS - 1, la.N_BLOCKS, la.N_BLOCKS + 1, 31])
 @pytest.mark.parametrize("rows", [1, 20])
 def test_gram_matrix(rows, columns):
     w = np.random.default_rng(columns).normal(size=(rows, columns))
-    got = np.asarray(jax.jit(gram_matrix)(jnp.asarray(w)))
+    got = np.asarray(jax.jit(la.gram_matrix)(jnp.asarray(w)))
     np.testing.assert_array_equal(got, got.T)
     # a sum of `rows` products of order one: rounding below rows x eps x |w|^2 = 20 x 2e-16 x 10
     np.testing.assert_allclose(got, w.T @ w, rtol=0, atol=1e-13)
@@ -59,19 +43,19 @@ def test_gram_matrix(rows, columns):
 def test_symmetric_product(xp):
     """A B with B = S A^T, which is symmetric without either being the other's transpose."""
     a, s = np.random.default_rng(1).normal(size=(13, 7)), spd(7)
-    got = np.asarray(symmetric_product(xp.asarray(a), xp.asarray(s @ a.T)))
+    got = np.asarray(la.symmetric_product(xp.asarray(a), xp.asarray(s @ a.T)))
     np.testing.assert_array_equal(got, got.T)
     np.testing.assert_allclose(got, a @ s @ a.T, rtol=0, atol=1e-13 * np.abs(got).max())
 
 
-@pytest.mark.parametrize("n", [1, 7, MAX_SUBSTITUTED + 1, 4 * MAX_SUBSTITUTED + 3])
+@pytest.mark.parametrize("n", [1, 7, la.MAX_SUBSTITUTED + 1, 4 * la.MAX_SUBSTITUTED + 3])
 @ARRAYS
 def test_inverses_of_triangles(n, xp):
     matrix = spd(n)
     lower = np.linalg.cholesky(matrix)
-    inverse = invert_lower(xp.asarray(lower + np.triu(np.ones((n, n)), 1)))
+    inverse = la.invert_lower(xp.asarray(lower + np.triu(np.ones((n, n)), 1)))
     np.testing.assert_allclose(np.asarray(inverse) @ lower, np.eye(n), rtol=0, atol=1e-11)
-    whole = np.asarray(inverse_from_cholesky(xp.asarray(lower)))
+    whole = np.asarray(la.inverse_from_cholesky(xp.asarray(lower)))
     np.testing.assert_array_equal(whole, whole.T)
     np.testing.assert_allclose(whole @ matrix, np.eye(n), rtol=0, atol=1e-10)
 
@@ -81,7 +65,7 @@ def test_inverses_of_triangles(n, xp):
 def test_solve_lower(batch, transpose):
     lower = np.linalg.cholesky(spd(6, *batch))
     x = np.random.default_rng(2).normal(size=(*batch, 6, 2))
-    got = np.asarray(solve_lower(jnp.asarray(lower), jnp.asarray(x), transpose=transpose))
+    got = np.asarray(la.solve_lower(jnp.asarray(lower), jnp.asarray(x), transpose=transpose))
     matrix = lower.swapaxes(-1, -2) if transpose else lower
     np.testing.assert_allclose(matrix @ got, x, rtol=0, atol=1e-13)
 
@@ -89,7 +73,7 @@ def test_solve_lower(batch, transpose):
 @pytest.mark.parametrize("batch", [(), (3,)])
 def test_checked_cholesky(batch):
     matrix = spd(6, *batch)
-    got = checked_cholesky("N", jnp.asarray(matrix))
+    got = la.checked_cholesky("N", jnp.asarray(matrix))
     np.testing.assert_allclose(np.tril(got), np.linalg.cholesky(matrix), rtol=0, atol=1e-13)
 
 
@@ -97,11 +81,10 @@ def test_checked_cholesky_names_what_has_no_factor():
     """One of a stack is enough; its lowest eigenvalue is 1 - 2."""
     bad = np.array([[1.0, 2.0], [2.0, 1.0]])
     stack = jnp.asarray(np.stack([np.eye(2), bad]))
-    refuse(
-        "the noise is .* eigenvalue is -1 .largest entry 2", checked_cholesky, "the noise", stack
-    )
+    words = "the noise is .* eigenvalue is -1 .largest entry 2"
+    refuse(words, la.checked_cholesky, "the noise", stack)
     # values are not known there
-    assert np.isnan(jax.jit(lambda m: checked_cholesky("the noise", m))(stack)[1]).any()
+    assert np.isnan(jax.jit(lambda m: la.checked_cholesky("the noise", m))(stack)[1]).any()
 
 
 def test_batched_solves_side_by_side_end():
@@ -124,39 +107,30 @@ def test_factors_are_clean_and_in_place_on_request():
     matrix = spd(40)
     given = matrix + np.triu(np.full((40, 40), np.nan), 1)
     kept = given.copy()
-    lower = cholesky(given)
+    lower = la.cholesky(given)
     np.testing.assert_allclose(lower @ lower.T, matrix, rtol=0, atol=1e-13)
     np.testing.assert_array_equal(given, kept)
-    assert cholesky(given, overwrite=True) is given
+    assert la.cholesky(given, overwrite=True) is given
     np.testing.assert_array_equal(given, lower)
-    assert np.isnan(cholesky(-matrix)).all()
+    assert np.isnan(la.cholesky(-matrix)).all()
 
 
 def longest_pause(work: Callable[[], None]) -> float:
     """The longest time for which this thread stood still while another worked, over the work's."""
-    started, took = Event(), []
-
-    def timed() -> None:
-        started.set()
-        begin = time.perf_counter()
-        work()
-        took.append(time.perf_counter() - begin)
-
-    worker, longest = Thread(target=timed), 0.0
-    worker.start()
-    started.wait()
-    before = time.perf_counter()
-    while not took:
-        now = time.perf_counter()
-        longest, before = max(longest, now - before), now
-    worker.join()
-    return longest / took[0]
+    start = before = time.perf_counter()
+    longest = 0.0
+    with ThreadPoolExecutor(1) as pool:
+        done = pool.submit(work)
+        while not done.done():
+            now = time.perf_counter()
+            longest, before = max(longest, now - before), now
+    return longest / (before - start)
 
 
 def test_other_threads_go_on_meanwhile():
     """The interpreter's lock is free while LAPACK works; SciPy's own wrapper keeps it."""
     lower = np.eye(2000)
-    assert min(longest_pause(partial(inverse_from_cholesky, lower)) for _ in range(3)) < 0.5
+    assert min(longest_pause(partial(la.inverse_from_cholesky, lower)) for _ in range(3)) < 0.5
     assert max(longest_pause(partial(dpotri, lower.T, lower=0)) for _ in range(3)) > 0.5
 
 
@@ -167,18 +141,18 @@ def test_products_with_a_triangle(n, xp):
     lower, matrix, x = np.tril(rng.normal(size=(n, n))), spd(n), rng.normal(size=(70, n))
     given = [xp.asarray(a) for a in (lower, matrix, x)]
     close = partial(np.testing.assert_allclose, rtol=0, atol=1e-12 * n)
-    close(times_lower(given[2], given[0], transpose=False), x @ lower)
-    close(times_lower(given[2], given[0], transpose=True), x @ lower.T)
+    close(la.times_lower(given[2], given[0], transpose=False), x @ lower)
+    close(la.times_lower(given[2], given[0], transpose=True), x @ lower.T)
     for found, expected in (
-        (sandwich(given[1], given[0]), lower.T @ matrix @ lower),
-        (outer_sandwich(given[1], given[0]), lower @ matrix @ lower.T),
+        (la.sandwich(given[1], given[0]), lower.T @ matrix @ lower),
+        (la.outer_sandwich(given[1], given[0]), lower @ matrix @ lower.T),
     ):
         close(found, expected)
         np.testing.assert_array_equal(found, np.asarray(found).T)
     inverse = np.linalg.inv(lower)
     # entries of the inverse grow with n
     scale = np.abs(inverse).max() ** 2
-    close(whitened(matrix, lower) / scale, inverse @ matrix @ inverse.T / scale)
+    close(la.whitened(matrix, lower) / scale, inverse @ matrix @ inverse.T / scale)
 
 
 @ARRAYS
@@ -191,7 +165,7 @@ def test_a_residual_of_large_numbers_is_precise(xp):
     with localcontext(prec=60):
         truth = (exact(vector) - exact(matrix) @ exact(x)).astype(float)
     scale = np.abs(matrix) @ np.abs(x)
-    found = precise_residual(*(xp.asarray(a) for a in (vector, matrix, x)))
+    found = la.precise_residual(*(xp.asarray(a) for a in (vector, matrix, x)))
     # 23 bits more than those of a float
     assert (np.abs(found - truth) / scale).max() < 1e-21
     assert (np.abs(vector - np.asarray(matrix @ x) - truth) / scale).max() > 1e-17
@@ -203,10 +177,10 @@ def test_few_rows_span_a_matrix():
     x = np.linspace(0.0, 1.0, 150)
     kind = rng.integers(0, 2, 150)
     matrix = np.cos(x[:, None] * np.arange(12.0)) * rng.standard_normal(12)
-    picked, factors = spanning_rows(matrix, kind)
+    picked, factors = la.spanning_rows(matrix, kind)
     assert len(picked) == len(set(picked.tolist())) <= 24
     np.testing.assert_allclose(factors @ matrix[picked], matrix, rtol=0, atol=1e-11)
     assert not factors[kind[:, None] != kind[picked]].any()
     # rows without anything in common need all of them
     rough = rng.standard_normal((20, 30))
-    assert sorted(spanning_rows(rough, np.zeros(20))[0]) == list(range(20))
+    assert sorted(la.spanning_rows(rough, np.zeros(20))[0]) == list(range(20))

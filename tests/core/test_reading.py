@@ -11,17 +11,9 @@ from assertions import refuse
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lusee_bayes.core import formats, layouts
+from lusee_bayes.core import formats, layouts, reading
 from lusee_bayes.core.formats import require_readable_hdf5
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
-from lusee_bayes.core.reading import (
-    as_yaml,
-    parse_yaml,
-    read_arrays,
-    read_json,
-    read_table,
-    read_yaml,
-)
 
 LAYOUT = Layout(
     "an example",
@@ -36,11 +28,8 @@ LAYOUT = Layout(
 
 
 def arrays(**changes):
-    found = {
-        "times": np.arange(3.0),
-        "data": np.ones((3, 2), dtype=np.float32),
-        "names": np.array(["a", "b"]),
-    }
+    found = {"times": np.arange(3.0), "names": np.array(["a", "b"])}
+    found |= {"data": np.ones((3, 2), dtype=np.float32)}
     return {name: v for name, v in (found | changes).items() if v is not None}
 
 
@@ -88,13 +77,13 @@ def test_what_no_memory_holds_is_not_read(tmp_path, monkeypatch):
 def test_tables_objects_and_arrays(tmp_path):
     (tmp_path / "t.csv").write_text("ell,name\n0,a\n1,b\n")
     table = Layout("a table", {"ell": Variable(("row",)), "name": Variable(("row",), "text")})
-    np.testing.assert_array_equal(read_table(tmp_path / "t.csv", table)["ell"], [0.0, 1.0])
+    np.testing.assert_array_equal(reading.read_table(tmp_path / "t.csv", table)["ell"], [0.0, 1.0])
     (tmp_path / "t.csv").write_text("ell,name\n0,a\n1\n")
-    refuse("line 3 has 1 entries for 2 columns", read_table, tmp_path / "t.csv", table)
+    refuse("line 3 has 1 entries for 2 columns", reading.read_table, tmp_path / "t.csv", table)
     (tmp_path / "o.json").write_text("[1]")
-    refuse("holds a list", read_json, tmp_path / "o.json", Layout("an object"))
+    refuse("holds a list", reading.read_json, tmp_path / "o.json", Layout("an object"))
     np.save(tmp_path / "a.npz", np.ones(3))
-    refuse("a.npz", read_arrays, tmp_path / "a.npz.npy", Layout("arrays"))
+    refuse("a.npz", reading.read_arrays, tmp_path / "a.npz.npy", Layout("arrays"))
 
 
 @pytest.fixture
@@ -136,7 +125,7 @@ TREES = st.recursive(
 @settings(max_examples=50, database=None, deadline=None, derandomize=True)
 @given(TREES)
 def test_what_is_written_comes_back(tree):
-    assert parse_yaml(as_yaml(tree), "the text") == tree
+    assert reading.parse_yaml(reading.as_yaml(tree), "the text") == tree
 
 
 @pytest.mark.parametrize(
@@ -148,7 +137,7 @@ def test_what_is_written_comes_back(tree):
     ],
 )  # fmt: skip
 def test_numbers_are_decimal_and_dates_are_text(text, value):
-    found = parse_yaml(text, "the text")
+    found = reading.parse_yaml(text, "the text")
     assert (type(found), found) == (type(value), value)
 
 
@@ -163,12 +152,12 @@ def test_numbers_are_decimal_and_dates_are_text(text, value):
     ],
 )
 def test_what_is_not_valid_is_refused(text, message):
-    refuse(message, parse_yaml, text, "the text")
+    refuse(message, reading.parse_yaml, text, "the text")
 
 
 def test_files_are_utf8(tmp_path):
     path = tmp_path / "x.yaml"
     path.write_bytes("a: é".encode("latin-1"))
-    refuse(r"x.yaml cannot be read as a scenario: .*utf-8", read_yaml, path, "a scenario")
+    refuse(r"x.yaml cannot be read as a scenario: .*utf-8", reading.read_yaml, path, "a scenario")
     path.write_bytes(b"\xef\xbb\xbfa: 1")
-    assert read_yaml(path, "a scenario") == {"a": 1}
+    assert reading.read_yaml(path, "a scenario") == {"a": 1}

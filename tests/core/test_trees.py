@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
-from assertions import refuse, refused
+from assertions import refuse, refused, require_conventions
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -211,24 +211,20 @@ FORMAT = "lusee_bayes example 1"
 
 
 def sky(**others: Any) -> Sky:
-    maps = {"pixels": np.ones((192, 2)), "coarse": np.ones(12)}
-    return Sky(
-        **(maps | {"names": np.array(["auto", "cross"]), "mhz": np.array([20.0, 30.0])} | others)
-    )
+    given = {"pixels": np.ones((192, 2)), "coarse": np.ones(12), "mhz": np.array([20.0, 30.0])}
+    return Sky(**(given | {"names": np.array(["auto", "cross"])} | others))
 
 
 def test_pixels_have_a_grid(tmp_path):
     """That of CF 1.13, of each resolution, which readers of the file do not need."""
     path = write_tree(tmp_path / "sky.nc", sky(), FORMAT, {"frame": "galactic"})
+    require_conventions(path)
     with xr.open_dataset(path, engine="h5netcdf") as file:
-        assert (file.attrs["Conventions"], file.attrs["frame"]) == ("CF-1.13", "galactic")
-        for name, level in (("pixels", 2), ("coarse", 0)):
-            grid = file[file[name].attrs["grid_mapping"]].attrs
-            assert grid["grid_mapping_name"] == "healpix" and grid["indexing_scheme"] == "ring"
-            assert grid["refinement_level"] == level
+        assert file.attrs["frame"] == "galactic"
+        for name, n in (("pixels", 192), ("coarse", 12)):
             index = file[f"{file[name].dims[0]}_index"]
             assert index.attrs["standard_name"] == "healpix_index"
-            np.testing.assert_array_equal(index, np.arange(12 * 4**level))
+            np.testing.assert_array_equal(index, np.arange(n))
         assert "grid_mapping" not in file["mhz"].attrs
     with opened_tree(path, FORMAT, "a sky") as tree:
         assert same(sky(), from_tree(Sky, tree, str(path)))
@@ -246,8 +242,7 @@ def test_pixels_have_a_grid(tmp_path):
     ],
 )
 def test_what_fields_ask_for_is_checked(changes, words):
-    with refused(words):
-        from_tree(Sky, to_tree(sky(**changes)), "a file")
+    refuse(words, from_tree, Sky, to_tree(sky(**changes)), "a file")
 
 
 def test_what_is_absent_has_its_default():
@@ -271,58 +266,33 @@ def put(tree: xr.DataTree, name: str, array: np.ndarray, *dims: str) -> None:
     tree.dataset = tree.to_dataset().drop_vars(name).assign({name: (dims, array)})
 
 
-DAMAGED = {
-    "no name": (lambda t: without(t, "name"), "a file has no name (it has "),
-    "no array": (lambda t: without(t, "sky"), "a file has no sky (it has "),
-    "no group": (lambda t: without(t, "inner"), "a file has no inner (it has "),
-    "within a group": (lambda t: without(t["inner"], "level"), "a file: inner has no level"),
-    "text for a number": (lambda t: t.attrs.update(count="many"), "count is 'many', expected"),
-    "half a count": (lambda t: t.attrs.update(count=2.5), "count is 2.5, expected a whole number"),
-    "NaN for a count": (lambda t: t.attrs.update(count=np.nan), "count is nan, expected"),
-    "numbers for one": (lambda t: t.attrs.update(share=np.ones(2)), "expected a number"),
-    "a number for text": (lambda t: t.attrs.update(name=3), "name is 3, expected text"),
-    "not JSON": (lambda t: t.attrs.update(labels="{one"), "labels is '{one', expected JSON"),
-    "other JSON": (
-        lambda t: t.attrs.update(labels="[1, 2]"),
-        "labels is '[1, 2]': Input should be a valid string",
-    ),
-    "a list for an object": (
-        lambda t: t.attrs.update(told="[]"),
-        "told is '[]': Input should be a valid dict",
-    ),
-    "a number for JSON": (lambda t: t.attrs.update(told=5), "told is 5, expected text"),
-    "another shape": (
-        lambda t: put(t, "sky", np.ones((4, 4)), "mode", "mode_2"),
-        "sky has shape (4, 4), expected mode",
-    ),
-    "another size": (
-        lambda t: put(t, "draws", np.ones((3, 5)), "draw", "other"),
-        "draws has shape (3, 5), expected draw x 4 (mode)",
-    ),
-    "complex": (
-        lambda t: put(t, "sky", np.ones(4, dtype=complex), "mode"),
-        "sky holds values of type complex128, expected real numbers",
-    ),
-    "floats for bytes": (
-        lambda t: put(t, "steps", np.ones((4, 2)), "mode", "part"),
-        "steps holds values of type float64, expected whole numbers",
-    ),
-    "a column less": (lambda t: without(t["rows"], "n"), "a file: rows has no n (it has "),
-    "text in a column": (
-        lambda t: put(t["rows"], "n", np.array(["a", "b"]), "rows_row"),
-        "rows: n holds values of type <U1, expected whole numbers",
-    ),
-    "a column of a frame less": (
-        lambda t: without(t["table"], "value"),
-        "a file: table has no column value (it has ",
-    ),
-    "no columns": (lambda t: t["table"].attrs.update(columns="x"), "table is 'x', expected JSON"),
-}
+DAMAGED = [
+    (lambda t: without(t, "name"), "a file has no name (it has "),
+    (lambda t: without(t, "sky"), "a file has no sky (it has "),
+    (lambda t: without(t, "inner"), "a file has no inner (it has "),
+    (lambda t: without(t["inner"], "level"), "a file: inner has no level"),
+    (lambda t: t.attrs.update(count="many"), "count is 'many', expected"),
+    (lambda t: t.attrs.update(count=2.5), "count is 2.5, expected a whole number"),
+    (lambda t: t.attrs.update(count=np.nan), "count is nan, expected"),
+    (lambda t: t.attrs.update(share=np.ones(2)), "expected a number"),
+    (lambda t: t.attrs.update(name=3), "name is 3, expected text"),
+    (lambda t: t.attrs.update(labels="{one"), "labels is '{one', expected JSON"),
+    (lambda t: t.attrs.update(labels="[1, 2]"), "labels is '[1, 2]': Input should be a valid str"),
+    (lambda t: t.attrs.update(told="[]"), "told is '[]': Input should be a valid dict"),
+    (lambda t: t.attrs.update(told=5), "told is 5, expected text"),
+    (lambda t: put(t, "sky", np.ones((4, 4)), "mode", "mode_2"), "sky has shape (4, 4), expected"),
+    (lambda t: put(t, "draws", np.ones((3, 5)), "draw", "other"), "expected draw x 4 (mode)"),
+    (lambda t: put(t, "sky", np.ones(4, dtype=complex), "mode"), "sky holds .* complex128, expe"),
+    (lambda t: put(t, "steps", np.ones((4, 2)), "mode", "part"), "steps holds .* float64, expec"),
+    (lambda t: without(t["rows"], "n"), "a file: rows has no n (it has "),
+    (lambda t: put(t["rows"], "n", np.array(["a", "b"]), "rows_row"), "rows: n holds .* <U1, exp"),
+    (lambda t: without(t["table"], "value"), "a file: table has no column value (it has "),
+    (lambda t: t["table"].attrs.update(columns="x"), "table is 'x', expected JSON"),
+]
 
 
-@pytest.mark.parametrize("name", DAMAGED)
-def test_what_is_damaged_is_told_in_a_sentence(name):
-    damage, words = DAMAGED[name]
+@pytest.mark.parametrize(("damage", "words"), DAMAGED)
+def test_what_is_damaged_is_told_in_a_sentence(damage, words):
     tree = to_tree(example())
     damage(tree)
     refuse(words, from_tree, Everything, tree, "a file")

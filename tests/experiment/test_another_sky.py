@@ -11,23 +11,17 @@ import jax
 import numpy as np
 import pytest
 import wrong_data
+from experiments import flagged
 from scipy import linalg, stats
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import lmax_of, synthesis_matrix
-from lusee_bayes.experiment.diagnosis import (
-    MixedProducts,
-    UnderAnySky,
-    data_mistakes,
-    diagnose,
-    model_mistakes,
-    port_mixing,
-)
+from lusee_bayes.experiment import diagnosis
 from lusee_bayes.experiment.experiment import doubts
 from lusee_bayes.experiment.model import full_model, radiometer, set_up, simulate
 from lusee_bayes.experiment.rounds import learned_prior, settled
 from lusee_bayes.experiment.sky_sections import FileSkySection
-from lusee_bayes.instrument.products import DataLayout, to_matrix, to_real
+from lusee_bayes.instrument.products import to_matrix, to_real
 from lusee_bayes.judge.residuals import residuals
 from lusee_bayes.noise.instrument_errors import with_gains
 from lusee_bayes.systematics.context import Around
@@ -57,10 +51,8 @@ def measured(scenario, seed, scale=1e-3):
     z = np.random.default_rng(seed).standard_normal(prior.size)
     truth = prior.colour(z) + other
     with_noise = scenario.model_copy(update={"seed": seed})
-    there = replace(
-        known.under(lb.Sky(truth, scenario.frequency_mhz, "other")), scenario=with_noise
-    )
-    return simulate(there), prior, truth
+    sky = lb.Sky(truth, scenario.frequency_mhz, "other")
+    return simulate(replace(known.under(sky), scenario=with_noise)), prior, truth
 
 
 def distance(inference, truth):
@@ -105,15 +97,13 @@ def test_what_n_is_built_around_by_default():
     assert radiometer_about(set_up(noisy, data)) == "posterior"
     absent = np.zeros(grid.shape, dtype=bool)
     absent[7] = True
-    layout = DataLayout.from_flags(absent)
-    partly = replace(data, data=np.asarray(layout.gather(grid)), layout=layout)
+    partly = flagged(data, absent)
     setup = set_up(scenario, partly)
     assert radiometer_about(setup) == "posterior"
     # before there is a prediction, it is about the modelled sky
-    about_model = radiometer(replace(setup, measured=False))
-    np.testing.assert_array_equal(
-        radiometer(setup, Around(partly)).diagonal(), about_model.diagonal()
-    )
+    about_data = radiometer(setup, Around(partly)).diagonal()
+    about_model = radiometer(replace(setup, measured=False)).diagonal()
+    np.testing.assert_array_equal(about_data, about_model)
 
 
 @pytest.mark.long
@@ -145,14 +135,11 @@ def test_the_default_path_with_drifts(sigma, test_data):
         prior = learned_prior(setup, setup.family, information).prior
         model = full_model(replace(setup, prior=prior), around)
         ideal = replace(found, solution=model.condition(data.data))
-        n = len(sky.modes)
-        assert distance(found, sky.modes) / n == pytest.approx(
-            distance(ideal, sky.modes) / n, abs=0.1
-        )
+        here, there = (distance(one, sky.modes) / len(sky.modes) for one in (found, ideal))
+        assert here == pytest.approx(there, abs=0.1)
         posterior = found.posterior
-        share, directions = linalg.eigh(
-            np.asarray(posterior.covariance()), np.asarray(posterior.prior.covariance())
-        )
+        both = (np.asarray(one.covariance()) for one in (posterior, posterior.prior))
+        share, directions = linalg.eigh(*both)
         best = share < 1e-3
         off = directions.T @ (sky.modes - np.asarray(posterior.mean)) / np.sqrt(share)
         total, known = total + float((off[best] ** 2).sum()), known + int(best.sum())
@@ -184,7 +171,7 @@ def diagnosed(wrong, scenario=None):
     experiment = lb.build(scenario, data)
     found = lb.infer(experiment)
     left = residuals(found.solution, data)
-    return left, diagnose(experiment, found, left)
+    return left, diagnosis.diagnose(experiment, found, left)
 
 
 def is_named(wrong, found):
@@ -221,11 +208,7 @@ def test_all_wrong_data_make_a_map_and_most_causes_are_named():
 def test_absent_samples_do_not_matter():
     def make(scenario, sky, seed):
         data = wrong_data.WRONG[0].make(scenario, sky, seed)
-        grid = np.array(data.grid())
-        rng = np.random.default_rng(3)
-        grid[rng.uniform(size=grid.shape) < 0.1] = np.nan
-        layout = type(data.layout).from_flags(np.isnan(grid))
-        return replace(data, data=np.asarray(layout.gather(grid)), layout=layout)
+        return flagged(data, np.random.default_rng(3).uniform(size=data.grid().shape) < 0.1)
 
     _, found = diagnosed(replace(wrong_data.WRONG[0], make=make))
     assert is_named(wrong_data.WRONG[0], found) and found.proposals[0].fits
@@ -241,7 +224,7 @@ def test_chi2_of_mixed_data_is_that_of_matrices():
     experiment = lb.build(scenario, data)
     model = lb.infer(experiment).model
     spectrum = 1e2 * np.asarray(setup.sky.spectrum())
-    here = UnderAnySky(setup, data, model, spectrum)
+    here = diagnosis.UnderAnySky(setup, data, model, spectrum)
     base, posterior = here.wide(model.coupling)
     a, s = np.asarray(model.coupling.dense()), np.asarray(lb.HarmonicPrior(spectrum).variance())
     inverse = np.linalg.inv(a @ np.diag(s) @ a.T + np.asarray(model.noise.dense()))
@@ -252,7 +235,7 @@ def test_chi2_of_mixed_data_is_that_of_matrices():
 
     grid = np.asarray(data.grid())
     assert base.chi2 == pytest.approx(expected(grid), rel=1e-4)
-    mixed = MixedProducts.of(here, posterior)
+    mixed = diagnosis.MixedProducts.of(here, posterior)
     tried = list(mixed.tried())
     for chi2, mistake in tried[:40:5] + tried[-40::7]:
         right = expected(mistake.undone(grid))
@@ -267,15 +250,15 @@ def test_mixings_are_those_of_voltages():
     ports, signs = (2, 0, 3, 1), (1.0, -1.0, 1.0, 1.0)
     order, c = np.array(ports), np.array(signs)
     expected = to_real((c[:, None] * c[None])[..., None] * v[order][:, order])
-    np.testing.assert_allclose(port_mixing(ports, signs) @ real, np.asarray(expected))
-    *_, mixing = next(data_mistakes(4))
+    np.testing.assert_allclose(diagnosis.port_mixing(ports, signs) @ real, np.asarray(expected))
+    *_, mixing = next(diagnosis.data_mistakes(4))
     np.testing.assert_allclose(mixing @ real, np.asarray(to_real(v.conj())))
 
 
 def test_beams_of_other_azimuths():
     """B(theta, -phi), and B(theta, 90 degrees - phi), at some directions."""
     setup = set_up(wrong_data.scenario(6))
-    found = {m.words: m.beams for m in model_mistakes(setup) if "azimuth" in m.words}
+    found = {m.words: m.beams for m in diagnosis.model_mistakes(setup) if "azimuth" in m.words}
     theta, phi = np.array([0.3, 0.8, 1.2]), np.array([0.1, 2.0, 4.0])
 
     def at(beams, phi):

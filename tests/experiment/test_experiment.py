@@ -1,7 +1,5 @@
 """From a scenario to data, and from data to a map that recovers a sky."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import healpy
@@ -10,40 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from assertions import refuse
-from experiments import mapped
+from experiments import flagged, mapped
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import map_to_modes
 from lusee_bayes.experiment.model import full_model, simulate
-from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.sky.prior import read_spectrum
 from lusee_bayes.systematics.context import measured_visibilities
 from lusee_bayes.testing.scenarios import small_scenario
 
 
-def flagged(whole: lb.Visibilities, flags: np.ndarray) -> lb.Visibilities:
-    """The same data without the samples that are flagged."""
-    layout = DataLayout.from_flags(flags)
-    data = layout.gather(whole.layout.scatter(whole.data))
-    return lb.Visibilities(data, layout, whole.observation, whole.frequency_mhz)
-
-
 def variances(setup) -> np.ndarray:
     """Diagonal of N."""
     return np.asarray(full_model(setup).noise.diagonal())
-
-
-def test_an_experiment_holds_its_data(tiny_experiment):
-    """Simulated ones, unless measured ones are given, which it keeps as they are."""
-    simulated = tiny_experiment.data
-    assert simulated.layout is tiny_experiment.setup.layout
-    np.testing.assert_array_equal(simulated.truth, tiny_experiment.setup.sky.modes)
-    np.testing.assert_array_equal(simulated.data, simulate(tiny_experiment.setup).data)
-    assert tiny_experiment.scenario == small_scenario()
-    measured = replace(simulated, data=simulated.data + 1.0, truth=None)
-    experiment = lb.build(tiny_experiment.scenario, measured)
-    assert experiment.data is measured
-    assert experiment.setup.layout is measured.layout
 
 
 @pytest.mark.parametrize(
@@ -68,9 +45,8 @@ def test_flagged_data_are_left_out_of_a_and_n(small_experiment):
     flags[3, 5] = flags[:, 10] = True
     gapped = lb.build(small_experiment.scenario, flagged(whole, flags))
     keep = ~flags.ravel()
-    np.testing.assert_array_equal(
-        gapped.setup.coupling.dense(), np.asarray(setup.coupling.dense())[keep]
-    )
+    rows = np.asarray(setup.coupling.dense())[keep]
+    np.testing.assert_array_equal(gapped.setup.coupling.dense(), rows)
     np.testing.assert_array_equal(variances(gapped.setup), variances(setup)[keep])
     # leaving a sample out is the limit of giving it no weight
     heavy = np.where(keep, variances(setup), 1e30)
@@ -83,23 +59,16 @@ def test_flagged_data_are_left_out_of_a_and_n(small_experiment):
 
 def test_measured_temperatures(small_experiment):
     setup, data = small_experiment.setup, small_experiment.data
-    sigma = np.sqrt(variances(setup)).reshape(16, -1)
     measured = measured_visibilities(data, setup.signal)
     np.testing.assert_array_equal(measured, data.layout.scatter(data.data))
-    assert np.abs(measured - setup.signal).max() < 6 * sigma.max()
     flags = np.zeros(measured.shape, dtype=bool)
     flags[2, 4] = True
     gapped = measured_visibilities(flagged(data, flags), setup.signal)
     np.testing.assert_array_equal(gapped[~flags], measured[~flags])
     np.testing.assert_allclose(gapped[2, 4], (measured[2, 3] + measured[2, 5]) / 2, rtol=1e-14)
     flags[0] = True
-    with pytest.raises(lb.InputError, match="auto 00R is absent .* use noise.radiometer"):
-        measured_visibilities(flagged(data, flags), setup.signal)
-
-
-def test_data_of_another_frequency_are_refused(small_experiment):
-    other = small_scenario("frequency_mhz=10", cycles=0.2)
-    refuse("data are at 25.0 MHz, the scenario at 10.0", lb.build, other, small_experiment.data)
+    words = "auto 00R is absent .* use noise.radiometer"
+    refuse(words, measured_visibilities, flagged(data, flags), setup.signal)
 
 
 def test_the_map_recovers_the_sky(small_experiment):
@@ -109,9 +78,8 @@ def test_the_map_recovers_the_sky(small_experiment):
     # prior's spectrum stays well below twice its expectation
     z = (channel.mean - np.asarray(experiment.data.truth)) / channel.std
     assert np.mean(z**2) < 2.0
-    assert channel.chi2 == pytest.approx(
-        channel.chi2_expected, abs=5 * np.sqrt(2 * experiment.data.layout.size)
-    )
+    scatter = np.sqrt(2 * experiment.data.layout.size)
+    assert channel.chi2 == pytest.approx(channel.chi2_expected, abs=5 * scatter)
 
 
 @pytest.mark.long
@@ -150,9 +118,8 @@ def files(tmp_path, monkeypatch):
 
 def test_the_map_is_that_of_the_same_prior_in_python(files, tmp_path):
     spectrum, pixels = files
-    scenario = small_scenario(
-        "prior={spectrum_file: cl.txt, mean_file: mean.fits}", lmax=FILE_LMAX, cycles=0.1
-    )
+    own = "prior={spectrum_file: cl.txt, mean_file: mean.fits}"
+    scenario = small_scenario(own, lmax=FILE_LMAX, cycles=0.1)
     experiment = lb.build(scenario)
     found = lb.infer(experiment).posterior
     prior = lb.HarmonicPrior(spectrum[: FILE_LMAX + 1], mean=map_to_modes(pixels, FILE_LMAX))
@@ -169,12 +136,8 @@ def test_the_map_is_that_of_the_same_prior_in_python(files, tmp_path):
 
 def test_files_of_another_frequency_are_scaled(files):
     spectrum, pixels = files
-    scenario = small_scenario(
-        "prior={spectrum_file: cl.txt, mean_file: mean.fits, file_frequency_mhz: 50, scale: 2}",
-        lmax=FILE_LMAX,
-    )
-    sky = lb.galaxy_sky(25.0, FILE_LMAX)
-    prior = scenario.prior.prior(sky)
+    own = "prior={spectrum_file: cl.txt, mean_file: mean.fits, file_frequency_mhz: 50, scale: 2}"
+    prior = small_scenario(own, lmax=FILE_LMAX).prior.prior(lb.galaxy_sky(25.0, FILE_LMAX))
     # half the frequency: 2^2.5 times as bright
     np.testing.assert_allclose(prior.spectrum, 2 * 2**5 * spectrum[: FILE_LMAX + 1], rtol=1e-14)
     np.testing.assert_allclose(prior.mean, 2**2.5 * map_to_modes(pixels, FILE_LMAX), rtol=1e-14)
@@ -198,17 +161,15 @@ def test_files_of_another_frequency_are_scaled(files):
 def test_a_bad_spectrum_is_refused(tmp_path, text, words):
     path = tmp_path / "cl.txt"
     path.write_text(text)
-    with pytest.raises(lb.InputError) as caught:
-        read_spectrum(path, FILE_LMAX)
-    assert words in str(caught.value)
-    assert "\n" not in str(caught.value)
+    refuse(words, read_spectrum, path, FILE_LMAX)
 
 
 def test_missing_and_coarse_files_are_refused(files):
     sky = lb.galaxy_sky(25.0, FILE_LMAX)
-    with pytest.raises(lb.InputError, match="check prior.spectrum_file"):
-        small_scenario("prior.spectrum_file=no.txt").prior.prior(sky)
-    refuse("check prior.mean_file", small_scenario("prior.mean_file=no.fits").prior.prior, sky)
     healpy.write_map("coarse.fits", np.ones(12), coord="G", dtype=np.float64)
-    with pytest.raises(lb.InputError, match="too large for a map of NSIDE 1"):
-        small_scenario("prior.mean_file=coarse.fits").prior.prior(sky)
+    for override, words in (
+        ("prior.spectrum_file=no.txt", "check prior.spectrum_file"),
+        ("prior.mean_file=no.fits", "check prior.mean_file"),
+        ("prior.mean_file=coarse.fits", "too large for a map of NSIDE 1"),
+    ):
+        refuse(words, small_scenario(override).prior.prior, sky)

@@ -5,8 +5,6 @@ lunarsky's LunarTopo, a sum over the file's grid. That this is what luseepy does
 own waterfall first.
 """
 
-from __future__ import annotations
-
 import astropy.units as u
 import jax
 import jax.numpy as jnp

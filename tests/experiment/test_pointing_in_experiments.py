@@ -2,19 +2,16 @@
 
 from dataclasses import replace
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from assertions import refuse
-from experiments import offset_posterior
-from numpyro import handlers
+from assertions import close, refuse, within
+from experiments import offset_posterior, with_known_sky
 from scipy import stats
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.diagnosis import diagnose
 from lusee_bayes.experiment.experiment import Experiment, program_pieces
 from lusee_bayes.experiment.model import (
-    base_model,
     full_model,
     model_about,
     radiometer,
@@ -27,8 +24,8 @@ from lusee_bayes.instrument.beams.monopoles import source_response
 from lusee_bayes.judge.residuals import residuals
 from lusee_bayes.sky.galaxy import galactic_unit_vector
 from lusee_bayes.systematics.context import Around, Setup
-from lusee_bayes.systematics.pointing_offsets import PointingOffsets, shifted
 
+ANGLE = "turntable_0_deg"
 TWO_RUNS = "observation.runs=[{cycles: 1}, {cycles: 1, turntable_deg: 30}]"
 OFF = "clock_s: 60, turntable_0_deg: 0.3, turntable_1_deg: 0.0, clock_drift_s_per_day: 0.0"
 PRIORS = "clock_s: 60, turntable_deg: 0.3, clock_drift_s_per_day: 1"
@@ -41,10 +38,19 @@ def scenario_of(*overrides, lmax=10, step_s=21600.0):
 
 def about_a_mean(setup: Setup, scale: float, seed: int) -> Setup:
     """A sky that is known to a part of its C_ell: the truth is a draw of the prior."""
-    spectrum = scale * np.asarray(setup.prior.spectrum)
-    prior = lb.HarmonicPrior(spectrum)
+    prior = with_known_sky(setup, scale).prior
     z = np.random.default_rng(seed).standard_normal(prior.size)
-    return replace(setup, prior=lb.HarmonicPrior(spectrum, mean=setup.sky.modes - prior.colour(z)))
+    mean = setup.sky.modes - prior.colour(z)
+    return replace(setup, prior=lb.HarmonicPrior(prior.spectrum, mean=mean))
+
+
+def with_pointing(setup: Setup, section) -> Setup:
+    noise = setup.scenario.noise.model_copy(update={"pointing": section})
+    return replace(setup, scenario=setup.scenario.model_copy(update={"noise": noise}))
+
+
+def differences(mean, truth) -> np.ndarray:
+    return np.array([mean[name] - truth[name] for name in mean])
 
 
 @pytest.fixture(scope="module")
@@ -59,30 +65,17 @@ def test_a_clock_and_a_turntable_that_are_off_are_found(known_sky):
     found = lb.infer(known_sky)
     mean, covariance = offset_posterior(found)
     truth = true_values(known_sky.setup)
-    assert truth == pytest.approx(
-        {
-            "clock_s": 60.0,
-            "clock_drift_s_per_day": 0.0,
-            "turntable_0_deg": 0.3,
-            "turntable_1_deg": 0.0,
-        }
-    )
-    off = np.array([mean[name] - truth[name] for name in mean])
-    std = np.sqrt(np.diagonal(covariance))
+    assert truth == pytest.approx(dict.fromkeys(truth, 0.0) | {"clock_s": 60.0, ANGLE: 0.3})
+    off, std = differences(mean, truth), np.sqrt(np.diagonal(covariance))
     assert (np.abs(off) < 3.5 * std).all()
     # they are told apart from none
-    assert mean["clock_s"] > 4 * std[0]
-    assert mean["turntable_0_deg"] > 50 * std[2]
+    assert mean["clock_s"] > 4 * std[0] and mean[ANGLE] > 50 * std[2]
     # chi^2 of the data and the errors of the map are those of data that nothing is wrong with
     n = found.model.n_data
     assert abs(found.solution.chi2 - n) < 4 * np.sqrt(2 * n)
     pull = (found.posterior.mean - known_sky.setup.sky.modes) / found.posterior.std()
-    straight = known_sky.setup.scenario.model_copy(
-        update={"noise": known_sky.setup.scenario.noise.model_copy(update={"pointing": None})}
-    )
-    setup = replace(known_sky.setup, scenario=straight)
-    plain = Experiment(setup, simulate(setup))
-    known = lb.infer(plain)
+    setup = with_pointing(known_sky.setup, None)
+    known = lb.infer(Experiment(setup, simulate(setup)))
     expected = (known.posterior.mean - setup.sky.modes) / known.posterior.std()
     assert np.mean(pull**2) == pytest.approx(np.mean(expected**2), abs=0.2)
     assert np.median(found.posterior.std() / known.posterior.std()) < 1.2
@@ -95,20 +88,18 @@ def diagnosis(experiment, found):
 
 def test_ignored_the_report_points_at_it(known_sky):
     section = known_sky.setup.scenario.noise.pointing.model_copy(update={"treatment": "ignored"})
-    noise = known_sky.setup.scenario.noise.model_copy(update={"pointing": section})
-    scenario = known_sky.setup.scenario.model_copy(update={"noise": noise})
-    experiment = Experiment(replace(known_sky.setup, scenario=scenario), known_sky.data)
+    experiment = Experiment(with_pointing(known_sky.setup, section), known_sky.data)
     found = lb.infer(experiment)
     assert found.solution.chi2 > 2 * found.model.n_data
     report = pointing_report(experiment, found)
     assert report.offsets is None
     best = diagnosis(experiment, found).proposals[0]
     name, value = best.words.split(" is off by ")
-    assert name == "turntable_0_deg" and float(value) == pytest.approx(0.3, rel=0.03) and best.fits
+    assert name == ANGLE and float(value) == pytest.approx(0.3, rel=0.03) and best.fits
     assert "noise.pointing" in best.remedy
     whole = report.preferred[report.preferred["first_day"] < 0].set_index("offset")
-    assert whole["value"]["turntable_0_deg"] == pytest.approx(0.3, rel=0.03)
-    days = report.preferred[report.preferred["offset"] == "turntable_0_deg"]
+    assert whole["value"][ANGLE] == pytest.approx(0.3, rel=0.03)
+    days = report.preferred[report.preferred["offset"] == ANGLE]
     # no more than MOST_STRETCHES groups of days, and those of the other run say nothing of it
     assert 10 < len(days) < 32
     assert days["last_day"].max() <= 28
@@ -125,36 +116,6 @@ def test_where_nothing_is_off_the_report_is_silent():
     assert told.fits and "fit as they are" in " ".join(told.sentences())
 
 
-def test_preferences_are_those_of_matrices(known_sky):
-    """a = t^T K^-1 r / t^T K^-1 t with K = A S A^T + N as a matrix."""
-    experiment = known_sky
-    found = lb.infer(experiment)
-    report = pointing_report(experiment, found)
-    model = found.model
-    a = np.asarray(model.coupling.dense())
-    k = a @ np.diag(np.asarray(model.prior.variance())) @ a.T + np.asarray(model.noise.dense())
-    mean = np.asarray(model.predict(model.prior.colour(model.prior.white_mean)))
-    u = np.linalg.solve(k, experiment.data.data - mean)
-    names = {"clock_s": 60.0, "turntable_1_deg": 0.3}
-    setup = shifted(experiment.setup, {})
-    for name, step in names.items():
-        centre = dict(offset_posterior(found)[0])
-        up, down = (
-            np.asarray(
-                shifted(setup, {**centre, name: centre[name] + sign * 1e-2 * step}).coupling
-                @ np.asarray(found.posterior.mean)
-            )
-            for sign in (1.0, -1.0)
-        )
-        t = (up - down) / (2e-2 * step)
-        row = report.preferred[
-            (report.preferred["offset"] == name) & (report.preferred["first_day"] < 0)
-        ].iloc[0]
-        information = t @ np.linalg.solve(k, t)
-        assert row["std"] == pytest.approx(information**-0.5, rel=1e-3)
-        assert row["value"] == pytest.approx(t @ u / information, abs=3e-3 * row["std"])
-
-
 def test_about_no_offsets_large_ones_are_not_described():
     """The report does not ask for what the scenario has."""
     far = "true_values: {turntable_deg: 2.0}"
@@ -164,48 +125,13 @@ def test_about_no_offsets_large_ones_are_not_described():
     assert "too much: set noise.pointing.treatment=sampled" in report.lines()[0]
 
 
-@pytest.mark.parametrize("name", ["clock_s", "turntable_1_deg", "lat_deg", "tilt_east_deg"])
-def test_sampled_sites_move_a_as_the_exact_shift_does(name):
-    pointing = (
-        "noise.pointing={clock_s: 60, turntable_deg: 0.3, lat_deg: 0.1, tilt_east_deg: 0.2, "
-        "treatment: sampled}"
-    )
-    runs = "observation.runs=[{cycles: 0.1}, {cycles: 0.1, turntable_deg: 30}]"
-    # about a mean: a sky of which nothing is known may as well have turned
-    setup = about_a_mean(set_up(scenario_of(runs, pointing, lmax=5)), 1e-4, 1)
-    data = simulate(setup)
-    offsets = PointingOffsets.build(setup.scenario.noise.pointing, setup, Around(data))
-    values = dict.fromkeys(offsets.names, 0.0) | {
-        name: 1.5 * dict(zip(offsets.names, offsets.stds.tolist(), strict=True))[name]
-    }
-    with (
-        handlers.seed(rng_seed=0),
-        handlers.substitute(data={site: jnp.asarray(value) for site, value in values.items()}),
-    ):
-        moved = offsets.sampled(base_model(setup))
-    expected = replace(base_model(setup), coupling=shifted(setup, values).coupling)
-    got, wanted, unmoved = (
-        float(m.condition(data.data).posterior.log_evidence)
-        for m in (moved, expected, base_model(setup))
-    )
-    assert abs(wanted - unmoved) > 1.0
-    # what the offset does to the data, in radiometer noise; of a clock's, 1e-3 are left out, and
-    # the evidence tells them by their product with unit normals
-    std = np.sqrt(np.asarray(expected.noise.diagonal()))
-    done = np.linalg.norm(
-        (expected.coupling @ setup.sky.modes - setup.coupling @ setup.sky.modes) / std
-    )
-    left = 4 * 1e-3 * done if name == "clock_s" else 1e-6 * done
-    assert got == pytest.approx(wanted, abs=left + 1e-4)
-
-
 @pytest.mark.long
 def test_simulation_based_calibration():
     """100 data sets with clock, turntable, lean and sky drawn from their priors."""
     pointing = "noise.pointing={clock_s: 60, turntable_deg: 0.1, tilt_east_deg: 0.1, %s}"
     first = set_up(scenario_of(pointing % "tilt_north_deg: 0.1", lmax=6, step_s=43200.0))
     # known to 1 %, where the clock is told to some 40 s
-    prior = lb.HarmonicPrior(1e-4 * np.asarray(first.prior.spectrum), mean=first.sky.modes)
+    prior = with_known_sky(first, 1e-4).prior
     z, ranks = [], []
     for seed in range(100):
         draw = np.asarray(prior.colour(np.random.default_rng(seed).standard_normal(prior.size)))
@@ -216,8 +142,7 @@ def test_simulation_based_calibration():
         found = lb.infer(experiment)
         mean, covariance = offset_posterior(found)
         truth = true_values(setup)
-        std = np.sqrt(np.diagonal(covariance))
-        z.append([(mean[name] - truth[name]) / s for name, s in zip(mean, std, strict=True)])
+        z.append(differences(mean, truth) / np.sqrt(np.diagonal(covariance)))
         pull = (found.posterior.mean - sky.modes) / found.posterior.std()
         ranks.append(np.asarray(pull)[[0, 2, 6, 20]])
     pulls = np.concatenate([z, ranks], axis=1)
@@ -244,48 +169,38 @@ def test_offsets_that_can_stand_for_one_another_settle(size):
     n = found.model.n_data
     assert abs(found.solution.chi2 - n) < 4 * np.sqrt(2 * n)
     mean, covariance = offset_posterior(found)
-    truth = true_values(experiment.setup)
-    off = np.array([mean[name] - truth[name] for name in mean])
+    off = differences(mean, true_values(experiment.setup))
     assert (np.abs(off) < 4 * np.sqrt(np.diagonal(covariance))).all()
 
 
 @pytest.mark.long
 def test_sources_and_gains_are_those_of_the_offsets():
     """Where offsets are known, the model is that of data without any, taken as the offsets say."""
-    extra = [
-        "sources.list=[{name: Cas A}, {name: Cyg A}]",
-        "noise.gain={sigma: 0.01}",
-        "noise.beam={shift_mhz: 1}",
-    ]
-    values = {"turntable_deg": 3.0}
+    extra = ["sources.list=[{name: Cas A}, {name: Cyg A}]", "noise.gain={sigma: 0.01}"]
+    extra += ["noise.beam={shift_mhz: 1}"]
     setup = set_up(scenario_of("noise.pointing={turntable_deg: 1}", *extra, lmax=5, step_s=43200.0))
     turned = "observation.runs=[{cycles: 1, turntable_deg: 3}]"
     there = set_up(scenario_of(turned, *extra, lmax=5, step_s=43200.0))
     expected = full_model(there)
-    around = Around(None, None, setup.sky.modes, values)
+    around = Around(None, None, setup.sky.modes, {"turntable_deg": 3.0})
     found, (offsets, *_) = model_about(setup, around)
     # the columns' own part left out; gains make 1 + sigma^2 of every auto, that part too
     own = offsets.columns @ offsets.centre
-    np.testing.assert_allclose(
-        found.predict(setup.sky.modes) + own,
-        expected.predict(setup.sky.modes),
-        rtol=0,
-        atol=2e-4 * np.abs(own).max(),
-    )
+    got, wanted = (model.predict(setup.sky.modes) for model in (found, expected))
+    within(got + own, wanted, 2e-4 * np.abs(own).max())
     systematic = np.asarray(found.noise.dense()) - offsets.columns @ offsets.columns.T
     systematic -= np.diag(np.asarray(radiometer(setup).diagonal()))
     wanted = np.asarray(expected.noise.dense())
     wanted = wanted - np.diag(np.asarray(radiometer(there).diagonal()))
-    np.testing.assert_allclose(systematic, wanted, rtol=0, atol=1e-9 * np.abs(wanted).max())
+    close(systematic, wanted, 1e-9)
 
 
 @pytest.mark.long
 def test_what_is_left_to_sample_is_about_the_offsets():
     """Gains are sampled, a turntable is marginalised: what is left of the model fits."""
     far = "noise.pointing={turntable_deg: 1, true_values: {turntable_deg: 2.0}}"
-    experiment = lb.build(
-        scenario_of(far, "noise.gain={sigma: 1e-9, treatment: sampled}", lmax=6, step_s=86400.0)
-    )
+    gain = "noise.gain={sigma: 1e-9, treatment: sampled}"
+    experiment = lb.build(scenario_of(far, gain, lmax=6, step_s=86400.0))
     model = program_pieces(experiment)["gaussian"]()
     n = model.n_data
     mean = model.condition(experiment.data.data).posterior.mean
@@ -299,24 +214,19 @@ def test_a_prior_is_learned_about_the_offsets():
     with_it, without = (
         lb.build(scenario_of(learned, *more, lmax=6, step_s=43200.0)) for more in ((off,), ())
     )
-    np.testing.assert_allclose(
-        with_it.learned.parameters, without.learned.parameters, rtol=0, atol=0.1
-    )
+    within(with_it.learned.parameters, without.learned.parameters, 0.1)
 
 
 def test_what_cannot_be():
-    far = "noise.pointing={lat_deg: 1, true_values: {lat_deg: 200}}"
-    with pytest.raises(
-        lb.InputError, match=r"noise.pointing, with lat_deg = 200: lat_deg must lie"
+    for section, words in (
+        ("lat_deg: 1, true_values: {lat_deg: 200}", "with lat_deg = 200: lat_deg must lie"),
+        ("clock_s: 1, true_values: {lat_deg: 1}", "true_values has 'lat_deg', which is not among"),
     ):
-        simulate(set_up(scenario_of(far, lmax=4)))
-    setup = set_up(scenario_of("noise.pointing={clock_s: 1, true_values: {lat_deg: 1}}", lmax=4))
-    refuse("true_values has 'lat_deg', which is not among the off", simulate, setup)
-    both = [
-        "noise.pointing={clock_s: 60, treatment: sampled}",
-        "noise.beam={parameters: {height_m: 0.1}, treatment: sampled}",
-    ]
-    refuse("cannot both be sampled", scenario_of, *both, lmax=4)
+        setup = set_up(scenario_of(f"noise.pointing={{{section}}}", lmax=4))
+        refuse(words, simulate, setup)
+    clock = "noise.pointing={clock_s: 60, treatment: sampled}"
+    beam = "noise.beam={parameters: {height_m: 0.1}, treatment: sampled}"
+    refuse("cannot both be sampled", scenario_of, clock, beam, lmax=4)
 
 
 def test_sources_are_seen_as_means_over_windows():
@@ -332,8 +242,8 @@ def test_sources_are_seen_as_means_over_windows():
     got = np.asarray(setup.responses[0])
     # a window of a day is 13 degrees of the sky; where Cas A sets within one, 8 instants tell its
     # mean to some percent of what it is when high
-    np.testing.assert_allclose(got, expected, rtol=0, atol=0.02 * np.abs(expected).max())
+    peak = np.abs(expected).max()
+    within(got, expected, 0.02 * peak)
     whole = np.abs(fine.reshape(16, -1, 400)).min(2).max(0) > 0
     assert 5 < whole.sum() < whole.size - 2
-    peak = np.abs(expected).max()
-    np.testing.assert_allclose(got[:, whole], expected[:, whole], rtol=0, atol=1e-9 * peak)
+    within(got[:, whole], expected[:, whole], 1e-9 * peak)

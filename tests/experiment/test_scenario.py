@@ -1,7 +1,5 @@
 """Scenarios: keys, defaults, overrides, round trip, sections in kinds, and errors that help."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -49,23 +47,32 @@ def assert_kept(scenario, folder):
 def test_a_resolved_scenario_is_the_same_scenario(name, tmp_path):
     scenario = load_scenario(name, ["seed=7", "observation.runs.0.turntable_deg=12.5"])
     assert_kept(scenario, tmp_path)
-    assert scenario.seed == 7
-    assert scenario.observation.runs[0].turntable_deg == 12.5
+    assert (scenario.seed, scenario.observation.runs[0].turntable_deg) == (7, 12.5)
 
 
-def test_overrides_reach_into_sections_that_the_file_leaves_out(tmp_path):
-    path = tmp_path / "short.yaml"
-    path.write_text("frequency_mhz: 10\n")
-    scenario = load_scenario(path, ["noise.radiometer.factor=10", "sky.file=a.hdf5", "nside=null"])
+@pytest.fixture
+def short(tmp_path):
+    """A scenario of a file with this text alone."""
+
+    def loaded(text, *overrides):
+        (tmp_path / "short.yaml").write_text(text)
+        return load_scenario(tmp_path / "short.yaml", overrides)
+
+    return loaded
+
+
+def test_overrides_reach_into_sections_that_the_file_leaves_out(short):
+    given = ["noise.radiometer.factor=10", "sky.file=a.hdf5", "nside=null"]
+    scenario = short("frequency_mhz: 10\n", *given)
     assert scenario.noise.radiometer.factor == 10.0
-    assert scenario.sky.file == "a.hdf5"
-    assert scenario.nside is None
+    assert (scenario.sky.file, scenario.nside) == ("a.hdf5", None)
 
 
 # a line for each rule and kind of mistake; what single numbers and words may be is below
 SHIFT, PARAMETERS = "noise.beam.shift_mhz=4", "noise.beam.parameters={length_m: 0.1}"
 SCHEDULE = "observation={schedule: nights.csv, window: mean, step_s: 20000, %s}"
 FOUR = "frequencies_mhz=[10, 15, 20, 30]"
+POSITIVE = "{model: positive, fields: [level, index]}"
 REFUSED = [
     # names
     ("frequncy_mhz=3", "unknown key 'frequncy_mhz'; did you mean 'frequency_mhz'"),
@@ -117,10 +124,7 @@ REFUSED = [
     ("sources.list=[{name: X, ra_deg: 10}]", "give both ra_deg and dec_deg, or none"),
     (f"prior.spectrum_file=a.txt {FOUR}", "say which in prior.file_frequency_mhz"),
     (f"prior.spectrum_file=a.txt {FOUR} joint=true", "joint takes the spectral prior"),
-    (
-        "frequencies_mhz=[10] joint=true spectral={model: positive, fields: [level, index]}",
-        "2 fields of the logarithm need at least as many chan",
-    ),
+    (f"frequencies_mhz=[10] joint=true spectral={POSITIVE}", "2 fields .* need at least as many"),
     (SCHEDULE % "start: 2027-01-16", "says when data are taken, and so does start"),
     (SCHEDULE % "runs: [{cycles: 2}]", "and so does runs; leave out one of them"),
     (SCHEDULE % "fixed_axis: true", "add window: instant"),
@@ -136,29 +140,21 @@ def test_errors_name_what_is_wrong(overrides, message):
     assert len(str(caught.value)) < 250
 
 
-def test_errors_of_the_file_itself(tmp_path):
+def test_errors_of_the_file_itself(short):
     refuse("no scenario 'fiducail'.*did you mean 'fiducial'", load_scenario, "fiducail")
-    (tmp_path / "list.yaml").write_text("- 1\n")
-    refuse("must hold keys and values, got a list", load_scenario, tmp_path / "list.yaml")
-    (tmp_path / "bad.yaml").write_text("a: [1\n")
-    refuse("not valid YAML", load_scenario, tmp_path / "bad.yaml")
+    refuse("must hold keys and values, got a list", short, "- 1\n")
+    refuse("not valid YAML", short, "a: [1\n")
 
 
 def test_default_maps_have_two_pixels_for_each_ell():
     for lmax, nside in [(8, 8), (47, 32), (64, 64), (95, 64)]:
-        scenario = Scenario(lmax=lmax)
-        assert scenario.map_nside == nside
-        assert 2 * scenario.map_nside >= lmax
+        assert Scenario(lmax=lmax).map_nside == nside >= lmax / 2
 
 
 def test_anchored_scenarios_name_the_same_files_in_any_folder(tmp_path, monkeypatch):
-    settings = (
-        "sky={model: file, file: a.fits}",
-        "prior={model: isotropic, mean_file: b.fits}",
-        "observation.schedule=c.csv",
-        "beam.file=d.nc",
-    )
-    scenario = load_scenario("fiducial", list(settings))
+    settings = ["sky={model: file, file: a.fits}", "prior={model: isotropic, mean_file: b.fits}"]
+    settings += ["observation.schedule=c.csv", "beam.file=d.nc"]
+    scenario = load_scenario("fiducial", settings)
     monkeypatch.chdir(tmp_path)
     found = scenario.anchored()
     names = found.sky.file, found.prior.mean_file, found.observation.schedule, found.beam.file
@@ -172,9 +168,8 @@ def test_anchored_scenarios_name_the_same_files_in_any_folder(tmp_path, monkeypa
 def test_every_entry_that_names_a_file_is_known():
     keys = {entry.path.split(".")[-1] for entry in scenario_keys()}
     files = {key for key in keys if key == "file" or key.endswith("_file")}
-    assert files <= set(FILES) and set(FILES) - files == {
-        *("schedule", "clock", "gain_table", "lines")
-    }
+    others = {"schedule", "clock", "gain_table", "lines"}
+    assert files <= set(FILES) and set(FILES) - files == others
 
 
 SHIPPED = {
@@ -281,61 +276,45 @@ def test_what_an_old_scenario_says_of_beams_is_kept(tmp_path, scalar, response):
 
 def test_an_old_scenario_with_a_sky_from_a_file(tmp_path):
     """``sources`` were said there, too, without effect; sources beside the map may be."""
-    sky = {"file": "x.hdf5", "dataset": "map", "file_frequency_mhz": 10.0, "sources": True}
+    sky = {"file": "x.hdf5", "dataset": "map", "file_frequency_mhz": 10.0}
     beside = {"list": [{"name": "Cas A"}]}
-    found = old_scenario(tmp_path / "old.yaml", sky=sky, sources=beside)
-    assert found.sky == FileSkySection(file="x.hdf5", dataset="map", file_frequency_mhz=10.0)
-    assert not found.sky.sources
+    found = old_scenario(tmp_path / "old.yaml", sky=sky | {"sources": True}, sources=beside)
+    assert found.sky == FileSkySection(**sky) and not found.sky.sources
     assert [source.name for source in found.sources.list] == ["Cas A"]
 
 
-def test_the_sky_of_a_short_file(tmp_path):
-    path = tmp_path / "short.yaml"
+def test_a_file_tells_which_sky_or_beams_they_are(short, response, scalar):
     for text, kind in (
-        ("{file: x.fits}", FileSkySection),
-        ("{model: galaxy, file: x.fits}", FileSkySection),
-        ("{model: galaxy, file: null}", GalaxySection),
-        ("{seed: 3}", GalaxySection),
+        ("sky: {file: x.fits}", FileSkySection),
+        ("sky: {model: galaxy, file: x.fits}", FileSkySection),
+        ("sky: {model: galaxy, file: null}", GalaxySection),
+        ("sky: {seed: 3}", GalaxySection),
     ):
-        path.write_text(f"sky: {text}")
-        assert type(load_scenario(path).sky) is kind, text
+        assert type(short(text).sky) is kind, text
+    for file, kind in [(response, ResponseSection), (scalar, ScalarBeamSection)]:
+        for found in (short(f"beam: {{file: {file}}}"), short("", f"beam.file={file}")):
+            assert found.beam == kind(file=file)
 
 
-def test_a_prior_takes_the_place_of_another(tmp_path):
+def test_a_prior_takes_the_place_of_another(tmp_path, short):
     """``--set`` leaves the keys of the kind that was there, which the other kind drops."""
     found = load_scenario("fiducial", ["prior.model=local_scales", "prior.sources=false"])
     assert found.prior == LocalScalesPriorSection(sources=False)
     assert_kept(found, tmp_path)
     plain = load_scenario("fiducial", ["prior.model=local_scales"])
-    (tmp_path / "plain.yaml").write_text(plain.to_yaml())
-    back = load_scenario(tmp_path / "plain.yaml", ["prior.model=isotropic"])
+    back = short(plain.to_yaml(), "prior.model=isotropic")
     assert back == load_scenario("fiducial", ["prior.spectrum=learned"])
-    (tmp_path / "short.yaml").write_text("prior: {tilt_std: 0.5}")
-    assert load_scenario(tmp_path / "short.yaml").prior == IsotropicPriorSection(tilt_std=0.5)
-
-
-def test_the_file_tells_which_beams_they_are(tmp_path, response, scalar):
-    path = tmp_path / "short.yaml"
-    for file, kind in [(response, ResponseSection), (scalar, ScalarBeamSection)]:
-        path.write_text(f"beam: {{file: {file}}}\n")
-        assert load_scenario(path).beam == kind(file=file)
-        assert load_scenario("fiducial", [f"beam.file={file}"]).beam == kind(file=file)
+    assert short("prior: {tilt_std: 0.5}").prior == IsotropicPriorSection(tilt_std=0.5)
 
 
 # --- the section of another file ------------------------------------------------------------------
 
 
 def test_the_section_of_another_file_is_put_up_alike(response, scalar):
-    arm = ScalarBeamSection(
-        file="own.fits",
-        taper=False,
-        rotations_deg=(0.0, 120.0),
-        turntable_offset_deg=7.0,
-        quadrature="luseepy",
-        moon_temperature_k=250.0,
-    )
-    assert arm.of_file(scalar) == arm.model_copy(update={"file": scalar})
     shared = {"turntable_offset_deg": 7.0, "quadrature": "luseepy", "moon_temperature_k": 250.0}
+    own = {"taper": False, "rotations_deg": (0.0, 120.0)}
+    arm = ScalarBeamSection(file="own.fits", **own, **shared)
+    assert arm.of_file(scalar) == arm.model_copy(update={"file": scalar})
     assert arm.of_file(response) == ResponseSection(file=response, **shared)
     ports = ResponseSection(file="own.fits", receiver="open", **shared)
     assert ports.of_file(scalar) == ScalarBeamSection(file=scalar, **shared)

@@ -1,19 +1,17 @@
 """The table of receivers, ground and gain table, and the direction that data cannot tell."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
-from experiments import four_ports, unknowns_report
+from experiments import drawn, four_ports, unknowns_report, with_known_sky
 from reference_linear import white_posterior
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.model import radiometer, set_up, simulate, true_values
+from lusee_bayes.experiment.model import radiometer, set_up, true_values
 from lusee_bayes.experiment.unknowns import NullDirection
 from lusee_bayes.instrument.products import auto_indices
 from lusee_bayes.report.map_page import map_page
@@ -52,10 +50,8 @@ def test_table_and_null_direction_are_those_of_the_joint_posterior(experiment):
     names = [*(f"receiver_{p}_k" for p in range(4)), "regolith_k", *(f"gain_{p}" for p in range(4))]
     assert list(table["unknown"]) == names
     assert list(table["unit"]) == ["K"] * 5 + [""] * 4
-    mean, scale = (
-        np.array([2000.0] * 4 + [250.0] + [0.0] * 4),
-        np.array([200.0] * 4 + [30.0] + [0.01] * 4),
-    )
+    mean = np.array([2000.0] * 4 + [250.0] + [0.0] * 4)
+    scale = np.array([200.0] * 4 + [30.0] + [0.01] * 4)
     shift = np.append(np.zeros(5), found.systematics[-1].expected)
     np.testing.assert_allclose(table["prior"], mean, rtol=1e-12)
     np.testing.assert_allclose(table["prior_std"], scale, rtol=1e-12)
@@ -74,13 +70,10 @@ def test_table_and_null_direction_are_those_of_the_joint_posterior(experiment):
     variances, directions = np.linalg.eigh(pick @ expected.covariance @ pick.T)
     assert report.null.share == pytest.approx(variances[-1], rel=1e-5)
     assert abs(report.null.weights @ directions[:, -1]) == pytest.approx(1.0, abs=1e-5)
-    assert report.common == pytest.approx(
-        np.sqrt(pick[6] @ expected.covariance @ pick[6]), rel=1e-5
-    )
-    assert report.null.names == (
-        "uniform sky", "receiver 0", "receiver 1", "receiver 2", "receiver 3", "regolith",
-        "common gain",
-    )  # fmt: skip
+    common = np.sqrt(pick[6] @ expected.covariance @ pick[6])
+    assert report.common == pytest.approx(common, rel=1e-5)
+    receivers = (f"receiver {port}" for port in range(4))
+    assert report.null.names == ("uniform sky", *receivers, "regolith", "common gain")
 
 
 def test_only_what_the_model_has_is_listed(response_file):
@@ -98,14 +91,12 @@ def test_only_what_the_model_has_is_listed(response_file):
 def test_the_null_direction_in_words():
     """Two unknowns of which the data tell the sum only, and one that they tell."""
     ridge = np.array([[0.5, -0.5, 0.0], [-0.5, 0.5, 0.0], [0.0, 0.0, 0.01]])
-    null = NullDirection.of(
-        ["uniform sky", "regolith", "receiver 0"], 0.8 * ridge + 1e-6 * np.eye(3)
-    )
+    names, covariance = ["uniform sky", "regolith", "receiver 0"], 0.8 * ridge + 1e-6 * np.eye(3)
+    null = NullDirection.of(names, covariance)
     assert null.share == pytest.approx(0.8, abs=1e-5)
-    assert sorted(null.words().split(", ")) in (
-        ["regolith +0.71", "uniform sky -0.71"],
-        ["regolith -0.71", "uniform sky +0.71"],
-    )
+    regolith, sky = sorted(null.words().split(", "))
+    assert (regolith[:-6], sky[:-6]) == ("regolith", "uniform sky")
+    assert {regolith[-5:], sky[-5:]} == {"+0.71", "-0.71"}
     assert null.sentence().endswith("it keeps 80% of its prior variance.")
     # nothing to say where the data tell most of it
     assert NullDirection.of(["uniform sky", "regolith"], 0.4 * np.eye(2)).sentence() == ""
@@ -114,9 +105,8 @@ def test_the_null_direction_in_words():
 @pytest.mark.parametrize(("common", "told"), [(None, False), (0.5, False), (0.95, True)])
 def test_the_common_gain_is_told_where_it_keeps_its_prior(experiment, common, told):
     report = replace(unknowns_report(experiment, lb.infer(experiment)), common=common)
-    assert (
-        any("common gain of all ports keeps its prior" in line for line in report.lines()) == told
-    )
+    words = "common gain of all ports keeps its prior"
+    assert any(words in line for line in report.lines()) == told
 
 
 @pytest.mark.long
@@ -156,20 +146,16 @@ def test_a_run_writes_them(experiment, tmp_path):
 
 def test_runs_without_them_are_as_before(small_map):
     assert not (small_map.folder / "unknowns.csv").exists()
-    assert (
-        json.loads((small_map.folder / "summary.json").read_text())["channels"][0]["unknowns"]
-        is None
-    )
+    summary = json.loads((small_map.folder / "summary.json").read_text())
+    assert summary["channels"][0]["unknowns"] is None
     assert "gain table" not in map_page(small_map.folder, "a run")
 
 
 def known(setup: Setup) -> Setup:
     """The same with receivers and ground that are known to be the truth."""
     noise, truth = setup.scenario.noise, true_values(setup)
-    fixed = {
-        name: getattr(noise, name).model_copy(update={"treatment": "ignored"})
-        for name in ("receiver", "regolith")
-    }
+    ignored = {"treatment": "ignored"}
+    fixed = {k: getattr(noise, k).model_copy(update=ignored) for k in ("receiver", "regolith")}
     scenario = setup.scenario.model_copy(update={"noise": noise.model_copy(update=fixed)})
     background = np.array(setup.beam_source.background(20.0))
     background += (truth["regolith_k"] - 250.0) * ground_per_kelvin(setup.beam_source, 20.0)
@@ -180,17 +166,12 @@ def known(setup: Setup) -> Setup:
 @pytest.mark.long
 def test_receivers_and_ground_that_are_not_known_cost_the_monopole_alone(response_file):
     """Of 20 data sets no mode with ell >= 1 moves by 0.1 standard deviations."""
-    first = set_up(four_ports(response_file, RECEIVER, GROUND))
     # known to a fifth, as one who maps a sky with structure knows it
-    spectrum = 0.04 * np.asarray(first.prior.spectrum)
-    first = replace(first, prior=lb.HarmonicPrior(spectrum, mean=first.sky.modes))
+    first = with_known_sky(set_up(four_ports(response_file, RECEIVER, GROUND)), 0.04)
     moved = []
     for seed in range(20):
-        z = np.random.default_rng(seed).standard_normal(first.prior.size)
-        modes = first.sky.modes + np.asarray(first.prior.colour(z))
-        scenario = first.scenario.model_copy(update={"seed": seed})
-        setup = replace(first, sky=replace(first.sky, modes=modes), scenario=scenario)
-        data = simulate(setup)
+        experiment = drawn(first, seed)
+        setup, data = experiment.setup, experiment.data
         unknown, told = (lb.infer(Experiment(s, data)).posterior for s in (setup, known(setup)))
         off = np.asarray(unknown.mean) - np.asarray(told.mean)
         moved.append(off / np.asarray(unknown.std()))

@@ -4,10 +4,9 @@ Each is made with what was really so (another turntable angle, other antennas, a
 by changing good data, and then says of itself what a scenario without the mistake expects.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import jax
 import numpy as np
@@ -67,13 +66,8 @@ def measured(
     signal = np.asarray(distort(setup, signal))
     noise = radiometer(replace(setup, signal=signal)).sample(jax.random.key(seed))
     nominal = setup if seen_by is None else set_up(seen_by)
-    return lb.Visibilities(
-        np.asarray(setup.layout.gather(signal) + noise),
-        setup.layout,
-        nominal.observation,
-        nominal.scenario.frequency_mhz,
-        sky.modes,
-    )
+    data, f = np.asarray(setup.layout.gather(signal) + noise), nominal.scenario.frequency_mhz
+    return lb.Visibilities(data, setup.layout, nominal.observation, f, sky.modes)
 
 
 def port_matrix(ports: list[int]) -> np.ndarray:
@@ -150,9 +144,7 @@ def _beams(beams: Callable[[Setup], ProductBeams]) -> Make:
 
 def shifted_by(mhz: float) -> Callable[[Setup], ProductBeams]:
     """Beams of a neighbouring channel."""
-    return lambda setup: setup.beam_source.beams(
-        setup.scenario.frequency_mhz + mhz, setup.scenario.lmax
-    )
+    return lambda s: s.beam_source.beams(s.scenario.frequency_mhz + mhz, s.scenario.lmax)
 
 
 def _finer(scenario: Scenario, sky: lb.Sky, seed: int) -> lb.Visibilities:
@@ -165,9 +157,8 @@ def _finer(scenario: Scenario, sky: lb.Sky, seed: int) -> lb.Visibilities:
 
 def _opposite(scenario: Scenario, sky: lb.Sky, seed: int) -> lb.Visibilities:
     """Taken at -20 degrees, dated as at 20."""
-    here, there = (
-        changed(scenario, f"observation.runs.0.turntable_deg={angle}") for angle in (-20, 20)
-    )
+    angle = "observation.runs.0.turntable_deg"
+    here, there = (changed(scenario, f"{angle}={value}") for value in (-20, 20))
     return measured(here, sky, seed, seen_by=there)
 
 
@@ -182,6 +173,21 @@ def _constant(kelvin: float) -> Make:
     )
 
 
+def _exchanged_ports(i: int, j: int) -> Wrong:
+    ports = port_matrix([{i: j, j: i}.get(k, k) for k in range(4)])
+    return Wrong(f"ports {i} and {j} exchanged", f"ports {i} and {j}", _mix(ports))
+
+
+def _turned_ports(n: int) -> Wrong:
+    ports = port_matrix([(k + n) % 4 for k in range(4)])
+    return Wrong(f"ports turned by {n}", f"ports are turned by {4 - n}", _mix(ports))
+
+
+def _turned_table(angle: int) -> Wrong:
+    there = _other(f"observation.runs.0.turntable_deg={angle}")
+    return Wrong(f"turntable at {angle}", f"turned by {angle}", there)
+
+
 AUTOS = {f"p{label}": 1.1 for label in LABELS if label[0] == label[1]}
 PORT_2 = {f"p{x}": 1.03 ** (x[:2].count("2")) for x in LABELS}
 CONJUGATED = {f"p{x}": -1.0 for x in LABELS if x[2] == "I"}
@@ -190,30 +196,9 @@ FLIPPED_1 = {f"p{x}": -1.0 for x in LABELS if x[:2].count("1") == 1}
 WRONG = (
     Wrong("imaginary parts conjugated", "conjugated", _mix(diagonal(**CONJUGATED))),
     Wrong("polarity of port 1", "port 1 have the other sign", _mix(diagonal(**FLIPPED_1))),
-    *(
-        Wrong(
-            f"ports {i} and {j} exchanged",
-            f"ports {i} and {j}",
-            _mix(port_matrix([{i: j, j: i}.get(k, k) for k in range(4)])),
-        )
-        for i, j in ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
-    ),
-    *(
-        Wrong(
-            f"ports turned by {n}",
-            f"ports are turned by {4 - n}",
-            _mix(port_matrix([(k + n) % 4 for k in range(4)])),
-        )
-        for n in (1, 2, 3)
-    ),
-    *(
-        Wrong(
-            f"turntable at {angle}",
-            f"turned by {angle}",
-            _other(f"observation.runs.0.turntable_deg={angle}"),
-        )
-        for angle in (90, 180, 270)
-    ),
+    *(_exchanged_ports(i, j) for i, j in combinations(range(4), 2)),
+    *(_turned_ports(n) for n in (1, 2, 3)),
+    *(_turned_table(angle) for angle in (90, 180, 270)),
     Wrong("sign of the turntable", "angles have the other sign", _opposite),
     Wrong("mirrored beams", "mirrored", _beams(mirrored)),
     Wrong("azimuth from North", "counted from North", _beams(from_north)),

@@ -3,17 +3,8 @@
 import numpy as np
 import pytest
 
+from lusee_bayes.flight import flags as fl
 from lusee_bayes.flight.bands import FRAME, ChannelBand, impulse_response, shared_noise
-from lusee_bayes.flight.flags import (
-    COMB_LIMIT,
-    burst_flags,
-    comb_bins,
-    comb_strength,
-    line_bins,
-    line_flags,
-    read_lines,
-    threshold,
-)
 from lusee_bayes.flight.session import AVERAGING, channel_mhz
 from lusee_bayes.testing.contracts import assert_refused
 
@@ -39,7 +30,7 @@ def flags_of(band, spectra):
     here = spectra[:, :, band.first : band.last]
     good = np.ones((len(here), here.shape[2]), dtype=bool)
     frames = np.full(len(here), FRAMES)
-    return line_flags(band, here, frames, good, threshold(FALSE_ALARM, 4))
+    return fl.line_flags(band, here, frames, good, fl.threshold(FALSE_ALARM, 4))
 
 
 def test_noise_is_flagged_as_rarely_as_is_said():
@@ -79,38 +70,38 @@ def test_a_comb_far_below_the_noise_of_a_channel_is_found(navgf):
     averaging = AVERAGING[navgf]
     spectra = autos(rng, rows=40, navgf=navgf)
     frames = np.full(40, FRAMES)
-    before = comb_strength(spectra, frames, averaging, MHZ)
+    before = fl.comb_strength(spectra, frames, averaging, MHZ)
     # neighbours predict a channel to fourth order: at 5 MHz, 6e-8 of it
-    assert np.abs(before).max() < COMB_LIMIT / 1.5
-    spectra[::2, :, comb_bins(averaging)] *= 1.0 + 1.0 / np.sqrt(FRAMES)
-    found = np.abs(comb_strength(spectra, frames, averaging, MHZ)) > COMB_LIMIT
+    assert np.abs(before).max() < fl.COMB_LIMIT / 1.5
+    spectra[::2, :, fl.comb_bins(averaging)] *= 1.0 + 1.0 / np.sqrt(FRAMES)
+    found = np.abs(fl.comb_strength(spectra, frames, averaging, MHZ)) > fl.COMB_LIMIT
     assert found[::2].all()
     assert not found[1::2].any()
 
 
 def test_a_notch_is_a_comb_below_and_a_strong_line_is_none():
     spectra, frames = autos(np.random.default_rng(5), rows=4), np.full(4, FRAMES)
-    spectra[:2, :, comb_bins(AVERAGING[1])] *= 1.0 - 5.0 / np.sqrt(FRAMES)
+    spectra[:2, :, fl.comb_bins(AVERAGING[1])] *= 1.0 - 5.0 / np.sqrt(FRAMES)
     spectra[2:, :, [835, 836]] *= 1e3
-    strength = comb_strength(spectra, frames, AVERAGING[1], MHZ)
-    assert (strength[:2] < -COMB_LIMIT).all() and (np.abs(strength[2:]) < COMB_LIMIT).all()
+    strength = fl.comb_strength(spectra, frames, AVERAGING[1], MHZ)
+    assert (strength[:2] < -fl.COMB_LIMIT).all() and (np.abs(strength[2:]) < fl.COMB_LIMIT).all()
     # where every bin has a channel of the comb nothing is told
-    assert comb_bins(AVERAGING[3]).all() and comb_bins(AVERAGING[4]).all()
+    assert fl.comb_bins(AVERAGING[3]).all() and fl.comb_bins(AVERAGING[4]).all()
     spectra = autos(np.random.default_rng(7), rows=4, navgf=4)
-    assert not comb_strength(spectra, frames, AVERAGING[4], MHZ).any()
+    assert not fl.comb_strength(spectra, frames, AVERAGING[4], MHZ).any()
 
 
 def test_known_lines_take_the_channels_about_them(tmp_path):
     lines = (20.8875,)
     # half-way between channels 835 and 836
-    assert np.flatnonzero(line_bins(lines, AVERAGING[1], MHZ)).tolist() == [834, 835, 836, 837]
-    assert np.flatnonzero(line_bins(lines, AVERAGING[4], MHZ)).tolist() == [208, 209]
-    assert not line_bins((), AVERAGING[1], MHZ).any()
+    assert np.flatnonzero(fl.line_bins(lines, AVERAGING[1], MHZ)).tolist() == [834, 835, 836, 837]
+    assert np.flatnonzero(fl.line_bins(lines, AVERAGING[4], MHZ)).tolist() == [208, 209]
+    assert not fl.line_bins((), AVERAGING[1], MHZ).any()
     path = tmp_path / "lines.csv"
     path.write_text("frequency_mhz,source\n20.8875,rover\n")
-    assert read_lines(path) == lines
+    assert fl.read_lines(path) == lines
     path.write_text("frequency,source\n20.8875,rover\n")
-    assert_refused(lambda: read_lines(path))
+    assert_refused(lambda: fl.read_lines(path))
 
 
 # one day at 42 s
@@ -128,7 +119,7 @@ def test_smooth_skies_are_flagged_as_rarely_as_is_said():
     flagged, total = 0, 0
     for seed in range(10):
         t, values, noise = bands_in_time(np.random.default_rng(seed))
-        found, scatter = burst_flags(t, values, noise, np.ones(N, dtype=bool), FALSE_ALARM)
+        found, scatter = fl.burst_flags(t, values, noise, np.ones(N, dtype=bool), FALSE_ALARM)
         flagged, total = flagged + found.sum(), total + N
         assert np.median(scatter) == pytest.approx(1.0, abs=0.05)
     assert flagged / total < 1e-3
@@ -142,7 +133,7 @@ def bursts_found(seed, offsets, length, strength):
         for offset in offsets:
             burst[start + offset : start + offset + length] = True
     values[burst] += strength * noise[burst]
-    found, _ = burst_flags(t, values, noise, np.ones(N, dtype=bool), FALSE_ALARM)
+    found, _ = fl.burst_flags(t, values, noise, np.ones(N, dtype=bool), FALSE_ALARM)
     return found, burst
 
 
@@ -166,7 +157,7 @@ def test_what_is_between_weak_bursts_stays():
 
 def test_noise_that_is_larger_than_expected_is_no_burst():
     t, values, noise = bands_in_time(np.random.default_rng(12), noise=6e-4)
-    found, scatter = burst_flags(t, values, noise / 3.0, np.ones(N, dtype=bool), FALSE_ALARM)
+    found, scatter = fl.burst_flags(t, values, noise / 3.0, np.ones(N, dtype=bool), FALSE_ALARM)
     assert found.mean() < 2e-3
     assert np.median(scatter) == pytest.approx(3.0, rel=0.05)
 
@@ -174,7 +165,7 @@ def test_noise_that_is_larger_than_expected_is_no_burst():
 def test_with_few_spectra_nothing_is_told():
     t = 1800.0 * np.arange(40)
     values = np.random.default_rng(1).random((40, 4))
-    found, scatter = burst_flags(t, values, 1e-4 * values, np.ones(40, dtype=bool), FALSE_ALARM)
+    found, scatter = fl.burst_flags(t, values, 1e-4 * values, np.ones(40, dtype=bool), FALSE_ALARM)
     assert not found.any()
     assert np.isnan(scatter).all()
 

@@ -1,7 +1,11 @@
 """Sessions of luseepy, of layout 4 made by hand, and our own; files that are damaged or foreign."""
 
+import json
+import re
 import shutil
 from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
 
 import h5py
 import layout_4
@@ -14,15 +18,9 @@ from layout_4 import NAMES, RAW_S, write_families, write_layout_4
 
 from lusee_bayes.cli.main import main
 from lusee_bayes.core.formats import is_session
-from lusee_bayes.flight.clock import Clock
+from lusee_bayes.flight.clock import Clock, clock_of, read_clock
 from lusee_bayes.flight.session import FLIGHT_PRODUCTS, OF_FLIGHT, TELEMETRY
-from lusee_bayes.flight.session_files import (
-    SessionRows,
-    cache_for,
-    guessed_chunks,
-    read_session,
-    write_session,
-)
+from lusee_bayes.flight.session_files import SessionRows, read_session, write_session
 from lusee_bayes.instrument.products import labels
 from lusee_bayes.testing.contracts import assert_refused
 
@@ -234,19 +232,6 @@ def test_what_is_no_session_leaves_nothing_behind(tmp_path, kind, blocks, text):
     refuse("not as netcdf", write_session, tmp_path / "s", some_rows(), [], kind="netcdf")
 
 
-def test_a_file_has_the_chunks_that_luseepy_makes_and_they_stay_in_memory(tmp_path):
-    path = write_session(tmp_path / "s", some_rows(), [written_counts()])
-    with h5py.File(path) as file:
-        cube = file["spectra/data"]
-        assert (cube.compression, cube.compression_opts) == ("gzip", 1)
-        assert cube.chunks == guessed_chunks(ROWS)
-    long = guessed_chunks(57_000)
-    assert long[0] > 256
-    needed = long[0] * 16 * 2048 * 4
-    assert needed <= cache_for(long)["rdcc_nbytes"] < 2 * needed
-    assert cache_for(None) == {}
-
-
 # --- what cannot be -------------------------------------------------------------------------------
 
 
@@ -321,3 +306,119 @@ def test_layout_4_in_fits_is_refused(tmp_path):
     primary.header["LAYOUTV"] = 4
     primary.writeto(tmp_path / "s.fits")
     refuse("as HDF5", read_session, tmp_path / "s.fits")
+
+
+# --- mission clocks: which UTC they stand for, and what contradicts them --------------------------
+
+
+RECORD = {
+    "format_version": 1,
+    "reference_event": "landing",
+    "clock_reference_isot": "2027-01-10T00:00:00",
+    "time_scale": "utc",
+    "clocks": {"spectrometer": {"clock_reference_raw_seconds": 100.0}},
+    "source": "a record",
+    "assumed": False,
+}
+SECONDS = np.array([100.0, 1e5, 3.0e7])
+
+
+def clock_file(tmp_path, **changes):
+    path = tmp_path / "clock.json"
+    record = {key: value for key, value in (RECORD | changes).items() if value is not None}
+    path.write_text(json.dumps(record))
+    return path
+
+
+def seconds_after(time, text):
+    """Since a date, by the standard library, which knows no leap seconds (there are none here)."""
+    at = datetime.fromisoformat(time.isot[:23])
+    return (at - datetime.fromisoformat(text)).total_seconds()
+
+
+# TAI - UTC is 37 s since 2017, TT - TAI 32.184 s: a reading in TT is 69.184 s earlier in UTC. In a
+# second of a clock that runs slow more than a second passes
+@pytest.mark.parametrize(
+    ("scale", "offset", "rate"),
+    [("utc", 0.0, None), ("tai", -37.0, None), ("tt", -69.184, None), ("utc", 0.0, 1.0 + 1e-5)],
+)
+def test_seconds_since_the_reference_in_each_scale(tmp_path, scale, offset, rate):
+    clock = read_clock(clock_file(tmp_path, time_scale=scale, rate=rate))
+    utc = clock.utc(SECONDS)
+    for k, raw in enumerate(SECONDS):
+        expected = (raw - 100.0) * (rate or 1.0) + offset
+        # isot has milliseconds
+        found = seconds_after(utc[k], "2027-01-10T00:00:00")
+        assert found == pytest.approx(expected, abs=2e-3)
+
+
+def test_times_are_exact_to_a_microsecond_over_a_year():
+    clock = Clock("here", 2461550.5, 0.0, "utc", 0.0)
+    raw = np.array([0.0, 3.0e7, 3.0e7 + 1e-3])
+    utc = clock.utc(raw)
+    assert (utc[2] - utc[1]).sec == pytest.approx(1e-3, abs=1e-6)
+
+
+def test_a_clock_has_to_be_known_and_two_must_not_differ():
+    said = Clock("file", 2461550.5, 0.0, "utc", 0.0)
+    assert clock_of("session", said, None, SECONDS) is said
+    assert clock_of("session", None, said, SECONDS) is said
+    words = r"give --clock clock\.json \(epoch, scale, rate\)"
+    refuse(words, clock_of, "session", None, None, SECONDS)
+    other = Clock("clock.json", 2461550.5, 0.0, "tt", 0.0)
+    refuse(r"differ by 69\.184 s", clock_of, "session", said, other, SECONDS)
+    # the same said in another way
+    same = Clock("clock.json", 2461550.5, 100.0 / 86400.0, "utc", 100.0)
+    assert clock_of("session", said, same, SECONDS) is same
+
+
+BAD_CLOCKS = [
+    {"format_version": 2},
+    {"time_scale": "lunar"},
+    {"clock_reference_isot": "yesterday"},
+    {"clock_reference_isot": "2027-13-10T00:00:00"},
+    {"clocks": {}},
+    {"clocks": {"spectrometer": {"clock_reference_raw_seconds": "100"}}},
+    {"clocks": {"spectrometer": {"clock_reference_raw_seconds": True}}},
+    {"rate": 2.0},
+    {"source": 3},
+    {"drift": 1.0},
+    {"clocks": {"spectrometer": {"clock_reference_raw_seconds": 100.0}, "spectrometre": {}}},
+    {"clocks": {"spectrometer": {"clock_reference_raw_seconds": 100.0}, "dcb": 3}},
+    {"clocks": {"spectrometer": {"clock_reference_raw_seconds": 10**400}}},
+    {"rate": 10**400},
+    {"stated_utc_isot": "2027-01-10T00:00:00"},
+    {"stated_utc_isot": "then", "clocks": None},
+]
+
+
+def test_a_clock_file_that_cannot_be_is_refused(tmp_path):
+    for changes in BAD_CLOCKS:
+        assert_refused(lambda changes=changes: read_clock(clock_file(tmp_path, **changes)))
+    clocks = {"spectrometer": {"clock_reference_raw_seconds": 100.0, "rate": 1.000001}}
+    refuse("'rate'; write rate beside clocks", read_clock, clock_file(tmp_path, clocks=clocks))
+    path = tmp_path / "clock.json"
+    path.write_text("{")
+    assert_refused(lambda: read_clock(path))
+    assert_refused(lambda: read_clock(tmp_path / "absent.json"))
+
+
+def test_the_utc_that_a_session_states_is_corrected(tmp_path):
+    """It moves by the offset at the reference, and by the rate times what has elapsed since."""
+    stated, true = "2027-01-10T00:00:00", "2027-01-10T00:00:46"
+    changes = {"clocks": None, "stated_utc_isot": stated, "clock_reference_isot": true}
+    given = read_clock(clock_file(tmp_path, rate=1.0 + 1e-6, **changes))
+    # a session whose own clock has a rate and an epoch of its own
+    said = Clock("session", 2461540.5, 0.0, "tt", 77.0, 1.0 - 1e-5)
+    before, after = said.utc(SECONDS), clock_of("session", said, given, SECONDS).utc(SECONDS)
+    elapsed = np.array([seconds_after(time, "2027-01-10T00:00:00") for time in before])
+    np.testing.assert_allclose((after - before).sec, 46.0 + 1e-6 * elapsed, rtol=0, atol=1e-6)
+    refuse("states no UTC", clock_of, "session", None, given, SECONDS)
+
+
+def test_the_clock_files_of_the_documentation_are_read(tmp_path):
+    page = Path(__file__).parents[2] / "docs" / "howto" / "first_light.md"
+    known, corrected = re.findall(r"```json\n(.*?)```", page.read_text(), flags=re.DOTALL)
+    for text in (known, corrected):
+        (tmp_path / "clock.json").write_text(text)
+        assert read_clock(tmp_path / "clock.json").rate == 1.000001

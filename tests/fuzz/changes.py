@@ -62,6 +62,10 @@ def item_changes(draw: st.DrawFn) -> tuple[Any, ...]:
     return kind, draw(FRACTION), draw(VALUES), draw(FILLS), draw(st.integers(0, 5))
 
 
+def _at(items: list[Any], fraction: float) -> Any:
+    return items[int(fraction * (len(items) - 1))]
+
+
 def _changed(array: np.ndarray, change: tuple[Any, ...]) -> np.ndarray:
     """Another array in an array's place."""
     kind, _, value, fill, number = change
@@ -91,26 +95,21 @@ def change_hdf5(path: Path, change: tuple[Any, ...]) -> None:
         found: list[Any] = []
         file.visititems(lambda _, item: found.append(item))
         if kind in ("attribute", "drop attribute"):
-            owners = [file, *found]
-            owner = owners[0] if number < 3 else owners[int(fraction * (len(owners) - 1))]
-            names = sorted(owner.attrs)
-            if not names:
-                return
-            name = names[int(fraction * (len(names) - 1))]
-            del owner.attrs[name]
-            if kind == "attribute" and value != 2**63:  # NumPy has no integer for it
-                owner.attrs[name] = value
+            owner = file if number < 3 else _at([file, *found], fraction)
+            if names := sorted(owner.attrs):
+                name = _at(names, fraction)
+                del owner.attrs[name]
+                if kind == "attribute" and value != 2**63:  # NumPy has no integer for it
+                    owner.attrs[name] = value
             return
         items = [item for item in found if isinstance(item, h5py.Dataset)]
-        if not items:
-            return
-        item = items[int(fraction * (len(items) - 1))]
-        name = item.name
-        if kind == "delete":
+        item = _at(items, fraction) if items else None
+        name = item and item.name
+        if item is not None and kind == "delete":
             del file[name]
-        elif kind == "rename":
+        elif item is not None and kind == "rename":
             file.move(name, f"{name}_other")
-        else:
+        elif item is not None:
             array = _changed(np.asarray(item[()]), change)
             if array.dtype.kind == "U":
                 array = np.char.encode(array, "utf-8")
@@ -174,11 +173,11 @@ def change_json(path: Path, change: tuple[Any, ...]) -> None:
         inner = [child for child in children if isinstance(child, dict | list) and child]
         if not inner:
             break
-        node = inner[int(fraction * (len(inner) - 1))]
+        node = _at(inner, fraction)
     keys = list(node) if isinstance(node, dict) else list(range(len(node)))
     if not keys:
         return
-    key = keys[int(fraction * (len(keys) - 1))]
+    key = _at(keys, fraction)
     if kind == "delete":
         del node[key]
     elif kind == "shape":
@@ -188,10 +187,8 @@ def change_json(path: Path, change: tuple[Any, ...]) -> None:
     path.write_text(json.dumps(tree))
 
 
-CHANGE = {
-    ".nc": change_hdf5, ".hdf5": change_hdf5, ".h5": change_hdf5, ".fits": change_fits,
-    ".json": change_json,
-}  # fmt: skip
+CHANGE = dict.fromkeys((".nc", ".hdf5", ".h5"), change_hdf5)
+CHANGE |= {".fits": change_fits, ".json": change_json}
 
 
 def change_items(path: Path, change: tuple[Any, ...]) -> None:

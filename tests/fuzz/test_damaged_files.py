@@ -4,12 +4,12 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import changes
 import h5py
 import numpy as np
 import pytest
 from assertions import require_conventions
 from astropy.io import fits
-from changes import SCALE, byte_changes, change_bytes, change_items, item_changes, require_answer
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from layout_4 import write_layout_4
@@ -23,13 +23,15 @@ from lusee_bayes.instrument.beams.sampled import read_beam, write_sampled_beams
 from lusee_bayes.instrument.visibilities import read_visibilities
 from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
 from lusee_bayes.report.describe import describe
+from lusee_bayes.report.pages import write_report
+from lusee_bayes.results.finished_runs import read_runs
 from lusee_bayes.results.map_files import read_channels, read_information
 from lusee_bayes.runs import folder as folder_module
 from lusee_bayes.runs import map_run
 from lusee_bayes.sky.sky_source import write_alms
 from lusee_bayes.testing.scenarios import small_scenario
 
-FEW, MANY = 2, 150 * SCALE
+FEW, MANY = 2, 150 * changes.SCALE
 
 
 def read_sky(path: Path) -> object:
@@ -143,10 +145,9 @@ def luseepys(tmp_path_factory, test_data) -> Path:
     for name, source in LUSEEPYS.items():
         with fits.open(test_data / "luseepy" / source) as opened:
             hdus = fits.HDUList([hdu.copy() for hdu in opened])
-            for hdu in hdus:
-                if source == "synthetic_monopole_beam.fits" and hdu.shape[:1] == (50,):
+            if name == "scalar_beam.fits":
+                for hdu in (one for one in hdus if one.shape[:1] == (50,)):
                     hdu.data = hdu.data[8:12]
-            if source == "synthetic_monopole_beam.fits":
                 hdus[0].header.update({"FREQ_MIN": 9.0, "FREQ_MAX": 12.0, "FREQ_N": 4})
             hdus.writeto(folder / name)
     return folder
@@ -172,19 +173,82 @@ def test_damaged_files(name, n, tmp_path, request):
             apply(target, one)
         before = sorted(tmp_path.iterdir())
         for reader in READERS[name]:
-            require_answer(lambda reader=reader: reader(target))
+            changes.require_answer(lambda reader=reader: reader(target))
         assert sorted(tmp_path.iterdir()) == before
 
     @settings(max_examples=n)
-    @given(st.lists(byte_changes(), min_size=1, max_size=3))
+    @given(st.lists(changes.byte_changes(), min_size=1, max_size=3))
     def damaged_bytes(change):
-        read(change, change_bytes)
+        read(change, changes.change_bytes)
 
     @settings(max_examples=n)
-    @given(st.lists(item_changes(), min_size=1, max_size=2))
+    @given(st.lists(changes.item_changes(), min_size=1, max_size=2))
     def damaged_items(change):
-        read(change, change_items)
+        read(change, changes.change_items)
 
     damaged_bytes()
     if source.suffix != ".npz":
         damaged_items()
+
+
+# --- folders of results: a report, a comparison, or a sentence ------------------------------------
+
+
+OF_RESULTS = 60 * changes.SCALE
+
+
+@pytest.fixture(scope="session")
+def sampled(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("sampled") / "run"
+    sampler = lb.Sampler(chains=2, warmup=20, draws=12)
+    return lb.run_sample(small_scenario(lmax=2), folder, sampler=sampler).folder
+
+
+@pytest.mark.parametrize(
+    ("kind", "n"),
+    [
+        *(("map", FEW), ("cube", FEW)),
+        *(pytest.param(k, OF_RESULTS, marks=pytest.mark.long) for k in ("map", "cube", "sample")),
+    ],
+)
+def test_damaged_results(kind, n, tmp_path, request):
+    if kind == "sample":
+        source = request.getfixturevalue("sampled")
+    else:
+        source = request.getfixturevalue({"map": "small_map", "cube": "small_cube"}[kind]).folder
+    folder = tmp_path / "results"
+    shutil.copytree(source, folder)
+    write_report(folder)  # as it is, it is read
+    names = sorted(p.name for p in source.iterdir() if p.is_file() and p.name != "report.html")
+    files = st.sampled_from(names)
+
+    def check(name, change, apply):
+        path = folder / name
+        shutil.copy(source / name, path)
+        if apply is None:
+            path.unlink()
+        else:
+            apply(path, change)
+        changes.require_answer(lambda: write_report(folder))
+        if kind == "map":
+            runs = [source, folder]
+            changes.require_answer(lambda: read_runs(runs))
+        shutil.copy(source / name, path)
+
+    @settings(max_examples=n)
+    @given(files, changes.byte_changes())
+    def damaged_bytes(name, change):
+        check(name, change, changes.change_bytes)
+
+    @settings(max_examples=n)
+    @given(files.filter(lambda name: Path(name).suffix in changes.CHANGE), changes.item_changes())
+    def damaged_items(name, change):
+        check(name, change, changes.change_items)
+
+    for name in names:
+        check(name, None, None)
+        if n > FEW:
+            check(name, ("cut", 0.0, 1, b""), changes.change_bytes)
+            check(name, ("insert", 0.0, 1, b"\0\xff\xfe"), changes.change_bytes)
+    damaged_bytes()
+    damaged_items()

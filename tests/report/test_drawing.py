@@ -3,20 +3,14 @@
 import healpy
 import numpy as np
 import pytest
+from jinja2 import UndefinedError
 from matplotlib.projections.geo import MollweideAxes
 
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import map_to_modes, modes_to_map
 from lusee_bayes.judge.convergence import warnings_of
-from lusee_bayes.report.figures.drawing import (
-    LEFT_AT_LMAX,
-    WIDTH,
-    number_of_tick,
-    shown,
-    taper,
-    taper_fwhm_deg,
-    unprojected,
-    view,
-)
+from lusee_bayes.report.figures import drawing
+from lusee_bayes.report.rendering import ENVIRONMENT, formatted, p_value, picture, render
 
 
 def test_points_lie_where_matplotlib_puts_them():
@@ -24,7 +18,7 @@ def test_points_lie_where_matplotlib_puts_them():
     rng = np.random.default_rng(3)
     x, y = rng.uniform(-1.0, 1.0, (2, 4000))
     inside = np.hypot(x, y) < 0.999
-    lon, lat = unprojected(x[inside], y[inside])
+    lon, lat = drawing.unprojected(x[inside], y[inside])
     # matplotlib's longitude grows to the right; its ellipse is sqrt(2) times (2, 1)
     theirs = transform.transform(np.radians(np.stack([-lon, lat], axis=1)))
     # its own iteration for the latitude stops at 1e-3 radians
@@ -34,26 +28,26 @@ def test_points_lie_where_matplotlib_puts_them():
 
 def test_a_map_of_longitude_and_latitude_comes_out_as_it_went_in():
     nside = 64
-    x, y, z = map(view, healpy.pix2vec(nside, np.arange(12 * nside**2)))
-    middle = quarter = WIDTH // 4
+    x, y, z = map(drawing.view, healpy.pix2vec(nside, np.arange(12 * nside**2)))
+    middle = quarter = drawing.WIDTH // 4
     # the centre of the view is l = 0; halfway to the left l = 90 degrees; the top is the pole
-    np.testing.assert_allclose(x[middle, WIDTH // 2], 1.0, atol=2e-2)
+    np.testing.assert_allclose(x[middle, drawing.WIDTH // 2], 1.0, atol=2e-2)
     np.testing.assert_allclose(y[middle, quarter], 1.0, atol=2e-2)
-    np.testing.assert_allclose(z[-1, WIDTH // 2], 1.0, atol=2e-2)
+    np.testing.assert_allclose(z[-1, drawing.WIDTH // 2], 1.0, atol=2e-2)
     # a unit vector stays one, up to what bilinear interpolation loses
     np.testing.assert_allclose(x**2 + y**2 + z**2, 1.0, atol=2e-3)
 
 
 @pytest.mark.parametrize("lmax", [1, 8, 47])
 def test_the_taper_is_healpys_gaussian_beam(lmax):
-    beam = healpy.gauss_beam(np.radians(taper_fwhm_deg(lmax)), lmax)
-    np.testing.assert_allclose(taper(lmax), beam, rtol=1e-12)
-    assert taper(lmax)[-1] == pytest.approx(LEFT_AT_LMAX)
+    beam = healpy.gauss_beam(np.radians(drawing.taper_fwhm_deg(lmax)), lmax)
+    np.testing.assert_allclose(drawing.taper(lmax), beam, rtol=1e-12)
+    assert drawing.taper(lmax)[-1] == pytest.approx(drawing.LEFT_AT_LMAX)
 
 
 def test_a_sky_of_one_mode_is_shown():
-    np.testing.assert_allclose(taper(0), [1.0])
-    np.testing.assert_allclose(shown(np.array([2.0]), 4), 2.0 / np.sqrt(4.0 * np.pi))
+    np.testing.assert_allclose(drawing.taper(0), [1.0])
+    np.testing.assert_allclose(drawing.shown(np.array([2.0]), 4), 2.0 / np.sqrt(4.0 * np.pi))
 
 
 @pytest.mark.parametrize("lmax", [12, 47])
@@ -67,9 +61,9 @@ def test_an_edge_has_no_rings(lmax):
     modes = map_to_modes(pixels, lmax)
     swing = 1.0 - modes_to_map(modes, 64).min()
     assert swing > 0.5
-    assert shown(modes, 64).min() > 1.0 - 0.1 * swing
+    assert drawing.shown(modes, 64).min() > 1.0 - 0.1 * swing
     # the mean is kept
-    assert shown(modes, 64).mean() == pytest.approx(pixels.mean(), rel=1e-3)
+    assert drawing.shown(modes, 64).mean() == pytest.approx(pixels.mean(), rel=1e-3)
 
 
 GOOD = {"r_hat": [1.0, 1.005], "ess_bulk": [900.0, 800.0], "ess_tail": [700.0, 600.0]}
@@ -109,5 +103,39 @@ def test_every_warning_has_its_reason(change, words):
     [(0.0, "0"), (12500.0, "12,500"), (0.25, "0.25"), (1.5e10, "1.5e10"), (-2e-5, "-2e-5")],
 )
 def test_ticks_are_short(value, text):
-    assert number_of_tick(value) == text
+    assert drawing.number_of_tick(value) == text
     assert float(text.replace(",", "")) == value
+
+
+# --- templates: what is missing is an error -------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("value", "form", "text"),
+    [(1.234, ".2f", "1.23"), (0.5, ".1%", "50.0%"), (None, ".2f", "-"), (np.nan, "", "-")],
+)
+def test_numbers_are_formatted_and_what_is_missing_is_said(value, form, text):
+    assert formatted(value, form, "-") == text
+    assert formatted("as it is", form, "-") == "as it is"
+
+
+def test_probabilities_of_a_column_have_no_equals_sign():
+    assert p_value(0.62) == "0.62"
+    assert p_value(0.0).startswith("< ")
+    assert p_value(np.nan, "no others") == "no others"
+
+
+def test_what_users_write_cannot_become_tags_and_bad_rows_stand_out():
+    text = """{% from "macros.html" import cells, table with context %}
+    {%- call(row) table(("a", "b"), rows, [false, true]) %}{{ cells(*row) }}{% endcall %}"""
+    rows = [("<b>", 1), ("&", 2)]
+    page = ENVIRONMENT.from_string(text).render(rows=rows)
+    assert "<tr><td>&lt;b&gt;</td><td>1</td></tr>" in page
+    assert "<tr class=bad><td>&amp;</td><td>2</td></tr>" in page
+
+
+def test_a_page_without_what_it_shows_is_an_error(tmp_path):
+    with pytest.raises(UndefinedError, match="caveat"):
+        render("comparison.html", tmp_path, runs=[], rows=[])
+    with pytest.raises(InputError, match=r"no figures/maps\.png"):
+        picture(tmp_path, "maps")

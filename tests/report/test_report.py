@@ -141,11 +141,6 @@ def test_a_page_of_many_channels_has_a_part_for_each(cube):
         assert f"<td>{channel['frequency_mhz']:g}</td><td>{channel['n_data']}</td>" in page
 
 
-def test_a_page_of_one_channel_has_no_selector(folder):
-    page = (folder / "report.html").read_text()
-    assert 'class="channel"' not in page and "viewer-channel" not in page.split("<script", 1)[0]
-
-
 @pytest.mark.parametrize("which", [FOLDER, CUBE, SAMPLED])
 @pytest.mark.parametrize("manifest", [True, False], ids=["manifest", "an older folder without"])
 def test_report_makes_a_page_anew(which, manifest, request, tmp_path, capsys):

@@ -8,16 +8,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from commands import posterior_of, sky_draws_of
-from experiments import at_times, channels_of, mapped, scaled_product, small_experiment
+from experiments import at_times, channels_of, correlated, mapped, scaled_product, small_experiment
+from reference_linear import matrices
 from scipy import stats
 
 import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_host
+from lusee_bayes.core.harmonics import mode_numbers
 from lusee_bayes.judge.chi2 import stands_out
 from lusee_bayes.judge.split import Split
-from lusee_bayes.results.channel_map import conditioned
+from lusee_bayes.linear.posterior import pixel_std
+from lusee_bayes.results.channel_map import conditioned, region_rows
 from lusee_bayes.results.finished_runs import FinishedRun
 from lusee_bayes.results.map_files import SavedInformation
+from lusee_bayes.testing.scenarios import small_scenario
 
 
 def dense_log_likelihood(model, data, skies) -> np.ndarray:
@@ -54,11 +58,6 @@ def test_likelihoods_of_draws_are_those_of_matrices(noise):
     # data of 1e5 standard deviations
     np.testing.assert_allclose(channel.log_likelihood, expected, atol=1e-6)
     assert len(expected) == 4 and np.ptp(expected) > 0.1
-
-
-def test_none_are_worked_out_for_no_draws():
-    _, channel = mapped(small_experiment())
-    assert channel.draws.shape == (0, 49) and channel.log_likelihood.shape == (0,)
 
 
 def test_arviz_opens_a_posterior(small_cube):
@@ -216,3 +215,59 @@ def test_covariances_of_every_channel_are_kept(kind, tmp_path, numbers_alone):
         assert here.diagnosis == there.diagnosis and here.coverage == there.coverage
         np.testing.assert_array_equal(here.mean, there.mean)
         np.testing.assert_array_equal(here.judged.z, there.judged.z)
+
+
+# --- under a prior that correlates modes ----------------------------------------------------------
+
+
+LMAX = 6
+
+
+@pytest.fixture(scope="module")
+def dense():
+    """The experiment conditioned on its data, and the channel."""
+    experiment = lb.build(small_scenario(lmax=LMAX, cycles=0.1))
+    setup = replace(experiment.setup, prior=correlated(experiment.setup.prior))
+    return mapped(replace(experiment, setup=setup))
+
+
+def test_the_channel_is_that_of_matrices(dense):
+    made, channel = dense
+    model, data = made.own.model, np.asarray(made.experiment.data.data)
+    (a, s, n), mean = matrices(model), np.asarray(model.prior.mean)
+    covariance = np.asarray(made.found.posterior.covariance())
+    # chi^2 of residuals: N_data less what the sky takes, tr(A C A^T N^-1)
+    taken = np.trace(np.linalg.solve(n, a @ covariance @ a.T))
+    np.testing.assert_allclose(channel.chi2_expected, len(data) - taken, rtol=1e-6)
+    np.testing.assert_allclose(channel.prior_std, np.sqrt(np.diag(s)), rtol=1e-12)
+    centred = data - a @ mean
+    centred = centred if model.offset is None else centred - np.asarray(model.offset)
+    k = a @ s @ a.T + n
+    # K spans ten orders of magnitude
+    total = centred @ np.linalg.solve(k, centred)
+    np.testing.assert_allclose(channel.chi2_model, total, rtol=1e-4)
+    parts = channel.instrument.chi2 + channel.judged.prior.chi2
+    np.testing.assert_allclose(parts, channel.chi2_model, rtol=1e-6)
+    # shares of the prior, the monopole taken for known
+    rest, left = s.copy(), covariance.copy()
+    for matrix in (rest, left):
+        matrix[0] = matrix[:, 0] = 0.0
+    share = (pixel_std(left, channel.nside) / pixel_std(rest, channel.nside)) ** 2
+    np.testing.assert_allclose(channel.details.prior_fraction, share, rtol=1e-8)
+    rows = region_rows(channel.nside, LMAX)
+    share = ((rows @ left) * rows).sum(1) / ((rows @ rest) * rows).sum(1)
+    np.testing.assert_allclose(channel.details.region_prior_fraction, share, rtol=1e-8)
+
+
+def test_its_resolution_is_packed(dense):
+    made, channel = dense
+    details = channel.details
+    width = details.prior_width
+    ell, _ = mode_numbers(LMAX)
+    steps = details.resolution_step[np.ix_(ell, ell)]
+    scale = width[:, None] / width[None]
+    found = details.resolution * steps * scale
+    s = np.asarray(made.own.model.prior.covariance())
+    covariance = np.asarray(made.found.posterior.covariance())
+    exact = np.eye(len(s)) - covariance @ np.linalg.inv(s)
+    assert (np.abs(found - exact) <= 0.51 * steps * scale).all()

@@ -14,6 +14,7 @@ from lusee_bayes.experiment.experiment import build, under_sky
 from lusee_bayes.experiment.model import set_up
 from lusee_bayes.experiment.sky_sections import FileSkySection, GalaxySection
 from lusee_bayes.judge.coverage import LEVELS, Counts, Coverage
+from lusee_bayes.judge.measures import strengths, strengths_in_words
 from lusee_bayes.sky.sky_source import write_alms
 from lusee_bayes.testing.scenarios import small_scenario
 
@@ -151,3 +152,28 @@ def test_a_given_sky_is_in_the_data_alone():
     np.testing.assert_array_equal(found.data.truth, expected.data.truth)
     usual = build(small_scenario(**sizes)).setup.prior.variance()
     np.testing.assert_array_equal(found.setup.prior.variance(), usual)
+
+
+# --- how strong a sky is compared with its prior --------------------------------------------------
+
+
+def test_strengths_are_squares_over_what_is_expected():
+    rng = np.random.default_rng(2)
+    sky, of_modes = rng.standard_normal((LMAX + 1) ** 2), rng.uniform(0.5, 2.0, (LMAX + 1) ** 2)
+    of_pixels = rng.uniform(0.5, 2.0, 12 * NSIDE**2)
+    found = strengths(sky, of_modes, of_pixels)
+    assert found["ell 5 to 6"] == pytest.approx((sky[25:] ** 2).sum() / of_modes[25:].sum())
+    pixels = pixel_matrix(NSIDE, LMAX)[:, 1:] @ sky[1:]
+    height = np.arange(12 * NSIDE**2)
+    cap = height < 100  # |b| > 30 degrees holds the whole cap
+    assert found["|b| > 30 deg"] > (pixels[cap] ** 2).sum() / of_pixels.sum()
+    bands = ["|b| < 10 deg", "|b| 10 to 30 deg", "|b| > 30 deg"]
+    assert list(found) == [*bands, "ell 1 to 4", "ell 5 to 6"]
+    # the monopole does not count
+    assert strengths(np.append(1e6, sky[1:]), of_modes, of_pixels) == found
+    words = strengths_in_words(found)
+    assert words.startswith("Power of the sky over what the prior expects: ")
+    assert f"{found['ell 5 to 6']:.2g} at ell 5 to 6." in words
+    # of what is not known nothing is said
+    assert strengths(sky, 0.0 * of_modes, 0.0 * of_pixels) == {}
+    assert strengths_in_words({}) == ""

@@ -23,13 +23,6 @@ from lusee_bayes.judge.measures import ell_cross
 from lusee_bayes.linear.linear_gaussian import InMap
 from lusee_bayes.results.forecast import Variation, forecast_rows
 from lusee_bayes.runs import plan_run
-from lusee_bayes.runs.plan_run import (
-    default_variations,
-    expected_snr_squared,
-    forecast,
-    forecasts_of,
-    without_ports,
-)
 
 # many shapes, each of which is compiled
 pytestmark = pytest.mark.long
@@ -49,7 +42,7 @@ def turned(*angles, factor=100):
 
 
 def bits(*overrides, lost=()):
-    return forecast(varied(*overrides, lost=lost)).information_bits
+    return plan_run.forecast(varied(*overrides, lost=lost)).information_bits
 
 
 def simulated(variation):
@@ -68,7 +61,7 @@ def simulated(variation):
 @pytest.mark.parametrize("angles", [(0,), (0, 30), (0, 30, 60)], ids=str)
 def test_information_is_the_mean_log_ratio_of_posterior_to_prior_density(angles):
     """ln p(m | d) - ln p(m) at the true sky, with NumPy alone, over 200 data sets."""
-    predicted = forecast(turned(*angles))
+    predicted = plan_run.forecast(turned(*angles))
     model, posterior, skies, means = simulated(turned(*angles))
     prior = np.asarray(model.prior.variance())
     root = np.sqrt(prior)
@@ -88,7 +81,7 @@ def test_information_is_the_mean_log_ratio_of_posterior_to_prior_density(angles)
 def test_expected_snr_is_that_of_simulated_maps():
     """sum_m mean^2 and sum_m (mean - m)^2, averaged over the 200, and the ell where they cross."""
     faint = turned(0, 30, factor=1e7)  # SNR^2 from 120 to 0.2
-    predicted = forecast(faint)
+    predicted = plan_run.forecast(faint)
     model, _, skies, means = simulated(faint)
     power, error = sum_over_m(means**2), sum_over_m((means - skies) ** 2)
     prior = sum_over_m(np.asarray(model.prior.variance()))
@@ -131,7 +124,7 @@ def assert_forecast_is(found, a, s, n):
 )
 def test_numbers_of_an_experiment_against_dense_algebra(cycles, systematic):
     variation = varied(f"observation.runs.0.cycles={cycles}", systematic)
-    found = forecast(variation)
+    found = plan_run.forecast(variation)
     assert 0 < found.modes < 49  # neither none nor all
     assert found.n_data == 16 * int(cycles * 27.321661 * 12)
     assert_forecast_is(found, *textbook(variation))
@@ -143,12 +136,12 @@ def test_a_lost_antenna_is_flags():
     experiment = lb.build(variation.scenario)
     setup = experiment.setup
     flags = np.repeat(np.array(dead)[:, None], setup.observation.n_times, axis=1)
-    found = forecast(replace(variation, lost=(2,)))
+    found = plan_run.forecast(replace(variation, lost=(2,)))
     assert found.n_data == 9 * setup.observation.n_times
     assert_forecast_is(found, *textbook(variation, ~flags.ravel()))
     # and the same model as that of data with these flags
     expected = full_model(set_up(variation.scenario, flagged(experiment.data, flags)))
-    got = full_model(without_ports(setup, [2]))
+    got = full_model(plan_run.without_ports(setup, [2]))
     np.testing.assert_array_equal(got.coupling.dense(), expected.coupling.dense())
     np.testing.assert_array_equal(got.noise.diagonal(), expected.noise.diagonal())
 
@@ -158,7 +151,7 @@ def test_an_ell_that_is_not_seen_and_one_without_power():
     a = jnp.eye(9)[:4]
     prior = lb.HarmonicPrior(jnp.asarray([0.0, 3.0, 2.0]))
     model = lb.LinearGaussian(a, prior, lb.DiagonalCovariance(jnp.ones(4)))
-    found = expected_snr_squared(model.factorise(InMap).condition(jnp.zeros(4)).posterior)
+    found = plan_run.expected_snr_squared(model.factorise(InMap).condition(jnp.zeros(4)).posterior)
     assert np.isnan(found[0])
     np.testing.assert_allclose(found[1:], [3.0, 0.0], atol=1e-15)
 
@@ -172,21 +165,20 @@ def test_a_duty_cycle_is_worth_the_noise_it_makes():
 
 def test_default_variations_compare_like_with_like():
     scenario = lb.load_scenario("two_cycles")
-    found = default_variations("two_cycles", scenario)
+    found = plan_run.default_variations("two_cycles", scenario)
     assert found[0].scenario == scenario
     families = {v.family: [w for w in found if w.family == v.family] for v in found}
 
-    def runs(variation):
-        return [(r.cycles, r.turntable_deg) for r in variation.scenario.observation.runs]
+    def times(family):
+        return [sum(r.cycles for r in v.scenario.observation.runs) for v in families[family]]
 
-    def time(variation):
-        return sum(cycles for cycles, _ in runs(variation))
-
-    assert [time(v) for v in families["turned, same time"]] == pytest.approx([2.0] * 3)
-    assert runs(families["turned, same time"][1]) == [(0.5, 0), (0.5, 30), (0.5, 30), (0.5, 60)]
-    assert [time(v) for v in families["turned, more time"]] == [4.0, 6.0]
-    assert runs(families["turned, more time"][0]) == [(1, 0), (1, 30), (1, 30), (1, 60)]
-    assert [time(v) for v in families["duration"]] == [0.25, 0.5, 1.0, 2.0, 3.0]
+    assert times("turned, same time") == pytest.approx([2.0] * 3)
+    assert times("turned, more time") == [4.0, 6.0]
+    for family, number, cycles in (("turned, same time", 1, 0.5), ("turned, more time", 0, 1.0)):
+        runs = families[family][number].scenario.observation.runs
+        angles = [(r.cycles, r.turntable_deg) for r in runs]
+        assert angles == [(cycles, 0), (cycles, 30), (cycles, 30), (cycles, 60)]
+    assert times("duration") == [0.25, 0.5, 1.0, 2.0, 3.0]
     assert all(r.night_only for v in families["nights only"] for r in v.scenario.observation.runs)
     duty = [v.scenario.noise.radiometer.duty_cycle for v in families["duty cycle"]]
     assert duty == [0.25, 0.5, 1.0]
@@ -196,19 +188,19 @@ def test_default_variations_compare_like_with_like():
 def test_what_is_there_twice_is_computed_once(monkeypatch, tmp_path):
     computed = []
     whole = varied()
-    first = forecast(whole)
+    first = plan_run.forecast(whole)
     monkeypatch.setattr(
         "lusee_bayes.runs.plan_run.forecast",
         lambda variation: computed.append(variation) or replace(first, variation=variation),
     )
     again, broken = replace(whole, name="again"), replace(whole, lost=(1,))
     given = [whole, again, broken], tmp_path, ThisProcess(), Stages()
-    made = forecasts_of(*given)
+    made = plan_run.forecasts_of(*given)
     rows = forecast_rows(made)
     assert computed == [whole, broken]
     # and what was computed is taken from its file the next time
-    assert forecast_rows(forecasts_of(*given)) == rows and len(computed) == 2
-    np.testing.assert_array_equal(forecasts_of(*given)[0].snr_squared, made[0].snr_squared)
+    assert forecast_rows(plan_run.forecasts_of(*given)) == rows and len(computed) == 2
+    np.testing.assert_array_equal(plan_run.forecasts_of(*given)[0].snr_squared, made[0].snr_squared)
     assert [row["variation"] for row in rows] == ["test", "again", "test"]
     assert rows[1]["difference_bits"] == "0.00"
 
@@ -216,7 +208,7 @@ def test_what_is_there_twice_is_computed_once(monkeypatch, tmp_path):
 def test_what_will_be_known_of_clock_and_turntable():
     """Against K = A S A^T + N as a matrix, and the derivative to an angle that is given."""
     offsets = "noise.pointing={turntable_deg: 1.0, clock_s: 60}"
-    found = forecast(varied(offsets)).offsets
+    found = plan_run.forecast(varied(offsets)).offsets
     assert list(found) == ["clock_s", "turntable_deg"]
     # the sky may as well have turned
     assert found["clock_s"] == pytest.approx(60.0, rel=0.02)
@@ -230,14 +222,14 @@ def test_what_will_be_known_of_clock_and_turntable():
     k, t = a @ s @ a.T + n, (up - down) / 0.02
     expected = np.sqrt(1.0 - t @ np.linalg.solve(k, t))
     assert found["turntable_deg"] == pytest.approx(expected, rel=1e-4)
-    rows = forecast_rows([forecast(varied(offsets)), forecast(varied())])
+    rows = forecast_rows([plan_run.forecast(varied(offsets)), plan_run.forecast(varied())])
     assert "turntable_deg +- " in rows[0]["clock_and_pointing"]
     assert rows[1]["clock_and_pointing"] == ""
 
 
 def test_ports_that_do_not_exist_and_none_left():
-    refuse("no port 4 to lose; ports are 0 to 3", forecast, varied(lost=(4,)))
-    refuse("small, test: all .* samples are flagged", forecast, varied(lost=(0, 1, 2, 3)))
+    refuse("no port 4 to lose; ports are 0 to 3", plan_run.forecast, varied(lost=(4,)))
+    refuse("small, test: all .* samples are flagged", plan_run.forecast, varied(lost=(0, 1, 2, 3)))
 
 
 TINY = ["--set", "lmax=6", "--set", "observation.runs.0.cycles=0.05"]
@@ -253,11 +245,10 @@ def test_the_command_writes_table_and_figure(tmp_path, capsys, monkeypatch):
     assert matplotlib.image.imread(tmp_path / "figures" / "plan.png").std() > 0.01
     rows = table_of(tmp_path / "plan.csv")
     names = [row["variation"] for row in rows if row["scenario"] == "fiducial"]
-    assert names == [
-        "as given", "0°", "0.05 cycles", "0.25", "0.5", "1", "port 0", "port 1", "port 2", "port 3",
-    ]  # fmt: skip
+    ports = [f"port {port}" for port in range(4)]
+    assert names == ["as given", "0°", "0.05 cycles", "0.25", "0.5", "1", *ports]
     assert [row["variation"] for row in rows if row["scenario"] == "noise_x100"] == names
-    expected = forecast(Variation("", "", "", lb.load_scenario("fiducial", tiny[1::2])))
+    expected = plan_run.forecast(Variation("", "", "", lb.load_scenario("fiducial", tiny[1::2])))
     first = rows[0]
     # two decimals
     assert float(first["information_bits"]) == pytest.approx(expected.information_bits, abs=0.0051)
@@ -288,9 +279,6 @@ def test_brackets_are_values_not_markup(tmp_path, capsys):
     vary = ["--vary", runs, "--vary", "noise.gain=null"]
     assert run("plan", "fiducial", *TINY, *vary, "-o", tmp_path) == 0
     name = "[{'cycles': 0.03}, {'cycles': 0.02, 'turntable_deg': 30}]"
-    assert [row["variation"] for row in table_of(tmp_path / "plan.csv")] == [
-        "as given",
-        name,
-        "None",
-    ]
+    names = [row["variation"] for row in table_of(tmp_path / "plan.csv")]
+    assert names == ["as given", name, "None"]
     assert name in capsys.readouterr().out

@@ -1,36 +1,44 @@
-"""Receivers whose spectra are smooth: all channels' skies and receivers as one dense Gaussian."""
+"""Receivers, ground and gain table of channels: their skies and unknowns as one dense Gaussian."""
 
 import shutil
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from assertions import assert_same_map, refuse
-from experiments import channels_of, four_ports
+from experiments import DenseChannels, channels_of, four_ports, unknowns_report
+from matplotlib.figure import Figure
 from reference_linear import Answer, white_posterior
 from scipy.linalg import block_diag
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.model import radiometer, set_up, true_values
-from lusee_bayes.runs import channels
+from lusee_bayes.core.harmonics import per_mode
+from lusee_bayes.experiment.model import set_up, true_values
+from lusee_bayes.report.map_page import map_page
+from lusee_bayes.runs import channels, map_run
 from lusee_bayes.runs.channels import map_channels
 
 FREQUENCIES, OCTAVES = np.array([15.0, 20.0, 22.0]), 0.4
-RECEIVER = (
-    f"noise.receiver={{power_k: 20000, slope: -2, relative_std: 0.5, smooth_octaves: {OCTAVES}}}"
-)
 NOT_SMOOTH = "noise.receiver={power_k: 20000, slope: -2, relative_std: 0.5}"
+RECEIVER = f"{NOT_SMOOTH[:-1]}, smooth_octaves: {OCTAVES}}}"
 GROUND = "noise.regolith={std_k: 2000}"
 # a tenth of the sky, so that the data leave something of the powers to the other channels
 NOISE = "noise.radiometer.factor=1e8"
+# of receivers whose powers are known better, of channels that are not smooth
+PLAIN = "noise.receiver={power_k: 2000, slope: -2}", "noise.regolith={std_k: 30}"
+TABLE = "noise.gain_table={std: 0.01}"
 N_MODES, N_PORTS, N_OWN, N_DRAWS = 16, 4, 5, 2000
 # of conditions of 1e4 or so
 ROUNDING = 1e-10
+# of two solutions of the same equations, in standard deviations: z is a difference of data and
+# prediction, 1e5 times the noise
+ROUGH = 1e-5
 
 
 def cube_of(response_file, *overrides, frequencies="[15, 20, 22]"):
-    return four_ports(response_file, NOISE, *overrides, f"frequencies_mhz={frequencies}")
+    return four_ports(response_file, *overrides, f"frequencies_mhz={frequencies}")
 
 
 def ties(frequencies) -> np.ndarray:
@@ -38,67 +46,19 @@ def ties(frequencies) -> np.ndarray:
     return np.exp(-(octaves**2) / (2.0 * OCTAVES**2))
 
 
-@dataclass
-class Dense:
-    """All channels in one normal equation: skies, then receivers port by port, then grounds."""
-
-    couplings: list[np.ndarray]
-    templates: list[np.ndarray]
-    noise: list[np.ndarray]
-    rest: list[np.ndarray]
-    prior: list[np.ndarray]
-
-    @classmethod
-    def of(cls, scenario):
-        found = cls([], [], [], [], [])
-        for channel in scenario.channels():
-            experiment = lb.build(channel)
-            setup = experiment.setup
-            columns = [np.asarray(s.columns) for s in lb.infer(experiment).systematics]
-            found.couplings.append(np.asarray(setup.coupling.dense()))
-            found.templates.append(np.concatenate(columns, axis=1))
-            found.noise.append(np.sqrt(np.asarray(radiometer(setup).diagonal())))
-            found.rest.append(np.asarray(experiment.data.data) - np.asarray(setup.offset))
-            found.prior.append(np.sqrt(np.asarray(setup.prior.variance())))
-        return found
-
-    def solve(self, used: tuple[int, ...]) -> Answer:
-        """Given the data of some channels: a sky and five unknowns of every one."""
-        n = len(self.rest)
-        root = np.linalg.cholesky(ties(FREQUENCIES))
-        size = N_MODES + N_OWN
-        unmixed = np.zeros((n * size, n * size))
-        for k in range(n):
-            own = slice(k * size, k * size + N_MODES)
-            unmixed[own, own] = np.diag(self.prior[k])
-            unmixed[k * size + 20, k * size + 20] = 1.0
-            for j in range(n):
-                for port in range(N_PORTS):
-                    at = N_MODES + port
-                    unmixed[k * size + at, j * size + at] = root[k, j]
-        own = (np.concatenate(x, axis=1) for x in zip(self.couplings, self.templates, strict=True))
-        taken = np.repeat([k in used for k in range(n)], [len(rest) for rest in self.rest])
-        rows, noise, rest = (
-            x[taken] for x in (block_diag(*own), *map(np.concatenate, (self.noise, self.rest)))
-        )
-        white = white_posterior(rows @ unmixed, np.ones(n * size), noise, rest)
-        covariance = unmixed @ white.covariance @ unmixed.T
-        return Answer(unmixed @ white.mean, covariance, white.log_prob)
-
-
 @pytest.fixture(scope="module")
 def scenario(response_file):
-    return cube_of(response_file, RECEIVER, GROUND, f"output={{draws: {N_DRAWS}}}")
+    return cube_of(response_file, NOISE, RECEIVER, GROUND, f"output={{draws: {N_DRAWS}}}")
 
 
 @pytest.fixture(scope="module")
-def dense(scenario) -> Dense:
-    return Dense.of(scenario)
+def dense(scenario) -> DenseChannels:
+    return DenseChannels.of(scenario)
 
 
 @pytest.fixture(scope="module")
 def expected(dense) -> Answer:
-    return dense.solve((0, 1, 2))
+    return solved(dense, (0, 1, 2))
 
 
 @pytest.fixture(scope="module")
@@ -109,6 +69,22 @@ def folder(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def cube(scenario, folder):
     return map_channels(scenario, folder)
+
+
+def solved(dense: DenseChannels, used: tuple[int, ...]) -> Answer:
+    """Given the data of some channels: a sky and five unknowns of every one."""
+    n, size = len(dense.rest), N_MODES + N_OWN
+    root = np.linalg.cholesky(ties(FREQUENCIES))
+    unmixed = block_diag(*(np.diag([*std, 0.0, 0.0, 0.0, 0.0, 1.0]) for std in dense.prior))
+    for port in range(N_MODES, N_MODES + N_PORTS):
+        unmixed[port::size, port::size] = root
+    own = (np.concatenate(x, axis=1) for x in zip(dense.couplings, dense.templates, strict=True))
+    taken = np.repeat([k in used for k in range(n)], [len(rest) for rest in dense.rest])
+    every = (block_diag(*own), np.concatenate(dense.noise), np.concatenate(dense.rest))
+    rows, noise, rest = (x[taken] for x in every)
+    white = white_posterior(rows @ unmixed, np.ones(n * size), noise, rest)
+    covariance = unmixed @ white.covariance @ unmixed.T
+    return Answer(unmixed @ white.mean, covariance, white.log_prob)
 
 
 def part(k: int, sky: bool = True) -> slice:
@@ -129,7 +105,7 @@ def test_skies_and_evidence_are_those_of_one_normal_equation(cube, dense, expect
     alone = sum(channel.log_evidence for channel in cube.channels)
     assert abs(cube.log_evidence - alone) > 0.1
     # other channels do tell: each channel's own posterior would be seen
-    own = dense.solve((1,))
+    own = solved(dense, (1,))
     assert (own.std / expected.std)[part(1)].max() > 1.05
     assert (np.abs(own.mean - expected.mean) / expected.std)[part(1)].max() > 0.05
 
@@ -139,7 +115,7 @@ def test_skies_and_evidence_are_those_of_one_normal_equation(cube, dense, expect
 def test_chi2_is_about_what_the_others_tell_of_the_receivers(cube, dense, expected):
     """N of a channel given the others' data: with the covariance that they leave to its five."""
     for k, channel in enumerate(cube.channels):
-        others = dense.solve(tuple(j for j in range(3) if j != k))
+        others = solved(dense, tuple(j for j in range(3) if j != k))
         t, a, z = dense.templates[k], dense.couplings[k], part(k, sky=False)
         noise = np.diag(dense.noise[k] ** 2) + t @ others.covariance[z, z] @ t.T
         rest = dense.rest[k] - t @ others.mean[z] - a @ expected.mean[part(k)]
@@ -194,7 +170,7 @@ def test_a_resumed_run_is_the_same(scenario, folder, cube, tmp_path, monkeypatch
 @pytest.mark.long
 def test_simulated_receivers_have_the_covariance(response_file):
     """Over seeds, ports and pairs of frequencies: products of normals scatter by 1 to sqrt 2."""
-    scenario = cube_of(response_file, RECEIVER)
+    scenario = cube_of(response_file, NOISE, RECEIVER)
     setup, n_seeds = set_up(scenario.channels()[0]), 150
     values = np.zeros((n_seeds, 3, N_PORTS))
     for seed in range(n_seeds):
@@ -217,27 +193,20 @@ def test_simulated_receivers_have_the_covariance(response_file):
 
 def test_seeds_of_simulated_receivers(response_file):
     """A cube has one function; another seed, port or treatment of the scenario another, or not."""
-    scenario = cube_of(response_file, RECEIVER)
+    scenario = cube_of(response_file, NOISE, RECEIVER)
     assert {c.noise.receiver.smooth_seed for c in scenario.channels()} == {scenario.seed}
     assert len({c.seed for c in scenario.channels()}) == 3
-    plain = cube_of(response_file, "noise.receiver={power_k: 2000}")
-    assert all(c.noise == plain.noise for c in plain.channels())
     one = four_ports(response_file, RECEIVER, "frequency_mhz=22")
-    last = scenario.channels()[2]
-    setup = set_up(last)
+    setup = set_up(scenario.channels()[2])
     assert true_values(setup) == true_values(replace(setup, scenario=one))
-
-
-def test_refused_in_one_sentence(response_file):
-    given = response_file, "spectral={components: [power_law]}", RECEIVER
-    refuse("with joint, leave it out", cube_of, *given, "joint=true")
-    refuse("greater than 0", cube_of, *given, "noise.receiver.smooth_octaves=0")
+    joint = "spectral={components: [power_law]}", RECEIVER, "joint=true"
+    refuse("with joint, leave it out", cube_of, response_file, *joint)
 
 
 @pytest.mark.usefixtures("numbers_alone")
 def test_after_earlier_data_residuals_are_those_of_the_new_ones(response_file, tmp_path):
     """No other frequency is near: what ties channels changes none of their numbers."""
-    given = (response_file, GROUND, "output={draws: 50, information: true}")
+    given = (response_file, NOISE, GROUND, "output={draws: 50, information: true}")
     alone, tied = (
         cube_of(*given, receiver, frequencies="[15, 20]")
         for receiver in (NOT_SMOOTH, f"{NOT_SMOOTH[:-1]}, smooth_octaves: 0.01}}")
@@ -255,3 +224,76 @@ def test_after_earlier_data_residuals_are_those_of_the_new_ones(response_file, t
         # of 16 modes: half a chi^2 of 16 about the likelihood of the mean, 50 times
         likely = [one.log_likelihood.mean() for one in (got, expected)]
         assert likely[0] == pytest.approx(likely[1], abs=5.0)
+
+
+# --- channels of their own, and joint ones -------------------------------------------------------
+
+
+@pytest.mark.long
+def test_a_channel_has_those_of_its_own_map(response_file, tmp_path, monkeypatch):
+    drawn = dict.fromkeys(map_run.MAP.figures, lambda _: Figure())
+    drawn["unknowns"] = map_run.MAP.figures["unknowns"]
+    monkeypatch.setattr(map_run, "MAP", replace(map_run.MAP, figures=drawn))
+    scenario = cube_of(response_file, *PLAIN, TABLE, frequencies="[15, 20]")
+    run = lb.run_map(scenario, tmp_path / "cube")
+    written = pd.read_csv(tmp_path / "cube" / "unknowns.csv", keep_default_na=False)
+    assert list(written)[:3] == ["frequency_mhz", "unknown", "unit"]
+    nulls = {}
+    for channel in run.result.scenario.channels():
+        experiment = lb.build(channel)
+        expected = unknowns_report(experiment, lb.infer(experiment))
+        nulls[channel.frequency_mhz] = expected.null
+        here = written[written["frequency_mhz"] == channel.frequency_mhz].reset_index(drop=True)
+        assert list(here["unknown"]) == list(expected.table["unknown"]) and len(here) == 9
+        off = (here["value"] - expected.table["value"]) / expected.table["std"]
+        assert np.abs(off).max() < ROUGH
+        for name in ["std", "prior", "prior_std", "true"]:
+            np.testing.assert_allclose(here[name], expected.table[name], rtol=ROUGH)
+        (found,) = (c for c in run.result.channels if c.frequency_mhz == channel.frequency_mhz)
+        assert found.unknowns.null.names == expected.null.names
+        assert found.unknowns.null.share == pytest.approx(expected.null.share, rel=ROUGH)
+        np.testing.assert_allclose(found.unknowns.null.weights, expected.null.weights, atol=1e-4)
+    # the mean power of receivers goes with frequency
+    receivers = written[written["unknown"] == "receiver_0_k"]["prior"]
+    assert receivers.iloc[0] == pytest.approx(receivers.iloc[1] * (20.0 / 15.0) ** 2)
+    lines = run.result.lines()
+    untold = "Receivers, ground and gain table: the data do not tell regolith_k (at 2 of 2 frequenc"
+    (line,) = (line for line in lines if line.startswith(untold))
+    (sentence,) = (line for line in lines if line.startswith("One combination of what looks alike"))
+    worst = max(nulls, key=lambda frequency: nulls[frequency].share)
+    assert f"at 2 of 2 frequencies. At {worst:g} MHz ({nulls[worst].words()}, in" in sentence
+    page = map_page(tmp_path / "cube", "a run")
+    assert line in page and sentence in page
+    assert "Powers of receivers" in page and page.count("<td>regolith_k</td><td>K</td>") == 2
+
+
+def test_in_a_joint_posterior_they_are_those_of_all_skies_and_unknowns_together(
+    response_file, tmp_path
+):
+    """Every sky and every unknown as one Gaussian in NumPy."""
+    spectral = "spectral.components=[power_law]"
+    given = (*PLAIN, "joint=true", spectral)
+    scenario = cube_of(response_file, *given, frequencies="[15, 20, 25]")
+    channels = map_channels(scenario, tmp_path)
+    prior = channels.joint.prior
+    stds = [np.sqrt(np.asarray(per_mode(c))) for c in (prior.spectra[0], *prior.residual)]
+    stds = np.concatenate([*stds, np.ones(3 * N_OWN)])
+    dense = DenseChannels.of(scenario)
+    common = [float(x) * a for x, a in zip(prior.mixing[:, 0], dense.couplings, strict=True)]
+    own = (block_diag(*blocks) for blocks in (dense.couplings, dense.templates))
+    a = np.concatenate([np.concatenate(common), *own], axis=1)
+    noise, rest = np.concatenate(dense.noise), np.concatenate(dense.rest)
+    expected = white_posterior(a, stds, noise, rest)
+    experiments = [lb.build(channel) for channel in scenario.channels()]
+    tables = [unknowns_report(e, lb.infer(e)).table for e in experiments]
+    alone = pd.concat(tables, ignore_index=True)
+    table = channels.unknowns.table
+    scale, own = table["prior_std"].to_numpy(), slice(4 * N_MODES, None)
+    std = scale * expected.std[own]
+    off = (table["value"] - table["prior"] - scale * expected.mean[own]) / std
+    assert np.abs(off).max() < 1e-4
+    np.testing.assert_allclose(table["std"], std, rtol=1e-4)
+    np.testing.assert_allclose(table["true"], alone["true"], rtol=1e-12)
+    # other channels do tell: the test would see a table of each channel's own data
+    assert (np.abs(table["value"] - alone["value"]) / std).max() > 0.05
+    assert all(channel.unknowns.null is None for channel in channels.channels)

@@ -14,13 +14,10 @@ from lusee_bayes.results.map_files import information_file, read_information
 from lusee_bayes.runs import map_run
 
 # N of the parts is that of the whole: about the model, and not about each one's data
-SIZES = [
-    "lmax=4",
-    "observation.runs=[{cycles: 0.1}, {cycles: 0.1, turntable_deg: 30}]",
-    "noise.radiometer.temperature=model",
-    "output.information=true",
-]
-LEARNED = "prior={model: isotropic}"
+SIZES = ["lmax=4", "observation.runs=[{cycles: 0.1}, {cycles: 0.1, turntable_deg: 30}]"]
+SIZES += ["noise.radiometer.temperature=model", "output.information=true"]
+GIVEN, LEARNED = "prior={model: isotropic, spectrum: sky}", "prior={model: isotropic}"
+CUBE = "frequencies_mhz=[20, 25, 30]"
 JOINT = ["joint=true", "spectral.components=[power_law]"]
 
 
@@ -42,57 +39,45 @@ def in_parts(scenario, folder):
 SIGMA, EVIDENCE = 1e-4, 1e-3
 
 
-def assert_equal(found, expected, *, than):
-    for here, there, alone in zip(found.channels, expected.channels, than.channels, strict=True):
-        assert_same_map(here, there, SIGMA)
-        # the first part alone would be seen
-        assert (np.abs(alone.mean - there.mean) / there.std).max() > 0.5
-    assert found.log_evidence == pytest.approx(expected.log_evidence, abs=EVIDENCE)
-
-
-@pytest.mark.parametrize(
-    "prior", ["prior={model: isotropic, spectrum: sky}", LEARNED], ids=["given", "learned"]
-)
-def test_a_map_is_that_of_all_data(prior, tmp_path, exact_tilt):
-    """A prior that is learned is learned anew, from all of them."""
-    scenario = lb.load_scenario("fiducial", [*SIZES, prior])
-    whole, first, both = in_parts(scenario, tmp_path)
-    assert_equal(both, whole, than=first)
-    if prior == LEARNED:
-        for here, there in zip(both.channel.parameters, whole.channel.parameters, strict=True):
-            assert here["value"] == pytest.approx(there["value"], abs=1e-3 * there["std"])
-        assert both.channel.parameters != first.channel.parameters
-    # residuals are those of the new data, and they fit
-    assert both.channel.n_data == whole.channel.n_data - first.channel.n_data
-    assert both.fit.level == "consistent"
-
-
 @pytest.mark.parametrize(
     "kind",
     [
-        pytest.param(["prior={model: isotropic, spectrum: sky}"], id="independent"),
-        pytest.param([LEARNED], id="learned", marks=pytest.mark.long),
-        pytest.param(JOINT, id="joint"),
+        pytest.param([GIVEN], id="map"),
+        pytest.param([LEARNED], id="learned map"),
+        pytest.param([CUBE, GIVEN], id="independent"),
+        pytest.param([CUBE, LEARNED], id="learned", marks=pytest.mark.long),
+        pytest.param([CUBE, *JOINT], id="joint"),
     ],
 )
-def test_channels_are_those_of_all_data(kind, tmp_path, exact_tilt):
-    scenario = lb.load_scenario("fiducial", [*SIZES, "frequencies_mhz=[20, 25, 30]", *kind])
+def test_a_map_is_that_of_all_data(kind, tmp_path, exact_tilt):
+    """A prior that is learned is learned anew, from all of them."""
+    scenario = lb.load_scenario("fiducial", [*SIZES, *kind])
     whole, first, both = in_parts(scenario, tmp_path)
-    assert_equal(both, whole, than=first)
-    assert both.fit.level == whole.fit.level == "consistent"
-    if kind == JOINT:
-        # one posterior of all data: whatever is told of them is of all
-        np.testing.assert_allclose(both.fits().chi2, whole.fits().chi2, rtol=1e-4)
-        assert both.fits().rest.chi2 == pytest.approx(whole.fits().rest.chi2, rel=1e-3)
-        assert both.fits().rest.degrees == pytest.approx(whole.fits().rest.degrees, rel=1e-3)
-        for here, there in zip(both.channels, whole.channels, strict=True):
-            assert here.n_data == there.n_data
+    joint = "joint=true" in kind
+    for here, there, alone in zip(both.channels, whole.channels, first.channels, strict=True):
+        assert_same_map(here, there, SIGMA)
+        # the first part alone would be seen
+        assert (np.abs(alone.mean - there.mean) / there.std).max() > 0.5
+        # residuals are those of the new data, or of one posterior of all data
+        assert here.n_data == there.n_data - (0 if joint else alone.n_data)
+        if joint:
             assert (np.abs(here.independent - there.independent) / there.std).max() < SIGMA
+    assert both.log_evidence == pytest.approx(whole.log_evidence, abs=EVIDENCE)
+    assert both.fit.level == whole.fit.level == "consistent"
+    if kind == [LEARNED]:
+        for here, there in zip(both.channel.parameters, whole.channel.parameters, strict=True):
+            assert here["value"] == pytest.approx(there["value"], abs=1e-3 * there["std"])
+        assert both.channel.parameters != first.channel.parameters
+    if joint:
+        here, there = both.fits(), whole.fits()
+        np.testing.assert_allclose(here.chi2, there.chi2, rtol=1e-4)
+        assert here.rest.chi2 == pytest.approx(there.rest.chi2, rel=1e-3)
+        assert here.rest.degrees == pytest.approx(there.rest.degrees, rel=1e-3)
     # and it can go on
-    for channel in scenario.channels():
+    for channel in scenario.channels() or (scenario,):
         kept = read_information(information_file(tmp_path / "both"), channel)
         assert len(kept.digests) == 2
-        assert kept.information.n_data == 2 * first.channel.n_data
+        assert kept.information.n_data == 2 * first.channels[0].n_data
 
 
 def test_a_stopped_run_does_not_go_on_with_other_earlier_data(tmp_path):

@@ -1,7 +1,5 @@
 """Averages of a file, and what they cost: as a user meets them, and against closed forms."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from commands import refused, run
@@ -9,7 +7,6 @@ from experiments import flagged
 
 import lusee_bayes as lb
 from lusee_bayes.cli.options import parse_duration
-from lusee_bayes.experiment.model import set_up
 from lusee_bayes.instrument.averaging import averaged
 from lusee_bayes.instrument.visibilities import read_visibilities
 from lusee_bayes.testing.scenarios import small_scenario
@@ -31,20 +28,6 @@ def data():
 @pytest.fixture
 def path(data, tmp_path):
     return data.write(tmp_path / "data.nc")
-
-
-def test_the_mean_of_a_signal_is_the_signal_of_the_mean(data):
-    """A of averages is that of their windows, with flags that leave some samples out."""
-    flags = np.random.default_rng(4).random((16, data.layout.n_times)) < 0.05
-    some = flagged(data, flags)
-    setup = set_up(scenario(), some)
-    signal = replace(some, data=some.layout.gather(np.asarray(setup.signal)))
-    coarse = averaged(signal, 4 * 1800.0)
-    assert 0 < coarse.layout.size < signal.layout.size
-    seen = set_up(scenario(), coarse)
-    expected = coarse.layout.gather(np.asarray(seen.signal))
-    # integrals over windows of both are exact to 1e-10
-    np.testing.assert_allclose(coarse.data, expected, rtol=0, atol=1e-9 * expected.max())
 
 
 def test_what_is_lost_is_small_and_grows_with_the_square_of_the_length(path, tmp_path):

@@ -209,6 +209,9 @@ def test_what_too_few_channels_cannot_be_is_named(gap, tmp_path, numbers_alone):
     other = three(frequencies="[40, 45]")
     refuse("no channel can be mapped: 40 MHz: ", lb.run_map, other, tmp_path, data=gap)
     refuse("no data at", lb.run_map, three(), tmp_path, data=tmp_path / "gone.fits")
+    lmax_of_fields = scenario_of().spectral.lmax_of_fields
+    refuse(r"lmax 80 have 13122 unknowns.*use lmax=69", lmax_of_fields, 80)
+    assert lmax_of_fields(60) == 69
 
 
 @pytest.mark.long
@@ -305,9 +308,3 @@ def test_joint_maps_of_low_frequencies_are_no_worse_than_independent_ones(tmp_pa
         z = (modes_to_map(channel.mean - channel.truth, nside) / channel.pixel_std)[centre]
         # lmax 10 resolves one or two places there: 3 sigma at most
         assert np.sqrt((z**2).mean()) < 3.0
-
-
-def test_bad_input_is_refused_in_a_sentence():
-    lmax_of_fields = scenario_of().spectral.lmax_of_fields
-    refuse(r"lmax 80 have 13122 unknowns.*use lmax=69", lmax_of_fields, 80)
-    assert lmax_of_fields(60) == 69

@@ -21,14 +21,8 @@ from lusee_bayes.report.map_page import flight_section
 from lusee_bayes.report.rendering import render
 from lusee_bayes.runs.data_run import reduced_lines, run_simulate_flight
 
-SET = [
-    "lmax=3",
-    "frequency_mhz=20",
-    "observation.step_s=900",
-    "observation.runs=[{cycles: 0.003}]",
-    "noise.radiometer.form=exact",
-    "flight={per_kelvin_v2_hz: 1e-21}",
-]
+SET = ["lmax=3", "frequency_mhz=20", "observation.step_s=900", "observation.runs=[{cycles: 0.003}]"]
+SET += ["noise.radiometer.form=exact", "flight={per_kelvin_v2_hz: 1e-21}"]
 
 
 def simulate(folder, *more, force=False):
@@ -168,9 +162,13 @@ def reduced(of_two_bands):
     return reduce_files(sessions, scenario)
 
 
+def page_of(reduced, folder):
+    write_reduced(folder / "reduced.nc", reduced)
+    return render("flight.html", folder, flight=flight_section(folder))
+
+
 def test_the_section_says_how_spectra_were_reduced(reduced, tmp_path):
-    write_reduced(tmp_path / "reduced.nc", reduced)
-    page = render("flight.html", tmp_path, flight=flight_section(tmp_path))
+    page = page_of(reduced, tmp_path)
     for told in (
         "gains.nc (netCDF)",
         "the centre of channel k is at k times 25 kHz",
@@ -187,9 +185,7 @@ def test_files_of_older_versions_are_described_as_far_as_they_say_it(reduced, tm
     new = ("scale", "rate", "clock_file")
     (session,) = reduced.sessions
     session = {name: value for name, value in session.items() if name not in new}
-    older = replace(reduced, sessions=(session,), recipe={})
-    write_reduced(tmp_path / "reduced.nc", older)
-    page = render("flight.html", tmp_path, flight=flight_section(tmp_path))
+    page = page_of(replace(reduced, sessions=(session,), recipe={}), tmp_path)
     assert "longitude 182.258°, latitude -23.814°<" in page
     assert "of the clock file" in page and "0x307" in page
     assert read_reduced(tmp_path / "reduced.nc").notes() == ()

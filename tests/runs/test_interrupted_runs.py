@@ -64,11 +64,8 @@ COMMANDS = {
     ),
     "paper": (["paper"], "unfinished-cases"),
 }
-RESUME = {
-    "cube": "the same command continues from the finished channels",
-    "sample": "go on with --resume",
-    "paper": "the same command continues from the finished cases",
-}
+AGAIN = "the same command continues from the finished"
+RESUME = {"cube": f"{AGAIN} channels", "sample": "go on with --resume", "paper": f"{AGAIN} cases"}
 
 
 class Command:

@@ -81,10 +81,9 @@ def test_samples_have_the_moments_of_weighted_draws(tmp_path):
 
 
 def test_the_scenario_says_what_is_sampled():
-    learned, known = (
-        program_pieces(lb.build(small_scenario(section, lmax=LMAX, cycles=0.1)))["log_normal"]()
-        for section in (NO_SOURCES, "log_normal={amplitude: 0.02, tilt: -2.0}")
-    )
+    sections = NO_SOURCES, "log_normal={amplitude: 0.02, tilt: -2.0}"
+    built = (lb.build(small_scenario(section, lmax=LMAX, cycles=0.1)) for section in sections)
+    learned, known = (program_pieces(experiment)["log_normal"]() for experiment in built)
     assert learned.sites == ("amplitude", "tilt", "structure")
     assert known.sites == ("structure",) and learned.sky.size == n_modes(LMAX) < known.sky.size
     expected = np.sqrt(0.02**2 * (np.arange(2.0, LMAX + 2.0) / 10.0) ** -2.0)

@@ -4,44 +4,41 @@ Truths are drawn from a program's own priors, data from the truths (by the progr
 draws from the posterior by Hamiltonian Monte Carlo about the mode found for each data set.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import equinox as eqx
 import numpy as np
 import pytest
-from experiments import draw_within, four_ports, unknowns_report
+from experiments import (
+    draw_within,
+    drawn,
+    four_ports,
+    sky_and_amplitudes,
+    unknowns_report,
+    with_known_sky,
+)
 from numpyro import handlers
 from scipy import stats
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.experiment import Experiment, program_pieces
-from lusee_bayes.experiment.model import full_model, set_up, simulate, true_values
+from lusee_bayes.experiment.experiment import program_pieces
+from lusee_bayes.experiment.model import full_model, set_up, true_values
 from lusee_bayes.experiment.rounds import settled
 from lusee_bayes.experiment.unknowns import SKY
 from lusee_bayes.judge.coverage import LEVELS
-from lusee_bayes.linear.amplitudes import template_amplitudes
 from lusee_bayes.sampling.hmc import Sampler
 from lusee_bayes.sampling.programs import numpyro_promotion
 from lusee_bayes.sampling.validation import FALSE_ALARM, N_DRAWS, Ranks, calibrate
-from lusee_bayes.systematics.context import Setup
 from lusee_bayes.systematics.gain_drifts import SCALES
 from lusee_bayes.systematics.gain_table import COMMON_GAIN
 from lusee_bayes.systematics.systematic import Chart
 
 TINY = ("lmax=6", "observation.runs.0.cycles=0.02")  # 96 data, 49 modes
 MONTH = ("lmax=6", "observation.step_s=172800")  # a sample every other day: all sources rise
-LEVELS_UNKNOWN = (
-    "noise.radiometer.log_factor_std=0.5",
-    "prior.log_amplitude_std=0.5",
-    "prior.tilt_std=0.5",
-)
-SOURCES = (
-    "sources.treatment=sampled",
-    "sources.list=[{name: Cas A}, {name: Cyg A}, {name: For A}, "
-    "{name: Jupiter, flux_jy: 100000, stokes_v: 0.3}]",
-)
+SPECTRUM = "prior.log_amplitude_std=0.5", "prior.tilt_std=0.5"
+LEVEL = "noise.radiometer.log_factor_std=0.5"
+JUPITER = "{name: Jupiter, flux_jy: 100000, stokes_v: 0.3}"
+SOURCES = f"sources.list=[{{name: Cas A}}, {{name: Cyg A}}, {{name: For A}}, {JUPITER}]"
 
 
 def pieces(name: str, *overrides: str):
@@ -62,19 +59,27 @@ class Truth(eqx.Module):
         return {name: site["value"] for name, site in trace.items()}, data
 
 
+def hmc(warmup: int) -> Sampler:
+    return Sampler(warmup=warmup, draws=N_DRAWS, algorithm="hmc")
+
+
 class Draws(eqx.Module):
-    """Draws of one chain in the coordinates about the mode of each data set."""
+    """Draws of one chain about the mode of each data set; of sky and drifts in their chart."""
 
     program: object = eqx.field(static=True)
     arguments: dict
     sampler: Sampler = eqx.field(static=True)
     starts: int = eqx.field(static=True, default=1)
+    chart: Chart | None = None
+    thin: int = eqx.field(static=True, default=1)
 
     def __call__(self, key, data):
-        arguments = {**self.arguments, "data": data}
-        approximation = lb.laplace_approximation(self.program.model, arguments, starts=self.starts)
-        whitening = approximation.whitening
-        return draw_within(self.program.model, arguments, key, self.sampler, whitening)
+        model, arguments = self.program.model, {**self.arguments, "data": data}
+        start, hold = None, ()
+        if self.chart is not None:
+            start, hold = {"sky": marginalised(arguments, data).mean}, SCALES
+        found = lb.laplace_approximation(model, arguments, start, hold, self.starts, self.chart)
+        return draw_within(model, arguments, key, self.sampler, found.whitening, self.thin)
 
 
 class Sites(eqx.Module):
@@ -88,17 +93,10 @@ class Sites(eqx.Module):
 
 def ranks_of(program, arguments, quantities, *, draws=None, n=100, seed=1, regions=()) -> Ranks:
     """One data set after the other: in a batch, each would wait for the slowest."""
-    sampler = Sampler(warmup=60, draws=N_DRAWS, algorithm="hmc")
+    given = Truth(program, arguments), draws or Draws(program, arguments, hmc(60)), quantities
+    options = {"n_simulations": n, "seed": seed, "one_by_one": True, "regions": regions}
     with numpyro_promotion():
-        return calibrate(
-            Truth(program, arguments),
-            draws or Draws(program, arguments, sampler),
-            quantities,
-            n_simulations=n,
-            seed=seed,
-            one_by_one=True,
-            regions=regions,
-        )
+        return calibrate(*given, **options)
 
 
 def limits(ranks: Ranks, level: float) -> tuple[float, float]:
@@ -119,14 +117,14 @@ def assert_calibrated(ranks: Ranks):
 
 @pytest.mark.long
 def test_noise_level_amplitude_and_tilt():
-    program, arguments = pieces("systematics", *TINY, *LEVELS_UNKNOWN)
+    program, arguments = pieces("systematics", *TINY, LEVEL, *SPECTRUM)
     found = ranks_of(program, arguments, Sites(("noise_level", "amplitude", "tilt")))
     assert_calibrated(found)
 
 
 @pytest.mark.long
 def test_fluxes_of_sources_at_rest_and_of_jupiter():
-    program, arguments = pieces("systematics", *MONTH, *SOURCES)
+    program, arguments = pieces("systematics", *MONTH, SOURCES, "sources.treatment=sampled")
     names = tuple(f"flux_{name}" for name in ("Cas_A", "Cyg_A", "For_A", "Jupiter"))
     assert_calibrated(ranks_of(program, arguments, Sites(names)))
 
@@ -140,8 +138,7 @@ def test_permittivity_loss_tangent_and_tilt():
     (antennas,) = arguments["systematics"]
     coarse = replace(antennas, instrument=replace(antennas.instrument, nodes=(12, 16)))
     arguments = {**arguments, "systematics": (coarse,)}
-    sampler = Sampler(warmup=40, draws=N_DRAWS, algorithm="hmc")
-    draws = Draws(program, arguments, sampler, starts=3)
+    draws = Draws(program, arguments, hmc(40), starts=3)
     found = ranks_of(program, arguments, Sites(antennas.names), draws=draws)
     assert_calibrated(found)
 
@@ -155,30 +152,10 @@ def marginalised(arguments, data):
     around = data
     for _ in range(4):
         seen = drifts.layout.scatter(around)
-        posterior = (
-            replace(drifts, visibilities=seen).marginalised(gaussian).condition(data).posterior
-        )
+        model = replace(drifts, visibilities=seen).marginalised(gaussian)
+        posterior = model.condition(data).posterior
         around = gaussian.predict(posterior.mean)
     return posterior
-
-
-class SampledDrifts(eqx.Module):
-    """Draws of sky and drifts together, as ``lusee-bayes sample`` makes them."""
-
-    program: object = eqx.field(static=True)
-    arguments: dict
-    chart: Chart
-    thin: int = eqx.field(static=True)
-
-    def __call__(self, key, data):
-        arguments = {**self.arguments, "data": data}
-        start = {"sky": marginalised(arguments, data).mean}
-        approximation = lb.laplace_approximation(
-            self.program.model, arguments, start, SCALES, chart=self.chart
-        )
-        sampler = Sampler(warmup=100, draws=N_DRAWS, algorithm="hmc")
-        whitening = approximation.whitening
-        return draw_within(self.program.model, arguments, key, sampler, whitening, self.thin)
 
 
 class MarginalisedDrifts(eqx.Module):
@@ -201,18 +178,17 @@ class SkyAsAWhole(eqx.Module):
         return {"mode": sky[::6], "distance": (white**2).sum()}
 
 
-def drifting(drift: str):
+def drifting(drift: str, thin: int):
     program, arguments = pieces("gains", *TINY, f"noise.gain={{{drift}, treatment: sampled}}")
     chart = arguments["gain_drifts"].chart(arguments["gaussian"])
-    return program, arguments, chart
+    return program, arguments, Draws(program, arguments, hmc(100), chart=chart, thin=thin)
 
 
 @pytest.mark.long
 def test_strong_drifts_are_calibrated_where_they_are_sampled_and_not_where_marginalised():
     """sigma_g = 0.05 against noise of 1e-5: second order is not enough for the sky as a whole."""
-    program, arguments, chart = drifting("sigma: 0.05, correlation_h: 10")
+    program, arguments, draws = drifting("sigma: 0.05, correlation_h: 10", 3)
     quantities, regions = SkyAsAWhole(arguments), ("distance",)
-    draws = SampledDrifts(program, arguments, chart, 3)
     exact = ranks_of(program, arguments, quantities, draws=draws, n=200, regions=regions)
     assert_calibrated(exact)
     draws = MarginalisedDrifts(arguments)
@@ -227,9 +203,8 @@ def test_strong_drifts_are_calibrated_where_they_are_sampled_and_not_where_margi
 def test_strength_and_correlation_time_of_drifts():
     """Sampled with the drifts themselves and the sky."""
     scales = "sigma: 0.02, correlation_h: 10, log_sigma_std: 0.5, log_correlation_std: 0.2"
-    program, arguments, chart = drifting(scales)
+    program, arguments, draws = drifting(scales, 8)
     quantities = Sites(("gain_sigma", "gain_correlation_h"))
-    draws = SampledDrifts(program, arguments, chart, 8)
     assert_calibrated(ranks_of(program, arguments, quantities, draws=draws))
 
 
@@ -237,41 +212,24 @@ def test_strength_and_correlation_time_of_drifts():
 
 
 N = 100
-UNKNOWN = (
-    "noise.receiver={power_k: 2000}",
-    "noise.regolith={std_k: 30}",
-    "noise.gain_table={std: 0.01}",
-)
+GROUND = "noise.regolith={std_k: 30}"
+UNKNOWN = "noise.receiver={power_k: 2000}", GROUND, "noise.gain_table={std: 0.01}"
 # modes of the sky whose ranks are taken: one of every ell, and some with m != 0
 MODES = (0, 2, 3, 6, 8, 12)
 
 
-def drawn(first: Setup, seed: int) -> tuple[Setup, Experiment]:
-    """The setup with a sky drawn from its prior, and data of it; N is that of the model sky."""
-    z = np.random.default_rng(seed).standard_normal(first.prior.size)
-    sky = replace(first.sky, modes=np.asarray(first.prior.colour(z)) + first.prior.mean)
-    scenario = first.scenario.model_copy(update={"seed": seed})
-    setup = replace(first, sky=sky, scenario=scenario)
-    return setup, Experiment(setup, simulate(setup))
-
-
 @pytest.mark.long
 def test_simulation_based_calibration(response_file):
-    first = set_up(four_ports(response_file, *UNKNOWN))
     # known to a fifth, so that no sky is without a signal
-    spectrum = 0.04 * np.asarray(first.prior.spectrum)
-    first = replace(first, prior=lb.HarmonicPrior(spectrum, mean=first.sky.modes))
+    first = with_known_sky(set_up(four_ports(response_file, *UNKNOWN)), 0.04)
     sky_std = np.sqrt(np.asarray(first.prior.variance()))
     ranks, null, shares = [], [], []
     for seed in range(N):
-        setup, experiment = drawn(first, seed)
+        experiment = drawn(first, seed)
+        setup = experiment.setup
         found, truth = settled(setup, experiment.data), true_values(setup)
-        columns = np.concatenate([np.asarray(s.columns) for s in found.systematics], axis=1)
-        told = template_amplitudes(found.solution, columns)
-        sky_covariance = np.asarray(found.posterior.covariance())
-        expected = np.concatenate([s.expected for s in found.systematics])
-        mean = np.concatenate([np.asarray(found.posterior.mean), expected + told.mean])
-        covariance = np.block([[sky_covariance, told.with_sky], [told.with_sky.T, told.covariance]])
+        mean, covariance = sky_and_amplitudes(found)
+        mean[16:] += np.concatenate([s.expected for s in found.systematics])
         rng = np.random.default_rng((seed, 1))
         draws = rng.multivariate_normal(mean, covariance, N_DRAWS, method="cholesky")
         z = [(truth[f"receiver_{port}_k"] - 2000.0) / 200.0 for port in range(4)]

@@ -3,8 +3,6 @@
 Small dense models against scipy; a scenario's own, of condition 1e12, against decimal arithmetic.
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,15 +19,11 @@ from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.noise.covariance import Covariance, DenseCovariance, LowRankCovariance
 from lusee_bayes.noise.instrument_errors import difference
 from lusee_bayes.sampling.programs import numpyro_promotion
-from lusee_bayes.systematics.context import Around, Setup
+from lusee_bayes.systematics.context import Around
 from lusee_bayes.systematics.noise_level import NoiseLevel
 from lusee_bayes.systematics.prior_spectrum import PriorSpectrum
 from lusee_bayes.systematics.sources import PointSources, Source
-from lusee_bayes.systematics.systematic import (
-    MOST_COLLAPSED,
-    AdditiveNoise,
-    Marginalised,
-)
+from lusee_bayes.systematics.systematic import MOST_COLLAPSED, AdditiveNoise, Marginalised
 
 LMAX, N_DATA = 4, 40
 ELLS = np.arange(LMAX + 1)
@@ -44,11 +38,8 @@ class Case:
         self.a, self.spectrum = rng.normal(size=(N_DATA, 25)), 4.0 / (1.0 + ELLS)
         self.n = 3.0 * random_covariance(rng, N_DATA)
         self.data = 3.0 * rng.normal(size=N_DATA)
-        self.model = lb.LinearGaussian(
-            jnp.asarray(self.a),
-            lb.HarmonicPrior(jnp.asarray(self.spectrum)),
-            DenseCovariance(jnp.asarray(self.n)),
-        )
+        prior, noise = lb.HarmonicPrior(self.spectrum), DenseCovariance(jnp.asarray(self.n))
+        self.model = lb.LinearGaussian(jnp.asarray(self.a), prior, noise)
 
     def evidence(self, factors=1.0, level=1.0, more=0.0, mean=0.0) -> float:
         """ln N(d; mean, A S A^T + level N + more) with C_ell times ``factors``."""
@@ -79,41 +70,34 @@ CLOSE = 1e-11
 # --- one by one -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("level", [0.2, 1.0, 7.0])
-def test_the_noise_level_is_a_ratio_of_variances(case, level):
-    expected = case.evidence(level=level) + lognorm.logpdf(level, 0.7)
-    got = general(case, [NoiseLevel(0.7)], {"noise_level": level})
-    assert got == pytest.approx(expected, rel=CLOSE)
+def steep(tilt):
+    return ((ELLS + 1) / 10) ** tilt
 
 
-@pytest.mark.parametrize(("amplitude", "tilt"), [(1.0, 0.0), (0.3, -1.0), (5.0, 1.4)])
-def test_amplitude_and_tilt_of_the_spectrum(case, amplitude, tilt):
-    """C_ell A ((ell + 1) / 10)^tilt; either may be known."""
-    steep = ((ELLS + 1) / 10) ** tilt
-    of_amplitude, of_tilt = lognorm.logpdf(amplitude, 0.4), norm.logpdf(tilt, 0.0, 0.6)
-    got = general(case, [PriorSpectrum(0.4, 0.6)], {"amplitude": amplitude, "tilt": tilt})
-    expected = case.evidence(amplitude * steep) + of_amplitude + of_tilt
-    assert got == pytest.approx(expected, rel=CLOSE)
-    got = general(case, [PriorSpectrum(0.4)], {"amplitude": amplitude})
-    assert got == pytest.approx(case.evidence(amplitude) + of_amplitude, rel=CLOSE)
-    got = general(case, [PriorSpectrum(tilt_std=0.6)], {"tilt": tilt})
-    assert got == pytest.approx(case.evidence(steep) + of_tilt, rel=CLOSE)
+def bands(*edges):
+    return PriorSpectrum(edges=edges, log_band_std=0.8)
 
 
 @pytest.mark.parametrize(
-    ("edges", "power", "factors"),
+    ("systematic", "values", "stds", "factors"),
     [
-        ((2,), [0.5, 3.0], [0.5, 0.5, 3.0, 3.0, 3.0]),
-        ((1, 2, 4), [4.0, 0.3, 1.5, 0.7], [4.0, 0.3, 1.5, 1.5, 0.7]),
+        (NoiseLevel(0.7), {"noise_level": 0.2}, [0.7], 1.0),
+        (NoiseLevel(0.7), {"noise_level": 7.0}, [0.7], 1.0),
+        (PriorSpectrum(0.4), {"amplitude": 5.0}, [0.4], 5.0),
+        (PriorSpectrum(tilt_std=0.6), {"tilt": -1.0}, [0.6], steep(-1.0)),
+        (PriorSpectrum(0.4, 0.6), {"amplitude": 0.3, "tilt": 1.4}, [0.4, 0.6], 0.3 * steep(1.4)),
+        # an edge is the first ell of its band; the lowest begins at 0, the highest ends it
+        (bands(2), {"band_power": [0.5, 3.0]}, [0.8], [0.5, 0.5, 3.0, 3.0, 3.0]),
+        (bands(1, 2, 4), {"band_power": [4.0, 0.3, 1.5, 0.7]}, [0.8], [4.0, 0.3, 1.5, 1.5, 0.7]),
     ],
 )
-def test_bands_of_the_spectrum(case, edges, power, factors):
-    """An edge is the first ell of its band; the lowest band begins at 0, the highest ends it."""
-    expected = case.evidence(np.array(factors)) + lognorm.logpdf(power, 0.8).sum()
-    got = general(
-        case, [PriorSpectrum(edges=edges, log_band_std=0.8)], {"band_power": np.array(power)}
-    )
-    assert got == pytest.approx(expected, rel=CLOSE)
+def test_levels_and_spectra_are_factors_of_n_and_c_ell(case, systematic, values, stds, factors):
+    """A ratio of variances; C_ell A ((ell + 1) / 10)^tilt, and powers of bands."""
+    expected = case.evidence(np.asarray(factors), level=values.get("noise_level", 1.0))
+    for (name, value), std in zip(values.items(), stds, strict=True):
+        prior = norm(0.0, std) if name == "tilt" else lognorm(std)
+        expected += prior.logpdf(value).sum()
+    assert general(case, [systematic], values) == pytest.approx(expected, rel=CLOSE)
 
 
 def test_the_program_with_bands(case):
@@ -126,16 +110,6 @@ def test_the_program_with_bands(case):
     got, trace = density(program, arguments, {"band_power": power})
     assert set(trace) == {"band_power", "data"}
     assert got == pytest.approx(expected, rel=CLOSE)
-
-
-# --- priors ---------------------------------------------------------------------------------------
-
-
-def test_marginalised_they_stay_as_they_are(case):
-    """There is no Gaussian for them."""
-    for systematic in (NoiseLevel(0.5), PriorSpectrum(0.5, 0.5), PriorSpectrum(edges=(2,))):
-        assert systematic.marginalised(case.model) is case.model
-        assert not systematic.needs_sky
 
 
 # --- several at once ------------------------------------------------------------------------------
@@ -168,39 +142,21 @@ def test_several_at_once(case):
 
 
 # --- in a scenario --------------------------------------------------------------------------------
-
-ALL = (
-    "noise.radiometer.log_factor_std=0.5",
-    "prior.band_edges=[2, 5]",
-    "prior.log_band_std=0.8",
-    "noise.beam={shift_mhz: 2, treatment: sampled}",
-    "sources={list: [{name: Cas A}, {name: For A, relative_std: 0.2}], treatment: sampled}",
-)
-
-
-def matrices(setup: Setup):
-    """A, the difference to the beams of 27 MHz, diagonals of S and of the radiometer's N."""
-    shift = lb.CouplingMatrix.build(
-        difference(lb.monopole_beams(27.0, 6), setup.beams), setup.pointing
-    )
-    return (
-        np.asarray(setup.coupling.dense()),
-        np.asarray(shift.dense()),
-        np.asarray(setup.prior.variance()),
-        np.asarray(radiometer(setup).diagonal()),
-    )
+SOURCES = "sources.list=[{name: Cas A}, {name: For A, relative_std: 0.2}]"
 
 
 def test_the_level_is_that_of_the_radiometer_only():
     """A sampled noise level leaves a marginalised beam error as it is, and marginalised sources."""
-    sources = ALL[4].replace("sampled", "marginalised")
-    e = small_experiment(ALL[0], "noise.beam.shift_mhz=2", sources)
+    level = "noise.radiometer.log_factor_std=0.5"
+    e = small_experiment(level, "noise.beam.shift_mhz=2", SOURCES)
     setup, data, program = e.setup, e.data, lb.load_program("systematics")
     base, rest = model_to_sample(setup, Around(data))
     assert isinstance(rest[0], NoiseLevel)
     assert all(isinstance(systematic, Marginalised) for systematic in rest[1:]) and len(rest) == 3
     np.testing.assert_array_equal(base.noise.diagonal(), radiometer(setup).diagonal())
-    _, da, s, n = matrices(setup)
+    shift = difference(lb.monopole_beams(27.0, 6), setup.beams)
+    da = np.asarray(lb.CouplingMatrix.build(shift, setup.pointing).dense())
+    s, n = np.asarray(setup.prior.variance()), np.asarray(radiometer(setup).diagonal())
     t = np.stack([np.asarray(r).reshape(-1) for r in setup.responses], axis=1)
     std = PointSources.build(setup.scenario.sources, setup, Around()).stds
     arguments = program_arguments(program, e)
@@ -245,26 +201,22 @@ class Correlated(AdditiveNoise):
 
 @pytest.fixture(scope="module")
 def model():
-    rng = np.random.default_rng(0)
-    return lb.LinearGaussian(
-        jnp.asarray(rng.normal(size=(N_PRODUCTS * N_TIMES, N_MODES))),
-        lb.HarmonicPrior(jnp.ones(3)),
-        lb.DiagonalCovariance(jnp.full(N_PRODUCTS * N_TIMES, 0.1)),
-    )
+    n = N_PRODUCTS * N_TIMES
+    a, noise = np.random.default_rng(0).normal(size=(n, N_MODES)), jnp.full(n, 0.1)
+    prior, noise = lb.HarmonicPrior(jnp.ones(3)), lb.DiagonalCovariance(noise)
+    return lb.LinearGaussian(jnp.asarray(a), prior, noise, jnp.arange(float(n)))
 
 
 def terms():
     layout = DataLayout(N_PRODUCTS, N_TIMES)
     patterns = np.random.default_rng(1).normal(size=(layout.size, 2))
-    return [
-        Pickup("pickup", layout, jnp.asarray(patterns)),
-        Correlated("hum", layout, jnp.arange(float(N_TIMES))),
-    ]
+    hum = Correlated("hum", layout, jnp.arange(float(N_TIMES)))
+    return [Pickup("pickup", layout, jnp.asarray(patterns)), hum]
 
 
 @pytest.mark.parametrize("term", terms(), ids=lambda term: term.name)
 def test_marginalised_and_sampled_are_one_distribution(model, term):
-    """The offset is linear in the site's normals, with the covariance that N is given."""
+    """What is added to the offset is linear in the site's normals, with the covariance in N."""
     dense = np.asarray(term.covariance().dense())
     added = np.asarray(term.marginalised(model).noise.dense() - model.noise.dense())
     np.testing.assert_allclose(added, dense, rtol=0, atol=1e-13)
@@ -282,27 +234,6 @@ def test_marginalised_and_sampled_are_one_distribution(model, term):
     assert float(fn.log_prob(z)) == pytest.approx(float(expected), rel=1e-13)
     root = np.asarray(jax.jit(jax.jacfwd(offset))(jnp.zeros(rank)))
     np.testing.assert_allclose(root @ root.T, dense, rtol=0, atol=1e-12)
-    np.testing.assert_array_equal(offset(jnp.zeros(rank)), 0.0)
+    np.testing.assert_array_equal(offset(jnp.zeros(rank)), model.offset)
     assert term.needs_sky == (rank > MOST_COLLAPSED)
     assert not term.changes_coupling
-
-
-def test_sampled_noise_is_added_to_what_is_there(model):
-    background = jnp.arange(float(model.n_data))
-    given = lb.LinearGaussian(model.coupling, model.prior, model.noise, background)
-    term = terms()[0]
-    with handlers.seed(rng_seed=0), handlers.trace() as trace:
-        sampled = term.sampled(given)
-    expected = background + term.patterns @ trace["pickup_noise"]["value"]
-    np.testing.assert_allclose(sampled.offset, expected, rtol=1e-14)
-
-
-@pytest.mark.parametrize("term", terms(), ids=lambda term: term.name)
-def test_simulated_data_hold_a_draw_of_it(model, term, monkeypatch):
-    monkeypatch.setattr(type(term), "build", classmethod(lambda cls, *args: term))
-    setup, key = small_experiment().setup, jax.random.key(3)
-    truth = type(term).truth(None, setup, key)
-    assert set(truth) == {f"{term.name}_noise"}
-    drawn = np.asarray(type(term).in_data(None, setup, model, truth, key).offset)
-    expected = term.covariance().sample(type(term).own_key(key))
-    np.testing.assert_allclose(drawn, expected, rtol=0, atol=1e-14)
