@@ -64,7 +64,7 @@ def viewer(
     """
     channels = len(frequencies_mhz)
     full, nside = _nsides(maps, channels)
-    pack = _quantised if channels > 1 else _single
+    pack = _quantised if channels > 1 else lambda cube: {"values": packed(cube)}
     maps = {name: _degraded(cube, nside) for name, cube in maps.items()}
     altitude = None if highest_altitude is None else _degraded(highest_altitude[None], nside)[0]
     return {
@@ -125,10 +125,6 @@ def _degraded(cube: Maps, nside: int) -> Maps:
     if healpy.npix2nside(cube.shape[1]) == nside:
         return cube
     return np.stack([healpy.ud_grade(pixels, nside) for pixels in cube])
-
-
-def _single(cube: Maps) -> dict[str, Any]:
-    return {"values": packed(cube)}
 
 
 def _quantised(cube: Maps) -> dict[str, Any]:

@@ -466,15 +466,10 @@ def packed_resolution(
     return np.rint(white / steps[np.ix_(ell, ell)]).astype(np.int8), steps, width
 
 
-def region_nside(nside: int) -> int:
-    """NSIDE of the regions of a map: REGION_NSIDE, or the map's own if that is coarser."""
-    return min(REGION_NSIDE, nside)
-
-
 def region_of(nside: int) -> np.ndarray:
-    """The region (HEALPix RING of :func:`region_nside`) that each pixel (RING) belongs to."""
+    """The region (HEALPix RING) that each pixel (RING) belongs to."""
     nested = healpy.ring2nest(nside, np.arange(healpy.nside2npix(nside)))
-    coarse = region_nside(nside)
+    coarse = min(REGION_NSIDE, nside)
     return healpy.nest2ring(coarse, nested // (nside // coarse) ** 2)
 
 

@@ -112,7 +112,9 @@ def _true(section: BeamErrorSection, setup: Setup, values: Values) -> tuple[Beam
     if section.shift_mhz is not None:
         return source, frequency_mhz + section.shift_mhz
     if section.file is not None:
-        return setup.source_of_file(section.file), frequency_mhz
+        # behind the same receivers, turned as the scenario's
+        other = setup.scenario.beam.of_file(section.file).source()
+        return other.behind(setup.receiver), frequency_mhz
     own = {name: values[name] for name in section.parameters}
     return with_values(source.monopoles, own), frequency_mhz
 

@@ -110,10 +110,6 @@ class Setup:
         grid = (self.layout.n_products, self.layout.n_times)
         return self.layout.gather(np.broadcast_to(self.background[:, None], grid))
 
-    def source_of_file(self, file: str) -> BeamSource:
-        """The beams of another file, behind the same receivers and turned as the scenario's."""
-        return self.scenario.beam.of_file(file).source().behind(self.receiver)
-
     def with_prior(self, section: Any) -> Setup:
         """Return the same with another prior, or family of priors.
 
