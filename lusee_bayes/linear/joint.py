@@ -350,7 +350,7 @@ def channel_sky(
         mean, skies = whole[0], whole[1:]
         if covariance is not None:
             white = linalg.scaled(covariance, 1.0 / residual_root, overwrite=True)
-            white = linalg.whitened(white, lower)
+            white = linalg.inverse_sandwich(white, lower)
             white[np.diag_indices(n_modes)] += 1.0
             white = linalg.sandwich(white, linalg.invert_lower(lower, overwrite=True))
             covariance = linalg.scaled(white, residual_root, overwrite=True)

@@ -151,7 +151,7 @@ def test_products_with_a_triangle(n, xp):
         np.testing.assert_array_equal(found, np.asarray(found).T)
     root = np.linalg.cholesky(spd(n + 1)[:n, :n])
     inverse = np.linalg.inv(root)
-    close(la.whitened(matrix, root), inverse @ matrix @ inverse.T)
+    close(la.inverse_sandwich(matrix, root), inverse @ matrix @ inverse.T)
 
 
 @ARRAYS
