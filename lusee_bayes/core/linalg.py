@@ -186,9 +186,7 @@ def sandwich(matrix: Matrix, lower: Matrix) -> Matrix:
     return symmetric_product(lower.T @ matrix, lower)
 
 
-def inverse_sandwich(
-    matrix: Float[np.ndarray, "n n"], lower: Float[np.ndarray, "n n"]
-) -> np.ndarray:
+def inverse_sandwich(matrix: Matrix, lower: Matrix) -> Matrix:
     """Return L^-1 M L^-T for symmetric M and lower triangular L, symmetric to the last bit."""
     return _sandwiched(1, matrix, lower)
 
