@@ -31,6 +31,7 @@ each S(theta).
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import jax
 import jax.numpy as jnp
@@ -183,6 +184,27 @@ class _Point:
     posterior: Posterior
     value: float
 
+    @cached_property
+    def known(self) -> Square:
+        """How much of the prior's covariance of u the data take away."""
+        return np.eye(self.posterior.prior.size) - inverse_from_cholesky(self.posterior.lower)
+
+    def slope(self, family: PriorFamily) -> Parameters:
+        """Gradient of ln p(d, theta)."""
+        prior, mean = self.posterior.prior, self.posterior.white_mean
+        expected = prior.whiten_columns(prior.whiten_columns(self.known).T)
+        of_data = self.member.forms(prior.whiten_columns((mean - prior.white_mean)[None]).T)[:, 0]
+        return of_data - self.member.traces(expected) + family.hyperprior.gradient(self.parameters)
+
+    def curvature(self, family: PriorFamily, rng: Generator, n: int) -> Square:
+        """Its expected curvature, from simulated data sets."""
+        drawn = _root(self.known) @ rng.standard_normal((len(self.known), n))
+        scores = self.member.forms(self.posterior.prior.whiten_columns(drawn.T).T)
+        scores = scores - scores.mean(1, keepdims=True)
+        curvature = scores @ scores.T / (n - 1.0)
+        curvature[np.diag_indices(len(curvature))] += family.hyperprior.curvature(self.parameters)
+        return curvature
+
 
 def learn(
     family: PriorFamily, information: Information, start: Parameters | None = None, seed: int = 1
@@ -209,7 +231,7 @@ def learn(
     rng = np.random.default_rng(seed)
     here = _at(family, information, family.hyperprior.start() if start is None else start)
     for steps in range(MAX_STEPS + 1):
-        gradient, curvature = _slope(family, here, rng, SIMULATIONS)
+        gradient, curvature = here.slope(family), here.curvature(family, rng, SIMULATIONS)
         step = np.linalg.solve(curvature, gradient)
         gain = 0.5 * float(gradient @ step)
         if gain < SETTLED:
@@ -314,23 +336,6 @@ def _uphill(
     )
 
 
-def _slope(family: PriorFamily, here: _Point, rng: Generator, n: int) -> tuple[Parameters, Square]:
-    """Gradient of ln p(d, theta), and its expected curvature."""
-    prior, posterior, hyperprior = here.posterior.prior, here.posterior, family.hyperprior
-    unknown = np.asarray(inverse_from_cholesky(posterior.lower))
-    known = np.eye(len(unknown)) - unknown
-    expected = prior.whiten_columns(prior.whiten_columns(known).T)
-    pull = prior.whiten_columns((posterior.white_mean - prior.white_mean)[None]).T
-    found = here.member.forms(pull)[:, 0] - here.member.traces(expected)
-    root = _root(known)
-    drawn = prior.whiten_columns((root @ rng.standard_normal((len(root), n))).T).T
-    scores = here.member.forms(drawn)
-    scores = scores - scores.mean(1, keepdims=True)
-    curvature = scores @ scores.T / (n - 1.0)
-    curvature[np.diag_indices(len(curvature))] += hyperprior.curvature(here.parameters)
-    return found + hyperprior.gradient(here.parameters), curvature
-
-
 def _root(known: Square) -> Float[np.ndarray, "n k"]:
     """A root of a covariance with eigenvalues from 0 to 1.
 
@@ -347,8 +352,7 @@ def _root(known: Square) -> Float[np.ndarray, "n k"]:
 def _learned(
     family: PriorFamily, information: Information, here: _Point, rng: Generator, steps: int
 ) -> Learned:
-    _, curvature = _slope(family, here, rng, FINAL_SIMULATIONS)
-    covariance = np.linalg.inv(curvature)
+    covariance = np.linalg.inv(here.curvature(family, rng, FINAL_SIMULATIONS))
 
     def spread(rows: Float[np.ndarray, "rows parameters"]) -> Float[np.ndarray, " rows"]:
         return np.einsum("ij,ij->i", rows @ covariance, rows)

@@ -26,6 +26,7 @@ from lusee_bayes.core.arrays import Ells, Modes, ModesMatrix, Vector
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.harmonics import n_modes, per_mode, sum_over_m, synthesis_matrix
 from lusee_bayes.core.lazy import healpy
+from lusee_bayes.core.linalg import checked_cholesky, scaled
 from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.priors.families import Hyperprior, Member, Parameters, PriorFamily, SpectrumBasis
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, PointSource, galaxy_map
@@ -222,7 +223,7 @@ class LocalScales(PriorFamily):
         return _covariance(self, fluxes, _texture(self, member.spectrum, strengths))
 
     def prior(self, covariance):
-        return DensePrior.of_covariance(covariance, mean=self.mean)
+        return DensePrior(checked_cholesky("the prior covariance", covariance), mean=self.mean)
 
     def start_from(self, coarse, parameters):
         power, *others = coarse._split(parameters)
@@ -236,8 +237,8 @@ class LocalScales(PriorFamily):
 
 
 def _covariance(family: LocalScales, flux: float, texture: ModesMatrix) -> ModesMatrix:
-    sources = flux * (family.sources @ family.sources.T)
-    return family.wide @ family.wide.T + sources + texture
+    columns = np.concatenate([family.wide, np.sqrt(flux) * family.sources], axis=1)
+    return columns @ columns.T + texture
 
 
 def _texture(
@@ -247,7 +248,7 @@ def _texture(
     for band, strength in zip(family.bands, strengths, strict=True):
         scale = _scale(band, spectrum)
         part = band.grid.product_matrix(strength.reshape(band.grid.shape))
-        total[: len(scale), : len(scale)] += scale[:, None] * part * scale
+        total[: len(scale), : len(scale)] += scaled(part, scale, overwrite=True)
     return total
 
 

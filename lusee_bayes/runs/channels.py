@@ -186,7 +186,7 @@ class ChannelInformation:
 
 
 # channels that one task adds up, one after the other
-BLOCK = 4
+BLOCK = 8
 
 
 @dataclass(frozen=True)

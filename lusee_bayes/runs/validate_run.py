@@ -91,20 +91,10 @@ def run_validate(
             )
         if engine is not None:
             engine.work_in(run.path)
-        ranks = calibrate_sky(
-            model,
-            model,
-            n_simulations=simulations,
-            seed=scenario.seed,
-            engine=engine,
-            stages=stages,
-        )
+        more = {"seed": scenario.seed, "engine": engine, "stages": stages}
+        ranks = calibrate_sky(model, model, n_simulations=simulations, **more)
         result = ValidationResult(name, drawn, found, ranks)
         return run.write(result, stages, Provenance.of_experiment(experiment, data))
-
-
-def _of_sampled(output: Output) -> Output:
-    return Output(lambda result, folder: output.write(result.sampled, folder))
 
 
 def _as_markdown(result: ValidationResult) -> str:
@@ -115,7 +105,7 @@ def _as_markdown(result: ValidationResult) -> str:
 VALIDATION = RunKind(
     "validate",
     outputs=(
-        *map(_of_sampled, SAMPLE_OUTPUTS),
+        *(Output(lambda r, folder, o=o: o.write(r.sampled, folder)) for o in SAMPLE_OUTPUTS),
         model_file("validation.json", lambda result: result.summary()),
         text_file("validation.md", _as_markdown),
     ),
