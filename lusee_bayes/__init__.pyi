@@ -33,9 +33,7 @@ from .sampling.evidence import estimate_evidence as estimate_evidence
 from .sampling.hmc import Sampler as Sampler
 from .sampling.hmc import Whitening as Whitening
 from .sampling.hmc import sample as sample
-from .sampling.mode import laplace_approximation as laplace_approximation
 from .sampling.programs import load_program as load_program
-from .sampling.validation import validate_draws as validate_draws
 from .sky.prior import HarmonicPrior as HarmonicPrior
 from .sky.sky_source import Sky as Sky
 from .sky.sky_source import galaxy_sky as galaxy_sky

@@ -17,6 +17,7 @@ from small_models import Case
 import lusee_bayes as lb
 from lusee_bayes.noise.covariance import DenseCovariance
 from lusee_bayes.sampling import evidence as comparison
+from lusee_bayes.sampling.mode import laplace_approximation
 from lusee_bayes.sampling.programs import Program
 
 
@@ -154,7 +155,7 @@ def test_where_there_is_no_mode_nothing_is_found():
         x = numpyro.sample("x", dist.Normal(jnp.zeros(()), 1.0))
         numpyro.factor("ever more", 0.1 * (x - 1.0) ** 4)
 
-    assert not bool(lb.laplace_approximation(model, {"data": None}).converged)
+    assert not bool(laplace_approximation(model, {"data": None}).converged)
     endless = Program("endless", model, "")
     refuse("no mode of the posterior", comparison.estimate_evidence, endless, {}, np.zeros(1))
 

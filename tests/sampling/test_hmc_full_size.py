@@ -10,6 +10,7 @@ import equinox as eqx
 import pytest
 
 import lusee_bayes as lb
+from lusee_bayes.sampling.validation import validate_draws
 
 LMAX = int(os.environ.get("LUSEE_BAYES_TEST_LMAX", "31"))
 
@@ -34,14 +35,14 @@ def test_nuts_agrees_with_every_mean_every_variance_and_the_covariance(scenario)
     )
     draws = chains.sites["sky"]
     assert draws.shape == (4, 500, (LMAX + 1) ** 2)
-    found = lb.validate_draws(
+    found = validate_draws(
         draws, posterior, chains.statistics["diverging"], chains.statistics["energy"]
     )
     assert found.passed, [check for check in found.checks if not check.passed]
     assert found.ess_bulk.min() > 1000
     # standard deviations 2 % off do not pass: total variance: 4 % off, 1 % allowed
     wrong = eqx.tree_at(lambda p: p.lower, posterior, 1.02 * posterior.lower)
-    again = lb.validate_draws(
+    again = validate_draws(
         draws, wrong, chains.statistics["diverging"], chains.statistics["energy"]
     )
     assert not again.passed

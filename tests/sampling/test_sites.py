@@ -23,6 +23,7 @@ import lusee_bayes as lb
 from lusee_bayes.linear.linear_gaussian import FromInformation, InData, InMap
 from lusee_bayes.noise.covariance import DenseCovariance
 from lusee_bayes.sampling.hmc import whitened
+from lusee_bayes.sampling.mode import laplace_approximation
 from lusee_bayes.sampling.programs import numpyro_promotion
 from lusee_bayes.sky.prior import DensePrior
 
@@ -204,7 +205,7 @@ def test_the_gaussian_about_the_mode_of_a_linear_model_is_its_posterior():
     prior = DensePrior.of_covariance(jnp.asarray(half @ half.T + np.eye(9)))
     a, data = (jnp.asarray(rng.standard_normal(shape)) for shape in ((6, 9), 6))
     model = lb.LinearGaussian(a, prior, lb.DiagonalCovariance(jnp.ones(6)))
-    found = lb.laplace_approximation(program.model, {**program.arguments(model), "data": data})
+    found = laplace_approximation(program.model, {**program.arguments(model), "data": data})
     expected, root = model.condition(data).posterior, np.asarray(found.whitening.root)
     np.testing.assert_allclose(found.whitening.mean, expected.mean, atol=1e-9)
     np.testing.assert_allclose(root @ root.T, expected.covariance(), atol=1e-9)

@@ -27,6 +27,7 @@ from lusee_bayes.experiment.rounds import settled
 from lusee_bayes.experiment.unknowns import SKY
 from lusee_bayes.judge.coverage import LEVELS
 from lusee_bayes.sampling.hmc import Sampler
+from lusee_bayes.sampling.mode import laplace_approximation
 from lusee_bayes.sampling.programs import numpyro_promotion
 from lusee_bayes.sampling.validation import FALSE_ALARM, N_DRAWS, Ranks, calibrate
 from lusee_bayes.systematics.gain_drifts import SCALES
@@ -78,7 +79,7 @@ class Draws(eqx.Module):
         start, hold = None, ()
         if self.chart is not None:
             start, hold = {"sky": marginalised(arguments, data).mean}, SCALES
-        found = lb.laplace_approximation(model, arguments, start, hold, self.starts, self.chart)
+        found = laplace_approximation(model, arguments, start, hold, self.starts, self.chart)
         return draw_within(model, arguments, key, self.sampler, found.whitening, self.thin)
 
 
