@@ -85,7 +85,8 @@ class ComponentSums(eqx.Module):
     Attributes
     ----------
     matrices : (pairs, modes, modes) array
-        sum_f s_fc s_fc' M' for c >= c', row by row, in 1/K^2.
+        sum_f s_fc s_fc' M' for c >= c', row by row, in 1/K^2; what is above the diagonal does not
+        count.
     vectors : (components, modes) array
         sum_f s_fc v', in 1/K.
     reference : (components, modes) array
@@ -140,7 +141,7 @@ class ComponentSums(eqx.Module):
         k, n = self.reference.shape
         matrix = np.zeros((k, n, k, n))
         for pair, (i, j) in enumerate(zip(*np.tril_indices(k), strict=True)):
-            matrix[i, :, j] = matrix[j, :, i] = self.matrices[pair]
+            matrix[i, :, j] = matrix[j, :, i] = linalg.mirrored(self.matrices[pair].copy())
         return Information(
             matrix.reshape(k * n, k * n),
             self.vectors.reshape(k * n),
@@ -213,8 +214,8 @@ def summed_information(
     for pair, (i, j) in enumerate(zip(*np.tril_indices(len(mixing)), strict=True)):
         weight, total = mixing[i] * mixing[j], sums.matrices[pair]
         for first in range(0, len(total), ROWS):  # products that fit into a cache
-            rows = slice(first, first + ROWS)
-            total[rows] += weight * common.matrix[rows]
+            lower = slice(first, first + ROWS), slice(0, first + ROWS)
+            total[lower] += weight * common.matrix[lower]
     vectors = sums.vectors + mixing[:, None] * common.vector
     return replace(sums, vectors=vectors)._plus(common, "misfit", "log_det", "n_data")
 
