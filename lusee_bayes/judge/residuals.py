@@ -210,7 +210,7 @@ def residuals(solution: Solution, data: Visibilities) -> Residuals:
     """
     model, layout = solution.model, data.layout
     predicted = np.asarray(model.predict(solution.posterior.mean))
-    split = Split.of(solution.posterior, solution.chi2, model.n_data)
+    split = Split.of(solution.posterior, solution.chi2, model.n_data, solution.matrix)
     wide = replace(model, prior=split.wide.prior)
     left_out = LeftOut.of(wide, data, split.wide)
     if left_out is None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lusee_bayes.core.arrays import Square
+from lusee_bayes.core.arrays import ModesMatrix, Square
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import cholesky, solve_lower, times_lower
 from lusee_bayes.judge.chi2 import ChiSquare
@@ -37,7 +37,12 @@ class Split:
 
     @classmethod
     def of(
-        cls, posterior: Posterior, chi2: float, n_data: int, expected: float | None = None
+        cls,
+        posterior: Posterior,
+        chi2: float,
+        n_data: int,
+        matrix: ModesMatrix | None = None,
+        expected: float | None = None,
     ) -> Split:
         """Split chi^2 of the data behind a posterior.
 
@@ -48,6 +53,8 @@ class Split:
         chi2 : float
             Of the data under the model, sky included.
         n_data : int
+        matrix : (modes, modes) array, optional
+            A^T N^-1 A, where it is known.
         expected : float, optional
             :func:`.expected_chi2`, where it is known.
 
@@ -59,11 +66,11 @@ class Split:
         known = n_data - (expected_chi2(posterior, n_data) if expected is None else expected)
         size = max(1.0, np.sqrt(float(posterior.prior_chi2()) / known)) if known > 0 else 1.0
         try:
-            wide, less = widened(posterior, WIDER * size)
+            wide, less = widened(posterior, WIDER * size, matrix)
         except InputError:
             # data that do not fit ask for a sky that is stronger by orders of magnitude, under
             # which numbers of 64 bits do not tell noise from sky; they stand out under this, too
-            wide, less = widened(posterior, WIDER)
+            wide, less = widened(posterior, WIDER, matrix)
         degrees = n_data - with_sky(n_data - expected_chi2(wide, n_data))
         instrument = ChiSquare(chi2 - less, float(degrees))
         return cls(instrument, ChiSquare(less, float(n_data - degrees)), wide)
@@ -74,7 +81,9 @@ def with_sky(directions: float) -> float:
     return (1.0 - 1.0 / WIDER**2) * directions
 
 
-def widened(posterior: Posterior, factor: float) -> tuple[Posterior, float]:
+def widened(
+    posterior: Posterior, factor: float, matrix: ModesMatrix | None = None
+) -> tuple[Posterior, float]:
     """Compute the posterior given the same data under a prior with wider standard deviations.
 
     Parameters
@@ -83,6 +92,8 @@ def widened(posterior: Posterior, factor: float) -> tuple[Posterior, float]:
         With NumPy's arrays.
     factor : float
         By which the prior's standard deviations are multiplied, about the same mean.
+    matrix : (modes, modes) array, optional
+        A^T N^-1 A, where it is known: a prior without correlations scales it in no time.
 
     Returns
     -------
@@ -96,16 +107,20 @@ def widened(posterior: Posterior, factor: float) -> tuple[Posterior, float]:
     InputError
         If Lambda_k cannot be factorised.
     """
-    prior, lower = posterior.prior, np.tril(posterior.lower)
+    prior, log_det = posterior.prior, log_det_of(posterior.lower)
     off = posterior.white_mean - prior.white_mean
     # with a basis, outside of its span the posterior is the prior
     inside = off if posterior.basis is None else posterior.basis.T @ off
-    precision = times_lower(lower, lower, transpose=True)
+    if matrix is not None and prior.independent and posterior.basis is None:
+        precision = prior.sandwich(matrix)
+    else:
+        lower = np.tril(posterior.lower)
+        precision = times_lower(lower, lower, transpose=True)
+        # as large as what follows
+        del lower
+        precision[np.diag_indices(len(precision))] -= 1.0
     precision *= factor**2
-    log_det = log_det_of(lower)
-    # as large as what follows
-    del lower
-    precision[np.diag_indices(len(precision))] -= factor**2 - 1.0
+    precision[np.diag_indices(len(precision))] += 1.0
     root = cholesky(precision, overwrite=True)
     if not np.isfinite(np.diagonal(root)).all():
         raise InputError(

@@ -13,7 +13,7 @@ each channel has a posterior of its own, from the channel's data alone.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -153,7 +153,7 @@ class ComponentSums(eqx.Module):
 
 
 def solve_directly(
-    prior: SpectralPrior, channels: Iterable[Information], reference: ChannelModes
+    prior: SpectralPrior, channels: Sequence[Information], reference: ChannelModes
 ) -> Posterior:
     """Compute the posterior of all component maps by factorising its matrix.
 
@@ -161,8 +161,8 @@ def solve_directly(
     ----------
     prior : SpectralPrior
         Of all channels.
-    channels : iterable of Information
-        In the prior's order; read once, one after the other.
+    channels : sequence of Information
+        In the prior's order.
     reference : (channels, modes) array
         A reference sky for every channel, such as that of its information, in K.
 
@@ -176,13 +176,11 @@ def solve_directly(
     InputError
         If there are more or fewer channels than the prior has, or the mean does not converge.
     """
-    sums, count = ComponentSums.empty(prior, reference), 0
+    if len(channels) != prior.n_channels:
+        raise InputError(f"there are {len(channels)} channels, the prior is for {prior.n_channels}")
+    sums = ComponentSums.empty(prior, reference)
     for channel, information in enumerate(channels):
-        if channel >= prior.n_channels:
-            raise InputError(f"there are more channels than the prior's {prior.n_channels}")
-        sums, count = summed_information(sums, prior, channel, information), channel + 1
-    if count != prior.n_channels:
-        raise InputError(f"there are {count} channels, the prior is for {prior.n_channels}")
+        sums = summed_information(sums, prior, channel, information)
     return component_posterior(sums.information(), prior)
 
 

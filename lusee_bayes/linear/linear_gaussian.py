@@ -278,6 +278,11 @@ class Solution(Described):
             return self.known
         return FromInformation.of(self.model).condition(self.data).information
 
+    @property
+    def matrix(self) -> ModesMatrix | None:
+        """A^T N^-1 A, where it has been computed."""
+        return None if self.known is None else self.known.matrix
+
     @cached_property
     def covariance(self) -> Float[Array, "unknowns unknowns"]:
         """C of the posterior, in K^2."""

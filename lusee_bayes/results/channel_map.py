@@ -261,8 +261,8 @@ class Conditioned:
                 fluxes = flux_table(experiment, own)
         with stages("diagnostics"):
             if not (alone or thorough):
-                given = judge.posterior, judge.chi2, own.model.n_data, self.expected
-                instrument = Split.of(*given).instrument
+                given = judge.posterior, judge.chi2, own.model.n_data, judge.matrix
+                instrument = Split.of(*given, self.expected).instrument
             if alone or thorough or instrument.p < DOUBTFUL:
                 left = residuals(judge, data)
                 instrument, judged = left.split.instrument, self._judged(left)

@@ -119,17 +119,11 @@ def require_own(folder: Path, kinds: Sequence[str], origin: Origin) -> None:
     for name in [*origin, *there]:
         old, new = there.get(name), origin.get(name)
         if old != new:
-            old, new = (_short(value) for value in (old, new))
+            old, new = (f"{value or 'not given':.60}" for value in (old, new))
             raise InputError(
                 f"'{folder}' holds results of another run: {name} is {old} there and {new} here; "
                 f"{advice}"
             )
-
-
-def _short(value: str | None) -> str:
-    if value is None:
-        return "not given"
-    return value if len(value) <= 60 else f"{value[:57]}..."
 
 
 FIGURES = "figures"

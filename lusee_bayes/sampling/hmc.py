@@ -301,8 +301,8 @@ class Checkpoints:
             if found.get(name) != described.get(name):
                 raise InputError(
                     f"the unfinished run in '{self.folder}' has another {name}: "
-                    f"{_short(found.get(name))}, now {_short(described.get(name))}; resume it with "
-                    "the same, or delete the folder"
+                    f"{found.get(name)!s:.40}, now {described.get(name)!s:.40}; resume it with the "
+                    "same, or delete the folder"
                 )
 
     def _paths(self) -> list[Path]:
@@ -340,11 +340,6 @@ class Checkpoints:
 
 def _iteration(path: Path) -> int:
     return int(path.stem.removeprefix("chunk-"))
-
-
-def _short(value: object) -> str:
-    text = str(value)
-    return text if len(text) <= 40 else f"{text[:37]}..."
 
 
 ALGORITHMS = ("nuts", "hmc")

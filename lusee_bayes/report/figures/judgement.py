@@ -15,16 +15,7 @@ from lusee_bayes.flight.reduced import REASONS, USED, Reduced
 from lusee_bayes.instrument.products import all_products, labels
 from lusee_bayes.instrument.times import unannounced_leap_seconds
 from lusee_bayes.judge.chi2 import probability
-from lusee_bayes.report.figures.drawing import (
-    BLUE,
-    COLOURS,
-    DIVERGING,
-    GREY,
-    ORANGE,
-    framed,
-    plain_ticks,
-    without_minor_ticks,
-)
+from lusee_bayes.report.figures import drawing
 from lusee_bayes.results.map_result import MapResult
 
 # residuals beyond that have the darkest colours
@@ -47,7 +38,7 @@ def residuals_by_product(result: MapResult) -> Figure | None:
         np.append(np.arange(len(hours)), len(hours)) - 0.5,
         np.arange(len(labels) + 1) - 0.5,
         z,
-        cmap=DIVERGING,
+        cmap=drawing.DIVERGING,
         norm=Normalize(-WIDEST, WIDEST),
         rasterized=True,
     )
@@ -63,13 +54,13 @@ def residuals_by_product(result: MapResult) -> Figure | None:
     products = channel.judged.of_kind("product")
     rows = [labels.index(group.name) for group in products]
     for key, marker, colour, text in (
-        ("p", "o", BLUE, "product given all others"),
-        ("others_p", "D", ORANGE, "all others without it"),
+        ("p", "o", drawing.BLUE, "product given all others"),
+        ("others_p", "D", drawing.ORANGE, "all others without it"),
     ):
         p = np.maximum([getattr(group, key) for group in products], LEAST_P)
         right.semilogx(p, rows, ls="", marker=marker, color=colour, ms=5, label=text)
-    without_minor_ticks(right.xaxis)
-    right.axvline(1.0, color=GREY, lw=0.5)
+    drawing.without_minor_ticks(right.xaxis)
+    right.axvline(1.0, color=drawing.GREY, lw=0.5)
     right.set(xlabel=f"p-value (drawn down to {LEAST_P:g})", xlim=(LEAST_P / 3, 3))
     right.grid(axis="y", lw=0.3)
     right.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False, fontsize=8)
@@ -86,7 +77,7 @@ def groups_by_frequency(result: MapResult) -> Figure | None:
     found = [{str(group): group.p for group in channel.judged.groups} for channel in judged]
     names = list(dict.fromkeys(name for one in found for name in one))
     p = np.array([[one.get(name, np.nan) for one in found] for name in names])
-    figure, axes = framed((max(5.0, 2.5 + 0.3 * len(judged)), 1.0 + 0.2 * len(names)))
+    figure, axes = drawing.framed((max(5.0, 2.5 + 0.3 * len(judged)), 1.0 + 0.2 * len(names)))
     scale = Normalize(np.log10(LEAST_P), 0.0)
     image = axes.imshow(np.log10(np.maximum(p, LEAST_P)), cmap="magma", norm=scale, aspect="auto")
     shown = np.arange(0, len(judged), 1 + len(judged) // 20)
@@ -110,22 +101,22 @@ def pointing_by_day(result: MapResult) -> Figure | None:
     preferred = result.channel.pointing.preferred
     names = list(dict.fromkeys(preferred["offset"]))
     size = (12, 0.6 + 2.1 * len(names))
-    figure, panels = framed(size, len(names), sharex=True, squeeze=False)
+    figure, panels = drawing.framed(size, len(names), sharex=True, squeeze=False)
     panels = panels[:, 0]
     for axes, name in zip(panels, names, strict=True):
         mine = preferred[preferred["offset"] == name]
         days, whole = mine[mine["first_day"] >= 0].dropna(), mine[mine["first_day"] < 0].dropna()
         days = days[days["std"] < TOO_WIDE * days["std"].median()]
         middle = (days["first_day"] + days["last_day"] + 1) / 2.0
-        axes.axhline(0.0, color=GREY, lw=0.8)
+        axes.axhline(0.0, color=drawing.GREY, lw=0.8)
         axes.errorbar(
-            middle, days["value"], days["std"], fmt="o", ms=3, color=BLUE, label="each day"
+            middle, days["value"], days["std"], fmt="o", ms=3, color=drawing.BLUE, label="each day"
         )
         if len(whole):
             value, std = float(whole["value"].iloc[0]), float(whole["std"].iloc[0])
             if np.isfinite(std) and std < TOO_WIDE * days["std"].median():
-                axes.axhspan(value - std, value + std, color=ORANGE, alpha=0.3)
-                axes.axhline(value, color=ORANGE, label="all days alike")
+                axes.axhspan(value - std, value + std, color=drawing.ORANGE, alpha=0.3)
+                axes.axhline(value, color=drawing.ORANGE, label="all days alike")
         kind, _, unit = name.rpartition("_")
         axes.set_ylabel(f"{kind.replace('_', ' ')} [{UNITS.get(unit, unit)}]")
     panels[0].legend(loc="upper right", ncols=2, frameon=False)
@@ -147,7 +138,7 @@ def unknowns_by_frequency(result: MapResult) -> Figure | None:
     names = list(dict.fromkeys(table["unknown"]))
     n_rows = -(-len(names) // PANELS_IN_A_ROW)
     size = (13, 0.6 + 2.5 * n_rows)
-    figure, panels = framed(size, n_rows, PANELS_IN_A_ROW, squeeze=False)
+    figure, panels = drawing.framed(size, n_rows, PANELS_IN_A_ROW, squeeze=False)
     panels = list(panels.flat)
     for axes, name in zip(panels, names, strict=False):
         rows = table[table["unknown"] == name]
@@ -155,11 +146,13 @@ def unknowns_by_frequency(result: MapResult) -> Figure | None:
             rows[column].to_numpy()
             for column in ("frequency_mhz", "value", "std", "prior", "prior_std")
         )
-        axes.fill_between(f, prior - before, prior + before, color=GREY, alpha=0.25, lw=0)
-        axes.errorbar(f, prior, before, color=GREY, fmt="none", lw=4, alpha=0.4, label="prior")
-        axes.errorbar(f, value, std, color=BLUE, fmt=".", ms=5, lw=1.2, label="posterior")
+        axes.fill_between(f, prior - before, prior + before, color=drawing.GREY, alpha=0.25, lw=0)
+        axes.errorbar(
+            f, prior, before, color=drawing.GREY, fmt="none", lw=4, alpha=0.4, label="prior"
+        )
+        axes.errorbar(f, value, std, color=drawing.BLUE, fmt=".", ms=5, lw=1.2, label="posterior")
         if "true" in rows:
-            axes.plot(f, rows["true"].to_numpy(), "x", color=ORANGE, ms=5, label="truth")
+            axes.plot(f, rows["true"].to_numpy(), "x", color=drawing.ORANGE, ms=5, label="truth")
         axes.xaxis.set_major_locator(MaxNLocator(5))
         unit = rows["unit"].iloc[0] or "relative"
         axes.set(title=name, xlabel="frequency [MHz]", ylabel=unit)
@@ -172,7 +165,7 @@ def unknowns_by_frequency(result: MapResult) -> Figure | None:
     return figure
 
 
-LEVEL_COLOURS = {"L": COLOURS[4], "M": BLUE, "H": COLOURS[3]}
+LEVEL_COLOURS = {"L": drawing.COLOURS[4], "M": drawing.BLUE, "H": drawing.COLOURS[3]}
 
 
 def time_line(reduced: Reduced) -> Figure:
@@ -184,7 +177,7 @@ def time_line(reduced: Reduced) -> Figure:
         flags["some channels"] = ((reduced.lines > 0) & (reduced.reason == USED)).any(axis=0)
     n_rows = max(len(flags), 1)
     size, heights = (12, 3.4 + 0.25 * len(flags)), (4, n_rows)
-    figure, (top, bottom) = framed(size, 2, sharex=True, height_ratios=heights)
+    figure, (top, bottom) = drawing.framed(size, 2, sharex=True, height_ratios=heights)
     level = reduced.level[reduced.bin_of]
     n_ports = level.shape[1]
     for port in range(n_ports):
@@ -201,7 +194,7 @@ def time_line(reduced: Reduced) -> Figure:
     top.set(yticks=range(n_ports), ylabel="port", ylim=(n_ports - 0.5, -1.2))
     top.set_title("Gain of every port")
     for row, flagged in enumerate(flags.values()):
-        bottom.plot(days[flagged], np.full(flagged.sum(), row), "|", ms=9, color=ORANGE)
+        bottom.plot(days[flagged], np.full(flagged.sum(), row), "|", ms=9, color=drawing.ORANGE)
     bottom.set(
         yticks=range(len(flags)),
         yticklabels=list(flags),
@@ -217,7 +210,7 @@ def waterfall(result: MapResult) -> Figure | None:
     reduced, band = result.reduced, result.band
     if not result.single or reduced is None:
         return None
-    figure, panels = framed((13, 9), 4, 4, sharex=True)
+    figure, panels = drawing.framed((13, 9), 4, 4, sharex=True)
     first = np.searchsorted(reduced.bin_of, np.arange(reduced.values.shape[2]))
     days = _days(reduced)[first]
     n_bins = reduced.values.shape[2]
@@ -230,15 +223,20 @@ def waterfall(result: MapResult) -> Figure | None:
         number = products[product.label]
         kept = reduced.values[band, number]
         flagged = ~np.isfinite(kept) | used_in_part
-        axes.plot(days, kept, ".", ms=3, color=BLUE, label="after flags")
+        axes.plot(days, kept, ".", ms=3, color=drawing.BLUE, label="after flags")
         before = reduced.before[band, number]
         axes.plot(
-            days[flagged], before[flagged], ".", ms=4, color=ORANGE, label="before, where flagged"
+            days[flagged],
+            before[flagged],
+            ".",
+            ms=4,
+            color=drawing.ORANGE,
+            label="before, where flagged",
         )
         low, high = _range(kept[np.isfinite(kept)])
         axes.set_ylim(low, high)
         axes.set_title(product.label, fontsize=9)
-        plain_ticks(axes, 3)
+        drawing.plain_ticks(axes, 3)
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:.3g}")
     panels[0, 0].legend(frameon=False, fontsize=8)
     for axes in panels[-1]:
@@ -258,10 +256,10 @@ def calibration(reduced: Reduced) -> Figure:
     Of one band the gains at its frequency are points with error bars, and both kinds of scatter
     have a place of their own.
     """
-    figure, (left, right) = framed((12, 4.2), 1, 2)
+    figure, (left, right) = drawing.framed((12, 4.2), 1, 2)
     _gains(left, reduced)
     _scatter(right, reduced)
-    right.axhline(1.0, color=GREY, lw=0.8)
+    right.axhline(1.0, color=drawing.GREY, lw=0.8)
     right.set_ylabel("scatter over radiometer noise")
     found = np.concatenate([reduced.line_scatter, reduced.scatter, [1.0]])
     right.set_ylim(0.0, 1.3 * float(np.nanmax(found)))
@@ -280,7 +278,7 @@ def _gains(left: Axes, reduced: Reduced) -> None:
             (line,) = left.semilogy(
                 curves.frequencies_mhz,
                 gain,
-                color=COLOURS[port],
+                color=drawing.COLOURS[port],
                 ls={"L": ":", "M": "-", "H": "--"}[letter],
                 label=label,
             )
@@ -293,7 +291,7 @@ def _gains(left: Axes, reduced: Reduced) -> None:
                 at, error = (np.interp(f, curves.frequencies_mhz, y) for y in (gain, std))
                 left.errorbar(f, at, error, fmt="o", ms=4, capsize=3, color=line.get_color())
     for f in reduced.frequencies_mhz:
-        left.axvline(f, color=GREY, lw=0.5, zorder=0)
+        left.axvline(f, color=drawing.GREY, lw=0.5, zorder=0)
     known = bool((curves.std > 0).any())
     left.set(xlabel="frequency [MHz]", ylabel="counts for 1 nV²/Hz")
     largest = float(np.nanmax(curves.std / curves.gain)) if known else 0.0
@@ -304,8 +302,8 @@ def _gains(left: Axes, reduced: Reduced) -> None:
 
 def _scatter(right: Axes, reduced: Reduced) -> None:
     kinds = (
-        (reduced.line_scatter, BLUE, "o", "channels about\na smooth spectrum"),
-        (reduced.scatter, ORANGE, "s", "spectra about\na smooth curve in time"),
+        (reduced.line_scatter, drawing.BLUE, "o", "channels about\na smooth spectrum"),
+        (reduced.scatter, drawing.ORANGE, "s", "spectra about\na smooth curve in time"),
     )
     alone = len(reduced.frequencies_mhz) == 1
     for place, (values, colour, mark, name) in enumerate(kinds):
@@ -318,7 +316,7 @@ def _scatter(right: Axes, reduced: Reduced) -> None:
             style = {"color": colour, "label": name.replace("\n", " "), "fillstyle": "none"}
             right.plot(reduced.frequencies_mhz, values, mark, **style)
         elif alone:
-            right.text(place, 0.5, "not known", ha="center", color=GREY)
+            right.text(place, 0.5, "not known", ha="center", color=drawing.GREY)
     if alone:
         right.set_xticks(range(len(kinds)), [kind[-1] for kind in kinds])
         right.set_xlim(-0.6, len(kinds) - 0.4)

@@ -16,27 +16,14 @@ from matplotlib.figure import Figure
 from lusee_bayes.core.harmonics import mode_numbers
 from lusee_bayes.judge.coverage import LEVELS
 from lusee_bayes.judge.measures import highest_altitude
-from lusee_bayes.report.figures.drawing import (
-    BLUE,
-    COLOURS,
-    DIVERGING,
-    GREY,
-    ORANGE,
-    SEQUENTIAL,
-    Size,
-    framed,
-    note,
-    plain_ticks,
-    sky_panel,
-    temperatures,
-)
+from lusee_bayes.report.figures import drawing
 from lusee_bayes.results.sample_result import SampleResult
 from lusee_bayes.sampling.least import N_BINS
 from lusee_bayes.sampling.validation import Comparison, Ranks
 from lusee_bayes.systematics.systematic import SKY
 
 # of a value for every mode
-DOTS = {"ls": "", "marker": ".", "ms": 3, "color": BLUE}
+DOTS = {"ls": "", "marker": ".", "ms": 3, "color": drawing.BLUE}
 # quantities in the figures, the first of a run's list
 N_RANKS, N_PAIRS = 8, 5
 # draws of a chain from which ranks and densities can be estimated
@@ -72,7 +59,7 @@ def pairs(quantities: Quantities) -> Figure:
     size, title = (side, side), "Pairs of quantities"
     figure = _drawn(arviz_plots.plot_pair, "posterior", chosen, title, size, visuals=visuals)
     for axes in figure.axes:
-        plain_ticks(axes, 3)
+        drawing.plain_ticks(axes, 3)
         axes.tick_params(labelsize=8)
         for label in (axes.xaxis.label, axes.yaxis.label):
             label.set(text=label.get_text().replace(" [", "\n["), size=9)
@@ -84,12 +71,12 @@ def _drawn(
     group: str,
     quantities: Quantities,
     title: str,
-    size: Size,
+    size: drawing.Size,
     **options: object,
 ) -> Figure:
     """ArviZ's figure, which pyplot then forgets; a note where draws do not suffice for it."""
     if not _vary(quantities.values()):
-        return note(title, TOO_FEW)
+        return drawing.note(title, TOO_FEW)
     tree = arviz_base.from_dict({group: quantities})
     frame = {"layout": "constrained", "figsize": size}
     collection = plot(tree, backend="matplotlib", figure_kwargs=frame, **options)
@@ -104,12 +91,12 @@ def against_analytic(tree: xr.DataTree) -> Figure:
     skies, constants = tree["posterior"][SKY].values, tree["constant_data"]
     mean, std = constants["analytic_mean"].values, constants["analytic_std"].values
     flat = skies.reshape(-1, skies.shape[-1])
-    figure, (left, right) = framed((11, 4), 1, 2)
+    figure, (left, right) = drawing.framed((11, 4), 1, 2)
     left.plot((flat.mean(axis=0) - mean) / std, **DOTS)
-    left.axhline(0.0, color=GREY, lw=0.8)
+    left.axhline(0.0, color=drawing.GREY, lw=0.8)
     left.set(xlabel="mode", ylabel="difference [standard deviations]", title="Means")
     right.plot(flat.std(axis=0, ddof=1) / std, **DOTS)
-    right.axhline(1.0, color=GREY, lw=0.8)
+    right.axhline(1.0, color=drawing.GREY, lw=0.8)
     right.set(xlabel="mode", ylabel="draws / analytic", title="Standard deviations")
     figure.suptitle("Draws against the analytic posterior, mode by mode")
     return figure
@@ -127,7 +114,9 @@ def uncertainty(run: SampleResult) -> Figure:
     maps = run.maps
     chains, draws = run.skies.shape[:2]
     if chains * draws < 2:
-        return note("Uncertainty of the drawn maps", "not drawn: a single draw has no spread")
+        return drawing.note(
+            "Uncertainty of the drawn maps", "not drawn: a single draw has no spread"
+        )
     level = maps["mean"].mean()
     width = maps["upper"] - maps["lower"]
     spread, interval = 100.0 * maps["std"] / level, 100.0 * width / level
@@ -137,22 +126,28 @@ def uncertainty(run: SampleResult) -> Figure:
     limit = np.percentile(np.abs(skewness), 99.0)
     percent = "% of the mean sky"
     panels = [
-        ("mean of the draws", maps["mean"], temperatures(maps["mean"]), SEQUENTIAL, "K"),
-        ("standard deviation", spread, _range(spread), SEQUENTIAL, percent),
-        ("width of the 90 % interval", interval, _range(interval), SEQUENTIAL, percent),
+        (
+            "mean of the draws",
+            maps["mean"],
+            drawing.temperatures(maps["mean"]),
+            drawing.SEQUENTIAL,
+            "K",
+        ),
+        ("standard deviation", spread, _range(spread), drawing.SEQUENTIAL, percent),
+        ("width of the 90 % interval", interval, _range(interval), drawing.SEQUENTIAL, percent),
         (
             "asymmetry of the 90 % interval about the mean",
             skewness,
             Normalize(-limit, limit),
-            DIVERGING,
+            drawing.DIVERGING,
             "of its width (chance alone for a Gaussian)",
         ),
     ]
     nside = run.experiment.scenario.map_nside
     altitude = highest_altitude(run.experiment.data.observation, nside)
-    figure, grid_of_axes = framed((12, 7.2), 2, 2)
+    figure, grid_of_axes = drawing.framed((12, 7.2), 2, 2)
     for axes, panel in zip(grid_of_axes.flat, panels, strict=True):
-        sky_panel(axes, *panel, altitude=altitude, shrink=0.85)
+        drawing.sky_panel(axes, *panel, altitude=altitude, shrink=0.85)
     figure.suptitle(
         f"{chains} x {draws} draws of {run.tree.attrs['program']} at "
         f"{run.experiment.scenario.frequency_mhz:g} MHz, Galactic coordinates; dashed: never above "
@@ -169,19 +164,19 @@ def traces(run: SampleResult) -> Figure:
     """Draws of other sites, of the first modes and of landmarks against time, with histograms."""
     columns = list(run.quantities().items())[:8]
     size = (11, 1.7 * len(columns) + 0.8)
-    figure, grid = framed(size, len(columns), 2, width_ratios=(3, 1), squeeze=False)
+    figure, grid = drawing.framed(size, len(columns), 2, width_ratios=(3, 1), squeeze=False)
     for (left, right), (name, draws) in zip(grid, columns, strict=True):
         # a range of a few rounding errors cannot be cut into bins
         moved = np.ptp(draws) > 1e-12 * np.abs(draws).max()
         bins = np.histogram_bin_edges(draws, 40 if moved else 1)
         for number, chain in enumerate(draws):
-            colour = COLOURS[number % len(COLOURS)]
+            colour = drawing.COLOURS[number % len(drawing.COLOURS)]
             left.plot(chain, color=colour, lw=0.5, alpha=0.8)
             right.hist(
                 chain, bins, color=colour, histtype="step", density=True, label=f"chain {number}"
             )
-        plain_ticks(left)
-        plain_ticks(right)
+        drawing.plain_ticks(left)
+        drawing.plain_ticks(right)
         left.set(ylabel=name.replace(" [", "\n["), xlim=(0, draws.shape[1]))
         left.yaxis.label.set_size(8)
         right.set(yticks=[])
@@ -194,23 +189,25 @@ def traces(run: SampleResult) -> Figure:
 
 def comparison(result: Comparison) -> Figure:
     """HMC against the analytic posterior: means, variances, covariance, effective sizes."""
-    figure, ((means, variances), (covariance, sizes)) = framed((11, 7), 2, 2)
+    figure, ((means, variances), (covariance, sizes)) = drawing.framed((11, 7), 2, 2)
     ell, _ = mode_numbers(round(np.sqrt(len(result.mean_z))) - 1)
     limit = result.checks[0].upper
     means.plot(result.mean_z, **DOTS)
     for bound in (-limit, limit):
-        means.axhline(bound, color=ORANGE, ls="--", lw=1)
+        means.axhline(bound, color=drawing.ORANGE, ls="--", lw=1)
     means.set(
         xlabel="mode", ylabel="difference of means [Monte Carlo error]", title="Means of every mode"
     )
     variances.errorbar(
         np.arange(len(ell)), result.variance_ratio, result.variance_error, elinewidth=0.3, **DOTS
     )
-    variances.axhline(1.0, color=GREY, lw=0.8)
+    variances.axhline(1.0, color=drawing.GREY, lw=0.8)
     variances.set(xlabel="mode", ylabel="variance: draws / analytic", title="Variances")
     rank = np.arange(1, len(result.eigenvalues) + 1)
-    covariance.plot(rank, result.eigenvalues, color=BLUE, label="draws")
-    covariance.plot(rank, result.null_eigenvalues, color=ORANGE, ls="--", label="exact chains")
+    covariance.plot(rank, result.eigenvalues, color=drawing.BLUE, label="draws")
+    covariance.plot(
+        rank, result.null_eigenvalues, color=drawing.ORANGE, ls="--", label="exact chains"
+    )
     covariance.set(
         xlabel="number, rising",
         ylabel="generalised eigenvalue",
@@ -218,7 +215,7 @@ def comparison(result: Comparison) -> Figure:
     )
     covariance.legend(frameon=False)
     sizes.semilogy(result.ess_bulk, label="bulk", **DOTS)
-    sizes.semilogy(result.ess_tail, label="tail", **(DOTS | {"color": ORANGE}))
+    sizes.semilogy(result.ess_tail, label="tail", **(DOTS | {"color": drawing.ORANGE}))
     sizes.set(xlabel="mode", ylabel="effective sample size", title="Effective sample sizes")
     sizes.legend(frameon=False)
     figure.suptitle(
@@ -230,14 +227,14 @@ def comparison(result: Comparison) -> Figure:
 def rank_statistics(ranks: Ranks) -> Figure:
     """Rank histograms with the band of 99 % of the bins, and coverage of the regions."""
     shown = np.unique(np.linspace(0, len(ranks.names) - 1, 11).astype(int))
-    figure, panels = framed((12, 7), 3, 4)
+    figure, panels = drawing.framed((12, 7), 3, 4)
     panels = panels.ravel()
     low, high = ranks.band()
     centres = (np.arange(N_BINS) + 0.5) / N_BINS
     histogram, p_values = ranks.histogram(), ranks.p_values()
     for axes, k in zip(panels, shown, strict=False):
-        axes.bar(centres, histogram[k], 1.0 / N_BINS, color=BLUE, alpha=0.7)
-        axes.axhspan(low, high, color=GREY, alpha=0.25, lw=0)
+        axes.bar(centres, histogram[k], 1.0 / N_BINS, color=drawing.BLUE, alpha=0.7)
+        axes.axhspan(low, high, color=drawing.GREY, alpha=0.25, lw=0)
         axes.set_title(f"{ranks.names[k]}, p = {p_values[k]:.2g}", fontsize=9)
         axes.set(xlim=(0, 1), xticks=[0, 0.5, 1])
     for axes in panels[len(shown) :]:
@@ -247,9 +244,9 @@ def rank_statistics(ranks: Ranks) -> Figure:
     table = ranks.coverage()
     levels = np.array(LEVELS)
     for coverage in table.values():
-        last.plot(levels, [coverage[p] - p for p in LEVELS], color=BLUE, lw=0.5, alpha=0.6)
+        last.plot(levels, [coverage[p] - p for p in LEVELS], color=drawing.BLUE, lw=0.5, alpha=0.6)
     error = 3 * np.array([ranks.coverage_error(p) for p in LEVELS])
-    last.fill_between(levels, -error, error, color=GREY, alpha=0.25, lw=0)
+    last.fill_between(levels, -error, error, color=drawing.GREY, alpha=0.25, lw=0)
     last.set(xlabel="level", title="coverage - level (band: 3 errors)")
     last.set_xticks(levels, [f"{p:.0%}" for p in LEVELS], fontsize=7, rotation=45)
     last.title.set_size(9)
