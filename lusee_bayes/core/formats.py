@@ -87,7 +87,8 @@ def _read_all(path: str, size: int) -> None:
 
 
 def _read(item: h5py.Group | h5py.Dataset, size: int) -> None:
-    for name in item.attrs:
+    # to look a name up may take forever, too, where those that are there come to an end
+    for name in ("format", *item.attrs):
         with suppress(*DAMAGE):  # the reader says it
             item.attrs[name]
     if isinstance(item, h5py.Dataset) and item.size:
