@@ -80,6 +80,9 @@ def _read_all(path: str, size: int) -> None:
         faulthandler.disable()
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
         with h5py.File(path) as file:
+            # to look a name up may take forever where to list them fails at once
+            with suppress(*DAMAGE):
+                file.attrs.get("format")
             _read(file, size)
             file.visititems(lambda _, item: _read(item, size))
     finally:
@@ -87,8 +90,7 @@ def _read_all(path: str, size: int) -> None:
 
 
 def _read(item: h5py.Group | h5py.Dataset, size: int) -> None:
-    # to look a name up may take forever, too, where those that are there come to an end
-    for name in ("format", *item.attrs):
+    for name in item.attrs:
         with suppress(*DAMAGE):  # the reader says it
             item.attrs[name]
     if isinstance(item, h5py.Dataset) and item.size:

@@ -267,9 +267,10 @@ def run_sample(
         with run_folder(folder, SAMPLE, scenario, data, program.path, **given) as run:
             n_draws = sampler.chains * sampler.draws
             experiment = measured_experiment(scenario, data, stages, n_draws=n_draws)
-            options = {"resume": resume, "stages": stages}
-            result = sample_result(experiment, program, sampler, run.path, **options)
-            return run.write(result, stages, Provenance.of_experiment(experiment, data))
+            made = sample_result(
+                experiment, program, sampler, run.path, resume=resume, stages=stages
+            )
+            return run.write(made, stages, Provenance.of_experiment(experiment, data))
 
     folder, stages = user_path(folder), stages or Stages()
     if scenario.single:

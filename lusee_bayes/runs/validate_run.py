@@ -79,10 +79,9 @@ def run_validate(
     require_draws(sampler.draws)
     given = {"replace": replace, "program": named(program)}
     with run_folder(folder, VALIDATION, scenario, data, program.path, **given) as run:
-        n_draws = sampler.chains * sampler.draws
-        experiment = measured_experiment(scenario, data, stages, n_draws=n_draws)
-        options = {"resume": resume, "stages": stages}
-        drawn = sample_result(experiment, program, sampler, run.path, **options)
+        n = sampler.chains * sampler.draws
+        experiment = measured_experiment(scenario, data, stages, n_draws=n)
+        drawn = sample_result(experiment, program, sampler, run.path, resume=resume, stages=stages)
         posterior, model = drawn.inference.posterior, drawn.inference.model
         with stages("comparison"):
             stats = drawn.tree["sample_stats"]
