@@ -96,7 +96,10 @@ def write_report(folder: str | Path) -> Path:
     if not os.path.isdir(folder):
         raise InputError(f"'{folder}' is no folder; give the folder of a finished run")
     recover(folder)
-    kind = _kind(folder)
+    manifest, old = read_manifest(folder), {"samples.nc": "sample", "posterior.nc": "map"}
+    # folders that were written before there were manifests
+    guessed = [kind for name, kind in old.items() if (folder / name).is_file()]
+    kind = manifest["kind"] if manifest is not None else next(iter(guessed), None)
     if kind not in PAGES:
         raise InputError(
             f"'{folder}' holds neither posterior.nc (lusee-bayes map) nor samples.nc (lusee-bayes "
@@ -106,14 +109,3 @@ def write_report(folder: str | Path) -> Path:
     with replacing(path) as partial:
         partial.write_text(PAGES[kind](folder, folder.resolve().name), encoding="utf-8")
     return path
-
-
-def _kind(folder: Path) -> str | None:
-    """The kind of run whose results a folder holds."""
-    manifest = read_manifest(folder)
-    if manifest is not None:
-        return manifest["kind"]
-    # folders that were written before there were manifests
-    if (folder / "samples.nc").is_file():
-        return "sample"
-    return "map" if (folder / "posterior.nc").is_file() else None
