@@ -3,6 +3,8 @@
 import faulthandler
 import os
 import time
+from contextlib import nullcontext
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -102,6 +104,25 @@ def test_a_file_without_end_is_refused(path, monkeypatch):
     start = time.monotonic()
     refuse("does not come to an end with it within 0.2 s", require_readable_hdf5, path)
     assert time.monotonic() - start < 30
+
+
+def test_a_name_whose_search_has_no_end_is_refused_even_where_names_cannot_be_listed(
+    path, monkeypatch
+):
+    """As of a file whose root HDF5 neither lists nor, asked for an attribute, comes back from."""
+
+    class Attributes(dict):
+        def __iter__(self):
+            raise RuntimeError("cannot iterate")
+
+        def get(self, name):
+            time.sleep(60)
+
+    file = SimpleNamespace(attrs=Attributes())
+    formats._probe.cache_clear()
+    monkeypatch.setattr(formats, "LIMIT_S", 0.2)
+    monkeypatch.setattr(formats.h5py, "File", lambda path: nullcontext(file))
+    refuse("does not come to an end with it within 0.2 s", require_readable_hdf5, path)
 
 
 def test_a_file_that_ends_the_process_is_refused(path, monkeypatch):
