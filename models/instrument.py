@@ -1,6 +1,6 @@
 """The ground, the antennas and the map from one run: the sky is integrated out for every beam.
 
-Change the names and priors to those of your own question; ``instrument.dense`` takes every
+Change the names and priors to those of your own question; ``instrument.coupling`` takes every
 parameter of ``lusee_bayes.instrument.beams.PARAMETERS``.
 """
 
@@ -21,7 +21,7 @@ def model(instrument, gaussian, data=None):
     values = {name: numpyro.sample(name, prior) for name, prior in values.items()}
     level = numpyro.sample("noise_level", dist.LogNormal(0.0, 0.5))
     gaussian = lb.LinearGaussian(
-        instrument.dense(values), gaussian.prior, gaussian.noise.scaled(level), gaussian.offset
+        instrument.coupling(values), gaussian.prior, gaussian.noise.scaled(level), gaussian.offset
     )
     numpyro.sample("data", lb.Marginal(gaussian), obs=data)
     return gaussian

@@ -254,7 +254,7 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
                 "the program asks for the embedded antennas, which beam.file replaces; leave out "
                 "beam.file"
             )
-        return setup.prepared
+        return setup.instrument
 
     @cache
     def around() -> Around:

@@ -212,7 +212,7 @@ class Scenario(Section):
     @model_validator(mode="after")
     def _sections_agree(self) -> Scenario:
         many, own_sources = self.frequencies_mhz, self.sources.list
-        prior, error, pointing = self.prior, self.noise.beam, self.noise.pointing
+        prior, error = self.prior, self.noise.beam
         parameters = error is not None and error.parameters
         if any(b <= a for a, b in pairwise(many)):
             raise ValueError("frequencies_mhz must grow from one to the next")
@@ -246,11 +246,6 @@ class Scenario(Section):
             raise ValueError(
                 "noise.receiver.smooth_octaves ties the receivers of channels that have a "
                 "posterior each; with joint, leave it out"
-            )
-        if pointing and parameters and pointing.treatment == error.treatment == "sampled":
-            raise ValueError(
-                "noise.pointing and the parameters of noise.beam cannot both be sampled: each of "
-                "them makes A anew; set the treatment of one to marginalised"
             )
         return self
 

@@ -38,7 +38,13 @@ from lusee_bayes.core.checks import Described, require_array, require_float64, r
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, mode_numbers, tilts, turn_about, turn_about_z
 from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.beams.monopoles import Monopoles, monopole_beams, parameter, with_values
+from lusee_bayes.instrument.beams.monopoles import (
+    Monopoles,
+    beam_modes,
+    monopole_beams,
+    parameter,
+    with_values,
+)
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout
@@ -295,12 +301,15 @@ class CouplingMatrix(Coupling):
         The orientations at every sample.
     layout : DataLayout
         The product and the time of every row.
+    modes : (products, modes) array
+        The beams in the frame of the lander, of which all else is made.
     """
 
     body_beams: BodyBeams
     by_order: Float[Array, "runs orders beams degrees"]
     pointing: Pointing
     layout: DataLayout
+    modes: BeamModes
 
     @classmethod
     def build(
@@ -358,7 +367,7 @@ class CouplingMatrix(Coupling):
         """
         body = body_beams(modes, pointing)
         lmax = len(pointing.pole_from_galactic.blocks) - 1
-        return cls(body, _by_order(body, lmax), pointing, layout)
+        return cls(body, _by_order(body, lmax), pointing, layout, modes)
 
     @classmethod
     def observe(cls, beams: ProductBeams, observation: Observation) -> CouplingMatrix:
@@ -401,7 +410,24 @@ class CouplingMatrix(Coupling):
         self.layout.require_same(direction.layout)
         body = self.body_beams + amplitude * direction.body_beams
         by_order = self.by_order + amplitude * direction.by_order
-        return replace(self, body_beams=body, by_order=by_order)
+        modes = self.modes + amplitude * direction.modes
+        return replace(self, body_beams=body, by_order=by_order, modes=modes)
+
+    def of(
+        self, *, modes: BeamModes | None = None, pointing: Pointing | None = None
+    ) -> CouplingMatrix:
+        """The same with other beams, or seen from elsewhere; differentiable in both.
+
+        Parameters
+        ----------
+        modes : (products, modes) array, optional
+            Beams in the frame of the lander.
+        pointing : Pointing, optional
+            The orientation at every sample.
+        """
+        pointing = self.pointing if pointing is None else pointing
+        made = self.of_modes(self.modes if modes is None else modes, pointing, self.layout)
+        return replace(made, response=self.response)
 
     def rows(self, product: RowNumbers, time: RowNumbers) -> Float[Array, "rows modes"]:
         """Compute chosen rows of A, flagged or not, without the response.
@@ -556,47 +582,6 @@ def _pairs(modes: Float[Array, "*batch modes"], lmax: int) -> Float[Array, "*bat
     return xp.concatenate([plus, minus], axis=-2)
 
 
-# unit beams that are rotated at once
-CHUNK = 64
-Rotations = tuple[Float[Array, "_ times _"], ...]
-
-
-def rotations_of(pointing: Pointing) -> Rotations:
-    """Compute R(t) of all samples, which rotates beams into Galactic coordinates.
-
-    It takes 8 (lmax + 1)^3 4 / 3 bytes a sample: 54 MB for a month at lmax 24.
-
-    Parameters
-    ----------
-    pointing : Pointing
-        The orientations at every sample.
-
-    Returns
-    -------
-    tuple of (2 ell + 1, times, 2 ell + 1) arrays
-        For every ell up to the lmax of ``pointing``: topocentric orders first, Galactic orders
-        last.
-    """
-    n_ells = len(pointing.pole_from_galactic.blocks)
-    blocks: list[list[Array]] = [[] for _ in range(n_ells)]
-    for start in range(0, n_ells**2, CHUNK):
-        rows = _turned(jnp.eye(CHUNK, n_ells**2, start), pointing)
-        for ell in range(n_ells):
-            first, end = max(start, ell**2), min(start + CHUNK, (ell + 1) ** 2)
-            if first < end:
-                inside = rows[first - start : end - start, :, ell**2 : (ell + 1) ** 2]
-                blocks[ell].append(inside)
-    return tuple(jnp.concatenate(parts) for parts in blocks)
-
-
-@eqx.filter_jit
-def _turned(beams: BeamModes, pointing: Pointing) -> TimeModes:
-    """Rows of A of any number of beams, without a response and with nothing missing."""
-    layout = DataLayout(beams.shape[0], pointing.n_times)
-    coupling = CouplingMatrix.of_modes(beams, pointing, layout)
-    return coupling.dense().reshape(beams.shape[0], pointing.n_times, -1)
-
-
 class Instrument(eqx.Module):
     """Antennas whose parameters may change, with everything else that A is made of.
 
@@ -614,8 +599,6 @@ class Instrument(eqx.Module):
         Highest ell of the beams and the sky.
     nodes : (int, int) or None
         Of the grid on which beams are computed; see ``monopole_beams``.
-    rotations : tuple of array or None
-        :func:`rotations_of` all samples, computed by :meth:`prepared`.
     """
 
     monopoles: Monopoles
@@ -624,17 +607,6 @@ class Instrument(eqx.Module):
     frequency_mhz: float = eqx.field(static=True)
     lmax: int = eqx.field(static=True)
     nodes: tuple[int, int] | None = eqx.field(static=True, default=None)
-    rotations: Rotations | None = None
-
-    def prepared(self) -> Instrument:
-        """Compute the rotations of all samples, as :meth:`dense` needs them.
-
-        Returns
-        -------
-        Instrument
-            The same with them.
-        """
-        return replace(self, rotations=rotations_of(self.pointing))
 
     def value(self, name: str) -> Float[Array, ""]:
         """Look up the present value of a parameter.
@@ -677,17 +649,19 @@ class Instrument(eqx.Module):
         antennas = with_values(self.monopoles, values or {})
         return monopole_beams(self.frequency_mhz, self.lmax, antennas, nodes=self.nodes)
 
-    def derivative(self, name: str) -> ProductBeams:
-        """Compute the derivative of :meth:`beams` in a parameter, the others held.
+    def derivatives(
+        self, values: Mapping[str, Float[Array, ""]]
+    ) -> Float[Array, "parameters products modes"]:
+        """Compute the derivatives of :meth:`beams` in some parameters, where they have values.
 
         Parameters
         ----------
-        name : str
-            One of ``beams.PARAMETERS``.
+        values : mapping of str to () array
+            Values of ``beams.PARAMETERS``, in whose order the derivatives are.
 
         Returns
         -------
-        ProductBeams
+        (parameters, products, modes) array
             In K per K and unit of the parameter.
 
         Raises
@@ -695,35 +669,29 @@ class Instrument(eqx.Module):
         InputError
             If there is no such parameter; the message names the nearest.
         """
-        value = self.value(name)
-        _, slope = jax.jvp(lambda v: self.beams({name: v}).modes, (value,), (jnp.ones_like(value),))
-        return ProductBeams(slope, self.frequency_mhz)
+        at = jnp.array([float(value) for value in values.values()])
+        frequency = jnp.asarray(self.frequency_mhz)
+        return _slopes(self.monopoles, frequency, at, tuple(values), self.lmax, self.nodes)
 
-    def dense(self, values: Mapping[str, Float[Array, ""]]) -> Float[Array, "data modes"]:
-        """Compute A as a matrix, of a :meth:`prepared` instrument.
+    def coupling(self, values: Mapping[str, Float[Array, ""]] | None = None) -> CouplingMatrix:
+        """Compute A of antennas with these values.
 
         Parameters
         ----------
-        values : mapping of str to () array
+        values : mapping of str to () array, optional
             Values of some parameters (``beams.PARAMETERS``); the others keep theirs.
 
         Returns
         -------
-        (data, modes) array
+        CouplingMatrix
             Differentiable in the values.
 
         Raises
         ------
         InputError
-            If the instrument was not prepared, or there is no parameter of that name.
+            If there is no parameter of that name.
         """
-        if self.rotations is None:
-            raise InputError("prepare the instrument first: instrument = instrument.prepared()")
-        beams = self.beams(values).modes
-        ells = jnp.split(beams, np.arange(1, len(self.rotations)) ** 2, axis=1)
-        pairs = zip(ells, self.rotations, strict=True)
-        rows = [jnp.einsum("km,mtn->ktn", part, block) for part, block in pairs]
-        return self.layout.gather(jnp.concatenate(rows, axis=2))
+        return self.coupling_of(self.beams(values))
 
     def coupling_of(self, beams: ProductBeams) -> CouplingMatrix:
         """Compute A of given beams, or dA of a difference of beams.
@@ -744,3 +712,12 @@ class Instrument(eqx.Module):
             If the beams have another lmax or other products.
         """
         return CouplingMatrix.build(beams, self.pointing, self.layout)
+
+
+@eqx.filter_jit
+def _slopes(monopoles, frequency_mhz, at, names, lmax, nodes) -> Array:
+    def modes(x: Array) -> BeamModes:
+        there = with_values(monopoles, dict(zip(names, x, strict=True)))
+        return beam_modes(frequency_mhz, lmax, there, "I", nodes)
+
+    return jnp.moveaxis(jax.jacfwd(modes)(at), -1, 0)

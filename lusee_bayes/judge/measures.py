@@ -59,7 +59,7 @@ def data_freedom(solution: Solution, columns: Float[Array, "data n"]) -> DataVec
         If N is not positive definite.
     """
     model, columns = solution.model, np.asarray(columns)
-    factor, root = model.noise.factor(), solution.posterior.root()
+    factor, root = solution.factor, solution.posterior.root()
     weighted_columns = np.asarray(factor.solve(columns))
     solved = weighted_columns
     freedom = np.zeros(model.n_data)
@@ -119,7 +119,7 @@ def preferences(solution: Solution, templates: Float[np.ndarray, "data n"]) -> P
         If N is not positive definite.
     """
     model, pull = solution.model, templates.T @ solution.weighted_residual()
-    solved = np.asarray(model.noise.factor().solve(templates))
+    solved = np.asarray(solution.factor.solve(templates))
     # rows of P^T
     seen = np.stack([np.asarray(model.coupling.transpose_mv(column)) for column in solved.T])
     known = (templates * solved).sum(0) - ((seen @ solution.covariance) * seen).sum(1)

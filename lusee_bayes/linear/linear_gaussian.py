@@ -261,15 +261,23 @@ class Solution(Described):
         Over the sky, with the evidence of the data.
     known : Information or None
         :attr:`information`, where the posterior was computed from it.
+    of_noise : Factor or None
+        :attr:`factor`, where it was computed.
     """
 
     model: LinearGaussian
     data: DataVector
     posterior: Posterior
     known: Information | None = None
+    of_noise: Factor | None = None
 
     def description(self) -> tuple[str, ...]:
         return (*self.posterior.description(), "posterior, information, covariance, under(prior)")
+
+    @cached_property
+    def factor(self) -> Factor:
+        """L of N = L L^T."""
+        return self.model.noise.factor() if self.of_noise is None else self.of_noise
 
     @cached_property
     def information(self) -> Information:
@@ -291,7 +299,8 @@ class Solution(Described):
     @cached_property
     def chi2(self) -> float:
         """(d - E[d])^T (A S A^T + N)^-1 (d - E[d]): of the data under the model, sky included."""
-        misfit = self.model.chi2(self.posterior.mean, self.data)
+        white = self.factor.whiten(self.data - self.model.predict(self.posterior.mean))
+        misfit = white @ white
         return float(misfit + self.posterior.prior_chi2())
 
     def weighted_residual(self) -> DataVector:
@@ -301,7 +310,7 @@ class Solution(Described):
         part in the data.
         """
         residual = self.data - self.model.predict(self.posterior.mean)
-        return np.asarray(self.model.noise.factor().solve(residual))
+        return np.asarray(self.factor.solve(residual))
 
     def under(self, prior: Prior) -> Solution:
         """Solve for the same data under another prior; A^T N^-1 A is not computed again.
@@ -414,7 +423,7 @@ class FromInformation(Form):
         if not structured:
             coupling = DenseCoupling(coupling.dense())
         if matrix is None and structured:
-            matrix = normal_matrix(coupling, model.noise)
+            matrix = normal_matrix(coupling, model.noise, factor)
         elif matrix is None:
             matrix = gram_matrix(np.asarray(factor.whiten(coupling.dense())))
         return cls(model, factor, coupling, matrix, precision_root(matrix, model.prior))
@@ -425,7 +434,7 @@ class FromInformation(Form):
         u, _, _ = self._about(data, np.zeros(prior.size)).white_mean(prior, self.lower, most=1)
         information = self._about(data, prior.colour(u))
         posterior = information.posterior(prior, self.lower)
-        return Solution(self.model, data, posterior, information)
+        return Solution(self.model, data, posterior, information, self.factor)
 
     def _about(self, data: DataVector, sky: Modes) -> Information:
         """The information of data, about a reference sky."""

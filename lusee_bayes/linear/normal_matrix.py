@@ -30,7 +30,7 @@ from lusee_bayes.core.arrays import ModesMatrix, on_host
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import Rotation, mode_numbers
-from lusee_bayes.core.linalg import checked_cholesky, gram_matrix, mirrored, solve_lower
+from lusee_bayes.core.linalg import gram_matrix, mirrored, solve_lower
 from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix, turned_about_pole
 from lusee_bayes.noise import covariance
 
@@ -167,7 +167,9 @@ def _weighted(
     return [(x @ beams).reshape(n_orders, -1, n) for x in factors]
 
 
-def normal_matrix(coupling: Coupling, noise: covariance.Covariance) -> ModesMatrix:
+def normal_matrix(
+    coupling: Coupling, noise: covariance.Covariance, factor: covariance.Factor | None = None
+) -> ModesMatrix:
     """Compute A^T N^-1 A without forming A.
 
     Exact for the coupling's own functions of time. JAX's arrays are copied to the host, so that it
@@ -181,6 +183,8 @@ def normal_matrix(coupling: Coupling, noise: covariance.Covariance) -> ModesMatr
         A, with structure in time.
     noise : Covariance
         N, in K^2, of one of the kinds in ``NORMAL_MATRICES``.
+    factor : Factor, optional
+        Of N, where it is known.
 
     Returns
     -------
@@ -199,7 +203,8 @@ def normal_matrix(coupling: Coupling, noise: covariance.Covariance) -> ModesMatr
             f"{type(noise).__name__} has no structure in time that A^T N^-1 A could use, or the "
             "coupling has a response of its own; use the dense form"
         )
-    return NORMAL_MATRICES[type(noise)](*on_host((coupling, noise)))
+    factor = noise.factor() if factor is None else factor
+    return NORMAL_MATRICES[type(noise)](*on_host((coupling, noise, factor)))
 
 
 def has_structure(coupling: Coupling, noise: covariance.Covariance) -> bool:
@@ -240,18 +245,17 @@ def _base(noise: covariance.Covariance) -> covariance.Covariance:
     return noise.base if isinstance(noise, covariance.LowRankUpdate) else noise
 
 
-def _within_times(coupling: CouplingMatrix, noise: covariance.Covariance) -> ModesMatrix:
+def _within_times(coupling: CouplingMatrix, noise: covariance.Covariance, _) -> ModesMatrix:
     return summed(coupling, noise.time_weights(coupling.layout))
 
 
-def _with_templates(coupling: CouplingMatrix, noise: covariance.LowRankUpdate) -> ModesMatrix:
+def _with_templates(
+    coupling: CouplingMatrix, noise: covariance.LowRankUpdate, factor: covariance.LowRankFactor
+) -> ModesMatrix:
     """With N_0 + T T^T: A^T D A - V^T (1 + T^T D T)^-1 V, V = T^T D A, D = N_0^-1."""
-    base = noise.base.factor()
-    weighted = np.asarray(base.solve(noise.update.root))
-    v = np.stack([coupling.transpose_mv(column) for column in weighted.T])
-    small = np.eye(v.shape[0]) + noise.update.root.T @ weighted
-    lower = checked_cholesky(f"1 + T^T D T of {noise.update.name}", small)
-    return normal_matrix(coupling, noise.base) - gram_matrix(solve_lower(lower, v, transpose=False))
+    v = [coupling.transpose_mv(factor.base.whiten_transpose(column)) for column in factor.v.T]
+    solved = solve_lower(factor.lower, np.stack(v), transpose=False)
+    return normal_matrix(coupling, noise.base, factor.base) - gram_matrix(solved)
 
 
 def summed(coupling: CouplingMatrix, weights: Float[np.ndarray, "..."]) -> ModesMatrix:
@@ -306,9 +310,11 @@ def _turned(
 STREAMED = 1024
 
 
-def _streamed(coupling: CouplingMatrix, noise: covariance.TimeBandedCovariance) -> ModesMatrix:
+def _streamed(
+    coupling: CouplingMatrix, _: covariance.Covariance, factor: covariance.TimeBandedFactor
+) -> ModesMatrix:
     """For time-banded noise: A is made, whitened and summed one block row of N after the other."""
-    pointing, layout, factor = coupling.pointing, coupling.layout, on_host(noise.factor())
+    pointing, layout = coupling.pointing, coupling.layout
     n_blocks, rows, window = factor.left.shape
     steps, n_modes = rows // layout.n_products, coupling.shape[1]
     present, total = layout.present.T, np.zeros((n_modes, n_modes))

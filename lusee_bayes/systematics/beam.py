@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Annotated, ClassVar
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
@@ -62,16 +63,18 @@ class BeamErrors(Systematic):
 
     key: ClassVar[str] = "noise.beam"
     section: ClassVar[type[Section]] = BeamErrorSection
+    words: ClassVar[str] = "the beams"
     draw: ClassVar[int] = 3
-    first_order: ClassVar[bool] = False
+
+    @classmethod
+    def in_rounds(cls, section: BeamErrorSection) -> bool:
+        return bool(section.parameters)
 
     @classmethod
     def build(cls, section: BeamErrorSection, setup: Setup, around: Around) -> BeamErrors:
         if not section.parameters:
             return BeamError(setup.instrument.coupling_of(difference_of_beams(section, setup)))
-        sampled = section.treatment == "sampled"
-        instrument = setup.prepared if sampled else setup.instrument
-        return InstrumentParameters.centred(instrument, section.parameters)
+        return InstrumentParameters.centred(setup.instrument, section.parameters)
 
     @classmethod
     def truth(cls, section: BeamErrorSection, setup: Setup, key: PRNGKeyArray) -> Truth:
@@ -135,6 +138,8 @@ class BeamError(BeamErrors):
         dA for an amplitude of one, such as the difference to another beam.
     """
 
+    first_order: ClassVar[bool] = False
+
     direction: Coupling
 
     @property
@@ -158,20 +163,24 @@ class InstrumentParameters(BeamErrors):
     Attributes
     ----------
     instrument : Instrument
-        The instrument with its present parameters. :meth:`sampled` needs it prepared.
-    centres, widths : dict of float
-        Means and standard deviations of the priors, by the parameters' names.
+        The instrument with the prior means of its parameters.
+    parameters : tuple of str
+        Those that are not known.
+    widths : tuple of float
+        Standard deviations of their priors.
     """
 
+    moves: ClassVar[bool] = True
+
     instrument: Instrument
+    parameters: tuple[str, ...] = eqx.field(static=True)
     # numbers, not arrays: equinox's jit then keeps them known, and the checks of the priors and
     # the ends of their domains need their values
-    centres: dict[str, float]
-    widths: dict[str, float]
+    widths: tuple[float, ...] = eqx.field(static=True)
 
     @classmethod
     def centred(cls, instrument: Instrument, stds: Mapping[str, float]) -> InstrumentParameters:
-        """Put the priors' means at the instrument's present values.
+        """Put the priors' means at the instrument's values.
 
         Parameters
         ----------
@@ -185,31 +194,29 @@ class InstrumentParameters(BeamErrors):
         InputError
             For unknown names, and for a prior that reaches out of a parameter's domain.
         """
-        centres = {name: float(instrument.value(name)) for name in stds}
-        made = cls(instrument, centres, {name: float(std) for name, std in stds.items()})
+        made = cls(instrument, tuple(stds), tuple(map(float, stds.values())))
         for unknown in made.unknowns:
             unknown.prior()
         return made
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
-        known = [(name, parameter(name), std) for name, std in self.widths.items()]
+        known = [(n, parameter(n), s) for n, s in zip(self.parameters, self.widths, strict=True)]
+        means = [float(self.instrument.value(name)) for name in self.parameters]
         return tuple(
-            Unknown(n, self.centres[n], std, low=p.low, high=p.high) for n, p, std in known
+            Unknown(name, mean, std, low=p.low, high=p.high)
+            for (name, p, std), mean in zip(known, means, strict=True)
         )
 
     def effect(self, model, values):
         """A of antennas that have these values."""
-        return replace(model, coupling=self.instrument.dense(values))
+        return replace(model, coupling=model.coupling.of(modes=self.instrument.beams(values).modes))
 
-    def marginalised(self, model: LinearGaussian) -> LinearGaussian:
-        """Add dA S dA^T for every parameter to N, dA = std times the derivative of A."""
-        for name, std in self.widths.items():
-            slope = std * self.instrument.derivative(name).modes
-            beams = ProductBeams(slope, self.instrument.frequency_mhz)
-            direction = self.instrument.coupling_of(beams)
-            model = BeamError(direction).marginalised(model)
-        return model
+    def derivative(self, model, sky, centre):
+        """That of :meth:`effect`, through the derivatives of the beams."""
+        slopes = np.asarray(self.instrument.derivatives(self.values(centre)))
+        seen = [model.coupling.of(modes=slope) @ np.asarray(sky) for slope in slopes]
+        return np.stack(seen, axis=1) * np.array(self.widths)
 
 
 def true_beams(setup: Setup) -> ProductBeams:

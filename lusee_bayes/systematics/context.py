@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -133,11 +132,6 @@ class Setup:
         complete = CouplingMatrix.build(self.beams, self.pointing)
         change = complete.layout.scatter(complete @ (sky.modes - self.sky.modes))
         return replace(self, sky=sky, signal=self.signal + change)
-
-    @cached_property
-    def prepared(self) -> Instrument:
-        """The instrument, prepared for A to be made of many beams."""
-        return self.instrument.prepared()
 
     @property
     def has_autos(self) -> bool:

@@ -19,7 +19,7 @@ from pydantic import Field
 
 from lusee_bayes.core.arrays import Array, DataVector, namespace, on_device
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.core.harmonics import Rotation, generators, lmax_of
+from lusee_bayes.core.harmonics import Rotation, generators
 from lusee_bayes.core.reading import naming
 from lusee_bayes.core.section import NOT_TINY, Section, Treatment, requires
 from lusee_bayes.instrument.beams.monopoles import Monopoles, beams_towards
@@ -109,8 +109,6 @@ class PointingOffsets(Systematic):
         Of a clock that is off, and all else as the observation says.
     hours : (times,) array
         Since the first sample.
-    modes : (products, modes) array
-        The beams in the frame of the lander.
     mcmf_from_lander : (3, 3) array
         Without offsets.
     layout : DataLayout
@@ -135,7 +133,6 @@ class PointingOffsets(Systematic):
     about: Float[Array, "2"]
     pointing: Pointing
     hours: Float[Array, " times"]
-    modes: Float[Array, "products modes"]
     mcmf_from_lander: Float[Array, "3 3"]
     layout: DataLayout
     sources: MovingSources | None = None
@@ -174,7 +171,6 @@ class PointingOffsets(Systematic):
             np.array([values.get(name, 0.0) for name in CLOCK]),
             pointing,
             setup.observation.hours,
-            setup.beams.modes,
             observation.lander_from_mcmf().T,
             setup.layout,
             sources,
@@ -222,7 +218,7 @@ class PointingOffsets(Systematic):
     def effect(self, model, values):
         """A of the offsets; sources with their mean fluxes move with it."""
         pointing = self.turned(values)
-        model = replace(model, coupling=CouplingMatrix.of_modes(self.modes, pointing, self.layout))
+        model = replace(model, coupling=model.coupling.of(pointing=pointing))
         if self.sources is None:
             return model
         seen = self.sources.seen(self.orientation(values), self.layout)
@@ -243,9 +239,9 @@ class PointingOffsets(Systematic):
         turn = np.einsum("tji,tjkn->tikn", np.asarray(orientation), np.asarray(slopes))
         columns = 0.0
         for axis in range(3):
-            blocks = (generators(ell)[axis] for ell in range(lmax_of(self.modes.shape[1]) + 1))
-            beams = Rotation(tuple(blocks))(self.modes)
-            seen = CouplingMatrix.of_modes(beams, pointing, self.layout) @ np.asarray(sky)
+            blocks = (generators(ell)[axis] for ell in range(model.coupling.lmax + 1))
+            beams = Rotation(tuple(blocks))(model.coupling.modes)
+            seen = model.coupling.of(modes=beams, pointing=pointing) @ np.asarray(sky)
             w = turn[:, (axis + 2) % 3, (axis + 1) % 3]
             columns = columns + seen[:, None] * w[np.asarray(self.layout.time)]
         return columns if self.sources is None else columns + np.asarray(of_sources)

@@ -23,8 +23,8 @@ from lusee_bayes.systematics.systematic import Systematic
 SYSTEMATICS: tuple[type[Systematic], ...] = (
     NoiseLevel,
     PriorSpectrum,
-    PointingOffsets,
     BeamErrors,
+    PointingOffsets,
     PointSources,
     Receivers,
     RegolithTemperature,
