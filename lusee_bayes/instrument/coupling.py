@@ -28,7 +28,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
@@ -40,7 +39,6 @@ from lusee_bayes.core.harmonics import lmax_of, mode_numbers, tilts, turn_about,
 from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.beams.monopoles import (
     Monopoles,
-    beam_modes,
     monopole_beams,
     parameter,
     with_values,
@@ -649,30 +647,6 @@ class Instrument(eqx.Module):
         antennas = with_values(self.monopoles, values or {})
         return monopole_beams(self.frequency_mhz, self.lmax, antennas, nodes=self.nodes)
 
-    def derivatives(
-        self, values: Mapping[str, Float[Array, ""]]
-    ) -> Float[Array, "parameters products modes"]:
-        """Compute the derivatives of :meth:`beams` in some parameters, where they have values.
-
-        Parameters
-        ----------
-        values : mapping of str to () array
-            Values of ``beams.PARAMETERS``, in whose order the derivatives are.
-
-        Returns
-        -------
-        (parameters, products, modes) array
-            In K per K and unit of the parameter.
-
-        Raises
-        ------
-        InputError
-            If there is no such parameter; the message names the nearest.
-        """
-        at = jnp.array([float(value) for value in values.values()])
-        frequency = jnp.asarray(self.frequency_mhz)
-        return _slopes(self.monopoles, frequency, at, tuple(values), self.lmax, self.nodes)
-
     def coupling(self, values: Mapping[str, Float[Array, ""]] | None = None) -> CouplingMatrix:
         """Compute A of antennas with these values.
 
@@ -712,12 +686,3 @@ class Instrument(eqx.Module):
             If the beams have another lmax or other products.
         """
         return CouplingMatrix.build(beams, self.pointing, self.layout)
-
-
-@eqx.filter_jit
-def _slopes(monopoles, frequency_mhz, at, names, lmax, nodes) -> Array:
-    def modes(x: Array) -> BeamModes:
-        there = with_values(monopoles, dict(zip(names, x, strict=True)))
-        return beam_modes(frequency_mhz, lmax, there, "I", nodes)
-
-    return jnp.moveaxis(jax.jacfwd(modes)(at), -1, 0)

@@ -25,7 +25,13 @@ from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise import instrument_errors
 from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.sources import source_responses
-from lusee_bayes.systematics.systematic import Systematic, Truth, Unknown, Values
+from lusee_bayes.systematics.systematic import (
+    ChangedBeams,
+    Systematic,
+    Truth,
+    Unknown,
+    Values,
+)
 
 
 class BeamErrorSection(Section):
@@ -157,7 +163,7 @@ class BeamError(BeamErrors):
         return replace(model, noise=model.noise + noise)
 
 
-class InstrumentParameters(BeamErrors):
+class InstrumentParameters(ChangedBeams, BeamErrors):
     """Parameters of the antennas that are not known; their priors are Gaussian.
 
     Attributes
@@ -169,8 +175,6 @@ class InstrumentParameters(BeamErrors):
     widths : tuple of float
         Standard deviations of their priors.
     """
-
-    moves: ClassVar[bool] = True
 
     instrument: Instrument
     parameters: tuple[str, ...] = eqx.field(static=True)
@@ -208,15 +212,9 @@ class InstrumentParameters(BeamErrors):
             for (name, p, std), mean in zip(known, means, strict=True)
         )
 
-    def effect(self, model, values):
-        """A of antennas that have these values."""
-        return replace(model, coupling=model.coupling.of(modes=self.instrument.beams(values).modes))
-
-    def derivative(self, model, sky, centre):
-        """That of :meth:`effect`, through the derivatives of the beams."""
-        slopes = np.asarray(self.instrument.derivatives(self.values(centre)))
-        seen = [model.coupling.of(modes=slope) @ np.asarray(sky) for slope in slopes]
-        return np.stack(seen, axis=1) * np.array(self.widths)
+    def modes(self, modes, values):
+        """Beams of antennas that have these values."""
+        return self.instrument.beams(values).modes
 
 
 def true_beams(setup: Setup) -> ProductBeams:

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import zlib
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
 from statistics import NormalDist
@@ -550,6 +550,43 @@ class Expanded(Marginalised):
 @eqx.filter_jit
 def _derivative(systematic, model, sky, centre):
     return jax.jacfwd(lambda z: systematic.effect(model, systematic.values(z)).predict(sky))(centre)
+
+
+# steps of a derivative, in prior standard deviations, and their weights: exact to the fourth order
+STEPS = {-2.0: 1.0, -1.0: -8.0, 1.0: 8.0, 2.0: -1.0}
+STEP = 0.01
+
+
+class ChangedBeams(Systematic):
+    """Something that changes the beams; a subclass has :meth:`modes`."""
+
+    moves: ClassVar[bool] = True
+
+    @abstractmethod
+    def modes(
+        self, modes: Float[Array, "products modes"], values: Values
+    ) -> Float[Array, "products modes"]:
+        """Beams in the frame of the lander with values of the unknowns, of those without them."""
+
+    def slopes(
+        self, modes: Float[Array, "products modes"], centre: Vector
+    ) -> Iterator[Float[Array, "products modes"]]:
+        """Derivatives of :meth:`modes` by the unknowns in prior standard deviations, one by one."""
+        for step in STEP * np.eye(len(centre)):
+            ways = [self.modes(modes, self.values(centre + n * step)) for n in STEPS]
+            weighted = zip(STEPS.values(), ways, strict=True)
+            yield sum(weight * np.asarray(way) for weight, way in weighted) / (12.0 * STEP)
+
+    def effect(self, model, values):
+        """A of these beams."""
+        coupling = model.coupling
+        return replace(model, coupling=coupling.of(modes=self.modes(coupling.modes, values)))
+
+    def derivative(self, model, sky, centre):
+        """That of :meth:`effect`, through the beams."""
+        coupling = model.coupling
+        slopes = self.slopes(np.asarray(coupling.modes), centre)
+        return np.stack([coupling.of(modes=slope) @ np.asarray(sky) for slope in slopes], axis=1)
 
 
 class AdditiveNoise(Systematic):

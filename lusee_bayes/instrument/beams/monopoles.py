@@ -299,12 +299,12 @@ def monopole_beams(
     """
     monopoles = Monopoles() if monopoles is None else monopoles
     require_positive("frequency_mhz", frequency_mhz)
-    modes = beam_modes(_array(frequency_mhz), lmax, monopoles, stokes, nodes)
+    modes = _modes(_array(frequency_mhz), lmax, monopoles, stokes, nodes)
     return ProductBeams(modes, float(frequency_mhz))
 
 
 @compiled
-def beam_modes(
+def _modes(
     frequency_mhz: Frequency, lmax: int, monopoles: Monopoles, stokes: str, nodes: Any
 ) -> Float[Array, "products modes"]:
     grid = HemisphereGrid.gauss_legendre(*nodes) if nodes else HemisphereGrid.for_lmax(lmax)
