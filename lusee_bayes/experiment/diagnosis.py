@@ -403,7 +403,7 @@ def _number(factor: float, std: float) -> str:
 def _gram(here: UnderAnySky, posterior: Posterior, columns: Float[np.ndarray, "data n"]) -> Square:
     """X^T K^-1 X, K^-1 = N^-1 - N^-1 A C A^T N^-1."""
     solved = np.asarray(here.model.noise.factor().solve(columns))
-    seen = np.stack([np.asarray(here.model.coupling.transpose_mv(x)) for x in solved.T])
+    seen = np.asarray(here.model.coupling.transpose_mv(solved)).T
     white = np.asarray(posterior.prior.colour_columns(seen)).T
     half = solve_lower(posterior.lower, white, transpose=False)
     return columns.T @ solved - half.T @ half

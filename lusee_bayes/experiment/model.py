@@ -193,24 +193,25 @@ def in_noise(
         In their order.
     around : Around
     """
-    sky = np.asarray(setup.sky.modes if around.sky is None else around.sky)
-    held, gains = [], []
+    if around.sky is None:
+        around = replace(around, sky=setup.sky.modes)
+    values, stages = around.values or {}, []
     for systematic in found:
+        before = model
         if systematic.first_order:
-            held.append(on_host(Expanded.about(systematic, model, sky, around.values)))
-            model = held[-1].seen(model)
+            model = systematic.effect(model, systematic.values(systematic.centre(values)))
+        stages.append((systematic, before, model.coupling.response))
+    last, held = model.coupling.response, []
+    for systematic, before, response in stages:
+        if systematic.first_order:
+            later = last if response is None else last / response
+            held.append(on_host(Expanded.about(systematic, before, around, later)))
         else:
             held.append(Marginalised(systematic))
-        gains.append(model.coupling.response)
-    if gains and gains[-1] is None:
-        return held
-    later = [gains[-1] if before is None else gains[-1] / before for before in gains]
-    return [s.behind(g) if isinstance(s, Expanded) else s for s, g in zip(held, later, strict=True)]
+    return held
 
 
-def model_about(
-    setup: Setup, around: Around, *, scaling: bool = True
-) -> tuple[LinearGaussian, tuple[Marginalised, ...]]:
+def model_about(setup: Setup, around: Around) -> tuple[LinearGaussian, tuple[Marginalised, ...]]:
     """The full model, and the systematics in its N.
 
     Parameters
@@ -218,11 +219,9 @@ def model_about(
     setup : Setup
     around : Around
         What N is built around.
-    scaling : bool
-        Whether those are part of it that scale the sky.
     """
     model, found = base_model(setup, around), (s for _, s in systematics(setup, around))
-    held = in_noise(setup, model, (s for s in found if scaling or not s.scales_sky), around)
+    held = in_noise(setup, model, found, around)
     for systematic in held:
         model = systematic.marginalised(model)
     return model, tuple(held)

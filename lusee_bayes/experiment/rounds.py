@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -20,7 +21,6 @@ from lusee_bayes.experiment import sky_sections
 from lusee_bayes.experiment.model import full_model, model_about, moved
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.visibilities import Visibilities
-from lusee_bayes.judge.measures import data_freedom
 from lusee_bayes.linear.amplitudes import Amplitudes, template_amplitudes
 from lusee_bayes.linear.information import Information, integrated_out
 from lusee_bayes.linear.linear_gaussian import FromInformation, LinearGaussian, Solution
@@ -39,6 +39,8 @@ SETTLED, MAX_ROUNDS = 1e-2, 30
 # no unknown moves further in a round, in prior standard deviations: beyond, the first order that
 # the move comes from says little
 FARTHEST = 2.0
+# skies that the volume of those that fit is estimated with; always the same ones
+VOLUME_DRAWS = 8
 # steps that swing about where they lead to are halved, down to this part of the whole
 SHORTEST = 0.125
 
@@ -131,9 +133,14 @@ def settled(
     def conditioned(around: Around, rounds: int) -> Inference:
         model, found = model_about(setup, around)
         solution = model.condition(data.data) if known is None else known.under(model.prior)
-        return Inference(solution, found, rounds, around)
+        solved, excess = solution.weighted_residual(), 0.0
+        for part in found:
+            if isinstance(part, Expanded):
+                off = part.columns.T @ solved
+                excess += float(off @ off - (off + part.expected) @ (off + part.expected))
+        return Inference(solution.less(excess), found, rounds, around)
 
-    found = conditioned(start or _start(setup, data), 1)
+    found = conditioned(start or Around(data), 1)
     if not rebuilds(setup):
         return found
     step = _Step()
@@ -178,8 +185,9 @@ class _Step:
 
 def _around(setup: Setup, found: Inference, step: _Step) -> tuple[Around, _Step]:
     """What the terms of N are built around next, given a posterior, and the step there."""
-    visibilities, sky, values = None, None, None
-    solved = found.solution.weighted_residual()
+    visibilities, sky, values, volume = None, None, None, None
+    solution = found.solution
+    solved = solution.weighted_residual()
     if found.moving:
         ways = [s.expected + s.columns.T @ solved - s.centre for s in found.expanded]
         far = zip(found.expanded, ways, strict=True)
@@ -187,30 +195,18 @@ def _around(setup: Setup, found: Inference, step: _Step) -> tuple[Around, _Step]
         values = {}
         for s, way in zip(found.expanded, ways, strict=True):
             values |= s.systematic.in_units(s.centre + step.size * way)
+            if s.systematic.learns:
+                told = found.amplitudes(s)
+                values |= s.systematic.relearned(s.expected + told.mean, told.std**2)
         here = np.asarray(setup.sky.modes if found.around.sky is None else found.around.sky)
         sky = here + step.size * (found.posterior.mean - here)
+        draws = solution.posterior.sample(jax.random.key(0), VOLUME_DRAWS) - found.posterior.mean
+        seen = (found.model.coupling @ draw for draw in draws)
+        volume = draws, np.stack([np.asarray(solution.factor.solve(one)) for one in seen])
     if rebuilds_visibilities(setup):
         visibilities = prediction(moved(setup, values), found, solved)
-    return replace(found.around, visibilities=visibilities, sky=sky, values=values), step
-
-
-def _start(setup: Setup, data: Visibilities) -> Around:
-    """What N is built around first: the data and, with a gain table, a model that trusts it.
-
-    That model gives the share of each datum that it follows, which errors of the table change by no
-    more than what they change the radiometer noise by; and, where the modelled sky is another than
-    the data's, the sky.
-    """
-    around = Around(data)
-    if not any(cls.scales_sky for cls in first_order(setup)):
-        return around
-    model, held = model_about(setup, around, scaling=False)
-    columns = [s.columns for s in held if isinstance(s, Expanded)]
-    solution = model.condition(data.data)
-    nothing = np.zeros((model.n_data, 0))
-    freedom = data_freedom(solution, np.concatenate([nothing, *columns], axis=1))
-    sky = solution.posterior.mean if setup.measured else None
-    return Around(data, sky=sky, freedom=freedom)
+    around = replace(found.around, visibilities=visibilities, sky=sky, values=values)
+    return replace(around, volume=volume), step
 
 
 def rebuilds(setup: Setup) -> bool:

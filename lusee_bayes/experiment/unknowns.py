@@ -31,6 +31,7 @@ from lusee_bayes.instrument.pointing import offset_names
 from lusee_bayes.judge.measures import preferences
 from lusee_bayes.linear.amplitudes import Amplitudes, AmplitudesOfSky, amplitudes_of_sky
 from lusee_bayes.sky.galaxy import kelvin_steradian
+from lusee_bayes.systematics.context import Around
 from lusee_bayes.systematics.gain_table import COMMON_GAIN
 from lusee_bayes.systematics.pointing_offsets import PointingOffsets, shifted
 from lusee_bayes.systematics.sources import PointSources
@@ -370,7 +371,7 @@ def _preferred(
     steps = {name: step for kind, step in TESTED.items() for name in offset_names((kind,), n_runs)}
     centre = dict.fromkeys(steps, 0.0) | values
     offsets = PointingOffsets.of(shifted(setup, centre), steps, centre)
-    about = Expanded.about(offsets, base_model(setup), sky, centre)
+    about = Expanded.about(offsets, base_model(setup), Around(sky=sky, values=centre))
     per_unit = np.asarray(about.columns) / offsets.stds
     day = setup.observation.day
     length = -(-(int(day.max()) + 1) // MOST_STRETCHES)

@@ -24,7 +24,7 @@ numbers per ell and sample, and derivatives cost no more.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 
 import equinox as eqx
@@ -120,8 +120,8 @@ class Coupling(Described, eqx.Module):
         """A m, of a vector whose type and shape are right."""
 
     @abstractmethod
-    def _backward(self, data: DataVector) -> Modes:
-        """A^T d, of a vector whose type and shape are right."""
+    def _backward(self, data: Float[Array, "data *n"]) -> Float[Array, "unknowns *n"]:
+        """A^T d, of vectors whose type and shape are right."""
 
     def __matmul__(self, sky: Modes) -> DataVector:
         """Compute A m: the mean data of a sky.
@@ -147,17 +147,17 @@ class Coupling(Described, eqx.Module):
         data = self._forward(sky)
         return data if self.response is None else data * self.response
 
-    def transpose_mv(self, data: DataVector) -> Modes:
+    def transpose_mv(self, data: Float[Array, "data *n"]) -> Float[Array, "unknowns *n"]:
         """Compute A^T d.
 
         Parameters
         ----------
-        data : (data,) array
-            Any vector of the length of the data.
+        data : (data,) or (data, n) array
+            Any vector of the length of the data, or several as columns.
 
         Returns
         -------
-        (unknowns,) array
+        (unknowns,) or (unknowns, n) array
             A^T d, in the unit of ``data``.
 
         Raises
@@ -166,8 +166,10 @@ class Coupling(Described, eqx.Module):
             If ``data`` is not float64 or has another length.
         """
         require_float64("the data", data)
-        require_shape("the data", data, (self.shape[0],))
-        return self._backward(data if self.response is None else data * self.response)
+        require_shape("the data", data, (self.shape[0], *data.shape[1:2]))
+        if self.response is not None:
+            data = (data.T * self.response).T
+        return self._backward(data)
 
     def with_response(self, factors: DataVector) -> Coupling:
         """Multiply every row by a factor, on top of those it has.
@@ -411,6 +413,29 @@ class CouplingMatrix(Coupling):
         modes = self.modes + amplitude * direction.modes
         return replace(self, body_beams=body, by_order=by_order, modes=modes)
 
+    def along(
+        self, beams: Iterable[BeamModes], pointing: Pointing | None = None
+    ) -> Callable[[Modes], Float[Array, "beams products times"]]:
+        """Prepare what several sets of beams see, for any sky, without the response.
+
+        Parameters
+        ----------
+        beams : iterable of (products, modes) array
+            In the frame of the lander.
+        pointing : Pointing, optional
+            Another one.
+
+        Returns
+        -------
+        callable
+            Of a (modes,) sky, which gives (beams, products, times) visibilities, missing ones too.
+        """
+        stacked = np.concatenate(list(beams))
+        shape = -1, self.layout.n_products, self.layout.n_times
+        pointing = self.pointing if pointing is None else pointing
+        made = self.of_modes(stacked, pointing, DataLayout(len(stacked), shape[2]))
+        return lambda sky: np.asarray(made @ np.asarray(sky)).reshape(shape)
+
     def of(
         self, *, modes: BeamModes | None = None, pointing: Pointing | None = None
     ) -> CouplingMatrix:
@@ -500,27 +525,32 @@ class CouplingMatrix(Coupling):
         return self.layout.gather(xp.concatenate(grids, axis=1))
 
     @compiled
-    def _backward(self, data: DataVector) -> Modes:
+    def _backward(self, data: Float[Array, "data *n"]) -> Float[Array, "modes *n"]:
         """The transpose of :func:`_forward`, step by step."""
-        n = self.lmax + 1
-        grid = self.layout.scatter(data)
+        n, columns = self.lmax + 1, data.shape[1:]
+        grid = self.layout.scatter(data.reshape(len(data), -1))
         cosine, sine = _phases(self.pointing.azimuth, self.lmax)
         functions = self.pointing.functions
-        both = 0.0
+        both, most = 0.0, max(1, MOST_TIMES // grid.shape[2])
         for run, span in self.pointing.runs():
-            for first in range(span.start, span.stop, MOST_TIMES):
-                part = slice(first, min(first + MOST_TIMES, span.stop))
-                weighted = grid[:, part].T[:, :, None] * functions[part][:, None]
+            for first in range(span.start, span.stop, most):
+                part = slice(first, min(first + most, span.stop))
+                # times, products, functions, columns
+                weighted = grid[:, part].swapaxes(0, 1)[:, :, None]
+                weighted = weighted * functions[part][:, None, :, None]
+                shape = -1, weighted.shape[1] * weighted.shape[2], weighted.shape[3]
                 weighted = weighted.reshape(weighted.shape[0], -1)
-                x_and_y = [wave[part].T @ weighted for wave in (cosine, sine)]
-                x_and_y = namespace(weighted).stack(x_and_y, axis=-1)
-                both = both + self.by_order[run].swapaxes(1, 2) @ x_and_y
-        # (orders, degrees): of pairs, and of what they are crossed to
-        straight, crossed = both[..., 0], both[..., 1]
+                waves = [(wave[part].T @ weighted).reshape(shape) for wave in (cosine, sine)]
+                waves = namespace(weighted).concatenate(waves, axis=-1)
+                both = both + self.by_order[run].swapaxes(1, 2) @ waves
+        # (orders, degrees, columns): of pairs, and of what they are crossed to
+        half = both.shape[-1] // 2
+        straight, crossed = both[..., :half], both[..., half:]
         plus, minus = straight[:, :n] - crossed[:, n:], straight[:, n:] + crossed[:, :n]
         ell, m = mode_numbers(self.lmax)
-        packed = namespace(both).where(m >= 0, plus[np.abs(m), ell], minus[np.abs(m), ell])
-        return self.pointing.pole_from_galactic.T(packed)
+        above = (m >= 0)[:, None]
+        packed = namespace(both).where(above, plus[np.abs(m), ell], minus[np.abs(m), ell])
+        return self.pointing.pole_from_galactic.T(packed.T).T.reshape(-1, *columns)
 
     def _block(self, run: int, times) -> Float[Array, "products times modes"]:
         """Rows of all products for some samples of one run; times: a slice or numbers."""

@@ -121,7 +121,7 @@ def preferences(solution: Solution, templates: Float[np.ndarray, "data n"]) -> P
     model, pull = solution.model, templates.T @ solution.weighted_residual()
     solved = np.asarray(solution.factor.solve(templates))
     # rows of P^T
-    seen = np.stack([np.asarray(model.coupling.transpose_mv(column)) for column in solved.T])
+    seen = np.asarray(model.coupling.transpose_mv(solved)).T
     known = (templates * solved).sum(0) - ((seen @ solution.covariance) * seen).sum(1)
     # what the sky can take up altogether is left with rounding alone
     told = known > ROUNDING * (templates * solved).sum(0)

@@ -149,7 +149,7 @@ def amplitudes_of_sky(solution: Solution, templates: Float[Array, "data n"]) -> 
     """
     model, t = solution.model, np.asarray(templates)
     solved = np.asarray(solution.factor.solve(t))
-    pull = np.stack([np.asarray(model.coupling.transpose_mv(column)) for column in solved.T])
+    pull = np.asarray(model.coupling.transpose_mv(solved)).T
     mean, covariance = t.T @ solution.weighted_residual(), np.eye(t.shape[1]) - t.T @ solved
     return AmplitudesOfSky(mean, pull, covariance, solution.posterior.mean)
 

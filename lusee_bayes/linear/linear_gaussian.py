@@ -263,6 +263,8 @@ class Solution(Described):
         :attr:`information`, where the posterior was computed from it.
     of_noise : Factor or None
         :attr:`factor`, where it was computed.
+    excess : float
+        What chi^2 has too much where prior means of unknowns in N are moved, to make up for volume.
     """
 
     model: LinearGaussian
@@ -270,6 +272,7 @@ class Solution(Described):
     posterior: Posterior
     known: Information | None = None
     of_noise: Factor | None = None
+    excess: float = 0.0
 
     def description(self) -> tuple[str, ...]:
         return (*self.posterior.description(), "posterior, information, covariance, under(prior)")
@@ -301,7 +304,7 @@ class Solution(Described):
         """(d - E[d])^T (A S A^T + N)^-1 (d - E[d]): of the data under the model, sky included."""
         white = self.factor.whiten(self.data - self.model.predict(self.posterior.mean))
         misfit = white @ white
-        return float(misfit + self.posterior.prior_chi2())
+        return float(misfit + self.posterior.prior_chi2()) - self.excess
 
     def weighted_residual(self) -> DataVector:
         """Compute N^-1 (d - offset - A m), m the posterior mean of the sky.
@@ -311,6 +314,12 @@ class Solution(Described):
         """
         residual = self.data - self.model.predict(self.posterior.mean)
         return np.asarray(self.factor.solve(residual))
+
+    def less(self, excess: float) -> Solution:
+        """The same, with chi^2 and -2 ln p(d) lower by a number."""
+        evidence = np.asarray(self.posterior.log_evidence + excess / 2.0)
+        posterior = replace(self.posterior, log_evidence=evidence)
+        return replace(self, posterior=posterior, excess=excess)
 
     def under(self, prior: Prior) -> Solution:
         """Solve for the same data under another prior; A^T N^-1 A is not computed again.

@@ -253,8 +253,8 @@ def _with_templates(
     coupling: CouplingMatrix, noise: covariance.LowRankUpdate, factor: covariance.LowRankFactor
 ) -> ModesMatrix:
     """With N_0 + T T^T: A^T D A - V^T (1 + T^T D T)^-1 V, V = T^T D A, D = N_0^-1."""
-    v = [coupling.transpose_mv(factor.base.whiten_transpose(column)) for column in factor.v.T]
-    solved = solve_lower(factor.lower, np.stack(v), transpose=False)
+    v = coupling.transpose_mv(np.asarray(factor.base.whiten_transpose(factor.v)))
+    solved = solve_lower(factor.lower, v.T, transpose=False)
     return normal_matrix(coupling, noise.base, factor.base) - gram_matrix(solved)
 
 

@@ -162,15 +162,16 @@ class Around:
         About which the model is linear in its unknowns, in K; None for the scenario's.
     values : mapping of float or None
         Of the unknowns about which it is linear, by name; None for their prior means.
-    freedom : (data,) array or None
-        Share of each datum that sky and others follow, for the gain table; None for none.
+    volume : ((draws, modes), (draws, data)) arrays or None
+        Deviations s of skies from the mean of a posterior, in K, and N^-1 A s: what the volume of
+        skies that fit is estimated with. None before there is a posterior.
     """
 
     data: Visibilities | None = None
     visibilities: Grid | None = None
     sky: Modes | None = None
     values: Mapping[str, float] | None = None
-    freedom: DataVector | None = None
+    volume: tuple[Float[Array, "draws modes"], Float[Array, "draws data"]] | None = None
 
 
 def noise_visibilities(setup: Setup, around: Around, about: NoiseAbout) -> Grid:

@@ -8,15 +8,6 @@ port i's power gain, the data are ::
 With errors of 1 % what the first order leaves out, 1e-4, is ten times the radiometer noise, unless
 it is about values and a sky that the data determine: then it is the Gaussian about the joint mode
 of all unknowns.
-
-That mode is not where the bulk is: a larger gain and a smaller sky fit as well, and of n modes that
-the data determine, each gains by being smaller. With the sky integrated out, ln|K| makes up for it,
-K(z) = F (A S A^T + ...) F + N_0, whose derivative is ::
-
-    d(-ln|K| / 2)/dz_e = -sum_k h_k dln F_k/dz_e,    h = diag(1 - N_0 K^-1),
-
-h_k the share of datum k that the model follows (:func:`.data_freedom`). It is that of a prior mean
-of -dln F/dz^T h in place of 0, with which rounds lead to the mode of p(z | d).
 """
 
 from __future__ import annotations
@@ -24,13 +15,11 @@ from __future__ import annotations
 from typing import Annotated, ClassVar
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from pydantic import Field
 
-from lusee_bayes.core.arrays import Array, DataVector, Vector, namespace, on_device
+from lusee_bayes.core.arrays import Array, DataVector, Vector, namespace
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.section import NOT_TINY, Section, Treatment
 from lusee_bayes.instrument.products import DataLayout, ports
@@ -75,8 +64,6 @@ class GainTable(Systematic):
         Relative change of the port's power gain per prior standard deviation.
     layout : DataLayout
         The data.
-    freedom : (data,) array or None
-        h: the share of each datum that sky and others follow; None for zeros.
     """
 
     key: ClassVar[str] = "noise.gain_table"
@@ -86,17 +73,15 @@ class GainTable(Systematic):
     remedy: ClassVar[str] = "noise.gain_table.treatment=sampled"
     changes_coupling: ClassVar[bool] = False
     moves: ClassVar[bool] = True
-    scales_sky: ClassVar[bool] = True
 
     errors: tuple[str, ...] = eqx.field(static=True)
     port: tuple[int, ...] = eqx.field(static=True)
     slope: Float[Array, "errors times"]
     layout: DataLayout
-    freedom: Float[Array, " data"] | None = None
 
     @classmethod
     def build(cls, section: GainTableSection, setup: Setup, around: Around) -> GainTable:
-        return cls(*table_errors(setup), setup.layout, around.freedom)
+        return cls(*table_errors(setup), setup.layout)
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
@@ -134,17 +119,6 @@ class GainTable(Systematic):
     def effect(self, model, values):
         """Multiply by F."""
         return multiplied(model, self.factors(values[GAIN_TABLE]))
-
-    def expected(self, centre: Vector) -> Vector:
-        """What makes up for the volume of skies that fit: -dln F/dz^T h."""
-        if self.freedom is None:
-            return np.zeros(len(centre))
-        return -np.asarray(_volume_slopes(*on_device((self, centre))))
-
-
-@eqx.filter_jit
-def _volume_slopes(table: GainTable, z: Array) -> Array:
-    return jax.grad(lambda z: table.freedom @ jnp.log(table.factors(z)))(z)
 
 
 def table_errors(

@@ -224,8 +224,8 @@ class PointingOffsets(Systematic):
         seen = self.sources.seen(self.orientation(values), self.layout)
         return with_added(model, seen - self.sources.known)
 
-    def derivative(self, model, sky, centre):
-        """That of :meth:`effect`, through the turns of the antennas.
+    def linearised(self, model, centre):
+        """Through the turns of the antennas.
 
         ::
 
@@ -237,14 +237,22 @@ class PointingOffsets(Systematic):
         pointing = self.turned(self.values(centre))
         orientation, slopes, of_sources = _slopes(*on_device((self, centre)))
         turn = np.einsum("tji,tjkn->tikn", np.asarray(orientation), np.asarray(slopes))
-        columns = 0.0
+        beams, ways = [], []
         for axis in range(3):
             blocks = (generators(ell)[axis] for ell in range(model.coupling.lmax + 1))
-            beams = Rotation(tuple(blocks))(model.coupling.modes)
-            seen = model.coupling.of(modes=beams, pointing=pointing) @ np.asarray(sky)
+            beams.append(Rotation(tuple(blocks))(np.asarray(model.coupling.modes)))
             w = turn[:, (axis + 2) % 3, (axis + 1) % 3]
-            columns = columns + seen[:, None] * w[np.asarray(self.layout.time)]
-        return columns if self.sources is None else columns + np.asarray(of_sources)
+            ways.append(w[np.asarray(self.layout.time)])
+        see = model.coupling.along(beams, pointing)
+
+        def columns(sky):
+            turned = zip(see(sky), ways, strict=True)
+            seen = sum(self.layout.gather(one)[:, None] * way for one, way in turned)
+            # sources are no part of the sky
+            known = of_sources is not None and model.offset is not None
+            return seen + np.asarray(of_sources) if known else seen
+
+        return columns
 
     def orientation(self, values: Values) -> Float[Array, "times 3 3"]:
         """The rotation from the antennas' frame to the Moon-fixed one at every sample.

@@ -9,6 +9,7 @@ from pydantic import create_model
 
 from lusee_bayes.core.section import Section
 from lusee_bayes.systematics.beam import BeamErrors
+from lusee_bayes.systematics.field_errors import FieldErrors
 from lusee_bayes.systematics.gain_drifts import GainDrifts
 from lusee_bayes.systematics.gain_table import GainTable
 from lusee_bayes.systematics.noise_level import NoiseLevel, RadiometerSection
@@ -24,6 +25,7 @@ SYSTEMATICS: tuple[type[Systematic], ...] = (
     NoiseLevel,
     PriorSpectrum,
     BeamErrors,
+    FieldErrors,
     PointingOffsets,
     PointSources,
     Receivers,

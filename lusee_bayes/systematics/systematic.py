@@ -12,6 +12,15 @@ later multiply T, too. Where z_0 and m_0 are those that the data
 determine, found in rounds, this is the Gaussian about the joint mode of sky and unknowns (Gauss and
 Newton), with the term that couples z - z_0 and m - m_0 left out.
 
+That mode is not where the bulk is: a larger gain and a smaller sky fit as well, and of n modes that
+the data determine, each gains by being smaller. With the sky integrated out, ln p(d | z) has the
+volume -ln|Lambda| / 2 besides the misfit, whose slope (Fisher's identity) is ::
+
+    g = -tr(C A^T N^-1 dA/dz) = -E[T(s)^T N^-1 A s],    s ~ N(0, C),
+
+with T(s) the columns of a sky s. It is that of a prior mean of g in place of 0, with which rounds
+lead to the mode of p(z | d); a few draws of s give it to sqrt(2 / (n draws)) of itself.
+
 Some are marginalised otherwise, by a method :meth:`Systematic.marginalised` of their own: unknowns
 that are many and Gaussian have a covariance of their own (gain drifts, :class:`AdditiveNoise`),
 errors of beams one that is averaged over the skies of the prior, and scales (:class:`Scale`) have
@@ -22,7 +31,7 @@ from __future__ import annotations
 
 import zlib
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
 from statistics import NormalDist
@@ -54,6 +63,8 @@ MOST_COLLAPSED = 64
 
 # true values of what simulated data hold, by the names of their sites
 Truth = dict[str, float | np.ndarray]
+# the derivative T of the data, (data, n), for a sky
+Slopes = Callable[[Modes], Float[Array, "data n"]]
 # values of a systematic's unknowns, by the names of their sites
 Values = Mapping[str, float | Float[Array, "..."]]
 
@@ -191,11 +202,10 @@ class Systematic(eqx.Module):
         Whether :meth:`marginalised` takes the effect to first order.
     moves : bool
         Whether that is about values and a sky that the data determine, found in rounds.
-    scales_sky : bool
-        Whether its effect is a factor of all visibilities; more unknown skies then fit the data the
-        larger it is, which :meth:`expected` makes up for.
     has_table : bool
         Whether reports have a table of its unknowns alone.
+    learns : bool
+        Whether what its prior depends on is learned in rounds (:meth:`relearned`).
     """
 
     key: ClassVar[str] = ""
@@ -208,8 +218,8 @@ class Systematic(eqx.Module):
     changes_coupling: ClassVar[bool] = True
     first_order: ClassVar[bool] = True
     moves: ClassVar[bool] = False
-    scales_sky: ClassVar[bool] = False
     has_table: ClassVar[bool] = False
+    learns: ClassVar[bool] = False
 
     # --- in a scenario ---
 
@@ -336,6 +346,14 @@ class Systematic(eqx.Module):
         """Values by name, of numbers in prior standard deviations from the prior mean."""
         return dict(zip(self.names, (self.means + self.stds * z).tolist(), strict=True))
 
+    def centre(self, values: Mapping[str, float]) -> Vector:
+        """Numbers in prior standard deviations from the prior mean, of values by name.
+
+        What has no value is at its mean.
+        """
+        own = zip(self.names, self.means, strict=True)
+        return np.array([values.get(name, mean) - mean for name, mean in own]) / self.stds
+
     def true(self, truth: Truth) -> dict[str, float]:
         """True values by name, of those by site."""
         z = {u.name: (np.asarray(truth[u.name]) - u.mean) / u.std for u in self.unknowns}
@@ -359,27 +377,32 @@ class Systematic(eqx.Module):
         """
         raise NotImplementedError(f"{type(self).__name__} has no effect of its values")
 
-    def derivative(
-        self, model: LinearGaussian, sky: Modes, centre: Vector
-    ) -> Float[Array, "data n"]:
-        """Compute T, the derivative of the data by the unknowns in prior std's, in K.
+    def linearised(self, model: LinearGaussian, centre: Vector) -> Slopes:
+        """Prepare T, the derivative of the data by the unknowns in prior std's, for any sky.
 
         Parameters
         ----------
         model : LinearGaussian
             With what comes before it.
-        sky : (modes,) array
-            In K.
         centre : (n,) array
             About which, in prior standard deviations.
+
+        Returns
+        -------
+        callable
+            Of a (modes,) sky in K, which gives the (data, n) array T, in K.
         """
-        coupling, prior, unit = model.coupling, model.prior, np.ones(1)
-        if not self.changes_coupling:  # how much of this sky there is
-            coupling, prior = DenseCoupling((coupling @ sky)[:, None]), IndependentPrior(unit)
-            sky = unit
-        noise = DiagonalCovariance(np.ones(model.n_data))
-        bare = LinearGaussian(coupling, prior, noise, model.offset)
-        return _derivative(*on_device((self, bare, sky, centre)))
+
+        def columns(sky: Modes) -> Float[Array, "data n"]:
+            coupling, prior, unit = model.coupling, model.prior, np.ones(1)
+            if not self.changes_coupling:  # how much of this sky there is
+                coupling, prior = DenseCoupling((coupling @ sky)[:, None]), IndependentPrior(unit)
+                sky = unit
+            noise = DiagonalCovariance(np.ones(model.n_data))
+            bare = LinearGaussian(coupling, prior, noise, model.offset)
+            return np.asarray(_columns(*on_device((self, bare, sky, centre))))
+
+        return columns
 
     def beyond_first_order(
         self, model: LinearGaussian, sky: Modes, z: Vector
@@ -402,9 +425,15 @@ class Systematic(eqx.Module):
         middle, ways = seen(0.0 * z), zip(self.names, np.diag(z), strict=True)
         return {name: (seen(way) + seen(-way)) / 2.0 - middle for name, way in ways}
 
-    def expected(self, centre: Vector) -> Vector:
-        """What :meth:`marginalised` takes the prior mean for, about values, in prior std's."""
-        return np.zeros(len(centre))
+    def relearned(self, mean: Vector, variance: Vector) -> dict[str, float]:
+        """Learn what its prior depends on from the posterior of its unknowns, by name.
+
+        Parameters
+        ----------
+        mean, variance : (n,) array
+            In prior standard deviations.
+        """
+        return {}
 
     def chart(self, model: LinearGaussian) -> Chart | None:
         """Return coordinates of its sites, and of the sky's, in which ridges are straight.
@@ -437,8 +466,8 @@ class Systematic(eqx.Module):
         LinearGaussian
             The model averaged over its prior.
         """
-        sky = model.prior.colour(model.prior.white_mean)
-        return Expanded.about(self, model, sky).marginalised(model)
+        around = Around(sky=model.prior.colour(model.prior.white_mean))
+        return Expanded.about(self, model, around).marginalised(model)
 
     def sampled(self, model: LinearGaussian) -> LinearGaussian:
         """Sample its unknowns; call this inside a NumPyro program.
@@ -510,8 +539,8 @@ class Expanded(Marginalised):
         cls,
         systematic: Systematic,
         model: LinearGaussian,
-        sky: Modes,
-        values: Mapping[str, float] | None = None,
+        around: Around,
+        gains: DataVector | None = None,
     ) -> Expanded:
         """Expand a systematic about values and a sky.
 
@@ -520,26 +549,25 @@ class Expanded(Marginalised):
         systematic : Systematic
         model : LinearGaussian
             With all that comes before it, at its values.
-        sky : (modes,) array
-            m_0, in K.
-        values : mapping of float, optional
-            Of its unknowns, by name; what is left out is at its prior mean.
+        around : Around
+            The sky m_0, and values of the unknowns by name; what is left out is at its prior mean.
+        gains : (data,) array, optional
+            That come later.
         """
-        given = values or {}
-        means, names = systematic.means, systematic.names
-        at = np.array([given.get(name, mean) for name, mean in zip(names, means, strict=True)])
-        centre = (at - means) / systematic.stds
-        columns = systematic.derivative(model, sky, centre)
-        expected = systematic.expected(centre)
-        return cls(systematic, centre, columns, expected, columns @ (expected - centre))
+        centre = systematic.centre(around.values or {})
+        slopes = systematic.linearised(model, centre)
+        columns, expected = slopes(np.asarray(around.sky)), np.zeros(len(centre))
+        later = 1.0 if gains is None else gains
+        if systematic.moves and around.volume is not None:
+            bare = systematic.linearised(replace(model, offset=None), centre)
+            for deviation, weighted in zip(*around.volume, strict=True):
+                expected -= bare(deviation).T @ (later * weighted) / len(around.volume[0])
+        shift = columns @ (expected - centre)
+        return cls(systematic, centre, (columns.T * later).T, expected, shift)
 
     def seen(self, model: LinearGaussian) -> LinearGaussian:
         """The model at z_0."""
         return self.systematic.effect(model, self.systematic.values(self.centre))
-
-    def behind(self, gains: DataVector) -> Expanded:
-        """The same where gains come later."""
-        return replace(self, columns=self.columns * gains[:, None])
 
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Take the effect at z_0, add T T^T to N and T (expected - z_0) to the mean."""
@@ -548,7 +576,7 @@ class Expanded(Marginalised):
 
 
 @eqx.filter_jit
-def _derivative(systematic, model, sky, centre):
+def _columns(systematic, model, sky, centre):
     return jax.jacfwd(lambda z: systematic.effect(model, systematic.values(z)).predict(sky))(centre)
 
 
@@ -582,11 +610,13 @@ class ChangedBeams(Systematic):
         coupling = model.coupling
         return replace(model, coupling=coupling.of(modes=self.modes(coupling.modes, values)))
 
-    def derivative(self, model, sky, centre):
-        """That of :meth:`effect`, through the beams."""
-        coupling = model.coupling
-        slopes = self.slopes(np.asarray(coupling.modes), centre)
-        return np.stack([coupling.of(modes=slope) @ np.asarray(sky) for slope in slopes], axis=1)
+    def linearised(self, model, centre):
+        """Through the beams."""
+        slopes = self.slopes(np.asarray(model.coupling.modes), centre)
+        see, layout, response = model.coupling.along(slopes), model.coupling.layout, 1.0
+        if model.coupling.response is not None:
+            response = model.coupling.response
+        return lambda sky: np.stack([layout.gather(one) * response for one in see(sky)], axis=1)
 
 
 class AdditiveNoise(Systematic):
