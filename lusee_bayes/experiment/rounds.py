@@ -190,8 +190,13 @@ def _around(setup: Setup, found: Inference, step: _Step) -> tuple[Around, _Step]
     solved = solution.weighted_residual()
     if found.moving:
         ways = [s.expected + s.columns.T @ solved - s.centre for s in found.expanded]
-        far = zip(found.expanded, ways, strict=True)
-        step = step.after(np.concatenate([way for s, way in far if s.systematic.moves]))
+        # where the prior is learned, its widths say nothing of how far the first order reaches
+        far = [
+            way
+            for s, way in zip(found.expanded, ways, strict=True)
+            if s.systematic.moves and not s.systematic.learns
+        ]
+        step = step.after(np.concatenate(far)) if far else step
         values = {}
         for s, way in zip(found.expanded, ways, strict=True):
             values |= s.systematic.in_units(s.centre + step.size * way)

@@ -529,27 +529,27 @@ class CouplingMatrix(Coupling):
         """The transpose of :func:`_forward`, step by step."""
         n, columns = self.lmax + 1, data.shape[1:]
         grid = self.layout.scatter(data.reshape(len(data), -1))
-        cosine, sine = _phases(self.pointing.azimuth, self.lmax)
-        functions = self.pointing.functions
-        both, most = 0.0, max(1, MOST_TIMES // grid.shape[2])
+        phases, functions = _phases(self.pointing.azimuth, self.lmax), self.pointing.functions
+        n_products, n_functions = self.body_beams.shape[1:3]
+        xp, both = namespace(grid, functions), 0.0
         for run, span in self.pointing.runs():
-            for first in range(span.start, span.stop, most):
-                part = slice(first, min(first + most, span.stop))
-                # times, products, functions, columns
-                weighted = grid[:, part].swapaxes(0, 1)[:, :, None]
-                weighted = weighted * functions[part][:, None, :, None]
-                shape = -1, weighted.shape[1] * weighted.shape[2], weighted.shape[3]
-                weighted = weighted.reshape(weighted.shape[0], -1)
-                waves = [(wave[part].T @ weighted).reshape(shape) for wave in (cosine, sine)]
-                waves = namespace(weighted).concatenate(waves, axis=-1)
-                both = both + self.by_order[run].swapaxes(1, 2) @ waves
+            for first in range(span.start, span.stop, MOST_TIMES):
+                part = slice(first, min(first + MOST_TIMES, span.stop))
+                over_time = grid[:, part].swapaxes(0, 1).reshape(part.stop - first, -1)
+                waves = []
+                for wave in phases:
+                    wave = wave[part][:, :, None] * functions[part][:, None]
+                    seen = wave.reshape(len(over_time), -1).T @ over_time
+                    seen = seen.reshape(n, n_functions, n_products, -1).swapaxes(1, 2)
+                    waves.append(seen.reshape(n, n_products * n_functions, -1))
+                both = both + self.by_order[run].swapaxes(1, 2) @ xp.concatenate(waves, axis=-1)
         # (orders, degrees, columns): of pairs, and of what they are crossed to
         half = both.shape[-1] // 2
         straight, crossed = both[..., :half], both[..., half:]
         plus, minus = straight[:, :n] - crossed[:, n:], straight[:, n:] + crossed[:, :n]
         ell, m = mode_numbers(self.lmax)
         above = (m >= 0)[:, None]
-        packed = namespace(both).where(above, plus[np.abs(m), ell], minus[np.abs(m), ell])
+        packed = xp.where(above, plus[np.abs(m), ell], minus[np.abs(m), ell])
         return self.pointing.pole_from_galactic.T(packed.T).T.reshape(-1, *columns)
 
     def _block(self, run: int, times) -> Float[Array, "products times modes"]:
