@@ -1,7 +1,7 @@
 """The ground, the antennas and the map from one run: the sky is integrated out for every beam.
 
 Change the names and priors to those of your own question; ``instrument.coupling`` takes every
-parameter of ``lusee_bayes.instrument.beams.PARAMETERS``.
+parameter of the embedded antennas, or of a grid of beam files (docs/files.md).
 """
 
 import numpyro

@@ -249,7 +249,7 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
 
     def instrument() -> Instrument:
         require_free(BeamErrors)
-        if experiment.scenario.beam.is_file:
+        if not setup.beam_source.parameters():
             raise InputError(
                 "the program asks for the embedded antennas, which beam.file replaces; leave out "
                 "beam.file"
@@ -313,9 +313,38 @@ def posterior_draws(
     return posterior.sample(key, n)
 
 
+# rms error of interpolated beams in the data, in radiometer noise, above which it is doubtful
+MOST_OFF = 0.1
+
+
+def interpolation_error(setup: Setup) -> dict[str, float]:
+    """RMS error of interpolated beams in the model sky's data, over the radiometer noise.
+
+    By where it is found, such as "zenith_angle_deg 75" (:meth:`.BeamSource.interpolation_errors`),
+    the largest of each; nothing where beams are not interpolated in parameters.
+    """
+    std = np.sqrt(np.asarray(radiometer(setup).diagonal()))
+    off = setup.beam_source.interpolation_errors(setup.frequency_mhz, setup.scenario.lmax)
+
+    def rms(modes: np.ndarray) -> float:
+        seen = setup.coupling.of(modes=modes) @ setup.sky.modes
+        return float(np.sqrt(np.mean((seen / std) ** 2)))
+
+    return {where: max(map(rms, lines)) for where, lines in off.items()}
+
+
 def doubts(experiment: Experiment, inference: Inference) -> tuple[str, ...]:
     """What is doubtful about an experiment's data, its prior and its rounds."""
     learned, found = experiment.learned, list(experiment.doubts)
+    errors = interpolation_error(experiment.setup)
+    worst = max(errors, key=errors.__getitem__, default="")
+    if worst and errors[worst] > MOST_OFF:
+        found.append(
+            f"Beams between the files of {experiment.scenario.beam.label} may be off by up to "
+            f"{errors[worst]:.2g} radiometer standard deviations (rms), as those of {worst} are "
+            "where they are interpolated without their own files; files in smaller steps, or more "
+            "of them, make it less."
+        )
     if learned is not None and not learned.settled:
         found.append(
             "The prior is a fixed, wide one: its parameters do not settle, whatever the noise."

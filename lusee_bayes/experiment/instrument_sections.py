@@ -27,6 +27,7 @@ from lusee_bayes.core.section import (
     requires,
 )
 from lusee_bayes.instrument.beams.fields import Interpolation
+from lusee_bayes.instrument.beams.grid import read_beam_grid, read_grid_table
 from lusee_bayes.instrument.beams.luseepy_files import read_response, read_scalar_beam
 from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith
 from lusee_bayes.instrument.beams.sampled import beam_kind, read_sampled
@@ -195,6 +196,9 @@ ReceiverSection = Annotated[
 class BaseBeamSection(Section):
     """What all beams have in common."""
 
+    # whether something about them can be an unknown
+    has_parameters: ClassVar[bool] = False
+
     def of_file(self, file: str) -> Any:
         """The section of beams of a file that are turned as these are."""
         kind = BEAM_SECTIONS[beam_kind(file)]
@@ -224,6 +228,7 @@ class MonopoleBeamSection(BaseBeamSection):
     """
 
     is_file: ClassVar[bool] = False
+    has_parameters: ClassVar[bool] = True
     # for the header of a file, and number of antennas
     label: ClassVar[str] = "monopole"
     n_ports: ClassVar[int] = N_ANTENNAS
@@ -373,9 +378,35 @@ class SampledBeamSection(_FileSection):
         return replace(read_sampled(self.file), **asked)
 
 
+class GridBeamSection(ScalarBeamSection, ResponseSection, SampledBeamSection):
+    """Beams of files over a grid of parameters; every file takes the keys that its kind has.
+
+    Attributes
+    ----------
+    file : str
+        CSV table of the files, with their parameters.
+    values : dict
+        Of the table's parameters, each by default in the middle of the grid.
+    """
+
+    has_parameters: ClassVar[bool] = True
+
+    model: Literal["grid"] = "grid"
+    values: dict[str, float] = Field(default_factory=dict)
+
+    @property
+    def n_ports(self) -> int:
+        """Number of ports."""
+        return self.of_file(read_grid_table(self.file)[0][0]).n_ports
+
+    def source(self) -> BeamSource:
+        """The beams of all files, interpolated."""
+        return read_beam_grid(self.file, self.values, lambda file: self.of_file(file).source())
+
+
 BEAM_SECTIONS = kinds_of(
     MonopoleBeamSection, ScalarBeamSection, ResponseSection, SampledBeamSection
-)
+) | kinds_of(GridBeamSection)
 
 
 def _complete_beam(tree: dict[str, Any]) -> None:
@@ -385,7 +416,7 @@ def _complete_beam(tree: dict[str, Any]) -> None:
     file = tree.get("file")
     if tree["model"] == default and file is not None:
         tree["model"] = beam_kind(file) if isinstance(file, str) else "luseepy"
-    if tree["model"] != "response" and tree.get("receiver") == "jfet":
+    if tree["model"] not in ("response", "grid") and tree.get("receiver") == "jfet":
         del tree["receiver"]  # scenarios of 0.1 held all keys of all kinds
     temperatures = ("moon_temperature_k", "antenna_temperature_k")
     if tree["model"] == default and any(tree.get(name) for name in temperatures):

@@ -19,7 +19,6 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ
-from lusee_bayes.instrument.beams.monopoles import Monopoles
 from lusee_bayes.instrument.coupling import CouplingMatrix, DenseCoupling, Instrument
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import auto_indices
@@ -92,9 +91,7 @@ def set_up(
         complete = CouplingMatrix.build(beams, pointing)
         layout = complete.layout if data is None else data.layout
         signal = expected_signal(sources, complete, sky, background, responses)
-        # those of a file have no parameters
-        antennas = Monopoles() if scenario.beam.is_file else source.monopoles
-        instrument = Instrument(antennas, pointing, layout, scenario.frequency_mhz, scenario.lmax)
+        instrument = Instrument(source, pointing, layout, scenario.frequency_mhz, scenario.lmax)
         coupling = replace(complete, layout=layout)
     pieces = observation, sky, source, instrument, beams, coupling, prior, responses, background
     of_data = None if data is None else data.calibration, data is not None

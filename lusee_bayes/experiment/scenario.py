@@ -225,10 +225,11 @@ class Scenario(Section):
                 "the embedded sky holds the catalogue's sources already; with sources.list of its "
                 "own, set sky.sources=false"
             )
-        if self.beam.is_file and parameters:
+        if parameters and not self.beam.has_parameters:
             raise ValueError(
                 "noise.beam.parameters are those of the embedded antennas, which beam.file "
-                "replaces; use noise.beam.shift_mhz or noise.beam.file"
+                "replaces; use noise.beam.shift_mhz or noise.beam.file, or files over a grid of "
+                "parameters (beam.model=grid)"
             )
         if (self.beam.is_file or (error is not None and error.file is not None)) and own_sources:
             raise ValueError(

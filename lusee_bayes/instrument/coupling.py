@@ -37,12 +37,7 @@ from lusee_bayes.core.checks import Described, require_array, require_float64, r
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, mode_numbers, tilts, turn_about, turn_about_z
 from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.beams.monopoles import (
-    Monopoles,
-    monopole_beams,
-    parameter,
-    with_values,
-)
+from lusee_bayes.instrument.beams.source import BeamSource
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout
@@ -615,7 +610,7 @@ class Instrument(eqx.Module):
 
     Attributes
     ----------
-    monopoles : Monopoles
+    source : BeamSource
         The antennas and the ground, with the present values of all parameters.
     pointing : Pointing
         The orientations at every sample.
@@ -625,16 +620,13 @@ class Instrument(eqx.Module):
         In MHz.
     lmax : int
         Highest ell of the beams and the sky.
-    nodes : (int, int) or None
-        Of the grid on which beams are computed; see ``monopole_beams``.
     """
 
-    monopoles: Monopoles
+    source: BeamSource
     pointing: Pointing
     layout: DataLayout
     frequency_mhz: float = eqx.field(static=True)
     lmax: int = eqx.field(static=True)
-    nodes: tuple[int, int] | None = eqx.field(static=True, default=None)
 
     def value(self, name: str) -> Float[Array, ""]:
         """Look up the present value of a parameter.
@@ -642,7 +634,7 @@ class Instrument(eqx.Module):
         Parameters
         ----------
         name : str
-            One of ``beams.PARAMETERS``.
+            One of :meth:`.BeamSource.parameters`.
 
         Returns
         -------
@@ -654,15 +646,15 @@ class Instrument(eqx.Module):
         InputError
             If there is no such parameter; the message names the nearest.
         """
-        return parameter(name).where(self.monopoles)
+        return self.source.parameter(name).value
 
-    def beams(self, values: Mapping[str, Float[Array, ""]] | None = None) -> ProductBeams:
+    def beams(self, values: Mapping[str, float | Float[Array, ""]] | None = None) -> ProductBeams:
         """Compute the beams of all products.
 
         Parameters
         ----------
         values : mapping of str to () array, optional
-            Values of some parameters (``beams.PARAMETERS``); the others keep theirs.
+            Values of some parameters (:meth:`.BeamSource.parameters`); the others keep theirs.
 
         Returns
         -------
@@ -674,16 +666,17 @@ class Instrument(eqx.Module):
         InputError
             If there is no parameter of that name.
         """
-        antennas = with_values(self.monopoles, values or {})
-        return monopole_beams(self.frequency_mhz, self.lmax, antennas, nodes=self.nodes)
+        return self.source.with_values(values or {}).beams(self.frequency_mhz, self.lmax)
 
-    def coupling(self, values: Mapping[str, Float[Array, ""]] | None = None) -> CouplingMatrix:
+    def coupling(
+        self, values: Mapping[str, float | Float[Array, ""]] | None = None
+    ) -> CouplingMatrix:
         """Compute A of antennas with these values.
 
         Parameters
         ----------
         values : mapping of str to () array, optional
-            Values of some parameters (``beams.PARAMETERS``); the others keep theirs.
+            Values of some parameters (:meth:`.BeamSource.parameters`); the others keep theirs.
 
         Returns
         -------

@@ -43,6 +43,7 @@ KINDS: tuple[tuple[Callable[[Path], bool], str], ...] = (
     (lambda path: has_words(path, formats.UVBEAM_WORDS), SAMPLED),
     (_has_image("combinations", "products"), "instrument.waterfalls:read_waterfall"),
     (formats.is_session, "flight.session_files:read_session"),
+    (lambda path: path.suffix == ".csv", "instrument.beams.grid:read_beam_grid"),
     (lambda path: True, "sky.sky_source:read_sky_file"),
 )
 

@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 from pydantic import Field
 
+from lusee_bayes.core.arrays import DataVector
 from lusee_bayes.core.section import Positive, Section, Treatment, requires
 from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.beams.monopoles import parameter, with_values
 from lusee_bayes.instrument.beams.source import BeamSource
 from lusee_bayes.instrument.coupling import Coupling, Instrument
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
@@ -31,6 +31,7 @@ from lusee_bayes.systematics.systematic import (
     Truth,
     Unknown,
     Values,
+    with_added,
 )
 
 
@@ -44,8 +45,8 @@ class BeamErrorSection(Section):
     file : str
         The data are taken with the beams of this file.
     parameters : dict
-        Prior standard deviations of parameters of the embedded antennas about the values in
-        ``beam``, by name; the data's own are drawn with the seed.
+        Prior standard deviations of parameters of the embedded antennas, or of a grid of files,
+        about the values in ``beam``, by name; the data's own are drawn with the seed.
     treatment : {"marginalised", "sampled", "ignored"}
         The error's covariance is added to N, its amplitude or parameters are sampled with the
         map, or it is left out of the model.
@@ -125,7 +126,7 @@ def _true(section: BeamErrorSection, setup: Setup, values: Values) -> tuple[Beam
         other = setup.scenario.beam.of_file(section.file).source()
         return other.behind(setup.receiver), frequency_mhz
     own = {name: values[name] for name in section.parameters}
-    return with_values(source.monopoles, own), frequency_mhz
+    return source.with_values(own), frequency_mhz
 
 
 def difference_of_beams(section: BeamErrorSection, setup: Setup) -> ProductBeams:
@@ -205,16 +206,32 @@ class InstrumentParameters(ChangedBeams, BeamErrors):
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
-        known = [(n, parameter(n), s) for n, s in zip(self.parameters, self.widths, strict=True)]
-        means = [float(self.instrument.value(name)) for name in self.parameters]
+        known = [self.instrument.source.parameter(name) for name in self.parameters]
         return tuple(
-            Unknown(name, mean, std, low=p.low, high=p.high)
-            for (name, p, std), mean in zip(known, means, strict=True)
+            Unknown(name, float(p.value), std, low=p.low, high=p.high)
+            for name, p, std in zip(self.parameters, known, self.widths, strict=True)
         )
 
     def modes(self, modes, values):
         """Beams of antennas that have these values."""
         return self.instrument.beams(values).modes
+
+    def effect(self, model, values):
+        """A of these beams, and what ground and antennas then emit."""
+        return with_added(super().effect(model, values), self.emitted(values))
+
+    def derivative(self, model, sky, centre):
+        """That of :meth:`effect`."""
+        emitted = np.stack(list(self.differences(self.emitted, centre)), axis=1)
+        return super().derivative(model, sky, centre) + emitted
+
+    def emitted(self, values: Values) -> DataVector:
+        """What ground and antennas emit beyond the background, in K."""
+        source, frequency_mhz = self.instrument.source, self.instrument.frequency_mhz
+        more = source.with_values(values).background(frequency_mhz)
+        more, layout = more - source.background(frequency_mhz), self.instrument.layout
+        each_time = np.ones((1, layout.n_times))
+        return layout.gather(more[:, None] * each_time)
 
 
 def true_beams(setup: Setup) -> ProductBeams:

@@ -600,8 +600,14 @@ class ChangedBeams(Systematic):
         self, modes: Float[Array, "products modes"], centre: Vector
     ) -> Iterator[Float[Array, "products modes"]]:
         """Derivatives of :meth:`modes` by the unknowns in prior standard deviations, one by one."""
+        return self.differences(lambda values: self.modes(modes, values), centre)
+
+    def differences(
+        self, made: Callable[[Values], Array], centre: Vector
+    ) -> Iterator[Float[np.ndarray, "..."]]:
+        """Derivatives of what is made of values likewise."""
         for step in STEP * np.eye(len(centre)):
-            ways = [self.modes(modes, self.values(centre + n * step)) for n in STEPS]
+            ways = [made(self.values(centre + n * step)) for n in STEPS]
             weighted = zip(STEPS.values(), ways, strict=True)
             yield sum(weight * np.asarray(way) for weight, way in weighted) / (12.0 * STEP)
 

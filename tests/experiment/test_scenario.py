@@ -97,8 +97,8 @@ REFUSED = [
     ("lmax.x=1", "'lmax' holds a value, not a section"),
     ("seed=[", "not valid YAML"),
     # entries of another kind, and those that have to be there
-    ("beam.receiver=open", "fiducial: beam: receiver is an entry of model response, not of"),
-    ("beam.quadrature=luseepy", "quadrature is an entry of model luseepy, response, not of"),
+    ("beam.receiver=open", "fiducial: beam: receiver is an entry of model response, grid, not of"),
+    ("beam.quadrature=luseepy", "quadrature is an entry of model luseepy, response, grid, not of"),
     ("beam.moon_temperature_k=250", "temperatures of Moon and antennas need beam.file"),
     ("beam={file: arm.fits, antenna_temperature_k: 300}", "scalar beam, which knows of no losses"),
     ("beam={file: arm.fits, height_m: 1}", "height_m is an entry of model monopole"),
@@ -379,7 +379,9 @@ def test_a_default_changes_nothing(plain, key):
 
 
 RECEIVER = "beam={model: response, file: x, receiver: {model: %s, file: x}}"
-OF_KIND = {name: f"beam={{model: {name}, file: x}}" for name in ("luseepy", "response", "sampled")}
+OF_KIND = {
+    name: f"beam={{model: {name}, file: x}}" for name in ("luseepy", "response", "sampled", "grid")
+}
 OF_KIND |= {name: f"prior.model={name}" for name in ("isotropic", "local_scales")}
 OF_KIND |= {name: (RECEIVER % name).replace(", file: x}}", "}}") for name in ("jfet", "capacitor")}
 

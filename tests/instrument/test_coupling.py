@@ -16,7 +16,7 @@ from scipy.stats import norm, truncnorm
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import Rotation, n_modes, turn_about_z
 from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith, with_values
+from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith
 from lusee_bayes.instrument.coupling import CouplingMatrix, DenseCoupling, Instrument
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout, auto_indices, labels
@@ -235,7 +235,7 @@ def test_derivatives_are_those_of_finite_differences(pointing, layout, parameter
     assert got.frequency_mhz == FREQUENCY
     start = instrument.value(parameter)
     step = 1e-5 * float(start)
-    moved = [with_values(antennas, {parameter: start + s}) for s in (step, -step)]
+    moved = [antennas.with_values({parameter: start + s}) for s in (step, -step)]
     up, down = (lb.monopole_beams(FREQUENCY, LOW, one).modes for one in moved)
     expected = (np.asarray(up) - np.asarray(down)) / (2.0 * step)
     assert np.abs(expected).max() > 0
@@ -325,7 +325,7 @@ def test_what_cannot_be_is_refused(coupling, instrument, base, pointing):
         refuse(words, coupling.rows, np.array([product]), np.array([time]))
     words = "unknown beam parameter 'lenght_m'; did you mean 'length_m'"
     refuse(words, instrument.derivative, "lenght_m")
-    refuse(words, with_values, instrument.monopoles, {"lenght_m": 0.1})
+    refuse(words, instrument.source.with_values, {"lenght_m": 0.1})
     refuse("prepare the instrument first", replace(instrument, rotations=None).dense, {})
     # a direction has no gains, and the same samples
     one, plus = jnp.ones(()), base.coupling.plus

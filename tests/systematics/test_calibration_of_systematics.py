@@ -137,7 +137,8 @@ def test_permittivity_loss_tangent_and_tilt():
     treatment = f"noise.beam={{treatment: sampled, parameters: {{{parameters}}}}}"
     program, arguments = pieces("systematics", *TINY, treatment)
     (antennas,) = arguments["systematics"]
-    coarse = replace(antennas, instrument=replace(antennas.instrument, nodes=(12, 16)))
+    source = replace(antennas.instrument.source, nodes=(12, 16))
+    coarse = replace(antennas, instrument=replace(antennas.instrument, source=source))
     arguments = {**arguments, "systematics": (coarse,)}
     draws = Draws(program, arguments, hmc(40), starts=3)
     found = ranks_of(program, arguments, Sites(antennas.names), draws=draws)

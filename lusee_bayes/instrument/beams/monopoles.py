@@ -19,7 +19,6 @@ gives V_k(t) = x B_k(n(t)) (:func:`source_response`). It rises and sets sharply,
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import equinox as eqx
@@ -29,7 +28,7 @@ from scipy.constants import speed_of_light
 
 from lusee_bayes.core.arrays import Array, as_complex, compiled, namespace
 from lusee_bayes.core.checks import is_traced, require_array, require_finite, require_positive
-from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.beams.fields import (
     AntennaFields,
     Fields,
@@ -39,7 +38,7 @@ from lusee_bayes.instrument.beams.fields import (
     product_modes,
     stokes_pairs,
 )
-from lusee_bayes.instrument.beams.source import BeamSource
+from lusee_bayes.instrument.beams.source import BeamSource, Parameter
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import to_real
 
@@ -174,6 +173,8 @@ class Monopoles(BeamSource, eqx.Module):
         Directions of the arms at turntable angle zero, from East towards North.
     turntable_offset_deg : float
         How much further the turntable is than it says, from East towards North.
+    nodes : (int, int) or None
+        Of the grid on which beams are computed; see :func:`monopole_beams`.
 
     Raises
     ------
@@ -187,6 +188,7 @@ class Monopoles(BeamSource, eqx.Module):
     height_m: Float[Array, ""] = eqx.field(default=2.0, converter=_array)
     azimuths_deg: Float[Array, " antennas"] = eqx.field(default=PORT_AZIMUTHS_DEG, converter=_array)
     turntable_offset_deg: Float[Array, ""] = eqx.field(default=0.0, converter=_array)
+    nodes: tuple[int, int] | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
         for name in ("zenith_angle_deg", "azimuths_deg", "turntable_offset_deg"):
@@ -202,8 +204,18 @@ class Monopoles(BeamSource, eqx.Module):
     def monopoles(self) -> Monopoles:
         return self
 
+    def parameters(self) -> dict[str, Parameter]:
+        return {n: Parameter(where(self), *ends) for n, (where, *ends) in PARAMETERS.items()}
+
+    def with_values(self, values: Mapping[str, float | Float[Array, ""]]) -> Monopoles:
+        changed = self
+        for name, value in values.items():
+            self.parameter(name)
+            changed = eqx.tree_at(PARAMETERS[name][0], changed, _array(value))
+        return changed
+
     def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
-        return monopole_beams(frequency_mhz, lmax, self)
+        return monopole_beams(frequency_mhz, lmax, self, nodes=self.nodes)
 
     def fields(self, frequency_mhz: Frequency, grid: HemisphereGrid) -> AntennaFields:
         """Return the field patterns on a grid, with the phase centre at the feed for all arms."""
@@ -311,58 +323,16 @@ def _modes(
     return product_modes(monopoles.fields(frequency_mhz, grid), lmax, stokes=stokes)
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """A parameter of the embedded antennas.
-
-    Attributes
-    ----------
-    where : callable
-        Returns the parameter of given antennas.
-    low, high : float
-        Ends of its domain.
-    """
-
-    where: Callable[[Monopoles], Float[Array, ""]]
-    low: float = -np.inf
-    high: float = np.inf
-
-
-PARAMETERS = {
-    "length_m": Parameter(lambda m: m.length_m, low=0.0),
-    "zenith_angle_deg": Parameter(lambda m: m.zenith_angle_deg, low=0.0, high=180.0),
-    "height_m": Parameter(lambda m: m.height_m, low=0.0),
-    "turntable_offset_deg": Parameter(lambda m: m.turntable_offset_deg),
-    "surface_permittivity": Parameter(lambda m: m.regolith.surface_permittivity, low=1.0),
-    "deep_permittivity": Parameter(lambda m: m.regolith.deep_permittivity, low=1.0),
-    "loss_tangent": Parameter(lambda m: m.regolith.loss_tangent, low=0.0),
+# where each parameter of the antennas is, and the ends of its domain
+PARAMETERS: Mapping[str, tuple[Callable[[Monopoles], Float[Array, ""]], float, float]] = {
+    "length_m": (lambda m: m.length_m, 0.0, np.inf),
+    "zenith_angle_deg": (lambda m: m.zenith_angle_deg, 0.0, 180.0),
+    "height_m": (lambda m: m.height_m, 0.0, np.inf),
+    "turntable_offset_deg": (lambda m: m.turntable_offset_deg, -np.inf, np.inf),
+    "surface_permittivity": (lambda m: m.regolith.surface_permittivity, 1.0, np.inf),
+    "deep_permittivity": (lambda m: m.regolith.deep_permittivity, 1.0, np.inf),
+    "loss_tangent": (lambda m: m.regolith.loss_tangent, 0.0, np.inf),
 }
-
-
-def parameter(name: str) -> Parameter:
-    """Return the parameter of this name.
-
-    Raises
-    ------
-    InputError
-        If there is none; the message gives the nearest name.
-    """
-    if name not in PARAMETERS:
-        raise InputError(f"unknown beam parameter '{name}'; {nearest(name, PARAMETERS)}")
-    return PARAMETERS[name]
-
-
-def with_values(monopoles: Monopoles, values: Mapping[str, float | Float[Array, ""]]) -> Monopoles:
-    """Return the antennas with other values of the named parameters.
-
-    Raises
-    ------
-    InputError
-        If a name is unknown.
-    """
-    for name, value in values.items():
-        monopoles = eqx.tree_at(parameter(name).where, monopoles, _array(value))
-    return monopoles
 
 
 # rotations keep |n| = 1 to rounding; a vector that is further from it is a mistake

@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -23,7 +23,7 @@ from pydantic import BeforeValidator, Field
 from scipy.constants import Boltzmann
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.formats import read_fits
 from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.section import LARGEST, Positive, Section
@@ -259,6 +259,22 @@ class Circuit:
         return 4.0 * Boltzmann * self.loading @ kelvin_ohm @ self.loading.conj().T
 
 
+class Parameter(NamedTuple):
+    """A parameter of antennas.
+
+    Attributes
+    ----------
+    value : () array
+        The present one, in the unit that the parameter's name ends with.
+    low, high : float
+        Ends of its domain.
+    """
+
+    value: float | Float[Array, ""]
+    low: float = -np.inf
+    high: float = np.inf
+
+
 class BeamSource(ABC):
     """The antennas of an instrument at every frequency, and what they receive from the ground.
 
@@ -373,6 +389,41 @@ class BeamSource(ABC):
     def behind(self, receiver: Receiver | None) -> BeamSource:
         """Return the source with the receivers of data, where they and nothing else say them."""
         return self
+
+    def parameters(self) -> Mapping[str, Parameter]:
+        """Return what can be changed about the antennas, by name; nothing about those of a file."""
+        return {}
+
+    def parameter(self, name: str) -> Parameter:
+        """Return the parameter of this name.
+
+        Raises
+        ------
+        InputError
+            If there is none; the message gives the nearest name.
+        """
+        found = self.parameters()
+        if name not in found:
+            raise InputError(f"unknown beam parameter '{name}'; {nearest(name, found)}")
+        return found[name]
+
+    def with_values(self, values: Mapping[str, float | Float[Array, ""]]) -> BeamSource:
+        """Return the antennas with other values of the named parameters, differentiable in these.
+
+        Raises
+        ------
+        InputError
+            If a name is unknown, or a value outside what the source can have.
+        """
+        for name in values:
+            self.parameter(name)
+        return self
+
+    def interpolation_errors(
+        self, frequency_mhz: float, lmax: int
+    ) -> Mapping[str, Float[np.ndarray, "lines products modes"]]:
+        """Return errors of beams that are interpolated in parameters, by what they are found at."""
+        return {}
 
     @property
     def monopoles(self) -> BeamSource:

@@ -1,0 +1,256 @@
+"""Beams of files over a grid of parameters, interpolated between them.
+
+Somebody's simulations of the antennas at several values of, say, permittivity and tilt are one
+source of beams, whose parameters can be unknowns. A table in CSV says what each file is of: a
+column ``file``, relative to the table, and a column for each parameter, with a row for every
+combination of their values.
+
+Beams are sums over the files, B(p) = sum_k w_k(p) B_k, with products of weights along each
+parameter: polynomials through all of up to five values, cubic splines through more. So is what the
+ground and the antennas' losses emit.
+
+**Unit.** What is measured are volts, and 1 K stays what it is for the antennas at nominal values
+p_0, U(p_0), whatever their impedances are at p: what is interpolated are B_k U_k / U(p_0), U being
+the root of U_aa U_bb of a product's ports (:mod:`.luseepy_files`). Sources that know no volts are
+interpolated as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import product
+from math import factorial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.interpolate import make_interp_spline
+
+from lusee_bayes.core.arrays import Array, namespace
+from lusee_bayes.core.checks import Described, is_traced
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.layouts import Layout, Variable
+from lusee_bayes.core.reading import read_table
+from lusee_bayes.instrument.beams.fields import HemisphereGrid, Interpolation, Pairs, ProductBeams
+from lusee_bayes.instrument.beams.sampled import read_beam
+from lusee_bayes.instrument.beams.source import BeamSource, Circuit, Parameter, Receiver
+from lusee_bayes.instrument.products import all_products
+
+Nodes = Float[np.ndarray, " nodes"]
+# values of a parameter through which one polynomial goes; through more go cubic splines
+MOST_IN_ONE = 5
+WHAT = "a table of beam files: a column file, and one with two or more values for each parameter"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class GridBeams(Described, BeamSource):
+    """Sources of beams at the nodes of a grid of parameters, interpolated to values of these.
+
+    Attributes
+    ----------
+    path : str
+        The table, for error messages.
+    axes : mapping of str to (nodes,) array
+        Growing values of each parameter.
+    sources : tuple of BeamSource
+        For every combination of these values, those of the last parameter changing first.
+    values : mapping of str to () array
+        Present values of the parameters.
+    nominal : mapping of str to float
+        Values for which visibilities in volts are converted to K.
+    known : dict
+        What has been computed at the nodes.
+    """
+
+    path: str
+    axes: Mapping[str, Nodes]
+    sources: tuple[BeamSource, ...]
+    values: Mapping[str, float | Float[Array, ""]]
+    nominal: Mapping[str, float]
+    known: dict[Any, np.ndarray] = field(default_factory=dict)
+
+    def description(self) -> tuple[str, ...]:
+        axes = (f"{name} {', '.join(f'{x:g}' for x in xs)}" for name, xs in self.axes.items())
+        return f"{len(self.sources)} beam files, {self.n_ports} ports, over a grid of", *axes
+
+    @property
+    def n_ports(self) -> int:
+        return self.sources[0].n_ports
+
+    def parameters(self) -> dict[str, Parameter]:
+        return {n: Parameter(self.values[n], xs[0], xs[-1]) for n, xs in self.axes.items()}
+
+    def with_values(self, values: Mapping[str, float | Float[Array, ""]]) -> GridBeams:
+        for name, value in values.items():
+            _, low, high = self.parameter(name)
+            if not is_traced(value) and not low <= value <= high:
+                raise InputError(
+                    f"{self.path}: {name} is {float(value):.6g}, and the files go from {low:g} to "
+                    f"{high:g}; give a value between these, or files that reach there"
+                )
+        return replace(self, values={**self.values, **values})
+
+    def weights(self, values: Mapping[str, float | Float[Array, ""]]) -> Float[Array, " sources"]:
+        """Return the weights of the sources at these values of all parameters."""
+        found = np.ones(1)
+        for name, nodes in self.axes.items():
+            found = (found[:, None] * weights_along(nodes, values[name])[None]).reshape(-1)
+        return found
+
+    def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
+        return ProductBeams(self._seen(frequency_mhz, lmax)[:, :-1], float(frequency_mhz))
+
+    def background(self, frequency_mhz: float) -> Float[Array, " products"]:
+        return self._seen(frequency_mhz, 0)[:, -1]
+
+    def _seen(self, frequency_mhz: float, lmax: int) -> Float[Array, "products columns"]:
+        """Coefficients of the beams, and what comes without any sky."""
+        nodes = self._at_nodes(frequency_mhz, lmax)
+        return (self.weights(self.values) @ nodes.reshape(len(nodes), -1)).reshape(nodes.shape[1:])
+
+    def _at_nodes(self, frequency_mhz: float, lmax: int) -> Float[np.ndarray, "sources products n"]:
+        """The same of every source, in the unit of the nominal values."""
+        key = frequency_mhz, lmax
+        if key not in self.known:
+            unit = self.circuit(frequency_mhz)
+            self.known[key] = np.stack([_in_unit(source, unit, *key) for source in self.sources])
+        return self.known[key]
+
+    def circuit(self, frequency_mhz: float) -> Circuit | None:
+        """Return antennas and receivers at the nominal values, which say what 1 K is."""
+        found = [source.circuit(frequency_mhz) for source in self.sources]
+        if None in found:
+            return None
+        weights, names = self.weights(self.nominal), ("antenna_ohm", "moon_ohm", "loss_ohm")
+        parts = {n: np.tensordot(weights, [getattr(c, n) for c in found], 1) for n in names}
+        return replace(found[0], **parts)
+
+    def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> Any:
+        raise InputError(f"{self.path}: between files are beams of products, not the E fields")
+
+    def patterns(self, frequency_mhz: float, grid: HemisphereGrid) -> Pairs:
+        found = [np.asarray(source.patterns(frequency_mhz, grid)) for source in self.sources]
+        return np.tensordot(self.weights(self.values), found, 1)
+
+    def interpolated(self, frequency_mhz: float) -> Interpolation | None:
+        return self.sources[0].interpolated(frequency_mhz)
+
+    def behind(self, receiver: Receiver | None) -> GridBeams:
+        return replace(self, sources=tuple(s.behind(receiver) for s in self.sources), known={})
+
+    def interpolation_errors(
+        self, frequency_mhz: float, lmax: int
+    ) -> dict[str, Float[np.ndarray, "lines products modes"]]:
+        """Return by how much beams are off where they are interpolated without their own file.
+
+        For each value of a parameter between its ends: the beams of its other values, interpolated
+        along this parameter, minus those of the files. It is more than the error of the whole grid,
+        whose polynomials have a degree more, or half the step.
+        """
+        nodes, found = self._at_nodes(frequency_mhz, lmax)[..., :-1], {}
+        whole = nodes.reshape(*map(len, self.axes.values()), *nodes.shape[1:])
+        for number, (name, xs) in enumerate(self.axes.items()):
+            along = np.moveaxis(whole, number, 0)
+            for k in range(1, len(xs) - 1):
+                weights = weights_along(np.delete(xs, k), xs[k])
+                off = np.tensordot(weights, np.delete(along, k, 0), 1) - along[k]
+                found[f"{name} {xs[k]:g}"] = off.reshape(-1, *nodes.shape[1:])
+        return found
+
+
+def _in_unit(source: BeamSource, unit: Circuit | None, frequency_mhz: float, lmax: int):
+    """A source's coefficients and background, where 1 K is what it is in another circuit."""
+    modes, ground = source.beams(frequency_mhz, lmax).modes, source.background(frequency_mhz)
+    both = np.concatenate([np.asarray(modes), np.asarray(ground)[:, None]], axis=1)
+    if unit is None:
+        return both
+    own, other = (c.per_kelvin.diagonal().real for c in (source.circuit(frequency_mhz), unit))
+    first, second, _ = map(list, zip(*all_products(source.n_ports), strict=True))
+    return both * np.sqrt((own / other)[first] * (own / other)[second])[:, None]
+
+
+def weights_along(nodes: Nodes, value: float | Float[Array, ""]) -> Float[Array, " nodes"]:
+    """Return the weights of values at nodes that interpolate to another place.
+
+    Parameters
+    ----------
+    nodes : (nodes,) array
+        Growing, at least two.
+    value : () array
+        The place, between the first and the last node.
+
+    Returns
+    -------
+    (nodes,) array
+        Differentiable in ``value``, twice where there are more than five nodes.
+    """
+    n, xp = len(nodes), namespace(value)
+    degree = n - 1 if n <= MOST_IN_ONE else 3
+    spline = make_interp_spline(nodes, np.eye(n), k=degree)
+    starts = np.unique(spline.t)[:-1]
+    # Taylor's coefficients of every weight, at the start of every piece
+    taylor = np.stack([spline(starts, nu=d) / factorial(d) for d in range(degree + 1)], axis=1)
+    piece = xp.searchsorted(xp.asarray(starts[1:]), value, side="right")
+    step, own = value - xp.asarray(starts)[piece], xp.asarray(taylor)[piece]
+    return sum(step**d * own[d] for d in range(degree + 1))
+
+
+def read_beam_grid(
+    path: str | Path,
+    values: Mapping[str, float] | None = None,
+    read: Callable[[str], BeamSource] = read_beam,
+) -> GridBeams:
+    """Read a table of beam files over a grid of parameters, and the files.
+
+    Parameters
+    ----------
+    path : str or Path
+    values : mapping of float, optional
+        Of parameters; by default they are in the middle of the grid.
+    read : callable
+        Makes the beams of a file.
+
+    Returns
+    -------
+    GridBeams
+
+    Raises
+    ------
+    InputError
+        As :func:`read_grid_table`; for unknown parameters, values outside the grid, and files that
+        cannot be read.
+    """
+    files, axes = read_grid_table(path)
+    middle = {name: float(xs[0] + xs[-1]) / 2.0 for name, xs in axes.items()}
+    grid = GridBeams(str(path), axes, tuple(map(read, files)), middle, middle)
+    grid = grid.with_values(values or {})
+    return replace(grid, nominal=grid.values)
+
+
+def read_grid_table(path: str | Path) -> tuple[tuple[str, ...], dict[str, Nodes]]:
+    """Read the names of files over a grid, the last parameter changing first, and its axes.
+
+    Raises
+    ------
+    InputError
+        For a table that is missing or damaged, lacks a combination of values, or has one twice.
+    """
+    columns = read_table(path, Layout(WHAT, {"file": Variable(("row",), "text")}))
+    names = [name for name in columns if name != "file"]
+    layout = Layout(WHAT, dict.fromkeys(names, Variable(("row",))))
+    numbers = layout.checked(path, {name: columns[name] for name in names}, {}).arrays
+    axes = {name: np.unique(column) for name, column in numbers.items()}
+    if min(map(len, axes.values()), default=0) < 2:
+        raise InputError(f"{path} has a parameter of one value, or none; expected {WHAT}")
+    rows, places = list(zip(*numbers.values(), strict=True)), list(product(*axes.values()))
+    for place in places:
+        if rows.count(place) != 1:
+            said = ", ".join(f"{name} {x:g}" for name, x in zip(axes, place, strict=True))
+            raise InputError(
+                f"{path} has {rows.count(place) or 'no'} files of {said}; expected one file for "
+                "every combination of the parameters' values"
+            )
+    files = (columns["file"][rows.index(place)] for place in places)
+    return tuple(str(Path(path).parent / file) for file in files), axes
