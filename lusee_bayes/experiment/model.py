@@ -205,7 +205,7 @@ def in_noise(
     if gains and gains[-1] is None:
         return held
     later = [gains[-1] if before is None else gains[-1] / before for before in gains]
-    return [s.behind(g) if isinstance(s, Expanded) else s for s, g in zip(held, later, strict=True)]
+    return [s.behind(g) for s, g in zip(held, later, strict=True)]
 
 
 def model_about(

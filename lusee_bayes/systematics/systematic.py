@@ -406,6 +406,15 @@ class Systematic(eqx.Module):
         """What :meth:`marginalised` takes the prior mean for, about values, in prior std's."""
         return np.zeros(len(centre))
 
+    def behind(self, gains: DataVector) -> Systematic:
+        """The same where gains that come later multiply its term of N; by default it is as it is.
+
+        Parameters
+        ----------
+        gains : (data,) array
+        """
+        return self
+
     def chart(self, model: LinearGaussian) -> Chart | None:
         """Return coordinates of its sites, and of the sky's, in which ridges are straight.
 
@@ -475,6 +484,10 @@ class Marginalised(eqx.Module):
     def changes_coupling(self) -> bool:
         """Whether A depends on it."""
         return self.systematic.changes_coupling
+
+    def behind(self, gains: DataVector) -> Marginalised:
+        """The same where gains come later."""
+        return replace(self, systematic=self.systematic.behind(gains))
 
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """The model with it in N."""
