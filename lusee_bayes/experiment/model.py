@@ -200,11 +200,11 @@ def in_noise(
         stages.append((systematic, before, model.coupling.response))
     last, held = model.coupling.response, []
     for systematic, before, response in stages:
+        later = last if response is None or last is None else last / response
         if systematic.first_order:
-            later = last if response is None else last / response
             held.append(on_host(Expanded.about(systematic, before, around, later)))
         else:
-            held.append(Marginalised(systematic))
+            held.append(Marginalised(systematic if later is None else systematic.behind(later)))
     return held
 
 

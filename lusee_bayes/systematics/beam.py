@@ -220,10 +220,11 @@ class InstrumentParameters(ChangedBeams, BeamErrors):
         """A of these beams, and what ground and antennas then emit."""
         return with_added(super().effect(model, values), self.emitted(values))
 
-    def derivative(self, model, sky, centre):
+    def linearised(self, model, centre):
         """That of :meth:`effect`."""
+        of_sky = super().linearised(model, centre)
         emitted = np.stack(list(self.differences(self.emitted, centre)), axis=1)
-        return super().derivative(model, sky, centre) + emitted
+        return lambda sky: of_sky(sky) + emitted
 
     def emitted(self, values: Values) -> DataVector:
         """What ground and antennas emit beyond the background, in K."""

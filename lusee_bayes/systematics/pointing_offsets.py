@@ -248,9 +248,7 @@ class PointingOffsets(Systematic):
         def columns(sky):
             turned = zip(see(sky), ways, strict=True)
             seen = sum(self.layout.gather(one)[:, None] * way for one, way in turned)
-            # sources are no part of the sky
-            known = of_sources is not None and model.offset is not None
-            return seen + np.asarray(of_sources) if known else seen
+            return seen if of_sources is None else seen + np.asarray(of_sources)
 
         return columns
 

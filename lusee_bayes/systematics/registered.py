@@ -14,6 +14,7 @@ from lusee_bayes.systematics.gain_drifts import GainDrifts
 from lusee_bayes.systematics.gain_table import GainTable
 from lusee_bayes.systematics.noise_level import NoiseLevel, RadiometerSection
 from lusee_bayes.systematics.pointing_offsets import PointingOffsets
+from lusee_bayes.systematics.polarisation import Polarisation
 from lusee_bayes.systematics.prior_spectrum import PriorSpectrum
 from lusee_bayes.systematics.receivers import Receivers
 from lusee_bayes.systematics.regolith import RegolithTemperature
@@ -30,6 +31,7 @@ SYSTEMATICS: tuple[type[Systematic], ...] = (
     PointSources,
     Receivers,
     RegolithTemperature,
+    Polarisation,
     GainTable,
     GainDrifts,
 )

@@ -435,6 +435,15 @@ class Systematic(eqx.Module):
         """
         return {}
 
+    def behind(self, gains: DataVector) -> Systematic:
+        """The same where gains that come later multiply its term of N; by default it is as it is.
+
+        Parameters
+        ----------
+        gains : (data,) array
+        """
+        return self
+
     def chart(self, model: LinearGaussian) -> Chart | None:
         """Return coordinates of its sites, and of the sky's, in which ridges are straight.
 
@@ -559,9 +568,10 @@ class Expanded(Marginalised):
         columns, expected = slopes(np.asarray(around.sky)), np.zeros(len(centre))
         later = 1.0 if gains is None else gains
         if systematic.moves and around.volume is not None:
-            bare = systematic.linearised(replace(model, offset=None), centre)
+            still = slopes(np.zeros(model.prior.size))  # of what is no sky
             for deviation, weighted in zip(*around.volume, strict=True):
-                expected -= bare(deviation).T @ (later * weighted) / len(around.volume[0])
+                seen = slopes(deviation) - still
+                expected -= seen.T @ (later * weighted) / len(around.volume[0])
         shift = columns @ (expected - centre)
         return cls(systematic, centre, (columns.T * later).T, expected, shift)
 

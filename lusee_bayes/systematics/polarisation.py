@@ -1,0 +1,208 @@
+"""Polarised emission of the sky, which the map does not model: circular, and depolarised linear.
+
+Data hold A_V v + A_E e + A_B b besides A m: the coefficients of Stokes V, and those of the E and B
+modes of linear polarisation. They are independent and Gaussian, with isotropic spectra; integrated
+out, N gets U U^T, U = (A_V C_V^(1/2), A_E C_E^(1/2), A_B C_B^(1/2)). Faraday rotation turns E into
+B, so that at these frequencies both have the same power.
+
+**Linear polarisation.** Q and U refer to the directions of increasing theta and phi, in the frame
+of the antennas as in :func:`.stokes_pairs`: Q is positive along theta, U half way from theta to
+phi. These are healpy's (the IAU's U has the other sign, since its angles count from North towards
+East). A sky of modes is ::
+
+    Q + i U = -sum_lm (E_lm + i B_lm) N_l D y_lm,    N_l = sqrt((l - 2)! / (l + 2)!),
+    D = sin(theta) (d_theta + i d_phi / sin(theta)) (1 / sin(theta)) (d_theta + i d_phi /
+        sin(theta)),
+
+D the spin-raising operator applied twice, y the real harmonics of :mod:`.core.harmonics`. With y =
+lambda(theta) f(phi) the real part of -N D y is W f, the imaginary one X df/dphi, and with
+Legendre's equation ::
+
+    W = N [2 cot lambda' + (l (l + 1) - 2 m^2 / sin^2) lambda],    X = -2 N (lambda' - cot lambda)
+                                                                       / sin.
+
+A product with patterns P_Q and P_U then has the beam e_lm = int P_Q W f + P_U X f' for E, and
+b_lm = int P_U W f - P_Q X f' for B. E and B turn with the sky as scalars do, so that A_E and A_B
+are made of e and b as A is of the beams of Stokes I. The test is a sum over pixels of
+``healpy.alm2map_spin``'s Q and U. A wrong sign of U would go unseen in U U^T, since it swaps the
+sign of B alone, which has no correlation with E.
+
+References
+----------
+Zaldarriaga and Seljak 1997, PRD 55, 1830; Kamionkowski, Kosowsky and Stebbins 1997, PRD 55, 7368.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field
+
+from lusee_bayes.core.arrays import Array, DataVector
+from lusee_bayes.core.harmonics import azimuth_functions, mode_numbers, per_mode
+from lusee_bayes.core.lazy import special
+from lusee_bayes.core.reading import naming
+from lusee_bayes.core.section import Section, Treatment
+from lusee_bayes.instrument.beams.fields import (
+    AntennaFields,
+    HemisphereGrid,
+    ProductBeams,
+    mean_auto_integral,
+    product_modes,
+    stokes_beam,
+)
+from lusee_bayes.instrument.coupling import CouplingMatrix
+from lusee_bayes.instrument.pointing import Pointing
+from lusee_bayes.instrument.products import auto_indices, to_real
+from lusee_bayes.noise.covariance import LowRankCovariance
+from lusee_bayes.systematics.context import Around, Setup
+from lusee_bayes.systematics.systematic import AdditiveNoise
+
+# lowest ell of circular and of linear polarisation
+CIRCULAR, LINEAR = 0, 2
+Share = Annotated[float, Field(ge=0, le=1)]
+Modes = Float[Array, "products modes"]
+
+
+class PolarisationSection(Section):
+    """Polarised emission that the map does not model; there is none unless the first two say so.
+
+    Attributes
+    ----------
+    linear : float
+        Rms of the linearly polarised brightness, sqrt(Q^2 + U^2), over the mean of the model sky.
+    circular : float
+        Rms of Stokes V over the mean of the model sky.
+    lmax : int
+        Highest ell that it has.
+    slope : float
+        Its C_ell go as (ell + 1)^slope. With -2 every octave of ell has about the same power.
+    treatment : {"marginalised", "sampled", "ignored"}
+        Its covariance is added to N, it is sampled with the map, or it is left out of the model.
+    """
+
+    linear: Share = 0.0
+    circular: Share = 0.0
+    lmax: Annotated[int, Field(ge=LINEAR, le=63)] = 10
+    slope: Annotated[float, Field(ge=-10, le=10)] = -2.0
+    treatment: Treatment = "marginalised"
+
+
+class Polarisation(AdditiveNoise):
+    """Stokes V, E and B modes of the sky, as noise of their angular power spectra.
+
+    It is seen by the setup's antennas, where its observation points them. Files of beams that are
+    interpolated linearly between frequencies have products, not fields: these are then taken from
+    the interpolated fields, with the scale of the beams.
+
+    Attributes
+    ----------
+    root : (data, rank) array
+        U, in K.
+    """
+
+    key: ClassVar[str] = "noise.polarisation"
+    section: ClassVar[type[Section]] = PolarisationSection
+    words: ClassVar[str] = "the polarised sky"
+
+    root: Float[Array, "data rank"]
+
+    @classmethod
+    def treatment(cls, scenario: Any) -> str | None:
+        section = scenario.noise.polarisation
+        some = section is not None and (section.linear or section.circular)
+        return section.treatment if some else None
+
+    @classmethod
+    def build(cls, section: PolarisationSection, setup: Setup, around: Around) -> Polarisation:
+        grid, lmax = HemisphereGrid.for_lmax(section.lmax), section.lmax
+        with naming(cls.key):
+            fields = setup.beam_source.fields(setup.beams.frequency_mhz, grid)
+        scale = beam_scale(fields, setup.beams)
+        mean = float(setup.sky.modes[0]) / np.sqrt(4.0 * np.pi)
+        beams: list[tuple[float, int, Modes]] = []
+        if section.circular:
+            v = product_modes(fields, lmax, stokes="V", normalise=False)
+            beams.append((section.circular, CIRCULAR, v))
+        if section.linear:
+            # each has half of the power
+            each = section.linear / np.sqrt(2.0)
+            beams += [(each, LINEAR, modes) for modes in linear_modes(fields, lmax)]
+        pointing, columns = Pointing.of(setup.observation, lmax), []
+        for share, lowest, modes in beams:
+            std = mean * np.sqrt(per_mode(unit_spectrum(lmax, lowest, section.slope)))
+            coupling = CouplingMatrix.of_modes(scale * np.asarray(modes), pointing, setup.layout)
+            columns.append((coupling.dense() * (share * std)[None])[:, lowest**2 :])
+        return cls("polarisation", setup.layout, np.concatenate(columns, axis=1))
+
+    def behind(self, gains: DataVector) -> Polarisation:
+        return replace(self, root=self.root * np.asarray(gains)[:, None])
+
+    def covariance(self) -> LowRankCovariance:
+        return LowRankCovariance(self.root, self.words)
+
+
+def unit_spectrum(lmax: int, lowest: int, slope: float) -> Float[np.ndarray, " ells"]:
+    """C_ell for ell = 0..lmax that go as (ell + 1)^slope, of a field whose rms is one.
+
+    Parameters
+    ----------
+    lmax : int
+    lowest : int
+        C_ell is zero below.
+    slope : float
+    """
+    ell = np.arange(lmax + 1.0)
+    shape = np.where(ell >= lowest, (ell + 1.0) ** slope, 0.0)
+    return 4.0 * np.pi * shape / ((2.0 * ell + 1.0) @ shape)
+
+
+def beam_scale(fields: AntennaFields, beams: ProductBeams) -> float:
+    """Return what makes products of fields beams in K per K, whatever unit the fields have.
+
+    Parameters
+    ----------
+    fields : AntennaFields
+    beams : ProductBeams
+        Of the same antennas: the scale is that of the mean integral of their autos.
+    """
+    autos = beams.modes[auto_indices(fields.n_antennas), 0]
+    return float(np.sqrt(4.0 * np.pi) * autos.mean() / mean_auto_integral(fields))
+
+
+def linear_modes(fields: AntennaFields, lmax: int) -> tuple[Modes, Modes]:
+    """Return the coefficients of the products' beams for E and for B modes.
+
+    Parameters
+    ----------
+    fields : AntennaFields
+    lmax : int
+        At least 2; the grid has more than twice as many azimuths.
+
+    Returns
+    -------
+    e, b : (products, modes) array
+        Real packed; e @ E + b @ B are the visibilities of a sky with these modes in the frame of
+        the antennas, in the unit of the fields squared. Zero for ell < 2.
+    """
+    grid, (ell, m) = fields.grid, mode_numbers(lmax)
+    table = special.sph_legendre_p_all(lmax, lmax, grid.theta, diff_n=1)
+    polar, slope = np.swapaxes(table[:, ell, np.abs(m)], 1, 2)
+    sin, cot = np.sin(grid.theta)[:, None], 1.0 / np.tan(grid.theta)[:, None]
+    product = ell * (ell + 1.0)
+    n = np.where(ell < LINEAR, 0.0, 1.0 / np.sqrt(np.maximum(product * (product - 2.0), 1.0)))
+    weights = grid.weights[:, None] * n * (2.0 * np.pi / grid.n_phi)
+    even = weights * (2.0 * cot * slope + (product - 2.0 * m**2 / sin**2) * polar)
+    # df_m / dphi is m f_-m
+    odd = -2.0 * weights * m * (slope - cot * polar) / sin
+    azimuth = azimuth_functions(grid.phi, lmax)
+    q, u = (np.asarray(to_real(stokes_beam(fields, stokes))) @ azimuth for stokes in "QU")
+
+    def summed(pattern: Array, polar: Array, orders: Array) -> Modes:
+        return np.einsum("ktc,tc->kc", pattern[..., lmax + orders], polar)
+
+    e = summed(q, even, m) + summed(u, odd, -m)
+    return e, summed(u, even, m) - summed(q, odd, -m)
