@@ -23,7 +23,6 @@ from lusee_bayes.core.harmonics import Rotation, generators
 from lusee_bayes.core.reading import naming
 from lusee_bayes.core.section import NOT_TINY, Section, Treatment, requires
 from lusee_bayes.instrument.beams.monopoles import Monopoles, beams_towards
-from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.pointing import (
     CLOCK,
     OFFSETS,
@@ -360,7 +359,7 @@ def shifted(setup: Setup, values: Mapping[str, float]) -> Setup:
         pointing = setup.pointing.placed(observation)
     sources, frequency_mhz = setup.scenario.sources.list, setup.frequency_mhz
     responses = source_responses(sources, observation, setup.beam_source, frequency_mhz)
-    complete = CouplingMatrix.build(setup.beams, pointing)
+    complete = setup.complete.of(pointing=pointing)
     parts = complete, setup.sky, setup.background, responses
     return replace(
         setup,

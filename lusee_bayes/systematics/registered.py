@@ -11,6 +11,7 @@ from lusee_bayes.core.section import Section
 from lusee_bayes.systematics.beam import BeamErrors
 from lusee_bayes.systematics.gain_drifts import GainDrifts
 from lusee_bayes.systematics.gain_table import GainTable
+from lusee_bayes.systematics.horizon import Horizon
 from lusee_bayes.systematics.noise_level import NoiseLevel, RadiometerSection
 from lusee_bayes.systematics.pointing_offsets import PointingOffsets
 from lusee_bayes.systematics.prior_spectrum import PriorSpectrum
@@ -24,6 +25,7 @@ SYSTEMATICS: tuple[type[Systematic], ...] = (
     NoiseLevel,
     PriorSpectrum,
     BeamErrors,
+    Horizon,
     PointingOffsets,
     PointSources,
     Receivers,

@@ -1,0 +1,313 @@
+"""The horizon: terrain that hides the sky below an altitude h, which depends on the azimuth.
+
+Antennas are modelled over flat ground: their beams end at altitude 0. Terrain takes from the
+coefficients of every product what lies below it, ::
+
+    delta b_lm = - int dphi int_0^h(phi) dt cos t P(t, phi) y_lm(t, phi),
+
+with the product's pattern P in the units of its beam. Beams keep their scale. What is hidden emits
+like a body of the ground's temperature T: a sky of T everywhere looks the same with and without
+terrain.
+
+**Quadrature.** P y_lm is smooth in the altitude t. As the polynomial through Gauss-Legendre nodes
+t_q in a strip that no altitude leaves it is integrated up to any h exactly::
+
+    int_0^h dt f(t) = sum_q W_q(h) f(t_q),    W_q the integral of Lagrange's polynomial of node q,
+
+so that a harmonic transform on the rings t_q makes all coefficients, differentiable in h. Azimuths
+are 1440: steps of h are seen to a quarter of a degree.
+
+**Altitudes below zero** look where the antennas' model has no field. They count as the same strip
+above the horizon does, with the opposite sign: W(-h) = -W(h). That is exact to first order in h,
+and, where patterns vanish at the horizon as h^2 (antennas over ground that is no conductor), to
+third. There the data do not depend on h to first order at h = 0, so that what is not known is to be
+about a known altitude that is not zero everywhere.
+
+**Turntable.** Terrain does not turn with the antennas. In their frame it is another one in every
+run: beams are (runs, products, modes) where there is a horizon. That it does not lean with the
+lander is neglected, as is that point sources set behind it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Annotated, ClassVar
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+from numpy.polynomial.legendre import leggauss, legvander
+from pydantic import Field
+
+from lusee_bayes.core.arrays import Array, Modes, namespace
+from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.layouts import Layout, Variable
+from lusee_bayes.core.reading import read_table
+from lusee_bayes.core.section import NOT_TINY, Section, Temperature, Treatment, requires
+from lusee_bayes.instrument.beams.fields import HemisphereGrid
+from lusee_bayes.instrument.beams.source import BeamSource
+from lusee_bayes.instrument.pointing import offset_names, with_offsets
+from lusee_bayes.instrument.products import DataLayout, auto_indices, to_real
+from lusee_bayes.systematics.context import Around, Setup
+from lusee_bayes.systematics.sources import expected_signal
+from lusee_bayes.systematics.systematic import ChangedBeams, Unknown, Values, with_added
+
+Altitudes = Float[Array, "runs azimuths"]
+RunBeams = Float[Array, "runs products modes"]
+HIGHEST_DEG = 45.0
+TABLE = Layout(
+    "a table of the horizon with the columns azimuth_deg and altitude_deg",
+    {
+        "azimuth_deg": Variable(("row",), low=-360.0, high=360.0),
+        "altitude_deg": Variable(("row",), low=0.0, high=HIGHEST_DEG),
+    },
+)
+AZIMUTHS = 1440
+# how far from what is known of it the altitude may be, in prior standard deviations
+REACH = 6.0
+
+
+class HorizonSection(Section):
+    """Terrain that hides the sky below an altitude, known but for a smooth function of azimuth.
+
+    Attributes
+    ----------
+    file : str
+        Table (CSV) of the known altitude: the columns ``azimuth_deg``, from North towards East, and
+        ``altitude_deg``, with straight lines between its rows.
+    altitude_deg : float
+        Known altitude in all directions, without such a table.
+    std_deg : float
+        Prior standard deviation of what has to be added in each direction.
+    harmonics : int
+        Highest order of its Fourier series in azimuth.
+    moon_temperature_k : float
+        Temperature of the terrain, which emits where it hides the sky.
+    treatment : {"marginalised", "sampled", "ignored"}
+        The covariance of the series is added to N to first order about what the data tell, its
+        coefficients are sampled with the map, or the model takes the known altitude for the truth.
+    true_values : dict
+        What simulated data hold, by name (horizon_deg, horizon_cos_1_deg, horizon_sin_1_deg, ...);
+        the others are drawn from their priors.
+    """
+
+    file: str | None = None
+    altitude_deg: Annotated[float, Field(ge=0, le=HIGHEST_DEG)] = 0.0
+    std_deg: Annotated[float, Field(gt=0, le=7.5), NOT_TINY]
+    harmonics: Annotated[int, Field(ge=0, le=60)] = 3
+    moon_temperature_k: Temperature = 0.0
+    treatment: Treatment = "marginalised"
+    true_values: dict[str, Annotated[float, Field(ge=-45, le=45)]] = Field(default_factory=dict)
+
+    _one_altitude = requires(
+        lambda section: section.file is None or section.altitude_deg == 0.0,
+        "give either file or altitude_deg",
+    )
+    _not_about_zero = requires(
+        lambda section: section.treatment == "ignored" or section.file or section.altitude_deg,
+        "give file or altitude_deg, what is known of the altitude: beams may vanish at altitude 0, "
+        "about which data then tell nothing of it",
+    )
+
+    def table(self) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
+        """Azimuths from North towards East and known altitudes, in degrees.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be read, is not such a table, has fewer than two rows, or gives a
+            direction twice.
+        """
+        if self.file is None:
+            return np.zeros(1), np.full(1, self.altitude_deg)
+        found = read_table(self.file, TABLE, "check noise.horizon.file")
+        azimuth = found["azimuth_deg"] % 360.0
+        if len(azimuth) < 2:
+            raise InputError(f"{self.file} has one row; expected two or more of {TABLE.what}")
+        if len(np.unique(azimuth)) < len(azimuth):
+            raise InputError(
+                f"{self.file} gives a direction twice (360 degrees are 0); give it once"
+            )
+        return azimuth, found["altitude_deg"]
+
+
+class Strip(eqx.Module):
+    """Patterns of all products above the flat horizon, and where the terrain's directions are.
+
+    Attributes
+    ----------
+    patterns : (products, rings, azimuths) array
+        In the units of beams, 1/sr; azimuths in the frame of the antennas.
+    azimuth : (runs, azimuths) array
+        The same directions from North towards East, in radians.
+    highest : float
+        Altitude at which the strip ends, in radians; altitudes above are taken for this one.
+    lmax : int
+    """
+
+    patterns: Float[Array, "products rings azimuths"]
+    azimuth: Altitudes
+    highest: float = eqx.field(static=True)
+    lmax: int = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, source: BeamSource, setup: Setup, turntable_deg: tuple, highest: float) -> Strip:
+        """Of a setup's antennas at the turntable's angles."""
+        frequency_mhz, lmax = setup.beams.frequency_mhz, setup.beams.lmax
+        # polynomials that follow the harmonics (lmax radians in each of angle) and the patterns
+        n_rings = 24 + int(highest * lmax)
+        grid = _rings(n_rings, highest)
+        patterns = np.asarray(to_real(source.patterns(frequency_mhz, grid)))
+        autos, whole = auto_indices(source.n_ports), HemisphereGrid.for_lmax(0)
+        unscaled = whole.modes(to_real(source.patterns(frequency_mhz, whole)), 0)[autos].mean()
+        scale = np.asarray(setup.beams.modes)[autos, 0].mean() / float(unscaled)
+        azimuth = np.pi / 2.0 - grid.phi - np.radians(np.array(turntable_deg))[:, None]
+        return cls(patterns * scale, azimuth, highest, lmax)
+
+    def hidden(self, altitude: Altitudes) -> RunBeams:
+        """Compute what terrain of this altitude, in radians, does to the beams; differentiable."""
+        xp, n = namespace(altitude, self.patterns), self.patterns.shape[1]
+        sign = xp.where(altitude < 0.0, -1.0, 1.0)
+        x = 2.0 * xp.minimum(sign * altitude, self.highest) / self.highest - 1.0
+        legendre = [xp.ones_like(x), x]
+        for k in range(1, n):
+            legendre.append(((2 * k + 1) * x * legendre[k] - k * legendre[k - 1]) / (k + 1))
+        # (2 k + 1) times the integral of polynomial k from -1 on
+        integrals = [x + 1.0, *(legendre[k + 1] - legendre[k - 1] for k in range(1, n))]
+        nodes, weights = leggauss(n)
+        lagrange = legvander(nodes, n - 1) * weights[:, None] * (self.highest / 4.0)
+        inside = sign[:, None] * xp.einsum("qk,krj->rqj", lagrange, xp.stack(integrals))
+        return -_rings(n, self.highest).modes(self.patterns * inside[:, None], self.lmax)
+
+
+def _rings(n: int, highest: float) -> HemisphereGrid:
+    """Gauss-Legendre nodes in altitude, with cos t for weights."""
+    altitude = (leggauss(n)[0] + 1.0) * (highest / 2.0)
+    return HemisphereGrid(np.pi / 2.0 - altitude, np.cos(altitude), AZIMUTHS)
+
+
+class Horizon(ChangedBeams):
+    """The altitude of the terrain: what is known of it, and a Fourier series of unknowns.
+
+    Coefficients are independent, of standard deviation std / sqrt(1 + harmonics): that of the sum
+    is std in every direction.
+
+    Attributes
+    ----------
+    strip : Strip
+        Of the antennas with the values of other unknowns about which the model is.
+    known : (runs, azimuths) array
+        Altitude of the table, in radians.
+    before : (runs, products, modes) array
+        What the modelled beams hold of the horizon already.
+    std_deg : float
+        Of each coefficient.
+    harmonics : int
+    moon_k : float
+        Temperature of the terrain, in K.
+    """
+
+    key: ClassVar[str] = "noise.horizon"
+    section: ClassVar[type[Section]] = HorizonSection
+    words: ClassVar[str] = "the horizon"
+    unit: ClassVar[str] = "deg"
+    remedy: ClassVar[str] = "a smaller noise.horizon.std_deg, or its treatment=sampled"
+
+    strip: Strip
+    known: Altitudes
+    before: RunBeams | float
+    std_deg: float = eqx.field(static=True)
+    harmonics: int = eqx.field(static=True)
+    moon_k: float = eqx.field(static=True)
+
+    @classmethod
+    def build(cls, section: HorizonSection, setup: Setup, around: Around) -> Horizon:
+        azimuth, altitude = section.table()
+        highest = np.radians(altitude.max() + REACH * section.std_deg)
+        turntable_deg = setup.observation.turntable_deg
+        strip = Strip.of(setup.beam_source, setup, turntable_deg, min(float(highest), np.pi / 2.0))
+        known = np.interp(np.degrees(strip.azimuth), azimuth, altitude, period=360.0)
+        std = section.std_deg / (1.0 + section.harmonics) ** 0.5
+        before = 0.0 if setup.hidden is None else setup.hidden
+        series = std, section.harmonics, section.moon_temperature_k
+        return cls(strip, np.radians(known), before, *series)
+
+    @classmethod
+    def moved(cls, section: HorizonSection, setup: Setup, values: Values) -> Setup:
+        """Behind terrain of this altitude: A, what the terrain emits, and the signal."""
+        observation = setup.observation
+        names = offset_names(("turntable_deg",), observation.n_runs)
+        turned = {name: values[name] for name in names if name in values}
+        there = replace(setup, observation=with_offsets(observation, turned))
+        found = cls.build(section, there, Around())
+        own = {name: values.get(name, 0.0) for name in found.names}
+        hidden = np.asarray(found.strip.hidden(found.altitude(own)))
+        emitted = -np.sqrt(4.0 * np.pi) * found.moon_k * (hidden - found.before)[..., 0]
+        background = setup.background
+        if found.moon_k:
+            background = (background.T + emitted[observation.run]).T
+        coupling = setup.coupling.of(modes=np.asarray(setup.beams.modes) + hidden)
+        layout = DataLayout(setup.layout.n_products, setup.layout.n_times)
+        complete = replace(coupling, layout=layout)
+        parts = complete, setup.sky, background, setup.responses
+        signal = expected_signal(setup.scenario.sources.list, *parts)
+        return replace(setup, coupling=coupling, background=background, signal=signal)
+
+    @classmethod
+    def truth(cls, section, setup, key):
+        drawn = super().truth(section, setup, key)
+        for name in section.true_values:
+            if name not in drawn:
+                raise InputError(
+                    f"noise.horizon.true_values has '{name}', which is no coefficient of its "
+                    f"series; {nearest(name, tuple(drawn))}"
+                )
+        return drawn | {name: float(value) for name, value in section.true_values.items()}
+
+    @classmethod
+    def in_data(cls, section, setup, model, truth, key):
+        """The same: its A is that of the true horizon."""
+        return model
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        orders = range(1, self.harmonics + 1)
+        waves = [f"horizon_{wave}_{k}_deg" for k in orders for wave in ("cos", "sin")]
+        return tuple(Unknown(name, 0.0, self.std_deg) for name in ("horizon_deg", *waves))
+
+    def altitude(self, values: Values) -> Altitudes:
+        """The altitude in every direction, in radians."""
+        angle = np.arange(1, self.harmonics + 1) * self.strip.azimuth[..., None]
+        xp = namespace(angle, *values.values())
+        waves = xp.stack([xp.cos(angle), xp.sin(angle)], axis=-1).reshape(*angle.shape[:2], -1)
+        series = self.stacked(values) * (np.pi / 180.0)
+        return self.known + series[0] + waves @ series[1:]
+
+    @property
+    def uniform(self) -> Modes:
+        """A sky of the terrain's temperature."""
+        return np.eye(1, (self.strip.lmax + 1) ** 2)[0] * (np.sqrt(4.0 * np.pi) * self.moon_k)
+
+    def modes(self, modes, values):
+        """Beams behind terrain of these values, in every run."""
+        return modes + (self.strip.hidden(self.altitude(values)) - self.before)
+
+    def effect(self, model, values):
+        """A of these beams; what they lose of a sky of the terrain's temperature, it emits."""
+        made = super().effect(model, values)
+        if not self.moon_k:
+            return made
+        return with_added(made, model.coupling @ self.uniform - made.coupling @ self.uniform)
+
+    def derivative(self, model, sky, centre):
+        """That of :meth:`effect`: of a sky that is so much warmer than the terrain."""
+        return super().derivative(model, np.asarray(sky) - self.uniform, centre)
+
+
+def behind_known_horizon(setup: Setup) -> Setup:
+    """The setup behind the terrain that its scenario knows of, whatever is done about the rest."""
+    section = setup.scenario.noise.horizon
+    if section is None:
+        return setup
+    made = Horizon.moved(section, setup, {})
+    return replace(made, hidden=np.asarray(made.coupling.modes) - np.asarray(made.beams.modes))
