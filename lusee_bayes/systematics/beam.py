@@ -215,7 +215,7 @@ class InstrumentParameters(ChangedBeams, BeamErrors):
     def modes(self, modes, values):
         """Beams of antennas that have these values; a horizon hides what it hides without them."""
         made = self.instrument.beams(values).modes
-        return made if modes.ndim == 2 else modes + (made - self.instrument.beams().modes)
+        return made if modes.ndim == 2 else modes + (made - self.instrument.beams().modes)[None]
 
 
 def true_beams(setup: Setup) -> ProductBeams:

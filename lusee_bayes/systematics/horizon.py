@@ -177,7 +177,7 @@ class Strip(eqx.Module):
         nodes, weights = leggauss(n)
         lagrange = legvander(nodes, n - 1) * weights[:, None] * (self.highest / 4.0)
         inside = sign[:, None] * xp.einsum("qk,krj->rqj", lagrange, xp.stack(integrals))
-        return -_rings(n, self.highest).modes(self.patterns * inside[:, None], self.lmax)
+        return -_rings(n, self.highest).modes(self.patterns[None] * inside[:, None], self.lmax)
 
 
 def _rings(n: int, highest: float) -> HemisphereGrid:
@@ -277,7 +277,8 @@ class Horizon(ChangedBeams):
 
     def altitude(self, values: Values) -> Altitudes:
         """The altitude in every direction, in radians."""
-        angle = np.arange(1, self.harmonics + 1) * self.strip.azimuth[..., None]
+        orders = np.arange(1.0, self.harmonics + 1.0)[None, None]
+        angle = orders * self.strip.azimuth[..., None]
         xp = namespace(angle, *values.values())
         waves = xp.stack([xp.cos(angle), xp.sin(angle)], axis=-1).reshape(*angle.shape[:2], -1)
         series = self.stacked(values) * (np.pi / 180.0)

@@ -39,7 +39,7 @@ from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.core.section import Section
-from lusee_bayes.instrument.coupling import DenseCoupling
+from lusee_bayes.instrument.coupling import BeamModes, DenseCoupling
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import Covariance, DiagonalCovariance, LowRankCovariance
@@ -563,14 +563,10 @@ class ChangedBeams(Systematic):
     moves: ClassVar[bool] = True
 
     @abstractmethod
-    def modes(
-        self, modes: Float[Array, "products modes"], values: Values
-    ) -> Float[Array, "products modes"]:
+    def modes(self, modes: BeamModes, values: Values) -> BeamModes:
         """Beams in the frame of the lander with values of the unknowns, of those without them."""
 
-    def slopes(
-        self, modes: Float[Array, "products modes"], centre: Vector
-    ) -> Iterator[Float[Array, "products modes"]]:
+    def slopes(self, modes: BeamModes, centre: Vector) -> Iterator[BeamModes]:
         """Derivatives of :meth:`modes` by the unknowns in prior standard deviations, one by one."""
         for step in STEP * np.eye(len(centre)):
             ways = [self.modes(modes, self.values(centre + n * step)) for n in STEPS]
