@@ -40,14 +40,13 @@ from numpy.polynomial.legendre import leggauss, legvander
 from pydantic import Field
 
 from lusee_bayes.core.arrays import Array, Modes, namespace
-from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.reading import read_table
 from lusee_bayes.core.section import NOT_TINY, Section, Temperature, Treatment, requires
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
-from lusee_bayes.instrument.beams.source import BeamSource
 from lusee_bayes.instrument.pointing import offset_names, with_offsets
-from lusee_bayes.instrument.products import DataLayout, auto_indices, to_real
+from lusee_bayes.instrument.products import auto_indices, to_real
 from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.sources import expected_signal
 from lusee_bayes.systematics.systematic import ChangedBeams, Unknown, Values, with_added
@@ -55,12 +54,10 @@ from lusee_bayes.systematics.systematic import ChangedBeams, Unknown, Values, wi
 Altitudes = Float[Array, "runs azimuths"]
 RunBeams = Float[Array, "runs products modes"]
 HIGHEST_DEG = 45.0
+COLUMNS = {"azimuth_deg": (-360.0, 360.0), "altitude_deg": (0.0, HIGHEST_DEG)}
 TABLE = Layout(
-    "a table of the horizon with the columns azimuth_deg and altitude_deg",
-    {
-        "azimuth_deg": Variable(("row",), low=-360.0, high=360.0),
-        "altitude_deg": Variable(("row",), low=0.0, high=HIGHEST_DEG),
-    },
+    f"a table of the horizon with the columns {' and '.join(COLUMNS)}",
+    {name: Variable(("row",), low=low, high=high) for name, (low, high) in COLUMNS.items()},
 )
 AZIMUTHS = 1440
 # how far from what is known of it the altitude may be, in prior standard deviations
@@ -76,7 +73,7 @@ class HorizonSection(Section):
         Table (CSV) of the known altitude: the columns ``azimuth_deg``, from North towards East, and
         ``altitude_deg``, with straight lines between its rows.
     altitude_deg : float
-        Known altitude in all directions, without such a table.
+        Known altitude in all directions; with such a table, what it is higher everywhere.
     std_deg : float
         Prior standard deviation of what has to be added in each direction.
     harmonics : int
@@ -99,85 +96,26 @@ class HorizonSection(Section):
     treatment: Treatment = "marginalised"
     true_values: dict[str, Annotated[float, Field(ge=-45, le=45)]] = Field(default_factory=dict)
 
-    _one_altitude = requires(
-        lambda section: section.file is None or section.altitude_deg == 0.0,
-        "give either file or altitude_deg",
-    )
     _not_about_zero = requires(
         lambda section: section.treatment == "ignored" or section.file or section.altitude_deg,
-        "give file or altitude_deg, what is known of the altitude: beams may vanish at altitude 0, "
-        "about which data then tell nothing of it",
+        "give file or altitude_deg: about altitude 0, where beams vanish, data tell nothing of it",
     )
 
-    def table(self) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, " rows"]]:
-        """Azimuths from North towards East and known altitudes, in degrees.
+    def known(self, azimuth: Altitudes) -> Altitudes:
+        """Interpolate the known altitude, all in radians.
 
         Raises
         ------
         InputError
-            If the file cannot be read, is not such a table, has fewer than two rows, or gives a
-            direction twice.
+            If the file cannot be read, is not such a table, or has fewer than two rows.
         """
         if self.file is None:
-            return np.zeros(1), np.full(1, self.altitude_deg)
-        found = read_table(self.file, TABLE, "check noise.horizon.file")
-        azimuth = found["azimuth_deg"] % 360.0
-        if len(azimuth) < 2:
+            return np.full(azimuth.shape, np.radians(self.altitude_deg))
+        columns = read_table(self.file, TABLE, "check noise.horizon.file")
+        rows = [columns[name] for name in COLUMNS]
+        if len(rows[0]) < 2:
             raise InputError(f"{self.file} has one row; expected two or more of {TABLE.what}")
-        if len(np.unique(azimuth)) < len(azimuth):
-            raise InputError(
-                f"{self.file} gives a direction twice (360 degrees are 0); give it once"
-            )
-        return azimuth, found["altitude_deg"]
-
-
-class Strip(eqx.Module):
-    """Patterns of all products above the flat horizon, and where the terrain's directions are.
-
-    Attributes
-    ----------
-    patterns : (products, rings, azimuths) array
-        In the units of beams, 1/sr; azimuths in the frame of the antennas.
-    azimuth : (runs, azimuths) array
-        The same directions from North towards East, in radians.
-    highest : float
-        Altitude at which the strip ends, in radians; altitudes above are taken for this one.
-    lmax : int
-    """
-
-    patterns: Float[Array, "products rings azimuths"]
-    azimuth: Altitudes
-    highest: float = eqx.field(static=True)
-    lmax: int = eqx.field(static=True)
-
-    @classmethod
-    def of(cls, source: BeamSource, setup: Setup, turntable_deg: tuple, highest: float) -> Strip:
-        """Of a setup's antennas at the turntable's angles."""
-        frequency_mhz, lmax = setup.beams.frequency_mhz, setup.beams.lmax
-        # polynomials that follow the harmonics (lmax radians in each of angle) and the patterns
-        n_rings = 24 + int(highest * lmax)
-        grid = _rings(n_rings, highest)
-        patterns = np.asarray(to_real(source.patterns(frequency_mhz, grid)))
-        autos, whole = auto_indices(source.n_ports), HemisphereGrid.for_lmax(0)
-        unscaled = whole.modes(to_real(source.patterns(frequency_mhz, whole)), 0)[autos].mean()
-        scale = np.asarray(setup.beams.modes)[autos, 0].mean() / float(unscaled)
-        azimuth = np.pi / 2.0 - grid.phi - np.radians(np.array(turntable_deg))[:, None]
-        return cls(patterns * scale, azimuth, highest, lmax)
-
-    def hidden(self, altitude: Altitudes) -> RunBeams:
-        """Compute what terrain of this altitude, in radians, does to the beams; differentiable."""
-        xp, n = namespace(altitude, self.patterns), self.patterns.shape[1]
-        sign = xp.where(altitude < 0.0, -1.0, 1.0)
-        x = 2.0 * xp.minimum(sign * altitude, self.highest) / self.highest - 1.0
-        legendre = [xp.ones_like(x), x]
-        for k in range(1, n):
-            legendre.append(((2 * k + 1) * x * legendre[k] - k * legendre[k - 1]) / (k + 1))
-        # (2 k + 1) times the integral of polynomial k from -1 on
-        integrals = [x + 1.0, *(legendre[k + 1] - legendre[k - 1] for k in range(1, n))]
-        nodes, weights = leggauss(n)
-        lagrange = legvander(nodes, n - 1) * weights[:, None] * (self.highest / 4.0)
-        inside = sign[:, None] * xp.einsum("qk,krj->rqj", lagrange, xp.stack(integrals))
-        return -_rings(n, self.highest).modes(self.patterns[None] * inside[:, None], self.lmax)
+        return np.radians(self.altitude_deg + np.interp(np.degrees(azimuth), *rows, period=360.0))
 
 
 def _rings(n: int, highest: float) -> HemisphereGrid:
@@ -194,12 +132,19 @@ class Horizon(ChangedBeams):
 
     Attributes
     ----------
-    strip : Strip
-        Of the antennas with the values of other unknowns about which the model is.
+    patterns : (products, rings, azimuths) array
+        Of the antennas with the values of other unknowns about which the model is, in the strip
+        above altitude 0 and in 1/sr; azimuths from East towards North in the antennas' frame.
+    azimuth : (runs, azimuths) array
+        The same directions from North towards East on the ground, in radians.
     known : (runs, azimuths) array
-        Altitude of the table, in radians.
+        Altitude that is known, in radians.
     before : (runs, products, modes) array
-        What the modelled beams hold of the horizon already.
+        What the modelled beams have of the horizon already; zero for none.
+    highest : float
+        Where the strip ends, in radians; altitudes above are taken for this one.
+    lmax : int
+        Of the beams.
     std_deg : float
         Of each coefficient.
     harmonics : int
@@ -213,56 +158,53 @@ class Horizon(ChangedBeams):
     unit: ClassVar[str] = "deg"
     remedy: ClassVar[str] = "a smaller noise.horizon.std_deg, or its treatment=sampled"
 
-    strip: Strip
+    patterns: Float[Array, "products rings azimuths"]
+    azimuth: Altitudes
     known: Altitudes
     before: RunBeams | float
+    highest: float = eqx.field(static=True)
+    lmax: int = eqx.field(static=True)
     std_deg: float = eqx.field(static=True)
     harmonics: int = eqx.field(static=True)
     moon_k: float = eqx.field(static=True)
 
     @classmethod
     def build(cls, section: HorizonSection, setup: Setup, around: Around) -> Horizon:
-        azimuth, altitude = section.table()
-        highest = np.radians(altitude.max() + REACH * section.std_deg)
-        turntable_deg = setup.observation.turntable_deg
-        strip = Strip.of(setup.beam_source, setup, turntable_deg, min(float(highest), np.pi / 2.0))
-        known = np.interp(np.degrees(strip.azimuth), azimuth, altitude, period=360.0)
-        std = section.std_deg / (1.0 + section.harmonics) ** 0.5
+        source, beams, whole = setup.beam_source, setup.beams, HemisphereGrid.for_lmax(0)
+        ahead = np.radians(np.array(setup.observation.turntable_deg))[:, None]
+        azimuth = np.pi / 2.0 - ahead - 2.0 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS
+        known = section.known(azimuth)
+        highest = min(float(known.max() + np.radians(REACH * section.std_deg)), np.pi / 2.0)
+        # polynomials that follow the harmonics, lmax radians for each of angle, and the patterns
+        grids = _rings(24 + int(highest * beams.lmax), highest), whole
+        found = [to_real(source.patterns(beams.frequency_mhz, grid)) for grid in grids]
+        patterns, all_round = map(np.asarray, found)
+        autos = auto_indices(source.n_ports)
+        scale = np.asarray(beams.modes)[autos, 0].mean() / whole.modes(all_round, 0)[autos].mean()
         before = 0.0 if setup.hidden is None else setup.hidden
-        series = std, section.harmonics, section.moon_temperature_k
-        return cls(strip, np.radians(known), before, *series)
+        std_deg = section.std_deg / (1.0 + section.harmonics) ** 0.5
+        series = std_deg, section.harmonics, section.moon_temperature_k
+        return cls(patterns * scale, azimuth, known, before, highest, beams.lmax, *series)
 
     @classmethod
     def moved(cls, section: HorizonSection, setup: Setup, values: Values) -> Setup:
-        """Behind terrain of this altitude: A, what the terrain emits, and the signal."""
-        observation = setup.observation
-        names = offset_names(("turntable_deg",), observation.n_runs)
-        turned = {name: values[name] for name in names if name in values}
-        there = replace(setup, observation=with_offsets(observation, turned))
-        found = cls.build(section, there, Around())
-        own = {name: values.get(name, 0.0) for name in found.names}
-        hidden = np.asarray(found.strip.hidden(found.altitude(own)))
-        emitted = -np.sqrt(4.0 * np.pi) * found.moon_k * (hidden - found.before)[..., 0]
-        background = setup.background
-        if found.moon_k:
-            background = (background.T + emitted[observation.run]).T
-        coupling = setup.coupling.of(modes=np.asarray(setup.beams.modes) + hidden)
-        layout = DataLayout(setup.layout.n_products, setup.layout.n_times)
-        complete = replace(coupling, layout=layout)
-        parts = complete, setup.sky, background, setup.responses
-        signal = expected_signal(setup.scenario.sources.list, *parts)
-        return replace(setup, coupling=coupling, background=background, signal=signal)
+        """Behind terrain of this altitude: A, what the terrain emits, and the signal.
 
-    @classmethod
-    def truth(cls, section, setup, key):
-        drawn = super().truth(section, setup, key)
-        for name in section.true_values:
-            if name not in drawn:
-                raise InputError(
-                    f"noise.horizon.true_values has '{name}', which is no coefficient of its "
-                    f"series; {nearest(name, tuple(drawn))}"
-                )
-        return drawn | {name: float(value) for name, value in section.true_values.items()}
+        Without values it is the known one.
+        """
+        names = offset_names(("turntable_deg",), setup.observation.n_runs)
+        observation = with_offsets(setup.observation, {n: values[n] for n in names if n in values})
+        found = cls.build(section, replace(setup, observation=observation), Around())
+        hidden = np.asarray(found.hidden({name: values.get(name, 0.0) for name in found.names}))
+        emitted = (found.before - hidden)[..., 0] * found.uniform[0]
+        made = replace(
+            setup,
+            coupling=setup.coupling.of(modes=np.asarray(setup.beams.modes) + hidden),
+            background=(setup.background.T + emitted[observation.run]).T,
+            hidden=hidden if setup.hidden is None else setup.hidden,
+        )
+        parts = made.complete, made.sky, made.background, made.responses
+        return replace(made, signal=expected_signal(setup.scenario.sources.list, *parts))
 
     @classmethod
     def in_data(cls, section, setup, model, truth, key):
@@ -275,40 +217,44 @@ class Horizon(ChangedBeams):
         waves = [f"horizon_{wave}_{k}_deg" for k in orders for wave in ("cos", "sin")]
         return tuple(Unknown(name, 0.0, self.std_deg) for name in ("horizon_deg", *waves))
 
+    @property
+    def uniform(self) -> Modes:
+        """A sky of the terrain's temperature."""
+        return np.eye(1, (self.lmax + 1) ** 2)[0] * (np.sqrt(4.0 * np.pi) * self.moon_k)
+
     def altitude(self, values: Values) -> Altitudes:
         """The altitude in every direction, in radians."""
         orders = np.arange(1.0, self.harmonics + 1.0)[None, None]
-        angle = orders * self.strip.azimuth[..., None]
-        xp = namespace(angle, *values.values())
+        angle, xp = orders * self.azimuth[..., None], namespace(self.azimuth, *values.values())
         waves = xp.stack([xp.cos(angle), xp.sin(angle)], axis=-1).reshape(*angle.shape[:2], -1)
         series = self.stacked(values) * (np.pi / 180.0)
         return self.known + series[0] + waves @ series[1:]
 
-    @property
-    def uniform(self) -> Modes:
-        """A sky of the terrain's temperature."""
-        return np.eye(1, (self.strip.lmax + 1) ** 2)[0] * (np.sqrt(4.0 * np.pi) * self.moon_k)
+    def hidden(self, values: Values) -> RunBeams:
+        """What terrain of these values does to the beams; differentiable."""
+        altitude, n = self.altitude(values), self.patterns.shape[1]
+        xp = namespace(altitude, self.patterns)
+        sign = xp.where(altitude < 0.0, -1.0, 1.0)
+        x = 2.0 * xp.minimum(sign * altitude, self.highest) / self.highest - 1.0
+        legendre = [xp.ones_like(x), x]
+        for k in range(1, n):
+            legendre.append(((2 * k + 1) * x * legendre[k] - k * legendre[k - 1]) / (k + 1))
+        # (2 k + 1) times the integral of polynomial k from -1 on
+        integrals = [x + 1.0, *(legendre[k + 1] - legendre[k - 1] for k in range(1, n))]
+        nodes, weights = leggauss(n)
+        lagrange = legvander(nodes, n - 1) * weights[:, None] * (self.highest / 4.0)
+        inside = sign[:, None] * xp.einsum("qk,krj->rqj", lagrange, xp.stack(integrals))
+        return -_rings(n, self.highest).modes(self.patterns[None] * inside[:, None], self.lmax)
 
     def modes(self, modes, values):
         """Beams behind terrain of these values, in every run."""
-        return modes + (self.strip.hidden(self.altitude(values)) - self.before)
+        return modes + (self.hidden(values) - self.before)
 
     def effect(self, model, values):
         """A of these beams; what they lose of a sky of the terrain's temperature, it emits."""
         made = super().effect(model, values)
-        if not self.moon_k:
-            return made
         return with_added(made, model.coupling @ self.uniform - made.coupling @ self.uniform)
 
     def derivative(self, model, sky, centre):
         """That of :meth:`effect`: of a sky that is so much warmer than the terrain."""
         return super().derivative(model, np.asarray(sky) - self.uniform, centre)
-
-
-def behind_known_horizon(setup: Setup) -> Setup:
-    """The setup behind the terrain that its scenario knows of, whatever is done about the rest."""
-    section = setup.scenario.noise.horizon
-    if section is None:
-        return setup
-    made = Horizon.moved(section, setup, {})
-    return replace(made, hidden=np.asarray(made.coupling.modes) - np.asarray(made.beams.modes))
