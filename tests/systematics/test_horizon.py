@@ -131,6 +131,8 @@ def test_the_prior_is_as_wide_in_every_direction():
     ((_, horizon),) = models.systematics(setup_of("altitude_deg: 1, std_deg: 1.5, harmonics: 4"))
     ways = [horizon.altitude(horizon.values(z)) - horizon.known for z in np.eye(9)]
     np.testing.assert_allclose(np.degrees(np.sqrt(np.square(ways).sum(0))), 1.5, rtol=1e-12)
+    east = np.sin(horizon.azimuth) * np.radians(1.5) / np.sqrt(5)
+    np.testing.assert_allclose(ways[horizon.names.index("horizon_sin_1_deg")], east, atol=1e-15)
 
 
 def test_data_tell_the_horizon():
@@ -142,13 +144,11 @@ def test_data_tell_the_horizon():
     given = (scenario(f"{KNOWN}, treatment: {t}", step_s=43200.0) for t in TREATMENTS)
     found, trusting = (lb.infer(lb.build(one, data=data)) for one in given)
     (horizon,) = found.expanded
-    amplitudes, true = found.amplitudes(horizon), np.array(list(TRUE.values()))
-    assert horizon.systematic.names == tuple(TRUE) and not found.unsettled
-    away = horizon.expected + amplitudes.mean - true / horizon.systematic.stds
+    amplitudes, n, chi2 = found.amplitudes(horizon), found.model.n_data, found.solution.chi2
+    assert horizon.systematic.names == tuple(TRUE) and amplitudes.std.max() < 0.1
+    away = horizon.expected + amplitudes.mean - list(TRUE.values()) / horizon.systematic.stds
     assert away @ np.linalg.solve(amplitudes.covariance, away) < 20.5  # 0.1 % of chi^2 of five
-    assert amplitudes.std.max() < 0.1
-    n = found.model.n_data
-    assert found.solution.chi2 < n + 4 * np.sqrt(2 * n) and trusting.solution.chi2 > 10 * n
+    assert chi2 < n + 4 * np.sqrt(2 * n) and trusting.solution.chi2 > 10 * n and not found.unsettled
 
 
 def test_sampled_the_density_is_that_of_beams_behind_the_terrain():
