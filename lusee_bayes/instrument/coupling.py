@@ -410,8 +410,7 @@ class CouplingMatrix(Coupling):
         self.layout.require_same(direction.layout)
         body = self.body_beams + amplitude * direction.body_beams
         by_order = self.by_order + amplitude * direction.by_order
-        added = amplitude * direction.modes
-        modes = self.modes + (added if added.ndim == self.modes.ndim else added[None])
+        modes = self.modes + amplitude * direction.modes
         return replace(self, body_beams=body, by_order=by_order, modes=modes)
 
     def of(

@@ -52,9 +52,7 @@ from lusee_bayes.systematics.sources import expected_signal
 from lusee_bayes.systematics.systematic import ChangedBeams, Unknown, Values, with_added
 
 Altitudes = Float[Array, "runs azimuths"]
-RunBeams = Float[Array, "runs products modes"]
-HIGHEST_DEG = 45.0
-COLUMNS = {"azimuth_deg": (-360.0, 360.0), "altitude_deg": (0.0, HIGHEST_DEG)}
+COLUMNS = {"azimuth_deg": (-360.0, 360.0), "altitude_deg": (0.0, 45.0)}
 TABLE = Layout(
     f"a table of the horizon with the columns {' and '.join(COLUMNS)}",
     {name: Variable(("row",), low=low, high=high) for name, (low, high) in COLUMNS.items()},
@@ -89,7 +87,7 @@ class HorizonSection(Section):
     """
 
     file: str | None = None
-    altitude_deg: Annotated[float, Field(ge=0, le=HIGHEST_DEG)] = 0.0
+    altitude_deg: Annotated[float, Field(ge=0, le=45)] = 0.0
     std_deg: Annotated[float, Field(gt=0, le=7.5), NOT_TINY]
     harmonics: Annotated[int, Field(ge=0, le=60)] = 3
     moon_temperature_k: Temperature = 0.0
@@ -161,7 +159,7 @@ class Horizon(ChangedBeams):
     patterns: Float[Array, "products rings azimuths"]
     azimuth: Altitudes
     known: Altitudes
-    before: RunBeams | float
+    before: Float[Array, "runs products modes"] | float
     highest: float = eqx.field(static=True)
     lmax: int = eqx.field(static=True)
     std_deg: float = eqx.field(static=True)
@@ -182,16 +180,24 @@ class Horizon(ChangedBeams):
         autos = auto_indices(source.n_ports)
         scale = np.asarray(beams.modes)[autos, 0].mean() / whole.modes(all_round, 0)[autos].mean()
         before = 0.0 if setup.hidden is None else setup.hidden
-        std_deg = section.std_deg / (1.0 + section.harmonics) ** 0.5
-        series = std_deg, section.harmonics, section.moon_temperature_k
-        return cls(patterns * scale, azimuth, known, before, highest, beams.lmax, *series)
+        series = section.std_deg / (1.0 + section.harmonics) ** 0.5, section.harmonics
+        parts = patterns * scale, azimuth, known, before, highest, beams.lmax, *series
+        return cls(*parts, section.moon_temperature_k)
 
     @classmethod
     def moved(cls, section: HorizonSection, setup: Setup, values: Values) -> Setup:
         """Behind terrain of this altitude: A, what the terrain emits, and the signal.
 
         Without values it is the known one.
+
+        Raises
+        ------
+        InputError
+            Beside an error of the beams along the direction to others, which terrain would hide in
+            part.
         """
+        if setup.scenario.noise.beam and not setup.scenario.noise.beam.parameters:
+            raise InputError("beside noise.horizon, noise.beam can have parameters alone")
         names = offset_names(("turntable_deg",), setup.observation.n_runs)
         observation = with_offsets(setup.observation, {n: values[n] for n in names if n in values})
         found = cls.build(section, replace(setup, observation=observation), Around())
@@ -230,7 +236,7 @@ class Horizon(ChangedBeams):
         series = self.stacked(values) * (np.pi / 180.0)
         return self.known + series[0] + waves @ series[1:]
 
-    def hidden(self, values: Values) -> RunBeams:
+    def hidden(self, values: Values) -> Float[Array, "runs products modes"]:
         """What terrain of these values does to the beams; differentiable."""
         altitude, n = self.altitude(values), self.patterns.shape[1]
         xp = namespace(altitude, self.patterns)
