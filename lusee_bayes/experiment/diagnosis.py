@@ -262,9 +262,9 @@ class UnderAnySky:
             pointing = pointing.placed(observation)
         else:
             pointing = Pointing.of(observation, lmax)
-        modes = np.asarray(beams.modes)[:, : n_modes(lmax)]
-        beams = ProductBeams(modes, beams.frequency_mhz)
-        return self.wide(CouplingMatrix.build(beams, pointing, self.data.layout))[0]
+        hidden = 0.0 if self.setup.hidden is None else self.setup.hidden
+        modes = (np.asarray(beams.modes) + hidden)[..., : n_modes(lmax)]
+        return self.wide(CouplingMatrix.of_modes(modes, pointing, self.data.layout))[0]
 
     def without(self, mistake: DataMistake) -> ChiSquare:
         """Residual chi^2 of the data without a mistake, with N for them."""

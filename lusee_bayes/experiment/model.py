@@ -27,6 +27,7 @@ from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import Covariance
 from lusee_bayes.noise.radiometer import radiometer_noise
 from lusee_bayes.systematics.context import Around, Setup, noise_visibilities, prior_and_family
+from lusee_bayes.systematics.horizon import Horizon
 from lusee_bayes.systematics.noise_level import radiometer_about
 from lusee_bayes.systematics.registered import SYSTEMATICS
 from lusee_bayes.systematics.regolith import ground_per_kelvin
@@ -95,7 +96,9 @@ def set_up(
         coupling = replace(complete, layout=layout)
     pieces = observation, sky, source, instrument, beams, coupling, prior, responses, background
     of_data = None if data is None else data.calibration, data is not None
-    return Setup(scenario, *pieces, signal, receiver, *of_data, family)
+    setup = Setup(scenario, *pieces, signal, receiver, *of_data, family)
+    horizon = scenario.noise.horizon
+    return setup if horizon is None else Horizon.moved(horizon, setup, {})
 
 
 def require_fitting(data: Visibilities, scenario: Scenario) -> None:

@@ -43,7 +43,7 @@ from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout
 
 Matrix = Float[Array, "data unknowns"]
-BeamModes = Float[Array, "products modes"]
+BeamModes = Float[Array, "*runs products modes"]
 BodyBeams = Float[Array, "runs products functions modes"]
 RowNumbers = Int[np.ndarray, " rows"]
 TimeModes = Float[Array, "products times modes"]
@@ -195,7 +195,7 @@ def body_beams(modes: BeamModes, pointing: Pointing) -> BodyBeams:
 
     Parameters
     ----------
-    modes : (products, modes) array
+    modes : (products, modes) or (runs, products, modes) array
         Harmonic coefficients in the frame of the lander, real packed.
     pointing : Pointing
         The orientations; differentiable in its turntable angles and turns.
@@ -206,7 +206,8 @@ def body_beams(modes: BeamModes, pointing: Pointing) -> BodyBeams:
     """
     xp, runs = namespace(modes, pointing), []
     for run in range(len(pointing.run_starts) - 1):
-        body = _on_the_moon(turn_about_z(modes, pointing.turntable[run]), pointing)
+        own = modes if modes.ndim == 2 else modes[run]
+        body = _on_the_moon(turn_about_z(own, pointing.turntable[run]), pointing)
         runs.append(_taken_up(xp.stack(tilts(body, pointing.order), axis=1), pointing.factors))
     return xp.stack(runs)
 
@@ -296,8 +297,9 @@ class CouplingMatrix(Coupling):
         The orientations at every sample.
     layout : DataLayout
         The product and the time of every row.
-    modes : (products, modes) array
-        The beams in the frame of the lander, of which all else is made.
+    modes : (products, modes) or (runs, products, modes) array
+        The beams in the frame of the lander, of which all else is made; those of every run where
+        terrain does not turn with the turntable.
     """
 
     body_beams: BodyBeams
@@ -425,10 +427,10 @@ class CouplingMatrix(Coupling):
         callable
             Of a (modes,) sky, which gives (beams, products, times) visibilities, missing ones too.
         """
-        stacked = np.concatenate(list(beams))
+        stacked = np.concatenate(list(beams), axis=-2)
         shape = -1, self.layout.n_products, self.layout.n_times
         pointing = self.pointing if pointing is None else pointing
-        made = self.of_modes(stacked, pointing, DataLayout(len(stacked), shape[2]))
+        made = self.of_modes(stacked, pointing, DataLayout(stacked.shape[-2], shape[2]))
         return lambda sky: np.asarray(made @ np.asarray(sky)).reshape(shape)
 
     def of(

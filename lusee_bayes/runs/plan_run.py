@@ -83,7 +83,7 @@ def without_ports(setup: Setup, lost: Sequence[int]) -> Setup:
     dead = np.array([p.i in lost or p.j in lost for p in all_products(n_ports)])
     left = DataLayout.from_flags(~np.asarray(layout.present) | dead[:, None])
     instrument = replace(setup.instrument, layout=left)
-    coupling = instrument.coupling_of(setup.beams)
+    coupling = replace(setup.coupling, layout=left)
     return replace(setup, instrument=instrument, coupling=coupling)
 
 

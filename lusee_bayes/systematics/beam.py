@@ -106,7 +106,7 @@ class BeamErrors(Systematic):
             beam_source=source,
             beams=beams,
             coupling=setup.instrument.coupling_of(beams),
-            background=setup.background + (emitted - nominal),
+            background=(setup.background.T + (emitted - nominal)).T,
             responses=source_responses(sources, setup.observation, source, frequency_mhz),
         )
 
@@ -213,8 +213,9 @@ class InstrumentParameters(ChangedBeams, BeamErrors):
         )
 
     def modes(self, modes, values):
-        """Beams of antennas that have these values."""
-        return self.instrument.beams(values).modes
+        """Beams of antennas that have these values; a horizon hides what it hides without them."""
+        made = self.instrument.beams(values).modes
+        return made if modes.ndim == 2 else modes + (made - self.instrument.beams().modes)[None]
 
     def effect(self, model, values):
         """A of these beams, and what ground and antennas then emit."""

@@ -56,8 +56,8 @@ class Setup:
         S. Where it is to be learned, what is expected before there are data.
     responses : tuple of (products, times) arrays
         Of each point source beside the map, to 1 K sr.
-    background : (products,) array
-        Visibilities without any sky, of ground, antennas and the mean receiver, in K.
+    background : (products,) or (products, times) array
+        Visibilities without any sky, of ground, antennas, the mean receiver and terrain, in K.
     signal : (products, times) array
         Visibilities of sky, background and sources through the modelled beams, in K.
     receiver : Receiver or None
@@ -68,6 +68,8 @@ class Setup:
         Whether the data were given, so that their sky is not the modelled one.
     family : PriorFamily or None
         Of which data choose the prior; None for a prior that is given.
+    hidden : (runs, products, modes) array or None
+        What the known horizon does to the beams, which do without it; None for flat ground.
     """
 
     scenario: Any
@@ -79,12 +81,13 @@ class Setup:
     coupling: CouplingMatrix
     prior: Prior
     responses: tuple[Grid, ...]
-    background: Float[Array, " products"]
+    background: Float[Array, "products *times"]
     signal: Grid
     receiver: Receiver | None = None
     calibration: Calibration | None = None
     measured: bool = False
     family: PriorFamily | None = None
+    hidden: Float[Array, "runs products modes"] | None = None
 
     @property
     def frequency_mhz(self) -> float:
@@ -102,12 +105,18 @@ class Setup:
         return self.coupling.layout
 
     @property
+    def complete(self) -> CouplingMatrix:
+        """A for all products at all times."""
+        layout = DataLayout(self.layout.n_products, self.layout.n_times)
+        return replace(self.coupling, layout=layout)
+
+    @property
     def offset(self) -> DataVector | None:
         """The background in every datum, in K; None where there is none."""
         if not np.any(self.background):
             return None
         grid = (self.layout.n_products, self.layout.n_times)
-        return self.layout.gather(np.broadcast_to(self.background[:, None], grid))
+        return self.layout.gather(np.broadcast_to(self.background.reshape(grid[0], -1), grid))
 
     def with_prior(self, section: Any) -> Setup:
         """Return the same with another prior, or family of priors.
@@ -129,7 +138,7 @@ class Setup:
         sky : Sky
             Of the same frequency and lmax.
         """
-        complete = CouplingMatrix.build(self.beams, self.pointing)
+        complete = self.complete
         change = complete.layout.scatter(complete @ (sky.modes - self.sky.modes))
         return replace(self, sky=sky, signal=self.signal + change)
 

@@ -153,12 +153,12 @@ class FieldErrors(ChangedBeams):
     def modes(self, modes, values):
         """Add what the errors change."""
         more = self.grid.analyse(self.changed(values) - self.patterns)
-        return modes + more[:, : modes.shape[1]]
+        return modes + more[:, : modes.shape[-1]]
 
     def linearised(self, model, centre):
         """Through the beams times every Y_k, of which all amplitudes of k are made."""
         coupling, n = model.coupling, self.n_ports
-        beams, size = np.asarray(self.changed(self.values(centre))), coupling.modes.shape[1]
+        beams, size = np.asarray(self.changed(self.values(centre))), coupling.modes.shape[-1]
         along = (self.grid.analyse(beams * y)[:, :size] for y in np.asarray(self.harmonics))
         see = coupling.along(along)
         first, second, imaginary = ports(n)

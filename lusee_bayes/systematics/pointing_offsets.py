@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import equinox as eqx
 import jax
@@ -18,12 +18,10 @@ from jaxtyping import Float, Int
 from pydantic import Field
 
 from lusee_bayes.core.arrays import Array, DataVector, namespace, on_device
-from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import Rotation, generators
 from lusee_bayes.core.reading import naming
 from lusee_bayes.core.section import NOT_TINY, Section, Treatment, requires
 from lusee_bayes.instrument.beams.monopoles import Monopoles, beams_towards
-from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.pointing import (
     CLOCK,
     OFFSETS,
@@ -36,7 +34,7 @@ from lusee_bayes.instrument.pointing import (
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.sources import SOURCE_NODES, expected_signal, source_responses
-from lusee_bayes.systematics.systematic import Systematic, Truth, Unknown, Values, with_added
+from lusee_bayes.systematics.systematic import Systematic, Unknown, Values, with_added
 
 # wider priors are none: the sky looks nothing like it did
 Offset = Annotated[float, Field(gt=0, le=45), NOT_TINY]
@@ -188,17 +186,6 @@ class PointingOffsets(Systematic):
         names = offset_names(section.kinds, setup.observation.n_runs)
         offsets = {name: value for name, value in values.items() if name in names}
         return shifted(setup, offsets) if offsets else setup
-
-    @classmethod
-    def truth(cls, section: PointingSection, setup: Setup, key: Any) -> Truth:
-        drawn = super().truth(section, setup, key)
-        for name in section.true_values:
-            if name not in drawn:
-                raise InputError(
-                    f"noise.pointing.true_values has '{name}', which is not among the offsets "
-                    f"that have a prior; {nearest(name, tuple(drawn))}"
-                )
-        return drawn | {name: float(value) for name, value in section.true_values.items()}
 
     @classmethod
     def in_data(cls, section, setup, model, truth, key):
@@ -366,7 +353,7 @@ def shifted(setup: Setup, values: Mapping[str, float]) -> Setup:
         pointing = setup.pointing.placed(observation)
     sources, frequency_mhz = setup.scenario.sources.list, setup.frequency_mhz
     responses = source_responses(sources, observation, setup.beam_source, frequency_mhz)
-    complete = CouplingMatrix.build(setup.beams, pointing)
+    complete = setup.complete.of(pointing=pointing)
     parts = complete, setup.sky, setup.background, responses
     return replace(
         setup,

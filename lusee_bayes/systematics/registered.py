@@ -12,6 +12,7 @@ from lusee_bayes.systematics.beam import BeamErrors
 from lusee_bayes.systematics.field_errors import FieldErrors
 from lusee_bayes.systematics.gain_drifts import GainDrifts
 from lusee_bayes.systematics.gain_table import GainTable
+from lusee_bayes.systematics.horizon import Horizon
 from lusee_bayes.systematics.noise_level import NoiseLevel, RadiometerSection
 from lusee_bayes.systematics.pointing_offsets import PointingOffsets
 from lusee_bayes.systematics.polarisation import Polarisation
@@ -27,6 +28,7 @@ SYSTEMATICS: tuple[type[Systematic], ...] = (
     PriorSpectrum,
     BeamErrors,
     FieldErrors,
+    Horizon,
     PointingOffsets,
     PointSources,
     Receivers,

@@ -263,7 +263,7 @@ def expected_signal(
     sources: tuple[SourceSection, ...],
     complete: CouplingMatrix,
     sky: Sky,
-    background: Float[Array, " products"],
+    background: Float[Array, "products *times"],
     responses: tuple[Grid, ...],
 ) -> Grid:
     """Visibilities of sky, background and sources with their mean fluxes, in K.
@@ -274,12 +274,12 @@ def expected_signal(
     complete : CouplingMatrix
         A, for all products at all times.
     sky : Sky
-    background : (products,) array
+    background : (products,) or (products, times) array
         In K.
     responses : tuple of (products, times) arrays
         As in :class:`.Setup`.
     """
-    signal = complete.layout.scatter(complete @ sky.modes) + background[:, None]
+    signal = complete.layout.scatter(complete @ sky.modes) + background.reshape(len(background), -1)
     for section, response in zip(sources, responses, strict=True):
         signal = signal + section.mean_flux(sky.frequency_mhz) * response
     return signal

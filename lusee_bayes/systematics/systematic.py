@@ -45,10 +45,10 @@ from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.arrays import Array, DataVector, Modes, Vector, namespace, on_device, scalar
 from lusee_bayes.core.checks import require_positive
-from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.core.section import Section
-from lusee_bayes.instrument.coupling import DenseCoupling
+from lusee_bayes.instrument.coupling import BeamModes, DenseCoupling
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import Covariance, DiagonalCovariance, LowRankCovariance
@@ -256,7 +256,7 @@ class Systematic(eqx.Module):
 
     @classmethod
     def truth(cls, section: Any, setup: Setup, key: PRNGKeyArray) -> Truth:
-        """Draw the true values in simulated data from their priors.
+        """Draw the true values in simulated data from their priors, but for those that it says.
 
         Parameters
         ----------
@@ -267,9 +267,17 @@ class Systematic(eqx.Module):
         """
         found = cls.build(section, setup, Around())
         z = np.asarray(jax.random.normal(cls.own_key(key), (len(found.names),)))
-        return {
+        drawn = {
             name: value if value.ndim else float(value) for name, value in found.values(z).items()
         }
+        said = getattr(section, "true_values", {})
+        for name in said:
+            if name not in drawn:
+                raise InputError(
+                    f"{cls.key}.true_values has '{name}', which is not among what has a prior; "
+                    f"{nearest(name, tuple(drawn))}"
+                )
+        return drawn | {name: float(value) for name, value in said.items()}
 
     @classmethod
     def own_key(cls, key: PRNGKeyArray) -> PRNGKeyArray:
@@ -601,14 +609,10 @@ class ChangedBeams(Systematic):
     moves: ClassVar[bool] = True
 
     @abstractmethod
-    def modes(
-        self, modes: Float[Array, "products modes"], values: Values
-    ) -> Float[Array, "products modes"]:
+    def modes(self, modes: BeamModes, values: Values) -> BeamModes:
         """Beams in the frame of the lander with values of the unknowns, of those without them."""
 
-    def slopes(
-        self, modes: Float[Array, "products modes"], centre: Vector
-    ) -> Iterator[Float[Array, "products modes"]]:
+    def slopes(self, modes: BeamModes, centre: Vector) -> Iterator[BeamModes]:
         """Derivatives of :meth:`modes` by the unknowns in prior standard deviations, one by one."""
         return self.differences(lambda values: self.modes(modes, values), centre)
 
