@@ -14,6 +14,9 @@ the evidence is largest where the sum of squares of the amplitudes of each ell i
 number of them that the data determine, ::
 
     sum a^2 = gamma_ell C_ell,    gamma_ell = n_ell - sum Var(a) / C_ell.
+
+The strength only grows that way: where parameters of the antennas describe most of an error, what
+is left has a few shapes, and the strength of all would be found far too low for these.
 """
 
 from __future__ import annotations
@@ -37,6 +40,8 @@ from lusee_bayes.systematics.systematic import ChangedBeams, Unknown, Values
 
 # what is learned, by name
 STD, SLOPE = "field_std", "field_slope"
+# standard deviation in any direction, at most
+LARGEST = 0.1
 # prior standard deviations of ln std and of the slope
 LOG_STD, SLOPE_STD = 2.0, 1.0
 
@@ -48,18 +53,18 @@ class FieldErrorsSection(Section):
     ----------
     std : float
         Standard deviation of the relative amplitude, and of the phase in radians, in any direction;
-        what is expected of it, where it is learned.
+        the least, where it is learned.
     lmax : int
         Highest ell of the errors.
     slope : float
         C_ell goes with (1 + ell)^-slope.
     learned : bool
-        Whether ``std`` and ``slope`` are learned from the data.
+        Whether the data may raise ``std``, and choose the slope.
     treatment : {"marginalised", "sampled", "ignored"}
         Found in rounds and marginalised, sampled with the map, or left out of the model.
     """
 
-    std: Annotated[float, Field(gt=0, le=0.1), NOT_TINY] = 1e-3
+    std: Annotated[float, Field(gt=0, le=LARGEST), NOT_TINY] = 1e-3
     lmax: Annotated[int, Field(ge=0, le=12)] = 6
     slope: Annotated[float, Field(ge=-2, le=6)] = 1.0
     learned: bool = True
@@ -201,7 +206,9 @@ class FieldErrors(ChangedBeams):
             off = (log_std - np.log(expected.std)) / LOG_STD, (slope - expected.slope) / SLOPE_STD
             return float(fit + 0.5 * (off[0] ** 2 + off[1] ** 2))
 
-        log_std, slope = minimize(cost, [np.log(expected.std), expected.slope]).x
+        # never below what is expected: errors of a few shapes alone would be underrated
+        bounds = [(np.log(expected.std), np.log(LARGEST)), (-2.0, 6.0)]
+        log_std, slope = minimize(cost, [np.log(expected.std), expected.slope], bounds=bounds).x
         return {STD: float(np.exp(log_std)), SLOPE: float(slope)}
 
 

@@ -1,0 +1,226 @@
+"""How far a map can be trusted: what its Gaussian leaves out, and which errors it would not show.
+
+**Reach.** Unknowns of the instrument are described by a Gaussian about their found values. Draws of
+sky and unknowns from it are weighed against the exact density, ::
+
+    ln w = -1/2 [ |L^-1 (d - v(m, z))|^2 - |L^-1 (d - v_lin(m, z))|^2 ] - z^2 / 2 + (z - e)^2 / 2,
+
+with L of the noise without them, and e the moved means of the model's prior. The tail of the
+weights says whether the Gaussian serves (Pareto k of Vehtari et al. 2024: up to 0.7).
+
+**Blind spots.** An error of the instrument that no unknown describes adds T z to the data. It moves
+the mean map by C A^T N^-1 T z, and raises the residual chi^2, what no sky can absorb, by ::
+
+    z^T T^T [N^-1 - N^-1 A (A^T N^-1 A)^-1 A^T N^-1] T z
+
+(the inverse with a very wide prior). Neither needs data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+from arviz_stats.base import array_stats
+
+from lusee_bayes.core.arrays import Modes
+from lusee_bayes.experiment.experiment import Experiment
+from lusee_bayes.experiment.model import base_model, moved, systematics
+from lusee_bayes.experiment.rounds import Inference
+from lusee_bayes.experiment.unknowns import TESTED
+from lusee_bayes.instrument.pointing import offset_names
+from lusee_bayes.linear.amplitudes import amplitudes_of_sky
+from lusee_bayes.noise.covariance import LowRankFactor
+from lusee_bayes.systematics.beam import InstrumentParameters
+from lusee_bayes.systematics.context import Around, Setup
+from lusee_bayes.systematics.field_errors import FieldErrors, FieldErrorsSection
+from lusee_bayes.systematics.pointing_offsets import PointingOffsets
+from lusee_bayes.systematics.systematic import Systematic
+
+# draws that are weighed, and the k up to which a Gaussian serves
+N_WEIGHED, LARGEST_K = 100, 0.7
+# an error of the fields, and of each parameter of the antennas, relative
+FIELDS, PARAMETERS = 1e-3, 1e-2
+# of the fields: enough to see whether anything shows
+FIELD_LMAX = 3
+# how much wider than the prior the sky is where all of the data's skies are let in
+WIDE = 1e2
+# a residual chi^2 is seen to be too large by so many of its standard deviations
+SEEN = 3.0
+FIELDS_NAME = "the ports' fields"
+# errors that a sentence names
+MOST_NAMED = 4
+
+
+def pareto_k(setup: Setup, data: np.ndarray, found: Inference) -> float | None:
+    """Weigh draws of sky and unknowns from the Gaussian of an inference.
+
+    Parameters
+    ----------
+    setup : Setup
+    data : (data,) array
+        In K.
+    found : Inference
+
+    Returns
+    -------
+    float or None
+        Pareto k of the weights; None where nothing was found in rounds.
+    """
+    parts, factor = found.expanded, found.solution.factor
+    if not found.moving or not isinstance(factor, LowRankFactor):
+        return None
+    columns = np.concatenate([part.columns for part in parts], axis=1)
+    told = amplitudes_of_sky(found.solution, columns)
+    keys = jax.random.split(jax.random.key(setup.scenario.seed), 2)
+    skies = np.asarray(found.posterior.sample(keys[0], N_WEIGHED))
+    values, axes = np.linalg.eigh(told.covariance)
+    root = axes * np.sqrt(np.maximum(values, 0.0))
+    normals = np.asarray(jax.random.normal(keys[1], (N_WEIGHED, len(told.mean))))
+    off = told.mean + normals @ root.T - (skies - told.reference) @ told.pull.T
+    expected = np.concatenate([part.expected for part in parts])
+    ends = np.cumsum([len(part.centre) for part in parts])[:-1]
+    base = base_model(setup, found.around)
+    built = [found for _, found in systematics(setup, found.around)]
+    log_weights = np.empty(N_WEIGHED)
+    for k, (sky, a) in enumerate(zip(skies, off, strict=True)):
+        kinds = (type(part.systematic) for part in parts)
+        z = dict(zip(kinds, np.split(a + expected, ends), strict=True))
+        model = base
+        for systematic in built:
+            if type(systematic) in z:
+                own = systematic.values(z[type(systematic)])
+                model = systematic.effect(model, own)
+            elif not systematic.first_order:  # as in N, but for its noise
+                model = replace(systematic.marginalised(model), noise=model.noise)
+        exact = factor.base.whiten(data - model.predict(sky))
+        linear = factor.base.whiten(data - found.model.predict(sky) - columns @ a)
+        prior = (a**2).sum() - ((a + expected) ** 2).sum()
+        log_weights[k] = 0.5 * (linear @ linear - exact @ exact + prior)
+    return float(array_stats.psislw(-log_weights)[1])
+
+
+@dataclass(frozen=True)
+class BlindSpot:
+    """An error of the instrument that no unknown of the model describes.
+
+    Attributes
+    ----------
+    name : str
+        What it is of.
+    size : float
+        Its standard deviation, in ``unit``.
+    unit : str
+    bias : float
+        By how much it moves the map: rms over modes, in posterior standard deviations.
+    shown : float
+        By how much it raises the residual chi^2, in standard deviations of that.
+    """
+
+    name: str
+    size: float
+    unit: str
+    bias: float
+    shown: float
+
+    @property
+    def unnoticed(self) -> tuple[float, float]:
+        """The size up to which the residual chi^2 does not show it, and the bias of that size."""
+        factor = float(np.sqrt(SEEN / max(self.shown, np.finfo(np.float64).tiny)))
+        return self.size * factor, self.bias * factor
+
+    def words(self) -> str:
+        """What it does, in a few words."""
+        return f"{self.name} by {self.size:g}{self.unit} ({self.bias:.2g})"
+
+
+def blind_sentence(spots: Iterable[BlindSpot]) -> str:
+    """Which errors would move the map and not be seen; empty where there are none."""
+    unseen = [spot for spot in spots if spot.shown < SEEN and spot.bias > 1.0]
+    if not unseen:
+        return ""
+    unseen = sorted(unseen, key=lambda spot: -spot.bias)[:MOST_NAMED]
+    return (
+        "The model takes the instrument for exact, and the residual chi^2 would not show an error "
+        f"of {', '.join(spot.words() for spot in unseen)}; in brackets, by how many of its "
+        "standard deviations (rms) such an error moves the map. noise.beam.parameters, "
+        "noise.fields and noise.pointing make unknowns of them; a second turntable angle shows more."
+    )
+
+
+def errors_of(setup: Setup) -> Iterator[tuple[str, float, str, Systematic, slice]]:
+    """Name, size and unit of errors that a model may lack, with what describes them."""
+    section = FieldErrorsSection(std=FIELDS, lmax=FIELD_LMAX, learned=False)
+    fields = FieldErrors.build(section, setup, Around())
+    yield FIELDS_NAME, 100.0 * FIELDS, " %", fields, slice(None)
+    source = setup.beam_source
+    known = {name: p.value for name, p in source.parameters().items() if float(p.value)}
+    stds = {name: PARAMETERS * abs(float(value)) for name, value in known.items()}
+    parameters = InstrumentParameters(setup.instrument, tuple(stds), tuple(stds.values()))
+    for k, name in enumerate(stds):
+        yield name, 100.0 * PARAMETERS, " %", parameters, slice(k, k + 1)
+    runs = setup.observation.n_runs
+    steps = {name: step for kind, step in TESTED.items() for name in offset_names((kind,), runs)}
+    offsets = PointingOffsets.of(setup, steps, dict.fromkeys(steps, 0.0))
+    for k, (name, step) in enumerate(steps.items()):
+        yield name, step, "", offsets, slice(k, k + 1)
+
+
+def blind_spots(setup: Setup, found: Inference, sky: Modes) -> tuple[BlindSpot, ...]:
+    """Work out what errors of the instrument do that the model does not have.
+
+    Parameters
+    ----------
+    setup : Setup
+    found : Inference
+    sky : (modes,) array
+        In K.
+    """
+    has = {name for part in found.expanded for name in part.systematic.names}
+    if any(isinstance(part.systematic, FieldErrors) for part in found.expanded):
+        has.add(FIELDS_NAME)
+    there = moved(setup, found.around.values)
+    solution, model = found.solution, base_model(there, found.around)
+    root = solution.posterior.root()
+    wide = solution.under(found.model.prior.widened(WIDE)).posterior.root()
+    spots, slopes, degrees = [], {}, max(found.model.n_data - len(sky), 1)
+    for name, size, unit, systematic, which in errors_of(there):
+        if name in has:
+            continue
+        if type(systematic) not in slopes:
+            centre = np.zeros(len(systematic.names))
+            columns = np.asarray(systematic.linearised(model, centre)(sky))
+            solved = np.asarray(solution.factor.solve(columns))
+            pull = np.asarray(found.model.coupling.transpose_mv(solved))
+            moves = ((root.T @ pull) ** 2).sum(0)
+            left = (columns * solved).sum(0) - ((wide.T @ pull) ** 2).sum(0)
+            slopes[type(systematic)] = moves, left
+        moves, left = (x[which].sum() for x in slopes[type(systematic)])
+        bias = float(np.sqrt(moves / len(sky)))
+        spots.append(BlindSpot(name, size, unit, bias, float(left / np.sqrt(2.0 * degrees))))
+    return tuple(spots)
+
+
+def reach(experiment: Experiment, found: Inference) -> list[str]:
+    """What is doubtful about the Gaussian, and what data would not show, a sentence each.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    found : Inference
+        Of its data.
+    """
+    sentences, setup = [], experiment.setup
+    k = pareto_k(setup, experiment.data.data, found)
+    if k is not None and k > LARGEST_K:
+        keys = ", ".join(dict.fromkeys(part.systematic.key for part in found.moving))
+        sentences.append(
+            f"The Gaussian about the found values of {keys} does not describe their posterior "
+            f"(Pareto k = {k:.2g}, accepted: {LARGEST_K:g}); set treatment=sampled where the prior "
+            "is widest, or give narrower priors."
+        )
+    if setup.measured:
+        sentences += filter(None, [blind_sentence(blind_spots(setup, found, found.posterior.mean))])
+    return sentences
