@@ -50,6 +50,8 @@ WIDE = 1e2
 # a residual chi^2 is seen to be too large by so many of its standard deviations
 SEEN = 3.0
 FIELDS_NAME = "the ports' fields"
+# what raises chi^2 by less is what a sky can absorb altogether, but for rounding
+NOTHING = 1e-3
 # errors that a sentence names
 MOST_NAMED = 4
 
@@ -146,7 +148,7 @@ def blind_sentence(spots: Iterable[BlindSpot]) -> str:
         "The model takes the instrument for exact, and the residual chi^2 would not show an error "
         f"of {', '.join(spot.words() for spot in unseen)}; in brackets, by how many of its "
         "standard deviations (rms) such an error moves the map. noise.beam.parameters, "
-        "noise.fields and noise.pointing make unknowns of them; a second turntable angle shows more."
+        "noise.fields and noise.pointing make them unknowns; a second turntable angle shows more."
     )
 
 

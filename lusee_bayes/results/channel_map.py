@@ -23,6 +23,7 @@ from lusee_bayes.experiment.diagnosis import diagnose
 from lusee_bayes.experiment.experiment import Experiment, doubts, explained, infer, posterior_draws
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.unknowns import Unknowns, flux_table, pointing_report
+from lusee_bayes.experiment.validity import reach
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.judge import measures
 from lusee_bayes.judge.chi2 import LEVELS
@@ -295,7 +296,7 @@ class Conditioned:
             parameters=() if learned is None else tuple(learned.as_rows()),
             log_evidence_learned=None if learned is None else learned.log_evidence,
             beam_rms_difference=beam_rms_difference(experiment.setup),
-            doubts=doubts(experiment, own),
+            doubts=(*doubts(experiment, own), *(reach(experiment, own) if alone else ())),
             judged=judged,
             details=details,
             pointing=pointing,

@@ -56,7 +56,8 @@ class Forecast:
     modes : how many have SNR > 1; snr_squared : (ells,) expected SNR_ell^2 for ell = 0..lmax;
     resolution_deg : as in a map's summary, 180 degrees / ell_cross, None if there is none;
     offsets : expected standard deviation of every offset of clock and pointing that the model has,
-    by name
+    by name; unnoticed : errors of the instrument that the model does not have, as large as the
+    residual chi^2 would not show, and by how many standard deviations (rms) each moves the map
     """
 
     variation: Variation
@@ -67,6 +68,7 @@ class Forecast:
     snr_squared: Ells
     resolution_deg: float | None
     offsets: dict[str, float] = field(default_factory=dict)
+    unnoticed: str = ""
 
     def offsets_line(self) -> str:
         """How well clock and pointing will be known; empty where the model has no such offsets."""
@@ -98,7 +100,14 @@ def forecast_lines(forecasts: Sequence[Forecast]) -> list[str]:
         more = best.information_bits - first.information_bits
         text += f"; most: {best.variation.family}, {best.variation.name}: +{more:.0f} bits"
     offsets = first.offsets_line()
-    return [text, f"{source}: {offsets}"] if offsets else [text]
+    lines = [text, f"{source}: {offsets}"] if offsets else [text]
+    for one in forecasts:
+        if one.unnoticed:
+            lines.append(
+                f"{source}, {one.variation.name}: chi^2 would not show errors up to these (in "
+                f"brackets, the map's then, in its standard deviations): {one.unnoticed}"
+            )
+    return lines
 
 
 def forecast_rows(forecasts: Sequence[Forecast]) -> list[dict[str, object]]:
@@ -120,6 +129,7 @@ def forecast_rows(forecasts: Sequence[Forecast]) -> list[dict[str, object]]:
                 "ell_cross": "none" if row.ell_cross is None else row.ell_cross,
                 "resolution_deg": "none" if resolution is None else f"{resolution:.2f}",
                 "clock_and_pointing": row.offsets_line().replace(",", ";"),
+                "unnoticed_errors": row.unnoticed.replace(",", ";"),
             }
         )
     return rows

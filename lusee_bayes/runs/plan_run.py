@@ -33,6 +33,7 @@ from lusee_bayes.experiment.instrument_sections import RunSection
 from lusee_bayes.experiment.model import model_about, set_up
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
+from lusee_bayes.experiment.validity import NOTHING, blind_spots
 from lusee_bayes.instrument.products import DataLayout, all_products
 from lusee_bayes.judge.measures import effective_resolution_deg, prior_fraction_per_ell
 from lusee_bayes.linear.amplitudes import template_amplitudes
@@ -108,6 +109,18 @@ def expected_offsets(found: Inference) -> dict[str, float]:
     return found.offsets.systematic.in_units(amplitudes.std)
 
 
+def turned(family: str) -> bool:
+    """Whether variations are looked at for errors that pass unnoticed, whose cure are angles."""
+    return family in (AS_GIVEN, "turned, same time", "turned, more time") or "runs" in family
+
+
+def unnoticed(setup: Setup, found: Inference) -> str:
+    """Errors that the residual chi^2 would not show, those first that move the map most."""
+    spots = blind_spots(setup, found, np.asarray(setup.sky.modes))
+    told = sorted((s for s in spots if s.shown > NOTHING), key=lambda s: -s.unnoticed[1])
+    return ", ".join(f"{s.name} {s.unnoticed[0]:.2g}{s.unit} ({s.unnoticed[1]:.2g})" for s in told)
+
+
 def forecast(variation: Variation) -> Forecast:
     """Build A, S and N of a variation and take the numbers from its posterior covariance.
 
@@ -131,6 +144,7 @@ def forecast(variation: Variation) -> Forecast:
             snr_squared=expected_snr_squared(posterior),
             resolution_deg=effective_resolution_deg(prior_fraction_per_ell(posterior)),
             offsets=expected_offsets(found),
+            unnoticed=unnoticed(setup, found) if turned(variation.family) else "",
         )
     except InputError as error:
         raise InputError(f"{variation.source}, {variation.name}: {error}") from error
