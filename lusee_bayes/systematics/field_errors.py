@@ -9,13 +9,13 @@ up to ``lmax``. Beams of products are then P_ij exp(f_i + conj f_j), and the der
 amplitude is the product of Y_k and the beam, whatever the values. c follows from the standard
 deviation of either part in any direction.
 
-How strong and how smooth the errors are is learned with everything else, in rounds (MacKay 1992):
-the evidence is largest where the sum of squares of the amplitudes of each ell is C_ell times the
-number of them that the data determine, ::
+How strong and how smooth the errors are is learned with everything else, in rounds. Each takes the
+C_ell that are most probable for the amplitudes as they were found, uncertain as they are (expectation
+and maximisation): of n_ell amplitudes a of one ell, a spectrum alone would be ::
 
-    sum a^2 = gamma_ell C_ell,    gamma_ell = n_ell - sum Var(a) / C_ell.
+    C_ell = sum (mean of a^2 + Var(a)) / n_ell.
 
-The strength only grows that way: where parameters of the antennas describe most of an error, what
+The strength only grows: where parameters of the antennas describe most of an error, what
 is left has a few shapes, and the strength of all would be found far too low for these.
 """
 
@@ -194,15 +194,14 @@ class FieldErrors(ChangedBeams):
 
     def relearned(self, mean: Vector, variance: Vector) -> dict[str, float]:
         expected, stds = self.expectation, np.asarray(self.of_ell)
-        sizes = [u.size for u in self.unknowns]
+        sizes = np.array([u.size for u in self.unknowns])
         ends = np.cumsum(sizes)[:-1]
-        squares = np.array([(z**2).sum() for z in np.split(mean, ends)]) * stds**2
-        known = np.array([(1.0 - v).sum() for v in np.split(variance, ends)]).clip(0.0)
+        squares = np.array([z.sum() for z in np.split(mean**2 + variance, ends)]) * stds**2
 
         def cost(x: Vector) -> float:
             log_std, slope = x
             there = of_ell(np.exp(log_std), slope, expected.lmax)
-            fit = (known * np.log(there) + squares / (2.0 * there**2)).sum()
+            fit = (sizes * np.log(there) + squares / (2.0 * there**2)).sum()
             off = (log_std - np.log(expected.std)) / LOG_STD, (slope - expected.slope) / SLOPE_STD
             return float(fit + 0.5 * (off[0] ** 2 + off[1] ** 2))
 
