@@ -13,7 +13,6 @@ each channel has a posterior of its own, from the channel's data alone.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -25,7 +24,6 @@ from jaxtyping import Float, PRNGKeyArray
 from lusee_bayes.core import linalg
 from lusee_bayes.core.arrays import Array, Modes, ModesMatrix, on_host
 from lusee_bayes.core.checks import require_shape
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.prior import IndependentPrior
@@ -150,38 +148,6 @@ class ComponentSums(eqx.Module):
             self.log_det,
             self.n_data,
         )
-
-
-def solve_directly(
-    prior: SpectralPrior, channels: Sequence[Information], reference: ChannelModes
-) -> Posterior:
-    """Compute the posterior of all component maps by factorising its matrix.
-
-    Parameters
-    ----------
-    prior : SpectralPrior
-        Of all channels.
-    channels : sequence of Information
-        In the prior's order.
-    reference : (channels, modes) array
-        A reference sky for every channel, such as that of its information, in K.
-
-    Returns
-    -------
-    Posterior
-        Of the component maps in one vector, the first map first, with the evidence of all data.
-
-    Raises
-    ------
-    InputError
-        If there are more or fewer channels than the prior has, or the mean does not converge.
-    """
-    if len(channels) != prior.n_channels:
-        raise InputError(f"there are {len(channels)} channels, the prior is for {prior.n_channels}")
-    sums = ComponentSums.empty(prior, reference)
-    for channel, information in enumerate(channels):
-        sums = summed_information(sums, prior, channel, information)
-    return component_posterior(sums.information(), prior)
 
 
 def summed_information(
