@@ -14,20 +14,8 @@ from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.reading import as_yaml
 from lusee_bayes.experiment.scenario import Scenario
 
-UNITS = {
-    "mhz": "MHz",
-    "hz": "Hz",
-    "deg": "degrees",
-    "m": "m",
-    "s": "s",
-    "day": "s/day",
-    "h": "h",
-    "k": "K",
-    "jy": "Jy",
-    "pf": "pF",
-    "nh": "nH",
-    "ohm": "Ohm",
-}
+SAME = ("MHz", "Hz", "m", "s", "h", "K", "Jy", "pF", "nH", "Ohm")
+UNITS = {unit.lower(): unit for unit in SAME} | {"deg": "degrees", "day": "s/day"}
 TYPES = {"number": "number", "integer": "integer", "string": "text", "boolean": "true, false"}
 # JSON schema's names of bounds, as they are written
 BOUNDS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}

@@ -81,13 +81,8 @@ def reduce_sessions(
             keep = np.zeros(len(level), dtype=bool)
             keep[piece] = True
             starts = range(0, int(keep.sum()), SLAB)
-            spectra = reduced.Reduced.blank(
-                like,
-                line.observation.select(keep),
-                np.arange(keep.sum()),
-                level[piece],
-                len(starts),
-            )
+            here = line.observation.select(keep), np.arange(keep.sum()), level[piece]
+            spectra = reduced.Reduced.blank(like, *here, len(starts))
             for start in starts:
                 slab = _slab(line, recipe, states, piece.start + start, next(counts))
                 in_threads(partial(slab, spectra, start), numbers)

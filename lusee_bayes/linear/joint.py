@@ -60,13 +60,12 @@ def common_part(information: Information, residual_root: Modes | None) -> Inform
     log_det = 2.0 * np.log(np.diagonal(lower)).sum()
     matrix = -inverse
     matrix[np.diag_indices_from(matrix)] += 1.0
-    return Information(
-        linalg.scaled(matrix, 1.0 / residual_root, overwrite=True),
-        solved / residual_root,
-        information.reference,
-        np.asarray(information.misfit - gradient @ solved),
-        np.asarray(information.log_det + log_det),
-        information.n_data,
+    return replace(
+        information,
+        matrix=linalg.scaled(matrix, 1.0 / residual_root, overwrite=True),
+        vector=solved / residual_root,
+        misfit=np.asarray(information.misfit - gradient @ solved),
+        log_det=np.asarray(information.log_det + log_det),
     )
 
 
@@ -140,14 +139,9 @@ class ComponentSums(eqx.Module):
         matrix = np.zeros((k, n, k, n))
         for pair, (i, j) in enumerate(zip(*np.tril_indices(k), strict=True)):
             matrix[i, :, j] = matrix[j, :, i] = linalg.mirrored(self.matrices[pair].copy())
-        return Information(
-            matrix.reshape(k * n, k * n),
-            self.vectors.reshape(k * n),
-            self.reference.reshape(k * n),
-            self.misfit,
-            self.log_det,
-            self.n_data,
-        )
+        matrix, vector = matrix.reshape(k * n, k * n), self.vectors.reshape(k * n)
+        scalars = self.misfit, self.log_det, self.n_data
+        return Information(matrix, vector, self.reference.reshape(k * n), *scalars)
 
 
 def summed_information(

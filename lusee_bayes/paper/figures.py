@@ -105,16 +105,9 @@ def drawn(case: xr.Dataset, name: str) -> Float[np.ndarray, " pixels"]:
 
 def flat_bar(figure: Figure, axes: Axes | list[Axes], image, unit: str) -> None:
     """A flat bar below; three round numbers on a logarithmic one."""
-    bar = figure.colorbar(
-        image,
-        ax=axes,
-        label=unit,
-        location="bottom",
-        shrink=0.7,
-        aspect=30 if isinstance(axes, Axes) else 60,
-        extend="both",
-        pad=0.04,
-    )
+    style = {"location": "bottom", "shrink": 0.7, "extend": "both", "pad": 0.04}
+    aspect = 30 if isinstance(axes, Axes) else 60
+    bar = figure.colorbar(image, ax=axes, label=unit, aspect=aspect, **style)
     if isinstance(image.norm, LogNorm):
         low, high = np.log10([image.norm.vmin, image.norm.vmax])
         ticks = [float(f"{10**t:.1e}") for t in np.linspace(low, high, 5)[[0, 2, 4]]]

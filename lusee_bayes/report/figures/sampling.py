@@ -124,24 +124,14 @@ def uncertainty(run: SampleResult) -> Figure:
     # draws that are all the same have no width, and no asymmetry
     skewness = np.divide(excess, width, out=np.zeros_like(width), where=width > 0)
     limit = np.percentile(np.abs(skewness), 99.0)
-    percent = "% of the mean sky"
+    percent, chance = "% of the mean sky", "of its width (chance alone for a Gaussian)"
+    skewed = "asymmetry of the 90 % interval about the mean"
+    signed, kelvin = Normalize(-limit, limit), drawing.temperatures(maps["mean"])
     panels = [
-        (
-            "mean of the draws",
-            maps["mean"],
-            drawing.temperatures(maps["mean"]),
-            drawing.SEQUENTIAL,
-            "K",
-        ),
+        ("mean of the draws", maps["mean"], kelvin, drawing.SEQUENTIAL, "K"),
         ("standard deviation", spread, _range(spread), drawing.SEQUENTIAL, percent),
         ("width of the 90 % interval", interval, _range(interval), drawing.SEQUENTIAL, percent),
-        (
-            "asymmetry of the 90 % interval about the mean",
-            skewness,
-            Normalize(-limit, limit),
-            drawing.DIVERGING,
-            "of its width (chance alone for a Gaussian)",
-        ),
+        (skewed, skewness, signed, drawing.DIVERGING, chance),
     ]
     nside = run.experiment.scenario.map_nside
     altitude = highest_altitude(run.experiment.data.observation, nside)
