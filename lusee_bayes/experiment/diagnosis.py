@@ -147,10 +147,8 @@ def data_mistakes(n_ports: int) -> Iterator[tuple[str, str, Mixing]]:
             signs = [-1.0 if port in flipped else 1.0 for port in numbers]
             yield wrong, remedy, port_mixing(numbers, signs)
     for i, j in combinations(numbers, 2):
-        wrong, remedy = (
-            f"ports {i} and {j} are exchanged",
-            f"exchange ports {i} and {j} of the data",
-        )
+        wrong = f"ports {i} and {j} are exchanged"
+        remedy = f"exchange ports {i} and {j} of the data"
         yield wrong, remedy, port_mixing([{i: j, j: i}.get(port, port) for port in numbers])
     for turn in range(1, n_ports):
         wrong = f"the ports are turned by {turn}: the model's port 0 is the data's port {turn}"

@@ -90,11 +90,8 @@ def reduce_sessions(
             spans.append(np.stack(in_threads(finish, numbers)))
             slabs.append(spectra.slab_scatter)
             done(piece.stop)
-    return replace(
-        whole,
-        span_scatter=np.concatenate(spans, axis=1),
-        slab_scatter=np.concatenate(slabs, axis=1),
-    )
+    of_spans, of_slabs = np.concatenate(spans, axis=1), np.concatenate(slabs, axis=1)
+    return replace(whole, span_scatter=of_spans, slab_scatter=of_slabs)
 
 
 def _in_common(line: Timeline, recipe: Recipe, level: session.PortLevels) -> dict[str, Any]:

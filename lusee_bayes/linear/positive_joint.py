@@ -192,10 +192,9 @@ def find_joint_mode(
     channels: Channels,
     *,
     learn: bool = False,
-    start: Fields | None = None,
     report: Callable[[int, str], None] | None = None,
 ) -> PositiveMode:
-    """Find the most probable skies.
+    """Find the most probable skies, beginning with the templates themselves.
 
     Parameters
     ----------
@@ -206,8 +205,6 @@ def find_joint_mode(
         Their data.
     learn : bool
         Learn A and tilt of every field and residual, by the maximum of the evidence.
-    start : (fields, modes) array, optional
-        Fields to begin with; by default zero, the templates themselves.
     report : callable, optional
         Told the number of every round, and how far it moved.
 
@@ -216,7 +213,7 @@ def find_joint_mode(
     InputError
         If the rounds do not settle, or the data are too precise to be solved for.
     """
-    fields = np.zeros((len(skies.names), skies.n_fields)) if start is None else start
+    fields = np.zeros((len(skies.names), skies.n_fields))
     exponents = skies.mixing @ fields
     here = _Point(fields, exponents, _chi2(skies, channels, exponents))
     shapes: Shapes = {"exponent": (skies.n_fields,), "chi2": ()}

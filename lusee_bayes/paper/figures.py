@@ -57,12 +57,9 @@ def data_by_product(cases: Cases) -> Figure:
     centres = (np.arange(n_products) + 0.5) * n_times
     axes.set_xticks(centres, [str(name) for name in data["product"].values], fontsize=8)
     axes.tick_params(axis="x", length=0)
-    axes.set(
-        xlabel="product (time runs within each)",
-        ylabel="visibility [K]",
-        xlim=(0, data.size),
-        title=f"Data vector at 25 MHz: {n_products} products, {n_times} samples each",
-    )
+    axes.set(xlabel="product (time runs within each)", ylabel="visibility [K]")
+    axes.set_xlim(0, data.size)
+    axes.set_title(f"Data vector at 25 MHz: {n_products} products, {n_times} samples each")
     return figure
 
 

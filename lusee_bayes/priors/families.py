@@ -139,11 +139,9 @@ class Hyperprior:
         x, t = np.split(scores, [len(self.centre)])
         shape = self.tail / self.steepness
         theta = np.sign(x) * -special.stdtrit(FREEDOM, special.ndtr(-np.abs(x)))
-        power = np.where(
-            t < 0,
-            special.gammainccinv(shape, special.ndtr(t)),
-            special.gammaincinv(shape, special.ndtr(-t)),
-        )
+        above = special.gammainccinv(shape, special.ndtr(t))
+        below = special.gammaincinv(shape, special.ndtr(-t))
+        power = np.where(t < 0, above, below)
         cells = -np.log(power / shape) / self.steepness
         return np.concatenate([self.centre + self.width * theta, cells])
 

@@ -190,12 +190,8 @@ def time_line(reduced: Reduced) -> Figure:
     top.set_title("Gain of every port")
     for row, flagged in enumerate(flags.values()):
         bottom.plot(days[flagged], np.full(flagged.sum(), row), "|", ms=9, color=drawing.ORANGE)
-    bottom.set(
-        yticks=range(len(flags)),
-        yticklabels=list(flags),
-        ylim=(n_rows - 0.5, -0.5),
-        xlabel=f"days since {_first(reduced)} UTC",
-    )
+    bottom.set(yticks=range(len(flags)), yticklabels=list(flags), ylim=(n_rows - 0.5, -0.5))
+    bottom.set_xlabel(f"days since {_first(reduced)} UTC")
     bottom.set_title("Flagged in at least one band" if flags else "Nothing is flagged")
     return figure
 

@@ -50,13 +50,11 @@ def data_vector(result: MapResult) -> Figure | None:
         axes.axvline(k * n_times, color=GREY, lw=0.4)
     axes.set_xticks((np.arange(n_products) + 0.5) * n_times, channel.labels, fontsize=8)
     axes.tick_params(axis="x", length=0)
-    axes.set(
-        xlabel="product (time runs within each)",
-        ylabel="visibility [K]",
-        xlim=(0, n_times * n_products),
-        title=f"Data vector at {channel.frequency_mhz:g} MHz, {channel.n_data} samples"
-        + (f", {channel.n_missing} missing" if channel.n_missing else ""),
-    )
+    axes.set(xlabel="product (time runs within each)", ylabel="visibility [K]")
+    axes.set_xlim(0, n_times * n_products)
+    missing = f", {channel.n_missing} missing" if channel.n_missing else ""
+    title = f"Data vector at {channel.frequency_mhz:g} MHz, {channel.n_data} samples{missing}"
+    axes.set_title(title)
     return figure
 
 

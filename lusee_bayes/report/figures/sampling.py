@@ -185,9 +185,8 @@ def comparison(result: Comparison) -> Figure:
     means.plot(result.mean_z, **DOTS)
     for bound in (-limit, limit):
         means.axhline(bound, color=drawing.ORANGE, ls="--", lw=1)
-    means.set(
-        xlabel="mode", ylabel="difference of means [Monte Carlo error]", title="Means of every mode"
-    )
+    means.set(xlabel="mode", ylabel="difference of means [Monte Carlo error]")
+    means.set_title("Means of every mode")
     variances.errorbar(
         np.arange(len(ell)), result.variance_ratio, result.variance_error, elinewidth=0.3, **DOTS
     )
@@ -198,11 +197,8 @@ def comparison(result: Comparison) -> Figure:
     covariance.plot(
         rank, result.null_eigenvalues, color=drawing.ORANGE, ls="--", label="exact chains"
     )
-    covariance.set(
-        xlabel="number, rising",
-        ylabel="generalised eigenvalue",
-        title="Covariance in analytic coordinates",
-    )
+    covariance.set(xlabel="number, rising", ylabel="generalised eigenvalue")
+    covariance.set_title("Covariance in analytic coordinates")
     covariance.legend(frameon=False)
     sizes.semilogy(result.ess_bulk, label="bulk", **DOTS)
     sizes.semilogy(result.ess_tail, label="tail", **(DOTS | {"color": drawing.ORANGE}))
