@@ -103,14 +103,9 @@ def map_command(
     from lusee_bayes.runs.cost import demand_of
     from lusee_bayes.runs.map_run import run_map
 
-    loaded = options.load(
-        scenario,
-        frequencies_mhz=frequencies,
-        joint=joint,
-        output__draws=draws,
-        output__covariance=covariance,
-        output__information=information,
-    )
+    kept = {"output__draws": draws, "output__covariance": covariance}
+    kept["output__information"] = information
+    loaded = options.load(scenario, frequencies_mhz=frequencies, joint=joint, **kept)
     several = bool(loaded.frequencies_mhz)
     if not several and engine != EngineOptions():
         raise InputError("--workers and --cluster share out channels; give --frequencies")

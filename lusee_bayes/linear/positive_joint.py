@@ -161,12 +161,8 @@ def linearised(
     diffuse = diffuse_part(skies, channel, information).without()
     here = diffuse.recentred(skies.modes(channel, exponent))
     slope = skies.jacobian(channel, exponent)
-    return replace(
-        here,
-        matrix=symmetric_product(slope.T @ here.matrix, slope),
-        vector=here.vector @ slope,
-        reference=exponent,
-    )
+    matrix, vector = symmetric_product(slope.T @ here.matrix, slope), here.vector @ slope
+    return replace(here, matrix=matrix, vector=vector, reference=exponent)
 
 
 @dataclass(frozen=True)

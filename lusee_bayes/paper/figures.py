@@ -85,8 +85,6 @@ def frequency_maps(cases: Cases) -> Figure:
                 axes, pixels, norm=scale, cmap=cmap, highest_altitude=altitude
             )
             axes.set_title(f"{frequency} MHz, {name}", fontsize=10)
-            axes.set_xticklabels([])
-            axes.set_yticklabels([])
             flat_bar(figure, axes, image, "K" if row < 2 else "% of the mean sky")
     figure.suptitle(
         "Galactic coordinates, longitude grows to the left; dashed: never observed; drawn through "
@@ -184,8 +182,6 @@ def scenario_maps(cases: Cases) -> Figure:
         axes = figure.add_subplot(4, 3, position)
         image = drawing.mollweide(axes, pixels, norm=norm, highest_altitude=altitude)
         axes.set_title(title, fontsize=11)
-        axes.set_xticklabels([])
-        axes.set_yticklabels([])
     flat_bar(figure, figure.axes, image, "K")
     lmax = lmax_of(cases["fiducial"].sizes["mode"])
     figure.suptitle(
