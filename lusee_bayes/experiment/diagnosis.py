@@ -345,9 +345,8 @@ class MixedProducts:
         """A gain of a port's voltage, squared in its auto: chi^2 is of fourth order in it."""
         parts = [weights(np.diag((powers == k) * 1.0), b=-1.0 * (k == 0)) for k in range(3)]
         gram = np.array([[u @ self.q @ v for v in parts] for u in parts])
-        chi2 = np.polynomial.Polynomial(
-            [np.trace(gram[:, ::-1], offset=2 - order) for order in range(5)]
-        )
+        powers_of_gain = [np.trace(gram[:, ::-1], offset=2 - order) for order in range(5)]
+        chi2 = np.polynomial.Polynomial(powers_of_gain)
         roots = chi2.deriv().roots()
         real = roots.real[np.abs(roots.imag) <= 1e-6 * np.abs(roots.real)]
         gain = real[np.argmin(chi2(real))]

@@ -107,9 +107,8 @@ def _keys_of(section: Schema, sections: Schema, prefix: str, kind: str) -> Itera
             meaning = meaning or (f"Kind of {prefix.rstrip('.')}" if name == "model" else "")
             yield Key(path, kind, _unit(name), _choices(entry), default, meaning)
         elif is_list or default == "none":
-            yield Key(
-                path, kind, "", "list of sections" if is_list else "a section", default, meaning
-            )
+            choices = "list of sections" if is_list else "a section"
+            yield Key(path, kind, "", choices, default, meaning)
         kinds = [one["properties"]["model"]["const"] for one in inner] if len(inner) > 1 else [""]
         if len(inner) > 1:
             first = "none" if default == "none" else kinds[0]

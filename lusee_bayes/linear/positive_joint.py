@@ -229,9 +229,8 @@ def find_joint_mode(
             # a law that nothing depends on may go to and fro
             change = np.where(change * last < 0, 0.5, 1.0) * change
         if moved < SETTLED and np.abs(change).max() < SETTLED_LAW:
-            return PositiveMode(
-                skies, laws, here.exponents, posterior, energy, float(moved), rounds
-            )
+            known = skies, laws, here.exponents, posterior
+            return PositiveMode(*known, energy, float(moved), rounds)
         here = _descended(skies, channels, prior, here, there)
         laws, last = replace(laws, parameters=laws.parameters + change), change
     raise InputError(
