@@ -66,6 +66,11 @@ class Chains:
     sites: dict[str, np.ndarray]
     statistics: dict[str, np.ndarray]
 
+    @property
+    def gradients(self) -> int:
+        """Gradient evaluations behind the draws, all chains together, warmup left out."""
+        return int(self.statistics["n_steps"].sum())
+
 
 class Whitening(eqx.Module):
     """Coordinates z of one or more sites, x = mean + R z, in which a posterior is round.

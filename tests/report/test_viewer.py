@@ -226,11 +226,12 @@ def test_keys_move_the_direction_and_parts_are_those_that_the_page_has(which, re
 
 
 def test_maps_that_do_not_go_together_are_refused():
-    mean, up, wrong = np.ones((2, 12)), {"highest_altitude": np.ones(12)}, np.ones((1, 13))
+    mean, up = np.ones((2, 12)), {"highest_altitude": np.ones(12)}
     for other in (np.ones((1, 12)), np.ones((2, 48))):
         maps = {"mean": mean, "std": other}
         refuse("maps of std have the shape", viewer, [10.0, 20.0], maps, **up)
-    refuse("on a HEALPix grid", viewer, [10.0], {"mean": wrong, "std": wrong}, **up)
+    maps, up = dict.fromkeys(("mean", "std"), np.ones((1, 13))), {"highest_altitude": np.ones(13)}
+    refuse("on a HEALPix grid", viewer, [10.0], maps, **up)
 
 
 def test_a_sky_below_zero_has_a_linear_scale():

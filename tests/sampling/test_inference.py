@@ -124,6 +124,7 @@ def test_statistics_belong_to_the_draws_beside_them(algorithm, request, gaussian
     # draws hang together: an energy without the momenta, or of others, is off by all of it
     assert kinetic.mean() == pytest.approx(N_MODES / 2, abs=0.6)
     assert (chains.statistics["step_size"] == chains.statistics["step_size"][:, :1]).all()
+    assert chains.gradients == chains.statistics["n_steps"].sum()
 
 
 def test_hmc_in_wrong_coordinates_follows_the_analytic_posterior(hmc, exact):

@@ -114,9 +114,8 @@ def uncertainty(run: SampleResult) -> Figure:
     maps = run.maps
     chains, draws = run.skies.shape[:2]
     if chains * draws < 2:
-        return drawing.note(
-            "Uncertainty of the drawn maps", "not drawn: a single draw has no spread"
-        )
+        why = "not drawn: a single draw has no spread"
+        return drawing.note("Uncertainty of the drawn maps", why)
     level = maps["mean"].mean()
     width = maps["upper"] - maps["lower"]
     spread, interval = 100.0 * maps["std"] / level, 100.0 * width / level
@@ -204,9 +203,8 @@ def comparison(result: Comparison) -> Figure:
     sizes.semilogy(result.ess_tail, label="tail", **(DOTS | {"color": drawing.ORANGE}))
     sizes.set(xlabel="mode", ylabel="effective sample size", title="Effective sample sizes")
     sizes.legend(frameon=False)
-    figure.suptitle(
-        f"HMC against the analytic posterior: {'passed' if result.passed else 'FAILED'}"
-    )
+    verdict = "passed" if result.passed else "FAILED"
+    figure.suptitle(f"HMC against the analytic posterior: {verdict}")
     return figure
 
 
@@ -238,8 +236,6 @@ def rank_statistics(ranks: Ranks) -> Figure:
     last.title.set_size(9)
     figure.supxlabel("rank of the truth among the draws")
     figure.supylabel("simulations per bin")
-    figure.suptitle(
-        f"Calibration over {ranks.n_simulations} simulations: "
-        f"{'passed' if ranks.passed else 'FAILED'}"
-    )
+    verdict = "passed" if ranks.passed else "FAILED"
+    figure.suptitle(f"Calibration over {ranks.n_simulations} simulations: {verdict}")
     return figure
