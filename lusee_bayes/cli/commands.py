@@ -103,14 +103,9 @@ def map_command(
     from lusee_bayes.runs.cost import demand_of
     from lusee_bayes.runs.map_run import run_map
 
-    loaded = options.load(
-        scenario,
-        frequencies_mhz=frequencies,
-        joint=joint,
-        output__draws=draws,
-        output__covariance=covariance,
-        output__information=information,
-    )
+    kept = {"output__draws": draws, "output__covariance": covariance}
+    kept["output__information"] = information
+    loaded = options.load(scenario, frequencies_mhz=frequencies, joint=joint, **kept)
     several = bool(loaded.frequencies_mhz)
     if not several and engine != EngineOptions():
         raise InputError("--workers and --cluster share out channels; give --frequencies")
@@ -288,13 +283,9 @@ def sample_command(
 
     loaded = options.load(scenario, frequencies_mhz=frequencies)
     program = default_program(loaded) if model is None else load_program(model)
-    run = run_sample(
-        loaded,
-        options.folder(scenario, f"-{program.name}"),
-        program=program,
-        **chains.running(loaded.seed, algorithm),
-        **options.running(),
-    )
+    folder = options.folder(scenario, f"-{program.name}")
+    given = chains.running(loaded.seed, algorithm) | options.running()
+    run = run_sample(loaded, folder, program=program, **given)
     several, lines = bool(loaded.frequencies_mhz), []
     for result in run.result:
         lines += [f"{result.experiment.scenario.frequency_mhz:g} MHz"] * several + result.lines()
@@ -336,15 +327,10 @@ def validate_command(
     from lusee_bayes.runs.validate_run import demand_of_calibration, run_validate
 
     with engine.open(demand_of_calibration(loaded)) as opened:
-        run = run_validate(
-            loaded,
-            options.folder(scenario, "-validation"),
-            name=Path(scenario).stem,
-            simulations=simulations,
-            engine=opened,
-            **chains.running(loaded.seed),
-            **options.running(),
-        )
+        folder = options.folder(scenario, "-validation")
+        given = {"name": Path(scenario).stem, "simulations": simulations, "engine": opened}
+        given |= chains.running(loaded.seed) | options.running()
+        run = run_validate(loaded, folder, **given)
     verdict = f"{run.result.headline()}; look at {run.page}"
     options.tell(verdict, files=run.files, table=checks_table(run.result.checks))
     return 0 if run.result.passed else 1
@@ -455,15 +441,9 @@ def compare_priors_command(
     loaded = options.load(scenario)
     names = None if priors is None else [n.strip() for n in priors.split(",") if n.strip()]
     with engine.open(demand_of(loaded)) as opened:
-        run = run_compare_priors(
-            loaded,
-            options.folder(scenario, "-priors"),
-            names,
-            truth=truth,
-            name=Path(scenario).stem,
-            engine=opened,
-            **options.running(),
-        )
+        folder = options.folder(scenario, "-priors")
+        given = {"truth": truth, "name": Path(scenario).stem, "engine": opened}
+        run = run_compare_priors(loaded, folder, names, **given, **options.running())
     lines = [*run.result.lines(), f"look at {run.page}"]
     options.tell(*lines, files=run.files, table=priors_table(run.result))
 

@@ -255,14 +255,10 @@ def own_workers(n: int, demand: engine.Demand) -> Iterator[distributed.LocalClus
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         with dask.config.set(settings):
-            cluster = distributed.LocalCluster(
-                n_workers=n,
-                threads_per_worker=side_by_side,
-                memory_limit=memory_limit() // n,
-                host="127.0.0.1",
-                dashboard_address="127.0.0.1:0",
-                silence_logs=logging.CRITICAL,
-            )
+            each = {"threads_per_worker": side_by_side, "memory_limit": memory_limit() // n}
+            here = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
+            more = each | here | {"silence_logs": logging.CRITICAL}
+            cluster = distributed.LocalCluster(n_workers=n, **more)
     finally:
         signal.signal(signal.SIGINT, before)
     with cluster:

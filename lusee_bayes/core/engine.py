@@ -108,10 +108,6 @@ class Tasks(Generic[T, R]):
     items: Sequence[T]
     names: Sequence[str]
 
-    def __post_init__(self):
-        if len(self.items) != len(self.names):
-            raise ValueError(f"{len(self.items)} items have {len(self.names)} names")
-
 
 @dataclass(frozen=True)
 class Demand:

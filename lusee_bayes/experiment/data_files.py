@@ -339,16 +339,12 @@ def recipe_of(scenario: Scenario) -> Recipe:
             "the integrations; use --set observation.timestamp=middle (or start, end, instant)"
         )
     here = scenario.observation
-    return Recipe(
-        section,
-        gain_table_of(section),
-        timestamp,
-        scenario.frequencies_mhz or (scenario.frequency_mhz,),
-        here.average_s,
-        () if section.lines is None else read_lines(section.lines),
-        None if section.clock is None else read_clock(section.clock),
-        (here.lon_deg, here.lat_deg) if section.site == "scenario" else None,
-    )
+    frequencies = scenario.frequencies_mhz or (scenario.frequency_mhz,)
+    known = section, gain_table_of(section), timestamp, frequencies, here.average_s
+    lines = () if section.lines is None else read_lines(section.lines)
+    clock = None if section.clock is None else read_clock(section.clock)
+    site = (here.lon_deg, here.lat_deg) if section.site == "scenario" else None
+    return Recipe(*known, lines, clock, site)
 
 
 def visibilities_of(reduced: Reduced, scenario: Scenario) -> Visibilities:

@@ -147,10 +147,8 @@ def data_mistakes(n_ports: int) -> Iterator[tuple[str, str, Mixing]]:
             signs = [-1.0 if port in flipped else 1.0 for port in numbers]
             yield wrong, remedy, port_mixing(numbers, signs)
     for i, j in combinations(numbers, 2):
-        wrong, remedy = (
-            f"ports {i} and {j} are exchanged",
-            f"exchange ports {i} and {j} of the data",
-        )
+        wrong = f"ports {i} and {j} are exchanged"
+        remedy = f"exchange ports {i} and {j} of the data"
         yield wrong, remedy, port_mixing([{i: j, j: i}.get(port, port) for port in numbers])
     for turn in range(1, n_ports):
         wrong = f"the ports are turned by {turn}: the model's port 0 is the data's port {turn}"
@@ -347,9 +345,8 @@ class MixedProducts:
         """A gain of a port's voltage, squared in its auto: chi^2 is of fourth order in it."""
         parts = [weights(np.diag((powers == k) * 1.0), b=-1.0 * (k == 0)) for k in range(3)]
         gram = np.array([[u @ self.q @ v for v in parts] for u in parts])
-        chi2 = np.polynomial.Polynomial(
-            [np.trace(gram[:, ::-1], offset=2 - order) for order in range(5)]
-        )
+        powers_of_gain = [np.trace(gram[:, ::-1], offset=2 - order) for order in range(5)]
+        chi2 = np.polynomial.Polynomial(powers_of_gain)
         roots = chi2.deriv().roots()
         real = roots.real[np.abs(roots.imag) <= 1e-6 * np.abs(roots.real)]
         gain = real[np.argmin(chi2(real))]

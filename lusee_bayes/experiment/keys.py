@@ -14,20 +14,8 @@ from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.reading import as_yaml
 from lusee_bayes.experiment.scenario import Scenario
 
-UNITS = {
-    "mhz": "MHz",
-    "hz": "Hz",
-    "deg": "degrees",
-    "m": "m",
-    "s": "s",
-    "day": "s/day",
-    "h": "h",
-    "k": "K",
-    "jy": "Jy",
-    "pf": "pF",
-    "nh": "nH",
-    "ohm": "Ohm",
-}
+SAME = ("MHz", "Hz", "m", "s", "h", "K", "Jy", "pF", "nH", "Ohm")
+UNITS = {unit.lower(): unit for unit in SAME} | {"deg": "degrees", "day": "s/day"}
 TYPES = {"number": "number", "integer": "integer", "string": "text", "boolean": "true, false"}
 # JSON schema's names of bounds, as they are written
 BOUNDS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
@@ -119,9 +107,8 @@ def _keys_of(section: Schema, sections: Schema, prefix: str, kind: str) -> Itera
             meaning = meaning or (f"Kind of {prefix.rstrip('.')}" if name == "model" else "")
             yield Key(path, kind, _unit(name), _choices(entry), default, meaning)
         elif is_list or default == "none":
-            yield Key(
-                path, kind, "", "list of sections" if is_list else "a section", default, meaning
-            )
+            choices = "list of sections" if is_list else "a section"
+            yield Key(path, kind, "", choices, default, meaning)
         kinds = [one["properties"]["model"]["const"] for one in inner] if len(inner) > 1 else [""]
         if len(inner) > 1:
             first = "none" if default == "none" else kinds[0]

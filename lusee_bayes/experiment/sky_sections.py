@@ -372,16 +372,11 @@ class SpectralSection(Section):
             sources = np.array(
                 [[s.modes(f, lmax) for s in BRIGHT_SOURCES] for f in frequencies_mhz]
             )
-        return PositiveSkies.of(
-            np.array(frequencies_mhz),
-            [partial(diffuse_brightness, f) for f in frequencies_mhz],
-            lmax,
-            self.fields,
-            **self.model_dump(include={"reference_mhz", "turnover_mhz"}),
-            sources=sources,
-            weight=galactic_share,
-            lmax_fields=self.lmax_of_fields(lmax),
-        )
+        templates = [partial(diffuse_brightness, f) for f in frequencies_mhz]
+        own = self.model_dump(include={"reference_mhz", "turnover_mhz"})
+        own |= {"weight": galactic_share, "lmax_fields": self.lmax_of_fields(lmax)}
+        skies = np.array(frequencies_mhz), templates, lmax, self.fields
+        return PositiveSkies.of(*skies, sources=sources, **own)
 
     def n_maps(self, frequencies_mhz: tuple[float, ...]) -> int:
         """How many maps the skies of these channels are made of."""

@@ -220,14 +220,7 @@ def shared_noise(taps: int, taper: Taper) -> tuple[float, ...]:
     tuple of float
         In units of the variance of independent frames in independent channels; the first is above
         one where frames overlap.
-
-    Raises
-    ------
-    InputError
-        For fewer taps than none.
     """
-    if taps < 0:
-        raise InputError(f"a filter bank has no {taps} taps; give 0 for independent channels")
     if taps == 0:
         return (1.0,)
     h = impulse_response(taps, taper)

@@ -262,7 +262,6 @@ def draw_gains(
 
 
 COEFFICIENTS = "alpha_refit.csv"
-MODELS = ("quadratic", "linear")
 CSV = Layout(
     "luseepy's coefficients of gains",
     {name: Variable(("row",), "text") for name in ("gain_setting", "component", "model", "term")}
@@ -301,8 +300,6 @@ def write_gain_table(path: str | Path, table: GainModel) -> Path:
 
 
 def _read_folder(folder: Path, model: str) -> GainModel:
-    if model not in MODELS:
-        raise InputError(f"unknown model of gains '{model}'; {nearest(model, MODELS)}")
     found = []
     for name in ("freqs", "mean", "eigvecs"):
         arrays = [_gain_array(folder / f"{place}_{name}.npy") for place in PLACES]

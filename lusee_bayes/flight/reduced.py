@@ -322,13 +322,10 @@ class Reduced(Described):
         scale = np.sqrt(per_kelvin[FIRST_PORT] * per_kelvin[SECOND_PORT])
         values = np.where(present, self.values[band], 0.0)[:, bins] / scale[:, None]
         layout = DataLayout.from_flags(~present[:, bins])
-        return Visibilities(
-            layout.gather(values),
-            layout,
-            _one_run_an_angle(observation),
-            float(self.frequencies_mhz[band]),
-            calibration=self._calibration(band, bins),
-        )
+        observation, mhz = _one_run_an_angle(observation), float(self.frequencies_mhz[band])
+        calibration = self._calibration(band, bins)
+        data = layout.gather(values)
+        return Visibilities(data, layout, observation, mhz, calibration=calibration)
 
     def _calibration(self, band: int, bins: Left) -> Calibration:
         found = {n: x for place in PLACES for n, x in self._errors(band, bins, place) if x.any()}

@@ -81,13 +81,8 @@ def reduce_sessions(
             keep = np.zeros(len(level), dtype=bool)
             keep[piece] = True
             starts = range(0, int(keep.sum()), SLAB)
-            spectra = reduced.Reduced.blank(
-                like,
-                line.observation.select(keep),
-                np.arange(keep.sum()),
-                level[piece],
-                len(starts),
-            )
+            here = line.observation.select(keep), np.arange(keep.sum()), level[piece]
+            spectra = reduced.Reduced.blank(like, *here, len(starts))
             for start in starts:
                 slab = _slab(line, recipe, states, piece.start + start, next(counts))
                 in_threads(partial(slab, spectra, start), numbers)
@@ -95,11 +90,8 @@ def reduce_sessions(
             spans.append(np.stack(in_threads(finish, numbers)))
             slabs.append(spectra.slab_scatter)
             done(piece.stop)
-    return replace(
-        whole,
-        span_scatter=np.concatenate(spans, axis=1),
-        slab_scatter=np.concatenate(slabs, axis=1),
-    )
+    of_spans, of_slabs = np.concatenate(spans, axis=1), np.concatenate(slabs, axis=1)
+    return replace(whole, span_scatter=of_spans, slab_scatter=of_slabs)
 
 
 def _in_common(line: Timeline, recipe: Recipe, level: session.PortLevels) -> dict[str, Any]:

@@ -137,16 +137,11 @@ def whole_spectra(
     Raises
     ------
     InputError
-        If there are more or fewer rows than the session has, or other products.
+        If there are fewer rows than the session has.
     """
     first = 0
     for block in blocks:
         n, products, bins = block.shape
-        if products != N_PRODUCTS or bins > N_CHANNELS or first + n > n_rows:
-            raise InputError(
-                f"{path}: rows {first} to {first + n} have the shape {block.shape}, expected at "
-                f"most {n_rows - first} rows of {N_PRODUCTS} products and {N_CHANNELS} channels"
-            )
         full = np.full((n, products, N_CHANNELS), np.nan, dtype=np.float32)
         full[..., :bins] = block
         yield first, full
@@ -238,12 +233,9 @@ def write_session(
     Raises
     ------
     InputError
-        For another kind, blocks that do not make up the rows, and a file that cannot be
-        written.
+        For blocks that do not make up the rows, and a file that cannot be written.
     """
-    write = {"hdf5": _write_session_hdf5, "fits": _write_session_fits}.get(kind)
-    if write is None:
-        raise InputError(f"sessions are written as hdf5 or fits, not as {kind}")
+    write = {"hdf5": _write_session_hdf5, "fits": _write_session_fits}[kind]
     path = user_path(path)
     with replacing(path) as unfinished:
         write(unfinished, rows, blocks)

@@ -129,8 +129,6 @@ class Calibration:
     def __post_init__(self):
         checks.require_positive("the number of samples averaged", self.n_averaged)
         n, times = len(self.gain_names), len(self.n_averaged)
-        if (self.gain_port is None) != (n == 0) or (self.gain_slope is None) != (n == 0):
-            raise InputError("errors of the gain table need names, ports and slopes")
         if n:
             checks.require_shape("gain_port", self.gain_port, (n,))
             checks.require_shape("gain_slope", self.gain_slope, (n, times))

@@ -1,6 +1,4 @@
-"""Degrees of freedom of each datum, score tests, and the sky's strength.
-
-Degrees of freedom are those of sky and templates together.
+"""Score tests, the sky's strength, and how near a map is to the truth.
 
 Score tests tell what the data would prefer of something that the model leaves out. With K = A S A^T
 + N the covariance of data under the model and u = K^-1 (d - E[d]), data that hold a t besides
@@ -25,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array, DataVector, Ells, Modes, Pixels, Vector
+from lusee_bayes.core.arrays import Ells, Modes, Pixels, Vector
 from lusee_bayes.core.harmonics import lmax_of, mean_over_m, modes_to_map, sum_over_m
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.linalg import invert_lower
@@ -33,49 +31,6 @@ from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.judge.coverage import latitudes, multipoles
 from lusee_bayes.linear.linear_gaussian import Solution
 from lusee_bayes.linear.posterior import Posterior
-
-# directions of the sky that are seen at once, and entries of A up to which it is made a matrix:
-# products of matrices take a tenth of the time
-CHUNK, DENSE = 256, 10**8
-
-
-def data_freedom(solution: Solution, columns: Float[Array, "data n"]) -> DataVector:
-    """Compute the diagonal of K_s K^-1: which share of each datum sky and templates follow.
-
-    With the templates V among the columns of N's square root, K_s = A S A^T + V V^T is the
-    covariance of what is no noise, and K = A S A^T + N that of the data. Where V = 0 this is the
-    diagonal of A C A^T N^-1. Its sum is the number of modes and templates that the data determine.
-
-    Parameters
-    ----------
-    solution : Solution
-        For any data, of a model with ``columns @ columns.T`` in its noise.
-    columns : (data, n) array
-        V, in K.
-
-    Raises
-    ------
-    InputError
-        If N is not positive definite.
-    """
-    model, columns = solution.model, np.asarray(columns)
-    factor, root = solution.factor, solution.posterior.root()
-    weighted_columns = np.asarray(factor.solve(columns))
-    solved = weighted_columns
-    freedom = np.zeros(model.n_data)
-    coupling = model.coupling
-    dense = np.asarray(coupling.dense()) if coupling.shape[0] * coupling.shape[1] <= DENSE else None
-    for start in range(0, root.shape[1], CHUNK):
-        directions = root[:, start : start + CHUNK]
-        if dense is not None:
-            seen = dense @ directions
-        else:
-            seen = np.stack([np.asarray(coupling @ r) for r in directions.T], axis=1)
-        weighted = np.asarray(factor.solve(seen))
-        freedom += (seen * weighted).sum(1)
-        solved = solved - weighted @ (seen.T @ weighted_columns)
-    return freedom + (columns * solved).sum(1)
-
 
 # relative, of a difference of two quadratic forms
 ROUNDING = 1e-10

@@ -132,15 +132,9 @@ def widened(
     less = (1.0 - factor**-2) * float(inside @ (inside + step))
     moved = step if posterior.basis is None else posterior.basis @ step
     log_evidence = posterior.log_evidence + 0.5 * (less + log_det - log_det_of(root))
-    wide = Posterior(
-        prior.widened(factor),
-        (posterior.white_mean + moved) / factor,
-        root,
-        posterior.basis,
-        np.asarray(log_evidence),
-        posterior.refinement,
-    )
-    return wide, less
+    mean, known = (posterior.white_mean + moved) / factor, np.asarray(log_evidence)
+    parts = prior.widened(factor), mean, root, posterior.basis, known, posterior.refinement
+    return Posterior(*parts), less
 
 
 def log_det_of(root: Square) -> float:

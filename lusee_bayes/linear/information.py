@@ -355,11 +355,8 @@ def integrated_out(
     lower = cholesky(scaled(here.matrix[n:, n:], scale) + np.eye(others))
     across = solve_lower(lower, scale[:, None] * here.matrix[n:, :n], transpose=False)
     pull = solve_lower(lower, (scale * here.vector[n:])[:, None], transpose=False)
-    return Information(
-        here.matrix[:n, :n] - across.T @ across,
-        here.vector[:n] - (across.T @ pull)[:, 0],
-        here.reference[:n],
-        np.asarray(here.misfit - (pull**2).sum()),
-        np.asarray(here.log_det + 2.0 * np.log(np.diagonal(lower)).sum()),
-        here.n_data,
-    )
+    misfit = np.asarray(here.misfit - (pull**2).sum())
+    log_det = np.asarray(here.log_det + 2.0 * np.log(np.diagonal(lower)).sum())
+    matrix = here.matrix[:n, :n] - across.T @ across
+    vector = here.vector[:n] - (across.T @ pull)[:, 0]
+    return Information(matrix, vector, here.reference[:n], misfit, log_det, here.n_data)

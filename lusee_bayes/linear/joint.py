@@ -13,7 +13,6 @@ each channel has a posterior of its own, from the channel's data alone.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -25,7 +24,6 @@ from jaxtyping import Float, PRNGKeyArray
 from lusee_bayes.core import linalg
 from lusee_bayes.core.arrays import Array, Modes, ModesMatrix, on_host
 from lusee_bayes.core.checks import require_shape
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.prior import IndependentPrior
@@ -62,13 +60,12 @@ def common_part(information: Information, residual_root: Modes | None) -> Inform
     log_det = 2.0 * np.log(np.diagonal(lower)).sum()
     matrix = -inverse
     matrix[np.diag_indices_from(matrix)] += 1.0
-    return Information(
-        linalg.scaled(matrix, 1.0 / residual_root, overwrite=True),
-        solved / residual_root,
-        information.reference,
-        np.asarray(information.misfit - gradient @ solved),
-        np.asarray(information.log_det + log_det),
-        information.n_data,
+    return replace(
+        information,
+        matrix=linalg.scaled(matrix, 1.0 / residual_root, overwrite=True),
+        vector=solved / residual_root,
+        misfit=np.asarray(information.misfit - gradient @ solved),
+        log_det=np.asarray(information.log_det + log_det),
     )
 
 
@@ -142,46 +139,9 @@ class ComponentSums(eqx.Module):
         matrix = np.zeros((k, n, k, n))
         for pair, (i, j) in enumerate(zip(*np.tril_indices(k), strict=True)):
             matrix[i, :, j] = matrix[j, :, i] = linalg.mirrored(self.matrices[pair].copy())
-        return Information(
-            matrix.reshape(k * n, k * n),
-            self.vectors.reshape(k * n),
-            self.reference.reshape(k * n),
-            self.misfit,
-            self.log_det,
-            self.n_data,
-        )
-
-
-def solve_directly(
-    prior: SpectralPrior, channels: Sequence[Information], reference: ChannelModes
-) -> Posterior:
-    """Compute the posterior of all component maps by factorising its matrix.
-
-    Parameters
-    ----------
-    prior : SpectralPrior
-        Of all channels.
-    channels : sequence of Information
-        In the prior's order.
-    reference : (channels, modes) array
-        A reference sky for every channel, such as that of its information, in K.
-
-    Returns
-    -------
-    Posterior
-        Of the component maps in one vector, the first map first, with the evidence of all data.
-
-    Raises
-    ------
-    InputError
-        If there are more or fewer channels than the prior has, or the mean does not converge.
-    """
-    if len(channels) != prior.n_channels:
-        raise InputError(f"there are {len(channels)} channels, the prior is for {prior.n_channels}")
-    sums = ComponentSums.empty(prior, reference)
-    for channel, information in enumerate(channels):
-        sums = summed_information(sums, prior, channel, information)
-    return component_posterior(sums.information(), prior)
+        matrix, vector = matrix.reshape(k * n, k * n), self.vectors.reshape(k * n)
+        scalars = self.misfit, self.log_det, self.n_data
+        return Information(matrix, vector, self.reference.reshape(k * n), *scalars)
 
 
 def summed_information(

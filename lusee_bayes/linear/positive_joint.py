@@ -161,12 +161,8 @@ def linearised(
     diffuse = diffuse_part(skies, channel, information).without()
     here = diffuse.recentred(skies.modes(channel, exponent))
     slope = skies.jacobian(channel, exponent)
-    return replace(
-        here,
-        matrix=symmetric_product(slope.T @ here.matrix, slope),
-        vector=here.vector @ slope,
-        reference=exponent,
-    )
+    matrix, vector = symmetric_product(slope.T @ here.matrix, slope), here.vector @ slope
+    return replace(here, matrix=matrix, vector=vector, reference=exponent)
 
 
 @dataclass(frozen=True)
@@ -192,10 +188,9 @@ def find_joint_mode(
     channels: Channels,
     *,
     learn: bool = False,
-    start: Fields | None = None,
     report: Callable[[int, str], None] | None = None,
 ) -> PositiveMode:
-    """Find the most probable skies.
+    """Find the most probable skies, beginning with the templates themselves.
 
     Parameters
     ----------
@@ -206,8 +201,6 @@ def find_joint_mode(
         Their data.
     learn : bool
         Learn A and tilt of every field and residual, by the maximum of the evidence.
-    start : (fields, modes) array, optional
-        Fields to begin with; by default zero, the templates themselves.
     report : callable, optional
         Told the number of every round, and how far it moved.
 
@@ -216,7 +209,7 @@ def find_joint_mode(
     InputError
         If the rounds do not settle, or the data are too precise to be solved for.
     """
-    fields = np.zeros((len(skies.names), skies.n_fields)) if start is None else start
+    fields = np.zeros((len(skies.names), skies.n_fields))
     exponents = skies.mixing @ fields
     here = _Point(fields, exponents, _chi2(skies, channels, exponents))
     shapes: Shapes = {"exponent": (skies.n_fields,), "chi2": ()}
@@ -236,9 +229,8 @@ def find_joint_mode(
             # a law that nothing depends on may go to and fro
             change = np.where(change * last < 0, 0.5, 1.0) * change
         if moved < SETTLED and np.abs(change).max() < SETTLED_LAW:
-            return PositiveMode(
-                skies, laws, here.exponents, posterior, energy, float(moved), rounds
-            )
+            known = skies, laws, here.exponents, posterior
+            return PositiveMode(*known, energy, float(moved), rounds)
         here = _descended(skies, channels, prior, here, there)
         laws, last = replace(laws, parameters=laws.parameters + change), change
     raise InputError(

@@ -697,11 +697,6 @@ class TimeBandedCovariance(_OverLayout):
         self.layout = layout
         self.name = name
 
-    @property
-    def width(self) -> int:
-        """Largest distance in samples at which two times are coupled."""
-        return self.band.shape[1] - 1
-
     def dense(self):
         unit = namespace(self).eye(self.size)
         grid = self.layout.by_time(unit)

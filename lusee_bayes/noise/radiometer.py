@@ -122,11 +122,8 @@ def radiometer_noise(
     visibilities = without_gaps(visibilities, layout)
     checks.require_finite("the visibilities", visibilities)
     autos = visibilities[auto_indices(round(np.sqrt(layout.n_products)))]
-    checks.require_positive(
-        "the antenna temperature (autos of the visibilities)",
-        autos,
-        "noise levels are taken from it; use a sky with a positive mean",
-    )
+    hint = "noise levels are taken from it; use a sky with a positive mean"
+    checks.require_positive("the antenna temperature (autos of the visibilities)", autos, hint)
     scale = factor / (bandwidth_hz * step_s * duty_cycle)
     if np.ndim(scale):
         checks.require_shape("the radiometer's step_s", scale, (layout.n_times,))

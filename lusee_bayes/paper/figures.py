@@ -57,12 +57,9 @@ def data_by_product(cases: Cases) -> Figure:
     centres = (np.arange(n_products) + 0.5) * n_times
     axes.set_xticks(centres, [str(name) for name in data["product"].values], fontsize=8)
     axes.tick_params(axis="x", length=0)
-    axes.set(
-        xlabel="product (time runs within each)",
-        ylabel="visibility [K]",
-        xlim=(0, data.size),
-        title=f"Data vector at 25 MHz: {n_products} products, {n_times} samples each",
-    )
+    axes.set(xlabel="product (time runs within each)", ylabel="visibility [K]")
+    axes.set_xlim(0, data.size)
+    axes.set_title(f"Data vector at 25 MHz: {n_products} products, {n_times} samples each")
     return figure
 
 
@@ -88,8 +85,6 @@ def frequency_maps(cases: Cases) -> Figure:
                 axes, pixels, norm=scale, cmap=cmap, highest_altitude=altitude
             )
             axes.set_title(f"{frequency} MHz, {name}", fontsize=10)
-            axes.set_xticklabels([])
-            axes.set_yticklabels([])
             flat_bar(figure, axes, image, "K" if row < 2 else "% of the mean sky")
     figure.suptitle(
         "Galactic coordinates, longitude grows to the left; dashed: never observed; drawn through "
@@ -105,16 +100,9 @@ def drawn(case: xr.Dataset, name: str) -> Float[np.ndarray, " pixels"]:
 
 def flat_bar(figure: Figure, axes: Axes | list[Axes], image, unit: str) -> None:
     """A flat bar below; three round numbers on a logarithmic one."""
-    bar = figure.colorbar(
-        image,
-        ax=axes,
-        label=unit,
-        location="bottom",
-        shrink=0.7,
-        aspect=30 if isinstance(axes, Axes) else 60,
-        extend="both",
-        pad=0.04,
-    )
+    style = {"location": "bottom", "shrink": 0.7, "extend": "both", "pad": 0.04}
+    aspect = 30 if isinstance(axes, Axes) else 60
+    bar = figure.colorbar(image, ax=axes, label=unit, aspect=aspect, **style)
     if isinstance(image.norm, LogNorm):
         low, high = np.log10([image.norm.vmin, image.norm.vmax])
         ticks = [float(f"{10**t:.1e}") for t in np.linspace(low, high, 5)[[0, 2, 4]]]
@@ -194,8 +182,6 @@ def scenario_maps(cases: Cases) -> Figure:
         axes = figure.add_subplot(4, 3, position)
         image = drawing.mollweide(axes, pixels, norm=norm, highest_altitude=altitude)
         axes.set_title(title, fontsize=11)
-        axes.set_xticklabels([])
-        axes.set_yticklabels([])
     flat_bar(figure, figure.axes, image, "K")
     lmax = lmax_of(cases["fiducial"].sizes["mode"])
     figure.suptitle(

@@ -139,11 +139,9 @@ class Hyperprior:
         x, t = np.split(scores, [len(self.centre)])
         shape = self.tail / self.steepness
         theta = np.sign(x) * -special.stdtrit(FREEDOM, special.ndtr(-np.abs(x)))
-        power = np.where(
-            t < 0,
-            special.gammainccinv(shape, special.ndtr(t)),
-            special.gammaincinv(shape, special.ndtr(-t)),
-        )
+        above = special.gammainccinv(shape, special.ndtr(t))
+        below = special.gammaincinv(shape, special.ndtr(-t))
+        power = np.where(t < 0, above, below)
         cells = -np.log(power / shape) / self.steepness
         return np.concatenate([self.centre + self.width * theta, cells])
 
@@ -255,11 +253,9 @@ class SpectrumBasis:
         hats = np.maximum(0.0, 1.0 - np.abs(x[:, None] - knots) / SPACING)
         matrix = np.column_stack([np.ones(lmax + 1), x, 0.5 * x**2, hats])
         departures = np.full(len(knots), DEPARTURE_WIDTH)
-        return cls(
-            matrix,
-            np.concatenate([[np.log(power), TILT, 0.0], np.zeros(len(knots))]),
-            np.concatenate([[LOG_AMPLITUDE_WIDTH, TILT_WIDTH, CURVATURE_WIDTH], departures]),
-        )
+        centre = np.concatenate([[np.log(power), TILT, 0.0], np.zeros(len(knots))])
+        width = np.concatenate([[LOG_AMPLITUDE_WIDTH, TILT_WIDTH, CURVATURE_WIDTH], departures])
+        return cls(matrix, centre, width)
 
 
 @dataclass(frozen=True)
@@ -285,10 +281,8 @@ class IsotropicFamily(PriorFamily):
 
     @property
     def hyperprior(self) -> Hyperprior:
-        return Hyperprior(
-            np.append(self.spectrum.centre, self.log_monopole),
-            np.append(self.spectrum.width, LOG_MONOPOLE_WIDTH),
-        )
+        width = np.append(self.spectrum.width, LOG_MONOPOLE_WIDTH)
+        return Hyperprior(np.append(self.spectrum.centre, self.log_monopole), width)
 
     def at(self, parameters: Parameters) -> IsotropicMember:
         return IsotropicMember(self, parameters)

@@ -201,11 +201,9 @@ class LocalScales(PriorFamily):
     @property
     def hyperprior(self) -> Hyperprior:
         centre, width = self.covariates
-        return Hyperprior(
-            np.concatenate([self.spectrum.centre, [0.0], centre]),
-            np.concatenate([self.spectrum.width, [SOURCES_WIDTH], width]),
-            N_CELLS,
-        )
+        centres = np.concatenate([self.spectrum.centre, [0.0], centre])
+        widths = np.concatenate([self.spectrum.width, [SOURCES_WIDTH], width])
+        return Hyperprior(centres, widths, N_CELLS)
 
     def at(self, parameters: Parameters) -> LocalScalesMember:
         return LocalScalesMember(self, *self._split(parameters))

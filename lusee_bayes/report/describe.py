@@ -26,21 +26,19 @@ def _has_image(*names: str) -> Callable[[Path], bool]:
     return lambda path: is_fits(path) and bool(set(names) & set(image_names(path)))
 
 
-SAMPLED = "instrument.beams.sampled:read_sampled"
+BEAM = "instrument.beams.sampled:read_beam"
 # what reads the package's own netCDF files, by their attribute ``format``, and how other files are
 # recognised; what is none of them is a sky. Readers are named by path and imported when there is
 # such a file: each needs libraries that others do not
 READERS = {
     formats.VISIBILITIES: "instrument.visibilities:read_visibilities",
-    formats.BEAMS: SAMPLED,
+    formats.BEAMS: BEAM,
     formats.REDUCED: "flight.reduced:read_reduced",
     formats.GAINS: "flight.gain_model:read_gain_table",
 }
 KINDS: tuple[tuple[Callable[[Path], bool], str], ...] = (
-    (_has_image("h_theta_real"), "instrument.beams.luseepy_files:read_response"),
-    (_has_image("etheta_real"), "instrument.beams.luseepy_files:read_scalar_beam"),
-    (_has_image("e_theta_real", "product_beam"), SAMPLED),
-    (lambda path: has_words(path, formats.UVBEAM_WORDS), SAMPLED),
+    (_has_image("h_theta_real", "etheta_real", "e_theta_real", "product_beam"), BEAM),
+    (lambda path: has_words(path, formats.UVBEAM_WORDS), BEAM),
     (_has_image("combinations", "products"), "instrument.waterfalls:read_waterfall"),
     (formats.is_session, "flight.session_files:read_session"),
     (lambda path: path.suffix == ".csv", "instrument.beams.grid:read_beam_grid"),

@@ -71,13 +71,9 @@ def _viewer(channels: tuple[ChannelResult, ...]) -> dict[str, Any]:
     for k, sky in enumerate(details.draws, 1):
         maps[f"draw{k}"] = modes_to_map(sky, nside)[None]
     names = ("mean", "std", "prior_fraction")
-    return viewer(
-        frequencies,
-        maps,
-        highest_altitude=altitude,
-        regions={name: getattr(details, f"region_{name}")[None] for name in names},
-        resolutions=[resolution(details)],
-    )
+    regions = {name: getattr(details, f"region_{name}")[None] for name in names}
+    more = {"regions": regions, "resolutions": [resolution(details)]}
+    return viewer(frequencies, maps, highest_altitude=altitude, **more)
 
 
 def _groups(judged: Judged | None) -> dict[str, dict[str, Any]]:

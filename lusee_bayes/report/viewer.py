@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -37,7 +36,7 @@ def viewer(
     frequencies_mhz: Sequence[float],
     maps: Mapping[str, Maps],
     *,
-    highest_altitude: Float[np.ndarray, " pixels"] | None = None,
+    highest_altitude: Float[np.ndarray, " pixels"],
     regions: Mapping[str, Float[np.ndarray, "channels regions"]] | None = None,
     resolutions: Sequence[Mapping[str, Any]] = (),
 ) -> dict[str, Any]:
@@ -50,7 +49,7 @@ def viewer(
     maps : mapping of (channels, pixels) arrays
         HEALPix RING, Galactic, by name: "mean" and "std" in K; where they are known "truth" in K,
         "prior_fraction" and draws in K, "draw1" and so on. Differences from the truth follow.
-    highest_altitude : (pixels,) array, optional
+    highest_altitude : (pixels,) array
         sin of the highest altitude of each pixel: what never rose is marked.
     regions : mapping of (channels, regions) arrays, optional
         "mean" and "std" in K and "prior_fraction" of larger pixels.
@@ -66,14 +65,14 @@ def viewer(
     full, nside = _nsides(maps, channels)
     pack = _quantised if channels > 1 else lambda cube: {"values": packed(cube)}
     maps = {name: _degraded(cube, nside) for name, cube in maps.items()}
-    altitude = None if highest_altitude is None else _degraded(highest_altitude[None], nside)[0]
+    altitude = _degraded(highest_altitude[None], nside)[0]
     return {
         "frequencies": list(frequencies_mhz),
         "nside": nside,
         "full_nside": full,
         "maps": {name: pack(cube) for name, cube in maps.items()},
         "scales": _scales(maps, altitude),
-        "highest_altitude": None if altitude is None else packed(altitude),
+        "highest_altitude": packed(altitude),
         "regions": None if regions is None else _regions(regions),
         "resolutions": list(resolutions),
         **_furniture(),
@@ -136,15 +135,12 @@ def _quantised(cube: Maps) -> dict[str, Any]:
 
 
 def _scales(
-    maps: Mapping[str, Maps], altitude: Float[np.ndarray, " pixels"] | None
+    maps: Mapping[str, Maps], altitude: Float[np.ndarray, " pixels"]
 ) -> dict[str, list[dict[str, Any]]]:
     """Bounds of the colours of every channel, by what they are of."""
-    seen = partial(np.percentile, q=[0.5, 90.0])
-    if altitude is not None:
-        seen = partial(seen_range, altitude=altitude)
     scales = {
         "temperature": [_temperature(sky) for sky in maps.get("truth", maps["mean"])],
-        "std": [_scale(*seen(std), log=True) for std in maps["std"]],
+        "std": [_scale(*seen_range(std, altitude), log=True) for std in maps["std"]],
     }
     if "truth" in maps:
         limits = np.percentile(np.abs(maps["mean"] - maps["truth"]), 99.0, axis=1)

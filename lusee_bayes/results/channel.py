@@ -328,14 +328,12 @@ def errors_by_latitude(channel: ChannelResult) -> tuple[SkyErrors, ...]:
         With its truth.
     """
     truth, mean = (modes_to_map(m, channel.nside) for m in (channel.truth, channel.mean))
-    return tuple(
-        SkyErrors(
-            name,
-            float(np.sqrt(((mean - truth)[inside] ** 2).mean())),
-            float(channel.pixel_std[inside].mean() / truth[inside].mean()),
-        )
-        for name, inside in latitudes(channel.nside).items()
-    )
+    found = []
+    for name, inside in latitudes(channel.nside).items():
+        rms = float(np.sqrt(((mean - truth)[inside] ** 2).mean()))
+        relative = float(channel.pixel_std[inside].mean() / truth[inside].mean())
+        found.append(SkyErrors(name, rms, relative))
+    return tuple(found)
 
 
 def snr_at_some_ell(channel: ChannelResult) -> dict[int, float]:

@@ -65,15 +65,9 @@ def write_maps(folder: Path, maps: Mapping[str, Pixels], scenario: Scenario) -> 
             (key, *value) if isinstance(value, tuple) else (key, value)
             for key, value in cards(name, scenario).items()
         ]
-        healpy.write_map(
-            folder / f"{name}.fits",
-            pixels,
-            coord="G",
-            column_names=[name.upper()],
-            column_units="K",
-            dtype=np.float64,
-            extra_header=extra,
-        )
+        column = {"column_names": [name.upper()], "column_units": "K", "dtype": np.float64}
+        path = folder / f"{name}.fits"
+        healpy.write_map(path, pixels, coord="G", extra_header=extra, **column)
 
 
 def write_cubes(

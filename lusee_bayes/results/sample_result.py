@@ -88,11 +88,8 @@ class SampleResult:
         """What a terminal shows."""
         table = self.summary.rename_axis("quantity").reset_index()
         figures = self.figures()
-        reasons = warnings_of(
-            {name: table[name].to_numpy() for name in table},
-            chains=figures.chains,
-            divergences=figures.divergences,
-        )
+        columns = {name: table[name].to_numpy() for name in table}
+        reasons = warnings_of(columns, **figures.model_dump(include={"chains", "divergences"}))
         return [self.headline(), *reasons, *self.experiment.doubts]
 
     def figures(self) -> SamplingSummary:

@@ -68,14 +68,9 @@ class ValidationResult:
 
 def calibration_check(ranks: Ranks) -> Check:
     """The verdict of calibration as one check."""
-    return Check(
-        "calibration",
-        float(ranks.p_values().min()),
-        ranks.threshold,
-        1.0,
-        f"smallest p-value of {len(ranks.names)} rank histograms over {ranks.n_simulations} "
-        "simulations",
-    )
+    n, least = len(ranks.names), float(ranks.p_values().min())
+    meaning = f"smallest p-value of {n} rank histograms over {ranks.n_simulations} simulations"
+    return Check("calibration", least, ranks.threshold, 1.0, meaning)
 
 
 def allowed(check: Check) -> str:

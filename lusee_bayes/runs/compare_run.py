@@ -160,15 +160,10 @@ def _under(name: str, setup: Setup, experiment: Experiment, solution: Solution) 
     made = conditioned(mapped)
     channel = made.result(made.known(alone=False))
     own = made.own.solution
-    return UnderPrior(
-        name,
-        channel.prior,
-        channel,
-        evidence,
-        0 if learned is None else len(learned.parameters),
-        held_out(own, mapped.data),
-        Split.of(own.posterior, channel.chi2_model, own.model.n_data),
-    )
+    n_parameters = 0 if learned is None else len(learned.parameters)
+    split = Split.of(own.posterior, channel.chi2_model, own.model.n_data)
+    judged = held_out(own, mapped.data), split
+    return UnderPrior(name, channel.prior, channel, evidence, n_parameters, *judged)
 
 
 # what the folder of a comparison of priors holds; a new file is one line here

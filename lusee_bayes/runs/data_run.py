@@ -95,17 +95,10 @@ def _write_waterfall(path: Path, experiments: Sequence[Experiment], scenario: Sc
     sources = [(e.setup.beam_source, e.scenario.frequency_mhz) for e in experiments]
     circuits = [circuit for source, f in sources if (circuit := source.circuit(f)) is not None]
     if circuits:
-        section = scenario.beam
-        write_four_port(
-            path,
-            data,
-            circuits,
-            moon_k=section.moon_temperature_k,
-            antenna_k=section.antenna_temperature_k,
-            interpolation=section.interpolation,
-            response=section.file,
-            scenario=scenario.to_yaml(),
-        )
+        beam = scenario.beam
+        emission = {"moon_k": beam.moon_temperature_k, "antenna_k": beam.antenna_temperature_k}
+        said = {"interpolation": beam.interpolation, "response": beam.file}
+        write_four_port(path, data, circuits, **emission, **said, scenario=scenario.to_yaml())
         return
     unknown = complex(np.nan, np.nan)
     impedance = [source.impedance(f) for source, f in sources]

@@ -109,32 +109,19 @@ def sample_result(
             update(iteration, _state_in_words(iteration, state, sampler))
 
         with naming(f"the program '{program.path or program.name}'"):
-            chains = sample(
-                program.model,
-                {**arguments, "data": data.data},
-                sampler,
-                whitening,
-                checkpoints,
-                report,
-            )
+            observed = {**arguments, "data": data.data}
+            chains = sample(program.model, observed, sampler, whitening, checkpoints, report)
     with stages("data tree"):
-        tree = to_datatree(
-            chains,
-            program,
-            inference.model,
-            inference.posterior,
-            data,
-            seed=sampler.seed,
-            arguments=arguments,
-            truth=true_values(experiment.setup),
-            attributes={
-                "coordinates": "learned in warmup" if whitening is None else "white",
-                "identity": json.dumps(identity),
-                "frequency_mhz": scenario.frequency_mhz,
-                "frame": "galactic",
-                "scenario": scenario.to_yaml(),
-            },
-        )
+        said = {
+            "coordinates": "learned in warmup" if whitening is None else "white",
+            "identity": json.dumps(identity),
+            "frequency_mhz": scenario.frequency_mhz,
+            "frame": "galactic",
+            "scenario": scenario.to_yaml(),
+        }
+        drawn = chains, program, inference.model, inference.posterior, data
+        more = {"arguments": arguments, "truth": true_values(experiment.setup), "attributes": said}
+        tree = to_datatree(*drawn, seed=sampler.seed, **more)
     speed = _speed(times, chains, sampler.warmup)
     return SampleResult(experiment, inference, tree, stages.seconds, speed)
 

@@ -85,9 +85,8 @@ def run_validate(
         posterior, model = drawn.inference.posterior, drawn.inference.model
         with stages("comparison"):
             stats = drawn.tree["sample_stats"]
-            found = validate_draws(
-                drawn.skies, posterior, stats["diverging"].values, stats["energy"].values
-            )
+            told = stats["diverging"].values, stats["energy"].values
+            found = validate_draws(drawn.skies, posterior, *told)
         if engine is not None:
             engine.work_in(run.path)
         more = {"seed": scenario.seed, "engine": engine, "stages": stages}

@@ -167,11 +167,8 @@ def with_log_likelihood(
         flat = {name: jnp.reshape(v, (-1, *v.shape[2:])) for name, v in sites.items()}
         rows = np.asarray(jax.lax.map(predicted, flat))
     rows = rows.reshape(few.sizes["chain"], few.sizes["draw"], -1)
-    return arviz_base.from_dict(
-        {"posterior": sites, "log_likelihood": {DATA: rows}},
-        dims={DATA: ["datum"]},
-        check_conventions=False,
-    )
+    groups = {"posterior": sites, "log_likelihood": {DATA: rows}}
+    return arviz_base.from_dict(groups, dims={DATA: ["datum"]}, check_conventions=False)
 
 
 def compare_programs(trees: Mapping[str, xr.DataTree]) -> pd.DataFrame:

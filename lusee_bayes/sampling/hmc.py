@@ -490,10 +490,8 @@ def sample(
         name: np.concatenate([part[name] for part in parts]).swapaxes(0, 1)[:, : sampler.draws]
         for name in parts[0]
     }
-    return Chains(
-        {name: values for name, values in merged.items() if name not in STATISTICS},
-        {name: merged[name] for name in STATISTICS},
-    )
+    sites = {name: values for name, values in merged.items() if name not in STATISTICS}
+    return Chains(sites, {name: merged[name] for name in STATISTICS})
 
 
 class _Run:
@@ -516,10 +514,8 @@ class _Run:
         self.sampler = sampler
         # leaves of the model's arguments that are arrays are traced, the rest is structure
         self.dynamic, static = eqx.partition((whitening, arguments), eqx.is_array)
-        self.kernel = sampler.kernel(
-            lambda dynamic: model(*eqx.combine(dynamic, static)),
-            whitening.root.shape[1] if set(latent) == white else None,
-        )
+        n_white = whitening.root.shape[1] if set(latent) == white else None
+        self.kernel = sampler.kernel(lambda given: model(*eqx.combine(given, static)), n_white)
         # XLA may stand still over batches of matrices to factorise where cores are few; several
         # devices, each with a chain of its own, would only stand idle
         chart = None if whitening is None else whitening.chart

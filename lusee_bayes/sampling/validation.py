@@ -252,17 +252,11 @@ def calibrate_sky(
     size, rng = solver.model.prior.size, np.random.default_rng(seed)
     modes = np.unique(np.linspace(0, size - 1, min(N_RANKED, size)).astype(int))
     directions = rng.standard_normal((N_RANKED, size))
-    ranks = calibrate(
-        truth.sample,
-        eqx.Partial(_sky_draws, solver),
-        eqx.Partial(ranked_of_sky, solver, jnp.asarray(modes), jnp.asarray(directions)),
-        n_simulations=n_simulations,
-        seed=seed,
-        batch=int(np.clip(MEMORY // (N_DRAWS * posterior.n_data), 1, BATCH)),
-        regions=("distance",),
-        engine=engine,
-        stages=stages,
-    )
+    ranked = eqx.Partial(ranked_of_sky, solver, jnp.asarray(modes), jnp.asarray(directions))
+    given = {"n_simulations": n_simulations, "seed": seed, "engine": engine, "stages": stages}
+    given["batch"] = int(np.clip(MEMORY // (N_DRAWS * posterior.n_data), 1, BATCH))
+    draw = eqx.Partial(_sky_draws, solver)
+    ranks = calibrate(truth.sample, draw, ranked, regions=("distance",), **given)
     # modes by their number among all modes
     numbers = {f"mode {i}": f"mode {mode}" for i, mode in enumerate(modes)}
     return replace(ranks, names=tuple(numbers.get(name, name) for name in ranks.names))

@@ -43,7 +43,6 @@ from scipy.special import log_ndtr
 
 from lusee_bayes.core.arrays import Array, Vector, namespace
 from lusee_bayes.core.checks import require_positive, require_shape
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes, per_mode
 from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.sky.galaxy import FREE_FREE_SLOPE, PointSource
@@ -360,29 +359,19 @@ class PositiveSkies(eqx.Module):
         weight : callable, optional
             w of theta and phi, Galactic, in radians; by default one.
         lmax_fields : int, optional
-            Highest ell of the exponents; by default ``lmax``.
+            Highest ell of the exponents, ``lmax`` at least; by default ``lmax``.
         band : int, optional
             Band limit of the grid; by default 192, or three times that of the exponents.
 
         Raises
         ------
         InputError
-            For unknown names, fewer channels than fields, another number of templates than of
-            frequencies, and templates or weights that are not positive everywhere.
+            For unknown names, fewer channels than fields, and templates or weights that are not
+            positive everywhere.
         """
         frequencies = np.asarray(frequencies_mhz, dtype=np.float64)
         require_names("field", FIELDS_OF, names, FIELDS, len(frequencies))
-        if len(templates) != len(frequencies):
-            raise InputError(
-                f"there are {len(templates)} templates for {len(frequencies)} frequencies; give "
-                "one for each"
-            )
         highest = lmax if lmax_fields is None else lmax_fields
-        if highest < lmax:
-            raise InputError(
-                f"the lmax of the fields is {highest}, that of the maps {lmax}; give the fields as "
-                "many modes at least"
-            )
         grid = SphereGrid.of(highest, max(GRID * highest, FIELDS_GRID) if band is None else band)
         at = grid.directions()
         levels = np.stack([template(*at).reshape(grid.shape) for template in templates])
@@ -493,11 +482,6 @@ class FieldLaws:
         levels = np.concatenate([amplitudes, np.full(len(skies.levels), RESIDUAL)])
         parameters = np.column_stack([np.log(levels), np.full(len(levels), TILT)])
         return cls(parameters, means, parameters)
-
-    def log_density(self) -> float:
-        """ln p of the parameters, but for a constant."""
-        away = (self.parameters - self.expected) / [LOG_WIDTH, TILT_WIDTH]
-        return -0.5 * float((away**2).sum())
 
     def prior(self, skies: PositiveSkies) -> SpectralPrior:
         """The prior of the fields: a spectral prior whose maps have no unit."""

@@ -177,13 +177,9 @@ class SpectralPrior(checks.Described, eqx.Module):
         # the fit has taken its share of the residuals' variance
         free = len(frequencies) / max(len(frequencies) - len(names), 1)
         left_over = np.sqrt(free) * (skies - mixing @ maps)
-        return cls(
-            jnp.asarray(frequencies),
-            jnp.asarray(mixing),
-            jnp.asarray(power_spectrum(maps)),
-            _residual_spectra(*((left_over, 1.0) if residual is None else (skies, residual))),
-            names,
-        )
+        rest = (left_over, 1.0) if residual is None else (skies, residual)
+        parts = map(jnp.asarray, (frequencies, mixing, power_spectrum(maps)))
+        return cls(*parts, _residual_spectra(*rest), names)
 
     @classmethod
     def kernel(
@@ -231,13 +227,10 @@ class SpectralPrior(checks.Described, eqx.Module):
         kept = values > KERNEL_TOLERANCE * values[-1]
         values, vectors = values[kept][::-1], vectors[:, kept][:, ::-1]
         spectrum = power_spectrum(skies / power_law[:, None]).mean(0)
-        return cls(
-            jnp.asarray(frequencies),
-            jnp.asarray(power_law[:, None] * vectors),
-            jnp.asarray(values[:, None] * spectrum),
-            _residual_spectra(skies, residual),
-            tuple(f"principal {k}" for k in range(len(values))),
-        )
+        names = tuple(f"principal {k}" for k in range(len(values)))
+        mixing, spectra = power_law[:, None] * vectors, values[:, None] * spectrum
+        parts = map(jnp.asarray, (frequencies, mixing, spectra))
+        return cls(*parts, _residual_spectra(skies, residual), names)
 
     def description(self) -> tuple[str, ...]:
         residual = "no residual" if self.residual is None else "a residual in each"

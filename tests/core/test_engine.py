@@ -83,8 +83,6 @@ def test_a_failure_ends_the_stage():
     refuse("of number 1", ThisProcess(1).each, tasks_of(fail, 5), Stages(), "s")
     assert begun[:2] == [0, 1] and len(begun) < 4
     assert ThisProcess().each(tasks_of(abs, 0), Stages(), "s") == []
-    with pytest.raises(ValueError, match="2 items have 1 names"):
-        Tasks(abs, [1, 2], ["one"])
 
 
 def opened(demand=DEMAND, **given):

@@ -20,7 +20,7 @@ from lusee_bayes.linear.positive_joint import (
     linearised,
     positive_sky,
 )
-from lusee_bayes.sky.positive_skies import FieldLaws, PositiveSkies
+from lusee_bayes.sky.positive_skies import LOG_WIDTH, TILT_WIDTH, FieldLaws, PositiveSkies
 
 LMAX = 3
 N = n_modes(LMAX)
@@ -199,7 +199,8 @@ def test_learned_laws_maximise_the_evidence():
     def evidence(parameters):
         there = replace(found, parameters=parameters)
         mode = find_joint_mode(skies, there, channels)
-        return float(mode.posterior.log_evidence) + there.log_density()
+        away = (parameters - found.expected) / [LOG_WIDTH, TILT_WIDTH]
+        return float(mode.posterior.log_evidence) - 0.5 * (away**2).sum()
 
     step = 0.3
     for law in range(len(found.parameters)):
@@ -216,11 +217,8 @@ def test_learned_laws_maximise_the_evidence():
 
 def test_bad_input_is_refused_in_a_sentence():
     refuse("unknown field 'indx'; did you mean 'index'", skies_of, FREQUENCIES, ("level", "indx"))
-    one, build, every = FREQUENCIES[:1], PositiveSkies.of, [partial(band, f) for f in FREQUENCIES]
+    one, build = FREQUENCIES[:1], PositiveSkies.of
     refuse("2 fields .* need at least as many channels", skies_of, one, ("level", "index"))
-    refuse("1 templates for 4 frequencies", build, FREQUENCIES, [partial(band, 5.0)], LMAX)
-    refuse("fields is 2, that of the maps 3", build, FREQUENCIES, every, LMAX, lmax_fields=2)
-
     holes = [lambda theta, phi, f=f: band(f, theta, phi) - 50.0 for f in FREQUENCIES]
     refuse("the template", build, FREQUENCIES, holes, LMAX)
     skies = skies_of(FREQUENCIES[:1], ("level",))

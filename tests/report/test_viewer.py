@@ -226,15 +226,18 @@ def test_keys_move_the_direction_and_parts_are_those_that_the_page_has(which, re
 
 
 def test_maps_that_do_not_go_together_are_refused():
-    mean = np.ones((2, 12))
+    mean, up = np.ones((2, 12)), {"highest_altitude": np.ones(12)}
     for other in (np.ones((1, 12)), np.ones((2, 48))):
-        refuse("maps of std have the shape", viewer, [10.0, 20.0], {"mean": mean, "std": other})
-    refuse("on a HEALPix grid", viewer, [10.0], {"mean": np.ones((1, 13)), "std": np.ones((1, 13))})
+        maps = {"mean": mean, "std": other}
+        refuse("maps of std have the shape", viewer, [10.0, 20.0], maps, **up)
+    maps, up = dict.fromkeys(("mean", "std"), np.ones((1, 13))), {"highest_altitude": np.ones(13)}
+    refuse("on a HEALPix grid", viewer, [10.0], maps, **up)
 
 
 def test_a_sky_below_zero_has_a_linear_scale():
     maps = {"mean": np.linspace(-2.0, -1.0, 24).reshape(2, 12), "std": np.ones((2, 12))}
-    for scale in viewer([10.0, 20.0], maps)["scales"]["temperature"]:
+    made = viewer([10.0, 20.0], maps, highest_altitude=np.ones(12))
+    for scale in made["scales"]["temperature"]:
         assert not scale["log"] and -2.0 <= scale["low"] < scale["high"] <= -1.0
 
 

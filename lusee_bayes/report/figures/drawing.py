@@ -128,12 +128,8 @@ def orthographic(axes: Axes, grid: HemisphereGrid, pattern: Float[np.ndarray, "t
     )
     axes.set(aspect="equal", xticks=[], yticks=[], xlim=(-1.15, 1.15), ylim=(-1.15, 1.15))
     axes.add_artist(Circle((0, 0), 1.0, fill=False, color=GREY, lw=0.8))
-    for name, (px, py) in {
-        "N": (0, 1.08),
-        "E": (1.08, 0),
-        "S": (0, -1.08),
-        "W": (-1.08, 0),
-    }.items():
+    points = {"N": (0, 1.08), "E": (1.08, 0), "S": (0, -1.08), "W": (-1.08, 0)}
+    for name, (px, py) in points.items():
         axes.text(px, py, name, ha="center", va="center", fontsize=8)
     axes.set_frame_on(False)
     return image
@@ -192,14 +188,8 @@ def mollweide(
     axes.add_patch(rim)
     image.set_clip_path(rim)
     if highest_altitude is not None and (highest_altitude < 0).any():
-        line = axes.contour(
-            view(highest_altitude),
-            [0.0],
-            extent=extent,
-            colors="black",
-            linestyles="dashed",
-            linewidths=1.2,
-        )
+        style = {"colors": "black", "linestyles": "dashed", "linewidths": 1.2}
+        line = axes.contour(view(highest_altitude), [0.0], extent=extent, **style)
         line.set_path_effects(SEEN_ANYWHERE)
         line.set_clip_path(rim)
     _graticule(axes)

@@ -34,14 +34,9 @@ def residuals_by_product(result: MapResult) -> Figure | None:
     places = {"left": 0.06, "right": 0.98, "bottom": 0.11, "top": 0.82, "wspace": 0.03}
     left, right = figure.subplots(1, 2, width_ratios=(3, 1), sharey=True, gridspec_kw=places)
     # samples are not evenly spaced where runs follow one another or nights are left out
-    image = left.pcolormesh(
-        np.append(np.arange(len(hours)), len(hours)) - 0.5,
-        np.arange(len(labels) + 1) - 0.5,
-        z,
-        cmap=drawing.DIVERGING,
-        norm=Normalize(-WIDEST, WIDEST),
-        rasterized=True,
-    )
+    x, y = np.arange(len(hours) + 1) - 0.5, np.arange(len(labels) + 1) - 0.5
+    style = {"cmap": drawing.DIVERGING, "norm": Normalize(-WIDEST, WIDEST), "rasterized": True}
+    image = left.pcolormesh(x, y, z, **style)
     ticks = np.linspace(0, len(hours) - 1, 7).astype(int)
     left.set_xticks(ticks, [f"{hours[k] / 24:.1f}" for k in ticks])
     left.set_yticks(np.arange(len(labels)), labels)
@@ -195,12 +190,8 @@ def time_line(reduced: Reduced) -> Figure:
     top.set_title("Gain of every port")
     for row, flagged in enumerate(flags.values()):
         bottom.plot(days[flagged], np.full(flagged.sum(), row), "|", ms=9, color=drawing.ORANGE)
-    bottom.set(
-        yticks=range(len(flags)),
-        yticklabels=list(flags),
-        ylim=(n_rows - 0.5, -0.5),
-        xlabel=f"days since {_first(reduced)} UTC",
-    )
+    bottom.set(yticks=range(len(flags)), yticklabels=list(flags), ylim=(n_rows - 0.5, -0.5))
+    bottom.set_xlabel(f"days since {_first(reduced)} UTC")
     bottom.set_title("Flagged in at least one band" if flags else "Nothing is flagged")
     return figure
 
@@ -225,14 +216,8 @@ def waterfall(result: MapResult) -> Figure | None:
         flagged = ~np.isfinite(kept) | used_in_part
         axes.plot(days, kept, ".", ms=3, color=drawing.BLUE, label="after flags")
         before = reduced.before[band, number]
-        axes.plot(
-            days[flagged],
-            before[flagged],
-            ".",
-            ms=4,
-            color=drawing.ORANGE,
-            label="before, where flagged",
-        )
+        style = {"ms": 4, "color": drawing.ORANGE, "label": "before, where flagged"}
+        axes.plot(days[flagged], before[flagged], ".", **style)
         low, high = _range(kept[np.isfinite(kept)])
         axes.set_ylim(low, high)
         axes.set_title(product.label, fontsize=9)
@@ -274,22 +259,14 @@ def _gains(left: Axes, reduced: Reduced) -> None:
             gain, std = curves.gain[number, port], curves.std[number, port]
             if not np.isfinite(gain).any():
                 continue
-            label = f"{letter}{port}"
-            (line,) = left.semilogy(
-                curves.frequencies_mhz,
-                gain,
-                color=drawing.COLOURS[port],
-                ls={"L": ":", "M": "-", "H": "--"}[letter],
-                label=label,
-            )
-            low = np.maximum(gain - std, 1e-3 * gain)
-            left.fill_between(
-                curves.frequencies_mhz, low, gain + std, color=line.get_color(), alpha=0.25, lw=0
-            )
+            colour, line = drawing.COLOURS[port], {"L": ":", "M": "-", "H": "--"}[letter]
+            mhz, low = curves.frequencies_mhz, np.maximum(gain - std, 1e-3 * gain)
+            left.semilogy(mhz, gain, color=colour, ls=line, label=f"{letter}{port}")
+            left.fill_between(mhz, low, gain + std, color=colour, alpha=0.25, lw=0)
             if alone:
                 f = reduced.frequencies_mhz
-                at, error = (np.interp(f, curves.frequencies_mhz, y) for y in (gain, std))
-                left.errorbar(f, at, error, fmt="o", ms=4, capsize=3, color=line.get_color())
+                at, error = (np.interp(f, mhz, y) for y in (gain, std))
+                left.errorbar(f, at, error, fmt="o", ms=4, capsize=3, color=colour)
     for f in reduced.frequencies_mhz:
         left.axvline(f, color=drawing.GREY, lw=0.5, zorder=0)
     known = bool((curves.std > 0).any())

@@ -50,13 +50,11 @@ def data_vector(result: MapResult) -> Figure | None:
         axes.axvline(k * n_times, color=GREY, lw=0.4)
     axes.set_xticks((np.arange(n_products) + 0.5) * n_times, channel.labels, fontsize=8)
     axes.tick_params(axis="x", length=0)
-    axes.set(
-        xlabel="product (time runs within each)",
-        ylabel="visibility [K]",
-        xlim=(0, n_times * n_products),
-        title=f"Data vector at {channel.frequency_mhz:g} MHz, {channel.n_data} samples"
-        + (f", {channel.n_missing} missing" if channel.n_missing else ""),
-    )
+    axes.set(xlabel="product (time runs within each)", ylabel="visibility [K]")
+    axes.set_xlim(0, n_times * n_products)
+    missing = f", {channel.n_missing} missing" if channel.n_missing else ""
+    title = f"Data vector at {channel.frequency_mhz:g} MHz, {channel.n_data} samples{missing}"
+    axes.set_title(title)
     return figure
 
 
@@ -69,9 +67,8 @@ def beams(result: MapResult) -> Figure | None:
     grid = HemisphereGrid.gauss_legendre(*nodes)
     places = {"left": 0.01, "right": 0.99, "bottom": 0.02, "top": 0.82, "wspace": 0.04}
     figure, grid_of_axes = in_places((11, 4), 1, len(details.patterns), **places)
-    for axes, title, pattern in zip(
-        grid_of_axes, details.pattern_names, details.patterns, strict=True
-    ):
+    named = zip(grid_of_axes, details.pattern_names, details.patterns, strict=True)
+    for axes, title, pattern in named:
         image = orthographic(axes, grid, pattern)
         axes.set_title(title)
     figure.colorbar(image, ax=figure.axes, label="beam / its peak", shrink=0.8, pad=0.02)
@@ -126,14 +123,12 @@ def channel_map(channel: ChannelResult) -> Figure:
         span = np.percentile(np.abs(percent), 99.0)
         extra = {"mean - truth": (percent, Normalize(-span, span), DIVERGING, "% of the mean sky")}
     altitude, scale = channel.highest_altitude, temperatures(sky, 0.05)
+    spread = LogNorm(*seen_range(channel.pixel_std, altitude))
     panels = {
         **({"truth": (sky, scale)} if extra else {}),
         "posterior mean": (mean, scale),
         **extra,
-        "posterior standard deviation": (
-            channel.pixel_std,
-            LogNorm(*seen_range(channel.pixel_std, altitude)),
-        ),
+        "posterior standard deviation": (channel.pixel_std, spread),
     }
     rows = (len(panels) + 1) // 2
     places = {"left": 0.01, "right": 0.98, "bottom": 0.01, "top": 0.88, "wspace": 0.06}
@@ -271,18 +266,16 @@ def channel_fidelity(cube: MapResult) -> Figure:
     norm = LogNorm(0.3, 30.0) if known else Normalize(0.0, 1.0)
     figure, (left, right) = framed((12, 4.4), 1, 2)
     ell, channel = np.arange(values.shape[1]), np.arange(values.shape[0])
-    image = left.pcolormesh(
-        ell[1:], channel, values[:, 1:], norm=norm, cmap=SEQUENTIAL, shading="nearest"
-    )
+    style = {"norm": norm, "cmap": SEQUENTIAL, "shading": "nearest"}
+    image = left.pcolormesh(ell[1:], channel, values[:, 1:], **style)
     shown = np.unique(np.linspace(0, len(channel) - 1, min(len(channel), 8)).round().astype(int))
     left.set_yticks(shown, [f"{cube.frequencies_mhz[k]:g}" for k in shown])
     left.set(xlabel=r"multipole $\ell$", ylabel="frequency [MHz]", title=label)
     figure.colorbar(image, ax=left, label=label, extend="both" if known else "neither")
     right.plot(ell[1:], values[:, 1:].mean(0), color=BLUE, label="this run")
     if alone is not None:
-        right.plot(
-            ell[1:], alone[:, 1:].mean(0), color=ORANGE, ls="--", label="every channel on its own"
-        )
+        style = {"color": ORANGE, "ls": "--", "label": "every channel on its own"}
+        right.plot(ell[1:], alone[:, 1:].mean(0), **style)
     if known:
         right.set_yscale("log")
         right.axhline(1.0, color=GREY, lw=0.8, ls=":")
@@ -298,11 +291,10 @@ def chi2(cube: MapResult) -> Figure | None:
     figure, axes = framed((8, 4))
     fits = cube.fits()
     ratio, width = fits.chi2 / fits.degrees, np.sqrt(2.0 / fits.degrees)
-    axes.fill_between(
-        cube.frequencies_mhz, 1 - 2 * width, 1 + 2 * width, color=GREY, alpha=0.3, lw=0
-    )
+    mhz = cube.frequencies_mhz
+    axes.fill_between(mhz, 1 - 2 * width, 1 + 2 * width, color=GREY, alpha=0.3, lw=0)
     axes.axhline(1.0, color=GREY, lw=0.8)
-    axes.plot(cube.frequencies_mhz, ratio, "o", ms=4, color=BLUE)
+    axes.plot(mhz, ratio, "o", ms=4, color=BLUE)
     if np.isfinite(ratio).all() and ratio.max() > 3.0:
         axes.set_yscale("log")
     axes.set(xlabel="frequency [MHz]", ylabel=r"$\chi^2$ / its mean if the model holds")

@@ -114,9 +114,8 @@ def uncertainty(run: SampleResult) -> Figure:
     maps = run.maps
     chains, draws = run.skies.shape[:2]
     if chains * draws < 2:
-        return drawing.note(
-            "Uncertainty of the drawn maps", "not drawn: a single draw has no spread"
-        )
+        why = "not drawn: a single draw has no spread"
+        return drawing.note("Uncertainty of the drawn maps", why)
     level = maps["mean"].mean()
     width = maps["upper"] - maps["lower"]
     spread, interval = 100.0 * maps["std"] / level, 100.0 * width / level
@@ -124,24 +123,14 @@ def uncertainty(run: SampleResult) -> Figure:
     # draws that are all the same have no width, and no asymmetry
     skewness = np.divide(excess, width, out=np.zeros_like(width), where=width > 0)
     limit = np.percentile(np.abs(skewness), 99.0)
-    percent = "% of the mean sky"
+    percent, chance = "% of the mean sky", "of its width (chance alone for a Gaussian)"
+    skewed = "asymmetry of the 90 % interval about the mean"
+    signed, kelvin = Normalize(-limit, limit), drawing.temperatures(maps["mean"])
     panels = [
-        (
-            "mean of the draws",
-            maps["mean"],
-            drawing.temperatures(maps["mean"]),
-            drawing.SEQUENTIAL,
-            "K",
-        ),
+        ("mean of the draws", maps["mean"], kelvin, drawing.SEQUENTIAL, "K"),
         ("standard deviation", spread, _range(spread), drawing.SEQUENTIAL, percent),
         ("width of the 90 % interval", interval, _range(interval), drawing.SEQUENTIAL, percent),
-        (
-            "asymmetry of the 90 % interval about the mean",
-            skewness,
-            Normalize(-limit, limit),
-            drawing.DIVERGING,
-            "of its width (chance alone for a Gaussian)",
-        ),
+        (skewed, skewness, signed, drawing.DIVERGING, chance),
     ]
     nside = run.experiment.scenario.map_nside
     altitude = highest_altitude(run.experiment.data.observation, nside)
@@ -195,9 +184,8 @@ def comparison(result: Comparison) -> Figure:
     means.plot(result.mean_z, **DOTS)
     for bound in (-limit, limit):
         means.axhline(bound, color=drawing.ORANGE, ls="--", lw=1)
-    means.set(
-        xlabel="mode", ylabel="difference of means [Monte Carlo error]", title="Means of every mode"
-    )
+    means.set(xlabel="mode", ylabel="difference of means [Monte Carlo error]")
+    means.set_title("Means of every mode")
     variances.errorbar(
         np.arange(len(ell)), result.variance_ratio, result.variance_error, elinewidth=0.3, **DOTS
     )
@@ -208,19 +196,15 @@ def comparison(result: Comparison) -> Figure:
     covariance.plot(
         rank, result.null_eigenvalues, color=drawing.ORANGE, ls="--", label="exact chains"
     )
-    covariance.set(
-        xlabel="number, rising",
-        ylabel="generalised eigenvalue",
-        title="Covariance in analytic coordinates",
-    )
+    covariance.set(xlabel="number, rising", ylabel="generalised eigenvalue")
+    covariance.set_title("Covariance in analytic coordinates")
     covariance.legend(frameon=False)
     sizes.semilogy(result.ess_bulk, label="bulk", **DOTS)
     sizes.semilogy(result.ess_tail, label="tail", **(DOTS | {"color": drawing.ORANGE}))
     sizes.set(xlabel="mode", ylabel="effective sample size", title="Effective sample sizes")
     sizes.legend(frameon=False)
-    figure.suptitle(
-        f"HMC against the analytic posterior: {'passed' if result.passed else 'FAILED'}"
-    )
+    verdict = "passed" if result.passed else "FAILED"
+    figure.suptitle(f"HMC against the analytic posterior: {verdict}")
     return figure
 
 
@@ -252,8 +236,6 @@ def rank_statistics(ranks: Ranks) -> Figure:
     last.title.set_size(9)
     figure.supxlabel("rank of the truth among the draws")
     figure.supylabel("simulations per bin")
-    figure.suptitle(
-        f"Calibration over {ranks.n_simulations} simulations: "
-        f"{'passed' if ranks.passed else 'FAILED'}"
-    )
+    verdict = "passed" if ranks.passed else "FAILED"
+    figure.suptitle(f"Calibration over {ranks.n_simulations} simulations: {verdict}")
     return figure
