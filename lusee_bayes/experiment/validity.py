@@ -23,9 +23,9 @@ from dataclasses import dataclass, replace
 
 import jax
 import numpy as np
-from arviz_stats.base import array_stats
 
 from lusee_bayes.core.arrays import Modes
+from lusee_bayes.core.lazy import array_stats
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import base_model, moved, systematics
 from lusee_bayes.experiment.rounds import Inference

@@ -9,14 +9,14 @@ up to ``lmax``. Beams of products are then P_ij exp(f_i + conj f_j), and the der
 amplitude is the product of Y_k and the beam, whatever the values. c follows from the standard
 deviation of either part in any direction.
 
-How strong and how smooth the errors are is learned with everything else, in rounds. Each takes the
-C_ell that are most probable for the amplitudes as they were found, uncertain as they are (expectation
-and maximisation): of n_ell amplitudes a of one ell, a spectrum alone would be ::
+How strong the errors are is learned with everything else, in rounds. Each takes the strength that
+is most probable for the n amplitudes as they were found, uncertain as they are (expectation and
+maximisation), ::
 
-    C_ell = sum (mean of a^2 + Var(a)) / n_ell.
+    c = sum [(mean of a)^2 + Var(a)] (1 + ell)^slope / n,
 
-The strength only grows: where parameters of the antennas describe most of an error, what
-is left has a few shapes, and the strength of all would be found far too low for these.
+but never less than what is expected: where parameters of the antennas describe most of an error,
+what is left has a few shapes, and the strength of all would be found far too low for these.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
 from pydantic import Field
-from scipy.optimize import minimize
 
 from lusee_bayes.core.arrays import Array, Vector, as_complex, namespace
 from lusee_bayes.core.harmonics import n_modes
@@ -39,11 +38,9 @@ from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.systematic import ChangedBeams, Unknown, Values
 
 # what is learned, by name
-STD, SLOPE = "field_std", "field_slope"
+STD = "field_std"
 # standard deviation in any direction, at most
 LARGEST = 0.1
-# prior standard deviations of ln std and of the slope
-LOG_STD, SLOPE_STD = 2.0, 1.0
 
 
 class FieldErrorsSection(Section):
@@ -59,7 +56,7 @@ class FieldErrorsSection(Section):
     slope : float
         C_ell goes with (1 + ell)^-slope.
     learned : bool
-        Whether the data may raise ``std``, and choose the slope.
+        Whether the data may raise ``std``.
     treatment : {"marginalised", "sampled", "ignored"}
         Found in rounds and marginalised, sampled with the map, or left out of the model.
     """
@@ -105,7 +102,7 @@ class FieldErrors(ChangedBeams):
         grid, values = SphereGrid.of(band, band), around.values or {}
         own = np.eye(n_modes(section.lmax), n_modes(band))
         return cls(
-            of_ell(values.get(STD, section.std), values.get(SLOPE, section.slope), section.lmax),
+            of_ell(values.get(STD, section.std), section.slope, section.lmax),
             grid.synthesise(np.asarray(setup.beam_source.beams(setup.frequency_mhz, band).modes)),
             grid.synthesise(own),
             grid,
@@ -193,22 +190,10 @@ class FieldErrors(ChangedBeams):
         return self.expectation.learned
 
     def relearned(self, mean: Vector, variance: Vector) -> dict[str, float]:
-        expected, stds = self.expectation, np.asarray(self.of_ell)
-        sizes = np.array([u.size for u in self.unknowns])
-        ends = np.cumsum(sizes)[:-1]
-        squares = np.array([z.sum() for z in np.split(mean**2 + variance, ends)]) * stds**2
-
-        def cost(x: Vector) -> float:
-            log_std, slope = x
-            there = of_ell(np.exp(log_std), slope, expected.lmax)
-            fit = (sizes * np.log(there) + squares / (2.0 * there**2)).sum()
-            off = (log_std - np.log(expected.std)) / LOG_STD, (slope - expected.slope) / SLOPE_STD
-            return float(fit + 0.5 * (off[0] ** 2 + off[1] ** 2))
-
-        # never below what is expected: errors of a few shapes alone would be underrated
-        bounds = [(np.log(expected.std), np.log(LARGEST)), (-2.0, 6.0)]
-        log_std, slope = minimize(cost, [np.log(expected.std), expected.slope], bounds=bounds).x
-        return {STD: float(np.exp(log_std)), SLOPE: float(slope)}
+        expected = self.expectation
+        now = np.asarray(self.of_ell)[0] / of_ell(1.0, expected.slope, expected.lmax)[0]
+        found = float(now * np.sqrt(np.mean(mean**2 + variance)))
+        return {STD: min(max(found, expected.std), LARGEST)}
 
 
 def of_ell(std: float, slope: float, lmax: int) -> Float[np.ndarray, " ells"]:
