@@ -24,16 +24,22 @@ and given d, g ~ N(K^-1 T v(d + sum_j t_j), K^-1).
 
 *Tied amplitudes* of several channels: channel k has amplitudes z_k, N(0, 1) when it is worked out,
 and its posterior of them is N(E_k, V_k). Its likelihood is then exp(-z^T (V_k^-1 - 1) z / 2 + z^T
-V_k^-1 E_k) up to a factor. Let the prior of all of them be N(0, K x 1) instead: K_kk = 1 ties the
-channels' values of one amplitude, and different amplitudes are independent. With K = R R^T and z =
-R w, w ~ N(0, 1), ::
+V_k^-1 E_k) up to a factor. Let the prior be another one, under which different amplitudes are
+independent, and the channels' values of amplitude i are N(0, K_i) with ones on the diagonal: all
+ones where it is one and the same for all. With the diagonal of all K_i = R R^T and z = R w, w ~
+N(0, 1), ::
 
     Lambda = 1 + sum_k R_k^T (V_k^-1 - 1) R_k,    mean of w = Lambda^-1 sum_k R_k^T V_k^-1 E_k,
 
-which needs no inverse of K. What follows for channel k, N(E'_k, V'_k), is its own posterior times
+which needs no inverse of K_i: R has as many columns as these have eigenvalues above rounding, one
+where all are ones. What follows for channel k, N(E'_k, V'_k), is its own posterior times
 exp(-z^T Q z / 2 + q^T z), which is what the other channels tell of its amplitudes: ::
 
     Q = V'^-1 - V^-1,    q = V'^-1 E' - V^-1 E.
+
+Where N has a prior mean e to make up for the volume of skies (:mod:`.systematic`), z^T e is part of
+the likelihood, the volume at that z, and not of the prior: all this holds with the E of N(e, 1).
+About e, as an :class:`Amplitudes` is, E - e and E' - e give the Q and the q that belong there.
 """
 
 from __future__ import annotations
@@ -285,19 +291,22 @@ class Tied:
         Of all channels together.
     log_evidence : float
         ln p of all data, less the sum of the channels' ln p with amplitudes of N(0, 1).
+    names : tuple of str
+        Of the amplitudes, where they have some.
     """
 
     mean: Float[np.ndarray, "channels n"]
     covariance: Float[np.ndarray, "channels n n"]
     draws: Float[np.ndarray, "draws channels n"]
     log_evidence: float
+    names: tuple[str, ...] = ()
 
 
 def tie(
     mean: Float[np.ndarray, "channels n"],
     covariance: Float[np.ndarray, "channels n n"],
-    kernel: Float[np.ndarray, "channels channels"],
-    normals: Float[np.ndarray, "draws white"],
+    kernels: Float[np.ndarray, "n channels channels"],
+    normals: Float[np.ndarray, "draws most"],
 ) -> Tied:
     """Give amplitudes that were independent from channel to channel a prior that ties them.
 
@@ -305,10 +314,10 @@ def tie(
     ----------
     mean, covariance : (channels, n) and (channels, n, n) array
         E and V: of each channel's own data, with amplitudes of N(0, 1).
-    kernel : (channels, channels) array
-        K, with ones on its diagonal; it may be singular.
+    kernels : (n, channels, channels) array
+        K_i, with ones on their diagonals; they may be singular.
     normals : (draws, channels * n) array
-        Standard normals, of which draws are made.
+        Standard normals, of which draws are made; as many of each as R has columns are used.
 
     Raises
     ------
@@ -318,12 +327,15 @@ def tie(
     n_channels, n = mean.shape
     if not (np.linalg.eigvalsh(covariance) > 0).all():
         raise InputError(
-            "the data tell the powers of receivers better than rounding lets their covariance be "
-            "known; leave out noise.receiver.smooth_octaves"
+            "the data of a channel tell what it shares with others better than rounding lets the "
+            "covariance be known; map the channels one by one"
         )
-    strength, vectors = np.linalg.eigh(kernel)
-    root = np.kron(vectors * np.sqrt(np.maximum(strength, 0.0)), np.eye(n))
-    blocks = root.reshape(n_channels, n, -1)
+    strengths, vectors = np.linalg.eigh(kernels)
+    number, kept = np.nonzero(strengths > strengths.max() * n_channels * np.finfo(float).eps)
+    blocks = np.zeros((n_channels, n, len(kept)))
+    values = vectors[number, :, kept] * np.sqrt(strengths[number, kept])[:, None]
+    blocks[:, number, np.arange(len(kept))] = values.T
+    root = blocks.reshape(n_channels * n, -1)
     told = np.linalg.inv(covariance)
     pulled = np.einsum("kij,kjw->kiw", told - np.eye(n), blocks)
     precision = np.eye(root.shape[1]) + root.T @ pulled.reshape(root.shape)
@@ -336,7 +348,7 @@ def tie(
         white = white + step[:, 0]
         z = (root @ white).reshape(mean.shape)
     half = solve_lower(lower, root.T, transpose=False).T.reshape(n_channels, n, -1)
-    draws = solve_lower(lower, normals.T, transpose=True).T @ root.T
+    draws = solve_lower(lower, normals[:, : len(kept)].T, transpose=True).T @ root.T
     off = mean - z
     quadratic = np.einsum("ki,kij,kj->", off, told, off) - (z**2).sum() + white @ white
     log_dets = np.linalg.slogdet(covariance)[1].sum() + 2.0 * np.log(np.diagonal(lower)).sum()
