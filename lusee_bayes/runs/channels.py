@@ -413,13 +413,15 @@ class ChannelAlone:
         deviations = self.deviations + (draws - mean - with_them) @ gain.T
         # what the other channels tell of this one's unknowns
         n = len(amplitudes.mean)
-        precision, vector = np.zeros((n, n)), np.zeros(n)
+        precision, vector, about = np.zeros((n, n)), np.zeros(n), np.zeros(n)
         precision[np.ix_(own, own)], vector[own] = told_by_others(e, v, mean, covariance)
-        unknowns = replace(self.unknowns, amplitudes=amplitudes.given(precision, vector))
+        about[own] = mean
+        given = amplitudes.given(precision, vector, about)
+        unknowns = replace(self.unknowns, amplitudes=given)
         sky_share = np.linalg.solve(v, (np.linalg.solve(v, v - inner)).T)
         gained = np.linalg.slogdet(np.eye(len(own)) + (covariance - v) @ sky_share)[1]
         bits = self.figures["information_bits"] - 0.5 * gained / np.log(2.0)
-        information = information_given(self.information, amplitudes, precision, vector)
+        information = information_given(self.information, amplitudes, precision, vector, about)
         skies, known = moved + deviations[: self.n_draws], self.known
         if known.pointing is not None:
             offsets = known.pointing.given(unknowns.table(moved, left))
