@@ -216,24 +216,20 @@ class Unknowns:
         found : Inference
             Of these data alone.
         """
-        scenario, held, octaves = experiment.scenario, [], []
-        for one in found.expanded:
-            over = one.systematic.octaves(attrgetter(one.systematic.key)(scenario))
-            if over or not one.systematic.has_table:
-                held.append(one)
-                octaves.append(np.full(len(one.expected), over))
+        scenario, held, octaves, alike = experiment.scenario, [], [], []
+        for part in found.expanded:
+            own, none = part.systematic, ((), np.zeros((0, len(part.expected))))
+            over = own.octaves(attrgetter(own.key)(scenario))
+            if over or not own.has_table:
+                held.append(part)
+                octaves.append(np.full(len(part.expected), over))
+                alike.append(none if own.has_table else own.like_the_sky())
         if not held:
             return None
         data, columns = experiment.data, np.concatenate([s.columns for s in held], axis=1)
         # of spectra, the sky behind them may be known, but not what the scenario would have drawn
         known = data.truth is not None and data.calibration is None
         rows = before_data(held, true_values(experiment.setup) if known else None)
-        alike = [
-            ((), np.zeros((0, len(s.expected))))
-            if s.systematic.has_table
-            else s.systematic.like_the_sky()
-            for s in held
-        ]
         return cls(
             tuple(rows.to_dict("records")),
             amplitudes_of_sky(found.solution, columns),
@@ -350,11 +346,9 @@ class PointingReport:
 
     def given(self, told: pd.DataFrame) -> PointingReport:
         """The same with the value and std of each offset that a table of unknowns has."""
-        if self.offsets is None:
-            return self
-        told = told.set_index("unknown").loc[self.offsets["offset"], ["value", "std"]]
-        columns = {name: told[name].to_numpy() for name in told}
-        return replace(self, offsets=self.offsets.assign(**columns))
+        told, table = told.set_index("unknown"), self.offsets
+        columns = {name: table["offset"].map(told[name]) for name in ("value", "std")}
+        return replace(self, offsets=table.assign(**columns))
 
     def lines(self) -> list[str]:
         """One line for every offset."""

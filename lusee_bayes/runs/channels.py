@@ -416,16 +416,14 @@ class ChannelAlone:
         precision, vector, about = np.zeros((n, n)), np.zeros(n), np.zeros(n)
         precision[np.ix_(own, own)], vector[own] = told_by_others(e, v, mean, covariance)
         about[own] = mean
-        given = amplitudes.given(precision, vector, about)
-        unknowns = replace(self.unknowns, amplitudes=given)
+        unknowns = replace(self.unknowns, amplitudes=amplitudes.given(precision, vector, about))
         sky_share = np.linalg.solve(v, (np.linalg.solve(v, v - inner)).T)
         gained = np.linalg.slogdet(np.eye(len(own)) + (covariance - v) @ sky_share)[1]
         bits = self.figures["information_bits"] - 0.5 * gained / np.log(2.0)
         information = information_given(self.information, amplitudes, precision, vector, about)
         skies, known = moved + deviations[: self.n_draws], self.known
-        if known.pointing is not None:
-            offsets = known.pointing.given(unknowns.table(moved, left))
-            known = replace(known, pointing=offsets)
+        if known.pointing is not None and known.pointing.offsets is not None:
+            known = replace(known, pointing=known.pointing.given(unknowns.table(moved, left)))
         return channel_result(
             known,
             moved,
@@ -493,9 +491,9 @@ def map_channels(
     """Work out all channels, going on from what an interrupted run has left in ``folder``.
 
     Where channels share unknowns, each is worked out alone, and then given what the others tell of
-    its instrument. A channel that cannot be mapped leaves the others as they are: it
-    is named in the result, and a joint posterior is that of the others. Of a single frequency
-    nothing unfinished is kept.
+    its instrument. A channel that cannot be mapped leaves the others as they are: it is named in
+    the result, and a joint posterior is that of the others. Of a single frequency nothing
+    unfinished is kept.
 
     Parameters
     ----------
