@@ -260,8 +260,9 @@ def model_to_sample(
 
 def true_values(setup: Setup) -> Truth:
     """True values of what simulated data hold, by the names of their sites."""
-    key, truth = jax.random.key(setup.scenario.seed), {}
+    truth: Truth = {}
     for cls, section in present(SYSTEMATICS, setup.scenario):
+        key = jax.random.key(cls.true_seed(section, setup.scenario))
         truth |= cls.truth(section, setup, key)
     return truth
 

@@ -23,6 +23,7 @@ from lusee_bayes.experiment import instrument_sections, sky_sections
 from lusee_bayes.flight.recipe import FlightSection
 from lusee_bayes.systematics.registered import SYSTEMATICS, NoiseSection
 from lusee_bayes.systematics.sources import SourcesSection
+from lusee_bayes.systematics.systematic import present
 
 
 def apply_override(tree: dict[str, Any], override: str) -> None:
@@ -183,6 +184,9 @@ class Scenario(Section):
         What is written on request.
     seed : int
         Seed of simulated data and of draws.
+    instrument_seed : int
+        Seed of what channels share of the instrument in simulated data; by default ``seed``.
+        Channels of a run of several frequencies have that of the run.
     """
 
     frequency_mhz: Frequency = 25.0
@@ -201,6 +205,7 @@ class Scenario(Section):
     flight: FlightSection | None = None
     output: OutputSection = OutputSection()
     seed: Seed = 1
+    instrument_seed: Seed | None = None
 
     @field_validator("nside")
     @classmethod
@@ -243,7 +248,8 @@ class Scenario(Section):
                 "the files of the prior are of one frequency; with frequencies_mhz, say which in "
                 "prior.file_frequency_mhz"
             )
-        if self.joint and self.ties_receivers:
+        receiver = self.noise.receiver
+        if self.joint and is_modelled(receiver) and receiver.smooth_octaves is not None:
             raise ValueError(
                 "noise.receiver.smooth_octaves ties the receivers of channels that have a "
                 "posterior each; with joint, leave it out"
@@ -251,11 +257,16 @@ class Scenario(Section):
         return self
 
     @property
-    def ties_receivers(self) -> bool:
-        """Whether receivers' powers of several frequencies are inferred as smooth spectra."""
-        receiver = self.noise.receiver
-        smooth = is_modelled(receiver) and receiver.smooth_octaves is not None
-        return smooth and bool(self.frequencies_mhz)
+    def shared(self) -> dict[str, float]:
+        """What channels with posteriors of their own share of the instrument: words and octaves."""
+        if self.joint or not self.frequencies_mhz:
+            return {}
+        found = {
+            cls.words: cls.octaves(section)
+            for cls, section in present(SYSTEMATICS, self)
+            if cls.treatment(self) != "ignored"
+        }
+        return {words: octaves for words, octaves in found.items() if octaves}
 
     def with_section(self, name: str, **values: object) -> Scenario:
         """The scenario with some values of a section changed."""
@@ -272,12 +283,9 @@ class Scenario(Section):
         alone: dict[str, Any] = {"frequencies_mhz": (), "joint": False}
         if self.joint:  # theirs is the spectral prior, of the sky's own C_ell
             alone["prior"] = sky_sections.IsotropicPriorSection(spectrum="sky")
-        receiver = self.noise.receiver
-        if receiver is not None and receiver.smooth_octaves is not None:
-            # one function, of which each channel sees a value
-            seed = self.seed if receiver.smooth_seed is None else receiver.smooth_seed
-            shared = receiver.model_copy(update={"smooth_seed": seed})
-            alone["noise"] = self.noise.model_copy(update={"receiver": shared})
+        alone["instrument_seed"] = (
+            self.seed if self.instrument_seed is None else self.instrument_seed
+        )
         return tuple(
             self.model_copy(update={**alone, "frequency_mhz": f, "seed": self.seed + number})
             for number, f in enumerate(self.frequencies_mhz)

@@ -14,7 +14,8 @@ Of clock and pointing, the offsets of the model are told, and which each day pre
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -175,15 +176,19 @@ def _line(name: str, row: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Unknowns:
-    """What some data tell of receivers, ground and gain table, given the sky.
+    """What some data tell of the instrument given the sky: what reports list, and what is shared.
 
     Attributes
     ----------
     rows : tuple of dict
-        Of each: unknown, unit, prior, prior_std, ``expected`` (the prior mean in N) and, if known,
-        true.
+        Of each: unknown, unit, prior, prior_std, ``expected`` (the prior mean in N), ``listed``
+        (whether it is in the table: clock and pointing have one of their own) and, if known, true.
     amplitudes : AmplitudesOfSky
         Of all of them, about ``expected``.
+    expected : (n,) array
+        In prior standard deviations.
+    octaves : (n,) array
+        Over which channels share them (:meth:`.Systematic.octaves`).
     names : tuple of str
         Of what may look like a uniform sky: powers and temperatures, and what all errors of gains
         have in common.
@@ -195,6 +200,8 @@ class Unknowns:
 
     rows: tuple[dict[str, Any], ...]
     amplitudes: AmplitudesOfSky
+    expected: Float[np.ndarray, " n"]
+    octaves: Float[np.ndarray, " n"]
     names: tuple[str, ...]
     parts: Float[np.ndarray, "parts n"]
     sky_std: float
@@ -209,26 +216,38 @@ class Unknowns:
         found : Inference
             Of these data alone.
         """
-        listed = [s for s in found.expanded if not s.systematic.has_table]
-        if not listed:
+        scenario, held, octaves, alike = experiment.scenario, [], [], []
+        for part in found.expanded:
+            own, none = part.systematic, ((), np.zeros((0, len(part.expected))))
+            over = own.octaves(attrgetter(own.key)(scenario))
+            if over or not own.has_table:
+                held.append(part)
+                octaves.append(np.full(len(part.expected), over))
+                alike.append(none if own.has_table else own.like_the_sky())
+        if not held:
             return None
-        data, columns = experiment.data, np.concatenate([s.columns for s in listed], axis=1)
+        data, columns = experiment.data, np.concatenate([s.columns for s in held], axis=1)
         # of spectra, the sky behind them may be known, but not what the scenario would have drawn
         known = data.truth is not None and data.calibration is None
-        rows = before_data(listed, true_values(experiment.setup) if known else None)
-        alike = [s.systematic.like_the_sky() for s in listed]
+        rows = before_data(held, true_values(experiment.setup) if known else None)
         return cls(
             tuple(rows.to_dict("records")),
             amplitudes_of_sky(found.solution, columns),
+            np.concatenate([s.expected for s in held]),
+            np.concatenate(octaves),
             tuple(name for names, _ in alike for name in names),
             block_diag(*(parts for _, parts in alike)),
             float(np.sqrt(np.asarray(found.model.prior.variance())[0])),
         )
 
+    def table(self, mean: Modes, covariance: ModesMatrix) -> pd.DataFrame:
+        """All of them with value and std, the sky integrated out; parameters are of the report."""
+        return given_data(pd.DataFrame(self.rows), self.amplitudes.integrated(mean, covariance))
+
     def report(
         self, mean: Modes, covariance: ModesMatrix, *, joint: bool = False
-    ) -> UnknownsReport:
-        """What is told of them with the sky integrated out.
+    ) -> UnknownsReport | None:
+        """What is told of those that are listed, the sky integrated out; None without any.
 
         Parameters
         ----------
@@ -237,8 +256,10 @@ class Unknowns:
         joint : bool
             It is also that of other data: no null direction is looked for.
         """
-        told = self.amplitudes.integrated(mean, covariance)
-        rows = given_data(pd.DataFrame(self.rows), told)
+        told, rows = self.amplitudes.integrated(mean, covariance), self.table(mean, covariance)
+        rows = rows[rows["listed"]]
+        if rows.empty:
+            return None
         null = None if joint else self._null_direction(told, float(covariance[0, 0]))
         common = None
         if COMMON_GAIN in self.names:
@@ -267,8 +288,8 @@ def before_data(parts: Sequence[Expanded], truth: Truth | None) -> pd.DataFrame:
     Returns
     -------
     DataFrame
-        A row for each: unknown, unit, prior, prior_std, ``expected`` (the prior mean in N) and, if
-        known, true.
+        A row for each: unknown, unit, prior, prior_std, ``expected`` (the prior mean in N),
+        ``listed`` and, if known, true.
     """
     tables = []
     for part in parts:
@@ -280,7 +301,8 @@ def before_data(parts: Sequence[Expanded], truth: Truth | None) -> pd.DataFrame:
             "true": {} if truth is None else own.true(truth),
         }
         table = pd.DataFrame({name: values for name, values in columns.items() if values})
-        tables.append(table.rename_axis("unknown").reset_index().assign(unit=own.unit))
+        table = table.rename_axis("unknown").reset_index()
+        tables.append(table.assign(unit=own.unit, listed=not own.has_table))
     return pd.concat(tables, ignore_index=True)
 
 
@@ -321,6 +343,12 @@ class PointingReport:
 
     offsets: pd.DataFrame | None
     preferred: pd.DataFrame
+
+    def given(self, told: pd.DataFrame) -> PointingReport:
+        """The same with the value and std of each offset that a table of unknowns has."""
+        told, table = told.set_index("unknown"), self.offsets
+        columns = {name: table["offset"].map(told[name]) for name in ("value", "std")}
+        return replace(self, offsets=table.assign(**columns))
 
     def lines(self) -> list[str]:
         """One line for every offset."""

@@ -8,7 +8,11 @@ under the model, and C that of the sky, ::
     covariance = 1 - T^T K^-1 T = 1 - T^T N^-1 T + P C P^T,        P = T^T N^-1 A,
     Cov(m, amplitudes) = -S A^T K^-1 T = -C P^T.
 
-A is not formed.
+A is not formed. Data may tell an amplitude to 1e-6: 1 - T^T N^-1 T would have no digits left. With
+U of N = N_0 + U U^T (:mod:`.covariance`), of which T is some columns, and V = L_0^-1 U, nothing is
+subtracted::
+
+    N^-1 U = L_0^-T V (1 + V^T V)^-1,    1 - U^T N^-1 U = (1 + V^T V)^-1.
 
 *Patterns* of unknown strength beside a sky, such as point sources, are integrated out and put back,
 ::
@@ -24,16 +28,22 @@ and given d, g ~ N(K^-1 T v(d + sum_j t_j), K^-1).
 
 *Tied amplitudes* of several channels: channel k has amplitudes z_k, N(0, 1) when it is worked out,
 and its posterior of them is N(E_k, V_k). Its likelihood is then exp(-z^T (V_k^-1 - 1) z / 2 + z^T
-V_k^-1 E_k) up to a factor. Let the prior of all of them be N(0, K x 1) instead: K_kk = 1 ties the
-channels' values of one amplitude, and different amplitudes are independent. With K = R R^T and z =
-R w, w ~ N(0, 1), ::
+V_k^-1 E_k) up to a factor. Let the prior be another one, under which different amplitudes are
+independent, and the channels' values of amplitude i are N(0, K_i) with ones on the diagonal: all
+ones where it is one and the same for all. With the diagonal of all K_i = R R^T and z = R w, w ~
+N(0, 1), ::
 
     Lambda = 1 + sum_k R_k^T (V_k^-1 - 1) R_k,    mean of w = Lambda^-1 sum_k R_k^T V_k^-1 E_k,
 
-which needs no inverse of K. What follows for channel k, N(E'_k, V'_k), is its own posterior times
-exp(-z^T Q z / 2 + q^T z), which is what the other channels tell of its amplitudes: ::
+which needs no inverse of K_i: R has as many columns as these have eigenvalues above rounding, one
+where all are ones. What follows for channel k, N(E'_k, V'_k), is its own posterior times
+exp(-x^T Q x / 2 + q^T x), x = z - E', which is what the other channels tell of its amplitudes: ::
 
-    Q = V'^-1 - V^-1,    q = V'^-1 E' - V^-1 E.
+    Q = V'^-1 - V^-1,    q = V^-1 (E' - E).
+
+Where N has a prior mean e to make up for the volume of skies (:mod:`.systematic`), z^T e is part of
+the likelihood, the volume at that z, and not of the prior: all this holds with the E of N(e, 1).
+About e, as an :class:`Amplitudes` is, E - e and E' - e take the places of E and E'.
 """
 
 from __future__ import annotations
@@ -43,6 +53,7 @@ from dataclasses import dataclass, replace
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
+from scipy.linalg import cho_solve
 
 from lusee_bayes.core.arrays import Array, Modes, ModesMatrix, Square, Vector
 from lusee_bayes.core.checks import require_shape
@@ -50,6 +61,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky, solve_lower
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.linear_gaussian import Solution
+from lusee_bayes.noise.covariance import LowRankFactor
 
 
 @dataclass(frozen=True)
@@ -111,20 +123,20 @@ class AmplitudesOfSky:
             with_sky,
         )
 
-    def given(self, precision: Square, vector: Vector) -> AmplitudesOfSky:
-        """Take in what is known of the amplitudes besides: exp(-z^T Q z / 2 + q^T z).
+    def given(self, precision: Square, vector: Vector, about: Vector) -> AmplitudesOfSky:
+        """Take in what is known of the amplitudes besides: exp(-x^T Q x / 2 + q^T x), x = z - t.
 
         Parameters
         ----------
         precision : (n, n) array
             Q.
-        vector : (n,) array
-            q.
+        vector, about : (n,) array
+            q and t.
         """
         kept = np.linalg.inv(np.eye(len(vector)) + self.covariance @ precision)
         covariance = kept @ self.covariance
         return AmplitudesOfSky(
-            self.mean + covariance @ (vector - precision @ self.mean),
+            self.mean + covariance @ (vector - precision @ (self.mean - about)),
             kept @ self.pull,
             covariance,
             self.reference,
@@ -140,17 +152,27 @@ def amplitudes_of_sky(solution: Solution, templates: Float[Array, "data n"]) -> 
         Of a model with ``templates @ templates.T`` in its noise. Its posterior mean becomes the
         reference sky: differences from it keep their digits.
     templates : (data, n) array
-        T, in K.
+        T, columns of what N has, in K.
 
     Raises
     ------
     InputError
         If N is not positive definite.
     """
-    model, t = solution.model, np.asarray(templates)
-    solved = np.asarray(solution.factor.solve(t))
-    pull = np.asarray(model.coupling.transpose_mv(solved)).T
-    mean, covariance = t.T @ solution.weighted_residual(), np.eye(t.shape[1]) - t.T @ solved
+    model, t, factor = solution.model, np.asarray(templates), solution.factor
+    if isinstance(factor, LowRankFactor):
+        root = np.asarray(model.noise.update.root)
+        at: list[int] = []
+        for column in t.T:  # two may be alike
+            found = np.flatnonzero((root == column[:, None]).all(0))
+            at.append(next(int(k) for k in found if k not in at))
+        left = cho_solve((np.asarray(factor.lower), True), np.eye(root.shape[1])[:, at])
+        solved, covariance = factor.base.whiten_transpose(factor.v @ left), left[at]
+    else:
+        solved = np.asarray(factor.solve(t))
+        covariance = np.eye(t.shape[1]) - t.T @ solved
+    pull = np.asarray(model.coupling.transpose_mv(np.asarray(solved))).T
+    mean = t.T @ solution.weighted_residual()
     return AmplitudesOfSky(mean, pull, covariance, solution.posterior.mean)
 
 
@@ -285,19 +307,22 @@ class Tied:
         Of all channels together.
     log_evidence : float
         ln p of all data, less the sum of the channels' ln p with amplitudes of N(0, 1).
+    names : tuple of str
+        Of the amplitudes, where they have some.
     """
 
     mean: Float[np.ndarray, "channels n"]
     covariance: Float[np.ndarray, "channels n n"]
     draws: Float[np.ndarray, "draws channels n"]
     log_evidence: float
+    names: tuple[str, ...] = ()
 
 
 def tie(
     mean: Float[np.ndarray, "channels n"],
     covariance: Float[np.ndarray, "channels n n"],
-    kernel: Float[np.ndarray, "channels channels"],
-    normals: Float[np.ndarray, "draws white"],
+    kernels: Float[np.ndarray, "n channels channels"],
+    normals: Float[np.ndarray, "draws most"],
 ) -> Tied:
     """Give amplitudes that were independent from channel to channel a prior that ties them.
 
@@ -305,10 +330,10 @@ def tie(
     ----------
     mean, covariance : (channels, n) and (channels, n, n) array
         E and V: of each channel's own data, with amplitudes of N(0, 1).
-    kernel : (channels, channels) array
-        K, with ones on its diagonal; it may be singular.
+    kernels : (n, channels, channels) array
+        K_i, with ones on their diagonals; they may be singular.
     normals : (draws, channels * n) array
-        Standard normals, of which draws are made.
+        Standard normals, of which draws are made; as many of each as R has columns are used.
 
     Raises
     ------
@@ -318,12 +343,15 @@ def tie(
     n_channels, n = mean.shape
     if not (np.linalg.eigvalsh(covariance) > 0).all():
         raise InputError(
-            "the data tell the powers of receivers better than rounding lets their covariance be "
-            "known; leave out noise.receiver.smooth_octaves"
+            "the data of a channel tell what it shares with others better than rounding lets the "
+            "covariance be known; map the channels one by one"
         )
-    strength, vectors = np.linalg.eigh(kernel)
-    root = np.kron(vectors * np.sqrt(np.maximum(strength, 0.0)), np.eye(n))
-    blocks = root.reshape(n_channels, n, -1)
+    strengths, vectors = np.linalg.eigh(kernels)
+    number, kept = np.nonzero(strengths > strengths.max() * n_channels * np.finfo(float).eps)
+    blocks = np.zeros((n_channels, n, len(kept)))
+    values = vectors[number, :, kept] * np.sqrt(strengths[number, kept])[:, None]
+    blocks[:, number, np.arange(len(kept))] = values.T
+    root = blocks.reshape(n_channels * n, -1)
     told = np.linalg.inv(covariance)
     pulled = np.einsum("kij,kjw->kiw", told - np.eye(n), blocks)
     precision = np.eye(root.shape[1]) + root.T @ pulled.reshape(root.shape)
@@ -336,7 +364,7 @@ def tie(
         white = white + step[:, 0]
         z = (root @ white).reshape(mean.shape)
     half = solve_lower(lower, root.T, transpose=False).T.reshape(n_channels, n, -1)
-    draws = solve_lower(lower, normals.T, transpose=True).T @ root.T
+    draws = solve_lower(lower, normals[:, : len(kept)].T, transpose=True).T @ root.T
     off = mean - z
     quadratic = np.einsum("ki,kij,kj->", off, told, off) - (z**2).sum() + white @ white
     log_dets = np.linalg.slogdet(covariance)[1].sum() + 2.0 * np.log(np.diagonal(lower)).sum()
@@ -351,21 +379,26 @@ def tie(
 def told_by_others(
     mean: Vector, covariance: Square, tied_mean: Vector, tied_covariance: Square
 ) -> tuple[Square, Vector]:
-    """Q and q of one channel, from its own posterior and that given all data."""
-    own, tied = np.linalg.inv(covariance), np.linalg.inv(tied_covariance)
-    return tied - own, own @ (tied_mean - mean) + (tied - own) @ tied_mean
+    """Q and q of one channel about E', from its own posterior and that given all data."""
+    own = np.linalg.inv(covariance)
+    return np.linalg.inv(tied_covariance) - own, own @ (tied_mean - mean)
 
 
 def information_given(
-    information: Information, amplitudes: AmplitudesOfSky, precision: Square, vector: Vector
+    information: Information,
+    amplitudes: AmplitudesOfSky,
+    precision: Square,
+    vector: Vector,
+    about: Vector,
 ) -> Information:
-    """What data say of the sky where amplitudes are known to be N((1 + Q)^-1 q, (1 + Q)^-1).
+    """What data say of the sky where amplitudes are N(0, 1) times exp(-x^T Q x / 2 + q^T x).
 
     ::
 
-        M + P^T W P,    v + P^T (1 + Q D)^-1 (Q z - q),    W = (1 + Q D)^-1 Q,
+        M + P^T W P,    v + P^T (1 + Q D)^-1 (Q x - q),    W = (1 + Q D)^-1 Q,
 
-    of z = ``amplitudes.mean``, D = ``amplitudes.covariance`` and P = ``amplitudes.pull``.
+    of x = ``amplitudes.mean`` - t, D = ``amplitudes.covariance`` and P = ``amplitudes.pull``. With
+    t where the amplitudes are, large Q leave no small differences of large numbers.
 
     Parameters
     ----------
@@ -375,17 +408,17 @@ def information_given(
         About the same reference sky.
     precision : (n, n) array
         Q.
-    vector : (n,) array
-        q.
+    vector, about : (n,) array
+        q and t.
     """
-    z, pull, inner = amplitudes.mean, amplitudes.pull, amplitudes.covariance
-    one = np.eye(len(z))
+    off, pull, inner = amplitudes.mean - about, amplitudes.pull, amplitudes.covariance
+    one, rest = np.eye(len(off)), vector - about
     mixed = one + precision @ inner
-    gradient = np.linalg.solve(mixed, vector - precision @ z)
+    gradient = np.linalg.solve(mixed, vector - precision @ off)
     weight = np.linalg.solve(mixed, precision)
-    least = z + inner @ gradient
+    least = off + inner @ gradient
     misfit = gradient @ inner @ gradient + least @ (precision @ least - 2.0 * vector)
-    misfit += vector @ np.linalg.solve(one + precision, vector)
+    misfit += rest @ np.linalg.solve(one + precision, rest) - about @ about
     log_det = np.linalg.slogdet(mixed)[1] - np.linalg.slogdet(one + precision)[1]
     return replace(
         information,

@@ -200,7 +200,7 @@ class ChannelResult(ChannelData, Described):
         Mean given this channel's data alone, where ``mean`` is given those of all.
     log_evidence, information_bits : float
         NaN for a channel of a joint posterior, where only those of all channels are known. Where
-        receivers tie channels, ln p of the channel's own data alone.
+        channels share unknowns, ln p of the channel's own data alone.
     chi2, chi2_expected : float
         Of the residuals about the mean, and its mean if the model holds.
     chi2_model : float

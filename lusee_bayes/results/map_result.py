@@ -60,12 +60,12 @@ class ChannelUnknowns:
     ----------
     reports : dict of UnknownsReport
         By frequency in MHz.
-    octaves : float or None
-        Over which receivers' spectra are smooth; None where every frequency has its own power.
+    shared : dict of float
+        What channels share, :attr:`.Scenario.shared`.
     """
 
     reports: dict[float, UnknownsReport]
-    octaves: float | None
+    shared: dict[str, float]
 
     @property
     def table(self) -> pd.DataFrame:
@@ -83,10 +83,11 @@ class ChannelUnknowns:
         counts = [f"{name} (at {k} of {n} frequencies)" for name, k in untold.items()]
         what = f"do not tell {', '.join(counts)}" if counts else "tell all of them"
         found = [f"Receivers, ground and gain table: the data {what}."]
-        if self.octaves is not None:
+        for words, octaves in self.shared.items():
+            like = "the same" if np.isinf(octaves) else f"smooth over {octaves:g} octaves"
             found.append(
-                f"Powers of receivers are smooth over {self.octaves:g} octaves: every channel is "
-                "given what the others tell of them."
+                f"Unknowns of {words} are {like} at all frequencies: every channel is given what "
+                "the others tell of them."
             )
         sentence = self._null_sentence()
         return [*found, sentence] if sentence else found
@@ -174,7 +175,7 @@ class MapResult(Described):
     reduced : Reduced or None
         Of flight data: the spectra behind them.
     tie_log_evidence : float
-        What smooth spectra of the receivers add to the sum of the channels' ln evidence.
+        What it adds that channels share the instrument to the sum of the channels' ln evidence.
     """
 
     scenario: Scenario
@@ -248,10 +249,8 @@ class MapResult(Described):
     @cached_property
     def unknowns(self) -> ChannelUnknowns | None:
         """Receivers, ground and gain table, where the model has them."""
-        tied = self.scenario.ties_receivers
-        octaves = self.scenario.noise.receiver.smooth_octaves if tied else None
         reports = {c.frequency_mhz: c.unknowns for c in self.channels if c.unknowns is not None}
-        return ChannelUnknowns(reports, octaves) if reports else None
+        return ChannelUnknowns(reports, self.scenario.shared) if reports else None
 
     def table(self, name: str, part: str = "") -> pd.DataFrame | None:
         """A table of all channels, or a part of what they have by that name."""
@@ -269,8 +268,8 @@ class MapResult(Described):
         if self.single:
             return ", ".join(self.channel.figures())
         kind = "each on its own" if self.joint is None else "one posterior"
-        if self.scenario.ties_receivers:
-            kind = "each on its own but for smooth spectra of receivers"
+        if self.scenario.shared:
+            kind = "each on its own but for the instrument that they share"
         parts = [f"{counted(len(self.channels), 'frequency', 'frequencies')}, {kind}"]
         crosses = [c.ell_cross for c in self.channels if c.ell_cross is not None]
         if crosses:
@@ -367,7 +366,7 @@ class MapResult(Described):
             frequencies_mhz=self.frequencies_mhz.tolist(),
             unmapped=self.gaps(),
             joint=self._joint_summary(),
-            tied=self.scenario.ties_receivers,
+            tied=bool(self.scenario.shared),
             level=self.fit.level,
             verdict=self.fit.text,
             log_evidence=self.log_evidence,

@@ -3,17 +3,23 @@
 Channels are worked out alone, and then all together where a joint posterior of component maps, or
 positive skies, are asked for, from the information of every channel.
 
-Where receivers have smooth spectra, channels are tied. What port i's power is off by, z_i(f) in
-prior standard deviations, is a Gaussian process::
+Channels share the instrument. What an unknown is off by, z(f) in prior standard deviations, is a
+Gaussian process over frequency, independent of other unknowns, ::
 
-    K(f, f') = exp(-(log2 f - log2 f')^2 / (2 smooth_octaves^2)),    ports independent.
+    K(f, f') = exp(-(log2 f - log2 f')^2 / (2 octaves^2)),
 
-A channel alone has z ~ N(0, 1), as its diagonal says. Its posterior of sky m and powers z, with
-means E and covariance V of z, becomes that given all data (:mod:`.amplitudes`) by ::
+of the octaves that its systematic says (:meth:`.Systematic.octaves`): those of smooth spectra of
+receivers, infinitely many for antennas, clock, pointing and horizon, which have one value, none for
+gains, ground and whatever else is each channel's own. A channel alone has z ~ N(0, 1), as the
+diagonal says. Its posterior of sky m and z, with means E and covariance V of z, becomes that given
+all data (:mod:`.amplitudes`) by ::
 
     mean of m + G (E' - E),    covariance of m + G (V' - V) G^T,    G = Cov(m, z) V^-1,
 
-since m depends on other channels through z alone, and so do ground and gains.
+since m depends on other channels through z alone, and so does all else that is not known. Unknowns
+are tied by name; a channel without one tells nothing of it. Each channel is to first order about
+what its own data tell. The tied values are within about one of its own widths of that, where the
+first order holds as well as for the channel alone.
 
 Unfinished work is kept in files: ``DIR/channels/25.information.nc`` holds what its data say,
 ``25.alone.nc`` its posterior given its own data, ``25.result.nc`` that given all. So memory stays
@@ -37,6 +43,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lusee_bayes.core import formats
+from lusee_bayes.core.arrays import Square, Vector
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.formats import says
@@ -57,7 +64,6 @@ from lusee_bayes.results.map_files import information_file, read_information
 from lusee_bayes.results.map_result import Components, MapResult
 from lusee_bayes.runs.cost import measured_experiment
 from lusee_bayes.sky.spectral_prior import SpectralPrior
-from lusee_bayes.systematics.receivers import is_receiver
 
 T = TypeVar("T")
 CHANNELS = "channels"
@@ -327,7 +333,7 @@ class ChannelAlone:
     information : Information
         Of its own data, without earlier ones.
     unknowns : Unknowns
-        Receivers, ground and gain table given the sky.
+        Of the instrument, given the sky.
     mean, covariance : (modes,) and (modes, modes) array
         In K and K^2.
     deviations : (all, modes) array
@@ -359,17 +365,22 @@ class ChannelAlone:
         kept = made.covariance, deviations, len(made.draws), made.figures()
         return cls(known, own, made.unknowns, mean, *kept)
 
-    def shared(self) -> tuple[Float[np.ndarray, " ports"], Float[np.ndarray, "ports ports"], int]:
-        """E and V of the receivers' powers, in prior standard deviations; how many draws."""
+    def shared(self) -> tuple[dict[str, float], Vector, Square, int]:
+        """Names and octaves of what is shared, its E and V; how many draws."""
         told, own = self._told(), self._own()
-        return told.mean[own], told.covariance[np.ix_(own, own)], len(self.deviations)
+        octaves = dict(zip(self._names(), self.unknowns.octaves[own].tolist(), strict=True))
+        mean = (self.unknowns.expected + told.mean)[own]
+        return octaves, mean, told.covariance[np.ix_(own, own)], len(self.deviations)
 
     def _told(self) -> Amplitudes:
         return self.unknowns.amplitudes.integrated(self.mean, self.covariance)
 
-    def _own(self) -> Int[np.ndarray, " ports"]:
-        """Which unknowns are powers of receivers."""
-        return np.flatnonzero([is_receiver(row["unknown"]) for row in self.unknowns.rows])
+    def _own(self) -> Int[np.ndarray, " n"]:
+        """Which unknowns are shared."""
+        return np.flatnonzero(self.unknowns.octaves)
+
+    def _names(self) -> list[str]:
+        return [self.unknowns.rows[k]["unknown"] for k in self._own()]
 
     def given(self, tied: Tied, number: int, scenario: Scenario) -> ChannelResult:
         """The channel given all data.
@@ -377,20 +388,22 @@ class ChannelAlone:
         Parameters
         ----------
         tied : Tied
-            E', V' and draws of the powers of receivers.
+            E', V' and draws of what is shared.
         number : int
             Of the channel among those that are tied.
         scenario : Scenario
             Of the channel.
         """
-        mean, covariance, draws = tied.mean[number], tied.covariance[number], tied.draws[:, number]
+        told, own, at = self._told(), self._own(), [tied.names.index(n) for n in self._names()]
+        expected = self.unknowns.expected[own]
+        mean, draws = tied.mean[number, at] - expected, tied.draws[:, number, at] - expected
+        covariance = tied.covariance[number][np.ix_(at, at)]
         key = jax.random.fold_in(draw_key(scenario), TIED + 1)
-        told, own = self._told(), self._own()
         e, v = told.mean[own], told.covariance[np.ix_(own, own)]
         gain = np.linalg.solve(v, told.with_sky[:, own].T).T
         moved = self.mean + gain @ (mean - e)
         left = self.covariance + gain @ (covariance - v) @ gain.T
-        # powers that go with the channel's own draws, less their mean
+        # values that go with the channel's own draws, less their mean
         amplitudes = self.unknowns.amplitudes
         inner = amplitudes.covariance[np.ix_(own, own)]
         normals = np.asarray(jax.random.normal(key, (len(self.deviations), len(own))))
@@ -400,16 +413,19 @@ class ChannelAlone:
         deviations = self.deviations + (draws - mean - with_them) @ gain.T
         # what the other channels tell of this one's unknowns
         n = len(amplitudes.mean)
-        precision, vector = np.zeros((n, n)), np.zeros(n)
+        precision, vector, about = np.zeros((n, n)), np.zeros(n), np.zeros(n)
         precision[np.ix_(own, own)], vector[own] = told_by_others(e, v, mean, covariance)
-        unknowns = replace(self.unknowns, amplitudes=amplitudes.given(precision, vector))
+        about[own] = mean
+        unknowns = replace(self.unknowns, amplitudes=amplitudes.given(precision, vector, about))
         sky_share = np.linalg.solve(v, (np.linalg.solve(v, v - inner)).T)
         gained = np.linalg.slogdet(np.eye(len(own)) + (covariance - v) @ sky_share)[1]
         bits = self.figures["information_bits"] - 0.5 * gained / np.log(2.0)
-        information = information_given(self.information, amplitudes, precision, vector)
-        skies = moved + deviations[: self.n_draws]
+        information = information_given(self.information, amplitudes, precision, vector, about)
+        skies, known = moved + deviations[: self.n_draws], self.known
+        if known.pointing is not None and known.pointing.offsets is not None:
+            known = replace(known, pointing=known.pointing.given(unknowns.table(moved, left)))
         return channel_result(
-            self.known,
+            known,
             moved,
             left,
             skies,
@@ -423,15 +439,15 @@ class ChannelAlone:
 def kernel(
     frequencies_mhz: Float[np.ndarray, " channels"], octaves: float
 ) -> Float[np.ndarray, "channels channels"]:
-    """K of the module's equations, with a port's values at all frequencies."""
+    """K of the module's equations, with an unknown's values at all frequencies."""
     x = np.log2(frequencies_mhz) / octaves
     return np.exp(-0.5 * (x[:, None] - x[None]) ** 2)
 
 
-def tie_receivers(
+def tie_channels(
     scenario: Scenario, frequencies_mhz: Sequence[float], shared: Sequence[tuple]
 ) -> Tied:
-    """The receivers' powers given the data of all channels, from what is kept of each alone.
+    """What channels share given the data of all of them, from what is kept of each alone.
 
     Parameters
     ----------
@@ -447,11 +463,18 @@ def tie_receivers(
     InputError
         As :func:`.tie`.
     """
-    means, covariances, (n_draws, *_) = zip(*shared, strict=True)
-    own = jax.random.fold_in(draw_key(scenario), TIED)
-    normals = np.asarray(jax.random.normal(own, (n_draws, sum(map(len, means)))))
-    ties = kernel(np.array(frequencies_mhz), scenario.noise.receiver.smooth_octaves)
-    return tie(np.stack(means), np.stack(covariances), ties, normals)
+    octaves = {name: over for one in shared for name, over in one[0].items()}
+    names, n_channels = tuple(octaves), len(shared)
+    # data that tell nothing of what they do not have
+    mean = np.zeros((n_channels, len(names)))
+    covariance = np.tile(np.eye(len(names)), (n_channels, 1, 1))
+    for number, (held, own_mean, own_covariance, _) in enumerate(shared):
+        at = [names.index(name) for name in held]
+        mean[number, at], covariance[number][np.ix_(at, at)] = own_mean, own_covariance
+    key = jax.random.fold_in(draw_key(scenario), TIED)
+    normals = np.asarray(jax.random.normal(key, (shared[0][-1], mean.size)))
+    kernels = [kernel(np.array(frequencies_mhz), over) for over in octaves.values()]
+    return replace(tie(mean, covariance, np.stack(kernels), normals), names=names)
 
 
 def map_channels(
@@ -467,10 +490,10 @@ def map_channels(
 ) -> MapResult:
     """Work out all channels, going on from what an interrupted run has left in ``folder``.
 
-    Where receivers have smooth spectra, each channel is worked out alone, and then given what the
-    others tell of its receivers. A channel that cannot be mapped leaves the others as they are: it
-    is named in the result, and a joint posterior is that of the others. Of a single frequency
-    nothing unfinished is kept.
+    Where channels share unknowns, each is worked out alone, and then given what the others tell of
+    its instrument. A channel that cannot be mapped leaves the others as they are: it is named in
+    the result, and a joint posterior is that of the others. Of a single frequency nothing
+    unfinished is kept.
 
     Parameters
     ----------
@@ -518,7 +541,7 @@ def map_channels(
     identity = identity_of(scenario, data, truth, digest, thorough)
     files = ChannelFiles(folder.resolve(), identity)
     channels = tuple(channel.anchored() for channel in scenario.channels())
-    alone = not scenario.joint and not scenario.ties_receivers
+    alone = not scenario.joint and not scenario.shared
     kind = ChannelResult if alone else ChannelInformation if scenario.joint else ChannelAlone
 
     def observe(channel: Scenario) -> tuple | str:
@@ -550,7 +573,7 @@ def map_channels(
         n_draws = max(scenario.output.draws, N_DRAWS if data is None or truth else 0)
         components = solve_components(left, at_hand, shared, n_draws)
     elif not alone:
-        tied = tie_receivers(scenario, [channel.frequency_mhz for channel in mapped], shared)
+        tied = tie_channels(scenario, [channel.frequency_mhz for channel in mapped], shared)
 
     def finish(number: int) -> None:
         """Write the result of a channel, given what all have in common."""
@@ -563,7 +586,7 @@ def map_channels(
         files.kept(channel, ChannelResult, make)
 
     if not alone:
-        stage = "joint skies" if scenario.joint else "smooth receivers"
+        stage = "joint skies" if scenario.joint else "shared instrument"
         tasks = Tasks(finish, range(len(mapped)), [names_of((channel,)) for channel in mapped])
         engine.each(tasks, stages, stage)
     results = tuple(files.read(channel, ChannelResult) for channel in mapped)

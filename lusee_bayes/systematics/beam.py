@@ -78,6 +78,10 @@ class BeamErrors(Systematic):
         return bool(section.parameters)
 
     @classmethod
+    def octaves(cls, section: BeamErrorSection) -> float:
+        return np.inf if section.parameters else 0.0
+
+    @classmethod
     def build(cls, section: BeamErrorSection, setup: Setup, around: Around) -> BeamErrors:
         if not section.parameters:
             return BeamError(setup.instrument.coupling_of(difference_of_beams(section, setup)))
@@ -238,9 +242,10 @@ class InstrumentParameters(ChangedBeams, BeamErrors):
 
 def true_beams(setup: Setup) -> ProductBeams:
     """The beams that simulated data are taken with."""
-    section, key = setup.scenario.noise.beam, jax.random.key(setup.scenario.seed)
+    section = setup.scenario.noise.beam
     if section is None:
         return setup.beams
+    key = jax.random.key(BeamErrors.true_seed(section, setup.scenario))
     return BeamErrors.moved(section, setup, BeamErrors.truth(section, setup, key)).beams
 
 

@@ -167,6 +167,10 @@ class Horizon(ChangedBeams):
     moon_k: float = eqx.field(static=True)
 
     @classmethod
+    def octaves(cls, section: HorizonSection) -> float:
+        return np.inf
+
+    @classmethod
     def build(cls, section: HorizonSection, setup: Setup, around: Around) -> Horizon:
         source, beams, whole = setup.beam_source, setup.beams, HemisphereGrid.for_lmax(0)
         ahead = np.radians(np.array(setup.observation.turntable_deg))[:, None]

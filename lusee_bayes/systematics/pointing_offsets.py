@@ -145,6 +145,10 @@ class PointingOffsets(Systematic):
         return section.around == "posterior"
 
     @classmethod
+    def octaves(cls, section: PointingSection) -> float:
+        return np.inf
+
+    @classmethod
     def build(cls, section: PointingSection, setup: Setup, around: Around) -> PointingOffsets:
         names = offset_names(section.kinds, setup.observation.n_runs)
         stds = {name: float(getattr(section, offset_kind(name))) for name in names}

@@ -14,7 +14,7 @@ from jaxtyping import Float, PRNGKeyArray
 from pydantic import Field
 
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.section import Megahertz, Positive, Section, Seed, Treatment, requires
+from lusee_bayes.core.section import Megahertz, Positive, Section, Treatment, requires
 from lusee_bayes.instrument.beams.source import BeamSource
 from lusee_bayes.instrument.products import auto_indices
 from lusee_bayes.systematics.context import Around, Setup
@@ -42,9 +42,6 @@ class ReceiverNoiseSection(Section):
     smooth_octaves : float
         What a port's power is off by is a smooth function of frequency, which forgets itself over
         so many octaves; without it, every frequency has an error of its own.
-    smooth_seed : int
-        Seed of that function in simulated data; by default the scenario's. Channels of a run of
-        several frequencies have that of the run.
     treatment : {"marginalised", "sampled", "ignored"}
         Their covariance is added to N, the powers are sampled with the map, or the model takes
         all of them for the mean.
@@ -56,7 +53,6 @@ class ReceiverNoiseSection(Section):
     reference_mhz: Megahertz = 10.0
     relative_std: Positive = 0.1
     smooth_octaves: Positive | None = None
-    smooth_seed: Seed | None = None
     treatment: Treatment = "marginalised"
 
     _one_power = requires(
@@ -93,6 +89,10 @@ class Receivers(Temperatures):
     draw: ClassVar[int] = 8
 
     @classmethod
+    def octaves(cls, section: ReceiverNoiseSection) -> float:
+        return section.smooth_octaves or 0.0
+
+    @classmethod
     def build(cls, section: ReceiverNoiseSection, setup: Setup, around: Around) -> Receivers:
         powers = section.powers(setup.beam_source, setup.frequency_mhz)
         own = np.asarray(setup.layout.product)[:, None] == auto_indices(len(powers))[None]
@@ -103,10 +103,9 @@ class Receivers(Temperatures):
     def truth(cls, section: ReceiverNoiseSection, setup: Setup, key: PRNGKeyArray) -> Truth:
         if section.smooth_octaves is None:
             return super().truth(section, setup, key)
-        shared = key if section.smooth_seed is None else jax.random.key(section.smooth_seed)
         octave = float(np.log2(setup.frequency_mhz))
         receivers = cls.build(section, setup, Around())
-        own, n = jax.random.fold_in(shared, cls.draw), len(receivers.unknowns)
+        own, n = cls.own_key(key), len(receivers.unknowns)
         return receivers.values(_smooth_spectra(own, n, octave / section.smooth_octaves))
 
 
@@ -123,8 +122,3 @@ def _smooth_spectra(key: PRNGKeyArray, n_ports: int, x: float) -> Float[np.ndarr
     waves, cosines, sines = np.asarray(jax.random.normal(key, (3, n_ports, N_WAVES)))
     values = cosines * np.cos(waves * x) + sines * np.sin(waves * x)
     return values.sum(1) / np.sqrt(N_WAVES)
-
-
-def is_receiver(name: str) -> bool:
-    """Tell whether an unknown's name is that of a receiver's power."""
-    return name.startswith("receiver_") and name.endswith("_k")

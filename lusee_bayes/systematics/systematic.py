@@ -255,6 +255,20 @@ class Systematic(eqx.Module):
         return cls.moves
 
     @classmethod
+    def octaves(cls, section: Any) -> float:
+        """Over how many octaves of frequency its unknowns keep their values.
+
+        Zero where every channel has its own, infinity where all channels share one value.
+        """
+        return 0.0
+
+    @classmethod
+    def true_seed(cls, section: Any, scenario: Any) -> int:
+        """Seed of the true values in simulated data, the instrument's where channels share them."""
+        shared = scenario.instrument_seed if cls.octaves(section) else None
+        return scenario.seed if shared is None else shared
+
+    @classmethod
     def truth(cls, section: Any, setup: Setup, key: PRNGKeyArray) -> Truth:
         """Draw the true values in simulated data from their priors, but for those that it says.
 
@@ -263,7 +277,7 @@ class Systematic(eqx.Module):
         section : Section
         setup : Setup
         key : PRNG key
-            Of the scenario's seed.
+            Of :meth:`true_seed`.
         """
         found = cls.build(section, setup, Around())
         z = np.asarray(jax.random.normal(cls.own_key(key), (len(found.names),)))

@@ -194,7 +194,7 @@ def test_simulated_receivers_have_the_covariance(response_file):
 def test_seeds_of_simulated_receivers(response_file):
     """A cube has one function; another seed, port or treatment of the scenario another, or not."""
     scenario = cube_of(response_file, NOISE, RECEIVER)
-    assert {c.noise.receiver.smooth_seed for c in scenario.channels()} == {scenario.seed}
+    assert {c.instrument_seed for c in scenario.channels()} == {scenario.seed}
     assert len({c.seed for c in scenario.channels()}) == 3
     one = four_ports(response_file, RECEIVER, "frequency_mhz=22")
     setup = set_up(scenario.channels()[2])

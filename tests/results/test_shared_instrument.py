@@ -1,0 +1,162 @@
+"""What channels share of the instrument, and smooth receivers, as one Gaussian."""
+
+import numpy as np
+import pytest
+from assertions import assert_same_map, within
+from reference_linear import Answer, random_covariance, white_posterior
+from scipy.linalg import block_diag
+from scipy.stats import multivariate_normal
+
+import lusee_bayes as lb
+from lusee_bayes.experiment.model import radiometer
+from lusee_bayes.linear.amplitudes import tie
+from lusee_bayes.runs import channels
+from lusee_bayes.runs.channels import kernel, map_channels, tie_channels
+
+FREQUENCIES, OCTAVES = np.array([15.0, 20.0, 22.0]), 0.4
+RUNS = "observation.runs=[{cycles: 1}, {cycles: 1, turntable_deg: 30}]"
+OFFSETS = "noise.pointing={turntable_deg: 0.3}"
+SMALL = (
+    *("frequencies_mhz=[15, 20, 22]", "lmax=5", "observation.step_s=43200.0", RUNS, OFFSETS),
+    "noise.beam={parameters: {zenith_angle_deg: 1.0, surface_permittivity: 0.2}}",
+    f"noise.receiver={{power_k: 20000, slope: -2, relative_std: 0.5, smooth_octaves: {OCTAVES}}}",
+    *("noise.radiometer.factor=1e6", "output.draws=5", "prior={model: isotropic, spectrum: sky}"),
+)
+N_MODES, SAME = 36, ["zenith_angle_deg", "surface_permittivity"]
+ANGLES = ["turntable_0_deg", "turntable_1_deg"]
+# of three values that all channels share, and of four smooth ones
+ALL = np.ones((3, 3))
+SMOOTH = np.exp(-(np.log2(FREQUENCIES[:, None] / FREQUENCIES) ** 2) / (2.0 * OCTAVES**2))
+
+
+def log_normal(y, mean, covariance) -> float:
+    return multivariate_normal.logpdf(y, mean, covariance)
+
+
+@pytest.mark.parametrize("volume", [0.0, 3.0])
+def test_ties_are_those_of_one_gaussian_of_all_amplitudes(volume):
+    """Data y = z + noise of each channel, and the volume of its skies exp(e^T z)."""
+    rng = np.random.default_rng(4)
+    noise = np.stack([0.1 * random_covariance(rng, 3) for _ in range(3)])
+    y, e = rng.normal(size=(3, 3)), volume * rng.normal(size=(3, 3))
+    covariance = np.linalg.inv(np.linalg.inv(noise) + np.eye(3))
+    mean = np.einsum("kij,kj->ki", covariance, np.linalg.solve(noise, y[..., None])[..., 0] + e)
+    kernels = np.stack([ALL, SMOOTH, ALL])
+    got = tie(mean, covariance, kernels, np.eye(9))
+    every = sum(np.kron(one, np.diag(np.eye(3)[i])) for i, one in enumerate(kernels))
+    before, known = every @ e.ravel(), every + block_diag(*noise)
+    gain = np.linalg.solve(known, every).T
+    after = every - gain @ every
+    within(got.mean.ravel(), before + gain @ (y.ravel() - before), 1e-12)
+    within(got.covariance, np.stack([after[k : k + 3, k : k + 3] for k in (0, 3, 6)]), 1e-12)
+    draws = (got.draws - got.mean).reshape(9, 9)
+    within(draws.T @ draws, after, 1e-12)
+    # one white number for each shared value
+    assert np.count_nonzero(np.abs(draws).sum(1)) == 5
+    expected = log_normal(y.ravel(), before, known) + e.ravel() @ before / 2.0
+    for own_y, own_e, own in zip(y, e, noise, strict=True):
+        expected -= log_normal(own_y, own_e, np.eye(3) + own) + own_e @ own_e / 2.0
+    assert got.log_evidence == pytest.approx(expected, abs=1e-10)
+
+
+def test_a_channel_without_an_unknown_tells_nothing_of_it():
+    scenario = lb.load_scenario("fiducial", SMALL)
+    one = {"a": np.inf, "b": np.inf}, np.array([0.5, 1.0]), np.diag([0.2, 0.1]), 4
+    other = {"a": np.inf}, np.array([0.3]), np.full((1, 1), 0.5), 4
+    tied = tie_channels(scenario, [15.0, 20.0], [one, other])
+    assert tied.names == ("a", "b")
+    # of a: 1 / 0.2 + 1 / 0.5 - 1
+    within(tied.mean, [[3.1 / 6.0, 1.0]] * 2, 1e-12)
+    within(tied.covariance, np.stack([np.diag([1.0 / 6.0, 0.1])] * 2), 1e-12)
+    within(kernel(FREQUENCIES, np.inf), ALL, 0)
+    within(kernel(FREQUENCIES, OCTAVES), SMOOTH, 1e-15)
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    return lb.load_scenario("fiducial", SMALL)
+
+
+@pytest.fixture(scope="module")
+def cube(scenario, tmp_path_factory):
+    return map_channels(scenario, tmp_path_factory.mktemp("shared"))
+
+
+@pytest.fixture(scope="module")
+def expected(scenario) -> tuple[Answer, np.ndarray]:
+    """Skies, shared values and receivers about what each channel's own data tell of them."""
+    skies, same, own, rest, noise, stds, constant = [], [], [], [], [], [], 0.0
+    expectations = []
+    for channel in scenario.channels():
+        experiment = lb.build(channel)
+        found = lb.infer(experiment)
+        columns = np.concatenate([s.columns for s in found.expanded], axis=1)
+        e = np.concatenate([s.expected for s in found.expanded])
+        told = np.concatenate([found.amplitudes(s).mean for s in found.expanded])
+        constant -= e @ (e + told)
+        skies.append(np.asarray(found.model.coupling.dense()))
+        same.append(columns[:, :4])
+        own.append(columns[:, 4:])
+        rest.append(np.asarray(experiment.data.data - found.model.offset) + columns @ e)
+        noise.append(np.sqrt(np.asarray(radiometer(experiment.setup).diagonal())))
+        stds.append(np.sqrt(np.asarray(found.model.prior.variance())))
+        expectations.append(e)
+    e = np.sum(expectations, axis=0)
+    assert np.abs(e[:4]).max() > 0.5 and not e[4:].any()
+    # volumes exp(e^T z) of all channels together make the prior's mean their sum
+    before = e[:4]
+    rows = np.concatenate([block_diag(*skies), np.concatenate(same), block_diag(*own)], axis=1)
+    unmixed = block_diag(np.eye(3 * N_MODES + 4), np.kron(np.linalg.cholesky(SMOOTH), np.eye(4)))
+    prior = np.concatenate([*stds, np.ones(16)])
+    left = np.concatenate(rest) - np.concatenate(same) @ before
+    white = white_posterior(rows @ unmixed, prior, np.concatenate(noise), left)
+    mean = unmixed @ white.mean
+    mean[3 * N_MODES :][:4] += before
+    log_prob = white.log_prob + before @ before / 2.0 + constant
+    return Answer(mean, unmixed @ white.covariance @ unmixed.T, log_prob)
+
+
+def test_skies_are_those_of_one_normal_equation(cube, expected):
+    for k, channel in enumerate(cube.channels):
+        own = slice(k * N_MODES, (k + 1) * N_MODES)
+        assert_same_map(channel, Answer(expected.mean[own], expected.covariance[own, own], 0), 1e-6)
+    assert cube.log_evidence == pytest.approx(expected.log_prob, abs=1e-4)
+    assert "but for the instrument that they share" in cube.headline()
+    assert any("Unknowns of the beams are the same at all" in line for line in cube.lines())
+
+
+def test_tables_have_the_shared_values(cube, expected):
+    shared, std = slice(3 * N_MODES, None), expected.std
+    for k, channel in enumerate(cube.channels):
+        table, offsets = channel.unknowns.table, channel.pointing.offsets
+        assert list(table["unknown"]) == [*SAME, *(f"receiver_{i}_k" for i in range(4))]
+        assert list(offsets["offset"]) == ANGLES
+        z = (table["value"] - table["prior"]) / table["prior_std"]
+        z = np.concatenate([z[:2], offsets["value"] / offsets["prior_std"], z[2:]])
+        width = (one["std"] / one["prior_std"] for one in (table[:2], offsets, table[2:]))
+        mine = np.r_[:4, 4 + 4 * k : 8 + 4 * k]
+        within((z - expected.mean[shared][mine]) / std[shared][mine], 0.0, 1e-6)
+        np.testing.assert_allclose(np.concatenate(list(width)), std[shared][mine], rtol=1e-6)
+
+
+@pytest.mark.long
+def test_eight_channels_tell_the_instrument_twice_as_well_as_the_best(tmp_path, monkeypatch):
+    stds = "surface_permittivity: 0.2, deep_permittivity: 0.3, loss_tangent: 0.002"
+    frequencies = np.linspace(10.0, 30.0, 8).round(1).tolist()
+    cube = (
+        *(f"frequencies_mhz={frequencies}", "lmax=8", "observation.step_s=21600.0", RUNS, OFFSETS),
+        f"noise.beam={{parameters: {{zenith_angle_deg: 1.0, {stds}}}}}",
+        "prior={model: isotropic, spectrum: sky}",
+    )
+    alone = []
+    monkeypatch.setattr(channels, "tie", lambda *given: alone.append(given[1]) or tie(*given))
+    made = map_channels(lb.load_scenario("fiducial", cube), tmp_path).channels
+    best = np.sqrt(np.diagonal(alone[0], axis1=1, axis2=2)).min(0)
+    tables = [(channel.unknowns.table, channel.pointing.offsets) for channel in made]
+    for own in tables:
+        std = np.concatenate([table["std"] / table["prior_std"] for table in own])
+        assert (std < 0.5 * best).all()
+        for table, first in zip(own, tables[0], strict=True):
+            assert (table["true"] == first["true"]).all()
+            assert (np.abs(table["value"] - table["true"]) < 3.5 * table["std"]).all()
+            np.testing.assert_allclose(table["value"], first["value"], rtol=1e-9)
