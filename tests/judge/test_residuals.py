@@ -20,7 +20,7 @@ from lusee_bayes.instrument.coupling import DenseCoupling
 from lusee_bayes.judge import left_out
 from lusee_bayes.judge.chi2 import FALSE_ALARM, ChiSquare, stands_out, two_sided
 from lusee_bayes.judge.left_out import KINDS, LeftOut, groups_of
-from lusee_bayes.judge.measures import data_freedom, preferences
+from lusee_bayes.judge.measures import preferences
 from lusee_bayes.judge.residuals import held_out, residuals
 from lusee_bayes.judge.split import WIDER, Split, widened
 from lusee_bayes.linear.linear_gaussian import FromInformation, InData, InMap, form_of
@@ -400,30 +400,6 @@ def test_what_the_sky_takes_up_is_not_told():
     got = preferences(model.condition(data), template)
     assert np.isnan(got.amplitude).all()
     assert np.isnan(got.std).all()
-
-
-# --- the share of each datum that the model follows -----------------------------------------------
-
-
-@pytest.mark.parametrize("dense", [0, 10**8])
-def test_it_is_the_diagonal_of_a_product_of_matrices(monkeypatch, dense):
-    """K_s K^-1 with templates and another low-rank term, five directions at once."""
-    monkeypatch.setattr("lusee_bayes.judge.measures.CHUNK", 5)
-    monkeypatch.setattr("lusee_bayes.judge.measures.DENSE", dense)
-    rng = np.random.default_rng(0)
-    a, v, other = rng.normal(size=(30, 9)), rng.normal(size=(30, 2)), rng.normal(size=(30, 1))
-    spectrum, n = np.array([4.0, 1.0, 0.3]), rng.uniform(0.5, 2.0, 30)
-    noise = lb.DiagonalCovariance(n) + LowRankCovariance(v) + LowRankCovariance(other)
-    model = lb.LinearGaussian(DenseCoupling(a), lb.HarmonicPrior(spectrum), noise)
-    signal = a @ np.diag(np.repeat(spectrum, [1, 3, 5])) @ a.T + v @ v.T
-    whole = signal + np.diag(n) + other @ other.T
-    expected = np.diag(signal @ np.linalg.inv(whole))
-    got = data_freedom(model.condition(np.zeros(30)), v)
-    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-10)
-    # without templates the sky's alone
-    bare = a @ np.diag(np.repeat(spectrum, [1, 3, 5])) @ a.T
-    got = data_freedom(model.condition(np.zeros(30)), np.zeros((30, 0)))
-    np.testing.assert_allclose(got, np.diag(bare @ np.linalg.inv(whole)), rtol=0, atol=1e-10)
 
 
 # --- groups of data left out, against A, S and N as matrices --------------------------------------
