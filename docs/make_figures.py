@@ -282,7 +282,7 @@ def regolith(folder: Path) -> None:
     wrong = ground | {"surface_permittivity": setup.scenario.beam.surface_permittivity}
 
     def fixed(values):
-        model = lb.LinearGaussian(setup.prepared.dense(values), base.prior, base.noise)
+        model = lb.LinearGaussian(setup.instrument.coupling(values), base.prior, base.noise)
         return signal_to_noise(model.condition(data.data).posterior.mean, sky)
 
     mean = tree["posterior"]["sky"].values.mean((0, 1))

@@ -84,7 +84,8 @@ def offset_posterior(found: Inference) -> tuple[dict[str, float], np.ndarray]:
     """Mean of every offset of clock and pointing by name, and their covariance in these units."""
     offsets, told = found.offsets, found.amplitudes(found.offsets)
     stds = offsets.systematic.stds
-    return offsets.systematic.in_units(told.mean), told.covariance * np.outer(stds, stds)
+    mean = offsets.systematic.in_units(offsets.expected + told.mean)
+    return mean, told.covariance * np.outer(stds, stds)
 
 
 def of_run(data: lb.Visibilities, run: int) -> lb.Visibilities:

@@ -179,7 +179,7 @@ class Around:
     data: Visibilities | None = None
     visibilities: Grid | None = None
     sky: Modes | None = None
-    values: Mapping[str, float] | None = None
+    values: Mapping[str, float | Float[Array, "..."]] | None = None
     volume: tuple[Float[Array, "draws modes"], Float[Array, "draws data"]] | None = None
 
 

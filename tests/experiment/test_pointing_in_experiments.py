@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from assertions import close, refuse, within
-from experiments import offset_posterior, with_known_sky
+from experiments import density_of, offset_posterior, with_known_sky
 from scipy import stats
 
 import lusee_bayes as lb
@@ -14,6 +14,7 @@ from lusee_bayes.experiment.experiment import Experiment, program_pieces
 from lusee_bayes.experiment.model import (
     full_model,
     model_about,
+    moved,
     radiometer,
     set_up,
     simulate,
@@ -22,6 +23,7 @@ from lusee_bayes.experiment.model import (
 from lusee_bayes.experiment.unknowns import pointing_report
 from lusee_bayes.instrument.beams.monopoles import source_response
 from lusee_bayes.judge.residuals import residuals
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.sky.galaxy import galactic_unit_vector
 from lusee_bayes.systematics.context import Around, Setup
 
@@ -224,9 +226,28 @@ def test_what_cannot_be():
     ):
         setup = set_up(scenario_of(f"noise.pointing={{{section}}}", lmax=4))
         refuse(words, simulate, setup)
-    clock = "noise.pointing={clock_s: 60, treatment: sampled}"
+
+
+def test_beams_and_pointing_are_sampled_together():
+    """The density is that of antennas and angles built so, of which none is left out."""
+    pointing = "noise.pointing={turntable_deg: 0.5, tilt_east_deg: 0.5, treatment: sampled}"
     beam = "noise.beam={parameters: {height_m: 0.1}, treatment: sampled}"
-    refuse("cannot both be sampled", scenario_of, clock, beam, lmax=4)
+    experiment = lb.build(scenario_of(pointing, beam, lmax=4, step_s=86400.0))
+    setup, data = experiment.setup, experiment.data.data
+    values = {"turntable_deg": 0.4, "tilt_east_deg": -0.3, "height_m": 2.05}
+
+    def evidence(values):
+        there = moved(setup, values)
+        model = LinearGaussian(there.coupling, setup.prior, radiometer(setup), there.offset)
+        return float(model.log_prob(data))
+
+    priors = stats.norm.logpdf(list(values.values()), [0.0, 0.0, 2.0], [0.5, 0.5, 0.1]).sum()
+    # A by two routes leaves 1e-13 of the data, which are 1e5 times the noise
+    got = density_of(experiment, values)
+    assert got == pytest.approx(evidence(values) + priors, rel=1e-7)
+    for name in values:
+        others = {key: value for key, value in values.items() if key != name}
+        assert abs(evidence(others) + priors - got) > 1e-4 * abs(got), name
 
 
 def test_sources_are_seen_as_means_over_windows():

@@ -328,6 +328,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "keys.md"
 WITHIN = {
     "noise.gain": "noise.gain={}",
     "noise.beam": "noise.beam={shift_mhz: 4}",
+    "noise.fields": "noise.fields={}",
     "noise.horizon": "noise.horizon={std_deg: 1, file: horizon.csv}",
     "noise.pointing": "noise.pointing={clock_s: 60}",
     "noise.receiver": "noise.receiver={power_k: 100}",

@@ -15,9 +15,8 @@ import numpy as np
 import numpyro
 import pytest
 from assertions import refuse
-from experiments import draw_within
 from numpyro import distributions as dist
-from reference_linear import matrices, random_covariance, z_of
+from reference_linear import matrices, random_covariance
 from reference_linear import posterior as naive_posterior
 from scipy.stats import lognorm, multivariate_normal
 from small_models import assert_mean
@@ -343,46 +342,6 @@ def test_progress_is_reported_after_each_chunk_and_another_seed_makes_other_draw
     # warmup ends a chunk, and so does the run; NumPyro's own counter agrees with ours
     assert told == [(n, n) for n in (25, 50, 60, 85, 110, 130)]
     assert not np.isin(chains.sites["x"], uninterrupted.sites["x"]).any()
-
-
-# ---- chains inside a JAX program
-
-
-def in_numpyros_types():
-    return jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow")
-
-
-@pytest.mark.long
-def test_chains_within_a_program_follow_each_data_sets_posterior(gaussian):
-    """64 data sets at once. In each one's white coordinates the draws' means are independent."""
-    n_sets, sampler = 64, Sampler(warmup=100, draws=30, algorithm="hmc")
-    program, pieces = lb.load_program("sky"), lb.load_program("sky").arguments(gaussian)
-    solver = gaussian.factorise()
-
-    def one(key):
-        data_key, key = jax.random.split(key)
-        data = gaussian.sample(data_key)[1]
-        whitening = lb.Whitening.of(solver.condition(data).posterior)
-        arguments = pieces | {"data": data}
-        return data, draw_within(program.model, arguments, key, sampler, whitening, thin=2)
-
-    promotion, ranks = in_numpyros_types()
-    with promotion, ranks:
-        data, sites = jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(1), n_sets))
-    assert set(sites) == {"sky"}
-    assert sites["sky"].shape == (n_sets, 30, N_MODES)
-    textbook = matrices(gaussian)
-    z = np.empty(sites["sky"].shape)
-    for k in range(n_sets):
-        answer = naive_posterior(*textbook, data[k])
-        centred = np.asarray(sites["sky"][k]) - answer.mean
-        z[k] = np.linalg.solve(np.linalg.cholesky(answer.covariance), centred.T).T
-    i, j = np.triu_indices(N_MODES)
-    for values, expected in [(z, 0.0), (z[..., i] * z[..., j], (i == j).astype(float))]:
-        means = values.mean(1)
-        t = (means.mean(0) - expected) / (means.std(0, ddof=1) / np.sqrt(n_sets))
-        # Student's t with 63 degrees of freedom reaches a fifth further than a normal at 1e-6
-        assert np.abs(t).max() < 1.2 * z_of(t.size)
 
 
 # ---- several devices

@@ -385,7 +385,7 @@ def test_clock_and_pointing_beside_it_settle_in_the_same_rounds(response_file):
         there = moved(setup, {"turntable_deg": 0.05 * x[25]})
         seen = np.asarray(there.coupling @ (prior * x[:16])) + np.asarray(setup.offset)
         seen = seen + linear @ x[16:21]
-        force = np.concatenate([np.zeros(21), rest[-1].expected, [0.0]])
+        force = np.concatenate([np.zeros(21), rest[-1].expected, found.offsets.expected])
         return np.append((per_port(x[21:25]) * seen - d) / noise, x - force)
 
     steps = 1e-4 * np.eye(26)

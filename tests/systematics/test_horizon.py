@@ -119,8 +119,8 @@ def test_columns_are_the_derivative_of_the_effect():
     ((_, horizon),), centre = models.systematics(setup), np.linspace(-1.0, 1.0, 7)
     model, sky = models.base_model(setup), np.asarray(setup.sky.modes)
     assert np.asarray(horizon.altitude(horizon.values(centre))).min() < -0.01
-    columns = horizon.derivative(model, sky, centre)
-    close(Systematic.derivative(horizon, model, sky, centre), columns, 1e-8)
+    columns = horizon.linearised(model, centre)(sky)
+    close(Systematic.linearised(horizon, model, centre)(sky), columns, 1e-8)
     for step, column in zip(1e-3 * np.eye(7), columns.T, strict=True):
         ways = [horizon.effect(model, horizon.values(centre + s)) for s in (step, -step)]
         more, less = (np.asarray(way.predict(sky)) for way in ways)

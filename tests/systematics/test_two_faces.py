@@ -302,7 +302,7 @@ def test_columns_are_the_derivative_of_the_effect(more):
         values |= systematic.in_units(rng.normal(size=len(systematic.names)))
     model, sky = base_model(setup), setup.sky.modes
     for _, systematic in systematics(setup, Around(values=values)):
-        expanded = on_host(Expanded.about(systematic, model, sky, values))
+        expanded = on_host(Expanded.about(systematic, model, Around(sky=sky, values=values)))
         expected = differences(systematic, model, sky, expanded.centre)
         size, off = (np.linalg.norm(x, axis=0) for x in (expected, expanded.columns - expected))
         for name, size_of, off_of in zip(systematic.names, size, off, strict=True):

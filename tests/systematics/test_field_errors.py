@@ -1,0 +1,135 @@
+"""Errors of the fields: their columns and beams, what is learned of them, maps beside them."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from assertions import close
+from reference import real_harmonics
+
+import lusee_bayes as lb
+from lusee_bayes.core.sphere_grid import SphereGrid
+from lusee_bayes.experiment.model import base_model, set_up, simulate, systematics
+from lusee_bayes.instrument.beams.fields import (
+    AntennaFields,
+    HemisphereGrid,
+    mean_auto_integral,
+    stokes_beam,
+)
+from lusee_bayes.instrument.products import to_real
+from lusee_bayes.systematics.context import Setup
+from lusee_bayes.systematics.field_errors import SLOPE, STD, FieldErrors, FieldErrorsSection, of_ell
+
+TWO_RUNS = "observation.runs=[{cycles: 0.5}, {cycles: 0.5, turntable_deg: 40}]"
+
+
+def scenario(fields: str, *overrides: str, lmax: int = 4, step_s: float = 86400.0):
+    plain = [f"lmax={lmax}", f"observation.step_s={step_s}", TWO_RUNS]
+    noise = [f"noise.fields={{{fields}}}"] if fields else []
+    return lb.load_scenario("fiducial", overrides=[*plain, *noise, *overrides])
+
+
+def errors_of(fields: str) -> tuple[Setup, FieldErrors, np.ndarray]:
+    """The setup, the systematic, and unknowns away from their prior means."""
+    setup = set_up(scenario(fields))
+    ((_, errors),) = systematics(setup)
+    return setup, errors, np.random.default_rng(1).standard_normal(len(errors.names))
+
+
+def test_columns_are_the_derivative_of_the_effect():
+    """Central differences: h^2 std^2 of the slope, and rounding over the step."""
+    setup, errors, z = errors_of("lmax: 2, std: 0.03")
+    model, sky = base_model(setup), np.asarray(setup.sky.modes)
+    columns = errors.linearised(model, z)(sky)
+    assert columns.shape == (model.n_data, 2 * 4 * 9)
+    for k in np.random.default_rng(2).choice(len(z), 16, replace=False):
+        step = 1e-3 * np.eye(len(z))[k]
+        ways = (errors.effect(model, errors.values(z + s)).predict(sky) for s in (step, -step))
+        more, less = map(np.asarray, ways)
+        close((more - less) / 2e-3, columns[:, k], 1e-7)
+
+
+def test_beams_are_those_of_fields_with_errors():
+    """Fields of the antennas times exp(f), integrated where they are.
+
+    Beams up to lmax + 2 times Y up to 2 have all that enters coefficients up to lmax: only the
+    second order, half the square of an exponent of 2 std, misses beams further up. The scale is
+    that of antennas without errors.
+    """
+    std, lmax = 1e-3, 4
+    setup, errors, z = errors_of(f"lmax: 2, std: {std}")
+    values = errors.values(z)
+    grid = HemisphereGrid.gauss_legendre(48, 48)
+    theta, phi = (x.ravel() for x in np.meshgrid(grid.theta, grid.phi, indexing="ij"))
+    modes = np.concatenate(
+        [values[f"field_error_{ell}"].reshape(2, 4, 2 * ell + 1) for ell in range(3)], axis=2
+    )
+    real, imaginary = modes @ real_harmonics(theta, phi, 2).T
+    fields = setup.beam_source.fields(setup.frequency_mhz, grid)
+    factor = np.exp(real + 1j * imaginary).reshape(4, *np.shape(fields.e_theta)[1:])
+    wrong = AntennaFields(fields.e_theta * factor, fields.e_phi * factor, grid)
+    scale = mean_auto_integral(fields)
+    before, after = (
+        np.asarray(grid.modes(to_real(stokes_beam(one)) / scale, lmax)) for one in (fields, wrong)
+    )
+    nominal = np.asarray(setup.beams.modes)
+    change = np.asarray(errors.modes(nominal, values)) - nominal
+    assert np.abs(after - before).max() > std * np.abs(before).max()
+    assert np.abs(change - (after - before)).max() < (2 * std) ** 2 / 2 * np.abs(before).max()
+
+
+def test_strength_and_slope_become_those_of_the_largest_evidence():
+    """Amplitudes seen in noise: at the fixpoint, on a grid of the evidence and the expectation."""
+    section, lmax, rng = (
+        FieldErrorsSection(std=1e-3, slope=1.0, lmax=5),
+        5,
+        np.random.default_rng(3),
+    )
+    sizes = [2 * 2 * (2 * ell + 1) for ell in range(lmax + 1)]
+    scatter = 2e-3 * rng.uniform(0.5, 2.0, sum(sizes))
+    true = np.repeat(of_ell(8e-3, 2.5, lmax), sizes)
+    seen = rng.normal(size=len(true)) * np.hypot(true, scatter)
+    nothing, values = np.zeros((4, 1, 1)), {STD: section.std, SLOPE: section.slope}
+    for _ in range(60):
+        there = of_ell(values[STD], values[SLOPE], lmax)
+        errors, std = (
+            FieldErrors(there, nothing, nothing, SphereGrid.of(1, 1), section),
+            np.repeat(there, sizes),
+        )
+        variance = 1.0 / (1.0 + (std / scatter) ** 2)
+        values = errors.relearned(variance * std * seen / scatter**2, variance)
+
+    def log_evidence(std, slope):
+        variance = np.repeat(of_ell(std, slope, lmax), sizes) ** 2 + scatter**2
+        fit = -0.5 * (np.log(variance) + seen**2 / variance).sum()
+        return (
+            fit - (np.log(std / section.std) / 2.0) ** 2 / 2.0 - (slope - section.slope) ** 2 / 2.0
+        )
+
+    stds, slopes = np.geomspace(4e-3, 16e-3, 121), np.linspace(1.0, 4.0, 121)
+    evidence = np.array([[log_evidence(std, slope) for slope in slopes] for std in stds])
+    i, j = np.unravel_index(evidence.argmax(), evidence.shape)
+    assert 0 < i < 120 and 0 < j < 120
+    assert values[STD] == pytest.approx(stds[i], rel=0.012)
+    assert values[SLOPE] == pytest.approx(slopes[j], abs=0.025)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_maps_beside_errors_of_the_fields(seed):
+    """Sky and errors of twice the expected strength, drawn: the map is off by what it says."""
+    truth, *given = (
+        scenario(fields, "prior={model: isotropic}", f"seed={seed}", lmax=6, step_s=43200.0)
+        for fields in ("lmax: 2, std: 2e-3", "lmax: 2, std: 1e-3", "")
+    )
+    setup, full = set_up(truth), []
+    draw = np.asarray(setup.prior.sample(jax.random.key(seed)))
+    setup = setup.under(replace(setup.sky, modes=draw * np.sign(draw[0])))
+    data = simulate(setup)
+    for one in given:
+        found = lb.infer(lb.build(one, data=data))
+        posterior = found.posterior
+        away = posterior.prior.whiten(setup.sky.modes) - posterior.white_mean
+        full.append(np.sqrt(np.mean((np.asarray(posterior.lower).T @ away) ** 2)))
+        assert not found.unsettled
+    assert 0.75 < full[0] < 1.25 and full[1] > 5.0
