@@ -38,7 +38,7 @@ astropy_exceptions = LazyModule("astropy.utils.exceptions")
 pandas = LazyModule("pandas")
 xarray = LazyModule("xarray")
 special = LazyModule("scipy.special")
-array_stats = LazyModule("arviz_stats.base.array_stats")
+arviz_stats = LazyModule("arviz_stats.base")
 # an optional extra
 pyuvdata = LazyModule("pyuvdata")
 dist = LazyModule("numpyro.distributions")

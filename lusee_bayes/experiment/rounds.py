@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -39,7 +38,7 @@ SETTLED, MAX_ROUNDS = 1e-2, 30
 # no unknown moves further in a round, in prior standard deviations: beyond, the first order that
 # the move comes from says little
 FARTHEST = 2.0
-# skies that the volume of those that fit is estimated with; always the same ones
+# draws of noise that the volume of skies that fit is estimated with; always the same ones
 VOLUME_DRAWS = 8
 # steps that swing about where they lead to are halved, down to this part of the whole
 SHORTEST = 0.125
@@ -205,9 +204,10 @@ def _around(setup: Setup, found: Inference, step: _Step) -> tuple[Around, _Step]
                 values |= s.systematic.relearned(s.expected + told.mean, told.std**2)
         here = np.asarray(setup.sky.modes if found.around.sky is None else found.around.sky)
         sky = here + step.size * (found.posterior.mean - here)
-        draws = solution.posterior.sample(jax.random.key(0), VOLUME_DRAWS) - found.posterior.mean
-        seen = (found.model.coupling @ draw for draw in draws)
-        volume = draws, np.stack([np.asarray(solution.factor.solve(one)) for one in seen])
+        white = np.random.default_rng(0).standard_normal((found.model.n_data, VOLUME_DRAWS))
+        weighted = np.asarray(solution.factor.whiten_transpose(white))
+        skies = solution.covariance @ np.asarray(found.model.coupling.transpose_mv(weighted))
+        volume = skies.T, weighted.T
     if rebuilds_visibilities(setup):
         visibilities = prediction(moved(setup, values), found, solved)
     around = replace(found.around, visibilities=visibilities, sky=sky, values=values)

@@ -25,7 +25,7 @@ import jax
 import numpy as np
 
 from lusee_bayes.core.arrays import Modes
-from lusee_bayes.core.lazy import array_stats
+from lusee_bayes.core.lazy import arviz_stats
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import base_model, moved, systematics
 from lusee_bayes.experiment.rounds import Inference
@@ -101,7 +101,9 @@ def pareto_k(setup: Setup, data: np.ndarray, found: Inference) -> float | None:
         linear = factor.base.whiten(data - found.model.predict(sky) - columns @ a)
         prior = (a**2).sum() - ((a + expected) ** 2).sum()
         log_weights[k] = 0.5 * (linear @ linear - exact @ exact + prior)
-    return float(array_stats.psislw(-log_weights)[1])
+    with np.errstate(all="ignore"):  # one draw may have all of the weight
+        k = float(arviz_stats.array_stats.psislw(-log_weights)[1])
+    return k if np.isfinite(k) else np.inf
 
 
 @dataclass(frozen=True)
@@ -215,7 +217,7 @@ def reach(experiment: Experiment, found: Inference) -> list[str]:
         Of its data.
     """
     sentences, setup = [], experiment.setup
-    k = pareto_k(setup, experiment.data.data, found)
+    k = pareto_k(setup, np.asarray(experiment.data.data), found)
     if k is not None and k > LARGEST_K:
         keys = ", ".join(dict.fromkeys(part.systematic.key for part in found.moving))
         sentences.append(

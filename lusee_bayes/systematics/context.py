@@ -172,8 +172,8 @@ class Around:
     values : mapping of float or None
         Of the unknowns about which it is linear, by name; None for their prior means.
     volume : ((draws, modes), (draws, data)) arrays or None
-        Deviations s of skies from the mean of a posterior, in K, and N^-1 A s: what the volume of
-        skies that fit is estimated with. None before there is a posterior.
+        Skies s = C A^T w of noise alone, in K, and w = N^-1 n: what the volume of skies that fit is
+        estimated with. None before there is a posterior.
     """
 
     data: Visibilities | None = None

@@ -16,10 +16,13 @@ That mode is not where the bulk is: a larger gain and a smaller sky fit as well,
 the data determine, each gains by being smaller. With the sky integrated out, ln p(d | z) has the
 volume -ln|Lambda| / 2 besides the misfit, whose slope (Fisher's identity) is ::
 
-    g = -tr(C A^T N^-1 dA/dz) = -E[T(s)^T N^-1 A s],    s ~ N(0, C),
+    g = -tr(C A^T N^-1 dA/dz) = -E[T(s)^T w],    s = C A^T w,    w ~ N(0, N^-1),
 
 with T(s) the columns of a sky s. It is that of a prior mean of g in place of 0, with which rounds
-lead to the mode of p(z | d); a few draws of s give it to sqrt(2 / (n draws)) of itself.
+lead to the mode of p(z | d). Skies s are what maps make of noise alone: they hold what is known
+well, and a few of them give g to sqrt(2 n / draws) of the relative change of what one unknown does
+to a datum. (Draws of N(0, C) would not: an unknown that moves a mode that is not known to where
+data are seen makes them scatter without end.)
 
 Some are marginalised otherwise, by a method :meth:`Systematic.marginalised` of their own: unknowns
 that are many and Gaussian have a covariance of their own (gain drifts, :class:`AdditiveNoise`),

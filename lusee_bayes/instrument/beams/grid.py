@@ -26,12 +26,12 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.interpolate import make_interp_spline
 
 from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.checks import Described, is_traced
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.layouts import Layout, Variable
+from lusee_bayes.core.lazy import interpolate
 from lusee_bayes.core.reading import read_table
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, Interpolation, Pairs, ProductBeams
 from lusee_bayes.instrument.beams.sampled import read_beam
@@ -188,7 +188,7 @@ def weights_along(nodes: Nodes, value: float | Float[Array, ""]) -> Float[Array,
     """
     n, xp = len(nodes), namespace(value)
     degree = n - 1 if n <= MOST_IN_ONE else 3
-    spline = make_interp_spline(nodes, np.eye(n), k=degree)
+    spline = interpolate.make_interp_spline(nodes, np.eye(n), k=degree)
     starts = np.unique(spline.t)[:-1]
     # Taylor's coefficients of every weight, at the start of every piece
     taylor = np.stack([spline(starts, nu=d) / factorial(d) for d in range(degree + 1)], axis=1)

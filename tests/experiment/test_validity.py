@@ -1,0 +1,117 @@
+"""What a map leaves out, and which errors of the instrument it would not show."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import lusee_bayes as lb
+from lusee_bayes.experiment import validity
+from lusee_bayes.experiment.model import base_model, moved, set_up
+from lusee_bayes.experiment.rounds import Inference, model_about
+from lusee_bayes.systematics.context import Around
+
+ISOTROPIC = "prior={model: isotropic}"
+
+
+def scenario_of(*overrides, lmax, step_s):
+    size = [f"lmax={lmax}", f"observation.step_s={step_s}"]
+    return lb.load_scenario("fiducial", [*size, *overrides])
+
+
+@pytest.fixture(scope="module")
+def plain():
+    experiment = lb.build(scenario_of(ISOTROPIC, lmax=6, step_s=43200.0))
+    return experiment, lb.infer(experiment)
+
+
+@pytest.fixture(scope="module")
+def spots(plain):
+    experiment, found = plain
+    made = validity.blind_spots(experiment.setup, found, found.posterior.mean)
+    return {spot.name: spot for spot in made}
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("surface_permittivity", {"surface_permittivity": 3.7 * 1.01}),
+        ("tilt_north_deg", {"tilt_north_deg": 0.1}),
+    ],
+)
+def test_what_an_error_does_is_what_it_does_to_data(plain, spots, name, values):
+    """Data with the error in them, mapped without it; chi^2 of what no sky of any size explains.
+
+    The first order leaves out 1 % of an error of 1 %; a prior 100 times as wide is none to 1e-4 of
+    what the data determine, and to 1 % of what they hardly do.
+    """
+    experiment, found = plain
+    section = {"surface_permittivity": "beam={parameters: {surface_permittivity: 0.1}}"}
+    scenario = scenario_of(
+        ISOTROPIC,
+        "noise." + section.get(name, "pointing={tilt_north_deg: 1}"),
+        lmax=6,
+        step_s=43200.0,
+    )
+    sky, off = found.posterior.mean, moved(set_up(scenario), values)
+    more = np.asarray(off.coupling @ sky) - np.asarray(experiment.setup.coupling @ sky)
+    d = np.asarray(experiment.data.data)
+    shift = found.model.condition(d + more).posterior.mean - found.model.condition(d).posterior.mean
+    c = np.asarray(found.posterior.covariance())
+    bias = np.sqrt(shift @ np.linalg.solve(c, shift) / len(sky))
+    assert spots[name].bias == pytest.approx(bias, rel=0.03)
+    std = np.sqrt(np.asarray(found.model.noise.diagonal()))
+    a, white = np.asarray(found.model.coupling.dense()) / std[:, None], more / std
+    left = white - a @ np.linalg.lstsq(a, white, rcond=None)[0]
+    degrees = len(d) - len(sky)
+    assert spots[name].shown == pytest.approx(left @ left / np.sqrt(2.0 * degrees), rel=0.05)
+
+
+def test_a_clock_that_is_off_turns_the_sky_alone(spots):
+    """No residual shows it, however far it moves the map."""
+    assert spots["clock_s"].bias > 0.1 and spots["clock_s"].shown < validity.NOTHING
+
+
+def test_what_is_an_unknown_is_no_blind_spot():
+    given = "noise.beam={parameters: {surface_permittivity: 0.1}}", "noise.fields={lmax: 1}"
+    setup = set_up(scenario_of(ISOTROPIC, *given, lmax=4, step_s=86400.0))
+    model, held = model_about(setup, Around())
+    found = Inference(model.condition(np.zeros(model.n_data)), held, 1, Around())
+    names = [one.name for one in validity.blind_spots(setup, found, setup.sky.modes)]
+    assert "deep_permittivity" in names
+    assert not {"surface_permittivity", validity.FIELDS_NAME} & set(names)
+
+
+def test_the_sentence_names_what_moves_the_map_and_is_not_seen():
+    spots = [
+        validity.BlindSpot("a", 1.0, " %", 40.0, 0.1),
+        validity.BlindSpot("b", 0.1, "", 90.0, 5.0),
+        validity.BlindSpot("c", 0.1, "", 0.1, 0.1),
+    ]
+    text = validity.blind_sentence(spots)
+    assert "a by 1 % (40)" in text and " b by" not in text and " c by" not in text
+    assert not validity.blind_sentence(spots[1:])
+    size, bias = spots[1].unnoticed
+    assert size == pytest.approx(0.1 * np.sqrt(0.6)) and bias == pytest.approx(90 * np.sqrt(0.6))
+
+
+def test_the_gaussian_serves_where_values_were_found_and_not_far_from_them():
+    beam = "noise.beam={parameters: {surface_permittivity: 0.2, zenith_angle_deg: 1}}"
+    runs = "observation.runs=[{cycles: 1}, {cycles: 1, turntable_deg: 30}]"
+    experiment = lb.build(scenario_of(ISOTROPIC, beam, runs, lmax=5, step_s=43200.0))
+    found, setup, d = lb.infer(experiment), experiment.setup, np.asarray(experiment.data.data)
+    assert validity.pareto_k(setup, d, found) < validity.LARGEST_K
+    assert not validity.reach(experiment, found)
+    # about the prior's means, two standard deviations off, the first order is far from the model
+    model, held = model_about(setup, Around(experiment.data))
+    first = Inference(model.condition(d), held, 1, Around(experiment.data))
+    assert validity.pareto_k(setup, d, first) > validity.LARGEST_K
+    assert "Pareto k" in validity.reach(experiment, first)[0]
+
+
+def test_nothing_is_weighed_where_nothing_was_found_in_rounds(plain):
+    experiment, found = plain
+    assert validity.pareto_k(experiment.setup, np.asarray(experiment.data.data), found) is None
+    measured = replace(experiment, setup=replace(experiment.setup, measured=True))
+    assert "would not show" in validity.reach(measured, found)[0]
+    assert base_model(experiment.setup).n_data == found.model.n_data
