@@ -101,9 +101,10 @@ def pareto_k(setup: Setup, data: np.ndarray, found: Inference) -> float | None:
         linear = factor.base.whiten(data - found.model.predict(sky) - columns @ a)
         prior = (a**2).sum() - ((a + expected) ** 2).sum()
         log_weights[k] = 0.5 * (linear @ linear - exact @ exact + prior)
-    with np.errstate(all="ignore"):  # one draw may have all of the weight
-        k = float(arviz_stats.array_stats.psislw(-log_weights)[1])
-    return k if np.isfinite(k) else np.inf
+    weights = np.exp(log_weights - log_weights.max())
+    if weights.sum() ** 2 < 2.0 * (weights**2).sum():  # one draw has nearly all of it: no tail
+        return np.inf
+    return float(arviz_stats.array_stats.psislw(-log_weights)[1])
 
 
 @dataclass(frozen=True)
