@@ -150,12 +150,14 @@ def blind_sentence(spots: Iterable[BlindSpot]) -> str:
     return (
         "The model takes the instrument for exact, and the residual chi^2 would not show an error "
         f"of {', '.join(spot.words() for spot in unseen)}; in brackets, by how many of its "
-        "standard deviations (rms) such an error moves the map. noise.beam.parameters, "
-        "noise.fields and noise.pointing make them unknowns; a second turntable angle shows more."
+        "standard deviations (rms) such an error moves the map. noise.beam.parameters and "
+        "noise.fields make them unknowns; a second turntable angle shows more of them."
     )
 
 
-def errors_of(setup: Setup) -> Iterator[tuple[str, float, str, Systematic, slice]]:
+def errors_of(
+    setup: Setup, *, pointing: bool
+) -> Iterator[tuple[str, float, str, Systematic, slice]]:
     """Name, size and unit of errors that a model may lack, with what describes them."""
     section = FieldErrorsSection(std=FIELDS, lmax=FIELD_LMAX, learned=False)
     fields = FieldErrors.build(section, setup, Around())
@@ -166,6 +168,8 @@ def errors_of(setup: Setup) -> Iterator[tuple[str, float, str, Systematic, slice
     parameters = InstrumentParameters(setup.instrument, tuple(stds), tuple(stds.values()))
     for k, name in enumerate(stds):
         yield name, 100.0 * PARAMETERS, " %", parameters, slice(k, k + 1)
+    if not pointing:
+        return
     runs = setup.observation.n_runs
     steps = {name: step for kind, step in TESTED.items() for name in offset_names((kind,), runs)}
     offsets = PointingOffsets.of(setup, steps, dict.fromkeys(steps, 0.0))
@@ -173,7 +177,9 @@ def errors_of(setup: Setup) -> Iterator[tuple[str, float, str, Systematic, slice
         yield name, step, "", offsets, slice(k, k + 1)
 
 
-def blind_spots(setup: Setup, found: Inference, sky: Modes) -> tuple[BlindSpot, ...]:
+def blind_spots(
+    setup: Setup, found: Inference, sky: Modes, *, pointing: bool = True
+) -> tuple[BlindSpot, ...]:
     """Work out what errors of the instrument do that the model does not have.
 
     Parameters
@@ -182,6 +188,8 @@ def blind_spots(setup: Setup, found: Inference, sky: Modes) -> tuple[BlindSpot, 
     found : Inference
     sky : (modes,) array
         In K.
+    pointing : bool
+        Clock and pointing, too, besides fields and antennas.
     """
     has = {name for part in found.expanded for name in part.systematic.names}
     if any(isinstance(part.systematic, FieldErrors) for part in found.expanded):
@@ -191,7 +199,7 @@ def blind_spots(setup: Setup, found: Inference, sky: Modes) -> tuple[BlindSpot, 
     root = solution.posterior.root()
     wide = solution.under(found.model.prior.widened(WIDE)).posterior.root()
     spots, slopes, degrees = [], {}, max(found.model.n_data - len(sky), 1)
-    for name, size, unit, systematic, which in errors_of(there):
+    for name, size, unit, systematic, which in errors_of(there, pointing=pointing):
         if name in has:
             continue
         if type(systematic) not in slopes:
@@ -227,5 +235,6 @@ def reach(experiment: Experiment, found: Inference) -> list[str]:
             "is widest, or give narrower priors."
         )
     if setup.measured:
-        sentences += filter(None, [blind_sentence(blind_spots(setup, found, found.posterior.mean))])
+        spots = blind_spots(setup, found, found.posterior.mean, pointing=False)
+        sentences += filter(None, [blind_sentence(spots)])
     return sentences

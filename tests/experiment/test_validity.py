@@ -95,6 +95,8 @@ def test_the_sentence_names_what_moves_the_map_and_is_not_seen():
     assert size == pytest.approx(0.1 * np.sqrt(0.6)) and bias == pytest.approx(90 * np.sqrt(0.6))
 
 
+@pytest.mark.long
+@pytest.mark.essential
 def test_the_gaussian_serves_where_values_were_found_and_not_far_from_them():
     beam = "noise.beam={parameters: {surface_permittivity: 0.2, zenith_angle_deg: 1}}"
     runs = "observation.runs=[{cycles: 1}, {cycles: 1, turntable_deg: 30}]"
