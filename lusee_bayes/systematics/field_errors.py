@@ -73,7 +73,7 @@ class FieldErrors(ChangedBeams):
 
     Attributes
     ----------
-    stds : (ells,) array
+    of_ell : (ells,) array
         Square roots of C_ell.
     patterns : (products, rings, phi) array
         The beams without errors.
@@ -81,8 +81,8 @@ class FieldErrors(ChangedBeams):
         Y_k.
     grid : SphereGrid
         Exact for the beams' coefficients up to that of the map.
-    section_of : FieldErrorsSection
-        What is expected.
+    expectation : FieldErrorsSection
+        What the scenario says of them.
     """
 
     key: ClassVar[str] = "noise.fields"
