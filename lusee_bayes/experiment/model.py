@@ -211,7 +211,9 @@ def in_noise(
     return held
 
 
-def model_about(setup: Setup, around: Around) -> tuple[LinearGaussian, tuple[Marginalised, ...]]:
+def model_about(
+    setup: Setup, around: Around, *, scaling: bool = True
+) -> tuple[LinearGaussian, tuple[Marginalised, ...]]:
     """The full model, and the systematics in its N.
 
     Parameters
@@ -219,9 +221,11 @@ def model_about(setup: Setup, around: Around) -> tuple[LinearGaussian, tuple[Mar
     setup : Setup
     around : Around
         What N is built around.
+    scaling : bool
+        Whether those are part of it that scale the sky.
     """
     model, found = base_model(setup, around), (s for _, s in systematics(setup, around))
-    held = in_noise(setup, model, found, around)
+    held = in_noise(setup, model, (s for s in found if scaling or not s.scales_sky), around)
     for systematic in held:
         model = systematic.marginalised(model)
     return model, tuple(held)

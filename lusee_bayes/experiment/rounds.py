@@ -139,7 +139,7 @@ def settled(
                 excess += float(off @ off - (off + part.expected) @ (off + part.expected))
         return Inference(solution.less(excess), found, rounds, around)
 
-    found = conditioned(start or Around(data), 1)
+    found = conditioned(start or _start(setup, data), 1)
     if not rebuilds(setup):
         return found
     step = _Step()
@@ -212,6 +212,18 @@ def _around(setup: Setup, found: Inference, step: _Step) -> tuple[Around, _Step]
         visibilities = prediction(moved(setup, values), found, solved)
     around = replace(found.around, visibilities=visibilities, sky=sky, values=values)
     return replace(around, volume=volume), step
+
+
+def _start(setup: Setup, data: Visibilities) -> Around:
+    """What N is built around first: the data and, with a gain table, the sky of one that is exact.
+
+    About a sky that is far from the data's, what one table does looks like what skies do.
+    """
+    around = Around(data)
+    if not setup.measured or not any(cls.scales_sky for cls in first_order(setup)):
+        return around
+    model, _ = model_about(setup, around, scaling=False)
+    return Around(data, sky=model.condition(data.data).posterior.mean)
 
 
 def rebuilds(setup: Setup) -> bool:
