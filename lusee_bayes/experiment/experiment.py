@@ -29,7 +29,6 @@ from lusee_bayes.instrument.coupling import Instrument
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.plausibility import require_plausible
 from lusee_bayes.linear.information import Information
-from lusee_bayes.linear.linear_gaussian import Solution
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.priors.learning import Learned, draws_with_parameters
 from lusee_bayes.sky.sky_source import SkySource
@@ -56,10 +55,8 @@ class Experiment(Described):
         How the setup's prior was learned; None for one that was given.
     fitting : Fitting or None
         Of flight data: the times that did not fit and are left out; None for other data.
-    around : Around or None
-        What N was built around when the prior was learned, in rounds; None for the data alone.
-    solution : Solution or None
-        Of the data under the prior before them, where the prior was learned from it.
+    found : Inference or None
+        Where the prior was learned: the data under it.
     """
 
     setup: Setup
@@ -67,8 +64,7 @@ class Experiment(Described):
     doubts: tuple[str, ...] = ()
     learned: Learned | None = None
     fitting: Fitting | None = None
-    around: Around | None = None
-    solution: Solution | None = None
+    found: Inference | None = None
 
     def description(self) -> tuple[str, ...]:
         scenario = self.scenario
@@ -175,10 +171,8 @@ def _learned(
     if experiment.setup.family is None:
         return experiment
     with stages("prior"):
-        setup, learned, around, known = with_learned_prior(
-            experiment.setup, experiment.data, earlier
-        )
-    return replace(experiment, setup=setup, learned=learned, around=around, solution=known)
+        setup, found = with_learned_prior(experiment.setup, experiment.data, earlier)
+    return replace(experiment, setup=setup, learned=found.learned, found=found)
 
 
 def with_truth(experiment: Experiment) -> Experiment:
@@ -224,7 +218,7 @@ def infer(experiment: Experiment) -> Inference:
     InputError
         As :func:`.settled`.
     """
-    return settled(experiment.setup, experiment.data, experiment.around, experiment.solution)
+    return experiment.found or settled(experiment.setup, experiment.data)
 
 
 def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
@@ -261,7 +255,7 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
         # about none, large offsets are not described, and gains are those of other antennas
         if not rebuilds(setup):
             return Around(data)
-        return settled(setup, data, experiment.around).around
+        return infer(experiment).around
 
     to_sample = cache(lambda: model_to_sample(setup, around()))
     return {

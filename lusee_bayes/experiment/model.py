@@ -148,7 +148,8 @@ def radiometer(setup: Setup, around: Around | None = None) -> Covariance:
         given = section.model_dump(include={"bandwidth_hz", "duty_cycle"})
         given["step_s"] = setup.observation.live_s
     common = {"form": section.form, "factor": section.factor}
-    return radiometer_noise(visibilities, setup.layout, **given, **common)
+    noise = radiometer_noise(visibilities, setup.layout, **given, **common)
+    return noise if around is None or around.tempered == 1.0 else noise.scaled(around.tempered)
 
 
 def moved(setup: Setup, values: Truth | None) -> Setup:
@@ -212,7 +213,7 @@ def in_noise(
 
 
 def model_about(
-    setup: Setup, around: Around, *, scaling: bool = True
+    setup: Setup, around: Around, *, moving: bool = True
 ) -> tuple[LinearGaussian, tuple[Marginalised, ...]]:
     """The full model, and the systematics in its N.
 
@@ -221,11 +222,11 @@ def model_about(
     setup : Setup
     around : Around
         What N is built around.
-    scaling : bool
-        Whether those are part of it that scale the sky.
+    moving : bool
+        Whether those are part of it that are found in rounds.
     """
     model, found = base_model(setup, around), (s for _, s in systematics(setup, around))
-    held = in_noise(setup, model, (s for s in found if scaling or not s.scales_sky), around)
+    held = in_noise(setup, model, (s for s in found if moving or not s.moves), around)
     for systematic in held:
         model = systematic.marginalised(model)
     return model, tuple(held)

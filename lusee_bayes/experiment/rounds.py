@@ -6,7 +6,7 @@ Priors also come by name, for a comparison under which of them data are most pro
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,15 +17,17 @@ from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.section import is_modelled
 from lusee_bayes.experiment import sky_sections
-from lusee_bayes.experiment.model import full_model, model_about, moved
+from lusee_bayes.experiment.model import model_about, moved, systematics
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.amplitudes import Amplitudes, template_amplitudes
 from lusee_bayes.linear.information import Information, integrated_out
-from lusee_bayes.linear.linear_gaussian import FromInformation, LinearGaussian, Solution
+from lusee_bayes.linear.linear_gaussian import LinearGaussian, Solution
 from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.noise.covariance import LowRankFactor
 from lusee_bayes.priors.families import PriorFamily
 from lusee_bayes.priors.learning import Learned, learn_whatever_fits
+from lusee_bayes.sky.prior import Prior
 from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.gain_drifts import gains_about
 from lusee_bayes.systematics.noise_level import radiometer_about
@@ -38,6 +40,15 @@ SETTLED, MAX_ROUNDS = 1e-2, 30
 # no unknown moves further in a round, in prior standard deviations: beyond, the first order that
 # the move comes from says little
 FARTHEST = 2.0
+# while chi^2 of what N is built around is more than TEMPERED per datum, in the first rounds,
+# radiometer noise is taken for as much larger
+TEMPERED, MAX_TEMPERED_ROUNDS = 10.0, 20
+# where chi^2 then is too large by so many of its standard deviations, rounds begin elsewhere, too,
+# so often, with noise that is larger again
+FAR_OFF, MORE_STARTS, MORE_TEMPERED = 10.0, 2, 30.0
+# a prior is learned first when the map moves by less than this, and last when learning it again
+# moves the map by less than PRIOR_SETTLED; a step of learning that is not taken moves it by 0.01
+NEARLY, PRIOR_SETTLED, MAX_LEARNED = 0.5, 0.05, 8
 # draws of noise that the volume of skies that fit is estimated with; always the same ones
 VOLUME_DRAWS = 8
 # steps that swing about where they lead to are halved, down to this part of the whole
@@ -60,6 +71,8 @@ class Inference:
         What it was built around.
     unsettled : str
         A sentence if the map still moves from round to round; empty otherwise.
+    learned : Learned or None
+        How the prior was learned in these rounds.
     """
 
     solution: Solution
@@ -67,6 +80,7 @@ class Inference:
     rounds: int
     around: Around
     unsettled: str = ""
+    learned: Learned | None = None
 
     @property
     def model(self) -> LinearGaussian:
@@ -97,26 +111,65 @@ class Inference:
         """What these data tell of a systematic's unknowns, in prior standard deviations."""
         return template_amplitudes(self.solution, part.columns)
 
+    def misfit(self) -> float:
+        """Chi^2 per datum of the sky and the values that N is built around, under the rest of N."""
+        factor, solution, noise = self.solution.factor, self.solution, self.model.noise
+        residual = solution.data - self.model.predict(self.around.sky)
+        if isinstance(factor, LowRankFactor):
+            solved = solution.weighted_residual()
+            residual = residual - noise.update.root @ (noise.update.root.T @ solved)
+            for part in self.expanded:
+                here = part.expected + part.columns.T @ solved - part.centre
+                residual = residual + part.columns @ here
+            factor = factor.base
+        white = np.asarray(factor.whiten(residual))
+        return float(white @ white) / len(white)
+
+    @property
+    def fits(self) -> bool:
+        """Whether chi^2 of the data does not stand out by far."""
+        n = len(self.solution.data)
+        return self.solution.chi2 < n + FAR_OFF * np.sqrt(2.0 * n)
+
+    def moves_from(self, before: Inference) -> float:
+        """By how much the map has moved, rms in standard deviations."""
+        return float(self.posterior.rms_shift_from(before.posterior))
+
+    def under(self, prior: Prior, learned: Learned | None = None) -> Inference:
+        """The same under another prior, one that was learned."""
+        solution = self.solution.under(prior)
+        return replace(self, solution=_less_moved(solution, self.expanded), learned=learned)
+
+
+# learns a prior from the information in data, from given parameters on
+Learning = Callable[[Information, Float[np.ndarray, " parameters"] | None], Learned]
+
 
 def settled(
-    setup: Setup, data: Visibilities, start: Around | None = None, known: Solution | None = None
+    setup: Setup, data: Visibilities, start: Around | None = None, learn: Learning | None = None
 ) -> Inference:
     """Condition the model on data, in as many rounds as its N needs.
 
     One round, unless a term of N is built around what the data tell: the gains around the
-    posterior's own prediction, or clock, pointing and gain table around its sky and their own
-    values. Then N and the map are repeated until the map moves by less than 0.01 standard
-    deviations (rms). Those values go part of the way where they would go far, or swing: what is
-    second order in them may outweigh what tells two of them apart.
+    posterior's own prediction, or the instrument around its sky and values of its own. Then N and
+    the map are repeated until the map moves by less than 0.01 standard deviations (rms).
+
+    What is second order in values that are far off may outweigh by orders of magnitude what tells
+    two of them apart. Rounds therefore begin with radiometer noise that is larger, so that chi^2
+    of what N is built around is 10 per datum; values go part of the way where they would go far,
+    or swing. Where chi^2 is far too large at their end, they begin twice more with an instrument
+    that is drawn from its prior, and the end of largest ln p counts.
 
     Parameters
     ----------
     setup : Setup
     data : Visibilities
     start : Around, optional
-        What N is built around in the first round; by default the data.
-    known : Solution, optional
-        Of the data under another prior, where N is built once.
+        What N is built around in the first round; by default the data and, where the instrument
+        is found, the sky of one as it is expected.
+    learn : callable, optional
+        ``learn(information, start)`` learns the prior, in the rounds: first when they have nearly
+        settled, last when that moves the map by less than 0.05 standard deviations.
 
     Returns
     -------
@@ -128,27 +181,33 @@ def settled(
     InputError
         If N is not positive definite.
     """
-
-    def conditioned(around: Around, rounds: int) -> Inference:
-        model, found = model_about(setup, around)
-        solution = model.condition(data.data) if known is None else known.under(model.prior)
-        solved, excess = solution.weighted_residual(), 0.0
-        for part in found:
-            if isinstance(part, Expanded):
-                off = part.columns.T @ solved
-                excess += float(off @ off - (off + part.expected) @ (off + part.expected))
-        return Inference(solution.less(excess), found, rounds, around)
-
-    found = conditioned(start or _start(setup, data), 1)
-    if not rebuilds(setup):
-        return found
-    step = _Step()
-    for rounds in range(2, MAX_ROUNDS + 1):
+    found, step = _approached(setup, data, start or _start(setup, data))
+    for seed in range(MORE_STARTS if found.moving else 0):
+        if found.fits:
+            break
+        other = _approached(setup, data, _elsewhere(setup, found.around, seed))
+        if other[0].posterior.log_evidence > found.posterior.log_evidence:
+            found, step = other
+    moves, n_learned, learned, in_rounds = np.inf, 0, None, rebuilds(setup)
+    while True:
+        last, at_rest = not in_rounds or found.rounds >= MAX_ROUNDS, moves < SETTLED * step.size
+        if learn is not None and n_learned < MAX_LEARNED and (at_rest or last or learned is None):
+            known = None if learned is None or not learned.settled else learned.parameters
+            learned, n_learned = learn(found.solution.information, known), n_learned + 1
+            told = found.under(learned.prior, learned)
+            changed, found = told.moves_from(found), told
+            if in_rounds and changed > PRIOR_SETTLED:
+                at_rest = False
+                found = replace(told, learned=replace(learned, still_moves=changed))
+            setup = replace(setup, prior=learned.prior)
+        if last or at_rest:
+            break
         around, step = _around(setup, found, step)
-        before, found = found, conditioned(around, rounds)
-        if float(found.posterior.rms_shift_from(before.posterior)) < SETTLED * step.size:
-            return found
-    moves = float(found.posterior.rms_shift_from(before.posterior))
+        before, found = found, _conditioned(setup, data, around, found.rounds + 1)
+        found = replace(found, learned=before.learned)
+        moves = found.moves_from(before) if around.tempered == 1.0 else np.inf
+    if at_rest or not in_rounds:
+        return found
     remedies = [cls.remedy for cls in first_order(setup)]
     remedies += ["noise.gain.visibilities=model"] * rebuilds_gains(setup)
     unsettled = (
@@ -156,6 +215,43 @@ def settled(
         "of rebuilding N around it"
     )
     return replace(found, unsettled=f"{'; use '.join([unsettled, *remedies[:1]])}.")
+
+
+def _approached(setup: Setup, data: Visibilities, around: Around) -> tuple[Inference, _Step]:
+    """Rounds until the map has nearly settled, and the step there."""
+    found, step = _conditioned(setup, data, around, 1), _Step()
+    moves = np.inf if rebuilds(setup) else 0.0
+    while moves > NEARLY and found.rounds < MAX_TEMPERED_ROUNDS:
+        around, step = _around(setup, found, step)
+        before, found = found, _conditioned(setup, data, around, found.rounds + 1)
+        moves = found.moves_from(before) if around.tempered == 1.0 else np.inf
+    return found, step
+
+
+def _elsewhere(setup: Setup, around: Around, seed: int) -> Around:
+    """Where else rounds may begin: with an instrument that is drawn from its prior."""
+    rng, values = np.random.default_rng(seed), {}
+    for _, systematic in systematics(setup, Around(around.data)):
+        if systematic.first_order and not systematic.learns:
+            values |= systematic.in_units(rng.standard_normal(len(systematic.names)))
+    start = _start(setup, around.data)
+    return replace(start, values=values, tempered=MORE_TEMPERED * start.tempered)
+
+
+def _conditioned(setup: Setup, data: Visibilities, around: Around, rounds: int) -> Inference:
+    model, held = model_about(setup, around)
+    solution = _less_moved(model.condition(data.data), held)
+    return Inference(solution, held, rounds, around)
+
+
+def _less_moved(solution: Solution, held: Sequence[Marginalised]) -> Solution:
+    """With chi^2 and evidence as if the prior means of unknowns had not been moved."""
+    solved, excess = solution.weighted_residual(), 0.0
+    for part in held:
+        if isinstance(part, Expanded):
+            off = part.columns.T @ solved
+            excess += float(off @ off - (off + part.expected) @ (off + part.expected))
+    return solution.less(excess)
 
 
 @dataclass(frozen=True)
@@ -184,8 +280,7 @@ class _Step:
 
 def _around(setup: Setup, found: Inference, step: _Step) -> tuple[Around, _Step]:
     """What the terms of N are built around next, given a posterior, and the step there."""
-    visibilities, sky, values, volume = None, None, None, None
-    solution = found.solution
+    around, solution = found.around, found.solution
     solved = solution.weighted_residual()
     if found.moving:
         ways = [s.expected + s.columns.T @ solved - s.centre for s in found.expanded]
@@ -199,31 +294,46 @@ def _around(setup: Setup, found: Inference, step: _Step) -> tuple[Around, _Step]
         values = {}
         for s, way in zip(found.expanded, ways, strict=True):
             values |= s.systematic.in_units(s.centre + step.size * way)
-            if s.systematic.learns:
+            if s.systematic.learns and around.tempered == 1.0:
                 told = found.amplitudes(s)
                 values |= s.systematic.relearned(s.expected + told.mean, told.std**2)
-        here = np.asarray(setup.sky.modes if found.around.sky is None else found.around.sky)
-        sky = here + step.size * (found.posterior.mean - here)
-        white = np.random.default_rng(0).standard_normal((found.model.n_data, VOLUME_DRAWS))
-        weighted = np.asarray(solution.factor.whiten_transpose(white))
-        skies = solution.covariance @ np.asarray(found.model.coupling.transpose_mv(weighted))
-        volume = skies.T, weighted.T
+        sky = around.sky + step.size * (found.posterior.mean - around.sky)
+        tempered = _tempered(around.tempered * found.misfit(), found.rounds)
+        around = replace(around, sky=sky, values=values, tempered=tempered)
+        if tempered == 1.0:
+            around = replace(around, volume=_volume(solution))
     if rebuilds_visibilities(setup):
-        visibilities = prediction(moved(setup, values), found, solved)
-    around = replace(found.around, visibilities=visibilities, sky=sky, values=values)
-    return replace(around, volume=volume), step
+        seen = prediction(moved(setup, around.values), found, solved)
+        around = replace(around, visibilities=seen)
+    return around, step
 
 
 def _start(setup: Setup, data: Visibilities) -> Around:
-    """What N is built around first: the data and, with a gain table, the sky of one that is exact.
+    """What N is built around first: the data and, where the instrument is found, a sky.
 
-    About a sky that is far from the data's, what one table does looks like what skies do.
+    That of the instrument as it is expected, with larger noise where it does not fit.
     """
     around = Around(data)
-    if not setup.measured or not any(cls.scales_sky for cls in first_order(setup)):
+    if not first_order(setup):
         return around
-    model, _ = model_about(setup, around, scaling=False)
-    return Around(data, sky=model.condition(data.data).posterior.mean)
+    model, held = model_about(setup, around, moving=False)
+    solution = model.condition(data.data)
+    exact = Inference(solution, held, 0, replace(around, sky=solution.posterior.mean))
+    return replace(exact.around, tempered=_tempered(exact.misfit(), 0))
+
+
+def _tempered(misfit: float, rounds: int) -> float:
+    """What radiometer noise is multiplied by; little more than one is not worth a round."""
+    tempered = misfit / TEMPERED
+    return 1.0 if tempered < 2.0 or rounds >= MAX_TEMPERED_ROUNDS else tempered
+
+
+def _volume(solution: Solution) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:
+    """:attr:`.Around.volume`."""
+    white = np.random.default_rng(0).standard_normal((solution.model.n_data, VOLUME_DRAWS))
+    weighted = np.asarray(solution.factor.whiten_transpose(white))
+    pulls = np.asarray(solution.model.coupling.transpose_mv(weighted))
+    return (solution.covariance @ pulls).T, weighted.T
 
 
 def rebuilds(setup: Setup) -> bool:
@@ -269,21 +379,14 @@ def prediction(setup: Setup, found: Inference, solved: DataVector) -> Grid:
     return setup.under(mean).signal + setup.layout.scatter(besides)
 
 
-# the map and its prior are found together when the map moves by less than this, rms; a step of
-# learning that is not taken moves it by a hundredth
-PRIOR_SETTLED, MAX_PRIOR_ROUNDS = 0.05, 8
 # parameters are learned up to this ell first, in a tenth of the time, where there are more
 COARSE_LMAX = 24
 
 
 def with_learned_prior(
     setup: Setup, data: Visibilities, earlier: Information | None = None
-) -> tuple[Setup, Learned, Around | None, Solution | None]:
-    """Learn the prior from data.
-
-    Systematics are in N as far as they are marginalised. Where N is built around what the data
-    tell, learning takes part in the rounds: N under the prior so far, the prior under this N, and
-    so on, until the map moves by less than 0.05 standard deviations (rms).
+) -> tuple[Setup, Inference]:
+    """Learn the prior from data, with all that is in N (:func:`settled`).
 
     Parameters
     ----------
@@ -297,41 +400,16 @@ def with_learned_prior(
     -------
     Setup
         With the prior.
-    Learned
-        How it was learned.
-    Around or None
-        What N was built around in the last round; None where that is the data alone.
-    Solution or None
-        Of these data under the prior before them, where N is built once.
+    Inference
+        Under that prior, with how it was learned.
     """
-    if not rebuilds(setup):
-        solution = about_sky(setup, data)
-        learned = learned_prior(setup, setup.family, _with_more(solution.information, earlier))
-        return replace(setup, prior=learned.prior), learned, None, solution
-    learned, before, found = None, None, settled(setup, data)
-    for _ in range(MAX_PRIOR_ROUNDS):
-        information = found.solution.information
-        start = None if learned is None or not learned.settled else learned.parameters
-        learned = learned_prior(setup, setup.family, _with_more(information, earlier), start)
-        setup = replace(setup, prior=learned.prior)
-        before, found = found, settled(setup, data, found.around)
-        moved = float(found.posterior.rms_shift_from(before.posterior))
-        if moved < PRIOR_SETTLED:
-            return setup, learned, found.around, None
-    return setup, replace(learned, still_moves=moved), found.around, None
 
+    def learn(information: Information, start: Vector | None) -> Learned:
+        more = information if earlier is None else information + earlier
+        return learned_prior(setup, setup.family, more, start)
 
-def about_sky(setup: Setup, data: Visibilities) -> Solution:
-    """Solve for the sky under the setup's prior, through what data say of it.
-
-    Where N is built around what data tell, it is about that of the prior before them.
-    """
-    around = settled(setup, data).around if rebuilds(setup) else Around(data)
-    return full_model(setup, around).condition(data.data, FromInformation)
-
-
-def _with_more(information: Information, earlier: Information | None) -> Information:
-    return information if earlier is None else information + earlier
+    found = settled(setup, data, learn=learn)
+    return replace(setup, prior=found.learned.prior), found
 
 
 def learned_prior(
@@ -348,7 +426,7 @@ def learned_prior(
         Of the scenario that the family is of.
     family : PriorFamily
     information : Information
-        What the data say of the sky (:func:`about_sky`).
+        What the data say of the sky.
     start : (parameters,) array, optional
         Where to begin.
     """

@@ -287,7 +287,7 @@ class Solution(Described):
         """ln p(d | m) as a function of the sky; only its reference depends on the prior."""
         if self.known is not None:
             return self.known
-        return FromInformation.of(self.model).condition(self.data).information
+        return FromInformation.of(self.model).condition(self.data).less(self.excess).information
 
     @property
     def matrix(self) -> ModesMatrix | None:
@@ -318,8 +318,10 @@ class Solution(Described):
     def less(self, excess: float) -> Solution:
         """The same, with chi^2 and -2 ln p(d) lower by a number."""
         evidence = np.asarray(self.posterior.log_evidence + excess / 2.0)
-        posterior = replace(self.posterior, log_evidence=evidence)
-        return replace(self, posterior=posterior, excess=excess)
+        posterior, known = replace(self.posterior, log_evidence=evidence), self.known
+        if known is not None:
+            known = replace(known, misfit=np.asarray(known.misfit - excess))
+        return replace(self, posterior=posterior, known=known, excess=excess)
 
     def under(self, prior: Prior) -> Solution:
         """Solve for the same data under another prior; A^T N^-1 A is not computed again.
@@ -337,7 +339,8 @@ class Solution(Described):
         model = replace(self.model, prior=prior)
         if form_of(model) is not FromInformation:
             return model.condition(self.data)
-        return FromInformation.of(model, self.information.matrix).condition(self.data)
+        known = self.information.matrix, self.of_noise
+        return FromInformation.of(model, *known).condition(self.data)
 
 
 def form_of(model: LinearGaussian, *, transformed: bool = False) -> type[Form]:
@@ -424,10 +427,16 @@ class FromInformation(Form):
     lower: ModesMatrix
 
     @classmethod
-    def of(cls, model: LinearGaussian, matrix: ModesMatrix | None = None) -> FromInformation:
-        """Factorise a model, of which A^T N^-1 A may be known."""
+    def of(
+        cls,
+        model: LinearGaussian,
+        matrix: ModesMatrix | None = None,
+        factor: Factor | None = None,
+    ) -> FromInformation:
+        """Factorise a model, of which A^T N^-1 A and L of N may be known."""
         model = on_host(model)
-        coupling, factor = model.coupling, model.noise.factor()
+        coupling = model.coupling
+        factor = model.noise.factor() if factor is None else factor
         structured = has_structure(coupling, model.noise)
         if not structured:
             coupling = DenseCoupling(coupling.dense())

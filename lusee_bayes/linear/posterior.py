@@ -212,14 +212,14 @@ class Posterior(Described, eqx.Module):
         Parameters
         ----------
         other : Posterior
-            With the same prior.
+            Over the same sky.
 
         Returns
         -------
         () array
             Rms over modes, in standard deviations of this posterior.
         """
-        xp, shift = namespace(self), self.white_mean - other.white_mean
+        xp, shift = namespace(self), self.white_mean - self.prior.whiten(other.mean)
         inside = shift if self.basis is None else self.basis.T @ shift
         squared = ((inside @ xp.tril(self.lower)) ** 2).sum()
         if self.basis is not None:

@@ -11,11 +11,10 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import Data
 from lusee_bayes.experiment.experiment import Experiment, observed
-from lusee_bayes.experiment.rounds import about_sky, learned_prior, named_priors, rebuilds
+from lusee_bayes.experiment.rounds import Inference, learned_prior, named_priors, rebuilds, settled
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.judge.residuals import held_out
 from lusee_bayes.judge.split import Split
-from lusee_bayes.linear.linear_gaussian import Solution
 from lusee_bayes.report.figures.maps import curves_of_runs, maps_of_runs
 from lusee_bayes.report.figures.plans import priors
 from lusee_bayes.report.pages import comparison_page
@@ -134,29 +133,29 @@ def run_compare_priors(
     with run_folder(folder, COMPARE_PRIORS, scenario, data, replace=replace, **origin) as run:
         experiment = measured_experiment(scenario, data, stages, truth=truth, make=observed)
         with stages("data"):
-            solution = about_sky(experiment.setup, experiment.data)
+            found = settled(experiment.setup, experiment.data)
 
         def under(prior: str) -> UnderPrior:
             setup = experiment.setup.with_prior(sections[prior])
-            return _under(prior, setup, experiment, solution)
+            return _under(prior, setup, experiment, found)
 
         engine.work_in(run.path)
-        found = engine.each(Tasks(under, list(sections), list(sections)), stages, "priors")
-        result = PriorComparison(name, scenario, tuple(found), stages.seconds)
+        mapped = engine.each(Tasks(under, list(sections), list(sections)), stages, "priors")
+        result = PriorComparison(name, scenario, tuple(mapped), stages.seconds)
         provenance = Provenance.of_experiment(experiment, data)
         return run.write(result, stages, provenance)
 
 
-def _under(name: str, setup: Setup, experiment: Experiment, solution: Solution) -> UnderPrior:
+def _under(name: str, setup: Setup, experiment: Experiment, found: Inference) -> UnderPrior:
     """Map the data under one prior, or a family of them, and leave out groups of them."""
-    information = solution.information
+    information = found.solution.information
     if setup.family is None:
         learned, evidence = None, float(information.posterior(setup.prior).log_evidence)
     else:
         learned = learned_prior(setup, setup.family, information)
         setup, evidence = replace(setup, prior=learned.prior), learned.log_evidence
-    known = None if rebuilds(setup) else solution
-    mapped = replace(experiment, setup=setup, learned=learned, solution=known)
+    known = None if rebuilds(setup) else found.under(setup.prior)
+    mapped = replace(experiment, setup=setup, learned=learned, found=known)
     made = conditioned(mapped)
     channel = made.result(made.known(alone=False))
     own = made.own.solution

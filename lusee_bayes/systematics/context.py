@@ -174,6 +174,8 @@ class Around:
     volume : ((draws, modes), (draws, data)) arrays or None
         Skies s = C A^T w of noise alone, in K, and w = N^-1 n: what the volume of skies that fit is
         estimated with. None before there is a posterior.
+    tempered : float
+        Factor of radiometer noise in first rounds.
     """
 
     data: Visibilities | None = None
@@ -181,6 +183,7 @@ class Around:
     sky: Modes | None = None
     values: Mapping[str, float | Float[Array, "..."]] | None = None
     volume: tuple[Float[Array, "draws modes"], Float[Array, "draws data"]] | None = None
+    tempered: float = 1.0
 
 
 def noise_visibilities(setup: Setup, around: Around, about: NoiseAbout) -> Grid:
