@@ -17,7 +17,7 @@ from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.section import is_modelled
 from lusee_bayes.experiment import sky_sections
-from lusee_bayes.experiment.model import model_about, moved, systematics
+from lusee_bayes.experiment.model import model_about, moved
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.amplitudes import Amplitudes, template_amplitudes
@@ -44,8 +44,8 @@ FARTHEST = 2.0
 # radiometer noise is taken for as much larger
 TEMPERED, MAX_TEMPERED_ROUNDS = 10.0, 20
 # where chi^2 then is too large by so many of its standard deviations, rounds begin elsewhere, too,
-# so often, with noise that is larger again
-FAR_OFF, MORE_STARTS, MORE_TEMPERED = 10.0, 2, 30.0
+# with noise that is larger again
+FAR_OFF, MORE_TEMPERED = 10.0, 30.0
 # a prior is learned first when the map moves by less than this, and last when learning it again
 # moves the map by less than PRIOR_SETTLED; a step of learning that is not taken moves it by 0.01
 NEARLY, PRIOR_SETTLED, MAX_LEARNED = 0.5, 0.05, 8
@@ -157,8 +157,8 @@ def settled(
     What is second order in values that are far off may outweigh by orders of magnitude what tells
     two of them apart. Rounds therefore begin with radiometer noise that is larger, so that chi^2
     of what N is built around is 10 per datum; values go part of the way where they would go far,
-    or swing. Where chi^2 is far too large at their end, they begin twice more with an instrument
-    that is drawn from its prior, and the end of largest ln p counts.
+    or swing. Where chi^2 is far too large at their end, they begin once more with an instrument
+    that is as far off on the other side, and the end of larger ln p counts.
 
     Parameters
     ----------
@@ -182,10 +182,8 @@ def settled(
         If N is not positive definite.
     """
     found, step = _approached(setup, data, start or _start(setup, data))
-    for seed in range(MORE_STARTS if found.moving else 0):
-        if found.fits:
-            break
-        other = _approached(setup, data, _elsewhere(setup, found.around, seed))
+    if found.moving and not found.fits:
+        other = _approached(setup, data, _elsewhere(setup, found))
         if other[0].posterior.log_evidence > found.posterior.log_evidence:
             found, step = other
     moves, n_learned, learned, in_rounds = np.inf, 0, None, rebuilds(setup)
@@ -228,13 +226,12 @@ def _approached(setup: Setup, data: Visibilities, around: Around) -> tuple[Infer
     return found, step
 
 
-def _elsewhere(setup: Setup, around: Around, seed: int) -> Around:
-    """Where else rounds may begin: with an instrument that is drawn from its prior."""
-    rng, values = np.random.default_rng(seed), {}
-    for _, systematic in systematics(setup, Around(around.data)):
-        if systematic.first_order and not systematic.learns:
-            values |= systematic.in_units(rng.standard_normal(len(systematic.names)))
-    start = _start(setup, around.data)
+def _elsewhere(setup: Setup, found: Inference) -> Around:
+    """Where else rounds may begin: with an instrument as far off on the other side."""
+    start, values = _start(setup, found.around.data), {}
+    for part in found.expanded:
+        if not part.systematic.learns:
+            values |= part.systematic.in_units(-part.centre)
     return replace(start, values=values, tempered=MORE_TEMPERED * start.tempered)
 
 
