@@ -245,12 +245,14 @@ def model_to_sample(
     """The model before anything is sampled, and what is then to be applied to it.
 
     Systematics that are marginalised come in their place in the order, as sampled ones without a
-    site.
+    site. Gains that are sampled multiply these, too.
     """
     model, later = on_device(base_model(setup, around)), []
     found = systematics(setup, around)
-    held = in_noise(setup, model, (systematic for _, systematic in found), around)
-    for (treatment, systematic), as_noise in zip(found, held, strict=True):
+    others = (s for t, s in found if t != "sampled" or not s.scales_sky)
+    held = iter(in_noise(setup, model, others, around))
+    for treatment, systematic in found:
+        as_noise = None if treatment == "sampled" and systematic.scales_sky else next(held)
         if treatment == "sampled":
             later.append(systematic)
         elif later:

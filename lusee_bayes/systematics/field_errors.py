@@ -135,7 +135,7 @@ class FieldErrors(ChangedBeams):
     def unknowns(self) -> tuple[Unknown, ...]:
         """Of every ell: the real parts of all ports, order by order, then the imaginary parts."""
         return tuple(
-            Unknown(f"field_error_{ell}", std=float(std), size=2 * self.n_ports * (2 * ell + 1))
+            Unknown(f"field_error_{ell}", std=std, size=2 * self.n_ports * (2 * ell + 1))
             for ell, std in enumerate(self.of_ell)
         )
 
