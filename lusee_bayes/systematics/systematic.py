@@ -557,6 +557,22 @@ class Marginalised(eqx.Module):
         return self.marginalised(model)
 
 
+class InPlace(Marginalised):
+    """A systematic at its place among sampled ones, in a model whose N holds it already.
+
+    Attributes
+    ----------
+    held : Marginalised
+        As N holds it.
+    """
+
+    held: Marginalised
+
+    def sampled(self, model: LinearGaussian) -> LinearGaussian:
+        """What it does besides."""
+        return replace(self.held.marginalised(model), noise=model.noise)
+
+
 class Expanded(Marginalised):
     """A systematic to first order about values, as N holds it.
 
