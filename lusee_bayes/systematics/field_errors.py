@@ -154,8 +154,8 @@ class FieldErrors(ChangedBeams):
 
     def modes(self, modes, values):
         """Add what the errors change."""
-        more = self.grid.analyse(self.changed(values) - self.patterns)
-        return modes + more[:, : modes.shape[-1]]
+        more = self.grid.analyse(self.changed(values) - self.patterns)[:, : modes.shape[-1]]
+        return modes + (more if modes.ndim == 2 else more[None])
 
     def linearised(self, model, centre):
         """Through the beams times every Y_k, of which all amplitudes of k are made."""
