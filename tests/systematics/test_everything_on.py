@@ -118,7 +118,7 @@ def test_error_bars_of_all_together_are_right():
 
     The sky is known to a fifth, so that none is without a signal.
     """
-    more = {"lmax": 4, "step_s": 172800.0, "prior": {"model": "isotropic", "spectrum": "sky"}}
+    more = {"lmax": 4, "step_s": 86400.0, "prior": {"model": "isotropic", "spectrum": "sky"}}
     first = with_known_sky(set_up(scenario(10.0, 2, **more)), 0.04)
     prior, chi2, below = first.prior, [], []
     for seed in range(N):

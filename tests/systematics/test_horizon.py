@@ -162,7 +162,7 @@ def test_sampled_the_density_is_that_of_beams_behind_the_terrain():
 
 
 def test_other_beams_are_behind_the_terrain_too():
-    """A whole shift is what simulated data hold: a hundredth of it is hidden."""
+    """A whole shift is what simulated data hold; the terrain hides 8e-5 of what it changes."""
     setup = setup_of(KNOWN, "noise.beam={shift_mhz: 1}", lmax=4)
     (_, beams), *_ = models.systematics(setup)
     got = beams.effect(models.base_model(setup), {"beam_amplitude": 1.0}).coupling
