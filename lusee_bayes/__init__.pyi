@@ -38,3 +38,4 @@ from .sky.prior import HarmonicPrior as HarmonicPrior
 from .sky.sky_source import Sky as Sky
 from .sky.sky_source import galaxy_sky as galaxy_sky
 from .sky.sky_source import sky_from_file as sky_from_file
+from .systematics.systematic import sky_is_sampled as sky_is_sampled

@@ -1,7 +1,7 @@
 """Whatever the scenario says is to be sampled, and the sky: ``treatment: sampled``.
 
-The sky is integrated out, and drawn exactly for every draw of the others, unless one of them (gain
-drifts) has so many unknowns that it is better sampled together with the sky.
+The sky is integrated out, and drawn exactly for every draw of the others, unless these are so many
+(gain drifts, errors of fields) that they are better sampled together with the sky.
 """
 
 import numpyro
@@ -13,7 +13,7 @@ def model(gaussian, systematics, data=None):
     """``gaussian``: the model without ``systematics``, which are applied one after the other."""
     for systematic in systematics:
         gaussian = systematic.sampled(gaussian)
-    if any(systematic.needs_sky for systematic in systematics):
+    if lb.sky_is_sampled(systematics):
         sky = numpyro.sample("sky", lb.SkyPrior(gaussian.prior))
         seen = lb.CorrelatedNormal(gaussian.predict(sky), gaussian.noise)
         numpyro.sample("data", seen, obs=data)

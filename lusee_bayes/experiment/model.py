@@ -24,7 +24,7 @@ from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import auto_indices
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
-from lusee_bayes.noise.covariance import Covariance
+from lusee_bayes.noise.covariance import Covariance, KnownFactor, LowRankUpdate
 from lusee_bayes.noise.radiometer import radiometer_noise
 from lusee_bayes.systematics.context import Around, Setup, noise_visibilities, prior_and_family
 from lusee_bayes.systematics.horizon import Horizon
@@ -32,7 +32,15 @@ from lusee_bayes.systematics.noise_level import radiometer_about
 from lusee_bayes.systematics.registered import SYSTEMATICS
 from lusee_bayes.systematics.regolith import ground_per_kelvin
 from lusee_bayes.systematics.sources import expected_signal, source_responses
-from lusee_bayes.systematics.systematic import Expanded, Marginalised, Systematic, Truth, present
+from lusee_bayes.systematics.systematic import (
+    Expanded,
+    InPlace,
+    Marginalised,
+    Scale,
+    Systematic,
+    Truth,
+    present,
+)
 
 # two sites closer than that are one: 30 m
 SAME_SITE_DEG = 1e-3
@@ -246,18 +254,32 @@ def model_to_sample(
     """The model before anything is sampled, and what is then to be applied to it.
 
     Systematics that are marginalised come in their place in the order, as sampled ones without a
-    site.
+    site. Gains that are sampled multiply these, too. N is factorised once, unless the noise level
+    or the prior is sampled, on which it depends.
     """
     model, later = on_device(base_model(setup, around)), []
-    found = systematics(setup, around)
-    held = in_noise(setup, model, (systematic for _, systematic in found), around)
-    for (treatment, systematic), as_noise in zip(found, held, strict=True):
+    found, whole = systematics(setup, around), model
+    sampled = [systematic for treatment, systematic in found if treatment == "sampled"]
+    others = (s for t, s in found if t != "sampled" or not s.scales_sky)
+    held = iter(in_noise(setup, model, others, around))
+    for treatment, systematic in found:
+        as_noise = None if treatment == "sampled" and systematic.scales_sky else next(held)
         if treatment == "sampled":
             later.append(systematic)
-        elif later:
+            continue
+        whole = as_noise.marginalised(whole)
+        if later:
             later.append(as_noise)
         else:
             model = as_noise.marginalised(model)
+    if later and not any(isinstance(systematic, Scale) for systematic in sampled):
+        noise, gains = on_device(whole.noise), any(s.scales_sky or s.needs_sky for s in sampled)
+        if gains and isinstance(noise, LowRankUpdate):
+            noise = replace(noise, base=KnownFactor.of(noise.base))
+        else:
+            noise = KnownFactor.of(noise)
+        model = replace(model, noise=noise)
+        later = [InPlace(s.systematic, s) if isinstance(s, Marginalised) else s for s in later]
     if later and not any(systematic.changes_coupling for systematic in later):
         model = replace(model, coupling=DenseCoupling(model.coupling.dense()))
     return model, tuple(later)

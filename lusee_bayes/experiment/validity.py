@@ -37,7 +37,7 @@ from lusee_bayes.systematics.beam import InstrumentParameters
 from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.field_errors import FieldErrors, FieldErrorsSection
 from lusee_bayes.systematics.pointing_offsets import PointingOffsets
-from lusee_bayes.systematics.systematic import Systematic
+from lusee_bayes.systematics.systematic import Systematic, Unknown
 
 # draws that are weighed, and the k up to which a Gaussian serves
 N_WEIGHED, LARGEST_K = 100, 0.7
@@ -163,10 +163,10 @@ def errors_of(
     fields = FieldErrors.build(section, setup, Around())
     yield FIELDS_NAME, 100.0 * FIELDS, " %", fields, slice(None)
     source = setup.beam_source
-    known = {name: p.value for name, p in source.parameters().items() if float(p.value)}
-    stds = {name: PARAMETERS * abs(float(value)) for name, value in known.items()}
-    parameters = InstrumentParameters(setup.instrument, tuple(stds), tuple(stds.values()))
-    for k, name in enumerate(stds):
+    known = {name: float(p.value) for name, p in source.parameters().items() if float(p.value)}
+    priors = tuple(Unknown(name, value, PARAMETERS * abs(value)) for name, value in known.items())
+    parameters = InstrumentParameters(setup.instrument, priors)
+    for k, name in enumerate(known):
         yield name, 100.0 * PARAMETERS, " %", parameters, slice(k, k + 1)
     if not pointing:
         return

@@ -454,6 +454,46 @@ class LowRankUpdate(Covariance):
         return LowRankUpdate(self.base.scaled(factor), self.update.scaled(factor))
 
 
+class KnownFactor(Covariance):
+    """N with its square root, computed once: programs would do it at every evaluation.
+
+    Attributes
+    ----------
+    covariance : Covariance
+        N.
+    root : Factor
+        Of N.
+    """
+
+    covariance: Covariance
+    root: Factor
+
+    @classmethod
+    def of(cls, noise: Covariance) -> KnownFactor:
+        """Factorise it. InputError if it is not positive definite."""
+        return cls(noise, noise.factor())
+
+    @property
+    def size(self) -> int:
+        return self.covariance.size
+
+    def diagonal(self):
+        return self.covariance.diagonal()
+
+    def dense(self):
+        return self.covariance.dense()
+
+    def factor(self):
+        return self.root
+
+    def absorb(self, other):
+        low_rank = isinstance(other, LowRankCovariance | LowRankUpdate)
+        return None if low_rank else self.covariance + other
+
+    def scaled(self, factor):
+        return self.covariance.scaled(factor)
+
+
 class LowRankFactor(Factor):
     """The square root L = L_0 B^-T of N_0 + U U^T.
 

@@ -142,8 +142,12 @@ def coordinates(
     if positive is not None and set(latent) == set(positive.sites):
         return coordinates_of(positive, inference.solution.information)
     start = {SKY: inference.posterior.mean} if SKY in latent else {}
+    # where rounds have led to the mode, it is looked for nowhere else
+    for part in inference.expanded if inference.moving else ():
+        found = part.systematic.values(part.expected + inference.amplitudes(part).mean)
+        start |= {name: value for name, value in found.items() if name in latent}
     arguments = {**arguments, "data": data.data}
-    starts = 1 if SKY in latent else STARTS
+    starts = 1 if SKY in latent or set(start) == set(latent) else STARTS
     chart = _chart(arguments, latent)
     found = laplace_approximation(program.model, arguments, start, SCALES, starts, chart)
     return found.whitening if bool(found.converged) else None

@@ -20,10 +20,11 @@ from lusee_bayes.core.arrays import DataVector
 from lusee_bayes.core.section import Positive, Section, Treatment, requires
 from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.beams.source import BeamSource
-from lusee_bayes.instrument.coupling import Coupling, Instrument
+from lusee_bayes.instrument.coupling import BeamModes, Coupling, CouplingMatrix, Instrument
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise import instrument_errors
 from lusee_bayes.systematics.context import Around, Setup
+from lusee_bayes.systematics.horizon import Horizon
 from lusee_bayes.systematics.sources import source_responses
 from lusee_bayes.systematics.systematic import (
     ChangedBeams,
@@ -84,7 +85,8 @@ class BeamErrors(Systematic):
     @classmethod
     def build(cls, section: BeamErrorSection, setup: Setup, around: Around) -> BeamErrors:
         if not section.parameters:
-            return BeamError(setup.instrument.coupling_of(difference_of_beams(section, setup)))
+            direction = difference_of_beams(section, setup)
+            return BeamError(CouplingMatrix.of_modes(direction, setup.pointing, setup.layout))
         return InstrumentParameters.centred(setup.instrument, section.parameters)
 
     @classmethod
@@ -133,11 +135,15 @@ def _true(section: BeamErrorSection, setup: Setup, values: Values) -> tuple[Beam
     return source.with_values(own), frequency_mhz
 
 
-def difference_of_beams(section: BeamErrorSection, setup: Setup) -> ProductBeams:
-    """The direction to other beams, those of a shift or of a file."""
+def difference_of_beams(section: BeamErrorSection, setup: Setup) -> BeamModes:
+    """The direction to other beams, those of a shift or of a file; of each run behind a horizon."""
     source, frequency_mhz = _true(section, setup, {})
-    other = source.beams(frequency_mhz, setup.beams.lmax)
-    return instrument_errors.difference(other, setup.beams)
+    other, horizon = source.beams(frequency_mhz, setup.beams.lmax), setup.scenario.noise.horizon
+    modes = instrument_errors.difference(other, setup.instrument.beams()).modes
+    if horizon is None:
+        return modes
+    there = Horizon.build(horizon, replace(setup, beam_source=source, beams=other), Around())
+    return modes + there.hidden(dict.fromkeys(there.names, 0.0)) - setup.hidden
 
 
 class BeamError(BeamErrors):
@@ -175,17 +181,13 @@ class InstrumentParameters(ChangedBeams, BeamErrors):
     ----------
     instrument : Instrument
         The instrument with the prior means of its parameters.
-    parameters : tuple of str
-        Those that are not known.
-    widths : tuple of float
-        Standard deviations of their priors.
+    priors : tuple of Unknown
+        Those that are not known, in numbers: arrays would be traced, and the checks of the priors
+        and the ends of their domains need values.
     """
 
     instrument: Instrument
-    parameters: tuple[str, ...] = eqx.field(static=True)
-    # numbers, not arrays: equinox's jit then keeps them known, and the checks of the priors and
-    # the ends of their domains need their values
-    widths: tuple[float, ...] = eqx.field(static=True)
+    priors: tuple[Unknown, ...] = eqx.field(static=True)
 
     @classmethod
     def centred(cls, instrument: Instrument, stds: Mapping[str, float]) -> InstrumentParameters:
@@ -203,18 +205,18 @@ class InstrumentParameters(ChangedBeams, BeamErrors):
         InputError
             For unknown names, and for a prior that reaches out of a parameter's domain.
         """
-        made = cls(instrument, tuple(stds), tuple(map(float, stds.values())))
-        for unknown in made.unknowns:
+        known = {name: instrument.source.parameter(name) for name in stds}
+        priors = tuple(
+            Unknown(name, float(p.value), float(stds[name]), low=float(p.low), high=float(p.high))
+            for name, p in known.items()
+        )
+        for unknown in priors:
             unknown.prior()
-        return made
+        return cls(instrument, priors)
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
-        known = [self.instrument.source.parameter(name) for name in self.parameters]
-        return tuple(
-            Unknown(name, float(p.value), std, low=p.low, high=p.high)
-            for name, p, std in zip(self.parameters, known, self.widths, strict=True)
-        )
+        return self.priors
 
     def modes(self, modes, values):
         """Beams of antennas that have these values; a horizon hides what it hides without them."""

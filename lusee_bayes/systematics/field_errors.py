@@ -135,7 +135,7 @@ class FieldErrors(ChangedBeams):
     def unknowns(self) -> tuple[Unknown, ...]:
         """Of every ell: the real parts of all ports, order by order, then the imaginary parts."""
         return tuple(
-            Unknown(f"field_error_{ell}", std=float(std), size=2 * self.n_ports * (2 * ell + 1))
+            Unknown(f"field_error_{ell}", std=std, size=2 * self.n_ports * (2 * ell + 1))
             for ell, std in enumerate(self.of_ell)
         )
 
@@ -154,8 +154,8 @@ class FieldErrors(ChangedBeams):
 
     def modes(self, modes, values):
         """Add what the errors change."""
-        more = self.grid.analyse(self.changed(values) - self.patterns)
-        return modes + more[:, : modes.shape[-1]]
+        more = self.grid.analyse(self.changed(values) - self.patterns)[:, : modes.shape[-1]]
+        return modes + (more if modes.ndim == 2 else more[None])
 
     def linearised(self, model, centre):
         """Through the beams times every Y_k, of which all amplitudes of k are made."""

@@ -255,7 +255,8 @@ class GainDrifts(Systematic):
         noise = drift.covariance(self.visibilities, self.hours, self.layout, width)
         mean = drift.mean_response(self.layout.n_products)[:, None]
         grid = jnp.broadcast_to(mean, (self.layout.n_products, self.layout.n_times))
-        return multiplied(replace(model, noise=model.noise + noise), self.layout.gather(grid))
+        behind = multiplied(model, self.layout.gather(grid))
+        return replace(behind, noise=model.noise + noise)
 
     def effect(self, model, values):
         """Multiply by the response to ``gains``."""

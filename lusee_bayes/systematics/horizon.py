@@ -193,15 +193,7 @@ class Horizon(ChangedBeams):
         """Behind terrain of this altitude: A, what the terrain emits, and the signal.
 
         Without values it is the known one.
-
-        Raises
-        ------
-        InputError
-            Beside an error of the beams along the direction to others, which terrain would hide in
-            part.
         """
-        if setup.scenario.noise.beam and not setup.scenario.noise.beam.parameters:
-            raise InputError("beside noise.horizon, noise.beam can have parameters alone")
         names = offset_names(("turntable_deg",), setup.observation.n_runs)
         observation = with_offsets(setup.observation, {n: values[n] for n in names if n in values})
         found = cls.build(section, replace(setup, observation=observation), Around())

@@ -54,7 +54,12 @@ from lusee_bayes.core.section import Section
 from lusee_bayes.instrument.coupling import BeamModes, DenseCoupling
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
-from lusee_bayes.noise.covariance import Covariance, DiagonalCovariance, LowRankCovariance
+from lusee_bayes.noise.covariance import (
+    Covariance,
+    DiagonalCovariance,
+    LowRankCovariance,
+    LowRankUpdate,
+)
 from lusee_bayes.sky.prior import IndependentPrior
 from lusee_bayes.systematics.context import Around, Setup
 
@@ -198,7 +203,7 @@ class Systematic(eqx.Module):
     remedy : str
         What may help where rounds do not settle.
     needs_sky : bool
-        Whether it has so many unknowns that the sky has to be sampled together with them.
+        Whether the sky has to be sampled together with it, however many unknowns it has.
     changes_coupling : bool
         Whether A depends on it: if not, A is made dense once and for all.
     first_order : bool
@@ -532,6 +537,7 @@ class Marginalised(eqx.Module):
 
     systematic: Systematic
 
+    names: ClassVar[tuple[str, ...]] = ()
     needs_sky: ClassVar[bool] = False
 
     @property
@@ -546,6 +552,22 @@ class Marginalised(eqx.Module):
     def sampled(self, model: LinearGaussian) -> LinearGaussian:
         """The same: no site is sampled."""
         return self.marginalised(model)
+
+
+class InPlace(Marginalised):
+    """A systematic at its place among sampled ones, in a model whose N holds it already.
+
+    Attributes
+    ----------
+    held : Marginalised
+        As N holds it.
+    """
+
+    held: Marginalised
+
+    def sampled(self, model: LinearGaussian) -> LinearGaussian:
+        """What it does besides."""
+        return replace(self.held.marginalised(model), noise=model.noise)
 
 
 class Expanded(Marginalised):
@@ -683,10 +705,6 @@ class AdditiveNoise(Systematic):
     def unknowns(self) -> tuple[Unknown, ...]:
         return (Unknown(f"{self.name}_noise", size=self.covariance().rank),)
 
-    @property
-    def needs_sky(self) -> bool:
-        return self.covariance().rank > MOST_COLLAPSED
-
     def effect(self, model, values):
         """Add the noise that (rank,) unit normals make."""
         return with_added(model, self.covariance().colour(values[f"{self.name}_noise"]))
@@ -749,15 +767,25 @@ def present(systematics: Sequence[type[Systematic]], scenario: Any) -> list[tupl
     return [(cls, attrgetter(cls.key)(scenario)) for cls in found]
 
 
+def sky_is_sampled(systematics: Sequence[Systematic | Marginalised]) -> bool:
+    """Whether all together have so many unknowns that the sky is to be sampled with them."""
+    n = sum(len(systematic.names) for systematic in systematics)
+    return n > MOST_COLLAPSED or any(systematic.needs_sky for systematic in systematics)
+
+
 def with_added(model: LinearGaussian, signal: DataVector) -> LinearGaussian:
     """Add a signal in K to the mean of a model's data."""
     return replace(model, offset=signal if model.offset is None else model.offset + signal)
 
 
 def multiplied(model: LinearGaussian, response: DataVector) -> LinearGaussian:
-    """Multiply the mean of a model's data, of sky and offset, by gains."""
+    """Multiply by gains what a model's data hold: sky and offset, and unknowns that N holds."""
     offset = None if model.offset is None else model.offset * response
-    return replace(model, coupling=model.coupling.with_response(response), offset=offset)
+    coupling, noise = model.coupling.with_response(response), model.noise
+    if isinstance(noise, LowRankUpdate):
+        root = (noise.update.root.T * response[None]).T
+        noise = replace(noise, update=replace(noise.update, root=root))
+    return replace(model, coupling=coupling, noise=noise, offset=offset)
 
 
 def scalar_or_none(value: float | Float[Array, ""] | None) -> Float[Array, ""] | None:

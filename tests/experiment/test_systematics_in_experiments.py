@@ -98,7 +98,7 @@ def test_a_shifted_beam_is_that_of_the_other_frequency():
     # the same beams compiled twice: rounding
     within(true_beams(setup).modes, other.modes, 1e-15)
     change = np.asarray(other.modes) - np.asarray(setup.beams.modes)
-    within(difference_of_beams(setup.scenario.noise.beam, setup).modes, change, 1e-15)
+    within(difference_of_beams(setup.scenario.noise.beam, setup), change, 1e-15)
     seen = lb.CouplingMatrix.build(other, setup.pointing) @ setup.sky.modes
     sigma = np.sqrt(np.asarray(radiometer(setup).diagonal()))
     z = np.asarray(data.data - seen) / sigma

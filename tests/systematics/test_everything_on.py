@@ -1,14 +1,22 @@
 """Gains, ground, arms, clock, turntable and receivers, all unknown, found together with the sky."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from experiments import with_known_sky
+from scipy.stats import chi2 as stats_chi2
+from scipy.stats import kstest, norm
 
 import lusee_bayes as lb
+from lusee_bayes.experiment import rounds
+from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.experiment.model import set_up, simulate, true_values
-from lusee_bayes.experiment.rounds import Inference
+from lusee_bayes.experiment.rounds import Inference, settled
 from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.linear.amplitudes import template_amplitudes
+from lusee_bayes.sampling.programs import require_sampleable
 from lusee_bayes.systematics.context import Setup
 
 SKIES = {
@@ -28,6 +36,8 @@ NOISE = {
     "pointing": {"clock_s": 20.0, "turntable_deg": 0.2},
     "receiver": {"power_k": 2e4, "relative_std": 0.1},
 }
+# data sets of a calibration
+N = 40
 
 
 def scenario(mhz: float, angles: int, **more) -> Scenario:
@@ -74,6 +84,62 @@ def test_all_are_found_together(test_data):
     assert not found.unsettled and found.rounds < 12
     assert 0.75 < whitened_error(truth, found) < 1.25
     assert max(map(abs, away.values())) < 3.5
+
+
+@pytest.mark.long
+def test_every_unknown_can_be_sampled_beside_all_others(monkeypatch):
+    """Programs are traced, not run; what N is about does not matter."""
+    monkeypatch.setattr(rounds, "MAX_ROUNDS", 2)
+    more = {
+        "gain_table": {"std": 0.005},
+        "horizon": {"altitude_deg": 3.0, "std_deg": 1.0, "harmonics": 1},
+        "fields": {"lmax": 2},
+        "polarisation": {"linear": 0.01, "lmax": 2},
+    }
+    everything = NOISE | more
+    given = {"sky": {"sources": False}, "step_s": 5e5, "lmax": 2}
+    for kept in ("gain", "beam"):
+        noise = {
+            key: {**section, "treatment": "marginalised" if key == kept else "sampled"}
+            for key, section in everything.items()
+        }
+        sources = {"list": [{"name": "Cas A"}], "treatment": "sampled"}
+        made = lb.build(scenario(10.0, 2, noise=noise, sources=sources, **given))
+        program, found = lb.load_program("systematics"), lb.infer(made)
+        arguments = program.arguments(found.model, program_pieces(made))
+        latent = require_sampleable(program, arguments, np.asarray(made.data.data), 9)
+        # so many errors of fields, or of gains, are sampled with the sky
+        assert "sky" in latent and len(latent) > 10
+
+
+@pytest.mark.long
+def test_error_bars_of_all_together_are_right():
+    """Skies and instruments drawn from their priors: chi^2 of sky and of ten unknowns, and ranks.
+
+    The sky is known to a fifth, so that none is without a signal.
+    """
+    more = {"lmax": 4, "step_s": 86400.0, "prior": {"model": "isotropic", "spectrum": "sky"}}
+    first = with_known_sky(set_up(scenario(10.0, 2, **more)), 0.04)
+    prior, chi2, below = first.prior, [], []
+    for seed in range(N):
+        own = replace(first, scenario=first.scenario.model_copy(update={"seed": seed}))
+        white = np.random.default_rng(seed).standard_normal(prior.size)
+        sky = np.asarray(prior.colour(white)) + np.asarray(prior.mean)
+        truth = own.under(replace(own.sky, modes=sky))
+        found = settled(replace(own, measured=True), simulate(truth))
+        assert not found.unsettled
+        columns = np.concatenate([np.asarray(part.columns) for part in found.expanded], axis=1)
+        told = template_amplitudes(found.solution, columns)
+        off = np.array(list(pulls(truth, found).values()))
+        below.append(norm.cdf(off))
+        away = off * np.concatenate([found.amplitudes(part).std for part in found.expanded])
+        of_sky = prior.size * whitened_error(truth, found) ** 2
+        chi2.append((of_sky, away @ np.linalg.solve(told.covariance, away)))
+    n = prior.size, len(off)
+    print(np.mean(chi2, axis=0) / n, [kstest(one, "uniform").pvalue for one in np.transpose(below)])
+    for own, size in zip(np.transpose(chi2), n, strict=True):
+        assert kstest(own, stats_chi2(size).cdf).pvalue > 1e-3
+    assert min(kstest(one, "uniform").pvalue for one in np.transpose(below)) > 1e-3 / len(off)
 
 
 @pytest.mark.long

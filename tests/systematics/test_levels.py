@@ -23,7 +23,12 @@ from lusee_bayes.systematics.context import Around
 from lusee_bayes.systematics.noise_level import NoiseLevel
 from lusee_bayes.systematics.prior_spectrum import PriorSpectrum
 from lusee_bayes.systematics.sources import PointSources, Source
-from lusee_bayes.systematics.systematic import MOST_COLLAPSED, AdditiveNoise, Marginalised
+from lusee_bayes.systematics.systematic import (
+    MOST_COLLAPSED,
+    AdditiveNoise,
+    Marginalised,
+    sky_is_sampled,
+)
 
 LMAX, N_DATA = 4, 40
 ELLS = np.arange(LMAX + 1)
@@ -235,5 +240,5 @@ def test_marginalised_and_sampled_are_one_distribution(model, term):
     root = np.asarray(jax.jit(jax.jacfwd(offset))(jnp.zeros(rank)))
     np.testing.assert_allclose(root @ root.T, dense, rtol=0, atol=1e-12)
     np.testing.assert_array_equal(offset(jnp.zeros(rank)), model.offset)
-    assert term.needs_sky == (rank > MOST_COLLAPSED)
+    assert sky_is_sampled((term,)) == (rank > MOST_COLLAPSED)
     assert not term.changes_coupling

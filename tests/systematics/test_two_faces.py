@@ -28,6 +28,7 @@ from lusee_bayes.instrument.pointing import CLOCK
 from lusee_bayes.instrument.products import all_products
 from lusee_bayes.systematics.context import Around
 from lusee_bayes.systematics.gain_drifts import GainDrifts
+from lusee_bayes.systematics.polarisation import Polarisation
 from lusee_bayes.systematics.systematic import Expanded
 
 GAINS = "noise.gain={sigma: %g, correlation_h: 10, treatment: %s, visibilities: %s}"
@@ -80,6 +81,23 @@ def test_white_noise_makes_drifts_of_the_right_covariance():
         expected = 4e-4 * np.exp(-(lag**2) / (2 * correlation_h**2))
         cut = np.exp(-2 * (60.0 / correlation_h) ** 2)
         np.testing.assert_allclose(root.T @ root, expected, rtol=0, atol=4e-4 * (1e-14 + cut))
+
+
+def test_sampled_gains_multiply_what_n_holds_and_drifts_stay_in_it():
+    """N by hand: the radiometer's, that of drifts, and the polarised sky behind the table."""
+    table, sky = "noise.gain_table={std: 0.02, treatment: sampled}", "{linear: 0.01, lmax: 2}"
+    drifts = GAINS % (1e-3, "marginalised", "model")
+    e = small_experiment(table, f"noise.polarisation={sky}", drifts, lmax=2)
+    setup, z = e.setup, np.array([0.7, -1.1, 0.4, 1.6])
+    base, section = base_model(setup), setup.scenario.noise
+    drifting = GainDrifts.build(section.gain, setup, Around()).marginalised(base)
+    gains = np.repeat([np.sqrt((1 + 0.02 * z[i]) * (1 + 0.02 * z[j])) for i, j in PAIRS], 6)
+    u = gains[:, None] * Polarisation.build(section.polarisation, setup, Around()).root
+    a = gains[:, None] * np.asarray(drifting.coupling.dense())
+    noise, s = np.asarray(drifting.noise.dense()) + u @ u.T, np.asarray(setup.prior.variance())
+    expected = exact_posterior(a, s, noise, np.asarray(e.data.data)).log_prob
+    got = density_of(e, {"gain_table": z})
+    assert got == pytest.approx(expected + norm.logpdf(z).sum(), rel=1e-8, abs=1e-4)
 
 
 # --- coordinates for sky and gains together -------------------------------------------------------
