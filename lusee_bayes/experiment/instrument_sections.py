@@ -194,15 +194,26 @@ ReceiverSection = Annotated[
 
 
 class BaseBeamSection(Section):
-    """What all beams have in common."""
+    """What all beams have in common.
+
+    Attributes
+    ----------
+    exact : bool
+        Maps of measured data take the beams as they are. By default, and without ``noise.beam`` and
+        ``noise.fields``, ground, arms and fields are then unknowns.
+    """
 
     # whether something about them can be an unknown
     has_parameters: ClassVar[bool] = False
+    # standard deviations of what is not known of them by default, relative
+    errors: ClassVar[Mapping[str, float]] = {}
+
+    exact: bool = False
 
     def of_file(self, file: str) -> Any:
         """The section of beams of a file that are turned as these are."""
         kind = BEAM_SECTIONS[beam_kind(file)]
-        shared = set(kind.model_fields) - {"model", "file"}
+        shared = set(kind.model_fields) - {"model", "file", "exact"}
         return kind(file=file, **self.model_dump(include=shared))
 
 
@@ -233,6 +244,15 @@ class MonopoleBeamSection(BaseBeamSection):
     label: ClassVar[str] = "monopole"
     n_ports: ClassVar[int] = N_ANTENNAS
 
+    errors: ClassVar[Mapping[str, float]] = {
+        "surface_permittivity": 0.05,
+        "deep_permittivity": 0.05,
+        "loss_tangent": 0.3,
+        "zenith_angle_deg": 0.007,
+        "length_m": 0.003,
+        "height_m": 0.01,
+    }
+
     model: Literal["monopole"] = "monopole"
     length_m: Positive = 3.0
     zenith_angle_deg: Annotated[float, Field(gt=0, lt=180)] = 75.0
@@ -246,7 +266,8 @@ class MonopoleBeamSection(BaseBeamSection):
         """The antennas."""
         ground = {"surface_permittivity", "deep_permittivity", "loss_tangent"}
         regolith = Regolith(**self.model_dump(include=ground))
-        return Monopoles(regolith=regolith, **self.model_dump(exclude={"model", *ground}))
+        others = self.model_dump(exclude={"model", "exact", *ground})
+        return Monopoles(regolith=regolith, **others)
 
 
 class _FileSection(BaseBeamSection):

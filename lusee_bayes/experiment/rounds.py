@@ -6,6 +6,7 @@ Priors also come by name, for a comparison under which of them data are most pro
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -129,7 +130,7 @@ class Inference:
     def fits(self) -> bool:
         """Whether chi^2 of the data does not stand out by far."""
         n = len(self.solution.data)
-        return self.solution.chi2 < n + FAR_OFF * np.sqrt(2.0 * n)
+        return self.solution.chi2 < n + FAR_OFF * math.sqrt(2.0 * n)
 
     def moves_from(self, before: Inference) -> float:
         """By how much the map has moved, rms in standard deviations."""

@@ -21,6 +21,8 @@ from lusee_bayes.core.reading import as_yaml, parse_yaml, read_yaml
 from lusee_bayes.core.section import Frequency, Section, Seed, is_modelled
 from lusee_bayes.experiment import instrument_sections, sky_sections
 from lusee_bayes.flight.recipe import FlightSection
+from lusee_bayes.systematics.beam import BeamErrorSection
+from lusee_bayes.systematics.field_errors import FieldErrorsSection
 from lusee_bayes.systematics.registered import SYSTEMATICS, NoiseSection
 from lusee_bayes.systematics.sources import SourcesSection
 from lusee_bayes.systematics.systematic import present
@@ -267,6 +269,17 @@ class Scenario(Section):
             if cls.treatment(self) != "ignored"
         }
         return {words: octaves for words, octaves in found.items() if octaves}
+
+    def of_measured(self) -> Scenario:
+        """The scenario of measured data: beams that nobody calls exact have unknowns."""
+        if self.beam.exact or self.noise.beam is not None or self.noise.fields is not None:
+            return self
+        known = {
+            name: relative * getattr(self.beam, name) for name, relative in self.beam.errors.items()
+        }
+        stds = {name: std for name, std in known.items() if std > 0.0}
+        beam = BeamErrorSection(parameters=stds) if stds else None
+        return self.with_section("noise", beam=beam, fields=FieldErrorsSection())
 
     def with_section(self, name: str, **values: object) -> Scenario:
         """The scenario with some values of a section changed."""

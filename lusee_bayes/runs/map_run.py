@@ -79,6 +79,7 @@ def run_map(
         If the scenario samples something, or for whatever is wrong with scenario, data or folder.
     """
     scenario = load_scenario(scenario)
+    scenario = scenario if data is None else scenario.of_measured()
     stages = stages or Stages()
     scenario.require_marginal("a map", "use: lusee-bayes sample")
     if not scenario.single:

@@ -73,6 +73,7 @@ class GainTable(Systematic):
     remedy: ClassVar[str] = "noise.gain_table.treatment=sampled"
     changes_coupling: ClassVar[bool] = False
     moves: ClassVar[bool] = True
+    scales_sky: ClassVar[bool] = True
 
     errors: tuple[str, ...] = eqx.field(static=True)
     port: tuple[int, ...] = eqx.field(static=True)

@@ -210,6 +210,8 @@ class Systematic(eqx.Module):
         Whether :meth:`marginalised` takes the effect to first order.
     moves : bool
         Whether that is about values and a sky that the data determine, found in rounds.
+    scales_sky : bool
+        Whether its effect is a factor of all visibilities.
     has_table : bool
         Whether reports have a table of its unknowns alone.
     learns : bool
@@ -226,6 +228,7 @@ class Systematic(eqx.Module):
     changes_coupling: ClassVar[bool] = True
     first_order: ClassVar[bool] = True
     moves: ClassVar[bool] = False
+    scales_sky: ClassVar[bool] = False
     has_table: ClassVar[bool] = False
     learns: ClassVar[bool] = False
 

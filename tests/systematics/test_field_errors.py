@@ -130,3 +130,21 @@ def test_maps_beside_errors_of_the_fields(seed):
         full.append(np.sqrt(np.mean((np.asarray(posterior.lower).T @ away) ** 2)))
         assert not found.unsettled
     assert 0.75 < full[0] < 1.25 and full[1] > 5.0
+
+
+def test_beams_of_measured_data_are_not_exact_unless_a_scenario_says_so():
+    """Ground and arms that differ from the model's by what is expected of them.
+
+    49 modes: the rms of directions scatters by 0.1, so that 1.4 is beyond four of that. With exact
+    beams it is larger by orders of magnitude.
+    """
+    shared = [TWO_RUNS, "observation.step_s=43200", "lmax=6"]
+    true = ["surface_permittivity=3.85", "deep_permittivity=6.0", "zenith_angle_deg=75.4"]
+    measured = [f"beam.{one}" for one in true]
+    data = simulate(set_up(lb.load_scenario("fiducial", overrides=[*shared, *measured])))
+    for exact in (True, False):
+        model = lb.load_scenario("fiducial", overrides=[*shared, f"beam.exact={exact}".lower()])
+        posterior = lb.infer(lb.build(model.of_measured(), data)).posterior
+        off = posterior.mean - data.truth
+        full = np.sqrt(off @ np.linalg.solve(posterior.covariance(), off) / len(off))
+        assert full > 10.0 if exact else 0.6 < full < 1.4

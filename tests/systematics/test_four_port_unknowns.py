@@ -22,7 +22,7 @@ from lusee_bayes.experiment.model import (
     true_signal,
     true_values,
 )
-from lusee_bayes.experiment.rounds import Inference
+from lusee_bayes.experiment.rounds import Inference, settled
 from lusee_bayes.instrument.beams.sampled import read_beam
 from lusee_bayes.instrument.products import all_products, labels
 from lusee_bayes.instrument.visibilities import Calibration
@@ -322,7 +322,7 @@ def test_rounds_find_the_mode_and_the_first_order_does_not(experiment, response_
     first = Inference(model.condition(d), unknowns, 1, around)
     assert np.abs(off(first) / std).max() > 5.0
     assert np.abs(root @ off(first)).max() > 5.0
-    again = lb.infer(replace(experiment, around=around))
+    again = settled(experiment.setup, experiment.data, around)
     assert np.abs(off(again) / std).max() < 0.05
     # the joint mode is another: each of 21 skies and powers gains by being 0.5 % smaller
     assert force.min() > 0.04
