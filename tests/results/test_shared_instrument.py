@@ -63,7 +63,7 @@ def test_a_channel_without_an_unknown_tells_nothing_of_it():
     scenario = lb.load_scenario("fiducial", SMALL)
     one = {"a": np.inf, "b": np.inf}, np.array([0.5, 1.0]), np.diag([0.2, 0.1]), 4
     other = {"a": np.inf}, np.array([0.3]), np.full((1, 1), 0.5), 4
-    tied = tie_channels(scenario, [15.0, 20.0], [one, other])
+    tied, _ = tie_channels(scenario, [15.0, 20.0], [one, other])
     assert tied.names == ("a", "b")
     # of a: 1 / 0.2 + 1 / 0.5 - 1
     within(tied.mean, [[3.1 / 6.0, 1.0]] * 2, 1e-12)

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
 from matplotlib.ticker import MaxNLocator
 
 from lusee_bayes.flight.gain_model import LETTERS
@@ -158,6 +159,68 @@ def unknowns_by_frequency(result: MapResult) -> Figure | None:
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper right", ncols=3, frameon=False)
     return figure
+
+
+# half the width of a corner plot's panels, in posterior standard deviations
+CORNER = 3.5, 12.0
+
+
+def corner(result: MapResult) -> Figure | None:
+    """Draw the posterior of the first channel's unknowns, pair by pair, with prior and truth.
+
+    Axes are in posterior standard deviations from the posterior mean. They go as far as the truth,
+    up to 12; beyond, it is marked at the edge.
+    """
+    theta = result.channel.theta
+    if theta is None or theta.corner.empty:
+        return None
+    table, n = theta.corner, len(theta.corner)
+    prior = ((table["prior"] - table["value"]) / table["std"]).to_numpy()
+    wide = (table["prior_std"] / table["std"]).to_numpy()
+    true, half = np.full(n, np.nan), CORNER[0]
+    if "true" in table:
+        true = ((table["true"] - table["value"]) / table["std"]).to_numpy()
+        half = min(max(half, 1.2 * float(np.abs(true).max())), CORNER[1])
+        true = np.clip(true, -0.97 * half, 0.97 * half)
+    side, x = 1.3 * n + 1.0, np.linspace(-half, half, 201)
+    figure, panels = drawing.framed((side, side), n, n, squeeze=False)
+    for (i, j), axes in np.ndenumerate(panels):
+        axes.set(xlim=(-half, half), xticks=[-2, 0, 2], yticks=[])
+        axes.tick_params(labelsize=7, labelbottom=i == n - 1)
+        if j > i:
+            axes.set_axis_off()
+        elif i == j:
+            axes.plot(
+                x, np.exp(-0.5 * ((x - prior[i]) / wide[i]) ** 2), color=drawing.GREY, alpha=0.5
+            )
+            axes.plot(x, np.exp(-0.5 * x**2), color=drawing.BLUE)
+            axes.axvline(true[i], color=drawing.ORANGE, lw=1)
+            row = table.iloc[i]
+            name = row["unknown"].replace("_", " ")
+            axes.set_title(
+                f"{name}\n{row['value']:.6g}\n± {row['std']:.1g} {row['unit']}", fontsize=7
+            )
+        else:
+            axes.set(ylim=(-half, half), yticks=[-2, 0, 2] if j == 0 else [])
+            _ellipses(axes, (0.0, 0.0), (1.0, 1.0), theta.correlation[i, j], drawing.BLUE, 1.0)
+            _ellipses(axes, prior[[j, i]], wide[[j, i]], 0.0, drawing.GREY, 0.5)
+            axes.plot(true[j], true[i], "x", color=drawing.ORANGE, ms=6)
+    at = "" if result.single else f" (channel of {result.channel.frequency_mhz:g} MHz)"
+    figure.suptitle(f"Unknowns of the instrument{at}", fontsize=10)
+    figure.supxlabel("posterior standard deviations from the mean", fontsize=9)
+    return figure
+
+
+def _ellipses(axes: Axes, middle, widths, correlation: float, colour: str, alpha: float) -> None:
+    """Contours of a Gaussian in two unknowns at one and two standard deviations."""
+    cross = correlation * widths[0] * widths[1]
+    values, vectors = np.linalg.eigh([[widths[0] ** 2, cross], [cross, widths[1] ** 2]])
+    angle = float(np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1])))
+    short, long = np.sqrt(np.maximum(values, 0.0))
+    for n in (1, 2):
+        size = 2 * n * long, 2 * n * short
+        style = {"fill": False, "color": colour, "alpha": alpha, "lw": 1.2 / n}
+        axes.add_patch(Ellipse(middle, *size, angle=angle, **style))
 
 
 LEVEL_COLOURS = {"L": drawing.COLOURS[4], "M": drawing.BLUE, "H": drawing.COLOURS[3]}
