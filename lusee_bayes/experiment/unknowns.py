@@ -10,10 +10,10 @@ integrated out.
 
 Of clock and pointing, the offsets of the model are told, and which each day prefers.
 
-Together, the unknowns of the instrument are theta. With W = Cov(m, theta) and V = Cov(theta), fixing
-theta at its posterior mean lowers the covariance C of the sky by W V^-1 W^T; the ratio of the
-variances of this matrix and of C is the share of theta. The shares of single systematics, with
-blocks of W and V, need not add up: errors that are correlated may count in several of them.
+Together, the unknowns of the instrument are theta. With W = Cov(m, theta) and V = Cov(theta),
+fixing theta at its posterior mean lowers the covariance C of the sky by W V^-1 W^T; the ratio of
+the variances of this matrix and of C is the share of theta. The shares of single systematics, with
+blocks of W and V, need not add up.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ as 38 of 46 channels above, are seen in the sum and in the number of those above
 The rest of chi^2 of all data under the model tells of the prior.
 
 Channels that share the instrument can contradict each other. The data of channel k constrain the
-shared unknowns by a likelihood N(y, L^-1) in z (:mod:`.amplitudes`: L = V^-1 - 1, L y = V^-1 E), and
+shared unknowns by a likelihood N(y, L^-1), with L = V^-1 - 1 and L y = V^-1 E (:mod:`.amplitudes`);
 all other channels, with the prior, predict N(m, P). If the instrument is the same, ::
 
     chi^2 = (y - m)^T (L^-1 + P)^-1 (y - m)
