@@ -143,6 +143,10 @@ class AmplitudesOfSky:
         )
 
 
+# data that are looked at first to find a column among many
+FEW = 8
+
+
 def amplitudes_of_sky(solution: Solution, templates: Float[Array, "data n"]) -> AmplitudesOfSky:
     """Compute the posterior of templates' amplitudes given the sky.
 
@@ -164,8 +168,9 @@ def amplitudes_of_sky(solution: Solution, templates: Float[Array, "data n"]) -> 
         root = np.asarray(model.noise.update.root)
         at: list[int] = []
         for column in t.T:  # two may be alike
-            found = np.flatnonzero((root == column[:, None]).all(0))
-            at.append(next(int(k) for k in found if k not in at))
+            alike = np.flatnonzero((root[:FEW] == column[:FEW, None]).all(0))
+            alike = (int(k) for k in alike if k not in at)
+            at.append(next(k for k in alike if (root[:, k] == column).all()))
         left = cho_solve((np.asarray(factor.lower), True), np.eye(root.shape[1])[:, at])
         solved, covariance = factor.base.whiten_transpose(factor.v @ left), left[at]
     else:
