@@ -25,7 +25,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.linalg import block_diag
 
 from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels
@@ -332,7 +332,7 @@ class Unknowns:
 
         correlation = told.covariance / np.outer(told.std, told.std)
 
-        def root(which: Sequence[int]) -> Float[np.ndarray, "modes which"]:
+        def root(which: Int[np.ndarray, " which"]) -> Float[np.ndarray, "modes kept"]:
             """R of W V^-1 W^T = R R^T."""
             values, axes = np.linalg.eigh(correlation[np.ix_(which, which)])
             kept = values > len(values) * np.finfo(np.float64).eps

@@ -193,8 +193,10 @@ class SharedTest:
     Attributes
     ----------
     frequency_mhz : float
-    chi2, degrees : float
+    chi2 : float
         Of the difference from all others that agree with each other.
+    degrees : int
+        Directions of the unknowns that the channel's own data constrain.
     disagrees : bool
         Whether it stands out among all channels.
     shares : dict of float
@@ -205,7 +207,7 @@ class SharedTest:
 
     frequency_mhz: float
     chi2: float
-    degrees: float
+    degrees: int
     disagrees: bool
     shares: dict[str, float]
 
