@@ -9,6 +9,11 @@ other channel's data tell of them: p(z | all data) is p(z | m, d) with the joint
 integrated out.
 
 Of clock and pointing, the offsets of the model are told, and which each day prefers.
+
+Together, the unknowns of the instrument are theta. With W = Cov(m, theta) and V = Cov(theta),
+fixing theta at its posterior mean lowers the covariance C of the sky by W V^-1 W^T; the ratio of
+the variances of this matrix and of C is the share of theta. The shares of single systematics, with
+blocks of W and V, need not add up.
 """
 
 from __future__ import annotations
@@ -20,10 +25,10 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.linalg import block_diag
 
-from lusee_bayes.core.arrays import Modes, ModesMatrix
+from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels
 from lusee_bayes.core.trees import quantity
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import base_model, radiometer, true_values
@@ -31,6 +36,7 @@ from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.instrument.pointing import offset_names
 from lusee_bayes.judge.measures import preferences
 from lusee_bayes.linear.amplitudes import Amplitudes, AmplitudesOfSky, amplitudes_of_sky
+from lusee_bayes.linear.posterior import pixel_std
 from lusee_bayes.sky.galaxy import kelvin_steradian
 from lusee_bayes.systematics.context import Around
 from lusee_bayes.systematics.gain_table import COMMON_GAIN
@@ -174,6 +180,48 @@ def _line(name: str, row: Mapping[str, Any]) -> str:
     return text
 
 
+# unknowns in a corner plot, at most
+MOST_IN_CORNER = 12
+ALL_TOGETHER = "all together"
+
+
+@dataclass(frozen=True)
+class InstrumentPosterior:
+    """Posterior of theta, the unknowns of the instrument, and what it does to the map.
+
+    Attributes
+    ----------
+    table : DataFrame
+        A row for each unknown, or for each ell of the errors of fields: ``systematic``,
+        ``unknown``, ``n`` (how many it stands for), ``moved`` and ``width``, the rms distance of
+        posterior means from prior means and the rms standard deviation, in prior standard
+        deviations.
+    corner : DataFrame
+        At most 12 unknowns, no errors of fields: first those that channels share, then those that
+        are best constrained relative to their priors. Columns as in :class:`UnknownsReport`.
+    correlation : (parameters, parameters) array
+        Of these.
+    shares : dict of float
+        The share of the map's variance, summed over all modes, that would vanish if a systematic,
+        or all together, were known.
+    pixel_share : (pixels,) array
+        The same share for each pixel of the map, all systematics together.
+    """
+
+    table: pd.DataFrame
+    corner: pd.DataFrame
+    shares: dict[str, float]
+    correlation: Float[np.ndarray, "parameter parameter_2"] = quantity(
+        "1", "correlation of unknowns"
+    )
+    pixel_share: Pixels = quantity("1", "share of the variance that unknowns of the instrument add")
+
+    def summary(self) -> dict[str, Any]:
+        """Entry of summary.json."""
+        tables = {name: getattr(self, name).to_dict("records") for name in ("table", "corner")}
+        return {"shares": self.shares, **tables, "correlation": self.correlation.tolist()}
+
+
 @dataclass(frozen=True)
 class Unknowns:
     """What some data tell of the instrument given the sky: what reports list, and what is shared.
@@ -181,8 +229,7 @@ class Unknowns:
     Attributes
     ----------
     rows : tuple of dict
-        Of each: unknown, unit, prior, prior_std, ``expected`` (the prior mean in N), ``listed``
-        (whether it is in the table: clock and pointing have one of their own) and, if known, true.
+        As of :func:`before_data`.
     amplitudes : AmplitudesOfSky
         Of all of them, about ``expected``.
     expected : (n,) array
@@ -220,7 +267,7 @@ class Unknowns:
         for part in found.expanded:
             own, none = part.systematic, ((), np.zeros((0, len(part.expected))))
             over = own.octaves(attrgetter(own.key)(scenario))
-            if over or not own.has_table:
+            if not isinstance(own, PointSources):
                 held.append(part)
                 octaves.append(np.full(len(part.expected), over))
                 alike.append(none if own.has_table else own.like_the_sky())
@@ -268,6 +315,51 @@ class Unknowns:
         columns = [*UNKNOWN_COLUMNS, *(["true"] if "true" in rows else [])]
         return UnknownsReport(rows[columns], null, common)
 
+    def instrument(
+        self, mean: Modes, covariance: ModesMatrix, pixels: Pixels
+    ) -> InstrumentPosterior:
+        """Posterior of all of them, and what it does to the map.
+
+        Parameters
+        ----------
+        mean, covariance : (modes,) and (modes, modes) array
+            Posterior of the sky, in K and K^2.
+        pixels : (pixels,) array
+            Posterior standard deviation of each pixel, in K.
+        """
+        told, total = self.amplitudes.integrated(mean, covariance), float(np.trace(covariance))
+        rows = given_data(pd.DataFrame(self.rows), told)
+
+        correlation = told.covariance / np.outer(told.std, told.std)
+
+        def root(which: Int[np.ndarray, " which"]) -> Float[np.ndarray, "modes kept"]:
+            """R of W V^-1 W^T = R R^T."""
+            values, axes = np.linalg.eigh(correlation[np.ix_(which, which)])
+            kept = values > len(values) * np.finfo(np.float64).eps
+            return (told.with_sky / told.std)[:, which] @ (axes[:, kept] / np.sqrt(values[kept]))
+
+        every = root(np.arange(len(rows)))
+        kinds = rows.groupby("systematic", sort=False).indices
+        parts = {ALL_TOGETHER: every} | {name: root(at) for name, at in kinds.items()}
+        moved = (rows["value"] - rows["prior"]) / rows["prior_std"]
+        squares = rows.assign(n=1, moved=moved**2, width=told.std**2)
+        named = squares.rename(columns={"unknown": "one", "site": "unknown"})
+        groups = named.groupby(["systematic", "unknown"], sort=False)
+        table = groups.agg({"n": "sum", "moved": "mean", "width": "mean"}).reset_index()
+        table[["moved", "width"]] **= 0.5
+        single = np.flatnonzero(rows["site"] == rows["unknown"])
+        best = np.lexsort((told.std[single], self.octaves[single] == 0))[:MOST_IN_CORNER]
+        corner = np.sort(single[best])
+        columns = [*UNKNOWN_COLUMNS, *(["true"] if "true" in rows else [])]
+        nside = round(np.sqrt(len(pixels) / 12))
+        return InstrumentPosterior(
+            table,
+            rows.loc[corner, columns].reset_index(drop=True),
+            {name: float((part**2).sum()) / total for name, part in parts.items()},
+            correlation[np.ix_(corner, corner)],
+            (pixel_std(every @ every.T, nside) / pixels) ** 2,
+        )
+
     def _null_direction(self, told: Amplitudes, variance: float) -> NullDirection:
         mixed = self.parts @ told.with_sky[0] / self.sky_std
         inner = self.parts @ told.covariance @ self.parts.T
@@ -289,7 +381,8 @@ def before_data(parts: Sequence[Expanded], truth: Truth | None) -> pd.DataFrame:
     -------
     DataFrame
         A row for each: unknown, unit, prior, prior_std, ``expected`` (the prior mean in N),
-        ``listed`` and, if known, true.
+        ``listed`` (whether it is in the report's table: pointing has one of its own), what it
+        belongs to (``systematic``, and ``site``: the ell of errors of fields) and, if known, true.
     """
     tables = []
     for part in parts:
@@ -302,7 +395,10 @@ def before_data(parts: Sequence[Expanded], truth: Truth | None) -> pd.DataFrame:
         }
         table = pd.DataFrame({name: values for name, values in columns.items() if values})
         table = table.rename_axis("unknown").reset_index()
-        tables.append(table.assign(unit=own.unit, listed=not own.has_table))
+        sites = [u.name for u in own.unknowns for _ in range(u.size or 1)]
+        sites = sites if own.has_table else own.names
+        table = table.assign(unit=own.unit, listed=not own.has_table, site=sites)
+        tables.append(table.assign(systematic=own.words))
     return pd.concat(tables, ignore_index=True)
 
 

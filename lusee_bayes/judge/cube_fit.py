@@ -6,10 +6,21 @@ is above its median with a chance of one half. Small excesses that no channel sh
 as 38 of 46 channels above, are seen in the sum and in the number of those above.
 
 The rest of chi^2 of all data under the model tells of the prior.
+
+Channels that share the instrument can contradict each other. The data of channel k constrain the
+shared unknowns by a likelihood N(y, L^-1), with L = V^-1 - 1 and L y = V^-1 E (:mod:`.amplitudes`);
+all other channels, with the prior, predict N(m, P). If the instrument is the same, ::
+
+    chi^2 = (y - m)^T (L^-1 + P)^-1 (y - m)
+
+has as many degrees of freedom as there are directions that channel k constrains. A wrong channel
+spoils the prediction of all the others. The worst channel is therefore left out, and the rest are
+tested again, until no channel stands out.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +29,7 @@ from pydantic import computed_field
 from scipy.special import bdtr, chdtrc
 
 from lusee_bayes.judge.chi2 import LEVELS, ChiSquare, Fit, Level, in_brief, probability, stands_out
+from lusee_bayes.linear.amplitudes import root_of_kernels
 
 # of the joint tests
 N_TESTS = 4
@@ -168,3 +180,115 @@ class ChannelFits:
                 "too wide elsewhere: choose another prior (lusee-bayes compare-priors)."
             ]
         return []
+
+
+# information in prior units below which a channel's own data do not constrain a direction
+LEAST_INFORMATION = 1e-2
+
+
+@dataclass(frozen=True)
+class SharedTest:
+    """What a channel's own data say of the shared instrument, compared with all other channels.
+
+    Attributes
+    ----------
+    frequency_mhz : float
+    chi2 : float
+        Of the difference from all others that agree with each other.
+    degrees : int
+        Directions of the unknowns that the channel's own data constrain.
+    disagrees : bool
+        Whether it stands out among all channels.
+    shares : dict of float
+        By unknown that all channels have in common: this channel's share of the information, which
+        is 1 / variance - 1 in prior units. Each channel counts as if it were alone; NaN where no
+        channel constrains the unknown.
+    """
+
+    frequency_mhz: float
+    chi2: float
+    degrees: int
+    disagrees: bool
+    shares: dict[str, float]
+
+    @computed_field
+    @property
+    def p(self) -> float:
+        """Probability of a larger chi^2 if all channels share one instrument."""
+        return float(chdtrc(self.degrees, self.chi2)) if self.degrees else 1.0
+
+
+def shared_tests(
+    mean: Float[np.ndarray, "channels n"],
+    covariance: Float[np.ndarray, "channels n n"],
+    kernels: Float[np.ndarray, "n channels channels"],
+    names: Sequence[str],
+    frequencies_mhz: Sequence[float],
+) -> tuple[SharedTest, ...]:
+    """Test each channel against all others, and compare what each says of the instrument.
+
+    Parameters
+    ----------
+    mean, covariance, kernels : array
+        As of :func:`.tie`, in prior standard deviations.
+    names : sequence of str
+        Of the n unknowns.
+    frequencies_mhz : sequence of float
+        Of the channels.
+    """
+    told, blocks = np.linalg.inv(covariance), root_of_kernels(kernels)
+    pull = np.einsum("kij,kj->ki", told, mean)
+    precision = told - np.eye(len(names))
+    agree, found = list(range(len(mean))), [(0.0, 0)] * len(mean)
+
+    def compared(k: int) -> tuple[float, int]:
+        """chi^2 of channel k and its degrees of freedom."""
+        others, vector = np.eye(blocks.shape[2]), np.zeros(blocks.shape[2])
+        for j in set(agree) - {k}:
+            others += blocks[j].T @ precision[j] @ blocks[j]
+            vector += blocks[j].T @ pull[j]
+        predicted = blocks[k] @ np.linalg.solve(others, vector)
+        spread = blocks[k] @ np.linalg.solve(others, blocks[k].T)
+        values, axes = np.linalg.eigh(precision[k])
+        kept = values > max(LEAST_INFORMATION, len(values) * np.finfo(float).eps * values[-1])
+        # in units of the channel's own errors: chi^2 = r^T (1 + L^1/2 P L^1/2)^-1 r
+        white = axes[:, kept] / np.sqrt(values[kept])
+        off = white.T @ (told[k] @ (mean[k] - predicted) + predicted)
+        half = precision[k] @ white
+        return float(off @ np.linalg.solve(np.eye(len(off)) + half.T @ spread @ half, off)), len(
+            off
+        )
+
+    def excess(k: int) -> float:
+        return (found[k][0] - found[k][1]) / np.sqrt(2.0 * found[k][1] or 1.0)
+
+    while len(agree) > 1:
+        for k in agree:
+            found[k] = compared(k)
+        worst = max(agree, key=excess)
+        if not stands_out(float(chdtrc(max(found[worst][1], 1), found[worst][0])), len(mean)):
+            break
+        # of two that differ, neither is known to be right
+        agree = [k for k in agree if k != worst] if len(agree) > 2 else []
+    alone = 1.0 / np.diagonal(covariance, axis1=1, axis2=2) - 1.0
+    common = [i for i, kernel in enumerate(kernels) if (kernel == 1.0).all()]
+    shares = np.divide(
+        alone, alone.sum(0), out=np.full(alone.shape, np.nan), where=alone.sum(0) > 0
+    )
+    return tuple(
+        SharedTest(f, *found[k], k not in agree, {names[i]: float(shares[k, i]) for i in common})
+        for k, f in enumerate(frequencies_mhz)
+    )
+
+
+def disagreement(tests: Sequence[SharedTest]) -> list[str]:
+    """Name the channels that disagree, in a sentence; none where all agree."""
+    bad = [f"{t.frequency_mhz:g} MHz (p {probability(t.p)})" for t in tests if t.disagrees]
+    if not bad:
+        return []
+    verb = "disagrees" if len(bad) == 1 else "disagree"
+    return [
+        f"{in_brief(bad)} {verb} with the other channels about the instrument that they share, "
+        "which makes the maps of all channels wrong: check beams and data there, or map the rest "
+        "without."
+    ]

@@ -143,6 +143,10 @@ class AmplitudesOfSky:
         )
 
 
+# data that are looked at first to find a column among many
+FEW = 8
+
+
 def amplitudes_of_sky(solution: Solution, templates: Float[Array, "data n"]) -> AmplitudesOfSky:
     """Compute the posterior of templates' amplitudes given the sky.
 
@@ -164,8 +168,9 @@ def amplitudes_of_sky(solution: Solution, templates: Float[Array, "data n"]) -> 
         root = np.asarray(model.noise.update.root)
         at: list[int] = []
         for column in t.T:  # two may be alike
-            found = np.flatnonzero((root == column[:, None]).all(0))
-            at.append(next(int(k) for k in found if k not in at))
+            alike = np.flatnonzero((root[:FEW] == column[:FEW, None]).all(0))
+            alike = (int(k) for k in alike if k not in at)
+            at.append(next(k for k in alike if (root[:, k] == column).all()))
         left = cho_solve((np.asarray(factor.lower), True), np.eye(root.shape[1])[:, at])
         solved, covariance = factor.base.whiten_transpose(factor.v @ left), left[at]
     else:
@@ -318,6 +323,25 @@ class Tied:
     names: tuple[str, ...] = ()
 
 
+def root_of_kernels(
+    kernels: Float[np.ndarray, "n channels channels"],
+) -> Float[np.ndarray, "channels n white"]:
+    """R of K = R R^T, for the amplitudes of all channels.
+
+    Parameters
+    ----------
+    kernels : (n, channels, channels) array
+        K_i; they may be singular.
+    """
+    n, n_channels, _ = kernels.shape
+    strengths, vectors = np.linalg.eigh(kernels)
+    number, kept = np.nonzero(strengths > strengths.max() * n_channels * np.finfo(float).eps)
+    blocks = np.zeros((n_channels, n, len(kept)))
+    values = vectors[number, :, kept] * np.sqrt(strengths[number, kept])[:, None]
+    blocks[:, number, np.arange(len(kept))] = values.T
+    return blocks
+
+
 def tie(
     mean: Float[np.ndarray, "channels n"],
     covariance: Float[np.ndarray, "channels n n"],
@@ -346,11 +370,7 @@ def tie(
             "the data of a channel tell what it shares with others better than rounding lets the "
             "covariance be known; map the channels one by one"
         )
-    strengths, vectors = np.linalg.eigh(kernels)
-    number, kept = np.nonzero(strengths > strengths.max() * n_channels * np.finfo(float).eps)
-    blocks = np.zeros((n_channels, n, len(kept)))
-    values = vectors[number, :, kept] * np.sqrt(strengths[number, kept])[:, None]
-    blocks[:, number, np.arange(len(kept))] = values.T
+    blocks = root_of_kernels(kernels)
     root = blocks.reshape(n_channels * n, -1)
     told = np.linalg.inv(covariance)
     pulled = np.einsum("kij,kjw->kiw", told - np.eye(n), blocks)
@@ -364,7 +384,7 @@ def tie(
         white = white + step[:, 0]
         z = (root @ white).reshape(mean.shape)
     half = solve_lower(lower, root.T, transpose=False).T.reshape(n_channels, n, -1)
-    draws = solve_lower(lower, normals[:, : len(kept)].T, transpose=True).T @ root.T
+    draws = solve_lower(lower, normals[:, : root.shape[1]].T, transpose=True).T @ root.T
     off = mean - z
     quadratic = np.einsum("ki,kij,kj->", off, told, off) - (z**2).sum() + white @ white
     log_dets = np.linalg.slogdet(covariance)[1].sum() + 2.0 * np.log(np.diagonal(lower)).sum()

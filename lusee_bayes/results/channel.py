@@ -18,7 +18,7 @@ from lusee_bayes.core.checks import Described, extent
 from lusee_bayes.core.harmonics import modes_to_map, power_spectrum
 from lusee_bayes.core.trees import quantity
 from lusee_bayes.experiment.diagnosis import Diagnosis
-from lusee_bayes.experiment.unknowns import PointingReport, UnknownsReport
+from lusee_bayes.experiment.unknowns import InstrumentPosterior, PointingReport, UnknownsReport
 from lusee_bayes.judge import measures
 from lusee_bayes.judge.chi2 import ChiSquare, Level
 from lusee_bayes.judge.coverage import Coverage, latitudes
@@ -212,6 +212,8 @@ class ChannelResult(ChannelData, Described):
         How often error bars hold the truth, by latitude; empty where it is not known.
     unknowns : UnknownsReport or None
         Of receivers, ground and gain table, where the model has them.
+    theta : InstrumentPosterior or None
+        Of all unknowns of the instrument, and what they do to the map.
     """
 
     mean: SkyModes = quantity("K", "posterior mean")
@@ -230,6 +232,7 @@ class ChannelResult(ChannelData, Described):
     refinement: float = np.nan
     coverage: tuple[Coverage, ...] = ()
     unknowns: UnknownsReport | None = None
+    theta: InstrumentPosterior | None = None
 
     def description(self) -> tuple[str, ...]:
         return (

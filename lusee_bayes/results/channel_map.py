@@ -237,6 +237,7 @@ class Conditioned:
                 report = replace(report, onto=self.onto)
             given = (known, self.posterior.mean, self.covariance, self.draws, self.log_likelihood())
             more = {"unknowns": report, "pixels": self.pixel_std, **self.figures()}
+            more["instrument"] = self.unknowns
             return channel_result(*given, self.compared(), **more)
 
     def known(
@@ -341,6 +342,7 @@ def channel_result(
     compared: Float[np.ndarray, "more modes"] | None = None,
     *,
     pixels: Pixels | None = None,
+    instrument: Unknowns | None = None,
     covariance_kept: bool = False,
     information_bits: float = np.nan,
     **figures: Any,
@@ -361,6 +363,8 @@ def channel_result(
         Draws less mean for :class:`.Counts`, where the truth is known, in K.
     pixels : (pixels,) array, optional
         Standard deviations of pixels in K, where they are known already.
+    instrument : Unknowns, optional
+        Of the instrument given the sky, where the model has them.
     covariance_kept : bool
         Keep the covariance with the result.
     information_bits, **figures
@@ -388,6 +392,7 @@ def channel_result(
         covariance=covariance if covariance_kept else None,
         information_bits=information_bits,
         coverage=held,
+        theta=None if instrument is None else instrument.instrument(mean, covariance, width),
     )
 
 

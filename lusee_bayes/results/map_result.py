@@ -25,7 +25,7 @@ from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.unknowns import UnknownsReport, flux_lines
 from lusee_bayes.flight.reduced import Reduced
 from lusee_bayes.judge.chi2 import RULE, ChiSquare, Fit
-from lusee_bayes.judge.cube_fit import ChannelFits
+from lusee_bayes.judge.cube_fit import ChannelFits, SharedTest, disagreement
 from lusee_bayes.linear.positive_joint import PositiveMode
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.summaries import JointSummary, MapSummary, PullSummary
@@ -176,6 +176,8 @@ class MapResult(Described):
         Of flight data: the spectra behind them.
     tie_log_evidence : float
         What it adds that channels share the instrument to the sum of the channels' ln evidence.
+    shared_tests : tuple of SharedTest
+        Whether each channel agrees with the others about the instrument that they share.
     """
 
     scenario: Scenario
@@ -185,6 +187,7 @@ class MapResult(Described):
     unmapped: dict[float, str] = field(default_factory=dict)
     reduced: Reduced | None = None
     tie_log_evidence: float = 0.0
+    shared_tests: tuple[SharedTest, ...] = ()
 
     def description(self) -> tuple[str, ...]:
         if self.single:
@@ -314,7 +317,8 @@ class MapResult(Described):
         """What is doubtful about the data, with the channel where there are several."""
         if self.single:
             return list(self.channel.doubts)
-        return [f"{c.frequency_mhz:g} MHz: {d}" for c in self.channels for d in c.doubts]
+        own = [f"{c.frequency_mhz:g} MHz: {d}" for c in self.channels for d in c.doubts]
+        return [*disagreement(self.shared_tests), *own]
 
     def gaps(self) -> list[str]:
         """Which channels could not be mapped, and why, a sentence each."""
@@ -374,6 +378,7 @@ class MapResult(Described):
             n_modes=len(self.channel.mean),
             doubts=self.doubts(),
             tests=[] if self.single else self.fits().tests(),
+            shared=self.shared_tests,
             pulls=[] if self.single else self.pulls(),
             unknowns=[] if self.unknowns is None else self.unknowns.lines(),
             channels=list(self.channels),

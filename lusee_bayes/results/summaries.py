@@ -7,10 +7,10 @@ from typing import Any
 from pydantic import BaseModel, field_validator
 
 from lusee_bayes.experiment.diagnosis import Diagnosis
-from lusee_bayes.experiment.unknowns import PointingReport, UnknownsReport
+from lusee_bayes.experiment.unknowns import InstrumentPosterior, PointingReport, UnknownsReport
 from lusee_bayes.judge.chi2 import ChiSquare, Level
 from lusee_bayes.judge.coverage import Coverage
-from lusee_bayes.judge.cube_fit import JointTest
+from lusee_bayes.judge.cube_fit import JointTest, SharedTest
 
 
 class JudgedSummary(BaseModel, from_attributes=True):
@@ -48,13 +48,14 @@ class ChannelSummary(BaseModel, from_attributes=True):
     log_evidence_learned: float | None
     coverage: tuple[Coverage, ...]
     unknowns: dict[str, Any] | None
+    theta: dict[str, Any] | None = None
     pointing: list[dict[str, Any]] | None
     doubts: list[str]
 
-    @field_validator("unknowns", mode="before")
+    @field_validator("unknowns", "theta", mode="before")
     @classmethod
     def _rows_of_unknowns(cls, told: Any) -> Any:
-        return told.summary() if isinstance(told, UnknownsReport) else told
+        return told.summary() if isinstance(told, UnknownsReport | InstrumentPosterior) else told
 
     @field_validator("pointing", mode="before")
     @classmethod
@@ -100,6 +101,7 @@ class MapSummary(BaseModel):
     n_modes: int
     doubts: list[str]
     tests: list[JointTest]
+    shared: list[SharedTest] = []
     pulls: list[PullSummary]
     unknowns: list[str]
     channels: list[ChannelSummary]

@@ -55,6 +55,7 @@ from lusee_bayes.experiment.experiment import build, draw_key
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.unknowns import Unknowns
 from lusee_bayes.judge.coverage import N_DRAWS
+from lusee_bayes.judge.cube_fit import SharedTest, shared_tests
 from lusee_bayes.linear import joint, positive_joint
 from lusee_bayes.linear.amplitudes import Amplitudes, Tied, information_given, tie, told_by_others
 from lusee_bayes.linear.information import Information
@@ -185,6 +186,7 @@ class ChannelInformation:
             information.log_likelihood(skies),
             np.asarray(sky.draws) - np.asarray(sky.mean),
             unknowns=report,
+            instrument=self.unknowns,
             independent=np.asarray(information.reference),
             covariance_kept=scenario.output.covariance,
             **information.fit(sky.mean, sky.covariance),
@@ -432,6 +434,7 @@ class ChannelAlone:
             information.log_likelihood(skies),
             deviations[self.n_draws :],
             unknowns=unknowns.report(moved, left),
+            instrument=unknowns,
             **(self.figures | information.fit(moved, left) | {"information_bits": float(bits)}),
         )
 
@@ -446,8 +449,8 @@ def kernel(
 
 def tie_channels(
     scenario: Scenario, frequencies_mhz: Sequence[float], shared: Sequence[tuple]
-) -> Tied:
-    """What channels share given the data of all of them, from what is kept of each alone.
+) -> tuple[Tied, tuple[SharedTest, ...]]:
+    """What channels share given the data of all of them, and whether each agrees with the others.
 
     Parameters
     ----------
@@ -474,7 +477,8 @@ def tie_channels(
     key = jax.random.fold_in(draw_key(scenario), TIED)
     normals = np.asarray(jax.random.normal(key, (shared[0][-1], mean.size)))
     kernels = [kernel(np.array(frequencies_mhz), over) for over in octaves.values()]
-    return replace(tie(mean, covariance, np.stack(kernels), normals), names=names)
+    given = mean, covariance, np.stack(kernels)
+    return replace(tie(*given, normals), names=names), shared_tests(*given, names, frequencies_mhz)
 
 
 def map_channels(
@@ -565,7 +569,7 @@ def map_channels(
     if len(unmapped) == len(channels):
         raise InputError(f"no channel can be mapped: {_reasons(unmapped)}")
     mapped, shared = zip(*(one for one in by_channel if not isinstance(one[1], str)), strict=True)
-    components, tied = None, None
+    components, tied, tests = None, None, ()
     if scenario.joint:
         left = _without(unmapped, scenario)
         at_hand = ChannelsInFiles(mapped, files, engine, stages)
@@ -573,7 +577,7 @@ def map_channels(
         n_draws = max(scenario.output.draws, N_DRAWS if data is None or truth else 0)
         components = solve_components(left, at_hand, shared, n_draws)
     elif not alone:
-        tied = tie_channels(scenario, [channel.frequency_mhz for channel in mapped], shared)
+        tied, tests = tie_channels(scenario, [channel.frequency_mhz for channel in mapped], shared)
 
     def finish(number: int) -> None:
         """Write the result of a channel, given what all have in common."""
@@ -590,10 +594,8 @@ def map_channels(
         tasks = Tasks(finish, range(len(mapped)), [names_of((channel,)) for channel in mapped])
         engine.each(tasks, stages, stage)
     results = tuple(files.read(channel, ChannelResult) for channel in mapped)
-    evidence = 0.0 if tied is None else tied.log_evidence
-    return MapResult(
-        scenario, results, components, stages.seconds, unmapped, tie_log_evidence=evidence
-    )
+    told = {} if tied is None else {"tie_log_evidence": tied.log_evidence, "shared_tests": tests}
+    return MapResult(scenario, results, components, stages.seconds, unmapped, **told)
 
 
 def _without(unmapped: dict[float, str], scenario: Scenario) -> Scenario:

@@ -168,6 +168,8 @@ MAP = RunKind(
         "groups": judgement.groups_by_frequency,
         "pointing": judgement.pointing_by_day,
         "unknowns": judgement.unknowns_by_frequency,
+        "corner": judgement.corner,
+        "instrument_share": maps.instrument_share,
         "flight_waterfall": judgement.waterfall,
         "flight_time_line": lambda r: r.reduced and judgement.time_line(r.reduced),
         "flight_calibration": lambda r: r.reduced and judgement.calibration(r.reduced),

@@ -5,10 +5,13 @@ import pytest
 from assertions import assert_same_map, within
 from reference_linear import Answer, random_covariance, white_posterior
 from scipy.linalg import block_diag
-from scipy.stats import multivariate_normal
+from scipy.stats import chi2, multivariate_normal
 
 import lusee_bayes as lb
+from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.experiment.model import radiometer
+from lusee_bayes.experiment.unknowns import ALL_TOGETHER
+from lusee_bayes.judge.cube_fit import disagreement, shared_tests
 from lusee_bayes.linear.amplitudes import tie
 from lusee_bayes.runs import channels
 from lusee_bayes.runs.channels import kernel, map_channels, tie_channels
@@ -59,11 +62,51 @@ def test_ties_are_those_of_one_gaussian_of_all_amplitudes(volume):
     assert got.log_evidence == pytest.approx(expected, abs=1e-10)
 
 
+@pytest.mark.parametrize("wrong", [[], [1], [0, 4]])
+def test_channels_that_disagree_are_those_that_are_wrong(wrong):
+    """chi^2 against matrices: y of a channel given y of all others that agree."""
+    rng, mhz = np.random.default_rng(8), np.array([15.0, 20.0, 22.0, 26.0, 30.0, 31.0])
+    far = np.log2(mhz[:, None] / mhz)
+    kernels = np.stack([np.ones((6, 6)), np.exp(-0.5 * (far / OCTAVES) ** 2), np.ones((6, 6))])
+    noise = np.stack([0.01 * random_covariance(rng, 3) for _ in mhz])
+    noise[2] += np.diag([0.0, 0.0, 1e7])  # knows nothing of the third
+    every = sum(np.kron(one, np.diag(np.eye(3)[i])) for i, one in enumerate(kernels))
+    known = every + block_diag(*noise)
+    y = multivariate_normal(np.zeros(18), known, seed=4).rvs().reshape(6, 3)
+    y[wrong, 0] += 4.0
+    covariance = np.linalg.inv(np.linalg.inv(noise) + np.eye(3))
+    mean = np.einsum("kij,kj->ki", covariance, np.linalg.solve(noise, y[..., None])[..., 0])
+    tests = shared_tests(mean, covariance, kernels, ("a", "b", "c"), mhz.tolist())
+    assert [k for k, one in enumerate(tests) if one.disagrees] == wrong
+    for k in set(range(6)) - set(wrong):
+        own = 3 * k + np.arange(2 if k == 2 else 3)
+        others = [3 * j + i for j in range(6) if j != k and j not in wrong for i in range(3)]
+        gain = np.linalg.solve(known[np.ix_(others, others)], known[np.ix_(others, own)]).T
+        off = y.ravel()[own] - gain @ y.ravel()[others]
+        left = known[np.ix_(own, own)] - gain @ known[np.ix_(others, own)]
+        expected = off @ np.linalg.solve(left, off)
+        assert (tests[k].chi2, tests[k].degrees) == (pytest.approx(expected, rel=1e-5), len(own))
+        assert tests[k].p == pytest.approx(chi2.sf(expected, len(own)), rel=1e-4)
+    told = 1.0 / np.diagonal(covariance, axis1=1, axis2=2) - 1.0
+    shares = [[one.shares[name] for name in "ac"] for one in tests]
+    within(shares, (told / told.sum(0))[:, [0, 2]], 1e-12)
+    assert all(len(one.shares) == 2 for one in tests)
+    assert [f"{mhz[k]:g} MHz" in text for text in disagreement(tests) for k in wrong] == (
+        [True] * len(wrong)
+    )
+
+
+def test_two_channels_that_differ_are_both_named():
+    mean, covariance = np.array([[1.0], [-1.0]]), np.full((2, 1, 1), 1e-4)
+    tests = shared_tests(mean, covariance, np.ones((1, 2, 2)), ("a",), [15.0, 20.0])
+    assert [one.disagrees for one in tests] == [True, True]
+
+
 def test_a_channel_without_an_unknown_tells_nothing_of_it():
     scenario = lb.load_scenario("fiducial", SMALL)
     one = {"a": np.inf, "b": np.inf}, np.array([0.5, 1.0]), np.diag([0.2, 0.1]), 4
     other = {"a": np.inf}, np.array([0.3]), np.full((1, 1), 0.5), 4
-    tied = tie_channels(scenario, [15.0, 20.0], [one, other])
+    tied, _ = tie_channels(scenario, [15.0, 20.0], [one, other])
     assert tied.names == ("a", "b")
     # of a: 1 / 0.2 + 1 / 0.5 - 1
     within(tied.mean, [[3.1 / 6.0, 1.0]] * 2, 1e-12)
@@ -137,6 +180,55 @@ def test_tables_have_the_shared_values(cube, expected):
         mine = np.r_[:4, 4 + 4 * k : 8 + 4 * k]
         within((z - expected.mean[shared][mine]) / std[shared][mine], 0.0, 1e-6)
         np.testing.assert_allclose(np.concatenate(list(width)), std[shared][mine], rtol=1e-6)
+
+
+def test_theta_adds_the_variance_that_fixing_it_would_take_away(cube, expected):
+    """Against the covariance of all skies and unknowns, conditioned with matrices."""
+    for k, channel in enumerate(cube.channels):
+        sky, theta = np.arange(k * N_MODES, (k + 1) * N_MODES), channel.theta
+        shared = 3 * N_MODES + np.arange(4)
+        receivers = 3 * N_MODES + 4 + 4 * k + np.arange(4)
+        parts = {ALL_TOGETHER: np.r_[shared, receivers], "the beams": shared[:2]}
+        parts |= {"clock and pointing": shared[2:], "the receivers": receivers}
+        before = expected.covariance[np.ix_(sky, sky)]
+        for name, at in parts.items():
+            cross, own = expected.covariance[np.ix_(sky, at)], expected.covariance[np.ix_(at, at)]
+            gone = cross @ np.linalg.solve(own, cross.T)
+            assert theta.shares[name] == pytest.approx(np.trace(gone) / np.trace(before), rel=1e-4)
+            if name == ALL_TOGETHER:
+                grid = np.stack([modes_to_map(one, channel.nside) for one in np.eye(N_MODES)])
+                share = np.einsum("mp,mn,np->p", grid, gone, grid)
+                share /= np.einsum("mp,mn,np->p", grid, before, grid)
+                np.testing.assert_allclose(theta.pixel_share, share, rtol=1e-4)
+        assert set(theta.shares) == set(parts) and 0.01 < theta.shares[ALL_TOGETHER] < 1.0
+        same = parts[ALL_TOGETHER]
+        scale = np.outer(expected.std[same], expected.std[same])
+        within(theta.correlation, expected.covariance[np.ix_(same, same)] / scale, 1e-6)
+        np.testing.assert_allclose(theta.table["width"], expected.std[same], rtol=1e-6)
+        assert list(theta.corner["unknown"][:4]) == [*SAME, *ANGLES]
+    assert not disagreement(cube.shared_tests) and len(cube.shared_tests) == 3
+
+
+def test_a_wrong_resonance_in_one_channel_of_eight_is_named(tmp_path, monkeypatch):
+    """Antennas of 3.02 m in one channel; seven with another length that is theirs in common."""
+    frequencies = [10.0, 13.0, 16.0, 19.0, 21.0, 24.0, 27.0, 30.0]
+    sizes = (f"frequencies_mhz={frequencies}", "lmax=4", "observation.step_s=1e5", RUNS)
+    more = ("noise.radiometer.factor=1e4", "noise.beam={parameters: {length_m: 0.01}}")
+    model = ("prior={model: isotropic, spectrum: sky}", "output.draws=0")
+    eight = lb.load_scenario("fiducial", (*sizes, *more, *model))
+    other = lb.load_scenario(eight, ["beam.length_m=3.02"]).channels()[3]
+    wrong, made = lb.build(other).data, channels.measured_experiment
+
+    def measured(channel, data, *given, **more):
+        own = wrong if channel.frequency_mhz == other.frequency_mhz else data
+        return made(channel, own, *given, **more)
+
+    monkeypatch.setattr(channels, "measured_experiment", measured)
+    found = map_channels(eight, tmp_path)
+    (sentence,) = found.doubts()
+    assert sentence.startswith("19 MHz (p ") and "disagrees with the other channels" in sentence
+    assert sentence in found.lines() and found.summary().doubts == [sentence]
+    assert [one.disagrees for one in found.summary().shared] == [f == 19.0 for f in frequencies]
 
 
 @pytest.mark.long

@@ -9,8 +9,9 @@ from assertions import close
 from reference import real_harmonics
 
 import lusee_bayes as lb
+from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.core.sphere_grid import SphereGrid
-from lusee_bayes.experiment.model import base_model, set_up, simulate, systematics
+from lusee_bayes.experiment.model import base_model, radiometer, set_up, simulate, systematics
 from lusee_bayes.instrument.beams.fields import (
     AntennaFields,
     HemisphereGrid,
@@ -18,6 +19,7 @@ from lusee_bayes.instrument.beams.fields import (
     stokes_beam,
 )
 from lusee_bayes.instrument.products import to_real
+from lusee_bayes.results.finished_runs import FinishedRun
 from lusee_bayes.systematics.context import Setup
 from lusee_bayes.systematics.field_errors import STD, FieldErrors, FieldErrorsSection, of_ell
 
@@ -148,3 +150,37 @@ def test_beams_of_measured_data_are_not_exact_unless_a_scenario_says_so():
         off = posterior.mean - data.truth
         full = np.sqrt(off @ np.linalg.solve(posterior.covariance(), off) / len(off))
         assert full > 10.0 if exact else 0.6 < full < 1.4
+
+
+def test_a_report_has_the_share_of_the_variance_that_they_add(tmp_path):
+    """As saved, against dense posteriors with and without the unknowns in N."""
+    parameters = "noise.beam={parameters: {zenith_angle_deg: 1.0}}"
+    own = parameters, "prior={model: isotropic, spectrum: sky}"
+    given = scenario("std: 1.0e-3, lmax: 1, learned: false", *own, lmax=3, step_s=2e5)
+    run = lb.run_map(given, tmp_path / "map")
+    found = lb.infer(experiment := lb.build(given))
+    a, noise = np.asarray(found.model.coupling.dense()), radiometer(experiment.setup).diagonal()
+    inverse = np.diag(1.0 / np.asarray(found.model.prior.variance()))
+    known = np.linalg.inv(a.T @ (a / np.asarray(noise)[:, None]) + inverse)
+    of = {part.systematic.words: np.asarray(part.columns) for part in found.expanded}
+    whole = np.linalg.inv(a.T @ np.linalg.solve(np.asarray(found.model.noise.dense()), a) + inverse)
+    left = {"all together": known}
+    for name in of:  # the others stay unknown
+        rest = np.concatenate([columns for other, columns in of.items() if other != name], axis=1)
+        n = np.diag(np.asarray(noise)) + rest @ rest.T
+        left[name] = np.linalg.inv(a.T @ np.linalg.solve(n, a) + inverse)
+    channel = FinishedRun.read(run.folder).channel
+    theta = channel.theta
+    expected = {name: 1.0 - np.trace(one) / np.trace(whole) for name, one in left.items()}
+    assert theta.shares == pytest.approx(expected, rel=1e-4) and set(of) < set(expected)
+    grid = np.stack([modes_to_map(one, channel.nside) for one in np.eye(len(whole))])
+    before, after = (np.einsum("mp,mn,np->p", grid, one, grid) for one in (whole, known))
+    np.testing.assert_allclose(theta.pixel_share, 1.0 - after / before, rtol=1e-4)
+    assert theta.table["n"].tolist() == [1, 8, 24]
+    assert theta.table["unknown"].tolist()[1:] == ["field_error_0", "field_error_1"]
+    assert theta.corner["unknown"].tolist() == ["zenith_angle_deg"]
+    summary = FinishedRun.read(run.folder).summary.channels[0].theta
+    assert summary["shares"] == pytest.approx(theta.shares, rel=1e-12)
+    page = (run.folder / "report.html").read_text(encoding="utf-8")
+    assert "<td>field_error_1</td><td>24</td>" in page and "Posterior of pairs of unknowns" in page
+    assert "Galactic maps of the share of the variance" in page

@@ -160,6 +160,60 @@ def unknowns_by_frequency(result: MapResult) -> Figure | None:
     return figure
 
 
+# half the width of a corner plot's panels, in posterior standard deviations
+CORNER = 3.5, 8.0
+
+
+def corner(result: MapResult) -> Figure | None:
+    """Draw the posterior of the first channel's unknowns, pair by pair, with prior and truth.
+
+    Axes are in posterior standard deviations from the posterior mean. They go as far as the truth,
+    up to 8; beyond, it is marked at the edge.
+    """
+    theta = result.channel.theta
+    if theta is None or theta.corner.empty:
+        return None
+    table, n = theta.corner, len(theta.corner)
+    prior = ((table["prior"] - table["value"]) / table["std"]).to_numpy()
+    wide = (table["prior_std"] / table["std"]).to_numpy()
+    true, half = np.full(n, np.nan), CORNER[0]
+    if "true" in table:
+        true = ((table["true"] - table["value"]) / table["std"]).to_numpy()
+        half = min(max(half, 1.2 * float(np.abs(true).max())), CORNER[1])
+        true = np.clip(true, -0.97 * half, 0.97 * half)
+    side, x, t = 1.3 * n + 1.0, np.linspace(-half, half, 201), np.linspace(0.0, 2 * np.pi, 101)
+    ticks = [-2, 0, 2] if half < 5 else [-5, 0, 5]
+    figure, panels = drawing.framed((side, 1.2 * side), n, n, squeeze=False)
+    for (i, j), axes in np.ndenumerate(panels):
+        axes.set(xlim=(-half, half), xticks=ticks, yticks=[])
+        axes.tick_params(labelsize=7, labelbottom=i == n - 1)
+        if j > i:
+            axes.set_axis_off()
+        elif i == j:
+            axes.plot(
+                x, np.exp(-0.5 * ((x - prior[i]) / wide[i]) ** 2), color=drawing.GREY, alpha=0.5
+            )
+            axes.plot(x, np.exp(-0.5 * x**2), color=drawing.BLUE)
+            axes.axvline(true[i], color=drawing.ORANGE, lw=1)
+            name, unit, value, std = table.iloc[i][["unknown", "unit", "value", "std"]]
+            digits = max(0, 1 - int(np.floor(np.log10(std))))
+            numbers = f"{value:.{digits}f}\n± {std:.{digits}f} {unit}"
+            axes.set_title(f"{name.replace('_', ' ')}\n{numbers}", fontsize=7)
+        else:
+            axes.set(ylim=(-half, half), yticks=ticks if j == 0 else [])
+            r = theta.correlation[i, j]
+            across, up = np.cos(t), r * np.cos(t) + np.sqrt(max(1.0 - r**2, 0.0)) * np.sin(t)
+            for k in (1, 2):
+                pair = prior[j] + k * wide[j] * np.cos(t), prior[i] + k * wide[i] * np.sin(t)
+                axes.plot(*pair, color=drawing.GREY, alpha=0.5, lw=1.2 / k)
+                axes.plot(k * across, k * up, color=drawing.BLUE, lw=1.2 / k)
+            axes.plot(true[j], true[i], "x", color=drawing.ORANGE, ms=6)
+    at = "" if result.single else f" (channel of {result.channel.frequency_mhz:g} MHz)"
+    figure.suptitle(f"Unknowns of the instrument{at}", fontsize=10)
+    figure.supxlabel("posterior standard deviations from the mean", fontsize=9)
+    return figure
+
+
 LEVEL_COLOURS = {"L": drawing.COLOURS[4], "M": drawing.BLUE, "H": drawing.COLOURS[3]}
 
 

@@ -214,6 +214,21 @@ def channel_maps(cube: MapResult) -> Figure:
     return _rows_of_maps({f"{channel.frequency_mhz:g} MHz": channel for channel in channels})
 
 
+def instrument_share(result: MapResult) -> Figure | None:
+    """Share of each pixel's variance that comes from unknowns of the instrument."""
+    known = [channel for channel in result.channels if channel.theta is not None]
+    if not known:
+        return None
+    chosen = np.unique(np.linspace(0, len(known) - 1, min(len(known), SHOWN)).round().astype(int))
+    figure, grid = framed((6.4 * len(chosen), 3.8), 1, len(chosen), squeeze=False)
+    for axes, channel in zip(grid.flat, (known[k] for k in chosen), strict=True):
+        share, title = 100.0 * channel.theta.pixel_share, f"{channel.frequency_mhz:g} MHz"
+        scale = Normalize(0.0, max(float(np.percentile(share, 99.5)), 1e-3))
+        options = {"altitude": channel.highest_altitude, "shrink": 0.8}
+        sky_panel(axes, title, share, scale, SEQUENTIAL, "% of the variance", **options)
+    return figure
+
+
 def maps_of_runs(runs: Sequence[FinishedRun]) -> Figure:
     """Posterior mean and standard deviation of every run, each kind on one scale."""
     channels = [run.channel for run in runs]
