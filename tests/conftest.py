@@ -28,12 +28,14 @@ from jaxtyping import install_import_hook  # noqa: E402
 install_import_hook("lusee_bayes", "beartype.beartype")
 
 import jax  # noqa: E402
+import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 from experiments import small_experiment as make_small_experiment  # noqa: E402
 from fits_files import write_response  # noqa: E402
 
 import lusee_bayes as lb  # noqa: E402
 from lusee_bayes.experiment.experiment import Experiment  # noqa: E402
+from lusee_bayes.instrument.beams import monopoles  # noqa: E402
 
 # a program that was compiled once is not compiled again, in this run or the next. A folder for each
 # worker: JAX's cache is not safe for several that write
@@ -42,6 +44,28 @@ WORKER = os.environ.get("PYTEST_XDIST_WORKER", "main")
 jax.config.update("jax_compilation_cache_dir", str(ROOT / ".pytest_cache" / "xla" / WORKER))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+def known_beams(compute):
+    """Beams of antennas that an earlier test has asked for, too, are not computed again."""
+    known = {}
+
+    def beams(frequency_mhz, lmax, antennas, stokes, nodes):
+        leaves = jax.tree.leaves((frequency_mhz, antennas))
+        if lmax > 16 or not all(isinstance(leaf, np.ndarray) for leaf in leaves):
+            return compute(frequency_mhz, lmax, antennas, stokes, nodes)
+        key = lmax, stokes, nodes, *(leaf.tobytes() for leaf in leaves)
+        if key not in known:
+            known[key] = compute(frequency_mhz, lmax, antennas, stokes, nodes)
+            known[key].flags.writeable = False
+        return known[key]
+
+    return beams
+
+
+monopoles._modes = known_beams(monopoles._modes)
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")

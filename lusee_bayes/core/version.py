@@ -43,10 +43,12 @@ def versions(*, with_commit: bool = True) -> dict[str, str]:
     """
     libraries = ("jax", "numpyro", "arviz-stats", "numpy", "scipy", "healpy", "astropy", "lunarsky")
     own = {"commit": commit()} if with_commit and commit() else {}
-    found = {name: metadata.version(name) for name in libraries}
+    found = {name: installed(name) for name in libraries}
     return {"lusee_bayes": __version__, **own, **found}
 
 
+# every file that is written asks
+installed = lru_cache(metadata.version)
 COMMAND: ContextVar[str] = ContextVar("COMMAND", default="")
 
 

@@ -7,7 +7,9 @@ defaults included; running that file again gives the same numbers.
 
 from __future__ import annotations
 
+import json
 import os
+from functools import lru_cache
 from importlib import resources
 from itertools import pairwise
 from pathlib import Path
@@ -324,7 +326,13 @@ class Scenario(Section):
 
     def to_yaml(self) -> str:
         """The resolved scenario, defaults included."""
-        return as_yaml(self.model_dump(mode="json"))
+        return _as_yaml(json.dumps(self.model_dump(mode="json")))
+
+
+@lru_cache(maxsize=64)
+def _as_yaml(text: str) -> str:
+    """Of JSON; a run writes the same scenario into each of its files."""
+    return as_yaml(json.loads(text))
 
 
 def scenario_names() -> list[str]:

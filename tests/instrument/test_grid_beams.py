@@ -157,7 +157,7 @@ def found(table, step, seed):
     return full, pulls, told.std, max(interpolation_error(experiment.setup).values()), said
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(k, marks=pytest.mark.long) for k in (2, 3))])
 def test_data_tell_parameters_between_files(tables, seed):
     full, pulls, widths, error, said = found(tables[0.06], 0.06, seed)
     assert full < 1.3 and np.abs(pulls).max() < 3.0 and widths.max() < 0.4

@@ -42,9 +42,9 @@ SIGMA, EVIDENCE = 1e-4, 1e-3
 @pytest.mark.parametrize(
     "kind",
     [
-        pytest.param([GIVEN], id="map"),
+        pytest.param([GIVEN], id="map", marks=pytest.mark.long),
         pytest.param([LEARNED], id="learned map"),
-        pytest.param([CUBE, GIVEN], id="independent"),
+        pytest.param([CUBE, GIVEN], id="independent", marks=pytest.mark.long),
         pytest.param([CUBE, LEARNED], id="learned", marks=pytest.mark.long),
         pytest.param([CUBE, *JOINT], id="joint"),
     ],
