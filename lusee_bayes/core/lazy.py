@@ -38,6 +38,7 @@ astropy_exceptions = LazyModule("astropy.utils.exceptions")
 pandas = LazyModule("pandas")
 xarray = LazyModule("xarray")
 special = LazyModule("scipy.special")
+rotations = LazyModule("scipy.spatial.transform")
 arviz_stats = LazyModule("arviz_stats.base")
 # an optional extra
 pyuvdata = LazyModule("pyuvdata")

@@ -15,8 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from lusee_bayes.core.arrays import Draws, Modes, Pixels
-from lusee_bayes.core.engine import in_threads
-from lusee_bayes.core.harmonics import columns_to_maps, lmax_of, mode_numbers
+from lusee_bayes.core.harmonics import lmax_of, mode_numbers, modes_to_map
 from lusee_bayes.core.lazy import healpy, special
 
 # of the central intervals that are counted, and their names in files
@@ -25,8 +24,6 @@ NAMES = tuple(f"{100 * level:.0f}" for level in LEVELS)
 REST = ("rms", "rms_scatter", "largest", "allowed")
 # draws that tell the scatter: it is then known to 4 %
 N_DRAWS = 300
-# skies that are counted together: their maps fit into a cache
-BATCH = 50
 # degrees of |b|: the plane, where the sky is furthest from the prior, its surroundings, the rest
 LATITUDES = (10.0, 30.0)
 # first ell of each group
@@ -110,15 +107,9 @@ class Counts:
         """
         nside = healpy.npix2nside(len(std))
         bands = latitudes(nside)
-
-        def count(skies: Float[np.ndarray, "modes skies"]) -> np.ndarray:
-            maps = columns_to_maps(skies, nside)
-            maps /= std[:, None]
-            return _statistics(maps, bands.values())
-
-        both = np.concatenate([error[:, None], deviations.T], axis=1)
-        batches = np.array_split(both, max(1, both.shape[1] // BATCH), axis=1)
-        return cls._of(bands, np.concatenate(in_threads(count, batches), axis=2))
+        pulls = ((modes_to_map(x, nside) / std)[:, None] for x in (error, *deviations))
+        counted = [_statistics(one, bands.values()) for one in pulls]
+        return cls._of(bands, np.concatenate(counted, axis=2))
 
     @classmethod
     def of_modes(cls, std: Modes, error: Modes, deviations: Draws) -> Counts:
