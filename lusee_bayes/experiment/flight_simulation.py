@@ -22,7 +22,7 @@ from lusee_bayes.experiment.model import set_up, true_signal, true_values
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.flight import synthesis
 from lusee_bayes.flight.clock import DAY_S, MJD_ZERO, Clock
-from lusee_bayes.flight.gain_model import GainModel, draw_gains, synthetic_gains
+from lusee_bayes.flight.gain_model import GainModel, draw_gains
 from lusee_bayes.flight.recipe import FlightSection, FlightSimulatedSection
 from lusee_bayes.flight.session import ADC_HIGH, ADC_LOW, FRAME_S, PORTS, BinOrigin, channel_mhz
 from lusee_bayes.flight.session_files import SessionRows
@@ -349,11 +349,7 @@ def _drawn_gains(
     scenario: Scenario, flight: FlightSection
 ) -> tuple[GainModel, GainModel, dict[str, float]]:
     """The table, the gains of which it is the mean, and by how much they are off."""
-    if flight.gain_table is None:
-        table = synthetic_gains().with_component_std(flight.component_std)
-    else:
-        table = gain_table_of(flight)
-    section = scenario.noise.gain_table
+    table, section = gain_table_of(flight), scenario.noise.gain_table
     if section is None:
         return table, table, {}
     if section.std is not None:
