@@ -106,7 +106,7 @@ def strengths(deviation: Modes, of_modes: Modes, of_pixels: Pixels) -> dict[str,
     bands = latitudes(nside)
     ells = multipoles(lmax_of(len(deviation)))
     parts = [(name, modes_to_map(rest, nside), of_pixels, bands[name]) for name in list(bands)[:-1]]
-    parts += [(name, rest, of_modes, ells[name]) for name in list(ells)[1:-1]]
+    parts += [(name, rest, of_modes, ells[name]) for name in list(ells)[1:]]
     return {
         name: float((values[inside] ** 2).sum() / expected[inside].sum())
         for name, values, expected, inside in parts
