@@ -108,9 +108,8 @@ class FlightSimulation:
         """Which spectra each session has."""
         hours = self.observation.hours
         number = np.floor((hours - hours[0]) / self.section.session_h + 1e-9)
-        starts = np.flatnonzero(np.diff(number, prepend=-1.0))
-        ends = np.append(starts[1:], len(number))
-        return tuple(slice(int(a), int(b)) for a, b in zip(starts, ends, strict=True))
+        edges = np.flatnonzero(np.diff(number, prepend=-1.0, append=np.inf)).tolist()
+        return tuple(slice(start, end) for start, end in pairwise(edges))
 
     def rows(self, session: slice) -> SessionRows:
         """Return what a session says of its spectra.
@@ -276,11 +275,6 @@ def spectra_observation(scenario: Scenario, window_s: float) -> Observation:
         If the axis of the Moon is fixed, no sample lasts for so long, or the turntable turns:
         sessions do not say its angle.
     """
-    if scenario.observation.fixed_axis:
-        raise InputError(
-            "spectra are means over the time of their integration, and observation.fixed_axis is "
-            "for instants; leave it out"
-        )
     # whatever the samples of other data would be
     planned = scenario.observation.model_copy(update={"window": "mean"}).observation()
     bounds, live = planned.windows.bounds_s, planned.windows.live_per_sample_s
