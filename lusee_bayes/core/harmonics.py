@@ -23,7 +23,6 @@ operators in this basis. K_z couples only m with -m, K_x and K_y only ``|m|`` wi
 from __future__ import annotations
 
 from functools import lru_cache
-from itertools import pairwise
 
 import equinox as eqx
 import numpy as np
@@ -32,7 +31,7 @@ from jaxtyping import Complex, Float
 from lusee_bayes.core.arrays import Array, Fields, namespace
 from lusee_bayes.core.checks import require_finite, require_whole
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.lazy import healpy, special
+from lusee_bayes.core.lazy import healpy, rotations, special
 
 SQRT2 = np.sqrt(2.0)
 Angles = Float[np.ndarray, " points"]
@@ -185,26 +184,6 @@ def pixel_matrix(nside: int, lmax: int) -> Float[np.ndarray, "pixels modes"]:
     return synthesis_matrix(theta, phi, lmax)
 
 
-def columns_to_maps(
-    modes: Float[np.ndarray, "modes maps"], nside: int
-) -> Float[np.ndarray, "pixels maps"]:
-    """Synthesise many HEALPix RING maps at once, a column each: products of matrices by ring."""
-    require_nside(nside)
-    lmax = lmax_of(modes.shape[0])
-    theta, phi = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)))
-    heights, first = np.unique(theta, return_index=True)
-    by_order, starts = modes_by_order(lmax)
-    polar, packed = polar_functions(heights, lmax)[:, by_order], modes[by_order]
-    waves = np.empty((len(heights), 2 * lmax + 1, modes.shape[1]))
-    for order, (begin, end) in enumerate(pairwise([*starts, len(modes)])):
-        np.matmul(polar[:, begin:end], packed[begin:end], out=waves[:, order])
-    azimuth = azimuth_functions(phi, lmax)
-    maps = np.empty((len(phi), modes.shape[1]))
-    for wave, (begin, end) in zip(waves, pairwise([*first, len(phi)]), strict=True):
-        np.matmul(azimuth[begin:end], wave, out=maps[begin:end])
-    return maps
-
-
 def sum_over_m(values: Fields) -> Float[np.ndarray, "*batch ells"]:
     """Sum a quantity that is given per mode over the modes of each ell = 0..lmax."""
     lmax = lmax_of(values.shape[-1])
@@ -297,25 +276,6 @@ def generators(ell: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return k_x - k_x.T, k_y - k_y.T, k_z
 
 
-@lru_cache(maxsize=512)
-def _eigen_y(ell: int) -> tuple[np.ndarray, np.ndarray]:
-    """Eigenvalues (exact integers) and vectors of the Hermitian i K_y within one ell."""
-    values, vectors = np.linalg.eigh(1j * generators(ell)[1])
-    return np.rint(values), vectors
-
-
-def _block_y(ell: int, angle: float) -> np.ndarray:
-    """exp(angle K_y) within one ell."""
-    values, vectors = _eigen_y(ell)
-    return np.real((vectors * np.exp(-1j * angle * values)) @ vectors.conj().T)
-
-
-def _block_z(ell: int, angle: float) -> np.ndarray:
-    """exp(angle K_z) within one ell."""
-    m = np.arange(-ell, ell + 1)
-    return np.diag(np.cos(m * angle)) + np.fliplr(np.diag(np.sin(m * angle)))
-
-
 class Rotation(eqx.Module):
     """An orthogonal matrix on packed modes.
 
@@ -330,11 +290,15 @@ class Rotation(eqx.Module):
     @classmethod
     def from_matrix(cls, matrix: Float[np.ndarray, "3 3"], lmax: int) -> Rotation:
         """Return D(g) for the proper rotation matrix g that takes vectors n to g n."""
-        first, tilt, last = euler_zyz(np.asarray(matrix))
-        blocks = [
-            _block_z(ell, first) @ _block_y(ell, tilt) @ _block_z(ell, last)
-            for ell in range(lmax + 1)
-        ]
+        turn = rotations.Rotation.from_matrix(matrix).as_rotvec()
+        angle = np.linalg.norm(turn)
+        axis = turn / angle if angle else turn
+        blocks = []
+        for ell in range(lmax + 1):
+            # the eigenvalues of i axis . K are whole numbers
+            values, vectors = np.linalg.eigh(1j * np.tensordot(axis, generators(ell), 1))
+            waves = vectors * np.exp(-1j * angle * np.rint(values))
+            blocks.append(np.real(waves @ vectors.conj().T))
         return cls(tuple(blocks))
 
     @property
@@ -348,22 +312,6 @@ class Rotation(eqx.Module):
             modes[..., ell**2 : (ell + 1) ** 2] @ block.T for ell, block in enumerate(self.blocks)
         ]
         return namespace(modes, self).concatenate(turned, axis=-1)
-
-
-def euler_zyz(matrix: Float[np.ndarray, "3 3"]) -> tuple[float, float, float]:
-    """Return the Euler angles of a rotation, in radians, exact also for a tilt of 0 or pi.
-
-    Returns
-    -------
-    first, tilt, last : float
-        With matrix = R_z(first) R_y(tilt) R_z(last).
-    """
-    tilt = np.arctan2(np.hypot(matrix[0, 2], matrix[1, 2]), matrix[2, 2])
-    first = np.arctan2(matrix[1, 2], matrix[0, 2])
-    # undo the first turn and the tilt: the last angle is that of the first column that remains
-    sideways = np.array([-np.sin(first), np.cos(first), 0.0])
-    along = np.array([np.cos(tilt) * np.cos(first), np.cos(tilt) * np.sin(first), -np.sin(tilt)])
-    return first, tilt, np.arctan2(sideways @ matrix[:, 0], along @ matrix[:, 0])
 
 
 def turn_about_z(modes: Fields, angle: float | Float[Array, ""]) -> Fields:

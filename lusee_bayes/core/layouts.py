@@ -19,19 +19,11 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 
 from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.lazy import units
 from lusee_bayes.core.progress import gigabytes, memory_limit
 
-# for each unit of the package, what a file may state instead, with the factor to it
-UNITS: Mapping[str, Mapping[str, float]] = {
-    "K": {"K": 1.0, "kelvin": 1.0, "Kelvin": 1.0, "mK": 1e-3, "uK": 1e-6, "kK": 1e3},
-    "V^2/Hz": dict.fromkeys(("V^2/Hz", "V**2/Hz", "V2/Hz", "V2 Hz-1", "V2 / Hz"), 1.0),
-    "MHz": {"MHz": 1.0, "kHz": 1e-3, "Hz": 1e-6, "GHz": 1e3},
-    "Ohm": dict.fromkeys(("Ohm", "ohm"), 1.0),
-    "deg": dict.fromkeys(("deg", "degree", "degrees"), 1.0),
-    "m": {"m": 1.0},
-    "d": {"d": 1.0},
-    "s": dict.fromkeys(("s", "second", "seconds"), 1.0),
-}
+# words for units that astropy does not know
+ALIASES = {"kelvin": "K", "degrees": "deg", "seconds": "s"}
 # what software writes that was not given a word or a unit, in lower case
 UNSTATED = ("", "unknown", "unspecified", "none")
 # LuSEE-Night ends at 50 MHz; what is larger was meant in Hz or kHz
@@ -47,7 +39,7 @@ def factor_to(where: str, unit: str, stated: Any) -> float:
     where : str
         The file and its variable, for the message.
     unit : str
-        The package's, of :data:`UNITS`; empty for a quantity without one.
+        The package's; empty for a quantity without one.
     stated : object
         The file's; None or one of :data:`UNSTATED` if it states none: then it is the package's.
 
@@ -60,12 +52,10 @@ def factor_to(where: str, unit: str, stated: Any) -> float:
     text = "" if stated is None else str(stated).strip()
     if not unit or text.lower() in UNSTATED:
         return 1.0
-    if text not in UNITS[unit]:
-        raise InputError(
-            f"{where} has the unit '{text}', expected one of {', '.join(UNITS[unit])}; convert it, "
-            "and correct the unit"
-        )
-    return UNITS[unit][text]
+    try:
+        return float(units.Unit(ALIASES.get(text, text)).to(unit))
+    except ValueError as error:
+        raise InputError(f"{where} has the unit '{text}', expected {unit}; convert it") from error
 
 
 def require_mhz(where: str, mhz: Any) -> None:
@@ -135,7 +125,7 @@ class Variable:
     optional : bool
         Whether it may be absent.
     unit : str
-        The package's unit, of :data:`.UNITS`. Numbers are converted from the unit that the file
+        The package's unit, as astropy writes it. Numbers are converted from the unit that the file
         states, if it states one.
     """
 

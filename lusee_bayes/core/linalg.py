@@ -316,12 +316,6 @@ def _strips(n: int) -> Iterator[tuple[int, int]]:
 def _from_strips(strips: list[Float[Array, "_ _"]]) -> Matrix:
     """The symmetric matrix whose rows, up to their diagonal block, are these."""
     n = strips[-1].shape[1]
-    if namespace(strips) is np:
-        product, first = np.empty((n, n)), 0
-        for strip in strips:
-            product[first : first + len(strip), : strip.shape[1]] = strip
-            first += len(strip)
-        return mirrored(product)
     rows = [jnp.pad(strip, ((0, 0), (0, n - strip.shape[1]))) for strip in strips]
     lower = jnp.tril(jnp.concatenate(rows))
     return lower + jnp.tril(lower, -1).T

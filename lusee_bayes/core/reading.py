@@ -157,7 +157,7 @@ def read_json(path: str | Path, layout: Layout, hint: str = "") -> dict[str, Any
     return found | layout.checked(path, {}, found).values
 
 
-def read_model(path: str | Path, kind: type[Model], what: str, hint: str = "") -> Model:
+def read_model(path: str | Path, kind: type[Model], what: str) -> Model:
     """Read an object in JSON into a pydantic model.
 
     Parameters
@@ -167,15 +167,13 @@ def read_model(path: str | Path, kind: type[Model], what: str, hint: str = "") -
         The model.
     what : str
         What it should be, for messages.
-    hint : str
-        What to do if there is no such file.
 
     Raises
     ------
     InputError
         If the file cannot be read, or the first thing in it that is not as the model has it.
     """
-    text = read_text(path, what, hint)
+    text = read_text(path, what)
     try:
         return kind.model_validate_json(text)
     except ValidationError as error:
@@ -305,9 +303,9 @@ def parse_yaml(text: str, where: str) -> Any:
         raise InputError(f"{where} is not valid YAML: {words}{place}") from error
 
 
-def read_yaml(path: str | Path, what: str, hint: str = "") -> Any:
+def read_yaml(path: str | Path, what: str) -> Any:
     """Read a YAML file. InputError if it cannot be read, or as :func:`parse_yaml`."""
-    return parse_yaml(read_text(path, what, hint), str(path))
+    return parse_yaml(read_text(path, what), str(path))
 
 
 def as_yaml(tree: Any, *, flow: bool = False) -> str:

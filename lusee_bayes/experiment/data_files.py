@@ -18,7 +18,7 @@ from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.flight.clock import read_clock
 from lusee_bayes.flight.flags import read_lines
-from lusee_bayes.flight.gain_model import GainModel, read_gain_table
+from lusee_bayes.flight.gain_model import GainModel, read_gain_table, synthetic_gains
 from lusee_bayes.flight.recipe import FlightSection, Recipe
 from lusee_bayes.flight.reduced import Reduced, read_reduced
 from lusee_bayes.flight.reduction import reduce_sessions
@@ -115,15 +115,13 @@ def are_sessions(data: Data) -> bool:
         If there are several files, and one is no session.
     """
     files = files_of(data)
-    if not files:
-        return False
     sessions = [is_session(require_file(path, "data", HINT)) for path in files]
     if len(files) > 1 and not all(sessions):
         other = files[sessions.index(False)]
         raise InputError(
             f"'{other}' is no session of the spectrometer; of other data, give one file"
         )
-    return all(sessions)
+    return bool(files) and all(sessions)
 
 
 def reduced_of(data: Data, scenario: Scenario, stages: Stages | None = None) -> Reduced | None:
@@ -210,9 +208,8 @@ def _stamped(path: str | Path, data: Visibilities, timestamp: Timestamp | None) 
         if timestamp is None:
             raise InputError(
                 f"{path} does not say what its times are: it has neither time_bounds nor the "
-                "attribute window = 'instant', and the start of a two-hour sample taken for its "
-                "middle shifts the data by tens to hundreds of standard deviations; use --set "
-                "observation.timestamp=start (or middle, end, instant)"
+                "attribute window = 'instant'; use --set observation.timestamp=start (or middle, "
+                "end, instant)"
             )
         with naming(path):
             return data.stamped(timestamp)
@@ -238,11 +235,9 @@ def _require_same_instrument(waterfall: Waterfall, scenario: Scenario) -> None:
         )
     rule, said = source.interpolated(frequency), waterfall.interpolation
     if rule is not None and said is not None and said != INTERPOLATIONS[rule]:
-        known = [name for name, word in INTERPOLATIONS.items() if word == said]
-        words = ", ".join(INTERPOLATIONS.values())
-        what_to_do = f"expected one of {words}, or a response that has it"
-        if known:
-            what_to_do = f"use --set beam.interpolation={known[0]}"
+        known = {w: f"use --set beam.interpolation={name}" for name, w in INTERPOLATIONS.items()}
+        other = f"expected one of {', '.join(known)}, or a response that has it"
+        what_to_do = known.get(said, other)
         raise InputError(
             f"{section.file} does not have the frequency {frequency:.15g} MHz; {waterfall.path} "
             f"has it by FREQINT = '{said}', the scenario by beam.interpolation={rule}; {what_to_do}"
@@ -251,15 +246,11 @@ def _require_same_instrument(waterfall: Waterfall, scenario: Scenario) -> None:
     ours = circuit.per_kelvin.diagonal().real
     port = int(np.argmax(np.abs(theirs / ours - 1.0)))
     if abs(theirs[port] / ours[port] - 1.0) > SAME_SCALE:
-        if waterfall.receiver is None:
-            what_to_do = "give the response and the beam.receiver that the data were taken with"
-        elif section.receiver is not None:
-            what_to_do = "leave out beam.receiver, so that the loads ZL in the data are used"
-        else:
-            what_to_do = "give the response that the data, which have the loads ZL, were taken with"
+        loads = "" if waterfall.receiver is None else "; without beam.receiver, their ZL is used"
         raise InputError(
             f"in {waterfall.path} 1 K is {theirs[port]:.6g} V^2/Hz at port {port}, with "
-            f"{section.file} it is {ours[port]:.6g}; {what_to_do}"
+            f"{section.file} it is {ours[port]:.6g}; give the response and the beam.receiver that "
+            f"the data were taken with{loads}"
         )
     for name, theirs_k in (
         ("moon_temperature_k", waterfall.moon_k),
@@ -385,12 +376,14 @@ def per_kelvin_of(scenario: Scenario) -> Float[np.ndarray, " ports"]:
 
 
 def gain_table_of(section: FlightSection) -> GainModel:
-    """The gain table that a scenario names, with what it says of its errors.
+    """The gain table that a scenario names, or a synthetic one, with what it says of its errors.
 
     Raises
     ------
     InputError
         If the table cannot be read, or says itself what the scenario says of its components.
     """
+    if section.gain_table is None:
+        return synthetic_gains().with_component_std(section.component_std)
     table = read_gain_table(section.gain_table, section.gain_model)
     return table.with_component_std(section.component_std)

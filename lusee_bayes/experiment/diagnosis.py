@@ -440,11 +440,6 @@ class Proposal:
     chi2: ChiSquare
 
     @property
-    def fits(self) -> bool:
-        """Whether the data would fit."""
-        return not stands_out(self.chi2.p, 1)
-
-    @property
     def excess(self) -> float:
         """How far chi^2 is from what is expected."""
         return abs(self.chi2.chi2 - self.chi2.degrees)
@@ -469,18 +464,13 @@ class Diagnosis:
     proposals: tuple[Proposal, ...]
     n_tried: int
 
-    @property
-    def fits(self) -> bool:
-        """Whether the data fit as they are."""
-        return not stands_out(self.chi2.p, 1)
-
     def sentences(self) -> list[str]:
         """The proposals in words, one each; or that there are none."""
-        if self.fits:
+        if self.chi2.fits:
             return [f"No usual mistake is needed: the data fit as they are ({self.chi2.words()})."]
         if not self.proposals:
             return [f"None of the usual mistakes explains it ({self.n_tried} tried)."]
-        first = "Did you mean" if self.proposals[0].fits else "Closest, but not enough"
+        first = "Did you mean" if self.proposals[0].chi2.fits else "Closest, but not enough"
         return [f"{first}:"] + [
             f"({number}) {one.words}: {one.remedy} ({one.chi2.words()})."
             for number, one in enumerate(self.proposals, 1)
@@ -527,9 +517,9 @@ def diagnose(experiment: Experiment, inference: Inference, found: Residuals) -> 
     nearly = [one for one in proposals if one.excess < excess]
     # these always absorb some of what is wrong, and count only if they absorb all of it
     proposals += _noise_level(found, data)
-    finer = [] if any(one.fits for one in proposals) else list(_finer(here))
+    finer = [] if any(one.chi2.fits for one in proposals) else list(_finer(here))
     proposals += finer
-    listed = [one for one in proposals if one.fits] or nearly
+    listed = [one for one in proposals if one.chi2.fits] or nearly
     listed.sort(key=lambda one: one.excess)
     return Diagnosis(base, tuple(_merged(listed)), len(of_data) + len(of_model) + 1 + len(finer))
 

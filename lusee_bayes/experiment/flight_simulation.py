@@ -22,7 +22,7 @@ from lusee_bayes.experiment.model import set_up, true_signal, true_values
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.flight import synthesis
 from lusee_bayes.flight.clock import DAY_S, MJD_ZERO, Clock
-from lusee_bayes.flight.gain_model import GainModel, draw_gains, synthetic_gains
+from lusee_bayes.flight.gain_model import GainModel, draw_gains
 from lusee_bayes.flight.recipe import FlightSection, FlightSimulatedSection
 from lusee_bayes.flight.session import ADC_HIGH, ADC_LOW, FRAME_S, PORTS, BinOrigin, channel_mhz
 from lusee_bayes.flight.session_files import SessionRows
@@ -108,9 +108,8 @@ class FlightSimulation:
         """Which spectra each session has."""
         hours = self.observation.hours
         number = np.floor((hours - hours[0]) / self.section.session_h + 1e-9)
-        starts = np.flatnonzero(np.diff(number, prepend=-1.0))
-        ends = np.append(starts[1:], len(number))
-        return tuple(slice(int(a), int(b)) for a, b in zip(starts, ends, strict=True))
+        edges = np.flatnonzero(np.diff(number, prepend=-1.0, append=np.inf)).tolist()
+        return tuple(slice(start, end) for start, end in pairwise(edges))
 
     def rows(self, session: slice) -> SessionRows:
         """Return what a session says of its spectra.
@@ -276,11 +275,6 @@ def spectra_observation(scenario: Scenario, window_s: float) -> Observation:
         If the axis of the Moon is fixed, no sample lasts for so long, or the turntable turns:
         sessions do not say its angle.
     """
-    if scenario.observation.fixed_axis:
-        raise InputError(
-            "spectra are means over the time of their integration, and observation.fixed_axis is "
-            "for instants; leave it out"
-        )
     # whatever the samples of other data would be
     planned = scenario.observation.model_copy(update={"window": "mean"}).observation()
     bounds, live = planned.windows.bounds_s, planned.windows.live_per_sample_s
@@ -349,11 +343,7 @@ def _drawn_gains(
     scenario: Scenario, flight: FlightSection
 ) -> tuple[GainModel, GainModel, dict[str, float]]:
     """The table, the gains of which it is the mean, and by how much they are off."""
-    if flight.gain_table is None:
-        table = synthetic_gains().with_component_std(flight.component_std)
-    else:
-        table = gain_table_of(flight)
-    section = scenario.noise.gain_table
+    table, section = gain_table_of(flight), scenario.noise.gain_table
     if section is None:
         return table, table, {}
     if section.std is not None:

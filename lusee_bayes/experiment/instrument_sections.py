@@ -439,17 +439,6 @@ def _complete_beam(tree: dict[str, Any]) -> None:
         tree["model"] = beam_kind(file) if isinstance(file, str) else "luseepy"
     if tree["model"] not in ("response", "grid") and tree.get("receiver") == "jfet":
         del tree["receiver"]  # scenarios of 0.1 held all keys of all kinds
-    temperatures = ("moon_temperature_k", "antenna_temperature_k")
-    if tree["model"] == default and any(tree.get(name) for name in temperatures):
-        raise ValueError(
-            "the beams of the embedded antennas are scaled to the sky alone: temperatures of "
-            "Moon and antennas need beam.file"
-        )
-    if tree["model"] == "luseepy" and tree.get("antenna_temperature_k"):
-        raise ValueError(
-            f"{file} is a scalar beam, which knows of no losses; leave out "
-            "beam.antenna_temperature_k"
-        )
 
 
 BeamSection = one_of(BEAM_SECTIONS, _complete_beam)

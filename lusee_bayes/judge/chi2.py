@@ -69,6 +69,11 @@ class ChiSquare:
         return two_sided(self.chi2, self.degrees)
 
     @property
+    def fits(self) -> bool:
+        """Whether it alone is what chance makes."""
+        return not stands_out(self.p, 1)
+
+    @property
     def too_small(self) -> bool:
         """Whether it is below what is expected, where it stands out."""
         return bool(self.chi2 < self.degrees)

@@ -8,15 +8,14 @@ much they scatter is therefore counted, too, over the pulls of a few hundred dra
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from lusee_bayes.core.arrays import Draws, Modes, Pixels
-from lusee_bayes.core.engine import in_threads
-from lusee_bayes.core.harmonics import columns_to_maps, lmax_of, mode_numbers
+from lusee_bayes.core.harmonics import mode_numbers, modes_to_map
 from lusee_bayes.core.lazy import healpy, special
 
 # of the central intervals that are counted, and their names in files
@@ -25,8 +24,6 @@ NAMES = tuple(f"{100 * level:.0f}" for level in LEVELS)
 REST = ("rms", "rms_scatter", "largest", "allowed")
 # draws that tell the scatter: it is then known to 4 %
 N_DRAWS = 300
-# skies that are counted together: their maps fit into a cache
-BATCH = 50
 # degrees of |b|: the plane, where the sky is furthest from the prior, its surroundings, the rest
 LATITUDES = (10.0, 30.0)
 # first ell of each group
@@ -110,27 +107,10 @@ class Counts:
         """
         nside = healpy.npix2nside(len(std))
         bands = latitudes(nside)
-
-        def count(skies: Float[np.ndarray, "modes skies"]) -> np.ndarray:
-            maps = columns_to_maps(skies, nside)
-            maps /= std[:, None]
-            return _statistics(maps, bands.values())
-
-        both = np.concatenate([error[:, None], deviations.T], axis=1)
-        batches = np.array_split(both, max(1, both.shape[1] // BATCH), axis=1)
-        return cls._of(bands, np.concatenate(in_threads(count, batches), axis=2))
-
-    @classmethod
-    def of_modes(cls, std: Modes, error: Modes, deviations: Draws) -> Counts:
-        """By multipole, of harmonic coefficients; what is known exactly pulls at nothing."""
-        groups = multipoles(lmax_of(len(std)))
-        width = np.where(std > 0, std, np.inf)[:, None]
-        both = np.concatenate([error[:, None], deviations.T], axis=1) / width
-        return cls._of(groups, _statistics(both, groups.values()))
-
-    @classmethod
-    def _of(cls, parts: Mapping[str, np.ndarray], values: np.ndarray) -> Counts:
-        return cls(tuple(parts), tuple(int(inside.sum()) for inside in parts.values()), values)
+        pulls = (modes_to_map(x, nside) / std for x in (error, *deviations))
+        counted = [_statistics(one, bands.values()) for one in pulls]
+        sizes = tuple(int(inside.sum()) for inside in bands.values())
+        return cls(tuple(bands), sizes, np.stack(counted, axis=2))
 
     def coverage(self) -> tuple[Coverage, ...]:
         """What was counted, with its scatter, part by part."""
@@ -145,15 +125,14 @@ class Counts:
 
 
 def _statistics(
-    pulls: Float[np.ndarray, "n skies"], parts: Iterable[Bool[np.ndarray, " n"]]
-) -> Float[np.ndarray, "parts statistics skies"]:
+    pulls: Pixels, parts: Iterable[Bool[np.ndarray, " pixels"]]
+) -> Float[np.ndarray, "parts statistics"]:
     limits = special.ndtri(0.5 + 0.5 * np.array(LEVELS))
     found = []
     for inside in parts:
         size = np.abs(pulls[inside])
-        held = [(size < limit).sum(0) / len(size) for limit in limits]
-        rms = np.sqrt(np.einsum("ij,ij->j", size, size) / len(size))
-        found.append([*held, rms, size.max(0)])
+        held = [(size < limit).mean() for limit in limits]
+        found.append([*held, np.sqrt((size**2).mean()), size.max()])
     return np.array(found)
 
 
@@ -170,12 +149,11 @@ def latitudes(nside: int) -> dict[str, Bool[np.ndarray, " pixels"]]:
 
 
 def multipoles(lmax: int) -> dict[str, Bool[np.ndarray, " modes"]]:
-    """Which modes are of which group of multipoles, and all of them."""
+    """Which modes are of which group of multipoles."""
     ell, _ = mode_numbers(lmax)
     first = [edge for edge in ELLS if edge <= lmax]
     last = [*(edge - 1 for edge in first[1:]), lmax]
-    groups = {
+    return {
         f"ell {low} to {high}" if high > low else f"ell {low}": (ell >= low) & (ell <= high)
         for low, high in zip(first, last, strict=True)
     }
-    return groups | {"every ell": ell >= 0}

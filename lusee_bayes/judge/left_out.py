@@ -37,6 +37,7 @@ What is left without a group has N_0 without it, so that D loses ``D_:s D_ss^-1 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -182,10 +183,6 @@ class Stretch(NamedTuple):
     with_sky: Float[np.ndarray, "products few sky"]
     factors: Float[np.ndarray, "times few"]
 
-    def factors_at(self, times: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n few"]:
-        """U at some of its times."""
-        return self.factors[np.searchsorted(self.times, times)]
-
 
 class LeftOut:
     """A model and its data, ready to leave out groups of them.
@@ -317,10 +314,8 @@ class LeftOut:
             stretch = self._stretch(number) if number >= 0 else self._whole
             return [self.missed(groups[k], stretch) for k in batches[number]]
 
-        found = zip(batches.values(), in_threads(leave_out, list(batches)), strict=True)
-        by_number = {
-            k: one for numbers, missed in found for k, one in zip(numbers, missed, strict=True)
-        }
+        missed = chain(*in_threads(leave_out, list(batches)))
+        by_number = dict(zip(chain(*batches.values()), missed, strict=True))
         return [by_number[k] for k in range(len(groups))]
 
     def _within(self, group: GridFlags, neither: int) -> int:
@@ -521,7 +516,7 @@ class LeftOut:
             c = np.einsum("tkj,tr->tjkr", root * some[..., None], span.factors)
             c, b = c.reshape(1, some.size, -1), b.reshape(1, -1, 1)
         q, r = np.linalg.qr(c)
-        combined = stretch.factors_at(span.few)
+        combined = stretch.factors[np.searchsorted(stretch.times, span.few)]
         mine = slice(None) if len(places) == len(stretch.half) else places
         few = ((combined @ x[mine]).reshape(len(r), r.shape[-1], -1) for x in stretch[1:3])
         w, with_sky = ((r @ x).reshape(-1, x.shape[-1]) for x in few)

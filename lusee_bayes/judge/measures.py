@@ -106,7 +106,7 @@ def strengths(deviation: Modes, of_modes: Modes, of_pixels: Pixels) -> dict[str,
     bands = latitudes(nside)
     ells = multipoles(lmax_of(len(deviation)))
     parts = [(name, modes_to_map(rest, nside), of_pixels, bands[name]) for name in list(bands)[:-1]]
-    parts += [(name, rest, of_modes, ells[name]) for name in list(ells)[1:-1]]
+    parts += [(name, rest, of_modes, ells[name]) for name in list(ells)[1:]]
     return {
         name: float((values[inside] ** 2).sum() / expected[inside].sum())
         for name, values, expected, inside in parts
@@ -135,7 +135,6 @@ def correlation(mean: Modes, truth: Modes) -> Ells:
     (ells,) array
         rho_ell; NaN where either map has no power.
     """
-    mean, truth = np.asarray(mean), np.asarray(truth)
     power = np.sqrt(sum_over_m(mean**2) * sum_over_m(truth**2))
     return _ratio(sum_over_m(mean * truth), power)
 
@@ -153,7 +152,6 @@ def signal_to_noise(mean: Modes, truth: Modes) -> Ells:
     (ells,) array
         SNR_ell; NaN where the maps are equal.
     """
-    mean, truth = np.asarray(mean), np.asarray(truth)
     return np.sqrt(_ratio(sum_over_m(mean**2), sum_over_m((mean - truth) ** 2)))
 
 

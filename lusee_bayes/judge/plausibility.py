@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 from jaxtyping import Float
 
@@ -110,24 +112,23 @@ def _about_crosses(data: Visibilities, values: Grid, sigma: Grid) -> tuple[str, 
     n = round(np.sqrt(data.layout.n_products))
     position = {tuple(product): k for k, product in enumerate(all_products(n))}
     doubts = []
-    for i in range(n):
-        for j in range(i + 1, n):
-            ii, jj = position[i, i, "R"], position[j, j, "R"]
-            re, im = position[i, j, "R"], position[i, j, "I"]
-            vi, vj = values[ii], values[jj]
-            cross = np.hypot(values[re], values[im])
-            # autos within noise of zero bound nothing
-            usable = (vi > 0) & (vj > 0) & ~np.isnan(cross)
-            vi, vj = np.where(usable, vi, 1.0), np.where(usable, vj, 1.0)
-            bound = np.sqrt(vi * vj)
-            spread = np.hypot(sigma[re], sigma[im])
-            of_bound = 0.5 * bound * np.hypot(sigma[ii] / vi, sigma[jj] / vj)
-            excess = usable & (cross - bound > SIGNIFICANT * np.hypot(spread, of_bound))
-            if excess.any():
-                first = data.observation.times[int(np.nonzero(excess)[0][0])].isot[:19]
-                doubts.append(
-                    f"|V_{i}{j}| is larger than sqrt(V_{i}{i} V_{j}{j}), which no sky gives, in "
-                    f"{int(excess.sum())} of {int(usable.sum())} samples (first {first}): one of "
-                    f"the products {i}{i}, {j}{j} and {i}{j} is wrong there."
-                )
+    for i, j in combinations(range(n), 2):
+        ii, jj = position[i, i, "R"], position[j, j, "R"]
+        re, im = position[i, j, "R"], position[i, j, "I"]
+        vi, vj = values[ii], values[jj]
+        cross = np.hypot(values[re], values[im])
+        # autos within noise of zero bound nothing
+        usable = (vi > 0) & (vj > 0) & ~np.isnan(cross)
+        vi, vj = np.where(usable, vi, 1.0), np.where(usable, vj, 1.0)
+        bound = np.sqrt(vi * vj)
+        spread = np.hypot(sigma[re], sigma[im])
+        of_bound = 0.5 * bound * np.hypot(sigma[ii] / vi, sigma[jj] / vj)
+        excess = usable & (cross - bound > SIGNIFICANT * np.hypot(spread, of_bound))
+        if excess.any():
+            first = data.observation.times[int(np.nonzero(excess)[0][0])].isot[:19]
+            doubts.append(
+                f"|V_{i}{j}| is larger than sqrt(V_{i}{i} V_{j}{j}), which no sky gives, in "
+                f"{int(excess.sum())} of {int(usable.sum())} samples (first {first}): one of "
+                f"the products {i}{i}, {j}{j} and {i}{j} is wrong there."
+            )
     return tuple(doubts)

@@ -139,10 +139,6 @@ class Whitening(eqx.Module):
         parts = zip(self.sites, jnp.split(x, ends[:-1]), strict=True)
         return {name: part.reshape(shape) for (name, shape), part in parts}
 
-    def join(self, values: Mapping[str, Float[Array, "..."]]) -> Float[Array, " unknowns"]:
-        """Join values by site to x."""
-        return jnp.concatenate([values[name].reshape(-1) for name in self.names])
-
     def to_values(
         self, x: Float[Array, " unknowns"], hold: Sequence[str] = ()
     ) -> tuple[dict[str, Float[Array, "..."]], Float[Array, ""]]:
@@ -156,7 +152,8 @@ class Whitening(eqx.Module):
 
     def from_values(self, values: Mapping[str, Float[Array, "..."]]) -> Float[Array, " unknowns"]:
         """Compute x of the sites' unconstrained values."""
-        return self.join(values if self.chart is None else self.chart.from_values(values))
+        values = values if self.chart is None else self.chart.from_values(values)
+        return jnp.concatenate([values[name].reshape(-1) for name in self.names])
 
 
 def whitened(program: Callable, whitening: Whitening) -> Callable:

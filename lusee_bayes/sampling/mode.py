@@ -367,9 +367,7 @@ CHUNK = 1024
 INTERVAL = 0.9
 
 
-def pixel_statistics(
-    skies: Skies, nside: int, probability: float = INTERVAL
-) -> dict[str, Float[np.ndarray, " pixels"]]:
+def pixel_statistics(skies: Skies, nside: int) -> dict[str, Float[np.ndarray, " pixels"]]:
     """Compute what the draws say of every pixel.
 
     Parameters
@@ -378,22 +376,13 @@ def pixel_statistics(
         Draws, in K.
     nside : int
         NSIDE of the pixels.
-    probability : float
-        Of the central credible interval, between 0 and 1.
 
     Returns
     -------
     dict of (pixels,) array
-        ``mean``, ``std``, and the ends ``lower`` and ``upper`` of the interval, in K.
-
-    Raises
-    ------
-    InputError
-        If the probability is not between 0 and 1.
+        ``mean``, ``std``, and the ends ``lower`` and ``upper`` of the 90 % interval, in K.
     """
-    if not 0 < probability < 1:
-        raise InputError(f"the probability of an interval must lie in 0..1, got {probability}")
-    tails = [(1 - probability) / 2, (1 + probability) / 2]
+    tails = [(1 - INTERVAL) / 2, (1 + INTERVAL) / 2]
     flat, parts = skies.reshape(-1, skies.shape[-1]), []
     matrix = pixel_matrix(nside, lmax_of(flat.shape[-1]))
     for first in range(0, len(matrix), CHUNK):

@@ -190,16 +190,13 @@ def load_program(source: str | Path) -> Program:
 
 
 def _find(source: str | Path) -> Path:
-    if str(source) in program_names():
+    names = program_names()
+    if str(source) in names:
         return next(f / f"{source}.py" for f in FOLDERS if (f / f"{source}.py").exists())
-    path = user_path(source)
+    path, own = user_path(source), ", ".join(names)
     if path.suffix == ".py":
-        own = f"the package has {', '.join(program_names())}"
-        return require_file(path, "program", own)
-    raise InputError(
-        f"no program '{source}': give the path of a Python file, or one of "
-        f"{', '.join(program_names())}"
-    )
+        return require_file(path, "program", f"the package has {own}")
+    raise InputError(f"no program '{source}': give the path of a Python file, or one of {own}")
 
 
 def traced(program: Callable, arguments: Mapping[str, Any]) -> tuple[dict[str, dict], Any]:

@@ -20,7 +20,6 @@ from lusee_bayes.core.arrays import on_device, on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes, turn_about_z
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, stokes_beam
-from lusee_bayes.instrument.beams.monopoles import Monopoles
 from lusee_bayes.instrument.beams.source import BeamSource
 from lusee_bayes.instrument.coupling import Coupling, DenseCoupling
 from lusee_bayes.instrument.products import auto_indices, labels, to_matrix, to_real
@@ -75,9 +74,7 @@ def _slopes(cov: Covariance, x):
     )
 
 
-def check_covariance(
-    cov: Covariance, dense: np.ndarray, *, slopes: bool = True, eager: bool = False
-) -> None:
+def check_covariance(cov: Covariance, dense: np.ndarray, *, slopes: bool = True) -> None:
     """Check what it means to be a Covariance: everything agrees with a matrix.
 
     Parameters
@@ -87,8 +84,6 @@ def check_covariance(
         The same matrix, by hand; its condition number has to stay below 1e3.
     slopes : bool
         Check derivatives, too.
-    eager : bool
-        Check outside of ``jax.jit``, too.
 
     Raises
     ------
@@ -102,10 +97,6 @@ def check_covariance(
     assert sign == 1.0
     assert cov.size == n
     factor = cov.factor()  # outside of jit, where values are checked
-    if eager:
-        close(cov.solve(jnp.asarray(x)), inverse @ x)
-        close(jax.jit(lambda v: cov.solve(v))(jnp.asarray(x)), inverse @ x)  # closed over
-        assert cov.sample(jax.random.key(1)).shape == (n,)
     got = _numbers_of_covariance(cov, jnp.asarray(x), jnp.asarray(xs), factor)
 
     # what it is
@@ -259,16 +250,6 @@ def check_beam_source(
     if circuit is not None:  # a covariance of voltages, which may be singular
         per_kelvin = np.linalg.eigvalsh(circuit.per_kelvin)
         assert per_kelvin.min() > -ROUNDING * per_kelvin.max() and per_kelvin.max() > 0.0
-
-    try:
-        antennas = source.monopoles
-    except InputError as error:
-        assert "which beam.file replaces" in str(error)
-    else:
-        assert isinstance(antennas, Monopoles)
-        own = antennas.fields(frequency_mhz, grid)
-        np.testing.assert_array_equal(own.e_theta, fields.e_theta)
-        np.testing.assert_array_equal(own.e_phi, fields.e_phi)
 
 
 @eqx.filter_jit

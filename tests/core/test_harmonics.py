@@ -34,12 +34,6 @@ def test_packing_is_ell_squared_plus_ell_plus_m():
     assert [h.lmax_of(h.n_modes(lmax)) for lmax in (0, 1, 47)] == [0, 1, 47]
 
 
-def test_many_maps_at_once_are_those_of_healpy():
-    modes = np.random.default_rng(5).standard_normal((h.n_modes(LMAX), 3))
-    expected = np.stack([h.modes_to_map(column, 4) for column in modes.T], axis=1)
-    within(h.columns_to_maps(modes, 4), expected, 1e-12)
-
-
 @pytest.mark.parametrize("n", [0, 2, 3, 2303])
 def test_a_number_that_is_no_square_is_refused(n):
     refuse(f"{n} coefficients", h.lmax_of, n)

@@ -185,7 +185,7 @@ def test_the_cause_is_named():
     wrong = next(one for one in wrong_data.WRONG if one.name == "one time 2 % too high")
     left, found = diagnosed(wrong, wrong_data.scenario(6, "observation.step_s=30000"))
     assert left.level() == "does not fit"
-    assert is_named(wrong, found) and found.proposals[0].fits
+    assert is_named(wrong, found) and found.proposals[0].chi2.fits
     assert wrong.cause in " ".join(found.sentences())
 
 
@@ -201,7 +201,7 @@ def test_all_wrong_data_make_a_map_and_most_causes_are_named():
     for wrong in wrong_data.UNMODELLED:
         left, found = diagnosed(wrong)
         assert left.level() == "does not fit", wrong.name
-        assert not any(proposal.fits for proposal in found.proposals), wrong.name
+        assert not any(proposal.chi2.fits for proposal in found.proposals), wrong.name
 
 
 @pytest.mark.long
@@ -211,7 +211,7 @@ def test_absent_samples_do_not_matter():
         return flagged(data, np.random.default_rng(3).uniform(size=data.grid().shape) < 0.1)
 
     _, found = diagnosed(replace(wrong_data.WRONG[0], make=make))
-    assert is_named(wrong_data.WRONG[0], found) and found.proposals[0].fits
+    assert is_named(wrong_data.WRONG[0], found) and found.proposals[0].chi2.fits
 
 
 def test_chi2_of_mixed_data_is_that_of_matrices():

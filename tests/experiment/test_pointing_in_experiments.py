@@ -97,7 +97,7 @@ def test_ignored_the_report_points_at_it(known_sky):
     assert report.offsets is None
     best = diagnosis(experiment, found).proposals[0]
     name, value = best.words.split(" is off by ")
-    assert name == ANGLE and float(value) == pytest.approx(0.3, rel=0.03) and best.fits
+    assert name == ANGLE and float(value) == pytest.approx(0.3, rel=0.03) and best.chi2.fits
     assert "noise.pointing" in best.remedy
     whole = report.preferred[report.preferred["first_day"] < 0].set_index("offset")
     assert whole["value"][ANGLE] == pytest.approx(0.3, rel=0.03)
@@ -115,7 +115,7 @@ def test_where_nothing_is_off_the_report_is_silent():
     experiment = Experiment(setup, simulate(setup))
     found = lb.infer(experiment)
     told = diagnosis(experiment, found)
-    assert told.fits and "fit as they are" in " ".join(told.sentences())
+    assert told.chi2.fits and "fit as they are" in " ".join(told.sentences())
 
 
 def test_about_no_offsets_large_ones_are_not_described():

@@ -104,7 +104,7 @@ QUICK = [kind for kind in KINDS if kind != "banded"]
 
 @pytest.mark.parametrize("kind", [*QUICK, pytest.param("banded", marks=pytest.mark.long)])
 def test_contract(kind, small_blocks):
-    check_covariance(*_terms(FLAGS)[kind], eager=kind != "banded")
+    check_covariance(*_terms(FLAGS)[kind])
 
 
 def test_contract_without_flags():

@@ -56,21 +56,6 @@ def test_pixels_are_counted_by_latitude():
         assert from_tree(Coverage, to_tree(part), "a file") == part
 
 
-def test_modes_are_counted_by_multipole():
-    rng = np.random.default_rng(2)
-    std, error, draws = rng.uniform(0.5, 2.0, N_MODES), *np.split(rng.standard_normal((8, 49)), [1])
-    # what is known exactly is where it should be, in every draw too
-    std[30] = error[0, 30] = 0.0
-    draws[:, 30] = 0.0
-    mean, low, high, every = Counts.of_modes(std, error[0], draws).coverage()
-    names = [part.name for part in (mean, low, high, every)]
-    assert names == ["ell 0", "ell 1 to 4", "ell 5 to 6", "every ell"]
-    width = np.where(std > 0, std, 1.0)
-    compare(low, error[0, 1:25] / width[1:25], draws[:, 1:25] / width[1:25])
-    compare(high, error[0, 25:] / width[25:], draws[:, 25:] / width[25:])
-    compare(every, error[0] / width, draws / width)
-
-
 @pytest.fixture(scope="module")
 def ensemble():
     """Coverage of 80 skies drawn from a prior, each seen through the same noisy instrument:
@@ -133,9 +118,7 @@ def test_skies_of_the_prior_are_covered_within_the_printed_errors(tmp_path):
         error = channel.truth - channel.mean
         for factor, found in far.items():
             pixels = Counts.of_pixels(factor * channel.pixel_std, error, drawn).coverage()
-            modes = Counts.of_modes(factor * channel.std, error, drawn).coverage()
-            parts = pixels[-1], modes[-1]
-            found.append([(part.held[1] - LEVELS[1]) / part.scatter[1] for part in parts])
+            found.append((pixels[-1].held[1] - LEVELS[1]) / pixels[-1].scatter[1])
     right, wide = (np.mean(found, axis=0) * np.sqrt(4) for found in far.values())
     assert np.abs(right).max() < 4.0
     assert wide.min() > 4.0
