@@ -535,17 +535,6 @@ class Whitened(Form):
         white = self.factor.whiten(data if offset is None else data - offset)
         return white - self.whitened @ self.model.prior.white_mean
 
-    def half(self) -> Float[Array, "rank data"]:
-        """Compute H with (A S A^T + N)^-1 = L^-T (1 - H^T H) L^-1.
-
-        Returns
-        -------
-        (rank, data) array
-            L_Lambda^-1 W^T; in the data-space form L_v^-1 R.
-        """
-        inside = self.whitened if self.basis is None else self.whitened @ self.basis
-        return solve_lower(self.lower, inside.T, transpose=False)
-
 
 class InMap(Whitened):
     """In map space: Lambda = 1 + W^T W."""

@@ -125,29 +125,6 @@ class CorrelatedNormal(Prediction):
         """Compute L^-1 (d - loc), N = L L^T."""
         return self.factor.whiten(value - self.loc)
 
-    def leave_one_out(self, value: DataVector) -> DataVector:
-        """Compute ln p(d_i | all other data) of every datum.
-
-        With the precision P and the residual r it is N(d_i - [P r]_i / P_ii, 1 / P_ii).
-
-        Parameters
-        ----------
-        value : (data,) array
-            d, in K.
-
-        References
-        ----------
-        Buerkner, Gabry & Vehtari 2021, Comput. Stat. 36, 1243.
-        """
-        root = self.factor.whiten(jnp.eye(self.loc.shape[0]))
-        precise = self.factor.solve(value - self.loc)
-        return _leave_one_out(precise, (root**2).sum(0))
-
-
-def _leave_one_out(precise: DataVector, diagonal: DataVector) -> DataVector:
-    """Log densities from P r and the diagonal of P."""
-    return -0.5 * precise**2 / diagonal + 0.5 * jnp.log(diagonal) - HALF_LOG_2PI
-
 
 class TimesStudentT(Prediction):
     """The data of every time t a multivariate Student-t about loc_t; event (data,).
@@ -277,14 +254,3 @@ class Marginal(dist.Distribution):
         solver = self.model.factorise()
         flat = value.reshape(-1, value.shape[-1])
         return jax.vmap(solver.log_prob)(flat).reshape(value.shape[:-1])
-
-    def leave_one_out(self, value: DataVector) -> DataVector:
-        """Compute ln p(d_i | all other data) of every datum; see CorrelatedNormal."""
-        solver = self.model.factorise()
-        white = solver.surprise(value)
-        root = solver.factor.whiten(jnp.eye(value.shape[0]))
-        # (A S A^T + N)^-1 = L^-T (1 - H^T H) L^-1,  H = L_Lambda^-1 W^T
-        half = solver.half()
-        inner = white - half.T @ (half @ white)
-        diagonal = (root**2).sum(0) - ((half @ root) ** 2).sum(0)
-        return _leave_one_out(solver.factor.whiten_transpose(inner), diagonal)

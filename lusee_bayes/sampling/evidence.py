@@ -1,28 +1,21 @@
-"""Which program suits the data better: evidences, and ArviZ's comparison of predictions.
+"""Which program suits the data better: evidences.
 
-Evidence: importance sampling from the Gaussian about the posterior's mode (heavier in the tails),
-with its error. Prediction: ln p(d_i | all other data) of every datum with full N, which Pareto
-smoothed importance sampling turns into the expected log density of data left out (``compare``).
+By importance sampling from the Gaussian about the posterior's mode (heavier in the tails), with the
+error.
 """
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import arviz_base
-import arviz_stats
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
-import xarray as xr
 from jaxtyping import Float
 from numpyro import distributions as dist
-from numpyro import handlers
 from numpyro.infer.util import potential_energy
 
 from lusee_bayes.core.arrays import Array
@@ -118,71 +111,3 @@ def _log_weights(
     site = f"{whitening.names[0]}{WHITE_SUFFIX}"
     log_p = jax.lax.map(lambda z: -potential_energy(model, (), arguments, {site: z}), z)
     return log_p - proposal.log_prob(z)
-
-
-def with_log_likelihood(
-    tree: xr.DataTree, program: Program, arguments: Mapping[str, Any], *, most: int = 400
-) -> xr.DataTree:
-    """Make a tree of some of the draws, with a group log_likelihood (chain, draw, datum).
-
-    Parameters
-    ----------
-    tree : DataTree
-        From :func:`~lusee_bayes.sampling.datatree.to_datatree`.
-    program : Program
-        The program that was sampled.
-    arguments : mapping
-        What it asks for, without the data.
-    most : int
-        Use this many draws at most, but one of each chain at least.
-
-    Returns
-    -------
-    DataTree
-        Its posterior has these draws only.
-
-    Raises
-    ------
-    InputError
-        If the program's data are not at a site Marginal or CorrelatedNormal.
-    """
-    posterior = tree["posterior"].dataset
-    each = max(1, most // posterior.sizes["chain"])
-    few = posterior.isel(draw=slice(None, None, -(-posterior.sizes["draw"] // each)))
-    sites = {str(name): value.values for name, value in few.data_vars.items()}
-    data = jnp.asarray(tree["observed_data"][DATA].values)
-
-    def predicted(values):
-        """ln p(d_i | all other data, sites) of every datum."""
-        model = handlers.substitute(handlers.seed(program.model, 0), values)
-        fn = handlers.trace(model).get_trace(**arguments, data=data)[DATA]["fn"]
-        if not hasattr(fn, "leave_one_out"):
-            raise InputError(
-                f"the data of the program '{program.name}' follow {type(fn).__name__}; a "
-                "comparison needs Marginal or CorrelatedNormal"
-            )
-        return fn.leave_one_out(data)
-
-    with numpyro_promotion():
-        flat = {name: jnp.reshape(v, (-1, *v.shape[2:])) for name, v in sites.items()}
-        rows = np.asarray(jax.lax.map(predicted, flat))
-    rows = rows.reshape(few.sizes["chain"], few.sizes["draw"], -1)
-    groups = {"posterior": sites, "log_likelihood": {DATA: rows}}
-    return arviz_base.from_dict(groups, dims={DATA: ["datum"]}, check_conventions=False)
-
-
-def compare_programs(trees: Mapping[str, xr.DataTree]) -> pd.DataFrame:
-    """Make ArviZ's table of expected log predictive densities, the best program first.
-
-    Programs that sample the sky predict given the sky, collapsed ones without it: do not compare
-    one with the other.
-
-    Parameters
-    ----------
-    trees : mapping of DataTree
-        By name, from :func:`with_log_likelihood`, all of the same data.
-    """
-    with warnings.catch_warnings():
-        # of how ArviZ calls pandas
-        warnings.filterwarnings("ignore", message="The inplace keyword in")
-        return arviz_stats.compare(dict(trees))
