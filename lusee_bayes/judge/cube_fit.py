@@ -201,8 +201,8 @@ class SharedTest:
         Whether it stands out among all channels.
     shares : dict of float
         By unknown that all channels have in common: this channel's share of the information, which
-        is 1 / variance - 1 in prior units. Each channel counts as if it were alone; NaN where no
-        channel constrains the unknown.
+        is 1 / variance - 1 in prior units. Each channel counts as if it were alone; zero where
+        no channel constrains the unknown.
     """
 
     frequency_mhz: float
@@ -269,10 +269,10 @@ def shared_tests(
             break
         # of two that differ, neither is known to be right
         agree = [k for k in agree if k != worst] if len(agree) > 2 else []
-    alone = 1.0 / np.diagonal(covariance, axis1=1, axis2=2) - 1.0
+    alone = np.maximum(1.0 / np.diagonal(covariance, axis1=1, axis2=2) - 1.0, 0.0)
     common = [i for i, kernel in enumerate(kernels) if (kernel == 1.0).all()]
-    none = np.full(alone.shape, np.nan)
-    shares = np.divide(alone, alone.sum(0), out=none, where=alone.sum(0) > 0)
+    total = alone.sum(0)
+    shares = np.divide(alone, total, out=np.zeros(alone.shape), where=total > 0)
     return tuple(
         SharedTest(f, *found[k], k not in agree, {names[i]: float(shares[k, i]) for i in common})
         for k, f in enumerate(frequencies_mhz)
