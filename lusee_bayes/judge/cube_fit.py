@@ -201,8 +201,8 @@ class SharedTest:
         Whether it stands out among all channels.
     shares : dict of float
         By unknown that all channels have in common: this channel's share of the information, which
-        is 1 / variance - 1 in prior units. Each channel counts as if it were alone; NaN where no
-        channel constrains the unknown.
+        is 1 / variance - 1 in prior units. Each channel counts as if it were alone; zero where
+        no channel constrains the unknown.
     """
 
     frequency_mhz: float
@@ -239,15 +239,15 @@ def shared_tests(
     told, blocks = np.linalg.inv(covariance), root_of_kernels(kernels)
     pull = np.einsum("kij,kj->ki", told, mean)
     precision = told - np.eye(len(names))
+    seen = np.swapaxes(blocks, 1, 2) @ precision @ blocks
+    pulled = np.einsum("kiw,ki->kw", blocks, pull)
     agree, found = list(range(len(mean))), [(0.0, 0)] * len(mean)
 
     def compared(k: int) -> tuple[float, int]:
         """chi^2 of channel k and its degrees of freedom."""
-        others, vector = np.eye(blocks.shape[2]), np.zeros(blocks.shape[2])
-        for j in set(agree) - {k}:
-            others += blocks[j].T @ precision[j] @ blocks[j]
-            vector += blocks[j].T @ pull[j]
-        predicted = blocks[k] @ np.linalg.solve(others, vector)
+        rest = [j for j in agree if j != k]
+        others = np.eye(blocks.shape[2]) + seen[rest].sum(0)
+        predicted = blocks[k] @ np.linalg.solve(others, pulled[rest].sum(0))
         spread = blocks[k] @ np.linalg.solve(others, blocks[k].T)
         values, axes = np.linalg.eigh(precision[k])
         kept = values > max(LEAST_INFORMATION, len(values) * np.finfo(float).eps * values[-1])
@@ -255,9 +255,8 @@ def shared_tests(
         white = axes[:, kept] / np.sqrt(values[kept])
         off = white.T @ (told[k] @ (mean[k] - predicted) + predicted)
         half = precision[k] @ white
-        return float(off @ np.linalg.solve(np.eye(len(off)) + half.T @ spread @ half, off)), len(
-            off
-        )
+        variance = np.eye(len(off)) + half.T @ spread @ half
+        return float(off @ np.linalg.solve(variance, off)), len(off)
 
     def excess(k: int) -> float:
         return (found[k][0] - found[k][1]) / np.sqrt(2.0 * found[k][1] or 1.0)
@@ -270,11 +269,10 @@ def shared_tests(
             break
         # of two that differ, neither is known to be right
         agree = [k for k in agree if k != worst] if len(agree) > 2 else []
-    alone = 1.0 / np.diagonal(covariance, axis1=1, axis2=2) - 1.0
+    alone = np.maximum(1.0 / np.diagonal(covariance, axis1=1, axis2=2) - 1.0, 0.0)
     common = [i for i, kernel in enumerate(kernels) if (kernel == 1.0).all()]
-    shares = np.divide(
-        alone, alone.sum(0), out=np.full(alone.shape, np.nan), where=alone.sum(0) > 0
-    )
+    total = alone.sum(0)
+    shares = np.divide(alone, total, out=np.zeros(alone.shape), where=total > 0)
     return tuple(
         SharedTest(f, *found[k], k not in agree, {names[i]: float(shares[k, i]) for i in common})
         for k, f in enumerate(frequencies_mhz)

@@ -210,7 +210,7 @@ def test_theta_adds_the_variance_that_fixing_it_would_take_away(cube, expected):
 
 
 def test_a_wrong_resonance_in_one_channel_of_eight_is_named(tmp_path, monkeypatch):
-    """Antennas of 3.02 m in one channel; seven with another length that is theirs in common."""
+    """Its antennas are 2 cm longer than those of the other seven."""
     frequencies = [10.0, 13.0, 16.0, 19.0, 21.0, 24.0, 27.0, 30.0]
     sizes = (f"frequencies_mhz={frequencies}", "lmax=4", "observation.step_s=1e5", RUNS)
     more = ("noise.radiometer.factor=1e4", "noise.beam={parameters: {length_m: 0.01}}")
