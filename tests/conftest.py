@@ -28,7 +28,6 @@ from jaxtyping import install_import_hook  # noqa: E402
 install_import_hook("lusee_bayes", "beartype.beartype")
 
 import jax  # noqa: E402
-import numpy as np  # noqa: E402
 import pytest  # noqa: E402
 from experiments import small_experiment as make_small_experiment  # noqa: E402
 from fits_files import write_response  # noqa: E402
@@ -47,27 +46,22 @@ jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
-
-def known_beams(compute):
-    """Beams of antennas that an earlier test has asked for, too, are not computed again."""
-    known = {}
-
-    def beams(frequency_mhz, lmax, antennas, stokes, nodes):
-        leaves = jax.tree.leaves((frequency_mhz, antennas))
-        if lmax > 16 or not all(isinstance(leaf, np.ndarray) for leaf in leaves):
-            return compute(frequency_mhz, lmax, antennas, stokes, nodes)
-        key = lmax, stokes, nodes, *(leaf.tobytes() for leaf in leaves)
-        if key not in known:
-            known[key] = compute(frequency_mhz, lmax, antennas, stokes, nodes)
-            known[key].flags.writeable = False
-        return known[key]
-
-    return beams
+known, beams_of = {}, monopoles._modes
 
 
-monopoles._modes = known_beams(monopoles._modes)
+def known_beams(*given):
+    """Beams that an earlier test has asked for, too, are not computed again."""
+    leaves = jax.tree.leaves(given)
+    if any(isinstance(leaf, jax.Array) for leaf in leaves):
+        return beams_of(*given)
+    key = tuple(leaf.tobytes() if hasattr(leaf, "tobytes") else leaf for leaf in leaves)
+    if key not in known:
+        known[key] = beams_of(*given)
+        known[key].flags.writeable = False
+    return known[key]
 
-jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+monopoles._modes = known_beams
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
 DATA = Path(

@@ -329,10 +329,8 @@ class Scenario(Section):
         return _as_yaml(json.dumps(self.model_dump(mode="json")))
 
 
-@lru_cache(maxsize=64)
-def _as_yaml(text: str) -> str:
-    """Of JSON; a run writes the same scenario into each of its files."""
-    return as_yaml(json.loads(text))
+# a run writes the same scenario into each of its files
+_as_yaml = lru_cache(maxsize=64)(lambda text: as_yaml(json.loads(text)))
 
 
 def scenario_names() -> list[str]:

@@ -7,8 +7,6 @@ the expensive part once and returns a :class:`Factor`, a square root N = L L^T t
 A new structure is one file: implement the abstract methods here, and ``absorb`` for the sums that
 keep the structure. ``a + b`` tries whether either side can absorb the other.
 
-N may be a full matrix, or diagonal.
-
 **Noise along a few directions**, such as templates with prior variances or beam errors: U U^T alone
 is singular; added to any other covariance N_0 it gives N_0 + U U^T, which is solved through the
 small matrix C = 1 + V^T V, V = L_0^-1 U (Woodbury). With C = R R^T, ::
@@ -38,7 +36,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core import checks
-from lusee_bayes.core.arrays import Array, compiled, namespace
+from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky, solve_lower
 from lusee_bayes.instrument.products import DataLayout
@@ -601,7 +599,9 @@ class TimeBlockCovariance(_OverLayout):
 
     def time_weights(self, layout):
         self.factor()  # raises where a block is not positive definite
-        return _inverse_blocks(self)
+        xp, present = namespace(self), self.layout.present.T
+        both = present[:, :, None] & present[:, None, :]
+        return xp.moveaxis(xp.where(both, xp.linalg.inv(self.blocks), 0.0), 0, 2)
 
     def absorb(self, other):
         if isinstance(other, TimeBlockCovariance):
@@ -616,13 +616,6 @@ class TimeBlockCovariance(_OverLayout):
 
     def scaled(self, factor):
         return TimeBlockCovariance(factor * self.blocks, self.layout)
-
-
-@compiled
-def _inverse_blocks(noise: TimeBlockCovariance) -> Float[Array, "products products times"]:
-    xp, present = namespace(noise), noise.layout.present.T
-    both = present[:, :, None] & present[:, None, :]
-    return xp.moveaxis(xp.where(both, xp.linalg.inv(noise.blocks), 0.0), 0, 2)
 
 
 # rows of a block: measured at 16 products and a band of 43 times, whitening 5232 x 2304 on two

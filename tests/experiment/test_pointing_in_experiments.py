@@ -230,18 +230,18 @@ def test_what_cannot_be():
 
 def test_beams_and_pointing_are_sampled_together():
     """The density is that of antennas and angles built so, of which none is left out."""
-    pointing = "noise.pointing={turntable_deg: 0.5, tilt_east_deg: 0.5, treatment: sampled}"
-    beam = "noise.beam={parameters: {height_m: 0.1}, treatment: sampled}"
+    pointing = "noise.pointing={turntable_deg: 0.05, tilt_east_deg: 0.05, treatment: sampled}"
+    beam = "noise.beam={parameters: {height_m: 0.01}, treatment: sampled}"
     experiment = lb.build(scenario_of(pointing, beam, lmax=4, step_s=86400.0))
     setup, data = experiment.setup, experiment.data.data
-    values = {"turntable_deg": 0.4, "tilt_east_deg": -0.3, "height_m": 2.05}
+    values = {"turntable_deg": 0.04, "tilt_east_deg": -0.03, "height_m": 2.005}
 
     def evidence(values):
         there = moved(setup, values)
         model = LinearGaussian(there.coupling, setup.prior, radiometer(setup), there.offset)
         return float(model.log_prob(data))
 
-    priors = stats.norm.logpdf(list(values.values()), [0.0, 0.0, 2.0], [0.5, 0.5, 0.1]).sum()
+    priors = stats.norm.logpdf(list(values.values()), [0.0, 0.0, 2.0], [0.05, 0.05, 0.01]).sum()
     # A by two routes leaves 1e-13 of the data, which are 1e5 times the noise
     got = density_of(experiment, values)
     assert got == pytest.approx(evidence(values) + priors, rel=1e-7)

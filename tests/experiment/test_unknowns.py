@@ -144,13 +144,6 @@ def test_a_run_writes_them(experiment, tmp_path):
         assert text in page
 
 
-def test_runs_without_them_are_as_before(small_map):
-    assert not (small_map.folder / "unknowns.csv").exists()
-    summary = json.loads((small_map.folder / "summary.json").read_text())
-    assert summary["channels"][0]["unknowns"] is None
-    assert "gain table" not in map_page(small_map.folder, "a run")
-
-
 def known(setup: Setup) -> Setup:
     """The same with receivers and ground that are known to be the truth."""
     noise, truth = setup.scenario.noise, true_values(setup)

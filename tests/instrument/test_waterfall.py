@@ -22,7 +22,6 @@ from lusee_bayes.core.reading import parse_yaml
 from lusee_bayes.experiment.model import set_up
 from lusee_bayes.instrument.products import DataLayout, labels
 from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
-from lusee_bayes.report.describe import describe
 
 PAIRS = [[i, j] for i in range(4) for j in range(i, 4)]
 HEADER = {
@@ -137,15 +136,6 @@ def test_missing_channels_files_and_ends(tmp_path):
     refuse("no data at", lb.read_data, tmp_path / "none.fits", ten)
     path.write_bytes(path.read_bytes()[:4000])
     refuse("cut short", lb.read_data, path, ten)
-
-
-def test_what_info_says_of_luseepys_files(test_data):
-    folder = test_data / "luseepy"
-    text = describe(folder / "waterfall_exact_engine.fits")
-    assert "channels at 5, 10, 15, 20, 25, 30, 35, 40, 45, 50 MHz" in text
-    assert "16 products (00R 01R" in text and "x 328 times, 0 samples missing" in text
-    text = describe(folder / "synthetic_monopole_beam.fits")
-    assert "1 to 50 MHz (50 frequencies)" in text and "91 angles" in text
 
 
 @pytest.mark.long

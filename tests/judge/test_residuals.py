@@ -417,9 +417,9 @@ NOISES = {
     "blocks and templates": ("noise.radiometer.form=exact", "noise.beam={shift_mhz: 4}"),
     "coupled": ("noise.gain={sigma: 0.01, visibilities: model}",),
 }
-WITHIN_TIMES = [kind for kind in NOISES if kind != "coupled"]
-TWO = ["diagonal", "blocks and templates"]
+TWO, ALONE = ("diagonal", "blocks and templates"), ("blocks", "templates")
 SIZES = {"few": FEW, "gaps": FEW, "many": MANY, "dense": MANY}
+TOGETHER = ("few", "many", "gaps")
 SIZES |= {"often": (*FEW, "observation.step_s=2400")}
 
 
@@ -492,9 +492,11 @@ MANY_TIMES = {"SHARED": 0, "DAYS": 1}
 @pytest.mark.parametrize(
     ("size", "kind", "limits"),
     [
-        *(("few", kind, limits) for kind in WITHIN_TIMES for limits in LIMITS),
-        *((size, kind, limits) for size in ("many", "gaps") for kind in TWO for limits in LIMITS),
-        *(("often", kind, MANY_TIMES) for kind in WITHIN_TIMES),
+        *((size, kind, limits) for size in TOGETHER for kind in TWO for limits in LIMITS),
+        *(("often", kind, MANY_TIMES) for kind in TWO),
+        # what is in "blocks and templates" alone
+        *(pytest.param("few", kind, limits, marks=LONG) for kind in ALONE for limits in LIMITS),
+        *(pytest.param("often", kind, MANY_TIMES, marks=LONG) for kind in ALONE),
         *(("dense", kind, {"QUICK": 0}) for kind in TWO),
         *(pytest.param("few", "coupled", limits, marks=[LONG, ESSENTIAL]) for limits in LIMITS),
     ],

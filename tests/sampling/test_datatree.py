@@ -260,6 +260,7 @@ def test_data_of_a_program_without_the_sky_are_replicated_with_its_skies(collaps
 def test_a_written_tree_comes_back(which, request, tmp_path):
     tree, _ = request.getfixturevalue(which)
     tree.to_netcdf(tmp_path / "samples.nc", engine="h5netcdf")
+    require_conventions(tmp_path / "samples.nc")
     found = read_datatree(tmp_path / "samples.nc")
     xr.testing.assert_identical(found, tree)
     for path, group in tree.subtree_with_keys:
@@ -281,11 +282,6 @@ def test_arviz_reads_the_tree(drawn):
     assert (np.abs(table["ess_bulk"] / skies[..., 0].size - 1) < 0.3).all()
     # 2000 independent draws of 4 chains: R-hat - 1 of order 1 / 500
     assert (table["r_hat"] < 1.01).all()
-
-
-def test_files_follow_the_conventions(drawn, tmp_path):
-    drawn[0].to_netcdf(tmp_path / "samples.nc", engine="h5netcdf")
-    require_conventions(tmp_path / "samples.nc")
 
 
 def test_files_that_are_no_samples_are_refused(setting, drawn, tmp_path):
