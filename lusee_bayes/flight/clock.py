@@ -17,45 +17,56 @@ seconds of ``time_scale`` in a second of theirs.
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from astropy.time import Time
+from pydantic import Field
 
 from lusee_bayes.core.arrays import Times
-from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.core.layouts import Attribute, Layout
-from lusee_bayes.core.reading import naming, read_json
-from lusee_bayes.instrument.times import scale_of, unannounced_leap_seconds, utc_of
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.reading import naming, read_model
+from lusee_bayes.core.section import Section
+from lusee_bayes.instrument.times import (
+    scale_of,
+    time_of_text,
+    unannounced_leap_seconds,
+    utc_of,
+)
 
 DAY_S, MJD_ZERO = 86400.0, 2400000.5
 # two clocks that differ by less are one
 SAME_S = 1e-3
 # a clock that is off by more is none
 MOST_OFF = 1e-2
-FORMAT = Layout(
-    "a clock reference",
-    attributes={
-        "format_version": Attribute("integer", low=1.0, high=1.0),
-        "clock_reference_isot": Attribute("text"),
-        "time_scale": Attribute("text"),
-        "source": Attribute("text"),
-        "rate": Attribute(low=1.0 - MOST_OFF, high=1.0 + MOST_OFF, optional=True),
-        "stated_utc_isot": Attribute("text", optional=True),
-    },
-)
-KEYS = {*FORMAT.attributes, "reference_event", "clocks", "assumed", "source_sha256"}
-# the clocks of luseepy's records, and what each has
-CLOCKS = ("spectrometer", "dcb")
-ANCHOR = Layout(
-    "what the clock showed at clock_reference_isot",
-    attributes={"clock_reference_raw_seconds": Attribute()},
-)
-ISO = re.compile(r"\d{4}-\d{2}-\d{2}T\d{2}:\d{2}:\d{2}(\.\d+)?")
+
+
+class _Reading(Section):
+    clock_reference_raw_seconds: float
+
+
+class _Clocks(Section):
+    """What the clocks of luseepy's records showed at ``clock_reference_isot``."""
+
+    spectrometer: _Reading
+    dcb: _Reading | None = None
+
+
+class _ClockFile(Section):
+    """What a clock file holds."""
+
+    format_version: Literal[1]
+    clock_reference_isot: str
+    time_scale: str
+    source: str
+    rate: Annotated[float, Field(ge=1.0 - MOST_OFF, le=1.0 + MOST_OFF)] = 1.0
+    stated_utc_isot: str | None = None
+    clocks: _Clocks | None = None
+    reference_event: Any = None
+    assumed: Any = None
+    source_sha256: Any = None
 
 
 @dataclass(frozen=True)
@@ -139,59 +150,20 @@ def read_clock(path: str | Path) -> Clock:
         that is none.
     """
     hint = "write luseepy's clock reference (format_version 1), see docs/howto/first_light.md"
-    found = read_json(path, FORMAT, hint)
-    _require_known(path, found, KEYS)
-    with naming(path):
-        scale = scale_of("time_scale", found["time_scale"])
-        time = _time(found, "clock_reference_isot", scale)
-        stated = _time(found, "stated_utc_isot", "utc") if "stated_utc_isot" in found else None
-    if (stated is None) == ("clocks" not in found):
+    found = read_model(path, _ClockFile, "a clock reference", hint)
+    if (found.stated_utc_isot is None) == (found.clocks is None):
         raise InputError(
             f"{path} needs either clocks, for sessions whose UTC is not known, or stated_utc_isot, "
             "to correct the UTC that sessions state; see docs/howto/first_light.md"
         )
-    raw_s = 0.0 if stated is not None else _spectrometer_s(path, found["clocks"])
-    rate = float(found.get("rate", 1.0))
-    return Clock(str(path), float(time.jd1), float(time.jd2), scale, raw_s, rate, stated)
-
-
-def _time(found: dict[str, Any], key: str, scale: str) -> Time:
-    text = found[key]
-    try:
-        if not ISO.fullmatch(text):
-            raise ValueError("write it as 2027-01-15T00:00:00")
-        with unannounced_leap_seconds():
-            return Time(text, format="isot", scale=scale)
-    except ValueError as error:
-        raise InputError(f"{key} '{text}' is no date: {error}") from error
-
-
-def _spectrometer_s(path: str | Path, clocks: Any) -> float:
-    """What the spectrometer's clock showed at the reference."""
-    if not isinstance(clocks, dict) or "spectrometer" not in clocks:
-        raise InputError(
-            f"{path} has no clocks.spectrometer with a clock_reference_raw_seconds: what the "
-            "spectrometer's clock showed at clock_reference_isot"
-        )
-    _require_known(f"{path}: clocks", clocks, CLOCKS)
-    raw_s = {}
-    for name, one in clocks.items():
-        where = f"{path}: clocks.{name}"
-        if not isinstance(one, dict):
-            raise InputError(f"{where} is {one!r}, expected an object: {ANCHOR.what}")
-        _require_known(where, one, ANCHOR.attributes)
-        raw_s[name] = ANCHOR.checked(where, {}, one).values["clock_reference_raw_seconds"]
-    return raw_s["spectrometer"]
-
-
-def _require_known(where: str | Path, found: dict[str, Any], known: Iterable[str]) -> None:
-    for key in found:
-        if key in known:
-            continue
-        hint = nearest(key, known)
-        if key in KEYS:
-            hint = f"write {key} beside clocks, not in it"
-        raise InputError(f"{where}: unknown entry '{key}'; {hint}")
+    with naming(path):
+        scale = scale_of("time_scale", found.time_scale)
+        time = time_of_text("clock_reference_isot", found.clock_reference_isot, scale)
+        if found.clocks is None:
+            raw_s, stated = 0.0, time_of_text("stated_utc_isot", found.stated_utc_isot)
+        else:
+            raw_s, stated = found.clocks.spectrometer.clock_reference_raw_seconds, None
+    return Clock(str(path), float(time.jd1), float(time.jd2), scale, raw_s, found.rate, stated)
 
 
 def clock_of(path: str | Path, said: Clock | None, given: Clock | None, raw_s: Times) -> Clock:

@@ -14,12 +14,13 @@ from jaxtyping import Bool, Float, Float32, Int, Shaped, UInt8
 from lusee_bayes.core import formats
 from lusee_bayes.core.checks import Described, counted, require_shape
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.lazy import xarray
 from lusee_bayes.core.reading import naming
 from lusee_bayes.core.trees import from_tree, opened_tree, quantity, write_tree
 from lusee_bayes.flight.gain_model import COUNTS, LEAD, LETTERS, N_COMPONENTS, PLACES, Curves
 from lusee_bayes.flight.session import AUTOS, FIRST_PORT, N_PRODUCTS, NO_LEVEL, PORTS, SECOND_PORT
 from lusee_bayes.instrument.averaging import binned
-from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ
+from lusee_bayes.instrument.beams.fields import place_of
 from lusee_bayes.instrument.observation import Observation, runs_of
 from lusee_bayes.instrument.products import DataLayout, labels
 from lusee_bayes.instrument.times import Windows, utc_of
@@ -177,7 +178,8 @@ class Reduced(Described):
     @cached_property
     def curvature(self) -> Float[np.ndarray, " bands"]:
         """The mean of :attr:`bend` over bins, which noise does not have, of the worst port."""
-        return np.array([_mean_abs(one) for one in self.bend])
+        means = xarray.DataArray(self.bend, dims=("band", "port", "bin")).mean("bin")
+        return np.abs(means).max("port").values
 
     def noise(self, band: int) -> Float[np.ndarray, "ports bins"]:
         """Return the standard deviations of the autos, by the radiometer equation."""
@@ -217,15 +219,8 @@ class Reduced(Described):
 
     def band(self, frequency_mhz: float) -> int:
         """Return the number of the band at a frequency. InputError if there is none."""
-        nearest = int(np.argmin(np.abs(self.frequencies_mhz - frequency_mhz)))
-        if abs(self.frequencies_mhz[nearest] - frequency_mhz) > SAME_FREQUENCY_MHZ:
-            known = ", ".join(f"{f:.9g}" for f in self.frequencies_mhz)
-            raise InputError(
-                f"the spectra were reduced to bands at {known} MHz, not at {frequency_mhz:.15g}; "
-                f"use --set frequency_mhz={self.frequencies_mhz[nearest]:.15g}, or reduce them "
-                "again"
-            )
-        return nearest
+        what = "the reduction, which can be repeated, has no band"
+        return place_of(what, self.frequencies_mhz, frequency_mhz)
 
     def bins_at(self, band: int) -> Left:
         """Return the bins of which a band has something left: the times of :meth:`at`."""
@@ -361,13 +356,7 @@ def _percent(shares: Mapping[str, float]) -> str:
 
 
 def _medians(found: Float[np.ndarray, "bands parts"]) -> Float[np.ndarray, " bands"]:
-    clean = [one[np.isfinite(one)] for one in found]
-    return np.array([float(np.median(one)) if one.size else np.nan for one in clean])
-
-
-def _mean_abs(bend: Float[np.ndarray, "ports bins"]) -> float:
-    known = np.isfinite(bend).any(axis=1)
-    return float(np.abs(np.nanmean(bend[known], axis=1)).max()) if known.any() else np.nan
+    return xarray.DataArray(found, dims=("band", "part")).median("part").values
 
 
 def _one_run_an_angle(observation: Observation) -> Observation:

@@ -6,7 +6,7 @@ hold, such as waveforms and housekeeping packets, there is nothing.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -16,6 +16,7 @@ from typing import Any
 import h5py
 import numpy as np
 from astropy.io import fits
+from astropy.table import Column, Table
 from jaxtyping import Float, Float32, Int
 
 from lusee_bayes.core.arrays import Rows
@@ -120,13 +121,6 @@ def cache_for(chunks: tuple[int, ...] | None) -> dict[str, Any]:
     spectra = chunks[0] * N_PRODUCTS * (N_CHANNELS + chunks[2]) * 4
     size = min(int(1.25 * spectra), LARGEST_CACHE)
     return {"rdcc_nbytes": max(size, 1 << 20), "rdcc_nslots": PLACES, "rdcc_w0": 1.0}
-
-
-def guessed_chunks(n_rows: int) -> tuple[int, ...]:
-    """Return the chunks that h5py chooses for the spectra of a session."""
-    with h5py.File("guess", "w", driver="core", backing_store=False) as file:
-        cube = file.create_dataset("data", (n_rows, N_PRODUCTS, N_CHANNELS), "f4", chunks=True)
-        return cube.chunks
 
 
 def whole_spectra(
@@ -242,27 +236,20 @@ def write_session(
     return path
 
 
-# files of FITS are made of records of this length
-RECORD = 2880
-# letters of FITS for types of columns
-FORMATS = {"i": "K", "f": "D"}
-
-
 def _write_session_fits(path: Path, rows: SessionRows, blocks: Iterable[Counts]) -> None:
     _fits_header(rows).writeto(path)
-    with path.open("ab") as file:
-        file.write(_cube_header(rows.n_rows).tostring().encode("ascii"))
-        size = 0
+    with fits.StreamingHDU(str(path), _cube_header(rows.n_rows)) as cube:
         for _, counts in whole_spectra(path, blocks, rows.n_rows):
-            size += file.write(counts.astype(">f4").tobytes())
-        file.write(b"\0" * (-size % RECORD))
+            cube.write(counts)
     with fits.open(path, mode="append") as hdus:
         number = np.arange(rows.n_rows)
-        times = {"RAW_TIME": rows.raw_s, "MJD_TIME": rows.mjd()}
+        raw_s, mjd = Column(rows.raw_s, unit="s"), Column(rows.mjd(), unit="d")
+        times = {"RAW_TIME": raw_s, "MJD_TIME": mjd}
         identity = {"UNIQUE_ID": number, **times, "ORIG_IDX": number}
-        hdus.append(_fits_table("SPECTRA_TIMES", identity))
-        hdus.append(_fits_table("SPECTRA_META", rows.metadata()))
-        hdus.append(_fits_table("SPEC_INTERP", {**times, **rows.telemetry}))
+        telemetry = {**times, **rows.telemetry}
+        tables = {"SPECTRA_TIMES": identity, "SPECTRA_META": rows.metadata()}
+        for name, columns in (tables | {"SPEC_INTERP": telemetry}).items():
+            hdus.append(fits.BinTableHDU(Table(columns), name=name))
 
 
 def _fits_header(rows: SessionRows) -> fits.HDUList:
@@ -280,23 +267,12 @@ def _fits_header(rows: SessionRows) -> fits.HDUList:
 
 
 def _cube_header(n_rows: int) -> fits.Header:
-    header = fits.Header()
-    header.update({"XTENSION": "IMAGE", "BITPIX": -32, "NAXIS": 3})
-    header.update({"NAXIS1": N_CHANNELS, "NAXIS2": N_PRODUCTS, "NAXIS3": n_rows})
-    header.update({"PCOUNT": 0, "GCOUNT": 1, "EXTNAME": "SPECTRA"})
+    shape = n_rows, N_PRODUCTS, N_CHANNELS
+    header = fits.ImageHDU(np.broadcast_to(np.float32(0.0), shape), name="SPECTRA").header
     header.update({"NTIME": n_rows, "NPROD": N_PRODUCTS, "NCHAN": N_CHANNELS})
     header.update({"BUNIT": "SDU", "BITSREST": True, "BITSREF": 31, "NORMVER": 1})
     header["HIERARCH REPRESENTATION"] = "gain_model_input_sdu"
     return header
-
-
-def _fits_table(name: str, columns: Mapping[str, np.ndarray]) -> fits.BinTableHDU:
-    units = {"RAW_TIME": "s", "MJD_TIME": "d"}
-    made = []
-    for key, values in columns.items():
-        form = f"{values[0].size}{FORMATS[values.dtype.kind]}"
-        made.append(fits.Column(key, form, unit=units.get(key), array=values))
-    return fits.BinTableHDU.from_columns(made, name=name)
 
 
 # as luseepy has it
@@ -313,11 +289,11 @@ CUBE = {
 
 
 def _write_session_hdf5(path: Path, rows: SessionRows, blocks: Iterable[Counts]) -> None:
-    chunks = guessed_chunks(rows.n_rows)
-    with h5py.File(path, "w", **cache_for(chunks)) as file:
+    with h5py.File(path, "w") as file:
         _write_all_but_spectra(file, rows)
-        shape = (rows.n_rows, N_PRODUCTS, N_CHANNELS)
-        cube = file.create_dataset("spectra/data", shape, "f4", chunks=chunks, **PACKED)
+        one = (1, N_PRODUCTS, N_CHANNELS)
+        shape = (rows.n_rows, *one[1:])
+        cube = file.create_dataset("spectra/data", shape, "f4", chunks=one, **PACKED)
         cube.attrs.update(CUBE)
         for first, counts in whole_spectra(path, blocks, rows.n_rows):
             cube[first : first + len(counts)] = counts

@@ -169,7 +169,7 @@ class Observation(checks.Described):
         InputError
             For a bad date, step or length, and for a run without samples.
         """
-        cuts, t0 = cut_runs(runs, step_s), times.utc_from_text("start", start)
+        cuts, t0 = cut_runs(runs, step_s), times.time_of_text("start", start)
         place = {"lon_deg": lon_deg, "lat_deg": lat_deg, "step_s": step_s, "fixed_axis": fixed_axis}
         place["turntable_deg"] = tuple(run.turntable_deg for run in runs)
         return cls._of_cuts(cuts, t0, np.arange(len(runs)), window, **place)

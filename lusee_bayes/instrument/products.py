@@ -29,6 +29,7 @@ from jaxtyping import Bool, Complex, Float, Int, Shaped
 from lusee_bayes.core.arrays import Array, Grid, GridFlags, as_complex, namespace, placed
 from lusee_bayes.core.checks import Described, is_traced
 from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.lazy import pandas
 
 N_ANTENNAS = 4
 Products = Float[Array, "products *rest"]
@@ -394,10 +395,9 @@ def without_gaps(visibilities: Grid, layout: DataLayout) -> Grid:
     if not absent.any():
         return visibilities
     products = all_products(antennas_of(layout.n_products))
-    times, measured = np.arange(layout.n_times), present.any(1)
-    for gaps, row in zip(absent, values, strict=True):
-        known = ~gaps
-        row[gaps] = np.interp(times[gaps], times[known], row[known]) if known.any() else 0.0
+    known = pandas.DataFrame(np.where(absent, np.nan, values).T)
+    filled = known.interpolate(limit_direction="both").fillna(0.0).to_numpy().T
+    values, measured = np.where(absent, filled, values), present.any(1)
     autos = np.array([p.i == p.j for p in products])
     unused = np.flatnonzero(autos & absent.all(1))
     for auto in (products[k] for k in unused):

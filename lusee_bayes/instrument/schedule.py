@@ -99,12 +99,12 @@ class Interval:
     @cached_property
     def start_time(self) -> Time:
         """The start, in UTC."""
-        return times.utc_from_text("start", self.start)
+        return times.time_of_text("start", self.start)
 
     @cached_property
     def length_s(self) -> float:
         """Length in seconds, the time without integration among them."""
-        return float(times.seconds_from(self.start_time, times.utc_from_text("end", self.end)))
+        return float(times.seconds_from(self.start_time, times.time_of_text("end", self.end)))
 
     def n_samples(self, step_s: float) -> int:
         """Count the samples of a step, by day and night; the last one may be shorter."""

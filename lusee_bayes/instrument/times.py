@@ -64,8 +64,8 @@ def later(times: Time, seconds: Any) -> Time:
         return times + seconds * u.s
 
 
-def utc_from_text(name: str, text: str) -> Time:
-    """Return the time of an ISO date in UTC.
+def time_of_text(name: str, text: str, scale: str = "utc") -> Time:
+    """Return the time of an ISO date in a scale.
 
     Raises
     ------
@@ -75,7 +75,7 @@ def utc_from_text(name: str, text: str) -> Time:
     try:
         with unannounced_leap_seconds():
             # astropy knows no Z, which ISO has for UTC
-            time = Time(text.removesuffix("Z"), scale="utc")
+            time = Time(text.removesuffix("Z"), scale=scale)
     except (ValueError, TypeError) as error:
         raise InputError(
             f"{name} '{text}' is not a date; write it as 2027-01-15T00:00:00"
@@ -169,7 +169,7 @@ def utc_times(times: Any) -> Time:
             found = Time(texts, scale="utc")
     except ValueError:
         # dates of several forms, or something else that the message names
-        return Time([utc_from_text(f"time {k}", text) for k, text in enumerate(texts)])
+        return Time([time_of_text(f"time {k}", text) for k, text in enumerate(texts)])
     require_ephemeris(found.jd)
     return found
 

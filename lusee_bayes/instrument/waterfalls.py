@@ -46,7 +46,7 @@ from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.core.version import __version__
 from lusee_bayes.instrument import products, times
 from lusee_bayes.instrument.beams import source
-from lusee_bayes.instrument.beams.fields import SAME_FREQUENCY_MHZ, Interpolation
+from lusee_bayes.instrument.beams.fields import Interpolation, place_of
 from lusee_bayes.instrument.observation import Observation, body_direction
 from lusee_bayes.instrument.visibilities import Visibilities
 
@@ -115,15 +115,7 @@ class Waterfall(Described):
         InputError
             If the file has none there.
         """
-        known = self.frequencies_mhz
-        nearest = int(np.argmin(np.abs(known - frequency_mhz)))
-        if abs(known[nearest] - frequency_mhz) > SAME_FREQUENCY_MHZ:
-            raise InputError(
-                f"{self.path} has no channel at {frequency_mhz:.15g} MHz (it has "
-                f"{', '.join(f'{f:.9g}' for f in known)}); use --set frequency_mhz="
-                f"{known[nearest]:.15g}"
-            )
-        return nearest
+        return place_of(f"{self.path} has no channel", self.frequencies_mhz, frequency_mhz)
 
     def at(self, frequency_mhz: float, n_ports: int = products.N_ANTENNAS) -> Visibilities:
         """Return one channel, without the samples that are missing or not finite.
@@ -186,7 +178,7 @@ def start_of(text: str) -> Time:
         kind, year = named[1], int(named[2])
         year += 2000 if year < 100 else 0
         begins = f"{year:04d}-01-01T01:00" if kind == "CY" else f"{year - 1:04d}-10-01"
-        return times.utc_from_text("LUNAR_DAY", begins)
+        return times.time_of_text("LUNAR_DAY", begins)
     if LUNAR_DAY.fullmatch(word):
         return _noon(int(word))
     first, to, _ = word.partition(" to ")
@@ -195,13 +187,13 @@ def start_of(text: str) -> Time:
             f"LUNAR_DAY '{text}' is not a date to a date (2027-01-15 00:00:00 to 2027-02-01), a "
             "year (CY2027, FY27) or the number of a lunar day (2700)"
         )
-    return times.utc_from_text("LUNAR_DAY", first)
+    return times.time_of_text("LUNAR_DAY", first)
 
 
 def _noon(number: int) -> Time:
     year, place = 2000 + number // 100, number % 100
     years = (f"{year}-01-01", f"{year + 1}-01-01")
-    new_year, next_year = (times.utc_from_text("LUNAR_DAY", first).jd for first in years)
+    new_year, next_year = (times.time_of_text("LUNAR_DAY", first).jd for first in years)
     days = np.arange(new_year, next_year + DAYS_AFTER_NEW_YEAR)
     height = _sun_height(days)
     highest = (height[1:-1] > height[:-2]) & (height[1:-1] > height[2:])

@@ -22,9 +22,6 @@ from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.linalg import inverse_from_cholesky, solve_lower
 from lusee_bayes.sky.prior import Prior
 
-# directions whose standard deviations are computed at once
-CHUNK = 2048
-
 # largest relative error of standard deviations that is accepted
 PRECISION = 1e-3
 
@@ -100,11 +97,7 @@ class Posterior(Described, eqx.Module):
             In K, if the directions have no unit.
         """
         xp = namespace(self)
-        parts = [
-            _std_of(self, xp.asarray(directions[i : i + CHUNK]))
-            for i in range(0, directions.shape[0], CHUNK)
-        ]
-        return xp.concatenate(parts)
+        return xp.sqrt(((xp.asarray(directions) @ self.root()) ** 2).sum(1))
 
     def covariance(self) -> Float[Array, "unknowns unknowns"]:
         """Compute C as a matrix.
@@ -273,20 +266,6 @@ def _std(posterior: Posterior) -> tuple[Float[Array, " unknowns"], Float[Array, 
         rows = xp.concatenate([rows, eye - basis @ basis.T])
     rounding = _rounding(posterior, (rows**2).sum(0))
     return xp.sqrt((posterior.prior.colour(rows) ** 2).sum(0)), rounding
-
-
-@compiled
-def _std_of(posterior: Posterior, directions: Float[Array, "n unknowns"]) -> Float[Array, " n"]:
-    """Standard deviations of given directions of m."""
-    xp = namespace(posterior)
-    white = posterior.prior.colour_columns(directions)
-    inside = white if posterior.basis is None else white @ posterior.basis
-    half = solve_lower(posterior.lower, inside.T, transpose=False)
-    variance = (half**2).sum(0)
-    if posterior.basis is not None:
-        outside = white - inside @ posterior.basis.T
-        variance = variance + (outside**2).sum(1)
-    return xp.sqrt(variance)
 
 
 @compiled

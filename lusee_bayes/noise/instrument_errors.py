@@ -68,12 +68,10 @@ def template_noise(
     """
     checks.require_array("the templates", templates, (layout.size, None))
     checks.require_float64("the templates' prior", prior)
-    n = templates.shape[1]
     if prior.ndim == 1:
-        checks.require_shape("the templates' prior", prior, (n,))
         checks.require_positive("the templates' prior variance", prior)
-        return LowRankCovariance(templates * jnp.sqrt(prior)[None], "the templates")
-    checks.require_array("the templates' prior", prior, (n, n))
+        prior = jnp.diag(prior)
+    checks.require_array("the templates' prior", prior, (templates.shape[1],) * 2)
     checks.require_symmetric("the templates' prior", prior)
     root = jnp.tril(checked_cholesky("the templates' prior", prior))
     return LowRankCovariance(templates @ root, "the templates")

@@ -23,7 +23,7 @@ from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
-from scipy import special
+from scipy import special, stats
 
 from lusee_bayes.core.arrays import Ells, ModesMatrix
 from lusee_bayes.core.harmonics import per_mode, sum_over_m
@@ -97,15 +97,11 @@ class Hyperprior:
 
     def _log_densities(self, parameters: Parameters) -> Parameters:
         z, t = self._parts(parameters)
-        half = FREEDOM / 2.0
-        theta = -(half + 0.5) * np.log1p(z**2 / FREEDOM) - np.log(self.width)
-        constant = (
-            special.gammaln(half + 0.5) - special.gammaln(half) - 0.5 * np.log(FREEDOM * np.pi)
-        )
+        theta = stats.t.logpdf(z, FREEDOM) - np.log(self.width)
         shape = self.tail / self.steepness
-        cells = -self.tail * t - shape * np.exp(-self.steepness * t)
-        of_cell = np.log(self.steepness) + shape * np.log(shape) - special.gammaln(shape)
-        return np.concatenate([theta + constant, cells + of_cell])
+        log_power = np.log(shape) - self.steepness * t
+        cells = stats.loggamma.logpdf(log_power, shape) + np.log(self.steepness)
+        return np.concatenate([theta, cells])
 
     def gradient(self, parameters: Parameters) -> Parameters:
         """Compute its derivative."""

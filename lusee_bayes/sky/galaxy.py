@@ -36,6 +36,7 @@ from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float
+from scipy.constants import Boltzmann, speed_of_light
 
 from lusee_bayes.core.arrays import Vector
 from lusee_bayes.core.errors import InputError
@@ -189,8 +190,6 @@ LANDMARKS = {
 }
 
 
-BOLTZMANN = 1.380649e-23  # J/K
-LIGHT_SPEED = 299792458.0  # m/s
 JANSKY = 1e-26  # W / m^2 / Hz
 
 # Optical depth of free-free absorption is close to nu^-2.1 (Mezger & Henderson 1967, ApJ 147, 471).
@@ -301,7 +300,7 @@ def kelvin_steradian(
         In K sr.
     """
     nu = np.asarray(frequency_mhz, dtype=np.float64) * 1e6
-    return flux_jy * JANSKY * (LIGHT_SPEED / nu) ** 2 / (2.0 * BOLTZMANN)
+    return flux_jy * JANSKY * (speed_of_light / nu) ** 2 / (2.0 * Boltzmann)
 
 
 def galactic_unit_vector(ra_deg: float, dec_deg: float) -> Float[np.ndarray, "3"]:

@@ -27,7 +27,7 @@ from lusee_bayes.core.checks import Described, extent, is_traced, require_array,
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import LARGEST_LMAX, n_modes, per_mode
 from lusee_bayes.core.layouts import Layout, Variable
-from lusee_bayes.core.reading import read_text, require_file
+from lusee_bayes.core.reading import read_text, reading, require_file
 from lusee_bayes.sky.sky_source import read_sky_file
 
 # ell + 1 at which the amplitude is that of the spectrum
@@ -480,24 +480,16 @@ def read_spectrum(path: str | Path, lmax: int) -> Float[np.ndarray, " ells"]:
     """
     require_whole("lmax", lmax, 0, LARGEST_LMAX)
     text = read_text(path, SPECTRUM.what, "check prior.spectrum_file").splitlines()
-    split = [line.split("#")[0].replace(",", " ").split() for line in text]
-    lines = [(number, words) for number, words in enumerate(split, start=1) if words]
-    if lines and lines[0][1][0].isalpha():  # names of the columns
+    lines = [line.split("#")[0].replace(",", " ").strip() for line in text]
+    lines = list(filter(None, lines))
+    if lines and lines[0][0].isalpha():  # names of the columns
         del lines[0]
     if not lines:
         raise InputError(f"{path} holds no numbers; expected {SPECTRUM.what}")
-    rows = []
-    for number, words in lines:
-        try:
-            ell, power = map(float, words)
-            whole = ell.is_integer()
-        except ValueError:
-            whole = False
-        if not whole:
-            line = text[number - 1].strip()
-            raise InputError(f"{path}: line {number} is '{line}', expected ell and C_ell in K^2")
-        rows.append((ell, power))
-    table = np.array(rows)
+    with reading(path, SPECTRUM.what):
+        table = np.loadtxt(lines, ndmin=2)
+        if table.shape[1] != 2 or (table[:, 0] % 1.0).any():
+            raise ValueError("expected ell and C_ell in K^2 in every line")
     columns = {"ell": table[:, 0].astype(np.int64), "C_ell": table[:, 1]}
     found = SPECTRUM.checked(path, columns, {}).arrays
     there = set(found["ell"].tolist())

@@ -382,19 +382,11 @@ def write_alms(path: str | Path, modes: Float[Array, " modes"], header: dict[str
     Path
         The file.
     """
-    alm = harmonics.to_healpy(modes)
-    lmax = harmonics.lmax_of(np.shape(modes)[-1])
-    ell, m = healpy.Alm.getlm(lmax)
-    columns = [
-        fits.Column("index", "J", array=ell**2 + ell + m + 1),
-        fits.Column("real", "D", "K", array=alm.real),
-        fits.Column("imag", "D", "K", array=alm.imag),
-    ]
-    table = fits.BinTableHDU.from_columns(columns, name="ALM")
-    ends = {"MAX-LPOL": (lmax, "highest ell"), "MAX-MPOL": (lmax, "highest m")}
-    table.header.update(ends | header)
+    units = {"TUNIT2": "K", "TUNIT3": "K", "EXTNAME": "ALM"}
     with replacing(path) as partial:
-        fits.HDUList([fits.PrimaryHDU(), table]).writeto(partial)
+        healpy.write_alm(partial, harmonics.to_healpy(modes), out_dtype=np.float64)
+        with fits.open(partial, mode="update") as hdus:
+            hdus[1].header.update(units | header)
     return user_path(path)
 
 

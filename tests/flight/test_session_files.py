@@ -388,7 +388,7 @@ def test_a_clock_file_that_cannot_be_is_refused(tmp_path):
     for changes in BAD_CLOCKS:
         assert_refused(lambda changes=changes: read_clock(clock_file(tmp_path, **changes)))
     clocks = {"spectrometer": {"clock_reference_raw_seconds": 100.0, "rate": 1.000001}}
-    refuse("'rate'; write rate beside clocks", read_clock, clock_file(tmp_path, clocks=clocks))
+    refuse("clocks.spectrometer.rate", read_clock, clock_file(tmp_path, clocks=clocks))
     path = tmp_path / "clock.json"
     path.write_text("{")
     assert_refused(lambda: read_clock(path))

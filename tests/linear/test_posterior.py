@@ -27,7 +27,6 @@ from lusee_bayes.judge.measures import (
     prior_fraction_per_ell,
     signal_to_noise,
 )
-from lusee_bayes.linear import posterior as posterior_module
 from lusee_bayes.linear.linear_gaussian import FromInformation, InData, InMap
 from lusee_bayes.noise.covariance import DenseCovariance
 
@@ -71,14 +70,6 @@ def test_what_it_says_of_itself(n_data, form):
     directions = np.random.default_rng(0).normal(size=(23, 16))
     variance = np.einsum("ni,ij,nj->n", directions, expected.covariance, directions)
     np.testing.assert_allclose(post.std_of(jnp.asarray(directions)), np.sqrt(variance), rtol=TOL)
-
-
-def test_std_of_does_not_depend_on_the_chunks(monkeypatch):
-    post, _ = conditioned(30, InMap)
-    directions = jnp.asarray(np.random.default_rng(0).normal(size=(23, 16)))
-    whole = np.asarray(post.std_of(directions))
-    monkeypatch.setattr(posterior_module, "CHUNK", 5)  # 4 chunks of 5 and one of 3
-    np.testing.assert_allclose(post.std_of(directions), whole, rtol=1e-14)
 
 
 @cases

@@ -174,6 +174,18 @@ Interpolation = Literal["linear", "spline"]
 SAME_FREQUENCY_MHZ = 1e-6
 
 
+def place_of(what: str, known_mhz: Frequencies, frequency_mhz: float) -> int:
+    """Return the place of a frequency among known ones. InputError if it is not among them."""
+    nearest = int(np.argmin(np.abs(known_mhz - frequency_mhz)))
+    if abs(known_mhz[nearest] - frequency_mhz) > SAME_FREQUENCY_MHZ:
+        raise InputError(
+            f"{what} at {frequency_mhz:.15g} MHz (it has "
+            f"{', '.join(f'{f:.9g}' for f in known_mhz)}); use --set frequency_mhz="
+            f"{known_mhz[nearest]:.15g}"
+        )
+    return nearest
+
+
 def neighbours(path: str, known_mhz: Frequencies, frequency_mhz: float) -> list[tuple[int, float]]:
     """Return the frequencies of a file that linear interpolation takes, and their weights.
 
