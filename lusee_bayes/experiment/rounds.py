@@ -207,13 +207,13 @@ def settled(
         moves = found.moves_from(before) if around.tempered == 1.0 else np.inf
     if at_rest or not in_rounds:
         return found
-    remedies = [cls.remedy for cls in first_order(setup)]
-    remedies += ["noise.gain.visibilities=model"] * rebuilds_gains(setup)
-    unsettled = (
-        f"The map still moves by {moves:.2g} of its standard deviations after {MAX_ROUNDS} rounds "
-        "of rebuilding N around it"
+    keys = [f"{cls.key}.treatment=sampled" for cls in first_order(setup)]
+    advice = f"; use {keys[0]}" if keys else "; use noise.gain.visibilities=model"
+    return replace(
+        found,
+        unsettled=f"The map still moves by {moves:.2g} of its standard deviations after "
+        f"{found.rounds} rounds of rebuilding N around it{advice}.",
     )
-    return replace(found, unsettled=f"{'; use '.join([unsettled, *remedies[:1]])}.")
 
 
 def _approached(setup: Setup, data: Visibilities, around: Around) -> tuple[Inference, _Step]:

@@ -475,9 +475,7 @@ def pointing_report(experiment: Experiment, found: Inference) -> PointingReport:
 
 def _table(experiment: Experiment, found: Inference, sky: Modes) -> pd.DataFrame:
     table = _alone(experiment, found, found.offsets)
-    # where values and sky are those that the data tell, only what is left of the offsets counts
-    moves = found.around.sky is not None
-    about = np.asarray(table["std"] / table["prior_std"] if moves else np.ones(len(table)))
+    about = np.asarray(table["std"] / table["prior_std"])  # what is left of the offsets
     noise = np.sqrt(np.asarray(radiometer(experiment.setup).diagonal()))
     model = base_model(experiment.setup)
     left = found.offsets.systematic.beyond_first_order(model, sky, about)

@@ -70,7 +70,6 @@ class GainTable(Systematic):
     section: ClassVar[type[Section]] = GainTableSection
     words: ClassVar[str] = "the gain table"
     draw: ClassVar[int] = 10
-    remedy: ClassVar[str] = "noise.gain_table.treatment=sampled"
     changes_coupling: ClassVar[bool] = False
     moves: ClassVar[bool] = True
     scales_sky: ClassVar[bool] = True

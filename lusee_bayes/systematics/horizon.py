@@ -154,7 +154,6 @@ class Horizon(ChangedBeams):
     section: ClassVar[type[Section]] = HorizonSection
     words: ClassVar[str] = "the horizon"
     unit: ClassVar[str] = "deg"
-    remedy: ClassVar[str] = "a smaller noise.horizon.std_deg, or its treatment=sampled"
 
     patterns: Float[Array, "products rings azimuths"]
     azimuth: Altitudes

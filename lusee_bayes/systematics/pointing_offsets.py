@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 import equinox as eqx
 import jax
@@ -62,9 +62,6 @@ class PointingSection(Section):
     treatment : {"marginalised", "sampled", "ignored"}
         Their covariance is added to N to first order, they are sampled with the map, or they are
         left out of the model.
-    around : {"posterior", "model"}
-        The sky and the offsets about which data depend on offsets to first order: those that the
-        data tell, found in rounds, or the scenario's sky and none.
     true_values : dict
         What simulated data hold, by name (turntable_0_deg, ... where there are several runs);
         the others are drawn from their priors.
@@ -78,7 +75,6 @@ class PointingSection(Section):
     tilt_east_deg: Offset | None = None
     tilt_north_deg: Offset | None = None
     treatment: Treatment = "marginalised"
-    around: Literal["posterior", "model"] = "posterior"
     true_values: dict[str, Annotated[float, Field(ge=-1e6, le=1e6)]] = Field(default_factory=dict)
 
     _something_is_not_known = requires(
@@ -113,17 +109,13 @@ class PointingOffsets(Systematic):
         The data.
     sources : MovingSources or None
         The point sources; None where the model has none.
-    about_data : bool
-        Whether they are about values and a sky that the data determine.
     """
 
     key: ClassVar[str] = "noise.pointing"
     section: ClassVar[type[Section]] = PointingSection
     words: ClassVar[str] = "clock and pointing"
     draw: ClassVar[int] = 7
-    remedy: ClassVar[str] = (
-        "smaller standard deviations in noise.pointing, or its treatment=sampled"
-    )
+    moves: ClassVar[bool] = True
     has_table: ClassVar[bool] = True
 
     offsets: tuple[str, ...] = eqx.field(static=True)
@@ -134,15 +126,6 @@ class PointingOffsets(Systematic):
     mcmf_from_lander: Float[Array, "3 3"]
     layout: DataLayout
     sources: MovingSources | None = None
-    about_data: bool = eqx.field(static=True, default=True)
-
-    @property
-    def moves(self) -> bool:
-        return self.about_data
-
-    @classmethod
-    def in_rounds(cls, section: PointingSection) -> bool:
-        return section.around == "posterior"
 
     @classmethod
     def octaves(cls, section: PointingSection) -> float:
@@ -153,8 +136,7 @@ class PointingOffsets(Systematic):
         names = offset_names(section.kinds, setup.observation.n_runs)
         stds = {name: float(getattr(section, offset_kind(name))) for name in names}
         values = around.values or {}
-        found = cls.of(setup, stds, {name: values.get(name, 0.0) for name in names})
-        return replace(found, about_data=cls.in_rounds(section))
+        return cls.of(setup, stds, {name: values.get(name, 0.0) for name in names})
 
     @classmethod
     def of(

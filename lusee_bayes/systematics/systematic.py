@@ -200,8 +200,6 @@ class Systematic(eqx.Module):
         Of all unknowns; empty for numbers, and where their names tell it.
     draw : int or None
         What the seed of simulated data is folded with; by default a number of the key.
-    remedy : str
-        What may help where rounds do not settle.
     needs_sky : bool
         Whether the sky has to be sampled together with it, however many unknowns it has.
     changes_coupling : bool
@@ -223,7 +221,6 @@ class Systematic(eqx.Module):
     words: ClassVar[str] = "a systematic"
     unit: ClassVar[str] = ""
     draw: ClassVar[int | None] = None
-    remedy: ClassVar[str] = ""
     needs_sky: ClassVar[bool] = False
     changes_coupling: ClassVar[bool] = True
     first_order: ClassVar[bool] = True

@@ -118,15 +118,6 @@ def test_where_nothing_is_off_the_report_is_silent():
     assert told.chi2.fits and "fit as they are" in " ".join(told.sentences())
 
 
-def test_about_no_offsets_large_ones_are_not_described():
-    """The report does not ask for what the scenario has."""
-    far = "true_values: {turntable_deg: 2.0}"
-    experiment = lb.build(scenario_of(f"noise.pointing={{turntable_deg: 1, around: model, {far}}}"))
-    found = lb.infer(experiment)
-    report = pointing_report(experiment, found)
-    assert "too much: set noise.pointing.treatment=sampled" in report.lines()[0]
-
-
 @pytest.mark.long
 def test_simulation_based_calibration():
     """100 data sets with clock, turntable, lean and sky drawn from their priors."""
