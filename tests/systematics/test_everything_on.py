@@ -89,7 +89,8 @@ def test_all_are_found_together(test_data):
 @pytest.mark.long
 def test_every_unknown_can_be_sampled_beside_all_others(monkeypatch):
     """Programs are traced, not run; what N is about does not matter."""
-    monkeypatch.setattr(rounds, "MAX_ROUNDS", 2)
+    for limit in ("MAX_ROUNDS", "MAX_TEMPERED_ROUNDS"):
+        monkeypatch.setattr(rounds, limit, 2)
     more = {
         "gain_table": {"std": 0.005},
         "horizon": {"altitude_deg": 3.0, "std_deg": 1.0, "harmonics": 1},
