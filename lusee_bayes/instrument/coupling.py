@@ -47,6 +47,7 @@ BeamModes = Float[Array, "*runs products modes"]
 BodyBeams = Float[Array, "runs products functions modes"]
 RowNumbers = Int[np.ndarray, " rows"]
 TimeModes = Float[Array, "products times modes"]
+Values = Mapping[str, float | Float[Array, ""]]
 # times whose data A^T d takes at once: it bounds the memory
 MOST_TIMES = 8192
 
@@ -650,7 +651,7 @@ class Instrument(eqx.Module):
         """
         return self.source.parameter(name).value
 
-    def beams(self, values: Mapping[str, float | Float[Array, ""]] | None = None) -> ProductBeams:
+    def beams(self, values: Values | None = None) -> ProductBeams:
         """Compute the beams of all products.
 
         Parameters
@@ -670,9 +671,7 @@ class Instrument(eqx.Module):
         """
         return self.source.with_values(values or {}).beams(self.frequency_mhz, self.lmax)
 
-    def coupling(
-        self, values: Mapping[str, float | Float[Array, ""]] | None = None
-    ) -> CouplingMatrix:
+    def coupling(self, values: Values | None = None) -> CouplingMatrix:
         """Compute A of antennas with these values.
 
         Parameters

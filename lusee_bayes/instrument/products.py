@@ -207,9 +207,8 @@ def _numbers(data: Any) -> np.ndarray:
 def _columns(products: Any, is_complex: bool, n_antennas: int) -> list[tuple[int, int, str]]:
     """Ports and part of each column; the part is empty for complex numbers."""
     if products is None:
-        ordered = all_products(n_antennas)
-        return [(i, j, "" if is_complex else part) for i, j, part in ordered
-                if part == "R" or not is_complex]  # fmt: skip
+        real = labels(n_antennas)
+        products = dict.fromkeys(label[:2] for label in real) if is_complex else real
     if isinstance(products, str):
         raise InputError(f"products is '{products}'; give a list with the name of each column")
     columns: list[tuple[int, int, str]] = []

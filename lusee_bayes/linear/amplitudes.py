@@ -229,8 +229,6 @@ class Patterns(eqx.Module):
     def without(self) -> Information:
         """Integrate the patterns out: what the data say of d."""
         whole = self.information
-        if not len(self.patterns):
-            return whole
         across = solve_lower(self.lower, self.patterns @ whole.matrix, transpose=False)
         pull = solve_lower(self.lower, (self.patterns @ whole.vector)[:, None], transpose=False)
         return replace(
@@ -265,8 +263,6 @@ class Patterns(eqx.Module):
             Draws of independent unit normals; zero for the mean.
         """
         there = diffuse + self.expected
-        if not len(self.patterns):
-            return there
         pull = self.information.vector - (there - self.information.reference) @ (
             self.information.matrix
         )

@@ -123,15 +123,8 @@ class Information(Described, eqx.Module):
         """
         require_shape("the other reference sky", other.reference, (self.n_modes,))
         here = other.recentred(self.reference)
-        return Information(
-            self.matrix + here.matrix,
-            self.vector + here.vector,
-            self.reference,
-            *(
-                np.asarray(getattr(self, name) + getattr(here, name))
-                for name in ("misfit", "log_det", "n_data")
-            ),
-        )
+        names = ("matrix", "vector", "misfit", "log_det", "n_data")
+        return replace(self, **{n: np.asarray(getattr(self, n) + getattr(here, n)) for n in names})
 
     def raised(self, factor: float) -> Information:
         """The information of the same data under N times a factor.

@@ -40,6 +40,10 @@ from lusee_bayes.instrument.products import DataLayout, ports
 from lusee_bayes.noise.covariance import LowRankCovariance, TimeBandedCovariance
 from lusee_bayes.sky.prior import Prior
 
+OfTimes = Float[Array, "products times"]
+Gains = Float[Array, "antennas times"]
+Hours = Float[np.ndarray, " times"]
+
 
 def template_noise(
     templates: Float[Array, "data templates"],
@@ -110,7 +114,7 @@ class GainDrift(eqx.Module):
         """Return C_g at lags in hours."""
         return self.sigma**2 * jnp.exp(-((lag_h / self.correlation_h) ** 2) / 2.0)
 
-    def width(self, hours: Float[np.ndarray, " times"]) -> int:
+    def width(self, hours: Hours) -> int:
         """Return how many samples apart two times can be and still be correlated."""
         reach = REACH * float(self.correlation_h)
         first = np.searchsorted(hours, np.asarray(hours) - reach)
@@ -118,7 +122,7 @@ class GainDrift(eqx.Module):
 
     def covariance(
         self,
-        visibilities: Float[Array, "products times"],
+        visibilities: OfTimes,
         hours: Float[Array, " times"],
         layout: DataLayout,
         width: int | None = None,
@@ -167,9 +171,7 @@ class GainDrift(eqx.Module):
         auto = jnp.asarray(i == j, dtype=jnp.float64)
         return 1.0 + self.sigma**2 * auto
 
-    def sample(
-        self, key: PRNGKeyArray, hours: Float[np.ndarray, " times"], n_antennas: int = 4
-    ) -> Float[Array, "antennas times"]:
+    def sample(self, key: PRNGKeyArray, hours: Hours, n_antennas: int = 4) -> Gains:
         """Draw g_i(t), (antennas, times), with exactly this covariance."""
         grid = white_grid(hours, float(self.correlation_h))
         white = jax.random.normal(key, (n_antennas, len(grid)), dtype=jnp.float64)
@@ -180,7 +182,7 @@ class GainDrift(eqx.Module):
         white: Float[Array, "antennas grid"],
         hours: Float[Array, " times"],
         grid: Float[Array, " grid"],
-    ) -> Float[Array, "antennas times"]:
+    ) -> Gains:
         """Return the gains that white noise on an even grid of times makes.
 
         The noise is convolved with a Gaussian of width sigma_t / sqrt(2); a sum over a spacing of
@@ -206,7 +208,7 @@ class GainDrift(eqx.Module):
 
 
 def white_grid(
-    hours: Float[np.ndarray, " times"],
+    hours: Hours,
     shortest_h: float,
     longest_h: float | None = None,
     *,
@@ -237,9 +239,7 @@ def white_grid(
     return np.arange(first, end, shortest_h / per_correlation)
 
 
-def with_gains(
-    visibilities: Float[Array, "products times"], gains: Float[Array, "antennas times"]
-) -> Float[Array, "products times"]:
+def with_gains(visibilities: OfTimes, gains: Gains) -> OfTimes:
     """Return (1 + g_i)(1 + g_j) V_ij, exactly, for every product."""
     i, j, _ = ports(gains.shape[0])
     return (1.0 + gains[i]) * (1.0 + gains[j]) * visibilities

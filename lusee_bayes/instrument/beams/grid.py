@@ -34,11 +34,12 @@ from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.lazy import interpolate
 from lusee_bayes.core.reading import read_table
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, Interpolation, Pairs, ProductBeams
-from lusee_bayes.instrument.beams.sampled import read_beam
 from lusee_bayes.instrument.beams.source import BeamSource, Circuit, Parameter, Receiver
 from lusee_bayes.instrument.products import all_products
 
 Nodes = Float[np.ndarray, " nodes"]
+Values = Mapping[str, float | Float[Array, ""]]
+Lines = Float[np.ndarray, "lines products modes"]
 # values of a parameter through which one polynomial goes; through more go cubic splines
 MOST_IN_ONE = 5
 WHAT = "a table of beam files: a column file, and one with two or more values for each parameter"
@@ -67,7 +68,7 @@ class GridBeams(Described, BeamSource):
     path: str
     axes: Mapping[str, Nodes]
     sources: tuple[BeamSource, ...]
-    values: Mapping[str, float | Float[Array, ""]]
+    values: Values
     nominal: Mapping[str, float]
     known: dict[Any, np.ndarray] = field(default_factory=dict)
 
@@ -82,7 +83,7 @@ class GridBeams(Described, BeamSource):
     def parameters(self) -> dict[str, Parameter]:
         return {n: Parameter(self.values[n], xs[0], xs[-1]) for n, xs in self.axes.items()}
 
-    def with_values(self, values: Mapping[str, float | Float[Array, ""]]) -> GridBeams:
+    def with_values(self, values: Values) -> GridBeams:
         for name, value in values.items():
             _, low, high = self.parameter(name)
             if not is_traced(value) and not low <= value <= high:
@@ -92,7 +93,7 @@ class GridBeams(Described, BeamSource):
                 )
         return replace(self, values={**self.values, **values})
 
-    def weights(self, values: Mapping[str, float | Float[Array, ""]]) -> Float[Array, " sources"]:
+    def weights(self, values: Values) -> Float[Array, " sources"]:
         """Return the weights of the sources at these values of all parameters."""
         found = np.ones(1)
         for name, nodes in self.axes.items():
@@ -140,9 +141,7 @@ class GridBeams(Described, BeamSource):
     def behind(self, receiver: Receiver | None) -> GridBeams:
         return replace(self, sources=tuple(s.behind(receiver) for s in self.sources), known={})
 
-    def interpolation_errors(
-        self, frequency_mhz: float, lmax: int
-    ) -> dict[str, Float[np.ndarray, "lines products modes"]]:
+    def interpolation_errors(self, frequency_mhz: float, lmax: int) -> dict[str, Lines]:
         """Return by how much beams are off where they are interpolated without their own file.
 
         For each value of a parameter between its ends: the beams of its other values, interpolated
@@ -198,16 +197,14 @@ def weights_along(nodes: Nodes, value: float | Float[Array, ""]) -> Float[Array,
 
 
 def read_beam_grid(
-    path: str | Path,
-    values: Mapping[str, float] | None = None,
-    read: Callable[[str], BeamSource] = read_beam,
+    path: str | Path, values: Mapping[str, float], read: Callable[[str], BeamSource]
 ) -> GridBeams:
     """Read a table of beam files over a grid of parameters, and the files.
 
     Parameters
     ----------
     path : str or Path
-    values : mapping of float, optional
+    values : mapping of float
         Of parameters; by default they are in the middle of the grid.
     read : callable
         Makes the beams of a file.
@@ -225,7 +222,7 @@ def read_beam_grid(
     files, axes = read_grid_table(path)
     middle = {name: float(xs[0] + xs[-1]) / 2.0 for name, xs in axes.items()}
     grid = GridBeams(str(path), axes, tuple(map(read, files)), middle, middle)
-    grid = grid.with_values(values or {})
+    grid = grid.with_values(values)
     return replace(grid, nominal=grid.values)
 
 
