@@ -29,12 +29,7 @@ from lusee_bayes.core.arrays import Times
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.reading import naming, read_model
 from lusee_bayes.core.section import Section
-from lusee_bayes.instrument.times import (
-    scale_of,
-    time_of_text,
-    unannounced_leap_seconds,
-    utc_of,
-)
+from lusee_bayes.instrument.times import scale_of, time_of_text, unannounced_leap_seconds, utc_of
 
 DAY_S, MJD_ZERO = 86400.0, 2400000.5
 # two clocks that differ by less are one

@@ -317,7 +317,11 @@ class Reduced(Described):
         scale = np.sqrt(per_kelvin[FIRST_PORT] * per_kelvin[SECOND_PORT])
         values = np.where(present, self.values[band], 0.0)[:, bins] / scale[:, None]
         layout = DataLayout.from_flags(~present[:, bins])
-        observation, mhz = _one_run_an_angle(observation), float(self.frequencies_mhz[band])
+        # a run for each stretch of one turntable angle, whatever the gains were
+        angles = np.array(observation.turntable_deg)[observation.run]
+        run, turntable_deg = runs_of(angles, observation.n_times)
+        observation = replace(observation, run=run, turntable_deg=turntable_deg)
+        mhz = float(self.frequencies_mhz[band])
         calibration = self._calibration(band, bins)
         data = layout.gather(values)
         return Visibilities(data, layout, observation, mhz, calibration=calibration)
@@ -357,13 +361,6 @@ def _percent(shares: Mapping[str, float]) -> str:
 
 def _medians(found: Float[np.ndarray, "bands parts"]) -> Float[np.ndarray, " bands"]:
     return xarray.DataArray(found, dims=("band", "part")).median("part").values
-
-
-def _one_run_an_angle(observation: Observation) -> Observation:
-    """The same with a run for each stretch of one turntable angle, whatever the gains were."""
-    angles = np.array(observation.turntable_deg)[observation.run]
-    run, turntable_deg = runs_of(angles, observation.n_times)
-    return replace(observation, run=run, turntable_deg=turntable_deg)
 
 
 HINT = "make it with: lusee-bayes reduce SCENARIO SESSION..."

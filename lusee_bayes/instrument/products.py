@@ -181,8 +181,12 @@ def real_products(data: Any, products: Any, flags: Any, convention: str, n_anten
     columns: list[tuple[str, np.ndarray]] = []
     for (i, j, part), values, gone in zip(ports_and_parts, data.T, absent.T, strict=True):
         pair, sign = f"{min(i, j)}{max(i, j)}", CONVENTIONS[convention] * (1.0 if i <= j else -1.0)
-        if i == j:
-            _require_real(pair, np.where(gone, 0.0, values))
+        imaginary = np.abs(values.imag) > AUTO_TOLERANCE * np.abs(values.real)
+        if i == j and (imaginary & ~gone).any():
+            k = int(np.argmax(imaginary & ~gone))
+            raise InputError(
+                f"the auto {pair} is {values[k]:.6g} at time {k}, not real; check the names"
+            )
         parts = {part: values} if part else {"R": values.real, "I": values.imag}
         for name, numbers in parts.items():
             if i != j or name == "R":
@@ -246,14 +250,6 @@ def _flags(flags: Any, shape: tuple[int, ...]) -> np.ndarray:
             f"flags have shape {flags.shape}, expected {shape} as the data, or {shape[:1]}"
         )
     return (flags if flags.ndim == 2 else flags[:, None]).astype(bool)
-
-
-def _require_real(pair: str, auto: np.ndarray) -> None:
-    bad = np.flatnonzero(np.abs(auto.imag) > AUTO_TOLERANCE * np.abs(auto.real))
-    if bad.size:
-        raise InputError(
-            f"the auto {pair} is {auto[bad[0]]:.6g} at time {bad[0]}, not real; check the names"
-        )
 
 
 class DataLayout(Described, eqx.Module):

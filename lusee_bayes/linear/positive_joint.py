@@ -409,7 +409,10 @@ def _large_scales(skies: PositiveSkies, channels: Channels, n: int) -> ChannelsI
 
     def large(channel: int, information: Information) -> Arrays:
         if information.n_modes > n:
-            information = integrated_out(information, n, _small_scales(skies, channel)[n:])
+            # small scales have the template's power, with its sources'
+            template = skies.modes(channel, np.zeros(skies.n_fields))
+            power = power_spectrum(template) + power_spectrum(skies.sources[channel]).sum(0)
+            information = integrated_out(information, n, per_mode(power)[n:])
         return {name: getattr(information, name) for name in names}
 
     shapes = dict(zip(names, ((n, n), (n,), (n,), (), (), ()), strict=True))
@@ -420,9 +423,3 @@ def _large_scales(skies: PositiveSkies, channels: Channels, n: int) -> ChannelsI
             for k in range(len(skies.levels))
         )
     )
-
-
-def _small_scales(skies: PositiveSkies, channel: int) -> Modes:
-    """The template's power in every mode, with its sources'."""
-    template = skies.modes(channel, np.zeros(skies.n_fields))
-    return per_mode(power_spectrum(template) + power_spectrum(skies.sources[channel]).sum(0))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +42,12 @@ def paper_scenarios(
     scenarios = {
         name: load_scenario(base, [*changes, *overrides]) for name, (base, changes) in CASES.items()
     }
-    return {name: with_sky_file(s, files) for name, s in scenarios.items()} if files else scenarios
+    for name, scenario in scenarios.items() if files else ():
+        # the file nearest in log frequency, scaled to the scenario's
+        nearest = min(files, key=lambda f: abs(np.log(f / scenario.frequency_mhz)))
+        sky = FileSkySection(file=str(files[nearest]), file_frequency_mhz=nearest)
+        scenarios[name] = scenario.model_copy(update={"sky": sky})
+    return scenarios
 
 
 def sky_frequency_mhz(path: str | Path) -> float:
@@ -58,13 +63,6 @@ def sky_frequency_mhz(path: str | Path) -> float:
             "example exp10.0MHz_sky_map.hdf5"
         )
     return float(found[1])
-
-
-def with_sky_file(scenario: Scenario, files: Mapping[float, Path]) -> Scenario:
-    """The scenario with the file (by MHz) nearest in log frequency, scaled to its frequency."""
-    nearest = min(files, key=lambda f: abs(np.log(f / scenario.frequency_mhz)))
-    sky = FileSkySection(file=str(files[nearest]), file_frequency_mhz=nearest)
-    return scenario.model_copy(update={"sky": sky})
 
 
 def is_case(path: Path, scenario: Scenario) -> bool:

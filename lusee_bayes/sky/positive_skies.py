@@ -62,10 +62,7 @@ NEWTON, REACH = 30, 2.0
 
 
 def deviation_spectrum(
-    lmax: int,
-    amplitude: Number,
-    tilt: Number,
-    level: Float[Array, "1"],
+    lmax: int, amplitude: Number, tilt: Number, level: Float[Array, "1"]
 ) -> Float[Array, " ells"]:
     """Compute C_ell = A^2 ((ell + 1) / 10)^tilt of the logarithm of a sky over its template.
 

@@ -362,20 +362,6 @@ class IndependentPrior(DiagonalPrior):
         return IndependentPrior(self.root * factor)
 
 
-def require_spectrum(spectrum: Float[Array, " ells"]) -> None:
-    """Raise an InputError unless C_ell is float64, finite and not negative."""
-    require_array("the prior spectrum", spectrum)
-    if is_traced(spectrum):
-        return
-    negative = np.asarray(spectrum) < 0
-    if negative.any():
-        ell = int(np.argmax(negative))
-        raise InputError(
-            f"the prior spectrum is negative at ell = {ell}: C_ell = {float(spectrum[ell]):.3g}; "
-            "a variance cannot be"
-        )
-
-
 class HarmonicPrior(DiagonalPrior):
     """S = diag(C_ell): an isotropic Gaussian sky in real harmonic coefficients, about a mean sky.
 
@@ -397,11 +383,19 @@ class HarmonicPrior(DiagonalPrior):
     mean: Float[Array, " modes"] | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self):
-        require_spectrum(self.spectrum)
-        if self.mean is None:
-            return
-        require_array("the prior mean", self.mean, (self.size,))
+        require_array("the prior spectrum", self.spectrum)
+        if self.mean is not None:
+            require_array("the prior mean", self.mean, (self.size,))
         if is_traced(self.spectrum, self.mean):
+            return
+        negative = np.asarray(self.spectrum) < 0
+        if negative.any():
+            ell = int(np.argmax(negative))
+            raise InputError(
+                f"the prior spectrum is negative at ell = {ell}: C_ell = "
+                f"{float(self.spectrum[ell]):.3g}; a variance cannot be"
+            )
+        if self.mean is None:
             return
         fixed = np.flatnonzero((np.asarray(self.mean) != 0.0) & ~(np.asarray(self.variance()) > 0))
         if fixed.size:

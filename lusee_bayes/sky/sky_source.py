@@ -326,9 +326,16 @@ class SkyAlms(SkyFile):
             that do not fill an lmax, and numbers that are not finite.
         """
         path = user_path(path)
-        frequencies, alm = (
-            _read_npz(path) if path.suffix == ".npz" else (None, _read_alm_fits(path))
-        )
+        if path.suffix == ".npz":
+            found = read_arrays(path, NPZ, "check sky.file").arrays
+            frequencies, alm = found["freq"], found["alm"]
+            if healpy.Alm.getlmax(alm.shape[1]) < 0:
+                raise InputError(
+                    f"{path}: alm has {alm.shape[1]} coefficients, expected (lmax + 1) "
+                    "(lmax + 2) / 2"
+                )
+        else:
+            frequencies, alm = None, _read_alm_fits(path)
         require_finite(f"{path}: the coefficients", np.stack([alm.real, alm.imag]))
         return cls(str(path), frequencies, harmonics.from_healpy(np.atleast_2d(alm)))
 
@@ -388,16 +395,6 @@ def write_alms(path: str | Path, modes: Float[Array, " modes"], header: dict[str
         with fits.open(partial, mode="update") as hdus:
             hdus[1].header.update(units | header)
     return user_path(path)
-
-
-def _read_npz(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    found = read_arrays(path, NPZ, "check sky.file").arrays
-    alm = found["alm"]
-    if healpy.Alm.getlmax(alm.shape[1]) < 0:
-        raise InputError(
-            f"{path}: alm has {alm.shape[1]} coefficients, expected (lmax + 1) (lmax + 2) / 2"
-        )
-    return found["freq"], alm
 
 
 def _read_alm_fits(path: Path) -> np.ndarray:
