@@ -322,17 +322,14 @@ class Reduced(Described):
         run, turntable_deg = runs_of(angles, observation.n_times)
         observation = replace(observation, run=run, turntable_deg=turntable_deg)
         mhz = float(self.frequencies_mhz[band])
-        calibration = self._calibration(band, bins)
-        data = layout.gather(values)
-        return Visibilities(data, layout, observation, mhz, calibration=calibration)
-
-    def _calibration(self, band: int, bins: Left) -> Calibration:
         found = {n: x for place in PLACES for n, x in self._errors(band, bins, place) if x.any()}
         n_averaged, lost = self.n_averaged[band, bins], float(sum(self.flagged(band).values()))
-        if not found:
-            return Calibration(n_averaged, lost=lost)
-        ports, slopes = [PLACES[name[:2]][1] for name in found], list(found.values())
-        return Calibration(n_averaged, tuple(found), np.array(ports), np.array(slopes), lost)
+        calibration = Calibration(n_averaged, lost=lost)
+        if found:
+            ports, slopes = [PLACES[name[:2]][1] for name in found], np.array(list(found.values()))
+            calibration = Calibration(n_averaged, tuple(found), np.array(ports), slopes, lost)
+        data = layout.gather(values)
+        return Visibilities(data, layout, observation, mhz, calibration=calibration)
 
     def _errors(self, band: int, bins: Left, place: str) -> Iterator[tuple[str, np.ndarray]]:
         """What may be off about a level of a port, by one standard deviation, where it has it."""

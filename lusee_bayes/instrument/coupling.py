@@ -48,6 +48,7 @@ BodyBeams = Float[Array, "runs products functions modes"]
 RowNumbers = Int[np.ndarray, " rows"]
 TimeModes = Float[Array, "products times modes"]
 Values = Mapping[str, float | Float[Array, ""]]
+Factors = Float[Array, "functions powers orders 2"]
 # times whose data A^T d takes at once: it bounds the memory
 MOST_TIMES = 8192
 
@@ -223,8 +224,7 @@ def _on_the_moon(modes: BeamModes, pointing: Pointing) -> Array:
 
 
 def _taken_up(
-    tilted: Float[Array, "products powers modes"],
-    factors: Float[Array, "functions powers orders 2"],
+    tilted: Float[Array, "products powers modes"], factors: Factors
 ) -> Float[Array, "products functions modes"]:
     """sum_p G_j(p, m) W_p, a complex factor for each pair c_m + i c_-m."""
     ell, m = mode_numbers(lmax_of(tilted.shape[-1]))

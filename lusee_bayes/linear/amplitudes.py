@@ -63,6 +63,9 @@ from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.linear_gaussian import Solution
 from lusee_bayes.noise.covariance import LowRankFactor
 
+Skies = Float[np.ndarray, "skies modes"]
+PatternModes = Float[np.ndarray, "patterns modes"]
+
 
 @dataclass(frozen=True)
 class Amplitudes:
@@ -199,14 +202,12 @@ class Patterns(eqx.Module):
         L.
     """
 
-    patterns: Float[np.ndarray, "patterns modes"]
+    patterns: PatternModes
     information: Information
     lower: Float[np.ndarray, "patterns patterns"]
 
     @classmethod
-    def of(
-        cls, patterns: Float[np.ndarray, "patterns modes"], information: Information
-    ) -> Patterns:
+    def of(cls, patterns: PatternModes, information: Information) -> Patterns:
         """Make it of patterns and of what data say of the whole sky.
 
         Raises
@@ -250,9 +251,7 @@ class Patterns(eqx.Module):
         """
         return self.whole_skies(diffuse[None], np.zeros((1, len(self.patterns))))[0]
 
-    def whole_skies(
-        self, diffuse: Float[np.ndarray, "skies modes"], z: Float[np.ndarray, "skies patterns"]
-    ) -> Float[np.ndarray, "skies modes"]:
+    def whole_skies(self, diffuse: Skies, z: Float[np.ndarray, "skies patterns"]) -> Skies:
         """Compute draws of m given draws of d, in K.
 
         Parameters

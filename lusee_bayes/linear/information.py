@@ -313,9 +313,7 @@ def precision_root(matrix: ModesMatrix, prior: Prior) -> ModesMatrix:
     return cholesky(precision, overwrite=True)
 
 
-def integrated_out(
-    information: Information, n: int, variance: Float[Array, " others"]
-) -> Information:
+def integrated_out(information: Information, n: int, variance: Modes) -> Information:
     """Write ln p(d) as a function of the first unknowns, the others integrated out.
 
     With b ~ N(0, D) for the others, and K = M_bb + D^-1, ::

@@ -31,7 +31,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core import checks
-from lusee_bayes.core.arrays import Array, scalar
+from lusee_bayes.core.arrays import Array, Grid, scalar
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky
 from lusee_bayes.instrument.beams.fields import ProductBeams
@@ -40,9 +40,8 @@ from lusee_bayes.instrument.products import DataLayout, ports
 from lusee_bayes.noise.covariance import LowRankCovariance, TimeBandedCovariance
 from lusee_bayes.sky.prior import Prior
 
-OfTimes = Float[Array, "products times"]
 Gains = Float[Array, "antennas times"]
-Hours = Float[np.ndarray, " times"]
+Hours = Float[Array, " times"]
 
 
 def template_noise(
@@ -121,11 +120,7 @@ class GainDrift(eqx.Module):
         return int((np.arange(len(hours)) - first).max())
 
     def covariance(
-        self,
-        visibilities: OfTimes,
-        hours: Float[Array, " times"],
-        layout: DataLayout,
-        width: int | None = None,
+        self, visibilities: Grid, hours: Hours, layout: DataLayout, width: int | None = None
     ) -> TimeBandedCovariance:
         """Return the noise term of the drifts around given visibilities d.
 
@@ -159,7 +154,10 @@ class GainDrift(eqx.Module):
         earlier = np.arange(layout.n_times)[:, None] - np.arange(width + 1)[None]
         lag = jnp.asarray(hours)[:, None] - jnp.asarray(hours)[np.maximum(earlier, 0)]
         kernel = jnp.where(jnp.asarray(earlier >= 0), self.kernel(lag), 0.0)
-        linear, quadratic = shared_antennas(layout.n_products)
+        # how many antennas two products share, and in how many ways two of them
+        i, j, _ = ports(round(np.sqrt(layout.n_products)))
+        ii, ij, ji, jj = (np.equal.outer(a, b).astype(np.float64) for a in (i, j) for b in (i, j))
+        linear, quadratic = ii + ij + ji + jj, ii * jj + ij * ji
         band = _band(
             visibilities, kernel, jnp.asarray(earlier), jnp.asarray(linear), jnp.asarray(quadratic)
         )
@@ -178,10 +176,7 @@ class GainDrift(eqx.Module):
         return self.history(white, hours, grid)
 
     def history(
-        self,
-        white: Float[Array, "antennas grid"],
-        hours: Float[Array, " times"],
-        grid: Float[Array, " grid"],
+        self, white: Float[Array, "antennas grid"], hours: Hours, grid: Float[Array, " grid"]
     ) -> Gains:
         """Return the gains that white noise on an even grid of times makes.
 
@@ -239,17 +234,10 @@ def white_grid(
     return np.arange(first, end, shortest_h / per_correlation)
 
 
-def with_gains(visibilities: OfTimes, gains: Gains) -> OfTimes:
+def with_gains(visibilities: Grid, gains: Gains) -> Grid:
     """Return (1 + g_i)(1 + g_j) V_ij, exactly, for every product."""
     i, j, _ = ports(gains.shape[0])
     return (1.0 + gains[i]) * (1.0 + gains[j]) * visibilities
-
-
-def shared_antennas(n_products: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return (dik + dil + djk + djl) and (dik djl + dil djk) for every pair of products."""
-    i, j, _ = ports(round(np.sqrt(n_products)))
-    ii, ij, ji, jj = (np.equal.outer(a, b).astype(np.float64) for a in (i, j) for b in (i, j))
-    return ii + ij + ji + jj, ii * jj + ij * ji
 
 
 @eqx.filter_jit

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -124,13 +125,11 @@ def case_table(cases: Cases) -> list[dict[str, object]]:
     rows = []
     for name, case in cases.items():
         row: dict[str, object] = {"case": name, "frequency_mhz": case.attrs["frequency_mhz"]}
-        for metric in ("rho", "snr"):
-            for ell in (1, 10, 20, 30, 40):
-                inside = ell < case.sizes["ell"]
-                row[f"{metric}_{ell}"] = f"{float(case[metric][ell]):.4g}" if inside else "beyond"
+        for metric, ell in product(("rho", "snr"), (1, 10, 20, 30, 40)):
+            inside = ell < case.sizes["ell"]
+            row[f"{metric}_{ell}"] = f"{float(case[metric][ell]):.4g}" if inside else "beyond"
         row["ell_cross"] = cross(case) if cross(case) < case.sizes["ell"] else "none"
-        for key in ("log_evidence", "chi2", "chi2_expected"):
-            row[key] = f"{case.attrs[key]:.1f}"
+        row |= {key: f"{case.attrs[key]:.1f}" for key in ("log_evidence", "chi2", "chi2_expected")}
         row["n_data"] = case.attrs["n_data"]
         rms = case.attrs.get("beam_rms_difference")
         row["beam_rms_difference"] = "none" if rms is None else f"{rms:.4f}"

@@ -146,9 +146,7 @@ class Hyperprior:
         log_normal = -0.5 * (scores**2 + np.log(2.0 * np.pi))
         return np.exp(log_normal - self._log_densities(self.of_scores(scores)))
 
-    def _parts(
-        self, parameters: Parameters
-    ) -> tuple[Float[np.ndarray, " theta"], Float[np.ndarray, " cells"]]:
+    def _parts(self, parameters: Parameters) -> tuple[Parameters, Parameters]:
         theta, cells = np.split(parameters, [len(self.centre)])
         return (theta - self.centre) / self.width, cells
 

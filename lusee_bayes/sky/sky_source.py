@@ -27,7 +27,7 @@ from astropy.io import fits
 from jaxtyping import Float
 
 from lusee_bayes.core import harmonics
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, Modes, Pixels
 from lusee_bayes.core.checks import Described, number, require_array, require_finite, require_whole
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.files import replacing, user_path
@@ -145,9 +145,7 @@ class SkyFile(Described, ABC):
         """
 
 
-def modes_of_map(
-    path: str | Path, pixels: Float[np.ndarray, " pixels"], lmax: int
-) -> Float[np.ndarray, " modes"]:
+def modes_of_map(path: str | Path, pixels: Pixels, lmax: int) -> Modes:
     """Coefficients of a file's map; an InputError names the file."""
     with naming(path):
         return harmonics.map_to_modes(pixels, lmax)
@@ -563,6 +561,9 @@ class SkySource(ABC):
         """
 
 
+Sources = tuple[PointSource, ...]
+
+
 @lru_cache(maxsize=4)
 def _galaxy_modes(frequency_mhz: float, seed: int | None, lmax: int) -> np.ndarray:
     """Compute the diffuse sky's coefficients, read-only: variations of a scenario share one sky."""
@@ -599,11 +600,7 @@ def read_sky_file(path: str | Path, dataset: str | None = None) -> SkyFile:
 
 
 def galaxy_sky(
-    frequency_mhz: float,
-    lmax: int = 47,
-    *,
-    seed: int | None = 1,
-    sources: tuple[PointSource, ...] = BRIGHT_SOURCES,
+    frequency_mhz: float, lmax: int = 47, *, seed: int | None = 1, sources: Sources = BRIGHT_SOURCES
 ) -> Sky:
     """Compute the embedded sky: diffuse Galaxy, extragalactic background and bright sources.
 

@@ -34,6 +34,7 @@ from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.lazy import interpolate
 from lusee_bayes.core.reading import read_table
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, Interpolation, Pairs, ProductBeams
+from lusee_bayes.instrument.beams.sampled import read_beam
 from lusee_bayes.instrument.beams.source import BeamSource, Circuit, Parameter, Receiver
 from lusee_bayes.instrument.products import all_products
 
@@ -197,14 +198,16 @@ def weights_along(nodes: Nodes, value: float | Float[Array, ""]) -> Float[Array,
 
 
 def read_beam_grid(
-    path: str | Path, values: Mapping[str, float], read: Callable[[str], BeamSource]
+    path: str | Path,
+    values: Mapping[str, float] | None = None,
+    read: Callable[[str], BeamSource] = read_beam,
 ) -> GridBeams:
     """Read a table of beam files over a grid of parameters, and the files.
 
     Parameters
     ----------
     path : str or Path
-    values : mapping of float
+    values : mapping of float, optional
         Of parameters; by default they are in the middle of the grid.
     read : callable
         Makes the beams of a file.
@@ -222,7 +225,7 @@ def read_beam_grid(
     files, axes = read_grid_table(path)
     middle = {name: float(xs[0] + xs[-1]) / 2.0 for name, xs in axes.items()}
     grid = GridBeams(str(path), axes, tuple(map(read, files)), middle, middle)
-    grid = grid.with_values(values)
+    grid = grid.with_values(values or {})
     return replace(grid, nominal=grid.values)
 
 
