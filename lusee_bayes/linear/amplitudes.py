@@ -120,11 +120,8 @@ class AmplitudesOfSky:
     def integrated(self, mean: Modes, covariance: ModesMatrix) -> Amplitudes:
         """Integrate a sky N(mean, covariance) out, in K and K^2: given any data besides."""
         with_sky = -covariance @ self.pull.T
-        return Amplitudes(
-            self.mean - self.pull @ (mean - self.reference),
-            self.covariance - self.pull @ with_sky,
-            with_sky,
-        )
+        least = self.mean - self.pull @ (mean - self.reference)
+        return Amplitudes(least, self.covariance - self.pull @ with_sky, with_sky)
 
     def given(self, precision: Square, vector: Vector, about: Vector) -> AmplitudesOfSky:
         """Take in what is known of the amplitudes besides: exp(-x^T Q x / 2 + q^T x), x = z - t.
@@ -138,12 +135,8 @@ class AmplitudesOfSky:
         """
         kept = np.linalg.inv(np.eye(len(vector)) + self.covariance @ precision)
         covariance = kept @ self.covariance
-        return AmplitudesOfSky(
-            self.mean + covariance @ (vector - precision @ (self.mean - about)),
-            kept @ self.pull,
-            covariance,
-            self.reference,
-        )
+        mean = self.mean + covariance @ (vector - precision @ (self.mean - about))
+        return AmplitudesOfSky(mean, kept @ self.pull, covariance, self.reference)
 
 
 def amplitudes_of_sky(solution: Solution, templates: Float[Array, "data n"]) -> AmplitudesOfSky:
@@ -363,12 +356,8 @@ def tie(
     off = mean - z
     quadratic = np.einsum("ki,kij,kj->", off, told, off) - (z**2).sum() + white @ white
     log_dets = np.linalg.slogdet(covariance)[1].sum() + 2.0 * np.log(np.diagonal(lower)).sum()
-    return Tied(
-        z,
-        half @ np.swapaxes(half, 1, 2),
-        z + draws.reshape(-1, n_channels, n),
-        float(-0.5 * (quadratic + log_dets)),
-    )
+    drawn, evidence = z + draws.reshape(-1, n_channels, n), float(-0.5 * (quadratic + log_dets))
+    return Tied(z, half @ np.swapaxes(half, 1, 2), drawn, evidence)
 
 
 def told_by_others(
