@@ -39,6 +39,8 @@ Points = Bool[np.ndarray, "rows points"]
 PointValues = Float[np.ndarray, "rows points"]
 Basis = Float[np.ndarray, "points terms"]
 Values = Float[np.ndarray, "rows products"]
+Spectra = Float[np.ndarray, "rows products points"]
+Normals = Float[np.ndarray, "rows terms terms"]
 # a spectrum with so many flags that its value has this many times the variance is not used
 MOST_VARIANCE = 4.0
 ROUNDING_MHZ = 1e-9
@@ -115,10 +117,7 @@ class ChannelBand:
         return cls(first, last, finer[:, : degree + 1], finer, shared)
 
     def values(
-        self,
-        spectra: Float[np.ndarray, "rows products bins"],
-        autos: Float[np.ndarray, "rows bins"],
-        good: Bool[np.ndarray, "rows bins"],
+        self, spectra: Spectra, autos: PointValues, good: Points
     ) -> tuple[Values, Rows, Values]:
         """Return the spectrum at the middle.
 
@@ -177,9 +176,7 @@ def point_weights(basis: Basis, good: Points) -> tuple[PointValues, RowFlags]:
     return np.where(good & possible[:, None], inverse[:, 0] @ basis.T, 0.0), possible
 
 
-def inverse_normals(
-    basis: Basis, good: Points
-) -> tuple[Float[np.ndarray, "rows terms terms"], RowFlags]:
+def inverse_normals(basis: Basis, good: Points) -> tuple[Normals, RowFlags]:
     """Return the inverse normal matrix of the curve through the good points of every row.
 
     Also whether there are enough points; it is the unit matrix where there are not.

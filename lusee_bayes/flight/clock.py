@@ -29,12 +29,7 @@ from lusee_bayes.core.arrays import Times
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.reading import naming, read_model
 from lusee_bayes.core.section import Section
-from lusee_bayes.instrument.times import (
-    scale_of,
-    time_of_text,
-    unannounced_leap_seconds,
-    utc_of,
-)
+from lusee_bayes.instrument.times import scale_of, time_of_text, unannounced_leap_seconds, utc_of
 
 DAY_S, MJD_ZERO = 86400.0, 2400000.5
 # two clocks that differ by less are one
@@ -122,13 +117,6 @@ class Clock:
             time = Time(self.jd1, self.jd2, format="jd", scale=self.scale, precision=9)
             return str(time.isot)
 
-    def correcting(self, said: Clock) -> Clock:
-        """Return the clock of a session by what it says itself, corrected by this one."""
-        with unannounced_leap_seconds():
-            since_s = float((self.stated - said.utc(np.array([said.raw_s]))[0]).sec)
-        raw_s = said.raw_s + since_s / said.rate
-        return replace(self, raw_s=raw_s, rate=self.rate * said.rate, stated=None)
-
     def differs_s(self, other: Clock, raw_s: Times) -> float:
         """Return by how many seconds two clocks differ at most at some readings."""
         ends = np.array([raw_s.min(), raw_s.max()])
@@ -197,7 +185,10 @@ def clock_of(path: str | Path, said: Clock | None, given: Clock | None, raw_s: T
                 f"{path} states no UTC that {given.source} could correct; give a clock file with "
                 "clocks in place of stated_utc_isot"
             )
-        return given.correcting(said)
+        with unannounced_leap_seconds():
+            since_s = float((given.stated - said.utc(np.array([said.raw_s]))[0]).sec)
+        raw_s = said.raw_s + since_s / said.rate
+        return replace(given, raw_s=raw_s, rate=given.rate * said.rate, stated=None)
     if given is None or said is None:
         return said or given
     differ = given.differs_s(said, raw_s)

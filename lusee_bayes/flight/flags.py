@@ -333,7 +333,9 @@ def _one_span(
     values = np.where(good[:, None], autos, 0.0).T[None]
     sigma = np.where(good[:, None], noise, 1.0).T[None]
     # noise from spectrum to spectrum, which a burst changes at its ends alone
-    scale = _from_neighbours(values[0] / sigma[0], good)
+    both = (good[1:] & good[:-1])[None]
+    steps = np.diff(values[0] / sigma[0], axis=1) / np.sqrt(2.0)
+    scale = np.array([robust_scale(port[None], both) for port in steps])
     kept = _without_the_highest(values, sigma * np.maximum(scale, 1.0)[:, None], good, x, limit)
     # and about the curve
     z = distances(values, sigma, good[None], kept[None], x)
@@ -353,13 +355,6 @@ def _one_span(
     known = good & _curve_is_known(values, kept, x)
     kept &= ~_flagged_stretches(z, kept | known, limit)
     return good & ~kept, float(np.median(scale))
-
-
-def _from_neighbours(z: Distances, good: Span) -> Float[np.ndarray, " ports"]:
-    """Standard deviation of each port, by differences of one spectrum and the next."""
-    both = (good[1:] & good[:-1])[None]
-    steps = np.diff(z, axis=1) / np.sqrt(2.0)
-    return np.array([robust_scale(port[None], both) for port in steps])
 
 
 def _without_the_highest(values: OneRow, sigma: OneRow, good: Span, x: Terms, limit: float) -> Span:

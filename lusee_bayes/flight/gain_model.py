@@ -34,6 +34,9 @@ from lusee_bayes.flight.session import LETTERS, PORTS, TELEMETRY, PortLevels, Te
 # levels of ports by their names, as M0, and where arrays have them
 PLACES = {f"{x}{port}": (k, port) for k, x in enumerate(LETTERS) for port in range(PORTS)}
 LEAD, N_COMPONENTS, N_TERMS = (len(LETTERS), PORTS), 2, 9
+Curve = Float[np.ndarray, " frequencies"]
+Errors = dict[str, float]
+Strengths = Float[np.ndarray, "rows components"]
 # one nV^2/Hz
 NANO2 = 1e-18
 # of gains: counts for one nV^2/Hz
@@ -97,7 +100,7 @@ class GainModel(Described):
         require_positive(f"{self.path}: the mean gain", self.mean, "give counts for 1 nV^2/Hz")
 
     def basis(
-        self, level: str, port: int, frequencies_mhz: Float[np.ndarray, " frequencies"]
+        self, level: str, port: int, frequencies_mhz: Curve
     ) -> Float[np.ndarray, "3 frequencies"]:
         """Return mean, v_1 and v_2 at some frequencies.
 
@@ -134,9 +137,7 @@ class GainModel(Described):
             )
         return replace(self, component_std=np.broadcast_to(std, self.components.shape[:3]).copy())
 
-    def strengths(
-        self, level: str, port: int, telemetry: Telemetry
-    ) -> Float[np.ndarray, "rows components"]:
+    def strengths(self, level: str, port: int, telemetry: Telemetry) -> Strengths:
         """Return q_1 and q_2 for telemetry.
 
         Parameters
@@ -215,7 +216,7 @@ def gain_curves(
 
 def draw_gains(
     table: GainModel, gain_std: float | None, generator: np.random.Generator
-) -> tuple[GainModel, dict[str, float]]:
+) -> tuple[GainModel, Errors]:
     """Draw gains of which a table is the mean.
 
     With independent standard normal z for each level of each port,
@@ -242,7 +243,7 @@ def draw_gains(
         If a gain is drawn below zero.
     """
     mean, coefficient = table.mean.copy(), table.coefficient.copy()
-    errors: dict[str, float] = {}
+    errors: Errors = {}
     for name, place in PLACES.items():
         if gain_std is not None:
             errors[name] = float(generator.standard_normal())
@@ -299,32 +300,27 @@ def write_gain_table(path: str | Path, table: GainModel) -> Path:
     return write_tree(path, table, formats.GAINS)
 
 
+# luseepy's arrays of every level and port
+ARRAYS = {"freqs": ("anchor",), "mean": ("anchor",), "eigvecs": ("anchor", "component")}
+
+
 def _read_folder(folder: Path, model: str) -> GainModel:
-    found = []
-    for name in ("freqs", "mean", "eigvecs"):
-        arrays = [_gain_array(folder / f"{place}_{name}.npy") for place in PLACES]
-        shapes = {values.shape for values in arrays}
-        if len(shapes) > 1:
-            raise InputError(f"{folder}: gains have different numbers of frequencies, {shapes}")
-        found.append(np.reshape(arrays, (*LEAD, *arrays[0].shape)))
-    mhz, mean, vectors = found
+    names = {name: [f"{place}_{name}" for place in PLACES] for name in ARRAYS}
+    found, layout = {}, {}
+    for name, of_places in names.items():
+        for one in of_places:
+            path = require_file(folder / f"{one}.npy", "a gain table", HINT)
+            with reading(path, "an array of luseepy's gain model"), path.open("rb") as file:
+                values = np.load(file, allow_pickle=False)
+            found[one] = values[:, :N_COMPONENTS] if values.ndim == 2 else values
+            layout[one] = Variable(ARRAYS[name])
+    arrays = Layout("luseepy's gain model", layout).checked(folder, found, {}).arrays
+    stacks = (np.stack([arrays[one] for one in of_places]) for of_places in names.values())
+    mhz, mean, vectors = (stack.reshape(*LEAD, *stack.shape[1:]) for stack in stacks)
     components = vectors.swapaxes(2, 3)
     coefficients = _coefficients(folder / COEFFICIENTS, model)
     kind = f"luseepy's gain model, {model} coefficients"
     return GainModel(str(folder), mhz, mean, components, coefficients, kind=kind)
-
-
-def _gain_array(path: Path) -> np.ndarray:
-    require_file(path, "a gain table", HINT)
-    with reading(path, "an array of luseepy's gain model"), path.open("rb") as file:
-        values = np.load(file, allow_pickle=False)
-    if values.dtype.kind not in "fiu" or not np.isfinite(values).all():
-        raise InputError(f"{path} holds other values than finite numbers")
-    two = path.stem.endswith("eigvecs")
-    if values.ndim != (2 if two else 1) or (two and values.shape[1] < N_COMPONENTS):
-        expected = "a matrix" if two else "a list"
-        raise InputError(f"{path} has shape {values.shape}, expected {expected}")
-    return (values[:, :N_COMPONENTS] if two else values).astype(np.float64)
 
 
 def _coefficients(path: Path, model: str) -> np.ndarray:

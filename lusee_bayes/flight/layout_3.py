@@ -87,7 +87,12 @@ def session_of_hdf5(path: Path, file: h5py.File, opener: Opener) -> Session:
         for name, item in file[group].items()
         if isinstance(item, h5py.Dataset)
     }
-    arrays |= _interpolated(path, file)
+    group = file.get(INTERPOLATED, {})
+    if "time" in group and "raw_times" in file["spectra"]:
+        theirs, ours = np.asarray(group["time"]), np.asarray(file["spectra/raw_times"])
+        if not np.array_equal(theirs, ours):
+            raise InputError(f"{path}: {INTERPOLATED}/time are not the times of the spectra")
+    arrays |= {f"telemetry/{name}": group[name] for name in TELEMETRY if name in group}
     return _checked_session(path, "HDF5", arrays, said_in(file), opener)
 
 
@@ -107,18 +112,6 @@ def session_of_fits(path: Path, hdus: fits.HDUList, opener: Opener) -> Session:
         if hdu in names and word in hdus[hdu].header
     }
     return _checked_session(path, "FITS", arrays, values, opener)
-
-
-def _interpolated(path: Path, file: h5py.File) -> dict[str, Unread]:
-    """Telemetry at the times of the spectra, as the file has it."""
-    if INTERPOLATED not in file:
-        return {}
-    group = file[INTERPOLATED]
-    if "time" in group and "raw_times" in file["spectra"]:
-        theirs, ours = np.asarray(group["time"]), np.asarray(file["spectra/raw_times"])
-        if theirs.shape != ours.shape or not np.array_equal(theirs, ours):
-            raise InputError(f"{path}: {INTERPOLATED}/time are not the times of the spectra")
-    return {f"telemetry/{name}": group[name] for name in TELEMETRY if name in group}
 
 
 def _checked_session(

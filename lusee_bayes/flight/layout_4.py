@@ -63,7 +63,12 @@ def session_of_4(path: Path, file: h5py.File, opener: Opener) -> Session:
     arrays = {"spectra/data": cube, **_metadata(path, file, cube.shape[0] if cube.shape else 0)}
     if (raw_s := _dataset(file, "spectra/raw_seconds")) is not None:
         arrays["spectra/raw_times"] = raw_s
-        _require_valid(path, _dataset(file, "spectra/raw_time_valid"))
+        marks = _dataset(file, "spectra/raw_time_valid")
+        if marks is not None and not np.asarray(marks).all():
+            raise InputError(
+                f"{path}: raw_time_valid marks the clock of {int((np.asarray(marks) == 0).sum())} "
+                f"of {len(marks)} spectra as invalid; ingest the session again without them"
+            )
     clock = _clock_by_reference(path, file)
     if clock is not None and raw_s is not None:
         arrays |= _telemetry_at_rows(path, file, clock, np.asarray(raw_s))
@@ -119,16 +124,6 @@ def _metadata(path: Path, file: h5py.File, n: int) -> dict[str, Unread]:
 def _values(numbers: Unread) -> str:
     """Which values an array has."""
     return ", ".join(map(str, np.unique(np.asarray(numbers)).tolist()))
-
-
-def _require_valid(path: Path, valid: Unread | None) -> None:
-    """InputError where a file marks times of its spectra as invalid."""
-    marks = np.ones(1) if valid is None else np.asarray(valid)
-    if not marks.all():
-        raise InputError(
-            f"{path}: raw_time_valid marks the clock of {int((marks == 0).sum())} of {marks.size} "
-            "spectra as invalid; ingest the session again without them"
-        )
 
 
 def _clock_by_reference(path: Path, file: h5py.File) -> Clock | None:

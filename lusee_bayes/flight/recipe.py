@@ -304,7 +304,10 @@ def timeline(sessions: Sequence[Session], recipe: Recipe) -> Timeline:
     if recipe.timestamp != "instant":
         times = later(times, TO_MIDDLE[recipe.timestamp] * window)
         windows = Windows.whole(-window / 2.0, window / 2.0, share * window)
-    state = _states(ordered)
+    # a state has one Navgf, one length and one set of gains: as text, which the levels are
+    states = [np.column_stack([s.navgf, s.navg_shift, s.level]) for s in ordered]
+    changes = [np.append(True, (one[1:] != one[:-1]).any(axis=1)) for one in states]
+    state = np.cumsum(np.concatenate(changes)) - 1
     with naming(", ".join(str(s.path) for s in ordered)):
         angles = (recipe.section.turntable_deg,) * (int(state[-1]) + 1)
         longest = float(window.max())
@@ -328,13 +331,3 @@ def _site(sessions: Sequence[Session]) -> tuple[float, float]:
                 "have a site that nobody has established, use --set flight.site=scenario"
             )
     return first.lon_deg, first.lat_deg
-
-
-def _states(sessions: Sequence[Session]) -> Int[np.ndarray, " rows"]:
-    """Numbers that grow wherever session, gains or averaging change."""
-    changes = []
-    for session in sessions:
-        # as text, which the levels are
-        state = np.column_stack([session.navgf, session.navg_shift, session.level])
-        changes.append(np.append(True, (state[1:] != state[:-1]).any(axis=1)))
-    return np.cumsum(np.concatenate(changes)) - 1

@@ -317,18 +317,19 @@ class Reduced(Described):
         scale = np.sqrt(per_kelvin[FIRST_PORT] * per_kelvin[SECOND_PORT])
         values = np.where(present, self.values[band], 0.0)[:, bins] / scale[:, None]
         layout = DataLayout.from_flags(~present[:, bins])
-        observation, mhz = _one_run_an_angle(observation), float(self.frequencies_mhz[band])
-        calibration = self._calibration(band, bins)
-        data = layout.gather(values)
-        return Visibilities(data, layout, observation, mhz, calibration=calibration)
-
-    def _calibration(self, band: int, bins: Left) -> Calibration:
+        # a run for each stretch of one turntable angle, whatever the gains were
+        angles = np.array(observation.turntable_deg)[observation.run]
+        run, turntable_deg = runs_of(angles, observation.n_times)
+        observation = replace(observation, run=run, turntable_deg=turntable_deg)
+        mhz = float(self.frequencies_mhz[band])
         found = {n: x for place in PLACES for n, x in self._errors(band, bins, place) if x.any()}
         n_averaged, lost = self.n_averaged[band, bins], float(sum(self.flagged(band).values()))
-        if not found:
-            return Calibration(n_averaged, lost=lost)
-        ports, slopes = [PLACES[name[:2]][1] for name in found], list(found.values())
-        return Calibration(n_averaged, tuple(found), np.array(ports), np.array(slopes), lost)
+        calibration = Calibration(n_averaged, lost=lost)
+        if found:
+            ports, slopes = [PLACES[name[:2]][1] for name in found], np.array(list(found.values()))
+            calibration = Calibration(n_averaged, tuple(found), np.array(ports), slopes, lost)
+        data = layout.gather(values)
+        return Visibilities(data, layout, observation, mhz, calibration=calibration)
 
     def _errors(self, band: int, bins: Left, place: str) -> Iterator[tuple[str, np.ndarray]]:
         """What may be off about a level of a port, by one standard deviation, where it has it."""
@@ -357,13 +358,6 @@ def _percent(shares: Mapping[str, float]) -> str:
 
 def _medians(found: Float[np.ndarray, "bands parts"]) -> Float[np.ndarray, " bands"]:
     return xarray.DataArray(found, dims=("band", "part")).median("part").values
-
-
-def _one_run_an_angle(observation: Observation) -> Observation:
-    """The same with a run for each stretch of one turntable angle, whatever the gains were."""
-    angles = np.array(observation.turntable_deg)[observation.run]
-    run, turntable_deg = runs_of(angles, observation.n_times)
-    return replace(observation, run=run, turntable_deg=turntable_deg)
 
 
 HINT = "make it with: lusee-bayes reduce SCENARIO SESSION..."

@@ -238,7 +238,12 @@ def write_session(
 
 def _write_session_fits(path: Path, rows: SessionRows, blocks: Iterable[Counts]) -> None:
     _fits_header(rows).writeto(path)
-    with fits.StreamingHDU(str(path), _cube_header(rows.n_rows)) as cube:
+    n, shape = rows.n_rows, (rows.n_rows, N_PRODUCTS, N_CHANNELS)
+    header = fits.ImageHDU(np.broadcast_to(np.float32(0.0), shape), name="SPECTRA").header
+    header.update({"NTIME": n, "NPROD": N_PRODUCTS, "NCHAN": N_CHANNELS})
+    header.update({"BUNIT": "SDU", "BITSREST": True, "BITSREF": 31, "NORMVER": 1})
+    header["HIERARCH REPRESENTATION"] = "gain_model_input_sdu"
+    with fits.StreamingHDU(str(path), header) as cube:
         for _, counts in whole_spectra(path, blocks, rows.n_rows):
             cube.write(counts)
     with fits.open(path, mode="append") as hdus:
@@ -264,15 +269,6 @@ def _fits_header(rows: SessionRows) -> fits.HDUList:
     clock = {"RAWSHFT": raw_s, "MJDOFF": mjd, "TIMESYS": scale.upper(), "CLKSRC": source}
     constants.header.update(site | clock)
     return fits.HDUList([primary, invariants, constants])
-
-
-def _cube_header(n_rows: int) -> fits.Header:
-    shape = n_rows, N_PRODUCTS, N_CHANNELS
-    header = fits.ImageHDU(np.broadcast_to(np.float32(0.0), shape), name="SPECTRA").header
-    header.update({"NTIME": n_rows, "NPROD": N_PRODUCTS, "NCHAN": N_CHANNELS})
-    header.update({"BUNIT": "SDU", "BITSREST": True, "BITSREF": 31, "NORMVER": 1})
-    header["HIERARCH REPRESENTATION"] = "gain_model_input_sdu"
-    return header
 
 
 # as luseepy has it

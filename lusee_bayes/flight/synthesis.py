@@ -29,6 +29,9 @@ from lusee_bayes.instrument.products import to_matrix, to_real
 AllChannels = Float[np.ndarray, "products rows channels"]
 Counts = Float[np.ndarray, "rows products bins"]
 Covariances = Complex[np.ndarray, "antennas antennas rows channels"]
+NodesMhz = Float[np.ndarray, " nodes"]
+BitSlices = Int[np.ndarray, "rows products"]
+Rounded = Float32[np.ndarray, "rows products bins"]
 INDEX = -2.5
 # below this share of the lowest known frequency spectra are held: what would rise further there
 # would be rounded coarsely elsewhere
@@ -57,9 +60,7 @@ class ChannelSpectra:
     correlations: Float[np.ndarray, "channels nodes"]
 
     @classmethod
-    def of(
-        cls, nodes_mhz: Float[np.ndarray, " nodes"], channels_mhz: session.Middles
-    ) -> ChannelSpectra:
+    def of(cls, nodes_mhz: NodesMhz, channels_mhz: session.Middles) -> ChannelSpectra:
         """Prepare the interpolation.
 
         Parameters
@@ -211,9 +212,7 @@ def bit_slices(counts: Counts) -> Int[np.ndarray, " products"]:
     return np.clip(bits, 0, REFERENCE).astype(np.int64)
 
 
-def rounded(
-    counts: Counts, bitslice: Int[np.ndarray, "rows products"]
-) -> Float32[np.ndarray, "rows products bins"]:
+def rounded(counts: Counts, bitslice: BitSlices) -> Rounded:
     """Return multiples of 2^(slice - 31).
 
     Parameters

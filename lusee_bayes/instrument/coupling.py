@@ -47,6 +47,8 @@ BeamModes = Float[Array, "*runs products modes"]
 BodyBeams = Float[Array, "runs products functions modes"]
 RowNumbers = Int[np.ndarray, " rows"]
 TimeModes = Float[Array, "products times modes"]
+Values = Mapping[str, float | Float[Array, ""]]
+Factors = Float[Array, "functions powers orders 2"]
 # times whose data A^T d takes at once: it bounds the memory
 MOST_TIMES = 8192
 
@@ -222,8 +224,7 @@ def _on_the_moon(modes: BeamModes, pointing: Pointing) -> Array:
 
 
 def _taken_up(
-    tilted: Float[Array, "products powers modes"],
-    factors: Float[Array, "functions powers orders 2"],
+    tilted: Float[Array, "products powers modes"], factors: Factors
 ) -> Float[Array, "products functions modes"]:
     """sum_p G_j(p, m) W_p, a complex factor for each pair c_m + i c_-m."""
     ell, m = mode_numbers(lmax_of(tilted.shape[-1]))
@@ -650,7 +651,7 @@ class Instrument(eqx.Module):
         """
         return self.source.parameter(name).value
 
-    def beams(self, values: Mapping[str, float | Float[Array, ""]] | None = None) -> ProductBeams:
+    def beams(self, values: Values | None = None) -> ProductBeams:
         """Compute the beams of all products.
 
         Parameters
@@ -670,9 +671,7 @@ class Instrument(eqx.Module):
         """
         return self.source.with_values(values or {}).beams(self.frequency_mhz, self.lmax)
 
-    def coupling(
-        self, values: Mapping[str, float | Float[Array, ""]] | None = None
-    ) -> CouplingMatrix:
+    def coupling(self, values: Values | None = None) -> CouplingMatrix:
         """Compute A of antennas with these values.
 
         Parameters

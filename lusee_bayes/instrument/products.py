@@ -181,8 +181,12 @@ def real_products(data: Any, products: Any, flags: Any, convention: str, n_anten
     columns: list[tuple[str, np.ndarray]] = []
     for (i, j, part), values, gone in zip(ports_and_parts, data.T, absent.T, strict=True):
         pair, sign = f"{min(i, j)}{max(i, j)}", CONVENTIONS[convention] * (1.0 if i <= j else -1.0)
-        if i == j:
-            _require_real(pair, np.where(gone, 0.0, values))
+        imaginary = np.abs(values.imag) > AUTO_TOLERANCE * np.abs(values.real)
+        if i == j and (imaginary & ~gone).any():
+            k = int(np.argmax(imaginary & ~gone))
+            raise InputError(
+                f"the auto {pair} is {values[k]:.6g} at time {k}, not real; check the names"
+            )
         parts = {part: values} if part else {"R": values.real, "I": values.imag}
         for name, numbers in parts.items():
             if i != j or name == "R":
@@ -207,9 +211,8 @@ def _numbers(data: Any) -> np.ndarray:
 def _columns(products: Any, is_complex: bool, n_antennas: int) -> list[tuple[int, int, str]]:
     """Ports and part of each column; the part is empty for complex numbers."""
     if products is None:
-        ordered = all_products(n_antennas)
-        return [(i, j, "" if is_complex else part) for i, j, part in ordered
-                if part == "R" or not is_complex]  # fmt: skip
+        real = labels(n_antennas)
+        products = dict.fromkeys(label[:2] for label in real) if is_complex else real
     if isinstance(products, str):
         raise InputError(f"products is '{products}'; give a list with the name of each column")
     columns: list[tuple[int, int, str]] = []
@@ -247,14 +250,6 @@ def _flags(flags: Any, shape: tuple[int, ...]) -> np.ndarray:
             f"flags have shape {flags.shape}, expected {shape} as the data, or {shape[:1]}"
         )
     return (flags if flags.ndim == 2 else flags[:, None]).astype(bool)
-
-
-def _require_real(pair: str, auto: np.ndarray) -> None:
-    bad = np.flatnonzero(np.abs(auto.imag) > AUTO_TOLERANCE * np.abs(auto.real))
-    if bad.size:
-        raise InputError(
-            f"the auto {pair} is {auto[bad[0]]:.6g} at time {bad[0]}, not real; check the names"
-        )
 
 
 class DataLayout(Described, eqx.Module):

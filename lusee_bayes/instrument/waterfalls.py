@@ -404,15 +404,12 @@ def write_waterfall(
         )
     pairs = np.array([(p.i, p.j) for p in products.all_products() if p.part == "R"])
     z = np.full(len(channels), np.nan + 1j * np.nan) if impedance_ohm is None else impedance_ohm
-    images = {"data": data, "freq": _frequencies(channels), "combinations": pairs}
+    mhz = np.array([channel.frequency_mhz for channel in channels])
+    images = {"data": data, "freq": mhz, "combinations": pairs}
     for port in range(products.N_ANTENNAS):
         images |= {f"ZRe_{port}": z.real.copy(), f"ZIm_{port}": z.imag.copy()}
     hdus = [fits.ImageHDU(image, name=name) for name, image in images.items()]
     return _write(path, hdus, {"VERSION": 0.1} | _site_and_times(first), scenario)
-
-
-def _frequencies(channels: Sequence[Visibilities]) -> Float[np.ndarray, " frequencies"]:
-    return np.array([channel.frequency_mhz for channel in channels])
 
 
 def _kelvin(path: Path, channels: Sequence[Visibilities]) -> ByTime:
@@ -526,7 +523,7 @@ def write_four_port(
     parameters = json.dumps({k: getattr(receiver, own) for k, own in names.items()}, sort_keys=True)
     images: list[tuple[str, Any, str]] = [
         ("data", data, UNIT),
-        ("freq", _frequencies(channels), "MHz"),
+        ("freq", [c.frequency_mhz for c in channels], "MHz"),
         ("time", np.stack([observation.times.jd1, observation.times.jd2], axis=-1), "d"),
         ("ZA", [c.antenna_ohm for c in circuits], "Ohm"),
         ("ZL", [c.load_ohm for c in circuits], "Ohm"),

@@ -63,6 +63,9 @@ from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.linear_gaussian import Solution
 from lusee_bayes.noise.covariance import LowRankFactor
 
+Skies = Float[np.ndarray, "skies modes"]
+PatternModes = Float[np.ndarray, "patterns modes"]
+
 
 @dataclass(frozen=True)
 class Amplitudes:
@@ -117,11 +120,8 @@ class AmplitudesOfSky:
     def integrated(self, mean: Modes, covariance: ModesMatrix) -> Amplitudes:
         """Integrate a sky N(mean, covariance) out, in K and K^2: given any data besides."""
         with_sky = -covariance @ self.pull.T
-        return Amplitudes(
-            self.mean - self.pull @ (mean - self.reference),
-            self.covariance - self.pull @ with_sky,
-            with_sky,
-        )
+        least = self.mean - self.pull @ (mean - self.reference)
+        return Amplitudes(least, self.covariance - self.pull @ with_sky, with_sky)
 
     def given(self, precision: Square, vector: Vector, about: Vector) -> AmplitudesOfSky:
         """Take in what is known of the amplitudes besides: exp(-x^T Q x / 2 + q^T x), x = z - t.
@@ -135,12 +135,8 @@ class AmplitudesOfSky:
         """
         kept = np.linalg.inv(np.eye(len(vector)) + self.covariance @ precision)
         covariance = kept @ self.covariance
-        return AmplitudesOfSky(
-            self.mean + covariance @ (vector - precision @ (self.mean - about)),
-            kept @ self.pull,
-            covariance,
-            self.reference,
-        )
+        mean = self.mean + covariance @ (vector - precision @ (self.mean - about))
+        return AmplitudesOfSky(mean, kept @ self.pull, covariance, self.reference)
 
 
 # data that are looked at first to find a column among many
@@ -204,14 +200,12 @@ class Patterns(eqx.Module):
         L.
     """
 
-    patterns: Float[np.ndarray, "patterns modes"]
+    patterns: PatternModes
     information: Information
     lower: Float[np.ndarray, "patterns patterns"]
 
     @classmethod
-    def of(
-        cls, patterns: Float[np.ndarray, "patterns modes"], information: Information
-    ) -> Patterns:
+    def of(cls, patterns: PatternModes, information: Information) -> Patterns:
         """Make it of patterns and of what data say of the whole sky.
 
         Raises
@@ -234,8 +228,6 @@ class Patterns(eqx.Module):
     def without(self) -> Information:
         """Integrate the patterns out: what the data say of d."""
         whole = self.information
-        if not len(self.patterns):
-            return whole
         across = solve_lower(self.lower, self.patterns @ whole.matrix, transpose=False)
         pull = solve_lower(self.lower, (self.patterns @ whole.vector)[:, None], transpose=False)
         return replace(
@@ -257,9 +249,7 @@ class Patterns(eqx.Module):
         """
         return self.whole_skies(diffuse[None], np.zeros((1, len(self.patterns))))[0]
 
-    def whole_skies(
-        self, diffuse: Float[np.ndarray, "skies modes"], z: Float[np.ndarray, "skies patterns"]
-    ) -> Float[np.ndarray, "skies modes"]:
+    def whole_skies(self, diffuse: Skies, z: Float[np.ndarray, "skies patterns"]) -> Skies:
         """Compute draws of m given draws of d, in K.
 
         Parameters
@@ -270,8 +260,6 @@ class Patterns(eqx.Module):
             Draws of independent unit normals; zero for the mean.
         """
         there = diffuse + self.expected
-        if not len(self.patterns):
-            return there
         pull = self.information.vector - (there - self.information.reference) @ (
             self.information.matrix
         )
@@ -388,12 +376,8 @@ def tie(
     off = mean - z
     quadratic = np.einsum("ki,kij,kj->", off, told, off) - (z**2).sum() + white @ white
     log_dets = np.linalg.slogdet(covariance)[1].sum() + 2.0 * np.log(np.diagonal(lower)).sum()
-    return Tied(
-        z,
-        half @ np.swapaxes(half, 1, 2),
-        z + draws.reshape(-1, n_channels, n),
-        float(-0.5 * (quadratic + log_dets)),
-    )
+    drawn, evidence = z + draws.reshape(-1, n_channels, n), float(-0.5 * (quadratic + log_dets))
+    return Tied(z, half @ np.swapaxes(half, 1, 2), drawn, evidence)
 
 
 def told_by_others(

@@ -123,15 +123,8 @@ class Information(Described, eqx.Module):
         """
         require_shape("the other reference sky", other.reference, (self.n_modes,))
         here = other.recentred(self.reference)
-        return Information(
-            self.matrix + here.matrix,
-            self.vector + here.vector,
-            self.reference,
-            *(
-                np.asarray(getattr(self, name) + getattr(here, name))
-                for name in ("misfit", "log_det", "n_data")
-            ),
-        )
+        names = ("matrix", "vector", "misfit", "log_det", "n_data")
+        return replace(self, **{n: np.asarray(getattr(self, n) + getattr(here, n)) for n in names})
 
     def raised(self, factor: float) -> Information:
         """The information of the same data under N times a factor.
@@ -320,9 +313,7 @@ def precision_root(matrix: ModesMatrix, prior: Prior) -> ModesMatrix:
     return cholesky(precision, overwrite=True)
 
 
-def integrated_out(
-    information: Information, n: int, variance: Float[Array, " others"]
-) -> Information:
+def integrated_out(information: Information, n: int, variance: Modes) -> Information:
     """Write ln p(d) as a function of the first unknowns, the others integrated out.
 
     With b ~ N(0, D) for the others, and K = M_bb + D^-1, ::

@@ -33,6 +33,7 @@ from lusee_bayes.sky.spectral_prior import SpectralPrior
 ROWS = 16
 
 # arrays that recur
+Pairs = Float[Array, "pairs modes modes"]
 ChannelModes = Float[Array, "channels modes"]
 
 
@@ -96,7 +97,7 @@ class ComponentSums(eqx.Module):
         Number of data of all channels.
     """
 
-    matrices: Float[Array, "pairs modes modes"]
+    matrices: Pairs
     vectors: Float[Array, "components modes"]
     reference: Float[Array, "components modes"]
     misfit: Float[Array, ""]
@@ -201,9 +202,7 @@ def component_posterior(information: Information, prior: SpectralPrior) -> Poste
     return information.posterior(IndependentPrior(prior.roots.reshape(-1)))
 
 
-def paired(
-    covariance: Float[Array, "unknowns unknowns"], prior: SpectralPrior
-) -> Float[Array, "pairs modes modes"]:
+def paired(covariance: Float[Array, "unknowns unknowns"], prior: SpectralPrior) -> Pairs:
     """Pack the components' covariance for :func:`channel_sky`.
 
     Parameters
@@ -254,7 +253,7 @@ def channel_sky(
     channel: int,
     information: Information,
     maps: Float[Array, "components modes"],
-    covariances: Float[Array, "pairs modes modes"] | None,
+    covariances: Pairs | None,
     draws: Float[Array, "n components modes"],
     key: PRNGKeyArray,
 ) -> ChannelSky:

@@ -428,10 +428,7 @@ class FromInformation(Form):
 
     @classmethod
     def of(
-        cls,
-        model: LinearGaussian,
-        matrix: ModesMatrix | None = None,
-        factor: Factor | None = None,
+        cls, model: LinearGaussian, matrix: ModesMatrix | None = None, factor: Factor | None = None
     ) -> FromInformation:
         """Factorise a model, of which A^T N^-1 A and L of N may be known."""
         model = on_host(model)

@@ -37,6 +37,9 @@ from lusee_bayes.noise import covariance
 # arrays that recur
 Beams = Float[np.ndarray, "orders products 2 functions degrees"]
 
+Places = Int[np.ndarray, " modes"]
+Phases = Complex[np.ndarray, "..."]
+Blocks = Float[np.ndarray, "rows columns"]
 # times that are summed at once: it bounds the memory
 CHUNK = 512
 
@@ -111,20 +114,18 @@ def of_one_angle(
     return whole
 
 
-def places(lmax: int) -> Int[np.ndarray, " modes"]:
+def places(lmax: int) -> Places:
     """Rows of the packed modes: by growing ``|m|``, for each first the a_lm, then the a_l,-m."""
     return np.argsort(_by_order(lmax))
 
 
 @lru_cache(maxsize=4)
-def _by_order(lmax: int) -> Int[np.ndarray, " modes"]:
+def _by_order(lmax: int) -> Places:
     ell, m = mode_numbers(lmax)
     return np.lexsort((ell, m < 0, np.abs(m)))
 
 
-def _rows_of_order(
-    m: int, beams: Beams, f: Complex[np.ndarray, "..."]
-) -> Float[np.ndarray, "rows columns"]:
+def _rows_of_order(m: int, beams: Beams, f: Phases) -> Blocks:
     """Rows a_lm, then a_l,-m, of one order; columns a_l'm', then a_l',-m', of orders up to it.
 
     Rows of degrees from ``m``; columns of all degrees, with zeros where there is no mode.
@@ -144,7 +145,7 @@ def _rows_of_order(
 
 
 def _weighted(
-    even: Complex[np.ndarray, "..."], odd: Complex[np.ndarray, "..."], beams: Beams
+    even: Phases, odd: Phases, beams: Beams
 ) -> list[Float[np.ndarray, "orders parts degrees"]]:
     """(P + Q) / 2 and (P - Q) / 2 without the row's own beam, real and imaginary parts.
 
@@ -293,9 +294,7 @@ def summed(coupling: CouplingMatrix, weights: Float[np.ndarray, "..."]) -> Modes
     return _turned(turn, mirrored(total), places(len(turn.blocks) - 1))
 
 
-def _turned(
-    rotation: Rotation, matrix: ModesMatrix, place: Int[np.ndarray, " modes"]
-) -> ModesMatrix:
+def _turned(rotation: Rotation, matrix: ModesMatrix, place: Places) -> ModesMatrix:
     """R^T M R degree by degree, on and below the diagonal: what is worked on fits into a cache."""
     turned = np.empty_like(matrix)
     spans = [slice(ell**2, (ell + 1) ** 2) for ell in range(len(rotation.blocks))]

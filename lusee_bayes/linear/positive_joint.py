@@ -42,6 +42,7 @@ Pairs = Float[np.ndarray, "pairs modes modes"]
 Fields = Float[np.ndarray, "fields modes"]
 ChannelModes = Float[np.ndarray, "channels modes"]
 
+OfLaws = Float[np.ndarray, "laws ells"]
 # found when a round moves all unknowns together by less than this, in standard deviations, and no
 # ln A or tilt by more than that
 SETTLED, SETTLED_LAW = 0.1, 0.05
@@ -50,6 +51,8 @@ MAX_ROUNDS, HALVINGS = 60, 20
 
 # arrays by name, and their shapes
 Arrays, Shapes = dict[str, np.ndarray], dict[str, tuple[int, ...]]
+# told the number of every round, and how far it moved
+Report = Callable[[int, str], None] | None
 # functions of a channel's number and information
 OfChannel = Callable[[int, Information], Arrays]
 Linearised = Callable[[int, Information], Information]
@@ -188,7 +191,7 @@ def find_joint_mode(
     channels: Channels,
     *,
     learn: bool = False,
-    report: Callable[[int, str], None] | None = None,
+    report: Report = None,
 ) -> PositiveMode:
     """Find the most probable skies, beginning with the templates themselves.
 
@@ -292,17 +295,13 @@ def _judged(
     return {**found, "power": sum_over_m(white**2), "known": sum_over_m(1.0 - variance)}
 
 
-def _powers(
-    posterior: Posterior, prior: SpectralPrior, found: Arrays
-) -> tuple[Float[np.ndarray, "laws ells"], Float[np.ndarray, "laws ells"]]:
+def _powers(posterior: Posterior, prior: SpectralPrior, found: Arrays) -> tuple[OfLaws, OfLaws]:
     """sum_m u^2 and sum_m (1 - var u) of all fields and residuals."""
     shape = prior.n_components, -1
     variance = np.diagonal(inverse_from_cholesky(np.asarray(posterior.lower))).reshape(shape)
     power = sum_over_m(np.asarray(posterior.white_mean).reshape(shape) ** 2)
-    return (
-        np.concatenate([power, found["power"]]),
-        np.concatenate([sum_over_m(1.0 - variance), found["known"]]),
-    )
+    known = sum_over_m(1.0 - variance)
+    return np.concatenate([power, found["power"]]), np.concatenate([known, found["known"]])
 
 
 def _descended(
@@ -379,11 +378,7 @@ COARSE_LMAX = 16
 
 
 def learn_laws(
-    skies: PositiveSkies,
-    channels: Channels,
-    *,
-    lmax_fields: int,
-    report: Callable[[int, str], None] | None = None,
+    skies: PositiveSkies, channels: Channels, *, lmax_fields: int, report: Report = None
 ) -> FieldLaws:
     """Learn C_ell of all fields and residuals, by the maximum of the evidence.
 
@@ -405,8 +400,7 @@ def learn_laws(
     lmax = min(skies.lmax, COARSE_LMAX)
     coarse = skies.coarser(lmax, lmax_fields)
     parts = _large_scales(skies, channels, n_modes(lmax))
-    mode = find_joint_mode(coarse, FieldLaws.of(coarse), parts, learn=True, report=report)
-    return mode.laws
+    return find_joint_mode(coarse, FieldLaws.of(coarse), parts, learn=True, report=report).laws
 
 
 def _large_scales(skies: PositiveSkies, channels: Channels, n: int) -> ChannelsInMemory:
@@ -415,7 +409,10 @@ def _large_scales(skies: PositiveSkies, channels: Channels, n: int) -> ChannelsI
 
     def large(channel: int, information: Information) -> Arrays:
         if information.n_modes > n:
-            information = integrated_out(information, n, _small_scales(skies, channel)[n:])
+            # small scales have the template's power, with its sources'
+            template = skies.modes(channel, np.zeros(skies.n_fields))
+            power = power_spectrum(template) + power_spectrum(skies.sources[channel]).sum(0)
+            information = integrated_out(information, n, per_mode(power)[n:])
         return {name: getattr(information, name) for name in names}
 
     shapes = dict(zip(names, ((n, n), (n,), (n,), (), (), ()), strict=True))
@@ -426,9 +423,3 @@ def _large_scales(skies: PositiveSkies, channels: Channels, n: int) -> ChannelsI
             for k in range(len(skies.levels))
         )
     )
-
-
-def _small_scales(skies: PositiveSkies, channel: int) -> Modes:
-    """The template's power in every mode, with its sources'."""
-    template = skies.modes(channel, np.zeros(skies.n_fields))
-    return per_mode(power_spectrum(template) + power_spectrum(skies.sources[channel]).sum(0))

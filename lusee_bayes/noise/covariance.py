@@ -41,6 +41,9 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky, solve_lower
 from lusee_bayes.instrument.products import DataLayout
 
+Columns = Float[Array, "data *columns"]
+Band = Float[Array, "times widths products products"]
+
 
 class Factor(eqx.Module):
     """A square root L of a covariance: N = L L^T.
@@ -58,22 +61,22 @@ class Factor(eqx.Module):
     couples_times: ClassVar[bool] = True
 
     @abstractmethod
-    def whiten(self, x: Float[Array, "data *columns"]) -> Float[Array, "data *columns"]:
+    def whiten(self, x: Columns) -> Columns:
         """Return L^-1 x, for a vector or for every column of a matrix."""
 
     @abstractmethod
-    def whiten_transpose(self, x: Float[Array, "data *columns"]) -> Float[Array, "data *columns"]:
+    def whiten_transpose(self, x: Columns) -> Columns:
         """Return L^-T x."""
 
     @abstractmethod
-    def colour(self, z: Float[Array, "data *columns"]) -> Float[Array, "data *columns"]:
+    def colour(self, z: Columns) -> Columns:
         """Return L z, which turns independent unit normals into draws of N(0, N)."""
 
     @abstractmethod
     def log_det(self) -> Float[Array, ""]:
         """Return ``ln|N|``."""
 
-    def solve(self, x: Float[Array, "data *columns"]) -> Float[Array, "data *columns"]:
+    def solve(self, x: Columns) -> Columns:
         """Return N^-1 x."""
         return self.whiten_transpose(self.whiten(x))
 
@@ -136,7 +139,7 @@ class Covariance(checks.Described, eqx.Module):
         """
         return None
 
-    def solve(self, x: Float[Array, "data *columns"]) -> Float[Array, "data *columns"]:
+    def solve(self, x: Columns) -> Columns:
         """Return N^-1 x."""
         return self.factor().solve(x)
 
@@ -149,7 +152,7 @@ class Covariance(checks.Described, eqx.Module):
         """Number of independent normals behind a draw of N(0, N)."""
         return self.size
 
-    def colour(self, z: Float[Array, "white *columns"]) -> Float[Array, "data *columns"]:
+    def colour(self, z: Float[Array, "white *columns"]) -> Columns:
         """Turn ``rank`` independent normals, or columns of them, into draws of N(0, N)."""
         return self.factor().colour(z)
 
@@ -194,10 +197,10 @@ class CholeskyFactor(Factor):
 
     lower: Float[Array, "*batch n n"]
 
-    def _columns(self, x: Float[Array, "data *columns"]) -> Float[Array, "*batch n all_columns"]:
+    def _columns(self, x: Columns) -> Float[Array, "*batch n all_columns"]:
         return x.reshape(x.shape[0], -1)
 
-    def _data(self, columns: Array, shape: tuple[int, ...]) -> Float[Array, "data *columns"]:
+    def _data(self, columns: Array, shape: tuple[int, ...]) -> Columns:
         return columns.reshape(shape)
 
     def whiten(self, x):
@@ -275,7 +278,7 @@ class DenseCovariance(Covariance):
         return DenseCovariance(factor * self.matrix, self.name)
 
 
-def _down(vector: Float[Array, " data"], x: Float[Array, "data *columns"]) -> Float[Array, "..."]:
+def _down(vector: Float[Array, " data"], x: Columns) -> Float[Array, "..."]:
     """The vector shaped to multiply the rows of x."""
     return vector.reshape(-1, *(1,) * (x.ndim - 1))
 
@@ -544,9 +547,7 @@ class _OverLayout(Covariance):
         return self.layout.size
 
 
-def _masked(
-    band: Float[Array, "times widths products products"], layout: DataLayout
-) -> Float[Array, "times widths products products"]:
+def _masked(band: Band, layout: DataLayout) -> Band:
     """The band with blocks before the first time, and missing samples, as of the unit matrix."""
     n_times, widths, products = band.shape[:3]
     time, back = np.arange(n_times)[:, None], np.arange(widths)[None]
@@ -645,9 +646,7 @@ class TimeBandedFactor(Factor):
     inverse: Float[Array, "blocks rows rows"]
     layout: DataLayout
 
-    def _swept(
-        self, step: Callable, across: Array, x: Float[Array, "data *columns"], reverse: bool = False
-    ) -> Float[Array, "data *columns"]:
+    def _swept(self, step: Callable, across: Array, x: Columns, reverse: bool = False) -> Columns:
         """x with a step for each block row: of what it hands on, and L before and in its row."""
         (n, rows, window), layout = self.left.shape, self.layout
         grid = layout.by_time(x)
@@ -711,15 +710,10 @@ class TimeBandedCovariance(_OverLayout):
         If the band does not fit the layout, is not finite, or is not symmetric within one time.
     """
 
-    band: Float[Array, "times widths products products"]
+    band: Band
     name: str = eqx.field(static=True, default="the time-banded covariance")
 
-    def __init__(
-        self,
-        band: Float[Array, "times widths products products"],
-        layout: DataLayout,
-        name: str = "the time-banded covariance",
-    ):
+    def __init__(self, band: Band, layout: DataLayout, name: str = "the time-banded covariance"):
         checks.require_float64(name, band)
         n = layout.n_products
         checks.require_shape(name, band, (layout.n_times, None, n, n))

@@ -31,7 +31,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core import checks
-from lusee_bayes.core.arrays import Array, scalar
+from lusee_bayes.core.arrays import Array, Grid, scalar
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky
 from lusee_bayes.instrument.beams.fields import ProductBeams
@@ -39,6 +39,9 @@ from lusee_bayes.instrument.coupling import Coupling
 from lusee_bayes.instrument.products import DataLayout, ports
 from lusee_bayes.noise.covariance import LowRankCovariance, TimeBandedCovariance
 from lusee_bayes.sky.prior import Prior
+
+Gains = Float[Array, "antennas times"]
+Hours = Float[Array, " times"]
 
 
 def template_noise(
@@ -110,18 +113,14 @@ class GainDrift(eqx.Module):
         """Return C_g at lags in hours."""
         return self.sigma**2 * jnp.exp(-((lag_h / self.correlation_h) ** 2) / 2.0)
 
-    def width(self, hours: Float[np.ndarray, " times"]) -> int:
+    def width(self, hours: Hours) -> int:
         """Return how many samples apart two times can be and still be correlated."""
         reach = REACH * float(self.correlation_h)
         first = np.searchsorted(hours, np.asarray(hours) - reach)
         return int((np.arange(len(hours)) - first).max())
 
     def covariance(
-        self,
-        visibilities: Float[Array, "products times"],
-        hours: Float[Array, " times"],
-        layout: DataLayout,
-        width: int | None = None,
+        self, visibilities: Grid, hours: Hours, layout: DataLayout, width: int | None = None
     ) -> TimeBandedCovariance:
         """Return the noise term of the drifts around given visibilities d.
 
@@ -155,7 +154,10 @@ class GainDrift(eqx.Module):
         earlier = np.arange(layout.n_times)[:, None] - np.arange(width + 1)[None]
         lag = jnp.asarray(hours)[:, None] - jnp.asarray(hours)[np.maximum(earlier, 0)]
         kernel = jnp.where(jnp.asarray(earlier >= 0), self.kernel(lag), 0.0)
-        linear, quadratic = shared_antennas(layout.n_products)
+        # how many antennas two products share, and in how many ways two of them
+        i, j, _ = ports(round(np.sqrt(layout.n_products)))
+        ii, ij, ji, jj = (np.equal.outer(a, b).astype(np.float64) for a in (i, j) for b in (i, j))
+        linear, quadratic = ii + ij + ji + jj, ii * jj + ij * ji
         band = _band(
             visibilities, kernel, jnp.asarray(earlier), jnp.asarray(linear), jnp.asarray(quadratic)
         )
@@ -167,20 +169,15 @@ class GainDrift(eqx.Module):
         auto = jnp.asarray(i == j, dtype=jnp.float64)
         return 1.0 + self.sigma**2 * auto
 
-    def sample(
-        self, key: PRNGKeyArray, hours: Float[np.ndarray, " times"], n_antennas: int = 4
-    ) -> Float[Array, "antennas times"]:
+    def sample(self, key: PRNGKeyArray, hours: Hours, n_antennas: int = 4) -> Gains:
         """Draw g_i(t), (antennas, times), with exactly this covariance."""
         grid = white_grid(hours, float(self.correlation_h))
         white = jax.random.normal(key, (n_antennas, len(grid)), dtype=jnp.float64)
         return self.history(white, hours, grid)
 
     def history(
-        self,
-        white: Float[Array, "antennas grid"],
-        hours: Float[Array, " times"],
-        grid: Float[Array, " grid"],
-    ) -> Float[Array, "antennas times"]:
+        self, white: Float[Array, "antennas grid"], hours: Hours, grid: Float[Array, " grid"]
+    ) -> Gains:
         """Return the gains that white noise on an even grid of times makes.
 
         The noise is convolved with a Gaussian of width sigma_t / sqrt(2); a sum over a spacing of
@@ -206,7 +203,7 @@ class GainDrift(eqx.Module):
 
 
 def white_grid(
-    hours: Float[np.ndarray, " times"],
+    hours: Hours,
     shortest_h: float,
     longest_h: float | None = None,
     *,
@@ -237,19 +234,10 @@ def white_grid(
     return np.arange(first, end, shortest_h / per_correlation)
 
 
-def with_gains(
-    visibilities: Float[Array, "products times"], gains: Float[Array, "antennas times"]
-) -> Float[Array, "products times"]:
+def with_gains(visibilities: Grid, gains: Gains) -> Grid:
     """Return (1 + g_i)(1 + g_j) V_ij, exactly, for every product."""
     i, j, _ = ports(gains.shape[0])
     return (1.0 + gains[i]) * (1.0 + gains[j]) * visibilities
-
-
-def shared_antennas(n_products: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return (dik + dil + djk + djl) and (dik djl + dil djk) for every pair of products."""
-    i, j, _ = ports(round(np.sqrt(n_products)))
-    ii, ij, ji, jj = (np.equal.outer(a, b).astype(np.float64) for a in (i, j) for b in (i, j))
-    return ii + ij + ji + jj, ii * jj + ij * ji
 
 
 @eqx.filter_jit

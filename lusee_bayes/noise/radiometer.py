@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from lusee_bayes.core import checks
-from lusee_bayes.core.arrays import Array, compiled, namespace
+from lusee_bayes.core.arrays import Array, Grid, compiled, namespace
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.instrument.products import DataLayout, auto_indices, ports, to_matrix, without_gaps
 from lusee_bayes.noise.covariance import Covariance, DiagonalCovariance, TimeBlockCovariance
@@ -74,7 +74,7 @@ RADIOMETER_FORMS = ("paper", "exact")
 
 
 def radiometer_noise(
-    visibilities: Float[Array, "products times"],
+    visibilities: Grid,
     layout: DataLayout,
     *,
     bandwidth_hz: Scalar = 1.0e6,
@@ -134,7 +134,7 @@ def radiometer_noise(
     return TimeBlockCovariance(exact_blocks(visibilities) * scale[:, None, None], layout)
 
 
-def paper_variance(visibilities: Float[Array, "products times"]) -> Float[Array, "products times"]:
+def paper_variance(visibilities: Grid) -> Grid:
     """Return (T_ii T_jj + V_k^2) / 2 in K^2, to be divided by df dt."""
     n = round(np.sqrt(visibilities.shape[0]))
     autos = visibilities[auto_indices(n)]
@@ -143,9 +143,7 @@ def paper_variance(visibilities: Float[Array, "products times"]) -> Float[Array,
 
 
 @compiled
-def exact_blocks(
-    visibilities: Float[Array, "products times"],
-) -> Float[Array, "times products products"]:
+def exact_blocks(visibilities: Grid) -> Float[Array, "times products products"]:
     """Return the covariance of the products at every time in K^2, to be divided by df dt.
 
     A product is Re(c V_ij) with c = 1 or -i, so ::

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +43,12 @@ def paper_scenarios(
     scenarios = {
         name: load_scenario(base, [*changes, *overrides]) for name, (base, changes) in CASES.items()
     }
-    return {name: with_sky_file(s, files) for name, s in scenarios.items()} if files else scenarios
+    for name, scenario in scenarios.items() if files else ():
+        # the file nearest in log frequency, scaled to the scenario's
+        nearest = min(files, key=lambda f: abs(np.log(f / scenario.frequency_mhz)))
+        sky = FileSkySection(file=str(files[nearest]), file_frequency_mhz=nearest)
+        scenarios[name] = scenario.model_copy(update={"sky": sky})
+    return scenarios
 
 
 def sky_frequency_mhz(path: str | Path) -> float:
@@ -58,13 +64,6 @@ def sky_frequency_mhz(path: str | Path) -> float:
             "example exp10.0MHz_sky_map.hdf5"
         )
     return float(found[1])
-
-
-def with_sky_file(scenario: Scenario, files: Mapping[float, Path]) -> Scenario:
-    """The scenario with the file (by MHz) nearest in log frequency, scaled to its frequency."""
-    nearest = min(files, key=lambda f: abs(np.log(f / scenario.frequency_mhz)))
-    sky = FileSkySection(file=str(files[nearest]), file_frequency_mhz=nearest)
-    return scenario.model_copy(update={"sky": sky})
 
 
 def is_case(path: Path, scenario: Scenario) -> bool:
@@ -126,13 +125,11 @@ def case_table(cases: Cases) -> list[dict[str, object]]:
     rows = []
     for name, case in cases.items():
         row: dict[str, object] = {"case": name, "frequency_mhz": case.attrs["frequency_mhz"]}
-        for metric in ("rho", "snr"):
-            for ell in (1, 10, 20, 30, 40):
-                inside = ell < case.sizes["ell"]
-                row[f"{metric}_{ell}"] = f"{float(case[metric][ell]):.4g}" if inside else "beyond"
+        for metric, ell in product(("rho", "snr"), (1, 10, 20, 30, 40)):
+            inside = ell < case.sizes["ell"]
+            row[f"{metric}_{ell}"] = f"{float(case[metric][ell]):.4g}" if inside else "beyond"
         row["ell_cross"] = cross(case) if cross(case) < case.sizes["ell"] else "none"
-        for key in ("log_evidence", "chi2", "chi2_expected"):
-            row[key] = f"{case.attrs[key]:.1f}"
+        row |= {key: f"{case.attrs[key]:.1f}" for key in ("log_evidence", "chi2", "chi2_expected")}
         row["n_data"] = case.attrs["n_data"]
         rms = case.attrs.get("beam_rms_difference")
         row["beam_rms_difference"] = "none" if rms is None else f"{rms:.4f}"

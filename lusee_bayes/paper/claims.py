@@ -247,11 +247,9 @@ def _overdetermined(cases: Cases) -> Verdict:
 
 
 def _mean_temperature(cases: Cases) -> Verdict:
-    off = [100 * abs(float(c["mean"].mean() / c["truth"].mean()) - 1) for c in bands(cases)]
-    seen = [
-        100 * abs(float(c["mean"][ever_up(c)].mean() / c["truth"][ever_up(c)].mean()) - 1)
-        for c in bands(cases)
-    ]
+    pairs = [(case["mean"], case["truth"], ever_up(case)) for case in bands(cases)]
+    off = [100 * abs(float(mean.mean() / truth.mean()) - 1) for mean, truth, _ in pairs]
+    seen = [100 * abs(float(mean[up].mean() / truth[up].mean()) - 1) for mean, truth, up in pairs]
     text = (
         f"off by {span(off, '.2f')} % at 5 to 50 MHz (over the observed sky {span(seen, '.2f')} %)"
     )

@@ -164,20 +164,16 @@ def by_scenario(cases: Cases, metric: str) -> Figure:
     return figure
 
 
-def _title(name: str) -> str:
-    case = TABLE[name]
-    return f"{case['group']}: {case['label']}" if "group" in case else name
-
-
 def scenario_maps(cases: Cases) -> Figure:
     """Figure 9: the true sky at 25 MHz and the map of every scenario, in the same colours."""
     truth = drawn(cases["fiducial"], "truth")
     norm = drawing.temperatures(truth)
     figure = Figure(figsize=(13, 11), layout="constrained")
-    panels = [("truth", truth, None)] + [
-        (_title(name), drawn(cases[name], "mean"), cases[name]["highest_altitude"].values)
-        for name in MAP_CASES
-    ]
+    panels = [("truth", truth, None)]
+    for name in MAP_CASES:
+        case = TABLE[name]
+        title = f"{case['group']}: {case['label']}" if "group" in case else name
+        panels.append((title, drawn(cases[name], "mean"), cases[name]["highest_altitude"].values))
     for position, (title, pixels, altitude) in enumerate(panels, 1):
         axes = figure.add_subplot(4, 3, position)
         image = drawing.mollweide(axes, pixels, norm=norm, highest_altitude=altitude)

@@ -32,6 +32,8 @@ from lusee_bayes.sky.prior import PIVOT, HarmonicPrior, Prior
 # arrays that recur
 Parameters = Float[np.ndarray, " parameters"]
 
+Theta = Float[np.ndarray, " theta"]
+Cells = Float[np.ndarray, " cells"]
 # degrees of freedom of the parameters' Student distribution: near their centre they are held as by
 # a normal one of the same width, and a few may be far from it
 FREEDOM = 2.0
@@ -76,8 +78,8 @@ class Hyperprior:
         Its power is gamma distributed with the inverse scale, tail / steepness.
     """
 
-    centre: Float[np.ndarray, " theta"]
-    width: Float[np.ndarray, " theta"]
+    centre: Theta
+    width: Theta
     n_cells: int = 0
     tail: float = 1.5
     steepness: float = 2.0
@@ -146,9 +148,7 @@ class Hyperprior:
         log_normal = -0.5 * (scores**2 + np.log(2.0 * np.pi))
         return np.exp(log_normal - self._log_densities(self.of_scores(scores)))
 
-    def _parts(
-        self, parameters: Parameters
-    ) -> tuple[Float[np.ndarray, " theta"], Float[np.ndarray, " cells"]]:
+    def _parts(self, parameters: Parameters) -> tuple[Theta, Cells]:
         theta, cells = np.split(parameters, [len(self.centre)])
         return (theta - self.centre) / self.width, cells
 

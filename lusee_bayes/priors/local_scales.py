@@ -36,6 +36,7 @@ from lusee_bayes.sky.sky_source import galaxy_sky
 # arrays that recur
 Covariates = Float[np.ndarray, " covariates"]
 
+Strengths = list[Float[np.ndarray, " _"]]
 # frequency in MHz at which the Galaxy is nearly transparent
 TRANSPARENT_MHZ = 50.0
 # fluctuations of the texture relative to the template's mean, where its spectrum is started
@@ -239,9 +240,7 @@ def _covariance(family: LocalScales, flux: float, texture: ModesMatrix) -> Modes
     return columns @ columns.T + texture
 
 
-def _texture(
-    family: LocalScales, spectrum: Ells, strengths: list[Float[np.ndarray, " _"]]
-) -> ModesMatrix:
+def _texture(family: LocalScales, spectrum: Ells, strengths: Strengths) -> ModesMatrix:
     total = np.zeros((len(family.mean),) * 2)
     for band, strength in zip(family.bands, strengths, strict=True):
         scale = _scale(band, spectrum)
@@ -279,7 +278,7 @@ class LocalScalesMember(Member):
         return np.exp(self.family.spectrum.matrix @ self.power)
 
     @cached_property
-    def strengths(self) -> list[Float[np.ndarray, " _"]]:
+    def strengths(self) -> Strengths:
         """v_j of every band."""
         return [
             np.exp(band.covariates @ self.coefficients + band.cells @ self.factors)

@@ -43,6 +43,8 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import require_nside, synthesis_matrix
 from lusee_bayes.core.lazy import coordinates, healpy
 
+Numbers = float | np.ndarray
+
 ELECTRON_TEMPERATURE_K = 8000.0
 SUN_RADIUS_KPC = 8.5
 
@@ -81,25 +83,6 @@ def absorption_per_emission_measure(frequency_mhz: float) -> float:
     nu_ghz = frequency_mhz / 1e3
     gaunt = np.log(4.955e-2 / nu_ghz) + 1.5 * np.log(ELECTRON_TEMPERATURE_K)
     return float(3.014e-2 * ELECTRON_TEMPERATURE_K**-1.5 * nu_ghz**-2 * gaunt)
-
-
-def thermal_emission(depth: np.ndarray) -> np.ndarray:
-    """Compute the brightness temperature of the gas itself, T_e (1 - exp(-tau)), in K.
-
-    The gas has one temperature. So the emission of all its parts, each absorbed by the gas in
-    front of it, int T_e exp(-tau) dtau, depends on the whole optical depth only: what is
-    transparent adds T_e tau, what is opaque is a black body of T_e.
-
-    Parameters
-    ----------
-    depth : array
-        Optical depth of the whole line of sight.
-
-    References
-    ----------
-    Rybicki & Lightman, Radiative Processes in Astrophysics, eq. 1.30 (Rayleigh-Jeans).
-    """
-    return -ELECTRON_TEMPERATURE_K * np.expm1(-depth)
 
 
 def thick_disc(radius_kpc: np.ndarray) -> np.ndarray:
@@ -221,14 +204,14 @@ class PointSource:
     valid_from_mhz: float
     turnover_mhz: float
 
-    def _measured(self, frequency_mhz: float | np.ndarray) -> float | np.ndarray:
+    def _measured(self, frequency_mhz: Numbers) -> Numbers:
         x = np.log10(np.asarray(frequency_mhz, dtype=np.float64) / 1e3)
         return 10.0 ** np.polynomial.polynomial.polyval(x, self.log_flux)
 
-    def _depth(self, frequency_mhz: float | np.ndarray) -> float | np.ndarray:
+    def _depth(self, frequency_mhz: Numbers) -> Numbers:
         return (np.asarray(frequency_mhz, dtype=np.float64) / self.turnover_mhz) ** FREE_FREE_SLOPE
 
-    def flux_jy(self, frequency_mhz: float | np.ndarray) -> float | np.ndarray:
+    def flux_jy(self, frequency_mhz: Numbers) -> Numbers:
         """Compute the flux density in Jy.
 
         Parameters
@@ -258,7 +241,7 @@ class PointSource:
         at = coordinates.SkyCoord(self.ra_deg, self.dec_deg, unit="deg", frame="icrs").galactic
         return float(at.l.deg), float(at.b.deg)
 
-    def kelvin_steradian(self, frequency_mhz: float | np.ndarray) -> float | np.ndarray:
+    def kelvin_steradian(self, frequency_mhz: Numbers) -> Numbers:
         """Compute the brightness temperature integrated over the source, in K sr."""
         return kelvin_steradian(self.flux_jy(frequency_mhz), frequency_mhz)
 
@@ -282,9 +265,7 @@ class PointSource:
         return self.kelvin_steradian(frequency_mhz) * synthesis_matrix(theta, phi, lmax)[0]
 
 
-def kelvin_steradian(
-    flux_jy: float | np.ndarray, frequency_mhz: float | np.ndarray
-) -> float | np.ndarray:
+def kelvin_steradian(flux_jy: Numbers, frequency_mhz: Numbers) -> Numbers:
     """Convert flux densities to brightness temperature times solid angle, S c^2 / (2 k nu^2).
 
     Parameters
@@ -500,7 +481,8 @@ def brightness(synchrotron: np.ndarray, depth: np.ndarray, frequency_mhz: float)
         Frequency in MHz.
     """
     behind = background(frequency_mhz) * np.exp(-depth)
-    return synchrotron + thermal_emission(depth) + behind
+    thermal = -ELECTRON_TEMPERATURE_K * np.expm1(-depth)
+    return synchrotron + thermal + behind
 
 
 def _towards(theta: Vector, phi: Vector) -> tuple[Slabs, tuple[np.ndarray, np.ndarray]]:

@@ -49,6 +49,11 @@ from lusee_bayes.sky.galaxy import FREE_FREE_SLOPE, PointSource
 from lusee_bayes.sky.prior import PIVOT
 from lusee_bayes.sky.spectral_prior import SpectralPrior, require_names
 
+Number = float | Float[Array, ""]
+White = Float[Array, "*batch unknowns"]
+Exponents = Float[np.ndarray, "*batch columns"]
+OfLaws = Float[np.ndarray, "laws ells"]
+ModesBatch = Float[np.ndarray, "*batch modes"]
 # a brightness temperature in K, of Galactic theta and phi in radians
 Template = Callable[[Vector, Vector], Vector]
 
@@ -57,10 +62,7 @@ NEWTON, REACH = 30, 2.0
 
 
 def deviation_spectrum(
-    lmax: int,
-    amplitude: float | Float[Array, ""],
-    tilt: float | Float[Array, ""],
-    level: Float[Array, "1"],
+    lmax: int, amplitude: Number, tilt: Number, level: Float[Array, "1"]
 ) -> Float[Array, " ells"]:
     """Compute C_ell = A^2 ((ell + 1) / 10)^tilt of the logarithm of a sky over its template.
 
@@ -199,9 +201,7 @@ class LogNormalSky(eqx.Module):
         """Number of white unknowns: modes of the logarithm, then sources."""
         return self.n_modes + len(self.source_modes)
 
-    def with_power_law(
-        self, amplitude: float | Float[Array, ""], tilt: float | Float[Array, ""]
-    ) -> LogNormalSky:
+    def with_power_law(self, amplitude: Number, tilt: Number) -> LogNormalSky:
         """Return the same with C_ell = A^2 ((ell + 1) / 10)^tilt for ell > 0.
 
         Parameters
@@ -223,7 +223,7 @@ class LogNormalSky(eqx.Module):
         xp = namespace(self.spectrum)
         return xp.concatenate([xp.sqrt(per_mode(self.spectrum)), np.ones(len(self.source_modes))])
 
-    def diffuse(self, white: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch rings phi"]:
+    def diffuse(self, white: White) -> Float[Array, "*batch rings phi"]:
         """Compute T exp(Y a) on the grid, in K."""
         xp = namespace(self, white)
         root = self.root()[: self.n_modes]
@@ -231,16 +231,14 @@ class LogNormalSky(eqx.Module):
         field = xp.exp(self.grid.synthesise(logarithm))
         return field * self.level.reshape(*(1,) * (white.ndim - 1), *self.level.shape)
 
-    def source_factors(
-        self, white: Float[Array, "*batch unknowns"]
-    ) -> Float[Array, "*batch sources"]:
+    def source_factors(self, white: White) -> Float[Array, "*batch sources"]:
         """Compute g(eta): fluxes of the sources over the catalogued ones."""
         eta = white[..., self.n_modes :]
         if namespace(white) is np:
             return -log_ndtr(-eta)
         return -jax.scipy.special.log_ndtr(-eta)
 
-    def modes(self, white: Float[Array, "*batch unknowns"]) -> Float[Array, "*batch modes"]:
+    def modes(self, white: White) -> Float[Array, "*batch modes"]:
         """Compute m.
 
         Parameters
@@ -401,9 +399,7 @@ class PositiveSkies(eqx.Module):
         """Modes of every field."""
         return n_modes(self.grid.lmax)
 
-    def values(
-        self, channel: int, exponent: Float[np.ndarray, "*batch columns"]
-    ) -> Float[np.ndarray, "*batch rings phi"]:
+    def values(self, channel: int, exponent: Exponents) -> Float[np.ndarray, "*batch rings phi"]:
         """Compute T_f exp(w phi) on the grid, in K: positive; too large a phi makes it infinite.
 
         Parameters
@@ -415,9 +411,7 @@ class PositiveSkies(eqx.Module):
         with np.errstate(over="ignore"):
             return self.levels[channel] * np.exp(self.weight * self.grid.synthesise(exponent))
 
-    def modes(
-        self, channel: int, exponent: Float[np.ndarray, "*batch columns"]
-    ) -> Float[np.ndarray, "*batch modes"]:
+    def modes(self, channel: int, exponent: Exponents) -> ModesBatch:
         """Compute the sky without point sources: real packed coefficients, Galactic, in K.
 
         Parameters
@@ -493,9 +487,7 @@ class FieldLaws:
             skies.frequencies_mhz, skies.mixing, spectra[:fields], spectra[fields:], skies.names
         )
 
-    def matched(
-        self, found: Float[np.ndarray, "laws ells"], known: Float[np.ndarray, "laws ells"]
-    ) -> FieldLaws:
+    def matched(self, found: OfLaws, known: OfLaws) -> FieldLaws:
         """Compute the parameters of :func:`matching_step`, law by law.
 
         Parameters

@@ -30,6 +30,8 @@ from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.reading import read_text, reading, require_file
 from lusee_bayes.sky.sky_source import read_sky_file
 
+Unknowns = Float[Array, " unknowns"]
+Covered = Float[Array, "unknowns unknowns"]
 # ell + 1 at which the amplitude is that of the spectrum
 PIVOT = 10.0
 
@@ -72,12 +74,10 @@ class Prior(Described, eqx.Module):
         """Compute A G^-1, the inverse of :meth:`colour_columns`."""
 
     @abstractmethod
-    def sandwich(self, matrix: Float[Array, "unknowns unknowns"]) -> Float[Array, "white white"]:
+    def sandwich(self, matrix: Covered) -> Float[Array, "white white"]:
         """Compute G^T M G of a symmetric M, which may be an information about m: that about u."""
 
-    def colour_covariance(
-        self, white: Float[Array, "white white"]
-    ) -> Float[Array, "unknowns unknowns"]:
+    def colour_covariance(self, white: Float[Array, "white white"]) -> Covered:
         """Compute G C G^T of a symmetric C, such as the covariance of u: that of m.
 
         NumPy's C may be overwritten.
@@ -85,11 +85,11 @@ class Prior(Described, eqx.Module):
         return self.colour(self.colour(white).T)
 
     @abstractmethod
-    def variance(self) -> Float[Array, " unknowns"]:
+    def variance(self) -> Unknowns:
         """Return the diagonal of S, in K^2."""
 
     @abstractmethod
-    def covariance(self) -> Float[Array, "unknowns unknowns"]:
+    def covariance(self) -> Covered:
         """Return S as a matrix, in K^2."""
 
     @abstractmethod
@@ -157,7 +157,7 @@ class DensePrior(Prior):
     """
 
     root: Float[Array, "modes white"]
-    mean: Float[Array, " unknowns"] | None = eqx.field(default=None, kw_only=True)
+    mean: Unknowns | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self):
         require_array("the root of the prior", self.root, (self.size, self.size))
@@ -175,9 +175,7 @@ class DensePrior(Prior):
 
     @classmethod
     def of_covariance(
-        cls,
-        covariance: Float[Array, "modes columns"],
-        mean: Float[Array, " unknowns"] | None = None,
+        cls, covariance: Float[Array, "modes columns"], mean: Unknowns | None = None
     ) -> DensePrior:
         """Make the prior of a covariance.
 
@@ -204,9 +202,7 @@ class DensePrior(Prior):
 
     @classmethod
     def of_root(
-        cls,
-        root: Float[np.ndarray, "modes columns"],
-        mean: Float[np.ndarray, " unknowns"] | None = None,
+        cls, root: Float[np.ndarray, "modes columns"], mean: Unknowns | None = None
     ) -> DensePrior:
         """Make the prior of any R with S = R R^T, which is not formed: it may be ill conditioned.
 
@@ -295,7 +291,7 @@ class DiagonalPrior(Prior):
 
     @property
     @abstractmethod
-    def widths(self) -> Float[Array, " unknowns"]:
+    def widths(self) -> Unknowns:
         """The diagonal of G: prior standard deviations, each in its unknown's unit."""
 
     @property
@@ -353,31 +349,17 @@ class IndependentPrior(DiagonalPrior):
         If they are not float64 or not finite.
     """
 
-    root: Float[Array, " unknowns"]
+    root: Unknowns
 
     def __check_init__(self):
         require_array("the prior's standard deviations", self.root)
 
     @property
-    def widths(self) -> Float[Array, " unknowns"]:
+    def widths(self) -> Unknowns:
         return self.root
 
     def widened(self, factor):
         return IndependentPrior(self.root * factor)
-
-
-def require_spectrum(spectrum: Float[Array, " ells"]) -> None:
-    """Raise an InputError unless C_ell is float64, finite and not negative."""
-    require_array("the prior spectrum", spectrum)
-    if is_traced(spectrum):
-        return
-    negative = np.asarray(spectrum) < 0
-    if negative.any():
-        ell = int(np.argmax(negative))
-        raise InputError(
-            f"the prior spectrum is negative at ell = {ell}: C_ell = {float(spectrum[ell]):.3g}; "
-            "a variance cannot be"
-        )
 
 
 class HarmonicPrior(DiagonalPrior):
@@ -401,11 +383,19 @@ class HarmonicPrior(DiagonalPrior):
     mean: Float[Array, " modes"] | None = eqx.field(default=None, kw_only=True)
 
     def __check_init__(self):
-        require_spectrum(self.spectrum)
-        if self.mean is None:
-            return
-        require_array("the prior mean", self.mean, (self.size,))
+        require_array("the prior spectrum", self.spectrum)
+        if self.mean is not None:
+            require_array("the prior mean", self.mean, (self.size,))
         if is_traced(self.spectrum, self.mean):
+            return
+        negative = np.asarray(self.spectrum) < 0
+        if negative.any():
+            ell = int(np.argmax(negative))
+            raise InputError(
+                f"the prior spectrum is negative at ell = {ell}: C_ell = "
+                f"{float(self.spectrum[ell]):.3g}; a variance cannot be"
+            )
+        if self.mean is None:
             return
         fixed = np.flatnonzero((np.asarray(self.mean) != 0.0) & ~(np.asarray(self.variance()) > 0))
         if fixed.size:

@@ -27,7 +27,7 @@ from astropy.io import fits
 from jaxtyping import Float
 
 from lusee_bayes.core import harmonics
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, Modes, Pixels
 from lusee_bayes.core.checks import Described, number, require_array, require_finite, require_whole
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.files import replacing, user_path
@@ -145,9 +145,7 @@ class SkyFile(Described, ABC):
         """
 
 
-def modes_of_map(
-    path: str | Path, pixels: Float[np.ndarray, " pixels"], lmax: int
-) -> Float[np.ndarray, " modes"]:
+def modes_of_map(path: str | Path, pixels: Pixels, lmax: int) -> Modes:
     """Coefficients of a file's map; an InputError names the file."""
     with naming(path):
         return harmonics.map_to_modes(pixels, lmax)
@@ -326,9 +324,16 @@ class SkyAlms(SkyFile):
             that do not fill an lmax, and numbers that are not finite.
         """
         path = user_path(path)
-        frequencies, alm = (
-            _read_npz(path) if path.suffix == ".npz" else (None, _read_alm_fits(path))
-        )
+        if path.suffix == ".npz":
+            found = read_arrays(path, NPZ, "check sky.file").arrays
+            frequencies, alm = found["freq"], found["alm"]
+            if healpy.Alm.getlmax(alm.shape[1]) < 0:
+                raise InputError(
+                    f"{path}: alm has {alm.shape[1]} coefficients, expected (lmax + 1) "
+                    "(lmax + 2) / 2"
+                )
+        else:
+            frequencies, alm = None, _read_alm_fits(path)
         require_finite(f"{path}: the coefficients", np.stack([alm.real, alm.imag]))
         return cls(str(path), frequencies, harmonics.from_healpy(np.atleast_2d(alm)))
 
@@ -388,16 +393,6 @@ def write_alms(path: str | Path, modes: Float[Array, " modes"], header: dict[str
         with fits.open(partial, mode="update") as hdus:
             hdus[1].header.update(units | header)
     return user_path(path)
-
-
-def _read_npz(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    found = read_arrays(path, NPZ, "check sky.file").arrays
-    alm = found["alm"]
-    if healpy.Alm.getlmax(alm.shape[1]) < 0:
-        raise InputError(
-            f"{path}: alm has {alm.shape[1]} coefficients, expected (lmax + 1) (lmax + 2) / 2"
-        )
-    return found["freq"], alm
 
 
 def _read_alm_fits(path: Path) -> np.ndarray:
@@ -566,6 +561,9 @@ class SkySource(ABC):
         """
 
 
+Sources = tuple[PointSource, ...]
+
+
 @lru_cache(maxsize=4)
 def _galaxy_modes(frequency_mhz: float, seed: int | None, lmax: int) -> np.ndarray:
     """Compute the diffuse sky's coefficients, read-only: variations of a scenario share one sky."""
@@ -602,11 +600,7 @@ def read_sky_file(path: str | Path, dataset: str | None = None) -> SkyFile:
 
 
 def galaxy_sky(
-    frequency_mhz: float,
-    lmax: int = 47,
-    *,
-    seed: int | None = 1,
-    sources: tuple[PointSource, ...] = BRIGHT_SOURCES,
+    frequency_mhz: float, lmax: int = 47, *, seed: int | None = 1, sources: Sources = BRIGHT_SOURCES
 ) -> Sky:
     """Compute the embedded sky: diffuse Galaxy, extragalactic background and bright sources.
 

@@ -39,6 +39,8 @@ from lusee_bayes.instrument.beams.source import BeamSource, Circuit, Parameter, 
 from lusee_bayes.instrument.products import all_products
 
 Nodes = Float[np.ndarray, " nodes"]
+Values = Mapping[str, float | Float[Array, ""]]
+Lines = Float[np.ndarray, "lines products modes"]
 # values of a parameter through which one polynomial goes; through more go cubic splines
 MOST_IN_ONE = 5
 WHAT = "a table of beam files: a column file, and one with two or more values for each parameter"
@@ -67,7 +69,7 @@ class GridBeams(Described, BeamSource):
     path: str
     axes: Mapping[str, Nodes]
     sources: tuple[BeamSource, ...]
-    values: Mapping[str, float | Float[Array, ""]]
+    values: Values
     nominal: Mapping[str, float]
     known: dict[Any, np.ndarray] = field(default_factory=dict)
 
@@ -82,7 +84,7 @@ class GridBeams(Described, BeamSource):
     def parameters(self) -> dict[str, Parameter]:
         return {n: Parameter(self.values[n], xs[0], xs[-1]) for n, xs in self.axes.items()}
 
-    def with_values(self, values: Mapping[str, float | Float[Array, ""]]) -> GridBeams:
+    def with_values(self, values: Values) -> GridBeams:
         for name, value in values.items():
             _, low, high = self.parameter(name)
             if not is_traced(value) and not low <= value <= high:
@@ -92,7 +94,7 @@ class GridBeams(Described, BeamSource):
                 )
         return replace(self, values={**self.values, **values})
 
-    def weights(self, values: Mapping[str, float | Float[Array, ""]]) -> Float[Array, " sources"]:
+    def weights(self, values: Values) -> Float[Array, " sources"]:
         """Return the weights of the sources at these values of all parameters."""
         found = np.ones(1)
         for name, nodes in self.axes.items():
@@ -140,9 +142,7 @@ class GridBeams(Described, BeamSource):
     def behind(self, receiver: Receiver | None) -> GridBeams:
         return replace(self, sources=tuple(s.behind(receiver) for s in self.sources), known={})
 
-    def interpolation_errors(
-        self, frequency_mhz: float, lmax: int
-    ) -> dict[str, Float[np.ndarray, "lines products modes"]]:
+    def interpolation_errors(self, frequency_mhz: float, lmax: int) -> dict[str, Lines]:
         """Return by how much beams are off where they are interpolated without their own file.
 
         For each value of a parameter between its ends: the beams of its other values, interpolated

@@ -49,18 +49,13 @@ DEPTH_M = 100.0
 Frequency = float | Float[Array, ""]
 Vectors = Float[Array, "directions 3"]
 Angles = Float[Array, "*#directions"]
+Patterns = Float[Array, "products directions"]
 Coefficients = Complex[Array, " theta"]
 
 
 def wavenumber(frequency_mhz: Frequency) -> Frequency:
     """Return k = 2 pi / wavelength, in 1/m."""
     return 2.0e6 * np.pi * frequency_mhz / speed_of_light
-
-
-def phasor(angle: Float[Array, "..."]) -> Complex[Array, "..."]:
-    """Return exp(i angle)."""
-    xp = namespace(angle)
-    return as_complex(xp.cos(angle), xp.sin(angle))
 
 
 def _array(x) -> Float[Array, "..."]:
@@ -252,7 +247,7 @@ class Monopoles(BeamSource, eqx.Module):
         up = xp.cos(tilt)
         reflected = self.regolith.reflection(cos.reshape(-1), frequency_mhz)
         s, p = (r.reshape(cos.shape) for r in reflected)
-        ground = phasor(-2.0 * k * self.height_m * cos)
+        ground = xp.exp(-2j * k * self.height_m * cos)
         direct = self._current_integral(k, along * sin + up * cos)
         bounced = self._current_integral(k, along * sin - up * cos) * ground
         to_direct = (along * cos - up * sin).astype(direct.dtype)
@@ -348,7 +343,7 @@ def beams_towards(
     monopoles: Monopoles | None = None,
     *,
     stokes: str = "I",
-) -> Float[Array, "products directions"]:
+) -> Patterns:
     """Return the beams B_k(n) of the embedded antennas in the directions n.
 
     A source of x K sr in direction n adds x B_k(n) kelvin to product k (for ``stokes`` V, x is the
@@ -397,7 +392,7 @@ def beams_towards(
 @compiled
 def _patterns(
     frequency_mhz: Frequency, directions: Vectors, monopoles: Monopoles, stokes: str
-) -> Float[Array, "products directions"]:
+) -> Patterns:
     visible = directions[:, 2] > 0.0
     # a visible direction replaces the hidden ones: its field and its slopes are finite
     xp = namespace(frequency_mhz, directions, monopoles)

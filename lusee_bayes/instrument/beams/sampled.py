@@ -382,8 +382,15 @@ def read_sampled_beams(path: str | Path) -> SampledBeams:
     found = read(layout=layout(names, "theta_deg" in there, said=said))
     arrays, given = found.arrays, {}
     if POWER in arrays:
+        names = [name.strip() for name in found.values["products"].split(",")]
         with naming(path):
-            given["products"] = _in_order(arrays[POWER], found.values["products"])
+            expected = labels(antennas_of(arrays[POWER].shape[1]))
+        if sorted(names) != sorted(expected):
+            raise InputError(
+                f"{path}: products is {', '.join(names)}, expected the names of its "
+                f"{len(expected)} product beams: {', '.join(expected)}"
+            )
+        given["products"] = arrays[POWER][:, [names.index(name) for name in expected]]
     else:
         for name in ("e_theta", "e_phi"):
             # infinity times 1j would be NaN, with a warning
@@ -428,18 +435,6 @@ def write_sampled_beams(path: str | Path, beams: SampledBeams) -> Path:
             dataset = formats.as_dataset(formats.BEAMS, declared, arrays, said)
             dataset.to_netcdf(partly, engine="h5netcdf")
     return path
-
-
-def _in_order(beams: np.ndarray, products: str) -> np.ndarray:
-    """Product beams in the package's order."""
-    names = [name.strip() for name in products.split(",")]
-    expected = labels(antennas_of(beams.shape[1]))
-    if len(names) != beams.shape[1] or sorted(names) != sorted(expected):
-        raise InputError(
-            f"products is {products}, expected the names of its {beams.shape[1]} product beams: "
-            f"{', '.join(expected)}"
-        )
-    return beams[:, [names.index(name) for name in expected]]
 
 
 def read_uvbeam(path: str | Path) -> SampledBeams:

@@ -39,6 +39,8 @@ from lusee_bayes.instrument.beams.fields import (
 from lusee_bayes.instrument.products import N_ANTENNAS
 
 Ohms = Complex[np.ndarray, "ports ports"]
+Values = Mapping[str, float | Float[Array, ""]]
+Lines = Float[np.ndarray, "lines products modes"]
 # matrices of the ports at every frequency
 LOADS, BY_PORTS = ("ZL_real", "ZL_imag"), ("freq", N_ANTENNAS, N_ANTENNAS)
 LOADS_LAYOUT = Layout(
@@ -407,7 +409,7 @@ class BeamSource(ABC):
             raise InputError(f"unknown beam parameter '{name}'; {nearest(name, found)}")
         return found[name]
 
-    def with_values(self, values: Mapping[str, float | Float[Array, ""]]) -> BeamSource:
+    def with_values(self, values: Values) -> BeamSource:
         """Return the antennas with other values of the named parameters, differentiable in these.
 
         Raises
@@ -419,9 +421,7 @@ class BeamSource(ABC):
             self.parameter(name)
         return self
 
-    def interpolation_errors(
-        self, frequency_mhz: float, lmax: int
-    ) -> Mapping[str, Float[np.ndarray, "lines products modes"]]:
+    def interpolation_errors(self, frequency_mhz: float, lmax: int) -> Mapping[str, Lines]:
         """Return errors of beams that are interpolated in parameters, by what they are found at."""
         return {}
 
