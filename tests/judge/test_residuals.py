@@ -419,7 +419,6 @@ NOISES = {
 }
 TWO, ALONE = ("diagonal", "blocks and templates"), ("blocks", "templates")
 SIZES = {"few": FEW, "gaps": FEW, "many": MANY, "dense": MANY}
-TOGETHER = ("few", "many", "gaps")
 SIZES |= {"often": (*FEW, "observation.step_s=2400")}
 
 
@@ -492,7 +491,9 @@ MANY_TIMES = {"SHARED": 0, "DAYS": 1}
 @pytest.mark.parametrize(
     ("size", "kind", "limits"),
     [
-        *((size, kind, limits) for size in TOGETHER for kind in TWO for limits in LIMITS),
+        *((size, kind, limits) for size in ("few", "gaps") for kind in TWO for limits in LIMITS),
+        *(("many", kind, limits) for kind in TWO for limits in LIMITS[:2]),
+        *(pytest.param("many", kind, LIMITS[2], marks=LONG) for kind in TWO),
         *(("often", kind, MANY_TIMES) for kind in TWO),
         # what is in "blocks and templates" alone
         *(pytest.param("few", kind, limits, marks=LONG) for kind in ALONE for limits in LIMITS),

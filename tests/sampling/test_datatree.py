@@ -260,7 +260,6 @@ def test_data_of_a_program_without_the_sky_are_replicated_with_its_skies(collaps
 def test_a_written_tree_comes_back(which, request, tmp_path):
     tree, _ = request.getfixturevalue(which)
     tree.to_netcdf(tmp_path / "samples.nc", engine="h5netcdf")
-    require_conventions(tmp_path / "samples.nc")
     found = read_datatree(tmp_path / "samples.nc")
     xr.testing.assert_identical(found, tree)
     for path, group in tree.subtree_with_keys:
@@ -269,6 +268,7 @@ def test_a_written_tree_comes_back(which, request, tmp_path):
     assert found.attrs["format"] == formats.SAMPLES
     assert found.attrs["program"] == {"drawn": "sky", "collapsed": "sky_marginal"}[which]
     if which == "drawn":
+        require_conventions(tmp_path / "samples.nc")
         assert (found.attrs["frequency_mhz"], found.attrs["note"]) == (25.0, "µ = 1")
 
 
