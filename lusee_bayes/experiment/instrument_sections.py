@@ -395,7 +395,7 @@ class SampledBeamSection(_FileSection):
 
     def source(self) -> BeamSource:
         """The beams of the file."""
-        asked = self.model_dump(exclude={"model", "file"})
+        asked = self.model_dump(exclude={"model", "file", "exact"})
         return replace(read_sampled(self.file), **asked)
 
 

@@ -248,7 +248,7 @@ def test_a_second_file_as_the_true_beams(tmp_path):
     assert beam_rms_difference(setup) == pytest.approx(1.01**2 - 1, rel=1e-9)
     direction = difference_of_beams(setup.scenario.noise.beam, setup)
     more = (1.01**2 - 1) * np.asarray(setup.beams.modes)
-    np.testing.assert_allclose(direction.modes, more, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(direction, more, rtol=0, atol=1e-12)
     signal = np.asarray(true_signal(setup, true_values(setup)))
     modelled = np.asarray(setup.signal)
     np.testing.assert_allclose(signal, 1.01**2 * modelled, rtol=0, atol=1e-9 * modelled.max())
