@@ -23,7 +23,7 @@ from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float
-from scipy import special, stats
+from scipy import special
 
 from lusee_bayes.core.arrays import Ells, ModesMatrix
 from lusee_bayes.core.harmonics import per_mode, sum_over_m
@@ -99,11 +99,15 @@ class Hyperprior:
 
     def _log_densities(self, parameters: Parameters) -> Parameters:
         z, t = self._parts(parameters)
-        theta = stats.t.logpdf(z, FREEDOM) - np.log(self.width)
+        half = FREEDOM / 2.0
+        theta = -(half + 0.5) * np.log1p(z**2 / FREEDOM) - np.log(self.width)
+        constant = (
+            special.gammaln(half + 0.5) - special.gammaln(half) - 0.5 * np.log(FREEDOM * np.pi)
+        )
         shape = self.tail / self.steepness
-        log_power = np.log(shape) - self.steepness * t
-        cells = stats.loggamma.logpdf(log_power, shape) + np.log(self.steepness)
-        return np.concatenate([theta, cells])
+        cells = -self.tail * t - shape * np.exp(-self.steepness * t)
+        of_cell = np.log(self.steepness) + shape * np.log(shape) - special.gammaln(shape)
+        return np.concatenate([theta + constant, cells + of_cell])
 
     def gradient(self, parameters: Parameters) -> Parameters:
         """Compute its derivative."""
