@@ -157,7 +157,7 @@ def read_json(path: str | Path, layout: Layout, hint: str = "") -> dict[str, Any
     return found | layout.checked(path, {}, found).values
 
 
-def read_model(path: str | Path, kind: type[Model], what: str) -> Model:
+def read_model(path: str | Path, kind: type[Model], what: str, hint: str = "") -> Model:
     """Read an object in JSON into a pydantic model.
 
     Parameters
@@ -167,13 +167,15 @@ def read_model(path: str | Path, kind: type[Model], what: str) -> Model:
         The model.
     what : str
         What it should be, for messages.
+    hint : str
+        What to do if there is no such file.
 
     Raises
     ------
     InputError
         If the file cannot be read, or the first thing in it that is not as the model has it.
     """
-    text = read_text(path, what)
+    text = read_text(path, what, hint)
     try:
         return kind.model_validate_json(text)
     except ValidationError as error:
