@@ -247,7 +247,8 @@ class Monopoles(BeamSource, eqx.Module):
         up = xp.cos(tilt)
         reflected = self.regolith.reflection(cos.reshape(-1), frequency_mhz)
         s, p = (r.reshape(cos.shape) for r in reflected)
-        ground = xp.exp(-2j * k * self.height_m * cos)
+        angle = -2.0 * k * self.height_m * cos
+        ground = as_complex(xp.cos(angle), xp.sin(angle))
         direct = self._current_integral(k, along * sin + up * cos)
         bounced = self._current_integral(k, along * sin - up * cos) * ground
         to_direct = (along * cos - up * sin).astype(direct.dtype)
