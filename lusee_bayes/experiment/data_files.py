@@ -246,11 +246,15 @@ def _require_same_instrument(waterfall: Waterfall, scenario: Scenario) -> None:
     ours = circuit.per_kelvin.diagonal().real
     port = int(np.argmax(np.abs(theirs / ours - 1.0)))
     if abs(theirs[port] / ours[port] - 1.0) > SAME_SCALE:
-        loads = "" if waterfall.receiver is None else "; without beam.receiver, their ZL is used"
+        if waterfall.receiver is None:
+            what_to_do = "give the response and the beam.receiver that the data were taken with"
+        elif section.receiver is not None:
+            what_to_do = "leave out beam.receiver, so that the loads ZL in the data are used"
+        else:
+            what_to_do = "give the response that the data, which have the loads ZL, were taken with"
         raise InputError(
             f"in {waterfall.path} 1 K is {theirs[port]:.6g} V^2/Hz at port {port}, with "
-            f"{section.file} it is {ours[port]:.6g}; give the response and the beam.receiver that "
-            f"the data were taken with{loads}"
+            f"{section.file} it is {ours[port]:.6g}; {what_to_do}"
         )
     for name, theirs_k in (
         ("moon_temperature_k", waterfall.moon_k),

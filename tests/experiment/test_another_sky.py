@@ -152,7 +152,7 @@ def test_the_default_path_with_drifts(sigma, test_data):
 def test_a_prior_that_does_not_settle_with_n_is_said_to(monkeypatch):
     """Rounds that may never end are cut short, and the map says by how much it still moves."""
     monkeypatch.setattr("lusee_bayes.experiment.rounds.PRIOR_SETTLED", 0.0)
-    monkeypatch.setattr("lusee_bayes.experiment.rounds.MAX_PRIOR_ROUNDS", 1)
+    monkeypatch.setattr("lusee_bayes.experiment.rounds.MAX_LEARNED", 1)
     short = "observation.step_s=60000", "prior.model=isotropic"
     scenario = wrong_data.scenario(4, *short, *TERMS["gain drifts"])
     data = wrong_data.measured(scenario, wrong_data.Mixed(1).at(25.0, 4), 1)

@@ -315,7 +315,7 @@ def test_a_scenario_with_a_response_and_a_warm_moon(tmp_path):
         ([], "give its response as beam.file"),
         (["beam.file={response}"], "use --set beam.moon_temperature_k=250"),
         (["beam.file={response}", "beam.moon_temperature_k=250", "beam.receiver=open"],
-         "without beam.receiver, their ZL is used"),
+         "leave out beam.receiver, so that the loads ZL in the data are used"),
         (["frequency_mhz=11"], "no channel at 11 MHz"),
     ],
 )  # fmt: skip
