@@ -80,6 +80,8 @@ class ChannelFits:
         Of all channels together, what the prior does not expect.
     joint : bool
         Whether channels share a posterior.
+    shared : tuple of SharedTest
+        Where they share the instrument.
     """
 
     frequencies_mhz: Float[np.ndarray, " channels"]
@@ -87,6 +89,7 @@ class ChannelFits:
     degrees: Float[np.ndarray, " channels"]
     rest: ChiSquare
     joint: bool = False
+    shared: tuple[SharedTest, ...] = ()
 
     @property
     def by_channel(self) -> list[ChiSquare]:
@@ -125,7 +128,9 @@ class ChannelFits:
     def fit(self) -> Fit:
         """The verdict of all tests, and the channels that stand out."""
         tests, p = self.tests(), self.p()
+        contradiction = disagreement(self.shared)
         level = max((test.level for test in tests), key=LEVELS.index)
+        level = "does not fit" if contradiction else level
         sky, misfit = self.rest.of_sky, "no sky explains the data of all channels"
         if self._too_quiet():
             misfit = (
@@ -136,7 +141,7 @@ class ChannelFits:
                 "consistent": "Consistent: instrument, noise and prior fit in all channels.",
                 "unlike the prior": "Unlike the prior: instrument and noise fit in all channels, "
                 f"but the skies are {sky}.",
-                "does not fit": f"Does not fit: {misfit}.",
+                "does not fit": f"Does not fit: {contradiction or f'{misfit}.'}",
             }[level]
         ]
         for test in tests:
@@ -150,7 +155,7 @@ class ChannelFits:
             frequencies = self.frequencies_mhz
             names = [f"{frequencies[k]:g} MHz (p {probability(float(p[k]))})" for k in extremes]
             told.append(f"{len(extremes)} of {len(p)} channels stand out: {in_brief(names)}.")
-        return Fit(level, " ".join([*told, *self._advice(level)]))
+        return Fit(level, " ".join([*told, *([] if contradiction else self._advice(level))]))
 
     def _too_quiet(self) -> bool:
         """Whether all channels together, or the one furthest out if that is less probable, have
@@ -279,14 +284,14 @@ def shared_tests(
     )
 
 
-def disagreement(tests: Sequence[SharedTest]) -> list[str]:
-    """Name the channels that disagree, in a sentence; none where all agree."""
+def disagreement(tests: Sequence[SharedTest]) -> str:
+    """Name the channels that disagree, in a sentence; empty where all agree."""
     bad = [f"{t.frequency_mhz:g} MHz (p {probability(t.p)})" for t in tests if t.disagrees]
     if not bad:
-        return []
+        return ""
     verb = "disagrees" if len(bad) == 1 else "disagree"
-    return [
+    return (
         f"{in_brief(bad)} {verb} with the other channels about the instrument that they share, "
         "which makes the maps of all channels wrong: check beams and data there, or map the rest "
         "without."
-    ]
+    )

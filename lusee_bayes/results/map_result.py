@@ -25,7 +25,7 @@ from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.unknowns import UnknownsReport, flux_lines
 from lusee_bayes.flight.reduced import Reduced
 from lusee_bayes.judge.chi2 import RULE, ChiSquare, Fit
-from lusee_bayes.judge.cube_fit import ChannelFits, SharedTest, disagreement
+from lusee_bayes.judge.cube_fit import ChannelFits, SharedTest
 from lusee_bayes.linear.positive_joint import PositiveMode
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.summaries import JointSummary, MapSummary, PullSummary
@@ -234,7 +234,8 @@ class MapResult(Described):
         n_data = float(self.stacked("n_data").sum())
         total = float(self.stacked("chi2_model").sum()) if self.joint is None else self.joint.chi2
         rest = ChiSquare(total - float(chi2.sum()), n_data - float(degrees.sum()))
-        return ChannelFits(self.frequencies_mhz, chi2, degrees, rest, self.joint is not None)
+        joint = self.joint is not None
+        return ChannelFits(self.frequencies_mhz, chi2, degrees, rest, joint, self.shared_tests)
 
     @cached_property
     def fit(self) -> Fit:
@@ -317,8 +318,7 @@ class MapResult(Described):
         """What is doubtful about the data, with the channel where there are several."""
         if self.single:
             return list(self.channel.doubts)
-        own = [f"{c.frequency_mhz:g} MHz: {d}" for c in self.channels for d in c.doubts]
-        return [*disagreement(self.shared_tests), *own]
+        return [f"{c.frequency_mhz:g} MHz: {d}" for c in self.channels for d in c.doubts]
 
     def gaps(self) -> list[str]:
         """Which channels could not be mapped, and why, a sentence each."""
