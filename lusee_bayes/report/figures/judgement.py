@@ -149,8 +149,7 @@ def unknowns_by_frequency(result: MapResult) -> Figure | None:
         if "true" in rows:
             axes.plot(f, rows["true"].to_numpy(), "x", color=drawing.ORANGE, ms=5, label="truth")
         axes.xaxis.set_major_locator(MaxNLocator(5))
-        unit = rows["unit"].iloc[0] or "relative"
-        axes.set(title=name, xlabel="frequency [MHz]", ylabel=unit)
+        axes.set(title=name, xlabel="frequency [MHz]", ylabel=rows["unit"].iloc[0])
         if prior.min() > 0.0 and prior.max() > WIDE * prior.min():
             axes.set_yscale("log")
     for axes in panels[len(names) :]:
