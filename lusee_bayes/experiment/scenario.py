@@ -281,7 +281,8 @@ class Scenario(Section):
         }
         stds = {name: std for name, std in known.items() if std > 0.0}
         beam = BeamErrorSection(parameters=stds) if stds else None
-        return self.with_section("noise", beam=beam, fields=FieldErrorsSection())
+        fields = FieldErrorsSection() if self.beam.source().has_fields else None
+        return self.with_section("noise", beam=beam, fields=fields)
 
     def with_section(self, name: str, **values: object) -> Scenario:
         """The scenario with some values of a section changed."""

@@ -159,10 +159,11 @@ def errors_of(
     setup: Setup, *, pointing: bool
 ) -> Iterator[tuple[str, float, str, Systematic, slice]]:
     """Name, size and unit of errors that a model may lack, with what describes them."""
-    section = FieldErrorsSection(std=FIELDS, lmax=FIELD_LMAX, learned=False)
-    fields = FieldErrors.build(section, setup, Around())
-    yield FIELDS_NAME, 100.0 * FIELDS, " %", fields, slice(None)
     source = setup.beam_source
+    if source.has_fields:
+        section = FieldErrorsSection(std=FIELDS, lmax=FIELD_LMAX, learned=False)
+        fields = FieldErrors.build(section, setup, Around())
+        yield FIELDS_NAME, 100.0 * FIELDS, " %", fields, slice(None)
     known = {name: float(p.value) for name, p in source.parameters().items() if float(p.value)}
     priors = tuple(Unknown(name, value, PARAMETERS * abs(value)) for name, value in known.items())
     parameters = InstrumentParameters(setup.instrument, priors)

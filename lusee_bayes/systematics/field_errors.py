@@ -1,19 +1,20 @@
 """Smooth errors of each port's field: what no parameter of the antennas describes.
 
-The response of port i is E_i exp(f_i), with f_i(n) a complex function of direction, whose real part
-is the relative error of the amplitude and whose imaginary part that of the phase, ::
+Port i responds with E_ic + e_ic above the horizon, c being East and North as they are at the zenith
+and as parallel transport from there has them elsewhere (Ludwig's third definition), ::
 
-    f_i(n) = sum_k a_ik Y_k(n),    Re a_ik, Im a_ik ~ N(0, C_ell),    C_ell = c (1 + ell)^-slope,
+    e_ic(n) = s_i sum_k a_ick Y_k(n),    Re a_ick, Im a_ick ~ N(0, C_ell),
 
-up to ``lmax``. Beams of products are then P_ij exp(f_i + conj f_j), and the derivative by an
-amplitude is the product of Y_k and the beam, whatever the values. c follows from the standard
-deviation of either part in any direction.
+with s_i the rms of |E_i| over the hemisphere, C_ell = C_0 (1 + ell)^-slope, up to ``lmax``. It is
+added, since what a lander scatters does not vanish where the antenna's own field does. Beams of
+products gain E_ic e_jc* + e_ic E_jc* + e_ic e_jc*. C_0 follows from the standard deviation of
+either part in any direction.
 
 How strong the errors are is learned with everything else, in rounds. Each takes the strength that
 is most probable for the n amplitudes as they were found, uncertain as they are (expectation and
 maximisation), ::
 
-    c = sum [(mean of a)^2 + Var(a)] (1 + ell)^slope / n,
+    C_0 = sum [(mean of a)^2 + Var(a)] (1 + ell)^slope / n,
 
 but never less than what is expected: where parameters of the antennas describe most of an error,
 what is left has a few shapes, and the strength of all would be found far too low for these.
@@ -31,9 +32,11 @@ from pydantic import Field
 
 from lusee_bayes.core.arrays import Array, Vector, as_complex, namespace
 from lusee_bayes.core.harmonics import n_modes
+from lusee_bayes.core.reading import naming
 from lusee_bayes.core.section import NOT_TINY, Section, Treatment
 from lusee_bayes.core.sphere_grid import SphereGrid
-from lusee_bayes.instrument.products import ports, to_matrix, to_real
+from lusee_bayes.instrument.beams.fields import HemisphereGrid, beam_scale
+from lusee_bayes.instrument.products import ports, to_real
 from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.systematic import ChangedBeams, Unknown, Values
 
@@ -49,8 +52,8 @@ class FieldErrorsSection(Section):
     Attributes
     ----------
     std : float
-        Standard deviation of the relative amplitude, and of the phase in radians, in any direction;
-        the least, where it is learned.
+        Standard deviation of the real and of the imaginary part of either component, over the rms
+        of the port's field, in any direction; the least, where it is learned.
     lmax : int
         Highest ell of the errors.
     slope : float
@@ -75,12 +78,16 @@ class FieldErrors(ChangedBeams):
     ----------
     of_ell : (ells,) array
         Square roots of C_ell.
-    patterns : (products, rings, phi) array
-        The beams without errors.
+    fields : (ports, 2, rings, phi) complex array
+        E up to the band of the grid, in sqrt(K / K / sr).
+    above : (rings, phi) array
+        One above the horizon, likewise.
+    sizes : (ports,) array
+        s, in the unit of E.
     harmonics : (harmonics, rings, phi) array
         Y_k.
     grid : SphereGrid
-        Exact for the beams' coefficients up to that of the map.
+        Exact for the beams' coefficients up to those of the map.
     expectation : FieldErrorsSection
         What the scenario says of them.
     """
@@ -91,20 +98,33 @@ class FieldErrors(ChangedBeams):
     has_table: ClassVar[bool] = True
 
     of_ell: Float[Array, " ells"]
-    patterns: Float[Array, "products rings phi"]
+    fields: Complex[Array, "ports 2 rings phi"]
+    above: Float[Array, "rings phi"]
+    sizes: Float[Array, " ports"]
     harmonics: Float[Array, "harmonics rings phi"]
     grid: SphereGrid
     expectation: FieldErrorsSection = eqx.field(static=True)
 
     @classmethod
     def build(cls, section: FieldErrorsSection, setup: Setup, around: Around) -> FieldErrors:
-        band = setup.beams.lmax + section.lmax
-        grid, values = SphereGrid.of(band, band), around.values or {}
-        own = np.eye(n_modes(section.lmax), n_modes(band))
+        band, values = setup.beams.lmax + 2 * section.lmax, around.values or {}
+        grid, sky = SphereGrid.of(band, band), HemisphereGrid.for_lmax(band)
+        source, mhz = setup.beam_source, setup.frequency_mhz
+        with naming(cls.key):
+            found = source.fields(mhz, sky)
+        theta, phi = np.asarray(found.e_theta), np.asarray(found.e_phi)
+        cos, sin = np.cos(sky.phi), np.sin(sky.phi)
+        fields = np.stack([cos * theta - sin * phi, sin * theta + cos * phi], axis=1)
+        power = sky.integrate((np.abs(fields) ** 2).sum(1))
+        unit = np.sqrt(beam_scale(found, source.beams(mhz, 0)) / 2.0)
+        parts = np.stack([fields.real, fields.imag, np.ones_like(fields.real)])
+        real, imaginary, above = grid.synthesise(sky.modes(parts, band))
         return cls(
             of_ell(values.get(STD, section.std), section.slope, section.lmax),
-            grid.synthesise(np.asarray(setup.beam_source.beams(setup.frequency_mhz, band).modes)),
-            grid.synthesise(own),
+            unit * as_complex(real, imaginary),
+            above[0, 0],
+            unit * np.sqrt(power / (2.0 * np.pi)),
+            grid.synthesise(np.eye(n_modes(section.lmax), n_modes(band))),
             grid,
             section,
         )
@@ -127,61 +147,57 @@ class FieldErrors(ChangedBeams):
         return model
 
     @property
-    def n_ports(self) -> int:
-        """Number of ports."""
-        return round(np.sqrt(self.patterns.shape[0]))
-
-    @property
     def unknowns(self) -> tuple[Unknown, ...]:
-        """Of every ell: the real parts of all ports, order by order, then the imaginary parts."""
+        """Of every ell: parts, ports, components, orders."""
         return tuple(
-            Unknown(f"field_error_{ell}", std=std, size=2 * self.n_ports * (2 * ell + 1))
+            Unknown(f"field_error_{ell}", std=float(std), size=4 * len(self.sizes) * (2 * ell + 1))
             for ell, std in enumerate(self.of_ell)
         )
 
-    def exponents(self, values: Values) -> Complex[Array, "ports rings phi"]:
-        """f of every port."""
-        parts = [values[u.name].reshape(2, self.n_ports, -1) for u in self.unknowns]
-        amplitudes = namespace(*parts).concatenate(parts, axis=2)
+    def errors(self, values: Values) -> Complex[Array, "ports 2 rings phi"]:
+        """e of every port."""
+        parts = [values[u.name].reshape(2, len(self.sizes), 2, -1) for u in self.unknowns]
+        amplitudes = namespace(*parts).concatenate(parts, axis=3)
         real, imaginary = namespace(*parts).tensordot(amplitudes, self.harmonics, 1)
-        return as_complex(real, imaginary)
-
-    def changed(self, values: Values) -> Float[Array, "products rings phi"]:
-        """The beams with errors."""
-        f = self.exponents(values)
-        factors = namespace(f).exp(f[:, None] + f[None].conj())
-        return to_real(to_matrix(self.patterns) * factors)
+        return self.sizes[:, None, None, None] * as_complex(real, imaginary)
 
     def modes(self, modes, values):
         """Add what the errors change."""
-        more = self.grid.analyse(self.changed(values) - self.patterns)[:, : modes.shape[-1]]
-        return modes + (more if modes.ndim == 2 else more[None])
+        e = self.errors(values)
+        xp = namespace(e)
+        crossed = xp.einsum("icrp,jcrp->ijrp", self.fields + 0.5 * self.above * e, e.conj())
+        more = self.grid.analyse(to_real(crossed + crossed.swapaxes(0, 1).conj()))
+        return modes + more[:, : modes.shape[-1]]
 
     def linearised(self, model, centre):
-        """Through the beams times every Y_k, of which all amplitudes of k are made."""
-        coupling, n = model.coupling, self.n_ports
-        beams, size = np.asarray(self.changed(self.values(centre))), coupling.modes.shape[-1]
-        along = (self.grid.analyse(beams * y)[:, :size] for y in np.asarray(self.harmonics))
-        see = coupling.along(along)
-        first, second, imaginary = ports(n)
-        own = np.equal.outer(np.arange(n), first) + 1.0 * np.equal.outer(np.arange(n), second)
-        across = np.equal.outer(np.arange(n), first) - 1.0 * np.equal.outer(np.arange(n), second)
-        # i times a product: its real part is less the imaginary one, and that the real one
-        other = np.arange(len(first)) + np.where(first == second, 0, np.where(imaginary, -1, 1))
-        across = across * np.where(imaginary, 1.0, -1.0)
-        product, time = np.asarray(coupling.layout.product), np.asarray(coupling.layout.time)
-        stds, ells = np.asarray(self.of_ell), np.arange(len(self.of_ell))
+        """Through what every Y_k conj(E_jc + e_jc) sees, of which all derivatives are made."""
+        coupling, n, ells = model.coupling, len(self.sizes), np.arange(len(self.of_ell))
+        there = np.conj(self.fields + self.above * self.errors(self.values(centre)))
+        parts, size = np.stack([there.real, there.imag]), coupling.modes.shape[-1]
+        rows = [self.grid.analyse(parts * y)[..., :size].reshape(-1, size) for y in self.harmonics]
+        # in sets of as many as there are products
+        used = np.concatenate(rows)
+        sets = np.concatenate([used, np.zeros((-len(used) % n**2, size))]).reshape(-1, n**2, size)
+        see, layout, (i, j, imaginary) = coupling.along(sets), coupling.layout, ports(n)
+        first, second, imaginary = (x[np.asarray(layout.product)] for x in (i, j, imaginary))
+        owns = (np.equal.outer(x, np.arange(n))[:, :, None, None] for x in (first, second))
+        by_first, by_second = owns
+        scale = np.repeat(np.asarray(self.of_ell), 2 * ells + 1)
+        place = [slice(ell**2, (ell + 1) ** 2) for ell in ells]
 
         def columns(sky):
-            seen = see(sky)
-            straight, crossed = seen[:, product, time], seen[:, other[product], time]
-            parts = []
-            for ell, std in zip(ells, stds, strict=True):
-                k = slice(ell**2, (ell + 1) ** 2)
-                real = own[:, None, product] * straight[None, k]
-                phase = across[:, None, product] * crossed[None, k]
-                parts.append(std * np.concatenate([real, phase]).reshape(-1, len(product)))
-            return np.concatenate(parts).T
+            seen = see(sky).reshape(-1, layout.n_times)[: len(used)]
+            seen = seen.reshape(-1, 2, n, 2, layout.n_times)
+            # data, components, harmonics
+            seen = np.moveaxis(seen[:, 0] + 1j * seen[:, 1], 0, 2) * scale[:, None]
+            seen = seen[..., np.asarray(layout.time)]
+            data = np.arange(len(first))
+            straight = by_first * seen[second, :, :, data][:, None]
+            turned = by_second * seen[first, :, :, data].conj()[:, None]
+            both = np.stack([straight + turned, 1j * (straight - turned)], axis=1)
+            both = np.where(imaginary[:, None, None, None, None], both.imag, both.real)
+            both = both * self.sizes[:, None, None]
+            return np.concatenate([both[..., k].reshape(len(data), -1) for k in place], axis=1)
 
         return columns
 

@@ -49,14 +49,13 @@ from lusee_bayes.core.section import Section, Treatment
 from lusee_bayes.instrument.beams.fields import (
     AntennaFields,
     HemisphereGrid,
-    ProductBeams,
-    mean_auto_integral,
+    beam_scale,
     product_modes,
     stokes_beam,
 )
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.pointing import Pointing
-from lusee_bayes.instrument.products import auto_indices, to_real
+from lusee_bayes.instrument.products import to_real
 from lusee_bayes.noise.covariance import LowRankCovariance
 from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.systematic import AdditiveNoise
@@ -158,19 +157,6 @@ def unit_spectrum(lmax: int, lowest: int, slope: float) -> Float[np.ndarray, " e
     ell = np.arange(lmax + 1.0)
     shape = np.where(ell >= lowest, (ell + 1.0) ** slope, 0.0)
     return 4.0 * np.pi * shape / ((2.0 * ell + 1.0) @ shape)
-
-
-def beam_scale(fields: AntennaFields, beams: ProductBeams) -> float:
-    """Return what makes products of fields beams in K per K, whatever unit the fields have.
-
-    Parameters
-    ----------
-    fields : AntennaFields
-    beams : ProductBeams
-        Of the same antennas: the scale is that of the mean integral of their autos.
-    """
-    autos = beams.modes[auto_indices(fields.n_antennas), 0]
-    return float(np.sqrt(4.0 * np.pi) * autos.mean() / mean_auto_integral(fields))
 
 
 def linear_modes(fields: AntennaFields, lmax: int) -> tuple[Modes, Modes]:

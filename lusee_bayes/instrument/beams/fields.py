@@ -449,6 +449,19 @@ def product_modes(
     return fields.grid.modes(patterns, lmax)
 
 
+def beam_scale(fields: AntennaFields, beams: ProductBeams) -> float:
+    """Return what makes products of fields beams in K per K, whatever unit the fields have.
+
+    Parameters
+    ----------
+    fields : AntennaFields
+    beams : ProductBeams
+        Of the same antennas: the scale is that of the mean integral of their autos.
+    """
+    autos = beams.modes[auto_indices(fields.n_antennas), 0]
+    return float(np.sqrt(4.0 * np.pi) * autos.mean() / mean_auto_integral(fields))
+
+
 def mean_auto_integral(fields: AntennaFields) -> Float[Array, ""]:
     """Return the integral of the Stokes I auto beam in steradian, averaged over antennas."""
     autos = to_real(stokes_beam(fields))[auto_indices(fields.n_antennas)]

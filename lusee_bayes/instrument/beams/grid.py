@@ -129,6 +129,8 @@ class GridBeams(Described, BeamSource):
         parts = {n: np.tensordot(weights, [getattr(c, n) for c in found], 1) for n in names}
         return replace(found[0], **parts)
 
+    has_fields = False
+
     def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> Any:
         raise InputError(f"{self.path}: between files are beams of products, not the E fields")
 

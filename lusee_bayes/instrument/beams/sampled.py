@@ -231,6 +231,10 @@ class SampledBeams(Described, BeamSource):
             return self.e_theta.shape[1]
         return antennas_of(self.products.shape[1])
 
+    @property
+    def has_fields(self) -> bool:
+        return self.products is None
+
     def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
         if self.products is not None:
             raise InputError(
