@@ -22,7 +22,7 @@ from lusee_bayes.core.checks import Described
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.leave_out import Fitting, fitting, without
-from lusee_bayes.experiment.model import model_to_sample, radiometer, set_up, simulate
+from lusee_bayes.experiment.model import model_to_sample, radiometer, set_up, simulate, systematics
 from lusee_bayes.experiment.rounds import Inference, rebuilds, settled, with_learned_prior
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.coupling import Instrument
@@ -267,6 +267,16 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
         "log_normal": lambda: on_device(log_normal.prior(setup.sky.frequency_mhz, setup.sky.lmax)),
         "layout": lambda: data.layout,
     }
+
+
+def sampled_together(experiment: Experiment) -> dict[str, float]:
+    """Over how many octaves channels share each sampled site (:meth:`.Systematic.octaves`)."""
+    scenario, found = experiment.scenario, {}
+    for treatment, own in systematics(experiment.setup):
+        octaves = own.octaves(attrgetter(own.key)(scenario))
+        if treatment == "sampled" and octaves:
+            found |= {unknown.name: octaves for unknown in own.unknowns}
+    return found
 
 
 # what the seed is folded with for posterior draws

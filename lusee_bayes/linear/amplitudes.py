@@ -311,6 +311,14 @@ class Tied:
     names: tuple[str, ...] = ()
 
 
+def kernel(
+    frequencies_mhz: Float[np.ndarray, " channels"], octaves: float
+) -> Float[np.ndarray, "channels channels"]:
+    """K(f, f') = exp(-(log2 f - log2 f')^2 / (2 octaves^2)), an unknown's covariance."""
+    x = np.log2(frequencies_mhz) / octaves
+    return np.exp(-0.5 * (x[:, None] - x[None]) ** 2)
+
+
 def root_of_kernels(
     kernels: Float[np.ndarray, "n channels channels"],
 ) -> Float[np.ndarray, "channels n white"]:

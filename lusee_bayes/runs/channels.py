@@ -57,7 +57,14 @@ from lusee_bayes.experiment.unknowns import Unknowns
 from lusee_bayes.judge.coverage import N_DRAWS
 from lusee_bayes.judge.cube_fit import SharedTest, shared_tests
 from lusee_bayes.linear import joint, positive_joint
-from lusee_bayes.linear.amplitudes import Amplitudes, Tied, information_given, tie, told_by_others
+from lusee_bayes.linear.amplitudes import (
+    Amplitudes,
+    Tied,
+    information_given,
+    kernel,
+    tie,
+    told_by_others,
+)
 from lusee_bayes.linear.information import Information
 from lusee_bayes.results.channel import ChannelData, ChannelResult, SkyModes
 from lusee_bayes.results.channel_map import Conditioned, channel_result, conditioned
@@ -437,14 +444,6 @@ class ChannelAlone:
             instrument=unknowns,
             **(self.figures | information.fit(moved, left) | {"information_bits": float(bits)}),
         )
-
-
-def kernel(
-    frequencies_mhz: Float[np.ndarray, " channels"], octaves: float
-) -> Float[np.ndarray, "channels channels"]:
-    """K of the module's equations, with an unknown's values at all frequencies."""
-    x = np.log2(frequencies_mhz) / octaves
-    return np.exp(-0.5 * (x[:, None] - x[None]) ** 2)
 
 
 def tie_channels(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import replace as replace_fields
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming, reading
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.data_files import Data
-from lusee_bayes.experiment.experiment import Experiment, infer, program_pieces
+from lusee_bayes.experiment.experiment import Experiment, infer, program_pieces, sampled_together
 from lusee_bayes.experiment.model import true_values
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
@@ -45,8 +46,10 @@ from lusee_bayes.sampling.hmc import Chains, Checkpoints, Sampler, Whitening, sa
 from lusee_bayes.sampling.log_normal_program import coordinates_of
 from lusee_bayes.sampling.mode import laplace_approximation
 from lusee_bayes.sampling.programs import Program, load_program, predicts, require_sampleable
+from lusee_bayes.sampling.shared_sites import SharedSites, of_channel, site_of
 from lusee_bayes.systematics.gain_drifts import SCALES
-from lusee_bayes.systematics.systematic import SKY, Chart, Systematic
+from lusee_bayes.systematics.registered import SYSTEMATICS
+from lusee_bayes.systematics.systematic import SKY, Chart, Systematic, present
 
 # where the mode of a collapsed program is looked for
 STARTS = 4
@@ -81,25 +84,73 @@ def sample_result(
         If ``folder`` holds an unfinished run and ``resume`` is not given, if the unfinished run has
         other settings, or if the program does not end with draws of the sky.
     """
+    given = {"resume": resume, "stages": stages}
+    return sample_together({"": experiment}, program, sampler, folder, **given)[0]
+
+
+def sample_together(
+    experiments: Mapping[str, Experiment],
+    program: Program,
+    sampler: Sampler,
+    folder: Path,
+    *,
+    resume: bool = False,
+    stages: Stages | None = None,
+) -> tuple[SampleResult, ...]:
+    """Sample the programs of several channels, which share unknowns, as one.
+
+    Parameters
+    ----------
+    experiments : mapping of Experiment
+        Of each channel, by the folder of its results in ``folder``.
+    program, sampler, folder, resume, stages
+        As of :func:`sample_result`, which is that of a single channel.
+    """
     stages = stages or Stages()
-    scenario, data = experiment.scenario, experiment.data
     with stages("posterior"):
-        inference = infer(experiment)
+        inferences = {name: infer(one) for name, one in experiments.items()}
+    several = len(experiments) > 1
+    scenarios = [one.scenario.to_yaml() for one in experiments.values()]
     identity = {
-        "scenario": scenario.to_yaml(),
-        "data": data.digest(),
+        "scenario": "---\n".join(scenarios),
+        "data": " ".join(one.data.digest() for one in experiments.values()),
         "program": program.name,
         "program text": program.digest,
         **{f"sampler's {name}": value for name, value in sampler.identity().items()},
         "versions": versions(with_commit=False),
     }
-    if resume and (finished := _finished(folder, identity, sampler)) is not None:
-        return SampleResult(experiment, inference, finished, stages.seconds, None)
-    arguments = program.arguments(inference.model, program_pieces(experiment))
-    n_modes = inference.posterior.mean.shape[0]
-    latent = require_sampleable(program, arguments, data.data, n_modes)
+    if resume and not (folder / CHAINS).exists():
+        found = [_finished(folder / name / SAMPLES, identity, sampler) for name in experiments]
+        if None not in found:
+            made = zip(experiments.values(), inferences.values(), found, strict=True)
+            return tuple(SampleResult(*one, stages.seconds, None) for one in made)
+    arguments, latent = {}, {}
+    for name, one in experiments.items():
+        inference = inferences[name]
+        arguments[name] = program.arguments(inference.model, program_pieces(one))
+        n_modes = inference.posterior.mean.shape[0]
+        latent[name] = require_sampleable(program, arguments[name], one.data.data, n_modes)
+    data = {name: one.data.data for name, one in experiments.items()}
+    first = next(iter(experiments))
+    if several:
+        frequencies = {name: one.scenario.frequency_mhz for name, one in experiments.items()}
+        model = SharedSites(program.model, frequencies, sampled_together(experiments[first]))
+        observed = {"channels": arguments, "data": data}
+    else:
+        model, observed = program.model, {**arguments[first], "data": data[first]}
     with stages("coordinates"):
-        whitening = coordinates(program, arguments, data, inference, latent)
+        if several:
+            start = {
+                site_of(name, site): value
+                for name in experiments
+                for site, value in start_of(inferences[name], latent[name]).items()
+            }
+            hold = [site_of(name, scale) for name in experiments for scale in SCALES]
+            about = laplace_approximation(model, observed, start, hold)
+            whitening = about.whitening if bool(about.converged) else None
+        else:
+            given = arguments[first], experiments[first].data, inferences[first], latent[first]
+            whitening = coordinates(program, *given)
     checkpoints = Checkpoints(folder / CHAINS, identity, resume=resume)
     times = []
     with stages.progress("sampling", sampler.warmup + sampler.draws) as update:
@@ -109,21 +160,24 @@ def sample_result(
             update(iteration, _state_in_words(iteration, state, sampler))
 
         with naming(f"the program '{program.path or program.name}'"):
-            observed = {**arguments, "data": data.data}
-            chains = sample(program.model, observed, sampler, whitening, checkpoints, report)
-    with stages("data tree"):
-        said = {
-            "coordinates": "learned in warmup" if whitening is None else "white",
-            "identity": json.dumps(identity),
-            "frequency_mhz": scenario.frequency_mhz,
-            "frame": "galactic",
-            "scenario": scenario.to_yaml(),
-        }
-        drawn = chains, program, inference.model, inference.posterior, data
-        more = {"arguments": arguments, "truth": true_values(experiment.setup), "attributes": said}
-        tree = to_datatree(*drawn, seed=sampler.seed, **more)
-    speed = _speed(times, chains, sampler.warmup)
-    return SampleResult(experiment, inference, tree, stages.seconds, speed)
+            chains = sample(model, observed, sampler, whitening, checkpoints, report)
+    speed, results = _speed(times, chains, sampler.warmup), []
+    for name, one in experiments.items():
+        with stages("data tree"):
+            own, scenario = inferences[name], one.scenario
+            said = {
+                "coordinates": "learned in warmup" if whitening is None else "white",
+                "identity": json.dumps(identity),
+                "frequency_mhz": scenario.frequency_mhz,
+                "frame": "galactic",
+                "scenario": scenario.to_yaml(),
+            }
+            drawn = of_channel(chains, name) if several else chains
+            given = drawn, program, own.model, own.posterior, one.data
+            more = {"arguments": arguments[name], "truth": true_values(one.setup)}
+            tree = to_datatree(*given, seed=sampler.seed, attributes=said, **more)
+        results.append(SampleResult(one, own, tree, stages.seconds, speed))
+    return tuple(results)
 
 
 def coordinates(
@@ -141,16 +195,21 @@ def coordinates(
     positive = arguments.get("log_normal")
     if positive is not None and set(latent) == set(positive.sites):
         return coordinates_of(positive, inference.solution.information)
-    start = {SKY: inference.posterior.mean} if SKY in latent else {}
+    start, arguments = start_of(inference, latent), {**arguments, "data": data.data}
     # where rounds have led to the mode, it is looked for nowhere else
-    for part in inference.expanded if inference.moving else ():
-        found = part.systematic.values(part.expected + inference.amplitudes(part).mean)
-        start |= {name: value for name, value in found.items() if name in latent}
-    arguments = {**arguments, "data": data.data}
     starts = 1 if SKY in latent or set(start) == set(latent) else STARTS
     chart = _chart(arguments, latent)
     found = laplace_approximation(program.model, arguments, start, SCALES, starts, chart)
     return found.whitening if bool(found.converged) else None
+
+
+def start_of(inference: Inference, latent: Sequence[str]) -> dict[str, np.ndarray]:
+    """Where the mode is looked for: at what rounds have found, if there were any."""
+    start = {SKY: inference.posterior.mean} if SKY in latent else {}
+    for part in inference.expanded if inference.moving else ():
+        found = part.systematic.values(part.expected + inference.amplitudes(part).mean)
+        start |= {name: np.asarray(value) for name, value in found.items() if name in latent}
+    return start
 
 
 def _chart(arguments: dict, latent: list[str]) -> Chart | None:
@@ -165,17 +224,17 @@ def _chart(arguments: dict, latent: list[str]) -> Chart | None:
     return None
 
 
-def _finished(folder: Path, identity: dict, sampler: Sampler) -> xr.DataTree | None:
+def _finished(path: Path, identity: dict, sampler: Sampler) -> xr.DataTree | None:
     """The samples that an earlier run of the same settings has left, if there are enough."""
-    if (folder / CHAINS).exists() or not (folder / SAMPLES).exists():
+    if not path.exists():
         return None
-    tree = read_datatree(folder / SAMPLES)
-    with reading(folder / SAMPLES, "samples"):
+    tree = read_datatree(path)
+    with reading(path, "samples"):
         same = json.loads(tree.attrs["identity"]) == json.loads(json.dumps(identity))
     if not same or tree["posterior"].sizes["draw"] != sampler.draws:
         raise InputError(
-            f"'{folder}' holds a finished run with other settings; leave out --resume to replace "
-            "it, or give another folder"
+            f"'{path.parent}' holds a finished run with other settings; leave out --resume to "
+            "replace it, or give another folder"
         )
     return tree
 
@@ -218,8 +277,8 @@ def run_sample(
 ) -> RunOutcome[tuple[SampleResult, ...]]:
     """Sample the posterior of a program, and write the folder in one transaction.
 
-    Several frequencies are sampled one after the other, each in a folder of its own, and their maps
-    are put together in cubes.
+    Several frequencies are sampled one after the other, or all together where they share what is
+    sampled. Each has a folder of its own, and their maps are put together in cubes.
 
     Parameters
     ----------
@@ -254,10 +313,11 @@ def run_sample(
 
     given = {"replace": replace, "program": named(program)}
 
-    def one(scenario: Scenario, folder: Path, stages: Stages) -> RunOutcome[SampleResult]:
-        with run_folder(folder, SAMPLE, scenario, data, program.path, **given) as run:
-            n_draws = sampler.chains * sampler.draws
-            experiment = measured_experiment(scenario, data, stages, n_draws=n_draws)
+    n_draws = sampler.chains * sampler.draws
+
+    def one(channel: Scenario, folder: Path, stages: Stages) -> RunOutcome[SampleResult]:
+        with run_folder(folder, SAMPLE, channel, data, program.path, **given) as run:
+            experiment = measured_experiment(channel, data, stages, n_draws=n_draws)
             made = sample_result(
                 experiment, program, sampler, run.path, resume=resume, stages=stages
             )
@@ -267,14 +327,36 @@ def run_sample(
     if scenario.single:
         made = one(scenario, folder, stages)
         return replace_fields(made, result=(made.result,))
+    channels = {f"{one.frequency_mhz:.15g}MHz": one for one in scenario.channels()}
     with run_folder(folder, CUBES, scenario, data, program.path, **given) as run:
         runs = []
-        for channel in scenario.channels():
-            where = run.path / f"{channel.frequency_mhz:.15g}MHz"
-            runs.append(one(channel, where, Stages(stages.console, verbose=stages.verbose)))
+        if samples_together(scenario):
+            experiments = {
+                name: measured_experiment(channel, data, stages, n_draws=n_draws)
+                for name, channel in channels.items()
+            }
+            drawn = sample_together(
+                experiments, program, sampler, run.path, resume=resume, stages=stages
+            )
+            for name, result in zip(channels, drawn, strict=True):
+                given_to = run.path / name, SAMPLE, channels[name], data, program.path
+                with run_folder(*given_to, **given) as own:
+                    origin = Provenance.of_experiment(experiments[name], data)
+                    runs.append(own.write(result, stages, origin))
+        else:
+            for name, channel in channels.items():
+                told = Stages(stages.console, verbose=stages.verbose)
+                runs.append(one(channel, run.path / name, told))
         results = tuple(each.result for each in runs)
         runs.append(run.write((scenario, results), stages))
         return RunOutcome(results, run.path, [file for each in runs for file in each.files])
+
+
+def samples_together(scenario: Scenario) -> bool:
+    """Whether channels share something that is sampled."""
+    treated = present(SYSTEMATICS, scenario)
+    sampled = [one for one in treated if one[0].treatment(scenario) == "sampled"]
+    return any(cls.octaves(section) for cls, section in sampled)
 
 
 def named(program: Program) -> str:
@@ -321,4 +403,6 @@ CUBES = RunKind(
         text_file("scenario.yaml", lambda sampled: sampled[0].to_yaml()),
     ),
     figures={},
+    unfinished=CHAINS,
+    resume=RESUME,
 )

@@ -251,10 +251,11 @@ def laplace_approximation(
     first = shapes.from_values(unconstrained)
     predicts = any(isinstance(s.get("fn"), Prediction) and s["is_observed"] for s in trace.values())
     problem = Potential(program, arguments, shapes, predicts, tuple(hold))
-    if not problem.predicts and n > MOST_COLLAPSED:
+    observed = sum(s["type"] == "sample" and s["is_observed"] for s in trace.values())
+    if not problem.predicts and n > (most := MOST_COLLAPSED * observed):
         raise InputError(
             f"the program has {n} unknowns and no site CorrelatedNormal, whose curvature is found "
-            f"without the Hessian; at most {MOST_COLLAPSED} unknowns are possible"
+            f"without the Hessian; at most {most} unknowns are possible"
         )
     free = jnp.ones(n).at[problem.held()].set(0.0)
     scale = FIRST * _prior_scale(latent)

@@ -1,0 +1,115 @@
+"""The programs of several channels as one, in which unknowns that channels share are tied.
+
+A site of a channel is called ``CHANNEL/NAME``. In prior standard deviations from its prior mean, an
+unknown that channels share is a Gaussian process z over frequency (:func:`.kernel`). Given z at the
+frequencies of earlier channels, a later channel has (k: covariance with those, K: of those) ::
+
+    z ~ N(k^T K^-1 z, 1 - k^T K^-1 k),
+
+and where that variance vanishes, as of values that are the same in all channels, it has no site of
+its own, but that value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from numpyro import distributions as dist
+from numpyro.primitives import Messenger
+
+from lusee_bayes.core.arrays import Array
+from lusee_bayes.linear.amplitudes import kernel
+from lusee_bayes.sampling.hmc import Chains
+
+# variances below this are rounding: of K's own, 1e-5 of a standard deviation
+NOTHING_LEFT = 1e-10
+
+
+def site_of(channel: str, name: str) -> str:
+    """The name of a channel's site."""
+    return f"{channel}/{name}"
+
+
+def of_channel(chains: Chains, channel: str) -> Chains:
+    """The draws of one channel, with its own names of sites."""
+    start = site_of(channel, "")
+    own = {n.removeprefix(start): v for n, v in chains.sites.items() if n.startswith(start)}
+    return Chains(own, chains.statistics)
+
+
+@dataclass(frozen=True)
+class SharedSites:
+    """A NumPyro model of several channels; its arguments, and the data, are mappings by channel.
+
+    Attributes
+    ----------
+    program : callable
+        The NumPyro model of a channel.
+    frequencies_mhz : dict of float
+        By channel.
+    octaves : dict of float
+        Over which channels share a site, by name (:meth:`.Systematic.octaves`).
+    """
+
+    program: Callable
+    frequencies_mhz: Mapping[str, float]
+    octaves: Mapping[str, float]
+
+    def __call__(self, channels: Mapping[str, dict], data: Mapping[str, Array] | None = None):
+        """Sample or observe all channels."""
+        known: dict[str, dict[str, Any]] = {}
+        for channel, arguments in channels.items():
+            with _Channel(self, channel, known):
+                self.program(**arguments, data=None if data is None else data[channel])
+
+
+class _Channel(Messenger):
+    """Names a channel's sites, and ties those that are shared to earlier channels.
+
+    known : by site and channel, values, or z where those differ; of sites alone, not of what
+        follows from others
+    """
+
+    def __init__(self, shared: SharedSites, channel: str, known: dict[str, dict[str, Any]]):
+        super().__init__()
+        self.shared, self.channel, self.known = shared, channel, known
+        # name and prior of what is shared, by site
+        self.sites: dict[str, tuple[str, dist.Distribution]] = {}
+
+    def process_message(self, msg: dict[str, Any]) -> None:
+        if msg["type"] not in ("sample", "deterministic"):
+            return
+        name, prior = msg["name"], msg["fn"]
+        msg["name"] = site_of(self.channel, name)
+        if msg["type"] != "sample" or name not in self.shared.octaves:
+            return
+        octaves, before = self.shared.octaves[name], self.known.setdefault(name, {})
+        if before and np.isinf(octaves):
+            (value,) = before.values()
+            msg |= {"type": "deterministic", "value": value}
+            return
+        self.sites[msg["name"]] = name, prior
+        if not before:
+            return
+        mhz = np.array([self.shared.frequencies_mhz[c] for c in (*before, self.channel)])
+        *k, variance = kernel(mhz, octaves)[-1]
+        weights = np.linalg.solve(kernel(mhz[:-1], octaves), k)
+        variance -= weights @ k
+        mean = prior.loc + prior.scale * (weights @ jnp.stack(list(before.values())))
+        if variance < NOTHING_LEFT:
+            del self.sites[msg["name"]]
+            msg |= {"type": "deterministic", "value": mean}
+        else:
+            msg["fn"] = dist.Normal(mean, prior.scale * np.sqrt(variance))
+
+    def postprocess_message(self, msg: dict[str, Any]) -> None:
+        if msg["name"] in self.sites:
+            name, prior = self.sites[msg["name"]]
+            value = msg["value"]
+            if np.isfinite(self.shared.octaves[name]):
+                value = (value - prior.loc) / prior.scale
+            self.known[name][self.channel] = value
