@@ -23,16 +23,7 @@ from lusee_bayes.results.channel_map import conditioned
 from lusee_bayes.results.finished_runs import FinishedRun, Provenance, comparison_rows, read_runs
 from lusee_bayes.results.prior_comparison import PriorComparison, UnderPrior
 from lusee_bayes.runs.cost import measured_experiment
-from lusee_bayes.runs.folder import (
-    SCENARIO,
-    Output,
-    RunKind,
-    RunOutcome,
-    model_file,
-    rows_file,
-    run_folder,
-    text_file,
-)
+from lusee_bayes.runs.folder import SCENARIO, Output, RunKind, RunOutcome, run_folder
 from lusee_bayes.systematics.context import Setup
 
 
@@ -73,7 +64,7 @@ COMPARISON = RunKind(
     "compare",
     outputs=(
         Output(_write_page),
-        rows_file("comparison.csv", comparison_rows),
+        Output.rows("comparison.csv", comparison_rows),
     ),
     figures={"maps": maps_of_runs, "curves": curves_of_runs},
     dpi=100,
@@ -169,10 +160,10 @@ def _under(name: str, setup: Setup, experiment: Experiment, found: Inference) ->
 COMPARE_PRIORS = RunKind(
     "compare-priors",
     outputs=(
-        model_file("priors.json", lambda result: result.summary()),
-        text_file("priors.md", lambda result: render_text("priors.md", result=result)),
+        Output.model("priors.json", lambda result: result.summary()),
+        Output.text("priors.md", lambda result: render_text("priors.md", result=result)),
         SCENARIO,
-        rows_file("priors.csv", lambda result: result.rows()),
+        Output.rows("priors.csv", lambda result: result.rows()),
     ),
     figures={"priors": priors},
 )

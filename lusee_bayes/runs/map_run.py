@@ -18,17 +18,7 @@ from lusee_bayes.results.finished_runs import Provenance
 from lusee_bayes.results.map_result import MapResult
 from lusee_bayes.runs.channels import CHANNELS, map_channels
 from lusee_bayes.runs.cost import posterior_cost, require_fits
-from lusee_bayes.runs.folder import (
-    SCENARIO,
-    Output,
-    RunKind,
-    RunOutcome,
-    model_file,
-    netcdf_file,
-    rows_file,
-    run_folder,
-    table_file,
-)
+from lusee_bayes.runs.folder import SCENARIO, Output, RunKind, RunOutcome, run_folder
 from lusee_bayes.sky.sky_source import write_alms
 
 
@@ -140,21 +130,21 @@ def _write_coefficients(result: MapResult, folder: Path) -> None:
 MAP = RunKind(
     "map",
     outputs=(
-        netcdf_file("posterior.nc", map_files.posterior_tree),
-        netcdf_file("diagnostics.nc", map_files.diagnostics_tree),
+        Output.netcdf("posterior.nc", map_files.posterior_tree),
+        Output.netcdf("diagnostics.nc", map_files.diagnostics_tree),
         Output(_write_maps),
         Output(_write_coefficients, wanted=lambda result: result.single),
-        rows_file("spectra.csv", lambda result: result.spectra()),
-        table_file("sources.csv", lambda result: result.table("fluxes")),
-        table_file("pointing.csv", lambda result: result.table("pointing", "offsets")),
-        table_file("pointing_by_day.csv", lambda result: result.table("pointing", "preferred")),
-        table_file("unknowns.csv", lambda result: result.unknowns and result.unknowns.table),
+        Output.rows("spectra.csv", lambda result: result.spectra()),
+        Output.table("sources.csv", lambda result: result.table("fluxes")),
+        Output.table("pointing.csv", lambda result: result.table("pointing", "offsets")),
+        Output.table("pointing_by_day.csv", lambda result: result.table("pointing", "preferred")),
+        Output.table("unknowns.csv", lambda result: result.unknowns and result.unknowns.table),
         Output(
             lambda r, folder: write_reduced(folder / REDUCED, r.reduced, r.scenario.to_yaml()),
             wanted=lambda r: r.reduced is not None,
         ),
         SCENARIO,
-        model_file("summary.json", lambda result: result.summary()),
+        Output.model("summary.json", lambda result: result.summary()),
     ),
     figures={
         "maps": maps.sky_maps,

@@ -41,7 +41,7 @@ from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.report.figures.plans import forecasts
 from lusee_bayes.results.forecast import AS_GIVEN, Forecast, Variation, forecast_rows
 from lusee_bayes.runs.cost import duration, posterior_cost, require_fits
-from lusee_bayes.runs.folder import RunKind, RunOutcome, inputs_of, rows_file, run_folder
+from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, inputs_of, run_folder
 from lusee_bayes.systematics.context import Around, Setup
 
 
@@ -400,7 +400,7 @@ def run_plan(
 # what the folder of a plan holds; a new file is one line here
 PLAN = RunKind(
     "plan",
-    outputs=(rows_file("plan.csv", forecast_rows),),
+    outputs=(Output.rows("plan.csv", forecast_rows),),
     figures={"plan": forecasts},
     unfinished=UNFINISHED,
     resume="the same command continues from the finished forecasts",

@@ -30,15 +30,7 @@ from lusee_bayes.results.finished_runs import Provenance
 from lusee_bayes.results.map_files import write_cubes, write_maps
 from lusee_bayes.results.sample_result import CHAINS, SAMPLES, SampleResult
 from lusee_bayes.runs.cost import measured_experiment
-from lusee_bayes.runs.folder import (
-    Output,
-    RunKind,
-    RunOutcome,
-    model_file,
-    netcdf_file,
-    run_folder,
-    text_file,
-)
+from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, run_folder
 from lusee_bayes.sampling.datatree import read_datatree, to_datatree
 from lusee_bayes.sampling.distributions import TimesStudentT
 from lusee_bayes.sampling.hmc import Chains, Checkpoints, Sampler, Whitening, sample
@@ -290,11 +282,11 @@ def _write_cubes(sampled: tuple[Scenario, tuple[SampleResult, ...]], folder: Pat
 
 
 SAMPLE_OUTPUTS = (
-    netcdf_file(SAMPLES, lambda run: run.tree),
+    Output.netcdf(SAMPLES, lambda run: run.tree),
     Output(lambda run, folder: write_maps(folder, run.maps, run.experiment.scenario)),
-    text_file("summary.csv", lambda run: run.summary.to_csv(index_label="quantity")),
-    text_file("scenario.yaml", lambda run: run.experiment.scenario.to_yaml()),
-    model_file("sampling.json", lambda run: run.figures()),
+    Output.text("summary.csv", lambda run: run.summary.to_csv(index_label="quantity")),
+    Output.text("scenario.yaml", lambda run: run.experiment.scenario.to_yaml()),
+    Output.model("sampling.json", lambda run: run.figures()),
 )
 
 # what the folder of a sampled program holds; a new file is one line here
@@ -318,7 +310,7 @@ CUBES = RunKind(
     "sampled cubes",
     outputs=(
         Output(_write_cubes),
-        text_file("scenario.yaml", lambda sampled: sampled[0].to_yaml()),
+        Output.text("scenario.yaml", lambda sampled: sampled[0].to_yaml()),
     ),
     figures={},
 )

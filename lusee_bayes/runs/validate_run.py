@@ -16,7 +16,7 @@ from lusee_bayes.results.finished_runs import Provenance
 from lusee_bayes.results.sample_result import CHAINS
 from lusee_bayes.results.validation_result import ValidationResult, allowed
 from lusee_bayes.runs.cost import demand_of, measured_experiment
-from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, model_file, run_folder, text_file
+from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, run_folder
 from lusee_bayes.runs.sample_run import RESUME, SAMPLE_OUTPUTS, named, sample_result
 from lusee_bayes.sampling.hmc import Sampler
 from lusee_bayes.sampling.least import require_draws, require_simulations
@@ -104,8 +104,8 @@ VALIDATION = RunKind(
     "validate",
     outputs=(
         *(Output(lambda r, folder, o=o: o.write(r.sampled, folder)) for o in SAMPLE_OUTPUTS),
-        model_file("validation.json", lambda result: result.summary()),
-        text_file("validation.md", _as_markdown),
+        Output.model("validation.json", lambda result: result.summary()),
+        Output.text("validation.md", _as_markdown),
     ),
     figures={
         "comparison": lambda result: comparison(result.comparison),
