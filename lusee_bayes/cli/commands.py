@@ -324,7 +324,7 @@ def validate_command(
     require_draws(chains.draws)
     loaded = options.load(scenario)
     from lusee_bayes.cli.tables import checks_table
-    from lusee_bayes.runs.validate_run import demand_of_calibration, run_validate
+    from lusee_bayes.runs.sample_run import demand_of_calibration, run_validate
 
     with engine.open(demand_of_calibration(loaded)) as opened:
         folder = options.folder(scenario, "-validation")

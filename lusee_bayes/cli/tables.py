@@ -10,7 +10,7 @@ from rich.table import Table
 from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows
 from lusee_bayes.results.forecast import AS_GIVEN, Forecast, forecast_rows
 from lusee_bayes.results.prior_comparison import PriorComparison
-from lusee_bayes.results.validation_result import allowed
+from lusee_bayes.results.sample_result import ValidationResult
 from lusee_bayes.sampling.validation import Check
 
 
@@ -47,8 +47,8 @@ def checks_table(checks: list[Check]) -> Table:
     table = Table("check", "value", "allowed", "", "what it is")
     for check in checks:
         verdict = "ok" if check.passed else "FAILED"
-        meaning = escape(check.meaning)
-        table.add_row(escape(check.name), f"{check.value:.4g}", allowed(check), verdict, meaning)
+        value, allowed = f"{check.value:.4g}", ValidationResult.allowed(check)
+        table.add_row(escape(check.name), value, allowed, verdict, escape(check.meaning))
     return table
 
 
