@@ -111,8 +111,7 @@ def map_command(
         raise InputError("--workers and --cluster share out channels; give --frequencies")
     with engine.open(demand_of(loaded)) if several else nullcontext() as opened:
         given = {"truth": truth, "earlier": add, "thorough": diagnose}
-        folder = options.folder(scenario)
-        run = run_map(loaded, folder, engine=opened, **given, **options.running())
+        run = run_map(loaded, options.folder(scenario), engine=opened, **given, **options.running())
     options.tell(*run.result.lines(), f"look at {run.page}", files=run.files)
 
 
@@ -148,8 +147,7 @@ def simulate_command(
 
     loaded = options.load(scenario, frequencies_mhz=frequencies)
     if flight:
-        place = options.output or Path("flight")
-        files = run_simulate_flight(loaded, place, **options.running())
+        files = run_simulate_flight(loaded, options.output or Path("flight"), **options.running())
         options.tell(*files.lines())
         return
     path = options.output or Path("data.nc")

@@ -71,8 +71,7 @@ class DaskEngine(engine.Engine):
     def work_in(self, folder: Path) -> None:
         self._folder = folder.resolve()
         asked = code_versions(), self._folder, self._demand
-        answers = self.client.run(refusal_of, *asked, on_error="return")
-        for worker, answer in answers.items():
+        for worker, answer in self.client.run(refusal_of, *asked, on_error="return").items():
             if answer is not None:
                 raise InputError(f"worker {worker}: {answer}")
 

@@ -71,8 +71,7 @@ def in_threads(function: Callable[[T], R], items: Sequence[T]) -> list[R]:
 @contextmanager
 def threads(n: int) -> Iterator[ThreadPoolExecutor]:
     """Start so many threads, each with its share of the processors for products of matrices."""
-    share = max(1, processors() // n)
-    with threadpool_limits(share, "blas"), ThreadPoolExecutor(n) as pool:
+    with threadpool_limits(max(1, processors() // n), "blas"), ThreadPoolExecutor(n) as pool:
         yield pool
 
 
@@ -253,8 +252,7 @@ def merged_as_tree(parts: Iterator[R], n: int, merge: Merge[R]) -> R:
     if n == 1:
         return next(parts)
     half = 1 << ((n - 1).bit_length() - 1)
-    first = merged_as_tree(parts, half, merge)
-    return merge(first, merged_as_tree(parts, n - half, merge))
+    return merge(merged_as_tree(parts, half, merge), merged_as_tree(parts, n - half, merge))
 
 
 # the variable by which Dask's own programs are told of a cluster

@@ -159,8 +159,7 @@ def with_grid(dataset: xr.Dataset) -> xr.Dataset:
             "refinement_level": round(np.log2(n / 12) / 2),
         }
         indices = {"standard_name": "healpix_index", "units": "1"}
-        packed = {"zlib": True, "shuffle": True}
-        numbers = dim, np.arange(n, dtype=np.int32), indices, packed
+        numbers = dim, np.arange(n, dtype=np.int32), indices, {"zlib": True, "shuffle": True}
         dataset = dataset.assign_coords({index: numbers}).assign({grid: ((), np.int8(0), mapping)})
     return dataset
 

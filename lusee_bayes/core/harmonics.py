@@ -86,8 +86,7 @@ def from_healpy(alm: Complex[np.ndarray, "*batch alms"]) -> Float[np.ndarray, "*
 def to_healpy(modes: Float[Array, " modes"]) -> Complex[np.ndarray, " alms"]:
     """Convert real packed coefficients to healpy's; inverse of :func:`from_healpy`."""
     modes = np.asarray(modes)
-    lmax = lmax_of(modes.shape[-1])
-    ell, m = healpy.Alm.getlm(lmax)
+    ell, m = healpy.Alm.getlm(lmax_of(modes.shape[-1]))
     centre = ell * (ell + 1)
     alm = (modes[centre + m] + 1j * modes[centre - m]) / SQRT2
     return np.where(m == 0, modes[centre] + 0j, alm)
@@ -130,8 +129,7 @@ def map_to_modes(pixels: Float[np.ndarray, " pixels"], lmax: int) -> Float[np.nd
 def modes_to_map(modes: Float[Array, " modes"], nside: int) -> Float[np.ndarray, " pixels"]:
     """Synthesise the HEALPix RING map of packed coefficients."""
     require_nside(nside)
-    alm = to_healpy(modes)
-    return healpy.alm2map(alm, nside, lmax=lmax_of(np.shape(modes)[-1]))
+    return healpy.alm2map(to_healpy(modes), nside, lmax=lmax_of(np.shape(modes)[-1]))
 
 
 @lru_cache(maxsize=8)
@@ -149,8 +147,7 @@ def polar_functions(theta: Angles, lmax: int) -> AtPoints:
 
 def azimuth_functions(phi: Angles, lmax: int) -> Float[np.ndarray, "points orders"]:
     """Return the azimuthal factor of y for m = -lmax..lmax: -sqrt(2) sin, 1, sqrt(2) cos."""
-    m = np.arange(1, lmax + 1)
-    angle = np.asarray(phi, dtype=float)[:, None] * m
+    angle = np.asarray(phi, dtype=float)[:, None] * np.arange(1, lmax + 1)
     sine, cosine = -SQRT2 * np.sin(angle)[:, ::-1], SQRT2 * np.cos(angle)
     return np.concatenate([sine, np.ones((len(angle), 1)), cosine], axis=1)
 

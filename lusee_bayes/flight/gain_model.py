@@ -383,5 +383,4 @@ def synthetic_gains() -> GainModel:
     # every level and port has a law of its own
     factor = 1.0 + 0.1 * np.arange(len(PLACES)).reshape(*LEAD, 1, 1)
     coefficient = np.broadcast_to(TERMS, (*LEAD, N_COMPONENTS, N_TERMS)) * factor
-    mhz = np.broadcast_to(f, mean.shape).copy()
-    return GainModel("made up", mhz, mean, component, coefficient)
+    return GainModel("made up", np.broadcast_to(f, mean.shape).copy(), mean, component, coefficient)

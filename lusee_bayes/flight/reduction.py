@@ -118,8 +118,7 @@ def _pieces(line: Timeline) -> list[slice]:
     ends = np.flatnonzero(np.append(np.diff(bin_of) != 0, True)) + 1
     pieces, start = [], 0
     for k, end in enumerate(ends):
-        last = k + 1 == len(ends)
-        if last or end - start >= PIECE or run[ends[k + 1] - 1] != run[start]:
+        if k + 1 == len(ends) or end - start >= PIECE or run[ends[k + 1] - 1] != run[start]:
             pieces.append(slice(start, int(end)))
             start = int(end)
     return pieces
@@ -191,8 +190,7 @@ class State:
         basis = np.full((session.PORTS, 3, averaging.n_bins), np.nan)
         for port, level in enumerate(levels):
             if level != session.NO_LEVEL:
-                splines = recipe.table.basis(level, port, middles)
-                basis[port] = splines[:, channels].mean(axis=2)
+                basis[port] = recipe.table.basis(level, port, middles)[:, channels].mean(axis=2)
         bands = tuple(
             ChannelBand.of(f, section.bandwidth_mhz, section.degree, averaging, middles, shared)
             for f in recipe.frequencies_mhz
@@ -364,8 +362,7 @@ def _flag_bursts(spectra: reduced.Reduced, false_alarm: float, number: int) -> S
     there = np.isfinite(autos)
     autos, noise = np.where(there, autos, 0.0), np.where(there & (noise > 0.0), noise, np.inf)
     reason = spectra.reason[number]
-    good = reason == reduced.USED
-    burst, scatter = flags.burst_flags(seconds, autos, noise, good, false_alarm)
+    burst, scatter = flags.burst_flags(seconds, autos, noise, reason == reduced.USED, false_alarm)
     reason[burst] = reduced.BURST
     return scatter
 

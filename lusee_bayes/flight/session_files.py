@@ -308,8 +308,7 @@ def _write_all_but_spectra(file: h5py.File, rows: SessionRows) -> None:
     number, raw_s, mjd = np.arange(rows.n_rows), rows.raw_s, rows.mjd()
     times = {"unique_ids": number, "original_indices": number, "mjd_times": mjd, "raw_times": raw_s}
     telemetry = {"time": raw_s, "mjd_time": mjd, **rows.telemetry}
-    groups = {"spectra": times, META: rows.metadata(), INTERPOLATED: telemetry}
-    for group, arrays in groups.items():
+    for group, arrays in {"spectra": times, META: rows.metadata(), INTERPOLATED: telemetry}.items():
         for name, values in arrays.items():
             file.create_dataset(f"{group}/{name}", data=values, **PACKED)
     file["spectra"].attrs["count"] = np.int64(rows.n_rows)

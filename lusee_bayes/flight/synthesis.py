@@ -124,8 +124,7 @@ class ChannelSpectra:
 
 def _at_channels(weights: Float[np.ndarray, "channels nodes"], values: np.ndarray) -> np.ndarray:
     """Values (nodes, rows, ...) in all channels: (..., rows, channels)."""
-    found = np.tensordot(values, weights, axes=(0, 1))
-    return np.moveaxis(found, 0, -2)
+    return np.moveaxis(np.tensordot(values, weights, axes=(0, 1)), 0, -2)
 
 
 # of the 31 bits of a number, so many hold the largest of a spectrum. What is rounded then is far
@@ -208,8 +207,7 @@ def bit_slices(counts: Counts) -> Int[np.ndarray, " products"]:
     top = np.empty(counts.shape[1])
     largest = np.abs(counts[0, session.OF_FLIGHT[session.AUTOS]]).max(axis=1)
     top[session.OF_FLIGHT] = np.sqrt(largest[session.FIRST_PORT] * largest[session.SECOND_PORT])
-    bits = np.ceil(np.log2(top)) + REFERENCE - BITS
-    return np.clip(bits, 0, REFERENCE).astype(np.int64)
+    return np.clip(np.ceil(np.log2(top)) + REFERENCE - BITS, 0, REFERENCE).astype(np.int64)
 
 
 def rounded(counts: Counts, bitslice: BitSlices) -> Rounded:

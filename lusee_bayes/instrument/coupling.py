@@ -546,8 +546,7 @@ class CouplingMatrix(Coupling):
         straight, crossed = both[..., :half], both[..., half:]
         plus, minus = straight[:, :n] - crossed[:, n:], straight[:, n:] + crossed[:, :n]
         ell, m = mode_numbers(self.lmax)
-        above = (m >= 0)[:, None]
-        packed = xp.where(above, plus[np.abs(m), ell], minus[np.abs(m), ell])
+        packed = xp.where((m >= 0)[:, None], plus[np.abs(m), ell], minus[np.abs(m), ell])
         return self.pointing.pole_from_galactic.T(packed.T).T.reshape(-1, *columns)
 
     def _block(self, run: int, times) -> Float[Array, "products times modes"]:

@@ -136,8 +136,7 @@ class Pointing(eqx.Module):
         observation : Observation
             With its own site, lean and turntable angles.
         """
-        lmax = len(self.mcmf_from_lander.blocks) - 1
-        lander, turntable = _lander(observation, lmax)
+        lander, turntable = _lander(observation, len(self.mcmf_from_lander.blocks) - 1)
         return replace(self, mcmf_from_lander=lander, turntable=turntable)
 
     @property
@@ -277,8 +276,7 @@ def with_offsets(observation: Observation, values: Values) -> Observation:
     given = {name: float(value) for name, value in values.items()}
     drift = given.get("clock_drift_s_per_day", 0.0)
     stretch = 1.0 + drift / 86400.0
-    late = given.get("clock_s", 0.0) + drift * observation.hours / 24.0
-    times = later(observation.times, late)
+    times = later(observation.times, given.get("clock_s", 0.0) + drift * observation.hours / 24.0)
     angles = zip(observation.turntable_deg, _of_runs(observation.n_runs), strict=True)
     windows = observation.windows
     if windows is not None:

@@ -287,8 +287,7 @@ class DataLayout(Described, eqx.Module):
             raise InputError(
                 f"all {flags.size} samples are flagged or missing; there is nothing to map"
             )
-        index = None if not flags.any() else np.flatnonzero(~flags.ravel())
-        return cls(*flags.shape, index)
+        return cls(*flags.shape, None if not flags.any() else np.flatnonzero(~flags.ravel()))
 
     @property
     def size(self) -> int:

@@ -443,8 +443,7 @@ def read_visibilities(path: str | Path) -> Visibilities:
     checks.require_finite(f"{path}: visibility (where not flagged)", values)
     with naming(path):
         layout = DataLayout.from_flags(flags)
-        utc = utc_of_jd(found)
-        times, windows = read_windows(found, utc)
+        times, windows = read_windows(found, utc_of_jd(found))
         says_window = windows is not None or said.get("window") == "instant"
         runs = here["run"], tuple(here["turntable_deg"].tolist()), said["step_s"]
         seen = Observation(said["lon_deg"], said["lat_deg"], times, *runs, windows=windows)

@@ -276,8 +276,7 @@ class IsotropicFamily(PriorFamily):
     def around(cls, temperature: float, lmax: int) -> IsotropicFamily:
         """Make the family of skies of about a mean temperature, in K."""
         power = 4.0 * np.pi * (RELATIVE_STRENGTH * temperature) ** 2 / 100.0
-        monopole = float(np.log(4.0 * np.pi * temperature**2))
-        return cls(SpectrumBasis.around(power, lmax), monopole)
+        return cls(SpectrumBasis.around(power, lmax), float(np.log(4.0 * np.pi * temperature**2)))
 
     @property
     def hyperprior(self) -> Hyperprior:
@@ -323,9 +322,7 @@ class IsotropicMember(Member):
         return np.diag(per_mode(self.spectrum))
 
     def traces(self, matrix):
-        of_ells = sum_over_m(np.diagonal(matrix))
-        return self.family.basis.T @ (0.5 * self.spectrum * of_ells)
+        return self.family.basis.T @ (0.5 * self.spectrum * sum_over_m(np.diagonal(matrix)))
 
     def forms(self, columns):
-        of_ells = sum_over_m((columns**2).T).T
-        return self.family.basis.T @ (0.5 * self.spectrum[:, None] * of_ells)
+        return self.family.basis.T @ (0.5 * self.spectrum[:, None] * sum_over_m((columns**2).T).T)

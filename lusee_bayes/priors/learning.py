@@ -95,8 +95,7 @@ def normal_scores(
     z = hyperprior.scores(parameters)
     for _ in range(STEPS):
         pull = slope - known @ (hyperprior.of_scores(z) - parameters)
-        gradient = hyperprior.slopes_of_scores(z) * pull - z
-        step = np.linalg.solve(precision(z), gradient)
+        step = np.linalg.solve(precision(z), hyperprior.slopes_of_scores(z) * pull - z)
         tried = (z + 0.5**k * step for k in range(HALVINGS))
         z = next((there for there in tried if value(there) >= value(z)), z)
     lower = checked_cholesky("the curvature of the parameters", precision(z))
@@ -417,8 +416,7 @@ def _under_drawn_parameters(
         z = jax.random.normal(jax.random.fold_in(key, attempt), (len(root),), dtype=jnp.float64)
         parameters = learned.parameters + root @ np.asarray(z)
         try:
-            prior = family.prior(family.at(parameters).covariance)
-            return information.posterior(prior)
+            return information.posterior(family.prior(family.at(parameters).covariance))
         except InputError as error:
             failed = error
     raise InputError(

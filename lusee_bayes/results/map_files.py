@@ -66,8 +66,7 @@ def write_maps(folder: Path, maps: Mapping[str, Pixels], scenario: Scenario) -> 
             for key, value in cards(name, scenario).items()
         ]
         column = {"column_names": [name.upper()], "column_units": "K", "dtype": np.float64}
-        path = folder / f"{name}.fits"
-        healpy.write_map(path, pixels, coord="G", extra_header=extra, **column)
+        healpy.write_map(folder / f"{name}.fits", pixels, coord="G", extra_header=extra, **column)
 
 
 def write_cubes(
@@ -215,8 +214,7 @@ def read_information(path: Path, channel: Scenario) -> SavedInformation:
                 f"--set frequency_mhz={next(iter(kept.children))}"
             )
         found = from_tree(SavedInformation, kept.children[name], str(path))
-    n = n_modes(channel.lmax)
-    if found.information.n_modes != n:
+    if found.information.n_modes != n_modes(channel.lmax):
         lmax = round(np.sqrt(found.information.n_modes)) - 1
         raise InputError(
             f"{path} is of lmax {lmax}, the scenario of {channel.lmax}; use --set lmax={lmax}"

@@ -531,8 +531,7 @@ def map_channels(
 
     def condition(channel: Scenario, told: Stages) -> Conditioned:
         before = None if kept is None else read_information(kept, channel)
-        information = None if before is None else before.information
-        make = partial(build, earlier=information)
+        make = partial(build, earlier=None if before is None else before.information)
         experiment = measured_experiment(channel, data, told, truth=truth, make=make)
         return conditioned(experiment, before, told)
 
@@ -542,8 +541,7 @@ def map_channels(
         return MapResult(scenario, (made.result(known, stages),), seconds=stages.seconds)
     engine.work_in(folder)
     digest = None if kept is None else digest_of(kept)
-    identity = identity_of(scenario, data, truth, digest, thorough)
-    files = ChannelFiles(folder.resolve(), identity)
+    files = ChannelFiles(folder.resolve(), identity_of(scenario, data, truth, digest, thorough))
     channels = tuple(channel.anchored() for channel in scenario.channels())
     alone = not scenario.joint and not scenario.shared
     kind = ChannelResult if alone else ChannelInformation if scenario.joint else ChannelAlone

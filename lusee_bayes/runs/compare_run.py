@@ -127,14 +127,12 @@ def run_compare_priors(
             found = settled(experiment.setup, experiment.data)
 
         def under(prior: str) -> UnderPrior:
-            setup = experiment.setup.with_prior(sections[prior])
-            return _under(prior, setup, experiment, found)
+            return _under(prior, experiment.setup.with_prior(sections[prior]), experiment, found)
 
         engine.work_in(run.path)
         mapped = engine.each(Tasks(under, list(sections), list(sections)), stages, "priors")
         result = PriorComparison(name, scenario, tuple(mapped), stages.seconds)
-        provenance = Provenance.of_experiment(experiment, data)
-        return run.write(result, stages, provenance)
+        return run.write(result, stages, Provenance.of_experiment(experiment, data))
 
 
 def _under(name: str, setup: Setup, experiment: Experiment, found: Inference) -> UnderPrior:

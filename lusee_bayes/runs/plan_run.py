@@ -52,8 +52,7 @@ def expected_snr_squared(posterior: Posterior) -> Float[np.ndarray, " ells"]:
     """
     prior = sum_over_m(posterior.prior.variance())
     left = sum_over_m(posterior.std() ** 2)
-    ratio = np.divide(prior, left, out=np.full_like(prior, np.nan), where=left > 0)
-    return ratio - 1.0
+    return np.divide(prior, left, out=np.full_like(prior, np.nan), where=left > 0) - 1.0
 
 
 def informed_modes(posterior: Posterior) -> int:
@@ -84,8 +83,7 @@ def without_ports(setup: Setup, lost: Sequence[int]) -> Setup:
     dead = np.array([p.i in lost or p.j in lost for p in all_products(n_ports)])
     left = DataLayout.from_flags(~np.asarray(layout.present) | dead[:, None])
     instrument = replace(setup.instrument, layout=left)
-    coupling = replace(setup.coupling, layout=left)
-    return replace(setup, instrument=instrument, coupling=coupling)
+    return replace(setup, instrument=instrument, coupling=replace(setup.coupling, layout=left))
 
 
 def expected_inference(setup: Setup) -> Inference:

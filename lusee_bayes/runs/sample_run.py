@@ -94,8 +94,7 @@ def sample_result(
     if resume and (finished := _finished(folder, identity, sampler)) is not None:
         return SampleResult(experiment, inference, finished, stages.seconds, None)
     arguments = program.arguments(inference.model, program_pieces(experiment))
-    n_modes = inference.posterior.mean.shape[0]
-    latent = require_sampleable(program, arguments, data.data, n_modes)
+    latent = require_sampleable(program, arguments, data.data, inference.posterior.mean.shape[0])
     with stages("coordinates"):
         whitening = coordinates(program, arguments, data, inference, latent)
     checkpoints = Checkpoints(folder / CHAINS, identity, resume=resume)

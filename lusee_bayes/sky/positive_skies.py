@@ -434,8 +434,7 @@ class PositiveSkies(eqx.Module):
         exponent : (modes,) array
             phi.
         """
-        field = self.weight * self.values(channel, exponent)
-        return self.grid.product_matrix(field, self.lmax)
+        return self.grid.product_matrix(self.weight * self.values(channel, exponent), self.lmax)
 
 
 # A of each field, whose rms over the sky is seven times that, and the width of its mean: a template
@@ -479,8 +478,7 @@ class FieldLaws:
 
     def prior(self, skies: PositiveSkies) -> SpectralPrior:
         """The prior of the fields: a spectral prior whose maps have no unit."""
-        lmax = skies.grid.lmax
-        spectra = np.exp(2.0 * self.parameters @ slopes(lmax))
+        spectra = np.exp(2.0 * self.parameters @ slopes(skies.grid.lmax))
         fields = len(self.means)
         spectra[:fields, 0] = 4.0 * np.pi * self.means**2
         return SpectralPrior(

@@ -287,8 +287,7 @@ def on_grid(rows: Pattern, theta: Angles, grid: HemisphereGrid, angle_deg: float
         return np.roll(rows, round(steps), axis=1)
     m = np.fft.fftfreq(n, 1.0 / n)
     spectrum = np.fft.fft(rows, axis=1) / n
-    phi = grid.phi - np.radians(angle_deg)
-    return spectrum @ np.exp(1j * m[:, None] * phi[None])
+    return spectrum @ np.exp(1j * m[:, None] * (grid.phi - np.radians(angle_deg))[None])
 
 
 STOKES = ("I", "Q", "U", "V")
@@ -370,8 +369,7 @@ class ProductBeams(checks.Described, eqx.Module):
         antennas_of(self.n_products)
 
     def description(self) -> tuple[str, ...]:
-        autos = self.modes[auto_indices(antennas_of(self.n_products)), 0]
-        integrals = autos * np.sqrt(4.0 * np.pi)
+        integrals = self.modes[auto_indices(antennas_of(self.n_products)), 0] * np.sqrt(4.0 * np.pi)
         return (
             f"{self.n_products} products at {self.frequency_mhz:g} MHz, lmax = {self.lmax}",
             f"{self.modes.shape[1]} real coefficients each, topocentric, K per K: "
@@ -464,8 +462,7 @@ def beam_scale(fields: AntennaFields, beams: ProductBeams) -> float:
 
 def mean_auto_integral(fields: AntennaFields) -> Float[Array, ""]:
     """Return the integral of the Stokes I auto beam in steradian, averaged over antennas."""
-    autos = to_real(stokes_beam(fields))[auto_indices(fields.n_antennas)]
-    integrals = fields.grid.integrate(autos)
+    integrals = fields.grid.integrate(to_real(stokes_beam(fields))[auto_indices(fields.n_antennas)])
     return namespace(integrals).asarray(integrals.mean())
 
 

@@ -319,8 +319,7 @@ class PortResponse(LuseepyBeam):
         return BandLimitedGrid.of(self.theta, self.n_phi)
 
     def behind(self, receiver: Receiver | None) -> PortResponse:
-        given = receiver is None or self.receiver_said
-        return self if given else replace(self, receiver=receiver)
+        return self if receiver is None or self.receiver_said else replace(self, receiver=receiver)
 
     def description(self) -> tuple[str, ...]:
         known = self.frequencies_mhz

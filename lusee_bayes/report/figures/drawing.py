@@ -121,8 +121,7 @@ def orthographic(axes: Axes, grid: HemisphereGrid, pattern: Float[np.ndarray, "t
     closed = np.concatenate([pattern, pattern[:, :1]], axis=1) / pattern.max()
     # the grid has no node at the zenith itself: every azimuth of the first ring meets there
     closed = np.concatenate([np.full((1, closed.shape[1]), closed[0].mean()), closed])
-    theta = np.append(0.0, grid.theta)
-    x, y = (np.outer(np.sin(theta), f(phi)) for f in (np.cos, np.sin))
+    x, y = (np.outer(np.sin(np.append(0.0, grid.theta)), f(phi)) for f in (np.cos, np.sin))
     image = axes.pcolormesh(
         x, y, closed, cmap=SEQUENTIAL, vmin=0, vmax=1, shading="gouraud", rasterized=True
     )
@@ -230,8 +229,7 @@ def view(pixels: Float[np.ndarray, " pixels"]) -> Float[np.ndarray, "height widt
         on with the rim's own values.
     """
     neighbours, weights = _projection(healpy.npix2nside(len(pixels)))
-    values = np.einsum("kp,kp->p", weights, np.asarray(pixels)[neighbours])
-    return values.reshape(WIDTH // 2, WIDTH)
+    return np.einsum("kp,kp->p", weights, np.asarray(pixels)[neighbours]).reshape(WIDTH // 2, WIDTH)
 
 
 @lru_cache(maxsize=4)
@@ -264,8 +262,7 @@ def unprojected(
     """
     t = np.arcsin(y)
     lat = np.arcsin((2.0 * t + np.sin(2.0 * t)) / np.pi)
-    inside = np.clip(x / np.cos(t), -1.0, 1.0)
-    return -180.0 * inside, np.degrees(lat)
+    return -180.0 * np.clip(x / np.cos(t), -1.0, 1.0), np.degrees(lat)
 
 
 def _graticule(axes: Axes) -> None:
@@ -281,8 +278,7 @@ def _graticule(axes: Axes) -> None:
     # their place is known: the layout need not measure them
     style = {"fontsize": 7, "va": "center", "in_layout": False}
     for lon in MERIDIANS:
-        text = f"{lon % 360:.0f}°"
-        label = axes.text(-EDGE[0] * lon / 180.0, 0.06, text, ha="center", **style)
+        label = axes.text(-EDGE[0] * lon / 180.0, 0.06, f"{lon % 360:.0f}°", ha="center", **style)
         label.set_path_effects(SEEN_ANYWHERE)
     for lat, x, y in zip(PARALLELS, ends, heights, strict=True):
         axes.text(-EDGE[0] * x - 0.05, EDGE[1] * y, f"{lat:.0f}°", ha="right", **style)

@@ -255,8 +255,7 @@ def waterfall(result: MapResult) -> Figure | None:
     if not result.single or reduced is None:
         return None
     figure, panels = drawing.framed((13, 9), 4, 4, sharex=True)
-    first = np.searchsorted(reduced.bin_of, np.arange(reduced.values.shape[2]))
-    days = _days(reduced)[first]
+    days = _days(reduced)[np.searchsorted(reduced.bin_of, np.arange(reduced.values.shape[2]))]
     n_bins = reduced.values.shape[2]
     used_in_part = np.bincount(reduced.bin_of, reduced.reason[band] != USED, n_bins) > 0
     products = {label: k for k, label in enumerate(labels())}

@@ -62,8 +62,7 @@ def forecasts(planned: Sequence[Forecast]) -> Figure:
 def _row_positions(planned: Sequence[Forecast]) -> dict[tuple[str, str], int]:
     """The row of every (family, variation) and of each family's own name, (family, "")."""
     rows: dict[tuple[str, str], int] = {}
-    families = dict.fromkeys(f.variation.family for f in planned)
-    for family in families:
+    for family in dict.fromkeys(f.variation.family for f in planned):
         names = dict.fromkeys(f.variation.name for f in planned if f.variation.family == family)
         if family != AS_GIVEN:
             rows[family, ""] = len(rows)

@@ -79,8 +79,7 @@ def _drawn(
         return drawing.note(title, TOO_FEW)
     tree = arviz_base.from_dict({group: quantities})
     frame = {"layout": "constrained", "figsize": size}
-    collection = plot(tree, backend="matplotlib", figure_kwargs=frame, **options)
-    figure = collection.viz["figure"].item()
+    figure = plot(tree, backend="matplotlib", figure_kwargs=frame, **options).viz["figure"].item()
     figure.suptitle(title)
     pyplot.close(figure)
     return figure
@@ -132,8 +131,7 @@ def uncertainty(run: SampleResult) -> Figure:
         ("width of the 90 % interval", interval, _range(interval), drawing.SEQUENTIAL, percent),
         (skewed, skewness, signed, drawing.DIVERGING, chance),
     ]
-    nside = run.experiment.scenario.map_nside
-    altitude = highest_altitude(run.experiment.data.observation, nside)
+    altitude = highest_altitude(run.experiment.data.observation, run.experiment.scenario.map_nside)
     figure, grid_of_axes = drawing.framed((12, 7.2), 2, 2)
     for axes, panel in zip(grid_of_axes.flat, panels, strict=True):
         drawing.sky_panel(axes, *panel, altitude=altitude, shrink=0.85)
