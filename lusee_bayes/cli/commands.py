@@ -281,9 +281,8 @@ def sample_command(
 
     loaded = options.load(scenario, frequencies_mhz=frequencies)
     program = default_program(loaded) if model is None else load_program(model)
-    folder = options.folder(scenario, f"-{program.name}")
     given = chains.running(loaded.seed, algorithm) | options.running()
-    run = run_sample(loaded, folder, program=program, **given)
+    run = run_sample(loaded, options.folder(scenario, f"-{program.name}"), program=program, **given)
     several, lines = bool(loaded.frequencies_mhz), []
     for result in run.result:
         lines += [f"{result.experiment.scenario.frequency_mhz:g} MHz"] * several + result.lines()
@@ -325,10 +324,9 @@ def validate_command(
     from lusee_bayes.runs.sample_run import demand_of_calibration, run_validate
 
     with engine.open(demand_of_calibration(loaded)) as opened:
-        folder = options.folder(scenario, "-validation")
         given = {"name": Path(scenario).stem, "simulations": simulations, "engine": opened}
         given |= chains.running(loaded.seed) | options.running()
-        run = run_validate(loaded, folder, **given)
+        run = run_validate(loaded, options.folder(scenario, "-validation"), **given)
     verdict = f"{run.result.headline()}; look at {run.page}"
     options.tell(verdict, files=run.files, table=checks_table(run.result.checks))
     return 0 if run.result.passed else 1
@@ -552,9 +550,8 @@ def paper_command(
     from lusee_bayes.runs.cost import demand_of
     from lusee_bayes.runs.paper_run import run_paper
 
-    demand = demand_of(*paper_scenarios(skies=sky).values())
     folder = options.output or Path("output/paper")
-    with engine.open(demand) as opened:
+    with engine.open(demand_of(*paper_scenarios(skies=sky).values())) as opened:
         run = run_paper(folder, skies=sky, engine=opened, **options.running())
     verdict = (run.folder / "claims.md").read_text(encoding="utf-8").splitlines()[0]
     files = [path for path in run.files if path.suffix != ".nc"]

@@ -290,9 +290,8 @@ def open_engine(
     if workers is None:
         cluster, workers = cluster or os.environ.get(SCHEDULER), 1
     if not cluster and workers == 1:
-        fits = demand.process_bytes() <= memory_limit()
         gc.freeze()  # modules stay: they need not be searched
-        yield ThisProcess(demand.side_by_side if fits else 1)
+        yield ThisProcess(demand.side_by_side if demand.process_bytes() <= memory_limit() else 1)
         return
     if find_spec("distributed") is None:
         raise InputError(

@@ -314,9 +314,8 @@ def _table(name: str, columns: Mapping[str, list]) -> xr.DataTree:
     for key, values in columns.items():
         array = np.array([np.nan if value is None else value for value in values])
         found[key] = (f"{name}_row", array.astype(np.int8) if array.dtype == bool else array)
-    attributes = {"columns": json.dumps(list(columns))}
     rows = {} if not columns or not len(next(iter(columns.values()))) else found
-    return xr.DataTree(xr.Dataset(rows, attrs=attributes))
+    return xr.DataTree(xr.Dataset(rows, attrs={"columns": json.dumps(list(columns))}))
 
 
 def _of_group(kind: _Kind, tree: xr.DataTree | StoredTree, where: str) -> Any:

@@ -222,10 +222,9 @@ def comb_strength(autos: Spectra, frames: Rows, averaging: Averaging, middles_mh
     with np.errstate(divide="ignore", invalid="ignore"):
         z = (autos[..., at] - around) / noise
     known = np.isfinite(z)
-    count = np.maximum(known.sum(axis=2), 1)
     # a strong line of its own is no comb
     clipped = np.clip(np.where(known, z, 0.0), -COMB_LIMIT, COMB_LIMIT)
-    strength = clipped.sum(axis=2) / np.sqrt(count)
+    strength = clipped.sum(axis=2) / np.sqrt(np.maximum(known.sum(axis=2), 1))
     most = np.abs(strength).argmax(axis=1)
     return np.take_along_axis(strength, most[:, None], axis=1)[:, 0]
 

@@ -317,10 +317,9 @@ def _read_folder(folder: Path, model: str) -> GainModel:
     arrays = Layout("luseepy's gain model", layout).checked(folder, found, {}).arrays
     stacks = (np.stack([arrays[one] for one in of_places]) for of_places in names.values())
     mhz, mean, vectors = (stack.reshape(*LEAD, *stack.shape[1:]) for stack in stacks)
-    components = vectors.swapaxes(2, 3)
     coefficients = _coefficients(folder / COEFFICIENTS, model)
     kind = f"luseepy's gain model, {model} coefficients"
-    return GainModel(str(folder), mhz, mean, components, coefficients, kind=kind)
+    return GainModel(str(folder), mhz, mean, vectors.swapaxes(2, 3), coefficients, kind=kind)
 
 
 def _coefficients(path: Path, model: str) -> np.ndarray:

@@ -251,9 +251,8 @@ def _write_session_fits(path: Path, rows: SessionRows, blocks: Iterable[Counts])
         raw_s, mjd = Column(rows.raw_s, unit="s"), Column(rows.mjd(), unit="d")
         times = {"RAW_TIME": raw_s, "MJD_TIME": mjd}
         identity = {"UNIQUE_ID": number, **times, "ORIG_IDX": number}
-        telemetry = {**times, **rows.telemetry}
         tables = {"SPECTRA_TIMES": identity, "SPECTRA_META": rows.metadata()}
-        for name, columns in (tables | {"SPEC_INTERP": telemetry}).items():
+        for name, columns in (tables | {"SPEC_INTERP": {**times, **rows.telemetry}}).items():
             hdus.append(fits.BinTableHDU(Table(columns), name=name))
 
 

@@ -513,13 +513,12 @@ class CouplingMatrix(Coupling):
         crossed = xp.concatenate([minus, -xp.where(zero_order, 0.0, plus)])
         both = xp.stack([pairs.T, crossed.T], axis=-1)
         cosine, sine = _phases(self.pointing.azimuth, self.lmax)
-        functions = self.pointing.functions
         grids = []
         for run, span in self.pointing.runs():
             x_and_y = self.by_order[run] @ both
             over_time = cosine[span] @ x_and_y[..., 0] + sine[span] @ x_and_y[..., 1]
             over_time = over_time.reshape(-1, n_products, n_functions)
-            grids.append((over_time * functions[span][:, None]).sum(-1).T)
+            grids.append((over_time * self.pointing.functions[span][:, None]).sum(-1).T)
         return self.layout.gather(xp.concatenate(grids, axis=1))
 
     @compiled

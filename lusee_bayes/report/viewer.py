@@ -175,11 +175,10 @@ def _furniture() -> dict[str, Any]:
     """Colours, the rotation from Galactic to ICRS, and the bright sources, for sky_view.js."""
     axes = coordinates.SkyCoord([0.0, 90.0, 0.0], [0.0, 0.0, 90.0], unit="deg", frame="galactic")
     names = [(source.name, *source.galactic()) for source in BRIGHT_SOURCES]
-    tables = {"sequential": SEQUENTIAL, "diverging": DIVERGING}
     return {
         "colours": {
             kind: _base64(colormaps[name](np.arange(256), bytes=True)[:, :3])
-            for kind, name in tables.items()
+            for kind, name in {"sequential": SEQUENTIAL, "diverging": DIVERGING}.items()
         },
         # columns: where the Galactic axes point
         "rotation": axes.icrs.cartesian.xyz.value.ravel().tolist(),

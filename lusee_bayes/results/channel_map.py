@@ -371,10 +371,9 @@ def channel_result(
         Whatever else a :class:`.ChannelResult` has: ``chi2``, ``unknowns``, ``independent`` ...
     """
     mean, covariance = np.asarray(mean), np.asarray(covariance)
-    nside = round(np.sqrt(known.highest_altitude.size / 12))
     width, held, variance = pixels, (), np.diagonal(covariance)
     if width is None:
-        width = pixel_std(covariance, nside)
+        width = pixel_std(covariance, round(np.sqrt(known.highest_altitude.size / 12)))
     if compared is not None and known.truth is not None:
         held = Counts.of_pixels(width, known.truth - mean, np.asarray(compared)).coverage()
     power = known.prior_std**2

@@ -100,9 +100,8 @@ class Provenance(BaseModel, frozen=True):
     @classmethod
     def of_experiment(cls, experiment: Experiment, data: Data | None) -> Provenance:
         """Of a run with an experiment's data."""
-        known = experiment.data.truth is not None
         times = taken(experiment.data.observation)
-        return cls.of(experiment.scenario, times, data, known_sky=known)
+        return cls.of(experiment.scenario, times, data, known_sky=experiment.data.truth is not None)
 
     @classmethod
     def read(cls, folder: Path) -> Provenance | None:

@@ -152,10 +152,9 @@ def _observed(channels: Sequence[ChannelResult], axis: dict) -> dict[str, xr.Dat
         angle = ("time", channel.turntable_deg, {"units": "degree"})
         turns.append(xr.Dataset({"turntable_deg": angle}, {"time": coords["time"]}))
     along = xr.Variable(*axis["frequency"][:2], axis["frequency"][2])
-    named = {"observed_data": parts, "constant_data": turns}
     return {
         name: xr.concat(each, along.to_index_variable(), join="outer")
-        for name, each in named.items()
+        for name, each in {"observed_data": parts, "constant_data": turns}.items()
     }
 
 

@@ -254,9 +254,8 @@ class ChannelsInFiles:
             for first in range(0, len(channels), BLOCK)
         ]
         names = [names_of(channels[block.start : block.stop]) for block in blocks]
-        tasks = Tasks(add, blocks, names)
         return self.engine.reduced(
-            tasks, joint.ComponentSums.plus, self.stages, "joint sums"
+            Tasks(add, blocks, names), joint.ComponentSums.plus, self.stages, "joint sums"
         ).information()
 
 
@@ -363,9 +362,8 @@ class ChannelAlone:
         deviations = made.draws - mean
         if compared is not None:
             deviations = np.concatenate([deviations, compared])
-        own = made.own.solution.information
         kept = made.covariance, deviations, len(made.draws), made.figures()
-        return cls(known, own, made.unknowns, mean, *kept)
+        return cls(known, made.own.solution.information, made.unknowns, mean, *kept)
 
     def shared(self) -> tuple[dict[str, float], Vector, Square, int]:
         """Names and octaves of what is shared, its E and V; how many draws."""
@@ -569,11 +567,10 @@ def map_channels(
     mapped, shared = zip(*(one for one in by_channel if not isinstance(one[1], str)), strict=True)
     components, tied, tests = None, None, ()
     if scenario.joint:
-        left = _without(unmapped, scenario)
         at_hand = ChannelsInFiles(mapped, files, engine, stages)
         # coverage is compared with draws
         n_draws = max(scenario.output.draws, N_DRAWS if data is None or truth else 0)
-        components = solve_components(left, at_hand, shared, n_draws)
+        components = solve_components(_without(unmapped, scenario), at_hand, shared, n_draws)
     elif not alone:
         tied, tests = tie_channels(scenario, [channel.frequency_mhz for channel in mapped], shared)
 
@@ -588,9 +585,8 @@ def map_channels(
         files.kept(channel, ChannelResult, make)
 
     if not alone:
-        stage = "joint skies" if scenario.joint else "shared instrument"
         tasks = Tasks(finish, range(len(mapped)), [names_of((channel,)) for channel in mapped])
-        engine.each(tasks, stages, stage)
+        engine.each(tasks, stages, "joint skies" if scenario.joint else "shared instrument")
     results = tuple(files.read(channel, ChannelResult) for channel in mapped)
     told = {} if tied is None else {"tie_log_evidence": tied.log_evidence, "shared_tests": tests}
     return MapResult(scenario, results, components, stages.seconds, unmapped, **told)

@@ -83,9 +83,8 @@ def run_map(
         more = {"truth": truth, "earlier": earlier, "thorough": thorough, "engine": engine}
         made = map_channels(scenario, run.path, data=given, stages=stages, **more)
         known, times = made.stacked("truth") is not None, made.channel.taken
-        provenance = Provenance.of(scenario, times, data, known_sky=known)
         made = replace_fields(made, reduced=reduced and _as_used(reduced, made))
-        return run.write(made, stages, provenance)
+        return run.write(made, stages, Provenance.of(scenario, times, data, known_sky=known))
 
 
 def _given(

@@ -242,10 +242,9 @@ def default_variations(source: str, scenario: Scenario) -> list[Variation]:
         section = radiometer.model_copy(update={"duty_cycle": duty})
         varied = scenario.with_section("noise", radiometer=section)
         found["duty cycle", f"{duty:g}"] = varied
-    variations = [Variation(source, *named, varied) for named, varied in found.items()]
     ports = range(scenario.beam.n_ports if scenario.beam.n_ports > 1 else 0)
     lost = [Variation(source, "antenna lost", f"port {k}", scenario, (k,)) for k in ports]
-    return variations + lost
+    return [Variation(source, *named, varied) for named, varied in found.items()] + lost
 
 
 Runs = tuple[RunSection, ...]

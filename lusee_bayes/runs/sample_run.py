@@ -281,9 +281,8 @@ def named(program: Program) -> str:
 
 def _write_cubes(sampled: tuple[Scenario, tuple[SampleResult, ...]], folder: Path) -> None:
     scenario, results = sampled
-    frequencies = np.array(scenario.frequencies_mhz)
     cubes = {name: np.stack([one.maps[name] for one in results]) for name in ("mean", "std")}
-    write_cubes(folder, cubes, frequencies, scenario)
+    write_cubes(folder, cubes, np.array(scenario.frequencies_mhz), scenario)
 
 
 SAMPLE_OUTPUTS = (

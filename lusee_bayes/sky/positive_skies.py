@@ -114,9 +114,8 @@ def matching_step(
     step = np.zeros(2)
     for _ in range(NEWTON):
         scaled = power * np.exp(-2.0 * (step @ slope))
-        gradient = slope @ (scaled - known) - narrow * (away + step)
         curvature = 2.0 * (slope * np.maximum(scaled, known)) @ slope.T + np.diag(narrow)
-        step = step + np.linalg.solve(curvature, gradient)
+        step = step + np.linalg.solve(curvature, slope @ (scaled - known) - narrow * (away + step))
     return np.clip(step, -REACH, REACH)
 
 
@@ -225,10 +224,9 @@ class LogNormalSky(eqx.Module):
 
     def diffuse(self, white: White) -> Float[Array, "*batch rings phi"]:
         """Compute T exp(Y a) on the grid, in K."""
-        xp = namespace(self, white)
         root = self.root()[: self.n_modes]
         logarithm = white[..., : self.n_modes] * root.reshape(*(1,) * (white.ndim - 1), -1)
-        field = xp.exp(self.grid.synthesise(logarithm))
+        field = namespace(self, white).exp(self.grid.synthesise(logarithm))
         return field * self.level.reshape(*(1,) * (white.ndim - 1), *self.level.shape)
 
     def source_factors(self, white: White) -> Float[Array, "*batch sources"]:

@@ -387,11 +387,10 @@ def write_alms(path: str | Path, modes: Float[Array, " modes"], header: dict[str
     Path
         The file.
     """
-    units = {"TUNIT2": "K", "TUNIT3": "K", "EXTNAME": "ALM"}
     with replacing(path) as partial:
         healpy.write_alm(partial, harmonics.to_healpy(modes), out_dtype=np.float64)
         with fits.open(partial, mode="update") as hdus:
-            hdus[1].header.update(units | header)
+            hdus[1].header.update({"TUNIT2": "K", "TUNIT3": "K", "EXTNAME": "ALM"} | header)
     return user_path(path)
 
 

@@ -267,9 +267,8 @@ def waterfall(result: MapResult) -> Figure | None:
         kept = reduced.values[band, number]
         flagged = ~np.isfinite(kept) | used_in_part
         axes.plot(days, kept, ".", ms=3, color=drawing.BLUE, label="after flags")
-        before = reduced.before[band, number]
         style = {"ms": 4, "color": drawing.ORANGE, "label": "before, where flagged"}
-        axes.plot(days[flagged], before[flagged], ".", **style)
+        axes.plot(days[flagged], reduced.before[band, number][flagged], ".", **style)
         low, high = _range(kept[np.isfinite(kept)])
         axes.set_ylim(low, high)
         axes.set_title(product.label, fontsize=9)

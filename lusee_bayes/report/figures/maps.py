@@ -240,9 +240,8 @@ def _rows_of_maps(
 
 def channel_spectra(cube: MapResult) -> Figure:
     """Brightness against frequency in some directions, with one standard deviation."""
-    landmarks = cube.landmarks()
     figure, panels = drawing.framed((11, 7), 2, 2, sharex=True)
-    for axes, (name, values) in zip(panels.flat, landmarks.items(), strict=True):
+    for axes, (name, values) in zip(panels.flat, cube.landmarks().items(), strict=True):
         f, mean, std = cube.frequencies_mhz, values["mean"], values["std"]
         axes.errorbar(f, mean, std, color=BLUE, fmt=".", ms=4, lw=1, label="posterior")
         if "truth" in values:

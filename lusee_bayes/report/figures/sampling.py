@@ -223,9 +223,8 @@ def rank_statistics(ranks: Ranks) -> Figure:
         axes.set_axis_off()
     last = panels[-1]
     last.set_axis_on()
-    table = ranks.coverage()
     levels = np.array(LEVELS)
-    for coverage in table.values():
+    for coverage in ranks.coverage().values():
         last.plot(levels, [coverage[p] - p for p in LEVELS], color=drawing.BLUE, lw=0.5, alpha=0.6)
     error = 3 * np.array([ranks.coverage_error(p) for p in LEVELS])
     last.fill_between(levels, -error, error, color=drawing.GREY, alpha=0.25, lw=0)
