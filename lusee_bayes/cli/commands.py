@@ -430,7 +430,7 @@ def compare_priors_command(
         data only), local_scales. By default all that can be. The scenario's
         own section counts for the prior of its kind.
     """
-    from lusee_bayes.cli.tables import priors_table
+    from lusee_bayes.cli.tables import table_of_numbers
     from lusee_bayes.runs.compare_run import run_compare_priors
     from lusee_bayes.runs.cost import demand_of
 
@@ -441,7 +441,7 @@ def compare_priors_command(
         given = {"truth": truth, "name": Path(scenario).stem, "engine": opened}
         run = run_compare_priors(loaded, folder, names, **given, **options.running())
     lines = [*run.result.lines(), f"look at {run.page}"]
-    options.tell(*lines, files=run.files, table=priors_table(run.result))
+    options.tell(*lines, files=run.files, table=table_of_numbers(*run.result.table()))
 
 
 @app.command(name="report")

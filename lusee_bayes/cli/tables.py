@@ -9,7 +9,6 @@ from rich.table import Table
 
 from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows
 from lusee_bayes.results.forecast import AS_GIVEN, Forecast, forecast_rows
-from lusee_bayes.results.prior_comparison import PriorComparison
 from lusee_bayes.results.sample_result import ValidationResult
 from lusee_bayes.sampling.validation import Check
 
@@ -52,7 +51,7 @@ def checks_table(checks: list[Check]) -> Table:
     return table
 
 
-def _of_numbers(header: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
+def table_of_numbers(header: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
     """A column of names, and others of numbers."""
     table = Table()
     for number, name in enumerate(header):
@@ -60,11 +59,6 @@ def _of_numbers(header: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
     for row in rows:
         table.add_row(*map(escape, row))
     return table
-
-
-def priors_table(result: PriorComparison) -> Table:
-    """One data set under several priors, a column for each."""
-    return _of_numbers(*result.table())
 
 
 def comparison_table(runs: Sequence[FinishedRun]) -> Table:
@@ -84,4 +78,4 @@ def comparison_table(runs: Sequence[FinishedRun]) -> Table:
         )
         for run, row in zip(runs, comparison_rows(runs), strict=True)
     ]
-    return _of_numbers((*header, "p instr.", "p prior"), rows)
+    return table_of_numbers((*header, "p instr.", "p prior"), rows)

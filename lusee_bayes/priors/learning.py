@@ -30,6 +30,7 @@ each S(theta).
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -259,13 +260,11 @@ def learn_whatever_fits(
     """
     demanded = demanded_factor(information, family.expected())
     for factor in demanded * HIGHER:
-        try:
+        with suppress(InputError):
             found = learn(family, information.raised(factor), start, seed)
             if factor > 1.0:  # a posterior under N itself is what it is for
                 information.posterior(found.prior)
-        except InputError:
-            continue
-        return replace(found, noise_factor=float(factor))
+            return replace(found, noise_factor=float(factor))
     return _fixed(family, information, float(demanded * HIGHER[-1]))
 
 
@@ -302,12 +301,10 @@ def _fixed(family: PriorFamily, information: Information, factor: float) -> Lear
     for _ in range(MOST_WIDENINGS):
         try:
             evidence = float(information.posterior(prior).log_evidence)
-            break
+            return Learned(prior, (), np.zeros(0), np.zeros((0, 0)), evidence, 0, settled=False)
         except InputError as error:
             prior, failed = prior.widened(10.0), error
-    else:
-        raise failed
-    return Learned(prior, (), np.zeros(0), np.zeros((0, 0)), evidence, 0, settled=False)
+    raise failed
 
 
 def _at(family: PriorFamily, information: Information, parameters: Parameters) -> _Point:
@@ -323,12 +320,10 @@ def _uphill(
     """The end of a step, or of a half, a quarter, ... of it, if ln p is not lower there."""
     part = 1.0
     while part >= SHORTEST:
-        try:
+        with suppress(InputError):  # too far: S has no Cholesky factor there
             there = _at(family, information, here.parameters + part * step)
-        except InputError:  # too far: S has no Cholesky factor there
-            there = None
-        if there is not None and there.value >= here.value - SETTLED / 10.0:
-            return there
+            if there.value >= here.value - SETTLED / 10.0:
+                return there
         part /= 2.0
     raise NotSettled(
         "the prior's parameters do not settle: ln p falls along its own gradient by rounding"

@@ -202,11 +202,8 @@ def evidence_caveat(runs: Sequence[FinishedRun]) -> str | None:
     str or None
         None if all runs map the very same data.
     """
-    first, reasons = runs[0], []
-    for run in runs[1:]:
-        reason = _difference(first, run)
-        if reason is not None:
-            reasons.append(f"{run.name} {reason}")
+    first, *others = runs
+    reasons = [f"{run.name} {why}" for run in others if (why := _difference(first, run))]
     if not reasons:
         return None
     return (

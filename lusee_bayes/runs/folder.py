@@ -325,7 +325,8 @@ def run_folder(
     origin, read = origin_of(scenario, data, **others), inputs_of(scenario, data, *inputs)
     folder = files.user_path(folder)
     files.require_folder(folder)
-    made = _made(folder)
+    made = [place for place in (folder, *folder.parents) if not place.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
     try:
         with files.locked(folder):
             files.recover(folder)
@@ -349,13 +350,6 @@ def run_folder(
         for place in ([folder / kind.unfinished] if kind.unfinished else []) + made:
             with suppress(OSError):
                 place.rmdir()
-
-
-def _made(folder: Path) -> list[Path]:
-    """Make a folder and those that it lies in; which ones were not there, the innermost first."""
-    missing = [place for place in (folder, *folder.parents) if not place.exists()]
-    folder.mkdir(parents=True, exist_ok=True)
-    return missing
 
 
 def _written_at(folder: Path) -> int | None:

@@ -179,9 +179,10 @@ def variations_of(
         first, *others = default_variations(source, load_scenario(source, overrides))
         found.append(first)
         for one in others:
-            if (why := one.obstacle()) is None:
+            try:
+                one.scenario.observation.observation()
                 found.append(one)
-            else:
+            except InputError as why:  # samples that cannot be taken: a run without any night, ...
                 stages.say(f"  left out: {source}, {one.family}, {one.name}: {why}")
     return found
 

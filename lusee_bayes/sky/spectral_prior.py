@@ -117,12 +117,9 @@ class SpectralPrior(checks.Described, eqx.Module):
 
     def __check_init__(self):
         channels, components = self.mixing.shape
-        for name, values, shape in (
-            ("the frequencies", self.frequencies_mhz, (channels,)),
-            ("the mixing", self.mixing, (None, None)),
-            ("the components' spectra", self.spectra, (components, None)),
-        ):
-            checks.require_array(name, values, shape)
+        checks.require_array("the frequencies", self.frequencies_mhz, (channels,))
+        checks.require_array("the mixing", self.mixing)
+        checks.require_array("the components' spectra", self.spectra, (components, None))
         checks.require_positive("the components' C_ell", self.spectra)
         if self.residual is not None:
             name, hint = "the residual spectra", "leave them out if there is no residual"

@@ -239,8 +239,9 @@ def time_line(reduced: Reduced) -> Figure:
         if (level == letter).any()
     ]
     top.legend(handles=handles, loc="upper right", ncols=3, frameon=False)
-    top.set(yticks=range(n_ports), ylabel="port", ylim=(n_ports - 0.5, -1.2))
-    top.set_title("Gain of every port")
+    top.set(
+        yticks=range(n_ports), ylim=(n_ports - 0.5, -1.2), ylabel="port", title="Gain of every port"
+    )
     for row, flagged in enumerate(flags.values()):
         bottom.plot(days[flagged], np.full(flagged.sum(), row), "|", ms=9, color=drawing.ORANGE)
     bottom.set(yticks=range(len(flags)), yticklabels=list(flags), ylim=(n_rows - 0.5, -0.5))
@@ -296,10 +297,9 @@ def calibration(reduced: Reduced) -> Figure:
     _gains(left, reduced)
     _scatter(right, reduced)
     right.axhline(1.0, color=drawing.GREY, lw=0.8)
-    right.set_ylabel("scatter over radiometer noise")
+    right.set(ylabel="scatter over radiometer noise", title="Noise found over noise expected")
     found = np.concatenate([reduced.line_scatter, reduced.scatter, [1.0]])
     right.set_ylim(0.0, 1.3 * float(np.nanmax(found)))
-    right.set_title("Noise found over noise expected")
     return figure
 
 

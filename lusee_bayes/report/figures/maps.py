@@ -81,13 +81,6 @@ def sky_maps(result: MapResult) -> Figure:
     return channel_maps(result) if len(result.channels) > 1 else channel_map(result.channel)
 
 
-def fidelity(result: MapResult) -> Figure:
-    """The fidelity of a channel by multipole, or of many by multipole and frequency."""
-    if len(result.channels) > 1:
-        return channel_fidelity(result)
-    return map_fidelity(result.channel)
-
-
 def spectra(result: MapResult) -> Figure:
     """Power spectra of a channel, or brightness against frequency of many."""
     return channel_spectra(result) if len(result.channels) > 1 else sky_spectra(result.channel)
@@ -255,8 +248,13 @@ def channel_spectra(cube: MapResult) -> Figure:
     return figure
 
 
-def channel_fidelity(cube: MapResult) -> Figure:
-    """SNR_ell (or, without a truth, the prior's share) over frequency and ell, and its mean."""
+def fidelity(cube: MapResult) -> Figure:
+    """SNR_ell (or, without a truth, the prior's share) over frequency and ell, and its mean.
+
+    Of one channel, as :func:`map_fidelity`.
+    """
+    if len(cube.channels) == 1:
+        return map_fidelity(cube.channel)
     snr, alone = cube.snr(), cube.snr(independent=True)
     known = snr is not None
     values = snr if known else cube.stacked("prior_fraction")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 import arviz_base
 import arviz_plots
@@ -75,7 +75,7 @@ def _drawn(
     **options: object,
 ) -> Figure:
     """ArviZ's figure, which pyplot then forgets; a note where draws do not suffice for it."""
-    if not _vary(quantities.values()):
+    if any(x.shape[1] < FEWEST or not (np.ptp(x, axis=1) > 0).all() for x in quantities.values()):
         return drawing.note(title, TOO_FEW)
     tree = arviz_base.from_dict({group: quantities})
     frame = {"layout": "constrained", "figsize": size}
@@ -99,13 +99,6 @@ def against_analytic(tree: xr.DataTree) -> Figure:
     right.set(xlabel="mode", ylabel="draws / analytic", title="Standard deviations")
     figure.suptitle("Draws against the analytic posterior, mode by mode")
     return figure
-
-
-def _vary(quantities: Iterable[Float[np.ndarray, "chains draws"]]) -> bool:
-    """Whether there are draws enough for ArviZ's estimates, and not all the same."""
-    return all(
-        draws.shape[1] >= FEWEST and bool((np.ptp(draws, axis=1) > 0).all()) for draws in quantities
-    )
 
 
 def uncertainty(run: SampleResult) -> Figure:
