@@ -286,17 +286,11 @@ class Rotation(eqx.Module):
 
     @classmethod
     def from_matrix(cls, matrix: Float[np.ndarray, "3 3"], lmax: int) -> Rotation:
-        """Return D(g) for the proper rotation matrix g that takes vectors n to g n."""
-        turn = rotations.Rotation.from_matrix(matrix).as_rotvec()
-        angle = np.linalg.norm(turn)
-        axis = turn / angle if angle else turn
-        blocks = []
-        for ell in range(lmax + 1):
-            # the eigenvalues of i axis . K are whole numbers
-            values, vectors = np.linalg.eigh(1j * np.tensordot(axis, generators(ell), 1))
-            waves = vectors * np.exp(-1j * angle * np.rint(values))
-            blocks.append(np.real(waves @ vectors.conj().T))
-        return cls(tuple(blocks))
+        """Return D(g) for the proper rotation matrix g that takes vectors n to g n.
+
+        What was asked for before, as all channels of a site do, is there.
+        """
+        return _rotation(np.ascontiguousarray(matrix, dtype=np.float64).tobytes(), lmax)
 
     @property
     def T(self) -> Rotation:
@@ -309,6 +303,20 @@ class Rotation(eqx.Module):
             modes[..., ell**2 : (ell + 1) ** 2] @ block.T for ell, block in enumerate(self.blocks)
         ]
         return namespace(modes, self).concatenate(turned, axis=-1)
+
+
+@lru_cache(maxsize=16)
+def _rotation(matrix: bytes, lmax: int) -> Rotation:
+    turn = rotations.Rotation.from_matrix(np.frombuffer(matrix).reshape(3, 3)).as_rotvec()
+    angle = np.linalg.norm(turn)
+    axis = turn / angle if angle else turn
+    blocks = []
+    for ell in range(lmax + 1):
+        # the eigenvalues of i axis . K are whole numbers
+        values, vectors = np.linalg.eigh(1j * np.tensordot(axis, generators(ell), 1))
+        waves = vectors * np.exp(-1j * angle * np.rint(values))
+        blocks.append(np.real(waves @ vectors.conj().T))
+    return Rotation(tuple(blocks))
 
 
 def turn_about_z(modes: Fields, angle: float | Float[Array, ""]) -> Fields:
@@ -338,14 +346,10 @@ def turn_about(axis: int, modes: Fields, angle: float | Float[Array, ""]) -> Fie
 
     Else as :func:`turn_about_z`.
     """
-    from_axis = _z_from(axis, round(np.sqrt(modes.shape[-1])) - 1)
+    # takes the axis to z: a cyclic swap of the axes
+    swap, lmax = np.roll(np.eye(3), -(axis + 1), axis=1).T, round(np.sqrt(modes.shape[-1])) - 1
+    from_axis = Rotation.from_matrix(swap, lmax)
     return from_axis.T(turn_about_z(from_axis(modes), angle))
-
-
-@lru_cache(maxsize=8)
-def _z_from(axis: int, lmax: int) -> Rotation:
-    """The rotation that takes the x axis (0) or the y axis (1) to z: a cyclic swap of the axes."""
-    return Rotation.from_matrix(np.roll(np.eye(3), -(axis + 1), axis=1).T, lmax)
 
 
 @lru_cache(maxsize=16)

@@ -23,7 +23,7 @@ from jaxtyping import Float
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.checks import Described, extent, require_positive, require_shape
-from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.files import user_path
 from lusee_bayes.core.layouts import Layout, Variable, require_mhz
 from lusee_bayes.core.lazy import interpolate
@@ -336,10 +336,7 @@ def _coefficients(path: Path, model: str) -> np.ndarray:
         if str(family).strip().lower() != model:
             continue
         name = f"{setting.strip().upper()} {component.strip().upper()} {term.strip()}"
-        if name not in places:
-            raise InputError(
-                f"{path}: line {number}: unknown coefficient '{name}'; {nearest(name, places)}"
-            )
+        require_known(f"{path}: line {number}: unknown coefficient", name, places)
         if name in seen:
             raise InputError(f"{path}: line {number} gives {name} a second time")
         seen.add(name)

@@ -24,7 +24,7 @@ numbers per ell and sample, and derivatives cost no more.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import equinox as eqx
@@ -37,7 +37,7 @@ from lusee_bayes.core.checks import Described, require_array, require_float64, r
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, mode_numbers, tilts, turn_about, turn_about_z
 from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.beams.source import BeamSource
+from lusee_bayes.instrument.beams.source import BeamSource, Values
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout
@@ -47,7 +47,6 @@ BeamModes = Float[Array, "*runs products modes"]
 BodyBeams = Float[Array, "runs products functions modes"]
 RowNumbers = Int[np.ndarray, " rows"]
 TimeModes = Float[Array, "products times modes"]
-Values = Mapping[str, float | Float[Array, ""]]
 Factors = Float[Array, "functions powers orders 2"]
 # times whose data A^T d takes at once: it bounds the memory
 MOST_TIMES = 8192

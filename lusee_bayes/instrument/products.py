@@ -28,7 +28,7 @@ from jaxtyping import Bool, Complex, Float, Int, Shaped
 
 from lusee_bayes.core.arrays import Array, Grid, GridFlags, as_complex, namespace, placed
 from lusee_bayes.core.checks import Described, is_traced
-from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.lazy import pandas
 
 N_ANTENNAS = 4
@@ -164,8 +164,7 @@ def real_products(data: Any, products: Any, flags: Any, convention: str, n_anten
     """
     masked = np.ma.getmaskarray(data) if isinstance(data, np.ma.MaskedArray) else False
     data = _numbers(data)
-    if convention not in CONVENTIONS:
-        raise InputError(f"unknown convention '{convention}'; {nearest(convention, CONVENTIONS)}")
+    require_known("unknown convention", convention, CONVENTIONS)
     ports_and_parts = _columns(products, np.iscomplexobj(data), n_antennas)
     if data.shape[1] != len(ports_and_parts):
         turned = "; transpose them" if data.shape[0] == len(ports_and_parts) else ""

@@ -267,14 +267,13 @@ class Visibilities(checks.Described):
     def description(self) -> tuple[str, ...]:
         missing = f", {self.n_missing} absent" if self.n_missing else ""
         truth = "" if self.truth is None else f"; simulated, lmax = {lmax_of(len(self.truth))}"
-        unsaid = ["it is not known what the times are: --set observation.timestamp=..."]
-        unsaid = [] if self.says_window else unsaid
+        unsaid = "it is not known what the times are: --set observation.timestamp=..."
         return (
             f"{self.layout.n_products} products x {self.layout.n_times} times at "
             f"{self.frequency_mhz:g} MHz, {self.layout.size} data{missing}",
             f"{checks.extent(self.data, 'K')}{truth}; products {checks.listed(self.labels)}",
             *self.observation.description(),
-            *unsaid,
+            *([] if self.says_window else [unsaid]),
         )
 
     @property

@@ -53,12 +53,7 @@ def data_by_product(cases: Cases) -> Figure:
     figure, axes = drawing.framed((11, 4))
     for k, series in enumerate(data.values):
         axes.plot(k * n_times + np.arange(n_times), series, color=drawing.BLUE, lw=1.0)
-        axes.axvline(k * n_times, color=drawing.GREY, lw=0.4)
-    centres = (np.arange(n_products) + 0.5) * n_times
-    axes.set_xticks(centres, [str(name) for name in data["product"].values], fontsize=8)
-    axes.tick_params(axis="x", length=0)
-    axes.set(xlabel="product (time runs within each)", ylabel="visibility [K]")
-    axes.set_xlim(0, data.size)
+    drawing.side_by_side(axes, [str(name) for name in data["product"].values], n_times)
     axes.set_title(f"Data vector at 25 MHz: {n_products} products, {n_times} samples each")
     return figure
 

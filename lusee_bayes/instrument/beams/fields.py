@@ -25,7 +25,7 @@ from scipy.special import roots_legendre
 
 from lusee_bayes.core import checks
 from lusee_bayes.core.arrays import Array, namespace
-from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.harmonics import LARGEST_LMAX, SQRT2, lmax_of, mode_numbers, polar_functions
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.instrument.products import antennas_of, auto_indices, labels_of, to_real
@@ -330,8 +330,7 @@ def stokes_pairs(e_theta: Fields, e_phi: Fields, stokes: str = "I") -> Pairs:
     ----------
     Hamaker and Bregman 1996, A&AS 117, 161 (the IAU's convention for V).
     """
-    if stokes not in STOKES:
-        raise InputError(f"unknown Stokes parameter '{stokes}'; {nearest(stokes, STOKES)}")
+    require_known("unknown Stokes parameter", stokes, STOKES)
     et, ep = e_theta[:, None], e_phi[:, None]
     ft, fp = e_theta[None].conj(), e_phi[None].conj()
     if stokes == "I":

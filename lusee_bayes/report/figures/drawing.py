@@ -11,6 +11,7 @@ level. It is for the eye only: files and numbers are without it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -113,6 +114,17 @@ def number_of_tick(value: float) -> str:
 def without_minor_ticks(axis: Axis) -> None:
     """Leave out the minor ticks of a logarithmic axis of many decades: hundreds, slow to draw."""
     axis.set_minor_locator(NullLocator())
+
+
+def side_by_side(axes: Axes, products: Sequence[str], n_times: int) -> None:
+    """Dress axes in which products follow one another, with time running within each."""
+    starts = n_times * np.arange(len(products))
+    for start in starts:
+        axes.axvline(start, color=GREY, lw=0.4)
+    axes.set_xticks(starts + 0.5 * n_times, products, fontsize=8)
+    axes.tick_params(axis="x", length=0)
+    axes.set(xlabel="product (time runs within each)", ylabel="visibility [K]")
+    axes.set_xlim(0, n_times * len(products))
 
 
 def orthographic(axes: Axes, grid: HemisphereGrid, pattern: Float[np.ndarray, "theta phi"]):

@@ -25,18 +25,12 @@ def data_vector(result: MapResult) -> Figure | None:
     if not result.single:
         return None
     channel = result.channel
-    n_products, n_times = channel.data.shape
     figure, (axes,) = drawing.in_places((11, 4), left=0.08, right=0.99, bottom=0.13, top=0.91)
     axes.plot(channel.data.ravel(), color=BLUE, lw=0.7)
-    for k in range(1, n_products):
-        axes.axvline(k * n_times, color=GREY, lw=0.4)
-    axes.set_xticks((np.arange(n_products) + 0.5) * n_times, channel.labels, fontsize=8)
-    axes.tick_params(axis="x", length=0)
-    axes.set(xlabel="product (time runs within each)", ylabel="visibility [K]")
-    axes.set_xlim(0, n_times * n_products)
+    drawing.side_by_side(axes, channel.labels, len(channel.hours))
     missing = f", {channel.n_missing} missing" if channel.n_missing else ""
-    title = f"Data vector at {channel.frequency_mhz:g} MHz, {channel.n_data} samples{missing}"
-    axes.set_title(title)
+    samples = f"{channel.n_data} samples{missing}"
+    axes.set_title(f"Data vector at {channel.frequency_mhz:g} MHz, {samples}")
     return figure
 
 
