@@ -123,7 +123,7 @@ class Options:
         console = Console(quiet=self.quiet, soft_wrap=True)
         say(console, *(f"  {path}" for path in files))
         if table is not None:
-            console.print(table, soft_wrap=False)
+            show(console, table)
         say(console, *lines)
 
 
@@ -257,3 +257,8 @@ def say(console: Console, *lines: object) -> None:
     """Print lines as they are."""
     for line in lines:
         console.print(str(line), highlight=False, markup=False)
+
+
+def show(console: Console, table: Table) -> None:
+    """Print a table within the width of the terminal: its cells are wrapped."""
+    console.print(table, soft_wrap=False)

@@ -28,7 +28,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
 
-from lusee_bayes.core.arrays import Array, Fields, namespace
+from lusee_bayes.core.arrays import Array, Fields, Square, namespace
 from lusee_bayes.core.checks import require_finite, require_whole
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import healpy, rotations, special
@@ -203,9 +203,7 @@ def per_mode(spectrum: Float[Array, "*batch ells"]) -> Fields:
     return spectrum[..., ell]
 
 
-def order_products(
-    matrix: Float[np.ndarray, "modes modes"], heights: Angles
-) -> Float[np.ndarray, "points orders orders"]:
+def order_products(matrix: Square, heights: Angles) -> Float[np.ndarray, "points orders orders"]:
     """Compute B of every ring, with y^T C y = f(phi)^T B f(phi), f the azimuth functions.
 
     Parameters

@@ -29,7 +29,7 @@ from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.map_result import MapResult
 
 
-def cards(name: str, scenario: Scenario) -> dict[str, object]:
+def cards(name: str, scenario: Scenario) -> dict[str, tuple]:
     """Header cards of a result: what it is, of which frequency, beam, site and scenario.
 
     Values are (value, comment), or for text that would not fit a value alone.
@@ -43,8 +43,8 @@ def cards(name: str, scenario: Scenario) -> dict[str, object]:
         "BEAM": (beam.label, "the antennas"),
         "SITELON": (site.lon_deg, "selenographic longitude in degrees"),
         "SITELAT": (site.lat_deg, "selenographic latitude in degrees"),
-        "SCENHASH": text_hash(scenario.to_yaml()),
-        "CREATOR": f"lusee_bayes {__version__}",
+        "SCENHASH": (text_hash(scenario.to_yaml()),),
+        "CREATOR": (f"lusee_bayes {__version__}",),
         # FITS keys have eight letters
         **{
             f"V_{re.split('[-_]', name)[0][:6].upper()}": (v, name)
@@ -61,10 +61,7 @@ def text_hash(text: str) -> str:
 def write_maps(folder: Path, maps: Mapping[str, Pixels], scenario: Scenario) -> None:
     """Write NAME.fits of maps: HEALPix RING, Galactic, K, float64, for healpy.read_map."""
     for name, pixels in maps.items():
-        extra = [
-            (key, *value) if isinstance(value, tuple) else (key, value)
-            for key, value in cards(name, scenario).items()
-        ]
+        extra = [(key, *value) for key, value in cards(name, scenario).items()]
         column = {"column_names": [name.upper()], "column_units": "K", "dtype": np.float64}
         healpy.write_map(folder / f"{name}.fits", pixels, coord="G", extra_header=extra, **column)
 

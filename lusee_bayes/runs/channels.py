@@ -437,9 +437,7 @@ class ChannelAlone:
         )
 
 
-def kernel(
-    frequencies_mhz: Float[np.ndarray, " channels"], octaves: float
-) -> Float[np.ndarray, "channels channels"]:
+def kernel(frequencies_mhz: Vector, octaves: float) -> Square:
     """K of the module's equations, with an unknown's values at all frequencies."""
     x = np.log2(frequencies_mhz) / octaves
     return np.exp(-0.5 * (x[:, None] - x[None]) ** 2)

@@ -62,10 +62,7 @@ def _write_page(runs: list[FinishedRun], folder: Path) -> None:
 # what the folder of a comparison holds; a new file is one line here
 COMPARISON = RunKind(
     "compare",
-    outputs=(
-        Output(_write_page),
-        Output.rows("comparison.csv", comparison_rows),
-    ),
+    outputs=(Output(_write_page), Output.rows("comparison.csv", comparison_rows)),
     figures={"maps": maps_of_runs, "curves": curves_of_runs},
     dpi=100,
 )

@@ -421,9 +421,7 @@ class PositiveSkies(eqx.Module):
         with np.errstate(invalid="ignore"):
             return self.grid.analyse(self.values(channel, exponent))[..., : n_modes(self.lmax)]
 
-    def jacobian(
-        self, channel: int, exponent: Float[np.ndarray, " columns"]
-    ) -> Float[np.ndarray, "modes columns"]:
+    def jacobian(self, channel: int, exponent: Vector) -> Float[np.ndarray, "modes columns"]:
         """Compute W, in K.
 
         Parameters

@@ -31,6 +31,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
+from lusee_bayes.core.arrays import Pixels
 from lusee_bayes.core.harmonics import lmax_of, modes_to_map, per_mode
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.version import printable
@@ -77,9 +78,7 @@ def temperatures(pixels: Float[np.ndarray, "..."], lowest: float = 0.5) -> LogNo
     return LogNorm(*np.percentile(pixels[pixels > 0], [lowest, 99.8]))
 
 
-def seen_range(
-    std: Float[np.ndarray, "..."], altitude: Float[np.ndarray, " pixels"]
-) -> tuple[float, float]:
+def seen_range(std: Float[np.ndarray, "..."], altitude: Pixels) -> tuple[float, float]:
     """Bounds of a logarithmic scale for standard deviations: of what was seen.
 
     A cap that never rose has standard deviations that would hide the structure of the rest. What
@@ -179,11 +178,11 @@ MERIDIANS, PARALLELS = (120.0, 60.0, 0.0, -60.0, -120.0), (-60.0, -30.0, 0.0, 30
 
 def mollweide(
     axes: Axes,
-    pixels: Float[np.ndarray, " pixels"],
+    pixels: Pixels,
     *,
     norm: Normalize,
     cmap: str = SEQUENTIAL,
-    highest_altitude: Float[np.ndarray, " pixels"] | None = None,
+    highest_altitude: Pixels | None = None,
 ) -> AxesImage:
     """Draw a Galactic HEALPix RING map: centre l = 0, longitude grows to the left.
 
@@ -212,12 +211,12 @@ def mollweide(
 def sky_panel(
     axes: Axes,
     title: str,
-    pixels: Float[np.ndarray, " pixels"],
+    pixels: Pixels,
     norm: Normalize,
     cmap: str = SEQUENTIAL,
     unit: str = "K",
     *,
-    altitude: Float[np.ndarray, " pixels"] | None = None,
+    altitude: Pixels | None = None,
     **bar: float,
 ) -> None:
     """Draw a map (:func:`mollweide`) with its title and a colour bar of its own."""
@@ -226,7 +225,7 @@ def sky_panel(
     axes.set_title(title)
 
 
-def view(pixels: Float[np.ndarray, " pixels"]) -> Float[np.ndarray, "height width"]:
+def view(pixels: Pixels) -> Float[np.ndarray, "height width"]:
     """Interpolate a map at every point of the view.
 
     Parameters
@@ -311,6 +310,6 @@ def taper_fwhm_deg(lmax: int) -> float:
     return float(np.degrees(sigma * np.sqrt(8.0 * np.log(2.0))))
 
 
-def shown(modes: Float[np.ndarray, " modes"], nside: int) -> Float[np.ndarray, " pixels"]:
+def shown(modes: Float[np.ndarray, " modes"], nside: int) -> Pixels:
     """Synthesise the HEALPix RING map of packed coefficients, seen through the beam."""
     return modes_to_map(modes * per_mode(taper(lmax_of(len(modes)))), nside)
