@@ -35,7 +35,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
 import h5py
 import jax
@@ -43,7 +42,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lusee_bayes.core import formats
-from lusee_bayes.core.arrays import Square, Vector
+from lusee_bayes.core.arrays import Square, T, Vector
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.formats import says
@@ -66,7 +65,6 @@ from lusee_bayes.results.map_result import Components, MapResult
 from lusee_bayes.runs.cost import measured_experiment
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
-T = TypeVar("T")
 CHANNELS = "channels"
 
 

@@ -124,11 +124,7 @@ def sample_result(
 
 
 def coordinates(
-    program: Program,
-    arguments: dict,
-    data: Visibilities,
-    inference: Inference,
-    latent: list[str],
+    program: Program, arguments: dict, data: Visibilities, inference: Inference, latent: list[str]
 ) -> Whitening | None:
     """White coordinates for a program: those of the analytic posterior where it samples the sky
     alone, and data are Gaussian about it; the straight ones of a log-normal sky; else those about

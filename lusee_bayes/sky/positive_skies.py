@@ -54,6 +54,7 @@ White = Float[Array, "*batch unknowns"]
 Exponents = Float[np.ndarray, "*batch columns"]
 OfLaws = Float[np.ndarray, "laws ells"]
 ModesBatch = Float[np.ndarray, "*batch modes"]
+Pair = Float[np.ndarray, "2"]
 # a brightness temperature in K, of Galactic theta and phi in radians
 Template = Callable[[Vector, Vector], Vector]
 
@@ -91,12 +92,8 @@ def slopes(lmax: int) -> Float[np.ndarray, "2 ells"]:
 
 
 def matching_step(
-    power: Float[np.ndarray, " n"],
-    known: Float[np.ndarray, " n"],
-    slope: Float[np.ndarray, "2 n"],
-    away: Float[np.ndarray, "2"],
-    narrow: Float[np.ndarray, "2"],
-) -> Float[np.ndarray, "2"]:
+    power: Vector, known: Vector, slope: Float[np.ndarray, "2 n"], away: Pair, narrow: Pair
+) -> Pair:
     """Compute the change of ln A and the tilt after which modes have as much power as they should.
 
     At the maximum of the evidence sum u^2 = sum (1 - var u) in units of the prior, for all that a
