@@ -353,10 +353,9 @@ class Visibilities(checks.Described):
             ohm = receiver.load_ohm
             arrays["load_frequency_mhz"] = receiver.frequencies_mhz
             arrays |= dict(zip(LOADS, (ohm.real, ohm.imag), strict=True))
-        kind = "instant" if windows is None else "mean"
         said = {name: getattr(seen, name) for name in ("lon_deg", "lat_deg", "step_s")}
         said |= {"frequency_mhz": self.frequency_mhz, "jd1.scale": "utc", "jd2.scale": "utc"}
-        said["window"] = kind if self.says_window else None
+        said["window"] = None if not self.says_window else "instant" if windows is None else "mean"
         dataset = as_dataset(formats.VISIBILITIES, LAYOUT, arrays, said)
         dataset = dataset.assign_coords(time=("time", _datetimes(seen.times), {}, ENCODING))
         if windows is None:

@@ -378,9 +378,8 @@ def channel_result(
         held = Counts.of_pixels(width, known.truth - mean, np.asarray(compared)).coverage()
     power = known.prior_std**2
     share = np.divide(variance, power, out=np.zeros(len(variance)), where=power > 0)
-    said = vars(known) | {"doubts": (*known.doubts, *about_information(information_bits))}
     return ChannelResult(
-        **said,
+        **(vars(known) | {"doubts": (*known.doubts, *about_information(information_bits))}),
         **figures,
         mean=mean,
         std=np.sqrt(variance),

@@ -50,7 +50,6 @@ def run_compare(
     InputError
         For fewer than two folders, or one that is not of a finished map run.
     """
-    stages = stages or Stages()
     with run_folder(folder, COMPARISON, None, None, *folders, replace=replace) as run:
         return run.write(read_runs(folders), stages)
 

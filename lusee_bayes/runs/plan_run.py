@@ -241,8 +241,7 @@ def default_variations(source: str, scenario: Scenario) -> list[Variation]:
             found[family, name] = scenario.with_section("observation", runs=varied)
     for duty in DUTY_CYCLES:
         section = radiometer.model_copy(update={"duty_cycle": duty})
-        varied = scenario.with_section("noise", radiometer=section)
-        found["duty cycle", f"{duty:g}"] = varied
+        found["duty cycle", f"{duty:g}"] = scenario.with_section("noise", radiometer=section)
     ports = range(scenario.beam.n_ports if scenario.beam.n_ports > 1 else 0)
     lost = [Variation(source, "antenna lost", f"port {k}", scenario, (k,)) for k in ports]
     return [Variation(source, *named, varied) for named, varied in found.items()] + lost
