@@ -6,13 +6,15 @@ import os
 from collections.abc import Callable, Mapping
 from functools import reduce
 from operator import or_
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, TypeVar
 
 from docstring_parser import DocstringStyle, parse
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from lusee_bayes.core.files import user_path
 from lusee_bayes.core.layouts import LARGEST_MHZ, NOT_HZ
+
+S = TypeVar("S", bound="Section")
 
 
 def _not_tiny(value: float) -> float:
@@ -73,7 +75,7 @@ class Section(BaseModel):
         json_schema_extra=_described,
     )
 
-    def anchored(self) -> Self:
+    def anchored(self: S) -> S:
         """The same with absolute names of files, which are then the same in any folder."""
         found: dict[str, Any] = {}
         for name, declared in type(self).model_fields.items():

@@ -34,7 +34,6 @@ from lusee_bayes.flight.session import LETTERS, PORTS, TELEMETRY, PortLevels, Te
 # levels of ports by their names, as M0, and where arrays have them
 PLACES = {f"{x}{port}": (k, port) for k, x in enumerate(LETTERS) for port in range(PORTS)}
 LEAD, N_COMPONENTS, N_TERMS = (len(LETTERS), PORTS), 2, 9
-Curve = Float[np.ndarray, " frequencies"]
 Errors = dict[str, float]
 Strengths = Float[np.ndarray, "rows components"]
 # one nV^2/Hz
@@ -100,7 +99,7 @@ class GainModel(Described):
         require_positive(f"{self.path}: the mean gain", self.mean, "give counts for 1 nV^2/Hz")
 
     def basis(
-        self, level: str, port: int, frequencies_mhz: Curve
+        self, level: str, port: int, frequencies_mhz: Float[np.ndarray, " frequencies"]
     ) -> Float[np.ndarray, "3 frequencies"]:
         """Return mean, v_1 and v_2 at some frequencies.
 

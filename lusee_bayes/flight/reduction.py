@@ -65,7 +65,7 @@ def reduce_sessions(
         )
     level = np.concatenate([s.level for s in line.sessions])
     like = _in_common(line, recipe, level)
-    first = np.searchsorted(line.bin_of, np.arange(line.n_bins))
+    first = np.searchsorted(line.bin_of, np.arange(line.bin_of[-1] + 1))
     whole = reduced.Reduced.blank(like, line.observation, line.bin_of, level[first])
     numbers = range(len(recipe.frequencies_mhz))
     spans, slabs = [], []

@@ -33,7 +33,6 @@ from lusee_bayes.sky.prior import PIVOT, HarmonicPrior, Prior
 Parameters = Float[np.ndarray, " parameters"]
 
 Theta = Float[np.ndarray, " theta"]
-Cells = Float[np.ndarray, " cells"]
 # degrees of freedom of the parameters' Student distribution: near their centre they are held as by
 # a normal one of the same width, and a few may be far from it
 FREEDOM = 2.0
@@ -152,7 +151,7 @@ class Hyperprior:
         log_normal = -0.5 * (scores**2 + np.log(2.0 * np.pi))
         return np.exp(log_normal - self._log_densities(self.of_scores(scores)))
 
-    def _parts(self, parameters: Parameters) -> tuple[Theta, Cells]:
+    def _parts(self, parameters: Parameters) -> tuple[Theta, Float[np.ndarray, " cells"]]:
         theta, cells = np.split(parameters, [len(self.centre)])
         return (theta - self.centre) / self.width, cells
 

@@ -53,7 +53,6 @@ Number = float | Float[Array, ""]
 White = Float[Array, "*batch unknowns"]
 Exponents = Float[np.ndarray, "*batch columns"]
 OfLaws = Float[np.ndarray, "laws ells"]
-ModesBatch = Float[np.ndarray, "*batch modes"]
 Pair = Float[np.ndarray, "2"]
 # a brightness temperature in K, of Galactic theta and phi in radians
 Template = Callable[[Vector, Vector], Vector]
@@ -406,7 +405,7 @@ class PositiveSkies(eqx.Module):
         with np.errstate(over="ignore"):
             return self.levels[channel] * np.exp(self.weight * self.grid.synthesise(exponent))
 
-    def modes(self, channel: int, exponent: Exponents) -> ModesBatch:
+    def modes(self, channel: int, exponent: Exponents) -> Float[np.ndarray, "*batch modes"]:
         """Compute the sky without point sources: real packed coefficients, Galactic, in K.
 
         Parameters
