@@ -35,8 +35,7 @@ from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.linear_gaussian import Solution
 from lusee_bayes.linear.posterior import Posterior, pixel_std, prior_pixel_std
 from lusee_bayes.results.channel import ChannelData, ChannelResult, Details, Judged
-from lusee_bayes.results.finished_runs import taken
-from lusee_bayes.results.map_files import SavedInformation
+from lusee_bayes.results.finished_runs import SavedInformation, taken
 from lusee_bayes.results.map_result import prior_sentence
 from lusee_bayes.sky.prior import DensePrior, Prior
 from lusee_bayes.systematics.beam import beam_rms_difference

@@ -60,7 +60,7 @@ from lusee_bayes.linear.amplitudes import Amplitudes, Tied, information_given, t
 from lusee_bayes.linear.information import Information
 from lusee_bayes.results.channel import ChannelData, ChannelResult, SkyModes
 from lusee_bayes.results.channel_map import Conditioned, channel_result, conditioned
-from lusee_bayes.results.map_files import information_file, read_information
+from lusee_bayes.results.finished_runs import information_file, read_information
 from lusee_bayes.results.map_result import Components, MapResult
 from lusee_bayes.runs.cost import measured_experiment
 from lusee_bayes.sky.spectral_prior import SpectralPrior

@@ -13,8 +13,7 @@ from lusee_bayes.experiment.data_files import Data, are_sessions, reduced_of, vi
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.flight.reduced import REDUCED, Reduced, write_reduced
 from lusee_bayes.report.figures import judgement, maps
-from lusee_bayes.results import map_files
-from lusee_bayes.results.finished_runs import Provenance
+from lusee_bayes.results import finished_runs
 from lusee_bayes.results.map_result import MapResult
 from lusee_bayes.runs.channels import CHANNELS, map_channels
 from lusee_bayes.runs.cost import posterior_cost, require_fits
@@ -84,7 +83,9 @@ def run_map(
         made = map_channels(scenario, run.path, data=given, stages=stages, **more)
         known, times = made.stacked("truth") is not None, made.channel.taken
         made = replace_fields(made, reduced=reduced and _as_used(reduced, made))
-        return run.write(made, stages, Provenance.of(scenario, times, data, known_sky=known))
+        return run.write(
+            made, stages, finished_runs.Provenance.of(scenario, times, data, known_sky=known)
+        )
 
 
 def _given(
@@ -115,13 +116,13 @@ def _as_used(reduced: Reduced, result: MapResult) -> Reduced:
 
 def _write_maps(result: MapResult, folder: Path) -> None:
     if result.single:
-        map_files.write_maps(folder, result.channel.maps(), result.scenario)
+        finished_runs.write_maps(folder, result.channel.maps(), result.scenario)
     else:
-        map_files.write_cubes(folder, result.maps(), result.frequencies_mhz, result.scenario)
+        finished_runs.write_cubes(folder, result.maps(), result.frequencies_mhz, result.scenario)
 
 
 def _write_coefficients(result: MapResult, folder: Path) -> None:
-    header = map_files.cards("mean", result.scenario)
+    header = finished_runs.cards("mean", result.scenario)
     write_alms(folder / "mean_alm.fits", result.channel.mean, header)
 
 
@@ -129,8 +130,8 @@ def _write_coefficients(result: MapResult, folder: Path) -> None:
 MAP = RunKind(
     "map",
     outputs=(
-        Output.netcdf("posterior.nc", map_files.posterior_tree),
-        Output.netcdf("diagnostics.nc", map_files.diagnostics_tree),
+        Output.netcdf("posterior.nc", finished_runs.posterior_tree),
+        Output.netcdf("diagnostics.nc", finished_runs.diagnostics_tree),
         Output(_write_maps),
         Output(_write_coefficients, wanted=lambda result: result.single),
         Output.rows("spectra.csv", lambda result: result.spectra()),

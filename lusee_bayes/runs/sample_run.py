@@ -30,8 +30,7 @@ from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.coverage import LEVELS
 from lusee_bayes.report.figures import sampling as figures
 from lusee_bayes.report.rendering import render_text
-from lusee_bayes.results.finished_runs import Provenance
-from lusee_bayes.results.map_files import write_cubes, write_maps
+from lusee_bayes.results.finished_runs import Provenance, write_cubes, write_maps
 from lusee_bayes.results.sample_result import CHAINS, SAMPLES, SampleResult, ValidationResult
 from lusee_bayes.runs.cost import demand_of, measured_experiment
 from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, run_folder
