@@ -26,7 +26,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int, Shaped
 
-from lusee_bayes.core.arrays import Array, Grid, GridFlags, as_complex, namespace
+from lusee_bayes.core.arrays import Array, Grid, GridFlags, as_complex, namespace, placed
 from lusee_bayes.core.checks import Described, is_traced
 from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.lazy import pandas
@@ -343,7 +343,7 @@ class DataLayout(Described, eqx.Module):
             return data.reshape(self.n_products, self.n_times, *rest)
         xp = namespace(data, self.index)
         flat = xp.zeros((self.n_products * self.n_times, *rest), dtype=data.dtype)
-        return flat.reshape(self.n_products, self.n_times, *rest)
+        return placed(flat, self.index, data).reshape(self.n_products, self.n_times, *rest)
 
     def by_time(self, data: Columns) -> ByTime:
         """Return d with the products of one time together; missing samples are zero."""

@@ -51,7 +51,7 @@ def run_compare(
         For fewer than two folders, or one that is not of a finished map run.
     """
     with run_folder(folder, COMPARISON, None, None, *folders, replace=replace) as run:
-        return run.write(read_runs(folders), stages)
+        return run.write(read_runs(folders), stages or Stages())
 
 
 def _write_page(runs: list[FinishedRun], folder: Path) -> None:

@@ -83,9 +83,8 @@ def run_map(
         made = map_channels(scenario, run.path, data=given, stages=stages, **more)
         known, times = made.stacked("truth") is not None, made.channel.taken
         made = replace_fields(made, reduced=reduced and _as_used(reduced, made))
-        return run.write(
-            made, stages, finished_runs.Provenance.of(scenario, times, data, known_sky=known)
-        )
+        provenance = finished_runs.Provenance.of(scenario, times, data, known_sky=known)
+        return run.write(made, stages, provenance)
 
 
 def _given(
