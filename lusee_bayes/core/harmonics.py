@@ -297,9 +297,7 @@ class Rotation(eqx.Module):
 
     def __call__(self, modes: Fields) -> Fields:
         """Turn the field, or fields, with these coefficients."""
-        turned = [
-            modes[..., ell**2 : (ell + 1) ** 2] @ block.T for ell, block in enumerate(self.blocks)
-        ]
+        turned = [modes[..., ell**2 : (ell + 1) ** 2] @ d.T for ell, d in enumerate(self.blocks)]
         return namespace(modes, self).concatenate(turned, axis=-1)
 
 

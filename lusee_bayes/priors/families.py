@@ -98,11 +98,9 @@ class Hyperprior:
 
     def _log_densities(self, parameters: Parameters) -> Parameters:
         z, t = self._parts(parameters)
-        half = FREEDOM / 2.0
-        theta = -(half + 0.5) * np.log1p(z**2 / FREEDOM) - np.log(self.width)
-        constant = (
-            special.gammaln(half + 0.5) - special.gammaln(half) - 0.5 * np.log(FREEDOM * np.pi)
-        )
+        h = FREEDOM / 2.0
+        theta = -(h + 0.5) * np.log1p(z**2 / FREEDOM) - np.log(self.width)
+        constant = special.gammaln(h + 0.5) - special.gammaln(h) - 0.5 * np.log(FREEDOM * np.pi)
         shape = self.tail / self.steepness
         cells = -self.tail * t - shape * np.exp(-self.steepness * t)
         of_cell = np.log(self.steepness) + shape * np.log(shape) - special.gammaln(shape)

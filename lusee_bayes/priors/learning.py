@@ -236,7 +236,7 @@ def learn(
         gain = 0.5 * float(gradient @ step)
         if gain < SETTLED:
             return _learned(family, information, here, rng, steps)
-        here = _uphill(family, information, here, step * min(1.0, LONGEST / np.abs(step).max()))
+        here = _climb(family, information, here, step * min(1.0, LONGEST / np.abs(step).max()))
     raise NotSettled(
         f"the prior's parameters did not settle in {MAX_STEPS} steps: the next would still add "
         f"{gain:.2g} to ln p (accepted: {SETTLED:g})"
@@ -314,9 +314,7 @@ def _at(family: PriorFamily, information: Information, parameters: Parameters) -
     return _Point(parameters, member, posterior, value)
 
 
-def _uphill(
-    family: PriorFamily, information: Information, here: _Point, step: Parameters
-) -> _Point:
+def _climb(family: PriorFamily, information: Information, here: _Point, step: Parameters) -> _Point:
     """The end of a step, or of a half, a quarter, ... of it, if ln p is not lower there."""
     part = 1.0
     while part >= SHORTEST:

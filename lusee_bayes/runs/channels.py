@@ -166,10 +166,8 @@ class ChannelInformation:
         """
         information, key = self.information, draw_key(scenario)
         draws, spread, n_draws = components.draws, components.spread, scenario.output.draws
-        if components.mode is not None:
-            sky = positive_joint.positive_sky(
-                components.mode, number, information, spread, draws, key
-            )
+        if (mode := components.mode) is not None:
+            sky = positive_joint.positive_sky(mode, number, information, spread, draws, key)
         else:
             means = (components.mean, spread, draws)
             sky = joint.channel_sky(components.prior, number, information, *means, key)

@@ -339,9 +339,8 @@ def forecasts_of(
         longest = len(others) * (time.perf_counter() - start)
         stages.say(f"  the other {len(others)} take about {duration(longest)}, or less")
         names = [f"{other.source}, {other.name}" for other in others]
-        found += engine.each(
-            Tasks(partial(kept_forecast, folder), others, names), stages, "planning"
-        )
+        tasks = Tasks(partial(kept_forecast, folder), others, names)
+        found += engine.each(tasks, stages, "planning")
     known = {_digest(one.variation): one for one in found}
     return [
         replace(known[_digest(there)], variation=here)

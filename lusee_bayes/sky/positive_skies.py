@@ -177,9 +177,8 @@ class LogNormalSky(eqx.Module):
         level = template(*grid.directions()).reshape(grid.shape)
         require_positive("the template", level, "a log-normal sky is a positive template times exp")
         modes = [source.modes(frequency_mhz, lmax) for source in sources]
-        return cls(
-            np.asarray(spectrum), grid, level, np.reshape(modes, (len(sources), n_modes(lmax)))
-        )
+        shape = len(sources), n_modes(lmax)
+        return cls(np.asarray(spectrum), grid, level, np.reshape(modes, shape))
 
     @property
     def lmax(self) -> int:

@@ -233,9 +233,8 @@ class DensePrior(Prior):
         return self.root.shape[0]
 
     def colour(self, u):
-        return linalg.times_lower(u.reshape(-1, self.size), self.root, transpose=True).reshape(
-            u.shape
-        )
+        flat = u.reshape(-1, self.size)
+        return linalg.times_lower(flat, self.root, transpose=True).reshape(u.shape)
 
     def colour_columns(self, a):
         return linalg.times_lower(a, self.root, transpose=False)

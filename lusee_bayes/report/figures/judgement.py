@@ -239,9 +239,8 @@ def time_line(reduced: Reduced) -> Figure:
         if (level == letter).any()
     ]
     top.legend(handles=handles, loc="upper right", ncols=3, frameon=False)
-    top.set(
-        yticks=range(n_ports), ylim=(n_ports - 0.5, -1.2), ylabel="port", title="Gain of every port"
-    )
+    top.set(yticks=range(n_ports), ylabel="port", ylim=(n_ports - 0.5, -1.2))
+    top.set_title("Gain of every port")
     for row, flagged in enumerate(flags.values()):
         bottom.plot(days[flagged], np.full(flagged.sum(), row), "|", ms=9, color=drawing.ORANGE)
     bottom.set(yticks=range(len(flags)), yticklabels=list(flags), ylim=(n_rows - 0.5, -0.5))
