@@ -242,9 +242,8 @@ def _require_form(where: str, array: Unread, declared: Variable, sizes: dict[str
         raise InputError(f"{where} holds values of type {array.dtype}, expected {words}")
     shape = tuple(array.shape)
     expected = [sizes.get(d) if isinstance(d, str) else d for d in declared.dims]
-    fits = len(shape) == len(expected) and all(
-        e is None or e == n for e, n in zip(expected, shape, strict=True)
-    )
+    same = len(shape) == len(expected)
+    fits = same and all(e in (None, n) for e, n in zip(expected, shape, strict=True))
     if not fits:
         words = " x ".join(
             f"{d}" if e is None or isinstance(d, int) else f"{e} ({d})"

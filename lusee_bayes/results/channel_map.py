@@ -312,9 +312,8 @@ class Conditioned:
         prior = self.found.model.prior
         expected = prior.variance() - np.diagonal(self.covariance)
         left, before = self.without_monopole
-        strong = measures.strengths(
-            self.posterior.mean - prior.colour(prior.white_mean), expected, before - left
-        )
+        moved = self.posterior.mean - prior.colour(prior.white_mean)
+        strong = measures.strengths(moved, expected, before - left)
         fit = found.fit(measures.strengths_in_words(strong))
 
         def on_grid(values: np.ndarray) -> np.ndarray:

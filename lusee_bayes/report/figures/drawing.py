@@ -133,9 +133,8 @@ def orthographic(axes: Axes, grid: HemisphereGrid, pattern: Float[np.ndarray, "t
     # the grid has no node at the zenith itself: every azimuth of the first ring meets there
     closed = np.concatenate([np.full((1, closed.shape[1]), closed[0].mean()), closed])
     x, y = (np.outer(np.sin(np.append(0.0, grid.theta)), f(phi)) for f in (np.cos, np.sin))
-    image = axes.pcolormesh(
-        x, y, closed, cmap=SEQUENTIAL, vmin=0, vmax=1, shading="gouraud", rasterized=True
-    )
+    style = {"cmap": SEQUENTIAL, "vmin": 0, "vmax": 1, "shading": "gouraud", "rasterized": True}
+    image = axes.pcolormesh(x, y, closed, **style)
     axes.set(aspect="equal", xticks=[], yticks=[], xlim=(-1.15, 1.15), ylim=(-1.15, 1.15))
     axes.add_artist(Circle((0, 0), 1.0, fill=False, color=GREY, lw=0.8))
     points = {"N": (0, 1.08), "E": (1.08, 0), "S": (0, -1.08), "W": (-1.08, 0)}
@@ -192,9 +191,8 @@ def mollweide(
     colours = colormaps[cmap].with_extremes(bad=colormaps[cmap](0.0))
     rim = Ellipse((0.0, 0.0), 2 * EDGE[0], 2 * EDGE[1], fill=False, color="black", lw=0.8)
     extent = (-EDGE[0], EDGE[0], -EDGE[1], EDGE[1])
-    image = axes.imshow(
-        view(pixels), extent=extent, origin="lower", cmap=colours, norm=norm, aspect="equal"
-    )
+    style = {"origin": "lower", "cmap": colours, "norm": norm, "aspect": "equal"}
+    image = axes.imshow(view(pixels), extent=extent, **style)
     axes.add_patch(rim)
     image.set_clip_path(rim)
     if highest_altitude is not None and (highest_altitude < 0).any():

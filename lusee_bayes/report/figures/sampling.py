@@ -184,9 +184,8 @@ def comparison(result: Comparison) -> Figure:
     variances.set(xlabel="mode", ylabel="variance: draws / analytic", title="Variances")
     rank = np.arange(1, len(result.eigenvalues) + 1)
     covariance.plot(rank, result.eigenvalues, color=drawing.BLUE, label="draws")
-    covariance.plot(
-        rank, result.null_eigenvalues, color=drawing.ORANGE, ls="--", label="exact chains"
-    )
+    exact = {"color": drawing.ORANGE, "ls": "--", "label": "exact chains"}
+    covariance.plot(rank, result.null_eigenvalues, **exact)
     covariance.set(xlabel="number, rising", ylabel="generalised eigenvalue")
     covariance.set_title("Covariance in analytic coordinates")
     covariance.legend(frameon=False)
