@@ -24,7 +24,7 @@ from .runs.map_run import run_map as run_map
 from .runs.paper_run import run_paper as run_paper
 from .runs.plan_run import run_plan as run_plan
 from .runs.sample_run import run_sample as run_sample
-from .runs.validate_run import run_validate as run_validate
+from .runs.sample_run import run_validate as run_validate
 from .sampling.distributions import CorrelatedNormal as CorrelatedNormal
 from .sampling.distributions import Marginal as Marginal
 from .sampling.distributions import SkyPrior as SkyPrior

@@ -22,7 +22,7 @@ from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.linear.amplitudes import template_amplitudes
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.channel_map import Conditioned, conditioned
-from lusee_bayes.results.map_files import SavedInformation
+from lusee_bayes.results.finished_runs import SavedInformation
 from lusee_bayes.sampling.hmc import whitened
 from lusee_bayes.sampling.programs import WHITE_SUFFIX, Program, latent_sites, numpyro_promotion
 from lusee_bayes.sky.prior import DensePrior, Prior

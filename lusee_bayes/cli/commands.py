@@ -111,8 +111,7 @@ def map_command(
         raise InputError("--workers and --cluster share out channels; give --frequencies")
     with engine.open(demand_of(loaded)) if several else nullcontext() as opened:
         given = {"truth": truth, "earlier": add, "thorough": diagnose}
-        folder = options.folder(scenario)
-        run = run_map(loaded, folder, engine=opened, **given, **options.running())
+        run = run_map(loaded, options.folder(scenario), engine=opened, **given, **options.running())
     options.tell(*run.result.lines(), f"look at {run.page}", files=run.files)
 
 
@@ -148,8 +147,7 @@ def simulate_command(
 
     loaded = options.load(scenario, frequencies_mhz=frequencies)
     if flight:
-        place = options.output or Path("flight")
-        files = run_simulate_flight(loaded, place, **options.running())
+        files = run_simulate_flight(loaded, options.output or Path("flight"), **options.running())
         options.tell(*files.lines())
         return
     path = options.output or Path("data.nc")
@@ -283,9 +281,8 @@ def sample_command(
 
     loaded = options.load(scenario, frequencies_mhz=frequencies)
     program = default_program(loaded) if model is None else load_program(model)
-    folder = options.folder(scenario, f"-{program.name}")
     given = chains.running(loaded.seed, algorithm) | options.running()
-    run = run_sample(loaded, folder, program=program, **given)
+    run = run_sample(loaded, options.folder(scenario, f"-{program.name}"), program=program, **given)
     several, lines = bool(loaded.frequencies_mhz), []
     for result in run.result:
         lines += [f"{result.experiment.scenario.frequency_mhz:g} MHz"] * several + result.lines()
@@ -324,13 +321,12 @@ def validate_command(
     require_draws(chains.draws)
     loaded = options.load(scenario)
     from lusee_bayes.cli.tables import checks_table
-    from lusee_bayes.runs.validate_run import demand_of_calibration, run_validate
+    from lusee_bayes.runs.sample_run import demand_of_calibration, run_validate
 
     with engine.open(demand_of_calibration(loaded)) as opened:
-        folder = options.folder(scenario, "-validation")
         given = {"name": Path(scenario).stem, "simulations": simulations, "engine": opened}
         given |= chains.running(loaded.seed) | options.running()
-        run = run_validate(loaded, folder, **given)
+        run = run_validate(loaded, options.folder(scenario, "-validation"), **given)
     verdict = f"{run.result.headline()}; look at {run.page}"
     options.tell(verdict, files=run.files, table=checks_table(run.result.checks))
     return 0 if run.result.passed else 1
@@ -434,7 +430,7 @@ def compare_priors_command(
         data only), local_scales. By default all that can be. The scenario's
         own section counts for the prior of its kind.
     """
-    from lusee_bayes.cli.tables import priors_table
+    from lusee_bayes.cli.tables import table_of_numbers
     from lusee_bayes.runs.compare_run import run_compare_priors
     from lusee_bayes.runs.cost import demand_of
 
@@ -445,7 +441,7 @@ def compare_priors_command(
         given = {"truth": truth, "name": Path(scenario).stem, "engine": opened}
         run = run_compare_priors(loaded, folder, names, **given, **options.running())
     lines = [*run.result.lines(), f"look at {run.page}"]
-    options.tell(*lines, files=run.files, table=priors_table(run.result))
+    options.tell(*lines, files=run.files, table=table_of_numbers(*run.result.table()))
 
 
 @app.command(name="report")
@@ -554,9 +550,8 @@ def paper_command(
     from lusee_bayes.runs.cost import demand_of
     from lusee_bayes.runs.paper_run import run_paper
 
-    demand = demand_of(*paper_scenarios(skies=sky).values())
     folder = options.output or Path("output/paper")
-    with engine.open(demand) as opened:
+    with engine.open(demand_of(*paper_scenarios(skies=sky).values())) as opened:
         run = run_paper(folder, skies=sky, engine=opened, **options.running())
     verdict = (run.folder / "claims.md").read_text(encoding="utf-8").splitlines()[0]
     files = [path for path in run.files if path.suffix != ".nc"]

@@ -218,7 +218,7 @@ class EngineOptions:
 
     def open(self, demand: Demand) -> AbstractContextManager[Engine]:
         """Start it for the block. InputError as :func:`.open_engine`."""
-        from lusee_bayes.core.engines import open_engine
+        from lusee_bayes.core.engine import open_engine
 
         return open_engine(demand, self.workers, self.cluster)
 

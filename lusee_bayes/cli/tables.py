@@ -9,8 +9,7 @@ from rich.table import Table
 
 from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows
 from lusee_bayes.results.forecast import AS_GIVEN, Forecast, forecast_rows
-from lusee_bayes.results.prior_comparison import PriorComparison
-from lusee_bayes.results.validation_result import allowed
+from lusee_bayes.results.sample_result import ValidationResult
 from lusee_bayes.sampling.validation import Check
 
 
@@ -47,12 +46,12 @@ def checks_table(checks: list[Check]) -> Table:
     table = Table("check", "value", "allowed", "", "what it is")
     for check in checks:
         verdict = "ok" if check.passed else "FAILED"
-        meaning = escape(check.meaning)
-        table.add_row(escape(check.name), f"{check.value:.4g}", allowed(check), verdict, meaning)
+        value, allowed = f"{check.value:.4g}", ValidationResult.allowed(check)
+        table.add_row(escape(check.name), value, allowed, verdict, escape(check.meaning))
     return table
 
 
-def _of_numbers(header: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
+def table_of_numbers(header: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
     """A column of names, and others of numbers."""
     table = Table()
     for number, name in enumerate(header):
@@ -60,11 +59,6 @@ def _of_numbers(header: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
     for row in rows:
         table.add_row(*map(escape, row))
     return table
-
-
-def priors_table(result: PriorComparison) -> Table:
-    """One data set under several priors, a column for each."""
-    return _of_numbers(*result.table())
 
 
 def comparison_table(runs: Sequence[FinishedRun]) -> Table:
@@ -84,4 +78,4 @@ def comparison_table(runs: Sequence[FinishedRun]) -> Table:
         )
         for run, row in zip(runs, comparison_rows(runs), strict=True)
     ]
-    return _of_numbers((*header, "p instr.", "p prior"), rows)
+    return table_of_numbers((*header, "p instr.", "p prior"), rows)

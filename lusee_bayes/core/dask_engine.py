@@ -22,7 +22,7 @@ from contextlib import closing, contextmanager
 from functools import lru_cache, partial
 from pathlib import Path
 from threading import Lock
-from typing import Any, TypeVar
+from typing import Any
 
 import cloudpickle
 import dask
@@ -31,14 +31,11 @@ from distributed.scheduler import NoWorkerError
 
 from lusee_bayes.core import engine
 from lusee_bayes.core.arrays import use_compilation_cache
-from lusee_bayes.core.engine import Merge, Tasks
+from lusee_bayes.core.engine import Merge, R, T, Tasks
 from lusee_bayes.core.errors import InputError, WorkersLost
 from lusee_bayes.core.files import scratch_folder
 from lusee_bayes.core.progress import Stages, gigabytes, memory_limit
 from lusee_bayes.core.version import __version__
-
-T = TypeVar("T")
-R = TypeVar("R")
 
 # of a task that fails: memory or disk may have been full
 REPEATS = 3
@@ -71,8 +68,7 @@ class DaskEngine(engine.Engine):
     def work_in(self, folder: Path) -> None:
         self._folder = folder.resolve()
         asked = code_versions(), self._folder, self._demand
-        answers = self.client.run(refusal_of, *asked, on_error="return")
-        for worker, answer in answers.items():
+        for worker, answer in self.client.run(refusal_of, *asked, on_error="return").items():
             if answer is not None:
                 raise InputError(f"worker {worker}: {answer}")
 

@@ -18,16 +18,18 @@ import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cached_property, partial
+from importlib.util import find_spec
 from pathlib import Path
 from threading import RLock
 from typing import Any, Generic, TypeVar
 
 from threadpoolctl import threadpool_limits
 
-from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.progress import Stages, memory_limit
 
 # each has its own memory to work in
 MOST = 8
@@ -69,8 +71,7 @@ def in_threads(function: Callable[[T], R], items: Sequence[T]) -> list[R]:
 @contextmanager
 def threads(n: int) -> Iterator[ThreadPoolExecutor]:
     """Start so many threads, each with its share of the processors for products of matrices."""
-    share = max(1, processors() // n)
-    with threadpool_limits(share, "blas"), ThreadPoolExecutor(n) as pool:
+    with threadpool_limits(max(1, processors() // n), "blas"), ThreadPoolExecutor(n) as pool:
         yield pool
 
 
@@ -251,5 +252,57 @@ def merged_as_tree(parts: Iterator[R], n: int, merge: Merge[R]) -> R:
     if n == 1:
         return next(parts)
     half = 1 << ((n - 1).bit_length() - 1)
-    first = merged_as_tree(parts, half, merge)
-    return merge(first, merged_as_tree(parts, n - half, merge))
+    return merge(merged_as_tree(parts, half, merge), merged_as_tree(parts, n - half, merge))
+
+
+# the variable by which Dask's own programs are told of a cluster
+SCHEDULER = "DASK_SCHEDULER_ADDRESS"
+
+
+@contextmanager
+def open_engine(
+    demand: Demand, workers: int | None = None, cluster: str | None = None
+) -> Iterator[Engine]:
+    """Start what is to carry out the tasks of a run, and end it after the block.
+
+    Parameters
+    ----------
+    demand : Demand
+        What the tasks take.
+    workers : int, optional
+        Processes of this machine; one, as by default, is this process, without any server.
+    cluster : str, optional
+        Address of the scheduler of a Dask cluster, as tcp://host:8786; by default that of the
+        environment variable ``DASK_SCHEDULER_ADDRESS``, if it is set.
+
+    Yields
+    ------
+    Engine
+
+    Raises
+    ------
+    InputError
+        If Dask is not installed, the workers do not fit into the memory, no scheduler answers, or
+        as :class:`.DaskEngine`.
+    """
+    if workers is not None and cluster is not None:
+        raise InputError("--workers starts workers of its own, --cluster uses others; give one")
+    if workers is None:
+        cluster, workers = cluster or os.environ.get(SCHEDULER), 1
+    if not cluster and workers == 1:
+        gc.freeze()  # modules stay: they need not be searched
+        yield ThisProcess(demand.side_by_side if demand.process_bytes() <= memory_limit() else 1)
+        return
+    if find_spec("distributed") is None:
+        raise InputError(
+            "--workers and --cluster need Dask; install it with pip install '.[cluster]' in the "
+            "clone of lusee_bayes"
+        )
+    # an optional library, which takes a second
+    from lusee_bayes.core.dask_engine import connected, own_workers
+
+    # before JAX starts: workers on the same GPU as this process need some of its memory
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    with ExitStack() as stack:
+        place = cluster or stack.enter_context(own_workers(workers, demand))
+        yield stack.enter_context(connected(place, demand))

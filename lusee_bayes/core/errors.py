@@ -28,6 +28,12 @@ class WorkersLost(RuntimeError):
     """Raised when workers fail again and again, or are gone; the message is one sentence."""
 
 
+def require_known(what: str, word: str, known: Iterable[str]) -> None:
+    """InputError with the nearest known word, if this one is not known."""
+    if word not in known:
+        raise InputError(f"{what} '{word}'; {nearest(word, known)}")
+
+
 def nearest(word: str, known: Iterable[str]) -> str:
     """Return a hint that names the closest of ``known``, or all of them if none is close."""
     known = list(known)

@@ -257,8 +257,10 @@ def transaction(
         with _naming_last(folder, stage):
             yield stage
         files = sorted(str(p.relative_to(stage)) for p in stage.rglob("*") if p.is_file())
-        for name in files:
-            _require_free(folder / name)
+        for target in (folder / name for name in files):
+            if target.is_dir():
+                raise InputError(f"'{target}' is a folder, and a file of the results has its name")
+            require_folder(target.parent)
         said = _Manifest(kind=kind, files=files, discard=list(discard), origin=dict(origin or {}))
         (stage / MANIFEST).write_text(said.model_dump_json(indent=2) + "\n", encoding="utf-8")
         os.replace(stage, folder / COMMITTED)
@@ -270,13 +272,6 @@ def transaction(
 def scratch_folder(folder: Path) -> Path:
     """Make a folder in ``folder`` for the run that has locked it."""
     return Path(tempfile.mkdtemp(prefix=SCRATCH, dir=folder))
-
-
-def _require_free(target: Path) -> None:
-    """InputError if a folder has the name of a result, or a file that of a folder of it."""
-    if target.is_dir():
-        raise InputError(f"'{target}' is a folder, and a file of the results has its name")
-    require_folder(target.parent)
 
 
 def recover(folder: str | Path) -> None:

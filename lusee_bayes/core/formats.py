@@ -159,8 +159,7 @@ def with_grid(dataset: xr.Dataset) -> xr.Dataset:
             "refinement_level": round(np.log2(n / 12) / 2),
         }
         indices = {"standard_name": "healpix_index", "units": "1"}
-        packed = {"zlib": True, "shuffle": True}
-        numbers = dim, np.arange(n, dtype=np.int32), indices, packed
+        numbers = dim, np.arange(n, dtype=np.int32), indices, {"zlib": True, "shuffle": True}
         dataset = dataset.assign_coords({index: numbers}).assign({grid: ((), np.int8(0), mapping)})
     return dataset
 
@@ -280,8 +279,6 @@ def says(path: Path, attributes: Mapping[str, str]) -> bool:
 
     What is damaged is made anew, as what is not there.
     """
-    if not path.is_file():
-        return False
     try:
         with reading(path, "unfinished work"), h5py.File(path) as file:
             return all(file.attrs.get(name) == value for name, value in attributes.items())

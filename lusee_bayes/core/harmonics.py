@@ -28,7 +28,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Complex, Float
 
-from lusee_bayes.core.arrays import Array, Fields, namespace
+from lusee_bayes.core.arrays import Array, Fields, Square, namespace
 from lusee_bayes.core.checks import require_finite, require_whole
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import healpy, rotations, special
@@ -86,8 +86,7 @@ def from_healpy(alm: Complex[np.ndarray, "*batch alms"]) -> Float[np.ndarray, "*
 def to_healpy(modes: Float[Array, " modes"]) -> Complex[np.ndarray, " alms"]:
     """Convert real packed coefficients to healpy's; inverse of :func:`from_healpy`."""
     modes = np.asarray(modes)
-    lmax = lmax_of(modes.shape[-1])
-    ell, m = healpy.Alm.getlm(lmax)
+    ell, m = healpy.Alm.getlm(lmax_of(modes.shape[-1]))
     centre = ell * (ell + 1)
     alm = (modes[centre + m] + 1j * modes[centre - m]) / SQRT2
     return np.where(m == 0, modes[centre] + 0j, alm)
@@ -130,8 +129,7 @@ def map_to_modes(pixels: Float[np.ndarray, " pixels"], lmax: int) -> Float[np.nd
 def modes_to_map(modes: Float[Array, " modes"], nside: int) -> Float[np.ndarray, " pixels"]:
     """Synthesise the HEALPix RING map of packed coefficients."""
     require_nside(nside)
-    alm = to_healpy(modes)
-    return healpy.alm2map(alm, nside, lmax=lmax_of(np.shape(modes)[-1]))
+    return healpy.alm2map(to_healpy(modes), nside, lmax=lmax_of(np.shape(modes)[-1]))
 
 
 @lru_cache(maxsize=8)
@@ -149,8 +147,7 @@ def polar_functions(theta: Angles, lmax: int) -> AtPoints:
 
 def azimuth_functions(phi: Angles, lmax: int) -> Float[np.ndarray, "points orders"]:
     """Return the azimuthal factor of y for m = -lmax..lmax: -sqrt(2) sin, 1, sqrt(2) cos."""
-    m = np.arange(1, lmax + 1)
-    angle = np.asarray(phi, dtype=float)[:, None] * m
+    angle = np.asarray(phi, dtype=float)[:, None] * np.arange(1, lmax + 1)
     sine, cosine = -SQRT2 * np.sin(angle)[:, ::-1], SQRT2 * np.cos(angle)
     return np.concatenate([sine, np.ones((len(angle), 1)), cosine], axis=1)
 
@@ -206,9 +203,7 @@ def per_mode(spectrum: Float[Array, "*batch ells"]) -> Fields:
     return spectrum[..., ell]
 
 
-def order_products(
-    matrix: Float[np.ndarray, "modes modes"], heights: Angles
-) -> Float[np.ndarray, "points orders orders"]:
+def order_products(matrix: Square, heights: Angles) -> Float[np.ndarray, "points orders orders"]:
     """Compute B of every ring, with y^T C y = f(phi)^T B f(phi), f the azimuth functions.
 
     Parameters
@@ -289,17 +284,11 @@ class Rotation(eqx.Module):
 
     @classmethod
     def from_matrix(cls, matrix: Float[np.ndarray, "3 3"], lmax: int) -> Rotation:
-        """Return D(g) for the proper rotation matrix g that takes vectors n to g n."""
-        turn = rotations.Rotation.from_matrix(matrix).as_rotvec()
-        angle = np.linalg.norm(turn)
-        axis = turn / angle if angle else turn
-        blocks = []
-        for ell in range(lmax + 1):
-            # the eigenvalues of i axis . K are whole numbers
-            values, vectors = np.linalg.eigh(1j * np.tensordot(axis, generators(ell), 1))
-            waves = vectors * np.exp(-1j * angle * np.rint(values))
-            blocks.append(np.real(waves @ vectors.conj().T))
-        return cls(tuple(blocks))
+        """Return D(g) for the proper rotation matrix g that takes vectors n to g n.
+
+        What was asked for before, as all channels of a site do, is there.
+        """
+        return _rotation(np.ascontiguousarray(matrix, dtype=np.float64).tobytes(), lmax)
 
     @property
     def T(self) -> Rotation:
@@ -308,10 +297,22 @@ class Rotation(eqx.Module):
 
     def __call__(self, modes: Fields) -> Fields:
         """Turn the field, or fields, with these coefficients."""
-        turned = [
-            modes[..., ell**2 : (ell + 1) ** 2] @ block.T for ell, block in enumerate(self.blocks)
-        ]
+        turned = [modes[..., ell**2 : (ell + 1) ** 2] @ d.T for ell, d in enumerate(self.blocks)]
         return namespace(modes, self).concatenate(turned, axis=-1)
+
+
+@lru_cache(maxsize=16)
+def _rotation(matrix: bytes, lmax: int) -> Rotation:
+    turn = rotations.Rotation.from_matrix(np.frombuffer(matrix).reshape(3, 3)).as_rotvec()
+    angle = np.linalg.norm(turn)
+    axis = turn / angle if angle else turn
+    blocks = []
+    for ell in range(lmax + 1):
+        # the eigenvalues of i axis . K are whole numbers
+        values, vectors = np.linalg.eigh(1j * np.tensordot(axis, generators(ell), 1))
+        waves = vectors * np.exp(-1j * angle * np.rint(values))
+        blocks.append(np.real(waves @ vectors.conj().T))
+    return Rotation(tuple(blocks))
 
 
 def turn_about_z(modes: Fields, angle: float | Float[Array, ""]) -> Fields:
@@ -341,14 +342,10 @@ def turn_about(axis: int, modes: Fields, angle: float | Float[Array, ""]) -> Fie
 
     Else as :func:`turn_about_z`.
     """
-    from_axis = _z_from(axis, round(np.sqrt(modes.shape[-1])) - 1)
+    # takes the axis to z: a cyclic swap of the axes
+    swap, lmax = np.roll(np.eye(3), -(axis + 1), axis=1).T, round(np.sqrt(modes.shape[-1])) - 1
+    from_axis = Rotation.from_matrix(swap, lmax)
     return from_axis.T(turn_about_z(from_axis(modes), angle))
-
-
-@lru_cache(maxsize=8)
-def _z_from(axis: int, lmax: int) -> Rotation:
-    """The rotation that takes the x axis (0) or the y axis (1) to z: a cyclic swap of the axes."""
-    return Rotation.from_matrix(np.roll(np.eye(3), -(axis + 1), axis=1).T, lmax)
 
 
 @lru_cache(maxsize=16)

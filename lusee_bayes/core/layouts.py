@@ -206,7 +206,11 @@ class Layout:
         InputError
             If the file lacks something, or something is not as declared.
         """
-        self._require_names(path, arrays, values)
+        for known, given in ((self.variables, arrays), (self.attributes, values)):
+            for name, one in known.items():
+                if not one.optional and given.get(name) is None:
+                    there = f"it has {', '.join(map(str, given))}" if len(given) else "it has none"
+                    raise InputError(f"{path} has no {name} ({there}); expected {self.what}")
         found = {
             name: _checked_value(f"{path}: {name}", values[name], declared)
             for name, declared in self.attributes.items()
@@ -229,14 +233,6 @@ class Layout:
             read[name] = _checked_array(f"{path}: {name}", array, declared, factor)
         return Content(read, found, sizes, frozenset(map(str, arrays)))
 
-    def _require_names(self, path: str | Path, *there: Mapping[str, Any]) -> None:
-        for declared, given in zip((self.variables, self.attributes), there, strict=True):
-            for name, one in declared.items():
-                if one.optional or given.get(name) is not None:
-                    continue
-                known = f"it has {', '.join(map(str, given))}" if len(given) else "it has none"
-                raise InputError(f"{path} has no {name} ({known}); expected {self.what}")
-
 
 def _require_form(where: str, array: Unread, declared: Variable, sizes: dict[str, int]) -> None:
     """InputError for another kind or shape than declared; lengths that are new become known."""
@@ -246,9 +242,8 @@ def _require_form(where: str, array: Unread, declared: Variable, sizes: dict[str
         raise InputError(f"{where} holds values of type {array.dtype}, expected {words}")
     shape = tuple(array.shape)
     expected = [sizes.get(d) if isinstance(d, str) else d for d in declared.dims]
-    fits = len(shape) == len(expected) and all(
-        e is None or e == n for e, n in zip(expected, shape, strict=True)
-    )
+    same = len(shape) == len(expected)
+    fits = same and all(e in (None, n) for e, n in zip(expected, shape, strict=True))
     if not fits:
         words = " x ".join(
             f"{d}" if e is None or isinstance(d, int) else f"{e} ({d})"

@@ -294,8 +294,7 @@ def spanning_rows(
 
 def mirrored(lower: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     """Make a lower triangle symmetric, in place; block by block, as caches like it."""
-    edges = [*range(0, len(lower), MIRRORED), len(lower)]
-    for first, end in pairwise(edges):
+    for first, end in pairwise([*range(0, len(lower), MIRRORED), len(lower)]):
         lower[:first, first:end] = lower[first:end, :first].T
         block = lower[first:end, first:end]
         block[:] = np.tril(block) + np.tril(block, -1).T

@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -52,11 +52,8 @@ class Stages:
     def __call__(self, name: str) -> Iterator[None]:
         """Run a ``with`` block as a stage: a spinner while it runs, its time when it is done."""
         start = time.perf_counter()
-        if self.console is None:
+        with nullcontext() if self.console is None else self.console.status(escape(f"{name} ...")):
             yield
-        else:
-            with self.console.status(escape(f"{name} ...")):
-                yield
         self._finish(name, start)
 
     @contextmanager

@@ -255,12 +255,6 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
         writer.writerows(rows)
 
 
-def rows_of(columns: Mapping[str, np.ndarray]) -> list[dict[str, object]]:
-    """Rows of a table that is given by columns, as plain Python values."""
-    rows = zip(*(values.tolist() for values in columns.values()), strict=True)
-    return [dict(zip(columns, row, strict=True)) for row in rows]
-
-
 class _Constructor(SafeConstructor):
     """The safe one, without dates."""
 

@@ -78,7 +78,7 @@ def quantity(
     said = {"units": units, "long_name": long_name}
     attributes = {name: words for name, words in said.items() if words} | dict(attributes or {})
     encoding = {"zlib": True, "complevel": 1} if packed else {}
-    metadata = {"attributes": attributes, "checks": checks or ANY, "encoding": encoding}
+    metadata = {"attributes": attributes, "checks": ANY if checks is None else checks, "encoding": encoding}
     return field(metadata=metadata, **options)
 
 
@@ -314,9 +314,8 @@ def _table(name: str, columns: Mapping[str, list]) -> xr.DataTree:
     for key, values in columns.items():
         array = np.array([np.nan if value is None else value for value in values])
         found[key] = (f"{name}_row", array.astype(np.int8) if array.dtype == bool else array)
-    attributes = {"columns": json.dumps(list(columns))}
     rows = {} if not columns or not len(next(iter(columns.values()))) else found
-    return xr.DataTree(xr.Dataset(rows, attrs=attributes))
+    return xr.DataTree(xr.Dataset(rows, attrs={"columns": json.dumps(list(columns))}))
 
 
 def _of_group(kind: _Kind, tree: xr.DataTree | StoredTree, where: str) -> Any:

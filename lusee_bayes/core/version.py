@@ -43,8 +43,7 @@ def versions(*, with_commit: bool = True) -> dict[str, str]:
     """
     libraries = ("jax", "numpyro", "arviz-stats", "numpy", "scipy", "healpy", "astropy", "lunarsky")
     own = {"commit": commit()} if with_commit and commit() else {}
-    found = {name: installed(name) for name in libraries}
-    return {"lusee_bayes": __version__, **own, **found}
+    return {"lusee_bayes": __version__, **own, **{name: installed(name) for name in libraries}}
 
 
 # every file that is written asks

@@ -109,8 +109,7 @@ class ChannelBand:
                 "use a larger flight.bandwidth_hz or a lower flight.degree"
             )
         first, last = int(within[0]), int(within[-1]) + 1
-        powers = np.arange(degree + 3)
-        finer = (x[first:last, :, None] ** powers).mean(axis=1)
+        finer = (x[first:last, :, None] ** np.arange(degree + 3)).mean(axis=1)
         apart = np.abs(channels[first:last, :, None, None] - channels[None, None, first:last])
         known = np.array([*shared_noise, 0.0])
         shared = known[np.minimum(apart, len(known) - 1)].mean(axis=(1, 3))

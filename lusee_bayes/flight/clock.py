@@ -114,8 +114,7 @@ class Clock:
     def isot(self) -> str:
         """The reference time as text, in its own scale."""
         with unannounced_leap_seconds():
-            time = Time(self.jd1, self.jd2, format="jd", scale=self.scale, precision=9)
-            return str(time.isot)
+            return str(Time(self.jd1, self.jd2, format="jd", scale=self.scale, precision=9).isot)
 
     def differs_s(self, other: Clock, raw_s: Times) -> float:
         """Return by how many seconds two clocks differ at most at some readings."""

@@ -94,10 +94,8 @@ def outliers(
     active = np.arange(len(values))
     for _ in range(MAX_ROUNDS):
         z[active] = distances(values[active], noise[active], good[active], kept[active], basis)
-        worst = np.abs(z[active]).max(axis=1)
-        among = np.where(kept[active], worst, 0.0)
-        most = among.max(axis=1, keepdims=True)
-        out = (among > limit) & (among >= WORST * most)
+        among = np.where(kept[active], np.abs(z[active]).max(axis=1), 0.0)
+        out = (among > limit) & (among >= WORST * among.max(axis=1, keepdims=True))
         # a curve needs more points than it has terms
         enough = (kept[active] & ~out).sum(axis=1) > basis.shape[1]
         out &= enough[:, None]
@@ -105,8 +103,7 @@ def outliers(
             break
         kept[active] &= ~out
         active = active[out.any(axis=1)]
-    back = good & ~kept & (np.abs(z).max(axis=1) <= limit)
-    kept |= back
+    kept |= good & ~kept & (np.abs(z).max(axis=1) <= limit)
     return good & ~kept, z
 
 
@@ -225,10 +222,9 @@ def comb_strength(autos: Spectra, frames: Rows, averaging: Averaging, middles_mh
     with np.errstate(divide="ignore", invalid="ignore"):
         z = (autos[..., at] - around) / noise
     known = np.isfinite(z)
-    count = np.maximum(known.sum(axis=2), 1)
     # a strong line of its own is no comb
     clipped = np.clip(np.where(known, z, 0.0), -COMB_LIMIT, COMB_LIMIT)
-    strength = clipped.sum(axis=2) / np.sqrt(count)
+    strength = clipped.sum(axis=2) / np.sqrt(np.maximum(known.sum(axis=2), 1))
     most = np.abs(strength).argmax(axis=1)
     return np.take_along_axis(strength, most[:, None], axis=1)[:, 0]
 

@@ -23,7 +23,7 @@ from jaxtyping import Float
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.checks import Described, extent, require_positive, require_shape
-from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.files import user_path
 from lusee_bayes.core.layouts import Layout, Variable, require_mhz
 from lusee_bayes.core.lazy import interpolate
@@ -34,7 +34,6 @@ from lusee_bayes.flight.session import LETTERS, PORTS, TELEMETRY, PortLevels, Te
 # levels of ports by their names, as M0, and where arrays have them
 PLACES = {f"{x}{port}": (k, port) for k, x in enumerate(LETTERS) for port in range(PORTS)}
 LEAD, N_COMPONENTS, N_TERMS = (len(LETTERS), PORTS), 2, 9
-Curve = Float[np.ndarray, " frequencies"]
 Errors = dict[str, float]
 Strengths = Float[np.ndarray, "rows components"]
 # one nV^2/Hz
@@ -100,7 +99,7 @@ class GainModel(Described):
         require_positive(f"{self.path}: the mean gain", self.mean, "give counts for 1 nV^2/Hz")
 
     def basis(
-        self, level: str, port: int, frequencies_mhz: Curve
+        self, level: str, port: int, frequencies_mhz: Float[np.ndarray, " frequencies"]
     ) -> Float[np.ndarray, "3 frequencies"]:
         """Return mean, v_1 and v_2 at some frequencies.
 
@@ -317,10 +316,9 @@ def _read_folder(folder: Path, model: str) -> GainModel:
     arrays = Layout("luseepy's gain model", layout).checked(folder, found, {}).arrays
     stacks = (np.stack([arrays[one] for one in of_places]) for of_places in names.values())
     mhz, mean, vectors = (stack.reshape(*LEAD, *stack.shape[1:]) for stack in stacks)
-    components = vectors.swapaxes(2, 3)
     coefficients = _coefficients(folder / COEFFICIENTS, model)
     kind = f"luseepy's gain model, {model} coefficients"
-    return GainModel(str(folder), mhz, mean, components, coefficients, kind=kind)
+    return GainModel(str(folder), mhz, mean, vectors.swapaxes(2, 3), coefficients, kind=kind)
 
 
 def _coefficients(path: Path, model: str) -> np.ndarray:
@@ -337,10 +335,7 @@ def _coefficients(path: Path, model: str) -> np.ndarray:
         if str(family).strip().lower() != model:
             continue
         name = f"{setting.strip().upper()} {component.strip().upper()} {term.strip()}"
-        if name not in places:
-            raise InputError(
-                f"{path}: line {number}: unknown coefficient '{name}'; {nearest(name, places)}"
-            )
+        require_known(f"{path}: line {number}: unknown coefficient", name, places)
         if name in seen:
             raise InputError(f"{path}: line {number} gives {name} a second time")
         seen.add(name)
@@ -383,5 +378,4 @@ def synthetic_gains() -> GainModel:
     # every level and port has a law of its own
     factor = 1.0 + 0.1 * np.arange(len(PLACES)).reshape(*LEAD, 1, 1)
     coefficient = np.broadcast_to(TERMS, (*LEAD, N_COMPONENTS, N_TERMS)) * factor
-    mhz = np.broadcast_to(f, mean.shape).copy()
-    return GainModel("made up", mhz, mean, component, coefficient)
+    return GainModel("made up", np.broadcast_to(f, mean.shape).copy(), mean, component, coefficient)

@@ -258,11 +258,6 @@ class Timeline:
     row: Int[np.ndarray, " rows"]
     bin_of: Int[np.ndarray, " rows"]
 
-    @property
-    def n_bins(self) -> int:
-        """Number of bins of time."""
-        return int(self.bin_of[-1]) + 1
-
 
 def timeline(sessions: Sequence[Session], recipe: Recipe) -> Timeline:
     """Put sessions in order, and cut their time into bins.

@@ -65,7 +65,7 @@ def reduce_sessions(
         )
     level = np.concatenate([s.level for s in line.sessions])
     like = _in_common(line, recipe, level)
-    first = np.searchsorted(line.bin_of, np.arange(line.n_bins))
+    first = np.searchsorted(line.bin_of, np.arange(line.bin_of[-1] + 1))
     whole = reduced.Reduced.blank(like, line.observation, line.bin_of, level[first])
     numbers = range(len(recipe.frequencies_mhz))
     spans, slabs = [], []
@@ -118,8 +118,7 @@ def _pieces(line: Timeline) -> list[slice]:
     ends = np.flatnonzero(np.append(np.diff(bin_of) != 0, True)) + 1
     pieces, start = [], 0
     for k, end in enumerate(ends):
-        last = k + 1 == len(ends)
-        if last or end - start >= PIECE or run[ends[k + 1] - 1] != run[start]:
+        if k + 1 == len(ends) or end - start >= PIECE or run[ends[k + 1] - 1] != run[start]:
             pieces.append(slice(start, int(end)))
             start = int(end)
     return pieces
@@ -191,8 +190,7 @@ class State:
         basis = np.full((session.PORTS, 3, averaging.n_bins), np.nan)
         for port, level in enumerate(levels):
             if level != session.NO_LEVEL:
-                splines = recipe.table.basis(level, port, middles)
-                basis[port] = splines[:, channels].mean(axis=2)
+                basis[port] = recipe.table.basis(level, port, middles)[:, channels].mean(axis=2)
         bands = tuple(
             ChannelBand.of(f, section.bandwidth_mhz, section.degree, averaging, middles, shared)
             for f in recipe.frequencies_mhz
@@ -250,65 +248,55 @@ def _slab(
     with naming(source.path):
         strengths = state.strengths(telemetry, len(counts))
     frames = source.frames[here]
-    lines = state.lines(counts, frames, notched)
-    return partial(_calibrate, state, counts, frames, strengths, lines, source.saturated[here])
+    lines, saturated = state.lines(counts, frames, notched), source.saturated[here]
 
+    def calibrate(spectra: reduced.Reduced, start: int, number: int) -> None:
+        """Calibrate, flag and average the channels of a band, into spectra from ``start`` on."""
+        band, averaging = state.bands[number], session.AVERAGING[state.navgf]
+        rows, at = slice(start, start + len(counts)), slice(band.first, band.last)
+        basis = state.basis[:, :, at]
+        gain = np.einsum("rpc,pck->rpk", strengths, basis)
+        with np.errstate(invalid="ignore"):
+            root = np.sqrt(np.where(gain > 0.0, gain, np.nan))
+        raw = counts[:, session.OF_FLIGHT, at].astype(np.float64)
+        factor = NANO2 * averaging.stride / averaging.members
+        channels = raw * factor / (root[:, session.FIRST_PORT] * root[:, session.SECOND_PORT])
+        if recipe.section.sign < 0:
+            channels[:, session.IMAGINARY] *= -1.0
+        finite = np.isfinite(channels)
+        present = finite.any(axis=2)
+        there = finite[:, session.AUTOS]
+        # where a product is there, all of it has to be
+        whole = (finite | ~present[..., None]).all(axis=1) & there.any(axis=(1, 2))[:, None]
+        good = whole & ~lines[:, at] & ~saturated[:, None]
+        # products without an auto of their own do not tell lines
+        filled = np.where(there, channels[:, session.AUTOS], 0.0)
+        limit = flags.threshold(recipe.section.false_alarm, session.PORTS)
+        found, z = flags.line_flags(band, filled, frames, good, limit)
+        kept = good & ~found
+        mean_auto = filled.sum(axis=1) / np.maximum(there.sum(axis=1), 1)
+        clean = np.where(finite, channels, 0.0)
+        values, variance, further = band.values(clean, mean_auto, kept)
+        before, _, _ = band.values(clean, mean_auto, whole)
+        reason = spectra.reason[number, rows]
+        reason[~np.isfinite(variance)] = reduced.TOO_MANY
+        reason[~good.any(axis=1)] = reduced.COMB
+        reason[~whole.any(axis=1)] = reduced.NO_DATA
+        reason[saturated] = reduced.SATURATED
+        spectra.values[number, :, rows] = np.where(present, values, np.nan).T
+        spectra.before[number, :, rows] = np.where(present, before, np.nan).T
+        spectra.n_averaged[number, rows] = frames / variance
+        noise = spectra.noise(number)[:, rows]
+        spectra.bend[number, :, rows] = _over(further[:, session.AUTOS].T, noise)
+        spectra.lines[number, rows] = 1.0 - kept.sum(axis=1) / len(band.basis)
+        spectra.slab_scatter[number, start // SLAB] = flags.robust_scale(z[:, 0], kept)
+        middle = band.basis[:, 0] / len(band.basis)
+        centre = np.einsum("rpk,k->pr", gain, middle)
+        spectra.gain[number, :, rows] = centre
+        components = np.einsum("pck,k->pc", basis[:, 1:], middle)
+        spectra.slope[number, ..., rows] = components[..., None] / centre[:, None]
 
-def _calibrate(
-    state: State,
-    counts: Counts,
-    frames: Rows,
-    strengths: Strengths,
-    lines: flags.Bins,
-    saturated: RowFlags,
-    spectra: reduced.Reduced,
-    start: int,
-    number: int,
-) -> None:
-    """Calibrate, flag and average the channels of a band, into spectra from ``start`` on."""
-    recipe, band, averaging = state.recipe, state.bands[number], session.AVERAGING[state.navgf]
-    rows, at = slice(start, start + len(counts)), slice(band.first, band.last)
-    basis = state.basis[:, :, at]
-    gain = np.einsum("rpc,pck->rpk", strengths, basis)
-    with np.errstate(invalid="ignore"):
-        root = np.sqrt(np.where(gain > 0.0, gain, np.nan))
-    raw = counts[:, session.OF_FLIGHT, at].astype(np.float64)
-    factor = NANO2 * averaging.stride / averaging.members
-    channels = raw * factor / (root[:, session.FIRST_PORT] * root[:, session.SECOND_PORT])
-    if recipe.section.sign < 0:
-        channels[:, session.IMAGINARY] *= -1.0
-    finite = np.isfinite(channels)
-    present = finite.any(axis=2)
-    there = finite[:, session.AUTOS]
-    # where a product is there, all of it has to be
-    whole = (finite | ~present[..., None]).all(axis=1) & there.any(axis=(1, 2))[:, None]
-    good = whole & ~lines[:, at] & ~saturated[:, None]
-    # products without an auto of their own do not tell lines
-    filled = np.where(there, channels[:, session.AUTOS], 0.0)
-    limit = flags.threshold(recipe.section.false_alarm, session.PORTS)
-    found, z = flags.line_flags(band, filled, frames, good, limit)
-    kept = good & ~found
-    mean_auto = filled.sum(axis=1) / np.maximum(there.sum(axis=1), 1)
-    clean = np.where(finite, channels, 0.0)
-    values, variance, further = band.values(clean, mean_auto, kept)
-    before, _, _ = band.values(clean, mean_auto, whole)
-    reason = spectra.reason[number, rows]
-    reason[~np.isfinite(variance)] = reduced.TOO_MANY
-    reason[~good.any(axis=1)] = reduced.COMB
-    reason[~whole.any(axis=1)] = reduced.NO_DATA
-    reason[saturated] = reduced.SATURATED
-    spectra.values[number, :, rows] = np.where(present, values, np.nan).T
-    spectra.before[number, :, rows] = np.where(present, before, np.nan).T
-    spectra.n_averaged[number, rows] = frames / variance
-    noise = spectra.noise(number)[:, rows]
-    spectra.bend[number, :, rows] = _over(further[:, session.AUTOS].T, noise)
-    spectra.lines[number, rows] = 1.0 - kept.sum(axis=1) / len(band.basis)
-    spectra.slab_scatter[number, start // SLAB] = flags.robust_scale(z[:, 0], kept)
-    middle = band.basis[:, 0] / len(band.basis)
-    centre = np.einsum("rpk,k->pr", gain, middle)
-    spectra.gain[number, :, rows] = centre
-    components = np.einsum("pck,k->pc", basis[:, 1:], middle)
-    spectra.slope[number, ..., rows] = components[..., None] / centre[:, None]
+    return calibrate
 
 
 def _over(values: Float[np.ndarray, "*n"], noise: Float[np.ndarray, "*n"]) -> np.ndarray:
@@ -364,8 +352,7 @@ def _flag_bursts(spectra: reduced.Reduced, false_alarm: float, number: int) -> S
     there = np.isfinite(autos)
     autos, noise = np.where(there, autos, 0.0), np.where(there & (noise > 0.0), noise, np.inf)
     reason = spectra.reason[number]
-    good = reason == reduced.USED
-    burst, scatter = flags.burst_flags(seconds, autos, noise, good, false_alarm)
+    burst, scatter = flags.burst_flags(seconds, autos, noise, reason == reduced.USED, false_alarm)
     reason[burst] = reduced.BURST
     return scatter
 

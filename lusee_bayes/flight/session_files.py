@@ -251,9 +251,8 @@ def _write_session_fits(path: Path, rows: SessionRows, blocks: Iterable[Counts])
         raw_s, mjd = Column(rows.raw_s, unit="s"), Column(rows.mjd(), unit="d")
         times = {"RAW_TIME": raw_s, "MJD_TIME": mjd}
         identity = {"UNIQUE_ID": number, **times, "ORIG_IDX": number}
-        telemetry = {**times, **rows.telemetry}
         tables = {"SPECTRA_TIMES": identity, "SPECTRA_META": rows.metadata()}
-        for name, columns in (tables | {"SPEC_INTERP": telemetry}).items():
+        for name, columns in (tables | {"SPEC_INTERP": {**times, **rows.telemetry}}).items():
             hdus.append(fits.BinTableHDU(Table(columns), name=name))
 
 
@@ -308,8 +307,7 @@ def _write_all_but_spectra(file: h5py.File, rows: SessionRows) -> None:
     number, raw_s, mjd = np.arange(rows.n_rows), rows.raw_s, rows.mjd()
     times = {"unique_ids": number, "original_indices": number, "mjd_times": mjd, "raw_times": raw_s}
     telemetry = {"time": raw_s, "mjd_time": mjd, **rows.telemetry}
-    groups = {"spectra": times, META: rows.metadata(), INTERPOLATED: telemetry}
-    for group, arrays in groups.items():
+    for group, arrays in {"spectra": times, META: rows.metadata(), INTERPOLATED: telemetry}.items():
         for name, values in arrays.items():
             file.create_dataset(f"{group}/{name}", data=values, **PACKED)
     file["spectra"].attrs["count"] = np.int64(rows.n_rows)

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Float32, Int, Shaped
 from scipy.interpolate import CubicSpline
 
-from lusee_bayes.core.arrays import RowFlags
+from lusee_bayes.core.arrays import RowFlags, Vector
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.flight import session
@@ -29,8 +29,6 @@ from lusee_bayes.instrument.products import to_matrix, to_real
 AllChannels = Float[np.ndarray, "products rows channels"]
 Counts = Float[np.ndarray, "rows products bins"]
 Covariances = Complex[np.ndarray, "antennas antennas rows channels"]
-NodesMhz = Float[np.ndarray, " nodes"]
-BitSlices = Int[np.ndarray, "rows products"]
 Rounded = Float32[np.ndarray, "rows products bins"]
 INDEX = -2.5
 # below this share of the lowest known frequency spectra are held: what would rise further there
@@ -60,7 +58,7 @@ class ChannelSpectra:
     correlations: Float[np.ndarray, "channels nodes"]
 
     @classmethod
-    def of(cls, nodes_mhz: NodesMhz, channels_mhz: session.Middles) -> ChannelSpectra:
+    def of(cls, nodes_mhz: Vector, channels_mhz: session.Middles) -> ChannelSpectra:
         """Prepare the interpolation.
 
         Parameters
@@ -124,8 +122,7 @@ class ChannelSpectra:
 
 def _at_channels(weights: Float[np.ndarray, "channels nodes"], values: np.ndarray) -> np.ndarray:
     """Values (nodes, rows, ...) in all channels: (..., rows, channels)."""
-    found = np.tensordot(values, weights, axes=(0, 1))
-    return np.moveaxis(found, 0, -2)
+    return np.moveaxis(np.tensordot(values, weights, axes=(0, 1)), 0, -2)
 
 
 # of the 31 bits of a number, so many hold the largest of a spectrum. What is rounded then is far
@@ -208,11 +205,10 @@ def bit_slices(counts: Counts) -> Int[np.ndarray, " products"]:
     top = np.empty(counts.shape[1])
     largest = np.abs(counts[0, session.OF_FLIGHT[session.AUTOS]]).max(axis=1)
     top[session.OF_FLIGHT] = np.sqrt(largest[session.FIRST_PORT] * largest[session.SECOND_PORT])
-    bits = np.ceil(np.log2(top)) + REFERENCE - BITS
-    return np.clip(bits, 0, REFERENCE).astype(np.int64)
+    return np.clip(np.ceil(np.log2(top)) + REFERENCE - BITS, 0, REFERENCE).astype(np.int64)
 
 
-def rounded(counts: Counts, bitslice: BitSlices) -> Rounded:
+def rounded(counts: Counts, bitslice: Int[np.ndarray, "rows products"]) -> Rounded:
     """Return multiples of 2^(slice - 31).
 
     Parameters

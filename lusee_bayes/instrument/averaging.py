@@ -50,7 +50,6 @@ from lusee_bayes.instrument.visibilities import Visibilities
 Samples, Tilts = Int[np.ndarray, " samples"], Float[np.ndarray, "nodes 2"]
 Functions = Float[np.ndarray, "times functions"]
 Factors = Float[np.ndarray, "functions powers orders 2"]
-Moments = Float[np.ndarray, "times moments"]
 Series = Float[np.ndarray, "moments columns"]
 BinFlags, Bounds = Bool[np.ndarray, "products bins"], Float[np.ndarray, "times 2"]
 
@@ -167,7 +166,7 @@ def _series(powers: list[tuple[int, int]], n_moments: int, largest: float, lmax:
     return series.reshape(n * n_moments, -1)
 
 
-def _fewest(moments: Moments, series: Series) -> tuple[Functions, Array]:
+def _fewest(moments: Float[np.ndarray, "times moments"], series: Series) -> tuple[Functions, Array]:
     """Functions u and factors G with u G = moments x series at every time, to ``TOLERANCE``."""
     q, r = np.linalg.qr(moments)
     across, left = np.linalg.qr(series.T)

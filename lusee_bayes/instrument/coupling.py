@@ -24,7 +24,7 @@ numbers per ell and sample, and derivatives cost no more.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import equinox as eqx
@@ -37,7 +37,7 @@ from lusee_bayes.core.checks import Described, require_array, require_float64, r
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, mode_numbers, tilts, turn_about, turn_about_z
 from lusee_bayes.instrument.beams.fields import ProductBeams
-from lusee_bayes.instrument.beams.source import BeamSource
+from lusee_bayes.instrument.beams.source import BeamSource, Values
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout
@@ -47,7 +47,6 @@ BeamModes = Float[Array, "*runs products modes"]
 BodyBeams = Float[Array, "runs products functions modes"]
 RowNumbers = Int[np.ndarray, " rows"]
 TimeModes = Float[Array, "products times modes"]
-Values = Mapping[str, float | Float[Array, ""]]
 Factors = Float[Array, "functions powers orders 2"]
 # times whose data A^T d takes at once: it bounds the memory
 MOST_TIMES = 8192
@@ -513,13 +512,12 @@ class CouplingMatrix(Coupling):
         crossed = xp.concatenate([minus, -xp.where(zero_order, 0.0, plus)])
         both = xp.stack([pairs.T, crossed.T], axis=-1)
         cosine, sine = _phases(self.pointing.azimuth, self.lmax)
-        functions = self.pointing.functions
         grids = []
         for run, span in self.pointing.runs():
             x_and_y = self.by_order[run] @ both
             over_time = cosine[span] @ x_and_y[..., 0] + sine[span] @ x_and_y[..., 1]
             over_time = over_time.reshape(-1, n_products, n_functions)
-            grids.append((over_time * functions[span][:, None]).sum(-1).T)
+            grids.append((over_time * self.pointing.functions[span][:, None]).sum(-1).T)
         return self.layout.gather(xp.concatenate(grids, axis=1))
 
     @compiled
@@ -546,8 +544,7 @@ class CouplingMatrix(Coupling):
         straight, crossed = both[..., :half], both[..., half:]
         plus, minus = straight[:, :n] - crossed[:, n:], straight[:, n:] + crossed[:, :n]
         ell, m = mode_numbers(self.lmax)
-        above = (m >= 0)[:, None]
-        packed = xp.where(above, plus[np.abs(m), ell], minus[np.abs(m), ell])
+        packed = xp.where((m >= 0)[:, None], plus[np.abs(m), ell], minus[np.abs(m), ell])
         return self.pointing.pole_from_galactic.T(packed.T).T.reshape(-1, *columns)
 
     def _block(self, run: int, times) -> Float[Array, "products times modes"]:

@@ -22,7 +22,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import lru_cache
 from typing import Any
 
 import equinox as eqx
@@ -31,7 +30,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation as SpatialRotation
 
 from lusee_bayes.core.arrays import Array, Times, namespace
-from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.harmonics import Rotation
 from lusee_bayes.instrument.averaging import sufficient_nodes, terms_of_exponential, windowed
 from lusee_bayes.instrument.observation import Observation
@@ -125,7 +124,7 @@ class Pointing(eqx.Module):
             order = sufficient_order(tilt, lmax)
         of_time = windowed(sample, weight, azimuth, tilt, order, lmax)
         starts = np.searchsorted(observation.run, np.arange(observation.n_runs + 1)).tolist()
-        frames = pole_frame, _rotation(pole_frame, lmax), *_lander(observation, lmax)
+        frames = pole_frame, Rotation.from_matrix(pole_frame, lmax), *_lander(observation, lmax)
         return cls(*of_time, *frames, run_starts=tuple(starts), order=order)
 
     def placed(self, observation: Observation) -> Pointing:
@@ -136,8 +135,7 @@ class Pointing(eqx.Module):
         observation : Observation
             With its own site, lean and turntable angles.
         """
-        lmax = len(self.mcmf_from_lander.blocks) - 1
-        lander, turntable = _lander(observation, lmax)
+        lander, turntable = _lander(observation, len(self.mcmf_from_lander.blocks) - 1)
         return replace(self, mcmf_from_lander=lander, turntable=turntable)
 
     @property
@@ -154,17 +152,7 @@ class Pointing(eqx.Module):
 def _lander(observation: Observation, lmax: int) -> tuple[Rotation, Array]:
     """The rotation from the lander to the Moon, and the turntable's angles in radians."""
     angles = np.array(observation.turntable_deg, dtype=np.float64)
-    return _rotation(observation.lander_from_mcmf().T, lmax), np.radians(angles)
-
-
-def _rotation(matrix: Float[np.ndarray, "3 3"], lmax: int) -> Rotation:
-    """Of harmonics; what was asked for before, as all channels of a site do, is there."""
-    return _rotation_of(np.ascontiguousarray(matrix).tobytes(), lmax)
-
-
-@lru_cache(maxsize=8)
-def _rotation_of(matrix: bytes, lmax: int) -> Rotation:
-    return Rotation.from_matrix(np.frombuffer(matrix).reshape(3, 3), lmax)
+    return Rotation.from_matrix(observation.lander_from_mcmf().T, lmax), np.radians(angles)
 
 
 def mean_pole_frame(mcmf: Float[np.ndarray, "times 3 3"]) -> Float[np.ndarray, "3 3"]:
@@ -244,8 +232,7 @@ def offset_names(kinds: tuple[str, ...], n_runs: int) -> tuple[str, ...]:
     """
     names: list[str] = []
     for kind in kinds:
-        if kind not in OFFSETS:
-            raise InputError(f"there is no offset '{kind}'; {nearest(kind, OFFSETS)}")
+        require_known("there is no offset", kind, OFFSETS)
         names += _of_runs(n_runs) if kind == "turntable_deg" else [kind]
     return tuple(names)
 
@@ -277,8 +264,7 @@ def with_offsets(observation: Observation, values: Values) -> Observation:
     given = {name: float(value) for name, value in values.items()}
     drift = given.get("clock_drift_s_per_day", 0.0)
     stretch = 1.0 + drift / 86400.0
-    late = given.get("clock_s", 0.0) + drift * observation.hours / 24.0
-    times = later(observation.times, late)
+    times = later(observation.times, given.get("clock_s", 0.0) + drift * observation.hours / 24.0)
     angles = zip(observation.turntable_deg, _of_runs(observation.n_runs), strict=True)
     windows = observation.windows
     if windows is not None:

@@ -28,7 +28,7 @@ from jaxtyping import Bool, Complex, Float, Int, Shaped
 
 from lusee_bayes.core.arrays import Array, Grid, GridFlags, as_complex, namespace, placed
 from lusee_bayes.core.checks import Described, is_traced
-from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.lazy import pandas
 
 N_ANTENNAS = 4
@@ -164,8 +164,7 @@ def real_products(data: Any, products: Any, flags: Any, convention: str, n_anten
     """
     masked = np.ma.getmaskarray(data) if isinstance(data, np.ma.MaskedArray) else False
     data = _numbers(data)
-    if convention not in CONVENTIONS:
-        raise InputError(f"unknown convention '{convention}'; {nearest(convention, CONVENTIONS)}")
+    require_known("unknown convention", convention, CONVENTIONS)
     ports_and_parts = _columns(products, np.iscomplexobj(data), n_antennas)
     if data.shape[1] != len(ports_and_parts):
         turned = "; transpose them" if data.shape[0] == len(ports_and_parts) else ""
@@ -287,8 +286,7 @@ class DataLayout(Described, eqx.Module):
             raise InputError(
                 f"all {flags.size} samples are flagged or missing; there is nothing to map"
             )
-        index = None if not flags.any() else np.flatnonzero(~flags.ravel())
-        return cls(*flags.shape, index)
+        return cls(*flags.shape, None if not flags.any() else np.flatnonzero(~flags.ravel()))
 
     @property
     def size(self) -> int:
@@ -345,8 +343,7 @@ class DataLayout(Described, eqx.Module):
             return data.reshape(self.n_products, self.n_times, *rest)
         xp = namespace(data, self.index)
         flat = xp.zeros((self.n_products * self.n_times, *rest), dtype=data.dtype)
-        flat = placed(flat, self.index, data)
-        return flat.reshape(self.n_products, self.n_times, *rest)
+        return placed(flat, self.index, data).reshape(self.n_products, self.n_times, *rest)
 
     def by_time(self, data: Columns) -> ByTime:
         """Return d with the products of one time together; missing samples are zero."""

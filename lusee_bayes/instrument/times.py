@@ -31,7 +31,7 @@ from jaxtyping import Bool, Float, Int
 
 from lusee_bayes.core.arrays import Times
 from lusee_bayes.core.checks import Described, extent, require_finite
-from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.errors import InputError, nearest, require_known
 from lusee_bayes.core.layouts import Attribute, Content
 from lusee_bayes.core.reading import naming
 
@@ -431,9 +431,7 @@ def windows_of(
             what = "live time" if bounds is None else "bounds"
             raise InputError(f"instants have no {what}; leave it out, or give another timestamp")
         return times, step_s, None
-    if timestamp not in TO_MIDDLE:
-        known = [*TO_MIDDLE, "instant"]
-        raise InputError(f"unknown timestamp '{timestamp}'; {nearest(timestamp, known)}")
+    require_known("unknown timestamp", timestamp, [*TO_MIDDLE, "instant"])
     ones = np.ones(len(times))
     start, end = (step_s * (TO_MIDDLE[timestamp] + side) * ones for side in (-0.5, 0.5))
     return _windowed(times, start, end, step_s, live_s)

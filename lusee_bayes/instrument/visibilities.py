@@ -267,14 +267,13 @@ class Visibilities(checks.Described):
     def description(self) -> tuple[str, ...]:
         missing = f", {self.n_missing} absent" if self.n_missing else ""
         truth = "" if self.truth is None else f"; simulated, lmax = {lmax_of(len(self.truth))}"
-        unsaid = ["it is not known what the times are: --set observation.timestamp=..."]
-        unsaid = [] if self.says_window else unsaid
+        unsaid = "it is not known what the times are: --set observation.timestamp=..."
         return (
             f"{self.layout.n_products} products x {self.layout.n_times} times at "
             f"{self.frequency_mhz:g} MHz, {self.layout.size} data{missing}",
             f"{checks.extent(self.data, 'K')}{truth}; products {checks.listed(self.labels)}",
             *self.observation.description(),
-            *unsaid,
+            *([] if self.says_window else [unsaid]),
         )
 
     @property
@@ -354,10 +353,9 @@ class Visibilities(checks.Described):
             ohm = receiver.load_ohm
             arrays["load_frequency_mhz"] = receiver.frequencies_mhz
             arrays |= dict(zip(LOADS, (ohm.real, ohm.imag), strict=True))
-        kind = "instant" if windows is None else "mean"
         said = {name: getattr(seen, name) for name in ("lon_deg", "lat_deg", "step_s")}
         said |= {"frequency_mhz": self.frequency_mhz, "jd1.scale": "utc", "jd2.scale": "utc"}
-        said["window"] = kind if self.says_window else None
+        said["window"] = None if not self.says_window else "instant" if windows is None else "mean"
         dataset = as_dataset(formats.VISIBILITIES, LAYOUT, arrays, said)
         dataset = dataset.assign_coords(time=("time", _datetimes(seen.times), {}, ENCODING))
         if windows is None:
@@ -443,8 +441,7 @@ def read_visibilities(path: str | Path) -> Visibilities:
     checks.require_finite(f"{path}: visibility (where not flagged)", values)
     with naming(path):
         layout = DataLayout.from_flags(flags)
-        utc = utc_of_jd(found)
-        times, windows = read_windows(found, utc)
+        times, windows = read_windows(found, utc_of_jd(found))
         says_window = windows is not None or said.get("window") == "instant"
         runs = here["run"], tuple(here["turntable_deg"].tolist()), said["step_s"]
         seen = Observation(said["lon_deg"], said["lat_deg"], times, *runs, windows=windows)

@@ -86,8 +86,7 @@ def compute_case(scenario: Scenario) -> xr.Dataset:
     spectra, maps = channel.spectra(), channel.maps()
     variances = data.layout.scatter(radiometer(setup).diagonal())
     grid = HemisphereGrid.gauss_legendre(*BEAM_NODES)
-    fields = setup.beam_source.fields(scenario.frequency_mhz, grid)
-    beams = np.abs(stokes_beam(fields))
+    beams = np.abs(stokes_beam(setup.beam_source.fields(scenario.frequency_mhz, grid)))
     rms = channel.beam_rms_difference
     beams = np.stack([beams[0, 0], beams[0, 2], beams[0, 1]]).astype(np.float32)
     units = {"rho": "1", "snr": "1", "cl_mean": "K2", "cl_truth": "K2"}

@@ -53,20 +53,14 @@ def data_by_product(cases: Cases) -> Figure:
     figure, axes = drawing.framed((11, 4))
     for k, series in enumerate(data.values):
         axes.plot(k * n_times + np.arange(n_times), series, color=drawing.BLUE, lw=1.0)
-        axes.axvline(k * n_times, color=drawing.GREY, lw=0.4)
-    centres = (np.arange(n_products) + 0.5) * n_times
-    axes.set_xticks(centres, [str(name) for name in data["product"].values], fontsize=8)
-    axes.tick_params(axis="x", length=0)
-    axes.set(xlabel="product (time runs within each)", ylabel="visibility [K]")
-    axes.set_xlim(0, data.size)
+    drawing.side_by_side(axes, [str(name) for name in data["product"].values], n_times)
     axes.set_title(f"Data vector at 25 MHz: {n_products} products, {n_times} samples each")
     return figure
 
 
 def frequency_maps(cases: Cases) -> Figure:
     """Figure 4: truth, posterior mean and difference over the mean, at five frequencies."""
-    figure = Figure(figsize=(18, 9), layout="constrained")
-    columns = len(SHOWN_FREQUENCIES)
+    figure, panels = drawing.framed((18, 9), 3, len(SHOWN_FREQUENCIES))
     for column, frequency in enumerate(SHOWN_FREQUENCIES):
         case = cases[frequency_case(frequency)]
         mean, truth = (drawn(case, name) for name in ("mean", "truth"))
@@ -80,10 +74,8 @@ def frequency_maps(cases: Cases) -> Figure:
             ("difference", percent, signed, drawing.DIVERGING, seen),
         ]
         for row, (name, pixels, scale, cmap, altitude) in enumerate(rows):
-            axes = figure.add_subplot(3, columns, row * columns + column + 1)
-            image = drawing.mollweide(
-                axes, pixels, norm=scale, cmap=cmap, highest_altitude=altitude
-            )
+            axes, style = panels[row, column], {"cmap": cmap, "highest_altitude": altitude}
+            image = drawing.mollweide(axes, pixels, norm=scale, **style)
             axes.set_title(f"{frequency} MHz, {name}", fontsize=10)
             flat_bar(figure, axes, image, "K" if row < 2 else "% of the mean sky")
     figure.suptitle(
@@ -168,14 +160,13 @@ def scenario_maps(cases: Cases) -> Figure:
     """Figure 9: the true sky at 25 MHz and the map of every scenario, in the same colours."""
     truth = drawn(cases["fiducial"], "truth")
     norm = drawing.temperatures(truth)
-    figure = Figure(figsize=(13, 11), layout="constrained")
-    panels = [("truth", truth, None)]
+    shown = [("truth", truth, None)]
     for name in MAP_CASES:
         case = TABLE[name]
         title = f"{case['group']}: {case['label']}" if "group" in case else name
-        panels.append((title, drawn(cases[name], "mean"), cases[name]["highest_altitude"].values))
-    for position, (title, pixels, altitude) in enumerate(panels, 1):
-        axes = figure.add_subplot(4, 3, position)
+        shown.append((title, drawn(cases[name], "mean"), cases[name]["highest_altitude"].values))
+    figure, panels = drawing.framed((13, 11), 4, 3)
+    for axes, (title, pixels, altitude) in zip(panels.flat, shown, strict=True):
         image = drawing.mollweide(axes, pixels, norm=norm, highest_altitude=altitude)
         axes.set_title(title, fontsize=11)
     flat_bar(figure, figure.axes, image, "K")

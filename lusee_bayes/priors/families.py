@@ -33,7 +33,6 @@ from lusee_bayes.sky.prior import PIVOT, HarmonicPrior, Prior
 Parameters = Float[np.ndarray, " parameters"]
 
 Theta = Float[np.ndarray, " theta"]
-Cells = Float[np.ndarray, " cells"]
 # degrees of freedom of the parameters' Student distribution: near their centre they are held as by
 # a normal one of the same width, and a few may be far from it
 FREEDOM = 2.0
@@ -99,11 +98,9 @@ class Hyperprior:
 
     def _log_densities(self, parameters: Parameters) -> Parameters:
         z, t = self._parts(parameters)
-        half = FREEDOM / 2.0
-        theta = -(half + 0.5) * np.log1p(z**2 / FREEDOM) - np.log(self.width)
-        constant = (
-            special.gammaln(half + 0.5) - special.gammaln(half) - 0.5 * np.log(FREEDOM * np.pi)
-        )
+        h = FREEDOM / 2.0
+        theta = -(h + 0.5) * np.log1p(z**2 / FREEDOM) - np.log(self.width)
+        constant = special.gammaln(h + 0.5) - special.gammaln(h) - 0.5 * np.log(FREEDOM * np.pi)
         shape = self.tail / self.steepness
         cells = -self.tail * t - shape * np.exp(-self.steepness * t)
         of_cell = np.log(self.steepness) + shape * np.log(shape) - special.gammaln(shape)
@@ -152,7 +149,7 @@ class Hyperprior:
         log_normal = -0.5 * (scores**2 + np.log(2.0 * np.pi))
         return np.exp(log_normal - self._log_densities(self.of_scores(scores)))
 
-    def _parts(self, parameters: Parameters) -> tuple[Theta, Cells]:
+    def _parts(self, parameters: Parameters) -> tuple[Theta, Float[np.ndarray, " cells"]]:
         theta, cells = np.split(parameters, [len(self.centre)])
         return (theta - self.centre) / self.width, cells
 
@@ -276,8 +273,7 @@ class IsotropicFamily(PriorFamily):
     def around(cls, temperature: float, lmax: int) -> IsotropicFamily:
         """Make the family of skies of about a mean temperature, in K."""
         power = 4.0 * np.pi * (RELATIVE_STRENGTH * temperature) ** 2 / 100.0
-        monopole = float(np.log(4.0 * np.pi * temperature**2))
-        return cls(SpectrumBasis.around(power, lmax), monopole)
+        return cls(SpectrumBasis.around(power, lmax), float(np.log(4.0 * np.pi * temperature**2)))
 
     @property
     def hyperprior(self) -> Hyperprior:
@@ -323,9 +319,7 @@ class IsotropicMember(Member):
         return np.diag(per_mode(self.spectrum))
 
     def traces(self, matrix):
-        of_ells = sum_over_m(np.diagonal(matrix))
-        return self.family.basis.T @ (0.5 * self.spectrum * of_ells)
+        return self.family.basis.T @ (0.5 * self.spectrum * sum_over_m(np.diagonal(matrix)))
 
     def forms(self, columns):
-        of_ells = sum_over_m((columns**2).T).T
-        return self.family.basis.T @ (0.5 * self.spectrum[:, None] * of_ells)
+        return self.family.basis.T @ (0.5 * self.spectrum[:, None] * sum_over_m((columns**2).T).T)

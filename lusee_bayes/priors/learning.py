@@ -30,6 +30,7 @@ each S(theta).
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -95,8 +96,7 @@ def normal_scores(
     z = hyperprior.scores(parameters)
     for _ in range(STEPS):
         pull = slope - known @ (hyperprior.of_scores(z) - parameters)
-        gradient = hyperprior.slopes_of_scores(z) * pull - z
-        step = np.linalg.solve(precision(z), gradient)
+        step = np.linalg.solve(precision(z), hyperprior.slopes_of_scores(z) * pull - z)
         tried = (z + 0.5**k * step for k in range(HALVINGS))
         z = next((there for there in tried if value(there) >= value(z)), z)
     lower = checked_cholesky("the curvature of the parameters", precision(z))
@@ -236,7 +236,7 @@ def learn(
         gain = 0.5 * float(gradient @ step)
         if gain < SETTLED:
             return _learned(family, information, here, rng, steps)
-        here = _uphill(family, information, here, step * min(1.0, LONGEST / np.abs(step).max()))
+        here = _climb(family, information, here, step * min(1.0, LONGEST / np.abs(step).max()))
     raise NotSettled(
         f"the prior's parameters did not settle in {MAX_STEPS} steps: the next would still add "
         f"{gain:.2g} to ln p (accepted: {SETTLED:g})"
@@ -260,13 +260,11 @@ def learn_whatever_fits(
     """
     demanded = demanded_factor(information, family.expected())
     for factor in demanded * HIGHER:
-        try:
+        with suppress(InputError):
             found = learn(family, information.raised(factor), start, seed)
             if factor > 1.0:  # a posterior under N itself is what it is for
                 information.posterior(found.prior)
-        except InputError:
-            continue
-        return replace(found, noise_factor=float(factor))
+            return replace(found, noise_factor=float(factor))
     return _fixed(family, information, float(demanded * HIGHER[-1]))
 
 
@@ -303,12 +301,10 @@ def _fixed(family: PriorFamily, information: Information, factor: float) -> Lear
     for _ in range(MOST_WIDENINGS):
         try:
             evidence = float(information.posterior(prior).log_evidence)
-            break
+            return Learned(prior, (), np.zeros(0), np.zeros((0, 0)), evidence, 0, settled=False)
         except InputError as error:
             prior, failed = prior.widened(10.0), error
-    else:
-        raise failed
-    return Learned(prior, (), np.zeros(0), np.zeros((0, 0)), evidence, 0, settled=False)
+    raise failed
 
 
 def _at(family: PriorFamily, information: Information, parameters: Parameters) -> _Point:
@@ -318,18 +314,14 @@ def _at(family: PriorFamily, information: Information, parameters: Parameters) -
     return _Point(parameters, member, posterior, value)
 
 
-def _uphill(
-    family: PriorFamily, information: Information, here: _Point, step: Parameters
-) -> _Point:
+def _climb(family: PriorFamily, information: Information, here: _Point, step: Parameters) -> _Point:
     """The end of a step, or of a half, a quarter, ... of it, if ln p is not lower there."""
     part = 1.0
     while part >= SHORTEST:
-        try:
+        with suppress(InputError):  # too far: S has no Cholesky factor there
             there = _at(family, information, here.parameters + part * step)
-        except InputError:  # too far: S has no Cholesky factor there
-            there = None
-        if there is not None and there.value >= here.value - SETTLED / 10.0:
-            return there
+            if there.value >= here.value - SETTLED / 10.0:
+                return there
         part /= 2.0
     raise NotSettled(
         "the prior's parameters do not settle: ln p falls along its own gradient by rounding"
@@ -417,8 +409,7 @@ def _under_drawn_parameters(
         z = jax.random.normal(jax.random.fold_in(key, attempt), (len(root),), dtype=jnp.float64)
         parameters = learned.parameters + root @ np.asarray(z)
         try:
-            prior = family.prior(family.at(parameters).covariance)
-            return information.posterior(prior)
+            return information.posterior(family.prior(family.at(parameters).covariance))
         except InputError as error:
             failed = error
     raise InputError(

@@ -151,13 +151,11 @@ class SmoothedTemplate:
     def of(cls, frequency_mhz: float) -> SmoothedTemplate:
         """Analyse the embedded diffuse sky, without its random component, at a frequency in MHz."""
         pixels = galaxy_map(frequency_mhz, TEMPLATE_NSIDE, seed=None)
-        alm = healpy.map2alm(pixels, lmax=TEMPLATE_LMAX, iter=3)
-        return cls(alm, float(np.log(pixels).mean()))
+        return cls(healpy.map2alm(pixels, lmax=TEMPLATE_LMAX, iter=3), float(np.log(pixels).mean()))
 
     def log(self, fwhm_deg: float, theta: Vector, phi: Vector) -> Vector:
         """ln of the smoothed template less its mean, in given directions."""
-        beam = healpy.gauss_beam(np.radians(fwhm_deg), lmax=TEMPLATE_LMAX)
-        alm = healpy.almxfl(self.alm, beam)
+        alm = healpy.almxfl(self.alm, healpy.gauss_beam(np.radians(fwhm_deg), lmax=TEMPLATE_LMAX))
         smooth = healpy.alm2map(alm, TEMPLATE_NSIDE, lmax=TEMPLATE_LMAX)
         require_positive("the smoothed template", smooth)
         return np.log(healpy.get_interp_val(smooth, theta, phi)) - self.mean_log
@@ -226,8 +224,7 @@ class LocalScales(PriorFamily):
 
     def start_from(self, coarse, parameters):
         power, *others = coarse._split(parameters)
-        more = np.zeros(len(self.spectrum.centre) - len(power))
-        return np.concatenate([power, more, *others])
+        return np.concatenate([power, np.zeros(len(self.spectrum.centre) - len(power)), *others])
 
     def _split(self, parameters: np.ndarray) -> list[np.ndarray]:
         """Those of the spectrum, of the sources, of the covariates and of the cells."""

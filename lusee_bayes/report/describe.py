@@ -86,8 +86,7 @@ class _Skies:
 
 def describe_posterior(path: Path) -> list[str]:
     """A posterior at one frequency or at several."""
-    what = "a posterior of lusee-bayes map"
-    with opened_tree(path, formats.POSTERIOR, what) as tree:
+    with opened_tree(path, formats.POSTERIOR, "a posterior of lusee-bayes map") as tree:
         found = from_tree(_Skies, tree, str(path))
         held = [name for name in HOLDS if name in tree.variables or name in tree.children]
         joint = "component_mean" in tree.variables

@@ -23,8 +23,7 @@ from lusee_bayes.core.reading import read_text
 from lusee_bayes.core.version import __version__, printable
 from lusee_bayes.judge.chi2 import RULE, probability
 from lusee_bayes.judge.convergence import CRITERIA
-from lusee_bayes.results.finished_runs import Provenance
-from lusee_bayes.results.map_files import text_hash
+from lusee_bayes.results.finished_runs import Provenance, text_hash
 
 
 def render(template: str, folder: Path, **context: Any) -> str:

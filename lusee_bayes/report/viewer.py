@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib import colormaps
 
+from lusee_bayes.core.arrays import Pixels
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, n_modes
 from lusee_bayes.core.lazy import coordinates, healpy
@@ -36,7 +37,7 @@ def viewer(
     frequencies_mhz: Sequence[float],
     maps: Mapping[str, Maps],
     *,
-    highest_altitude: Float[np.ndarray, " pixels"],
+    highest_altitude: Pixels,
     regions: Mapping[str, Float[np.ndarray, "channels regions"]] | None = None,
     resolutions: Sequence[Mapping[str, Any]] = (),
 ) -> dict[str, Any]:
@@ -134,9 +135,7 @@ def _quantised(cube: Maps) -> dict[str, Any]:
     return {"low": low.tolist(), "step": step.tolist(), "levels": _base64(levels)}
 
 
-def _scales(
-    maps: Mapping[str, Maps], altitude: Float[np.ndarray, " pixels"]
-) -> dict[str, list[dict[str, Any]]]:
+def _scales(maps: Mapping[str, Maps], altitude: Pixels) -> dict[str, list[dict[str, Any]]]:
     """Bounds of the colours of every channel, by what they are of."""
     scales = {
         "temperature": [_temperature(sky) for sky in maps.get("truth", maps["mean"])],
@@ -151,7 +150,7 @@ def _scales(
     return scales
 
 
-def _temperature(sky: Float[np.ndarray, " pixels"]) -> dict[str, Any]:
+def _temperature(sky: Pixels) -> dict[str, Any]:
     """Logarithmic, of what is above zero; linear where nothing is."""
     positive = sky[sky > 0]
     log = bool(positive.size)
@@ -175,11 +174,10 @@ def _furniture() -> dict[str, Any]:
     """Colours, the rotation from Galactic to ICRS, and the bright sources, for sky_view.js."""
     axes = coordinates.SkyCoord([0.0, 90.0, 0.0], [0.0, 0.0, 90.0], unit="deg", frame="galactic")
     names = [(source.name, *source.galactic()) for source in BRIGHT_SOURCES]
-    tables = {"sequential": SEQUENTIAL, "diverging": DIVERGING}
     return {
         "colours": {
             kind: _base64(colormaps[name](np.arange(256), bytes=True)[:, :3])
-            for kind, name in tables.items()
+            for kind, name in {"sequential": SEQUENTIAL, "diverging": DIVERGING}.items()
         },
         # columns: where the Galactic axes point
         "rotation": axes.icrs.cartesian.xyz.value.ravel().tolist(),

@@ -94,6 +94,23 @@ class Details:
     patterns: Float[np.ndarray, "pattern node azimuth"] = quantity("1", "beams over their peaks")
 
 
+# at which SNR is told
+ELLS = (5, 10, 20, 30)
+
+
+@dataclass(frozen=True)
+class SkyErrors:
+    """Errors of a map in a band of latitude.
+
+    name : of the band; rms_error_k : in K; std_over_sky : width of error bars over the sky's
+    brightness
+    """
+
+    name: str
+    rms_error_k: float
+    std_over_sky: float
+
+
 @dataclass(frozen=True, kw_only=True, repr=False)
 class ChannelData:
     """What is known of a channel besides its sky.
@@ -304,48 +321,17 @@ class ChannelResult(ChannelData, Described):
         parts.append(f"ln evidence {self.log_evidence:.1f}")
         return [*parts, f"{self.information_bits:.0f} bits"]
 
+    def errors_by_latitude(self) -> tuple[SkyErrors, ...]:
+        """Errors of the map by latitude, of a channel with its truth."""
+        truth, mean = (modes_to_map(m, self.nside) for m in (self.truth, self.mean))
+        found = []
+        for name, inside in latitudes(self.nside).items():
+            rms = float(np.sqrt(((mean - truth)[inside] ** 2).mean()))
+            relative = float(self.pixel_std[inside].mean() / truth[inside].mean())
+            found.append(SkyErrors(name, rms, relative))
+        return tuple(found)
 
-# at which SNR is told
-ELLS = (5, 10, 20, 30)
-
-
-@dataclass(frozen=True)
-class SkyErrors:
-    """Errors of a map in a band of latitude.
-
-    name : of the band; rms_error_k : in K; std_over_sky : width of error bars over the sky's
-    brightness
-    """
-
-    name: str
-    rms_error_k: float
-    std_over_sky: float
-
-
-def errors_by_latitude(channel: ChannelResult) -> tuple[SkyErrors, ...]:
-    """Errors of a channel's map by latitude.
-
-    Parameters
-    ----------
-    channel : ChannelResult
-        With its truth.
-    """
-    truth, mean = (modes_to_map(m, channel.nside) for m in (channel.truth, channel.mean))
-    found = []
-    for name, inside in latitudes(channel.nside).items():
-        rms = float(np.sqrt(((mean - truth)[inside] ** 2).mean()))
-        relative = float(channel.pixel_std[inside].mean() / truth[inside].mean())
-        found.append(SkyErrors(name, rms, relative))
-    return tuple(found)
-
-
-def snr_at_some_ell(channel: ChannelResult) -> dict[int, float]:
-    """SNR_ell at 5, 10, 20 and 30, as far as the map goes.
-
-    Parameters
-    ----------
-    channel : ChannelResult
-        With its truth.
-    """
-    snr = channel.snr()
-    return {ell: float(snr[ell]) for ell in ELLS if ell < len(snr)}
+    def snr_at_some_ell(self) -> dict[int, float]:
+        """SNR_ell at 5, 10, 20 and 30, as far as the map goes, of a channel with its truth."""
+        snr = self.snr()
+        return {ell: float(snr[ell]) for ell in ELLS if ell < len(snr)}

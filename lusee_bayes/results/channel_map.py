@@ -35,8 +35,7 @@ from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.linear_gaussian import Solution
 from lusee_bayes.linear.posterior import Posterior, pixel_std, prior_pixel_std
 from lusee_bayes.results.channel import ChannelData, ChannelResult, Details, Judged
-from lusee_bayes.results.finished_runs import taken
-from lusee_bayes.results.map_files import SavedInformation
+from lusee_bayes.results.finished_runs import SavedInformation, taken
 from lusee_bayes.results.map_result import prior_sentence
 from lusee_bayes.sky.prior import DensePrior, Prior
 from lusee_bayes.systematics.beam import beam_rms_difference
@@ -313,9 +312,8 @@ class Conditioned:
         prior = self.found.model.prior
         expected = prior.variance() - np.diagonal(self.covariance)
         left, before = self.without_monopole
-        strong = measures.strengths(
-            self.posterior.mean - prior.colour(prior.white_mean), expected, before - left
-        )
+        moved = self.posterior.mean - prior.colour(prior.white_mean)
+        strong = measures.strengths(moved, expected, before - left)
         fit = found.fit(measures.strengths_in_words(strong))
 
         def on_grid(values: np.ndarray) -> np.ndarray:
@@ -371,17 +369,15 @@ def channel_result(
         Whatever else a :class:`.ChannelResult` has: ``chi2``, ``unknowns``, ``independent`` ...
     """
     mean, covariance = np.asarray(mean), np.asarray(covariance)
-    nside = round(np.sqrt(known.highest_altitude.size / 12))
     width, held, variance = pixels, (), np.diagonal(covariance)
     if width is None:
-        width = pixel_std(covariance, nside)
+        width = pixel_std(covariance, round(np.sqrt(known.highest_altitude.size / 12)))
     if compared is not None and known.truth is not None:
         held = Counts.of_pixels(width, known.truth - mean, np.asarray(compared)).coverage()
     power = known.prior_std**2
     share = np.divide(variance, power, out=np.zeros(len(variance)), where=power > 0)
-    said = vars(known) | {"doubts": (*known.doubts, *about_information(information_bits))}
     return ChannelResult(
-        **said,
+        **(vars(known) | {"doubts": (*known.doubts, *about_information(information_bits))}),
         **figures,
         mean=mean,
         std=np.sqrt(variance),

@@ -18,7 +18,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from lusee_bayes.core.arrays import Ells
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.judge.measures import ell_cross
 
@@ -38,14 +37,6 @@ class Variation:
     name: str
     scenario: Scenario
     lost: tuple[int, ...] = ()
-
-    def obstacle(self) -> str | None:
-        """Why its samples cannot be taken (a run without any night, ...); None if they can."""
-        try:
-            self.scenario.observation.observation()
-        except InputError as error:
-            return str(error)
-        return None
 
 
 @dataclass(frozen=True)
@@ -101,13 +92,12 @@ def forecast_lines(forecasts: Sequence[Forecast]) -> list[str]:
         text += f"; most: {best.variation.family}, {best.variation.name}: +{more:.0f} bits"
     offsets = first.offsets_line()
     lines = [text, f"{source}: {offsets}"] if offsets else [text]
-    for one in forecasts:
-        if one.unnoticed:
-            lines.append(
-                f"{source}, {one.variation.name}: chi^2 would not show errors up to these (in "
-                f"brackets, the map's then, in its standard deviations): {one.unnoticed}"
-            )
-    return lines
+    return lines + [
+        f"{source}, {one.variation.name}: chi^2 would not show errors up to these (in brackets, "
+        f"the map's then, in its standard deviations): {one.unnoticed}"
+        for one in forecasts
+        if one.unnoticed
+    ]
 
 
 def forecast_rows(forecasts: Sequence[Forecast]) -> list[dict[str, object]]:

@@ -19,7 +19,6 @@ from lusee_bayes.core.checks import Described, counted, extent
 from lusee_bayes.core.harmonics import synthesis_matrix
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.progress import about_run
-from lusee_bayes.core.reading import rows_of
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.unknowns import UnknownsReport, flux_lines
@@ -395,12 +394,8 @@ class MapResult(Described):
 
     def spectra(self) -> list[dict[str, float]]:
         """Rows of spectra.csv: one for every channel and ell."""
-        rows = []
-        for channel in self.channels:
-            columns = {name: v.astype(np.float64) for name, v in channel.spectra().items()}
-            for ell, row in enumerate(rows_of(columns)):
-                rows.append({"frequency_mhz": channel.frequency_mhz, **row, "ell": ell})
-        return rows
+        tables = {c.frequency_mhz: pd.DataFrame(c.spectra()) for c in self.channels}
+        return below(tables).to_dict("records")
 
     def maps(self) -> dict[str, Float[np.ndarray, "channels pixels"]]:
         """Cubes by name, in K: mean, std and, where the truth is known, truth and residual."""

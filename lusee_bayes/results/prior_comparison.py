@@ -18,12 +18,7 @@ from lusee_bayes.judge.chi2 import ChiSquare
 from lusee_bayes.judge.coverage import LEVELS, Coverage
 from lusee_bayes.judge.residuals import HeldOut
 from lusee_bayes.judge.split import Split
-from lusee_bayes.results.channel import (
-    ChannelResult,
-    SkyErrors,
-    errors_by_latitude,
-    snr_at_some_ell,
-)
+from lusee_bayes.results.channel import ChannelResult, SkyErrors
 
 # a difference of two evidences of which each is good to one or two
 CLEAR = 3.0
@@ -73,8 +68,8 @@ class UnderPrior:
             instrument=self.split.instrument,
             rest=self.split.prior,
             coverage=channel.coverage,
-            errors=errors_by_latitude(channel) if known else (),
-            snr=snr_at_some_ell(channel) if known else {},
+            errors=channel.errors_by_latitude() if known else (),
+            snr=channel.snr_at_some_ell() if known else {},
         )
 
 

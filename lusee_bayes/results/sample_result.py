@@ -1,4 +1,8 @@
-"""A sampled scenario: draws that survive a kill, and what they say of the sky."""
+"""A sampled scenario: draws that survive a kill, what they say of the sky, and their validation.
+
+A validation compares HMC and simulated data sets with the analytic posterior: it has checks, and a
+verdict.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +17,9 @@ from lusee_bayes.core.progress import about_run
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.judge.convergence import warnings_of
-from lusee_bayes.results.summaries import SamplingSummary
+from lusee_bayes.results.summaries import SamplingSummary, ValidationSummary
 from lusee_bayes.sampling import mode
+from lusee_bayes.sampling.validation import Check, Comparison, Ranks
 from lusee_bayes.sky.galaxy import LANDMARKS
 from lusee_bayes.systematics.systematic import SKY
 
@@ -108,3 +113,73 @@ class SampleResult:
             gradients_per_second=self.gradients_per_second,
             **about_run(self.seconds),
         )
+
+
+# what a comparison has mode by mode
+OF_MODES = (
+    *("mean_z", "variance_ratio", "variance_error", "eigenvalues", "null_eigenvalues"),
+    *("ess_bulk", "ess_tail"),
+)
+
+
+@dataclass(frozen=True)
+class ValidationResult:
+    """A sampled run judged against the analytic posterior.
+
+    Attributes
+    ----------
+    name : str
+        Of the scenario.
+    sampled : SampleResult
+    comparison : Comparison
+        Draws against mean, variances and covariance.
+    ranks : Ranks
+        Simulation-based calibration.
+    """
+
+    name: str
+    sampled: SampleResult
+    comparison: Comparison
+    ranks: Ranks
+
+    @property
+    def checks(self) -> list[Check]:
+        """All of them, calibration last."""
+        n, least = len(self.ranks.names), float(self.ranks.p_values().min())
+        n_simulations, limit = self.ranks.n_simulations, self.ranks.threshold
+        meaning = f"smallest p-value of {n} rank histograms over {n_simulations} simulations"
+        return [*self.comparison.checks, Check("calibration", least, limit, 1.0, meaning)]
+
+    @property
+    def passed(self) -> bool:
+        """Whether every check passed."""
+        return all(check.passed for check in self.checks)
+
+    def headline(self) -> str:
+        """The verdict, in one line."""
+        checks = self.checks
+        verdict = "passed" if self.passed else "FAILED"
+        return f"{verdict}: {sum(c.passed for c in checks)} of {len(checks)} checks hold"
+
+    def summary(self) -> ValidationSummary:
+        """validation.json."""
+        ranks = self.ranks
+        levels = ranks.coverage().items()
+        return ValidationSummary(
+            passed=self.passed,
+            checks=self.checks,
+            modes={name: getattr(self.comparison, name).tolist() for name in OF_MODES},
+            coverage={name: {f"{p:g}": x for p, x in shares.items()} for name, shares in levels},
+            p_values=dict(zip(ranks.names, ranks.p_values().tolist(), strict=True)),
+        )
+
+    @staticmethod
+    def allowed(check: Check) -> str:
+        """The interval of a check in words."""
+        if check.lower == check.upper:
+            return f"{check.upper:g}"
+        if not np.isfinite(check.upper):
+            return f"at least {check.lower:.4g}"
+        if check.lower == -check.upper:
+            return f"+- {check.upper:.4g}"
+        return f"{check.lower:.4g} to {check.upper:.4g}"

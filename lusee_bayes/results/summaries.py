@@ -52,17 +52,12 @@ class ChannelSummary(BaseModel, from_attributes=True):
     pointing: list[dict[str, Any]] | None
     doubts: list[str]
 
-    @field_validator("unknowns", "theta", mode="before")
+    @field_validator("unknowns", "theta", "pointing", mode="before")
     @classmethod
-    def _rows_of_unknowns(cls, told: Any) -> Any:
+    def _as_rows(cls, told: Any) -> Any:
+        if isinstance(told, PointingReport):
+            return None if told.offsets is None else told.offsets.to_dict("records")
         return told.summary() if isinstance(told, UnknownsReport | InstrumentPosterior) else told
-
-    @field_validator("pointing", mode="before")
-    @classmethod
-    def _rows_of_offsets(cls, told: Any) -> Any:
-        if not isinstance(told, PointingReport):
-            return told
-        return None if told.offsets is None else told.offsets.to_dict("records")
 
 
 class JointSummary(BaseModel, from_attributes=True):

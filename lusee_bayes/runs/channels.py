@@ -35,7 +35,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
 import h5py
 import jax
@@ -43,7 +42,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lusee_bayes.core import formats
-from lusee_bayes.core.arrays import Square, Vector
+from lusee_bayes.core.arrays import Square, T, Vector
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.formats import says
@@ -68,12 +67,11 @@ from lusee_bayes.linear.amplitudes import (
 from lusee_bayes.linear.information import Information
 from lusee_bayes.results.channel import ChannelData, ChannelResult, SkyModes
 from lusee_bayes.results.channel_map import Conditioned, channel_result, conditioned
-from lusee_bayes.results.map_files import information_file, read_information
+from lusee_bayes.results.finished_runs import information_file, read_information
 from lusee_bayes.results.map_result import Components, MapResult
 from lusee_bayes.runs.cost import measured_experiment
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
-T = TypeVar("T")
 CHANNELS = "channels"
 
 
@@ -175,10 +173,8 @@ class ChannelInformation:
         """
         information, key = self.information, draw_key(scenario)
         draws, spread, n_draws = components.draws, components.spread, scenario.output.draws
-        if components.mode is not None:
-            sky = positive_joint.positive_sky(
-                components.mode, number, information, spread, draws, key
-            )
+        if (mode := components.mode) is not None:
+            sky = positive_joint.positive_sky(mode, number, information, spread, draws, key)
         else:
             means = (components.mean, spread, draws)
             sky = joint.channel_sky(components.prior, number, information, *means, key)
@@ -261,9 +257,8 @@ class ChannelsInFiles:
             for first in range(0, len(channels), BLOCK)
         ]
         names = [names_of(channels[block.start : block.stop]) for block in blocks]
-        tasks = Tasks(add, blocks, names)
         return self.engine.reduced(
-            tasks, joint.ComponentSums.plus, self.stages, "joint sums"
+            Tasks(add, blocks, names), joint.ComponentSums.plus, self.stages, "joint sums"
         ).information()
 
 
@@ -370,9 +365,8 @@ class ChannelAlone:
         deviations = made.draws - mean
         if compared is not None:
             deviations = np.concatenate([deviations, compared])
-        own = made.own.solution.information
         kept = made.covariance, deviations, len(made.draws), made.figures()
-        return cls(known, own, made.unknowns, mean, *kept)
+        return cls(known, made.own.solution.information, made.unknowns, mean, *kept)
 
     def shared(self) -> tuple[dict[str, float], Vector, Square, int]:
         """Names and octaves of what is shared, its E and V; how many draws."""
@@ -530,8 +524,7 @@ def map_channels(
 
     def condition(channel: Scenario, told: Stages) -> Conditioned:
         before = None if kept is None else read_information(kept, channel)
-        information = None if before is None else before.information
-        make = partial(build, earlier=information)
+        make = partial(build, earlier=None if before is None else before.information)
         experiment = measured_experiment(channel, data, told, truth=truth, make=make)
         return conditioned(experiment, before, told)
 
@@ -541,8 +534,7 @@ def map_channels(
         return MapResult(scenario, (made.result(known, stages),), seconds=stages.seconds)
     engine.work_in(folder)
     digest = None if kept is None else digest_of(kept)
-    identity = identity_of(scenario, data, truth, digest, thorough)
-    files = ChannelFiles(folder.resolve(), identity)
+    files = ChannelFiles(folder.resolve(), identity_of(scenario, data, truth, digest, thorough))
     channels = tuple(channel.anchored() for channel in scenario.channels())
     alone = not scenario.joint and not scenario.shared
     kind = ChannelResult if alone else ChannelInformation if scenario.joint else ChannelAlone
@@ -570,11 +562,10 @@ def map_channels(
     mapped, shared = zip(*(one for one in by_channel if not isinstance(one[1], str)), strict=True)
     components, tied, tests = None, None, ()
     if scenario.joint:
-        left = _without(unmapped, scenario)
         at_hand = ChannelsInFiles(mapped, files, engine, stages)
         # coverage is compared with draws
         n_draws = max(scenario.output.draws, N_DRAWS if data is None or truth else 0)
-        components = solve_components(left, at_hand, shared, n_draws)
+        components = solve_components(_without(unmapped, scenario), at_hand, shared, n_draws)
     elif not alone:
         tied, tests = tie_channels(scenario, [channel.frequency_mhz for channel in mapped], shared)
 
@@ -589,9 +580,8 @@ def map_channels(
         files.kept(channel, ChannelResult, make)
 
     if not alone:
-        stage = "joint skies" if scenario.joint else "shared instrument"
         tasks = Tasks(finish, range(len(mapped)), [names_of((channel,)) for channel in mapped])
-        engine.each(tasks, stages, stage)
+        engine.each(tasks, stages, "joint skies" if scenario.joint else "shared instrument")
     results = tuple(files.read(channel, ChannelResult) for channel in mapped)
     told = {} if tied is None else {"tie_log_evidence": tied.log_evidence, "shared_tests": tests}
     return MapResult(scenario, results, components, stages.seconds, unmapped, **told)

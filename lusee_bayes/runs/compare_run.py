@@ -23,16 +23,7 @@ from lusee_bayes.results.channel_map import conditioned
 from lusee_bayes.results.finished_runs import FinishedRun, Provenance, comparison_rows, read_runs
 from lusee_bayes.results.prior_comparison import PriorComparison, UnderPrior
 from lusee_bayes.runs.cost import measured_experiment
-from lusee_bayes.runs.folder import (
-    SCENARIO,
-    Output,
-    RunKind,
-    RunOutcome,
-    model_file,
-    rows_file,
-    run_folder,
-    text_file,
-)
+from lusee_bayes.runs.folder import SCENARIO, Output, RunKind, RunOutcome, run_folder
 from lusee_bayes.systematics.context import Setup
 
 
@@ -59,9 +50,8 @@ def run_compare(
     InputError
         For fewer than two folders, or one that is not of a finished map run.
     """
-    stages = stages or Stages()
     with run_folder(folder, COMPARISON, None, None, *folders, replace=replace) as run:
-        return run.write(read_runs(folders), stages)
+        return run.write(read_runs(folders), stages or Stages())
 
 
 def _write_page(runs: list[FinishedRun], folder: Path) -> None:
@@ -71,10 +61,7 @@ def _write_page(runs: list[FinishedRun], folder: Path) -> None:
 # what the folder of a comparison holds; a new file is one line here
 COMPARISON = RunKind(
     "compare",
-    outputs=(
-        Output(_write_page),
-        rows_file("comparison.csv", comparison_rows),
-    ),
+    outputs=(Output(_write_page), Output.rows("comparison.csv", comparison_rows)),
     figures={"maps": maps_of_runs, "curves": curves_of_runs},
     dpi=100,
 )
@@ -136,14 +123,12 @@ def run_compare_priors(
             found = settled(experiment.setup, experiment.data)
 
         def under(prior: str) -> UnderPrior:
-            setup = experiment.setup.with_prior(sections[prior])
-            return _under(prior, setup, experiment, found)
+            return _under(prior, experiment.setup.with_prior(sections[prior]), experiment, found)
 
         engine.work_in(run.path)
         mapped = engine.each(Tasks(under, list(sections), list(sections)), stages, "priors")
         result = PriorComparison(name, scenario, tuple(mapped), stages.seconds)
-        provenance = Provenance.of_experiment(experiment, data)
-        return run.write(result, stages, provenance)
+        return run.write(result, stages, Provenance.of_experiment(experiment, data))
 
 
 def _under(name: str, setup: Setup, experiment: Experiment, found: Inference) -> UnderPrior:
@@ -169,10 +154,10 @@ def _under(name: str, setup: Setup, experiment: Experiment, found: Inference) ->
 COMPARE_PRIORS = RunKind(
     "compare-priors",
     outputs=(
-        model_file("priors.json", lambda result: result.summary()),
-        text_file("priors.md", lambda result: render_text("priors.md", result=result)),
+        Output.model("priors.json", lambda result: result.summary()),
+        Output.text("priors.md", lambda result: render_text("priors.md", result=result)),
         SCENARIO,
-        rows_file("priors.csv", lambda result: result.rows()),
+        Output.rows("priors.csv", lambda result: result.rows()),
     ),
     figures={"priors": priors},
 )

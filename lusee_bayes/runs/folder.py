@@ -19,18 +19,9 @@ from pandas import DataFrame
 from pydantic import BaseModel
 from xarray import Dataset, DataTree
 
+from lusee_bayes.core import files
 from lusee_bayes.core.arrays import use_compilation_cache
 from lusee_bayes.core.errors import InputError, WorkersLost
-from lusee_bayes.core.files import (
-    MANIFEST,
-    locked,
-    read_manifest,
-    recover,
-    require_apart,
-    require_folder,
-    transaction,
-    user_path,
-)
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import write_csv
 from lusee_bayes.experiment.data_files import Data, digest_of, files_of, names_of_data
@@ -110,7 +101,7 @@ def require_own(folder: Path, kinds: Sequence[str], origin: Origin) -> None:
     InputError
         If it does; the first difference is named.
     """
-    manifest = read_manifest(folder)
+    manifest = files.read_manifest(folder)
     if manifest is None:
         return
     there, advice = manifest["origin"], "give another folder with -o, or --force to replace them"
@@ -172,39 +163,36 @@ class Output:
     write: Callable[[Any, Path], None]
     wanted: Callable[[Any], bool] = lambda result: True
 
+    @classmethod
+    def text(cls, name: str, text: Callable[[Any], str]) -> Output:
+        """A file of text, UTF-8."""
+        return cls(lambda run, folder: (folder / name).write_text(text(run), encoding="utf-8"))
 
-def text_file(name: str, text: Callable[[Any], str]) -> Output:
-    """A file of text, UTF-8."""
-    return Output(lambda result, folder: (folder / name).write_text(text(result), encoding="utf-8"))
+    @classmethod
+    def model(cls, name: str, figures: Callable[[Any], BaseModel]) -> Output:
+        """A pydantic model as JSON."""
+        return cls.text(name, lambda run: figures(run).model_dump_json(indent=2) + "\n")
 
+    @classmethod
+    def rows(cls, name: str, rows: Callable[[Any], Sequence[Mapping[str, object]]]) -> Output:
+        """A table, row by row."""
+        return cls(lambda run, folder: write_csv(folder / name, rows(run)))
 
-def model_file(name: str, figures: Callable[[Any], BaseModel]) -> Output:
-    """A pydantic model as JSON."""
-    return text_file(name, lambda result: figures(result).model_dump_json(indent=2) + "\n")
+    @classmethod
+    def table(cls, name: str, table: Callable[[Any], DataFrame | None]) -> Output:
+        """A table of pandas; None where the run has none."""
+        return cls(
+            lambda run, folder: table(run).to_csv(folder / name, index=False),
+            lambda run: table(run) is not None,
+        )
 
-
-def rows_file(name: str, rows: Callable[[Any], Sequence[Mapping[str, object]]]) -> Output:
-    """A table, row by row."""
-    return Output(lambda result, folder: write_csv(folder / name, rows(result)))
-
-
-def table_file(name: str, table: Callable[[Any], DataFrame | None]) -> Output:
-    """A table of pandas; None where the run has none."""
-
-    def write(result: Any, folder: Path) -> None:
-        table(result).to_csv(folder / name, index=False)
-
-    return Output(write, lambda result: table(result) is not None)
-
-
-def netcdf_file(name: str, content: Callable[[Any], Dataset | DataTree]) -> Output:
-    """A netCDF file, of a dataset or a tree of them."""
-    return Output(
-        lambda result, folder: content(result).to_netcdf(folder / name, engine="h5netcdf")
-    )
+    @classmethod
+    def netcdf(cls, name: str, content: Callable[[Any], Dataset | DataTree]) -> Output:
+        """A netCDF file, of a dataset or a tree of them."""
+        return cls(lambda run, folder: content(run).to_netcdf(folder / name, engine="h5netcdf"))
 
 
-SCENARIO = text_file("scenario.yaml", lambda result: result.scenario.to_yaml())
+SCENARIO = Output.text("scenario.yaml", lambda result: result.scenario.to_yaml())
 
 
 @dataclass(frozen=True)
@@ -274,7 +262,7 @@ class RunFolder:
         """
         kind, folder = self.kind, self.path
         discard = [kind.unfinished] if kind.unfinished else []
-        with transaction(folder, kind.name, discard, self.origin) as stage:
+        with files.transaction(folder, kind.name, discard, self.origin) as stage:
             if kind.figures:
                 (stage / FIGURES).mkdir()
                 with stages("figures"):
@@ -290,8 +278,8 @@ class RunFolder:
                 if kind.name in PAGES:
                     page = PAGES[kind.name](stage, folder.resolve().name)
                     (stage / REPORT).write_text(page, encoding="utf-8")
-            files = sorted(path.relative_to(stage) for path in stage.rglob("*") if path.is_file())
-        return RunOutcome(result, folder, [folder / name for name in files])
+            written = [path.relative_to(stage) for path in stage.rglob("*") if path.is_file()]
+        return RunOutcome(result, folder, [folder / name for name in sorted(written)])
 
 
 @contextmanager
@@ -335,16 +323,17 @@ def run_folder(
         With what the folder holds added to its message.
     """
     origin, read = origin_of(scenario, data, **others), inputs_of(scenario, data, *inputs)
-    folder = user_path(folder)
-    require_folder(folder)
-    made = _made(folder)
+    folder = files.user_path(folder)
+    files.require_folder(folder)
+    made = [place for place in (folder, *folder.parents) if not place.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
     try:
-        with locked(folder):
-            recover(folder)
+        with files.locked(folder):
+            files.recover(folder)
             if not replace:
                 require_own(folder, (kind.name, *kind.after), origin)
             else:
-                require_apart(folder, read)
+                files.require_apart(folder, read)
             before = _written_at(folder)
             use_compilation_cache()
             try:
@@ -363,20 +352,13 @@ def run_folder(
                 place.rmdir()
 
 
-def _made(folder: Path) -> list[Path]:
-    """Make a folder and those that it lies in; which ones were not there, the innermost first."""
-    missing = [place for place in (folder, *folder.parents) if not place.exists()]
-    folder.mkdir(parents=True, exist_ok=True)
-    return missing
-
-
 def _written_at(folder: Path) -> int | None:
-    manifest = folder / MANIFEST
+    manifest = folder / files.MANIFEST
     return manifest.stat().st_mtime_ns if manifest.is_file() else None
 
 
 def _state(folder: Path, before: int | None, kind: RunKind) -> str:
-    recover(folder)
+    files.recover(folder)
     now = _written_at(folder)
     if now is not None and now != before:
         return f"the new results in '{folder}' are complete"

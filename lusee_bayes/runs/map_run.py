@@ -13,22 +13,11 @@ from lusee_bayes.experiment.data_files import Data, are_sessions, reduced_of, vi
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.flight.reduced import REDUCED, Reduced, write_reduced
 from lusee_bayes.report.figures import judgement, maps
-from lusee_bayes.results import map_files
-from lusee_bayes.results.finished_runs import Provenance
+from lusee_bayes.results import finished_runs
 from lusee_bayes.results.map_result import MapResult
 from lusee_bayes.runs.channels import CHANNELS, map_channels
 from lusee_bayes.runs.cost import posterior_cost, require_fits
-from lusee_bayes.runs.folder import (
-    SCENARIO,
-    Output,
-    RunKind,
-    RunOutcome,
-    model_file,
-    netcdf_file,
-    rows_file,
-    run_folder,
-    table_file,
-)
+from lusee_bayes.runs.folder import SCENARIO, Output, RunKind, RunOutcome, run_folder
 from lusee_bayes.sky.sky_source import write_alms
 
 
@@ -93,8 +82,8 @@ def run_map(
         more = {"truth": truth, "earlier": earlier, "thorough": thorough, "engine": engine}
         made = map_channels(scenario, run.path, data=given, stages=stages, **more)
         known, times = made.stacked("truth") is not None, made.channel.taken
-        provenance = Provenance.of(scenario, times, data, known_sky=known)
         made = replace_fields(made, reduced=reduced and _as_used(reduced, made))
+        provenance = finished_runs.Provenance.of(scenario, times, data, known_sky=known)
         return run.write(made, stages, provenance)
 
 
@@ -126,13 +115,13 @@ def _as_used(reduced: Reduced, result: MapResult) -> Reduced:
 
 def _write_maps(result: MapResult, folder: Path) -> None:
     if result.single:
-        map_files.write_maps(folder, result.channel.maps(), result.scenario)
+        finished_runs.write_maps(folder, result.channel.maps(), result.scenario)
     else:
-        map_files.write_cubes(folder, result.maps(), result.frequencies_mhz, result.scenario)
+        finished_runs.write_cubes(folder, result.maps(), result.frequencies_mhz, result.scenario)
 
 
 def _write_coefficients(result: MapResult, folder: Path) -> None:
-    header = map_files.cards("mean", result.scenario)
+    header = finished_runs.cards("mean", result.scenario)
     write_alms(folder / "mean_alm.fits", result.channel.mean, header)
 
 
@@ -140,21 +129,21 @@ def _write_coefficients(result: MapResult, folder: Path) -> None:
 MAP = RunKind(
     "map",
     outputs=(
-        netcdf_file("posterior.nc", map_files.posterior_tree),
-        netcdf_file("diagnostics.nc", map_files.diagnostics_tree),
+        Output.netcdf("posterior.nc", finished_runs.posterior_tree),
+        Output.netcdf("diagnostics.nc", finished_runs.diagnostics_tree),
         Output(_write_maps),
         Output(_write_coefficients, wanted=lambda result: result.single),
-        rows_file("spectra.csv", lambda result: result.spectra()),
-        table_file("sources.csv", lambda result: result.table("fluxes")),
-        table_file("pointing.csv", lambda result: result.table("pointing", "offsets")),
-        table_file("pointing_by_day.csv", lambda result: result.table("pointing", "preferred")),
-        table_file("unknowns.csv", lambda result: result.unknowns and result.unknowns.table),
+        Output.rows("spectra.csv", lambda result: result.spectra()),
+        Output.table("sources.csv", lambda result: result.table("fluxes")),
+        Output.table("pointing.csv", lambda result: result.table("pointing", "offsets")),
+        Output.table("pointing_by_day.csv", lambda result: result.table("pointing", "preferred")),
+        Output.table("unknowns.csv", lambda result: result.unknowns and result.unknowns.table),
         Output(
             lambda r, folder: write_reduced(folder / REDUCED, r.reduced, r.scenario.to_yaml()),
             wanted=lambda r: r.reduced is not None,
         ),
         SCENARIO,
-        model_file("summary.json", lambda result: result.summary()),
+        Output.model("summary.json", lambda result: result.summary()),
     ),
     figures={
         "maps": maps.sky_maps,

@@ -13,7 +13,7 @@ from lusee_bayes.core.progress import Stages
 from lusee_bayes.paper.cases import case_table, compute_case, is_case, paper_scenarios
 from lusee_bayes.paper.claims import Cases, claim_table, claims_as_markdown
 from lusee_bayes.paper.figures import FIGURES
-from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, rows_file, run_folder, text_file
+from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, run_folder
 
 CASES, UNFINISHED = "cases", "unfinished-cases"
 
@@ -85,9 +85,9 @@ PAPER = RunKind(
     "paper",
     outputs=(
         Output(_write_cases),
-        rows_file("cases.csv", case_table),
-        rows_file("claims.csv", lambda cases: claim_table(cases)),
-        text_file("claims.md", lambda cases: claims_as_markdown(claim_table(cases))),
+        Output.rows("cases.csv", case_table),
+        Output.rows("claims.csv", lambda cases: claim_table(cases)),
+        Output.text("claims.md", lambda cases: claims_as_markdown(claim_table(cases))),
     ),
     figures=FIGURES,
     unfinished=UNFINISHED,

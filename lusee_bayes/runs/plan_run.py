@@ -41,7 +41,7 @@ from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.report.figures.plans import forecasts
 from lusee_bayes.results.forecast import AS_GIVEN, Forecast, Variation, forecast_rows
 from lusee_bayes.runs.cost import duration, posterior_cost, require_fits
-from lusee_bayes.runs.folder import RunKind, RunOutcome, inputs_of, rows_file, run_folder
+from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, inputs_of, run_folder
 from lusee_bayes.systematics.context import Around, Setup
 
 
@@ -52,8 +52,7 @@ def expected_snr_squared(posterior: Posterior) -> Float[np.ndarray, " ells"]:
     """
     prior = sum_over_m(posterior.prior.variance())
     left = sum_over_m(posterior.std() ** 2)
-    ratio = np.divide(prior, left, out=np.full_like(prior, np.nan), where=left > 0)
-    return ratio - 1.0
+    return np.divide(prior, left, out=np.full_like(prior, np.nan), where=left > 0) - 1.0
 
 
 def informed_modes(posterior: Posterior) -> int:
@@ -84,8 +83,7 @@ def without_ports(setup: Setup, lost: Sequence[int]) -> Setup:
     dead = np.array([p.i in lost or p.j in lost for p in all_products(n_ports)])
     left = DataLayout.from_flags(~np.asarray(layout.present) | dead[:, None])
     instrument = replace(setup.instrument, layout=left)
-    coupling = replace(setup.coupling, layout=left)
-    return replace(setup, instrument=instrument, coupling=coupling)
+    return replace(setup, instrument=instrument, coupling=replace(setup.coupling, layout=left))
 
 
 def expected_inference(setup: Setup) -> Inference:
@@ -181,9 +179,10 @@ def variations_of(
         first, *others = default_variations(source, load_scenario(source, overrides))
         found.append(first)
         for one in others:
-            if (why := one.obstacle()) is None:
+            try:
+                one.scenario.observation.observation()
                 found.append(one)
-            else:
+            except InputError as why:  # samples that cannot be taken: a run without any night, ...
                 stages.say(f"  left out: {source}, {one.family}, {one.name}: {why}")
     return found
 
@@ -242,12 +241,10 @@ def default_variations(source: str, scenario: Scenario) -> list[Variation]:
             found[family, name] = scenario.with_section("observation", runs=varied)
     for duty in DUTY_CYCLES:
         section = radiometer.model_copy(update={"duty_cycle": duty})
-        varied = scenario.with_section("noise", radiometer=section)
-        found["duty cycle", f"{duty:g}"] = varied
-    variations = [Variation(source, *named, varied) for named, varied in found.items()]
+        found["duty cycle", f"{duty:g}"] = scenario.with_section("noise", radiometer=section)
     ports = range(scenario.beam.n_ports if scenario.beam.n_ports > 1 else 0)
     lost = [Variation(source, "antenna lost", f"port {k}", scenario, (k,)) for k in ports]
-    return variations + lost
+    return [Variation(source, *named, varied) for named, varied in found.items()] + lost
 
 
 Runs = tuple[RunSection, ...]
@@ -342,9 +339,8 @@ def forecasts_of(
         longest = len(others) * (time.perf_counter() - start)
         stages.say(f"  the other {len(others)} take about {duration(longest)}, or less")
         names = [f"{other.source}, {other.name}" for other in others]
-        found += engine.each(
-            Tasks(partial(kept_forecast, folder), others, names), stages, "planning"
-        )
+        tasks = Tasks(partial(kept_forecast, folder), others, names)
+        found += engine.each(tasks, stages, "planning")
     known = {_digest(one.variation): one for one in found}
     return [
         replace(known[_digest(there)], variation=here)
@@ -400,7 +396,7 @@ def run_plan(
 # what the folder of a plan holds; a new file is one line here
 PLAN = RunKind(
     "plan",
-    outputs=(rows_file("plan.csv", forecast_rows),),
+    outputs=(Output.rows("plan.csv", forecast_rows),),
     figures={"plan": forecasts},
     unfinished=UNFINISHED,
     resume="the same command continues from the finished forecasts",

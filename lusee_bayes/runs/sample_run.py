@@ -1,6 +1,7 @@
 """Sampling of a program given an experiment's data: draws survive a kill.
 
-A sampling run: draws from the posterior of a NumPyro program.
+A sampling run: draws from the posterior of a NumPyro program. A validation: HMC and simulated data
+sets against the analytic posterior.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 import xarray as xr
 from numpyro.infer.hmc import HMCState
 
+from lusee_bayes.core.engine import Demand, Engine
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import user_path
 from lusee_bayes.core.progress import Stages
@@ -26,27 +28,22 @@ from lusee_bayes.experiment.model import true_values
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.instrument.visibilities import Visibilities
+from lusee_bayes.judge.coverage import LEVELS
 from lusee_bayes.report.figures import sampling as figures
-from lusee_bayes.results.finished_runs import Provenance
-from lusee_bayes.results.map_files import write_cubes, write_maps
-from lusee_bayes.results.sample_result import CHAINS, SAMPLES, SampleResult
-from lusee_bayes.runs.cost import measured_experiment
-from lusee_bayes.runs.folder import (
-    Output,
-    RunKind,
-    RunOutcome,
-    model_file,
-    netcdf_file,
-    run_folder,
-    text_file,
-)
+from lusee_bayes.report.rendering import render_text
+from lusee_bayes.results.finished_runs import Provenance, write_cubes, write_maps
+from lusee_bayes.results.sample_result import CHAINS, SAMPLES, SampleResult, ValidationResult
+from lusee_bayes.runs.cost import demand_of, measured_experiment
+from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, run_folder
 from lusee_bayes.sampling.datatree import read_datatree, to_datatree
 from lusee_bayes.sampling.distributions import TimesStudentT
 from lusee_bayes.sampling.hmc import Chains, Checkpoints, Sampler, Whitening, sample
+from lusee_bayes.sampling.least import require_draws, require_simulations
 from lusee_bayes.sampling.log_normal_program import coordinates_of
 from lusee_bayes.sampling.mode import laplace_approximation
 from lusee_bayes.sampling.programs import Program, load_program, predicts, require_sampleable
 from lusee_bayes.sampling.shared_sites import SharedSites, of_channel, site_of
+from lusee_bayes.sampling.validation import BATCH, N_DRAWS, calibrate_sky, validate_draws
 from lusee_bayes.systematics.gain_drifts import SCALES
 from lusee_bayes.systematics.registered import SYSTEMATICS
 from lusee_bayes.systematics.systematic import SKY, Chart, Systematic, present
@@ -181,11 +178,7 @@ def sample_together(
 
 
 def coordinates(
-    program: Program,
-    arguments: dict,
-    data: Visibilities,
-    inference: Inference,
-    latent: list[str],
+    program: Program, arguments: dict, data: Visibilities, inference: Inference, latent: list[str]
 ) -> Whitening | None:
     """White coordinates for a program: those of the analytic posterior where it samples the sky
     alone, and data are Gaussian about it; the straight ones of a log-normal sky; else those about
@@ -366,17 +359,16 @@ def named(program: Program) -> str:
 
 def _write_cubes(sampled: tuple[Scenario, tuple[SampleResult, ...]], folder: Path) -> None:
     scenario, results = sampled
-    frequencies = np.array(scenario.frequencies_mhz)
     cubes = {name: np.stack([one.maps[name] for one in results]) for name in ("mean", "std")}
-    write_cubes(folder, cubes, frequencies, scenario)
+    write_cubes(folder, cubes, np.array(scenario.frequencies_mhz), scenario)
 
 
 SAMPLE_OUTPUTS = (
-    netcdf_file(SAMPLES, lambda run: run.tree),
+    Output.netcdf(SAMPLES, lambda run: run.tree),
     Output(lambda run, folder: write_maps(folder, run.maps, run.experiment.scenario)),
-    text_file("summary.csv", lambda run: run.summary.to_csv(index_label="quantity")),
-    text_file("scenario.yaml", lambda run: run.experiment.scenario.to_yaml()),
-    model_file("sampling.json", lambda run: run.figures()),
+    Output.text("summary.csv", lambda run: run.summary.to_csv(index_label="quantity")),
+    Output.text("scenario.yaml", lambda run: run.experiment.scenario.to_yaml()),
+    Output.model("sampling.json", lambda run: run.figures()),
 )
 
 # what the folder of a sampled program holds; a new file is one line here
@@ -400,9 +392,100 @@ CUBES = RunKind(
     "sampled cubes",
     outputs=(
         Output(_write_cubes),
-        text_file("scenario.yaml", lambda sampled: sampled[0].to_yaml()),
+        Output.text("scenario.yaml", lambda sampled: sampled[0].to_yaml()),
     ),
     figures={},
     unfinished=CHAINS,
+    resume=RESUME,
+)
+
+
+def demand_of_calibration(scenario: Scenario) -> Demand:
+    """What simulation-based calibration takes, in batches that use all processors."""
+    return replace_fields(demand_of(scenario, n_draws=BATCH * N_DRAWS), side_by_side=1)
+
+
+def run_validate(
+    scenario: Scenario | str | Path,
+    folder: str | Path,
+    *,
+    name: str = "the scenario",
+    sampler: Sampler | None = None,
+    simulations: int = 500,
+    data: Data | None = None,
+    resume: bool = False,
+    engine: Engine | None = None,
+    replace: bool = False,
+    stages: Stages | None = None,
+) -> RunOutcome[ValidationResult]:
+    """Check the analytic posterior of a scenario by HMC and by simulated data sets.
+
+    The folder is written in one transaction.
+
+    Parameters
+    ----------
+    scenario : Scenario, or its file or name
+    folder : path
+        Of the results; draws are kept in it as they come.
+    name : str
+        Of the scenario, for the title.
+    sampler : Sampler, optional
+        By default with the scenario's seed.
+    simulations : int
+        Data sets for simulation-based calibration.
+    data : Visibilities, path, or sequence of them, optional
+        Visibilities to use; without them the scenario's own are simulated.
+    resume : bool
+        Go on with the unfinished run in the folder, or judge the finished one again.
+    engine : Engine, optional
+        What works on the simulated data sets; by default this process.
+    replace, stages : bool and Stages, optional
+        As in :func:`.run_map`.
+
+    Raises
+    ------
+    InputError
+        For too few draws or simulations, and as :func:`run_sample`.
+    """
+    scenario = load_scenario(scenario)
+    stages = stages or Stages()
+    sampler = sampler or Sampler(seed=scenario.seed)
+    program = load_program("sky")
+    require_simulations(simulations)
+    require_draws(sampler.draws)
+    given = {"replace": replace, "program": named(program)}
+    with run_folder(folder, VALIDATION, scenario, data, program.path, **given) as run:
+        n = sampler.chains * sampler.draws
+        experiment = measured_experiment(scenario, data, stages, n_draws=n)
+        drawn = sample_result(experiment, program, sampler, run.path, resume=resume, stages=stages)
+        posterior, model = drawn.inference.posterior, drawn.inference.model
+        with stages("comparison"):
+            stats = drawn.tree["sample_stats"]
+            told = stats["diverging"].values, stats["energy"].values
+            found = validate_draws(drawn.skies, posterior, *told)
+        if engine is not None:
+            engine.work_in(run.path)
+        more = {"seed": scenario.seed, "engine": engine, "stages": stages}
+        ranks = calibrate_sky(model, model, n_simulations=simulations, **more)
+        result = ValidationResult(name, drawn, found, ranks)
+        return run.write(result, stages, Provenance.of_experiment(experiment, data))
+
+
+# what the folder of a validation holds; a new file is one line here
+VALIDATION = RunKind(
+    "validate",
+    outputs=(
+        *(Output(lambda r, folder, o=o: o.write(r.sampled, folder)) for o in SAMPLE_OUTPUTS),
+        Output.model("validation.json", lambda result: result.summary()),
+        Output.text(
+            "validation.md", lambda run: render_text("validation.md", result=run, levels=LEVELS)
+        ),
+    ),
+    figures={
+        "comparison": lambda result: figures.comparison(result.comparison),
+        "calibration": lambda result: figures.rank_statistics(result.ranks),
+    },
+    unfinished=CHAINS,
+    after=("sample",),
     resume=RESUME,
 )

@@ -53,7 +53,7 @@ Number = float | Float[Array, ""]
 White = Float[Array, "*batch unknowns"]
 Exponents = Float[np.ndarray, "*batch columns"]
 OfLaws = Float[np.ndarray, "laws ells"]
-ModesBatch = Float[np.ndarray, "*batch modes"]
+Pair = Float[np.ndarray, "2"]
 # a brightness temperature in K, of Galactic theta and phi in radians
 Template = Callable[[Vector, Vector], Vector]
 
@@ -91,12 +91,8 @@ def slopes(lmax: int) -> Float[np.ndarray, "2 ells"]:
 
 
 def matching_step(
-    power: Float[np.ndarray, " n"],
-    known: Float[np.ndarray, " n"],
-    slope: Float[np.ndarray, "2 n"],
-    away: Float[np.ndarray, "2"],
-    narrow: Float[np.ndarray, "2"],
-) -> Float[np.ndarray, "2"]:
+    power: Vector, known: Vector, slope: Float[np.ndarray, "2 n"], away: Pair, narrow: Pair
+) -> Pair:
     """Compute the change of ln A and the tilt after which modes have as much power as they should.
 
     At the maximum of the evidence sum u^2 = sum (1 - var u) in units of the prior, for all that a
@@ -114,9 +110,8 @@ def matching_step(
     step = np.zeros(2)
     for _ in range(NEWTON):
         scaled = power * np.exp(-2.0 * (step @ slope))
-        gradient = slope @ (scaled - known) - narrow * (away + step)
         curvature = 2.0 * (slope * np.maximum(scaled, known)) @ slope.T + np.diag(narrow)
-        step = step + np.linalg.solve(curvature, gradient)
+        step = step + np.linalg.solve(curvature, slope @ (scaled - known) - narrow * (away + step))
     return np.clip(step, -REACH, REACH)
 
 
@@ -182,9 +177,8 @@ class LogNormalSky(eqx.Module):
         level = template(*grid.directions()).reshape(grid.shape)
         require_positive("the template", level, "a log-normal sky is a positive template times exp")
         modes = [source.modes(frequency_mhz, lmax) for source in sources]
-        return cls(
-            np.asarray(spectrum), grid, level, np.reshape(modes, (len(sources), n_modes(lmax)))
-        )
+        shape = len(sources), n_modes(lmax)
+        return cls(np.asarray(spectrum), grid, level, np.reshape(modes, shape))
 
     @property
     def lmax(self) -> int:
@@ -225,10 +219,9 @@ class LogNormalSky(eqx.Module):
 
     def diffuse(self, white: White) -> Float[Array, "*batch rings phi"]:
         """Compute T exp(Y a) on the grid, in K."""
-        xp = namespace(self, white)
         root = self.root()[: self.n_modes]
         logarithm = white[..., : self.n_modes] * root.reshape(*(1,) * (white.ndim - 1), -1)
-        field = xp.exp(self.grid.synthesise(logarithm))
+        field = namespace(self, white).exp(self.grid.synthesise(logarithm))
         return field * self.level.reshape(*(1,) * (white.ndim - 1), *self.level.shape)
 
     def source_factors(self, white: White) -> Float[Array, "*batch sources"]:
@@ -411,7 +404,7 @@ class PositiveSkies(eqx.Module):
         with np.errstate(over="ignore"):
             return self.levels[channel] * np.exp(self.weight * self.grid.synthesise(exponent))
 
-    def modes(self, channel: int, exponent: Exponents) -> ModesBatch:
+    def modes(self, channel: int, exponent: Exponents) -> Float[np.ndarray, "*batch modes"]:
         """Compute the sky without point sources: real packed coefficients, Galactic, in K.
 
         Parameters
@@ -423,9 +416,7 @@ class PositiveSkies(eqx.Module):
         with np.errstate(invalid="ignore"):
             return self.grid.analyse(self.values(channel, exponent))[..., : n_modes(self.lmax)]
 
-    def jacobian(
-        self, channel: int, exponent: Float[np.ndarray, " columns"]
-    ) -> Float[np.ndarray, "modes columns"]:
+    def jacobian(self, channel: int, exponent: Vector) -> Float[np.ndarray, "modes columns"]:
         """Compute W, in K.
 
         Parameters
@@ -434,8 +425,7 @@ class PositiveSkies(eqx.Module):
         exponent : (modes,) array
             phi.
         """
-        field = self.weight * self.values(channel, exponent)
-        return self.grid.product_matrix(field, self.lmax)
+        return self.grid.product_matrix(self.weight * self.values(channel, exponent), self.lmax)
 
 
 # A of each field, whose rms over the sky is seven times that, and the width of its mean: a template
@@ -479,8 +469,7 @@ class FieldLaws:
 
     def prior(self, skies: PositiveSkies) -> SpectralPrior:
         """The prior of the fields: a spectral prior whose maps have no unit."""
-        lmax = skies.grid.lmax
-        spectra = np.exp(2.0 * self.parameters @ slopes(lmax))
+        spectra = np.exp(2.0 * self.parameters @ slopes(skies.grid.lmax))
         fields = len(self.means)
         spectra[:fields, 0] = 4.0 * np.pi * self.means**2
         return SpectralPrior(

@@ -130,8 +130,7 @@ class Prior(Described, eqx.Module):
         (unknowns,) or (n, unknowns) array
             In K.
         """
-        shape = (self.size,) if n is None else (n, self.size)
-        u = jax.random.normal(key, shape, dtype=jnp.float64)
+        u = jax.random.normal(key, (self.size,) if n is None else (n, self.size), dtype=jnp.float64)
         return self.colour(u + self.white_mean.reshape(*(1,) * (u.ndim - 1), -1))
 
 
@@ -234,9 +233,8 @@ class DensePrior(Prior):
         return self.root.shape[0]
 
     def colour(self, u):
-        return linalg.times_lower(u.reshape(-1, self.size), self.root, transpose=True).reshape(
-            u.shape
-        )
+        flat = u.reshape(-1, self.size)
+        return linalg.times_lower(flat, self.root, transpose=True).reshape(u.shape)
 
     def colour_columns(self, a):
         return linalg.times_lower(a, self.root, transpose=False)
@@ -258,8 +256,7 @@ class DensePrior(Prior):
         return DensePrior(self.root * factor, mean=self.mean)
 
     def variance(self):
-        xp = namespace(self)
-        return xp.einsum("ij,ij->i", self.root, self.root)
+        return namespace(self).einsum("ij,ij->i", self.root, self.root)
 
     def covariance(self):
         product = linalg.times_lower(self.root, self.root, transpose=True)

@@ -31,7 +31,7 @@ from lusee_bayes.core.arrays import Array, Modes, Pixels
 from lusee_bayes.core.checks import Described, number, require_array, require_finite, require_whole
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.files import replacing, user_path
-from lusee_bayes.core.formats import is_fits, opened, require_readable_hdf5
+from lusee_bayes.core.formats import has_words, is_fits, opened, require_readable_hdf5
 from lusee_bayes.core.layouts import Attribute, Layout, Variable
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.reading import naming, read_arrays, reading, require_file
@@ -387,11 +387,10 @@ def write_alms(path: str | Path, modes: Float[Array, " modes"], header: dict[str
     Path
         The file.
     """
-    units = {"TUNIT2": "K", "TUNIT3": "K", "EXTNAME": "ALM"}
     with replacing(path) as partial:
         healpy.write_alm(partial, harmonics.to_healpy(modes), out_dtype=np.float64)
         with fits.open(partial, mode="update") as hdus:
-            hdus[1].header.update(units | header)
+            hdus[1].header.update({"TUNIT2": "K", "TUNIT3": "K", "EXTNAME": "ALM"} | header)
     return user_path(path)
 
 
@@ -454,10 +453,7 @@ class SkyCube(SkyFile):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        if not is_fits(path):
-            return False
-        with opened(path) as hdus:
-            return all(key in hdus[0].header for key in STEPS)
+        return has_words(path, STEPS)
 
     @classmethod
     def read(cls, path: str | Path, dataset: str | None = None) -> SkyCube:

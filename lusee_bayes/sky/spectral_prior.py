@@ -20,7 +20,7 @@ from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core import checks
 from lusee_bayes.core.arrays import Array, namespace
-from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.harmonics import per_mode, power_spectrum
 
 # spectra over the power law: x is frequency / reference, y frequency / turnover; ionised gas takes
@@ -53,8 +53,7 @@ def require_names(
     InputError
     """
     for name in names:
-        if name not in known:
-            raise InputError(f"unknown {kind} '{name}'; {nearest(name, known)}")
+        require_known(f"unknown {kind}", name, known)
     if not names or n_channels < len(names):
         raise InputError(
             f"{len(names)} {several} need at least as many channels, got {n_channels}; name fewer "
@@ -117,12 +116,9 @@ class SpectralPrior(checks.Described, eqx.Module):
 
     def __check_init__(self):
         channels, components = self.mixing.shape
-        for name, values, shape in (
-            ("the frequencies", self.frequencies_mhz, (channels,)),
-            ("the mixing", self.mixing, (None, None)),
-            ("the components' spectra", self.spectra, (components, None)),
-        ):
-            checks.require_array(name, values, shape)
+        checks.require_array("the frequencies", self.frequencies_mhz, (channels,))
+        checks.require_array("the mixing", self.mixing)
+        checks.require_array("the components' spectra", self.spectra, (components, None))
         checks.require_positive("the components' C_ell", self.spectra)
         if self.residual is not None:
             name, hint = "the residual spectra", "leave them out if there is no residual"

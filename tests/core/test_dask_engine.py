@@ -14,8 +14,7 @@ from threadpoolctl import threadpool_info
 
 from lusee_bayes.core import dask_engine
 from lusee_bayes.core.dask_engine import DaskEngine
-from lusee_bayes.core.engine import Demand, processors
-from lusee_bayes.core.engines import open_engine
+from lusee_bayes.core.engine import Demand, open_engine, processors
 from lusee_bayes.core.errors import InputError, WorkersLost
 from lusee_bayes.core.progress import Stages
 

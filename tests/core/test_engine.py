@@ -12,9 +12,16 @@ import pytest
 from assertions import refuse
 from rich.console import Console
 
-from lusee_bayes.core import engines, progress
-from lusee_bayes.core.engine import Demand, Tasks, ThisProcess, in_threads, once
-from lusee_bayes.core.engines import SCHEDULER, open_engine
+from lusee_bayes.core import engine, progress
+from lusee_bayes.core.engine import (
+    SCHEDULER,
+    Demand,
+    Tasks,
+    ThisProcess,
+    in_threads,
+    once,
+    open_engine,
+)
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 
@@ -93,13 +100,13 @@ def opened(demand=DEMAND, **given):
 @pytest.fixture
 def large(monkeypatch):
     """A machine of 64 GB, without a cluster."""
-    monkeypatch.setattr(engines, "memory_limit", lambda: 64 * 10**9)
+    monkeypatch.setattr(engine, "memory_limit", lambda: 64 * 10**9)
     monkeypatch.delenv(SCHEDULER, raising=False)
 
 
 @pytest.mark.usefixtures("large")
 def test_one_worker_is_this_process_which_needs_no_dask(monkeypatch):
-    monkeypatch.setattr(engines, "find_spec", lambda name: None)
+    monkeypatch.setattr(engine, "find_spec", lambda name: None)
     for n in (None, 1):
         with open_engine(DEMAND, n) as found:
             assert found == ThisProcess(2)

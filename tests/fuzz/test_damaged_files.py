@@ -24,8 +24,7 @@ from lusee_bayes.instrument.visibilities import read_visibilities
 from lusee_bayes.instrument.waterfalls import read_waterfall, write_waterfall
 from lusee_bayes.report.describe import describe
 from lusee_bayes.report.pages import write_report
-from lusee_bayes.results.finished_runs import read_runs
-from lusee_bayes.results.map_files import read_channels, read_information
+from lusee_bayes.results.finished_runs import read_channels, read_information, read_runs
 from lusee_bayes.runs import folder as folder_module
 from lusee_bayes.runs import map_run
 from lusee_bayes.sky.sky_source import write_alms

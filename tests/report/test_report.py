@@ -18,7 +18,7 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
 from lusee_bayes.judge import left_out
 from lusee_bayes.results.channel_map import region_of
-from lusee_bayes.results.map_files import read_channels
+from lusee_bayes.results.finished_runs import read_channels
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 

@@ -20,7 +20,7 @@ from reference_linear import resolution_rows
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import mode_numbers, pixel_matrix, synthesis_matrix
 from lusee_bayes.report.viewer import BUDGET, KERNEL_NSIDE, nside_of_page, viewer
-from lusee_bayes.results.map_files import read_channels
+from lusee_bayes.results.finished_runs import read_channels
 
 NODE = shutil.which("node")
 # elements that remember; a canvas whose context keeps the last image

@@ -19,8 +19,7 @@ from lusee_bayes.judge.chi2 import stands_out
 from lusee_bayes.judge.split import Split
 from lusee_bayes.linear.posterior import pixel_std
 from lusee_bayes.results.channel_map import conditioned, region_rows
-from lusee_bayes.results.finished_runs import FinishedRun
-from lusee_bayes.results.map_files import SavedInformation
+from lusee_bayes.results.finished_runs import FinishedRun, SavedInformation
 from lusee_bayes.testing.scenarios import small_scenario
 
 

@@ -10,7 +10,7 @@ from commands import posterior_of, refused, run
 from experiments import channels_of, of_run
 
 import lusee_bayes as lb
-from lusee_bayes.results.map_files import information_file, read_information
+from lusee_bayes.results.finished_runs import information_file, read_information
 from lusee_bayes.runs import map_run
 
 # N of the parts is that of the whole: about the model, and not about each one's data

@@ -27,7 +27,7 @@ import lusee_bayes as lb
 from lusee_bayes.core.files import LOCK
 from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.runs import sample_run, validate_run
+from lusee_bayes.runs import sample_run
 from lusee_bayes.runs.sample_run import sample_result
 from lusee_bayes.sampling import hmc
 from lusee_bayes.sampling.datatree import read_datatree
@@ -403,7 +403,7 @@ def test_half_the_covariance_is_found_out_with_exit_code_1(validated, tmp_path, 
         solution = replace(found.inference.solution, posterior=half)
         return replace(found, inference=replace(found.inference, solution=solution))
 
-    monkeypatch.setattr(validate_run, "sample_result", with_half_the_covariance)
+    monkeypatch.setattr(sample_run, "sample_result", with_half_the_covariance)
     arguments = [*SMALL, *SETTINGS, "--simulations", "100", "-q", "-o", folder, "--resume"]
     assert run("validate", *arguments) == 1
     report = consistent(folder)

@@ -25,7 +25,7 @@ from scipy.special import roots_legendre
 
 from lusee_bayes.core import checks
 from lusee_bayes.core.arrays import Array, namespace
-from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.harmonics import LARGEST_LMAX, SQRT2, lmax_of, mode_numbers, polar_functions
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.instrument.products import antennas_of, auto_indices, labels_of, to_real
@@ -287,8 +287,7 @@ def on_grid(rows: Pattern, theta: Angles, grid: HemisphereGrid, angle_deg: float
         return np.roll(rows, round(steps), axis=1)
     m = np.fft.fftfreq(n, 1.0 / n)
     spectrum = np.fft.fft(rows, axis=1) / n
-    phi = grid.phi - np.radians(angle_deg)
-    return spectrum @ np.exp(1j * m[:, None] * phi[None])
+    return spectrum @ np.exp(1j * m[:, None] * (grid.phi - np.radians(angle_deg))[None])
 
 
 STOKES = ("I", "Q", "U", "V")
@@ -331,8 +330,7 @@ def stokes_pairs(e_theta: Fields, e_phi: Fields, stokes: str = "I") -> Pairs:
     ----------
     Hamaker and Bregman 1996, A&AS 117, 161 (the IAU's convention for V).
     """
-    if stokes not in STOKES:
-        raise InputError(f"unknown Stokes parameter '{stokes}'; {nearest(stokes, STOKES)}")
+    require_known("unknown Stokes parameter", stokes, STOKES)
     et, ep = e_theta[:, None], e_phi[:, None]
     ft, fp = e_theta[None].conj(), e_phi[None].conj()
     if stokes == "I":
@@ -370,8 +368,7 @@ class ProductBeams(checks.Described, eqx.Module):
         antennas_of(self.n_products)
 
     def description(self) -> tuple[str, ...]:
-        autos = self.modes[auto_indices(antennas_of(self.n_products)), 0]
-        integrals = autos * np.sqrt(4.0 * np.pi)
+        integrals = self.modes[auto_indices(antennas_of(self.n_products)), 0] * np.sqrt(4.0 * np.pi)
         return (
             f"{self.n_products} products at {self.frequency_mhz:g} MHz, lmax = {self.lmax}",
             f"{self.modes.shape[1]} real coefficients each, topocentric, K per K: "
@@ -464,8 +461,7 @@ def beam_scale(fields: AntennaFields, beams: ProductBeams) -> float:
 
 def mean_auto_integral(fields: AntennaFields) -> Float[Array, ""]:
     """Return the integral of the Stokes I auto beam in steradian, averaged over antennas."""
-    autos = to_real(stokes_beam(fields))[auto_indices(fields.n_antennas)]
-    integrals = fields.grid.integrate(autos)
+    integrals = fields.grid.integrate(to_real(stokes_beam(fields))[auto_indices(fields.n_antennas)])
     return namespace(integrals).asarray(integrals.mean())
 
 

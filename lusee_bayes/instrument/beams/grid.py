@@ -35,12 +35,11 @@ from lusee_bayes.core.lazy import interpolate
 from lusee_bayes.core.reading import read_table
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, Interpolation, Pairs, ProductBeams
 from lusee_bayes.instrument.beams.sampled import read_beam
-from lusee_bayes.instrument.beams.source import BeamSource, Circuit, Parameter, Receiver
+from lusee_bayes.instrument.beams.source import BeamSource, Circuit, Lines, Parameter, Receiver
 from lusee_bayes.instrument.products import all_products
 
 Nodes = Float[np.ndarray, " nodes"]
 Values = Mapping[str, float | Float[Array, ""]]
-Lines = Float[np.ndarray, "lines products modes"]
 # values of a parameter through which one polynomial goes; through more go cubic splines
 MOST_IN_ONE = 5
 WHAT = "a table of beam files: a column file, and one with two or more values for each parameter"

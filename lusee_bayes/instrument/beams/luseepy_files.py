@@ -43,7 +43,7 @@ from scipy.special import roots_legendre
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import Described, counted, extent
-from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.formats import read_fits
 from lusee_bayes.core.harmonics import mode_numbers, polar_functions
 from lusee_bayes.core.layouts import UNSTATED, Attribute, Layout, Variable
@@ -101,8 +101,7 @@ def require_conventions(path: str | Path, said: Mapping[str, Any]) -> None:
     stated = {key: str(value).strip().lower() for key, value in said.items()}
     stated = {key: text for key, text in stated.items() if text not in UNSTATED}
     kind = stated.get("NORM_KIND", "already-effective-length")
-    if kind not in CONVERTED:
-        raise InputError(f"{path}: NORM_KIND is '{kind}'; {nearest(kind, CONVERTED)}")
+    require_known(f"{path}: NORM_KIND is", kind, CONVERTED)
     source = dict(zip(SOURCES[1:], CONVERTED[kind], strict=True))
     for key, expected in (CONVENTIONS | source).items():
         allowed = (expected,) if isinstance(expected, str) else expected
@@ -319,8 +318,7 @@ class PortResponse(LuseepyBeam):
         return BandLimitedGrid.of(self.theta, self.n_phi)
 
     def behind(self, receiver: Receiver | None) -> PortResponse:
-        given = receiver is None or self.receiver_said
-        return self if given else replace(self, receiver=receiver)
+        return self if receiver is None or self.receiver_said else replace(self, receiver=receiver)
 
     def description(self) -> tuple[str, ...]:
         known = self.frequencies_mhz

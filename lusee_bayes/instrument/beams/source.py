@@ -23,7 +23,7 @@ from pydantic import BeforeValidator, Field
 from scipy.constants import Boltzmann
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.formats import read_fits
 from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.section import LARGEST, Positive, Section
@@ -410,8 +410,7 @@ class BeamSource(ABC):
             If there is none; the message gives the nearest name.
         """
         found = self.parameters()
-        if name not in found:
-            raise InputError(f"unknown beam parameter '{name}'; {nearest(name, found)}")
+        require_known("unknown beam parameter", name, found)
         return found[name]
 
     def with_values(self, values: Values) -> BeamSource:

@@ -11,6 +11,7 @@ level. It is for the eye only: files and numbers are without it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -30,6 +31,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
+from lusee_bayes.core.arrays import Pixels
 from lusee_bayes.core.harmonics import lmax_of, modes_to_map, per_mode
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.version import printable
@@ -76,9 +78,7 @@ def temperatures(pixels: Float[np.ndarray, "..."], lowest: float = 0.5) -> LogNo
     return LogNorm(*np.percentile(pixels[pixels > 0], [lowest, 99.8]))
 
 
-def seen_range(
-    std: Float[np.ndarray, "..."], altitude: Float[np.ndarray, " pixels"]
-) -> tuple[float, float]:
+def seen_range(std: Float[np.ndarray, "..."], altitude: Pixels) -> tuple[float, float]:
     """Bounds of a logarithmic scale for standard deviations: of what was seen.
 
     A cap that never rose has standard deviations that would hide the structure of the rest. What
@@ -115,17 +115,26 @@ def without_minor_ticks(axis: Axis) -> None:
     axis.set_minor_locator(NullLocator())
 
 
+def side_by_side(axes: Axes, products: Sequence[str], n_times: int) -> None:
+    """Dress axes in which products follow one another, with time running within each."""
+    starts = n_times * np.arange(len(products))
+    for start in starts:
+        axes.axvline(start, color=GREY, lw=0.4)
+    axes.set_xticks(starts + 0.5 * n_times, products, fontsize=8)
+    axes.tick_params(axis="x", length=0)
+    axes.set(xlabel="product (time runs within each)", ylabel="visibility [K]")
+    axes.set_xlim(0, n_times * len(products))
+
+
 def orthographic(axes: Axes, grid: HemisphereGrid, pattern: Float[np.ndarray, "theta phi"]):
     """Draw a pattern on the plane of the horizon: x East, y North."""
     phi = np.append(grid.phi, 2 * np.pi)
     closed = np.concatenate([pattern, pattern[:, :1]], axis=1) / pattern.max()
     # the grid has no node at the zenith itself: every azimuth of the first ring meets there
     closed = np.concatenate([np.full((1, closed.shape[1]), closed[0].mean()), closed])
-    theta = np.append(0.0, grid.theta)
-    x, y = (np.outer(np.sin(theta), f(phi)) for f in (np.cos, np.sin))
-    image = axes.pcolormesh(
-        x, y, closed, cmap=SEQUENTIAL, vmin=0, vmax=1, shading="gouraud", rasterized=True
-    )
+    x, y = (np.outer(np.sin(np.append(0.0, grid.theta)), f(phi)) for f in (np.cos, np.sin))
+    style = {"cmap": SEQUENTIAL, "vmin": 0, "vmax": 1, "shading": "gouraud", "rasterized": True}
+    image = axes.pcolormesh(x, y, closed, **style)
     axes.set(aspect="equal", xticks=[], yticks=[], xlim=(-1.15, 1.15), ylim=(-1.15, 1.15))
     axes.add_artist(Circle((0, 0), 1.0, fill=False, color=GREY, lw=0.8))
     points = {"N": (0, 1.08), "E": (1.08, 0), "S": (0, -1.08), "W": (-1.08, 0)}
@@ -168,11 +177,11 @@ MERIDIANS, PARALLELS = (120.0, 60.0, 0.0, -60.0, -120.0), (-60.0, -30.0, 0.0, 30
 
 def mollweide(
     axes: Axes,
-    pixels: Float[np.ndarray, " pixels"],
+    pixels: Pixels,
     *,
     norm: Normalize,
     cmap: str = SEQUENTIAL,
-    highest_altitude: Float[np.ndarray, " pixels"] | None = None,
+    highest_altitude: Pixels | None = None,
 ) -> AxesImage:
     """Draw a Galactic HEALPix RING map: centre l = 0, longitude grows to the left.
 
@@ -182,9 +191,8 @@ def mollweide(
     colours = colormaps[cmap].with_extremes(bad=colormaps[cmap](0.0))
     rim = Ellipse((0.0, 0.0), 2 * EDGE[0], 2 * EDGE[1], fill=False, color="black", lw=0.8)
     extent = (-EDGE[0], EDGE[0], -EDGE[1], EDGE[1])
-    image = axes.imshow(
-        view(pixels), extent=extent, origin="lower", cmap=colours, norm=norm, aspect="equal"
-    )
+    style = {"origin": "lower", "cmap": colours, "norm": norm, "aspect": "equal"}
+    image = axes.imshow(view(pixels), extent=extent, **style)
     axes.add_patch(rim)
     image.set_clip_path(rim)
     if highest_altitude is not None and (highest_altitude < 0).any():
@@ -201,12 +209,12 @@ def mollweide(
 def sky_panel(
     axes: Axes,
     title: str,
-    pixels: Float[np.ndarray, " pixels"],
+    pixels: Pixels,
     norm: Normalize,
     cmap: str = SEQUENTIAL,
     unit: str = "K",
     *,
-    altitude: Float[np.ndarray, " pixels"] | None = None,
+    altitude: Pixels | None = None,
     **bar: float,
 ) -> None:
     """Draw a map (:func:`mollweide`) with its title and a colour bar of its own."""
@@ -215,7 +223,7 @@ def sky_panel(
     axes.set_title(title)
 
 
-def view(pixels: Float[np.ndarray, " pixels"]) -> Float[np.ndarray, "height width"]:
+def view(pixels: Pixels) -> Float[np.ndarray, "height width"]:
     """Interpolate a map at every point of the view.
 
     Parameters
@@ -230,8 +238,7 @@ def view(pixels: Float[np.ndarray, " pixels"]) -> Float[np.ndarray, "height widt
         on with the rim's own values.
     """
     neighbours, weights = _projection(healpy.npix2nside(len(pixels)))
-    values = np.einsum("kp,kp->p", weights, np.asarray(pixels)[neighbours])
-    return values.reshape(WIDTH // 2, WIDTH)
+    return np.einsum("kp,kp->p", weights, np.asarray(pixels)[neighbours]).reshape(WIDTH // 2, WIDTH)
 
 
 @lru_cache(maxsize=4)
@@ -264,8 +271,7 @@ def unprojected(
     """
     t = np.arcsin(y)
     lat = np.arcsin((2.0 * t + np.sin(2.0 * t)) / np.pi)
-    inside = np.clip(x / np.cos(t), -1.0, 1.0)
-    return -180.0 * inside, np.degrees(lat)
+    return -180.0 * np.clip(x / np.cos(t), -1.0, 1.0), np.degrees(lat)
 
 
 def _graticule(axes: Axes) -> None:
@@ -281,8 +287,7 @@ def _graticule(axes: Axes) -> None:
     # their place is known: the layout need not measure them
     style = {"fontsize": 7, "va": "center", "in_layout": False}
     for lon in MERIDIANS:
-        text = f"{lon % 360:.0f}°"
-        label = axes.text(-EDGE[0] * lon / 180.0, 0.06, text, ha="center", **style)
+        label = axes.text(-EDGE[0] * lon / 180.0, 0.06, f"{lon % 360:.0f}°", ha="center", **style)
         label.set_path_effects(SEEN_ANYWHERE)
     for lat, x, y in zip(PARALLELS, ends, heights, strict=True):
         axes.text(-EDGE[0] * x - 0.05, EDGE[1] * y, f"{lat:.0f}°", ha="right", **style)
@@ -303,6 +308,6 @@ def taper_fwhm_deg(lmax: int) -> float:
     return float(np.degrees(sigma * np.sqrt(8.0 * np.log(2.0))))
 
 
-def shown(modes: Float[np.ndarray, " modes"], nside: int) -> Float[np.ndarray, " pixels"]:
+def shown(modes: Float[np.ndarray, " modes"], nside: int) -> Pixels:
     """Synthesise the HEALPix RING map of packed coefficients, seen through the beam."""
     return modes_to_map(modes * per_mode(taper(lmax_of(len(modes)))), nside)

@@ -43,9 +43,8 @@ def residuals_by_product(result: MapResult) -> Figure | None:
     left.invert_yaxis()
     left.set(xlabel="time [days]", ylabel="product", title="Each datum given all others")
     left.set_facecolor("0.8")
-    figure.colorbar(
-        image, ax=left, label="standard deviations", extend="both", shrink=0.9, pad=0.02
-    )
+    bar = {"label": "standard deviations", "extend": "both", "shrink": 0.9, "pad": 0.02}
+    figure.colorbar(image, ax=left, **bar)
     products = channel.judged.of_kind("product")
     rows = [labels.index(group.name) for group in products]
     for key, marker, colour, text in (
@@ -104,9 +103,8 @@ def pointing_by_day(result: MapResult) -> Figure | None:
         days = days[days["std"] < TOO_WIDE * days["std"].median()]
         middle = (days["first_day"] + days["last_day"] + 1) / 2.0
         axes.axhline(0.0, color=drawing.GREY, lw=0.8)
-        axes.errorbar(
-            middle, days["value"], days["std"], fmt="o", ms=3, color=drawing.BLUE, label="each day"
-        )
+        style = {"fmt": "o", "ms": 3, "color": drawing.BLUE, "label": "each day"}
+        axes.errorbar(middle, days["value"], days["std"], **style)
         if len(whole):
             value, std = float(whole["value"].iloc[0]), float(whole["std"].iloc[0])
             if np.isfinite(std) and std < TOO_WIDE * days["std"].median():
@@ -142,9 +140,8 @@ def unknowns_by_frequency(result: MapResult) -> Figure | None:
             for column in ("frequency_mhz", "value", "std", "prior", "prior_std")
         )
         axes.fill_between(f, prior - before, prior + before, color=drawing.GREY, alpha=0.25, lw=0)
-        axes.errorbar(
-            f, prior, before, color=drawing.GREY, fmt="none", lw=4, alpha=0.4, label="prior"
-        )
+        style = {"color": drawing.GREY, "fmt": "none", "lw": 4, "alpha": 0.4, "label": "prior"}
+        axes.errorbar(f, prior, before, **style)
         axes.errorbar(f, value, std, color=drawing.BLUE, fmt=".", ms=5, lw=1.2, label="posterior")
         if "true" in rows:
             axes.plot(f, rows["true"].to_numpy(), "x", color=drawing.ORANGE, ms=5, label="truth")
@@ -255,8 +252,7 @@ def waterfall(result: MapResult) -> Figure | None:
     if not result.single or reduced is None:
         return None
     figure, panels = drawing.framed((13, 9), 4, 4, sharex=True)
-    first = np.searchsorted(reduced.bin_of, np.arange(reduced.values.shape[2]))
-    days = _days(reduced)[first]
+    days = _days(reduced)[np.searchsorted(reduced.bin_of, np.arange(reduced.values.shape[2]))]
     n_bins = reduced.values.shape[2]
     used_in_part = np.bincount(reduced.bin_of, reduced.reason[band] != USED, n_bins) > 0
     products = {label: k for k, label in enumerate(labels())}
@@ -268,9 +264,8 @@ def waterfall(result: MapResult) -> Figure | None:
         kept = reduced.values[band, number]
         flagged = ~np.isfinite(kept) | used_in_part
         axes.plot(days, kept, ".", ms=3, color=drawing.BLUE, label="after flags")
-        before = reduced.before[band, number]
         style = {"ms": 4, "color": drawing.ORANGE, "label": "before, where flagged"}
-        axes.plot(days[flagged], before[flagged], ".", **style)
+        axes.plot(days[flagged], reduced.before[band, number][flagged], ".", **style)
         low, high = _range(kept[np.isfinite(kept)])
         axes.set_ylim(low, high)
         axes.set_title(product.label, fontsize=9)
@@ -298,10 +293,9 @@ def calibration(reduced: Reduced) -> Figure:
     _gains(left, reduced)
     _scatter(right, reduced)
     right.axhline(1.0, color=drawing.GREY, lw=0.8)
-    right.set_ylabel("scatter over radiometer noise")
+    right.set(ylabel="scatter over radiometer noise", title="Noise found over noise expected")
     found = np.concatenate([reduced.line_scatter, reduced.scatter, [1.0]])
     right.set_ylim(0.0, 1.3 * float(np.nanmax(found)))
-    right.set_title("Noise found over noise expected")
     return figure
 
 

@@ -13,26 +13,8 @@ from matplotlib.ticker import LogLocator, NullLocator
 from lusee_bayes.core.harmonics import lmax_of, modes_to_map
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.judge.measures import ell_cross
-from lusee_bayes.report.figures.drawing import (
-    BLUE,
-    COLOURS,
-    DIVERGING,
-    GREY,
-    LINES,
-    ORANGE,
-    SEQUENTIAL,
-    colour_bar,
-    framed,
-    in_places,
-    mollweide,
-    orthographic,
-    seen_range,
-    shown,
-    sky_panel,
-    taper_fwhm_deg,
-    temperatures,
-    without_minor_ticks,
-)
+from lusee_bayes.report.figures import drawing
+from lusee_bayes.report.figures.drawing import BLUE, COLOURS, DIVERGING, GREY, LINES, ORANGE
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.finished_runs import FinishedRun
 from lusee_bayes.results.map_result import MapResult
@@ -43,18 +25,12 @@ def data_vector(result: MapResult) -> Figure | None:
     if not result.single:
         return None
     channel = result.channel
-    n_products, n_times = channel.data.shape
-    figure, (axes,) = in_places((11, 4), left=0.08, right=0.99, bottom=0.13, top=0.91)
+    figure, (axes,) = drawing.in_places((11, 4), left=0.08, right=0.99, bottom=0.13, top=0.91)
     axes.plot(channel.data.ravel(), color=BLUE, lw=0.7)
-    for k in range(1, n_products):
-        axes.axvline(k * n_times, color=GREY, lw=0.4)
-    axes.set_xticks((np.arange(n_products) + 0.5) * n_times, channel.labels, fontsize=8)
-    axes.tick_params(axis="x", length=0)
-    axes.set(xlabel="product (time runs within each)", ylabel="visibility [K]")
-    axes.set_xlim(0, n_times * n_products)
+    drawing.side_by_side(axes, channel.labels, len(channel.hours))
     missing = f", {channel.n_missing} missing" if channel.n_missing else ""
-    title = f"Data vector at {channel.frequency_mhz:g} MHz, {channel.n_data} samples{missing}"
-    axes.set_title(title)
+    samples = f"{channel.n_data} samples{missing}"
+    axes.set_title(f"Data vector at {channel.frequency_mhz:g} MHz, {samples}")
     return figure
 
 
@@ -66,10 +42,10 @@ def beams(result: MapResult) -> Figure | None:
     _, *nodes = details.patterns.shape
     grid = HemisphereGrid.gauss_legendre(*nodes)
     places = {"left": 0.01, "right": 0.99, "bottom": 0.02, "top": 0.82, "wspace": 0.04}
-    figure, grid_of_axes = in_places((11, 4), 1, len(details.patterns), **places)
+    figure, grid_of_axes = drawing.in_places((11, 4), 1, len(details.patterns), **places)
     named = zip(grid_of_axes, details.pattern_names, details.patterns, strict=True)
     for axes, title, pattern in named:
-        image = orthographic(axes, grid, pattern)
+        image = drawing.orthographic(axes, grid, pattern)
         axes.set_title(title)
     figure.colorbar(image, ax=figure.axes, label="beam / its peak", shrink=0.8, pad=0.02)
     figure.suptitle(f"Beams at {result.channel.frequency_mhz:g} MHz, zenith at the centre")
@@ -82,13 +58,14 @@ def draws(result: MapResult) -> Figure | None:
     if channel.details is None:
         return None
     found = np.stack([modes_to_map(sky, channel.nside) for sky in channel.details.draws])
-    scale, rows = temperatures(found), (len(found) + 1) // 2
+    scale, rows = drawing.temperatures(found), (len(found) + 1) // 2
     places = {"left": 0.01, "right": 0.98, "bottom": 0.01, "top": 0.9, "wspace": 0.02}
-    figure, grid_of_axes = in_places((12, 3.6 * rows), rows, 2, **places, hspace=0.12)
+    figure, grid_of_axes = drawing.in_places((12, 3.6 * rows), rows, 2, **places, hspace=0.12)
+    style = {"norm": scale, "highest_altitude": channel.highest_altitude}
     for k, (axes, pixels) in enumerate(zip(grid_of_axes, found, strict=True)):
-        image = mollweide(axes, pixels, norm=scale, highest_altitude=channel.highest_altitude)
+        image = drawing.mollweide(axes, pixels, **style)
         axes.set_title(f"draw {k + 1}")
-    colour_bar(figure, image, figure.axes, label="K", shrink=0.7, extend="both", pad=0.02)
+    drawing.colour_bar(figure, image, figure.axes, label="K", shrink=0.7, extend="both", pad=0.02)
     figure.suptitle(f"Draws of the posterior at {channel.frequency_mhz:g} MHz")
     return figure
 
@@ -96,13 +73,6 @@ def draws(result: MapResult) -> Figure | None:
 def sky_maps(result: MapResult) -> Figure:
     """The maps of one channel, or of a few of many."""
     return channel_maps(result) if len(result.channels) > 1 else channel_map(result.channel)
-
-
-def fidelity(result: MapResult) -> Figure:
-    """The fidelity of a channel by multipole, or of many by multipole and frequency."""
-    if len(result.channels) > 1:
-        return channel_fidelity(result)
-    return map_fidelity(result.channel)
 
 
 def spectra(result: MapResult) -> Figure:
@@ -115,15 +85,15 @@ def channel_map(channel: ChannelResult) -> Figure:
 
     All but the standard deviation are drawn through the beam of :mod:`.drawing`.
     """
-    sky = mean = shown(channel.mean, channel.nside)
+    sky = mean = drawing.shown(channel.mean, channel.nside)
     level, extra = mean.mean(), {}
     if channel.truth is not None:
-        sky = shown(channel.truth, channel.nside)
+        sky = drawing.shown(channel.truth, channel.nside)
         percent = 100.0 * (mean - sky) / level
         span = np.percentile(np.abs(percent), 99.0)
         extra = {"mean - truth": (percent, Normalize(-span, span), DIVERGING, "% of the mean sky")}
-    altitude, scale = channel.highest_altitude, temperatures(sky, 0.05)
-    spread = LogNorm(*seen_range(channel.pixel_std, altitude))
+    altitude, scale = channel.highest_altitude, drawing.temperatures(sky, 0.05)
+    spread = LogNorm(*drawing.seen_range(channel.pixel_std, altitude))
     panels = {
         **({"truth": (sky, scale)} if extra else {}),
         "posterior mean": (mean, scale),
@@ -132,13 +102,13 @@ def channel_map(channel: ChannelResult) -> Figure:
     }
     rows = (len(panels) + 1) // 2
     places = {"left": 0.01, "right": 0.98, "bottom": 0.01, "top": 0.88, "wspace": 0.06}
-    figure, grid_of_axes = in_places((12, 3.6 * rows), rows, 2, **places, hspace=0.12)
+    figure, grid_of_axes = drawing.in_places((12, 3.6 * rows), rows, 2, **places, hspace=0.12)
     for axes, (title, panel) in zip(grid_of_axes, panels.items(), strict=True):
-        sky_panel(axes, title, *panel, altitude=altitude, shrink=0.8, pad=0.03)
+        drawing.sky_panel(axes, title, *panel, altitude=altitude, shrink=0.8, pad=0.03)
     figure.suptitle(
         f"{channel.frequency_mhz:g} MHz, Galactic coordinates; dashed: never above the horizon\n"
         f"{', '.join(list(panels)[:-1])}: seen through a beam of "
-        f"{taper_fwhm_deg(lmax_of(len(channel.mean))):.1f}° (FWHM)"
+        f"{drawing.taper_fwhm_deg(lmax_of(len(channel.mean))):.1f}° (FWHM)"
     )
     return figure
 
@@ -148,13 +118,14 @@ def map_fidelity(channel: ChannelResult) -> Figure:
     spectra = channel.spectra()
     known = "snr" in spectra
     places = {"left": 0.06 if known else 0.14, "right": 0.98, "bottom": 0.13, "top": 0.9}
-    figure, panels = in_places((12 if known else 5, 4), 1, 3 if known else 1, **places, wspace=0.25)
+    width, columns = (12, 3) if known else (5, 1)
+    figure, panels = drawing.in_places((width, 4), 1, columns, **places, wspace=0.25)
     _fidelity(panels, spectra, color=BLUE)
     panels[-1].axhline(0.5, color=GREY, lw=0.8, ls=":")
     if known:
         panels[0].axhline(0.0, color=GREY, lw=0.8)
         panels[1].axhline(1.0, color=GREY, lw=0.8, ls=":")
-        without_minor_ticks(panels[1].yaxis)
+        drawing.without_minor_ticks(panels[1].yaxis)
         cross = ell_cross(spectra["snr"])
         if cross is not None:
             panels[1].axvline(cross, color=ORANGE, lw=1, ls="--", label=f"first below 1: {cross}")
@@ -184,7 +155,7 @@ def _fidelity(
 def sky_spectra(channel: ChannelResult) -> Figure:
     """C_ell of prior, posterior mean, truth and posterior variance."""
     columns = channel.spectra()
-    figure, (axes,) = in_places((6, 4.5), left=0.13, right=0.97, bottom=0.12, top=0.92)
+    figure, (axes,) = drawing.in_places((6, 4.5), left=0.13, right=0.97, bottom=0.12, top=0.92)
     ell = columns["ell"]
     styles = {
         "cl_prior": ("prior", GREY, "-"),
@@ -196,7 +167,7 @@ def sky_spectra(channel: ChannelResult) -> Figure:
         if name in columns:
             axes.semilogy(ell, columns[name], color=colour, ls=line, label=label)
     axes.set(xlabel=r"multipole $\ell$", ylabel=r"$C_\ell$ [K$^2$]", xlim=(0, ell[-1]))
-    without_minor_ticks(axes.yaxis)
+    drawing.without_minor_ticks(axes.yaxis)
     axes.legend(frameon=False)
     axes.set_title(f"Power at {channel.frequency_mhz:g} MHz")
     return figure
@@ -220,12 +191,12 @@ def instrument_share(result: MapResult) -> Figure | None:
     if not known:
         return None
     chosen = np.unique(np.linspace(0, len(known) - 1, min(len(known), SHOWN)).round().astype(int))
-    figure, grid = framed((6.4 * len(chosen), 3.8), 1, len(chosen), squeeze=False)
+    figure, grid = drawing.framed((6.4 * len(chosen), 3.8), 1, len(chosen), squeeze=False)
     for axes, channel in zip(grid.flat, (known[k] for k in chosen), strict=True):
         share, title = 100.0 * channel.theta.pixel_share, f"{channel.frequency_mhz:g} MHz"
         scale = Normalize(0.0, max(float(np.percentile(share, 99.5)), 1e-3))
-        options = {"altitude": channel.highest_altitude, "shrink": 0.8}
-        sky_panel(axes, title, share, scale, SEQUENTIAL, "% of the variance", **options)
+        options = {"altitude": channel.highest_altitude, "shrink": 0.8, "unit": "% of the variance"}
+        drawing.sky_panel(axes, title, share, scale, **options)
     return figure
 
 
@@ -233,9 +204,9 @@ def maps_of_runs(runs: Sequence[FinishedRun]) -> Figure:
     """Posterior mean and standard deviation of every run, each kind on one scale."""
     channels = [run.channel for run in runs]
     means = [modes_to_map(channel.mean, channel.nside) for channel in channels]
-    bounds = [seen_range(channel.pixel_std, channel.highest_altitude) for channel in channels]
+    bounds = [drawing.seen_range(one.pixel_std, one.highest_altitude) for one in channels]
     spread = LogNorm(min(low for low, _ in bounds), max(high for _, high in bounds))
-    scales = temperatures(np.concatenate(means)), spread
+    scales = drawing.temperatures(np.concatenate(means)), spread
     return _rows_of_maps({run.name: run.channel for run in runs}, scales)
 
 
@@ -243,22 +214,21 @@ def _rows_of_maps(
     named: Mapping[str, ChannelResult], scales: tuple[LogNorm, LogNorm] | None = None
 ) -> Figure:
     """Mean and standard deviation side by side, on the same scales or each on its own."""
-    figure, rows = framed((12, 3.4 * len(named) + 0.4), len(named), 2, squeeze=False)
+    figure, rows = drawing.framed((12, 3.4 * len(named) + 0.4), len(named), 2, squeeze=False)
     for (name, channel), (left, right) in zip(named.items(), rows, strict=True):
         mean, std = modes_to_map(channel.mean, channel.nside), channel.pixel_std
         altitude = channel.highest_altitude
         options = {"altitude": altitude, "shrink": 0.85}
-        own = scales or (temperatures(mean), LogNorm(*seen_range(std, altitude)))
-        sky_panel(left, f"{name}: posterior mean", mean, own[0], **options)
-        sky_panel(right, f"{name}: standard deviation", std, own[1], **options)
+        own = scales or (drawing.temperatures(mean), LogNorm(*drawing.seen_range(std, altitude)))
+        drawing.sky_panel(left, f"{name}: posterior mean", mean, own[0], **options)
+        drawing.sky_panel(right, f"{name}: standard deviation", std, own[1], **options)
     return figure
 
 
 def channel_spectra(cube: MapResult) -> Figure:
     """Brightness against frequency in some directions, with one standard deviation."""
-    landmarks = cube.landmarks()
-    figure, panels = framed((11, 7), 2, 2, sharex=True)
-    for axes, (name, values) in zip(panels.flat, landmarks.items(), strict=True):
+    figure, panels = drawing.framed((11, 7), 2, 2, sharex=True)
+    for axes, (name, values) in zip(panels.flat, cube.landmarks().items(), strict=True):
         f, mean, std = cube.frequencies_mhz, values["mean"], values["std"]
         axes.errorbar(f, mean, std, color=BLUE, fmt=".", ms=4, lw=1, label="posterior")
         if "truth" in values:
@@ -272,19 +242,24 @@ def channel_spectra(cube: MapResult) -> Figure:
     return figure
 
 
-def channel_fidelity(cube: MapResult) -> Figure:
-    """SNR_ell (or, without a truth, the prior's share) over frequency and ell, and its mean."""
+def fidelity(cube: MapResult) -> Figure:
+    """SNR_ell (or, without a truth, the prior's share) over frequency and ell, and its mean.
+
+    Of one channel, as :func:`map_fidelity`.
+    """
+    if len(cube.channels) == 1:
+        return map_fidelity(cube.channel)
     snr, alone = cube.snr(), cube.snr(independent=True)
     known = snr is not None
     values = snr if known else cube.stacked("prior_fraction")
     label = r"$\mathrm{SNR}_\ell$" if known else "share of the variance from the prior"
     norm = LogNorm(0.3, 30.0) if known else Normalize(0.0, 1.0)
-    figure, (left, right) = framed((12, 4.4), 1, 2)
+    figure, (left, right) = drawing.framed((12, 4.4), 1, 2)
     ell, channel = np.arange(values.shape[1]), np.arange(values.shape[0])
-    style = {"norm": norm, "cmap": SEQUENTIAL, "shading": "nearest"}
+    style = {"norm": norm, "cmap": drawing.SEQUENTIAL, "shading": "nearest"}
     image = left.pcolormesh(ell[1:], channel, values[:, 1:], **style)
-    shown = np.unique(np.linspace(0, len(channel) - 1, min(len(channel), 8)).round().astype(int))
-    left.set_yticks(shown, [f"{cube.frequencies_mhz[k]:g}" for k in shown])
+    ticks = np.unique(np.linspace(0, len(channel) - 1, min(len(channel), 8)).round().astype(int))
+    left.set_yticks(ticks, [f"{cube.frequencies_mhz[k]:g}" for k in ticks])
     left.set(xlabel=r"multipole $\ell$", ylabel="frequency [MHz]", title=label)
     figure.colorbar(image, ax=left, label=label, extend="both" if known else "neither")
     right.plot(ell[1:], values[:, 1:].mean(0), color=BLUE, label="this run")
@@ -303,7 +278,7 @@ def chi2(cube: MapResult) -> Figure | None:
     """chi^2 that judges every channel, over its mean if the model holds."""
     if cube.single:
         return None
-    figure, axes = framed((8, 4))
+    figure, axes = drawing.framed((8, 4))
     fits = cube.fits()
     ratio, width = fits.chi2 / fits.degrees, np.sqrt(2.0 / fits.degrees)
     mhz = cube.frequencies_mhz
@@ -320,7 +295,7 @@ def curves_of_runs(runs: Sequence[FinishedRun]) -> Figure:
     """rho_ell and SNR_ell where the truth is known, and the prior's share, of every run."""
     spectra = [run.channel.spectra() for run in runs]
     known = all("snr" in one for one in spectra)
-    figure, panels = framed((12 if known else 6, 4.2), 1, 3 if known else 1, squeeze=False)
+    figure, panels = drawing.framed((12 if known else 6, 4.2), 1, 3 if known else 1, squeeze=False)
     panels = list(panels.flat)
     for k, run in enumerate(runs):
         style = {"color": COLOURS[k % len(COLOURS)], "ls": LINES[k % len(LINES)], "lw": 1.3}

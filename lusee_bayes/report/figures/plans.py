@@ -17,6 +17,8 @@ from lusee_bayes.results.prior_comparison import PriorComparison
 
 # distinct without colour vision and by shape; again from the first after four
 STYLES = tuple(zip(COLOURS, "os^D", strict=False))
+# where every family and name of a variation is drawn
+Rows = dict[tuple[str, str], float]
 # numbers of a forecast, with the words of their axes; one that is None is not reached
 PANELS = {
     "information_bits": "information about the sky [bits]",
@@ -59,11 +61,10 @@ def forecasts(planned: Sequence[Forecast]) -> Figure:
     return figure
 
 
-def _row_positions(planned: Sequence[Forecast]) -> dict[tuple[str, str], int]:
+def _row_positions(planned: Sequence[Forecast]) -> Rows:
     """The row of every (family, variation) and of each family's own name, (family, "")."""
-    rows: dict[tuple[str, str], int] = {}
-    families = dict.fromkeys(f.variation.family for f in planned)
-    for family in families:
+    rows: Rows = {}
+    for family in dict.fromkeys(f.variation.family for f in planned):
         names = dict.fromkeys(f.variation.name for f in planned if f.variation.family == family)
         if family != AS_GIVEN:
             rows[family, ""] = len(rows)
@@ -73,34 +74,29 @@ def _row_positions(planned: Sequence[Forecast]) -> dict[tuple[str, str], int]:
 
 
 def _marks(
-    axes: Axes,
-    number: str,
-    mine: Sequence[Forecast],
-    rows: dict[tuple[str, str], float],
-    style: tuple[str, str],
-    numbers: bool,
+    axes: Axes, name: str, mine: Sequence[Forecast], rows: Rows, style: tuple[str, str], told: bool
 ) -> None:
-    """The marks of one scenario in one panel; ``numbers``: with their values beside them."""
+    """The marks of one scenario in one panel; ``told``: with their values beside them."""
     colour, marker = style
     for forecast in mine:
-        value = getattr(forecast, number)
+        value = getattr(forecast, name)
         # without a crossing, one ell beyond the last
         x = len(forecast.snr_squared) if value is None else value
         y = rows[forecast.variation.family, forecast.variation.name]
         face = "white" if value is None else colour
         label = forecast.variation.source if forecast is mine[0] else None
         axes.plot(x, y, marker, color=colour, mfc=face, ms=6, label=label)
-        if numbers:
+        if told:
             text = f"> {x - 1}" if value is None else f"{value:.0f}"
             box = {"fc": "white", "ec": "none", "pad": 0.8}
             style = {"textcoords": "offset points", "va": "center", "fontsize": 8, "bbox": box}
             axes.annotate(text, (x, y), (7, 0), **style)
-    reference = getattr(mine[0], number)
+    reference = getattr(mine[0], name)
     if reference is not None:
         axes.axvline(reference, color=colour, lw=0.9, ls="--", zorder=0)
 
 
-def _label_rows(axes: Axes, rows: dict[tuple[str, str], int]) -> None:
+def _label_rows(axes: Axes, rows: Rows) -> None:
     """Name every row from the top down; the families' names stand out."""
     axes.set_yticks(list(rows.values()), [name or family for family, name in rows])
     axes.set_ylim(max(rows.values()) + 0.7, -0.7)

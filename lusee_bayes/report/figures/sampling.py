@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 import arviz_base
 import arviz_plots
@@ -75,12 +75,11 @@ def _drawn(
     **options: object,
 ) -> Figure:
     """ArviZ's figure, which pyplot then forgets; a note where draws do not suffice for it."""
-    if not _vary(quantities.values()):
+    if any(x.shape[1] < FEWEST or not (np.ptp(x, axis=1) > 0).all() for x in quantities.values()):
         return drawing.note(title, TOO_FEW)
     tree = arviz_base.from_dict({group: quantities})
     frame = {"layout": "constrained", "figsize": size}
-    collection = plot(tree, backend="matplotlib", figure_kwargs=frame, **options)
-    figure = collection.viz["figure"].item()
+    figure = plot(tree, backend="matplotlib", figure_kwargs=frame, **options).viz["figure"].item()
     figure.suptitle(title)
     pyplot.close(figure)
     return figure
@@ -100,13 +99,6 @@ def against_analytic(tree: xr.DataTree) -> Figure:
     right.set(xlabel="mode", ylabel="draws / analytic", title="Standard deviations")
     figure.suptitle("Draws against the analytic posterior, mode by mode")
     return figure
-
-
-def _vary(quantities: Iterable[Float[np.ndarray, "chains draws"]]) -> bool:
-    """Whether there are draws enough for ArviZ's estimates, and not all the same."""
-    return all(
-        draws.shape[1] >= FEWEST and bool((np.ptp(draws, axis=1) > 0).all()) for draws in quantities
-    )
 
 
 def uncertainty(run: SampleResult) -> Figure:
@@ -132,8 +124,7 @@ def uncertainty(run: SampleResult) -> Figure:
         ("width of the 90 % interval", interval, _range(interval), drawing.SEQUENTIAL, percent),
         (skewed, skewness, signed, drawing.DIVERGING, chance),
     ]
-    nside = run.experiment.scenario.map_nside
-    altitude = highest_altitude(run.experiment.data.observation, nside)
+    altitude = highest_altitude(run.experiment.data.observation, run.experiment.scenario.map_nside)
     figure, grid_of_axes = drawing.framed((12, 7.2), 2, 2)
     for axes, panel in zip(grid_of_axes.flat, panels, strict=True):
         drawing.sky_panel(axes, *panel, altitude=altitude, shrink=0.85)
@@ -193,9 +184,8 @@ def comparison(result: Comparison) -> Figure:
     variances.set(xlabel="mode", ylabel="variance: draws / analytic", title="Variances")
     rank = np.arange(1, len(result.eigenvalues) + 1)
     covariance.plot(rank, result.eigenvalues, color=drawing.BLUE, label="draws")
-    covariance.plot(
-        rank, result.null_eigenvalues, color=drawing.ORANGE, ls="--", label="exact chains"
-    )
+    exact = {"color": drawing.ORANGE, "ls": "--", "label": "exact chains"}
+    covariance.plot(rank, result.null_eigenvalues, **exact)
     covariance.set(xlabel="number, rising", ylabel="generalised eigenvalue")
     covariance.set_title("Covariance in analytic coordinates")
     covariance.legend(frameon=False)
@@ -225,9 +215,8 @@ def rank_statistics(ranks: Ranks) -> Figure:
         axes.set_axis_off()
     last = panels[-1]
     last.set_axis_on()
-    table = ranks.coverage()
     levels = np.array(LEVELS)
-    for coverage in table.values():
+    for coverage in ranks.coverage().values():
         last.plot(levels, [coverage[p] - p for p in LEVELS], color=drawing.BLUE, lw=0.5, alpha=0.6)
     error = 3 * np.array([ranks.coverage_error(p) for p in LEVELS])
     last.fill_between(levels, -error, error, color=drawing.GREY, alpha=0.25, lw=0)
