@@ -1,7 +1,5 @@
 """Beams from luseepy's files, against what luseepy itself made of them, and synthetic files."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The sources of beams: the embedded antennas, scalar files and four-port responses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A against integrals over the sky, rows and rotations; and A of antennas that vary."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -1,7 +1,5 @@
 """The embedded antennas and the ground below them, against sums along the arms and closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from assertions import close, refuse, within

@@ -1,7 +1,5 @@
 """Times, orientations and bodies in the sky, against lunarsky, astropy and ERFA."""
 
-from __future__ import annotations
-
 import astropy.units as u
 import erfa
 import numpy as np

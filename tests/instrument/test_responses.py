@@ -1,7 +1,5 @@
 """Four-port responses and waterfalls, against luseepy's own simulation and by hand."""
 
-from __future__ import annotations
-
 import csv
 import json
 from dataclasses import replace

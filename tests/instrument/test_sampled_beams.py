@@ -1,7 +1,5 @@
 """Beams of one's own: sampled from known patterns, they give the known beams and visibilities."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Data sets: on disk, from arrays of any order and sign, with gaps, product by product."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime, timedelta, timezone
 
 import jax.numpy as jnp
@@ -12,15 +10,7 @@ from assertions import close, refuse
 from astropy.time import Time
 
 import lusee_bayes as lb
-from lusee_bayes.instrument.products import (
-    DataLayout,
-    Product,
-    all_products,
-    auto_indices,
-    labels,
-    to_matrix,
-    to_real,
-)
+from lusee_bayes.instrument import products as pr
 from lusee_bayes.instrument.visibilities import read_visibilities
 
 
@@ -29,7 +19,7 @@ def data():
     observation = lb.Observation.from_runs([lb.Run(0.05), lb.Run(0.03, turntable_deg=30.0)])
     rng = np.random.default_rng(0)
     flags = rng.random((16, observation.n_times)) < 0.1
-    layout = DataLayout.from_flags(flags)
+    layout = pr.DataLayout.from_flags(flags)
     values = jnp.asarray(rng.standard_normal(layout.size))
     return lb.Visibilities(values, layout, observation, 25.0, jnp.asarray(rng.standard_normal(9)))
 
@@ -262,7 +252,7 @@ FLAGS[:, 3] = True
 
 @pytest.mark.parametrize("flags", [np.zeros((3, 5), dtype=bool), FLAGS])
 def test_flagged_samples_are_not_in_the_data(flags):
-    layout = DataLayout.from_flags(flags)
+    layout = pr.DataLayout.from_flags(flags)
     # the positions by a loop in the order of d
     expected = [(p, t) for p in range(3) for t in range(5) if not flags[p, t]]
     assert list(zip(layout.product, layout.time, strict=True)) == expected
@@ -275,7 +265,7 @@ def test_flagged_samples_are_not_in_the_data(flags):
 @pytest.mark.parametrize("rest", [(), (2,)])
 @pytest.mark.parametrize("flags", [None, FLAGS])
 def test_scatter_is_the_transpose_of_gather(flags, rest):
-    layout = DataLayout(3, 5) if flags is None else DataLayout.from_flags(flags)
+    layout = pr.DataLayout(3, 5) if flags is None else pr.DataLayout.from_flags(flags)
     rng = np.random.default_rng(1)
     grid = rng.standard_normal((3, 5, *rest))
     data = rng.standard_normal((layout.size, *rest))
@@ -303,14 +293,14 @@ def hermitian(rng, n, *rest):
 
 
 def test_labels_are_those_of_luseepy():
-    assert list(labels()) == LUSEEPY
-    assert all_products()[4] == Product(0, 2, "I")
-    assert [LUSEEPY[k] for k in auto_indices()] == ["00R", "11R", "22R", "33R"]
+    assert list(pr.labels()) == LUSEEPY
+    assert pr.all_products()[4] == pr.Product(0, 2, "I")
+    assert [LUSEEPY[k] for k in pr.auto_indices()] == ["00R", "11R", "22R", "33R"]
 
 
 def test_each_product_is_the_entry_its_label_names():
     v = hermitian(np.random.default_rng(1), 4)
-    got = to_real(jnp.asarray(v))
+    got = pr.to_real(jnp.asarray(v))
     for label, value in zip(LUSEEPY, got, strict=True):
         entry = v[int(label[0]), int(label[1])]
         assert value == (entry.real if label[2] == "R" else entry.imag)
@@ -320,10 +310,10 @@ def test_each_product_is_the_entry_its_label_names():
 @pytest.mark.parametrize("n", [1, 2, 4])
 def test_matrix_and_products_are_inverse(n, rest):
     v = hermitian(np.random.default_rng(2), n, *rest)
-    products = to_real(jnp.asarray(v))
+    products = pr.to_real(jnp.asarray(v))
     assert products.shape == (n * n, *rest)
-    back = np.asarray(to_matrix(products))
+    back = np.asarray(pr.to_matrix(products))
     # a copy of numbers: exact, except that autos lose an imaginary rounding error
     close(back, v, 1e-14)
     np.testing.assert_array_equal(back, back.conj().swapaxes(0, 1))
-    np.testing.assert_array_equal(to_real(jnp.asarray(back)), products)
+    np.testing.assert_array_equal(pr.to_real(jnp.asarray(back)), products)

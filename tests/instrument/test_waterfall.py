@@ -1,7 +1,5 @@
 """Waterfalls of luseepy's simulator: its own file, and synthetic ones with gaps and odd orders."""
 
-from __future__ import annotations
-
 import csv
 import json
 from dataclasses import replace

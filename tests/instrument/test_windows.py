@@ -1,7 +1,5 @@
 """Windows of samples: averages of data by loops, A against instants, and files and arrays."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from datetime import datetime, timedelta
 

@@ -10,13 +10,7 @@ from scipy.linalg import block_diag
 
 import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_device, on_host
-from lusee_bayes.linear.joint import (
-    ComponentSums,
-    channel_sky,
-    component_posterior,
-    paired,
-    summed_information,
-)
+from lusee_bayes.linear import joint
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
 FREQUENCIES = np.array([10.0, 17.0, 25.0, 40.0])
@@ -94,10 +88,10 @@ def drawn(prior, made, seed=2):
 
 
 def solve_directly(prior, channels, reference):
-    sums = ComponentSums.empty(prior, reference)
+    sums = joint.ComponentSums.empty(prior, reference)
     for k, information in enumerate(channels):
-        sums = summed_information(sums, prior, k, information)
-    return component_posterior(sums.information(), prior)
+        sums = joint.summed_information(sums, prior, k, information)
+    return joint.component_posterior(sums.information(), prior)
 
 
 @pytest.fixture(
@@ -128,10 +122,10 @@ def test_the_direct_solution_is_the_textbooks(case, place):
     std = np.sqrt(np.diag(covariance)).reshape(-1, N_MODES)
     maps = found.mean.reshape(prior.n_components, N_MODES)
     draws = found.sample(jax.random.key(3), 4000).reshape(4000, -1, N_MODES)
-    spread = paired(found.covariance(), prior)
+    spread = joint.paired(found.covariance(), prior)
     for k, information in enumerate(channels):
         rows = slice(k * N_MODES, (k + 1) * N_MODES)
-        sky = channel_sky(prior, k, information, maps, spread, draws, jax.random.key(5))
+        sky = joint.channel_sky(prior, k, information, maps, spread, draws, jax.random.key(5))
         # the textbook's own subtraction of s leaves 1e-16 times (signal / noise)^2
         assert np.abs((np.asarray(sky.mean) - mean[rows]) / std[k]).max() < 1e-6
         np.testing.assert_allclose(
@@ -154,11 +148,11 @@ def test_skies_that_do_not_obey_the_prior_are_told():
         for prior_name, prior in (("true", true), ("wrong", wrong)):
             solved = solve_directly(prior, channels, reference)
             maps = solved.mean.reshape(prior.n_components, N_MODES)
-            spread = paired(solved.covariance(), prior)
+            spread = joint.paired(solved.covariance(), prior)
             none = jnp.zeros((0, prior.n_components, N_MODES))
             far = []
             for k, t in enumerate(channels):
-                sky = channel_sky(prior, k, t, maps, spread, none, jax.random.key(0))
+                sky = joint.channel_sky(prior, k, t, maps, spread, none, jax.random.key(0))
                 expected = t.n_data - np.vdot(t.matrix, sky.covariance)
                 far.append(float(sky.chi2 - expected) / np.sqrt(2 * len(data[k])))
             found[name, prior_name] = float(solved.log_evidence), max(np.abs(far))

@@ -1,7 +1,5 @@
 """Programs: found and refused in one sentence; skies and data drawn from collapsed ones."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 import sys
@@ -22,12 +20,7 @@ import lusee_bayes
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
 from lusee_bayes.experiment.experiment import program_pieces
-from lusee_bayes.sampling.programs import (
-    collapsed_draws,
-    is_collapsed,
-    numpyro_promotion,
-    require_sampleable,
-)
+from lusee_bayes.sampling import programs
 
 SPECTRUM = np.array([4.0, 1.0, 0.5])
 ELL_OF_MODE = np.repeat([0, 1, 2], [1, 3, 5])
@@ -185,12 +178,12 @@ def test_which_programs_have_integrated_the_sky_out(write, gaussian):
     found = {}
     for name in ("sky", "sky_marginal", "prior_amplitude"):
         program = lb.load_program(name)
-        found[name] = is_collapsed(program, program.arguments(gaussian), data)
+        found[name] = programs.is_collapsed(program, program.arguments(gaussian), data)
     assert found == {"sky": False, "sky_marginal": True, "prior_amplitude": True}
     mine = lb.load_program(write(OFFSET_PROGRAM))
-    assert is_collapsed(mine, mine.arguments(gaussian), data)
+    assert programs.is_collapsed(mine, mine.arguments(gaussian), data)
     kept = lb.load_program(write(OFFSET_PROGRAM.replace("return gaussian", "return None")))
-    assert not is_collapsed(kept, kept.arguments(gaussian), data)
+    assert not programs.is_collapsed(kept, kept.arguments(gaussian), data)
 
 
 @pytest.mark.parametrize("name", ["sky", "sky_marginal", "prior_amplitude", "spectrum_bands"])
@@ -199,7 +192,7 @@ def test_what_is_seen_without_a_sky_shifts_the_data(gaussian, name):
     program, offset = lb.load_program(name), jnp.asarray(100.0 * OFFSET)
     shifted = replace(gaussian, offset=offset)
     data = gaussian.sample(jax.random.key(4))[1]
-    with numpyro_promotion():
+    with programs.numpyro_promotion():
         seeded = handlers.seed(program.model, jax.random.key(5))
         sites = handlers.trace(seeded).get_trace(**program.arguments(gaussian))
         values = {k: v["value"] for k, v in sites.items() if k != "data"}
@@ -262,7 +255,7 @@ def test_skies_at_fixed_sites_follow_the_analytic_posterior(gaussian, collapsed,
     program, values, s, n, offset = collapsed[name]
     data = np.asarray(gaussian.sample(jax.random.key(1))[1])
     arguments = program.arguments(gaussian)
-    skies = collapsed_draws(program, arguments, data, repeated(values), jax.random.key(2))
+    skies = programs.collapsed_draws(program, arguments, data, repeated(values), jax.random.key(2))
     assert isinstance(skies, np.ndarray)
     assert skies.shape == (2, 5000, 9)
     expected = posterior(gaussian.coupling.dense(), s, n, data, offset)
@@ -275,7 +268,9 @@ def test_replicated_data_are_the_skies_seen_with_new_noise(gaussian, collapsed, 
     sky, data = (np.asarray(x) for x in gaussian.sample(jax.random.key(6)))
     skies = np.broadcast_to(sky, (2, 5000, 9))
     arguments = program.arguments(gaussian)
-    seen = collapsed_draws(program, arguments, data, repeated(values), jax.random.key(7), skies)
+    seen = programs.collapsed_draws(
+        program, arguments, data, repeated(values), jax.random.key(7), skies
+    )
     assert seen.shape == (2, 5000, N_DATA)
     mean = np.asarray(gaussian.coupling.dense()) @ sky + offset
     assert_draws_follow(seen.reshape(-1, N_DATA), mean, n)
@@ -351,7 +346,7 @@ def check(path, pieces):
     model, more, data = pieces
     program = lb.load_program(path)
     arguments = program.arguments(model, more)
-    return require_sampleable(program, arguments, data, model.prior.variance().shape[0])
+    return programs.require_sampleable(program, arguments, data, model.prior.variance().shape[0])
 
 
 def test_a_good_program_passes(tmp_path, pieces):

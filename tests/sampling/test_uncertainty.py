@@ -13,11 +13,7 @@ from small_models import random_gaussian
 
 from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
 from lusee_bayes.sampling import mode
-from lusee_bayes.sampling.mode import (
-    pixel_statistics,
-    sky_quantities,
-    summary,
-)
+from lusee_bayes.sampling.mode import pixel_statistics, sky_quantities, summary
 
 LMAX, NSIDE, N_MODES = 3, 4, 16
 N_CHAINS, N_DRAWS = 4, 5000

@@ -3,8 +3,6 @@
 Draws are made by numpy, with the textbook's dense mean and covariance, not by the solver.
 """
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The embedded sky: against ULSA itself, naive integration, physics and catalogues of sources."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 

@@ -1,7 +1,5 @@
 """The log-normal sky: T exp(s) and its harmonic coefficients."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import healpy

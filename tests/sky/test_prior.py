@@ -1,7 +1,5 @@
 """Priors on the sky: S in coefficients, priors with a mean, families of priors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import healpy as hp

@@ -21,15 +21,8 @@ from scipy.stats import chi2, norm
 
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
+from lusee_bayes.experiment import model as models
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.model import (
-    base_model,
-    full_model,
-    radiometer,
-    simulate,
-    systematics,
-    true_values,
-)
 from lusee_bayes.experiment.unknowns import flux_table
 from lusee_bayes.sampling.programs import latent_sites
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
@@ -59,7 +52,7 @@ def setup_of(*overrides: str, sources: str = LIST) -> Setup:
 @lru_cache
 def experiment(*overrides: str, sources: str = LIST) -> Experiment:
     setup = setup_of(*overrides, sources=sources)
-    return Experiment(setup, simulate(setup))
+    return Experiment(setup, models.simulate(setup))
 
 
 def columns() -> np.ndarray:
@@ -94,7 +87,7 @@ def answer():
     e, (mean, std), t = setup_of(), priors(), columns()
     both = np.concatenate([np.asarray(e.coupling.dense()), t], axis=1)
     variance = np.concatenate([np.asarray(e.prior.variance()), std**2])
-    noise = np.diag(np.asarray(radiometer(e).diagonal()))
+    noise = np.diag(np.asarray(models.radiometer(e).diagonal()))
     return exact_posterior(both, variance, noise, np.asarray(experiment().data.data) - t @ mean)
 
 
@@ -107,14 +100,14 @@ def test_the_sky_is_the_same_with_fluxes_in_the_noise_or_beside_it():
     """Both against the closed form: Lambda's condition of 1e10 costs 1e-6 of a variance; means are
     refined, to better than 1e-6 standard deviations."""
     expected, d = answer(), experiment().data.data
-    marginal = full_model(setup_of()).condition(d).posterior
+    marginal = models.full_model(setup_of()).condition(d).posterior
     sky = expected.std[:49]
     off = (np.asarray(marginal.mean) - expected.mean[:49]) / sky
     assert np.abs(off).max() < 1e-5
     np.testing.assert_allclose(np.asarray(marginal.std()), sky, rtol=1e-5)
     assert float(marginal.log_evidence) == pytest.approx(expected.log_prob, abs=1e-4)
     # the sources matter: with them in the data only, the sky is off by what can be seen
-    wrong = full_model(setup_of("sources.treatment=ignored")).condition(d).posterior
+    wrong = models.full_model(setup_of("sources.treatment=ignored")).condition(d).posterior
     assert np.abs((np.asarray(wrong.mean) - expected.mean[:49]) / sky).max() > 1.0
 
 
@@ -123,7 +116,7 @@ def test_the_sky_is_the_same_with_fluxes_in_the_noise_or_beside_it():
 
 def test_the_table_is_in_jansky():
     table = flux_table(experiment(), lb.infer(experiment()))
-    expected, (mean, std), truth = answer(), priors(), true_values(setup_of())
+    expected, (mean, std), truth = answer(), priors(), models.true_values(setup_of())
     jansky = 1.0 / kelvin_steradian(1.0)
     assert list(table["source"]) == ["Cas A", "For A", "For A", "For A", "Polaris"]
     assert list(table["block"]) == [0, 0, 1, 2, 0]
@@ -157,7 +150,7 @@ def test_the_program_given_its_fluxes():
     setup, d = e.setup, np.asarray(e.data.data)
     t, (mean, std) = columns(), priors()
     a, s = np.asarray(setup.coupling.dense()), np.asarray(setup.prior.variance())
-    noise = np.diag(np.asarray(radiometer(setup).diagonal()))
+    noise = np.diag(np.asarray(models.radiometer(setup).diagonal()))
     for z in (np.zeros(5), np.array([0.3, -1.0, 0.5, 2.0, -0.7])):
         flux = mean + std * z
         expected = exact_posterior(a, s, noise, d - t @ flux).log_prob
@@ -171,11 +164,11 @@ def test_the_program_given_its_fluxes():
 
 def test_simulated_data_hold_the_drawn_fluxes():
     setup = setup_of()
-    truth = true_values(setup)
+    truth = models.true_values(setup)
     flux = np.concatenate([np.atleast_1d(truth[site]) for site in SITES])
     d = experiment().data
     t, a = columns(), np.asarray(setup.coupling.dense())
-    sigma = np.sqrt(np.asarray(radiometer(setup).diagonal()))
+    sigma = np.sqrt(np.asarray(models.radiometer(setup).diagonal()))
 
     def misfit(flux):
         off = np.asarray(d.data) - a @ np.asarray(d.truth) - t @ flux
@@ -261,7 +254,7 @@ def test_sources_that_cannot_be(columns, std, message):
 )
 def test_antennas_that_cannot_be_sampled(parameters, message):
     sampled = f"noise.beam.parameters={parameters}", "noise.beam.treatment=sampled"
-    for ask in (true_values, systematics):
+    for ask in (models.true_values, models.systematics):
         refuse(message, ask, setup_of(*sampled, sources=CAS_A))
 
 
@@ -279,7 +272,7 @@ def test_bands_beyond_the_highest_ell():
     arguments = {n: v for n, v in program_arguments(program, e).items() if n != "data"}
     refuse("a band begins at ell = 7, above lmax = 6", latent_sites, program.model, arguments)
     # 6 is the highest ell itself
-    base = replace(base_model(e.setup), prior=lb.HarmonicPrior(jnp.ones(7)))
+    base = replace(models.base_model(e.setup), prior=lb.HarmonicPrior(jnp.ones(7)))
     with handlers.seed(rng_seed=0):
         PriorSpectrum(edges=(3, 6)).sampled(base)
 
@@ -313,4 +306,4 @@ def test_what_the_scenario_does_not_have():
     for program, section in (("gains", "noise.gain"), ("sources", "sources")):
         refuse(f"the scenario has no {section}", program_arguments, lb.load_program(program), bare)
     asked = lb.load_program("systematics").arguments
-    refuse("asks for 'gaussian', a piece of an experiment", asked, base_model(bare.setup))
+    refuse("asks for 'gaussian', a piece of an experiment", asked, models.base_model(bare.setup))
