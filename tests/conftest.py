@@ -143,6 +143,18 @@ def numbers_alone(monkeypatch):
 
 
 @pytest.fixture
+def write(tmp_path, request):
+    """Writes a text to a file, by default that of the module; its path."""
+
+    def write(text: str, name: str = getattr(request.module, "WRITTEN", "text")) -> Path:
+        path = tmp_path / name
+        path.write_text(text)
+        return path
+
+    return write
+
+
+@pytest.fixture
 def exact_tilt(monkeypatch):
     """Tilts about the pole between two runs as exact as about each one's own."""
     monkeypatch.setattr("lusee_bayes.instrument.pointing.LEAST_ORDER", 4)

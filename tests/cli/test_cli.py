@@ -16,12 +16,11 @@ from pathlib import Path
 
 import healpy
 import jax
-import matplotlib.image
 import numpy as np
 import pytest
 import xarray as xr
 from astropy.io import fits
-from commands import content, posterior_of, refused, run, sky_draws_of, table_of
+from commands import assert_drawn, content, posterior_of, refused, run, sky_draws_of, table_of
 from rich.console import Console
 
 import lusee_bayes
@@ -51,9 +50,8 @@ def test_map_writes_what_it_promises(folder):
     files = "posterior.nc mean.fits mean_alm.fits std.fits truth.fits residual.fits spectra.csv "
     files += "summary.json scenario.yaml diagnostics.nc report.html figures manifest.json"
     assert {p.name for p in folder.iterdir()} == {*files.split(), "provenance.json"}
-    for figure in ("maps", "data_vector", "beams", "fidelity", "spectra", "draws", "residuals"):
-        image = matplotlib.image.imread(folder / "figures" / f"{figure}.png")
-        assert image.std() > 0.01  # not blank
+    names = ("maps", "data_vector", "beams", "fidelity", "spectra", "draws", "residuals")
+    assert_drawn(*(folder / "figures" / f"{name}.png" for name in names))
 
 
 def test_the_files_agree_with_each_other(folder):

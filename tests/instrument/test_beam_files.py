@@ -10,11 +10,11 @@ import xarray as xr
 from assertions import off, refuse
 from astropy.io import fits
 from astropy.time import Time
+from commands import run, sets
 from fits_files import write_images
 from reference import hemisphere, real_harmonics
 
 import lusee_bayes as lb
-from lusee_bayes.cli.main import main
 from lusee_bayes.core.harmonics import from_healpy
 from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.experiment.model import set_up, true_signal, true_values
@@ -278,9 +278,8 @@ def test_the_program_of_the_instrument_needs_the_embedded_antennas(tmp_path):
 @pytest.mark.long
 def test_two_ports_from_a_file_make_a_map(tmp_path):
     path = write(tmp_path / "beam.fits")
-    given = ["lmax=6", "observation.runs.0.cycles=0.02"]
-    given += [f"beam.file={path}", "beam.rotations_deg=[0,90]"]
-    arguments = [a for override in given for a in ("--set", override)]
-    assert main(["map", "fiducial", *arguments, "-o", str(tmp_path / "map"), "--quiet"]) == 0
+    given = ["lmax=6", "observation.runs.0.cycles=0.02", f"beam.file={path}"]
+    arguments = sets(*given, "beam.rotations_deg=[0,90]")
+    assert run("map", "fiducial", *arguments, "-o", tmp_path / "map", "--quiet") == 0
     with xr.open_datatree(tmp_path / "map" / "diagnostics.nc", engine="h5netcdf") as found:
         assert json.loads(found["25"].attrs["labels"]) == ["00R", "01R", "01I", "11R"]

@@ -5,7 +5,7 @@ import pytest
 from assertions import close, refuse
 from numpy.polynomial import Polynomial
 from numpy.polynomial.legendre import Legendre
-from reference import hemisphere, real_harmonics, unit_vectors
+from reference import hemisphere, real_harmonics, tangents, unit_vectors
 from scipy.special import factorial
 
 from lusee_bayes.core.harmonics import mode_numbers, n_modes, polar_functions, synthesis_matrix
@@ -28,13 +28,8 @@ def over_half(polynomial):
 
 def short_dipole(axis):
     """Field of a short dipole along a unit vector, in free space above the horizon."""
-    axis = np.asarray(axis, dtype=float)
-    theta, phi = np.meshgrid(GRID.theta, GRID.phi, indexing="ij")
-    e_theta = np.stack(
-        [np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), -np.sin(theta)], axis=-1
-    )
-    e_phi = np.stack([-np.sin(phi), np.cos(phi), np.zeros_like(phi)], axis=-1)
-    return bf.AntennaFields(*(np.asarray((e @ axis)[None] + 0j) for e in (e_theta, e_phi)), GRID)
+    towards = tangents(GRID.theta[:, None], GRID.phi)
+    return bf.AntennaFields(*((along @ axis)[None] + 0j for along in towards), GRID)
 
 
 def random_fields(seed, n_antennas, grid):

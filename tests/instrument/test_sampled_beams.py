@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 from assertions import close, refuse
 from astropy.io import fits
-from reference import unit_vectors
+from reference import tangents, unit_vectors, vectors
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, from_rings
@@ -80,16 +80,10 @@ def test_short_dipoles_have_their_closed_form(kind):
 
     class Dipoles:
         def towards(self, _, theta, phi):
-            theta, phi = np.broadcast_arrays(theta, phi)
-            axes = (
-                np.stack(
-                    [np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), -np.sin(theta)]
-                ),
-                np.stack([-np.sin(phi), np.cos(phi), 0.0 * phi]),
-            )
-            n = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+            along = [np.moveaxis(axis, -1, 0) for axis in tangents(theta, phi)]
+            n = np.moveaxis(vectors(theta, phi), -1, 0)
             phase = np.exp(1j * k * np.tensordot(places, n, 1))
-            return tuple(np.tensordot(arms, axis, 1) * phase for axis in axes)
+            return tuple(np.tensordot(arms, axis, 1) * phase for axis in along)
 
     made = lb.sampled_beams(FREQUENCY, **KINDS[kind](Dipoles()), absolute=True)
     grid = HemisphereGrid.gauss_legendre(12, 20)

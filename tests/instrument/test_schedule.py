@@ -3,7 +3,7 @@ from datetime import datetime, timedelta
 import astropy.units as u
 import numpy as np
 import pytest
-from assertions import refuse, refused, within
+from assertions import refuse, within
 from astropy.time import Time
 from reference import is_dark
 
@@ -23,14 +23,7 @@ start, end, turntable_deg, duty_cycle, night_only
 """
 
 
-@pytest.fixture
-def write(tmp_path):
-    def write(text, name="schedule.csv"):
-        path = tmp_path / name
-        path.write_text(text)
-        return path
-
-    return write
+WRITTEN = "schedule.csv"
 
 
 def schedule(seed, n=5, **options):
@@ -76,14 +69,11 @@ def test_intervals_are_cut_as_by_a_loop(seed, step_s):
     at = seconds(o, origin)
     # dates in two doubles, and sums of days in seconds: a nanosecond
     np.testing.assert_allclose(at, (start + end) / 2.0, rtol=0, atol=1e-8)
-    within(at[:, None] + o.windows.bounds_s, np.stack([start, end], 1), 1e-8)  # fmt: skip
+    within(at[:, None] + o.windows.bounds_s, np.stack([start, end], 1), 1e-8)
     np.testing.assert_allclose(o.live_s, [w[2] for w in expected], rtol=0, atol=1e-8)
     np.testing.assert_array_equal(o.run, [w[3] for w in expected])
-    assert [o.turntable_deg[w[3]] for w in expected] == [
-        one.turntable_deg
-        for one in intervals
-        for _ in range(one.n_samples(step_s))
-    ]  # fmt: skip
+    angles = [one.turntable_deg for one in intervals for _ in range(one.n_samples(step_s))]
+    assert [o.turntable_deg[w[3]] for w in expected] == angles
 
 
 def test_instants_begin_before_the_end():
@@ -97,8 +87,8 @@ def test_instants_begin_before_the_end():
     assert o.windows is None
     assert (o.live_s == 7200.0).all()
     half = [Interval("2027-01-15", "2027-01-16", duty_cycle=0.5)]
-    with refused(r"no duty cycle; take windows \(observation.window=mean\)"):
-        lb.Observation.from_schedule(half, window="instant")
+    words = r"no duty cycle; take windows \(observation.window=mean\)"
+    refuse(words, lb.Observation.from_schedule, half, window="instant")
 
 
 @pytest.mark.parametrize("window", ["instant", "mean"])
@@ -126,7 +116,7 @@ def test_runs_are_a_schedule(window, step_s):
     assert (got.lon_deg, got.lat_deg) == (expected.lon_deg, expected.lat_deg)
     np.testing.assert_allclose(got.live_s, expected.live_s, rtol=0, atol=1e-8)
     if window == "mean":
-        within(got.windows.bounds_s, expected.windows.bounds_s, 1e-8)  # fmt: skip
+        within(got.windows.bounds_s, expected.windows.bounds_s, 1e-8)
 
 
 def test_windows_at_night_are_dark_from_end_to_end():
@@ -201,10 +191,11 @@ def test_bad_tables_are_refused(write, text, message):
 def test_an_interval_without_a_night_is_refused(write):
     # the Sun is up for two weeks from 1 February 2027 at this site
     text = f"{HEADER}2027-01-16,2027-01-17,0,1,true\n2027-02-05,2027-02-07,0,1,true\n"
-    with refused(r"schedule.csv, row 2 holds no lunar night; lengthen it"):
-        lb.Observation.from_schedule(read_schedule(write(text)))
+    observe = lb.Observation.from_schedule
+    words = "schedule.csv, row 2 holds no lunar night; lengthen it"
+    refuse(words, observe, read_schedule(write(text)))
     unnamed = [Interval("2027-02-05", "2027-02-07", night_only=True)]
-    refuse("interval 0 holds no lunar night", lb.Observation.from_schedule, unnamed)
+    refuse("interval 0 holds no lunar night", observe, unnamed)
 
 
 # a table as those of OpSim, with the states that its simulator adds

@@ -237,25 +237,12 @@ def test_the_circularly_polarised_part_enters_by_the_v_beam():
 # --- bad input
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ((0.0, ZENITH), "frequency_mhz must be positive, got 0.0"),
-        ((25.0, 1.1 * ZENITH), "must be unit vectors, number 0 has length 1.1; divide"),
-    ],
-)
-def test_bad_directions_are_refused(arguments, message):
-    refuse(message, mp.beams_towards, *arguments)
-
-
-@pytest.mark.parametrize(
-    ("galactic", "options", "message"),
-    [
-        (ZENITH[0], {"stokes_v": -1.5}, "from -1 to 1, got -1.5"),
-        (ZENITH[0], {"stokes_v": float("nan")}, "from -1 to 1, got nan"),
-        (2.0 * ZENITH[0], {}, "must be unit vectors, number 0 has length 2"),
-        (np.zeros((2, 3)), {}, "galactic has shape"),
-    ],
-)
-def test_bad_sources_are_refused(galactic, options, message):
-    refuse(message, mp.source_response, observation(), galactic, FREQUENCY, **options)
+def test_bad_directions_and_sources_are_refused():
+    o, towards, response = observation(), mp.beams_towards, mp.source_response
+    refuse("frequency_mhz must be positive, got 0.0", towards, 0.0, ZENITH)
+    refuse("unit vectors, number 0 has length 1.1; divide", towards, FREQUENCY, 1.1 * ZENITH)
+    for bad in (-1.5, np.nan):
+        words = f"from -1 to 1, got {bad}"
+        refuse(words, response, o, ZENITH[0], FREQUENCY, stokes_v=bad)
+    refuse("unit vectors, number 0 has length 2", response, o, 2.0 * ZENITH[0], FREQUENCY)
+    refuse("galactic has shape", response, o, np.zeros((2, 3)), FREQUENCY)

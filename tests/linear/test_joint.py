@@ -94,13 +94,10 @@ def solve_directly(prior, channels, reference):
     return joint.component_posterior(sums.information(), prior)
 
 
-@pytest.fixture(
-    scope="module",
-    params=[
-        "components",
-        *(pytest.param(p, marks=pytest.mark.long) for p in ("kernel", "no rest")),
-    ],
-)
+EVERY = ["components", *(pytest.param(p, marks=pytest.mark.long) for p in ("kernel", "no rest"))]
+
+
+@pytest.fixture(scope="module", params=EVERY)
 def case(request):
     """Prior, models, data, what they tell, and the textbook's answer."""
     prior = PRIORS[request.param]()

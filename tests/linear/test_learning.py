@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import jax
 import numpy as np
 import pytest
+from assertions import refuse
 from jaxtyping import TypeCheckError
 from scipy import integrate, stats
 from scipy.optimize import minimize
@@ -109,8 +110,7 @@ def test_others_integrated_out(case):
 
 def test_nothing_settles_without_steps(case, monkeypatch):
     monkeypatch.setattr("lusee_bayes.priors.learning.MAX_STEPS", 0)
-    with pytest.raises(lb.InputError, match="did not settle in 0 steps"):
-        learning.learn(case.family, case.information)
+    refuse("did not settle in 0 steps", learning.learn, case.family, case.information)
     # a family far from its own start is still found
     far = replace(case.family, log_monopole=case.family.log_monopole + 1.0)
     monkeypatch.undo()
@@ -305,5 +305,6 @@ class Hopeless(Strength):
 
 def test_parameters_without_a_covariance_are_drawn_anew_and_then_refused():
     known = weakly_known(Strength.around(2e4, LOW), 1.0)
-    with pytest.raises(lb.InputError, match="no sky can be drawn with the uncertainty of the pri"):
-        learning.draws_with_parameters(Hopeless.around(2e4, LOW), *known, jax.random.key(1), 3)
+    given = Hopeless.around(2e4, LOW), *known, jax.random.key(1), 3
+    words = "no sky can be drawn with the uncertainty of the pri"
+    refuse(words, learning.draws_with_parameters, *given)

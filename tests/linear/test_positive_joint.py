@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from assertions import refuse
+from reference import sphere
 from scipy import optimize, stats
 
 import lusee_bayes as lb
@@ -43,11 +44,8 @@ def skies_of(frequencies, names, n_sources=0):
 
 def quadrature():
     """Harmonics and weights on a grid of this file's own, far finer than the maps."""
-    x, weights = np.polynomial.legendre.leggauss(40)
-    phi = 2.0 * np.pi * np.arange(80) / 80
-    theta, azimuth = np.repeat(np.arccos(x), 80), np.tile(phi, 40)
-    y = synthesis_matrix(theta, azimuth, LMAX)
-    return theta, azimuth, y, np.repeat(weights, 80) * np.pi / 40
+    theta, phi, weights = sphere(40, 80)
+    return theta, phi, synthesis_matrix(theta, phi, LMAX), weights
 
 
 def observed(skies, laws, seed=0, noise=0.05, n_data=40):

@@ -391,9 +391,8 @@ def test_the_term_is_t_p_t(prior, matrix):
     expected = T @ matrix @ T.T
     got = template_noise(jnp.asarray(T), jnp.asarray(prior), SEEN)
     # products of a few numbers of order one
-    atol = 1e-14 * np.abs(expected).max()
-    np.testing.assert_allclose(got.dense(), expected, rtol=0, atol=atol)
-    np.testing.assert_allclose(got.diagonal(), np.diag(expected), rtol=0, atol=atol)
+    close(got.dense(), expected, 1e-14)
+    close(got.diagonal(), np.diag(expected), 1e-14)
     assert got.root.shape == (15, 3)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from commands import posterior_of, refused, run
+from commands import posterior_of, refused, run, sets
 from matplotlib.figure import Figure
 
 import lusee_bayes as lb
@@ -31,7 +31,7 @@ def simulate(folder, *more, force=False):
 
 
 def given(*more):
-    return [option for one in (*SET, *more) for option in ("--set", one)]
+    return sets(*SET, *more)
 
 
 def files_of(folder):

@@ -14,13 +14,12 @@ from pathlib import Path
 
 import equinox as eqx
 import healpy
-import matplotlib.image
 import numpy as np
 import pandas as pd
 import pytest
 from arviz_stats.base import array_stats
 from assertions import refuse
-from commands import content, refused, run
+from commands import assert_drawn, content, refused, run
 from reference_linear import z_of
 
 import lusee_bayes as lb
@@ -237,8 +236,7 @@ def test_sample_writes_what_it_promises(runs):
     assert {p.name for p in whole.iterdir()} == set(files.split())
     figures = {"uncertainty", "traces", "ranks", "energy", "pairs", "against_analytic"}
     assert {p.stem for p in (whole / "figures").iterdir()} == figures
-    for figure in (whole / "figures").iterdir():
-        assert matplotlib.image.imread(figure).std() > 0.01  # not blank
+    assert_drawn(*(whole / "figures").iterdir())
     expected = lb.load_scenario("fiducial", OVERRIDES)
     assert lb.load_scenario(whole / "scenario.yaml") == expected
 
@@ -348,8 +346,7 @@ def test_validation_of_the_true_posterior_passes(validated):
     report = json.loads((folder / "validation.json").read_text())
     assert report["passed"], [c for c in report["checks"] if not c["passed"]]
     assert code == 0
-    for figure in ("comparison", "calibration"):
-        assert matplotlib.image.imread(folder / "figures" / f"{figure}.png").std() > 0.01
+    assert_drawn(*(folder / "figures" / f"{name}.png" for name in ("comparison", "calibration")))
 
 
 def consistent(folder):

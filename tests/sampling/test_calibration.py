@@ -45,6 +45,14 @@ def p_values(ranks: validation.Ranks) -> dict[str, float]:
     return dict(zip(ranks.names, ranks.p_values().tolist(), strict=True))
 
 
+def assert_calibrated(ranks: validation.Ranks) -> None:
+    """Even ranks, and coverages within four errors."""
+    assert ranks.passed, p_values(ranks)
+    for name, coverage in ranks.coverage().items():
+        for level, share in coverage.items():
+            assert abs(share - level) < 4 * ranks.coverage_error(level), (name, level)
+
+
 # --- ranks ------------------------------------------------------------------------------------
 
 
@@ -106,8 +114,7 @@ def test_the_threshold_is_shared_by_all_quantities():
     one, eight = ranks_of(even), ranks_of(*[even] * 8)
     assert one.threshold == pytest.approx(validation.FALSE_ALARM)
     assert eight.threshold == pytest.approx(validation.FALSE_ALARM / 8)
-    p = 1.0
-    moved = 0
+    p, moved = 1.0, 0
     while p > validation.FALSE_ALARM:
         where = 5 + 5 * (moved % 19) + 100 * (moved // 19)
         uneven[where] = 0
@@ -200,13 +207,10 @@ def conjugate(shift=0.0, scale=1.0, s=S, simulations=500, **options) -> validati
 
 def test_the_conjugate_posterior_is_calibrated():
     ranks = conjugate()
-    assert ranks.passed, p_values(ranks)
     assert ranks.ranks.shape == (500, 3)
     assert ranks.ranks.min() == 0 and ranks.ranks.max() == validation.N_DRAWS
-    for name, coverage in ranks.coverage().items():
-        for level, share in coverage.items():
-            # 12 numbers: beyond 4 errors once in a thousand tests
-            assert abs(share - level) < 4 * ranks.coverage_error(level), (name, level)
+    # 12 numbers: beyond 4 errors once in a thousand tests
+    assert_calibrated(ranks)
 
 
 @pytest.mark.long
@@ -262,13 +266,10 @@ def test_too_few_data_sets_are_refused():
 def test_the_sky_is_calibrated(noise):
     ranks = validation.calibrate_sky(model(noise), model(noise), seed=1)
     assert ranks.n_simulations == 500
-    assert ranks.passed, p_values(ranks)
     assert len(ranks.names) == len(set(ranks.names)) == 22
     assert {"mode 0", "mode 48", "projection 9", "distance", "log likelihood"} < set(ranks.names)
-    for name, coverage in ranks.coverage().items():
-        for level, share in coverage.items():
-            # 88 numbers, many of them tied to each other: beyond 4 errors once in 200 tests
-            assert abs(share - level) < 4 * ranks.coverage_error(level), (name, level)
+    # 88 numbers, many of them tied to each other: beyond 4 errors once in 200 tests
+    assert_calibrated(ranks)
 
 
 def random_model(offset: bool) -> lb.LinearGaussian:

@@ -276,10 +276,8 @@ def tiny(sampler=TINY, checkpoints=None, stop_at=None):
 
 
 def assert_identical(chains, expected, draws=slice(None)):
-    for got, reference in [
-        (chains.sites, expected.sites),
-        (chains.statistics, expected.statistics),
-    ]:
+    for part in ("sites", "statistics"):
+        got, reference = getattr(chains, part), getattr(expected, part)
         assert set(got) == set(reference)
         for name, values in reference.items():
             np.testing.assert_array_equal(got[name], values[:, draws], err_msg=name)

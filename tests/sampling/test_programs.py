@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from assertions import refuse, refused
+from experiments import density
 from numpyro import handlers
-from numpyro.infer.util import log_density
 from reference_linear import assert_draws_follow, posterior
 from small_models import random_gaussian
 
@@ -52,14 +52,7 @@ def gaussian():
     return random_gaussian(SPECTRUM, N_DATA, 11, noise=3.0)
 
 
-@pytest.fixture
-def write(tmp_path):
-    def write(text, name="mine.py"):
-        path = tmp_path / name
-        path.write_text(text)
-        return path
-
-    return write
+WRITTEN = "mine.py"
 
 
 # --- finding them ---------------------------------------------------------------------------------
@@ -195,13 +188,11 @@ def test_what_is_seen_without_a_sky_shifts_the_data(gaussian, name):
     with programs.numpyro_promotion():
         seeded = handlers.seed(program.model, jax.random.key(5))
         sites = handlers.trace(seeded).get_trace(**program.arguments(gaussian))
-        values = {k: v["value"] for k, v in sites.items() if k != "data"}
-        expected, _ = log_density(
-            program.model, (), program.arguments(gaussian) | {"data": data}, values
-        )
-        arguments = program.arguments(shifted)
-        found, _ = log_density(program.model, (), arguments | {"data": data + offset}, values)
-        other, _ = log_density(program.model, (), arguments | {"data": data}, values)
+    values = {k: v["value"] for k, v in sites.items() if k != "data"}
+    expected, found, other = (
+        density(program, program.arguments(model) | {"data": d}, values)[0]
+        for model, d in ((gaussian, data), (shifted, data + offset), (shifted, data))
+    )
     np.testing.assert_allclose(found, expected, rtol=1e-11)
     assert abs(other - expected) > 1.0
 
@@ -349,9 +340,8 @@ def check(path, pieces):
     return programs.require_sampleable(program, arguments, data, model.prior.variance().shape[0])
 
 
-def test_a_good_program_passes(tmp_path, pieces):
-    path = tmp_path / "good.py"
-    path.write_text(HEAD + '    numpyro.sample("x.y-1", dist.Normal(0, 1))\n' + TWICE + GOOD)
+def test_a_good_program_passes(write, pieces):
+    path = write(HEAD + '    numpyro.sample("x.y-1", dist.Normal(0, 1))\n' + TWICE + GOOD)
     assert check(path, pieces) == ["sky", "x.y-1"]
 
 
@@ -377,9 +367,8 @@ def test_bad_programs_are_one_sentence(name, write, pieces):
 
 
 @pytest.mark.parametrize("argument", ["coupling, /, ", "*, coupling, *noise, ", "**others, "])
-def test_arguments_are_given_by_name(argument, tmp_path):
-    path = tmp_path / "bad.py"
-    path.write_text(f"def model({argument}data=None):\n    pass\n")
+def test_arguments_are_given_by_name(argument, write):
+    path = write(f"def model({argument}data=None):\n    pass\n")
     refuse("fails when it is loaded|by position, or as many as come", lb.load_program, path)
 
 

@@ -5,7 +5,6 @@ The oracle takes A, N_0 and the responses as matrices and works in decimal arith
 antennas, priors and treatments: one clear sentence each.
 """
 
-import csv
 from dataclasses import replace
 from functools import lru_cache
 
@@ -13,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from assertions import refuse
+from commands import run, sets, table_of
 from experiments import density_of, program_arguments, small_experiment
 from numpyro import handlers
 from reference_linear import exact_posterior
@@ -20,7 +20,6 @@ from scipy.constants import Boltzmann, speed_of_light
 from scipy.stats import chi2, norm
 
 import lusee_bayes as lb
-from lusee_bayes.cli.main import main
 from lusee_bayes.experiment import model as models
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.unknowns import flux_table
@@ -191,14 +190,11 @@ def test_simulated_data_hold_the_drawn_fluxes():
 
 @pytest.mark.long
 def test_the_map_command_writes_the_fluxes(tmp_path, capsys):
-    arguments = ["map", "fiducial", "-o", str(tmp_path)]
-    for override in ("lmax=6", "observation.runs.0.cycles=0.02", "sky.sources=false", LIST):
-        arguments += ["--set", override]
-    assert main(arguments) == 0
+    given = sets("lmax=6", "observation.runs.0.cycles=0.02", "sky.sources=false", LIST)
+    assert run("map", "fiducial", "-o", tmp_path, *given) == 0
     printed = capsys.readouterr().out
     assert "Polaris: 2e+04 +- 1e+04 Jy, the prior's: it is never above the horizon" in printed
-    with (tmp_path / "sources.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = table_of(tmp_path / "sources.csv")
     table = flux_table(experiment(), lb.infer(experiment()))
     assert list(rows[0]) == ["frequency_mhz", *table.columns]
     assert [row["source"] for row in rows] == list(table["source"])
@@ -224,16 +220,11 @@ def test_sources_that_are_not_known(source, message):
     refuse(message, lb.build, small_scenario(f"sources.list=[{{name: {source}}}]"))
 
 
-@pytest.mark.parametrize(
-    ("columns", "std", "message"),
-    [
-        (jnp.full((4, 1), np.nan), 1.0, "the response to X holds NaN"),
-        (jnp.ones((4, 1)), 0.0, "standard deviation of X's flux must be positive"),
-        (jnp.ones((4, 1)), float("nan"), "standard deviation of X's flux must be positive"),
-    ],
-)
-def test_sources_that_cannot_be(columns, std, message):
-    refuse(message, Source, columns, 1.0, std, "X")
+def test_sources_that_cannot_be():
+    refuse("the response to X holds NaN", Source, jnp.full((4, 1), np.nan), 1.0, 1.0, "X")
+    for std in (0.0, np.nan):
+        words = "standard deviation of X's flux must be positive"
+        refuse(words, Source, jnp.ones((4, 1)), 1.0, std, "X")
 
 
 # --- antennas -------------------------------------------------------------------------------------
