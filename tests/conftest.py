@@ -69,6 +69,14 @@ DATA = Path(
 )
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """What is essential is long, before anything is deselected."""
+    for item in items:
+        if item.get_closest_marker("essential"):
+            item.add_marker("long")
+
+
 def pytest_collection_finish():
     """What is there for good, modules and tests, is not looked at by every collection of garbage.
 

@@ -101,7 +101,6 @@ def test_headers_say_where_the_numbers_come_from(folder):
             assert healpy.read_map(folder / f"{name}.fits", dtype=None).dtype.itemsize == 8
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_simulate_then_map_equals_map(folder, tmp_path, capsys):
     data, scenario = tmp_path / "data.nc", folder / "scenario.yaml"

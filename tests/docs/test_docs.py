@@ -183,7 +183,6 @@ def applied(text: str, how: str, line: str, code: str) -> str:
     return "".join([*lines[:first], code, *lines[rest:]])
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_the_worked_examples_pass_their_tests(tmp_path):
     for folder in ("lusee_bayes", "models"):

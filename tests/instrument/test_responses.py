@@ -80,7 +80,6 @@ def volts(response, frequency, kelvin) -> np.ndarray:
     return np.asarray(to_real(matrix * scale))
 
 
-@pytest.mark.long
 @pytest.mark.essential
 @pytest.mark.parametrize(
     "channel", [0, 3, *(pytest.param(k, marks=pytest.mark.long) for k in (1, 2))]
@@ -455,7 +454,6 @@ def test_open_ports_have_no_loads_to_write(luseepy, tmp_path):
 
 
 @pytest.mark.essential
-@pytest.mark.long
 def test_simulated_and_mapped_between_the_responses_frequencies(luseepy, tmp_path):
     """14.5 MHz / 3, a Moon of many digits, other receivers, which nothing but the data say."""
     response, *_ = luseepy

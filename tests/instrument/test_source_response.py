@@ -108,7 +108,6 @@ def test_the_frequency_may_be_traced():
 # --- polarisation
 
 
-@pytest.mark.essential
 @pytest.mark.parametrize("stokes_v", [1.0, -1.0])
 def test_a_field_that_turns_in_time(stokes_v):
     """A real field turns around; the arms' real voltages are correlated as a correlator does.

@@ -98,7 +98,7 @@ LONG, ESSENTIAL = pytest.mark.long, pytest.mark.essential
     ("overrides", "flags"),
     [
         pytest.param((), None, id="diagonal"),
-        pytest.param((EXACT,), None, id="blocks", marks=[LONG, ESSENTIAL]),
+        pytest.param((EXACT,), None, id="blocks", marks=ESSENTIAL),
         pytest.param((GAIN, BEAM), None, id="banded and low rank", marks=LONG),
         pytest.param((EXACT, GAIN), FLAGS, id="banded with gaps", marks=LONG),
     ],
@@ -197,7 +197,6 @@ def test_what_is_wrong_is_pointed_at(kind, name):
     assert len(found.suspects()) == len({group.kind for group in found.suspects()})
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_what_no_group_explains():
     model, data = simulated()
@@ -499,7 +498,7 @@ MANY_TIMES = {"SHARED": 0, "DAYS": 1}
         *(pytest.param("few", kind, limits, marks=LONG) for kind in ALONE for limits in LIMITS),
         *(pytest.param("often", kind, MANY_TIMES, marks=LONG) for kind in ALONE),
         *(("dense", kind, {"QUICK": 0}) for kind in TWO),
-        *(pytest.param("few", "coupled", limits, marks=[LONG, ESSENTIAL]) for limits in LIMITS),
+        *(pytest.param("few", "coupled", limits, marks=ESSENTIAL) for limits in LIMITS),
     ],
 )
 def test_it_is_what_matrices_say(size, kind, limits, monkeypatch):

@@ -108,7 +108,6 @@ def case(request):
     return prior, *information_from(made, data), answer
 
 
-@pytest.mark.long
 @pytest.mark.essential
 @pytest.mark.parametrize("place", [on_host, on_device])
 def test_the_direct_solution_is_the_textbooks(case, place):

@@ -175,7 +175,6 @@ def instrument():
     return model, model.sample(jax.random.key(3))[1]
 
 
-@pytest.mark.long
 @pytest.mark.essential
 @pytest.mark.parametrize("form", FORMS)
 def test_real_experiment_to_sixty_digits(instrument, form):
@@ -219,7 +218,6 @@ def graded(n_data: int, largest: float, lmax=5, seed=1):
 # errors eps x largest^2 where Lambda may be 1: std and ln p of the forms on the sky's side lose
 # that much. The data form's triangle is graded, rows of
 # every size keep their own relative accuracy, and it loses only eps x largest.
-@pytest.mark.long
 @pytest.mark.essential
 @pytest.mark.parametrize("largest", [1e2, 1e4, 1e6])
 @pytest.mark.parametrize("n_data", [60, 24])

@@ -116,7 +116,6 @@ def test_contract_of_sums(first, second, small_blocks):
     check_covariance(cov_a + cov_b, dense_a + dense_b, slopes=True)
 
 
-@pytest.mark.long
 @pytest.mark.essential
 @pytest.mark.parametrize("kind", ["banded", "blocks", "dense"])
 def test_contract_of_low_rank_updates(kind, small_blocks):
@@ -128,7 +127,6 @@ def test_contract_of_low_rank_updates(kind, small_blocks):
 
 
 # blocks of two times: widths below, at and above a block, whole matrices; times no multiple of two
-@pytest.mark.long
 @pytest.mark.essential
 @pytest.mark.parametrize(
     ("width", "flagged"), [*((w, False) for w in (0, 1, 2, 3, 6, 9)), *((w, True) for w in (2, 5))]

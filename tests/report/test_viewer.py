@@ -93,7 +93,7 @@ def test_pixels_and_equatorial_coordinates(page, small_map, tmp_path):
 @needs_node
 @pytest.mark.parametrize(
     "which",
-    ["small_map", pytest.param("correlated", marks=[pytest.mark.long, pytest.mark.essential])],
+    ["small_map", pytest.param("correlated", marks=pytest.mark.essential)],
 )
 def test_point_spread_functions_are_those_of_the_posterior(which, request, tmp_path):
     """Against y^T R from the posterior; bytes are wrong by half a step at most, at random."""

@@ -38,7 +38,6 @@ def files_of(folder):
     return sorted(p.name for p in folder.iterdir())
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_a_map_of_simulated_sessions_has_the_sky_that_was_simulated(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(Figure, "savefig", lambda self, target, **_: Path(target).touch())

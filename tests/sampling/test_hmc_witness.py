@@ -102,7 +102,6 @@ def test_hmc_finds_the_analytic_posterior(noise):
     assert left.min() < 0.1 and left.max() > 0.5
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_hmc_finds_it_where_the_prior_correlates_modes():
     w = witness("correlated modes")

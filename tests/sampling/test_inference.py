@@ -93,7 +93,6 @@ def assert_follows(draws, answer):
     assert_mean(z[..., i] * z[..., j], (i == j).astype(float), "covariance")
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_nuts_follows_the_analytic_posterior(nuts, exact):
     chains, _ = nuts

@@ -102,7 +102,6 @@ def test_nuts_follows_the_grid(grid, sites):
 # --- the skies drawn with it ----------------------------------------------------------------------
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_skies_obey_the_law_of_total_variance(case, grid, sites):
     """Mean of the conditional variances plus variance of the conditional means, mode by mode."""

@@ -93,7 +93,6 @@ def answer():
 # --- marginalised ---------------------------------------------------------------------------------
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_the_sky_is_the_same_with_fluxes_in_the_noise_or_beside_it():
     """Both against the closed form: Lambda's condition of 1e10 costs 1e-6 of a variance; means are

@@ -146,7 +146,6 @@ def gains_of(drifts, values):
 CASES = [(), ("log_sigma_std",), ("log_correlation_std",), tuple(SCALES)]
 
 
-@pytest.mark.long
 @pytest.mark.essential
 @pytest.mark.parametrize("scales", CASES)
 def test_there_and_back_with_the_determinant_of_the_derivative(scales):
@@ -170,7 +169,6 @@ def test_there_and_back_with_the_determinant_of_the_derivative(scales):
     assert abs(expected) > 1e-2
 
 
-@pytest.mark.long
 @pytest.mark.essential
 @pytest.mark.parametrize("scales", CASES)
 def test_the_data_do_not_change_along_the_shared_scale(scales):
@@ -238,7 +236,6 @@ def test_the_instruments_program():
     assert density_of(e, values, "instrument") == pytest.approx(expected, rel=1e-7)
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_the_program_of_gain_scales():
     """N with the drifts' covariance entry by entry, the mean of the autos, and the priors."""
