@@ -1,8 +1,7 @@
 """Slow, obvious physics, written without the package: what its fast code must agree with.
 
-Nothing here imports lusee_bayes. Harmonics come from scipy one (ell, m) at a time, directions from
-lunarsky's LunarTopo frame, reflection from 2 x 2 characteristic matrices, antenna currents from
-vectors in space. Frames and conventions: topocentric x East, y North, z up; theta from the zenith,
+Nothing here imports lusee_bayes. Harmonics come from scipy, directions from lunarsky's LunarTopo
+frame, reflection from 2 x 2 characteristic matrices, antenna currents from vectors in space. Frames and conventions: topocentric x East, y North, z up; theta from the zenith,
 phi from East towards North; packed real modes at ell^2 + ell + m; time convention exp(+i w t).
 """
 
@@ -18,17 +17,10 @@ SPEED_OF_LIGHT = 299792458.0
 
 def real_harmonics(theta, phi, lmax):
     """Orthonormal real harmonics, (points, modes), from scipy's complex ones."""
-    columns = []
-    for ell in range(lmax + 1):
-        for m in range(-ell, ell + 1):
-            y = sph_harm_y(ell, abs(m), theta, phi)
-            if m == 0:
-                columns.append(y.real)
-            elif m > 0:
-                columns.append(np.sqrt(2.0) * y.real)
-            else:
-                columns.append(-np.sqrt(2.0) * y.imag)
-    return np.stack(columns, axis=-1)
+    pairs = [(ell, m) for ell in range(lmax + 1) for m in range(-ell, ell + 1)]
+    ell, m = np.array(pairs).T
+    y = sph_harm_y(ell, np.abs(m), np.asarray(theta)[..., None], np.asarray(phi)[..., None])
+    return np.where(m < 0, -y.imag, y.real) * np.where(m == 0, 1.0, np.sqrt(2.0))
 
 
 def vectors(theta, phi):

@@ -100,9 +100,8 @@ def test_the_commands_of_the_readme_run(tmp_path, monkeypatch, no_figures):
     blocks = FENCES.findall((ROOT / "README.md").read_text())
     lines = "".join(text for kind, text in blocks if kind == "sh").splitlines()
     # what only a shell does comes before the first command: the environment is activated
-    assert lines.index(". .venv/bin/activate") < min(
-        k for k, line in enumerate(lines) if line.startswith("lusee-bayes")
-    )
+    commands = [k for k, line in enumerate(lines) if line.startswith("lusee-bayes")]
+    assert lines.index(". .venv/bin/activate") < min(commands)
     for line in lines:
         if line.startswith("lusee-bayes"):
             run_command(line)

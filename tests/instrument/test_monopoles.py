@@ -21,21 +21,17 @@ def test_fields_agree_with_a_sum_along_the_arms(frequency, options):
     fields = m.fields(frequency, GRID)
     s, p = m.regolith.reflection(np.cos(GRID.theta), frequency)
     scale = np.abs(fields.e_theta).max()
+    sizes = {"length": float(m.length_m), "height": float(m.height_m)}
+    antenna = {"frequency_mhz": frequency, **sizes}
     # North, East, South, West
     azimuths = np.radians([90.0, 0.0, 270.0, 180.0])
     arms = vectors(np.full(4, np.radians(float(m.zenith_angle_deg))), azimuths)
     for port, arm in enumerate(arms):
         for t in range(len(GRID.theta)):
+            ground = complex(s[t]), complex(p[t])
             for f in range(0, GRID.n_phi, 3):
-                expected = arm_response(
-                    GRID.theta[t],
-                    GRID.phi[f],
-                    frequency_mhz=frequency,
-                    length=float(m.length_m),
-                    arm=arm,
-                    height=float(m.height_m),
-                    reflection=(complex(s[t]), complex(p[t])),
-                )
+                towards = GRID.theta[t], GRID.phi[f]
+                expected = arm_response(*towards, arm=arm, reflection=ground, **antenna)
                 got = fields.e_theta[port, t, f], fields.e_phi[port, t, f]
                 # Simpson's rule with 4000 steps of k h < 1e-3: 1e-13 of the integral
                 np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12 * scale)

@@ -148,6 +148,4 @@ def test_names():
 
 
 def test_a_negative_order_is_refused():
-    refuse(
-        "order of the tilt", pt.Pointing.of, lb.Observation.from_runs([lb.Run(0.1)]), 3, order=-1
-    )
+    refuse("order of the tilt", pt.Pointing.of, two_runs(), 3, order=-1)

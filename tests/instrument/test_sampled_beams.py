@@ -96,11 +96,8 @@ def test_short_dipoles_have_their_closed_form(kind):
     patterns = made.patterns(FREQUENCY, grid)
     assert np.abs(patterns - expected).max() < AT_HORIZON * np.abs(expected).max()
     # turned by an angle, the pattern at phi is the old one at phi - angle
-    steps = 3
-    turned = replace(made, turntable_offset_deg=steps * 360.0 / grid.n_phi).patterns(
-        FREQUENCY, grid
-    )
-    assert np.abs(turned - np.roll(patterns, steps, axis=-1)).max() < 1e-10 * np.abs(expected).max()
+    turned = replace(made, turntable_offset_deg=3 * 360.0 / grid.n_phi).patterns(FREQUENCY, grid)
+    assert np.abs(turned - np.roll(patterns, 3, axis=-1)).max() < 1e-10 * np.abs(expected).max()
 
 
 def test_rings_go_through_the_zenith():
@@ -116,22 +113,16 @@ def test_rings_go_through_the_zenith():
     aliased = 2 * (4 * np.sqrt(2 / 3) / NSIDE / 2) ** 3 / 6
     assert np.abs(found - expected).max() < BETWEEN + aliased
     # a real function stays real
-    np.testing.assert_allclose(
-        from_rings(np.where(UP, wave(THETA, PHI).real, 0.0), theta, phi), found.real, atol=1e-12
-    )
+    real = from_rings(np.where(UP, wave(THETA, PHI).real, 0.0), theta, phi)
+    np.testing.assert_allclose(real, found.real, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_sampled_beams_keep_the_contract(kind):
     source = replace(lb.sampled_beams(FREQUENCY, **embedded(kind)), turntable_offset_deg=5.0)
-    check_beam_source(
-        source,
-        replace(source, turntable_offset_deg=35.0),
-        turned_deg=30.0,
-        frequency_mhz=FREQUENCY,
-        lmax=LMAX,
-        quadrature=SPLINES,
-    )
+    turned = replace(source, turntable_offset_deg=35.0)
+    sizes = {"frequency_mhz": FREQUENCY, "lmax": LMAX, "quadrature": SPLINES}
+    check_beam_source(source, turned, turned_deg=30.0, **sizes)
 
 
 def test_the_scale_is_the_autos_or_the_files():

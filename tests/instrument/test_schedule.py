@@ -98,16 +98,14 @@ def test_runs_are_a_schedule(window, step_s):
     counts, angles = (10, 7, 12), (0.0, 30.0, -15.0)
     month = CYCLE_DAYS * 86400.0
     runs = [Run((n + 0.5) * step_s / month, a) for n, a in zip(counts, angles, strict=True)]
-    site = {"lon_deg": 10.0, "lat_deg": 20.0}
-    expected = lb.Observation.from_runs(
-        runs, start="2027-02-01T00:00:00", step_s=step_s, window=window, **site
-    )
+    given = {"lon_deg": 10.0, "lat_deg": 20.0, "step_s": step_s, "window": window}
+    expected = lb.Observation.from_runs(runs, start="2027-02-01T00:00:00", **given)
     at, intervals = datetime(2027, 2, 1), []
     for n, angle in zip(counts, angles, strict=True):
         end = at + timedelta(seconds=n * step_s)
         intervals.append(Interval(at.isoformat(), end.isoformat(), angle))
         at = end + timedelta(seconds=0.5 * step_s)
-    got = lb.Observation.from_schedule(intervals, step_s=step_s, window=window, **site)
+    got = lb.Observation.from_schedule(intervals, **given)
     # lengths in cycles are rounded, to 1e-16 of 1e5 seconds, and so are differences of dates
     apart = (got.times - expected.times).to_value(u.s)
     np.testing.assert_allclose(apart, 0.0, rtol=0, atol=1e-8)
@@ -123,7 +121,8 @@ def test_windows_at_night_are_dark_from_end_to_end():
     step_s, lon, lat = 40000.0, 182.258, -23.814
     dates = [("2027-01-14T00:00:00", "2027-01-31T00:00:00"), ("2027-02-01", "2027-02-16")]
     intervals = [Interval(*pair, night_only=True) for pair in dates]
-    o = lb.Observation.from_schedule(intervals, step_s=step_s, lon_deg=lon, lat_deg=lat)
+    given = {"step_s": step_s, "lon_deg": lon, "lat_deg": lat}
+    o = lb.Observation.from_schedule(intervals, **given)
     windows = naive(intervals, step_s)
     start, end = (Time([w[k] for w in windows]) for k in (0, 1))
     middle = start + (end - start) / 2.0
@@ -134,12 +133,10 @@ def test_windows_at_night_are_dark_from_end_to_end():
     apart = (o.times - middle[expected]).to_value(u.s)
     np.testing.assert_allclose(apart, 0.0, rtol=0, atol=1e-8)
     by_day = [Interval(*dates[0], night_only=True), Interval(*dates[1])]
-    mixed = lb.Observation.from_schedule(by_day, step_s=step_s, lon_deg=lon, lat_deg=lat)
+    mixed = lb.Observation.from_schedule(by_day, **given)
     second = start >= Time("2027-02-01")
     assert mixed.n_times == (expected | second).sum()
-    instants = lb.Observation.from_schedule(
-        intervals, step_s=step_s, lon_deg=lon, lat_deg=lat, window="instant"
-    )
+    instants = lb.Observation.from_schedule(intervals, window="instant", **given)
     assert instants.n_times == dark[0].sum()
 
 

@@ -78,12 +78,8 @@ def test_gradients_are_finite_and_right_with_sources_below_the_horizon():
         # true of no NaN either
         assert 1e-6 < np.abs(np.asarray(leaf)).max() < 1e6
     h = 1e-4
-    up, down = (
-        float(
-            f(eqx.tree_at(lambda x: x.height_m, m, jnp.asarray(2.0 + s)), jnp.asarray(directions))
-        )
-        for s in (h, -h)
-    )
+    moved = (eqx.tree_at(lambda x: x.height_m, m, jnp.asarray(2.0 + s)) for s in (h, -h))
+    up, down = (float(f(antennas, jnp.asarray(directions))) for antennas in moved)
     # third derivative of order (2 k)^3 = 1: h^2; rounding 1e-15 / h
     assert float(slopes.height_m) == pytest.approx((up - down) / (2 * h), rel=1e-6, abs=1e-9)
     hidden = eqx.filter_grad(f)(m, jnp.asarray(directions[[2, 2, 3, 3]]))
@@ -186,14 +182,9 @@ def test_a_smoothed_source_agrees_with_the_coupling_matrix():
     def integral(turntable):
         # every sample once for each direction, microseconds apart: the Moon turns by 3e-9 meanwhile
         apart = np.tile(1e-6 * np.arange(len(n)), o.n_times)
-        copies = lb.Observation(
-            o.lon_deg,
-            o.lat_deg,
-            Time(np.repeat(o.times.jd, len(n)), format="jd", scale="utc") + apart * u.s,
-            np.repeat(o.run, len(n)),
-            turntable,
-            o.step_s,
-        )
+        times = Time(np.repeat(o.times.jd, len(n)), format="jd", scale="utc") + apart * u.s
+        run = np.repeat(o.run, len(n))
+        copies = lb.Observation(o.lon_deg, o.lat_deg, times, run, turntable, o.step_s)
         each = mp.source_response(copies, np.tile(n, (o.n_times, 1)), FREQUENCY)
         return np.asarray(each).reshape(16, o.n_times, len(n)) @ weights
 

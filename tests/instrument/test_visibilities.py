@@ -32,9 +32,8 @@ def test_round_trip_is_exact(data, tmp_path):
     np.testing.assert_array_equal(again.observation.run, data.observation.run)
     assert again.observation.turntable_deg == (0.0, 30.0) and again.frequency_mhz == 25.0
     # orientations, the only use of the times, are the same to the last bit
-    np.testing.assert_array_equal(
-        again.observation.mcmf_from_galactic, data.observation.mcmf_from_galactic
-    )
+    there, here = (d.observation.mcmf_from_galactic for d in (data, again))
+    np.testing.assert_array_equal(here, there)
 
 
 def altered(change):
@@ -136,9 +135,8 @@ def test_any_order_of_products_and_of_their_ports():
     made = make(columns(pairs), products=[f"{i}{j}" for i, j in pairs])
     np.testing.assert_array_equal(made.grid(), expected())
     # the other convention: every array is the conjugate, and said so once
-    made = make(
-        columns(pairs).conj(), products=[f"{i}-{j}" for i, j in pairs], convention="conj(s_i) s_j"
-    )
+    names = [f"{i}-{j}" for i, j in pairs]
+    made = make(columns(pairs).conj(), products=names, convention="conj(s_i) s_j")
     np.testing.assert_array_equal(made.grid(), expected())
 
 

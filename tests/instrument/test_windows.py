@@ -171,9 +171,8 @@ def flagged(*absent, n=4):
     for product, sample in absent:
         flags[product, sample] = True
     layout = DataLayout.from_flags(flags)
-    return lb.Visibilities(
-        np.random.default_rng(3).normal(size=layout.size), layout, observation, 25.0
-    )
+    values = np.random.default_rng(3).normal(size=layout.size)
+    return lb.Visibilities(values, layout, observation, 25.0)
 
 
 @pytest.mark.parametrize(
@@ -362,9 +361,8 @@ def bounds_of(observation):
 @pytest.fixture
 def data():
     """Windows in pieces of odd lengths, and flags."""
-    observation = lb.Observation.from_runs(
-        [lb.Run(0.01), lb.Run(0.01, turntable_deg=30.0)], window="mean"
-    )
+    runs = [lb.Run(0.01), lb.Run(0.01, turntable_deg=30.0)]
+    observation = lb.Observation.from_runs(runs, window="mean")
     n, rng = observation.n_times, np.random.default_rng(5)
     observation = replace(observation, windows=partly_filled(n, 7200.0))
     layout = DataLayout.from_flags(rng.random((16, n)) < 0.1)
@@ -585,9 +583,8 @@ def test_rounded_times_make_no_overlaps():
         {"step_s": 60.0, "live_s": np.full(400, 60.0)},
         {"bounds": edges},
     ):
-        observation = lb.Visibilities.from_arrays(
-            data, rounded, 25.0, timestamp="start", **options
-        ).observation
+        series = lb.Visibilities.from_arrays(data, rounded, 25.0, timestamp="start", **options)
+        observation = series.observation
         found = bounds_of(observation)
         assert (found[1:, 0] >= found[:-1, 1] - 1e-6).all()
         np.testing.assert_allclose(found[:, 0], 60.0 * np.arange(400), rtol=0, atol=1e-4)

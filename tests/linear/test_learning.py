@@ -165,9 +165,8 @@ def test_scores_are_standard_normal_under_the_hyperprior():
         assert found[1] == pytest.approx(-0.5 * np.log(power))
         np.testing.assert_allclose(hyperprior.scores(found), both, rtol=1e-10, atol=1e-12)
         rise = hyperprior.of_scores(both + step) - hyperprior.of_scores(both - step)
-        np.testing.assert_allclose(
-            hyperprior.slopes_of_scores(both), rise / (2.0 * step), rtol=1e-7
-        )
+        slopes = rise / (2.0 * step)
+        np.testing.assert_allclose(hyperprior.slopes_of_scores(both), slopes, rtol=1e-7)
 
 
 # --- data that do not fit -------------------------------------------------------------------------

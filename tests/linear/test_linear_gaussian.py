@@ -281,12 +281,8 @@ def expected_slopes(model, d):
     a, n = np.asarray(model.coupling.dense()), np.asarray(model.noise.dense())
     spectrum = np.asarray(model.prior.spectrum)
     s, y = np.diag(per_mode(spectrum)), np.asarray(d)
-    of_ell = [
-        oracle.log_prob_slope(
-            a, s, n, y, np.diag(per_mode(np.arange(LMAX + 1.0) == ell) * 1.0), 0 * n
-        )
-        for ell in range(LMAX + 1)
-    ]
+    shapes = [np.diag(per_mode(one)) for one in np.eye(LMAX + 1)]
+    of_ell = [oracle.log_prob_slope(a, s, n, y, shape, 0 * n) for shape in shapes]
     return np.array(of_ell), oracle.log_prob_slope(a, s, n, y, 0 * s, n)
 
 

@@ -37,9 +37,8 @@ def skies_of(frequencies, names, n_sources=0):
     points = synthesis_matrix(np.array([0.4, 1.9]), np.array([2.0, 4.0]), LMAX)[:n_sources]
     sources = np.stack([20.0 * (f / 20.0) ** -2.5 * points for f in frequencies])
     templates = [partial(band, f) for f in frequencies]
-    return PositiveSkies.of(
-        frequencies, templates, LMAX, names, sources=sources, weight=weight, band=24
-    )
+    options = {"sources": sources, "weight": weight, "band": 24}
+    return PositiveSkies.of(frequencies, templates, LMAX, names, **options)
 
 
 def quadrature():
@@ -73,9 +72,8 @@ def rough(skies, level=0.3):
     """Laws of fields that are as strong as the templates, so that nothing is linear."""
     laws = FieldLaws.of(skies)
     parameters = laws.parameters.copy()
-    parameters[:, 0] = np.log(
-        level * np.where(np.arange(len(parameters)) < len(laws.means), 1, 0.3)
-    )
+    shares = np.where(np.arange(len(parameters)) < len(laws.means), 1, 0.3)
+    parameters[:, 0] = np.log(level * shares)
     parameters[:, 1] = -1.0
     return replace(laws, parameters=parameters)
 
@@ -133,9 +131,8 @@ def test_the_gaussian_is_that_of_one_big_model(case):
         matrix[:, at + N : at + N + n_sources] = skies.sources[k].T
         wide[at : at + N] = np.asarray(prior.residual_root(k))
         to_skies.append(matrix)
-        constants.append(
-            y.T @ (weights * level) - slope @ mode.exponents[k] + skies.sources[k].sum(0)
-        )
+        at_zero = y.T @ (weights * level) - slope @ mode.exponents[k]
+        constants.append(at_zero + skies.sources[k].sum(0))
     a = np.concatenate([s[0] @ t for s, t in zip(seen, to_skies, strict=True)])
     offset = np.concatenate([s[0] @ c for s, c in zip(seen, constants, strict=True)])
     d, sigma = (np.concatenate([s[k] for s in seen]) for k in (2, 1))

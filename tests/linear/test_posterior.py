@@ -157,9 +157,8 @@ def test_rho_and_snr_against_complex_coefficients_and_loops():
 def test_measures_of_made_up_maps():
     truth = np.random.default_rng(2).standard_normal(16)
     np.testing.assert_allclose(measures.correlation(truth, truth), 1.0, rtol=1e-12)
-    assert np.isnan(
-        measures.signal_to_noise(truth, truth)
-    ).all()  # no residual: undefined, not infinite
+    # no residual: undefined, not infinite
+    assert np.isnan(measures.signal_to_noise(truth, truth)).all()
     assert np.isnan(measures.correlation(np.zeros(16), truth)).all()
     # ell counts from one
     assert measures.ell_cross(np.array([0.1, 3.0, 2.0, 0.9, 2.0])) == 3

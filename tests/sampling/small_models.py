@@ -10,7 +10,23 @@ from arviz_stats.base import array_stats
 from reference_linear import Answer, posterior, random_covariance, z_of
 
 import lusee_bayes as lb
+from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.noise.covariance import DenseCovariance
+
+# kinds of N
+NOISES = {
+    "paper": ("fiducial",),
+    "exact": ("fiducial", "noise.radiometer.form=exact"),
+    "gain": ("gain_1e-2",),
+    "beam": ("beam_4MHz",),
+}
+
+
+def noisy(noise: str, *more: str) -> Scenario:
+    """96 data of 49 modes with a kind of N."""
+    scenario, *overrides = NOISES[noise]
+    small = ["lmax=6", "observation.runs.0.cycles=0.02", *overrides, *more]
+    return lb.load_scenario(scenario, small)
 
 
 def random_gaussian(spectrum, n_data: int, seed: int, noise: float = 1.0) -> lb.LinearGaussian:

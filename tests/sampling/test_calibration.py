@@ -15,6 +15,7 @@ import pytest
 from assertions import refuse
 from jaxtyping import Array, Float
 from scipy import stats
+from small_models import NOISES, noisy
 
 import lusee_bayes as lb
 from lusee_bayes.core.progress import Stages
@@ -22,13 +23,6 @@ from lusee_bayes.experiment.model import full_model, set_up
 from lusee_bayes.judge.coverage import LEVELS
 from lusee_bayes.sampling import validation
 
-SMALL = ("lmax=6", "observation.runs.0.cycles=0.02")
-NOISES = {
-    "paper": ("fiducial",),
-    "exact": ("fiducial", "noise.radiometer.form=exact"),
-    "gain": ("gain_1e-2",),
-    "beam": ("beam_4MHz",),
-}
 # one of them every time, the others by make long
 EVERY_NOISE = pytest.mark.parametrize(
     "noise", [n if n == "exact" else pytest.param(n, marks=pytest.mark.long) for n in NOISES]
@@ -37,8 +31,7 @@ EVERY_NOISE = pytest.mark.parametrize(
 
 @lru_cache
 def model(noise: str) -> lb.LinearGaussian:
-    scenario, *overrides = NOISES[noise]
-    return full_model(set_up(lb.load_scenario(scenario, [*SMALL, *overrides])))
+    return full_model(set_up(noisy(noise)))
 
 
 def p_values(ranks: validation.Ranks) -> dict[str, float]:
@@ -145,10 +138,8 @@ class Counting(Stages):
 
 def test_ranks_count_the_draws_below_the_truth():
     def simulate(key):
-        return {
-            "x": jnp.asarray([37.5, 0.5, validation.N_DRAWS + 0.5]),
-            "y": jnp.asarray(98.0),
-        }, jnp.zeros(1)
+        x = jnp.asarray([37.5, 0.5, validation.N_DRAWS + 0.5])
+        return {"x": x, "y": jnp.asarray(98.0)}, jnp.zeros(1)
 
     def draw(key, data):
         grid = jnp.arange(1.0, validation.N_DRAWS + 1.0)
@@ -156,9 +147,8 @@ def test_ranks_count_the_draws_below_the_truth():
         return {"x": jnp.stack([shuffled, grid, grid], axis=1), "y": shuffled}
 
     stages = Counting()
-    ranks = validation.calibrate(
-        simulate, draw, lambda sky, data: sky, n_simulations=130, batch=60, stages=stages
-    )
+    options = {"n_simulations": 130, "batch": 60, "stages": stages}
+    ranks = validation.calibrate(simulate, draw, lambda sky, data: sky, **options)
     assert ranks.names == ("x 0", "x 1", "x 2", "y")
     assert ranks.n_draws == validation.N_DRAWS
     # 37 of 1, 2, ... lie below 37.5; 97 below 98
@@ -195,14 +185,9 @@ S = 0.7
 
 def conjugate(shift=0.0, scale=1.0, s=S, simulations=500, **options) -> validation.Ranks:
     model = Conjugate(*(jnp.asarray(float(x)) for x in (shift, scale, s)))
-    return validation.calibrate(
-        model.simulate,
-        model.draw,
-        model.quantities,
-        n_simulations=simulations,
-        regions=("distance",),
-        **options,
-    )
+    given = model.simulate, model.draw, model.quantities
+    options |= {"n_simulations": simulations, "regions": ("distance",)}
+    return validation.calibrate(*given, **options)
 
 
 def test_the_conjugate_posterior_is_calibrated():

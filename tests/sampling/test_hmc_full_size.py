@@ -27,12 +27,9 @@ def test_nuts_agrees_with_every_mean_every_variance_and_the_covariance(scenario)
     inference, data = lb.infer(experiment), experiment.data
     model, posterior = inference.model, inference.posterior
     program = lb.load_program("sky")
-    chains = lb.sample(
-        program.model,
-        {**program.arguments(model), "data": data.data},
-        lb.Sampler(chains=4, draws=500, seed=2),
-        lb.Whitening.of(posterior),
-    )
+    arguments = {**program.arguments(model), "data": data.data}
+    sampler = lb.Sampler(chains=4, draws=500, seed=2)
+    chains = lb.sample(program.model, arguments, sampler, lb.Whitening.of(posterior))
     draws = chains.sites["sky"]
     assert draws.shape == (4, 500, (LMAX + 1) ** 2)
     statistics = [chains.statistics[name] for name in ("diverging", "energy")]

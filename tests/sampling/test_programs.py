@@ -71,11 +71,8 @@ def test_a_program_by_its_path(write):
 def test_a_file_named_like_a_program_is_meant_only_by_its_path(write, monkeypatch, tmp_path):
     path = write("def model(data=None):\n    return 'mine'\n", "sky.py")
     monkeypatch.chdir(tmp_path)
-    assert (
-        lb.load_program("sky").digest
-        == lb.load_program("sky").digest
-        != lb.load_program(path).digest
-    )
+    first, again, mine = (lb.load_program(source).digest for source in ("sky", "sky", path))
+    assert first == again != mine
     assert lb.load_program("sky.py").model() == "mine"
 
 
@@ -259,9 +256,8 @@ def test_replicated_data_are_the_skies_seen_with_new_noise(gaussian, collapsed, 
     sky, data = (np.asarray(x) for x in gaussian.sample(jax.random.key(6)))
     skies = np.broadcast_to(sky, (2, 5000, 9))
     arguments = program.arguments(gaussian)
-    seen = programs.collapsed_draws(
-        program, arguments, data, repeated(values), jax.random.key(7), skies
-    )
+    given = program, arguments, data, repeated(values), jax.random.key(7)
+    seen = programs.collapsed_draws(*given, skies)
     assert seen.shape == (2, 5000, N_DATA)
     mean = np.asarray(gaussian.coupling.dense()) @ sky + offset
     assert_draws_follow(seen.reshape(-1, N_DATA), mean, n)

@@ -38,14 +38,9 @@ def informed(truth: np.ndarray) -> Information:
     rng = np.random.default_rng(1)
     rotation = np.linalg.qr(rng.standard_normal((16, 16)))[0]
     precision = np.geomspace(1e-2, 1e-10, 16)
-    return Information(
-        (rotation * precision) @ rotation.T,
-        rotation @ (np.sqrt(precision) * rng.standard_normal(16)),
-        truth,
-        np.asarray(96.0),
-        np.asarray(0.0),
-        np.asarray(96.0),
-    )
+    matrix = (rotation * precision) @ rotation.T
+    vector = rotation @ (np.sqrt(precision) * rng.standard_normal(16))
+    return Information(matrix, vector, truth, *map(np.asarray, (96.0, 0.0, 96.0)))
 
 
 @lru_cache
@@ -69,15 +64,8 @@ def two_unknowns():
     sky = log_normal(0.1, lmax=0, sources=BRIGHT_SOURCES[:1])
     value = 1.5 * sky.modes(np.zeros(2))
     precision = float((0.05 * value[0]) ** -2)
-    given = Information(
-        np.array([[precision]]),
-        np.zeros(1),
-        value,
-        np.asarray(0.0),
-        np.asarray(-np.log(precision)),
-        np.asarray(1.0),
-    )
-    return sky, given
+    scalars = map(np.asarray, (0.0, -np.log(precision), 1.0))
+    return sky, Information(np.array([[precision]]), np.zeros(1), value, *scalars)
 
 
 def test_the_mode_is_where_a_search_without_derivatives_finds_it(two_unknowns):
@@ -190,9 +178,8 @@ def test_the_learned_spectrum_has_the_highest_evidence_and_its_curvature():
 def test_refusals():
     refuse("the information has shape", ln.find_mode, log_normal(0.1, lmax=2), information())
     sky = log_normal(0.1)
-    refuse(
-        "ln A and the tilt of the sky holds NaN", LogNormalPrior, sky, np.array([-np.inf, TILTED])
-    )
+    words, none = "ln A and the tilt of the sky holds NaN", np.array([-np.inf, TILTED])
+    refuse(words, LogNormalPrior, sky, none)
     refuse("of ln A or of the tilt must be", log_normal_prior, 0.1, (1.0, 0.0))
 
 

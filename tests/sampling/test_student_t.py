@@ -28,13 +28,10 @@ def case(request):
     flags[:, 2] = flags[:3, 4] = flags[1, 5:] = True
     layout = DataLayout.from_flags(flags)
     visibilities = np.array([9.0, 2.0, -1.0, 16.0])[:, None] * rng.uniform(1.0, 2.0, N_TIMES)
-    noise = lb.radiometer_noise(
-        visibilities, layout, bandwidth_hz=1.0, step_s=10.0, form=request.param
-    )
-    loc, value = rng.normal(size=(2, layout.size)) * 5.0
-    return SimpleNamespace(
-        layout=layout, noise=noise, loc=jnp.asarray(loc), value=jnp.asarray(value)
-    )
+    given = {"bandwidth_hz": 1.0, "step_s": 10.0, "form": request.param}
+    noise = lb.radiometer_noise(visibilities, layout, **given)
+    loc, value = jnp.asarray(rng.normal(size=(2, layout.size)) * 5.0)
+    return SimpleNamespace(layout=layout, noise=noise, loc=loc, value=value)
 
 
 def by_time(case, nu):
@@ -168,14 +165,11 @@ def burst():
     gaussian = lb.infer(experiment).model
     given = {name: value for name, value in arguments.items() if name != "data"}
     white = coordinates(PROGRAM, given, experiment.data, lb.infer(experiment), ["sky"])
-    chains = lb.sample(
-        PROGRAM.model, arguments, lb.Sampler(warmup=100, draws=300, algorithm="hmc"), white
-    )
-    good = lb.LinearGaussian(
-        np.asarray(gaussian.coupling.dense())[~hit],
-        gaussian.prior,
-        lb.DiagonalCovariance(np.asarray(gaussian.noise.diagonal())[~hit]),
-    ).condition(dirty[~hit])
+    sampler = lb.Sampler(warmup=100, draws=300, algorithm="hmc")
+    chains = lb.sample(PROGRAM.model, arguments, sampler, white)
+    a, variance = np.asarray(gaussian.coupling.dense()), np.asarray(gaussian.noise.diagonal())
+    rest = lb.LinearGaussian(a[~hit], gaussian.prior, lb.DiagonalCovariance(variance[~hit]))
+    good = rest.condition(dirty[~hit])
     return SimpleNamespace(
         bad=np.isin(np.arange(layout.n_times), bad),
         layout=layout,

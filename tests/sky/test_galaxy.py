@@ -176,9 +176,8 @@ def test_an_isothermal_slab_between_two_emitters_has_the_closed_form(tau):
     assert got == pytest.approx(want, rel=1e-10)
     # cut into slabs it is the same slab
     parts = [0.1 * column, 0.6 * column, 0.3 * column]
-    assert seen([front, 0, 0, 0, behind], [0, *parts, 0], frequency_mhz) == pytest.approx(
-        want, rel=1e-10
-    )
+    got = seen([front, 0, 0, 0, behind], [0, *parts, 0], frequency_mhz)
+    assert got == pytest.approx(want, rel=1e-10)
 
 
 @pytest.mark.parametrize("lon_deg, lat_deg", [*DIRECTIONS, (263.25, -9)])

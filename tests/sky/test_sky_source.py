@@ -96,14 +96,9 @@ def written(layout, folder, modes):
 def test_files_keep_the_contract(layout, tmp_path, modes):
     path, dataset = written(layout, tmp_path, modes)
     source = FileSkySection(file=str(path), dataset=dataset)
-    check_sky_source(
-        source,
-        frequency_mhz=25.0,
-        lmax=LMAX,
-        slice_rtol=BAND_LIMITED,
-        missing_mhz=10.0 if layout[3] else None,
-        missing_lmax=3 * NSIDE,
-    )
+    missing = {"missing_mhz": 10.0 if layout[3] else None, "missing_lmax": 3 * NSIDE}
+    sizes = {"frequency_mhz": 25.0, "lmax": LMAX, "slice_rtol": BAND_LIMITED}
+    check_sky_source(source, **sizes, **missing)
     assert source.at(25.0, LMAX).name == path.name
     np.testing.assert_allclose(source.at(25.0, LMAX).modes, modes, rtol=0, atol=1e-9 * modes[0])
 
@@ -188,9 +183,7 @@ def test_sources_are_added_to_the_galaxy():
     with_sources, without = lb.galaxy_sky(25.0, 8), lb.galaxy_sky(25.0, 8, sources=())
     added = sum(source.modes(25.0, 8) for source in BRIGHT_SOURCES)
     # the difference of numbers 1e5 times larger: rounding of the larger ones
-    np.testing.assert_allclose(
-        np.asarray(with_sources.modes) - np.asarray(without.modes), added, atol=1e-9
-    )
+    np.testing.assert_allclose(with_sources.modes - without.modes, added, atol=1e-9)
 
 
 def with_one(pixels, value):
@@ -259,9 +252,8 @@ def test_cubes_that_cannot_be_used(tmp_path, maps):
     refuse("from 1 to 50 MHz, not at 50.5; set sky.file_freq", cube.map_at, 50.5)
     refuse("expected 60 maps", ss.SkyCube.read, write_cube(tmp_path / "long.fits", maps, end=60))
     refuse("767 values are not", ss.SkyCube.read, write_cube(tmp_path / "odd.fits", maps[:, :-1]))
-    refuse(
-        "is this Hz", ss.SkyCube.read, write_cube(tmp_path / "hz.fits", maps, start=1e6, step=1e6)
-    )
+    in_hz = write_cube(tmp_path / "hz.fits", maps, start=1e6, step=1e6)
+    refuse("is this Hz", ss.SkyCube.read, in_hz)
     for unit, factor in (("mK", 1e-3), ("K", 1.0)):
         path = write_cube(tmp_path / f"{unit}.fits", maps)
         fits.setval(path, "BUNIT", value=unit)

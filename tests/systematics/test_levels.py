@@ -61,9 +61,8 @@ def case():
 def general(case, systematics, values) -> float:
     """By models/systematics.py; no site may be left to chance."""
     arguments = {"gaussian": case.model, "systematics": tuple(systematics)}
-    got, trace = density(
-        lb.load_program("systematics"), arguments | {"data": jnp.asarray(case.data)}, values
-    )
+    arguments["data"] = jnp.asarray(case.data)
+    got, trace = density(lb.load_program("systematics"), arguments, values)
     assert set(trace) == {*values, "data"}
     return got
 
