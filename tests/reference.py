@@ -1,8 +1,9 @@
 """Slow, obvious physics, written without the package: what its fast code must agree with.
 
 Nothing here imports lusee_bayes. Harmonics come from scipy, directions from lunarsky's LunarTopo
-frame, reflection from 2 x 2 characteristic matrices, antenna currents from vectors in space. Frames and conventions: topocentric x East, y North, z up; theta from the zenith,
-phi from East towards North; packed real modes at ell^2 + ell + m; time convention exp(+i w t).
+frame, reflection from 2 x 2 characteristic matrices, antenna currents from vectors in space. Frames
+and conventions: topocentric x East, y North, z up; theta from the zenith, phi from East towards
+North; packed real modes at ell^2 + ell + m; time convention exp(+i w t).
 """
 
 import astropy.units as u

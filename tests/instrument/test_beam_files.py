@@ -253,15 +253,15 @@ def test_a_second_file_as_the_true_beams(tmp_path):
     np.testing.assert_array_equal(true_beams(setup).modes, read_beam(path).beams(30.0, 6).modes)
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["beam.length_m=2"], "length_m is an entry of model monopole, not of luseepy"),
-        (["noise.beam={parameters: {length_m: 0.1}}"], "which beam.file replaces"),
-        (["sky.sources=false", "sources.list=[{name: Cas A}]"], "exact beams of the embedded"),
-        (["noise.beam={shift_mhz: 1, file: some.fits}"], "give either shift_mhz, file or param"),
-    ],
-)
+NOT_OF_A_FILE = [
+    (["beam.length_m=2"], "length_m is an entry of model monopole, not of luseepy"),
+    (["noise.beam={parameters: {length_m: 0.1}}"], "which beam.file replaces"),
+    (["sky.sources=false", "sources.list=[{name: Cas A}]"], "exact beams of the embedded"),
+    (["noise.beam={shift_mhz: 1, file: some.fits}"], "give either shift_mhz, file or param"),
+]
+
+
+@pytest.mark.parametrize(("overrides", "message"), NOT_OF_A_FILE)
 def test_what_a_file_does_not_have(overrides, message):
     refuse(message, lb.load_scenario, "fiducial", ["beam.file=some.fits", *overrides])
 

@@ -107,16 +107,16 @@ def test_layers_agree_with_characteristic_matrices(ground, frequency):
         np.testing.assert_allclose([s[k], p[k]], expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("make", "given", "words"),
-    [
-        (Monopoles, {"length_m": 0.0}, "length_m must be positive"),
-        (Monopoles, {"height_m": -1.0}, "height_m must be positive"),
-        (Monopoles().fields, {"frequency_mhz": 0.0, "grid": GRID}, "frequency_mhz must be"),
-        (Regolith, {"surface_permittivity": 0.0}, "permittivity must be positive"),
-        (Regolith, {"deep_permittivity": np.nan}, "permittivity must be positive"),
-        (Regolith, {"loss_tangent": -0.01}, "loss_tangent must not be negative"),
-    ],
-)
+IMPOSSIBLE = [
+    (Monopoles, {"length_m": 0.0}, "length_m must be positive"),
+    (Monopoles, {"height_m": -1.0}, "height_m must be positive"),
+    (Monopoles().fields, {"frequency_mhz": 0.0, "grid": GRID}, "frequency_mhz must be"),
+    (Regolith, {"surface_permittivity": 0.0}, "permittivity must be positive"),
+    (Regolith, {"deep_permittivity": np.nan}, "permittivity must be positive"),
+    (Regolith, {"loss_tangent": -0.01}, "loss_tangent must not be negative"),
+]
+
+
+@pytest.mark.parametrize(("make", "given", "words"), IMPOSSIBLE)
 def test_what_cannot_be_is_refused(make, given, words):
     refuse(words, make, **given)

@@ -215,21 +215,21 @@ def nan_at_the_zenith():
     return given
 
 
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        (lambda: {"e_theta": np.zeros((4, 48))}, "give e_theta and e_phi, or products"),
-        (lambda: embedded("grid") | {"phi_deg": None}, "give both theta_deg and phi_deg"),
-        (lambda: embedded("grid") | {"phi_deg": PHI_DEG + 1.0}, "expected 360 k / n"),
-        (lambda: embedded("grid") | {"theta_deg": THETA_DEG / 2}, "to the horizon"),
-        (lambda: embedded("grid") | {"theta_deg": THETA_DEG[::-1]}, "theta_deg does not grow"),
-        (lambda: embedded("grid") | {"e_phi": np.zeros((3, 31, 60))}, "e_phi has shape"),
-        (lambda: {"products": np.zeros((16, 50))}, "no HEALPix map"),
-        (lambda: {"products": np.zeros((5, 48))}, "5 products do not come from"),
-        (lambda: {"products": np.zeros((16, 48), dtype=complex)}, "type complex128, expected real"),
-        (nan_at_the_zenith, "NaN or infinity in 1 of"),
-    ],
-)
+NO_BEAMS = [
+    (lambda: {"e_theta": np.zeros((4, 48))}, "give e_theta and e_phi, or products"),
+    (lambda: embedded("grid") | {"phi_deg": None}, "give both theta_deg and phi_deg"),
+    (lambda: embedded("grid") | {"phi_deg": PHI_DEG + 1.0}, "expected 360 k / n"),
+    (lambda: embedded("grid") | {"theta_deg": THETA_DEG / 2}, "to the horizon"),
+    (lambda: embedded("grid") | {"theta_deg": THETA_DEG[::-1]}, "theta_deg does not grow"),
+    (lambda: embedded("grid") | {"e_phi": np.zeros((3, 31, 60))}, "e_phi has shape"),
+    (lambda: {"products": np.zeros((16, 50))}, "no HEALPix map"),
+    (lambda: {"products": np.zeros((5, 48))}, "5 products do not come from"),
+    (lambda: {"products": np.zeros((16, 48), dtype=complex)}, "type complex128, expected real"),
+    (nan_at_the_zenith, "NaN or infinity in 1 of"),
+]
+
+
+@pytest.mark.parametrize(("given", "words"), NO_BEAMS)
 def test_arrays_that_are_no_beams_are_refused(given, words):
     refuse(words, lb.sampled_beams, FREQUENCY, **given())
 

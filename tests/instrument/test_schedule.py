@@ -160,27 +160,27 @@ def test_a_table_in_csv(write):
 HEADER = "start,end,turntable_deg,duty_cycle,night_only\n"
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "schedule.csv cannot be read as a schedule"),
-        (f"# nights\n{HEADER}", "schedule.csv: a schedule needs at least one interval"),
-        ("start,end,turntable_deg,duty\n", "has the columns .*duty; a schedule has"),
-        ("start,end,end,turntable_deg\n", "has the columns start, end, end.1, turntable_deg; a"),
-        (f"{HEADER}2027-01-01,2027-01-02,0,1,false,5\n", "rows have more entries than the header"),
-        (f"{HEADER}\nsoon,2027-01-02,0,1,false\n", "row 1: start 'soon' is not a date; write it"),
-        (f"{HEADER}2027-01-01,61050.8,0,1,false\n", "row 1: end '61050.8' is not a date; write"),
-        (f"{HEADER}1827-01-01,2027-01-02,0,1,false\n", "outside the ephemeris .*: 1827"),
-        (f"{HEADER}2027-01-02,2027-01-01,0,1,false\n", "row 1: end 2027-01-01 does not come aft"),
-        (f"{HEADER}2027-01-01,2027-01-03,0,1,\n2027-01-02,2027-01-04,0,1,\n", "begins 86400 s b"),
-        (f"{HEADER}2027-01-05,2027-01-06,0,1,\n2027-01-01,2027-01-02,0,1,\n", "row 2.*; sort"),
-        (f"{HEADER}2027-01-01,2027-01-02,0,1.5,false\n", "row 1: duty_cycle is 1.5; give the fra"),
-        (f"{HEADER}2027-01-01,2027-01-02,0,half,\n", "row 1: duty_cycle is 'half', not a number"),
-        (f"{HEADER}2027-01-01,2027-01-02,,1,\n", "row 1: turntable_deg is '', not a number"),
-        (f"{HEADER}2027-01-01,2027-01-02,inf,1,\n", "row 1: turntable_deg is inf; give an angle"),
-        (f"{HEADER}2027-01-01,2027-01-02,0,1,1\n", "row 1: night_only is '1'; write true or false"),
-    ],
-)
+BAD_TABLES = [
+    ("", "schedule.csv cannot be read as a schedule"),
+    (f"# nights\n{HEADER}", "schedule.csv: a schedule needs at least one interval"),
+    ("start,end,turntable_deg,duty\n", "has the columns .*duty; a schedule has"),
+    ("start,end,end,turntable_deg\n", "has the columns start, end, end.1, turntable_deg; a"),
+    (f"{HEADER}2027-01-01,2027-01-02,0,1,false,5\n", "rows have more entries than the header"),
+    (f"{HEADER}\nsoon,2027-01-02,0,1,false\n", "row 1: start 'soon' is not a date; write it"),
+    (f"{HEADER}2027-01-01,61050.8,0,1,false\n", "row 1: end '61050.8' is not a date; write"),
+    (f"{HEADER}1827-01-01,2027-01-02,0,1,false\n", "outside the ephemeris .*: 1827"),
+    (f"{HEADER}2027-01-02,2027-01-01,0,1,false\n", "row 1: end 2027-01-01 does not come aft"),
+    (f"{HEADER}2027-01-01,2027-01-03,0,1,\n2027-01-02,2027-01-04,0,1,\n", "begins 86400 s b"),
+    (f"{HEADER}2027-01-05,2027-01-06,0,1,\n2027-01-01,2027-01-02,0,1,\n", "row 2.*; sort"),
+    (f"{HEADER}2027-01-01,2027-01-02,0,1.5,false\n", "row 1: duty_cycle is 1.5; give the fra"),
+    (f"{HEADER}2027-01-01,2027-01-02,0,half,\n", "row 1: duty_cycle is 'half', not a number"),
+    (f"{HEADER}2027-01-01,2027-01-02,,1,\n", "row 1: turntable_deg is '', not a number"),
+    (f"{HEADER}2027-01-01,2027-01-02,inf,1,\n", "row 1: turntable_deg is inf; give an angle"),
+    (f"{HEADER}2027-01-01,2027-01-02,0,1,1\n", "row 1: night_only is '1'; write true or false"),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), BAD_TABLES)
 def test_bad_tables_are_refused(write, text, message):
     refuse(message, read_schedule, write(text))
 
@@ -229,19 +229,19 @@ def test_a_command_table_of_opsim(write):
     assert lb.Observation.from_schedule(intervals).n_runs == 1
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "comtable.yml is no command table of OpSim: expected numbered entries"),
-        ("1: [\n", "comtable.yml is not valid YAML"),
-        ("1: {start: 61050.8}\n", "entry 1: a command table of OpSim has a start .* and a mode"),
-        ("1:\n  start: noon\n  mode: science\n", "entry 1: a command table of OpSim has a start"),
-        ("1: {start: 2461050.8, mode: science}\n", "entry 1: sample times run outside the ephemer"),
-        ("1: {start: 61051, mode: science}\n2: {start: 61050, mode: maint}\n", "entry 2.*; sort"),
-        ("1: {start: 61050.8, mode: maint}\n", "comtable.yml: a schedule needs at least one"),
-        ("1: {start: 61050, mode: maint}\n2: {start: 61051, mode: science}\n", "2.* has no end"),
-    ],
-)
+BAD_COMMANDS = [
+    ("", "comtable.yml is no command table of OpSim: expected numbered entries"),
+    ("1: [\n", "comtable.yml is not valid YAML"),
+    ("1: {start: 61050.8}\n", "entry 1: a command table of OpSim has a start .* and a mode"),
+    ("1:\n  start: noon\n  mode: science\n", "entry 1: a command table of OpSim has a start"),
+    ("1: {start: 2461050.8, mode: science}\n", "entry 1: sample times run outside the ephemer"),
+    ("1: {start: 61051, mode: science}\n2: {start: 61050, mode: maint}\n", "entry 2.*; sort"),
+    ("1: {start: 61050.8, mode: maint}\n", "comtable.yml: a schedule needs at least one"),
+    ("1: {start: 61050, mode: maint}\n2: {start: 61051, mode: science}\n", "2.* has no end"),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), BAD_COMMANDS)
 def test_bad_command_tables_are_refused(write, text, message):
     refuse(message, read_schedule, write(text, "comtable.yml"))
 

@@ -45,20 +45,20 @@ def altered(change):
     return write
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda d: d["visibility"].values.fill(np.nan), "visibility .where not flagged. holds NaN"),
-        (lambda d: d["flag"].values.fill(True), "all .* samples are flagged"),
-        (lambda d: d.attrs.update(format="other"), "its format is 'other'"),
-        (lambda d: d.assign_coords(product=d["product"].values[::-1]), "has products 33R, 23I"),
-        (lambda d: d.attrs.update(step_s=-1.0), "step_s is -1.0, expected a number from 0"),
-        (lambda d: d.attrs.update(frequency_mhz=25e6), "is this Hz"),
-        (lambda d: d["visibility"].attrs.update(units="Jy"), "unit"),
-        (lambda d: d["jd1"].attrs.update(scale="lunar"), "scale"),
-        (lambda d: d["jd2"].attrs.update(scale="tt"), "different scales"),
-    ],
-)
+BAD_FILES = [
+    (lambda d: d["visibility"].values.fill(np.nan), "visibility .where not flagged. holds NaN"),
+    (lambda d: d["flag"].values.fill(True), "all .* samples are flagged"),
+    (lambda d: d.attrs.update(format="other"), "its format is 'other'"),
+    (lambda d: d.assign_coords(product=d["product"].values[::-1]), "has products 33R, 23I"),
+    (lambda d: d.attrs.update(step_s=-1.0), "step_s is -1.0, expected a number from 0"),
+    (lambda d: d.attrs.update(frequency_mhz=25e6), "is this Hz"),
+    (lambda d: d["visibility"].attrs.update(units="Jy"), "unit"),
+    (lambda d: d["jd1"].attrs.update(scale="lunar"), "scale"),
+    (lambda d: d["jd2"].attrs.update(scale="tt"), "different scales"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), BAD_FILES)
 def test_bad_files_are_refused(data, tmp_path, change, message):
     path = tmp_path / "bad.nc"
     altered(change)(data, path)
@@ -201,41 +201,41 @@ def test_angles_are_runs_and_sites_are_places(tmp_path):
     assert again.observation.turntable_deg == (0.0, 30.0, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"products": ["00", "01"]}, "shape"),
-        ({"data": columns(PAIRS).T}, "transpose"),
-        ({"data": "text"}, "not an array of numbers"),
-        ({"data": [1.0, 2.0]}, "expected (times, products)"),
-        ({"products": ["0a"] * 10}, "unknown product '0a'"),
-        ({"products": ["04"] * 10}, "port 4"),
-        ({"products": ["01R"] * 10}, "the data are complex"),
-        ({"data": expected().T, "products": ["01"] * 16}, "name the part"),
-        ({"data": expected().T, "products": ["00I"] * 16}, "an auto is real"),
-        ({"products": ["00"] * 10}, "more than once"),
-        ({"data": columns([(0, 1), (1, 0)]), "products": ["01", "10"]}, "01R is given more than"),
-        ({"products": "00"}, "give a list"),
-        ({"products": [f"{3 - i}{3 - j}" for i, j in PAIRS[1:]] + ["33"]}, "check the names"),
-        ({"convention": "s_i conj(s_i)"}, "did you mean 's_i conj(s_j)'"),
-        ({"data": np.full((N, 10), np.inf + 0j)}, "infinity"),
-        ({"flags": np.zeros(3, dtype=bool)}, "flags have shape"),
-        ({"flags": np.full(N, 0.5)}, "other values than true and false"),
-        ({"flags": np.ones(N, dtype=bool)}, "nothing to map"),
-        ({"times": TIMES[:3]}, "3 times for data of 5 times"),
-        ({"times": TIMES[::-1]}, "times must grow"),
-        ({"times": ["yesterday"] * N}, "is not a date"),
-        ({"times": np.arange(N)}, "give datetimes"),
-        ({"times": [t.replace(year=2060) for t in TIMES]}, "ephemeris"),
-        ({"site": "Lusee-Nihgt"}, "did you mean 'LuSEE-Night'"),
-        ({"site": 3.0}, "longitude and latitude"),
-        ({"site": (0.0, 95.0)}, "lat_deg"),
-        ({"turntable_deg": [0.0, 1.0]}, "one for each of 5 times"),
-        ({"frequency_mhz": -1.0}, "frequency_mhz must be positive"),
-        ({"frequency_mhz": 25e6}, "is this Hz"),
-        ({"data": columns(PAIRS)[:1], "times": TIMES[:1]}, "give step_s"),
-    ],
-)
+WRONG = [
+    ({"products": ["00", "01"]}, "shape"),
+    ({"data": columns(PAIRS).T}, "transpose"),
+    ({"data": "text"}, "not an array of numbers"),
+    ({"data": [1.0, 2.0]}, "expected (times, products)"),
+    ({"products": ["0a"] * 10}, "unknown product '0a'"),
+    ({"products": ["04"] * 10}, "port 4"),
+    ({"products": ["01R"] * 10}, "the data are complex"),
+    ({"data": expected().T, "products": ["01"] * 16}, "name the part"),
+    ({"data": expected().T, "products": ["00I"] * 16}, "an auto is real"),
+    ({"products": ["00"] * 10}, "more than once"),
+    ({"data": columns([(0, 1), (1, 0)]), "products": ["01", "10"]}, "01R is given more than"),
+    ({"products": "00"}, "give a list"),
+    ({"products": [f"{3 - i}{3 - j}" for i, j in PAIRS[1:]] + ["33"]}, "check the names"),
+    ({"convention": "s_i conj(s_i)"}, "did you mean 's_i conj(s_j)'"),
+    ({"data": np.full((N, 10), np.inf + 0j)}, "infinity"),
+    ({"flags": np.zeros(3, dtype=bool)}, "flags have shape"),
+    ({"flags": np.full(N, 0.5)}, "other values than true and false"),
+    ({"flags": np.ones(N, dtype=bool)}, "nothing to map"),
+    ({"times": TIMES[:3]}, "3 times for data of 5 times"),
+    ({"times": TIMES[::-1]}, "times must grow"),
+    ({"times": ["yesterday"] * N}, "is not a date"),
+    ({"times": np.arange(N)}, "give datetimes"),
+    ({"times": [t.replace(year=2060) for t in TIMES]}, "ephemeris"),
+    ({"site": "Lusee-Nihgt"}, "did you mean 'LuSEE-Night'"),
+    ({"site": 3.0}, "longitude and latitude"),
+    ({"site": (0.0, 95.0)}, "lat_deg"),
+    ({"turntable_deg": [0.0, 1.0]}, "one for each of 5 times"),
+    ({"frequency_mhz": -1.0}, "frequency_mhz must be positive"),
+    ({"frequency_mhz": 25e6}, "is this Hz"),
+    ({"data": columns(PAIRS)[:1], "times": TIMES[:1]}, "give step_s"),
+]
+
+
+@pytest.mark.parametrize(("options", "words"), WRONG)
 def test_what_is_wrong_is_said_in_a_sentence(options, words):
     refuse(words, make, **options)
 

@@ -52,16 +52,16 @@ def test_every_sample_is_in_its_place(tmp_path):
     assert observation.step_s == 7200.0 and observation.turntable_deg == (0.0,)
 
 
-@pytest.mark.parametrize(
-    ("lunar_day", "first"),
-    [
-        ("CY2027", "2027-01-01T01:00:00.000"),  # luseepy begins them at one o'clock
-        ("CY27", "2027-01-01T01:00:00.000"),
-        ("FY27", "2026-10-01T00:00:00.000"),
-        ("FY2027", "2026-10-01T00:00:00.000"),
-        ("2027-02-01 13:00:00 to 2027-04-01", "2027-02-01T13:00:00.000"),
-    ],
-)
+RANGES = [
+    ("CY2027", "2027-01-01T01:00:00.000"),  # luseepy begins them at one o'clock
+    ("CY27", "2027-01-01T01:00:00.000"),
+    ("FY27", "2026-10-01T00:00:00.000"),
+    ("FY2027", "2026-10-01T00:00:00.000"),
+    ("2027-02-01 13:00:00 to 2027-04-01", "2027-02-01T13:00:00.000"),
+]
+
+
+@pytest.mark.parametrize(("lunar_day", "first"), RANGES)
 def test_ranges_of_time(tmp_path, lunar_day, first):
     path = write(tmp_path / "w.fits", header=HEADER | {"LUNAR_DAY": lunar_day})
     observation = read_waterfall(path).observation
@@ -104,23 +104,23 @@ def test_any_subset_and_order_of_products(tmp_path):
     assert np.isnan(grid[place["11R"]]).all()
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"header": {k: v for k, v in HEADER.items() if k != "DELTAT_SEC"}}, "no DELTAT_SEC"),
-        ({"header": HEADER | {"LUNAR_DAY": "tomorrow"}}, "LUNAR_DAY 'tomorrow' is not a date"),
-        ({"header": HEADER | {"LUNAR_DAY": "CY202"}}, "LUNAR_DAY 'CY202' is not a date to a date"),
-        ({"header": HEADER | {"LUNAR_DAY": 2714}}, "expected a number from 2700, the first"),
-        ({"header": HEADER | {"LUNAR_DAY": 9900}}, "outside the ephemeris"),
-        ({"pairs": [[0, 0], [0, 4]]}, "combinations holds a value outside 0 to 3: 4"),
-        ({"pairs": [[0, 1], [1, 0]]}, "the product 01R is given more than once"),
-        ({"data": np.zeros((12, 15, 2))}, r"data has 15 products, expected 16"),
-        ({"data": np.full((12, 16, 2), np.inf)}, "infinity"),
-        ({"frequencies": (10e6, 20e6)}, "is this Hz"),
-        ({"header": HEADER | {"BUNIT": "V^2/Hz"}}, "unit 'V.2/Hz'"),
-        ({"header": HEADER | {"DELTAT_SEC": -7200.0}}, "DELTAT_SEC is -7200.0, expected"),
-    ],
-)
+UNUSABLE = [
+    ({"header": {k: v for k, v in HEADER.items() if k != "DELTAT_SEC"}}, "no DELTAT_SEC"),
+    ({"header": HEADER | {"LUNAR_DAY": "tomorrow"}}, "LUNAR_DAY 'tomorrow' is not a date"),
+    ({"header": HEADER | {"LUNAR_DAY": "CY202"}}, "LUNAR_DAY 'CY202' is not a date to a date"),
+    ({"header": HEADER | {"LUNAR_DAY": 2714}}, "expected a number from 2700, the first"),
+    ({"header": HEADER | {"LUNAR_DAY": 9900}}, "outside the ephemeris"),
+    ({"pairs": [[0, 0], [0, 4]]}, "combinations holds a value outside 0 to 3: 4"),
+    ({"pairs": [[0, 1], [1, 0]]}, "the product 01R is given more than once"),
+    ({"data": np.zeros((12, 15, 2))}, r"data has 15 products, expected 16"),
+    ({"data": np.full((12, 16, 2), np.inf)}, "infinity"),
+    ({"frequencies": (10e6, 20e6)}, "is this Hz"),
+    ({"header": HEADER | {"BUNIT": "V^2/Hz"}}, "unit 'V.2/Hz'"),
+    ({"header": HEADER | {"DELTAT_SEC": -7200.0}}, "DELTAT_SEC is -7200.0, expected"),
+]
+
+
+@pytest.mark.parametrize(("options", "message"), UNUSABLE)
 def test_files_that_cannot_be_used(tmp_path, options, message):
     refuse(message, read_waterfall, write(tmp_path / "w.fits", **options))
 
@@ -235,18 +235,18 @@ def test_simulate_writes_it_and_map_reads_it(tmp_path):
     assert (tmp_path / "map" / "posterior.nc").is_file()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["-o", "w.fits"], "at least two channels"),
-        (["-o", "w.fits", "--set", "observation.window=mean"], "no room for windows"),
-        (["-o", "data.nc", "--frequencies", "10,20"], "netCDF files hold one frequency"),
-        (["-o", "w.fits", "--frequencies", "20,10"], "expected growing MHz"),
-        (["-o", "w.fits", "--frequencies", "ten"], "expected growing MHz"),
-        (["-o", "w.fits", "--frequencies", "5:50:0"], "expected growing MHz"),
-        (["-o", "w.fits", "--frequencies", "40:60:10"], "frequencies_mhz.2 is 60"),
-    ],
-)
+NOT_WRITTEN = [
+    (["-o", "w.fits"], "at least two channels"),
+    (["-o", "w.fits", "--set", "observation.window=mean"], "no room for windows"),
+    (["-o", "data.nc", "--frequencies", "10,20"], "netCDF files hold one frequency"),
+    (["-o", "w.fits", "--frequencies", "20,10"], "expected growing MHz"),
+    (["-o", "w.fits", "--frequencies", "ten"], "expected growing MHz"),
+    (["-o", "w.fits", "--frequencies", "5:50:0"], "expected growing MHz"),
+    (["-o", "w.fits", "--frequencies", "40:60:10"], "frequencies_mhz.2 is 60"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), NOT_WRITTEN)
 def test_channels_that_cannot_be_written(tmp_path, monkeypatch, capsys, arguments, message):
     monkeypatch.chdir(tmp_path)
     given = ["--set", "lmax=2", "--set", "observation.runs.0.cycles=0.02", "--quiet"]
@@ -321,18 +321,18 @@ backwards = np.array([[2461000.0, 0.5], [2461000.0, 0.7], [2461000.0, 0.6]])
 twice = np.array([[2461000.0, 0.5], [2461000.0, 0.5], [2461000.0, 0.6]])
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"products": ["13I", "13X"]}, "no product '13X'"),
-        ({"products": ["13I", "13I"]}, "the product 13I is given more than once"),
-        ({"products": ["13I", "00R", "11R"]}, r"data has shape \(5, 2, 2\), expected 5 \(time\)"),
-        ({"header": {"BUNIT": "K"}}, r"BUNIT is 'K'; known: V\^2/Hz"),
-        ({"header": {"TIMESYS": "LOCAL"}}, "TIMESYS is 'LOCAL'"),
-        ({"header": {"TIMEUNIT": "s"}}, "TIMEUNIT is 's'"),
-        ({"images": {"time": backwards, "data": np.ones((3, 2, 2))}}, "times must grow"),
-        ({"images": {"time": twice, "data": np.ones((3, 2, 2))}}, "times must grow"),
-    ],
-)
+UNUSABLE_FOUR_PORTS = [
+    ({"products": ["13I", "13X"]}, "no product '13X'"),
+    ({"products": ["13I", "13I"]}, "the product 13I is given more than once"),
+    ({"products": ["13I", "00R", "11R"]}, r"data has shape \(5, 2, 2\), expected 5 \(time\)"),
+    ({"header": {"BUNIT": "K"}}, r"BUNIT is 'K'; known: V\^2/Hz"),
+    ({"header": {"TIMESYS": "LOCAL"}}, "TIMESYS is 'LOCAL'"),
+    ({"header": {"TIMEUNIT": "s"}}, "TIMEUNIT is 's'"),
+    ({"images": {"time": backwards, "data": np.ones((3, 2, 2))}}, "times must grow"),
+    ({"images": {"time": twice, "data": np.ones((3, 2, 2))}}, "times must grow"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), UNUSABLE_FOUR_PORTS)
 def test_four_port_files_that_cannot_be_used(tmp_path, changes, message):
     refuse(message, read_waterfall, four_port(tmp_path / "w.fits", **changes))

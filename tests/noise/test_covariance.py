@@ -139,17 +139,17 @@ def test_bands_of_every_width(width, flagged, small_blocks):
 
 
 # 11 and 44 times make a block row; one gap hides more than a whole block row
+SIZES = [
+    (16, 25, 0, slice(0, 0)),
+    (16, 25, 11, slice(0, 0)),
+    (16, 27, 12, slice(9, 23)),
+    (16, 25, 40, slice(3, 4)),
+    (4, 95, 50, slice(60, 70)),
+]
+
+
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("n_products", "n_times", "width", "gap"),
-    [
-        (16, 25, 0, slice(0, 0)),
-        (16, 25, 11, slice(0, 0)),
-        (16, 27, 12, slice(9, 23)),
-        (16, 25, 40, slice(3, 4)),
-        (4, 95, 50, slice(60, 70)),
-    ],
-)
+@pytest.mark.parametrize(("n_products", "n_times", "width", "gap"), SIZES)
 def test_bands_at_the_blocks_own_size(n_products, n_times, width, gap):
     flags = np.zeros((n_products, n_times), dtype=bool)
     flags[:, gap] = True
@@ -293,28 +293,28 @@ MAKERS = {
 }
 
 
-@pytest.mark.parametrize(
-    ("kind", "entries", "message"),
-    [
-        *(
-            ("diagonal", jnp.array([1.0, bad, 2.0]), r"must be positive, .* first at \(1,\)")
-            for bad in (0.0, -1.0, np.nan, np.inf)
-        ),
-        *(
-            (kind, jnp.float32(entries), "(variance|term|blocks|beams) must be a float64 array")
-            for kind, entries in zip(MAKERS, (jnp.ones(3), UNIT, BLOCKS, BAND, ROOT), strict=True)
-        ),
-        ("dense", UNIT.at[0, 2].set(jnp.nan), r"the gain term holds NaN .*\(0, 2\)"),
-        ("blocks", BLOCKS.at[1, 1, 0].set(jnp.inf), r"noise blocks holds NaN .*\(1, 1, 0\)"),
-        ("banded", BAND.at[1, 1, 0, 1].set(jnp.nan), r"holds NaN .* first at \(1, 1, 0, 1\)"),
-        ("low rank", ROOT.at[3, 1].set(jnp.inf), r"the beams holds NaN or infinity .*\(3, 1\)"),
-        ("blocks", jnp.ones((2, 3, 3)), r"shape \(2, 3, 3\), expected \(3, 2, 2\)"),
-        ("banded", BAND[:2], r"shape \(2, 2, 2, 2\), expected \(3, any, 2, 2\)"),
-        ("dense", UNIT.at[0, 1].set(0.01), r"gain term is not symmetric: .* up to 0\.01 "),
-        ("blocks", BLOCKS.at[1, 0, 1].set(0.1), "not symmetric"),
-        ("banded", BAND.at[2, 0, 0, 1].set(0.5), "within one time is not symmetric: .* 0\\.5 "),
-    ],
-)
+BAD_ENTRIES = [
+    *(
+        ("diagonal", jnp.array([1.0, bad, 2.0]), r"must be positive, .* first at \(1,\)")
+        for bad in (0.0, -1.0, np.nan, np.inf)
+    ),
+    *(
+        (kind, jnp.float32(entries), "(variance|term|blocks|beams) must be a float64 array")
+        for kind, entries in zip(MAKERS, (jnp.ones(3), UNIT, BLOCKS, BAND, ROOT), strict=True)
+    ),
+    ("dense", UNIT.at[0, 2].set(jnp.nan), r"the gain term holds NaN .*\(0, 2\)"),
+    ("blocks", BLOCKS.at[1, 1, 0].set(jnp.inf), r"noise blocks holds NaN .*\(1, 1, 0\)"),
+    ("banded", BAND.at[1, 1, 0, 1].set(jnp.nan), r"holds NaN .* first at \(1, 1, 0, 1\)"),
+    ("low rank", ROOT.at[3, 1].set(jnp.inf), r"the beams holds NaN or infinity .*\(3, 1\)"),
+    ("blocks", jnp.ones((2, 3, 3)), r"shape \(2, 3, 3\), expected \(3, 2, 2\)"),
+    ("banded", BAND[:2], r"shape \(2, 2, 2, 2\), expected \(3, any, 2, 2\)"),
+    ("dense", UNIT.at[0, 1].set(0.01), r"gain term is not symmetric: .* up to 0\.01 "),
+    ("blocks", BLOCKS.at[1, 0, 1].set(0.1), "not symmetric"),
+    ("banded", BAND.at[2, 0, 0, 1].set(0.5), "within one time is not symmetric: .* 0\\.5 "),
+]
+
+
+@pytest.mark.parametrize(("kind", "entries", "message"), BAD_ENTRIES)
 def test_entries_that_no_covariance_has_are_refused(kind, entries, message):
     refuse(message, MAKERS[kind], entries)
 
@@ -394,16 +394,16 @@ def test_the_term_is_t_p_t(prior, matrix):
     assert got.root.shape == (15, 3)
 
 
-@pytest.mark.parametrize(
-    ("templates", "prior", "message"),
-    [
-        (T[:14], VARIANCES, r"the templates has shape \(14, 3\), expected \(15, any\)"),
-        (np.where(np.arange(15)[:, None] == 4, np.nan, T), VARIANCES, r"the templates holds NaN"),
-        (T, np.array([1.0, 0.0, 2.0]), r"prior variance must be positive, .* first at \(1,\)"),
-        (T, np.diag([1.0, -0.5, 2.0]), "prior is not positive definite: .* eigenvalue is -0.5 "),
-        (T, P + np.eye(3, k=1), "the templates' prior is not symmetric: .* up to 1 "),
-        (T, np.full((3, 3), np.inf), "the templates' prior holds NaN or infinity"),
-    ],
-)
+BAD_TEMPLATES = [
+    (T[:14], VARIANCES, r"the templates has shape \(14, 3\), expected \(15, any\)"),
+    (np.where(np.arange(15)[:, None] == 4, np.nan, T), VARIANCES, r"the templates holds NaN"),
+    (T, np.array([1.0, 0.0, 2.0]), r"prior variance must be positive, .* first at \(1,\)"),
+    (T, np.diag([1.0, -0.5, 2.0]), "prior is not positive definite: .* eigenvalue is -0.5 "),
+    (T, P + np.eye(3, k=1), "the templates' prior is not symmetric: .* up to 1 "),
+    (T, np.full((3, 3), np.inf), "the templates' prior holds NaN or infinity"),
+]
+
+
+@pytest.mark.parametrize(("templates", "prior", "message"), BAD_TEMPLATES)
 def test_bad_input_is_refused(templates, prior, message):
     refuse(message, template_noise, jnp.asarray(templates), jnp.asarray(prior), SEEN)

@@ -177,17 +177,16 @@ def test_starting_again_without_resume_is_refused_and_touches_nothing(killed, no
     assert content(killed) == before
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"sampler": replace(SAMPLER, seed=7)}, "another sampler's seed: 1, now 7"),
-        ({"program": "sky_marginal"}, "another program: sky, now sky_marginal"),
-        ({"digest": "0"}, "another program text: "),
-        ({"nside": 4}, "another scenario: "),
-        ({"factor": 1.0 + 1e-9}, "another data: "),
-    ],
-    ids=str,
-)
+ANOTHER_RUN = [
+    ({"sampler": replace(SAMPLER, seed=7)}, "another sampler's seed: 1, now 7"),
+    ({"program": "sky_marginal"}, "another program: sky, now sky_marginal"),
+    ({"digest": "0"}, "another program text: "),
+    ({"nside": 4}, "another scenario: "),
+    ({"factor": 1.0 + 1e-9}, "another data: "),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), ANOTHER_RUN, ids=str)
 def test_resuming_another_run_is_refused_and_the_difference_named(
     experiment, killed, no_sampling, change, message
 ):

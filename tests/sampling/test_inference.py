@@ -209,17 +209,17 @@ def test_the_marginal_program_finds_the_noise_level(gaussian, data, level_grid, 
     assert_mean(np.concatenate([logs, logs**2], -1), np.array(expected), "ln noise level")
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"chains": 0}, "chains must be at least 1, got 0"),
-        ({"warmup": 19}, "warmup must be at least 20, got 19"),
-        ({"draws": 0}, "draws must be at least 1, got 0"),
-        ({"target_accept": 1.0}, r"target_accept must lie in 0..1, got 1.0"),
-        ({"trajectory": 0.0}, "trajectory must be positive, got 0.0"),
-        ({"algorithm": "nut"}, "unknown algorithm 'nut'; did you mean 'nuts'?"),
-    ],
-)
+UNUSABLE = [
+    ({"chains": 0}, "chains must be at least 1, got 0"),
+    ({"warmup": 19}, "warmup must be at least 20, got 19"),
+    ({"draws": 0}, "draws must be at least 1, got 0"),
+    ({"target_accept": 1.0}, r"target_accept must lie in 0..1, got 1.0"),
+    ({"trajectory": 0.0}, "trajectory must be positive, got 0.0"),
+    ({"algorithm": "nut"}, "unknown algorithm 'nut'; did you mean 'nuts'?"),
+]
+
+
+@pytest.mark.parametrize(("settings", "message"), UNUSABLE)
 def test_settings_that_cannot_be_used(settings, message):
     refuse(message, Sampler, **settings)
 

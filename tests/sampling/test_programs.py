@@ -119,24 +119,24 @@ def test_no_such_program(tmp_path):
         assert str(source) in str(error.value) and "sky_marginal" in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("text", "message", "more"),
-    [
-        ("def model(:\n", "fails when it is loaded", "line 1"),
-        ("import nowhere_to_be_found\n", "fails when it is loaded", "nowhere_to_be_found"),
-        ("open('/nonexistent/table.txt')\n", "fails when it is loaded", "/nonexistent/table.txt"),
-        ("assert 1 > 2, 'not so'\n", "fails when it is loaded", "not so"),
-        *(
-            (text, "has no function 'model'", "def model(")
-            for text in ("x = 1\n", "model = 3\n", "def Model(data=None):\n    pass\n")
-        ),
-        ("def model(coupling, prior):\n    pass\n", "has no argument 'data'", "mine.py"),
-        # prior predictive draws need it; better refused now than after the sampling
-        ("def model(coupling, data):\n    pass\n", "data=None", "mine.py"),
-        ("def model(coupling, nois, data=None):\n    pass\n", "asks for 'nois'", "mean 'noise'?"),
-        ("def model(xyz, data=None):\n    pass\n", "asks for 'xyz'", "noise"),
-    ],
-)
+NO_PROGRAMS = [
+    ("def model(:\n", "fails when it is loaded", "line 1"),
+    ("import nowhere_to_be_found\n", "fails when it is loaded", "nowhere_to_be_found"),
+    ("open('/nonexistent/table.txt')\n", "fails when it is loaded", "/nonexistent/table.txt"),
+    ("assert 1 > 2, 'not so'\n", "fails when it is loaded", "not so"),
+    *(
+        (text, "has no function 'model'", "def model(")
+        for text in ("x = 1\n", "model = 3\n", "def Model(data=None):\n    pass\n")
+    ),
+    ("def model(coupling, prior):\n    pass\n", "has no argument 'data'", "mine.py"),
+    # prior predictive draws need it; better refused now than after the sampling
+    ("def model(coupling, data):\n    pass\n", "data=None", "mine.py"),
+    ("def model(coupling, nois, data=None):\n    pass\n", "asks for 'nois'", "mean 'noise'?"),
+    ("def model(xyz, data=None):\n    pass\n", "asks for 'xyz'", "noise"),
+]
+
+
+@pytest.mark.parametrize(("text", "message", "more"), NO_PROGRAMS)
 def test_files_that_are_no_programs(write, text, message, more):
     path = write(text)
     with refused(message) as error:

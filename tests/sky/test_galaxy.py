@@ -279,45 +279,45 @@ def test_frequencies_are_positive(bad):
     refuse("expected positive", SOURCES["Cyg A"].flux_jy, bad)
 
 
-@pytest.mark.parametrize(
-    "name, lon_deg, lat_deg",
-    [
-        ("Cas A", 111.7, -2.1),  # SNR G111.7-2.1 (Green's catalogue)
-        ("Tau A", 184.6, -5.8),  # SNR G184.6-5.8
-        ("Cyg A", 76.19, 5.76),  # SIMBAD, as are those below
-        ("Vir A", 283.78, 74.49),
-        ("Cen A", 309.52, 19.42),
-        ("For A", 240.16, -56.69),
-        ("Her A", 23.05, 28.95),
-        ("Hyd A", 242.93, 25.09),
-        ("Pic A", 251.60, -34.63),
-    ],
-)
+POSITIONS = [
+    ("Cas A", 111.7, -2.1),  # SNR G111.7-2.1 (Green's catalogue)
+    ("Tau A", 184.6, -5.8),  # SNR G184.6-5.8
+    ("Cyg A", 76.19, 5.76),  # SIMBAD, as are those below
+    ("Vir A", 283.78, 74.49),
+    ("Cen A", 309.52, 19.42),
+    ("For A", 240.16, -56.69),
+    ("Her A", 23.05, 28.95),
+    ("Hyd A", 242.93, 25.09),
+    ("Pic A", 251.60, -34.63),
+]
+
+
+@pytest.mark.parametrize("name, lon_deg, lat_deg", POSITIONS)
 def test_galactic_positions(name, lon_deg, lat_deg):
     # Catalogues round to 0.1 degree (Green) or 0.01.
     assert SOURCES[name].galactic() == pytest.approx((lon_deg, lat_deg), abs=0.06)
 
 
-@pytest.mark.parametrize(
-    "name, frequency_mhz, flux_jy, tolerance",
-    [
-        # Baars et al. 1977, table 4, Cyg A: their errors are 5 to 10 %; 15 % at the turnover.
-        ("Cyg A", 38.0, 25500.0, 0.10),
-        ("Cyg A", 25.0, 31500.0, 0.15),
-        ("Cyg A", 20.0, 27000.0, 0.15),
-        ("Cyg A", 10.05, 13500.0, 0.10),
-        # Baars et al. 1977, table 5, at 500 MHz: the two scales differ by less than 10 %.
-        ("Vir A", 500.0, 10 ** (5.023 - 0.856 * np.log10(500.0)), 0.10),
-        ("Her A", 500.0, 10 ** (4.963 - 1.052 * np.log10(500.0)), 0.10),
-        ("Hyd A", 500.0, 10 ** (4.497 - 0.910 * np.log10(500.0)), 0.10),
-        # Cas A, log S = 5.745 - 0.770 log nu in 1980, fading by 0.65 % a year (Reichart &
-        # Stephens 2000, ApJ 537, 904: 0.6 to 0.7 % at all frequencies) to 2016.
-        ("Cas A", 500.0, 10 ** (5.745 - 0.770 * np.log10(500.0)) * 0.9935**36, 0.10),
-        # and 0.66 of Bridle's 28 kJy of 1965 at 10.05 MHz.
-        ("Cas A", 10.05, 18500.0, 0.10),
-        ("Cen A", 408.0, 2740.0, 1e-3),
-    ],
-)
+FLUXES = [
+    # Baars et al. 1977, table 4, Cyg A: their errors are 5 to 10 %; 15 % at the turnover.
+    ("Cyg A", 38.0, 25500.0, 0.10),
+    ("Cyg A", 25.0, 31500.0, 0.15),
+    ("Cyg A", 20.0, 27000.0, 0.15),
+    ("Cyg A", 10.05, 13500.0, 0.10),
+    # Baars et al. 1977, table 5, at 500 MHz: the two scales differ by less than 10 %.
+    ("Vir A", 500.0, 10 ** (5.023 - 0.856 * np.log10(500.0)), 0.10),
+    ("Her A", 500.0, 10 ** (4.963 - 1.052 * np.log10(500.0)), 0.10),
+    ("Hyd A", 500.0, 10 ** (4.497 - 0.910 * np.log10(500.0)), 0.10),
+    # Cas A, log S = 5.745 - 0.770 log nu in 1980, fading by 0.65 % a year (Reichart &
+    # Stephens 2000, ApJ 537, 904: 0.6 to 0.7 % at all frequencies) to 2016.
+    ("Cas A", 500.0, 10 ** (5.745 - 0.770 * np.log10(500.0)) * 0.9935**36, 0.10),
+    # and 0.66 of Bridle's 28 kJy of 1965 at 10.05 MHz.
+    ("Cas A", 10.05, 18500.0, 0.10),
+    ("Cen A", 408.0, 2740.0, 1e-3),
+]
+
+
+@pytest.mark.parametrize("name, frequency_mhz, flux_jy, tolerance", FLUXES)
 def test_published_fluxes(name, frequency_mhz, flux_jy, tolerance):
     assert SOURCES[name].flux_jy(frequency_mhz) == pytest.approx(flux_jy, rel=tolerance)
 

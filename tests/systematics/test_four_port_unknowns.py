@@ -439,16 +439,16 @@ SLOPES = np.repeat([[0.08], [0.07]], 23, axis=1)
 WIDE = Calibration(np.full(23, 1e10), ("a", "b"), np.array([1, 1]), SLOPES)
 
 
-@pytest.mark.parametrize(
-    ("overrides", "calibration", "message"),
-    [
-        ([BARE], None, r"say nothing of a gain table; give noise\.gain_table\.std"),
-        ([BARE], UNNAMED, "give noise.gain_table.std"),
-        ([TABLE % "marginalised"], NAMED, "themselves; leave out noise.gain_table.std"),
-        ([BARE, "flight={gain_std: 0.3}"], None, "flight.gain_std is 0.3, .* give a smaller noise"),
-        ([BARE], WIDE, "of port 1 is known to 0.11 of itself, expected at"),
-    ],
-)
+BAD_TABLES = [
+    ([BARE], None, r"say nothing of a gain table; give noise\.gain_table\.std"),
+    ([BARE], UNNAMED, "give noise.gain_table.std"),
+    ([TABLE % "marginalised"], NAMED, "themselves; leave out noise.gain_table.std"),
+    ([BARE, "flight={gain_std: 0.3}"], None, "flight.gain_std is 0.3, .* give a smaller noise"),
+    ([BARE], WIDE, "of port 1 is known to 0.11 of itself, expected at"),
+]
+
+
+@pytest.mark.parametrize(("overrides", "calibration", "message"), BAD_TABLES)
 def test_tables_that_nobody_or_both_say_or_that_are_hardly_known(
     response_file, overrides, calibration, message
 ):

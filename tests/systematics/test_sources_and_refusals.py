@@ -205,16 +205,16 @@ def test_the_map_command_writes_the_fluxes(tmp_path, capsys):
 # --- sources --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("source", "message"),
-    [
-        ("Cas B", "unknown source 'Cas B'; did you mean 'Cas A'?"),
-        ("Q", "unknown source 'Q'; known: Cas A, Cen A, .*Venus.*ra_deg and dec_deg"),
-        # bodies have no flux in the catalogue
-        ("Jupiter", "'Jupiter' is not in the catalogue.* give flux_jy"),
-        ("mine, ra_deg: 1, dec_deg: 2", "'mine' is not in the catalogue"),
-    ],
-)
+UNKNOWN_SOURCES = [
+    ("Cas B", "unknown source 'Cas B'; did you mean 'Cas A'?"),
+    ("Q", "unknown source 'Q'; known: Cas A, Cen A, .*Venus.*ra_deg and dec_deg"),
+    # bodies have no flux in the catalogue
+    ("Jupiter", "'Jupiter' is not in the catalogue.* give flux_jy"),
+    ("mine, ra_deg: 1, dec_deg: 2", "'mine' is not in the catalogue"),
+]
+
+
+@pytest.mark.parametrize(("source", "message"), UNKNOWN_SOURCES)
 def test_sources_that_are_not_known(source, message):
     refuse(message, lb.build, small_scenario(f"sources.list=[{{name: {source}}}]"))
 
@@ -229,19 +229,19 @@ def test_sources_that_cannot_be():
 # --- antennas -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("parameters", "message"),
-    [
-        ("{lenght_m: 0.1}", "unknown beam parameter 'lenght_m'; did you mean 'length_m'?"),
-        ("{x: 1}", "unknown beam parameter 'x'; known: deep_permittivity, .*zenith_angle_deg"),
-        # 1 lies 2.7 / 5 standard deviations below: Phi(-0.54) = 29.5 %
-        ("{surface_permittivity: 5}", "surface_permittivity.* 29.5% .*at least 1"),
-        # Phi(-0.1) = 46 %
-        ("{loss_tangent: 0.1}", r"prior of loss_tangent, 0.01 \+- 0.1, has 46.0% .*at least 0"),
-        # 105 / 60 standard deviations to 180 degrees, 75 / 60 to 0: 10.6 % and 4.0 %
-        ("{zenith_angle_deg: 60}", r"prior of zenith_angle_deg, 75 \+- 60, has 14.6% .*at least 0"),
-    ],
-)
+BAD_ANTENNAS = [
+    ("{lenght_m: 0.1}", "unknown beam parameter 'lenght_m'; did you mean 'length_m'?"),
+    ("{x: 1}", "unknown beam parameter 'x'; known: deep_permittivity, .*zenith_angle_deg"),
+    # 1 lies 2.7 / 5 standard deviations below: Phi(-0.54) = 29.5 %
+    ("{surface_permittivity: 5}", "surface_permittivity.* 29.5% .*at least 1"),
+    # Phi(-0.1) = 46 %
+    ("{loss_tangent: 0.1}", r"prior of loss_tangent, 0.01 \+- 0.1, has 46.0% .*at least 0"),
+    # 105 / 60 standard deviations to 180 degrees, 75 / 60 to 0: 10.6 % and 4.0 %
+    ("{zenith_angle_deg: 60}", r"prior of zenith_angle_deg, 75 \+- 60, has 14.6% .*at least 0"),
+]
+
+
+@pytest.mark.parametrize(("parameters", "message"), BAD_ANTENNAS)
 def test_antennas_that_cannot_be_sampled(parameters, message):
     sampled = f"noise.beam.parameters={parameters}", "noise.beam.treatment=sampled"
     for ask in (models.true_values, models.systematics):
@@ -270,15 +270,15 @@ def test_bands_beyond_the_highest_ell():
 # --- programs that do not fit the scenario --------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("program", "overrides", "section"),
-    [
-        ("sources", [], "sources"),
-        ("gains", ["noise.gain.sigma=0.01"], "noise.gain"),
-        ("gain_scales", ["noise.gain.sigma=0.01"], "noise.gain"),
-        ("instrument", ["noise.beam.shift_mhz=4"], "noise.beam"),
-    ],
-)
+COUNTED_TWICE = [
+    ("sources", [], "sources"),
+    ("gains", ["noise.gain.sigma=0.01"], "noise.gain"),
+    ("gain_scales", ["noise.gain.sigma=0.01"], "noise.gain"),
+    ("instrument", ["noise.beam.shift_mhz=4"], "noise.beam"),
+]
+
+
+@pytest.mark.parametrize(("program", "overrides", "section"), COUNTED_TWICE)
 def test_nothing_is_counted_twice(program, overrides, section):
     """What a program samples must not be in N as well."""
     asked = lb.load_program(program)
