@@ -85,14 +85,10 @@ def given(n_data, n_unknowns):
     return DenseCoupling(matrix), matrix
 
 
-@pytest.mark.parametrize(
-    "made",
-    [
-        pytest.param(flagged, id="structured"),
-        pytest.param(lambda: given(9, 16), id="dense"),
-        pytest.param(lambda: given(30, 5), id="tall"),
-    ],
-)
+KINDS = {"structured": flagged, "dense": lambda: given(9, 16), "tall": lambda: given(30, 5)}
+
+
+@pytest.mark.parametrize("made", KINDS.values(), ids=list(KINDS))
 def test_contract(made):
     check_coupling(*made())
 

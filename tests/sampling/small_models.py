@@ -62,10 +62,6 @@ class Case:
         root = np.sqrt(level) * np.linalg.cholesky(n)
         return cls(a, base, n, a @ sky + root @ rng.normal(size=n_data))
 
-    def seen(self) -> np.ndarray:
-        """A S A^T."""
-        return self.a * per_mode(self.base) @ self.a.T
-
     def given(self, amplitude=1.0, tilt=0.0, level=1.0) -> Answer:
         """Textbook posterior of the sky, with the evidence; N times a level."""
         s = np.diag(per_mode(spectrum_of(self.base, amplitude, tilt)))

@@ -50,11 +50,8 @@ def test_mean_and_standard_deviation_of_pixels(gaussian, skies):
     found = pixel_statistics(skies, NSIDE)
     z = (found["mean"] - mean) / (std / np.sqrt(N))
     assert np.abs(z).max() < z_of(n_pixels)
-    ratio = found["std"] / std - 1
-    assert np.abs(ratio).max() < z_of(n_pixels) / np.sqrt(2 * N)
-    of_the_package = np.asarray(posterior.std_of(pixel_matrix(NSIDE, LMAX)))
-    ratio = found["std"] / of_the_package - 1
-    assert np.abs(ratio).max() < z_of(n_pixels) / np.sqrt(2 * N)
+    for expected in (std, np.asarray(posterior.std_of(pixel_matrix(NSIDE, LMAX)))):
+        assert np.abs(found["std"] / expected - 1).max() < z_of(n_pixels) / np.sqrt(2 * N)
 
 
 def test_intervals_of_pixels_are_the_central_gaussian_ones(gaussian, skies):

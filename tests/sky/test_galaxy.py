@@ -255,17 +255,16 @@ def test_bad_input_is_named(given):
     refuse(f"is {given[-1]}, expected .*; (use|give) ", galaxy.galaxy_map, *given)
 
 
+SIZED = {
+    "sky": lambda n: lb.galaxy_sky(25.0, lmax=n),
+    "map": lambda n: galaxy.galaxy_map(25.0, nside=n),
+    "beams": lambda n: lb.monopole_beams(25.0, n),
+    "synthesis": lambda n: modes_to_map(np.zeros(16), n),
+}
+
+
 @pytest.mark.parametrize("value", [-3, 10**12])
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda n: lb.galaxy_sky(25.0, lmax=n),
-        lambda n: galaxy.galaxy_map(25.0, nside=n),
-        lambda n: lb.monopole_beams(25.0, n),
-        lambda n: modes_to_map(np.zeros(16), n),
-    ],
-    ids=["sky", "map", "beams", "synthesis"],
-)
+@pytest.mark.parametrize("call", SIZED.values(), ids=list(SIZED))
 def test_sizes_that_would_end_the_process_are_refused(call, value):
     """healpy's C code aborts for some of them."""
     refuse("expected a whole number", call, value)
