@@ -1,8 +1,10 @@
 """Commands as users give them, and what they leave."""
 
 import csv
+import json
 from pathlib import Path
 
+import matplotlib.image
 import numpy as np
 import xarray as xr
 
@@ -13,6 +15,20 @@ from lusee_bayes.core.files import LOCK
 def run(*arguments: object) -> int:
     """The exit code of a command."""
     return main([str(argument) for argument in arguments])
+
+
+def sets(*overrides: str) -> list[str]:
+    """Overrides of a scenario as options of a command."""
+    return [word for override in overrides for word in ("--set", override)]
+
+
+def judged_map(data: Path, overrides: list[str], out: Path) -> tuple[np.ndarray, dict[str, object]]:
+    """Map data that hold their truth; rho of every ell, and the summary of the channel."""
+    command = ["map", "fiducial", "--data", data, "--truth", "-o", out, "--quiet"]
+    assert run(*command, *sets(*overrides)) == 0
+    rho = np.array([float(row["rho"]) for row in table_of(out / "spectra.csv")])
+    (summary,) = json.loads((out / "summary.json").read_text())["channels"]
+    return rho, summary
 
 
 def refused(capsys, *arguments: object) -> str:
@@ -28,6 +44,12 @@ def content(folder: Path) -> dict[str, bytes]:
     """Of all files but the lock, which nobody holds once its process is killed."""
     found = (path for path in folder.rglob("*") if path.is_file() and path.name != LOCK)
     return {str(path.relative_to(folder)): path.read_bytes() for path in found}
+
+
+def assert_drawn(*figures: Path) -> None:
+    """Assert that pictures are not blank."""
+    for figure in figures:
+        assert matplotlib.image.imread(figure).std() > 0.01, figure
 
 
 def table_of(path: Path) -> list[dict[str, str]]:

@@ -69,6 +69,14 @@ DATA = Path(
 )
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """What is essential is long, before anything is deselected."""
+    for item in items:
+        if item.get_closest_marker("essential"):
+            item.add_marker("long")
+
+
 def pytest_collection_finish():
     """What is there for good, modules and tests, is not looked at by every collection of garbage.
 
@@ -140,6 +148,18 @@ def numbers_alone(monkeypatch):
 
     monkeypatch.setattr(map_run, "MAP", replace(map_run.MAP, figures={}))
     monkeypatch.setattr(folder, "PAGES", {})
+
+
+@pytest.fixture
+def write(tmp_path, request):
+    """Writes a text to a file, by default that of the module; its path."""
+
+    def write(text: str, name: str = getattr(request.module, "WRITTEN", "text")) -> Path:
+        path = tmp_path / name
+        path.write_text(text)
+        return path
+
+    return write
 
 
 @pytest.fixture

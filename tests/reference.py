@@ -1,15 +1,16 @@
 """Slow, obvious physics, written without the package: what its fast code must agree with.
 
-Nothing here imports lusee_bayes. Harmonics come from scipy one (ell, m) at a time, directions from
-lunarsky's LunarTopo frame, reflection from 2 x 2 characteristic matrices, antenna currents from
-vectors in space. Frames and conventions: topocentric x East, y North, z up; theta from the zenith,
-phi from East towards North; packed real modes at ell^2 + ell + m; time convention exp(+i w t).
+Nothing here imports lusee_bayes. Harmonics come from scipy, directions from lunarsky's LunarTopo
+frame, reflection from 2 x 2 characteristic matrices, antenna currents from vectors in space. Frames
+and conventions: topocentric x East, y North, z up; theta from the zenith, phi from East towards
+North; packed real modes at ell^2 + ell + m; time convention exp(+i w t).
 """
 
 import astropy.units as u
 import numpy as np
 from astropy.coordinates import ICRS, CartesianRepresentation, Galactic, get_body_barycentric
 from lunarsky import MCMF, LunarTopo, MoonLocation
+from scipy.integrate import simpson
 from scipy.special import sph_harm_y
 
 SPEED_OF_LIGHT = 299792458.0
@@ -17,22 +18,21 @@ SPEED_OF_LIGHT = 299792458.0
 
 def real_harmonics(theta, phi, lmax):
     """Orthonormal real harmonics, (points, modes), from scipy's complex ones."""
-    columns = []
-    for ell in range(lmax + 1):
-        for m in range(-ell, ell + 1):
-            y = sph_harm_y(ell, abs(m), theta, phi)
-            if m == 0:
-                columns.append(y.real)
-            elif m > 0:
-                columns.append(np.sqrt(2.0) * y.real)
-            else:
-                columns.append(-np.sqrt(2.0) * y.imag)
-    return np.stack(columns, axis=-1)
+    pairs = [(ell, m) for ell in range(lmax + 1) for m in range(-ell, ell + 1)]
+    ell, m = np.array(pairs).T
+    y = sph_harm_y(ell, np.abs(m), np.asarray(theta)[..., None], np.asarray(phi)[..., None])
+    return np.where(m < 0, -y.imag, y.real) * np.where(m == 0, 1.0, np.sqrt(2.0))
 
 
 def vectors(theta, phi):
     """Unit vectors, components last."""
+    theta, phi = np.broadcast_arrays(theta, phi)
     return np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1)
+
+
+def tangents(theta, phi):
+    """Unit vectors along growing theta and along growing phi, components last."""
+    return vectors(theta + np.pi / 2, phi), vectors(np.pi / 2 + 0 * theta, phi + np.pi / 2)
 
 
 def unit_vectors(grid):
@@ -51,11 +51,17 @@ def steep_sky(lmax, seed=0, monopole=1e4):
 
 def hemisphere(n_theta, n_phi):
     """theta, phi and solid angle of directions that cover the hemisphere above the horizon."""
+    return sphere(n_theta, n_phi, lowest=0.0)
+
+
+def sphere(n_theta, n_phi, lowest=-1.0):
+    """The same of the whole sphere, or down to a cosine: Gauss nodes in it, equal steps in phi."""
     x, w = np.polynomial.legendre.leggauss(n_theta)
-    theta = np.arccos((x + 1.0) / 2.0)
+    half = (1.0 - lowest) / 2.0
     phi = 2.0 * np.pi * (np.arange(n_phi) + 0.5) / n_phi
-    theta, phi = (a.ravel() for a in np.meshgrid(theta, phi, indexing="ij"))
-    return theta, phi, np.repeat(w / 2.0, n_phi) * 2.0 * np.pi / n_phi
+    grid = np.meshgrid(np.arccos(1.0 + half * (x - 1.0)), phi, indexing="ij")
+    theta, phi = (a.ravel() for a in grid)
+    return theta, phi, np.repeat(w * half, n_phi) * 2.0 * np.pi / n_phi
 
 
 def galactic_directions(theta, phi, time, lon_deg, lat_deg):
@@ -132,23 +138,17 @@ def arm_response(
     """
     k = 2.0e6 * np.pi * frequency_mhz / SPEED_OF_LIGHT
     s = np.linspace(0.0, length, steps)
-    simpson = np.ones(steps)
-    simpson[1:-1:2], simpson[2:-1:2] = 4.0, 2.0
-    simpson *= (s[1] - s[0]) / 3.0
-    current = np.sin(k * (length - s)) * simpson
-    sin_t, cos_t, sin_p, cos_p = np.sin(theta), np.cos(theta), np.sin(phi), np.cos(phi)
-    n = np.array([sin_t * cos_p, sin_t * sin_p, cos_t])
+    current = np.sin(k * (length - s))
+    n, (e_theta, e_phi) = vectors(theta, phi), tangents(theta, phi)
     mirrored = n * np.array([1.0, 1.0, -1.0])
-    e_theta = np.array([cos_t * cos_p, cos_t * sin_p, -sin_t])
-    e_phi = np.array([-sin_p, cos_p, 0.0])
     r_s, r_p = reflection
     # H of the theta wave is horizontal and scales by p; E = H x (direction of travel)
     reflected_theta = -r_p * e_theta * np.array([1.0, 1.0, -1.0])
     reflected_phi = r_s * e_phi
-    detour = np.exp(-2j * k * height * cos_t)
+    detour = np.exp(-2j * k * height * n[2])
     answers = []
     for direct, reflected in ((e_theta, reflected_theta), (e_phi, reflected_phi)):
         wave = (arm @ direct) * np.exp(1j * k * s * (arm @ n))
         echo = (arm @ reflected) * np.exp(1j * k * s * (arm @ mirrored)) * detour
-        answers.append(np.sum(current * (wave + echo)))
+        answers.append(simpson(current * (wave + echo), x=s))
     return tuple(answers)

@@ -16,12 +16,11 @@ from pathlib import Path
 
 import healpy
 import jax
-import matplotlib.image
 import numpy as np
 import pytest
 import xarray as xr
 from astropy.io import fits
-from commands import content, posterior_of, refused, run, sky_draws_of, table_of
+from commands import assert_drawn, content, posterior_of, refused, run, sky_draws_of, table_of
 from rich.console import Console
 
 import lusee_bayes
@@ -51,9 +50,8 @@ def test_map_writes_what_it_promises(folder):
     files = "posterior.nc mean.fits mean_alm.fits std.fits truth.fits residual.fits spectra.csv "
     files += "summary.json scenario.yaml diagnostics.nc report.html figures manifest.json"
     assert {p.name for p in folder.iterdir()} == {*files.split(), "provenance.json"}
-    for figure in ("maps", "data_vector", "beams", "fidelity", "spectra", "draws", "residuals"):
-        image = matplotlib.image.imread(folder / "figures" / f"{figure}.png")
-        assert image.std() > 0.01  # not blank
+    names = ("maps", "data_vector", "beams", "fidelity", "spectra", "draws", "residuals")
+    assert_drawn(*(folder / "figures" / f"{name}.png" for name in names))
 
 
 def test_the_files_agree_with_each_other(folder):
@@ -103,7 +101,6 @@ def test_headers_say_where_the_numbers_come_from(folder):
             assert healpy.read_map(folder / f"{name}.fits", dtype=None).dtype.itemsize == 8
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_simulate_then_map_equals_map(folder, tmp_path, capsys):
     data, scenario = tmp_path / "data.nc", folder / "scenario.yaml"
@@ -207,19 +204,19 @@ def raises(error):
     return fail
 
 
-@pytest.mark.parametrize(
-    ("fail", "code", "words"),
-    [
-        (lambda: signal.raise_signal(signal.SIGTERM), 143, "terminated; no results"),
-        (lambda: signal.raise_signal(signal.SIGHUP), 129, "terminated; no results"),
-        (raises(MemoryError("Unable to allocate 8 TiB")), 1, "not enough memory (Unable to alloc"),
-        (raises(RuntimeError("RESOURCE_EXHAUSTED: Out of memory")), 1, "not enough memory (RES"),
-        (raises(RuntimeError("can't start new thread")), 1, "not enough memory (can't start"),
-        (raises(OSError(errno.ENOSPC, "No space left on device")), 1, "mean.fits'); results"),
-        (raises(OSError("Can't write data (errno = 28, error message = ..)")), 1, "mean.fits')"),
-        (raises(OSError("Not enough space on disk: requested 839168")), 1, "mean.fits'); results"),
-    ],
-)
+ENDINGS = [
+    (lambda: signal.raise_signal(signal.SIGTERM), 143, "terminated; no results"),
+    (lambda: signal.raise_signal(signal.SIGHUP), 129, "terminated; no results"),
+    (raises(MemoryError("Unable to allocate 8 TiB")), 1, "not enough memory (Unable to alloc"),
+    (raises(RuntimeError("RESOURCE_EXHAUSTED: Out of memory")), 1, "not enough memory (RES"),
+    (raises(RuntimeError("can't start new thread")), 1, "not enough memory (can't start"),
+    (raises(OSError(errno.ENOSPC, "No space left on device")), 1, "mean.fits'); results"),
+    (raises(OSError("Can't write data (errno = 28, error message = ..)")), 1, "mean.fits')"),
+    (raises(OSError("Not enough space on disk: requested 839168")), 1, "mean.fits'); results"),
+]
+
+
+@pytest.mark.parametrize(("fail", "code", "words"), ENDINGS)
 def test_what_ends_a_run_is_one_sentence_and_leaves_nothing(
     small_map, tmp_path, monkeypatch, capsys, fail, code, words
 ):
@@ -304,14 +301,14 @@ def test_tables_fit_eighty_columns(finished):
     assert max(map(len, printed(checks_table([check])))) <= 80
 
 
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        (lambda d: d + 1.0, "other values at the same times"),
-        (lambda d: 4e-24 * d, "the same data in another unit (times 4e-24)"),
-        (lambda d: np.where(np.arange(d.shape[1]) > 3, d, np.nan), "samples instead of"),
-    ],
-)
+OTHER_DATA = [
+    (lambda d: d + 1.0, "other values at the same times"),
+    (lambda d: 4e-24 * d, "the same data in another unit (times 4e-24)"),
+    (lambda d: np.where(np.arange(d.shape[1]) > 3, d, np.nan), "samples instead of"),
+]
+
+
+@pytest.mark.parametrize(("change", "reason"), OTHER_DATA)
 def test_evidences_of_other_data_are_not_compared(finished, change, reason):
     same = with_data(finished, "same", lambda d: d)
     assert evidence_caveat([finished, same]) is None
@@ -408,14 +405,14 @@ def test_help_waits_for_no_library(arguments):
     assert not modules & {"jax", "numpy", "astropy", "healpy", "matplotlib", "xarray", "pydantic"}
 
 
-@pytest.mark.parametrize(
-    ("name", "spared"),
-    [
-        ("posterior.nc", {"jax", "healpy", "matplotlib", "scipy"}),
-        ("diagnostics.nc", {"jax", "healpy", "matplotlib", "scipy"}),
-        ("mean.fits", {"numpyro", "xarray", "lunarsky", "scipy.stats", "healpy", "matplotlib"}),
-    ],
-)
+SPARED = [
+    ("posterior.nc", {"jax", "healpy", "matplotlib", "scipy"}),
+    ("diagnostics.nc", {"jax", "healpy", "matplotlib", "scipy"}),
+    ("mean.fits", {"numpyro", "xarray", "lunarsky", "scipy.stats", "healpy", "matplotlib"}),
+]
+
+
+@pytest.mark.parametrize(("name", "spared"), SPARED)
 def test_info_waits_for_no_more_than_its_file(name, spared, small_map):
     _, modules = outcome("info", small_map.folder / name)
     assert not modules & spared

@@ -18,19 +18,17 @@ from lusee_bayes.core.checks import (
     require_shape,
 )
 
+NO_FLOATS = [
+    (np.ones(3, dtype=np.float32), "an array of float32"),
+    (np.ones(3, dtype=np.int64), "an array of int64"),
+    (np.ones(3, dtype=np.complex128), "an array of complex128"),
+    (np.ones(3, dtype=bool), "an array of bool"),
+    ([1.0], "a list"),
+    (1.0, "a float"),
+]
 
-@pytest.mark.parametrize(
-    ("value", "got"),
-    [
-        (np.ones(3, dtype=np.float32), "an array of float32"),
-        (np.ones(3, dtype=np.int64), "an array of int64"),
-        (np.ones(3, dtype=np.complex128), "an array of complex128"),
-        (np.ones(3, dtype=bool), "an array of bool"),
-        ([1.0], "a list"),
-        (1.0, "a float"),
-    ],
-    ids=str,
-)
+
+@pytest.mark.parametrize(("value", "got"), NO_FLOATS, ids=str)
 def test_only_arrays_of_float64_are_accepted(value, got):
     refuse(f"the beam must be a float64 array, got {got}", require_float64, "the beam", value)
     for right in (np.ones(2), jnp.ones(2), np.float64(1.0)):

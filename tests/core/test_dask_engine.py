@@ -122,7 +122,6 @@ def test_lack_of_memory_or_disk_is_tried_again(engine, tmp_path):
     assert len(list(tmp_path.glob("10-*"))) == 4
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_a_task_whose_worker_dies_is_done_again_elsewhere(engine, tmp_path):
     def die(k):

@@ -117,15 +117,15 @@ def test_one_worker_is_this_process_which_needs_no_dask(monkeypatch):
         refuse("need Dask; install it with pip", opened, **given)
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"workers": 2, "cluster": "tcp://x:1"}, "give one"),
-        ({"workers": 12}, "12 workers need about 1.* GB of memory; this machine has .*: use fewer"),
-        ({"cluster": "nonsense:x"}, "no Dask scheduler answers at 'nonsense:x' .* as tcp://"),
-        ({"cluster": "tls://127.0.0.1:1"}, "no Dask scheduler answers .*TLS"),
-    ],
-)
+NOT_STARTED = [
+    ({"workers": 2, "cluster": "tcp://x:1"}, "give one"),
+    ({"workers": 12}, "12 workers need about 1.* GB of memory; this machine has .*: use fewer"),
+    ({"cluster": "nonsense:x"}, "no Dask scheduler answers at 'nonsense:x' .* as tcp://"),
+    ({"cluster": "tls://127.0.0.1:1"}, "no Dask scheduler answers .*TLS"),
+]
+
+
+@pytest.mark.parametrize(("given", "message"), NOT_STARTED)
 def test_what_cannot_be_started_is_refused(given, message):
     pytest.importorskip("distributed")
     refuse(message, opened, replace(DEMAND, task_bytes=1e13), **given)

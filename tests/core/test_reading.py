@@ -41,21 +41,21 @@ def test_what_is_declared_comes_back_in_its_kind():
     assert found.values == {"step": 2.0} and found.sizes == {"time": 3, "product": 2}
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"times": None}, "x: .*no times|x has no times"),
-        ({"data": np.ones((2, 2))}, r"data has shape \(2, 2\), expected 3"),
-        ({"data": np.ones(3)}, r"data has shape \(3,\)"),
-        ({"data": np.full((3, 2), np.nan)}, "data holds"),
-        ({"data": -np.ones((3, 2))}, "data"),
-        ({"data": np.array([["a", "b"]] * 3)}, "data"),
-        ({"data": np.ones((3, 2), dtype=complex)}, "data"),
-        ({"times": np.array([0.0, 2.0, 1.0])}, "times"),
-        ({"names": np.array(["a", "z"])}, "names"),
-        ({"flags": np.array([0, 1, 2])}, "flags"),
-    ],
-)
+NOT_AS_DECLARED = [
+    ({"times": None}, "x: .*no times|x has no times"),
+    ({"data": np.ones((2, 2))}, r"data has shape \(2, 2\), expected 3"),
+    ({"data": np.ones(3)}, r"data has shape \(3,\)"),
+    ({"data": np.full((3, 2), np.nan)}, "data holds"),
+    ({"data": -np.ones((3, 2))}, "data"),
+    ({"data": np.array([["a", "b"]] * 3)}, "data"),
+    ({"data": np.ones((3, 2), dtype=complex)}, "data"),
+    ({"times": np.array([0.0, 2.0, 1.0])}, "times"),
+    ({"names": np.array(["a", "z"])}, "names"),
+    ({"flags": np.array([0, 1, 2])}, "flags"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), NOT_AS_DECLARED)
 def test_what_is_not_as_declared_is_said(changes, message):
     refuse(message, LAYOUT.checked, "x", arrays(**changes), {"step": 2.0})
 
@@ -162,16 +162,16 @@ def test_numbers_are_decimal_and_dates_are_text(text, value):
     assert (type(found), found) == (type(value), value)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("a: 1\nb: 2\na: 3", r"duplicate key \"a\".* \(line 3\)"),
-        ("[" * 500 + "]" * 500, "is not valid YAML"),
-        ("a: [1", "is not valid YAML"),
-        ("!!python/object:os.system {}", "is not valid YAML"),
-        ("a\0b", "is not valid YAML"),
-    ],
-)
+NO_YAML = [
+    ("a: 1\nb: 2\na: 3", r"duplicate key \"a\".* \(line 3\)"),
+    ("[" * 500 + "]" * 500, "is not valid YAML"),
+    ("a: [1", "is not valid YAML"),
+    ("!!python/object:os.system {}", "is not valid YAML"),
+    ("a\0b", "is not valid YAML"),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), NO_YAML)
 def test_what_is_not_valid_is_refused(text, message):
     refuse(message, reading.parse_yaml, text, "the text")
 

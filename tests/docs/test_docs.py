@@ -100,9 +100,8 @@ def test_the_commands_of_the_readme_run(tmp_path, monkeypatch, no_figures):
     blocks = FENCES.findall((ROOT / "README.md").read_text())
     lines = "".join(text for kind, text in blocks if kind == "sh").splitlines()
     # what only a shell does comes before the first command: the environment is activated
-    assert lines.index(". .venv/bin/activate") < min(
-        k for k, line in enumerate(lines) if line.startswith("lusee-bayes")
-    )
+    commands = [k for k, line in enumerate(lines) if line.startswith("lusee-bayes")]
+    assert lines.index(". .venv/bin/activate") < min(commands)
     for line in lines:
         if line.startswith("lusee-bayes"):
             run_command(line)
@@ -183,7 +182,6 @@ def applied(text: str, how: str, line: str, code: str) -> str:
     return "".join([*lines[:first], code, *lines[rest:]])
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_the_worked_examples_pass_their_tests(tmp_path):
     for folder in ("lusee_bayes", "models"):

@@ -1,7 +1,5 @@
 """A against integrals over the sky, rows and rotations; and A of antennas that vary."""
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -64,13 +62,11 @@ def test_visibilities_agree_with_an_integral_over_the_sky_in_lunartopo(lmax, tur
     e = np.array(voltages)  # (antenna, direction, component)
     power = np.einsum("idc,jdc->ijd", e, e.conj()) / 2
     power /= np.mean([np.sum(power[i, i].real * solid_angle) for i in range(4)])
-    response = np.array(
-        [getattr(power[int(x[0]), int(x[1])], {"R": "real", "I": "imag"}[x[2]]) for x in labels()]
-    )
+    parts = {"R": np.real, "I": np.imag}
+    response = np.array([parts[x[2]](power[int(x[0]), int(x[1])]) for x in labels()])
+    site = {**SITE, "turntable_deg": turntable}
     for k in np.random.default_rng(2).integers(0, o.n_times, 3):
-        expected = visibilities(
-            response, grid, np.asarray(sky), o.times[k], **SITE, turntable_deg=turntable
-        )
+        expected = visibilities(response, grid, np.asarray(sky), o.times[k], **site)
         # Simpson with 120 steps along the arm, (k h)^4 / 180 = 1e-10, and the neglected tilts
         close(got[:, k], expected, 5e-9)
 
@@ -89,14 +85,10 @@ def given(n_data, n_unknowns):
     return DenseCoupling(matrix), matrix
 
 
-@pytest.mark.parametrize(
-    "made",
-    [
-        pytest.param(flagged, id="structured"),
-        pytest.param(lambda: given(9, 16), id="dense"),
-        pytest.param(lambda: given(30, 5), id="tall"),
-    ],
-)
+KINDS = {"structured": flagged, "dense": lambda: given(9, 16), "tall": lambda: given(30, 5)}
+
+
+@pytest.mark.parametrize("made", KINDS.values(), ids=list(KINDS))
 def test_contract(made):
     check_coupling(*made())
 
@@ -200,13 +192,9 @@ PLACED = {
 
 
 def test_a_of_placed_antennas_is_that_of_antennas_built_so(instrument, pointing, layout):
-    antennas = Monopoles(
-        Regolith(3.5, 6.5, 0.02),
-        length_m=3.1,
-        height_m=1.7,
-        zenith_angle_deg=73.0,
-        azimuths_deg=np.array([90.0, 0.0, -90.0, 180.0]) + 5.0,
-    )
+    geometry = {"length_m": 3.1, "height_m": 1.7, "zenith_angle_deg": 73.0}
+    geometry["azimuths_deg"] = np.array([90.0, 0.0, -90.0, 180.0]) + 5.0
+    antennas = Monopoles(Regolith(3.5, 6.5, 0.02), **geometry)
     beams = lb.monopole_beams(FREQUENCY, LOW, antennas)
     expected = np.asarray(lb.CouplingMatrix.build(beams, pointing, layout).dense())
     placed = {name: jnp.asarray(value) for name, value in PLACED.items()}
@@ -261,10 +249,8 @@ def test_the_amplitude_of_a_beam_error(instrument, base):
         mixed = ProductBeams((1 - amplitude) * own.modes + amplitude * other.modes, FREQUENCY)
         expected = instrument.coupling_of(mixed)
         # linear in the beams, as a product and as a matrix
-        scale = np.abs(np.asarray(expected @ sky)).max()
-        np.testing.assert_allclose(model.coupling @ sky, expected @ sky, rtol=0, atol=1e-12 * scale)
-        dense = np.asarray(expected.dense())
-        close(model.coupling.dense(), dense, 1e-13)
+        close(model.coupling @ sky, expected @ sky, 1e-12)
+        close(model.coupling.dense(), expected.dense(), 1e-13)
         fn = trace["beam_amplitude"]["fn"]
         assert float(fn.log_prob(amplitude)) == pytest.approx(norm.logpdf(amplitude))
 

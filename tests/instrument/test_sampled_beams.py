@@ -1,7 +1,5 @@
 """Beams of one's own: sampled from known patterns, they give the known beams and visibilities."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 
@@ -12,7 +10,7 @@ import pytest
 import xarray as xr
 from assertions import close, refuse
 from astropy.io import fits
-from reference import unit_vectors
+from reference import tangents, unit_vectors, vectors
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, from_rings
@@ -82,16 +80,10 @@ def test_short_dipoles_have_their_closed_form(kind):
 
     class Dipoles:
         def towards(self, _, theta, phi):
-            theta, phi = np.broadcast_arrays(theta, phi)
-            axes = (
-                np.stack(
-                    [np.cos(theta) * np.cos(phi), np.cos(theta) * np.sin(phi), -np.sin(theta)]
-                ),
-                np.stack([-np.sin(phi), np.cos(phi), 0.0 * phi]),
-            )
-            n = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+            along = [np.moveaxis(axis, -1, 0) for axis in tangents(theta, phi)]
+            n = np.moveaxis(vectors(theta, phi), -1, 0)
             phase = np.exp(1j * k * np.tensordot(places, n, 1))
-            return tuple(np.tensordot(arms, axis, 1) * phase for axis in axes)
+            return tuple(np.tensordot(arms, axis, 1) * phase for axis in along)
 
     made = lb.sampled_beams(FREQUENCY, **KINDS[kind](Dipoles()), absolute=True)
     grid = HemisphereGrid.gauss_legendre(12, 20)
@@ -104,11 +96,8 @@ def test_short_dipoles_have_their_closed_form(kind):
     patterns = made.patterns(FREQUENCY, grid)
     assert np.abs(patterns - expected).max() < AT_HORIZON * np.abs(expected).max()
     # turned by an angle, the pattern at phi is the old one at phi - angle
-    steps = 3
-    turned = replace(made, turntable_offset_deg=steps * 360.0 / grid.n_phi).patterns(
-        FREQUENCY, grid
-    )
-    assert np.abs(turned - np.roll(patterns, steps, axis=-1)).max() < 1e-10 * np.abs(expected).max()
+    turned = replace(made, turntable_offset_deg=3 * 360.0 / grid.n_phi).patterns(FREQUENCY, grid)
+    assert np.abs(turned - np.roll(patterns, 3, axis=-1)).max() < 1e-10 * np.abs(expected).max()
 
 
 def test_rings_go_through_the_zenith():
@@ -124,22 +113,16 @@ def test_rings_go_through_the_zenith():
     aliased = 2 * (4 * np.sqrt(2 / 3) / NSIDE / 2) ** 3 / 6
     assert np.abs(found - expected).max() < BETWEEN + aliased
     # a real function stays real
-    np.testing.assert_allclose(
-        from_rings(np.where(UP, wave(THETA, PHI).real, 0.0), theta, phi), found.real, atol=1e-12
-    )
+    real = from_rings(np.where(UP, wave(THETA, PHI).real, 0.0), theta, phi)
+    np.testing.assert_allclose(real, found.real, atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_sampled_beams_keep_the_contract(kind):
     source = replace(lb.sampled_beams(FREQUENCY, **embedded(kind)), turntable_offset_deg=5.0)
-    check_beam_source(
-        source,
-        replace(source, turntable_offset_deg=35.0),
-        turned_deg=30.0,
-        frequency_mhz=FREQUENCY,
-        lmax=LMAX,
-        quadrature=SPLINES,
-    )
+    turned = replace(source, turntable_offset_deg=35.0)
+    sizes = {"frequency_mhz": FREQUENCY, "lmax": LMAX, "quadrature": SPLINES}
+    check_beam_source(source, turned, turned_deg=30.0, **sizes)
 
 
 def test_the_scale_is_the_autos_or_the_files():
@@ -232,21 +215,21 @@ def nan_at_the_zenith():
     return given
 
 
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        (lambda: {"e_theta": np.zeros((4, 48))}, "give e_theta and e_phi, or products"),
-        (lambda: embedded("grid") | {"phi_deg": None}, "give both theta_deg and phi_deg"),
-        (lambda: embedded("grid") | {"phi_deg": PHI_DEG + 1.0}, "expected 360 k / n"),
-        (lambda: embedded("grid") | {"theta_deg": THETA_DEG / 2}, "to the horizon"),
-        (lambda: embedded("grid") | {"theta_deg": THETA_DEG[::-1]}, "theta_deg does not grow"),
-        (lambda: embedded("grid") | {"e_phi": np.zeros((3, 31, 60))}, "e_phi has shape"),
-        (lambda: {"products": np.zeros((16, 50))}, "no HEALPix map"),
-        (lambda: {"products": np.zeros((5, 48))}, "5 products do not come from"),
-        (lambda: {"products": np.zeros((16, 48), dtype=complex)}, "type complex128, expected real"),
-        (nan_at_the_zenith, "NaN or infinity in 1 of"),
-    ],
-)
+NO_BEAMS = [
+    (lambda: {"e_theta": np.zeros((4, 48))}, "give e_theta and e_phi, or products"),
+    (lambda: embedded("grid") | {"phi_deg": None}, "give both theta_deg and phi_deg"),
+    (lambda: embedded("grid") | {"phi_deg": PHI_DEG + 1.0}, "expected 360 k / n"),
+    (lambda: embedded("grid") | {"theta_deg": THETA_DEG / 2}, "to the horizon"),
+    (lambda: embedded("grid") | {"theta_deg": THETA_DEG[::-1]}, "theta_deg does not grow"),
+    (lambda: embedded("grid") | {"e_phi": np.zeros((3, 31, 60))}, "e_phi has shape"),
+    (lambda: {"products": np.zeros((16, 50))}, "no HEALPix map"),
+    (lambda: {"products": np.zeros((5, 48))}, "5 products do not come from"),
+    (lambda: {"products": np.zeros((16, 48), dtype=complex)}, "type complex128, expected real"),
+    (nan_at_the_zenith, "NaN or infinity in 1 of"),
+]
+
+
+@pytest.mark.parametrize(("given", "words"), NO_BEAMS)
 def test_arrays_that_are_no_beams_are_refused(given, words):
     refuse(words, lb.sampled_beams, FREQUENCY, **given())
 

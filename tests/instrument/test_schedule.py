@@ -3,7 +3,7 @@ from datetime import datetime, timedelta
 import astropy.units as u
 import numpy as np
 import pytest
-from assertions import refuse, refused, within
+from assertions import refuse, within
 from astropy.time import Time
 from reference import is_dark
 
@@ -23,14 +23,7 @@ start, end, turntable_deg, duty_cycle, night_only
 """
 
 
-@pytest.fixture
-def write(tmp_path):
-    def write(text, name="schedule.csv"):
-        path = tmp_path / name
-        path.write_text(text)
-        return path
-
-    return write
+WRITTEN = "schedule.csv"
 
 
 def schedule(seed, n=5, **options):
@@ -76,14 +69,11 @@ def test_intervals_are_cut_as_by_a_loop(seed, step_s):
     at = seconds(o, origin)
     # dates in two doubles, and sums of days in seconds: a nanosecond
     np.testing.assert_allclose(at, (start + end) / 2.0, rtol=0, atol=1e-8)
-    within(at[:, None] + o.windows.bounds_s, np.stack([start, end], 1), 1e-8)  # fmt: skip
+    within(at[:, None] + o.windows.bounds_s, np.stack([start, end], 1), 1e-8)
     np.testing.assert_allclose(o.live_s, [w[2] for w in expected], rtol=0, atol=1e-8)
     np.testing.assert_array_equal(o.run, [w[3] for w in expected])
-    assert [o.turntable_deg[w[3]] for w in expected] == [
-        one.turntable_deg
-        for one in intervals
-        for _ in range(one.n_samples(step_s))
-    ]  # fmt: skip
+    angles = [one.turntable_deg for one in intervals for _ in range(one.n_samples(step_s))]
+    assert [o.turntable_deg[w[3]] for w in expected] == angles
 
 
 def test_instants_begin_before_the_end():
@@ -97,8 +87,8 @@ def test_instants_begin_before_the_end():
     assert o.windows is None
     assert (o.live_s == 7200.0).all()
     half = [Interval("2027-01-15", "2027-01-16", duty_cycle=0.5)]
-    with refused(r"no duty cycle; take windows \(observation.window=mean\)"):
-        lb.Observation.from_schedule(half, window="instant")
+    words = r"no duty cycle; take windows \(observation.window=mean\)"
+    refuse(words, lb.Observation.from_schedule, half, window="instant")
 
 
 @pytest.mark.parametrize("window", ["instant", "mean"])
@@ -108,16 +98,14 @@ def test_runs_are_a_schedule(window, step_s):
     counts, angles = (10, 7, 12), (0.0, 30.0, -15.0)
     month = CYCLE_DAYS * 86400.0
     runs = [Run((n + 0.5) * step_s / month, a) for n, a in zip(counts, angles, strict=True)]
-    site = {"lon_deg": 10.0, "lat_deg": 20.0}
-    expected = lb.Observation.from_runs(
-        runs, start="2027-02-01T00:00:00", step_s=step_s, window=window, **site
-    )
+    given = {"lon_deg": 10.0, "lat_deg": 20.0, "step_s": step_s, "window": window}
+    expected = lb.Observation.from_runs(runs, start="2027-02-01T00:00:00", **given)
     at, intervals = datetime(2027, 2, 1), []
     for n, angle in zip(counts, angles, strict=True):
         end = at + timedelta(seconds=n * step_s)
         intervals.append(Interval(at.isoformat(), end.isoformat(), angle))
         at = end + timedelta(seconds=0.5 * step_s)
-    got = lb.Observation.from_schedule(intervals, step_s=step_s, window=window, **site)
+    got = lb.Observation.from_schedule(intervals, **given)
     # lengths in cycles are rounded, to 1e-16 of 1e5 seconds, and so are differences of dates
     apart = (got.times - expected.times).to_value(u.s)
     np.testing.assert_allclose(apart, 0.0, rtol=0, atol=1e-8)
@@ -126,14 +114,15 @@ def test_runs_are_a_schedule(window, step_s):
     assert (got.lon_deg, got.lat_deg) == (expected.lon_deg, expected.lat_deg)
     np.testing.assert_allclose(got.live_s, expected.live_s, rtol=0, atol=1e-8)
     if window == "mean":
-        within(got.windows.bounds_s, expected.windows.bounds_s, 1e-8)  # fmt: skip
+        within(got.windows.bounds_s, expected.windows.bounds_s, 1e-8)
 
 
 def test_windows_at_night_are_dark_from_end_to_end():
     step_s, lon, lat = 40000.0, 182.258, -23.814
     dates = [("2027-01-14T00:00:00", "2027-01-31T00:00:00"), ("2027-02-01", "2027-02-16")]
     intervals = [Interval(*pair, night_only=True) for pair in dates]
-    o = lb.Observation.from_schedule(intervals, step_s=step_s, lon_deg=lon, lat_deg=lat)
+    given = {"step_s": step_s, "lon_deg": lon, "lat_deg": lat}
+    o = lb.Observation.from_schedule(intervals, **given)
     windows = naive(intervals, step_s)
     start, end = (Time([w[k] for w in windows]) for k in (0, 1))
     middle = start + (end - start) / 2.0
@@ -144,12 +133,10 @@ def test_windows_at_night_are_dark_from_end_to_end():
     apart = (o.times - middle[expected]).to_value(u.s)
     np.testing.assert_allclose(apart, 0.0, rtol=0, atol=1e-8)
     by_day = [Interval(*dates[0], night_only=True), Interval(*dates[1])]
-    mixed = lb.Observation.from_schedule(by_day, step_s=step_s, lon_deg=lon, lat_deg=lat)
+    mixed = lb.Observation.from_schedule(by_day, **given)
     second = start >= Time("2027-02-01")
     assert mixed.n_times == (expected | second).sum()
-    instants = lb.Observation.from_schedule(
-        intervals, step_s=step_s, lon_deg=lon, lat_deg=lat, window="instant"
-    )
+    instants = lb.Observation.from_schedule(intervals, window="instant", **given)
     assert instants.n_times == dark[0].sum()
 
 
@@ -173,27 +160,27 @@ def test_a_table_in_csv(write):
 HEADER = "start,end,turntable_deg,duty_cycle,night_only\n"
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "schedule.csv cannot be read as a schedule"),
-        (f"# nights\n{HEADER}", "schedule.csv: a schedule needs at least one interval"),
-        ("start,end,turntable_deg,duty\n", "has the columns .*duty; a schedule has"),
-        ("start,end,end,turntable_deg\n", "has the columns start, end, end.1, turntable_deg; a"),
-        (f"{HEADER}2027-01-01,2027-01-02,0,1,false,5\n", "rows have more entries than the header"),
-        (f"{HEADER}\nsoon,2027-01-02,0,1,false\n", "row 1: start 'soon' is not a date; write it"),
-        (f"{HEADER}2027-01-01,61050.8,0,1,false\n", "row 1: end '61050.8' is not a date; write"),
-        (f"{HEADER}1827-01-01,2027-01-02,0,1,false\n", "outside the ephemeris .*: 1827"),
-        (f"{HEADER}2027-01-02,2027-01-01,0,1,false\n", "row 1: end 2027-01-01 does not come aft"),
-        (f"{HEADER}2027-01-01,2027-01-03,0,1,\n2027-01-02,2027-01-04,0,1,\n", "begins 86400 s b"),
-        (f"{HEADER}2027-01-05,2027-01-06,0,1,\n2027-01-01,2027-01-02,0,1,\n", "row 2.*; sort"),
-        (f"{HEADER}2027-01-01,2027-01-02,0,1.5,false\n", "row 1: duty_cycle is 1.5; give the fra"),
-        (f"{HEADER}2027-01-01,2027-01-02,0,half,\n", "row 1: duty_cycle is 'half', not a number"),
-        (f"{HEADER}2027-01-01,2027-01-02,,1,\n", "row 1: turntable_deg is '', not a number"),
-        (f"{HEADER}2027-01-01,2027-01-02,inf,1,\n", "row 1: turntable_deg is inf; give an angle"),
-        (f"{HEADER}2027-01-01,2027-01-02,0,1,1\n", "row 1: night_only is '1'; write true or false"),
-    ],
-)
+BAD_TABLES = [
+    ("", "schedule.csv cannot be read as a schedule"),
+    (f"# nights\n{HEADER}", "schedule.csv: a schedule needs at least one interval"),
+    ("start,end,turntable_deg,duty\n", "has the columns .*duty; a schedule has"),
+    ("start,end,end,turntable_deg\n", "has the columns start, end, end.1, turntable_deg; a"),
+    (f"{HEADER}2027-01-01,2027-01-02,0,1,false,5\n", "rows have more entries than the header"),
+    (f"{HEADER}\nsoon,2027-01-02,0,1,false\n", "row 1: start 'soon' is not a date; write it"),
+    (f"{HEADER}2027-01-01,61050.8,0,1,false\n", "row 1: end '61050.8' is not a date; write"),
+    (f"{HEADER}1827-01-01,2027-01-02,0,1,false\n", "outside the ephemeris .*: 1827"),
+    (f"{HEADER}2027-01-02,2027-01-01,0,1,false\n", "row 1: end 2027-01-01 does not come aft"),
+    (f"{HEADER}2027-01-01,2027-01-03,0,1,\n2027-01-02,2027-01-04,0,1,\n", "begins 86400 s b"),
+    (f"{HEADER}2027-01-05,2027-01-06,0,1,\n2027-01-01,2027-01-02,0,1,\n", "row 2.*; sort"),
+    (f"{HEADER}2027-01-01,2027-01-02,0,1.5,false\n", "row 1: duty_cycle is 1.5; give the fra"),
+    (f"{HEADER}2027-01-01,2027-01-02,0,half,\n", "row 1: duty_cycle is 'half', not a number"),
+    (f"{HEADER}2027-01-01,2027-01-02,,1,\n", "row 1: turntable_deg is '', not a number"),
+    (f"{HEADER}2027-01-01,2027-01-02,inf,1,\n", "row 1: turntable_deg is inf; give an angle"),
+    (f"{HEADER}2027-01-01,2027-01-02,0,1,1\n", "row 1: night_only is '1'; write true or false"),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), BAD_TABLES)
 def test_bad_tables_are_refused(write, text, message):
     refuse(message, read_schedule, write(text))
 
@@ -201,10 +188,11 @@ def test_bad_tables_are_refused(write, text, message):
 def test_an_interval_without_a_night_is_refused(write):
     # the Sun is up for two weeks from 1 February 2027 at this site
     text = f"{HEADER}2027-01-16,2027-01-17,0,1,true\n2027-02-05,2027-02-07,0,1,true\n"
-    with refused(r"schedule.csv, row 2 holds no lunar night; lengthen it"):
-        lb.Observation.from_schedule(read_schedule(write(text)))
+    observe = lb.Observation.from_schedule
+    words = "schedule.csv, row 2 holds no lunar night; lengthen it"
+    refuse(words, observe, read_schedule(write(text)))
     unnamed = [Interval("2027-02-05", "2027-02-07", night_only=True)]
-    refuse("interval 0 holds no lunar night", lb.Observation.from_schedule, unnamed)
+    refuse("interval 0 holds no lunar night", observe, unnamed)
 
 
 # a table as those of OpSim, with the states that its simulator adds
@@ -241,19 +229,19 @@ def test_a_command_table_of_opsim(write):
     assert lb.Observation.from_schedule(intervals).n_runs == 1
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "comtable.yml is no command table of OpSim: expected numbered entries"),
-        ("1: [\n", "comtable.yml is not valid YAML"),
-        ("1: {start: 61050.8}\n", "entry 1: a command table of OpSim has a start .* and a mode"),
-        ("1:\n  start: noon\n  mode: science\n", "entry 1: a command table of OpSim has a start"),
-        ("1: {start: 2461050.8, mode: science}\n", "entry 1: sample times run outside the ephemer"),
-        ("1: {start: 61051, mode: science}\n2: {start: 61050, mode: maint}\n", "entry 2.*; sort"),
-        ("1: {start: 61050.8, mode: maint}\n", "comtable.yml: a schedule needs at least one"),
-        ("1: {start: 61050, mode: maint}\n2: {start: 61051, mode: science}\n", "2.* has no end"),
-    ],
-)
+BAD_COMMANDS = [
+    ("", "comtable.yml is no command table of OpSim: expected numbered entries"),
+    ("1: [\n", "comtable.yml is not valid YAML"),
+    ("1: {start: 61050.8}\n", "entry 1: a command table of OpSim has a start .* and a mode"),
+    ("1:\n  start: noon\n  mode: science\n", "entry 1: a command table of OpSim has a start"),
+    ("1: {start: 2461050.8, mode: science}\n", "entry 1: sample times run outside the ephemer"),
+    ("1: {start: 61051, mode: science}\n2: {start: 61050, mode: maint}\n", "entry 2.*; sort"),
+    ("1: {start: 61050.8, mode: maint}\n", "comtable.yml: a schedule needs at least one"),
+    ("1: {start: 61050, mode: maint}\n2: {start: 61051, mode: science}\n", "2.* has no end"),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), BAD_COMMANDS)
 def test_bad_command_tables_are_refused(write, text, message):
     refuse(message, read_schedule, write(text, "comtable.yml"))
 

@@ -11,17 +11,12 @@ from scipy.signal import hilbert
 from scipy.special import eval_legendre
 
 import lusee_bayes as lb
+from lusee_bayes.instrument.beams import monopoles as mp
 from lusee_bayes.instrument.beams.fields import STOKES
-from lusee_bayes.instrument.beams.monopoles import (
-    Monopoles,
-    Regolith,
-    beams_towards,
-    source_response,
-)
 from lusee_bayes.instrument.products import to_matrix
 
 FREQUENCY = 25.0
-SHORT = Monopoles(Regolith(1.0, 1.0, 0.0), length_m=1e-3, zenith_angle_deg=90.0)  # free space
+SHORT = mp.Monopoles(mp.Regolith(1.0, 1.0, 0.0), length_m=1e-3, zenith_angle_deg=90.0)  # free space
 ZENITH = np.array([[0.0, 0.0, 1.0]])
 
 
@@ -36,7 +31,7 @@ N_TIMES = 228
 def towards(frequency, directions, monopoles=None, stokes="I"):
     """The beams in up to N_TIMES directions, by the one program that serves all samples, too."""
     repeated = np.resize(directions, (N_TIMES, 3))
-    beams = beams_towards(frequency, repeated, monopoles, stokes=stokes)
+    beams = mp.beams_towards(frequency, repeated, monopoles, stokes=stokes)
     return np.asarray(beams)[:, : len(directions)]
 
 
@@ -48,7 +43,7 @@ def towards(frequency, directions, monopoles=None, stokes="I"):
 def test_their_integrals_with_harmonics_are_the_modes(stokes):
     lmax = 8
     theta, phi, solid_angle = hemisphere(160, 48)
-    beams = np.asarray(beams_towards(FREQUENCY, vectors(theta, phi), stokes=stokes))
+    beams = np.asarray(mp.beams_towards(FREQUENCY, vectors(theta, phi), stokes=stokes))
     got = (beams * solid_angle) @ real_harmonics(theta, phi, lmax)
     expected = np.asarray(lb.monopole_beams(FREQUENCY, lmax, stokes=stokes).modes)
     # both sums over Gauss nodes have converged (test_monopoles.py: 1e-12 at 25 MHz)
@@ -73,9 +68,9 @@ def test_gradients_are_finite_and_right_with_sources_below_the_horizon():
 
     @eqx.filter_jit
     def f(monopoles, directions):
-        return jnp.sum(weights * beams_towards(FREQUENCY, directions, monopoles))
+        return jnp.sum(weights * mp.beams_towards(FREQUENCY, directions, monopoles))
 
-    m = Monopoles()
+    m = mp.Monopoles()
     slopes = eqx.filter_grad(f)(m, jnp.asarray(directions))
     leaves = jax.tree.leaves(slopes)
     assert len(leaves) == len(jax.tree.leaves(m))
@@ -83,12 +78,8 @@ def test_gradients_are_finite_and_right_with_sources_below_the_horizon():
         # true of no NaN either
         assert 1e-6 < np.abs(np.asarray(leaf)).max() < 1e6
     h = 1e-4
-    up, down = (
-        float(
-            f(eqx.tree_at(lambda x: x.height_m, m, jnp.asarray(2.0 + s)), jnp.asarray(directions))
-        )
-        for s in (h, -h)
-    )
+    moved = (eqx.tree_at(lambda x: x.height_m, m, jnp.asarray(2.0 + s)) for s in (h, -h))
+    up, down = (float(f(antennas, jnp.asarray(directions))) for antennas in moved)
     # third derivative of order (2 k)^3 = 1: h^2; rounding 1e-15 / h
     assert float(slopes.height_m) == pytest.approx((up - down) / (2 * h), rel=1e-6, abs=1e-9)
     hidden = eqx.filter_grad(f)(m, jnp.asarray(directions[[2, 2, 3, 3]]))
@@ -105,7 +96,7 @@ def test_gradients_are_finite_and_right_with_sources_below_the_horizon():
 
 def test_the_frequency_may_be_traced():
     directions = vectors(np.array([0.3, 1.2]), np.array([0.1, 2.0]))
-    many = jax.lax.map(lambda f: beams_towards(f, directions), jnp.asarray([20.0, 25.0]))
+    many = jax.lax.map(lambda f: mp.beams_towards(f, directions), jnp.asarray([20.0, 25.0]))
     for one, frequency in zip(many, (20.0, 25.0), strict=True):
         np.testing.assert_allclose(one, towards(frequency, directions), rtol=0, atol=1e-13)
 
@@ -113,7 +104,6 @@ def test_the_frequency_may_be_traced():
 # --- polarisation
 
 
-@pytest.mark.essential
 @pytest.mark.parametrize("stokes_v", [1.0, -1.0])
 def test_a_field_that_turns_in_time(stokes_v):
     """A real field turns around; the arms' real voltages are correlated as a correlator does.
@@ -192,15 +182,10 @@ def test_a_smoothed_source_agrees_with_the_coupling_matrix():
     def integral(turntable):
         # every sample once for each direction, microseconds apart: the Moon turns by 3e-9 meanwhile
         apart = np.tile(1e-6 * np.arange(len(n)), o.n_times)
-        copies = lb.Observation(
-            o.lon_deg,
-            o.lat_deg,
-            Time(np.repeat(o.times.jd, len(n)), format="jd", scale="utc") + apart * u.s,
-            np.repeat(o.run, len(n)),
-            turntable,
-            o.step_s,
-        )
-        each = source_response(copies, np.tile(n, (o.n_times, 1)), FREQUENCY)
+        times = Time(np.repeat(o.times.jd, len(n)), format="jd", scale="utc") + apart * u.s
+        run = np.repeat(o.run, len(n))
+        copies = lb.Observation(o.lon_deg, o.lat_deg, times, run, turntable, o.step_s)
+        each = mp.source_response(copies, np.tile(n, (o.n_times, 1)), FREQUENCY)
         return np.asarray(each).reshape(16, o.n_times, len(n)) @ weights
 
     scale = np.abs(expected).max()
@@ -218,10 +203,10 @@ def test_a_smoothed_source_agrees_with_the_coupling_matrix():
 def test_a_moving_source_is_a_fixed_one_at_every_sample():
     o = observation()
     path = vectors(np.linspace(0.5, 2.5, o.n_times), np.linspace(0.0, 5.0, o.n_times))
-    moving = np.asarray(source_response(o, path, FREQUENCY))
+    moving = np.asarray(mp.source_response(o, path, FREQUENCY))
     assert o.n_times == N_TIMES
     for k in (0, 34, o.n_times - 1):
-        fixed = np.asarray(source_response(o, path[k], FREQUENCY))
+        fixed = np.asarray(mp.source_response(o, path[k], FREQUENCY))
         np.testing.assert_array_equal(moving[:, k], fixed[:, k])
 
 
@@ -229,11 +214,11 @@ def test_the_circularly_polarised_part_enters_by_the_v_beam():
     o = observation()
     galactic = o.zenith_galactic()[24]
     intensity, half = (
-        np.asarray(source_response(o, galactic, FREQUENCY, stokes_v=v)) for v in (0.0, 0.5)
+        np.asarray(mp.source_response(o, galactic, FREQUENCY, stokes_v=v)) for v in (0.0, 0.5)
     )
-    circular = beams_towards(FREQUENCY, o.antenna_directions(galactic), stokes="V")
+    circular = mp.beams_towards(FREQUENCY, o.antenna_directions(galactic), stokes="V")
     np.testing.assert_allclose(half - intensity, 0.5 * circular, rtol=0, atol=1e-15)
-    slope = jax.grad(lambda v: jnp.sum(source_response(o, galactic, FREQUENCY, stokes_v=v)[2]))(
+    slope = jax.grad(lambda v: jnp.sum(mp.source_response(o, galactic, FREQUENCY, stokes_v=v)[2]))(
         jnp.asarray(0.0)
     )
     assert float(slope) == pytest.approx(float(circular[2].sum()), rel=1e-12)
@@ -242,25 +227,12 @@ def test_the_circularly_polarised_part_enters_by_the_v_beam():
 # --- bad input
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ((0.0, ZENITH), "frequency_mhz must be positive, got 0.0"),
-        ((25.0, 1.1 * ZENITH), "must be unit vectors, number 0 has length 1.1; divide"),
-    ],
-)
-def test_bad_directions_are_refused(arguments, message):
-    refuse(message, beams_towards, *arguments)
-
-
-@pytest.mark.parametrize(
-    ("galactic", "options", "message"),
-    [
-        (ZENITH[0], {"stokes_v": -1.5}, "from -1 to 1, got -1.5"),
-        (ZENITH[0], {"stokes_v": float("nan")}, "from -1 to 1, got nan"),
-        (2.0 * ZENITH[0], {}, "must be unit vectors, number 0 has length 2"),
-        (np.zeros((2, 3)), {}, "galactic has shape"),
-    ],
-)
-def test_bad_sources_are_refused(galactic, options, message):
-    refuse(message, source_response, observation(), galactic, FREQUENCY, **options)
+def test_bad_directions_and_sources_are_refused():
+    o, towards, response = observation(), mp.beams_towards, mp.source_response
+    refuse("frequency_mhz must be positive, got 0.0", towards, 0.0, ZENITH)
+    refuse("unit vectors, number 0 has length 1.1; divide", towards, FREQUENCY, 1.1 * ZENITH)
+    for bad in (-1.5, np.nan):
+        words = f"from -1 to 1, got {bad}"
+        refuse(words, response, o, ZENITH[0], FREQUENCY, stokes_v=bad)
+    refuse("unit vectors, number 0 has length 2", response, o, 2.0 * ZENITH[0], FREQUENCY)
+    refuse("galactic has shape", response, o, np.zeros((2, 3)), FREQUENCY)

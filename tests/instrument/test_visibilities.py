@@ -1,7 +1,5 @@
 """Data sets: on disk, from arrays of any order and sign, with gaps, product by product."""
 
-from __future__ import annotations
-
 from datetime import UTC, datetime, timedelta, timezone
 
 import jax.numpy as jnp
@@ -12,15 +10,7 @@ from assertions import close, refuse
 from astropy.time import Time
 
 import lusee_bayes as lb
-from lusee_bayes.instrument.products import (
-    DataLayout,
-    Product,
-    all_products,
-    auto_indices,
-    labels,
-    to_matrix,
-    to_real,
-)
+from lusee_bayes.instrument import products as pr
 from lusee_bayes.instrument.visibilities import read_visibilities
 
 
@@ -29,7 +19,7 @@ def data():
     observation = lb.Observation.from_runs([lb.Run(0.05), lb.Run(0.03, turntable_deg=30.0)])
     rng = np.random.default_rng(0)
     flags = rng.random((16, observation.n_times)) < 0.1
-    layout = DataLayout.from_flags(flags)
+    layout = pr.DataLayout.from_flags(flags)
     values = jnp.asarray(rng.standard_normal(layout.size))
     return lb.Visibilities(values, layout, observation, 25.0, jnp.asarray(rng.standard_normal(9)))
 
@@ -42,9 +32,8 @@ def test_round_trip_is_exact(data, tmp_path):
     np.testing.assert_array_equal(again.observation.run, data.observation.run)
     assert again.observation.turntable_deg == (0.0, 30.0) and again.frequency_mhz == 25.0
     # orientations, the only use of the times, are the same to the last bit
-    np.testing.assert_array_equal(
-        again.observation.mcmf_from_galactic, data.observation.mcmf_from_galactic
-    )
+    there, here = (d.observation.mcmf_from_galactic for d in (data, again))
+    np.testing.assert_array_equal(here, there)
 
 
 def altered(change):
@@ -56,20 +45,20 @@ def altered(change):
     return write
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda d: d["visibility"].values.fill(np.nan), "visibility .where not flagged. holds NaN"),
-        (lambda d: d["flag"].values.fill(True), "all .* samples are flagged"),
-        (lambda d: d.attrs.update(format="other"), "its format is 'other'"),
-        (lambda d: d.assign_coords(product=d["product"].values[::-1]), "has products 33R, 23I"),
-        (lambda d: d.attrs.update(step_s=-1.0), "step_s is -1.0, expected a number from 0"),
-        (lambda d: d.attrs.update(frequency_mhz=25e6), "is this Hz"),
-        (lambda d: d["visibility"].attrs.update(units="Jy"), "unit"),
-        (lambda d: d["jd1"].attrs.update(scale="lunar"), "scale"),
-        (lambda d: d["jd2"].attrs.update(scale="tt"), "different scales"),
-    ],
-)
+BAD_FILES = [
+    (lambda d: d["visibility"].values.fill(np.nan), "visibility .where not flagged. holds NaN"),
+    (lambda d: d["flag"].values.fill(True), "all .* samples are flagged"),
+    (lambda d: d.attrs.update(format="other"), "its format is 'other'"),
+    (lambda d: d.assign_coords(product=d["product"].values[::-1]), "has products 33R, 23I"),
+    (lambda d: d.attrs.update(step_s=-1.0), "step_s is -1.0, expected a number from 0"),
+    (lambda d: d.attrs.update(frequency_mhz=25e6), "is this Hz"),
+    (lambda d: d["visibility"].attrs.update(units="Jy"), "unit"),
+    (lambda d: d["jd1"].attrs.update(scale="lunar"), "scale"),
+    (lambda d: d["jd2"].attrs.update(scale="tt"), "different scales"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), BAD_FILES)
 def test_bad_files_are_refused(data, tmp_path, change, message):
     path = tmp_path / "bad.nc"
     altered(change)(data, path)
@@ -146,9 +135,8 @@ def test_any_order_of_products_and_of_their_ports():
     made = make(columns(pairs), products=[f"{i}{j}" for i, j in pairs])
     np.testing.assert_array_equal(made.grid(), expected())
     # the other convention: every array is the conjugate, and said so once
-    made = make(
-        columns(pairs).conj(), products=[f"{i}-{j}" for i, j in pairs], convention="conj(s_i) s_j"
-    )
+    names = [f"{i}-{j}" for i, j in pairs]
+    made = make(columns(pairs).conj(), products=names, convention="conj(s_i) s_j")
     np.testing.assert_array_equal(made.grid(), expected())
 
 
@@ -183,19 +171,18 @@ def test_flags_nan_and_products_without_a_column_are_absent():
     np.testing.assert_array_equal(autos.grid()[[0, 15]], expected()[[0, 15]])
 
 
-@pytest.mark.parametrize(
-    "times",
-    [
-        [t.isoformat() for t in TIMES],
-        [t.isoformat() + "Z" for t in TIMES],
-        [t.replace(tzinfo=UTC).astimezone(timezone(timedelta(hours=-7))) for t in TIMES],
-        np.array(TIMES, dtype="datetime64[s]"),
-        pd.DatetimeIndex(TIMES),
-        pd.DatetimeIndex(TIMES, tz="UTC").tz_convert("Asia/Tokyo"),
-        Time([t.isoformat() for t in TIMES], scale="utc").tdb,
-    ],
-    ids=["iso", "iso-z", "zone", "datetime64", "pandas", "pandas-zone", "tdb"],
-)
+ANY_KIND = {
+    "iso": [t.isoformat() for t in TIMES],
+    "iso-z": [t.isoformat() + "Z" for t in TIMES],
+    "zone": [t.replace(tzinfo=UTC).astimezone(timezone(timedelta(hours=-7))) for t in TIMES],
+    "datetime64": np.array(TIMES, dtype="datetime64[s]"),
+    "pandas": pd.DatetimeIndex(TIMES),
+    "pandas-zone": pd.DatetimeIndex(TIMES, tz="UTC").tz_convert("Asia/Tokyo"),
+    "tdb": Time([t.isoformat() for t in TIMES], scale="utc").tdb,
+}
+
+
+@pytest.mark.parametrize("times", ANY_KIND.values(), ids=list(ANY_KIND))
 def test_times_of_any_kind(times):
     observation = make(times=times).observation
     # the day is kept apart, so that rounding is that of a day in double precision
@@ -213,41 +200,41 @@ def test_angles_are_runs_and_sites_are_places(tmp_path):
     assert again.observation.turntable_deg == (0.0, 30.0, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"products": ["00", "01"]}, "shape"),
-        ({"data": columns(PAIRS).T}, "transpose"),
-        ({"data": "text"}, "not an array of numbers"),
-        ({"data": [1.0, 2.0]}, "expected (times, products)"),
-        ({"products": ["0a"] * 10}, "unknown product '0a'"),
-        ({"products": ["04"] * 10}, "port 4"),
-        ({"products": ["01R"] * 10}, "the data are complex"),
-        ({"data": expected().T, "products": ["01"] * 16}, "name the part"),
-        ({"data": expected().T, "products": ["00I"] * 16}, "an auto is real"),
-        ({"products": ["00"] * 10}, "more than once"),
-        ({"data": columns([(0, 1), (1, 0)]), "products": ["01", "10"]}, "01R is given more than"),
-        ({"products": "00"}, "give a list"),
-        ({"products": [f"{3 - i}{3 - j}" for i, j in PAIRS[1:]] + ["33"]}, "check the names"),
-        ({"convention": "s_i conj(s_i)"}, "did you mean 's_i conj(s_j)'"),
-        ({"data": np.full((N, 10), np.inf + 0j)}, "infinity"),
-        ({"flags": np.zeros(3, dtype=bool)}, "flags have shape"),
-        ({"flags": np.full(N, 0.5)}, "other values than true and false"),
-        ({"flags": np.ones(N, dtype=bool)}, "nothing to map"),
-        ({"times": TIMES[:3]}, "3 times for data of 5 times"),
-        ({"times": TIMES[::-1]}, "times must grow"),
-        ({"times": ["yesterday"] * N}, "is not a date"),
-        ({"times": np.arange(N)}, "give datetimes"),
-        ({"times": [t.replace(year=2060) for t in TIMES]}, "ephemeris"),
-        ({"site": "Lusee-Nihgt"}, "did you mean 'LuSEE-Night'"),
-        ({"site": 3.0}, "longitude and latitude"),
-        ({"site": (0.0, 95.0)}, "lat_deg"),
-        ({"turntable_deg": [0.0, 1.0]}, "one for each of 5 times"),
-        ({"frequency_mhz": -1.0}, "frequency_mhz must be positive"),
-        ({"frequency_mhz": 25e6}, "is this Hz"),
-        ({"data": columns(PAIRS)[:1], "times": TIMES[:1]}, "give step_s"),
-    ],
-)
+WRONG = [
+    ({"products": ["00", "01"]}, "shape"),
+    ({"data": columns(PAIRS).T}, "transpose"),
+    ({"data": "text"}, "not an array of numbers"),
+    ({"data": [1.0, 2.0]}, "expected (times, products)"),
+    ({"products": ["0a"] * 10}, "unknown product '0a'"),
+    ({"products": ["04"] * 10}, "port 4"),
+    ({"products": ["01R"] * 10}, "the data are complex"),
+    ({"data": expected().T, "products": ["01"] * 16}, "name the part"),
+    ({"data": expected().T, "products": ["00I"] * 16}, "an auto is real"),
+    ({"products": ["00"] * 10}, "more than once"),
+    ({"data": columns([(0, 1), (1, 0)]), "products": ["01", "10"]}, "01R is given more than"),
+    ({"products": "00"}, "give a list"),
+    ({"products": [f"{3 - i}{3 - j}" for i, j in PAIRS[1:]] + ["33"]}, "check the names"),
+    ({"convention": "s_i conj(s_i)"}, "did you mean 's_i conj(s_j)'"),
+    ({"data": np.full((N, 10), np.inf + 0j)}, "infinity"),
+    ({"flags": np.zeros(3, dtype=bool)}, "flags have shape"),
+    ({"flags": np.full(N, 0.5)}, "other values than true and false"),
+    ({"flags": np.ones(N, dtype=bool)}, "nothing to map"),
+    ({"times": TIMES[:3]}, "3 times for data of 5 times"),
+    ({"times": TIMES[::-1]}, "times must grow"),
+    ({"times": ["yesterday"] * N}, "is not a date"),
+    ({"times": np.arange(N)}, "give datetimes"),
+    ({"times": [t.replace(year=2060) for t in TIMES]}, "ephemeris"),
+    ({"site": "Lusee-Nihgt"}, "did you mean 'LuSEE-Night'"),
+    ({"site": 3.0}, "longitude and latitude"),
+    ({"site": (0.0, 95.0)}, "lat_deg"),
+    ({"turntable_deg": [0.0, 1.0]}, "one for each of 5 times"),
+    ({"frequency_mhz": -1.0}, "frequency_mhz must be positive"),
+    ({"frequency_mhz": 25e6}, "is this Hz"),
+    ({"data": columns(PAIRS)[:1], "times": TIMES[:1]}, "give step_s"),
+]
+
+
+@pytest.mark.parametrize(("options", "words"), WRONG)
 def test_what_is_wrong_is_said_in_a_sentence(options, words):
     refuse(words, make, **options)
 
@@ -262,7 +249,7 @@ FLAGS[:, 3] = True
 
 @pytest.mark.parametrize("flags", [np.zeros((3, 5), dtype=bool), FLAGS])
 def test_flagged_samples_are_not_in_the_data(flags):
-    layout = DataLayout.from_flags(flags)
+    layout = pr.DataLayout.from_flags(flags)
     # the positions by a loop in the order of d
     expected = [(p, t) for p in range(3) for t in range(5) if not flags[p, t]]
     assert list(zip(layout.product, layout.time, strict=True)) == expected
@@ -275,7 +262,7 @@ def test_flagged_samples_are_not_in_the_data(flags):
 @pytest.mark.parametrize("rest", [(), (2,)])
 @pytest.mark.parametrize("flags", [None, FLAGS])
 def test_scatter_is_the_transpose_of_gather(flags, rest):
-    layout = DataLayout(3, 5) if flags is None else DataLayout.from_flags(flags)
+    layout = pr.DataLayout(3, 5) if flags is None else pr.DataLayout.from_flags(flags)
     rng = np.random.default_rng(1)
     grid = rng.standard_normal((3, 5, *rest))
     data = rng.standard_normal((layout.size, *rest))
@@ -303,14 +290,14 @@ def hermitian(rng, n, *rest):
 
 
 def test_labels_are_those_of_luseepy():
-    assert list(labels()) == LUSEEPY
-    assert all_products()[4] == Product(0, 2, "I")
-    assert [LUSEEPY[k] for k in auto_indices()] == ["00R", "11R", "22R", "33R"]
+    assert list(pr.labels()) == LUSEEPY
+    assert pr.all_products()[4] == pr.Product(0, 2, "I")
+    assert [LUSEEPY[k] for k in pr.auto_indices()] == ["00R", "11R", "22R", "33R"]
 
 
 def test_each_product_is_the_entry_its_label_names():
     v = hermitian(np.random.default_rng(1), 4)
-    got = to_real(jnp.asarray(v))
+    got = pr.to_real(jnp.asarray(v))
     for label, value in zip(LUSEEPY, got, strict=True):
         entry = v[int(label[0]), int(label[1])]
         assert value == (entry.real if label[2] == "R" else entry.imag)
@@ -320,10 +307,10 @@ def test_each_product_is_the_entry_its_label_names():
 @pytest.mark.parametrize("n", [1, 2, 4])
 def test_matrix_and_products_are_inverse(n, rest):
     v = hermitian(np.random.default_rng(2), n, *rest)
-    products = to_real(jnp.asarray(v))
+    products = pr.to_real(jnp.asarray(v))
     assert products.shape == (n * n, *rest)
-    back = np.asarray(to_matrix(products))
+    back = np.asarray(pr.to_matrix(products))
     # a copy of numbers: exact, except that autos lose an imaginary rounding error
     close(back, v, 1e-14)
     np.testing.assert_array_equal(back, back.conj().swapaxes(0, 1))
-    np.testing.assert_array_equal(to_real(jnp.asarray(back)), products)
+    np.testing.assert_array_equal(pr.to_real(jnp.asarray(back)), products)

@@ -1,9 +1,5 @@
 """Waterfalls of luseepy's simulator: its own file, and synthetic ones with gaps and odd orders."""
 
-from __future__ import annotations
-
-import csv
-import json
 from dataclasses import replace
 
 import astropy.units as u
@@ -13,6 +9,7 @@ import pytest
 from assertions import refuse, refused
 from astropy.io import fits
 from astropy.time import Time, TimeDelta
+from commands import judged_map
 from fits_files import write_images
 
 import lusee_bayes as lb
@@ -55,16 +52,16 @@ def test_every_sample_is_in_its_place(tmp_path):
     assert observation.step_s == 7200.0 and observation.turntable_deg == (0.0,)
 
 
-@pytest.mark.parametrize(
-    ("lunar_day", "first"),
-    [
-        ("CY2027", "2027-01-01T01:00:00.000"),  # luseepy begins them at one o'clock
-        ("CY27", "2027-01-01T01:00:00.000"),
-        ("FY27", "2026-10-01T00:00:00.000"),
-        ("FY2027", "2026-10-01T00:00:00.000"),
-        ("2027-02-01 13:00:00 to 2027-04-01", "2027-02-01T13:00:00.000"),
-    ],
-)
+RANGES = [
+    ("CY2027", "2027-01-01T01:00:00.000"),  # luseepy begins them at one o'clock
+    ("CY27", "2027-01-01T01:00:00.000"),
+    ("FY27", "2026-10-01T00:00:00.000"),
+    ("FY2027", "2026-10-01T00:00:00.000"),
+    ("2027-02-01 13:00:00 to 2027-04-01", "2027-02-01T13:00:00.000"),
+]
+
+
+@pytest.mark.parametrize(("lunar_day", "first"), RANGES)
 def test_ranges_of_time(tmp_path, lunar_day, first):
     path = write(tmp_path / "w.fits", header=HEADER | {"LUNAR_DAY": lunar_day})
     observation = read_waterfall(path).observation
@@ -107,23 +104,23 @@ def test_any_subset_and_order_of_products(tmp_path):
     assert np.isnan(grid[place["11R"]]).all()
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"header": {k: v for k, v in HEADER.items() if k != "DELTAT_SEC"}}, "no DELTAT_SEC"),
-        ({"header": HEADER | {"LUNAR_DAY": "tomorrow"}}, "LUNAR_DAY 'tomorrow' is not a date"),
-        ({"header": HEADER | {"LUNAR_DAY": "CY202"}}, "LUNAR_DAY 'CY202' is not a date to a date"),
-        ({"header": HEADER | {"LUNAR_DAY": 2714}}, "expected a number from 2700, the first"),
-        ({"header": HEADER | {"LUNAR_DAY": 9900}}, "outside the ephemeris"),
-        ({"pairs": [[0, 0], [0, 4]]}, "combinations holds a value outside 0 to 3: 4"),
-        ({"pairs": [[0, 1], [1, 0]]}, "the product 01R is given more than once"),
-        ({"data": np.zeros((12, 15, 2))}, r"data has 15 products, expected 16"),
-        ({"data": np.full((12, 16, 2), np.inf)}, "infinity"),
-        ({"frequencies": (10e6, 20e6)}, "is this Hz"),
-        ({"header": HEADER | {"BUNIT": "V^2/Hz"}}, "unit 'V.2/Hz'"),
-        ({"header": HEADER | {"DELTAT_SEC": -7200.0}}, "DELTAT_SEC is -7200.0, expected"),
-    ],
-)
+UNUSABLE = [
+    ({"header": {k: v for k, v in HEADER.items() if k != "DELTAT_SEC"}}, "no DELTAT_SEC"),
+    ({"header": HEADER | {"LUNAR_DAY": "tomorrow"}}, "LUNAR_DAY 'tomorrow' is not a date"),
+    ({"header": HEADER | {"LUNAR_DAY": "CY202"}}, "LUNAR_DAY 'CY202' is not a date to a date"),
+    ({"header": HEADER | {"LUNAR_DAY": 2714}}, "expected a number from 2700, the first"),
+    ({"header": HEADER | {"LUNAR_DAY": 9900}}, "outside the ephemeris"),
+    ({"pairs": [[0, 0], [0, 4]]}, "combinations holds a value outside 0 to 3: 4"),
+    ({"pairs": [[0, 1], [1, 0]]}, "the product 01R is given more than once"),
+    ({"data": np.zeros((12, 15, 2))}, r"data has 15 products, expected 16"),
+    ({"data": np.full((12, 16, 2), np.inf)}, "infinity"),
+    ({"frequencies": (10e6, 20e6)}, "is this Hz"),
+    ({"header": HEADER | {"BUNIT": "V^2/Hz"}}, "unit 'V.2/Hz'"),
+    ({"header": HEADER | {"DELTAT_SEC": -7200.0}}, "DELTAT_SEC is -7200.0, expected"),
+]
+
+
+@pytest.mark.parametrize(("options", "message"), UNUSABLE)
 def test_files_that_cannot_be_used(tmp_path, options, message):
     refuse(message, read_waterfall, write(tmp_path / "w.fits", **options))
 
@@ -142,22 +139,11 @@ def test_missing_channels_files_and_ends(tmp_path):
 def test_the_map_from_luseepys_waterfall(tmp_path, test_data):
     """10 MHz, luseepy's beam, sky and noiseless data, the noise of a fiducial observation in N."""
     folder = test_data / "luseepy"
-    overrides = [
-        "frequency_mhz=10",
-        f"beam.file={folder / 'synthetic_monopole_beam.fits'}",
-        "beam.quadrature=luseepy",
-        f"sky.file={folder / 'sky_alm.npz'}",
-    ]
-    arguments = [a for override in overrides for a in ("--set", override)]
-    waterfall = folder / "waterfall_exact_engine.fits"
-    out = tmp_path / "map"
-    command = ["map", "fiducial", "--data", str(waterfall), "--truth", "-o", str(out), "--quiet"]
-    assert main([*command, *arguments]) == 0
-    with (out / "spectra.csv").open(newline="") as file:
-        rho = np.array([float(row["rho"]) for row in csv.DictReader(file)])
+    beam = [f"beam.file={folder / 'synthetic_monopole_beam.fits'}", "beam.quadrature=luseepy"]
+    given = ["frequency_mhz=10", *beam, f"sky.file={folder / 'sky_alm.npz'}"]
+    rho, summary = judged_map(folder / "waterfall_exact_engine.fits", given, tmp_path / "map")
     assert rho[1:9].min() > 0.9
     assert rho[1:27].min() > 0.5
-    (summary,) = json.loads((out / "summary.json").read_text())["channels"]
     assert summary["ell_cross"] is None or summary["ell_cross"] >= 18
     # nothing but the model's own noise is missing from the data: chi^2 falls short of its mean
     assert summary["chi2"] < summary["chi2_expected"]
@@ -220,16 +206,13 @@ def test_what_is_written_is_read_back_bit_by_bit(tmp_path):
         np.testing.assert_array_equal(hdus["ZIm_2"].data, [-40.0, -30.0])
 
 
-@pytest.mark.parametrize(
-    ("runs", "message"),
-    [
-        ((lb.Run(0.02, turntable_deg=30.0),), r"turntable angles, the data have \(30.0,\)"),
-        ((lb.Run(0.02), lb.Run(0.02)), "turntable angles"),
-        ((lb.Run(2.0, night_only=True),), "without gaps; write netCDF"),
-    ],
-)
-def test_what_luseepys_layout_cannot_hold(tmp_path, runs, message):
-    refuse(message, write_waterfall, tmp_path / "w.fits", 2 * [random_channel(runs)])
+def test_what_luseepys_layout_cannot_hold(tmp_path):
+    for runs, message in (
+        ([lb.Run(0.02, turntable_deg=30.0)], r"turntable angles, the data have \(30.0,\)"),
+        ([lb.Run(0.02), lb.Run(0.02)], "turntable angles"),
+        ([lb.Run(2.0, night_only=True)], "without gaps; write netCDF"),
+    ):
+        refuse(message, write_waterfall, tmp_path / "w.fits", 2 * [random_channel(runs)])
     assert not list(tmp_path.iterdir())
 
 
@@ -252,18 +235,18 @@ def test_simulate_writes_it_and_map_reads_it(tmp_path):
     assert (tmp_path / "map" / "posterior.nc").is_file()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["-o", "w.fits"], "at least two channels"),
-        (["-o", "w.fits", "--set", "observation.window=mean"], "no room for windows"),
-        (["-o", "data.nc", "--frequencies", "10,20"], "netCDF files hold one frequency"),
-        (["-o", "w.fits", "--frequencies", "20,10"], "expected growing MHz"),
-        (["-o", "w.fits", "--frequencies", "ten"], "expected growing MHz"),
-        (["-o", "w.fits", "--frequencies", "5:50:0"], "expected growing MHz"),
-        (["-o", "w.fits", "--frequencies", "40:60:10"], "frequencies_mhz.2 is 60"),
-    ],
-)
+NOT_WRITTEN = [
+    (["-o", "w.fits"], "at least two channels"),
+    (["-o", "w.fits", "--set", "observation.window=mean"], "no room for windows"),
+    (["-o", "data.nc", "--frequencies", "10,20"], "netCDF files hold one frequency"),
+    (["-o", "w.fits", "--frequencies", "20,10"], "expected growing MHz"),
+    (["-o", "w.fits", "--frequencies", "ten"], "expected growing MHz"),
+    (["-o", "w.fits", "--frequencies", "5:50:0"], "expected growing MHz"),
+    (["-o", "w.fits", "--frequencies", "40:60:10"], "frequencies_mhz.2 is 60"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), NOT_WRITTEN)
 def test_channels_that_cannot_be_written(tmp_path, monkeypatch, capsys, arguments, message):
     monkeypatch.chdir(tmp_path)
     given = ["--set", "lmax=2", "--set", "observation.runs.0.cycles=0.02", "--quiet"]
@@ -338,18 +321,18 @@ backwards = np.array([[2461000.0, 0.5], [2461000.0, 0.7], [2461000.0, 0.6]])
 twice = np.array([[2461000.0, 0.5], [2461000.0, 0.5], [2461000.0, 0.6]])
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"products": ["13I", "13X"]}, "no product '13X'"),
-        ({"products": ["13I", "13I"]}, "the product 13I is given more than once"),
-        ({"products": ["13I", "00R", "11R"]}, r"data has shape \(5, 2, 2\), expected 5 \(time\)"),
-        ({"header": {"BUNIT": "K"}}, r"BUNIT is 'K'; known: V\^2/Hz"),
-        ({"header": {"TIMESYS": "LOCAL"}}, "TIMESYS is 'LOCAL'"),
-        ({"header": {"TIMEUNIT": "s"}}, "TIMEUNIT is 's'"),
-        ({"images": {"time": backwards, "data": np.ones((3, 2, 2))}}, "times must grow"),
-        ({"images": {"time": twice, "data": np.ones((3, 2, 2))}}, "times must grow"),
-    ],
-)
+UNUSABLE_FOUR_PORTS = [
+    ({"products": ["13I", "13X"]}, "no product '13X'"),
+    ({"products": ["13I", "13I"]}, "the product 13I is given more than once"),
+    ({"products": ["13I", "00R", "11R"]}, r"data has shape \(5, 2, 2\), expected 5 \(time\)"),
+    ({"header": {"BUNIT": "K"}}, r"BUNIT is 'K'; known: V\^2/Hz"),
+    ({"header": {"TIMESYS": "LOCAL"}}, "TIMESYS is 'LOCAL'"),
+    ({"header": {"TIMEUNIT": "s"}}, "TIMEUNIT is 's'"),
+    ({"images": {"time": backwards, "data": np.ones((3, 2, 2))}}, "times must grow"),
+    ({"images": {"time": twice, "data": np.ones((3, 2, 2))}}, "times must grow"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), UNUSABLE_FOUR_PORTS)
 def test_four_port_files_that_cannot_be_used(tmp_path, changes, message):
     refuse(message, read_waterfall, four_port(tmp_path / "w.fits", **changes))

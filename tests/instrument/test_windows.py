@@ -1,7 +1,5 @@
 """Windows of samples: averages of data by loops, A against instants, and files and arrays."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from datetime import datetime, timedelta
 
@@ -173,22 +171,21 @@ def flagged(*absent, n=4):
     for product, sample in absent:
         flags[product, sample] = True
     layout = DataLayout.from_flags(flags)
-    return lb.Visibilities(
-        np.random.default_rng(3).normal(size=layout.size), layout, observation, 25.0
-    )
+    values = np.random.default_rng(3).normal(size=layout.size)
+    return lb.Visibilities(values, layout, observation, 25.0)
 
 
-@pytest.mark.parametrize(
-    ("absent", "kept", "lost"),
-    [
-        # product 5 in one of 4 samples, less than half; product 2 in three, so that one is lost
-        ([(5, 0), (5, 1), (5, 2), (2, 3)], [0, 1, 2], [5]),
-        # half of the samples is enough
-        ([(5, 0), (5, 1)], [2, 3], []),
-        # samples without any product do not count: the last one is all that there is
-        ([(p, k) for p in range(16) for k in range(3)], [3], []),
-    ],
-)
+RARELY_THERE = [
+    # product 5 in one of 4 samples, less than half; product 2 in three, so that one is lost
+    ([(5, 0), (5, 1), (5, 2), (2, 3)], [0, 1, 2], [5]),
+    # half of the samples is enough
+    ([(5, 0), (5, 1)], [2, 3], []),
+    # samples without any product do not count: the last one is all that there is
+    ([(p, k) for p in range(16) for k in range(3)], [3], []),
+]
+
+
+@pytest.mark.parametrize(("absent", "kept", "lost"), RARELY_THERE)
 def test_products_that_are_rarely_there_are_left_out(absent, kept, lost):
     data = flagged(*absent)
     found = averaged(data, 4 * STEP)
@@ -211,16 +208,16 @@ def test_bins_of_which_nothing_remains_are_dropped():
         refuse("nothing is left of the data in bins of 2400 s", averaged, data, 4 * STEP)
 
 
-@pytest.mark.parametrize(
-    ("windows", "to_s", "words"),
-    [
-        ("instant", 3600.0, "the samples are instants, which have no mean over a time"),
-        ("mean", 300.0, "over 300 s, which is shorter than their samples of 600 s"),
-        ("mean", 1e9 * 86400.0, "give at most 30 days"),
-        ("mean", 0.0, "the time to average over, in seconds, must be positive"),
-        ("mean", np.nan, "the time to average over, in seconds, must be positive"),
-    ],
-)
+NOT_AVERAGED = [
+    ("instant", 3600.0, "the samples are instants, which have no mean over a time"),
+    ("mean", 300.0, "over 300 s, which is shorter than their samples of 600 s"),
+    ("mean", 1e9 * 86400.0, "give at most 30 days"),
+    ("mean", 0.0, "the time to average over, in seconds, must be positive"),
+    ("mean", np.nan, "the time to average over, in seconds, must be positive"),
+]
+
+
+@pytest.mark.parametrize(("windows", "to_s", "words"), NOT_AVERAGED)
 def test_what_cannot_be_averaged(windows, to_s, words):
     observation = lb.Observation.from_runs([lb.Run(0.01)], step_s=STEP, window=windows)
     refuse(words, averaged, data_of(observation), to_s)
@@ -316,17 +313,17 @@ def test_equals_the_mean_of_20_instants_by_lunarsky(step_s, filled, lmax):
         assert np.abs((got[:, k] - expected) / sigma[:, 0]).max() < 1e-6
 
 
-@pytest.mark.parametrize(
-    ("sample", "start", "end", "live", "words"),
-    [
-        ([0], [1.0], [-1.0], [1.0], "sample 0 ends -1 s from its time, not after its start"),
-        ([0], [-1.0], [1.0], [3.0], "sample 0 was live for 3 s of a window of 2 s"),
-        ([0], [-1.0], [1.0], [0.0], "sample 0 has a live time of 0 s"),
-        ([0, 0], [0.0, 0.5], [1.0, 2.0], [1.0, 1.0], "a piece that begins at 0.5 s, before"),
-        ([0, 2], [0.0, 0.0], [1.0, 1.0], [1.0, 1.0], "must count the samples 0, 1"),
-        ([], [], [], [], "same length, with at least one piece"),
-    ],
-)
+IMPOSSIBLE = [
+    ([0], [1.0], [-1.0], [1.0], "sample 0 ends -1 s from its time, not after its start"),
+    ([0], [-1.0], [1.0], [3.0], "sample 0 was live for 3 s of a window of 2 s"),
+    ([0], [-1.0], [1.0], [0.0], "sample 0 has a live time of 0 s"),
+    ([0, 0], [0.0, 0.5], [1.0, 2.0], [1.0, 1.0], "a piece that begins at 0.5 s, before"),
+    ([0, 2], [0.0, 0.0], [1.0, 1.0], [1.0, 1.0], "must count the samples 0, 1"),
+    ([], [], [], [], "same length, with at least one piece"),
+]
+
+
+@pytest.mark.parametrize(("sample", "start", "end", "live", "words"), IMPOSSIBLE)
 def test_windows_that_cannot_be(sample, start, end, live, words):
     refuse(words, Windows, np.array(sample, dtype=int), *(np.array(x) for x in (start, end, live)))
 
@@ -364,9 +361,8 @@ def bounds_of(observation):
 @pytest.fixture
 def data():
     """Windows in pieces of odd lengths, and flags."""
-    observation = lb.Observation.from_runs(
-        [lb.Run(0.01), lb.Run(0.01, turntable_deg=30.0)], window="mean"
-    )
+    runs = [lb.Run(0.01), lb.Run(0.01, turntable_deg=30.0)]
+    observation = lb.Observation.from_runs(runs, window="mean")
     n, rng = observation.n_times, np.random.default_rng(5)
     observation = replace(observation, windows=partly_filled(n, 7200.0))
     layout = DataLayout.from_flags(rng.random((16, n)) < 0.1)
@@ -509,23 +505,23 @@ def bounds_alone(change):
     return lambda dataset: change(without_pieces(dataset))
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (lose("piece_end_s"), "there is piece_sample, but no piece_end_s"),
-        (bounds_alone(lose("time_bounds")), "there is live_time, but no time_bounds"),
-        (bounds_alone(lose("time_bounds", "live_time")), "window = 'mean', but no time_bounds"),
-        (attribute("window", "instant"), "says that the samples are instants, and piece_sample"),
-        (attribute("window", "means"), "window is 'means'; did you mean 'mean'"),
-        (shifted_bounds, "time_bounds and the pieces of sample 0 differ by 30 s"),
-        (changed("piece_start_s", np.nan), "piece_start_s holds NaN"),
-        (changed("piece_sample", 0), "at least one piece for each"),
-        (changed("piece_live_s", 4000.0), "sample 1 was live for 4000 s of a window of 3600 s"),
-        (bounds_alone(changed("live_time", -1.0)), "sample 1 has a live time of -1 s"),
-        (bounds_alone(changed("time_bounds", np.datetime64("NaT"))), "time_bounds holds no time"),
-        (bounds_alone(numbers), "time_bounds holds values of type float64, expected times"),
-    ],
-)
+NOT_OF_A_FILE = [
+    (lose("piece_end_s"), "there is piece_sample, but no piece_end_s"),
+    (bounds_alone(lose("time_bounds")), "there is live_time, but no time_bounds"),
+    (bounds_alone(lose("time_bounds", "live_time")), "window = 'mean', but no time_bounds"),
+    (attribute("window", "instant"), "says that the samples are instants, and piece_sample"),
+    (attribute("window", "means"), "window is 'means'; did you mean 'mean'"),
+    (shifted_bounds, "time_bounds and the pieces of sample 0 differ by 30 s"),
+    (changed("piece_start_s", np.nan), "piece_start_s holds NaN"),
+    (changed("piece_sample", 0), "at least one piece for each"),
+    (changed("piece_live_s", 4000.0), "sample 1 was live for 4000 s of a window of 3600 s"),
+    (bounds_alone(changed("live_time", -1.0)), "sample 1 has a live time of -1 s"),
+    (bounds_alone(changed("time_bounds", np.datetime64("NaT"))), "time_bounds holds no time"),
+    (bounds_alone(numbers), "time_bounds holds values of type float64, expected times"),
+]
+
+
+@pytest.mark.parametrize(("change", "words"), NOT_OF_A_FILE)
 def test_windows_that_a_file_cannot_have(tmp_path, change, words):
     path = rewritten(made(), tmp_path / "bad.nc", change)
     with refused(words) as caught:
@@ -587,9 +583,8 @@ def test_rounded_times_make_no_overlaps():
         {"step_s": 60.0, "live_s": np.full(400, 60.0)},
         {"bounds": edges},
     ):
-        observation = lb.Visibilities.from_arrays(
-            data, rounded, 25.0, timestamp="start", **options
-        ).observation
+        series = lb.Visibilities.from_arrays(data, rounded, 25.0, timestamp="start", **options)
+        observation = series.observation
         found = bounds_of(observation)
         assert (found[1:, 0] >= found[:-1, 1] - 1e-6).all()
         np.testing.assert_allclose(found[:, 0], 60.0 * np.arange(400), rtol=0, atol=1e-4)
@@ -599,22 +594,22 @@ def test_rounded_times_make_no_overlaps():
 PAIRS = [[s, s + timedelta(seconds=HOUR)] for s in STARTS]
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"timestamp": "begin"}, "unknown timestamp 'begin'; did you mean"),
-        ({"timestamp": "instant", "live_s": [1.0] * 4}, "instants have no live time"),
-        ({"timestamp": "instant", "bounds": PAIRS}, "instants have no bounds"),
-        ({"live_s": [1.0] * 3}, "live_s has shape (3,); give one finite number, or one for each"),
-        ({"live_s": "all"}, "live_s is 'all'; give one finite number"),
-        ({"live_s": [1.0, 0.0, 1.0, 3.0]}, "leave out samples in which nothing was integrated"),
-        ({"step_s": 4000.0}, "windows of samples 0 and 1 (2027-01-15T00:00:00) overlap by 400 s"),
-        ({"bounds": PAIRS[:3]}, "bounds have shape (3, 2), expected (4, 2)"),
-        ({"bounds": [["now", "then"]] * 4}, "bounds, taken row by row: time 0 'now' is not a date"),
-        ({"bounds": [pair[::-1] for pair in PAIRS]}, "windows need a start and then an end"),
-        ({"bounds": PAIRS[::-1]}, "the time of sample 0 (2027-01-15T00:00:00) is not within"),
-        ({"bounds": PAIRS, "step_s": 1800.0}, "lasts 3600 s, longer than the step of 1800 s"),
-    ],
-)
+WRONG = [
+    ({"timestamp": "begin"}, "unknown timestamp 'begin'; did you mean"),
+    ({"timestamp": "instant", "live_s": [1.0] * 4}, "instants have no live time"),
+    ({"timestamp": "instant", "bounds": PAIRS}, "instants have no bounds"),
+    ({"live_s": [1.0] * 3}, "live_s has shape (3,); give one finite number, or one for each"),
+    ({"live_s": "all"}, "live_s is 'all'; give one finite number"),
+    ({"live_s": [1.0, 0.0, 1.0, 3.0]}, "leave out samples in which nothing was integrated"),
+    ({"step_s": 4000.0}, "windows of samples 0 and 1 (2027-01-15T00:00:00) overlap by 400 s"),
+    ({"bounds": PAIRS[:3]}, "bounds have shape (3, 2), expected (4, 2)"),
+    ({"bounds": [["now", "then"]] * 4}, "bounds, taken row by row: time 0 'now' is not a date"),
+    ({"bounds": [pair[::-1] for pair in PAIRS]}, "windows need a start and then an end"),
+    ({"bounds": PAIRS[::-1]}, "the time of sample 0 (2027-01-15T00:00:00) is not within"),
+    ({"bounds": PAIRS, "step_s": 1800.0}, "lasts 3600 s, longer than the step of 1800 s"),
+]
+
+
+@pytest.mark.parametrize(("options", "words"), WRONG)
 def test_what_is_wrong_is_said_in_a_sentence(options, words):
     refuse(words, made, **options)

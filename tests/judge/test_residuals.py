@@ -94,15 +94,15 @@ GAIN, BEAM = "noise.gain={sigma: 0.01}", "noise.beam={shift_mhz: 4}"
 LONG, ESSENTIAL = pytest.mark.long, pytest.mark.essential
 
 
-@pytest.mark.parametrize(
-    ("overrides", "flags"),
-    [
-        pytest.param((), None, id="diagonal"),
-        pytest.param((EXACT,), None, id="blocks", marks=[LONG, ESSENTIAL]),
-        pytest.param((GAIN, BEAM), None, id="banded and low rank", marks=LONG),
-        pytest.param((EXACT, GAIN), FLAGS, id="banded with gaps", marks=LONG),
-    ],
-)
+KINDS_OF_N = [
+    pytest.param((), None, id="diagonal"),
+    pytest.param((EXACT,), None, id="blocks", marks=ESSENTIAL),
+    pytest.param((GAIN, BEAM), None, id="banded and low rank", marks=LONG),
+    pytest.param((EXACT, GAIN), FLAGS, id="banded with gaps", marks=LONG),
+]
+
+
+@pytest.mark.parametrize(("overrides", "flags"), KINDS_OF_N)
 def test_groups_and_single_data_by_hand(overrides, flags):
     model, data = simulated(*overrides, flags=flags)
     found = judged(model, data)
@@ -197,7 +197,6 @@ def test_what_is_wrong_is_pointed_at(kind, name):
     assert len(found.suspects()) == len({group.kind for group in found.suspects()})
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_what_no_group_explains():
     model, data = simulated()
@@ -488,20 +487,20 @@ LIMITS = [{}, {"QUICK": 0}, {"QUICK": 0, "SHARED": 0}]
 MANY_TIMES = {"SHARED": 0, "DAYS": 1}
 
 
-@pytest.mark.parametrize(
-    ("size", "kind", "limits"),
-    [
-        *((size, kind, limits) for size in ("few", "gaps") for kind in TWO for limits in LIMITS),
-        *(("many", kind, limits) for kind in TWO for limits in LIMITS[:2]),
-        *(pytest.param("many", kind, LIMITS[2], marks=LONG) for kind in TWO),
-        *(("often", kind, MANY_TIMES) for kind in TWO),
-        # what is in "blocks and templates" alone
-        *(pytest.param("few", kind, limits, marks=LONG) for kind in ALONE for limits in LIMITS),
-        *(pytest.param("often", kind, MANY_TIMES, marks=LONG) for kind in ALONE),
-        *(("dense", kind, {"QUICK": 0}) for kind in TWO),
-        *(pytest.param("few", "coupled", limits, marks=[LONG, ESSENTIAL]) for limits in LIMITS),
-    ],
-)
+SETTINGS = [
+    *((size, kind, limits) for size in ("few", "gaps") for kind in TWO for limits in LIMITS),
+    *(("many", kind, limits) for kind in TWO for limits in LIMITS[:2]),
+    *(pytest.param("many", kind, LIMITS[2], marks=LONG) for kind in TWO),
+    *(("often", kind, MANY_TIMES) for kind in TWO),
+    # what is in "blocks and templates" alone
+    *(pytest.param("few", kind, limits, marks=LONG) for kind in ALONE for limits in LIMITS),
+    *(pytest.param("often", kind, MANY_TIMES, marks=LONG) for kind in ALONE),
+    *(("dense", kind, {"QUICK": 0}) for kind in TWO),
+    *(pytest.param("few", "coupled", limits, marks=ESSENTIAL) for limits in LIMITS),
+]
+
+
+@pytest.mark.parametrize(("size", "kind", "limits"), SETTINGS)
 def test_it_is_what_matrices_say(size, kind, limits, monkeypatch):
     for name, value in limits.items():
         monkeypatch.setattr(left_out, name, value)

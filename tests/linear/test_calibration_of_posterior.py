@@ -87,7 +87,6 @@ KINDS = ["paper", "exact", "dense", "diagonal+dense"]
 FEWER = [(InMap, "exact"), (InData, "exact"), (InData, "diagonal+dense")]
 
 
-@pytest.mark.long
 @pytest.mark.essential
 @pytest.mark.parametrize(
     ("cycles", "form", "noise"),

@@ -94,9 +94,8 @@ def test_textbook_matrices_and_scipys_evidence(n_data, form):
     np.testing.assert_allclose(found_density, density, rtol=CLOSE)
     white = found.whiten(found.sample(jax.random.key(0), 4000))
     assert_draws_follow(white, np.zeros(N), np.eye(N))
-    assert_draws_follow(
-        found.sample(jax.random.key(1), 4000), answer.mean + TURN @ MEAN, answer.covariance
-    )
+    draws = found.sample(jax.random.key(1), 4000)
+    assert_draws_follow(draws, answer.mean + TURN @ MEAN, answer.covariance)
 
 
 def test_pixels_of_the_prior():

@@ -4,19 +4,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from assertions import close, refuse
+from assertions import close, refuse, within
 from reference_linear import posterior, z_of
 from scipy.linalg import block_diag
 
 import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_device, on_host
-from lusee_bayes.linear.joint import (
-    ComponentSums,
-    channel_sky,
-    component_posterior,
-    paired,
-    summed_information,
-)
+from lusee_bayes.linear import joint
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
 FREQUENCIES = np.array([10.0, 17.0, 25.0, 40.0])
@@ -94,19 +88,16 @@ def drawn(prior, made, seed=2):
 
 
 def solve_directly(prior, channels, reference):
-    sums = ComponentSums.empty(prior, reference)
+    sums = joint.ComponentSums.empty(prior, reference)
     for k, information in enumerate(channels):
-        sums = summed_information(sums, prior, k, information)
-    return component_posterior(sums.information(), prior)
+        sums = joint.summed_information(sums, prior, k, information)
+    return joint.component_posterior(sums.information(), prior)
 
 
-@pytest.fixture(
-    scope="module",
-    params=[
-        "components",
-        *(pytest.param(p, marks=pytest.mark.long) for p in ("kernel", "no rest")),
-    ],
-)
+EVERY = ["components", *(pytest.param(p, marks=pytest.mark.long) for p in ("kernel", "no rest"))]
+
+
+@pytest.fixture(scope="module", params=EVERY)
 def case(request):
     """Prior, models, data, what they tell, and the textbook's answer."""
     prior = PRIORS[request.param]()
@@ -117,7 +108,6 @@ def case(request):
     return prior, *information_from(made, data), answer
 
 
-@pytest.mark.long
 @pytest.mark.essential
 @pytest.mark.parametrize("place", [on_host, on_device])
 def test_the_direct_solution_is_the_textbooks(case, place):
@@ -128,15 +118,13 @@ def test_the_direct_solution_is_the_textbooks(case, place):
     std = np.sqrt(np.diag(covariance)).reshape(-1, N_MODES)
     maps = found.mean.reshape(prior.n_components, N_MODES)
     draws = found.sample(jax.random.key(3), 4000).reshape(4000, -1, N_MODES)
-    spread = paired(found.covariance(), prior)
+    spread = joint.paired(found.covariance(), prior)
     for k, information in enumerate(channels):
         rows = slice(k * N_MODES, (k + 1) * N_MODES)
-        sky = channel_sky(prior, k, information, maps, spread, draws, jax.random.key(5))
+        sky = joint.channel_sky(prior, k, information, maps, spread, draws, jax.random.key(5))
         # the textbook's own subtraction of s leaves 1e-16 times (signal / noise)^2
         assert np.abs((np.asarray(sky.mean) - mean[rows]) / std[k]).max() < 1e-6
-        np.testing.assert_allclose(
-            sky.covariance, covariance[rows, rows], rtol=0, atol=1e-7 * std[k].max() ** 2
-        )
+        within(sky.covariance, covariance[rows, rows], 1e-7 * std[k].max() ** 2)
         lower = np.linalg.cholesky(np.asarray(sky.covariance))
         z = np.linalg.solve(lower, (np.asarray(sky.draws) - np.asarray(sky.mean)).T)
         assert np.abs(z @ z.T / 4000 - np.eye(N_MODES)).max() < z_of(81) * np.sqrt(2 / 4000)
@@ -154,11 +142,11 @@ def test_skies_that_do_not_obey_the_prior_are_told():
         for prior_name, prior in (("true", true), ("wrong", wrong)):
             solved = solve_directly(prior, channels, reference)
             maps = solved.mean.reshape(prior.n_components, N_MODES)
-            spread = paired(solved.covariance(), prior)
+            spread = joint.paired(solved.covariance(), prior)
             none = jnp.zeros((0, prior.n_components, N_MODES))
             far = []
             for k, t in enumerate(channels):
-                sky = channel_sky(prior, k, t, maps, spread, none, jax.random.key(0))
+                sky = joint.channel_sky(prior, k, t, maps, spread, none, jax.random.key(0))
                 expected = t.n_data - np.vdot(t.matrix, sky.covariance)
                 far.append(float(sky.chi2 - expected) / np.sqrt(2 * len(data[k])))
             found[name, prior_name] = float(solved.log_evidence), max(np.abs(far))

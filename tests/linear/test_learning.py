@@ -5,22 +5,15 @@ from dataclasses import dataclass, replace
 import jax
 import numpy as np
 import pytest
+from assertions import refuse
 from jaxtyping import TypeCheckError
 from scipy import integrate, stats
 from scipy.optimize import minimize
 
 import lusee_bayes as lb
 from lusee_bayes.linear.information import Information, integrated_out
+from lusee_bayes.priors import learning
 from lusee_bayes.priors.families import FREEDOM, Hyperprior, IsotropicFamily
-from lusee_bayes.priors.learning import (
-    ROUNDING,
-    Learned,
-    _root,
-    demanded_factor,
-    draws_with_parameters,
-    learn,
-    learn_whatever_fits,
-)
 from lusee_bayes.priors.local_scales import embedded_local_scales
 from lusee_bayes.sky.prior import DensePrior
 
@@ -63,7 +56,7 @@ def log_density(case: Case, theta: np.ndarray) -> float:
 
 def test_the_maximum_is_that_of_a_general_optimiser(case):
     """Nelder-Mead knows no gradient; ln p there and here agree to what is said to be settled."""
-    found = learn(case.family, case.information)
+    found = learning.learn(case.family, case.information)
     start = case.family.hyperprior.start()
     options = {"xtol": 1e-4, "ftol": 1e-9, "maxiter": 200}
     other = minimize(lambda x: -log_density(case, x), start, method="Powell", options=options)
@@ -76,7 +69,7 @@ def test_the_maximum_is_that_of_a_general_optimiser(case):
 
 def test_the_curvature_is_that_of_the_evidence(case):
     """The expected curvature and the one at these data differ by their scatter: factor of two."""
-    found = learn(case.family, case.information)
+    found = learning.learn(case.family, case.information)
     for i in (0, len(found.parameters) - 1):
         step = np.zeros(len(found.parameters))
         step[i] = 0.1
@@ -92,7 +85,7 @@ def test_learning_gains_over_the_start_under_local_scales():
     theta = family.hyperprior.start()
     sky = np.asarray(family.prior(family.at(theta).covariance).sample(jax.random.key(7)))
     information = information_of(sky)
-    found = learn(family, information)
+    found = learning.learn(family, information)
     before = float(information.posterior(family.expected()).log_evidence)
     after = float(information.posterior(found.prior).log_evidence)
     assert after > before - 1.0
@@ -117,12 +110,11 @@ def test_others_integrated_out(case):
 
 def test_nothing_settles_without_steps(case, monkeypatch):
     monkeypatch.setattr("lusee_bayes.priors.learning.MAX_STEPS", 0)
-    with pytest.raises(lb.InputError, match="did not settle in 0 steps"):
-        learn(case.family, case.information)
+    refuse("did not settle in 0 steps", learning.learn, case.family, case.information)
     # a family far from its own start is still found
     far = replace(case.family, log_monopole=case.family.log_monopole + 1.0)
     monkeypatch.undo()
-    assert learn(far, case.information).steps > 0
+    assert learning.learn(far, case.information).steps > 0
 
 
 def test_a_root_of_what_rounding_has_spoilt():
@@ -131,9 +123,9 @@ def test_a_root_of_what_rounding_has_spoilt():
     q = np.linalg.qr(rng.standard_normal((6, 6)))[0]
     for values in ([1.0, 0.5, 0.1, 0.0, 0.0, -9e-4], [1.0, 0.5, 0.1, 0.0, 0.0, 0.0]):
         values = np.array(values)
-        root = _root(q * values @ q.T)
+        root = learning._root(q * values @ q.T)
         expected = q * np.clip(values, 0.0, 1.0) @ q.T
-        np.testing.assert_allclose(root @ root.T, expected, atol=1.1 * ROUNDING)
+        np.testing.assert_allclose(root @ root.T, expected, atol=1.1 * learning.ROUNDING)
 
 
 # --- normal scores --------------------------------------------------------------------------------
@@ -159,7 +151,7 @@ def test_the_evidence_agrees_with_draws_of_the_hyperprior():
     largest = max(values)
     expected = largest + np.log(np.exp(np.array(values) - largest).mean())
     # without the tails Laplace's approximation is 1.7 below
-    assert abs(learn(family, information).log_evidence - expected) < 0.6
+    assert abs(learning.learn(family, information).log_evidence - expected) < 0.6
 
 
 def test_scores_are_standard_normal_under_the_hyperprior():
@@ -173,9 +165,8 @@ def test_scores_are_standard_normal_under_the_hyperprior():
         assert found[1] == pytest.approx(-0.5 * np.log(power))
         np.testing.assert_allclose(hyperprior.scores(found), both, rtol=1e-10, atol=1e-12)
         rise = hyperprior.of_scores(both + step) - hyperprior.of_scores(both - step)
-        np.testing.assert_allclose(
-            hyperprior.slopes_of_scores(both), rise / (2.0 * step), rtol=1e-7
-        )
+        slopes = rise / (2.0 * step)
+        np.testing.assert_allclose(hyperprior.slopes_of_scores(both), slopes, rtol=1e-7)
 
 
 # --- data that do not fit -------------------------------------------------------------------------
@@ -199,9 +190,9 @@ def test_raised_information_is_that_of_raised_noise():
 
 def test_data_that_fit_demand_nothing(case):
     """And the prior is that of learning without a question asked."""
-    assert demanded_factor(case.information, case.family.expected()) == 1.0
-    plain = learn(case.family, case.information)
-    found = learn_whatever_fits(case.family, case.information)
+    assert learning.demanded_factor(case.information, case.family.expected()) == 1.0
+    plain = learning.learn(case.family, case.information)
+    found = learning.learn_whatever_fits(case.family, case.information)
     assert found.fits and found.noise_factor == 1.0
     np.testing.assert_array_equal(found.parameters, plain.parameters)
 
@@ -209,15 +200,15 @@ def test_data_that_fit_demand_nothing(case):
 def test_what_no_sky_explains_raises_n(case):
     """chi^2 of everything 50 times as large: N is raised by that."""
     bad = replace(case.information, misfit=np.asarray(50.0 * case.information.misfit))
-    factor = demanded_factor(bad, case.family.expected())
+    factor = learning.demanded_factor(bad, case.family.expected())
     assert 30.0 < factor < 80.0
-    found = learn_whatever_fits(case.family, bad)
+    found = learning.learn_whatever_fits(case.family, bad)
     assert found.noise_factor >= factor and not found.fits
 
 
 def test_where_nothing_settles_the_prior_is_fixed_and_wide(case, monkeypatch):
     monkeypatch.setattr("lusee_bayes.priors.learning.MAX_STEPS", 0)
-    found = learn_whatever_fits(case.family, case.information)
+    found = learning.learn_whatever_fits(case.family, case.information)
     assert not found.settled and not found.fits and found.as_rows() == []
     expected = case.family.expected()
     ratio = np.asarray(found.prior.variance()) / np.asarray(expected.variance())
@@ -263,8 +254,8 @@ def one_parameter():
         np.diag(noise**-2.0), seen / noise**2, np.zeros(SIZE), unknown, unknown, unknown
     )
     prior = family.prior(family.at(np.array([0.4])).covariance)
-    learned = Learned(prior, ("theta",), np.array([0.4]), np.array([[width**2]]), 0.0, 0)
-    draws = draws_with_parameters(family, learned, information, jax.random.key(1), 4500)
+    learned = learning.Learned(prior, ("theta",), np.array([0.4]), np.array([[width**2]]), 0.0, 0)
+    draws = learning.draws_with_parameters(family, learned, information, jax.random.key(1), 4500)
     return noise, seen, draws
 
 
@@ -287,19 +278,19 @@ def test_draws_are_those_of_the_integral_over_the_parameter(one_parameter):
             assert abs(level - expected) < 4.0 * error
 
 
-def weakly_known(family: IsotropicFamily, std: float) -> tuple[Learned, Information]:
+def weakly_known(family: IsotropicFamily, std: float) -> tuple[learning.Learned, Information]:
     """Parameters known to so much, and the information of data that hardly tell the sky."""
     theta = family.hyperprior.start()
     prior = family.prior(family.at(theta).covariance)
     matrix, one = np.eye(SIZE) * 1e-8, np.ones(())
     information = Information(matrix, np.ones(SIZE), np.zeros(SIZE), one, one, one)
-    return Learned(prior, (), theta, std**2 * np.eye(len(theta)), 0.0, 0), information
+    return learning.Learned(prior, (), theta, std**2 * np.eye(len(theta)), 0.0, 0), information
 
 
 def test_few_draws_and_none():
     family = IsotropicFamily.around(2e4, LOW)
     given = (family, *weakly_known(family, 0.3), jax.random.key(1))
-    drawn = [draws_with_parameters(*given, n) for n in (0, 1, 7)]
+    drawn = [learning.draws_with_parameters(*given, n) for n in (0, 1, 7)]
     assert [len(one) for one in drawn] == [0, 1, 7]
     assert len(np.unique(drawn[2], axis=0)) == 7
 
@@ -313,5 +304,6 @@ class Hopeless(Strength):
 
 def test_parameters_without_a_covariance_are_drawn_anew_and_then_refused():
     known = weakly_known(Strength.around(2e4, LOW), 1.0)
-    with pytest.raises(lb.InputError, match="no sky can be drawn with the uncertainty of the pri"):
-        draws_with_parameters(Hopeless.around(2e4, LOW), *known, jax.random.key(1), 3)
+    given = Hopeless.around(2e4, LOW), *known, jax.random.key(1), 3
+    words = "no sky can be drawn with the uncertainty of the pri"
+    refuse(words, learning.draws_with_parameters, *given)

@@ -5,16 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import reference_linear as oracle
 from assertions import refuse
 from jaxtyping import TypeCheckError
-from reference_linear import (
-    assert_draws_follow,
-    exact_posterior,
-    log_prob_slope,
-    posterior,
-    posterior_by_precision,
-    random_covariance,
-)
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.products import DataLayout
@@ -42,9 +35,9 @@ def noise_terms(n_data: int):
     rng = np.random.default_rng(11)
     layout = DataLayout(3, n_data // 3)
     diagonal = lb.DiagonalCovariance(jnp.asarray(rng.uniform(0.5, 2.0, n_data)))
-    blocks = np.stack([random_covariance(rng, 3) for _ in range(layout.n_times)])
+    blocks = np.stack([oracle.random_covariance(rng, 3) for _ in range(layout.n_times)])
     time_blocks = TimeBlockCovariance(jnp.asarray(blocks), layout)
-    dense = DenseCovariance(jnp.asarray(random_covariance(rng, n_data)))
+    dense = DenseCovariance(jnp.asarray(oracle.random_covariance(rng, n_data)))
     return {
         "diagonal": diagonal,
         "blocks": time_blocks,
@@ -70,7 +63,7 @@ def naive(model, d):
     """The oracle's answer for a model with a dense A."""
     offset = 0.0 if model.offset is None else np.asarray(model.offset)
     s = np.diag(per_mode(np.asarray(model.prior.spectrum)))
-    return posterior(model.coupling.dense(), s, model.noise.dense(), d, offset)
+    return oracle.posterior(model.coupling.dense(), s, model.noise.dense(), d, offset)
 
 
 def assert_same(post, expected, tol=WELL_SCALED):
@@ -93,8 +86,8 @@ def test_oracles_agree(n_data):
     a, n = np.asarray(model.coupling.dense()), np.asarray(model.noise.dense())
     first = naive(model, d)
     others = [
-        posterior_by_precision(a, np.diag(per_mode(SPECTRUM)), n, d),
-        exact_posterior(a, per_mode(SPECTRUM), n, d),
+        oracle.posterior_by_precision(a, np.diag(per_mode(SPECTRUM)), n, d),
+        oracle.exact_posterior(a, per_mode(SPECTRUM), n, d),
     ]
     for other in others:
         np.testing.assert_allclose(other.mean, first.mean, atol=WELL_SCALED)
@@ -105,15 +98,15 @@ def test_oracles_agree(n_data):
 def test_oracle_slope_is_that_of_scipys_density():
     rng = np.random.default_rng(0)
     a, d = rng.normal(size=(6, 4)), rng.normal(size=6)
-    s, n, ds, dn = (random_covariance(rng, k) for k in (4, 6, 4, 6))
+    s, n, ds, dn = (oracle.random_covariance(rng, k) for k in (4, 6, 4, 6))
     h = 1e-5
 
     def value(x):
-        return posterior(a, s + x * ds, n + x * dn, d).log_prob
+        return oracle.posterior(a, s + x * ds, n + x * dn, d).log_prob
 
     # central differences: h^2 times a third derivative of order 10, and 1e-15 / h of rounding
     slope = (value(h) - value(-h)) / (2 * h)
-    assert log_prob_slope(a, s, n, d, ds, dn) == pytest.approx(slope, abs=1e-8)
+    assert oracle.log_prob_slope(a, s, n, d, ds, dn) == pytest.approx(slope, abs=1e-8)
 
 
 # --- agreement on well-scaled cases --------------------------------------------------------------
@@ -161,7 +154,7 @@ def test_prior_predictive_draws_follow_the_evidence():
     k = a @ s @ a.T + np.asarray(model.noise.dense())
     joint = np.block([[s, s @ a.T], [a @ s, k]])
     mean = np.concatenate([np.zeros(16), np.full(9, 2.0)])
-    assert_draws_follow(np.concatenate([skies, data], axis=1), mean, joint)
+    oracle.assert_draws_follow(np.concatenate([skies, data], axis=1), mean, joint)
 
 
 # --- the real coupling matrix --------------------------------------------------------------------
@@ -182,7 +175,6 @@ def instrument():
     return model, model.sample(jax.random.key(3))[1]
 
 
-@pytest.mark.long
 @pytest.mark.essential
 @pytest.mark.parametrize("form", FORMS)
 def test_real_experiment_to_sixty_digits(instrument, form):
@@ -190,7 +182,7 @@ def test_real_experiment_to_sixty_digits(instrument, form):
     model, d = instrument
     a = np.asarray(model.coupling.dense())
     variance = per_mode(np.asarray(model.prior.spectrum))
-    exact = exact_posterior(a, variance, np.asarray(model.noise.dense()), d)
+    exact = oracle.exact_posterior(a, variance, np.asarray(model.noise.dense()), d)
     post = model.condition(d, form).posterior
     assert np.abs((np.asarray(post.mean) - exact.mean) / exact.std).max() < 1e-9
     # A^T N^-1 A holds the condition number times eps, 2e-6, of what is known least
@@ -217,7 +209,7 @@ def graded(n_data: int, largest: float, lmax=5, seed=1):
     d = d + rng.normal(size=n_data) * np.sqrt(variance)
     harmonic, noise = (lb.HarmonicPrior(jnp.asarray(spectrum)), lb.DiagonalCovariance(variance))
     model = lb.LinearGaussian(jnp.asarray(a), harmonic, noise)
-    return model, jnp.asarray(d), exact_posterior(a, prior, np.diag(variance), d)
+    return model, jnp.asarray(d), oracle.exact_posterior(a, prior, np.diag(variance), d)
 
 
 # What float64 reaches, with ten times to spare. The mean is refined, so all forms keep it to
@@ -226,7 +218,6 @@ def graded(n_data: int, largest: float, lmax=5, seed=1):
 # errors eps x largest^2 where Lambda may be 1: std and ln p of the forms on the sky's side lose
 # that much. The data form's triangle is graded, rows of
 # every size keep their own relative accuracy, and it loses only eps x largest.
-@pytest.mark.long
 @pytest.mark.essential
 @pytest.mark.parametrize("largest", [1e2, 1e4, 1e6])
 @pytest.mark.parametrize("n_data", [60, 24])
@@ -290,11 +281,9 @@ def expected_slopes(model, d):
     a, n = np.asarray(model.coupling.dense()), np.asarray(model.noise.dense())
     spectrum = np.asarray(model.prior.spectrum)
     s, y = np.diag(per_mode(spectrum)), np.asarray(d)
-    of_ell = [
-        log_prob_slope(a, s, n, y, np.diag(per_mode(np.arange(LMAX + 1.0) == ell) * 1.0), 0 * n)
-        for ell in range(LMAX + 1)
-    ]
-    return np.array(of_ell), log_prob_slope(a, s, n, y, 0 * s, n)
+    shapes = [np.diag(per_mode(one)) for one in np.eye(LMAX + 1)]
+    of_ell = [oracle.log_prob_slope(a, s, n, y, shape, 0 * n) for shape in shapes]
+    return np.array(of_ell), oracle.log_prob_slope(a, s, n, y, 0 * s, n)
 
 
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.grad])
@@ -366,7 +355,7 @@ def test_slopes_with_fewer_data_and_an_ell_without_power():
 
     a, s, n = model.coupling.dense(), np.diag(per_mode(spectrum)), model.noise.dense()
     a, n, added_n = np.asarray(a), np.asarray(n), np.diag(np.asarray(added))
-    expected = log_prob_slope(a, s, n, np.asarray(d), 0 * s, added_n)
+    expected = oracle.log_prob_slope(a, s, n, np.asarray(d), 0 * s, added_n)
     assert float(jax.jit(jax.jacfwd(value))(jnp.asarray(0.0))) == pytest.approx(expected, rel=1e-9)
 
 

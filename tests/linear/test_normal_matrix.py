@@ -19,12 +19,7 @@ from lusee_bayes.linear import information
 from lusee_bayes.linear.linear_gaussian import FromInformation, InMap, form_of
 from lusee_bayes.linear.normal_matrix import CHUNK, normal_matrix, summed, time_sums
 from lusee_bayes.linear.posterior import pixel_std
-from lusee_bayes.noise.covariance import (
-    DenseCovariance,
-    LowRankCovariance,
-    TimeBandedCovariance,
-    TimeBlockCovariance,
-)
+from lusee_bayes.noise import covariance as cov
 
 LMAX, N_PRODUCTS = 5, 4
 # the first and the last run see the sky through the same beams
@@ -57,10 +52,10 @@ def noise_of(kind, layout):
     roots = rng.standard_normal((layout.n_times, N_PRODUCTS, 2 * N_PRODUCTS))
     blocks = jnp.asarray(roots @ np.swapaxes(roots, 1, 2))
     if kind == "blocks":
-        return TimeBlockCovariance(blocks, layout)
+        return cov.TimeBlockCovariance(blocks, layout)
     if kind == "templates":
         root = jnp.asarray(rng.standard_normal((layout.size, 2)))
-        return TimeBlockCovariance(blocks, layout) + LowRankCovariance(root)
+        return cov.TimeBlockCovariance(blocks, layout) + cov.LowRankCovariance(root)
     # sums of what neighbouring times share: positive by construction
     shared = 0.3 * rng.standard_normal((layout.n_times + 2, N_PRODUCTS, N_PRODUCTS))
     band = np.zeros((layout.n_times, 3, N_PRODUCTS, N_PRODUCTS))
@@ -68,7 +63,7 @@ def noise_of(kind, layout):
         for t in range(w, layout.n_times):
             band[t, w] = sum(shared[t - w + k] @ shared[t - w + k].T for k in range(w, 3)) * 0.3
     band[:, 0] += np.asarray(blocks)
-    return TimeBandedCovariance(jnp.asarray(band), layout)
+    return cov.TimeBandedCovariance(jnp.asarray(band), layout)
 
 
 @pytest.mark.parametrize("place", [on_host, on_device])
@@ -119,8 +114,8 @@ def test_what_has_no_structure_is_refused():
     coupling = setting()
     layout = coupling.layout
     diagonal = noise_of("diagonal", layout)
-    dense = DenseCovariance(diagonal.dense())
-    for noise in (dense, dense + LowRankCovariance(jnp.ones((layout.size, 1)))):
+    dense = cov.DenseCovariance(diagonal.dense())
+    for noise in (dense, dense + cov.LowRankCovariance(jnp.ones((layout.size, 1)))):
         refuse("no structure in time", normal_matrix, coupling, noise)
     response = coupling.with_response(jnp.ones(layout.size))
     refuse("response of its own", normal_matrix, response, diagonal)
@@ -132,7 +127,7 @@ def model(kind="diagonal"):
     prior = lb.HarmonicPrior(jnp.asarray(10.0 / (1.0 + np.arange(LMAX + 1.0)) ** 2))
     noise = noise_of("diagonal", coupling.layout)
     if kind == "low rank":
-        noise = noise + LowRankCovariance(jnp.ones((coupling.layout.size, 1)))
+        noise = noise + cov.LowRankCovariance(jnp.ones((coupling.layout.size, 1)))
     offset = jnp.asarray(np.linspace(0, 1, coupling.layout.size)) if kind == "offset" else None
     return lb.LinearGaussian(coupling, prior, noise, offset)
 

@@ -8,18 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from assertions import refuse
+from reference import sphere
 from scipy import optimize, stats
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import n_modes, synthesis_matrix
+from lusee_bayes.linear import positive_joint as pj
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.joint import paired
-from lusee_bayes.linear.positive_joint import (
-    ChannelsInMemory,
-    find_joint_mode,
-    linearised,
-    positive_sky,
-)
 from lusee_bayes.sky.positive_skies import LOG_WIDTH, TILT_WIDTH, FieldLaws, PositiveSkies
 
 LMAX = 3
@@ -41,18 +37,14 @@ def skies_of(frequencies, names, n_sources=0):
     points = synthesis_matrix(np.array([0.4, 1.9]), np.array([2.0, 4.0]), LMAX)[:n_sources]
     sources = np.stack([20.0 * (f / 20.0) ** -2.5 * points for f in frequencies])
     templates = [partial(band, f) for f in frequencies]
-    return PositiveSkies.of(
-        frequencies, templates, LMAX, names, sources=sources, weight=weight, band=24
-    )
+    options = {"sources": sources, "weight": weight, "band": 24}
+    return PositiveSkies.of(frequencies, templates, LMAX, names, **options)
 
 
 def quadrature():
     """Harmonics and weights on a grid of this file's own, far finer than the maps."""
-    x, weights = np.polynomial.legendre.leggauss(40)
-    phi = 2.0 * np.pi * np.arange(80) / 80
-    theta, azimuth = np.repeat(np.arccos(x), 80), np.tile(phi, 40)
-    y = synthesis_matrix(theta, azimuth, LMAX)
-    return theta, azimuth, y, np.repeat(weights, 80) * np.pi / 40
+    theta, phi, weights = sphere(40, 80)
+    return theta, phi, synthesis_matrix(theta, phi, LMAX), weights
 
 
 def observed(skies, laws, seed=0, noise=0.05, n_data=40):
@@ -80,9 +72,8 @@ def rough(skies, level=0.3):
     """Laws of fields that are as strong as the templates, so that nothing is linear."""
     laws = FieldLaws.of(skies)
     parameters = laws.parameters.copy()
-    parameters[:, 0] = np.log(
-        level * np.where(np.arange(len(parameters)) < len(laws.means), 1, 0.3)
-    )
+    shares = np.where(np.arange(len(parameters)) < len(laws.means), 1, 0.3)
+    parameters[:, 0] = np.log(level * shares)
     parameters[:, 1] = -1.0
     return replace(laws, parameters=parameters)
 
@@ -102,7 +93,7 @@ def test_the_mode_of_one_channel_is_that_of_a_direct_minimisation():
         return np.concatenate([(d - a @ sky) / sigma, white])
 
     direct = optimize.least_squares(residuals, np.zeros(2 * N), xtol=1e-15, ftol=1e-15, gtol=1e-12)
-    mode = find_joint_mode(skies, laws, ChannelsInMemory((information,)))
+    mode = pj.find_joint_mode(skies, laws, pj.ChannelsInMemory((information,)))
     # what a last step of 0.1 sigma at most leaves: the curvature's own error times that step
     np.testing.assert_allclose(mode.energy, 2.0 * direct.cost, atol=0.1**2)
     np.testing.assert_allclose(mode.fields[0] / root, direct.x[:N], atol=0.02)
@@ -115,8 +106,8 @@ def case():
     skies = skies_of(FREQUENCIES, ("level", "index", "absorption"), n_sources=2)
     laws = rough(skies, 0.1)
     seen = observed(skies, laws, seed=3)
-    channels = ChannelsInMemory(tuple(s[-1] for s in seen))
-    return skies, laws, seen, find_joint_mode(skies, laws, channels)
+    channels = pj.ChannelsInMemory(tuple(s[-1] for s in seen))
+    return skies, laws, seen, pj.find_joint_mode(skies, laws, channels)
 
 
 def test_the_gaussian_is_that_of_one_big_model(case):
@@ -140,9 +131,8 @@ def test_the_gaussian_is_that_of_one_big_model(case):
         matrix[:, at + N : at + N + n_sources] = skies.sources[k].T
         wide[at : at + N] = np.asarray(prior.residual_root(k))
         to_skies.append(matrix)
-        constants.append(
-            y.T @ (weights * level) - slope @ mode.exponents[k] + skies.sources[k].sum(0)
-        )
+        at_zero = y.T @ (weights * level) - slope @ mode.exponents[k]
+        constants.append(at_zero + skies.sources[k].sum(0))
     a = np.concatenate([s[0] @ t for s, t in zip(seen, to_skies, strict=True)])
     offset = np.concatenate([s[0] @ c for s, c in zip(seen, constants, strict=True)])
     d, sigma = (np.concatenate([s[k] for s in seen]) for k in (2, 1))
@@ -159,7 +149,7 @@ def test_the_gaussian_is_that_of_one_big_model(case):
     spread = paired(mode.posterior.covariance(), prior)
     none = np.zeros((0, fields, N))
     for k, (s, t) in enumerate(zip(seen, to_skies, strict=True)):
-        sky = positive_sky(mode, k, s[-1], spread, none, jax.random.key(0))
+        sky = pj.positive_sky(mode, k, s[-1], spread, none, jax.random.key(0))
         expected = t @ covariance @ t.T
         width = np.sqrt(np.diagonal(expected))
         assert np.abs((sky.covariance - expected) / np.outer(width, width)).max() < 1e-6
@@ -172,7 +162,7 @@ def test_draws_scatter_as_the_covariance_says_and_are_positive(case):
     n = 3000
     draws = np.asarray(mode.posterior.sample(jax.random.key(1), n)).reshape(n, -1, N)
     spread = paired(mode.posterior.covariance(), mode.prior)
-    sky = positive_sky(mode, 0, seen[0][-1], spread, draws, jax.random.key(2))
+    sky = pj.positive_sky(mode, 0, seen[0][-1], spread, draws, jax.random.key(2))
     width = np.sqrt(np.diagonal(sky.covariance))
     # standard deviations of 3000 draws scatter by 1.3 %, the exponential adds some percent
     np.testing.assert_allclose(sky.draws.std(0) / width, 1.0, atol=0.15)
@@ -185,7 +175,7 @@ def test_far_templates_are_reached_in_shorter_steps():
     laws = rough(skies)
     a, sigma, d, _ = observed(skies, laws)[0]
     far = information_of(a, sigma, 20.0 * d, 1e12)
-    mode = find_joint_mode(skies, laws, ChannelsInMemory((far,)))
+    mode = pj.find_joint_mode(skies, laws, pj.ChannelsInMemory((far,)))
     assert np.exp(skies.grid.synthesise(mode.exponents[0])).mean() > 10.0
 
 
@@ -193,12 +183,12 @@ def test_far_templates_are_reached_in_shorter_steps():
 def test_learned_laws_maximise_the_evidence():
     skies = skies_of(FREQUENCIES, ("level", "index"))
     laws = rough(skies, 0.1)
-    channels = ChannelsInMemory(tuple(s[-1] for s in observed(skies, laws, seed=5, n_data=60)))
-    found = find_joint_mode(skies, FieldLaws.of(skies), channels, learn=True).laws
+    channels = pj.ChannelsInMemory(tuple(s[-1] for s in observed(skies, laws, seed=5, n_data=60)))
+    found = pj.find_joint_mode(skies, FieldLaws.of(skies), channels, learn=True).laws
 
     def evidence(parameters):
         there = replace(found, parameters=parameters)
-        mode = find_joint_mode(skies, there, channels)
+        mode = pj.find_joint_mode(skies, there, channels)
         away = (parameters - found.expected) / [LOG_WIDTH, TILT_WIDTH]
         return float(mode.posterior.log_evidence) - 0.5 * (away**2).sum()
 
@@ -223,4 +213,4 @@ def test_bad_input_is_refused_in_a_sentence():
     refuse("the template", build, FREQUENCIES, holes, LMAX)
     skies = skies_of(FREQUENCIES[:1], ("level",))
     other = Information(*(np.zeros(s) for s in ((4, 4), 4, 4, (), (), ())))
-    refuse("the patterns", linearised, skies, 0, other, np.zeros(N))
+    refuse("the patterns", pj.linearised, skies, 0, other, np.zeros(N))

@@ -14,13 +14,6 @@ from reference_linear import random_covariance
 import lusee_bayes as lb
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.noise import covariance
-from lusee_bayes.noise.covariance import (
-    DenseCovariance,
-    LowRankCovariance,
-    LowRankUpdate,
-    TimeBandedCovariance,
-    TimeBlockCovariance,
-)
 from lusee_bayes.noise.instrument_errors import template_noise
 from lusee_bayes.testing.contracts import check_covariance, close
 
@@ -64,14 +57,14 @@ def _banded(flags, width, seed=5):
     apart = np.abs(time_of[:, None] - time_of[None])
     assert (by_hand[apart > width] == 0).all()
     layout = DataLayout.from_flags(flags)
-    return TimeBandedCovariance(jnp.asarray(band), layout, "the memory"), by_hand
+    return covariance.TimeBandedCovariance(jnp.asarray(band), layout, "the memory"), by_hand
 
 
 def _directions(n, rank=2, seed=11):
     """(U U^T, the same by hand, entry by entry)."""
     u = np.random.default_rng(seed).normal(size=(n, rank))
     by_hand = np.array([[sum(u[i] * u[j]) for j in range(n)] for i in range(n)])
-    return LowRankCovariance(jnp.asarray(u), "the templates"), by_hand
+    return covariance.LowRankCovariance(jnp.asarray(u), "the templates"), by_hand
 
 
 def _terms(flags):
@@ -91,10 +84,10 @@ def _terms(flags):
     base, (directions, outer) = lb.DiagonalCovariance(jnp.asarray(updated)), _directions(n)
     return {
         "diagonal": (lb.DiagonalCovariance(jnp.asarray(variance)), np.diag(variance)),
-        "blocks": (TimeBlockCovariance(jnp.asarray(blocks), layout), by_hand),
-        "dense": (DenseCovariance(jnp.asarray(matrix)), matrix),
+        "blocks": (covariance.TimeBlockCovariance(jnp.asarray(blocks), layout), by_hand),
+        "dense": (covariance.DenseCovariance(jnp.asarray(matrix)), matrix),
         "banded": _banded(flags, 2),
-        "low rank": (LowRankUpdate(base, directions), np.diag(updated) + outer),
+        "low rank": (covariance.LowRankUpdate(base, directions), np.diag(updated) + outer),
     }
 
 
@@ -123,19 +116,17 @@ def test_contract_of_sums(first, second, small_blocks):
     check_covariance(cov_a + cov_b, dense_a + dense_b, slopes=True)
 
 
-@pytest.mark.long
 @pytest.mark.essential
 @pytest.mark.parametrize("kind", ["banded", "blocks", "dense"])
 def test_contract_of_low_rank_updates(kind, small_blocks):
     cov, dense = _terms(FLAGS)[kind]
     directions, outer = _directions(len(dense), seed=12)
-    check_covariance(LowRankUpdate(cov, directions), dense + outer, slopes=True)
+    check_covariance(covariance.LowRankUpdate(cov, directions), dense + outer, slopes=True)
     for total in (cov + directions, directions + cov):
         close(_dense(total), dense + outer)
 
 
 # blocks of two times: widths below, at and above a block, whole matrices; times no multiple of two
-@pytest.mark.long
 @pytest.mark.essential
 @pytest.mark.parametrize(
     ("width", "flagged"), [*((w, False) for w in (0, 1, 2, 3, 6, 9)), *((w, True) for w in (2, 5))]
@@ -148,17 +139,17 @@ def test_bands_of_every_width(width, flagged, small_blocks):
 
 
 # 11 and 44 times make a block row; one gap hides more than a whole block row
+SIZES = [
+    (16, 25, 0, slice(0, 0)),
+    (16, 25, 11, slice(0, 0)),
+    (16, 27, 12, slice(9, 23)),
+    (16, 25, 40, slice(3, 4)),
+    (4, 95, 50, slice(60, 70)),
+]
+
+
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("n_products", "n_times", "width", "gap"),
-    [
-        (16, 25, 0, slice(0, 0)),
-        (16, 25, 11, slice(0, 0)),
-        (16, 27, 12, slice(9, 23)),
-        (16, 25, 40, slice(3, 4)),
-        (4, 95, 50, slice(60, 70)),
-    ],
-)
+@pytest.mark.parametrize(("n_products", "n_times", "width", "gap"), SIZES)
 def test_bands_at_the_blocks_own_size(n_products, n_times, width, gap):
     flags = np.zeros((n_products, n_times), dtype=bool)
     flags[:, gap] = True
@@ -170,18 +161,18 @@ def test_sums_keep_the_structure():
     directions, _ = _directions(diagonal.size)
     assert isinstance(diagonal + diagonal, lb.DiagonalCovariance)
     for term in (diagonal + blocks, blocks + diagonal, blocks + blocks):
-        assert isinstance(term, TimeBlockCovariance)
+        assert isinstance(term, covariance.TimeBlockCovariance)
     for term in (dense + blocks, blocks + dense, diagonal + dense, dense + dense, banded + dense):
-        assert isinstance(term, DenseCovariance)
+        assert isinstance(term, covariance.DenseCovariance)
     for other in (diagonal, blocks, banded):
         for term in (banded + other, other + banded):
-            assert isinstance(term, TimeBandedCovariance)
+            assert isinstance(term, covariance.TimeBandedCovariance)
             assert term.band.shape[1] == 3
         for term in (other + directions, directions + other, other + low_rank, low_rank + other):
-            assert isinstance(term, LowRankUpdate)
+            assert isinstance(term, covariance.LowRankUpdate)
             assert isinstance(term.base, type(other))
     assert (low_rank + directions).update.root.shape[1] == 4
-    assert isinstance(directions + directions, LowRankCovariance)
+    assert isinstance(directions + directions, covariance.LowRankCovariance)
 
 
 def test_bands_of_different_width_add_up(small_blocks):
@@ -195,7 +186,7 @@ def test_as_many_directions_as_data_leave_no_structure():
     for rank in (len(dense), len(dense) + 3):
         directions, outer = _directions(len(dense), rank)
         total = cov + directions
-        assert isinstance(total, DenseCovariance)
+        assert isinstance(total, covariance.DenseCovariance)
         close(total.dense(), dense + outer)
         ones = np.ones(len(dense))
         close(total.solve(jnp.asarray(ones)), np.linalg.solve(dense + outer, ones))
@@ -225,7 +216,7 @@ def test_strong_directions_are_whitened_too(kind):
     """
     base, dense = _terms(FLAGS)[kind]
     directions, _ = _directions(len(dense), rank=3)
-    factor = LowRankUpdate(base, directions.scaled(1e8)).factor()
+    factor = covariance.LowRankUpdate(base, directions.scaled(1e8)).factor()
     strong = factor.whiten(1e4 * directions.root)
     weak = factor.whiten(jnp.asarray(np.linalg.cholesky(dense)))
     unit = np.asarray(strong @ strong.T + weak @ weak.T)
@@ -253,7 +244,7 @@ def test_flagged_samples_change_nothing_whatever_their_blocks_hold():
     cov, dense = _terms(FLAGS)["blocks"]
     junk = np.asarray(cov.blocks).copy()
     junk[FLAGS.T] = 1e6  # rows of samples that were never taken
-    again = TimeBlockCovariance(jnp.asarray(junk), cov.layout)
+    again = covariance.TimeBlockCovariance(jnp.asarray(junk), cov.layout)
     close(again.dense(), dense, 1e-15)
     assert float(again.log_det()) == float(cov.log_det())
 
@@ -277,13 +268,13 @@ def test_gradients_reach_the_entries():
     terms = _terms(FLAGS)
     (diagonal, d), (blocks, b), (dense, m) = (terms[k] for k in ("diagonal", "blocks", "dense"))
     close(slope(lb.DiagonalCovariance, diagonal.variance), np.diag(expected(d)))
-    close(slope(DenseCovariance, dense.matrix), expected(m))
+    close(slope(covariance.DenseCovariance, dense.matrix), expected(m))
     by_block = np.zeros((N_TIMES, N_PRODUCTS, N_PRODUCTS))
     product_of, time_of = np.nonzero(~FLAGS)
     for i, j in product(range(layout.size), repeat=2):
         if time_of[i] == time_of[j]:
             by_block[time_of[i], product_of[i], product_of[j]] = expected(b)[i, j]
-    close(slope(lambda e: TimeBlockCovariance(e, layout), blocks.blocks), by_block)
+    close(slope(lambda e: covariance.TimeBlockCovariance(e, layout), blocks.blocks), by_block)
 
 
 # --- refusals ---------------------------------------------------------------------------------
@@ -295,43 +286,43 @@ BLOCKS = jnp.tile(jnp.eye(2)[None], (3, 1, 1))
 UNIT, ROOT = jnp.eye(3), jnp.ones((4, 2))
 MAKERS = {
     "diagonal": lb.DiagonalCovariance,
-    "dense": lambda m: DenseCovariance(m, "the gain term"),
-    "blocks": lambda b: TimeBlockCovariance(b, LAYOUT),
-    "banded": lambda b: TimeBandedCovariance(b, LAYOUT, "the gain term"),
-    "low rank": lambda u: LowRankCovariance(u, "the beams"),
+    "dense": lambda m: covariance.DenseCovariance(m, "the gain term"),
+    "blocks": lambda b: covariance.TimeBlockCovariance(b, LAYOUT),
+    "banded": lambda b: covariance.TimeBandedCovariance(b, LAYOUT, "the gain term"),
+    "low rank": lambda u: covariance.LowRankCovariance(u, "the beams"),
 }
 
 
-@pytest.mark.parametrize(
-    ("kind", "entries", "message"),
-    [
-        *(
-            ("diagonal", jnp.array([1.0, bad, 2.0]), r"must be positive, .* first at \(1,\)")
-            for bad in (0.0, -1.0, np.nan, np.inf)
-        ),
-        *(
-            (kind, jnp.float32(entries), "(variance|term|blocks|beams) must be a float64 array")
-            for kind, entries in zip(MAKERS, (jnp.ones(3), UNIT, BLOCKS, BAND, ROOT), strict=True)
-        ),
-        ("dense", UNIT.at[0, 2].set(jnp.nan), r"the gain term holds NaN .*\(0, 2\)"),
-        ("blocks", BLOCKS.at[1, 1, 0].set(jnp.inf), r"noise blocks holds NaN .*\(1, 1, 0\)"),
-        ("banded", BAND.at[1, 1, 0, 1].set(jnp.nan), r"holds NaN .* first at \(1, 1, 0, 1\)"),
-        ("low rank", ROOT.at[3, 1].set(jnp.inf), r"the beams holds NaN or infinity .*\(3, 1\)"),
-        ("blocks", jnp.ones((2, 3, 3)), r"shape \(2, 3, 3\), expected \(3, 2, 2\)"),
-        ("banded", BAND[:2], r"shape \(2, 2, 2, 2\), expected \(3, any, 2, 2\)"),
-        ("dense", UNIT.at[0, 1].set(0.01), r"gain term is not symmetric: .* up to 0\.01 "),
-        ("blocks", BLOCKS.at[1, 0, 1].set(0.1), "not symmetric"),
-        ("banded", BAND.at[2, 0, 0, 1].set(0.5), "within one time is not symmetric: .* 0\\.5 "),
-    ],
-)
+BAD_ENTRIES = [
+    *(
+        ("diagonal", jnp.array([1.0, bad, 2.0]), r"must be positive, .* first at \(1,\)")
+        for bad in (0.0, -1.0, np.nan, np.inf)
+    ),
+    *(
+        (kind, jnp.float32(entries), "(variance|term|blocks|beams) must be a float64 array")
+        for kind, entries in zip(MAKERS, (jnp.ones(3), UNIT, BLOCKS, BAND, ROOT), strict=True)
+    ),
+    ("dense", UNIT.at[0, 2].set(jnp.nan), r"the gain term holds NaN .*\(0, 2\)"),
+    ("blocks", BLOCKS.at[1, 1, 0].set(jnp.inf), r"noise blocks holds NaN .*\(1, 1, 0\)"),
+    ("banded", BAND.at[1, 1, 0, 1].set(jnp.nan), r"holds NaN .* first at \(1, 1, 0, 1\)"),
+    ("low rank", ROOT.at[3, 1].set(jnp.inf), r"the beams holds NaN or infinity .*\(3, 1\)"),
+    ("blocks", jnp.ones((2, 3, 3)), r"shape \(2, 3, 3\), expected \(3, 2, 2\)"),
+    ("banded", BAND[:2], r"shape \(2, 2, 2, 2\), expected \(3, any, 2, 2\)"),
+    ("dense", UNIT.at[0, 1].set(0.01), r"gain term is not symmetric: .* up to 0\.01 "),
+    ("blocks", BLOCKS.at[1, 0, 1].set(0.1), "not symmetric"),
+    ("banded", BAND.at[2, 0, 0, 1].set(0.5), "within one time is not symmetric: .* 0\\.5 "),
+]
+
+
+@pytest.mark.parametrize(("kind", "entries", "message"), BAD_ENTRIES)
 def test_entries_that_no_covariance_has_are_refused(kind, entries, message):
     refuse(message, MAKERS[kind], entries)
 
 
 def test_what_passes_and_a_factor_that_does_not():
-    DenseCovariance(UNIT.at[0, 1].set(1e-14))  # rounding
+    covariance.DenseCovariance(UNIT.at[0, 1].set(1e-14))  # rounding
     # blocks between times need not be symmetric
-    TimeBandedCovariance(BAND.at[1, 1, 0, 1].set(0.5), LAYOUT)
+    covariance.TimeBandedCovariance(BAND.at[1, 1, 0, 1].set(0.5), LAYOUT)
     for bad in (0.0, -2.0):
         refuse("must be positive", lb.DiagonalCovariance(jnp.ones(3)).scaled, bad)
 
@@ -346,15 +337,15 @@ def _indefinite():
 @pytest.mark.parametrize("kind", ["dense", "blocks", "banded"])
 def test_indefinite_terms_are_named_with_their_lowest_eigenvalue(kind):
     if kind == "dense":
-        cov = DenseCovariance(_indefinite(), "the gain term")
+        cov = covariance.DenseCovariance(_indefinite(), "the gain term")
     elif kind == "blocks":
         blocks = jnp.stack([jnp.eye(6), _indefinite()])
-        cov = TimeBlockCovariance(blocks, DataLayout(6, 2))
+        cov = covariance.TimeBlockCovariance(blocks, DataLayout(6, 2))
     else:
         # times 0 and 1 correlated by 1.25: eigenvalues 1 +- 1.25; the last time stands alone
         band = jnp.zeros((3, 2, 4, 4)).at[:, 0].set(jnp.eye(4)).at[1, 1].set(1.25 * jnp.eye(4))
-        cov = TimeBandedCovariance(band, DataLayout(4, 3), "the gain term")
-        cov = LowRankUpdate(cov, LowRankCovariance(1e-3 * jnp.ones((12, 1))))
+        cov = covariance.TimeBandedCovariance(band, DataLayout(4, 3), "the gain term")
+        cov = covariance.LowRankUpdate(cov, covariance.LowRankCovariance(1e-3 * jnp.ones((12, 1))))
     name = "noise" if kind == "blocks" else "the gain term"
     for use in (cov.factor, cov.log_det, lambda: cov.solve(jnp.ones(cov.size))):
         refuse(rf"{name}.* not positive definite: .* eigenvalue is -0\.25 ", use)
@@ -377,7 +368,7 @@ def test_blocks_with_other_flags_are_refused():
 
 def test_a_dense_term_can_be_built_inside_jit_from_known_numbers():
     matrix = jnp.asarray(random_covariance(np.random.default_rng(0), 3))
-    got = jax.jit(lambda x: DenseCovariance(matrix).solve(x))(jnp.ones(3))
+    got = jax.jit(lambda x: covariance.DenseCovariance(matrix).solve(x))(jnp.ones(3))
     close(got, np.linalg.solve(np.asarray(matrix), np.ones(3)))
 
 
@@ -398,22 +389,21 @@ def test_the_term_is_t_p_t(prior, matrix):
     expected = T @ matrix @ T.T
     got = template_noise(jnp.asarray(T), jnp.asarray(prior), SEEN)
     # products of a few numbers of order one
-    atol = 1e-14 * np.abs(expected).max()
-    np.testing.assert_allclose(got.dense(), expected, rtol=0, atol=atol)
-    np.testing.assert_allclose(got.diagonal(), np.diag(expected), rtol=0, atol=atol)
+    close(got.dense(), expected, 1e-14)
+    close(got.diagonal(), np.diag(expected), 1e-14)
     assert got.root.shape == (15, 3)
 
 
-@pytest.mark.parametrize(
-    ("templates", "prior", "message"),
-    [
-        (T[:14], VARIANCES, r"the templates has shape \(14, 3\), expected \(15, any\)"),
-        (np.where(np.arange(15)[:, None] == 4, np.nan, T), VARIANCES, r"the templates holds NaN"),
-        (T, np.array([1.0, 0.0, 2.0]), r"prior variance must be positive, .* first at \(1,\)"),
-        (T, np.diag([1.0, -0.5, 2.0]), "prior is not positive definite: .* eigenvalue is -0.5 "),
-        (T, P + np.eye(3, k=1), "the templates' prior is not symmetric: .* up to 1 "),
-        (T, np.full((3, 3), np.inf), "the templates' prior holds NaN or infinity"),
-    ],
-)
+BAD_TEMPLATES = [
+    (T[:14], VARIANCES, r"the templates has shape \(14, 3\), expected \(15, any\)"),
+    (np.where(np.arange(15)[:, None] == 4, np.nan, T), VARIANCES, r"the templates holds NaN"),
+    (T, np.array([1.0, 0.0, 2.0]), r"prior variance must be positive, .* first at \(1,\)"),
+    (T, np.diag([1.0, -0.5, 2.0]), "prior is not positive definite: .* eigenvalue is -0.5 "),
+    (T, P + np.eye(3, k=1), "the templates' prior is not symmetric: .* up to 1 "),
+    (T, np.full((3, 3), np.inf), "the templates' prior holds NaN or infinity"),
+]
+
+
+@pytest.mark.parametrize(("templates", "prior", "message"), BAD_TEMPLATES)
 def test_bad_input_is_refused(templates, prior, message):
     refuse(message, template_noise, jnp.asarray(templates), jnp.asarray(prior), SEEN)

@@ -19,21 +19,16 @@ N_TIMES = len(HOURS)
 
 def pairs(n_antennas):
     """Antennas of 00R, 01R, 01I, 02R, ...: twice the same pair for a cross product."""
-    names = []
-    for i in range(n_antennas):
-        names.append((i, i))
-        for j in range(i + 1, n_antennas):
-            names += [(i, j), (i, j)]
-    return names
+    every = range(n_antennas)
+    return [(i, j) for i in every for j in every[i:] for _ in range(1 + (i != j))]
 
 
 def visibilities(n_antennas, n_times=N_TIMES, seed=0):
     """No symmetry, both signs in the crosses, as a (products, times) array in K."""
     rng = np.random.default_rng(seed)
     grid = rng.normal(size=(n_antennas**2, n_times)) * 3e3
-    for k, (i, j) in enumerate(pairs(n_antennas)):
-        if i == j:
-            grid[k] = 2e4 + abs(grid[k])
+    autos = [i == j for i, j in pairs(n_antennas)]
+    grid[autos] = 2e4 + abs(grid[autos])
     return grid
 
 
@@ -137,10 +132,8 @@ def test_mean_and_covariance_of_simulated_histories():
 
 def test_with_gains_is_the_product_of_both_antennas():
     d, gains = visibilities(3), np.random.default_rng(1).normal(size=(3, N_TIMES))
-    expected = np.zeros_like(d)
-    for k, (i, j) in enumerate(pairs(3)):
-        for t in range(N_TIMES):
-            expected[k, t] = (1.0 + gains[i, t]) * (1.0 + gains[j, t]) * d[k, t]
+    both = zip(pairs(3), d, strict=True)
+    expected = [(1.0 + gains[i]) * (1.0 + gains[j]) * seen for (i, j), seen in both]
     got = with_gains(jnp.asarray(d), jnp.asarray(gains))
     np.testing.assert_allclose(got, expected, rtol=1e-15 * 2)
 

@@ -4,14 +4,13 @@ from dataclasses import replace
 from functools import cache
 
 import healpy
-import matplotlib.image
 import numpy as np
 import pytest
 import xarray as xr
 from assertions import refuse, require_conventions
 from astropy import units as u
 from astropy.coordinates import SkyCoord
-from commands import table_of
+from commands import assert_drawn, table_of
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.harmonics import map_to_modes
@@ -72,12 +71,10 @@ def computed(monkeypatch):
 
 @pytest.mark.long
 def test_everything_is_written(folder):
-    assert {p.name for p in folder.iterdir()} == {
-        "cases", "figures", "cases.csv", "claims.csv", "claims.md", "manifest.json",
-    }  # fmt: skip
+    names = "cases figures cases.csv claims.csv claims.md manifest.json"
+    assert {p.name for p in folder.iterdir()} == set(names.split())
     assert {p.stem for p in (folder / "figures").iterdir()} == set(FIGURES)
-    for figure in (folder / "figures").iterdir():
-        assert matplotlib.image.imread(figure).std() > 0.01  # not blank
+    assert_drawn(*(folder / "figures").iterdir())
     assert {p.name for p in (folder / "cases").iterdir()} == {f"{n}.nc" for n in paper.CASES}
     rows = table_of(folder / "cases.csv")
     assert [row["case"] for row in rows] == list(paper.CASES)

@@ -74,7 +74,7 @@ class Outline(HTMLParser):
 
 
 # a map run with all its figures takes half a minute
-FOLDER = pytest.param("folder", marks=[pytest.mark.long, pytest.mark.essential])
+FOLDER = pytest.param("folder", marks=pytest.mark.essential)
 SAMPLED = pytest.param("sampled", marks=pytest.mark.long)
 CUBE = pytest.param("cube", marks=pytest.mark.long)
 
@@ -96,7 +96,6 @@ def test_pages_are_whole_and_need_nothing_else(which, request):
     assert len(page) < 8e6
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_a_pixels_posterior_is_that_of_the_file(folder):
     data = viewer_data((folder / "report.html").read_text())

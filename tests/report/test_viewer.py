@@ -93,7 +93,7 @@ def test_pixels_and_equatorial_coordinates(page, small_map, tmp_path):
 @needs_node
 @pytest.mark.parametrize(
     "which",
-    ["small_map", pytest.param("correlated", marks=[pytest.mark.long, pytest.mark.essential])],
+    ["small_map", pytest.param("correlated", marks=pytest.mark.essential)],
 )
 def test_point_spread_functions_are_those_of_the_posterior(which, request, tmp_path):
     """Against y^T R from the posterior; bytes are wrong by half a step at most, at random."""
@@ -142,9 +142,8 @@ def test_what_a_direction_and_the_pointer_tell(page, tmp_path):
     # the Galactic centre is at 266.4, -28.9 degrees
     assert "266.4" in told["hover"] and "-28.9" in told["hover"]
     assert {"Cas A", "Cyg A", "60°", "-30°"} <= set(told["texts"])
-    assert {"mean", "std", "truth", "residual", "pull", "prior_fraction", "draw1"} <= set(
-        told["options"]
-    )
+    layers = {"mean", "std", "truth", "residual", "pull", "prior_fraction", "draw1"}
+    assert layers <= set(told["options"])
     assert told["ticks"] == [[1, 10, 100, 1000], [-4, -2, 0, 2, 4], [4000, 5000, 6000]]
     # the ellipse fills pi/4 of its rectangle, and more of it when zoomed in
     assert told["seen"] == pytest.approx([400 * 200 * np.pi / 4, 120 * 60 * np.pi / 4], rel=0.02)

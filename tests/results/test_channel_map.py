@@ -41,15 +41,14 @@ def dense_z(judged, data) -> np.ndarray:
     return (off - q @ (q.T @ off)) / np.sqrt(1.0 - (q**2).sum(1))
 
 
-@pytest.mark.parametrize(
-    "noise",
-    [
-        (),
-        ("noise.gain={sigma: 0.01}",),
-        ("noise.radiometer.form=exact", "noise.beam={shift_mhz: 1}"),
-    ],
-    ids=["diagonal", "banded", "templates"],
-)
+NOISES = {
+    "diagonal": (),
+    "banded": ("noise.gain={sigma: 0.01}",),
+    "templates": ("noise.radiometer.form=exact", "noise.beam={shift_mhz: 1}"),
+}
+
+
+@pytest.mark.parametrize("noise", NOISES.values(), ids=list(NOISES))
 def test_likelihoods_of_draws_are_those_of_matrices(noise):
     made, channel = mapped(small_experiment("output.draws=4", *noise))
     data = made.experiment.data.data

@@ -72,15 +72,15 @@ def test_channels_that_stand_out_are_named():
     assert "no sky explains" in fits(loud).fit().text
 
 
-@pytest.mark.parametrize(
-    ("found", "joint", "said", "not_said"),
-    [
-        (400.0, False, ["compare-priors", "400, expected 200 +- 20", "too narrow"], "are weaker"),
-        (400.0, True, ["spectral.components"], "compare-priors"),
-        (50.0, False, ["skies are weaker", "error bars are too wide"], "too narrow"),
-        (50.0, True, ["smaller spectral.residual"], "compare-priors"),
-    ],
-)
+PRIORS = [
+    (400.0, False, ["compare-priors", "400, expected 200 +- 20", "too narrow"], "are weaker"),
+    (400.0, True, ["spectral.components"], "compare-priors"),
+    (50.0, False, ["skies are weaker", "error bars are too wide"], "too narrow"),
+    (50.0, True, ["smaller spectral.residual"], "compare-priors"),
+]
+
+
+@pytest.mark.parametrize(("found", "joint", "said", "not_said"), PRIORS)
 def test_the_prior_is_judged_apart(found, joint, said, not_said):
     """Only if the instrument fits."""
     chi2 = np.random.default_rng(6).chisquare(5000.0, 46)

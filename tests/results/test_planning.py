@@ -4,12 +4,11 @@ from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
-import matplotlib.image
 import numpy as np
 import pytest
 import scipy.linalg
 from assertions import refuse
-from commands import run, table_of
+from commands import assert_drawn, run, table_of
 from experiments import flagged
 from reference_linear import matrices
 
@@ -242,7 +241,7 @@ def test_the_command_writes_table_and_figure(tmp_path, capsys, monkeypatch):
     tiny = [*TINY, "--set", "observation.start=2027-02-03"]
     assert run("plan", "fiducial", "noise_x100", *tiny, "-o", tmp_path) == 0
     assert {p.name for p in tmp_path.iterdir()} == {"plan.csv", "figures", "manifest.json"}
-    assert matplotlib.image.imread(tmp_path / "figures" / "plan.png").std() > 0.01
+    assert_drawn(tmp_path / "figures" / "plan.png")
     rows = table_of(tmp_path / "plan.csv")
     names = [row["variation"] for row in rows if row["scenario"] == "fiducial"]
     ports = [f"port {port}" for port in range(4)]

@@ -92,7 +92,6 @@ def part(k: int, sky: bool = True) -> slice:
     return slice(start, start + N_MODES) if sky else slice(start + N_MODES, start + 21)
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_skies_and_evidence_are_those_of_one_normal_equation(cube, dense, expected):
     for k, channel in enumerate(cube.channels):
@@ -110,7 +109,6 @@ def test_skies_and_evidence_are_those_of_one_normal_equation(cube, dense, expect
     assert (np.abs(own.mean - expected.mean) / expected.std)[part(1)].max() > 0.05
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_chi2_is_about_what_the_others_tell_of_the_receivers(cube, dense, expected):
     """N of a channel given the others' data: with the covariance that they leave to its five."""
@@ -126,7 +124,6 @@ def test_chi2_is_about_what_the_others_tell_of_the_receivers(cube, dense, expect
         assert channel.chi2_expected == pytest.approx(degrees, rel=ROUNDING)
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_receivers_and_ground_are_those_of_one_normal_equation(cube, expected):
     for k, channel in enumerate(cube.channels):
@@ -139,7 +136,6 @@ def test_receivers_and_ground_are_those_of_one_normal_equation(cube, expected):
     assert any("smooth over 0.4 octaves" in line for line in cube.lines())
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_draws_are_of_all_channels_together(cube, expected):
     """Covariances of white draws scatter by 1 / sqrt(n), their squares by sqrt(2 / n)."""

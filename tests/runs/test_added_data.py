@@ -39,16 +39,16 @@ def in_parts(scenario, folder):
 SIGMA, EVIDENCE = 1e-4, 1e-3
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [
-        pytest.param([GIVEN], id="map", marks=pytest.mark.long),
-        pytest.param([LEARNED], id="learned map"),
-        pytest.param([CUBE, GIVEN], id="independent", marks=pytest.mark.long),
-        pytest.param([CUBE, LEARNED], id="learned", marks=pytest.mark.long),
-        pytest.param([CUBE, *JOINT], id="joint"),
-    ],
-)
+MAPS = [
+    pytest.param([GIVEN], id="map", marks=pytest.mark.long),
+    pytest.param([LEARNED], id="learned map"),
+    pytest.param([CUBE, GIVEN], id="independent", marks=pytest.mark.long),
+    pytest.param([CUBE, LEARNED], id="learned", marks=pytest.mark.long),
+    pytest.param([CUBE, *JOINT], id="joint"),
+]
+
+
+@pytest.mark.parametrize("kind", MAPS)
 def test_a_map_is_that_of_all_data(kind, tmp_path, exact_tilt):
     """A prior that is learned is learned anew, from all of them."""
     scenario = lb.load_scenario("fiducial", [*SIZES, *kind])

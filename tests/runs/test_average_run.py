@@ -87,18 +87,18 @@ def test_average_s_of_the_scenario_does_not_count(path, data, tmp_path):
     assert made.data.observation.n_times == data.observation.n_times
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["--to", "2hours"], "'2hours' is not a length of time; give a positive number"),
-        (["--to", "10min"], "shorter than their samples of 1800 s"),
-        (["--to", "2h", "-o", "w.fits"], "give -o a name that does not end in .fits"),
-        (["--to", "2h", "-o", "data.nc"], "'data.nc' is an input of this run"),
-        (["--to", "2h", "--set", "frequency_mhz=10"], "the data are at 25.0 MHz"),
-        (["--to", "2h", "--set", "frequencies_mhz=[10,20]"], "averages are of one frequency"),
-        (["--to", "2h", "--set", "observation.timestamp=start"], "leave that out"),
-    ],
-)
+BAD_INPUT = [
+    (["--to", "2hours"], "'2hours' is not a length of time; give a positive number"),
+    (["--to", "10min"], "shorter than their samples of 1800 s"),
+    (["--to", "2h", "-o", "w.fits"], "give -o a name that does not end in .fits"),
+    (["--to", "2h", "-o", "data.nc"], "'data.nc' is an input of this run"),
+    (["--to", "2h", "--set", "frequency_mhz=10"], "the data are at 25.0 MHz"),
+    (["--to", "2h", "--set", "frequencies_mhz=[10,20]"], "averages are of one frequency"),
+    (["--to", "2h", "--set", "observation.timestamp=start"], "leave that out"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "words"), BAD_INPUT)
 def test_bad_input_is_a_sentence(path, tmp_path, monkeypatch, capsys, arguments, words):
     monkeypatch.chdir(tmp_path)
     assert words in refused(capsys, "average", path, *arguments)

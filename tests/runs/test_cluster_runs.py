@@ -34,6 +34,14 @@ if __name__ == "__main__":
 """
 
 
+def wait_for(there, seconds=60):
+    """Until it is so."""
+    deadline = time.monotonic() + seconds
+    while not there():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
 class Cluster:
     """Processes of ``dask scheduler`` and ``dask worker``, in a folder of their own."""
 
@@ -49,8 +57,8 @@ class Cluster:
         written = self.folder / f"scheduler-{time.monotonic_ns()}.json"
         options = ["--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(written)]
         self.scheduler = self._dask("scheduler", "--no-dashboard", *options)
-        self._wait(written.is_file)
-        self._wait(lambda: written.read_text().endswith("}"))
+        wait_for(written.is_file)
+        wait_for(lambda: written.read_text().endswith("}"))
         self.address = json.loads(written.read_text())["address"]
         self.workers = []
 
@@ -63,9 +71,8 @@ class Cluster:
         """The command line, as a process."""
         words = [sys.executable, "-c", PROGRAM, *map(str, arguments)]
         environment = self.environment | {"DASK_SCHEDULER_ADDRESS": self.address}
-        return subprocess.Popen(
-            words, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
+        pipe = subprocess.PIPE
+        return subprocess.Popen(words, env=environment, stdout=pipe, stderr=pipe, text=True)
 
     def kill(self, process: subprocess.Popen):
         """With all that it has started: a nanny's worker ends with it."""
@@ -81,13 +88,6 @@ class Cluster:
         options = {"env": self.environment, "cwd": self.folder, "start_new_session": True}
         command, nowhere = [sys.executable, "-m", "dask", *words], subprocess.DEVNULL
         return subprocess.Popen(command, stdout=nowhere, stderr=nowhere, **options)
-
-    @staticmethod
-    def _wait(there):
-        deadline = time.monotonic() + 60
-        while not there():
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
 
 
 @pytest.fixture
@@ -127,10 +127,11 @@ def finished(folder: Path) -> dict[str, int]:
 
 
 def when_some_are_there(process: subprocess.Popen, folder: Path, n: int = 3):
-    deadline = time.monotonic() + 120
-    while len(finished(folder)) < n:
-        assert time.monotonic() < deadline and process.poll() is None, process.communicate()
-        time.sleep(0.01)
+    def there():
+        assert process.poll() is None, process.communicate()
+        return len(finished(folder)) >= n
+
+    wait_for(there, 120)
 
 
 def goes_on(cluster: Cluster, folder: Path, *more):
@@ -190,19 +191,15 @@ def test_what_is_killed_goes_on_where_it_was(killed, cluster, alone, tmp_path):
 
 @pytest.mark.long
 def test_workers_of_a_killed_command_end_with_it(tmp_path):
-    process = subprocess.Popen(
-        [sys.executable, "-m", "lusee_bayes.cli", *MAP, "--workers", "2", "-o", tmp_path, "-q"]
-    )
+    command = [sys.executable, "-m", "lusee_bayes.cli", *MAP, "--workers", "2", "-q"]
+    process = subprocess.Popen([*command, "-o", tmp_path])
     when_some_are_there(process, tmp_path)
     command = ["ps", "-o", "pid=", "--ppid", str(process.pid)]
     started = subprocess.run(command, capture_output=True, text=True).stdout.split()
     assert started
     process.kill()
     process.wait()
-    deadline = time.monotonic() + 30
-    while any(Path(f"/proc/{pid}").exists() for pid in started):
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
+    wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in started), 30)
     assert list(tmp_path.glob("channels/*.nc"))
 
 

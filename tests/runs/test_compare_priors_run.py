@@ -28,7 +28,6 @@ def finished(tmp_path_factory):
     return folder
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_what_a_run_leaves(finished, capsys):
     assert {path.name for path in finished.iterdir() if path.is_file()} == FILES
@@ -51,7 +50,6 @@ def test_what_a_run_leaves(finished, capsys):
     assert found["verdict"] in capsys.readouterr().out
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_it_is_what_separate_maps_find(finished):
     """Each in a scenario of its own, from the simulation to the map."""

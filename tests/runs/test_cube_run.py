@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from assertions import assert_same_map, refuse
 from astropy.io import fits
-from commands import posterior_of, refused, run, sky_draws_of, table_of
+from commands import posterior_of, refused, run, sets, sky_draws_of, table_of
 from experiments import channels_of
 
 import lusee_bayes as lb
@@ -173,9 +173,8 @@ def test_a_channel_that_cannot_be_mapped_leaves_the_others_as_they_are(
     scenario = three(*joint, frequencies="[20, 30]")
     whole = lb.run_map(scenario, tmp_path / "without", data=gap, truth=True)
     monkeypatch.setattr(folder_module, "PAGES", {"map": lambda folder, _: head_of(folder)})
-    sets = [word for one in joint for word in ("--set", one)]
-    command = ["map", "fiducial", *THREE, *sets, "--data", gap, "-o", tmp_path / "with", "--truth"]
-    assert run(*command) == 0
+    command = ["map", "fiducial", *THREE, *sets(*joint), "--data", gap, "--truth"]
+    assert run(*command, "-o", tmp_path / "with") == 0
     told = capsys.readouterr().out
     got, expected = posterior_of(tmp_path / "with"), posterior_of(tmp_path / "without")
     np.testing.assert_array_equal(got["frequency"], [20.0, 30.0])
@@ -258,7 +257,7 @@ def scenario_of(*overrides, frequencies="[10, 20, 40]"):
 
 @pytest.mark.long
 def test_files_of_a_run_agree_with_each_other(tmp_path, capsys):
-    settings = [word for setting in POSITIVE[:-1] for word in ("--set", setting)]
+    settings = sets(*POSITIVE[:-1])
     command = ["map", "fiducial", *settings, "--frequencies", "10,20,40", "--joint"]
     assert run(*command, "--draws", 3, "-o", tmp_path / "out") == 0
     said = capsys.readouterr().out

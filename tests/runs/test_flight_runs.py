@@ -8,7 +8,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from commands import posterior_of, refused, run
+from commands import posterior_of, refused, run, sets
 from matplotlib.figure import Figure
 
 import lusee_bayes as lb
@@ -31,14 +31,13 @@ def simulate(folder, *more, force=False):
 
 
 def given(*more):
-    return [option for one in (*SET, *more) for option in ("--set", one)]
+    return sets(*SET, *more)
 
 
 def files_of(folder):
     return sorted(p.name for p in folder.iterdir())
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_a_map_of_simulated_sessions_has_the_sky_that_was_simulated(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(Figure, "savefig", lambda self, target, **_: Path(target).touch())

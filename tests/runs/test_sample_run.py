@@ -14,13 +14,12 @@ from pathlib import Path
 
 import equinox as eqx
 import healpy
-import matplotlib.image
 import numpy as np
 import pandas as pd
 import pytest
 from arviz_stats.base import array_stats
 from assertions import refuse
-from commands import content, refused, run
+from commands import assert_drawn, content, refused, run
 from reference_linear import z_of
 
 import lusee_bayes as lb
@@ -178,17 +177,16 @@ def test_starting_again_without_resume_is_refused_and_touches_nothing(killed, no
     assert content(killed) == before
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"sampler": replace(SAMPLER, seed=7)}, "another sampler's seed: 1, now 7"),
-        ({"program": "sky_marginal"}, "another program: sky, now sky_marginal"),
-        ({"digest": "0"}, "another program text: "),
-        ({"nside": 4}, "another scenario: "),
-        ({"factor": 1.0 + 1e-9}, "another data: "),
-    ],
-    ids=str,
-)
+ANOTHER_RUN = [
+    ({"sampler": replace(SAMPLER, seed=7)}, "another sampler's seed: 1, now 7"),
+    ({"program": "sky_marginal"}, "another program: sky, now sky_marginal"),
+    ({"digest": "0"}, "another program text: "),
+    ({"nside": 4}, "another scenario: "),
+    ({"factor": 1.0 + 1e-9}, "another data: "),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), ANOTHER_RUN, ids=str)
 def test_resuming_another_run_is_refused_and_the_difference_named(
     experiment, killed, no_sampling, change, message
 ):
@@ -237,8 +235,7 @@ def test_sample_writes_what_it_promises(runs):
     assert {p.name for p in whole.iterdir()} == set(files.split())
     figures = {"uncertainty", "traces", "ranks", "energy", "pairs", "against_analytic"}
     assert {p.stem for p in (whole / "figures").iterdir()} == figures
-    for figure in (whole / "figures").iterdir():
-        assert matplotlib.image.imread(figure).std() > 0.01  # not blank
+    assert_drawn(*(whole / "figures").iterdir())
     expected = lb.load_scenario("fiducial", OVERRIDES)
     assert lb.load_scenario(whole / "scenario.yaml") == expected
 
@@ -348,8 +345,7 @@ def test_validation_of_the_true_posterior_passes(validated):
     report = json.loads((folder / "validation.json").read_text())
     assert report["passed"], [c for c in report["checks"] if not c["passed"]]
     assert code == 0
-    for figure in ("comparison", "calibration"):
-        assert matplotlib.image.imread(folder / "figures" / f"{figure}.png").std() > 0.01
+    assert_drawn(*(folder / "figures" / f"{name}.png" for name in ("comparison", "calibration")))
 
 
 def consistent(folder):

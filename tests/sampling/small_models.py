@@ -10,7 +10,23 @@ from arviz_stats.base import array_stats
 from reference_linear import Answer, posterior, random_covariance, z_of
 
 import lusee_bayes as lb
+from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.noise.covariance import DenseCovariance
+
+# kinds of N
+NOISES = {
+    "paper": ("fiducial",),
+    "exact": ("fiducial", "noise.radiometer.form=exact"),
+    "gain": ("gain_1e-2",),
+    "beam": ("beam_4MHz",),
+}
+
+
+def noisy(noise: str, *more: str) -> Scenario:
+    """96 data of 49 modes with a kind of N."""
+    scenario, *overrides = NOISES[noise]
+    small = ["lmax=6", "observation.runs.0.cycles=0.02", *overrides, *more]
+    return lb.load_scenario(scenario, small)
 
 
 def random_gaussian(spectrum, n_data: int, seed: int, noise: float = 1.0) -> lb.LinearGaussian:
@@ -45,10 +61,6 @@ class Case:
         sky = width * rng.normal(size=len(width))
         root = np.sqrt(level) * np.linalg.cholesky(n)
         return cls(a, base, n, a @ sky + root @ rng.normal(size=n_data))
-
-    def seen(self) -> np.ndarray:
-        """A S A^T."""
-        return self.a * per_mode(self.base) @ self.a.T
 
     def given(self, amplitude=1.0, tilt=0.0, level=1.0) -> Answer:
         """Textbook posterior of the sky, with the evidence; N times a level."""

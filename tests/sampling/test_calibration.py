@@ -4,8 +4,6 @@ By the analytic posterior, with every kind of N. The data are so few (96 of 49 m
 1 % and 80 % of the modes' variances is left from the prior.
 """
 
-from __future__ import annotations
-
 from contextlib import contextmanager
 from functools import lru_cache
 
@@ -17,27 +15,14 @@ import pytest
 from assertions import refuse
 from jaxtyping import Array, Float
 from scipy import stats
+from small_models import NOISES, noisy
 
 import lusee_bayes as lb
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.model import full_model, set_up
 from lusee_bayes.judge.coverage import LEVELS
-from lusee_bayes.sampling.validation import (
-    FALSE_ALARM,
-    N_DRAWS,
-    Ranks,
-    calibrate,
-    calibrate_sky,
-    ranked_of_sky,
-)
+from lusee_bayes.sampling import validation
 
-SMALL = ("lmax=6", "observation.runs.0.cycles=0.02")
-NOISES = {
-    "paper": ("fiducial",),
-    "exact": ("fiducial", "noise.radiometer.form=exact"),
-    "gain": ("gain_1e-2",),
-    "beam": ("beam_4MHz",),
-}
 # one of them every time, the others by make long
 EVERY_NOISE = pytest.mark.parametrize(
     "noise", [n if n == "exact" else pytest.param(n, marks=pytest.mark.long) for n in NOISES]
@@ -46,20 +31,27 @@ EVERY_NOISE = pytest.mark.parametrize(
 
 @lru_cache
 def model(noise: str) -> lb.LinearGaussian:
-    scenario, *overrides = NOISES[noise]
-    return full_model(set_up(lb.load_scenario(scenario, [*SMALL, *overrides])))
+    return full_model(set_up(noisy(noise)))
 
 
-def p_values(ranks: Ranks) -> dict[str, float]:
+def p_values(ranks: validation.Ranks) -> dict[str, float]:
     return dict(zip(ranks.names, ranks.p_values().tolist(), strict=True))
+
+
+def assert_calibrated(ranks: validation.Ranks) -> None:
+    """Even ranks, and coverages within four errors."""
+    assert ranks.passed, p_values(ranks)
+    for name, coverage in ranks.coverage().items():
+        for level, share in coverage.items():
+            assert abs(share - level) < 4 * ranks.coverage_error(level), (name, level)
 
 
 # --- ranks ------------------------------------------------------------------------------------
 
 
-def ranks_of(*columns, n_draws=99, regions=()) -> Ranks:
+def ranks_of(*columns, n_draws=99, regions=()) -> validation.Ranks:
     names = tuple("abcdefgh"[: len(columns)])
-    return Ranks(np.stack(columns, axis=1), n_draws, names, regions)
+    return validation.Ranks(np.stack(columns, axis=1), n_draws, names, regions)
 
 
 def test_the_histogram_has_twenty_bins_of_five_ranks():
@@ -113,16 +105,15 @@ def test_the_threshold_is_shared_by_all_quantities():
     uneven = even.copy()
     # moved from other bins to the first: chi^2 = (24 (24/19) + 24^2) / 25 = 24.3
     one, eight = ranks_of(even), ranks_of(*[even] * 8)
-    assert one.threshold == pytest.approx(FALSE_ALARM)
-    assert eight.threshold == pytest.approx(FALSE_ALARM / 8)
-    p = 1.0
-    moved = 0
-    while p > FALSE_ALARM:
+    assert one.threshold == pytest.approx(validation.FALSE_ALARM)
+    assert eight.threshold == pytest.approx(validation.FALSE_ALARM / 8)
+    p, moved = 1.0, 0
+    while p > validation.FALSE_ALARM:
         where = 5 + 5 * (moved % 19) + 100 * (moved // 19)
         uneven[where] = 0
         moved += 1
         p = ranks_of(uneven).p_values()[0]
-    assert FALSE_ALARM / 8 < p < FALSE_ALARM
+    assert validation.FALSE_ALARM / 8 < p < validation.FALSE_ALARM
     assert not ranks_of(uneven).passed
     # the same among eight quantities is not that rare
     assert ranks_of(uneven, *[even] * 7).passed
@@ -147,21 +138,21 @@ class Counting(Stages):
 
 def test_ranks_count_the_draws_below_the_truth():
     def simulate(key):
-        return {"x": jnp.asarray([37.5, 0.5, N_DRAWS + 0.5]), "y": jnp.asarray(98.0)}, jnp.zeros(1)
+        x = jnp.asarray([37.5, 0.5, validation.N_DRAWS + 0.5])
+        return {"x": x, "y": jnp.asarray(98.0)}, jnp.zeros(1)
 
     def draw(key, data):
-        grid = jnp.arange(1.0, N_DRAWS + 1.0)
+        grid = jnp.arange(1.0, validation.N_DRAWS + 1.0)
         shuffled = jax.random.permutation(key, grid)
         return {"x": jnp.stack([shuffled, grid, grid], axis=1), "y": shuffled}
 
     stages = Counting()
-    ranks = calibrate(
-        simulate, draw, lambda sky, data: sky, n_simulations=130, batch=60, stages=stages
-    )
+    options = {"n_simulations": 130, "batch": 60, "stages": stages}
+    ranks = validation.calibrate(simulate, draw, lambda sky, data: sky, **options)
     assert ranks.names == ("x 0", "x 1", "x 2", "y")
-    assert ranks.n_draws == N_DRAWS
+    assert ranks.n_draws == validation.N_DRAWS
     # 37 of 1, 2, ... lie below 37.5; 97 below 98
-    np.testing.assert_array_equal(ranks.ranks, np.tile([37, 0, N_DRAWS, 97], (130, 1)))
+    np.testing.assert_array_equal(ranks.ranks, np.tile([37, 0, validation.N_DRAWS, 97], (130, 1)))
     assert stages.done == [1, 2, 3]  # batches
 
 
@@ -180,7 +171,7 @@ class Conjugate(eqx.Module):
         return truth, (truth + S * noise)[None]
 
     def draw(self, key, data):
-        z = jax.random.normal(key, (N_DRAWS,), dtype=jnp.float64)
+        z = jax.random.normal(key, (validation.N_DRAWS,), dtype=jnp.float64)
         std = self.s / jnp.sqrt(1 + self.s**2)
         return data[0] / (1 + self.s**2) + std * (self.shift + self.scale * z)
 
@@ -192,27 +183,19 @@ class Conjugate(eqx.Module):
 S = 0.7
 
 
-def conjugate(shift=0.0, scale=1.0, s=S, simulations=500, **options) -> Ranks:
+def conjugate(shift=0.0, scale=1.0, s=S, simulations=500, **options) -> validation.Ranks:
     model = Conjugate(*(jnp.asarray(float(x)) for x in (shift, scale, s)))
-    return calibrate(
-        model.simulate,
-        model.draw,
-        model.quantities,
-        n_simulations=simulations,
-        regions=("distance",),
-        **options,
-    )
+    given = model.simulate, model.draw, model.quantities
+    options |= {"n_simulations": simulations, "regions": ("distance",)}
+    return validation.calibrate(*given, **options)
 
 
 def test_the_conjugate_posterior_is_calibrated():
     ranks = conjugate()
-    assert ranks.passed, p_values(ranks)
     assert ranks.ranks.shape == (500, 3)
-    assert ranks.ranks.min() == 0 and ranks.ranks.max() == N_DRAWS
-    for name, coverage in ranks.coverage().items():
-        for level, share in coverage.items():
-            # 12 numbers: beyond 4 errors once in a thousand tests
-            assert abs(share - level) < 4 * ranks.coverage_error(level), (name, level)
+    assert ranks.ranks.min() == 0 and ranks.ranks.max() == validation.N_DRAWS
+    # 12 numbers: beyond 4 errors once in a thousand tests
+    assert_calibrated(ranks)
 
 
 @pytest.mark.long
@@ -227,17 +210,17 @@ def test_every_data_set_is_another_and_batches_do_not_matter():
     assert abs(neighbours) < 5 / np.sqrt(120)
 
 
-@pytest.mark.parametrize(
-    ("wrong", "caught"),
-    [
-        # ranks of m pile up at one end, or at both, or in the middle
-        ({"shift": 0.5}, "m"),
-        ({"scale": np.sqrt(2)}, "distance"),
-        pytest.param({"scale": np.sqrt(0.5)}, "distance", marks=pytest.mark.long),
-        # the noise taken for half of its variance: the data pull too much
-        pytest.param({"s": S / np.sqrt(2)}, "m", marks=pytest.mark.long),
-    ],
-)
+WRONG_POSTERIORS = [
+    # ranks of m pile up at one end, or at both, or in the middle
+    ({"shift": 0.5}, "m"),
+    ({"scale": np.sqrt(2)}, "distance"),
+    pytest.param({"scale": np.sqrt(0.5)}, "distance", marks=pytest.mark.long),
+    # the noise taken for half of its variance: the data pull too much
+    pytest.param({"s": S / np.sqrt(2)}, "m", marks=pytest.mark.long),
+]
+
+
+@pytest.mark.parametrize(("wrong", "caught"), WRONG_POSTERIORS)
 def test_a_wrong_conjugate_posterior_is_noticed(wrong, caught):
     ranks = conjugate(**wrong)
     assert not ranks.passed
@@ -249,7 +232,7 @@ def test_a_posterior_that_ignores_the_data_is_noticed_only_by_what_depends_on_th
 
     # taken for infinitely noisy, data leave the posterior at the prior
     p = p_values(conjugate(s=1e10))
-    assert p["m"] > FALSE_ALARM
+    assert p["m"] > validation.FALSE_ALARM
     assert p["log likelihood"] < 1e-20
 
 
@@ -257,7 +240,7 @@ def test_too_few_data_sets_are_refused():
     refuse("at least 100 simulations, .*got 99", conjugate, simulations=99)
     assert conjugate(simulations=100).n_simulations == 100
     with pytest.raises(lb.InputError, match="at least 100 simulations, .*got 20"):
-        calibrate_sky(random_model(True), random_model(True), n_simulations=20)
+        validation.calibrate_sky(random_model(True), random_model(True), n_simulations=20)
 
 
 # --- calibrate_sky ----------------------------------------------------------------------------
@@ -266,15 +249,12 @@ def test_too_few_data_sets_are_refused():
 @pytest.mark.long
 @EVERY_NOISE
 def test_the_sky_is_calibrated(noise):
-    ranks = calibrate_sky(model(noise), model(noise), seed=1)
+    ranks = validation.calibrate_sky(model(noise), model(noise), seed=1)
     assert ranks.n_simulations == 500
-    assert ranks.passed, p_values(ranks)
     assert len(ranks.names) == len(set(ranks.names)) == 22
     assert {"mode 0", "mode 48", "projection 9", "distance", "log likelihood"} < set(ranks.names)
-    for name, coverage in ranks.coverage().items():
-        for level, share in coverage.items():
-            # 88 numbers, many of them tied to each other: beyond 4 errors once in 200 tests
-            assert abs(share - level) < 4 * ranks.coverage_error(level), (name, level)
+    # 88 numbers, many of them tied to each other: beyond 4 errors once in 200 tests
+    assert_calibrated(ranks)
 
 
 def random_model(offset: bool) -> lb.LinearGaussian:
@@ -293,7 +273,7 @@ def test_what_is_ranked_of_a_sky():
     directions = np.random.default_rng(0).standard_normal((3, 9))
     sky, data = (np.asarray(x) for x in gaussian.sample(jax.random.key(3)))
     arrays = (jnp.asarray(x) for x in (np.array([0, 2, 5, 8]), directions, sky, data))
-    got = ranked_of_sky(gaussian.factorise(), *arrays)
+    got = validation.ranked_of_sky(gaussian.factorise(), *arrays)
     np.testing.assert_array_equal(got["mode"], sky[[0, 2, 5, 8]])
     s, n = np.asarray(gaussian.prior.variance()), np.asarray(gaussian.noise.dense())
     np.testing.assert_allclose(got["projection"], directions @ (sky / np.sqrt(s)), rtol=1e-12)
@@ -308,10 +288,10 @@ def test_what_is_ranked_of_a_sky():
 
 @pytest.mark.long
 def test_fewer_data_than_modes_with_an_offset():
-    ranks = calibrate_sky(random_model(True), random_model(True))
+    ranks = validation.calibrate_sky(random_model(True), random_model(True))
     assert ranks.passed, p_values(ranks)
     assert {f"mode {i}" for i in range(9)} < set(ranks.names)
-    assert not calibrate_sky(random_model(True), random_model(False)).passed
+    assert not validation.calibrate_sky(random_model(True), random_model(False)).passed
 
 
 @pytest.mark.long
@@ -320,7 +300,7 @@ def test_fewer_data_than_modes_with_an_offset():
 def test_a_noise_off_by_sqrt_2_is_noticed(noise, factor):
     truth = model(noise)
     wrong = lb.LinearGaussian(truth.coupling, truth.prior, truth.noise.scaled(factor))
-    ranks = calibrate_sky(truth, wrong, seed=1)
+    ranks = validation.calibrate_sky(truth, wrong, seed=1)
     assert not ranks.passed
     p = p_values(ranks)
     assert max(p["distance"], p["log likelihood"]) < 1e-8

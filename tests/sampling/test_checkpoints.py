@@ -115,16 +115,16 @@ def test_an_unfinished_run_is_not_touched_without_resume(folder):
     refuse("unfinished run (no iterations done)", Checkpoints, new, IDENTITY, resume=False)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"sampler's seed": 4}, "has another sampler's seed: 3, now 4"),
-        ({"program": "sky_marginal"}, "has another program: sky, now sky_marginal"),
-        ({"versions": {"jax": "0.11"}}, r"another versions: \{'jax': '0.10'\}, now"),
-        ({"program": None}, "another program: sky, now None"),
-        ({"program": "x" * 500}, "has another program: sky, now xxx"),
-    ],
-)
+ANOTHER_RUN = [
+    ({"sampler's seed": 4}, "has another sampler's seed: 3, now 4"),
+    ({"program": "sky_marginal"}, "has another program: sky, now sky_marginal"),
+    ({"versions": {"jax": "0.11"}}, r"another versions: \{'jax': '0.10'\}, now"),
+    ({"program": None}, "another program: sky, now None"),
+    ({"program": "x" * 500}, "has another program: sky, now xxx"),
+]
+
+
+@pytest.mark.parametrize(("changes", "message"), ANOTHER_RUN)
 def test_another_run_is_refused_and_the_difference_named(folder, changes, message):
     identity = {name: value for name, value in (IDENTITY | changes).items() if value is not None}
     with refused(message) as caught:

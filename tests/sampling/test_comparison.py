@@ -1,7 +1,5 @@
 """Evidences and predictions of programs against brute force: quadrature, and dense Gaussians."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import jax.numpy as jnp

@@ -52,31 +52,28 @@ def chains_of(sites):
     return Chains(sites, statistics | {"diverging": rng.random(shape) > 0.5})
 
 
+def tree_of(setting, chains, program="sky", **options):
+    model, data = setting
+    posterior = model.condition(data.data).posterior
+    return to_datatree(chains, lb.load_program(program), model, posterior, data, **options)
+
+
 @pytest.fixture(scope="module")
 def drawn(setting):
     """(tree, chains) of the program sky."""
     model, data = setting
-    posterior = model.condition(data.data).posterior
-    skies = np.asarray(posterior.sample(jax.random.key(3), N_CHAINS * N_DRAWS))
-    chains = chains_of({"sky": skies.reshape(N_CHAINS, N_DRAWS, N_MODES)})
-    tree = to_datatree(
-        chains, lb.load_program("sky"), model, posterior, data,
-        n_predictive=N_CHAINS * N_DRAWS, attributes={"frequency_mhz": 25.0, "note": "µ = 1"},
-    )  # fmt: skip
-    return tree, chains
+    skies = model.condition(data.data).posterior.sample(jax.random.key(3), N_CHAINS * N_DRAWS)
+    chains = chains_of({"sky": np.asarray(skies).reshape(N_CHAINS, N_DRAWS, N_MODES)})
+    given = {"attributes": {"frequency_mhz": 25.0, "note": "µ = 1"}}
+    return tree_of(setting, chains, n_predictive=N_CHAINS * N_DRAWS, **given), chains
 
 
 @pytest.fixture(scope="module")
 def collapsed(setting):
     """(tree, chains) of sky_marginal; its noise levels span a factor of a hundred."""
-    model, data = setting
     levels = np.exp(np.random.default_rng(8).uniform(-2.3, 2.3, (N_CHAINS, N_DRAWS)))
     chains = chains_of({"noise_level": levels})
-    tree = to_datatree(
-        chains, lb.load_program("sky_marginal"), model, model.condition(data.data).posterior, data,
-        n_predictive=N_CHAINS * N_DRAWS,
-    )  # fmt: skip
-    return tree, chains
+    return tree_of(setting, chains, "sky_marginal", n_predictive=N_CHAINS * N_DRAWS), chains
 
 
 def test_every_group_is_there_with_its_dimensions(drawn, setting):
@@ -178,18 +175,15 @@ def test_predictive_groups_are_thinned_and_know_which_draws_they_belong_to(setti
     model, data = setting
     posterior = model.condition(data.data).posterior
     skies = np.asarray(posterior.sample(jax.random.key(1), 120)).reshape(4, 30, N_MODES)
-    program = lb.load_program("sky")
     # noise a million times smaller than the sky tells which sky the data belong to
     quiet = lb.LinearGaussian(model.coupling, model.prior, model.noise.scaled(1e-12))
-    arguments = (program, quiet, posterior, data)
+    arguments = (lb.load_program("sky"), quiet, posterior, data)
     tree = to_datatree(chains_of({"sky": skies}), *arguments, n_predictive=10)
     predicted = tree["posterior_predictive"]
     np.testing.assert_array_equal(predicted["draw"], [0, 12, 24])
     assert predicted.sizes["chain"] == 4
-    expected = (
-        tree["posterior"]["sky"].sel(draw=predicted["draw"]).values
-        @ np.asarray(model.coupling.dense()).T
-    )
+    thinned = tree["posterior"]["sky"].sel(draw=predicted["draw"]).values
+    expected = thinned @ np.asarray(model.coupling.dense()).T
     # noise of 1e-6 times some units
     np.testing.assert_allclose(predicted["data"], expected, atol=1e-5)
     assert tree["prior"].sizes["draw"] == 10
@@ -203,12 +197,10 @@ def test_another_seed_makes_other_predictive_draws_and_real_data_have_no_truth(s
     posterior = model.condition(data.data).posterior
     chains = chains_of({"sky": np.asarray(posterior.sample(jax.random.key(1), 8))[None]})
     first, other = (
-        to_datatree(chains, lb.load_program("sky"), model, posterior, d, seed=seed, n_predictive=8)
-        for seed, d in [(1, data), (2, real)]
+        tree_of((model, d), chains, seed=seed, n_predictive=8) for seed, d in [(1, data), (2, real)]
     )
-    for group, name in [
-        ("prior", "sky"), ("prior_predictive", "data"), ("posterior_predictive", "data"),
-    ]:  # fmt: skip
+    groups = {"prior": "sky", "prior_predictive": "data", "posterior_predictive": "data"}
+    for group, name in groups.items():
         assert not np.isin(first[group][name].values, other[group][name].values).any()
     xr.testing.assert_equal(first["posterior"], other["posterior"])
     constants = {"prior_std", "analytic_mean", "analytic_std"}

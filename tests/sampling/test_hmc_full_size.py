@@ -27,22 +27,15 @@ def test_nuts_agrees_with_every_mean_every_variance_and_the_covariance(scenario)
     inference, data = lb.infer(experiment), experiment.data
     model, posterior = inference.model, inference.posterior
     program = lb.load_program("sky")
-    chains = lb.sample(
-        program.model,
-        {**program.arguments(model), "data": data.data},
-        lb.Sampler(chains=4, draws=500, seed=2),
-        lb.Whitening.of(posterior),
-    )
+    arguments = {**program.arguments(model), "data": data.data}
+    sampler = lb.Sampler(chains=4, draws=500, seed=2)
+    chains = lb.sample(program.model, arguments, sampler, lb.Whitening.of(posterior))
     draws = chains.sites["sky"]
     assert draws.shape == (4, 500, (LMAX + 1) ** 2)
-    found = validate_draws(
-        draws, posterior, chains.statistics["diverging"], chains.statistics["energy"]
-    )
+    statistics = [chains.statistics[name] for name in ("diverging", "energy")]
+    found = validate_draws(draws, posterior, *statistics)
     assert found.passed, [check for check in found.checks if not check.passed]
     assert found.ess_bulk.min() > 1000
     # standard deviations 2 % off do not pass: total variance: 4 % off, 1 % allowed
     wrong = eqx.tree_at(lambda p: p.lower, posterior, 1.02 * posterior.lower)
-    again = validate_draws(
-        draws, wrong, chains.statistics["diverging"], chains.statistics["energy"]
-    )
-    assert not again.passed
+    assert not validate_draws(draws, wrong, *statistics).passed

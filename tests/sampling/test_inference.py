@@ -93,7 +93,6 @@ def assert_follows(draws, answer):
     assert_mean(z[..., i] * z[..., j], (i == j).astype(float), "covariance")
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_nuts_follows_the_analytic_posterior(nuts, exact):
     chains, _ = nuts
@@ -164,14 +163,9 @@ def by_quadrature(gaussian, data, noise, logs):
 def test_a_sky_in_white_coordinates_beside_a_site_in_none(gaussian, data, level_grid):
     """Against quadrature over the level: p(level | d), and the sky's mean and second moments."""
     whitening = lb.Whitening.of(gaussian.condition(data).posterior)
-    arguments = {
-        "coupling": gaussian.coupling,
-        "prior": gaussian.prior,
-        "scale": jnp.asarray(0.7),
-        "data": data,
-    }
+    given = {"coupling": gaussian.coupling, "prior": gaussian.prior, "scale": jnp.asarray(0.7)}
     sampler = Sampler(chains=4, warmup=300, draws=1500, seed=2)
-    chains = sample(noisy_sky, arguments, sampler, whitening)
+    chains = sample(noisy_sky, given | {"data": data}, sampler, whitening)
     assert set(chains.sites) == {"sky", "level", "mean_sky"}
     sky, level = chains.sites["sky"], chains.sites["level"]
     # a sum of nine numbers in another order: rounding
@@ -215,17 +209,17 @@ def test_the_marginal_program_finds_the_noise_level(gaussian, data, level_grid, 
     assert_mean(np.concatenate([logs, logs**2], -1), np.array(expected), "ln noise level")
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"chains": 0}, "chains must be at least 1, got 0"),
-        ({"warmup": 19}, "warmup must be at least 20, got 19"),
-        ({"draws": 0}, "draws must be at least 1, got 0"),
-        ({"target_accept": 1.0}, r"target_accept must lie in 0..1, got 1.0"),
-        ({"trajectory": 0.0}, "trajectory must be positive, got 0.0"),
-        ({"algorithm": "nut"}, "unknown algorithm 'nut'; did you mean 'nuts'?"),
-    ],
-)
+UNUSABLE = [
+    ({"chains": 0}, "chains must be at least 1, got 0"),
+    ({"warmup": 19}, "warmup must be at least 20, got 19"),
+    ({"draws": 0}, "draws must be at least 1, got 0"),
+    ({"target_accept": 1.0}, r"target_accept must lie in 0..1, got 1.0"),
+    ({"trajectory": 0.0}, "trajectory must be positive, got 0.0"),
+    ({"algorithm": "nut"}, "unknown algorithm 'nut'; did you mean 'nuts'?"),
+]
+
+
+@pytest.mark.parametrize(("settings", "message"), UNUSABLE)
 def test_settings_that_cannot_be_used(settings, message):
     refuse(message, Sampler, **settings)
 
@@ -276,10 +270,8 @@ def tiny(sampler=TINY, checkpoints=None, stop_at=None):
 
 
 def assert_identical(chains, expected, draws=slice(None)):
-    for got, reference in [
-        (chains.sites, expected.sites),
-        (chains.statistics, expected.statistics),
-    ]:
+    for part in ("sites", "statistics"):
+        got, reference = getattr(chains, part), getattr(expected, part)
         assert set(got) == set(reference)
         for name, values in reference.items():
             np.testing.assert_array_equal(got[name], values[:, draws], err_msg=name)
@@ -332,13 +324,12 @@ def test_draws_do_not_depend_on_the_size_of_chunks(uninterrupted, monkeypatch):
 
 
 def test_progress_is_reported_after_each_chunk_and_another_seed_makes_other_draws(uninterrupted):
-    told = []
-    chains = sample(
-        bent,
-        {"y": jnp.asarray(1.5)},
-        Sampler(**{**vars(TINY), "seed": 9}),
-        report=lambda iteration, state: told.append((iteration, int(state.i[0]))),
-    )
+    told, other = [], Sampler(**{**vars(TINY), "seed": 9})
+
+    def report(iteration, state):
+        told.append((iteration, int(state.i[0])))
+
+    chains = sample(bent, {"y": jnp.asarray(1.5)}, other, report=report)
     # warmup ends a chunk, and so does the run; NumPyro's own counter agrees with ours
     assert told == [(n, n) for n in (25, 50, 60, 85, 110, 130)]
     assert not np.isin(chains.sites["x"], uninterrupted.sites["x"]).any()
@@ -396,10 +387,9 @@ def test_chains_are_shared_out_among_devices_and_draw_the_same(gaussian, data, t
         "PYTHONPATH": os.pathsep.join((str(ROOT), str(TESTS.parent))),
     }
     code = textwrap.dedent(DEVICES_SCRIPT.format(tests=str(TESTS)))
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path)],
-        env=env, cwd=tmp_path, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    command = [sys.executable, "-c", code, str(tmp_path)]
+    options = {"env": env, "cwd": tmp_path, "capture_output": True, "text": True}
+    done = subprocess.run(command, check=False, **options)
     assert done.returncode == 0, done.stderr
     shared = np.load(tmp_path / "chains.npz")
     whitening = lb.Whitening.of(gaussian.condition(data).posterior)

@@ -4,8 +4,6 @@ The oracle knows the model from its docstring only: d ~ N(0, A S A^T + N), S = d
 C_ell = spectrum A ((ell + 1) / 10)^tilt, ln A ~ N(0, 0.5^2), tilt ~ N(0, 0.5^2).
 """
 
-from __future__ import annotations
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -104,7 +102,6 @@ def test_nuts_follows_the_grid(grid, sites):
 # --- the skies drawn with it ----------------------------------------------------------------------
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_skies_obey_the_law_of_total_variance(case, grid, sites):
     """Mean of the conditional variances plus variance of the conditional means, mode by mode."""

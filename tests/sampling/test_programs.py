@@ -1,7 +1,5 @@
 """Programs: found and refused in one sentence; skies and data drawn from collapsed ones."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 import sys
@@ -13,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from assertions import refuse, refused
+from experiments import density
 from numpyro import handlers
-from numpyro.infer.util import log_density
 from reference_linear import assert_draws_follow, posterior
 from small_models import random_gaussian
 
@@ -22,12 +20,7 @@ import lusee_bayes
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
 from lusee_bayes.experiment.experiment import program_pieces
-from lusee_bayes.sampling.programs import (
-    collapsed_draws,
-    is_collapsed,
-    numpyro_promotion,
-    require_sampleable,
-)
+from lusee_bayes.sampling import programs
 
 SPECTRUM = np.array([4.0, 1.0, 0.5])
 ELL_OF_MODE = np.repeat([0, 1, 2], [1, 3, 5])
@@ -59,14 +52,7 @@ def gaussian():
     return random_gaussian(SPECTRUM, N_DATA, 11, noise=3.0)
 
 
-@pytest.fixture
-def write(tmp_path):
-    def write(text, name="mine.py"):
-        path = tmp_path / name
-        path.write_text(text)
-        return path
-
-    return write
+WRITTEN = "mine.py"
 
 
 # --- finding them ---------------------------------------------------------------------------------
@@ -85,11 +71,8 @@ def test_a_program_by_its_path(write):
 def test_a_file_named_like_a_program_is_meant_only_by_its_path(write, monkeypatch, tmp_path):
     path = write("def model(data=None):\n    return 'mine'\n", "sky.py")
     monkeypatch.chdir(tmp_path)
-    assert (
-        lb.load_program("sky").digest
-        == lb.load_program("sky").digest
-        != lb.load_program(path).digest
-    )
+    first, again, mine = (lb.load_program(source).digest for source in ("sky", "sky", path))
+    assert first == again != mine
     assert lb.load_program("sky.py").model() == "mine"
 
 
@@ -136,24 +119,24 @@ def test_no_such_program(tmp_path):
         assert str(source) in str(error.value) and "sky_marginal" in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("text", "message", "more"),
-    [
-        ("def model(:\n", "fails when it is loaded", "line 1"),
-        ("import nowhere_to_be_found\n", "fails when it is loaded", "nowhere_to_be_found"),
-        ("open('/nonexistent/table.txt')\n", "fails when it is loaded", "/nonexistent/table.txt"),
-        ("assert 1 > 2, 'not so'\n", "fails when it is loaded", "not so"),
-        *(
-            (text, "has no function 'model'", "def model(")
-            for text in ("x = 1\n", "model = 3\n", "def Model(data=None):\n    pass\n")
-        ),
-        ("def model(coupling, prior):\n    pass\n", "has no argument 'data'", "mine.py"),
-        # prior predictive draws need it; better refused now than after the sampling
-        ("def model(coupling, data):\n    pass\n", "data=None", "mine.py"),
-        ("def model(coupling, nois, data=None):\n    pass\n", "asks for 'nois'", "mean 'noise'?"),
-        ("def model(xyz, data=None):\n    pass\n", "asks for 'xyz'", "noise"),
-    ],
-)
+NO_PROGRAMS = [
+    ("def model(:\n", "fails when it is loaded", "line 1"),
+    ("import nowhere_to_be_found\n", "fails when it is loaded", "nowhere_to_be_found"),
+    ("open('/nonexistent/table.txt')\n", "fails when it is loaded", "/nonexistent/table.txt"),
+    ("assert 1 > 2, 'not so'\n", "fails when it is loaded", "not so"),
+    *(
+        (text, "has no function 'model'", "def model(")
+        for text in ("x = 1\n", "model = 3\n", "def Model(data=None):\n    pass\n")
+    ),
+    ("def model(coupling, prior):\n    pass\n", "has no argument 'data'", "mine.py"),
+    # prior predictive draws need it; better refused now than after the sampling
+    ("def model(coupling, data):\n    pass\n", "data=None", "mine.py"),
+    ("def model(coupling, nois, data=None):\n    pass\n", "asks for 'nois'", "mean 'noise'?"),
+    ("def model(xyz, data=None):\n    pass\n", "asks for 'xyz'", "noise"),
+]
+
+
+@pytest.mark.parametrize(("text", "message", "more"), NO_PROGRAMS)
 def test_files_that_are_no_programs(write, text, message, more):
     path = write(text)
     with refused(message) as error:
@@ -185,12 +168,12 @@ def test_which_programs_have_integrated_the_sky_out(write, gaussian):
     found = {}
     for name in ("sky", "sky_marginal", "prior_amplitude"):
         program = lb.load_program(name)
-        found[name] = is_collapsed(program, program.arguments(gaussian), data)
+        found[name] = programs.is_collapsed(program, program.arguments(gaussian), data)
     assert found == {"sky": False, "sky_marginal": True, "prior_amplitude": True}
     mine = lb.load_program(write(OFFSET_PROGRAM))
-    assert is_collapsed(mine, mine.arguments(gaussian), data)
+    assert programs.is_collapsed(mine, mine.arguments(gaussian), data)
     kept = lb.load_program(write(OFFSET_PROGRAM.replace("return gaussian", "return None")))
-    assert not is_collapsed(kept, kept.arguments(gaussian), data)
+    assert not programs.is_collapsed(kept, kept.arguments(gaussian), data)
 
 
 @pytest.mark.parametrize("name", ["sky", "sky_marginal", "prior_amplitude", "spectrum_bands"])
@@ -199,16 +182,14 @@ def test_what_is_seen_without_a_sky_shifts_the_data(gaussian, name):
     program, offset = lb.load_program(name), jnp.asarray(100.0 * OFFSET)
     shifted = replace(gaussian, offset=offset)
     data = gaussian.sample(jax.random.key(4))[1]
-    with numpyro_promotion():
+    with programs.numpyro_promotion():
         seeded = handlers.seed(program.model, jax.random.key(5))
         sites = handlers.trace(seeded).get_trace(**program.arguments(gaussian))
-        values = {k: v["value"] for k, v in sites.items() if k != "data"}
-        expected, _ = log_density(
-            program.model, (), program.arguments(gaussian) | {"data": data}, values
-        )
-        arguments = program.arguments(shifted)
-        found, _ = log_density(program.model, (), arguments | {"data": data + offset}, values)
-        other, _ = log_density(program.model, (), arguments | {"data": data}, values)
+    values = {k: v["value"] for k, v in sites.items() if k != "data"}
+    expected, found, other = (
+        density(program, program.arguments(model) | {"data": d}, values)[0]
+        for model, d in ((gaussian, data), (shifted, data + offset), (shifted, data))
+    )
     np.testing.assert_allclose(found, expected, rtol=1e-11)
     assert abs(other - expected) > 1.0
 
@@ -262,7 +243,7 @@ def test_skies_at_fixed_sites_follow_the_analytic_posterior(gaussian, collapsed,
     program, values, s, n, offset = collapsed[name]
     data = np.asarray(gaussian.sample(jax.random.key(1))[1])
     arguments = program.arguments(gaussian)
-    skies = collapsed_draws(program, arguments, data, repeated(values), jax.random.key(2))
+    skies = programs.collapsed_draws(program, arguments, data, repeated(values), jax.random.key(2))
     assert isinstance(skies, np.ndarray)
     assert skies.shape == (2, 5000, 9)
     expected = posterior(gaussian.coupling.dense(), s, n, data, offset)
@@ -275,7 +256,8 @@ def test_replicated_data_are_the_skies_seen_with_new_noise(gaussian, collapsed, 
     sky, data = (np.asarray(x) for x in gaussian.sample(jax.random.key(6)))
     skies = np.broadcast_to(sky, (2, 5000, 9))
     arguments = program.arguments(gaussian)
-    seen = collapsed_draws(program, arguments, data, repeated(values), jax.random.key(7), skies)
+    given = program, arguments, data, repeated(values), jax.random.key(7)
+    seen = programs.collapsed_draws(*given, skies)
     assert seen.shape == (2, 5000, N_DATA)
     mean = np.asarray(gaussian.coupling.dense()) @ sky + offset
     assert_draws_follow(seen.reshape(-1, N_DATA), mean, n)
@@ -351,12 +333,11 @@ def check(path, pieces):
     model, more, data = pieces
     program = lb.load_program(path)
     arguments = program.arguments(model, more)
-    return require_sampleable(program, arguments, data, model.prior.variance().shape[0])
+    return programs.require_sampleable(program, arguments, data, model.prior.variance().shape[0])
 
 
-def test_a_good_program_passes(tmp_path, pieces):
-    path = tmp_path / "good.py"
-    path.write_text(HEAD + '    numpyro.sample("x.y-1", dist.Normal(0, 1))\n' + TWICE + GOOD)
+def test_a_good_program_passes(write, pieces):
+    path = write(HEAD + '    numpyro.sample("x.y-1", dist.Normal(0, 1))\n' + TWICE + GOOD)
     assert check(path, pieces) == ["sky", "x.y-1"]
 
 
@@ -382,9 +363,8 @@ def test_bad_programs_are_one_sentence(name, write, pieces):
 
 
 @pytest.mark.parametrize("argument", ["coupling, /, ", "*, coupling, *noise, ", "**others, "])
-def test_arguments_are_given_by_name(argument, tmp_path):
-    path = tmp_path / "bad.py"
-    path.write_text(f"def model({argument}data=None):\n    pass\n")
+def test_arguments_are_given_by_name(argument, write):
+    path = write(f"def model({argument}data=None):\n    pass\n")
     refuse("fails when it is loaded|by position, or as many as come", lb.load_program, path)
 
 

@@ -29,7 +29,6 @@ from lusee_bayes.sky.prior import DensePrior
 
 LMAX = 2
 N_DATA = 30
-NO_OFFSET = jnp.zeros(N_DATA)
 
 
 def program(name):
@@ -90,13 +89,7 @@ def joint(model, arguments, values):
 def case(gaussian):
     """(arguments of a program with data, whitening by the posterior given them)."""
     _, data = gaussian.sample(jax.random.key(9))
-    arguments = {
-        "coupling": gaussian.coupling,
-        "offset": NO_OFFSET,
-        "prior": gaussian.prior,
-        "fixed_noise": gaussian.noise.factor(),
-        "data": data,
-    }
+    arguments = lb.load_program("sky").arguments(gaussian) | {"data": data}
     return arguments, lb.Whitening.of(gaussian.condition(data).posterior)
 
 
@@ -109,11 +102,8 @@ def z():
 @pytest.mark.parametrize("n_data", [N_DATA, 5])
 def test_the_log_determinant_is_that_of_the_root(gaussian, n_data, form):
     """More and fewer data than the 9 modes, in both forms of the posterior."""
-    few = lb.LinearGaussian(
-        gaussian.coupling.dense()[:n_data],
-        gaussian.prior,
-        DenseCovariance(gaussian.noise.matrix[:n_data, :n_data]),
-    )
+    noise = DenseCovariance(gaussian.noise.matrix[:n_data, :n_data])
+    few = lb.LinearGaussian(gaussian.coupling.dense()[:n_data], gaussian.prior, noise)
     posterior = few.condition(few.sample(jax.random.key(1))[1], form).posterior
     whitening = lb.Whitening.of(posterior)
     # a sum of 9 logarithms of order one, and of a root with condition below 100
@@ -136,9 +126,8 @@ def test_the_density_of_z_is_the_programs_own_times_the_determinant(gaussian, ca
     """For any coordinates, and a program for which they are the wrong ones."""
     arguments, right = case
     wrong = lb.Whitening.of(gaussian.condition(3.0 + 2.0 * arguments["data"], InData).posterior)
-    wrong = eqx.tree_at(
-        lambda w: (w.root, w.log_det), wrong, (2.0 * wrong.root, wrong.log_det + 9 * np.log(2.0))
-    )
+    twice = 2.0 * wrong.root, wrong.log_det + 9 * np.log(2.0)
+    wrong = eqx.tree_at(lambda w: (w.root, w.log_det), wrong, twice)
     for model, others in [(program("sky"), {}), (strong_sky, {"amplitude": jnp.asarray(1.7)})]:
         for whitening in (right, wrong):
             sky = whitening.mean + whitening.root @ z
@@ -185,9 +174,8 @@ def test_predictions_from_draws_of_z(gaussian, case):
     z = jax.random.normal(jax.random.key(3), (n, 9), dtype=jnp.float64)
     free = {**arguments, "data": None}
     with numpyro_promotion():
-        drawn = Predictive(whitened(program("sky"), whitening), {"sky_white": z})(
-            jax.random.key(4), **free
-        )
+        predictive = Predictive(whitened(program("sky"), whitening), {"sky_white": z})
+        drawn = predictive(jax.random.key(4), **free)
     expected = np.asarray(whitening.mean) + np.asarray(z) @ np.asarray(whitening.root).T
     np.testing.assert_allclose(drawn["sky"], expected, rtol=1e-13, atol=1e-13)
     a = np.asarray(gaussian.coupling.dense())

@@ -1,7 +1,5 @@
 """Coordinates of a log-normal sky's posterior, and its mode, against closed forms and searches."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache, partial
 
@@ -14,14 +12,8 @@ from scipy import optimize
 
 from lusee_bayes.core.arrays import on_device
 from lusee_bayes.linear.information import Information
+from lusee_bayes.sampling import log_normal_program as ln
 from lusee_bayes.sampling.log_normal_prior import AMPLITUDE, STRUCTURE, TILT, LogNormalPrior
-from lusee_bayes.sampling.log_normal_program import (
-    LogNormalMode,
-    coordinates_of,
-    find_mode,
-    learn_spectrum,
-    straight_coordinates,
-)
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, diffuse_brightness
 from lusee_bayes.sky.positive_skies import LogNormalSky, deviation_spectrum
 from lusee_bayes.sky.prior import DensePrior
@@ -46,14 +38,9 @@ def informed(truth: np.ndarray) -> Information:
     rng = np.random.default_rng(1)
     rotation = np.linalg.qr(rng.standard_normal((16, 16)))[0]
     precision = np.geomspace(1e-2, 1e-10, 16)
-    return Information(
-        (rotation * precision) @ rotation.T,
-        rotation @ (np.sqrt(precision) * rng.standard_normal(16)),
-        truth,
-        np.asarray(96.0),
-        np.asarray(0.0),
-        np.asarray(96.0),
-    )
+    matrix = (rotation * precision) @ rotation.T
+    vector = rotation @ (np.sqrt(precision) * rng.standard_normal(16))
+    return Information(matrix, vector, truth, *map(np.asarray, (96.0, 0.0, 96.0)))
 
 
 @lru_cache
@@ -64,8 +51,8 @@ def information(amplitude: float = 0.03) -> Information:
 
 
 @lru_cache
-def mode() -> LogNormalMode:
-    return find_mode(log_normal(0.03, sources=BRIGHT_SOURCES[:1]), information())
+def mode() -> ln.LogNormalMode:
+    return ln.find_mode(log_normal(0.03, sources=BRIGHT_SOURCES[:1]), information())
 
 
 # --- the mode ---------------------------------------------------------------------------------
@@ -77,15 +64,8 @@ def two_unknowns():
     sky = log_normal(0.1, lmax=0, sources=BRIGHT_SOURCES[:1])
     value = 1.5 * sky.modes(np.zeros(2))
     precision = float((0.05 * value[0]) ** -2)
-    given = Information(
-        np.array([[precision]]),
-        np.zeros(1),
-        value,
-        np.asarray(0.0),
-        np.asarray(-np.log(precision)),
-        np.asarray(1.0),
-    )
-    return sky, given
+    scalars = map(np.asarray, (0.0, -np.log(precision), 1.0))
+    return sky, Information(np.array([[precision]]), np.zeros(1), value, *scalars)
 
 
 def test_the_mode_is_where_a_search_without_derivatives_finds_it(two_unknowns):
@@ -95,7 +75,7 @@ def test_the_mode_is_where_a_search_without_derivatives_finds_it(two_unknowns):
         return float(given.chi2(sky.modes(u))) + u @ u
 
     best = optimize.minimize(energy, np.zeros(2), method="Nelder-Mead", tol=1e-10)
-    np.testing.assert_allclose(find_mode(sky, given).white, best.x, atol=1e-4)
+    np.testing.assert_allclose(ln.find_mode(sky, given).white, best.x, atol=1e-4)
 
 
 def test_small_deviations_have_the_posterior_of_a_gaussian_sky():
@@ -104,7 +84,7 @@ def test_small_deviations_have_the_posterior_of_a_gaussian_sky():
     root = sky.jacobian(np.zeros(sky.size))
     prior = DensePrior.of_covariance(root @ root.T, sky.modes(np.zeros(sky.size)))
     given = informed(sky.modes(np.random.default_rng(0).standard_normal(sky.size)))
-    expected, found = given.posterior(prior), find_mode(sky, given)
+    expected, found = given.posterior(prior), ln.find_mode(sky, given)
     std = np.asarray(expected.std())
     assert np.abs((found.modes - np.asarray(expected.mean)) / std).max() < 0.02
     half = np.linalg.solve(found.lower, found.jacobian.T)
@@ -132,7 +112,7 @@ def test_straight_coordinates_are_one_to_one_with_the_determinant_they_say(learn
     power_law = np.array([np.log(0.03), TILTED]) if learned else None
     covariance = np.array([[0.04, 0.01], [0.01, 0.09]]) if learned else None
     found = replace(mode(), power_law=power_law, covariance=covariance)
-    coordinates = straight_coordinates(found)
+    coordinates = ln.straight_coordinates(found)
     n = coordinates.root.shape[0]
     z = jax.random.normal(jax.random.key(3), (n,), dtype=jnp.float64)
     x = coordinates.mean + coordinates.root @ z
@@ -154,7 +134,7 @@ def test_straight_coordinates_are_one_to_one_with_the_determinant_they_say(learn
 
 
 def test_energies_are_those_of_a_gaussian_in_straight_coordinates_only():
-    coordinates, found = straight_coordinates(mode()), mode()
+    coordinates, found = ln.straight_coordinates(mode()), mode()
     z = jax.random.normal(jax.random.key(0), (60, found.sky.size), dtype=jnp.float64)
     x = np.asarray(coordinates.mean)[None] + np.asarray(z @ coordinates.root.T)
     values, _ = jax.jit(jax.vmap(coordinates.to_values))(jnp.asarray(x))
@@ -172,13 +152,13 @@ def test_energies_are_those_of_a_gaussian_in_straight_coordinates_only():
 
 def test_the_learned_spectrum_has_the_highest_evidence_and_its_curvature():
     prior = log_normal_prior(0.02, (0.7, 0.5))
-    found = learn_spectrum(prior, information())
+    found = ln.learn_spectrum(prior, information())
     best = found.power_law
     centre, std = np.array([np.log(0.02), TILTED]), np.array([0.7, 0.5])
 
     def log_posterior(theta):
         sky = prior.sky.with_power_law(np.exp(theta[0]), theta[1])
-        there = find_mode(sky, information())
+        there = ln.find_mode(sky, information())
         of_data = -0.5 * (float(there.information.misfit) + there.white @ there.white)
         of_data -= np.log(np.diagonal(there.lower)).sum()
         return of_data - 0.5 * (((theta - centre) / std) ** 2).sum()
@@ -196,17 +176,16 @@ def test_the_learned_spectrum_has_the_highest_evidence_and_its_curvature():
 
 
 def test_refusals():
-    refuse("the information has shape", find_mode, log_normal(0.1, lmax=2), information())
+    refuse("the information has shape", ln.find_mode, log_normal(0.1, lmax=2), information())
     sky = log_normal(0.1)
-    refuse(
-        "ln A and the tilt of the sky holds NaN", LogNormalPrior, sky, np.array([-np.inf, TILTED])
-    )
+    words, none = "ln A and the tilt of the sky holds NaN", np.array([-np.inf, TILTED])
+    refuse(words, LogNormalPrior, sky, none)
     refuse("of ln A or of the tilt must be", log_normal_prior, 0.1, (1.0, 0.0))
 
 
 @pytest.mark.parametrize("widths", [None, (0.7, 0.5)])
 def test_coordinates_are_those_of_the_sites_that_are_sampled(widths):
     prior = log_normal_prior(0.02, widths)
-    coordinates = coordinates_of(prior, information())
+    coordinates = ln.coordinates_of(prior, information())
     assert coordinates.names == prior.sites
     assert coordinates.chart.names == (STRUCTURE, AMPLITUDE, TILT)

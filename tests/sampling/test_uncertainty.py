@@ -13,11 +13,7 @@ from small_models import random_gaussian
 
 from lusee_bayes.core.harmonics import modes_to_map, pixel_matrix
 from lusee_bayes.sampling import mode
-from lusee_bayes.sampling.mode import (
-    pixel_statistics,
-    sky_quantities,
-    summary,
-)
+from lusee_bayes.sampling.mode import pixel_statistics, sky_quantities, summary
 
 LMAX, NSIDE, N_MODES = 3, 4, 16
 N_CHAINS, N_DRAWS = 4, 5000
@@ -54,11 +50,8 @@ def test_mean_and_standard_deviation_of_pixels(gaussian, skies):
     found = pixel_statistics(skies, NSIDE)
     z = (found["mean"] - mean) / (std / np.sqrt(N))
     assert np.abs(z).max() < z_of(n_pixels)
-    ratio = found["std"] / std - 1
-    assert np.abs(ratio).max() < z_of(n_pixels) / np.sqrt(2 * N)
-    of_the_package = np.asarray(posterior.std_of(pixel_matrix(NSIDE, LMAX)))
-    ratio = found["std"] / of_the_package - 1
-    assert np.abs(ratio).max() < z_of(n_pixels) / np.sqrt(2 * N)
+    for expected in (std, np.asarray(posterior.std_of(pixel_matrix(NSIDE, LMAX)))):
+        assert np.abs(found["std"] / expected - 1).max() < z_of(n_pixels) / np.sqrt(2 * N)
 
 
 def test_intervals_of_pixels_are_the_central_gaussian_ones(gaussian, skies):

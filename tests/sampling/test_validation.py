@@ -3,8 +3,6 @@
 Draws are made by numpy, with the textbook's dense mean and covariance, not by the solver.
 """
 
-from __future__ import annotations
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -127,9 +125,8 @@ def test_numbers_are_those_of_numpy_and_scipy(truth):
     moments = flat.T @ flat / TOTAL
     # the two routes to mean and C agree to about 1e-10
     np.testing.assert_allclose(found.variance_ratio, np.diag(moments) / truth.std**2, rtol=1e-8)
-    np.testing.assert_allclose(
-        found.eigenvalues, linalg.eigh(moments, truth.covariance, eigvals_only=True), rtol=1e-8
-    )
+    expected = linalg.eigh(moments, truth.covariance, eigvals_only=True)
+    np.testing.assert_allclose(found.eigenvalues, expected, rtol=1e-8)
     # effective sizes of independent draws are their number, known to some 10 %: errors to 5 %
     z = flat.mean(0) / (truth.std / np.sqrt(TOTAL))
     np.testing.assert_allclose(found.mean_z, z, rtol=0.15, atol=0)
@@ -175,9 +172,8 @@ def test_a_wrong_variance_of_one_direction_fails_though_no_mode_shows_it(factor,
     wrong = np.eye(MODES) + (factor - 1) * np.outer(direction, direction)
     mean = np.linspace(-1, 1, MODES) * scale
     white, energy = chains(2, "independent")
-    found = judge(
-        mean + white * scale, energy, wrong_posterior(mean, wrong * np.outer(scale, scale))
-    )
+    posterior = wrong_posterior(mean, wrong * np.outer(scale, scale))
+    found = judge(mean + white * scale, energy, posterior)
     # the size of that direction also moves the mean eigenvalue by a few percent, which is seen
     assert which in failed(found)
     assert failed(found) <= {which, "covariance, mean"}
@@ -199,9 +195,8 @@ def test_an_overall_variance_off_by_a_twentieth_fails_in_the_mean_eigenvalue(tru
     """No mode and no direction shows 5 %, but the mean over 16 modes of 2000 independent draws
     has an error of sqrt(2 / 32000) = 0.8 %; the margin is six of them.
     """
-    found = judge(
-        *truth.draws(3, "independent"), wrong_posterior(truth.mean, truth.covariance / 1.07)
-    )
+    wrong = wrong_posterior(truth.mean, truth.covariance / 1.07)
+    found = judge(*truth.draws(3, "independent"), wrong)
     assert failed(found) == {"covariance, mean"}
 
 
@@ -244,15 +239,15 @@ def test_badly_explored_energies_fail(truth):
     assert {c.name: c.value for c in found.checks}["BFMI"] == pytest.approx(1.0, abs=0.25)
 
 
-@pytest.mark.parametrize(
-    ("broken", "message"),
-    [
-        (lambda x: x[..., :-1], r"has shape \(4, 500, 15\), expected .* 16\)"),
-        (lambda x: x[:, :99], "needs 100 draws of each chain, got 99"),
-        (lambda x: np.where(np.arange(MODES) == 3, np.nan, x), "NaN or infinity"),
-        (lambda x: np.where(np.arange(MODES) == 3, np.inf, x), "NaN or infinity"),
-    ],
-)
+NOT_COMPARED = [
+    (lambda x: x[..., :-1], r"has shape \(4, 500, 15\), expected .* 16\)"),
+    (lambda x: x[:, :99], "needs 100 draws of each chain, got 99"),
+    (lambda x: np.where(np.arange(MODES) == 3, np.nan, x), "NaN or infinity"),
+    (lambda x: np.where(np.arange(MODES) == 3, np.inf, x), "NaN or infinity"),
+]
+
+
+@pytest.mark.parametrize(("broken", "message"), NOT_COMPARED)
 def test_draws_that_cannot_be_compared_are_refused(truth, broken, message):
     draws, energy = truth.draws(9)
     draws = broken(draws)

@@ -1,7 +1,5 @@
 """The log-normal sky: T exp(s) and its harmonic coefficients."""
 
-from __future__ import annotations
-
 from functools import partial
 
 import healpy
@@ -10,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from assertions import refuse
+from reference import sphere
 from scipy import stats
 
 from lusee_bayes.core.arrays import on_device
@@ -41,13 +40,11 @@ def white(sky) -> np.ndarray:
 
 def by_quadrature(sky: LogNormalSky, white: np.ndarray) -> np.ndarray:
     """m of one u: a matrix of harmonics at the points of a rule of its own, source by source."""
-    x, w = np.polynomial.legendre.leggauss(60)
-    phi = 2.0 * np.pi * np.arange(130) / 130
-    theta, phi = (v.ravel() for v in np.meshgrid(np.arccos(x), phi, indexing="ij"))
+    theta, phi, area = sphere(60, 130)
     harmonics = synthesis_matrix(theta, phi, LMAX)
     ell = np.floor(np.sqrt(np.arange(n_modes(LMAX)))).astype(int)
     logarithm = harmonics @ (np.sqrt(np.asarray(sky.spectrum)[ell]) * white[: n_modes(LMAX)])
-    field = waves(theta, phi) * np.exp(logarithm) * np.repeat(w, 130) * 2.0 * np.pi / 130
+    field = waves(theta, phi) * np.exp(logarithm) * area
     modes = harmonics.T @ field
     for source, eta in zip(BRIGHT_SOURCES[:2], white[n_modes(LMAX) :], strict=True):
         factor = stats.expon.ppf(stats.norm.cdf(eta))

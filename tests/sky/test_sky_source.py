@@ -3,34 +3,20 @@
 And each layout by itself: maps, cubes of maps, coefficients.
 """
 
-from __future__ import annotations
-
 import h5py
 import healpy
 import numpy as np
 import pytest
-from assertions import refuse, refused
+from assertions import refuse
 from astropy.io import fits
 from made_skies import SmoothSky, SpottySky
 
 import lusee_bayes as lb
-from lusee_bayes.core.harmonics import (
-    from_healpy,
-    modes_to_map,
-    synthesis_matrix,
-    to_healpy,
-)
+from lusee_bayes.core.harmonics import from_healpy, modes_to_map, synthesis_matrix, to_healpy
 from lusee_bayes.experiment.sky_sections import FileSkySection, GalaxySection
 from lusee_bayes.report.describe import describe
+from lusee_bayes.sky import sky_source as ss
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
-from lusee_bayes.sky.sky_source import (
-    SKY_READERS,
-    SkyAlms,
-    SkyCube,
-    SkyMap,
-    read_sky_file,
-    write_alms,
-)
 from lusee_bayes.testing.contracts import assert_refused, check_sky_source
 
 NSIDE, LMAX = 16, 8
@@ -82,7 +68,7 @@ def cube(path, modes):
 
 
 def fits_alms(path, modes):
-    write_alms(path, modes, {})
+    ss.write_alms(path, modes, {})
 
 
 def npz_alms(path, modes):
@@ -91,11 +77,11 @@ def npz_alms(path, modes):
 
 # name of the file, who writes it, who reads it, and whether it says its frequencies
 LAYOUTS = [
-    ("map.fits", fits_map, SkyMap, False),
-    ("map.hdf5", hdf5_map, SkyMap, False),
-    ("cube.fits", cube, SkyCube, True),
-    ("alm.fits", fits_alms, SkyAlms, False),
-    ("alm.npz", npz_alms, SkyAlms, True),
+    ("map.fits", fits_map, ss.SkyMap, False),
+    ("map.hdf5", hdf5_map, ss.SkyMap, False),
+    ("cube.fits", cube, ss.SkyCube, True),
+    ("alm.fits", fits_alms, ss.SkyAlms, False),
+    ("alm.npz", npz_alms, ss.SkyAlms, True),
 ]
 of_every_layout = pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout[0])
 
@@ -110,14 +96,9 @@ def written(layout, folder, modes):
 def test_files_keep_the_contract(layout, tmp_path, modes):
     path, dataset = written(layout, tmp_path, modes)
     source = FileSkySection(file=str(path), dataset=dataset)
-    check_sky_source(
-        source,
-        frequency_mhz=25.0,
-        lmax=LMAX,
-        slice_rtol=BAND_LIMITED,
-        missing_mhz=10.0 if layout[3] else None,
-        missing_lmax=3 * NSIDE,
-    )
+    missing = {"missing_mhz": 10.0 if layout[3] else None, "missing_lmax": 3 * NSIDE}
+    sizes = {"frequency_mhz": 25.0, "lmax": LMAX, "slice_rtol": BAND_LIMITED}
+    check_sky_source(source, **sizes, **missing)
     assert source.at(25.0, LMAX).name == path.name
     np.testing.assert_allclose(source.at(25.0, LMAX).modes, modes, rtol=0, atol=1e-9 * modes[0])
 
@@ -138,10 +119,10 @@ def test_files_are_scaled_from_their_frequency(layout, tmp_path, modes):
 @of_every_layout
 def test_exactly_one_reader_reads_a_file(layout, tmp_path, modes):
     path, dataset = written(layout, tmp_path, modes)
-    found = next(reader for reader in SKY_READERS if reader.recognises(path))
+    found = next(reader for reader in ss.SKY_READERS if reader.recognises(path))
     assert found is layout[2]
-    assert isinstance(read_sky_file(path, dataset), found)
-    assert all(line.strip() for line in read_sky_file(path, dataset).description())
+    assert isinstance(ss.read_sky_file(path, dataset), found)
+    assert all(line.strip() for line in ss.read_sky_file(path, dataset).description())
 
 
 def test_the_galaxy_keeps_the_contract():
@@ -162,11 +143,10 @@ def test_the_test_skies_keep_the_contract(kind):
 
 
 def test_a_file_is_there_and_its_frequency_positive():
+    given = lb.sky_from_file, "nowhere.fits", 25.0, LMAX
     for frequency in (0.0, -3.0, np.nan):
-        with refused("file_frequency_mhz must be positive"):
-            lb.sky_from_file("nowhere.fits", 25.0, LMAX, file_frequency_mhz=frequency)
-    with refused("no sky map at 'nowhere.fits'; check sky.file"):
-        lb.sky_from_file("nowhere.fits", 25.0, LMAX)
+        refuse("file_frequency_mhz must be positive", *given, file_frequency_mhz=frequency)
+    refuse("no sky map at 'nowhere.fits'; check sky.file", *given)
 
 
 @pytest.fixture
@@ -179,7 +159,7 @@ def test_ulsa_file_is_read_as_it_is(test_data):
     path = test_data / "ulsa" / "exp10.0MHz_sky_map_with_absorption.hdf5"
     with h5py.File(path) as file:
         expected = file["smooth_absorb"][...]
-    np.testing.assert_array_equal(read_sky_file(path).pixels, expected)
+    np.testing.assert_array_equal(ss.read_sky_file(path).pixels, expected)
     # the monopole is the mean pixel, but for what aliases into it from above lmax
     sky = lb.sky_from_file(path, 10.0, 47)
     assert sky.mean_temperature == pytest.approx(expected.mean(), rel=1e-6)
@@ -203,9 +183,7 @@ def test_sources_are_added_to_the_galaxy():
     with_sources, without = lb.galaxy_sky(25.0, 8), lb.galaxy_sky(25.0, 8, sources=())
     added = sum(source.modes(25.0, 8) for source in BRIGHT_SOURCES)
     # the difference of numbers 1e5 times larger: rounding of the larger ones
-    np.testing.assert_allclose(
-        np.asarray(with_sources.modes) - np.asarray(without.modes), added, atol=1e-9
-    )
+    np.testing.assert_allclose(with_sources.modes - without.modes, added, atol=1e-9)
 
 
 def with_one(pixels, value):
@@ -227,13 +205,13 @@ BAD_MAPS = [
 @pytest.mark.parametrize(("words", "make"), BAD_MAPS, ids=lambda one: str(one)[:20])
 def test_bad_maps_are_refused_in_one_sentence(tmp_path, pixels, make, words):
     make(tmp_path / "map.fits", pixels)
-    refuse(words, read_sky_file, tmp_path / "map.fits")
+    refuse(words, ss.read_sky_file, tmp_path / "map.fits")
 
 
 def test_millikelvin_are_converted_and_lmax_has_to_fit(tmp_path, pixels):
     path = tmp_path / "map.fits"
     write_fits(path, pixels, "mK")
-    np.testing.assert_allclose(read_sky_file(path).pixels, pixels / 1e3, rtol=1e-14)
+    np.testing.assert_allclose(ss.read_sky_file(path).pixels, pixels / 1e3, rtol=1e-14)
     refuse("lmax = 48 is too large for a map of NSIDE 16", lb.sky_from_file, path, 10.0, 48)
 
 
@@ -250,7 +228,7 @@ def maps():
 
 
 def test_fifty_maps_and_what_is_between_them(tmp_path, maps):
-    cube = SkyCube.read(write_cube(tmp_path / "ULSA_32_ddi_smooth.fits", maps))
+    cube = ss.SkyCube.read(write_cube(tmp_path / "ULSA_32_ddi_smooth.fits", maps))
     np.testing.assert_array_equal(cube.frequencies_mhz, np.arange(1.0, 51.0))
     np.testing.assert_array_equal(cube.map_at(25.0), maps[24])
     np.testing.assert_array_equal(cube.map_at(50.0), maps[49])
@@ -270,21 +248,22 @@ def test_a_scenario_with_a_cube(tmp_path, maps):
 
 
 def test_cubes_that_cannot_be_used(tmp_path, maps):
-    cube = SkyCube.read(write_cube(tmp_path / "cube.fits", maps))
+    cube = ss.SkyCube.read(write_cube(tmp_path / "cube.fits", maps))
     refuse("from 1 to 50 MHz, not at 50.5; set sky.file_freq", cube.map_at, 50.5)
-    refuse("expected 60 maps", SkyCube.read, write_cube(tmp_path / "long.fits", maps, end=60))
-    refuse("767 values are not", SkyCube.read, write_cube(tmp_path / "odd.fits", maps[:, :-1]))
-    refuse("is this Hz", SkyCube.read, write_cube(tmp_path / "hz.fits", maps, start=1e6, step=1e6))
+    refuse("expected 60 maps", ss.SkyCube.read, write_cube(tmp_path / "long.fits", maps, end=60))
+    refuse("767 values are not", ss.SkyCube.read, write_cube(tmp_path / "odd.fits", maps[:, :-1]))
+    in_hz = write_cube(tmp_path / "hz.fits", maps, start=1e6, step=1e6)
+    refuse("is this Hz", ss.SkyCube.read, in_hz)
     for unit, factor in (("mK", 1e-3), ("K", 1.0)):
         path = write_cube(tmp_path / f"{unit}.fits", maps)
         fits.setval(path, "BUNIT", value=unit)
-        np.testing.assert_allclose(SkyCube.read(path).pixels, factor * maps, rtol=1e-15)
+        np.testing.assert_allclose(ss.SkyCube.read(path).pixels, factor * maps, rtol=1e-15)
     fits.setval(path, "BUNIT", value="MJy/sr")
-    refuse("unit 'MJy/sr'", SkyCube.read, path)
-    refuse("NaN or infinity", SkyCube.read, write_cube(tmp_path / "holes.fits", np.nan * maps))
+    refuse("unit 'MJy/sr'", ss.SkyCube.read, path)
+    refuse("NaN or infinity", ss.SkyCube.read, write_cube(tmp_path / "holes.fits", np.nan * maps))
     negative = maps.copy()
     negative[9, 5] = -1.0
-    cube = SkyCube.read(write_cube(tmp_path / "negative.fits", negative))
+    cube = ss.SkyCube.read(write_cube(tmp_path / "negative.fits", negative))
     assert cube.map_at(10.0)[5] == -1.0
     refuse("not positive at 9 or 10 MHz", cube.map_at, 9.5)
     path = tmp_path / "cube.fits"
@@ -302,11 +281,11 @@ def coefficients():
 
 def test_coefficients_through_healpy_bit_by_bit(tmp_path, coefficients):
     modes = coefficients
-    path = write_alms(tmp_path / "alm.fits", modes, {"FREQ": 25.0})
+    path = ss.write_alms(tmp_path / "alm.fits", modes, {"FREQ": 25.0})
     ours = from_healpy(healpy.read_alm(path))
     # sqrt(2) there and back again
     np.testing.assert_allclose(ours, modes, rtol=4e-16)
-    np.testing.assert_array_equal(SkyAlms.read(path).modes[0], ours)
+    np.testing.assert_array_equal(ss.SkyAlms.read(path).modes[0], ours)
     np.testing.assert_array_equal(lb.sky_from_file(path, 25.0, 8).modes, ours)
     # healpy's own file, and fewer coefficients than it has
     theirs = tmp_path / "healpy.fits"
@@ -326,7 +305,7 @@ def test_luseepys_coefficients_of_many_frequencies(test_data):
 
 
 def test_coefficients_that_cannot_be_used(tmp_path, coefficients):
-    path = write_alms(tmp_path / "alm.fits", coefficients, {})
+    path = ss.write_alms(tmp_path / "alm.fits", coefficients, {})
     refuse("up to ell = 8, not up to 9", lb.sky_from_file, path, 25.0, 9)
     with fits.open(path) as hdus:
         table = hdus[1].data
@@ -334,11 +313,11 @@ def test_coefficients_that_cannot_be_used(tmp_path, coefficients):
         bad = table.copy()
         bad["index"][3] = 2  # ell = 1, m = -1
         fits.BinTableHDU(bad, name="ALM").writeto(tmp_path / "negative.fits")
-    refuse("1 coefficients up to ell = 8 are missing", SkyAlms.read, tmp_path / "short.fits")
-    refuse("0 <= m <= ell", SkyAlms.read, tmp_path / "negative.fits")
+    refuse("1 coefficients up to ell = 8 are missing", ss.SkyAlms.read, tmp_path / "short.fits")
+    refuse("0 <= m <= ell", ss.SkyAlms.read, tmp_path / "negative.fits")
     np.savez(tmp_path / "a.npz", alm=np.zeros((2, 45), complex))
-    refuse(r"no freq \(it has alm\)", SkyAlms.read, tmp_path / "a.npz")
+    refuse(r"no freq \(it has alm\)", ss.SkyAlms.read, tmp_path / "a.npz")
     np.savez(tmp_path / "b.npz", alm=np.zeros((2, 44), complex), freq=[1.0, 2.0])
-    refuse("alm has 44 coefficients", SkyAlms.read, tmp_path / "b.npz")
+    refuse("alm has 44 coefficients", ss.SkyAlms.read, tmp_path / "b.npz")
     (tmp_path / "c.npz").write_text("nothing")
-    refuse("cannot be read as coefficients", SkyAlms.read, tmp_path / "c.npz")
+    refuse("cannot be read as coefficients", ss.SkyAlms.read, tmp_path / "c.npz")

@@ -7,16 +7,9 @@ draws from the posterior by Hamiltonian Monte Carlo about the mode found for eac
 from dataclasses import replace
 
 import equinox as eqx
+import experiments as ex
 import numpy as np
 import pytest
-from experiments import (
-    draw_within,
-    drawn,
-    four_ports,
-    sky_and_amplitudes,
-    unknowns_report,
-    with_known_sky,
-)
 from numpyro import handlers
 from scipy import stats
 
@@ -80,7 +73,7 @@ class Draws(eqx.Module):
         if self.chart is not None:
             start, hold = {"sky": marginalised(arguments, data).mean}, SCALES
         found = laplace_approximation(model, arguments, start, hold, self.starts, self.chart)
-        return draw_within(model, arguments, key, self.sampler, found.whitening, self.thin)
+        return ex.draw_within(model, arguments, key, self.sampler, found.whitening, self.thin)
 
 
 class Sites(eqx.Module):
@@ -223,14 +216,14 @@ MODES = (0, 2, 3, 6, 8, 12)
 @pytest.mark.long
 def test_simulation_based_calibration(response_file):
     # known to a fifth, so that no sky is without a signal
-    first = with_known_sky(set_up(four_ports(response_file, *UNKNOWN)), 0.04)
+    first = ex.with_known_sky(set_up(ex.four_ports(response_file, *UNKNOWN)), 0.04)
     sky_std = np.sqrt(np.asarray(first.prior.variance()))
     ranks, null, shares = [], [], []
     for seed in range(N):
-        experiment = drawn(first, seed)
+        experiment = ex.drawn(first, seed)
         setup = experiment.setup
         found, truth = settled(setup, experiment.data), true_values(setup)
-        mean, covariance = sky_and_amplitudes(found)
+        mean, covariance = ex.sky_and_amplitudes(found)
         mean[16:] += np.concatenate([s.expected for s in found.systematics])
         rng = np.random.default_rng((seed, 1))
         draws = rng.multivariate_normal(mean, covariance, N_DRAWS, method="cholesky")
@@ -240,7 +233,7 @@ def test_simulation_based_calibration(response_file):
         picked = [*MODES, *range(16, 25)]
         ranks.append((draws < true).sum(0)[picked])
         # along the null direction, in prior standard deviations
-        report = unknowns_report(experiment, found)
+        report = ex.unknowns_report(experiment, found)
         assert report.null.names[0] == SKY
         assert report.null.names[-1] == COMMON_GAIN
         off = true - mean

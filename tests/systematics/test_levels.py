@@ -61,9 +61,8 @@ def case():
 def general(case, systematics, values) -> float:
     """By models/systematics.py; no site may be left to chance."""
     arguments = {"gaussian": case.model, "systematics": tuple(systematics)}
-    got, trace = density(
-        lb.load_program("systematics"), arguments | {"data": jnp.asarray(case.data)}, values
-    )
+    arguments["data"] = jnp.asarray(case.data)
+    got, trace = density(lb.load_program("systematics"), arguments, values)
     assert set(trace) == {*values, "data"}
     return got
 
@@ -83,19 +82,19 @@ def bands(*edges):
     return PriorSpectrum(edges=edges, log_band_std=0.8)
 
 
-@pytest.mark.parametrize(
-    ("systematic", "values", "stds", "factors"),
-    [
-        (NoiseLevel(0.7), {"noise_level": 0.2}, [0.7], 1.0),
-        (NoiseLevel(0.7), {"noise_level": 7.0}, [0.7], 1.0),
-        (PriorSpectrum(0.4), {"amplitude": 5.0}, [0.4], 5.0),
-        (PriorSpectrum(tilt_std=0.6), {"tilt": -1.0}, [0.6], steep(-1.0)),
-        (PriorSpectrum(0.4, 0.6), {"amplitude": 0.3, "tilt": 1.4}, [0.4, 0.6], 0.3 * steep(1.4)),
-        # an edge is the first ell of its band; the lowest begins at 0, the highest ends it
-        (bands(2), {"band_power": [0.5, 3.0]}, [0.8], [0.5, 0.5, 3.0, 3.0, 3.0]),
-        (bands(1, 2, 4), {"band_power": [4.0, 0.3, 1.5, 0.7]}, [0.8], [4.0, 0.3, 1.5, 1.5, 0.7]),
-    ],
-)
+FACTORS = [
+    (NoiseLevel(0.7), {"noise_level": 0.2}, [0.7], 1.0),
+    (NoiseLevel(0.7), {"noise_level": 7.0}, [0.7], 1.0),
+    (PriorSpectrum(0.4), {"amplitude": 5.0}, [0.4], 5.0),
+    (PriorSpectrum(tilt_std=0.6), {"tilt": -1.0}, [0.6], steep(-1.0)),
+    (PriorSpectrum(0.4, 0.6), {"amplitude": 0.3, "tilt": 1.4}, [0.4, 0.6], 0.3 * steep(1.4)),
+    # an edge is the first ell of its band; the lowest begins at 0, the highest ends it
+    (bands(2), {"band_power": [0.5, 3.0]}, [0.8], [0.5, 0.5, 3.0, 3.0, 3.0]),
+    (bands(1, 2, 4), {"band_power": [4.0, 0.3, 1.5, 0.7]}, [0.8], [4.0, 0.3, 1.5, 1.5, 0.7]),
+]
+
+
+@pytest.mark.parametrize(("systematic", "values", "stds", "factors"), FACTORS)
 def test_levels_and_spectra_are_factors_of_n_and_c_ell(case, systematic, values, stds, factors):
     """A ratio of variances; C_ell A ((ell + 1) / 10)^tilt, and powers of bands."""
     expected = case.evidence(np.asarray(factors), level=values.get("noise_level", 1.0))

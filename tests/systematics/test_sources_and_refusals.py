@@ -5,7 +5,6 @@ The oracle takes A, N_0 and the responses as matrices and works in decimal arith
 antennas, priors and treatments: one clear sentence each.
 """
 
-import csv
 from dataclasses import replace
 from functools import lru_cache
 
@@ -13,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from assertions import refuse
+from commands import run, sets, table_of
 from experiments import density_of, program_arguments, small_experiment
 from numpyro import handlers
 from reference_linear import exact_posterior
@@ -20,16 +20,8 @@ from scipy.constants import Boltzmann, speed_of_light
 from scipy.stats import chi2, norm
 
 import lusee_bayes as lb
-from lusee_bayes.cli.main import main
+from lusee_bayes.experiment import model as models
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.model import (
-    base_model,
-    full_model,
-    radiometer,
-    simulate,
-    systematics,
-    true_values,
-)
 from lusee_bayes.experiment.unknowns import flux_table
 from lusee_bayes.sampling.programs import latent_sites
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
@@ -59,7 +51,7 @@ def setup_of(*overrides: str, sources: str = LIST) -> Setup:
 @lru_cache
 def experiment(*overrides: str, sources: str = LIST) -> Experiment:
     setup = setup_of(*overrides, sources=sources)
-    return Experiment(setup, simulate(setup))
+    return Experiment(setup, models.simulate(setup))
 
 
 def columns() -> np.ndarray:
@@ -94,27 +86,26 @@ def answer():
     e, (mean, std), t = setup_of(), priors(), columns()
     both = np.concatenate([np.asarray(e.coupling.dense()), t], axis=1)
     variance = np.concatenate([np.asarray(e.prior.variance()), std**2])
-    noise = np.diag(np.asarray(radiometer(e).diagonal()))
+    noise = np.diag(np.asarray(models.radiometer(e).diagonal()))
     return exact_posterior(both, variance, noise, np.asarray(experiment().data.data) - t @ mean)
 
 
 # --- marginalised ---------------------------------------------------------------------------------
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_the_sky_is_the_same_with_fluxes_in_the_noise_or_beside_it():
     """Both against the closed form: Lambda's condition of 1e10 costs 1e-6 of a variance; means are
     refined, to better than 1e-6 standard deviations."""
     expected, d = answer(), experiment().data.data
-    marginal = full_model(setup_of()).condition(d).posterior
+    marginal = models.full_model(setup_of()).condition(d).posterior
     sky = expected.std[:49]
     off = (np.asarray(marginal.mean) - expected.mean[:49]) / sky
     assert np.abs(off).max() < 1e-5
     np.testing.assert_allclose(np.asarray(marginal.std()), sky, rtol=1e-5)
     assert float(marginal.log_evidence) == pytest.approx(expected.log_prob, abs=1e-4)
     # the sources matter: with them in the data only, the sky is off by what can be seen
-    wrong = full_model(setup_of("sources.treatment=ignored")).condition(d).posterior
+    wrong = models.full_model(setup_of("sources.treatment=ignored")).condition(d).posterior
     assert np.abs((np.asarray(wrong.mean) - expected.mean[:49]) / sky).max() > 1.0
 
 
@@ -123,7 +114,7 @@ def test_the_sky_is_the_same_with_fluxes_in_the_noise_or_beside_it():
 
 def test_the_table_is_in_jansky():
     table = flux_table(experiment(), lb.infer(experiment()))
-    expected, (mean, std), truth = answer(), priors(), true_values(setup_of())
+    expected, (mean, std), truth = answer(), priors(), models.true_values(setup_of())
     jansky = 1.0 / kelvin_steradian(1.0)
     assert list(table["source"]) == ["Cas A", "For A", "For A", "For A", "Polaris"]
     assert list(table["block"]) == [0, 0, 1, 2, 0]
@@ -157,7 +148,7 @@ def test_the_program_given_its_fluxes():
     setup, d = e.setup, np.asarray(e.data.data)
     t, (mean, std) = columns(), priors()
     a, s = np.asarray(setup.coupling.dense()), np.asarray(setup.prior.variance())
-    noise = np.diag(np.asarray(radiometer(setup).diagonal()))
+    noise = np.diag(np.asarray(models.radiometer(setup).diagonal()))
     for z in (np.zeros(5), np.array([0.3, -1.0, 0.5, 2.0, -0.7])):
         flux = mean + std * z
         expected = exact_posterior(a, s, noise, d - t @ flux).log_prob
@@ -171,11 +162,11 @@ def test_the_program_given_its_fluxes():
 
 def test_simulated_data_hold_the_drawn_fluxes():
     setup = setup_of()
-    truth = true_values(setup)
+    truth = models.true_values(setup)
     flux = np.concatenate([np.atleast_1d(truth[site]) for site in SITES])
     d = experiment().data
     t, a = columns(), np.asarray(setup.coupling.dense())
-    sigma = np.sqrt(np.asarray(radiometer(setup).diagonal()))
+    sigma = np.sqrt(np.asarray(models.radiometer(setup).diagonal()))
 
     def misfit(flux):
         off = np.asarray(d.data) - a @ np.asarray(d.truth) - t @ flux
@@ -198,14 +189,11 @@ def test_simulated_data_hold_the_drawn_fluxes():
 
 @pytest.mark.long
 def test_the_map_command_writes_the_fluxes(tmp_path, capsys):
-    arguments = ["map", "fiducial", "-o", str(tmp_path)]
-    for override in ("lmax=6", "observation.runs.0.cycles=0.02", "sky.sources=false", LIST):
-        arguments += ["--set", override]
-    assert main(arguments) == 0
+    given = sets("lmax=6", "observation.runs.0.cycles=0.02", "sky.sources=false", LIST)
+    assert run("map", "fiducial", "-o", tmp_path, *given) == 0
     printed = capsys.readouterr().out
     assert "Polaris: 2e+04 +- 1e+04 Jy, the prior's: it is never above the horizon" in printed
-    with (tmp_path / "sources.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = table_of(tmp_path / "sources.csv")
     table = flux_table(experiment(), lb.infer(experiment()))
     assert list(rows[0]) == ["frequency_mhz", *table.columns]
     assert [row["source"] for row in rows] == list(table["source"])
@@ -217,51 +205,46 @@ def test_the_map_command_writes_the_fluxes(tmp_path, capsys):
 # --- sources --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("source", "message"),
-    [
-        ("Cas B", "unknown source 'Cas B'; did you mean 'Cas A'?"),
-        ("Q", "unknown source 'Q'; known: Cas A, Cen A, .*Venus.*ra_deg and dec_deg"),
-        # bodies have no flux in the catalogue
-        ("Jupiter", "'Jupiter' is not in the catalogue.* give flux_jy"),
-        ("mine, ra_deg: 1, dec_deg: 2", "'mine' is not in the catalogue"),
-    ],
-)
+UNKNOWN_SOURCES = [
+    ("Cas B", "unknown source 'Cas B'; did you mean 'Cas A'?"),
+    ("Q", "unknown source 'Q'; known: Cas A, Cen A, .*Venus.*ra_deg and dec_deg"),
+    # bodies have no flux in the catalogue
+    ("Jupiter", "'Jupiter' is not in the catalogue.* give flux_jy"),
+    ("mine, ra_deg: 1, dec_deg: 2", "'mine' is not in the catalogue"),
+]
+
+
+@pytest.mark.parametrize(("source", "message"), UNKNOWN_SOURCES)
 def test_sources_that_are_not_known(source, message):
     refuse(message, lb.build, small_scenario(f"sources.list=[{{name: {source}}}]"))
 
 
-@pytest.mark.parametrize(
-    ("columns", "std", "message"),
-    [
-        (jnp.full((4, 1), np.nan), 1.0, "the response to X holds NaN"),
-        (jnp.ones((4, 1)), 0.0, "standard deviation of X's flux must be positive"),
-        (jnp.ones((4, 1)), float("nan"), "standard deviation of X's flux must be positive"),
-    ],
-)
-def test_sources_that_cannot_be(columns, std, message):
-    refuse(message, Source, columns, 1.0, std, "X")
+def test_sources_that_cannot_be():
+    refuse("the response to X holds NaN", Source, jnp.full((4, 1), np.nan), 1.0, 1.0, "X")
+    for std in (0.0, np.nan):
+        words = "standard deviation of X's flux must be positive"
+        refuse(words, Source, jnp.ones((4, 1)), 1.0, std, "X")
 
 
 # --- antennas -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("parameters", "message"),
-    [
-        ("{lenght_m: 0.1}", "unknown beam parameter 'lenght_m'; did you mean 'length_m'?"),
-        ("{x: 1}", "unknown beam parameter 'x'; known: deep_permittivity, .*zenith_angle_deg"),
-        # 1 lies 2.7 / 5 standard deviations below: Phi(-0.54) = 29.5 %
-        ("{surface_permittivity: 5}", "surface_permittivity.* 29.5% .*at least 1"),
-        # Phi(-0.1) = 46 %
-        ("{loss_tangent: 0.1}", r"prior of loss_tangent, 0.01 \+- 0.1, has 46.0% .*at least 0"),
-        # 105 / 60 standard deviations to 180 degrees, 75 / 60 to 0: 10.6 % and 4.0 %
-        ("{zenith_angle_deg: 60}", r"prior of zenith_angle_deg, 75 \+- 60, has 14.6% .*at least 0"),
-    ],
-)
+BAD_ANTENNAS = [
+    ("{lenght_m: 0.1}", "unknown beam parameter 'lenght_m'; did you mean 'length_m'?"),
+    ("{x: 1}", "unknown beam parameter 'x'; known: deep_permittivity, .*zenith_angle_deg"),
+    # 1 lies 2.7 / 5 standard deviations below: Phi(-0.54) = 29.5 %
+    ("{surface_permittivity: 5}", "surface_permittivity.* 29.5% .*at least 1"),
+    # Phi(-0.1) = 46 %
+    ("{loss_tangent: 0.1}", r"prior of loss_tangent, 0.01 \+- 0.1, has 46.0% .*at least 0"),
+    # 105 / 60 standard deviations to 180 degrees, 75 / 60 to 0: 10.6 % and 4.0 %
+    ("{zenith_angle_deg: 60}", r"prior of zenith_angle_deg, 75 \+- 60, has 14.6% .*at least 0"),
+]
+
+
+@pytest.mark.parametrize(("parameters", "message"), BAD_ANTENNAS)
 def test_antennas_that_cannot_be_sampled(parameters, message):
     sampled = f"noise.beam.parameters={parameters}", "noise.beam.treatment=sampled"
-    for ask in (true_values, systematics):
+    for ask in (models.true_values, models.systematics):
         refuse(message, ask, setup_of(*sampled, sources=CAS_A))
 
 
@@ -279,7 +262,7 @@ def test_bands_beyond_the_highest_ell():
     arguments = {n: v for n, v in program_arguments(program, e).items() if n != "data"}
     refuse("a band begins at ell = 7, above lmax = 6", latent_sites, program.model, arguments)
     # 6 is the highest ell itself
-    base = replace(base_model(e.setup), prior=lb.HarmonicPrior(jnp.ones(7)))
+    base = replace(models.base_model(e.setup), prior=lb.HarmonicPrior(jnp.ones(7)))
     with handlers.seed(rng_seed=0):
         PriorSpectrum(edges=(3, 6)).sampled(base)
 
@@ -287,15 +270,15 @@ def test_bands_beyond_the_highest_ell():
 # --- programs that do not fit the scenario --------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("program", "overrides", "section"),
-    [
-        ("sources", [], "sources"),
-        ("gains", ["noise.gain.sigma=0.01"], "noise.gain"),
-        ("gain_scales", ["noise.gain.sigma=0.01"], "noise.gain"),
-        ("instrument", ["noise.beam.shift_mhz=4"], "noise.beam"),
-    ],
-)
+COUNTED_TWICE = [
+    ("sources", [], "sources"),
+    ("gains", ["noise.gain.sigma=0.01"], "noise.gain"),
+    ("gain_scales", ["noise.gain.sigma=0.01"], "noise.gain"),
+    ("instrument", ["noise.beam.shift_mhz=4"], "noise.beam"),
+]
+
+
+@pytest.mark.parametrize(("program", "overrides", "section"), COUNTED_TWICE)
 def test_nothing_is_counted_twice(program, overrides, section):
     """What a program samples must not be in N as well."""
     asked = lb.load_program(program)
@@ -313,4 +296,4 @@ def test_what_the_scenario_does_not_have():
     for program, section in (("gains", "noise.gain"), ("sources", "sources")):
         refuse(f"the scenario has no {section}", program_arguments, lb.load_program(program), bare)
     asked = lb.load_program("systematics").arguments
-    refuse("asks for 'gaussian', a piece of an experiment", asked, base_model(bare.setup))
+    refuse("asks for 'gaussian', a piece of an experiment", asked, models.base_model(bare.setup))
