@@ -78,7 +78,11 @@ def quantity(
     said = {"units": units, "long_name": long_name}
     attributes = {name: words for name, words in said.items() if words} | dict(attributes or {})
     encoding = {"zlib": True, "complevel": 1} if packed else {}
-    metadata = {"attributes": attributes, "checks": ANY if checks is None else checks, "encoding": encoding}
+    metadata = {
+        "attributes": attributes,
+        "checks": ANY if checks is None else checks,
+        "encoding": encoding,
+    }
     return field(metadata=metadata, **options)
 
 

@@ -32,7 +32,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import Rotation, mode_numbers
 from lusee_bayes.core.linalg import gram_matrix, mirrored, solve_lower
 from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix, turned_about_pole
-from lusee_bayes.noise import covariance
+from lusee_bayes.noise import covariance, time_blocks
 
 # arrays that recur
 Beams = Float[np.ndarray, "orders products 2 functions degrees"]
@@ -310,7 +310,7 @@ STREAMED = 1024
 
 
 def _streamed(
-    coupling: CouplingMatrix, _: covariance.Covariance, factor: covariance.TimeBandedFactor
+    coupling: CouplingMatrix, _: covariance.Covariance, factor: time_blocks.TimeBandedFactor
 ) -> ModesMatrix:
     """For time-banded noise: A is made, whitened and summed one block row of N after the other."""
     pointing, layout = coupling.pointing, coupling.layout
@@ -339,7 +339,7 @@ def _streamed(
 # how A^T N^-1 A is summed for each structure of N in time; those without an entry need A itself
 NORMAL_MATRICES: dict[type[covariance.Covariance], Callable[..., ModesMatrix]] = {
     covariance.DiagonalCovariance: _within_times,
-    covariance.TimeBlockCovariance: _within_times,
-    covariance.TimeBandedCovariance: _streamed,
+    time_blocks.TimeBlockCovariance: _within_times,
+    time_blocks.TimeBandedCovariance: _streamed,
     covariance.LowRankUpdate: _with_templates,
 }

@@ -37,7 +37,8 @@ from lusee_bayes.core.linalg import checked_cholesky
 from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.coupling import Coupling
 from lusee_bayes.instrument.products import DataLayout, ports
-from lusee_bayes.noise.covariance import LowRankCovariance, TimeBandedCovariance
+from lusee_bayes.noise.covariance import LowRankCovariance
+from lusee_bayes.noise.time_blocks import TimeBandedCovariance
 from lusee_bayes.sky.prior import Prior
 
 Gains = Float[Array, "antennas times"]

@@ -24,7 +24,8 @@ from lusee_bayes.core import checks
 from lusee_bayes.core.arrays import Array, Grid, compiled, namespace
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.instrument.products import DataLayout, auto_indices, ports, to_matrix, without_gaps
-from lusee_bayes.noise.covariance import Covariance, DiagonalCovariance, TimeBlockCovariance
+from lusee_bayes.noise.covariance import Covariance, DiagonalCovariance
+from lusee_bayes.noise.time_blocks import TimeBlockCovariance
 
 
 def sample_covariances(

@@ -42,7 +42,7 @@ from lusee_bayes.sampling.least import require_draws, require_simulations
 from lusee_bayes.sampling.log_normal_program import coordinates_of
 from lusee_bayes.sampling.mode import laplace_approximation
 from lusee_bayes.sampling.programs import Program, load_program, predicts, require_sampleable
-from lusee_bayes.sampling.shared_sites import SharedSites, of_channel, site_of
+from lusee_bayes.sampling.shared_sites import SharedSites, of_channel, site_in
 from lusee_bayes.sampling.validation import BATCH, N_DRAWS, calibrate_sky, validate_draws
 from lusee_bayes.systematics.gain_drifts import SCALES
 from lusee_bayes.systematics.registered import SYSTEMATICS
@@ -138,11 +138,11 @@ def sample_together(
     with stages("coordinates"):
         if several:
             start = {
-                site_of(name, site): value
+                site_in(name, site): value
                 for name in experiments
-                for site, value in start_of(inferences[name], latent[name]).items()
+                for site, value in values_found(inferences[name], latent[name]).items()
             }
-            hold = [site_of(name, scale) for name in experiments for scale in SCALES]
+            hold = [site_in(name, scale) for name in experiments for scale in SCALES]
             about = laplace_approximation(model, observed, start, hold)
             whitening = about.whitening if bool(about.converged) else None
         else:
@@ -188,7 +188,7 @@ def coordinates(
     positive = arguments.get("log_normal")
     if positive is not None and set(latent) == set(positive.sites):
         return coordinates_of(positive, inference.solution.information)
-    start, arguments = start_of(inference, latent), {**arguments, "data": data.data}
+    start, arguments = values_found(inference, latent), {**arguments, "data": data.data}
     # where rounds have led to the mode, it is looked for nowhere else
     starts = 1 if SKY in latent or set(start) == set(latent) else STARTS
     chart = _chart(arguments, latent)
@@ -196,7 +196,7 @@ def coordinates(
     return found.whitening if bool(found.converged) else None
 
 
-def start_of(inference: Inference, latent: Sequence[str]) -> dict[str, np.ndarray]:
+def values_found(inference: Inference, latent: Sequence[str]) -> dict[str, np.ndarray]:
     """Where the mode is looked for: at what rounds have found, if there were any."""
     start = {SKY: inference.posterior.mean} if SKY in latent else {}
     for part in inference.expanded if inference.moving else ():

@@ -29,14 +29,14 @@ from lusee_bayes.sampling.hmc import Chains
 NOTHING_LEFT = 1e-10
 
 
-def site_of(channel: str, name: str) -> str:
+def site_in(channel: str, name: str) -> str:
     """The name of a channel's site."""
     return f"{channel}/{name}"
 
 
 def of_channel(chains: Chains, channel: str) -> Chains:
     """The draws of one channel, with its own names of sites."""
-    start = site_of(channel, "")
+    start = site_in(channel, "")
     own = {n.removeprefix(start): v for n, v in chains.sites.items() if n.startswith(start)}
     return Chains(own, chains.statistics)
 
@@ -84,7 +84,7 @@ class _Channel(Messenger):
         if msg["type"] not in ("sample", "deterministic"):
             return
         name, prior = msg["name"], msg["fn"]
-        msg["name"] = site_of(self.channel, name)
+        msg["name"] = site_in(self.channel, name)
         if msg["type"] != "sample" or name not in self.shared.octaves:
             return
         octaves, before = self.shared.octaves[name], self.known.setdefault(name, {})

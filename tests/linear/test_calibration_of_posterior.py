@@ -20,7 +20,8 @@ from scipy.stats import chi2, kstest
 import lusee_bayes as lb
 from lusee_bayes.experiment.model import full_model
 from lusee_bayes.linear.linear_gaussian import InData, InMap, Whitened
-from lusee_bayes.noise.covariance import Covariance, DenseCovariance, TimeBlockCovariance
+from lusee_bayes.noise.covariance import Covariance, DenseCovariance
+from lusee_bayes.noise.time_blocks import TimeBlockCovariance
 
 LMAX, N_MODES, N_DRAWS, SEED = 8, 81, 4000, 20270115
 SPECTRUM = 1e8 * (1.0 + np.arange(LMAX + 1.0)) ** -2.5  # K^2; the monopole is 20000 K below

@@ -13,7 +13,8 @@ import lusee_bayes as lb
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.linear.information import CONVERGENCE
 from lusee_bayes.linear.linear_gaussian import FromInformation, InData, InMap, form_of
-from lusee_bayes.noise.covariance import DenseCovariance, TimeBlockCovariance
+from lusee_bayes.noise.covariance import DenseCovariance
+from lusee_bayes.noise.time_blocks import TimeBlockCovariance
 
 FORMS = (InMap, InData, FromInformation)
 LMAX, N_MODES = 3, 16

@@ -20,6 +20,7 @@ from lusee_bayes.linear.linear_gaussian import FromInformation, InMap, form_of
 from lusee_bayes.linear.normal_matrix import CHUNK, normal_matrix, summed, time_sums
 from lusee_bayes.linear.posterior import pixel_std
 from lusee_bayes.noise import covariance as cov
+from lusee_bayes.noise import time_blocks
 
 LMAX, N_PRODUCTS = 5, 4
 # the first and the last run see the sky through the same beams
@@ -52,10 +53,10 @@ def noise_of(kind, layout):
     roots = rng.standard_normal((layout.n_times, N_PRODUCTS, 2 * N_PRODUCTS))
     blocks = jnp.asarray(roots @ np.swapaxes(roots, 1, 2))
     if kind == "blocks":
-        return cov.TimeBlockCovariance(blocks, layout)
+        return time_blocks.TimeBlockCovariance(blocks, layout)
     if kind == "templates":
         root = jnp.asarray(rng.standard_normal((layout.size, 2)))
-        return cov.TimeBlockCovariance(blocks, layout) + cov.LowRankCovariance(root)
+        return time_blocks.TimeBlockCovariance(blocks, layout) + cov.LowRankCovariance(root)
     # sums of what neighbouring times share: positive by construction
     shared = 0.3 * rng.standard_normal((layout.n_times + 2, N_PRODUCTS, N_PRODUCTS))
     band = np.zeros((layout.n_times, 3, N_PRODUCTS, N_PRODUCTS))
@@ -63,7 +64,7 @@ def noise_of(kind, layout):
         for t in range(w, layout.n_times):
             band[t, w] = sum(shared[t - w + k] @ shared[t - w + k].T for k in range(w, 3)) * 0.3
     band[:, 0] += np.asarray(blocks)
-    return cov.TimeBandedCovariance(jnp.asarray(band), layout)
+    return time_blocks.TimeBandedCovariance(jnp.asarray(band), layout)
 
 
 @pytest.mark.parametrize("place", [on_host, on_device])

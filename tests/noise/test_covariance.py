@@ -13,7 +13,7 @@ from reference_linear import random_covariance
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.noise import covariance
+from lusee_bayes.noise import covariance, time_blocks
 from lusee_bayes.noise.instrument_errors import template_noise
 from lusee_bayes.testing.contracts import check_covariance, close
 
@@ -26,7 +26,7 @@ FLAGS[1, 0] = True
 @pytest.fixture
 def small_blocks(monkeypatch):
     """Block rows of two times of three products, so that small matrices have several."""
-    monkeypatch.setattr(covariance, "ROWS", 7)
+    monkeypatch.setattr(time_blocks, "ROWS", 7)
 
 
 def _entries(flags):
@@ -57,7 +57,7 @@ def _banded(flags, width, seed=5):
     apart = np.abs(time_of[:, None] - time_of[None])
     assert (by_hand[apart > width] == 0).all()
     layout = DataLayout.from_flags(flags)
-    return covariance.TimeBandedCovariance(jnp.asarray(band), layout, "the memory"), by_hand
+    return time_blocks.TimeBandedCovariance(jnp.asarray(band), layout, "the memory"), by_hand
 
 
 def _directions(n, rank=2, seed=11):
@@ -84,7 +84,7 @@ def _terms(flags):
     base, (directions, outer) = lb.DiagonalCovariance(jnp.asarray(updated)), _directions(n)
     return {
         "diagonal": (lb.DiagonalCovariance(jnp.asarray(variance)), np.diag(variance)),
-        "blocks": (covariance.TimeBlockCovariance(jnp.asarray(blocks), layout), by_hand),
+        "blocks": (time_blocks.TimeBlockCovariance(jnp.asarray(blocks), layout), by_hand),
         "dense": (covariance.DenseCovariance(jnp.asarray(matrix)), matrix),
         "banded": _banded(flags, 2),
         "low rank": (covariance.LowRankUpdate(base, directions), np.diag(updated) + outer),
@@ -161,12 +161,12 @@ def test_sums_keep_the_structure():
     directions, _ = _directions(diagonal.size)
     assert isinstance(diagonal + diagonal, lb.DiagonalCovariance)
     for term in (diagonal + blocks, blocks + diagonal, blocks + blocks):
-        assert isinstance(term, covariance.TimeBlockCovariance)
+        assert isinstance(term, time_blocks.TimeBlockCovariance)
     for term in (dense + blocks, blocks + dense, diagonal + dense, dense + dense, banded + dense):
         assert isinstance(term, covariance.DenseCovariance)
     for other in (diagonal, blocks, banded):
         for term in (banded + other, other + banded):
-            assert isinstance(term, covariance.TimeBandedCovariance)
+            assert isinstance(term, time_blocks.TimeBandedCovariance)
             assert term.band.shape[1] == 3
         for term in (other + directions, directions + other, other + low_rank, low_rank + other):
             assert isinstance(term, covariance.LowRankUpdate)
@@ -244,7 +244,7 @@ def test_flagged_samples_change_nothing_whatever_their_blocks_hold():
     cov, dense = _terms(FLAGS)["blocks"]
     junk = np.asarray(cov.blocks).copy()
     junk[FLAGS.T] = 1e6  # rows of samples that were never taken
-    again = covariance.TimeBlockCovariance(jnp.asarray(junk), cov.layout)
+    again = time_blocks.TimeBlockCovariance(jnp.asarray(junk), cov.layout)
     close(again.dense(), dense, 1e-15)
     assert float(again.log_det()) == float(cov.log_det())
 
@@ -274,7 +274,7 @@ def test_gradients_reach_the_entries():
     for i, j in product(range(layout.size), repeat=2):
         if time_of[i] == time_of[j]:
             by_block[time_of[i], product_of[i], product_of[j]] = expected(b)[i, j]
-    close(slope(lambda e: covariance.TimeBlockCovariance(e, layout), blocks.blocks), by_block)
+    close(slope(lambda e: time_blocks.TimeBlockCovariance(e, layout), blocks.blocks), by_block)
 
 
 # --- refusals ---------------------------------------------------------------------------------
@@ -287,8 +287,8 @@ UNIT, ROOT = jnp.eye(3), jnp.ones((4, 2))
 MAKERS = {
     "diagonal": lb.DiagonalCovariance,
     "dense": lambda m: covariance.DenseCovariance(m, "the gain term"),
-    "blocks": lambda b: covariance.TimeBlockCovariance(b, LAYOUT),
-    "banded": lambda b: covariance.TimeBandedCovariance(b, LAYOUT, "the gain term"),
+    "blocks": lambda b: time_blocks.TimeBlockCovariance(b, LAYOUT),
+    "banded": lambda b: time_blocks.TimeBandedCovariance(b, LAYOUT, "the gain term"),
     "low rank": lambda u: covariance.LowRankCovariance(u, "the beams"),
 }
 
@@ -322,7 +322,7 @@ def test_entries_that_no_covariance_has_are_refused(kind, entries, message):
 def test_what_passes_and_a_factor_that_does_not():
     covariance.DenseCovariance(UNIT.at[0, 1].set(1e-14))  # rounding
     # blocks between times need not be symmetric
-    covariance.TimeBandedCovariance(BAND.at[1, 1, 0, 1].set(0.5), LAYOUT)
+    time_blocks.TimeBandedCovariance(BAND.at[1, 1, 0, 1].set(0.5), LAYOUT)
     for bad in (0.0, -2.0):
         refuse("must be positive", lb.DiagonalCovariance(jnp.ones(3)).scaled, bad)
 
@@ -340,11 +340,11 @@ def test_indefinite_terms_are_named_with_their_lowest_eigenvalue(kind):
         cov = covariance.DenseCovariance(_indefinite(), "the gain term")
     elif kind == "blocks":
         blocks = jnp.stack([jnp.eye(6), _indefinite()])
-        cov = covariance.TimeBlockCovariance(blocks, DataLayout(6, 2))
+        cov = time_blocks.TimeBlockCovariance(blocks, DataLayout(6, 2))
     else:
         # times 0 and 1 correlated by 1.25: eigenvalues 1 +- 1.25; the last time stands alone
         band = jnp.zeros((3, 2, 4, 4)).at[:, 0].set(jnp.eye(4)).at[1, 1].set(1.25 * jnp.eye(4))
-        cov = covariance.TimeBandedCovariance(band, DataLayout(4, 3), "the gain term")
+        cov = time_blocks.TimeBandedCovariance(band, DataLayout(4, 3), "the gain term")
         cov = covariance.LowRankUpdate(cov, covariance.LowRankCovariance(1e-3 * jnp.ones((12, 1))))
     name = "noise" if kind == "blocks" else "the gain term"
     for use in (cov.factor, cov.log_det, lambda: cov.solve(jnp.ones(cov.size))):

@@ -9,8 +9,8 @@ from reference_linear import assert_draws_follow, z_of
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.noise.covariance import TimeBandedCovariance
 from lusee_bayes.noise.instrument_errors import GainDrift, with_gains
+from lusee_bayes.noise.time_blocks import TimeBandedCovariance
 
 # a gap of 27 hours, and of 190, beyond which nothing is correlated
 HOURS = np.array([0.0, 2.0, 4.5, 31.5, 33.5, 223.5])

@@ -11,8 +11,8 @@ from reference_linear import z_of
 
 import lusee_bayes as lb
 from lusee_bayes.instrument.products import DataLayout, to_matrix, to_real
-from lusee_bayes.noise.covariance import TimeBlockCovariance
 from lusee_bayes.noise.radiometer import exact_blocks, paper_variance, sample_covariances
+from lusee_bayes.noise.time_blocks import TimeBlockCovariance
 
 N_ANTENNAS, N_PRODUCTS, N_TIMES = 4, 16, 3
 BANDWIDTH, STEP = 2.0e5, 600.0
