@@ -156,9 +156,9 @@ def test_any_words(n, here, capsys, monkeypatch):
     def stop(*_, **__):
         raise InputError("stopped before the run")
 
-    for name in ("compare", "map", "paper", "plan", "sample", "validate"):
-        monkeypatch.setattr(f"lusee_bayes.runs.{name}_run.run_{name}", stop)
-    monkeypatch.setattr("lusee_bayes.runs.data_run.run_simulate", stop)
+    runs = {name: name for name in ("compare", "map", "paper", "plan", "sample")}
+    for name, file in (runs | {"validate": "sample", "simulate": "data"}).items():
+        monkeypatch.setattr(f"lusee_bayes.runs.{file}_run.run_{name}", stop)
     before = sorted(p.name for p in here.rglob("*"))
     commands = ["map", "sample", "simulate", "validate", "plan", "compare", "report", "info"]
 
