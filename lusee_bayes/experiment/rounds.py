@@ -44,7 +44,7 @@ FARTHEST = 2.0
 # while chi^2 of what N is built around is more than TEMPERED per datum, in the first rounds,
 # radiometer noise is taken for as much larger
 TEMPERED, MAX_TEMPERED_ROUNDS = 10.0, 20
-# where chi^2 then is too large by so many of its standard deviations, rounds begin elsewhere, too,
+# where chi^2 then is too large by so many of its standard deviations, other ways are tried, one
 # with noise that is larger again
 FAR_OFF, MORE_TEMPERED = 10.0, 30.0
 # a prior is learned first when the map moves by less than this, and last when learning it again
@@ -158,8 +158,10 @@ def settled(
     What is second order in values that are far off may outweigh by orders of magnitude what tells
     two of them apart. Rounds therefore begin with radiometer noise that is larger, so that chi^2
     of what N is built around is 10 per datum; values go part of the way where they would go far,
-    or swing. Where chi^2 is far too large at their end, they begin once more with an instrument
-    that is as far off on the other side, and the end of larger ln p counts.
+    or swing. Where chi^2 is far too large at their end, they begin once more, with the sky of each
+    instrument found anew while noise is larger (variable projection, whose first order in values
+    has no product with a change of the sky), and if need be again, with an instrument that is as
+    far off on the other side. The end of larger ln p counts.
 
     Parameters
     ----------
@@ -182,11 +184,14 @@ def settled(
     InputError
         If N is not positive definite.
     """
-    found, step = _approached(setup, data, start or _start(setup, data))
-    if found.moving and not found.fits:
-        other = _approached(setup, data, _elsewhere(setup, found))
-        if other[0].posterior.log_evidence > found.posterior.log_evidence:
-            found, step = other
+    start = start or _start(setup, data)
+    found, step = _approached(setup, data, start)
+    for projected in (True, False):
+        if found.moving and not found.fits:
+            begin = start if projected else _elsewhere(setup, found)
+            other = _approached(setup, data, begin, projected=projected)
+            if other[0].posterior.log_evidence > found.posterior.log_evidence:
+                found, step = other
     moves, n_learned, learned, in_rounds = np.inf, 0, None, rebuilds(setup)
     while True:
         last, at_rest = not in_rounds or found.rounds >= MAX_ROUNDS, moves < SETTLED * step.size
@@ -216,12 +221,23 @@ def settled(
     )
 
 
-def _approached(setup: Setup, data: Visibilities, around: Around) -> tuple[Inference, _Step]:
-    """Rounds until the map has nearly settled, and the step there."""
+def _approached(
+    setup: Setup, data: Visibilities, around: Around, *, projected: bool = False
+) -> tuple[Inference, _Step]:
+    """Rounds until the map has nearly settled, and the step there.
+
+    projected : while noise is larger, find the sky of each instrument anew; it is no longer larger
+        once values have nearly settled
+    """
     found, step = _conditioned(setup, data, around, 1), _Step()
     moves = np.inf if rebuilds(setup) else 0.0
     while moves > NEARLY and found.rounds < MAX_TEMPERED_ROUNDS:
         around, step = _around(setup, found, step)
+        if projected and around.tempered > 1.0:
+            rest = step.whole is not None and np.abs(step.whole).max() < NEARLY
+            around = replace(
+                _exact(setup, around).around, tempered=1.0 if rest else around.tempered
+            )
         before, found = found, _conditioned(setup, data, around, found.rounds + 1)
         moves = found.moves_from(before) if around.tempered == 1.0 else np.inf
     return found, step
@@ -314,10 +330,15 @@ def _start(setup: Setup, data: Visibilities) -> Around:
     around = Around(data)
     if not first_order(setup):
         return around
-    model, held = model_about(setup, around, moving=False)
-    solution = model.condition(data.data)
-    exact = Inference(solution, held, 0, replace(around, sky=solution.posterior.mean))
+    exact = _exact(setup, around)
     return replace(exact.around, tempered=_tempered(exact.misfit(), 0))
+
+
+def _exact(setup: Setup, around: Around) -> Inference:
+    """What data tell of the sky if values are these, about that sky."""
+    model, held = model_about(setup, around, moving=False)
+    solution = model.condition(around.data.data)
+    return Inference(solution, held, 0, replace(around, sky=solution.posterior.mean))
 
 
 def _tempered(misfit: float, rounds: int) -> float:
