@@ -7,7 +7,7 @@ Priors also come by name, for a comparison under which of them data are most pro
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -184,7 +184,7 @@ def settled(
     InputError
         If N is not positive definite.
     """
-    start = start or _start(setup, data)
+    start = start or beginning(setup, data)
     found, step = _approached(setup, data, start)
     for projected in (True, False):
         if found.moving and not found.fits:
@@ -245,7 +245,7 @@ def _approached(
 
 def _elsewhere(setup: Setup, found: Inference) -> Around:
     """Where else rounds may begin: with an instrument as far off on the other side."""
-    start, values = _start(setup, found.around.data), {}
+    start, values = beginning(setup, found.around.data), {}
     for part in found.expanded:
         if not part.systematic.learns:
             values |= part.systematic.in_units(-part.centre)
@@ -322,12 +322,15 @@ def _around(setup: Setup, found: Inference, step: _Step) -> tuple[Around, _Step]
     return around, step
 
 
-def _start(setup: Setup, data: Visibilities) -> Around:
+def beginning(
+    setup: Setup, data: Visibilities, values: Mapping[str, float] | None = None
+) -> Around:
     """What N is built around first: the data and, where the instrument is found, a sky.
 
-    That of the instrument as it is expected, with larger noise where it does not fit.
+    That of the instrument with these values, by default as it is expected, with larger noise where
+    it does not fit.
     """
-    around = Around(data)
+    around = Around(data, values=values)
     if not first_order(setup):
         return around
     exact = _exact(setup, around)
@@ -336,7 +339,8 @@ def _start(setup: Setup, data: Visibilities) -> Around:
 
 def _exact(setup: Setup, around: Around) -> Inference:
     """What data tell of the sky if values are these, about that sky."""
-    model, held = model_about(setup, around, moving=False)
+    there = moved(setup, around.values)
+    model, held = model_about(there, replace(around, values=None), moving=False)
     solution = model.condition(around.data.data)
     return Inference(solution, held, 0, replace(around, sky=solution.posterior.mean))
 
@@ -403,7 +407,10 @@ COARSE_LMAX = 24
 
 
 def with_learned_prior(
-    setup: Setup, data: Visibilities, earlier: Information | None = None
+    setup: Setup,
+    data: Visibilities,
+    earlier: Information | None = None,
+    start: Around | None = None,
 ) -> tuple[Setup, Inference]:
     """Learn the prior from data, with all that is in N (:func:`settled`).
 
@@ -414,6 +421,8 @@ def with_learned_prior(
     data : Visibilities
     earlier : Information, optional
         Of earlier data, which are learned from, too.
+    start : Around, optional
+        As of :func:`settled`.
 
     Returns
     -------
@@ -427,7 +436,7 @@ def with_learned_prior(
         more = information if earlier is None else information + earlier
         return learned_prior(setup, setup.family, more, start)
 
-    found = settled(setup, data, learn=learn)
+    found = settled(setup, data, start, learn)
     return replace(setup, prior=found.learned.prior), found
 
 
