@@ -233,7 +233,7 @@ class Conditioned:
             if self.unknowns is not None:
                 own = self.own.solution
                 report = self.unknowns.report(own.posterior.mean, own.covariance)
-                report = replace(report, onto=self.onto)
+                report = report and replace(report, onto=self.onto)
             given = (known, self.posterior.mean, self.covariance, self.draws, self.log_likelihood())
             more = {"unknowns": report, "pixels": self.pixel_std, **self.figures()}
             more["instrument"] = self.unknowns

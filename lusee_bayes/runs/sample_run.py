@@ -118,7 +118,7 @@ def sample_together(
     }
     if resume and not (folder / CHAINS).exists():
         found = [_finished(folder / name / SAMPLES, identity, sampler) for name in experiments]
-        if None not in found:
+        if all(one is not None for one in found):
             made = zip(experiments.values(), inferences.values(), found, strict=True)
             return tuple(SampleResult(*one, stages.seconds, None) for one in made)
     arguments, latent = {}, {}

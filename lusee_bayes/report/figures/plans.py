@@ -67,9 +67,9 @@ def _row_positions(planned: Sequence[Forecast]) -> Rows:
     for family in dict.fromkeys(f.variation.family for f in planned):
         names = dict.fromkeys(f.variation.name for f in planned if f.variation.family == family)
         if family != AS_GIVEN:
-            rows[family, ""] = len(rows)
+            rows[family, ""] = float(len(rows))
         for name in names:
-            rows[family, name] = len(rows)
+            rows[family, name] = float(len(rows))
     return rows
 
 
