@@ -116,7 +116,7 @@ def test_every_folder_keeps_its_budget():
     assert total <= 25_356
     assert len(paths) <= 170
     assert sum(imports for *_, imports in counted) <= 0.11 * total
-    assert sum(lines_of_code(path)[0] for path in (ROOT / "tests").rglob("*.py")) <= 20_111
+    assert sum(lines_of_code(path)[0] for path in (ROOT / "tests").rglob("*.py")) <= 20_144
 
 
 def test_a_name_means_one_thing():
