@@ -14,7 +14,7 @@ from lusee_bayes.experiment.unknowns import ALL_TOGETHER
 from lusee_bayes.judge.cube_fit import disagreement, shared_tests
 from lusee_bayes.linear.amplitudes import tie
 from lusee_bayes.runs import channels
-from lusee_bayes.runs.channels import kernel, map_channels, tie_channels
+from lusee_bayes.runs.channels import Share, kernel, map_channels, tie_channels
 
 FREQUENCIES, OCTAVES = np.array([15.0, 20.0, 22.0]), 0.4
 RUNS = "observation.runs=[{cycles: 1}, {cycles: 1, turntable_deg: 30}]"
@@ -103,8 +103,9 @@ def test_two_channels_that_differ_are_both_named():
 
 def test_a_channel_without_an_unknown_tells_nothing_of_it():
     scenario = lb.load_scenario("fiducial", SMALL)
-    one = {"a": np.inf, "b": np.inf}, np.array([0.5, 1.0]), np.diag([0.2, 0.1]), 4
-    other = {"a": np.inf}, np.array([0.3]), np.full((1, 1), 0.5), 4
+    both = {"a": np.inf, "b": np.inf}
+    one = Share(both, np.array([0.5, 1.0]), np.diag([0.2, 0.1]), 4, {}, True)
+    other = Share({"a": np.inf}, np.array([0.3]), np.full((1, 1), 0.5), 4, {}, True)
     tied, _ = tie_channels(scenario, [15.0, 20.0], [one, other])
     assert tied.names == ("a", "b")
     # of a: 1 / 0.2 + 1 / 0.5 - 1

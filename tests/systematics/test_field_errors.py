@@ -146,6 +146,7 @@ def test_maps_beside_errors_of_the_fields(seed):
     assert 0.75 < full[0] < 1.25 and full[1] > 5.0
 
 
+@pytest.mark.essential
 def test_beams_of_measured_data_are_not_exact_unless_a_scenario_says_so():
     """Ground, arms and fields that differ from the model's, drawn as is expected of them.
 
@@ -163,6 +164,7 @@ def test_beams_of_measured_data_are_not_exact_unless_a_scenario_says_so():
         assert full > 10.0 if exact else 0.6 < full < 1.4
 
 
+@pytest.mark.essential
 def test_a_report_has_the_share_of_the_variance_that_they_add(tmp_path):
     """As saved, against dense posteriors with and without the unknowns in N."""
     parameters = "noise.beam={parameters: {zenith_angle_deg: 1.0}}"
