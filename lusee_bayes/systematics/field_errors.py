@@ -5,7 +5,7 @@ and as parallel transport from there has them elsewhere (Ludwig's third definiti
 
     e_ic(n) = s_i sum_k a_ick Y_k(n),    Re a_ick, Im a_ick ~ N(0, C_ell),
 
-with s_i the rms of |E_i| over the hemisphere, C_ell = C_0 (1 + ell)^-slope, up to ``lmax``. It is
+with s_i the rms of E_i over the hemisphere, C_ell = C_0 (1 + ell)^-slope, up to ``lmax``. It is
 added, since what a lander scatters does not vanish where the antenna's own field does. Beams of
 products gain E_ic e_jc* + e_ic E_jc* + e_ic e_jc*. C_0 follows from the standard deviation of
 either part in any direction.
