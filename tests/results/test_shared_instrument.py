@@ -210,6 +210,7 @@ def test_theta_adds_the_variance_that_fixing_it_would_take_away(cube, expected):
     assert cube.fit.level == "consistent"
 
 
+@pytest.mark.essential
 def test_a_wrong_resonance_in_one_channel_of_eight_is_named(tmp_path, monkeypatch):
     """Its antennas are 2 cm longer than those of the other seven."""
     frequencies = [10.0, 13.0, 16.0, 19.0, 21.0, 24.0, 27.0, 30.0]
