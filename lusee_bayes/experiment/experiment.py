@@ -6,7 +6,7 @@ gives the posterior over its sky, and the pieces that programs can ask for.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
@@ -25,7 +25,6 @@ from lusee_bayes.experiment.leave_out import Fitting, fitting, without
 from lusee_bayes.experiment.model import model_to_sample, radiometer, set_up, simulate, systematics
 from lusee_bayes.experiment.rounds import (
     Inference,
-    beginning,
     rebuilds,
     settled,
     with_learned_prior,
@@ -97,7 +96,6 @@ def build(
     stages: Stages | None = None,
     *,
     earlier: Information | None = None,
-    values: Mapping[str, float] | None = None,
 ) -> Experiment:
     """Build the experiment of a scenario, with the prior that its data tell.
 
@@ -112,8 +110,6 @@ def build(
         Told what is being done.
     earlier : Information, optional
         Of earlier data, which the prior learns from, too.
-    values : mapping of float, optional
-        Of unknowns of the instrument, by name: where rounds begin.
 
     Raises
     ------
@@ -122,7 +118,7 @@ def build(
         gives (:func:`.require_plausible`), and for a prior that does not settle.
     """
     stages = stages or Stages()
-    return _learned(_fitting(observed(scenario, data, stages), stages), stages, earlier, values)
+    return _learned(_fitting(observed(scenario, data, stages), stages), stages, earlier)
 
 
 @contextmanager
@@ -175,19 +171,13 @@ def _fitting(experiment: Experiment, stages: Stages) -> Experiment:
 
 
 def _learned(
-    experiment: Experiment,
-    stages: Stages,
-    earlier: Information | None = None,
-    values: Mapping[str, float] | None = None,
+    experiment: Experiment, stages: Stages, earlier: Information | None = None
 ) -> Experiment:
     setup, data = experiment.setup, experiment.data
-    start = None if values is None else beginning(setup, data, values)
     if setup.family is None:
-        return (
-            experiment if start is None else replace(experiment, found=settled(setup, data, start))
-        )
+        return experiment
     with stages("prior"):
-        setup, found = with_learned_prior(setup, data, earlier, start)
+        setup, found = with_learned_prior(setup, data, earlier)
     return replace(experiment, setup=setup, learned=found.learned, found=found)
 
 

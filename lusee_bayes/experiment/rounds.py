@@ -44,9 +44,8 @@ FARTHEST = 2.0
 # while chi^2 of what N is built around is more than TEMPERED per datum, in the first rounds,
 # radiometer noise is taken for as much larger
 TEMPERED, MAX_TEMPERED_ROUNDS = 10.0, 20
-# where chi^2 then is too large by so many of its standard deviations, other ways are tried, one
-# with noise that is larger again
-FAR_OFF, MORE_TEMPERED = 10.0, 30.0
+# where chi^2 then is too large by so many of its standard deviations, as many other ways are tried
+FAR_OFF, OTHER_WAYS = 10.0, 6
 # a prior is learned first when the map moves by less than this, and last when learning it again
 # moves the map by less than PRIOR_SETTLED; a step of learning that is not taken moves it by 0.01
 NEARLY, PRIOR_SETTLED, MAX_LEARNED = 0.5, 0.05, 8
@@ -133,8 +132,12 @@ class Inference:
         return self.solution.chi2 < n + FAR_OFF * math.sqrt(2.0 * n)
 
     def moves_from(self, before: Inference) -> float:
-        """By how much the map has moved, rms in standard deviations."""
-        return float(self.posterior.rms_shift_from(before.posterior))
+        """By how much the map has moved, or is from the sky that N is built around if that is more.
+
+        Rms, in standard deviations.
+        """
+        skies = [before.posterior.mean, *([self.around.sky] if self.moving else [])]
+        return max(float(self.posterior.rms_shift_from(sky)) for sky in skies)
 
     def under(self, prior: Prior, learned: Learned | None = None) -> Inference:
         """The same under another prior, one that was learned."""
@@ -157,11 +160,11 @@ def settled(
 
     What is second order in values that are far off may outweigh by orders of magnitude what tells
     two of them apart. Rounds therefore begin with radiometer noise that is larger, so that chi^2
-    of what N is built around is 10 per datum; values go part of the way where they would go far,
-    or swing. Where chi^2 is far too large at their end, they begin once more, with the sky of each
-    instrument found anew while noise is larger (variable projection, whose first order in values
-    has no product with a change of the sky), and if need be again, with an instrument that is as
-    far off on the other side. The end of larger ln p counts.
+    of what N is built around is 10 per datum, and the sky of each instrument is found anew
+    (variable projection: first order in values then has no product with a change of the sky).
+    Values go part of the way where they would go far, or swing. Where chi^2 is far too large at
+    their end, they begin again, up to six times: with an instrument that is as far off on the
+    other side, and with draws of the prior. The end of the largest ln p counts.
 
     Parameters
     ----------
@@ -184,17 +187,15 @@ def settled(
     InputError
         If N is not positive definite.
     """
-    start = start or beginning(setup, data)
-    found, step = _approached(setup, data, start)
-    for projected in (True, False):
+    found, step = _approached(setup, data, start or beginning(setup, data))
+    for way in range(OTHER_WAYS):
         if found.moving and not found.fits:
-            begin = start if projected else _elsewhere(setup, found)
-            other = _approached(setup, data, begin, projected=projected)
+            other = _approached(setup, data, beginning(setup, data, _elsewhere(found, way)))
             if other[0].posterior.log_evidence > found.posterior.log_evidence:
                 found, step = other
     moves, n_learned, learned, in_rounds = np.inf, 0, None, rebuilds(setup)
     while True:
-        last, at_rest = not in_rounds or found.rounds >= MAX_ROUNDS, moves < SETTLED * step.size
+        last, at_rest = not in_rounds or found.rounds >= MAX_ROUNDS, moves < SETTLED
         if learn is not None and n_learned < MAX_LEARNED and (at_rest or last or learned is None):
             known = None if learned is None or not learned.settled else learned.parameters
             learned, n_learned = learn(found.solution.information, known), n_learned + 1
@@ -221,35 +222,29 @@ def settled(
     )
 
 
-def _approached(
-    setup: Setup, data: Visibilities, around: Around, *, projected: bool = False
-) -> tuple[Inference, _Step]:
-    """Rounds until the map has nearly settled, and the step there.
-
-    projected : while noise is larger, find the sky of each instrument anew; it is no longer larger
-        once values have nearly settled
-    """
+def _approached(setup: Setup, data: Visibilities, around: Around) -> tuple[Inference, _Step]:
+    """Rounds until the map has nearly settled, and the step there."""
     found, step = _conditioned(setup, data, around, 1), _Step()
     moves = np.inf if rebuilds(setup) else 0.0
     while moves > NEARLY and found.rounds < MAX_TEMPERED_ROUNDS:
         around, step = _around(setup, found, step)
-        if projected and around.tempered > 1.0:
-            rest = step.whole is not None and np.abs(step.whole).max() < NEARLY
-            around = replace(
-                _exact(setup, around).around, tempered=1.0 if rest else around.tempered
-            )
+        if around.tempered > 1.0:
+            at_rest = step.whole is None or np.abs(step.whole).max() < NEARLY
+            exact = _exact(setup, around).around
+            around = replace(exact, tempered=1.0 if at_rest else around.tempered)
         before, found = found, _conditioned(setup, data, around, found.rounds + 1)
         moves = found.moves_from(before) if around.tempered == 1.0 else np.inf
     return found, step
 
 
-def _elsewhere(setup: Setup, found: Inference) -> Around:
-    """Where else rounds may begin: with an instrument as far off on the other side."""
-    start, values = beginning(setup, found.around.data), {}
+def _elsewhere(found: Inference, way: int) -> dict[str, float]:
+    """Where else rounds may begin: as far off on the other side, or anywhere in the prior."""
+    rng, values = np.random.default_rng(way), {}
     for part in found.expanded:
         if not part.systematic.learns:
-            values |= part.systematic.in_units(-part.centre)
-    return replace(start, values=values, tempered=MORE_TEMPERED * start.tempered)
+            z = -part.centre if not way else rng.standard_normal(len(part.centre))
+            values |= part.systematic.in_units(z)
+    return values
 
 
 def _conditioned(setup: Setup, data: Visibilities, around: Around, rounds: int) -> Inference:
@@ -312,7 +307,8 @@ def _around(setup: Setup, found: Inference, step: _Step) -> tuple[Around, _Step]
                 told = found.amplitudes(s)
                 values |= s.systematic.relearned(s.expected + told.mean, told.std**2)
         sky = around.sky + step.size * (found.posterior.mean - around.sky)
-        tempered = _tempered(around.tempered * found.misfit(), found.rounds)
+        fits = around.tempered == 1.0 and found.fits
+        tempered = 1.0 if fits else _tempered(around.tempered * found.misfit(), found.rounds)
         around = replace(around, sky=sky, values=values, tempered=tempered)
         if tempered == 1.0:
             around = replace(around, volume=_volume(solution))
@@ -407,10 +403,7 @@ COARSE_LMAX = 24
 
 
 def with_learned_prior(
-    setup: Setup,
-    data: Visibilities,
-    earlier: Information | None = None,
-    start: Around | None = None,
+    setup: Setup, data: Visibilities, earlier: Information | None = None
 ) -> tuple[Setup, Inference]:
     """Learn the prior from data, with all that is in N (:func:`settled`).
 
@@ -421,8 +414,6 @@ def with_learned_prior(
     data : Visibilities
     earlier : Information, optional
         Of earlier data, which are learned from, too.
-    start : Around, optional
-        As of :func:`settled`.
 
     Returns
     -------
@@ -436,7 +427,7 @@ def with_learned_prior(
         more = information if earlier is None else information + earlier
         return learned_prior(setup, setup.family, more, start)
 
-    found = settled(setup, data, start, learn)
+    found = settled(setup, data, learn=learn)
     return replace(setup, prior=found.learned.prior), found
 
 

@@ -199,20 +199,20 @@ class Posterior(Described, eqx.Module):
         u = self.white_mean - self.prior.white_mean
         return namespace(self).asarray(u @ u)
 
-    def rms_shift_from(self, other: Posterior) -> Float[Array, ""]:
-        """Compute the distance of two posterior means.
+    def rms_shift_from(self, sky: Float[Array, " mode"]) -> Float[Array, ""]:
+        """Compute the distance of the mean from a sky.
 
         Parameters
         ----------
-        other : Posterior
-            Over the same sky.
+        sky : (modes,) array
+            In K.
 
         Returns
         -------
         () array
             Rms over modes, in standard deviations of this posterior.
         """
-        xp, shift = namespace(self), self.white_mean - self.prior.whiten(other.mean)
+        xp, shift = namespace(self), self.white_mean - self.prior.whiten(sky)
         inside = shift if self.basis is None else self.basis.T @ shift
         squared = ((inside @ xp.tril(self.lower)) ** 2).sum()
         if self.basis is not None:

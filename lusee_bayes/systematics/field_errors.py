@@ -150,7 +150,7 @@ class FieldErrors(ChangedBeams):
     def unknowns(self) -> tuple[Unknown, ...]:
         """Of every ell: parts, ports, components, orders."""
         return tuple(
-            Unknown(f"field_error_{ell}", std=float(std), size=4 * len(self.sizes) * (2 * ell + 1))
+            Unknown(f"field_error_{ell}", std=std, size=4 * len(self.sizes) * (2 * ell + 1))
             for ell, std in enumerate(self.of_ell)
         )
 
@@ -167,7 +167,7 @@ class FieldErrors(ChangedBeams):
         xp = namespace(e)
         crossed = xp.einsum("icrp,jcrp->ijrp", self.fields + 0.5 * self.above * e, e.conj())
         more = self.grid.analyse(to_real(crossed + crossed.swapaxes(0, 1).conj()))
-        return modes + more[:, : modes.shape[-1]]
+        return modes + xp.broadcast_to(more[:, : modes.shape[-1]], modes.shape)
 
     def linearised(self, model, centre):
         """Through what every Y_k conj(E_jc + e_jc) sees, of which all derivatives are made."""

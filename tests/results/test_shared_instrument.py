@@ -104,8 +104,8 @@ def test_two_channels_that_differ_are_both_named():
 def test_a_channel_without_an_unknown_tells_nothing_of_it():
     scenario = lb.load_scenario("fiducial", SMALL)
     both = {"a": np.inf, "b": np.inf}
-    one = Share(both, np.array([0.5, 1.0]), np.diag([0.2, 0.1]), 4, {}, True)
-    other = Share({"a": np.inf}, np.array([0.3]), np.full((1, 1), 0.5), 4, {}, True)
+    one = Share(both, np.array([0.5, 1.0]), np.diag([0.2, 0.1]), 4)
+    other = Share({"a": np.inf}, np.array([0.3]), np.full((1, 1), 0.5), 4)
     tied, _ = tie_channels(scenario, [15.0, 20.0], [one, other])
     assert tied.names == ("a", "b")
     # of a: 1 / 0.2 + 1 / 0.5 - 1
