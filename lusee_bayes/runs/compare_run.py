@@ -110,6 +110,7 @@ def run_compare_priors(
         something, and as :func:`run_map`.
     """
     scenario = load_scenario(scenario)
+    scenario = scenario if data is None else scenario.of_measured()
     engine, stages = engine or ThisProcess(side_by_side=1), stages or Stages()
     if not scenario.single:
         raise InputError("compare-priors is for a single frequency; leave out frequencies_mhz")

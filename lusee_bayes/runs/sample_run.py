@@ -296,6 +296,7 @@ def run_sample(
         whatever is wrong with scenario, program, data or folder.
     """
     scenario = load_scenario(scenario)
+    scenario = scenario if data is None else scenario.of_measured()
     if scenario.joint:
         raise InputError(
             "channels are sampled one by one; the joint posterior is Gaussian, and lusee-bayes map "

@@ -197,3 +197,17 @@ def test_a_report_has_the_share_of_the_variance_that_they_add(tmp_path):
     page = (run.folder / "report.html").read_text(encoding="utf-8")
     assert "<td>field_error_1</td><td>48</td>" in page and "Posterior of pairs of unknowns" in page
     assert "Galactic maps of the share of the variance" in page
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("command", ["sample", "compare_priors"])
+def test_other_runs_of_measured_data_have_them_too(tmp_path, command):
+    given = lb.load_scenario("fiducial", ["lmax=2", "beam.exact=false", "observation.step_s=2e5"])
+    data = simulate(set_up(given))
+    if command == "sample":
+        sampler = lb.Sampler(chains=1, warmup=20, draws=4)
+        lb.run_sample(given, tmp_path / "run", data=data, sampler=sampler)
+    else:
+        lb.run_compare_priors(given, tmp_path / "run", data=data)
+    written = lb.load_scenario(tmp_path / "run" / "scenario.yaml")
+    assert written == given.of_measured() != given
