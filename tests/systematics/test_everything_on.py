@@ -170,23 +170,14 @@ def test_rounds_that_end_in_a_wrong_mode_begin_elsewhere(monkeypatch, tmp_path):
     healpy.write_map(file, values, dtype=np.float64, **units)
     prior = {"model": "isotropic", "spectrum": "sky", "scale": 0.04, "mean_file": str(file)}
     runs = [{"cycles": 0.5}, {"cycles": 0.5, "turntable_deg": 30.0}]
-    setup = set_up(
-        Scenario.model_validate(
-            {
-                "frequency_mhz": 18.0,
-                "lmax": 6,
-                "seed": 9,
-                "prior": prior | {"file_frequency_mhz": 25.0, "spectral_index": -2.5},
-                "observation": {"runs": runs, "step_s": 43200.0},
-                "noise": NOISE,
-            }
-        )
-    )
+    prior |= {"file_frequency_mhz": 25.0, "spectral_index": -2.5}
+    observation = {"runs": runs, "step_s": 43200.0}
+    given = {"frequency_mhz": 18.0, "lmax": 6, "seed": 9, "prior": prior, "noise": NOISE}
+    setup = set_up(Scenario.model_validate(given | {"observation": observation}))
     white = np.random.default_rng(9001).standard_normal(setup.prior.size)
     modes = np.asarray(setup.prior.colour(white)) + np.asarray(setup.prior.mean)
-    truth = setup.under(replace(setup.sky, modes=modes))
-    data = simulate(truth)
-    found = settled(replace(setup, measured=True), data)
+    truth, measured = setup.under(replace(setup.sky, modes=modes)), replace(setup, measured=True)
+    found = settled(measured, data := simulate(truth))
     assert found.fits and 0.6 < whitened_error(truth, found) < 1.4
     monkeypatch.setattr(rounds, "OTHER_WAYS", 0)
-    assert not settled(replace(setup, measured=True), data).fits
+    assert not settled(measured, data).fits
