@@ -99,7 +99,7 @@ class Stages:
             nonlocal said, last
             now = time.perf_counter()
             with counting:
-                if now - said < LINE_S or done - last < LINE_SHARE * total or done >= total:
+                if now - said < LINE_S or abs(done - last) < LINE_SHARE * total or done >= total:
                     return
                 said, last = now, done
             self.say(f"  {name}: {done} of {total} ({done / total:.0%}) {remark}".rstrip())

@@ -7,7 +7,7 @@ gives the posterior over its sky, and the pieces that programs can ask for.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
 from operator import attrgetter
@@ -24,7 +24,9 @@ from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.leave_out import Fitting, fitting, without
 from lusee_bayes.experiment.model import model_to_sample, radiometer, set_up, simulate, systematics
 from lusee_bayes.experiment.rounds import (
+    MAX_ROUNDS,
     Inference,
+    Report,
     rebuilds,
     settled,
     with_learned_prior,
@@ -176,8 +178,8 @@ def _learned(
     setup, data = experiment.setup, experiment.data
     if setup.family is None:
         return experiment
-    with stages("prior"):
-        setup, found = with_learned_prior(setup, data, earlier)
+    with rounds_of(experiment, stages, "prior") as report:
+        setup, found = with_learned_prior(setup, data, earlier, report)
     return replace(experiment, setup=setup, learned=found.learned, found=found)
 
 
@@ -212,19 +214,27 @@ def under_sky(setup: Setup, source: SkySource, seed: int) -> Experiment:
     return _learned(Experiment(seen, simulate(seen)), Stages())
 
 
-def infer(experiment: Experiment) -> Inference:
+def rounds_of(experiment: Experiment, stages: Stages, name: str) -> AbstractContextManager:
+    """A stage, whose progress is that of the rounds where there are some to come."""
+    in_rounds = experiment.found is None and rebuilds(experiment.setup)
+    return stages.progress(name, MAX_ROUNDS) if in_rounds else stages(name)
+
+
+def infer(experiment: Experiment, report: Report | None = None) -> Inference:
     """Condition the experiment's model on its data (:func:`.settled`).
 
     Parameters
     ----------
     experiment : Experiment
+    report : callable, optional
+        Told of every round.
 
     Raises
     ------
     InputError
         As :func:`.settled`.
     """
-    return experiment.found or settled(experiment.setup, experiment.data)
+    return experiment.found or settled(experiment.setup, experiment.data, report=report)
 
 
 def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import DataVector, Grid, Vector
+from lusee_bayes.core.arrays import DataVector, Grid, Modes, Vector
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.section import is_modelled
@@ -126,17 +126,23 @@ class Inference:
         return float(white @ white) / len(white)
 
     @property
+    def remark(self) -> str:
+        """Chi^2, for a line on the rounds."""
+        larger = " of larger noise" if self.around.tempered > 1.0 else ""
+        return f"chi^2 {self.solution.chi2:.0f} for {len(self.solution.data)} data{larger}"
+
+    @property
     def fits(self) -> bool:
         """Whether chi^2 of the data does not stand out by far."""
         n = len(self.solution.data)
         return self.solution.chi2 < n + FAR_OFF * math.sqrt(2.0 * n)
 
-    def moves_from(self, before: Inference) -> float:
+    def moves_from(self, mean: Modes) -> float:
         """By how much the map has moved, or is from the sky that N is built around if that is more.
 
         Rms, in standard deviations.
         """
-        skies = [before.posterior.mean, *([self.around.sky] if self.moving else [])]
+        skies = [mean, *([self.around.sky] if self.moving else [])]
         return max(float(self.posterior.rms_shift_from(sky)) for sky in skies)
 
     def under(self, prior: Prior, learned: Learned | None = None) -> Inference:
@@ -147,10 +153,16 @@ class Inference:
 
 # learns a prior from the information in data, from given parameters on
 Learning = Callable[[Information, Float[np.ndarray, " parameters"] | None], Learned]
+# is told how many rounds are done, and a remark
+Report = Callable[[int, str], None]
 
 
 def settled(
-    setup: Setup, data: Visibilities, start: Around | None = None, learn: Learning | None = None
+    setup: Setup,
+    data: Visibilities,
+    start: Around | None = None,
+    learn: Learning | None = None,
+    report: Report | None = None,
 ) -> Inference:
     """Condition the model on data, in as many rounds as its N needs.
 
@@ -176,6 +188,8 @@ def settled(
     learn : callable, optional
         ``learn(information, start)`` learns the prior, in the rounds: first when they have nearly
         settled, last when that moves the map by less than 0.05 standard deviations.
+    report : callable, optional
+        ``report(rounds, remark)`` is told of every round.
 
     Returns
     -------
@@ -187,10 +201,12 @@ def settled(
     InputError
         If N is not positive definite.
     """
-    found, step = _approached(setup, data, start or beginning(setup, data))
+    report = report or (lambda rounds, remark: None)
+    found, step = _approached(setup, data, start or beginning(setup, data), report)
     for way in range(OTHER_WAYS):
         if found.moving and not found.fits:
-            other = _approached(setup, data, beginning(setup, data, _elsewhere(found, way)))
+            begin = beginning(setup, data, _elsewhere(found, way))
+            other = _approached(setup, data, begin, report)
             if other[0].posterior.log_evidence > found.posterior.log_evidence:
                 found, step = other
     moves, n_learned, learned, in_rounds = np.inf, 0, None, rebuilds(setup)
@@ -200,7 +216,7 @@ def settled(
             known = None if learned is None or not learned.settled else learned.parameters
             learned, n_learned = learn(found.solution.information, known), n_learned + 1
             told = found.under(learned.prior, learned)
-            changed, found = told.moves_from(found), told
+            changed, found = told.moves_from(found.posterior.mean), told
             if in_rounds and changed > PRIOR_SETTLED:
                 at_rest = False
                 found = replace(told, learned=replace(learned, still_moves=changed))
@@ -208,12 +224,14 @@ def settled(
         if last or at_rest:
             break
         around, step = _around(setup, found, step)
-        before, found = found, _conditioned(setup, data, around, found.rounds + 1)
-        found = replace(found, learned=before.learned)
-        moves = found.moves_from(before) if around.tempered == 1.0 else np.inf
+        mean, prior, n = found.posterior.mean, found.learned, found.rounds + 1
+        del found  # its N
+        found = replace(_conditioned(setup, data, around, n), learned=prior)
+        report(found.rounds, found.remark)
+        moves = found.moves_from(mean) if around.tempered == 1.0 else np.inf
     if at_rest or not in_rounds:
         return found
-    keys = [f"{cls.key}.treatment=sampled" for cls in first_order(setup)]
+    keys = [f"{cls.key}.treatment=sampled" for cls in first_order(setup.scenario)]
     advice = f"; use {keys[0]}" if keys else "; use noise.gain.visibilities=model"
     return replace(
         found,
@@ -222,7 +240,9 @@ def settled(
     )
 
 
-def _approached(setup: Setup, data: Visibilities, around: Around) -> tuple[Inference, _Step]:
+def _approached(
+    setup: Setup, data: Visibilities, around: Around, report: Report
+) -> tuple[Inference, _Step]:
     """Rounds until the map has nearly settled, and the step there."""
     found, step = _conditioned(setup, data, around, 1), _Step()
     moves = np.inf if rebuilds(setup) else 0.0
@@ -232,8 +252,11 @@ def _approached(setup: Setup, data: Visibilities, around: Around) -> tuple[Infer
             at_rest = step.whole is None or np.abs(step.whole).max() < NEARLY
             exact = _exact(setup, around).around
             around = replace(exact, tempered=1.0 if at_rest else around.tempered)
-        before, found = found, _conditioned(setup, data, around, found.rounds + 1)
-        moves = found.moves_from(before) if around.tempered == 1.0 else np.inf
+        mean, n = found.posterior.mean, found.rounds + 1
+        del found  # its N
+        found = _conditioned(setup, data, around, n)
+        report(found.rounds, found.remark)
+        moves = found.moves_from(mean) if around.tempered == 1.0 else np.inf
     return found, step
 
 
@@ -327,7 +350,7 @@ def beginning(
     it does not fit.
     """
     around = Around(data, values=values)
-    if not first_order(setup):
+    if not first_order(setup.scenario):
         return around
     exact = _exact(setup, around)
     return replace(exact.around, tempered=_tempered(exact.misfit(), 0))
@@ -357,15 +380,15 @@ def _volume(solution: Solution) -> tuple[Float[np.ndarray, "..."], Float[np.ndar
 
 def rebuilds(setup: Setup) -> bool:
     """Whether some term of N is built around what the data tell."""
-    return rebuilds_visibilities(setup) or bool(first_order(setup))
+    return rebuilds_visibilities(setup) or bool(first_order(setup.scenario))
 
 
-def first_order(setup: Setup) -> tuple[type[Systematic], ...]:
+def first_order(scenario: Scenario) -> tuple[type[Systematic], ...]:
     """Those that are to first order about values that the data tell."""
     return tuple(
         cls
-        for cls, section in present(SYSTEMATICS, setup.scenario)
-        if cls.treatment(setup.scenario) != "ignored" and cls.in_rounds(section)
+        for cls, section in present(SYSTEMATICS, scenario)
+        if cls.treatment(scenario) != "ignored" and cls.in_rounds(section)
     )
 
 
@@ -403,7 +426,10 @@ COARSE_LMAX = 24
 
 
 def with_learned_prior(
-    setup: Setup, data: Visibilities, earlier: Information | None = None
+    setup: Setup,
+    data: Visibilities,
+    earlier: Information | None = None,
+    report: Report | None = None,
 ) -> tuple[Setup, Inference]:
     """Learn the prior from data, with all that is in N (:func:`settled`).
 
@@ -414,6 +440,8 @@ def with_learned_prior(
     data : Visibilities
     earlier : Information, optional
         Of earlier data, which are learned from, too.
+    report : callable, optional
+        As of :func:`settled`.
 
     Returns
     -------
@@ -427,7 +455,7 @@ def with_learned_prior(
         more = information if earlier is None else information + earlier
         return learned_prior(setup, setup.family, more, start)
 
-    found = settled(setup, data, learn=learn)
+    found = settled(setup, data, learn=learn, report=report)
     return replace(setup, prior=found.learned.prior), found
 
 

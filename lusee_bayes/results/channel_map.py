@@ -20,7 +20,14 @@ from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.diagnosis import diagnose
-from lusee_bayes.experiment.experiment import Experiment, doubts, explained, infer, posterior_draws
+from lusee_bayes.experiment.experiment import (
+    Experiment,
+    doubts,
+    explained,
+    infer,
+    posterior_draws,
+    rounds_of,
+)
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.unknowns import Unknowns, flux_table, pointing_report
 from lusee_bayes.experiment.validity import reach
@@ -73,8 +80,9 @@ def conditioned(
     InputError
         For data that the earlier ones hold already, and as :func:`infer`.
     """
-    with (stages or Stages())("posterior"), explained(experiment):
-        own, data = infer(experiment), experiment.data
+    rounds = rounds_of(experiment, stages or Stages(), "posterior")
+    with rounds as report, explained(experiment):
+        own, data = infer(experiment, report), experiment.data
         made = Conditioned(experiment, own, own, own, (data.digest(),))
         if earlier is not None:
             information = earlier.with_more(made.information, data.digest())

@@ -21,6 +21,7 @@ from lusee_bayes.core.progress import Stages, gigabytes, memory_limit
 from lusee_bayes.experiment.data_files import Data, read_data
 from lusee_bayes.experiment.experiment import Experiment, build, with_truth
 from lusee_bayes.experiment.leave_out import ARRAYS, MOST_MEMORY
+from lusee_bayes.experiment.rounds import first_order
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.visibilities import Visibilities
 
@@ -34,6 +35,9 @@ SQUARES, JOINT_SQUARES, OPERATIONS = 8, 4, 12
 ROUNDS = 8
 # what learning a prior adds to them: about five steps with all modes
 LEARNING_SQUARES, LEARNING_OPERATIONS = 4, 80
+# what rounds that find an instrument add to operations, a datum and unknown, and arrays of data for
+# each error of the fields
+IN_ROUNDS, FIELD_ARRAYS = 3e5, 8
 # what comparing times of flight data adds, in n_data n^2
 COMPARING_OPERATIONS = 40
 # pixels of every map of a report, and of what each is made of
@@ -149,6 +153,11 @@ def posterior_cost(scenario: Scenario, n_draws: int = 0, n_data: int | None = No
     if scenario.prior.is_learned and not scenario.joint:
         squares += LEARNING_SQUARES * float(n_modes) ** 2
         operations += LEARNING_OPERATIONS * n_channels * float(n_modes) ** 3
+    if first_order(scenario):
+        fields = scenario.noise.fields
+        n_errors = 0 if fields is None else 16 * (fields.lmax + 1) ** 2
+        operations += IN_ROUNDS * n_channels * float(n_data) * (n_modes + n_errors)
+        squares += FIELD_ARRAYS * float(n_data) * n_errors
     if scenario.flight is not None and scenario.flight.leave_out:
         operations += n_channels * COMPARING_OPERATIONS * float(n_data) * float(n_modes) ** 2
         # without room for it they are not compared

@@ -71,6 +71,10 @@ class FieldErrorsSection(Section):
     treatment: Treatment = "marginalised"
 
 
+# data whose columns are made at once
+BLOCK = 1024
+
+
 class FieldErrors(ChangedBeams):
     """Smooth errors of each port's field.
 
@@ -188,16 +192,19 @@ class FieldErrors(ChangedBeams):
         def columns(sky):
             seen = see(sky).reshape(-1, layout.n_times)[: len(used)]
             seen = seen.reshape(-1, 2, n, 2, layout.n_times)
-            # data, components, harmonics
+            # ports, components, harmonics, times
             seen = np.moveaxis(seen[:, 0] + 1j * seen[:, 1], 0, 2) * scale[:, None]
-            seen = seen[..., np.asarray(layout.time)]
-            data = np.arange(len(first))
-            straight = by_first * seen[second, :, :, data][:, None]
-            turned = by_second * seen[first, :, :, data].conj()[:, None]
-            both = np.stack([straight + turned, 1j * (straight - turned)], axis=1)
-            both = np.where(imaginary[:, None, None, None, None], both.imag, both.real)
-            both = both * self.sizes[:, None, None]
-            return np.concatenate([both[..., k].reshape(len(data), -1) for k in place], axis=1)
+            found = np.empty((len(first), len(self.names)))
+            for rows in np.array_split(np.arange(len(first)), 1 + len(first) // BLOCK):
+                at = np.asarray(layout.time)[rows]
+                straight = by_first[rows] * seen[second[rows], :, :, at][:, None]
+                turned = by_second[rows] * seen[first[rows], :, :, at].conj()[:, None]
+                both = np.stack([straight + turned, 1j * (straight - turned)], axis=1)
+                both = np.where(imaginary[rows, None, None, None, None], both.imag, both.real)
+                both = both * self.sizes[:, None, None]
+                parts = [both[..., k].reshape(len(rows), -1) for k in place]
+                found[rows] = np.concatenate(parts, axis=1)
+            return found
 
         return columns
 

@@ -612,15 +612,17 @@ class Expanded(Marginalised):
         """
         centre = systematic.centre(around.values or {})
         slopes = systematic.linearised(model, centre)
-        columns, expected = slopes(np.asarray(around.sky)), np.zeros(len(centre))
-        later = 1.0 if gains is None else gains
+        later, expected = 1.0 if gains is None else gains, np.zeros(len(centre))
         if systematic.moves and around.volume is not None:
             still = slopes(np.zeros(model.prior.size))  # of what is no sky
             for deviation, weighted in zip(*around.volume, strict=True):
-                seen = slopes(deviation) - still
-                expected -= seen.T @ (later * weighted) / len(around.volume[0])
+                pull = later * weighted / len(around.volume[0])
+                expected -= slopes(deviation).T @ pull - still.T @ pull
+            del still
+        columns = slopes(np.asarray(around.sky))
         shift = columns @ (expected - centre)
-        return cls(systematic, centre, (columns.T * later).T, expected, shift)
+        columns = columns if gains is None else columns * gains[:, None]
+        return cls(systematic, centre, columns, expected, shift)
 
     def seen(self, model: LinearGaussian) -> LinearGaussian:
         """The model at z_0."""
