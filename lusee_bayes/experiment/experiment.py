@@ -6,7 +6,7 @@ gives the posterior over its sky, and the pieces that programs can ask for.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
@@ -27,6 +27,7 @@ from lusee_bayes.experiment.rounds import (
     MAX_ROUNDS,
     Inference,
     Report,
+    beginning,
     rebuilds,
     settled,
     with_learned_prior,
@@ -98,6 +99,7 @@ def build(
     stages: Stages | None = None,
     *,
     earlier: Information | None = None,
+    values: Mapping[str, float] | None = None,
 ) -> Experiment:
     """Build the experiment of a scenario, with the prior that its data tell.
 
@@ -112,6 +114,8 @@ def build(
         Told what is being done.
     earlier : Information, optional
         Of earlier data, which the prior learns from, too.
+    values : mapping of float, optional
+        Of unknowns of the instrument, by name: where rounds begin.
 
     Raises
     ------
@@ -120,7 +124,7 @@ def build(
         gives (:func:`.require_plausible`), and for a prior that does not settle.
     """
     stages = stages or Stages()
-    return _learned(_fitting(observed(scenario, data, stages), stages), stages, earlier)
+    return _learned(_fitting(observed(scenario, data, stages), stages), stages, earlier, values)
 
 
 @contextmanager
@@ -173,13 +177,19 @@ def _fitting(experiment: Experiment, stages: Stages) -> Experiment:
 
 
 def _learned(
-    experiment: Experiment, stages: Stages, earlier: Information | None = None
+    experiment: Experiment,
+    stages: Stages,
+    earlier: Information | None = None,
+    values: Mapping[str, float] | None = None,
 ) -> Experiment:
     setup, data = experiment.setup, experiment.data
+    start = None if values is None else beginning(setup, data, values)
     if setup.family is None:
-        return experiment
+        return (
+            experiment if start is None else replace(experiment, found=settled(setup, data, start))
+        )
     with rounds_of(experiment, stages, "prior") as report:
-        setup, found = with_learned_prior(setup, data, earlier, report)
+        setup, found = with_learned_prior(setup, data, earlier, start, report)
     return replace(experiment, setup=setup, learned=found.learned, found=found)
 
 

@@ -256,7 +256,8 @@ def _approached(
         del found  # its N
         found = _conditioned(setup, data, around, n)
         report(found.rounds, found.remark)
-        moves = found.moves_from(mean) if around.tempered == 1.0 else np.inf
+        moved_by = float(found.posterior.rms_shift_from(mean))
+        moves = moved_by if around.tempered == 1.0 else np.inf
     return found, step
 
 
@@ -429,6 +430,7 @@ def with_learned_prior(
     setup: Setup,
     data: Visibilities,
     earlier: Information | None = None,
+    start: Around | None = None,
     report: Report | None = None,
 ) -> tuple[Setup, Inference]:
     """Learn the prior from data, with all that is in N (:func:`settled`).
@@ -440,7 +442,7 @@ def with_learned_prior(
     data : Visibilities
     earlier : Information, optional
         Of earlier data, which are learned from, too.
-    report : callable, optional
+    start, report : Around and callable, optional
         As of :func:`settled`.
 
     Returns
@@ -451,11 +453,11 @@ def with_learned_prior(
         Under that prior, with how it was learned.
     """
 
-    def learn(information: Information, start: Vector | None) -> Learned:
+    def learn(information: Information, known: Vector | None) -> Learned:
         more = information if earlier is None else information + earlier
-        return learned_prior(setup, setup.family, more, start)
+        return learned_prior(setup, setup.family, more, known)
 
-    found = settled(setup, data, learn=learn, report=report)
+    found = settled(setup, data, start, learn, report)
     return replace(setup, prior=found.learned.prior), found
 
 

@@ -289,9 +289,8 @@ def disagreement(tests: Sequence[SharedTest]) -> str:
     bad = [f"{t.frequency_mhz:g} MHz (p {probability(t.p)})" for t in tests if t.disagrees]
     if not bad:
         return ""
-    verb = "disagrees" if len(bad) == 1 else "disagree"
+    verbs = ("disagrees", "is") if len(bad) == 1 else ("disagree", "are")
     return (
-        f"{in_brief(bad)} {verb} with the other channels about the instrument that they share, "
-        "which makes the maps of all channels wrong: check beams and data there, or map the rest "
-        "without."
+        f"{in_brief(bad)} {verbs[0]} with the other channels about the instrument that they share, "
+        f"and {verbs[1]} not tied to them: check beams and data there."
     )

@@ -331,13 +331,16 @@ TIED = 1 << 20
 class Share(NamedTuple):
     """What channels that share unknowns need of a channel.
 
-    octaves : of what is shared, by name; mean, covariance : its E and V; n_draws : of the sky
+    octaves : of what is shared, by name; mean, covariance : its E and V; n_draws : of the sky;
+    priors : mean and standard deviation of each unknown, by name; fits : whether its data fit
     """
 
     octaves: dict[str, float]
     mean: Vector
     covariance: Square
     n_draws: int
+    priors: dict[str, tuple[float, float]]
+    fits: bool
 
 
 @dataclass(frozen=True)
@@ -360,6 +363,8 @@ class ChannelAlone:
         That are kept.
     figures : dict
         :meth:`.Conditioned.figures`.
+    fits : bool
+        Whether chi^2 of its data does not stand out by far.
     """
 
     known: ChannelData
@@ -370,6 +375,7 @@ class ChannelAlone:
     deviations: Float[np.ndarray, "all mode"]
     n_draws: int
     figures: dict[str, float | bool]
+    fits: bool
 
     @classmethod
     def of(cls, made: Conditioned, known: ChannelData) -> ChannelAlone:
@@ -379,14 +385,16 @@ class ChannelAlone:
         if compared is not None:
             deviations = np.concatenate([deviations, compared])
         kept = made.covariance, deviations, len(made.draws), made.figures()
-        return cls(known, made.own.solution.information, made.unknowns, mean, *kept)
+        return cls(known, made.own.solution.information, made.unknowns, mean, *kept, made.own.fits)
 
     def shared(self) -> Share:
         """What the others need of it."""
         told, own = self._told(), self._own()
         octaves = dict(zip(self._names(), self.unknowns.octaves[own].tolist(), strict=True))
         mean = (self.unknowns.expected + told.mean)[own]
-        return Share(octaves, mean, told.covariance[np.ix_(own, own)], len(self.deviations))
+        priors = {row["unknown"]: (row["prior"], row["prior_std"]) for row in self.unknowns.rows}
+        covariance = told.covariance[np.ix_(own, own)]
+        return Share(octaves, mean, covariance, len(self.deviations), priors, self.fits)
 
     def _told(self) -> Amplitudes:
         return self.unknowns.amplitudes.integrated(self.mean, self.covariance)
@@ -458,6 +466,8 @@ def tie_channels(
 ) -> tuple[Tied, tuple[SharedTest, ...]]:
     """What channels share given the data of all of them, and whether each agrees with the others.
 
+    One that does not is tied to none.
+
     Parameters
     ----------
     scenario : Scenario
@@ -483,8 +493,30 @@ def tie_channels(
     key = jax.random.fold_in(draw_key(scenario), TIED)
     normals = np.asarray(jax.random.normal(key, (shared[0].n_draws, mean.size)))
     kernels = [kernel(np.array(frequencies_mhz), over) for over in octaves.values()]
-    given = mean, covariance, np.stack(kernels)
-    return replace(tie(*given, normals), names=names), shared_tests(*given, names, frequencies_mhz)
+    kernels = np.stack(kernels)
+    tests = shared_tests(mean, covariance, kernels, names, frequencies_mhz)
+    for number, test in enumerate(tests):
+        if test.disagrees:
+            kernels[:, number], kernels[:, :, number] = 0.0, 0.0
+            kernels[:, number, number] = 1.0
+    return replace(tie(mean, covariance, kernels, normals), names=names), tests
+
+
+@dataclass(frozen=True)
+class ChannelAgain(ChannelAlone):
+    """The same, where its data did not fit: the likelier of that and of a second look."""
+
+
+def told_by_fitting(
+    scenario: Scenario, frequencies_mhz: Sequence[float], shared: Sequence[Share]
+) -> dict[str, float]:
+    """Values of what all channels have in common, by name, given the data of those that fit."""
+    fitting = [(f, one) for f, one in zip(frequencies_mhz, shared, strict=True) if one.fits]
+    tied, _ = tie_channels(scenario, *zip(*fitting, strict=True))
+    common = [n for n, over in fitting[0][1].octaves.items() if np.isinf(over)]
+    priors, at = fitting[0][1].priors, [tied.names.index(name) for name in common]
+    z = dict(zip(common, tied.mean[0, at], strict=True))
+    return {name: priors[name][0] + priors[name][1] * float(z[name]) for name in common}
 
 
 def map_channels(
@@ -501,9 +533,10 @@ def map_channels(
     """Work out all channels, going on from what an interrupted run has left in ``folder``.
 
     Where channels share unknowns, each is worked out alone, and then given what the others tell of
-    its instrument. A channel that cannot be mapped leaves the others as they are: it is named in
-    the result, and a joint posterior is that of the others. Of a single frequency nothing
-    unfinished is kept.
+    its instrument. One whose data do not fit is worked out again, from the instrument of those that
+    do, and the likelier of both counts. A channel that cannot be mapped leaves the others as they
+    are: it is named in the result, and a joint posterior is that of the others. Of a single
+    frequency nothing unfinished is kept.
 
     Parameters
     ----------
@@ -535,9 +568,11 @@ def map_channels(
     data = None if data is None else anchored(data)
     kept = None if earlier is None else information_file(earlier)
 
-    def condition(channel: Scenario, told: Stages) -> Conditioned:
+    def condition(
+        channel: Scenario, told: Stages, values: dict[str, float] | None = None
+    ) -> Conditioned:
         before = None if kept is None else read_information(kept, channel)
-        make = partial(build, earlier=None if before is None else before.information)
+        make = partial(build, earlier=None if before is None else before.information, values=values)
         experiment = measured_experiment(channel, data, told, truth=truth, make=make)
         return conditioned(experiment, before, told)
 
@@ -573,7 +608,7 @@ def map_channels(
     if len(unmapped) == len(channels):
         raise InputError(f"no channel can be mapped: {_reasons(unmapped)}")
     mapped, shared = zip(*(one for one in by_channel if not isinstance(one[1], str)), strict=True)
-    components, tied, tests = None, None, ()
+    components, tied, tests, kinds = None, None, (), {}
     if scenario.joint:
         at_hand = ChannelsInFiles(mapped, files, engine, stages)
         # coverage is compared with draws
@@ -581,6 +616,27 @@ def map_channels(
         components = solve_components(_without(unmapped, scenario), at_hand, shared, n_draws)
     elif not alone:
         frequencies = [channel.frequency_mhz for channel in mapped]
+        unfit = [number for number, one in enumerate(shared) if not one.fits]
+        if 0 < len(unfit) < len(mapped):
+            values = told_by_fitting(scenario, frequencies, shared)
+
+            def again(number: int) -> Share:
+                """Look at the data of a channel from what the others tell of the instrument."""
+                channel = mapped[number]
+
+                def make() -> ChannelAgain:
+                    made, before = condition(channel, Stages(), values), files.read(channel, kind)
+                    if made.figures()["log_evidence"] < before.figures["log_evidence"]:
+                        return ChannelAgain(**vars(before))
+                    return ChannelAgain.of(made, made.known(alone=False, thorough=thorough))
+
+                return files.kept(channel, ChannelAgain, make).shared()
+
+            kinds = dict.fromkeys(unfit, ChannelAgain)
+            tasks = Tasks(again, unfit, [names_of((mapped[number],)) for number in unfit])
+            looked = engine.each(tasks, stages, "channels again")
+            changed = dict(zip(unfit, looked, strict=True))
+            shared = [changed.get(number, one) for number, one in enumerate(shared)]
         tied, tests = tie_channels(scenario, frequencies, shared)
 
     def finish(number: int) -> None:
@@ -589,7 +645,7 @@ def map_channels(
         own = scenario if scenario.joint else channel
 
         def make() -> ChannelResult:
-            return files.read(channel, kind).given(common, number, own)
+            return files.read(channel, kinds.get(number, kind)).given(common, number, own)
 
         files.kept(channel, ChannelResult, make)
 

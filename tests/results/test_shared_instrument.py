@@ -104,13 +104,19 @@ def test_two_channels_that_differ_are_both_named():
 def test_a_channel_without_an_unknown_tells_nothing_of_it():
     scenario = lb.load_scenario("fiducial", SMALL)
     both = {"a": np.inf, "b": np.inf}
-    one = Share(both, np.array([0.5, 1.0]), np.diag([0.2, 0.1]), 4)
-    other = Share({"a": np.inf}, np.array([0.3]), np.full((1, 1), 0.5), 4)
+    one = Share(both, np.array([0.5, 1.0]), np.diag([0.2, 0.1]), 4, {}, True)
+    other = Share({"a": np.inf}, np.array([0.3]), np.full((1, 1), 0.5), 4, {}, True)
     tied, _ = tie_channels(scenario, [15.0, 20.0], [one, other])
     assert tied.names == ("a", "b")
     # of a: 1 / 0.2 + 1 / 0.5 - 1
     within(tied.mean, [[3.1 / 6.0, 1.0]] * 2, 1e-12)
     within(tied.covariance, np.stack([np.diag([1.0 / 6.0, 0.1])] * 2), 1e-12)
+    # a third that differs from both keeps its own, and tells the others nothing
+    third = Share({"a": np.inf}, np.array([-9.0]), np.full((1, 1), 0.01), 4, {}, True)
+    apart, tests = tie_channels(scenario, [15.0, 20.0, 22.0], [one, other, third])
+    assert [test.disagrees for test in tests] == [False, False, True]
+    within(apart.mean, [[3.1 / 6.0, 1.0]] * 2 + [[-9.0, 0.0]], 1e-12)
+    within(apart.covariance[2], np.diag([0.01, 1.0]), 1e-12)
     within(kernel(FREQUENCIES, np.inf), ALL, 0)
     within(kernel(FREQUENCIES, OCTAVES), SMOOTH, 1e-15)
 
@@ -230,6 +236,9 @@ def test_a_wrong_resonance_in_one_channel_of_eight_is_named(tmp_path, monkeypatc
     assert found.fit.level == "does not fit" and not found.doubts()
     assert found.lines()[0].startswith("Does not fit: 19 MHz (p ")
     assert [one.disagrees for one in found.summary().shared] == [f == 19.0 for f in frequencies]
+    for one in found.channels:
+        (own,) = one.unknowns.table[["value", "true", "std"]].to_numpy()
+        assert abs(own[0] - own[1]) < 4.0 * own[2] or one.frequency_mhz == 19.0
 
 
 @pytest.mark.long
