@@ -130,8 +130,9 @@ def longest_pause(work: Callable[[], None]) -> float:
 def test_other_threads_go_on_meanwhile():
     """The interpreter's lock is free while LAPACK works; SciPy's own wrapper keeps it."""
     lower = np.eye(2000)
-    assert min(longest_pause(partial(la.inverse_from_cholesky, lower)) for _ in range(3)) < 0.5
-    assert max(longest_pause(partial(dpotri, lower.T, lower=0)) for _ in range(3)) > 0.5
+    ours = min(longest_pause(partial(la.inverse_from_cholesky, lower)) for _ in range(3))
+    # on a busy machine less than all of its time
+    assert ours < 0.5 * max(longest_pause(partial(dpotri, lower.T, lower=0)) for _ in range(3))
 
 
 @ARRAYS
