@@ -80,6 +80,7 @@ def test_a_map_is_that_of_all_data(kind, tmp_path, exact_tilt):
         assert kept.information.n_data == 2 * first.channels[0].n_data
 
 
+@pytest.mark.essential
 def test_a_stopped_run_does_not_go_on_with_other_earlier_data(tmp_path):
     """The folder is the same, its content is not."""
     scenario = lb.load_scenario("fiducial", [*SIZES, "frequencies_mhz=[20, 25]"])

@@ -78,6 +78,7 @@ def pulls(truth: Setup, found: Inference) -> dict[str, float]:
     return off
 
 
+@pytest.mark.essential
 def test_all_are_found_together(test_data):
     more = {"lmax": 6, "step_s": 21600.0, "prior": {"model": "isotropic"}, "seed": 1}
     truth, found = of_another_sky(test_data, 10.0, 2, **more)

@@ -151,6 +151,7 @@ def test_data_tell_the_horizon():
     assert chi2 < n + 4 * np.sqrt(2 * n) and trusting.solution.chi2 > 10 * n and not found.unsettled
 
 
+@pytest.mark.essential
 def test_sampled_the_density_is_that_of_beams_behind_the_terrain():
     setup = setup_of(f"{KNOWN}, treatment: sampled", lmax=4)
     there, data = models.moved(setup, TRUE), models.simulate(setup)
