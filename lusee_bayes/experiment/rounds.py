@@ -224,9 +224,9 @@ def settled(
         if last or at_rest:
             break
         around, step = _around(setup, found, step)
-        mean, prior, n = found.posterior.mean, found.learned, found.rounds + 1
+        mean, n, as_learned = found.posterior.mean, found.rounds + 1, found.learned
         del found  # its N
-        found = replace(_conditioned(setup, data, around, n), learned=prior)
+        found = replace(_conditioned(setup, data, around, n), learned=as_learned)
         report(found.rounds, found.remark)
         moves = found.moves_from(mean) if around.tempered == 1.0 else np.inf
     if at_rest or not in_rounds:

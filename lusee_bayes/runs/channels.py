@@ -492,8 +492,7 @@ def tie_channels(
         mean[number, at], covariance[number][np.ix_(at, at)] = one.mean, one.covariance
     key = jax.random.fold_in(draw_key(scenario), TIED)
     normals = np.asarray(jax.random.normal(key, (shared[0].n_draws, mean.size)))
-    kernels = [kernel(np.array(frequencies_mhz), over) for over in octaves.values()]
-    kernels = np.stack(kernels)
+    kernels = np.stack([kernel(np.array(frequencies_mhz), over) for over in octaves.values()])
     tests = shared_tests(mean, covariance, kernels, names, frequencies_mhz)
     for number, test in enumerate(tests):
         if test.disagrees:
