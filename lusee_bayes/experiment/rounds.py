@@ -44,7 +44,10 @@ FARTHEST = 2.0
 # while chi^2 of what N is built around is more than TEMPERED per datum, in the first rounds,
 # radiometer noise is taken for as much larger
 TEMPERED, MAX_TEMPERED_ROUNDS = 10.0, 20
-# where chi^2 then is too large by so many of its standard deviations, as many other ways are tried
+# how much wider than the prior the sky is where all of the data's skies are let in
+WIDE = 1e2
+# where chi^2 is too large by so many of its standard deviations, even so, as many other ways are
+# tried
 FAR_OFF, OTHER_WAYS = 10.0, 6
 # a prior is learned first when the map moves by less than this, and last when learning it again
 # moves the map by less than PRIOR_SETTLED; a step of learning that is not taken moves it by 0.01
@@ -133,9 +136,12 @@ class Inference:
 
     @property
     def fits(self) -> bool:
-        """Whether chi^2 of the data does not stand out by far."""
-        n = len(self.solution.data)
-        return self.solution.chi2 < n + FAR_OFF * math.sqrt(2.0 * n)
+        """Whether chi^2 does not stand out by far, whatever the prior expects of the sky."""
+        n, solution = len(self.solution.data), self.solution
+        most = n + FAR_OFF * math.sqrt(2.0 * n)
+        if solution.chi2 >= most:
+            solution = self.under(self.model.prior.widened(WIDE)).solution
+        return solution.chi2 < most
 
     def moves_from(self, mean: Modes) -> float:
         """By how much the map has moved, or is from the sky that N is built around if that is more.
@@ -174,9 +180,9 @@ def settled(
     two of them apart. Rounds therefore begin with radiometer noise that is larger, so that chi^2
     of what N is built around is 10 per datum, and the sky of each instrument is found anew
     (variable projection: first order in values then has no product with a change of the sky).
-    Values go part of the way where they would go far, or swing. Where chi^2 is far too large at
-    their end, they begin again, up to six times: with an instrument that is as far off on the
-    other side, and with draws of the prior. The end of the largest ln p counts.
+    Values go part of the way where they would go far, or swing. Where no sky fits at their end,
+    whatever the prior expects of it, they begin again, up to six times: with an instrument that is
+    as far off on the other side, and with draws of the prior. The end of the largest ln p counts.
 
     Parameters
     ----------

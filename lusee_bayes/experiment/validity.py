@@ -30,7 +30,7 @@ from lusee_bayes.core.arrays import Modes
 from lusee_bayes.core.lazy import arviz_stats
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import base_model, moved, systematics
-from lusee_bayes.experiment.rounds import Inference
+from lusee_bayes.experiment.rounds import WIDE, Inference
 from lusee_bayes.experiment.unknowns import TESTED
 from lusee_bayes.instrument.pointing import offset_names
 from lusee_bayes.linear.amplitudes import amplitudes_of_sky
@@ -49,8 +49,6 @@ LARGEST_MOVE = 0.3
 FIELDS, PARAMETERS = 1e-3, 1e-2
 # of the fields: enough to see whether anything shows
 FIELD_LMAX = 3
-# how much wider than the prior the sky is where all of the data's skies are let in
-WIDE = 1e2
 # a residual chi^2 is seen to be too large by so many of its standard deviations
 SEEN = 3.0
 FIELDS_NAME = "the ports' fields"

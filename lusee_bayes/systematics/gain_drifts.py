@@ -65,9 +65,9 @@ class GainSection(Section):
         Their covariance is added to N, they are sampled with the map, or they are left out of the
         model.
     visibilities : {"model", "measured", "posterior"}, optional
-        Visibilities that the covariance is built around: the modelled sky's; the data, whose own
-        drifts move the map by about a standard deviation; or the map's prediction, in rounds. By
-        default the modelled sky's for simulated data, and the map's prediction for measured ones.
+        Visibilities that the covariance is built around: the modelled sky's, right only for
+        simulated data whose instrument is exactly known; the data, whose own drifts move the map
+        by about a standard deviation; or by default the map's prediction, in rounds.
     """
 
     sigma: Positive = 0.01
@@ -269,8 +269,7 @@ class GainDrifts(Systematic):
 
 def gains_about(setup: Setup) -> NoiseAbout:
     """Which visibilities the covariance of gain drifts is built around."""
-    chosen = setup.scenario.noise.gain.visibilities
-    return chosen or ("posterior" if setup.measured else "model")
+    return setup.scenario.noise.gain.visibilities or "posterior"
 
 
 class GainCoordinates(Chart):

@@ -85,7 +85,7 @@ def test_what_n_is_built_around_by_default():
     simulated = set_up(scenario)
     data, _, _ = measured(scenario, 1)
     given = set_up(scenario, data)
-    assert (radiometer_about(simulated), gains_about(simulated)) == ("model", "model")
+    assert (radiometer_about(simulated), gains_about(simulated)) == ("model", "posterior")
     assert (radiometer_about(given), gains_about(given)) == ("measured", "posterior")
     grid = np.asarray(data.grid())
     for setup, signal in ((simulated, simulated.signal), (given, grid)):
