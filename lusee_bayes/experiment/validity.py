@@ -98,8 +98,8 @@ def weighed(setup: Setup, data: np.ndarray, found: Inference) -> tuple[float, fl
             if type(systematic) in z:
                 own = systematic.values(z[type(systematic)])
                 model = systematic.effect(model, own)
-            elif not systematic.first_order:  # as in N, but for its noise
-                model = replace(systematic.marginalised(model), noise=model.noise)
+            elif not systematic.first_order:
+                model = systematic.averaged(model)
         first_order = found.model.predict(sky) + columns @ a
         beyond[k] = model.predict(sky) - first_order
         exact = factor.base.whiten(data - first_order - beyond[k])

@@ -349,7 +349,7 @@ class LeftOut:
         self._summable = weights is not None and self._model.coupling.has_time_structure
         if weights is None:
             self._cells = DataLayout(noise.size, 1)
-            weights = np.linalg.inv(np.asarray(noise.dense()))[..., None]
+            weights = np.asarray(noise.factor().solve(np.eye(noise.size)))[..., None]
         self._weights = np.moveaxis(np.asarray(weights), -1, 0)
         self._t, self._n_templates = self._by_cell(self._templates), self._templates.shape[1]
 

@@ -253,10 +253,13 @@ class GainDrifts(Systematic):
         width = self.width if drift is None else self.widest
         drift = self.drift if drift is None else drift
         noise = drift.covariance(self.visibilities, self.hours, self.layout, width)
-        mean = drift.mean_response(self.layout.n_products)[:, None]
+        return replace(self.averaged(model, drift), noise=model.noise + noise)
+
+    def averaged(self, model: LinearGaussian, drift: GainDrift | None = None) -> LinearGaussian:
+        """Multiply by the mean response, of the same parameters."""
+        mean = (drift or self.drift).mean_response(self.layout.n_products)[:, None]
         grid = jnp.broadcast_to(mean, (self.layout.n_products, self.layout.n_times))
-        behind = multiplied(model, self.layout.gather(grid))
-        return replace(behind, noise=model.noise + noise)
+        return multiplied(model, self.layout.gather(grid))
 
     def effect(self, model, values):
         """Multiply by the response to ``gains``."""

@@ -508,6 +508,10 @@ class Systematic(eqx.Module):
         around = Around(sky=model.prior.colour(model.prior.white_mean))
         return Expanded.about(self, model, around).marginalised(model)
 
+    def averaged(self, model: LinearGaussian) -> LinearGaussian:
+        """The same but for N, which stays as it is."""
+        return replace(self.marginalised(model), noise=model.noise)
+
     def sampled(self, model: LinearGaussian) -> LinearGaussian:
         """Sample its unknowns; call this inside a NumPyro program.
 
