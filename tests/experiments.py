@@ -41,8 +41,7 @@ def small_experiment(*overrides: str, lmax: int = 6, cycles: float = 0.02) -> Ex
     in_setup = tuple(o for o in overrides if not o.startswith(NOT_IN_SETUP))
     if in_setup == overrides:
         return lb.build(scenario)
-    built = small_experiment(*in_setup, lmax=lmax, cycles=cycles).setup
-    setup = replace(built, scenario=scenario)
+    setup = replace(small_experiment(*in_setup, lmax=lmax, cycles=cycles).setup, scenario=scenario)
     return Experiment(setup, simulate(setup))
 
 
@@ -118,8 +117,7 @@ def scaled_product(data: lb.Visibilities, product: int, factor: float) -> lb.Vis
 def program_arguments(program: Program, experiment: Experiment) -> dict[str, Any]:
     """All that a program asks for, and the data."""
     model = full_model(experiment.setup, Around(experiment.data))
-    arguments = program.arguments(model, program_pieces(experiment))
-    return arguments | {"data": experiment.data.data}
+    return program.arguments(model, program_pieces(experiment)) | {"data": experiment.data.data}
 
 
 def density(
@@ -152,8 +150,7 @@ def drawn(first: Setup, seed: int) -> Experiment:
     """Data of a sky that is drawn from the prior; N is that of the model sky."""
     z = np.random.default_rng(seed).standard_normal(first.prior.size)
     sky = replace(first.sky, modes=np.asarray(first.prior.colour(z)) + first.prior.mean)
-    scenario = first.scenario.model_copy(update={"seed": seed})
-    setup = replace(first, sky=sky, scenario=scenario)
+    setup = replace(first, sky=sky, scenario=first.scenario.model_copy(update={"seed": seed}))
     return Experiment(setup, simulate(setup))
 
 

@@ -64,13 +64,10 @@ def _probe(path: str, mtime_ns: int, size: int) -> None:
         signal.setitimer(signal.ITIMER_REAL, LIMIT_S)
         _read_all(path, size)
     _, status = os.waitpid(child, 0)
-    if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGALRM:
-        raise InputError(
-            f"{path} is damaged: HDF5's library does not come to an end with it within "
-            f"{LIMIT_S:g} s"
-        )
     if os.WIFSIGNALED(status):
-        raise InputError(f"{path} is damaged: HDF5's library fails on it")
+        endless = f"does not come to an end with it within {LIMIT_S:g} s"
+        why = endless if os.WTERMSIG(status) == signal.SIGALRM else "fails on it"
+        raise InputError(f"{path} is damaged: HDF5's library {why}")
 
 
 def _read_all(path: str, size: int) -> None:
@@ -132,17 +129,13 @@ def format_of(path: str | Path) -> str | None:
     return kind if isinstance(kind, str) else None
 
 
-# the conventions that files of the package follow
-CF = "CF-1.13"
-
-
 # dimensions that are the pixels of a HEALPix map in RING order
 HEALPIX = ("pixel", "pixels", "region")
 
 
 def header(format_: str) -> dict[str, str]:
     """Attributes of a file of the package: its format, conventions and version."""
-    return {"Conventions": CF, "format": format_, "lusee_bayes_version": __version__}
+    return {"Conventions": "CF-1.13", "format": format_, "lusee_bayes_version": __version__}
 
 
 def with_grid(dataset: xr.Dataset) -> xr.Dataset:

@@ -18,7 +18,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
-from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.lazy import units
 from lusee_bayes.core.progress import gigabytes, memory_limit
 
@@ -243,8 +243,7 @@ def _require_form(where: str, array: Unread, declared: Variable, sizes: dict[str
     shape = tuple(array.shape)
     expected = [sizes.get(d) if isinstance(d, str) else d for d in declared.dims]
     same = len(shape) == len(expected)
-    fits = same and all(e in (None, n) for e, n in zip(expected, shape, strict=True))
-    if not fits:
+    if not (same and all(e in (None, n) for e, n in zip(expected, shape, strict=True))):
         words = " x ".join(
             f"{d}" if e is None or isinstance(d, int) else f"{e} ({d})"
             for d, e in zip(declared.dims, expected, strict=True)
@@ -258,8 +257,8 @@ def _require_form(where: str, array: Unread, declared: Variable, sizes: dict[str
 def _checked_array(where: str, values: np.ndarray, declared: Variable, factor: float) -> np.ndarray:
     if declared.kind == "text":
         texts = np.array([_text(where, x) for x in values.ravel()]).reshape(values.shape)
-        for text in texts.ravel():
-            _require_choice(where, str(text), declared.choices)
+        for text in texts.ravel() if declared.choices else ():
+            require_known(f"{where} is", str(text), declared.choices)
         return texts
     if declared.kind == "time":
         if np.isnat(values).any():
@@ -311,7 +310,8 @@ def _checked_value(where: str, value: Any, declared: Variable) -> Any:
         value = str(value)
     if kind in ("text", "word"):
         text = _text(where, value)
-        _require_choice(where, text, declared.choices)
+        if declared.choices:
+            require_known(f"{where} is", text, declared.choices)
         return text
     # lists of lists of different lengths are no array
     number = np.asarray(None if isinstance(value, list) else value)
@@ -335,8 +335,3 @@ def _text(where: str, value: Any) -> str:
     if not isinstance(text, str):
         raise InputError(f"{where} is {value!r}, expected text")
     return str(text)
-
-
-def _require_choice(where: str, text: str, choices: Sequence[str]) -> None:
-    if choices and text not in choices:
-        raise InputError(f"{where} is '{text}'; {nearest(text, choices)}")

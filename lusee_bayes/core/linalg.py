@@ -141,9 +141,7 @@ def solve_lower(lower: Matrices, x: Columns, *, transpose: bool) -> Columns:
 
 def gram_matrix(w: Float[Array, "rows columns"]) -> Float[Array, "columns columns"]:
     """Return W^T W, symmetric to the last bit."""
-    if namespace(w) is np:
-        return w.T @ w
-    return symmetric_product(w.T, w)
+    return w.T @ w if namespace(w) is np else symmetric_product(w.T, w)
 
 
 def symmetric_product(left: Float[Array, "n inner"], right: Float[Array, "inner n"]) -> Matrix:

@@ -20,10 +20,8 @@ from rich.markup import escape
 from lusee_bayes.core.version import versions
 
 # limits of the process's control group, of either version
-CGROUP_LIMITS = (
-    Path("/sys/fs/cgroup/memory.max"),
-    Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
-)
+CGROUPS = Path("/sys/fs/cgroup")
+CGROUP_LIMITS = (CGROUPS / "memory.max", CGROUPS / "memory" / "memory.limit_in_bytes")
 # addresses that libraries and threads reserve without using the memory, below which XLA aborts
 RESERVED = 1_500_000_000
 # seconds and share of a stage between lines of its progress in a file

@@ -175,9 +175,8 @@ def read_model(path: str | Path, kind: type[Model], what: str, hint: str = "") -
     InputError
         If the file cannot be read, or the first thing in it that is not as the model has it.
     """
-    text = read_text(path, what, hint)
     try:
-        return kind.model_validate_json(text)
+        return kind.model_validate_json(read_text(path, what, hint))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])

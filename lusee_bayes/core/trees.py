@@ -77,11 +77,10 @@ def quantity(
     """
     said = {"units": units, "long_name": long_name}
     attributes = {name: words for name, words in said.items() if words} | dict(attributes or {})
-    encoding = {"zlib": True, "complevel": 1} if packed else {}
     metadata = {
         "attributes": attributes,
         "checks": ANY if checks is None else checks,
-        "encoding": encoding,
+        "encoding": {"zlib": True, "complevel": 1} if packed else {},
     }
     return field(metadata=metadata, **options)
 

@@ -21,7 +21,7 @@ the mean map by C A^T N^-1 T z, and raises the residual chi^2, what no sky can a
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import jax
 import numpy as np

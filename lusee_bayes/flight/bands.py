@@ -39,7 +39,6 @@ Points = Bool[np.ndarray, "rows points"]
 PointValues = Float[np.ndarray, "rows points"]
 Basis = Float[np.ndarray, "points terms"]
 Values = Float[np.ndarray, "rows products"]
-Spectra = Float[np.ndarray, "rows products points"]
 Normals = Float[np.ndarray, "rows terms terms"]
 # a spectrum with so many flags that its value has this many times the variance is not used
 MOST_VARIANCE = 4.0
@@ -116,7 +115,7 @@ class ChannelBand:
         return cls(first, last, finer[:, : degree + 1], finer, shared)
 
     def values(
-        self, spectra: Spectra, autos: PointValues, good: Points
+        self, spectra: Float[np.ndarray, "rows products points"], autos: PointValues, good: Points
     ) -> tuple[Values, Rows, Values]:
         """Return the spectrum at the middle.
 

@@ -348,8 +348,7 @@ def _one_span(
     kept = _with_what_fits(values, sigma, good, kept, x, limit)
     # what lies between spectra that are flagged, each of them far off
     z = distances(values, sigma, good[None], kept[None], x)[0]
-    known = good & _curve_is_known(values, kept, x)
-    kept &= ~_flagged_stretches(z, kept | known, limit)
+    kept &= ~_flagged_stretches(z, kept | (good & _curve_is_known(values, kept, x)), limit)
     return good & ~kept, float(np.median(scale))
 
 

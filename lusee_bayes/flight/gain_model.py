@@ -261,7 +261,6 @@ def draw_gains(
     return replace(table, mean=mean, coefficient=coefficient), errors
 
 
-COEFFICIENTS = "alpha_refit.csv"
 CSV = Layout(
     "luseepy's coefficients of gains",
     {name: Variable(("row",), "text") for name in ("gain_setting", "component", "model", "term")}
@@ -316,7 +315,7 @@ def _read_folder(folder: Path, model: str) -> GainModel:
     arrays = Layout("luseepy's gain model", layout).checked(folder, found, {}).arrays
     stacks = (np.stack([arrays[one] for one in of_places]) for of_places in names.values())
     mhz, mean, vectors = (stack.reshape(*LEAD, *stack.shape[1:]) for stack in stacks)
-    coefficients = _coefficients(folder / COEFFICIENTS, model)
+    coefficients = _coefficients(folder / "alpha_refit.csv", model)
     kind = f"luseepy's gain model, {model} coefficients"
     return GainModel(str(folder), mhz, mean, vectors.swapaxes(2, 3), coefficients, kind=kind)
 

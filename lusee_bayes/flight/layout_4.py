@@ -166,12 +166,10 @@ def _telemetry_at_rows(path: Path, file: h5py.File, clock: Clock, raw_s: Rows) -
     names = np.asarray(found["field_names"]).tolist()
     seconds, ticks, values = (np.asarray(found[name], dtype=np.float64) for name in parts[1:])
     times_s = seconds + ticks / TICKS - anchor + clock.raw_s
+    columns = {name: values[:, names.index(name)] for name in TELEMETRY if name in names}
     return {
-        f"telemetry/{name}": _interpolated_to(
-            f"{path}: telemetry {name}", raw_s, times_s, values[:, names.index(name)]
-        )
-        for name in TELEMETRY
-        if name in names
+        f"telemetry/{name}": _interpolated_to(f"{path}: telemetry {name}", raw_s, times_s, column)
+        for name, column in columns.items()
     }
 
 

@@ -363,7 +363,6 @@ def _medians(found: Float[np.ndarray, "bands parts"]) -> Float[np.ndarray, " ban
 HINT = "make it with: lusee-bayes reduce SCENARIO SESSION..."
 # what a run calls its file of them
 REDUCED = "reduced.nc"
-SHARE = {"low": 0.0, "high": 1.0}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -408,7 +407,7 @@ class _Saved:
         packed=True,
     )
     line_share: Float32[np.ndarray, "frequency spectrum"] = quantity(
-        "1", "flagged channels", checks=SHARE, packed=True
+        "1", "flagged channels", checks={"low": 0.0, "high": 1.0}, packed=True
     )
     lon_deg: float
     lat_deg: float

@@ -252,6 +252,7 @@ class Session(Described, Recorded):
 
 
 META = "spectra/metadata"
+ADC_INVALID = (f"{META}/adc_invalid_count_min", f"{META}/adc_invalid_count_max")
 
 
 def _counts(*more: int, low: float = -np.inf, high: float = np.inf, optional: bool = False):
@@ -264,17 +265,13 @@ ROWS = {
     # NaN where the clock is not known
     "spectra/mjd_times": Variable(("row",), finite=False, optional=True),
     f"{META}/Navgf": _counts(),
-    f"{META}/Navg1_shift": _counts(low=0.0, high=40.0),
-    f"{META}/Navg2_shift": _counts(low=0.0, high=40.0),
+    **{f"{META}/Navg{k}_shift": _counts(low=0.0, high=40.0) for k in (1, 2)},
     f"{META}/actual_bitslice": _counts(16, low=0.0, high=31.0),
-    f"{META}/adc_min": _counts(PORTS),
-    f"{META}/adc_max": _counts(PORTS),
-    f"{META}/adc_invalid_count_min": _counts(PORTS, low=0.0, optional=True),
-    f"{META}/adc_invalid_count_max": _counts(PORTS, low=0.0, optional=True),
+    **dict.fromkeys((f"{META}/adc_min", f"{META}/adc_max"), _counts(PORTS)),
+    **dict.fromkeys(ADC_INVALID, _counts(PORTS, low=0.0, optional=True)),
     f"{META}/errors": _counts(optional=True),
     # layout 4 alone has these two
-    f"{META}/weight": _counts(low=0.0, optional=True),
-    f"{META}/notch": _counts(low=0.0, optional=True),
+    **dict.fromkeys((f"{META}/weight", f"{META}/notch"), _counts(low=0.0, optional=True)),
     **{f"telemetry/{name}": Variable(("row",), optional=True) for name in TELEMETRY},
 }
 SAID = {
@@ -332,8 +329,7 @@ def session_of(path: Path, found: Content, arrays: Mapping[str, Unread], **other
         level=_levels(path, arrays, n),
         adc_low=rows[f"{META}/adc_min"],
         adc_high=rows[f"{META}/adc_max"],
-        adc_invalid=rows.get(f"{META}/adc_invalid_count_min", none)
-        + rows.get(f"{META}/adc_invalid_count_max", none),
+        adc_invalid=sum(rows.get(name, none) for name in ADC_INVALID),
         errors=rows.get(f"{META}/errors", none[:, 0]),
         notch=rows.get(f"{META}/notch"),
         telemetry={x: rows[name] for x in TELEMETRY if (name := f"telemetry/{x}") in rows},

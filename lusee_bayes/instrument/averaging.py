@@ -49,7 +49,6 @@ from lusee_bayes.instrument.visibilities import Visibilities
 # numbers of samples; ex and ey; u_j and G_j of the module's equations
 Samples, Tilts = Int[np.ndarray, " samples"], Float[np.ndarray, "nodes 2"]
 Functions = Float[np.ndarray, "times functions"]
-Factors = Float[np.ndarray, "functions powers orders 2"]
 Series = Float[np.ndarray, "moments columns"]
 BinFlags, Bounds = Bool[np.ndarray, "products bins"], Float[np.ndarray, "times 2"]
 
@@ -85,7 +84,7 @@ def sufficient_nodes(angle: float) -> int:
 
 def windowed(
     sample: Numbers, weight: Nodes, azimuth: Nodes, tilt: Tilts, order: int, lmax: int
-) -> tuple[Times, Functions, Factors]:
+) -> tuple[Times, Functions, Float[np.ndarray, "functions powers orders 2"]]:
     """Average what A knows of time over windows.
 
     Parameters

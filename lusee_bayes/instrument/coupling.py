@@ -335,8 +335,7 @@ class CouplingMatrix(Coupling):
         """
         size = len(pointing.pole_from_galactic.blocks) ** 2
         require_shape("the beam coefficients", beams.modes, (beams.n_products, size))
-        if layout is None:
-            layout = DataLayout(beams.n_products, pointing.n_times)
+        layout = DataLayout(beams.n_products, pointing.n_times) if layout is None else layout
         if (layout.n_products, layout.n_times) != (beams.n_products, pointing.n_times):
             raise InputError(
                 f"the data layout has {layout.n_products} products x {layout.n_times} times, "

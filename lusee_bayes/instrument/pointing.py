@@ -117,11 +117,9 @@ class Pointing(eqx.Module):
         n = sufficient_nodes(lmax * FASTEST_TURN * longest / 2.0)
         instants, sample, weight = observation.at_nodes(n)
         mcmf = instants.mcmf_from_galactic
-        if pole_frame is None:
-            pole_frame = mean_pole_frame(mcmf)
+        pole_frame = mean_pole_frame(mcmf) if pole_frame is None else pole_frame
         azimuth, tilt = split(mcmf @ pole_frame.T)
-        if order is None:
-            order = sufficient_order(tilt, lmax)
+        order = sufficient_order(tilt, lmax) if order is None else order
         of_time = windowed(sample, weight, azimuth, tilt, order, lmax)
         starts = np.searchsorted(observation.run, np.arange(observation.n_runs + 1)).tolist()
         frames = pole_frame, Rotation.from_matrix(pole_frame, lmax), *_lander(observation, lmax)
@@ -202,8 +200,9 @@ def sufficient_order(tilt: Tilts, lmax: int) -> int:
 CLOCK = ("clock_s", "clock_drift_s_per_day")
 # lean of the lander towards East and towards North
 TILTS = ("tilt_east_deg", "tilt_north_deg")
-# these, the turntable of every run, from East towards North, and the site
-OFFSETS = (*CLOCK, "turntable_deg", "lon_deg", "lat_deg", *TILTS)
+SITE = ("lon_deg", "lat_deg")
+# these, and the turntable of every run, from East towards North
+OFFSETS = (*CLOCK, "turntable_deg", *SITE, *TILTS)
 # by which the Moon turns against the sky, as azimuths of the sky count it, in radians per hour
 TURN_PER_HOUR = -2.0 * np.pi / (CYCLE_DAYS * 24.0)
 
@@ -270,17 +269,12 @@ def with_offsets(observation: Observation, values: Values) -> Observation:
     if windows is not None:
         sizes = (stretch * x for x in (windows.start_s, windows.end_s, windows.live_s))
         windows = Windows(windows.sample, *sizes)
-    east, north = observation.tilt_deg
-    return replace(
-        observation,
-        lon_deg=observation.lon_deg + given.get("lon_deg", 0.0),
-        lat_deg=observation.lat_deg + given.get("lat_deg", 0.0),
-        times=times,
-        turntable_deg=tuple(angle + given.get(name, 0.0) for angle, name in angles),
-        step_s=observation.step_s * stretch,
-        windows=windows,
-        tilt_deg=(east + given.get("tilt_east_deg", 0.0), north + given.get("tilt_north_deg", 0.0)),
-    )
+    leans = zip(observation.tilt_deg, TILTS, strict=True)
+    moved: dict[str, Any] = {n: getattr(observation, n) + given.get(n, 0.0) for n in SITE}
+    moved["turntable_deg"] = tuple(angle + given.get(name, 0.0) for angle, name in angles)
+    moved["tilt_deg"] = tuple(lean + given.get(name, 0.0) for lean, name in leans)
+    step_s = observation.step_s * stretch
+    return replace(observation, times=times, step_s=step_s, windows=windows, **moved)
 
 
 def turned_by_offsets(pointing: Pointing, hours: Array, values: Values) -> Pointing:

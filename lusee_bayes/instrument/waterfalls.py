@@ -201,9 +201,8 @@ def _noon(number: int) -> Time:
     beginning, noon = days[1:-1][highest][:-1], np.inf
     if place < len(beginning):
         around = (beginning[place] - 1.0, beginning[place] + 1.0)
-        noon = scipy.optimize.minimize_scalar(
-            lambda jd: -_sun_height(np.array([jd]))[0], bounds=around, options={"xatol": NOON_JD}
-        ).x
+        given = {"bounds": around, "options": {"xatol": NOON_JD}}
+        noon = scipy.optimize.minimize_scalar(lambda jd: -_sun_height(np.array([jd]))[0], **given).x
     if noon >= next_year:
         raise InputError(
             f"LUNAR_DAY {number}: expected a number from {number - place}, the first lunar day of "

@@ -131,25 +131,19 @@ class ChannelFits:
         contradiction = disagreement(self.shared)
         level = max((test.level for test in tests), key=LEVELS.index)
         level = "does not fit" if contradiction else level
-        sky, misfit = self.rest.of_sky, "no sky explains the data of all channels"
-        if self._too_quiet():
-            misfit = (
-                "the data scatter less about what a sky explains than the noise would have them"
-            )
-        told = [
-            {
-                "consistent": "Consistent: instrument, noise and prior fit in all channels.",
-                "unlike the prior": "Unlike the prior: instrument and noise fit in all channels, "
-                f"but the skies are {sky}.",
-                "does not fit": f"Does not fit: {contradiction or f'{misfit}.'}",
-            }[level]
-        ]
+        quiet = "the data scatter less about what a sky explains than the noise would have them"
+        misfit = quiet if self._too_quiet() else "no sky explains the data of all channels"
+        verdicts = {
+            "consistent": "Consistent: instrument, noise and prior fit in all channels.",
+            "unlike the prior": "Unlike the prior: instrument and noise fit in all channels, "
+            f"but the skies are {self.rest.of_sky}.",
+            "does not fit": f"Does not fit: {contradiction or f'{misfit}.'}",
+        }
+        told = [verdicts[level]]
         for test in tests:
-            corrected = min(1.0, test.n * test.p)
+            p_value = probability(min(1.0, test.n * test.p))
             times = f" among {test.n}" if test.n > 1 else ""
-            told.append(
-                f"{test.name.capitalize()}: {test.found} (p {probability(corrected)}{times})."
-            )
+            told.append(f"{test.name.capitalize()}: {test.found} (p {p_value}{times}).")
         extremes = self.extremes()
         if extremes:
             frequencies = self.frequencies_mhz

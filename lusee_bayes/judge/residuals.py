@@ -211,8 +211,7 @@ def residuals(solution: Solution, data: Visibilities) -> Residuals:
     model, layout = solution.model, data.layout
     predicted = np.asarray(model.predict(solution.posterior.mean))
     split = Split.of(solution.posterior, solution.chi2, model.n_data, solution.matrix)
-    wide = replace(model, prior=split.wide.prior)
-    left_out = LeftOut.of(wide, data, split.wide)
+    left_out = LeftOut.of(replace(model, prior=split.wide.prior), data, split.wide)
     if left_out is None:
         return Residuals(predicted, np.full(model.n_data, np.nan), split, ())
     whole = split.instrument

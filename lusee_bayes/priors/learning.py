@@ -44,7 +44,7 @@ from lusee_bayes.core.arrays import Draws, Square
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky, cholesky, inverse_from_cholesky
-from lusee_bayes.judge.chi2 import ChiSquare, stands_out
+from lusee_bayes.judge.chi2 import ChiSquare
 from lusee_bayes.judge.measures import expected_chi2
 from lusee_bayes.judge.split import Split
 from lusee_bayes.linear.information import Information
@@ -284,8 +284,7 @@ def demanded_factor(information: Information, prior: Prior) -> float:
         left = Split.of(posterior, chi2, n_data).instrument
     except InputError:  # the data are too far from any sky for these numbers: rounding rules them
         left = ChiSquare(float(information.misfit), float(n_data))
-    fits = left.too_small or not stands_out(left.p, 1)
-    return 1.0 if fits else left.chi2 / left.degrees
+    return 1.0 if left.too_small or left.fits else left.chi2 / left.degrees
 
 
 def _fixed(family: PriorFamily, information: Information, factor: float) -> Learned:

@@ -348,11 +348,8 @@ def embedded_local_scales(
     monopole[0] = mean[0]
     strength = RELATIVE_STRENGTH * np.exp(smoothed[0].mean_log)
     modes = [source.modes(frequency_mhz, lmax) for source in sources]
-    return LocalScales(
-        mean,
-        np.stack([SCALE_WIDTH * mean, MONOPOLE_WIDTH * monopole], axis=1),
-        np.reshape(modes, (-1, n_modes(lmax))).T,
-        SpectrumBasis.around(4.0 * np.pi * strength**2 / 100.0, lmax),
-        tuple(Band.of(window, *smoothed) for window in windows(lmax)),
-        expected_covariates(),
-    )
+    wide = np.stack([SCALE_WIDTH * mean, MONOPOLE_WIDTH * monopole], axis=1)
+    of_sources = np.reshape(modes, (-1, n_modes(lmax))).T
+    spectrum = SpectrumBasis.around(4.0 * np.pi * strength**2 / 100.0, lmax)
+    bands = tuple(Band.of(window, *smoothed) for window in windows(lmax))
+    return LocalScales(mean, wide, of_sources, spectrum, bands, expected_covariates())

@@ -48,10 +48,8 @@ KINDS: tuple[tuple[Callable[[Path], bool], str], ...] = (
 
 # a uniform sky of 1 K
 MONOPOLE = np.sqrt(4.0 * np.pi)
-HOLDS = (
-    *("truth", "covariance", "independent_mean"),
-    *("posterior", "log_likelihood", "observed_data", "constant_data", "information"),
-)
+HOLDS = ("truth", "covariance", "independent_mean")
+HOLDS += ("posterior", "log_likelihood", "observed_data", "constant_data", "information")
 
 
 def describe_diagnostics(path: Path) -> list[str]:
@@ -161,8 +159,7 @@ def describe_folder(folder: Path) -> list[str]:
         if (folder / name).is_file():
             figures = read_json(folder / name, Layout("the figures of a run"))
             lines += [str(figures["verdict"])] if "verdict" in figures else []
-    names = sorted(str(name) for name in manifest["files"])
-    return [*lines, f"files: {', '.join(names)}"]
+    return [*lines, f"files: {', '.join(sorted(manifest['files']))}"]
 
 
 def _cards(path: Path) -> list[str]:

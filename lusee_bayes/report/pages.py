@@ -24,8 +24,7 @@ SUMMARY_TABLE = Layout(
     "a summary of draws",
     {
         "quantity": Variable(ROWS, "text"),
-        "mean": Variable(ROWS, finite=False),
-        "sd": Variable(ROWS, finite=False),
+        **dict.fromkeys(("mean", "sd"), Variable(ROWS, finite=False)),
         "r_hat": Variable(ROWS, missing=True),
     },
 )

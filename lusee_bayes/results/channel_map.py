@@ -33,7 +33,6 @@ from lusee_bayes.experiment.unknowns import Unknowns, flux_table, pointing_repor
 from lusee_bayes.experiment.validity import reach
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.judge import measures
-from lusee_bayes.judge.chi2 import LEVELS
 from lusee_bayes.judge.coverage import N_DRAWS, Counts
 from lusee_bayes.judge.plausibility import about_information
 from lusee_bayes.judge.residuals import Residuals, residuals
@@ -47,7 +46,6 @@ from lusee_bayes.results.map_result import prior_sentence
 from lusee_bayes.sky.prior import DensePrior, Prior
 from lusee_bayes.systematics.beam import beam_rms_difference
 
-DOES_NOT_FIT = LEVELS[-1]
 # standard deviation of modes without prior variance, over the widest
 EXACT = 1e-12
 # groups of the data of a channel of many are judged where what no sky explains is less probable
@@ -90,13 +88,9 @@ def conditioned(
             posterior = information.posterior(prior)
             information = information.recentred(posterior.mean)
             before = _given_earlier(earlier.information.posterior(prior))
-            made = Conditioned(
-                experiment,
-                own,
-                replace(own, solution=Solution(own.model, data.data, posterior, information)),
-                replace(own, solution=own.solution.under(before)),
-                (*earlier.digests, data.digest()),
-            )
+            found = replace(own, solution=Solution(own.model, data.data, posterior, information))
+            judged = replace(own, solution=own.solution.under(before))
+            made = Conditioned(experiment, own, found, judged, (*earlier.digests, data.digest()))
         return made
 
 
@@ -166,9 +160,8 @@ class Conditioned:
         """
         covariance, nside = self.covariance, self.experiment.scenario.map_nside
         monopole = 1.0 / np.sqrt(4.0 * np.pi)
-        with_monopole = (
-            2.0 * harmonics.modes_to_map(covariance[0], nside) - monopole * covariance[0, 0]
-        )
+        with_mean = harmonics.modes_to_map(covariance[0], nside)
+        with_monopole = 2.0 * with_mean - monopole * covariance[0, 0]
         before = prior_pixel_std(self.found.model.prior, nside) ** 2
         return self.pixel_std**2 - monopole * with_monopole, before
 
@@ -276,7 +269,7 @@ class Conditioned:
                 left = residuals(judge, data)
                 instrument, judged = left.split.instrument, self._judged(left)
             details = _details(self) if alone else None
-        bad = judged is not None and judged.level == DOES_NOT_FIT
+        bad = judged is not None and judged.level == "does not fit"
         if bad or (thorough and left is not None):
             with stages("usual mistakes"):
                 diagnosis = diagnose(experiment, own, left)

@@ -46,6 +46,8 @@ def cards(name: str, scenario: Scenario) -> dict[str, tuple]:
     Values are (value, comment), or (value,) for text that leaves no room for a comment.
     """
     beam, site = scenario.beam, scenario.observation
+    # FITS keys have eight letters
+    own = {f"V_{re.split('[-_]', n)[0][:6].upper()}": (v, n) for n, v in versions().items()}
     return {
         "CONTENT": (name, "of the posterior over the sky"),
         "FREQ": (scenario.frequency_mhz, "frequency in MHz"),
@@ -56,11 +58,7 @@ def cards(name: str, scenario: Scenario) -> dict[str, tuple]:
         "SITELAT": (site.lat_deg, "selenographic latitude in degrees"),
         "SCENHASH": (text_hash(scenario.to_yaml()),),
         "CREATOR": (f"lusee_bayes {__version__}",),
-        # FITS keys have eight letters
-        **{
-            f"V_{re.split('[-_]', name)[0][:6].upper()}": (v, name)
-            for name, v in versions().items()
-        },
+        **own,
     }
 
 
@@ -92,9 +90,7 @@ def write_cubes(
     for name, pixels in cubes.items():
         image = fits.PrimaryHDU(np.asarray(pixels, dtype=np.float64))
         header = image.header
-        for key, value in cards(name, scenario).items():
-            if key != "FREQ":
-                header[key] = value
+        header.update({k: card for k, card in cards(name, scenario).items() if k != "FREQ"})
         header["BUNIT"], header["COORDSYS"], header["ORDERING"] = "K", "G", "RING"
         header["NSIDE"] = scenario.map_nside
         if not len(steps) or np.allclose(steps, steps[0], rtol=1e-9):
@@ -360,9 +356,6 @@ class Provenance(BaseModel, frozen=True):
         return f"measured: {self.file}"
 
 
-NEEDED = ("summary.json", "diagnostics.nc")
-
-
 @dataclass(frozen=True)
 class FinishedRun:
     """What a map run has left: the name of its folder, its figures, and its channels.
@@ -393,7 +386,7 @@ class FinishedRun:
         """InputError if the folder is not one of a finished map run."""
         folder = user_path(folder)
         recover(folder)
-        require_files(folder, NEEDED, "map")
+        require_files(folder, ("summary.json", "diagnostics.nc"), "map")
         summary = read_model(folder / "summary.json", MapSummary, "the figures of a map run")
         channels = read_channels(folder / "diagnostics.nc")
         found = [channel.frequency_mhz for channel in channels]
@@ -469,10 +462,8 @@ def _difference(first: FinishedRun, run: FinishedRun) -> str | None:
 
 
 # figures of channels that are set side by side
-COMPARED = (
-    *("frequency_mhz", "n_data", "ell_cross", "resolution_deg", "information_bits"),
-    *("log_evidence", "chi2", "chi2_expected"),
-)
+COMPARED = ("frequency_mhz", "n_data", "ell_cross", "resolution_deg", "information_bits")
+COMPARED += ("log_evidence", "chi2", "chi2_expected")
 
 
 def comparison_rows(runs: Sequence[FinishedRun]) -> list[dict[str, object]]:

@@ -106,20 +106,19 @@ def forecast_rows(forecasts: Sequence[Forecast]) -> list[dict[str, object]]:
     for row in forecasts:
         it, resolution = row.variation, row.resolution_deg
         more = row.information_bits - baseline(forecasts, it.source).information_bits
-        rows.append(
-            {
-                "scenario": it.source,
-                "family": it.family,
-                "variation": it.name,
-                "days": f"{row.days:.2f}",
-                "n_data": row.n_data,
-                "information_bits": f"{row.information_bits:.2f}",
-                "difference_bits": f"{more:.2f}",
-                "modes_snr_above_1": row.modes,
-                "ell_cross": "none" if row.ell_cross is None else row.ell_cross,
-                "resolution_deg": "none" if resolution is None else f"{resolution:.2f}",
-                "clock_and_pointing": row.offsets_line().replace(",", ";"),
-                "unnoticed_errors": row.unnoticed.replace(",", ";"),
-            }
-        )
+        told = {
+            "scenario": it.source,
+            "family": it.family,
+            "variation": it.name,
+            "days": f"{row.days:.2f}",
+            "n_data": row.n_data,
+            "information_bits": f"{row.information_bits:.2f}",
+            "difference_bits": f"{more:.2f}",
+            "modes_snr_above_1": row.modes,
+            "ell_cross": "none" if row.ell_cross is None else row.ell_cross,
+            "resolution_deg": "none" if resolution is None else f"{resolution:.2f}",
+            "clock_and_pointing": row.offsets_line().replace(",", ";"),
+            "unnoticed_errors": row.unnoticed.replace(",", ";"),
+        }
+        rows.append(told)
     return rows

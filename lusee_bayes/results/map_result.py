@@ -353,14 +353,8 @@ class MapResult(Described):
                 return []
             pull = (values["mean"] - values["truth"]) / values["std"]
             worst = int(np.argmax(np.abs(pull)))
-            found.append(
-                PullSummary(
-                    direction=name,
-                    rms=np.sqrt((pull**2).mean()),
-                    worst=pull[worst],
-                    worst_mhz=self.frequencies_mhz[worst],
-                )
-            )
+            where = {"direction": name, "worst_mhz": self.frequencies_mhz[worst]}
+            found.append(PullSummary(**where, rms=np.sqrt((pull**2).mean()), worst=pull[worst]))
         return found
 
     def summary(self) -> MapSummary:

@@ -116,10 +116,8 @@ class SampleResult:
 
 
 # what a comparison has mode by mode
-OF_MODES = (
-    *("mean_z", "variance_ratio", "variance_error", "eigenvalues", "null_eigenvalues"),
-    *("ess_bulk", "ess_tail"),
-)
+OF_MODES = ("mean_z", "variance_ratio", "variance_error", "eigenvalues", "null_eigenvalues")
+OF_MODES += ("ess_bulk", "ess_tail")
 
 
 @dataclass(frozen=True)

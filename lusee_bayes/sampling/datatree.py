@@ -119,14 +119,10 @@ def to_datatree(
         "observed_data": {programs.DATA: data.data},
         "constant_data": constants,
     }
-    tree = arviz_base.from_dict(
-        jax.tree.map(np.asarray, groups),
-        dims=dims,
-        check_conventions=False,  # more chains than draws is unusual, not wrong
-        attrs={
-            "/": formats.header(formats.SAMPLES) | {"program": program.name, **(attributes or {})}
-        },
-    )
+    said = formats.header(formats.SAMPLES) | {"program": program.name, **(attributes or {})}
+    # more chains than draws is unusual, not wrong
+    options = {"dims": dims, "check_conventions": False, "attrs": {"/": said}}
+    tree = arviz_base.from_dict(jax.tree.map(np.asarray, groups), **options)
     for statistic in tree["sample_stats"].data_vars.values():
         statistic.attrs["units"] = "1"
     predicted = tree["posterior_predictive"]
@@ -145,9 +141,8 @@ def _with_coordinates(tree: xr.DataTree, model: LinearGaussian, data: Visibiliti
     }
 
     def labelled(dataset: xr.Dataset) -> xr.Dataset:
-        dataset = dataset.assign_coords(
-            {name: given for name, given in coordinates.items() if given[0] in dataset.dims}
-        )
+        own = {name: given for name, given in coordinates.items() if given[0] in dataset.dims}
+        dataset = dataset.assign_coords(own)
         for values in dataset.data_vars.values():
             if {"mode", "datum"} & set(values.dims):
                 values.attrs["units"] = "K"

@@ -109,8 +109,7 @@ class CorrelatedNormal(Prediction):
         """Data vectors, ``(*sample_shape, data)``, in K."""
         n = int(np.prod(sample_shape))
         z = jax.random.normal(key, (self.loc.shape[0], n), dtype=jnp.float64)
-        draws = self.factor.colour(z).T + self.loc[None]
-        return draws.reshape(*sample_shape, -1)
+        return (self.factor.colour(z).T + self.loc[None]).reshape(*sample_shape, -1)
 
     def log_prob(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
         """Compute ln p(d | loc, N) of one data vector, or of every row of an array."""
@@ -246,8 +245,7 @@ class Marginal(dist.Distribution):
     def sample(self, key: PRNGKeyArray, sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
         """Data vectors of skies of the prior, ``(*sample_shape, data)``, in K."""
         keys = jax.random.split(key, int(np.prod(sample_shape)))
-        draws = jax.vmap(lambda k: self.model.sample(k)[1])(keys)
-        return draws.reshape(*sample_shape, -1)
+        return jax.vmap(lambda k: self.model.sample(k)[1])(keys).reshape(*sample_shape, -1)
 
     def log_prob(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
         """Compute ln p(d) of one data vector, or of every row of an array."""

@@ -31,7 +31,7 @@ from numpyro.infer.hmc import HMCState
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import is_traced, require_positive
-from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.files import replacing
 from lusee_bayes.core.layouts import Layout
 from lusee_bayes.core.lazy import dist, numpyro
@@ -393,10 +393,7 @@ class Sampler:
         if not 0 < self.target_accept < 1:
             raise InputError(f"target_accept must lie in 0..1, got {self.target_accept}")
         require_positive("trajectory", self.trajectory)
-        if self.algorithm not in ALGORITHMS:
-            raise InputError(
-                f"unknown algorithm '{self.algorithm}'; {nearest(self.algorithm, ALGORITHMS)}"
-            )
+        require_known("unknown algorithm", self.algorithm, ALGORITHMS)
 
     def identity(self) -> dict[str, object]:
         """Return all settings but the number of draws: a run is resumed only with the same."""
@@ -528,10 +525,8 @@ class _Run:
         """The first state of every chain."""
 
         def first(keys, dynamic):
-            warmup = self.sampler.warmup
-            return self._of_chains(
-                lambda key: self.kernel.init(key, warmup, None, (dynamic,), {}), keys
-            )
+            given = self.sampler.warmup, None, (dynamic,), {}
+            return self._of_chains(lambda key: self.kernel.init(key, *given), keys)
 
         keys = jax.random.split(jax.random.PRNGKey(self.sampler.seed), self.sampler.chains)
         return self._shared_out(jax.jit(first)(keys, self.dynamic))

@@ -62,7 +62,6 @@ Pair = Float[np.ndarray, "2"]
 PairMatrix = Float[np.ndarray, "2 2"]
 Unknowns = Float[np.ndarray, " unknowns"]
 White = Float[Array, " unknowns"]
-Directions = Float[Array, " directions"]
 
 # the mode is found when a step is shorter than this, in standard deviations, all unknowns together
 SETTLED = 1e-3
@@ -161,7 +160,7 @@ class StraightSky(Chart):
         return sky, scales, along, self.white + linear + self.across @ kept
 
     def _correction(
-        self, sky: LogNormalSky, white: White, scales: Directions, group: slice
+        self, sky: LogNormalSky, white: White, scales: Float[Array, " directions"], group: slice
     ) -> Float[Array, " free"]:
         """Steps along a group and all stiffer ones that bring the map nearer to the mode's."""
         off = sky.modes(white) - self.modes

@@ -43,7 +43,6 @@ Coordinates = Float[Array, " n"]
 Matrix = Float[Array, "n n"]
 Skies = Float[np.ndarray, "chains draws modes"]
 Quantity = Float[np.ndarray, "chains draws"]
-Region = Bool[np.ndarray, "_"]
 
 # step of the differences that give the Hessian, in standard deviations
 DIFFERENCE = 0.1
@@ -138,9 +137,8 @@ class Potential(eqx.Module):
         rows = jax.lax.map(derivative, unit, batch_size=COLUMNS)
         if not len(held):
             return rows
-        return rows.at[held].set(
-            jax.lax.map(lambda e: jax.jvp(lambda x: f(x, False), (x,), (e,))[1], unit[held])
-        )
+        exact = jax.lax.map(lambda e: jax.jvp(lambda x: f(x, False), (x,), (e,))[1], unit[held])
+        return rows.at[held].set(exact)
 
 
 def root_of_inverse(curvature: Matrix, problem: Potential) -> tuple[Array, Array]:

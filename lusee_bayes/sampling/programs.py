@@ -71,10 +71,8 @@ PIECES: dict[str, Callable[[LinearGaussian], Any]] = {
 
 # ... and of the experiment: the model without those that are to be sampled, they themselves, and
 # the product and time of every datum
-EXPERIMENT_PIECES = (
-    *("gaussian", "systematics", "gain_drifts", "instrument"),
-    *("sources", "log_normal", "layout"),
-)
+EXPERIMENT_PIECES = ("gaussian", "systematics", "gain_drifts", "instrument")
+EXPERIMENT_PIECES += ("sources", "log_normal", "layout")
 
 
 @dataclass(frozen=True)

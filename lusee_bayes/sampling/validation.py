@@ -403,8 +403,7 @@ def validate_draws(
     if not np.isfinite(draws).all():
         raise InputError("the draws hold NaN or infinity; their chains have failed")
     n_chains, _, n_modes = draws.shape
-    std = np.asarray(posterior.std())
-    deviations = (draws - np.asarray(posterior.mean)) / std
+    deviations = (draws - np.asarray(posterior.mean)) / np.asarray(posterior.std())
     mean_z = deviations.mean((0, 1)) * np.sqrt(_ess(deviations, method="mean"))
     variance_ratio = (deviations**2).mean((0, 1))
     ess_square = _ess(deviations**2, method="mean")

@@ -364,14 +364,11 @@ def _nodes() -> tuple[np.ndarray, np.ndarray]:
     Panels are short near the Sun and around the opaque Vela shell's near side, 0.21 kpc away. They
     end at the Galactic centre, where the emissivity has a cusp; beyond it they grow again.
     """
-    edges = np.concatenate(
-        [
-            [0.0, 0.02, 0.06, 0.15, 0.18, 0.2, 0.22, 0.24, 0.27],
-            np.linspace(0.3, SUN_RADIUS_KPC, 26),
-            np.linspace(SUN_RADIUS_KPC, 2.0 * SUN_RADIUS_KPC, 26)[1:],
-            2.0 * SUN_RADIUS_KPC * (DEPTH_KPC / 2.0 / SUN_RADIUS_KPC) ** (np.arange(1, 9) / 8),
-        ]
-    )
+    nearest = [0.0, 0.02, 0.06, 0.15, 0.18, 0.2, 0.22, 0.24, 0.27]
+    inner = np.linspace(0.3, SUN_RADIUS_KPC, 26)
+    beyond = np.linspace(SUN_RADIUS_KPC, 2.0 * SUN_RADIUS_KPC, 26)[1:]
+    far = 2.0 * SUN_RADIUS_KPC * (DEPTH_KPC / 2.0 / SUN_RADIUS_KPC) ** (np.arange(1, 9) / 8)
+    edges = np.concatenate([nearest, inner, beyond, far])
     x, w = np.polynomial.legendre.leggauss(3)
     half = 0.5 * np.diff(edges)
     middle = 0.5 * (edges[1:] + edges[:-1])

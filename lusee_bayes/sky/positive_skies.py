@@ -226,10 +226,8 @@ class LogNormalSky(eqx.Module):
 
     def source_factors(self, white: White) -> Float[Array, "*batch sources"]:
         """Compute g(eta): fluxes of the sources over the catalogued ones."""
-        eta = white[..., self.n_modes :]
-        if namespace(white) is np:
-            return -log_ndtr(-eta)
-        return -jax.scipy.special.log_ndtr(-eta)
+        log_share = log_ndtr if namespace(white) is np else jax.scipy.special.log_ndtr
+        return -log_share(-white[..., self.n_modes :])
 
     def modes(self, white: White) -> Float[Array, "*batch modes"]:
         """Compute m.
@@ -472,9 +470,8 @@ class FieldLaws:
         spectra = np.exp(2.0 * self.parameters @ slopes(skies.grid.lmax))
         fields = len(self.means)
         spectra[:fields, 0] = 4.0 * np.pi * self.means**2
-        return SpectralPrior(
-            skies.frequencies_mhz, skies.mixing, spectra[:fields], spectra[fields:], skies.names
-        )
+        of_each = spectra[:fields], spectra[fields:]
+        return SpectralPrior(skies.frequencies_mhz, skies.mixing, *of_each, skies.names)
 
     def matched(self, found: OfLaws, known: OfLaws) -> FieldLaws:
         """Compute the parameters of :func:`matching_step`, law by law.

@@ -223,10 +223,8 @@ class DensePrior(Prior):
     def description(self) -> tuple[str, ...]:
         about = "zero" if self.mean is None else "a mean sky"
         width = extent(namespace(self).sqrt(self.variance()), "K")
-        return (
-            f"correlated coefficients about {about}, {self.size} modes, Galactic",
-            f"standard deviations {width}",
-        )
+        head = f"correlated coefficients about {about}, {self.size} modes, Galactic"
+        return head, f"standard deviations {width}"
 
     @property
     def size(self) -> int:

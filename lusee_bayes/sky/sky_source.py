@@ -271,8 +271,7 @@ TABLE = Layout(
     "coefficients, as healpy.write_alm writes them",
     {
         "index": Variable(("coefficient",), "integer", low=1.0),
-        "real": Variable(("coefficient",), unit="K"),
-        "imag": Variable(("coefficient",), unit="K"),
+        **dict.fromkeys(COLUMNS[1:], Variable(("coefficient",), unit="K")),
     },
 )
 NPZ = Layout(
@@ -304,10 +303,9 @@ class SkyAlms(SkyFile):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        if path.suffix == ".npz":
-            return True
-        if not is_fits(path):
-            return False
+        is_npz = path.suffix == ".npz"
+        if is_npz or not is_fits(path):
+            return is_npz
         with opened(path) as hdus:
             tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU)]
             names = tables[0].columns.names if tables else []
@@ -426,9 +424,8 @@ CUBE = Layout(
     "sky maps of many frequencies: an image (frequency, pixel)",
     {"maps": Variable(("frequency", "pixel"), unit="K")},
     {
-        "FREQ_START": Attribute(low=0.0, unit="MHz"),
-        "FREQ_END": Attribute(low=0.0, unit="MHz"),
-        "FREQ_STEP": Attribute(low=1e-6, unit="MHz"),
+        name: Attribute(low=low, unit="MHz")
+        for name, low in zip(STEPS, (0.0, 0.0, 1e-6), strict=True)
     },
 )
 

@@ -13,19 +13,10 @@ from assertions import refuse
 from rich.console import Console
 
 from lusee_bayes.core import engine, progress
-from lusee_bayes.core.engine import (
-    SCHEDULER,
-    Demand,
-    Tasks,
-    ThisProcess,
-    in_threads,
-    once,
-    open_engine,
-)
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 
-DEMAND = Demand(base_bytes=1e9, task_bytes=1e9)
+DEMAND = engine.Demand(base_bytes=1e9, task_bytes=1e9)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -35,7 +26,7 @@ def frozen():
 
 
 def tasks_of(function, n):
-    return Tasks(function, range(n), [f"number {k}" for k in range(n)])
+    return engine.Tasks(function, range(n), [f"number {k}" for k in range(n)])
 
 
 def tree(parts):
@@ -52,7 +43,7 @@ def joined(a, b):
 
 @pytest.mark.parametrize(("n", "side_by_side"), [(1, 2), (2, 1), (3, 2), (7, 5), (12, 2)])
 def test_results_come_in_order_and_merge_as_a_tree(n, side_by_side):
-    found, stages = ThisProcess(side_by_side), Stages()
+    found, stages = engine.ThisProcess(side_by_side), Stages()
     assert found.each(tasks_of(lambda k: k * k, n), stages, "s") == [k * k for k in range(n)]
     assert found.reduced(tasks_of(str, n), joined, stages, "sum") == tree([*map(str, range(n))])
     assert [*stages.seconds] == ["s", "sum"]
@@ -66,7 +57,7 @@ def test_so_many_are_carried_out_at_a_time():
         together.wait()
         return k
 
-    assert ThisProcess(2).each(tasks_of(meet, 6), Stages(), "s") == list(range(6))
+    assert engine.ThisProcess(2).each(tasks_of(meet, 6), Stages(), "s") == list(range(6))
     now = set()
 
     def alone(k):
@@ -75,7 +66,7 @@ def test_so_many_are_carried_out_at_a_time():
         assert now == {k}
         now.remove(k)
 
-    ThisProcess(1).each(tasks_of(alone, 5), Stages(), "s")
+    engine.ThisProcess(1).each(tasks_of(alone, 5), Stages(), "s")
 
 
 def test_a_failure_ends_the_stage():
@@ -87,13 +78,13 @@ def test_a_failure_ends_the_stage():
             raise InputError("of number 1")
         time.sleep(0.2)
 
-    refuse("of number 1", ThisProcess(1).each, tasks_of(fail, 5), Stages(), "s")
+    refuse("of number 1", engine.ThisProcess(1).each, tasks_of(fail, 5), Stages(), "s")
     assert begun[:2] == [0, 1] and len(begun) < 4
-    assert ThisProcess().each(tasks_of(abs, 0), Stages(), "s") == []
+    assert engine.ThisProcess().each(tasks_of(abs, 0), Stages(), "s") == []
 
 
 def opened(demand=DEMAND, **given):
-    with open_engine(demand, **given):
+    with engine.open_engine(demand, **given):
         pass
 
 
@@ -101,18 +92,18 @@ def opened(demand=DEMAND, **given):
 def large(monkeypatch):
     """A machine of 64 GB, without a cluster."""
     monkeypatch.setattr(engine, "memory_limit", lambda: 64 * 10**9)
-    monkeypatch.delenv(SCHEDULER, raising=False)
+    monkeypatch.delenv(engine.SCHEDULER, raising=False)
 
 
 @pytest.mark.usefixtures("large")
 def test_one_worker_is_this_process_which_needs_no_dask(monkeypatch):
     monkeypatch.setattr(engine, "find_spec", lambda name: None)
     for n in (None, 1):
-        with open_engine(DEMAND, n) as found:
-            assert found == ThisProcess(2)
+        with engine.open_engine(DEMAND, n) as found:
+            assert found == engine.ThisProcess(2)
     # two at a time would not fit
-    with open_engine(replace(DEMAND, task_bytes=40e9)) as found:
-        assert found == ThisProcess(1)
+    with engine.open_engine(replace(DEMAND, task_bytes=40e9)) as found:
+        assert found == engine.ThisProcess(1)
     for given in ({"workers": 2}, {"cluster": "tcp://127.0.0.1:1"}):
         refuse("need Dask; install it with pip", opened, **given)
 
@@ -161,24 +152,24 @@ def test_results_of_threads_come_in_order_and_an_error_is_the_callers():
         time.sleep(0.002 * abs(7 - k))
         return 1.0 / (k - 8)
 
-    assert in_threads(late, range(8)) == [1.0 / (k - 8) for k in range(8)]
-    assert in_threads(late, []) == []
+    assert engine.in_threads(late, range(8)) == [1.0 / (k - 8) for k in range(8)]
+    assert engine.in_threads(late, []) == []
     with pytest.raises(ZeroDivisionError):
-        in_threads(late, range(6, 10))
+        engine.in_threads(late, range(6, 10))
 
 
 def test_what_is_shared_is_computed_once():
     class Shared:
         count = 0
 
-        @once
+        @engine.once
         def value(self) -> int:
             time.sleep(0.01)
             Shared.count += 1
             return 42
 
     shared = Shared()
-    assert in_threads(lambda _: shared.value, range(6)) == [42] * 6
+    assert engine.in_threads(lambda _: shared.value, range(6)) == [42] * 6
     assert Shared.count == 1
 
 

@@ -125,8 +125,7 @@ def test_the_citation_is_whole():
     # what the standard asks for
     assert {"authors", "message", "title"} <= set(citation)
     assert f"version = {{{lb.__version__}}}" in (DOCS / "citing.md").read_text()
-    readme = (ROOT / "README.md").read_text()
-    assert citation["preferred-citation"]["url"] in readme
+    assert citation["preferred-citation"]["url"] in (ROOT / "README.md").read_text()
 
 
 def test_the_scenarios_of_the_pages_are_scenarios(tmp_path):
@@ -147,8 +146,7 @@ def test_every_module_has_an_entry_in_the_api():
         for path in (ROOT / "lusee_bayes").rglob("*.py")
         if path.stem != "__init__"
     }
-    without_page = {m for m in modules if m.split(".")[1] in ("cli", "paper")}
-    assert documented == modules - without_page
+    assert documented == modules - {m for m in modules if m.split(".")[1] in ("cli", "paper")}
 
 
 def test_the_table_of_public_names_is_complete():
@@ -193,8 +191,7 @@ def test_the_worked_examples_pass_their_tests(tmp_path):
             assert not path.exists(), path
             path.write_text(match["code"])
         else:
-            changed = applied(path.read_text(), match["how"], match["line"], match["code"])
-            path.write_text(changed)
+            path.write_text(applied(path.read_text(), match["how"], match["line"], match["code"]))
     environment = os.environ | {"PYTHONPATH": str(tmp_path), "MPLBACKEND": "agg"}
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests"]
     options = {"cwd": tmp_path, "env": environment, "capture_output": True, "text": True}
@@ -284,8 +281,7 @@ def test_both_faces_of_the_guides_systematic_have_one_evidence():
     cable = made["CablePickup"](jnp.asarray(rng.normal(size=30)), 0.7)
     data = gaussian.sample(jax.random.key(0))[1] + 0.5 * cable.pattern
     program = lb.load_program("systematics")
-    arguments = {"gaussian": gaussian, "systematics": (cable,)}
-    found = lb.estimate_evidence(program, arguments, data)
+    found = lb.estimate_evidence(program, {"gaussian": gaussian, "systematics": (cable,)}, data)
     exact = float(cable.marginalised(gaussian).log_prob(data))
     # a Gaussian is what the proposal is about, so that nearly every draw counts
     assert found.effective > 200

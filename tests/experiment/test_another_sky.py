@@ -46,10 +46,8 @@ def measured(scenario, seed, scale=1e-3):
     """Data of a draw of a prior about another sky, that prior, and the truth."""
     known = set_up(scenario)
     other = wrong_data.Mixed(seed).at(scenario.frequency_mhz, scenario.lmax).modes
-    spectrum = scale * np.asarray(known.sky.spectrum())
-    prior = lb.HarmonicPrior(spectrum, mean=other)
-    z = np.random.default_rng(seed).standard_normal(prior.size)
-    truth = prior.colour(z) + other
+    prior = lb.HarmonicPrior(scale * np.asarray(known.sky.spectrum()), mean=other)
+    truth = prior.colour(np.random.default_rng(seed).standard_normal(prior.size)) + other
     with_noise = scenario.model_copy(update={"seed": seed})
     sky = lb.Sky(truth, scenario.frequency_mhz, "other")
     return simulate(replace(known.under(sky), scenario=with_noise)), prior, truth
@@ -72,8 +70,7 @@ def test_the_errors_are_what_is_claimed(term):
     total, modes = 0.0, 0
     for seed in (1, 2):
         data, prior, truth = measured(scenario, seed)
-        setup = replace(set_up(scenario, data), prior=prior, family=None)
-        found = settled(setup, data)
+        found = settled(replace(set_up(scenario, data), prior=prior, family=None), data)
         assert not found.unsettled
         total, modes = total + distance(found, truth), modes + len(truth)
     p = 2.0 * min(stats.chi2.sf(total, modes), stats.chi2.cdf(total, modes))
@@ -102,8 +99,7 @@ def test_what_n_is_built_around_by_default():
     assert radiometer_about(setup) == "posterior"
     # before there is a prediction, it is about the modelled sky
     about_data = radiometer(setup, Around(partly)).diagonal()
-    about_model = radiometer(replace(setup, measured=False)).diagonal()
-    np.testing.assert_array_equal(about_data, about_model)
+    np.testing.assert_array_equal(about_data, radiometer(replace(setup, measured=False)).diagonal())
 
 
 @pytest.mark.long
@@ -127,8 +123,7 @@ def test_the_default_path_with_drifts(sigma, test_data):
             return with_gains(v, lb.GainDrift(sigma, 10.0).sample(key, hours))
 
         data = wrong_data.measured(scenario, sky, seed, distort=distort)
-        experiment = lb.build(scenario, data)
-        found = lb.infer(experiment)
+        found = lb.infer(lb.build(scenario, data))
         around = Around(data, seen["true"])
         setup = set_up(scenario, data)
         information = full_model(setup, around).condition(data.data).information
@@ -217,12 +212,10 @@ def test_absent_samples_do_not_matter():
 def test_chi2_of_mixed_data_is_that_of_matrices():
     """(W d - b)^T (A S A^T + N)^-1 (W d - b), written out."""
     # noise that is loud enough for the inverse of a matrix
-    loud = "noise.radiometer.factor=1e6"
-    scenario = wrong_data.scenario(4, "observation.step_s=60000", loud)
+    scenario = wrong_data.scenario(4, "observation.step_s=60000", "noise.radiometer.factor=1e6")
     data = wrong_data.measured(scenario, sky(4), 1)
     setup = set_up(scenario, data)
-    experiment = lb.build(scenario, data)
-    model = lb.infer(experiment).model
+    model = lb.infer(lb.build(scenario, data)).model
     spectrum = 1e2 * np.asarray(setup.sky.spectrum())
     here = diagnosis.UnderAnySky(setup, data, model, spectrum)
     base, posterior = here.wide(model.coupling)
@@ -235,8 +228,7 @@ def test_chi2_of_mixed_data_is_that_of_matrices():
 
     grid = np.asarray(data.grid())
     assert base.chi2 == pytest.approx(expected(grid), rel=1e-4)
-    mixed = diagnosis.MixedProducts.of(here, posterior)
-    tried = list(mixed.tried())
+    tried = list(diagnosis.MixedProducts.of(here, posterior).tried())
     for chi2, mistake in tried[:40:5] + tried[-40::7]:
         right = expected(mistake.undone(grid))
         assert chi2 == pytest.approx(right, rel=1e-4, abs=1e-3 * base.chi2), mistake.words

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from assertions import refuse
+from assertions import refuse, within
 from fits_files import write_images
 from scipy import stats
 from scipy.linalg import eigh
@@ -38,8 +38,7 @@ TO_START = {"start": 0.0, "middle": -0.5, "end": -1.0}
 def file_of(folder, window):
     """Of samples with windows or instants; of neither, where ``window`` is None."""
     observation = lb.Observation.from_runs([lb.Run(0.02)], window=window or "instant")
-    n = observation.n_times
-    data = np.random.default_rng(2).normal(3e4, 1e2, (n, 16))
+    data = np.random.default_rng(2).normal(3e4, 1e2, (observation.n_times, 16))
     made = lb.Visibilities.from_arrays(
         data, observation.times, 25.0, timestamp="instant" if window != "mean" else "middle"
     )
@@ -64,8 +63,7 @@ def test_data_come_as_paths_or_in_memory(tmp_path, monkeypatch):
         found = lb.read_data(given, scenario())
         assert found.digest() == read.digest() == digest_of(found)
     other = replace(read, frequency_mhz=30.0)
-    there = lb.read_data([read, other], scenario("frequency_mhz=30"))
-    assert there.frequency_mhz == 30.0
+    assert lb.read_data([read, other], scenario("frequency_mhz=30")).frequency_mhz == 30.0
     averages = lb.read_data(read, scenario(f"observation.average_s={2 * STEP}"))
     assert averages.digest() == averaged(read, 2 * STEP).digest()
     for given, noun in (
@@ -98,8 +96,8 @@ def test_a_scenario_says_what_a_file_does_not(tmp_path, timestamp):
         found = lb.read_data(path, given).observation
         start = (found.times - stamps.times).sec + found.windows.bounds_s[:, 0]
         # Julian dates in two parts
-        np.testing.assert_allclose(start, TO_START[timestamp] * STEP, rtol=0, atol=1e-6)
-        np.testing.assert_allclose(found.live_s, STEP, rtol=0, atol=1e-6)
+        within(start, TO_START[timestamp] * STEP, 1e-6)
+        within(found.live_s, STEP, 1e-6)
     instants = lb.read_data(path, scenario("observation.timestamp=instant"))
     assert instants.observation.windows is None and instants.says_window
 
@@ -144,8 +142,7 @@ def test_waterfalls_are_instants_unless_the_scenario_says_other(tmp_path):
     found = lb.read_data(path, scenario())
     assert found.observation.windows is None and found.says_window
     started = lb.read_data(path, scenario("observation.timestamp=start")).observation
-    late = (started.times - found.observation.times).sec
-    np.testing.assert_allclose(late, STEP / 2, rtol=0, atol=1e-6)
+    within((started.times - found.observation.times).sec, STEP / 2, 1e-6)
     np.testing.assert_allclose(started.windows.bounds_s, [[-STEP / 2, STEP / 2]] * 12)
     assert lb.read_data(path, scenario("observation.timestamp=instant")).digest() == found.digest()
     average = scenario("observation.average_s=14400")
@@ -195,8 +192,7 @@ def test_a_schedule_is_simulated_and_mapped(path, given, tmp_path):
     posterior = lb.infer(experiment).posterior
     error = np.asarray(posterior.mean - experiment.setup.sky.modes)
     # 25 modes: their chi^2 is not above 60 once in 1e4 schedules
-    covariance = np.asarray(posterior.covariance())
-    assert error @ np.linalg.solve(covariance, error) < 60.0
+    assert error @ np.linalg.solve(np.asarray(posterior.covariance()), error) < 60.0
 
 
 def test_costs_count_the_samples_of_a_schedule(given):

@@ -42,8 +42,7 @@ def simulated(folder, *more, rows=8, step_s=1800.0, average_s=None):
 def relative_error(reduced, truth):
     """Of each product, in the mean of the autos."""
     true = truth["visibility_v2_hz"]
-    level = true[:, AUTOS].mean(axis=1, keepdims=True)
-    return np.abs((reduced.values - true) / level)
+    return np.abs((reduced.values - true) / true[:, AUTOS].mean(axis=1, keepdims=True))
 
 
 QUIET = "flight.simulated.radiometer=false"
@@ -73,8 +72,7 @@ def test_another_sign_or_origin_is_seen(tmp_path):
     scenario = lb.load_scenario(str(tmp_path / "scenario.yaml"), ["observation.average_s=null"])
     given = scenario.flight
     for change in ({"convention": "conj(s_i) s_j"}, {"bin_origin": "edge"}):
-        flight = given.model_copy(update=change)
-        scenario = scenario.model_copy(update={"flight": flight})
+        scenario = scenario.model_copy(update={"flight": given.model_copy(update=change)})
         other = reduce_files([tmp_path / "session_000.h5"], scenario)
         off = np.abs(other.values - made.values) / made.values[:, AUTOS].mean(axis=1, keepdims=True)
         assert off.max() > 1e-3
@@ -82,8 +80,7 @@ def test_another_sign_or_origin_is_seen(tmp_path):
 
 def test_times_and_windows_are_those_of_the_observation(tmp_path):
     reduced, truth = simulated(tmp_path, "flight.simulated.clock=unknown", QUIET, step_s=42.0)
-    seconds = (reduced.observation.times.mjd - truth["mjd_utc"]) * 86400.0
-    assert np.abs(seconds).max() < 1e-4
+    assert np.abs((reduced.observation.times.mjd - truth["mjd_utc"]) * 86400.0).max() < 1e-4
     np.testing.assert_allclose(reduced.observation.windows.live_s, 2**20 * 40e-6, rtol=1e-12)
     assert truth["frames"] == 2**20
 
@@ -168,8 +165,7 @@ def test_products_that_are_absent_are_absent(tmp_path):
     assert truth["absent"].any()
     gone = np.isnan(reduced.values).sum(axis=1)
     np.testing.assert_array_equal(gone[0], truth["absent"].sum(axis=1))
-    present = np.isfinite(reduced.values)
-    assert relative_error(reduced, truth)[present].max() < 1e-6
+    assert relative_error(reduced, truth)[np.isfinite(reduced.values)].max() < 1e-6
 
 
 @pytest.mark.long
@@ -202,8 +198,7 @@ def test_a_tone_that_no_bin_holds_is_refused():
     """Navgf 3 leaves out every fourth channel, the last of each bin."""
 
     def drawn(channel):
-        tones = (0.025 * channel,)
-        section = FlightSimulatedSection(navgf=3, tones_mhz=tones)
+        section = FlightSimulatedSection(navgf=3, tones_mhz=(0.025 * channel,))
         return Disturbances.drawn(section, np.arange(20.0), 3600.0, "centre", 1)
 
     for channel in (1000, 1001, 1002):
@@ -291,8 +286,7 @@ def test_what_the_comb_spoils_and_nothing_else_is_left_out(mapped, truth):
     saturated = {(s, int(r)) for s, r in truth["saturated"]}
     names = [(s, int(r)) for s, r in zip(truth["session"], truth["row"], strict=True)]
     times = [name for name in names if name not in saturated]
-    flagged = [times[k] for k in np.flatnonzero(experiment.fitting.flagged.all(axis=0))]
-    assert flagged == comb
+    assert [times[k] for k in np.flatnonzero(experiment.fitting.flagged.all(axis=0))] == comb
     assert "3 of 124 times" in experiment.fitting.remark
 
 
@@ -313,11 +307,9 @@ def test_the_map_is_that_of_the_same_data_in_kelvin(flight, truth, mapped):
     data = lb.Visibilities.from_arrays(values, truth["times_utc"][keep], 10.0, **said)
     # how many samples there are is not said by times
     data = replace(data, calibration=Calibration(np.array([n for _, n in made])))
-    plain = scenario_of(flight, "flight.leave_out=false")
-    other = lb.infer(lb.build(plain, data)).posterior
+    other = lb.infer(lb.build(scenario_of(flight, "flight.leave_out=false"), data)).posterior
     std = np.asarray(other.std())
-    moved = (np.asarray(found.posterior.mean) - np.asarray(other.mean)) / std
-    assert np.abs(moved).max() < 0.01
+    assert np.abs((np.asarray(found.posterior.mean) - np.asarray(other.mean)) / std).max() < 0.01
     np.testing.assert_allclose(np.asarray(found.posterior.std()), std, rtol=1e-3)
 
 
@@ -325,13 +317,11 @@ def test_the_map_is_that_of_the_same_data_in_kelvin(flight, truth, mapped):
 @pytest.mark.essential
 def test_the_known_sky_is_within_the_error_bars(mapped):
     experiment, found = mapped
-    sky = np.asarray(experiment.setup.sky.modes)
-    off = found.posterior.whiten(sky[None])[0]
+    off = found.posterior.whiten(np.asarray(experiment.setup.sky.modes)[None])[0]
     # an isotropic prior of the sky's own C_ell: chi^2 of the modes scatters by sqrt(2 n)
     n = len(off)
     assert np.sum(off**2) == pytest.approx(n, abs=5.0 * np.sqrt(2.0 * n))
-    report = unknowns_report(experiment, found)
-    told = report.table.set_index("unknown")
+    told = unknowns_report(experiment, found).table.set_index("unknown")
     truth_k = 4e-20 / per_kelvin_of(experiment.scenario)
     for port in range(4):
         row = told.loc[f"receiver_{port}_k"]
@@ -368,7 +358,6 @@ def test_sessions_are_given_once_not_mixed_with_other_files_and_of_the_site(flig
     refuse("twice", reduce_files, [one, one], scenario)
     refuse("truth.npz", lb.read_data, [one, flight / "truth.npz"], scenario)
     elsewhere = scenario_of(flight, "observation.lat_deg=-20.0")
-    data = lb.read_data(files(flight)[:1], elsewhere)
-    refuse("use --set observation", set_up, elsewhere, data)
+    refuse("use --set observation", set_up, elsewhere, lb.read_data(files(flight)[:1], elsewhere))
     ours = scenario_of(flight, "observation.lat_deg=-20.0", "flight.site=scenario")
     assert lb.read_data(files(flight)[:1], ours).observation.lat_deg == -20.0

@@ -48,8 +48,7 @@ def test_clean_data_are_left_as_they_are(experiment):
     setup, flagged = experiment.setup, 0
     for seed in range(5):
         noise = np.asarray(radiometer(setup).sample(jax.random.key(seed)))
-        signal = setup.layout.gather(setup.signal)
-        data = replace(experiment.data, data=np.asarray(signal) + noise)
+        data = replace(experiment.data, data=np.asarray(setup.layout.gather(setup.signal)) + noise)
         found = fitting(setup, data, FALSE_ALARM)
         assert found.remark == "" or found.flagged.any()
         flagged += int(found.flagged.any(axis=0).sum())
@@ -108,8 +107,7 @@ def test_a_bad_day_is_found_alone(experiment):
     """Each of its data is off by too little to be seen by itself, and so is each of its times."""
     bad = np.floor(experiment.data.observation.hours / 24.0) == 3
     assert bad.sum() == 12
-    data = spoilt(experiment, bad[experiment.data.layout.time], 0.7, seed=9)
-    found = found_in(experiment, data)
+    found = found_in(experiment, spoilt(experiment, bad[experiment.data.layout.time], 0.7, seed=9))
     np.testing.assert_array_equal(found.flagged, np.broadcast_to(bad, found.flagged.shape))
     assert [(group.kind, group.name) for group in found.groups] == [("day", "3")]
 
@@ -136,8 +134,7 @@ def test_all_rules_together_take_a_fifth_at_most(experiment):
     day = np.floor(experiment.data.observation.hours / 24.0)[layout.time] == 3
     bad = np.isin(layout.product, [2, 6]) | day
     assert 0.2 < bad.mean() < 0.3
-    found = found_in(experiment, spoilt(experiment, bad, 3.0))
-    assert found.flagged.mean() <= 0.2
+    assert found_in(experiment, spoilt(experiment, bad, 3.0)).flagged.mean() <= 0.2
 
 
 @pytest.mark.parametrize(("lost", "goes"), [(0.0, True), (0.17, False)])
@@ -154,8 +151,7 @@ def test_what_the_reduction_took_counts(experiment, lost, goes):
 def test_before_data_are_flagged_lmax_is_tried(experiment):
     """Of a sky with structure up to lmax 14, mapped up to 6: the times fit at 14."""
     fine = lb.build(experiment.scenario.model_copy(update={"lmax": 14}))
-    setup = set_up(experiment.scenario, fine.data)
-    found = fitting(setup, fine.data, FALSE_ALARM)
+    found = fitting(set_up(experiment.scenario, fine.data), fine.data, FALSE_ALARM)
     assert not found.flagged.any()
     assert found.remark.startswith("lmax=6 is too small") and "--set lmax=14" in found.remark
     # and if the map then fails, it is not the prior that is blamed
@@ -165,8 +161,7 @@ def test_before_data_are_flagged_lmax_is_tried(experiment):
 
 
 def test_what_does_not_fit_at_a_higher_lmax_either_is_flagged(experiment):
-    fine = lb.build(experiment.scenario.model_copy(update={"lmax": 14}))
-    data = with_bursts(fine, [20], 30.0)
+    data = with_bursts(lb.build(experiment.scenario.model_copy(update={"lmax": 14})), [20], 30.0)
     found = fitting(set_up(experiment.scenario, data), data, FALSE_ALARM)
     assert np.flatnonzero(found.flagged.all(axis=0)).tolist() == [20] and found.flagged.sum() == 16
     assert "lmax=14 fits" in found.remark and "1 of 65 times" in found.remark
@@ -195,8 +190,7 @@ def check(small_experiment):
         grid = np.array(data.grid())
         where = np.s_[:] if label is None else np.s_[data.labels.index(label), time]
         grid[where] = change(grid[where], sigma[where])
-        seen = replace(data, data=setup.layout.gather(grid))
-        return require_plausible(seen, setup.signal, std)
+        return require_plausible(replace(data, data=setup.layout.gather(grid)), setup.signal, std)
 
     return check
 

@@ -23,7 +23,6 @@ from lusee_bayes.experiment.model import (
 from lusee_bayes.experiment.unknowns import pointing_report
 from lusee_bayes.instrument.beams.monopoles import source_response
 from lusee_bayes.judge.residuals import residuals
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.sky.galaxy import galactic_unit_vector
 from lusee_bayes.systematics.context import Around, Setup
 
@@ -41,8 +40,7 @@ def scenario_of(*overrides, lmax=10, step_s=21600.0):
 def about_a_mean(setup: Setup, scale: float, seed: int) -> Setup:
     """A sky that is known to a part of its C_ell: the truth is a draw of the prior."""
     prior = with_known_sky(setup, scale).prior
-    z = np.random.default_rng(seed).standard_normal(prior.size)
-    mean = setup.sky.modes - prior.colour(z)
+    mean = setup.sky.modes - prior.colour(np.random.default_rng(seed).standard_normal(prior.size))
     return replace(setup, prior=lb.HarmonicPrior(prior.spectrum, mean=mean))
 
 
@@ -84,8 +82,7 @@ def test_a_clock_and_a_turntable_that_are_off_are_found(known_sky):
 
 
 def diagnosis(experiment, found):
-    left = residuals(found.solution, experiment.data)
-    return diagnose(experiment, found, left)
+    return diagnose(experiment, found, residuals(found.solution, experiment.data))
 
 
 def test_ignored_the_report_points_at_it(known_sky):
@@ -113,8 +110,7 @@ def test_where_nothing_is_off_the_report_is_silent():
     nothing = f"noise.pointing={{clock_s: 60, turntable_deg: 0.3, {none}, treatment: ignored}}"
     setup = about_a_mean(set_up(scenario_of(TWO_RUNS, nothing, lmax=6, step_s=86400.0)), 1e-2, 5)
     experiment = Experiment(setup, simulate(setup))
-    found = lb.infer(experiment)
-    told = diagnosis(experiment, found)
+    told = diagnosis(experiment, lb.infer(experiment))
     assert told.chi2.fits and "fit as they are" in " ".join(told.sentences())
 
 
@@ -131,11 +127,9 @@ def test_simulation_based_calibration():
         sky = replace(first.sky, modes=first.sky.modes + draw)
         scenario = first.scenario.model_copy(update={"seed": seed})
         setup = replace(first.under(sky), scenario=scenario, prior=prior)
-        experiment = Experiment(setup, simulate(setup))
-        found = lb.infer(experiment)
+        found = lb.infer(Experiment(setup, simulate(setup)))
         mean, covariance = offset_posterior(found)
-        truth = true_values(setup)
-        z.append(differences(mean, truth) / np.sqrt(np.diagonal(covariance)))
+        z.append(differences(mean, true_values(setup)) / np.sqrt(np.diagonal(covariance)))
         pull = (found.posterior.mean - sky.modes) / found.posterior.std()
         ranks.append(np.asarray(pull)[[0, 2, 6, 20]])
     pulls = np.concatenate([z, ranks], axis=1)
@@ -183,8 +177,7 @@ def test_sources_and_gains_are_those_of_the_offsets():
     within(got + own, wanted, 2e-4 * np.abs(own).max())
     systematic = np.asarray(found.noise.dense()) - offsets.columns @ offsets.columns.T
     systematic -= np.diag(np.asarray(radiometer(setup).diagonal()))
-    wanted = np.asarray(expected.noise.dense())
-    wanted = wanted - np.diag(np.asarray(radiometer(there).diagonal()))
+    wanted = np.asarray(expected.noise.dense()) - np.diag(np.asarray(radiometer(there).diagonal()))
     close(systematic, wanted, 1e-9)
 
 
@@ -215,8 +208,7 @@ def test_what_cannot_be():
         ("lat_deg: 1, true_values: {lat_deg: 200}", "with lat_deg = 200: lat_deg must lie"),
         ("clock_s: 1, true_values: {lat_deg: 1}", "true_values has 'lat_deg', which is not among"),
     ):
-        setup = set_up(scenario_of(f"noise.pointing={{{section}}}", lmax=4))
-        refuse(words, simulate, setup)
+        refuse(words, simulate, set_up(scenario_of(f"noise.pointing={{{section}}}", lmax=4)))
 
 
 def test_beams_and_pointing_are_sampled_together():
@@ -229,7 +221,7 @@ def test_beams_and_pointing_are_sampled_together():
 
     def evidence(values):
         there = moved(setup, values)
-        model = LinearGaussian(there.coupling, setup.prior, radiometer(setup), there.offset)
+        model = lb.LinearGaussian(there.coupling, setup.prior, radiometer(setup), there.offset)
         return float(model.log_prob(data))
 
     priors = stats.norm.logpdf(list(values.values()), [0.0, 0.0, 2.0], [0.05, 0.05, 0.01]).sum()
@@ -243,9 +235,7 @@ def test_beams_and_pointing_are_sampled_together():
 
 def test_sources_are_seen_as_means_over_windows():
     """Cas A rises, sets and turns within windows of a day: against 400 instants in each."""
-    source = "sources.list=[{name: Cas A}]"
-    scenario = scenario_of(source, lmax=4, step_s=86400.0)
-    setup = set_up(scenario)
+    setup = set_up(scenario_of("sources.list=[{name: Cas A}]", lmax=4, step_s=86400.0))
     instants, sample, weight = setup.observation.at_nodes(400)
     antennas = setup.beam_source.monopoles
     direction = galactic_unit_vector(350.85, 58.815)

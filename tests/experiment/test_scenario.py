@@ -379,8 +379,7 @@ DEFAULTS = [
 def test_a_default_changes_nothing(plain, key):
     before = [text for name, text in WITHIN.items() if key.path.startswith(f"{name}.")]
     value = "false" if key.path == "sky.sources" else key.default
-    changed = load_scenario(plain, [*before, f"{key.path}={value}"])
-    assert changed == load_scenario(plain, before)
+    assert load_scenario(plain, [*before, f"{key.path}={value}"]) == load_scenario(plain, before)
 
 
 RECEIVER = "beam={model: response, file: x, receiver: {model: %s, file: x}}"
@@ -403,8 +402,7 @@ def outside(choices):
     """Values that a key does not take, by the words for those that it takes."""
     numbers = re.search(r"(?:number|integer), (.*)", choices)
     if numbers is None:
-        of_words = re.fullmatch(r"(list of: )?\w+(, \w+)+", choices)
-        return ["neither"] if of_words else []
+        return ["neither"] if re.fullmatch(r"(list of: )?\w+(, \w+)+", choices) else []
     if " to " in numbers[1]:
         low, high = map(float, numbers[1].split(" to "))
         return [low - 1.0, high + 1.0]

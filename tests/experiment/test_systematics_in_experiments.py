@@ -56,9 +56,7 @@ def test_the_posteriors_own_prediction_has_settled():
     predicted = predicted.reshape(16, -1)
     # the signal plus A (m - sky) cancels to rounding
     scale = float(jnp.abs(predicted).max())
-    nothing = np.zeros(found.model.n_data)
-    got = prediction(setup, found, nothing)
-    np.testing.assert_allclose(got, predicted, rtol=0, atol=1e-12 * scale)
+    within(prediction(setup, found, np.zeros(found.model.n_data)), predicted, 1e-12 * scale)
     again = full_model(setup, Around(data, predicted)).condition(data.data).posterior
     assert float(again.rms_shift_from(posterior.mean)) < SETTLED
     # it did move on the way
@@ -85,10 +83,9 @@ def test_beam_parameters_are_directions_of_one_sigma():
         expected = expected + (da * spectrum[None]) @ da.T
     got = np.asarray(model.noise.dense())
     # central differences: h^2 f''' = 1e-8 of the slope
-    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-6 * expected.max())
+    within(got, expected, 1e-6 * expected.max())
     # the data's own beams differ by a draw of that size
-    rms = beam_rms_difference(setup)
-    assert 1e-3 < rms < 0.3
+    assert 1e-3 < beam_rms_difference(setup) < 0.3
     assert beam_rms_difference(experiment().setup) is None
 
 
@@ -100,8 +97,7 @@ def test_a_shifted_beam_is_that_of_the_other_frequency():
     change = np.asarray(other.modes) - np.asarray(setup.beams.modes)
     within(difference_of_beams(setup.scenario.noise.beam, setup), change, 1e-15)
     seen = lb.CouplingMatrix.build(other, setup.pointing) @ setup.sky.modes
-    sigma = np.sqrt(np.asarray(radiometer(setup).diagonal()))
-    z = np.asarray(data.data - seen) / sigma
+    z = np.asarray(data.data - seen) / np.sqrt(np.asarray(radiometer(setup).diagonal()))
     assert abs((z**2).sum() - z.size) < 5 * np.sqrt(2 * z.size)
 
 
@@ -139,8 +135,7 @@ class Hum(AdditiveNoise):
 
     @classmethod
     def build(cls, section, setup, around):
-        root = patterns(setup.layout.size, section.sigma_k)
-        return cls("hum", setup.layout, jnp.asarray(root))
+        return cls("hum", setup.layout, jnp.asarray(patterns(setup.layout.size, section.sigma_k)))
 
     def covariance(self) -> Covariance:
         return LowRankCovariance(self.root, "the hum")
@@ -175,8 +170,7 @@ def test_it_is_marginalised_into_n(registered):
     assert isinstance(term, Hum)
     root = patterns(96, 20.0)
     expected = np.diag(np.asarray(radiometer(setup).diagonal())) + root @ root.T
-    got = np.asarray(full_model(setup).noise.dense())
-    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-13 * expected.max())
+    within(np.asarray(full_model(setup).noise.dense()), expected, 1e-13 * expected.max())
     # the sky's part of the model is as it was
     kept, own = (jax.tree.leaves(c) for c in (full_model(setup).coupling, setup.coupling))
     for one, other in zip(kept, own, strict=True):
@@ -219,8 +213,7 @@ def test_simulated_data_hold_it_whatever_its_treatment(registered):
         replace(setup, scenario=setup.scenario.model_copy(update={"seed": 2}))
         for setup in (setup_with(treatment="ignored"), setup_with())
     )
-    other = np.asarray(simulate(reseeded).data - simulate(bare).data)
-    assert np.abs(other - added).max() > 1.0
+    assert np.abs(np.asarray(simulate(reseeded).data - simulate(bare).data) - added).max() > 1.0
 
 
 # --- a term with values of its own ----------------------------------------------------------------

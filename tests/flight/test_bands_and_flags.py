@@ -29,8 +29,7 @@ def band_of(f=10.0, navgf=1):
 def flags_of(band, spectra):
     here = spectra[:, :, band.first : band.last]
     good = np.ones((len(here), here.shape[2]), dtype=bool)
-    frames = np.full(len(here), FRAMES)
-    return fl.line_flags(band, here, frames, good, fl.threshold(FALSE_ALARM, 4))
+    return fl.line_flags(band, here, np.full(len(here), FRAMES), good, fl.threshold(FALSE_ALARM, 4))
 
 
 def test_noise_is_flagged_as_rarely_as_is_said():
@@ -214,8 +213,7 @@ def test_what_the_degree_leaves_out_is_told_by_two_more_powers():
     for degree in (0, 2):
         band = ChannelBand.of(10.0, 1.0, degree, AVERAGING[1], mhz)
         here = law[None, band.first : band.last]
-        good = np.ones(here.shape, dtype=bool)
-        found, _, further = band.values(here[:, None], here, good)
+        found, _, further = band.values(here[:, None], here, np.ones(here.shape, dtype=bool))
         off[degree] = found[0, 0] - 1.0
         # two more powers take nearly all of it away
         assert further[0, 0] == pytest.approx(-off[degree], rel=0.01)
@@ -233,8 +231,7 @@ def test_noise_of_steep_spectra_and_shared_channels_by_drawing_it():
     good[0, 3:6] = False
     _, variance, _ = band.values(shape[:, None], shape, good)
     rng = np.random.default_rng(5)
-    root = np.linalg.cholesky(band.shared)
-    drawn = shape * (root @ rng.standard_normal((n, 20_000))).T
+    drawn = shape * (np.linalg.cholesky(band.shared) @ rng.standard_normal((n, 20_000))).T
     shapes, flags = (np.broadcast_to(x, drawn.shape) for x in (shape, good))
     values, _, _ = band.values(drawn[:, None], shapes, flags)
     middle, _, _ = band.values(shape[:, None], shape, good)

@@ -139,8 +139,7 @@ def covariances(nodes, rows, rng):
 @pytest.mark.parametrize("nodes", [[10.0], [10.0, 25.0], [8.0, 10.0, 12.0, 14.0, 30.0]])
 def test_channels_go_through_the_known_frequencies_and_are_covariances(nodes):
     known = covariances(len(nodes), 3, np.random.default_rng(1))
-    mhz = channel_mhz("centre")
-    spectra = ChannelSpectra.of(np.array(nodes), mhz)(known)
+    spectra = ChannelSpectra.of(np.array(nodes), channel_mhz("centre"))(known)
     for number, f in enumerate(nodes):
         at = int(np.rint(f / 0.025))
         np.testing.assert_allclose(spectra[:, :, at], known[number], rtol=1e-11, atol=1e-12)
@@ -174,5 +173,4 @@ def test_counts_are_whole_numbers_of_few_enough_bits():
     found = rounded(spectra, np.broadcast_to(slices, (3, 16)))
     step = 2.0 ** (slices - 31)
     np.testing.assert_allclose(found, spectra, rtol=1e-6, atol=step.max())
-    whole = spectra[0, autos] / step[autos, None]
-    assert 2**25 < np.rint(whole).max() < 2**28
+    assert 2**25 < np.rint(spectra[0, autos] / step[autos, None]).max() < 2**28

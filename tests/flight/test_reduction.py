@@ -145,8 +145,7 @@ def test_averages_are_means_of_the_spectra(flight, table, reduced):
 
 
 def test_kelvin_are_what_an_enclosure_makes(reduced):
-    per_kelvin = np.array([1.0, 4.0, 9.0, 16.0]) * 1e-22
-    data = reduced.at(10.0, per_kelvin)
+    data = reduced.at(10.0, np.array([1.0, 4.0, 9.0, 16.0]) * 1e-22)
     at = labels().index("12I")
     kelvin = np.asarray(data.grid())[at, :40]
     np.testing.assert_allclose(kelvin * 6e-22, reduced.values[0, at, :40], rtol=1e-12)
@@ -182,8 +181,7 @@ def test_shares_of_flags_are_those_of_the_values_that_there_were(reduced):
 
 
 def test_files_of_reduced_spectra_hold_all(reduced, tmp_path):
-    path = rd.write_reduced(tmp_path / "reduced.nc", reduced)
-    found = rd.read_reduced(path)
+    found = rd.read_reduced(rd.write_reduced(tmp_path / "reduced.nc", reduced))
     for name in ("values", "n_averaged", "reason", "gain", "slope", "bin_of", "level", "lines"):
         np.testing.assert_array_equal(getattr(found, name), getattr(reduced, name))
     a, b = (one.at(25.0, np.ones(4)) for one in (found, reduced))

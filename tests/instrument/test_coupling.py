@@ -102,8 +102,7 @@ def test_dense_rows_are_each_times_own_rotation(coupling):
     topocentric = o.topocentric_from_mcmf() @ o.mcmf_from_galactic
     for k in (0, 5, o.n_times - 1):
         seen = Rotation.from_matrix(topocentric[k], LMAX)(a)
-        turned = turn_about_z(beams, np.radians(o.turntable_deg[o.run[k]]))
-        expected = np.asarray(turned @ seen)
+        expected = np.asarray(turn_about_z(beams, np.radians(o.turntable_deg[o.run[k]])) @ seen)
         # the neglected third order of the tilts: (1e-3)^3 of low modes
         close(dense[:, k] @ np.asarray(a), expected, 1e-8)
 
@@ -116,8 +115,7 @@ def test_the_moons_axis_is_not_fixed(cycles, lmax, monkeypatch):
     beams, sky = lb.monopole_beams(25.0, lmax), steep_sky(lmax)
 
     def visibilities_at(order=None):
-        pointing = Pointing.of(o, lmax, order)
-        return np.asarray(CouplingMatrix.build(beams, pointing) @ sky)
+        return np.asarray(CouplingMatrix.build(beams, Pointing.of(o, lmax, order)) @ sky)
 
     monkeypatch.setattr("lusee_bayes.instrument.averaging.TOLERANCE", 1e-14)
     exact = visibilities_at(5)  # itself good to 1e-9 sigma
@@ -194,8 +192,7 @@ PLACED = {
 def test_a_of_placed_antennas_is_that_of_antennas_built_so(instrument, pointing, layout):
     geometry = {"length_m": 3.1, "height_m": 1.7, "zenith_angle_deg": 73.0}
     geometry["azimuths_deg"] = np.array([90.0, 0.0, -90.0, 180.0]) + 5.0
-    antennas = Monopoles(Regolith(3.5, 6.5, 0.02), **geometry)
-    beams = lb.monopole_beams(FREQUENCY, LOW, antennas)
+    beams = lb.monopole_beams(FREQUENCY, LOW, Monopoles(Regolith(3.5, 6.5, 0.02), **geometry))
     expected = np.asarray(lb.CouplingMatrix.build(beams, pointing, layout).dense())
     placed = {name: jnp.asarray(value) for name, value in PLACED.items()}
     close(instrument.coupling(placed).dense(), expected, 1e-13)
@@ -239,8 +236,7 @@ def test_sites_of_the_antennas_parameters(instrument, base):
 def test_the_amplitude_of_a_beam_error(instrument, base):
     other = lb.monopole_beams(29.0, LOW)
     own = instrument.beams()
-    direction = ProductBeams(other.modes - own.modes, FREQUENCY)
-    error = BeamError(instrument.coupling_of(direction))
+    error = BeamError(instrument.coupling_of(ProductBeams(other.modes - own.modes, FREQUENCY)))
     sky = base.prior.sample(jax.random.key(3))
     for amplitude in (0.0, 0.7, 1.0):
         value = {"beam_amplitude": jnp.asarray(amplitude)}

@@ -84,8 +84,7 @@ def test_inside_a_compiled_function_as_exactly_shifted(names):
     exact = seen(pt.Pointing.of(pt.with_offsets(o, values), LMAX), beams)
     nominal = pt.Pointing.of(o, LMAX)
     got = seen(pt.turned_by_offsets(nominal, o.hours, values), beams)
-    before = seen(nominal, beams)
-    moved = np.abs((exact - before) / sigma(exact, o)).max()
+    moved = np.abs((exact - seen(nominal, beams)) / sigma(exact, o)).max()
     left = np.abs((exact - got) / sigma(exact, o)).max()
     # the rate of the turn varies by 1e-4, and the pole wanders by 2e-8 rad within a minute
     clock = any(name.startswith("clock") for name in names)
@@ -125,8 +124,7 @@ def test_a_leaning_lander_by_hand():
     up = north.topocentric_from_mcmf() @ north.lander_from_mcmf().T @ [0.0, 0.0, 1.0]
     np.testing.assert_allclose(up, [0, np.sin(np.radians(3)), np.cos(np.radians(3))], atol=1e-15)
     # a source in the zenith is seen 3 degrees South of the antennas' own
-    zenith = north.zenith_galactic()
-    seen_at = north.antenna_directions(zenith)[0]
+    seen_at = north.antenna_directions(north.zenith_galactic())[0]
     expected = [0, -np.sin(np.radians(3)), np.cos(np.radians(3))]
     np.testing.assert_allclose(seen_at, expected, atol=1e-12)
 
@@ -141,8 +139,7 @@ def test_shifted_observations():
 
 
 def test_names():
-    every = pt.offset_names(tuple(pt.OFFSETS), 2)
-    assert every == tuple(VALUES)
+    assert pt.offset_names(tuple(pt.OFFSETS), 2) == tuple(VALUES)
     assert pt.offset_names(("turntable_deg",), 1) == ("turntable_deg",)
     refuse("no offset 'clock'; did you mean 'clock_s'", pt.offset_names, ("clock",), 1)
 

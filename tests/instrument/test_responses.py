@@ -53,8 +53,7 @@ def test_loads_and_scales_are_luseepys(luseepy, channel):
     response, _, images = luseepy
     f = FREQUENCIES[channel]
     np.testing.assert_allclose(JFETReceiver().load(f), matrix(images, "zl", channel), rtol=1e-13)
-    loading = response.circuit(f).loading
-    np.testing.assert_allclose(loading, matrix(images, "m", channel), rtol=0, atol=1e-14)
+    within(response.circuit(f).loading, matrix(images, "m", channel), 1e-14)
     enclosure = matrix(images, "blackbody_normalization", channel).diagonal().real
     np.testing.assert_allclose(response.per_kelvin(f), enclosure, rtol=1e-13)
 
@@ -92,11 +91,9 @@ def test_all_products_in_volts(luseepy, test_data, channel):
     # the first sample, where a fixed axis is no approximation, and all about the first one's axis
     assert off(simulated(luseepy, test_data, frequency, ~every | (np.arange(328) == 0)),
                expected[:, :1]) < 5e-8  # fmt: skip
-    fixed = simulated(luseepy, test_data, frequency, every, fixed_axis=True)
-    assert off(fixed, expected) < 1e-7
+    assert off(simulated(luseepy, test_data, frequency, every, fixed_axis=True), expected) < 1e-7
     # the Moon's axis wanders
-    true = simulated(luseepy, test_data, frequency, every)
-    assert 5e-5 < off(true, expected) < 5e-4
+    assert 5e-5 < off(simulated(luseepy, test_data, frequency, every), expected) < 5e-4
 
 
 def test_all_products_of_the_first_sample(luseepy, test_data):
@@ -181,7 +178,7 @@ def test_between_frequencies_as_luseepy_does(tmp_path):
     largest = np.abs(expected).max()
     got = np.asarray(to_matrix(volts(response, f, response.beams(f, 3).modes)))
     # the file's single precision
-    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-6 * largest)
+    within(got, expected, 1e-6 * largest)
     splined = replace(response, interpolation="spline")
     splined = volts(splined, f, splined.beams(f, 3).modes)
     assert np.abs(np.asarray(to_matrix(splined)) - expected).max() > 1e-2 * largest
@@ -193,10 +190,8 @@ def test_between_frequencies_as_luseepy_does(tmp_path):
     # nothing is interpolated where the file has the frequency, to luseepy's 1e-6 MHz
     opened = replace(response, receiver=None)
     exact = opened.beams(20.0, 3).modes
-    near = opened.beams(20.0 + 9e-7, 3).modes
-    np.testing.assert_array_equal(near, exact)
-    splined = replace(opened, interpolation="spline").beams(20.0, 3).modes
-    close(splined, exact, 1e-13)
+    np.testing.assert_array_equal(opened.beams(20.0 + 9e-7, 3).modes, exact)
+    close(replace(opened, interpolation="spline").beams(20.0, 3).modes, exact, 1e-13)
 
 
 def test_receivers(tmp_path):
@@ -415,8 +410,7 @@ def test_luseepys_four_ports_are_written_back(luseepy, tmp_path):
     # a multiplication and a division by the same number
     np.testing.assert_allclose(back.grid, waterfall.grid, rtol=3e-16, atol=0)
     assert (back.moon_k, back.antenna_k, back.interpolation) == (250.0, 0.0, "linear-native-alm")
-    seconds = (back.observation.times - waterfall.observation.times).to_value("s")
-    assert not seconds.any()
+    assert not (back.observation.times - waterfall.observation.times).to_value("s").any()
 
 
 def test_gaps_are_written(luseepy, tmp_path):
@@ -468,7 +462,7 @@ def test_simulated_and_mapped_between_the_responses_frequencies(luseepy, tmp_pat
     setup = lb.build(scenario, data).setup
     expected = replace(response, receiver=CapacitorReceiver()).beams(f, 4)
     # the loads go through the file bit by bit
-    np.testing.assert_allclose(setup.beams.modes, expected.modes, rtol=0, atol=1e-14)
+    within(setup.beams.modes, expected.modes, 1e-14)
     sure = lb.load_scenario("fiducial", [*beam, f"frequency_mhz={f!r}", warm,
                                          f"beam.receiver={capacitor}"])  # fmt: skip
     np.testing.assert_allclose(data.grid(), lb.build(sure).data.grid(), rtol=1e-14)

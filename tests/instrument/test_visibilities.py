@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from assertions import close, refuse
+from assertions import close, refuse, within
 from astropy.time import Time
 
 import lusee_bayes as lb
@@ -18,8 +18,7 @@ from lusee_bayes.instrument.visibilities import read_visibilities
 def data():
     observation = lb.Observation.from_runs([lb.Run(0.05), lb.Run(0.03, turntable_deg=30.0)])
     rng = np.random.default_rng(0)
-    flags = rng.random((16, observation.n_times)) < 0.1
-    layout = pr.DataLayout.from_flags(flags)
+    layout = pr.DataLayout.from_flags(rng.random((16, observation.n_times)) < 0.1)
     values = jnp.asarray(rng.standard_normal(layout.size))
     return lb.Visibilities(values, layout, observation, 25.0, jnp.asarray(rng.standard_normal(9)))
 
@@ -39,8 +38,7 @@ def test_round_trip_is_exact(data, tmp_path):
 def altered(change):
     def write(data, path):
         dataset = data.to_dataset()
-        dataset = change(dataset) or dataset
-        dataset.to_netcdf(path, engine="h5netcdf")
+        (change(dataset) or dataset).to_netcdf(path, engine="h5netcdf")
 
     return write
 
@@ -79,8 +77,7 @@ def test_temperatures_in_other_units_are_converted(data, tmp_path, unit, factor)
 def test_times_in_other_scales_are_brought_to_utc(data, tmp_path, scale, s):
     path = tmp_path / "other.nc"
     altered(lambda d: [d[k].attrs.update(scale=scale) for k in ("jd1", "jd2")] and d)(data, path)
-    moved = (data.observation.times - read_visibilities(path).observation.times).sec
-    np.testing.assert_allclose(moved, s, rtol=0, atol=2e-3)
+    within((data.observation.times - read_visibilities(path).observation.times).sec, s, 2e-3)
 
 
 def test_other_files_are_refused(tmp_path):
@@ -143,11 +140,9 @@ def test_any_order_of_products_and_of_their_ports():
 def test_real_products_in_any_order():
     names = [p.upper() for p in lb.Visibilities.labels.fget(make())]
     order = RNG.permutation(len(names))
-    data = expected()[order].T
-    made = make(data, products=[names[k] for k in order])
+    made = make(expected()[order].T, products=[names[k] for k in order])
     np.testing.assert_array_equal(made.grid(), expected())
-    made = make(expected().T)
-    np.testing.assert_array_equal(made.grid(), expected())
+    np.testing.assert_array_equal(make(expected().T).grid(), expected())
     # 10I is the imaginary part of the conjugate
     made = make(np.stack([MATRIX[:, 0, 0].real, MATRIX[:, 1, 0].imag], 1), products=["00", "10I"])
     np.testing.assert_array_equal(made.grid()[2], MATRIX[:, 0, 1].imag)
@@ -269,7 +264,7 @@ def test_scatter_is_the_transpose_of_gather(flags, rest):
     left = np.sum(np.asarray(layout.gather(jnp.asarray(grid))) * data)
     back = np.asarray(layout.scatter(jnp.asarray(data)))
     # sums of fifteen products of order one
-    np.testing.assert_allclose(np.sum(grid * back), left, rtol=0, atol=1e-13)
+    within(np.sum(grid * back), left, 1e-13)
     np.testing.assert_array_equal(layout.gather(jnp.asarray(back)), data)
     if flags is not None:
         assert not back[flags].any()
@@ -297,8 +292,7 @@ def test_labels_are_those_of_luseepy():
 
 def test_each_product_is_the_entry_its_label_names():
     v = hermitian(np.random.default_rng(1), 4)
-    got = pr.to_real(jnp.asarray(v))
-    for label, value in zip(LUSEEPY, got, strict=True):
+    for label, value in zip(LUSEEPY, pr.to_real(jnp.asarray(v)), strict=True):
         entry = v[int(label[0]), int(label[1])]
         assert value == (entry.real if label[2] == "R" else entry.imag)
 

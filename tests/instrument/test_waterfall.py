@@ -292,15 +292,8 @@ def four_port(path, **changes):
         "time": np.stack([np.floor(jd), jd % 1.0], axis=1),
         "blackbody_normalization_real": np.tile(4.0 * np.eye(4), (2, 1, 1)),
     } | changes.pop("images", {})
-    header = {
-        "BUNIT": "V^2/Hz",
-        "TIMESYS": "UTC",
-        "DELTAT_SEC": 7200.0,
-        "LUN_LAT_DEG": -23.814,
-        "LUN_LONG_DEG": 182.258,
-        "TMOON_K": 250.0,
-    } | changes.pop("header", {})
-    write_images(path, images, header)
+    header = HEADER | {"BUNIT": "V^2/Hz", "TIMESYS": "UTC", "TMOON_K": 250.0}
+    write_images(path, images, header | changes.pop("header", {}))
     column = fits.Column("label", "8A", array=np.array(changes.pop("products", ["13I", "00R"])))
     with fits.open(path, mode="append") as hdus:
         hdus.append(fits.BinTableHDU.from_columns([column], name="products"))

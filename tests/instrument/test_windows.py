@@ -150,8 +150,7 @@ def test_no_bin_is_longer_than_asked_for(to_s):
     observation = observed(keep, windows="whole")
     # what follows the gap is off the grid by a third of a sample
     late = np.where(np.arange(24) > 10, STEP / 3, 0.0)
-    observation = replace(observation, times=observation.times + late * u.s)
-    data = data_of(observation)
+    data = data_of(replace(observation, times=observation.times + late * u.s))
     after = averaged(data, to_s)
     bounds = after.observation.windows.bounds_s
     assert (bounds[:, 1] - bounds[:, 0] <= to_s + 1e-6).all()
@@ -277,13 +276,11 @@ def test_equals_the_mean_of_200_instants(step_s, filled, lmax):
         offsets, weights = nodes_of(o.windows, k, 200)
         with unannounced_leap_seconds():
             times = o.times[k] + offsets * u.s
-        run = np.zeros(len(times), dtype=int)
-        instants = replace(o, times=times, run=run, windows=None)
+        instants = replace(o, times=times, run=np.zeros(len(times), dtype=int), windows=None)
         pointing = Pointing.of(instants, lmax, order=4)
         v = np.asarray(lb.CouplingMatrix.build(beams, pointing) @ sky).reshape(16, -1)
         expected[:, k] = v @ weights
-    off = (got - expected) / sigma_of(expected, o)
-    assert np.abs(off).max() < 1e-6
+    assert np.abs((got - expected) / sigma_of(expected, o)).max() < 1e-6
     # and instants at the same times would not do
     instants = np.asarray(lb.CouplingMatrix.observe(beams, replace(o, windows=None)) @ sky)
     wrong = np.abs((instants.reshape(16, -1) - expected) / sigma_of(expected, o)).max()
@@ -363,10 +360,8 @@ def data():
     """Windows in pieces of odd lengths, and flags."""
     runs = [lb.Run(0.01), lb.Run(0.01, turntable_deg=30.0)]
     observation = lb.Observation.from_runs(runs, window="mean")
-    n, rng = observation.n_times, np.random.default_rng(5)
-    observation = replace(observation, windows=partly_filled(n, 7200.0))
-    layout = DataLayout.from_flags(rng.random((16, n)) < 0.1)
-    return lb.Visibilities(rng.normal(size=layout.size), layout, observation, 25.0)
+    windows = partly_filled(observation.n_times, 7200.0)
+    return data_of(replace(observation, windows=windows), 0.1, seed=5)
 
 
 def test_windows_come_back_to_the_last_bit(data, tmp_path):
@@ -405,8 +400,7 @@ def test_other_software_finds_bounds_as_the_cf_conventions_have_them(tmp_path):
 
 
 def rewritten(data, path, change):
-    dataset = data.to_dataset()
-    change(dataset).to_netcdf(path, engine="h5netcdf")
+    change(data.to_dataset()).to_netcdf(path, engine="h5netcdf")
     return path
 
 

@@ -44,8 +44,7 @@ def simulated(*overrides, flags=None):
     sky = np.sqrt(np.asarray(model.prior.variance())) * rng.standard_normal(model.prior.size)
     noise = np.linalg.cholesky(np.asarray(model.noise.dense())) @ rng.standard_normal(model.n_data)
     seen = np.asarray(model.coupling @ jnp.asarray(sky)) + noise
-    data = replace(e.data, data=jnp.asarray(seen), layout=e.setup.layout)
-    return model, data
+    return model, replace(e.data, data=jnp.asarray(seen), layout=e.setup.layout)
 
 
 def both_sides(x, n):
@@ -121,16 +120,14 @@ def test_groups_and_single_data_by_hand(overrides, flags):
         assert group.n == len(index)
         assert group.chi2 == pytest.approx(expected, rel=1e-6)
         # condition numbers of 1e8 under the wide prior
-        degrees = degrees_by_hand(model, index, wide)
-        assert group.degrees == pytest.approx(degrees, abs=1e-4)
+        assert group.degrees == pytest.approx(degrees_by_hand(model, index, wide), abs=1e-4)
         assert group.p == pytest.approx(both_sides(group.chi2, group.degrees), rel=1e-6)
         others = whole.chi2 - group.chi2, whole.degrees - group.degrees
         assert group.others_p == pytest.approx(both_sides(*others), rel=1e-6)
     for datum in (0, 33, layout.size - 1):
         off, covariance, _ = by_hand(model, data, np.array([datum]), wide)
         assert found.z[datum] == pytest.approx(off[0] / np.sqrt(covariance[0, 0]), abs=1e-6)
-    mean = model.condition(data.data).posterior.mean
-    predicted = np.asarray(model.predict(mean))
+    predicted = np.asarray(model.predict(model.condition(data.data).posterior.mean))
     np.testing.assert_allclose(found.predicted, predicted, rtol=0, atol=1e-6 * predicted.max())
     assert found.fit().level == "consistent" and found.suspects() == []
     assert found.fit().text.startswith("Consistent: instrument and noise fit (p ")
@@ -161,8 +158,7 @@ def test_one_group_is_everything():
 def test_precise_data_of_one_day_are_judged_by_product():
     """A as a matrix: K^-1 of all data, which nothing predicts, has no root in 64 bits."""
     model, data = simulated("noise.radiometer.factor=1e-6", "observation.runs=[{cycles: 0.03}]")
-    model = replace(model, coupling=DenseCoupling(model.coupling.dense()))
-    found = judged(model, data)
+    found = judged(replace(model, coupling=DenseCoupling(model.coupling.dense())), data)
     assert found.level() == "consistent"
     # N(0, 1) or narrower: one of 1e5 data is beyond 5
     assert np.abs(found.z).max() < 5
@@ -202,8 +198,7 @@ def test_what_no_group_explains():
     model, data = simulated()
     rng = np.random.default_rng(1)
     noise = 3.0 * np.sqrt(float(model.noise.diagonal().mean()))
-    bad = corrupted(data, slice(None), noise * rng.standard_normal((16, 24)))
-    found = judged(model, bad)
+    found = judged(model, corrupted(data, slice(None), noise * rng.standard_normal((16, 24))))
     assert found.suspects() == []
     assert "no single one is to blame" in found.fit().text
 
@@ -259,8 +254,7 @@ def test_the_posterior_under_a_wider_prior(form, prior):
     model = model_of(60 if form is not InData else 18, prior)
     data = drawn(model, np.random.default_rng(2))
     solution = model.condition(data, form=form)
-    posterior = solution.posterior
-    wide, less = widened(posterior, 3.0)
+    wide, less = widened(solution.posterior, 3.0)
     again = with_prior(model, model.prior.widened(3.0)).condition(data, form=form)
     expected = again.posterior
     std = np.asarray(expected.std())
@@ -395,8 +389,7 @@ def test_what_the_sky_takes_up_is_not_told():
     prior = lb.HarmonicPrior(np.full(LMAX + 1, 1e14))
     model = lb.LinearGaussian(DenseCoupling(a), prior, lb.DiagonalCovariance(np.ones(N_DATA)))
     data = rng.standard_normal(N_DATA)
-    template = a @ rng.standard_normal((a.shape[1], 1))
-    got = preferences(model.condition(data), template)
+    got = preferences(model.condition(data), a @ rng.standard_normal((a.shape[1], 1)))
     assert np.isnan(got.amplitude).all()
     assert np.isnan(got.std).all()
 
@@ -463,8 +456,7 @@ def check(found: LeftOut, data, inverse, sky, u, groups, chosen=None):
         block = inverse[np.ix_(inside, inside)]
         missed = found.missed(group)
         assert missed.n == inside.sum()
-        chi2 = u[inside] @ np.linalg.solve(block, u[inside])
-        assert missed.chi2 == pytest.approx(chi2, rel=1e-6)
+        assert missed.chi2 == pytest.approx(u[inside] @ np.linalg.solve(block, u[inside]), rel=1e-6)
         assert missed.log_det == pytest.approx(np.linalg.slogdet(block)[1], rel=1e-7)
         # a difference of numbers of data, and of traces with condition numbers of 1e6
         directions = np.trace(np.linalg.solve(block, of_sky[np.ix_(inside, inside)]))
@@ -591,5 +583,4 @@ def test_groups_have_data():
     assert [sum(group.kind == kind for group in found) for kind in KINDS] == [16, 2, 2]
     day = data.observation.hours // 24 == 1
     np.testing.assert_array_equal(found[17].data, np.broadcast_to(day, (16, len(day))))
-    fewer = groups_of(flagged(data, found[3].data))
-    assert found[3].name not in [group.name for group in fewer]
+    assert found[3].name not in [group.name for group in groups_of(flagged(data, found[3].data))]

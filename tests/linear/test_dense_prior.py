@@ -68,8 +68,7 @@ def test_a_turned_problem_has_the_turned_posterior(n_data, form):
     for name in ("information_bits", "prior_chi2"):
         value, wanted = (getattr(p, name)() for p in (found, expected))
         np.testing.assert_allclose(value, wanted, rtol=CLOSE)
-    left = np.diag(covariance) / np.diag(S)
-    np.testing.assert_allclose(found.prior_fraction(), left, rtol=CLOSE)
+    np.testing.assert_allclose(found.prior_fraction(), np.diag(covariance) / np.diag(S), rtol=CLOSE)
     assert informed_modes(found) == informed_modes(expected)
 
 
@@ -86,14 +85,12 @@ def test_textbook_matrices_and_scipys_evidence(n_data, form):
     evidence = multivariate_normal.logpdf(data, seen, k)
     np.testing.assert_allclose(found.log_evidence, evidence, rtol=CLOSE)
     chi2 = model.chi2(found.mean, jnp.asarray(data)) + found.prior_chi2()
-    expected = (data - seen) @ np.linalg.solve(k, data - seen)
-    np.testing.assert_allclose(chi2, expected, rtol=CLOSE)
+    np.testing.assert_allclose(chi2, (data - seen) @ np.linalg.solve(k, data - seen), rtol=CLOSE)
     sky = RNG.normal(size=(3, N))
     density = multivariate_normal.logpdf(sky, TURN @ MEAN, S)
     found_density = lb.SkyPrior(model.prior).log_prob(jnp.asarray(sky))
     np.testing.assert_allclose(found_density, density, rtol=CLOSE)
-    white = found.whiten(found.sample(jax.random.key(0), 4000))
-    assert_draws_follow(white, np.zeros(N), np.eye(N))
+    assert_draws_follow(found.whiten(found.sample(jax.random.key(0), 4000)), np.zeros(N), np.eye(N))
     draws = found.sample(jax.random.key(1), 4000)
     assert_draws_follow(draws, answer.mean + TURN @ MEAN, answer.covariance)
 
@@ -116,16 +113,14 @@ def test_a_mean_far_from_the_reference_sky_is_exact():
     data = a @ (prior.root @ rng.normal(size=N)) + rng.normal(size=60)
     matrix, vector, zero = a.T @ a, a.T @ data, np.zeros(())
     misfit, n_data = np.asarray(data @ data), np.asarray(60.0)
-    information = Information(matrix, vector, np.zeros(N), misfit, zero, n_data)
-    found = information.posterior(prior)
+    found = Information(matrix, vector, np.zeros(N), misfit, zero, n_data).posterior(prior)
     assert float(found.refinement) < 1e-6
     with localcontext(prec=60):
         g, m, v = (exact(x) for x in (prior.root, (matrix + matrix.T) / 2.0, vector))
         precision = g.T @ m @ g + exact(np.eye(N))
         u = solve_exactly(precision, (g.T @ v)[:, None])[0][:, 0].astype(float)
     # in posterior standard deviations
-    off = np.linalg.norm(found.lower.T @ (found.white_mean - u))
-    assert off < 1e-6
+    assert np.linalg.norm(found.lower.T @ (found.white_mean - u)) < 1e-6
     # in plain arithmetic the gradient is not good enough
     plain = np.zeros(N)
     for _ in range(5):

@@ -60,8 +60,7 @@ def test_the_maximum_is_that_of_a_general_optimiser(case):
     start = case.family.hyperprior.start()
     options = {"xtol": 1e-4, "ftol": 1e-9, "maxiter": 200}
     other = minimize(lambda x: -log_density(case, x), start, method="Powell", options=options)
-    here = log_density(case, found.parameters)
-    assert here > -other.fun - 0.05
+    assert log_density(case, found.parameters) > -other.fun - 0.05
     std = np.sqrt(np.diagonal(found.covariance))
     assert np.abs(found.parameters - other.x).max() < 0.5 * std.max()
     assert (np.abs(found.parameters - case.truth) < 4.0 * std).all()
@@ -75,8 +74,7 @@ def test_the_curvature_is_that_of_the_evidence(case):
         step[i] = 0.1
         values = [log_density(case, found.parameters + s) for s in (step, 0.0 * step, -step)]
         curvature = -(values[0] - 2.0 * values[1] + values[2]) / 0.01
-        expected = np.linalg.inv(found.covariance)[i, i]
-        assert 0.5 < curvature / expected < 2.0
+        assert 0.5 < curvature / np.linalg.inv(found.covariance)[i, i] < 2.0
 
 
 def test_learning_gains_over_the_start_under_local_scales():
@@ -87,8 +85,7 @@ def test_learning_gains_over_the_start_under_local_scales():
     information = information_of(sky)
     found = learning.learn(family, information)
     before = float(information.posterior(family.expected()).log_evidence)
-    after = float(information.posterior(found.prior).log_evidence)
-    assert after > before - 1.0
+    assert float(information.posterior(found.prior).log_evidence) > before - 1.0
     assert np.isfinite(found.log_evidence)
     assert [row["name"] for row in found.as_rows()] == list(family.names)
 
@@ -139,8 +136,7 @@ def test_the_evidence_agrees_with_draws_of_the_hyperprior():
     sky = np.asarray(prior.sample(jax.random.key(4)))
     information = information_of(sky, noise=2000.0, seed=3, n_data=40, strength=5.0 / 3.0)
     hyperprior, rng = family.hyperprior, np.random.default_rng(5)
-    size = (1000, hyperprior.size)
-    drawn = hyperprior.centre + hyperprior.width * rng.standard_t(FREEDOM, size)
+    drawn = hyperprior.centre + hyperprior.width * rng.standard_t(FREEDOM, (1000, hyperprior.size))
     values = []
     for theta in drawn:
         try:
@@ -210,8 +206,7 @@ def test_where_nothing_settles_the_prior_is_fixed_and_wide(case, monkeypatch):
     monkeypatch.setattr("lusee_bayes.priors.learning.MAX_STEPS", 0)
     found = learning.learn_whatever_fits(case.family, case.information)
     assert not found.settled and not found.fits and found.as_rows() == []
-    expected = case.family.expected()
-    ratio = np.asarray(found.prior.variance()) / np.asarray(expected.variance())
+    ratio = np.asarray(found.prior.variance()) / np.asarray(case.family.expected().variance())
     np.testing.assert_allclose(ratio, ratio[0], rtol=1e-10)
     assert ratio[0] >= 1.0
     evidence = float(case.information.posterior(found.prior).log_evidence)

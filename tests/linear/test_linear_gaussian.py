@@ -152,8 +152,7 @@ def test_prior_predictive_draws_follow_the_evidence():
     model, _ = well_scaled(9, "blocks", offset=np.full(9, 2.0))
     skies, data = jax.jit(jax.vmap(model.sample))(jax.random.split(jax.random.key(4), 20_000))
     a, s = np.asarray(model.coupling.dense()), np.diag(per_mode(SPECTRUM))
-    k = a @ s @ a.T + np.asarray(model.noise.dense())
-    joint = np.block([[s, s @ a.T], [a @ s, k]])
+    joint = np.block([[s, s @ a.T], [a @ s, a @ s @ a.T + np.asarray(model.noise.dense())]])
     mean = np.concatenate([np.zeros(16), np.full(9, 2.0)])
     oracle.assert_draws_follow(np.concatenate([skies, data], axis=1), mean, joint)
 
@@ -280,8 +279,7 @@ def log_prob_of(model, d):
 def expected_slopes(model, d):
     """d ln p / d C_ell and d ln p / d (noise level) by the textbook formula."""
     a, n = np.asarray(model.coupling.dense()), np.asarray(model.noise.dense())
-    spectrum = np.asarray(model.prior.spectrum)
-    s, y = np.diag(per_mode(spectrum)), np.asarray(d)
+    s, y = np.diag(per_mode(np.asarray(model.prior.spectrum))), np.asarray(d)
     shapes = [np.diag(per_mode(one)) for one in np.eye(LMAX + 1)]
     of_ell = [oracle.log_prob_slope(a, s, n, y, shape, 0 * n) for shape in shapes]
     return np.array(of_ell), oracle.log_prob_slope(a, s, n, y, 0 * s, n)

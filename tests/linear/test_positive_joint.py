@@ -144,8 +144,7 @@ def test_the_gaussian_is_that_of_one_big_model(case):
     evidence = stats.multivariate_normal(offset, (a * wide**2) @ a.T + np.diag(sigma**2)).logpdf(d)
     np.testing.assert_allclose(mode.posterior.log_evidence, evidence, rtol=1e-9)
     std = np.sqrt(np.diagonal(covariance))[: fields * N]
-    far = (mode.fields.ravel() - mean[: fields * N]) / std
-    assert np.abs(far).max() < 1e-6
+    assert np.abs((mode.fields.ravel() - mean[: fields * N]) / std).max() < 1e-6
     spread = paired(mode.posterior.covariance(), prior)
     none = np.zeros((0, fields, N))
     for k, (s, t) in enumerate(zip(seen, to_skies, strict=True)):
@@ -187,8 +186,7 @@ def test_learned_laws_maximise_the_evidence():
     found = pj.find_joint_mode(skies, FieldLaws.of(skies), channels, learn=True).laws
 
     def evidence(parameters):
-        there = replace(found, parameters=parameters)
-        mode = pj.find_joint_mode(skies, there, channels)
+        mode = pj.find_joint_mode(skies, replace(found, parameters=parameters), channels)
         away = (parameters - found.expected) / [LOG_WIDTH, TILT_WIDTH]
         return float(mode.posterior.log_evidence) - 0.5 * (away**2).sum()
 

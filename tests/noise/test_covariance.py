@@ -51,11 +51,9 @@ def _banded(flags, width, seed=5):
     for t in range(n_times):
         for w in range(min(width, t) + 1):
             band[t, w] = full[t, t - w]
-    entries = _entries(flags)
-    product_of, time_of = (np.array(x) for x in zip(*entries, strict=True))
+    product_of, time_of = (np.array(x) for x in zip(*_entries(flags), strict=True))
     by_hand = full[time_of[:, None], time_of[None], product_of[:, None], product_of[None]]
-    apart = np.abs(time_of[:, None] - time_of[None])
-    assert (by_hand[apart > width] == 0).all()
+    assert (by_hand[np.abs(time_of[:, None] - time_of[None]) > width] == 0).all()
     layout = DataLayout.from_flags(flags)
     return time_blocks.TimeBandedCovariance(jnp.asarray(band), layout, "the memory"), by_hand
 

@@ -95,8 +95,7 @@ def test_claims_have_every_column_filled(folder):
 
 @pytest.mark.long
 def test_a_real_run_at_tiny_size(tmp_path):
-    files = runs.run_paper(tmp_path, TINY).files
-    assert all(path.is_file() for path in files)
+    assert all(path.is_file() for path in runs.run_paper(tmp_path, TINY).files)
     require_conventions(tmp_path / "cases" / "fiducial.nc")
     rows = table_of(tmp_path / "cases.csv")
     assert float(rows[0]["rho_1"]) > 0.9  # one cycle knows the dipole
@@ -255,5 +254,4 @@ def synthetic(name: str, agrees: bool) -> xr.Dataset:
 def test_every_claim_can_come_out_both_ways(agrees):
     cases = {name: synthetic(name, agrees) for name in paper.CASES}
     verdicts = {claim.paper: claim.verdict(cases) for claim in CLAIMS}
-    wrong = {s: v for s, v in verdicts.items() if (v.agrees == "yes") != agrees}
-    assert not wrong
+    assert not {s: v for s, v in verdicts.items() if (v.agrees == "yes") != agrees}

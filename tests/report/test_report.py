@@ -192,8 +192,7 @@ def test_a_page_without_groups(tmp_path, monkeypatch):
     experiment = lb.build(made.result.scenario)
     (a, s, n), data = matrices(lb.infer(experiment).model), np.asarray(experiment.data.data)
     expected = data @ np.linalg.solve(a @ s @ a.T + n, data)
-    told = channel.instrument.chi2 + channel.judged.prior.chi2
-    assert told == pytest.approx(expected, rel=1e-4)
+    assert channel.instrument.chi2 + channel.judged.prior.chi2 == pytest.approx(expected, rel=1e-4)
     page = (made.folder / "report.html").read_text()
     assert "By product" not in page and made.result.verdict() in page
 
@@ -248,8 +247,7 @@ def in_browser(page: str, tmp_path, width: int, points) -> dict:
 def test_in_a_browser(which, width, request, tmp_path):
     folder = request.getfixturevalue(which)
     points = np.random.default_rng(3).uniform([0, -90], [360, 90], (300, 2))
-    page = (folder / "report.html").read_text()
-    found = in_browser(page, tmp_path, width, points)
+    found = in_browser((folder / "report.html").read_text(), tmp_path, width, points)
     assert found["errors"] == []
     assert found["width"] == width
     assert found["needed"] <= width

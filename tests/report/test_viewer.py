@@ -81,8 +81,7 @@ def test_pixels_and_equatorial_coordinates(page, small_map, tmp_path):
     lon, lat = rng.uniform(0, 360, 300), np.degrees(np.arcsin(rng.uniform(-1, 1, 300)))
     points = json.dumps(np.stack([lon, lat], 1).tolist())
     told = run_page(page, tmp_path, f"told.at = {points}.map((p) => viewer.at(...p));")["at"]
-    nside = small_map.result.channel.nside
-    expected = healpy.ang2pix(nside, lon, lat, lonlat=True)
+    expected = healpy.ang2pix(small_map.result.channel.nside, lon, lat, lonlat=True)
     np.testing.assert_array_equal([one["pixel"] for one in told], expected)
     icrs = SkyCoord(lon, lat, unit="deg", frame="galactic").icrs
     found = SkyCoord([x["ra"] for x in told], [x["dec"] for x in told], unit="deg")
@@ -186,8 +185,7 @@ def test_channels_of_the_page_are_those_of_the_files(small_cube, tmp_path):
     # the slider, and every selector of the page, choose the channel that is told of
     assert told["hidden"] == [True, True, False] and told["chosen"] == [1, 1]
     assert told["shown"] == [False, True, False]
-    nside = small_cube.result.scenario.map_nside
-    pixels = healpy.ang2pix(nside, lon, lat, lonlat=True)
+    pixels = healpy.ang2pix(small_cube.result.scenario.map_nside, lon, lat, lonlat=True)
     for name in ("mean", "std", "truth"):
         cube = fits.getdata(small_cube.folder / f"{name}.fits")
         step = np.ptp(cube, axis=1) / 65535
@@ -235,8 +233,7 @@ def test_maps_that_do_not_go_together_are_refused():
 
 def test_a_sky_below_zero_has_a_linear_scale():
     maps = {"mean": np.linspace(-2.0, -1.0, 24).reshape(2, 12), "std": np.ones((2, 12))}
-    made = viewer([10.0, 20.0], maps, highest_altitude=np.ones(12))
-    for scale in made["scales"]["temperature"]:
+    for scale in viewer([10.0, 20.0], maps, highest_altitude=np.ones(12))["scales"]["temperature"]:
         assert not scale["log"] and -2.0 <= scale["low"] < scale["high"] <= -1.0
 
 

@@ -51,8 +51,7 @@ NOISES = {
 @pytest.mark.parametrize("noise", NOISES.values(), ids=list(NOISES))
 def test_likelihoods_of_draws_are_those_of_matrices(noise):
     made, channel = mapped(small_experiment("output.draws=4", *noise))
-    data = made.experiment.data.data
-    expected = dense_log_likelihood(made.own.model, data, channel.draws)
+    expected = dense_log_likelihood(made.own.model, made.experiment.data.data, channel.draws)
     # data of 1e5 standard deviations
     np.testing.assert_allclose(channel.log_likelihood, expected, atol=1e-6)
     assert len(expected) == 4 and np.ptp(expected) > 0.1
@@ -61,8 +60,7 @@ def test_likelihoods_of_draws_are_those_of_matrices(noise):
 def test_arviz_opens_a_posterior(small_cube):
     """With the groups and dimensions of ArviZ, and the likelihood of every channel's draws."""
     tree = posterior_of(small_cube.folder)
-    groups = {"posterior", "log_likelihood", "observed_data", "constant_data"}
-    assert groups == set(tree.children)
+    assert {"posterior", "log_likelihood", "observed_data", "constant_data"} == set(tree.children)
     sky, result = tree["posterior"]["sky"], small_cube.result
     assert sky.dims == ("chain", "draw", "frequency", "mode") and sky.shape == (1, 3, 3, 25)
     np.testing.assert_array_equal(sky["frequency"], [20.0, 25.0, 30.0])
@@ -149,8 +147,7 @@ def test_they_are_named_wherever_the_verdict_is(found):
 
 def test_as_in_a_map_of_its_own(bad, found):
     scenario, data = bad
-    channel = scenario.channels()[1]
-    _, expected = mapped(lb.build(channel, data[1]))
+    _, expected = mapped(lb.build(scenario.channels()[1], data[1]))
     here, there = found.result.channels[1].judged, expected.judged
     assert here.suspects == there.suspects and here.level == there.level
     np.testing.assert_allclose(here.z, there.z, rtol=0, atol=1e-6)
@@ -163,8 +160,7 @@ def test_every_channel_is_judged_if_that_is_asked_for(bad, tmp_path, numbers_alo
     assert [c.judged is None for c in result.channels] == [False] * 3
     assert [c.judged.level for c in result.channels] == ["consistent", "does not fit", "consistent"]
     assert all(c.diagnosis is not None for c in result.channels)
-    posterior = posterior_of(tmp_path / "run")
-    np.testing.assert_array_equal(posterior["mean"], result.stacked("mean"))
+    np.testing.assert_array_equal(posterior_of(tmp_path / "run")["mean"], result.stacked("mean"))
 
 
 def test_modes_that_the_prior_knows_exactly_can_have_earlier_data():
@@ -177,8 +173,7 @@ def test_modes_that_the_prior_knows_exactly_can_have_earlier_data():
     data = experiment.data
     other = replace(experiment, data=replace(data, data=data.data + 1e-9 * jnp.abs(data.data)))
     first = conditioned(other)
-    earlier = SavedInformation(first.information, first.digests)
-    made, channel = mapped(experiment, earlier)
+    made, channel = mapped(experiment, SavedInformation(first.information, first.digests))
     assert (channel.std[9:16] == 0).all() and (channel.mean[9:16] == 0).all()
     expected = first.information + conditioned(experiment).information
     np.testing.assert_allclose(channel.std, expected.posterior(setup.prior).std(), rtol=1e-4)
@@ -206,8 +201,7 @@ def test_covariances_of_every_channel_are_kept(kind, tmp_path, numbers_alone):
     for channel in run.result.channels:
         assert channel.judged.level == "consistent" and channel.diagnosis is not None
     # what is written is read back
-    again = FinishedRun.read(run.folder).channels
-    for here, there in zip(run.result.channels, again, strict=True):
+    for here, there in zip(run.result.channels, FinishedRun.read(run.folder).channels, strict=True):
         assert here.judged.suspects == there.judged.suspects
         assert repr(here.judged.groups) == repr(there.judged.groups)  # with NaN
         assert here.diagnosis == there.diagnosis and here.coverage == there.coverage
@@ -242,8 +236,7 @@ def test_the_channel_is_that_of_matrices(dense):
     centred = centred if model.offset is None else centred - np.asarray(model.offset)
     k = a @ s @ a.T + n
     # K spans ten orders of magnitude
-    total = centred @ np.linalg.solve(k, centred)
-    np.testing.assert_allclose(channel.chi2_model, total, rtol=1e-4)
+    np.testing.assert_allclose(channel.chi2_model, centred @ np.linalg.solve(k, centred), rtol=1e-4)
     parts = channel.instrument.chi2 + channel.judged.prior.chi2
     np.testing.assert_allclose(parts, channel.chi2_model, rtol=1e-6)
     # shares of the prior, the monopole taken for known
@@ -266,6 +259,5 @@ def test_its_resolution_is_packed(dense):
     scale = width[:, None] / width[None]
     found = details.resolution * steps * scale
     s = np.asarray(made.own.model.prior.covariance())
-    covariance = np.asarray(made.found.posterior.covariance())
-    exact = np.eye(len(s)) - covariance @ np.linalg.inv(s)
+    exact = np.eye(len(s)) - np.asarray(made.found.posterior.covariance()) @ np.linalg.inv(s)
     assert (np.abs(found - exact) <= 0.51 * steps * scale).all()

@@ -35,8 +35,7 @@ def compare(found: Coverage, truth, draws):
     expected, drawn = by_hand(truth), np.array([by_hand(draw) for draw in draws])
     assert found.n == len(truth)
     np.testing.assert_allclose([*found.held, found.rms, found.largest], expected, rtol=1e-12)
-    scatter = drawn.std(0)
-    np.testing.assert_allclose([*found.scatter, found.rms_scatter], scatter[:5], rtol=1e-9)
+    np.testing.assert_allclose([*found.scatter, found.rms_scatter], drawn.std(0)[:5], rtol=1e-9)
     assert found.allowed == pytest.approx(np.quantile(drawn[:, 5], 0.95))
 
 
@@ -49,8 +48,7 @@ def test_pixels_are_counted_by_latitude():
     found = Counts.of_pixels(std, error, draws).coverage()
     names = ["|b| < 10 deg", "|b| 10 to 30 deg", "|b| > 30 deg", "whole sky"]
     assert [part.name for part in found] == names
-    bands = [(0, 10), (10, 30), (30, 90), (0, 90)]
-    for part, (low, high) in zip(found, bands, strict=True):
+    for part, (low, high) in zip(found, [(0, 10), (10, 30), (30, 90), (0, 90)], strict=True):
         here = [k for k in range(len(b)) if low <= abs(b[k]) < high]
         compare(part, pull[here], [draw[here] for draw in drawn])
         assert from_tree(Coverage, to_tree(part), "a file") == part
@@ -65,12 +63,10 @@ def ensemble():
     prior = 3.0 / (1.0 + ell)
     # data that know the north better than the south, and large scales better than small ones
     y = pixel_matrix(4, LMAX)
-    north = np.arange(len(y)) < len(y) // 3
-    a = y[north] / 0.2
+    a = y[np.arange(len(y)) < len(y) // 3] / 0.2
     covariance = np.linalg.inv(a.T @ a + np.diag(prior**-2.0))
     root = np.linalg.cholesky(covariance)
-    on_map = pixel_matrix(NSIDE, LMAX)
-    std = np.sqrt(((on_map @ root) ** 2).sum(1))
+    std = np.sqrt(((pixel_matrix(NSIDE, LMAX) @ root) ** 2).sum(1))
 
     def coverage():
         sky = prior * rng.standard_normal(N_MODES)
@@ -147,8 +143,7 @@ def test_strengths_are_squares_over_what_is_expected():
     found = strengths(sky, of_modes, of_pixels)
     assert found["ell 5 to 6"] == pytest.approx((sky[25:] ** 2).sum() / of_modes[25:].sum())
     pixels = pixel_matrix(NSIDE, LMAX)[:, 1:] @ sky[1:]
-    height = np.arange(12 * NSIDE**2)
-    cap = height < 100  # |b| > 30 degrees holds the whole cap
+    cap = np.arange(12 * NSIDE**2) < 100  # |b| > 30 degrees holds the whole cap
     assert found["|b| > 30 deg"] > (pixels[cap] ** 2).sum() / of_pixels.sum()
     bands = ["|b| < 10 deg", "|b| 10 to 30 deg", "|b| > 30 deg"]
     assert list(found) == [*bands, "ell 1 to 4", "ell 5 to 6"]

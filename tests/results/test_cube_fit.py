@@ -95,13 +95,11 @@ def test_chi2_of_a_channel_is_that_of_its_data_under_the_model(small_cube):
     run = small_cube.result
     for channel, scenario in zip(run.channels, run.scenario.channels(), strict=True):
         experiment = lb.build(scenario)
-        model = full_model(experiment.setup)
-        (a, s, n), d = matrices(model), np.asarray(experiment.data.data)
+        (a, s, n), d = matrices(full_model(experiment.setup)), np.asarray(experiment.data.data)
         sky = a @ s @ a.T
         assert channel.chi2_model == pytest.approx(d @ np.linalg.solve(sky + n, d), rel=1e-4)
         # what no sky explains, with a prior that is wide by hand
-        wide = WIDER**2 * sky + n
-        expected = d @ np.linalg.solve(wide, d)
+        expected = d @ np.linalg.solve(WIDER**2 * sky + n, d)
         assert channel.instrument.chi2 == pytest.approx(expected, abs=0.02 * expected)
     fits = run.fits()
     total, n_data = (sum(getattr(c, k) for c in run.channels) for k in ("chi2_model", "n_data"))
@@ -121,8 +119,7 @@ def test_a_joint_run_is_judged(tmp_path):
     scenario = lb.load_scenario("fiducial", [*sizes, "joint=true", "spectral.residual=0.1"])
     run = lb.run_map(scenario, tmp_path / "joint").result
     alone = sum(channel.instrument.chi2 for channel in run.channels)
-    rest = run.fits().rest
-    assert rest.chi2 + alone == pytest.approx(run.joint.chi2)
+    assert run.fits().rest.chi2 + alone == pytest.approx(run.joint.chi2)
     # the instrument is judged as in channels of their own
     own = lb.run_map(lb.load_scenario("fiducial", sizes), tmp_path / "own").result
     np.testing.assert_allclose(run.fits().chi2, own.fits().chi2, rtol=1e-6)

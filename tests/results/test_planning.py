@@ -50,8 +50,7 @@ def simulated(variation):
     solver = model.factorise()
     skies = model.prior.sample(jax.random.key(3), N_SETS)
     signals = skies @ model.coupling.dense().T
-    keys = jax.random.split(jax.random.key(4), N_SETS)
-    noise = map(model.noise.sample, keys)
+    noise = map(model.noise.sample, jax.random.split(jax.random.key(4), N_SETS))
     posteriors = [solver.condition(s + n).posterior for s, n in zip(signals, noise, strict=True)]
     means = np.stack([np.asarray(p.mean) for p in posteriors])
     return model, posteriors[0], np.asarray(skies), means
@@ -102,16 +101,14 @@ def textbook(variation, keep=None):
 
 def assert_forecast_is(found, a, s, n):
     """Against the data-space evidence ratio and the generalised eigenvalues of (S, C)."""
-    root = np.linalg.cholesky(n)
-    w = np.linalg.solve(root, a) * np.sqrt(np.diag(s))
+    w = np.linalg.solve(np.linalg.cholesky(n), a) * np.sqrt(np.diag(s))
     nats = 0.5 * np.linalg.slogdet(np.eye(len(w)) + w @ w.T)[1]
     # w w^T squares the signal-to-noise ratio, 1e5: eps x 1e10 x 100 directions
     assert found.information_bits == pytest.approx(nats / np.log(2.0), abs=1e-3)
     c = np.linalg.inv(w.T @ w + np.eye(w.shape[1])) * np.sqrt(np.outer(np.diag(s), np.diag(s)))
     # (S - C) x = lambda C x
     ratios = scipy.linalg.eigh(s - c, s, eigvals_only=True)
-    ratios = ratios / (1.0 - ratios)
-    assert found.modes == (ratios > 1.0).sum()
+    assert found.modes == (ratios / (1.0 - ratios) > 1.0).sum()
     known, left = (sum_over_m(np.diag(x)) for x in (s - c, c))
     np.testing.assert_allclose(found.snr_squared, known / left, rtol=1e-5)
 

@@ -83,8 +83,7 @@ def solved(dense: DenseChannels, used: tuple[int, ...]) -> Answer:
     every = (block_diag(*own), np.concatenate(dense.noise), np.concatenate(dense.rest))
     rows, noise, rest = (x[taken] for x in every)
     white = white_posterior(rows @ unmixed, np.ones(n * size), noise, rest)
-    covariance = unmixed @ white.covariance @ unmixed.T
-    return Answer(unmixed @ white.mean, covariance, white.log_prob)
+    return Answer(unmixed @ white.mean, unmixed @ white.covariance @ unmixed.T, white.log_prob)
 
 
 def part(k: int, sky: bool = True) -> slice:
@@ -101,8 +100,7 @@ def test_skies_and_evidence_are_those_of_one_normal_equation(cube, dense, expect
         bits = np.log2(dense.prior[k]).sum() - 0.5 * np.linalg.slogdet(covariance)[1] / np.log(2)
         assert channel.information_bits == pytest.approx(bits, abs=N_MODES * ROUNDING)
     assert cube.log_evidence == pytest.approx(expected.log_prob, rel=ROUNDING)
-    alone = sum(channel.log_evidence for channel in cube.channels)
-    assert abs(cube.log_evidence - alone) > 0.1
+    assert abs(cube.log_evidence - sum(channel.log_evidence for channel in cube.channels)) > 0.1
     # other channels do tell: each channel's own posterior would be seen
     own = solved(dense, (1,))
     assert (own.std / expected.std)[part(1)].max() > 1.05
@@ -170,8 +168,7 @@ def test_simulated_receivers_have_the_covariance(response_file):
     setup, n_seeds = set_up(scenario.channels()[0]), 150
     values = np.zeros((n_seeds, 3, N_PORTS))
     for seed in range(n_seeds):
-        channels = scenario.model_copy(update={"seed": 10 * seed}).channels()
-        for k, channel in enumerate(channels):
+        for k, channel in enumerate(scenario.model_copy(update={"seed": 10 * seed}).channels()):
             truth = true_values(replace(setup, scenario=channel))
             mean = 20000.0 * (channel.frequency_mhz / 10.0) ** -2
             powers = np.array([truth[f"receiver_{port}_k"] for port in range(N_PORTS)])
@@ -267,8 +264,7 @@ def test_in_a_joint_posterior_they_are_those_of_all_skies_and_unknowns_together(
     response_file, tmp_path
 ):
     """Every sky and every unknown as one Gaussian in NumPy."""
-    spectral = "spectral.components=[power_law]"
-    given = (*PLAIN, "joint=true", spectral)
+    given = (*PLAIN, "joint=true", "spectral.components=[power_law]")
     scenario = cube_of(response_file, *given, frequencies="[15, 20, 25]")
     channels = map_channels(scenario, tmp_path)
     prior = channels.joint.prior
@@ -286,8 +282,7 @@ def test_in_a_joint_posterior_they_are_those_of_all_skies_and_unknowns_together(
     table = channels.unknowns.table
     scale, own = table["prior_std"].to_numpy(), slice(4 * N_MODES, None)
     std = scale * expected.std[own]
-    off = (table["value"] - table["prior"] - scale * expected.mean[own]) / std
-    assert np.abs(off).max() < 1e-4
+    assert np.abs((table["value"] - table["prior"] - scale * expected.mean[own]) / std).max() < 1e-4
     np.testing.assert_allclose(table["std"], std, rtol=1e-4)
     np.testing.assert_allclose(table["true"], alone["true"], rtol=1e-12)
     # other channels do tell: the test would see a table of each channel's own data

@@ -35,8 +35,7 @@ def test_what_a_run_leaves(finished, capsys):
     assert [one["name"] for one in found["priors"]] == PRIORS
     best = max(found["priors"], key=lambda one: one["log_evidence"])
     assert found["best"] == best["name"] and best["name"] in found["verdict"]
-    rows = table_of(finished / "priors.csv")
-    for row, one in zip(rows, found["priors"], strict=True):
+    for row, one in zip(table_of(finished / "priors.csv"), found["priors"], strict=True):
         assert row["prior"] == one["name"]
         assert float(row["log_evidence"]) == one["log_evidence"]
         assert float(row["day_log_density"]) == one["held_out"][1]["log_density"]
@@ -71,8 +70,7 @@ def test_it_is_what_separate_maps_find(finished):
 @pytest.mark.long
 def test_data_of_a_prior_prefer_it(name, tmp_path):
     """A sky drawn from a prior; its mean is the model's, since antennas are warm."""
-    scenario = small_scenario(**SIZES)
-    setup = set_up(scenario).with_prior(NAMED[name])
+    setup = set_up(small_scenario(**SIZES)).with_prior(NAMED[name])
     sky = np.array(setup.prior.sample(jax.random.key(11)))
     sky[0] = setup.sky.modes[0]
     path = write_alms(tmp_path / "sky.fits", sky, {})

@@ -75,8 +75,7 @@ def runs(tmp_path_factory):
     whole, killed = base / "whole", base / "killed"
     process = start(killed)
     # three files of draws, out of forty
-    chunk = f"chunk-{SAMPLER.warmup + 3 * CHUNK:08d}.npz"
-    killer = executioner(process, killed / "chains" / chunk)
+    killer = executioner(process, killed / "chains" / f"chunk-{SAMPLER.warmup + 3 * CHUNK:08d}.npz")
     try:
         assert run("sample", *SMALL, *SETTINGS, "-q", "-o", whole) == 0
         assert killer.wait() == 0, process.communicate()[1]
@@ -162,8 +161,7 @@ def test_a_killed_run_resumes_to_the_draws_of_an_undisturbed_one(killed, tree, m
 
     monkeypatch.setattr(hmc.Checkpoints, "append", spy)
     assert run("sample", *SMALL, *SETTINGS, "-q", "-o", killed, "--resume") == 0
-    total = SAMPLER.warmup + SAMPLER.draws
-    assert written == list(range(max(before) + CHUNK, total + 1, CHUNK))
+    assert written == list(range(max(before) + CHUNK, SAMPLER.warmup + SAMPLER.draws + 1, CHUNK))
     assert all(untouched)
     assert_same_trees(read_datatree(killed / "samples.nc"), tree)
     assert not (killed / "chains").exists()
@@ -207,8 +205,7 @@ def test_resuming_a_finished_run_takes_it_over(whole, tree, no_sampling):
     summary = pd.read_csv(whole / "summary.csv", index_col="quantity")
     assert run("sample", *SMALL, *SETTINGS, "-q", "-o", whole, "--resume") == 0
     assert_same_trees(read_datatree(whole / "samples.nc"), tree)
-    after = content(whole)
-    assert set(after) == set(before)
+    assert set(content(whole)) == set(before)
     # draws that lie in memory in another order are summed in another order
     again = pd.read_csv(whole / "summary.csv", index_col="quantity")
     pd.testing.assert_frame_equal(again, summary, check_exact=False, rtol=1e-6)
@@ -236,8 +233,7 @@ def test_sample_writes_what_it_promises(runs):
     figures = {"uncertainty", "traces", "ranks", "energy", "pairs", "against_analytic"}
     assert {p.stem for p in (whole / "figures").iterdir()} == figures
     assert_drawn(*(whole / "figures").iterdir())
-    expected = lb.load_scenario("fiducial", OVERRIDES)
-    assert lb.load_scenario(whole / "scenario.yaml") == expected
+    assert lb.load_scenario(whole / "scenario.yaml") == lb.load_scenario("fiducial", OVERRIDES)
 
 
 def maps_of(folder, *names):
@@ -249,8 +245,7 @@ def test_the_maps_are_those_of_the_draws(runs, tree):
     skies = tree["posterior"]["sky"].values.reshape(-1, N_MODES)
     assert len(skies) == SAMPLER.chains * SAMPLER.draws
     mean, std, lower, upper = maps_of(runs[0], "mean", "std", "lower", "upper")
-    synthesis = np.stack([modes_to_map(mode, NSIDE) for mode in np.eye(N_MODES)])
-    values = skies @ synthesis
+    values = skies @ np.stack([modes_to_map(mode, NSIDE) for mode in np.eye(N_MODES)])
     # rounding of sums of 49 terms that cancel in part
     np.testing.assert_allclose(mean, values.mean(0), rtol=1e-9)
     np.testing.assert_allclose(std, values.std(0, ddof=1), rtol=1e-8)
@@ -319,14 +314,12 @@ def test_programs_without_the_sky_get_their_maps_too(program, tmp_path):
     others = set(tree["posterior"].data_vars) - {"sky"}
     expected = {"sky_marginal": {"noise_level"}, "prior_amplitude": {"amplitude", "tilt"}}
     assert others == expected[program]
-    table = pd.read_csv(out / "summary.csv", index_col="quantity")
-    assert expected[program] <= set(table.index)
+    assert expected[program] <= set(pd.read_csv(out / "summary.csv", index_col="quantity").index)
     skies = tree["posterior"]["sky"].values.reshape(-1, N_MODES)
     (mean,) = maps_of(out, "mean")
     np.testing.assert_allclose(mean, modes_to_map(skies.mean(0), NSIDE), rtol=1e-9)
     # the truth within six posterior deviations in every mode
-    off = (skies.mean(0) - tree["constant_data"]["truth"].values) / skies.std(0)
-    assert np.abs(off).max() < 6
+    assert np.abs((skies.mean(0) - tree["constant_data"]["truth"].values) / skies.std(0)).max() < 6
 
 
 # ---- validation of the same draws
@@ -394,8 +387,7 @@ def test_half_the_covariance_is_found_out_with_exit_code_1(validated, tmp_path, 
         found = sample_result(*args, **options)
         posterior = found.inference.posterior
         half = eqx.tree_at(lambda p: p.lower, posterior, np.sqrt(2) * posterior.lower)
-        ratio = half.covariance() / posterior.covariance()
-        np.testing.assert_allclose(ratio, 0.5, rtol=1e-6)
+        np.testing.assert_allclose(half.covariance() / posterior.covariance(), 0.5, rtol=1e-6)
         solution = replace(found.inference.solution, posterior=half)
         return replace(found, inference=replace(found.inference, solution=solution))
 

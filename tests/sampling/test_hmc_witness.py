@@ -16,7 +16,6 @@ import lusee_bayes as lb
 from lusee_bayes.linear.linear_gaussian import InMap
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.noise.covariance import DenseCovariance
-from lusee_bayes.sampling.hmc import Sampler, Whitening, sample
 from lusee_bayes.sampling.validation import Comparison, validate_draws
 from lusee_bayes.sky.prior import DensePrior, Prior
 
@@ -38,8 +37,8 @@ class Witness:
         program = lb.load_program("sky")
         arguments = {**program.arguments(self.model), "data": self.data.data}
         # of the seeds 0 to 3, with gains, 0 is one of the false alarms that are stated
-        sampler, white = Sampler(draws=2000, seed=2), Whitening.of(self.posterior)
-        self.chains = sample(program.model, arguments, sampler, white)
+        sampler, white = lb.Sampler(draws=2000, seed=2), lb.Whitening.of(self.posterior)
+        self.chains = lb.sample(program.model, arguments, sampler, white)
 
     def judge(self, posterior: Posterior) -> Comparison:
         diverging, energy = (self.chains.statistics[name] for name in ("diverging", "energy"))

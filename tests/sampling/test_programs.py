@@ -81,8 +81,7 @@ def test_the_text_that_was_digested_is_the_one_that_runs(write, monkeypatch, byt
     """Edits within one second and of the same length: bytecode caches cannot tell them apart."""
     monkeypatch.setattr(sys, "dont_write_bytecode", not bytecode)
     for i in range(4):
-        program = lb.load_program(write(f"def model(data=None):\n    return {i}\n"))
-        assert program.model() == i
+        assert lb.load_program(write(f"def model(data=None):\n    return {i}\n")).model() == i
 
 
 def test_a_program_may_hold_dataclasses_and_modules(write):
@@ -112,8 +111,7 @@ def test_a_program_has_its_own_future_imports_only(write):
 
 
 def test_no_such_program(tmp_path):
-    missing = tmp_path / "missing.py"
-    for source in ("sky_margnal", missing, tmp_path):
+    for source in ("sky_margnal", tmp_path / "missing.py", tmp_path):
         with refused("no program") as error:
             lb.load_program(source)
         assert str(source) in str(error.value) and "sky_marginal" in str(error.value)
@@ -216,23 +214,14 @@ def collapsed(gaussian, tmp_path_factory):
     path.write_text(OFFSET_PROGRAM)
     s, n = np.diag(SPECTRUM[ELL_OF_MODE]), np.asarray(gaussian.noise.dense())
     steeper = 2.5 * ((ELL_OF_MODE + 1.0) / 10.0) ** -0.6
-    return {
-        "prior_amplitude": (
-            lb.load_program("prior_amplitude"),
-            {"amplitude": 2.5, "tilt": -0.6},
-            s * steeper,
-            n,
-            0.0,
-        ),
-        "sky_marginal": (lb.load_program("sky_marginal"), {"noise_level": 0.4}, s, 0.4 * n, 0.0),
-        "offset": (
-            lb.load_program(path),
-            {"slope": 1.5, "gains": np.array([0.5, 1.2]), "total": 1.7},
-            s,
-            1.7 * n,
-            1.5 * OFFSET,
-        ),
+    values = {"slope": 1.5, "gains": np.array([0.5, 1.2]), "total": 1.7}
+    made = {
+        "prior_amplitude": ({"amplitude": 2.5, "tilt": -0.6}, s * steeper, n, 0.0),
+        "sky_marginal": ({"noise_level": 0.4}, s, 0.4 * n, 0.0),
+        path: (values, s, 1.7 * n, 1.5 * OFFSET),
     }
+    loaded = {source: lb.load_program(source) for source in made}
+    return {program.name: (program, *made[source]) for source, program in loaded.items()}
 
 
 each = pytest.mark.parametrize("name", ["prior_amplitude", "sky_marginal", "offset"])
@@ -255,8 +244,7 @@ def test_replicated_data_are_the_skies_seen_with_new_noise(gaussian, collapsed, 
     program, values, _, n, offset = collapsed[name]
     sky, data = (np.asarray(x) for x in gaussian.sample(jax.random.key(6)))
     skies = np.broadcast_to(sky, (2, 5000, 9))
-    arguments = program.arguments(gaussian)
-    given = program, arguments, data, repeated(values), jax.random.key(7)
+    given = program, program.arguments(gaussian), data, repeated(values), jax.random.key(7)
     seen = programs.collapsed_draws(*given, skies)
     assert seen.shape == (2, 5000, N_DATA)
     mean = np.asarray(gaussian.coupling.dense()) @ sky + offset
@@ -325,8 +313,7 @@ BAD = {
 def pieces():
     scenario = lb.load_scenario("fiducial", ["lmax=2", "observation.runs.0.cycles=0.05"])
     experiment = lb.build(scenario)
-    model = lb.infer(experiment).model
-    return model, program_pieces(experiment), experiment.data.data
+    return lb.infer(experiment).model, program_pieces(experiment), experiment.data.data
 
 
 def check(path, pieces):

@@ -15,7 +15,6 @@ from scipy.stats import multivariate_normal, norm
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.runs.sample_run import run_sample
 from lusee_bayes.sampling.hmc import Chains
 from lusee_bayes.sampling.programs import numpyro_promotion
 from lusee_bayes.sampling.shared_sites import SharedSites, of_channel
@@ -73,17 +72,12 @@ def test_a_channel_has_its_own_names():
     assert of_channel(chains, "18MHz").sites == {"sky": np.zeros(1)}
 
 
-SCENARIO = {
-    "frequencies_mhz": [10.0, 25.0],
-    "lmax": 2,
-    "seed": 3,
-    "prior": {"model": "isotropic"},
-    "observation": {
-        "runs": [{"cycles": 0.25}, {"cycles": 0.25, "turntable_deg": 40.0}],
-        "step_s": 43200.0,
-    },
-}
-POWERS = {"power_k": 2e4, "relative_std": 0.1, "smooth_octaves": 1.0}
+SCENARIO = (
+    *("frequencies_mhz=[10, 25]", "lmax=2", "seed=3", "prior={model: isotropic}"),
+    "observation={runs: [{cycles: 0.25}, {cycles: 0.25, turntable_deg: 40}], step_s: 43200}",
+    "noise.pointing={clock_s: 20, treatment: %s}",
+    "noise.receiver={power_k: 2e4, relative_std: 0.1, smooth_octaves: 1, treatment: %s}",
+)
 
 
 @pytest.mark.long
@@ -93,23 +87,15 @@ def test_channels_that_share_what_is_sampled_are_sampled_together(tmp_path):
     600 draws or more of every unknown: means to 0.2 and widths to 0.15 of a width are five errors.
     """
     sampled, mapped = (
-        Scenario.model_validate(
-            SCENARIO
-            | {
-                "noise": {
-                    "pointing": {"clock_s": 20.0, "treatment": treatment},
-                    "receiver": {**POWERS, "treatment": treatment},
-                }
-            }
-        )
+        lb.load_scenario(Scenario(), [text.replace("%s", treatment) for text in SCENARIO])
         for treatment in ("sampled", "marginalised")
     )
     sampler = lb.Sampler(chains=4, warmup=50, draws=250, seed=1)
-    drawn = run_sample(sampled, tmp_path / "sampled", sampler=sampler).result
+    drawn = lb.run_sample(sampled, tmp_path / "sampled", sampler=sampler).result
     clocks = [one.tree["posterior"]["clock_s"].values for one in drawn]
     np.testing.assert_array_equal(clocks[0], clocks[1])
     assert not (tmp_path / "sampled" / "chains").exists()
-    again = run_sample(sampled, tmp_path / "sampled", sampler=sampler, resume=True).result
+    again = lb.run_sample(sampled, tmp_path / "sampled", sampler=sampler, resume=True).result
     channels = lb.run_map(mapped, tmp_path / "mapped").result.channels
     for one, channel in zip(again, channels, strict=True):
         table, found = channel.theta.corner.set_index("unknown"), one.summary

@@ -73,8 +73,7 @@ def test_batches_and_draws(gaussian):
 def strong_sky(coupling, offset, prior, fixed_noise, data=None):
     """A program whose prior, noise and coupling are not those that the whitening was made with."""
     amplitude = numpyro.sample("amplitude", dist.LogNormal(0.0, 0.5))
-    scaled = lb.HarmonicPrior(prior.spectrum * amplitude)
-    sky = numpyro.sample("sky", lb.SkyPrior(scaled))
+    sky = numpyro.sample("sky", lb.SkyPrior(lb.HarmonicPrior(prior.spectrum * amplitude)))
     seen = coupling @ sky + offset
     numpyro.sample("data", lb.CorrelatedNormal(seen + 0.1 * seen**2, fixed_noise), obs=data)
 
@@ -130,11 +129,9 @@ def test_the_density_of_z_is_the_programs_own_times_the_determinant(gaussian, ca
     wrong = eqx.tree_at(lambda w: (w.root, w.log_det), wrong, twice)
     for model, others in [(program("sky"), {}), (strong_sky, {"amplitude": jnp.asarray(1.7)})]:
         for whitening in (right, wrong):
-            sky = whitening.mean + whitening.root @ z
-            plain = joint(model, arguments, {"sky": sky, **others})
+            plain = joint(model, arguments, {"sky": whitening.mean + whitening.root @ z, **others})
             expected = plain + np.linalg.slogdet(np.asarray(whitening.root))[1]
-            model_of_z = whitened(model, whitening)
-            got = joint(model_of_z, arguments, {"sky_white": z, **others})
+            got = joint(whitened(model, whitening), arguments, {"sky_white": z, **others})
             # terms up to 1e4, summed in another order: 1e4 x 10 x eps
             assert got == pytest.approx(expected, abs=1e-11, rel=1e-13)
             # and the determinant is not a detail
@@ -145,8 +142,7 @@ def test_z_is_standard_normal_where_the_coordinates_are_the_posteriors(gaussian,
     """p(d, m) |dm/dz| = p(d) N(z; 0, 1), with the evidence by scipy."""
     arguments, whitening = case
     a, s, n = matrices(gaussian)
-    covariance = a @ s @ a.T + n
-    evidence = multivariate_normal(cov=covariance).logpdf(arguments["data"])
+    evidence = multivariate_normal(cov=a @ s @ a.T + n).logpdf(arguments["data"])
     for factor in (0.0, 1.0, -5.0):
         at = factor * np.asarray(z)
         expected = evidence + multivariate_normal(cov=np.eye(9)).logpdf(at)

@@ -113,15 +113,13 @@ def test_straight_coordinates_are_one_to_one_with_the_determinant_they_say(learn
     covariance = np.array([[0.04, 0.01], [0.01, 0.09]]) if learned else None
     found = replace(mode(), power_law=power_law, covariance=covariance)
     coordinates = ln.straight_coordinates(found)
-    n = coordinates.root.shape[0]
-    z = jax.random.normal(jax.random.key(3), (n,), dtype=jnp.float64)
+    z = jax.random.normal(jax.random.key(3), (coordinates.root.shape[0],), dtype=jnp.float64)
     x = coordinates.mean + coordinates.root @ z
 
     @jax.jit
     def flat(x):
         values, log_det = coordinates.to_values(x)
-        parts = [values[name].reshape(-1) for name in coordinates.names]
-        return jnp.concatenate(parts), log_det
+        return jnp.concatenate([values[name].reshape(-1) for name in coordinates.names]), log_det
 
     values, log_det = flat(x)
     assert float(jnp.abs(values - x).max()) > 1e-3
@@ -157,8 +155,7 @@ def test_the_learned_spectrum_has_the_highest_evidence_and_its_curvature():
     centre, std = np.array([np.log(0.02), TILTED]), np.array([0.7, 0.5])
 
     def log_posterior(theta):
-        sky = prior.sky.with_power_law(np.exp(theta[0]), theta[1])
-        there = ln.find_mode(sky, information())
+        there = ln.find_mode(prior.sky.with_power_law(np.exp(theta[0]), theta[1]), information())
         of_data = -0.5 * (float(there.information.misfit) + there.white @ there.white)
         of_data -= np.log(np.diagonal(there.lower)).sum()
         return of_data - 0.5 * (((theta - centre) / std) ** 2).sum()

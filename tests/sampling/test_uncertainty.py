@@ -31,8 +31,7 @@ def gaussian():
 @pytest.fixture(scope="module")
 def skies(gaussian):
     """Independent draws, as if of four chains."""
-    draws = gaussian[0].sample(jax.random.key(1), N)
-    return np.asarray(draws).reshape(N_CHAINS, N_DRAWS, N_MODES)
+    return np.asarray(gaussian[0].sample(jax.random.key(1), N)).reshape(N_CHAINS, N_DRAWS, N_MODES)
 
 
 def pixel_posterior(answer):
@@ -48,8 +47,7 @@ def test_mean_and_standard_deviation_of_pixels(gaussian, skies):
     n_pixels = healpy.nside2npix(NSIDE)
     # the mean of N draws scatters by std / sqrt(N), their standard deviation by std / sqrt(2 N)
     found = pixel_statistics(skies, NSIDE)
-    z = (found["mean"] - mean) / (std / np.sqrt(N))
-    assert np.abs(z).max() < z_of(n_pixels)
+    assert np.abs((found["mean"] - mean) / (std / np.sqrt(N))).max() < z_of(n_pixels)
     for expected in (std, np.asarray(posterior.std_of(pixel_matrix(NSIDE, LMAX)))):
         assert np.abs(found["std"] / expected - 1).max() < z_of(n_pixels) / np.sqrt(2 * N)
 
@@ -141,5 +139,4 @@ def test_the_summary_has_a_row_for_each_quantity_with_its_own_numbers(gaussian, 
 
 def test_the_summary_of_many_short_chains_warns_of_nothing():
     """More chains than draws is unusual, not wrong."""
-    draws = np.random.default_rng(0).normal(size=(8, 6))
-    assert list(summary({"x": draws}).index) == ["x"]
+    assert list(summary({"x": np.random.default_rng(0).normal(size=(8, 6))}).index) == ["x"]

@@ -196,8 +196,7 @@ def test_an_overall_variance_off_by_a_twentieth_fails_in_the_mean_eigenvalue(tru
     has an error of sqrt(2 / 32000) = 0.8 %; the margin is six of them.
     """
     wrong = wrong_posterior(truth.mean, truth.covariance / 1.07)
-    found = judge(*truth.draws(3, "independent"), wrong)
-    assert failed(found) == {"covariance, mean"}
+    assert failed(judge(*truth.draws(3, "independent"), wrong)) == {"covariance, mean"}
 
 
 # --- chains that failed -----------------------------------------------------------------------
@@ -207,8 +206,7 @@ def test_one_divergence_is_enough(truth):
     draws, energy = truth.draws(5)
     diverging = np.zeros((CHAINS, DRAWS), bool)
     diverging[2, 17] = True
-    found = judge(draws, energy, truth.posterior, diverging)
-    assert failed(found) == {"divergences"}
+    assert failed(judge(draws, energy, truth.posterior, diverging)) == {"divergences"}
     assert judge(draws, energy, truth.posterior).passed
 
 
@@ -232,8 +230,7 @@ def test_badly_explored_energies_fail(truth):
     """A random walk of 500 steps: the steps' variance over the walk's is some 6 / 500."""
     draws, energy = truth.draws(8)
     energy = np.cumsum(np.random.default_rng(8).standard_normal(energy.shape), axis=1)
-    found = judge(draws, energy, truth.posterior)
-    assert failed(found) == {"BFMI"}
+    assert failed(judge(draws, energy, truth.posterior)) == {"BFMI"}
     # half of a draw's energy is new: steps have the variance of the energies, to some 6 %
     found = judge(*truth.draws(8, "independent"), truth.posterior)
     assert {c.name: c.value for c in found.checks}["BFMI"] == pytest.approx(1.0, abs=0.25)

@@ -44,11 +44,9 @@ def by_quadrature(sky: LogNormalSky, white: np.ndarray) -> np.ndarray:
     harmonics = synthesis_matrix(theta, phi, LMAX)
     ell = np.floor(np.sqrt(np.arange(n_modes(LMAX)))).astype(int)
     logarithm = harmonics @ (np.sqrt(np.asarray(sky.spectrum)[ell]) * white[: n_modes(LMAX)])
-    field = waves(theta, phi) * np.exp(logarithm) * area
-    modes = harmonics.T @ field
+    modes = harmonics.T @ (waves(theta, phi) * np.exp(logarithm) * area)
     for source, eta in zip(BRIGHT_SOURCES[:2], white[n_modes(LMAX) :], strict=True):
-        factor = stats.expon.ppf(stats.norm.cdf(eta))
-        modes = modes + factor * source.modes(MHZ, LMAX)
+        modes = modes + stats.expon.ppf(stats.norm.cdf(eta)) * source.modes(MHZ, LMAX)
     return modes
 
 
@@ -75,8 +73,7 @@ def test_the_jacobian_is_the_derivative(sky, white):
 
 
 def test_sources_have_exponential_fluxes(sky):
-    draws = np.random.default_rng(0).standard_normal((4000, sky.size))
-    factors = sky.source_factors(draws)
+    factors = sky.source_factors(np.random.default_rng(0).standard_normal((4000, sky.size)))
     assert stats.kstest(factors.ravel(), "expon").pvalue > 1e-3
     far = np.concatenate([np.zeros((1, n_modes(LMAX))), [[-30.0, 8.0]]], axis=1)
     # -ln(1 - p) is p where p is tiny

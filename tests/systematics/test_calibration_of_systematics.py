@@ -19,7 +19,6 @@ from lusee_bayes.experiment.model import full_model, set_up, true_values
 from lusee_bayes.experiment.rounds import settled
 from lusee_bayes.experiment.unknowns import SKY
 from lusee_bayes.judge.coverage import LEVELS
-from lusee_bayes.sampling.hmc import Sampler
 from lusee_bayes.sampling.mode import laplace_approximation
 from lusee_bayes.sampling.programs import numpyro_promotion
 from lusee_bayes.sampling.validation import FALSE_ALARM, N_DRAWS, Ranks, calibrate
@@ -53,8 +52,8 @@ class Truth(eqx.Module):
         return {name: site["value"] for name, site in trace.items()}, data
 
 
-def hmc(warmup: int) -> Sampler:
-    return Sampler(warmup=warmup, draws=N_DRAWS, algorithm="hmc")
+def hmc(warmup: int) -> lb.Sampler:
+    return lb.Sampler(warmup=warmup, draws=N_DRAWS, algorithm="hmc")
 
 
 class Draws(eqx.Module):
@@ -62,7 +61,7 @@ class Draws(eqx.Module):
 
     program: object = eqx.field(static=True)
     arguments: dict
-    sampler: Sampler = eqx.field(static=True)
+    sampler: lb.Sampler = eqx.field(static=True)
     starts: int = eqx.field(static=True, default=1)
     chart: Chart | None = None
     thin: int = eqx.field(static=True, default=1)
@@ -112,8 +111,7 @@ def assert_calibrated(ranks: Ranks):
 @pytest.mark.long
 def test_noise_level_amplitude_and_tilt():
     program, arguments = pieces("systematics", *TINY, LEVEL, *SPECTRUM)
-    found = ranks_of(program, arguments, Sites(("noise_level", "amplitude", "tilt")))
-    assert_calibrated(found)
+    assert_calibrated(ranks_of(program, arguments, Sites(("noise_level", "amplitude", "tilt"))))
 
 
 @pytest.mark.long
@@ -134,8 +132,7 @@ def test_permittivity_loss_tangent_and_tilt():
     coarse = replace(antennas, instrument=replace(antennas.instrument, source=source))
     arguments = {**arguments, "systematics": (coarse,)}
     draws = Draws(program, arguments, hmc(40), starts=3)
-    found = ranks_of(program, arguments, Sites(antennas.names), draws=draws)
-    assert_calibrated(found)
+    assert_calibrated(ranks_of(program, arguments, Sites(antennas.names), draws=draws))
 
 
 # --- gain drifts ------------------------------------------------------------------------------
@@ -146,8 +143,7 @@ def marginalised(arguments, data):
     gaussian, drifts = arguments["gaussian"], arguments["gain_drifts"]
     around = data
     for _ in range(4):
-        seen = drifts.layout.scatter(around)
-        model = replace(drifts, visibilities=seen).marginalised(gaussian)
+        model = replace(drifts, visibilities=drifts.layout.scatter(around)).marginalised(gaussian)
         posterior = model.condition(data).posterior
         around = gaussian.predict(posterior.mean)
     return posterior

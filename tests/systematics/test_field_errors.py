@@ -87,30 +87,17 @@ def test_beams_are_those_of_fields_with_errors():
 
 def test_the_strength_becomes_that_of_the_largest_evidence():
     """Amplitudes seen in noise: at the fixpoint, on a grid of the evidence."""
-    section, lmax, rng = (
-        FieldErrorsSection(std=1e-3, slope=2.5, lmax=5),
-        5,
-        np.random.default_rng(3),
-    )
+    section, rng = FieldErrorsSection(std=1e-3, slope=2.5, lmax=5), np.random.default_rng(3)
+    lmax = section.lmax
     sizes = [4 * (2 * ell + 1) for ell in range(lmax + 1)]
     scatter = 2e-3 * rng.uniform(0.5, 2.0, sum(sizes))
     true = np.repeat(of_ell(8e-3, 2.5, lmax), sizes)
     seen = rng.normal(size=len(true)) * np.hypot(true, scatter)
     nothing, values = np.zeros((1, 1, 1)), {STD: section.std}
+    beams = np.zeros((1, 2, 1, 1), complex), nothing[0], np.ones(1), nothing, SphereGrid.of(1, 1)
     for _ in range(60):
         there = of_ell(values[STD], section.slope, lmax)
-        errors, std = (
-            FieldErrors(
-                there,
-                np.zeros((1, 2, 1, 1), complex),
-                nothing[0],
-                np.ones(1),
-                nothing,
-                SphereGrid.of(1, 1),
-                section,
-            ),
-            np.repeat(there, sizes),
-        )
+        errors, std = FieldErrors(there, *beams, section), np.repeat(there, sizes)
         variance = 1.0 / (1.0 + (std / scatter) ** 2)
         values = errors.relearned(variance * std * seen / scatter**2, variance)
 

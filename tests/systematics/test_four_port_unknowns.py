@@ -49,8 +49,7 @@ def columns(response_file, n_times: int) -> np.ndarray:
     grid = np.zeros((16, n_times, 5))
     for port, product in enumerate(AUTOS):
         grid[product, :, port] = 200.0
-    warmer = ground(response_file, 280.0) - ground(response_file, 250.0)
-    grid[:, :, 4] = warmer[:, None]
+    grid[:, :, 4] = (ground(response_file, 280.0) - ground(response_file, 250.0))[:, None]
     return grid.reshape(-1, 5)
 
 
@@ -62,8 +61,7 @@ def joint(warm: Experiment, response_file):
     a, prior = np.concatenate([a, t], axis=1), np.append(prior, np.ones(5))
     constant = ground(response_file, 250.0).copy()
     constant[AUTOS] += 2000.0
-    rest = data - np.repeat(constant, setup.layout.n_times)
-    return white_posterior(a, prior, noise, rest)
+    return white_posterior(a, prior, noise, data - np.repeat(constant, setup.layout.n_times))
 
 
 def assert_same(found: Inference, expected: Answer, sigma: float) -> None:
@@ -125,8 +123,7 @@ def test_simulated_data_hold_them_whatever_their_treatment(warm, response_file, 
     assert 0.0 < abs(truth["regolith_k"] - 250.0) < 4 * 30.0
     z = np.append((powers - 2000.0) / 200.0, (truth["regolith_k"] - 250.0) / 30.0)
     added = np.asarray(setup.layout.gather(true_signal(setup, truth) - setup.signal))
-    t = columns(response_file, setup.layout.n_times)
-    np.testing.assert_allclose(added, t @ z, rtol=0, atol=1e-8)
+    within(added, columns(response_file, setup.layout.n_times) @ z, 1e-8)
     np.testing.assert_array_equal(simulate(setup).data, warm.data.data)
     reseeded = replace(setup, scenario=given.model_copy(update={"seed": 2}))
     assert not set(true_values(reseeded).values()) & set(truth.values())
@@ -142,8 +139,7 @@ def test_ground_at_zero_kelvin_has_a_template_all_the_same(response_file):
 
 def test_receivers_sampled_have_the_density_of_the_closed_form(response_file):
     """Priors by scipy, and the evidence of the sky alone given the five."""
-    given = four_ports(response_file, RECEIVER % "sampled", GROUND % "sampled")
-    e = lb.build(given)
+    e = lb.build(four_ports(response_file, RECEIVER % "sampled", GROUND % "sampled"))
     setup, z = e.setup, np.array([0.3, -0.2, 0.1, 0.5, -1.2])
     values = {f"receiver_{port}_k": 2000.0 + 200.0 * z[port] for port in range(4)}
     values["regolith_k"] = 250.0 + 30.0 * z[4]
@@ -267,8 +263,7 @@ def test_rounds_find_the_mode_and_the_first_order_does_not(experiment, response_
     found = lb.infer(experiment)
     assert found.rounds > 2
     (a, prior, noise), offset = parts(setup), np.asarray(setup.offset)
-    linear = columns(response_file, 23)
-    rows = np.concatenate([a * prior, linear], axis=1)
+    rows = np.concatenate([a * prior, columns(response_file, 23)], axis=1)
 
     def volume(z):
         """d(ln|K| / 2)/dz."""
@@ -316,8 +311,7 @@ def test_rounds_find_the_mode_and_the_first_order_does_not(experiment, response_
     first = Inference(model.condition(d), unknowns, 1, around)
     assert np.abs(off(first) / std).max() > 5.0
     assert np.abs(root @ off(first)).max() > 5.0
-    again = settled(experiment.setup, experiment.data, around)
-    assert np.abs(off(again) / std).max() < 0.05
+    assert np.abs(off(settled(experiment.setup, experiment.data, around)) / std).max() < 0.05
     # the joint mode is another: each of 21 skies and powers gains by being 0.5 % smaller
     assert force.min() > 0.04
     joint = least_squares(residuals, mode, jacobian, args=(np.zeros(4),), **tight).x
@@ -348,8 +342,7 @@ def test_errors_that_data_name_are_found(named):
     found = lb.infer(Experiment(named, data))
     (table,) = found.systematics
     assert table.systematic.names == ("gain_M0_PC1", "gain_M0_PC2", "gain_L3_PC1", "gain_M1_PC1")
-    slope = slopes(23)[:4]
-    rms = [np.sqrt((s[s != 0] ** 2).mean()) for s in slope]
+    rms = [np.sqrt((s[s != 0] ** 2).mean()) for s in slopes(23)[:4]]
     np.testing.assert_allclose(table.systematic.stds, rms, rtol=1e-12)
     told = found.amplitudes(table)
     off = (table.expected + told.mean - true_values(named)["gain_table"]) / told.std
@@ -417,8 +410,7 @@ def test_beside_what_is_sampled_it_is_marginalised_in_its_place(response_file):
     receiver = "noise.receiver={power_k: 2000, treatment: sampled}"
     e = lb.build(four_ports(response_file, receiver, TABLE % "marginalised"))
     values = {f"receiver_{port}_k": 2000.0 + 50.0 * port for port in range(4)}
-    found = lb.infer(e)
-    (table,) = found.moving
+    (table,) = lb.infer(e).moving
     factors = np.asarray(table.systematic.factors(np.asarray(table.centre)))
     a, prior, noise = parts(e.setup)
     t = np.asarray(table.columns)

@@ -19,7 +19,6 @@ from lusee_bayes.core.harmonics import synthesis_matrix, turn_about_z
 from lusee_bayes.experiment import model as models
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.instrument.beams.monopoles import Monopoles, beams_towards
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.systematics.context import Around
 from lusee_bayes.systematics.systematic import Systematic
 
@@ -156,7 +155,7 @@ def test_sampled_the_density_is_that_of_beams_behind_the_terrain():
     setup = setup_of(f"{KNOWN}, treatment: sampled", lmax=4)
     there, data = models.moved(setup, TRUE), models.simulate(setup)
     noise = models.base_model(setup).noise
-    model = LinearGaussian(there.coupling, setup.prior, noise, there.offset)
+    model = lb.LinearGaussian(there.coupling, setup.prior, noise, there.offset)
     expected = float(model.log_prob(data.data))
     expected += norm.logpdf(list(TRUE.values()), 0, 1.5 / np.sqrt(3)).sum()
     assert density_of(Experiment(setup, data), TRUE) == pytest.approx(expected, rel=1e-8)

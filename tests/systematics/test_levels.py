@@ -19,16 +19,11 @@ from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.noise.covariance import Covariance, DenseCovariance, LowRankCovariance
 from lusee_bayes.noise.instrument_errors import difference
 from lusee_bayes.sampling.programs import numpyro_promotion
+from lusee_bayes.systematics import systematic
 from lusee_bayes.systematics.context import Around
 from lusee_bayes.systematics.noise_level import NoiseLevel
 from lusee_bayes.systematics.prior_spectrum import PriorSpectrum
 from lusee_bayes.systematics.sources import PointSources, Source
-from lusee_bayes.systematics.systematic import (
-    MOST_COLLAPSED,
-    AdditiveNoise,
-    Marginalised,
-    sky_is_sampled,
-)
 
 LMAX, N_DATA = 4, 40
 ELLS = np.arange(LMAX + 1)
@@ -134,14 +129,14 @@ def test_several_at_once(case):
     levels, bands = NoiseLevel(0.7), PriorSpectrum(edges=(3,), log_band_std=0.8)
     # the order of those that do not touch the noise is all the same
     for order in (
-        [levels, bands, source, Marginalised(hidden)],
-        [source, levels, Marginalised(hidden), bands],
+        [levels, bands, source, systematic.Marginalised(hidden)],
+        [source, levels, systematic.Marginalised(hidden), bands],
     ):
         expected = case.evidence(factors, level, term, mean) + priors
         assert general(case, order, values) == pytest.approx(expected, rel=CLOSE)
     # a level behind the marginalised source scales that, too
     expected = case.evidence(factors, level, level * term, mean) + priors
-    got = general(case, [bands, Marginalised(hidden), levels, source], values)
+    got = general(case, [bands, systematic.Marginalised(hidden), levels, source], values)
     assert got == pytest.approx(expected, rel=CLOSE)
 
 
@@ -151,12 +146,11 @@ SOURCES = "sources.list=[{name: Cas A}, {name: For A, relative_std: 0.2}]"
 
 def test_the_level_is_that_of_the_radiometer_only():
     """A sampled noise level leaves a marginalised beam error as it is, and marginalised sources."""
-    level = "noise.radiometer.log_factor_std=0.5"
-    e = small_experiment(level, "noise.beam.shift_mhz=2", SOURCES)
+    e = small_experiment("noise.radiometer.log_factor_std=0.5", "noise.beam.shift_mhz=2", SOURCES)
     setup, data, program = e.setup, e.data, lb.load_program("systematics")
     base, rest = model_to_sample(setup, Around(data))
     assert isinstance(rest[0], NoiseLevel)
-    assert all(isinstance(systematic, Marginalised) for systematic in rest[1:]) and len(rest) == 3
+    assert all(isinstance(one, systematic.Marginalised) for one in rest[1:]) and len(rest) == 3
     np.testing.assert_array_equal(base.noise.diagonal(), radiometer(setup).diagonal())
     shift = difference(lb.monopole_beams(27.0, 6), setup.beams)
     da = np.asarray(lb.CouplingMatrix.build(shift, setup.pointing).dense())
@@ -165,17 +159,15 @@ def test_the_level_is_that_of_the_radiometer_only():
     std = PointSources.build(setup.scenario.sources, setup, Around()).stds
     arguments = program_arguments(program, e)
     with numpyro_promotion():
-        model = handlers.substitute(program.model, {"noise_level": jnp.asarray(9.0)})
-        given = model(**arguments)
+        given = handlers.substitute(program.model, {"noise_level": jnp.asarray(9.0)})(**arguments)
     term = (da * s) @ da.T + (t * std**2) @ t.T
     expected = np.diag(9.0 * n) + term
     got = np.asarray(given.noise.dense())
     # the two terms hold up to 1e6 K^2 of which rounding leaves 1e-10 K^2, the radiometer 0.05
-    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-13 * term.max())
+    within(got, expected, 1e-13 * term.max())
     assert np.abs(got - (np.diag(n) + term)).max() > 0.1
     # in the first-order model the level is one
-    plain = np.diag(n) + term
-    within(full_model(setup).noise.dense(), plain, 1e-13 * term.max())
+    within(full_model(setup).noise.dense(), np.diag(n) + term, 1e-13 * term.max())
     # and in simulated data it is the drawn one
     assert set(true_values(setup)) == {"noise_level", "beam_amplitude", "flux_Cas_A", "flux_For_A"}
 
@@ -183,7 +175,7 @@ def test_the_level_is_that_of_the_radiometer_only():
 N_PRODUCTS, N_TIMES, N_MODES = 4, 20, 9
 
 
-class Pickup(AdditiveNoise):
+class Pickup(systematic.AdditiveNoise):
     """Known patterns with unknown amplitudes."""
 
     patterns: jax.Array
@@ -192,7 +184,7 @@ class Pickup(AdditiveNoise):
         return LowRankCovariance(self.patterns, "the pickup")
 
 
-class Correlated(AdditiveNoise):
+class Correlated(systematic.AdditiveNoise):
     """Noise that lasts a while, of every product by itself."""
 
     hours: jax.Array
@@ -222,8 +214,7 @@ def terms():
 def test_marginalised_and_sampled_are_one_distribution(model, term):
     """What is added to the offset is linear in the site's normals, with the covariance in N."""
     dense = np.asarray(term.covariance().dense())
-    added = np.asarray(term.marginalised(model).noise.dense() - model.noise.dense())
-    np.testing.assert_allclose(added, dense, rtol=0, atol=1e-13)
+    within(np.asarray(term.marginalised(model).noise.dense() - model.noise.dense()), dense, 1e-13)
     rank = term.covariance().rank
 
     def offset(z):
@@ -237,7 +228,7 @@ def test_marginalised_and_sampled_are_one_distribution(model, term):
     expected = -0.5 * (z**2).sum() - 0.5 * rank * np.log(2.0 * np.pi)
     assert float(fn.log_prob(z)) == pytest.approx(float(expected), rel=1e-13)
     root = np.asarray(jax.jit(jax.jacfwd(offset))(jnp.zeros(rank)))
-    np.testing.assert_allclose(root @ root.T, dense, rtol=0, atol=1e-12)
+    within(root @ root.T, dense, 1e-12)
     np.testing.assert_array_equal(offset(jnp.zeros(rank)), model.offset)
-    assert sky_is_sampled((term,)) == (rank > MOST_COLLAPSED)
+    assert systematic.sky_is_sampled((term,)) == (rank > systematic.MOST_COLLAPSED)
     assert not term.changes_coupling

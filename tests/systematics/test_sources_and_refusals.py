@@ -100,8 +100,7 @@ def test_the_sky_is_the_same_with_fluxes_in_the_noise_or_beside_it():
     expected, d = answer(), experiment().data.data
     marginal = models.full_model(setup_of()).condition(d).posterior
     sky = expected.std[:49]
-    off = (np.asarray(marginal.mean) - expected.mean[:49]) / sky
-    assert np.abs(off).max() < 1e-5
+    assert np.abs((np.asarray(marginal.mean) - expected.mean[:49]) / sky).max() < 1e-5
     np.testing.assert_allclose(np.asarray(marginal.std()), sky, rtol=1e-5)
     assert float(marginal.log_evidence) == pytest.approx(expected.log_prob, abs=1e-4)
     # the sources matter: with them in the data only, the sky is off by what can be seen
@@ -131,8 +130,7 @@ def test_the_table_is_in_jansky():
     # the data do tell something
     assert expected.std[49] < 0.9 * std[0]
     # and the truth is where the posterior says, five of them to 5 sigma
-    off = (table["flux_jy"] - table["true_jy"]) / table["std_jy"]
-    assert np.abs(off).max() < 5.0
+    assert np.abs((table["flux_jy"] - table["true_jy"]) / table["std_jy"]).max() < 5.0
     # data without a truth have no such column
     real = replace(experiment(), data=replace(experiment().data, truth=None))
     assert "true_jy" not in flux_table(real, lb.infer(real))
@@ -283,8 +281,7 @@ def test_nothing_is_counted_twice(program, overrides, section):
     """What a program samples must not be in N as well."""
     asked = lb.load_program(program)
     e = experiment(*overrides, sources=CAS_A)
-    wanted = f"would count twice; set {section}.treatment=sampled"
-    refuse(wanted, program_arguments, asked, e)
+    refuse(f"would count twice; set {section}.treatment=sampled", program_arguments, asked, e)
     # either of the other treatments will do
     for treatment in ("sampled", "ignored"):
         free = experiment(*overrides, f"{section}.treatment={treatment}", sources=CAS_A)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from assertions import close, within
 from experiments import density, density_of, program_arguments, small_experiment
 from jax.flatten_util import ravel_pytree
 from reference_linear import exact_posterior
@@ -64,7 +65,7 @@ def test_the_program_is_the_exact_product_of_gains():
     got, trace = density(program, arguments, {"sky": sky, "gain_noise": white})
     # residuals of many sigma: squares of 1e5 sigma, each to 1e-10 of itself
     assert got == pytest.approx(expected, rel=1e-9)
-    np.testing.assert_allclose(trace["gains"]["value"], gains, rtol=0, atol=1e-15)
+    within(trace["gains"]["value"], gains, 1e-15)
 
 
 def test_white_noise_makes_drifts_of_the_right_covariance():
@@ -74,12 +75,11 @@ def test_white_noise_makes_drifts_of_the_right_covariance():
     for correlation_h in (10.0, 14.0, 20.0):
         drift = lb.GainDrift(0.02, correlation_h)
         # a margin for 10 hours cuts off longer ones at exp(-(60 / t)^2 2)
-        unit = jnp.eye(drifts.grid.shape[0])
-        root = np.asarray(drift.history(unit, hours, drifts.grid))
+        root = np.asarray(drift.history(jnp.eye(drifts.grid.shape[0]), hours, drifts.grid))
         lag = hours[:, None] - hours[None]
         expected = 4e-4 * np.exp(-(lag**2) / (2 * correlation_h**2))
         cut = np.exp(-2 * (60.0 / correlation_h) ** 2)
-        np.testing.assert_allclose(root.T @ root, expected, rtol=0, atol=4e-4 * (1e-14 + cut))
+        within(root.T @ root, expected, 4e-4 * (1e-14 + cut))
 
 
 def test_sampled_gains_multiply_what_n_holds_and_drifts_stay_in_it():
@@ -159,8 +159,7 @@ def test_there_and_back_with_the_determinant_of_the_derivative(scales):
     back, log_det = chart.to_values(x)
     assert set(back) == set(values)
     for name in values:
-        size = np.abs(np.asarray(values[name])).max()
-        np.testing.assert_allclose(back[name], values[name], rtol=0, atol=1e-9 * size)
+        within(back[name], values[name], 1e-9 * np.abs(np.asarray(values[name])).max())
     assert (np.asarray(x["other"]) == np.asarray(values["other"])).all()
     flat, split = ravel_pytree(x)
     jacobian = jax.jit(jax.jacfwd(lambda f: ravel_pytree(chart.to_values(split(f))[0])[0]))(flat)
@@ -208,9 +207,7 @@ def test_drifts_too_strong_for_the_coordinates_have_none():
     """Where the mean gain may be -1 the scale has no logarithm: 0.1 exp(3 x 0.5) > 0.2."""
     gaussian, drifts, chart = pieces("log_sigma_std")
     assert chart is not None
-    strong = lb.GainDrift(0.1, 10.0)
-    kinder = GainDrifts(**{**vars(drifts), "drift": strong})
-    assert kinder.chart(gaussian) is None
+    assert GainDrifts(**{**vars(drifts), "drift": lb.GainDrift(0.1, 10.0)}).chart(gaussian) is None
 
 
 # --- models/instrument.py and models/gain_scales.py -----------------------------------------------
@@ -239,8 +236,7 @@ def test_the_instruments_program():
 @pytest.mark.essential
 def test_the_program_of_gain_scales():
     """N with the drifts' covariance entry by entry, the mean of the autos, and the priors."""
-    gain = "noise.gain={sigma: 0.01, correlation_h: 8, treatment: sampled}"
-    e = small_experiment(gain, lmax=4)
+    e = small_experiment("noise.gain={sigma: 0.01, correlation_h: 8, treatment: sampled}", lmax=4)
     setup, data = e.setup, e.data
     sigma, octaves = 0.013, 0.4
     correlation_h = 8.0 * 2.0**octaves
@@ -333,7 +329,7 @@ def test_about_values_a_is_that_of_the_shifted_observation():
     model, sky = base_model(setup), setup.sky.modes
     got = np.asarray(offsets.effect(model, values).predict(sky))
     exact = np.asarray(moved(setup, values).coupling @ sky)
-    np.testing.assert_allclose(got, exact, rtol=0, atol=1e-12 * np.abs(exact).max())
+    close(got, exact, 1e-12)
     # sources that the context has moved are not moved twice, and angles alone need no ephemeris; of
     # what a clock does without them 1e-3 are left out
     angles = {name: value for name, value in values.items() if name not in CLOCK}

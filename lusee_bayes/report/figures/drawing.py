@@ -247,9 +247,7 @@ def _projection(nside: int) -> tuple[np.ndarray, np.ndarray]:
     x = (np.arange(WIDTH) + 0.5) / WIDTH * 2.0 - 1.0
     y = (np.arange(WIDTH // 2) + 0.5) / (WIDTH // 2) * 2.0 - 1.0
     x, y = (grid.ravel() for grid in np.meshgrid(x, y))
-    lon, lat = unprojected(x, y)
-    neighbours, weights = healpy.get_interp_weights(nside, lon, lat, lonlat=True)
-    return neighbours, weights
+    return healpy.get_interp_weights(nside, *unprojected(x, y), lonlat=True)
 
 
 def unprojected(

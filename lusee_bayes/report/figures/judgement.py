@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import astropy.units as u
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
@@ -13,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from lusee_bayes.flight.gain_model import LETTERS
 from lusee_bayes.flight.reduced import REASONS, USED, Reduced
 from lusee_bayes.instrument.products import all_products, labels
-from lusee_bayes.instrument.times import unannounced_leap_seconds
+from lusee_bayes.instrument.times import seconds_from
 from lusee_bayes.judge.chi2 import probability
 from lusee_bayes.report.figures import drawing
 from lusee_bayes.results.map_result import MapResult
@@ -135,10 +134,8 @@ def unknowns_by_frequency(result: MapResult) -> Figure | None:
     panels = list(panels.flat)
     for axes, name in zip(panels, names, strict=False):
         rows = table[table["unknown"] == name]
-        f, value, std, prior, before = (
-            rows[column].to_numpy()
-            for column in ("frequency_mhz", "value", "std", "prior", "prior_std")
-        )
+        columns = ("frequency_mhz", "value", "std", "prior", "prior_std")
+        f, value, std, prior, before = (rows[column].to_numpy() for column in columns)
         axes.fill_between(f, prior - before, prior + before, color=drawing.GREY, alpha=0.25, lw=0)
         style = {"color": drawing.GREY, "fmt": "none", "lw": 4, "alpha": 0.4, "label": "prior"}
         axes.errorbar(f, prior, before, **style)
@@ -161,12 +158,16 @@ CORNER = 3.5, 8.0
 
 
 def corner(result: MapResult) -> Figure | None:
-    """Draw the posterior of the first channel's unknowns, pair by pair, with prior and truth.
+    """Draw the posterior of a channel's unknowns, pair by pair, with prior and truth.
 
-    Axes are in posterior standard deviations from the posterior mean. They go as far as the truth,
-    up to 8; beyond, it is marked at the edge.
+    The channel is the first of those that share the instrument. Axes are in posterior standard
+    deviations from the posterior mean. They go as far as the truth, up to 8; beyond, it is marked
+    at the edge.
     """
-    theta = result.channel.theta
+    apart = [test.frequency_mhz for test in result.shared_tests if test.disagrees]
+    of_all = (one for one in result.channels if one.frequency_mhz not in apart)
+    channel = next(of_all, result.channel)
+    theta = channel.theta
     if theta is None or theta.corner.empty:
         return None
     table, n = theta.corner, len(theta.corner)
@@ -186,9 +187,8 @@ def corner(result: MapResult) -> Figure | None:
         if j > i:
             axes.set_axis_off()
         elif i == j:
-            axes.plot(
-                x, np.exp(-0.5 * ((x - prior[i]) / wide[i]) ** 2), color=drawing.GREY, alpha=0.5
-            )
+            before = np.exp(-0.5 * ((x - prior[i]) / wide[i]) ** 2)
+            axes.plot(x, before, color=drawing.GREY, alpha=0.5)
             axes.plot(x, np.exp(-0.5 * x**2), color=drawing.BLUE)
             axes.axvline(true[i], color=drawing.ORANGE, lw=1)
             name, unit, value, std = table.iloc[i][["unknown", "unit", "value", "std"]]
@@ -204,7 +204,7 @@ def corner(result: MapResult) -> Figure | None:
                 axes.plot(*pair, color=drawing.GREY, alpha=0.5, lw=1.2 / k)
                 axes.plot(k * across, k * up, color=drawing.BLUE, lw=1.2 / k)
             axes.plot(true[j], true[i], "x", color=drawing.ORANGE, ms=6)
-    at = "" if result.single else f" (channel of {result.channel.frequency_mhz:g} MHz)"
+    at = "" if result.single else f" (channel of {channel.frequency_mhz:g} MHz)"
     figure.suptitle(f"Unknowns of the instrument{at}", fontsize=10)
     figure.supxlabel("posterior standard deviations from the mean", fontsize=9)
     return figure
@@ -266,8 +266,7 @@ def waterfall(result: MapResult) -> Figure | None:
         axes.plot(days, kept, ".", ms=3, color=drawing.BLUE, label="after flags")
         style = {"ms": 4, "color": drawing.ORANGE, "label": "before, where flagged"}
         axes.plot(days[flagged], reduced.before[band, number][flagged], ".", **style)
-        low, high = _range(kept[np.isfinite(kept)])
-        axes.set_ylim(low, high)
+        axes.set_ylim(*_range(kept[np.isfinite(kept)]))
         axes.set_title(product.label, fontsize=9)
         drawing.plain_ticks(axes, 3)
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:.3g}")
@@ -317,10 +316,9 @@ def _gains(left: Axes, reduced: Reduced) -> None:
     for f in reduced.frequencies_mhz:
         left.axvline(f, color=drawing.GREY, lw=0.5, zorder=0)
     known = bool((curves.std > 0).any())
-    left.set(xlabel="frequency [MHz]", ylabel="counts for 1 nV²/Hz")
     largest = float(np.nanmax(curves.std / curves.gain)) if known else 0.0
     told = f"known to {largest:.2g} of themselves or better" if known else "no error is known"
-    left.set_title(f"Gains: {told}")
+    left.set(xlabel="frequency [MHz]", ylabel="counts for 1 nV²/Hz", title=f"Gains: {told}")
     left.legend(frameon=False, ncols=2, fontsize=8)
 
 
@@ -352,8 +350,7 @@ def _scatter(right: Axes, reduced: Reduced) -> None:
 
 def _days(reduced: Reduced) -> Float[np.ndarray, " rows"]:
     times = reduced.observation.times
-    with unannounced_leap_seconds():
-        return np.asarray((times - times[0]).to_value(u.day))
+    return seconds_from(times[0], times) / 86400.0
 
 
 def _first(reduced: Reduced) -> str:

@@ -39,8 +39,7 @@ def beams(result: MapResult) -> Figure | None:
     details = result.channel.details
     if details is None:
         return None
-    _, *nodes = details.patterns.shape
-    grid = HemisphereGrid.gauss_legendre(*nodes)
+    grid = HemisphereGrid.gauss_legendre(*details.patterns.shape[1:])
     places = {"left": 0.01, "right": 0.99, "bottom": 0.02, "top": 0.82, "wspace": 0.04}
     figure, grid_of_axes = drawing.in_places((11, 4), 1, len(details.patterns), **places)
     named = zip(grid_of_axes, details.pattern_names, details.patterns, strict=True)

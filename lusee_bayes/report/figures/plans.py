@@ -146,10 +146,8 @@ def _evidence(axes: Axes, result: PriorComparison) -> None:
     axes.barh(rows, behind, color=colours, alpha=0.6, height=0.6, label="ln evidence (bars)")
     for j, held in enumerate(result.best.held_out):
         values = np.array([one.held_out[j].log_density for one in result.priors])
-        label = f"ln p of {held.kind}s left out"
-        axes.plot(
-            values.max() - values, rows, f"k{MARKERS[held.kind]}", mfc="none", ms=7, label=label
-        )
+        style = {"mfc": "none", "ms": 7, "label": f"ln p of {held.kind}s left out"}
+        axes.plot(values.max() - values, rows, f"k{MARKERS[held.kind]}", **style)
     axes.set_yticks(rows, [one.name for one in result.priors])
     axes.invert_yaxis()
     axes.set_xscale("symlog", linthresh=LINEAR, linscale=0.5)

@@ -152,9 +152,8 @@ def traces(run: SampleResult) -> Figure:
         for number, chain in enumerate(draws):
             colour = drawing.COLOURS[number % len(drawing.COLOURS)]
             left.plot(chain, color=colour, lw=0.5, alpha=0.8)
-            right.hist(
-                chain, bins, color=colour, histtype="step", density=True, label=f"chain {number}"
-            )
+            style = {"histtype": "step", "density": True, "label": f"chain {number}"}
+            right.hist(chain, bins, color=colour, **style)
         drawing.plain_ticks(left)
         drawing.plain_ticks(right)
         left.set(ylabel=name.replace(" [", "\n["), xlim=(0, draws.shape[1]))
@@ -177,9 +176,8 @@ def comparison(result: Comparison) -> Figure:
         means.axhline(bound, color=drawing.ORANGE, ls="--", lw=1)
     means.set(xlabel="mode", ylabel="difference of means [Monte Carlo error]")
     means.set_title("Means of every mode")
-    variances.errorbar(
-        np.arange(len(ell)), result.variance_ratio, result.variance_error, elinewidth=0.3, **DOTS
-    )
+    ratio, error = result.variance_ratio, result.variance_error
+    variances.errorbar(np.arange(len(ell)), ratio, error, elinewidth=0.3, **DOTS)
     variances.axhline(1.0, color=drawing.GREY, lw=0.8)
     variances.set(xlabel="mode", ylabel="variance: draws / analytic", title="Variances")
     rank = np.arange(1, len(result.eigenvalues) + 1)
@@ -211,10 +209,9 @@ def rank_statistics(ranks: Ranks) -> Figure:
         axes.axhspan(low, high, color=drawing.GREY, alpha=0.25, lw=0)
         axes.set_title(f"{ranks.names[k]}, p = {p_values[k]:.2g}", fontsize=9)
         axes.set(xlim=(0, 1), xticks=[0, 0.5, 1])
-    for axes in panels[len(shown) :]:
+    *unused, last = panels[len(shown) :]
+    for axes in unused:
         axes.set_axis_off()
-    last = panels[-1]
-    last.set_axis_on()
     levels = np.array(LEVELS)
     for coverage in ranks.coverage().values():
         last.plot(levels, [coverage[p] - p for p in LEVELS], color=drawing.BLUE, lw=0.5, alpha=0.6)
