@@ -25,6 +25,7 @@ from lusee_bayes.instrument.beams.monopoles import source_response
 from lusee_bayes.judge.residuals import residuals
 from lusee_bayes.sky.galaxy import galactic_unit_vector
 from lusee_bayes.systematics.context import Around, Setup
+from lusee_bayes.systematics.pointing_offsets import PointingOffsets
 
 ANGLE = "turntable_0_deg"
 TWO_RUNS = "observation.runs=[{cycles: 1}, {cycles: 1, turntable_deg: 30}]"
@@ -170,7 +171,8 @@ def test_sources_and_gains_are_those_of_the_offsets():
     there = set_up(scenario_of(turned, *extra, lmax=5, step_s=43200.0))
     expected = full_model(there)
     around = Around(None, None, setup.sky.modes, {"turntable_deg": 3.0})
-    found, (offsets, *_) = model_about(setup, around)
+    found, held = model_about(setup, around)
+    (offsets,) = (one for one in held if isinstance(one.systematic, PointingOffsets))
     # the columns' own part left out; gains make 1 + sigma^2 of every auto, that part too
     own = offsets.columns @ offsets.centre
     got, wanted = (model.predict(setup.sky.modes) for model in (found, expected))

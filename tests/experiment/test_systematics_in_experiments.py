@@ -69,19 +69,18 @@ def test_the_posteriors_own_prediction_has_settled():
 
 @pytest.mark.long
 def test_beam_parameters_are_directions_of_one_sigma():
-    setup, model = experiment(PARAMETERS).setup, inferred(PARAMETERS).model
-    assert isinstance(model.noise, LowRankUpdate)
-    spectrum = np.asarray(setup.prior.variance())
+    """About the sky and the values that were found."""
+    setup, found = experiment(PARAMETERS).setup, inferred(PARAMETERS)
     expected = np.diag(np.asarray(radiometer(setup).diagonal()))
+    values = found.around.values
+    assert isinstance(found.model.noise, LowRankUpdate) and len(values) == 2
     for name, sigma in {"length_m": 0.1, "zenith_angle_deg": 2.0}.items():
-        value = getattr(setup.scenario.beam, name)
-        plus, minus = (
-            np.asarray(experiment(f"beam.{name}={value + step}").setup.coupling.dense())
-            for step in (1e-4, -1e-4)
-        )
-        da = sigma * (plus - minus) / 2e-4
-        expected = expected + (da * spectrum[None]) @ da.T
-    got = np.asarray(model.noise.dense())
+        steps = (values | {name: values[name] + step} for step in (1e-4, -1e-4))
+        beams = ([f"beam.{key}={value}" for key, value in step.items()] for step in steps)
+        plus, minus = (experiment(*one).setup.coupling @ found.around.sky for one in beams)
+        moved = sigma * (np.asarray(plus) - np.asarray(minus)) / 2e-4
+        expected = expected + np.outer(moved, moved)
+    got = np.asarray(found.model.noise.dense())
     # central differences: h^2 f''' = 1e-8 of the slope
     within(got, expected, 1e-6 * expected.max())
     # the data's own beams differ by a draw of that size

@@ -236,7 +236,10 @@ def test_the_instruments_program():
 @pytest.mark.essential
 def test_the_program_of_gain_scales():
     """N with the drifts' covariance entry by entry, the mean of the autos, and the priors."""
-    e = small_experiment("noise.gain={sigma: 0.01, correlation_h: 8, treatment: sampled}", lmax=4)
+    e = small_experiment(
+        "noise.gain={sigma: 0.01, correlation_h: 8, treatment: sampled, visibilities: model}",
+        lmax=4,
+    )
     setup, data = e.setup, e.data
     sigma, octaves = 0.013, 0.4
     correlation_h = 8.0 * 2.0**octaves
