@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import App, Parameter
 from rich.console import Console
 
 from lusee_bayes.cli.options import (
+    Algorithm,
     ChainOptions,
     Count,
     DataOptions,
@@ -246,7 +247,7 @@ def sample_command(
     scenario: str,
     *,
     model: str | None = None,
-    algorithm: Literal["nuts", "hmc"] = "nuts",
+    algorithm: Algorithm | None = None,
     frequencies: Frequencies | None = None,
     options: DataOptions = DataOptions(),
     chains: ChainOptions = ChainOptions(),
@@ -271,7 +272,8 @@ def sample_command(
         sky_marginal, gains, instrument, ...). By default systematics, where the scenario says that
         something is to be sampled, else sky.
     algorithm
-        The No-U-Turn Sampler, or Hamiltonian Monte Carlo with trajectories of fixed length.
+        nuts, the No-U-Turn Sampler; hmc, Hamiltonian Monte Carlo with trajectories of fixed length;
+        or crank-nicolson, without gradients, the default where rounds have found what is sampled.
     frequencies
         Channels in MHz, as 10,25,30 or as first:last:step, one after the other: each in a folder of
         its own, and their maps together in cubes. With --resume, finished ones are taken over.

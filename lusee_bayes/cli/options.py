@@ -223,6 +223,9 @@ class EngineOptions:
         return open_engine(demand, self.workers, self.cluster)
 
 
+Algorithm = Literal["nuts", "hmc", "crank-nicolson"]
+
+
 @Parameter(name="*")
 @dataclass(frozen=True)
 class ChainOptions:
@@ -245,7 +248,7 @@ class ChainOptions:
     draws: Count = 1000
     warmup: Number = 150
 
-    def running(self, seed: int, algorithm: Literal["nuts", "hmc"] = "nuts") -> dict[str, Any]:
+    def running(self, seed: int, algorithm: Algorithm | None = None) -> dict[str, Any]:
         """What every run takes that samples."""
         from lusee_bayes.sampling.hmc import Sampler
 

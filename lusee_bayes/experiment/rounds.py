@@ -23,7 +23,7 @@ from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.amplitudes import Amplitudes, template_amplitudes
 from lusee_bayes.linear.information import Information, integrated_out
-from lusee_bayes.linear.linear_gaussian import LinearGaussian, Solution
+from lusee_bayes.linear.linear_gaussian import FromInformation, LinearGaussian, Solution
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.noise.covariance import LowRankFactor
 from lusee_bayes.priors.families import PriorFamily
@@ -253,14 +253,16 @@ def _approached(
     found, step = _conditioned(setup, data, around, 1), _Step()
     moves = np.inf if rebuilds(setup) else 0.0
     while moves > NEARLY and found.rounds < MAX_TEMPERED_ROUNDS:
-        around, step = _around(setup, found, step)
-        if around.tempered > 1.0:
-            at_rest = step.whole is None or np.abs(step.whole).max() < NEARLY
-            exact = _exact(setup, around).around
-            around = replace(exact, tempered=1.0 if at_rest else around.tempered)
+        (around, step), exact = _around(setup, found, step), None
         mean, n = found.posterior.mean, found.rounds + 1
         del found  # its N
-        found = _conditioned(setup, data, around, n)
+        if around.tempered > 1.0:
+            at_rest = step.whole is None or np.abs(step.whole).max() < NEARLY
+            exact = _exact(setup, around)
+            around = exact.around
+            if at_rest:
+                around, exact = replace(around, tempered=1.0), None
+        found = _conditioned(setup, data, around, n, exact)
         report(found.rounds, found.remark)
         moved_by = float(found.posterior.rms_shift_from(mean))
         moves = moved_by if around.tempered == 1.0 else np.inf
@@ -277,9 +279,16 @@ def _elsewhere(found: Inference, way: int) -> dict[str, float]:
     return values
 
 
-def _conditioned(setup: Setup, data: Visibilities, around: Around, rounds: int) -> Inference:
+def _conditioned(
+    setup: Setup, data: Visibilities, around: Around, rounds: int, exact: Inference | None = None
+) -> Inference:
+    """``exact``: what the same A and radiometer noise tell of the sky if values are these."""
     model, held = model_about(setup, around)
-    solution = _less_moved(model.condition(data.data), held)
+    if exact is None or exact.solution.matrix is None:
+        solution = model.condition(data.data)
+    else:
+        solution = FromInformation.beside(exact.solution, model).condition(data.data)
+    solution = _less_moved(solution, held)
     return Inference(solution, held, rounds, around)
 
 

@@ -294,8 +294,8 @@ class Tied:
     Attributes
     ----------
     mean : (channels, n) array
-    covariance : (channels, n, n) array
-        Of each channel's amplitudes.
+    root : (channels, n, white) array
+        R of the covariance R R^T of the amplitudes of all channels.
     draws : (draws, channels, n) array
         Of all channels together.
     log_evidence : float
@@ -305,10 +305,15 @@ class Tied:
     """
 
     mean: Float[np.ndarray, "channels n"]
-    covariance: Float[np.ndarray, "channels n n"]
+    root: Float[np.ndarray, "channels n white"]
     draws: Float[np.ndarray, "draws channels n"]
     log_evidence: float
     names: tuple[str, ...] = ()
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "channels n n"]:
+        """Of each channel's amplitudes."""
+        return self.root @ np.swapaxes(self.root, 1, 2)
 
 
 def kernel(
@@ -385,7 +390,7 @@ def tie(
     quadratic = np.einsum("ki,kij,kj->", off, told, off) - (z**2).sum() + white @ white
     log_dets = np.linalg.slogdet(covariance)[1].sum() + 2.0 * np.log(np.diagonal(lower)).sum()
     drawn, evidence = z + draws.reshape(-1, n_channels, n), float(-0.5 * (quadratic + log_dets))
-    return Tied(z, half @ np.swapaxes(half, 1, 2), drawn, evidence)
+    return Tied(z, half, drawn, evidence)
 
 
 def told_by_others(

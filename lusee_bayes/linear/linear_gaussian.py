@@ -54,7 +54,7 @@ from lusee_bayes.linear.information import (
 )
 from lusee_bayes.linear.normal_matrix import has_structure, normal_matrix
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.noise.covariance import Covariance, Factor
+from lusee_bayes.noise.covariance import Covariance, Factor, LowRankFactor
 from lusee_bayes.sky.prior import Prior
 
 
@@ -442,6 +442,24 @@ class FromInformation(Form):
         elif matrix is None:
             matrix = gram_matrix(np.asarray(factor.whiten(coupling.dense())))
         return cls(model, factor, coupling, matrix, precision_root(matrix, model.prior))
+
+    @classmethod
+    def beside(cls, solution: Solution, model: LinearGaussian) -> FromInformation:
+        """Factorise a model with the A and N_0 of one that is solved, and other U.
+
+        Of N = N_0 + U U^T, with V and R of :class:`.LowRankFactor`, ::
+
+            A^T N^-1 A = A^T N_0^-1 A - (R^-1 V^T L_0^-1 A)^T (R^-1 V^T L_0^-1 A).
+        """
+        model, old = on_host(model), solution.factor
+        base = old.base if isinstance(old, LowRankFactor) else old
+        factor, matrix = model.noise.factor(base), solution.matrix
+        for sign, one in ((1.0, old), (-1.0, factor)):
+            if isinstance(one, LowRankFactor):
+                pull = np.asarray(model.coupling.transpose_mv(base.whiten_transpose(one.v)))
+                half = np.asarray(solve_lower(one.lower, pull.T, transpose=False))
+                matrix = matrix + sign * gram_matrix(half)
+        return cls(model, factor, model.coupling, matrix, precision_root(matrix, model.prior))
 
     def condition(self, data: DataVector) -> Solution:
         data, prior = np.asarray(data), self.model.prior

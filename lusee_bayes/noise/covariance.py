@@ -411,8 +411,9 @@ class LowRankUpdate(Covariance):
     def dense(self):
         return self.base.dense() + self.update.dense()
 
-    def factor(self):
-        base = self.base.factor()
+    def factor(self, base: Factor | None = None):
+        """L, where that of N_0 may be known."""
+        base = self.base.factor() if base is None else base
         v = base.whiten(self.update.root)
         small = np.eye(v.shape[1]) + v.T @ v
         lower = checked_cholesky(f"1 + V^T V of {self.update.name}", small)

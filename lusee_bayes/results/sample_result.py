@@ -39,7 +39,7 @@ class SampleResult:
         The draws, as ArviZ has them.
     seconds : dict
         By stage.
-    gradients_per_second : float or None
+    steps_per_second : float or None
         Of all chains together while drawing; None if too little was drawn in this session to tell.
     """
 
@@ -47,7 +47,7 @@ class SampleResult:
     inference: Inference
     tree: xr.DataTree
     seconds: dict[str, float]
-    gradients_per_second: float | None
+    steps_per_second: float | None
 
     @property
     def skies(self) -> np.ndarray:
@@ -85,8 +85,8 @@ class SampleResult:
             f"bulk ESS at least {table['ess_bulk'].min():.0f}",
             f"{figures.divergences} divergences",
         ]
-        if self.gradients_per_second is not None:
-            parts.append(f"{self.gradients_per_second:.0f} gradients/s")
+        if self.steps_per_second is not None:
+            parts.append(f"{self.steps_per_second:.0f} steps/s")
         return ", ".join(parts)
 
     def lines(self) -> list[str]:
@@ -110,7 +110,7 @@ class SampleResult:
             doubts=list(self.experiment.doubts),
             step_size=[float(x) for x in stats["step_size"].values[:, -1]],
             mean_steps=float(stats["n_steps"].mean()),
-            gradients_per_second=self.gradients_per_second,
+            steps_per_second=self.steps_per_second,
             **about_run(self.seconds),
         )
 

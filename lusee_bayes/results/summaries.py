@@ -116,7 +116,7 @@ class SamplingSummary(BaseModel):
     doubts: list[str]
     step_size: list[float]
     mean_steps: float
-    gradients_per_second: float | None
+    steps_per_second: float | None
     seconds: dict[str, float]
     peak_memory_gb: float
     versions: dict[str, str]

@@ -29,6 +29,7 @@ from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.coverage import LEVELS
+from lusee_bayes.linear.amplitudes import Amplitudes, template_amplitudes
 from lusee_bayes.report.figures import sampling as figures
 from lusee_bayes.report.rendering import render_text
 from lusee_bayes.results.finished_runs import Provenance, write_cubes, write_maps
@@ -41,12 +42,18 @@ from lusee_bayes.sampling.hmc import Chains, Checkpoints, Sampler, Whitening, sa
 from lusee_bayes.sampling.least import require_draws, require_simulations
 from lusee_bayes.sampling.log_normal_program import coordinates_of
 from lusee_bayes.sampling.mode import laplace_approximation
-from lusee_bayes.sampling.programs import Program, load_program, predicts, require_sampleable
-from lusee_bayes.sampling.shared_sites import SharedSites, of_channel, site_in
+from lusee_bayes.sampling.programs import (
+    Program,
+    latent_sites,
+    load_program,
+    predicts,
+    require_sampleable,
+)
+from lusee_bayes.sampling.shared_sites import SharedSites, gaussian_of_sites, of_channel
 from lusee_bayes.sampling.validation import BATCH, N_DRAWS, calibrate_sky, validate_draws
 from lusee_bayes.systematics.gain_drifts import SCALES
 from lusee_bayes.systematics.registered import SYSTEMATICS
-from lusee_bayes.systematics.systematic import SKY, Chart, Systematic, present
+from lusee_bayes.systematics.systematic import SKY, Chart, Systematic, Unknown, present
 
 # where the mode of a collapsed program is looked for
 STARTS = 4
@@ -129,23 +136,21 @@ def sample_together(
         latent[name] = require_sampleable(program, arguments[name], one.data.data, n_modes)
     data = {name: one.data.data for name, one in experiments.items()}
     first = next(iter(experiments))
+    frequencies = {name: one.scenario.frequency_mhz for name, one in experiments.items()}
+    octaves = sampled_together(experiments[first])
     if several:
-        frequencies = {name: one.scenario.frequency_mhz for name, one in experiments.items()}
-        model = SharedSites(program.model, frequencies, sampled_together(experiments[first]))
+        model = SharedSites(program.model, frequencies, octaves)
         observed = {"channels": arguments, "data": data}
     else:
         model, observed = program.model, {**arguments[first], "data": data[first]}
+    whitening = None
     with stages("coordinates"):
-        if several:
-            start = {
-                site_in(name, site): value
-                for name in experiments
-                for site, value in values_found(inferences[name], latent[name]).items()
-            }
-            hold = [site_in(name, scale) for name in experiments for scale in SCALES]
-            about = laplace_approximation(model, observed, start, hold)
-            whitening = about.whitening if bool(about.converged) else None
-        else:
+        rounds = found_in_rounds(inferences, latent)
+        if rounds is not None:
+            sampler = replace_fields(sampler, algorithm=sampler.algorithm or "crank-nicolson")
+            sites = latent_sites(model, observed)
+            whitening = gaussian_of_sites(*rounds, frequencies, octaves, sites)
+        elif not several:
             given = arguments[first], experiments[first].data, inferences[first], latent[first]
             whitening = coordinates(program, *given)
     checkpoints = Checkpoints(folder / CHAINS, identity, resume=resume)
@@ -196,6 +201,27 @@ def coordinates(
     return found.whitening if bool(found.converged) else None
 
 
+def found_in_rounds(
+    inferences: Mapping[str, Inference], latent: Mapping[str, Sequence[str]]
+) -> tuple[dict[str, Amplitudes], list[Unknown]] | None:
+    """What each channel's data tell of unknowns that rounds have found or that are linear.
+
+    None where others are sampled, too; ``latent``: what is, in each channel.
+    """
+    known, unknowns = {}, []
+    for channel, found in inferences.items():
+        sites = set(latent[channel])
+        own = [p for p in found.expanded if {u.name for u in p.systematic.unknowns} <= sites]
+        unknowns = [u for part in own for u in part.systematic.unknowns]
+        known_well = found.moving or not any(part.systematic.scales_sky for part in own)
+        if not known_well or {u.name for u in unknowns} != sites:
+            return None
+        told = template_amplitudes(found.solution, np.concatenate([p.columns for p in own], axis=1))
+        expected = np.concatenate([part.expected for part in own])
+        known[channel] = replace_fields(told, mean=expected + told.mean)
+    return known, unknowns
+
+
 def values_found(inference: Inference, latent: Sequence[str]) -> dict[str, np.ndarray]:
     """Where the mode is looked for: at what rounds have found, if there were any."""
     start = {SKY: inference.posterior.mean} if SKY in latent else {}
@@ -236,12 +262,12 @@ def _state_in_words(iteration: int, state: HMCState, sampler: Sampler) -> str:
     phase = "warmup" if iteration <= sampler.warmup else "draws"
     steps, size = float(state.num_steps.mean()), float(state.adapt_state.step_size.mean())
     return (
-        f"{phase}, {steps:.0f} steps of {size:.3f}, acceptance {state.mean_accept_prob.mean():.2f}"
+        f"{phase}, steps {steps:.0f} x {size:.3f}, acceptance {state.mean_accept_prob.mean():.2f}"
     )
 
 
 def _speed(times: list[tuple[float, int]], chains: Chains, warmup: int) -> float | None:
-    """Gradients per second between the first and the last file of draws of this session."""
+    """Steps per second between the first and the last file of draws of this session."""
     drawn = [(at, done - warmup) for at, done in times if done > warmup]
     if len(drawn) < 2:
         return None

@@ -59,7 +59,7 @@ def to_datatree(
 
     The groups are posterior, sample_stats, prior, prior and posterior predictive, data and
     constants. Skies are on dims (chain, draw, mode) with coords ell and m, in K; data on (datum)
-    with coords product and time. Skies of programs that integrate them out are drawn.
+    with coords product and time. Skies that programs integrate out are drawn unless they have been.
 
     Parameters
     ----------
@@ -94,7 +94,8 @@ def to_datatree(
         prior = Predictive(program.model, num_samples=n_predictive)(keys[1], **arguments)
         if programs.is_collapsed(program, arguments, data.data):
             given = (program, arguments, data.data)
-            sites[SKY] = programs.collapsed_draws(*given, sites, keys[0])
+            if SKY not in sites:
+                sites[SKY] = programs.collapsed_draws(*given, sites, keys[0])
             replicated = programs.collapsed_draws(*given, thinned, keys[2], sites[SKY][:, ::step])
         else:
             again = Predictive(program.model, thinned, batch_ndims=2, return_sites=[programs.DATA])

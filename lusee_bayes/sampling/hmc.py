@@ -25,9 +25,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Float
+from jaxtyping import Float, PRNGKeyArray
+from numpyro import handlers
 from numpyro.infer import HMC, NUTS
 from numpyro.infer.hmc import HMCState
+from numpyro.infer.hmc_util import HMCAdaptState
+from numpyro.infer.mcmc import MCMCKernel
+from numpyro.infer.util import constrain_fn
 
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import is_traced, require_positive
@@ -36,9 +40,17 @@ from lusee_bayes.core.files import replacing
 from lusee_bayes.core.layouts import Layout
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.core.reading import read_json, reading
+from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.sampling.programs import WHITE_SUFFIX, latent_sites, numpyro_promotion, predicts
-from lusee_bayes.systematics.systematic import Chart
+from lusee_bayes.sampling.distributions import Marginal
+from lusee_bayes.sampling.programs import (
+    DATA,
+    WHITE_SUFFIX,
+    latent_sites,
+    numpyro_promotion,
+    predicts,
+)
+from lusee_bayes.systematics.systematic import SKY, Chart
 
 # statistics of every draw, by their ArviZ names
 STATISTICS: dict[str, Callable[[HMCState], Array]] = {
@@ -68,7 +80,10 @@ class Chains:
 
     @property
     def gradients(self) -> int:
-        """Gradient evaluations behind the draws, all chains together, warmup left out."""
+        """Evaluations of density and gradient, all chains together, warmup left out.
+
+        Of the density alone for "crank-nicolson".
+        """
         return int(self.statistics["n_steps"].sum())
 
 
@@ -339,13 +354,117 @@ def _iteration(path: Path) -> int:
     return int(path.stem.removeprefix("chunk-"))
 
 
-ALGORITHMS = ("nuts", "hmc")
+ALGORITHMS = ("nuts", "hmc", "crank-nicolson")
 
 # iterations between two files: a few seconds of work at the fiducial size
 CHUNK = 25
 
 # deepest tree of NUTS where all coordinates are white
 WHITE_DEPTH = 6
+
+
+class CrankNicolson(MCMCKernel):
+    """Turns of white coordinates, for a posterior near N(0, 1) whose gradient is dear.
+
+    ::
+
+        z' = z cos a + p sin a,    p ~ N(0, 1),
+
+    is where Hamiltonian Monte Carlo arrives if the potential is z^2 / 2. It is taken with
+    probability min(1, w(z') / w(z)), w = p(z | d) / N(z; 0, 1): the draws are those of p(z | d)
+    (preconditioned Crank-Nicolson; Cotter et al. 2013, Statistical Science 28, 424). A quarter turn
+    forgets z. Warmup makes turns shorter while fewer are taken than is aimed at. Skies that the
+    program integrates out and returns are drawn with every z.
+
+    Parameters
+    ----------
+    model : callable
+        The NumPyro model.
+    site : str
+        Its only latent site, unconstrained.
+    size : int
+        Of that.
+    turn, target : float
+        Longest a, and the acceptance rate that is aimed at.
+    """
+
+    sample_field = "z"
+
+    def __init__(self, model: Callable, site: str, size: int, turn: float, target: float):
+        self.model, self.site, self.size, self.turn, self.target = model, site, size, turn, target
+
+    def _looked(
+        self, args: tuple, kwargs: dict, z: Array, key: PRNGKeyArray
+    ) -> tuple[Float[Array, ""], dict[str, Array]]:
+        """-ln p at z, with z itself, and draws of the skies that are integrated out there."""
+        given = handlers.substitute(handlers.seed(self.model, key), {self.site: z})
+        with handlers.trace() as sites:
+            returned = given(*args, **kwargs)
+        to_draw = jax.tree.leaves(returned, is_leaf=lambda x: isinstance(x, LinearGaussian))
+        total, found = jnp.zeros(()), {self.site: z}
+        for name, site in sites.items():
+            if site["type"] != "sample":
+                continue
+            fn, value = site["fn"], site["value"]
+            if isinstance(fn, Marginal) and any(fn.model is one for one in to_draw):
+                posterior = fn.model.condition(value).posterior
+                key, own = jax.random.split(key)
+                found[name.removesuffix(DATA) + SKY] = posterior.sample(own)
+                density = posterior.log_evidence
+            else:
+                density = fn.log_prob(value).sum()
+            scale = site.get("scale")
+            total = total - (density if scale is None else scale * density)
+        return jnp.where(jnp.isnan(total), jnp.inf, total), found
+
+    def init(self, rng_key, num_warmup, init_params, model_args, model_kwargs):
+        """The first state: a draw of N(0, 1)."""
+        self.warmup = num_warmup
+        key, of_start, of_skies = jax.random.split(rng_key, 3)
+        start, zero = jax.random.normal(of_start, (self.size,)), jnp.zeros(())
+        potential, z = self._looked(model_args, model_kwargs, start, of_skies)
+        adapt = HMCAdaptState(zero + self.turn, *[None] * (len(HMCAdaptState._fields) - 1))
+        fields = dict.fromkeys(HMCState._fields) | {"diverging": jnp.asarray(False)}
+        fields |= {"i": jnp.asarray(0), "z": z, "num_steps": jnp.asarray(1), "rng_key": key}
+        fields |= {"potential_energy": potential, "energy": potential, "adapt_state": adapt}
+        return HMCState(**fields | {"accept_prob": zero, "mean_accept_prob": zero})
+
+    def sample(self, state, model_args, model_kwargs):
+        """The next state, of one chain or of all."""
+        if state.rng_key.ndim > 1:
+            return jax.vmap(lambda one: self.sample(one, model_args, model_kwargs))(state)
+        key, of_turn, of_skies, of_choice = jax.random.split(state.rng_key, 4)
+        z, turn = state.z[self.site], state.adapt_state.step_size
+        p = jax.random.normal(of_turn, z.shape)
+        there = z * jnp.cos(turn) + p * jnp.sin(turn)
+        potential, new = self._looked(model_args, model_kwargs, there, of_skies)
+        gained = state.potential_energy - potential + (there @ there - z @ z) / 2.0
+        accept = jnp.exp(jnp.minimum(gained, 0.0))
+        taken, i = jax.random.uniform(of_choice) < accept, state.i + 1
+        in_warmup = i <= self.warmup
+        longer = jnp.minimum(turn * jnp.exp((accept - self.target) / jnp.sqrt(i)), self.turn)
+        n = jnp.where(in_warmup, i, i - self.warmup)
+        return state._replace(
+            i=i,
+            z=jax.tree.map(lambda new, old: jnp.where(taken, new, old), new, state.z),
+            potential_energy=jnp.where(taken, potential, state.potential_energy),
+            energy=state.potential_energy + (p @ p) / 2.0,
+            accept_prob=accept,
+            mean_accept_prob=state.mean_accept_prob + (accept - state.mean_accept_prob) / n,
+            diverging=jnp.isinf(potential),
+            adapt_state=state.adapt_state._replace(step_size=jnp.where(in_warmup, longer, turn)),
+            rng_key=key,
+        )
+
+    def postprocess_fn(self, model_args, model_kwargs):
+        """All sites of a draw, and its skies."""
+        given = self.model, model_args, model_kwargs
+
+        def sites(z: dict[str, Array]) -> dict[str, Array]:
+            own = {self.site: z[self.site]}
+            return z | constrain_fn(*given, own, return_deterministic=True)
+
+        return sites
 
 
 @dataclass(frozen=True)
@@ -364,13 +483,15 @@ class Sampler:
         Draws of each chain that are kept.
     seed : int
         Seed of all chains.
-    algorithm : str
-        "nuts", or "hmc" with trajectories of a fixed length.
+    algorithm : str or None
+        "nuts"; "hmc" with trajectories of a fixed length; or "crank-nicolson", without gradients,
+        for a posterior that is known nearly. By default the last where rounds have found one, else
+        "nuts".
     target_accept : float
         Acceptance rate at which the step size aims.
     trajectory : float
-        Length of a trajectory of "hmc"; pi / 2 makes draws of a whitened Gaussian nearly
-        independent.
+        Length of a trajectory of "hmc", longest of "crank-nicolson"; pi / 2 makes draws of a
+        whitened Gaussian nearly independent.
 
     Raises
     ------
@@ -382,7 +503,7 @@ class Sampler:
     warmup: int = 150
     draws: int = 1000
     seed: int = 0
-    algorithm: str = "nuts"
+    algorithm: str | None = None
     target_accept: float = 0.7
     trajectory: float = np.pi / 2
 
@@ -393,13 +514,13 @@ class Sampler:
         if not 0 < self.target_accept < 1:
             raise InputError(f"target_accept must lie in 0..1, got {self.target_accept}")
         require_positive("trajectory", self.trajectory)
-        require_known("unknown algorithm", self.algorithm, ALGORITHMS)
+        require_known("unknown algorithm", self.algorithm or ALGORITHMS[0], ALGORITHMS)
 
     def identity(self) -> dict[str, object]:
         """Return all settings but the number of draws: a run is resumed only with the same."""
         return {name: value for name, value in asdict(self).items() if name != "draws"}
 
-    def kernel(self, model: Callable, n_white: int | None) -> HMC:
+    def kernel(self, model: Callable, white: Whitening | None) -> HMC | CrankNicolson:
         """Make the NumPyro kernel of these settings.
 
         In white coordinates the metric is known, the step size is near 1.5 n^-1/4, and after
@@ -409,14 +530,28 @@ class Sampler:
         ----------
         model : callable
             The NumPyro model.
-        n_white : int or None
-            Number of coordinates if all are white, else None.
+        white : Whitening or None
+            The coordinates if all are white, else None.
+
+        Raises
+        ------
+        InputError
+            For "crank-nicolson" where not all coordinates are white.
 
         References
         ----------
         Beskos et al. 2013, Bernoulli 19, 1501 (the step size).
         """
         settings: dict[str, Any] = {"target_accept_prob": self.target_accept}
+        n_white = None if white is None else white.root.shape[1]
+        if self.algorithm == "crank-nicolson":
+            if white is None:
+                raise InputError(
+                    "crank-nicolson needs coordinates in which all sites together are nearly "
+                    "N(0, 1), and none were found; use nuts"
+                )
+            site = white.names[0] + WHITE_SUFFIX
+            return CrankNicolson(model, site, n_white, self.trajectory, self.target_accept)
         if n_white is not None:
             settings |= {"adapt_mass_matrix": False, "step_size": 1.5 * n_white**-0.25}
         if self.algorithm == "hmc":
@@ -508,8 +643,8 @@ class _Run:
         self.sampler = sampler
         # leaves of the model's arguments that are arrays are traced, the rest is structure
         self.dynamic, static = eqx.partition((whitening, arguments), eqx.is_array)
-        n_white = whitening.root.shape[1] if set(latent) == white else None
-        self.kernel = sampler.kernel(lambda given: model(*eqx.combine(given, static)), n_white)
+        all_white = whitening if set(latent) == white else None
+        self.kernel = sampler.kernel(lambda given: model(*eqx.combine(given, static)), all_white)
         # XLA may stand still over batches of matrices to factorise where cores are few; several
         # devices, each with a chain of its own, would only stand idle
         chart = None if whitening is None else whitening.chart

@@ -12,18 +12,20 @@ its own, but that value.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from numpyro import distributions as dist
 from numpyro.primitives import Messenger
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.linear.amplitudes import kernel
-from lusee_bayes.sampling.hmc import Chains
+from lusee_bayes.linear.amplitudes import Amplitudes, kernel, tie
+from lusee_bayes.sampling.hmc import Chains, Whitening
+from lusee_bayes.systematics.systematic import Unknown
 
 # variances below this are rounding: of K's own, 1e-5 of a standard deviation
 NOTHING_LEFT = 1e-10
@@ -39,6 +41,51 @@ def of_channel(chains: Chains, channel: str) -> Chains:
     start = site_in(channel, "")
     own = {n.removeprefix(start): v for n, v in chains.sites.items() if n.startswith(start)}
     return Chains(own, chains.statistics)
+
+
+def gaussian_of_sites(
+    known: Mapping[str, Amplitudes],
+    unknowns: Sequence[Unknown],
+    frequencies_mhz: Mapping[str, float],
+    octaves: Mapping[str, float],
+    latent: Sequence[str],
+) -> Whitening:
+    """Coordinates in which the Gaussian of sites, given the data of all channels, is N(0, 1).
+
+    Parameters
+    ----------
+    known : mapping of Amplitudes
+        What each channel's own data tell of its unknowns.
+    unknowns : sequence of Unknown
+        Of every channel.
+    frequencies_mhz, octaves : mapping of float
+        As of :class:`SharedSites`.
+    latent : sequence of str
+        The sites that are sampled: of a single channel by their own names.
+    """
+    mhz = np.array([frequencies_mhz[channel] for channel in known])
+    sizes = [u.size or 1 for u in unknowns]
+    own = np.eye(len(mhz))
+    tying = [kernel(mhz, octaves[u.name]) if u.name in octaves else own for u in unknowns]
+    mean = np.stack([one.mean for one in known.values()])
+    covariance = np.stack([one.covariance for one in known.values()])
+    tied = tie(mean, covariance, np.repeat(tying, sizes, axis=0), np.zeros((0, mean.size)))
+    sites, parts = [], []
+    for number, channel in enumerate(known):
+        ends = np.cumsum(sizes)
+        for unknown, first, end in zip(unknowns, ends - sizes, ends, strict=True):
+            name = unknown.name if unknown.name in latent else site_in(channel, unknown.name)
+            if name not in latent:
+                continue
+            transform, z = dist.biject_to(unknown.prior().support), tied.mean[number, first:end]
+            to_x, ones = lambda z, u=unknown, t=transform: t.inv(u.at(z)), np.ones(len(z))
+            x, slope = jax.jvp(to_x, (jnp.asarray(z),), (jnp.asarray(ones),))
+            sites.append((name, () if unknown.size is None else (unknown.size,)))
+            parts.append((x, slope[:, None] * tied.root[number, first:end]))
+    mean, root = (np.concatenate([np.asarray(part[k]) for part in parts]) for k in (0, 1))
+    lower = np.linalg.cholesky(root @ root.T)
+    log_det = np.asarray(np.log(np.diagonal(lower)).sum())
+    return Whitening(*map(jnp.asarray, (mean, lower, log_det)), tuple(sites))
 
 
 @dataclass(frozen=True)
@@ -60,11 +107,14 @@ class SharedSites:
     octaves: Mapping[str, float]
 
     def __call__(self, channels: Mapping[str, dict], data: Mapping[str, Array] | None = None):
-        """Sample or observe all channels."""
+        """Sample or observe all channels; what the program returns of each."""
         known: dict[str, dict[str, Any]] = {}
+        returned = []
         for channel, arguments in channels.items():
             with _Channel(self, channel, known):
-                self.program(**arguments, data=None if data is None else data[channel])
+                own = None if data is None else data[channel]
+                returned.append(self.program(**arguments, data=own))
+        return returned
 
 
 class _Channel(Messenger):

@@ -299,7 +299,7 @@ def test_sampling_json_tells_of_the_very_run(runs, tree):
     assert figures["mean_acceptance"] == pytest.approx(statistics["acceptance_rate"].values.mean())
     # speed times the sampling's time is no more than all gradients but the first file's
     drawn = statistics["n_steps"].values[:, CHUNK:].sum()
-    assert 0 < drawn / figures["gradients_per_second"] < figures["seconds"]["sampling"]
+    assert 0 < drawn / figures["steps_per_second"] < figures["seconds"]["sampling"]
     assert set(figures["seconds"]) >= {"posterior", "sampling", "data tree", "figures"}
     assert {"lusee_bayes", "jax", "numpyro", "arviz-stats"} <= set(figures["versions"])
 

@@ -15,9 +15,11 @@ from scipy.stats import multivariate_normal, norm
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.scenario import Scenario
+from lusee_bayes.linear.amplitudes import Amplitudes
 from lusee_bayes.sampling.hmc import Chains
 from lusee_bayes.sampling.programs import numpyro_promotion
-from lusee_bayes.sampling.shared_sites import SharedSites, of_channel
+from lusee_bayes.sampling.shared_sites import SharedSites, gaussian_of_sites, of_channel
+from lusee_bayes.systematics.systematic import Unknown
 
 FREQUENCIES = {"10MHz": 10.0, "18MHz": 18.0, "40MHz": 40.0}
 MEANS = dict(zip(FREQUENCIES, (3.0, 5.0, 9.0), strict=True))
@@ -70,6 +72,48 @@ def test_what_is_nearly_the_same_has_no_site_of_its_own():
 def test_a_channel_has_its_own_names():
     chains = Chains({"10MHz/sky": np.ones(1), "18MHz/sky": np.zeros(1)}, {"lp": np.zeros(1)})
     assert of_channel(chains, "18MHz").sites == {"sky": np.zeros(1)}
+
+
+@pytest.mark.parametrize("octaves", [0.7, 1e6])
+def test_coordinates_are_those_of_the_gaussian_given_all_channels(octaves):
+    """Against all channels' values at once: prior precision and data added up.
+
+    Over 1e6 octaves only the first channel has a site, whose value the others scale.
+    """
+    unknowns = [Unknown("common", 3.0, 0.2), Unknown("smooth", 0.0, 2.0), Unknown("own", size=2)]
+    shared, rng, n = {"common": np.inf, "smooth": octaves}, np.random.default_rng(2), 12
+    known, seen, pulled = {}, np.zeros((n, n)), np.zeros(n)
+    for k, name in enumerate(FREQUENCIES):
+        rows = rng.normal(size=(5, 4))
+        data, covariance = rng.normal(size=5), np.linalg.inv(np.eye(4) + rows.T @ rows)
+        here = slice(4 * k, 4 * k + 4)
+        seen[here, here], pulled[here] = rows.T @ rows, rows.T @ data
+        known[name] = Amplitudes(covariance @ rows.T @ data, covariance, np.zeros((0, 4)))
+    x = np.log2(list(FREQUENCIES.values()))
+    prior = np.zeros((3, 4, 3, 4))
+    prior[:, 0, :, 0] = 1.0
+    prior[:, 1, :, 1] = np.exp(-0.5 * ((x[:, None] - x) / octaves) ** 2)
+    prior[:, 2, :, 2] = prior[:, 3, :, 3] = np.eye(3)
+    prior = prior.reshape(n, n)
+    expected = prior @ np.linalg.inv(np.eye(n) + seen @ prior)
+    mean = expected @ pulled
+    few = ["10MHz/smooth"] if octaves > 1.0 else [f"{name}/smooth" for name in FREQUENCIES]
+    latent = ["10MHz/common", *few, *(f"{name}/own" for name in FREQUENCIES)]
+    white = gaussian_of_sites(known, unknowns, FREQUENCIES, shared, latent)
+    assert sorted(white.names) == sorted(latent)
+    at = {
+        f"{name}/{u}": 4 * k + j
+        for k, name in enumerate(FREQUENCIES)
+        for j, u in enumerate(("common", "smooth", "own"))
+    }
+    numbers = np.concatenate(
+        [[at[s], at[s] + 1][: shape[0] if shape else 1] for s, shape in white.sites]
+    )
+    scale, middle = (np.tile(v, 3)[numbers] for v in ([0.2, 2.0, 1.0, 1.0], [3.0, 0.0, 0.0, 0.0]))
+    np.testing.assert_allclose(white.mean, middle + scale * mean[numbers], rtol=1e-9)
+    whole = scale[:, None] * expected[np.ix_(numbers, numbers)] * scale
+    np.testing.assert_allclose(white.root @ white.root.T, whole, rtol=1e-8, atol=1e-12)
+    assert float(white.log_det) == pytest.approx(np.linalg.slogdet(whole)[1] / 2.0)
 
 
 SCENARIO = (
