@@ -480,12 +480,12 @@ class FromInformation(Form):
 
 
 class Whitened(Form):
-    """Through W, in JAX: differentiable, and inside JAX's transformations, too.
+    """Through W = L^-1 A G, in JAX: differentiable, and inside JAX's transformations, too.
 
     Attributes
     ----------
     whitened : (data, white) array
-        W = L^-1 A G.
+        W; in map space L^-1 A.
     lower : (rank, rank) array
         Cholesky factor of Lambda, or of Lambda_v where ``basis`` is given.
     basis : (white, rank) array or None
@@ -515,6 +515,14 @@ class Whitened(Form):
     @abstractmethod
     def _log_det(self) -> Float[Array, ""]:
         """ln|Lambda|."""
+
+    def seen(self, u: Float[Array, " white"]) -> DataVector:
+        """Compute W u."""
+        return self.whitened @ u
+
+    def pulled(self, white: DataVector) -> Float[Array, " white"]:
+        """Compute W^T of white data."""
+        return self.whitened.T @ white
 
     def condition(self, data: DataVector) -> Solution:
         require_array("the data", data, (self.model.n_data,))
@@ -548,17 +556,24 @@ class Whitened(Form):
         """
         offset = self.model.offset
         white = self.factor.whiten(data if offset is None else data - offset)
-        return white - self.whitened @ self.model.prior.white_mean
+        return white - self.seen(self.model.prior.white_mean)
 
 
 class InMap(Whitened):
-    """In map space: Lambda = 1 + W^T W."""
+    """In map space: Lambda = 1 + G^T (A^T N^-1 A) G, so that only a square is coloured."""
 
     @staticmethod
     @eqx.filter_jit
     def _factorised(model):
-        factor, whitened = _white(model)
-        return factor, whitened, _root(gram_matrix(whitened)), None
+        factor = model.noise.factor()
+        whitened = factor.whiten(model.coupling.dense())
+        return factor, whitened, _root(model.prior.sandwich(gram_matrix(whitened))), None
+
+    def seen(self, u):
+        return self.whitened @ self.model.prior.colour(u)
+
+    def pulled(self, white):
+        return self.model.prior.colour_columns((self.whitened.T @ white)[None])[0]
 
     def _log_det(self):
         return 2.0 * jnp.log(jnp.diagonal(self.lower)).sum()
@@ -570,17 +585,13 @@ class InData(Whitened):
     @staticmethod
     @eqx.filter_jit
     def _factorised(model):
-        factor, whitened = _white(model)
+        factor = model.noise.factor()
+        whitened = factor.whiten(model.prior.colour_columns(model.coupling.dense()))
         basis, triangle = jnp.linalg.qr(jax.lax.stop_gradient(whitened).T)
         return factor, whitened, _root(triangle @ triangle.T), basis
 
     def _log_det(self):
         return _log_det_in_span(self.whitened, jax.lax.stop_gradient(self.lower))
-
-
-def _white(model: LinearGaussian) -> tuple[Factor, Array]:
-    factor = model.noise.factor()
-    return factor, factor.whiten(model.prior.colour_columns(model.coupling.dense()))
 
 
 def _root(normal: Array) -> Array:
@@ -602,11 +613,10 @@ def _log_det_in_span_jvp(primals, tangents):
     return _log_det_in_span(whitened, lower), 2.0 * (slope * tangents[0]).sum()
 
 
-def _newton(
-    whitened: Array, lower: Array, basis: Array | None, white: Array, u: Array
-) -> tuple[Array, Array]:
+def _newton(solver: Whitened, white: Array, u: Array) -> tuple[Array, Array]:
     """u plus Lambda^-1 (W^T (w - W u) - u), and the length of that step in standard deviations."""
-    gradient = whitened.T @ (white - whitened @ u) - u
+    lower, basis = solver.lower, solver.basis
+    gradient = solver.pulled(white - solver.seen(u)) - u
     projected = gradient if basis is None else basis.T @ gradient
     half = solve_lower(lower, projected[:, None], transpose=False)
     step = solve_lower(lower, half, transpose=True)[:, 0]
@@ -627,19 +637,18 @@ def _solve(solver: Whitened, data: DataVector) -> tuple[Array, Array, Array]:
     iteration: at its fixed point one more step with live arrays carries them exactly.
     """
     white = solver.surprise(data)
-    live = (solver.whitened, solver.lower, solver.basis, white)
-    frozen = jax.lax.stop_gradient(live)
+    frozen, still = jax.lax.stop_gradient((solver, white))
 
     def refine(state):
-        u, moved = _newton(*frozen, state[0])
+        u, moved = _newton(frozen, still, state[0])
         return u, moved, state[1], state[3] + 1
 
-    first, _ = _newton(*frozen, jnp.zeros(solver.whitened.shape[1]))
+    first, _ = _newton(frozen, still, jnp.zeros(solver.whitened.shape[1]))
     start = (first, jnp.inf, jnp.inf, 0)
     u, moved, _, _ = jax.lax.while_loop(lambda state: unfinished(*state[1:]), refine, start)
-    fixed = (solver.whitened, *frozen[1:3], white)
-    u, _ = _newton(*fixed, jax.lax.stop_gradient(u))
-    misfit = white - solver.whitened @ u
+    fixed = replace(solver, lower=frozen.lower, basis=frozen.basis)
+    u, _ = _newton(fixed, white, jax.lax.stop_gradient(u))
+    misfit = white - solver.seen(u)
     log_evidence = -0.5 * (
         misfit @ misfit
         + u @ u

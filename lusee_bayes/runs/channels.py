@@ -531,11 +531,11 @@ def map_channels(
 ) -> MapResult:
     """Work out all channels, going on from what an interrupted run has left in ``folder``.
 
-    Where channels share unknowns, each is worked out alone, and then given what the others tell of
-    its instrument. One whose data do not fit is worked out again, from the instrument of those that
-    do, and the likelier of both counts. A channel that cannot be mapped leaves the others as they
-    are: it is named in the result, and a joint posterior is that of the others. Of a single
-    frequency nothing unfinished is kept.
+    Where channels share unknowns, each is worked out alone, from the instrument that the first one
+    finds, and then given what the others tell of its instrument. One whose data do not fit is
+    worked out again, from the instrument of those that do, and the likelier of both counts. A
+    channel that cannot be mapped leaves the others as they are: it is named in the result, and a
+    joint posterior is that of the others. Of a single frequency nothing unfinished is kept.
 
     Parameters
     ----------
@@ -586,11 +586,15 @@ def map_channels(
     alone = not scenario.joint and not scenario.shared
     kind = ChannelResult if alone else ChannelInformation if scenario.joint else ChannelAlone
 
+    begin: dict[str, float] | None = None
+
     def observe(channel: Scenario) -> tuple | str:
         """Look at the data of a channel: what the others need of it, or why it cannot be mapped."""
 
         def make() -> ChannelResult | ChannelInformation | ChannelAlone:
-            made = condition(channel, Stages())
+            made = condition(channel, Stages(), begin)
+            if begin is not None and not made.own.fits:
+                made = condition(channel, Stages())
             known = made.known(alone=False, thorough=thorough)
             return made.result(known) if alone else kind.of(made, known)
 
@@ -600,8 +604,13 @@ def map_channels(
             return str(error)
         return () if alone else kept.shared()
 
-    names = [names_of((channel,)) for channel in channels]
-    found = engine.each(Tasks(observe, channels, names), stages, "channels")
+    names, found = [names_of((channel,)) for channel in channels], []
+    if kind is ChannelAlone:  # the others begin with the instrument of the first
+        found = engine.each(Tasks(observe, channels[:1], names[:1]), stages, "first channel")
+        if isinstance(found[0], Share) and found[0].fits:
+            begin = told_by_fitting(scenario, [channels[0].frequency_mhz], found) or None
+    left = channels[len(found) :], names[len(found) :]
+    found = [*found, *engine.each(Tasks(observe, *left), stages, "channels")]
     by_channel = list(zip(channels, found, strict=True))
     unmapped = {channel.frequency_mhz: why for channel, why in by_channel if isinstance(why, str)}
     if len(unmapped) == len(channels):

@@ -294,7 +294,7 @@ def ranked_of_sky(
         "mode": sky[modes],
         "projection": directions @ u,
         "distance": (solver.condition(data).posterior.whiten(sky[None])[0] ** 2).sum(),
-        "log likelihood": -0.5 * ((white - solver.whitened @ u) ** 2).sum(),
+        "log likelihood": -0.5 * ((white - solver.seen(u)) ** 2).sum(),
     }
 
 
