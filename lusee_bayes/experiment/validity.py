@@ -89,7 +89,7 @@ def weighed(setup: Setup, data: np.ndarray, found: Inference) -> tuple[float, fl
     ends = np.cumsum([len(part.centre) for part in parts])[:-1]
     base = base_model(setup, found.around)
     built = [found for _, found in systematics(setup, found.around)]
-    log_weights, beyond = np.empty(N_WEIGHED), np.empty((N_WEIGHED, len(data)))
+    first_order, beyond = np.empty((2, len(data), N_WEIGHED))
     for k, (sky, a) in enumerate(zip(skies, off, strict=True)):
         kinds = (type(part.systematic) for part in parts)
         z = dict(zip(kinds, np.split(a + expected, ends), strict=True))
@@ -100,13 +100,13 @@ def weighed(setup: Setup, data: np.ndarray, found: Inference) -> tuple[float, fl
                 model = systematic.effect(model, own)
             elif not systematic.first_order:
                 model = systematic.averaged(model)
-        first_order = found.model.predict(sky) + columns @ a
-        beyond[k] = model.predict(sky) - first_order
-        exact = factor.base.whiten(data - first_order - beyond[k])
-        linear = factor.base.whiten(data - first_order)
-        prior = (a**2).sum() - ((a + expected) ** 2).sum()
-        log_weights[k] = 0.5 * (linear @ linear - exact @ exact + prior)
-    pulls = np.asarray(found.model.coupling.transpose_mv(np.asarray(factor.solve(beyond.T))))
+        first_order[:, k] = found.model.predict(sky) + columns @ a
+        beyond[:, k] = model.predict(sky) - first_order[:, k]
+    left = data[:, None] - first_order
+    exact, linear = (np.asarray(factor.base.whiten(one)) for one in (left - beyond, left))
+    misfit = (linear**2).sum(0) - (exact**2).sum(0)
+    log_weights = 0.5 * (misfit + (off**2).sum(1) - ((off + expected) ** 2).sum(1))
+    pulls = np.asarray(found.model.coupling.transpose_mv(np.asarray(factor.solve(beyond))))
     moved_by = float(np.sqrt(np.mean((np.asarray(found.posterior.root()).T @ pulls) ** 2)))
     weights = np.exp(log_weights - log_weights.max())
     if weights.sum() ** 2 < 2.0 * (weights**2).sum():  # one draw has nearly all of it: no tail

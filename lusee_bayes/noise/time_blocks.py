@@ -302,6 +302,7 @@ class TimeBandedCovariance(_OverLayout):
         return TimeBandedCovariance(factor * self.band, self.layout, self.name)
 
 
+@eqx.filter_jit
 def _block_rows(band: Array) -> tuple[Array, Array]:
     """Rearrange the band into block rows: (blocks, rows, window) before the diagonal, and on it."""
     n_times, widths, products, _ = band.shape
