@@ -570,11 +570,11 @@ def turned_about_pole(beams: TimeModes, azimuth: Float[Array, " times"]) -> Time
     """
     lmax, xp = lmax_of(beams.shape[-1]), namespace(beams, azimuth)
     _, m = mode_numbers(lmax)
-    # take: a tenth of the time of an index in brackets
-    mirrored = xp.take(beams, np.arange(len(m)) - 2 * m, axis=-1)
     cosine, sine = (xp.take(wave, np.abs(m), axis=1) for wave in _phases(azimuth, lmax))
-    signed = sine * np.sign(m).astype(np.float64)[None]
-    return beams * cosine[None] - mirrored * signed[None]
+    signed, mirror = sine * np.sign(m).astype(np.float64)[None], np.arange(len(m)) - 2 * m
+    # one product after the other stays in the processor's memory; an index in place of take, or
+    # all products at once, would take several times as long
+    return xp.stack([one * cosine - xp.take(one, mirror, axis=1) * signed for one in beams])
 
 
 def _phases(azimuth: Float[Array, " times"], lmax: int) -> tuple[Array, Array]:

@@ -456,8 +456,9 @@ class FromInformation(Form):
         factor, matrix = model.noise.factor(base), solution.matrix
         for sign, one in ((1.0, old), (-1.0, factor)):
             if isinstance(one, LowRankFactor):
-                pull = np.asarray(model.coupling.transpose_mv(base.whiten_transpose(one.v)))
-                half = np.asarray(solve_lower(one.lower, pull.T, transpose=False))
+                weighted = np.asarray(base.whiten_transpose(one.v))
+                pull = model.coupling.transpose_mv(weighted)
+                half = solve_lower(np.asarray(one.lower), pull.T, transpose=False)
                 matrix = matrix + sign * gram_matrix(half)
         return cls(model, factor, model.coupling, matrix, precision_root(matrix, model.prior))
 
