@@ -194,8 +194,7 @@ def coordinates(
     if positive is not None and set(latent) == set(positive.sites):
         return coordinates_of(positive, inference.solution.information)
     start, arguments = values_found(inference, latent), {**arguments, "data": data.data}
-    # where rounds have led to the mode, it is looked for nowhere else
-    starts = 1 if SKY in latent or set(start) == set(latent) else STARTS
+    starts = 1 if SKY in latent else STARTS
     chart = _chart(arguments, latent)
     found = laplace_approximation(program.model, arguments, start, SCALES, starts, chart)
     return found.whitening if bool(found.converged) else None

@@ -418,8 +418,11 @@ class CrankNicolson(MCMCKernel):
         return jnp.where(jnp.isnan(total), jnp.inf, total), found
 
     def init(self, rng_key, num_warmup, init_params, model_args, model_kwargs):
-        """The first state: a draw of N(0, 1)."""
+        """The first state, of one chain or of all: a draw of N(0, 1)."""
         self.warmup = num_warmup
+        if rng_key.ndim > 1:
+            given = num_warmup, init_params, model_args, model_kwargs
+            return jax.vmap(lambda key: self.init(key, *given))(rng_key)
         key, of_start, of_skies = jax.random.split(rng_key, 3)
         start, zero = jax.random.normal(of_start, (self.size,)), jnp.zeros(())
         potential, z = self._looked(model_args, model_kwargs, start, of_skies)

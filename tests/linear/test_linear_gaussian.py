@@ -1,5 +1,7 @@
 """The posterior and the evidence, by both forms, against textbook formulas and 60 digits."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,7 +15,7 @@ import lusee_bayes as lb
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.linear.information import CONVERGENCE
 from lusee_bayes.linear.linear_gaussian import FromInformation, InData, InMap, form_of
-from lusee_bayes.noise.covariance import DenseCovariance
+from lusee_bayes.noise.covariance import DenseCovariance, LowRankCovariance
 from lusee_bayes.noise.time_blocks import TimeBlockCovariance
 
 FORMS = (InMap, InData, FromInformation)
@@ -365,3 +367,22 @@ def test_standard_deviations_are_right_or_refused():
     except lb.InputError:
         return
     assert np.abs(std / exact.std - 1.0).max() < 1e-3  # 3e-2 is what comes
+
+
+@pytest.mark.parametrize(("before", "after"), [(0, 3), (2, 3)])
+def test_beside_a_solved_model_columns_are_changed(before, after):
+    """A^T N^-1 A of one N_0 + U U^T from that of another: the textbook's posterior."""
+    model, d = well_scaled(30, "blocks")
+    rng = np.random.default_rng(6)
+
+    def with_columns(n: int) -> lb.LinearGaussian:
+        update = LowRankCovariance(jnp.asarray(rng.normal(size=(30, n))))
+        return replace(model, noise=model.noise + update) if n else model
+
+    known, wanted = with_columns(before).condition(d), with_columns(after)
+    found = FromInformation.beside(known, wanted).condition(d)
+    expected = oracle.posterior(*oracle.matrices(wanted), d)
+    off = (found.posterior.mean - expected.mean) / expected.std
+    assert np.abs(off).max() < WELL_SCALED
+    np.testing.assert_allclose(found.covariance, expected.covariance, atol=1e-10)
+    assert float(found.posterior.log_evidence) == pytest.approx(expected.log_prob, abs=1e-9)

@@ -6,11 +6,13 @@ import numpyro
 import pytest
 from assertions import refuse
 from numpyro import distributions as dist
-from reference_linear import posterior
+from reference_linear import assert_draws_follow, posterior
 from scipy.stats import norm
 from small_models import Case, assert_mean, per_mode
 
 import lusee_bayes as lb
+from lusee_bayes.linear.linear_gaussian import InData
+from lusee_bayes.noise.covariance import KnownFactor
 
 CASE = Case.drawn(np.array([4.0, 1.0, 0.5]), 12, 5, noise=2.0)
 
@@ -49,6 +51,19 @@ def test_turns_find_gain_and_sky(off, width):
     accepted, turn = (chains.statistics[name] for name in ("acceptance_rate", "step_size"))
     assert 0.5 < accepted.mean() < 0.95 and not chains.statistics["diverging"].any()
     assert (turn < 1.0).all() == (width > 2.0)
+
+
+def test_every_turn_is_taken_where_the_coordinates_are_the_posteriors():
+    """All chains at once, as programs run that predict the data; quarter turns forget."""
+    program, arguments = lb.load_program("sky"), CASE.arguments()
+    noise = KnownFactor.of(arguments.pop("noise"))
+    arguments |= {"fixed_noise": noise, "data": jnp.asarray(CASE.data)}
+    model = lb.LinearGaussian(arguments["coupling"], arguments["prior"], noise)
+    known = model.condition(arguments["data"], InData).posterior
+    sampler = lb.Sampler(draws=500, warmup=20, algorithm="crank-nicolson", seed=1)
+    chains = lb.sample(program.model, arguments, sampler, lb.Whitening.of(known))
+    assert (chains.statistics["acceptance_rate"] > 1.0 - 1e-9).all()
+    assert_draws_follow(chains.sites["sky"].reshape(-1, 9), known.mean, known.covariance())
 
 
 def test_turns_need_white_coordinates():
