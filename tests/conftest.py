@@ -64,9 +64,7 @@ def known_beams(*given):
 monopoles._modes = known_beams
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-DATA = Path(
-    os.environ.get("LUSEE_BAYES_TEST_DATA", Path(__file__).resolve().parents[2] / "shared" / "data")
-)
+DATA = Path(os.environ.get("LUSEE_BAYES_TEST_DATA", ROOT.parent / "shared" / "data"))
 
 
 @pytest.hookimpl(tryfirst=True)

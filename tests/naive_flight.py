@@ -24,9 +24,8 @@ def naive_gain(folder, level, port, seen, mhz):
         for row in csv.DictReader(file):
             if row["gain_setting"] == name and row["model"] == "quadratic":
                 q[row["component"]] += float(row["alpha_refit"]) * values[row["term"]]
-    mean, vectors, anchors = (
-        np.load(folder / f"{name}_{part}.npy") for part in ("mean", "eigvecs", "freqs")
-    )
+    files = (folder / f"{name}_{part}.npy" for part in ("mean", "eigvecs", "freqs"))
+    mean, vectors, anchors = map(np.load, files)
     return CubicSpline(anchors, mean + q["PC1"] * vectors[:, 0] + q["PC2"] * vectors[:, 1])(mhz)
 
 
@@ -47,10 +46,8 @@ def naive_band(flight, name, row, f, comb=False):
     within = (np.abs(x) <= 0.5 + 1e-9).all(axis=1)
     if comb:
         within &= (channels % 4 != 2).all(axis=1)
-    gains = [
-        naive_gain(flight / "gain", "LMH"[codes[p]], p, seen, 0.025 * channels[within]).mean(axis=1)
-        for p in range(4)
-    ]
+    mhz, levels = 0.025 * channels[within], ["LMH"[code] for code in codes]
+    gains = [naive_gain(flight / "gain", levels[p], p, seen, mhz).mean(axis=1) for p in range(4)]
     # mean powers of each bin's channels
     powers = np.stack([(x[within] ** k).mean(axis=1) for k in range(3)], axis=1)
     weights, found = np.linalg.pinv(powers)[0], {}

@@ -67,9 +67,8 @@ def sphere(n_theta, n_phi, lowest=-1.0):
 def galactic_directions(theta, phi, time, lon_deg, lat_deg):
     """Galactic colatitude and longitude of topocentric directions at one time."""
     site = MoonLocation.from_selenodetic(lon=lon_deg, lat=lat_deg)
-    here = LunarTopo(
-        az=(np.pi / 2 - phi) * u.rad, alt=(np.pi / 2 - theta) * u.rad, obstime=time, location=site
-    )
+    az, alt = ((np.pi / 2 - angle) * u.rad for angle in (phi, theta))
+    here = LunarTopo(az=az, alt=alt, obstime=time, location=site)
     there = here.transform_to(ICRS()).transform_to(Galactic())
     return np.pi / 2 - there.b.rad, there.l.rad
 
@@ -118,9 +117,8 @@ def layered_reflection(permittivities, thickness_m, cos_theta, frequency_mhz):
         for eps in permittivities[:-1]:
             q, y = admittance(eps)
             delta = k * q * thickness_m
-            matrix = matrix @ np.array(
-                [[np.cos(delta), 1j * np.sin(delta) / y], [1j * y * np.sin(delta), np.cos(delta)]]
-            )
+            cos, sin = np.cos(delta), 1j * np.sin(delta)
+            matrix = matrix @ np.array([[cos, sin / y], [y * sin, cos]])
         _, y0 = admittance(1.0)
         _, y_end = admittance(permittivities[-1])
         u_top, v_top = matrix @ np.array([1.0, y_end])

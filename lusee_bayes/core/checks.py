@@ -83,8 +83,7 @@ def require_shape(name: str, array: Any, shape: tuple[int | None, ...]) -> None:
         If the shape differs.
     """
     got = tuple(array.shape)
-    fits = len(got) == len(shape) and all(s in (None, g) for s, g in zip(shape, got, strict=True))
-    if not fits:
+    if len(got) != len(shape) or any(s not in (None, g) for s, g in zip(shape, got, strict=True)):
         expected = str(shape).replace("None", "any")
         raise InputError(f"{name} has shape {got}, expected {expected}")
 

@@ -73,11 +73,9 @@ class DaskEngine(engine.Engine):
                 raise InputError(f"worker {worker}: {answer}")
 
     def each(self, tasks: Tasks[T, R], stages: Stages, stage: str) -> list[R]:
-        found: list[Any] = [None] * len(tasks.items)
         with self._submitted(tasks, None, stages, stage) as (_, _, finished):
-            for number, future in finished:
-                found[number] = future.result()
-        return found
+            found = {number: future.result() for number, future in finished}
+        return [found[number] for number in range(len(tasks.items))]
 
     def reduced(self, tasks: Tasks[T, R], merge: Merge[R], stages: Stages, stage: str) -> R:
         with self._submitted(tasks, merge, stages, stage) as (job, futures, finished):
@@ -214,12 +212,8 @@ def refusal_of(
             f"{gigabytes(demand.process_bytes(n))}; start it with a larger --memory-limit or fewer "
             "--nthreads"
         )
-    if not folder.is_dir():
-        return (
-            f"it does not see '{folder}'; command and workers have to share a disk: give a folder "
-            "on it with -o"
-        )
-    return None
+    advice = "command and workers have to share a disk: give a folder on it with -o"
+    return None if folder.is_dir() else f"it does not see '{folder}'; {advice}"
 
 
 @contextmanager

@@ -254,8 +254,14 @@ def transaction(
     recover(folder)
     stage = scratch_folder(folder)
     try:
-        with _naming_last(folder, stage):
+        try:
             yield stage
+        except OSError as error:
+            # of several files the one that was written last, where it will lie
+            written = [path for path in stage.rglob("*") if path.is_file()]
+            last = max(written, key=lambda path: path.stat().st_mtime_ns, default=stage)
+            with naming_disk(folder / last.relative_to(stage)):
+                raise error
         files = sorted(str(p.relative_to(stage)) for p in stage.rglob("*") if p.is_file())
         for target in (folder / name for name in files):
             if target.is_dir():
@@ -339,18 +345,6 @@ def naming_disk(path: Path) -> Iterator[None]:
         if code is None:
             raise
         raise OSError(code, os.strerror(code), error.filename or str(path)) from error
-
-
-@contextmanager
-def _naming_last(folder: Path, stage: Path) -> Iterator[None]:
-    """The same for several files in turn: the one that was written last, where it will lie."""
-    try:
-        yield
-    except OSError as error:
-        written = [path for path in stage.rglob("*") if path.is_file()]
-        last = max(written, key=lambda path: path.stat().st_mtime_ns, default=stage)
-        with naming_disk(folder / last.relative_to(stage)):
-            raise error
 
 
 @contextmanager

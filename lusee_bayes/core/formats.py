@@ -146,11 +146,8 @@ def with_grid(dataset: xr.Dataset) -> xr.Dataset:
         for variable in dataset.variables.values():
             if dim in variable.dims:
                 variable.attrs["grid_mapping"] = grid
-        mapping = {
-            "grid_mapping_name": "healpix",
-            "indexing_scheme": "ring",
-            "refinement_level": round(np.log2(n / 12) / 2),
-        }
+        mapping: dict[str, Any] = {"grid_mapping_name": "healpix", "indexing_scheme": "ring"}
+        mapping["refinement_level"] = round(np.log2(n / 12) / 2)
         indices = {"standard_name": "healpix_index", "units": "1"}
         numbers = dim, np.arange(n, dtype=np.int32), indices, {"zlib": True, "shuffle": True}
         dataset = dataset.assign_coords({index: numbers}).assign({grid: ((), np.int8(0), mapping)})

@@ -149,9 +149,8 @@ def read_json(path: str | Path, layout: Layout, hint: str = "") -> dict[str, Any
     InputError
         If the file cannot be read, is no object, or lacks a value.
     """
-    text = read_text(path, layout.what, hint)
-    with reading(path, layout.what):
-        found = json.loads(text)
+    with reading(path, layout.what, hint):
+        found = json.loads(read_text(path, layout.what))
     if not isinstance(found, dict):
         raise InputError(f"{path} holds a {type(found).__name__}; expected {layout.what}")
     return found | layout.checked(path, {}, found).values
@@ -194,9 +193,8 @@ def read_table(path: str | Path, layout: Layout, hint: str = "") -> dict[str, np
         If the file cannot be read, rows are of different lengths, or a column is missing or not as
         declared.
     """
-    text = read_text(path, layout.what, hint)
-    with reading(path, layout.what):
-        rows = list(csv.reader(text.splitlines(), strict=True))
+    with reading(path, layout.what, hint):
+        rows = list(csv.reader(read_text(path, layout.what).splitlines(), strict=True))
     if len(rows) < 2:
         raise InputError(f"{path} has no rows; expected {layout.what}")
     header, *rows = rows
@@ -264,7 +262,6 @@ _Constructor.add_constructor("tag:yaml.org,2002:timestamp", lambda _, node: node
 def _yaml() -> YAML:
     plain = YAML(typ="safe", pure=True)
     plain.Constructor = _Constructor
-    plain.default_flow_style = False
     plain.allow_unicode = False  # line breaks of Unicode would not come back
     plain.sort_base_mapping_type_on_output = False
     return plain

@@ -68,11 +68,7 @@ class Section(BaseModel):
     """
 
     model_config = ConfigDict(
-        extra="forbid",
-        frozen=True,
-        allow_inf_nan=False,
-        strict=True,
-        json_schema_extra=_described,
+        extra="forbid", frozen=True, allow_inf_nan=False, strict=True, json_schema_extra=_described
     )
 
     def anchored(self: S) -> S:

@@ -122,8 +122,7 @@ def to_tree(value: Any) -> xr.DataTree:
         if kind.what == "array":
             array = np.asarray(held)
             if array.size:
-                written = dict(kind.attributes), dict(kind.encoding)
-                variables[name] = (kind.declared.dims, array, *written)
+                variables[name] = (kind.declared.dims, array, kind.attributes, kind.encoding)
             else:
                 empty[name] = array.shape
         elif kind.what == "group":
@@ -342,12 +341,11 @@ def _rows(kind: type[T], tree: xr.DataTree | StoredTree, where: str) -> Iterator
     if not tree.variables:
         return
     kinds = _fields(kind)
-    # gaps make whole numbers real
-    as_real = {name: {"kind": "real"} if one.optional else {} for name, one in kinds.items()}
-    columns = {
-        name: replace(one.declared, dims=("row",), optional=False, **as_real[name])
-        for name, one in kinds.items()
-    }
+    columns = {}
+    for name, one in kinds.items():
+        # gaps make whole numbers real
+        as_real = {"kind": "real"} if one.optional else {}
+        columns[name] = replace(one.declared, dims=("row",), optional=False, **as_real)
     found = Layout(kind.__name__, columns).checked(where, tree.variables, {}).arrays
     for row in zip(*(found[name].tolist() for name in kinds), strict=True):
         values = zip(kinds.items(), row, strict=True)

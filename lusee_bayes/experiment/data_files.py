@@ -63,8 +63,7 @@ def items_of(data: object) -> tuple[Visibilities, ...] | tuple[Path, ...]:
     one = Visibilities | str | Path
     given = (data,) if isinstance(data, one) else data
     items = given if isinstance(given, Sequence) else (given,)
-    wrong = [item for item in items if not isinstance(item, one)]
-    if wrong:
+    if wrong := [item for item in items if not isinstance(item, one)]:
         raise InputError(
             f"data are Visibilities, paths of files, or several of one of them, not a "
             f"{type(wrong[0]).__name__}; Visibilities.from_arrays makes some of arrays"
@@ -117,10 +116,8 @@ def are_sessions(data: Data) -> bool:
     files = files_of(data)
     sessions = [is_session(require_file(path, "data", HINT)) for path in files]
     if len(files) > 1 and not all(sessions):
-        other = files[sessions.index(False)]
-        raise InputError(
-            f"'{other}' is no session of the spectrometer; of other data, give one file"
-        )
+        odd = files[sessions.index(False)]
+        raise InputError(f"'{odd}' is no session of the spectrometer; of other data, give one file")
     return bool(files) and all(sessions)
 
 
@@ -157,8 +154,7 @@ def read_data(data: Data, scenario: Scenario) -> Visibilities:
         If the file cannot be used, it is not known or contradicted what its times are, they cannot
         be averaged, or a waterfall does not fit the scenario's beams.
     """
-    reduced = reduced_of(data, scenario)
-    if reduced is not None:
+    if (reduced := reduced_of(data, scenario)) is not None:
         return visibilities_of(reduced, scenario)
     files, timestamp = files_of(data), scenario.observation.timestamp
     path = files[0] if files else "the data"
@@ -227,8 +223,7 @@ def _require_same_instrument(waterfall: Waterfall, scenario: Scenario) -> None:
     """InputError unless data in V^2/Hz are those of these antennas, receivers and temperatures."""
     section, frequency = scenario.beam, scenario.frequency_mhz
     source = section.source().behind(waterfall.receiver)
-    circuit = source.circuit(frequency)
-    if circuit is None:
+    if (circuit := source.circuit(frequency)) is None:
         raise InputError(
             f"{waterfall.path} is in V^2/Hz, at the receivers' inputs of a four-port instrument; "
             "give its response as beam.file"
@@ -256,10 +251,8 @@ def _require_same_instrument(waterfall: Waterfall, scenario: Scenario) -> None:
             f"in {waterfall.path} 1 K is {theirs[port]:.6g} V^2/Hz at port {port}, with "
             f"{section.file} it is {ours[port]:.6g}; {what_to_do}"
         )
-    for name, theirs_k in (
-        ("moon_temperature_k", waterfall.moon_k),
-        ("antenna_temperature_k", waterfall.antenna_k),
-    ):
+    said_k = {"moon_temperature_k": waterfall.moon_k, "antenna_temperature_k": waterfall.antenna_k}
+    for name, theirs_k in said_k.items():
         ours_k = getattr(section, name)
         if not np.isclose(theirs_k, ours_k, rtol=SAME_TEMPERATURE, atol=0.0):
             raise InputError(
@@ -309,8 +302,7 @@ def recipe_of(scenario: Scenario) -> Recipe:
     InputError
         If it does not say what the files leave open: gains, bin origin, what the times are.
     """
-    section = scenario.flight
-    if section is None:
+    if (section := scenario.flight) is None:
         raise InputError(
             "the data are sessions of the spectrometer, and the scenario does not say how they "
             "become visibilities; give it a section flight, or --set 'flight={gain_table: ..., "
@@ -327,8 +319,7 @@ def recipe_of(scenario: Scenario) -> Recipe:
             "edge at k times 25 kHz, which differ by 12.5 kHz; use --set flight.bin_origin=centre "
             "(luseepy's labels) or edge"
         )
-    timestamp = scenario.observation.timestamp
-    if timestamp is None:
+    if (timestamp := scenario.observation.timestamp) is None:
         raise InputError(
             "the sessions do not say whether their times are the start, the middle or the end of "
             "the integrations; use --set observation.timestamp=middle (or start, end, instant)"
@@ -387,7 +378,6 @@ def gain_table_of(section: FlightSection) -> GainModel:
     InputError
         If the table cannot be read, or says itself what the scenario says of its components.
     """
-    if section.gain_table is None:
-        return synthetic_gains().with_component_std(section.component_std)
-    table = read_gain_table(section.gain_table, section.gain_model)
+    path = section.gain_table
+    table = synthetic_gains() if path is None else read_gain_table(path, section.gain_model)
     return table.with_component_std(section.component_std)

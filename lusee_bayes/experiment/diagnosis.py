@@ -191,10 +191,8 @@ def model_mistakes(setup: Setup) -> Iterator[ModelMistake]:
         yield ModelMistake(wrong, remedy, beams, with_offsets(observation, values))
     _, m = mode_numbers(beams.lmax)
     mirrored = np.asarray(beams.modes) * np.where(m < 0, -1.0, 1.0)
-    azimuths = {
-        "mirrored": mirrored,
-        "counted from North towards East": np.asarray(turn_about_z(mirrored, np.pi / 2.0)),
-    }
+    clockwise = np.asarray(turn_about_z(mirrored, np.pi / 2.0))
+    azimuths = {"mirrored": mirrored, "counted from North towards East": clockwise}
     for how, modes in azimuths.items():
         wrong, remedy = f"the azimuth of the beams is {how}", "count it from East towards North"
         yield ModelMistake(wrong, remedy, replace(beams, modes=modes), observation)
@@ -256,10 +254,8 @@ class UnderAnySky:
         ``pointing`` is that of the data's own observation, up to the ell that counts.
         """
         lmax = len(pointing.pole_from_galactic.blocks) - 1
-        if (observation.times == self.setup.observation.times).all():
-            pointing = pointing.placed(observation)
-        else:
-            pointing = Pointing.of(observation, lmax)
+        same = (observation.times == self.setup.observation.times).all()
+        pointing = pointing.placed(observation) if same else Pointing.of(observation, lmax)
         hidden = 0.0 if self.setup.hidden is None else self.setup.hidden
         modes = (np.asarray(beams.modes) + hidden)[..., : n_modes(lmax)]
         return self.wide(CouplingMatrix.of_modes(modes, pointing, self.data.layout))[0]
@@ -324,8 +320,7 @@ class MixedProducts:
         known.append(self._factor("every auto", autos * 1.0))
         known += [self._gain(k, 1.0 * (first == k) + (second == k)) for k in range(n_ports)]
         known.append(self._constant(np.flatnonzero(autos)))
-        for mistake in known:
-            yield self.chi2(mistake.w), mistake
+        yield from ((self.chi2(mistake.w), mistake) for mistake in known)
         yield from self._times()
 
     def chi2(self, w: Columns) -> float:
@@ -556,8 +551,7 @@ def _offsets(here: UnderAnySky, low: Pointing) -> Iterator[tuple[float, ModelMis
         for reach in REACHES:
             values = value + reach * np.array([-1.0, 0.0, 1.0])
             seen = [here.under(setup.beams, shifted(v), low).chi2 for v in values]
-            curvature = seen[0] - 2.0 * seen[1] + seen[2]
-            if curvature > 0.0:
+            if (curvature := seen[0] - 2.0 * seen[1] + seen[2]) > 0.0:
                 value += reach * np.clip(0.5 * (seen[0] - seen[2]) / curvature, -3.0, 3.0)
             chi2 = min(seen)
         section, kind = setup.scenario.noise.pointing, offset_kind(name)

@@ -22,7 +22,7 @@ from lusee_bayes.experiment.model import set_up, true_signal, true_values
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.flight import synthesis
 from lusee_bayes.flight.clock import DAY_S, MJD_ZERO, Clock
-from lusee_bayes.flight.gain_model import GainModel, draw_gains
+from lusee_bayes.flight.gain_model import Errors, GainModel, draw_gains
 from lusee_bayes.flight.recipe import FlightSection, FlightSimulatedSection
 from lusee_bayes.flight.session import ADC_HIGH, ADC_LOW, FRAME_S, PORTS, BinOrigin, channel_mhz
 from lusee_bayes.flight.session_files import SessionRows
@@ -89,7 +89,7 @@ class FlightSimulation:
     disturbances: synthesis.Disturbances
     table: GainModel
     gains: GainModel
-    gain_errors: dict[str, float]
+    gain_errors: Errors
     origin: BinOrigin
     navg_shift: int
     clock: Clock
@@ -178,10 +178,8 @@ class FlightSimulation:
             t = sample_covariances(t, self.frames / factor, generator)
         levels = "".join(self.disturbances.level[rows.start])
         counts = self._counting(levels)(to_real(t), self._telemetry(rows))
-        saturated = self.disturbances.saturated[rows]
-        counts[saturated] *= synthesis.SATURATED_FACTOR
-        bitslice = np.broadcast_to(self._slices[levels], counts.shape[:2])
-        found = synthesis.rounded(counts, bitslice)
+        counts[self.disturbances.saturated[rows]] *= synthesis.SATURATED_FACTOR
+        found = synthesis.rounded(counts, np.broadcast_to(self._slices[levels], counts.shape[:2]))
         found[self.disturbances.absent[rows]] = np.nan
         return found
 
@@ -200,9 +198,7 @@ class FlightSimulation:
 
     def _telemetry(self, rows: slice) -> Mapping[str, Float[np.ndarray, " _"]]:
         turns = 2.0 * np.pi * self.observation.hours[rows]
-        return {
-            name: m + a * np.sin(turns / period_h) for name, (m, a, period_h) in TELEMETRY.items()
-        }
+        return {name: m + a * np.sin(turns / period) for name, (m, a, period) in TELEMETRY.items()}
 
 
 def flight_of(scenario: Scenario) -> FlightSection:
@@ -252,12 +248,10 @@ def simulate_flight(scenario: Scenario, stages: Stages | None = None) -> FlightS
     hours = observation.hours - observation.hours[0]
     made = synthesis.Disturbances.drawn(section, hours, step_s, origin, scenario.seed)
     nodes = np.array(scenario.frequencies_mhz or (scenario.frequency_mhz,))
-    sky = nodes, true_visibilities(scenario, observation, stages)
+    seen = observation, nodes, true_visibilities(scenario, observation, stages)
     mjd = float(np.floor(observation.times[0].mjd)) - CLOCK_DAYS
     clock = Clock("the simulation", MJD_ZERO, mjd, "utc", CLOCK_S)
-    return FlightSimulation(
-        scenario, section, observation, *sky, made, *gains, origin, shift, clock
-    )
+    return FlightSimulation(scenario, section, *seen, made, *gains, origin, shift, clock)
 
 
 def spectra_observation(scenario: Scenario, window_s: float) -> Observation:
@@ -339,9 +333,7 @@ def true_visibilities(
     return found
 
 
-def _drawn_gains(
-    scenario: Scenario, flight: FlightSection
-) -> tuple[GainModel, GainModel, dict[str, float]]:
+def _drawn_gains(scenario: Scenario, flight: FlightSection) -> tuple[GainModel, GainModel, Errors]:
     """The table, the gains of which it is the mean, and by how much they are off."""
     table, section = gain_table_of(flight), scenario.noise.gain_table
     if section is None:
@@ -357,5 +349,4 @@ def _drawn_gains(
             "give flight.gain_std, or flight.component_std"
         )
     generator = np.random.default_rng([scenario.seed, 3])
-    gains, errors = draw_gains(table, flight.gain_std, generator)
-    return table, gains, errors
+    return table, *draw_gains(table, flight.gain_std, generator)

@@ -17,15 +17,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from lusee_bayes.core.section import (
-    Angle,
-    Positive,
-    Section,
-    Temperature,
-    kinds_of,
-    one_of,
-    requires,
-)
+from lusee_bayes.core.section import Angle, Positive, Section, Temperature, kinds_of, one_of
 from lusee_bayes.instrument.beams.fields import Interpolation
 from lusee_bayes.instrument.beams.grid import read_beam_grid, read_grid_table
 from lusee_bayes.instrument.beams.luseepy_files import read_response, read_scalar_beam
@@ -112,13 +104,10 @@ class ObservationSection(Section):
             return {**tree, "window": "instant"}
         return tree
 
-    _a_fixed_axis_has_instants = requires(
-        lambda section: not section.fixed_axis or section.window == "instant",
-        "fixed_axis is for samples that are instants; add window: instant",
-    )
-
     @model_validator(mode="after")
-    def _a_schedule_has_all_dates(self) -> ObservationSection:
+    def _entries_agree(self) -> ObservationSection:
+        if self.fixed_axis and self.window != "instant":
+            raise ValueError("fixed_axis is for samples that are instants; add window: instant")
         if self.schedule is None:
             return self
         for name in ("start", "runs"):
@@ -265,9 +254,8 @@ class MonopoleBeamSection(BaseBeamSection):
     def source(self) -> BeamSource:
         """The antennas."""
         ground = {"surface_permittivity", "deep_permittivity", "loss_tangent"}
-        regolith = Regolith(**self.model_dump(include=ground))
         others = self.model_dump(exclude={"model", "exact", *ground})
-        return Monopoles(regolith=regolith, **others)
+        return Monopoles(regolith=Regolith(**self.model_dump(include=ground)), **others)
 
 
 class _FileSection(BaseBeamSection):

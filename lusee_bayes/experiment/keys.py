@@ -55,8 +55,7 @@ class Key:
     def __str__(self) -> str:
         model = f"  (model {self.kind})" if self.kind else ""
         unit = f" [{self.unit}]" if self.unit else ""
-        choices = f"{self.choices}{unit}"
-        return f"{self.path} = {self.default}{model}\n    {self.meaning}\n    {choices}"
+        return f"{self.path} = {self.default}{model}\n    {self.meaning}\n    {self.choices}{unit}"
 
 
 def scenario_keys(within: str = "") -> list[Key]:

@@ -106,9 +106,8 @@ class GroupsCompared:
         """
         squares = self.z**2
         most, product = squares.max(axis=0), squares.argmax(axis=0)
-        judged = self.degrees > 0.0
         tail = _tail(self.chi2, self.degrees)
-        single = np.where(judged, special.chdtrc(1.0, most), 1.0) * len(squares)
+        single = np.where(self.degrees > 0.0, special.chdtrc(1.0, most), 1.0) * len(squares)
         out = (tail < false_alarm) | (single < false_alarm)
         out &= self.size >= max(WORST * self.size.max(), least)
         rest = _tail(self.chi2 - most, self.degrees - 1.0)
@@ -130,9 +129,8 @@ class GroupsCompared:
         DataGroup or None
             None if none stands out.
         """
-        present = self.left_out.present
         groups = [one for one in groups_of(self.data) if one.kind in ("product", "day")]
-        groups = [one for one in groups if (one.data & present).any()]
+        groups = [one for one in groups if (one.data & self.left_out.present).any()]
         chi2, degrees = _judged(self.left_out.each([group.data for group in groups]))
         out = _tail(chi2, degrees) < false_alarm
         if not out.any():
@@ -285,8 +283,7 @@ def _found(setup: Setup, data: Visibilities, rules: _Rules, stages: Stages) -> F
         gone = nothing if obvious is None else obvious
         before = np.where(gone.any(axis=0), start.ratio, 0.0)
     for rounds in range(1, MAX_ROUNDS + 1):
-        start = compared(*without(setup, data, gone))
-        if start is None:
+        if (start := compared(*without(setup, data, gone))) is None:
             return Fitting(nothing, before, NOT_JUDGED)
         before = np.where(before > 0.0, before, start.ratio)
         more, auto = rules.eliminated(start, gone)
@@ -418,8 +415,7 @@ class _Rules:
             first = first if groups else result
             if result is not None and found.worst(self.false_alarm).any():
                 return result, ""
-            group = found.worst_group(self.false_alarm)
-            if group is None:
+            if (group := found.worst_group(self.false_alarm)) is None:
                 # where no few groups are to blame: what was found without blaming any
                 return result or first, ""
             of_groups = of_groups | group.data

@@ -282,7 +282,7 @@ def _elsewhere(found: Inference, way: int) -> dict[str, float]:
 def _conditioned(
     setup: Setup, data: Visibilities, around: Around, rounds: int, exact: Inference | None = None
 ) -> Inference:
-    """``exact``: what the same A and radiometer noise tell of the sky if values are these."""
+    """``exact``: the sky if values are these, whose A^T N_0^-1 A serves here, too."""
     model, held = model_about(setup, around)
     if exact is None or exact.solution.matrix is None:
         solution = model.condition(data.data)

@@ -222,7 +222,6 @@ class Scenario(Section):
     def _sections_agree(self) -> Scenario:
         many, own_sources = self.frequencies_mhz, self.sources.list
         prior, error = self.prior, self.noise.beam
-        parameters = error is not None and error.parameters
         if any(b <= a for a, b in pairwise(many)):
             raise ValueError("frequencies_mhz must grow from one to the next")
         if self.joint and not many:
@@ -234,7 +233,7 @@ class Scenario(Section):
                 "the embedded sky holds the catalogue's sources already; with sources.list of its "
                 "own, set sky.sources=false"
             )
-        if parameters and not self.beam.has_parameters:
+        if error is not None and error.parameters and not self.beam.has_parameters:
             raise ValueError(
                 "noise.beam.parameters are those of the embedded antennas, which beam.file "
                 "replaces; use noise.beam.shift_mhz or noise.beam.file, or files over a grid of "
@@ -265,20 +264,17 @@ class Scenario(Section):
         """What channels with posteriors of their own share of the instrument: words and octaves."""
         if self.joint or not self.frequencies_mhz:
             return {}
-        found = {
-            cls.words: cls.octaves(section)
+        return {
+            cls.words: octaves
             for cls, section in present(SYSTEMATICS, self)
-            if cls.treatment(self) != "ignored"
+            if cls.treatment(self) != "ignored" and (octaves := cls.octaves(section))
         }
-        return {words: octaves for words, octaves in found.items() if octaves}
 
     def of_measured(self) -> Scenario:
         """The scenario of measured data: beams that nobody calls exact have unknowns."""
         if self.beam.exact or self.noise.beam is not None or self.noise.fields is not None:
             return self
-        known = {
-            name: relative * getattr(self.beam, name) for name, relative in self.beam.errors.items()
-        }
+        known = {name: error * getattr(self.beam, name) for name, error in self.beam.errors.items()}
         stds = {name: std for name, std in known.items() if std > 0.0}
         beam = BeamErrorSection(parameters=stds) if stds else None
         fields = FieldErrorsSection() if self.beam.source().has_fields else None
@@ -286,8 +282,7 @@ class Scenario(Section):
 
     def with_section(self, name: str, **values: object) -> Scenario:
         """The scenario with some values of a section changed."""
-        section = getattr(self, name).model_copy(update=values)
-        return self.model_copy(update={name: section})
+        return self.model_copy(update={name: getattr(self, name).model_copy(update=values)})
 
     @property
     def single(self) -> bool:
@@ -299,9 +294,8 @@ class Scenario(Section):
         alone: dict[str, Any] = {"frequencies_mhz": (), "joint": False}
         if self.joint:  # theirs is the spectral prior, of the sky's own C_ell
             alone["prior"] = sky_sections.IsotropicPriorSection(spectrum="sky")
-        alone["instrument_seed"] = (
-            self.seed if self.instrument_seed is None else self.instrument_seed
-        )
+        seed = self.instrument_seed
+        alone["instrument_seed"] = self.seed if seed is None else seed
         return tuple(
             self.model_copy(update={**alone, "frequency_mhz": f, "seed": self.seed + number})
             for number, f in enumerate(self.frequencies_mhz)
@@ -336,9 +330,8 @@ _as_yaml = lru_cache(maxsize=64)(lambda text: as_yaml(json.loads(text)))
 
 def scenario_names() -> list[str]:
     """Names of the scenarios that ship with the package."""
-    return sorted(
-        p.name.removesuffix(".yaml") for p in FOLDER.iterdir() if p.name.endswith(".yaml")
-    )
+    names = (entry.name for entry in FOLDER.iterdir())
+    return sorted(name.removesuffix(".yaml") for name in names if name.endswith(".yaml"))
 
 
 def load_scenario(

@@ -20,16 +20,10 @@ from lusee_bayes.priors.families import IsotropicFamily, PriorFamily
 from lusee_bayes.priors.local_scales import embedded_local_scales
 from lusee_bayes.sampling.log_normal_prior import LogNormalPrior
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, diffuse_brightness, galactic_share
-from lusee_bayes.sky.positive_skies import (
-    FIELDS,
-    FIELDS_OF,
-    LogNormalSky,
-    PositiveSkies,
-    deviation_spectrum,
-)
+from lusee_bayes.sky.positive_skies import LogNormalSky, PositiveSkies, deviation_spectrum
 from lusee_bayes.sky.prior import HarmonicPrior, Prior, read_mean, read_spectrum
 from lusee_bayes.sky.sky_source import Sky, SkySource, galaxy_sky, sky_from_file
-from lusee_bayes.sky.spectral_prior import SpectralPrior, check_components, require_names
+from lusee_bayes.sky.spectral_prior import SpectralPrior, check_components
 from lusee_bayes.systematics.prior_spectrum import SpectrumSection
 
 
@@ -333,7 +327,7 @@ class SpectralSection(Section):
         if self.model == "components":
             check_components(self.components, n, self.residual)
         if self.model == "positive":
-            require_names("field", FIELDS_OF, self.fields, FIELDS, n)
+            PositiveSkies.require_fields(self.fields, n)
 
     def lmax_of_fields(self, lmax: int) -> int:
         """Choose the highest ell of the fields: 1.5 times that of the map, if they can be solved.
@@ -367,11 +361,9 @@ class SpectralSection(Section):
         InputError
             As :meth:`lmax_of_fields`.
         """
-        sources = None
-        if self.sources:
-            sources = np.array(
-                [[s.modes(f, lmax) for s in BRIGHT_SOURCES] for f in frequencies_mhz]
-            )
+        catalogue = BRIGHT_SOURCES if self.sources else ()
+        modes = [[source.modes(f, lmax) for source in catalogue] for f in frequencies_mhz]
+        sources = np.reshape(modes, (len(modes), len(catalogue), n_modes(lmax)))
         templates = [partial(diffuse_brightness, f) for f in frequencies_mhz]
         own = self.model_dump(include={"reference_mhz", "turnover_mhz"})
         own |= {"weight": galactic_share, "lmax_fields": self.lmax_of_fields(lmax)}

@@ -28,7 +28,7 @@ import pandas as pd
 from jaxtyping import Float, Int
 from scipy.linalg import block_diag
 
-from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels
+from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels, Square
 from lusee_bayes.core.trees import quantity
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import base_model, radiometer, true_values
@@ -68,9 +68,7 @@ class NullDirection:
     share: float
 
     @classmethod
-    def of(
-        cls, names: Sequence[str], covariance: Float[np.ndarray, "parts parts"]
-    ) -> NullDirection:
+    def of(cls, names: Sequence[str], covariance: Square) -> NullDirection:
         """Find it in a posterior covariance.
 
         Parameters
@@ -87,8 +85,7 @@ class NullDirection:
 
     def words(self) -> str:
         """Its larger parts with their weights, the largest first."""
-        order = np.argsort(-np.abs(self.weights))
-        large = [k for k in order if abs(self.weights[k]) >= PART]
+        large = [k for k in np.argsort(-np.abs(self.weights)) if abs(self.weights[k]) >= PART]
         return ", ".join(f"{self.names[k]} {self.weights[k]:+.2f}" for k in large)
 
     def sentence(self) -> str:
@@ -263,16 +260,15 @@ class Unknowns:
         found : Inference
             Of these data alone.
         """
-        scenario, held, octaves, alike = experiment.scenario, [], [], []
-        for part in found.expanded:
-            own, none = part.systematic, ((), np.zeros((0, len(part.expected))))
-            over = own.octaves(attrgetter(own.key)(scenario))
-            if not isinstance(own, PointSources):
-                held.append(part)
-                octaves.append(np.full(len(part.expected), over))
-                alike.append(none if own.has_table else own.like_the_sky())
+        held = [part for part in found.expanded if not isinstance(part.systematic, PointSources)]
         if not held:
             return None
+        octaves, alike = [], []
+        for part in held:
+            own, none = part.systematic, ((), np.zeros((0, len(part.expected))))
+            over = own.octaves(attrgetter(own.key)(experiment.scenario))
+            octaves.append(np.full(len(part.expected), over))
+            alike.append(none if own.has_table else own.like_the_sky())
         data, columns = experiment.data, np.concatenate([s.columns for s in held], axis=1)
         # of spectra, the sky behind them may be known, but not what the scenario would have drawn
         known = data.truth is not None and data.calibration is None
@@ -467,28 +463,25 @@ def pointing_report(experiment: Experiment, found: Inference) -> PointingReport:
     found : Inference
         Of these data alone.
     """
-    sky = found.posterior.mean
-    table = None if found.offsets is None else _table(experiment, found, sky)
+    table = None if found.offsets is None else _table(experiment, found)
     values = {} if table is None else dict(zip(table["offset"], table["value"], strict=True))
-    return PointingReport(table, _preferred(experiment, found, sky, values))
+    return PointingReport(table, _preferred(experiment, found, values))
 
 
-def _table(experiment: Experiment, found: Inference, sky: Modes) -> pd.DataFrame:
+def _table(experiment: Experiment, found: Inference) -> pd.DataFrame:
     table = _alone(experiment, found, found.offsets)
     about = np.asarray(table["std"] / table["prior_std"])  # what is left of the offsets
     noise = np.sqrt(np.asarray(radiometer(experiment.setup).diagonal()))
     model = base_model(experiment.setup)
-    left = found.offsets.systematic.beyond_first_order(model, sky, about)
+    left = found.offsets.systematic.beyond_first_order(model, found.posterior.mean, about)
     beyond = [float(np.sqrt(np.mean((left[name] / noise) ** 2))) for name in table["unknown"]]
     table = table.assign(beyond_first_order=beyond).rename(columns={"unknown": "offset"})
     columns = ["offset", "value", "std", "prior_std", "beyond_first_order", "true"]
     return table[[name for name in columns if name in table]]
 
 
-def _preferred(
-    experiment: Experiment, found: Inference, sky: Modes, values: dict[str, float]
-) -> pd.DataFrame:
-    setup, data = experiment.setup, experiment.data
+def _preferred(experiment: Experiment, found: Inference, values: dict[str, float]) -> pd.DataFrame:
+    setup, data, sky = experiment.setup, experiment.data, found.posterior.mean
     n_runs = setup.observation.n_runs
     steps = {name: step for kind, step in TESTED.items() for name in offset_names((kind,), n_runs)}
     centre = dict.fromkeys(steps, 0.0) | values

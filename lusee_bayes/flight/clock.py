@@ -190,8 +190,7 @@ def clock_of(path: str | Path, said: Clock | None, given: Clock | None, raw_s: T
         return replace(given, raw_s=raw_s, rate=given.rate * said.rate, stated=None)
     if given is None or said is None:
         return said or given
-    differ = given.differs_s(said, raw_s)
-    if differ > SAME_S:
+    if (differ := given.differs_s(said, raw_s)) > SAME_S:
         raise InputError(
             f"{path} and {given.source} differ by {differ:.6g} s about the clock: the session says "
             f"{said.scale.upper()}, the clock file {given.scale.upper()}; leave out --clock, or "

@@ -97,8 +97,7 @@ def outliers(
         among = np.where(kept[active], np.abs(z[active]).max(axis=1), 0.0)
         out = (among > limit) & (among >= WORST * among.max(axis=1, keepdims=True))
         # a curve needs more points than it has terms
-        enough = (kept[active] & ~out).sum(axis=1) > basis.shape[1]
-        out &= enough[:, None]
+        out &= (kept[active] & ~out).sum(axis=1, keepdims=True) > basis.shape[1]
         if not out.any():
             break
         kept[active] &= ~out
@@ -139,8 +138,7 @@ def fitted_curves(values: Autos, kept: Points, basis: Basis) -> tuple[Autos, Poi
     inverse, _ = inverse_normals(basis, kept)
     pulled = np.einsum("rpk,ka->rpa", np.where(kept[:, None], values, 0.0), basis)
     curve = np.einsum("rab,rpb,ka->rpk", inverse, pulled, basis, optimize=True)
-    leverage = np.einsum("rab,ka,kb->rk", inverse, basis, basis, optimize=True)
-    return curve, leverage
+    return curve, np.einsum("rab,ka,kb->rk", inverse, basis, basis, optimize=True)
 
 
 def robust_scale(z: PointValues, good: Points) -> float:

@@ -151,8 +151,7 @@ class GainModel(Described):
         InputError
             If something of it is missing.
         """
-        lacking = [name for name in TELEMETRY if name not in telemetry]
-        if lacking:
+        if lacking := [name for name in TELEMETRY if name not in telemetry]:
             raise InputError(
                 f"the telemetry lacks {', '.join(lacking)}, by which the gain table predicts "
                 "gains; ingest the session with its telemetry, interpolated to the spectra"
@@ -246,8 +245,7 @@ def draw_gains(
     for name, place in PLACES.items():
         if gain_std is not None:
             errors[name] = float(generator.standard_normal())
-            factor = 1.0 + gain_std * errors[name]
-            if factor <= 0.0:
+            if (factor := 1.0 + gain_std * errors[name]) <= 0.0:
                 raise InputError(
                     f"with a standard deviation of {gain_std:g} of itself the gain of {name} "
                     "was drawn below zero; give a smaller flight.gain_std"

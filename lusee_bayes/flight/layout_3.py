@@ -132,8 +132,7 @@ def _clock_by_epoch(path: Path, found: Content) -> Clock | None:
     readings = found.arrays["spectra/raw_times"]
     by_epoch = mjd + (readings - raw_s) / DAY_S
     theirs = found.arrays.get("spectra/mjd_times", by_epoch)
-    off = np.flatnonzero(np.abs(theirs - by_epoch) > SAME_S / DAY_S)
-    if off.size:
+    if (off := np.flatnonzero(np.abs(theirs - by_epoch) > SAME_S / DAY_S)).size:
         k = int(off[0])
         raise InputError(
             f"{path}: mjd_times of spectrum {k} is {theirs[k]:.9g}, raw_times {readings[k]:.9g} s "

@@ -57,8 +57,7 @@ def session_of_4(path: Path, file: h5py.File, opener: Opener) -> Session:
     InputError
         If something is missing or not as it should be.
     """
-    cube = _dataset(file, "spectra/data")
-    if cube is None:
+    if (cube := _dataset(file, "spectra/data")) is None:
         raise no_spectra(path, "spectra/data", file)
     arrays = {"spectra/data": cube, **_metadata(path, file, cube.shape[0] if cube.shape else 0)}
     if (raw_s := _dataset(file, "spectra/raw_seconds")) is not None:
@@ -69,8 +68,7 @@ def session_of_4(path: Path, file: h5py.File, opener: Opener) -> Session:
                 f"{path}: raw_time_valid marks the clock of {int((np.asarray(marks) == 0).sum())} "
                 f"of {len(marks)} spectra as invalid; ingest the session again without them"
             )
-    clock = _clock_by_reference(path, file)
-    if clock is not None and raw_s is not None:
+    if (clock := _clock_by_reference(path, file)) is not None and raw_s is not None:
         arrays |= _telemetry_at_rows(path, file, clock, np.asarray(raw_s))
     found = LAYOUT_4.checked(path, arrays, said_in(file))
     unused = {
@@ -96,8 +94,7 @@ def _metadata(path: Path, file: h5py.File, n: int) -> dict[str, Unread]:
     """Fields that all rows have, in one shape."""
     found: dict[str, Unread] = {}
     for ours, theirs in FIELDS.items():
-        values = _dataset(file, f"{META}/fields/{theirs}/variant_000/data")
-        if values is None:
+        if (values := _dataset(file, f"{META}/fields/{theirs}/variant_000/data")) is None:
             continue
         if tuple(values.shape)[:1] != (n,):
             raise InputError(
@@ -131,8 +128,7 @@ def _clock_by_reference(path: Path, file: h5py.File) -> Clock | None:
     if not bool(said.get("available")):
         return None
     scale = scale_of(f"{path}: time_scale", str(said["time_scale"]))
-    raw_s = _anchors(file).get("spectrometer")
-    if raw_s is None:
+    if (raw_s := _anchors(file).get("spectrometer")) is None:
         return None
     with unannounced_leap_seconds():
         time = Time(str(said["clock_reference_isot"]), format="isot", scale=scale)
@@ -151,8 +147,7 @@ def _anchors(file: h5py.File) -> dict[str, float]:
 
 def _telemetry_at_rows(path: Path, file: h5py.File, clock: Clock, raw_s: Rows) -> dict[str, Unread]:
     """Telemetry at the times of the spectra, where both clocks have a reference."""
-    anchor = _anchors(file).get("dcb")
-    if anchor is None or "telemetry" not in file:
+    if (anchor := _anchors(file).get("dcb")) is None or "telemetry" not in file:
         return {}
     parts = ("field_names", "mission_seconds", "lusee_subsecs", "values")
     found = {name: _dataset(file, f"telemetry/{name}") for name in parts}

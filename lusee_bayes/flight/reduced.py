@@ -188,13 +188,12 @@ class Reduced(Described):
 
     def description(self) -> tuple[str, ...]:
         f = self.frequencies_mhz
-        used = self.reason == USED
         between = f"{f[0]:g} MHz" if len(f) == 1 else f"{f[0]:g} to {f[-1]:g} MHz"
         return (
             f"{counted(len(self.bin_of), 'spectrum', 'spectra')} of "
             f"{counted(len(self.sessions), 'session')} in {counted(self.values.shape[2], 'bin')}",
             f"{counted(len(f), 'band')} of {self.bandwidth_mhz:g} MHz at {between}",
-            f"{used.mean():.2%} of the spectra are used",
+            f"{(self.reason == USED).mean():.2%} of the spectra are used",
             *self.observation.description(),
             *(f"{name}: {text}" for name, text in self.recipe.items()),
             *self.notes(),
@@ -203,8 +202,7 @@ class Reduced(Described):
 
     def notes(self) -> tuple[str, ...]:
         """Return what has been taken from elsewhere than the sessions, a sentence each."""
-        corrected = {s["clock_file"] for s in self.sessions if s["clock"] == CORRECTED}
-        if corrected:
+        if corrected := {s["clock_file"] for s in self.sessions if s["clock"] == CORRECTED}:
             return (f"The UTC that the sessions state is corrected by {corrected.pop()}.",)
         told = [s for s in self.sessions if s["clock"] == "clock file" and s.get("clock_file")]
         if not told:
@@ -300,8 +298,7 @@ class Reduced(Described):
         """
         band = self.band(frequency_mhz)
         present = np.isfinite(self.values[band])
-        bins = self.bins_at(band)
-        if not bins.size:
+        if not (bins := self.bins_at(band)).size:
             counts = zip(REASONS[1:], self._counts(band)[1:], strict=True)
             raise InputError(
                 f"nothing is left of the spectra at {frequency_mhz:g} MHz: of "

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,7 @@ SLAB, PIECE = 128, 1024
 Counts = Float32[np.ndarray, "rows products channels"]
 Strengths = Float[np.ndarray, "rows ports 3"]
 Scatter = Float[np.ndarray, " spans"]
+StateOf = Callable[[int, tuple[str, ...]], "State"]
 
 
 def reduce_sessions(
@@ -76,7 +77,7 @@ def reduce_sessions(
     ):
         pieces = _pieces(line)
         counts = _read_ahead(ahead, files, line, pieces)
-        states: dict[Any, State] = {}
+        state_of = lru_cache(maxsize=None)(partial(State.of, recipe))
         for piece in pieces:
             keep = np.zeros(len(level), dtype=bool)
             keep[piece] = True
@@ -84,7 +85,7 @@ def reduce_sessions(
             here = line.observation.select(keep), np.arange(keep.sum()), level[piece]
             spectra = reduced.Reduced.blank(like, *here, len(starts))
             for start in starts:
-                slab = _slab(line, recipe, states, piece.start + start, next(counts))
+                slab = _slab(line, recipe, state_of, piece.start + start, next(counts))
                 in_threads(partial(slab, spectra, start), numbers)
             finish = partial(_finish, spectra, whole, piece, recipe.section.false_alarm)
             spans.append(np.stack(in_threads(finish, numbers)))
@@ -96,10 +97,8 @@ def reduce_sessions(
 
 def _in_common(line: Timeline, recipe: Recipe, level: session.PortLevels) -> dict[str, Any]:
     """What does not depend on the spectra."""
-    telemetry = {
-        name: np.concatenate([s.telemetry[name] for s in line.sessions])
-        for name in line.sessions[0].telemetry
-    }
+    names = line.sessions[0].telemetry
+    telemetry = {n: np.concatenate([s.telemetry[n] for s in line.sessions]) for n in names}
     return {
         "frequencies_mhz": np.array(recipe.frequencies_mhz),
         "bandwidth_mhz": recipe.section.bandwidth_mhz,
@@ -191,10 +190,8 @@ class State:
         for port, level in enumerate(levels):
             if level != session.NO_LEVEL:
                 basis[port] = recipe.table.basis(level, port, middles)[:, channels].mean(axis=2)
-        bands = tuple(
-            ChannelBand.of(f, section.bandwidth_mhz, section.degree, averaging, middles, shared)
-            for f in recipe.frequencies_mhz
-        )
+        of_all = section.bandwidth_mhz, section.degree, averaging, middles, shared
+        bands = tuple(ChannelBand.of(f, *of_all) for f in recipe.frequencies_mhz)
         known = flags.line_bins(recipe.lines_mhz, averaging, middles)
         if section.comb == "always":
             known = known | flags.comb_bins(averaging)
@@ -230,15 +227,12 @@ class State:
 
 
 def _slab(
-    line: Timeline, recipe: Recipe, states: dict[Any, State], start: int, counts: np.ndarray
+    line: Timeline, recipe: Recipe, state_of: StateOf, start: int, counts: np.ndarray
 ) -> Callable[[reduced.Reduced, int, int], None]:
     """What puts the counts of some spectra, from a row on, into a band."""
     source, first = line.sessions[int(line.session[start])], int(line.row[start])
     here = slice(first, first + len(counts))
-    key = (int(source.navgf[first]), tuple(str(level) for level in source.level[first]))
-    if key not in states:
-        states[key] = State.of(recipe, *key)
-    state = states[key]
+    state = state_of(int(source.navgf[first]), tuple(map(str, source.level[first])))
     telemetry = {name: values[here] for name, values in source.telemetry.items()}
     notched = np.zeros(len(counts), dtype=bool)
     if source.notch is not None:
@@ -264,8 +258,7 @@ def _slab(
         if recipe.section.sign < 0:
             channels[:, session.IMAGINARY] *= -1.0
         finite = np.isfinite(channels)
-        present = finite.any(axis=2)
-        there = finite[:, session.AUTOS]
+        present, there = finite.any(axis=2), finite[:, session.AUTOS]
         # where a product is there, all of it has to be
         whole = (finite | ~present[..., None]).all(axis=1) & there.any(axis=(1, 2))[:, None]
         good = whole & ~lines[:, at] & ~saturated[:, None]

@@ -183,8 +183,7 @@ class Session(Described, Recorded):
     unused: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self):
-        back = np.flatnonzero(~(np.diff(self.raw_s) > 0.0))
-        if back.size:
+        if (back := np.flatnonzero(~(np.diff(self.raw_s) > 0.0))).size:
             k = int(back[0])
             raise InputError(
                 f"{self.path}: spectrum {k + 1} (clock {self.raw_s[k + 1]:.6f} s) does not come "
@@ -343,8 +342,7 @@ def session_of(path: Path, found: Content, arrays: Mapping[str, Unread], **other
 
 def _levels(path: Path, arrays: Mapping[str, Unread], n: int) -> PortLevels:
     """Gain levels, of the flight software's numbers or of letters."""
-    name = f"{META}/actual_gain"
-    if name not in arrays:
+    if (name := f"{META}/actual_gain") not in arrays:
         raise InputError(
             f"{path} has no {name}, which says the gain of every spectrum; ingest the session "
             "again with luseepy's present version"

@@ -30,6 +30,7 @@ from lusee_bayes.flight.layout_4 import session_of_4
 from lusee_bayes.flight.session import CODES, META, N_CHANNELS, N_PRODUCTS, Read, Recorded, Session
 
 Counts = Float32[np.ndarray, "_ products _"]
+Blocks = Iterable[Counts]
 HDF5, FITS = (f"a session of lusee.ingest in {kind}" for kind in ("HDF5", "FITS"))
 NEWEST = 4
 
@@ -72,8 +73,7 @@ def _version_of(path: Path, version: Any) -> int:
         raise InputError(
             f"{path} has no layout_version: it is no session of luseepy's lusee.ingest"
         )
-    number = int(version)
-    if number < 3:
+    if (number := int(version)) < 3:
         raise InputError(
             f"{path} is of layout {number}, in which bit slices are not restored; ingest the "
             "session again with luseepy, which writes layout 3 or newer"
@@ -123,9 +123,7 @@ def cache_for(chunks: tuple[int, ...] | None) -> dict[str, Any]:
     return {"rdcc_nbytes": max(size, 1 << 20), "rdcc_nslots": PLACES, "rdcc_w0": 1.0}
 
 
-def whole_spectra(
-    path: Path, blocks: Iterable[Counts], n_rows: int
-) -> Iterator[tuple[int, Counts]]:
+def whole_spectra(path: Path, blocks: Blocks, n_rows: int) -> Iterator[tuple[int, Counts]]:
     """Yield the first row and the counts of every block, with all 2048 channels.
 
     Raises
@@ -176,12 +174,9 @@ class SessionRows(Recorded):
             "Navg1_shift": first,
             "Navg2_shift": self.navg_shift - first,
             "Navgf": self.navgf,
-            "format": none,
-            "errors": none,
-            "actual_bitslice": self.bitslice,
-            "bitslice": self.bitslice,
-            "actual_gain": gain,
-            "gain": gain,
+            **dict.fromkeys(("format", "errors"), none),
+            **dict.fromkeys(("actual_bitslice", "bitslice"), self.bitslice),
+            **dict.fromkeys(("actual_gain", "gain"), gain),
             "adc_min": self.adc_low,
             "adc_max": self.adc_high,
             "adc_mean": np.full_like(self.adc_rms, ADC_MEAN),
@@ -211,7 +206,7 @@ class SessionRows(Recorded):
 
 
 def write_session(
-    path: str | Path, rows: SessionRows, blocks: Iterable[Counts], *, kind: str = "hdf5"
+    path: str | Path, rows: SessionRows, blocks: Blocks, *, kind: str = "hdf5"
 ) -> Path:
     """Write a session whole or not at all.
 
@@ -236,7 +231,7 @@ def write_session(
     return path
 
 
-def _write_session_fits(path: Path, rows: SessionRows, blocks: Iterable[Counts]) -> None:
+def _write_session_fits(path: Path, rows: SessionRows, blocks: Blocks) -> None:
     _fits_header(rows).writeto(path)
     n, shape = rows.n_rows, (rows.n_rows, N_PRODUCTS, N_CHANNELS)
     header = fits.ImageHDU(np.broadcast_to(np.float32(0.0), shape), name="SPECTRA").header
@@ -283,12 +278,11 @@ CUBE = {
 }
 
 
-def _write_session_hdf5(path: Path, rows: SessionRows, blocks: Iterable[Counts]) -> None:
+def _write_session_hdf5(path: Path, rows: SessionRows, blocks: Blocks) -> None:
     with h5py.File(path, "w") as file:
         _write_all_but_spectra(file, rows)
-        one = (1, N_PRODUCTS, N_CHANNELS)
-        shape = (rows.n_rows, *one[1:])
-        cube = file.create_dataset("spectra/data", shape, "f4", chunks=one, **PACKED)
+        shape = (rows.n_rows, N_PRODUCTS, N_CHANNELS)
+        cube = file.create_dataset("spectra/data", shape, "f4", chunks=(1, *shape[1:]), **PACKED)
         cube.attrs.update(CUBE)
         for first, counts in whole_spectra(path, blocks, rows.n_rows):
             cube[first : first + len(counts)] = counts

@@ -328,8 +328,7 @@ class Disturbances:
         lines = self.section.tone_factor * (self.tone[rows, None] & self.tone_channel)
         lines = lines + self.section.comb_factor * (self.comb[rows, None] & comb)
         t += level * lines
-        here = np.flatnonzero(self.burst[rows])
-        if here.size:
+        if (here := np.flatnonzero(self.burst[rows])).size:
             wave = np.exp(1j * self.phase[rows][here]).T
             power = level[here] * self.section.burst_factor / np.sqrt(BURST_CHANNELS)
             t[:, :, here] += wave[:, None, :, None] * wave.conj()[None, :, :, None] * power

@@ -128,10 +128,9 @@ def windowed(
     of_power = [weighted * scaled[:, None] ** k for k in range(n_moments)]
     moments = np.stack([np.add.reduceat(x, first, axis=0) for x in of_power], axis=2)
     moments = moments.reshape(len(first), -1)
-    series = _series(powers, n_moments, largest, lmax)
     # small matrices: several threads would wait for one another
     with threadpool_limits(1, "blas"):
-        functions, factors = _fewest(moments, series)
+        functions, factors = _fewest(moments, _series(powers, n_moments, largest, lmax))
     weights = _importance(powers, lmax)
     factors = factors.reshape(len(factors), len(powers), lmax + 1, 2) / weights[..., None]
     return azimuth[first] + mean, functions, factors
@@ -226,8 +225,7 @@ def averaged(data: Visibilities, to_s: float) -> Visibilities:
     live_s = windows.live_per_sample_s
     bin_of = bins_of(observation, windows.bounds_s, to_s)
     kept, used = by_the_rule(np.asarray(data.layout.present), bin_of, live_s)
-    left = np.flatnonzero(used)
-    if not left.size:
+    if not (left := np.flatnonzero(used)).size:
         raise InputError(
             f"nothing is left of the data in bins of {to_s:g} s, in which products have no samples "
             "in common; average over less"
@@ -273,8 +271,7 @@ def bins_of(observation: Observation, bounds_s: Bounds, to_s: float) -> Samples:
     start, end = seconds + bounds_s[:, 0], seconds + bounds_s[:, 1]
     origin = start[np.searchsorted(observation.run, observation.run)]
     place = np.floor((start - origin + ROUNDING_S) / to_s)
-    bin_of = np.zeros(len(start), dtype=np.int64)
-    begins = 0
+    bin_of, begins = np.zeros(len(start), dtype=np.int64), 0
     for k in range(1, len(start)):
         same = observation.run[k] == observation.run[begins] and place[k] == place[begins]
         if same and end[k] - start[begins] <= to_s + ROUNDING_S:

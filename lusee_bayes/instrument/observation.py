@@ -240,8 +240,7 @@ class Observation(checks.Described):
             )
         at = times.later(t0, times_s)
         observation = cls(times=at, run=number[cut_of], windows=windows, **place)
-        night_only = np.array([cut.of.night_only for cut in cuts])
-        if not night_only.any():
+        if not (night_only := np.array([cut.of.night_only for cut in cuts])).any():
             return observation
         dark = observation.sun_altitude_deg() < 0.0
         if windows is not None and isinstance(cuts[0].of, Interval):

@@ -265,8 +265,7 @@ def with_offsets(observation: Observation, values: Values) -> Observation:
     stretch = 1.0 + drift / 86400.0
     times = later(observation.times, given.get("clock_s", 0.0) + drift * observation.hours / 24.0)
     angles = zip(observation.turntable_deg, _of_runs(observation.n_runs), strict=True)
-    windows = observation.windows
-    if windows is not None:
+    if (windows := observation.windows) is not None:
         sizes = (stretch * x for x in (windows.start_s, windows.end_s, windows.live_s))
         windows = Windows(windows.sample, *sizes)
     leans = zip(observation.tilt_deg, TILTS, strict=True)

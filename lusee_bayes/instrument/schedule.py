@@ -148,8 +148,7 @@ def cut_runs(runs: Sequence[Run], step_s: float) -> list[Cut]:
     for number, run in enumerate(runs):
         require_positive(f"the length in cycles of run {number}", run.cycles)
         length = run.cycles * CYCLE_DAYS * 86400.0
-        n = int(length // step_s)
-        if n < 1:
+        if (n := int(length // step_s)) < 1:
             raise InputError(
                 f"run {number} of {run.cycles} cycles holds no sample of {step_s} s; shorten step_s"
             )
@@ -189,14 +188,12 @@ def named_in_order(intervals: Sequence[Interval]) -> list[tuple[str, Interval]]:
         raise InputError("a schedule needs at least one interval, got none")
     named = [(one.where or f"interval {number}", one) for number, one in enumerate(intervals)]
     for (_, before), (name, after) in pairwise(named):
-        ahead = times.seconds_from(before.start_time, after.start_time)
-        if ahead < 0.0:
+        if (ahead := times.seconds_from(before.start_time, after.start_time)) < 0.0:
             raise InputError(
                 f"{name}: the interval from {after.start} begins before the one that "
                 f"precedes it, from {before.start}; sort the intervals by their start"
             )
-        overlap = before.length_s - ahead
-        if overlap > times.ROUNDING_S:
+        if (overlap := before.length_s - ahead) > times.ROUNDING_S:
             raise InputError(
                 f"{name}: the interval from {after.start} begins {overlap:g} s before "
                 f"the one that precedes it ends, {before.end}; give each stretch of time once"

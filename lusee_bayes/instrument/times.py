@@ -93,8 +93,7 @@ def require_ephemeris(jd: Times) -> None:
         If one does not.
     """
     first, last = EPHEMERIS_JD
-    outside = ~((jd >= first) & (jd <= last))
-    if not outside.any():
+    if not (outside := ~((jd >= first) & (jd <= last))).any():
         return
     at = float(jd[outside][0])
     date = f"Julian date {at:.6g}"
@@ -122,8 +121,7 @@ def utc_of(jd1: Times, jd2: Times, scale: str = "utc") -> Time:
 
 def scale_of(name: str, stated: str) -> str:
     """Return a scale of time that a file states as ``name``. InputError if it is not known."""
-    scale = stated.strip().lower()
-    if scale not in SCALES:
+    if (scale := stated.strip().lower()) not in SCALES:
         raise InputError(f"{name} is '{stated}'; {nearest(scale, SCALES)}")
     return scale
 

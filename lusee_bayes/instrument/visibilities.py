@@ -289,8 +289,7 @@ class Visibilities(checks.Described):
     def digest(self) -> str:
         """Return a hash of data, layout, times and windows, which tells data sets apart."""
         parts = [self.data, self.layout.product, self.layout.time, self.observation.times.jd]
-        windows = self.observation.windows
-        if windows is not None:
+        if (windows := self.observation.windows) is not None:
             parts += [windows.sample, windows.start_s, windows.end_s, windows.live_s]
         if self.calibration is not None:
             parts.append(self.calibration.n_averaged)
@@ -314,8 +313,7 @@ class Visibilities(checks.Described):
         InputError
             If the data have windows, and as :class:`Observation`.
         """
-        observation = self.observation
-        if observation.windows is not None:
+        if (observation := self.observation).windows is not None:
             raise InputError("the data have windows, so that their times are the middles of these")
         times, _, windows = windows_of(observation.times, timestamp, observation.step_s)
         seen = replace(observation, times=times, windows=windows)
@@ -431,11 +429,9 @@ def read_visibilities(path: str | Path) -> Visibilities:
     require_file(path, "data", HINT)
     found = read_netcdf(path, formats.VISIBILITIES, LAYOUT, HINT)
     here, said = found.arrays, found.values
-    products, expected = tuple(map(str, here["product"])), labels_of(len(here["product"]))
-    if products != expected:
-        raise InputError(
-            f"{path} has products {', '.join(products)}; expected {', '.join(expected)}"
-        )
+    given, expected = tuple(map(str, here["product"])), labels_of(len(here["product"]))
+    if given != expected:
+        raise InputError(f"{path} has products {', '.join(given)}; expected {', '.join(expected)}")
     flags = here["flag"]
     values = np.where(flags, 0.0, here["visibility"])
     checks.require_finite(f"{path}: visibility (where not flagged)", values)

@@ -139,8 +139,7 @@ class Waterfall(Described):
         values = self.grid[:, :, channel]
         present = np.isfinite(values)
         within = np.array([p.j < n_ports for p in products.all_products()])
-        beyond = present.any(1) & ~within
-        if beyond.any():
+        if (beyond := present.any(1) & ~within).any():
             label = products.labels()[int(np.argmax(beyond))]
             raise InputError(
                 f"{self.path} has the product {label}, but the beams are those of {n_ports} ports; "
@@ -415,8 +414,7 @@ def _kelvin(path: Path, channels: Sequence[Visibilities]) -> ByTime:
     """Samples of all channels, NaN where they are missing; InputError if there is no room."""
     first = channels[0].observation
     for channel in channels:
-        observation = channel.observation
-        if observation.windows is not None:
+        if (observation := channel.observation).windows is not None:
             raise InputError(f"{path}: {NO_ROOM}")
         if observation.turntable_deg != (0.0,):
             raise InputError(
@@ -502,8 +500,7 @@ def write_four_port(
         than four ports, channels of different observations.
     """
     path, observation = user_path(path), channels[0].observation
-    receiver = circuits[0].receiver
-    if receiver is None:
+    if (receiver := circuits[0].receiver) is None:
         raise InputError(
             f"{path}: luseepy's four-port waterfalls hold the loads of receivers, and the ports "
             f"are open; give another beam.receiver, or {HINT}"

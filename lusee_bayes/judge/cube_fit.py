@@ -108,8 +108,7 @@ class ChannelFits:
     def extremes(self) -> list[int]:
         """Channels that stand out among all of them, the least probable first."""
         p = self.p()
-        found = [k for k in np.argsort(p) if stands_out(float(p[k]), N_TESTS * len(p))]
-        return [int(k) for k in found]
+        return [int(k) for k in np.argsort(p) if stands_out(float(p[k]), N_TESTS * len(p))]
 
     def tests(self) -> list[JointTest]:
         """The joint tests: sum, number above the median, channel furthest out, and the prior."""
@@ -164,10 +163,8 @@ class ChannelFits:
             return ["Map the channels that stand out one by one: products and days are judged."]
         if level == "unlike the prior" and self.rest.too_small:
             narrower = "smaller spectral.residual" if self.joint else "narrower prior"
-            return [
-                "The prior is wider than the skies need, and error bars are too wide: a "
-                f"{narrower} would tell more (compare the evidence)."
-            ]
+            found = "The prior is wider than the skies need, and error bars are too wide"
+            return [f"{found}: a {narrower} would tell more (compare the evidence)."]
         if level == "unlike the prior" and self.joint:
             return [
                 "Skies may not obey the spectral prior, and error bars be too small: compare the "
@@ -283,8 +280,7 @@ def disagreement(tests: Sequence[SharedTest]) -> str:
     bad = [f"{t.frequency_mhz:g} MHz (p {probability(t.p)})" for t in tests if t.disagrees]
     if not bad:
         return ""
-    verbs = ("disagrees", "is") if len(bad) == 1 else ("disagree", "are")
-    return (
-        f"{in_brief(bad)} {verbs[0]} with the other channels about the instrument that they share, "
-        f"and {verbs[1]} not tied to them: check beams and data there."
-    )
+    disagree, are = ("disagrees", "is") if len(bad) == 1 else ("disagree", "are")
+    others = "the other channels about the instrument that they share"
+    advice = f"and {are} not tied to them: check beams and data there."
+    return f"{in_brief(bad)} {disagree} with {others}, {advice}"

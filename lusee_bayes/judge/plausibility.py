@@ -68,11 +68,8 @@ def require_plausible(data: Visibilities, signal: Grid, std: DataVector) -> tupl
 
 def about_information(bits: float) -> tuple[str, ...]:
     """Say that data tell nothing, if so; NaN where the information is not known."""
-    if not bits < LEAST_BITS:
-        return ()
-    return (
-        f"The data tell {bits:.2g} bits of the sky: the map is the prior's, whatever the sky is.",
-    )
+    text = f"The data tell {bits:.2g} bits of the sky: the map is the prior's, whatever the sky is."
+    return (text,) if bits < LEAST_BITS else ()
 
 
 def _refuse(data: Visibilities, bad: GridFlags, why: str) -> None:
@@ -94,17 +91,12 @@ def _about_range(
     if not present.any():
         return ()
     ratio = float(np.median(autos[present] / modelled[present]))
+    found = f"auto-correlations are {ratio:.2g} times those of the modelled sky"
     if not 1.0 / IMPOSSIBLE < ratio < IMPOSSIBLE:
-        raise InputError(
-            f"the auto-correlations are {ratio:.2g} times those of the modelled sky; look at the "
-            "unit of the data, their frequency and the beams"
-        )
-    if 1.0 / DOUBTFUL < ratio < DOUBTFUL:
-        return ()
-    return (
-        f"The auto-correlations are {ratio:.2g} times those of the modelled sky: are unit, "
-        "frequency and beams those of the data?",
-    )
+        advice = "look at the unit of the data, their frequency and the beams"
+        raise InputError(f"the {found}; {advice}")
+    doubt = f"The {found}: are unit, frequency and beams those of the data?"
+    return () if 1.0 / DOUBTFUL < ratio < DOUBTFUL else (doubt,)
 
 
 def _about_crosses(data: Visibilities, values: Grid, sigma: Grid) -> tuple[str, ...]:
@@ -126,9 +118,8 @@ def _about_crosses(data: Visibilities, values: Grid, sigma: Grid) -> tuple[str, 
         excess = usable & (cross - bound > SIGNIFICANT * np.hypot(spread, of_bound))
         if excess.any():
             first = data.observation.times[int(np.nonzero(excess)[0][0])].isot[:19]
-            doubts.append(
-                f"|V_{i}{j}| is larger than sqrt(V_{i}{i} V_{j}{j}), which no sky gives, in "
-                f"{int(excess.sum())} of {int(usable.sum())} samples (first {first}): one of "
-                f"the products {i}{i}, {j}{j} and {i}{j} is wrong there."
-            )
+            larger = f"|V_{i}{j}| is larger than sqrt(V_{i}{i} V_{j}{j}), which no sky gives"
+            where = f"{int(excess.sum())} of {int(usable.sum())} samples (first {first})"
+            wrong = f"one of the products {i}{i}, {j}{j} and {i}{j} is wrong there"
+            doubts.append(f"{larger}, in {where}: {wrong}.")
     return tuple(doubts)

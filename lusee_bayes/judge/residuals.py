@@ -116,8 +116,7 @@ class Residuals:
         """
         if self.extremes() or stands_out(self.split.instrument.p, self.n_tests):
             return "does not fit"
-        unlike = stands_out(self.split.prior.p, self.n_tests)
-        return "unlike the prior" if unlike else "consistent"
+        return "unlike the prior" if stands_out(self.split.prior.p, self.n_tests) else "consistent"
 
     def suspects(self) -> list[Group]:
         """Find the groups without which the rest fits.
@@ -174,15 +173,11 @@ class Residuals:
                 p = probability(mine[0].others_p)
                 parts.append(f"The others fit without {mine[0]} (p {p}): leave it out.")
             elif mine:
-                parts.append(
-                    f"The others fit without any one of {len(mine)} {kind}s "
-                    f"({in_brief([group.name for group in mine])}): the data do not tell which."
-                )
+                any_one = f"any one of {len(mine)} {kind}s ({in_brief([one.name for one in mine])})"
+                parts.append(f"The others fit without {any_one}: the data do not tell which.")
         if not suspects:
-            parts.append(
-                f"{len(extremes)} of {len(self.compared())} products, days and turntable angles "
-                "stand out, and no single one is to blame."
-            )
+            many = f"{len(extremes)} of {len(self.compared())} products, days and turntable angles"
+            parts.append(f"{many} stand out, and no single one is to blame.")
         return parts
 
 

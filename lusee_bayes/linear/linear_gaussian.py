@@ -409,6 +409,11 @@ class Form(eqx.Module):
         return self.condition(data).posterior.log_evidence
 
 
+# what two ways to compute an A differ by, relative; and what rounding may do to Lambda, whose
+# eigenvalues are 1 or more
+SAME, SEEN_ROUNDING = 1e-9, 1e-4
+
+
 class FromInformation(Form):
     """Through A^T N^-1 A, in NumPy; not inside JAX's transformations.
 
@@ -445,22 +450,31 @@ class FromInformation(Form):
 
     @classmethod
     def beside(cls, solution: Solution, model: LinearGaussian) -> FromInformation:
-        """Factorise a model with the A and N_0 of one that is solved, and other U.
+        """Factorise a model with the S and N_0 of one that is solved, and other U.
 
         Of N = N_0 + U U^T, with V and R of :class:`.LowRankFactor`, ::
 
-            A^T N^-1 A = A^T N_0^-1 A - (R^-1 V^T L_0^-1 A)^T (R^-1 V^T L_0^-1 A).
+            A^T N^-1 A = A^T N_0^-1 A - (R^-1 V^T L_0^-1 A)^T (R^-1 V^T L_0^-1 A),
+
+        unless A is another, too, or rounding of the first would be seen in Lambda.
         """
-        model, old = on_host(model), solution.factor
+        host, old = on_host(model), solution.factor
         base = old.base if isinstance(old, LowRankFactor) else old
-        factor, matrix = model.noise.factor(base), solution.matrix
+        factor, matrix = host.noise.factor(base), solution.matrix
+        largest = (np.asarray(solution.posterior.lower) ** 2).sum(1).max()
         for sign, one in ((1.0, old), (-1.0, factor)):
             if isinstance(one, LowRankFactor):
                 weighted = np.asarray(base.whiten_transpose(one.v))
-                pull = model.coupling.transpose_mv(weighted)
+                pull = host.coupling.transpose_mv(weighted)
                 half = solve_lower(np.asarray(one.lower), pull.T, transpose=False)
                 matrix = matrix + sign * gram_matrix(half)
-        return cls(model, factor, model.coupling, matrix, precision_root(matrix, model.prior))
+                largest = max(largest, (host.prior.colour_columns(half) ** 2).sum(0).max())
+        sky = solution.posterior.mean
+        seen, before = (np.asarray(one.coupling @ sky) for one in (host, solution.model))
+        another = np.abs(seen - before).max() > SAME * np.abs(seen).max()
+        if another or largest * np.finfo(np.float64).eps > SEEN_ROUNDING:
+            return cls.of(model)
+        return cls(host, factor, host.coupling, matrix, precision_root(matrix, host.prior))
 
     def condition(self, data: DataVector) -> Solution:
         data, prior = np.asarray(data), self.model.prior

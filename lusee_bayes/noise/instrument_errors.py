@@ -116,8 +116,7 @@ class GainDrift(eqx.Module):
 
     def width(self, hours: Hours) -> int:
         """Return how many samples apart two times can be and still be correlated."""
-        reach = REACH * float(self.correlation_h)
-        first = np.searchsorted(hours, np.asarray(hours) - reach)
+        first = np.searchsorted(hours, np.asarray(hours) - REACH * float(self.correlation_h))
         return int((np.arange(len(hours)) - first).max())
 
     def covariance(
@@ -159,16 +158,14 @@ class GainDrift(eqx.Module):
         i, j, _ = ports(round(np.sqrt(layout.n_products)))
         ii, ij, ji, jj = (np.equal.outer(a, b).astype(np.float64) for a in (i, j) for b in (i, j))
         linear, quadratic = ii + ij + ji + jj, ii * jj + ij * ji
-        band = _band(
-            visibilities, kernel, jnp.asarray(earlier), jnp.asarray(linear), jnp.asarray(quadratic)
-        )
+        arrays = map(jnp.asarray, (earlier, linear, quadratic))
+        band = _band(visibilities, kernel, *arrays)
         return TimeBandedCovariance(band, layout, "the gain-drift covariance")
 
     def mean_response(self, n_products: int) -> Float[Array, " products"]:
         """Return the mean factor of each product: 1 + sigma_g^2 for autos, 1 for crosses."""
         i, j, _ = ports(round(np.sqrt(n_products)))
-        auto = jnp.asarray(i == j, dtype=jnp.float64)
-        return 1.0 + self.sigma**2 * auto
+        return 1.0 + self.sigma**2 * jnp.asarray(i == j, dtype=jnp.float64)
 
     def sample(self, key: PRNGKeyArray, hours: Hours, n_antennas: int = 4) -> Gains:
         """Draw g_i(t), (antennas, times), with exactly this covariance."""

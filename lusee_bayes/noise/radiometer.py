@@ -27,12 +27,10 @@ from lusee_bayes.instrument.products import DataLayout, auto_indices, ports, to_
 from lusee_bayes.noise.covariance import Covariance, DiagonalCovariance
 from lusee_bayes.noise.time_blocks import TimeBlockCovariance
 
+Matrices = Complex[np.ndarray, "antennas antennas *rest"]
 
-def sample_covariances(
-    t: Complex[np.ndarray, "antennas antennas *rest"],
-    n_averaged: float,
-    generator: np.random.Generator,
-) -> Complex[np.ndarray, "antennas antennas *rest"]:
+
+def sample_covariances(t: Matrices, n_averaged: float, generator: np.random.Generator) -> Matrices:
     """Draw sample covariances.
 
     Parameters
@@ -48,9 +46,8 @@ def sample_covariances(
     InputError
         If one of the T is not positive definite: no voltages have it.
     """
-    matrices = np.moveaxis(t, (0, 1), (-2, -1))
     try:
-        lower = np.linalg.cholesky(matrices)
+        lower = np.linalg.cholesky(np.moveaxis(t, (0, 1), (-2, -1)))
     except np.linalg.LinAlgError as error:
         raise InputError(
             "the covariance of the voltages is not positive definite, so that there is no "

@@ -22,13 +22,7 @@ from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky, solve_lower
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.noise.covariance import (
-    CholeskyFactor,
-    Covariance,
-    DiagonalCovariance,
-    Factor,
-    log_det_of_lower,
-)
+from lusee_bayes.noise.covariance import CholeskyFactor, Covariance, DiagonalCovariance, Factor
 
 Band = Float[Array, "times widths products products"]
 
@@ -99,8 +93,7 @@ class TimeBlockCovariance(_OverLayout):
         blocks = _masked(blocks[:, None], layout)[:, 0]
         checks.require_finite("the noise blocks", blocks)
         checks.require_symmetric("the noise covariance of one time", blocks)
-        self.blocks = blocks
-        self.layout = layout
+        self.blocks, self.layout = blocks, layout
 
     def dense(self):
         unit = namespace(self).eye(self.size)
@@ -167,9 +160,8 @@ class TimeBandedFactor(Factor):
         grid = layout.by_time(x)
         flat = grid.reshape(layout.n_times * layout.n_products, -1)
         padded = jnp.pad(flat, ((0, n * rows - len(flat)), (0, 0)))
-        start = jnp.zeros((window, flat.shape[1]))
         parts = (self.left, across, padded.reshape(n, rows, -1))
-        _, found = jax.lax.scan(step, start, parts, reverse=reverse)
+        _, found = jax.lax.scan(step, jnp.zeros((window, flat.shape[1])), parts, reverse=reverse)
         found = found.reshape(n * rows, -1)[: len(flat)]
         return layout.from_times(found.reshape(grid.shape), x.shape)
 
@@ -202,7 +194,7 @@ class TimeBandedFactor(Factor):
         return self._swept(step, self.diagonal, z)
 
     def log_det(self):
-        return log_det_of_lower(self.diagonal)
+        return CholeskyFactor(self.diagonal).log_det()
 
 
 class TimeBandedCovariance(_OverLayout):
@@ -235,9 +227,7 @@ class TimeBandedCovariance(_OverLayout):
         band = _masked(band, layout)
         checks.require_finite(name, band)
         checks.require_symmetric(f"{name} within one time", band[:, 0])
-        self.band = band
-        self.layout = layout
-        self.name = name
+        self.band, self.layout, self.name = band, layout, name
 
     def dense(self):
         unit = namespace(self).eye(self.size)
@@ -273,9 +263,8 @@ class TimeBandedCovariance(_OverLayout):
         start, lowest = end, np.inf
         while lowest > 0 and start > 0:  # a short stretch may be positive by itself
             start = max(0, end - 2 * max(self.band.shape[1], end - start))
-            part = TimeBandedCovariance(
-                self.band[start:end], DataLayout(self.layout.n_products, end - start), self.name
-            )
+            layout = DataLayout(self.layout.n_products, end - start)
+            part = TimeBandedCovariance(self.band[start:end], layout, self.name)
             lowest = float(jnp.linalg.eigvalsh(part.dense()).min())
         raise InputError(
             f"{self.name} is not positive definite: its lowest eigenvalue is {lowest:.3g} between "

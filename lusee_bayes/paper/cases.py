@@ -13,7 +13,6 @@ import xarray as xr
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.formats import says, with_grid
 from lusee_bayes.core.reading import require_file
 from lusee_bayes.core.version import versions
 from lusee_bayes.experiment.experiment import build
@@ -25,9 +24,7 @@ from lusee_bayes.paper.claims import TABLE, Cases, cross
 from lusee_bayes.results.channel_map import conditioned
 
 # by name: a scenario of the package and what differs from it
-CASES = {
-    name: (case.get("scenario", name), case.get("changes", [])) for name, case in TABLE.items()
-}
+CASES = {name: (one.get("scenario", name), one.get("changes", [])) for name, one in TABLE.items()}
 
 # of a channel, as a case file has them
 MODES, NUMBERS = ("mean", "truth", "std"), ("log_evidence", "chi2", "chi2_expected", "n_data")
@@ -68,7 +65,7 @@ def sky_frequency_mhz(path: str | Path) -> float:
 
 def is_case(path: Path, scenario: Scenario) -> bool:
     """Whether a file holds the case of a scenario, computed by this version of the package."""
-    return says(path, formats.header(formats.PAPER_CASE) | {"scenario": scenario.to_yaml()})
+    return formats.says(path, formats.header(formats.PAPER_CASE) | {"scenario": scenario.to_yaml()})
 
 
 def compute_case(scenario: Scenario) -> xr.Dataset:
@@ -116,7 +113,7 @@ def compute_case(scenario: Scenario) -> xr.Dataset:
         "n_modes": len(channel.mean),
         **({} if rms is None else {"beam_rms_difference": rms}),
     }
-    return with_grid(xr.Dataset(variables, coords, attributes))
+    return formats.with_grid(xr.Dataset(variables, coords, attributes))
 
 
 def case_table(cases: Cases) -> list[dict[str, object]]:

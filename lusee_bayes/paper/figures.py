@@ -78,11 +78,14 @@ def frequency_maps(cases: Cases) -> Figure:
             image = drawing.mollweide(axes, pixels, norm=scale, **style)
             axes.set_title(f"{frequency} MHz, {name}", fontsize=10)
             flat_bar(figure, axes, image, "K" if row < 2 else "% of the mean sky")
-    figure.suptitle(
-        "Galactic coordinates, longitude grows to the left; dashed: never observed; drawn through "
-        f"a beam of {drawing.taper_fwhm_deg(lmax_of(case.sizes['mode'])):.1f}° (FWHM)"
-    )
+    figure.suptitle(f"Galactic coordinates, longitude grows to the left; {_how_drawn(case)}")
     return figure
+
+
+def _how_drawn(case: xr.Dataset) -> str:
+    """What a figure of maps says of its lines and its resolution."""
+    width = drawing.taper_fwhm_deg(lmax_of(case.sizes["mode"]))
+    return f"dashed: never observed; drawn through a beam of {width:.1f}° (FWHM)"
 
 
 def drawn(case: xr.Dataset, name: str) -> Float[np.ndarray, " pixels"]:
@@ -170,11 +173,8 @@ def scenario_maps(cases: Cases) -> Figure:
         image = drawing.mollweide(axes, pixels, norm=norm, highest_altitude=altitude)
         axes.set_title(title, fontsize=11)
     flat_bar(figure, figure.axes, image, "K")
-    lmax = lmax_of(cases["fiducial"].sizes["mode"])
-    figure.suptitle(
-        "Maps at 25 MHz, Galactic coordinates; dashed: never observed; drawn through a beam of "
-        f"{drawing.taper_fwhm_deg(lmax):.1f}° (FWHM)"
-    )
+    how = _how_drawn(cases["fiducial"])
+    figure.suptitle(f"Maps at 25 MHz, Galactic coordinates; {how}")
     return figure
 
 

@@ -169,10 +169,8 @@ class Learned:
     def as_rows(self) -> list[dict[str, float | str]]:
         """Name, value and standard deviation of the parameters that have a name."""
         std = np.sqrt(np.diagonal(self.covariance))
-        return [
-            {"name": name, "value": float(value), "std": float(width)}
-            for name, value, width in zip(self.names, self.parameters, std, strict=False)
-        ]
+        each = zip(self.names, self.parameters, std, strict=False)
+        return [{"name": name, "value": float(x), "std": float(width)} for name, x, width in each]
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from lusee_bayes.core import formats
 from lusee_bayes.core.checks import counted
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import read_manifest, recover
-from lusee_bayes.core.formats import has_words, image_names, is_fits, opened
 from lusee_bayes.core.layouts import Layout
 from lusee_bayes.core.reading import read_json, require_file
 from lusee_bayes.core.trees import from_tree, opened_tree
@@ -23,7 +22,7 @@ from lusee_bayes.core.trees import from_tree, opened_tree
 
 def _has_image(*names: str) -> Callable[[Path], bool]:
     """Whether a FITS file has one of these images."""
-    return lambda path: is_fits(path) and bool(set(names) & set(image_names(path)))
+    return lambda path: formats.is_fits(path) and bool({*names} & {*formats.image_names(path)})
 
 
 BEAM = "instrument.beams.sampled:read_beam"
@@ -38,7 +37,7 @@ READERS = {
 }
 KINDS: tuple[tuple[Callable[[Path], bool], str], ...] = (
     (_has_image("h_theta_real", "etheta_real", "e_theta_real", "product_beam"), BEAM),
-    (lambda path: has_words(path, formats.UVBEAM_WORDS), BEAM),
+    (lambda path: formats.has_words(path, formats.UVBEAM_WORDS), BEAM),
     (_has_image("combinations", "products"), "instrument.waterfalls:read_waterfall"),
     (formats.is_session, "flight.session_files:read_session"),
     (lambda path: path.suffix == ".csv", "instrument.beams.grid:read_beam_grid"),
@@ -95,14 +94,12 @@ def describe_posterior(path: Path) -> list[str]:
     if n > 1:
         kind = "one posterior for all" if joint else "each on its own"
         at = f"{n} frequencies from {frequencies[0]:g} to {frequencies[-1]:g} MHz, {kind}"
-    temperature = [
-        f"{m:.6g} K +- {s:.3g} K"
-        for m, s in zip(found.mean[:, 0] / MONOPOLE, found.std[:, 0] / MONOPOLE, strict=True)
-    ]
+    ends = np.stack([found.mean[[0, -1], 0], found.std[[0, -1], 0]], axis=1) / MONOPOLE
+    temperatures = [f"{mean:.6g} K +- {std:.3g} K" for mean, std in ends]
     known = (found.std < 0.5 * found.prior_std).sum(axis=1)
     return [
         f"posterior over {n_modes} modes (lmax {found.lmax}) at {at}, {found.frame}",
-        f"mean temperature {' to '.join(dict.fromkeys((temperature[0], temperature[-1])))}",
+        f"mean temperature {' to '.join(dict.fromkeys(temperatures))}",
         f"{' to '.join(dict.fromkeys((str(known.min()), str(known.max()))))} modes known to better "
         "than half their prior width",
         *found.unmapped.splitlines(),
@@ -164,7 +161,7 @@ def describe_folder(folder: Path) -> list[str]:
 
 def _cards(path: Path) -> list[str]:
     """What a FITS file of the package says of itself."""
-    with opened(path) as hdus:
+    with formats.opened(path) as hdus:
         headers = [hdu.header for hdu in hdus if "SCENHASH" in hdu.header]
         if not headers:
             return []
@@ -204,6 +201,6 @@ def describe(path: str | Path) -> str:
         else:
             reader = READERS.get(kind) or next(name for is_one, name in KINDS if is_one(path))
             lines = [repr(resolve_name(f"lusee_bayes.{reader}")(path))]
-            lines += _cards(path) if is_fits(path) else []
+            lines += _cards(path) if formats.is_fits(path) else []
     first, *further = lines
     return "\n".join([f"{path}: {first}", *(f"  {line}" for line in further)])

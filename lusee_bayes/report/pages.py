@@ -20,14 +20,12 @@ from lusee_bayes.results.prior_comparison import PriorsSummary, prior_table
 from lusee_bayes.results.summaries import SamplingSummary, ValidationSummary
 
 ROWS = ("quantity",)
-SUMMARY_TABLE = Layout(
-    "a summary of draws",
-    {
-        "quantity": Variable(ROWS, "text"),
-        **dict.fromkeys(("mean", "sd"), Variable(ROWS, finite=False)),
-        "r_hat": Variable(ROWS, missing=True),
-    },
-)
+SUMMARY_COLUMNS = {
+    "quantity": Variable(ROWS, "text"),
+    **dict.fromkeys(("mean", "sd"), Variable(ROWS, finite=False)),
+    "r_hat": Variable(ROWS, missing=True),
+}
+SUMMARY_TABLE = Layout("a summary of draws", SUMMARY_COLUMNS)
 
 
 def sample_page(folder: Path, name: str) -> str:

@@ -78,8 +78,7 @@ def conditioned(
     InputError
         For data that the earlier ones hold already, and as :func:`infer`.
     """
-    rounds = rounds_of(experiment, stages or Stages(), "posterior")
-    with rounds as report, explained(experiment):
+    with rounds_of(experiment, stages or Stages(), "posterior") as report, explained(experiment):
         own, data = infer(experiment, report), experiment.data
         made = Conditioned(experiment, own, own, own, (data.digest(),))
         if earlier is not None:

@@ -46,8 +46,6 @@ def cards(name: str, scenario: Scenario) -> dict[str, tuple]:
     Values are (value, comment), or (value,) for text that leaves no room for a comment.
     """
     beam, site = scenario.beam, scenario.observation
-    # FITS keys have eight letters
-    own = {f"V_{re.split('[-_]', n)[0][:6].upper()}": (v, n) for n, v in versions().items()}
     return {
         "CONTENT": (name, "of the posterior over the sky"),
         "FREQ": (scenario.frequency_mhz, "frequency in MHz"),
@@ -58,7 +56,8 @@ def cards(name: str, scenario: Scenario) -> dict[str, tuple]:
         "SITELAT": (site.lat_deg, "selenographic latitude in degrees"),
         "SCENHASH": (text_hash(scenario.to_yaml()),),
         "CREATOR": (f"lusee_bayes {__version__}",),
-        **own,
+        # FITS keys have eight letters
+        **{f"V_{re.split('[-_]', n)[0][:6].upper()}": (v, n) for n, v in versions().items()},
     }
 
 
@@ -432,10 +431,8 @@ def evidence_caveat(runs: Sequence[FinishedRun]) -> str | None:
     reasons = [f"{run.name} {why}" for run in others if (why := _difference(first, run))]
     if not reasons:
         return None
-    return (
-        f"Do not compare the evidences: they are of different data. Against {first.name}, "
-        f"{'; '.join(reasons)}."
-    )
+    against = f"Against {first.name}, {'; '.join(reasons)}."
+    return f"Do not compare the evidences: they are of different data. {against}"
 
 
 def _difference(first: FinishedRun, run: FinishedRun) -> str | None:

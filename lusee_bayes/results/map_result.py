@@ -6,6 +6,7 @@ maps.
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
 from textwrap import wrap
@@ -44,10 +45,8 @@ def joint_prior_sentence(scenario: Scenario) -> str:
     """Which prior the skies of a scenario's joint posterior have."""
     section, kept = scenario.spectral, f"prior.model={scenario.prior.model} is not used"
     if section.model == "positive":
-        return (
-            f"Prior spectral.model=positive: the embedded template times the exponential of "
-            f"{', '.join(section.fields)}, their C_ell learned from these data; {kept}."
-        )
+        sky = f"the embedded template times the exponential of {', '.join(section.fields)}"
+        return f"Prior spectral.model=positive: {sky}, their C_ell learned from these data; {kept}."
     return f"Prior spectral.model={section.model}, C_ell of the scenario's own skies; {kept}."
 
 
@@ -75,19 +74,15 @@ class ChannelUnknowns:
         """What a terminal shows: which of them, and which combination, the data do not tell."""
         if len(self.reports) == 1:
             return next(iter(self.reports.values())).lines()
-        n, untold = len(self.reports), dict[str, int]()
-        for report in self.reports.values():
-            for name in report.table["unknown"][~report.told]:
-                untold[name] = untold.get(name, 0) + 1
+        n, reports = len(self.reports), self.reports.values()
+        untold = Counter(name for one in reports for name in one.table["unknown"][~one.told])
         counts = [f"{name} (at {k} of {n} frequencies)" for name, k in untold.items()]
         what = f"do not tell {', '.join(counts)}" if counts else "tell all of them"
         found = [f"Receivers, ground and gain table: the data {what}."]
         for words, octaves in self.shared.items():
             like = "the same" if np.isinf(octaves) else f"smooth over {octaves:g} octaves"
-            found.append(
-                f"Unknowns of {words} are {like} at all frequencies: every channel is given what "
-                "the others tell of them."
-            )
+            given = "every channel is given what the others tell of them"
+            found.append(f"Unknowns of {words} are {like} at all frequencies: {given}.")
         sentence = self._null_sentence()
         return [*found, sentence] if sentence else found
 

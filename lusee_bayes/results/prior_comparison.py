@@ -152,11 +152,9 @@ class PriorComparison:
         first, second = sorted(self.priors, key=lambda one: -one.log_evidence)[:2]
         margin = first.log_evidence - second.log_evidence
         if margin < CLEAR:
-            return (
-                f"The data do not tell {first.name} from {second.name}: their ln evidences differ "
-                f"by {margin:.1f}, and less than {CLEAR:g} is within what Laplace's approximation "
-                "misses"
-            )
+            differ = f"their ln evidences differ by {margin:.1f}"
+            within = f"less than {CLEAR:g} is within what Laplace's approximation misses"
+            return f"The data do not tell {first.name} from {second.name}: {differ}, and {within}"
         return f"The data prefer {first.name}: its ln evidence is {margin:.1f} above {second.name}"
 
     def lines(self) -> list[str]:

@@ -57,11 +57,8 @@ class SampleResult:
     def quantities(self) -> dict[str, np.ndarray]:
         """Draws (chains, draws) of the other sites, landmarks, powers and lowest modes."""
         lmax = self.experiment.scenario.lmax
-        others = {
-            name: values.values
-            for name, values in self.tree["posterior"].data_vars.items()
-            if name != SKY and values.ndim == 2
-        }
+        sites = self.tree["posterior"].data_vars.items()
+        others = {name: x.values for name, x in sites if name != SKY and x.ndim == 2}
         ells = sorted({min(ell, lmax) for ell in (0, 1, 2, 5, 10, 20, 30, 40)})
         modes = [(ell, m) for ell in range(min(lmax, 2) + 1) for m in range(-ell, ell + 1)]
         return others | mode.sky_quantities(self.skies, pixels=LANDMARKS, ells=ells, modes=modes)

@@ -370,8 +370,7 @@ def _nodes() -> tuple[np.ndarray, np.ndarray]:
     far = 2.0 * SUN_RADIUS_KPC * (DEPTH_KPC / 2.0 / SUN_RADIUS_KPC) ** (np.arange(1, 9) / 8)
     edges = np.concatenate([nearest, inner, beyond, far])
     x, w = np.polynomial.legendre.leggauss(3)
-    half = 0.5 * np.diff(edges)
-    middle = 0.5 * (edges[1:] + edges[:-1])
+    half, middle = 0.5 * np.diff(edges), 0.5 * (edges[1:] + edges[:-1])
     return (middle[:, None] + half[:, None] * x).ravel(), (half[:, None] * w).ravel()
 
 

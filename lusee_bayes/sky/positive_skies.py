@@ -276,8 +276,6 @@ FIELDS = {
     "curvature": lambda x, y: np.log(x) ** 2,
     "absorption": lambda x, y: -(y**FREE_FREE_SLOPE),
 }
-# what they are, for messages
-FIELDS_OF = "fields of the logarithm"
 # least band limit of their grid: what it does not resolve of a template folds back into the map, at
 # 96 by 5 % of it in the plane
 FIELDS_GRID = 192
@@ -359,7 +357,7 @@ class PositiveSkies(eqx.Module):
             positive everywhere.
         """
         frequencies = np.asarray(frequencies_mhz, dtype=np.float64)
-        require_names("field", FIELDS_OF, names, FIELDS, len(frequencies))
+        cls.require_fields(names, len(frequencies))
         highest = lmax if lmax_fields is None else lmax_fields
         grid = SphereGrid.of(highest, max(GRID * highest, FIELDS_GRID) if band is None else band)
         at = grid.directions()
@@ -373,6 +371,11 @@ class PositiveSkies(eqx.Module):
         x, y = frequencies / reference_mhz, frequencies / turnover_mhz
         mixing = np.stack([FIELDS[name](x, y) for name in names], axis=1)
         return cls(frequencies, mixing, grid, levels, strength, sources, lmax, names)
+
+    @staticmethod
+    def require_fields(names: tuple[str, ...], n_channels: int) -> None:
+        """Refuse fields that are not known, and more of them than channels."""
+        require_names("field", "fields of the logarithm", names, FIELDS, n_channels)
 
     def coarser(self, lmax: int, lmax_fields: int) -> PositiveSkies:
         """Make the same of maps and fields with fewer modes.

@@ -383,8 +383,7 @@ class HarmonicPrior(DiagonalPrior):
             require_array("the prior mean", self.mean, (self.size,))
         if is_traced(self.spectrum, self.mean):
             return
-        negative = np.asarray(self.spectrum) < 0
-        if negative.any():
+        if (negative := np.asarray(self.spectrum) < 0).any():
             ell = int(np.argmax(negative))
             raise InputError(
                 f"the prior spectrum is negative at ell = {ell}: C_ell = "
@@ -465,8 +464,7 @@ def read_spectrum(path: str | Path, lmax: int) -> Float[np.ndarray, " ells"]:
     """
     require_whole("lmax", lmax, 0, LARGEST_LMAX)
     text = read_text(path, SPECTRUM.what, "check prior.spectrum_file").splitlines()
-    lines = [line.split("#")[0].replace(",", " ").strip() for line in text]
-    lines = list(filter(None, lines))
+    lines = [row for line in text if (row := line.split("#")[0].replace(",", " ").strip())]
     if lines and lines[0][0].isalpha():  # names of the columns
         del lines[0]
     if not lines:
@@ -478,15 +476,13 @@ def read_spectrum(path: str | Path, lmax: int) -> Float[np.ndarray, " ells"]:
     columns = {"ell": table[:, 0].astype(np.int64), "C_ell": table[:, 1]}
     found = SPECTRUM.checked(path, columns, {}).arrays
     there = set(found["ell"].tolist())
-    missing = [ell for ell in range(lmax + 1) if ell not in there]
-    if missing:
+    if missing := [ell for ell in range(lmax + 1) if ell not in there]:
         several = f" and {len(missing) - 1} more up to lmax = {lmax}" if len(missing) > 1 else ""
         raise InputError(
             f"{path} has no C_ell at ell = {missing[0]}{several}; give every ell from 0 to lmax, "
             "or lower lmax"
         )
-    spectrum = found["C_ell"][: lmax + 1]
-    if not spectrum.any():
+    if not (spectrum := found["C_ell"][: lmax + 1]).any():
         raise InputError(f"{path}: C_ell is zero at every ell up to {lmax}; a prior needs variance")
     return spectrum
 

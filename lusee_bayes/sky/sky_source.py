@@ -198,8 +198,7 @@ class SkyMap(SkyFile):
         hdf5 = h5py.is_hdf5(path)
         pixels = _read_hdf5(path, dataset or ULSA_DATASET) if hdf5 else _read_map(path)
         _require_healpix(path, pixels.size)
-        unseen = pixels == UNSEEN
-        if unseen.any():
+        if (unseen := pixels == UNSEEN).any():
             raise InputError(
                 f"{path}: {int(unseen.sum())} of {pixels.size} pixels are UNSEEN; give a full-sky "
                 "map"
@@ -241,8 +240,7 @@ def _read_hdf5(path: Path, dataset: str) -> np.ndarray:
 
 def _read_map(path: Path) -> np.ndarray:
     with opened(path) as hdus:
-        tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU)]
-        if not tables:
+        if not (tables := [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU)]):
             raise InputError(
                 f"{path} has no binary table; expected a HEALPix FITS map (or ULSA HDF5)"
             )
@@ -423,10 +421,8 @@ STEPS = ("FREQ_START", "FREQ_END", "FREQ_STEP")
 CUBE = Layout(
     "sky maps of many frequencies: an image (frequency, pixel)",
     {"maps": Variable(("frequency", "pixel"), unit="K")},
-    {
-        name: Attribute(low=low, unit="MHz")
-        for name, low in zip(STEPS, (0.0, 0.0, 1e-6), strict=True)
-    },
+    dict.fromkeys(STEPS[:2], Attribute(low=0.0, unit="MHz"))
+    | {STEPS[2]: Attribute(low=1e-6, unit="MHz")},
 )
 
 

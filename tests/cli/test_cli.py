@@ -177,9 +177,7 @@ def test_data_without_truth(folder, tmp_path):
     assert "rho" not in (out / "spectra.csv").read_text()
 
 
-def test_an_interrupted_write_leaves_the_previous_result_whole(
-    small_map, tmp_path, monkeypatch, capsys
-):
+def test_an_interrupted_write_leaves_the_old_result_whole(small_map, tmp_path, monkeypatch, capsys):
     out = shutil.copytree(small_map.folder, tmp_path / "out")
     before = content(out)
 

@@ -10,13 +10,8 @@ import pytest
 from assertions import refuse
 
 import lusee_bayes as lb
-from lusee_bayes.core.checks import (
-    is_traced,
-    require_finite,
-    require_float64,
-    require_positive,
-    require_shape,
-)
+from lusee_bayes.core import checks
+from lusee_bayes.core.checks import require_finite, require_float64, require_positive, require_shape
 
 NO_FLOATS = [
     (np.ones(3, dtype=np.float32), "an array of float32"),
@@ -67,7 +62,7 @@ def test_inside_a_transformation_values_pass_and_dtypes_do_not():
 
     @jax.jit
     def f(x):
-        seen.append(is_traced(1.0, x))
+        seen.append(checks.is_traced(1.0, x))
         require_finite("x", x)
         require_positive("x", x)
         require_shape("x", x, (2,))
@@ -76,7 +71,7 @@ def test_inside_a_transformation_values_pass_and_dtypes_do_not():
 
     f(jnp.array([-1.0, jnp.nan]))
     assert seen == [True]
-    assert not is_traced(jnp.ones(2), 1.0)
+    assert not checks.is_traced(jnp.ones(2), 1.0)
     refuse("float32", f, jnp.ones(2, dtype=jnp.float32))
 
 

@@ -106,9 +106,7 @@ def test_a_file_without_end_is_refused(path, monkeypatch):
     assert time.monotonic() - start < 30
 
 
-def test_a_name_whose_search_has_no_end_is_refused_even_where_names_cannot_be_listed(
-    path, monkeypatch
-):
+def test_a_name_whose_search_has_no_end_is_refused_even_where_none_can_be_listed(path, monkeypatch):
     """As of a file whose root HDF5 neither lists nor, asked for an attribute, comes back from."""
 
     class Attributes(dict):

@@ -236,8 +236,7 @@ def test_chi2_of_mixed_data_is_that_of_matrices():
 
 def test_mixings_are_those_of_voltages():
     """V_ij of s_i' = c_i s_p(i) is c_i conj(c_j) V_p(i)p(j)."""
-    rng = np.random.default_rng(1)
-    real = rng.standard_normal((16, 5))
+    real = np.random.default_rng(1).standard_normal((16, 5))
     v = np.asarray(to_matrix(real))
     ports, signs = (2, 0, 3, 1), (1.0, -1.0, 1.0, 1.0)
     order, c = np.array(ports), np.array(signs)

@@ -39,9 +39,8 @@ def file_of(folder, window):
     """Of samples with windows or instants; of neither, where ``window`` is None."""
     observation = lb.Observation.from_runs([lb.Run(0.02)], window=window or "instant")
     data = np.random.default_rng(2).normal(3e4, 1e2, (observation.n_times, 16))
-    made = lb.Visibilities.from_arrays(
-        data, observation.times, 25.0, timestamp="instant" if window != "mean" else "middle"
-    )
+    stamp = "instant" if window != "mean" else "middle"
+    made = lb.Visibilities.from_arrays(data, observation.times, 25.0, timestamp=stamp)
     dataset = made.to_dataset()
     if window is None:
         del dataset.attrs["window"]

@@ -29,9 +29,8 @@ def variances(setup) -> np.ndarray:
 def test_neither_noise_nor_seed_enter_a_setup(override, tiny_experiment):
     experiment = lb.build(small_scenario(override))
     for name in ("coupling", "prior", "beams", "background", "signal", "sky", "responses"):
-        built, shared = (
-            jax.tree.leaves(getattr(e.setup, name)) for e in (experiment, tiny_experiment)
-        )
+        built = jax.tree.leaves(getattr(experiment.setup, name))
+        shared = jax.tree.leaves(getattr(tiny_experiment.setup, name))
         assert len(built) == len(shared)
         for one, other in zip(built, shared, strict=True):
             np.testing.assert_array_equal(one, other)

@@ -9,17 +9,10 @@ from experiments import density_of, offset_posterior, with_known_sky
 from scipy import stats
 
 import lusee_bayes as lb
+from lusee_bayes.experiment import model as models
 from lusee_bayes.experiment.diagnosis import diagnose
 from lusee_bayes.experiment.experiment import Experiment, program_pieces
-from lusee_bayes.experiment.model import (
-    full_model,
-    model_about,
-    moved,
-    radiometer,
-    set_up,
-    simulate,
-    true_values,
-)
+from lusee_bayes.experiment.model import moved, radiometer, set_up, simulate, true_values
 from lusee_bayes.experiment.unknowns import pointing_report
 from lusee_bayes.instrument.beams.monopoles import source_response
 from lusee_bayes.judge.residuals import residuals
@@ -169,9 +162,9 @@ def test_sources_and_gains_are_those_of_the_offsets():
     setup = set_up(scenario_of("noise.pointing={turntable_deg: 1}", *extra, lmax=5, step_s=43200.0))
     turned = "observation.runs=[{cycles: 1, turntable_deg: 3}]"
     there = set_up(scenario_of(turned, *extra, lmax=5, step_s=43200.0))
-    expected = full_model(there)
+    expected = models.full_model(there)
     around = Around(None, None, setup.sky.modes, {"turntable_deg": 3.0})
-    found, held = model_about(setup, around)
+    found, held = models.model_about(setup, around)
     (offsets,) = (one for one in held if isinstance(one.systematic, PointingOffsets))
     # the columns' own part left out; gains make 1 + sigma^2 of every auto, that part too
     own = offsets.columns @ offsets.centre
@@ -199,10 +192,9 @@ def test_a_prior_is_learned_about_the_offsets():
     """A turntable off by degrees does not pass for the sky's: the prior is that of none."""
     learned = "prior={model: isotropic, spectrum: learned}"
     off = "noise.pointing={turntable_deg: 1, true_values: {turntable_deg: 2.0}}"
-    with_it, without = (
-        lb.build(scenario_of(learned, *more, lmax=6, step_s=43200.0)) for more in ((off,), ())
-    )
-    within(with_it.learned.parameters, without.learned.parameters, 0.1)
+    given = [scenario_of(learned, *more, lmax=6, step_s=43200.0) for more in ((off,), ())]
+    with_it, without = (lb.build(scenario).learned.parameters for scenario in given)
+    within(with_it, without, 0.1)
 
 
 def test_what_cannot_be():

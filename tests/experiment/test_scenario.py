@@ -10,19 +10,11 @@ from fits_files import write_images
 
 from lusee_bayes.core.reading import as_yaml, parse_yaml
 from lusee_bayes.core.section import FILES
-from lusee_bayes.experiment.instrument_sections import (
-    MonopoleBeamSection,
-    ResponseSection,
-    ScalarBeamSection,
-)
+from lusee_bayes.experiment import instrument_sections, sky_sections
+from lusee_bayes.experiment.instrument_sections import ResponseSection, ScalarBeamSection
 from lusee_bayes.experiment.keys import keys_as_markdown, scenario_keys
 from lusee_bayes.experiment.scenario import Scenario, load_scenario, scenario_names
-from lusee_bayes.experiment.sky_sections import (
-    FileSkySection,
-    GalaxySection,
-    IsotropicPriorSection,
-    LocalScalesPriorSection,
-)
+from lusee_bayes.experiment.sky_sections import FileSkySection, GalaxySection, IsotropicPriorSection
 
 
 def test_the_fiducial_scenario_is_the_papers():
@@ -254,7 +246,7 @@ def test_the_old_fiducial_scenario_is_the_fiducial_scenario(tmp_path):
     assert found.prior == IsotropicPriorSection(spectrum="sky")
     # written again, it has no key of another kind
     tree = parse_yaml(found.to_yaml(), "the file")
-    assert set(tree["beam"]) == set(MonopoleBeamSection.model_fields)
+    assert set(tree["beam"]) == set(instrument_sections.MonopoleBeamSection.model_fields)
     assert set(tree["sky"]) == set(GalaxySection.model_fields)
     assert tree["prior"]["spectrum"] == "sky"
 
@@ -265,7 +257,7 @@ def test_what_an_old_scenario_says_of_beams_is_kept(tmp_path, scalar, response):
     arm = {"file": scalar, "taper": False, "rotations_deg": [0.0, 90.0], **of_files}
     ports = {"file": response, "receiver": "open", "antenna_temperature_k": 300.0}
     for beam, kind, n_ports in (
-        (embedded, MonopoleBeamSection, 4),
+        (embedded, instrument_sections.MonopoleBeamSection, 4),
         (arm, ScalarBeamSection, 2),
         (ports, ResponseSection, 4),
     ):
@@ -301,7 +293,7 @@ def test_a_file_tells_which_sky_or_beams_they_are(short, response, scalar):
 def test_a_prior_takes_the_place_of_another(tmp_path, short):
     """``--set`` leaves the keys of the kind that was there, which the other kind drops."""
     found = load_scenario("fiducial", ["prior.model=local_scales", "prior.sources=false"])
-    assert found.prior == LocalScalesPriorSection(sources=False)
+    assert found.prior == sky_sections.LocalScalesPriorSection(sources=False)
     assert_kept(found, tmp_path)
     plain = load_scenario("fiducial", ["prior.model=local_scales"])
     back = short(plain.to_yaml(), "prior.model=isotropic")
@@ -320,7 +312,7 @@ def test_the_section_of_another_file_is_put_up_alike(response, scalar):
     assert arm.of_file(response) == ResponseSection(file=response, **shared)
     ports = ResponseSection(file="own.fits", receiver="open", **shared)
     assert ports.of_file(scalar) == ScalarBeamSection(file=scalar, **shared)
-    embedded = MonopoleBeamSection(turntable_offset_deg=7.0, length_m=2.0)
+    embedded = instrument_sections.MonopoleBeamSection(turntable_offset_deg=7.0, length_m=2.0)
     assert embedded.of_file(scalar) == ScalarBeamSection(file=scalar, turntable_offset_deg=7.0)
 
 
@@ -383,9 +375,8 @@ def test_a_default_changes_nothing(plain, key):
 
 
 RECEIVER = "beam={model: response, file: x, receiver: {model: %s, file: x}}"
-OF_KIND = {
-    name: f"beam={{model: {name}, file: x}}" for name in ("luseepy", "response", "sampled", "grid")
-}
+OF_FILES = "luseepy", "response", "sampled", "grid"
+OF_KIND = {name: f"beam={{model: {name}, file: x}}" for name in OF_FILES}
 OF_KIND |= {name: f"prior.model={name}" for name in ("isotropic", "local_scales")}
 OF_KIND |= {name: (RECEIVER % name).replace(", file: x}}", "}}") for name in ("jfet", "capacitor")}
 

@@ -12,16 +12,9 @@ from experiments import small_experiment
 
 import lusee_bayes as lb
 from lusee_bayes.core.section import Positive, Section, Treatment
-from lusee_bayes.experiment import model as model_module
+from lusee_bayes.experiment import model as models
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.model import (
-    full_model,
-    model_to_sample,
-    radiometer,
-    simulate,
-    systematics,
-    true_values,
-)
+from lusee_bayes.experiment.model import full_model, radiometer, simulate, systematics
 from lusee_bayes.experiment.rounds import SETTLED, Inference, prediction
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.noise.covariance import Covariance, LowRankCovariance, LowRankUpdate
@@ -148,7 +141,7 @@ def patterns(n_data: int, sigma_k: float) -> np.ndarray:
 @pytest.fixture
 def registered(monkeypatch, tiny_experiment):
     """The term behind those of the package, once there is an experiment without it."""
-    monkeypatch.setattr(model_module, "SYSTEMATICS", (*SYSTEMATICS, Hum))
+    monkeypatch.setattr(models, "SYSTEMATICS", (*SYSTEMATICS, Hum))
 
 
 def with_hum(**section) -> Scenario:
@@ -185,7 +178,7 @@ def test_ignored_or_left_out_it_is_not_in_n(registered):
 
 def test_sampled_it_is_left_to_the_program(registered):
     setup = setup_with(treatment="sampled")
-    base, (term,) = model_to_sample(setup, Around(small_experiment().data))
+    base, (term,) = models.model_to_sample(setup, Around(small_experiment().data))
     assert isinstance(term, Hum)
     np.testing.assert_array_equal(base.noise.diagonal(), radiometer(setup).diagonal())
     # in the model of first order it is in N all the same
@@ -237,9 +230,9 @@ def test_systematics_act_in_their_order(monkeypatch):
     setup = setup_with(sigma_k=100.0)
 
     def simulated(*more: type[Systematic]) -> np.ndarray:
-        monkeypatch.setattr(model_module, "SYSTEMATICS", (*SYSTEMATICS, *more))
+        monkeypatch.setattr(models, "SYSTEMATICS", (*SYSTEMATICS, *more))
         known = {Hum: "hum_noise", Amplifier: "factor"}
-        assert set(true_values(setup)) == {known[systematic] for systematic in more}
+        assert set(models.true_values(setup)) == {known[systematic] for systematic in more}
         return np.asarray(simulate(setup).data)
 
     signal = np.asarray(setup.layout.gather(setup.signal))

@@ -47,12 +47,8 @@ def test_what_an_error_does_is_what_it_does_to_data(plain, spots, name, values):
     """
     experiment, found = plain
     section = {"surface_permittivity": "beam={parameters: {surface_permittivity: 0.1}}"}
-    scenario = scenario_of(
-        ISOTROPIC,
-        "noise." + section.get(name, "pointing={tilt_north_deg: 1}"),
-        lmax=6,
-        step_s=43200.0,
-    )
+    term = "noise." + section.get(name, "pointing={tilt_north_deg: 1}")
+    scenario = scenario_of(ISOTROPIC, term, lmax=6, step_s=43200.0)
     sky, off = found.posterior.mean, moved(set_up(scenario), values)
     more = np.asarray(off.coupling @ sky) - np.asarray(experiment.setup.coupling @ sky)
     d = np.asarray(experiment.data.data)

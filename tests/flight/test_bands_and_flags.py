@@ -54,8 +54,7 @@ def test_lines_are_found_in_their_channel_alone(strength):
 
 
 def test_several_lines_hide_none():
-    rng = np.random.default_rng(3)
-    spectra, band = autos(rng), band_of()
+    spectra, band = autos(np.random.default_rng(3)), band_of()
     for k in (2, 3, 17, 30):
         spectra[:, :, band.first + k] *= 1.0 + 10.0 ** (k / 10) * 20.0 / np.sqrt(FRAMES)
     flagged, _ = flags_of(band, spectra)
@@ -188,8 +187,7 @@ def test_polynomials_of_the_degree_are_exact_in_the_middle(navgf, degree, origin
     band = ChannelBand.of(10.0, 2.0, degree, averaging, mhz)
     values = binned(averaging, spectrum(mhz, [3.0, 0.5, -0.2, 0.1, 0.05][: degree + 1]))
     here = values[band.first : band.last]
-    rng = np.random.default_rng(2)
-    good = rng.random((6, len(here))) > 0.15
+    good = np.random.default_rng(2).random((6, len(here))) > 0.15
     good[0] = True
     spectra = np.broadcast_to(here, (6, 2, len(here)))
     found, variance, further = band.values(spectra, np.broadcast_to(here, good.shape), good)

@@ -167,10 +167,8 @@ def test_between_frequencies_as_luseepy_does(tmp_path):
     harmonics = real_harmonics(theta, phi, 4) * solid_angle[:, None]
     crossed = {}
     for f in (20.0, 30.0):
-        arms = [
-            np.array([e.ravel() for e in point_pattern(theta, phi - np.radians(a), f)])
-            for a in angles
-        ]
+        fields = [point_pattern(theta, phi - np.radians(angle), f) for angle in angles]
+        arms = [np.array([e.ravel() for e in field]) for field in fields]
         first, second = ((np.abs(arm) ** 2).sum(0) for arm in arms)
         cross = (arms[0] * arms[1].conj()).sum(0)
         crossed[f] = np.array([first, cross.real, cross.imag, second]) @ harmonics

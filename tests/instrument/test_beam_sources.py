@@ -83,8 +83,7 @@ def test_response_beams(response, options, quadrature):
 
 def test_a_file_has_no_embedded_antennas_and_no_other_frequencies(scalar, response):
     for source in (replace(scalar, moon_k=250.0), replace(response, moon_k=250.0)):
-        words = r"embedded antennas, which beam\.file replaces"
-        refuse(words, getattr, source, "monopoles")
+        refuse(r"embedded antennas, which beam\.file replaces", getattr, source, "monopoles")
         for ask in (lambda f, s=source: s.beams(f, 2), source.background):
             refuse("to 50 MHz, not at 51", ask, 51.0)
     refuse("to 50 MHz, not at 51", scalar.impedance, 51.0)

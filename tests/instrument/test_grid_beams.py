@@ -174,10 +174,8 @@ def test_what_cannot_be_is_refused(tables, tmp_path, capsys):
     refuse("did you mean 'zenith_angle_deg'", read_beam_grid, table, {"zenit_angle_deg": 75.0})
     refuse("give a smaller standard deviation", lb.build, scenario(table, 4.0))
     rows = [("a", 1, 2), ("b", 1, 3), ("c", 2, 2), ("d", 2, 3)]
-    words = (
-        "has no files of surface_permittivity 2, zenith_angle_deg 3; expected one file for every"
-    )
-    refuse(words, read_beam_grid, write_table(tmp_path, rows[:3]))
+    said = "has no files of surface_permittivity 2, zenith_angle_deg 3; expected one file for every"
+    refuse(said, read_beam_grid, write_table(tmp_path, rows[:3]))
     words = "has 2 files of surface_permittivity 1, zenith_angle_deg 3; expected one file"
     refuse(words, read_beam_grid, write_table(tmp_path, [*rows, rows[1]]))
     refuse("a parameter of one value, or none", read_beam_grid, write_table(tmp_path, rows[:2]))

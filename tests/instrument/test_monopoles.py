@@ -59,8 +59,7 @@ def test_coefficients_do_not_change_when_the_nodes_double(frequency, lmax):
         for nodes in ((len(grid.theta), grid.n_phi), finer)
     )
     # from 25 MHz to 50 the echoes of layers 14 m apart vary twice as fast over the 64 nodes
-    tolerance = 1e-12 if frequency < 50.0 else 1e-11
-    close(coarse, fine, tolerance)
+    close(coarse, fine, 1e-12 if frequency < 50.0 else 1e-11)
 
 
 # --- reflection by the ground ---------------------------------------------------------------------

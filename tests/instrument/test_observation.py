@@ -5,13 +5,8 @@ import erfa
 import numpy as np
 import pytest
 from assertions import refuse, within
-from astropy.coordinates import (
-    ICRS,
-    CartesianRepresentation,
-    Galactic,
-    SkyCoord,
-    get_body_barycentric,
-)
+from astropy import coordinates
+from astropy.coordinates import ICRS, CartesianRepresentation, SkyCoord, get_body_barycentric
 from astropy.time import Time
 from lunarsky import MCMF, LunarTopo, MoonLocation
 from reference import galactic_directions, vectors
@@ -152,11 +147,10 @@ def by_erfa_and_lunartopo(planet, time, lon_deg, lat_deg):
         return (sun + erfa.plan94(tdb.jd1, jd2, planet)["p"]) * AU_KM
 
     moon = place(0.0, 3) + erfa.moon98(tdb.jd1, tdb.jd2)["p"] * AU_KM
-    site = MoonLocation.from_selenodetic(lon=lon_deg * u.deg, lat=lat_deg * u.deg, height=0.0 * u.m)
+    degrees = {"lon": lon_deg * u.deg, "lat": lat_deg * u.deg}
+    site = MoonLocation.from_selenodetic(**degrees, height=0.0 * u.m)
     radius = np.sqrt(site.x**2 + site.y**2 + site.z**2)
-    site = MoonLocation.from_selenodetic(
-        lon=lon_deg * u.deg, lat=lat_deg * u.deg, height=MOON_RADIUS_KM * u.km - radius
-    )
+    site = MoonLocation.from_selenodetic(**degrees, height=MOON_RADIUS_KM * u.km - radius)
     here = LunarTopo(obstime=time, location=site)
 
     def seen(seconds_ago):
@@ -164,9 +158,8 @@ def by_erfa_and_lunartopo(planet, time, lon_deg, lat_deg):
         distance = np.linalg.norm(away)
         with unannounced_leap_seconds():
             unit = ICRS(CartesianRepresentation(away / distance)).transform_to(MCMF(obstime=time))
-            centred = MCMF(
-                CartesianRepresentation(unit.cartesian.xyz.value * distance * u.km), obstime=time
-            )
+            xyz = unit.cartesian.xyz.value * distance * u.km
+            centred = MCMF(CartesianRepresentation(xyz), obstime=time)
             return centred.transform_to(here).cartesian.xyz.to_value(u.km).ravel()
 
     seconds = 0.0
@@ -194,7 +187,7 @@ def test_jupiter_is_where_the_almanac_had_it():
     # opposition of 10 January 2026, in Gemini near Pollux: RA 7h 23m, Dec 22
     observation = dates("2026-01-10T00:00:00")
     gal = body_direction("Jupiter", observation)
-    there = SkyCoord(Galactic(CartesianRepresentation(gal[0]))).icrs
+    there = SkyCoord(coordinates.Galactic(CartesianRepresentation(gal[0]))).icrs
     assert there.ra.deg == pytest.approx(110.8, abs=1.0)
     assert there.dec.deg == pytest.approx(22.0, abs=0.5)
     assert angle(gal, -body_direction("Sun", observation))[0] < np.radians(1.5)

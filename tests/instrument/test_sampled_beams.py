@@ -125,30 +125,28 @@ def test_sampled_beams_keep_the_contract(kind):
     check_beam_source(source, turned, turned_deg=30.0, **sizes)
 
 
+def modes_of(given, **more):
+    return lb.sampled_beams(FREQUENCY, **given, **more).beams(FREQUENCY, LMAX).modes
+
+
 def test_the_scale_is_the_autos_or_the_files():
     given = dict(embedded("grid"))
     bright = given | {"e_theta": 3.0 * given["e_theta"], "e_phi": 3.0 * given["e_phi"]}
-    scaled = lb.sampled_beams(FREQUENCY, **bright).beams(FREQUENCY, LMAX).modes
+    scaled = modes_of(bright)
     autos = scaled[[0, 7, 12, 15], 0] * np.sqrt(4 * np.pi)
     np.testing.assert_allclose(autos.mean(), 1.0, rtol=1e-12)
-    one, nine = (
-        lb.sampled_beams(FREQUENCY, **g, absolute=True).beams(FREQUENCY, LMAX).modes
-        for g in (given, bright)
-    )
+    one, nine = (modes_of(g, absolute=True) for g in (given, bright))
     np.testing.assert_allclose(nine, 9.0 * one, rtol=1e-12, atol=1e-12 * np.abs(nine).max())
     as_given = replace(lb.sampled_beams(FREQUENCY, **bright), normalise=False)
-    kept = as_given.beams(FREQUENCY, LMAX).modes
-    np.testing.assert_array_equal(kept, nine)
+    np.testing.assert_array_equal(as_given.beams(FREQUENCY, LMAX).modes, nine)
 
 
 @pytest.mark.parametrize("suffix", ["nc", "fits"])
 @pytest.mark.parametrize("kind", KINDS)
 def test_files_come_back(tmp_path, kind, suffix):
     one, two = (embedded(kind, f) for f in (20.0, 30.0))
-    arrays = {
-        name: values if name.endswith("deg") else np.stack([values, two[name]])
-        for name, values in one.items()
-    }
+    angles = {name for name in one if name.endswith("deg")}
+    arrays = {n: v if n in angles else np.stack([v, two[n]]) for n, v in one.items()}
     made = lb.sampled_beams([20.0, 30.0], **arrays, absolute=True)
     path = write_sampled_beams(tmp_path / f"mine.{suffix}", made)
     again = read_beam(path)
@@ -201,11 +199,7 @@ def test_what_is_on_or_below_the_horizon_is_not_used(kind):
             further[name][:, :30] = given[name][:, :30]
     else:
         further = {n: np.where(UP, given[n], np.nan) for n in ("e_theta", "e_phi")}
-    ours, own = (
-        lb.sampled_beams(FREQUENCY, **one).beams(FREQUENCY, LMAX).modes
-        for one in (given | further, given)
-    )
-    np.testing.assert_array_equal(ours, own)
+    np.testing.assert_array_equal(modes_of(given | further), modes_of(given))
 
 
 def nan_at_the_zenith():
@@ -279,9 +273,8 @@ def uvbeam(coordinates: str):
         options |= {"axis1_array": np.radians(PHI_DEG), "axis2_array": np.radians(THETA_DEG)}
         given = [on_grid(Monopoles(), f) for f in (20.0, 30.0)]
     # (vector: along phi, along theta; feed; frequency; directions)
-    options["data_array"] = np.stack(
-        [np.stack([one[name][:2] for one in given], axis=1) for name in ("e_phi", "e_theta")]
-    )
+    along = [[one[name][:2] for one in given] for name in ("e_phi", "e_theta")]
+    options["data_array"] = np.stack([np.stack(one, axis=1) for one in along])
     return pyuvdata.UVBeam.new(**options)
 
 

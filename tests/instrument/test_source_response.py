@@ -154,9 +154,8 @@ def around(n0, g, reach, n_radius, n_angle):
     root = (x + 1) / 2 * np.sqrt(height)
     cosine = 1 - root**2
     ring = w / 2 * np.sqrt(height) * 2 * root * 2 * np.pi / n_angle
-    kernel = sum(
-        (2 * ell + 1) / (4 * np.pi) * g[ell] * eval_legendre(ell, cosine) for ell in range(len(g))
-    )
+    terms = ((2 * ell + 1) * g[ell] * eval_legendre(ell, cosine) for ell in range(len(g)))
+    kernel = sum(terms) / (4 * np.pi)
     across = np.cross(n0, [0.0, 0.0, 1.0])
     across /= np.linalg.norm(across)
     other = np.cross(n0, across)
@@ -213,14 +212,14 @@ def test_a_moving_source_is_a_fixed_one_at_every_sample():
 def test_the_circularly_polarised_part_enters_by_the_v_beam():
     o = observation()
     galactic = o.zenith_galactic()[24]
-    intensity, half = (
-        np.asarray(mp.source_response(o, galactic, FREQUENCY, stokes_v=v)) for v in (0.0, 0.5)
-    )
+
+    def seen(v):
+        return mp.source_response(o, galactic, FREQUENCY, stokes_v=v)
+
+    intensity, half = (np.asarray(seen(v)) for v in (0.0, 0.5))
     circular = mp.beams_towards(FREQUENCY, o.antenna_directions(galactic), stokes="V")
     np.testing.assert_allclose(half - intensity, 0.5 * circular, rtol=0, atol=1e-15)
-    slope = jax.grad(lambda v: jnp.sum(mp.source_response(o, galactic, FREQUENCY, stokes_v=v)[2]))(
-        jnp.asarray(0.0)
-    )
+    slope = jax.grad(lambda v: jnp.sum(seen(v)[2]))(jnp.asarray(0.0))
     assert float(slope) == pytest.approx(float(circular[2].sum()), rel=1e-12)
 
 
@@ -232,7 +231,6 @@ def test_bad_directions_and_sources_are_refused():
     refuse("frequency_mhz must be positive, got 0.0", towards, 0.0, ZENITH)
     refuse("unit vectors, number 0 has length 1.1; divide", towards, FREQUENCY, 1.1 * ZENITH)
     for bad in (-1.5, np.nan):
-        words = f"from -1 to 1, got {bad}"
-        refuse(words, response, o, ZENITH[0], FREQUENCY, stokes_v=bad)
+        refuse(f"from -1 to 1, got {bad}", response, o, ZENITH[0], FREQUENCY, stokes_v=bad)
     refuse("unit vectors, number 0 has length 2", response, o, 2.0 * ZENITH[0], FREQUENCY)
     refuse("galactic has shape", response, o, np.zeros((2, 3)), FREQUENCY)

@@ -40,8 +40,7 @@ def write(path, data=None, pairs=PAIRS, header=HEADER, frequencies=(10.0, 20.0))
 
 
 def test_every_sample_is_in_its_place(tmp_path):
-    waterfall = read_waterfall(write(tmp_path / "w.fits"))
-    data = waterfall.at(20.0)
+    data = read_waterfall(write(tmp_path / "w.fits")).at(20.0)
     assert data.frequency_mhz == 20.0 and data.n_missing == 0
     expected = 100.0 * np.arange(16)[:, None] + np.arange(12)[None] + 0.1
     np.testing.assert_array_equal(data.grid(), expected)

@@ -62,11 +62,9 @@ def seconds_of(observation, origin):
 
 def pieces_of(observation, origin):
     """(start, end, live) of every piece of every sample, in seconds from one time."""
-    windows, seconds = observation.windows, seconds_of(observation, origin)
+    w, seconds = observation.windows, seconds_of(observation, origin)
     found = [[] for _ in seconds]
-    for k, a, b, live in zip(
-        windows.sample, windows.start_s, windows.end_s, windows.live_s, strict=True
-    ):
+    for k, a, b, live in zip(w.sample, w.start_s, w.end_s, w.live_s, strict=True):
         found[k].append((seconds[k] + a, seconds[k] + b, live))
     return found
 
@@ -74,6 +72,7 @@ def pieces_of(observation, origin):
 def naive(data, to_s):
     """Bins as lists of (run, values by product, pieces), by loops over the module's rule."""
     observation, grid = data.observation, data.grid()
+    there = ~np.isnan(grid)
     pieces = pieces_of(observation, observation.times[0])
     bins = {}
     for k, run in enumerate(observation.run):
@@ -83,14 +82,10 @@ def naive(data, to_s):
     found = []
     for (run, _), members in bins.items():
         live = {k: sum(p[2] for p in pieces[k]) for k in members}
-        members = [k for k in members if not np.isnan(grid[:, k]).all()]
-        total = sum(live[k] for k in members)
-        products = [
-            p
-            for p in range(16)
-            if sum(live[k] for k in members if not np.isnan(grid[p, k])) >= total / 2
-        ]
-        members = [k for k in members if not any(np.isnan(grid[p, k]) for p in products)]
+        members = [k for k in members if there[:, k].any()]
+        half = sum(live[k] for k in members) / 2
+        products = [p for p in range(16) if sum(live[k] for k in members if there[p, k]) >= half]
+        members = [k for k in members if all(there[p, k] for p in products)]
         if not members or not products:
             continue
         weight = sum(live[k] for k in members)
@@ -546,13 +541,9 @@ def test_middles_are_the_default_and_steps_may_be_shorter_than_the_times():
 
 def test_bounds_of_any_kind_of_times():
     bounds = [[s, s + timedelta(seconds=1000.0 + 100.0 * k)] for k, s in enumerate(STARTS)]
-    given = (
-        bounds,
-        [[one.isoformat() for one in pair] for pair in bounds],
-        np.array(bounds, dtype="datetime64[us]"),
-        Time(bounds, scale="utc"),
-    )
-    for one in given:
+    words = [[one.isoformat() for one in pair] for pair in bounds]
+    stamps = np.array(bounds, dtype="datetime64[us]")
+    for one in (bounds, words, stamps, Time(bounds, scale="utc")):
         observation = made(bounds=one, live_s=np.full(4, 500.0)).observation
         start = HOUR * np.arange(4)
         expected = np.stack([start, start + 1000.0 + 100.0 * np.arange(4)], axis=1)
@@ -571,12 +562,8 @@ def test_rounded_times_make_no_overlaps():
     data = np.zeros((400, 16))
     edges = np.random.default_rng(1).uniform(-2e-5, 2e-5, (400, 2))
     edges = starts[:, None] + (edges + np.array([0.0, 60.0])) * u.s
-    for options in (
-        {},
-        {"step_s": 60.0},
-        {"step_s": 60.0, "live_s": np.full(400, 60.0)},
-        {"bounds": edges},
-    ):
+    step = {"step_s": 60.0}
+    for options in ({}, step, step | {"live_s": np.full(400, 60.0)}, {"bounds": edges}):
         series = lb.Visibilities.from_arrays(data, rounded, 25.0, timestamp="start", **options)
         observation = series.observation
         found = bounds_of(observation)

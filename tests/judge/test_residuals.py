@@ -562,11 +562,9 @@ def test_densities_of_groups_are_what_the_covariance_of_the_data_says():
         return -0.5 * (value + chosen.sum() * np.log(2.0 * np.pi))
 
     every = np.ones(len(less), dtype=bool)
-    day = data.observation.hours[data.layout.time] // 24
-    groups = {
-        "product": [data.layout.product == j for j in range(16)],
-        "day": [day == j for j in np.unique(day)],
-    }
+    product, day = data.layout.product, data.observation.hours[data.layout.time] // 24
+    days = [day == j for j in np.unique(day)]
+    groups = {"product": [product == j for j in range(16)], "day": days}
     for found in held_out(model.condition(data.data), data):
         chosen = groups.pop(found.kind)
         expected = sum(log_density(every) - log_density(~inside) for inside in chosen)

@@ -116,8 +116,7 @@ def test_nothing_settles_without_steps(case, monkeypatch):
 
 def test_a_root_of_what_rounding_has_spoilt():
     """Very precise data: eigenvalues between 0 and 1 come out below 0 by more than is added."""
-    rng = np.random.default_rng(2)
-    q = np.linalg.qr(rng.standard_normal((6, 6)))[0]
+    q = np.linalg.qr(np.random.default_rng(2).standard_normal((6, 6)))[0]
     for values in ([1.0, 0.5, 0.1, 0.0, 0.0, -9e-4], [1.0, 0.5, 0.1, 0.0, 0.0, 0.0]):
         values = np.array(values)
         root = learning._root(q * values @ q.T)
@@ -175,9 +174,8 @@ def test_raised_information_is_that_of_raised_noise():
     coupling, data = rng.standard_normal((N_DATA, n)), 100.0 * rng.standard_normal(N_DATA)
     prior = lb.HarmonicPrior(np.full(LMAX + 1, 1e4))
     noise = (lb.DiagonalCovariance(np.full(N_DATA, variance)) for variance in (9.0, 63.0))
-    plain, expected = (
-        lb.LinearGaussian(coupling, prior, n).condition(data).information for n in noise
-    )
+    models = (lb.LinearGaussian(coupling, prior, n) for n in noise)
+    plain, expected = (model.condition(data).information for model in models)
     raised, sky = plain.raised(7.0), rng.standard_normal(n)
     np.testing.assert_allclose(raised.matrix, expected.matrix, rtol=1e-12)
     assert float(raised.chi2(sky)) == pytest.approx(float(expected.chi2(sky)), rel=1e-10)
@@ -244,10 +242,8 @@ def one_parameter():
     family, width = Strength.around(2e4, LOW), 1.0
     noise = np.geomspace(0.1, 10.0, SIZE) * SCALE
     seen = 2.0 * SCALE * np.ones(SIZE)
-    unknown = np.asarray(0.0)
-    information = Information(
-        np.diag(noise**-2.0), seen / noise**2, np.zeros(SIZE), unknown, unknown, unknown
-    )
+    unknown = [np.asarray(0.0)] * 3
+    information = Information(np.diag(noise**-2.0), seen / noise**2, np.zeros(SIZE), *unknown)
     prior = family.prior(family.at(np.array([0.4])).covariance)
     learned = learning.Learned(prior, ("theta",), np.array([0.4]), np.array([[width**2]]), 0.0, 0)
     draws = learning.draws_with_parameters(family, learned, information, jax.random.key(1), 4500)

@@ -12,6 +12,7 @@ from assertions import refuse
 from jaxtyping import TypeCheckError
 
 import lusee_bayes as lb
+from lusee_bayes.instrument.coupling import DenseCoupling
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.linear.information import CONVERGENCE
 from lusee_bayes.linear.linear_gaussian import FromInformation, InData, InMap, form_of
@@ -369,9 +370,12 @@ def test_standard_deviations_are_right_or_refused():
     assert np.abs(std / exact.std - 1.0).max() < 1e-3  # 3e-2 is what comes
 
 
-@pytest.mark.parametrize(("before", "after"), [(0, 3), (2, 3)])
-def test_beside_a_solved_model_columns_are_changed(before, after):
-    """A^T N^-1 A of one N_0 + U U^T from that of another: the textbook's posterior."""
+@pytest.mark.parametrize(("before", "after", "gain"), [(0, 3, 1.0), (2, 3, 1.0), (2, 3, 1.01)])
+def test_beside_a_solved_model_columns_are_changed(before, after, gain):
+    """A^T N^-1 A of one N_0 + U U^T from that of another: the textbook's posterior.
+
+    With another A it is not used.
+    """
     model, d = well_scaled(30, "blocks")
     rng = np.random.default_rng(6)
 
@@ -380,6 +384,7 @@ def test_beside_a_solved_model_columns_are_changed(before, after):
         return replace(model, noise=model.noise + update) if n else model
 
     known, wanted = with_columns(before).condition(d), with_columns(after)
+    wanted = replace(wanted, coupling=DenseCoupling(gain * wanted.coupling.dense()))
     found = FromInformation.beside(known, wanted).condition(d)
     expected = oracle.posterior(*oracle.matrices(wanted), d)
     off = (found.posterior.mean - expected.mean) / expected.std

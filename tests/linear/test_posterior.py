@@ -138,8 +138,7 @@ LMAX = 5
 
 def test_rho_and_snr_against_complex_coefficients_and_loops():
     # the paper writes them with complex a_lm over m = -ell..ell; healpy keeps m >= 0
-    rng = np.random.default_rng(1)
-    mean, truth = rng.standard_normal((2, (LMAX + 1) ** 2))
+    mean, truth = np.random.default_rng(1).standard_normal((2, (LMAX + 1) ** 2))
     a, b = to_healpy(mean), to_healpy(truth)
     rho, snr = measures.correlation(mean, truth), measures.signal_to_noise(mean, truth)
     for ell in range(LMAX + 1):
@@ -185,8 +184,7 @@ def test_the_sky_that_never_rises_is_a_cap_round_the_north_pole():
     # all but a cap of that radius about it in one cycle (paper: "within ~24 degrees of the NCP")
     observation = lb.Observation.from_runs([lb.Run()], step_s=3600.0)
     nside = 32
-    highest = measures.highest_altitude(observation, nside)
-    hidden = highest < 0
+    hidden = measures.highest_altitude(observation, nside) < 0
     radius = np.radians(-observation.lat_deg)
     expected = (1 - np.cos(radius)) / 2
     # pixels on the rim: 2 pi sin(radius) / pixel size of them, half a pixel each at worst

@@ -34,10 +34,8 @@ def test_the_term_is_da_s_da(beams, shifted):
     flags = np.zeros((16, pointing.n_times), dtype=bool)
     flags[2, 1] = flags[:, 4] = True
     layout = DataLayout.from_flags(flags)
-    a, b, direction = (
-        lb.CouplingMatrix.build(x, pointing, layout)
-        for x in (beams, shifted, difference(shifted, beams))
-    )
+    three = beams, shifted, difference(shifted, beams)
+    a, b, direction = (lb.CouplingMatrix.build(one, pointing, layout) for one in three)
     error = np.asarray(b.dense()) - np.asarray(a.dense())
     spectrum = 1e8 / (1.0 + np.arange(LMAX + 1.0)) ** 2
     per_mode = np.repeat(spectrum, 2 * np.arange(LMAX + 1) + 1)

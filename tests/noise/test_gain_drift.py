@@ -25,8 +25,7 @@ def pairs(n_antennas):
 
 def visibilities(n_antennas, n_times=N_TIMES, seed=0):
     """No symmetry, both signs in the crosses, as a (products, times) array in K."""
-    rng = np.random.default_rng(seed)
-    grid = rng.normal(size=(n_antennas**2, n_times)) * 3e3
+    grid = np.random.default_rng(seed).normal(size=(n_antennas**2, n_times)) * 3e3
     autos = [i == j for i, j in pairs(n_antennas)]
     grid[autos] = 2e4 + abs(grid[autos])
     return grid

@@ -67,16 +67,14 @@ def test_paper_form_is_the_papers_formula():
 
 def simulated_products(n: int, seed: int) -> np.ndarray:
     """n products s_i conj(s_j) of voltages s ~ CN(0, T(t=0)), shape (n, products)."""
-    rng = np.random.default_rng(seed)
-    white = rng.normal(size=(2, n, N_ANTENNAS)) / np.sqrt(2)
+    white = np.random.default_rng(seed).normal(size=(2, n, N_ANTENNAS)) / np.sqrt(2)
     s = (white[0] + 1j * white[1]) @ np.linalg.cholesky(T[0]).T
     return real_products(s[:, :, None] * s[:, None, :].conj())
 
 
 def test_exact_form_is_what_complex_gaussian_voltages_do():
     n = 200_000
-    x = simulated_products(n, seed=5)
-    delta = x - real_products(T[0])
+    delta = simulated_products(n, seed=5) - real_products(T[0])
     # mean of the products: T itself (this pins <s_i conj(s_j)> and the products' order)
     z = delta.mean(0) / (delta.std(0) / np.sqrt(n))
     assert np.abs(z).max() < z_of(N_PRODUCTS)
@@ -190,8 +188,7 @@ def test_an_absent_auto_is_interpolated_in_time():
 @pytest.mark.parametrize("form", ["paper", "exact"])
 def test_every_sample_has_its_own_live_time(form):
     """The mean of samples, weighted by live time, has the noise of all of their live time."""
-    rng = np.random.default_rng(4)
-    live = rng.uniform(10.0, 300.0, 5)
+    live = np.random.default_rng(4).uniform(10.0, 300.0, 5)
     v = jnp.repeat(VISIBILITIES[:, :1], 5, axis=1)
     layout = DataLayout(N_PRODUCTS, 5)
     fine = np.asarray(lb.radiometer_noise(v, layout, step_s=live, form=form).dense())

@@ -15,8 +15,7 @@ from lusee_bayes.report.rendering import ENVIRONMENT, formatted, p_value, pictur
 
 def test_points_lie_where_matplotlib_puts_them():
     transform = MollweideAxes.MollweideTransform(1)
-    rng = np.random.default_rng(3)
-    x, y = rng.uniform(-1.0, 1.0, (2, 4000))
+    x, y = np.random.default_rng(3).uniform(-1.0, 1.0, (2, 4000))
     inside = np.hypot(x, y) < 0.999
     lon, lat = drawing.unprojected(x[inside], y[inside])
     # matplotlib's longitude grows to the right; its ellipse is sqrt(2) times (2, 1)
@@ -128,8 +127,7 @@ def test_probabilities_of_a_column_have_no_equals_sign():
 def test_what_users_write_cannot_become_tags_and_bad_rows_stand_out():
     text = """{% from "macros.html" import cells, table with context %}
     {%- call(row) table(("a", "b"), rows, [false, true]) %}{{ cells(*row) }}{% endcall %}"""
-    rows = [("<b>", 1), ("&", 2)]
-    page = ENVIRONMENT.from_string(text).render(rows=rows)
+    page = ENVIRONMENT.from_string(text).render(rows=[("<b>", 1), ("&", 2)])
     assert "<tr><td>&lt;b&gt;</td><td>1</td></tr>" in page
     assert "<tr class=bad><td>&amp;</td><td>2</td></tr>" in page
 

@@ -54,9 +54,8 @@ SIZES = {"viewer-map": [400, 200], "viewer-psf": [120, 60]}
 
 def run_page(page: str, tmp_path, commands: str) -> dict:
     """What ``commands`` leave in ``told`` after the scripts of the page have run."""
-    (data,) = re.findall(
-        r'<script type="application/json" id="viewer-data">(.*?)</script>', page, re.DOTALL
-    )
+    embedded = r'<script type="application/json" id="viewer-data">(.*?)</script>'
+    (data,) = re.findall(embedded, page, re.DOTALL)
     scripts = re.findall(r"<script>\n(.*?)\n</script>", page, re.DOTALL)
     given = f"element('viewer-data').textContent = {json.dumps(data)};"
     last = "require('fs').writeFileSync('told.json', JSON.stringify(told));"

@@ -260,9 +260,7 @@ def test_a_channel_has_those_of_its_own_map(response_file, tmp_path, monkeypatch
     assert "Powers of receivers" in page and page.count("<td>regolith_k</td><td>K</td>") == 2
 
 
-def test_in_a_joint_posterior_they_are_those_of_all_skies_and_unknowns_together(
-    response_file, tmp_path
-):
+def test_in_a_joint_posterior_they_are_those_of_all_skies_and_unknowns(response_file, tmp_path):
     """Every sky and every unknown as one Gaussian in NumPy."""
     given = (*PLAIN, "joint=true", "spectral.components=[power_law]")
     scenario = cube_of(response_file, *given, frequencies="[15, 20, 25]")

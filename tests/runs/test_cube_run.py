@@ -155,8 +155,7 @@ def gap(tmp_path_factory):
     assert run("simulate", "fiducial", *THREE, "-o", path, "-q") == 0
     with fits.open(path, mode="update") as file:
         (channels,) = [hdu for hdu in file if hdu.data is not None and hdu.data.ndim == 3]
-        axis = channels.data.shape.index(3)
-        np.moveaxis(channels.data, axis, 0)[1] = np.nan
+        np.moveaxis(channels.data, channels.data.shape.index(3), 0)[1] = np.nan
     return path
 
 

@@ -213,9 +213,7 @@ def test_resuming_a_finished_run_takes_it_over(whole, tree, no_sampling):
 
 
 @pytest.mark.parametrize("change", [{"draws": 500}, {"draws": 2000}, {"seed": 7}], ids=str)
-def test_a_finished_run_with_other_settings_is_not_taken_over(
-    experiment, whole, no_sampling, change
-):
+def test_a_finished_run_of_other_settings_is_not_taken_over(experiment, whole, no_sampling, change):
     before = content(whole)
     given = experiment, lb.load_program("sky"), replace(SAMPLER, **change), whole
     refuse("finished run with other settings; leave out", sample_result, *given, resume=True)

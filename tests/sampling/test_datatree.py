@@ -126,9 +126,8 @@ def test_data_are_labelled_by_product_and_time_without_the_flagged_ones(drawn, s
         assert list(found) == expected
     # and each value is where the full grid has it
     grid = xr.DataArray(setting[1].grid(), coords=[("product", list(PRODUCTS)), ("time", range(4))])
-    for value, (product, time) in zip(
-        drawn[0]["observed_data"]["data"].values, expected, strict=True
-    ):
+    values = drawn[0]["observed_data"]["data"].values
+    for value, (product, time) in zip(values, expected, strict=True):
         assert float(grid.sel(product=product, time=int(time[11:13]) // 2)) == value
 
 
@@ -196,9 +195,8 @@ def test_another_seed_makes_other_predictive_draws_and_real_data_have_no_truth(s
     real = lb.Visibilities(data.data, data.layout, data.observation, 25.0)
     posterior = model.condition(data.data).posterior
     chains = chains_of({"sky": np.asarray(posterior.sample(jax.random.key(1), 8))[None]})
-    first, other = (
-        tree_of((model, d), chains, seed=seed, n_predictive=8) for seed, d in [(1, data), (2, real)]
-    )
+    first = tree_of((model, data), chains, seed=1, n_predictive=8)
+    other = tree_of((model, real), chains, seed=2, n_predictive=8)
     groups = {"prior": "sky", "prior_predictive": "data", "posterior_predictive": "data"}
     for group, name in groups.items():
         assert not np.isin(first[group][name].values, other[group][name].values).any()
@@ -241,10 +239,8 @@ def test_data_of_a_program_without_the_sky_are_replicated_with_its_skies(collaps
     assert_draws_follow(logs[:, None], [0.0], [[1.0]])
     # given its level, prior data are N(0, A S A^T + level N)
     data = tree["prior_predictive"]["data"].values[0]
-    whitened = [
-        np.linalg.solve(np.linalg.cholesky(a @ s @ a.T + np.exp(x) * n), d)
-        for x, d in zip(logs, data, strict=True)
-    ]
+    roots = [np.linalg.cholesky(a @ s @ a.T + np.exp(x) * n) for x in logs]
+    whitened = [np.linalg.solve(root, d) for root, d in zip(roots, data, strict=True)]
     assert_draws_follow(whitened, np.zeros(len(n)), np.eye(len(n)))
 
 

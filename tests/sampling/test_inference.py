@@ -197,10 +197,8 @@ def test_the_marginal_program_finds_the_noise_level(gaussian, data, level_grid, 
     chains = sample(lb.load_program("sky_marginal").model, arguments, sampler)
     assert set(chains.sites) == {"noise_level"}
     levels = np.exp(level_grid)
-    evidence = [
-        multivariate_normal(cov=a @ s @ a.T + level * n).logpdf(np.asarray(data))
-        for level in levels
-    ]
+    laws = [multivariate_normal(cov=a @ s @ a.T + level * n) for level in levels]
+    evidence = [law.logpdf(np.asarray(data)) for law in laws]
     # the density of ln level: the Jacobian is the level itself
     density = np.exp(np.array(evidence)) * lognorm(1.0).pdf(levels) * levels
     density /= density.sum()

@@ -50,9 +50,8 @@ def by_time(case, nu):
 def test_the_density_is_that_of_scipy(case, nu):
     site = lb.TimesStudentT(case.loc, case.noise.factor(), case.layout, nu)
     values = jnp.stack([case.value, 30.0 * case.value, case.loc])
-    expected = [
-        sum(law.logpdf(v[at]) for _, at, law in by_time(case, nu)) for v in np.asarray(values)
-    ]
+    laws = list(by_time(case, nu))
+    expected = [sum(law.logpdf(v[at]) for _, at, law in laws) for v in np.asarray(values)]
     np.testing.assert_allclose(site.log_prob(values), expected, rtol=1e-12)
     for one in (site, lb.TimesStudentT(case.loc, case.noise, case.layout, jnp.asarray(nu))):
         np.testing.assert_allclose(one.log_prob(values[0]), expected[0], rtol=1e-12)
@@ -209,8 +208,7 @@ def test_weights_tell_bad_times(burst):
 @pytest.mark.long
 def test_draws_are_those_of_another_sampler(burst):
     """Gibbs: the sky given w_t is Gaussian in closed form, w_t given the sky a Gamma law."""
-    rng = np.random.default_rng(4)
-    mean, std = gibbs(burst.gaussian, burst.layout, burst.dirty, 600, rng)
+    mean, std = gibbs(burst.gaussian, burst.layout, burst.dirty, 600, np.random.default_rng(4))
     # 1200 draws, worth at least 300 each: 0.06, less where they are worth more
     assert rms((burst.skies.mean(0) - mean) / std) < 0.06
     assert rms((burst.skies.mean(0) - np.asarray(burst.good.mean)) / std) > 0.06
@@ -234,10 +232,8 @@ def test_systematics_are_sampled_with_it(response_file):
     loc = np.asarray(gaussian.predict(sky)) + layout.gather(more)
     data, dense = np.asarray(arguments["data"]), np.asarray(gaussian.noise.dense())
     by_times = [np.flatnonzero(layout.time == t) for t in range(layout.n_times)]
-    seen = sum(
-        stats.multivariate_t(loc[at], dense[np.ix_(at, at)], df=NU).logpdf(data[at])
-        for at in by_times
-    )
+    laws = [stats.multivariate_t(loc[at], dense[np.ix_(at, at)], df=NU) for at in by_times]
+    seen = sum(law.logpdf(data[at]) for law, at in zip(laws, by_times, strict=True))
     prior = stats.norm(800.0, 80.0).logpdf(power).sum()
     prior += stats.norm(0.0, np.sqrt(gaussian.prior.variance())).logpdf(sky).sum()
     np.testing.assert_allclose(found, seen + prior, rtol=1e-9)

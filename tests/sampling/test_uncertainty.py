@@ -83,8 +83,7 @@ def test_quantities_against_direct_computation(skies):
     np.testing.assert_array_equal(found["sky(2, -1) [K]"], few[..., 5])
     np.testing.assert_array_equal(found["sky(3, 3) [K]"], few[..., 15])
     for ell in (0, 2, 3):
-        modes = few[..., ell**2 : (ell + 1) ** 2]
-        expected = (modes**2).sum(-1) / (2 * ell + 1)
+        expected = (few[..., ell**2 : (ell + 1) ** 2] ** 2).sum(-1) / (2 * ell + 1)
         np.testing.assert_allclose(found[f"C_{ell} [K2]"], expected, rtol=1e-14)
     # NSIDE 64 puts a pixel's centre within half a degree of any place: the place that is asked for
     # is then the pixel's own

@@ -132,8 +132,7 @@ def test_without_electrons_the_integral_is_quads(lon_deg, lat_deg):
         quad(emissivity, a, b, args=(lon_deg, lat_deg, 25.0), epsabs=0.0, epsrel=1e-10)[0]
         for a, b in itertools.pairwise(edges)
     )
-    tolerance = 1e-4 if lon_deg < 1.0 else 1e-6
-    assert got == pytest.approx(want, rel=tolerance)
+    assert got == pytest.approx(want, rel=1e-4 if lon_deg < 1.0 else 1e-6)
     assert depth == 0.0
 
 
@@ -239,9 +238,8 @@ def test_random_component_has_the_stated_rms_and_large_scales_at_every_nside():
     # One map's rms scatters by 0.12 of itself (few modes rule a spectrum ell^-2.7): 4 sigma.
     rms = [np.std(galaxy._fluctuations(64, seed)) for seed in range(20)]
     assert np.mean(rms) == pytest.approx(galaxy.FLUCTUATION_RMS, rel=4.0 * 0.12 / np.sqrt(20.0))
-    coarse, fine = (
-        hp.map2alm(galaxy._fluctuations(nside, 3), lmax=8, iter=10) for nside in (16, 64)
-    )
+    maps = (galaxy._fluctuations(nside, 3) for nside in (16, 64))
+    coarse, fine = (hp.map2alm(one, lmax=8, iter=10) for one in maps)
     # Pixel quadrature at the band limit of nside 16 costs 1e-4, against 2e-2 of another draw.
     np.testing.assert_allclose(coarse, fine, atol=2e-4)
     assert np.std(fine) > 5e-3

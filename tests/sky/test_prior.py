@@ -31,10 +31,8 @@ def pixel_covariance() -> np.ndarray:
     """S_pq = sum_l (2l+1)/(4 pi) C_l P_l(cos angle_pq): the addition theorem, no harmonics."""
     vectors = np.array(hp.pix2vec(NSIDE, np.arange(12 * NSIDE**2)))
     cosine = np.clip(vectors.T @ vectors, -1.0, 1.0)
-    return sum(
-        (2 * ell + 1) / (4 * np.pi) * c * eval_legendre(ell, cosine)
-        for ell, c in enumerate(SPECTRUM)
-    )
+    terms = ((2 * k + 1) * c * eval_legendre(k, cosine) for k, c in enumerate(SPECTRUM))
+    return sum(terms) / (4 * np.pi)
 
 
 @pytest.fixture(scope="module")

@@ -136,8 +136,7 @@ def test_the_galaxy_keeps_the_contract():
 def test_the_test_skies_keep_the_contract(kind):
     # the background's plane has power above lmax, 6e-6 between 8 and 191
     check_sky_source(kind(), frequency_mhz=10.0, lmax=16, slice_rtol=1e-4)
-    mean = kind().at(20.0, 8).mean_temperature
-    assert mean == pytest.approx(3e5 * 2**-2.5, rel=0.05)
+    assert kind().at(20.0, 8).mean_temperature == pytest.approx(3e5 * 2**-2.5, rel=0.05)
     first, second = (np.asarray(kind(seed).at(10.0, 8).modes) for seed in (1, 2))
     assert np.abs(first - second).max() > 1e-3 * np.abs(first).max()
 
@@ -151,8 +150,7 @@ def test_a_file_is_there_and_its_frequency_positive():
 
 @pytest.fixture
 def pixels():
-    rng = np.random.default_rng(3)
-    return 1e5 + 1e3 * rng.standard_normal(12 * NSIDE**2)
+    return 1e5 + 1e3 * np.random.default_rng(3).standard_normal(12 * NSIDE**2)
 
 
 def test_ulsa_file_is_read_as_it_is(test_data):
@@ -221,8 +219,7 @@ CUBE_NSIDE = 8
 @pytest.fixture
 def maps():
     """Power laws of two indices, one for each half of the pixels."""
-    rng = np.random.default_rng(5)
-    at_one = 1e6 * (1.0 + rng.random(12 * CUBE_NSIDE**2))
+    at_one = 1e6 * (1.0 + np.random.default_rng(5).random(12 * CUBE_NSIDE**2))
     index = np.where(np.arange(at_one.size) % 2, -2.5, -2.1)
     return at_one * np.arange(1.0, 51.0)[:, None] ** index
 

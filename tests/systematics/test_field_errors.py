@@ -12,12 +12,8 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.experiment.model import base_model, radiometer, set_up, simulate, systematics
-from lusee_bayes.instrument.beams.fields import (
-    AntennaFields,
-    HemisphereGrid,
-    mean_auto_integral,
-    stokes_beam,
-)
+from lusee_bayes.instrument.beams import fields as beam_fields
+from lusee_bayes.instrument.beams.fields import AntennaFields, HemisphereGrid, stokes_beam
 from lusee_bayes.instrument.products import to_real
 from lusee_bayes.results.finished_runs import FinishedRun
 from lusee_bayes.systematics.context import Setup
@@ -62,9 +58,8 @@ def test_beams_are_those_of_fields_with_errors():
     values = errors.values(z)
     grid = HemisphereGrid.gauss_legendre(48, 48)
     theta, phi = (x.ravel() for x in np.meshgrid(grid.theta, grid.phi, indexing="ij"))
-    modes = np.concatenate(
-        [values[f"field_error_{ell}"].reshape(2, 4, 2, 2 * ell + 1) for ell in range(3)], axis=3
-    )
+    of_ells = [values[f"field_error_{k}"].reshape(2, 4, 2, 2 * k + 1) for k in range(3)]
+    modes = np.concatenate(of_ells, axis=3)
     real, imaginary = modes @ real_harmonics(theta, phi, 2).T
     fields = setup.beam_source.fields(setup.frequency_mhz, grid)
     power = np.abs(np.asarray(fields.e_theta)) ** 2 + np.abs(np.asarray(fields.e_phi)) ** 2
@@ -75,10 +70,9 @@ def test_beams_are_those_of_fields_with_errors():
     cos, sin = np.cos(grid.phi), np.sin(grid.phi)
     e_theta = fields.e_theta + cos * more[:, 0] + sin * more[:, 1]
     wrong = AntennaFields(e_theta, fields.e_phi - sin * more[:, 0] + cos * more[:, 1], grid)
-    scale = mean_auto_integral(fields)
-    before, after = (
-        np.asarray(grid.modes(to_real(stokes_beam(one)) / scale, lmax)) for one in (fields, wrong)
-    )
+    scale = beam_fields.mean_auto_integral(fields)
+    stokes = (to_real(stokes_beam(one)) / scale for one in (fields, wrong))
+    before, after = (np.asarray(grid.modes(one, lmax)) for one in stokes)
     nominal = np.asarray(setup.beams.modes)
     change = np.asarray(errors.modes(nominal, values)) - nominal
     assert np.abs(after - before).max() > std * np.abs(before).max()
@@ -196,5 +190,4 @@ def test_other_runs_of_measured_data_have_them_too(tmp_path, command):
         lb.run_sample(given, tmp_path / "run", data=data, sampler=sampler)
     else:
         lb.run_compare_priors(given, tmp_path / "run", data=data)
-    written = lb.load_scenario(tmp_path / "run" / "scenario.yaml")
-    assert written == given.of_measured() != given
+    assert lb.load_scenario(tmp_path / "run" / "scenario.yaml") == given.of_measured() != given

@@ -11,17 +11,9 @@ from scipy.optimize import least_squares
 from scipy.stats import norm
 
 import lusee_bayes as lb
+from lusee_bayes.experiment import model as models
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.model import (
-    full_model,
-    model_about,
-    moved,
-    radiometer,
-    set_up,
-    simulate,
-    true_signal,
-    true_values,
-)
+from lusee_bayes.experiment.model import full_model, radiometer, set_up, simulate, true_values
 from lusee_bayes.experiment.rounds import Inference, settled
 from lusee_bayes.instrument.beams.sampled import read_beam
 from lusee_bayes.instrument.products import all_products, labels
@@ -122,7 +114,7 @@ def test_simulated_data_hold_them_whatever_their_treatment(warm, response_file, 
     assert len(set(powers)) == 4
     assert 0.0 < abs(truth["regolith_k"] - 250.0) < 4 * 30.0
     z = np.append((powers - 2000.0) / 200.0, (truth["regolith_k"] - 250.0) / 30.0)
-    added = np.asarray(setup.layout.gather(true_signal(setup, truth) - setup.signal))
+    added = np.asarray(setup.layout.gather(models.true_signal(setup, truth) - setup.signal))
     within(added, columns(response_file, setup.layout.n_times) @ z, 1e-8)
     np.testing.assert_array_equal(simulate(setup).data, warm.data.data)
     reseeded = replace(setup, scenario=given.model_copy(update={"seed": 2}))
@@ -210,7 +202,7 @@ def test_simulated_data_hold_the_errors_that_data_name(named):
     z = true_values(named)["gain_table"]
     # the last has no effect and is none
     assert z.shape == (4,)
-    seen = np.asarray(named.layout.gather(true_signal(named, {"gain_table": z})))
+    seen = np.asarray(named.layout.gather(models.true_signal(named, {"gain_table": z})))
     factors = by_hand(z, PORTS[:4], slopes(23)[:4])
     plain = np.asarray(named.layout.gather(named.signal))
     np.testing.assert_allclose(seen, factors * plain, rtol=1e-9, atol=1e-9)
@@ -228,7 +220,7 @@ def test_about_given_values_it_is_the_closed_form(experiment, response_file):
     values |= {f"receiver_{port}_k": 2000.0 + 200.0 * powers[port] for port in range(4)}
     sky = setup.sky.modes * rng.uniform(0.9, 1.1, 16)
     around = Around(data, values=values, sky=sky)
-    model, systematics = model_about(setup, around)
+    model, systematics = models.model_about(setup, around)
     found = Inference(model.condition(data.data), systematics, 1, around)
     linear = columns(response_file, 23)
     a, prior, noise = parts(setup)
@@ -307,7 +299,7 @@ def test_rounds_find_the_mode_and_the_first_order_does_not(experiment, response_
     around = replace(found.around, values=values, sky=sky)
     ways = np.linalg.norm([mode[21:] - high, mode[21:]], axis=1)
     assert ways[0] > 3.0 * ways[1]
-    model, unknowns = model_about(setup, around)
+    model, unknowns = models.model_about(setup, around)
     first = Inference(model.condition(d), unknowns, 1, around)
     assert np.abs(off(first) / std).max() > 5.0
     assert np.abs(root @ off(first)).max() > 5.0
@@ -369,7 +361,7 @@ def test_clock_and_pointing_beside_it_settle_in_the_same_rounds(response_file):
     x = np.concatenate([np.asarray(found.posterior.mean) / prior, *told, [turntable]])
 
     def residuals(x):
-        there = moved(setup, {"turntable_deg": 0.05 * x[25]})
+        there = models.moved(setup, {"turntable_deg": 0.05 * x[25]})
         seen = np.asarray(there.coupling @ (prior * x[:16])) + np.asarray(setup.offset)
         seen = seen + linear @ x[16:21]
         force = np.concatenate([np.zeros(21), rest[-1].expected, found.offsets.expected])
@@ -441,9 +433,7 @@ BAD_TABLES = [
 
 
 @pytest.mark.parametrize(("overrides", "calibration", "message"), BAD_TABLES)
-def test_tables_that_nobody_or_both_say_or_that_are_hardly_known(
-    response_file, overrides, calibration, message
-):
+def test_tables_by_none_or_both_or_hardly_known(response_file, overrides, calibration, message):
     setup = replace(set_up(four_ports(response_file, *overrides)), calibration=calibration)
     for ask in (true_values, full_model):
         refuse(message, ask, setup)

@@ -127,8 +127,7 @@ def test_simulated_data_hold_a_draw_of_it_and_gains_multiply_it():
     treated = setup_with(linear=0.01, circular=0.02)
     drawn = root_of(treated) @ true_values(setup)["polarisation_noise"]
     for one in (setup, treated):
-        added = (simulate(one).data - simulate(none).data).reshape(16, 2)
-        close(added, drawn, 1e-8)
+        close((simulate(one).data - simulate(none).data).reshape(16, 2), drawn, 1e-8)
     gains = "noise.gain_table={std: 0.05, treatment: ignored}"
     both = setup_with(gains, linear=0.01, circular=0.02)
     alone = replace(setup, scenario=small_scenario(*SHORT, gains))

@@ -14,15 +14,9 @@ from scipy.stats import lognorm, loguniform, norm, truncnorm, uniform
 
 import lusee_bayes as lb
 from lusee_bayes.core.arrays import on_host
+from lusee_bayes.experiment import model as models
 from lusee_bayes.experiment.experiment import Experiment, program_pieces
-from lusee_bayes.experiment.model import (
-    base_model,
-    full_model,
-    moved,
-    radiometer,
-    set_up,
-    systematics,
-)
+from lusee_bayes.experiment.model import full_model, moved, radiometer, set_up, systematics
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith
 from lusee_bayes.instrument.pointing import CLOCK
@@ -48,8 +42,7 @@ def test_the_program_is_the_exact_product_of_gains():
     program = lb.load_program("gains")
     arguments = {**program.arguments(full_model(setup), program_pieces(e)), "data": data.data}
     drifts = arguments["gain_drifts"]
-    rng = np.random.default_rng(0)
-    white = rng.normal(size=(4, drifts.grid.shape[0]))
+    white = np.random.default_rng(0).normal(size=(4, drifts.grid.shape[0]))
     sky = np.asarray(setup.prior.sample(jax.random.key(1)))
     hours, grid = data.observation.hours, np.asarray(drifts.grid)
     shape = np.sqrt((grid[1] - grid[0]) / 10.0 * np.sqrt(2 / np.pi))
@@ -88,7 +81,7 @@ def test_sampled_gains_multiply_what_n_holds_and_drifts_stay_in_it():
     drifts = GAINS % (1e-3, "marginalised", "model")
     e = small_experiment(table, f"noise.polarisation={sky}", drifts, lmax=2)
     setup, z = e.setup, np.array([0.7, -1.1, 0.4, 1.6])
-    base, section = base_model(setup), setup.scenario.noise
+    base, section = models.base_model(setup), setup.scenario.noise
     drifting = GainDrifts.build(section.gain, setup, Around()).marginalised(base)
     gains = np.repeat([np.sqrt((1 + 0.02 * z[i]) * (1 + 0.02 * z[j])) for i, j in PAIRS], 6)
     u = gains[:, None] * Polarisation.build(section.polarisation, setup, Around()).root
@@ -236,10 +229,8 @@ def test_the_instruments_program():
 @pytest.mark.essential
 def test_the_program_of_gain_scales():
     """N with the drifts' covariance entry by entry, the mean of the autos, and the priors."""
-    e = small_experiment(
-        "noise.gain={sigma: 0.01, correlation_h: 8, treatment: sampled, visibilities: model}",
-        lmax=4,
-    )
+    gain = "noise.gain={sigma: 0.01, correlation_h: 8, treatment: sampled, visibilities: model}"
+    e = small_experiment(gain, lmax=4)
     setup, data = e.setup, e.data
     sigma, octaves = 0.013, 0.4
     correlation_h = 8.0 * 2.0**octaves
@@ -313,7 +304,7 @@ def test_columns_are_the_derivative_of_the_effect(more):
     rng, values = np.random.default_rng(0), {}
     for _, systematic in systematics(setup):
         values |= systematic.in_units(rng.normal(size=len(systematic.names)))
-    model, sky = base_model(setup), setup.sky.modes
+    model, sky = models.base_model(setup), setup.sky.modes
     for _, systematic in systematics(setup, Around(values=values)):
         expanded = on_host(Expanded.about(systematic, model, Around(sky=sky, values=values)))
         expected = differences(systematic, model, sky, expanded.centre)
@@ -329,7 +320,7 @@ def test_about_values_a_is_that_of_the_shifted_observation():
     (_, nominal), *_ = systematics(setup)
     values = nominal.in_units(np.random.default_rng(1).normal(size=len(nominal.names)))
     (_, offsets), *_ = systematics(setup, Around(values=values))
-    model, sky = base_model(setup), setup.sky.modes
+    model, sky = models.base_model(setup), setup.sky.modes
     got = np.asarray(offsets.effect(model, values).predict(sky))
     exact = np.asarray(moved(setup, values).coupling @ sky)
     close(got, exact, 1e-12)

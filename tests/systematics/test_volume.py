@@ -57,8 +57,7 @@ def test_evidence_is_that_with_the_volume_as_a_factor():
 
     Chi^2 has the square of z_mean, not of its distance from the moved prior mean g.
     """
-    beam = {"parameters": {"zenith_angle_deg": 1.0}}
-    experiment = lb.build(scenario(beam=beam))
+    experiment = lb.build(scenario(beam={"parameters": {"zenith_angle_deg": 1.0}}))
     found = lb.infer(experiment)
     (part,), data = found.expanded, np.asarray(experiment.data.data)
     model = part.seen(base_model(experiment.setup, found.around))

@@ -170,8 +170,7 @@ def cardinal_functions(theta: Angles, intervals: int, parity: int) -> np.ndarray
     orders = np.arange(1, intervals)
     kernel = 1.0 + np.cos(intervals * difference)
     kernel = (kernel + 2.0 * np.cos(orders[:, None, None] * difference).sum(0)) / (2 * intervals)
-    cardinal = kernel[:, : intervals + 1].copy()
-    mirrored = kernel[:, :intervals:-1]
+    cardinal, mirrored = kernel[:, : intervals + 1].copy(), kernel[:, :intervals:-1]
     cardinal[:, 1:-1] += mirrored if parity == 0 else -mirrored
     if parity:
         cardinal[:, [0, -1]] = 0.0

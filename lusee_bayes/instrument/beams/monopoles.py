@@ -46,14 +46,14 @@ N_LAYERS = 8
 DEPTH_M = 100.0
 
 
-Frequency = float | Float[Array, ""]
+Scalar = float | Float[Array, ""]
 Vectors = Float[Array, "directions 3"]
 Angles = Float[Array, "*#directions"]
 Patterns = Float[Array, "products directions"]
 Coefficients = Complex[Array, " theta"]
 
 
-def wavenumber(frequency_mhz: Frequency) -> Frequency:
+def wavenumber(frequency_mhz: Scalar) -> Scalar:
     """Return k = 2 pi / wavelength, in 1/m."""
     return 2.0e6 * np.pi * frequency_mhz / speed_of_light
 
@@ -103,7 +103,7 @@ class Regolith(eqx.Module):
         return as_complex(real, -real * self.loss_tangent)
 
     def reflection(
-        self, cos_theta: Float[Array, " theta"], frequency_mhz: Frequency
+        self, cos_theta: Float[Array, " theta"], frequency_mhz: Scalar
     ) -> tuple[Coefficients, Coefficients]:
         """Return the reflection coefficients for waves that arrive at zenith angle theta.
 
@@ -212,7 +212,7 @@ class Monopoles(BeamSource, eqx.Module):
     def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
         return monopole_beams(frequency_mhz, lmax, self, nodes=self.nodes)
 
-    def fields(self, frequency_mhz: Frequency, grid: HemisphereGrid) -> AntennaFields:
+    def fields(self, frequency_mhz: Scalar, grid: HemisphereGrid) -> AntennaFields:
         """Return the field patterns on a grid, with the phase centre at the feed for all arms."""
         require_positive("frequency_mhz", frequency_mhz)
         # an array, so that all frequencies share one program
@@ -220,9 +220,7 @@ class Monopoles(BeamSource, eqx.Module):
         return AntennaFields(*self.towards(frequency, grid.theta[:, None], grid.phi[None]), grid)
 
     @compiled
-    def towards(
-        self, frequency_mhz: Frequency, theta: Angles, phi: Angles
-    ) -> tuple[Fields, Fields]:
+    def towards(self, frequency_mhz: Scalar, theta: Angles, phi: Angles) -> tuple[Fields, Fields]:
         """Return the fields of every arm in directions above the horizon; phase centre: the feed.
 
         Parameters
@@ -257,7 +255,7 @@ class Monopoles(BeamSource, eqx.Module):
         e_phi = across.astype(direct.dtype) * (direct + s * bounced)
         return e_theta, e_phi
 
-    def _current_integral(self, k: Frequency, projection: Array) -> Fields:
+    def _current_integral(self, k: Scalar, projection: Array) -> Fields:
         """int_0^L sin k(L - s) exp(i k s projection) ds.
 
         = (L / 2i) [exp(i b) sinc a - exp(-i a) sinc b],  a, b = k L (1 -+ projection) / 2:
@@ -313,7 +311,7 @@ def monopole_beams(
 
 @compiled
 def _modes(
-    frequency_mhz: Frequency, lmax: int, monopoles: Monopoles, stokes: str, nodes: Any
+    frequency_mhz: Scalar, lmax: int, monopoles: Monopoles, stokes: str, nodes: Any
 ) -> Float[Array, "products modes"]:
     grid = HemisphereGrid.gauss_legendre(*nodes) if nodes else HemisphereGrid.for_lmax(lmax)
     return product_modes(monopoles.fields(frequency_mhz, grid), lmax, stokes=stokes)
@@ -339,7 +337,7 @@ NORMALISATION_LMAX = 63
 
 
 def beams_towards(
-    frequency_mhz: Frequency,
+    frequency_mhz: Scalar,
     directions: Vectors,
     monopoles: Monopoles | None = None,
     *,
@@ -377,8 +375,7 @@ def beams_towards(
     require_array("directions", directions, (None, 3))
     if not is_traced(directions):
         length = np.linalg.norm(np.asarray(directions), axis=1)
-        bad = np.flatnonzero(np.abs(length - 1.0) > UNIT_TOLERANCE)
-        if bad.size:
+        if (bad := np.flatnonzero(np.abs(length - 1.0) > UNIT_TOLERANCE)).size:
             raise InputError(
                 f"directions must be unit vectors, number {bad[0]} has length "
                 f"{length[bad[0]]:.6g}; divide them by their length"
@@ -392,7 +389,7 @@ def beams_towards(
 
 @compiled
 def _patterns(
-    frequency_mhz: Frequency, directions: Vectors, monopoles: Monopoles, stokes: str
+    frequency_mhz: Scalar, directions: Vectors, monopoles: Monopoles, stokes: str
 ) -> Patterns:
     visible = directions[:, 2] > 0.0
     # a visible direction replaces the hidden ones: its field and its slopes are finite
@@ -413,7 +410,7 @@ def _normalisation(frequency_mhz: Float[Array, ""], monopoles: Monopoles) -> Flo
 def source_response(
     observation: Observation,
     galactic: Float[np.ndarray, "..."],
-    frequency_mhz: Frequency,
+    frequency_mhz: Scalar,
     monopoles: Monopoles | None = None,
     *,
     stokes_v: float | Float[Array, ""] = 0.0,

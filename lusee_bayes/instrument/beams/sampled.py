@@ -132,8 +132,7 @@ class Directions:
             # pixels below the horizon are zeros, whatever a file has there
             theta, _ = healpy.pix2ang(self.nside, np.arange(values.shape[-1]))
             kept = np.where(theta < np.pi / 2.0, values, 0.0)
-        bad = ~np.isfinite(kept)
-        if bad.any():
+        if (bad := ~np.isfinite(kept)).any():
             raise InputError(
                 f"{what} holds NaN or infinity in {bad.sum()} of {bad.size} places in the sky"
             )
@@ -495,8 +494,7 @@ def from_uvbeam(beam: Any, *, conjugate: bool = False, path: str = "the UVBeam")
             f"{path} is a UVBeam of type {beam.beam_type}; give one of type efield, since the "
             "crosses between ports need fields"
         )
-    system = beam.pixel_coordinate_system
-    if system not in ("az_za", "healpix"):
+    if (system := beam.pixel_coordinate_system) not in ("az_za", "healpix"):
         raise InputError(f"{path} has coordinates {system}; expected az_za or healpix")
     basis = np.asarray(beam.basis_vector_array)
     unit = np.zeros_like(basis)

@@ -129,8 +129,7 @@ class JFETReceiver(Section, Receiver):
     skin_power: _ports(Annotated[float, Field(ge=-10, le=10)]) = (1.39, 2.26, 4.35, 1.88)
 
     def load(self, frequency_mhz: float) -> Ohms:
-        w = 2.0e6 * np.pi * frequency_mhz
-        parallel = np.array(self.parallel_ohm)
+        w, parallel = 2.0e6 * np.pi * frequency_mhz, np.array(self.parallel_ohm)
         z = np.array(self.series_ohm) + np.array(self.skin_ohm) * w ** np.array(self.skin_power)
         z = z + 1j * w * 1e-9 * np.array(self.inductance_nh)
         z = z + parallel / (1.0 + 1j * w * parallel * 1e-12 * np.array(self.capacitance_pf))
@@ -246,8 +245,7 @@ class Circuit:
     @property
     def loading(self) -> Ohms:
         """M = ZL (ZA + ZL)^-1; the identity for open ports."""
-        load_ohm = self.load_ohm
-        if load_ohm is None:
+        if (load_ohm := self.load_ohm) is None:
             return np.eye(len(self.antenna_ohm), dtype=complex)
         return np.linalg.solve((self.antenna_ohm + load_ohm).T, load_ohm.T).T
 

@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 
 from lusee_bayes.flight.gain_model import LETTERS
 from lusee_bayes.flight.reduced import REASONS, USED, Reduced
-from lusee_bayes.instrument.products import all_products, labels
+from lusee_bayes.instrument.products import all_products
 from lusee_bayes.instrument.times import seconds_from
 from lusee_bayes.judge.chi2 import probability
 from lusee_bayes.report.figures import drawing
@@ -95,8 +95,7 @@ def pointing_by_day(result: MapResult) -> Figure | None:
     names = list(dict.fromkeys(preferred["offset"]))
     size = (12, 0.6 + 2.1 * len(names))
     figure, panels = drawing.framed(size, len(names), sharex=True, squeeze=False)
-    panels = panels[:, 0]
-    for axes, name in zip(panels, names, strict=True):
+    for axes, name in zip(panels[:, 0], names, strict=True):
         mine = preferred[preferred["offset"] == name]
         days, whole = mine[mine["first_day"] >= 0].dropna(), mine[mine["first_day"] < 0].dropna()
         days = days[days["std"] < TOO_WIDE * days["std"].median()]
@@ -111,8 +110,8 @@ def pointing_by_day(result: MapResult) -> Figure | None:
                 axes.axhline(value, color=drawing.ORANGE, label="all days alike")
         kind, _, unit = name.rpartition("_")
         axes.set_ylabel(f"{kind.replace('_', ' ')} [{UNITS.get(unit, unit)}]")
-    panels[0].legend(loc="upper right", ncols=2, frameon=False)
-    panels[-1].set_xlabel("days since the first sample")
+    panels[0, 0].legend(loc="upper right", ncols=2, frameon=False)
+    panels[-1, 0].set_xlabel("days since the first sample")
     figure.suptitle("Offset of clock and pointing that the data would prefer besides the model's")
     return figure
 
@@ -131,8 +130,7 @@ def unknowns_by_frequency(result: MapResult) -> Figure | None:
     n_rows = -(-len(names) // PANELS_IN_A_ROW)
     size = (13, 0.6 + 2.5 * n_rows)
     figure, panels = drawing.framed(size, n_rows, PANELS_IN_A_ROW, squeeze=False)
-    panels = list(panels.flat)
-    for axes, name in zip(panels, names, strict=False):
+    for axes, name in zip(panels.flat, names, strict=False):
         rows = table[table["unknown"] == name]
         columns = ("frequency_mhz", "value", "std", "prior", "prior_std")
         f, value, std, prior, before = (rows[column].to_numpy() for column in columns)
@@ -146,9 +144,9 @@ def unknowns_by_frequency(result: MapResult) -> Figure | None:
         axes.set(title=name, xlabel="frequency [MHz]", ylabel=rows["unit"].iloc[0])
         if prior.min() > 0.0 and prior.max() > WIDE * prior.min():
             axes.set_yscale("log")
-    for axes in panels[len(names) :]:
+    for axes in panels.flat[len(names) :]:
         axes.set_axis_off()
-    handles, labels = panels[0].get_legend_handles_labels()
+    handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper right", ncols=3, frameon=False)
     return figure
 
@@ -223,18 +221,13 @@ def time_line(reduced: Reduced) -> Figure:
     n_rows = max(len(flags), 1)
     size, heights = (12, 3.4 + 0.25 * len(flags)), (4, n_rows)
     figure, (top, bottom) = drawing.framed(size, 2, sharex=True, height_ratios=heights)
-    level = reduced.level[reduced.bin_of]
+    level, handles = reduced.level[reduced.bin_of], []
     n_ports = level.shape[1]
-    for port in range(n_ports):
-        for letter, colour in LEVEL_COLOURS.items():
-            here = level[:, port] == letter
-            if here.any():
-                top.plot(days[here], np.full(here.sum(), port), "|", ms=9, color=colour)
-    handles = [
-        top.plot([], [], "s", color=colour, label=f"gain {letter}")[0]
-        for letter, colour in LEVEL_COLOURS.items()
-        if (level == letter).any()
-    ]
+    for letter, colour in LEVEL_COLOURS.items():
+        rows, ports = np.nonzero(level == letter)
+        if len(rows):
+            top.plot(days[rows], ports, "|", ms=9, color=colour)
+            handles += top.plot([], [], "s", color=colour, label=f"gain {letter}")
     top.legend(handles=handles, loc="upper right", ncols=3, frameon=False)
     top.set(yticks=range(n_ports), ylabel="port", ylim=(n_ports - 0.5, -1.2))
     top.set_title("Gain of every port")
@@ -255,12 +248,10 @@ def waterfall(result: MapResult) -> Figure | None:
     days = _days(reduced)[np.searchsorted(reduced.bin_of, np.arange(reduced.values.shape[2]))]
     n_bins = reduced.values.shape[2]
     used_in_part = np.bincount(reduced.bin_of, reduced.reason[band] != USED, n_bins) > 0
-    products = {label: k for k, label in enumerate(labels())}
-    for product in all_products():
+    for number, product in enumerate(all_products()):
         # imaginary parts below the diagonal
         i, j = (product.i, product.j) if product.part == "R" else (product.j, product.i)
         axes: Axes = panels[i, j]
-        number = products[product.label]
         kept = reduced.values[band, number]
         flagged = ~np.isfinite(kept) | used_in_part
         axes.plot(days, kept, ".", ms=3, color=drawing.BLUE, label="after flags")

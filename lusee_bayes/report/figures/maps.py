@@ -57,12 +57,13 @@ def draws(result: MapResult) -> Figure | None:
     if channel.details is None:
         return None
     found = np.stack([modes_to_map(sky, channel.nside) for sky in channel.details.draws])
-    scale, rows = drawing.temperatures(found), (len(found) + 1) // 2
+    scale, altitude = drawing.temperatures(found), channel.highest_altitude
+    rows = (len(found) + 1) // 2
     places = {"left": 0.01, "right": 0.98, "bottom": 0.01, "top": 0.9, "wspace": 0.02}
     figure, grid_of_axes = drawing.in_places((12, 3.6 * rows), rows, 2, **places, hspace=0.12)
-    style = {"norm": scale, "highest_altitude": channel.highest_altitude}
+
     for k, (axes, pixels) in enumerate(zip(grid_of_axes, found, strict=True)):
-        image = drawing.mollweide(axes, pixels, **style)
+        image = drawing.mollweide(axes, pixels, norm=scale, highest_altitude=altitude)
         axes.set_title(f"draw {k + 1}")
     drawing.colour_bar(figure, image, figure.axes, label="K", shrink=0.7, extend="both", pad=0.02)
     figure.suptitle(f"Draws of the posterior at {channel.frequency_mhz:g} MHz")

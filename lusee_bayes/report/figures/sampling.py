@@ -200,16 +200,15 @@ def rank_statistics(ranks: Ranks) -> Figure:
     """Rank histograms with the band of 99 % of the bins, and coverage of the regions."""
     shown = np.unique(np.linspace(0, len(ranks.names) - 1, 11).astype(int))
     figure, panels = drawing.framed((12, 7), 3, 4)
-    panels = panels.ravel()
     low, high = ranks.band()
     centres = (np.arange(N_BINS) + 0.5) / N_BINS
     histogram, p_values = ranks.histogram(), ranks.p_values()
-    for axes, k in zip(panels, shown, strict=False):
+    for axes, k in zip(panels.flat, shown, strict=False):
         axes.bar(centres, histogram[k], 1.0 / N_BINS, color=drawing.BLUE, alpha=0.7)
         axes.axhspan(low, high, color=drawing.GREY, alpha=0.25, lw=0)
         axes.set_title(f"{ranks.names[k]}, p = {p_values[k]:.2g}", fontsize=9)
         axes.set(xlim=(0, 1), xticks=[0, 0.5, 1])
-    *unused, last = panels[len(shown) :]
+    *unused, last = panels.flat[len(shown) :]
     for axes in unused:
         axes.set_axis_off()
     levels = np.array(LEVELS)
