@@ -643,8 +643,8 @@ def _columns(systematic, model, sky, centre):
     return jax.jacfwd(lambda z: systematic.effect(model, systematic.values(z)).predict(sky))(centre)
 
 
-# step of a derivative, in prior standard deviations: exact to 1e-6 / 6 of the third one
-STEP = 1e-3
+# step of a derivative, in prior standard deviations: exact to 1e-8 / 6 of the third one
+STEP = 1e-4
 
 
 class ChangedBeams(Systematic):
