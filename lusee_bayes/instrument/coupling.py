@@ -572,9 +572,11 @@ def turned_about_pole(beams: TimeModes, azimuth: Float[Array, " times"]) -> Time
     _, m = mode_numbers(lmax)
     cosine, sine = (xp.take(wave, np.abs(m), axis=1) for wave in _phases(azimuth, lmax))
     signed, mirror = sine * np.sign(m).astype(np.float64)[None], np.arange(len(m)) - 2 * m
+    if xp is not np:
+        return beams * cosine[None] - xp.take(beams, mirror, axis=-1) * signed[None]
     # one product after the other stays in the processor's memory; an index in place of take, or
     # all products at once, would take several times as long
-    return xp.stack([one * cosine - xp.take(one, mirror, axis=1) * signed for one in beams])
+    return np.stack([one * cosine - np.take(one, mirror, axis=1) * signed for one in beams])
 
 
 def _phases(azimuth: Float[Array, " times"], lmax: int) -> tuple[Array, Array]:
