@@ -20,7 +20,7 @@ from pydantic import BaseModel, Field, ValidationError, field_validator, model_v
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.files import user_path
 from lusee_bayes.core.reading import as_yaml, parse_yaml, read_yaml
-from lusee_bayes.core.section import Frequency, Section, Seed, is_modelled
+from lusee_bayes.core.section import Frequency, Section, Seed
 from lusee_bayes.experiment import instrument_sections, sky_sections
 from lusee_bayes.flight.recipe import FlightSection
 from lusee_bayes.systematics.beam import BeamErrorSection
@@ -251,18 +251,12 @@ class Scenario(Section):
                 "the files of the prior are of one frequency; with frequencies_mhz, say which in "
                 "prior.file_frequency_mhz"
             )
-        receiver = self.noise.receiver
-        if self.joint and is_modelled(receiver) and receiver.smooth_octaves is not None:
-            raise ValueError(
-                "noise.receiver.smooth_octaves ties the receivers of channels that have a "
-                "posterior each; with joint, leave it out"
-            )
         return self
 
     @property
     def shared(self) -> dict[str, float]:
-        """What channels with posteriors of their own share of the instrument: words and octaves."""
-        if self.joint or not self.frequencies_mhz:
+        """What channels share of the instrument: words and octaves."""
+        if not self.frequencies_mhz:
             return {}
         return {
             cls.words: octaves

@@ -28,14 +28,21 @@ import pandas as pd
 from jaxtyping import Float, Int
 from scipy.linalg import block_diag
 
-from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels, Square
+from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels, Square, Vector
 from lusee_bayes.core.trees import quantity
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import base_model, radiometer, true_values
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.instrument.pointing import offset_names
 from lusee_bayes.judge.measures import preferences
-from lusee_bayes.linear.amplitudes import Amplitudes, AmplitudesOfSky, amplitudes_of_sky
+from lusee_bayes.linear.amplitudes import (
+    Amplitudes,
+    AmplitudesOfSky,
+    Shared,
+    Tied,
+    amplitudes_of_sky,
+)
+from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import pixel_std
 from lusee_bayes.sky.galaxy import kelvin_steradian
 from lusee_bayes.systematics.context import Around
@@ -227,8 +234,8 @@ class Unknowns:
     ----------
     rows : tuple of dict
         As of :func:`before_data`.
-    amplitudes : AmplitudesOfSky
-        Of all of them, about ``expected``.
+    amplitudes : AmplitudesOfSky or Amplitudes
+        Of all of them, about ``expected``; the latter given all data of a joint posterior.
     expected : (n,) array
         In prior standard deviations.
     octaves : (n,) array
@@ -243,7 +250,7 @@ class Unknowns:
     """
 
     rows: tuple[dict[str, Any], ...]
-    amplitudes: AmplitudesOfSky
+    amplitudes: AmplitudesOfSky | Amplitudes
     expected: Float[np.ndarray, " n"]
     octaves: Float[np.ndarray, " n"]
     names: tuple[str, ...]
@@ -282,6 +289,53 @@ class Unknowns:
             block_diag(*(parts for _, parts in alike)),
             float(np.sqrt(np.asarray(found.model.prior.variance())[0])),
         )
+
+    @property
+    def shared(self) -> Int[np.ndarray, " shared"]:
+        """Which of them channels share."""
+        return np.flatnonzero(self.octaves)
+
+    @property
+    def shared_names(self) -> list[str]:
+        """Names of these."""
+        return [self.rows[k]["unknown"] for k in self.shared]
+
+    def among(self, tied: Tied) -> list[int]:
+        """Their places among all that is tied."""
+        return [tied.names.index(name) for name in self.shared_names]
+
+    def _of(self, tied: Tied, number: int) -> Shared:
+        root = tied.prior_root[number, self.among(tied)]
+        return self.amplitudes.shared(self.shared, self.expected[self.shared], root)
+
+    def whole(self, information: Information, tied: Tied, number: int) -> Information:
+        """What these data say of the sky and of what all channels share together.
+
+        Parameters
+        ----------
+        information : Information
+            Of the sky, with the unknowns in N.
+        tied : Tied
+            The prior of what is shared.
+        number : int
+            Of the channel among those that are tied.
+        """
+        return self._of(tied, number).information(information, self.amplitudes.reference)
+
+    def given_all(self, tied: Tied, number: int, mean: Vector, covariance: Square) -> Unknowns:
+        """These given all data of a joint posterior.
+
+        Parameters
+        ----------
+        tied : Tied
+            The prior of what is shared.
+        number : int
+            Of the channel among those that are tied.
+        mean, covariance : (modes + w,) and square array
+            Of the sky and w, in K and K^2.
+        """
+        told = self.amplitudes.with_shared(self._of(tied, number), mean, covariance)
+        return replace(self, amplitudes=told)
 
     def table(self, mean: Modes, covariance: ModesMatrix) -> pd.DataFrame:
         """All of them with value and std, the sky integrated out; parameters are of the report."""

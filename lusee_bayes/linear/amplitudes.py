@@ -44,6 +44,13 @@ exp(-x^T Q x / 2 + q^T x), x = z - E', which is what the other channels tell of 
 Where N has a prior mean e to make up for the volume of skies (:mod:`.systematic`), z^T e is part of
 the likelihood, the volume at that z, and not of the prior: all this holds with the E of N(e, 1).
 About e, as an :class:`Amplitudes` is, E - e and E' - e take the places of E and E'.
+
+*With a joint posterior of skies*, z = R w of several channels, too, is told by all data together. A
+channel's posterior given its sky, z - e ~ N(y - P (m - m0), D), and its information (M, v) about
+the sky make up ln p(d | m, w) = ln p(d | m) + ln p(z | m, d) - ln N(z; 0, 1), the information ::
+
+    ( M + P^T D^-1 P    P^T D^-1 R       )        ( v                 )
+    ( R^T D^-1 P        R^T (D^-1 - 1) R ),       ( R^T R w0          )    about m0, R w0 = y + e.
 """
 
 from __future__ import annotations
@@ -52,7 +59,7 @@ from dataclasses import dataclass, replace
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.linalg import cho_solve
 
 from lusee_bayes.core.arrays import Array, Modes, ModesMatrix, Square, Vector
@@ -89,6 +96,10 @@ class Amplitudes:
         """Standard deviations."""
         return np.sqrt(np.diagonal(self.covariance))
 
+    def integrated(self, mean: Modes, covariance: ModesMatrix) -> Amplitudes:
+        """These, in which the sky is integrated out already."""
+        return self
+
 
 @dataclass(frozen=True)
 class AmplitudesOfSky:
@@ -123,6 +134,42 @@ class AmplitudesOfSky:
         least = self.mean - self.pull @ (mean - self.reference)
         return Amplitudes(least, self.covariance - self.pull @ with_sky, with_sky)
 
+    def shared(
+        self, own: Int[np.ndarray, " shared"], expected: Vector, root: Float[np.ndarray, "shared w"]
+    ) -> Shared:
+        """Those that are shared, e + x = R w.
+
+        Parameters
+        ----------
+        own : (shared,) array
+            Which.
+        expected : (shared,) array
+            Their e.
+        root : (shared, w) array
+            R.
+        """
+        covariance = self.covariance[np.ix_(own, own)]
+        return Shared(own, self.mean[own] + expected, self.pull[own], covariance, root)
+
+    def with_shared(self, shared: Shared, mean: Vector, covariance: Square) -> Amplitudes:
+        """Integrate a sky and what is shared out, N(mean, covariance) given any data besides.
+
+        Parameters
+        ----------
+        shared : Shared
+            Of these.
+        mean, covariance : (modes + w,) and square array
+            In K and K^2.
+        """
+        n = len(self.reference)
+        slope = np.linalg.solve(shared.covariance, self.covariance[shared.own]).T
+        reach = np.concatenate([slope @ shared.pull - self.pull, slope @ shared.root], axis=1)
+        off = np.concatenate([mean[:n] - self.reference, mean[n:]])
+        least = self.mean - slope @ shared.mean + reach @ off
+        left = self.covariance - slope @ self.covariance[shared.own]
+        with_all = covariance @ reach.T
+        return Amplitudes(least, left + reach @ with_all, with_all[:n])
+
     def given(self, precision: Square, vector: Vector, about: Vector) -> AmplitudesOfSky:
         """Take in what is known of the amplitudes besides: exp(-x^T Q x / 2 + q^T x), x = z - t.
 
@@ -137,6 +184,46 @@ class AmplitudesOfSky:
         covariance = kept @ self.covariance
         mean = self.mean + covariance @ (vector - precision @ (self.mean - about))
         return AmplitudesOfSky(mean, kept @ self.pull, covariance, self.reference)
+
+
+@dataclass(frozen=True)
+class Shared:
+    """What a channel's data tell of z = R w given its sky, m0 where there is none.
+
+    own : which of the channel's amplitudes they are; mean : y + e; pull : P; covariance : D;
+    root : R
+    """
+
+    own: Int[np.ndarray, " shared"]
+    mean: Vector
+    pull: Float[np.ndarray, "shared modes"]
+    covariance: Square
+    root: Float[np.ndarray, "shared w"]
+
+    def information(self, information: Information, sky: Modes) -> Information:
+        """What the data say of the sky and w together.
+
+        Parameters
+        ----------
+        information : Information
+            Of the sky.
+        sky : (modes,) array
+            m0, in K.
+        """
+        here, inverse = information.recentred(sky), np.linalg.inv(self.covariance)
+        at = np.linalg.lstsq(self.root, self.mean, rcond=None)[0]
+        told, pulled = self.root.T @ inverse, self.pull.T @ inverse
+        across, among = told @ self.pull, (told - self.root.T) @ self.root
+        matrix = np.block([[here.matrix + pulled @ self.pull, across.T], [across, among]])
+        vector = np.concatenate([here.vector, self.root.T @ self.mean])
+        return replace(
+            here,
+            matrix=matrix,
+            vector=vector,
+            reference=np.concatenate([sky, at]),
+            misfit=np.asarray(here.misfit - self.mean @ self.mean),
+            log_det=np.asarray(here.log_det + np.linalg.slogdet(self.covariance)[1]),
+        )
 
 
 # data that are looked at first to find a column among many
@@ -296,6 +383,10 @@ class Tied:
     mean : (channels, n) array
     root : (channels, n, white) array
         R of the covariance R R^T of the amplitudes of all channels.
+    white : (white,) array
+        Mean of w.
+    prior_root : (channels, n, white) array
+        R of the prior, z = R w.
     draws : (draws, channels, n) array
         Of all channels together.
     log_evidence : float
@@ -306,6 +397,8 @@ class Tied:
 
     mean: Float[np.ndarray, "channels n"]
     root: Float[np.ndarray, "channels n white"]
+    white: Float[np.ndarray, " white"]
+    prior_root: Float[np.ndarray, "channels n white"]
     draws: Float[np.ndarray, "draws channels n"]
     log_evidence: float
     names: tuple[str, ...] = ()
@@ -390,7 +483,7 @@ def tie(
     quadratic = np.einsum("ki,kij,kj->", off, told, off) - (z**2).sum() + white @ white
     log_dets = np.linalg.slogdet(covariance)[1].sum() + 2.0 * np.log(np.diagonal(lower)).sum()
     drawn, evidence = z + draws.reshape(-1, n_channels, n), float(-0.5 * (quadratic + log_dets))
-    return Tied(z, half, drawn, evidence)
+    return Tied(z, half, white, blocks, drawn, evidence)
 
 
 def told_by_others(

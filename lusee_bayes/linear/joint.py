@@ -1,4 +1,4 @@
-"""One posterior for the skies of several frequencies.
+"""One posterior for the skies of several frequencies, and for the instrument that they share.
 
 With m_f = sum_c s_fc a_c + r_f (spectral_prior.py), the residual r_f of each channel is integrated
 out by itself. In units of its prior, P = R^1/2 M R^1/2, and ::
@@ -9,6 +9,13 @@ are the channel's information about the common part sum_c s_fc a_c. Sums over ch
 s_fc s_fc' M' are the information of all channels about the component maps, (components x modes)
 unknowns, from which the posterior follows as for one sky. Given the components, the residual of
 each channel has a posterior of its own, from the channel's data alone.
+
+Channels may share other unknowns, w ~ N(0, 1) (:func:`.information_with`), which stand behind the
+modes of each channel's information, and behind all component maps. With M_w the block of w and the
+sky, and v_w that of w, ::
+
+    M_w' = M_w R^1/2 (1 + P)^-1 R^-1/2,    v_w' = v_w - M_w R^1/2 (1 + P)^-1 R^1/2 v,
+    M_ww' = M_ww - M_w R^1/2 (1 + P)^-1 R^1/2 M_w^T.
 """
 
 from __future__ import annotations
@@ -22,8 +29,9 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core import linalg
-from lusee_bayes.core.arrays import Array, Modes, ModesMatrix, on_host
+from lusee_bayes.core.arrays import Array, Modes, ModesMatrix, Square, Vector, on_host
 from lusee_bayes.core.checks import require_shape
+from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.prior import IndependentPrior
@@ -32,9 +40,10 @@ from lusee_bayes.sky.spectral_prior import SpectralPrior
 # rows that are added at once
 ROWS = 16
 
-# arrays that recur
-Pairs = Float[Array, "pairs modes modes"]
-ChannelModes = Float[Array, "channels modes"]
+# arrays that recur: blocks of a symmetric matrix row by row, down to its diagonal, and unknowns of
+# channels or draws, modes first, then what channels share
+Blocks = tuple[Float[Array, "_ _"], ...]
+Whole = Float[Array, "count whole"]
 
 
 def common_part(information: Information, residual_root: Modes | None) -> Information:
@@ -50,21 +59,29 @@ def common_part(information: Information, residual_root: Modes | None) -> Inform
     Returns
     -------
     Information
-        About the common part of the channel's sky.
+        About the common part of the channel's sky, and what channels share.
     """
     if residual_root is None:
         return information
+    n = len(residual_root)
     lower = residual_lower(information, residual_root)
     inverse = linalg.inverse_from_cholesky(lower)
-    gradient = residual_root * information.vector
+    gradient = residual_root * information.vector[:n]
     solved = inverse @ gradient
     log_det = 2.0 * np.log(np.diagonal(lower)).sum()
-    matrix = -inverse
+    matrix, vector = -inverse, solved / residual_root
     matrix[np.diag_indices_from(matrix)] += 1.0
+    matrix = linalg.scaled(matrix, 1.0 / residual_root, overwrite=True)
+    if information.n_modes > n:
+        across = information.matrix[n:, :n] * residual_root
+        kept = across @ inverse
+        among, seen = information.matrix[n:, n:] - kept @ across.T, kept / residual_root
+        matrix = np.block([[matrix, seen.T], [seen, among]])
+        vector = np.concatenate([vector, information.vector[n:] - across @ solved])
     return replace(
         information,
-        matrix=linalg.scaled(matrix, 1.0 / residual_root, overwrite=True),
-        vector=solved / residual_root,
+        matrix=matrix,
+        vector=vector,
         misfit=np.asarray(information.misfit - gradient @ solved),
         log_det=np.asarray(information.log_det + log_det),
     )
@@ -72,9 +89,39 @@ def common_part(information: Information, residual_root: Modes | None) -> Inform
 
 def residual_lower(information: Information, residual_root: Modes) -> ModesMatrix:
     """L L^T = 1 + P."""
-    normal = linalg.scaled(information.matrix, residual_root)
+    n = len(residual_root)
+    normal = linalg.scaled(information.matrix[:n, :n], residual_root)
     normal[np.diag_indices_from(normal)] += 1.0
     return linalg.cholesky(normal, overwrite=True)
+
+
+def _indices(k: int) -> zip:
+    """Rows and columns of blocks, of k components and what channels share."""
+    return zip(*np.tril_indices(k + 1), strict=True)
+
+
+def _weights(prior: SpectralPrior, channel: int) -> Vector:
+    """Of every component in a channel, and of what channels share."""
+    return np.append(prior.mixing[channel], 1.0)
+
+
+def common_of(
+    prior: SpectralPrior, channel: int, unknowns: Float[Array, "*batch unknowns"]
+) -> Float[np.ndarray, "*batch whole"]:
+    """Take the common part of a channel's sky from all unknowns, and what channels share.
+
+    Parameters
+    ----------
+    prior : SpectralPrior
+        Of all channels.
+    channel : int
+        Number of the channel in the prior.
+    unknowns : (..., unknowns) array
+        All component maps, one behind the other, and what channels share.
+    """
+    k, n = prior.n_components, n_modes(prior.lmax)
+    maps = unknowns[..., : k * n].reshape(*unknowns.shape[:-1], k, n)
+    return np.concatenate([prior.mixing[channel] @ maps, unknowns[..., k * n :]], axis=-1)
 
 
 class ComponentSums(eqx.Module):
@@ -82,67 +129,74 @@ class ComponentSums(eqx.Module):
 
     Attributes
     ----------
-    matrices : (pairs, modes, modes) array
-        sum_f s_fc s_fc' M' for c >= c', row by row, in 1/K^2; what is above the diagonal does not
-        count.
-    vectors : (components, modes) array
-        sum_f s_fc v', in 1/K.
-    reference : (components, modes) array
-        The reference maps, in K.
+    blocks : tuple of arrays
+        sum_f s_fc s_fc' M' for c >= c', row by row, in 1/K^2, of which nothing above the diagonal
+        counts; then those of what channels share with each component, and among themselves.
+    vector : (unknowns,) array
+        sum_f s_fc v', in 1/K, and that of what channels share.
+    reference : (unknowns,) array
+        The reference maps, in K, and values of what channels share.
     misfit : () array
-        Sum of the channels' chi^2 at the reference maps.
+        Sum of the channels' chi^2 at the reference.
     log_det : () array
         Sum of the channels' log determinants.
     n_data : () array
         Number of data of all channels.
+    n_components : int
     """
 
-    matrices: Pairs
-    vectors: Float[Array, "components modes"]
-    reference: Float[Array, "components modes"]
+    blocks: Blocks
+    vector: Vector
+    reference: Vector
     misfit: Float[Array, ""]
     log_det: Float[Array, ""]
     n_data: Float[Array, ""]
+    n_components: int = eqx.field(static=True)
 
     @classmethod
-    def empty(cls, prior: SpectralPrior, reference: ChannelModes) -> ComponentSums:
+    def empty(cls, prior: SpectralPrior, reference: Whole) -> ComponentSums:
         """Start the sums, with no channel in them.
 
         Parameters
         ----------
         prior : SpectralPrior
             Of all channels.
-        reference : (channels, modes) array
-            A reference sky for every channel, near its posterior mean, in K.
+        reference : (channels, modes + shared) array
+            A reference sky for every channel, near its posterior mean, in K, and values of what
+            channels share, the same for all.
 
         Returns
         -------
         ComponentSums
             Zeros, with the component maps that fit the reference skies best as reference maps.
         """
-        k = prior.n_components
-        maps = np.linalg.pinv(np.asarray(prior.mixing)) @ np.asarray(reference)
-        n, zero = maps.shape[1], np.zeros(())
-        matrices = np.zeros((k * (k + 1) // 2, n, n))
-        return cls(matrices, np.zeros((k, n)), maps, zero, zero, zero)
+        k, n, reference = prior.n_components, n_modes(prior.lmax), np.asarray(reference)
+        maps = np.linalg.pinv(np.asarray(prior.mixing)) @ reference[:, :n]
+        at = np.concatenate([maps.reshape(-1), reference[0, n:]])
+        sizes, zero = [*[n] * k, reference.shape[1] - n], np.zeros(())
+        blocks = tuple(np.zeros((sizes[i], sizes[j])) for i, j in _indices(k))
+        return cls(blocks, np.zeros(len(at)), at, zero, zero, zero, k)
 
     def plus(self, others: ComponentSums) -> ComponentSums:
-        """Add the sums of other channels, about the same reference maps; neither is changed."""
-        return self._plus(others, "matrices", "vectors", "misfit", "log_det", "n_data")
+        """Add the sums of other channels, about the same reference; neither is changed."""
+        blocks = tuple(a + b for a, b in zip(self.blocks, others.blocks, strict=True))
+        return replace(self._plus(others, "vector", "misfit", "log_det", "n_data"), blocks=blocks)
 
     def _plus(self, others: ComponentSums | Information, *names: str) -> ComponentSums:
         both = {name: np.asarray(getattr(self, name) + getattr(others, name)) for name in names}
         return replace(self, **both)
 
     def information(self) -> Information:
-        """Information about all component maps in one vector, the first map first."""
-        k, n = self.reference.shape
-        matrix = np.zeros((k, n, k, n))
-        for pair, (i, j) in enumerate(zip(*np.tril_indices(k), strict=True)):
-            matrix[i, :, j] = matrix[j, :, i] = linalg.mirrored(self.matrices[pair].copy())
-        matrix, vector = matrix.reshape(k * n, k * n), self.vectors.reshape(k * n)
-        scalars = self.misfit, self.log_det, self.n_data
-        return Information(matrix, vector, self.reference.reshape(k * n), *scalars)
+        """Information about all component maps in one vector, then what channels share."""
+        k, n, size = self.n_components, len(self.blocks[0]), len(self.vector)
+        matrix, at = np.empty((size, size)), [slice(c * n, (c + 1) * n) for c in range(k)]
+        at.append(slice(k * n, size))
+        for (i, j), block in zip(_indices(k), self.blocks, strict=True):
+            whole = linalg.mirrored(block.copy()) if i < k else block
+            matrix[at[i], at[j]], matrix[at[j], at[i]] = whole, whole.T
+        return Information(
+            matrix, self.vector, self.reference, self.misfit, self.log_det, self.n_data
+        )
 
 
 def summed_information(
@@ -153,7 +207,7 @@ def summed_information(
     Parameters
     ----------
     sums : ComponentSums
-        Of other channels; its matrices are changed in place.
+        Of other channels; its blocks are changed in place.
     prior : SpectralPrior
         Of all channels.
     channel : int
@@ -167,84 +221,108 @@ def summed_information(
         The sums with the channel.
     """
     prior = on_host(prior)
-    mixing = prior.mixing[channel]
+    k, n, weights = prior.n_components, n_modes(prior.lmax), _weights(prior, channel)
     common = common_part(information, prior.residual_root(channel))
-    common = common.recentred(mixing @ sums.reference)
-    for pair, (i, j) in enumerate(zip(*np.tril_indices(len(mixing)), strict=True)):
-        weight, total = mixing[i] * mixing[j], sums.matrices[pair]
+    common = common.recentred(common_of(prior, channel, sums.reference))
+    parts = [*[slice(0, n)] * k, slice(n, None)]
+    for (i, j), total in zip(_indices(k), sums.blocks, strict=True):
+        weight, own = weights[i] * weights[j], common.matrix[parts[i], parts[j]]
         for first in range(0, len(total), ROWS):  # products that fit into a cache
-            lower = slice(first, first + ROWS), slice(0, first + ROWS)
-            total[lower] += weight * common.matrix[lower]
-    vectors = sums.vectors + mixing[:, None] * common.vector
-    return replace(sums, vectors=vectors)._plus(common, "misfit", "log_det", "n_data")
+            lower = slice(first, first + ROWS), slice(0, first + ROWS if i < k else None)
+            total[lower] += weight * own[lower]
+    maps = weights[:k, None] * common.vector[:n]
+    vector = sums.vector + np.concatenate([maps.reshape(-1), common.vector[n:]])
+    return replace(sums, vector=vector)._plus(common, "misfit", "log_det", "n_data")
 
 
 def component_posterior(information: Information, prior: SpectralPrior) -> Posterior:
-    """Compute the posterior of all component maps from the information of all channels.
+    """Compute the posterior of all component maps, and of what channels share.
 
     Parameters
     ----------
     information : Information
-        About all component maps in one vector (:meth:`ComponentSums.information`).
+        Of all channels (:meth:`ComponentSums.information`).
     prior : SpectralPrior
         Of all channels.
 
     Returns
     -------
     Posterior
-        Of the component maps in one vector, the first map first.
+        Of the component maps in one vector, the first map first, then of what channels share.
 
     Raises
     ------
     InputError
         If the mean does not converge.
     """
-    return information.posterior(IndependentPrior(prior.roots.reshape(-1)))
+    roots = np.asarray(prior.roots).reshape(-1)
+    shared = np.ones(information.n_modes - len(roots))
+    return information.posterior(IndependentPrior(np.concatenate([roots, shared])))
 
 
-def paired(covariance: Float[Array, "unknowns unknowns"], prior: SpectralPrior) -> Pairs:
-    """Pack the components' covariance for :func:`channel_sky`.
+def paired(covariance: Float[Array, "unknowns unknowns"], prior: SpectralPrior) -> Blocks:
+    """Pack the covariance of all unknowns for :func:`channel_sky`.
 
     Parameters
     ----------
-    covariance : (components * modes, components * modes) array
-        Of all component maps in one vector, in K^2.
+    covariance : (unknowns, unknowns) array
+        Of :func:`component_posterior`, in K^2.
     prior : SpectralPrior
         Of all channels.
 
     Returns
     -------
-    (pairs, modes, modes) array
-        C_cc, and C_cc' + C_c'c for c > c', row by row, in K^2.
+    tuple of arrays
+        C_cc, and C_cc' + C_c'c for c > c', row by row, in K^2; then those of what channels share
+        with each component, and among themselves.
     """
-    k = prior.n_components
-    blocks = covariance.reshape(k, -1, k, covariance.shape[0] // k)
-    return np.stack(
-        [
-            blocks[i, :, j] + blocks[j, :, i] if i > j else blocks[i, :, i]
-            for i, j in zip(*np.tril_indices(k), strict=True)
-        ]
+    k, n = prior.n_components, n_modes(prior.lmax)
+    at = [*(slice(c * n, (c + 1) * n) for c in range(k)), slice(k * n, None)]
+    return tuple(
+        covariance[at[i], at[j]] + (covariance[at[j], at[i]] if j < i < k else 0.0)
+        for i, j in _indices(k)
     )
 
 
+def common_covariance(prior: SpectralPrior, channel: int, covariances: Blocks) -> Square:
+    """Covariance of :func:`common_of` a channel from that of all unknowns, in K^2.
+
+    Parameters
+    ----------
+    prior : SpectralPrior
+        Of all channels.
+    channel : int
+        Number of the channel in the prior.
+    covariances : tuple of arrays
+        As packed by :func:`paired`.
+    """
+    k, n, weights = prior.n_components, n_modes(prior.lmax), _weights(prior, channel)
+    whole = np.zeros((n + len(covariances[-1]),) * 2)
+    parts = [*[slice(0, n)] * k, slice(n, None)]
+    for (i, j), block in zip(_indices(k), covariances, strict=True):
+        whole[parts[i], parts[j]] += weights[i] * weights[j] * block
+    whole[:n, n:] = whole[n:, :n].T
+    return whole
+
+
 class ChannelSky(eqx.Module):
-    """The posterior of one channel's sky, given the data of all channels.
+    """The posterior of one channel's sky, and of what channels share, given all data.
 
     Attributes
     ----------
-    mean : (modes,) array
+    mean : (modes + shared,) array
         In K.
-    covariance : (modes, modes) array or None
+    covariance : (modes + shared, modes + shared) array or None
         In K^2; None if that of the component maps was not given.
-    draws : (n, modes) array
+    draws : (n, modes + shared) array
         In K.
     chi2 : () array
         Of the channel's data, at the mean.
     """
 
-    mean: Modes
-    covariance: ModesMatrix | None
-    draws: Float[Array, "n modes"]
+    mean: Float[Array, " whole"]
+    covariance: Float[Array, "whole whole"] | None
+    draws: Whole
     chi2: Float[Array, ""]
 
 
@@ -252,12 +330,12 @@ def channel_sky(
     prior: SpectralPrior,
     channel: int,
     information: Information,
-    maps: Float[Array, "components modes"],
-    covariances: Pairs | None,
-    draws: Float[Array, "n components modes"],
+    mean: Float[Array, " unknowns"],
+    covariances: Blocks | None,
+    draws: Float[Array, "count unknowns"],
     key: PRNGKeyArray,
 ) -> ChannelSky:
-    """Compute the sky of one channel from the posterior of the component maps.
+    """Compute the sky of one channel from the posterior of all unknowns.
 
     Parameters
     ----------
@@ -267,12 +345,12 @@ def channel_sky(
         Number of the channel in the prior.
     information : Information
         Of the channel's data.
-    maps : (components, modes) array
-        Mean of the component maps, in K.
-    covariances : (pairs, modes, modes) array or None
+    mean : (unknowns,) array
+        Of the component maps and what channels share, in K.
+    covariances : tuple of arrays or None
         Their covariance as packed by :func:`paired`, in K^2; None if that of the sky is not wanted.
-    draws : (n, components, modes) array
-        Draws of the component maps, in K.
+    draws : (n, unknowns) array
+        Draws of them, in K.
     key : PRNGKeyArray
         For draws of the channel's residual. Give the same key for all channels of a run.
 
@@ -284,32 +362,49 @@ def channel_sky(
     Raises
     ------
     InputError
-        If ``maps`` has another number of components than the prior.
+        If ``mean`` has another length than the prior and the information need.
     """
-    require_shape("the component maps", maps, (prior.n_components, None))
-    n_draws, _, n_modes = draws.shape
-    z = jax.random.normal(jax.random.fold_in(key, channel), (n_draws, n_modes), dtype=jnp.float64)
-    prior, maps, covariances, draws, z = on_host((prior, maps, covariances, draws, z))
-    mixing, residual_root = prior.mixing[channel], prior.residual_root(channel)
-    mean, skies = mixing @ maps, mixing @ draws
-    covariance = None
-    if covariances is not None:
-        first, second = np.tril_indices(len(mixing))
-        covariance = np.tensordot(mixing[first] * mixing[second], covariances, 1)
+    n = n_modes(prior.lmax)
+    shared = information.n_modes - n
+    require_shape("the mean of all unknowns", mean, (prior.n_components * n + shared,))
+    z = jax.random.normal(jax.random.fold_in(key, channel), (len(draws), n), dtype=jnp.float64)
+    prior, mean, covariances, draws, z = on_host((prior, mean, covariances, draws, z))
+    residual_root = prior.residual_root(channel)
+    # of the mean and of every draw
+    whole = common_of(prior, channel, np.concatenate([mean[None], draws]))
+    covariance = None if covariances is None else common_covariance(prior, channel, covariances)
     if residual_root is not None:
         lower = residual_lower(information, residual_root)
-        # of the mean and of every draw: the residual's mean, given the common part
-        common = np.concatenate([mean[None], skies])
-        pull = information.vector - (common - information.reference) @ information.matrix
+        # the residual's mean, given the common part
+        pull = information.vector[:n] - (whole - information.reference) @ information.matrix[:, :n]
         half = linalg.solve_lower(lower, (residual_root * pull).T, transpose=False)
         # a draw deviates from it by L^-T z
         half[:, 1:] += z.T
-        whole = common + residual_root * linalg.solve_lower(lower, half, transpose=True).T
-        mean, skies = whole[0], whole[1:]
+        whole[:, :n] += residual_root * linalg.solve_lower(lower, half, transpose=True).T
         if covariance is not None:
-            white = linalg.scaled(covariance, 1.0 / residual_root, overwrite=True)
-            white = linalg.inverse_sandwich(white, lower)
-            white[np.diag_indices(n_modes)] += 1.0
-            white = linalg.sandwich(white, linalg.invert_lower(lower, overwrite=True))
-            covariance = linalg.scaled(white, residual_root, overwrite=True)
-    return ChannelSky(mean, covariance, skies, information.chi2(mean))
+            covariance = _with_residual(covariance, information, residual_root, lower)
+    return ChannelSky(whole[0], covariance, whole[1:], information.chi2(whole[0]))
+
+
+def _with_residual(
+    covariance: Square, information: Information, residual_root: Modes, lower: ModesMatrix
+) -> Square:
+    """Of the whole sky from that of the common part; ``lower`` is overwritten."""
+    n = len(residual_root)
+    among, slope, across = covariance[n:, n:], np.zeros((n, 0)), np.zeros((n, 0))
+    if len(among):
+        columns = (information.matrix[:n, n:].T * residual_root, covariance[n:, :n] / residual_root)
+        half = linalg.solve_lower(lower, np.concatenate(columns).T, transpose=False)
+        back = residual_root[:, None] * linalg.solve_lower(lower, half, transpose=True)
+        # the residual follows what channels share by minus the first, the whole sky by the sum
+        slope = -back[:, : len(among)]
+        across = back[:, len(among) :] + slope @ among
+    white = linalg.scaled(covariance[:n, :n], 1.0 / residual_root)
+    white = linalg.inverse_sandwich(white, lower)
+    white[np.diag_indices(n)] += 1.0
+    white = linalg.sandwich(white, linalg.invert_lower(lower, overwrite=True))
+    sky = linalg.scaled(white, residual_root, overwrite=True)
+    if not len(among):
+        return sky
+    half = (across - slope @ among / 2.0) @ slope.T
+    return np.block([[sky + half + half.T, across], [across.T, among]])

@@ -6,8 +6,9 @@ With the exponents phi_f = sum_c s_fc a_c + r_f of :mod:`.positive_skies`, ::
 
 About given exponents m_f is linear, m_f + W_f (phi - phi_f), and what the data of a channel say of
 phi is a quadratic form: W^T M W, W^T v. So a round is a joint posterior as :mod:`.joint` finds it,
-of maps without unit. The step to its mean is halved until E falls, and rounds are repeated until a
-step would gain nothing. Meanwhile A and tilt of the fields may be learned.
+of maps without unit, and of unknowns w of the instrument that channels share, whose |w|^2 is part
+of E. The step to its mean is halved until E falls, and rounds are repeated until a step would gain
+nothing. Meanwhile A and tilt of the fields may be learned.
 The last posterior is the Gaussian about the mode, its evidence Laplace's.
 
 The laws of the fields are learned in twenty rounds from the large scales of all channels. A and
@@ -25,8 +26,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
+from scipy.linalg import block_diag
 
-from lusee_bayes.core.arrays import Modes
+from lusee_bayes.core.arrays import Vector
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes, per_mode, power_spectrum, sum_over_m
 from lusee_bayes.core.linalg import inverse_from_cholesky, symmetric_product
@@ -37,10 +39,9 @@ from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.positive_skies import FieldLaws, PositiveSkies
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
-# arrays that recur
-Pairs = Float[np.ndarray, "pairs modes modes"]
+# arrays that recur; exponents have the values of what channels share behind them
 Fields = Float[np.ndarray, "fields modes"]
-ChannelModes = Float[np.ndarray, "channels modes"]
+Exponents = Float[np.ndarray, "channels whole"]
 
 OfLaws = Float[np.ndarray, "laws ells"]
 # found when a round moves all unknowns together by less than this, in standard deviations, and no
@@ -66,7 +67,7 @@ class Channels(Protocol):
         """Call a function with number and information of every channel; its arrays, stacked."""
 
     def summed(
-        self, prior: SpectralPrior, reference: ChannelModes, function: Linearised
+        self, prior: SpectralPrior, reference: Exponents, function: Linearised
     ) -> Information:
         """What a function of every channel's information says of the component maps."""
 
@@ -89,7 +90,7 @@ class ChannelsInMemory:
         return {name: np.stack([part[name] for part in found]) for name in shapes}
 
     def summed(
-        self, prior: SpectralPrior, reference: ChannelModes, function: Linearised
+        self, prior: SpectralPrior, reference: Exponents, function: Linearised
     ) -> Information:
         """What a function of every channel's information says of the component maps."""
         sums = joint.ComponentSums.empty(prior, reference)
@@ -106,10 +107,10 @@ class PositiveMode:
     ----------
     skies : PositiveSkies
     laws : FieldLaws
-    exponents : (channels, modes) array
-        phi_f about which the skies are linear.
+    exponents : (channels, modes + shared) array
+        phi_f about which the skies are linear, and what channels share.
     posterior : Posterior
-        Of the fields in one vector, the first field first; without unit.
+        Of the fields in one vector, the first field first, and of what channels share; no unit.
     energy : float
         E: chi^2 of all data under the model, prior included.
     moved : float
@@ -120,7 +121,7 @@ class PositiveMode:
 
     skies: PositiveSkies
     laws: FieldLaws
-    exponents: ChannelModes
+    exponents: Exponents
     posterior: Posterior
     energy: float
     moved: float
@@ -134,16 +135,32 @@ class PositiveMode:
     @property
     def fields(self) -> Fields:
         """Posterior mean of the fields."""
-        return np.asarray(self.posterior.mean).reshape(len(self.skies.names), -1)
+        k, n = len(self.skies.names), self.skies.n_fields
+        return np.asarray(self.posterior.mean)[: k * n].reshape(k, n)
 
 
 def diffuse_part(skies: PositiveSkies, channel: int, information: Information) -> Patterns:
     """What a channel's data say of its point sources, and without them of the diffuse sky."""
-    return Patterns.of(skies.sources[channel], information)
+    sources = skies.sources[channel]
+    beside = np.zeros((len(sources), max(information.n_modes - sources.shape[1], 0)))
+    return Patterns.of(np.concatenate([sources, beside], axis=1), information)
+
+
+def _whole(skies: PositiveSkies, channel: int, exponent: np.ndarray) -> np.ndarray:
+    """The sky of an exponent, in K, and what channels share."""
+    n = skies.n_fields
+    sky = skies.modes(channel, exponent[..., :n])
+    return np.concatenate([sky, exponent[..., n:]], axis=-1)
+
+
+def _slope(skies: PositiveSkies, channel: int, exponent: Vector) -> np.ndarray:
+    """The derivative of :func:`_whole`."""
+    n = skies.n_fields
+    return block_diag(skies.jacobian(channel, exponent[:n]), np.eye(len(exponent) - n))
 
 
 def linearised(
-    skies: PositiveSkies, channel: int, information: Information, exponent: Modes
+    skies: PositiveSkies, channel: int, information: Information, exponent: Vector
 ) -> Information:
     """What a channel's data say of its exponent, the sky being linear about a given one.
 
@@ -152,9 +169,9 @@ def linearised(
     skies : PositiveSkies
     channel : int
     information : Information
-        Of the channel's sky, in K.
-    exponent : (modes,) array
-        phi_f.
+        Of the channel's sky, in K, and what channels share.
+    exponent : (modes + shared,) array
+        phi_f, and what channels share.
 
     Returns
     -------
@@ -162,33 +179,35 @@ def linearised(
         Without unit, point sources integrated out.
     """
     diffuse = diffuse_part(skies, channel, information).without()
-    here = diffuse.recentred(skies.modes(channel, exponent))
-    slope = skies.jacobian(channel, exponent)
+    here = diffuse.recentred(_whole(skies, channel, exponent))
+    slope = _slope(skies, channel, exponent)
     matrix, vector = symmetric_product(slope.T @ here.matrix, slope), here.vector @ slope
     return replace(here, matrix=matrix, vector=vector, reference=exponent)
 
 
 @dataclass(frozen=True)
 class _Point:
-    """Fields and exponents of all channels, and chi^2 of their skies."""
+    """All unknowns, exponents of all channels, and chi^2 of their skies."""
 
-    fields: Fields
-    exponents: ChannelModes
+    unknowns: Vector
+    exponents: Exponents
     chi2: float
 
     def energy(self, prior: SpectralPrior) -> float:
         """E under a prior."""
-        rest = self.exponents - np.asarray(prior.mixing) @ self.fields
+        k, n = np.shape(prior.roots)
+        fields, shared = self.unknowns[: k * n].reshape(k, n), self.unknowns[k * n :]
+        rest = self.exponents[:, :n] - np.asarray(prior.mixing) @ fields
         roots = np.stack([prior.residual_root(k) for k in range(prior.n_channels)])
-        return self.chi2 + float(
-            ((self.fields / prior.roots) ** 2).sum() + ((rest / roots) ** 2).sum()
-        )
+        parts = (fields / np.asarray(prior.roots), rest / roots, shared)
+        return self.chi2 + sum(float((part**2).sum()) for part in parts)
 
 
 def find_joint_mode(
     skies: PositiveSkies,
     laws: FieldLaws,
     channels: Channels,
+    shared: Vector | None = None,
     *,
     learn: bool = False,
     report: Report = None,
@@ -202,6 +221,8 @@ def find_joint_mode(
         C_ell of the fields, or where to begin to learn them.
     channels : Channels
         Their data.
+    shared : (shared,) array, optional
+        Where what channels share begins, if their information is about it.
     learn : bool
         Learn A and tilt of every field and residual, by the maximum of the evidence.
     report : callable, optional
@@ -212,10 +233,11 @@ def find_joint_mode(
     InputError
         If the rounds do not settle, or the data are too precise to be solved for.
     """
-    fields = np.zeros((len(skies.names), skies.n_fields))
-    exponents = skies.mixing @ fields
-    here = _Point(fields, exponents, _chi2(skies, channels, exponents))
-    shapes: Shapes = {"exponent": (skies.n_fields,), "chi2": ()}
+    shared = np.zeros(0) if shared is None else shared
+    start = np.concatenate([np.zeros(len(skies.names) * skies.n_fields), shared])
+    exponents = np.tile(np.append(np.zeros(skies.n_fields), shared), (len(skies.levels), 1))
+    here = _Point(start, exponents, _chi2(skies, channels, exponents))
+    shapes: Shapes = {"exponent": exponents.shape[1:], "chi2": ()}
     if learn:
         shapes |= dict.fromkeys(("power", "known"), (skies.grid.lmax + 1,))
     last = np.zeros_like(laws.parameters)
@@ -243,10 +265,10 @@ def find_joint_mode(
     )
 
 
-def _chi2(skies: PositiveSkies, channels: Channels, exponents: ChannelModes) -> float:
+def _chi2(skies: PositiveSkies, channels: Channels, exponents: Exponents) -> float:
     def chi2(channel: int, information: Information) -> Arrays:
         diffuse = diffuse_part(skies, channel, information).without()
-        return {"chi2": np.asarray(diffuse.chi2(skies.modes(channel, exponents[channel])))}
+        return {"chi2": np.asarray(diffuse.chi2(_whole(skies, channel, exponents[channel])))}
 
     return float(channels.each(chi2, {"chi2": ()})["chi2"].sum())
 
@@ -255,7 +277,7 @@ def _linear_round(
     skies: PositiveSkies,
     channels: Channels,
     prior: SpectralPrior,
-    exponents: ChannelModes,
+    exponents: Exponents,
     shapes: Shapes,
 ) -> tuple[Posterior, _Point, Arrays]:
     """The posterior of skies that are linear about exponents, its mean, and every channel there."""
@@ -265,33 +287,36 @@ def _linear_round(
 
     information = channels.summed(prior, exponents, relative)
     posterior = joint.component_posterior(information, prior)
-    maps = posterior.mean.reshape(prior.n_components, -1)
+    mean = np.asarray(posterior.mean)
     spread = joint.paired(posterior.covariance(), prior) if "power" in shapes else None
 
     def judged(channel: int, information: Information) -> Arrays:
-        return _judged(prior, channel, relative(channel, information), maps, spread)
+        return _judged(prior, channel, relative(channel, information), mean, spread)
 
     found = channels.each(judged, shapes)
-    return posterior, _Point(maps, found["exponent"], float(found["chi2"].sum())), found
+    return posterior, _Point(mean, found["exponent"], float(found["chi2"].sum())), found
 
 
 def _judged(
-    prior: SpectralPrior, channel: int, information: Information, maps: Fields, spread: Pairs | None
+    prior: SpectralPrior,
+    channel: int,
+    information: Information,
+    mean: Vector,
+    spread: joint.Blocks | None,
 ) -> Arrays:
     """Exponent and chi^2 of a channel at the mean of a linear round, and its residual's power."""
-    none = np.zeros((0, *maps.shape))
-    sky = joint.channel_sky(prior, channel, information, maps, None, none, jax.random.key(0))
+    none = np.zeros((0, len(mean)))
+    sky = joint.channel_sky(prior, channel, information, mean, None, none, jax.random.key(0))
     found = {"exponent": sky.mean, "chi2": sky.chi2}
     if spread is None:
         return found
-    root, mixing = prior.residual_root(channel), np.asarray(prior.mixing[channel])
+    root = prior.residual_root(channel)
     inverse = inverse_from_cholesky(joint.residual_lower(information, root))
-    first, second = np.tril_indices(len(mixing))
-    common = np.tensordot(mixing[first] * mixing[second], spread, 1)
+    common = joint.common_covariance(prior, channel, spread)
     # of the residual given the common part, and of what it follows of that
-    pull = (inverse * root[None]) @ information.matrix
+    pull = (inverse * root[None]) @ information.matrix[: len(root)]
     variance = np.diagonal(inverse) + np.einsum("ij,ij->i", pull @ common, pull)
-    white = (sky.mean - mixing @ maps) / root
+    white = ((sky.mean - joint.common_of(prior, channel, mean))[: len(root)]) / root
     return {**found, "power": sum_over_m(white**2), "known": sum_over_m(1.0 - variance)}
 
 
@@ -310,9 +335,9 @@ def _descended(
     """The end of a step, or of a half, a quarter, ... of it, if E is not higher there."""
     part, energy = 1.0, here.energy(prior)
     for _ in range(HALVINGS):
-        fields = here.fields + part * (there.fields - here.fields)
+        unknowns = here.unknowns + part * (there.unknowns - here.unknowns)
         exponents = here.exponents + part * (there.exponents - here.exponents)
-        trial = _Point(fields, exponents, _chi2(skies, channels, exponents))
+        trial = _Point(unknowns, exponents, _chi2(skies, channels, exponents))
         # what a short step gains may be rounding
         if trial.energy(prior) < energy + SETTLED**2:
             return trial
@@ -328,8 +353,8 @@ def positive_sky(
     mode: PositiveMode,
     channel: int,
     information: Information,
-    spread: Pairs,
-    draws: Float[np.ndarray, "n fields modes"],
+    spread: joint.Blocks,
+    draws: Float[np.ndarray, "count unknowns"],
     key: PRNGKeyArray,
 ) -> joint.ChannelSky:
     """Compute the sky of one channel.
@@ -344,32 +369,33 @@ def positive_sky(
         Number of the channel.
     information : Information
         Of the channel's data, in K.
-    spread : (pairs, modes, modes) array
-        Covariance of the fields as packed by :func:`.paired`.
-    draws : (n, fields, modes) array
-        Draws of the fields.
+    spread : tuple of arrays
+        Covariance of the fields and what channels share, as packed by :func:`.paired`.
+    draws : (n, unknowns) array
+        Draws of them.
     key : PRNGKeyArray
         For draws of residuals and fluxes. Give the same key for all channels of a run.
 
     Returns
     -------
     joint.ChannelSky
-        In K.
+        In K, of what channels share, too.
     """
     skies, exponent = mode.skies, mode.exponents[channel]
     relative = linearised(skies, channel, information, exponent)
-    found = joint.channel_sky(mode.prior, channel, relative, mode.fields, spread, draws, key)
+    unknowns = np.asarray(mode.posterior.mean)
+    found = joint.channel_sky(mode.prior, channel, relative, unknowns, spread, draws, key)
     beside = diffuse_part(skies, channel, information)
-    slope = skies.jacobian(channel, exponent)
+    slope = _slope(skies, channel, exponent)
     covariance = beside.whole_covariance(symmetric_product(slope @ found.covariance, slope.T))
-    mean = beside.whole_sky(skies.modes(channel, found.mean))
+    mean = beside.whole_sky(_whole(skies, channel, found.mean))
     shape = len(draws), len(beside.patterns)
     flux_key = jax.random.fold_in(jax.random.fold_in(key, channel), 1)
     z = np.asarray(jax.random.normal(flux_key, shape, dtype=jnp.float64))
     drawn = np.empty((len(draws), len(mean)))
     for first in range(0, len(draws), CHUNK):
         here = slice(first, first + CHUNK)
-        drawn[here] = skies.modes(channel, np.asarray(found.draws[here]))
+        drawn[here] = _whole(skies, channel, found.draws[here])
     return joint.ChannelSky(mean, covariance, beside.whole_skies(drawn, z), information.chi2(mean))
 
 

@@ -6,7 +6,7 @@ instrument, noise and prior are those of the data.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -193,6 +193,12 @@ class ChannelData:
     diagnosis: Diagnosis | None = None
     digests: tuple[str, ...] = ()
     information: Information | None = None
+
+    def given(self, table: pd.DataFrame) -> ChannelData:
+        """The same, where other channels tell of the offsets in a table of unknowns, too."""
+        if self.pointing is None or self.pointing.offsets is None:
+            return self
+        return replace(self, pointing=self.pointing.given(table))
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)

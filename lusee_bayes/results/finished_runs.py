@@ -122,7 +122,7 @@ def posterior_tree(result: MapResult) -> xr.DataTree:
         # fields of positive skies may have more modes than the maps
         dims = ("component", "mode" if joint.mode is None else "field_mode")
         unit = "K" if joint.mode is None else "1"
-        variables["component_mean"] = (dims, np.asarray(joint.mean), {"units": unit})
+        variables["component_mean"] = (dims, joint.maps, {"units": unit})
         mixing = np.asarray(joint.prior.mixing)
         variables["mixing"] = (("frequency", "component"), mixing, {"units": "1"})
     axis = {"frequency": ("frequency", result.frequencies_mhz, {"units": "MHz"})}

@@ -26,6 +26,7 @@ from lusee_bayes.experiment.unknowns import UnknownsReport, flux_lines
 from lusee_bayes.flight.reduced import Reduced
 from lusee_bayes.judge.chi2 import RULE, ChiSquare, Fit
 from lusee_bayes.judge.cube_fit import ChannelFits, SharedTest
+from lusee_bayes.linear.joint import Blocks
 from lusee_bayes.linear.positive_joint import PositiveMode
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.summaries import JointSummary, MapSummary, PullSummary
@@ -116,10 +117,11 @@ class Components:
     Attributes
     ----------
     prior : SpectralPrior
-    mean : (components, modes) array
-    spread : (pairs, modes, modes) array
+    mean : (unknowns,) array
+        One map behind the other, then what channels share of the instrument.
+    spread : tuple of arrays
         Their covariance (:func:`.paired`).
-    draws : (n, components, modes) array
+    draws : (n, unknowns) array
     chi2 : float
         Of all data under the model, prior included: chi^2 of N_data if it holds.
     log_evidence, information_bits : float
@@ -131,13 +133,19 @@ class Components:
 
     prior: SpectralPrior
     mean: Array
-    spread: Array
+    spread: Blocks
     draws: Array
     chi2: float
     log_evidence: float
     information_bits: float
     refinement: float
     mode: PositiveMode | None = None
+
+    @property
+    def maps(self) -> Float[np.ndarray, "components modes"]:
+        """Mean of the component maps."""
+        shape = np.shape(self.prior.roots)
+        return self.mean[: shape[0] * shape[1]].reshape(shape)
 
     @property
     def solver(self) -> str:
@@ -266,8 +274,8 @@ class MapResult(Described):
         if self.single:
             return ", ".join(self.channel.figures())
         kind = "each on its own" if self.joint is None else "one posterior"
-        if self.scenario.shared:
-            kind = "each on its own but for the instrument that they share"
+        if self.scenario.shared and self.joint is None:
+            kind += " but for the instrument that they share"
         parts = [f"{counted(len(self.channels), 'frequency', 'frequencies')}, {kind}"]
         crosses = [c.ell_cross for c in self.channels if c.ell_cross is not None]
         if crosses:

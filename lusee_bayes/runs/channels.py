@@ -21,6 +21,9 @@ are tied by name; a channel without one tells nothing of it. Each channel is to 
 what its own data tell. The tied values are within about one of its own widths of that, where the
 first order holds as well as for the channel alone.
 
+In a joint posterior z = R w of all channels, w ~ N(0, 1), is unknown beside the component maps, and
+each channel's data constrain both together (:mod:`.joint`).
+
 Unfinished work is kept in files: ``DIR/channels/25.information.nc`` holds what its data say,
 ``25.alone.nc`` its posterior given its own data, ``25.result.nc`` that given all. So memory stays
 bounded, and an interrupted run goes on where it was. Files of other scenarios or data are made
@@ -40,7 +43,7 @@ from typing import NamedTuple
 import h5py
 import jax
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from lusee_bayes.core import formats
 from lusee_bayes.core.arrays import Square, T, Vector
@@ -52,13 +55,13 @@ from lusee_bayes.core.trees import StoredTree, from_tree, write_tree
 from lusee_bayes.core.version import __version__
 from lusee_bayes.experiment.data_files import Data, anchored, digest_of
 from lusee_bayes.experiment.experiment import build, draw_key
+from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.unknowns import Unknowns
 from lusee_bayes.judge.coverage import N_DRAWS
 from lusee_bayes.judge.cube_fit import SharedTest, shared_tests
 from lusee_bayes.linear import joint, positive_joint
 from lusee_bayes.linear.amplitudes import (
-    Amplitudes,
     Tied,
     information_given,
     kernel,
@@ -85,15 +88,19 @@ class ChannelFiles:
         Of the run.
     identity : str
         Of the run (:func:`identity_of`), whose files alone are taken up again.
+    again : set of float
+        Frequencies of channels that have been looked at twice: what counts is the second.
     """
 
-    def __init__(self, folder: Path, identity: str):
+    def __init__(self, folder: Path, identity: str, again: frozenset[float] = frozenset()):
         self.folder = folder / CHANNELS
-        self.identity = identity
+        self.identity, self.again = identity, again
 
     def path(self, channel: Scenario, kind: type) -> Path:
         """Of what is kept of a channel, a dataclass such as :class:`ChannelInformation`."""
         name = kind.__name__.removeprefix("Channel").lower()
+        if kind is not ChannelResult and channel.frequency_mhz in self.again:
+            name += ".again"
         return self.folder / f"{channel.frequency_mhz:.15g}.{name}.nc"
 
     def kept(self, channel: Scenario, kind: type[T], make: Callable[[], T]) -> T:
@@ -111,11 +118,18 @@ class ChannelFiles:
         with h5py.File(path) as file:
             return from_tree(kind, StoredTree(file), str(path))
 
-    def information(self, channel: Scenario) -> Information:
-        """Of a :class:`ChannelInformation`, this part alone."""
+    def information(
+        self, channel: Scenario, number: int = 0, tied: Tied | None = None
+    ) -> Information:
+        """Of a :class:`ChannelInformation` this part alone, of what is tied, too."""
         path = self.path(channel, ChannelInformation)
         with h5py.File(path) as file:
-            return from_tree(Information, StoredTree(file["information"]), str(path))
+            tree = StoredTree(file)
+            information = from_tree(Information, tree.children["information"], str(path))
+            if tied is None:
+                return information
+            unknowns = from_tree(Unknowns, tree.children["unknowns"], str(path))
+        return unknowns.whole(information, tied, number)
 
 
 def identity_of(scenario: Scenario, data: Data | None, *others: object) -> str:
@@ -144,54 +158,70 @@ class ChannelInformation:
         Receivers, ground and gain table given the sky, where the model has them.
     sky : (modes,) array
         The scenario's model sky, in K.
+    share : Share or None
+        What it has of the instrument that channels share.
     """
 
     information: Information
     known: ChannelData
     unknowns: Unknowns | None
     sky: Float[np.ndarray, " mode"]
+    share: Share | None
 
     @classmethod
     def of(cls, made: Conditioned, known: ChannelData) -> ChannelInformation:
         """Of all data of a channel, earlier ones included."""
-        sky = np.asarray(made.experiment.setup.sky.modes)
-        return cls(made.information, made.of_all(known), made.unknowns, sky)
+        sky, share = np.asarray(made.experiment.setup.sky.modes), None
+        if made.unknowns is not None and made.unknowns.shared.size:
+            share = Share.of(made.unknowns, made.posterior.mean, made.covariance, 0, made.own)
+        return cls(made.information, made.of_all(known), made.unknowns, sky, share)
 
-    def shared(self) -> tuple[SkyModes, SkyModes]:
-        """What the prior of all channels takes: the reference sky, and the model's."""
-        return np.asarray(self.information.reference), self.sky
+    def seen(self) -> Seen:
+        """What the prior of all channels takes, too: the reference sky, and the model's."""
+        return Seen(self.share, np.asarray(self.information.reference), self.sky)
 
-    def given(self, components: Components, number: int, scenario: Scenario) -> ChannelResult:
+    def given(
+        self, tied: Tied | None, components: Components, number: int, scenario: Scenario
+    ) -> ChannelResult:
         """The channel given all data.
 
         Parameters
         ----------
+        tied : Tied or None
+            The prior of what is shared.
         components : Components
         number : int
             Of the channel among those of the components.
         scenario : Scenario
             Of all channels.
         """
-        information, key = self.information, draw_key(scenario)
-        draws, spread, n_draws = components.draws, components.spread, scenario.output.draws
+        information, unknowns, known = self.information, self.unknowns, self.known
+        n, key, n_draws = information.n_modes, draw_key(scenario), scenario.output.draws
+        if unknowns is not None and tied is not None:
+            information = unknowns.whole(information, tied, number)
+        draws, spread = components.draws, components.spread
         if (mode := components.mode) is not None:
             sky = positive_joint.positive_sky(mode, number, information, spread, draws, key)
         else:
             means = (components.mean, spread, draws)
             sky = joint.channel_sky(components.prior, number, information, *means, key)
-        skies, report = np.asarray(sky.draws[:n_draws]), None
-        if self.unknowns is not None:
-            report = self.unknowns.report(sky.mean, sky.covariance, joint=True)
+        mean, covariance, drawn = sky.mean[:n], sky.covariance[:n, :n], sky.draws[:, :n]
+        report = None
+        if unknowns is not None:
+            if tied is not None:
+                unknowns = unknowns.given_all(tied, number, sky.mean, sky.covariance)
+                known = known.given(unknowns.table(mean, covariance))
+            report = unknowns.report(mean, covariance, joint=True)
         return channel_result(
-            self.known,
-            sky.mean,
-            sky.covariance,
-            skies,
-            information.log_likelihood(skies),
-            np.asarray(sky.draws) - np.asarray(sky.mean),
+            known,
+            mean,
+            covariance,
+            drawn[:n_draws],
+            information.log_likelihood(sky.draws[:n_draws]),
+            drawn - mean,
             unknowns=report,
-            instrument=self.unknowns,
-            independent=np.asarray(information.reference),
+            instrument=unknowns,
+            independent=np.asarray(self.information.reference),
             covariance_kept=scenario.output.covariance,
             **information.fit(sky.mean, sky.covariance),
         )
@@ -214,12 +244,15 @@ class ChannelsInFiles:
     engine : Engine
     stages : Stages
         Told what is being done.
+    tied : Tied or None
+        The prior of what channels share, which is then an unknown, too.
     """
 
     channels: tuple[Scenario, ...]
     files: ChannelFiles
     engine: Engine
     stages: Stages
+    tied: Tied | None = None
 
     def each(
         self,
@@ -227,10 +260,10 @@ class ChannelsInFiles:
         shapes: dict[str, tuple[int, ...]],
     ) -> dict[str, np.ndarray]:
         """Call a function with number and information of every channel; its arrays, stacked."""
-        files, channels = self.files, self.channels
+        files, channels, tied = self.files, self.channels, self.tied
 
         def call(number: int) -> dict[str, np.ndarray]:
-            return function(number, files.information(channels[number]))
+            return function(number, files.information(channels[number], number, tied))
 
         tasks = Tasks(call, range(len(channels)), [names_of((one,)) for one in channels])
         found = self.engine.each(tasks, self.stages, "joint sums")
@@ -243,13 +276,13 @@ class ChannelsInFiles:
         function: Callable[[int, Information], Information],
     ) -> Information:
         """What a function of every channel's information says of the component maps."""
-        files, channels = self.files, self.channels
+        files, channels, tied = self.files, self.channels, self.tied
 
         def add(numbers: range) -> joint.ComponentSums:
             sums = joint.ComponentSums.empty(prior, reference)
             for number in numbers:
-                information = function(number, files.information(channels[number]))
-                sums = joint.summed_information(sums, prior, number, information)
+                own = function(number, files.information(channels[number], number, tied))
+                sums = joint.summed_information(sums, prior, number, own)
             return sums
 
         # the same blocks, and the same tree of them, whatever carries out the tasks
@@ -270,7 +303,7 @@ def names_of(channels: tuple[Scenario, ...]) -> str:
 
 
 def solve_components(
-    scenario: Scenario, channels: ChannelsInFiles, shared: Sequence[tuple], n_draws: int
+    scenario: Scenario, channels: ChannelsInFiles, seen: Sequence[Seen], n_draws: int
 ) -> Components:
     """Work out the joint posterior of all channels.
 
@@ -279,8 +312,8 @@ def solve_components(
     scenario : Scenario
         Of the channels.
     channels : ChannelsInFiles
-    shared : sequence of tuple
-        :meth:`.ChannelInformation.shared` of each.
+    seen : sequence of Seen
+        Of each.
     n_draws : int
         Draws of the component maps.
 
@@ -290,32 +323,34 @@ def solve_components(
         If data are too precise to be solved for, or positive skies do not settle.
     """
     spectral, stages, frequencies = scenario.spectral, channels.stages, scenario.frequencies_mhz
-    mode = None
+    tied, mode = channels.tied, None
     if spectral.model == "positive":
         with stages("templates"):
             skies = spectral.positive_skies(frequencies, scenario.lmax)
         silent = replace(channels, stages=Stages())
         coarse = spectral.lmax_of_fields(min(scenario.lmax, positive_joint.COARSE_LMAX))
         with stages.progress("laws of the fields", positive_joint.MAX_ROUNDS) as report:
-            laws = positive_joint.learn_laws(skies, silent, lmax_fields=coarse, report=report)
+            alone = replace(silent, tied=None)
+            laws = positive_joint.learn_laws(skies, alone, lmax_fields=coarse, report=report)
         with stages.progress("positive skies", positive_joint.MAX_ROUNDS) as report:
-            mode = positive_joint.find_joint_mode(skies, laws, silent, report=report)
+            start = None if tied is None else tied.white
+            mode = positive_joint.find_joint_mode(skies, laws, silent, start, report=report)
         prior, posterior, chi2, moved = mode.prior, mode.posterior, mode.energy, mode.moved
     else:
-        reference, skies = map(np.array, zip(*shared, strict=True))
-        prior = spectral.prior(np.array(frequencies), skies)
+        prior = spectral.prior(np.array(frequencies), np.array([one.sky for one in seen]))
+        white = np.zeros(0) if tied is None else tied.white
+        reference = np.array([np.concatenate([one.reference, white]) for one in seen])
         information = channels.summed(prior, reference, lambda _, information: information)
     with stages("joint posterior"):
         if mode is None:
             posterior = joint.component_posterior(information, prior)
             chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
             moved = float(posterior.refinement)
-        shape = (prior.n_components, posterior.mean.shape[0] // prior.n_components)
         return Components(
             prior,
-            posterior.mean.reshape(shape),
+            np.asarray(posterior.mean),
             jax.block_until_ready(joint.paired(posterior.covariance(), prior)),
-            posterior.sample(draw_key(scenario), n_draws).reshape(n_draws, *shape),
+            posterior.sample(draw_key(scenario), n_draws),
             chi2,
             float(posterior.log_evidence),
             float(posterior.information_bits()),
@@ -328,19 +363,42 @@ def solve_components(
 TIED = 1 << 20
 
 
-class Share(NamedTuple):
+@dataclass(frozen=True)
+class Share:
     """What channels that share unknowns need of a channel.
 
     octaves : of what is shared, by name; mean, covariance : its E and V; n_draws : of the sky;
-    priors : mean and standard deviation of each unknown, by name; fits : whether its data fit
+    priors : mean and standard deviation of each unknown, by name; fits : whether its data fit;
+    log_evidence : of its own data
     """
 
     octaves: dict[str, float]
-    mean: Vector
-    covariance: Square
+    mean: Float[np.ndarray, " unknown"]
+    covariance: Float[np.ndarray, "unknown unknown_2"]
     n_draws: int
     priors: dict[str, tuple[float, float]]
     fits: bool
+    log_evidence: float
+
+    @classmethod
+    def of(
+        cls, unknowns: Unknowns, mean: Vector, covariance: Square, n_draws: int, found: Inference
+    ) -> Share:
+        """Of a channel's unknowns under its own posterior of the sky, in K and K^2."""
+        told, own = unknowns.amplitudes.integrated(mean, covariance), unknowns.shared
+        octaves = dict(zip(unknowns.shared_names, unknowns.octaves[own].tolist(), strict=True))
+        priors = {row["unknown"]: (row["prior"], row["prior_std"]) for row in unknowns.rows}
+        spread = told.covariance[np.ix_(own, own)]
+        figures = n_draws, priors, found.fits, float(found.posterior.log_evidence)
+        return cls(octaves, (unknowns.expected + told.mean)[own], spread, *figures)
+
+
+class Seen(NamedTuple):
+    """What is needed of a channel to solve for all: its share, of joint skies what these take."""
+
+    share: Share | None
+    reference: SkyModes | None = None
+    sky: SkyModes | None = None
 
 
 @dataclass(frozen=True)
@@ -363,8 +421,8 @@ class ChannelAlone:
         That are kept.
     figures : dict
         :meth:`.Conditioned.figures`.
-    fits : bool
-        Whether chi^2 of its data does not stand out by far.
+    share : Share
+        What it has of the instrument that channels share.
     """
 
     known: ChannelData
@@ -375,7 +433,7 @@ class ChannelAlone:
     deviations: Float[np.ndarray, "all mode"]
     n_draws: int
     figures: dict[str, float | bool]
-    fits: bool
+    share: Share
 
     @classmethod
     def of(cls, made: Conditioned, known: ChannelData) -> ChannelAlone:
@@ -384,29 +442,15 @@ class ChannelAlone:
         deviations = made.draws - mean
         if compared is not None:
             deviations = np.concatenate([deviations, compared])
-        kept = made.covariance, deviations, len(made.draws), made.figures()
-        return cls(known, made.own.solution.information, made.unknowns, mean, *kept, made.own.fits)
+        share = Share.of(made.unknowns, mean, made.covariance, len(deviations), made.own)
+        kept = made.covariance, deviations, len(made.draws), made.figures(), share
+        return cls(known, made.own.solution.information, made.unknowns, mean, *kept)
 
-    def shared(self) -> Share:
+    def seen(self) -> Seen:
         """What the others need of it."""
-        told, own = self._told(), self._own()
-        octaves = dict(zip(self._names(), self.unknowns.octaves[own].tolist(), strict=True))
-        mean = (self.unknowns.expected + told.mean)[own]
-        priors = {row["unknown"]: (row["prior"], row["prior_std"]) for row in self.unknowns.rows}
-        covariance = told.covariance[np.ix_(own, own)]
-        return Share(octaves, mean, covariance, len(self.deviations), priors, self.fits)
+        return Seen(self.share)
 
-    def _told(self) -> Amplitudes:
-        return self.unknowns.amplitudes.integrated(self.mean, self.covariance)
-
-    def _own(self) -> Int[np.ndarray, " n"]:
-        """Which unknowns are shared."""
-        return np.flatnonzero(self.unknowns.octaves)
-
-    def _names(self) -> list[str]:
-        return [self.unknowns.rows[k]["unknown"] for k in self._own()]
-
-    def given(self, tied: Tied, number: int, scenario: Scenario) -> ChannelResult:
+    def given(self, tied: Tied, _: None, number: int, scenario: Scenario) -> ChannelResult:
         """The channel given all data.
 
         Parameters
@@ -418,7 +462,8 @@ class ChannelAlone:
         scenario : Scenario
             Of the channel.
         """
-        told, own, at = self._told(), self._own(), [tied.names.index(n) for n in self._names()]
+        own, at = self.unknowns.shared, self.unknowns.among(tied)
+        told = self.unknowns.amplitudes.integrated(self.mean, self.covariance)
         expected = self.unknowns.expected[own]
         mean, draws = tied.mean[number, at] - expected, tied.draws[:, number, at] - expected
         covariance = tied.covariance[number][np.ix_(at, at)]
@@ -445,11 +490,9 @@ class ChannelAlone:
         gained = np.linalg.slogdet(np.eye(len(own)) + (covariance - v) @ sky_share)[1]
         bits = self.figures["information_bits"] - 0.5 * gained / np.log(2.0)
         information = information_given(self.information, amplitudes, precision, vector, about)
-        skies, known = moved + deviations[: self.n_draws], self.known
-        if known.pointing is not None and known.pointing.offsets is not None:
-            known = replace(known, pointing=known.pointing.given(unknowns.table(moved, left)))
+        skies = moved + deviations[: self.n_draws]
         return channel_result(
-            known,
+            self.known.given(unknowns.table(moved, left)),
             moved,
             left,
             skies,
@@ -499,11 +542,6 @@ def tie_channels(
             kernels[:, number], kernels[:, :, number] = 0.0, 0.0
             kernels[:, number, number] = 1.0
     return replace(tie(mean, covariance, kernels, normals), names=names), tests
-
-
-@dataclass(frozen=True)
-class ChannelAgain(ChannelAlone):
-    """The same, where its data did not fit: the likelier of that and of a second look."""
 
 
 def told_by_fitting(
@@ -588,7 +626,7 @@ def map_channels(
 
     begin: dict[str, float] | None = None
 
-    def observe(channel: Scenario) -> tuple | str:
+    def observe(channel: Scenario) -> Seen | str:
         """Look at the data of a channel: what the others need of it, or why it cannot be mapped."""
 
         def make() -> ChannelResult | ChannelInformation | ChannelAlone:
@@ -602,58 +640,59 @@ def map_channels(
             kept = files.kept(channel, kind, make)
         except InputError as error:
             return str(error)
-        return () if alone else kept.shared()
+        return Seen(None) if alone else kept.seen()
 
     names, found = [names_of((channel,)) for channel in channels], []
-    if kind is ChannelAlone:  # the others begin with the instrument of the first
+    if scenario.shared:  # the others begin with the instrument of the first
         found = engine.each(Tasks(observe, channels[:1], names[:1]), stages, "first channel")
-        if isinstance(found[0], Share) and found[0].fits:
-            begin = told_by_fitting(scenario, [channels[0].frequency_mhz], found) or None
+        if isinstance(found[0], Seen) and found[0].share.fits:
+            begin = told_by_fitting(scenario, [channels[0].frequency_mhz], [found[0].share]) or None
     left = channels[len(found) :], names[len(found) :]
     found = [*found, *engine.each(Tasks(observe, *left), stages, "channels")]
     by_channel = list(zip(channels, found, strict=True))
     unmapped = {channel.frequency_mhz: why for channel, why in by_channel if isinstance(why, str)}
     if len(unmapped) == len(channels):
         raise InputError(f"no channel can be mapped: {_reasons(unmapped)}")
-    mapped, shared = zip(*(one for one in by_channel if not isinstance(one[1], str)), strict=True)
-    components, tied, tests, kinds = None, None, (), {}
-    if scenario.joint:
-        at_hand = ChannelsInFiles(mapped, files, engine, stages)
-        # coverage is compared with draws
-        n_draws = max(scenario.output.draws, N_DRAWS if data is None or truth else 0)
-        components = solve_components(_without(unmapped, scenario), at_hand, shared, n_draws)
-    elif not alone:
-        frequencies = [channel.frequency_mhz for channel in mapped]
-        unfit = [number for number, one in enumerate(shared) if not one.fits]
+    mapped, seen = zip(*(one for one in by_channel if not isinstance(one[1], str)), strict=True)
+    components, tied, tests = None, None, ()
+    if scenario.shared:
+        frequencies, shares = [channel.frequency_mhz for channel in mapped], [s.share for s in seen]
+        unfit = [number for number, one in enumerate(shares) if not one.fits]
         if 0 < len(unfit) < len(mapped):
-            values = told_by_fitting(scenario, frequencies, shared)
+            values = told_by_fitting(scenario, frequencies, shares)
+            again = frozenset(frequencies[number] for number in unfit)
+            first, files = files, ChannelFiles(folder.resolve(), files.identity, again)
 
-            def again(number: int) -> Share:
+            def look_again(number: int) -> Seen:
                 """Look at the data of a channel from what the others tell of the instrument."""
                 channel = mapped[number]
 
-                def make() -> ChannelAgain:
-                    made, before = condition(channel, Stages(), values), files.read(channel, kind)
-                    if made.figures()["log_evidence"] < before.figures["log_evidence"]:
-                        return ChannelAgain(**vars(before))
-                    return ChannelAgain.of(made, made.known(alone=False, thorough=thorough))
+                def make() -> ChannelInformation | ChannelAlone:
+                    made, before = condition(channel, Stages(), values), first.read(channel, kind)
+                    if made.figures()["log_evidence"] < before.share.log_evidence:
+                        return before
+                    return kind.of(made, made.known(alone=False, thorough=thorough))
 
-                return files.kept(channel, ChannelAgain, make).shared()
+                return files.kept(channel, kind, make).seen()
 
-            kinds = dict.fromkeys(unfit, ChannelAgain)
-            tasks = Tasks(again, unfit, [names_of((mapped[number],)) for number in unfit])
+            tasks = Tasks(look_again, unfit, [names_of((mapped[number],)) for number in unfit])
             looked = engine.each(tasks, stages, "channels again")
             changed = dict(zip(unfit, looked, strict=True))
-            shared = [changed.get(number, one) for number, one in enumerate(shared)]
-        tied, tests = tie_channels(scenario, frequencies, shared)
+            seen = [changed.get(number, one) for number, one in enumerate(seen)]
+        tied, tests = tie_channels(scenario, frequencies, [one.share for one in seen])
+    if scenario.joint:
+        at_hand = ChannelsInFiles(mapped, files, engine, stages, tied)
+        # coverage is compared with draws
+        n_draws = max(scenario.output.draws, N_DRAWS if data is None or truth else 0)
+        components = solve_components(_without(unmapped, scenario), at_hand, seen, n_draws)
 
     def finish(number: int) -> None:
         """Write the result of a channel, given what all have in common."""
-        channel, common = mapped[number], components or tied
+        channel = mapped[number]
         own = scenario if scenario.joint else channel
 
         def make() -> ChannelResult:
-            return files.read(channel, kinds.get(number, kind)).given(common, number, own)
+            return files.read(channel, kind).given(tied, components, number, own)
 
         files.kept(channel, ChannelResult, make)
 
@@ -661,8 +700,16 @@ def map_channels(
         tasks = Tasks(finish, range(len(mapped)), [names_of((channel,)) for channel in mapped])
         engine.each(tasks, stages, "joint skies" if scenario.joint else "shared instrument")
     results = tuple(files.read(channel, ChannelResult) for channel in mapped)
-    told = {} if tied is None else {"tie_log_evidence": tied.log_evidence, "shared_tests": tests}
-    return MapResult(scenario, results, components, stages.seconds, unmapped, **told)
+    tie = 0.0 if tied is None else tied.log_evidence
+    return MapResult(
+        scenario,
+        results,
+        components,
+        stages.seconds,
+        unmapped,
+        tie_log_evidence=tie,
+        shared_tests=tests,
+    )
 
 
 def _without(unmapped: dict[float, str], scenario: Scenario) -> Scenario:

@@ -47,18 +47,27 @@ def quadrature():
     return theta, phi, synthesis_matrix(theta, phi, LMAX), weights
 
 
-def observed(skies, laws, seed=0, noise=0.05, n_data=40):
-    """Skies drawn from the prior, seen by random couplings."""
+def observed(skies, laws, seed=0, noise=0.05, n_data=40, n_shared=0):
+    """Skies drawn from the prior, seen by random couplings, beside what all channels share."""
     rng = np.random.default_rng(seed)
     exponents = np.asarray(laws.prior(skies).sample(jax.random.key(seed)))
-    found = []
+    found, shared = [], rng.standard_normal(n_shared)
     for k, exponent in enumerate(exponents):
         fluxes = rng.exponential(size=skies.sources.shape[1])
         sky = skies.modes(k, exponent) + fluxes @ skies.sources[k]
         a = rng.standard_normal((n_data + 2 * k, N))
         sigma = noise * np.sqrt((a @ sky) ** 2).mean() * rng.uniform(0.5, 2.0, len(a))
         d = a @ sky + sigma * rng.standard_normal(len(a))
-        found.append((a, sigma, d, information_of(a, sigma, d, (sky**2).max())))
+        information = information_of(a, sigma, d, (sky**2).max())
+        if n_shared:
+            t = np.sqrt(sigma**2).mean() * rng.standard_normal((len(a), n_shared))
+            rows, at = np.concatenate([a, t], axis=1), np.append(information.reference, shared)
+            d = d + t @ shared
+            white, left = rows / sigma[:, None], (d - rows @ at) / sigma
+            told = white.T @ white, white.T @ left, at, np.asarray(left @ left)
+            information = Information(*told, information.log_det, information.n_data)
+            a = rows
+        found.append((a, sigma, d, information))
     return found
 
 
@@ -102,37 +111,39 @@ def test_the_mode_of_one_channel_is_that_of_a_direct_minimisation():
 
 @pytest.fixture(scope="module")
 def case():
-    """Four channels with sources, their mode, and one big linear model about it."""
+    """Four channels with sources that share two unknowns, and their mode."""
     skies = skies_of(FREQUENCIES, ("level", "index", "absorption"), n_sources=2)
     laws = rough(skies, 0.1)
-    seen = observed(skies, laws, seed=3)
+    seen = observed(skies, laws, seed=3, n_shared=2)
     channels = pj.ChannelsInMemory(tuple(s[-1] for s in seen))
-    return skies, laws, seen, pj.find_joint_mode(skies, laws, channels)
+    return skies, laws, seen, pj.find_joint_mode(skies, laws, channels, np.zeros(2))
 
 
 def test_the_gaussian_is_that_of_one_big_model(case):
-    """All channels stacked: unknowns are fields, residuals and the sources' fluxes."""
+    """All channels stacked: unknowns are fields, residuals, fluxes, and what channels share."""
     skies, _, seen, mode = case
     prior, fields = mode.prior, len(skies.names)
     theta, phi, y, weights = quadrature()
     n_sources = skies.sources.shape[1]
-    size = fields * N + len(seen) * (N + n_sources)
+    size = fields * N + len(seen) * (N + n_sources) + 2
     to_skies, constants, wide = [], [], np.ones(size)
     wide[: fields * N] = np.asarray(prior.roots).ravel()
     strength = weight(theta, phi)
     for k in range(len(seen)):
-        level = band(FREQUENCIES[k], theta, phi) * np.exp(strength * (y @ mode.exponents[k]))
+        exponent = mode.exponents[k, :N]
+        level = band(FREQUENCIES[k], theta, phi) * np.exp(strength * (y @ exponent))
         slope = y.T @ ((weights * strength * level)[:, None] * y)
-        matrix = np.zeros((N, size))
+        matrix = np.zeros((N + 2, size))
+        matrix[N:, -2:] = np.eye(2)
         for c in range(fields):
-            matrix[:, c * N : (c + 1) * N] = prior.mixing[k, c] * slope
+            matrix[:N, c * N : (c + 1) * N] = prior.mixing[k, c] * slope
         at = fields * N + k * (N + n_sources)
-        matrix[:, at : at + N] = slope
-        matrix[:, at + N : at + N + n_sources] = skies.sources[k].T
+        matrix[:N, at : at + N] = slope
+        matrix[:N, at + N : at + N + n_sources] = skies.sources[k].T
         wide[at : at + N] = np.asarray(prior.residual_root(k))
         to_skies.append(matrix)
-        at_zero = y.T @ (weights * level) - slope @ mode.exponents[k]
-        constants.append(at_zero + skies.sources[k].sum(0))
+        at_zero = y.T @ (weights * level) - slope @ exponent
+        constants.append(np.append(at_zero + skies.sources[k].sum(0), [0.0, 0.0]))
     a = np.concatenate([s[0] @ t for s, t in zip(seen, to_skies, strict=True)])
     offset = np.concatenate([s[0] @ c for s, c in zip(seen, constants, strict=True)])
     d, sigma = (np.concatenate([s[k] for s in seen]) for k in (2, 1))
@@ -143,10 +154,13 @@ def test_the_gaussian_is_that_of_one_big_model(case):
 
     evidence = stats.multivariate_normal(offset, (a * wide**2) @ a.T + np.diag(sigma**2)).logpdf(d)
     np.testing.assert_allclose(mode.posterior.log_evidence, evidence, rtol=1e-9)
-    std = np.sqrt(np.diagonal(covariance))[: fields * N]
-    assert np.abs((mode.fields.ravel() - mean[: fields * N]) / std).max() < 1e-6
+    kept = [*range(fields * N), size - 2, size - 1]
+    std = np.sqrt(np.diagonal(covariance))[kept]
+    assert np.abs((mode.posterior.mean - mean[kept]) / std).max() < 1e-6
+    # all four tell of what they share
+    assert std[-1] < 0.2
     spread = paired(mode.posterior.covariance(), prior)
-    none = np.zeros((0, fields, N))
+    none = np.zeros((0, fields * N + 2))
     for k, (s, t) in enumerate(zip(seen, to_skies, strict=True)):
         sky = pj.positive_sky(mode, k, s[-1], spread, none, jax.random.key(0))
         expected = t @ covariance @ t.T
@@ -159,13 +173,13 @@ def test_the_gaussian_is_that_of_one_big_model(case):
 def test_draws_scatter_as_the_covariance_says_and_are_positive(case):
     skies, _, seen, mode = case
     n = 3000
-    draws = np.asarray(mode.posterior.sample(jax.random.key(1), n)).reshape(n, -1, N)
+    draws = np.asarray(mode.posterior.sample(jax.random.key(1), n))
     spread = paired(mode.posterior.covariance(), mode.prior)
     sky = pj.positive_sky(mode, 0, seen[0][-1], spread, draws, jax.random.key(2))
     width = np.sqrt(np.diagonal(sky.covariance))
     # standard deviations of 3000 draws scatter by 1.3 %, the exponential adds some percent
     np.testing.assert_allclose(sky.draws.std(0) / width, 1.0, atol=0.15)
-    assert (skies.values(0, mode.exponents[0]) > 0).all()
+    assert (skies.values(0, mode.exponents[0, :N]) > 0).all()
 
 
 def test_far_templates_are_reached_in_shorter_steps():

@@ -106,15 +106,16 @@ def test_two_channels_that_differ_are_both_named():
 
 def test_a_channel_without_an_unknown_tells_nothing_of_it():
     scenario = lb.load_scenario("fiducial", SMALL)
-    one = Share({"a": np.inf, "b": np.inf}, np.array([0.5, 1.0]), np.diag([0.2, 0.1]), 4, {}, True)
-    other = Share({"a": np.inf}, np.array([0.3]), np.full((1, 1), 0.5), 4, {}, True)
+    both, covariance = {"a": np.inf, "b": np.inf}, np.diag([0.2, 0.1])
+    one = Share(both, np.array([0.5, 1.0]), covariance, 4, {}, True, 0.0)
+    other = Share({"a": np.inf}, np.array([0.3]), np.full((1, 1), 0.5), 4, {}, True, 0.0)
     tied, _ = tie_channels(scenario, [15.0, 20.0], [one, other])
     assert tied.names == ("a", "b")
     # of a: 1 / 0.2 + 1 / 0.5 - 1
     within(tied.mean, [[3.1 / 6.0, 1.0]] * 2, 1e-12)
     within(tied.covariance, np.stack([np.diag([1.0 / 6.0, 0.1])] * 2), 1e-12)
     # a third that differs from both keeps its own, and tells the others nothing
-    third = Share({"a": np.inf}, np.array([-9.0]), np.full((1, 1), 0.01), 4, {}, True)
+    third = Share({"a": np.inf}, np.array([-9.0]), np.full((1, 1), 0.01), 4, {}, True, 0.0)
     apart, tests = tie_channels(scenario, [15.0, 20.0, 22.0], [one, other, third])
     assert [test.disagrees for test in tests] == [False, False, True]
     within(apart.mean, [[3.1 / 6.0, 1.0]] * 2 + [[-9.0, 0.0]], 1e-12)

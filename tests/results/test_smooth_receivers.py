@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from assertions import assert_same_map, refuse
+from assertions import assert_same_map, within
 from experiments import DenseChannels, channels_of, four_ports, unknowns_report
 from matplotlib.figure import Figure
 from reference_linear import Answer, white_posterior
@@ -192,8 +192,6 @@ def test_seeds_of_simulated_receivers(response_file):
     one = four_ports(response_file, RECEIVER, "frequency_mhz=22")
     setup = set_up(scenario.channels()[2])
     assert true_values(setup) == true_values(replace(setup, scenario=one))
-    joint = "spectral={components: [power_law]}", RECEIVER, "joint=true"
-    refuse("with joint, leave it out", cube_of, response_file, *joint)
 
 
 @pytest.mark.usefixtures("numbers_alone")
@@ -260,29 +258,49 @@ def test_a_channel_has_those_of_its_own_map(response_file, tmp_path, monkeypatch
     assert "Powers of receivers" in page and page.count("<td>regolith_k</td><td>K</td>") == 2
 
 
-def test_in_a_joint_posterior_they_are_those_of_all_skies_and_unknowns(response_file, tmp_path):
+@pytest.mark.parametrize("smooth", [False, True])
+def test_in_a_joint_posterior_they_are_those_of_all_skies_and_unknowns(
+    smooth, response_file, tmp_path
+):
     """Every sky and every unknown as one Gaussian in NumPy."""
-    given = (*PLAIN, "joint=true", "spectral.components=[power_law]")
-    scenario = cube_of(response_file, *given, frequencies="[15, 20, 25]")
+    own = (NOISE, RECEIVER, GROUND) if smooth else PLAIN
+    given = (*own, "joint=true", "spectral.components=[power_law]")
+    more = f"output={{draws: {N_DRAWS}, covariance: true}}"
+    scenario = cube_of(response_file, *given, more, frequencies="[15, 20, 25]")
     channels = map_channels(scenario, tmp_path)
     prior = channels.joint.prior
     stds = [np.sqrt(np.asarray(per_mode(c))) for c in (prior.spectra[0], *prior.residual)]
     stds = np.concatenate([*stds, np.ones(3 * N_OWN)])
     dense = DenseChannels.of(scenario)
-    common = [float(x) * a for x, a in zip(prior.mixing[:, 0], dense.couplings, strict=True)]
-    own = (block_diag(*blocks) for blocks in (dense.couplings, dense.templates))
-    a = np.concatenate([np.concatenate(common), *own], axis=1)
+    unmixed = np.eye(len(stds))
+    for port in range(4 * N_MODES, 4 * N_MODES + N_PORTS if smooth else 0):
+        unmixed[port::N_OWN, port::N_OWN] = np.linalg.cholesky(ties(prior.frequencies_mhz))
+    skies = np.zeros((3 * N_MODES, len(stds)))
+    skies[:, :N_MODES] = np.kron(np.asarray(prior.mixing), np.eye(N_MODES))
+    skies[:, N_MODES : 4 * N_MODES] = np.eye(3 * N_MODES)
+    a = block_diag(*dense.couplings) @ skies
+    a[:, 4 * N_MODES :] = block_diag(*dense.templates) @ unmixed[4 * N_MODES :, 4 * N_MODES :]
     noise, rest = np.concatenate(dense.noise), np.concatenate(dense.rest)
     expected = white_posterior(a, stds, noise, rest)
     experiments = [lb.build(channel) for channel in scenario.channels()]
     tables = [unknowns_report(e, lb.infer(e)).table for e in experiments]
     alone = pd.concat(tables, ignore_index=True)
     table = channels.unknowns.table
-    scale, own = table["prior_std"].to_numpy(), slice(4 * N_MODES, None)
-    std = scale * expected.std[own]
-    assert np.abs((table["value"] - table["prior"] - scale * expected.mean[own]) / std).max() < 1e-4
-    np.testing.assert_allclose(table["std"], std, rtol=1e-4)
+    scale, own = table["prior_std"].to_numpy(), unmixed[4 * N_MODES :]
+    mean, std = own @ expected.mean, np.sqrt(np.diagonal(own @ expected.covariance @ own.T))
+    assert np.abs(((table["value"] - table["prior"]) / scale - mean) / std).max() < 1e-4
+    np.testing.assert_allclose(table["std"], scale * std, rtol=1e-4)
     np.testing.assert_allclose(table["true"], alone["true"], rtol=1e-12)
     # other channels do tell: the test would see a table of each channel's own data
-    assert (np.abs(table["value"] - alone["value"]) / std).max() > 0.05
+    assert (np.abs(table["value"] - alone["value"]) / table["std"]).max() > 0.05
     assert all(channel.unknowns.null is None for channel in channels.channels)
+    mean, covariance = skies @ expected.mean, skies @ expected.covariance @ skies.T
+    for k, channel in enumerate(channels.channels):
+        sky = slice(k * N_MODES, (k + 1) * N_MODES)
+        assert_same_map(channel, Answer(mean[sky], covariance[sky, sky], 0.0), 1e-4)
+        gone = covariance[sky, sky] - channel.covariance
+        within(gone / np.outer(channel.std, channel.std), 0.0, 1e-4)
+        z = np.linalg.solve(np.linalg.cholesky(covariance[sky, sky]), (channel.draws - mean[sky]).T)
+        assert np.abs(z @ z.T / N_DRAWS - np.eye(N_MODES)).max() < 5 * np.sqrt(2 / N_DRAWS)
+    assert channels.log_evidence == pytest.approx(expected.log_prob, rel=1e-9)
+    assert len(channels.shared_tests) == (3 if smooth else 0)

@@ -256,7 +256,8 @@ def scenario_of(*overrides, frequencies="[10, 20, 40]"):
 @pytest.mark.long
 def test_files_of_a_run_agree_with_each_other(tmp_path, capsys):
     command = ["map", "fiducial", *sets(*POSITIVE[:-1]), "--frequencies", "10,20,40", "--joint"]
-    assert run(*command, "--draws", 3, "-o", tmp_path / "out") == 0
+    shared = sets("noise.pointing={turntable_deg: 0.2}")
+    assert run(*command, *shared, "--draws", 3, "-o", tmp_path / "out") == 0
     said = capsys.readouterr().out
     assert "spectral.model=positive" in said and "prior.model=isotropic is not used" in said
     channels = posterior_of(tmp_path / "out")
@@ -272,6 +273,11 @@ def test_files_of_a_run_agree_with_each_other(tmp_path, capsys):
         assert np.abs(common - mean).max() < 0.1 * np.abs(mean).max()
         # three draws of each mode are within five standard deviations of the mean
         assert (np.abs(draws - mean) < 5.0 * channels["std"].values[k]).all()
+    # all channels have one turntable
+    offsets = table_of(tmp_path / "out" / "pointing.csv")
+    value, true, std = ([float(row[name]) for row in offsets] for name in ("value", "true", "std"))
+    assert len(value) == 3 and np.ptp(value) < 1e-9
+    assert abs(value[0] - true[0]) < 4.0 * std[0] < 0.4
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["joint"]["components"] == ["level", "index"]
     assert "spectral.model=positive" in summary["joint"]["prior"]
