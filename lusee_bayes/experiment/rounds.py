@@ -49,6 +49,9 @@ WIDE = 1e2
 # where chi^2 is too large by so many of its standard deviations, even so, as many other ways are
 # tried
 FAR_OFF, OTHER_WAYS = 10.0, 6
+# of so many instruments each other way begins with the likeliest; rounds that leave more than this
+# part of what chi^2 is too large by do not lead to one that fits
+CANDIDATES, STALLED = 8, 0.5
 # a prior is learned first when the map moves by less than this, and last when learning it again
 # moves the map by less than PRIOR_SETTLED; a step of learning that is not taken moves it by 0.01
 NEARLY, PRIOR_SETTLED, MAX_LEARNED = 0.5, 0.05, 8
@@ -129,6 +132,12 @@ class Inference:
         return float(white @ white) / len(white)
 
     @property
+    def excess(self) -> float:
+        """How much chi^2 is above its mean; none of larger noise, which says little."""
+        tempered = self.around.tempered > 1.0
+        return np.nan if tempered else self.solution.chi2 - len(self.solution.data)
+
+    @property
     def remark(self) -> str:
         """Chi^2, for a line on the rounds."""
         larger = " of larger noise" if self.around.tempered > 1.0 else ""
@@ -181,8 +190,9 @@ def settled(
     of what N is built around is 10 per datum, and the sky of each instrument is found anew
     (variable projection: first order in values then has no product with a change of the sky).
     Values go part of the way where they would go far, or swing. Where no sky fits at their end,
-    whatever the prior expects of it, they begin again, up to six times: with an instrument that is
-    as far off on the other side, and with draws of the prior. The end of the largest ln p counts.
+    whatever the prior expects of it, they begin again, up to six times: where about half of the
+    values found are drawn anew from their prior, with the likeliest of eight such instruments. The
+    end of the largest ln p counts.
 
     Parameters
     ----------
@@ -211,7 +221,7 @@ def settled(
     found, step = _approached(setup, data, start or beginning(setup, data), report)
     for way in range(OTHER_WAYS):
         if found.moving and not found.fits:
-            begin = beginning(setup, data, _elsewhere(found, way))
+            begin = _elsewhere(setup, data, found, way)
             other = _approached(setup, data, begin, report)
             if other[0].posterior.log_evidence > found.posterior.log_evidence:
                 found, step = other
@@ -251,13 +261,16 @@ def _approached(
 ) -> tuple[Inference, _Step]:
     """Rounds until the map has nearly settled, and the step there."""
     found, step = _conditioned(setup, data, around, 1), _Step()
-    moves = np.inf if rebuilds(setup) else 0.0
-    while moves > NEARLY and found.rounds < MAX_TEMPERED_ROUNDS:
+    moves, stalled = np.inf if rebuilds(setup) else 0.0, False
+    while moves > NEARLY and not stalled and found.rounds < MAX_TEMPERED_ROUNDS:
         (around, step), exact = _around(setup, found, step), None
-        mean, n = found.posterior.mean, found.rounds + 1
+        mean, n, excess = found.posterior.mean, found.rounds + 1, found.excess
+        at_rest = step.whole is None or np.abs(step.whole).max() < NEARLY
+        if around.tempered > 1.0:
+            # what larger noise does not explain leads nowhere from where nothing moves
+            stalled = at_rest and not found.fits
         del found  # its N
         if around.tempered > 1.0:
-            at_rest = step.whole is None or np.abs(step.whole).max() < NEARLY
             exact = _exact(setup, around)
             around = exact.around
             if at_rest:
@@ -266,17 +279,26 @@ def _approached(
         report(found.rounds, found.remark)
         moved_by = float(found.posterior.rms_shift_from(mean))
         moves = moved_by if around.tempered == 1.0 else np.inf
+        stalled = stalled or (found.excess > STALLED * excess and not found.fits)
     return found, step
 
 
-def _elsewhere(found: Inference, way: int) -> dict[str, float]:
-    """Where else rounds may begin: as far off on the other side, or anywhere in the prior."""
-    rng, values = np.random.default_rng(way), {}
-    for part in found.expanded:
-        if not part.systematic.learns:
-            z = -part.centre if not way else rng.standard_normal(len(part.centre))
+def _elsewhere(setup: Setup, data: Visibilities, found: Inference, way: int) -> Around:
+    """Where else rounds may begin: the likeliest of draws that keep half of the values found."""
+    rng, best = np.random.default_rng(way), None
+    parts = [part for part in found.expanded if not part.systematic.learns]
+    for _ in range(CANDIDATES):
+        values, log_prior = {}, 0.0
+        for part in parts:
+            drawn = rng.standard_normal(len(part.centre))
+            z = np.where(rng.random(len(drawn)) < 0.5, part.centre, drawn)
             values |= part.systematic.in_units(z)
-    return values
+            log_prior -= 0.5 * float(z @ z)
+        exact = _exact(setup, Around(data, values=values))
+        likely = float(exact.posterior.log_evidence) + log_prior
+        if best is None or likely > best[0]:
+            best = likely, replace(exact.around, tempered=_tempered(exact.misfit(), 0))
+    return best[1]
 
 
 def _conditioned(
