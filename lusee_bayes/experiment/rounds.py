@@ -52,6 +52,9 @@ FAR_OFF, OTHER_WAYS = 10.0, 6
 # of so many instruments each other way begins with the likeliest; rounds that leave more than this
 # part of what chi^2 is too large by do not lead to one that fits
 CANDIDATES, STALLED = 8, 0.5
+# the part of the values found that these keep, way after way: where most are right, half are the
+# quickest, and where they all are wrong, none
+KEPT = 0.5, 0.0
 # a prior is learned first when the map moves by less than this, and last when learning it again
 # moves the map by less than PRIOR_SETTLED; a step of learning that is not taken moves it by 0.01
 NEARLY, PRIOR_SETTLED, MAX_LEARNED = 0.5, 0.05, 8
@@ -191,8 +194,8 @@ def settled(
     (variable projection: first order in values then has no product with a change of the sky).
     Values go part of the way where they would go far, or swing. Where no sky fits at their end,
     whatever the prior expects of it, they begin again, up to six times: where about half of the
-    values found are drawn anew from their prior, with the likeliest of eight such instruments. The
-    end of the largest ln p counts.
+    values found, or all, are drawn anew from their prior, with the likeliest of eight such
+    instruments. The end of the largest ln p counts.
 
     Parameters
     ----------
@@ -284,14 +287,15 @@ def _approached(
 
 
 def _elsewhere(setup: Setup, data: Visibilities, found: Inference, way: int) -> Around:
-    """Where else rounds may begin: the likeliest of draws that keep half of the values found."""
+    """Where else rounds may begin: the likeliest of draws, which may keep half of the values."""
     rng, best = np.random.default_rng(way), None
     parts = [part for part in found.expanded if not part.systematic.learns]
     for _ in range(CANDIDATES):
         values, log_prior = {}, 0.0
         for part in parts:
             drawn = rng.standard_normal(len(part.centre))
-            z = np.where(rng.random(len(drawn)) < 0.5, part.centre, drawn)
+            kept = rng.random(len(drawn)) < KEPT[way % len(KEPT)]
+            z = np.where(kept, part.centre, drawn)
             values |= part.systematic.in_units(z)
             log_prior -= 0.5 * float(z @ z)
         exact = _exact(setup, Around(data, values=values))

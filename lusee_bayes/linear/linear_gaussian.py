@@ -54,7 +54,7 @@ from lusee_bayes.linear.information import (
 )
 from lusee_bayes.linear.normal_matrix import has_structure, normal_matrix
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.noise.covariance import Covariance, Factor, LowRankFactor
+from lusee_bayes.noise.covariance import Covariance, Factor, LowRankFactor, LowRankUpdate
 from lusee_bayes.sky.prior import Prior
 
 
@@ -456,9 +456,11 @@ class FromInformation(Form):
 
             A^T N^-1 A = A^T N_0^-1 A - (R^-1 V^T L_0^-1 A)^T (R^-1 V^T L_0^-1 A),
 
-        unless A is another, too, or rounding of the first would be seen in Lambda.
+        unless there is no U, A is another, too, or rounding of the first would be seen in Lambda.
         """
         host, old = on_host(model), solution.factor
+        if not isinstance(host.noise, LowRankUpdate):
+            return cls.of(model)
         base = old.base if isinstance(old, LowRankFactor) else old
         factor, matrix = host.noise.factor(base), solution.matrix
         largest = (np.asarray(solution.posterior.lower) ** 2).sum(1).max()

@@ -181,19 +181,19 @@ class ChannelInformation:
         return Seen(self.share, np.asarray(self.information.reference), self.sky)
 
     def given(
-        self, tied: Tied | None, components: Components, number: int, scenario: Scenario
+        self, number: int, scenario: Scenario, tied: Tied | None, components: Components
     ) -> ChannelResult:
         """The channel given all data.
 
         Parameters
         ----------
-        tied : Tied or None
-            The prior of what is shared.
-        components : Components
         number : int
             Of the channel among those of the components.
         scenario : Scenario
             Of all channels.
+        tied : Tied or None
+            The prior of what is shared.
+        components : Components
         """
         information, unknowns, known = self.information, self.unknowns, self.known
         n, key, n_draws = information.n_modes, draw_key(scenario), scenario.output.draws
@@ -450,17 +450,17 @@ class ChannelAlone:
         """What the others need of it."""
         return Seen(self.share)
 
-    def given(self, tied: Tied, _: None, number: int, scenario: Scenario) -> ChannelResult:
+    def given(self, number: int, scenario: Scenario, tied: Tied) -> ChannelResult:
         """The channel given all data.
 
         Parameters
         ----------
-        tied : Tied
-            E', V' and draws of what is shared.
         number : int
             Of the channel among those that are tied.
         scenario : Scenario
             Of the channel.
+        tied : Tied
+            E', V' and draws of what is shared.
         """
         own, at = self.unknowns.shared, self.unknowns.among(tied)
         told = self.unknowns.amplitudes.integrated(self.mean, self.covariance)
@@ -689,10 +689,10 @@ def map_channels(
     def finish(number: int) -> None:
         """Write the result of a channel, given what all have in common."""
         channel = mapped[number]
-        own = scenario if scenario.joint else channel
+        common = (channel, tied) if components is None else (scenario, tied, components)
 
         def make() -> ChannelResult:
-            return files.read(channel, kind).given(tied, components, number, own)
+            return files.read(channel, kind).given(number, *common)
 
         files.kept(channel, ChannelResult, make)
 

@@ -370,7 +370,10 @@ def test_standard_deviations_are_right_or_refused():
     assert np.abs(std / exact.std - 1.0).max() < 1e-3  # 3e-2 is what comes
 
 
-@pytest.mark.parametrize(("before", "after", "gain"), [(0, 3, 1.0), (2, 3, 1.0), (2, 3, 1.01)])
+BESIDE = [(0, 3, 1.0), (2, 3, 1.0), (2, 3, 1.01), (2, 0, 1.0)]
+
+
+@pytest.mark.parametrize(("before", "after", "gain"), BESIDE)
 def test_beside_a_solved_model_columns_are_changed(before, after, gain):
     """A^T N^-1 A of one N_0 + U U^T from that of another: the textbook's posterior.
 

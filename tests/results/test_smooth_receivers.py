@@ -258,7 +258,7 @@ def test_a_channel_has_those_of_its_own_map(response_file, tmp_path, monkeypatch
     assert "Powers of receivers" in page and page.count("<td>regolith_k</td><td>K</td>") == 2
 
 
-@pytest.mark.parametrize("smooth", [False, True])
+@pytest.mark.parametrize("smooth", [pytest.param(False, marks=pytest.mark.long), True])
 def test_in_a_joint_posterior_they_are_those_of_all_skies_and_unknowns(
     smooth, response_file, tmp_path
 ):
