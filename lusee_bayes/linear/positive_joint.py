@@ -6,7 +6,7 @@ With the exponents phi_f = sum_c s_fc a_c + r_f of :mod:`.positive_skies`, ::
 
 About given exponents m_f is linear, m_f + W_f (phi - phi_f), and what the data of a channel say of
 phi is a quadratic form: W^T M W, W^T v. So a round is a joint posterior as :mod:`.joint` finds it,
-of maps without unit, and of unknowns w of the instrument that channels share, whose |w|^2 is part
+of maps without unit, and of unknowns w of the instrument that channels share, whose w^T w is part
 of E. The step to its mean is halved until E falls, and rounds are repeated until a step would gain
 nothing. Meanwhile A and tilt of the fields may be learned.
 The last posterior is the Gaussian about the mode, its evidence Laplace's.
