@@ -194,6 +194,7 @@ def test_seeds_of_simulated_receivers(response_file):
     assert true_values(setup) == true_values(replace(setup, scenario=one))
 
 
+@pytest.mark.essential
 @pytest.mark.usefixtures("numbers_alone")
 def test_after_earlier_data_residuals_are_those_of_the_new_ones(response_file, tmp_path):
     """No other frequency is near: what ties channels changes none of their numbers."""
