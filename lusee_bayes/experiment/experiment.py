@@ -20,6 +20,7 @@ from jaxtyping import PRNGKeyArray
 from lusee_bayes.core.arrays import Draws, on_device
 from lusee_bayes.core.checks import Described
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.leave_out import Fitting, fitting, without
 from lusee_bayes.experiment.model import model_to_sample, radiometer, set_up, simulate, systematics
@@ -27,7 +28,6 @@ from lusee_bayes.experiment.rounds import (
     MAX_ROUNDS,
     Inference,
     Report,
-    beginning,
     rebuilds,
     settled,
     with_learned_prior,
@@ -146,11 +146,14 @@ def observed(
     Parameters and errors are those of :func:`build`, but that no prior has to settle.
     """
     stages = stages or Stages()
-    data = None if data is None else data.with_truth_up_to(scenario.lmax)
+    if data is not None and data.truth is not None:
+        if len(data.truth) <= n_modes(scenario.lmax):  # of a sky that ends there
+            scenario = scenario.with_section("noise", above_lmax=None)
+        data = data.with_truth_up_to(scenario.lmax)
     setup = set_up(scenario, data, stages)
     if data is None:
         with stages("noise"):
-            return Experiment(setup, simulate(setup))
+            return Experiment(setup, simulate(setup).with_truth_up_to(scenario.lmax))
     std = np.sqrt(np.asarray(radiometer(setup).diagonal()))
     doubts = list(require_plausible(data, setup.signal, std))
     gains_known = data.calibration is not None and data.calibration.gain_names
@@ -183,7 +186,7 @@ def _learned(
     values: Mapping[str, float] | None = None,
 ) -> Experiment:
     setup, data = experiment.setup, experiment.data
-    start = None if values is None else beginning(setup, data, values)
+    start = None if values is None else Around(data, values=values)
     if setup.family is None:
         return (
             experiment if start is None else replace(experiment, found=settled(setup, data, start))
@@ -209,7 +212,7 @@ def under_sky(setup: Setup, source: SkySource, seed: int) -> Experiment:
     setup : Setup
         Of the scenario.
     source : SkySource
-        The sky; what it has above the scenario's lmax is left out.
+        The sky; what it has above the scenario's lmax is left out, but for what the model knows of.
     seed : int
         Of the noise and of the systematics.
 
@@ -221,7 +224,12 @@ def under_sky(setup: Setup, source: SkySource, seed: int) -> Experiment:
     scenario = setup.scenario.model_copy(update={"seed": seed})
     sky = source.at(scenario.frequency_mhz, scenario.lmax)
     seen = replace(setup.under(sky), scenario=scenario)
-    return _learned(Experiment(seen, simulate(seen)), Stages())
+    if seen.above is not None:
+        whole = source.at(scenario.frequency_mhz, scenario.noise.above_lmax.top(scenario.lmax))
+        modes = np.asarray(whole.modes)[seen.prior.size :]
+        seen = replace(seen, above=replace(seen.above, modes=modes))
+    data = simulate(seen).with_truth_up_to(scenario.lmax)
+    return _learned(Experiment(seen, data), Stages())
 
 
 def rounds_of(experiment: Experiment, stages: Stages, name: str) -> AbstractContextManager:

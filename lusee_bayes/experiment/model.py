@@ -14,7 +14,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 
-from lusee_bayes.core.arrays import Grid, on_device, on_host
+from lusee_bayes.core.arrays import Grid, Vector, on_device, on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario
@@ -26,6 +26,7 @@ from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.noise.covariance import Covariance, KnownFactor, LowRankUpdate
 from lusee_bayes.noise.radiometer import radiometer_noise
+from lusee_bayes.systematics.above_lmax import AboveLmax, sky_above
 from lusee_bayes.systematics.context import Around, Setup, noise_visibilities, prior_and_family
 from lusee_bayes.systematics.horizon import Horizon
 from lusee_bayes.systematics.noise_level import radiometer_about
@@ -106,7 +107,23 @@ def set_up(
     of_data = None if data is None else data.calibration, data is not None
     setup = Setup(scenario, *pieces, signal, receiver, *of_data, family)
     horizon = scenario.noise.horizon
-    return setup if horizon is None else Horizon.moved(horizon, setup, {})
+    setup = setup if horizon is None else Horizon.moved(horizon, setup, {})
+    return with_sky_above(setup)
+
+
+def with_sky_above(setup: Setup, parameters: Vector | None = None) -> Setup:
+    """The setup with the sky above lmax, where that is part of the model.
+
+    Parameters
+    ----------
+    setup : Setup
+    parameters : (parameters,) array, optional
+        Of the family of priors, learned from the data.
+    """
+    if AboveLmax.treatment(setup.scenario) is None:
+        return setup
+    std = np.sqrt(np.asarray(radiometer(setup).diagonal()))
+    return replace(setup, above=sky_above(setup, std, parameters))
 
 
 def require_fitting(data: Visibilities, scenario: Scenario) -> None:
@@ -310,13 +327,18 @@ def true_signal(setup: Setup, truth: Truth) -> Grid:
 
 
 def simulate(setup: Setup) -> Visibilities:
-    """Visibilities of the scenario's sky, with every draw from its seed."""
-    model = true_model(setup, true_values(setup))
+    """Visibilities of the scenario's sky, with every draw from its seed.
+
+    The truth is the sky that they hold, above lmax, too.
+    """
+    model, truth = true_model(setup, true_values(setup)), setup.sky.modes
     noise = model.noise.sample(jax.random.key(setup.scenario.seed))
+    if setup.above is not None:
+        truth = np.concatenate([truth, setup.above.modes])
     return Visibilities(
         model.predict(setup.sky.modes) + noise,
         setup.layout,
         setup.observation,
         setup.scenario.frequency_mhz,
-        setup.sky.modes,
+        truth,
     )

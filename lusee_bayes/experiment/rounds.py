@@ -18,7 +18,7 @@ from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.section import is_modelled
 from lusee_bayes.experiment import sky_sections
-from lusee_bayes.experiment.model import model_about, moved
+from lusee_bayes.experiment.model import model_about, moved, with_sky_above
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.amplitudes import Amplitudes, template_amplitudes
@@ -29,6 +29,7 @@ from lusee_bayes.noise.covariance import LowRankFactor
 from lusee_bayes.priors.families import PriorFamily
 from lusee_bayes.priors.learning import Learned, learn_whatever_fits
 from lusee_bayes.sky.prior import Prior
+from lusee_bayes.systematics.above_lmax import AboveLmax
 from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.gain_drifts import gains_about
 from lusee_bayes.systematics.noise_level import radiometer_about
@@ -55,6 +56,8 @@ CANDIDATES, STALLED = 8, 0.5
 # the part of the values found that these keep, way after way: where most are right, half are the
 # quickest, and where they all are wrong, none
 KEPT = 0.5, 0.0
+# an instrument is found with some of the times first, which have so many data a mode of the sky
+ENOUGH = 8
 # a prior is learned first when the map moves by less than this, and last when learning it again
 # moves the map by less than PRIOR_SETTLED; a step of learning that is not taken moves it by 0.01
 NEARLY, PRIOR_SETTLED, MAX_LEARNED = 0.5, 0.05, 8
@@ -203,7 +206,7 @@ def settled(
     data : Visibilities
     start : Around, optional
         What N is built around in the first round; by default the data and, where the instrument
-        is found, the sky of one as it is expected.
+        is found, the sky of one with these values, or as it is expected.
     learn : callable, optional
         ``learn(information, start)`` learns the prior, in the rounds: first when they have nearly
         settled, last when that moves the map by less than 0.05 standard deviations.
@@ -221,13 +224,20 @@ def settled(
         If N is not positive definite.
     """
     report = report or (lambda rounds, remark: None)
-    found, step = _approached(setup, data, start or beginning(setup, data), report)
-    for way in range(OTHER_WAYS):
-        if found.moving and not found.fits:
-            begin = _elsewhere(setup, data, found, way)
-            other = _approached(setup, data, begin, report)
-            if other[0].posterior.log_evidence > found.posterior.log_evidence:
-                found, step = other
+    start = start or Around(data)
+    if start.sky is None:
+        if (few := _fewer(setup, data)) is not None:
+            found, step = _nearby(*few, beginning(*few, start.values), report)
+            fixed = {
+                name
+                for s in found.expanded
+                if not s.systematic.moves
+                for name in s.systematic.names
+            }
+            values = (found.around.values or {}).items()
+            start = replace(start, values={n: v for n, v in values if n not in fixed})
+        start = beginning(setup, data, start.values)
+    found, step = _nearby(setup, data, start, report)
     moves, n_learned, learned, in_rounds = np.inf, 0, None, rebuilds(setup)
     while True:
         last, at_rest = not in_rounds or found.rounds >= MAX_ROUNDS, moves < SETTLED
@@ -257,6 +267,30 @@ def settled(
         unsettled=f"The map still moves by {moves:.2g} of its standard deviations after "
         f"{found.rounds} rounds of rebuilding N around it{advice}.",
     )
+
+
+def _fewer(setup: Setup, data: Visibilities) -> tuple[Setup, Visibilities] | None:
+    """Every so many of the times, where an instrument is to be found and these are enough."""
+    run = setup.observation.run
+    stride = len(data.data) // (ENOUGH * setup.prior.size)
+    if stride < 2 or not first_order(setup.scenario):
+        return None
+    keep = (np.arange(len(run)) - np.searchsorted(run, run)) % stride == 0
+    return setup.select(keep), data.select(keep)
+
+
+def _nearby(
+    setup: Setup, data: Visibilities, around: Around, report: Report
+) -> tuple[Inference, _Step]:
+    """Rounds until the map has nearly settled, and where it does not fit, from elsewhere."""
+    found, step = _approached(setup, data, around, report)
+    for way in range(OTHER_WAYS):
+        if found.moving and not found.fits:
+            begin = _elsewhere(setup, data, found, way)
+            other = _approached(setup, data, begin, report)
+            if other[0].posterior.log_evidence > found.posterior.log_evidence:
+                found, step = other
+    return found, step
 
 
 def _approached(
@@ -494,12 +528,33 @@ def with_learned_prior(
         Under that prior, with how it was learned.
     """
 
-    def learn(information: Information, known: Vector | None) -> Learned:
-        more = information if earlier is None else information + earlier
-        return learned_prior(setup, setup.family, more, known)
+    known = None
 
+    def whole(information: Information) -> Information:
+        return information if earlier is None else information + earlier
+
+    def learn(information: Information, at: Vector | None) -> Learned:
+        return learned_prior(setup, setup.family, whole(information), known if at is None else at)
+
+    if AboveLmax.treatment(setup.scenario) == "marginalised":
+        # what is expected above lmax follows from what is learned below
+        found = settled(setup, data, start, report=report)
+        known, start = first_parameters(setup, whole(found.solution.information)), found.around
+        setup = with_sky_above(setup, known)
     found = settled(setup, data, start, learn, report)
     return replace(setup, prior=found.learned.prior), found
+
+
+def first_parameters(setup: Setup, information: Information) -> Vector | None:
+    """Parameters of the setup's family that are learned up to a lower ell, if there are some."""
+    scenario, family, seed = setup.scenario, setup.family, setup.scenario.seed
+    coarse = family
+    if scenario.lmax > COARSE_LMAX:
+        coarse = scenario.prior.family(scenario.frequency_mhz, COARSE_LMAX)
+        n = n_modes(COARSE_LMAX)
+        information = integrated_out(information, n, np.asarray(setup.prior.variance())[n:])
+    found = learn_whatever_fits(coarse, information, seed=seed)
+    return family.start_from(coarse, found.parameters) if found.settled else None
 
 
 def learned_prior(
@@ -520,15 +575,9 @@ def learned_prior(
     start : (parameters,) array, optional
         Where to begin.
     """
-    scenario, seed = setup.scenario, setup.scenario.seed
-    if start is not None or scenario.lmax <= COARSE_LMAX:
-        return learn_whatever_fits(family, information, start, seed)
-    coarse = scenario.prior.family(scenario.frequency_mhz, COARSE_LMAX)
-    n = n_modes(COARSE_LMAX)
-    variance = np.asarray(setup.prior.variance())[n:]
-    first = learn_whatever_fits(coarse, integrated_out(information, n, variance), seed=seed)
-    start = family.start_from(coarse, first.parameters) if first.settled else None
-    return learn_whatever_fits(family, information, start=start, seed=seed)
+    if start is None and setup.scenario.lmax > COARSE_LMAX:
+        start = first_parameters(setup, information)
+    return learn_whatever_fits(family, information, start, setup.scenario.seed)
 
 
 # takes C_ell of the scenario's sky, which only simulations know

@@ -23,6 +23,7 @@ from lusee_bayes.core.reading import as_yaml, parse_yaml, read_yaml
 from lusee_bayes.core.section import Frequency, Section, Seed
 from lusee_bayes.experiment import instrument_sections, sky_sections
 from lusee_bayes.flight.recipe import FlightSection
+from lusee_bayes.systematics.above_lmax import AboveLmaxSection
 from lusee_bayes.systematics.beam import BeamErrorSection
 from lusee_bayes.systematics.field_errors import FieldErrorsSection
 from lusee_bayes.systematics.registered import SYSTEMATICS, NoiseSection
@@ -265,7 +266,12 @@ class Scenario(Section):
         }
 
     def of_measured(self) -> Scenario:
-        """The scenario of measured data: beams that nobody calls exact have unknowns."""
+        """The scenario of measured data: beams that nobody calls exact have unknowns.
+
+        And the sky does not end at lmax.
+        """
+        if self.noise.above_lmax is None:
+            return self.with_section("noise", above_lmax=AboveLmaxSection()).of_measured()
         if self.beam.exact or self.noise.beam is not None or self.noise.fields is not None:
             return self
         known = {name: error * getattr(self.beam, name) for name, error in self.beam.errors.items()}

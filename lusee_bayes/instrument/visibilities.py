@@ -134,6 +134,11 @@ class Calibration:
             checks.require_shape("gain_slope", self.gain_slope, (n, times))
             checks.require_finite("gain_slope", self.gain_slope)
 
+    def select(self, keep: Bool[np.ndarray, " times"]) -> Calibration:
+        """Return that of the times where ``keep`` is True."""
+        slope = None if self.gain_slope is None else self.gain_slope[:, keep]
+        return replace(self, n_averaged=self.n_averaged[keep], gain_slope=slope)
+
 
 LOADS, LOAD = ("load_ohm_real", "load_ohm_imag"), ("load_frequency", "port", "port_2")
 # what to do where there is no file of them
@@ -318,6 +323,14 @@ class Visibilities(checks.Described):
         times, _, windows = windows_of(observation.times, timestamp, observation.step_s)
         seen = replace(observation, times=times, windows=windows)
         return replace(self, observation=seen, says_window=True)
+
+    def select(self, keep: Bool[np.ndarray, " times"]) -> Visibilities:
+        """Return the same at those times only where ``keep`` is True."""
+        layout = DataLayout.from_flags(~np.asarray(self.layout.present)[:, keep])
+        data = layout.gather(self.layout.scatter(self.data)[:, keep])
+        said = None if self.calibration is None else self.calibration.select(keep)
+        seen = self.observation.select(keep)
+        return replace(self, data=data, layout=layout, observation=seen, calibration=said)
 
     def with_truth_up_to(self, lmax: int) -> Visibilities:
         """Return the same with the truth of a map of this lmax: cut, or zero above its own."""

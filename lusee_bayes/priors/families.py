@@ -186,6 +186,11 @@ class PriorFamily(ABC):
     def at(self, parameters: Parameters) -> Member:
         """Return the member of these parameters."""
 
+    @property
+    def centre(self) -> Float[np.ndarray, " modes"] | None:
+        """Mean of all of its priors, in K; None for zero."""
+        return None
+
     def expected(self) -> Prior:
         """Return the prior of the parameters that are most probable before there are data."""
         return self.prior(self.at(self.hyperprior.start()).covariance)

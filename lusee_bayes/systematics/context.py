@@ -11,12 +11,12 @@ visibilities. What neither troubles is the map's own prediction, in rounds
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from lusee_bayes.core.arrays import Array, DataVector, Grid, Modes
 from lusee_bayes.core.errors import InputError
@@ -33,6 +33,36 @@ from lusee_bayes.sky.sky_source import Sky
 
 # visibilities that a term of N is built around: the modelled sky's, the data, or the map's own
 NoiseAbout = Literal["model", "measured", "posterior"]
+
+
+@dataclass(frozen=True)
+class Above:
+    """What the sky above lmax may add to the data.
+
+    Attributes
+    ----------
+    coupling : (data, modes) array
+        A of the modes there.
+    modes : (modes,) array
+        Of the modelled sky, in K.
+    family : PriorFamily or None
+        Priors up to the highest ell, of which data choose one; None for a prior that is given.
+    root : (data, rank) array
+        Of the covariance of what is added, in K.
+    mean : (data,) array
+        Its mean, in K.
+    """
+
+    coupling: Float[Array, "data modes"]
+    modes: Modes
+    family: PriorFamily | None
+    root: Float[Array, "data rank"]
+    mean: DataVector
+
+    def kept(self, place: Callable[[Array], Array]) -> Above:
+        """The same for other data; ``place`` finds theirs in an array of these."""
+        own = {name: place(getattr(self, name)) for name in ("coupling", "root", "mean")}
+        return replace(self, **own)
 
 
 @dataclass(frozen=True)
@@ -70,6 +100,8 @@ class Setup:
         Of which data choose the prior; None for a prior that is given.
     hidden : (runs, products, modes) array or None
         What the known horizon does to the beams, which do without it; None for flat ground.
+    above : Above or None
+        None where the model ends at lmax.
     """
 
     scenario: Any
@@ -88,6 +120,7 @@ class Setup:
     measured: bool = False
     family: PriorFamily | None = None
     hidden: Float[Array, "runs products modes"] | None = None
+    above: Above | None = None
 
     @property
     def frequency_mhz(self) -> float:
@@ -141,6 +174,29 @@ class Setup:
         complete = self.complete
         change = complete.layout.scatter(complete @ (sky.modes - self.sky.modes))
         return replace(self, sky=sky, signal=self.signal + change)
+
+    def select(self, keep: Bool[np.ndarray, " times"]) -> Setup:
+        """Return the same at those of its times where ``keep`` is True, some of every run."""
+        observation, turns = self.observation.select(keep), self.pointing
+        ends = np.searchsorted(observation.run, np.arange(observation.n_runs + 1)).tolist()
+        of_time = {"azimuth": turns.azimuth[keep], "functions": turns.functions[keep]}
+        pointing = replace(turns, **of_time, run_starts=tuple(ends))
+        layout = DataLayout.from_flags(~np.asarray(self.layout.present)[:, keep])
+        moved = {"pointing": pointing, "layout": layout}
+        background, calibration, above = self.background, self.calibration, self.above
+        if above is not None:
+            above = above.kept(lambda x: layout.gather(self.layout.scatter(x)[:, keep]))
+        return replace(
+            self,
+            observation=observation,
+            instrument=replace(self.instrument, **moved),
+            coupling=replace(self.coupling, **moved),
+            responses=tuple(grid[:, keep] for grid in self.responses),
+            background=background if background.ndim == 1 else background[:, keep],
+            signal=self.signal[:, keep],
+            calibration=None if calibration is None else calibration.select(keep),
+            above=above,
+        )
 
     @property
     def has_autos(self) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from pydantic import create_model
 
 from lusee_bayes.core.section import Section
+from lusee_bayes.systematics.above_lmax import AboveLmax
 from lusee_bayes.systematics.beam import BeamErrors
 from lusee_bayes.systematics.field_errors import FieldErrors
 from lusee_bayes.systematics.gain_drifts import GainDrifts
@@ -30,6 +31,7 @@ SYSTEMATICS: tuple[type[Systematic], ...] = (
     FieldErrors,
     Horizon,
     PointingOffsets,
+    AboveLmax,
     PointSources,
     Receivers,
     RegolithTemperature,

@@ -1,0 +1,150 @@
+"""The sky above the map's lmax: the antennas see it, and it is integrated out.
+
+::
+
+    d = A m + A' m' + n,    m' ~ N(mu', S'),
+
+m' being the modes from lmax + 1 up to lmax + margin, S' that part of the prior's covariance, and A'
+of the instrument as it is expected. Integrated out, A' mu' adds to the mean of the data, and A' S'
+A'^T to N. Left out of it are directions that together change chi^2 by less than one, and the
+correlation of m' with m, through which the data tell more of m' than N assumes. Where the data tell
+the prior, S' and mu' follow from the parameters that are learned at lmax.
+
+Simulated data hold the modes that the scenario's sky has up to lmax + margin.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Annotated, ClassVar
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import Field
+
+from lusee_bayes.core.arrays import Array, DataVector
+from lusee_bayes.core.harmonics import LARGEST_LMAX
+from lusee_bayes.core.linalg import checked_cholesky, gram_matrix
+from lusee_bayes.core.section import Section, Treatment
+from lusee_bayes.instrument.coupling import CouplingMatrix
+from lusee_bayes.instrument.pointing import Pointing
+from lusee_bayes.noise.covariance import LowRankCovariance
+from lusee_bayes.systematics.context import Above, Around, Setup
+from lusee_bayes.systematics.systematic import AdditiveNoise, with_added
+
+# by how much directions that are left out may change chi^2 together
+LEFT_OUT = 1.0
+
+
+class AboveLmaxSection(Section):
+    """The sky above the map's lmax.
+
+    Attributes
+    ----------
+    margin : int
+        By how much more than lmax the ell of what the antennas see may be.
+    least_lmax : int
+        How far it reaches at least.
+    treatment : {"marginalised", "sampled", "ignored"}
+        Its covariance is added to N, it is sampled with the map, or the model ends at lmax.
+    """
+
+    margin: Annotated[int, Field(ge=1, le=64)] = 16
+    least_lmax: Annotated[int, Field(ge=0, le=LARGEST_LMAX)] = 47
+    treatment: Treatment = "marginalised"
+
+    def top(self, lmax: int) -> int:
+        """Highest ell that is seen."""
+        return min(max(lmax + self.margin, self.least_lmax), LARGEST_LMAX)
+
+
+class AboveLmax(AdditiveNoise):
+    """What the sky above lmax adds to the data.
+
+    Attributes
+    ----------
+    root : (data, rank) array
+        A' S'^(1/2), in K.
+    mean : (data,) array
+        A' mu', in K.
+    """
+
+    key: ClassVar[str] = "noise.above_lmax"
+    section: ClassVar[type[Section]] = AboveLmaxSection
+    words: ClassVar[str] = "the sky above lmax"
+
+    root: Float[Array, "data rank"]
+    mean: DataVector
+
+    @classmethod
+    def build(cls, section: AboveLmaxSection, setup: Setup, around: Around) -> AboveLmax:
+        return cls("above_lmax", setup.layout, setup.above.root, setup.above.mean)
+
+    @classmethod
+    def truth(cls, section, setup, key):
+        """The scenario's own sky, which is no draw."""
+        return {}
+
+    @classmethod
+    def in_data(cls, section, setup, model, truth, key):
+        """Add the modes of the scenario's sky."""
+        coupling = _coupling(setup, section.top(setup.scenario.lmax))
+        return with_added(model, coupling @ setup.above.modes)
+
+    def behind(self, gains: DataVector) -> AboveLmax:
+        return replace(self, root=self.root * np.asarray(gains)[:, None])
+
+    def covariance(self) -> LowRankCovariance:
+        return LowRankCovariance(self.root, self.words)
+
+    def effect(self, model, values):
+        return with_added(super().effect(model, values), self.mean)
+
+    def marginalised(self, model):
+        """Add the covariance to N, and the mean to the data's."""
+        return with_added(super().marginalised(model), self.mean)
+
+
+def sky_above(
+    setup: Setup, std: DataVector, parameters: Float[np.ndarray, " parameters"] | None = None
+) -> Above:
+    """What the sky above lmax may add to the data.
+
+    Parameters
+    ----------
+    setup : Setup
+    std : (data,) array
+        Of the radiometer noise, in K.
+    parameters : (parameters,) array, optional
+        Of the setup's family of priors, learned from the data; by default what is expected of them.
+    """
+    scenario, n, known = setup.scenario, setup.prior.size, setup.above
+    frequency_mhz, lmax = scenario.frequency_mhz, scenario.noise.above_lmax.top(scenario.lmax)
+    if known is None:
+        sky, family = (
+            scenario.sky.at(frequency_mhz, lmax),
+            scenario.prior.family(frequency_mhz, lmax),
+        )
+        coupling, modes = _coupling(setup, lmax), np.asarray(sky.modes)[n:]
+        prior = None if family is not None else scenario.prior.prior(sky)
+    else:
+        coupling, modes, family = known.coupling, known.modes, known.family
+    if family is None:
+        covariance, mean = prior.covariance(), prior.mean
+    else:
+        at = family.hyperprior.start()
+        at = at if parameters is None else family.start_from(setup.family, parameters)
+        covariance, mean = family.at(at).covariance, family.centre
+    root = coupling @ checked_cholesky("the prior above lmax", np.asarray(covariance)[n:, n:])
+    white = root / np.asarray(std)[:, None]
+    values, vectors = np.linalg.eigh(gram_matrix(white))
+    root = root @ vectors[:, np.cumsum(values) > LEFT_OUT]
+    added = np.zeros(len(root)) if mean is None else coupling @ np.asarray(mean)[n:]
+    return Above(coupling, modes, family, root, added)
+
+
+def _coupling(setup: Setup, lmax: int) -> Float[np.ndarray, "data modes"]:
+    """A', of the modes above the setup's lmax."""
+    beams = setup.beam_source.beams(setup.frequency_mhz, lmax)
+    coupling = CouplingMatrix.build(beams, Pointing.of(setup.observation, lmax), setup.layout)
+    return np.asarray(coupling.dense())[:, setup.prior.size :]

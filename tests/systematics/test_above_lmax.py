@@ -1,0 +1,81 @@
+"""The sky above lmax: against the posterior of all modes, and skies that do not end at lmax."""
+
+import numpy as np
+import pytest
+
+import lusee_bayes as lb
+from lusee_bayes.core.harmonics import n_modes
+from lusee_bayes.experiment.model import full_model, radiometer, set_up, simulate, true_signal
+from lusee_bayes.systematics import above_lmax
+from lusee_bayes.systematics.context import prior_and_family
+
+LMAX, MARGIN = 5, 4
+N = n_modes(LMAX)
+SHARED = (
+    "observation={runs: [{cycles: 0.3}], step_s: 14400}",
+    "noise.radiometer.temperature=model",
+)
+
+
+def scenario(lmax, *more):
+    return lb.load_scenario("fiducial", [f"lmax={lmax}", *SHARED, *more])
+
+
+@pytest.fixture(scope="module", params=["isotropic, spectrum: sky", "local_scales"])
+def both(request):
+    """(scenario to lmax with what is above, setup of all modes)."""
+    prior = f"prior={{model: {request.param}}}"
+    own = scenario(LMAX, prior, f"noise.above_lmax={{margin: {MARGIN}}}")
+    return own, set_up(scenario(LMAX + MARGIN, prior))
+
+
+def test_integrated_out_is_the_marginal_of_the_posterior_of_all_modes(both, monkeypatch):
+    """Of a prior in which those above lmax are not correlated with the others."""
+    monkeypatch.setattr(above_lmax, "LEFT_OUT", 1e-16)
+    own, whole = both
+    data = simulate(whole).with_truth_up_to(LMAX)
+    setup = set_up(own, data)
+    a, n = np.asarray(whole.coupling.dense()), np.asarray(radiometer(setup).diagonal())
+    prior = prior_and_family(whole.scenario, whole.sky)[0]
+    s = np.array(prior.covariance())
+    mean = np.zeros(len(s)) if prior.mean is None else np.asarray(prior.mean)
+    s[:N, :N], s[:N, N:], s[N:, :N] = np.asarray(setup.prior.covariance()), 0.0, 0.0
+    # least squares of data and prior in white units: no matrix is squared
+    rows = np.concatenate([a / np.sqrt(n)[:, None], np.linalg.inv(np.linalg.cholesky(s))])
+    q, r = np.linalg.qr(rows)
+    white = np.concatenate([(data.data - a @ mean) / np.sqrt(n), np.zeros(len(s))])
+    root = np.linalg.inv(r)
+    expected, std = mean + root @ (q.T @ white), np.sqrt((root**2).sum(1))
+    posterior = full_model(setup).condition(data.data).posterior
+    # N is inverted with columns of up to 1e5 times the noise: 1e-16 x (1e5)^2 is lost
+    assert np.abs((posterior.mean - expected[:N]) / std[:N]).max() < 1e-3
+    np.testing.assert_allclose(posterior.std(), std[:N], rtol=1e-4)
+
+
+def test_simulated_data_hold_what_the_sky_has_above_lmax(both):
+    own, whole = both
+    setup, ends_at_lmax = set_up(own), set_up(own.with_section("noise", above_lmax=None))
+    added = true_signal(setup, {}) - true_signal(ends_at_lmax, {})
+    expected = np.asarray(whole.coupling.dense())[:, N:] @ np.asarray(whole.sky.modes)[N:]
+    # sums of 1e4 K
+    np.testing.assert_allclose(added.ravel(), expected, atol=1e-10)
+    np.testing.assert_array_equal(simulate(setup).truth[N:], whole.sky.modes[N:])
+
+
+@pytest.mark.parametrize("prior", ["isotropic", "local_scales"])
+def test_a_sky_that_does_not_end_at_lmax_has_error_bars_that_are_right(prior):
+    """chi^2 per direction of those that the data know best; an order of magnitude off without."""
+    given = "lmax=8", f"prior={{model: {prior}}}", "observation.step_s=14400"
+    sky = "noise.above_lmax={margin: 16, treatment: ignored}"
+    data = simulate(set_up(lb.load_scenario("fiducial", [*given, sky])))
+    found = []
+    for above in ("{}", "null"):
+        own = lb.load_scenario("fiducial", [*given, f"noise.above_lmax={above}"])
+        posterior = lb.infer(lb.build(own, data)).posterior
+        truth = np.asarray(data.truth)[: posterior.prior.size]
+        white = posterior.prior.whiten(truth - posterior.mean)
+        shares, directions = np.linalg.eigh(posterior.lower @ posterior.lower.T)
+        known = shares > 1e2
+        found.append(np.mean((directions.T @ white)[known] ** 2 * shares[known]))
+    with_it, without = found
+    assert 0.5 < with_it < 1.5 < 5.0 < without
