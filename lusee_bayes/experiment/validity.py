@@ -54,6 +54,8 @@ SEEN = 3.0
 FIELDS_NAME = "the ports' fields"
 # what raises chi^2 by less is what a sky can absorb altogether, but for rounding
 NOTHING = 1e-3
+# standard deviations of the noise that the sky above lmax may add without being mentioned
+LITTLE = 0.1
 # errors that a sentence names
 MOST_NAMED = 4
 
@@ -224,6 +226,22 @@ def blind_spots(
     return tuple(spots)
 
 
+def about_sky_above(setup: Setup) -> str:
+    """What the sky above lmax adds to the data, and where it ends; empty where that is little."""
+    if (above := setup.above) is None:
+        return ""
+    added = float(np.sqrt(above.power.sum() / len(above.root)))
+    if added < LITTLE:
+        return ""
+    lmax, rest = setup.scenario.lmax, np.append(np.cumsum(above.power[::-1])[::-1], 0.0)
+    enough = lmax + int(np.argmax(rest < np.sqrt(2.0 * len(above.root))))
+    return (
+        f"The sky above lmax = {lmax} adds about {added:.2g} standard deviations of the noise to "
+        "every datum (rms). It is integrated out, so that the error bars hold, but the data tell "
+        f"less of the map; above lmax = {enough} it would add less to chi^2 than chance."
+    )
+
+
 def reach(experiment: Experiment, found: Inference) -> list[str]:
     """What is doubtful about the Gaussian, and what data would not show, a sentence each.
 
@@ -244,6 +262,7 @@ def reach(experiment: Experiment, found: Inference) -> list[str]:
             f"{moved_by:.2g} of its standard deviations (rms), so that {holds}; "
             "treatment=sampled does without the Gaussian."
         )
+    sentences += filter(None, [about_sky_above(setup)])
     if setup.measured:
         spots = blind_spots(setup, found, found.posterior.mean, pointing=False)
         sentences += filter(None, [blind_sentence(spots)])

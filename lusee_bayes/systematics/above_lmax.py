@@ -135,12 +135,15 @@ def sky_above(
         at = family.hyperprior.start()
         at = at if parameters is None else family.start_from(setup.family, parameters)
         covariance, mean = family.at(at).covariance, family.centre
-    root = coupling @ checked_cholesky("the prior above lmax", np.asarray(covariance)[n:, n:])
-    white = root / np.asarray(std)[:, None]
+    covariance, std = np.asarray(covariance)[n:, n:], np.asarray(std)[:, None]
+    power = ((coupling / std) ** 2).sum(0) * np.diagonal(covariance)
+    power = np.add.reduceat(power, np.arange(scenario.lmax + 1, lmax + 1) ** 2 - n)
+    root = coupling @ checked_cholesky("the prior above lmax", covariance)
+    white = root / std
     values, vectors = np.linalg.eigh(gram_matrix(white))
     root = root @ vectors[:, np.cumsum(values) > LEFT_OUT]
     added = np.zeros(len(root)) if mean is None else coupling @ np.asarray(mean)[n:]
-    return Above(coupling, modes, family, root, added)
+    return Above(coupling, modes, family, root, added, power)
 
 
 def _coupling(setup: Setup, lmax: int) -> Float[np.ndarray, "data modes"]:

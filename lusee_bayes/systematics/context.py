@@ -51,6 +51,8 @@ class Above:
         Of the covariance of what is added, in K.
     mean : (data,) array
         Its mean, in K.
+    power : (ells,) array
+        What each ell from lmax + 1 on is expected to add to chi^2 of a model without it.
     """
 
     coupling: Float[Array, "data modes"]
@@ -58,6 +60,7 @@ class Above:
     family: PriorFamily | None
     root: Float[Array, "data rank"]
     mean: DataVector
+    power: Float[np.ndarray, " ells"]
 
     def kept(self, place: Callable[[Array], Array]) -> Above:
         """The same for other data; ``place`` finds theirs in an array of these."""

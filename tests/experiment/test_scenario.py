@@ -328,6 +328,7 @@ WITHIN = {
     "noise.receiver": "noise.receiver={power_k: 100}",
     "noise.regolith": "noise.regolith={std_k: 20}",
     "noise.polarisation": "noise.polarisation={}",
+    "noise.above_lmax": "noise.above_lmax={}",
     "noise.gain_table": "noise.gain_table={std: 0.01}",
     "sources.list.0": "sources.list=[{name: Cas A}]",
     "flight": "flight={}",

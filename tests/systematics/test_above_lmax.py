@@ -25,7 +25,7 @@ def scenario(lmax, *more):
 def both(request):
     """(scenario to lmax with what is above, setup of all modes)."""
     prior = f"prior={{model: {request.param}}}"
-    own = scenario(LMAX, prior, f"noise.above_lmax={{margin: {MARGIN}}}")
+    own = scenario(LMAX, prior, f"noise.above_lmax={{margin: {MARGIN}, least_lmax: 0}}")
     return own, set_up(scenario(LMAX + MARGIN, prior))
 
 
@@ -62,11 +62,13 @@ def test_simulated_data_hold_what_the_sky_has_above_lmax(both):
     np.testing.assert_array_equal(simulate(setup).truth[N:], whole.sky.modes[N:])
 
 
-@pytest.mark.parametrize("prior", ["isotropic", "local_scales"])
+@pytest.mark.parametrize(
+    "prior", ["isotropic", pytest.param("local_scales", marks=pytest.mark.essential)]
+)
 def test_a_sky_that_does_not_end_at_lmax_has_error_bars_that_are_right(prior):
     """chi^2 per direction of those that the data know best; an order of magnitude off without."""
     given = "lmax=8", f"prior={{model: {prior}}}", "observation.step_s=14400"
-    sky = "noise.above_lmax={margin: 16, treatment: ignored}"
+    sky = "noise.above_lmax={treatment: ignored}"
     data = simulate(set_up(lb.load_scenario("fiducial", [*given, sky])))
     found = []
     for above in ("{}", "null"):
@@ -78,4 +80,5 @@ def test_a_sky_that_does_not_end_at_lmax_has_error_bars_that_are_right(prior):
         known = shares > 1e2
         found.append(np.mean((directions.T @ white)[known] ** 2 * shares[known]))
     with_it, without = found
-    assert 0.5 < with_it < 1.5 < 5.0 < without
+    # an isotropic prior gives the sky between the spots of the plane more power than it has
+    assert 0.2 < with_it < 1.5 < 5.0 < without
