@@ -87,6 +87,8 @@ class Experiment(Described):
         return self.setup.scenario
 
 
+# numbers of the largest matrix of data and modes above lmax that is made: 4 GB
+MOST_ABOVE = 5e8
 GAIN_ERRORS = (
     "The gains may be off by errors that are known (flight.gain_std, or the gain table's own) and "
     "not part of N: give noise.gain_table={}."
@@ -146,16 +148,26 @@ def observed(
     Parameters and errors are those of :func:`build`, but that no prior has to settle.
     """
     stages = stages or Stages()
+    doubts, above = [], scenario.noise.above_lmax
     if data is not None and data.truth is not None:
         if len(data.truth) <= n_modes(scenario.lmax):  # of a sky that ends there
-            scenario = scenario.with_section("noise", above_lmax=None)
+            above = None
         data = data.with_truth_up_to(scenario.lmax)
+    if above is not None and data is not None:
+        entries = data.layout.size * n_modes(above.top(scenario.lmax))
+        if entries > MOST_ABOVE:
+            above = None
+            doubts.append(
+                f"The model ends at lmax = {scenario.lmax}: of {data.layout.size:,} data, what the "
+                "sky adds above that takes too much memory; average them, or raise lmax."
+            )
+    scenario = scenario.with_section("noise", above_lmax=above)
     setup = set_up(scenario, data, stages)
     if data is None:
         with stages("noise"):
             return Experiment(setup, simulate(setup).with_truth_up_to(scenario.lmax))
     std = np.sqrt(np.asarray(radiometer(setup).diagonal()))
-    doubts = list(require_plausible(data, setup.signal, std))
+    doubts += require_plausible(data, setup.signal, std)
     gains_known = data.calibration is not None and data.calibration.gain_names
     if gains_known and scenario.noise.gain_table is None:
         doubts.append(GAIN_ERRORS)

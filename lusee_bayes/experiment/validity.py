@@ -228,7 +228,8 @@ def blind_spots(
 
 def about_sky_above(setup: Setup) -> str:
     """What the sky above lmax adds to the data, and where it ends; empty where that is little."""
-    if (above := setup.above) is None:
+    above, section = setup.above, setup.scenario.noise.above_lmax
+    if above is None or section.treatment == "ignored":
         return ""
     added = float(np.sqrt(above.power.sum() / len(above.root)))
     if added < LITTLE:

@@ -219,7 +219,7 @@ class Conditioned:
         return {
             "log_evidence": float(posterior.log_evidence),
             "information_bits": float(posterior.information_bits()),
-            "chi2": float(model.chi2(posterior.mean, data)),
+            "chi2": float(model.chi2(posterior.mean, data)) - self.judged.solution.excess,
             "chi2_expected": self.expected,
             "chi2_model": self.judged.solution.chi2,
             "refinement": float(posterior.refinement),

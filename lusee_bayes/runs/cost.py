@@ -40,6 +40,8 @@ LEARNING_SQUARES, LEARNING_OPERATIONS = 4, 80
 IN_ROUNDS, FIELD_ARRAYS = 3e5, 8
 # what comparing times of flight data adds, in n_data n^2
 COMPARING_OPERATIONS = 40
+# of the sky above lmax: arrays of data, and floating-point operations a datum and in n^3
+ABOVE_ARRAYS, ABOVE_OPERATIONS = 4, 12
 # pixels of every map of a report, and of what each is made of
 MAPS = 12
 # arrays of data for each source that is in the model
@@ -158,6 +160,10 @@ def posterior_cost(scenario: Scenario, n_draws: int = 0, n_data: int | None = No
         n_errors = 0 if fields is None else 16 * (fields.lmax + 1) ** 2
         operations += IN_ROUNDS * n_channels * float(n_data) * (n_modes + n_errors)
         squares += FIELD_ARRAYS * float(n_data) * n_errors
+    if (above := scenario.noise.above_lmax) is not None:
+        n_above = float(above.top(scenario.lmax) + 1) ** 2
+        squares += ABOVE_ARRAYS * n_data * n_above + 2.0 * n_above**2
+        operations += ABOVE_OPERATIONS * n_channels * (n_data * n_above**2 + n_above**3)
     if scenario.flight is not None and scenario.flight.leave_out:
         operations += n_channels * COMPARING_OPERATIONS * float(n_data) * float(n_modes) ** 2
         # without room for it they are not compared
