@@ -8,14 +8,14 @@ much they scatter is therefore counted, too, over the pulls of a few hundred dra
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from lusee_bayes.core.arrays import Draws, Modes, Pixels
-from lusee_bayes.core.harmonics import mode_numbers, modes_to_map
+from lusee_bayes.core.arrays import Draws, Modes, Pixels, Vector
+from lusee_bayes.core.harmonics import lmax_of, mode_numbers, modes_to_map
 from lusee_bayes.core.lazy import healpy, special
 
 # of the central intervals that are counted, and their names in files
@@ -106,11 +106,19 @@ class Counts:
             Draws of the posterior less its mean, in K.
         """
         nside = healpy.npix2nside(len(std))
-        bands = latitudes(nside)
         pulls = (modes_to_map(x, nside) / std for x in (error, *deviations))
-        counted = [_statistics(one, bands.values()) for one in pulls]
-        sizes = tuple(int(inside.sum()) for inside in bands.values())
-        return cls(tuple(bands), sizes, np.stack(counted, axis=2))
+        return cls._of(latitudes(nside), pulls)
+
+    @classmethod
+    def of_modes(cls, std: Modes, error: Modes, deviations: Draws) -> Counts:
+        """By multipole, of harmonic coefficients; what is known exactly pulls at nothing."""
+        width = np.where(std > 0, std, np.inf)
+        return cls._of(multipoles(lmax_of(len(std))), (x / width for x in (error, *deviations)))
+
+    @classmethod
+    def _of(cls, parts: Mapping[str, np.ndarray], pulls: Iterable[np.ndarray]) -> Counts:
+        counted = np.stack([_statistics(one, parts.values()) for one in pulls], axis=2)
+        return cls(tuple(parts), tuple(int(inside.sum()) for inside in parts.values()), counted)
 
     def coverage(self) -> tuple[Coverage, ...]:
         """What was counted, with its scatter, part by part."""
@@ -125,7 +133,7 @@ class Counts:
 
 
 def _statistics(
-    pulls: Pixels, parts: Iterable[Bool[np.ndarray, " pixels"]]
+    pulls: Vector, parts: Iterable[Bool[np.ndarray, " n"]]
 ) -> Float[np.ndarray, "parts statistics"]:
     limits = special.ndtri(0.5 + 0.5 * np.array(LEVELS))
     found = []
