@@ -12,7 +12,8 @@ there; the quadratic form holds near theta* only, and further ones may leave for
 own.
 
 With the sky integrated out, ln p(d, theta) is maximised by Fisher scoring: its gradient is exact,
-its curvature the Fisher information, estimated from simulated data, and that of the hyperprior.
+its curvature the Fisher information, estimated from simulated data, and that of the hyperprior,
+corrected by how the gradient has changed along earlier steps.
 Around the maximum theta is taken for normal; the prior that is returned has the variances' means
 over it. The evidence is the integral of p(d, theta) by Laplace's approximation, in coordinates that
 know the hyperprior's tails.
@@ -30,6 +31,7 @@ each S(theta).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -106,6 +108,8 @@ def normal_scores(
 # the maximum is found when the next step could not add more than this to ln p
 SETTLED = 0.03
 MAX_STEPS = 60
+# where ln p is less curved along a step than this part of what is expected, that is not used
+STEEP_ENOUGH = 1e-3
 # longest step of a parameter
 LONGEST = 3.0
 # shortest part of a step that is tried
@@ -226,10 +230,14 @@ def learn(
     InputError
         If S is not positive definite.
     """
-    rng = np.random.default_rng(seed)
+    rng, before, moves = np.random.default_rng(seed), None, []
     here = _at(family, information, family.hyperprior.start() if start is None else start)
     for steps in range(MAX_STEPS + 1):
-        gradient, curvature = here.slope(family), here.curvature(family, rng, SIMULATIONS)
+        gradient = here.slope(family)
+        if before is not None:
+            moves.append((here.parameters - before[0], before[1] - gradient))
+        before = here.parameters, gradient
+        curvature = _corrected(here.curvature(family, rng, SIMULATIONS), moves)
         step = np.linalg.solve(curvature, gradient)
         gain = 0.5 * float(gradient @ step)
         if gain < SETTLED:
@@ -239,6 +247,16 @@ def learn(
         f"the prior's parameters did not settle in {MAX_STEPS} steps: the next would still add "
         f"{gain:.2g} to ln p (accepted: {SETTLED:g})"
     )
+
+
+def _corrected(curvature: Square, moves: Sequence[tuple[Parameters, Parameters]]) -> Square:
+    """The curvature that says of earlier steps how the gradient fell (Broyden, Fletcher et al.)."""
+    for step, fall in moves:
+        along = curvature @ step
+        if fall @ step > STEEP_ENOUGH * (step @ along):
+            curvature = curvature - np.outer(along, along) / (step @ along)
+            curvature = curvature + np.outer(fall, fall) / (fall @ step)
+    return curvature
 
 
 def learn_whatever_fits(
