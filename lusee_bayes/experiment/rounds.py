@@ -195,6 +195,7 @@ def settled(
     two of them apart. Rounds therefore begin with radiometer noise that is larger, so that chi^2
     of what N is built around is 10 per datum, and the sky of each instrument is found anew
     (variable projection: first order in values then has no product with a change of the sky).
+    Where data are many, this is done with every so many of the times first.
     Values go part of the way where they would go far, or swing. Where no sky fits at their end,
     whatever the prior expects of it, they begin again, up to six times: where about half of the
     values found, or all, are drawn anew from their prior, with the likeliest of eight such
