@@ -2,9 +2,11 @@
 
 ::
 
-    m = T + s_T x_1 T + s_0 x_0 Y_00 + sum_b f_b s_b y(b) + R sum_j w_j P [sqrt(v_j) n_j]
+    m = T + s_T x_1 T + s_0 x_0 Y_00 + sum_k s_k x_k o(k) + sum_b f_b s_b y(b)
+          + R sum_j w_j P [sqrt(v_j) n_j]
 
-T is a template; its scale and the monopole are wide. y(b) are point sources of the catalogue. n_j
+T is a template; its scale and the monopole are wide. o(k) are extended objects that are known by
+name, y(b) point sources of the catalogue. n_j
 is white noise on the sphere, v_j(p) a positive field, P the harmonic analysis, w_j windows in ell
 an octave wide with sum_j w_j^2 = 1, and R = diag(C_ell^1/2). Where all v_j = 1 the last term is an
 isotropic field of spectrum C_ell. Its covariance is R sum_j w_j W(v_j) w_j R, W(v) being the matrix
@@ -29,7 +31,13 @@ from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.linalg import checked_cholesky, scaled
 from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.priors.families import Hyperprior, Member, Parameters, PriorFamily, SpectrumBasis
-from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, PointSource, galaxy_map
+from lusee_bayes.sky.galaxy import (
+    BRIGHT_SOURCES,
+    EXTENDED_OBJECTS,
+    ExtendedObject,
+    PointSource,
+    galaxy_map,
+)
 from lusee_bayes.sky.prior import PIVOT, DensePrior
 from lusee_bayes.sky.sky_source import galaxy_sky
 
@@ -179,8 +187,8 @@ class LocalScales(PriorFamily):
     ----------
     mean : (modes,) array
         T, in K.
-    wide : (modes, 2) array
-        Template and monopole, times their standard deviations, in K.
+    wide : (modes, 2 + objects) array
+        Template, monopole and extended objects, times their standard deviations, in K.
     sources : (modes, sources) array
         Catalogued sources, in K.
     spectrum : SpectrumBasis
@@ -191,7 +199,7 @@ class LocalScales(PriorFamily):
     """
 
     mean: Modes
-    wide: Float[np.ndarray, "modes 2"]
+    wide: Float[np.ndarray, "modes wide"]
     sources: Float[np.ndarray, "modes sources"]
     spectrum: SpectrumBasis
     bands: tuple[Band, ...]
@@ -333,7 +341,10 @@ class LocalScalesMember(Member):
 
 
 def embedded_local_scales(
-    frequency_mhz: float, lmax: int, sources: tuple[PointSource, ...] = BRIGHT_SOURCES
+    frequency_mhz: float,
+    lmax: int,
+    sources: tuple[PointSource, ...] = BRIGHT_SOURCES,
+    objects: tuple[ExtendedObject, ...] = EXTENDED_OBJECTS,
 ) -> LocalScales:
     """Make the family whose template is the embedded diffuse sky.
 
@@ -343,6 +354,8 @@ def embedded_local_scales(
     lmax : int
     sources : tuple of PointSource
         The catalogue: those that may be there.
+    objects : tuple of ExtendedObject
+        Those that may be brighter or darker than their surroundings.
     """
     # the template, and the same sky where hardly anything is absorbed
     clear_mhz = max(TRANSPARENT_MHZ, frequency_mhz)
@@ -352,7 +365,9 @@ def embedded_local_scales(
     monopole[0] = mean[0]
     strength = RELATIVE_STRENGTH * np.exp(smoothed[0].mean_log)
     modes = [source.modes(frequency_mhz, lmax) for source in sources]
-    wide = np.stack([SCALE_WIDTH * mean, MONOPOLE_WIDTH * monopole], axis=1)
+    level = mean[0] / np.sqrt(4.0 * np.pi)
+    extended = [level * one.strength * one.modes(lmax) for one in objects]
+    wide = np.stack([SCALE_WIDTH * mean, MONOPOLE_WIDTH * monopole, *extended], axis=1)
     of_sources = np.reshape(modes, (-1, n_modes(lmax))).T
     spectrum = SpectrumBasis.around(4.0 * np.pi * strength**2 / 100.0, lmax)
     bands = tuple(Band.of(window, *smoothed) for window in windows(lmax))

@@ -40,7 +40,7 @@ from scipy.constants import Boltzmann, speed_of_light
 
 from lusee_bayes.core.arrays import Vector
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import require_nside, synthesis_matrix
+from lusee_bayes.core.harmonics import per_mode, require_nside, synthesis_matrix
 from lusee_bayes.core.lazy import coordinates, healpy
 
 Numbers = float | np.ndarray
@@ -263,6 +263,59 @@ class PointSource:
         l_deg, b_deg = self.galactic()
         theta, phi = np.array([np.radians(90.0 - b_deg)]), np.array([np.radians(l_deg)])
         return self.kelvin_steradian(frequency_mhz) * synthesis_matrix(theta, phi, lmax)[0]
+
+
+@dataclass(frozen=True)
+class ExtendedObject:
+    """A disc or a shell of the sky whose brightness is not known.
+
+    Attributes
+    ----------
+    name : str
+    l_deg, b_deg : float
+        Its centre, Galactic.
+    radius_deg : float
+        Of a shell; 0 for a disc.
+    width_deg : float
+        FWHM of the shell, or of the disc.
+    strength : float
+        Standard deviation of its brightness over the mean brightness of the sky.
+    """
+
+    name: str
+    l_deg: float
+    b_deg: float
+    radius_deg: float
+    width_deg: float
+    strength: float
+
+    def modes(self, lmax: int) -> Float[np.ndarray, " modes"]:
+        """Coefficients of a brightness that is one where the object is brightest."""
+        x, weight = np.polynomial.legendre.leggauss(N_POLAR)
+        away = (np.degrees(np.arccos(x)) - self.radius_deg) / self.width_deg
+        profile = weight * np.exp(-4.0 * np.log(2.0) * away**2)
+        zonal = 2.0 * np.pi * np.polynomial.legendre.legvander(x, lmax).T @ profile
+        theta, phi = np.radians([90.0 - self.b_deg]), np.radians([self.l_deg])
+        return per_mode(zonal) * synthesis_matrix(theta, phi, lmax)[0]
+
+
+# nodes in the polar angle, for widths of a degree and more
+N_POLAR = 1024
+# Loops: Berkhuijsen, Haslam & Salter 1971 (A&A 14, 252). Other centres and sizes: SIMBAD. Strengths
+# are those of surveys at 22 to 408 MHz to within a factor of two, rounded up; where ionised gas
+# absorbs, an object is darker than its surroundings.
+EXTENDED_OBJECTS = (
+    ExtendedObject("LMC", 280.5, -32.9, 0.0, 6.0, 0.5),
+    ExtendedObject("SMC", 302.8, -44.3, 0.0, 3.0, 0.2),
+    ExtendedObject("Cygnus X", 80.0, 1.0, 0.0, 7.0, 1.0),
+    ExtendedObject("Vela", 263.6, -2.8, 0.0, 7.0, 0.5),
+    ExtendedObject("Gum nebula", 258.0, -2.0, 0.0, 30.0, 0.2),
+    ExtendedObject("Orion-Eridanus", 200.0, -25.0, 0.0, 35.0, 0.1),
+    ExtendedObject("Loop I", 329.0, 17.5, 58.0, 10.0, 0.2),
+    ExtendedObject("Loop II", 100.0, -32.5, 45.5, 8.0, 0.1),
+    ExtendedObject("Loop III", 124.0, 15.5, 32.5, 8.0, 0.1),
+    ExtendedObject("Loop IV", 315.0, 48.5, 20.0, 6.0, 0.1),
+)
 
 
 def kelvin_steradian(flux_jy: Numbers, frequency_mhz: Numbers) -> Numbers:

@@ -11,9 +11,9 @@ from assertions import refuse
 from scipy.integrate import quad
 
 import lusee_bayes as lb
-from lusee_bayes.core.harmonics import modes_to_map
+from lusee_bayes.core.harmonics import modes_to_map, synthesis_matrix
 from lusee_bayes.sky import galaxy
-from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
+from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, EXTENDED_OBJECTS
 
 NSIDE = 64
 
@@ -347,3 +347,17 @@ def test_kelvin_steradian_is_the_rayleigh_jeans_law():
     assert source.kelvin_steradian(30.0) == pytest.approx(0.01, rel=1e-12)
     # Cyg A at 38 MHz, 25.5 kJy: lambda = 7.889 m gives 574.8 K sr; its flux is held to 1 %.
     assert SOURCES["Cyg A"].kelvin_steradian(38.0) == pytest.approx(574.8, rel=0.01)
+
+
+@pytest.mark.parametrize("one", [o for o in EXTENDED_OBJECTS if o.width_deg > 6.5])
+def test_an_extended_object_is_its_profile_about_its_centre(one):
+    """Width w: what is above lmax = 95 is exp(-(95 w / 2.355)^2 / 2), 1e-5 at most."""
+    rng = np.random.default_rng(3)
+    points = rng.standard_normal((200, 3))
+    points /= np.linalg.norm(points, axis=1)[:, None]
+    theta, phi = np.arccos(points[:, 2]), np.arctan2(points[:, 1], points[:, 0])
+    centre = hp.ang2vec(one.l_deg, one.b_deg, lonlat=True)
+    away = np.degrees(np.arccos(points @ centre)) - one.radius_deg
+    expected = np.exp(-0.5 * (away / (one.width_deg / np.sqrt(8.0 * np.log(2.0)))) ** 2)
+    found = synthesis_matrix(theta, phi, 95) @ one.modes(95)
+    np.testing.assert_allclose(found, expected, atol=1e-4)
