@@ -316,7 +316,8 @@ class MixedProducts:
         turned = weights(np.zeros((n, n)), reversed_times=True)
         known.append(DataMistake("the times are reversed", "sort the data by time", turned))
         names = [f"product {product.label}" for product in all_products(n_ports)]
-        known += list(map(self._factor, names, np.eye(n)))
+        some = np.asarray(self.here.data.layout.present).any(1)
+        known += [self._factor(names[k], np.eye(n)[k]) for k in np.flatnonzero(some)]
         known.append(self._factor("every auto", autos * 1.0))
         known += [self._gain(k, 1.0 * (first == k) + (second == k)) for k in range(n_ports)]
         known.append(self._constant(np.flatnonzero(autos)))
