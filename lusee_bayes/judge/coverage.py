@@ -73,60 +73,36 @@ class Coverage:
         }
 
 
-@dataclass(frozen=True)
-class Counts:
-    """Statistics of the pulls of the truth and of draws, part by part.
+def coverage_of_pixels(std: Pixels, error: Modes, deviations: Draws) -> tuple[Coverage, ...]:
+    """Count how many pixels are held by their error bars, by Galactic latitude.
 
-    Attributes
+    Parameters
     ----------
-    names : tuple of str
-        Of the parts.
-    sizes : tuple of int
-        Number of pixels or modes of each.
-    values : (parts, statistics, skies) array
-        Shares within the intervals of ``LEVELS``, rms and largest absolute pull; of the truth
-        first, then of every draw.
+    std : (pixels,) array
+        HEALPix RING, Galactic, in K.
+    error : (modes,) array
+        Truth less mean, in K.
+    deviations : (draws, modes) array
+        Draws of the posterior less its mean, in K, which tell the scatter.
     """
-
-    names: tuple[str, ...]
-    sizes: tuple[int, ...]
-    values: Float[np.ndarray, "parts statistics skies"]
-
-    @classmethod
-    def of_pixels(cls, std: Pixels, error: Modes, deviations: Draws) -> Counts:
-        """By Galactic latitude.
-
-        Parameters
-        ----------
-        std : (pixels,) array
-            HEALPix RING, Galactic, in K.
-        error : (modes,) array
-            Truth less mean, in K.
-        deviations : (draws, modes) array
-            Draws of the posterior less its mean, in K.
-        """
-        nside = healpy.npix2nside(len(std))
-        bands = latitudes(nside)
-        pulls = (modes_to_map(x, nside) / std for x in (error, *deviations))
-        counted = [_statistics(one, bands.values()) for one in pulls]
-        sizes = tuple(int(inside.sum()) for inside in bands.values())
-        return cls(tuple(bands), sizes, np.stack(counted, axis=2))
-
-    def coverage(self) -> tuple[Coverage, ...]:
-        """What was counted, with its scatter, part by part."""
-        truth, draws = self.values[..., 0], self.values[..., 1:]
-        n, allowed = len(LEVELS), np.quantile(draws[:, -1], ALLOWED, axis=1)
-        columns = (x.tolist() for x in (truth, draws.std(2), truth[:, n + 1], allowed))
-        parts = zip(self.names, self.sizes, *columns, strict=True)
-        return tuple(
-            Coverage(name, size, tuple(held[:n]), tuple(spread[:n]), held[n], spread[n], *largest)
-            for name, size, held, spread, *largest in parts
-        )
+    nside = healpy.npix2nside(len(std))
+    bands = latitudes(nside)
+    pulls = (modes_to_map(x, nside) / std for x in (error, *deviations))
+    counted = np.stack([_statistics(one, bands.values()) for one in pulls], axis=2)
+    truth, draws = counted[..., 0], counted[..., 1:]
+    n, allowed = len(LEVELS), np.quantile(draws[:, -1], ALLOWED, axis=1)
+    columns = (x.tolist() for x in (truth, draws.std(2), truth[:, n + 1], allowed))
+    sizes = (int(inside.sum()) for inside in bands.values())
+    return tuple(
+        Coverage(name, size, tuple(held[:n]), tuple(spread[:n]), held[n], spread[n], *largest)
+        for name, size, held, spread, *largest in zip(bands, sizes, *columns, strict=True)
+    )
 
 
 def _statistics(
     pulls: Pixels, parts: Iterable[Bool[np.ndarray, " pixels"]]
 ) -> Float[np.ndarray, "parts statistics"]:
+    """Shares within the intervals of ``LEVELS``, rms and largest absolute pull of each part."""
     limits = special.ndtri(0.5 + 0.5 * np.array(LEVELS))
     found = []
     for inside in parts:

@@ -33,7 +33,7 @@ from lusee_bayes.experiment.unknowns import Unknowns, flux_table, pointing_repor
 from lusee_bayes.experiment.validity import reach
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.judge import measures
-from lusee_bayes.judge.coverage import N_DRAWS, Counts
+from lusee_bayes.judge.coverage import N_DRAWS, coverage_of_pixels
 from lusee_bayes.judge.plausibility import about_information
 from lusee_bayes.judge.residuals import Residuals, residuals
 from lusee_bayes.judge.split import Split
@@ -208,7 +208,7 @@ class Conditioned:
         return replace(known, n_data=n_data, instrument=instrument)
 
     def compared(self) -> Float[np.ndarray, "more modes"] | None:
-        """Draws less the mean for :class:`.Counts`, in K; None where no truth is known."""
+        """Draws less the mean, in K, for :func:`.coverage_of_pixels`; None without a truth."""
         if self.experiment.data.truth is None:
             return None
         return self.drawn[-N_DRAWS:] - self.posterior.mean
@@ -358,7 +358,7 @@ def channel_result(
     log_likelihood : (n,) array
         Of the draws.
     compared : (more, modes) array, optional
-        Draws less mean for :class:`.Counts`, where the truth is known, in K.
+        Draws less mean for :func:`.coverage_of_pixels`, where the truth is known, in K.
     pixels : (pixels,) array, optional
         Standard deviations of pixels in K, where they are known already.
     instrument : Unknowns, optional
@@ -373,7 +373,7 @@ def channel_result(
     if width is None:
         width = pixel_std(covariance, round(np.sqrt(known.highest_altitude.size / 12)))
     if compared is not None and known.truth is not None:
-        held = Counts.of_pixels(width, known.truth - mean, np.asarray(compared)).coverage()
+        held = coverage_of_pixels(width, known.truth - mean, np.asarray(compared))
     power = known.prior_std**2
     share = np.divide(variance, power, out=np.zeros(len(variance)), where=power > 0)
     return ChannelResult(

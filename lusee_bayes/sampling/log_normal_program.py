@@ -54,11 +54,10 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.information import Information
 from lusee_bayes.sampling.hmc import Whitening
 from lusee_bayes.sampling.log_normal_prior import AMPLITUDE, STRUCTURE, TILT, LogNormalPrior
-from lusee_bayes.sky.positive_skies import LogNormalSky, matching_step
+from lusee_bayes.sky.positive_skies import LogNormalSky, Pair, matching_step
 from lusee_bayes.systematics.systematic import Chart
 
 # arrays that recur
-Pair = Float[np.ndarray, "2"]
 PairMatrix = Float[np.ndarray, "2 2"]
 Unknowns = Float[np.ndarray, " unknowns"]
 White = Float[Array, " unknowns"]

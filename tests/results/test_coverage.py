@@ -13,7 +13,7 @@ from lusee_bayes.core.trees import from_tree, to_tree
 from lusee_bayes.experiment.experiment import build, under_sky
 from lusee_bayes.experiment.model import set_up
 from lusee_bayes.experiment.sky_sections import FileSkySection, GalaxySection
-from lusee_bayes.judge.coverage import LEVELS, Counts, Coverage
+from lusee_bayes.judge.coverage import LEVELS, Coverage, coverage_of_pixels
 from lusee_bayes.judge.measures import strengths, strengths_in_words
 from lusee_bayes.sky.sky_source import write_alms
 from lusee_bayes.testing.scenarios import small_scenario
@@ -45,7 +45,7 @@ def test_pixels_are_counted_by_latitude():
     error, draws = rng.standard_normal(N_MODES), rng.standard_normal((7, N_MODES))
     pull, *drawn = [modes_to_map(sky, NSIDE) / std for sky in (error, *draws)]
     b = np.degrees(np.pi / 2 - healpy.pix2ang(NSIDE, np.arange(len(std)))[0])
-    found = Counts.of_pixels(std, error, draws).coverage()
+    found = coverage_of_pixels(std, error, draws)
     names = ["|b| < 10 deg", "|b| 10 to 30 deg", "|b| > 30 deg", "whole sky"]
     assert [part.name for part in found] == names
     for part, (low, high) in zip(found, [(0, 10), (10, 30), (30, 90), (0, 90)], strict=True):
@@ -72,7 +72,7 @@ def ensemble():
         sky = prior * rng.standard_normal(N_MODES)
         mean = covariance @ (a.T @ (a @ sky + rng.standard_normal(len(a))))
         drawn = rng.standard_normal((100, N_MODES)) @ root.T
-        return Counts.of_pixels(std, sky - mean, drawn).coverage()
+        return coverage_of_pixels(std, sky - mean, drawn)
 
     return [coverage() for _ in range(80)]
 
@@ -113,7 +113,7 @@ def test_skies_of_the_prior_are_covered_within_the_printed_errors(tmp_path):
         drawn = made.compared()
         error = channel.truth - channel.mean
         for factor, found in far.items():
-            pixels = Counts.of_pixels(factor * channel.pixel_std, error, drawn).coverage()
+            pixels = coverage_of_pixels(factor * channel.pixel_std, error, drawn)
             found.append((pixels[-1].held[1] - LEVELS[1]) / pixels[-1].scatter[1])
     right, wide = (np.mean(found, axis=0) * np.sqrt(4) for found in far.values())
     assert np.abs(right).max() < 4.0
