@@ -387,8 +387,6 @@ def straight_coordinates(mode: LogNormalMode) -> Whitening:
 
 def _bounds(strength: Float[np.ndarray, " directions"], gain: float) -> tuple[int, ...]:
     """Where groups begin in which curvatures differ by less than the squared gain."""
-    if not len(strength):
-        return (0,)
     group = np.floor(np.log(strength / STIFF) / max(np.log(1.0 / gain), LEAST)).astype(int)
     first = np.flatnonzero(np.diff(group, prepend=-1))
     return (*first.tolist(), len(strength))
