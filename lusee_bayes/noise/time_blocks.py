@@ -272,19 +272,17 @@ class TimeBandedCovariance(_OverLayout):
         )
 
     def absorb(self, other):
-        if isinstance(other, TimeBandedCovariance | TimeBlockCovariance):
-            self.layout.require_same(other.layout)
-        if isinstance(other, TimeBandedCovariance):
-            wide, narrow = sorted((self.band, other.band), key=lambda b: -b.shape[1])
-            extra = wide.shape[1] - narrow.shape[1]
-            narrow = jnp.pad(narrow, ((0, 0), (0, extra), (0, 0), (0, 0)))
-            return TimeBandedCovariance(wide + narrow, self.layout, self.name)
         if isinstance(other, DiagonalCovariance):
             other = TimeBlockCovariance(jnp.zeros_like(self.band[:, 0]), self.layout).absorb(other)
         if isinstance(other, TimeBlockCovariance):
-            band = self.band.at[:, 0].add(other.blocks)
-            return TimeBandedCovariance(band, self.layout, self.name)
-        return None
+            other = TimeBandedCovariance(other.blocks[:, None], other.layout)
+        if not isinstance(other, TimeBandedCovariance):
+            return None
+        self.layout.require_same(other.layout)
+        wide, narrow = sorted((self.band, other.band), key=lambda b: -b.shape[1])
+        extra = wide.shape[1] - narrow.shape[1]
+        narrow = jnp.pad(narrow, ((0, 0), (0, extra), (0, 0), (0, 0)))
+        return TimeBandedCovariance(wide + narrow, self.layout, self.name)
 
     def scaled(self, factor):
         return TimeBandedCovariance(factor * self.band, self.layout, self.name)
