@@ -23,8 +23,7 @@ import numpy as np
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.layouts import Content, Layout, Unloaded
-from lusee_bayes.core.lazy import astropy_exceptions, fits
-from lusee_bayes.core.lazy import xarray as xr
+from lusee_bayes.core.lazy import astropy_exceptions, fits, xarray
 from lusee_bayes.core.reading import reading, require_file
 from lusee_bayes.core.version import __version__
 
@@ -138,7 +137,7 @@ def header(format_: str) -> dict[str, str]:
     return {"Conventions": "CF-1.13", "format": format_, "lusee_bayes_version": __version__}
 
 
-def with_grid(dataset: xr.Dataset) -> xr.Dataset:
+def with_grid(dataset: xarray.Dataset) -> xarray.Dataset:
     """The same with the grid of all arrays in pixels, of whole maps, as CF 1.13 has it."""
     for dim in {*HEALPIX} & {*dataset.dims}:
         n = dataset.sizes[dim]
@@ -184,7 +183,7 @@ def read_netcdf(path: str | Path, format_: str, layout: Layout, hint: str = "") 
     """
     path = require_format(path, format_, layout.what, hint)
     opened_as = {"engine": "h5netcdf", "decode_times": False}
-    with reading(path, layout.what), xr.open_dataset(path, **opened_as) as dataset:
+    with reading(path, layout.what), xarray.open_dataset(path, **opened_as) as dataset:
         arrays = {str(name): variable for name, variable in dataset.variables.items()}
         for name in arrays.keys() & layout.variables.keys():
             declared, dims = layout.variables[name], arrays[name].dims
@@ -196,7 +195,7 @@ def read_netcdf(path: str | Path, format_: str, layout: Layout, hint: str = "") 
         return layout.checked(path, arrays, said | dataset.attrs)
 
 
-def _decoded(dataset: xr.Dataset, name: str, variable: xr.Variable) -> xr.Variable:
+def _decoded(dataset: xarray.Dataset, name: str, variable: xarray.Variable) -> xarray.Variable:
     """Times by the CF conventions: bounds have the units of what they bound, if none of their own.
 
     Without units they stay numbers.
@@ -205,12 +204,12 @@ def _decoded(dataset: xr.Dataset, name: str, variable: xr.Variable) -> xr.Variab
     units = {key: v for attrs in bounding for key, v in attrs.items() if key in CF_TIME}
     known = variable.copy(deep=False)
     known.attrs = units | dict(variable.attrs)
-    return xr.conventions.decode_cf_variable(name, known)
+    return xarray.conventions.decode_cf_variable(name, known)
 
 
 def as_dataset(
     format_: str, layout: Layout, arrays: Mapping[str, Any], values: Mapping[str, Any]
-) -> xr.Dataset:
+) -> xarray.Dataset:
     """Lay out what :func:`read_netcdf` reads, on the dimensions and in the units of a layout.
 
     Parameters
@@ -228,7 +227,7 @@ def as_dataset(
         declared = layout.variables[name]
         units = {"units": declared.unit or "1"} if declared.kind == "real" else {}
         variables[name] = (tuple(map(str, declared.dims)), arrays[name], units)
-    dataset = xr.Dataset(variables, attrs=header(format_))
+    dataset = xarray.Dataset(variables, attrs=header(format_))
     for name, value in values.items():
         variable, _, attribute = name.rpartition(".")
         if value is not None:

@@ -11,12 +11,11 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core import harmonics
+from lusee_bayes.core import harmonics, linalg
 from lusee_bayes.core.arrays import Array, Fields, as_complex, namespace
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import special
-from lusee_bayes.core.linalg import mirrored
 
 
 class SphereGrid(eqx.Module):
@@ -191,7 +190,7 @@ class SphereGrid(eqx.Module):
                     matrix[at[:, None], to[None]] = block[other:]
                     if square:
                         matrix[to[:, None], at[None]] = block[other:].T
-        return mirrored(matrix) if square else matrix
+        return linalg.mirrored(matrix) if square else matrix
 
     def diagonal(self, matrix: Float[np.ndarray, "modes modes"]) -> Float[np.ndarray, "rings phi"]:
         """Compute y^T C y at the grid's points: the variance of a field of covariance C.

@@ -31,8 +31,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing, user_path
 from lusee_bayes.core.formats import header, require_format, with_grid
 from lusee_bayes.core.layouts import Attribute, Layout, Unloaded, Unread, Variable
-from lusee_bayes.core.lazy import pandas as pd
-from lusee_bayes.core.lazy import xarray as xr
+from lusee_bayes.core.lazy import pandas, xarray
 from lusee_bayes.core.reading import reading
 
 T = TypeVar("T")
@@ -103,7 +102,7 @@ class _Kind:
     encoding: Mapping[str, Any] = field(default_factory=dict)
 
 
-def to_tree(value: Any) -> xr.DataTree:
+def to_tree(value: Any) -> xarray.DataTree:
     """Lay out a dataclass.
 
     Parameters
@@ -138,7 +137,7 @@ def to_tree(value: Any) -> xr.DataTree:
             attributes[name] = int(held) if isinstance(held, bool) else held
     if empty:
         attributes[EMPTY] = json.dumps(empty)
-    return xr.DataTree(with_grid(xr.Dataset(variables, attrs=attributes)), children=groups)
+    return xarray.DataTree(with_grid(xarray.Dataset(variables, attrs=attributes)), children=groups)
 
 
 def write_tree(
@@ -219,7 +218,7 @@ def opened_tree(path: str | Path, format_: str, what: str, hint: str = "") -> It
         yield StoredTree(file)
 
 
-def from_tree(kind: type[T], tree: xr.DataTree | StoredTree, where: str) -> T:
+def from_tree(kind: type[T], tree: xarray.DataTree | StoredTree, where: str) -> T:
     """Make a dataclass of what :func:`to_tree` made of one.
 
     Parameters
@@ -310,26 +309,26 @@ def _kind_of(hint: Any, checks: Mapping[str, Any] = ANY) -> _Kind:
     return _Kind("json", hint, declared=Attribute("text"))
 
 
-def _table(name: str, columns: Mapping[str, list]) -> xr.DataTree:
+def _table(name: str, columns: Mapping[str, list]) -> xarray.DataTree:
     """Columns as variables; one of numbers may have gaps."""
     found = {}
     for key, values in columns.items():
         array = np.array([np.nan if value is None else value for value in values])
         found[key] = (f"{name}_row", array.astype(np.int8) if array.dtype == bool else array)
     rows = {} if not columns or not len(next(iter(columns.values()))) else found
-    return xr.DataTree(xr.Dataset(rows, attrs={"columns": json.dumps(list(columns))}))
+    return xarray.DataTree(xarray.Dataset(rows, attrs={"columns": json.dumps(list(columns))}))
 
 
-def _of_group(kind: _Kind, tree: xr.DataTree | StoredTree, where: str) -> Any:
+def _of_group(kind: _Kind, tree: xarray.DataTree | StoredTree, where: str) -> Any:
     if kind.what == "group":
         return from_tree(kind.of, tree, where)
     if kind.what == "table":
         return tuple(_rows(kind.of, tree, where))
     names = _json(where, tree.attrs.get("columns", "[]"))
-    return pd.DataFrame({name: _column(tree, name, where) for name in names})
+    return pandas.DataFrame({name: _column(tree, name, where) for name in names})
 
 
-def _column(tree: xr.DataTree | StoredTree, name: str, where: str) -> list:
+def _column(tree: xarray.DataTree | StoredTree, name: str, where: str) -> list:
     if name in tree.variables:
         return np.asarray(tree.variables[name]).tolist()
     if tree.variables:
@@ -337,7 +336,7 @@ def _column(tree: xr.DataTree | StoredTree, name: str, where: str) -> list:
     return []
 
 
-def _rows(kind: type[T], tree: xr.DataTree | StoredTree, where: str) -> Iterator[T]:
+def _rows(kind: type[T], tree: xarray.DataTree | StoredTree, where: str) -> Iterator[T]:
     if not tree.variables:
         return
     kinds = _fields(kind)

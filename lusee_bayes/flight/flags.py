@@ -89,8 +89,6 @@ def outliers(
         Distances from the curve through the others in standard deviations, 0 where not good.
     """
     kept, z = good.copy(), np.zeros_like(values)
-    if not len(values):
-        return good & ~kept, z
     active = np.arange(len(values))
     for _ in range(MAX_ROUNDS):
         z[active] = distances(values[active], noise[active], good[active], kept[active], basis)

@@ -438,9 +438,6 @@ def write_reduced(path: str | Path, reduced: Reduced, scenario: str = "") -> Pat
     saved = _Saved(
         product=np.array(labels()),
         before_flags=reduced.before.astype(np.float32),
-        scatter=reduced.scatter,
-        line_scatter=reduced.line_scatter,
-        curvature=reduced.curvature,
         jd1=seen.times.jd1,
         jd2=seen.times.jd2,
         run=np.asarray(seen.run),
@@ -450,6 +447,7 @@ def write_reduced(path: str | Path, reduced: Reduced, scenario: str = "") -> Pat
         live_s=None if windows is None else windows.live_s,
         scenario=scenario,
         **{name: getattr(seen, name) for name in ("lon_deg", "lat_deg", "step_s")},
+        **{name: getattr(reduced, name) for name in ("scatter", "line_scatter", "curvature")},
         **{name: getattr(reduced, ours) for name, ours in NAMES.items()},
     )
     return write_tree(path, saved, formats.REDUCED)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Int
 
 from lusee_bayes.core.arrays import RowFlags, Rows
 from lusee_bayes.core.engine import in_threads
@@ -326,7 +326,7 @@ def _finish(
         squares = np.where(used, weights**2 / spectra.n_averaged[number], 0.0)
         n_averaged = np.bincount(bin_of, weights, n) ** 2 / np.bincount(bin_of, squares, n)
     whole.n_averaged[number, bins] = np.where(some, n_averaged, 0.0)
-    averaged = partial(_means, bin_of=bin_of, n=n)
+    averaged = partial(_means, first=np.searchsorted(bin_of, np.arange(n)))
     whole.values[number][:, bins] = np.where(kept & some, averaged(values, weights), np.nan)
     whole.before[number][:, bins] = averaged(spectra.before[number], live)
     whole.gain[number][:, bins] = averaged(spectra.gain[number], live)
@@ -351,17 +351,14 @@ def _flag_bursts(spectra: reduced.Reduced, false_alarm: float, number: int) -> S
 
 
 def _means(
-    values: Float[np.ndarray, "... rows"], weights: Rows, bin_of: session.RowCounts, n: int
+    values: Float[np.ndarray, "... rows"], weights: Rows, first: Int[np.ndarray, " bins"]
 ) -> Float[np.ndarray, "... bins"]:
-    """Weighted means of the finite values of each bin; NaN where it has none."""
-    rows = np.moveaxis(values, -1, 0)
-    weights = weights.reshape(-1, *(1,) * (rows.ndim - 1))
-    known = np.isfinite(rows) * weights
-    total, summed = (np.zeros((n, *rows.shape[1:])) for _ in range(2))
-    np.add.at(total, bin_of, known)
-    np.add.at(summed, bin_of, np.where(known > 0.0, rows, 0.0) * weights)
+    """Weighted means of the finite values of bins from these rows on; NaN where one has none."""
+    known = np.isfinite(values) * weights
+    total = np.add.reduceat(known, first, axis=-1)
+    summed = np.add.reduceat(np.where(known > 0.0, values, 0.0) * weights, first, axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.moveaxis(summed / total, 0, -1)
+        return summed / total
 
 
 def _said_of(source: session.Session, recipe: Recipe) -> Mapping[str, Any]:

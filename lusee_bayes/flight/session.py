@@ -355,9 +355,7 @@ def _levels(path: Path, arrays: Mapping[str, Unread], n: int) -> PortLevels:
         raise InputError(f"{path}: {name} has shape {codes.shape}, expected ({n}, {PORTS})")
     if codes.dtype.kind not in "iuSU":
         raise InputError(f"{path}: {name} holds {codes.dtype}, expected gain codes or letters")
-    in_letters = codes.dtype.kind in "SU"
-    codes = codes.astype("U1") if in_letters else codes
-    levels = np.full((n, PORTS), NO_LEVEL, dtype="U1")
-    for level, code in CODES.items():
-        levels[codes == (level if in_letters else code)] = level
-    return levels
+    if codes.dtype.kind in "iu":
+        codes = np.select([codes == code for code in CODES.values()], LETTERS, NO_LEVEL)
+    levels = codes.astype("U1")
+    return np.where(np.isin(levels, LETTERS), levels, NO_LEVEL)

@@ -19,8 +19,7 @@ from scipy.interpolate import CubicSpline
 from lusee_bayes.core.arrays import RowFlags, Vector
 from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.flight import session
-from lusee_bayes.flight.flags import COMB_FIRST, COMB_SPACING
+from lusee_bayes.flight import flags, session
 from lusee_bayes.flight.gain_model import LETTERS, NANO2, GainModel
 from lusee_bayes.flight.recipe import FlightSimulatedSection
 from lusee_bayes.instrument.products import to_matrix, to_real
@@ -324,7 +323,7 @@ class Disturbances:
             Frames that each averages.
         """
         level = np.einsum("iirc->rc", t).real / (session.PORTS * np.sqrt(frames))
-        comb = np.arange(session.N_CHANNELS) % COMB_SPACING == COMB_FIRST
+        comb = np.arange(session.N_CHANNELS) % flags.COMB_SPACING == flags.COMB_FIRST
         lines = self.section.tone_factor * (self.tone[rows, None] & self.tone_channel)
         lines = lines + self.section.comb_factor * (self.comb[rows, None] & comb)
         t += level * lines

@@ -88,9 +88,8 @@ class Observation(checks.Described):
         if not -90.0 <= self.lat_deg <= 90.0:
             raise InputError(f"lat_deg must lie in -90..90, got {self.lat_deg}")
         checks.require_positive("step_s", self.step_s)
-        angles = np.array([self.lon_deg, *self.turntable_deg])
-        checks.require_finite("lon_deg and turntable_deg", angles)
-        checks.require_finite("tilt_deg", np.array(self.tilt_deg))
+        checks.require_finite("lon_deg and turntable_deg", [self.lon_deg, *self.turntable_deg])
+        checks.require_finite("tilt_deg", self.tilt_deg)
         if self.times.shape != self.run.shape or self.times.ndim != 1 or not self.times.size:
             raise InputError(
                 f"times {self.times.shape} and run {self.run.shape} must be lists of one length"

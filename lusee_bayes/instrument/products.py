@@ -306,8 +306,6 @@ class DataLayout(Described, eqx.Module):
     @property
     def present(self) -> Bool[Array, "products times"]:
         """Whether each sample of the grid is in d."""
-        if self.index is None:
-            return np.ones((self.n_products, self.n_times), dtype=bool)
         return self.scatter(namespace(self.index).ones(self.size, dtype=bool))
 
     def _positions(self) -> np.ndarray:

@@ -174,8 +174,7 @@ def utc_times(times: Any) -> Time:
 
 def _as_text(number: int, one: Any) -> str:
     if isinstance(one, datetime):
-        one = one.astimezone(UTC).replace(tzinfo=None) if one.tzinfo else one
-        one = one.isoformat()
+        one = (one.astimezone(UTC).replace(tzinfo=None) if one.tzinfo else one).isoformat()
     if not isinstance(one, str):
         raise InputError(
             f"time {number} is {one!r}, of type {type(one).__name__}; give datetimes, ISO dates in "

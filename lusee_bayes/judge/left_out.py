@@ -110,9 +110,6 @@ class Missed(NamedTuple):
         return 0.5 * (self.log_det - self.chi2 - self.n * float(np.log(2.0 * np.pi)))
 
 
-NOT_TOLD = (np.nan, np.nan, np.nan)
-
-
 KINDS = ("product", "day", "turntable angle")
 
 
@@ -292,7 +289,7 @@ class LeftOut:
         cells = self._on_cells(group & self.present)
         n = int(np.count_nonzero(cells))
         if n == np.count_nonzero(self.present):
-            return Missed(n, *NOT_TOLD)
+            return Missed(n, np.nan, np.nan, np.nan)
         blocks, places = (np.flatnonzero(cells.any(axis)) for axis in (1, 0))
         where = np.ix_(blocks, places)
         root = roots(self._weights[blocks], cells[blocks])

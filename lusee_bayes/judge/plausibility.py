@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from lusee_bayes.core.arrays import DataVector, Grid, GridFlags
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.instrument.products import all_products, auto_indices
+from lusee_bayes.instrument.products import auto_indices, to_matrix
 from lusee_bayes.instrument.visibilities import Visibilities
 
 # what noise alone does to one of 1e8 samples
@@ -101,21 +101,17 @@ def _about_range(
 
 def _about_crosses(data: Visibilities, values: Grid, sigma: Grid) -> tuple[str, ...]:
     """Pairs of antennas whose crosses are larger than their autos allow."""
-    n = round(np.sqrt(data.layout.n_products))
-    position = {tuple(product): k for k, product in enumerate(all_products(n))}
+    correlations, spreads = to_matrix(values), np.abs(to_matrix(sigma))
     doubts = []
-    for i, j in combinations(range(n), 2):
-        ii, jj = position[i, i, "R"], position[j, j, "R"]
-        re, im = position[i, j, "R"], position[i, j, "I"]
-        vi, vj = values[ii], values[jj]
-        cross = np.hypot(values[re], values[im])
+    for i, j in combinations(range(len(correlations)), 2):
+        vi, vj = correlations[i, i].real, correlations[j, j].real
+        cross = np.abs(correlations[i, j])
         # autos within noise of zero bound nothing
         usable = (vi > 0) & (vj > 0) & ~np.isnan(cross)
         vi, vj = np.where(usable, vi, 1.0), np.where(usable, vj, 1.0)
         bound = np.sqrt(vi * vj)
-        spread = np.hypot(sigma[re], sigma[im])
-        of_bound = 0.5 * bound * np.hypot(sigma[ii] / vi, sigma[jj] / vj)
-        excess = usable & (cross - bound > SIGNIFICANT * np.hypot(spread, of_bound))
+        of_bound = 0.5 * bound * np.hypot(spreads[i, i] / vi, spreads[j, j] / vj)
+        excess = usable & (cross - bound > SIGNIFICANT * np.hypot(spreads[i, j], of_bound))
         if excess.any():
             first = data.observation.times[int(np.nonzero(excess)[0][0])].isot[:19]
             larger = f"|V_{i}{j}| is larger than sqrt(V_{i}{i} V_{j}{j}), which no sky gives"

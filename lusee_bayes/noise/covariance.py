@@ -33,9 +33,7 @@ from lusee_bayes.core import checks
 from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky, solve_lower
-from lusee_bayes.instrument.products import DataLayout
-
-Columns = Float[Array, "data *columns"]
+from lusee_bayes.instrument.products import Columns, DataLayout
 
 
 class Factor(eqx.Module):

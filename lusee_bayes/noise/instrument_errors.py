@@ -30,10 +30,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from lusee_bayes.core import checks
+from lusee_bayes.core import checks, linalg
 from lusee_bayes.core.arrays import Array, Grid, scalar
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.linalg import checked_cholesky
 from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.coupling import Coupling
 from lusee_bayes.instrument.products import DataLayout, ports
@@ -77,7 +76,7 @@ def template_noise(
         prior = jnp.diag(prior)
     checks.require_array("the templates' prior", prior, (templates.shape[1],) * 2)
     checks.require_symmetric("the templates' prior", prior)
-    root = jnp.tril(checked_cholesky("the templates' prior", prior))
+    root = jnp.tril(linalg.checked_cholesky("the templates' prior", prior))
     return LowRankCovariance(templates @ root, "the templates")
 
 

@@ -22,7 +22,7 @@ from jaxtyping import Complex, Float
 
 from lusee_bayes.core import checks
 from lusee_bayes.core.arrays import Array, Grid, compiled, namespace
-from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.instrument.products import DataLayout, auto_indices, ports, to_matrix, without_gaps
 from lusee_bayes.noise.covariance import Covariance, DiagonalCovariance
 from lusee_bayes.noise.time_blocks import TimeBlockCovariance
@@ -108,8 +108,7 @@ def radiometer_noise(
     InputError
         For an unknown form, parameters out of range, and autos that are not positive.
     """
-    if form not in RADIOMETER_FORMS:
-        raise InputError(f"unknown radiometer form '{form}'; {nearest(form, RADIOMETER_FORMS)}")
+    require_known("unknown radiometer form", form, RADIOMETER_FORMS)
     given = {"bandwidth_hz": bandwidth_hz, "step_s": step_s, "factor": factor}
     for name, value in (given | {"duty_cycle": duty_cycle}).items():
         checks.require_positive(f"the radiometer's {name}", value)

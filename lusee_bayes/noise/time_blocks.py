@@ -17,10 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core import checks
+from lusee_bayes.core import checks, linalg
 from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.linalg import checked_cholesky, solve_lower
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.noise.covariance import CholeskyFactor, Covariance, DiagonalCovariance, Factor
 
@@ -103,7 +102,7 @@ class TimeBlockCovariance(_OverLayout):
         return self.layout.gather(namespace(self).diagonal(self.blocks, axis1=1, axis2=2).T)
 
     def factor(self):
-        lower = checked_cholesky("the noise covariance of one time", self.blocks)
+        lower = linalg.checked_cholesky("the noise covariance of one time", self.blocks)
         return TimeBlockFactor(lower, self.layout)
 
     def time_weights(self, layout):
@@ -250,7 +249,7 @@ class TimeBandedCovariance(_OverLayout):
         if not checks.is_traced(diagonal):
             self._require_positive(diagonal)
         unit = jnp.broadcast_to(jnp.eye(diagonal.shape[1]), diagonal.shape)
-        inverse = solve_lower(diagonal, unit, transpose=False)
+        inverse = linalg.solve_lower(diagonal, unit, transpose=False)
         return TimeBandedFactor(left, diagonal, inverse, self.layout)
 
     def _require_positive(self, diagonal: Float[Array, "blocks rows rows"]) -> None:
@@ -273,19 +272,17 @@ class TimeBandedCovariance(_OverLayout):
         )
 
     def absorb(self, other):
-        if isinstance(other, TimeBandedCovariance | TimeBlockCovariance):
-            self.layout.require_same(other.layout)
-        if isinstance(other, TimeBandedCovariance):
-            wide, narrow = sorted((self.band, other.band), key=lambda b: -b.shape[1])
-            extra = wide.shape[1] - narrow.shape[1]
-            narrow = jnp.pad(narrow, ((0, 0), (0, extra), (0, 0), (0, 0)))
-            return TimeBandedCovariance(wide + narrow, self.layout, self.name)
         if isinstance(other, DiagonalCovariance):
             other = TimeBlockCovariance(jnp.zeros_like(self.band[:, 0]), self.layout).absorb(other)
         if isinstance(other, TimeBlockCovariance):
-            band = self.band.at[:, 0].add(other.blocks)
-            return TimeBandedCovariance(band, self.layout, self.name)
-        return None
+            other = TimeBandedCovariance(other.blocks[:, None], other.layout)
+        if not isinstance(other, TimeBandedCovariance):
+            return None
+        self.layout.require_same(other.layout)
+        wide, narrow = sorted((self.band, other.band), key=lambda b: -b.shape[1])
+        extra = wide.shape[1] - narrow.shape[1]
+        narrow = jnp.pad(narrow, ((0, 0), (0, extra), (0, 0), (0, 0)))
+        return TimeBandedCovariance(wide + narrow, self.layout, self.name)
 
     def scaled(self, factor):
         return TimeBandedCovariance(factor * self.band, self.layout, self.name)
@@ -324,7 +321,7 @@ def _cholesky(left: Array, diagonal: Array) -> tuple[Array, Array]:
 
     def step(reach, row):
         before, on = row
-        solved = solve_lower(reach, before.T, transpose=False).T
+        solved = linalg.solve_lower(reach, before.T, transpose=False).T
         # Cholesky's value needs the lower triangle only, its derivative a symmetric matrix
         rest = jnp.tril(on - solved @ solved.T)
         rest = rest + jnp.tril(rest, -1).T

@@ -19,11 +19,10 @@ from pandas import DataFrame
 from pydantic import BaseModel
 from xarray import Dataset, DataTree
 
-from lusee_bayes.core import files
+from lusee_bayes.core import files, reading
 from lusee_bayes.core.arrays import use_compilation_cache
 from lusee_bayes.core.errors import InputError, WorkersLost
 from lusee_bayes.core.progress import Stages
-from lusee_bayes.core.reading import write_csv
 from lusee_bayes.experiment.data_files import Data, digest_of, files_of, names_of_data
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.report.figures.drawing import save
@@ -176,7 +175,7 @@ class Output:
     @classmethod
     def rows(cls, name: str, rows: Callable[[Any], Sequence[Mapping[str, object]]]) -> Output:
         """A table, row by row."""
-        return cls(lambda run, folder: write_csv(folder / name, rows(run)))
+        return cls(lambda run, folder: reading.write_csv(folder / name, rows(run)))
 
     @classmethod
     def table(cls, name: str, table: Callable[[Any], DataFrame | None]) -> Output:

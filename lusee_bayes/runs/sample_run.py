@@ -36,19 +36,14 @@ from lusee_bayes.results.finished_runs import Provenance, write_cubes, write_map
 from lusee_bayes.results.sample_result import CHAINS, SAMPLES, SampleResult, ValidationResult
 from lusee_bayes.runs.cost import demand_of, measured_experiment
 from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, run_folder
+from lusee_bayes.sampling import programs
 from lusee_bayes.sampling.datatree import read_datatree, to_datatree
 from lusee_bayes.sampling.distributions import TimesStudentT
 from lusee_bayes.sampling.hmc import Chains, Checkpoints, Sampler, Whitening, sample
 from lusee_bayes.sampling.least import require_draws, require_simulations
 from lusee_bayes.sampling.log_normal_program import coordinates_of
 from lusee_bayes.sampling.mode import laplace_approximation
-from lusee_bayes.sampling.programs import (
-    Program,
-    latent_sites,
-    load_program,
-    predicts,
-    require_sampleable,
-)
+from lusee_bayes.sampling.programs import Program
 from lusee_bayes.sampling.shared_sites import SharedSites, gaussian_of_sites, of_channel
 from lusee_bayes.sampling.validation import BATCH, N_DRAWS, calibrate_sky, validate_draws
 from lusee_bayes.systematics.gain_drifts import SCALES
@@ -133,7 +128,7 @@ def sample_together(
         inference = inferences[name]
         arguments[name] = program.arguments(inference.model, program_pieces(one))
         n_modes = inference.posterior.mean.shape[0]
-        latent[name] = require_sampleable(program, arguments[name], one.data.data, n_modes)
+        latent[name] = programs.require_sampleable(program, arguments[name], one.data.data, n_modes)
     data = {name: one.data.data for name, one in experiments.items()}
     first = next(iter(experiments))
     frequencies = {name: one.scenario.frequency_mhz for name, one in experiments.items()}
@@ -148,7 +143,7 @@ def sample_together(
         rounds = found_in_rounds(inferences, latent)
         if rounds is not None:
             sampler = replace_fields(sampler, algorithm=sampler.algorithm or "crank-nicolson")
-            sites = latent_sites(model, observed)
+            sites = programs.latent_sites(model, observed)
             whitening = gaussian_of_sites(*rounds, frequencies, octaves, sites)
         elif not several:
             given = arguments[first], experiments[first].data, inferences[first], latent[first]
@@ -188,7 +183,7 @@ def coordinates(
     """White coordinates for a program: those of the analytic posterior where it samples the sky
     alone, and data are Gaussian about it; the straight ones of a log-normal sky; else those about
     its mode. None if no mode is found: warmup then learns scales."""
-    if latent == [SKY] and not predicts(program.model, arguments, TimesStudentT):
+    if latent == [SKY] and not programs.predicts(program.model, arguments, TimesStudentT):
         return Whitening.of(inference.posterior)
     positive = arguments.get("log_normal")
     if positive is not None and set(latent) == set(positive.sites):
@@ -279,7 +274,7 @@ RESUME = "go on with --resume"
 
 def default_program(scenario: Scenario) -> Program:
     """``systematics`` where something is sampled, or ``sky``."""
-    return load_program("systematics" if scenario.samples else "sky")
+    return programs.load_program("systematics" if scenario.samples else "sky")
 
 
 def run_sample(
@@ -476,7 +471,7 @@ def run_validate(
     scenario = load_scenario(scenario)
     stages = stages or Stages()
     sampler = sampler or Sampler(seed=scenario.seed)
-    program = load_program("sky")
+    program = programs.load_program("sky")
     require_simulations(simulations)
     require_draws(sampler.draws)
     given = {"replace": replace, "program": named(program)}

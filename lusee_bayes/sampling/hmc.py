@@ -26,7 +26,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Float, PRNGKeyArray
-from numpyro import handlers
 from numpyro.infer import HMC, NUTS
 from numpyro.infer.hmc import HMCState
 from numpyro.infer.hmc_util import HMCAdaptState
@@ -42,14 +41,8 @@ from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.core.reading import read_json, reading
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.sampling import programs
 from lusee_bayes.sampling.distributions import Marginal
-from lusee_bayes.sampling.programs import (
-    DATA,
-    WHITE_SUFFIX,
-    latent_sites,
-    numpyro_promotion,
-    predicts,
-)
 from lusee_bayes.systematics.systematic import SKY, Chart
 
 # statistics of every draw, by their ArviZ names
@@ -199,7 +192,7 @@ def whitened(program: Callable, whitening: Whitening) -> Callable:
     def model(*args, **kwargs):
         first = whitening.names[0]
         free = dist.ImproperUniform(dist.constraints.real_vector, (), (whitening.root.shape[1],))
-        z = numpyro.sample(f"{first}{WHITE_SUFFIX}", free)
+        z = numpyro.sample(f"{first}{programs.WHITE_SUFFIX}", free)
         values, log_det = whitening.to_values(whitening.mean + whitening.root @ z)
         # the determinant of all coordinates is counted once, with the first site
         log_dets = dict.fromkeys(whitening.names, 0.0) | {first: whitening.log_det + log_det}
@@ -397,8 +390,8 @@ class CrankNicolson(MCMCKernel):
         self, args: tuple, kwargs: dict, z: Array, key: PRNGKeyArray
     ) -> tuple[Float[Array, ""], dict[str, Array]]:
         """-ln p at z, with z itself, and draws of the skies that are integrated out there."""
-        given = handlers.substitute(handlers.seed(self.model, key), {self.site: z})
-        with handlers.trace() as sites:
+        given = numpyro.handlers.substitute(numpyro.handlers.seed(self.model, key), {self.site: z})
+        with numpyro.handlers.trace() as sites:
             returned = given(*args, **kwargs)
         to_draw = jax.tree.leaves(returned, is_leaf=lambda x: isinstance(x, LinearGaussian))
         total, found = jnp.zeros(()), {self.site: z}
@@ -409,7 +402,7 @@ class CrankNicolson(MCMCKernel):
             if isinstance(fn, Marginal) and any(fn.model is one for one in to_draw):
                 posterior = fn.model.condition(value).posterior
                 key, own = jax.random.split(key)
-                found[name.removesuffix(DATA) + SKY] = posterior.sample(own)
+                found[name.removesuffix(programs.DATA) + SKY] = posterior.sample(own)
                 density = posterior.log_evidence
             else:
                 density = fn.log_prob(value).sum()
@@ -553,7 +546,7 @@ class Sampler:
                     "crank-nicolson needs coordinates in which all sites together are nearly "
                     "N(0, 1), and none were found; use nuts"
                 )
-            site = white.names[0] + WHITE_SUFFIX
+            site = white.names[0] + programs.WHITE_SUFFIX
             return CrankNicolson(model, site, n_white, self.trajectory, self.target_accept)
         if n_white is not None:
             settings |= {"adapt_mass_matrix": False, "step_size": 1.5 * n_white**-0.25}
@@ -598,7 +591,7 @@ def sample(
     run = _Run(program, dict(arguments), sampler, whitening)
     chunks = [] if checkpoints is None else checkpoints.chunks()
     done, total = 0, sampler.warmup + sampler.draws
-    with numpyro_promotion():
+    with programs.numpyro_promotion():
         state = run.start()
         if not bool(jnp.isfinite(state.potential_energy).all()):
             raise InputError(
@@ -636,7 +629,7 @@ class _Run:
             run = program if whitening is None else whitened(program, whitening)
             return run(**arguments)
 
-        latent = latent_sites(program, arguments)
+        latent = programs.latent_sites(program, arguments)
         white = set() if whitening is None else set(whitening.names)
         if unknown := white - set(latent):
             raise InputError(
@@ -651,7 +644,7 @@ class _Run:
         # XLA may stand still over batches of matrices to factorise where cores are few; several
         # devices, each with a chain of its own, would only stand idle
         chart = None if whitening is None else whitening.chart
-        factorises = not predicts(program, arguments) or (chart is not None and chart.factorises)
+        factorises = not programs.predicts(program, arguments) or bool(chart and chart.factorises)
         self.one_by_one = len(jax.local_devices()) == 1 and factorises
         self.advance = jax.jit(self._advance)
 
@@ -693,7 +686,7 @@ class _Run:
         state, rows = jax.lax.scan(step, state, jnp.arange(CHUNK))
         constrain = self.kernel.postprocess_fn((dynamic,), {})
         sites = jax.vmap(jax.vmap(constrain))(rows.pop("z"))
-        sites = {n: values for n, values in sites.items() if not n.endswith(WHITE_SUFFIX)}
+        sites = {n: values for n, values in sites.items() if not n.endswith(programs.WHITE_SUFFIX)}
         return state, sites | rows
 
     def _shared_out(self, state: HMCState) -> HMCState:

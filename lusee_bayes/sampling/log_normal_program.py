@@ -54,11 +54,10 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.information import Information
 from lusee_bayes.sampling.hmc import Whitening
 from lusee_bayes.sampling.log_normal_prior import AMPLITUDE, STRUCTURE, TILT, LogNormalPrior
-from lusee_bayes.sky.positive_skies import LogNormalSky, matching_step
+from lusee_bayes.sky.positive_skies import LogNormalSky, Pair, matching_step
 from lusee_bayes.systematics.systematic import Chart
 
 # arrays that recur
-Pair = Float[np.ndarray, "2"]
 PairMatrix = Float[np.ndarray, "2 2"]
 Unknowns = Float[np.ndarray, " unknowns"]
 White = Float[Array, " unknowns"]
@@ -388,8 +387,6 @@ def straight_coordinates(mode: LogNormalMode) -> Whitening:
 
 def _bounds(strength: Float[np.ndarray, " directions"], gain: float) -> tuple[int, ...]:
     """Where groups begin in which curvatures differ by less than the squared gain."""
-    if not len(strength):
-        return (0,)
     group = np.floor(np.log(strength / STIFF) / max(np.log(1.0 / gain), LEAST)).astype(int)
     first = np.flatnonzero(np.diff(group, prepend=-1))
     return (*first.tolist(), len(strength))

@@ -146,8 +146,7 @@ def root_of_inverse(curvature: Matrix, problem: Potential) -> tuple[Array, Array
     if not problem.predicts:
         return _root_of_any_sign(curvature)
     lower = jnp.linalg.cholesky(curvature)
-    unit = jnp.eye(curvature.shape[0])
-    root = jax.scipy.linalg.solve_triangular(lower, unit, lower=True).T
+    root = jax.scipy.linalg.solve_triangular(lower, jnp.eye(len(lower)), lower=True).T
     # priors need not curve upwards everywhere
     positive = jnp.isfinite(root).all()
     return jax.lax.cond(positive, lambda: (root, positive), lambda: _root_of_any_sign(curvature))
@@ -269,8 +268,7 @@ def laplace_approximation(
 
 
 def _unconstrained(site: dict) -> Float[Array, "..."]:
-    value = jnp.asarray(site["value"], dtype=jnp.float64)
-    return dist.biject_to(site["fn"].support).inv(value)
+    return dist.biject_to(site["fn"].support).inv(jnp.asarray(site["value"], dtype=jnp.float64))
 
 
 def _drawn(

@@ -25,7 +25,6 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro
 from jaxtyping import Float, PRNGKeyArray
-from numpyro import distributions as dist
 from numpyro import handlers
 from numpyro.infer import Predictive
 from numpyro.infer.util import log_density
@@ -270,7 +269,7 @@ def collapsed_draws(
     def model():
         gaussian = program.model(**arguments, data=jnp.asarray(data))
         exact = gaussian.condition(data).posterior.sample(numpyro.prng_key())
-        sky = numpyro.sample("drawn sky", dist.Delta(exact, event_dim=1))
+        sky = numpyro.sample("drawn sky", numpyro.distributions.Delta(exact, event_dim=1))
         replicated = gaussian.predict(sky) + gaussian.noise.sample(numpyro.prng_key())
         numpyro.deterministic("drawn data", replicated)
 
@@ -365,8 +364,7 @@ def _blaming(who: str, doing: str) -> Iterator[None]:
         frames = traceback.extract_tb(error.__traceback__)
         own = [frame.lineno for frame in frames if f"'{frame.filename}'" in who]
         at = f" (line {own[-1]})" if own else ""
-        kind = type(error).__name__
-        raise InputError(f"{who} fails {doing}{at}: {kind}: {error}") from error
+        raise InputError(f"{who} fails {doing}{at}: {type(error).__name__}: {error}") from error
 
 
 def _require_site(name: str, site: dict[str, Any], latent: bool, who: str) -> None:

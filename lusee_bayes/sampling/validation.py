@@ -184,8 +184,7 @@ def calibrate(
 
     def rank(start: int) -> dict[str, np.ndarray]:
         keys = jax.random.split(jax.random.key(seed), n_simulations)[start : start + batch]
-        ranks = _rank_batch(simulate, draw, quantities, keys, one_by_one)
-        return jax.tree.map(np.asarray, ranks)
+        return jax.tree.map(np.asarray, _rank_batch(simulate, draw, quantities, keys, one_by_one))
 
     starts = range(0, n_simulations, batch)
     names = [f"data sets from {start} on" for start in starts]

@@ -218,8 +218,7 @@ def check_beam_source(
     else:
         assert fields.grid is grid
         assert fields.n_antennas == n
-        own = np.asarray(stokes_beam(fields))
-        np.testing.assert_allclose(patterns, own, rtol=0, atol=ROUNDING * np.abs(own).max())
+        close(patterns, stokes_beam(fields), ROUNDING)
     unit = (modes * expected).sum() / (expected**2).sum()
     assert unit > 0
     np.testing.assert_allclose(modes, unit * expected, rtol=0, atol=quadrature * largest)
@@ -239,8 +238,7 @@ def check_beam_source(
     assert background.shape == (n**2,)
     assert np.isfinite(background).all()
     assert (background[auto_indices(n)] >= 0.0).all()
-    atol = ROUNDING * np.abs(background).max()
-    np.testing.assert_allclose(turned.background(frequency_mhz), background, rtol=0, atol=atol)
+    close(turned.background(frequency_mhz), background, ROUNDING)
 
     impedance = source.impedance(frequency_mhz)
     assert impedance is None or np.isfinite(impedance)

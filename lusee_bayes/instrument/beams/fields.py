@@ -21,7 +21,6 @@ import equinox as eqx
 import numpy as np
 import scipy
 from jaxtyping import Complex, Float, Inexact
-from scipy.special import roots_legendre
 
 from lusee_bayes.core import checks
 from lusee_bayes.core.arrays import Array, namespace
@@ -60,7 +59,7 @@ class HemisphereGrid(eqx.Module):
     @classmethod
     def gauss_legendre(cls, n_theta: int, n_phi: int) -> HemisphereGrid:
         """Return a grid, exact for polynomials in cos theta up to degree 2 n_theta - 1."""
-        nodes, weights = roots_legendre(n_theta)
+        nodes, weights = scipy.special.roots_legendre(n_theta)
         return cls(np.arccos((nodes[::-1] + 1.0) / 2.0), weights[::-1] / 2.0, n_phi)
 
     @classmethod
@@ -252,9 +251,7 @@ def at_frequency(
         Outside the known frequencies.
     """
     places = neighbours(path, known_mhz, frequency_mhz)
-    if len(places) == 1:
-        return [np.asarray(part[places[0][0]]) for part in parts]
-    if rule == "linear":
+    if len(places) == 1 or rule == "linear":
         return [np.asarray(sum(weight * part[k] for k, weight in places)) for part in parts]
     degree = min(3, len(known_mhz) - 1)
     splines = [scipy.interpolate.make_interp_spline(known_mhz, part, k=degree) for part in parts]

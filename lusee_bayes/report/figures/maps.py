@@ -179,10 +179,13 @@ SHOWN = 3
 
 def channel_maps(cube: MapResult) -> Figure:
     """Posterior mean and standard deviation of a few channels from the lowest to the highest."""
-    n = len(cube.channels)
-    chosen = np.unique(np.linspace(0, n - 1, min(n, SHOWN)).round().astype(int))
-    channels = [cube.channels[k] for k in chosen]
+    channels = [cube.channels[k] for k in _few_of(len(cube.channels), SHOWN)]
     return _rows_of_maps({f"{channel.frequency_mhz:g} MHz": channel for channel in channels})
+
+
+def _few_of(n: int, most: int) -> np.ndarray:
+    """Numbers of the first of n, of the last, and of some between."""
+    return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int))
 
 
 def instrument_share(result: MapResult) -> Figure | None:
@@ -190,7 +193,7 @@ def instrument_share(result: MapResult) -> Figure | None:
     known = [channel for channel in result.channels if channel.theta is not None]
     if not known:
         return None
-    chosen = np.unique(np.linspace(0, len(known) - 1, min(len(known), SHOWN)).round().astype(int))
+    chosen = _few_of(len(known), SHOWN)
     figure, grid = drawing.framed((6.4 * len(chosen), 3.8), 1, len(chosen), squeeze=False)
     for axes, channel in zip(grid.flat, (known[k] for k in chosen), strict=True):
         share, title = 100.0 * channel.theta.pixel_share, f"{channel.frequency_mhz:g} MHz"
@@ -258,7 +261,7 @@ def fidelity(cube: MapResult) -> Figure:
     ell, channel = np.arange(values.shape[1]), np.arange(values.shape[0])
     style = {"norm": norm, "cmap": drawing.SEQUENTIAL, "shading": "nearest"}
     image = left.pcolormesh(ell[1:], channel, values[:, 1:], **style)
-    ticks = np.unique(np.linspace(0, len(channel) - 1, min(len(channel), 8)).round().astype(int))
+    ticks = _few_of(len(channel), 8)
     left.set_yticks(ticks, [f"{cube.frequencies_mhz[k]:g}" for k in ticks])
     left.set(xlabel=r"multipole $\ell$", ylabel="frequency [MHz]", title=label)
     figure.colorbar(image, ax=left, label=label, extend="both" if known else "neither")
