@@ -6,8 +6,8 @@ gives the posterior over its sky, and the pieces that programs can ask for.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cache
 from operator import attrgetter
@@ -127,17 +127,6 @@ def build(
     """
     stages = stages or Stages()
     return _learned(_fitting(observed(scenario, data, stages), stages), stages, earlier, values)
-
-
-@contextmanager
-def explained(experiment: Experiment) -> Iterator[None]:
-    """Add why good data do not fit to the message of an InputError of the block, where known."""
-    try:
-        yield
-    except InputError as error:
-        if experiment.fitting is None or not experiment.fitting.cause:
-            raise
-        raise InputError(f"{experiment.fitting.cause} ({error})") from error
 
 
 def observed(

@@ -8,8 +8,7 @@ day spoils the predictions of all times: where more times do not fit than may be
 first. What is left is fitted again, since N is built around the data, until nothing more goes.
 
 All rules together, those of the reduction included, take a fifth of the data at most. A port's auto
-never goes whole while its crosses stay, whose noise depends on it. A map whose lmax is too small
-fits no data; so before much is flagged, higher ones are tried.
+never goes whole while its crosses stay, whose noise depends on it.
 """
 
 from __future__ import annotations
@@ -21,12 +20,10 @@ from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Grid, GridFlags, Vector
 from lusee_bayes.core.checks import counted
-from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.lazy import special
 from lusee_bayes.core.progress import Stages, memory_limit
 from lusee_bayes.core.section import is_modelled
-from lusee_bayes.experiment.model import full_model, set_up
+from lusee_bayes.experiment.model import full_model
 from lusee_bayes.experiment.rounds import rebuilds, settled
 from lusee_bayes.instrument.products import DataLayout, auto_indices, ports
 from lusee_bayes.instrument.visibilities import Visibilities
@@ -202,10 +199,8 @@ KEPT = (
 )
 # where all rules together would take more, it is not the data but noise, gains or beams
 MOST = 0.2
-# flagged without looking for another cause, whatever the rules of the reduction took
+# may always go, whatever the rules of the reduction took
 SMALL = 0.05
-# by how much lmax is raised to look for it, how often, and how far chi^2 then falls at least
-STEP, STEPS, FALLS = 8, 3, 0.5
 # what stands out less than this part of the worst waits for the next fit; what stands out this much
 # more than half of the times goes before N is built around what all others say: it would take N
 # along, which then settles nowhere
@@ -228,10 +223,6 @@ class Fitting:
         Products and days that are flagged as a whole.
     share : float
         Of the values, flagged.
-    refused : bool
-        Whether so much would have to go that nothing does.
-    cause : str
-        Why good data do not fit, where that was found: also why a map of them may fail.
     """
 
     flagged: GridFlags
@@ -239,8 +230,6 @@ class Fitting:
     remark: str = ""
     groups: tuple[DataGroup, ...] = ()
     share: float = 0.0
-    refused: bool = False
-    cause: str = ""
 
 
 def fitting(
@@ -262,18 +251,9 @@ def fitting(
     Returns
     -------
     Fitting
-        With nothing flagged, and a remark, if so many data do not fit that it is not them; with
-        what does not fit at a higher lmax either, if others do.
+        With nothing flagged, and a remark, if so many data do not fit that it is not them.
     """
     rules, stages = _Rules.of(data, false_alarm), stages or Stages()
-    found = _found(setup, data, rules, stages)
-    if not found.refused and found.share <= SMALL:
-        return found
-    return _at_higher_lmax(setup, data, rules, found, stages)
-
-
-def _found(setup: Setup, data: Visibilities, rules: _Rules, stages: Stages) -> Fitting:
-    """Find data that do not fit at the setup's lmax."""
     gone = nothing = np.zeros(rules.present.shape, dtype=bool)
     before, groups, kept = np.zeros(nothing.shape[1]), (), ""
     start = compared(setup, data, settle=False) if rebuilds(setup) else None
@@ -300,46 +280,7 @@ def _found(setup: Setup, data: Visibilities, rules: _Rules, stages: Stages) -> F
             share = rules.count(gone) / data.layout.size
             remark = " ".join(filter(None, [rules.remark(gone, groups, share), kept]))
             return Fitting(gone, before, remark, groups, share)
-    return Fitting(nothing, before, f"{TOO_MANY} {kept}".strip(), refused=True)
-
-
-def _at_higher_lmax(
-    setup: Setup, data: Visibilities, rules: _Rules, found: Fitting, stages: Stages
-) -> Fitting:
-    """What does not fit at a higher lmax, where others do; ``found`` where none is any better.
-
-    It is raised as long as chi^2 of the times falls and there is memory.
-    """
-    lmax, best, size = setup.scenario.lmax, found, float(np.median(found.chi2))
-    enough = SMALL if found.refused else min(SMALL, found.share / 2.0)
-    for higher in range(lmax + STEP, lmax + STEPS * STEP + 1, STEP):
-        if n_modes(higher) > data.layout.size / 2:
-            # so many modes fit anything
-            break
-        try:
-            wider = set_up(setup.scenario.model_copy(update={"lmax": higher}), data)
-        except InputError:
-            # no beams or sky up to there
-            break
-        again, before = _found(wider, data, rules, stages), size
-        size = float(np.median(again.chi2))
-        if again.remark == NOT_JUDGED:
-            break
-        too_small = f"lmax={lmax} is too small for these data"
-        if not again.refused and again.share <= enough:
-            cause = f"{too_small}: lmax={higher} fits; use --set lmax={higher}"
-            remark = f"{cause}. {again.remark}".strip()
-            return replace(again, chi2=found.chi2, remark=remark, cause=cause)
-        if not 0.0 < size < FALLS * before:
-            break
-        cause = (
-            f"{too_small}, so that none was flagged: with lmax={higher} chi^2 of the times is "
-            f"{size / float(np.median(found.chi2)):.2g} of what it is now; use --set "
-            f"lmax={higher} or more"
-        )
-        nothing = np.zeros_like(found.flagged)
-        best = Fitting(nothing, found.chi2, f"{cause}.", refused=True, cause=cause)
-    return best
+    return Fitting(nothing, before, f"{TOO_MANY} {kept}".strip())
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,6 @@ from lusee_bayes.experiment.diagnosis import diagnose
 from lusee_bayes.experiment.experiment import (
     Experiment,
     doubts,
-    explained,
     infer,
     posterior_draws,
     rounds_of,
@@ -78,7 +77,7 @@ def conditioned(
     InputError
         For data that the earlier ones hold already, and as :func:`infer`.
     """
-    with rounds_of(experiment, stages or Stages(), "posterior") as report, explained(experiment):
+    with rounds_of(experiment, stages or Stages(), "posterior") as report:
         own, data = infer(experiment, report), experiment.data
         made = Conditioned(experiment, own, own, own, (data.digest(),))
         if earlier is not None:

@@ -8,11 +8,11 @@ import pytest
 from assertions import refuse
 
 import lusee_bayes as lb
-from lusee_bayes.experiment.experiment import explained
 from lusee_bayes.experiment.leave_out import NOT_JUDGED, TOO_MANY, fitting, without
 from lusee_bayes.experiment.model import radiometer, set_up
 from lusee_bayes.instrument.visibilities import Calibration
 from lusee_bayes.judge.plausibility import SIGNIFICANT, about_information, require_plausible
+from lusee_bayes.systematics.above_lmax import AboveLmaxSection
 from lusee_bayes.systematics.context import measured_visibilities
 from lusee_bayes.testing.contracts import assert_refused
 
@@ -148,23 +148,14 @@ def test_what_the_reduction_took_counts(experiment, lost, goes):
     assert found.share == pytest.approx(len(times) / 65.0 if goes else 0.0)
 
 
-def test_before_data_are_flagged_lmax_is_tried(experiment):
-    """Of a sky with structure up to lmax 14, mapped up to 6: the times fit at 14."""
-    fine = lb.build(experiment.scenario.model_copy(update={"lmax": 14}))
-    found = fitting(set_up(experiment.scenario, fine.data), fine.data, FALSE_ALARM)
-    assert not found.flagged.any()
-    assert found.remark.startswith("lmax=6 is too small") and "--set lmax=14" in found.remark
-    # and if the map then fails, it is not the prior that is blamed
-    told = pytest.raises(lb.InputError, match=r"^lmax=6 is .*lmax=14 \(no prior\)")
-    with told, explained(replace(fine, fitting=found)):
-        raise lb.InputError("no prior")
-
-
-def test_what_does_not_fit_at_a_higher_lmax_either_is_flagged(experiment):
-    data = with_bursts(lb.build(experiment.scenario.model_copy(update={"lmax": 14})), [20], 30.0)
-    found = fitting(set_up(experiment.scenario, data), data, FALSE_ALARM)
+def test_a_sky_that_does_not_end_at_lmax_is_no_reason_to_flag(experiment):
+    """Of a sky with structure up to lmax 14, mapped up to 6: only a time with a burst goes."""
+    data = with_bursts(lb.build(experiment.scenario.model_copy(update={"lmax": 14})), [20], 1e3)
+    whole = experiment.scenario.with_section("noise", above_lmax=AboveLmaxSection())
+    found = fitting(set_up(whole, data), data, FALSE_ALARM)
     assert np.flatnonzero(found.flagged.all(axis=0)).tolist() == [20] and found.flagged.sum() == 16
-    assert "lmax=14 fits" in found.remark and "1 of 65 times" in found.remark
+    # without what is above lmax hardly any time fits
+    assert fitting(set_up(experiment.scenario, data), data, FALSE_ALARM).remark.startswith(TOO_MANY)
 
 
 def test_what_cannot_be_judged_is_said(experiment, monkeypatch):
