@@ -291,16 +291,17 @@ class ExtendedObject:
 
     def modes(self, lmax: int) -> Float[np.ndarray, " modes"]:
         """Coefficients of a brightness that is one where the object is brightest."""
-        x, weight = np.polynomial.legendre.leggauss(N_POLAR)
-        away = (np.degrees(np.arccos(x)) - self.radius_deg) / self.width_deg
-        profile = weight * np.exp(-4.0 * np.log(2.0) * away**2)
-        zonal = 2.0 * np.pi * np.polynomial.legendre.legvander(x, lmax).T @ profile
+        polar = (np.arange(N_POLAR) + 0.5) * np.pi / N_POLAR
+        away = (np.degrees(polar) - self.radius_deg) / self.width_deg
+        profile = np.exp(-4.0 * np.log(2.0) * away**2) * np.sin(polar)
+        zonal = np.polynomial.legendre.legvander(np.cos(polar), lmax).T @ profile
+        zonal *= 2.0 * np.pi**2 / N_POLAR
         theta, phi = np.radians([90.0 - self.b_deg]), np.radians([self.l_deg])
         return per_mode(zonal) * synthesis_matrix(theta, phi, lmax)[0]
 
 
-# nodes in the polar angle, for widths of a degree and more
-N_POLAR = 1024
+# steps in the polar angle: exact to 1e-5 for widths of some degrees
+N_POLAR = 6000
 # Loops: Berkhuijsen, Haslam & Salter 1971 (A&A 14, 252). Other centres and sizes: SIMBAD. Strengths
 # are those of surveys at 22 to 408 MHz to within a factor of two, rounded up; where ionised gas
 # absorbs, an object is darker than its surroundings.

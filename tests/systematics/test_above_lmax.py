@@ -68,10 +68,11 @@ def test_simulated_data_hold_what_the_sky_has_above_lmax(both):
 def test_a_sky_that_does_not_end_at_lmax_has_error_bars_that_are_right(prior):
     """chi^2 per direction of those that the data know best; an order of magnitude off without."""
     given = "lmax=8", f"prior={{model: {prior}}}", "observation.step_s=14400"
-    sky = "noise.above_lmax={treatment: ignored}"
+    reach = "margin: 12, least_lmax: 0"
+    sky = f"noise.above_lmax={{{reach}, treatment: ignored}}"
     data = simulate(set_up(lb.load_scenario("fiducial", [*given, sky])))
     found = []
-    for above in ("{}", "null"):
+    for above in (f"{{{reach}}}", "null"):
         own = lb.load_scenario("fiducial", [*given, f"noise.above_lmax={above}"])
         posterior = lb.infer(lb.build(own, data)).posterior
         truth = np.asarray(data.truth)[: posterior.prior.size]
