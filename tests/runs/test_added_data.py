@@ -44,7 +44,7 @@ MAPS = [
     pytest.param([LEARNED], id="learned map"),
     pytest.param([CUBE, GIVEN], id="independent", marks=pytest.mark.long),
     pytest.param([CUBE, LEARNED], id="learned", marks=pytest.mark.long),
-    pytest.param([CUBE, *JOINT], id="joint"),
+    pytest.param([CUBE, *JOINT], id="joint", marks=pytest.mark.essential),
 ]
 
 
