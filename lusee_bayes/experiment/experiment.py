@@ -142,16 +142,17 @@ def observed(
         if len(data.truth) <= n_modes(scenario.lmax):  # of a sky that ends there
             above = None
         data = data.with_truth_up_to(scenario.lmax)
-    if above is not None and data is not None:
-        entries = data.layout.size * n_modes(above.top(scenario.lmax))
-        if entries > MOST_ABOVE:
-            above = None
-            doubts.append(
-                f"The model ends at lmax = {scenario.lmax}: of {data.layout.size:,} data, what the "
-                "sky adds above that takes too much memory; average them, or raise lmax."
-            )
     scenario = scenario.with_section("noise", above_lmax=above)
-    setup = set_up(scenario, data, stages)
+    try:
+        if above is not None and data is not None:
+            _require_room(data.layout.size, above.top(scenario.lmax))
+        setup = set_up(scenario, data, stages)
+    except InputError as error:
+        if above is None or data is None:
+            raise
+        # what is wrong without the sky above lmax, too, is raised here
+        setup = set_up(scenario.with_section("noise", above_lmax=None), data, stages)
+        doubts.append(f"The model ends at lmax = {scenario.lmax}, and the sky does not: {error}.")
     if data is None:
         with stages("noise"):
             return Experiment(setup, simulate(setup).with_truth_up_to(scenario.lmax))
@@ -163,6 +164,15 @@ def observed(
     for doubt in doubts:
         stages.say(f"  doubtful: {doubt}")
     return Experiment(setup, data, tuple(doubts))
+
+
+def _require_room(n_data: int, lmax: int) -> None:
+    """InputError if a matrix of data and modes is too large."""
+    if n_data * n_modes(lmax) > MOST_ABOVE:
+        raise InputError(
+            f"with {n_data:,} data, what the sky adds up to lmax = {lmax} takes too much memory; "
+            "average the data, or raise lmax"
+        )
 
 
 def _fitting(experiment: Experiment, stages: Stages) -> Experiment:

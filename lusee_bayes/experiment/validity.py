@@ -231,8 +231,7 @@ def about_sky_above(setup: Setup) -> str:
     above, section = setup.above, setup.scenario.noise.above_lmax
     if above is None or section.treatment == "ignored":
         return ""
-    added = float(np.sqrt(above.power.sum() / len(above.root)))
-    if added < LITTLE:
+    if (added := float(np.sqrt(above.power.sum() / len(above.root)))) < LITTLE:
         return ""
     lmax, rest = setup.scenario.lmax, np.append(np.cumsum(above.power[::-1])[::-1], 0.0)
     enough = lmax + int(np.argmax(rest < np.sqrt(2.0 * len(above.root))))

@@ -13,9 +13,8 @@ SCENARIO = (
     "noise={gain: {sigma: 0.005, correlation_h: 12}, receiver: {power_k: 2.0e4}, "
     "polarisation: {linear: 0.01}, pointing: {clock_s: 20, turntable_deg: 0.2}, "
     "above_lmax: {margin: 3, least_lmax: 0}}",
-    "sky.sources=false",
-    "sources.list=[{name: Cas A}]",
-)
+    "sky.sources=false", "sources.list=[{name: Cas A}]",
+)  # fmt: skip
 
 
 @pytest.mark.essential
@@ -26,8 +25,7 @@ def test_the_model_of_some_times_is_that_of_all_without_the_others():
     flags[3, 5], flags[:, 7] = True, True
     setup, data = without(setup, data, flags)
     keep = np.arange(data.layout.n_times) % 3 != 1
-    some, few = setup.select(keep), data.select(keep)
-    rows = keep[np.asarray(data.layout.time)]
+    some, few, rows = setup.select(keep), data.select(keep), keep[np.asarray(data.layout.time)]
     np.testing.assert_array_equal(few.data, data.data[rows])
     whole, part = full_model(setup), full_model(some)
     expected = np.asarray(whole.coupling.dense())[rows]

@@ -1,5 +1,8 @@
 """The sky above lmax: against the posterior of all modes, and skies that do not end at lmax."""
 
+from dataclasses import replace
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 
@@ -62,6 +65,18 @@ def test_simulated_data_hold_what_the_sky_has_above_lmax(both):
     np.testing.assert_array_equal(simulate(setup).truth[N:], whole.sky.modes[N:])
 
 
+def test_beams_that_end_before_leave_a_map_and_a_doubt(monkeypatch):
+    own = scenario(LMAX, "noise.above_lmax={}")
+    data = replace(simulate(set_up(own)), truth=None)
+    refused = Mock(side_effect=lb.InputError("72 azimuths cannot resolve lmax = 47"))
+    monkeypatch.setattr("lusee_bayes.experiment.model.sky_above", refused)
+    experiment = lb.build(own, data)
+    assert experiment.setup.above is None and "72 azimuths" in experiment.doubts[0]
+    monkeypatch.undo()
+    monkeypatch.setattr("lusee_bayes.experiment.experiment.MOST_ABOVE", 1e5)
+    assert "too much memory" in lb.build(own, data).doubts[0]
+
+
 @pytest.mark.parametrize(
     "prior", ["isotropic", pytest.param("local_scales", marks=pytest.mark.essential)]
 )
@@ -80,6 +95,5 @@ def test_a_sky_that_does_not_end_at_lmax_has_error_bars_that_are_right(prior):
         shares, directions = np.linalg.eigh(posterior.lower @ posterior.lower.T)
         known = shares > 1e2
         found.append(np.mean((directions.T @ white)[known] ** 2 * shares[known]))
-    with_it, without = found
     # an isotropic prior gives the sky between the spots of the plane more power than it has
-    assert 0.2 < with_it < 1.5 < 5.0 < without
+    assert 0.2 < found[0] < 1.5 < 5.0 < found[1]
