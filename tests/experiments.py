@@ -202,8 +202,7 @@ def draw_within(program, arguments, key, sampler, whitening=None, thin=1) -> dic
     all_white = set(latent_sites(program, arguments)) == white
     dynamic, static = eqx.partition(arguments, eqx.is_array)
     kernel = sampler.kernel(
-        lambda dynamic: run(**eqx.combine(dynamic, static)),
-        whitening.root.shape[1] if all_white else None,
+        lambda dynamic: run(**eqx.combine(dynamic, static)), whitening if all_white else None
     )
 
     def iterate(n, state):

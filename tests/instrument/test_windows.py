@@ -505,7 +505,7 @@ NOT_OF_A_FILE = [
     (changed("piece_sample", 0), "at least one piece for each"),
     (changed("piece_live_s", 4000.0), "sample 1 was live for 4000 s of a window of 3600 s"),
     (bounds_alone(changed("live_time", -1.0)), "sample 1 has a live time of -1 s"),
-    (bounds_alone(changed("time_bounds", np.datetime64("NaT"))), "time_bounds holds no time"),
+    (bounds_alone(changed("time_bounds", np.datetime64("NaT", "ns"))), "time_bounds holds no time"),
     (bounds_alone(numbers), "time_bounds holds values of type float64, expected times"),
 ]
 
