@@ -25,12 +25,14 @@ import numpy as np
 from jaxtyping import Float
 from scipy import special
 
-from lusee_bayes.core.arrays import Ells, ModesMatrix
+from lusee_bayes.core.arrays import Ells, ModesMatrix, Square
 from lusee_bayes.core.harmonics import per_mode, sum_over_m
 from lusee_bayes.sky.prior import PIVOT, HarmonicPrior, Prior
 
 # arrays that recur
 Parameters = Float[np.ndarray, " parameters"]
+
+Scored = Float[np.ndarray, "*n parameters"]
 
 Theta = Float[np.ndarray, " theta"]
 # degrees of freedom of the parameters' Student distribution: near their centre they are held as by
@@ -51,6 +53,9 @@ LOG_AMPLITUDE_WIDTH = 6.0
 LOG_MONOPOLE_WIDTH = 2.0
 # fluctuations relative to the mean, where the spectrum is started
 RELATIVE_STRENGTH = 0.05
+
+# of Gauss and Hermite's rule for the means of cells' factors
+NODES = 20
 
 # variance of parameters' linear combinations, one a row
 Spread = Callable[[Float[np.ndarray, "rows parameters"]], Float[np.ndarray, " rows"]]
@@ -133,16 +138,35 @@ class Hyperprior:
         cells = np.where(below < above, special.ndtri(below), -special.ndtri(above))
         return np.concatenate([theta, cells])
 
-    def of_scores(self, scores: Parameters) -> Parameters:
+    def of_scores(self, scores: Scored) -> Scored:
         """Compute the inverse of :meth:`scores`."""
-        x, t = np.split(scores, [len(self.centre)])
+        x, t = np.split(scores, [len(self.centre)], axis=-1)
         shape = self.tail / self.steepness
         theta = np.sign(x) * -special.stdtrit(FREEDOM, special.ndtr(-np.abs(x)))
         above = special.gammainccinv(shape, special.ndtr(t))
         below = special.gammaincinv(shape, special.ndtr(-t))
         power = np.where(t < 0, above, below)
         cells = -np.log(power / shape) / self.steepness
-        return np.concatenate([self.centre + self.width * theta, cells])
+        return np.concatenate([self.centre + self.width * theta, cells], axis=-1)
+
+    def near(self, scores: Parameters, drawn: Scored) -> Scored:
+        """Compute parameters of drawn scores: theta to first order about given ones.
+
+        Factors of cells have means, those of variables of a Student distribution have none.
+        """
+        found, n = self.of_scores(drawn), len(self.centre)
+        linear = self.of_scores(scores) + self.slopes_of_scores(scores) * (drawn - scores)
+        found[..., :n] = linear[..., :n]
+        return found
+
+    def moments(self, scores: Parameters, covariance: Square) -> tuple[Parameters, Square]:
+        """Mean and covariance of :meth:`near` for normal scores, with their correlation."""
+        nodes, weights = np.polynomial.hermite_e.hermegauss(NODES)
+        std = np.sqrt(np.diagonal(covariance))
+        values = self.near(scores, scores + nodes[:, None] * std)
+        mean, square = (weights @ values**k / weights.sum() for k in (1, 2))
+        scale = np.sqrt(square - mean**2) / std
+        return mean, scale[:, None] * covariance * scale
 
     def slopes_of_scores(self, scores: Parameters) -> Parameters:
         """Compute d parameter / d score of each: phi(z) over the parameter's density."""

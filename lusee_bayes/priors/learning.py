@@ -14,9 +14,10 @@ own.
 With the sky integrated out, ln p(d, theta) is maximised by Fisher scoring: its gradient is exact,
 its curvature the Fisher information, estimated from simulated data, and that of the hyperprior,
 corrected by how the gradient has changed along earlier steps.
-Around the maximum theta is taken for normal; the prior that is returned has the variances' means
-over it. The evidence is the integral of p(d, theta) by Laplace's approximation, in coordinates that
-know the hyperprior's tails.
+Around the maximum z is taken for normal, and theta for linear in it, but for the cells' factors:
+their distribution is skewed, and where the data do not see a cell its mean is far above the most
+probable value. The prior that is returned has the variances' means over it. The evidence is the
+integral of p(d, theta) by Laplace's approximation, in coordinates that know the hyperprior's tails.
 
 Draws of a sky have the parameters as uncertain as they are, ::
 
@@ -24,9 +25,9 @@ Draws of a sky have the parameters as uncertain as they are, ::
 
 The posterior that a run reports is one Gaussian, with the variances' means over theta as its prior.
 Where the data hardly tell how strong the sky is, its draws are all of the same strength; those of
-p(m | d) are quieter in one sky than in another, and a few departures are far larger. Here theta is
+p(m | d) are quieter in one sky than in another, and a few departures are far larger. Here z is
 drawn from the normal distribution about its most probable value, and skies from the posterior under
-each S(theta).
+each S(theta(z)).
 """
 
 from __future__ import annotations
@@ -58,9 +59,27 @@ from lusee_bayes.sky.prior import Prior
 STEPS, HALVINGS = 2, 10
 
 
-def normal_scores(
-    hyperprior: Hyperprior, parameters: Parameters, covariance: Square
-) -> tuple[Parameters, float]:
+@dataclass(frozen=True)
+class Scores:
+    """The normal distribution of the parameters' normal scores.
+
+    Attributes
+    ----------
+    mean : (parameters,) array
+        Most probable scores.
+    covariance : (parameters, parameters) array
+        About them.
+    log_volume : float
+        Its integral, by Laplace's approximation: what turns ln p(d | theta) at the mean into ln
+        p(d).
+    """
+
+    mean: Parameters
+    covariance: Square
+    log_volume: float
+
+
+def normal_scores(hyperprior: Hyperprior, parameters: Parameters, covariance: Square) -> Scores:
     """Transform the normal distribution about the most probable parameters to normal scores.
 
     Parameters
@@ -70,14 +89,6 @@ def normal_scores(
         Most probable, hyperprior included.
     covariance : (parameters, parameters) array
         Of the normal distribution about them.
-
-    Returns
-    -------
-    mean : (parameters,) array
-        Of the normal distribution of the scores, about their maximum.
-    log_volume : float
-        Its integral, by Laplace's approximation: what turns ln p(d | theta) at the mean into ln
-        p(d).
 
     Raises
     ------
@@ -102,7 +113,8 @@ def normal_scores(
         tried = (z + 0.5**k * step for k in range(HALVINGS))
         z = next((there for there in tried if value(there) >= value(z)), z)
     lower = checked_cholesky("the curvature of the parameters", precision(z))
-    return z, float(-np.log(np.diagonal(lower)).sum() - 0.5 * z @ z)
+    log_volume = float(-np.log(np.diagonal(lower)).sum() - 0.5 * z @ z)
+    return Scores(z, inverse_from_cholesky(lower), log_volume)
 
 
 # the maximum is found when the next step could not add more than this to ln p
@@ -142,6 +154,8 @@ class Learned:
         Most probable values.
     covariance : (parameters, parameters) array
         Of the normal distribution around them.
+    scores : Scores
+        The normal distribution of their normal scores, from which they are drawn.
     log_evidence : float
         ln p(d), with the sky and the parameters integrated out (Laplace).
     steps : int
@@ -159,6 +173,7 @@ class Learned:
     names: tuple[str, ...]
     parameters: Parameters
     covariance: Square
+    scores: Scores
     log_evidence: float
     steps: int
     noise_factor: float = field(default=1.0, kw_only=True)
@@ -316,7 +331,8 @@ def _fixed(family: PriorFamily, information: Information, factor: float) -> Lear
     for _ in range(MOST_WIDENINGS):
         try:
             evidence = float(information.posterior(prior).log_evidence)
-            return Learned(prior, (), np.zeros(0), np.zeros((0, 0)), evidence, 0, settled=False)
+            none = Scores(np.zeros(0), np.zeros((0, 0)), 0.0)
+            return Learned(prior, (), none.mean, none.covariance, none, evidence, 0, settled=False)
         except InputError as error:
             prior, failed = prior.widened(10.0), error
     raise failed
@@ -360,15 +376,16 @@ def _learned(
     family: PriorFamily, information: Information, here: _Point, rng: Generator, steps: int
 ) -> Learned:
     covariance = np.linalg.inv(here.curvature(family, rng, FINAL_SIMULATIONS))
+    scores = normal_scores(family.hyperprior, here.parameters, covariance)
+    mean, about = family.hyperprior.moments(scores.mean, scores.covariance)
 
     def spread(rows: Float[np.ndarray, "rows parameters"]) -> Float[np.ndarray, " rows"]:
-        return np.einsum("ij,ij->i", rows @ covariance, rows)
+        return np.einsum("ij,ij->i", rows @ about, rows)
 
-    scores, log_volume = normal_scores(family.hyperprior, here.parameters, covariance)
-    there = family.prior(family.at(family.hyperprior.of_scores(scores)).covariance)
-    evidence = float(information.posterior(there).log_evidence) + log_volume
-    prior = family.prior(family.averaged(here.parameters, spread))
-    return Learned(prior, family.names, here.parameters, covariance, evidence, steps)
+    there = family.prior(family.at(family.hyperprior.of_scores(scores.mean)).covariance)
+    evidence = float(information.posterior(there).log_evidence) + scores.log_volume
+    prior = family.prior(family.averaged(mean, spread))
+    return Learned(prior, family.names, here.parameters, covariance, scores, evidence, steps)
 
 
 # skies that are drawn with the same theta, and the least number of theta where skies are so many
@@ -405,7 +422,7 @@ def draws_with_parameters(
     drawn = np.empty((n, information.n_modes))
     if not n:
         return drawn
-    root = np.linalg.cholesky(learned.covariance)
+    root = np.linalg.cholesky(learned.scores.covariance)
     sets = min(n, max(LEAST, -(-n // SHARED)))
 
     def some(k: int) -> None:
@@ -420,9 +437,10 @@ def draws_with_parameters(
 def _under_drawn_parameters(
     family: PriorFamily, learned: Learned, root: Square, information: Information, key: PRNGKeyArray
 ) -> Posterior:
+    scores = learned.scores.mean
     for attempt in range(ATTEMPTS):
         z = jax.random.normal(jax.random.fold_in(key, attempt), (len(root),), dtype=jnp.float64)
-        parameters = learned.parameters + root @ np.asarray(z)
+        parameters = family.hyperprior.near(scores, scores + root @ np.asarray(z))
         try:
             return information.posterior(family.prior(family.at(parameters).covariance))
         except InputError as error:

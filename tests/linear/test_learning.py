@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from assertions import refuse
 from jaxtyping import TypeCheckError
-from scipy import integrate, stats
+from scipy import integrate, special, stats
 from scipy.optimize import minimize
 
 import lusee_bayes as lb
@@ -164,6 +164,23 @@ def test_scores_are_standard_normal_under_the_hyperprior():
         np.testing.assert_allclose(hyperprior.slopes_of_scores(both), slopes, rtol=1e-7)
 
 
+def test_an_unseen_cell_has_the_factor_that_is_expected_of_it():
+    """Mean and variance of ln v against a gamma variable's; theta is linear in its score."""
+    hyperprior = Hyperprior(np.array([1.0]), np.array([0.5]), n_cells=2)
+    mean, covariance = hyperprior.moments(np.zeros(3), np.diag([0.01, 1.0, 1.0]))
+    shape = hyperprior.tail / hyperprior.steepness
+    expected = 0.5 * (np.log(shape) - special.digamma(shape))
+    np.testing.assert_allclose(mean, [1.0, expected, expected], rtol=1e-3)
+    variance = 0.25 * special.polygamma(1, shape)
+    slope = hyperprior.slopes_of_scores(np.zeros(3))[0]
+    expected = [0.01 * slope**2, variance, variance]
+    np.testing.assert_allclose(np.diagonal(covariance), expected, rtol=1e-2)
+    # theta is linear, the cells are what their scores say
+    far = hyperprior.near(np.zeros(3), np.full(3, 2.0))
+    assert far[0] == pytest.approx(1.0 + 2.0 * slope)
+    np.testing.assert_allclose(far[1:], hyperprior.of_scores(np.full(3, 2.0))[1:])
+
+
 # --- data that do not fit -------------------------------------------------------------------------
 
 
@@ -229,11 +246,20 @@ SCALE = 1e3
 class Strength(IsotropicFamily):
     """S = exp(theta) s^2 1."""
 
+    hyperprior = Hyperprior(np.array([0.4]), np.array([1.0]))
+
     def at(self, parameters):
         return Member(np.exp(parameters[0]) * SCALE**2 * np.eye(SIZE))
 
     def prior(self, covariance):
         return lb.HarmonicPrior(np.diagonal(covariance)[np.arange(LOW + 1) ** 2])
+
+
+def scores_of(hyperprior, theta, covariance) -> learning.Scores:
+    """Those whose parameters are normal about theta, with this covariance."""
+    z = hyperprior.scores(theta)
+    slope = hyperprior.slopes_of_scores(z)
+    return learning.Scores(z, covariance / slope[:, None] / slope, 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -245,7 +271,9 @@ def one_parameter():
     unknown = [np.asarray(0.0)] * 3
     information = Information(np.diag(noise**-2.0), seen / noise**2, np.zeros(SIZE), *unknown)
     prior = family.prior(family.at(np.array([0.4])).covariance)
-    learned = learning.Learned(prior, ("theta",), np.array([0.4]), np.array([[width**2]]), 0.0, 0)
+    theta, covariance = np.array([0.4]), np.array([[width**2]])
+    scores = scores_of(family.hyperprior, theta, covariance)
+    learned = learning.Learned(prior, ("theta",), theta, covariance, scores, 0.0, 0)
     draws = learning.draws_with_parameters(family, learned, information, jax.random.key(1), 4500)
     return noise, seen, draws
 
@@ -275,7 +303,9 @@ def weakly_known(family: IsotropicFamily, std: float) -> tuple[learning.Learned,
     prior = family.prior(family.at(theta).covariance)
     matrix, one = np.eye(SIZE) * 1e-8, np.ones(())
     information = Information(matrix, np.ones(SIZE), np.zeros(SIZE), one, one, one)
-    return learning.Learned(prior, (), theta, std**2 * np.eye(len(theta)), 0.0, 0), information
+    covariance = std**2 * np.eye(len(theta))
+    scores = scores_of(family.hyperprior, theta, covariance)
+    return learning.Learned(prior, (), theta, covariance, scores, 0.0, 0), information
 
 
 def test_few_draws_and_none():
