@@ -5,8 +5,11 @@
 Data of each sky are simulated with the scenario's instrument and noise, and mapped with its prior,
 which knows nothing of the sky. Two tests of each sky, both against draws of its posterior: the
 share or rms pull, of any band of latitude or group of multipoles, that is furthest from what is
-expected; and the largest pull of the whole sky. Ends with exit code 1 if p of either, times the
-number of all tests, is below 0.01: a run whose error bars are right fails once in a hundred.
+expected; and the largest pull of the whole sky. A second table has the chi^2 per direction of
+truth - mean, by how much of the prior's variance the data leave; the share of C_ell within the
+draws' central 68 %; and the pull of the mean temperature; with means over all skies. Ends with exit
+code 1 if p of either, times the number of all tests, is below 0.01: a run whose error bars are
+right fails once in a hundred.
 """
 
 from __future__ import annotations
@@ -24,16 +27,17 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
+from scipy.linalg import eigh
 
 import lusee_bayes as lb
-from lusee_bayes.core.harmonics import modes_to_map
+from lusee_bayes.core.harmonics import modes_to_map, power_spectrum
 from lusee_bayes.experiment.experiment import posterior_draws, under_sky
 from lusee_bayes.experiment.model import set_up
 from lusee_bayes.experiment.sky_sections import FileSkySection, GalaxySection
 from lusee_bayes.judge.coverage import LEVELS, Counts
 from lusee_bayes.report.figures.drawing import BLUE, DIVERGING, GREY, ORANGE, colour_bar, mollweide
 from lusee_bayes.results.channel import ChannelResult
-from lusee_bayes.results.channel_map import conditioned
+from lusee_bayes.results.channel_map import Conditioned, conditioned
 from lusee_bayes.sky.sky_source import SkySource
 
 # each takes a seed
@@ -44,6 +48,8 @@ NAMED: dict[str, Callable[[int], SkySource]] = {
     "spotty": SpottySky,
 }
 FALSE_ALARM, TESTS = 0.01, 2
+# directions of which at most that share of the prior's variance is left
+SUBSPACES = (0.001, 0.01, 0.1, 0.5)
 # pulls beyond that have the darkest colours; shares further from their levels are at the rim
 WIDEST, FURTHEST = 4.0, 50.0
 
@@ -56,6 +62,10 @@ class Mapped:
     channel: ChannelResult
     pixels: Counts
     modes: Counts
+    # chi^2 per direction of each of SUBSPACES, share of C_ell, pull of the mean temperature
+    known: tuple[float, ...]
+    spectrum: float
+    temperature: float
 
     def p_held(self) -> float:
         """p of the share or rms pull that is furthest from what is expected.
@@ -96,6 +106,40 @@ def find_sky(text: str) -> tuple[str, SkySource]:
     path = Path(file).absolute()
     given = {"file_frequency_mhz": float(frequency)} if frequency else {}
     return path.stem, FileSkySection(file=str(path), **given)
+
+
+def judged(name: str, made: Conditioned, n_draws: int) -> Mapped:
+    """Compare a map with its truth and with draws of its posterior."""
+    channel = made.result(made.known())
+    error = channel.truth - channel.mean
+    drawn = posterior_draws(made.experiment, made.posterior, lambda: made.information, n_draws)
+    deviations = drawn - channel.mean
+    pixels = Counts.of_pixels(channel.pixel_std, error, deviations)
+    modes = Counts.of_modes(channel.std, error, deviations)
+    left, directions = eigh(made.covariance, made.posterior.prior.covariance())
+    chi2 = (directions.T @ error) ** 2 / left
+    known = tuple(float(chi2[left < share].mean()) for share in SUBSPACES)
+    below = (power_spectrum(drawn) < power_spectrum(channel.truth)).mean(0)
+    spectrum = float((np.abs(below[1:] - 0.5) < 0.34).mean())
+    return Mapped(name, channel, pixels, modes, known, spectrum, float(error[0] / channel.std[0]))
+
+
+def summed_up(mapped: list[Mapped]) -> Table:
+    """What is known best, the spectra and the mean temperatures, and their means."""
+    names = (*(f"< {share}" for share in SUBSPACES), "C_ell in 68 %", "z of the mean T")
+    table = Table("sky", *names, title="chi^2 per direction with so much of the prior's variance")
+    rows = np.array([(*sky.known, sky.spectrum, sky.temperature) for sky in mapped])
+    for sky, row in zip(mapped, rows, strict=True):
+        table.add_row(sky.name, *(f"{x:.2f}" for x in row))
+    means = [*rows[:, :-1].mean(0), np.sqrt((rows[:, -1] ** 2).mean())]
+    table.add_section()
+    table.add_row("mean (rms of z)", *(f"{x:.2f}" for x in means))
+    for kind in ("pixels", "modes"):
+        for k, part in enumerate(getattr(mapped[0], kind).names):
+            held = [100 * getattr(sky, kind).values[k, :4, 0] for sky in mapped]
+            words = ", ".join(f"{share:.1f}" for share in np.mean(held, axis=0))
+            table.add_row(f"{part}: within 50, 68, 90, 95 %", words)
+    return table
 
 
 def draw(mapped: list[Mapped], frequency_mhz: float) -> Figure:
@@ -151,14 +195,7 @@ def main() -> int:
     for name, source in map(find_sky, options.skies):
         # noise of its own for each sky, whatever the others are
         made = conditioned(under_sky(setup, source, scenario.seed + zlib.crc32(name.encode())))
-        channel = made.result(made.known())
-        error = channel.truth - channel.mean
-        drawn = posterior_draws(
-            made.experiment, made.posterior, lambda made=made: made.information, n_draws
-        )
-        drawn = drawn - channel.mean
-        pixels = Counts.of_pixels(channel.pixel_std, error, drawn)
-        mapped.append(Mapped(name, channel, pixels, Counts.of_modes(channel.std, error, drawn)))
+        mapped.append(judged(name, made, n_draws))
     table = Table("sky", "part", *(f"{level:.0%}" for level in LEVELS), "rms pull", "largest")
     for sky in mapped:
         for part in (*sky.pixels.coverage(), *sky.modes.coverage()):
@@ -173,6 +210,7 @@ def main() -> int:
         table.add_section()
     console = Console(width=130)
     console.print(table)
+    console.print(summed_up(mapped))
     for sky in mapped:
         verdict = "hold" if sky.holds(n) else "DO NOT hold"
         console.print(

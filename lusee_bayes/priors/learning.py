@@ -16,7 +16,9 @@ its curvature the Fisher information, estimated from simulated data, and that of
 corrected by how the gradient has changed along earlier steps.
 Around the maximum z is taken for normal, and theta for linear in it, but for the cells' factors:
 their distribution is skewed, and where the data do not see a cell its mean is far above the most
-probable value. The prior that is returned has the variances' means over it. The evidence is the
+probable value. The prior that is returned has the variances' means over it, at the level that suits
+the data best: they tell the variances' mean over many cells, which the most probable logarithms of
+each do not give. The evidence is the
 integral of p(d, theta) by Laplace's approximation, in coordinates that know the hyperprior's tails.
 
 Draws of a sky have the parameters as uncertain as they are, ::
@@ -133,6 +135,8 @@ SIMULATIONS, FINAL_SIMULATIONS = 200, 500
 ROUNDING = 1e-4
 # of the factor of N that data that do not fit demand: what is tried, one after the other
 HIGHER = np.array([1.0, 1e2, 1e4])
+# shifts of ln C at which the evidence of the averaged prior is computed, to find the best one
+LEVELS = (-1.0, -0.5, 0.0)
 # how often a fixed prior is made ten times as wide where rounding leaves no posterior mean
 MOST_WIDENINGS = 4
 
@@ -384,7 +388,17 @@ def _learned(
 
     there = family.prior(family.at(family.hyperprior.of_scores(scores.mean)).covariance)
     evidence = float(information.posterior(there).log_evidence) + scores.log_volume
-    prior = family.prior(family.averaged(mean, spread))
+
+    def at_level(shift: float) -> Posterior:
+        level = np.concatenate([[mean[0] + shift], mean[1:]])
+        return information.posterior(family.prior(family.averaged(level, spread)))
+
+    tried = [float(at_level(shift).log_evidence) for shift in LEVELS]
+    square, linear, _ = np.polyfit(LEVELS, tried, 2)
+    shift = -0.5 * linear / square if square < 0 else LEVELS[int(np.argmax(tried))]
+    moved = np.zeros(len(mean))
+    moved[0] = shift / family.hyperprior.slopes_of_scores(scores.mean)[0]
+    prior, scores = at_level(shift).prior, replace(scores, mean=scores.mean + moved)
     return Learned(prior, family.names, here.parameters, covariance, scores, evidence, steps)
 
 

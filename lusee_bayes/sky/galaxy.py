@@ -289,11 +289,15 @@ class ExtendedObject:
     width_deg: float
     strength: float
 
+    def profile(self, polar: np.ndarray) -> np.ndarray:
+        """Brightness at angles from the centre, in radians, over the largest."""
+        away = (np.degrees(polar) - self.radius_deg) / self.width_deg
+        return np.exp(-4.0 * np.log(2.0) * away**2)
+
     def modes(self, lmax: int) -> Float[np.ndarray, " modes"]:
         """Coefficients of a brightness that is one where the object is brightest."""
         polar = (np.arange(N_POLAR) + 0.5) * np.pi / N_POLAR
-        away = (np.degrees(polar) - self.radius_deg) / self.width_deg
-        profile = np.exp(-4.0 * np.log(2.0) * away**2) * np.sin(polar)
+        profile = self.profile(polar) * np.sin(polar)
         zonal = np.polynomial.legendre.legvander(np.cos(polar), lmax).T @ profile
         zonal *= 2.0 * np.pi**2 / N_POLAR
         theta, phi = np.radians([90.0 - self.b_deg]), np.radians([self.l_deg])
@@ -386,6 +390,17 @@ BACKGROUND_INDEX = -2.58
 FLUCTUATION_RMS = 0.05
 FLUCTUATION_SLOPE = -2.7
 FLUCTUATION_LMAX = 191
+
+# Spurs: parts of shells, besides loops I to IV, that are brighter by up to this share. Clouds of
+# ionised gas within some 300 pc, in front of most of the emission: FWHM in degrees, scale height of
+# b, median and scatter of the emission measure in pc cm^-6 (the Gum nebula's is 100 to 300), and
+# the share of a cloud that is covered
+N_SPURS, SPUR = 8, 0.15
+N_CLOUDS, CLOUD_WIDTH_DEG, CLOUD_HEIGHT_DEG = 15, (2.0, 9.0), 8.0
+CLOUD_EMISSION_MEASURE, CLOUD_SCATTER, CLOUD_COVERED = 30.0, 0.8, (0.3, 1.0)
+# Extragalactic sources above a flux in Jy at 25 MHz: 70,000 above 0.4 Jy at 74 MHz on 3 pi (Cohen
+# et al. 2007, AJ 134, 1245), N(> S) ~ S^-1.5, S ~ nu^-0.7. The brightest are in the catalogue
+N_FAINT, FAINT_JY, FAINT_MHZ, FAINT_INDEX = 2300, (10.0, 200.0), 25.0, -0.7
 
 MINIMUM_MHZ = 1.0
 MAXIMUM_MHZ = 50.0
@@ -572,6 +587,64 @@ def _fluctuations(nside: int, seed: int) -> np.ndarray:
     return healpy.alm2map(alm * np.sqrt(spectrum[ell]), nside, lmax=lmax)
 
 
+@dataclass(frozen=True)
+class Structures:
+    """What a seed adds to the smooth Galaxy, on a HEALPix grid.
+
+    Attributes
+    ----------
+    emission : (pixels,) array
+        Factor of the synchrotron emission.
+    clouds : (clouds, pixels) array
+        Emission measure of each cloud, in pc cm^-6.
+    covered : (clouds,) array
+        The share of each that it covers, densely; the rest is empty.
+    flux_jy : (pixels,) array
+        Of extragalactic sources, at ``FAINT_MHZ``.
+    """
+
+    emission: Vector
+    clouds: Float[np.ndarray, "clouds pixels"]
+    covered: Float[np.ndarray, " clouds"]
+    flux_jy: Vector
+
+    @classmethod
+    @lru_cache(maxsize=1)
+    def of(cls, nside: int, seed: int) -> Structures:
+        """Draw them: the same at every ``nside``."""
+        rng = np.random.default_rng([seed, 1])
+        l_deg, b_deg = healpy.pix2ang(nside, np.arange(12 * nside**2), lonlat=True)
+        loops = [one for one in EXTENDED_OBJECTS if one.radius_deg]
+        for _ in range(N_SPURS):
+            centre = rng.uniform(0.0, 360.0), np.degrees(np.arcsin(rng.uniform(-1.0, 1.0)))
+            shape = rng.uniform(15.0, 60.0), rng.uniform(3.0, 10.0)
+            loops.append(ExtendedObject("spur", *centre, *shape, SPUR))
+        emission = np.exp(_fluctuations(nside, seed) - 0.5 * FLUCTUATION_RMS**2)
+        for one in loops:
+            away, towards = _seen_from(one, l_deg, b_deg)
+            part = 0.5 + 0.5 * np.cos(towards - rng.uniform(0.0, 2.0 * np.pi))
+            emission += rng.uniform(1.0, 2.0) * one.strength * part * one.profile(away)
+        emission /= emission.mean()
+        clouds = []
+        for _ in range(N_CLOUDS):
+            centre = rng.uniform(0.0, 360.0), np.clip(rng.laplace(0.0, CLOUD_HEIGHT_DEG), -90, 90)
+            one = ExtendedObject("cloud", *centre, 0.0, rng.uniform(*CLOUD_WIDTH_DEG), 1.0)
+            measure = CLOUD_EMISSION_MEASURE * np.exp(CLOUD_SCATTER * rng.standard_normal())
+            clouds.append(measure * one.profile(_seen_from(one, l_deg, b_deg)[0]))
+        covered = rng.uniform(*CLOUD_COVERED, N_CLOUDS)
+        least, most = np.array(FAINT_JY) ** -1.5
+        flux = rng.uniform(most, least, N_FAINT) ** (-1.0 / 1.5)
+        at = healpy.vec2pix(nside, *rng.standard_normal((3, N_FAINT)))
+        faint = np.bincount(at, flux, 12 * nside**2)
+        return cls(emission, np.array(clouds), covered, faint)
+
+
+def _seen_from(one: ExtendedObject, l_deg: Vector, b_deg: Vector) -> tuple[Vector, Vector]:
+    """Angle from an object's centre, and azimuth about it, in radians."""
+    rotation = healpy.Rotator(rot=(one.l_deg, one.b_deg - 90.0))
+    return tuple(rotation(np.radians(90.0 - b_deg), np.radians(l_deg)))
+
+
 def galaxy_map(frequency_mhz: float, nside: int = 64, seed: int | None = 1) -> np.ndarray:
     """Compute the brightness temperature of the diffuse sky.
 
@@ -614,9 +687,17 @@ def galaxy_map(frequency_mhz: float, nside: int = 64, seed: int | None = 1) -> n
 
     slabs, places = _towards(*healpy.pix2ang(nside, np.arange(12 * nside**2)))
     synchrotron, depth = (values[places] for values in slabs.synchrotron(frequency_mhz))
-    if seed is not None:
-        synchrotron *= np.exp(_fluctuations(nside, seed) - 0.5 * FLUCTUATION_RMS**2)
-    return brightness(synchrotron, depth, frequency_mhz)
+    if seed is None:
+        return brightness(synchrotron, depth, frequency_mhz)
+    drawn = Structures.of(nside, seed)
+    total = brightness(synchrotron * drawn.emission, depth, frequency_mhz)
+    per_measure = absorption_per_emission_measure(frequency_mhz)
+    for cloud, covered in zip(drawn.clouds, drawn.covered, strict=True):
+        absorbed = -covered * np.expm1(-per_measure * cloud)
+        total += absorbed * (ELECTRON_TEMPERATURE_K - total)
+    flux = drawn.flux_jy * (frequency_mhz / FAINT_MHZ) ** FAINT_INDEX
+    faint = kelvin_steradian(flux, frequency_mhz) / healpy.nside2pixarea(nside)
+    return total + np.exp(-depth) * faint
 
 
 def galactic_share(theta: Vector, phi: Vector) -> Vector:

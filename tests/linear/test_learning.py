@@ -87,6 +87,19 @@ def test_learning_gains_over_the_start_under_local_scales():
     before = float(information.posterior(family.expected()).log_evidence)
     assert float(information.posterior(found.prior).log_evidence) > before - 1.0
     assert np.isfinite(found.log_evidence)
+    # the variances' means are at the level that suits the data best: another is less probable
+    mean, about = family.hyperprior.moments(found.scores.mean, found.scores.covariance)
+
+    def evidence(shift):
+        level = mean + shift * (np.arange(len(mean)) == 0)
+        spread = lambda rows: np.einsum("ij,jk,ik->i", rows, about, rows)  # noqa: E731
+        return float(
+            information.posterior(family.prior(family.averaged(level, spread))).log_evidence
+        )
+
+    best = float(information.posterior(found.prior).log_evidence)
+    assert evidence(0.0) == pytest.approx(best, abs=0.01)
+    assert max(evidence(-0.4), evidence(0.4)) < best
     assert [row["name"] for row in found.as_rows()] == list(family.names)
 
 

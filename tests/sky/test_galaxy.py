@@ -100,10 +100,10 @@ def test_mean_temperature_is_ulsas(ulsa_map, frequency_mhz):
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_spectrum_at_10_mhz_is_ulsas(ulsa_map, seed):
-    # Asked for: a factor of two. The random part adds up to 30 % to the weakest odd multipoles.
+    # A factor of two: loops and spurs add up to 80 % to the weakest odd multipoles.
     diffuse = hp.anafast(galaxy.galaxy_map(10.0, NSIDE, seed), lmax=47)
     ratio = (diffuse / hp.anafast(ulsa_map(10.0), lmax=47))[1:31]
-    assert ratio.min() > 0.7 and ratio.max() < 1.5, np.round(ratio, 2)
+    assert ratio.min() > 0.7 and ratio.max() < 2.0, np.round(ratio, 2)
 
 
 def test_spectrum_with_the_sources_is_ulsas_within_a_factor_of_two(ulsa_map):
@@ -112,10 +112,10 @@ def test_spectrum_with_the_sources_is_ulsas_within_a_factor_of_two(ulsa_map):
     assert ratio.min() > 0.5 and ratio.max() < 2.0, np.round(ratio, 2)
 
 
-@pytest.mark.parametrize("frequency_mhz, floor", [(1.0, 0.85), (3.0, 0.85), (10.0, 0.98)])
+@pytest.mark.parametrize("frequency_mhz, floor", [(1.0, 0.8), (3.0, 0.8), (10.0, 0.97)])
 def test_pattern_is_ulsas(ulsa_map, frequency_mhz, floor):
     # Spectra forget phases. What we leave out shows below 10 MHz: Loop I's cap in the north at
-    # 1 MHz, the arms at 3 MHz; each is about 15 % of the variance.
+    # 1 MHz, the arms at 3 MHz; each is about 15 % of the variance. So do our clouds and sources.
     ours, theirs = galaxy.galaxy_map(frequency_mhz, NSIDE), ulsa_map(frequency_mhz)
     assert np.corrcoef(ours, theirs)[0, 1] > floor
 
@@ -243,6 +243,35 @@ def test_random_component_has_the_stated_rms_and_large_scales_at_every_nside():
     # Pixel quadrature at the band limit of nside 16 costs 1e-4, against 2e-2 of another draw.
     np.testing.assert_allclose(coarse, fine, atol=2e-4)
     assert np.std(fine) > 5e-3
+
+
+def test_loops_clouds_and_faint_sources_are_the_same_at_every_nside():
+    coarse, fine = (galaxy.Structures.of(nside, 4) for nside in (16, 64))
+    # the texture's small scales, 2 % of rms, are in the finer map alone
+    assert np.std(hp.ud_grade(fine.emission, 16) / coarse.emission) < 0.03
+    assert fine.emission.mean() == pytest.approx(1.0) and fine.emission.std() > 0.06
+    np.testing.assert_array_equal(fine.covered, coarse.covered)
+    assert coarse.flux_jy.sum() == pytest.approx(fine.flux_jy.sum())
+    # N(> S) ~ S^-1.5, but for those that share a pixel: 2300 in 49152
+    above = [(fine.flux_jy > flux).sum() for flux in (10.0, 20.0)]
+    assert above[1] / above[0] == pytest.approx(2.0**-1.5, abs=0.05)
+
+
+@pytest.mark.parametrize("frequency_mhz, opaque", [(3.0, True), (50.0, False)])
+def test_clouds_absorb_what_they_cover(frequency_mhz, opaque):
+    """A dense cloud leaves the share that is not covered, and adds its own 8000 K."""
+    drawn = galaxy.Structures.of(NSIDE, 4)
+    k = int(np.argmax(drawn.clouds.max(1)))
+    at = int(np.argmax(drawn.clouds[k]))
+    others = np.arange(len(drawn.clouds)) != k
+    assert drawn.clouds[others, at].max() < 1.0, "the densest cloud lies apart from the others"
+    depth = galaxy.absorption_per_emission_measure(frequency_mhz) * drawn.clouds[k, at]
+    assert (depth > 1.0) == opaque
+    synchrotron, gas = one_line(*hp.pix2ang(NSIDE, at, lonlat=True), frequency_mhz)
+    bare = all_of_a_line(synchrotron * drawn.emission[at], gas, frequency_mhz)
+    share = drawn.covered[k] * (1.0 - np.exp(-depth))
+    want = (1.0 - share) * bare + share * 8000.0
+    assert galaxy.galaxy_map(frequency_mhz, NSIDE, 4)[at] == pytest.approx(want, rel=0.02)
 
 
 @pytest.mark.parametrize("given", [(0.5,), (51.0,), (float("nan"),), (10.0, 48), (10.0, 64, -1)])
