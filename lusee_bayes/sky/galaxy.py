@@ -23,9 +23,9 @@ along every line of sight through ionised gas, in front of an isotropic backgrou
     T(l, b) = int [j(s) + kappa(s) T_e] exp(-tau(s)) ds + T_bg exp(-tau(inf)),
     tau(s) = int_0^s kappa ds'.
 
-The emissivity and the background are theirs. The electrons' thermal
-emission kappa T_e, which ULSA leaves out, and the random component are ours. No file is read: the
-map is computed.
+The emissivity and the background are theirs. The electrons' thermal emission kappa T_e, which ULSA
+leaves out, and what a seed adds are ours: a random factor, loops and spurs, nearby clouds and faint
+sources. No file is read: the map is computed.
 """
 
 from __future__ import annotations
@@ -648,13 +648,13 @@ def _seen_from(one: ExtendedObject, l_deg: Vector, b_deg: Vector) -> tuple[Vecto
 def galaxy_map(frequency_mhz: float, nside: int = 64, seed: int | None = 1) -> np.ndarray:
     """Compute the brightness temperature of the diffuse sky.
 
-    The synchrotron emission is multiplied by exp(g - var(g)/2), g a Gaussian field drawn from
-    ``seed``: the pattern is the same at all frequencies, the mean is kept and the sky stays
-    positive. The background is absorbed by the whole Galactic column.
+    What ``seed`` draws (:class:`Structures`) is the same at all frequencies: the synchrotron
+    emission is multiplied by a positive factor of mean one, clouds in front absorb and emit, and
+    faint sources shine through the whole Galactic column, as the background does.
 
     Two numbers were tuned against ULSA's maps, by hand: the clumping of the thick disc
-    (:mod:`.galaxy`) and FLUCTUATION_RMS. With seed 1 the mean is within 2 % of ULSA's at 1, 3
-    and 10 MHz, and C_ell at 10 MHz within 15 % for 1 <= ell <= 30. At 1 MHz the local gas rules
+    (:mod:`.galaxy`) and FLUCTUATION_RMS. With seed 1 the mean is within 4 % of ULSA's at 1, 3
+    and 10 MHz, and C_ell at 10 MHz within 40 % for 1 <= ell <= 30. At 1 MHz the local gas rules
     the sky, and only the largest scales agree.
 
     Parameters
@@ -664,7 +664,7 @@ def galaxy_map(frequency_mhz: float, nside: int = 64, seed: int | None = 1) -> n
     nside : int
         A power of two.
     seed : int or None
-        Of the random component, not negative; None leaves it out.
+        Of the random structures, not negative; None leaves them out.
 
     Returns
     -------
