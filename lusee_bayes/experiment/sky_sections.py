@@ -33,7 +33,7 @@ class GalaxySection(Section, SkySource):
     Attributes
     ----------
     seed : int
-        Seed of the random small scales.
+        Seed of the random small scales, loops, clouds and faint sources.
     sources : bool
         Add the brightest point sources.
     """

@@ -313,6 +313,8 @@ EXTENDED_OBJECTS = (
     ExtendedObject("LMC", 280.5, -32.9, 0.0, 6.0, 0.5),
     ExtendedObject("SMC", 302.8, -44.3, 0.0, 3.0, 0.2),
     ExtendedObject("Cygnus X", 80.0, 1.0, 0.0, 7.0, 1.0),
+    ExtendedObject("Cepheus", 110.0, 3.0, 0.0, 7.0, 0.5),
+    ExtendedObject("W3, W4 and W5", 135.0, 1.0, 0.0, 5.0, 0.5),
     ExtendedObject("Vela", 263.6, -2.8, 0.0, 7.0, 0.5),
     ExtendedObject("Gum nebula", 258.0, -2.0, 0.0, 30.0, 0.2),
     ExtendedObject("Orion-Eridanus", 200.0, -25.0, 0.0, 35.0, 0.1),
@@ -567,7 +569,6 @@ def _slabs(points: bytes) -> tuple[Slabs, tuple[np.ndarray, np.ndarray]]:
     return slabs, ((theta > 0.5 * np.pi).astype(int), np.argsort(order)[line])
 
 
-@lru_cache(maxsize=1)
 def _fluctuations(nside: int, seed: int) -> np.ndarray:
     """Gaussian field of the logarithm of the synchrotron emission, (12 nside^2,), zero mean.
 

@@ -598,8 +598,8 @@ def galaxy_sky(
     frequency_mhz : float
     lmax : int
     seed : int or None
-        Chooses the random small-scale structure, which is the same at all frequencies; None leaves
-        it out.
+        Chooses the random structure (:class:`.Structures`), which is the same at all frequencies;
+        None leaves it out.
     sources : tuple of PointSource
         The sources that are added to the diffuse sky.
 
