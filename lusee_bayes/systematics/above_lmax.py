@@ -15,22 +15,20 @@ Simulated data hold the modes that the scenario's sky has up to lmax + margin.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Annotated, ClassVar
 
 import numpy as np
 from jaxtyping import Float
 from pydantic import Field
 
-from lusee_bayes.core.arrays import Array, DataVector
+from lusee_bayes.core.arrays import DataVector
 from lusee_bayes.core.harmonics import LARGEST_LMAX
 from lusee_bayes.core.linalg import checked_cholesky, gram_matrix
 from lusee_bayes.core.section import Section, Treatment
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.pointing import Pointing
-from lusee_bayes.noise.covariance import LowRankCovariance
 from lusee_bayes.systematics.context import Above, Around, Setup
-from lusee_bayes.systematics.systematic import AdditiveNoise, with_added
+from lusee_bayes.systematics.systematic import LowRankNoise, with_added
 
 # by how much directions that are left out may change chi^2 together
 LEFT_OUT = 1.0
@@ -58,13 +56,11 @@ class AboveLmaxSection(Section):
         return min(max(lmax + self.margin, self.least_lmax), LARGEST_LMAX)
 
 
-class AboveLmax(AdditiveNoise):
-    """What the sky above lmax adds to the data.
+class AboveLmax(LowRankNoise):
+    """What the sky above lmax adds to the data; its root is A' S'^(1/2).
 
     Attributes
     ----------
-    root : (data, rank) array
-        A' S'^(1/2), in K.
     mean : (data,) array
         A' mu', in K.
     """
@@ -73,7 +69,6 @@ class AboveLmax(AdditiveNoise):
     section: ClassVar[type[Section]] = AboveLmaxSection
     words: ClassVar[str] = "the sky above lmax"
 
-    root: Float[Array, "data rank"]
     mean: DataVector
 
     @classmethod
@@ -90,12 +85,6 @@ class AboveLmax(AdditiveNoise):
         """Add the modes of the scenario's sky."""
         coupling = _coupling(setup, section.top(setup.scenario.lmax))
         return with_added(model, coupling @ setup.above.modes)
-
-    def behind(self, gains: DataVector) -> AboveLmax:
-        return replace(self, root=self.root * np.asarray(gains)[:, None])
-
-    def covariance(self) -> LowRankCovariance:
-        return LowRankCovariance(self.root, self.words)
 
     def effect(self, model, values):
         return with_added(super().effect(model, values), self.mean)

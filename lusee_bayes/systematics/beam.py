@@ -73,6 +73,7 @@ class BeamErrors(Systematic):
     section: ClassVar[type[Section]] = BeamErrorSection
     words: ClassVar[str] = "the beams"
     draw: ClassVar[int] = 3
+    moves_setup: ClassVar[bool] = True
 
     @classmethod
     def in_rounds(cls, section: BeamErrorSection) -> bool:
@@ -115,11 +116,6 @@ class BeamErrors(Systematic):
             background=(setup.background.T + (emitted - nominal)).T,
             responses=source_responses(sources, setup.observation, source, frequency_mhz),
         )
-
-    @classmethod
-    def in_data(cls, section, setup, model, truth, key) -> LinearGaussian:
-        """The same: its A is that of the true beams."""
-        return model
 
 
 def _true(section: BeamErrorSection, setup: Setup, values: Values) -> tuple[BeamSource, float]:

@@ -99,6 +99,7 @@ class FieldErrors(ChangedBeams):
     key: ClassVar[str] = "noise.fields"
     section: ClassVar[type[Section]] = FieldErrorsSection
     words: ClassVar[str] = "the fields"
+    moves_setup: ClassVar[bool] = True
     has_table: ClassVar[bool] = True
 
     of_ell: Float[Array, " ells"]
@@ -144,11 +145,6 @@ class FieldErrors(ChangedBeams):
         modes = found.modes(np.asarray(setup.beams.modes), values)
         beams = replace(setup.beams, modes=modes)
         return replace(setup, beams=beams, coupling=setup.coupling.of(modes=modes))
-
-    @classmethod
-    def in_data(cls, section, setup, model, truth, key):
-        """The same: its A is that of the errors."""
-        return model
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:

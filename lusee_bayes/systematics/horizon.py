@@ -154,6 +154,7 @@ class Horizon(ChangedBeams):
     section: ClassVar[type[Section]] = HorizonSection
     words: ClassVar[str] = "the horizon"
     unit: ClassVar[str] = "deg"
+    moves_setup: ClassVar[bool] = True
 
     patterns: Float[Array, "products rings azimuths"]
     azimuth: Altitudes
@@ -206,11 +207,6 @@ class Horizon(ChangedBeams):
         )
         parts = made.complete, made.sky, made.background, made.responses
         return replace(made, signal=expected_signal(setup.scenario.sources.list, *parts))
-
-    @classmethod
-    def in_data(cls, section, setup, model, truth, key):
-        """The same: its A is that of the true horizon."""
-        return model
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:

@@ -116,6 +116,7 @@ class PointingOffsets(Systematic):
     words: ClassVar[str] = "clock and pointing"
     draw: ClassVar[int] = 7
     moves: ClassVar[bool] = True
+    moves_setup: ClassVar[bool] = True
     has_table: ClassVar[bool] = True
 
     offsets: tuple[str, ...] = eqx.field(static=True)
@@ -172,11 +173,6 @@ class PointingOffsets(Systematic):
         names = offset_names(section.kinds, setup.observation.n_runs)
         offsets = {name: value for name, value in values.items() if name in names}
         return shifted(setup, offsets) if offsets else setup
-
-    @classmethod
-    def in_data(cls, section, setup, model, truth, key):
-        """The same: its A is that of the offsets."""
-        return model
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:

@@ -34,14 +34,13 @@ Zaldarriaga and Seljak 1997, PRD 55, 1830; Kamionkowski, Kosowsky and Stebbins 1
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float
 from pydantic import Field
 
-from lusee_bayes.core.arrays import Array, DataVector
+from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.harmonics import azimuth_functions, mode_numbers, per_mode
 from lusee_bayes.core.lazy import special
 from lusee_bayes.core.reading import naming
@@ -56,9 +55,8 @@ from lusee_bayes.instrument.beams.fields import (
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import to_real
-from lusee_bayes.noise.covariance import LowRankCovariance
 from lusee_bayes.systematics.context import Around, Setup
-from lusee_bayes.systematics.systematic import AdditiveNoise
+from lusee_bayes.systematics.systematic import LowRankNoise
 
 # lowest ell of circular and of linear polarisation
 CIRCULAR, LINEAR = 0, 2
@@ -90,24 +88,17 @@ class PolarisationSection(Section):
     treatment: Treatment = "marginalised"
 
 
-class Polarisation(AdditiveNoise):
+class Polarisation(LowRankNoise):
     """Stokes V, E and B modes of the sky, as noise of their angular power spectra.
 
     It is seen by the setup's antennas, where its observation points them. Files of beams that are
     interpolated linearly between frequencies have products, not fields: these are then taken from
     the interpolated fields, with the scale of the beams.
-
-    Attributes
-    ----------
-    root : (data, rank) array
-        U, in K.
     """
 
     key: ClassVar[str] = "noise.polarisation"
     section: ClassVar[type[Section]] = PolarisationSection
     words: ClassVar[str] = "the polarised sky"
-
-    root: Float[Array, "data rank"]
 
     @classmethod
     def treatment(cls, scenario: Any) -> str | None:
@@ -136,12 +127,6 @@ class Polarisation(AdditiveNoise):
             coupling = CouplingMatrix.of_modes(scale * np.asarray(modes), pointing, setup.layout)
             columns.append((coupling.dense() * (share * std)[None])[:, lowest**2 :])
         return cls("polarisation", setup.layout, np.concatenate(columns, axis=1))
-
-    def behind(self, gains: DataVector) -> Polarisation:
-        return replace(self, root=self.root * np.asarray(gains)[:, None])
-
-    def covariance(self) -> LowRankCovariance:
-        return LowRankCovariance(self.root, self.words)
 
 
 def unit_spectrum(lmax: int, lowest: int, slope: float) -> Float[np.ndarray, " ells"]:

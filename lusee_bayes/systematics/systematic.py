@@ -97,9 +97,7 @@ class Chart(eqx.Module):
         """The sites whose coordinates it changes or needs."""
 
     @abstractmethod
-    def to_values(
-        self, x: Mapping[str, Float[Array, "..."]]
-    ) -> tuple[dict[str, Float[Array, "..."]], Float[Array, ""]]:
+    def to_values(self, x: Values) -> tuple[Values, Float[Array, ""]]:
         """Compute the sites' values.
 
         Parameters
@@ -116,9 +114,7 @@ class Chart(eqx.Module):
         """
 
     @abstractmethod
-    def from_values(
-        self, values: Mapping[str, Float[Array, "..."]]
-    ) -> dict[str, Float[Array, "..."]]:
+    def from_values(self, values: Values) -> Values:
         """Compute the coordinates of unconstrained values by site."""
 
 
@@ -208,6 +204,8 @@ class Systematic(eqx.Module):
         Whether :meth:`marginalised` takes the effect to first order.
     moves : bool
         Whether that is about values and a sky that the data determine, found in rounds.
+    moves_setup : bool
+        Whether :meth:`moved` has all that its true values do to simulated data.
     scales_sky : bool
         Whether its effect is a factor of all visibilities.
     has_table : bool
@@ -225,6 +223,7 @@ class Systematic(eqx.Module):
     changes_coupling: ClassVar[bool] = True
     first_order: ClassVar[bool] = True
     moves: ClassVar[bool] = False
+    moves_setup: ClassVar[bool] = False
     scales_sky: ClassVar[bool] = False
     has_table: ClassVar[bool] = False
     learns: ClassVar[bool] = False
@@ -312,6 +311,8 @@ class Systematic(eqx.Module):
     ) -> LinearGaussian:
         """The model with the true values of simulated data.
 
+        It is the same where :attr:`moves_setup`: its A is that of the true values.
+
         Parameters
         ----------
         section : Section
@@ -324,6 +325,8 @@ class Systematic(eqx.Module):
         key : PRNG key
             Of the scenario's seed, for what else is drawn.
         """
+        if cls.moves_setup:
+            return model
         found = cls.build(section, setup, Around())
         return found.effect(model, {u.name: truth[u.name] for u in found.unknowns})
 
@@ -716,6 +719,24 @@ class AdditiveNoise(Systematic):
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Add the covariance to N."""
         return replace(model, noise=model.noise + self.covariance())
+
+
+class LowRankNoise(AdditiveNoise):
+    """Noise U U^T.
+
+    Attributes
+    ----------
+    root : (data, rank) array
+        U, in K.
+    """
+
+    root: Float[Array, "data rank"]
+
+    def behind(self, gains: DataVector) -> LowRankNoise:
+        return replace(self, root=self.root * np.asarray(gains)[:, None])
+
+    def covariance(self) -> LowRankCovariance:
+        return LowRankCovariance(self.root, self.words)
 
 
 class Temperatures(Systematic):
