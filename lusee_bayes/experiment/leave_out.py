@@ -395,8 +395,4 @@ def without(setup: Setup, data: Visibilities, gone: GridFlags) -> tuple[Setup, V
         return setup, data
     layout = DataLayout.from_flags(~np.asarray(data.layout.present) | gone)
     kept = replace(data, data=layout.gather(data.layout.scatter(data.data)), layout=layout)
-    instrument = replace(setup.instrument, layout=layout)
-    coupling, above = replace(setup.coupling, layout=layout), setup.above
-    if above is not None:
-        above = above.kept(lambda x: layout.gather(data.layout.scatter(x)))
-    return replace(setup, instrument=instrument, coupling=coupling, above=above), kept
+    return setup.with_layout(layout), kept

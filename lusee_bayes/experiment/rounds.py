@@ -469,14 +469,10 @@ def first_order(scenario: Scenario) -> tuple[type[Systematic], ...]:
     )
 
 
-def rebuilds_gains(setup: Setup) -> bool:
-    """Whether the gain term is built around the posterior's own prediction."""
-    return is_modelled(setup.scenario.noise.gain) and gains_about(setup) == "posterior"
-
-
 def rebuilds_visibilities(setup: Setup) -> bool:
     """Whether gains or radiometer noise are built around the posterior's own prediction."""
-    return rebuilds_gains(setup) or radiometer_about(setup) == "posterior"
+    gains = is_modelled(setup.scenario.noise.gain) and gains_about(setup) == "posterior"
+    return gains or radiometer_about(setup) == "posterior"
 
 
 def prediction(setup: Setup, found: Inference, solved: DataVector) -> Grid:

@@ -72,10 +72,8 @@ class Coupling(Described, eqx.Module):
     def shape(self) -> tuple[int, int]:
         """(data, unknowns)"""
 
-    @property
-    def has_time_structure(self) -> bool:
-        """Whether A^T N^-1 A can be summed over time without A (``linear.normal_matrix``)."""
-        return False
+    # whether A^T N^-1 A can be summed over time without A (``linear.normal_matrix``)
+    has_time_structure = False
 
     def dense(self) -> Matrix:
         """A as a matrix, with the response."""

@@ -71,11 +71,6 @@ class Forecast:
         return ell_cross(self.snr_squared)
 
 
-def baseline(forecasts: Sequence[Forecast], source: str) -> Forecast:
-    """The first forecast of a source: the scenario that the others vary."""
-    return next(f for f in forecasts if f.variation.source == source)
-
-
 def forecast_lines(forecasts: Sequence[Forecast]) -> list[str]:
     """The information in a scenario as given, and its most informative variation.
 
@@ -102,10 +97,10 @@ def forecast_lines(forecasts: Sequence[Forecast]) -> list[str]:
 
 def forecast_rows(forecasts: Sequence[Forecast]) -> list[dict[str, object]]:
     """Rows of plan.csv; ``difference_bits`` is that to the same source's first variation."""
-    rows = []
+    rows, first = [], {row.variation.source: row for row in reversed(forecasts)}
     for row in forecasts:
         it, resolution = row.variation, row.resolution_deg
-        more = row.information_bits - baseline(forecasts, it.source).information_bits
+        more = row.information_bits - first[it.source].information_bits
         told = {
             "scenario": it.source,
             "family": it.family,

@@ -81,9 +81,7 @@ def without_ports(setup: Setup, lost: Sequence[int]) -> Setup:
         if not 0 <= port < n_ports:
             raise InputError(f"there is no port {port} to lose; ports are 0 to {n_ports - 1}")
     dead = np.array([p.i in lost or p.j in lost for p in all_products(n_ports)])
-    left = DataLayout.from_flags(~np.asarray(layout.present) | dead[:, None])
-    instrument = replace(setup.instrument, layout=left)
-    return replace(setup, instrument=instrument, coupling=replace(setup.coupling, layout=left))
+    return setup.with_layout(DataLayout.from_flags(~np.asarray(layout.present) | dead[:, None]))
 
 
 def expected_inference(setup: Setup) -> Inference:

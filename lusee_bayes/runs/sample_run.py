@@ -54,20 +54,23 @@ from lusee_bayes.systematics.systematic import SKY, Chart, Systematic, Unknown, 
 STARTS = 4
 
 
-def sample_result(
-    experiment: Experiment,
+def sample_together(
+    experiments: Mapping[str, Experiment],
     program: Program,
     sampler: Sampler,
     folder: Path,
     *,
     resume: bool = False,
     stages: Stages | None = None,
-) -> SampleResult:
-    """Sample ``program`` given an experiment's data; draws are kept in ``folder``/chains.
+) -> tuple[SampleResult, ...]:
+    """Sample ``program`` given experiments' data; draws are kept in ``folder``/chains.
+
+    Programs of several channels, which share unknowns, are sampled as one.
 
     Parameters
     ----------
-    experiment : Experiment
+    experiments : mapping of Experiment
+        Of each channel, by the folder of its results in ``folder``; that of one alone is empty.
     program : Program
     sampler : Sampler
     folder : Path
@@ -82,28 +85,6 @@ def sample_result(
     InputError
         If ``folder`` holds an unfinished run and ``resume`` is not given, if the unfinished run has
         other settings, or if the program does not end with draws of the sky.
-    """
-    given = {"resume": resume, "stages": stages}
-    return sample_together({"": experiment}, program, sampler, folder, **given)[0]
-
-
-def sample_together(
-    experiments: Mapping[str, Experiment],
-    program: Program,
-    sampler: Sampler,
-    folder: Path,
-    *,
-    resume: bool = False,
-    stages: Stages | None = None,
-) -> tuple[SampleResult, ...]:
-    """Sample the programs of several channels, which share unknowns, as one.
-
-    Parameters
-    ----------
-    experiments : mapping of Experiment
-        Of each channel, by the folder of its results in ``folder``.
-    program, sampler, folder, resume, stages
-        As of :func:`sample_result`, which is that of a single channel.
     """
     stages = stages or Stages()
     with stages("posterior"):
@@ -332,8 +313,8 @@ def run_sample(
     def one(channel: Scenario, folder: Path, stages: Stages) -> RunOutcome[SampleResult]:
         with run_folder(folder, SAMPLE, channel, data, program.path, **given) as run:
             experiment = measured_experiment(channel, data, stages, n_draws=n_draws)
-            made = sample_result(
-                experiment, program, sampler, run.path, resume=resume, stages=stages
+            (made,) = sample_together(
+                {"": experiment}, program, sampler, run.path, resume=resume, stages=stages
             )
             return run.write(made, stages, Provenance.of_experiment(experiment, data))
 
@@ -478,7 +459,9 @@ def run_validate(
     with run_folder(folder, VALIDATION, scenario, data, program.path, **given) as run:
         n = sampler.chains * sampler.draws
         experiment = measured_experiment(scenario, data, stages, n_draws=n)
-        drawn = sample_result(experiment, program, sampler, run.path, resume=resume, stages=stages)
+        (drawn,) = sample_together(
+            {"": experiment}, program, sampler, run.path, resume=resume, stages=stages
+        )
         posterior, model = drawn.inference.posterior, drawn.inference.model
         with stages("comparison"):
             stats = drawn.tree["sample_stats"]

@@ -178,6 +178,14 @@ class Setup:
         change = complete.layout.scatter(complete @ (sky.modes - self.sky.modes))
         return replace(self, sky=sky, signal=self.signal + change)
 
+    def with_layout(self, layout: DataLayout) -> Setup:
+        """Return the same for fewer of its data."""
+        above, instrument = self.above, replace(self.instrument, layout=layout)
+        if above is not None:
+            above = above.kept(lambda x: layout.gather(self.layout.scatter(x)))
+        coupling = replace(self.coupling, layout=layout)
+        return replace(self, instrument=instrument, coupling=coupling, above=above)
+
     def select(self, keep: Bool[np.ndarray, " times"]) -> Setup:
         """Return the same at those of its times where ``keep`` is True, some of every run."""
         observation, turns = self.observation.select(keep), self.pointing

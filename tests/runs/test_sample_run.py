@@ -27,7 +27,7 @@ from lusee_bayes.core.files import LOCK
 from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.runs import sample_run
-from lusee_bayes.runs.sample_run import sample_result
+from lusee_bayes.runs.sample_run import sample_together
 from lusee_bayes.sampling import hmc
 from lusee_bayes.sampling.datatree import read_datatree
 from lusee_bayes.sampling.hmc import CHUNK
@@ -195,8 +195,8 @@ def test_resuming_another_run_is_refused_and_the_difference_named(
     setup, data = replace(experiment.setup, scenario=scenario), experiment.data
     data = replace(data, data=data.data * change.get("factor", 1.0))
     before = content(killed)
-    given = Experiment(setup, data), program, change.get("sampler", SAMPLER), killed
-    refuse(message, sample_result, *given, resume=True)
+    given = {"": Experiment(setup, data)}, program, change.get("sampler", SAMPLER), killed
+    refuse(message, sample_together, *given, resume=True)
     assert content(killed) == before
 
 
@@ -215,8 +215,8 @@ def test_resuming_a_finished_run_takes_it_over(whole, tree, no_sampling):
 @pytest.mark.parametrize("change", [{"draws": 500}, {"draws": 2000}, {"seed": 7}], ids=str)
 def test_a_finished_run_of_other_settings_is_not_taken_over(experiment, whole, no_sampling, change):
     before = content(whole)
-    given = experiment, lb.load_program("sky"), replace(SAMPLER, **change), whole
-    refuse("finished run with other settings; leave out", sample_result, *given, resume=True)
+    given = {"": experiment}, lb.load_program("sky"), replace(SAMPLER, **change), whole
+    refuse("finished run with other settings; leave out", sample_together, *given, resume=True)
     assert content(whole) == before
 
 
@@ -382,14 +382,14 @@ def test_half_the_covariance_is_found_out_with_exit_code_1(validated, tmp_path, 
     folder = Path(shutil.copytree(validated[1], tmp_path / "out"))
 
     def with_half_the_covariance(*args, **options):
-        found = sample_result(*args, **options)
+        (found,) = sample_together(*args, **options)
         posterior = found.inference.posterior
         half = eqx.tree_at(lambda p: p.lower, posterior, np.sqrt(2) * posterior.lower)
         np.testing.assert_allclose(half.covariance() / posterior.covariance(), 0.5, rtol=1e-6)
         solution = replace(found.inference.solution, posterior=half)
-        return replace(found, inference=replace(found.inference, solution=solution))
+        return (replace(found, inference=replace(found.inference, solution=solution)),)
 
-    monkeypatch.setattr(sample_run, "sample_result", with_half_the_covariance)
+    monkeypatch.setattr(sample_run, "sample_together", with_half_the_covariance)
     arguments = [*SMALL, *SETTINGS, "--simulations", "100", "-q", "-o", folder, "--resume"]
     assert run("validate", *arguments) == 1
     report = consistent(folder)

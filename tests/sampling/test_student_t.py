@@ -14,7 +14,7 @@ from scipy import stats
 import lusee_bayes as lb
 from lusee_bayes.instrument.products import DataLayout, auto_indices
 from lusee_bayes.noise.covariance import DenseCovariance
-from lusee_bayes.runs.sample_run import coordinates, sample_result
+from lusee_bayes.runs.sample_run import coordinates, sample_together
 
 N_TIMES = 8
 FORMS = ["paper", "exact"]
@@ -242,7 +242,8 @@ def test_systematics_are_sampled_with_it(response_file):
 @pytest.mark.long
 def test_a_run_keeps_the_weights(tmp_path):
     experiment = small_experiment(lmax=2)
-    result = sample_result(experiment, PROGRAM, lb.Sampler(chains=2, warmup=20, draws=30), tmp_path)
+    given = {"": experiment}, PROGRAM, lb.Sampler(chains=2, warmup=20, draws=30), tmp_path
+    (result,) = sample_together(*given)
     weight = result.tree["posterior"]["weight"].values
     assert weight.shape == (2, 30, experiment.data.layout.n_times)
     assert result.tree.attrs["coordinates"] == "white"

@@ -286,10 +286,8 @@ class BeamSource(ABC):
     def n_ports(self) -> int:
         """Number of ports; there are n_ports^2 real products."""
 
-    @property
-    def has_fields(self) -> bool:
-        """Whether there are fields of antennas, not beams of products alone."""
-        return True
+    # whether there are fields of antennas, not beams of products alone
+    has_fields = True
 
     @abstractmethod
     def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
