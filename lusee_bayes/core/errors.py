@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 # characters of a message, which quotes what was given
 LONGEST = 1000
@@ -26,6 +27,15 @@ class InputError(ValueError):
 
 class WorkersLost(RuntimeError):
     """Raised when workers fail again and again, or are gone; the message is one sentence."""
+
+
+@contextmanager
+def refusing(message: str, *kinds: type[Exception]) -> Iterator[None]:
+    """Raise InputError with this message for errors of these kinds."""
+    try:
+        yield
+    except kinds as error:
+        raise InputError(message) from error
 
 
 def require_known(what: str, word: str, known: Iterable[str]) -> None:

@@ -18,7 +18,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
-from lusee_bayes.core.errors import InputError, require_known
+from lusee_bayes.core.errors import InputError, refusing, require_known
 from lusee_bayes.core.lazy import units
 from lusee_bayes.core.progress import gigabytes, memory_limit
 
@@ -52,10 +52,8 @@ def factor_to(where: str, unit: str, stated: Any) -> float:
     text = "" if stated is None else str(stated).strip()
     if not unit or text.lower() in UNSTATED:
         return 1.0
-    try:
+    with refusing(f"{where} has the unit '{text}', expected {unit}; convert it", ValueError):
         return float(units.Unit(ALIASES.get(text, text)).to(unit))
-    except ValueError as error:
-        raise InputError(f"{where} has the unit '{text}', expected {unit}; convert it") from error
 
 
 def require_mhz(where: str, mhz: Any) -> None:
@@ -328,10 +326,8 @@ def _checked_value(where: str, value: Any, declared: Variable) -> Any:
 
 
 def _text(where: str, value: Any) -> str:
-    try:
+    with refusing(f"{where} holds text that is not UTF-8: {value!r}", UnicodeDecodeError):
         text = value.decode() if isinstance(value, bytes) else value
-    except UnicodeDecodeError as error:
-        raise InputError(f"{where} holds text that is not UTF-8: {value!r}") from error
     if not isinstance(text, str):
         raise InputError(f"{where} is {value!r}, expected text")
     return str(text)

@@ -27,7 +27,7 @@ import h5py
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.errors import InputError, refusing
 from lusee_bayes.core.files import replacing, user_path
 from lusee_bayes.core.formats import header, require_format, with_grid
 from lusee_bayes.core.layouts import Attribute, Layout, Unloaded, Unread, Variable
@@ -368,7 +368,5 @@ def _of_json(kind: Any, text: str, where: str) -> Any:
 
 
 def _json(where: str, text: Any) -> Any:
-    try:
+    with refusing(f"{where} is {text!r}, expected JSON", TypeError, ValueError):
         return json.loads(text)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{where} is {text!r}, expected JSON") from error

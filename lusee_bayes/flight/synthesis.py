@@ -18,7 +18,7 @@ from scipy.interpolate import CubicSpline
 
 from lusee_bayes.core.arrays import RowFlags, Vector
 from lusee_bayes.core.checks import require_positive
-from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.errors import InputError, refusing
 from lusee_bayes.flight import flags, session
 from lusee_bayes.flight.gain_model import LETTERS, NANO2, GainModel
 from lusee_bayes.flight.recipe import FlightSimulatedSection
@@ -96,13 +96,10 @@ class ChannelSpectra:
         require_positive("the autos of the visibilities", autos)
         scale = np.sqrt(autos[:, session.FIRST_PORT] * autos[:, session.SECOND_PORT])
         matrices = np.moveaxis(to_matrix(np.moveaxis(known / scale, 1, 0)), (0, 1), (-2, -1))
-        try:
+        advice = "voltages cannot be so correlated; check beams and sky"
+        wrong = f"the visibilities of a time are not positive definite: {advice}"
+        with refusing(wrong, np.linalg.LinAlgError):
             factors = np.linalg.cholesky(matrices)
-        except np.linalg.LinAlgError as error:
-            raise InputError(
-                "the visibilities of a time are not positive definite: voltages cannot be so "
-                "correlated; check beams and sky"
-            ) from error
         low = _at_channels(self.correlations, factors)
         ports = np.arange(len(session.AUTOS))
         diagonal = np.log(factors[..., ports, ports].real)

@@ -31,7 +31,7 @@ from scipy.spatial.transform import Rotation as SpatialRotation
 
 from lusee_bayes.core import checks
 from lusee_bayes.core.arrays import Times
-from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.errors import InputError, nearest, refusing
 from lusee_bayes.instrument import times
 from lusee_bayes.instrument.schedule import Cut, Interval, Run, cut_intervals, cut_runs
 
@@ -477,12 +477,9 @@ def site_of(site: Any) -> tuple[float, float]:
                 f"unknown site '{site}'; {nearest(site, SITES)} (or give two angles in degrees)"
             )
         return known[site.lower()]
-    try:
+    wrong = f"the site is {site!r}; give longitude and latitude in degrees, or {', '.join(SITES)}"
+    with refusing(wrong, TypeError, ValueError):
         lon, lat = (float(x) for x in site)
-    except (TypeError, ValueError) as error:
-        raise InputError(
-            f"the site is {site!r}; give longitude and latitude in degrees, or {', '.join(SITES)}"
-        ) from error
     return lon, lat
 
 

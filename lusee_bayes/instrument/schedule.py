@@ -26,7 +26,7 @@ from astropy.time import Time
 from jaxtyping import Float
 
 from lusee_bayes.core.checks import require_positive
-from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.errors import InputError, refusing
 from lusee_bayes.core.lazy import pandas
 from lusee_bayes.core.reading import naming, parse_yaml, read_text, reading
 from lusee_bayes.instrument import times
@@ -300,14 +300,11 @@ def _of_commands(path: str, text: str) -> tuple[Interval, ...]:
 
 def _command(place: str, entry: object) -> tuple[str, float, str]:
     """Where an entry is, its start as MJD and its mode."""
-    try:
-        start, mode = float(entry["start"]), str(entry["mode"])  # type: ignore[index]
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{place}: a command table of OpSim has a start (a modified Julian date, UTC, as "
-            "61050.8) and a mode in each entry"
-        ) from error
+    expected = "a start (a modified Julian date, UTC, as 61050.8) and a mode in each entry"
+    wrong = f"a command table of OpSim has {expected}"
     with naming(place):
+        with refusing(wrong, KeyError, TypeError, ValueError):
+            start, mode = float(entry["start"]), str(entry["mode"])  # type: ignore[index]
         times.require_ephemeris(np.array([start + 2400000.5]))
     return place, start, mode
 

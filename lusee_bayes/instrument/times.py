@@ -31,7 +31,7 @@ from jaxtyping import Bool, Float, Int
 
 from lusee_bayes.core.arrays import Times
 from lusee_bayes.core.checks import Described, extent, require_finite
-from lusee_bayes.core.errors import InputError, nearest, require_known
+from lusee_bayes.core.errors import InputError, nearest, refusing, require_known
 from lusee_bayes.core.layouts import Attribute, Content
 from lusee_bayes.core.reading import naming
 
@@ -72,14 +72,10 @@ def time_of_text(name: str, text: str, scale: str = "utc") -> Time:
     InputError
         If it is none, or outside the ephemeris; the message begins with ``name``.
     """
-    try:
-        with unannounced_leap_seconds():
-            # astropy knows no Z, which ISO has for UTC
-            time = Time(text.removesuffix("Z"), scale=scale)
-    except (ValueError, TypeError) as error:
-        raise InputError(
-            f"{name} '{text}' is not a date; write it as 2027-01-15T00:00:00"
-        ) from error
+    wrong = f"{name} '{text}' is not a date; write it as 2027-01-15T00:00:00"
+    with refusing(wrong, ValueError, TypeError), unannounced_leap_seconds():
+        # astropy knows no Z, which ISO has for UTC
+        time = Time(text.removesuffix("Z"), scale=scale)
     require_ephemeris(np.atleast_1d(time.jd))
     return time
 

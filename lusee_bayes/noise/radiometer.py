@@ -22,7 +22,7 @@ from jaxtyping import Complex, Float
 
 from lusee_bayes.core import checks
 from lusee_bayes.core.arrays import Array, Grid, compiled, namespace
-from lusee_bayes.core.errors import InputError, require_known
+from lusee_bayes.core.errors import InputError, refusing, require_known
 from lusee_bayes.instrument.products import DataLayout, auto_indices, ports, to_matrix, without_gaps
 from lusee_bayes.noise.covariance import Covariance, DiagonalCovariance
 from lusee_bayes.noise.time_blocks import TimeBlockCovariance
@@ -46,14 +46,12 @@ def sample_covariances(t: Matrices, n_averaged: float, generator: np.random.Gene
     InputError
         If one of the T is not positive definite: no voltages have it.
     """
-    try:
+    wrong = (
+        "the covariance of the voltages is not positive definite, so that there is no radiometer "
+        "noise for it; check that the autos are positive and the correlations below one"
+    )
+    with refusing(wrong, np.linalg.LinAlgError):
         lower = np.linalg.cholesky(np.moveaxis(t, (0, 1), (-2, -1)))
-    except np.linalg.LinAlgError as error:
-        raise InputError(
-            "the covariance of the voltages is not positive definite, so that there is no "
-            "radiometer noise for it; check that the autos are positive and the correlations below "
-            "one"
-        ) from error
     n, scale = len(t), 1.0 / np.sqrt(n_averaged)
     hermitian = np.zeros_like(t)
     for i in range(n):

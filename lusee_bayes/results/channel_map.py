@@ -20,13 +20,7 @@ from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.diagnosis import diagnose
-from lusee_bayes.experiment.experiment import (
-    Experiment,
-    doubts,
-    infer,
-    posterior_draws,
-    rounds_of,
-)
+from lusee_bayes.experiment.experiment import Experiment, doubts, infer, posterior_draws, rounds_of
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.unknowns import Unknowns, flux_table, pointing_report
 from lusee_bayes.experiment.validity import reach

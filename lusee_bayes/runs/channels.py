@@ -61,13 +61,7 @@ from lusee_bayes.experiment.unknowns import Unknowns
 from lusee_bayes.judge.coverage import N_DRAWS
 from lusee_bayes.judge.cube_fit import SharedTest, shared_tests
 from lusee_bayes.linear import joint, positive_joint
-from lusee_bayes.linear.amplitudes import (
-    Tied,
-    information_given,
-    kernel,
-    tie,
-    told_by_others,
-)
+from lusee_bayes.linear.amplitudes import Tied, information_given, kernel, tie, told_by_others
 from lusee_bayes.linear.information import Information
 from lusee_bayes.results.channel import ChannelData, ChannelResult, SkyModes
 from lusee_bayes.results.channel_map import Conditioned, channel_result, conditioned

@@ -125,7 +125,7 @@ def forecast(variation: Variation) -> Forecast:
     InputError
         With the variation's name, for whatever is wrong with its scenario.
     """
-    try:
+    with naming(f"{variation.source}, {variation.name}"):
         setup = set_up(variation.scenario)
         if variation.lost:
             setup = without_ports(setup, variation.lost)
@@ -142,8 +142,6 @@ def forecast(variation: Variation) -> Forecast:
             offsets=expected_offsets(found),
             unnoticed=unnoticed(setup, found) if turned(variation.family) else "",
         )
-    except InputError as error:
-        raise InputError(f"{variation.source}, {variation.name}: {error}") from error
 
 
 def variations_of(

@@ -81,6 +81,8 @@ class PriorSpectrum(Scale):
 
     key: ClassVar[str] = "prior"
     section: ClassVar[type[Section]] = SpectrumSection
+    # its true values are the sky's own
+    moves_setup: ClassVar[bool] = True
 
     log_amplitude_std: Float[Array, ""] | None = eqx.field(default=None, converter=scalar_or_none)
     tilt_std: Float[Array, ""] | None = eqx.field(default=None, converter=scalar_or_none)
@@ -99,10 +101,6 @@ class PriorSpectrum(Scale):
     @classmethod
     def truth(cls, section: Any, setup: Setup, key: PRNGKeyArray) -> Truth:
         return {}
-
-    @classmethod
-    def in_data(cls, section, setup, model, truth, key):
-        return model
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
