@@ -65,6 +65,15 @@ def require_conventions(path: Path) -> None:
                     assert n == 12 * 4 ** grid["refinement_level"]
 
 
+def raising(error: BaseException) -> Callable[..., None]:
+    """What fails with this error, whatever it is called with."""
+
+    def fail(*_, **__):
+        raise error
+
+    return fail
+
+
 @contextmanager
 def refused(words: str) -> Iterator[pytest.ExceptionInfo[InputError]]:
     """Assert that input is refused in one sentence that has these words, or their pattern."""

@@ -66,13 +66,6 @@ def channels_of(scenario: Scenario) -> list[lb.Visibilities]:
     return [lb.build(channel).data for channel in scenario.channels() or (scenario,)]
 
 
-def at_times(data: lb.Visibilities, keep: np.ndarray) -> lb.Visibilities:
-    """The data of some times by themselves."""
-    observation = data.observation.select(keep)
-    flat, layout = jnp.asarray(data.grid()[:, keep].ravel()), DataLayout(16, observation.n_times)
-    return replace(data, data=flat, layout=layout, observation=observation)
-
-
 def unknowns_report(experiment: Experiment, found: Inference) -> UnknownsReport | None:
     """What data alone tell of receivers, ground and gain table."""
     unknowns, posterior = Unknowns.of(experiment, found), found.posterior
@@ -89,7 +82,7 @@ def offset_posterior(found: Inference) -> tuple[dict[str, float], np.ndarray]:
 
 def of_run(data: lb.Visibilities, run: int) -> lb.Visibilities:
     """The data of one run by themselves."""
-    return at_times(data, data.observation.run == run)
+    return data.select(data.observation.run == run)
 
 
 def correlated(prior: Prior) -> DensePrior:

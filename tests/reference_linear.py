@@ -47,19 +47,6 @@ def resolution_rows(posterior, directions) -> np.ndarray:
     return y - np.linalg.solve(np.asarray(prior.covariance()), covariance @ y.T).T
 
 
-def posterior_by_precision(a, s, n, d) -> Answer:
-    """The other textbook form: Lambda = A^T N^-1 A + S^-1, and the evidence written with it."""
-    a, s, n, d = (np.asarray(x, dtype=np.float64) for x in (a, s, n, d))
-    n_inverse = np.linalg.inv(n)
-    precision = a.T @ n_inverse @ a + np.linalg.inv(s)
-    source = a.T @ n_inverse @ d
-    mean = np.linalg.solve(precision, source)
-    log_dets = sum(np.linalg.slogdet(x)[1] for x in (n, s, precision))
-    chi2 = d @ n_inverse @ d - source @ mean
-    log_prob = -0.5 * (chi2 + log_dets + len(d) * np.log(2 * np.pi))
-    return Answer(mean, np.linalg.inv(precision), float(log_prob))
-
-
 def log_prob_slope(a, s, n, d, ds, dn) -> float:
     """d ln p(d) / dx for S(x), N(x) with derivatives ds, dn: (y^T dK y - tr K^-1 dK) / 2."""
     k = a @ s @ a.T + n

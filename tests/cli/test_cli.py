@@ -19,6 +19,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
+from assertions import raising
 from astropy.io import fits
 from commands import assert_drawn, content, posterior_of, refused, run, sky_draws_of, table_of
 from rich.console import Console
@@ -124,7 +125,7 @@ def test_simulate_then_map_equals_map(folder, tmp_path, capsys):
 @pytest.mark.parametrize("flag", ["covariance", "information"])
 def test_options_of_the_output_reach_the_scenario(flag, monkeypatch):
     """What they make is tested beside run_map."""
-    given, stop = [], raises(KeyboardInterrupt())
+    given, stop = [], raising(KeyboardInterrupt())
     monkeypatch.setattr(runs, "run_map", lambda *a, **_: given.append(a) or stop())
     assert run("map", "fiducial", f"--{flag}", "--draws", 7, "-o", "x", "-q") == 130
     assert given[0][0].output == OutputSection(draws=7, **{flag: True})
@@ -182,7 +183,7 @@ def test_an_interrupted_write_leaves_the_old_result_whole(small_map, tmp_path, m
     before = content(out)
 
     # the last file but the page
-    monkeypatch.setattr(MapResult, "summary", raises(KeyboardInterrupt()))
+    monkeypatch.setattr(MapResult, "summary", raising(KeyboardInterrupt()))
     monkeypatch.setattr(runs, "map_channels", lambda *_, **__: small_map.result)
     monkeypatch.setattr(runs, "MAP", replace(runs.MAP, figures={}))
     assert run("map", "fiducial", *SMALL, "--set", "seed=2", "-o", out, "--force", "-q") == 130
@@ -195,22 +196,15 @@ def test_an_interrupted_write_leaves_the_old_result_whole(small_map, tmp_path, m
     assert content(tmp_path / "new") == {}
 
 
-def raises(error):
-    def fail(*_, **__):
-        raise error
-
-    return fail
-
-
 ENDINGS = [
     (lambda: signal.raise_signal(signal.SIGTERM), 143, "terminated; no results"),
     (lambda: signal.raise_signal(signal.SIGHUP), 129, "terminated; no results"),
-    (raises(MemoryError("Unable to allocate 8 TiB")), 1, "not enough memory (Unable to alloc"),
-    (raises(RuntimeError("RESOURCE_EXHAUSTED: Out of memory")), 1, "not enough memory (RES"),
-    (raises(RuntimeError("can't start new thread")), 1, "not enough memory (can't start"),
-    (raises(OSError(errno.ENOSPC, "No space left on device")), 1, "mean.fits'); results"),
-    (raises(OSError("Can't write data (errno = 28, error message = ..)")), 1, "mean.fits')"),
-    (raises(OSError("Not enough space on disk: requested 839168")), 1, "mean.fits'); results"),
+    (raising(MemoryError("Unable to allocate 8 TiB")), 1, "not enough memory (Unable to alloc"),
+    (raising(RuntimeError("RESOURCE_EXHAUSTED: Out of memory")), 1, "not enough memory (RES"),
+    (raising(RuntimeError("can't start new thread")), 1, "not enough memory (can't start"),
+    (raising(OSError(errno.ENOSPC, "No space left on device")), 1, "mean.fits'); results"),
+    (raising(OSError("Can't write data (errno = 28, error message = ..)")), 1, "mean.fits')"),
+    (raising(OSError("Not enough space on disk: requested 839168")), 1, "mean.fits'); results"),
 ]
 
 

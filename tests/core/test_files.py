@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from assertions import refuse, refused
+from assertions import raising, refuse, refused
 
 import lusee_bayes
 from lusee_bayes.core import files as fs
@@ -171,10 +171,7 @@ def test_a_failure_leaves_the_folder_as_it_was(error, folder):
 def test_a_failing_rename_leaves_the_folder_as_it_was(folder, monkeypatch):
     before = content(folder)
 
-    def fail(*_):
-        raise OSError("the disk is full")
-
-    monkeypatch.setattr(os, "replace", fail)
+    monkeypatch.setattr(os, "replace", raising(OSError("the disk is full")))
     with pytest.raises(OSError, match="full"):
         finished(folder, NEW)
     assert content(folder) == before and not list(folder.glob(".*"))

@@ -144,15 +144,11 @@ def registered(monkeypatch, tiny_experiment):
     monkeypatch.setattr(models, "SYSTEMATICS", (*SYSTEMATICS, Hum))
 
 
-def with_hum(**section) -> Scenario:
-    """The small scenario with the hum, if there is one."""
+def setup_with(**section) -> Setup:
+    """The small setup with the hum, if there is one."""
     tree = small_experiment().scenario.model_dump()
     tree["noise"]["hum"] = section or None
-    return ScenarioWithHum.model_validate(tree)
-
-
-def setup_with(**section) -> Setup:
-    return replace(small_experiment().setup, scenario=with_hum(**section))
+    return replace(small_experiment().setup, scenario=ScenarioWithHum.model_validate(tree))
 
 
 def test_it_is_marginalised_into_n(registered):

@@ -38,24 +38,17 @@ def read_sky(path: Path) -> object:
     return lb.load_scenario("fiducial", overrides).sky.at(25.0, 2)
 
 
-def read_any_data(path: Path) -> object:
-    return lb.read_data(path, small_scenario(lmax=2))
-
-
-def read_kept(path: Path) -> object:
-    return read_information(path, small_scenario(lmax=2))
-
-
 def read_spectra(path: Path) -> object:
     session = read_session(path)
     with session.spectra() as read:
         return read(0, session.n_rows)
 
 
+LMAX_2 = small_scenario(lmax=2)
 READERS = {
     "visibilities.nc": (describe, read_visibilities),
     "windows.nc": (describe, read_visibilities),
-    "waterfall.fits": (describe, read_waterfall, read_any_data),
+    "waterfall.fits": (describe, read_waterfall, lambda path: lb.read_data(path, LMAX_2)),
     "four_port.fits": (describe, read_waterfall),
     "scalar_beam.fits": (describe, lambda path: read_beam(path).beams(10.0, 2)),
     "response.fits": (describe, lambda path: read_beam(path).beams(10.0, 2)),
@@ -63,7 +56,7 @@ READERS = {
     "sampled_fields.fits": (describe, lambda path: read_beam(path).beams(25.0, 2)),
     "sampled_products.nc": (describe, lambda path: read_beam(path).beams(25.0, 2)),
     "posterior.nc": (describe,),
-    "information.nc": (describe, read_kept),
+    "information.nc": (describe, lambda path: read_information(path, LMAX_2)),
     "cube.nc": (describe,),
     "diagnostics.nc": (describe, read_channels),
     "map.fits": (describe, read_sky),

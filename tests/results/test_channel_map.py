@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from commands import posterior_of, sky_draws_of
-from experiments import at_times, channels_of, correlated, mapped, scaled_product, small_experiment
+from experiments import channels_of, correlated, mapped, scaled_product, small_experiment
 from reference_linear import matrices
 from scipy import stats
 
@@ -88,7 +88,7 @@ def test_data_of_channels_at_other_times_have_gaps(tmp_path, numbers_alone):
     sizes = ["lmax=3", "observation.runs.0.cycles=0.1", "frequencies_mhz=[20, 25]"]
     scenario = lb.load_scenario("fiducial", sizes)
     first, second = channels_of(scenario)
-    both = [first, at_times(second, np.arange(second.observation.n_times) >= 5)]
+    both = [first, second.select(np.arange(second.observation.n_times) >= 5)]
     run = lb.run_map(scenario, tmp_path / "run", data=both)
     seen = posterior_of(run.folder)["observed_data"]["visibility"]
     hours = [np.asarray(one.observation.hours) for one in both]

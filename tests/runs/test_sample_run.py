@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from arviz_stats.base import array_stats
-from assertions import refuse
+from assertions import raising, refuse
 from commands import assert_drawn, content, refused, run
 from reference_linear import z_of
 
@@ -113,11 +113,7 @@ def tree(runs):
 @pytest.fixture
 def no_sampling(runs, monkeypatch):
     """Any attempt to draw fails."""
-
-    def fail(*_, **__):
-        raise AssertionError("it began to sample")
-
-    monkeypatch.setattr(sample_run, "sample", fail)
+    monkeypatch.setattr(sample_run, "sample", raising(AssertionError("it began to sample")))
 
 
 def assert_same_trees(found, expected):

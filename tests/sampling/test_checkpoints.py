@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from assertions import refuse, refused
+from assertions import raising, refuse, refused
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.sampling import hmc
@@ -91,15 +91,11 @@ def test_a_chunk_is_written_whole_or_not_at_all(folder, monkeypatch, moment):
 
     It is on the disk before it has its name: else a crash could leave the name with nothing in it.
     """
-
-    def fail(*_, **__):
-        raise OSError("disk full")
-
     before = {path.name: path.read_bytes() for path in chunks(folder)}
     run = again(folder)
     owner = hmc.np if moment == "savez" else hmc.os
     with monkeypatch.context() as patch:
-        patch.setattr(owner, moment, fail)
+        patch.setattr(owner, moment, raising(OSError("disk full")))
         with pytest.raises(OSError, match="disk full"):
             run.append(Chunk(20, *arrays_of(9)))
     assert {path.name: path.read_bytes() for path in chunks(folder)} == before

@@ -8,18 +8,13 @@ import numpyro
 import pytest
 from assertions import refuse
 from numpyro import distributions as dist
-from scipy.stats import multivariate_normal, norm
+from scipy.stats import norm
 from small_models import Case
 
 import lusee_bayes as lb
 from lusee_bayes.sampling import evidence as comparison
 from lusee_bayes.sampling.mode import laplace_approximation
 from lusee_bayes.sampling.programs import Program
-
-
-def log_normal(d, covariance, mean=0.0) -> float:
-    """By scipy."""
-    return float(multivariate_normal.logpdf(d, np.zeros(len(d)) + mean, covariance))
 
 
 def log_integral(log_p, *nodes) -> float:

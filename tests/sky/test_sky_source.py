@@ -54,21 +54,9 @@ def write_cube(path, maps, start=1, end=None, step=1):
     return path
 
 
-def fits_map(path, modes):
-    write_fits(path, modes_to_map(modes, NSIDE))
-
-
-def hdf5_map(path, modes):
-    write_hdf5(path, other=modes_to_map(modes, NSIDE))
-
-
 def cube(path, modes):
     """The same sky at 24, 25 and 26 MHz."""
     write_cube(path, np.tile(modes_to_map(modes, NSIDE), (3, 1)), start=24)
-
-
-def fits_alms(path, modes):
-    ss.write_alms(path, modes, {})
 
 
 def npz_alms(path, modes):
@@ -77,10 +65,10 @@ def npz_alms(path, modes):
 
 # name of the file, who writes it, who reads it, and whether it says its frequencies
 LAYOUTS = [
-    ("map.fits", fits_map, ss.SkyMap, False),
-    ("map.hdf5", hdf5_map, ss.SkyMap, False),
+    ("map.fits", lambda path, m: write_fits(path, modes_to_map(m, NSIDE)), ss.SkyMap, False),
+    ("map.hdf5", lambda path, m: write_hdf5(path, other=modes_to_map(m, NSIDE)), ss.SkyMap, False),
     ("cube.fits", cube, ss.SkyCube, True),
-    ("alm.fits", fits_alms, ss.SkyAlms, False),
+    ("alm.fits", lambda path, m: ss.write_alms(path, m, {}), ss.SkyAlms, False),
     ("alm.npz", npz_alms, ss.SkyAlms, True),
 ]
 of_every_layout = pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout[0])
