@@ -133,6 +133,16 @@ def density_of(
     return got
 
 
+def differences(systematic, model, sky, centre, steps) -> np.ndarray:
+    """Central ones of data of this sky, one column for each step of the systematic's unknowns."""
+
+    def seen(z):
+        return np.asarray(systematic.effect(model, systematic.values(z)).predict(sky))
+
+    over = [(seen(centre + s) - seen(centre - s)) / (2.0 * np.linalg.norm(s)) for s in steps]
+    return np.stack(over, axis=1)
+
+
 def with_known_sky(setup: Setup, scale: float) -> Setup:
     """The setup with a prior about its own sky, of a part of its C_ell."""
     spectrum = scale * np.asarray(setup.prior.spectrum)

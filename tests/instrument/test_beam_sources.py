@@ -26,11 +26,6 @@ def response(test_data):
     return read_beam(test_data / "luseepy" / "synthetic_response_v3.fits")
 
 
-def further(source: BeamSource, angle_deg: float) -> BeamSource:
-    """The same antennas, turned from East towards North."""
-    return replace(source, turntable_offset_deg=source.turntable_offset_deg + angle_deg)
-
-
 # nodes between the files' directions see splines: 1e-10 measured. luseepy's rule for scalar beams
 # costs h^2 / 12 of the slopes at zenith and horizon (1.7e-4 measured), its rule for responses
 # counts the horizon half (4.8e-4)
@@ -38,7 +33,8 @@ SPLINES, LUSEEPY = 1e-9, 1e-3
 
 
 def check(source: BeamSource, quadrature: float) -> None:
-    turned, sizes = further(source, TURNED_DEG), {"frequency_mhz": FREQUENCY, "lmax": LMAX}
+    turned = replace(source, turntable_offset_deg=source.turntable_offset_deg + TURNED_DEG)
+    sizes = {"frequency_mhz": FREQUENCY, "lmax": LMAX}
     check_beam_source(source, turned, turned_deg=TURNED_DEG, quadrature=quadrature, **sizes)
 
 

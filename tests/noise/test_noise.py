@@ -65,16 +65,12 @@ def test_paper_form_is_the_papers_formula():
     np.testing.assert_allclose(paper_variance(VISIBILITIES), expected, rtol=2e-15)
 
 
-def simulated_products(n: int, seed: int) -> np.ndarray:
-    """n products s_i conj(s_j) of voltages s ~ CN(0, T(t=0)), shape (n, products)."""
-    white = np.random.default_rng(seed).normal(size=(2, n, N_ANTENNAS)) / np.sqrt(2)
-    s = (white[0] + 1j * white[1]) @ np.linalg.cholesky(T[0]).T
-    return real_products(s[:, :, None] * s[:, None, :].conj())
-
-
 def test_exact_form_is_what_complex_gaussian_voltages_do():
+    """Products s_i conj(s_j) of voltages s ~ CN(0, T(t=0))."""
     n = 200_000
-    delta = simulated_products(n, seed=5) - real_products(T[0])
+    white = np.random.default_rng(5).normal(size=(2, n, N_ANTENNAS)) / np.sqrt(2)
+    s = (white[0] + 1j * white[1]) @ np.linalg.cholesky(T[0]).T
+    delta = real_products(s[:, :, None] * s[:, None, :].conj()) - real_products(T[0])
     # mean of the products: T itself (this pins <s_i conj(s_j)> and the products' order)
     z = delta.mean(0) / (delta.std(0) / np.sqrt(n))
     assert np.abs(z).max() < z_of(N_PRODUCTS)

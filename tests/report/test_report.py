@@ -24,22 +24,10 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 
 
 @pytest.fixture(scope="module")
-def folder(small_map):
-    """Of a finished map run, shared: to be read."""
-    return small_map.folder
-
-
-@pytest.fixture(scope="module")
-def cube(small_cube):
-    """Of a finished run of three frequencies, shared: to be read."""
-    return small_cube.folder
-
-
-@pytest.fixture(scope="module")
 def sampled(tmp_path_factory):
     scenario = lb.load_scenario("fiducial", ["lmax=2", "observation.runs.0.cycles=0.05"])
     sampler = lb.Sampler(draws=50, warmup=50, seed=scenario.seed)
-    return lb.run_sample(scenario, tmp_path_factory.mktemp("run") / "s", sampler=sampler).folder
+    return lb.run_sample(scenario, tmp_path_factory.mktemp("run") / "s", sampler=sampler)
 
 
 def viewer_data(page: str) -> dict:
@@ -74,32 +62,33 @@ class Outline(HTMLParser):
 
 
 # a map run with all its figures takes half a minute
-FOLDER = pytest.param("folder", marks=pytest.mark.essential)
+MAP = pytest.param("small_map", marks=pytest.mark.essential)
 SAMPLED = pytest.param("sampled", marks=pytest.mark.long)
-CUBE = pytest.param("cube", marks=pytest.mark.long)
+CUBE = pytest.param("small_cube", marks=pytest.mark.long)
 
 
-@pytest.mark.parametrize("which", [FOLDER, CUBE, SAMPLED])
+@pytest.mark.parametrize("which", [MAP, CUBE, SAMPLED])
 def test_pages_are_whole_and_need_nothing_else(which, request):
-    page = (request.getfixturevalue(which) / "report.html").read_text()
+    folder = request.getfixturevalue(which).folder
+    page = (folder / "report.html").read_text()
     outline = Outline()
     outline.feed(page)
     assert outline.open == []
-    assert len(outline.pictures) >= (4 if which == "cube" else 6)
+    assert len(outline.pictures) >= (4 if which == "small_cube" else 6)
     for picture in outline.pictures:
         assert picture["src"].startswith("data:image/png;base64,")
         assert len(picture["alt"]) > 20
     for link in outline.links:  # to a section, or to a file beside the page
         inside = link[0] == "#" and link[1:] in outline.anchors
-        assert inside or (request.getfixturevalue(which) / link).is_file()
+        assert inside or (folder / link).is_file()
     assert "://" not in page  # which base64 never holds
     assert len(page) < 8e6
 
 
 @pytest.mark.essential
-def test_a_pixels_posterior_is_that_of_the_file(folder):
-    data = viewer_data((folder / "report.html").read_text())
-    file = posterior_of(folder)
+def test_a_pixels_posterior_is_that_of_the_file(small_map):
+    data = viewer_data((small_map.folder / "report.html").read_text())
+    file = posterior_of(small_map.folder)
     mean, covariance = file["mean"].values[0], file["covariance"].values[0]
     nside = data["nside"]
     y = pixel_matrix(nside, 8)
@@ -121,10 +110,10 @@ def test_a_pixels_posterior_is_that_of_the_file(folder):
     np.testing.assert_allclose(layer(data, "prior_fraction"), share, rtol=1e-5)
 
 
-def test_a_page_of_many_channels_has_a_part_for_each(cube):
+def test_a_page_of_many_channels_has_a_part_for_each(small_cube):
     """One is shown at a time; selectors stand above them, and the maps have a slider."""
-    page = (cube / "report.html").read_text()
-    summary = json.loads((cube / "summary.json").read_text())
+    page = (small_cube.folder / "report.html").read_text()
+    summary = json.loads((small_cube.folder / "summary.json").read_text())
     n = len(summary["channels"])
     assert n == 3 and viewer_data(page)["frequencies"] == [20.0, 25.0, 30.0]
     (slider,) = re.findall(r'<input id="viewer-channel" type="range" [^>]*>', page)
@@ -140,11 +129,11 @@ def test_a_page_of_many_channels_has_a_part_for_each(cube):
         assert f"<td>{channel['frequency_mhz']:g}</td><td>{channel['n_data']}</td>" in page
 
 
-@pytest.mark.parametrize("which", [FOLDER, CUBE, SAMPLED])
+@pytest.mark.parametrize("which", [MAP, CUBE, SAMPLED])
 @pytest.mark.parametrize("manifest", [True, False], ids=["manifest", "an older folder without"])
 def test_report_makes_a_page_anew(which, manifest, request, tmp_path, capsys):
     # the title is the folder's name
-    folder = request.getfixturevalue(which)
+    folder = request.getfixturevalue(which).folder
     mine = shutil.copytree(folder, tmp_path / folder.name)
     (mine / "report.html").unlink()
     if not manifest:
@@ -243,16 +232,16 @@ def in_browser(page: str, tmp_path, width: int, points) -> dict:
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
 @pytest.mark.parametrize("width", [1280, 390])
-@pytest.mark.parametrize("which", [FOLDER, CUBE, SAMPLED])
+@pytest.mark.parametrize("which", [MAP, CUBE, SAMPLED])
 def test_in_a_browser(which, width, request, tmp_path):
-    folder = request.getfixturevalue(which)
+    folder = request.getfixturevalue(which).folder
     points = np.random.default_rng(3).uniform([0, -90], [360, 90], (300, 2))
     found = in_browser((folder / "report.html").read_text(), tmp_path, width, points)
     assert found["errors"] == []
     assert found["width"] == width
     assert found["needed"] <= width
     assert found["cut"] == 0
-    if which == "folder":
+    if which == "small_map":
         # the page's own HEALPix is healpy's (test_viewer.py)
         pixels = np.array([p["pixel"] for p in found["pixels"]])
         mean = healpy.read_map(folder / "mean.fits", dtype=np.float64)

@@ -35,10 +35,6 @@ ALL = np.ones((3, 3))
 SMOOTH = np.exp(-(np.log2(FREQUENCIES[:, None] / FREQUENCIES) ** 2) / (2.0 * OCTAVES**2))
 
 
-def log_normal(y, mean, covariance) -> float:
-    return multivariate_normal.logpdf(y, mean, covariance)
-
-
 @pytest.mark.parametrize("volume", [0.0, 3.0])
 def test_ties_are_those_of_one_gaussian_of_all_amplitudes(volume):
     """Data y = z + noise of each channel, and the volume of its skies exp(e^T z)."""
@@ -59,6 +55,7 @@ def test_ties_are_those_of_one_gaussian_of_all_amplitudes(volume):
     within(draws.T @ draws, after, 1e-12)
     # one white number for each shared value
     assert np.count_nonzero(np.abs(draws).sum(1)) == 5
+    log_normal = multivariate_normal.logpdf
     expected = log_normal(y.ravel(), before, known) + e.ravel() @ before / 2.0
     for own_y, own_e, own in zip(y, e, noise, strict=True):
         expected -= log_normal(own_y, own_e, np.eye(3) + own) + own_e @ own_e / 2.0

@@ -58,18 +58,13 @@ def mode() -> ln.LogNormalMode:
 # --- the mode ---------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def two_unknowns():
+def test_the_mode_is_where_a_search_without_derivatives_finds_it():
     """A datum of the mean temperature, half as large again as the template's, known to 5 %."""
     sky = log_normal(0.1, lmax=0, sources=BRIGHT_SOURCES[:1])
     value = 1.5 * sky.modes(np.zeros(2))
     precision = float((0.05 * value[0]) ** -2)
     scalars = map(np.asarray, (0.0, -np.log(precision), 1.0))
-    return sky, Information(np.array([[precision]]), np.zeros(1), value, *scalars)
-
-
-def test_the_mode_is_where_a_search_without_derivatives_finds_it(two_unknowns):
-    sky, given = two_unknowns
+    given = Information(np.array([[precision]]), np.zeros(1), value, *scalars)
 
     def energy(u):
         return float(given.chi2(sky.modes(u))) + u @ u

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from assertions import close, within
-from experiments import density, density_of, program_arguments, small_experiment
+from experiments import density, density_of, differences, program_arguments, small_experiment
 from jax.flatten_util import ravel_pytree
 from reference_linear import exact_posterior
 from scipy.stats import lognorm, loguniform, norm, truncnorm, uniform
@@ -282,16 +282,6 @@ def scenario(*more: str) -> Scenario:
     return lb.load_scenario("fiducial", [*given, "prior={model: isotropic, spectrum: sky}"])
 
 
-def differences(systematic, model, sky, centre):
-    """Central ones of the effect, with steps of 1e-4 prior standard deviations."""
-
-    def seen(z):
-        return np.asarray(systematic.effect(model, systematic.values(z)).predict(sky))
-
-    steps = 1e-4 * np.eye(len(centre))
-    return np.stack([(seen(centre + s) - seen(centre - s)) / 2e-4 for s in steps], axis=1)
-
-
 BESIDE_SOURCES = pytest.param([POINTING, *SOURCES], marks=pytest.mark.long)
 
 
@@ -307,7 +297,8 @@ def test_columns_are_the_derivative_of_the_effect(more):
     model, sky = models.base_model(setup), setup.sky.modes
     for _, systematic in systematics(setup, Around(values=values)):
         expanded = on_host(Expanded.about(systematic, model, Around(sky=sky, values=values)))
-        expected = differences(systematic, model, sky, expanded.centre)
+        steps = 1e-4 * np.eye(len(expanded.centre))
+        expected = differences(systematic, model, sky, expanded.centre, steps)
         size, off = (np.linalg.norm(x, axis=0) for x in (expected, expanded.columns - expected))
         for name, size_of, off_of in zip(systematic.names, size, off, strict=True):
             # a source that is down in a block does nothing
