@@ -15,7 +15,7 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import wraps
 from pathlib import Path
 from types import ModuleType
@@ -46,6 +46,8 @@ Ells = Float[np.ndarray, " ells"]
 Pixels = Float[np.ndarray, " pixels"]
 Vector = Float[np.ndarray, " n"]
 Square = Float[np.ndarray, "n n"]
+# of parameters, by name
+Values = Mapping[str, float | Float[Array, ""]]
 
 F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T")

@@ -20,7 +20,6 @@ the offset itself does to the data.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -29,7 +28,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation as SpatialRotation
 
-from lusee_bayes.core.arrays import Array, Times, namespace
+from lusee_bayes.core.arrays import Array, Times, Values, namespace
 from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.harmonics import Rotation
 from lusee_bayes.instrument.averaging import sufficient_nodes, terms_of_exponential, windowed
@@ -205,8 +204,6 @@ SITE = ("lon_deg", "lat_deg")
 OFFSETS = (*CLOCK, "turntable_deg", *SITE, *TILTS)
 # by which the Moon turns against the sky, as azimuths of the sky count it, in radians per hour
 TURN_PER_HOUR = -2.0 * np.pi / (CYCLE_DAYS * 24.0)
-
-Values = Mapping[str, float | Float[Array, ""]]
 
 
 def offset_names(kinds: tuple[str, ...], n_runs: int) -> tuple[str, ...]:

@@ -38,6 +38,7 @@ from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, beam_scale
 from lusee_bayes.instrument.products import ports, to_real
 from lusee_bayes.systematics.context import Around, Setup
+from lusee_bayes.systematics.polarisation import unit_spectrum
 from lusee_bayes.systematics.systematic import ChangedBeams, Unknown, Values
 
 # what is learned, by name
@@ -217,6 +218,4 @@ class FieldErrors(ChangedBeams):
 
 def of_ell(std: float, slope: float, lmax: int) -> Float[np.ndarray, " ells"]:
     """Square roots of C_ell, which add up to this standard deviation in any direction."""
-    ell = np.arange(lmax + 1.0)
-    spectrum = (1.0 + ell) ** -slope
-    return std * np.sqrt(spectrum * 4.0 * np.pi / ((2.0 * ell + 1.0) @ spectrum))
+    return std * np.sqrt(unit_spectrum(lmax, 0, -slope))

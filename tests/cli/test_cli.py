@@ -167,7 +167,7 @@ def test_the_users_folder_stands_for_a_tilde_everywhere(tmp_path, monkeypatch, c
 
 
 @pytest.mark.long
-def test_data_without_truth(folder, tmp_path):
+def test_data_without_truth(tmp_path):
     run("simulate", "fiducial", *SMALL, "-o", tmp_path / "sim.nc", "-q")
     data = xr.load_dataset(tmp_path / "sim.nc", engine="h5netcdf", decode_times=False)
     data.drop_vars("truth").to_netcdf(tmp_path / "real.nc", engine="h5netcdf")

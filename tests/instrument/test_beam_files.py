@@ -27,7 +27,7 @@ from lusee_bayes.instrument.waterfalls import read_waterfall
 from lusee_bayes.systematics.beam import beam_rms_difference, difference_of_beams, true_beams
 from lusee_bayes.testing.scenarios import small_scenario
 
-LMAX, PORTS = 47, 4
+LMAX = 47
 
 
 # --- luseepy's own waterfall --------------------------------------------------------------------

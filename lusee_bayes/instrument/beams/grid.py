@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import Array, namespace
+from lusee_bayes.core.arrays import Array, Values, namespace
 from lusee_bayes.core.checks import Described, is_traced
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.layouts import Layout, Variable
@@ -39,7 +39,6 @@ from lusee_bayes.instrument.beams.source import BeamSource, Circuit, Lines, Para
 from lusee_bayes.instrument.products import all_products
 
 Nodes = Float[np.ndarray, " nodes"]
-Values = Mapping[str, float | Float[Array, ""]]
 # values of a parameter through which one polynomial goes; through more go cubic splines
 MOST_IN_ONE = 5
 WHAT = "a table of beam files: a column file, and one with two or more values for each parameter"

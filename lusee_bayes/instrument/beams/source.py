@@ -22,7 +22,7 @@ from jaxtyping import Complex, Float
 from pydantic import BeforeValidator, Field
 from scipy.constants import Boltzmann
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, Values
 from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.formats import read_fits
 from lusee_bayes.core.layouts import Layout, Variable
@@ -39,7 +39,6 @@ from lusee_bayes.instrument.beams.fields import (
 from lusee_bayes.instrument.products import N_ANTENNAS
 
 Ohms = Complex[np.ndarray, "ports ports"]
-Values = Mapping[str, float | Float[Array, ""]]
 Lines = Float[np.ndarray, "lines products modes"]
 # matrices of the ports at every frequency
 LOADS, BY_PORTS = ("ZL_real", "ZL_imag"), ("freq", N_ANTENNAS, N_ANTENNAS)
