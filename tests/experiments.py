@@ -152,7 +152,7 @@ def with_known_sky(setup: Setup, scale: float) -> Setup:
 def drawn(first: Setup, seed: int) -> Experiment:
     """Data of a sky that is drawn from the prior; N is that of the model sky."""
     z = np.random.default_rng(seed).standard_normal(first.prior.size)
-    sky = replace(first.sky, modes=np.asarray(first.prior.colour(z)) + first.prior.mean)
+    sky = replace(first.sky, modes=np.asarray(first.prior.colour(z + first.prior.white_mean)))
     setup = replace(first, sky=sky, scenario=first.scenario.model_copy(update={"seed": seed}))
     return Experiment(setup, simulate(setup))
 

@@ -341,7 +341,7 @@ def sampled_beams(
 FIELDS = ("e_theta_real", "e_theta_imag", "e_phi_real", "e_phi_imag")
 POWER = "product_beam"
 WHAT = "sampled beams"
-HINT = "lusee_bayes.write_sampled_beams makes one of sampled_beams(...)"
+HINT = "lusee_bayes.instrument.beams.sampled.write_sampled_beams makes one"
 
 
 def layout(names: tuple[str, ...], grid: bool, kind: Kind = "real", said: Any = None) -> Layout:
