@@ -389,9 +389,13 @@ def _learned(
     there = family.prior(family.at(family.hyperprior.of_scores(scores.mean)).covariance)
     evidence = float(information.posterior(there).log_evidence) + scores.log_volume
 
+    # the variances are a constant, and one that goes with the level
+    doubled = np.concatenate([[mean[0] + np.log(2.0)], mean[1:]])
+    once, twice = (family.averaged(level, spread) for level in (mean, doubled))
+
     def at_level(shift: float) -> Posterior:
-        level = np.concatenate([[mean[0] + shift], mean[1:]])
-        return information.posterior(family.prior(family.averaged(level, spread)))
+        covariance = once + np.expm1(shift) * (twice - once)
+        return information.posterior(family.prior(covariance))
 
     tried = [float(at_level(shift).log_evidence) for shift in LEVELS]
     square, linear, _ = np.polyfit(LEVELS, tried, 2)
