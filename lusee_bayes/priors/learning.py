@@ -18,8 +18,8 @@ Around the maximum z is taken for normal, and theta for linear in it, but for th
 their distribution is skewed, and where the data do not see a cell its mean is far above the most
 probable value. The prior that is returned has the variances' means over it, at the level that suits
 the data best: they tell the variances' mean over many cells, which the most probable logarithms of
-each do not give. The evidence is the
-integral of p(d, theta) by Laplace's approximation, in coordinates that know the hyperprior's tails.
+each do not give. The evidence is the integral of p(d, theta) by Laplace's approximation, in
+coordinates that know the hyperprior's tails.
 
 Draws of a sky have the parameters as uncertain as they are, ::
 
