@@ -179,19 +179,16 @@ def test_scores_are_standard_normal_under_the_hyperprior():
 
 def test_an_unseen_cell_has_the_factor_that_is_expected_of_it():
     """Mean and variance of ln v against a gamma variable's; theta is linear in its score."""
-    hyperprior = Hyperprior(np.array([1.0]), np.array([0.5]), n_cells=2)
-    mean, covariance = hyperprior.moments(np.zeros(3), np.diag([0.01, 1.0, 1.0]))
-    shape = hyperprior.tail / hyperprior.steepness
-    expected = 0.5 * (np.log(shape) - special.digamma(shape))
-    np.testing.assert_allclose(mean, [1.0, expected, expected], rtol=1e-3)
-    variance = 0.25 * special.polygamma(1, shape)
-    slope = hyperprior.slopes_of_scores(np.zeros(3))[0]
-    expected = [0.01 * slope**2, variance, variance]
-    np.testing.assert_allclose(np.diagonal(covariance), expected, rtol=1e-2)
-    # theta is linear, the cells are what their scores say
-    far = hyperprior.near(np.zeros(3), np.full(3, 2.0))
-    assert far[0] == pytest.approx(1.0 + 2.0 * slope)
-    np.testing.assert_allclose(far[1:], hyperprior.of_scores(np.full(3, 2.0))[1:])
+    hyperprior = Hyperprior(np.array([1.0]), np.array([0.5]), n_cells=1)
+    mean, covariance = hyperprior.moments(np.zeros(2), np.diag([0.01, 1.0]))
+    shape, slope = 0.75, hyperprior.slopes_of_scores(np.zeros(2))[0]
+    np.testing.assert_allclose(mean, [1.0, 0.5 * (np.log(shape) - special.digamma(shape))], 1e-3)
+    variances = [0.01 * slope**2, 0.25 * special.polygamma(1, shape)]
+    np.testing.assert_allclose(np.diagonal(covariance), variances, rtol=1e-2)
+    # theta is linear, the cell is what its score says
+    two = np.full(2, 2.0)
+    expected = [1.0 + 2.0 * slope, hyperprior.of_scores(two)[1]]
+    np.testing.assert_allclose(hyperprior.near(np.zeros(2), two), expected)
 
 
 # --- data that do not fit -------------------------------------------------------------------------

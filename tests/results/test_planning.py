@@ -130,16 +130,19 @@ def test_a_lost_antenna_is_flags():
     variation = varied()
     dead = [p.i == 2 or p.j == 2 for p in all_products()]
     experiment = lb.build(variation.scenario)
-    setup = experiment.setup
-    flags = np.repeat(np.array(dead)[:, None], setup.observation.n_times, axis=1)
+    flags = np.repeat(np.array(dead)[:, None], experiment.setup.observation.n_times, axis=1)
     found = plan_run.forecast(replace(variation, lost=(2,)))
-    assert found.n_data == 9 * setup.observation.n_times
+    assert found.n_data == 9 * experiment.setup.observation.n_times
     assert_forecast_is(found, *textbook(variation, ~flags.ravel()))
     # and the same model as that of data with these flags
     expected = full_model(set_up(variation.scenario, flagged(experiment.data, flags)))
-    got = full_model(plan_run.without_ports(setup, [2]))
+    got = full_model(plan_run.without_ports(experiment.setup, [2]))
     np.testing.assert_array_equal(got.coupling.dense(), expected.coupling.dense())
     np.testing.assert_array_equal(got.noise.diagonal(), expected.noise.diagonal())
+    # so is what the sky above lmax adds
+    seen = lb.build(varied("noise.above_lmax={margin: 2, least_lmax: 0}").scenario).setup
+    kept = plan_run.without_ports(seen, [2]).above.coupling
+    np.testing.assert_array_equal(kept, seen.above.coupling[~flags.ravel()])
 
 
 def test_an_ell_that_is_not_seen_and_one_without_power():
