@@ -35,10 +35,10 @@ from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix, turned_abo
 from lusee_bayes.noise import covariance, time_blocks
 
 # arrays that recur
-Beams = Float[np.ndarray, "orders products 2 functions degrees"]
+Beams = Complex[np.ndarray, "orders groups functions degrees"]
 
 Places = Int[np.ndarray, " modes"]
-Phases = Complex[np.ndarray, "..."]
+Sums = Complex[np.ndarray, "q groups functions functions"]
 Blocks = Float[np.ndarray, "rows columns"]
 # times that are summed at once: it bounds the memory
 CHUNK = 512
@@ -99,9 +99,13 @@ def of_one_angle(
     to its own, and rows of degrees from it, are computed; the others are mirror images, or zero.
     """
     n = by_order.shape[0]
-    beams = by_order.reshape(n, n_products, -1, 2, n).swapaxes(2, 3)
-    f = time_sums(weights.reshape(-1, azimuth.shape[0]), azimuth, functions.T, n - 1)
-    f = f.reshape(*weights.shape[:-1], *f.shape[1:])
+    parts = by_order.reshape(n, n_products, -1, 2, n)
+    beams = parts[..., 0, :] + 1j * parts[..., 1, :]
+    sums = time_sums(weights.reshape(-1, azimuth.shape[0]), azimuth, functions.T, n - 1)
+    f = np.moveaxis(sums.reshape(*weights.shape[:-1], *sums.shape[1:]), -1, 0)
+    if weights.ndim == 3:  # products are coupled, and count like functions
+        f, beams = f.swapaxes(2, 3), beams.reshape(n, 1, -1, n)
+    f = np.ascontiguousarray(f).reshape(len(f), *beams.shape[1:3], beams.shape[2])
     # of every mode: degree, order, and whether it is a_l,-m
     ell, m = (x[_by_order(n - 1)] for x in mode_numbers(n - 1))
     m, s = np.abs(m), (m < 0).astype(int)
@@ -125,47 +129,21 @@ def _by_order(lmax: int) -> Places:
     return np.lexsort((ell, m < 0, np.abs(m)))
 
 
-def _rows_of_order(m: int, beams: Beams, f: Phases) -> Blocks:
+def _rows_of_order(m: int, beams: Beams, f: Sums) -> Blocks:
     """Rows a_lm, then a_l,-m, of one order; columns a_l'm', then a_l',-m', of orders up to it.
 
     Rows of degrees from ``m``; columns of all degrees, with zeros where there is no mode.
     """
-    n, others = beams.shape[0], np.arange(m + 1)
-    difference = np.take(f, m - others + 2 * (n - 1), axis=-1)
-    total = np.take(f, m + others + 2 * (n - 1), axis=-1)
-    plus, minus = _weighted((total + difference) / 2.0, (total - difference) / 2.0, beams[: m + 1])
-    real, imaginary = own = beams[m][..., m:].swapaxes(0, 1)
-    # real and imaginary parts of complex products by products of real matrices
-    both = np.concatenate([np.stack([real, -imaginary], 1), np.stack([imaginary, real], 1)], -1)
-    both = both.reshape(-1, 2 * own.shape[-1]).T
-    # (rows, orders, degrees) of either
-    r = n - m
-    u, v = ((both @ x).swapaxes(0, 1).reshape(2 * r, -1) for x in (plus, minus))
-    return np.block([[u[:r], -v[r:]], [u[r:], v[:r]]])
-
-
-def _weighted(
-    even: Phases, odd: Phases, beams: Beams
-) -> list[Float[np.ndarray, "orders parts degrees"]]:
-    """(P + Q) / 2 and (P - Q) / 2 without the row's own beam, real and imaginary parts.
-
-    With the other beam W + i W', and F(m + m') + F(m - m') = 2 even, their difference 2 odd::
-
-        (P + Q) / 2 = even W + i odd W',    (P - Q) / 2 = -odd W - i even W'.
-    """
-    n_orders, n_products, _, n_functions, n = beams.shape
-    factors = [
-        np.stack([np.stack([even.real, -odd.imag]), np.stack([even.imag, odd.real])]),
-        np.stack([np.stack([-odd.real, even.imag]), np.stack([-odd.imag, -even.real])]),
-    ]
-    if even.ndim == 5:
-        # part, other part, product, other product, function, other function, order
-        factors = [x.transpose(6, 2, 0, 4, 3, 1, 5) for x in factors]
-        factors = [x.reshape(n_orders, n_products * 2 * n_functions, -1) for x in factors]
-        return [x @ beams.reshape(n_orders, -1, n) for x in factors]
-    beams = beams.reshape(n_orders, n_products, -1, n)
-    factors = [x.transpose(5, 2, 0, 3, 1, 4).reshape(*beams.shape[:3], -1) for x in factors]
-    return [(x @ beams).reshape(n_orders, -1, n) for x in factors]
+    n, zero = beams.shape[0], len(f) // 2
+    own, others = beams[m][..., m:], beams[: m + 1]
+    p = f[zero : zero + m + 1][::-1] @ others.conj()
+    q = f[zero + m : zero + 2 * m + 1] @ others
+    own = own.reshape(-1, own.shape[-1]).T / 2.0
+    # (rows, orders and degrees)
+    u, v = (
+        (own @ x.reshape(m + 1, -1, n)).swapaxes(0, 1).reshape(n - m, -1) for x in (p + q, p - q)
+    )
+    return np.block([[u.real, -v.imag], [u.imag, v.real]])
 
 
 def normal_matrix(
