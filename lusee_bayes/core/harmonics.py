@@ -26,7 +26,7 @@ from functools import lru_cache
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 
 from lusee_bayes.core.arrays import Array, Fields, Square, namespace
 from lusee_bayes.core.checks import require_finite, require_whole
@@ -201,6 +201,13 @@ def per_mode(spectrum: Float[Array, "*batch ells"]) -> Fields:
     """Repeat a quantity that is given per ell for every mode of that ell."""
     ell, _ = mode_numbers(spectrum.shape[-1] - 1)
     return spectrum[..., ell]
+
+
+@lru_cache(maxsize=8)
+def modes_by_size_of_order(lmax: int) -> Int[np.ndarray, " modes"]:
+    """Packed modes by growing ``|m|``: for each first the a_lm, then the a_l,-m, by growing ell."""
+    ell, m = mode_numbers(lmax)
+    return np.lexsort((ell, m < 0, np.abs(m)))
 
 
 def order_products(matrix: Square, heights: Angles) -> Float[np.ndarray, "points orders orders"]:

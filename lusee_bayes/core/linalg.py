@@ -184,8 +184,13 @@ def sandwich(matrix: Matrix, lower: Matrix) -> Matrix:
     return symmetric_product(lower.T @ matrix, lower)
 
 
-def inverse_sandwich(matrix: Matrix, lower: Matrix) -> Matrix:
-    """Return L^-1 M L^-T for symmetric M and lower triangular L, symmetric to the last bit."""
+def inverse_sandwich(matrix: Matrix, lower: Matrix, *, transpose: bool = False) -> Matrix:
+    """Return L^-1 M L^-T, or L^-T M L^-1, for symmetric M and lower triangular L."""
+    if namespace(matrix, lower) is not np:
+        solved = solve_lower(lower, matrix, transpose=transpose)
+        return solve_lower(lower, solved.T, transpose=transpose)
+    if transpose:  # with rows and columns in reverse order it is the other one
+        return _reversed(_sandwiched(1, _reversed(matrix), _reversed(lower.T)))
     return _sandwiched(1, matrix, lower)
 
 

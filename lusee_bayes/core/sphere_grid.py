@@ -168,29 +168,30 @@ class SphereGrid(eqx.Module):
         square = lmax == highest
         fourier = np.fft.fft(np.asarray(field) * np.asarray(self.weights)[:, None], axis=1).T
         transposed = np.ascontiguousarray(table[: lmax + 1, :, : lmax + 1].transpose(0, 2, 1))
-        matrix = np.empty((harmonics.n_modes(lmax), harmonics.n_modes(highest)))
+        # rows and columns by growing |m|
+        rows, columns = (harmonics.modes_by_size_of_order(x) for x in (lmax, highest))
+        ell, order = (x[rows] for x in harmonics.mode_numbers(lmax))
+        starts = np.searchsorted(
+            np.abs(harmonics.mode_numbers(highest)[1][columns]), range(highest + 1)
+        )
+        matrix = np.empty((len(rows), len(columns)))
         for m in range(highest + 1):
             others = np.arange(m if square else 0, lmax + 1)
             low, high = fourier[others - m], fourier[(others + m) % self.n_phi]
-            # cos m'phi cos m phi, sin sin, sin m'phi cos m phi, cos m'phi sin m phi
-            factors = (low + high).real, (low - high).real, (low + high).imag, (high - low).imag
-            signs = (1, 1), (-1, -1), (-1, 1), (1, -1)
-            degrees = np.arange(m, highest + 1)
-            for factor, (sign, own) in zip(factors, signs, strict=True):
-                if own < 0 and m == 0:  # sin 0
-                    continue
-                columns = table[m][:, m:][None] * (0.5 * factor)[:, :, None]
-                blocks = transposed[others[0] :] @ columns  # m', its ells, those of m
-                to = degrees * (degrees + 1) + own * m
-                for other, block in zip(others, blocks, strict=True):
-                    if sign < 0 and other == 0:
-                        continue
-                    ell = np.arange(other, lmax + 1)
-                    at = ell * (ell + 1) + sign * other
-                    matrix[at[:, None], to[None]] = block[other:]
-                    if square:
-                        matrix[to[:, None], at[None]] = block[other:].T
-        return linalg.mirrored(matrix) if square else matrix
+            # cos m'phi and sin m'phi, times cos m phi and sin m phi
+            cosine = (low + high).real, (low + high).imag
+            sine = (high - low).imag, (low - high).real
+            for own, factors in enumerate([cosine, sine][: 1 + (m > 0)]):
+                first = starts[m] + own * (highest + 1 - m)
+                for negative, factor in enumerate(factors):
+                    blocks = transposed[others] @ (table[m][:, m:] * (0.5 * factor)[:, :, None])
+                    to = np.flatnonzero(((order < 0) == negative) & (np.abs(order) >= others[0]))
+                    found = blocks[np.abs(order[to]) - others[0], ell[to]]
+                    matrix[to, first : first + highest + 1 - m] = found
+        if square:
+            matrix = linalg.mirrored(matrix)
+        rows, columns = np.argsort(rows), np.argsort(columns)
+        return matrix[rows].take(columns, axis=1)
 
     def diagonal(self, matrix: Float[np.ndarray, "modes modes"]) -> Float[np.ndarray, "rings phi"]:
         """Compute y^T C y at the grid's points: the variance of a field of covariance C.

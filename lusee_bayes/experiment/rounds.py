@@ -27,7 +27,7 @@ from lusee_bayes.linear.linear_gaussian import FromInformation, LinearGaussian, 
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.noise.covariance import LowRankFactor
 from lusee_bayes.priors.families import PriorFamily
-from lusee_bayes.priors.learning import Learned, learn_whatever_fits
+from lusee_bayes.priors.learning import Learned, learn_whatever_fits, most_probable
 from lusee_bayes.sky.prior import Prior
 from lusee_bayes.systematics.above_lmax import AboveLmax
 from lusee_bayes.systematics.context import Around, Setup
@@ -550,8 +550,8 @@ def first_parameters(setup: Setup, information: Information) -> Vector | None:
         coarse = scenario.prior.family(scenario.frequency_mhz, COARSE_LMAX)
         n = n_modes(COARSE_LMAX)
         information = integrated_out(information, n, np.asarray(setup.prior.variance())[n:])
-    found = learn_whatever_fits(coarse, information, seed=seed)
-    return family.start_from(coarse, found.parameters) if found.settled else None
+    found = most_probable(coarse, information, seed)
+    return None if found is None else family.start_from(coarse, found)
 
 
 def learned_prior(

@@ -21,7 +21,6 @@ this is NumPy's, whatever arrays A and N have.
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Complex, Float, Int
@@ -29,7 +28,7 @@ from jaxtyping import Complex, Float, Int
 from lusee_bayes.core.arrays import ModesMatrix, on_host
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import Rotation, mode_numbers
+from lusee_bayes.core.harmonics import Rotation, mode_numbers, modes_by_size_of_order
 from lusee_bayes.core.linalg import gram_matrix, mirrored, solve_lower
 from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix, turned_about_pole
 from lusee_bayes.noise import covariance, time_blocks
@@ -107,7 +106,7 @@ def of_one_angle(
         f, beams = f.swapaxes(2, 3), beams.reshape(n, 1, -1, n)
     f = np.ascontiguousarray(f).reshape(len(f), *beams.shape[1:3], beams.shape[2])
     # of every mode: degree, order, and whether it is a_l,-m
-    ell, m = (x[_by_order(n - 1)] for x in mode_numbers(n - 1))
+    ell, m = (x[modes_by_size_of_order(n - 1)] for x in mode_numbers(n - 1))
     m, s = np.abs(m), (m < 0).astype(int)
     whole = np.zeros((len(m),) * 2)
     for order in range(n):
@@ -120,13 +119,7 @@ def of_one_angle(
 
 def places(lmax: int) -> Places:
     """Rows of the packed modes: by growing ``|m|``, for each first the a_lm, then the a_l,-m."""
-    return np.argsort(_by_order(lmax))
-
-
-@lru_cache(maxsize=4)
-def _by_order(lmax: int) -> Places:
-    ell, m = mode_numbers(lmax)
-    return np.lexsort((ell, m < 0, np.abs(m)))
+    return np.argsort(modes_by_size_of_order(lmax))
 
 
 def _rows_of_order(m: int, beams: Beams, f: Sums) -> Blocks:

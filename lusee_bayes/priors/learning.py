@@ -71,14 +71,14 @@ class Scores:
         Most probable scores.
     covariance : (parameters, parameters) array
         About them.
-    log_volume : float
-        Its integral, by Laplace's approximation: what turns ln p(d | theta) at the mean into ln
+    log_gain : float
+        Laplace's approximation: what turns ln p(d | theta) of the most probable parameters into ln
         p(d).
     """
 
     mean: Parameters
     covariance: Square
-    log_volume: float
+    log_gain: float
 
 
 def normal_scores(hyperprior: Hyperprior, parameters: Parameters, covariance: Square) -> Scores:
@@ -115,8 +115,8 @@ def normal_scores(hyperprior: Hyperprior, parameters: Parameters, covariance: Sq
         tried = (z + 0.5**k * step for k in range(HALVINGS))
         z = next((there for there in tried if value(there) >= value(z)), z)
     lower = checked_cholesky("the curvature of the parameters", precision(z))
-    log_volume = float(-np.log(np.diagonal(lower)).sum() - 0.5 * z @ z)
-    return Scores(z, inverse_from_cholesky(lower), log_volume)
+    log_gain = value(z) - float(np.log(np.diagonal(lower)).sum())
+    return Scores(z, inverse_from_cholesky(lower), log_gain)
 
 
 # the maximum is found when the next step could not add more than this to ln p
@@ -213,7 +213,7 @@ class _Point:
     def slope(self, family: PriorFamily) -> Parameters:
         """Gradient of ln p(d, theta)."""
         prior, mean = self.posterior.prior, self.posterior.white_mean
-        expected = prior.whiten_columns(prior.whiten_columns(self.known).T)
+        expected = prior.whitened_sandwich(self.known)
         of_data = self.member.forms(prior.whiten_columns((mean - prior.white_mean)[None]).T)[:, 0]
         return of_data - self.member.traces(expected) + family.hyperprior.gradient(self.parameters)
 
@@ -249,6 +249,13 @@ def learn(
     InputError
         If S is not positive definite.
     """
+    return _learned(family, information, *_uphill(family, information, start, seed))
+
+
+def _uphill(
+    family: PriorFamily, information: Information, start: Parameters | None, seed: int
+) -> tuple[_Point, Generator, int]:
+    """The most probable parameters, random numbers for more, and the steps that were taken."""
     rng, before, moves = np.random.default_rng(seed), None, []
     here = _at(family, information, family.hyperprior.start() if start is None else start)
     for steps in range(MAX_STEPS + 1):
@@ -260,7 +267,7 @@ def learn(
         step = np.linalg.solve(curvature, gradient)
         gain = 0.5 * float(gradient @ step)
         if gain < SETTLED:
-            return _learned(family, information, here, rng, steps)
+            return here, rng, steps
         here = _climb(family, information, here, step * min(1.0, LONGEST / np.abs(step).max()))
     raise NotSettled(
         f"the prior's parameters did not settle in {MAX_STEPS} steps: the next would still add "
@@ -301,6 +308,14 @@ def learn_whatever_fits(
                 information.posterior(found.prior)
             return replace(found, noise_factor=float(factor))
     return _fixed(family, information, float(demanded * HIGHER[-1]))
+
+
+def most_probable(family: PriorFamily, information: Information, seed: int) -> Parameters | None:
+    """Find where :func:`learn_whatever_fits` ends uphill; None if it does not settle."""
+    for factor in demanded_factor(information, family.expected()) * HIGHER:
+        with suppress(InputError):
+            return _uphill(family, information.raised(factor), None, seed)[0].parameters
+    return None
 
 
 def demanded_factor(information: Information, prior: Prior) -> float:
@@ -386,8 +401,7 @@ def _learned(
     def spread(rows: Float[np.ndarray, "rows parameters"]) -> Float[np.ndarray, " rows"]:
         return np.einsum("ij,ij->i", rows @ about, rows)
 
-    there = family.prior(family.at(family.hyperprior.of_scores(scores.mean)).covariance)
-    evidence = float(information.posterior(there).log_evidence) + scores.log_volume
+    evidence = float(here.posterior.log_evidence) + scores.log_gain
 
     # the variances are a constant, and one that goes with the level
     doubled = np.concatenate([[mean[0] + np.log(2.0)], mean[1:]])
@@ -406,7 +420,8 @@ def _learned(
     return Learned(prior, family.names, here.parameters, covariance, scores, evidence, steps)
 
 
-# skies that are drawn with the same theta, and the least number of theta where skies are so many
+# skies that are drawn with the same theta, at most, and the number of theta from which on it is
+# more than two
 SHARED, LEAST = 30, 10
 # how often a theta is drawn anew whose S is not positive definite to rounding
 ATTEMPTS = 5
@@ -441,7 +456,7 @@ def draws_with_parameters(
     if not n:
         return drawn
     root = np.linalg.cholesky(learned.scores.covariance)
-    sets = min(n, max(LEAST, -(-n // SHARED)))
+    sets = max(min(-(-n // 2), LEAST), -(-n // SHARED))
 
     def some(k: int) -> None:
         own = jax.random.fold_in(key, k)

@@ -77,6 +77,10 @@ class Prior(Described, eqx.Module):
     def sandwich(self, matrix: Covered) -> Float[Array, "white white"]:
         """Compute G^T M G of a symmetric M, which may be an information about m: that about u."""
 
+    def whitened_sandwich(self, matrix: Float[Array, "white white"]) -> Covered:
+        """Compute G^-T M G^-1 of a symmetric M."""
+        return self.whiten_columns(self.whiten_columns(matrix).T)
+
     def colour_covariance(self, white: Float[Array, "white white"]) -> Covered:
         """Compute G C G^T of a symmetric C, such as the covariance of u: that of m.
 
@@ -246,6 +250,9 @@ class DensePrior(Prior):
 
     def sandwich(self, matrix):
         return linalg.sandwich(matrix, self.root)
+
+    def whitened_sandwich(self, matrix):
+        return linalg.inverse_sandwich(matrix, self.root, transpose=True)
 
     def colour_covariance(self, white):
         return linalg.outer_sandwich(white, self.root)

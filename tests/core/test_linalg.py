@@ -152,7 +152,9 @@ def test_products_with_a_triangle(n, xp):
         np.testing.assert_array_equal(found, np.asarray(found).T)
     root = np.linalg.cholesky(spd(n + 1)[:n, :n])
     inverse = np.linalg.inv(root)
+    root, matrix = xp.asarray(root), xp.asarray(matrix)
     close(la.inverse_sandwich(matrix, root), inverse @ matrix @ inverse.T)
+    close(la.inverse_sandwich(matrix, root, transpose=True), inverse.T @ matrix @ inverse)
 
 
 @ARRAYS
