@@ -27,6 +27,7 @@ import jax
 import numpy as np
 
 from lusee_bayes.core.arrays import Modes
+from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.lazy import arviz_stats
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import base_model, moved, systematics
@@ -41,8 +42,10 @@ from lusee_bayes.systematics.field_errors import FieldErrors, FieldErrorsSection
 from lusee_bayes.systematics.pointing_offsets import PointingOffsets
 from lusee_bayes.systematics.systematic import Systematic, Unknown
 
-# draws that are weighed, and the k up to which a Gaussian serves
-N_WEIGHED, LARGEST_K = 100, 0.7
+# draws that are weighed, the first of them, and the k up to which a Gaussian serves
+N_WEIGHED, N_FIRST, LARGEST_K = 100, 25, 0.7
+# weights whose logarithms differ by less (rms) count for 1 / (1 + EVEN^2) = 0.92 of their number
+EVEN = 0.3
 # moves of the map, in standard deviations (rms), that make its error larger by a twentieth
 LARGEST_MOVE = 0.3
 # an error of the fields, and of each parameter of the antennas, relative
@@ -73,8 +76,8 @@ def weighed(setup: Setup, data: np.ndarray, found: Inference) -> tuple[float, fl
     Returns
     -------
     (float, float) or None
-        Pareto k of the weights, and by how much what is beyond first order moves the map, rms in
-        standard deviations; None where nothing was found in rounds.
+        Pareto k of the weights, -inf where they hardly differ, and by how much what is beyond first
+        order moves the map, rms in standard deviations; None where nothing was found in rounds.
     """
     parts, factor = found.expanded, found.solution.factor
     if not found.moving or not isinstance(factor, LowRankFactor):
@@ -84,16 +87,17 @@ def weighed(setup: Setup, data: np.ndarray, found: Inference) -> tuple[float, fl
     keys = jax.random.split(jax.random.key(setup.scenario.seed), 2)
     skies = np.asarray(found.posterior.sample(keys[0], N_WEIGHED))
     values, axes = np.linalg.eigh(told.covariance)
-    root = axes * np.sqrt(np.maximum(values, 0.0))
+    spread = axes * np.sqrt(np.maximum(values, 0.0))
     normals = np.asarray(jax.random.normal(keys[1], (N_WEIGHED, len(told.mean))))
-    off = told.mean + normals @ root.T - (skies - told.reference) @ told.pull.T
+    off = told.mean + normals @ spread.T - (skies - told.reference) @ told.pull.T
     expected = np.concatenate([part.expected for part in parts])
     ends = np.cumsum([len(part.centre) for part in parts])[:-1]
     base = base_model(setup, found.around)
     built = [found for _, found in systematics(setup, found.around)]
     first_order, beyond = np.empty((2, len(data), N_WEIGHED))
-    for k, (sky, a) in enumerate(zip(skies, off, strict=True)):
-        kinds = (type(part.systematic) for part in parts)
+
+    def drawn(k: int) -> None:
+        sky, a, kinds = skies[k], off[k], (type(part.systematic) for part in parts)
         z = dict(zip(kinds, np.split(a + expected, ends), strict=True))
         model = base
         for systematic in built:
@@ -104,12 +108,19 @@ def weighed(setup: Setup, data: np.ndarray, found: Inference) -> tuple[float, fl
                 model = systematic.averaged(model)
         first_order[:, k] = found.model.predict(sky) + columns @ a
         beyond[:, k] = model.predict(sky) - first_order[:, k]
-    left = data[:, None] - first_order
-    exact, linear = (np.asarray(factor.base.whiten(one)) for one in (left - beyond, left))
-    misfit = (linear**2).sum(0) - (exact**2).sum(0)
-    log_weights = 0.5 * (misfit + (off**2).sum(1) - ((off + expected) ** 2).sum(1))
-    pulls = np.asarray(found.model.coupling.transpose_mv(np.asarray(factor.solve(beyond))))
-    moved_by = float(np.sqrt(np.mean((np.asarray(found.posterior.root()).T @ pulls) ** 2)))
+
+    root, begin = np.asarray(found.posterior.root()), 0
+    for n in (N_FIRST, N_WEIGHED):
+        in_threads(drawn, range(begin, n))
+        begin, steps, linear, more = n, off[:n], first_order[:, :n], beyond[:, :n]
+        left = data[:, None] - linear
+        exact, linear = (np.asarray(factor.base.whiten(one)) for one in (left - more, left))
+        misfit = (linear**2).sum(0) - (exact**2).sum(0)
+        log_weights = 0.5 * (misfit + (steps**2).sum(1) - ((steps + expected) ** 2).sum(1))
+        pulls = np.asarray(found.model.coupling.transpose_mv(np.asarray(factor.solve(more))))
+        moved_by = float(np.sqrt(np.mean((root.T @ pulls) ** 2)))
+        if log_weights.std() < EVEN:
+            return -np.inf, moved_by
     weights = np.exp(log_weights - log_weights.max())
     if weights.sum() ** 2 < 2.0 * (weights**2).sum():  # one draw has nearly all of it: no tail
         return np.inf, moved_by

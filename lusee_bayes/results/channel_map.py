@@ -268,6 +268,10 @@ class Conditioned:
         if scenario.noise.pointing is not None or bad:
             with stages("clock and pointing"):
                 pointing = pointing_report(experiment, own)
+        doubtful = list(doubts(experiment, own))
+        if alone:
+            with stages("first order"):
+                doubtful += reach(experiment, own)
         fitting = experiment.fitting
         return ChannelData(
             frequency_mhz=scenario.frequency_mhz,
@@ -289,7 +293,7 @@ class Conditioned:
             parameters=() if learned is None else tuple(learned.as_rows()),
             log_evidence_learned=None if learned is None else learned.log_evidence,
             beam_rms_difference=beam_rms_difference(experiment.setup),
-            doubts=(*doubts(experiment, own), *(reach(experiment, own) if alone else ())),
+            doubts=tuple(doubtful),
             judged=judged,
             details=details,
             pointing=pointing,
