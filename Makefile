@@ -1,3 +1,6 @@
+# a pipe fails with any of its commands
+SHELL := bash
+.SHELLFLAGS := -o pipefail -ec
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -10,10 +13,9 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: map test essential long lint docs bench clean
 
-# a posterior map of the embedded sky at 25 MHz, in output/fiducial
+# a posterior map of the embedded sky at 25 MHz, in output/first_map
 map: $(VENV)/installed
-	$(BIN)/lusee-bayes map fiducial
-	@echo "the command is $(BIN)/lusee-bayes; . $(BIN)/activate puts it on PATH"
+	$(BIN)/lusee-bayes map
 
 # a file's tests stay in one process: they share fixtures and compiled functions. Two processes also
 # keep each below the number of memory maps that compiled programs may take up
@@ -56,8 +58,9 @@ clean:
 	rm -rf $(VENV) output docs/_build
 
 $(VENV)/installed: pyproject.toml
+	@echo "Installing into $(VENV): two to six minutes, the first time only"
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --editable .
+	$(BIN)/python -m pip install --editable . | sed -n 's/^Collecting \([a-zA-Z0-9_-]*\).*/  \1/p'
 	touch $@
 
 $(VENV)/installed-dev: pyproject.toml $(VENV)/installed

@@ -36,8 +36,8 @@ GREEN = "#009E73"  # of the same palette as BLUE and ORANGE
 
 
 def first_map() -> None:
-    """Draw the maps of `lusee-bayes map fiducial`."""
-    made = conditioned(lb.build(lb.load_scenario("fiducial")))
+    """Draw the maps of `lusee-bayes map`."""
+    made = conditioned(lb.build(lb.load_scenario("first_map")))
     channel_map(made.result(made.known())).savefig(HERE / "maps.png", dpi=110)
 
 

@@ -49,9 +49,13 @@ app = App(
 app.register_install_completion_command()
 
 
+# mapped where no scenario is named
+FIRST_MAP = "first_map"
+
+
 @app.command(name="map")
 def map_command(
-    scenario: str,
+    scenario: str | None = None,
     *,
     truth: Flag = False,
     draws: Number | None = None,
@@ -70,6 +74,7 @@ def map_command(
 
     **Examples**
 
+    - ``lusee-bayes map``
     - ``lusee-bayes map fiducial --set frequency_mhz=10 -o output/ten``
     - ``lusee-bayes map fiducial --data data.nc -o output/measured``
     - ``lusee-bayes map fiducial --data waterfall.fits --set beam.file=beam.fits``
@@ -81,17 +86,18 @@ def map_command(
     Parameters
     ----------
     scenario
-        A YAML file, or the name of a scenario of the package (fiducial, ...).
+        A YAML file, or the name of a scenario of the package (default: first_map).
     truth
-        The given data are of the scenario's own sky: compare the map with it.
+        Compare the map with the scenario's sky: for data that were simulated from it.
     draws
         Number of posterior draws to keep in posterior.nc (output.draws).
     covariance
         Keep the posterior covariance in posterior.nc (output.covariance).
     information
-        Keep in posterior.nc what the data say of the sky, for --add (output.information).
+        Keep the information of the data about the sky in posterior.nc, for --add
+        (output.information).
     add
-        Folder of a run with --information: the data are added to those behind it.
+        Folder of a run with --information: combine its data with these.
     diagnose
         Judge every group of data, and try the usual mistakes (signs, exchanged ports, angles,
         clocks, ...), even if the data fit; where they do not, both is done anyway.
@@ -104,6 +110,9 @@ def map_command(
     from lusee_bayes.runs.cost import demand_of
     from lusee_bayes.runs.map_run import run_map
 
+    if scenario is None and options.data is not None:
+        raise InputError("--data needs the scenario of its instrument: lusee-bayes map SCENARIO")
+    scenario = scenario or FIRST_MAP
     kept = {"output__draws": draws, "output__covariance": covariance}
     kept["output__information"] = information
     loaded = options.load(scenario, frequencies_mhz=frequencies, joint=joint, **kept)
@@ -113,7 +122,8 @@ def map_command(
     with engine.open(demand_of(loaded)) if several else nullcontext() as opened:
         given = {"truth": truth, "earlier": add, "thorough": diagnose}
         run = run_map(loaded, options.folder(scenario), engine=opened, **given, **options.running())
-    options.tell(*run.result.lines(), f"look at {run.page}", files=run.files)
+    lines = run.result.lines(verbose=options.verbose)
+    options.tell(*lines, f"look at {run.page}", files=run.files)
 
 
 @app.command(name="simulate")

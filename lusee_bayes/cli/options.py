@@ -105,7 +105,7 @@ class Options:
     quiet
         Print nothing but errors.
     verbose
-        Print the memory in use after every stage.
+        Print the memory in use after every stage, details of the result, and its files.
     """
 
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None
@@ -119,9 +119,9 @@ class Options:
         return {"replace": self.force, "stages": stages}
 
     def tell(self, *lines: object, files: Sequence[Path] = (), table: Table | None = None) -> None:
-        """Print which files were written, a table, and what else there is to say."""
+        """Print the files with --verbose, a table, and what else there is to say."""
         console = Console(quiet=self.quiet, soft_wrap=True)
-        say(console, *(f"  {path}" for path in files))
+        say(console, *(f"  {path}" for path in files if self.verbose))
         if table is not None:
             show(console, table)
         say(console, *lines)

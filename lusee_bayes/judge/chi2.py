@@ -45,9 +45,14 @@ FALSE_ALARM = 1e-3
 # groups or channels that are named in a sentence
 NAMED = 4
 RULE = (
-    f"A test stands out if its p times the number of tests is below {FALSE_ALARM:g}: by chance "
-    f"once in {1.0 / FALSE_ALARM:.0f} reports"
+    f"A test is flagged if its Bonferroni-corrected p-value is below {FALSE_ALARM:g}: a false "
+    f"alarm in 1 of {1.0 / FALSE_ALARM:.0f} reports"
 )
+HEADLINES: dict[Level, str] = {
+    "consistent": "The map is consistent with the data, the noise and the prior.",
+    "unlike the prior": "Prior mismatch: the data fit, but the sky is implausible under the prior.",
+    "does not fit": "The data do not fit the model: do not trust the error bars.",
+}
 
 
 @dataclass(frozen=True)
@@ -82,8 +87,8 @@ class ChiSquare:
     def of_sky(self) -> str:
         """What the sky is where its prior's chi^2 stands out."""
         if self.too_small:
-            return "weaker, or closer to the prior's mean, than the prior expects"
-        return "not what the prior allows"
+            return "fainter, or closer to the prior's mean, than the prior assumes"
+        return "inconsistent with the prior"
 
     def words(self) -> str:
         """p, and chi^2 with what is expected of it."""
@@ -92,7 +97,7 @@ class ChiSquare:
     def found(self) -> str:
         """chi^2 with what is expected of it."""
         expected = f"{self.degrees:.0f} +- {np.sqrt(2.0 * self.degrees):.0f}"
-        return f"chi^2 {self.chi2:.0f}, expected {expected}"
+        return f"chi2 {self.chi2:.0f}, expected {expected}"
 
 
 @dataclass(frozen=True)
@@ -102,12 +107,22 @@ class Fit:
     Attributes
     ----------
     level : {"consistent", "unlike the prior", "does not fit"}
-    text : str
-        The verdict in sentences: what stands out, and what to do.
+    details : str
+        In sentences: what stands out, and what to do.
     """
 
     level: Level
-    text: str
+    details: str
+
+    @property
+    def headline(self) -> str:
+        """The verdict in one sentence."""
+        return HEADLINES[self.level]
+
+    @property
+    def text(self) -> str:
+        """The verdict with its details."""
+        return f"{self.headline} {self.details}"
 
 
 def two_sided(chi2: float, n: float | int) -> float:

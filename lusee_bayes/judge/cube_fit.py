@@ -130,13 +130,13 @@ class ChannelFits:
         contradiction = disagreement(self.shared)
         level = max((test.level for test in tests), key=LEVELS.index)
         level = "does not fit" if contradiction else level
-        quiet = "the data scatter less about what a sky explains than the noise would have them"
-        misfit = quiet if self._too_quiet() else "no sky explains the data of all channels"
+        quiet = "The data scatter less than the assumed noise"
+        misfit = quiet if self._too_quiet() else "No sky explains the data of all channels"
         verdicts = {
-            "consistent": "Consistent: instrument, noise and prior fit in all channels.",
-            "unlike the prior": "Unlike the prior: instrument and noise fit in all channels, "
+            "consistent": "Instrument, noise and prior fit in all channels.",
+            "unlike the prior": "Instrument and noise fit in all channels, "
             f"but the skies are {self.rest.of_sky}.",
-            "does not fit": f"Does not fit: {contradiction or f'{misfit}.'}",
+            "does not fit": contradiction or f"{misfit}.",
         }
         told = [verdicts[level]]
         for test in tests:
@@ -172,7 +172,7 @@ class ChannelFits:
             ]
         if level == "unlike the prior":
             return [
-                "Error bars may be too narrow where skies are stronger than the prior expects, and "
+                "Error bars may be too narrow where skies are brighter than the prior assumes, and "
                 "too wide elsewhere: choose another prior (lusee-bayes compare-priors)."
             ]
         return []

@@ -29,12 +29,12 @@ from lusee_bayes.linear.linear_gaussian import Solution
 
 # of a prior that the sky is unlike
 TOO_WIDE = (
-    "The prior is wider than the sky needs: where the sky is weaker than it expects, error bars "
-    "are too wide; a narrower prior would tell more (lusee-bayes compare-priors)."
+    "The prior is wider than the sky needs: error bars are too wide where the sky is fainter than "
+    "the prior assumes. Choose a narrower prior (lusee-bayes compare-priors)."
 )
 TOO_NARROW = (
-    "Where the sky is stronger than the prior expects, error bars are too narrow, and too wide "
-    "where it is weaker: choose another prior (lusee-bayes compare-priors)."
+    "Error bars are too narrow where the sky is brighter than the prior assumes, and too wide "
+    "where it is fainter. Choose another prior (lusee-bayes compare-priors)."
 )
 
 
@@ -144,17 +144,14 @@ class Residuals:
         level = self.level()
         instrument, prior = (part.words() for part in (self.split.instrument, self.split.prior))
         if level == "consistent":
-            told = f"instrument and noise fit ({instrument}), and so does the prior ({prior})."
-            return Fit(level, f"Consistent: {told}")
+            return Fit(level, f"Instrument and noise: {instrument}. Prior: {prior}.")
         if level == "unlike the prior":
-            fits, sky = f"instrument and noise fit ({instrument})", self.split.prior.of_sky
             advice = TOO_WIDE if self.split.prior.too_small else TOO_NARROW
-            told = [f"Unlike the prior: {fits}, but the sky is {sky} ({prior}).", strengths, advice]
-            return Fit(level, " ".join(filter(None, told)))
+            sky = f"The sky is {self.split.prior.of_sky} ({prior}); instrument and noise fit "
+            return Fit(level, " ".join(filter(None, [f"{sky}({instrument}).", strengths, advice])))
         small = self.split.instrument.too_small and not self.extremes()
-        why = "the noise is smaller than assumed" if small else "no sky explains these data"
-        told = f"Does not fit: {why} ({instrument}); do not trust the error bars."
-        return Fit(level, " ".join([told, *self._blame()]))
+        why = "The noise is smaller than assumed" if small else "No sky explains these data"
+        return Fit(level, " ".join([f"{why} ({instrument}).", *self._blame()]))
 
     def _blame(self) -> list[str]:
         """Which groups stand out, and what to leave out or to look at."""
@@ -166,18 +163,18 @@ class Residuals:
         parts, extremes, suspects = [], self.extremes(), self.suspects()
         if suspects and extremes:
             named = in_brief([f"{group} (p {probability(group.p)})" for group in extremes])
-            parts.append(f"Of {len(self.compared())} groups these stand out: {named}.")
+            parts.append(f"Of {len(self.compared())} groups, these are inconsistent: {named}.")
         for kind in KINDS:
             mine = [group for group in suspects if group.kind == kind]
             if len(mine) == 1:
                 p = probability(mine[0].others_p)
-                parts.append(f"The others fit without {mine[0]} (p {p}): leave it out.")
+                parts.append(f"The others fit without {mine[0]} (p {p}): exclude it.")
             elif mine:
                 any_one = f"any one of {len(mine)} {kind}s ({in_brief([one.name for one in mine])})"
-                parts.append(f"The others fit without {any_one}: the data do not tell which.")
+                parts.append(f"The others fit without {any_one}: the data cannot show which.")
         if not suspects:
             many = f"{len(extremes)} of {len(self.compared())} products, days and turntable angles"
-            parts.append(f"{many} stand out, and no single one is to blame.")
+            parts.append(f"{many} are inconsistent; excluding any one of them is not enough.")
         return parts
 
 

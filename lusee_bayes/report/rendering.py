@@ -9,6 +9,7 @@ how it was made: scenario, versions, times, memory.
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
@@ -21,9 +22,12 @@ from lusee_bayes.core.checks import counted
 from lusee_bayes.core.files import require_files
 from lusee_bayes.core.reading import read_text
 from lusee_bayes.core.version import __version__, printable
-from lusee_bayes.judge.chi2 import RULE, probability
+from lusee_bayes.judge.chi2 import HEADLINES, RULE, probability
 from lusee_bayes.judge.convergence import CRITERIA
 from lusee_bayes.results.finished_runs import Provenance, text_hash
+
+# words of a terminal, and what pages have in their place
+SYMBOLS = {r"\bchi(2\b|\^2)": "chi²", r"\+-": "±", r"\bell\b": "\N{SCRIPT SMALL L}"}
 
 
 def render(template: str, folder: Path, **context: Any) -> str:
@@ -93,15 +97,26 @@ def p_value(p: float, missing: str = "") -> str:
     return missing if p != p else probability(p).removeprefix("= ")
 
 
+def typeset(value: Any) -> Any:
+    """Text of the terminal as a page writes it: chi², ± and the script l."""
+    if not isinstance(value, str) or isinstance(value, Markup):
+        return value
+    for plain, symbol in SYMBOLS.items():
+        value = re.sub(plain, symbol, value)
+    return value
+
+
 ENVIRONMENT = Environment(
     loader=PackageLoader("lusee_bayes.report"),
+    finalize=typeset,
     autoescape=select_autoescape(),
     undefined=StrictUndefined,
     trim_blocks=True,
     lstrip_blocks=True,
 )
 ENVIRONMENT.filters |= {"number": formatted, "probability": p_value}
-ENVIRONMENT.globals |= {"asset": asset, "counted": counted, "RULE": RULE, "CRITERIA": CRITERIA}
+ENVIRONMENT.globals |= {"asset": asset, "counted": counted, "CRITERIA": CRITERIA}
+ENVIRONMENT.globals |= {"RULE": RULE, "HEADLINES": HEADLINES}
 
 
 def render_run(template: str, path: Path, run: Mapping[str, Any], **context: Any) -> str:

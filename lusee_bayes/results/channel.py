@@ -20,7 +20,7 @@ from lusee_bayes.core.trees import quantity
 from lusee_bayes.experiment.diagnosis import Diagnosis
 from lusee_bayes.experiment.unknowns import InstrumentPosterior, PointingReport, UnknownsReport
 from lusee_bayes.judge import measures
-from lusee_bayes.judge.chi2 import ChiSquare, Level
+from lusee_bayes.judge.chi2 import HEADLINES, ChiSquare, Fit, Level
 from lusee_bayes.judge.coverage import Coverage, latitudes
 from lusee_bayes.judge.residuals import Group
 from lusee_bayes.linear.information import Information
@@ -57,6 +57,11 @@ class Judged:
     predicted: OnGrid = quantity("K", "visibilities of the mean map")
     z: OnGrid = quantity("1", "data less their prediction by all others, in standard deviations")
     groups: tuple[Group, ...] = ()
+
+    @property
+    def fit(self) -> Fit:
+        """The verdict."""
+        return Fit(self.level, self.verdict.removeprefix(f"{HEADLINES[self.level]} "))
 
     def of_kind(self, kind: str) -> list[Group]:
         """The products, for example."""
@@ -324,7 +329,6 @@ class ChannelResult(ChannelData, Described):
         if self.resolution_deg is not None:
             parts.append(f"resolution {self.resolution_deg:.1f} deg")
         parts.append(f"chi2 {self.chi2:.0f} (expected {self.chi2_expected:.0f})")
-        parts.append(f"ln evidence {self.log_evidence:.1f}")
         return [*parts, f"{self.information_bits:.0f} bits"]
 
     def errors_by_latitude(self) -> tuple[SkyErrors, ...]:

@@ -243,10 +243,10 @@ class MapResult(Described):
     def fit(self) -> Fit:
         """Whether the data of all channels fit."""
         if self.single:
-            return Fit(self.channel.judged.level, self.channel.judged.verdict)
+            return self.channel.judged.fit
         found = self.fits().fit()
         blamed = [
-            f"{c.frequency_mhz:g} MHz: {c.judged.verdict}"
+            f"{c.frequency_mhz:g} MHz: {c.judged.fit.details}"
             for c in self.channels
             if c.judged is not None and c.judged.level == "does not fit"
         ]
@@ -286,9 +286,18 @@ class MapResult(Described):
             parts.append(f"{joint.iterations} iterations, {joint.refinement:.1g} sigma left")
         return ", ".join(parts)
 
-    def lines(self) -> list[str]:
-        """What a terminal shows: verdict and causes first, then prior, unknowns and figures."""
-        told = [self.verdict()]
+    def lines(self, *, verbose: bool = True) -> list[str]:
+        """What a terminal shows: remarks, and at the end the verdict and the main numbers.
+
+        Details of the verdict, its causes, prior and unknowns come first, where it is bad or
+        ``verbose`` asks for them.
+        """
+        details = self._details() if verbose or self.fit.level != "consistent" else []
+        remarks = *self.doubts(), *self.gaps(), *self._flags()
+        return [*details, *remarks, self.fit.headline, self.headline()]
+
+    def _details(self) -> list[str]:
+        told = [self.fit.details]
         for channel in self.channels:
             at = "" if self.single else f"{channel.frequency_mhz:g} MHz: "
             causes = [] if channel.diagnosis is None else channel.diagnosis.sentences()
@@ -298,7 +307,7 @@ class MapResult(Described):
             told += [f"{at}{line}" for line in (*causes, *prior, *fluxes, *offsets)]
         told += [] if self.joint is None else [joint_prior_sentence(self.scenario)]
         told += [] if self.unknowns is None else self.unknowns.lines()
-        return [*told, self.headline(), RULE, *self.doubts(), *self.gaps(), *self._flags()]
+        return [*told, f"{RULE}."]
 
     def _flags(self) -> list[str]:
         """How much of flight data was flagged, and what is doubtful about them."""

@@ -130,13 +130,13 @@ def test_groups_and_single_data_by_hand(overrides, flags):
     predicted = np.asarray(model.predict(model.condition(data.data).posterior.mean))
     np.testing.assert_allclose(found.predicted, predicted, rtol=0, atol=1e-6 * predicted.max())
     assert found.fit().level == "consistent" and found.suspects() == []
-    assert found.fit().text.startswith("Consistent: instrument and noise fit (p ")
+    assert "consistent" in found.fit().headline and "(p " not in found.fit().headline
 
 
 @pytest.mark.parametrize(
     ("width", "said", "not_said"),
-    [(10.0, "error bars are too wide; a narrower prior", "what the prior allows"),
-     (0.1, "stronger than the prior expects, error bars are too narrow", "narrower prior")],
+    [(10.0, "narrower prior", "too narrow"),
+     (0.1, "too narrow", "narrower prior")],
 )  # fmt: skip
 def test_a_prior_that_is_too_wide_is_told_from_one_that_is_too_narrow(width, said, not_said):
     """The same data, under a prior ten times as wide as the sky's, and as narrow."""
@@ -187,7 +187,7 @@ def test_what_is_wrong_is_pointed_at(kind, name):
     found = judged(model, bad)
     assert found.fit().level == "does not fit"
     assert (kind, name) in [(group.kind, group.name) for group in found.suspects()]
-    for words in (f"{kind} {name}", "The others fit without", "leave it out"):
+    for words in (f"{kind} {name}", "The others fit without"):
         assert words in found.fit().text
     # and no other of its kind
     assert len(found.suspects()) == len({group.kind for group in found.suspects()})
@@ -200,7 +200,7 @@ def test_what_no_group_explains():
     noise = 3.0 * np.sqrt(float(model.noise.diagonal().mean()))
     found = judged(model, corrupted(data, slice(None), noise * rng.standard_normal((16, 24))))
     assert found.suspects() == []
-    assert "no single one is to blame" in found.fit().text
+    assert "any one of them is not enough" in found.fit().text
 
 
 # --- chi^2 in two parts ---------------------------------------------------------------------------
@@ -344,8 +344,8 @@ def test_one_rate_for_all_tests_of_a_report():
 def test_what_was_found_is_told_with_what_was_expected():
     part = ChiSquare(130.0, 98.0)
     assert part.p == pytest.approx(2 * stats.chi2.sf(130.0, 98.0))
-    assert part.words() == f"p = {part.p:.2g}, chi^2 130, expected 98 +- 14"
-    assert ChiSquare(1e9, 98.0).words().startswith("p < 1e-300, chi^2 1000000000")
+    assert part.words() == f"p = {part.p:.2g}, chi2 130, expected 98 +- 14"
+    assert ChiSquare(1e9, 98.0).words().startswith("p < 1e-300, chi2 1000000000")
 
 
 # --- score tests of templates ---------------------------------------------------------------------

@@ -134,7 +134,7 @@ def test_groups_of_a_channel_are_judged_where_it_does_not_fit(found):
 def test_they_are_named_wherever_the_verdict_is(found):
     result, summary = found.result, FinishedRun.read(found.folder).summary
     assert result.fit.level == summary.level == "does not fit"
-    assert f"25 MHz: {result.channels[1].judged.verdict}" in result.verdict()
+    assert f"25 MHz: {result.channels[1].judged.fit.details}" in result.verdict()
     assert summary.verdict == result.verdict()
     assert summary.channels[1].judged.suspects == list(result.channels[1].judged.suspects)
     assert summary.channels[0].judged is None
