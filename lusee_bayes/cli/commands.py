@@ -1,12 +1,14 @@
-"""The commands: each parses its options, calls a run and prints what it has found.
+"""The commands: each parses its options, calls a run and prints its results.
 
-What a command runs is imported when it is called, so that ``--help`` and completion answer at once.
-The docstrings are the help: what Markdown (the terminal) and reST (the site) both read.
+A command imports its run only when called, so that ``--help`` and completion respond immediately.
+The docstrings are the help text, in the subset that Markdown (terminal) and reST (site) share.
 """
 
 from __future__ import annotations
 
+import json
 from contextlib import nullcontext
+from itertools import takewhile
 from pathlib import Path
 from typing import Annotated
 
@@ -37,23 +39,23 @@ app = App(
     name="lusee-bayes",
     version=release,
     suppress_keyboard_interrupt=False,
-    # [ begins a file's name like any other character
+    # a file name may begin with [
     default_parameter=Parameter(json_list=False, json_dict=False),
     help=(
         "Bayesian maps of the low-frequency sky from LuSEE-Night's visibilities.\n\n"
-        "Exit codes: 0 success, 1 a validation failed, or workers, memory or disk gave out, 2 bad "
-        "input (one sentence on standard error), 130 interrupted, 143 terminated. lusee-bayes "
-        "COMMAND --help shows examples."
+        "Exit codes: 0 success; 1 a validation failed, workers were lost, or memory or disk ran "
+        "out; 2 bad input (one sentence on standard error); 130 interrupted; 143 terminated. For "
+        "examples, see lusee-bayes COMMAND --help."
     ),
 )
 app.register_install_completion_command()
 
 
-# mapped where no scenario is named
+# the scenario that map uses by default
 FIRST_MAP = "first_map"
 
 
-@app.command(name="map")
+@app.command(name="map", group="Maps")
 def map_command(
     scenario: str | None = None,
     *,
@@ -68,9 +70,9 @@ def map_command(
     options: DataOptions = DataOptions(),
     engine: EngineOptions = EngineOptions(),
 ) -> None:
-    """Make a posterior map of a scenario, or of given data.
+    """Compute a posterior map of the sky from simulated or given data.
 
-    The results are in output/NAME, unless --output names another folder.
+    Results go to output/NAME, or to the folder given by --output.
 
     **Examples**
 
@@ -86,26 +88,26 @@ def map_command(
     Parameters
     ----------
     scenario
-        A YAML file, or the name of a scenario of the package (default: first_map).
+        YAML file, or name of a built-in scenario (default: first_map).
     truth
-        Compare the map with the scenario's sky: for data that were simulated from it.
+        Compare the map with the scenario's sky (use if the data were simulated from it).
     draws
-        Number of posterior draws to keep in posterior.nc (output.draws).
+        Number of posterior draws to store in posterior.nc (output.draws).
     covariance
-        Keep the posterior covariance in posterior.nc (output.covariance).
+        Store the posterior covariance in posterior.nc (output.covariance).
     information
-        Keep the information of the data about the sky in posterior.nc, for --add
+        Store the data's information about the sky in posterior.nc, for a later --add
         (output.information).
     add
-        Folder of a run with --information: combine its data with these.
+        Folder of a run made with --information: add the new data to that run.
     diagnose
-        Judge every group of data, and try the usual mistakes (signs, exchanged ports, angles,
-        clocks, ...), even if the data fit; where they do not, both is done anyway.
+        Test every group of data and try the usual mistakes (signs, swapped ports, angles, clocks,
+        ...), even if the data fit. If they do not fit, this is done automatically.
     frequencies
-        Channels in MHz, as 10,25,30 or as first:last:step: a map of each, on its own. The same
-        command continues an interrupted run.
+        Channels in MHz, as 10,25,30 or first:last:step, mapped independently. To resume an
+        interrupted run, repeat the command.
     joint
-        One posterior for the skies of all channels, with the scenario's spectral prior.
+        Fit one posterior to all channels, using the scenario's spectral prior.
     """
     from lusee_bayes.runs.cost import demand_of
     from lusee_bayes.runs.map_run import run_map
@@ -118,7 +120,7 @@ def map_command(
     loaded = options.load(scenario, frequencies_mhz=frequencies, joint=joint, **kept)
     several = bool(loaded.frequencies_mhz)
     if not several and engine != EngineOptions():
-        raise InputError("--workers and --cluster share out channels; give --frequencies")
+        raise InputError("--workers and --cluster distribute channels; give --frequencies")
     with engine.open(demand_of(loaded)) if several else nullcontext() as opened:
         given = {"truth": truth, "earlier": add, "thorough": diagnose}
         run = run_map(loaded, options.folder(scenario), engine=opened, **given, **options.running())
@@ -126,7 +128,7 @@ def map_command(
     options.tell(*lines, f"look at {run.page}", files=run.files)
 
 
-@app.command(name="simulate")
+@app.command(name="simulate", group="Data")
 def simulate_command(
     scenario: str,
     *,
@@ -134,10 +136,10 @@ def simulate_command(
     flight: Flag = False,
     options: ScenarioOptions = ScenarioOptions(),
 ) -> None:
-    """Simulate the visibilities of a scenario.
+    """Simulate visibilities for a scenario.
 
-    They are in data.nc, unless --output names another file: netCDF, or luseepy's waterfall if the
-    name ends in .fits. Sessions are in the folder flight, or in that of --output.
+    Results go to data.nc, or to the file given by --output: netCDF, or a luseepy waterfall if the
+    name ends in .fits. With --flight, sessions go to the folder flight, or to --output.
 
     **Examples**
 
@@ -147,12 +149,12 @@ def simulate_command(
     Parameters
     ----------
     scenario
-        A YAML file, or the name of a scenario of the package (fiducial, ...).
+        YAML file, or name of a built-in scenario (fiducial, ...).
     frequencies
-        Channels of a waterfall in MHz, as 10,25,30 or as first:last:step; the noise of each has a
-        seed of its own, one more than that of the channel before.
+        Channels of a waterfall in MHz, as 10,25,30 or first:last:step. The noise seed increases by
+        one from channel to channel.
     flight
-        Write sessions of the spectrometer, as they come from the lander (flight.simulated).
+        Write spectrometer sessions as the lander delivers them (flight.simulated).
     """
     from lusee_bayes.runs.data_run import run_simulate, run_simulate_flight
 
@@ -169,7 +171,7 @@ def simulate_command(
     )
 
 
-@app.command(name="reduce")
+@app.command(name="reduce", group="Data")
 def reduce_command(
     scenario: str,
     files: Annotated[list[Path], Parameter(required=True)],
@@ -179,11 +181,11 @@ def reduce_command(
     clock: str | None = None,
     options: ScenarioOptions = ScenarioOptions(),
 ) -> None:
-    """Calibrate, flag and average sessions of the spectrometer.
+    """Calibrate, flag and average spectrometer sessions.
 
-    What the files leave open (gain table, bin origin, what the times are, a clock) is said by the
-    scenario. map does the same with --data SESSION..., for its own frequencies. The bands are in
-    reduced.nc, unless --output names another file, for map --data.
+    The scenario supplies what the files lack: gain table, bin origin, meaning of the times, clock.
+    map --data SESSION... reduces sessions in the same way, for its own frequencies. Bands go to
+    reduced.nc, or to the file given by --output; pass that file to map --data.
 
     **Examples**
 
@@ -193,14 +195,14 @@ def reduce_command(
     Parameters
     ----------
     scenario
-        A YAML file, or the name of a scenario of the package, with a section flight.
+        YAML file, or name of a built-in scenario, with a section flight.
     files
-        Sessions that luseepy has written, HDF5 or FITS, in any order.
+        Sessions written by luseepy, HDF5 or FITS, in any order.
     frequencies
-        Middles of the bands in MHz, as 10,25,30 or as first:last:step.
+        Band centres in MHz, as 10,25,30 or first:last:step.
     clock
-        Clock reference in JSON, for sessions with no absolute time, or to correct the UTC that they
-        state (flight.clock).
+        Clock reference (JSON), for sessions with no absolute time or to correct their UTC
+        (flight.clock).
     """
     from lusee_bayes.core.checks import counted
     from lusee_bayes.runs.data_run import reduced_lines, run_reduce
@@ -212,7 +214,7 @@ def reduce_command(
     options.tell(*reduced_lines(reduced), f"{bands} -> {path}")
 
 
-@app.command(name="average")
+@app.command(name="average", group="Data")
 def average_command(
     data: Path,
     *,
@@ -221,11 +223,10 @@ def average_command(
     no_information: Flag = False,
     options: ScenarioOptions = ScenarioOptions(),
 ) -> None:
-    """Average data over longer times, and say what that costs.
+    """Average data over longer times and report the information lost.
 
-    Data then need less memory and time to map. The cost is information about the map, in bits, by
-    the forecast that plan makes. The averages are in averaged.nc, unless --output names another
-    file.
+    Averaged data need less memory and time to map. The loss of information about the map, in bits,
+    is forecast as in plan. Averages go to averaged.nc, or to the file given by --output.
 
     **Examples**
 
@@ -235,14 +236,14 @@ def average_command(
     Parameters
     ----------
     data
-        Visibilities whose samples have windows; of a waterfall the scenario's frequency is taken.
+        Visibilities whose samples have windows. From a waterfall, the scenario's frequency is used.
     to
-        Length of the averages: 30s, 10min, 2h, 1d.
+        Averaging time: 30s, 10min, 2h, 1d.
     scenario
-        Instrument, noise and prior for the information that is lost: a YAML file, or the name of a
-        scenario of the package.
+        Scenario with the instrument, noise and prior used to compute the loss: YAML file, or name
+        of a built-in scenario.
     no_information
-        Leave out the information, which takes the memory and the time of two maps.
+        Skip the information loss, which takes the memory and time of two maps.
     """
     from lusee_bayes.runs.data_run import run_average
 
@@ -252,7 +253,7 @@ def average_command(
     options.tell(*run.lines(), f"{run.averaged.layout.size} visibilities -> {path}")
 
 
-@app.command(name="sample")
+@app.command(name="sample", group="Maps")
 def sample_command(
     scenario: str,
     *,
@@ -262,10 +263,10 @@ def sample_command(
     options: DataOptions = DataOptions(),
     chains: ChainOptions = ChainOptions(),
 ) -> None:
-    """Sample the posterior of a NumPyro program by Hamiltonian Monte Carlo.
+    """Sample the posterior of a NumPyro program with Hamiltonian Monte Carlo.
 
-    Draws are written during the run: after an interruption, --resume continues it. The results are
-    in output/NAME-PROGRAM, unless --output names another folder.
+    Draws are written during the run; --resume continues an interrupted run. Results go to
+    output/NAME-PROGRAM, or to the folder given by --output.
 
     **Examples**
 
@@ -276,17 +277,17 @@ def sample_command(
     Parameters
     ----------
     scenario
-        A YAML file, or the name of a scenario of the package (fiducial, ...).
+        YAML file, or name of a built-in scenario (fiducial, ...).
     model
-        The program: a Python file with a function model, or one of the package by its name (sky,
-        sky_marginal, gains, instrument, ...). By default systematics, where the scenario says that
-        something is to be sampled, else sky.
+        Program: a Python file with a function model, or the name of a built-in program (sky,
+        sky_marginal, gains, instrument, ...). Default: systematics if the scenario samples
+        anything, else sky.
     algorithm
-        nuts, the No-U-Turn Sampler; hmc, Hamiltonian Monte Carlo with trajectories of fixed length;
-        or crank-nicolson, without gradients, the default where rounds have found what is sampled.
+        nuts (No-U-Turn Sampler), hmc (trajectories of fixed length) or crank-nicolson (no
+        gradients; the default if the sampled parameters were first estimated iteratively).
     frequencies
-        Channels in MHz, as 10,25,30 or as first:last:step, one after the other: each in a folder of
-        its own, and their maps together in cubes. With --resume, finished ones are taken over.
+        Channels in MHz, as 10,25,30 or first:last:step, sampled one after another. Each channel has
+        its own folder; cubes combine the maps. --resume keeps finished channels.
     """
     from lusee_bayes.runs.sample_run import default_program, run_sample
     from lusee_bayes.sampling.programs import load_program
@@ -302,7 +303,7 @@ def sample_command(
     options.tell(*lines, f"look at {there}", files=run.files)
 
 
-@app.command(name="validate")
+@app.command(name="validate", group="Maps")
 def validate_command(
     scenario: str,
     *,
@@ -311,10 +312,10 @@ def validate_command(
     chains: ChainOptions = ChainOptions(),
     engine: EngineOptions = EngineOptions(),
 ) -> int:
-    """Check the posterior of a scenario by HMC and by simulated data sets.
+    """Check the posterior of a scenario with HMC and simulated data sets.
 
-    Ends with exit code 1 if a check fails; the thresholds are in validation.md. The results are in
-    output/NAME-validation, unless --output names another folder.
+    The exit code is 1 if a check fails; validation.md lists the thresholds. Results go to
+    output/NAME-validation, or to the folder given by --output.
 
     **Examples**
 
@@ -323,9 +324,9 @@ def validate_command(
     Parameters
     ----------
     scenario
-        A YAML file, or the name of a scenario of the package (fiducial, ...).
+        YAML file, or name of a built-in scenario (fiducial, ...).
     simulations
-        Data sets for simulation-based calibration.
+        Number of data sets for simulation-based calibration.
     """
     from lusee_bayes.sampling.least import require_draws, require_simulations
 
@@ -344,7 +345,7 @@ def validate_command(
     return 0 if run.result.passed else 1
 
 
-@app.command(name="plan")
+@app.command(name="plan", group="Maps")
 def plan_command(
     scenario: str,
     *others: str,
@@ -352,10 +353,10 @@ def plan_command(
     options: ScenarioOptions = ScenarioOptions(),
     engine: EngineOptions = EngineOptions(),
 ) -> None:
-    """Forecast the information in observations, without data.
+    """Forecast the information content of observations, without data.
 
-    That is information, modes with SNR > 1 and ell_cross. Table and figure are in output/plan,
-    unless --output names another folder.
+    Reports bits of information, the number of modes with SNR > 1, and ell_cross, the first ell with
+    SNR < 1. Table and figure go to output/plan, or to the folder given by --output.
 
     **Examples**
 
@@ -365,12 +366,12 @@ def plan_command(
     Parameters
     ----------
     scenario
-        A YAML file, or the name of a scenario of the package (fiducial, ...).
+        YAML file, or name of a built-in scenario (fiducial, ...).
     others
-        More scenarios; each is planned with all variations.
+        More scenarios; every variation is applied to each.
     vary
-        key.path=value,value,...; an entry of the scenario and the values to try, as often as
-        needed, instead of turntable, duration, nights, duty cycle and lost antennas.
+        key.path=value,value,...: a key and the values to try; may be repeated. Default: vary
+        turntable, duration, nights, duty cycle and lost antennas.
     """
     from lusee_bayes.cli.tables import forecast_table
     from lusee_bayes.results.forecast import forecast_lines
@@ -388,12 +389,12 @@ def plan_command(
     options.tell(*lines, f"look at {run.folder}/figures/plan.png", files=run.files)
 
 
-@app.command(name="compare")
+@app.command(name="compare", group="Results")
 def compare_command(*folders: Path, options: Options = Options()) -> None:
-    """Set finished map runs side by side: maps, spectra, evidence.
+    """Compare finished map runs: maps, spectra, evidence.
 
-    comparison.html, comparison.csv and the figures are in output/comparison, unless --output names
-    another folder.
+    comparison.html, comparison.csv and the figures go to output/comparison, or to the folder given
+    by --output.
 
     **Examples**
 
@@ -402,7 +403,7 @@ def compare_command(*folders: Path, options: Options = Options()) -> None:
     Parameters
     ----------
     folders
-        Results of map, two or more.
+        Two or more result folders of map.
     """
     from lusee_bayes.cli.tables import comparison_table
     from lusee_bayes.results.finished_runs import evidence_caveat
@@ -413,7 +414,7 @@ def compare_command(*folders: Path, options: Options = Options()) -> None:
     options.tell(*lines, files=run.files, table=comparison_table(run.result))
 
 
-@app.command(name="compare-priors")
+@app.command(name="compare-priors", group="Maps")
 def compare_priors_command(
     scenario: str,
     *,
@@ -422,9 +423,9 @@ def compare_priors_command(
     options: DataOptions = DataOptions(),
     engine: EngineOptions = EngineOptions(),
 ) -> None:
-    """Map one data set under several priors, and say which of them it prefers.
+    """Map one data set under several priors and report which one the data prefer.
 
-    The results are in output/NAME-priors, unless --output names another folder.
+    Results go to output/NAME-priors, or to the folder given by --output.
 
     **Examples**
 
@@ -434,13 +435,14 @@ def compare_priors_command(
     Parameters
     ----------
     scenario
-        A YAML file, or the name of a scenario of the package (fiducial, ...).
+        YAML file, or name of a built-in scenario (fiducial, ...).
     truth
-        The given data are of the scenario's own sky: count how often error bars hold it.
+        Compute how often error bars cover the scenario's sky (use if the data were simulated from
+        it).
     priors
-        Two or more, with commas: isotropic, isotropic-sky (C_ell of the scenario's sky; simulated
-        data only), local_scales. By default all that can be. The scenario's
-        own section counts for the prior of its kind.
+        Two or more, separated by commas: isotropic, isotropic-sky (C_ell of the scenario's sky;
+        simulated data only), local_scales. Default: all that apply. The scenario's prior section
+        sets the prior of its kind.
     """
     from lusee_bayes.cli.tables import table_of_numbers
     from lusee_bayes.runs.compare_run import run_compare_priors
@@ -456,9 +458,9 @@ def compare_priors_command(
     options.tell(*lines, files=run.files, table=table_of_numbers(*run.result.table()))
 
 
-@app.command(name="report")
+@app.command(name="report", group="Results")
 def report_command(folder: Path, *, quiet: Quiet = False) -> None:
-    """Write report.html again from the results in the folder of a run.
+    """Rebuild report.html from the results in a run folder.
 
     **Examples**
 
@@ -467,20 +469,20 @@ def report_command(folder: Path, *, quiet: Quiet = False) -> None:
     Parameters
     ----------
     folder
-        Results of map, sample or validate.
+        Results of map, sample, validate or compare-priors.
     quiet
-        Print nothing but errors.
+        Print only errors.
     """
     from lusee_bayes.report.pages import write_report
 
     say(Console(quiet=quiet, soft_wrap=True), f"look at {write_report(folder)}")
 
 
-@app.command(name="info")
+@app.command(name="info", group="Data")
 def info_command(files: Annotated[list[Path], Parameter(required=True)], /) -> int:
-    """Describe the contents of files, or of runs' folders.
+    """Describe the contents of files or run folders.
 
-    That is visibilities, sessions, a posterior, samples, a sky, beams.
+    Reads visibilities, sessions, posteriors, samples, skies and beams.
 
     **Examples**
 
@@ -492,7 +494,7 @@ def info_command(files: Annotated[list[Path], Parameter(required=True)], /) -> i
     Parameters
     ----------
     files
-        One or several; one that cannot be read is named, and the others are shown.
+        One or more files or folders. Unreadable ones are named; the others are still described.
     """
     from lusee_bayes.report.describe import describe
 
@@ -505,14 +507,14 @@ def info_command(files: Annotated[list[Path], Parameter(required=True)], /) -> i
             say(errors, f"lusee-bayes: {error}")
             refused += 1
         else:
-            # a part for each
+            # one block per file
             say(console, f"\n{told}" if number else told)
     return 2 if refused else 0
 
 
-@app.command(name="keys")
-def keys_command(key: str = "", *, markdown: Flag = False) -> None:
-    """List the keys of a scenario: meaning, unit, choices, default.
+@app.command(name="keys", group="Scenarios")
+def keys_command(key: str = "", *, markdown: Flag = False, schema: Flag = False) -> None:
+    """List every setting of a scenario, with its meaning, unit, choices and default.
 
     **Examples**
 
@@ -522,29 +524,78 @@ def keys_command(key: str = "", *, markdown: Flag = False) -> None:
     Parameters
     ----------
     key
-        A key, or a section (noise, noise.gain, ...): list only what is in it.
+        List only this key or section (noise, noise.gain, ...).
     markdown
-        Write a table of Markdown.
+        Print a Markdown table.
+    schema
+        Print the JSON schema of a scenario, with which editors complete and check YAML.
     """
     from lusee_bayes.experiment.keys import keys_as_markdown, scenario_keys
+    from lusee_bayes.experiment.scenario import Scenario
 
+    if schema:
+        print(json.dumps(Scenario.model_json_schema(), indent=1))
+        return
     keys = scenario_keys(key)
     lines = [keys_as_markdown(keys).rstrip()] if markdown else map(str, keys)
     say(Console(soft_wrap=True), *lines)
 
 
-@app.command(name="paper")
+@app.command(name="scenarios", group="Scenarios")
+def scenarios_command() -> None:
+    """List the scenarios of the package.
+
+    **Examples**
+
+    - ``lusee-bayes scenarios``
+    """
+    from lusee_bayes.experiment.scenario import scenario_names, scenario_text
+
+    for name in scenario_names():
+        comment = takewhile(lambda line: line.startswith("#"), scenario_text(name).splitlines())
+        say(Console(soft_wrap=True), f"{name}: {' '.join(line.lstrip('# ') for line in comment)}")
+
+
+@app.command(name="init", group="Scenarios")
+def init_command(file: Path, *, like: str = FIRST_MAP, force: Flag = False) -> None:
+    """Write a scenario with comments, to be changed.
+
+    **Examples**
+
+    - ``lusee-bayes init mine.yaml``
+    - ``lusee-bayes init mine.yaml --like fiducial``
+
+    Parameters
+    ----------
+    file
+        The YAML file to write.
+    like
+        The scenario of the package to begin with.
+    force
+        Replace the file if it exists.
+    """
+    from lusee_bayes.core.files import user_path
+    from lusee_bayes.experiment.scenario import scenario_text
+
+    path, text = user_path(file), scenario_text(like)
+    if path.exists() and not force:
+        raise InputError(f"{path} exists; give another name, or --force to replace it")
+    path.write_text(f"{text}# lusee-bayes keys lists every setting\n", encoding="utf-8")
+    say(Console(soft_wrap=True), f"{path}; map it: lusee-bayes map {path}")
+
+
+@app.command(name="paper", group="Results")
 def paper_command(
     *,
     sky: Annotated[tuple[Path, ...], Many] = (),
     options: Options = Options(),
     engine: EngineOptions = EngineOptions(),
 ) -> None:
-    """Reproduce the figures of the reference paper and judge its claims.
+    """Reproduce the figures of the reference paper and check its claims.
 
-    Cases that were computed before with the same scenario and version are kept, so that an
-    interrupted run continues where it stopped. Cases, figures and tables are in output/paper,
-    unless --output names another folder.
+    Finished cases with the same scenario and version are reused, so an interrupted run resumes
+    where it stopped. Cases, figures and tables go to output/paper, or to the folder given by
+    --output.
 
     **Examples**
 
@@ -554,9 +605,8 @@ def paper_command(
     Parameters
     ----------
     sky
-        ULSA HDF5 files with the frequency in their names, as exp10.0MHz_sky.hdf5; each case scales
-        the one nearest in log frequency.
-        Without them the embedded sky is used.
+        ULSA HDF5 files with the frequency in their names, such as exp10.0MHz_sky.hdf5; each case
+        scales the file nearest in log frequency. Default: the embedded sky.
     """
     from lusee_bayes.paper.cases import paper_scenarios
     from lusee_bayes.runs.cost import demand_of

@@ -1,7 +1,7 @@
 """The command line: parsing, error messages and exit codes. The work is in ``runs``.
 
-Exit codes: 0 success, 1 a validation failed, or workers, memory or disk gave out, 2 bad input (one
-sentence on standard error), 130 interrupted, 143 terminated.
+Exit codes: 0 success; 1 a validation failed, workers were lost, or memory or disk ran out; 2 bad
+input (one sentence on standard error); 130 interrupted; 143 terminated.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from lusee_bayes.cli.options import say
 from lusee_bayes.core.errors import InputError, WorkersLost
 from lusee_bayes.core.version import COMMAND, printable
 
-# the beginning of a path in the user's folder, by itself or after the name of an option
+# the start of a path in the user's home folder, alone or after an option name
 HOME = re.compile(r"^(--[a-z-]+=)?(~.*)$", re.DOTALL)
 
-# beginnings of messages of RuntimeErrors for want of memory: of XLA, and of Python's threads
+# how out-of-memory RuntimeErrors begin: those of XLA, and of Python's threads
 NO_MEMORY = ("RESOURCE_EXHAUSTED", "can't start new thread")
 UNCHANGED = "results are complete or unchanged"
 
@@ -56,14 +56,14 @@ def _heeding_termination() -> Iterator[list[int]]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; returns the exit code."""
-    # imports and figures make objects by the million that stay: to search them for cycles again
-    # and again takes a fifth of their time
+    # imports and figures create millions of long-lived objects; searching them for cycles over and
+    # over takes a fifth of their time
     gc.set_threshold(100_000, 20, 100)
     given = sys.argv[1:] if arguments is None else arguments
-    # ~ within an option, as in --data=~/a.nc, is one that no shell has replaced
+    # the shell does not expand ~ within an option, as in --data=~/a.nc
     expanded = [HOME.sub(lambda own: (own[1] or "") + expanduser(own[2]), one) for one in given]
     for stream in (sys.stdout, sys.stderr):
-        # names of files may have bytes, and reports letters, that the terminal's encoding lacks
+        # file names and reports may contain bytes or letters that the terminal's encoding lacks
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     before = COMMAND.set(printable(shlex.join(["lusee-bayes", *given])))
@@ -78,13 +78,13 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _outcome(arguments: list[str], came: list[int]) -> tuple[int, str]:
-    """The exit code of a command, and why it has failed, if it has."""
+    """The exit code of a command, and the reason if it failed."""
     try:
         code = app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
     except (InputError, CycloptsError) as error:
         return 2, " ".join(str(error).split())
     except BrokenPipeError:
-        # whoever was to read the output has gone: head has its lines
+        # the reader closed the pipe, as head does when it has its lines
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1, ""
     except OSError as error:
@@ -103,8 +103,8 @@ def _outcome(arguments: list[str], came: list[int]) -> tuple[int, str]:
             "fewer times or fewer draws, or a machine with more memory"
         )
     except KeyboardInterrupt as interrupt:
-        # runs say what their folder holds
-        held = str(interrupt) or "nothing has been written"
+        # runs report the state of their folder
+        held = str(interrupt) or "nothing was written"
         how = "terminated" if came else "interrupted"
         return 128 + (came or [signal.SIGINT])[0], f"{how}; {held}"
     return code if isinstance(code, int) else 0, ""

@@ -1,4 +1,4 @@
-"""What commands share: options that mean the same everywhere, and how a command prints."""
+"""Options that mean the same in every command, and how a command prints."""
 
 from __future__ import annotations
 
@@ -24,34 +24,34 @@ if TYPE_CHECKING:
     from lusee_bayes.core.engine import Demand, Engine
     from lusee_bayes.experiment.scenario import Scenario
 
-# a number and its unit
+# a number with its unit
 DURATION = re.compile(r"\s*([0-9]*\.?[0-9]+(?:e[+-]?[0-9]+)?)\s*(s|min|h|d)\s*", re.ASCII)
 SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
-# channels of one run: far more than 25 kHz apart over the band
+# most channels of one run: more than one per 25 kHz over the band
 MOST_CHANNELS = 4096
 
 
 def whole(least: int, text: str) -> int:
-    """A whole number of at least ``least``: no fractions, no other digits. InputError if not."""
+    """A whole number of at least ``least``, in ASCII digits. InputError otherwise."""
     if not re.fullmatch("-?[0-9]{1,9}", text) or int(text) < least:
         raise InputError(f"expected a whole number from {least} to 999999999, got {text[:40]}")
     return int(text)
 
 
 def parse_duration(text: str) -> float:
-    """Seconds out of ``30s``, ``10min``, ``2h`` or ``1d``. InputError if it is none of these."""
+    """Seconds from ``30s``, ``10min``, ``2h`` or ``1d``. InputError otherwise."""
     found = DURATION.fullmatch(text)
     seconds = float(found[1]) * SECONDS[found[2]] if found else 0.0
     if not 0.0 < seconds < inf:
         raise InputError(
-            f"'{text[:40]}' is not a length of time; give a positive number and its unit, s, min, "
-            "h or d, as in 30s, 10min, 2h or 1d"
+            f"'{text[:40]}' is not a duration; give a positive number with its unit (s, min, h or "
+            "d), such as 30s, 10min, 2h or 1d"
         )
     return seconds
 
 
 def parse_frequencies(text: str) -> list[float]:
-    """MHz out of ``10,25,30`` or of ``first:last:step``, the last included.
+    """Frequencies in MHz from ``10,25,30`` or ``first:last:step``, the last included.
 
     InputError if it is neither.
     """
@@ -66,11 +66,11 @@ def parse_frequencies(text: str) -> list[float]:
                 found = [first + k * step for k in range(min(count, MOST_CHANNELS) + 1)]
     if count >= MOST_CHANNELS:
         raise InputError(
-            f"{text} is {count + 1} channels; at most {MOST_CHANNELS} are possible in one run"
+            f"{text} gives {count + 1} channels; one run allows at most {MOST_CHANNELS}"
         )
     if not found or any(b <= a for a, b in pairwise(found)):
         raise InputError(
-            f"expected growing MHz, as 10,25,30 or as 5:50:5 (first, last, step), got {text[:40]}"
+            f"expected increasing MHz, as 10,25,30 or 5:50:5 (first:last:step), got {text[:40]}"
         )
     return found
 
@@ -79,14 +79,14 @@ def _read_by(read: Callable[[str], Any]) -> Parameter:
     return Parameter(converter=lambda _, tokens: read(tokens[0].value), n_tokens=1, negative="")
 
 
-# so many of something: none of them is possible, or at least one
+# a number of items: zero allowed, or at least one
 Number = Annotated[int, _read_by(partial(whole, 0))]
 Count = Annotated[int, _read_by(partial(whole, 1))]
 Duration = Annotated[float, _read_by(parse_duration)]
 Frequencies = Annotated[list[float], _read_by(parse_frequencies)]
 Flag = Annotated[bool, Parameter(negative="")]
 Quiet = Annotated[bool, Parameter(name=["--quiet", "-q"], negative="")]
-# as often as needed; and one or many, or all that follow the option
+# an option that may be repeated; and one that takes all values that follow it
 Repeated = Parameter(negative="", show_default=False)
 Many = Parameter(consume_multiple=True, negative="", show_default=False)
 
@@ -94,18 +94,18 @@ Many = Parameter(consume_multiple=True, negative="", show_default=False)
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Options:
-    """What every command takes that writes results.
+    """Options of every command that writes results.
 
     Attributes
     ----------
     output
-        The folder of the results, or their file; the command says what it is by default.
+        Folder or file for the results; the help text above gives the default.
     force
-        Replace what is there already: a file, or results of another run in the folder.
+        Overwrite an existing file, or results of another run in the folder.
     quiet
-        Print nothing but errors.
+        Print only errors.
     verbose
-        Print the memory in use after every stage, details of the result, and its files.
+        Also print memory use after every stage, details of the result, and its files.
     """
 
     output: Annotated[Path | None, Parameter(name=["--output", "-o"])] = None
@@ -114,12 +114,12 @@ class Options:
     verbose: Annotated[bool, Parameter(name=["--verbose", "-v"], negative="")] = False
 
     def running(self) -> dict[str, Any]:
-        """What every run takes."""
+        """Arguments of every run."""
         stages = Stages(Console(quiet=self.quiet, soft_wrap=True), verbose=self.verbose)
         return {"replace": self.force, "stages": stages}
 
     def tell(self, *lines: object, files: Sequence[Path] = (), table: Table | None = None) -> None:
-        """Print the files with --verbose, a table, and what else there is to say."""
+        """Print the files with --verbose, the table and the lines."""
         console = Console(quiet=self.quiet, soft_wrap=True)
         say(console, *(f"  {path}" for path in files if self.verbose))
         if table is not None:
@@ -130,30 +130,30 @@ class Options:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class ScenarioOptions(Options):
-    """What commands take that read a scenario.
+    """Options of commands that read a scenario.
 
     Attributes
     ----------
     set_
-        key.path=value; overrides an entry of the scenario, as often as needed.
+        key.path=value: override a key of the scenario; may be repeated.
     """
 
     set_: Annotated[tuple[str, ...], Parameter(name="--set"), Repeated] = ()
 
     def load(self, source: str, **entries: object) -> Scenario:
-        """The scenario of the command, with ``--set`` and with what options say of it.
+        """The scenario of the command, with ``--set`` and the entries that options set.
 
         Parameters
         ----------
         source : str
             A YAML file or the name of a scenario.
         **entries
-            Values of entries, dots written as ``__``; those that are None or False are left alone.
+            Values of entries, dots written as ``__``; None and False leave an entry unchanged.
 
         Raises
         ------
         InputError
-            As :func:`.load_scenario`, and as :func:`.require_apart` if results are to be replaced.
+            As :func:`.load_scenario`, and as :func:`.require_apart` with --force.
         """
         from lusee_bayes.core.files import require_apart
         from lusee_bayes.experiment.scenario import load_scenario
@@ -168,23 +168,23 @@ class ScenarioOptions(Options):
         return load_scenario(source, [*self.set_, *given])
 
     def folder(self, source: str, suffix: str = "") -> Path:
-        """Where the results of a scenario go."""
+        """The folder for the results of a scenario."""
         return self.output or Path("output") / f"{Path(source).stem}{suffix}"
 
 
 @Parameter(name="*")
 @dataclass(frozen=True)
 class DataOptions(ScenarioOptions):
-    """What commands take that work on data.
+    """Options of commands that process data.
 
     Attributes
     ----------
     data
-        Visibilities to use, of a file of simulate or reduce, a waterfall of luseepy, or sessions of
-        its lusee.ingest, one or many; without them the scenario's own are simulated.
+        Data to use: a file written by simulate or reduce, a luseepy waterfall, or session files of
+        lusee.ingest. If omitted, data are simulated from the scenario.
     clock
-        Clock reference in JSON, for sessions with no absolute time, or to correct the UTC that they
-        state (flight.clock).
+        Clock reference (JSON), for sessions with no absolute time or to correct their UTC
+        (flight.clock).
     """
 
     data: Annotated[tuple[Path, ...] | None, Many] = None
@@ -195,29 +195,29 @@ class DataOptions(ScenarioOptions):
         return super().load(source, flight__clock=self.clock, **entries)
 
     def running(self) -> dict[str, Any]:
-        """What every run takes, and the data."""
+        """Arguments of every run, and the data."""
         return super().running() | {"data": self.data}
 
 
 @Parameter(name="*")
 @dataclass(frozen=True)
 class EngineOptions:
-    """What carries out the tasks of a run.
+    """Options for distributing the tasks of a run.
 
     Attributes
     ----------
     workers
-        Processes of this machine that share out the work; by default one.
+        Number of worker processes on this machine (default: 1).
     cluster
-        Address of a Dask scheduler, as tcp://host:8786, whose workers share out the work; by
-        default DASK_SCHEDULER_ADDRESS.
+        Address of a Dask scheduler whose workers do the work, such as tcp://host:8786 (default:
+        DASK_SCHEDULER_ADDRESS).
     """
 
     workers: Count | None = None
     cluster: str | None = None
 
     def open(self, demand: Demand) -> AbstractContextManager[Engine]:
-        """Start it for the block. InputError as :func:`.open_engine`."""
+        """Start the engine for the block. InputError as :func:`.open_engine`."""
         from lusee_bayes.core.engine import open_engine
 
         return open_engine(demand, self.workers, self.cluster)
@@ -229,18 +229,18 @@ Algorithm = Literal["nuts", "hmc", "crank-nicolson"]
 @Parameter(name="*")
 @dataclass(frozen=True)
 class ChainOptions:
-    """What commands take that sample.
+    """Options of commands that sample.
 
     Attributes
     ----------
     resume
-        Continue the unfinished run in the folder, or judge the finished one again.
+        Continue the unfinished run in the folder, or re-evaluate a finished one.
     chains
-        Chains side by side.
+        Number of chains, run in parallel.
     draws
-        Draws of each chain, after warmup.
+        Number of draws per chain, after warmup.
     warmup
-        Iterations in which the step size is found; they are not kept.
+        Number of iterations used to adapt the step size; they are discarded.
     """
 
     resume: Flag = False
@@ -249,7 +249,7 @@ class ChainOptions:
     warmup: Number = 150
 
     def running(self, seed: int, algorithm: Algorithm | None = None) -> dict[str, Any]:
-        """What every run takes that samples."""
+        """Arguments of every run that samples."""
         from lusee_bayes.sampling.hmc import Sampler
 
         sampler = Sampler(self.chains, self.warmup, self.draws, seed, algorithm)
@@ -257,11 +257,11 @@ class ChainOptions:
 
 
 def say(console: Console, *lines: object) -> None:
-    """Print lines as they are."""
+    """Print lines without markup."""
     for line in lines:
         console.print(str(line), highlight=False, markup=False)
 
 
 def show(console: Console, table: Table) -> None:
-    """Print a table within the width of the terminal: its cells are wrapped."""
+    """Print a table within the width of the terminal, with wrapped cells."""
     console.print(table, soft_wrap=False)

@@ -17,9 +17,9 @@ def forecast_table(forecasts: list[Forecast]) -> Table:
     """The forecasts of one scenario as a table for the terminal."""
     source = forecasts[0].variation.source
     text = Table(title=escape(source), title_justify="left", title_style="bold")
-    text.caption = "expected: modes with SNR > 1; ell, the first with SNR < 1; deg, resolution"
+    text.caption = "expected values; modes: SNR > 1; ell: first with SNR < 1; deg: resolution"
     text.add_column("variation", no_wrap=True)
-    for name in ("days", "data", "bits", "more", "modes", "ell", "deg"):
+    for name in ("days", "data", "bits", "+bits", "modes", "ell", "deg"):
         text.add_column(name, justify="right")
     family = ""
     for row, forecast in zip(forecast_rows(forecasts), forecasts, strict=True):
@@ -42,8 +42,8 @@ def forecast_table(forecasts: list[Forecast]) -> Table:
 
 
 def checks_table(checks: list[Check]) -> Table:
-    """The checks of a validation."""
-    table = Table("check", "value", "allowed", "", "what it is")
+    """The checks of a validation as a table."""
+    table = Table("check", "value", "allowed", "", "meaning")
     for check in checks:
         verdict = "ok" if check.passed else "FAILED"
         value, allowed = f"{check.value:.4g}", ValidationResult.allowed(check)
@@ -52,7 +52,7 @@ def checks_table(checks: list[Check]) -> Table:
 
 
 def table_of_numbers(header: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
-    """A column of names, and others of numbers."""
+    """A table with a column of names and columns of numbers."""
     table = Table()
     for number, name in enumerate(header):
         table.add_column(escape(name), justify="right" if number else "left", overflow="fold")
@@ -62,8 +62,8 @@ def table_of_numbers(header: Sequence[str], rows: Iterable[Sequence[str]]) -> Ta
 
 
 def comparison_table(runs: Sequence[FinishedRun]) -> Table:
-    """Finished runs side by side."""
-    header = "run", "MHz", "fit", "SNR<1 at ell", "bits", "ln evidence", "- best"
+    """A comparison of finished runs."""
+    header = "run", "MHz", "verdict", "SNR<1 at ell", "bits", "ln evidence", "- best"
     rows = [
         (
             run.name,

@@ -114,8 +114,7 @@ def require_finite(name: str, array: Any) -> None:
     bad = ~np.isfinite(np.asarray(array))
     if bad.any():
         raise InputError(
-            f"{name} holds NaN or infinity ({_first_offenders(bad)}); "
-            "flag missing samples instead of storing a value for them"
+            f"{name}: NaN or infinity ({_first_offenders(bad)}); flag missing samples instead"
         )
 
 
@@ -192,7 +191,7 @@ def require_symmetric(name: str, matrices: Any) -> None:
     if asymmetry > SYMMETRY_TOLERANCE * largest:
         raise InputError(
             f"{name} is not symmetric: entries differ by up to {asymmetry:.3g} from their mirror "
-            f"images (largest entry {largest:.3g}); give (N + N.T) / 2 if that is what you mean"
+            f"images (largest entry {largest:.3g}); use (N + N.T) / 2 to symmetrise it"
         )
 
 

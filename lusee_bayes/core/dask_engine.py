@@ -102,7 +102,7 @@ class DaskEngine(engine.Engine):
         that results are freed.
         """
         if self._folder is None:
-            raise RuntimeError("the engine is not told where to work: call work_in first")
+            raise RuntimeError("the engine has no folder: call work_in first")
         place, numbers = scratch_folder(self._folder), {}
         job = place / "job.pickle"
 
@@ -112,7 +112,7 @@ class DaskEngine(engine.Engine):
                 again = [tasks.names[numbers[k]] for k in said["processing-tasks"] if k in numbers]
                 if again:
                     ended = f"worker {said['worker']} ended"
-                    stages.say(f"  {ended}; given to others: {', '.join(again)}")
+                    stages.say(f"  {ended}; reassigned to others: {', '.join(again)}")
 
         def finished() -> Iterator[tuple[int, distributed.Future]]:
             waiting = distributed.as_completed(futures, loop=self.client.loop)
@@ -138,13 +138,12 @@ class DaskEngine(engine.Engine):
             number = numbers.get(str(error.task))
             what = "a sum" if number is None else tasks.names[number]
             raise WorkersLost(
-                f"{stage}, {what}: {error.allowed_failures + 1} workers ended while they worked on "
-                f"it, one after the other, the last of them {error.last_worker.address} (killed, "
-                "or out of memory)"
+                f"{stage}, {what}: {error.allowed_failures + 1} workers died on it in succession, "
+                f"the last at {error.last_worker.address} (killed, or out of memory)"
             ) from error
         except (CancelledError, NoWorkerError) as error:
             raise WorkersLost(
-                "the Dask scheduler is gone, has no workers, or has forgotten this run"
+                "the Dask scheduler has ended, has no workers, or has lost this run"
             ) from error
         finally:
             if self.client.status == "running":
@@ -204,15 +203,15 @@ def refusal_of(
         Dask gives the worker to an argument of this name.
     """
     if code_versions() != wanted:
-        return f"it has {code_versions()}, the command {wanted}; install the same on both"
+        return f"it has {code_versions()}, the command {wanted}; install the same versions on both"
     limit, n = dask_worker.memory_manager.memory_limit, dask_worker.state.nthreads
     if demand is not None and limit and demand.process_bytes(n) > limit:
         return (
-            f"it may take {gigabytes(limit)} of memory, and {n} task(s) at a time need about "
+            f"it is limited to {gigabytes(limit)} of memory, but {n} task(s) at a time need about "
             f"{gigabytes(demand.process_bytes(n))}; start it with a larger --memory-limit or fewer "
             "--nthreads"
         )
-    advice = "command and workers have to share a disk: give a folder on it with -o"
+    advice = "command and workers must share a disk: give a folder on it with -o"
     return None if folder.is_dir() else f"it does not see '{folder}'; {advice}"
 
 

@@ -286,7 +286,7 @@ def open_engine(
         as :class:`.DaskEngine`.
     """
     if workers is not None and cluster is not None:
-        raise InputError("--workers starts workers of its own, --cluster uses others; give one")
+        raise InputError("--workers starts local workers, --cluster uses existing ones; give one")
     if workers is None:
         cluster, workers = cluster or os.environ.get(SCHEDULER), 1
     if not cluster and workers == 1:

@@ -11,10 +11,10 @@ LONGEST = 1000
 
 
 class InputError(ValueError):
-    """Input that cannot be used. The message says what is wrong, where, and what to do.
+    """Invalid input. The message states what is wrong, where, and what to do.
 
-    It is one line, whatever it quotes: characters that cannot be printed are shown by their
-    escapes, and the middle of a long one is left out.
+    It is always one line: characters that cannot be printed are escaped, and the middle of a long
+    message is omitted.
     """
 
     def __init__(self, message: object):

@@ -60,7 +60,7 @@ def require_folder(folder: str | Path) -> None:
         tempfile.TemporaryFile(dir=place).close()
     except OSError as error:
         raise InputError(
-            f"nothing can be written into '{place}': {error.strerror}; give another folder"
+            f"cannot write into '{place}': {error.strerror}; give another folder"
         ) from error
 
 
@@ -108,12 +108,12 @@ def require_new(path: str | Path, *, replace: bool, inputs: Iterable[str | Path]
     if user_path(path).resolve() in [user_path(read).resolve() for read in inputs]:
         raise InputError(f"'{path}' is an input of this run; give another name with -o")
     if not replace and user_path(path).exists():
-        raise InputError(f"'{path}' is there already; give -o another name, or --force")
+        raise InputError(f"'{path}' exists already; give -o another name, or --force")
 
 
 def _require_name(path: Path) -> None:
     if "\0" in str(path) or not str(path):
-        raise InputError(f"'{path!s}' is no name of a file; give one without NUL characters")
+        raise InputError(f"'{path!s}' is not a valid file name; remove the NUL characters")
 
 
 def _is_there(path: Path) -> bool:
@@ -122,7 +122,7 @@ def _is_there(path: Path) -> bool:
         path.stat()
     except (FileNotFoundError, NotADirectoryError):
         if path.is_symlink():
-            raise InputError(f"'{path}' is a link that leads nowhere; remove it") from None
+            raise InputError(f"'{path}' is a broken link; remove it") from None
         return False
     except OSError as error:
         raise InputError(f"'{path}' cannot be used for the results: {error.strerror}") from error
@@ -154,7 +154,7 @@ def locked(folder: Path) -> Iterator[None]:
         with suppress(FileNotFoundError):
             owner = path.read_text(encoding="utf-8", errors="replace") or owner
         raise InputError(
-            f"another run works in '{folder}' ({owner}); wait for it, or give another folder"
+            f"another run uses '{folder}' ({owner}); wait for it to end, or give another folder"
         ) from error
     try:
         path.write_text(f"process {os.getpid()} on {socket.gethostname()}", encoding="utf-8")
@@ -209,8 +209,7 @@ def read_manifest(folder: Path) -> dict[str, Any] | None:
     except (ValidationError, OSError) as error:
         why = error.errors()[0]["msg"] if isinstance(error, ValidationError) else error.strerror
         raise InputError(
-            f"'{path}' cannot be read ({why}); delete it, and the next run replaces the files of "
-            "its own names"
+            f"'{path}' cannot be read ({why}); delete it: the next run then replaces its own files"
         ) from error
 
 
@@ -265,7 +264,7 @@ def transaction(
         files = sorted(str(p.relative_to(stage)) for p in stage.rglob("*") if p.is_file())
         for target in (folder / name for name in files):
             if target.is_dir():
-                raise InputError(f"'{target}' is a folder, and a file of the results has its name")
+                raise InputError(f"'{target}' is a folder, but a result file has the same name")
             require_folder(target.parent)
         said = _Manifest(kind=kind, files=files, discard=list(discard), origin=dict(origin or {}))
         (stage / MANIFEST).write_text(said.model_dump_json(indent=2) + "\n", encoding="utf-8")

@@ -64,7 +64,7 @@ def _probe(path: str, mtime_ns: int, size: int) -> None:
         _read_all(path, size)
     _, status = os.waitpid(child, 0)
     if os.WIFSIGNALED(status):
-        endless = f"does not come to an end with it within {LIMIT_S:g} s"
+        endless = f"does not finish reading it within {LIMIT_S:g} s"
         why = endless if os.WTERMSIG(status) == signal.SIGALRM else "fails on it"
         raise InputError(f"{path} is damaged: HDF5's library {why}")
 
@@ -257,7 +257,7 @@ def require_format(path: str | Path, format_: str, what: str, hint: str = "") ->
     found = format_of(path)
     if found != format_:
         raise InputError(
-            f"{path} is not a file of {what}: its format is '{found or 'absent'}', expected "
+            f"{path} does not contain {what}: its format is '{found or 'absent'}', expected "
             f"'{format_}'" + (f"; {hint}" if hint else "")
         )
     return path
@@ -378,7 +378,7 @@ def opened(path: str | Path, what: str = "FITS", hint: str = "") -> Iterator[fit
         except OSError as error:
             if "SIMPLE" not in str(error):
                 raise
-            raise InputError(f"{path} cannot be read as {what}: it is no FITS file") from error
+            raise InputError(f"{path} cannot be read as {what}: it is not a FITS file") from error
         with hdus:
             yield hdus
 

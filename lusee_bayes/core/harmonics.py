@@ -62,7 +62,7 @@ def lmax_of(n: int) -> int:
     """
     lmax = round(np.sqrt(n)) - 1
     if n < 1 or n_modes(lmax) != n:
-        raise InputError(f"{n} coefficients do not fill any lmax: expected a square number")
+        raise InputError(f"{n} coefficients do not match any lmax: expected a square number")
     return lmax
 
 
@@ -120,7 +120,7 @@ def map_to_modes(pixels: Float[np.ndarray, " pixels"], lmax: int) -> Float[np.nd
     nside = healpy.npix2nside(pixels.size)
     if lmax > 3 * nside - 1:
         raise InputError(
-            f"lmax = {lmax} is too large for a map of NSIDE {nside}, which holds lmax <= "
+            f"lmax = {lmax} is too large for a map of NSIDE {nside}, which supports lmax <= "
             f"{3 * nside - 1}; lower lmax or give a finer map"
         )
     return from_healpy(healpy.map2alm(pixels, lmax=lmax, iter=10))

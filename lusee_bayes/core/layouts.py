@@ -221,7 +221,7 @@ class Layout:
         n_bytes = sum(8 * int(np.prod(arrays[n].shape, dtype=object)) for n in here)
         if n_bytes > memory_limit():
             raise InputError(
-                f"{path} says that it holds {gigabytes(n_bytes)} of numbers; this machine has "
+                f"{path} declares {gigabytes(n_bytes)} of numbers; this machine has "
                 f"{gigabytes(memory_limit())} of memory"
             )
         read = {}
@@ -237,7 +237,7 @@ def _require_form(where: str, array: Unread, declared: Variable, sizes: dict[str
     kind, (allowed, _, words) = np.dtype(array.dtype).kind, KINDS[declared.kind]
     # text of any length is kept as objects
     if kind not in allowed and not (declared.kind == "text" and kind == "O"):
-        raise InputError(f"{where} holds values of type {array.dtype}, expected {words}")
+        raise InputError(f"{where} has values of type {array.dtype}, expected {words}")
     shape = tuple(array.shape)
     expected = [sizes.get(d) if isinstance(d, str) else d for d in declared.dims]
     same = len(shape) == len(expected)
@@ -261,10 +261,10 @@ def _checked_array(where: str, values: np.ndarray, declared: Variable, factor: f
     if declared.kind == "time":
         if np.isnat(values).any():
             first = tuple(np.argwhere(np.isnat(values))[0].tolist())
-            raise InputError(f"{where} holds no time at {first}")
+            raise InputError(f"{where} has no time at {first}")
         return values.astype("datetime64[ns]")
     if declared.kind == "boolean" and not np.isin(values, (0, 1)).all():
-        raise InputError(f"{where} holds other numbers than 0 and 1, expected true or false")
+        raise InputError(f"{where} has numbers other than 0 and 1, expected true or false")
     values = np.asarray(values, dtype=KINDS[declared.kind][1], order="C")
     if declared.kind == "boolean":
         return values
@@ -282,7 +282,7 @@ def _checked_array(where: str, values: np.ndarray, declared: Variable, factor: f
     if declared.grows and not (np.diff(values) > 0).all():
         place = int(np.flatnonzero(~(np.diff(values) > 0))[0])
         raise InputError(
-            f"{where} does not grow: {values[place + 1]:.12g} follows {values[place]:.12g}"
+            f"{where} does not increase: {values[place + 1]:.12g} follows {values[place]:.12g}"
         )
     return values
 
@@ -296,7 +296,7 @@ def _require_none(where: str, values: np.ndarray, bad: np.ndarray, what: str) ->
         first = tuple(np.argwhere(np.atleast_1d(bad))[0].tolist())
         value = values[first] if values.ndim else values
         raise InputError(
-            f"{where} holds {what}: {value:g} at {first}, {int(bad.sum())} of {bad.size} in all"
+            f"{where} contains {what}: {value:g} at {first}, {int(bad.sum())} of {bad.size} in all"
         )
 
 
@@ -326,7 +326,7 @@ def _checked_value(where: str, value: Any, declared: Variable) -> Any:
 
 
 def _text(where: str, value: Any) -> str:
-    with refusing(f"{where} holds text that is not UTF-8: {value!r}", UnicodeDecodeError):
+    with refusing(f"{where} contains text that is not UTF-8: {value!r}", UnicodeDecodeError):
         text = value.decode() if isinstance(value, bytes) else value
     if not isinstance(text, str):
         raise InputError(f"{where} is {value!r}, expected text")

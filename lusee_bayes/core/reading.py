@@ -64,7 +64,7 @@ def require_file(path: str | Path, what: str, hint: str = "") -> Path:
         kind = "a folder" if stat.S_ISDIR(mode) else "neither a file nor a folder"
         raise InputError(f"'{path}' is {kind}; give a file: {what}")
     if not os.access(path, os.R_OK):
-        raise InputError(f"'{path}' may not be read by this user; change its permissions")
+        raise InputError(f"'{path}' is not readable by this user; change its permissions")
     return path
 
 
@@ -102,7 +102,7 @@ def reading(path: str | Path, what: str, hint: str = "") -> Iterator[Path]:
         raise
     except Exception as error:
         raise InputError(
-            f"{path} cannot be read as {what}: {_reason(error)}; it is cut short, damaged, or of "
+            f"{path} cannot be read as {what}: {_reason(error)}; it is truncated, damaged, or of "
             "another kind"
         ) from error
 
@@ -125,7 +125,7 @@ def _reason(error: BaseException) -> str:
     """The first line of an error, short."""
     text = " ".join(str(error).split()) or type(error).__name__
     if isinstance(error, KeyError):
-        text = text.strip("'\"") if " " in text else f"there is no {text}"
+        text = text.strip("'\"") if " " in text else f"missing {text}"
     return text if len(text) <= 160 else f"{text[:157]}..."
 
 
@@ -137,7 +137,7 @@ def read_text(path: str | Path, what: str, hint: str = "") -> str:
             raise InputError(f"'{path}' has {size:,} bytes; expected {what}")
         text = file.read_bytes().decode("utf-8-sig")
     if "\0" in text:
-        raise InputError(f"'{path}' holds NUL bytes; expected {what}")
+        raise InputError(f"'{path}' contains NUL bytes; expected {what}")
     return text
 
 
@@ -152,7 +152,7 @@ def read_json(path: str | Path, layout: Layout, hint: str = "") -> dict[str, Any
     with reading(path, layout.what, hint):
         found = json.loads(read_text(path, layout.what))
     if not isinstance(found, dict):
-        raise InputError(f"{path} holds a {type(found).__name__}; expected {layout.what}")
+        raise InputError(f"{path} contains a {type(found).__name__}; expected {layout.what}")
     return found | layout.checked(path, {}, found).values
 
 
@@ -230,7 +230,7 @@ def read_arrays(path: str | Path, layout: Layout, hint: str = "") -> Content:
         np.load(file, allow_pickle=False) as arrays,
     ):
         if not isinstance(arrays, np.lib.npyio.NpzFile):
-            raise InputError(f"{path} holds a single array; expected {layout.what}")
+            raise InputError(f"{path} contains a single array; expected {layout.what}")
         there = {name: _unloaded(arrays, name) for name in arrays.files}
         values = {name: arrays[name] for name in layout.attributes if name in there}
         return layout.checked(path, there, values)

@@ -181,5 +181,5 @@ def without_other_kinds(tree: dict[str, Any], kinds: Kinds, *, strict: bool) -> 
         plain = list(default) if isinstance(default, tuple) else default
         if strict and value not in (None, default, plain):
             names = ", ".join(name for name, kind in kinds.items() if kind in others)
-            raise ValueError(f"{key} is an entry of model {names}, not of {tree['model']}")
+            raise ValueError(f"{key} belongs to model {names}, not to {tree['model']}")
     return kept

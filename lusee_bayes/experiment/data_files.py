@@ -65,14 +65,14 @@ def items_of(data: object) -> tuple[Visibilities, ...] | tuple[Path, ...]:
     items = given if isinstance(given, Sequence) else (given,)
     if wrong := [item for item in items if not isinstance(item, one)]:
         raise InputError(
-            f"data are Visibilities, paths of files, or several of one of them, not a "
-            f"{type(wrong[0]).__name__}; Visibilities.from_arrays makes some of arrays"
+            "data must be Visibilities, paths of files, or lists of either, not a "
+            f"{type(wrong[0]).__name__}; use Visibilities.from_arrays for arrays"
         )
     sets = tuple(item for item in items if isinstance(item, Visibilities))
     if not items:
-        raise InputError("no data are given")
+        raise InputError("got no data; give Visibilities or files")
     if len(sets) not in (0, len(items)):
-        raise InputError("data are in memory or in files, not in both")
+        raise InputError("got data both in memory and in files; give one kind")
     return sets or tuple(user_path(path) for path in items)
 
 
@@ -117,7 +117,7 @@ def are_sessions(data: Data) -> bool:
     sessions = [is_session(require_file(path, "data", HINT)) for path in files]
     if len(files) > 1 and not all(sessions):
         odd = files[sessions.index(False)]
-        raise InputError(f"'{odd}' is no session of the spectrometer; of other data, give one file")
+        raise InputError(f"'{odd}' is no session of the spectrometer; give other data as one file")
     return bool(files) and all(sessions)
 
 
@@ -142,17 +142,17 @@ def read_data(data: Data, scenario: Scenario) -> Visibilities:
     Parameters
     ----------
     data : Visibilities, path, or sequence of them
-        Visibilities in memory, the one of the scenario's frequency of several; a file; or sessions
-        of the spectrometer, which are reduced.
+        Visibilities in memory (of several, those at the scenario's frequency are used), a file, or
+        sessions of the spectrometer, which are reduced.
     scenario : Scenario
-        Of the frequency to read, of the instrument that a waterfall has to fit, of what the times
-        of a file are that does not say so, and of the time to average over.
+        Sets the frequency to read, the instrument that a waterfall must match, the meaning of the
+        times if a file does not specify it, and the time to average over.
 
     Raises
     ------
     InputError
-        If the file cannot be used, it is not known or contradicted what its times are, they cannot
-        be averaged, or a waterfall does not fit the scenario's beams.
+        If the file cannot be used, the meaning of its times is unknown or contradictory, data
+        cannot be averaged, or a waterfall does not match the scenario's beams.
     """
     if (reduced := reduced_of(data, scenario)) is not None:
         return visibilities_of(reduced, scenario)
@@ -185,7 +185,7 @@ def _is_waterfall(path: Path) -> bool:
         known = bool(WATERFALL_IMAGES & set(image_names(path)))
     if not known:
         said = f" (its format is '{kind}')" if kind else ""
-        raise InputError(f"{path} holds nothing that can be mapped{said}; give {ACCEPTED}")
+        raise InputError(f"{path} contains no data to map{said}; give {ACCEPTED}")
     return is_waterfall
 
 
@@ -203,9 +203,9 @@ def _stamped(path: str | Path, data: Visibilities, timestamp: Timestamp | None) 
     if not data.says_window:
         if timestamp is None:
             raise InputError(
-                f"{path} does not say what its times are: it has neither time_bounds nor the "
-                "attribute window = 'instant'; use --set observation.timestamp=start (or middle, "
-                "end, instant)"
+                f"{path} does not specify the meaning of its times: it has neither time_bounds nor "
+                "the attribute window = 'instant'; use --set observation.timestamp=start (or "
+                "middle, end, instant)"
             )
         with naming(path):
             return data.stamped(timestamp)
@@ -213,8 +213,8 @@ def _stamped(path: str | Path, data: Visibilities, timestamp: Timestamp | None) 
     if timestamp not in (None, "instant" if instants else "middle"):
         said = "instants" if instants else "means over windows, with their start and end"
         raise InputError(
-            f"{path} says that its samples are {said}, the scenario that their times are "
-            f"observation.timestamp={timestamp}; leave that out, or correct the file"
+            f"{path} declares its samples {said}, but the scenario has "
+            f"observation.timestamp={timestamp}; remove that, or correct the file"
         )
     return data
 
@@ -231,22 +231,22 @@ def _require_same_instrument(waterfall: Waterfall, scenario: Scenario) -> None:
     rule, said = source.interpolated(frequency), waterfall.interpolation
     if rule is not None and said is not None and said != INTERPOLATIONS[rule]:
         known = {w: f"use --set beam.interpolation={name}" for name, w in INTERPOLATIONS.items()}
-        other = f"expected one of {', '.join(known)}, or a response that has it"
+        other = f"expected one of {', '.join(known)}, or a response that includes it"
         what_to_do = known.get(said, other)
         raise InputError(
-            f"{section.file} does not have the frequency {frequency:.15g} MHz; {waterfall.path} "
-            f"has it by FREQINT = '{said}', the scenario by beam.interpolation={rule}; {what_to_do}"
+            f"{section.file} does not contain the frequency {frequency:.15g} MHz; {waterfall.path} "
+            f"uses FREQINT = '{said}', the scenario by beam.interpolation={rule}; {what_to_do}"
         )
     theirs = waterfall.per_kelvin[waterfall.channel(frequency)]
     ours = circuit.per_kelvin.diagonal().real
     port = int(np.argmax(np.abs(theirs / ours - 1.0)))
     if abs(theirs[port] / ours[port] - 1.0) > SAME_SCALE:
         if waterfall.receiver is None:
-            what_to_do = "give the response and the beam.receiver that the data were taken with"
+            what_to_do = "give the response and the beam.receiver of the data"
         elif section.receiver is not None:
-            what_to_do = "leave out beam.receiver, so that the loads ZL in the data are used"
+            what_to_do = "remove beam.receiver to use the loads ZL in the data"
         else:
-            what_to_do = "give the response that the data, which have the loads ZL, were taken with"
+            what_to_do = "give the response of the data, which contain the loads ZL"
         raise InputError(
             f"in {waterfall.path} 1 K is {theirs[port]:.6g} V^2/Hz at port {port}, with "
             f"{section.file} it is {ours[port]:.6g}; {what_to_do}"
@@ -256,7 +256,7 @@ def _require_same_instrument(waterfall: Waterfall, scenario: Scenario) -> None:
         ours_k = getattr(section, name)
         if not np.isclose(theirs_k, ours_k, rtol=SAME_TEMPERATURE, atol=0.0):
             raise InputError(
-                f"{waterfall.path} holds the emission of {theirs_k:.15g} K, the scenario's {name} "
+                f"{waterfall.path} includes emission at {theirs_k:.15g} K, the scenario's {name} "
                 f"is {ours_k:.15g}; use --set beam.{name}={theirs_k:.15g}"
             )
 
@@ -285,7 +285,7 @@ def reduce_files(
     known = [path.resolve() for path in paths]
     for k, path in enumerate(known):
         if path in known[:k]:
-            raise InputError(f"'{paths[k]}' is given twice; give every session once")
+            raise InputError(f"'{paths[k]}' is listed twice; list every session once")
         if format_of(path) == formats.REDUCED:
             raise InputError(f"'{paths[k]}' is reduced already; give it to lusee-bayes map --data")
     recipe = recipe_of(scenario)
@@ -304,25 +304,25 @@ def recipe_of(scenario: Scenario) -> Recipe:
     """
     if (section := scenario.flight) is None:
         raise InputError(
-            "the data are sessions of the spectrometer, and the scenario does not say how they "
-            "become visibilities; give it a section flight, or --set 'flight={gain_table: ..., "
-            "bin_origin: centre}' (docs/howto/first_light.md)"
+            "the data are sessions of the spectrometer, but the scenario has no section flight to "
+            "reduce them; add one, or --set 'flight={gain_table: ..., bin_origin: centre}' "
+            "(docs/howto/first_light.md)"
         )
     if section.gain_table is None:
         raise InputError(
-            "the sessions hold counts, and the scenario names no gain table; use --set "
+            "the sessions contain counts, but the scenario has no gain table; use --set "
             "flight.gain_table=... (the folder of luseepy's gain model, or a netCDF file)"
         )
     if section.bin_origin is None:
         raise InputError(
-            "it is not settled whether channel k of the spectrometer has its centre or its lower "
-            "edge at k times 25 kHz, which differ by 12.5 kHz; use --set flight.bin_origin=centre "
-            "(luseepy's labels) or edge"
+            "the scenario must specify whether k times 25 kHz is the centre or the lower edge of "
+            "channel k, which differ by 12.5 kHz; use --set flight.bin_origin=centre (luseepy's "
+            "labels) or edge"
         )
     if (timestamp := scenario.observation.timestamp) is None:
         raise InputError(
-            "the sessions do not say whether their times are the start, the middle or the end of "
-            "the integrations; use --set observation.timestamp=middle (or start, end, instant)"
+            "the sessions do not specify whether times are the start, middle or end of "
+            "integrations; use --set observation.timestamp=middle (or start, end, instant)"
         )
     here = scenario.observation
     frequencies = scenario.frequencies_mhz or (scenario.frequency_mhz,)
@@ -356,14 +356,14 @@ def per_kelvin_of(scenario: Scenario) -> Float[np.ndarray, " ports"]:
     circuit = scenario.beam.source().circuit(scenario.frequency_mhz)
     if circuit is None and said is None:
         raise InputError(
-            "flight data are in V^2/Hz, at the receivers' inputs, and these beams know no volts; "
-            "give luseepy's four-port response as beam.file (beam.model=response), or say what "
-            "1 K makes: --set flight.per_kelvin_v2_hz=..."
+            "flight data are in V^2/Hz, at the receivers' inputs, but these beams are not "
+            "calibrated in volts; give luseepy's four-port response as beam.file "
+            "(beam.model=response), or the power of 1 K: --set flight.per_kelvin_v2_hz=..."
         )
     if circuit is not None and said is not None:
         raise InputError(
-            "flight.per_kelvin_v2_hz is for beams that know no volts, and these have impedances; "
-            "leave it out"
+            "flight.per_kelvin_v2_hz is for beams without impedances, but these have them; remove "
+            "it"
         )
     if circuit is None:
         return np.full(scenario.beam.n_ports, float(said))

@@ -132,18 +132,18 @@ def data_mistakes(n_ports: int) -> Iterator[tuple[str, str, Mixing]]:
     """Conjugation, signs and exchanges: what is wrong, what to do, and what mixes the products."""
     products, numbers = all_products(n_ports), range(n_ports)
     first, second, imaginary = ports(n_ports)
-    wrong = "the data are conjugated: the imaginary parts have the other sign"
+    wrong = "the data are conjugated: the imaginary parts have the wrong sign"
     remedy = "change their sign (from_arrays: convention='conj(s_i) s_j')"
     yield wrong, remedy, np.diag(np.where(imaginary, -1.0, 1.0))
-    wrong = "all crosses have the other sign"
+    wrong = "all crosses have the wrong sign"
     yield wrong, "change their sign", np.diag(np.where(first != second, -1.0, 1.0))
     for size in range(1, n_ports // 2 + 1):
         for flipped in combinations(numbers, size):
             if 2 * size == n_ports and 0 not in flipped:  # as if the others were flipped
                 continue
             named = " and ".join(map(str, flipped))
-            wrong = f"the voltages of port {named} have the other sign"
-            remedy = f"change the sign of all crosses of port {named} with others"
+            wrong = f"the voltages of port {named} have the wrong sign"
+            remedy = f"change the sign of all crosses of port {named} with other ports"
             signs = [-1.0 if port in flipped else 1.0 for port in numbers]
             yield wrong, remedy, port_mixing(numbers, signs)
     for i, j in combinations(numbers, 2):
@@ -151,9 +151,9 @@ def data_mistakes(n_ports: int) -> Iterator[tuple[str, str, Mixing]]:
         remedy = f"exchange ports {i} and {j} of the data"
         yield wrong, remedy, port_mixing([{i: j, j: i}.get(port, port) for port in numbers])
     for turn in range(1, n_ports):
-        wrong = f"the ports are turned by {turn}: the model's port 0 is the data's port {turn}"
+        wrong = f"the ports are rotated by {turn}: the model's port 0 is the data's port {turn}"
         turned = port_mixing([(port + turn) % n_ports for port in numbers])
-        yield wrong, "number the data's ports as the beams'", turned
+        yield wrong, "number the ports of the data like those of the beams", turned
     for i, j in combinations(range(len(products)), 2):
         order = np.arange(len(products))
         order[[i, j]] = j, i
@@ -169,14 +169,14 @@ def model_mistakes(setup: Setup) -> Iterator[ModelMistake]:
     angles = dict(zip(turntables, observation.turntable_deg, strict=True))
     offsets: list[tuple[str, str, dict[str, float]]] = [
         (
-            f"the array is turned by {turn:g} degrees from East towards North",
+            f"the array is rotated by {turn:g} degrees from East towards North",
             f"use --set beam.turntable_offset_deg={turn:g}",
             dict.fromkeys(turntables, turn),
         )
         for turn in (90.0, 180.0, 270.0)
     ]
     if any(angles.values()):
-        wrong = "the turntable's angles have the other sign"
+        wrong = "the turntable's angles have the wrong sign"
         opposite = {name: -2.0 * angle for name, angle in angles.items()}
         offsets.append((wrong, "count them from East towards North", opposite))
     half = observation.step_s / 2.0
@@ -186,7 +186,7 @@ def model_mistakes(setup: Setup) -> Iterator[ModelMistake]:
     for name, key in (("latitude", "lat_deg"), ("longitude", "lon_deg")):
         value = getattr(observation, key)
         remedy = f"use --set observation.{key}={-value:g}"
-        offsets.append((f"the site's {name} has the other sign", remedy, {key: -2.0 * value}))
+        offsets.append((f"the site's {name} has the wrong sign", remedy, {key: -2.0 * value}))
     for wrong, remedy, values in offsets:
         yield ModelMistake(wrong, remedy, beams, with_offsets(observation, values))
     _, m = mode_numbers(beams.lmax)
@@ -202,7 +202,7 @@ def model_mistakes(setup: Setup) -> Iterator[ModelMistake]:
             other = setup.beam_source.beams(frequency, beams.lmax)
         except InputError:  # the source has none there
             continue
-        wrong = f"the frequency is that of the neighbouring channel, {frequency:g} MHz"
+        wrong = f"the data are from the neighbouring channel, {frequency:g} MHz"
         yield ModelMistake(wrong, f"use --set frequency_mhz={frequency:g}", other, observation)
 
 
@@ -334,8 +334,8 @@ class MixedProducts:
         curvature = self.chi2(step)
         missing = -float(step @ self.q @ whole) / curvature
         factor = _number(1.0 / (1.0 + missing), curvature**-0.5)
-        wrong = f"{name} is {factor} times what the others predict"
-        return DataMistake(wrong, f"look at the calibration of {name}", whole + missing * step)
+        wrong = f"{name} is {factor} times the prediction from the others"
+        return DataMistake(wrong, f"check the calibration of {name}", whole + missing * step)
 
     def _gain(self, port: int, powers: Products) -> DataMistake:
         """A gain of a port's voltage, squared in its auto: chi^2 is of fourth order in it."""
@@ -346,8 +346,8 @@ class MixedProducts:
         roots = chi2.deriv().roots()
         real = roots.real[np.abs(roots.imag) <= 1e-6 * np.abs(roots.real)]
         gain = real[np.argmin(chi2(real))]
-        wrong = f"the voltage of port {port} is {1.0 / gain:.5g} times what the others predict"
-        remedy = f"look at the calibration of port {port}"
+        wrong = f"port {port}'s voltage is {1.0 / gain:.5g} times the prediction from the others"
+        remedy = f"check the calibration of port {port}"
         return DataMistake(wrong, remedy, weights(np.diag(gain**powers)))
 
     def _constant(self, autos: Int[np.ndarray, " autos"]) -> DataMistake:
@@ -357,7 +357,7 @@ class MixedProducts:
         level = np.linalg.solve(self.q[np.ix_(places, places)], self.q[places] @ whole)
         whole[places] -= level
         named = ", ".join(f"{x:.4g}" for x in level)
-        wrong = f"the autos have a constant of {named} K besides the sky"
+        wrong = f"the autos contain a constant of {named} K besides the sky"
         return DataMistake(wrong, "give noise.receiver, or subtract it", whole)
 
     def _times(self) -> Iterator[tuple[float, DataMistake]]:
@@ -380,11 +380,11 @@ class MixedProducts:
             factor = 1.0 - pull[time] / bend
             when = here.data.observation.times[time].isot[:19]
             wrong = (
-                f"all products at {when} are {_number(1.0 / factor, bend**-0.5)} times what the "
-                "other times predict"
+                f"all products at {when} are {_number(1.0 / factor, bend**-0.5)} times the "
+                "prediction from other times"
             )
             right = weights(factor * np.eye(len(self.grid)))
-            mistake = DataMistake(wrong, "leave this time out", right, time)
+            mistake = DataMistake(wrong, "flag this time", right, time)
             yield self.chi2(whole) - pull[time] ** 2 / bend, mistake
 
 
@@ -404,8 +404,8 @@ def _gram(here: UnderAnySky, posterior: Posterior, columns: Float[np.ndarray, "d
 
 # changes of the model are compared up to this ell
 SCREENED_LMAX = 12
-# computed as the scenario has it: so many of the data and of the model, the best first, that leave
-# less than this share of what is too much
+# computed as the scenario has it: so many of the data and of the model, the best first; those of
+# the data only if they leave less than this share of what is too much
 TRIED, PROMISING = 3, 0.1
 # where nothing makes the data fit, those are listed that leave less than this share
 EXPLAINED = 0.03
@@ -463,9 +463,9 @@ class Diagnosis:
     def sentences(self) -> list[str]:
         """The proposals in words, one each; or that there are none."""
         if self.chi2.fits:
-            return [f"No usual mistake is needed: the data fit as they are ({self.chi2.words()})."]
+            return [f"The data fit without assuming a mistake ({self.chi2.words()})."]
         if not self.proposals:
-            return [f"None of the usual mistakes explains it ({self.n_tried} tried)."]
+            return [f"None of the {self.n_tried} usual mistakes explains the misfit."]
         first = "Did you mean" if self.proposals[0].chi2.fits else "Closest, but not enough"
         return [f"{first}:"] + [
             f"({number}) {one.words}: {one.remedy} ({one.chi2.words()})."
@@ -492,18 +492,19 @@ def diagnose(experiment: Experiment, inference: Inference, found: Residuals) -> 
     here = UnderAnySky.of(setup, data, inference.model)
     base, posterior = here.wide(here.model.coupling)
 
-    def best(tried: Sequence[tuple[float, object]], whole: ChiSquare) -> list:
-        """The most promising, by chi^2."""
-        most = whole.degrees + PROMISING * abs(whole.chi2 - whole.degrees)
+    def best(tried: Sequence[tuple[float, object]], most: float) -> list:
+        """Those of the smallest chi^2."""
         found = sorted((one for one in tried if one[0] < most), key=lambda one: one[0])
         return [one for _, one in found[:TRIED]]
 
     of_data = list(MixedProducts.of(here, posterior).tried())
-    proposals = [Proposal(m.words, m.remedy, here.without(m)) for m in best(of_data, base)]
+    promising = base.degrees + PROMISING * abs(base.chi2 - base.degrees)
+    proposals = [Proposal(m.words, m.remedy, here.without(m)) for m in best(of_data, promising)]
     low = Pointing.of(setup.observation, min(SCREENED_LMAX, setup.scenario.lmax))
     known = list(model_mistakes(setup))
     screened = [here.under(m.beams, m.observation, low).chi2 for m in known]
-    whole = here.under(setup.beams, setup.observation, low)
+    # at low ell, what the sky has beyond is left
+    whole = here.under(setup.beams, setup.observation, low).chi2
     of_model = [*zip(screened, known, strict=True), *_offsets(here, low)]
     proposals += [
         Proposal(m.words, m.remedy, here.under(m.beams, m.observation, setup.pointing))
@@ -575,7 +576,7 @@ def _noise_level(found: Residuals, data: Visibilities) -> Iterator[Proposal]:
     if stands_out(least, len(groups)) or abs(pairs.sum()) > WHITE * np.sqrt(len(pairs)):
         return
     yield Proposal(
-        f"the noise variance is {factor:.3g} times what is assumed",
+        f"the noise variance is {factor:.3g} times the assumed one",
         f"multiply noise.radiometer.factor by {factor:.3g}",
         ChiSquare(whole.degrees, whole.degrees),
     )

@@ -90,8 +90,8 @@ class Experiment(Described):
 # numbers of the largest matrix of data and modes above lmax that is made: 4 GB
 MOST_ABOVE = 5e8
 GAIN_ERRORS = (
-    "The gains may be off by errors that are known (flight.gain_std, or the gain table's own) and "
-    "not part of N: give noise.gain_table={}."
+    "The stated errors of the gains (flight.gain_std, or the gain table's) are not part of N: give "
+    "noise.gain_table={}."
 )
 
 
@@ -103,27 +103,27 @@ def build(
     earlier: Information | None = None,
     values: Mapping[str, float] | None = None,
 ) -> Experiment:
-    """Build the experiment of a scenario, with the prior that its data tell.
+    """Build the experiment of a scenario, with the prior learned from its data.
 
     Parameters
     ----------
     scenario : Scenario
         Of one frequency.
     data : Visibilities, optional
-        Measured data; without them the scenario's own are simulated. A truth of another lmax is
-        cut, or filled with zeros.
+        Measured data; if omitted, data are simulated from the scenario. A truth of another lmax is
+        truncated, or padded with zeros.
     stages : Stages, optional
         Told what is being done.
     earlier : Information, optional
-        Of earlier data, which the prior learns from, too.
+        Of earlier data, from which the prior is also learned.
     values : mapping of float, optional
-        Of unknowns of the instrument, by name: where rounds begin.
+        Starting values of the instrument's unknowns, by name.
 
     Raises
     ------
     InputError
-        If the data are of another frequency, another site or other ports, for data that no sky
-        gives (:func:`.require_plausible`), and for a prior that does not settle.
+        If the data have another frequency, site or number of ports, if they are implausible
+        (:func:`.require_plausible`), and if the prior's parameters do not converge.
     """
     stages = stages or Stages()
     return _learned(_fitting(observed(scenario, data, stages), stages), stages, earlier, values)
@@ -152,7 +152,7 @@ def observed(
             raise
         # what is wrong without the sky above lmax, too, is raised here
         setup = set_up(scenario.with_section("noise", above_lmax=None), data, stages)
-        doubts.append(f"The model ends at lmax = {scenario.lmax}, and the sky does not: {error}.")
+        doubts.append(f"The model ends at lmax = {scenario.lmax}, but the sky does not: {error}.")
     if data is None:
         with stages("noise"):
             return Experiment(setup, simulate(setup).with_truth_up_to(scenario.lmax))
@@ -170,8 +170,8 @@ def _require_room(n_data: int, lmax: int) -> None:
     """InputError if a matrix of data and modes is too large."""
     if n_data * n_modes(lmax) > MOST_ABOVE:
         raise InputError(
-            f"with {n_data:,} data, what the sky adds up to lmax = {lmax} takes too much memory; "
-            "average the data, or raise lmax"
+            f"with {n_data:,} data, the sky up to lmax = {lmax} takes too much memory; average the "
+            "data, or raise lmax"
         )
 
 
@@ -180,7 +180,7 @@ def _fitting(experiment: Experiment, stages: Stages) -> Experiment:
     section, data = experiment.scenario.flight, experiment.data
     if section is None or not section.leave_out or data.calibration is None:
         return experiment
-    with stages("times that do not fit"):
+    with stages("inconsistent times"):
         found = fitting(experiment.setup, data, section.false_alarm, stages)
         setup, kept = without(experiment.setup, data, found.flagged)
     doubts = experiment.doubts
@@ -276,13 +276,13 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
     def require_free(cls: type[Systematic]) -> None:
         if cls.treatment(experiment.scenario) == "marginalised":
             raise InputError(
-                "the program samples what the scenario marginalises, so that it would count "
-                f"twice; set {cls.key}.treatment=sampled"
+                "the program samples what the scenario marginalises, which would count twice; set "
+                f"{cls.key}.treatment=sampled"
             )
 
     def own(cls: type[Systematic]) -> Systematic:
         if cls.treatment(experiment.scenario) is None:
-            raise InputError(f"the scenario has no {cls.key} that could be sampled")
+            raise InputError(f"the scenario has no {cls.key} to sample")
         require_free(cls)
         return cls.build(attrgetter(cls.key)(experiment.scenario), setup, around())
 
@@ -290,7 +290,7 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
         require_free(BeamErrors)
         if not setup.beam_source.parameters():
             raise InputError(
-                "the program asks for the embedded antennas, which beam.file replaces; leave out "
+                "the program needs the embedded antennas, which beam.file replaces; remove "
                 "beam.file"
             )
         return setup.instrument
@@ -389,24 +389,21 @@ def doubts(experiment: Experiment, inference: Inference) -> tuple[str, ...]:
     worst = max(errors, key=errors.__getitem__, default="")
     if worst and errors[worst] > MOST_OFF:
         found.append(
-            f"Beams between the files of {experiment.scenario.beam.label} may be off by up to "
-            f"{errors[worst]:.2g} radiometer standard deviations (rms), as those of {worst} are "
-            "where they are interpolated without their own files; files in smaller steps, or more "
-            "of them, make it less."
+            f"Beams interpolated between the files of {experiment.scenario.beam.label} may be "
+            f"wrong by up to {errors[worst]:.2g} radiometer standard deviations (rms), tested by "
+            f"omitting the files of {worst}; use more files, in smaller steps."
         )
     if learned is not None and not learned.settled:
-        found.append(
-            "The prior is a fixed, wide one: its parameters do not settle, whatever the noise."
-        )
+        found.append("The prior is fixed and wide: its parameters do not converge for any noise.")
     elif learned is not None and learned.noise_factor > 1.0:
         found.append(
-            f"The prior was learned with N times {learned.noise_factor:.2g}, as the residual chi^2 "
-            "demands; the map has the scenario's N."
+            f"The prior was learned with N times {learned.noise_factor:.2g}, to match residual "
+            "chi2; the map uses the scenario's N."
         )
     if learned is not None and learned.still_moves > 0.0:
         found.append(
-            f"The map still moves by {learned.still_moves:.2g} of its standard deviations from one "
-            "round of learning its prior to the next."
+            "Learning the prior did not converge: the map still changes by "
+            f"{learned.still_moves:.2g} standard deviations per round."
         )
     if inference.unsettled:
         found.append(inference.unsettled)

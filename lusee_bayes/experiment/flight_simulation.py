@@ -228,17 +228,16 @@ def simulate_flight(scenario: Scenario, stages: Stages | None = None) -> FlightS
     radiometer, step_s = scenario.noise.radiometer, scenario.observation.step_s
     if radiometer.duty_cycle != 1.0 or radiometer.log_factor_std is not None:
         raise InputError(
-            "the noise of spectra is that of the frames they average; leave out duty_cycle and "
-            "log_factor_std of noise.radiometer"
+            "the noise of spectra follows from their frames; remove duty_cycle and log_factor_std "
+            "of noise.radiometer"
         )
     if flight.filter_taps:
         raise InputError(
-            "channels of simulated spectra share no noise, and flight.filter_taps says that they "
-            "do; set it to 0"
+            "channels of simulated spectra have independent noise; set flight.filter_taps to 0"
         )
     if step_s < FRAME_S:
         raise InputError(
-            f"a frame of the spectrometer lasts {FRAME_S:g} s, and a sample {step_s:g} s; use a "
+            f"a frame of the spectrometer lasts {FRAME_S:g} s, but a sample {step_s:g} s; use a "
             "longer observation.step_s (42 s in flight)"
         )
     shift = int(np.floor(np.log2(step_s / FRAME_S * (1.0 + 1e-12))))
@@ -283,8 +282,8 @@ def spectra_observation(scenario: Scenario, window_s: float) -> Observation:
     observation = planned.select(long)
     if len(set(observation.turntable_deg)) > 1:
         raise InputError(
-            "the turntable turns within the observation, and sessions do not say its angle; "
-            "simulate the stretch of each angle on its own (observation.runs)"
+            "the turntable rotates within the observation, but sessions do not contain its angle; "
+            "simulate each angle separately (observation.runs)"
         )
     edges = np.full(observation.n_times, half)
     return replace(observation, windows=Windows.whole(-edges, edges))
@@ -340,13 +339,13 @@ def _drawn_gains(scenario: Scenario, flight: FlightSection) -> tuple[GainModel, 
         return table, table, {}
     if section.std is not None:
         raise InputError(
-            "noise.gain_table.std is for data without a gain table, and spectra have one; leave it "
-            "out and give flight.gain_std, the error of the gains of each level of each port"
+            "noise.gain_table.std is for data without a gain table, but spectra have one; remove "
+            "it and give flight.gain_std, the error of the gains of each level of each port"
         )
     if flight.gain_std is None and table.component_std is None:
         raise InputError(
-            "noise.gain_table says that the gains are not exact, and nothing says by how much; "
-            "give flight.gain_std, or flight.component_std"
+            "noise.gain_table needs the errors of the gains; give flight.gain_std, or "
+            "flight.component_std"
         )
     generator = np.random.default_rng([scenario.seed, 3])
     return table, *draw_gains(table, flight.gain_std, generator)

@@ -37,16 +37,16 @@ from lusee_bayes.instrument.times import Timestamp
 
 
 class RunSection(Section):
-    """One stretch of data at one turntable angle.
+    """A continuous stretch of data at one turntable angle.
 
     Attributes
     ----------
     cycles : float
-        Length in lunar cycles of 27.321661 days.
+        Duration in lunar cycles of 27.321661 days.
     turntable_deg : float
-        Angle of the turntable, from East towards North.
+        Turntable angle, from East towards North.
     night_only : bool
-        Leave out samples with the Sun above the horizon.
+        Exclude samples taken with the Sun above the horizon.
     """
 
     cycles: Positive = 1.0
@@ -55,7 +55,7 @@ class RunSection(Section):
 
 
 class ObservationSection(Section):
-    """Where and when; ``runs`` follow one another from ``start``, or a ``schedule`` has dates.
+    """Site and times: consecutive ``runs`` from ``start``, or the dates in a ``schedule``.
 
     Attributes
     ----------
@@ -64,25 +64,25 @@ class ObservationSection(Section):
     lat_deg : float
         Latitude of the site on the Moon (MCMF).
     start : str
-        Beginning of the first sample, UTC, as 2027-01-15T00:00:00.
+        Start of the first sample, UTC, for example 2027-01-15T00:00:00.
     step_s : float
         Time between samples.
     window : {"mean", "instant"}
-        What a sample is where no data say it: the mean over its step, or the sky at its beginning,
-        as in the paper and in luseepy's simulators.
+        What a sample represents, unless the data file specifies it: the mean over its step, or the
+        sky at its start, as in the paper and in luseepy's simulators.
     timestamp : {"start", "middle", "end", "instant"}
-        What the times of a file of data are, if it does not say so itself; windows then last for
-        the file's step.
+        Point of each sample that the times in a data file mark, unless the file specifies it; each
+        window then lasts one step of the file.
     average_s : float
-        Data of a file are averaged over this time when they are read.
+        Average data from a file over this time when reading them.
     runs : tuple of RunSection
-        Stretches of data, one after another.
+        Consecutive stretches of data.
     schedule : str, optional
-        File of the intervals in which data are taken, instead of ``start`` and ``runs``: CSV, or a
-        command table of OpSim.
+        File of observing intervals, instead of ``start`` and ``runs``: CSV, or an OpSim command
+        table.
     fixed_axis : bool
-        The Moon turns about the axis of the first sample, as luseepy's engine ``croissant`` has
-        it; for data that it has made, with ``window: instant``.
+        Rotate the Moon about its axis at the first sample, as luseepy's ``croissant`` engine does;
+        for data simulated with that engine, with ``window: instant``.
     """
 
     lon_deg: Annotated[float, Field(ge=-360, le=360)] = 182.258
@@ -144,7 +144,7 @@ def _observation(section: ObservationSection, intervals: tuple[Interval, ...]) -
 
 
 class ReceiverFileSection(Section):
-    """Loads from a file: images ``freq``, ``ZL_real`` and ``ZL_imag``.
+    """Load impedances from a file with images ``freq``, ``ZL_real`` and ``ZL_imag``.
 
     Attributes
     ----------
@@ -161,7 +161,7 @@ class ReceiverFileSection(Section):
 
 
 class OpenSection(Section):
-    """Nothing."""
+    """Open ports: no receiver connected."""
 
     model: Literal["open"] = "open"
 
@@ -183,13 +183,13 @@ ReceiverSection = Annotated[
 
 
 class BaseBeamSection(Section):
-    """What all beams have in common.
+    """Settings common to all beams.
 
     Attributes
     ----------
     exact : bool
-        Maps of measured data take the beams as they are. By default, and without ``noise.beam`` and
-        ``noise.fields``, ground, arms and fields are then unknowns.
+        Assume exact beams when mapping measured data. By default, if neither ``noise.beam`` nor
+        ``noise.fields`` is set, ground, arms and fields are unknowns of the map.
     """
 
     # whether something about them can be an unknown
@@ -212,19 +212,19 @@ class MonopoleBeamSection(BaseBeamSection):
     Attributes
     ----------
     length_m : float
-        Length of an arm.
+        Arm length.
     zenith_angle_deg : float
         Angle of the arms from the zenith.
     height_m : float
-        Height of the feed over the ground.
+        Height of the feed above the ground.
     surface_permittivity : float
         Permittivity of the regolith at the surface.
     deep_permittivity : float
-        Permittivity of the regolith 100 m deep.
+        Permittivity of the regolith at a depth of 100 m.
     loss_tangent : float
         Loss tangent of the regolith.
     turntable_offset_deg : float
-        Added to every angle of the turntable, from East towards North.
+        Added to every turntable angle, from East towards North.
     """
 
     is_file: ClassVar[bool] = False
@@ -259,12 +259,12 @@ class MonopoleBeamSection(BaseBeamSection):
 
 
 class _FileSection(BaseBeamSection):
-    """What the beams of files have in common.
+    """Settings common to beams from files.
 
     Attributes
     ----------
     turntable_offset_deg : float
-        Added to every angle of the turntable, from East towards North.
+        Added to every turntable angle, from East towards North.
     """
 
     is_file: ClassVar[bool] = True
@@ -279,14 +279,14 @@ class _FileSection(BaseBeamSection):
 
 
 class _LuseepySection(_FileSection):
-    """What the beams of luseepy's files have in common.
+    """Settings common to beams from luseepy files.
 
     Attributes
     ----------
     quadrature : {"exact", "luseepy"}
-        ``luseepy`` is luseepy's own rule, for data that luseepy has made.
+        Quadrature over the sphere; ``luseepy`` is luseepy's own rule, for data simulated with it.
     moon_temperature_k : float
-        Temperature of the ground, which adds its own radiation.
+        Temperature of the ground, which adds thermal emission.
     """
 
     quadrature: Literal["exact", "luseepy"] = "exact"
@@ -301,20 +301,20 @@ class _LuseepySection(_FileSection):
 
 
 class ScalarBeamSection(_LuseepySection):
-    """A scalar beam of luseepy: the pattern of one arm, used once for every port.
+    """A luseepy scalar beam: the pattern of one arm, reused for every port.
 
     Attributes
     ----------
     file : str
-        FITS version 2.
+        luseepy FITS file, version 2.
     rotations_deg : tuple of float
-        Angle of the pattern for each port, from East towards North; ``turntable_offset_deg`` is
-        added.
+        Rotation of the pattern for each port, from East towards North, in addition to
+        ``turntable_offset_deg``.
     taper : bool
-        Fade out towards the horizon as luseepy does.
+        Taper the beam towards the horizon, as luseepy does.
     interpolation : {"linear", "spline"}
-        Between the file's frequencies: products of fields linearly as in luseepy, or fields by
-        cubic splines.
+        Interpolation between the file's frequencies: linear in products of fields, as in luseepy,
+        or cubic splines in the fields.
     """
 
     model: Literal["luseepy"] = "luseepy"
@@ -333,20 +333,20 @@ class ScalarBeamSection(_LuseepySection):
 
 
 class ResponseSection(_LuseepySection):
-    """A four-port response of luseepy: coupled antennas with their receivers.
+    """A luseepy four-port response: coupled antennas with their receivers.
 
     Attributes
     ----------
     file : str
-        FITS version 3.
+        luseepy FITS file, version 3.
     interpolation : {"linear", "spline"}
-        Between the file's frequencies: impedances and products of fields linearly as in luseepy, or
-        impedances and fields by cubic splines.
+        Interpolation between the file's frequencies: linear in impedances and products of fields,
+        as in luseepy, or cubic splines in impedances and fields.
     receiver : {"jfet", "capacitor", "file", "open"} or mapping, optional
-        What is connected to the ports, with its parameters. If it is left out, that of the data
-        where their file holds it, else luseepy's preamplifiers.
+        Receiver connected to the ports, with its parameters. Default: the receiver in the data file
+        if it includes one, else luseepy's preamplifiers.
     antenna_temperature_k : float
-        Temperature of the antennas' losses, which add their own radiation.
+        Temperature of the antennas, whose losses add thermal emission.
     """
 
     n_ports: ClassVar[int] = N_ANTENNAS
@@ -363,14 +363,14 @@ class ResponseSection(_LuseepySection):
 
 
 class SampledBeamSection(_FileSection):
-    """Beams of one's own in directions: fields of antennas or beams of products, or a UVBeam.
+    """Your own sampled beams: antenna fields or product beams by direction, or a UVBeam.
 
     Attributes
     ----------
     file : str
-        netCDF or FITS of :func:`lusee_bayes.sampled_beams`, or pyuvdata's beam FITS.
+        netCDF or FITS from ``lusee_bayes.sampled_beams``, or a pyuvdata beam FITS.
     normalise : bool
-        Scale the beams so that autos integrate to one on average; by default as the file says.
+        Scale the beams so that autos integrate to one on average; default: as in the file.
     """
 
     model: Literal["sampled"] = "sampled"
@@ -388,14 +388,14 @@ class SampledBeamSection(_FileSection):
 
 
 class GridBeamSection(ScalarBeamSection, ResponseSection, SampledBeamSection):
-    """Beams of files over a grid of parameters; every file takes the keys that its kind has.
+    """Beams from files on a grid of parameters; each file uses the keys of its own kind.
 
     Attributes
     ----------
     file : str
-        CSV table of the files, with their parameters.
+        CSV table of the files and their parameters.
     values : dict
-        Of the table's parameters, each by default in the middle of the grid.
+        Values of the table's parameters; default: the middle of the grid.
     """
 
     has_parameters: ClassVar[bool] = True

@@ -186,15 +186,15 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Groups
 
 MAX_ROUNDS = 10
 NOT_JUDGED = (
-    "Times were not compared with each other, which would need too much memory; use a longer "
+    "Times were not compared with each other for lack of memory; use a longer "
     "observation.average_s."
 )
 TOO_MANY = (
-    "More than a fifth of the data are inconsistent with the rest, so that none was flagged: "
-    "noise, gains or beams are not those of the data."
+    "More than 20 % of the data are inconsistent with the rest; none was flagged: check noise, "
+    "gains and beams."
 )
 KEPT = (
-    "Product {port}{port}R is inconsistent with the rest and was kept, since the noise of port "
+    "Product {port}{port}R is inconsistent with the rest but was kept, because the noise of port "
     "{port}'s other products depends on it: check the gain and the receiver of port {port}."
 )
 # where all rules together would take more, it is not the data but noise, gains or beams
@@ -377,9 +377,8 @@ class _Rules:
             return ""
         named = " and ".join(filter(None, [", ".join(parts[:-1]), parts[-1]]))
         return (
-            f"Flagged as inconsistent with the remaining data: {named}, {share:.2g} of the values. "
-            f"Noise alone would cause {2.0 * n * self.false_alarm:.2g} such flags of times or "
-            "values."
+            f"Flagged as inconsistent with the remaining data: {named}, {share:.2g} of all values. "
+            f"Noise alone would cause {2.0 * n * self.false_alarm:.2g} such flags."
         )
 
 

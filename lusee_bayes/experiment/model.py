@@ -130,13 +130,13 @@ def require_fitting(data: Visibilities, scenario: Scenario) -> None:
     """InputError unless data are of the scenario's frequency and site, with known times."""
     if not data.says_window:
         raise InputError(
-            "the data do not say what their times are; use data.stamped('start') (or 'middle', "
-            "'end', 'instant'), or read_data with observation.timestamp"
+            "the data do not specify the meaning of their times; use data.stamped('start') (or "
+            "'middle', 'end', 'instant'), or read_data with observation.timestamp"
         )
     if scenario.observation.fixed_axis and data.observation.windows is not None:
         raise InputError(
-            "the data are means over windows, and a fixed axis of the Moon is for data of "
-            "luseepy's croissant, which are instants; leave out observation.fixed_axis"
+            "the data are means over windows, but a fixed axis of the Moon (luseepy's croissant) "
+            "needs instants; remove observation.fixed_axis"
         )
     if abs(data.frequency_mhz - scenario.frequency_mhz) > SAME_FREQUENCY_MHZ:
         raise InputError(
@@ -148,8 +148,8 @@ def require_fitting(data: Visibilities, scenario: Scenario) -> None:
     if max(abs(east), abs(here.lat_deg - there.lat_deg)) > SAME_SITE_DEG:
         # luseepy writes a site of its own where it is told none
         unsettled = (
-            ", or, where nobody has established the site in the sessions, --set "
-            "flight.site=scenario when they are reduced"
+            ", or, if the site in the sessions is a placeholder, --set flight.site=scenario when "
+            "reducing them"
         )
         raise InputError(
             f"the data were taken at longitude {here.lon_deg:g}, latitude {here.lat_deg:g} "

@@ -147,7 +147,7 @@ class Inference:
     def remark(self) -> str:
         """Chi^2, for a line on the rounds."""
         larger = " of larger noise" if self.around.tempered > 1.0 else ""
-        return f"chi^2 {self.solution.chi2:.0f} for {len(self.solution.data)} data{larger}"
+        return f"chi2 {self.solution.chi2:.0f} for {len(self.solution.data)} data{larger}"
 
     @property
     def fits(self) -> bool:
@@ -265,8 +265,8 @@ def settled(
     advice = f"; use {keys[0]}" if keys else "; use noise.gain.visibilities=model"
     return replace(
         found,
-        unsettled=f"The map still moves by {moves:.2g} of its standard deviations after "
-        f"{found.rounds} rounds of rebuilding N around it{advice}.",
+        unsettled=f"The map did not converge: after {found.rounds} rounds of updating N, it still "
+        f"changes by {moves:.2g} standard deviations{advice}.",
     )
 
 
@@ -616,13 +616,12 @@ def named_priors(
             raise InputError(f"--priors: no prior '{name}'; {nearest(name, NAMED)}")
     if len(names) < 2 or len(set(names)) < len(names):
         raise InputError(
-            f"--priors {','.join(names)}: a comparison needs two or more different ones of "
-            f"{', '.join(NAMED)}"
+            f"--priors {','.join(names)}: give at least two different ones of {', '.join(NAMED)}"
         )
     if OF_TRUE_SKY in names and not known_sky:
         raise InputError(
-            f"--priors: {OF_TRUE_SKY} takes C_ell of the scenario's sky, which nobody knows of "
-            "measured data; leave it out, or give --truth if the data are of that sky"
+            f"--priors: {OF_TRUE_SKY} needs C_ell of the scenario's sky, which is unknown for "
+            "measured data; omit it, or give --truth if the data were simulated from that sky"
         )
     own, named = scenario.prior, {name: NAMED[name] for name in names}
     # isotropic priors differ in where C_ell comes from

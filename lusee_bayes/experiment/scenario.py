@@ -135,16 +135,16 @@ FOLDER = resources.files("lusee_bayes.experiment") / "scenarios"
 
 
 class OutputSection(Section):
-    """Results that are written on request.
+    """Optional results.
 
     Attributes
     ----------
     draws : int
-        Number of posterior draws ``posterior.nc`` keeps.
+        Number of posterior draws to store in ``posterior.nc``.
     covariance : bool
-        Keep the posterior covariance in ``posterior.nc``.
+        Store the posterior covariance in ``posterior.nc``.
     information : bool
-        Keep in ``posterior.nc`` what the data say of the sky, so that new data can be added later.
+        Store the data's information about the sky in ``posterior.nc``, for adding data later.
     """
 
     draws: Annotated[int, Field(ge=0)] = 0
@@ -153,45 +153,46 @@ class OutputSection(Section):
 
 
 class Scenario(Section):
-    """A complete run: of one frequency, or of all of ``frequencies_mhz``.
+    """A complete run at one frequency, or at all of ``frequencies_mhz``.
 
     Attributes
     ----------
     frequency_mhz : float
         Frequency of the map.
     frequencies_mhz : tuple of float
-        Channels of a run of several frequencies, in growing order.
+        Channels of a run at several frequencies, in increasing order.
     joint : bool
-        The channels share one posterior, with the spectral prior; by default each has its own.
+        Fit one posterior to all channels with the spectral prior; by default, map each channel
+        independently.
     lmax : int
         Highest ell of the map, which has (lmax + 1)^2 modes.
     nside : int
-        HEALPix NSIDE of written maps; by default the lowest with two pixels for each ell.
+        HEALPix NSIDE of written maps; default: the lowest with two pixels per ell.
     observation : ObservationSection
-        Where and when.
+        Site and times.
     beam : BeamSection
         The antennas.
     sky : SkySection
-        The true sky of simulated data, and the model for the noise level.
+        True sky of simulated data, and the sky model that sets the noise level.
     prior : PriorSection
-        S.
+        Prior on the sky (S).
     noise : NoiseSection
-        N.
+        Noise and systematics (N).
     sources : SourcesSection
-        Point sources apart from the map.
+        Point sources that are not part of the map.
     spectral : SpectralSection
-        Prior of joint channels.
+        Prior on the skies of joint channels.
     log_normal : LogNormalSection
         Prior of the program ``log_normal``.
     flight : FlightSection
-        How sessions of the spectrometer become visibilities.
+        Reduction of spectrometer sessions to visibilities.
     output : OutputSection
-        What is written on request.
+        Optional results.
     seed : int
-        Seed of simulated data and of draws.
+        Seed for simulated data and draws.
     instrument_seed : int
-        Seed of what channels share of the instrument in simulated data; by default ``seed``.
-        Channels of a run of several frequencies have that of the run.
+        Seed for the part of the simulated instrument that all channels share; default: ``seed``.
+        In a run at several frequencies, all channels use the same seed.
     """
 
     frequency_mhz: Frequency = 25.0
@@ -334,12 +335,20 @@ def scenario_names() -> list[str]:
     return sorted(name.removesuffix(".yaml") for name in names if name.endswith(".yaml"))
 
 
+def scenario_text(name: str) -> str:
+    """The YAML of a scenario of the package. InputError for an unknown name."""
+    names = scenario_names()
+    if name not in names:
+        raise InputError(f"the package has no scenario '{name}'; {nearest(name, names)}")
+    return (FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
+
+
 def load_scenario(
     source: str | Path | Scenario, overrides: list[str] | tuple[str, ...] = ()
 ) -> Scenario:
     """Read a YAML file, or a scenario of the package by name, and apply ``key.path=value``.
 
-    A scenario is taken as it is, so that every run takes one, its file or its name.
+    A Scenario is returned unchanged: runs accept a scenario, its file or its name.
 
     InputError with one sentence for a missing file, bad YAML, an unknown key or a bad value.
     """
@@ -366,7 +375,7 @@ def _read_yaml(source: str | Path) -> dict[Any, Any]:
     if os.path.exists(user_path(source)):
         tree = read_yaml(user_path(source), "a scenario")
     elif str(source) in names:
-        tree = parse_yaml((FOLDER / f"{source}.yaml").read_text(encoding="utf-8"), str(source))
+        tree = parse_yaml(scenario_text(str(source)), str(source))
     elif os.sep in str(source) or Path(source).suffix[1:2].isalpha():
         raise InputError(
             f"no scenario file at '{source}'; check the path, or give the name of a scenario of "

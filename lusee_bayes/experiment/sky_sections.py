@@ -28,14 +28,14 @@ from lusee_bayes.systematics.prior_spectrum import SpectrumSection
 
 
 class GalaxySection(Section, SkySource):
-    """The embedded Galaxy.
+    """The embedded model of the Galaxy.
 
     Attributes
     ----------
     seed : int
-        Seed of the random small scales, loops, clouds and faint sources.
+        Seed for the random small scales, loops, clouds and faint sources.
     sources : bool
-        Add the brightest point sources.
+        Include the brightest point sources.
     """
 
     model: Literal["galaxy"] = "galaxy"
@@ -48,19 +48,19 @@ class GalaxySection(Section, SkySource):
 
 
 class FileSkySection(Section, SkySource):
-    """A sky from a file: ULSA's HDF5, HEALPix FITS, luseepy's FITS of many maps, coefficients.
+    """A sky from a file: ULSA HDF5, HEALPix FITS, luseepy multi-map FITS, or coefficients.
 
     Attributes
     ----------
     file : str
         Path of the file.
     dataset : str
-        Data set of an HDF5 file.
+        Dataset to read from an HDF5 file.
     file_frequency_mhz : float
-        Frequency that the file was made for; by default the scenario's. Of a file with many
-        frequencies, this one is taken.
+        Frequency of the sky in the file (default: the scenario's); it selects the map to read from
+        a file with several frequencies.
     spectral_index : float
-        Scales the sky from ``file_frequency_mhz`` to the scenario's frequency.
+        Index for scaling the sky from ``file_frequency_mhz`` to the scenario's frequency.
     """
 
     # whether the catalogue's sources are added: they are in the file, if at all
@@ -99,28 +99,28 @@ LOG_AMPLITUDE_STD, TILT_STD = 1.0, 0.5
 
 
 class IsotropicPriorSection(SpectrumSection):
-    """Independent coefficients: C_ell learned from the data, the sky's own, or a file's; mean 0.
+    """Independent coefficients, mean 0; C_ell is learned, the sky's own, or read from a file.
 
-    ``sky`` takes C_ell of the scenario's sky, which simulations know and observers do not: the
-    paper's setting. With it or with a file's, an amplitude and a tilt can be sampled,
+    ``sky`` uses C_ell of the scenario's sky, which is known only in simulations: the paper's
+    setting. With this C_ell, or one from a file, you can sample an amplitude and a tilt,
     C_ell A ((ell + 1) / 10)^tilt, or one amplitude for every band of ell.
 
     Attributes
     ----------
     spectrum : {"learned", "sky"}
-        Where C_ell comes from, if not from a file: by default learned, unless another entry acts on
-        a C_ell that is known.
+        Source of C_ell, if not a file; default: learned, unless another key modifies a known
+        C_ell.
     scale : float
-        Multiplies C_ell.
+        Factor applied to C_ell.
     spectrum_file : str
-        Text with lines of ell and C_ell in K^2, in place of the scenario's sky.
+        Text file of ell and C_ell in K^2, used instead of the scenario's sky.
     mean_file : str
-        The prior mean: a HEALPix FITS map in K, Galactic.
+        Prior mean: a HEALPix FITS map in K, in Galactic coordinates.
     file_frequency_mhz : float
-        What these files were made for; by default the scenario's frequency.
+        Frequency of the prior's files; default: the scenario's frequency.
     spectral_index : float
-        Scales them from ``file_frequency_mhz`` to the scenario's frequency: the mean once, C_ell
-        twice.
+        Index for scaling the prior's files from ``file_frequency_mhz`` to the scenario's frequency:
+        applied once to the mean, twice to C_ell.
     """
 
     model: Literal["isotropic"] = "isotropic"
@@ -187,16 +187,16 @@ class IsotropicPriorSection(SpectrumSection):
 
 
 class LocalScalesPriorSection(Section):
-    """A template, and Gaussian deviations whose strength at every place and scale is learned.
+    """A template plus Gaussian deviations whose strength is learned by position and scale.
 
-    The template is the embedded diffuse Galaxy; how much of it there is, whether the catalogue's
-    sources are there, C_ell of the deviations, and how their strength goes with the template's
-    brightness, with the Galactic plane and from place to place are all told by the data.
+    The template is the embedded diffuse Galaxy. The data determine its amplitude, whether the
+    catalogue's sources are present, C_ell of the deviations, and how their strength varies with
+    the template's brightness, with the Galactic plane and with position.
 
     Attributes
     ----------
     sources : bool
-        Allow for the catalogue's sources.
+        Allow for the sources of the catalogue.
     """
 
     # as of the isotropic one
@@ -229,21 +229,21 @@ PriorSection = one_of(PRIOR_SECTIONS, _complete_prior)
 
 
 class LogNormalSection(Section):
-    """The positive sky of the program ``log_normal``, which has a prior of its own.
+    """The positive sky of the program ``log_normal``, which uses its own prior.
 
-    It is the embedded diffuse Galaxy times the exponential of a Gaussian field, whose C_ell is
-    A^2 ((ell + 1) / 10)^tilt. A and the tilt are sampled with the sky, or given.
+    The sky is the embedded diffuse Galaxy times the exponential of a Gaussian field with
+    C_ell = A^2 ((ell + 1) / 10)^tilt. A and the tilt are fixed or sampled with the sky.
 
     Attributes
     ----------
     amplitude : float
-        A, of the logarithm of the sky over the Galaxy; sampled, with the tilt, if it is left out.
+        Amplitude A of ln(sky / Galaxy); if omitted, A and the tilt are sampled.
     tilt : float
-        Slope of C_ell; needed with A.
+        Slope of C_ell; required with ``amplitude``.
     scale_std : float
-        Standard deviation of the logarithm of the Galaxy's overall scale.
+        Prior standard deviation of ln of the Galaxy's overall scale.
     sources : bool
-        Add the catalogue's sources, each with a positive flux that may be small.
+        Include the catalogue's sources, each with a positive flux that may be small.
     """
 
     amplitude: Positive | None = None
@@ -276,9 +276,9 @@ MOST_UNKNOWNS = 10_000
 
 
 class SpectralSection(Section):
-    """The prior on skies of several frequencies that are mapped together.
+    """The prior on skies of several frequencies that are mapped jointly.
 
-    C_ell of components and kernel follow from the scenario's skies; that of positive skies is
+    For components and kernel, C_ell follows from the scenario's skies; for positive skies it is
     learned from the data.
 
     Attributes
@@ -290,22 +290,22 @@ class SpectralSection(Section):
         Spectra of the maps: a power law, its curvature (times ln nu) and its turnover (times
         1 - exp(-tau), tau = (turnover_mhz / nu)^2.1).
     fields : tuple of str
-        What varies over positive skies: their level, spectral index and curvature (times ln nu and
-        ln^2 nu), and the optical depth at turnover_mhz, which goes as nu^-2.1.
+        Quantities that vary across positive skies: level, spectral index and curvature (times ln nu
+        and ln^2 nu), and the optical depth at turnover_mhz, which scales as nu^-2.1.
     sources : bool
-        Give the catalogue's sources fluxes of their own in every channel of positive skies, each as
-        uncertain as it is large.
+        For positive skies, fit the flux of each catalogue source independently in every channel,
+        with an uncertainty equal to the flux.
     index : float
         Spectral index of the power law.
     reference_mhz : float
-        Frequency at which the components are given.
+        Reference frequency of the components.
     turnover_mhz : float
-        Frequency of optical depth 1 in the turnover.
+        Frequency at which the turnover has optical depth 1.
     length : float
         Correlation length of the Gaussian process in ln nu.
     residual : float
-        rms of what each channel has of its own, over that of its sky; by default what the
-        components leave of the skies, 0.01 with the kernel.
+        rms of the part that is independent in each channel, relative to the rms of its sky;
+        default: the part of the skies outside the components, or 0.01 with the kernel.
     """
 
     model: Literal["components", "kernel", "positive"] = "components"

@@ -100,8 +100,8 @@ class NullDirection:
         if self.share <= WORTH:
             return ""
         return (
-            f"These data hardly tell one combination of what looks alike ({self.words()}, in prior "
-            f"standard deviations): it keeps {self.share:.0%} of its prior variance."
+            f"One parameter combination is nearly unconstrained ({self.words()}, in prior standard "
+            f"deviations): its variance is {self.share:.0%} of the prior variance."
         )
 
 
@@ -145,13 +145,13 @@ class UnknownsReport:
         found = []
         if self.common is not None and self.common > UNTOLD:
             found.append(
-                "The common gain of all ports keeps its prior (standard deviation "
-                f"{self.common:.2f} of the prior's): no sky of unknown brightness tells it."
+                "The common gain of all ports is unconstrained (standard deviation "
+                f"{self.common:.2f} of the prior's): it is degenerate with the sky's brightness."
             )
         if self.onto:
             found.append(
-                "Receivers, ground and gains are what the new data alone tell of them; those of "
-                "the earlier data are in the folder that the map was made onto."
+                "Receivers, ground and gains are constrained here by the new data only; for the "
+                "earlier data, see the folder of the earlier map."
             )
         return found
 
@@ -180,7 +180,7 @@ def _line(name: str, row: Mapping[str, Any]) -> str:
     unit = f" {row['unit']}" if row.get("unit") else ""
     text = f"{name}: {row['value']:.4g} +- {row['std']:.2g}{unit}"
     if row["std"] > UNTOLD * row["prior_std"]:
-        text += f", the prior's {row['prior_std']:.2g}: these data do not tell it"
+        text += f" (unconstrained: prior +- {row['prior_std']:.2g})"
     return text
 
 
@@ -501,7 +501,7 @@ class PointingReport:
         lines = []
         for row in [] if self.offsets is None else self.offsets.to_dict("records"):
             left = row["beyond_first_order"]
-            text = f"{_line(row['offset'], row)}; beyond first order {left:.1g} of the noise"
+            text = f"{_line(row['offset'], row)}; beyond first order: {left:.1g} of the noise"
             if left > NEGLIGIBLE:
                 text += ", too much: set noise.pointing.treatment=sampled"
             lines.append(text)
@@ -598,6 +598,6 @@ def flux_lines(fluxes: pd.DataFrame) -> list[str]:
         name = row["source"] if row["block"] == 0 else f"{row['source']} ({row['block']})"
         text = f"{name}: {row['flux_jy']:.4g} +- {row['std_jy']:.2g} Jy"
         if not row["above_horizon"]:
-            text += ", the prior's: it is never above the horizon"
+            text += " (prior: never above the horizon)"
         lines.append(text)
     return lines

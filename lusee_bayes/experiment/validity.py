@@ -168,10 +168,10 @@ def blind_sentence(spots: Iterable[BlindSpot]) -> str:
         return ""
     unseen = sorted(unseen, key=lambda spot: -spot.bias)[:MOST_NAMED]
     return (
-        "The model takes the instrument for exact, and the residual chi^2 would not show an error "
-        f"of {', '.join(spot.words() for spot in unseen)}; in brackets, by how many of its "
-        "standard deviations (rms) such an error moves the map. noise.beam.parameters and "
-        "noise.fields make them unknowns; a second turntable angle shows more of them."
+        "The model assumes an exact instrument, and residual chi2 would not reveal an error of "
+        f"{', '.join(spot.words() for spot in unseen)}; in brackets, the resulting error of the "
+        "map in standard deviations (rms). noise.beam.parameters and noise.fields include such "
+        "errors; a second turntable angle reveals more of them."
     )
 
 
@@ -248,8 +248,8 @@ def about_sky_above(setup: Setup) -> str:
     enough = lmax + int(np.argmax(rest < np.sqrt(2.0 * len(above.root))))
     return (
         f"The sky above lmax = {lmax} adds about {added:.2g} standard deviations of the noise to "
-        "every datum (rms). It is integrated out, so that the error bars hold, but the data tell "
-        f"less of the map; above lmax = {enough} it would add less to chi^2 than chance."
+        "every datum (rms). It is marginalised: the error bars are valid, but larger. Above lmax = "
+        f"{enough} it would add less to chi2 than chance."
     )
 
 
@@ -266,12 +266,12 @@ def reach(experiment: Experiment, found: Inference) -> list[str]:
     k, moved_by = weighed(setup, np.asarray(experiment.data.data), found) or (0.0, 0.0)
     if k > LARGEST_K:
         keys = ", ".join(dict.fromkeys(part.systematic.key for part in found.moving))
-        holds = "its errors hold" if moved_by < LARGEST_MOVE else "its errors do not hold"
+        holds = "its errors are valid" if moved_by < LARGEST_MOVE else "its errors are not valid"
         sentences.append(
-            f"The Gaussian about the found values of {keys} is not all of their posterior (Pareto "
-            f"k = {k:.2g}, accepted: {LARGEST_K:g}). What is beyond first order moves the map by "
-            f"{moved_by:.2g} of its standard deviations (rms), so that {holds}; "
-            "treatment=sampled does without the Gaussian."
+            f"The posterior of {keys} is not Gaussian (Pareto k = {k:.2g}, accepted: "
+            f"{LARGEST_K:g}). Terms beyond first order move the map by {moved_by:.2g} of its "
+            f"standard deviations (rms), so that {holds}; treatment=sampled avoids the Gaussian "
+            "approximation."
         )
     sentences += filter(None, [about_sky_above(setup)])
     if setup.measured:

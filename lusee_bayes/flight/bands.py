@@ -103,9 +103,9 @@ class ChannelBand:
         # two further powers are fitted to find lines
         if len(within) < degree + 4:
             raise InputError(
-                f"the band of {bandwidth_mhz:g} MHz about {frequency_mhz:g} MHz has {len(within)} "
-                f"bins, and a polynomial of degree {degree} needs {degree + 4} to be checked; "
-                "use a larger flight.bandwidth_hz or a lower flight.degree"
+                f"the band of {bandwidth_mhz:g} MHz around {frequency_mhz:g} MHz has {len(within)} "
+                f"bins, but testing a polynomial of degree {degree} takes {degree + 4}; use a "
+                "larger flight.bandwidth_hz or a lower flight.degree"
             )
         first, last = int(within[0]), int(within[-1]) + 1
         finer = (x[first:last, :, None] ** np.arange(degree + 3)).mean(axis=1)

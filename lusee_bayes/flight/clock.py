@@ -140,8 +140,8 @@ def read_clock(path: str | Path) -> Clock:
     found = read_model(path, _ClockFile, "a clock reference", hint)
     if (found.stated_utc_isot is None) == (found.clocks is None):
         raise InputError(
-            f"{path} needs either clocks, for sessions whose UTC is not known, or stated_utc_isot, "
-            "to correct the UTC that sessions state; see docs/howto/first_light.md"
+            f"{path} needs either clocks, for sessions whose UTC is unknown, or stated_utc_isot, "
+            "to correct the UTC stated in sessions; see docs/howto/first_light.md"
         )
     with naming(path):
         scale = scale_of("time_scale", found.time_scale)
@@ -175,13 +175,13 @@ def clock_of(path: str | Path, said: Clock | None, given: Clock | None, raw_s: T
     """
     if given is None and said is None:
         raise InputError(
-            f"{path} does not say which UTC its clock stands for (its time scale is unknown), and "
-            "a wrong scale or epoch turns the map; give --clock clock.json (epoch, scale, rate)"
+            f"{path} does not specify the UTC of its clock (its time scale is unknown), and a "
+            "wrong scale or epoch rotates the map; give --clock clock.json (epoch, scale, rate)"
         )
     if given is not None and given.stated is not None:
         if said is None:
             raise InputError(
-                f"{path} states no UTC that {given.source} could correct; give a clock file with "
+                f"{path} contains no UTC for {given.source} to correct; give a clock file with "
                 "clocks in place of stated_utc_isot"
             )
         with unannounced_leap_seconds():
@@ -192,8 +192,8 @@ def clock_of(path: str | Path, said: Clock | None, given: Clock | None, raw_s: T
         return said or given
     if (differ := given.differs_s(said, raw_s)) > SAME_S:
         raise InputError(
-            f"{path} and {given.source} differ by {differ:.6g} s about the clock: the session says "
-            f"{said.scale.upper()}, the clock file {given.scale.upper()}; leave out --clock, or "
-            "give one with stated_utc_isot, which corrects the session's"
+            f"{path} and {given.source} differ by {differ:.6g} s on the clock: the session has "
+            f"{said.scale.upper()}, the clock file {given.scale.upper()}; omit --clock, or give a "
+            "file with stated_utc_isot, which corrects the session's"
         )
     return given

@@ -176,7 +176,7 @@ def read_lines(path: str | Path) -> tuple[float, ...]:
     InputError
         If it cannot be read.
     """
-    found = read_table(path, TABLE, "write a line 'frequency_mhz,source' and one for each")
+    found = read_table(path, TABLE, "write a header 'frequency_mhz,source' and one line for each")
     return tuple(found["frequency_mhz"].tolist())
 
 

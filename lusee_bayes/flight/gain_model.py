@@ -94,7 +94,7 @@ class GainModel(Described):
         for name, shape in (shapes | {"coefficient": [N_COMPONENTS, N_TERMS]}).items():
             require_shape(f"{self.path}: {name}", getattr(self, name), (*LEAD, *shape))
         if not (np.diff(self.anchor_mhz, axis=2) > 0.0).all():
-            raise InputError(f"{self.path}: the frequencies of the gains do not grow")
+            raise InputError(f"{self.path}: the frequencies of the gains do not increase")
         require_mhz(f"{self.path}: the frequencies of the gains", self.anchor_mhz)
         require_positive(f"{self.path}: the mean gain", self.mean, "give counts for 1 nV^2/Hz")
 
@@ -131,8 +131,8 @@ class GainModel(Described):
             return self
         if self.component_std is not None:
             raise InputError(
-                f"{self.path} says by how much its components may be off, and so does "
-                "flight.component_std; leave that out"
+                f"{self.path} already contains the errors of its components; remove "
+                "flight.component_std"
             )
         return replace(self, component_std=np.broadcast_to(std, self.components.shape[:3]).copy())
 
@@ -153,7 +153,7 @@ class GainModel(Described):
         """
         if lacking := [name for name in TELEMETRY if name not in telemetry]:
             raise InputError(
-                f"the telemetry lacks {', '.join(lacking)}, by which the gain table predicts "
+                f"the telemetry lacks {', '.join(lacking)}, from which the gain table predicts "
                 "gains; ingest the session with its telemetry, interpolated to the spectra"
             )
         known = {"1": np.ones_like(telemetry[TELEMETRY[0]]), **telemetry}
@@ -247,8 +247,8 @@ def draw_gains(
             errors[name] = float(generator.standard_normal())
             if (factor := 1.0 + gain_std * errors[name]) <= 0.0:
                 raise InputError(
-                    f"with a standard deviation of {gain_std:g} of itself the gain of {name} "
-                    "was drawn below zero; give a smaller flight.gain_std"
+                    f"with a relative standard deviation of {gain_std:g}, the sampled gain of "
+                    f"{name} is negative; give a smaller flight.gain_std"
                 )
             mean[place] *= factor
             coefficient[place] *= factor
@@ -334,7 +334,7 @@ def _coefficients(path: Path, model: str) -> np.ndarray:
         name = f"{setting.strip().upper()} {component.strip().upper()} {term.strip()}"
         require_known(f"{path}: line {number}: unknown coefficient", name, places)
         if name in seen:
-            raise InputError(f"{path}: line {number} gives {name} a second time")
+            raise InputError(f"{path}: line {number} repeats {name}")
         seen.add(name)
         found[places[name]] = value
     given = {name.rpartition(" ")[0] for name in seen}

@@ -58,7 +58,7 @@ def said_in(file: Mapping[str, Any]) -> dict[str, Any]:
 def no_spectra(path: Path, lacking: str, there: Iterable[str]) -> InputError:
     """Return the error of a file without spectra, with what is there."""
     return InputError(
-        f"{path} has no {lacking}: the session holds no spectra (it has "
+        f"{path} has no {lacking}: the session contains no spectra (it has "
         f"{', '.join(there) or 'nothing'})"
     )
 
@@ -91,7 +91,7 @@ def session_of_hdf5(path: Path, file: h5py.File, opener: Opener) -> Session:
     if "time" in group and "raw_times" in file["spectra"]:
         theirs, ours = np.asarray(group["time"]), np.asarray(file["spectra/raw_times"])
         if not np.array_equal(theirs, ours):
-            raise InputError(f"{path}: {INTERPOLATED}/time are not the times of the spectra")
+            raise InputError(f"{path}: {INTERPOLATED}/time differs from the times of the spectra")
     arrays |= {f"telemetry/{name}": group[name] for name in TELEMETRY if name in group}
     return _checked_session(path, "HDF5", arrays, said_in(file), opener)
 

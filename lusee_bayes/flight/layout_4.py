@@ -98,14 +98,14 @@ def _metadata(path: Path, file: h5py.File, n: int) -> dict[str, Unread]:
             continue
         if tuple(values.shape)[:1] != (n,):
             raise InputError(
-                f"{path}: {META}/fields/{theirs} is there in the shape {tuple(values.shape)} for "
-                f"{n} spectra, or has several shapes; ingest the session again"
+                f"{path}: {META}/fields/{theirs} has shape {tuple(values.shape)} for {n} spectra, "
+                "or several shapes; ingest the session again"
             )
         rows = _dataset(file, f"{META}/fields/{theirs}/variant_000/row_indices")
         if rows is not None and not np.array_equal(np.asarray(rows), np.arange(n)):
             raise InputError(
-                f"{path}: row_indices of {META}/fields/{theirs} are not 0 to {n - 1}, a number for "
-                "each spectrum; ingest the session again"
+                f"{path}: row_indices of {META}/fields/{theirs} are not 0 to {n - 1}, one for each "
+                "spectrum; ingest the session again"
             )
         found[f"{META}/{ours}"] = values
     if (navgf := _dataset(file, "spectra/navgf")) is not None:
@@ -155,8 +155,8 @@ def _telemetry_at_rows(path: Path, file: h5py.File, clock: Clock, raw_s: Rows) -
         if array is None:
             raise InputError(
                 f"{path}: telemetry has no {name} (it has "
-                f"{', '.join(file['telemetry']) or 'nothing'}); ingest the session again "
-                "with luseepy's present version"
+                f"{', '.join(file['telemetry']) or 'nothing'}); ingest the session again with the "
+                "current luseepy"
             )
     names = np.asarray(found["field_names"]).tolist()
     seconds, ticks, values = (np.asarray(found[name], dtype=np.float64) for name in parts[1:])
@@ -184,7 +184,7 @@ def _interpolated_to(where: str, raw_s: Rows, times_s: Times, values: Times) -> 
     slack = 2.0 * float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
     if not len(times_s) or raw_s[0] < times_s[0] - slack or raw_s[-1] > times_s[-1] + slack:
         raise InputError(
-            f"{where} does not cover the spectra, so that their gain is not known; ingest the "
+            f"{where} does not cover the spectra, so that their gain is unknown; ingest the "
             "session with its telemetry"
         )
     return np.interp(raw_s, times_s, values)

@@ -32,46 +32,46 @@ Levels = Annotated[str, Field(pattern="^[LMH]{4}$")]
 
 
 class FlightSimulatedSection(Section):
-    """Sessions that ``simulate --flight`` writes; by default nothing disturbs them.
+    """Sessions written by ``simulate --flight``; by default without disturbances.
 
     Attributes
     ----------
     kind : {"hdf5", "fits"}
-        Of file.
+        File format.
     navgf : {1, 2, 3, 4}
-        Averaging over channels.
+        Averaging over channels (Navgf).
     levels : str
-        Gains of the four ports, of L, M and H.
+        Gain levels of the four ports, each L, M or H.
     session_h : float
-        Length of a session.
+        Session length.
     clock : {"known", "unknown"}
-        Whether the files say which UTC their clock stands for; if not, a clock file does.
+        Whether the files relate their clock to UTC; if not, a separate clock file does.
     radiometer : bool
-        Add the radiometer noise of every channel.
+        Add radiometer noise to every channel.
     switch_h : float
-        When the gains change to ``switch_levels``, from the beginning of the observation.
+        Time from the start of the observation at which gains change to ``switch_levels``.
     switch_levels : str
-        Gains from then on.
+        Gain levels after that change.
     absent_share : float
-        Share of the spectra that lack one of the products.
+        Fraction of spectra that lack one product.
     saturated_share : float
-        Share of the spectra in which the ADCs are at their ends.
+        Fraction of spectra with saturated ADCs.
     tones_mhz : tuple of float
-        Frequencies of tones, each in one channel.
+        Frequencies of tones, each confined to one channel.
     tone_share : float
-        Share of the spectra that have the tones.
+        Fraction of spectra that contain the tones.
     tone_factor : float
-        Power of a tone, in multiples of the radiometer noise of a channel.
+        Power of a tone, in units of the radiometer noise of a channel.
     comb_share : float
-        Share of the spectra in which the calibrator's comb is on.
+        Fraction of spectra with the calibrator's comb on.
     comb_factor : float
-        Power of each of its lines, in multiples of the radiometer noise of a channel.
+        Power of each comb line, in units of the radiometer noise of a channel.
     burst_every_h : float
-        Mean time from burst to burst, as those of Jupiter and the Sun.
+        Mean time between bursts, such as those of Jupiter and the Sun.
     burst_s : float
-        Length of the longest; the shortest last for a spectrum.
+        Duration of the longest burst; the shortest last one spectrum.
     burst_factor : float
-        Power of a burst, in multiples of the radiometer noise of a spectrum in 1 MHz.
+        Power of a burst, in units of the radiometer noise of a spectrum in 1 MHz.
     """
 
     kind: Literal["hdf5", "fits"] = "hdf5"
@@ -100,52 +100,52 @@ Rare = Annotated[float, Field(ge=1e-12, le=0.1)]
 
 
 class FlightSection(Section):
-    """How sessions of the spectrometer become visibilities, where --data are sessions.
+    """Reduction of spectrometer sessions to visibilities, for --data that are sessions.
 
     Attributes
     ----------
     gain_table : str
-        Folder of luseepy's gain model, or a gain table in netCDF.
+        Folder of luseepy's gain model, or a netCDF gain table.
     gain_model : {"quadratic", "linear"}
-        Which coefficients of luseepy's folder.
+        Coefficients to use from luseepy's folder.
     component_std : tuple of float
-        Standard deviations of the strengths of the two components of the gains, of each level of
-        each port on its own, where the gain table does not have them.
+        Standard deviations of the strengths of the two gain components, independent for each level
+        of each port; used if the gain table lacks them.
     gain_std : float
-        Standard deviation of the power gain of each level of each port, relative, besides; of each
-        port, if simulated with ``noise.gain_table`` as anything but sessions.
+        Additional relative standard deviation of the power gain, for each level of each port; for
+        each port, if ``noise.gain_table`` simulates data other than sessions.
     bin_origin : {"centre", "edge"}
-        What of channel k lies at k times 25 kHz. It is not settled, and has to be said.
+        Point of channel k that lies at k times 25 kHz. The convention is not settled: set this key.
     clock : str
-        Clock reference in JSON, for files with no absolute time, or to correct the UTC that they
-        state.
+        Clock reference (JSON), for files with no absolute time, or to correct the UTC in the
+        files.
     site : {"file", "scenario"}
-        Whose site counts: luseepy writes one that nobody has established if it is told none.
+        Where to read the site; luseepy files contain a placeholder if none was configured.
     bandwidth_hz : float
-        Width of the band about the frequency of a map.
+        Width of the band around the frequency of a map.
     degree : int
-        Of the polynomial that is fitted to the spectrum in the band, and taken in its middle.
+        Degree of the polynomial fitted to the spectrum in the band and evaluated at its middle.
     filter_taps : int
-        Taps of the filter bank: how much noise neighbouring channels share; 0 for none.
+        Taps of the filter bank, which set how much noise neighbouring channels share; 0 for none.
     filter_window : {"rectangular", "hann", "hamming", "blackman"}
-        Its window.
+        Window of the filter bank.
     convention : {"s_i conj(s_j)", "conj(s_i) s_j"}
-        What the complex products are the mean of.
+        Quantity whose mean is a complex product.
     per_kelvin_v2_hz : float
-        V^2/Hz that 1 K makes at each port, for beams that know no volts.
+        V^2/Hz that 1 K produces at each port, for beams not calibrated in volts.
     turntable_deg : float
-        Angle of the turntable, from East towards North.
+        Turntable angle, from East towards North.
     lines : str
-        CSV table of known lines: frequency_mhz, source.
+        CSV table of known lines, with columns frequency_mhz and source.
     comb : {"found", "always", "never"}
-        Whether the calibrator's comb is looked for in every spectrum, or known to be on or off.
+        Search every spectrum for the calibrator's comb, or assume that it is always or never on.
     false_alarm : float
-        Chance that a value of pure noise is flagged, of each kind of test.
+        Probability that a test flags a value of pure noise, for each kind of test.
     leave_out : bool
-        Flag bins of time, single values, products and days that do not fit what all others predict
-        for them.
+        Flag time bins, single values, products and days that are inconsistent with the rest of the
+        data.
     simulated : FlightSimulatedSection
-        Sessions that are simulated, and what disturbs them.
+        Simulated sessions and their disturbances.
     """
 
     gain_table: str | None = None
@@ -170,7 +170,7 @@ class FlightSection(Section):
 
     _gains_are_positive = requires(
         lambda section: section.gain_std is None or section.gain_std < 1.0,
-        "gain_std is relative to the gain; give a number below 1",
+        "gain_std is relative to the gain; set it below 1",
     )
 
     @property
@@ -277,9 +277,8 @@ def timeline(sessions: Sequence[Session], recipe: Recipe) -> Timeline:
     """
     if recipe.timestamp == "instant" and recipe.average_s is not None:
         raise InputError(
-            "the times of the spectra are said to be instants (observation.timestamp=instant), "
-            "which have no mean over a time; leave out observation.average_s, or say "
-            "observation.timestamp=middle"
+            "the times of the spectra are declared instants (observation.timestamp=instant), which "
+            "cannot be averaged; remove observation.average_s, or set observation.timestamp=middle"
         )
     found = [(s, clock_of(s.path, s.clock, recipe.clock, s.raw_s).utc(s.raw_s)) for s in sessions]
     found.sort(key=lambda one: one[1][0].jd)
@@ -321,8 +320,8 @@ def _site(sessions: Sequence[Session]) -> tuple[float, float]:
         differ = max(abs(other.lon_deg - first.lon_deg), abs(other.lat_deg - first.lat_deg))
         if differ > SAME_SITE_DEG:
             raise InputError(
-                f"{first.path} is of longitude {first.lon_deg:g}, latitude {first.lat_deg:g} "
-                f"degrees, {other.path} of {other.lon_deg:g}, {other.lat_deg:g}; where the files "
-                "have a site that nobody has established, use --set flight.site=scenario"
+                f"{first.path} is at longitude {first.lon_deg:g}, latitude {first.lat_deg:g} "
+                f"degrees, {other.path} at {other.lon_deg:g}, {other.lat_deg:g}; if the site in "
+                "the files is a placeholder, use --set flight.site=scenario"
             )
     return first.lon_deg, first.lat_deg

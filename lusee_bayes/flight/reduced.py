@@ -203,21 +203,21 @@ class Reduced(Described):
     def notes(self) -> tuple[str, ...]:
         """Return what has been taken from elsewhere than the sessions, a sentence each."""
         if corrected := {s["clock_file"] for s in self.sessions if s["clock"] == CORRECTED}:
-            return (f"The UTC that the sessions state is corrected by {corrected.pop()}.",)
+            return (f"The UTC stated in the sessions is corrected by {corrected.pop()}.",)
         told = [s for s in self.sessions if s["clock"] == "clock file" and s.get("clock_file")]
         if not told:
             return ()
         who = Path(told[0]["file"]).name if len(told) == 1 else f"{len(told)} sessions"
         verb = "does" if len(told) == 1 else "do"
         return (
-            f"{who} {verb} not say which UTC the clock stands for: its scale "
-            f"({told[0]['scale'].upper()}) and epoch are those of the clock file "
+            f"{who} {verb} not specify the UTC of the clock: its scale "
+            f"({told[0]['scale'].upper()}) and epoch come from the clock file "
             f"{told[0]['clock_file']}.",
         )
 
     def band(self, frequency_mhz: float) -> int:
         """Return the number of the band at a frequency. InputError if there is none."""
-        what = "the reduction, which can be repeated, has no band"
+        what = "the reduction has no band"
         return place_of(what, self.frequencies_mhz, frequency_mhz)
 
     def bins_at(self, band: int) -> Left:
@@ -260,19 +260,19 @@ class Reduced(Described):
         found = []
         if sum(self.flagged(band).values()) > MUCH:
             found.append(
-                f"The rules of the reduction {self.flag_line(band)}. That is more than a fifth: "
-                "check the sessions, flight.false_alarm, flight.lines and flight.comb."
+                f"The reduction {self.flag_line(band)}. This is more than 20 %: check the "
+                "sessions, flight.false_alarm, flight.lines and flight.comb."
             )
         noise, curvature = float(self.scatter[band]), float(self.curvature[band])
         if noise > NOISY:
             found.append(
-                f"Spectra scatter {noise:.2g} times as much in time as the radiometer's noise: "
-                "gains drift, or something else than the sky changes; consider noise.gain."
+                f"The scatter of spectra in time is {noise:.2g} times the radiometer noise: gains "
+                "drift, or something other than the sky changes; consider noise.gain."
             )
         if curvature > CURVED:
             found.append(
-                f"The spectrum within the band is no polynomial of that degree: two more powers "
-                f"move a value by {curvature:.2g} standard deviations; use a smaller "
+                "A polynomial of degree flight.degree does not fit the band: two more powers "
+                f"change a value by {curvature:.2g} standard deviations; use a smaller "
                 "flight.bandwidth_hz, or a higher flight.degree."
             )
         return tuple(found)
@@ -301,8 +301,8 @@ class Reduced(Described):
         if not (bins := self.bins_at(band)).size:
             counts = zip(REASONS[1:], self._counts(band)[1:], strict=True)
             raise InputError(
-                f"nothing is left of the spectra at {frequency_mhz:g} MHz: of "
-                f"{self.reason.shape[1]}, {', '.join(f'{name} {n}' for name, n in counts if n)}"
+                f"no spectra are left at {frequency_mhz:g} MHz: of {self.reason.shape[1]}, "
+                f"{', '.join(f'{name} {n}' for name, n in counts if n)}"
             )
         keep = (self.reason[band] == USED) & np.isin(self.bin_of, bins)
         if self.average_s is None:
@@ -468,7 +468,7 @@ def read_reduced(path: str | Path) -> Reduced:
     with opened_tree(path, formats.REDUCED, "reduced spectra", HINT) as tree:
         saved = from_tree(_Saved, tree, str(path))
     if tuple(saved.product) != labels():
-        raise InputError(f"{path} has other products than {', '.join(labels())}")
+        raise InputError(f"{path} does not have the products {', '.join(labels())}")
     with naming(path):
         require_shape("level", saved.level, (None, PORTS))
         require_shape("curves", saved.curves.gain, (*LEAD, None))
@@ -481,7 +481,7 @@ def read_reduced(path: str | Path) -> Reduced:
         runs = saved.run, tuple(saved.turntable_deg.tolist()), saved.step_s
         observation = Observation(*place, times, *runs, windows=windows)
     if saved.bin_of.max() >= saved.n_averaged.shape[1]:
-        raise InputError(f"{path}: bin_of goes beyond the {saved.n_averaged.shape[1]} bins")
+        raise InputError(f"{path}: bin_of exceeds the {saved.n_averaged.shape[1]} bins")
     return Reduced(
         observation=observation,
         before=saved.before_flags.astype(np.float64),

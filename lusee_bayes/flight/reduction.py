@@ -61,8 +61,8 @@ def reduce_sessions(
     line = timeline(sessions, recipe)
     if recipe.average_s is not None and recipe.average_s < line.observation.step_s:
         raise InputError(
-            f"the spectra are to be averaged over {recipe.average_s:g} s, and last for "
-            f"{line.observation.step_s:g} s; use a longer observation.average_s, or none"
+            f"observation.average_s is {recipe.average_s:g} s, shorter than a spectrum "
+            f"({line.observation.step_s:g} s); use a longer one, or none"
         )
     level = np.concatenate([s.level for s in line.sessions])
     like = _in_common(line, recipe, level)

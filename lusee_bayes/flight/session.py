@@ -186,8 +186,8 @@ class Session(Described, Recorded):
         if (back := np.flatnonzero(~(np.diff(self.raw_s) > 0.0))).size:
             k = int(back[0])
             raise InputError(
-                f"{self.path}: spectrum {k + 1} (clock {self.raw_s[k + 1]:.6f} s) does not come "
-                f"after spectrum {k} ({self.raw_s[k]:.6f} s); the spectra have to be in order"
+                f"{self.path}: spectrum {k + 1} (clock {self.raw_s[k + 1]:.6f} s) is not later "
+                f"than spectrum {k} ({self.raw_s[k]:.6f} s); spectra must be in order of time"
             )
         for value in np.unique(self.navgf):
             if int(value) not in AVERAGING:
@@ -225,14 +225,14 @@ class Session(Described, Recorded):
 
     def description(self) -> tuple[str, ...]:
         states = ["".join(row) for row in np.unique(self.level, axis=0)]
-        clock = "its clock stands for a UTC that the file does not say"
+        clock = "the file does not specify the UTC of its clock"
         if self.clock is not None:
             ends = self.clock.utc(self.raw_s[[0, -1]])
             clock = f"{ends[0].isot[:19]} to {ends[1].isot[:19]} UTC, clock in {self.clock.scale}"
         averaged = ", ".join(map(str, np.unique(self.navgf)))
         lengths = dict.fromkeys((self.window_s.min(), self.window_s.max()))
         length = " to ".join(f"{length:.6g}" for length in lengths)
-        notch = "not said" if self.notch is None else f"{int((self.notch > 0).sum())} with it"
+        notch = "unknown" if self.notch is None else f"{int((self.notch > 0).sum())} with it"
         lacking = [name for name in TELEMETRY if name not in self.telemetry]
         unused = [f"{name} ({counted(n, 'row')})" for name, n in self.unused.items()]
         return (
@@ -344,8 +344,8 @@ def _levels(path: Path, arrays: Mapping[str, Unread], n: int) -> PortLevels:
     """Gain levels, of the flight software's numbers or of letters."""
     if (name := f"{META}/actual_gain") not in arrays:
         raise InputError(
-            f"{path} has no {name}, which says the gain of every spectrum; ingest the session "
-            "again with luseepy's present version"
+            f"{path} has no {name}, the gain of every spectrum; ingest the session again with the "
+            "current luseepy"
         )
     codes = np.asarray(arrays[name])
     if codes.dtype.kind == "S" and codes.shape == (n,):
@@ -354,7 +354,7 @@ def _levels(path: Path, arrays: Mapping[str, Unread], n: int) -> PortLevels:
     if codes.shape != (n, PORTS):
         raise InputError(f"{path}: {name} has shape {codes.shape}, expected ({n}, {PORTS})")
     if codes.dtype.kind not in "iuSU":
-        raise InputError(f"{path}: {name} holds {codes.dtype}, expected gain codes or letters")
+        raise InputError(f"{path}: {name} contains {codes.dtype}, expected gain codes or letters")
     if codes.dtype.kind in "iu":
         codes = np.select([codes == code for code in CODES.values()], LETTERS, NO_LEVEL)
     levels = codes.astype("U1")

@@ -53,13 +53,13 @@ def read_session(path: str | Path) -> Session:
         with opened(path, FITS) as hdus:
             if _version_of(path, hdus[0].header.get("LAYOUTV")) == 4:
                 raise InputError(
-                    f"{path} is of layout 4 in FITS; this version reads layout 4 in HDF5: ingest "
-                    "the session again with luseepy, as HDF5"
+                    f"{path} is of layout 4 in FITS, but this version reads layout 4 only in HDF5; "
+                    "ingest the session again with luseepy, as HDF5"
                 )
             return session_of_fits(path, hdus, partial(_fits_spectra, path))
     with reading(path, HDF5):
         if not h5py.is_hdf5(path):
-            raise InputError(f"{path} is neither HDF5 nor FITS, and so no session of lusee.ingest")
+            raise InputError(f"{path} is neither HDF5 nor FITS; expected a session of lusee.ingest")
         require_readable_hdf5(path)
         with h5py.File(path) as file:
             version = _version_of(path, file.attrs.get("layout_version"))
@@ -71,16 +71,16 @@ def _version_of(path: Path, version: Any) -> int:
     """The version of a layout. InputError if it is none that this package reads."""
     if version is None:
         raise InputError(
-            f"{path} has no layout_version: it is no session of luseepy's lusee.ingest"
+            f"{path} has no layout_version; expected a session of luseepy's lusee.ingest"
         )
     if (number := int(version)) < 3:
         raise InputError(
-            f"{path} is of layout {number}, in which bit slices are not restored; ingest the "
-            "session again with luseepy, which writes layout 3 or newer"
+            f"{path} is of layout {number}, without restored bit slices; ingest the session again "
+            "with luseepy, which writes layout 3 or newer"
         )
     if number > NEWEST:
         raise InputError(
-            f"{path} is of layout {number}; this version reads 3 and {NEWEST}; get a newer one"
+            f"{path} is of layout {number}; this version reads 3 and {NEWEST}; update lusee_bayes"
         )
     return number
 
@@ -139,7 +139,7 @@ def whole_spectra(path: Path, blocks: Blocks, n_rows: int) -> Iterator[tuple[int
         yield first, full
         first += n
     if first != n_rows:
-        raise InputError(f"{path}: there are counts of {first} spectra for {n_rows} rows")
+        raise InputError(f"{path}: counts of {first} spectra for {n_rows} rows")
 
 
 # of the frames, so many are averaged by the hardware, as a power of two; software does the rest

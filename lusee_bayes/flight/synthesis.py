@@ -96,7 +96,7 @@ class ChannelSpectra:
         require_positive("the autos of the visibilities", autos)
         scale = np.sqrt(autos[:, session.FIRST_PORT] * autos[:, session.SECOND_PORT])
         matrices = np.moveaxis(to_matrix(np.moveaxis(known / scale, 1, 0)), (0, 1), (-2, -1))
-        advice = "voltages cannot be so correlated; check beams and sky"
+        advice = "voltages cannot have these correlations; check beams and sky"
         wrong = f"the visibilities of a time are not positive definite: {advice}"
         with refusing(wrong, np.linalg.LinAlgError):
             factors = np.linalg.cholesky(matrices)
@@ -348,9 +348,9 @@ def _tone_channels(
         if not kept[channel]:
             there = mhz[np.where(kept, far, np.inf).argmin()]
             raise InputError(
-                f"the tone at {tone_mhz:g} MHz is in channel {channel}, which Navgf "
-                f"{navgf} leaves out, so that no spectrum would have it; use {there:.6g} "
-                "MHz in flight.simulated.tones_mhz, or another flight.simulated.navgf"
+                f"the tone at {tone_mhz:g} MHz is in channel {channel}, which Navgf {navgf} drops, "
+                f"so that it would be in no spectrum; use {there:.6g} MHz in "
+                "flight.simulated.tones_mhz, or another flight.simulated.navgf"
             )
         tones[channel] = True
     return tones

@@ -214,21 +214,21 @@ def averaged(data: Visibilities, to_s: float) -> Visibilities:
     observation, windows = data.observation, data.observation.windows
     if windows is None:
         raise InputError(
-            "the samples are instants, which have no mean over a time; give samples with windows "
+            "the samples are instants, which cannot be averaged; give samples with windows "
             "(observation.window=mean in a simulation, observation.timestamp for other data)"
         )
     if to_s < observation.step_s - ROUNDING_S:
         raise InputError(
-            f"the data are to be averaged over {to_s:g} s, which is shorter than their samples of "
-            f"{observation.step_s:g} s; give at least that, or leave them as they are"
+            f"the averaging time of {to_s:g} s is shorter than the samples ({observation.step_s:g} "
+            "s); give at least that, or do not average"
         )
     live_s = windows.live_per_sample_s
     bin_of = bins_of(observation, windows.bounds_s, to_s)
     kept, used = by_the_rule(np.asarray(data.layout.present), bin_of, live_s)
     if not (left := np.flatnonzero(used)).size:
         raise InputError(
-            f"nothing is left of the data in bins of {to_s:g} s, in which products have no samples "
-            "in common; average over less"
+            f"averaging over {to_s:g} s leaves no data: products have no samples in common; give a "
+            "shorter time"
         )
     # bins of which something remains, counted anew
     bins, bin_of_left = np.unique(bin_of[left], return_inverse=True)
@@ -264,8 +264,8 @@ def bins_of(observation: Observation, bounds_s: Bounds, to_s: float) -> Samples:
     """
     if to_s > LONGEST_S:
         raise InputError(
-            f"the data are to be averaged over {to_s:g} s, {to_s / 86400.0:g} days; give at most "
-            f"{LONGEST_S / 86400.0:g} days, in which the Moon turns once"
+            f"the averaging time is {to_s:g} s, i.e. {to_s / 86400.0:g} days; give at most "
+            f"{LONGEST_S / 86400.0:g} days, one rotation of the Moon"
         )
     seconds = seconds_from(observation.times[0], observation.times)
     start, end = seconds + bounds_s[:, 0], seconds + bounds_s[:, 1]

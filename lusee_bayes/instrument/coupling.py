@@ -382,7 +382,7 @@ class CouplingMatrix(Coupling):
         return cls.build(beams, Pointing.of(observation, beams.lmax))
 
     def description(self) -> tuple[str, ...]:
-        how = "never formed: beams, pointing and a turn for each order m"
+        how = "applied without forming it: beams, pointing and a rotation for each order m"
         return *super().description(), *self.layout.description(), how
 
     @property

@@ -98,21 +98,21 @@ class Observation(checks.Described):
         if back.size:
             before, after = self.times[back[0]].isot, self.times[back[0] + 1].isot
             raise InputError(
-                f"times must grow from sample to sample, but sample {back[0] + 1} ({after}) does "
-                f"not come after sample {back[0]} ({before}); sort them, and give each time once"
+                f"times must increase, but sample {back[0] + 1} ({after}) is not later than sample "
+                f"{back[0]} ({before}); sort them, and give each time once"
             )
         last = self.n_runs - 1
         if not times.counts_up(self.run) or self.run[-1] != last:
             raise InputError(
-                f"run must count 0, 1, ... up to {last}, one for each turntable angle, never back"
+                f"run must count 0, 1, ... up to {last}, one per turntable angle, never decreasing"
             )
         times.require_ephemeris(self.times.jd)
         if self.windows is None:
             return
         if self.fixed_axis:
             raise InputError(
-                "a fixed axis of the Moon is for luseepy's croissant, whose samples are instants; "
-                "use observation.window=instant with it"
+                "a fixed axis of the Moon (luseepy's croissant) needs samples that are instants; "
+                "use observation.window=instant"
             )
         self.windows.require_fitting(self.times, self.step_s)
 
@@ -142,7 +142,7 @@ class Observation(checks.Described):
     ) -> Observation:
         """Return an observation of runs that follow one another; defaults as in the paper.
 
-        A run of c cycles holds floor(c cycle / step_s) samples, start + k step_s; the next begins
+        A run of c cycles has floor(c cycle / step_s) samples, start + k step_s; the next begins
         c cycles later.
 
         Parameters
@@ -234,8 +234,8 @@ class Observation(checks.Described):
             times_s, windows = times_s + half, times.Windows.whole(-half, half, live_s)
         elif (live_s < length_s).any():
             raise InputError(
-                "samples that are instants have no duty cycle; take windows "
-                "(observation.window=mean), or leave out the schedule's duty_cycle"
+                "samples that are instants have no duty cycle; use windows "
+                "(observation.window=mean), or remove the schedule's duty_cycle"
             )
         at = times.later(t0, times_s)
         observation = cls(times=at, run=number[cut_of], windows=windows, **place)
@@ -250,7 +250,7 @@ class Observation(checks.Described):
         for k, cut in enumerate(cuts):
             if not keep[cut_of == k].any():
                 raise InputError(
-                    f"{cut.name} holds no lunar night; lengthen it, move it or drop night_only"
+                    f"{cut.name} contains no lunar night; lengthen it, move it or drop night_only"
                 )
         return observation.select(keep)
 

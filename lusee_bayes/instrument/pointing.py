@@ -228,7 +228,7 @@ def offset_names(kinds: tuple[str, ...], n_runs: int) -> tuple[str, ...]:
     """
     names: list[str] = []
     for kind in kinds:
-        require_known("there is no offset", kind, OFFSETS)
+        require_known("unknown offset", kind, OFFSETS)
         names += _of_runs(n_runs) if kind == "turntable_deg" else [kind]
     return tuple(names)
 

@@ -72,7 +72,7 @@ def antennas_of(n_products: int) -> int:
     """Return the number of antennas that have so many products. InputError if none has."""
     n = round(np.sqrt(n_products))
     if n * n != n_products:
-        raise InputError(f"{n_products} products do not come from any number of antennas (n^2)")
+        raise InputError(f"{n_products} products do not match any number of antennas; expected n^2")
     return n
 
 
@@ -129,9 +129,9 @@ def in_order(
     grid = np.full((len(places), *columns[0][1].shape), np.nan)
     for number, (name, values) in enumerate(columns):
         if name not in places:
-            raise InputError(f"there is no product '{name}'; known: {', '.join(places)}")
+            raise InputError(f"unknown product '{name}'; known: {', '.join(places)}")
         if name in [other for other, _ in columns[:number]]:
-            raise InputError(f"the product {name} is given more than once; name each once")
+            raise InputError(f"the product {name} is listed twice; list each once")
         grid[places[name]] = values
     return grid
 
@@ -175,7 +175,7 @@ def real_products(data: Any, products: Any, flags: Any, convention: str, n_anten
     if np.isinf(data[~absent]).any():
         first = np.argwhere(np.isinf(data) & ~absent)[0]
         raise InputError(
-            f"the data hold infinity at time {first[0]}, product {first[1]}; flag such samples"
+            f"the data contain infinity at time {first[0]}, product {first[1]}; flag such samples"
         )
     columns: list[tuple[str, np.ndarray]] = []
     for (i, j, part), values, gone in zip(ports_and_parts, data.T, absent.T, strict=True):
@@ -213,7 +213,7 @@ def _columns(products: Any, is_complex: bool, n_antennas: int) -> list[tuple[int
         real = labels(n_antennas)
         products = dict.fromkeys(label[:2] for label in real) if is_complex else real
     if isinstance(products, str):
-        raise InputError(f"products is '{products}'; give a list with the name of each column")
+        raise InputError(f"products is '{products}'; give a list of the names of the columns")
     columns: list[tuple[int, int, str]] = []
     for name in products:
         found = NAME.fullmatch(name if isinstance(name, str) else "".join(map(str, name)))
@@ -223,27 +223,25 @@ def _columns(products: Any, is_complex: bool, n_antennas: int) -> list[tuple[int
         i, j, part = int(found[1]), int(found[2]), found[3].upper()
         if max(i, j) >= n_antennas:
             raise InputError(
-                f"the product '{name}' has port {max(i, j)}, of ports 0 to {n_antennas - 1}; "
-                "give n_antennas if there are more"
+                f"the product '{name}' has port {max(i, j)}, expected 0 to {n_antennas - 1}; give "
+                "n_antennas for more ports"
             )
         if is_complex and part:
             raise InputError(f"the data are complex; name the ports of '{name}' alone, '{i}{j}'")
         if not is_complex and not part and i != j:
             raise InputError(f"the data are real; name the part of '{name}', {name}R or {name}I")
         if i == j and part == "I":
-            raise InputError(f"there is no product '{name}': an auto is real")
+            raise InputError(f"unknown product '{name}': an auto is real")
         columns.append((i, j, part if is_complex else part or "R"))
         if columns[-1] in columns[:-1]:
-            raise InputError(f"the product '{name}' is given more than once; name each once")
+            raise InputError(f"the product '{name}' is listed twice; list each once")
     return columns
 
 
 def _flags(flags: Any, shape: tuple[int, ...]) -> np.ndarray:
     flags = np.zeros(shape, dtype=bool) if flags is None else np.asarray(flags)
     if flags.dtype.kind not in "biu" or not np.isin(flags, (0, 1)).all():
-        raise InputError(
-            "flags hold other values than true and false; give true where samples are not used"
-        )
+        raise InputError("flags must be true or false; give true where samples are not used")
     if flags.shape not in (shape, shape[:1]):
         raise InputError(
             f"flags have shape {flags.shape}, expected {shape} as the data, or {shape[:1]}"
@@ -283,9 +281,7 @@ class DataLayout(Described, eqx.Module):
         """
         flags = np.asarray(flags, dtype=bool)
         if flags.all():
-            raise InputError(
-                f"all {flags.size} samples are flagged or missing; there is nothing to map"
-            )
+            raise InputError(f"all {flags.size} samples are flagged or missing: nothing to map")
         return cls(*flags.shape, None if not flags.any() else np.flatnonzero(~flags.ravel()))
 
     @property
@@ -325,8 +321,8 @@ class DataLayout(Described, eqx.Module):
             same = is_traced(self.index, other.index) or np.array_equal(self.index, other.index)
         if not same:
             raise InputError(
-                f"two layouts of {self.size} and {other.size} data hold different samples; build "
-                "both terms for the same observation and flags"
+                f"two layouts of {self.size} and {other.size} data contain different samples; "
+                "build both terms for the same observation and flags"
             )
 
     def gather(self, grid: Shaped[Array, "products times *rest"]) -> Shaped[Array, "data *rest"]:
@@ -394,7 +390,7 @@ def without_gaps(visibilities: Grid, layout: DataLayout) -> Grid:
         for product, is_there in zip(products, measured, strict=True):
             if is_there and auto.i in (product.i, product.j):
                 raise InputError(
-                    f"the auto {auto.label} is absent at all times, and the noise of "
+                    f"the auto {auto.label} is missing at all times, but the noise of "
                     f"{product.label} depends on it; give modelled visibilities of all samples, "
                     "such as the signal of a CouplingMatrix without flags"
                 )

@@ -86,9 +86,7 @@ class Interval:
 
     def __post_init__(self):
         if not self.length_s > times.ROUNDING_S:
-            raise InputError(
-                f"end {self.end} does not come after start {self.start}; exchange them"
-            )
+            raise InputError(f"end {self.end} is not later than start {self.start}; exchange them")
         if not np.isfinite(self.turntable_deg):
             raise InputError(f"turntable_deg is {self.turntable_deg}; give an angle in degrees")
         if not 0.0 < self.duty_cycle <= 1.0:
@@ -150,7 +148,7 @@ def cut_runs(runs: Sequence[Run], step_s: float) -> list[Cut]:
         length = run.cycles * CYCLE_DAYS * 86400.0
         if (n := int(length // step_s)) < 1:
             raise InputError(
-                f"run {number} of {run.cycles} cycles holds no sample of {step_s} s; shorten step_s"
+                f"run {number} of {run.cycles} cycles has no sample of {step_s} s; shorten step_s"
             )
         steps = np.full(n, float(step_s))
         cuts.append(Cut(elapsed + step_s * np.arange(n), steps, steps, run, f"run {number}"))
@@ -190,13 +188,13 @@ def named_in_order(intervals: Sequence[Interval]) -> list[tuple[str, Interval]]:
     for (_, before), (name, after) in pairwise(named):
         if (ahead := times.seconds_from(before.start_time, after.start_time)) < 0.0:
             raise InputError(
-                f"{name}: the interval from {after.start} begins before the one that "
-                f"precedes it, from {before.start}; sort the intervals by their start"
+                f"{name}: the interval from {after.start} begins before the previous one, from "
+                f"{before.start}; sort the intervals by their start"
             )
         if (overlap := before.length_s - ahead) > times.ROUNDING_S:
             raise InputError(
-                f"{name}: the interval from {after.start} begins {overlap:g} s before "
-                f"the one that precedes it ends, {before.end}; give each stretch of time once"
+                f"{name}: the interval from {after.start} begins {overlap:g} s before the previous "
+                f"one ends, {before.end}; remove the overlap"
             )
     return named
 
@@ -251,8 +249,8 @@ def _of_table(path: str, text: str) -> tuple[Interval, ...]:
     table = table.fillna("")
     if not REQUIRED <= set(table.columns) <= REQUIRED | OPTIONAL:
         raise InputError(
-            f"{path} has the columns {', '.join(table.columns)}; a schedule has "
-            f"{', '.join(sorted(REQUIRED))}, and may have {' and '.join(sorted(OPTIONAL))}"
+            f"{path} has the columns {', '.join(table.columns)}; a schedule needs "
+            f"{', '.join(sorted(REQUIRED))}, and may include {' and '.join(sorted(OPTIONAL))}"
         )
     rows = enumerate(table.to_dict("records"), start=1)
     return tuple(_interval(f"{path}, row {number}", row) for number, row in rows)
@@ -265,7 +263,7 @@ def _interval(place: str, row: dict[str, str]) -> Interval:
             try:
                 known[name] = float(row.get(name) or default)
             except ValueError as error:
-                raise InputError(f"{name} is '{row[name]}', not a number") from error
+                raise InputError(f"{name} is '{row[name]}', expected a number") from error
         night = (row.get("night_only", "").strip() or "false").lower()
         if night not in ("true", "false"):
             raise InputError(f"night_only is '{night}'; write true or false")
@@ -277,15 +275,15 @@ def _of_commands(path: str, text: str) -> tuple[Interval, ...]:
     root = parse_yaml(text, path)
     if not isinstance(root, dict):
         raise InputError(
-            f"{path} is no command table of OpSim: expected numbered entries with start and mode; "
-            "a table of intervals is a CSV file, whose name ends otherwise"
+            f"{path} is not a command table of OpSim: expected numbered entries with start and "
+            "mode; for a table of intervals, use a CSV file with another ending"
         )
     entries = [_command(f"{path}, entry {name}", entry) for name, entry in root.items()]
     for (_, before, _), (place, after, _) in pairwise(entries):
         if not after > before:
             raise InputError(
-                f"{place}: start {after} does not come after that of the entry before, {before}; "
-                "sort the entries by their start"
+                f"{place}: start {after} is not later than the previous one, {before}; sort the "
+                "entries by their start"
             )
     if entries and entries[-1][2] == OBSERVING:
         raise InputError(
@@ -300,8 +298,8 @@ def _of_commands(path: str, text: str) -> tuple[Interval, ...]:
 
 def _command(place: str, entry: object) -> tuple[str, float, str]:
     """Where an entry is, its start as MJD and its mode."""
-    expected = "a start (a modified Julian date, UTC, as 61050.8) and a mode in each entry"
-    wrong = f"a command table of OpSim has {expected}"
+    expected = "a start (modified Julian date, UTC, e.g. 61050.8) and a mode in each entry"
+    wrong = f"a command table of OpSim needs {expected}"
     with naming(place):
         with refusing(wrong, KeyError, TypeError, ValueError):
             start, mode = float(entry["start"]), str(entry["mode"])  # type: ignore[index]

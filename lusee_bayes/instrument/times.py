@@ -72,7 +72,7 @@ def time_of_text(name: str, text: str, scale: str = "utc") -> Time:
     InputError
         If it is none, or outside the ephemeris; the message begins with ``name``.
     """
-    wrong = f"{name} '{text}' is not a date; write it as 2027-01-15T00:00:00"
+    wrong = f"{name} '{text}' is not a date; write e.g. 2027-01-15T00:00:00"
     with refusing(wrong, ValueError, TypeError), unannounced_leap_seconds():
         # astropy knows no Z, which ISO has for UTC
         time = Time(text.removesuffix("Z"), scale=scale)
@@ -97,8 +97,8 @@ def require_ephemeris(jd: Times) -> None:
         with unannounced_leap_seconds():
             date = Time(at, format="jd").isot[:19]
     raise InputError(
-        f"sample times run outside the ephemeris ({EPHEMERIS_YEARS[0]}-{EPHEMERIS_YEARS[1]}): "
-        f"{date}; give a start inside it"
+        f"sample times lie outside the ephemeris ({EPHEMERIS_YEARS[0]}-{EPHEMERIS_YEARS[1]}): "
+        f"{date}; choose a start within it"
     )
 
 
@@ -191,7 +191,7 @@ def step_of(times: Time, step_s: float | None) -> float:
     if step_s is not None:
         return float(step_s)
     if len(times) < 2:
-        raise InputError("the integration time of a single sample is not known; give step_s")
+        raise InputError("the integration time of a single sample is unknown; give step_s")
     return float(np.median(np.abs(seconds_from(times[:-1], times[1:]))))
 
 
@@ -312,14 +312,14 @@ class Windows(Described):
             longest = int(np.argmax(length))
             raise InputError(
                 f"the window of sample {longest} lasts {length[longest]:g} s, longer than the step "
-                f"of {step_s:g} s from sample to sample; check the bounds, or give the step"
+                f"between samples ({step_s:g} s); check the bounds, or give the step"
             )
         gaps = np.diff(seconds_from(times[0], times)) + bounds[1:, 0] - bounds[:-1, 1]
         if (gaps < -ROUNDING_S).any():
             first = int(np.argmax(gaps < -ROUNDING_S))
             raise InputError(
                 f"the windows of samples {first} and {first + 1} ({times[first].isot[:19]}) "
-                f"overlap by {-gaps[first]:g} s; give each stretch of time to one sample"
+                f"overlap by {-gaps[first]:g} s; remove the overlap"
             )
 
     def require_bounds(self, times: Time, bounds: Any) -> None:
@@ -338,7 +338,7 @@ class Windows(Described):
             first = int(np.argmax(off > EYE_S))
             raise InputError(
                 f"time_bounds and the pieces of sample {first} differ by {off[first]:g} s; change "
-                "both, or leave out the variables of the pieces"
+                "both, or omit the variables of the pieces"
             )
 
     def select(self, keep: Bool[np.ndarray, " samples"]) -> Windows:
@@ -422,7 +422,7 @@ def windows_of(
     if timestamp == "instant":
         if live_s is not None or bounds is not None:
             what = "live time" if bounds is None else "bounds"
-            raise InputError(f"instants have no {what}; leave it out, or give another timestamp")
+            raise InputError(f"instants have no {what}; omit it, or give another timestamp")
         return times, step_s, None
     require_known("unknown timestamp", timestamp, [*TO_MIDDLE, "instant"])
     ones = np.ones(len(times))
@@ -440,8 +440,8 @@ def _bounded(times: Time, bounds: Time, step_s: Step, live_s: Live) -> Windowed:
         first = int(np.argmax(outside))
         raise InputError(
             f"the time of sample {first} ({times[first].isot[:19]}) is not within its bounds, "
-            f"which begin {start[first]:g} s and end {end[first]:g} s from it; give bounds in the "
-            "order of the times"
+            f"which begin {start[first]:g} s and end {end[first]:g} s from it; sort the bounds "
+            "like the times"
         )
     if step_s is None and step < length.max() <= step + rounding:
         step = float(length.max())
@@ -467,7 +467,7 @@ def utc_bounds(bounds: Any, n_times: int) -> Time:
     bounds = bounds if isinstance(bounds, Time) else np.asarray(bounds)
     if bounds.shape != (n_times, 2):
         raise InputError(f"bounds have shape {bounds.shape}, expected ({n_times}, 2)")
-    with naming("bounds, taken row by row"):
+    with naming("bounds, row by row"):
         return utc_times(bounds).reshape(n_times, 2)
 
 

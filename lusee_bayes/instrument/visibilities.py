@@ -73,11 +73,11 @@ def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None]:
     lost = [name for name in PIECES if name not in here]
     if said == "instant" and given:
         raise InputError(
-            f"the attribute window says that the samples are instants, and {given[0]} gives "
-            "them windows; leave out one of them"
+            f"the attribute window declares the samples instants, but {given[0]} gives windows; "
+            "remove one of them"
         )
     if 0 < len(lost) < len(PIECES):
-        raise InputError(f"there is {given[0]}, but no {lost[0]}; pieces of windows need both")
+        raise InputError(f"{given[0]} without {lost[0]}; pieces of windows need both")
     if not lost:
         windows = Windows(*(here[name] for name in PIECES))
         if "time_bounds" in here:
@@ -89,9 +89,7 @@ def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None]:
         return middles, windows
     if given or said == "mean":
         what = "live_time" if given else "the attribute window = 'mean'"
-        raise InputError(
-            f"there is {what}, but no time_bounds; add the start and the end of every sample"
-        )
+        raise InputError(f"{what} without time_bounds; add the start and the end of every sample")
     return times, None
 
 
@@ -161,10 +159,10 @@ class Visibilities(checks.Described):
         The sky of simulated data in K, Galactic, of any lmax (:meth:`with_truth_up_to`); None for
         real data.
     receiver : MeasuredReceiver or None
-        The loads through which they were taken, for data of luseepy's four ports.
+        The loads of the receivers, for data of luseepy's four ports.
     says_window : bool
-        Whether it is known what the times are. False for data of a file that says neither windows
-        nor instants: they are of no use before :meth:`stamped`.
+        Whether the meaning of the times is known. False for data of a file that specifies neither
+        windows nor instants: call :meth:`stamped` before use.
     calibration : Calibration or None
         Of averages of a spectrometer's spectra; None for other data.
 
@@ -230,18 +228,18 @@ class Visibilities(checks.Described):
         turntable_deg : float or (times,) array
             Turntable angle in degrees, from East towards North.
         convention : {"s_i conj(s_j)", "conj(s_i) s_j"}
-            What "ij" is the mean of, with voltages that go as exp(+i w t). Software that has
-            exp(-i w t) has the other sign of the imaginary part, too.
+            What "ij" is the mean of, for voltages that vary as exp(+i w t). With exp(-i w t), the
+            imaginary part changes sign.
         timestamp : {"middle", "start", "end", "instant"}
-            What the times are. Samples are means over windows of ``step_s``, unless they are
+            Meaning of the times. Samples are means over windows of ``step_s``, unless they are
             instants.
         bounds : (times, 2) sequence, optional
-            Start and end of every sample, of any kind of times, where they are not those of
-            ``timestamp`` and ``step_s``. The times then may be anywhere between.
+            Start and end of every sample, of any kind of times, if they do not follow from
+            ``timestamp`` and ``step_s``. The times may then lie anywhere between.
         live_s : float or (times,) array, optional
             How long each sample was integrated, in seconds; by default all of its window.
         step_s : float, optional
-            From sample to sample, in seconds; by default the median of the times.
+            Time between samples, in seconds; by default the median.
         n_antennas : int
             Number of ports.
 
@@ -252,13 +250,13 @@ class Visibilities(checks.Described):
         Raises
         ------
         InputError
-            If arrays do not fit each other or cannot be what they are said to be.
+            If arrays are inconsistent with each other or with their description.
         """
         values = real_products(data, products, flags, convention, n_antennas)
         utc = utc_times(times)
         if len(utc) != values.shape[1]:
             raise InputError(
-                f"there are {len(utc)} times for data of {values.shape[1]} times (their first axis)"
+                f"got {len(utc)} times for data of {values.shape[1]} times (their first axis)"
             )
         checks.require_positive("frequency_mhz", frequency_mhz)
         require_mhz("frequency_mhz", frequency_mhz)
@@ -272,7 +270,7 @@ class Visibilities(checks.Described):
     def description(self) -> tuple[str, ...]:
         missing = f", {self.n_missing} absent" if self.n_missing else ""
         truth = "" if self.truth is None else f"; simulated, lmax = {lmax_of(len(self.truth))}"
-        unsaid = "it is not known what the times are: --set observation.timestamp=..."
+        unsaid = "meaning of the times unknown: --set observation.timestamp=..."
         return (
             f"{self.layout.n_products} products x {self.layout.n_times} times at "
             f"{self.frequency_mhz:g} MHz, {self.layout.size} data{missing}",
@@ -283,7 +281,7 @@ class Visibilities(checks.Described):
 
     @property
     def n_missing(self) -> int:
-        """Number of samples of the grid that are flagged or were never taken."""
+        """Number of samples of the grid that are flagged or missing."""
         return self.layout.n_products * self.layout.n_times - self.layout.size
 
     @property
@@ -292,7 +290,7 @@ class Visibilities(checks.Described):
         return labels_of(self.layout.n_products)
 
     def digest(self) -> str:
-        """Return a hash of data, layout, times and windows, which tells data sets apart."""
+        """Return a hash of data, layout, times and windows, which identifies the data set."""
         parts = [self.data, self.layout.product, self.layout.time, self.observation.times.jd]
         if (windows := self.observation.windows) is not None:
             parts += [windows.sample, windows.start_s, windows.end_s, windows.live_s]
@@ -307,7 +305,7 @@ class Visibilities(checks.Described):
         return np.where(present, np.asarray(self.layout.scatter(self.data)), np.nan)
 
     def stamped(self, timestamp: str) -> Visibilities:
-        """Return the same data, their times being what is said; windows last for a step.
+        """Return the same data with this meaning of their times; windows last for a step.
 
         Parameters
         ----------
@@ -319,7 +317,7 @@ class Visibilities(checks.Described):
             If the data have windows, and as :class:`Observation`.
         """
         if (observation := self.observation).windows is not None:
-            raise InputError("the data have windows, so that their times are the middles of these")
+            raise InputError("the data have windows, and their times are the middles of these")
         times, _, windows = windows_of(observation.times, timestamp, observation.step_s)
         seen = replace(observation, times=times, windows=windows)
         return replace(self, observation=seen, says_window=True)

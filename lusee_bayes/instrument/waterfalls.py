@@ -105,7 +105,7 @@ class Waterfall(Described):
         if self.per_kelvin is None:
             return lines
         volts = extent(self.per_kelvin, "V^2/Hz")
-        return *lines, f"1 K is {volts}; with the emission of the Moon at {self.moon_k:.15g} K"
+        return *lines, f"1 K is {volts}; including emission of the Moon at {self.moon_k:.15g} K"
 
     def channel(self, frequency_mhz: float) -> int:
         """Return the number of the channel at a frequency.
@@ -142,8 +142,8 @@ class Waterfall(Described):
         if (beyond := present.any(1) & ~within).any():
             label = products.labels()[int(np.argmax(beyond))]
             raise InputError(
-                f"{self.path} has the product {label}, but the beams are those of {n_ports} ports; "
-                "give beam.rotations_deg an angle for every port"
+                f"{self.path} has the product {label}, but the beams have {n_ports} ports; give "
+                "beam.rotations_deg an angle for every port"
             )
         with naming(f"{self.path} at {frequency_mhz:g} MHz"):
             layout = products.DataLayout.from_flags(~present[within])
@@ -183,8 +183,8 @@ def start_of(text: str) -> Time:
     first, to, _ = word.partition(" to ")
     if not to:
         raise InputError(
-            f"LUNAR_DAY '{text}' is not a date to a date (2027-01-15 00:00:00 to 2027-02-01), a "
-            "year (CY2027, FY27) or the number of a lunar day (2700)"
+            f"LUNAR_DAY '{text}' is invalid; expected a range of dates (2027-01-15 00:00:00 to "
+            "2027-02-01), a year (CY2027, FY27) or the number of a lunar day (2700)"
         )
     return times.time_of_text("LUNAR_DAY", first)
 
@@ -353,8 +353,8 @@ def read_waterfall(path: str | Path) -> Waterfall:
 
 HINT = "write netCDF (a name that does not end in .fits)"
 NO_ROOM = (
-    "luseepy's waterfalls have no room for windows, and the samples are means over theirs; "
-    f"{HINT}, or simulate with --set observation.window=instant"
+    f"luseepy's waterfalls cannot store windows, but the samples have them; {HINT}, or simulate "
+    "with --set observation.window=instant"
 )
 
 
@@ -391,13 +391,13 @@ def write_waterfall(
     path, first = user_path(path), channels[0].observation
     if len(channels) < 2:
         raise InputError(
-            f"{path}: luseepy's reader takes at least two channels; give --frequencies, or {HINT}"
+            f"{path}: luseepy's reader needs at least two channels; give --frequencies, or {HINT}"
         )
     data = _kelvin(path, channels)
     seconds = times.seconds_from(first.times[0], first.times)
     if np.abs(seconds - first.step_s * np.arange(first.n_times)).max() > times.ROUNDING_S:
         raise InputError(
-            f"{path}: luseepy's waterfalls have a sample every {first.step_s:g} s without gaps; "
+            f"{path}: luseepy's waterfalls need a sample every {first.step_s:g} s without gaps; "
             f"{HINT}"
         )
     pairs = np.array([(p.i, p.j) for p in products.all_products() if p.part == "R"])
@@ -418,7 +418,7 @@ def _kelvin(path: Path, channels: Sequence[Visibilities]) -> ByTime:
             raise InputError(f"{path}: {NO_ROOM}")
         if observation.turntable_deg != (0.0,):
             raise InputError(
-                f"{path}: luseepy's waterfalls have no turntable angles, the data have "
+                f"{path}: luseepy's waterfalls cannot store turntable angles, the data have "
                 f"{observation.turntable_deg}; {HINT}"
             )
         if channel.layout.n_products != products.N_ANTENNAS**2:
@@ -502,7 +502,7 @@ def write_four_port(
     path, observation = user_path(path), channels[0].observation
     if (receiver := circuits[0].receiver) is None:
         raise InputError(
-            f"{path}: luseepy's four-port waterfalls hold the loads of receivers, and the ports "
+            f"{path}: luseepy's four-port waterfalls include the loads of receivers, but the ports "
             f"are open; give another beam.receiver, or {HINT}"
         )
     enclosure = np.array([circuit.per_kelvin for circuit in circuits])

@@ -10,7 +10,7 @@ import numpy as np
 # the share of diverged draws that is
 AGREE, PER_CHAIN, FAR, FEW = 1.01, 100, 1.05, 0.01
 CRITERIA = (
-    f"Wanted: R-hat of at most {AGREE:g}, effective sizes of {PER_CHAIN} for each chain, no "
+    f"Required: R-hat of at most {AGREE:g}, effective sizes of {PER_CHAIN} for each chain, no "
     f"divergences. Bad: R-hat above {FAR:g}, or more than {FEW:.0%} of the draws diverged."
 )
 
@@ -31,8 +31,8 @@ def warnings_of(table: Mapping[str, np.ndarray], *, chains: int, divergences: in
     if above:
         furthest = int(np.argmax(r_hat))
         found.append(
-            f"Not converged: R-hat is above {AGREE:g} for {above} of {len(names)} quantities, most "
-            f"for {names[furthest]} ({r_hat[furthest]:.3f}). Raise --draws."
+            f"Not converged: R-hat is above {AGREE:g} for {above} of {len(names)} quantities, "
+            f"largest for {names[furthest]} ({r_hat[furthest]:.3f}). Raise --draws."
         )
     least = PER_CHAIN * chains
     for column, what in (("ess_bulk", "bulk"), ("ess_tail", "tail")):
@@ -44,12 +44,12 @@ def warnings_of(table: Mapping[str, np.ndarray], *, chains: int, divergences: in
             worst = int(np.argmin(size))
             found.append(
                 f"The {what} effective size is below {least} for {few} of {len(names)} quantities, "
-                f"least for {names[worst]} ({size[worst]:.0f}): raise --draws."
+                f"smallest for {names[worst]} ({size[worst]:.0f}): raise --draws."
             )
     if divergences:
         found.append(
-            f"{divergences} trajectories diverged: the steps are too long where the "
-            "posterior is narrow. Raise --warmup; if that does not help, write the program in "
-            "coordinates in which its posterior is wide."
+            f"{divergences} trajectories diverged: the steps are too long where the posterior is "
+            "narrow. Raise --warmup; if that does not help, reparametrise the program so that its "
+            "posterior is nowhere narrow."
         )
     return found

@@ -120,7 +120,7 @@ class ChannelFits:
         return [
             JointTest("sum over all channels", self.total.p, 1, self.total.found()),
             JointTest("channels above the median", signs, 1, f"{above} of {n}"),
-            JointTest("channel furthest out", float(p[least]), n, where),
+            JointTest("most deviant channel", float(p[least]), n, where),
             JointTest("prior", self.rest.p, 1, self.rest.found(), of_prior=True),
         ]
 
@@ -147,7 +147,7 @@ class ChannelFits:
         if extremes:
             frequencies = self.frequencies_mhz
             names = [f"{frequencies[k]:g} MHz (p {probability(float(p[k]))})" for k in extremes]
-            told.append(f"{len(extremes)} of {len(p)} channels stand out: {in_brief(names)}.")
+            told.append(f"{len(extremes)} of {len(p)} channels flagged: {in_brief(names)}.")
         return Fit(level, " ".join([*told, *([] if contradiction else self._advice(level))]))
 
     def _too_quiet(self) -> bool:
@@ -158,17 +158,17 @@ class ChannelFits:
 
     def _advice(self, level: Level) -> list[str]:
         if level == "does not fit" and self._too_quiet():
-            return ["The noise is given too large (noise.radiometer): error bars are too wide."]
+            return ["The assumed noise (noise.radiometer) is too large: error bars are too wide."]
         if level == "does not fit":
-            return ["Map the channels that stand out one by one: products and days are judged."]
+            return ["Map the flagged channels one by one: this also tests their products and days."]
         if level == "unlike the prior" and self.rest.too_small:
             narrower = "smaller spectral.residual" if self.joint else "narrower prior"
-            found = "The prior is wider than the skies need, and error bars are too wide"
-            return [f"{found}: a {narrower} would tell more (compare the evidence)."]
+            found = "The prior is wider than the skies require, and error bars are too wide"
+            return [f"{found}: a {narrower} would give a sharper map (compare the evidence)."]
         if level == "unlike the prior" and self.joint:
             return [
-                "Skies may not obey the spectral prior, and error bars be too small: compare the "
-                "evidence of other spectral.components and of a larger spectral.residual."
+                "The skies may not follow the spectral prior, and error bars be too small: compare "
+                "the evidence of other spectral.components and a larger spectral.residual."
             ]
         if level == "unlike the prior":
             return [
@@ -281,6 +281,6 @@ def disagreement(tests: Sequence[SharedTest]) -> str:
     if not bad:
         return ""
     disagree, are = ("disagrees", "is") if len(bad) == 1 else ("disagree", "are")
-    others = "the other channels about the instrument that they share"
-    advice = f"and {are} not tied to them: check beams and data there."
+    others = "the other channels on the shared instrument"
+    advice = f"and {are} solved without them: check beams and data there."
     return f"{in_brief(bad)} {disagree} with {others}, {advice}"

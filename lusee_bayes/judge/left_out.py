@@ -366,8 +366,8 @@ class LeftOut:
             lower[n:, n:] = np.tril(posterior.lower)
         if not np.isfinite(np.diagonal(lower)).all():
             raise InputError(
-                "the data are too precise to tell how a part of them differs from what the others "
-                "predict; use fewer data at once"
+                "the data are too precise to compare a part of them with its prediction from the "
+                "others; use fewer data at once"
             )
         return lower
 

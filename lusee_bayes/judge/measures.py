@@ -119,7 +119,7 @@ def strengths_in_words(found: Mapping[str, float]) -> str:
     if not found:
         return ""
     listed = ", ".join(f"{value:.2g} at {name}" for name, value in found.items())
-    return f"Power of the sky over what the prior expects: {listed}."
+    return f"Sky power relative to the prior: {listed}."
 
 
 def correlation(mean: Modes, truth: Modes) -> Ells:

@@ -54,21 +54,21 @@ def require_plausible(data: Visibilities, signal: Grid, std: DataVector) -> tupl
     _refuse(
         data,
         np.abs(values) > IMPOSSIBLE * max(typical, float(np.abs(modelled).max())),
-        f"more than {IMPOSSIBLE:g} times what the modelled sky gives ({typical:.3g} K); look at "
-        "the unit of the data, or leave the sample out (NaN)",
+        f"more than {IMPOSSIBLE:g} times the modelled sky ({typical:.3g} K); check the unit of the "
+        "data, or flag the sample (NaN)",
     )
     _refuse(
         data,
         np.isin(np.arange(len(values)), autos)[:, None] & (values < -SIGNIFICANT * sigma),
-        "an auto-correlation that is negative beyond its noise; look at signs and order of the "
-        "products, or leave the sample out (NaN)",
+        "an auto-correlation that is significantly negative; check signs and order of the "
+        "products, or flag the sample (NaN)",
     )
     return (*_about_range(values[autos], modelled[autos]), *_about_crosses(data, values, sigma))
 
 
 def about_information(bits: float) -> tuple[str, ...]:
     """Say that data tell nothing, if so; NaN where the information is not known."""
-    text = f"The data tell {bits:.2g} bits of the sky: the map is the prior's, whatever the sky is."
+    text = f"The data contain only {bits:.2g} bits of information on the sky: the map is the prior."
     return (text,) if bits < LEAST_BITS else ()
 
 
@@ -93,9 +93,9 @@ def _about_range(
     ratio = float(np.median(autos[present] / modelled[present]))
     found = f"auto-correlations are {ratio:.2g} times those of the modelled sky"
     if not 1.0 / IMPOSSIBLE < ratio < IMPOSSIBLE:
-        advice = "look at the unit of the data, their frequency and the beams"
+        advice = "check the unit of the data, their frequency and the beams"
         raise InputError(f"the {found}; {advice}")
-    doubt = f"The {found}: are unit, frequency and beams those of the data?"
+    doubt = f"The {found}: check the unit of the data, their frequency and the beams."
     return () if 1.0 / DOUBTFUL < ratio < DOUBTFUL else (doubt,)
 
 
@@ -114,8 +114,8 @@ def _about_crosses(data: Visibilities, values: Grid, sigma: Grid) -> tuple[str, 
         excess = usable & (cross - bound > SIGNIFICANT * np.hypot(spreads[i, j], of_bound))
         if excess.any():
             first = data.observation.times[int(np.nonzero(excess)[0][0])].isot[:19]
-            larger = f"|V_{i}{j}| is larger than sqrt(V_{i}{i} V_{j}{j}), which no sky gives"
+            larger = f"|V_{i}{j}| is larger than sqrt(V_{i}{i} V_{j}{j}), which is impossible"
             where = f"{int(excess.sum())} of {int(usable.sum())} samples (first {first})"
-            wrong = f"one of the products {i}{i}, {j}{j} and {i}{j} is wrong there"
+            wrong = f"one of {i}{i}, {j}{j} and {i}{j} is wrong"
             doubts.append(f"{larger}, in {where}: {wrong}.")
     return tuple(doubts)

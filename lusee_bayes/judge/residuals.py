@@ -29,8 +29,8 @@ from lusee_bayes.linear.linear_gaussian import Solution
 
 # of a prior that the sky is unlike
 TOO_WIDE = (
-    "The prior is wider than the sky needs: error bars are too wide where the sky is fainter than "
-    "the prior assumes. Choose a narrower prior (lusee-bayes compare-priors)."
+    "The prior is wider than the sky requires: error bars are too wide where the sky is fainter "
+    "than the prior assumes. Choose a narrower prior (lusee-bayes compare-priors)."
 )
 TOO_NARROW = (
     "Error bars are too narrow where the sky is brighter than the prior assumes, and too wide "
@@ -157,8 +157,8 @@ class Residuals:
         """Which groups stand out, and what to leave out or to look at."""
         if not self.groups:
             return [
-                "Products, days and turntable angles were not judged: the noise couples different "
-                "times, which would need the whole of A."
+                "Products, days and turntable angles were not tested: the noise couples different "
+                "times, so that the test would need all of A."
             ]
         parts, extremes, suspects = [], self.extremes(), self.suspects()
         if suspects and extremes:

@@ -461,8 +461,8 @@ def tie(
     n_channels, n = mean.shape
     if not (np.linalg.eigvalsh(covariance) > 0).all():
         raise InputError(
-            "the data of a channel tell what it shares with others better than rounding lets the "
-            "covariance be known; map the channels one by one"
+            "a channel's data determine the shared unknowns to below rounding; map the channels "
+            "one by one"
         )
     blocks = root_of_kernels(kernels)
     root = blocks.reshape(n_channels * n, -1)

@@ -69,7 +69,7 @@ class Information(Described, eqx.Module):
     matrix: ModesMatrix = quantity("K-2", "A^T N^-1 A")
     vector: Modes = quantity("K-1", "A^T N^-1 (d - A reference)")
     reference: Modes = quantity("K", "reference sky")
-    misfit: Float[Array, ""] = quantity("1", "chi^2 at the reference sky")
+    misfit: Float[Array, ""] = quantity("1", "chi2 at the reference sky")
     log_det: Float[Array, ""] = quantity("1", "ln det N")
     n_data: Float[Array, ""] = quantity("1", "number of data")
 
@@ -226,9 +226,9 @@ class Information(Described, eqx.Module):
         accepted = CONVERGENCE * max(1.0, float(np.sqrt(np.mean(np.square(u)))))
         if not moved <= accepted:
             raise InputError(
-                f"the posterior mean did not converge: its last step was {moved:.2g} "
-                f"standard deviations (accepted: {accepted:.2g}); the data are too precise for "
-                "the normal equations, or far from anything that the prior allows"
+                f"the posterior mean did not converge: its last step was {moved:.2g} standard "
+                f"deviations (accepted: {accepted:.2g}); the data are too precise for the normal "
+                "equations, or far outside the prior"
             )
         return Posterior(prior, u, lower, None, np.asarray(log_evidence), np.asarray(moved))
 

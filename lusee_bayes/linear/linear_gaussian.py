@@ -104,7 +104,7 @@ class LinearGaussian(Described, eqx.Module):
             f"d = A m{offset} + n, {self.n_data} data, {self.prior.size} unknowns of the sky, in K",
             f"A {type(self.coupling).__name__}, S {type(self.prior).__name__}, "
             f"N {type(self.noise).__name__}",
-            "condition(data).posterior is that of the sky",
+            "condition(data).posterior is the posterior of the sky",
         )
 
     @property
@@ -548,7 +548,7 @@ class Whitened(Form):
         if not is_traced(moved) and not float(moved) <= CONVERGENCE:
             raise InputError(
                 f"the posterior mean did not converge: after {MAX_REFINEMENTS} refinements it "
-                f"still moves by {float(moved):.2g} standard deviations (accepted: "
+                f"still changes by {float(moved):.2g} standard deviations (accepted: "
                 f"{CONVERGENCE:g}); the noise is too small for float64 arithmetic"
             )
         prior = self.model.prior

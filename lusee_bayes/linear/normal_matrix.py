@@ -172,7 +172,7 @@ def normal_matrix(
     require_shape("N", np.empty((noise.size, 0)), (coupling.shape[0], None))
     if not has_structure(coupling, noise):
         raise InputError(
-            f"{type(noise).__name__} has no structure in time that A^T N^-1 A could use, or the "
+            f"{type(noise).__name__} has no structure in time to compute A^T N^-1 A with, or the "
             "coupling has a response of its own; use the dense form"
         )
     factor = noise.factor() if factor is None else factor

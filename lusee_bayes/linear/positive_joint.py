@@ -259,8 +259,8 @@ def find_joint_mode(
         here = _descended(skies, channels, prior, here, there)
         laws, last = replace(laws, parameters=laws.parameters + change), change
     raise InputError(
-        f"the positive skies did not settle in {MAX_ROUNDS} rounds: the last moved by {moved:.2g} "
-        "standard deviations; the data are far from anything that the templates allow: use "
+        f"the positive skies did not converge in {MAX_ROUNDS} rounds: the last step was "
+        f"{moved:.2g} standard deviations; the data are far from the templates: use "
         "spectral.model=components"
     )
 

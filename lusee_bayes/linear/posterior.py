@@ -6,6 +6,7 @@ The variances of all pixels of a map are diag(Y C Y^T), ring by ring; see
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 
 import equinox as eqx
@@ -21,6 +22,8 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.linalg import inverse_from_cholesky, solve_lower
 from lusee_bayes.sky.prior import Prior
+
+Degrees = Sequence[float] | Float[np.ndarray, " n"]
 
 # largest relative error of standard deviations that is accepted
 PRECISION = 1e-3
@@ -65,6 +68,28 @@ class Posterior(Described, eqx.Module):
     def mean(self) -> Float[Array, " unknowns"]:
         """Posterior mean of m in K; of harmonics: Galactic, real packed."""
         return self.prior.colour(self.white_mean)
+
+    def to_map(self, nside: int = 64) -> Pixels:
+        """Compute the mean as a Galactic HEALPix RING map, in K."""
+        return harmonics.modes_to_map(np.asarray(self.mean), nside)
+
+    def pixel_covariance(self, lon_deg: Degrees, lat_deg: Degrees) -> Float[np.ndarray, "n n"]:
+        """Compute the covariance of the sky's temperatures in given directions.
+
+        Parameters
+        ----------
+        lon_deg, lat_deg : (n,) array
+            Galactic longitudes and latitudes.
+
+        Returns
+        -------
+        (n, n) array
+            In K^2.
+        """
+        theta, phi = np.radians(90.0 - np.asarray(lat_deg)), np.radians(np.asarray(lon_deg))
+        root = np.asarray(self.root())
+        rows = harmonics.synthesis_matrix(theta, phi, harmonics.lmax_of(len(root))) @ root
+        return rows @ rows.T
 
     def std(self) -> Float[Array, " unknowns"]:
         """Compute the standard deviation of every unknown.
@@ -234,8 +259,8 @@ class Posterior(Described, eqx.Module):
 def _require_precise(rounding: Float[Array, ""]) -> None:
     if not is_traced(rounding) and float(rounding) > PRECISION:
         raise InputError(
-            f"standard deviations of the map-space form would be wrong by {rounding:.1g} of "
-            f"themselves (accepted: {PRECISION:g}): the data are too precise for the normal "
+            "standard deviations of the map-space form would have a relative error of "
+            f"{rounding:.1g} (accepted: {PRECISION:g}): the data are too precise for the normal "
             "equations; use form=InData"
         )
 

@@ -166,7 +166,7 @@ class Covariance(checks.Described, eqx.Module):
         if total is None:
             raise InputError(
                 f"{type(self).__name__} and {type(other).__name__} have no common structure; "
-                "turn one of them into DenseCovariance(term.dense())"
+                "convert one of them to DenseCovariance(term.dense())"
             )
         return total
 
@@ -366,8 +366,8 @@ class LowRankCovariance(Covariance):
 
     def factor(self):
         raise InputError(
-            f"{self.name} has rank {self.root.shape[1]} at most over {self.size} data, so it is "
-            "not positive definite by itself; add the radiometer noise"
+            f"{self.name} has rank {self.root.shape[1]} at most over {self.size} data, so that it "
+            "is not positive definite; add the radiometer noise"
         )
 
     def absorb(self, other):

@@ -148,7 +148,7 @@ class GainDrift(eqx.Module):
         checks.require_array("the visibilities", visibilities, (layout.n_products, layout.n_times))
         checks.require_shape("hours", hours, (layout.n_times,))
         if not checks.is_traced(hours) and not (np.diff(hours) > 0).all():
-            raise InputError("the sample times (hours) must grow from one to the next")
+            raise InputError("the sample times (hours) must increase")
         width = self.width(hours) if width is None else width
         earlier = np.arange(layout.n_times)[:, None] - np.arange(width + 1)[None]
         lag = jnp.asarray(hours)[:, None] - jnp.asarray(hours)[np.maximum(earlier, 0)]

@@ -47,8 +47,8 @@ def sample_covariances(t: Matrices, n_averaged: float, generator: np.random.Gene
         If one of the T is not positive definite: no voltages have it.
     """
     wrong = (
-        "the covariance of the voltages is not positive definite, so that there is no radiometer "
-        "noise for it; check that the autos are positive and the correlations below one"
+        "the covariance of the voltages is not positive definite, so that its radiometer noise is "
+        "undefined; check that autos are positive and correlations below one"
     )
     with refusing(wrong, np.linalg.LinAlgError):
         lower = np.linalg.cholesky(np.moveaxis(t, (0, 1), (-2, -1)))
@@ -117,7 +117,7 @@ def radiometer_noise(
     visibilities = without_gaps(visibilities, layout)
     checks.require_finite("the visibilities", visibilities)
     autos = visibilities[auto_indices(round(np.sqrt(layout.n_products)))]
-    hint = "noise levels are taken from it; use a sky with a positive mean"
+    hint = "it sets the noise level; use a sky with a positive mean"
     checks.require_positive("the antenna temperature (autos of the visibilities)", autos, hint)
     scale = factor / (bandwidth_hz * step_s * duty_cycle)
     if np.ndim(scale):

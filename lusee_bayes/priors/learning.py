@@ -270,7 +270,7 @@ def _uphill(
             return here, rng, steps
         here = _climb(family, information, here, step * min(1.0, LONGEST / np.abs(step).max()))
     raise NotSettled(
-        f"the prior's parameters did not settle in {MAX_STEPS} steps: the next would still add "
+        f"the prior's parameters did not converge in {MAX_STEPS} steps: the next would still add "
         f"{gain:.2g} to ln p (accepted: {SETTLED:g})"
     )
 
@@ -374,7 +374,7 @@ def _climb(family: PriorFamily, information: Information, here: _Point, step: Pa
                 return there
         part /= 2.0
     raise NotSettled(
-        "the prior's parameters do not settle: ln p falls along its own gradient by rounding"
+        "the prior's parameters do not converge: ln p decreases along its gradient, by rounding"
     )
 
 
@@ -479,6 +479,5 @@ def _under_drawn_parameters(
         except InputError as error:
             failed = error
     raise InputError(
-        f"no sky can be drawn with the uncertainty of the prior's parameters: {failed}; use "
-        "prior.model=isotropic"
+        f"cannot draw skies with uncertain prior parameters: {failed}; use prior.model=isotropic"
     )

@@ -1,1 +1,1 @@
-"""What a person looks at: figures, pages, and what is in a file."""
+"""Output for readers: figures, pages, and descriptions of files."""

@@ -1,4 +1,4 @@
-"""Recognising files and saying what is in them."""
+"""Recognising files and describing their contents."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def describe_diagnostics(path: Path) -> list[str]:
             lines.append(f"diagnostics of a map at {frequency} MHz")
             judged = channel.children.get("judged")
             if judged is None:
-                lines.append("the data fit as a whole and were not judged group by group")
+                lines.append("the data fit as a whole; their groups were not tested")
                 continue
             kinds, n = np.unique(judged.children["groups"].variables["kind"], return_counts=True)
             counts = ", ".join(counted(k, kind) for kind, k in zip(kinds, n.tolist(), strict=True))
@@ -88,11 +88,11 @@ def describe_posterior(path: Path) -> list[str]:
         held = [name for name in HOLDS if name in tree.variables or name in tree.children]
         joint = "component_mean" in tree.variables
     if not found.mean.size:
-        raise InputError(f"{path} holds no sky; make that map again")
+        raise InputError(f"{path} contains no sky; rerun that map")
     frequencies, (n, n_modes) = found.frequency, found.mean.shape
     at = f"{frequencies[0]:g} MHz"
     if n > 1:
-        kind = "one posterior for all" if joint else "each on its own"
+        kind = "one joint posterior" if joint else "independent posteriors"
         at = f"{n} frequencies from {frequencies[0]:g} to {frequencies[-1]:g} MHz, {kind}"
     ends = np.stack([found.mean[[0, -1], 0], found.std[[0, -1], 0]], axis=1) / MONOPOLE
     temperatures = [f"{mean:.6g} K +- {std:.3g} K" for mean, std in ends]
@@ -100,10 +100,10 @@ def describe_posterior(path: Path) -> list[str]:
     return [
         f"posterior over {n_modes} modes (lmax {found.lmax}) at {at}, {found.frame}",
         f"mean temperature {' to '.join(dict.fromkeys(temperatures))}",
-        f"{' to '.join(dict.fromkeys((str(known.min()), str(known.max()))))} modes known to better "
-        "than half their prior width",
+        f"{' to '.join(dict.fromkeys((str(known.min()), str(known.max()))))} modes constrained to "
+        "better than half their prior width",
         *found.unmapped.splitlines(),
-        f"also holds: {', '.join(held) or 'nothing else'}",
+        f"also contains: {', '.join(held) or 'nothing else'}",
         f"versions: {json.dumps(found.versions)}",
     ]
 
@@ -115,7 +115,7 @@ def describe_samples(path: Path) -> list[str]:
     posterior, statistics = tree["posterior"], tree["sample_stats"]
     sites = ", ".join(f"{name} {v.shape[2:]}" for name, v in posterior.data_vars.items())
     return [
-        f"{posterior.sizes['chain']} x {posterior.sizes['draw']} draws of the program "
+        f"{posterior.sizes['chain']} x {posterior.sizes['draw']} draws from the program "
         f"{tree.attrs['program']} at {float(tree.attrs['frequency_mhz']):g} MHz",
         f"sites: {sites}",
         f"{int(statistics['diverging'].sum())} divergences, "
@@ -128,7 +128,7 @@ FIGURES = ("summary.json", "sampling.json", "priors.json")
 
 
 def describe_folder(folder: Path) -> list[str]:
-    """A finished run: its kind, where it comes from, its verdict, its files.
+    """A finished run: its kind, origin, verdict and files.
 
     Raises
     ------
@@ -139,8 +139,8 @@ def describe_folder(folder: Path) -> list[str]:
     manifest = read_manifest(folder)
     if manifest is None:
         raise InputError(
-            f"'{folder}' is a folder that no run has written: it has no manifest.json; give a file "
-            "or the folder of a finished run"
+            f"'{folder}' is not the folder of a run (it has no manifest.json); give a file or the "
+            "folder of a finished run"
         )
     lines = [f"results of lusee-bayes {manifest['kind']}"]
     found = resolve_name("lusee_bayes.results.finished_runs:Provenance").read(folder)
@@ -160,7 +160,7 @@ def describe_folder(folder: Path) -> list[str]:
 
 
 def _cards(path: Path) -> list[str]:
-    """What a FITS file of the package says of itself."""
+    """The header of a FITS file of the package, in words."""
     with formats.opened(path) as hdus:
         headers = [hdu.header for hdu in hdus if "SCENHASH" in hdu.header]
         if not headers:

@@ -1,4 +1,4 @@
-"""report.html, one file that says of a run what a person wants to know of it, and comparisons."""
+"""report.html, the results of a run on one page, and pages that compare runs."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def write_report(folder: str | Path) -> Path:
     """
     folder = Path(folder)
     if not os.path.isdir(folder):
-        raise InputError(f"'{folder}' is no folder; give the folder of a finished run")
+        raise InputError(f"'{folder}' is not a folder; give the folder of a finished run")
     recover(folder)
     manifest, old = read_manifest(folder), {"samples.nc": "sample", "posterior.nc": "map"}
     # folders that were written before there were manifests
@@ -99,7 +99,7 @@ def write_report(folder: str | Path) -> Path:
     kind = manifest["kind"] if manifest is not None else next(iter(guessed), None)
     if kind not in PAGES:
         raise InputError(
-            f"'{folder}' holds neither posterior.nc (lusee-bayes map) nor samples.nc (lusee-bayes "
+            f"'{folder}' has neither posterior.nc (lusee-bayes map) nor samples.nc (lusee-bayes "
             "sample, validate); give the folder of a finished run"
         )
     path = folder / REPORT

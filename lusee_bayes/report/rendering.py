@@ -1,4 +1,4 @@
-"""Pages out of templates: what every template may use, and what the pages of all runs have.
+"""Rendering pages from templates: functions for all templates, and context for pages of runs.
 
 The words of a page, its tables and its captions stand in ``templates/``; the modules beside this
 one read and compute what they show. A page is one file with everything inside. That of a run begins

@@ -114,8 +114,8 @@ def _nsides(maps: Mapping[str, Maps], channels: int) -> tuple[int, int]:
     for name, cube in maps.items():
         if cube.shape != (channels, pixels) or not healpy.isnpixok(pixels):
             raise InputError(
-                f"maps of {name} have the shape {cube.shape}, expected {channels} channels of as "
-                f"many pixels as the mean has ({pixels}), on a HEALPix grid; make the results anew"
+                f"maps of {name} have the shape {cube.shape}; expected {channels} channels of "
+                f"{pixels} pixels, like the mean, on a HEALPix grid; rerun the map"
             )
     nside = healpy.npix2nside(pixels)
     return nside, nside_of_page(nside, len(maps) * channels) if channels > 1 else nside

@@ -55,7 +55,7 @@ class Judged:
     extremes: tuple[str, ...]
     suspects: tuple[str, ...]
     predicted: OnGrid = quantity("K", "visibilities of the mean map")
-    z: OnGrid = quantity("1", "data less their prediction by all others, in standard deviations")
+    z: OnGrid = quantity("1", "data minus prediction from all other data, in standard deviations")
     groups: tuple[Group, ...] = ()
 
     @property
@@ -251,7 +251,7 @@ class ChannelResult(ChannelData, Described):
     draws: Float[np.ndarray, "draw mode"] = quantity("K", "draws of the posterior")
     log_likelihood: Float[np.ndarray, " draw"] = quantity("1", "ln p(d | m) of each draw")
     covariance: SkyMatrix | None = quantity("K2", "posterior covariance", default=None)
-    independent: SkyModes | None = quantity("K", "mean given its own data alone", default=None)
+    independent: SkyModes | None = quantity("K", "mean given only its own data", default=None)
     log_evidence: float = np.nan
     information_bits: float = np.nan
     chi2: float

@@ -22,7 +22,7 @@ from jaxtyping import Float
 from pydantic import BaseModel
 
 from lusee_bayes.core import formats
-from lusee_bayes.core.arrays import Pixels
+from lusee_bayes.core.arrays import Draws, Pixels
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import recover, require_files, user_path
 from lusee_bayes.core.harmonics import mode_numbers, n_modes
@@ -49,7 +49,7 @@ def cards(name: str, scenario: Scenario) -> dict[str, tuple]:
     return {
         "CONTENT": (name, "of the posterior over the sky"),
         "FREQ": (scenario.frequency_mhz, "frequency in MHz"),
-        "LMAX": (scenario.lmax, "highest ell that is covered"),
+        "LMAX": (scenario.lmax, "highest ell included"),
         "FRAME": ("galactic", "of directions"),
         "BEAM": (beam.label, "the antennas"),
         "SITELON": (site.lon_deg, "selenographic longitude in degrees"),
@@ -182,10 +182,43 @@ class SavedInformation:
         """
         if digest in self.digests:
             raise InputError(
-                "these data are behind the earlier posterior already; used again, they would count "
-                "twice"
+                "the earlier posterior already includes these data, and they would count twice; "
+                "give only new data"
             )
         return information + self.information
+
+
+def read_draws(folder: str | Path, frequency_mhz: float | None = None) -> Draws:
+    """Read the posterior draws of a finished map (``lusee-bayes map --draws N``).
+
+    Parameters
+    ----------
+    folder : str or Path
+        Of the run.
+    frequency_mhz : float, optional
+        The channel; by default the only one.
+
+    Returns
+    -------
+    (draws, modes) array
+        Real harmonic coefficients, Galactic, in K.
+
+    Raises
+    ------
+    InputError
+        If the run has kept no draws, or there is no such channel.
+    """
+    path = require_file(user_path(folder) / "posterior.nc", "a posterior of lusee-bayes map")
+    with opened_tree(path, formats.POSTERIOR, "a posterior of lusee-bayes map") as tree:
+        if "posterior" not in tree.children:
+            raise InputError(f"{path} has no draws; map again with --draws N")
+        known = np.asarray(tree.variables["frequency"])
+        near = np.isclose(known, known if frequency_mhz is None else frequency_mhz)
+        if near.sum() != 1:
+            names = ", ".join(f"{f:g}" for f in known)
+            raise InputError(f"{path} has channels of {names} MHz; give one as frequency_mhz")
+        skies = np.asarray(tree.children["posterior"].variables["sky"])
+        return skies[0, :, np.flatnonzero(near)[0]]
 
 
 KEPT = "a posterior of lusee-bayes map --information"
@@ -207,19 +240,19 @@ def read_information(path: Path, channel: Scenario) -> SavedInformation:
         kept = tree.children.get(INFORMATION)
         if kept is None:
             raise InputError(
-                f"{path} does not hold the information of its data; make that map again with "
+                f"{path} does not contain the information of its data; make that map again with "
                 "--information"
             )
         if name not in kept.children:
             raise InputError(
-                f"{path} is of {', '.join(kept.children)} MHz, the scenario of {name} MHz; use "
+                f"{path} is for {', '.join(kept.children)} MHz, the scenario for {name} MHz; use "
                 f"--set frequency_mhz={next(iter(kept.children))}"
             )
         found = from_tree(SavedInformation, kept.children[name], str(path))
     if found.information.n_modes != n_modes(channel.lmax):
         lmax = round(np.sqrt(found.information.n_modes)) - 1
         raise InputError(
-            f"{path} is of lmax {lmax}, the scenario of {channel.lmax}; use --set lmax={lmax}"
+            f"{path} has lmax = {lmax}, the scenario lmax = {channel.lmax}; use --set lmax={lmax}"
         )
     return found
 
@@ -391,9 +424,9 @@ class FinishedRun:
         found = [channel.frequency_mhz for channel in channels]
         if found != summary.frequencies_mhz:
             raise InputError(
-                f"'{folder}' holds files of different runs: summary.json is of "
-                f"{_in_mhz(summary.frequencies_mhz)}, diagnostics.nc of {_in_mhz(found)}; make the "
-                "map again"
+                f"'{folder}' contains files of different runs: summary.json is for "
+                f"{_in_mhz(summary.frequencies_mhz)}, diagnostics.nc for {_in_mhz(found)}; make "
+                "the map again"
             )
         return cls(folder.resolve().name, summary, channels, Provenance.read(folder))
 
@@ -405,7 +438,7 @@ def _in_mhz(frequencies: Sequence[float]) -> str:
 def read_runs(folders: Sequence[str | Path]) -> list[FinishedRun]:
     """Two runs or more, with names that tell them apart. InputError for fewer."""
     if len(folders) < 2:
-        raise InputError(f"give two folders or more to compare, got {len(folders)}")
+        raise InputError(f"give at least two folders to compare, got {len(folders)}")
     runs = [FinishedRun.read(folder) for folder in folders]
     names = [run.name for run in runs]
     if len(set(names)) < len(names):
@@ -414,7 +447,7 @@ def read_runs(folders: Sequence[str | Path]) -> list[FinishedRun]:
     for run in runs:
         if len(run.channels) > 1 or run.channel.judged is None:
             raise InputError(
-                f"'{run.name}' is a run of frequencies_mhz; give folders of maps of one frequency"
+                f"'{run.name}' has several frequencies; give folders of single-frequency maps"
             )
     return runs
 
@@ -431,8 +464,8 @@ def evidence_caveat(runs: Sequence[FinishedRun]) -> str | None:
     reasons = [f"{run.name} {why}" for run in others if (why := _difference(first, run))]
     if not reasons:
         return None
-    against = f"Against {first.name}, {'; '.join(reasons)}."
-    return f"Do not compare the evidences: they are of different data. {against}"
+    against = f"Compared with {first.name}, {'; '.join(reasons)}."
+    return f"Do not compare the evidences: the runs used different data. {against}"
 
 
 def _difference(first: FinishedRun, run: FinishedRun) -> str | None:
@@ -446,16 +479,16 @@ def _difference(first: FinishedRun, run: FinishedRun) -> str | None:
         return f"has {sizes[1]} instead of {sizes[0]}"
     if (np.isnan(here) != np.isnan(there)).any():
         counts = [int(np.isfinite(a).sum()) for a in (here, there)]
-        return f"uses {counts[1]} samples instead of {counts[0]}, or others"
+        return f"uses {counts[1]} samples instead of {counts[0]}, or different ones"
     known = np.isfinite(here)
     if np.array_equal(here[known], there[known]):
         return None
     scale = float(np.vdot(here[known], there[known]) / np.vdot(here[known], here[known]))
     if np.allclose(there[known], scale * here[known], rtol=1e-6, atol=0.0):
-        return f"has the same data in another unit (times {scale:.6g})"
+        return f"has the same data in a different unit (factor {scale:.6g})"
     if not np.array_equal(first.channel.hours, run.channel.hours):
-        return "was observed at other times"
-    return "has other values at the same times (another file, noise, sky or seed)"
+        return "was observed at different times"
+    return "has different values at the same times (a different file, noise, sky or seed)"
 
 
 # figures of channels that are set side by side

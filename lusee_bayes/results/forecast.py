@@ -88,8 +88,8 @@ def forecast_lines(forecasts: Sequence[Forecast]) -> list[str]:
     offsets = first.offsets_line()
     lines = [text, f"{source}: {offsets}"] if offsets else [text]
     return lines + [
-        f"{source}, {one.variation.name}: chi^2 would not show errors up to these (in brackets, "
-        f"the map's then, in its standard deviations): {one.unnoticed}"
+        f"{source}, {one.variation.name}: residual chi2 would not reveal errors up to these (in "
+        f"brackets, the resulting error of the map, in standard deviations): {one.unnoticed}"
         for one in forecasts
         if one.unnoticed
     ]

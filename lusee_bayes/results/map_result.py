@@ -47,8 +47,8 @@ def joint_prior_sentence(scenario: Scenario) -> str:
     section, kept = scenario.spectral, f"prior.model={scenario.prior.model} is not used"
     if section.model == "positive":
         sky = f"the embedded template times the exponential of {', '.join(section.fields)}"
-        return f"Prior spectral.model=positive: {sky}, their C_ell learned from these data; {kept}."
-    return f"Prior spectral.model={section.model}, C_ell of the scenario's own skies; {kept}."
+        return f"Prior spectral.model=positive: {sky}, with C_ell learned from these data; {kept}."
+    return f"Prior spectral.model={section.model}, C_ell from the scenario's skies; {kept}."
 
 
 @dataclass(frozen=True)
@@ -78,11 +78,11 @@ class ChannelUnknowns:
         n, reports = len(self.reports), self.reports.values()
         untold = Counter(name for one in reports for name in one.table["unknown"][~one.told])
         counts = [f"{name} (at {k} of {n} frequencies)" for name, k in untold.items()]
-        what = f"do not tell {', '.join(counts)}" if counts else "tell all of them"
+        what = f"do not constrain {', '.join(counts)}" if counts else "constrain all of them"
         found = [f"Receivers, ground and gain table: the data {what}."]
         for words, octaves in self.shared.items():
             like = "the same" if np.isinf(octaves) else f"smooth over {octaves:g} octaves"
-            given = "every channel is given what the others tell of them"
+            given = "every channel uses the constraints from all others"
             found.append(f"Unknowns of {words} are {like} at all frequencies: {given}.")
         sentence = self._null_sentence()
         return [*found, sentence] if sentence else found
@@ -96,9 +96,9 @@ class ChannelUnknowns:
         worst = left_open[int(np.argmax([nulls[f].share for f in left_open]))]
         words, share = nulls[worst].words(), nulls[worst].share
         return (
-            f"One combination of what looks alike is hardly told at {len(left_open)} of "
+            f"One parameter combination is nearly unconstrained at {len(left_open)} of "
             f"{len(nulls)} frequencies. At {worst:g} MHz ({words}, in prior standard deviations) "
-            f"it keeps {share:.0%} of its prior variance."
+            f"its variance is {share:.0%} of the prior variance."
         )
 
 
@@ -273,9 +273,9 @@ class MapResult(Described):
         """The few figures that matter, in one line."""
         if self.single:
             return ", ".join(self.channel.figures())
-        kind = "each on its own" if self.joint is None else "one posterior"
+        kind = "solved independently" if self.joint is None else "one posterior"
         if self.scenario.shared and self.joint is None:
-            kind += " but for the instrument that they share"
+            kind += " except for the instrument that they share"
         parts = [f"{counted(len(self.channels), 'frequency', 'frequencies')}, {kind}"]
         crosses = [c.ell_cross for c in self.channels if c.ell_cross is not None]
         if crosses:

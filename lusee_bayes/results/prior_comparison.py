@@ -23,8 +23,8 @@ from lusee_bayes.results.channel import ChannelResult, SkyErrors
 # a difference of two evidences of which each is good to one or two
 CLEAR = 3.0
 HELD_OUT = (
-    "Left out: every product, or every day, predicted from all other data, with the prior that was "
-    "learned from all; ln p and chi^2 are summed over them."
+    "Left out: each product, or each day, is predicted from all other data with the prior learned "
+    "from all data; ln p and chi2 are sums over them."
 )
 
 
@@ -113,7 +113,7 @@ class PriorsSummary(BaseModel):
     @model_validator(mode="after")
     def _tell_the_same(self) -> PriorsSummary:
         if any(one.tells() != self.priors[0].tells() for one in self.priors):
-            raise ValueError("its priors tell different things; make the results anew")
+            raise ValueError("its priors have different entries; make the results again")
         return self
 
 
@@ -153,8 +153,8 @@ class PriorComparison:
         margin = first.log_evidence - second.log_evidence
         if margin < CLEAR:
             differ = f"their ln evidences differ by {margin:.1f}"
-            within = f"less than {CLEAR:g} is within what Laplace's approximation misses"
-            return f"The data do not tell {first.name} from {second.name}: {differ}, and {within}"
+            within = f"within the error of Laplace's approximation ({CLEAR:g})"
+            return f"The data do not favour {first.name} over {second.name}: {differ}, {within}"
         return f"The data prefer {first.name}: its ln evidence is {margin:.1f} above {second.name}"
 
     def lines(self) -> list[str]:
@@ -163,7 +163,7 @@ class PriorComparison:
         for k, kind in enumerate(held.kind for held in self.best.held_out):
             best = max(self.priors, key=lambda one, k=k: one.held_out[k].log_density)
             if best is not self.best:
-                found.append(f"Each {kind} is predicted best from the others under {best.name}.")
+                found.append(f"{best.name} predicts each {kind} best from the others.")
         return [*found, HELD_OUT]
 
     def table(self) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
@@ -218,21 +218,21 @@ def prior_table(priors: Sequence[PriorSummary]) -> tuple[tuple[str, ...], list[t
         return [f"{value - max(values):.1f}" for value in values]
 
     rows["ln evidence"] = each(".1f", lambda one: one.log_evidence)
-    rows["less the best"] = less_best(lambda one: one.log_evidence)
+    rows["minus the best"] = less_best(lambda one: one.log_evidence)
     rows["parameters learned"] = each("", lambda one: one.parameters)
     for k, held in enumerate(first.held_out):
         left_out = f"{held.kind}s left out"
         density = less_best(lambda one, k=k: one.held_out[k].log_density)
-        rows[f"{left_out}: ln p less the best"] = density
+        rows[f"{left_out}: ln p minus the best"] = density
         rows[f"{left_out}: chi2 of {held.n}"] = each(".0f", lambda one, k=k: one.held_out[k].chi2)
-    for key, words in (("instrument", "no sky explains"), ("rest", "of the sky")):
+    for key, words in (("instrument", "instrument + noise"), ("rest", "prior")):
         parts = [getattr(one, key) for one in priors]
         rows[f"chi2 {words}"] = [f"{x.chi2:.0f} of {x.degrees:.0f}" for x in parts]
     for k, part in enumerate(first.coverage):
         for level in (0.68, 0.95):
             n = LEVELS.index(level)
             held = each(".1%", lambda one, k=k, n=n: one.coverage[k].held[n])
-            rows[f"{level:.0%} hold, {part.name}"] = held
+            rows[f"{level:.0%} coverage, {part.name}"] = held
         rows[f"rms pull, {part.name}"] = each(".2f", lambda one, k=k: one.coverage[k].rms)
     if first.coverage:
         rows["largest pull"] = each(".1f", lambda one: one.coverage[-1].largest)

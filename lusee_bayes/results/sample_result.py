@@ -154,7 +154,7 @@ class ValidationResult:
         """The verdict, in one line."""
         checks = self.checks
         verdict = "passed" if self.passed else "FAILED"
-        return f"{verdict}: {sum(c.passed for c in checks)} of {len(checks)} checks hold"
+        return f"{verdict}: {sum(c.passed for c in checks)} of {len(checks)} checks pass"
 
     def summary(self) -> ValidationSummary:
         """validation.json."""

@@ -79,10 +79,10 @@ def run_compare_priors(
     replace: bool = False,
     stages: Stages | None = None,
 ) -> RunOutcome[PriorComparison]:
-    """Map one data set under several priors, and say which of them it prefers.
+    """Map one data set under several priors, and report which of them the data prefer.
 
-    A, N and the data are the same for all; what :func:`run_map` would find is found for each. The
-    folder is written in one transaction.
+    A, N and the data are the same for all; each result equals that of :func:`run_map`. The folder
+    is written in one transaction.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def run_compare_priors(
     scenario = scenario if data is None else scenario.of_measured()
     engine, stages = engine or ThisProcess(side_by_side=1), stages or Stages()
     if not scenario.single:
-        raise InputError("compare-priors is for a single frequency; leave out frequencies_mhz")
+        raise InputError("compare-priors works on a single frequency; remove frequencies_mhz")
     scenario.require_marginal("compare-priors", "set treatment=marginalised")
     sections = named_priors(priors, scenario, known_sky=data is None or truth)
     sections = {name: section.anchored() for name, section in sections.items()}

@@ -216,7 +216,7 @@ def require_fits(
             break
     raise InputError(
         f"the run would need about {gigabytes(cost.memory)} of memory for {cost.n_data:,} data and "
-        f"{cost.n_unknowns:,} unknowns; this process may use {gigabytes(limit)}{advice}"
+        f"{cost.n_unknowns:,} unknowns; this process is limited to {gigabytes(limit)}{advice}"
     )
 
 

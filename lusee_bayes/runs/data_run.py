@@ -46,12 +46,12 @@ def run_simulate(
     Parameters
     ----------
     scenario : Scenario, or its file or name
-        Of one frequency, or of those of a waterfall; the noise of each has a seed of its own, one
-        more than that of the channel before.
+        At one frequency, or at those of a waterfall; each channel's noise has its own seed, which
+        increases by one from channel to channel.
     path : path
         The file: netCDF, or luseepy's waterfall if the name ends in ``.fits``.
     replace : bool
-        Replace the file if it is there already.
+        Replace the file if it exists already.
     stages : Stages, optional
         Told what is being done.
 
@@ -63,8 +63,8 @@ def run_simulate(
     Raises
     ------
     InputError
-        If the file is there already, for several channels in a netCDF file, and for what a
-        waterfall cannot hold.
+        If the file exists already, for several channels in a netCDF file, and for data that a
+        waterfall cannot store.
     """
     scenario = load_scenario(scenario)
     path, stages = user_path(path), stages or Stages()
@@ -74,8 +74,8 @@ def run_simulate(
         raise InputError(f"{path}: {NO_ROOM}")
     if scenario.frequencies_mhz and not is_waterfall:
         raise InputError(
-            f"'{path}': netCDF files hold one frequency; for frequencies_mhz (--frequencies), give "
-            "-o a name that ends in .fits"
+            f"'{path}': a netCDF file contains one frequency; for frequencies_mhz (--frequencies), "
+            "give -o a name that ends in .fits"
         )
     channels = (scenario,) if scenario.single else scenario.channels()
     require_fits(simulation_cost(scenario, len(channels)), scenario)
@@ -213,12 +213,12 @@ def run_simulate_flight(
     Raises
     ------
     InputError
-        As :func:`.simulate_flight`, and if the folder holds sessions already, or cannot be written.
+        As :func:`.simulate_flight`, and if the folder has sessions already, or cannot be written.
     """
     scenario, folder, stages = load_scenario(scenario), user_path(folder), stages or Stages()
     if not replace and (there := sorted(folder.glob("session_*"))):
         raise InputError(
-            f"'{folder}' holds sessions already ({there[0].name}); give -o another folder, or "
+            f"'{folder}' already contains sessions ({there[0].name}); give -o another folder, or "
             "--force"
         )
     with run_folder(folder, FLIGHT, scenario, replace=replace) as run:
@@ -363,13 +363,12 @@ def run_average(
     replace: bool = False,
     stages: Stages | None = None,
 ) -> Averages:
-    """Average data, write them whole or not at all, and work out what is lost.
+    """Average data, write them completely or not at all, and compute the loss of information.
 
     Parameters
     ----------
     scenario : Scenario, or its file or name
-        How to read the data, and what the information is worked out with; ``average_s`` does not
-        count.
+        How to read the data and compute the information; ``average_s`` is ignored.
     data : Visibilities or path
         With windows.
     to_s : float
@@ -391,13 +390,13 @@ def run_average(
     stages, path = stages or Stages(), user_path(path)
     if path.suffix == ".fits":
         raise InputError(
-            f"'{path}': averages have windows, for which luseepy's waterfalls have no room; give "
-            "-o a name that does not end in .fits"
+            f"'{path}': averages have windows, which luseepy's waterfalls cannot store; give -o a "
+            "name that does not end in .fits"
         )
     require_new(path, replace=replace, inputs=inputs_of(scenario, data))
     if scenario.frequencies_mhz:
         raise InputError(
-            "averages are of one frequency; give a scenario with frequency_mhz and without "
+            "averages have one frequency; give a scenario with frequency_mhz and without "
             "frequencies_mhz"
         )
     scenario = scenario.with_section("observation", average_s=None)

@@ -105,14 +105,13 @@ def require_own(folder: Path, kinds: Sequence[str], origin: Origin) -> None:
         return
     there, advice = manifest["origin"], "give another folder with -o, or --force to replace them"
     if manifest["kind"] not in kinds:
-        raise InputError(f"'{folder}' holds results of lusee-bayes {manifest['kind']}; {advice}")
+        raise InputError(f"'{folder}' contains results of lusee-bayes {manifest['kind']}; {advice}")
     for name in [*origin, *there]:
         old, new = there.get(name), origin.get(name)
         if old != new:
             old, new = (f"{value or 'not given':.60}" for value in (old, new))
             raise InputError(
-                f"'{folder}' holds results of another run: {name} is {old} there and {new} here; "
-                f"{advice}"
+                f"'{folder}' contains results of another run: {name} was {old}, now {new}; {advice}"
             )
 
 
@@ -361,6 +360,6 @@ def _state(folder: Path, before: int | None, kind: RunKind) -> str:
     now = _written_at(folder)
     if now is not None and now != before:
         return f"the new results in '{folder}' are complete"
-    earlier = "no results are written" if now is None else "the earlier results are as they were"
+    earlier = "no results were written" if now is None else "the earlier results are unchanged"
     resumed = kind.unfinished and any((folder / kind.unfinished).glob("*"))
     return f"{earlier} in '{folder}'{f'; {kind.resume}' if resumed else ''}"

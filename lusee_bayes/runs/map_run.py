@@ -41,22 +41,22 @@ def run_map(
     Parameters
     ----------
     scenario : Scenario, or its file or name
-        Of one frequency or of several; ``output`` says what is written besides the maps.
+        At one or several frequencies; ``output`` lists what is written besides the maps.
     folder : path
         Of the results.
     data : Visibilities, path, or sequence of them, optional
-        Visibilities to map, in memory or in a file, or sessions of the spectrometer; without them
-        the scenario's own are simulated.
+        Visibilities to map, in memory or in a file, or sessions of the spectrometer; if omitted,
+        data are simulated from the scenario.
     truth : bool
-        The given data are of the scenario's own sky: compare the map with it.
+        Compare the map with the scenario's sky (use if the data were simulated from it).
     earlier : path, optional
-        Folder of a run that has kept its information (``output.information``), to whose data these
-        are added.
+        Folder of a run with saved information (``output.information``), whose posterior these data
+        update.
     thorough : bool
-        Judge every group of data, and try the usual mistakes in data and model, even if the data
+        Test every group of data, and try the usual mistakes in data and model, even if the data
         fit.
     engine : Engine, optional
-        What carries out the channels; by default this process.
+        Where channels are computed; by default in this process.
     replace : bool
         Replace results of another run in the folder.
     stages : Stages, optional
@@ -65,7 +65,7 @@ def run_map(
     Raises
     ------
     InputError
-        If the scenario samples something, or for whatever is wrong with scenario, data or folder.
+        If the scenario samples an unknown, or scenario, data or folder are invalid.
     """
     scenario = load_scenario(scenario)
     scenario = scenario if data is None else scenario.of_measured()

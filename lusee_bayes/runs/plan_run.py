@@ -79,7 +79,7 @@ def without_ports(setup: Setup, lost: Sequence[int]) -> Setup:
     n_ports = round(np.sqrt(layout.n_products))
     for port in lost:
         if not 0 <= port < n_ports:
-            raise InputError(f"there is no port {port} to lose; ports are 0 to {n_ports - 1}")
+            raise InputError(f"port {port} does not exist; ports are 0 to {n_ports - 1}")
     dead = np.array([p.i in lost or p.j in lost for p in all_products(n_ports)])
     return setup.with_layout(DataLayout.from_flags(~np.asarray(layout.present) | dead[:, None]))
 
@@ -168,7 +168,7 @@ def variations_of(
     found: list[Variation] = []
     for number, source in enumerate(sources):
         if source in sources[:number]:
-            raise InputError(f"the scenario '{source}' is given twice; give each once")
+            raise InputError(f"the scenario '{source}' is listed twice; list each once")
         if vary:
             found += given_variations(source, vary, overrides)
             continue
@@ -194,7 +194,7 @@ def given_variations(source: str, vary: Sequence[str], overrides: Sequence[str])
         values = parse_yaml(f"[{listed}]", f"--vary {text}")
         if not key or not isinstance(values, list) or not values:
             raise InputError(
-                f"--vary takes key.path=value,value,... (as "
+                "--vary expects key.path=value,value,... (e.g. "
                 f"noise.radiometer.duty_cycle=0.25,0.5), got '{text}'"
             )
         for value in values:
@@ -357,7 +357,7 @@ def run_plan(
 ) -> RunOutcome[list[Forecast]]:
     """Forecast the information in every variation, and write table and figure in one transaction.
 
-    A plan that was stopped goes on with the same call.
+    The same call resumes a plan that was stopped.
 
     Parameters
     ----------
@@ -366,15 +366,15 @@ def run_plan(
     folder : path
         Of the results.
     engine : Engine, optional
-        What makes the forecasts; by default this process.
+        Where forecasts are computed; by default in this process.
     replace, stages : bool and Stages, optional
         As in :func:`.run_map`.
 
     Raises
     ------
     InputError
-        With the variation's name, for whatever is wrong with its scenario, and if its forecast
-        does not fit into the memory.
+        With the variation's name, if its scenario is invalid, or its forecast does not fit into
+        memory.
     """
     engine, stages = engine or ThisProcess(), stages or Stages()
     for v in variations:

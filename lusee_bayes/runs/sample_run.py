@@ -227,7 +227,7 @@ def _finished(path: Path, identity: dict, sampler: Sampler) -> xr.DataTree | Non
         same = json.loads(tree.attrs["identity"]) == json.loads(json.dumps(identity))
     if not same or tree["posterior"].sizes["draw"] != sampler.draws:
         raise InputError(
-            f"'{path.parent}' holds a finished run with other settings; leave out --resume to "
+            f"'{path.parent}' contains a finished run with other settings; omit --resume to "
             "replace it, or give another folder"
         )
     return tree
@@ -250,7 +250,7 @@ def _speed(times: list[tuple[float, int]], chains: Chains, warmup: int) -> float
     return float(chains.statistics["n_steps"][:, first:last].sum() / (end - start))
 
 
-RESUME = "go on with --resume"
+RESUME = "continue with --resume"
 
 
 def default_program(scenario: Scenario) -> Program:
@@ -300,8 +300,8 @@ def run_sample(
     scenario = scenario if data is None else scenario.of_measured()
     if scenario.joint:
         raise InputError(
-            "channels are sampled one by one; the joint posterior is Gaussian, and lusee-bayes map "
-            "--joint --draws N draws from it exactly"
+            "lusee-bayes sample samples one channel at a time; for the joint posterior, which is "
+            "Gaussian, use lusee-bayes map --joint --draws N for exact draws"
         )
     program = program or default_program(scenario)
     sampler = sampler or Sampler(seed=scenario.seed)

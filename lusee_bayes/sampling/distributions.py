@@ -169,9 +169,9 @@ class TimesStudentT(Prediction):
         super().__init__(loc, noise)
         if self.factor.couples_times:
             raise InputError(
-                f"a Student-t for every time needs noise that couples no two times, not "
-                f"{type(noise).__name__}; have what couples them (gains, receivers, sources) "
-                "sampled instead of marginalised, or leave it out"
+                "a Student-t for every time needs noise without correlation in time, not "
+                f"{type(noise).__name__}; sample what correlates times (gains, receivers, sources) "
+                "instead of marginalising it, or leave it out"
             )
         self.layout = layout
         self.nu = nu

@@ -85,7 +85,7 @@ def estimate_evidence(
     laplace = laplace_approximation(program.model, arguments)
     if not bool(laplace.converged):
         raise InputError(
-            f"no mode of the posterior was found in {int(laplace.steps)} steps (the last moved by "
+            f"found no mode of the posterior in {int(laplace.steps)} steps (last step: "
             f"{float(laplace.moved):.2g} standard deviations); narrow the priors"
         )
     with numpyro_promotion():

@@ -259,7 +259,7 @@ class Chunk:
                     kind, name = key.split(":", 1)
                     kinds[kind][name] = arrays[key]
         except InputError as error:
-            raise InputError(f"{error}; delete it to go on from the one before") from error
+            raise InputError(f"{error}; delete it to continue from the one before") from error
         return cls(_iteration(path), list(kinds["state"].values()), kinds["draws"])
 
 
@@ -289,7 +289,7 @@ class Checkpoints:
         if not marker.exists():
             if paths:
                 raise InputError(
-                    f"'{self.folder}' holds draws, but no {IDENTITY} that says of which run; "
+                    f"'{self.folder}' contains draws, but no {IDENTITY} to identify the run; "
                     "delete the folder"
                 )
             with replacing(marker) as scratch:
@@ -298,8 +298,8 @@ class Checkpoints:
         if not resume:
             done = _iteration(paths[-1]) if paths else "no"
             raise InputError(
-                f"'{self.folder}' holds an unfinished run ({done} iterations done); go on with "
-                "--resume, or delete the folder"
+                f"'{self.folder}' contains an unfinished run ({done} iterations done); continue "
+                "with --resume, or delete the folder"
             )
         found = read_json(marker, IDENTITY_LAYOUT)
         for name in sorted({*found, *described}):
@@ -307,7 +307,7 @@ class Checkpoints:
                 raise InputError(
                     f"the unfinished run in '{self.folder}' has another {name}: "
                     f"{found.get(name)!s:.40}, now {described.get(name)!s:.40}; resume it with the "
-                    "same, or delete the folder"
+                    "same value, or delete the folder"
                 )
 
     def _paths(self) -> list[Path]:
@@ -327,7 +327,7 @@ class Checkpoints:
             if chunk.draws and chunk.start != done:
                 raise InputError(
                     f"'{self.folder}' lacks the draws of iterations {done} to {chunk.start}; "
-                    "delete the chunks behind them to go on from there"
+                    "delete the later chunks to continue from there"
                 )
             done = chunk.iteration
         return chunks
@@ -467,7 +467,7 @@ class CrankNicolson(MCMCKernel):
 class Sampler:
     """How to sample.
 
-    Where all sites are white the metric is known, else warmup learns a diagonal one.
+    If all sites are white, the metric is known; otherwise warmup learns a diagonal one.
 
     Attributes
     ----------
@@ -543,8 +543,8 @@ class Sampler:
         if self.algorithm == "crank-nicolson":
             if white is None:
                 raise InputError(
-                    "crank-nicolson needs coordinates in which all sites together are nearly "
-                    "N(0, 1), and none were found; use nuts"
+                    "crank-nicolson needs coordinates in which all sites are jointly close to N(0, "
+                    "1), and found none; use nuts"
                 )
             site = white.names[0] + programs.WHITE_SUFFIX
             return CrankNicolson(model, site, n_white, self.trajectory, self.target_accept)
@@ -595,8 +595,8 @@ def sample(
         state = run.start()
         if not bool(jnp.isfinite(state.potential_energy).all()):
             raise InputError(
-                "the density is NaN or infinite where the chains begin; look for logarithms and "
-                "roots of negative numbers, for scales of zero, and for data outside a support"
+                "the density is NaN or infinite where the chains start; check for logarithms and "
+                "roots of negative numbers, scales of zero, and data outside a support"
             )
         if chunks:
             done, state = chunks[-1].iteration, run.restore(state, chunks[-1].state)

@@ -254,9 +254,9 @@ def find_mode(
         elif promised > ROUNDING and gained > GOOD:
             damping, least = max(damping / DAMPING if damping > 1.0 else 0.0, least), 0.7 * least
     raise InputError(
-        f"no mode of the log-normal sky was found in {MAX_STEPS} steps (the last moved by "
-        f"{moved:.2g} standard deviations); the data are far from anything that the template "
-        "allows: check their scale, or raise log_normal.scale_std"
+        f"found no mode of the log-normal sky in {MAX_STEPS} steps (last step: {moved:.2g} "
+        "standard deviations); the data are far from the template: check their scale, or raise "
+        "log_normal.scale_std"
     )
 
 
@@ -315,9 +315,8 @@ def learn_spectrum(prior: LogNormalPrior, information: Information) -> LogNormal
         ratio = sky.root() / sky.with_power_law(np.exp(theta[0]), theta[1]).root()
         start = mode.white * ratio if np.abs(step).max() < NEAR else None
     raise InputError(
-        f"no maximum of the evidence was found in {SPECTRUM_STEPS} steps: A = "
-        f"{np.exp(theta[0]):.3g}, tilt = {theta[1]:.3g}; give log_normal.amplitude and "
-        "log_normal.tilt"
+        f"found no maximum of the evidence in {SPECTRUM_STEPS} steps: A = {np.exp(theta[0]):.3g}, "
+        f"tilt = {theta[1]:.3g}; give log_normal.amplitude and log_normal.tilt"
     )
 
 

@@ -251,8 +251,8 @@ def laplace_approximation(
     observed = sum(s["type"] == "sample" and s["is_observed"] for s in trace.values())
     if not problem.predicts and n > (most := MOST_COLLAPSED * observed):
         raise InputError(
-            f"the program has {n} unknowns and no site CorrelatedNormal, whose curvature is found "
-            f"without the Hessian; at most {most} unknowns are possible"
+            f"the program has {n} unknowns, expected at most {most} without a site "
+            "CorrelatedNormal, whose curvature needs no Hessian"
         )
     free = jnp.ones(n).at[problem.held()].set(0.0)
     scale = FIRST * _prior_scale(latent)
@@ -423,11 +423,11 @@ def sky_quantities(
     spectra = power_spectrum(skies) if len(ells) else None
     for ell in ells:
         if not 0 <= ell <= lmax:
-            raise InputError(f"there is no ell = {ell} up to lmax = {lmax}")
+            raise InputError(f"ell = {ell} is outside 0..lmax = {lmax}")
         columns[f"C_{ell} [K2]"] = spectra[..., ell]
     for ell, m in modes:
         if not (0 <= ell <= lmax and abs(m) <= ell):
-            raise InputError(f"there is no mode (ell, m) = ({ell}, {m}) up to lmax = {lmax}")
+            raise InputError(f"(ell, m) = ({ell}, {m}) is not a mode up to lmax = {lmax}")
         columns[f"sky({ell}, {m}) [K]"] = skies[..., ell**2 + ell + m]
     return columns
 

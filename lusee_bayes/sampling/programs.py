@@ -120,9 +120,9 @@ class Program:
         names = inspect.signature(self.model).parameters
         if "coupling" in names and "offset" not in names and model.offset is not None:
             raise InputError(
-                f"the program '{self.name}' asks for 'coupling' alone, and these data hold ground "
-                "or receivers besides the sky; add the argument 'offset', and coupling @ sky + "
-                "offset"
+                f"the program '{self.name}' has the argument 'coupling' but not 'offset', and "
+                "these data include ground or receivers besides the sky; add 'offset', and use "
+                "coupling @ sky + offset"
             )
         pieces = {name: partial(make, model) for name, make in PIECES.items()} | dict(more or {})
         for name in names:
@@ -170,8 +170,8 @@ def load_program(source: str | Path) -> Program:
     for name, argument in asked.items():
         if argument.kind not in (argument.POSITIONAL_OR_KEYWORD, argument.KEYWORD_ONLY):
             raise InputError(
-                f"model in '{path}' takes '{name}' by position, or as many as come; every argument "
-                "is given by its name: def model(coupling, prior, noise, data=None)"
+                f"model in '{path}' takes '{name}' by position, or variably many; arguments are "
+                "passed by name: def model(coupling, prior, noise, data=None)"
             )
         if name != DATA and name not in known:
             raise InputError(
@@ -180,8 +180,8 @@ def load_program(source: str | Path) -> Program:
             )
     if DATA not in asked or asked[DATA].default is not None:
         raise InputError(
-            f"model in '{path}' has no argument 'data' that is None by default; write data=None: "
-            "with data they are observed, without they are drawn"
+            f"model in '{path}' has no argument 'data' with default None; write data=None: given "
+            "data are observed, otherwise data are drawn"
         )
     return Program(path.stem, model, hashlib.sha256(text).hexdigest(), str(path))
 
@@ -324,14 +324,14 @@ def require_sampleable(
         raise InputError(f"{who} has no observed site 'data'; sample('data', ..., obs=data)")
     _require_shape(sites[DATA], data.shape, f"{who} observes")
     if not latent:
-        raise InputError(f"{who} samples nothing: it has no site that is not observed")
+        raise InputError(f"{who} has no latent site, so that nothing is sampled")
     if SKY in sites:
         what = "samples" if SKY in latent else "computes"
         _require_shape(sites[SKY], (n_modes,), f"{who} {what}")
     elif not isinstance(returned, LinearGaussian):
         raise InputError(
-            f"{who} has no site 'sky', and returns no LinearGaussian to draw the sky from; do one "
-            "or the other"
+            f"{who} has no site 'sky' and returns no LinearGaussian to draw the sky from; do one "
+            "of the two"
         )
     with _blaming(who, "when it is called with data=None"):
         drawn = latent_sites(program.model, {**arguments, DATA: None})
@@ -370,18 +370,18 @@ def _blaming(who: str, doing: str) -> Iterator[None]:
 def _require_site(name: str, site: dict[str, Any], latent: bool, who: str) -> None:
     if not NAME.fullmatch(name):
         raise InputError(
-            f"{who} has a site '{name}'; names are letters, digits, '_', '.' and '-', and begin "
-            "with a letter or '_'"
+            f"{who} has a site '{name}'; use letters, digits, '_', '.' and '-', beginning with a "
+            "letter or '_'"
         )
     if name in TAKEN or name.endswith(WHITE_SUFFIX):
-        raise InputError(f"{who} has a site '{name}', a name that is taken; give it another")
+        raise InputError(f"{who} has a site '{name}', a reserved name; rename it")
     if latent and site["fn"].support.is_discrete:
         raise InputError(
-            f"{who} has the discrete site '{name}'; Hamiltonian Monte Carlo needs continuous "
-            "ones: sum it out, or put a continuous distribution in its place"
+            f"{who} has the discrete site '{name}'; Hamiltonian Monte Carlo needs continuous ones: "
+            "sum over it, or use a continuous distribution"
         )
     if latent and jnp.issubdtype(jnp.result_type(site["value"]), jnp.complexfloating):
-        raise InputError(f"{who} has the complex site '{name}'; sample its two parts")
+        raise InputError(f"{who} has the complex site '{name}'; sample real and imaginary part")
 
 
 def _require_shape(site: dict[str, Any], shape: tuple[int, ...], what: str) -> None:

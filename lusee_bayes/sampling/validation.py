@@ -400,7 +400,7 @@ def validate_draws(
     require_shape("the draws", draws, (None, None, posterior.prior.size))
     require_draws(draws.shape[1])
     if not np.isfinite(draws).all():
-        raise InputError("the draws hold NaN or infinity; their chains have failed")
+        raise InputError("the draws contain NaN or infinity: their chains have failed")
     n_chains, _, n_modes = draws.shape
     deviations = (draws - np.asarray(posterior.mean)) / np.asarray(posterior.std())
     mean_z = deviations.mean((0, 1)) * np.sqrt(_ess(deviations, method="mean"))

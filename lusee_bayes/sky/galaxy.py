@@ -679,8 +679,8 @@ def galaxy_map(frequency_mhz: float, nside: int = 64, seed: int | None = 1) -> n
     """
     if not MINIMUM_MHZ <= frequency_mhz <= MAXIMUM_MHZ:
         raise InputError(
-            f"frequency_mhz is {frequency_mhz}, expected {MINIMUM_MHZ:g} to {MAXIMUM_MHZ:g}; "
-            "give a frequency in MHz within LuSEE-Night's band"
+            f"frequency_mhz is {frequency_mhz}, expected {MINIMUM_MHZ:g} to {MAXIMUM_MHZ:g}; give "
+            "a frequency in MHz within the band of LuSEE-Night"
         )
     require_nside(nside)
     if seed is not None and seed < 0:

@@ -362,7 +362,7 @@ class PositiveSkies(eqx.Module):
         grid = SphereGrid.of(highest, max(GRID * highest, FIELDS_GRID) if band is None else band)
         at = grid.directions()
         levels = np.stack([template(*at).reshape(grid.shape) for template in templates])
-        require_positive("the template", levels, "a sky whose logarithm is modelled has no holes")
+        require_positive("the template", levels, "its logarithm is modelled")
         strength = np.ones(grid.shape) if weight is None else weight(*at).reshape(grid.shape)
         require_positive("the weight of the fields", strength)
         if sources is None:

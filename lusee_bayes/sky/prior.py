@@ -227,7 +227,7 @@ class DensePrior(Prior):
     def description(self) -> tuple[str, ...]:
         about = "zero" if self.mean is None else "a mean sky"
         width = extent(namespace(self).sqrt(self.variance()), "K")
-        head = f"correlated coefficients about {about}, {self.size} modes, Galactic"
+        head = f"correlated coefficients with mean {about}, {self.size} modes, Galactic"
         return head, f"standard deviations {width}"
 
     @property
@@ -334,7 +334,7 @@ class DiagonalPrior(Prior):
     def require_density(self) -> None:
         if not is_traced(self.widths) and not np.asarray(self.widths).all():
             zero = int(np.argmin(np.abs(np.asarray(self.widths))))
-            raise InputError(f"unknown {zero} has no prior variance and no density; drop it")
+            raise InputError(f"unknown {zero} has zero prior variance and no density; drop it")
 
 
 class IndependentPrior(DiagonalPrior):
@@ -394,7 +394,7 @@ class HarmonicPrior(DiagonalPrior):
             ell = int(np.argmax(negative))
             raise InputError(
                 f"the prior spectrum is negative at ell = {ell}: C_ell = "
-                f"{float(self.spectrum[ell]):.3g}; a variance cannot be"
+                f"{float(self.spectrum[ell]):.3g}; give a variance"
             )
         if self.mean is None:
             return
@@ -408,7 +408,7 @@ class HarmonicPrior(DiagonalPrior):
     def description(self) -> tuple[str, ...]:
         about = "zero" if self.mean is None else "a mean sky"
         return (
-            f"independent coefficients about {about}, lmax = {self.spectrum.shape[0] - 1}",
+            f"independent coefficients with mean {about}, lmax = {self.spectrum.shape[0] - 1}",
             f"{self.size} real coefficients, Galactic; C_ell {extent(self.spectrum, 'K^2')}",
         )
 
@@ -475,7 +475,7 @@ def read_spectrum(path: str | Path, lmax: int) -> Float[np.ndarray, " ells"]:
     if lines and lines[0][0].isalpha():  # names of the columns
         del lines[0]
     if not lines:
-        raise InputError(f"{path} holds no numbers; expected {SPECTRUM.what}")
+        raise InputError(f"{path} contains no numbers; expected {SPECTRUM.what}")
     with reading(path, SPECTRUM.what):
         table = np.loadtxt(lines, ndmin=2)
         if table.shape[1] != 2 or (table[:, 0] % 1.0).any():

@@ -218,7 +218,7 @@ class SkyMap(SkyFile):
 
 def _require_healpix(path: str | Path, n_pixels: int) -> None:
     if not n_pixels or n_pixels != 12 * round((n_pixels / 12) ** 0.5) ** 2:
-        raise InputError(f"{path}: {n_pixels} values are not a HEALPix map of 12 NSIDE^2")
+        raise InputError(f"{path} has {n_pixels} values, expected 12 NSIDE^2 of a HEALPix map")
 
 
 def _layout(name: str) -> Layout:
@@ -252,8 +252,8 @@ def _read_map(path: Path) -> np.ndarray:
     ordering = str(header.get("ORDERING", "absent")).strip().upper()
     if ordering != "RING":
         raise InputError(
-            f"{path}: ORDERING is {ordering}, expected RING; write it again with "
-            "healpy.write_map(..., nest=False), after healpy.reorder(m, n2r=True) if it is NESTED"
+            f"{path}: ORDERING is {ordering}, expected RING; rewrite it with healpy.write_map(..., "
+            "nest=False), after healpy.reorder(m, n2r=True) if it is NESTED"
         )
     frame = str(header.get("COORDSYS", "G")).strip().upper()
     if frame not in ("G", "GALACTIC"):
@@ -341,8 +341,8 @@ class SkyAlms(SkyFile):
     def modes_at(self, frequency_mhz: float, lmax: int) -> Float[np.ndarray, " modes"]:
         if lmax > self.lmax:
             raise InputError(
-                f"{self.path} has coefficients up to ell = {self.lmax}, not up to {lmax}; lower "
-                "lmax"
+                f"{self.path} has coefficients up to ell = {self.lmax}, expected up to {lmax}; "
+                "lower lmax"
             )
         known, channel = self.frequencies_mhz, 0
         if known is not None:
@@ -351,7 +351,7 @@ class SkyAlms(SkyFile):
                 raise InputError(
                     f"{self.path} has no coefficients at {frequency_mhz:g} MHz (it has "
                     f"{', '.join(f'{f:g}' for f in known)}); set sky.file_frequency_mhz to one of "
-                    "those, and they are scaled with sky.spectral_index"
+                    "those, to scale them with sky.spectral_index"
                 )
         return self.modes[channel, : harmonics.n_modes(lmax)]
 
@@ -496,8 +496,8 @@ class SkyCube(SkyFile):
         if not known[0] <= frequency_mhz <= known[-1]:
             raise InputError(
                 f"{self.path} has maps from {known[0]:g} to {known[-1]:g} MHz, not at "
-                f"{frequency_mhz:g}; set sky.file_frequency_mhz to one of those, and it is scaled "
-                "with sky.spectral_index"
+                f"{frequency_mhz:g}; set sky.file_frequency_mhz to one of those, to scale it with "
+                "sky.spectral_index"
             )
         above = int(np.searchsorted(known, frequency_mhz))
         if known[above] == frequency_mhz:
@@ -506,8 +506,8 @@ class SkyCube(SkyFile):
         if not ((low > 0) & (high > 0)).all():
             raise InputError(
                 f"{self.path} has pixels that are not positive at {known[above - 1]:g} or "
-                f"{known[above]:g} MHz, between which there is no power law; take a frequency of "
-                "the file"
+                f"{known[above]:g} MHz, so that no power law interpolates between them; use a "
+                "frequency of the file"
             )
         share = np.log(frequency_mhz / known[above - 1]) / np.log(known[above] / known[above - 1])
         return low * (high / low) ** share
@@ -518,10 +518,10 @@ class SkyCube(SkyFile):
     def description(self) -> tuple[str, ...]:
         known, pixels = self.frequencies_mhz, self.pixels
         return (
-            f"{len(pixels)} HEALPix sky maps, NSIDE {healpy.npix2nside(pixels.shape[1])}, taken "
-            "to be RING and Galactic",
+            f"{len(pixels)} HEALPix sky maps, NSIDE {healpy.npix2nside(pixels.shape[1])}, assumed "
+            "RING and Galactic",
             f"{known[0]:g} to {known[-1]:g} MHz, means {pixels[0].mean():.6g} to "
-            f"{pixels[-1].mean():.6g} K, least pixel {pixels.min():.4g} K",
+            f"{pixels[-1].mean():.6g} K, smallest pixel {pixels.min():.4g} K",
         )
 
 

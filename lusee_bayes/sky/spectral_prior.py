@@ -80,9 +80,8 @@ def check_components(names: tuple[str, ...], n_channels: int, residual: float | 
     require_names("component", "spectral components", names, SPECTRA, n_channels)
     if residual is None and n_channels == len(names):
         raise InputError(
-            f"{len(names)} spectral components fit the skies of {n_channels} channels "
-            "exactly, whatever these are; give spectral.residual, name fewer in "
-            "spectral.components, or give more frequencies"
+            f"{len(names)} spectral components fit any skies of {n_channels} channels exactly; "
+            "give spectral.residual, name fewer in spectral.components, or give more frequencies"
         )
 
 
@@ -121,7 +120,7 @@ class SpectralPrior(checks.Described, eqx.Module):
         checks.require_array("the components' spectra", self.spectra, (components, None))
         checks.require_positive("the components' C_ell", self.spectra)
         if self.residual is not None:
-            name, hint = "the residual spectra", "leave them out if there is no residual"
+            name, hint = "the residual spectra", "omit them without a residual"
             checks.require_array(name, self.residual, (channels, self.spectra.shape[1]))
             checks.require_positive(name, self.residual, hint)
 

@@ -40,11 +40,11 @@ class AboveLmaxSection(Section):
     Attributes
     ----------
     margin : int
-        By how much more than lmax the ell of what the antennas see may be.
+        Number of multipoles above lmax that the antennas can see.
     least_lmax : int
-        How far it reaches at least.
+        Minimum value of the highest ell that the antennas see.
     treatment : {"marginalised", "sampled", "ignored"}
-        Its covariance is added to N, it is sampled with the map, or the model ends at lmax.
+        Add its covariance to N, sample it with the map, or end the model at lmax.
     """
 
     margin: Annotated[int, Field(ge=1, le=64)] = 16

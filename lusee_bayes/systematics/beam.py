@@ -37,20 +37,20 @@ from lusee_bayes.systematics.systematic import (
 
 
 class BeamErrorSection(Section):
-    """Beams that differ from the model's in the data; give one of the first three keys.
+    """Beam errors: the data use other beams than the model; give one of the first three keys.
 
     Attributes
     ----------
     shift_mhz : float
-        The data are taken with the beams of frequency + shift.
+        The data use the beams at frequency + shift.
     file : str
-        The data are taken with the beams of this file.
+        The data use the beams in this file.
     parameters : dict
-        Prior standard deviations of parameters of the embedded antennas, or of a grid of files,
-        about the values in ``beam``, by name; the data's own are drawn with the seed.
+        Prior standard deviations, by name, of parameters of the embedded antennas or of a grid of
+        files, about the values in ``beam``; simulated data draw true values from this prior.
     treatment : {"marginalised", "sampled", "ignored"}
-        The error's covariance is added to N, its amplitude or parameters are sampled with the
-        map, or it is left out of the model.
+        Add the covariance of the error to N, sample its amplitude or parameters with the map, or
+        leave it out of the model.
     """
 
     shift_mhz: Annotated[float, Field(ge=-49, le=49)] | None = None

@@ -53,16 +53,16 @@ class FieldErrorsSection(Section):
     Attributes
     ----------
     std : float
-        Standard deviation of the real and of the imaginary part of either component, over the rms
-        of the port's field, in any direction; the least, where it is learned.
+        Standard deviation, in any direction, of the real and the imaginary part of each component,
+        relative to the rms of the port's field; a lower limit if ``learned``.
     lmax : int
         Highest ell of the errors.
     slope : float
-        C_ell goes with (1 + ell)^-slope.
+        C_ell of the errors scales as (1 + ell)^-slope.
     learned : bool
-        Whether the data may raise ``std``.
+        Let the data increase ``std``.
     treatment : {"marginalised", "sampled", "ignored"}
-        Found in rounds and marginalised, sampled with the map, or left out of the model.
+        Estimate them iteratively and marginalise, sample them with the map, or leave them out.
     """
 
     std: Annotated[float, Field(gt=0, le=LARGEST), NOT_TINY] = 1e-3

@@ -48,7 +48,7 @@ _HANDLERS = threading.Lock()
 
 
 class GainSection(Section):
-    """Gain drifts in the data: their covariance in N, or the drifts themselves ``sampled``.
+    """Gain drifts: their covariance is added to N, or the drifts are ``sampled``.
 
     Attributes
     ----------
@@ -57,17 +57,16 @@ class GainSection(Section):
     correlation_h : float
         Correlation time.
     log_sigma_std : float
-        Prior standard deviation of ln sigma, where it is not known. Simulated data hold one drawn
-        from it, and it is sampled with the drifts.
+        Prior standard deviation of ln sigma, for an unknown sigma. Sigma is then sampled with the
+        drifts; simulated data use one drawn from this prior.
     log_correlation_std : float
         The same for ln of the correlation time.
     treatment : {"marginalised", "sampled", "ignored"}
-        Their covariance is added to N, they are sampled with the map, or they are left out of the
-        model.
+        Add their covariance to N, sample them with the map, or leave them out of the model.
     visibilities : {"model", "measured", "posterior"}, optional
-        Visibilities that the covariance is built around: the modelled sky's, right only for
-        simulated data whose instrument is exactly known; the data, whose own drifts move the map
-        by about a standard deviation; or by default the map's prediction, in rounds.
+        Visibilities from which the covariance is computed: those of the model sky, correct only for
+        simulated data with an exactly known instrument; the data, whose own drifts shift the map by
+        about one standard deviation; or, by default, the map's prediction (iterative).
     """
 
     sigma: Positive = 0.01
@@ -82,8 +81,8 @@ class GainSection(Section):
             section.treatment != "marginalised"
             or (section.log_sigma_std is None and section.log_correlation_std is None)
         ),
-        "log_sigma_std and log_correlation_std need treatment 'sampled': a covariance has to know "
-        "its scales",
+        "log_sigma_std and log_correlation_std need treatment 'sampled': a covariance has fixed "
+        "scales",
     )
 
 

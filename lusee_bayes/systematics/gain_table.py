@@ -35,16 +35,16 @@ COMMON_GAIN = "common gain"
 
 
 class GainTableSection(Section):
-    """Errors of the gain table, which all spectra of one level of one port share.
+    """Errors of the gain table, shared by all spectra at one level of one port.
 
     Attributes
     ----------
     std : float
-        Prior standard deviation of every port's power gain, relative, where the data do not say
-        the errors of their table themselves and ``flight.gain_std`` does not, either.
+        Relative prior standard deviation of every port's power gain, used if neither the data nor
+        ``flight.gain_std`` specifies the errors of the gain table.
     treatment : {"marginalised", "sampled", "ignored"}
-        Their covariance is added to N to first order about what the data tell, found in rounds;
-        they are sampled with the map; or they are left out of the model.
+        Add their covariance to N to first order about their iterative estimate, sample them with
+        the map, or leave them out of the model.
     """
 
     std: Annotated[float, Field(gt=0, le=LARGEST), NOT_TINY] | None = None
@@ -136,7 +136,7 @@ def table_errors(
     named = calibration is not None and calibration.gain_slope is not None
     if named and std is not None:
         raise InputError(
-            "the data say the errors of their gain table themselves; leave out noise.gain_table.std"
+            "the data already contain the errors of their gain table; remove noise.gain_table.std"
         )
     if not named:
         if std is None and setup.scenario.flight is not None:
@@ -144,14 +144,14 @@ def table_errors(
             std = setup.scenario.flight.gain_std
             if std is not None and std > LARGEST:
                 raise InputError(
-                    f"flight.gain_std is {std:g}, and power gains that are off by more than "
-                    f"{LARGEST:g} of themselves are not modelled; give a smaller "
-                    "noise.gain_table.std for simulated data"
+                    f"flight.gain_std is {std:g}, but relative errors of power gains above "
+                    f"{LARGEST:g} are not modelled; give a smaller noise.gain_table.std for "
+                    "simulated data"
                 )
         if std is None:
             raise InputError(
-                "the data say nothing of a gain table; give noise.gain_table.std, the relative "
-                "error of every port's power gain"
+                "the data contain no gain table; give noise.gain_table.std, the relative error of "
+                "every port's power gain"
             )
         ports = tuple(range(setup.beam_source.n_ports))
         slope = np.full((len(ports), setup.layout.n_times), std)
@@ -163,9 +163,9 @@ def table_errors(
         total = float(np.sqrt((slope[port == number] ** 2).sum(0)).max())
         if total > LARGEST:
             raise InputError(
-                f"the data say that the power gain of port {number} is known to {total:.2g} of "
-                f"itself, expected at most {LARGEST:g}; noise.gain_table.treatment=ignored takes "
-                "it as it is"
+                f"the data give the power gain of port {number} a relative error of {total:.2g}, "
+                f"expected at most {LARGEST:g}; noise.gain_table.treatment=ignored treats it as "
+                "exact"
             )
     names = tuple(f"gain_{calibration.gain_names[k].replace(' ', '_')}" for k in used)
     return names, tuple(port.tolist()), slope

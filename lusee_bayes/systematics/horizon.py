@@ -63,27 +63,27 @@ REACH = 6.0
 
 
 class HorizonSection(Section):
-    """Terrain that hides the sky below an altitude, known but for a smooth function of azimuth.
+    """Terrain that hides the sky: a known altitude plus a smooth unknown function of azimuth.
 
     Attributes
     ----------
     file : str
-        Table (CSV) of the known altitude: the columns ``azimuth_deg``, from North towards East, and
-        ``altitude_deg``, with straight lines between its rows.
+        CSV table of the known altitude, interpolated linearly: columns ``azimuth_deg``, from North
+        towards East, and ``altitude_deg``.
     altitude_deg : float
-        Known altitude in all directions; with such a table, what it is higher everywhere.
+        Known altitude in all directions; if ``file`` is set, a constant added to the table.
     std_deg : float
-        Prior standard deviation of what has to be added in each direction.
+        Prior standard deviation of the altitude error in each direction.
     harmonics : int
-        Highest order of its Fourier series in azimuth.
+        Highest order of the Fourier series of the error in azimuth.
     moon_temperature_k : float
         Temperature of the terrain, which emits where it hides the sky.
     treatment : {"marginalised", "sampled", "ignored"}
-        The covariance of the series is added to N to first order about what the data tell, its
-        coefficients are sampled with the map, or the model takes the known altitude for the truth.
+        Add the covariance of the series to N to first order about its iterative estimate, sample
+        its coefficients with the map, or assume that the known altitude is exact.
     true_values : dict
-        What simulated data hold, by name (horizon_deg, horizon_cos_1_deg, horizon_sin_1_deg, ...);
-        the others are drawn from their priors.
+        True values in simulated data, by name (horizon_deg, horizon_cos_1_deg, horizon_sin_1_deg,
+        ...); the others are drawn from their priors.
     """
 
     file: str | None = None
@@ -96,7 +96,7 @@ class HorizonSection(Section):
 
     _not_about_zero = requires(
         lambda section: section.treatment == "ignored" or section.file or section.altitude_deg,
-        "give file or altitude_deg: about altitude 0, where beams vanish, data tell nothing of it",
+        "give file or altitude_deg: at altitude 0, where beams vanish, data do not constrain it",
     )
 
     def known(self, azimuth: Altitudes) -> Altitudes:

@@ -28,21 +28,21 @@ class RadiometerSection(Section):
     Attributes
     ----------
     form : {"paper", "exact"}
-        ``paper``: independent products; ``exact``: the covariance of the products at each time.
+        ``paper``: independent products; ``exact``: full covariance of the products at each time.
     bandwidth_hz : float
-        Width of a channel.
+        Channel width.
     duty_cycle : float
-        Share of the live time in which the spectrometer integrates: 1 where data or a schedule say
-        their live time as it was.
+        Fraction of the live time spent integrating. Use 1 if data or a schedule already give the
+        true live time.
     factor : float
-        Factor of the noise variance.
+        Factor applied to the noise variance.
     log_factor_std : float
-        Prior standard deviation of ln of a further factor of the variance, where the level is not
-        known. Simulated data hold one drawn from it, and it is sampled.
+        Prior standard deviation of ln of an additional variance factor, for an unknown noise level.
+        The factor is sampled; simulated data include one drawn from this prior.
     temperature : {"model", "measured", "posterior"}, optional
-        Visibilities that set the level: the modelled sky's, the data themselves, or the map's own
-        prediction, in rounds. By default the modelled sky's for simulated data, and for measured
-        ones the data themselves, unless their noise would bias the map; then the map's prediction.
+        Visibilities that set the noise level: those of the model sky, the data themselves, or the
+        map's prediction (iterative). Default: the model sky for simulated data; for measured data
+        the data themselves or, if their noise would bias the map, the map's prediction.
     """
 
     form: Literal["paper", "exact"] = "paper"

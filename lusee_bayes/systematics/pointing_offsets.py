@@ -41,29 +41,29 @@ Offset = Annotated[float, Field(gt=0, le=45), NOT_TINY]
 
 
 class PointingSection(Section):
-    """Offsets of clock and pointing: prior standard deviations of what has to be added.
+    """Clock and pointing offsets: prior standard deviations of the corrections to add.
 
     Attributes
     ----------
     clock_s : float
-        Samples were taken later than their times say by so many seconds.
+        Delay of the samples relative to their recorded times.
     clock_drift_s_per_day : float
-        And later by so much more every day from the first sample on.
+        Increase of this delay per day since the first sample.
     turntable_deg : float
-        Angle of the turntable, of every run on its own.
+        Turntable angle, independent for every run.
     lon_deg : float
         Longitude of the site.
     lat_deg : float
         Latitude of the site.
     tilt_east_deg : float
-        Lean of the lander towards East.
+        Tilt of the lander towards East.
     tilt_north_deg : float
-        Lean of the lander towards North.
+        Tilt of the lander towards North.
     treatment : {"marginalised", "sampled", "ignored"}
-        Their covariance is added to N to first order, they are sampled with the map, or they are
-        left out of the model.
+        Add their covariance to N to first order, sample them with the map, or leave them out of the
+        model.
     true_values : dict
-        What simulated data hold, by name (turntable_0_deg, ... where there are several runs);
+        True values in simulated data, by name (turntable_0_deg, ... if there are several runs);
         the others are drawn from their priors.
     """
 
@@ -79,7 +79,7 @@ class PointingSection(Section):
 
     _something_is_not_known = requires(
         lambda section: section.kinds,
-        f"give a standard deviation of at least one of {', '.join(OFFSETS)}",
+        f"give a standard deviation for at least one of {', '.join(OFFSETS)}",
     )
 
     @property

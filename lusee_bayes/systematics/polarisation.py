@@ -65,20 +65,20 @@ Modes = Float[Array, "products modes"]
 
 
 class PolarisationSection(Section):
-    """Polarised emission that the map does not model; there is none unless the first two say so.
+    """Polarised emission, which the map does not model; none unless linear or circular is set.
 
     Attributes
     ----------
     linear : float
-        Rms of the linearly polarised brightness, sqrt(Q^2 + U^2), over the mean of the model sky.
+        rms linearly polarised brightness, sqrt(Q^2 + U^2), relative to the mean of the model sky.
     circular : float
-        Rms of Stokes V over the mean of the model sky.
+        rms of Stokes V, relative to the mean of the model sky.
     lmax : int
-        Highest ell that it has.
+        Highest ell of the polarised emission.
     slope : float
-        Its C_ell go as (ell + 1)^slope. With -2 every octave of ell has about the same power.
+        C_ell scales as (ell + 1)^slope; with -2, all octaves of ell have about the same power.
     treatment : {"marginalised", "sampled", "ignored"}
-        Its covariance is added to N, it is sampled with the map, or it is left out of the model.
+        Add its covariance to N, sample it with the map, or leave it out of the model.
     """
 
     linear: Share = 0.0

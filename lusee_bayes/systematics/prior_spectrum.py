@@ -27,18 +27,18 @@ PIVOT = 10.0
 
 
 class SpectrumSection(Section):
-    """What may be sampled of C_ell.
+    """Parameters of C_ell that can be sampled.
 
     Attributes
     ----------
     log_amplitude_std : float
-        Prior standard deviation of ln A; A is sampled if it is given.
+        Prior standard deviation of ln A; if set, A is sampled.
     tilt_std : float
-        Prior standard deviation of the tilt, which is sampled if it is given.
+        Prior standard deviation of the tilt; if set, the tilt is sampled.
     band_edges : tuple of int
-        First ell of each band but the lowest; amplitudes of the bands are sampled if it is given.
+        First ell of each band except the lowest; if set, the band amplitudes are sampled.
     log_band_std : float
-        Prior standard deviation of ln of each band's amplitude.
+        Prior standard deviation of ln of each band amplitude.
     """
 
     log_amplitude_std: Positive | None = None
@@ -54,7 +54,7 @@ class SpectrumSection(Section):
     )
     _bands_grow = requires(
         lambda section: list(section.band_edges) == sorted(set(section.band_edges)),
-        "band_edges must grow from one to the next",
+        "band_edges must increase",
     )
 
     @property
@@ -125,14 +125,14 @@ class PriorSpectrum(Scale):
         """
         if not isinstance(model.prior, HarmonicPrior):
             raise InputError(
-                "a sampled spectrum is that of an isotropic prior, got "
-                f"{type(model.prior).__name__}; use a HarmonicPrior"
+                f"a sampled spectrum needs an isotropic prior, got {type(model.prior).__name__}; "
+                "use a HarmonicPrior"
             )
         spectrum = model.prior.spectrum
         ell = np.arange(spectrum.shape[0])
         if self.edges:
             if self.edges[-1] > ell[-1]:
-                raise InputError(f"a band begins at ell = {self.edges[-1]}, above lmax = {ell[-1]}")
+                raise InputError(f"a band starts at ell = {self.edges[-1]}, above lmax = {ell[-1]}")
             band = np.searchsorted(np.asarray(self.edges), ell, side="right")
             spectrum = spectrum * values["band_power"][band]
         slope = jnp.asarray((ell + 1.0) / PIVOT) ** values.get("tilt", 0.0)

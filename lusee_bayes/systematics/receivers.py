@@ -25,26 +25,26 @@ N_WAVES = 512
 
 
 class ReceiverNoiseSection(Section):
-    """Noise of every port's receiver: constant, in that port's auto; give one of the powers.
+    """Constant receiver noise in the auto of every port; give one of the two powers.
 
     Attributes
     ----------
     power_v2_hz : float
-        Mean power in V^2/Hz at the receiver's input; needs a response file, which knows volts.
+        Mean power in V^2/Hz at the receiver input; needs a response file, calibrated in volts.
     power_k : float
         Mean power as an antenna temperature.
     slope : float
-        Exponent of frequency, with which the mean goes.
+        Spectral exponent of the mean power.
     reference_mhz : float
-        Frequency at which the mean is the given power.
+        Frequency at which the mean equals the given power.
     relative_std : float
-        Prior standard deviation of every port's own power over the mean.
+        Prior standard deviation of each port's power, relative to the mean.
     smooth_octaves : float
-        What a port's power is off by is a smooth function of frequency, which forgets itself over
-        so many octaves; without it, every frequency has an error of its own.
+        Correlation length in octaves of each port's power error, a smooth function of frequency; if
+        omitted, the errors at different frequencies are independent.
     treatment : {"marginalised", "sampled", "ignored"}
-        Their covariance is added to N, the powers are sampled with the map, or the model takes
-        all of them for the mean.
+        Add their covariance to N, sample the powers with the map, or assume that all powers equal
+        the mean.
     """
 
     power_v2_hz: Positive | None = None
@@ -74,8 +74,8 @@ class ReceiverNoiseSection(Section):
         circuit = source.circuit(frequency_mhz)
         if circuit is None:
             raise InputError(
-                "noise.receiver.power_v2_hz needs antennas that know volts, which are those of a "
-                "response file; give that as beam.file, or use noise.receiver.power_k"
+                "noise.receiver.power_v2_hz needs antennas calibrated in volts, i.e. a response "
+                "file; give it as beam.file, or use noise.receiver.power_k"
             )
         return self.power_v2_hz * rise / circuit.per_kelvin.diagonal().real
 

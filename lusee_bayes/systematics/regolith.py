@@ -17,15 +17,15 @@ from lusee_bayes.systematics.systematic import Temperatures
 
 
 class RegolithSection(Section):
-    """Temperature of the ground, known to be about ``beam.moon_temperature_k``.
+    """Temperature of the ground, with ``beam.moon_temperature_k`` as its prior mean.
 
     Attributes
     ----------
     std_k : float
         Prior standard deviation.
     treatment : {"marginalised", "sampled", "ignored"}
-        Its covariance is added to N, it is sampled with the map, or the model takes
-        ``beam.moon_temperature_k`` for the truth.
+        Add its covariance to N, sample it with the map, or assume that
+        ``beam.moon_temperature_k`` is exact.
     """
 
     std_k: Positive
@@ -58,9 +58,8 @@ def ground_per_kelvin(source: BeamSource, frequency_mhz: float) -> Float[Array, 
     """
     if not hasattr(source, "moon_k"):
         raise InputError(
-            "noise.regolith needs antennas that receive from the ground, which are those of a "
-            "response file or of a scalar beam file; give one as beam.file, or leave out "
-            "noise.regolith"
+            "noise.regolith needs antennas that receive from the ground, i.e. a response file or a "
+            "scalar beam file; give one as beam.file, or remove noise.regolith"
         )
     warm, cold = (replace(source, moon_k=kelvin) for kelvin in (1.0, 0.0))
     return np.asarray(warm.background(frequency_mhz)) - np.asarray(cold.background(frequency_mhz))

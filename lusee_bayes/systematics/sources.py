@@ -34,24 +34,24 @@ SOURCE_NODES = 8
 
 
 class SourceSection(Section):
-    """A point source, apart from the map: one of the catalogue, a body of the solar system, or own.
+    """A point source outside the map: from the catalogue, a solar-system body, or your own.
 
     Attributes
     ----------
     name : str
-        Of the catalogue (Cas A, ...), of a body (Sun, Jupiter, ...), or any other with a position.
+        Catalogue source (Cas A, ...), body (Sun, Jupiter, ...), or any other name with a position.
     flux_jy : float
-        Mean of the prior on its flux density; by default the catalogue's.
+        Prior mean of its flux density; default: the catalogue's value.
     relative_std : float
-        Standard deviation of that prior over its mean.
+        Prior standard deviation of the flux density, relative to its mean.
     ra_deg : float
-        Right ascension of an own source (ICRS).
+        Right ascension of your own source (ICRS).
     dec_deg : float
-        Declination of an own source (ICRS).
+        Declination of your own source (ICRS).
     stokes_v : float
         Circularly polarised fraction V / I, positive if right-handed (IAU).
     block_h : float
-        Length of blocks of time that have independent amplitudes; by default one for all times.
+        Length of time blocks with independent amplitudes; default: one block for all times.
     """
 
     name: str
@@ -74,8 +74,8 @@ class SourceSection(Section):
         if self.name in CATALOGUE:
             return float(CATALOGUE[self.name].kelvin_steradian(frequency_mhz))
         raise InputError(
-            f"the source '{self.name}' is not in the catalogue, so that its flux is not known; "
-            "give flux_jy, the mean of its prior"
+            f"the source '{self.name}' is not in the catalogue, so that its flux is unknown; give "
+            "flux_jy, the mean of its prior"
         )
 
     def direction(self, observation: Observation) -> Float[np.ndarray, "..."]:
@@ -87,8 +87,8 @@ class SourceSection(Section):
         known = CATALOGUE.get(self.name)
         if known is None:
             raise InputError(
-                f"unknown source '{self.name}'; {nearest(self.name, [*CATALOGUE, *BODIES])} "
-                "(or give ra_deg and dec_deg of your own)"
+                f"unknown source '{self.name}'; {nearest(self.name, [*CATALOGUE, *BODIES])} (or "
+                "give ra_deg and dec_deg)"
             )
         return galactic_unit_vector(known.ra_deg, known.dec_deg)
 
@@ -101,15 +101,15 @@ class SourceSection(Section):
 
 
 class SourcesSection(Section):
-    """Point sources that are not part of the map: in N, sampled, or ignored.
+    """Point sources that are not part of the map: marginalised, sampled or ignored.
 
     Attributes
     ----------
     list : tuple of SourceSection
         The sources.
     treatment : {"marginalised", "sampled", "ignored"}
-        Their covariance is added to N, their fluxes are sampled with the map, or they are left out
-        of the model.
+        Add their covariance to N, sample their fluxes with the map, or leave them out of the
+        model.
     """
 
     list: tuple[SourceSection, ...] = ()
@@ -120,7 +120,7 @@ class SourcesSection(Section):
         names = [source.name for source in self.list]
         if len(set(names)) < len(names):
             twice = next(name for name in names if names.count(name) > 1)
-            raise ValueError(f"the source '{twice}' is there twice")
+            raise ValueError(f"the source '{twice}' is listed twice")
         return self
 
 

@@ -165,8 +165,8 @@ class Unknown:
             edge = f"at least {low:g}" if mean - low < high - mean else f"at most {high:g}"
             raise InputError(
                 f"the prior of {self.name}, {mean:g} +- {std:g}, has {outside:.1%} of its weight "
-                f"outside what it can be ({edge}); give a smaller standard deviation or move the "
-                "mean"
+                f"outside the allowed range ({edge}); give a smaller standard deviation or move "
+                "the mean"
             )
         ends = {name: end for name, end in (("low", low), ("high", high)) if np.isfinite(end)}
         return dist.TruncatedNormal(mean, std, **ends)
@@ -295,7 +295,7 @@ class Systematic(eqx.Module):
         for name in said:
             if name not in drawn:
                 raise InputError(
-                    f"{cls.key}.true_values has '{name}', which is not among what has a prior; "
+                    f"{cls.key}.true_values has '{name}', which has no prior; "
                     f"{nearest(name, tuple(drawn))}"
                 )
         return drawn | {name: float(value) for name, value in said.items()}
@@ -793,7 +793,7 @@ def present(systematics: Sequence[type[Systematic]], scenario: Any) -> list[tupl
 
 
 def sky_is_sampled(systematics: Sequence[Systematic | Marginalised]) -> bool:
-    """Whether all together have so many unknowns that the sky is to be sampled with them."""
+    """Whether they have too many unknowns in total to marginalise the sky while sampling."""
     n = sum(len(systematic.names) for systematic in systematics)
     return n > MOST_COLLAPSED or any(systematic.needs_sky for systematic in systematics)
 

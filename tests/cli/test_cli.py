@@ -19,7 +19,7 @@ import jax
 import numpy as np
 import pytest
 import xarray as xr
-from assertions import raising
+from assertions import raising, refuse
 from astropy.io import fits
 from commands import assert_drawn, content, posterior_of, refused, run, sky_draws_of, table_of
 from rich.console import Console
@@ -31,7 +31,8 @@ from lusee_bayes.cli.tables import checks_table, comparison_table
 from lusee_bayes.core.arrays import SWITCH
 from lusee_bayes.core.harmonics import from_healpy, modes_to_map, pixel_matrix
 from lusee_bayes.core.version import COMMAND
-from lusee_bayes.experiment.scenario import OutputSection
+from lusee_bayes.experiment.scenario import OutputSection, load_scenario, scenario_names
+from lusee_bayes.judge.chi2 import HEADLINES
 from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows, evidence_caveat
 from lusee_bayes.results.map_result import MapResult
 from lusee_bayes.runs import map_run as runs
@@ -107,18 +108,22 @@ def test_simulate_then_map_equals_map(folder, tmp_path, capsys):
     data, scenario = tmp_path / "data.nc", folder / "scenario.yaml"
     assert run("simulate", scenario, "-o", data) == 0
     assert "1024 visibilities of 16 products" in capsys.readouterr().out
-    options = ["--draws", 3, "--set", "output.covariance=false", "-o", tmp_path / "out"]
+    options = ["--draws", 3, "--set", "output.covariance=false", "-o", tmp_path / "out", "-v"]
     # that of simulated data, which measured ones have not by default
     options += ["--set", "noise.radiometer.temperature=model"]
     assert run("map", scenario, "--data", data, *options) == 0
     said = capsys.readouterr().out
     for path in (tmp_path / "out").rglob("*"):
         assert path.is_dir() or path.name == "manifest.json" or str(path) in said
-    assert said.strip().splitlines()[-1] == f"look at {tmp_path}/out/report.html"
+    verdict, numbers, page = said.strip().splitlines()[-3:]
+    assert page == f"look at {tmp_path}/out/report.html" and "chi2" in numbers
+    assert verdict in HEADLINES.values()
     first, again = posterior_of(folder), posterior_of(tmp_path / "out")
     np.testing.assert_array_equal(first["mean"].values, again["mean"].values)
     np.testing.assert_array_equal(first["truth"].values, again["truth"].values)
-    assert again["posterior"].sizes["draw"] == 3
+    drawn = lusee_bayes.read_draws(tmp_path / "out")
+    np.testing.assert_array_equal(drawn, again["posterior"]["sky"].values[0, :, 0])
+    refuse("channels of 25 MHz", lusee_bayes.read_draws, tmp_path / "out", 30.0)
     assert "covariance" in first and "covariance" not in again
 
 
@@ -127,8 +132,18 @@ def test_options_of_the_output_reach_the_scenario(flag, monkeypatch):
     """What they make is tested beside run_map."""
     given, stop = [], raising(KeyboardInterrupt())
     monkeypatch.setattr(runs, "run_map", lambda *a, **_: given.append(a) or stop())
-    assert run("map", "fiducial", f"--{flag}", "--draws", 7, "-o", "x", "-q") == 130
+    assert run("map", f"--{flag}", "--draws", 7, "-q") == 130
     assert given[0][0].output == OutputSection(draws=7, **{flag: True})
+    assert given[0][0].prior.model == "local_scales" and str(given[0][1]) == "output/first_map"
+
+
+def test_a_scenario_to_begin_with(tmp_path, capsys):
+    assert run("init", tmp_path / "mine.yaml", "--like", "fiducial") == 0
+    assert load_scenario(tmp_path / "mine.yaml") == load_scenario("fiducial")
+    assert "exists" in refused(capsys, "init", tmp_path / "mine.yaml")
+    assert run("scenarios") == 0 and run("keys", "--schema") == 0
+    listed, _, schema = capsys.readouterr().out.partition("{")
+    assert all(f"{name}: " in listed for name in scenario_names()) and '"maximum": 383' in schema
 
 
 def test_names_of_files_keep_their_capitals():
@@ -151,7 +166,7 @@ def test_info_recognises_files_and_folders(small_map, folder, tmp_path, capsys):
         assert run("info", path) == 0
         told = capsys.readouterr().out
         assert all(word in told for word in words), told
-    assert "a folder that no run has written" in refused(capsys, "info", tmp_path)
+    assert "not the folder of a run" in refused(capsys, "info", tmp_path)
 
 
 def test_the_users_folder_stands_for_a_tilde_everywhere(tmp_path, monkeypatch, capsys):
@@ -188,11 +203,11 @@ def test_an_interrupted_write_leaves_the_old_result_whole(small_map, tmp_path, m
     monkeypatch.setattr(runs, "MAP", replace(runs.MAP, figures={}))
     assert run("map", "fiducial", *SMALL, "--set", "seed=2", "-o", out, "--force", "-q") == 130
     said = capsys.readouterr().err.strip()
-    assert said == f"lusee-bayes: interrupted; the earlier results are as they were in '{out}'"
+    assert said == f"lusee-bayes: interrupted; the earlier results are unchanged in '{out}'"
     assert content(out) == before
     assert not list(out.glob(".*"))
     assert run("map", "fiducial", *SMALL, "-o", tmp_path / "new", "-q") == 130
-    assert "interrupted; no results are written in" in capsys.readouterr().err
+    assert "interrupted; no results were written in" in capsys.readouterr().err
     assert content(tmp_path / "new") == {}
 
 
@@ -294,8 +309,8 @@ def test_tables_fit_eighty_columns(finished):
 
 
 OTHER_DATA = [
-    (lambda d: d + 1.0, "other values at the same times"),
-    (lambda d: 4e-24 * d, "the same data in another unit (times 4e-24)"),
+    (lambda d: d + 1.0, "different values at the same times"),
+    (lambda d: 4e-24 * d, "the same data in a different unit (factor 4e-24)"),
     (lambda d: np.where(np.arange(d.shape[1]) > 3, d, np.nan), "samples instead of"),
 ]
 

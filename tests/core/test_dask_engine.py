@@ -133,7 +133,7 @@ def test_a_task_whose_worker_dies_is_done_again_elsewhere(engine, tmp_path):
     assert engine.each(tasks_of(die, 5), said, "s") == list(range(5))
     assert len(list(tmp_path.glob("2-*"))) == 3
     told = [line for line in said.lines if "worker" in line]
-    assert told and all("given to others: " in line for line in told)
+    assert told and all("reassigned to others: " in line for line in told)
     assert any("number 2" in line for line in told)
 
     def always(k):
@@ -143,7 +143,7 @@ def test_a_task_whose_worker_dies_is_done_again_elsewhere(engine, tmp_path):
         time.sleep(0.1)
         return k
 
-    with pytest.raises(WorkersLost, match="^sums, number 1: 4 workers ended while they worked on "):
+    with pytest.raises(WorkersLost, match="^sums, number 1: 4 workers died on"):
         engine.reduced(tasks_of(always, 3), joined, Stages(), "sums")
     assert len(list(tmp_path.glob("10-*"))) == 4
     # and what comes next is not affected
@@ -177,7 +177,7 @@ LARGE = Demand(base_bytes=1e9, task_bytes=1e15)
 def test_workers_that_cannot_do_it_are_refused(engine, tmp_path, monkeypatch):
     new = DaskEngine(engine.client)
     greedy = DaskEngine(engine.client, LARGE)
-    refuse(r"may take .* of memory, and 1 task\(s\) at a time need", greedy.work_in, tmp_path)
+    refuse(r"is limited to .* of memory, but 1 task\(s\) at a time need", greedy.work_in, tmp_path)
     refuse("does not see '.*gone'; command and workers", new.work_in, tmp_path / "gone")
     with monkeypatch.context() as patch:
         patch.setattr(dask_engine, "code_versions", lambda: "lusee_bayes 0.0 and Python 3.0")

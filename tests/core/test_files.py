@@ -248,7 +248,7 @@ def test_a_damaged_manifest_is_one_sentence_before_anything_is_written(text, fol
 def test_what_is_in_the_way_is_refused_before_the_commit(folder, tmp_path):
     before = content(folder)
     for name, words in {
-        "figures": "'.*figures' is a folder, and a file of the results has its name",
+        "figures": "'.*figures' is a folder, but a result file has the same name",
         "mean.fits/x": "'.*mean.fits' is a file",
     }.items():
         refuse(words, finished, folder, {name: "x"})
@@ -300,7 +300,7 @@ def elsewhere(tmp_path):
 
 
 def test_two_runs_cannot_mix(tmp_path, elsewhere):
-    with refused(f"another run works in .*process {elsewhere.pid} on"), fs.locked(tmp_path):
+    with refused(f"another run uses .*process {elsewhere.pid} on"), fs.locked(tmp_path):
         pass
 
 

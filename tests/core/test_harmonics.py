@@ -85,7 +85,7 @@ def test_bad_maps_are_refused():
     refuse("100 pixels are not a HEALPix map", h.map_to_modes, np.ones(100), 2)
     hole = np.where(np.arange(48) == 5, np.nan, 1.0)
     refuse("1 of 48 entries, first at (5,)", h.map_to_modes, hole, 2)
-    refuse("holds lmax <= 5", h.map_to_modes, np.ones(48), 6)
+    refuse("supports lmax <= 5", h.map_to_modes, np.ones(48), 6)
     refuse("the field has shape", SphereGrid.of(3, 6).product_matrix, np.ones((3, 4)))
 
 

@@ -45,7 +45,7 @@ NOT_AS_DECLARED = [
     ({"times": None}, "x: .*no times|x has no times"),
     ({"data": np.ones((2, 2))}, r"data has shape \(2, 2\), expected 3"),
     ({"data": np.ones(3)}, r"data has shape \(3,\)"),
-    ({"data": np.full((3, 2), np.nan)}, "data holds"),
+    ({"data": np.full((3, 2), np.nan)}, "data contains"),
     ({"data": -np.ones((3, 2))}, "data"),
     ({"data": np.array([["a", "b"]] * 3)}, "data"),
     ({"data": np.ones((3, 2), dtype=complex)}, "data"),
@@ -83,7 +83,7 @@ def test_tables_objects_and_arrays(tmp_path):
     (tmp_path / "t.csv").write_text("ell,name\n0,a\n1\n")
     refuse("line 3 has 1 entries for 2 columns", reading.read_table, tmp_path / "t.csv", table)
     (tmp_path / "o.json").write_text("[1]")
-    refuse("holds a list", reading.read_json, tmp_path / "o.json", Layout("an object"))
+    refuse("contains a list", reading.read_json, tmp_path / "o.json", Layout("an object"))
     np.save(tmp_path / "a.npz", np.ones(3))
     refuse("a.npz", reading.read_arrays, tmp_path / "a.npz.npy", Layout("arrays"))
 
@@ -102,7 +102,7 @@ def test_a_file_without_end_is_refused(path, monkeypatch):
     monkeypatch.setattr(formats, "LIMIT_S", 0.2)
     monkeypatch.setattr(formats, "_read_all", lambda path, size: time.sleep(60))
     start = time.monotonic()
-    refuse("does not come to an end with it within 0.2 s", require_readable_hdf5, path)
+    refuse("does not finish reading it within 0.2 s", require_readable_hdf5, path)
     assert time.monotonic() - start < 30
 
 
@@ -120,7 +120,7 @@ def test_a_name_whose_search_has_no_end_is_refused_even_where_none_can_be_listed
     formats._probe.cache_clear()
     monkeypatch.setattr(formats, "LIMIT_S", 0.2)
     monkeypatch.setattr(formats.h5py, "File", lambda path: nullcontext(file))
-    refuse("does not come to an end with it within 0.2 s", require_readable_hdf5, path)
+    refuse("does not finish reading it within 0.2 s", require_readable_hdf5, path)
 
 
 def test_a_file_that_ends_the_process_is_refused(path, monkeypatch):

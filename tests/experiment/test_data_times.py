@@ -67,7 +67,7 @@ def test_data_come_as_paths_or_in_memory(tmp_path, monkeypatch):
     assert averages.digest() == averaged(read, 2 * STEP).digest()
     for given, noun in (
         ([read, other], "none of them at 20 MHz"),
-        ([read, path], "not in both"),
+        ([read, path], "both in memory and in files"),
         ([], "no data"),
     ):
         refuse(noun, lb.read_data, given, scenario("frequency_mhz=20"))
@@ -114,9 +114,9 @@ def test_a_file_that_says_it_is_believed_whatever_is_simulated(tmp_path, window)
     ("window", "timestamp", "words"),
     [
         (None, None, r"use --set observation.timestamp=start \(or middle, end, instant\)"),
-        ("instant", "start", "says that its samples are instants, the scenario that their times"),
-        ("mean", "start", "says that its samples are means over windows"),
-        ("mean", "instant", "observation.timestamp=instant; leave that out"),
+        ("instant", "start", "declares its samples instants, but the scenario"),
+        ("mean", "start", "declares its samples means over windows"),
+        ("mean", "instant", "observation.timestamp=instant; remove that"),
     ],
 )
 def test_what_is_unclear_or_contradicts_is_refused(tmp_path, window, timestamp, words):
@@ -127,9 +127,9 @@ def test_what_is_unclear_or_contradicts_is_refused(tmp_path, window, timestamp, 
 
 def test_no_experiment_of_data_with_unclear_times_or_a_fixed_axis_in_windows(tmp_path):
     data = read_visibilities(file_of(tmp_path, None)[0])
-    refuse("do not say what their times are; use data.stamped", set_up, scenario(), data)
+    refuse("do not specify .* their times; use data.stamped", set_up, scenario(), data)
     data, fixed = read_visibilities(file_of(tmp_path, "mean")[0]), "observation.fixed_axis=true"
-    refuse("means over windows.*leave out observation.fixed_axis", set_up, scenario(fixed), data)
+    refuse("means over windows.*remove observation.fixed_axis", set_up, scenario(fixed), data)
 
 
 def test_waterfalls_are_instants_unless_the_scenario_says_other(tmp_path):
@@ -150,7 +150,7 @@ def test_waterfalls_are_instants_unless_the_scenario_says_other(tmp_path):
 
 def test_waterfalls_have_no_room_for_windows(tmp_path):
     data = lb.build(scenario("observation.window=mean")).data
-    words = r"no room for windows.*observation\.window=instant"
+    words = r"cannot store windows.*observation\.window=instant"
     refuse(words, write_waterfall, tmp_path / "w.fits", 2 * [data])
     assert not list(tmp_path.iterdir())
 

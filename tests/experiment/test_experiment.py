@@ -64,7 +64,7 @@ def test_measured_temperatures(small_experiment):
     np.testing.assert_array_equal(gapped[~flags], measured[~flags])
     np.testing.assert_allclose(gapped[2, 4], (measured[2, 3] + measured[2, 5]) / 2, rtol=1e-14)
     flags[0] = True
-    words = "auto 00R is absent .* use noise.radiometer"
+    words = "auto 00R is missing .* use noise.radiometer"
     refuse(words, measured_visibilities, flagged(data, flags), setup.signal)
 
 
@@ -145,7 +145,7 @@ def test_files_of_another_frequency_are_scaled(files):
         ("0 1\n1 2\n3 4\n", "no C_ell at ell = 2"),
         ("2 1\n3 2\n", "no C_ell at ell = 0"),
         ("0 1\n1 2\n", "no C_ell at ell = 2 and 4 more up to lmax = 6"),
-        ("0 1\n0 2\n", "does not grow"),
+        ("0 1\n0 2\n", "does not increase"),
         ("".join(f"{ell} 0\n" for ell in range(9)), "cl.txt: C_ell is zero"),
         ("0 -1\n", "outside 0 to inf"),
         ("0 nan\n", "NaN"),

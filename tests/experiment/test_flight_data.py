@@ -180,14 +180,14 @@ def test_the_same_seed_makes_the_same_disturbances_and_noise(tmp_path):
 @pytest.mark.parametrize(
     "changes, text",
     [
-        (["flight=null"], "these beams know no volts"),
-        (["noise.radiometer.duty_cycle=0.5"], "leave out duty_cycle"),
-        (["flight.filter_taps=4"], "share no noise"),
+        (["flight=null"], "not calibrated in volts"),
+        (["noise.radiometer.duty_cycle=0.5"], "remove duty_cycle"),
+        (["flight.filter_taps=4"], "independent noise"),
         (["observation.step_s=1e-5", "observation.runs=[{cycles: 1e-10}]"], "a frame of"),
-        (["observation.runs=[{cycles: 1}, {cycles: 1, turntable_deg: 30}]"], "the turntable turns"),
-        (["noise.gain_table={}"], "nothing says by how much; give flight.gain_std"),
+        (["observation.runs=[{cycles: 1}, {cycles: 1, turntable_deg: 30}]"], "turntable rotates"),
+        (["noise.gain_table={}"], "errors of the gains; give flight.gain_std"),
         (["noise.gain_table={std: 0.01}"], "give flight.gain_std, the error of the gains"),
-        (["noise.gain_table={}", "flight.gain_std=0.9", "seed=2"], "was drawn below zero"),
+        (["noise.gain_table={}", "flight.gain_std=0.9", "seed=2"], "is negative"),
     ],
 )
 def test_what_makes_no_sessions_is_refused(changes, text):
@@ -203,7 +203,7 @@ def test_a_tone_that_no_bin_holds_is_refused():
 
     for channel in (1000, 1001, 1002):
         assert np.flatnonzero(drawn(channel).tone_channel).tolist() == [channel]
-    refuse(r"channel 1003, which Navgf 3 leaves out.*25\.(05|1) MHz", drawn, 1003)
+    refuse(r"channel 1003, which Navgf 3 drops.*25\.(05|1) MHz", drawn, 1003)
 
 
 @pytest.mark.long
@@ -332,11 +332,11 @@ def test_the_known_sky_is_within_the_error_bars(mapped):
 NO_VOLTS = "beam={model: monopole}", "noise.receiver=null"
 VOLTS = "flight.per_kelvin_v2_hz=5.0e-23"
 ASKED = [
-    (["flight.gain_table=null"], "names no gain table"),
+    (["flight.gain_table=null"], "has no gain table"),
     (["flight.bin_origin=null"], "flight.bin_origin=centre"),
     (["observation.timestamp=null"], "observation.timestamp=middle"),
-    (["flight=null"], "give it a section flight"),
-    (NO_VOLTS, "these beams know no volts"),
+    (["flight=null"], "no section flight"),
+    (NO_VOLTS, "not calibrated in volts"),
     ([VOLTS], "per_kelvin_v2_hz"),
 ]
 

@@ -97,7 +97,7 @@ def test_the_null_direction_in_words():
     regolith, sky = sorted(null.words().split(", "))
     assert (regolith[:-6], sky[:-6]) == ("regolith", "uniform sky")
     assert {regolith[-5:], sky[-5:]} == {"+0.71", "-0.71"}
-    assert null.sentence().endswith("it keeps 80% of its prior variance.")
+    assert null.sentence().endswith("its variance is 80% of the prior variance.")
     # nothing to say where the data tell most of it
     assert NullDirection.of(["uniform sky", "regolith"], 0.4 * np.eye(2)).sentence() == ""
 
@@ -105,7 +105,7 @@ def test_the_null_direction_in_words():
 @pytest.mark.parametrize(("common", "told"), [(None, False), (0.5, False), (0.95, True)])
 def test_the_common_gain_is_told_where_it_keeps_its_prior(experiment, common, told):
     report = replace(unknowns_report(experiment, lb.infer(experiment)), common=common)
-    words = "common gain of all ports keeps its prior"
+    words = "common gain of all ports is unconstrained"
     assert any(words in line for line in report.lines()) == told
 
 
@@ -119,7 +119,7 @@ def test_unknowns_of_added_data_are_said_to_be_of_the_new_data(response_file, tm
     run = lb.run_map(second, tmp_path / "both", earlier=tmp_path / "first")
     expected = unknowns_report(alone, lb.infer(alone))
     pd.testing.assert_frame_equal(run.result.channel.unknowns.table, expected.table)
-    note = "what the new data alone tell"
+    note = "by the new data only"
     assert any(note in line for line in run.result.lines())
     assert note in map_page(tmp_path / "both", "both")
     assert note not in map_page(tmp_path / "first", "first")
@@ -135,7 +135,7 @@ def test_a_run_writes_them(experiment, tmp_path):
     assert sum(weight**2 for weight in summary["null_direction"].values()) == pytest.approx(1.0)
     lines = run.result.lines()
     assert any(line.startswith("receiver_0_k: ") and line.endswith(" K") for line in lines)
-    assert any("regolith_k" in line and "these data do not tell it" in line for line in lines)
+    assert any("regolith_k" in line and "(unconstrained: " in line for line in lines)
     assert summary["null_sentence"] in lines
     page = map_page(tmp_path / "map", "a run")
     assert "Receivers, ground and gain table" in page

@@ -108,12 +108,12 @@ def test_the_gaussian_serves_where_values_were_found_and_not_far_from_them():
     away = first.posterior.prior.whiten(found.posterior.mean) - first.posterior.white_mean
     wrong = np.sqrt(np.mean((np.asarray(first.posterior.lower).T @ away) ** 2))
     assert k > validity.LARGEST_K and wrong / 3.0 < moved_by < 3.0 * wrong
-    assert "its errors do not hold" in validity.reach(experiment, first)[0]
+    assert "its errors are not valid" in validity.reach(experiment, first)[0]
 
 
 def test_nothing_is_weighed_where_nothing_was_found_in_rounds(plain):
     experiment, found = plain
     assert validity.weighed(experiment.setup, np.asarray(experiment.data.data), found) is None
     measured = replace(experiment, setup=replace(experiment.setup, measured=True))
-    assert "would not show" in validity.reach(measured, found)[0]
+    assert "would not reveal" in validity.reach(measured, found)[0]
     assert base_model(experiment.setup).n_data == found.model.n_data

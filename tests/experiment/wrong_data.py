@@ -180,12 +180,12 @@ def _exchanged_ports(i: int, j: int) -> Wrong:
 
 def _turned_ports(n: int) -> Wrong:
     ports = port_matrix([(k + n) % 4 for k in range(4)])
-    return Wrong(f"ports turned by {n}", f"ports are turned by {4 - n}", _mix(ports))
+    return Wrong(f"ports turned by {n}", f"ports are rotated by {4 - n}", _mix(ports))
 
 
 def _turned_table(angle: int) -> Wrong:
     there = _other(f"observation.runs.0.turntable_deg={angle}")
-    return Wrong(f"turntable at {angle}", f"turned by {angle}", there)
+    return Wrong(f"turntable at {angle}", f"rotated by {angle}", there)
 
 
 AUTOS = {f"p{label}": 1.1 for label in LABELS if label[0] == label[1]}
@@ -195,11 +195,11 @@ FLIPPED_1 = {f"p{x}": -1.0 for x in LABELS if x[:2].count("1") == 1}
 
 WRONG = (
     Wrong("imaginary parts conjugated", "conjugated", _mix(diagonal(**CONJUGATED))),
-    Wrong("polarity of port 1", "port 1 have the other sign", _mix(diagonal(**FLIPPED_1))),
+    Wrong("polarity of port 1", "port 1 have the wrong sign", _mix(diagonal(**FLIPPED_1))),
     *(_exchanged_ports(i, j) for i, j in combinations(range(4), 2)),
     *(_turned_ports(n) for n in (1, 2, 3)),
     *(_turned_table(angle) for angle in (90, 180, 270)),
-    Wrong("sign of the turntable", "angles have the other sign", _opposite),
+    Wrong("sign of the turntable", "angles have the wrong sign", _opposite),
     Wrong("mirrored beams", "mirrored", _beams(mirrored)),
     Wrong("azimuth from North", "counted from North", _beams(from_north)),
     Wrong("01R and 02R exchanged", "01R and 02R", _mix(exchanged("01R", "02R"))),
@@ -209,7 +209,7 @@ WRONG = (
     Wrong("02I 2 % too high", "product 02I", _mix(diagonal(p02I=1.02))),
     Wrong("33R 1 % too high", "product 33R", _mix(diagonal(p33R=1.01))),
     Wrong("13R has the other sign", "product 13R", _mix(diagonal(p13R=-1.0))),
-    Wrong("port 2 3 % too high", "voltage of port 2", _mix(diagonal(**PORT_2))),
+    Wrong("port 2 3 % too high", "port 2's voltage", _mix(diagonal(**PORT_2))),
     Wrong("constant in the autos", "constant", _constant(200.0)),
     Wrong("times reversed", "reversed", _on_grid(lambda grid: grid[:, ::-1])),
     Wrong("one time 2 % too high", "all products at 2027-01-", _one_time(1.02, 37)),

@@ -219,7 +219,7 @@ def test_bins_that_are_not_there_are_nan_and_a_clock_may_be_unknown(tmp_path, ki
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_no_session_leaves_nothing_behind(tmp_path, kind):
-    few, text = [written_counts()[:4]], "there are counts of 4 spectra for 7 rows"
+    few, text = [written_counts()[:4]], "counts of 4 spectra for 7 rows"
     refuse(text, write_session, tmp_path / "s", some_rows(), few, kind=kind)
     assert not list(tmp_path.iterdir())
 
@@ -400,7 +400,7 @@ def test_the_utc_that_a_session_states_is_corrected(tmp_path):
     before, after = said.utc(SECONDS), clock_of("session", said, given, SECONDS).utc(SECONDS)
     elapsed = np.array([seconds_after(time, "2027-01-10T00:00:00") for time in before])
     np.testing.assert_allclose((after - before).sec, 46.0 + 1e-6 * elapsed, rtol=0, atol=1e-6)
-    refuse("states no UTC", clock_of, "session", None, given, SECONDS)
+    refuse("contains no UTC", clock_of, "session", None, given, SECONDS)
 
 
 def test_the_clock_files_of_the_documentation_are_read(tmp_path):

@@ -39,9 +39,8 @@ IS_PIPE, JOINT = "neither a file nor a folder", "--joint --frequencies 20,25"
 WRONG = [
     # where results go
     ("map fiducial -o /", "root of all files"),
-    ("map fiducial -o /proc/nope", "nothing can be written|No such"),
+    ("map fiducial -o /proc/nope", "cannot write into|No such"),
     ("map fiducial -o file/x", "file' is a file; give a folder for the results"),
-    ("map fiducial -o file", "'file' is a file"),
     ("simulate fiducial --flight --set flight={} -o file", "is a file"),
     ("map fiducial -o pipe", IS_PIPE),
     (f"map fiducial -o {LONG}", "too long"),
@@ -51,44 +50,33 @@ WRONG = [
     # options
     ("mapp fiducial", "mapp"),
     ("map fiducial --draw 3", "--draw"),
-    ("map fiducial --draws many", "many"),
+    ("map --data gone.nc", "needs the scenario"),
     ("sample fiducial --chains 0", "--chains: expected .*got 0"),
     ("sample fiducial --warmup 3", "at least 20, got 3"),
     ("sample fiducial --algorithm hcm", "hcm.*nuts"),
     ("validate fiducial --simulations 50", "simulations"),
-    ("map fiducial --frequencies=1:50:1e-9", "channels; at most 4096"),
-    ("map fiducial --frequencies 20,10", "expected growing MHz"),
+    ("map fiducial --frequencies=1:50:1e-9", "at most 4096"),
     ("map fiducial --joint", "joint needs frequencies_mhz"),
     ("map fiducial --workers 2", "give --frequencies"),
-    ("map fiducial --cluster tcp://127.0.0.1:1", "give --frequencies"),
     (f"map fiducial {JOINT}", "need at least as many channels, got 2"),
     ("compare-priors fiducial --priors isotropic,local", "'local'; did you mean 'local_scales'?"),
-    ("compare-priors fiducial --priors isotropic", "a comparison needs two or more"),
-    ("compare-priors fiducial --priors isotropic,isotropic", "two or more different ones"),
+    ("compare-priors fiducial --priors isotropic,isotropic", "at least two different ones"),
     ("compare-priors fiducial --priors isotropic,isotropic-sky --data file", "scenario's sky"),
-    ("compare-priors fiducial --set frequencies_mhz=[10,20]", "is for a single frequency"),
+    ("compare-priors fiducial --set frequencies_mhz=[10,20]", "works on a single frequency"),
     ("compare-priors fiducial --set prior.tilt_std=0.1", "something is to be sampled"),
-    ("compare", "two"),
-    ("plan", "scenario"),
-    ("plan fiducial fiducial", "'fiducial' is given twice; give each once"),
-    ("plan fiducial --vary lmax", "--vary takes key.path=value,value"),
-    ("plan fiducial --vary lmax=]", "--vary lmax=] is not valid YAML"),
+    ("plan fiducial fiducial", "'fiducial' is listed twice; list each once"),
+    ("plan fiducial --vary lmax", "--vary expects key.path=value,value"),
     ("plan fiducial --vary lmx=3,4", "unknown key 'lmx'; did you mean 'lmax'"),
     ("plan fiducial --vary lmax=3,0", "greater than or equal to 1"),
     ("plan fiducial --set sky.file=/gone/a.fits", "fiducial, as given: no sky map at"),
-    ("plan fiducial --set observation.start=soon", "fiducial, as given: start 'soon'"),
     # scenarios
-    ("map", "scenario"),
     ("map nonsense", "no scenario 'nonsense'"),
     ("map three_cycle", "did you mean 'three_cycles'"),
     ("map three_cycle.yaml", "no scenario file at 'three_cycle.yaml'; check the path"),
-    (f"map {NUL}", "no scenario"),
-    ("map pipe", IS_PIPE),
-    ("map .", "is a folder"),
     ("map fiducial --set lmax=" + "9" * 5000, "is not valid YAML"),
     ("map fiducial --set lmax=383", "of memory.*lmax=.*would fit"),
     ("map fiducial --set observation.runs.0.cycles=1000000", "about .* of memory .*would fit"),
-    ("map fiducial --set observation.runs.0.cycles=0.0001", "holds no sample"),
+    ("map fiducial --set observation.runs.0.cycles=0.0001", "has no sample"),
     ("map fiducial --set observation.start=soon", "'soon' is not a date"),
     ("map fiducial --set observation.start=2051-01-01", "outside the ephemeris"),
     ("map fiducial --set sky.file=gone.fits", "no sky map at 'gone.fits'"),
@@ -102,26 +90,20 @@ WRONG = [
             'noise.beam={"shift_mhz":4,"treatment":"sampled"}',
             "noise.radiometer.log_factor_std=0.5",
             "prior.tilt_std=0.5",
-            "prior.log_amplitude_std=0.5",
             "prior.band_edges=[2,4]",
         )
     ),
     # data, programs, results
     ("map fiducial --data pipe", IS_PIPE),
     ("map fiducial --data .", "is a folder"),
-    ("map fiducial --data file", "file"),
     ("map fiducial --data gone.nc", "no data at 'gone.nc'; make some"),
     (f"map fiducial --data {OTHER}", r"no data at 'x\\udcff.nc'"),
     ("sample fiducial --model fil", "no program 'fil'.*prior_amplitude"),
     ("sample fiducial --model gone.py", "no program at 'gone.py'"),
     ("sample fiducial --model program.py", "no observed site"),
-    ("info pipe", IS_PIPE),
-    ("info file", "file"),
-    ("info gone.fits", "no file at 'gone.fits'"),
     ("info [red]x[/red].nc", r"no file at '\[red\]x\[/red\].nc'"),
     (f"info {OTHER}", r"no file at 'x\\udcff.nc'"),
-    ("report file", "is no folder"),
-    ("report .", "holds neither"),
+    ("report .", "neither posterior.nc"),
 ]
 
 
@@ -141,7 +123,7 @@ def test_results_of_another_run_stay(here, capsys, small_map):
     before = {p: p.read_bytes() for p in small_map.folder.rglob("*") if p.is_file()}
     other = ("--set", "frequency_mhz=15", "-o", small_map.folder)
     said = refused(capsys, "map", "fiducial", *SMALL, *other)
-    assert "frequency_mhz is 25.0 there and 15.0 here" in said and "--force" in said
+    assert "frequency_mhz was 25.0, now 15.0" in said and "--force" in said
     assert before == {p: p.read_bytes() for p in small_map.folder.rglob("*") if p.is_file()}
 
 

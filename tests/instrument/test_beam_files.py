@@ -195,7 +195,7 @@ def point_pattern(theta, phi, f):
 
 UNUSABLE = [
     ({"change": lambda i: i.update(EPhi_imag=i["EPhi_imag"][:, :-1])}, "EPhi_imag has shape"),
-    ({"change": lambda i: i.update(freq=i["freq"][::-1].copy())}, "freq does not grow"),
+    ({"change": lambda i: i.update(freq=i["freq"][::-1].copy())}, "freq does not increase"),
     ({"change": lambda i: i.update(gain_conv=i["gain_conv"][:-1])}, "gain_conv has shape"),
     ({"header": {"THETA_MAX": 180.0}}, "theta 0 to 180"),
     ({"header": {"TIMECONV": "e-iwt"}}, "TIMECONV"),
@@ -212,7 +212,7 @@ def test_missing_and_other_files(tmp_path):
     refuse(r"no beam file at .*check beam\.file", read_beam, tmp_path / "none.fits")
     path = tmp_path / "beam.fits"
     path.write_text("no FITS at all")
-    refuse("cannot be read as a scalar beam .*: it is no FITS file$", read_beam, path)
+    refuse("cannot be read as a scalar beam .*: it is not a FITS file$", read_beam, path)
 
 
 # --- in a scenario ----------------------------------------------------------------------------
@@ -246,7 +246,7 @@ def test_a_second_file_as_the_true_beams(tmp_path):
 
 
 NOT_OF_A_FILE = [
-    (["beam.length_m=2"], "length_m is an entry of model monopole, not of luseepy"),
+    (["beam.length_m=2"], "length_m belongs to model monopole, not to luseepy"),
     (["noise.beam={parameters: {length_m: 0.1}}"], "which beam.file replaces"),
     (["sky.sources=false", "sources.list=[{name: Cas A}]"], "exact beams of the embedded"),
     (["noise.beam={shift_mhz: 1, file: some.fits}"], "give either shift_mhz, file or param"),
@@ -260,7 +260,7 @@ def test_what_a_file_does_not_have(overrides, message):
 
 def test_the_program_of_the_instrument_needs_the_embedded_antennas(tmp_path):
     experiment = lb.build(small_scenario(f"beam.file={write(tmp_path / 'beam.fits')}"))
-    refuse("leave out beam.file", program_pieces(experiment)["instrument"])
+    refuse("remove beam.file", program_pieces(experiment)["instrument"])
 
 
 @pytest.mark.long

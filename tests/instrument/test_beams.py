@@ -124,8 +124,8 @@ def test_what_no_beams_are_is_refused():
     refuse("e_theta must be", bf.AntennaFields, good.e_theta.astype(np.complex64), good.e_phi, GRID)
     refuse("e_theta has shape", bf.AntennaFields, good.e_theta[:, 1:], good.e_phi[:, 1:], GRID)
     refuse("Stokes parameter 'W'; known: I, Q, U, V", bf.stokes_beam, good, "W")
-    refuse("3 products do not come", bf.ProductBeams, np.zeros((3, 4)), 10.0)
-    refuse("5 coefficients do not fill any lmax", bf.ProductBeams, np.zeros((4, 5)), 10.0)
+    refuse("3 products do not match", bf.ProductBeams, np.zeros((3, 4)), 10.0)
+    refuse("5 coefficients do not match any lmax", bf.ProductBeams, np.zeros((4, 5)), 10.0)
 
 
 # --- luseepy's quadrature rules, against closed forms ---------------------------------------------

@@ -268,6 +268,6 @@ def test_what_cannot_be_is_refused(coupling, instrument, base, pointing):
     error = instrument.coupling_of(instrument.beams())
     refuse("no response of its own", plus, one, error.with_response(jnp.ones(error.shape[0])))
     complete = lb.CouplingMatrix.build(instrument.beams(), pointing)
-    refuse("hold different samples", plus, one, complete)
+    refuse("contain different samples", plus, one, complete)
     wide = DenseCoupling(jnp.ones((3, 2)))
     refuse("the direction has shape", DenseCoupling(jnp.eye(3)).plus, one, wide)

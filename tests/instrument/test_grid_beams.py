@@ -162,19 +162,19 @@ def test_data_tell_parameters_between_files(tables, seed):
     assert error < 0.1 and not said
     full, pulls, _, error, said = found(tables[0.4], 0.4, seed)
     assert full > 1.3 and np.abs(pulls).max() > 4.0
-    assert error > 1.0 and "of surface_permittivity 3.7 are" in said[0]
+    assert error > 1.0 and "of surface_permittivity 3.7" in said[0]
 
 
 def test_what_cannot_be_is_refused(tables, tmp_path, capsys):
     table = tables[0.4]
-    words = "surface_permittivity is 4.2, and the files go from 3.3 to 4.1; give a value between"
+    words = "surface_permittivity is 4.2, but the files cover 3.3 to 4.1; give a value in"
     refuse(words, read_beam_grid, table, {"surface_permittivity": 4.2})
     refuse("did you mean 'zenith_angle_deg'", read_beam_grid, table, {"zenit_angle_deg": 75.0})
     refuse("give a smaller standard deviation", lb.build, scenario(table, 4.0))
     rows = [("a", 1, 2), ("b", 1, 3), ("c", 2, 2), ("d", 2, 3)]
-    said = "has no files of surface_permittivity 2, zenith_angle_deg 3; expected one file for every"
+    said = "has no files for surface_permittivity 2, zenith_angle_deg 3; expected one file"
     refuse(said, read_beam_grid, write_table(tmp_path, rows[:3]))
-    words = "has 2 files of surface_permittivity 1, zenith_angle_deg 3; expected one file"
+    words = "has 2 files for surface_permittivity 1, zenith_angle_deg 3; expected one file"
     refuse(words, read_beam_grid, write_table(tmp_path, [*rows, rows[1]]))
     refuse("a parameter of one value, or none", read_beam_grid, write_table(tmp_path, rows[:2]))
     refuse("zenith_angle_deg", read_beam_grid, write_table(tmp_path, [*rows, ("e", 3, "steep")]))

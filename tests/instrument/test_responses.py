@@ -243,7 +243,7 @@ def test_losses_emit_at_the_antennas_temperature(tmp_path):
 
 
 UNUSABLE = [
-    ("freq", lambda f: f[::-1].copy(), "freq does not grow"),
+    ("freq", lambda f: f[::-1].copy(), "freq does not increase"),
     ("ZA_real", lambda za: za[:, :3], "ZA_real has shape"),
     ("Rmoon", lambda r: 2 * r, "Rsky . Rmoon . Rloss differ"),
     ("theta", lambda theta: 2 * theta, "theta goes from 0 to 180 degrees"),
@@ -293,7 +293,7 @@ def test_a_scenario_with_a_response_and_a_warm_moon(tmp_path):
         ([], "give its response as beam.file"),
         (["beam.file={response}"], "use --set beam.moon_temperature_k=250"),
         (["beam.file={response}", "beam.moon_temperature_k=250", "beam.receiver=open"],
-         "leave out beam.receiver, so that the loads ZL in the data are used"),
+         "remove beam.receiver to use the loads ZL in the data"),
         (["frequency_mhz=11"], "no channel at 11 MHz"),
     ],
 )  # fmt: skip
@@ -481,7 +481,7 @@ def test_simulated_and_mapped_between_the_responses_frequencies(luseepy, tmp_pat
 
     # other receivers, another rule
     for override, message in (
-        ("beam.receiver=jfet", "leave out beam.receiver"),
+        ("beam.receiver=jfet", "remove beam.receiver"),
         ("beam.interpolation=spline", "use --set beam.interpolation=linear"),
     ):
         refuse(message, lb.read_data, path, lb.load_scenario("fiducial", [*given, override]))

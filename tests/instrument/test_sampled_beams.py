@@ -170,7 +170,7 @@ def test_a_scenario_takes_the_file(tmp_path):
     assert (scenario.beam.n_ports, scenario.beam.label) == (4, "mine.nc")
     ours, own = (lb.build(s).setup.signal for s in (scenario, small_scenario()))
     assert np.abs(ours - own).max() < SPLINES * np.abs(own).max()
-    with pytest.raises(lb.InputError, match="rotations_deg is an entry of model luseepy"):
+    with pytest.raises(lb.InputError, match="rotations_deg belongs to model luseepy"):
         small_scenario(f"beam={{model: sampled, file: {path}, rotations_deg: [0, 10]}}")
 
 
@@ -214,10 +214,10 @@ NO_BEAMS = [
     (lambda: embedded("grid") | {"phi_deg": None}, "give both theta_deg and phi_deg"),
     (lambda: embedded("grid") | {"phi_deg": PHI_DEG + 1.0}, "expected 360 k / n"),
     (lambda: embedded("grid") | {"theta_deg": THETA_DEG / 2}, "to the horizon"),
-    (lambda: embedded("grid") | {"theta_deg": THETA_DEG[::-1]}, "theta_deg does not grow"),
+    (lambda: embedded("grid") | {"theta_deg": THETA_DEG[::-1]}, "theta_deg does not increase"),
     (lambda: embedded("grid") | {"e_phi": np.zeros((3, 31, 60))}, "e_phi has shape"),
-    (lambda: {"products": np.zeros((16, 50))}, "no HEALPix map"),
-    (lambda: {"products": np.zeros((5, 48))}, "5 products do not come from"),
+    (lambda: {"products": np.zeros((16, 50))}, "not the 12 NSIDE.2 pixels"),
+    (lambda: {"products": np.zeros((5, 48))}, "5 products do not match"),
     (lambda: {"products": np.zeros((16, 48), dtype=complex)}, "type complex128, expected real"),
     (nan_at_the_zenith, "NaN or infinity in 1 of"),
 ]
@@ -231,9 +231,9 @@ def test_arrays_that_are_no_beams_are_refused(given, words):
 def test_what_cannot_be_computed_is_refused():
     zero = lb.sampled_beams(FREQUENCY, products=np.zeros((16, 12 * 4**2)))
     refuse("autos integrate to 0 sr", zero.beams, FREQUENCY, 2)
-    refuse("not the E fields", zero.fields, FREQUENCY, HemisphereGrid.for_lmax(2))
+    refuse("needs the E fields", zero.fields, FREQUENCY, HemisphereGrid.for_lmax(2))
     two = np.zeros((2, 16, 48))
-    refuse("frequency_mhz does not grow", lb.sampled_beams, [20.0, 10.0], products=two)
+    refuse("frequency_mhz does not increase", lb.sampled_beams, [20.0, 10.0], products=two)
 
 
 @pytest.mark.parametrize("suffix", ["nc", "fits"])

@@ -86,7 +86,7 @@ def test_instants_begin_before_the_end():
     assert o.windows is None
     assert (o.live_s == 7200.0).all()
     half = [Interval("2027-01-15", "2027-01-16", duty_cycle=0.5)]
-    words = r"no duty cycle; take windows \(observation.window=mean\)"
+    words = r"no duty cycle; use windows \(observation.window=mean\)"
     refuse(words, lb.Observation.from_schedule, half, window="instant")
 
 
@@ -160,18 +160,18 @@ HEADER = "start,end,turntable_deg,duty_cycle,night_only\n"
 BAD_TABLES = [
     ("", "schedule.csv cannot be read as a schedule"),
     (f"# nights\n{HEADER}", "schedule.csv: a schedule needs at least one interval"),
-    ("start,end,turntable_deg,duty\n", "has the columns .*duty; a schedule has"),
+    ("start,end,turntable_deg,duty\n", "has the columns .*duty; a schedule needs"),
     ("start,end,end,turntable_deg\n", "has the columns start, end, end.1, turntable_deg; a"),
     (f"{HEADER}2027-01-01,2027-01-02,0,1,false,5\n", "rows have more entries than the header"),
-    (f"{HEADER}\nsoon,2027-01-02,0,1,false\n", "row 1: start 'soon' is not a date; write it"),
+    (f"{HEADER}\nsoon,2027-01-02,0,1,false\n", "row 1: start 'soon' is not a date; write"),
     (f"{HEADER}2027-01-01,61050.8,0,1,false\n", "row 1: end '61050.8' is not a date; write"),
     (f"{HEADER}1827-01-01,2027-01-02,0,1,false\n", "outside the ephemeris .*: 1827"),
-    (f"{HEADER}2027-01-02,2027-01-01,0,1,false\n", "row 1: end 2027-01-01 does not come aft"),
+    (f"{HEADER}2027-01-02,2027-01-01,0,1,false\n", "row 1: end 2027-01-01 is not later"),
     (f"{HEADER}2027-01-01,2027-01-03,0,1,\n2027-01-02,2027-01-04,0,1,\n", "begins 86400 s b"),
     (f"{HEADER}2027-01-05,2027-01-06,0,1,\n2027-01-01,2027-01-02,0,1,\n", "row 2.*; sort"),
     (f"{HEADER}2027-01-01,2027-01-02,0,1.5,false\n", "row 1: duty_cycle is 1.5; give the fra"),
-    (f"{HEADER}2027-01-01,2027-01-02,0,half,\n", "row 1: duty_cycle is 'half', not a number"),
-    (f"{HEADER}2027-01-01,2027-01-02,,1,\n", "row 1: turntable_deg is '', not a number"),
+    (f"{HEADER}2027-01-01,2027-01-02,0,half,\n", "row 1: duty_cycle is 'half', expected a number"),
+    (f"{HEADER}2027-01-01,2027-01-02,,1,\n", "row 1: turntable_deg is '', expected a number"),
     (f"{HEADER}2027-01-01,2027-01-02,inf,1,\n", "row 1: turntable_deg is inf; give an angle"),
     (f"{HEADER}2027-01-01,2027-01-02,0,1,1\n", "row 1: night_only is '1'; write true or false"),
 ]
@@ -186,10 +186,10 @@ def test_an_interval_without_a_night_is_refused(write):
     # the Sun is up for two weeks from 1 February 2027 at this site
     text = f"{HEADER}2027-01-16,2027-01-17,0,1,true\n2027-02-05,2027-02-07,0,1,true\n"
     observe = lb.Observation.from_schedule
-    words = "schedule.csv, row 2 holds no lunar night; lengthen it"
+    words = "schedule.csv, row 2 contains no lunar night; lengthen it"
     refuse(words, observe, read_schedule(write(text)))
     unnamed = [Interval("2027-02-05", "2027-02-07", night_only=True)]
-    refuse("interval 0 holds no lunar night", observe, unnamed)
+    refuse("interval 0 contains no lunar night", observe, unnamed)
 
 
 # a table as those of OpSim, with the states that its simulator adds
@@ -226,11 +226,11 @@ def test_a_command_table_of_opsim(write):
 
 
 BAD_COMMANDS = [
-    ("", "comtable.yml is no command table of OpSim: expected numbered entries"),
+    ("", "comtable.yml is not a command table of OpSim: expected numbered entries"),
     ("1: [\n", "comtable.yml is not valid YAML"),
-    ("1: {start: 61050.8}\n", "entry 1: a command table of OpSim has a start .* and a mode"),
-    ("1:\n  start: noon\n  mode: science\n", "entry 1: a command table of OpSim has a start"),
-    ("1: {start: 2461050.8, mode: science}\n", "entry 1: sample times run outside the ephemer"),
+    ("1: {start: 61050.8}\n", "entry 1: a command table of OpSim needs a start .* and a mode"),
+    ("1:\n  start: noon\n  mode: science\n", "entry 1: a command table of OpSim needs a start"),
+    ("1: {start: 2461050.8, mode: science}\n", "entry 1: sample times lie outside the ephemer"),
     ("1: {start: 61051, mode: science}\n2: {start: 61050, mode: maint}\n", "entry 2.*; sort"),
     ("1: {start: 61050.8, mode: maint}\n", "comtable.yml: a schedule needs at least one"),
     ("1: {start: 61050, mode: maint}\n2: {start: 61051, mode: science}\n", "2.* has no end"),

@@ -44,7 +44,7 @@ def altered(change):
 
 
 BAD_FILES = [
-    (lambda d: d["visibility"].values.fill(np.nan), "visibility .where not flagged. holds NaN"),
+    (lambda d: d["visibility"].values.fill(np.nan), "visibility .where not flagged..*NaN"),
     (lambda d: d["flag"].values.fill(True), "all .* samples are flagged"),
     (lambda d: d.attrs.update(format="other"), "its format is 'other'"),
     (lambda d: d.assign_coords(product=d["product"].values[::-1]), "has products 33R, 23I"),
@@ -83,7 +83,7 @@ def test_times_in_other_scales_are_brought_to_utc(data, tmp_path, scale, s):
 def test_other_files_are_refused(tmp_path):
     refuse("no data at .*lusee-bayes simulate", read_visibilities, tmp_path / "none.nc")
     (tmp_path / "text.nc").write_text("hello")
-    refuse("not a file of visibilities", read_visibilities, tmp_path / "text.nc")
+    refuse("does not contain visibilities", read_visibilities, tmp_path / "text.nc")
 
 
 def test_lengths_must_fit(data):
@@ -205,17 +205,17 @@ WRONG = [
     ({"products": ["01R"] * 10}, "the data are complex"),
     ({"data": expected().T, "products": ["01"] * 16}, "name the part"),
     ({"data": expected().T, "products": ["00I"] * 16}, "an auto is real"),
-    ({"products": ["00"] * 10}, "more than once"),
-    ({"data": columns([(0, 1), (1, 0)]), "products": ["01", "10"]}, "01R is given more than"),
+    ({"products": ["00"] * 10}, "listed twice"),
+    ({"data": columns([(0, 1), (1, 0)]), "products": ["01", "10"]}, "01R is listed twice"),
     ({"products": "00"}, "give a list"),
     ({"products": [f"{3 - i}{3 - j}" for i, j in PAIRS[1:]] + ["33"]}, "check the names"),
     ({"convention": "s_i conj(s_i)"}, "did you mean 's_i conj(s_j)'"),
     ({"data": np.full((N, 10), np.inf + 0j)}, "infinity"),
     ({"flags": np.zeros(3, dtype=bool)}, "flags have shape"),
-    ({"flags": np.full(N, 0.5)}, "other values than true and false"),
+    ({"flags": np.full(N, 0.5)}, "must be true or false"),
     ({"flags": np.ones(N, dtype=bool)}, "nothing to map"),
     ({"times": TIMES[:3]}, "3 times for data of 5 times"),
-    ({"times": TIMES[::-1]}, "times must grow"),
+    ({"times": TIMES[::-1]}, "times must increase"),
     ({"times": ["yesterday"] * N}, "is not a date"),
     ({"times": np.arange(N)}, "give datetimes"),
     ({"times": [t.replace(year=2060) for t in TIMES]}, "ephemeris"),

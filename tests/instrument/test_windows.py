@@ -199,12 +199,12 @@ def test_bins_of_which_nothing_remains_are_dropped():
     rarely = flagged(*((p, k) for p in range(16) for k in range(4) if p % 4 != k))
     halves = flagged(*((p, k) for p in range(16) for k in range(4) if p % 2 != k % 2))
     for data in (rarely, halves):
-        refuse("nothing is left of the data in bins of 2400 s", averaged, data, 4 * STEP)
+        refuse("averaging over 2400 s leaves no data", averaged, data, 4 * STEP)
 
 
 NOT_AVERAGED = [
-    ("instant", 3600.0, "the samples are instants, which have no mean over a time"),
-    ("mean", 300.0, "over 300 s, which is shorter than their samples of 600 s"),
+    ("instant", 3600.0, "the samples are instants, which cannot be averaged"),
+    ("mean", 300.0, "of 300 s is shorter than the samples .600 s"),
     ("mean", 1e9 * 86400.0, "give at most 30 days"),
     ("mean", 0.0, "the time to average over, in seconds, must be positive"),
     ("mean", np.nan, "the time to average over, in seconds, must be positive"),
@@ -328,7 +328,7 @@ def test_windows_that_samples_cannot_have():
     with refused(r"samples 0 and 1 \(2027-01-15T01:00:00\) overlap by 600"):
         replace(o, windows=Windows.whole(-3600 * n, 3600 * n + 600 * (o.hours == 0)), step_s=8e3)
     refuse("windows of 3 samples for 16 times", replace, o, windows=Windows.whole(-n[:3], n[:3]))
-    refuse("samples are instants; use observation.window=instant", replace, o, fixed_axis=True)
+    refuse("that are instants; use observation.window=instant", replace, o, fixed_axis=True)
 
 
 # --- windows in files and in arrays ---------------------------------------------------------------
@@ -444,11 +444,11 @@ def test_instants_and_silent_files(data, tmp_path):
     path = rewritten(instants, tmp_path / "silent.nc", silent)
     again = read_visibilities(path)
     assert not again.says_window and again.observation.windows is None
-    assert "not known what the times are" in describe(path)
+    assert "meaning of the times unknown" in describe(path)
     # what does not say it does not learn it by being written
     assert not read_visibilities(again.write(tmp_path / "again.nc")).says_window
-    assert "it is not known what the times are" in repr(again)
-    assert "not known" not in repr(instants)
+    assert "meaning of the times unknown" in repr(again)
+    assert "unknown" not in repr(instants)
     started = again.stamped("start")
     np.testing.assert_allclose(bounds_of(started.observation)[:, 0], HOUR * np.arange(4), atol=1e-6)
     refuse("the data have windows", started.stamped, "end")
@@ -495,18 +495,18 @@ def bounds_alone(change):
 
 
 NOT_OF_A_FILE = [
-    (lose("piece_end_s"), "there is piece_sample, but no piece_end_s"),
-    (bounds_alone(lose("time_bounds")), "there is live_time, but no time_bounds"),
-    (bounds_alone(lose("time_bounds", "live_time")), "window = 'mean', but no time_bounds"),
-    (attribute("window", "instant"), "says that the samples are instants, and piece_sample"),
+    (lose("piece_end_s"), "piece_sample without piece_end_s"),
+    (bounds_alone(lose("time_bounds")), "live_time without time_bounds"),
+    (bounds_alone(lose("time_bounds", "live_time")), "window = 'mean' without time_bounds"),
+    (attribute("window", "instant"), "declares the samples instants, but piece_sample"),
     (attribute("window", "means"), "window is 'means'; did you mean 'mean'"),
     (shifted_bounds, "time_bounds and the pieces of sample 0 differ by 30 s"),
-    (changed("piece_start_s", np.nan), "piece_start_s holds NaN"),
+    (changed("piece_start_s", np.nan), "piece_start_s.*NaN"),
     (changed("piece_sample", 0), "at least one piece for each"),
     (changed("piece_live_s", 4000.0), "sample 1 was live for 4000 s of a window of 3600 s"),
     (bounds_alone(changed("live_time", -1.0)), "sample 1 has a live time of -1 s"),
-    (bounds_alone(changed("time_bounds", np.datetime64("NaT", "ns"))), "time_bounds holds no time"),
-    (bounds_alone(numbers), "time_bounds holds values of type float64, expected times"),
+    (bounds_alone(changed("time_bounds", np.datetime64("NaT", "ns"))), "time_bounds has no time"),
+    (bounds_alone(numbers), "time_bounds has values of type float64, expected times"),
 ]
 
 
@@ -584,10 +584,10 @@ WRONG = [
     ({"live_s": [1.0, 0.0, 1.0, 3.0]}, "leave out samples in which nothing was integrated"),
     ({"step_s": 4000.0}, "windows of samples 0 and 1 (2027-01-15T00:00:00) overlap by 400 s"),
     ({"bounds": PAIRS[:3]}, "bounds have shape (3, 2), expected (4, 2)"),
-    ({"bounds": [["now", "then"]] * 4}, "bounds, taken row by row: time 0 'now' is not a date"),
+    ({"bounds": [["now", "then"]] * 4}, "bounds, row by row: time 0 'now' is not a date"),
     ({"bounds": [pair[::-1] for pair in PAIRS]}, "windows need a start and then an end"),
     ({"bounds": PAIRS[::-1]}, "the time of sample 0 (2027-01-15T00:00:00) is not within"),
-    ({"bounds": PAIRS, "step_s": 1800.0}, "lasts 3600 s, longer than the step of 1800 s"),
+    ({"bounds": PAIRS, "step_s": 1800.0}, "lasts 3600 s, longer than the step .* .1800 s"),
 ]
 
 

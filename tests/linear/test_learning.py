@@ -120,7 +120,7 @@ def test_others_integrated_out(case):
 
 def test_nothing_settles_without_steps(case, monkeypatch):
     monkeypatch.setattr("lusee_bayes.priors.learning.MAX_STEPS", 0)
-    refuse("did not settle in 0 steps", learning.learn, case.family, case.information)
+    refuse("did not converge in 0 steps", learning.learn, case.family, case.information)
     # a family far from its own start is still found
     far = replace(case.family, log_monopole=case.family.log_monopole + 1.0)
     monkeypatch.undo()
@@ -336,5 +336,5 @@ class Hopeless(Strength):
 def test_parameters_without_a_covariance_are_drawn_anew_and_then_refused():
     known = weakly_known(Strength.around(2e4, LOW), 1.0)
     given = Hopeless.around(2e4, LOW), *known, jax.random.key(1), 3
-    words = "no sky can be drawn with the uncertainty of the pri"
+    words = "cannot draw skies with uncertain prior parameters"
     refuse(words, learning.draws_with_parameters, *given)

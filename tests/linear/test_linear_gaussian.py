@@ -316,7 +316,7 @@ def test_bad_data_are_refused(small, form):
     model, d = small
     for bad, message in (
         (d[:-1], r"the data has shape \(8,\), expected \(9,?\)"),
-        (d.at[4].set(jnp.nan), r"the data holds NaN or infinity \(1 of 9 .*\(4,\)"),
+        (d.at[4].set(jnp.nan), r"the data.*NaN or infinity \(1 of 9 .*\(4,\)"),
         (d.astype(jnp.float32), r"the data must be a float64 array, got .*float32"),
     ):
         for ask in (lambda x: model.condition(x, form).posterior, model.log_prob):
@@ -329,9 +329,9 @@ def test_bad_parts_are_refused(small):
     for given, words in (
         ((a[:8], prior, noise), "coupling matrix has 8 rows, the noise covariance 9"),
         ((a, lb.HarmonicPrior(jnp.ones(3)), noise), "matrix has 16 columns, the prior 9 .* lmax"),
-        ((a.at[2, 3].set(jnp.nan), prior, noise), r"coupling matrix holds NaN .*\(2, 3\)"),
+        ((a.at[2, 3].set(jnp.nan), prior, noise), r"coupling matrix.*NaN .*\(2, 3\)"),
         ((a.astype(jnp.float32), prior, noise), "coupling matrix must be a float64 array"),
-        ((a, prior, noise, jnp.full(9, jnp.nan)), "the offset holds NaN"),
+        ((a, prior, noise, jnp.full(9, jnp.nan)), "the offset.*NaN"),
     ):
         refuse(words, lb.LinearGaussian, *given)
     with pytest.raises((lb.InputError, TypeCheckError), match="offset"):  # types are checked first

@@ -300,10 +300,10 @@ BAD_ENTRIES = [
         (kind, jnp.float32(entries), "(variance|term|blocks|beams) must be a float64 array")
         for kind, entries in zip(MAKERS, (jnp.ones(3), UNIT, BLOCKS, BAND, ROOT), strict=True)
     ),
-    ("dense", UNIT.at[0, 2].set(jnp.nan), r"the gain term holds NaN .*\(0, 2\)"),
-    ("blocks", BLOCKS.at[1, 1, 0].set(jnp.inf), r"noise blocks holds NaN .*\(1, 1, 0\)"),
-    ("banded", BAND.at[1, 1, 0, 1].set(jnp.nan), r"holds NaN .* first at \(1, 1, 0, 1\)"),
-    ("low rank", ROOT.at[3, 1].set(jnp.inf), r"the beams holds NaN or infinity .*\(3, 1\)"),
+    ("dense", UNIT.at[0, 2].set(jnp.nan), r"the gain term.*NaN .*\(0, 2\)"),
+    ("blocks", BLOCKS.at[1, 1, 0].set(jnp.inf), r"noise blocks.*NaN .*\(1, 1, 0\)"),
+    ("banded", BAND.at[1, 1, 0, 1].set(jnp.nan), r"NaN .* first at \(1, 1, 0, 1\)"),
+    ("low rank", ROOT.at[3, 1].set(jnp.inf), r"the beams.*NaN or infinity .*\(3, 1\)"),
     ("blocks", jnp.ones((2, 3, 3)), r"shape \(2, 3, 3\), expected \(3, 2, 2\)"),
     ("banded", BAND[:2], r"shape \(2, 2, 2, 2\), expected \(3, any, 2, 2\)"),
     ("dense", UNIT.at[0, 1].set(0.01), r"gain term is not symmetric: .* up to 0\.01 "),
@@ -361,7 +361,7 @@ def test_blocks_with_other_flags_are_refused():
     other = FLAGS[:, ::-1]  # as many samples, but not the same ones
     for first, second in product(["blocks", "banded"], repeat=2):
         a, b = _terms(FLAGS)[first][0], _terms(other)[second][0]
-        refuse("hold different samples; build both", add, a, b)
+        refuse("contain different samples; build both", add, a, b)
 
 
 def test_a_dense_term_can_be_built_inside_jit_from_known_numbers():
@@ -394,11 +394,11 @@ def test_the_term_is_t_p_t(prior, matrix):
 
 BAD_TEMPLATES = [
     (T[:14], VARIANCES, r"the templates has shape \(14, 3\), expected \(15, any\)"),
-    (np.where(np.arange(15)[:, None] == 4, np.nan, T), VARIANCES, r"the templates holds NaN"),
+    (np.where(np.arange(15)[:, None] == 4, np.nan, T), VARIANCES, r"the templates.*NaN"),
     (T, np.array([1.0, 0.0, 2.0]), r"prior variance must be positive, .* first at \(1,\)"),
     (T, np.diag([1.0, -0.5, 2.0]), "prior is not positive definite: .* eigenvalue is -0.5 "),
     (T, P + np.eye(3, k=1), "the templates' prior is not symmetric: .* up to 1 "),
-    (T, np.full((3, 3), np.inf), "the templates' prior holds NaN or infinity"),
+    (T, np.full((3, 3), np.inf), "the templates' prior.*NaN or infinity"),
 ]
 
 

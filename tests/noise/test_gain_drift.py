@@ -223,7 +223,7 @@ def test_bad_visibilities_are_refused():
     short, shapes = d[:, :5], r"the visibilities has shape \(4, 5\), expected \(4, 6\)"
     refuse(shapes, drift.covariance, short, HOURS[:5], layout)
     bad = d.at[2, 1].set(jnp.nan)
-    refuse(r"visibilities holds NaN .* first at \(2, 1\)", drift.covariance, bad, HOURS, layout)
+    refuse(r"visibilities.*NaN .* first at \(2, 1\)", drift.covariance, bad, HOURS, layout)
 
 
 def test_the_term_alone_is_not_a_noise():

@@ -129,7 +129,7 @@ def test_bad_options_and_visibilities_are_refused():
     never[7] = True
     for visibilities, layout, words in (
         (VISIBILITIES.at[7, 2].set(-1.0), LAYOUT, r"temperature .* positive.*\(1, 2\).*sky"),
-        (VISIBILITIES.at[5, 0].set(jnp.nan), LAYOUT, r"the visibilities holds NaN .*\(5, 0\)"),
+        (VISIBILITIES.at[5, 0].set(jnp.nan), LAYOUT, r"the visibilities.*NaN .*\(5, 0\)"),
         (VISIBILITIES, DataLayout(N_PRODUCTS, 4), r"shape \(16, 3\), expected \(16, 4\)"),
         (VISIBILITIES.astype(jnp.float32), LAYOUT, "must be a float64 array.*float32"),
         (jnp.where(never, 0.0, VISIBILITIES), DataLayout.from_flags(never), "the auto 11R"),

@@ -158,7 +158,7 @@ def test_a_broken_case_file_is_computed_again(four, place, tmp_path, monkeypatch
     )
     monkeypatch.setattr(paper, "CASES", dict(list(paper.CASES.items())[:1]))
     (tmp_path / place).mkdir()
-    (tmp_path / place / "fiducial.nc").write_text("cut short")
+    (tmp_path / place / "fiducial.nc").write_text("truncated")
     run_cases(tmp_path)
     assert len(computed) == 1
 

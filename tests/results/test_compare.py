@@ -46,7 +46,7 @@ def test_the_right_model_wins(runs, tmp_path, capsys):
 
 def test_different_data_are_told_apart(runs, tmp_path, capsys):
     read = read_runs([runs / "fiducial", runs / "other"])
-    assert "has other values at the same times" in evidence_caveat(read)
+    assert "has different values at the same times" in evidence_caveat(read)
     assert evidence_caveat(read_runs([runs / "fiducial", runs / "gain_1e-2"])) is None
     assert read[0].channel.mean.shape == read[1].channel.mean.shape
     assert run("compare", runs / "fiducial", runs / "other", "-o", tmp_path / "out") == 0
@@ -57,9 +57,9 @@ def test_what_cannot_be_compared(runs, small_cube, tmp_path, capsys, numbers_alo
     scenario = lb.load_scenario("fiducial", [*SMALL, "frequencies_mhz=[25]"])
     one = lb.run_map(scenario, tmp_path / "one")
     for folders, message in (
-        ([runs / "fiducial", small_cube.folder], "'cube' is a run of frequencies_mhz"),
-        ([runs / "fiducial", one.folder], "'one' is a run of frequencies_mhz"),
-        ([runs / "fiducial"], "give two folders or more to compare, got 1"),
+        ([runs / "fiducial", small_cube.folder], "'cube' has several frequencies"),
+        ([runs / "fiducial", one.folder], "'one' has several frequencies"),
+        ([runs / "fiducial"], "give at least two folders to compare, got 1"),
         ([runs / "fiducial", tmp_path], "has no summary.json"),
         ([runs / "fiducial", runs / "fiducial"], "two of the folders are named 'fiducial'"),
     ):

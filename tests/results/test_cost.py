@@ -39,10 +39,10 @@ def test_a_joint_posterior_that_does_not_fit_is_refused_with_what_would(monkeypa
     found = cost.posterior_cost(scenario)
     assert found.n_unknowns == 3 * 101**2 and found.memory > 8.0 * 4 * found.n_unknowns**2
     monkeypatch.setattr(cost, "memory_limit", lambda: 16e9)
-    refused = r"30,603 unknowns; this process may use 16 GB; joint=false would fit"
+    refused = r"30,603 unknowns; this process is limited to 16 GB; joint=false would fit"
     refuse(refused, cost.require_fits, found, scenario)
     monkeypatch.setattr(cost, "memory_limit", lambda: 3e9)
-    refuse(r"may use 3 GB; lmax=\d\d would fit", cost.require_fits, found, scenario)
+    refuse(r"limited to 3 GB; lmax=\d\d would fit", cost.require_fits, found, scenario)
 
 
 def test_the_maps_of_a_kernel_are_its_principal_spectra():

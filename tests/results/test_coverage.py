@@ -150,7 +150,7 @@ def test_strengths_are_squares_over_what_is_expected():
     # the monopole does not count
     assert strengths(np.append(1e6, sky[1:]), of_modes, of_pixels) == found
     words = strengths_in_words(found)
-    assert words.startswith("Power of the sky over what the prior expects: ")
+    assert words.startswith("Sky power relative to the prior: ")
     assert f"{found['ell 5 to 6']:.2g} at ell 5 to 6." in words
     # of what is not known nothing is said
     assert strengths(sky, 0.0 * of_modes, 0.0 * of_pixels) == {}

@@ -62,7 +62,7 @@ def test_channels_that_stand_out_are_named():
     # noise that is given too large is no fit either
     fit, quiet = run.fit(), fits(0.8 * chi2[:1]).fit()
     assert run.extremes() == [7, 30] and fit.level == quiet.level == "does not fit"
-    assert "2 of 46 channels stand out: 12 MHz" in fit.text and "35 MHz" in fit.text
+    assert "2 of 46 channels flagged: 12 MHz" in fit.text and "35 MHz" in fit.text
     assert "No sky explains" in fit.text and "too large" not in fit.text
     assert "noise.radiometer" in quiet.text and "No sky explains" not in quiet.text
     # one channel that is too loud, whatever the sum

@@ -227,7 +227,7 @@ def test_what_will_be_known_of_clock_and_turntable():
 
 
 def test_ports_that_do_not_exist_and_none_left():
-    refuse("no port 4 to lose; ports are 0 to 3", plan_run.forecast, varied(lost=(4,)))
+    refuse("port 4 does not exist; ports are 0 to 3", plan_run.forecast, varied(lost=(4,)))
     refuse("small, test: all .* samples are flagged", plan_run.forecast, varied(lost=(0, 1, 2, 3)))
 
 
@@ -255,7 +255,7 @@ def test_the_command_writes_table_and_figure(tmp_path, capsys, monkeypatch):
     more = float(rows[4]["information_bits"]) - expected.information_bits
     assert float(rows[4]["difference_bits"]) == pytest.approx(more, abs=0.0101)
     out = capsys.readouterr().out
-    assert "left out: fiducial, nights only, 0.05 cycles: run 0 holds no lunar night" in out
+    assert "left out: fiducial, nights only, 0.05 cycles: run 0 contains no lunar night" in out
     assert "noise_x100: " in out
     assert out.strip().splitlines()[-1] == f"look at {tmp_path}/figures/plan.png"
 

@@ -173,7 +173,7 @@ def test_skies_are_those_of_one_normal_equation(cube, expected):
         own = slice(k * N_MODES, (k + 1) * N_MODES)
         assert_same_map(channel, Answer(expected.mean[own], expected.covariance[own, own], 0), 1e-6)
     assert cube.log_evidence == pytest.approx(expected.log_prob, abs=1e-4)
-    assert "but for the instrument that they share" in cube.headline()
+    assert "except for the instrument that they share" in cube.headline()
     assert any("Unknowns of the beams are the same at all" in line for line in cube.lines())
 
 

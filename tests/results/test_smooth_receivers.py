@@ -249,9 +249,9 @@ def test_a_channel_has_those_of_its_own_map(response_file, tmp_path, monkeypatch
     receivers = written[written["unknown"] == "receiver_0_k"]["prior"]
     assert receivers.iloc[0] == pytest.approx(receivers.iloc[1] * (20.0 / 15.0) ** 2)
     lines = run.result.lines()
-    untold = "Receivers, ground and gain table: the data do not tell regolith_k (at 2 of 2 frequenc"
+    untold = "Receivers, ground and gain table: the data do not constrain regolith_k (at 2 of 2 "
     (line,) = (line for line in lines if line.startswith(untold))
-    (sentence,) = (line for line in lines if line.startswith("One combination of what looks alike"))
+    (sentence,) = (line for line in lines if line.startswith("One parameter combination"))
     worst = max(nulls, key=lambda frequency: nulls[frequency].share)
     assert f"at 2 of 2 frequencies. At {worst:g} MHz ({nulls[worst].words()}, in" in sentence
     page = map_page(tmp_path / "cube", "a run")

@@ -125,10 +125,10 @@ def test_from_the_command_line(tmp_path, capsys, monkeypatch):
     for arguments, message in (
         (("--data", "b.nc", "--add", "both"), "would count twice"),
         (("--add", "none"), "no posterior of lusee-bayes map --information at"),
-        (("--add", "plain"), "does not hold the information of its data; make that map again"),
-        (("--add", "both", "--set", "frequency_mhz=10"), "is of 25 MHz, the scenario of 10 MHz"),
-        (("--add", "both", "--set", "lmax=4"), "is of lmax 5, the scenario of 4; use --set lmax=5"),
-        (("--add", "both", "--frequencies", "10,20"), "no channel .*: 10 MHz: .* is of 25 MHz"),
+        (("--add", "plain"), "does not contain the information of its data; make that map again"),
+        (("--add", "both", "--set", "frequency_mhz=10"), "is for 25 MHz, the scenario for 10 MHz"),
+        (("--add", "both", "--set", "lmax=4"), "has lmax = 5, the scenario lmax = 4; use"),
+        (("--add", "both", "--frequencies", "10,20"), "no channel .*: 10 MHz: .* is for 25 MHz"),
     ):
         assert re.search(message, refused(capsys, *mapped, *arguments, "-o", "third"))
     assert not (tmp_path / "third").exists()

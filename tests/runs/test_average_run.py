@@ -56,7 +56,7 @@ def test_the_command_writes_averages_and_says_what_they_cost(path, tmp_path, cap
     found = read_visibilities(out)
     assert found.digest() == averaged(read_visibilities(path), 7200.0).digest()
     there = refused(capsys, "average", path, "--to", "4h", "-o", out, *given)
-    assert "is there already; give -o another name, or --force" in there
+    assert "exists already; give -o another name, or --force" in there
     long, again = tmp_path / "long.nc", tmp_path / "again.nc"
     assert "days" in refused(capsys, "average", path, "--to", "1e9d", "-o", long, *given)
     assert not long.exists()
@@ -88,13 +88,13 @@ def test_average_s_of_the_scenario_does_not_count(path, data, tmp_path):
 
 
 BAD_INPUT = [
-    (["--to", "2hours"], "'2hours' is not a length of time; give a positive number"),
-    (["--to", "10min"], "shorter than their samples of 1800 s"),
+    (["--to", "2hours"], "'2hours' is not a duration; give a positive number"),
+    (["--to", "10min"], "shorter than the samples (1800 s)"),
     (["--to", "2h", "-o", "w.fits"], "give -o a name that does not end in .fits"),
     (["--to", "2h", "-o", "data.nc"], "'data.nc' is an input of this run"),
     (["--to", "2h", "--set", "frequency_mhz=10"], "the data are at 25.0 MHz"),
-    (["--to", "2h", "--set", "frequencies_mhz=[10,20]"], "averages are of one frequency"),
-    (["--to", "2h", "--set", "observation.timestamp=start"], "leave that out"),
+    (["--to", "2h", "--set", "frequencies_mhz=[10,20]"], "averages have one frequency"),
+    (["--to", "2h", "--set", "observation.timestamp=start"], "remove that"),
 ]
 
 
@@ -110,5 +110,5 @@ def test_lengths_of_time():
     for text, seconds in (lengths | {".5min": 30.0, "1e3s": 1000.0}).items():
         assert parse_duration(text) == seconds
     for text in ("", "h", "2", "0s", "-2h", "2 hours", "1e999d", "nan s", "٣s", "2h 30min"):
-        with pytest.raises(lb.InputError, match="is not a length of time; .* 30s, 10min, 2h or 1d"):
+        with pytest.raises(lb.InputError, match="is not a duration; .* 30s, 10min, 2h or 1d"):
             parse_duration(text)

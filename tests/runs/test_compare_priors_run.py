@@ -40,7 +40,7 @@ def test_what_a_run_leaves(finished, capsys):
         assert float(row["log_evidence"]) == one["log_evidence"]
         assert float(row["day_log_density"]) == one["held_out"][1]["log_density"]
     page = (finished / "report.html").read_text()
-    assert found["verdict"] in page and "68% hold, |b| &gt; 30 deg" in page
+    assert found["verdict"] in page and "68% coverage, |b| &gt; 30 deg" in page
     assert found["verdict"] in (finished / "priors.md").read_text()
     (finished / "report.html").unlink()
     assert run("report", finished) == 0

@@ -97,7 +97,7 @@ def test_files_are_replaced_only_if_it_is_asked_for(simulated, tmp_path, capsys)
     out, session = tmp_path / "out.nc", simulated / "session_000.h5"
     before = session.read_bytes()
     again = ("simulate", "fiducial", "--flight", "-q", "-o", simulated, *given())
-    told = f"'{simulated}' holds sessions already (session_000.h5); give -o another folder, or"
+    told = f"'{simulated}' already contains sessions (session_000.h5); give -o another folder, or"
     assert told in refused(capsys, *again)
     assert session.read_bytes() == before
     for command in (
@@ -106,7 +106,7 @@ def test_files_are_replaced_only_if_it_is_asked_for(simulated, tmp_path, capsys)
     ):
         out.write_bytes(b"mine")
         there = refused(capsys, *command, "-o", out)
-        assert "is there already; give -o another name, or --force" in there
+        assert "exists already; give -o another name, or --force" in there
         assert out.read_bytes() == b"mine"
         assert run(*command, "-o", out, "--force") == 0
         assert out.read_bytes() != b"mine"
@@ -119,7 +119,7 @@ def test_files_are_replaced_only_if_it_is_asked_for(simulated, tmp_path, capsys)
 def test_what_can_be_mapped_is_said_of_a_file_that_cannot(simulated, tmp_path, capsys, name):
     given = ["--data", simulated / name, "-q", "-o", tmp_path / "map"]
     error = refused(capsys, "map", simulated / "scenario.yaml", *given)
-    assert f"{name} holds nothing that can be mapped" in error
+    assert f"{name} contains no data to map" in error
     assert all(kind in error for kind in ("visibilities", "waterfall", "sessions", "reduce"))
 
 
@@ -175,7 +175,7 @@ def test_the_section_says_how_spectra_were_reduced(reduced, tmp_path):
         "polynomial of degree 2 over 1 MHz",
         "longitude 182.258°, latitude -23.814°, of the sessions",
         "0x307",
-        "UTC, of the clock file",
+        "UTC, from the clock file",
     ):
         assert told in page, told
 
@@ -186,13 +186,13 @@ def test_files_of_older_versions_are_described_as_far_as_they_say_it(reduced, tm
     session = {name: value for name, value in session.items() if name not in new}
     page = page_of(replace(reduced, sessions=(session,), recipe={}), tmp_path)
     assert "longitude 182.258°, latitude -23.814°<" in page
-    assert "of the clock file" in page and "0x307" in page
+    assert "from the clock file" in page and "0x307" in page
     assert read_reduced(tmp_path / "reduced.nc").notes() == ()
 
 
 def test_a_clock_that_the_sessions_do_not_say_is_told_in_one_line(of_two_bands, reduced, tmp_path):
     (told,) = [line for line in reduced_lines(reduced) if "clock file" in line]
-    assert told.startswith("session_000.h5 ") and told.endswith("of the clock file clock.json.")
+    assert told.startswith("session_000.h5 ") and told.endswith("from the clock file clock.json.")
     # nothing to say where the session says it itself
     known = lb.load_scenario("fiducial", [*TWO_BANDS, "flight.simulated.clock=known"])
     made = run_simulate_flight(known, tmp_path)
@@ -218,7 +218,7 @@ def test_of_one_frequency_gains_are_points_with_error_bars(reduced):
     marks = [line for line in right.lines if line.get_marker() in ("o", "s")]
     known = [x for x in (*reduced.line_scatter, *reduced.scatter) if np.isfinite(x)]
     assert [line.get_ydata()[0] for line in marks] == known and 0 < len(known) < 2
-    assert [text.get_text() for text in right.texts] == [f"{known[0]:.3f}", "not known"]
+    assert [text.get_text() for text in right.texts] == [f"{known[0]:.3f}", "unknown"]
 
 
 def test_of_several_frequencies_noise_is_drawn_by_frequency(of_two_bands):

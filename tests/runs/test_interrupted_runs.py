@@ -65,7 +65,7 @@ COMMANDS = {
     "paper": (["paper"], "unfinished-cases"),
 }
 AGAIN = "the same command continues from the finished"
-RESUME = {"cube": f"{AGAIN} channels", "sample": "go on with --resume", "paper": f"{AGAIN} cases"}
+RESUME = {"cube": f"{AGAIN} channels", "sample": "with --resume", "paper": f"{AGAIN} cases"}
 
 
 class Command:
@@ -209,7 +209,7 @@ def test_an_interrupt_says_what_the_folder_holds(command, with_earlier, tmp_path
     errors = process.communicate(timeout=600)[1].strip()
     assert process.returncode == 130, errors
     state = state_of(folder, it, earlier)
-    before = "the earlier results are as they were" if earlier else "no results are written"
+    before = "the earlier results are unchanged" if earlier else "no results were written"
     sentence = {
         "new": f"the new results in '{folder}' are complete",
         "old": f"{before} in '{folder}'",

@@ -212,7 +212,7 @@ def test_resuming_a_finished_run_takes_it_over(whole, tree, no_sampling):
 def test_a_finished_run_of_other_settings_is_not_taken_over(experiment, whole, no_sampling, change):
     before = content(whole)
     given = {"": experiment}, lb.load_program("sky"), replace(SAMPLER, **change), whole
-    refuse("finished run with other settings; leave out", sample_together, *given, resume=True)
+    refuse("finished run with other settings; omit", sample_together, *given, resume=True)
     assert content(whole) == before
 
 
@@ -260,7 +260,7 @@ def test_the_samples_hold_the_analytic_posterior_and_what_they_are(runs, tree, e
     assert tree.attrs["program"] == "sky"
     assert tree.attrs["scenario"] == experiment.scenario.to_yaml()
     assert run("info", runs[0] / "samples.nc") == 0
-    assert "4 x 1000 draws of the program sky at 25 MHz" in capsys.readouterr().out
+    assert "4 x 1000 draws from the program sky at 25 MHz" in capsys.readouterr().out
 
 
 def test_the_summary_tells_of_landmarks_powers_and_lowest_modes(runs, tree):

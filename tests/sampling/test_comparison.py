@@ -139,4 +139,4 @@ def test_where_there_is_no_mode_nothing_is_found():
 
     assert not bool(laplace_approximation(model, {"data": None}).converged)
     endless = Program("endless", model, "")
-    refuse("no mode of the posterior", comparison.estimate_evidence, endless, {}, np.zeros(1))
+    refuse("found no mode of the posterior", comparison.estimate_evidence, endless, {}, np.zeros(1))

@@ -101,7 +101,7 @@ def test_refusals():
     refuse("template must be positive", LogNormalSky.of, nothing, SPECTRUM, MHZ, band=20)
     spectrum = np.where(np.arange(LMAX + 1) == 3, 0.0, SPECTRUM)
     refuse("spectrum of the logarithm must", LogNormalSky.of, waves, spectrum, MHZ, band=20)
-    refuse("does not hold harmonics", LogNormalSky.of, waves, SPECTRUM, MHZ, band=LMAX - 1)
+    refuse("does not support harmonics", LogNormalSky.of, waves, SPECTRUM, MHZ, band=LMAX - 1)
 
 
 def test_the_embedded_template_is_the_sky_without_its_random_part():

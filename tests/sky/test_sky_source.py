@@ -184,7 +184,7 @@ BAD_MAPS = [
     ("has the unit 'Jy', expected K", lambda to, x: write_fits(to, x, "Jy")),
     ("neither HDF5 nor FITS", lambda to, x: to.write_text("not a map")),
     ("did you mean 'smooth_absorp'", lambda to, x: write_hdf5(to, smooth_absorp=x)),
-    ("not a HEALPix map", lambda to, x: write_hdf5(to, smooth_absorb=x[:-1])),
+    ("of a HEALPix map", lambda to, x: write_hdf5(to, smooth_absorb=x[:-1])),
 ]
 
 
@@ -236,7 +236,7 @@ def test_cubes_that_cannot_be_used(tmp_path, maps):
     cube = ss.SkyCube.read(write_cube(tmp_path / "cube.fits", maps))
     refuse("from 1 to 50 MHz, not at 50.5; set sky.file_freq", cube.map_at, 50.5)
     refuse("expected 60 maps", ss.SkyCube.read, write_cube(tmp_path / "long.fits", maps, end=60))
-    refuse("767 values are not", ss.SkyCube.read, write_cube(tmp_path / "odd.fits", maps[:, :-1]))
+    refuse("has 767 values", ss.SkyCube.read, write_cube(tmp_path / "odd.fits", maps[:, :-1]))
     in_hz = write_cube(tmp_path / "hz.fits", maps, start=1e6, step=1e6)
     refuse("is this Hz", ss.SkyCube.read, in_hz)
     for unit, factor in (("mK", 1e-3), ("K", 1.0)):
@@ -253,7 +253,7 @@ def test_cubes_that_cannot_be_used(tmp_path, maps):
     refuse("not positive at 9 or 10 MHz", cube.map_at, 9.5)
     path = tmp_path / "cube.fits"
     path.write_bytes(path.read_bytes()[:10_000])
-    refuse("cut short", lb.sky_from_file, path, 25.0, 4)
+    refuse("truncated", lb.sky_from_file, path, 25.0, 4)
 
 
 # --- coefficients -------------------------------------------------------------------------------
@@ -291,7 +291,7 @@ def test_luseepys_coefficients_of_many_frequencies(test_data):
 
 def test_coefficients_that_cannot_be_used(tmp_path, coefficients):
     path = ss.write_alms(tmp_path / "alm.fits", coefficients, {})
-    refuse("up to ell = 8, not up to 9", lb.sky_from_file, path, 25.0, 9)
+    refuse("up to ell = 8, expected up to 9", lb.sky_from_file, path, 25.0, 9)
     with fits.open(path) as hdus:
         table = hdus[1].data
         fits.BinTableHDU(table[:-1], name="ALM").writeto(tmp_path / "short.fits")

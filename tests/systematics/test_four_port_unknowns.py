@@ -146,7 +146,7 @@ def test_receivers_sampled_have_the_density_of_the_closed_form(response_file):
 
 def test_what_antennas_without_volts_or_ground_cannot_have():
     for section, message in (
-        ("noise.receiver={power_v2_hz: 1e-17}", "power_v2_hz needs antennas that know volts"),
+        ("noise.receiver={power_v2_hz: 1e-17}", "power_v2_hz needs antennas calibrated in volts"),
         ("noise.regolith={std_k: 30}", r"noise\.regolith needs antennas that receive from the"),
     ):
         refuse(message, set_up, lb.load_scenario("fiducial", ["lmax=2", section]))
@@ -424,11 +424,11 @@ WIDE = Calibration(np.full(23, 1e10), ("a", "b"), np.array([1, 1]), SLOPES)
 
 
 BAD_TABLES = [
-    ([BARE], None, r"say nothing of a gain table; give noise\.gain_table\.std"),
+    ([BARE], None, r"contain no gain table; give noise\.gain_table\.std"),
     ([BARE], UNNAMED, "give noise.gain_table.std"),
-    ([TABLE % "marginalised"], NAMED, "themselves; leave out noise.gain_table.std"),
+    ([TABLE % "marginalised"], NAMED, "gain table; remove noise.gain_table.std"),
     ([BARE, "flight={gain_std: 0.3}"], None, "flight.gain_std is 0.3, .* give a smaller noise"),
-    ([BARE], WIDE, "of port 1 is known to 0.11 of itself, expected at"),
+    ([BARE], WIDE, "of port 1 a relative error of 0.11, expected at"),
 ]
 
 

@@ -165,7 +165,7 @@ def test_without_it_the_map_fails_and_with_it_the_errors_are_right(kind):
 def test_what_cannot_be_is_refused():
     beams = lb.sampled_beams(MHZ, products=np.ones((16, 12 * 4**2)))
     setup = replace(setup_with(linear=0.01), beam_source=beams)
-    why = "noise.polarisation: the beams has beams of products, not the E fields of antennas"
+    why = "noise.polarisation: the beams: product beams, but this needs the E fields"
     refuse(why, model_about, setup, Around())
     refuse("less than or equal to 1", small_scenario, "noise.polarisation.linear=1.5")
     refuse("greater than or equal to 2", small_scenario, "noise.polarisation.lmax=1")

@@ -212,7 +212,7 @@ def neighbours(path: str, known_mhz: Frequencies, frequency_mhz: float) -> list[
     if not known_mhz[0] < frequency_mhz < known_mhz[-1]:
         raise InputError(
             f"{path} has values from {known_mhz[0]:g} to {known_mhz[-1]:g} MHz, not at "
-            f"{frequency_mhz:.12g}; change frequency_mhz, or give a file that reaches there"
+            f"{frequency_mhz:.12g}; change frequency_mhz, or give a file that covers it"
         )
     above = int(np.searchsorted(known_mhz, frequency_mhz))
     low, high = known_mhz[above - 1], known_mhz[above]

@@ -87,8 +87,8 @@ class GridBeams(Described, BeamSource):
             _, low, high = self.parameter(name)
             if not is_traced(value) and not low <= value <= high:
                 raise InputError(
-                    f"{self.path}: {name} is {float(value):.6g}, and the files go from {low:g} to "
-                    f"{high:g}; give a value between these, or files that reach there"
+                    f"{self.path}: {name} is {float(value):.6g}, but the files cover {low:g} to "
+                    f"{high:g}; give a value in this range, or files that cover it"
                 )
         return replace(self, values={**self.values, **values})
 
@@ -130,7 +130,7 @@ class GridBeams(Described, BeamSource):
     has_fields = False
 
     def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> Any:
-        raise InputError(f"{self.path}: between files are beams of products, not the E fields")
+        raise InputError(f"{self.path}: only product beams are interpolated, not E fields")
 
     def patterns(self, frequency_mhz: float, grid: HemisphereGrid) -> Pairs:
         found = [np.asarray(source.patterns(frequency_mhz, grid)) for source in self.sources]
@@ -249,7 +249,7 @@ def read_grid_table(path: str | Path) -> tuple[tuple[str, ...], dict[str, Nodes]
         if rows.count(place) != 1:
             said = ", ".join(f"{name} {x:g}" for name, x in zip(axes, place, strict=True))
             raise InputError(
-                f"{path} has {rows.count(place) or 'no'} files of {said}; expected one file for "
+                f"{path} has {rows.count(place) or 'no'} files for {said}; expected one file for "
                 "every combination of the parameters' values"
             )
     files = (columns["file"][rows.index(place)] for place in places)

@@ -412,7 +412,7 @@ def read_response(path: str | Path) -> PortResponse:
     off = np.abs(sky + moon + loss - resistance).max() / np.abs(resistance).max()
     if off > RESISTANCE_TOLERANCE:
         raise InputError(
-            f"{path}: Rsky + Rmoon + Rloss differ from (ZA + ZA^H) / 2, by {off:.1g} of it"
+            f"{path}: Rsky + Rmoon + Rloss differ from (ZA + ZA^H) / 2 by a relative {off:.1g}"
         )
     theta = np.linspace(0.0, np.pi / 2.0, len(theta_deg))
     return PortResponse(str(path), frequencies, theta, h_theta, h_phi, impedance, moon, loss)
@@ -551,7 +551,7 @@ def read_scalar_beam(path: str | Path) -> ScalarBeam:
     if (sizes["theta"], sizes["phi"]) != (said["THETA_N"], said["PHI_N"]):
         raise InputError(
             f"{path}: the fields have {sizes['theta']} x {sizes['phi']} directions, the header "
-            f"says {said['THETA_N']} x {said['PHI_N']} (THETA_N, PHI_N)"
+            f"gives {said['THETA_N']} x {said['PHI_N']} (THETA_N, PHI_N)"
         )
     pair = [images[f"{name}_real"] + 1j * images[f"{name}_imag"] for name in FIELD_NAMES]
     # the last azimuth is the first once more

@@ -100,15 +100,15 @@ class Directions:
         if theta is None or phi is None:
             if not healpy.isnpixok(n_last):
                 raise InputError(
-                    f"{path}: {n_last} directions are no HEALPix map of 12 NSIDE^2 pixels; give "
-                    "theta_deg and phi_deg for a grid"
+                    f"{path}: {n_last} directions are not the 12 NSIDE^2 pixels of a HEALPix map; "
+                    "give theta_deg and phi_deg for a grid"
                 )
             return cls(None, 0, healpy.npix2nside(n_last))
         used = theta[theta < 90.0 - ANGLE_TOLERANCE]
         if len(used) < 4 or max(used[0], 90.0 - used[-1]) > np.diff(theta)[: len(used)].max():
             raise InputError(
                 f"{path}: theta_deg runs from {theta[0]:g} to {theta[-1]:g} in {len(theta)} steps, "
-                "expected angles from the zenith (0) to the horizon (90), four at least"
+                "expected at least four angles from the zenith (0) to the horizon (90)"
             )
         n = len(phi) - int(len(phi) > 1 and abs(phi[-1] - 360.0) < ANGLE_TOLERANCE)
         if np.abs(phi[:n] - 360.0 * np.arange(n) / n).max() > ANGLE_TOLERANCE:
@@ -134,7 +134,7 @@ class Directions:
             kept = np.where(theta < np.pi / 2.0, values, 0.0)
         if (bad := ~np.isfinite(kept)).any():
             raise InputError(
-                f"{what} holds NaN or infinity in {bad.sum()} of {bad.size} places in the sky"
+                f"{what} contains NaN or infinity in {bad.sum()} of {bad.size} directions"
             )
         return kept
 
@@ -217,7 +217,7 @@ class SampledBeams(Described, BeamSource):
 
     def description(self) -> tuple[str, ...]:
         kind = "E fields of" if self.products is None else "product beams of"
-        scale = "K per K" if self.absolute else "to be scaled so that autos integrate to one"
+        scale = "K per K" if self.absolute else "normalised so that autos integrate to one"
         known = listed(tuple(f"{f:g}" for f in self.frequencies_mhz))
         at, where = self.directions, f"HEALPix pixels of NSIDE {self.directions.nside}"
         if at.theta is not None:
@@ -236,9 +236,7 @@ class SampledBeams(Described, BeamSource):
 
     def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
         if self.products is not None:
-            raise InputError(
-                f"{self.path} has beams of products, not the E fields of antennas, which this needs"
-            )
+            raise InputError(f"{self.path}: product beams, but this needs the E fields of antennas")
         parts = self._at(frequency_mhz, self.e_theta, self.e_phi)
         turned = self.directions.vectors_on(*parts, grid, self.turntable_offset_deg)
         return AntennaFields(*turned, grid)
@@ -267,7 +265,7 @@ class SampledBeams(Described, BeamSource):
             scale = float(grid.integrate(patterns[auto_indices(self.n_ports)]).mean())
             if not scale > 0.0:
                 raise InputError(
-                    f"{self.path}: the autos integrate to {scale:g} sr on average, not above zero"
+                    f"{self.path}: the autos integrate to {scale:g} sr on average; expected > 0"
                 )
             patterns = patterns / scale
         return ProductBeams(grid.modes(patterns, lmax), float(frequency_mhz))
@@ -341,7 +339,7 @@ def sampled_beams(
 FIELDS = ("e_theta_real", "e_theta_imag", "e_phi_real", "e_phi_imag")
 POWER = "product_beam"
 WHAT = "sampled beams"
-HINT = "lusee_bayes.instrument.beams.sampled.write_sampled_beams makes one"
+HINT = "lusee_bayes.instrument.beams.sampled.write_sampled_beams writes one"
 
 
 def layout(names: tuple[str, ...], grid: bool, kind: Kind = "real", said: Any = None) -> Layout:
@@ -501,8 +499,8 @@ def from_uvbeam(beam: Any, *, conjugate: bool = False, path: str = "the UVBeam")
     unit[0, 0] = unit[1, 1] = 1.0
     if basis.shape[:2] != (2, 2) or not np.allclose(basis, unit, atol=1e-9):
         raise InputError(
-            f"{path} has fields along other vectors than azimuth and zenith angle; convert it "
-            "first (basis_vector_array is not the unit matrix)"
+            f"{path} has fields along vectors other than azimuth and zenith angle "
+            "(basis_vector_array is not the unit matrix); convert it first"
         )
     # (vector, feed, frequency, ...) to (frequency, feed, ...)
     along_phi, along_theta = np.swapaxes(np.asarray(beam.data_array), 1, 2)

@@ -43,7 +43,7 @@ Lines = Float[np.ndarray, "lines products modes"]
 # matrices of the ports at every frequency
 LOADS, BY_PORTS = ("ZL_real", "ZL_imag"), ("freq", N_ANTENNAS, N_ANTENNAS)
 LOADS_LAYOUT = Layout(
-    "loads ZL of four receivers, as luseepy's four-port waterfalls hold them",
+    "loads ZL of four receivers, as in luseepy's four-port waterfalls",
     {
         "freq": Variable(("freq",), low=0.0, grows=True, unit="MHz"),
         **dict.fromkeys(LOADS, Variable(BY_PORTS, unit="Ohm")),
@@ -428,5 +428,5 @@ class BeamSource(ABC):
     def monopoles(self) -> BeamSource:
         """The embedded antennas. InputError where the beams are those of a file."""
         raise InputError(
-            "this needs the embedded antennas, which beam.file replaces; leave out beam.file"
+            "this needs the embedded antennas, which beam.file replaces; remove beam.file"
         )

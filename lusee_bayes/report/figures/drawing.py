@@ -1,12 +1,12 @@
-"""What figures share: colours, axes, and Galactic maps in Mollweide's projection.
+"""Colours, axes and Galactic Mollweide maps for all figures.
 
-A view of a map is a picture of fixed size: which pixels make up each of its points is worked out
-once for all maps of one NSIDE, and a map is then a sum of four numbers a point.
+A view of a map is a picture of fixed size. The pixels that contribute to each of its points are
+computed once per NSIDE; drawing a map then sums four numbers per point.
 
-Maps are drawn through a beam, so that bright edges have no rings: coefficients that end abruptly at
-lmax ring, and beside the Galactic plane a truth of lmax = 47 falls to half of the real sky, and one
-of lmax = 24 below zero. A Gaussian beam with a tenth left at lmax takes the rings to the per cent
-level. It is for the eye only: files and numbers are without it.
+Maps are drawn with a Gaussian beam, because a map truncated at lmax rings: next to the Galactic
+plane, a truth with lmax = 47 drops to half of the real sky, and one with lmax = 24 below zero. A
+beam that falls to a tenth at lmax reduces the rings to the per cent level. It affects only the
+figures; files and numbers are unsmoothed.
 """
 
 from __future__ import annotations
@@ -159,7 +159,7 @@ def colour_bar(
 
 
 def note(title: str, text: str) -> Figure:
-    """Make a figure that says why there is none."""
+    """Make a figure that states why nothing is drawn."""
     figure = Figure(figsize=(8, 1.6), layout="constrained")
     figure.suptitle(title)
     figure.text(0.5, 0.35, text, ha="center")

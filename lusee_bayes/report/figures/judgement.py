@@ -17,14 +17,14 @@ from lusee_bayes.judge.chi2 import probability
 from lusee_bayes.report.figures import drawing
 from lusee_bayes.results.map_result import MapResult
 
-# residuals beyond that have the darkest colours
+# residuals beyond this have the darkest colours
 WIDEST = 4.0
-# p-values are shown down to that
+# smaller p-values are drawn at this one
 LEAST_P = 1e-10
 
 
 def residuals_by_product(result: MapResult) -> Figure | None:
-    """Every datum against the prediction of all others, and what each product's removal mends."""
+    """Residuals of every datum given all others, and p of the rest without each product."""
     channel = result.channel
     if not result.single:
         return None
@@ -40,7 +40,7 @@ def residuals_by_product(result: MapResult) -> Figure | None:
     left.set_xticks(ticks, [f"{hours[k] / 24:.1f}" for k in ticks])
     left.set_yticks(np.arange(len(labels)), labels)
     left.invert_yaxis()
-    left.set(xlabel="time [days]", ylabel="product", title="Each datum given all others")
+    left.set(xlabel="time [days]", ylabel="product", title="Residuals given all other data")
     left.set_facecolor("0.8")
     bar = {"label": "standard deviations", "extend": "both", "shrink": 0.9, "pad": 0.02}
     figure.colorbar(image, ax=left, **bar)
@@ -54,11 +54,11 @@ def residuals_by_product(result: MapResult) -> Figure | None:
         right.semilogx(p, rows, ls="", marker=marker, color=colour, ms=5, label=text)
     drawing.without_minor_ticks(right.xaxis)
     right.axvline(1.0, color=drawing.GREY, lw=0.5)
-    right.set(xlabel=f"p-value (drawn down to {LEAST_P:g})", xlim=(LEAST_P / 3, 3))
+    right.set(xlabel=f"p-value (clipped at {LEAST_P:g})", xlim=(LEAST_P / 3, 3))
     right.grid(axis="y", lw=0.3)
     right.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False, fontsize=8)
     p = probability(channel.instrument.p)
-    figure.suptitle(f"Residuals at {channel.frequency_mhz:g} MHz: p {p} of what no sky explains")
+    figure.suptitle(f"Residuals at {channel.frequency_mhz:g} MHz (instrument + noise: p {p})")
     return figure
 
 
@@ -76,14 +76,14 @@ def groups_by_frequency(result: MapResult) -> Figure | None:
     shown = np.arange(0, len(judged), 1 + len(judged) // 20)
     axes.set_xticks(shown, [f"{judged[k].frequency_mhz:g}" for k in shown])
     axes.set_yticks(range(len(names)), names, fontsize=7)
-    axes.set(xlabel="frequency [MHz]", title="Groups of data given all others")
-    figure.colorbar(image, ax=axes, label="log10 of p")
+    axes.set(xlabel="frequency [MHz]", title="Groups of data, each given all others")
+    figure.colorbar(image, ax=axes, label="log10 p")
     return figure
 
 
-# days whose errors are so many times the median of all are not shown: they would hide the others
+# days whose errors exceed this multiple of the median are not shown: they would hide the others
 TOO_WIDE = 20.0
-# of the end of an offset's name
+# units by the ending of an offset's name
 UNITS = {"s": "s", "day": "s/day", "deg": "degrees"}
 
 
@@ -107,17 +107,17 @@ def pointing_by_day(result: MapResult) -> Figure | None:
             value, std = float(whole["value"].iloc[0]), float(whole["std"].iloc[0])
             if np.isfinite(std) and std < TOO_WIDE * days["std"].median():
                 axes.axhspan(value - std, value + std, color=drawing.ORANGE, alpha=0.3)
-                axes.axhline(value, color=drawing.ORANGE, label="all days alike")
+                axes.axhline(value, color=drawing.ORANGE, label="all days together")
         kind, _, unit = name.rpartition("_")
         axes.set_ylabel(f"{kind.replace('_', ' ')} [{UNITS.get(unit, unit)}]")
     panels[0, 0].legend(loc="upper right", ncols=2, frameon=False)
     panels[-1, 0].set_xlabel("days since the first sample")
-    figure.suptitle("Offset of clock and pointing that the data would prefer besides the model's")
+    figure.suptitle("Clock and pointing offsets preferred by the data, relative to the model")
     return figure
 
 
 PANELS_IN_A_ROW = 4
-# from where on a prior that changes with frequency hides what errors there are
+# a prior that varies by more than this factor with frequency would hide the errors
 WIDE = 3.0
 
 
@@ -235,7 +235,7 @@ def time_line(reduced: Reduced) -> Figure:
         bottom.plot(days[flagged], np.full(flagged.sum(), row), "|", ms=9, color=drawing.ORANGE)
     bottom.set(yticks=range(len(flags)), yticklabels=list(flags), ylim=(n_rows - 0.5, -0.5))
     bottom.set_xlabel(f"days since {_first(reduced)} UTC")
-    bottom.set_title("Flagged in at least one band" if flags else "Nothing is flagged")
+    bottom.set_title("Flagged in at least one band" if flags else "Nothing flagged")
     return figure
 
 
@@ -255,7 +255,7 @@ def waterfall(result: MapResult) -> Figure | None:
         kept = reduced.values[band, number]
         flagged = ~np.isfinite(kept) | used_in_part
         axes.plot(days, kept, ".", ms=3, color=drawing.BLUE, label="after flags")
-        style = {"ms": 4, "color": drawing.ORANGE, "label": "before, where flagged"}
+        style = {"ms": 4, "color": drawing.ORANGE, "label": "before flags, where flagged"}
         axes.plot(days[flagged], reduced.before[band, number][flagged], ".", **style)
         axes.set_ylim(*_range(kept[np.isfinite(kept)]))
         axes.set_title(product.label, fontsize=9)
@@ -267,23 +267,23 @@ def waterfall(result: MapResult) -> Figure | None:
     for axes in panels[:, 0]:
         axes.set_ylabel("V²/Hz")
     figure.suptitle(
-        f"Products at {reduced.frequencies_mhz[band]:g} MHz since {_first(reduced)} UTC; values "
-        "beyond the frame are flagged"
+        f"Products at {reduced.frequencies_mhz[band]:g} MHz since {_first(reduced)} UTC (values "
+        "outside the frame are flagged)"
     )
     return figure
 
 
 def calibration(reduced: Reduced) -> Figure:
-    """Draw the gains with their errors, and the noise found over the noise expected.
+    """Draw the gains with their errors, and the ratio of measured to expected noise.
 
-    Of one band the gains at its frequency are points with error bars, and both kinds of scatter
-    have a place of their own.
+    For one band, points with error bars mark the gains at its frequency, and the two kinds of
+    scatter are side by side.
     """
     figure, (left, right) = drawing.framed((12, 4.2), 1, 2)
     _gains(left, reduced)
     _scatter(right, reduced)
     right.axhline(1.0, color=drawing.GREY, lw=0.8)
-    right.set(ylabel="scatter over radiometer noise", title="Noise found over noise expected")
+    right.set(ylabel="scatter / radiometer noise", title="Measured / expected noise")
     found = np.concatenate([reduced.line_scatter, reduced.scatter, [1.0]])
     right.set_ylim(0.0, 1.3 * float(np.nanmax(found)))
     return figure
@@ -308,8 +308,8 @@ def _gains(left: Axes, reduced: Reduced) -> None:
         left.axvline(f, color=drawing.GREY, lw=0.5, zorder=0)
     known = bool((curves.std > 0).any())
     largest = float(np.nanmax(curves.std / curves.gain)) if known else 0.0
-    told = f"known to {largest:.2g} of themselves or better" if known else "no error is known"
-    left.set(xlabel="frequency [MHz]", ylabel="counts for 1 nV²/Hz", title=f"Gains: {told}")
+    told = f"{100 * largest:.2g} % or better" if known else "unknown"
+    left.set(xlabel="frequency [MHz]", ylabel="counts for 1 nV²/Hz", title=f"Gain errors: {told}")
     left.legend(frameon=False, ncols=2, fontsize=8)
 
 
@@ -329,7 +329,7 @@ def _scatter(right: Axes, reduced: Reduced) -> None:
             style = {"color": colour, "label": name.replace("\n", " "), "fillstyle": "none"}
             right.plot(reduced.frequencies_mhz, values, mark, **style)
         elif alone:
-            right.text(place, 0.5, "not known", ha="center", color=drawing.GREY)
+            right.text(place, 0.5, "unknown", ha="center", color=drawing.GREY)
     if alone:
         right.set_xticks(range(len(kinds)), [kind[-1] for kind in kinds])
         right.set_xlim(-0.6, len(kinds) - 0.4)

@@ -10,9 +10,11 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
+from lusee_bayes.core.arrays import Modes
 from lusee_bayes.core.harmonics import lmax_of, modes_to_map
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.judge.measures import ell_cross
+from lusee_bayes.linear.posterior import Posterior, pixel_std
 from lusee_bayes.report.figures import drawing
 from lusee_bayes.report.figures.drawing import BLUE, COLOURS, DIVERGING, GREY, LINES, ORANGE
 from lusee_bayes.results.channel import ChannelResult
@@ -46,7 +48,7 @@ def beams(result: MapResult) -> Figure | None:
     for axes, title, pattern in named:
         image = drawing.orthographic(axes, grid, pattern)
         axes.set_title(title)
-    figure.colorbar(image, ax=figure.axes, label="beam / its peak", shrink=0.8, pad=0.02)
+    figure.colorbar(image, ax=figure.axes, label="beam / peak", shrink=0.8, pad=0.02)
     figure.suptitle(f"Beams at {result.channel.frequency_mhz:g} MHz, zenith at the centre")
     return figure
 
@@ -66,7 +68,7 @@ def draws(result: MapResult) -> Figure | None:
         image = drawing.mollweide(axes, pixels, norm=scale, highest_altitude=altitude)
         axes.set_title(f"draw {k + 1}")
     drawing.colour_bar(figure, image, figure.axes, label="K", shrink=0.7, extend="both", pad=0.02)
-    figure.suptitle(f"Draws of the posterior at {channel.frequency_mhz:g} MHz")
+    figure.suptitle(f"Posterior draws at {channel.frequency_mhz:g} MHz")
     return figure
 
 
@@ -78,6 +80,34 @@ def sky_maps(result: MapResult) -> Figure:
 def spectra(result: MapResult) -> Figure:
     """Power spectra of a channel, or brightness against frequency of many."""
     return channel_spectra(result) if len(result.channels) > 1 else sky_spectra(result.channel)
+
+
+def plot_map(sky: Posterior | Modes, nside: int = 64) -> Figure:
+    """Draw a sky, or mean and standard deviation of a posterior.
+
+    Parameters
+    ----------
+    sky : Posterior or (modes,) array
+        Real harmonic coefficients, Galactic, in K.
+    nside : int
+        HEALPix resolution of what is drawn.
+
+    Returns
+    -------
+    Figure
+        Of Matplotlib: ``savefig(path)`` writes it.
+    """
+    mean = np.asarray(sky.mean if isinstance(sky, Posterior) else sky)
+    pixels = drawing.shown(mean, nside)
+    panels = {"sky": (pixels, drawing.temperatures(pixels, 0.05))}
+    if isinstance(sky, Posterior):
+        std = pixel_std(np.asarray(sky.covariance()), nside)
+        panels = {"posterior mean": panels["sky"]}
+        panels["posterior standard deviation"] = std, LogNorm(*np.percentile(std, [0.5, 99.5]))
+    figure, places = drawing.framed((6 * len(panels), 3.6), 1, len(panels), squeeze=False)
+    for axes, (title, panel) in zip(places[0], panels.items(), strict=True):
+        drawing.sky_panel(axes, title, *panel, shrink=0.8, pad=0.03)
+    return figure
 
 
 def channel_map(channel: ChannelResult) -> Figure:
@@ -106,8 +136,8 @@ def channel_map(channel: ChannelResult) -> Figure:
     for axes, (title, panel) in zip(grid_of_axes, panels.items(), strict=True):
         drawing.sky_panel(axes, title, *panel, altitude=altitude, shrink=0.8, pad=0.03)
     figure.suptitle(
-        f"{channel.frequency_mhz:g} MHz, Galactic coordinates; dashed: never above the horizon\n"
-        f"{', '.join(list(panels)[:-1])}: seen through a beam of "
+        f"{channel.frequency_mhz:g} MHz, Galactic coordinates; dashed: region that never rises\n"
+        f"{', '.join(list(panels)[:-1])}: smoothed with a beam of "
         f"{drawing.taper_fwhm_deg(lmax_of(len(channel.mean))):.1f}° (FWHM)"
     )
     return figure
@@ -142,7 +172,7 @@ def _fidelity(
     """Curves of the prior's share in the last panel, and of rho and SNR before it, if there are."""
     ell = spectra["ell"][1:]
     panels[-1].plot(ell, spectra["prior_fraction"][1:], label=label, **style)
-    panels[-1].set(ylabel="share of the variance from the prior", ylim=(0, 1.02))
+    panels[-1].set(ylabel="fraction of the variance from the prior", ylim=(0, 1.02))
     if len(panels) > 1:
         panels[0].plot(ell, spectra["rho"][1:], **style)
         panels[0].set(ylabel=r"correlation with the truth $\rho_\ell$", ylim=(-0.25, 1.05))
@@ -255,7 +285,7 @@ def fidelity(cube: MapResult) -> Figure:
     snr, alone = cube.snr(), cube.snr(independent=True)
     known = snr is not None
     values = snr if known else cube.stacked("prior_fraction")
-    label = r"$\mathrm{SNR}_\ell$" if known else "share of the variance from the prior"
+    label = r"$\mathrm{SNR}_\ell$" if known else "fraction of the variance from the prior"
     norm = LogNorm(0.3, 30.0) if known else Normalize(0.0, 1.0)
     figure, (left, right) = drawing.framed((12, 4.4), 1, 2)
     ell, channel = np.arange(values.shape[1]), np.arange(values.shape[0])
@@ -267,7 +297,7 @@ def fidelity(cube: MapResult) -> Figure:
     figure.colorbar(image, ax=left, label=label, extend="both" if known else "neither")
     right.plot(ell[1:], values[:, 1:].mean(0), color=BLUE, label="this run")
     if alone is not None:
-        style = {"color": ORANGE, "ls": "--", "label": "every channel on its own"}
+        style = {"color": ORANGE, "ls": "--", "label": "each channel independently"}
         right.plot(ell[1:], alone[:, 1:].mean(0), **style)
     if known:
         right.set_yscale("log")
@@ -290,7 +320,7 @@ def chi2(cube: MapResult) -> Figure | None:
     axes.plot(mhz, ratio, "o", ms=4, color=BLUE)
     if np.isfinite(ratio).all() and ratio.max() > 3.0:
         axes.set_yscale("log")
-    axes.set(xlabel="frequency [MHz]", ylabel=r"$\chi^2$ / its mean if the model holds")
+    axes.set(xlabel="frequency [MHz]", ylabel=r"$\chi^2$ / its expectation")
     return figure
 
 

@@ -19,7 +19,7 @@ from lusee_bayes.results.prior_comparison import PriorComparison
 STYLES = tuple(zip(COLOURS, "os^D", strict=False))
 # where every family and name of a variation is drawn
 Rows = dict[tuple[str, str], float]
-# numbers of a forecast, with the words of their axes; one that is None is not reached
+# numbers of a forecast with their axis labels; None means that the threshold is not reached
 PANELS = {
     "information_bits": "information about the sky [bits]",
     "modes": "modes with expected SNR > 1 [number]",
@@ -97,7 +97,7 @@ def _marks(
 
 
 def _label_rows(axes: Axes, rows: Rows) -> None:
-    """Name every row from the top down; the families' names stand out."""
+    """Name every row from the top down, with the families in bold."""
     axes.set_yticks(list(rows.values()), [name or family for family, name in rows])
     axes.set_ylim(max(rows.values()) + 0.7, -0.7)
     for (_, name), tick in zip(rows, axes.get_yticklabels(), strict=True):
@@ -115,7 +115,7 @@ def _title(planned: Sequence[Forecast], sources: Sequence[str]) -> str:
         found += f" at {scenarios[0].frequency_mhz:g} MHz"
     if len({s.lmax for s in scenarios}) == 1:
         found += rf", up to $\ell$ = {scenarios[0].lmax}"
-    return f"Information in an observation: {found} (dashed: as given)"
+    return f"Information content: {found} (dashed: scenario as given)"
 
 
 # of the interval whose coverage is drawn
@@ -146,12 +146,12 @@ def _evidence(axes: Axes, result: PriorComparison) -> None:
     axes.barh(rows, behind, color=colours, alpha=0.6, height=0.6, label="ln evidence (bars)")
     for j, held in enumerate(result.best.held_out):
         values = np.array([one.held_out[j].log_density for one in result.priors])
-        style = {"mfc": "none", "ms": 7, "label": f"ln p of {held.kind}s left out"}
+        style = {"mfc": "none", "ms": 7, "label": f"ln p of held-out {held.kind}s"}
         axes.plot(values.max() - values, rows, f"k{MARKERS[held.kind]}", **style)
     axes.set_yticks(rows, [one.name for one in result.priors])
     axes.invert_yaxis()
     axes.set_xscale("symlog", linthresh=LINEAR, linscale=0.5)
-    axes.set(xlabel="below the best", xlim=(-0.5, None))
+    axes.set(xlabel="difference from the best", xlim=(-0.5, None))
     axes.legend(frameon=False, fontsize=8, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)
 
 
@@ -166,7 +166,7 @@ def _coverage(axes: Axes, result: PriorComparison) -> None:
         axes.errorbar(x, held, yerr=scatter, fmt="o", color=colour, capsize=3, label=one.name)
     axes.axhline(100.0 * LEVEL, color=GREY, lw=0.8)
     axes.set_xticks(np.arange(len(parts)), parts, fontsize=8)
-    axes.set(ylabel=f"pixels that {LEVEL:.0%} intervals hold [%]", ylim=(None, 101.0))
+    axes.set(ylabel=f"pixels covered by {LEVEL:.0%} intervals [%]", ylim=(None, 101.0))
 
 
 def _errors(axes: Axes, result: PriorComparison) -> None:
@@ -184,7 +184,7 @@ def _errors(axes: Axes, result: PriorComparison) -> None:
     if result.known_sky:
         truth = power_spectrum(result.best.channel.truth)[1:]
         axes.semilogy(ell, truth, color=GREY, lw=1.0, label="true sky")
-        axes.set_title("errors (dotted: what error bars expect)", fontsize=9)
+        axes.set_title("errors (dotted: expected from the error bars)", fontsize=9)
     else:
         axes.set_title("expected errors", fontsize=9)
     axes.set(xlabel=r"multipole $\ell$", ylabel=r"$C_\ell$ [K$^2$]")

@@ -1,4 +1,4 @@
-"""Figures of chains and draws: whether they can be trusted, and what they say."""
+"""Figures of chains and draws: diagnostics and results."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ DOTS = {"ls": "", "marker": ".", "ms": 3, "color": drawing.BLUE}
 N_RANKS, N_PAIRS = 8, 5
 # draws of a chain from which ranks and densities can be estimated
 FEWEST = 4
-TOO_FEW = f"not drawn: a chain has fewer than {FEWEST} draws, or has not moved"
+TOO_FEW = f"not drawn: a chain has fewer than {FEWEST} draws or did not move"
 
 Quantities = dict[str, Float[np.ndarray, "chains draws"]]
 
@@ -40,14 +40,14 @@ def ranks(quantities: Quantities) -> Figure:
     """
     chosen = dict(list(quantities.items())[:N_RANKS])
     size = (12, 2.6 * ((len(chosen) + 3) // 4) + 0.4)
-    title = "Ranks among the draws of all chains, one curve for each chain"
+    title = "Ranks among the draws of all chains, one curve per chain"
     return _drawn(arviz_plots.plot_rank, "posterior", chosen, title, size)
 
 
 def energy(statistics: xr.Dataset) -> Figure:
     """Energies of the draws about their mean, their changes from draw to draw, and BFMI."""
     energies = {"energy": statistics["energy"].values}
-    title = "Energies; BFMI below 0.3: chains that move slowly"
+    title = "Energies (BFMI below 0.3: chains move slowly)"
     return _drawn(arviz_plots.plot_energy, "sample_stats", energies, title, (11, 3.6))
 
 
@@ -97,7 +97,7 @@ def against_analytic(tree: xr.DataTree) -> Figure:
     right.plot(flat.std(axis=0, ddof=1) / std, **DOTS)
     right.axhline(1.0, color=drawing.GREY, lw=0.8)
     right.set(xlabel="mode", ylabel="draws / analytic", title="Standard deviations")
-    figure.suptitle("Draws against the analytic posterior, mode by mode")
+    figure.suptitle("Draws compared with the analytic posterior, mode by mode")
     return figure
 
 
@@ -106,7 +106,7 @@ def uncertainty(run: SampleResult) -> Figure:
     maps = run.maps
     chains, draws = run.skies.shape[:2]
     if chains * draws < 2:
-        why = "not drawn: a single draw has no spread"
+        why = "not drawn: a single draw has no standard deviation"
         return drawing.note("Uncertainty of the drawn maps", why)
     level = maps["mean"].mean()
     width = maps["upper"] - maps["lower"]
@@ -115,7 +115,7 @@ def uncertainty(run: SampleResult) -> Figure:
     # draws that are all the same have no width, and no asymmetry
     skewness = np.divide(excess, width, out=np.zeros_like(width), where=width > 0)
     limit = np.percentile(np.abs(skewness), 99.0)
-    percent, chance = "% of the mean sky", "of its width (chance alone for a Gaussian)"
+    percent, chance = "% of the mean sky", "fraction of its width (noise only if Gaussian)"
     skewed = "asymmetry of the 90 % interval about the mean"
     signed, kelvin = Normalize(-limit, limit), drawing.temperatures(maps["mean"])
     panels = [
@@ -129,9 +129,9 @@ def uncertainty(run: SampleResult) -> Figure:
     for axes, panel in zip(grid_of_axes.flat, panels, strict=True):
         drawing.sky_panel(axes, *panel, altitude=altitude, shrink=0.85)
     figure.suptitle(
-        f"{chains} x {draws} draws of {run.tree.attrs['program']} at "
-        f"{run.experiment.scenario.frequency_mhz:g} MHz, Galactic coordinates; dashed: never above "
-        "the horizon"
+        f"{chains} x {draws} draws from {run.tree.attrs['program']} at "
+        f"{run.experiment.scenario.frequency_mhz:g} MHz, Galactic coordinates; dashed line: region "
+        "that never rises"
     )
     return figure
 
@@ -162,7 +162,7 @@ def traces(run: SampleResult) -> Figure:
         right.tick_params(labelsize=8)
     grid[0][1].legend(frameon=False, fontsize=7)
     grid[-1][0].set_xlabel("draw")
-    figure.suptitle(f"Draws of {run.tree.attrs['program']}")
+    figure.suptitle(f"Draws from {run.tree.attrs['program']}")
     return figure
 
 
@@ -184,7 +184,7 @@ def comparison(result: Comparison) -> Figure:
     covariance.plot(rank, result.eigenvalues, color=drawing.BLUE, label="draws")
     exact = {"color": drawing.ORANGE, "ls": "--", "label": "exact chains"}
     covariance.plot(rank, result.null_eigenvalues, **exact)
-    covariance.set(xlabel="number, rising", ylabel="generalised eigenvalue")
+    covariance.set(xlabel="rank, in increasing order", ylabel="generalised eigenvalue")
     covariance.set_title("Covariance in analytic coordinates")
     covariance.legend(frameon=False)
     sizes.semilogy(result.ess_bulk, label="bulk", **DOTS)
@@ -192,7 +192,7 @@ def comparison(result: Comparison) -> Figure:
     sizes.set(xlabel="mode", ylabel="effective sample size", title="Effective sample sizes")
     sizes.legend(frameon=False)
     verdict = "passed" if result.passed else "FAILED"
-    figure.suptitle(f"HMC against the analytic posterior: {verdict}")
+    figure.suptitle(f"HMC compared with the analytic posterior: {verdict}")
     return figure
 
 
@@ -216,7 +216,7 @@ def rank_statistics(ranks: Ranks) -> Figure:
         last.plot(levels, [coverage[p] - p for p in LEVELS], color=drawing.BLUE, lw=0.5, alpha=0.6)
     error = 3 * np.array([ranks.coverage_error(p) for p in LEVELS])
     last.fill_between(levels, -error, error, color=drawing.GREY, alpha=0.25, lw=0)
-    last.set(xlabel="level", title="coverage - level (band: 3 errors)")
+    last.set(xlabel="level", title="coverage - level (band: 3 standard errors)")
     last.set_xticks(levels, [f"{p:.0%}" for p in LEVELS], fontsize=7, rotation=45)
     last.title.set_size(9)
     figure.supxlabel("rank of the truth among the draws")
