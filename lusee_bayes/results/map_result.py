@@ -250,7 +250,7 @@ class MapResult(Described):
             for c in self.channels
             if c.judged is not None and c.judged.level == "does not fit"
         ]
-        return Fit(found.level, " ".join([found.text, *blamed[:NAMED]]))
+        return Fit(found.level, " ".join([found.details, *blamed[:NAMED]]))
 
     @cached_property
     def unknowns(self) -> ChannelUnknowns | None:

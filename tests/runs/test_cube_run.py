@@ -84,7 +84,7 @@ def test_runs_take_names_strings_and_data_in_memory(tmp_path, monkeypatch, numbe
     assert_same_map(posterior_of(here.folder), posterior_of(again.folder), 1e-6)
     # the same sets are the same run, others are not
     lb.run_map(scenario, str(here.folder), data=tuple(sets), truth=True)
-    refuse("data is", lb.run_map, scenario, here.folder, data=sets[::-1], truth=True)
+    refuse("data was", lb.run_map, scenario, here.folder, data=sets[::-1], truth=True)
     provenance = json.loads((here.folder / "provenance.json").read_text())
     assert provenance["file"] == "visibilities in memory"
 
@@ -94,7 +94,7 @@ def test_files_of_a_cube_agree_with_each_other(joint, capsys):
     channels = posterior_of(joint)
     assert run("info", joint / "posterior.nc") == 0
     said = capsys.readouterr().out
-    assert "25 modes (lmax 4) at 3 frequencies from 20 to 30 MHz, one posterior for all" in said
+    assert "25 modes (lmax 4) at 3 frequencies from 20 to 30 MHz" in said and "joint" in said
     nside = lb.load_scenario("fiducial", SMALL[1::2]).map_nside
     for name in ("mean", "truth"):
         read = SkyCube.read(joint / f"{name}.fits")
@@ -257,7 +257,7 @@ def scenario_of(*overrides, frequencies="[10, 20, 40]"):
 def test_files_of_a_run_agree_with_each_other(tmp_path, capsys):
     command = ["map", "fiducial", *sets(*POSITIVE[:-1]), "--frequencies", "10,20,40", "--joint"]
     shared = sets("noise.pointing={turntable_deg: 0.2}")
-    assert run(*command, *shared, "--draws", 3, "-o", tmp_path / "out") == 0
+    assert run(*command, *shared, "--draws", 3, "-v", "-o", tmp_path / "out") == 0
     said = capsys.readouterr().out
     assert "spectral.model=positive" in said and "prior.model=isotropic is not used" in said
     channels = posterior_of(tmp_path / "out")

@@ -65,7 +65,7 @@ COMMANDS = {
     "paper": (["paper"], "unfinished-cases"),
 }
 AGAIN = "the same command continues from the finished"
-RESUME = {"cube": f"{AGAIN} channels", "sample": "with --resume", "paper": f"{AGAIN} cases"}
+RESUME = {"cube": f"{AGAIN} channels", "sample": "continue with --resume", "paper": f"{AGAIN} cases"}
 
 
 class Command:
