@@ -64,7 +64,7 @@ COMMANDS = {
     ),
     "paper": (["paper"], "unfinished-cases"),
 }
-AGAIN = "the same command continues from the finished"
+AGAIN = "command continues from the finished"
 RESUME = {"cube": f"{AGAIN} channels", "sample": "continue with --resume", "paper": f"{AGAIN} cases"}
 
 
