@@ -46,7 +46,6 @@ WRONG = [
     (f"map fiducial -o {LONG}", "too long"),
     (f"map fiducial -o {NUL}", "NUL"),
     ("simulate fiducial -o /dev/full", IS_PIPE),
-    ("simulate fiducial -o .", "is a folder"),
     # options
     ("mapp fiducial", "mapp"),
     ("map fiducial --draw 3", "--draw"),

@@ -65,7 +65,8 @@ COMMANDS = {
     "paper": (["paper"], "unfinished-cases"),
 }
 AGAIN = "command continues from the finished"
-RESUME = {"cube": f"{AGAIN} channels", "sample": "continue with --resume", "paper": f"{AGAIN} cases"}
+RESUME = {"cube": f"{AGAIN} channels", "paper": f"{AGAIN} cases"}
+RESUME["sample"] = "continue with --resume"
 
 
 class Command:
