@@ -64,7 +64,7 @@ COMMANDS = {
     ),
     "paper": (["paper"], "unfinished-cases"),
 }
-AGAIN = "command continues from the finished"
+AGAIN = "the same command continues from the finished"
 RESUME = {"cube": f"{AGAIN} channels", "paper": f"{AGAIN} cases"}
 RESUME["sample"] = "continue with --resume"
 
