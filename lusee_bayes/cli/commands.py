@@ -574,14 +574,14 @@ def init_command(file: Path, *, like: str = FIRST_MAP, force: Flag = False) -> N
     force
         Replace the file if it exists.
     """
-    from lusee_bayes.core.files import user_path
+    from lusee_bayes.core.files import replacing, require_new
     from lusee_bayes.experiment.scenario import scenario_text
 
-    path, text = user_path(file), scenario_text(like)
-    if path.exists() and not force:
-        raise InputError(f"{path} exists; give another name, or --force to replace it")
-    path.write_text(f"{text}# lusee-bayes keys lists every setting\n", encoding="utf-8")
-    say(Console(soft_wrap=True), f"{path}; map it: lusee-bayes map {path}")
+    text = f"{scenario_text(like)}# lusee-bayes keys lists every setting\n"
+    require_new(file, replace=force)
+    with replacing(file) as path:
+        path.write_text(text, encoding="utf-8")
+    say(Console(soft_wrap=True), f"{file}; map it: lusee-bayes map {file}")
 
 
 @app.command(name="paper", group="Results")

@@ -108,7 +108,7 @@ def require_new(path: str | Path, *, replace: bool, inputs: Iterable[str | Path]
     if user_path(path).resolve() in [user_path(read).resolve() for read in inputs]:
         raise InputError(f"'{path}' is an input of this run; give another name with -o")
     if not replace and user_path(path).exists():
-        raise InputError(f"'{path}' exists already; give -o another name, or --force")
+        raise InputError(f"'{path}' exists already; give another name, or --force")
 
 
 def _require_name(path: Path) -> None:
