@@ -82,21 +82,24 @@ def spectra(result: MapResult) -> Figure:
     return channel_spectra(result) if len(result.channels) > 1 else sky_spectra(result.channel)
 
 
-def plot_map(sky: Posterior | Modes, nside: int = 64) -> Figure:
+def plot_map(sky: MapResult | Posterior | Modes, nside: int = 64) -> Figure:
     """Draw a sky, or mean and standard deviation of a posterior.
 
     Parameters
     ----------
-    sky : Posterior or (modes,) array
-        Real harmonic coefficients, Galactic, in K.
+    sky : MapResult, Posterior or (modes,) array
+        Real harmonic coefficients, Galactic, in K. Of a result (``lb.run_map(...).result``) also
+        truth and residual, if the truth is known, and the region that never rises.
     nside : int
-        HEALPix resolution of what is drawn.
+        HEALPix resolution of what is drawn; a result has its own.
 
     Returns
     -------
     Figure
         Of Matplotlib: ``savefig(path)`` writes it.
     """
+    if isinstance(sky, MapResult):
+        return sky_maps(sky)
     mean = np.asarray(sky.mean if isinstance(sky, Posterior) else sky)
     pixels = drawing.shown(mean, nside)
     panels = {"sky": (pixels, drawing.temperatures(pixels, 0.05))}
