@@ -476,19 +476,19 @@ class FieldLaws:
         of_each = spectra[:fields], spectra[fields:]
         return SpectralPrior(skies.frequencies_mhz, skies.mixing, *of_each, skies.names)
 
-    def matched(self, found: OfLaws, known: OfLaws) -> FieldLaws:
+    def matched(self, powers: OfLaws, known: OfLaws) -> FieldLaws:
         """Compute the parameters of :func:`matching_step`, law by law.
 
         Parameters
         ----------
-        found : (fields + channels, ells) array
+        powers : (fields + channels, ells) array
             sum_m u^2, u being the posterior mean in units of the prior.
         known : (fields + channels, ells) array
             sum_m (1 - var u).
         """
-        slope, parameters = slopes(found.shape[1] - 1), self.parameters.copy()
+        slope, parameters = slopes(powers.shape[1] - 1), self.parameters.copy()
         narrow = np.array([LOG_WIDTH, TILT_WIDTH]) ** -2.0
-        for k, (power, left) in enumerate(zip(found, known, strict=True)):
+        for k, (power, left) in enumerate(zip(powers, known, strict=True)):
             # the mean over the sky has a width that is given
             of = slice(1 if k < len(self.means) else 0, None)
             away = self.parameters[k] - self.expected[k]

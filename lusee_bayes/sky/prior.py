@@ -225,9 +225,9 @@ class DensePrior(Prior):
         return cls(np.tril(lower * np.sign(np.diagonal(lower))), mean=mean)
 
     def description(self) -> tuple[str, ...]:
-        about = "zero" if self.mean is None else "a mean sky"
+        mean = "zero" if self.mean is None else "a mean sky"
         width = extent(namespace(self).sqrt(self.variance()), "K")
-        head = f"correlated coefficients with mean {about}, {self.size} modes, Galactic"
+        head = f"correlated coefficients with mean {mean}, {self.size} modes, Galactic"
         return head, f"standard deviations {width}"
 
     @property
@@ -406,9 +406,9 @@ class HarmonicPrior(DiagonalPrior):
             )
 
     def description(self) -> tuple[str, ...]:
-        about = "zero" if self.mean is None else "a mean sky"
+        mean = "zero" if self.mean is None else "a mean sky"
         return (
-            f"independent coefficients with mean {about}, lmax = {self.spectrum.shape[0] - 1}",
+            f"independent coefficients with mean {mean}, lmax = {self.spectrum.shape[0] - 1}",
             f"{self.size} real coefficients, Galactic; C_ell {extent(self.spectrum, 'K^2')}",
         )
 
@@ -481,15 +481,15 @@ def read_spectrum(path: str | Path, lmax: int) -> Float[np.ndarray, " ells"]:
         if table.shape[1] != 2 or (table[:, 0] % 1.0).any():
             raise ValueError("expected ell and C_ell in K^2 in every line")
     columns = {"ell": table[:, 0].astype(np.int64), "C_ell": table[:, 1]}
-    found = SPECTRUM.checked(path, columns, {}).arrays
-    there = set(found["ell"].tolist())
-    if missing := [ell for ell in range(lmax + 1) if ell not in there]:
+    checked = SPECTRUM.checked(path, columns, {}).arrays
+    ells = set(checked["ell"].tolist())
+    if missing := [ell for ell in range(lmax + 1) if ell not in ells]:
         several = f" and {len(missing) - 1} more up to lmax = {lmax}" if len(missing) > 1 else ""
         raise InputError(
             f"{path} has no C_ell at ell = {missing[0]}{several}; give every ell from 0 to lmax, "
             "or lower lmax"
         )
-    if not (spectrum := found["C_ell"][: lmax + 1]).any():
+    if not (spectrum := checked["C_ell"][: lmax + 1]).any():
         raise InputError(f"{path}: C_ell is zero at every ell up to {lmax}; a prior needs variance")
     return spectrum
 

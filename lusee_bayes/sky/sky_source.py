@@ -321,8 +321,8 @@ class SkyAlms(SkyFile):
         """
         path = user_path(path)
         if path.suffix == ".npz":
-            found = read_arrays(path, NPZ, "check sky.file").arrays
-            frequencies, alm = found["freq"], found["alm"]
+            arrays = read_arrays(path, NPZ, "check sky.file").arrays
+            frequencies, alm = arrays["freq"], arrays["alm"]
             if healpy.Alm.getlmax(alm.shape[1]) < 0:
                 raise InputError(
                     f"{path}: alm has {alm.shape[1]} coefficients, expected (lmax + 1) "
@@ -344,21 +344,21 @@ class SkyAlms(SkyFile):
                 f"{self.path} has coefficients up to ell = {self.lmax}, expected up to {lmax}; "
                 "lower lmax"
             )
-        known, channel = self.frequencies_mhz, 0
-        if known is not None:
-            channel = int(np.argmin(np.abs(known - frequency_mhz)))
-            if not np.isclose(known[channel], frequency_mhz, rtol=1e-9):
+        mhz, channel = self.frequencies_mhz, 0
+        if mhz is not None:
+            channel = int(np.argmin(np.abs(mhz - frequency_mhz)))
+            if not np.isclose(mhz[channel], frequency_mhz, rtol=1e-9):
                 raise InputError(
                     f"{self.path} has no coefficients at {frequency_mhz:g} MHz (it has "
-                    f"{', '.join(f'{f:g}' for f in known)}); set sky.file_frequency_mhz to one of "
+                    f"{', '.join(f'{f:g}' for f in mhz)}); set sky.file_frequency_mhz to one of "
                     "those, to scale them with sky.spectral_index"
                 )
         return self.modes[channel, : harmonics.n_modes(lmax)]
 
     def description(self) -> tuple[str, ...]:
-        known, means = self.frequencies_mhz, self.modes[:, 0] / np.sqrt(4.0 * np.pi)
+        mhz, means = self.frequencies_mhz, self.modes[:, 0] / np.sqrt(4.0 * np.pi)
         skies = "one sky" if len(means) == 1 else f"{len(means)} skies"
-        frequencies = "" if known is None else f", {', '.join(f'{f:g}' for f in known)} MHz"
+        frequencies = "" if mhz is None else f", {', '.join(f'{f:g}' for f in mhz)} MHz"
         levels = f"{means[0]:.6g}" if len(means) == 1 else f"{means[0]:.6g} to {means[-1]:.6g}"
         return (
             f"coefficients of {skies} up to ell = {self.lmax}{frequencies}",
@@ -395,8 +395,8 @@ def _read_alm_fits(path: Path) -> np.ndarray:
         table = next(hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU))
         columns = {name: table.data.field(name) for name in COLUMNS}
         units = {f"{one.name.lower()}.units": one.unit for one in table.columns}
-        found = TABLE.checked(path, columns, units).arrays
-    index, real, imag = (found[name] for name in COLUMNS)
+        arrays = TABLE.checked(path, columns, units).arrays
+    index, real, imag = (arrays[name] for name in COLUMNS)
     ell = np.floor(np.sqrt(index - 1.0) + 1e-9).astype(int)
     m = index - 1 - ell**2 - ell
     # what does not fit into memory, or is written twice, fills no lmax either
@@ -459,11 +459,11 @@ class SkyCube(SkyFile):
             HEALPix, and numbers that are not finite.
         """
         with opened(path, "sky maps of many frequencies") as hdus:
-            there = {} if hdus[0].data is None else {"maps": hdus[0].data}
+            images = {} if hdus[0].data is None else {"maps": hdus[0].data}
             header = dict(hdus[0].header)
-            found = CUBE.checked(path, there, header | {"maps.units": header.get("BUNIT")})
-        start, end, step = (found.values[key] for key in STEPS)
-        pixels = found.arrays["maps"]
+            cube = CUBE.checked(path, images, header | {"maps.units": header.get("BUNIT")})
+        start, end, step = (cube.values[key] for key in STEPS)
+        pixels = cube.arrays["maps"]
         count = round((end - start) / step) + 1
         if len(pixels) != count:
             raise InputError(
@@ -492,35 +492,35 @@ class SkyCube(SkyFile):
             Outside the file's frequencies, or where a pixel between two frequencies is not
             positive in both.
         """
-        known = self.frequencies_mhz
-        if not known[0] <= frequency_mhz <= known[-1]:
+        mhz = self.frequencies_mhz
+        if not mhz[0] <= frequency_mhz <= mhz[-1]:
             raise InputError(
-                f"{self.path} has maps from {known[0]:g} to {known[-1]:g} MHz, not at "
+                f"{self.path} has maps from {mhz[0]:g} to {mhz[-1]:g} MHz, not at "
                 f"{frequency_mhz:g}; set sky.file_frequency_mhz to one of those, to scale it with "
                 "sky.spectral_index"
             )
-        above = int(np.searchsorted(known, frequency_mhz))
-        if known[above] == frequency_mhz:
+        above = int(np.searchsorted(mhz, frequency_mhz))
+        if mhz[above] == frequency_mhz:
             return self.pixels[above]
         low, high = self.pixels[above - 1], self.pixels[above]
         if not ((low > 0) & (high > 0)).all():
             raise InputError(
-                f"{self.path} has pixels that are not positive at {known[above - 1]:g} or "
-                f"{known[above]:g} MHz, so that no power law interpolates between them; use a "
+                f"{self.path} has pixels that are not positive at {mhz[above - 1]:g} or "
+                f"{mhz[above]:g} MHz, so that no power law interpolates between them; use a "
                 "frequency of the file"
             )
-        share = np.log(frequency_mhz / known[above - 1]) / np.log(known[above] / known[above - 1])
+        share = np.log(frequency_mhz / mhz[above - 1]) / np.log(mhz[above] / mhz[above - 1])
         return low * (high / low) ** share
 
     def modes_at(self, frequency_mhz: float, lmax: int) -> Float[np.ndarray, " modes"]:
         return modes_of_map(self.path, self.map_at(frequency_mhz), lmax)
 
     def description(self) -> tuple[str, ...]:
-        known, pixels = self.frequencies_mhz, self.pixels
+        mhz, pixels = self.frequencies_mhz, self.pixels
         return (
             f"{len(pixels)} HEALPix sky maps, NSIDE {healpy.npix2nside(pixels.shape[1])}, assumed "
             "RING and Galactic",
-            f"{known[0]:g} to {known[-1]:g} MHz, means {pixels[0].mean():.6g} to "
+            f"{mhz[0]:g} to {mhz[-1]:g} MHz, means {pixels[0].mean():.6g} to "
             f"{pixels[-1].mean():.6g} K, smallest pixel {pixels.min():.4g} K",
         )
 

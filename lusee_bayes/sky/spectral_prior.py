@@ -172,9 +172,9 @@ class SpectralPrior(checks.Described, eqx.Module):
         # the fit has taken its share of the residuals' variance
         free = len(frequencies) / max(len(frequencies) - len(names), 1)
         left_over = np.sqrt(free) * (skies - mixing @ maps)
-        rest = (left_over, 1.0) if residual is None else (skies, residual)
+        residuals = (left_over, 1.0) if residual is None else (skies, residual)
         parts = map(jnp.asarray, (frequencies, mixing, power_spectrum(maps)))
-        return cls(*parts, _residual_spectra(*rest), names)
+        return cls(*parts, _residual_spectra(*residuals), names)
 
     @classmethod
     def kernel(
