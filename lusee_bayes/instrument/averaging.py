@@ -317,9 +317,9 @@ def binned(observation: Observation, left: Samples, bin_of: Samples, to_s: float
         Length of the bins, in seconds.
     """
     first = np.searchsorted(bin_of, np.arange(bin_of[-1] + 1))
-    here = observation.select(np.isin(np.arange(observation.n_times), left))
-    windows = here.windows
-    seconds = seconds_from(here.times[0], here.times)
+    kept = observation.select(np.isin(np.arange(observation.n_times), left))
+    windows = kept.windows
+    seconds = seconds_from(kept.times[0], kept.times)
     offset = seconds[windows.sample]
     start, end = windows.start_s + offset, windows.end_s + offset
     bin_of_piece, share = bin_of[windows.sample], windows.live_s / (end - start)
@@ -334,6 +334,6 @@ def binned(observation: Observation, left: Samples, bin_of: Samples, to_s: float
     begin = np.searchsorted(bin_of_piece, np.arange(len(first)))
     last = np.append(begin[1:], len(start)) - 1
     middle = (start[begin] + end[last]) / 2.0
-    times, offset = later(here.times[first], middle - seconds[first]), middle[bin_of_piece]
+    times, offset = later(kept.times[first], middle - seconds[first]), middle[bin_of_piece]
     windows = Windows(bin_of_piece, start - offset, end - offset, live)
-    return replace(here, times=times, run=here.run[first], step_s=to_s, windows=windows)
+    return replace(kept, times=times, run=kept.run[first], step_s=to_s, windows=windows)

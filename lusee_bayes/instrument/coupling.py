@@ -205,8 +205,8 @@ def body_beams(modes: BeamModes, pointing: Pointing) -> BodyBeams:
     """
     xp, runs = namespace(modes, pointing), []
     for run in range(len(pointing.run_starts) - 1):
-        own = modes if modes.ndim == 2 else modes[run]
-        body = _on_the_moon(turn_about_z(own, pointing.turntable[run]), pointing)
+        of_run = modes if modes.ndim == 2 else modes[run]
+        body = _on_the_moon(turn_about_z(of_run, pointing.turntable[run]), pointing)
         runs.append(_taken_up(xp.stack(tilts(body, pointing.order), axis=1), pointing.factors))
     return xp.stack(runs)
 
@@ -472,10 +472,10 @@ class CouplingMatrix(Coupling):
                 raise InputError(f"{name} numbers must lie in 0..{limit - 1}, got {numbers}")
         places, blocks = [], []
         for run, span in self.pointing.runs():
-            here = np.flatnonzero((time >= span.start) & (time < span.stop))
-            times, position = np.unique(time[here], return_inverse=True)
-            places.append(here)
-            blocks.append(self._block(run, times)[product[here], position])
+            chosen = np.flatnonzero((time >= span.start) & (time < span.stop))
+            times, position = np.unique(time[chosen], return_inverse=True)
+            places.append(chosen)
+            blocks.append(self._block(run, times)[product[chosen], position])
         return namespace(*blocks).concatenate(blocks)[np.argsort(np.concatenate(places))]
 
     def time_features(self, times: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n features"]:

@@ -471,12 +471,12 @@ def site_of(site: Any) -> tuple[float, float]:
         If it is neither.
     """
     if isinstance(site, str):
-        known = {name.lower(): place for name, place in SITES.items()}
-        if site.lower() not in known:
+        sites = {name.lower(): place for name, place in SITES.items()}
+        if site.lower() not in sites:
             raise InputError(
                 f"unknown site '{site}'; {nearest(site, SITES)} (or give two angles in degrees)"
             )
-        return known[site.lower()]
+        return sites[site.lower()]
     wrong = f"the site is {site!r}; give longitude and latitude in degrees, or {', '.join(SITES)}"
     with refusing(wrong, TypeError, ValueError):
         lon, lat = (float(x) for x in site)

@@ -298,8 +298,8 @@ def turned_by_offsets(pointing: Pointing, hours: Array, values: Values) -> Point
     radians = np.pi / 180.0
     # a lander further East sees the sky as it will be later
     lon = given.get("lon_deg", zero) * radians - TURN_PER_HOUR * late_h
-    rest = [given.get(name, zero) * radians for name in ("lat_deg", *TILTS)]
+    angles = [given.get(name, zero) * radians for name in ("lat_deg", *TILTS)]
     names = _of_runs(len(pointing.run_starts) - 1)
     turntable = pointing.turntable + xp.stack([given.get(name, zero) * radians for name in names])
     azimuth = pointing.azimuth + TURN_PER_HOUR * drift * hours
-    return replace(pointing, azimuth=azimuth, turntable=turntable, turns=xp.stack([lon, *rest]))
+    return replace(pointing, azimuth=azimuth, turntable=turntable, turns=xp.stack([lon, *angles]))

@@ -216,11 +216,11 @@ def _columns(products: Any, is_complex: bool, n_antennas: int) -> list[tuple[int
         raise InputError(f"products is '{products}'; give a list of the names of the columns")
     columns: list[tuple[int, int, str]] = []
     for name in products:
-        found = NAME.fullmatch(name if isinstance(name, str) else "".join(map(str, name)))
-        if not found:
+        match = NAME.fullmatch(name if isinstance(name, str) else "".join(map(str, name)))
+        if not match:
             example = "'01'" if is_complex else "'01R' and '01I'"
             raise InputError(f"unknown product '{name}'; name the two ports, such as {example}")
-        i, j, part = int(found[1]), int(found[2]), found[3].upper()
+        i, j, part = int(match[1]), int(match[2]), match[3].upper()
         if max(i, j) >= n_antennas:
             raise InputError(
                 f"the product '{name}' has port {max(i, j)}, expected 0 to {n_antennas - 1}; give "
@@ -381,8 +381,8 @@ def without_gaps(visibilities: Grid, layout: DataLayout) -> Grid:
     if not absent.any():
         return visibilities
     products = all_products(antennas_of(layout.n_products))
-    known = pandas.DataFrame(np.where(absent, np.nan, values).T)
-    filled = known.interpolate(limit_direction="both").fillna(0.0).to_numpy().T
+    table = pandas.DataFrame(np.where(absent, np.nan, values).T)
+    filled = table.interpolate(limit_direction="both").fillna(0.0).to_numpy().T
     values, measured = np.where(absent, filled, values), present.any(1)
     autos = np.array([p.i == p.j for p in products])
     unused = np.flatnonzero(autos & absent.all(1))

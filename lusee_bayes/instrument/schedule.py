@@ -258,16 +258,16 @@ def _of_table(path: str, text: str) -> tuple[Interval, ...]:
 
 def _interval(place: str, row: dict[str, str]) -> Interval:
     with naming(place):
-        known: dict[str, Any] = {"where": place}
+        options: dict[str, Any] = {"where": place}
         for name, default in (("turntable_deg", ""), ("duty_cycle", "1")):
             try:
-                known[name] = float(row.get(name) or default)
+                options[name] = float(row.get(name) or default)
             except ValueError as error:
                 raise InputError(f"{name} is '{row[name]}', expected a number") from error
         night = (row.get("night_only", "").strip() or "false").lower()
         if night not in ("true", "false"):
             raise InputError(f"night_only is '{night}'; write true or false")
-        return Interval(row["start"], row["end"], night_only=night == "true", **known)
+        return Interval(row["start"], row["end"], night_only=night == "true", **options)
 
 
 def _of_commands(path: str, text: str) -> tuple[Interval, ...]:

@@ -122,7 +122,7 @@ def scale_of(name: str, stated: str) -> str:
     return scale
 
 
-def utc_of_jd(found: Content) -> Time:
+def utc_of_jd(content: Content) -> Time:
     """Return times of a file's ``jd1`` and ``jd2``, in UTC.
 
     They are in the scale that the file states (:data:`JD_SCALES`), or in UTC.
@@ -132,10 +132,10 @@ def utc_of_jd(found: Content) -> Time:
     InputError
         If the scale is not known or differs between the two, and as :func:`utc_of`.
     """
-    scales = {scale_of(n, found.values[n]) for n in JD_SCALES if n in found.values} or {"utc"}
+    scales = {scale_of(n, content.values[n]) for n in JD_SCALES if n in content.values} or {"utc"}
     if len(scales) > 1:
         raise InputError(f"jd1 and jd2 have different scales, {' and '.join(sorted(scales))}")
-    return utc_of(found.arrays["jd1"], found.arrays["jd2"], scales.pop())
+    return utc_of(content.arrays["jd1"], content.arrays["jd2"], scales.pop())
 
 
 def utc_times(times: Any) -> Time:
@@ -160,12 +160,12 @@ def utc_times(times: Any) -> Time:
     texts = [_as_text(number, one) for number, one in enumerate(listed.tolist())]
     try:
         with unannounced_leap_seconds():
-            found = Time(texts, scale="utc")
+            parsed = Time(texts, scale="utc")
     except ValueError:
         # dates of several forms, or something else that the message names
         return Time([time_of_text(f"time {k}", text) for k, text in enumerate(texts)])
-    require_ephemeris(found.jd)
-    return found
+    require_ephemeris(parsed.jd)
+    return parsed
 
 
 def _as_text(number: int, one: Any) -> str:
@@ -343,9 +343,9 @@ class Windows(Described):
 
     def select(self, keep: Bool[np.ndarray, " samples"]) -> Windows:
         """Return the windows of the samples where ``keep`` is True."""
-        here = keep[self.sample]
-        _, sample = np.unique(self.sample[here], return_inverse=True)
-        return Windows(sample, self.start_s[here], self.end_s[here], self.live_s[here])
+        kept = keep[self.sample]
+        _, sample = np.unique(self.sample[kept], return_inverse=True)
+        return Windows(sample, self.start_s[kept], self.end_s[kept], self.live_s[kept])
 
     def nodes(self, n: int) -> tuple[Numbers, Nodes, Nodes]:
         """Return instants whose weighted means are those over the windows (Gauss-Legendre).

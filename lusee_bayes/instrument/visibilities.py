@@ -46,12 +46,12 @@ def _datetimes(times: Time) -> np.ndarray:
     return times.isot.astype("datetime64[ms]")
 
 
-def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None]:
+def read_windows(content: Content, times: Time) -> tuple[Time, Windows | None]:
     """Return what a file says of the windows of its samples.
 
     Parameters
     ----------
-    found : Content
+    content : Content
         Of :data:`LAYOUT`.
     times : (times,) Time
         Of its samples.
@@ -68,9 +68,9 @@ def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None]:
         For variables that belong together and are not all there, or contradict each other, and
         as :class:`.Windows`.
     """
-    here, said = found.arrays, found.values.get("window")
-    given = [name for name in (*PIECES, "time_bounds", "live_time") if name in here]
-    lost = [name for name in PIECES if name not in here]
+    arrays, said = content.arrays, content.values.get("window")
+    given = [name for name in (*PIECES, "time_bounds", "live_time") if name in arrays]
+    lost = [name for name in PIECES if name not in arrays]
     if said == "instant" and given:
         raise InputError(
             f"the attribute window declares the samples instants, but {given[0]} gives windows; "
@@ -79,13 +79,13 @@ def read_windows(found: Content, times: Time) -> tuple[Time, Windows | None]:
     if 0 < len(lost) < len(PIECES):
         raise InputError(f"{given[0]} without {lost[0]}; pieces of windows need both")
     if not lost:
-        windows = Windows(*(here[name] for name in PIECES))
-        if "time_bounds" in here:
-            windows.require_bounds(times, here["time_bounds"])
+        windows = Windows(*(arrays[name] for name in PIECES))
+        if "time_bounds" in arrays:
+            windows.require_bounds(times, arrays["time_bounds"])
         return times, windows
-    if "time_bounds" in here:
-        step_s, live_s = found.values["step_s"], here.get("live_time")
-        middles, _, windows = windows_of(times, "middle", step_s, live_s, here["time_bounds"])
+    if "time_bounds" in arrays:
+        step_s, live_s = content.values["step_s"], arrays.get("live_time")
+        middles, _, windows = windows_of(times, "middle", step_s, live_s, arrays["time_bounds"])
         return middles, windows
     if given or said == "mean":
         what = "live_time" if given else "the attribute window = 'mean'"
@@ -334,8 +334,8 @@ class Visibilities(checks.Described):
         """Return the same with the truth of a map of this lmax: cut, or zero above its own."""
         if self.truth is None or len(self.truth) == n_modes(lmax):
             return self
-        known = np.asarray(self.truth)[: n_modes(lmax)]
-        return replace(self, truth=np.pad(known, (0, n_modes(lmax) - len(known))))
+        truth = np.asarray(self.truth)[: n_modes(lmax)]
+        return replace(self, truth=np.pad(truth, (0, n_modes(lmax) - len(truth))))
 
     def to_dataset(self) -> xr.Dataset:
         """Return a Dataset with dims product, time and run_number.
@@ -438,20 +438,20 @@ def read_visibilities(path: str | Path) -> Visibilities:
         but flagged samples.
     """
     require_file(path, "data", HINT)
-    found = read_netcdf(path, formats.VISIBILITIES, LAYOUT, HINT)
-    here, said = found.arrays, found.values
-    given, expected = tuple(map(str, here["product"])), labels_of(len(here["product"]))
+    content = read_netcdf(path, formats.VISIBILITIES, LAYOUT, HINT)
+    arrays, said = content.arrays, content.values
+    given, expected = tuple(map(str, arrays["product"])), labels_of(len(arrays["product"]))
     if given != expected:
         raise InputError(f"{path} has products {', '.join(given)}; expected {', '.join(expected)}")
-    flags = here["flag"]
-    values = np.where(flags, 0.0, here["visibility"])
+    flags = arrays["flag"]
+    values = np.where(flags, 0.0, arrays["visibility"])
     checks.require_finite(f"{path}: visibility (where not flagged)", values)
     with naming(path):
         layout = DataLayout.from_flags(flags)
-        times, windows = read_windows(found, utc_of_jd(found))
+        times, windows = read_windows(content, utc_of_jd(content))
         says_window = windows is not None or said.get("window") == "instant"
-        runs = here["run"], tuple(here["turntable_deg"].tolist()), said["step_s"]
+        runs = arrays["run"], tuple(arrays["turntable_deg"].tolist()), said["step_s"]
         seen = Observation(said["lon_deg"], said["lat_deg"], times, *runs, windows=windows)
-        receiver = receiver_of(path, here, "load_frequency_mhz", *LOADS)
-        known = said["frequency_mhz"], here.get("truth"), receiver, says_window
-        return Visibilities(layout.gather(values), layout, seen, *known)
+        receiver = receiver_of(path, arrays, "load_frequency_mhz", *LOADS)
+        details = said["frequency_mhz"], arrays.get("truth"), receiver, says_window
+        return Visibilities(layout.gather(values), layout, seen, *details)

@@ -94,11 +94,11 @@ class Waterfall(Described):
     interpolation: str | None = None
 
     def description(self) -> tuple[str, ...]:
-        here = ~np.isnan(self.grid).all((1, 2))
-        names = [name for name, there in zip(products.labels(), here, strict=True) if there]
+        measured = ~np.isnan(self.grid).all((1, 2))
+        names = [name for name, seen in zip(products.labels(), measured, strict=True) if seen]
         lines = (
             f"{len(names)} products ({' '.join(names)}) x {self.observation.n_times} times, "
-            f"{np.isnan(self.grid[here]).sum()} samples missing",
+            f"{np.isnan(self.grid[measured]).sum()} samples missing",
             f"channels at {', '.join(f'{f:.9g}' for f in self.frequencies_mhz)} MHz",
             *self.observation.description(),
         )
@@ -213,8 +213,8 @@ def _noon(number: int) -> Time:
 def _sun_height(jd: Float[np.ndarray, " times"]) -> Float[np.ndarray, " times"]:
     """Sine of the Sun's altitude in the middle of the far side."""
     zeros = np.zeros(len(jd), dtype=int)
-    there = Observation(180.0, 0.0, times.utc_of(jd, np.zeros(len(jd))), zeros, (0.0,), 1.0)
-    return np.einsum("ti,ti->t", body_direction("Sun", there), there.zenith_galactic())
+    far_side = Observation(180.0, 0.0, times.utc_of(jd, np.zeros(len(jd))), zeros, (0.0,), 1.0)
+    return np.einsum("ti,ti->t", body_direction("Sun", far_side), far_side.zenith_galactic())
 
 
 SCALAR_WATERFALL = Layout(
@@ -246,9 +246,9 @@ def read_scalar(path: Path) -> Waterfall:
         For a truncated file, a missing image or header entry, columns that do not fit the
         products, ports beyond 0..3, or a bad date.
     """
-    found = read_fits(path, SCALAR_WATERFALL)
-    data, columns = found.arrays["data"], []
-    for i, j in found.arrays["combinations"]:
+    content = read_fits(path, SCALAR_WATERFALL)
+    data, columns = content.arrays["data"], []
+    for i, j in content.arrays["combinations"]:
         # V_ji is V_ij conjugated
         pair, sign = f"{min(i, j)}{max(i, j)}", 1.0 if i < j else -1.0
         columns += [(f"{pair}R", 1.0)] if i == j else [(f"{pair}R", 1.0), (f"{pair}I", sign)]
@@ -257,13 +257,13 @@ def read_scalar(path: Path) -> Waterfall:
             f"{path}: data has {data.shape[1]} products, expected {len(columns)} by combinations"
         )
     with naming(path):
-        said, values = found.values, np.moveaxis(data, 1, 0)
+        said, values = content.values, np.moveaxis(data, 1, 0)
         signed = zip(columns, values, strict=True)
         grid = products.in_order([(label, sign * one) for (label, sign), one in signed])
         first, seconds = start_of(said["LUNAR_DAY"]), said["DELTAT_SEC"] * np.arange(len(data))
         times.require_ephemeris(first.jd + seconds[-1:] / 86400.0)
         observation = _observation(times.later(first, seconds), said)
-    return Waterfall(str(path), grid, found.arrays["freq"], observation)
+    return Waterfall(str(path), grid, content.arrays["freq"], observation)
 
 
 def _observation(at: Time, said: Mapping[str, Any]) -> Observation:
@@ -313,8 +313,8 @@ def read_four_port(path: Path) -> Waterfall:
         For a truncated file, a missing image or header entry, shapes or a unit that do not fit,
         unknown products, or times that do not grow.
     """
-    found = read_fits(path, FOUR_PORT_WATERFALL)
-    images, said = found.arrays, found.values
+    content = read_fits(path, FOUR_PORT_WATERFALL)
+    images, said = content.arrays, content.values
     per_kelvin = images["blackbody_normalization_real"].diagonal(axis1=1, axis2=2)
     require_positive(f"{path}: the diagonal of blackbody_normalization_real", per_kelvin)
     root = np.sqrt(per_kelvin)
@@ -326,8 +326,8 @@ def read_four_port(path: Path) -> Waterfall:
         scale = times.scale_of("TIMESYS", said.get("TIMESYS", "UTC"))
         observation = _observation(times.utc_of(*images["time"].T, scale), said)
     loads = source.receiver_of(path, images, "freq", *source.LOADS)
-    known = per_kelvin, said["TMOON_K"], said.get("TANT_K", 0.0), loads, said.get("FREQINT")
-    return Waterfall(str(path), grid, images["freq"], observation, *known)
+    details = per_kelvin, said["TMOON_K"], said.get("TANT_K", 0.0), loads, said.get("FREQINT")
+    return Waterfall(str(path), grid, images["freq"], observation, *details)
 
 
 def read_waterfall(path: str | Path) -> Waterfall:
@@ -516,7 +516,7 @@ def write_four_port(
     # visibilities are real products of a Hermitian matrix
     none = np.zeros_like(ratio)
     names = receiver.luseepy_parameters
-    parameters = json.dumps({k: getattr(receiver, own) for k, own in names.items()}, sort_keys=True)
+    parameters = json.dumps({k: getattr(receiver, n) for k, n in names.items()}, sort_keys=True)
     images: list[tuple[str, Any, str]] = [
         ("data", data, UNIT),
         ("freq", [c.frequency_mhz for c in channels], "MHz"),

@@ -496,13 +496,13 @@ def from_rings(
     for m in range(2 * nside):
         enough = np.flatnonzero(sizes > 2 * m)
         both = 2 * nside - 1 + np.unique([-m, m])
-        known = series[..., enough, :][..., both]
+        rings = series[..., enough, :][..., both]
         # at the zenith every order but 0 is zero
         zenith = np.zeros(min(m, 1))
-        none = np.zeros_like(known[..., : zenith.size, :])
+        none = np.zeros_like(rings[..., : zenith.size, :])
         nodes = [-ring_theta[enough][::-1], zenith, ring_theta[enough]]
-        known = np.concatenate([(-1.0) ** m * known[..., ::-1, :], none, known], axis=-2)
-        spline = scipy.interpolate.CubicSpline(np.concatenate(nodes), known, axis=-2)
+        rings = np.concatenate([(-1.0) ** m * rings[..., ::-1, :], none, rings], axis=-2)
+        spline = scipy.interpolate.CubicSpline(np.concatenate(nodes), rings, axis=-2)
         spread[..., both] = spline(theta)
     values = spread @ np.exp(1j * orders[:, None] * phi[None])
     return values if np.iscomplexobj(pixels) else values.real

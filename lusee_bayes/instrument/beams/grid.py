@@ -94,10 +94,10 @@ class GridBeams(Described, BeamSource):
 
     def weights(self, values: Values) -> Float[Array, " sources"]:
         """Return the weights of the sources at these values of all parameters."""
-        found = np.ones(1)
+        combined = np.ones(1)
         for name, nodes in self.axes.items():
-            found = (found[:, None] * weights_along(nodes, values[name])[None]).reshape(-1)
-        return found
+            combined = (combined[:, None] * weights_along(nodes, values[name])[None]).reshape(-1)
+        return combined
 
     def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
         return ProductBeams(self._seen(frequency_mhz, lmax)[:, :-1], float(frequency_mhz))
@@ -120,12 +120,12 @@ class GridBeams(Described, BeamSource):
 
     def circuit(self, frequency_mhz: float) -> Circuit | None:
         """Return antennas and receivers at the nominal values, which say what 1 K is."""
-        found = [source.circuit(frequency_mhz) for source in self.sources]
-        if None in found:
+        circuits = [source.circuit(frequency_mhz) for source in self.sources]
+        if None in circuits:
             return None
         weights, names = self.weights(self.nominal), ("antenna_ohm", "moon_ohm", "loss_ohm")
-        parts = {n: np.tensordot(weights, [getattr(c, n) for c in found], 1) for n in names}
-        return replace(found[0], **parts)
+        parts = {n: np.tensordot(weights, [getattr(c, n) for c in circuits], 1) for n in names}
+        return replace(circuits[0], **parts)
 
     has_fields = False
 
@@ -133,8 +133,8 @@ class GridBeams(Described, BeamSource):
         raise InputError(f"{self.path}: only product beams are interpolated, not E fields")
 
     def patterns(self, frequency_mhz: float, grid: HemisphereGrid) -> Pairs:
-        found = [np.asarray(source.patterns(frequency_mhz, grid)) for source in self.sources]
-        return np.tensordot(self.weights(self.values), found, 1)
+        each = [np.asarray(source.patterns(frequency_mhz, grid)) for source in self.sources]
+        return np.tensordot(self.weights(self.values), each, 1)
 
     def interpolated(self, frequency_mhz: float) -> Interpolation | None:
         return self.sources[0].interpolated(frequency_mhz)
@@ -149,15 +149,15 @@ class GridBeams(Described, BeamSource):
         along this parameter, minus those of the files. It is more than the error of the whole grid,
         whose polynomials have a degree more, or half the step.
         """
-        nodes, found = self._at_nodes(frequency_mhz, lmax)[..., :-1], {}
+        nodes, errors = self._at_nodes(frequency_mhz, lmax)[..., :-1], {}
         whole = nodes.reshape(*map(len, self.axes.values()), *nodes.shape[1:])
         for number, (name, xs) in enumerate(self.axes.items()):
             along = np.moveaxis(whole, number, 0)
             for k in range(1, len(xs) - 1):
                 weights = weights_along(np.delete(xs, k), xs[k])
                 off = np.tensordot(weights, np.delete(along, k, 0), 1) - along[k]
-                found[f"{name} {xs[k]:g}"] = off.reshape(-1, *nodes.shape[1:])
-        return found
+                errors[f"{name} {xs[k]:g}"] = off.reshape(-1, *nodes.shape[1:])
+        return errors
 
 
 def _in_unit(source: BeamSource, unit: Circuit | None, frequency_mhz: float, lmax: int):
@@ -193,8 +193,8 @@ def weights_along(nodes: Nodes, value: float | Float[Array, ""]) -> Float[Array,
     # Taylor's coefficients of every weight, at the start of every piece
     taylor = np.stack([spline(starts, nu=d) / factorial(d) for d in range(degree + 1)], axis=1)
     piece = xp.searchsorted(xp.asarray(starts[1:]), value, side="right")
-    step, own = value - xp.asarray(starts)[piece], xp.asarray(taylor)[piece]
-    return sum(step**d * own[d] for d in range(degree + 1))
+    step, terms = value - xp.asarray(starts)[piece], xp.asarray(taylor)[piece]
+    return sum(step**d * terms[d] for d in range(degree + 1))
 
 
 def read_beam_grid(

@@ -238,11 +238,11 @@ class LuseepyBeam(Described, BeamSource):
     moon_k: float = field(default=0.0, kw_only=True)
 
     def description(self) -> tuple[str, ...]:
-        known = self.frequencies_mhz
-        middle = float(known[len(known) // 2])
+        mhz = self.frequencies_mhz
+        middle = float(mhz[len(mhz) // 2])
         autos = replace(self, moon_k=1.0).background(middle)[auto_indices(self.n_ports)]
         return (
-            f"{counted(self.n_ports, 'port')}, {extent(known, 'MHz')} ({len(known)} frequencies)",
+            f"{counted(self.n_ports, 'port')}, {extent(mhz, 'MHz')} ({len(mhz)} frequencies)",
             f"{len(self.theta)} angles from the zenith to the horizon, {self.n_phi} azimuths",
             f"{autos.mean():.3f} of an auto at {middle:g} MHz comes from the ground",
         )
@@ -278,8 +278,8 @@ class LuseepyBeam(Described, BeamSource):
         return neighbours(self.path, self.frequencies_mhz, frequency_mhz)
 
     def _at(self, frequency_mhz: float, *parts: np.ndarray) -> list[np.ndarray]:
-        known, rule = self.frequencies_mhz, self.interpolation
-        return at_frequency(self.path, known, frequency_mhz, *parts, rule=rule)
+        mhz, rule = self.frequencies_mhz, self.interpolation
+        return at_frequency(self.path, mhz, frequency_mhz, *parts, rule=rule)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -320,8 +320,8 @@ class PortResponse(LuseepyBeam):
         return self if receiver is None or self.receiver_said else replace(self, receiver=receiver)
 
     def description(self) -> tuple[str, ...]:
-        known = self.frequencies_mhz
-        kelvin = self.per_kelvin(float(known[len(known) // 2]))
+        mhz = self.frequencies_mhz
+        kelvin = self.per_kelvin(float(mhz[len(mhz) // 2]))
         return *super().description(), f"1 K is {extent(kelvin, 'V^2/Hz')} behind the receivers"
 
     def circuit(self, frequency_mhz: float) -> Circuit:
@@ -394,9 +394,9 @@ def read_response(path: str | Path) -> PortResponse:
         than the hemisphere above the horizon, frequencies that do not grow, numbers that are not
         finite, resistances that do not add up, or a header that states other conventions.
     """
-    found = read_fits(path, RESPONSE_LAYOUT, "check beam.file")
-    require_conventions(path, found.values)
-    images = found.arrays
+    response = read_fits(path, RESPONSE_LAYOUT, "check beam.file")
+    require_conventions(path, response.values)
+    images = response.arrays
     frequencies, theta_deg, phi_deg = (images[name] for name in AXES)
     for name, degrees, last in (("theta", theta_deg, 90.0), ("phi", phi_deg, 360.0)):
         if not np.allclose(degrees, np.linspace(0.0, last, len(degrees)), rtol=0, atol=1e-9):
@@ -539,8 +539,8 @@ def read_scalar_beam(path: str | Path) -> ScalarBeam:
         than the hemisphere above the horizon, frequencies that do not grow, numbers that are
         not finite, or a header that states other conventions.
     """
-    found = read_fits(path, SCALAR_LAYOUT, "check beam.file")
-    images, said, sizes = found.arrays, found.values, found.sizes
+    beam = read_fits(path, SCALAR_LAYOUT, "check beam.file")
+    images, said, sizes = beam.arrays, beam.values, beam.sizes
     require_conventions(path, said)
     ends = [said[key] for key in ("THETA_MIN", "THETA_MAX", "PHI_MIN", "PHI_MAX")]
     if ends != [0.0, 90.0, 0.0, 360.0]:

@@ -218,11 +218,11 @@ class SampledBeams(Described, BeamSource):
     def description(self) -> tuple[str, ...]:
         kind = "E fields of" if self.products is None else "product beams of"
         scale = "K per K" if self.absolute else "normalised so that autos integrate to one"
-        known = listed(tuple(f"{f:g}" for f in self.frequencies_mhz))
+        frequencies = listed(tuple(f"{f:g}" for f in self.frequencies_mhz))
         at, where = self.directions, f"HEALPix pixels of NSIDE {self.directions.nside}"
         if at.theta is not None:
             where = f"{len(at.theta)} theta x {at.n_phi} phi"
-        return f"{kind} {self.n_ports} antennas, {where}", f"at {known} MHz; {scale}"
+        return f"{kind} {self.n_ports} antennas, {where}", f"at {frequencies} MHz; {scale}"
 
     @property
     def n_ports(self) -> int:
@@ -376,14 +376,14 @@ def read_sampled_beams(path: str | Path) -> SampledBeams:
         read = partial(formats.read_fits, path, hint=HINT)
     else:
         read = partial(formats.read_netcdf, path, formats.BEAMS, hint=HINT)
-    there = read(layout=Layout(WHAT)).there
-    names = (POWER,) if POWER in there else FIELDS
+    present = read(layout=Layout(WHAT)).there
+    names = (POWER,) if POWER in present else FIELDS
     said = {"absolute": Attribute("boolean")}
-    said |= {"products": Attribute("text")} if POWER in there else {}
-    found = read(layout=layout(names, "theta_deg" in there, said=said))
-    arrays, given = found.arrays, {}
+    said |= {"products": Attribute("text")} if POWER in present else {}
+    content = read(layout=layout(names, "theta_deg" in present, said=said))
+    arrays, given = content.arrays, {}
     if POWER in arrays:
-        names = [name.strip() for name in found.values["products"].split(",")]
+        names = [name.strip() for name in content.values["products"].split(",")]
         with naming(path):
             expected = labels(antennas_of(arrays[POWER].shape[1]))
         if sorted(names) != sorted(expected):
@@ -398,7 +398,7 @@ def read_sampled_beams(path: str | Path) -> SampledBeams:
             parts = np.stack([arrays[f"{name}_{part}"] for part in ("real", "imag")], axis=-1)
             given[name] = parts.view(complex)[..., 0]
     angles = {name: arrays.get(name) for name in ("theta_deg", "phi_deg")}
-    options = {"absolute": found.values["absolute"], "path": str(path)}
+    options = {"absolute": content.values["absolute"], "path": str(path)}
     return sampled_beams(arrays["frequency_mhz"], **given, **angles, **options)
 
 
@@ -558,8 +558,8 @@ def beam_kind(path: str | Path) -> str:
         return "luseepy"
     in_fits = formats.is_fits(path)
     names = set(formats.image_names(path)) if in_fits else set()
-    own = names & {FIELDS[0], POWER} if in_fits else formats.format_of(path) == formats.BEAMS
-    if own or formats.has_words(path, formats.UVBEAM_WORDS):
+    is_ours = names & {FIELDS[0], POWER} if in_fits else formats.format_of(path) == formats.BEAMS
+    if is_ours or formats.has_words(path, formats.UVBEAM_WORDS):
         return "sampled"
     return "response" if "h_theta_real" in names else "luseepy"
 

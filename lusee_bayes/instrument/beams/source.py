@@ -404,9 +404,9 @@ class BeamSource(ABC):
         InputError
             If there is none; the message gives the nearest name.
         """
-        found = self.parameters()
-        require_known("unknown beam parameter", name, found)
-        return found[name]
+        parameters = self.parameters()
+        require_known("unknown beam parameter", name, parameters)
+        return parameters[name]
 
     def with_values(self, values: Values) -> BeamSource:
         """Return the antennas with other values of the named parameters, differentiable in these.
