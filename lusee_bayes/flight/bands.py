@@ -110,8 +110,8 @@ class ChannelBand:
         first, last = int(within[0]), int(within[-1]) + 1
         finer = (x[first:last, :, None] ** np.arange(degree + 3)).mean(axis=1)
         apart = np.abs(channels[first:last, :, None, None] - channels[None, None, first:last])
-        known = np.array([*shared_noise, 0.0])
-        shared = known[np.minimum(apart, len(known) - 1)].mean(axis=(1, 3))
+        correlation = np.array([*shared_noise, 0.0])
+        shared = correlation[np.minimum(apart, len(correlation) - 1)].mean(axis=(1, 3))
         return cls(first, last, finer[:, : degree + 1], finer, shared)
 
     def values(
@@ -219,12 +219,12 @@ def shared_noise(taps: int, taper: Taper) -> tuple[float, ...]:
     if taps == 0:
         return (1.0,)
     h = impulse_response(taps, taper)
-    found, padded = np.zeros(REACH + 1), np.pad(h, len(h))
+    covariance, padded = np.zeros(REACH + 1), np.pad(h, len(h))
     for start in range(FRAME, 2 * len(h), FRAME):
         # frames fold onto one: exp(2 pi i d n / N) has their period
         folded = (h * padded[start : start + len(h)]).reshape(taps, FRAME).sum(axis=0)
-        found += np.abs(np.fft.fft(folded)[: REACH + 1]) ** 2
-    return tuple((found / (h @ h) ** 2).tolist())
+        covariance += np.abs(np.fft.fft(folded)[: REACH + 1]) ** 2
+    return tuple((covariance / (h @ h) ** 2).tolist())
 
 
 def impulse_response(taps: int, taper: Taper) -> Float[np.ndarray, " samples"]:

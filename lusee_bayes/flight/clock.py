@@ -137,20 +137,20 @@ def read_clock(path: str | Path) -> Clock:
         that is none.
     """
     hint = "write luseepy's clock reference (format_version 1), see docs/howto/first_light.md"
-    found = read_model(path, _ClockFile, "a clock reference", hint)
-    if (found.stated_utc_isot is None) == (found.clocks is None):
+    file = read_model(path, _ClockFile, "a clock reference", hint)
+    if (file.stated_utc_isot is None) == (file.clocks is None):
         raise InputError(
             f"{path} needs either clocks, for sessions whose UTC is unknown, or stated_utc_isot, "
             "to correct the UTC stated in sessions; see docs/howto/first_light.md"
         )
     with naming(path):
-        scale = scale_of("time_scale", found.time_scale)
-        time = time_of_text("clock_reference_isot", found.clock_reference_isot, scale)
-        if found.clocks is None:
-            raw_s, stated = 0.0, time_of_text("stated_utc_isot", found.stated_utc_isot)
+        scale = scale_of("time_scale", file.time_scale)
+        time = time_of_text("clock_reference_isot", file.clock_reference_isot, scale)
+        if file.clocks is None:
+            raw_s, stated = 0.0, time_of_text("stated_utc_isot", file.stated_utc_isot)
         else:
-            raw_s, stated = found.clocks.spectrometer.clock_reference_raw_seconds, None
-    return Clock(str(path), float(time.jd1), float(time.jd2), scale, raw_s, found.rate, stated)
+            raw_s, stated = file.clocks.spectrometer.clock_reference_raw_seconds, None
+    return Clock(str(path), float(time.jd1), float(time.jd2), scale, raw_s, file.rate, stated)
 
 
 def clock_of(path: str | Path, said: Clock | None, given: Clock | None, raw_s: Times) -> Clock:

@@ -120,8 +120,8 @@ def distances(values: Autos, noise: Autos, good: Points, kept: Points, basis: Ba
         In standard deviations, the curve's own uncertainty included; 0 where not good.
     """
     curve, leverage = fitted_curves(values, kept, basis)
-    own = np.where(kept, 1.0 - leverage, 1.0 + leverage)
-    scale = noise * np.sqrt(np.maximum(own, 1e-3))[:, None]
+    factor = np.where(kept, 1.0 - leverage, 1.0 + leverage)
+    scale = noise * np.sqrt(np.maximum(factor, 1e-3))[:, None]
     return np.where(good[:, None], (values - curve) / scale, 0.0)
 
 
@@ -176,8 +176,8 @@ def read_lines(path: str | Path) -> tuple[float, ...]:
     InputError
         If it cannot be read.
     """
-    found = read_table(path, TABLE, "write a header 'frequency_mhz,source' and one line for each")
-    return tuple(found["frequency_mhz"].tolist())
+    columns = read_table(path, TABLE, "write a header 'frequency_mhz,source' and one line for each")
+    return tuple(columns["frequency_mhz"].tolist())
 
 
 def line_bins(lines_mhz: tuple[float, ...], averaging: Averaging, middles_mhz: Middles) -> BinFlags:
@@ -217,10 +217,10 @@ def comb_strength(autos: Spectra, frames: Rows, averaging: Averaging, middles_mh
     noise = np.abs(around) * spread / np.sqrt(frames * averaging.members)[:, None, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         z = (autos[..., at] - around) / noise
-    known = np.isfinite(z)
+    finite = np.isfinite(z)
     # a strong line of its own is no comb
-    clipped = np.clip(np.where(known, z, 0.0), -COMB_LIMIT, COMB_LIMIT)
-    strength = clipped.sum(axis=2) / np.sqrt(np.maximum(known.sum(axis=2), 1))
+    clipped = np.clip(np.where(finite, z, 0.0), -COMB_LIMIT, COMB_LIMIT)
+    strength = clipped.sum(axis=2) / np.sqrt(np.maximum(finite.sum(axis=2), 1))
     most = np.abs(strength).argmax(axis=1)
     return np.take_along_axis(strength, most[:, None], axis=1)[:, 0]
 
@@ -250,8 +250,8 @@ def line_flags(
     # the level of the spectrum, which a strong line must not raise; ports that are absent are zero
     usable = np.where((good | ~good.any(axis=1)[:, None])[:, None], autos, np.nan)
     level = np.nanmedian(usable, axis=2)
-    own = np.sqrt(np.diagonal(band.shared))
-    noise = np.abs(level)[..., None] * own / np.sqrt(frames)[:, None, None]
+    root = np.sqrt(np.diagonal(band.shared))
+    noise = np.abs(level)[..., None] * root / np.sqrt(frames)[:, None, None]
     return outliers(autos, np.where(noise > 0.0, noise, 1.0), good, band.finer, limit)
 
 
@@ -302,11 +302,11 @@ def burst_flags(
 
 def _filled(seconds: Rows, autos: Levels, known: Bool[np.ndarray, "rows ports"]) -> Levels:
     """Autos with what lies between their neighbours in place of others, so as to bend no curve."""
-    found = autos.copy()
+    filled = autos.copy()
     for port, at in enumerate(known.T):
         if at.any():
-            found[~at, port] = np.interp(seconds[~at], seconds[at], autos[at, port])
-    return found
+            filled[~at, port] = np.interp(seconds[~at], seconds[at], autos[at, port])
+    return filled
 
 
 def _spans(seconds: Rows) -> list[np.ndarray]:
@@ -314,7 +314,7 @@ def _spans(seconds: Rows) -> list[np.ndarray]:
     whole = seconds[-1] - seconds[0]
     n = max(1, int(np.ceil(whole / SPAN_S - 1e-9)))
     number = np.minimum((seconds - seconds[0]) * n // max(whole, 1.0), n - 1).astype(int)
-    return [found for k in range(n) if (found := np.flatnonzero(number == k)).size]
+    return [rows for k in range(n) if (rows := np.flatnonzero(number == k)).size]
 
 
 def _one_span(
@@ -331,16 +331,16 @@ def _one_span(
     kept = _without_the_highest(values, sigma * np.maximum(scale, 1.0)[:, None], good, x, limit)
     # and about the curve
     z = distances(values, sigma, good[None], kept[None], x)
-    about = np.array([robust_scale(z[:, p], kept[None]) for p in range(autos.shape[1])])
-    scale = np.maximum(scale, about)
+    scatter = np.array([robust_scale(z[:, p], kept[None]) for p in range(autos.shape[1])])
+    scale = np.maximum(scale, scatter)
     sigma = sigma * np.maximum(scale, 1.0)[None, :, None]
     kept = _with_what_fits(values, sigma, good, kept, x, limit)
     while kept.sum() >= LEAST // 2:
         out, z = outliers(values, sigma, kept[None], x, limit)
-        found = out[0] | _about_stretches(z[0], kept & ~out[0], limit)
-        if not found.any():
+        off = out[0] | _about_stretches(z[0], kept & ~out[0], limit)
+        if not off.any():
             break
-        kept &= ~found
+        kept &= ~off
     kept = _with_what_fits(values, sigma, good, kept, x, limit)
     # what lies between spectra that are flagged, each of them far off
     z = distances(values, sigma, good[None], kept[None], x)[0]
@@ -372,8 +372,8 @@ def _with_what_fits(
         curve, _ = fitted_curves(values, kept[None], x)
         z = ((values - curve) / sigma)[0]
         more = good & ~kept & (np.abs(z).max(axis=0) <= limit)
-        known = good & _curve_is_known(values, kept, x)
-        more = kept | (more & ~_flagged_stretches(z, kept | more | known, limit))
+        on_curve = good & _curve_is_known(values, kept, x)
+        more = kept | (more & ~_flagged_stretches(z, kept | more | on_curve, limit))
         if (more == kept).all():
             break
         kept = more
@@ -389,12 +389,12 @@ def _curve_is_known(values: OneRow, kept: Span, x: Terms) -> Span:
 def _about_stretches(z: Distances, kept: Span, limit: float) -> Span:
     """All stretches whose sum is beyond the limit, and so more than is off."""
     sums, counts = _sums(z, kept)
-    found = np.zeros(len(kept), dtype=bool)
+    beyond = np.zeros(len(kept), dtype=bool)
     for length in LENGTHS[1:]:
         if length <= len(kept) // 2:
             for start in np.flatnonzero((_sizes_of(sums, counts, length) > limit).any(axis=0)):
-                found[start : start + length] = True
-    return found & kept
+                beyond[start : start + length] = True
+    return beyond & kept
 
 
 def _flagged_stretches(z: Distances, good: Span, limit: float) -> Span:

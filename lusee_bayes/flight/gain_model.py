@@ -115,8 +115,8 @@ class GainModel(Described):
             Counts for 1 nV^2/Hz; NaN where the table has no gain.
         """
         place = LETTERS.index(level), port
-        known = np.vstack([self.mean[place], self.components[place]])
-        spline = interpolate.CubicSpline(self.anchor_mhz[place], known.T, extrapolate=False)
+        curves = np.vstack([self.mean[place], self.components[place]])
+        spline = interpolate.CubicSpline(self.anchor_mhz[place], curves.T, extrapolate=False)
         return spline(frequencies_mhz).T
 
     def with_component_std(self, std: tuple[float, ...] | None) -> GainModel:
@@ -156,8 +156,8 @@ class GainModel(Described):
                 f"the telemetry lacks {', '.join(lacking)}, from which the gain table predicts "
                 "gains; ingest the session with its telemetry, interpolated to the spectra"
             )
-        known = {"1": np.ones_like(telemetry[TELEMETRY[0]]), **telemetry}
-        phi = [prod(known[name] for name in term.split("*")) for term in _terms(port)]
+        values = {"1": np.ones_like(telemetry[TELEMETRY[0]]), **telemetry}
+        phi = [prod(values[name] for name in term.split("*")) for term in _terms(port)]
         return np.stack(phi, axis=1) @ self.coefficient[LETTERS.index(level), port].T
 
 
@@ -302,15 +302,15 @@ ARRAYS = {"freqs": ("anchor",), "mean": ("anchor",), "eigvecs": ("anchor", "comp
 
 def _read_folder(folder: Path, model: str) -> GainModel:
     names = {name: [f"{place}_{name}" for place in PLACES] for name in ARRAYS}
-    found, layout = {}, {}
+    files, layout = {}, {}
     for name, of_places in names.items():
         for one in of_places:
             path = require_file(folder / f"{one}.npy", "a gain table", HINT)
             with reading(path, "an array of luseepy's gain model"), path.open("rb") as file:
                 values = np.load(file, allow_pickle=False)
-            found[one] = values[:, :N_COMPONENTS] if values.ndim == 2 else values
+            files[one] = values[:, :N_COMPONENTS] if values.ndim == 2 else values
             layout[one] = Variable(ARRAYS[name])
-    arrays = Layout("luseepy's gain model", layout).checked(folder, found, {}).arrays
+    arrays = Layout("luseepy's gain model", layout).checked(folder, files, {}).arrays
     stacks = (np.stack([arrays[one] for one in of_places]) for of_places in names.values())
     mhz, mean, vectors = (stack.reshape(*LEAD, *stack.shape[1:]) for stack in stacks)
     coefficients = _coefficients(folder / "alpha_refit.csv", model)
@@ -326,7 +326,7 @@ def _coefficients(path: Path, model: str) -> np.ndarray:
         for r in range(N_COMPONENTS)
         for k, term in enumerate(_terms(place[1]))
     }
-    found, seen = np.zeros((*LEAD, N_COMPONENTS, N_TERMS)), set()
+    coefficients, seen = np.zeros((*LEAD, N_COMPONENTS, N_TERMS)), set()
     rows = zip(*(columns[name] for name in CSV.variables), strict=True)
     for number, (setting, component, family, term, value) in enumerate(rows, start=2):
         if str(family).strip().lower() != model:
@@ -336,12 +336,12 @@ def _coefficients(path: Path, model: str) -> np.ndarray:
         if name in seen:
             raise InputError(f"{path}: line {number} repeats {name}")
         seen.add(name)
-        found[places[name]] = value
+        coefficients[places[name]] = value
     given = {name.rpartition(" ")[0] for name in seen}
     lacking = dict.fromkeys(one for name in places if (one := name.rpartition(" ")[0]) not in given)
     if lacking:
         raise InputError(f"{path} has no coefficients of model {model} for {', '.join(lacking)}")
-    return found
+    return coefficients
 
 
 def _terms(port: int) -> tuple[str, ...]:

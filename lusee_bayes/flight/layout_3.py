@@ -55,11 +55,11 @@ def said_in(file: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def no_spectra(path: Path, lacking: str, there: Iterable[str]) -> InputError:
+def no_spectra(path: Path, lacking: str, names: Iterable[str]) -> InputError:
     """Return the error of a file without spectra, with what is there."""
     return InputError(
         f"{path} has no {lacking}: the session contains no spectra (it has "
-        f"{', '.join(there) or 'nothing'})"
+        f"{', '.join(names) or 'nothing'})"
     )
 
 
@@ -117,21 +117,21 @@ def session_of_fits(path: Path, hdus: fits.HDUList, opener: Opener) -> Session:
 def _checked_session(
     path: Path, kind: str, arrays: dict[str, Any], values: dict[str, Any], opener: Opener
 ) -> Session:
-    found = LAYOUT_3.checked(path, arrays, values)
-    clock = _clock_by_epoch(path, found)
-    return session_of(path, found, arrays, layout=3, kind=kind, clock=clock, opener=opener)
+    content = LAYOUT_3.checked(path, arrays, values)
+    clock = _clock_by_epoch(path, content)
+    return session_of(path, content, arrays, layout=3, kind=kind, clock=clock, opener=opener)
 
 
-def _clock_by_epoch(path: Path, found: Content) -> Clock | None:
-    scale = found.values.get("constants.time_scale", UNKNOWN).lower()
-    mjd = found.values["constants.mjd_epoch_offset_days"]
+def _clock_by_epoch(path: Path, content: Content) -> Clock | None:
+    scale = content.values.get("constants.time_scale", UNKNOWN).lower()
+    mjd = content.values["constants.mjd_epoch_offset_days"]
     # luseepy writes zero where the epoch is not known
     if mjd == 0.0:
         return None
-    raw_s = found.values["constants.raw_time_subtract_seconds"]
-    readings = found.arrays["spectra/raw_times"]
+    raw_s = content.values["constants.raw_time_subtract_seconds"]
+    readings = content.arrays["spectra/raw_times"]
     by_epoch = mjd + (readings - raw_s) / DAY_S
-    theirs = found.arrays.get("spectra/mjd_times", by_epoch)
+    theirs = content.arrays.get("spectra/mjd_times", by_epoch)
     if (off := np.flatnonzero(np.abs(theirs - by_epoch) > SAME_S / DAY_S)).size:
         k = int(off[0])
         raise InputError(

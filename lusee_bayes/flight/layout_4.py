@@ -70,14 +70,14 @@ def session_of_4(path: Path, file: h5py.File, opener: Opener) -> Session:
             )
     if (clock := _clock_by_reference(path, file)) is not None and raw_s is not None:
         arrays |= _telemetry_at_rows(path, file, clock, np.asarray(raw_s))
-    found = LAYOUT_4.checked(path, arrays, said_in(file))
+    content = LAYOUT_4.checked(path, arrays, said_in(file))
     unused = {
         name: int(np.ravel(file[group].attrs.get("count", 0))[0])
         for group, name in UNUSED.items()
         if group in file
     }
     others = {"layout": 4, "kind": "HDF5", "clock": clock, "unused": unused}
-    return session_of(path, found, arrays, opener=opener, **others)
+    return session_of(path, content, arrays, opener=opener, **others)
 
 
 def _dataset(file: h5py.File, path: str) -> Unread | None:
@@ -92,7 +92,7 @@ def _dataset(file: h5py.File, path: str) -> Unread | None:
 
 def _metadata(path: Path, file: h5py.File, n: int) -> dict[str, Unread]:
     """Fields that all rows have, in one shape."""
-    found: dict[str, Unread] = {}
+    fields: dict[str, Unread] = {}
     for ours, theirs in FIELDS.items():
         if (values := _dataset(file, f"{META}/fields/{theirs}/variant_000/data")) is None:
             continue
@@ -107,15 +107,15 @@ def _metadata(path: Path, file: h5py.File, n: int) -> dict[str, Unread]:
                 f"{path}: row_indices of {META}/fields/{theirs} are not 0 to {n - 1}, one for each "
                 "spectrum; ingest the session again"
             )
-        found[f"{META}/{ours}"] = values
+        fields[f"{META}/{ours}"] = values
     if (navgf := _dataset(file, "spectra/navgf")) is not None:
-        told = np.asarray(found.setdefault(f"{META}/Navgf", navgf))
-        if not np.array_equal(told, np.asarray(navgf)):
+        averaged = np.asarray(fields.setdefault(f"{META}/Navgf", navgf))
+        if not np.array_equal(averaged, np.asarray(navgf)):
             raise InputError(
                 f"{path}: spectra/navgf is {_values(navgf)}, navgf of the metadata is "
-                f"{_values(told)}; ingest the session again"
+                f"{_values(averaged)}; ingest the session again"
             )
-    return found
+    return fields
 
 
 def _values(numbers: Unread) -> str:
@@ -150,16 +150,16 @@ def _telemetry_at_rows(path: Path, file: h5py.File, clock: Clock, raw_s: Rows) -
     if (anchor := _anchors(file).get("dcb")) is None or "telemetry" not in file:
         return {}
     parts = ("field_names", "mission_seconds", "lusee_subsecs", "values")
-    found = {name: _dataset(file, f"telemetry/{name}") for name in parts}
-    for name, array in found.items():
+    arrays = {name: _dataset(file, f"telemetry/{name}") for name in parts}
+    for name, array in arrays.items():
         if array is None:
             raise InputError(
                 f"{path}: telemetry has no {name} (it has "
                 f"{', '.join(file['telemetry']) or 'nothing'}); ingest the session again with the "
                 "current luseepy"
             )
-    names = np.asarray(found["field_names"]).tolist()
-    seconds, ticks, values = (np.asarray(found[name], dtype=np.float64) for name in parts[1:])
+    names = np.asarray(arrays["field_names"]).tolist()
+    seconds, ticks, values = (np.asarray(arrays[name], dtype=np.float64) for name in parts[1:])
     times_s = seconds + ticks / TICKS - anchor + clock.raw_s
     columns = {name: values[:, names.index(name)] for name in TELEMETRY if name in names}
     return {

@@ -280,20 +280,20 @@ def timeline(sessions: Sequence[Session], recipe: Recipe) -> Timeline:
             "the times of the spectra are declared instants (observation.timestamp=instant), which "
             "cannot be averaged; remove observation.average_s, or set observation.timestamp=middle"
         )
-    found = [(s, clock_of(s.path, s.clock, recipe.clock, s.raw_s).utc(s.raw_s)) for s in sessions]
-    found.sort(key=lambda one: one[1][0].jd)
-    for (a, times_a), (b, times_b) in pairwise(found):
+    timed = [(s, clock_of(s.path, s.clock, recipe.clock, s.raw_s).utc(s.raw_s)) for s in sessions]
+    timed.sort(key=lambda one: one[1][0].jd)
+    for (a, times_a), (b, times_b) in pairwise(timed):
         if times_b[0] <= times_a[-1]:
             raise InputError(
                 f"{a.path} ({times_a[0].isot[:19]} to {times_a[-1].isot[:19]}) and {b.path} "
                 f"({times_b[0].isot[:19]} to {times_b[-1].isot[:19]}) overlap in time; give each "
                 "spectrum once"
             )
-    ordered = tuple(s for s, _ in found)
+    ordered = tuple(s for s, _ in timed)
     lon, lat = _site(ordered) if recipe.site is None else recipe.site
     window = np.concatenate([s.window_s for s in ordered])
     share = np.concatenate([s.share for s in ordered])
-    times = utc_of(*(np.concatenate([getattr(t, n) for _, t in found]) for n in ("jd1", "jd2")))
+    times = utc_of(*(np.concatenate([getattr(t, n) for _, t in timed]) for n in ("jd1", "jd2")))
     windows = None
     if recipe.timestamp != "instant":
         times = later(times, TO_MIDDLE[recipe.timestamp] * window)

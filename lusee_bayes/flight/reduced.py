@@ -204,15 +204,15 @@ class Reduced(Described):
         """Return what has been taken from elsewhere than the sessions, a sentence each."""
         if corrected := {s["clock_file"] for s in self.sessions if s["clock"] == CORRECTED}:
             return (f"The UTC stated in the sessions is corrected by {corrected.pop()}.",)
-        told = [s for s in self.sessions if s["clock"] == "clock file" and s.get("clock_file")]
-        if not told:
+        by_file = [s for s in self.sessions if s["clock"] == "clock file" and s.get("clock_file")]
+        if not by_file:
             return ()
-        who = Path(told[0]["file"]).name if len(told) == 1 else f"{len(told)} sessions"
-        verb = "does" if len(told) == 1 else "do"
+        who = Path(by_file[0]["file"]).name if len(by_file) == 1 else f"{len(by_file)} sessions"
+        verb = "does" if len(by_file) == 1 else "do"
         return (
             f"{who} {verb} not specify the UTC of the clock: its scale "
-            f"({told[0]['scale'].upper()}) and epoch come from the clock file "
-            f"{told[0]['clock_file']}.",
+            f"({by_file[0]['scale'].upper()}) and epoch come from the clock file "
+            f"{by_file[0]['clock_file']}.",
         )
 
     def band(self, frequency_mhz: float) -> int:
@@ -251,31 +251,31 @@ class Reduced(Described):
 
     def flag_line(self, band: int | None = None, misfit: float = 0.0) -> str:
         """Say how much was flagged, as :meth:`flagged`."""
-        found = self.flagged(band, misfit)
-        rules = f": {_percent(found)}" if found else ""
-        return f"flagged {sum(found.values()):.2%} of the values{rules}"
+        shares = self.flagged(band, misfit)
+        rules = f": {_percent(shares)}" if shares else ""
+        return f"flagged {sum(shares.values()):.2%} of the values{rules}"
 
     def doubts(self, band: int) -> tuple[str, ...]:
         """Return what is doubtful about a band, a sentence each."""
-        found = []
+        sentences = []
         if sum(self.flagged(band).values()) > MUCH:
-            found.append(
+            sentences.append(
                 f"The reduction {self.flag_line(band)}. This is more than 20 %: check the "
                 "sessions, flight.false_alarm, flight.lines and flight.comb."
             )
         noise, curvature = float(self.scatter[band]), float(self.curvature[band])
         if noise > NOISY:
-            found.append(
+            sentences.append(
                 f"The scatter of spectra in time is {noise:.2g} times the radiometer noise: gains "
                 "drift, or something other than the sky changes; consider noise.gain."
             )
         if curvature > CURVED:
-            found.append(
+            sentences.append(
                 "A polynomial of degree flight.degree does not fit the band: two more powers "
                 f"change a value by {curvature:.2g} standard deviations; use a smaller "
                 "flight.bandwidth_hz, or a higher flight.degree."
             )
-        return tuple(found)
+        return tuple(sentences)
 
     def at(self, frequency_mhz: float, per_kelvin: Float[np.ndarray, " ports"]) -> Visibilities:
         """Return one band.
@@ -319,25 +319,25 @@ class Reduced(Described):
         run, turntable_deg = runs_of(angles, observation.n_times)
         observation = replace(observation, run=run, turntable_deg=turntable_deg)
         mhz = float(self.frequencies_mhz[band])
-        found = {n: x for place in PLACES for n, x in self._errors(band, bins, place) if x.any()}
+        stds = {n: x for place in PLACES for n, x in self._errors(band, bins, place) if x.any()}
         n_averaged, lost = self.n_averaged[band, bins], float(sum(self.flagged(band).values()))
         calibration = Calibration(n_averaged, lost=lost)
-        if found:
-            ports, slopes = [PLACES[name[:2]][1] for name in found], np.array(list(found.values()))
-            calibration = Calibration(n_averaged, tuple(found), np.array(ports), slopes, lost)
+        if stds:
+            ports, slopes = [PLACES[name[:2]][1] for name in stds], np.array(list(stds.values()))
+            calibration = Calibration(n_averaged, tuple(stds), np.array(ports), slopes, lost)
         data = layout.gather(values)
         return Visibilities(data, layout, observation, mhz, calibration=calibration)
 
     def _errors(self, band: int, bins: Left, place: str) -> Iterator[tuple[str, np.ndarray]]:
         """What may be off about a level of a port, by one standard deviation, where it has it."""
         port = PLACES[place][1]
-        here = self.level[bins, port] == place[0]
+        at_level = self.level[bins, port] == place[0]
         if self.gain_std is not None:
-            yield place, np.where(here, self.gain_std, 0.0)
+            yield place, np.where(at_level, self.gain_std, 0.0)
         if self.component_std is not None:
             slopes = self.component_std[PLACES[place]][:, None] * self.slope[band, port][:, bins]
             for number, slope in enumerate(slopes, start=1):
-                yield f"{place} PC{number}", np.where(here, slope, 0.0)
+                yield f"{place} PC{number}", np.where(at_level, slope, 0.0)
 
     def without(self, band: int, gone: Bool[np.ndarray, "products bins"]) -> Reduced:
         """Return the same without some values of a band, which do not fit the map."""
@@ -353,8 +353,8 @@ def _percent(shares: Mapping[str, float]) -> str:
     return ", ".join(f"{name} {share:.2%}" for name, share in shares.items())
 
 
-def _medians(found: Float[np.ndarray, "bands parts"]) -> Float[np.ndarray, " bands"]:
-    return xarray.DataArray(found, dims=("band", "part")).median("part").values
+def _medians(parts: Float[np.ndarray, "bands parts"]) -> Float[np.ndarray, " bands"]:
+    return xarray.DataArray(parts, dims=("band", "part")).median("part").values
 
 
 HINT = "make it with: lusee-bayes reduce SCENARIO SESSION..."

@@ -82,8 +82,8 @@ def reduce_sessions(
             keep = np.zeros(len(level), dtype=bool)
             keep[piece] = True
             starts = range(0, int(keep.sum()), SLAB)
-            here = line.observation.select(keep), np.arange(keep.sum()), level[piece]
-            spectra = reduced.Reduced.blank(like, *here, len(starts))
+            layout = line.observation.select(keep), np.arange(keep.sum()), level[piece]
+            spectra = reduced.Reduced.blank(like, *layout, len(starts))
             for start in starts:
                 slab = _slab(line, recipe, state_of, piece.start + start, next(counts))
                 in_threads(partial(slab, spectra, start), numbers)
@@ -192,19 +192,19 @@ class State:
                 basis[port] = recipe.table.basis(level, port, middles)[:, channels].mean(axis=2)
         of_all = section.bandwidth_mhz, section.degree, averaging, middles, shared
         bands = tuple(ChannelBand.of(f, *of_all) for f in recipe.frequencies_mhz)
-        known = flags.line_bins(recipe.lines_mhz, averaging, middles)
+        lines = flags.line_bins(recipe.lines_mhz, averaging, middles)
         if section.comb == "always":
-            known = known | flags.comb_bins(averaging)
-        return cls(recipe, navgf, levels, bands, basis, known)
+            lines = lines | flags.comb_bins(averaging)
+        return cls(recipe, navgf, levels, bands, basis, lines)
 
     def strengths(self, telemetry: session.Telemetry, n_rows: int) -> Strengths:
         """Return 1, q_1 and q_2 of every port; NaN where it has no level."""
-        found = np.full((n_rows, session.PORTS, 3), np.nan)
+        values = np.full((n_rows, session.PORTS, 3), np.nan)
         for port, level in enumerate(self.levels):
             if level != session.NO_LEVEL:
-                found[:, port, 0] = 1.0
-                found[:, port, 1:] = self.recipe.table.strengths(level, port, telemetry)
-        return found
+                values[:, port, 0] = 1.0
+                values[:, port, 1:] = self.recipe.table.strengths(level, port, telemetry)
+        return values
 
     def lines(self, counts: Counts, frames: Rows, notched: RowFlags) -> flags.Bins:
         """Return the bins with known lines, or of the comb where it is on.
@@ -231,18 +231,18 @@ def _slab(
 ) -> Callable[[reduced.Reduced, int, int], None]:
     """What puts the counts of some spectra, from a row on, into a band."""
     source, first = line.sessions[int(line.session[start])], int(line.row[start])
-    here = slice(first, first + len(counts))
+    rows_read = slice(first, first + len(counts))
     state = state_of(int(source.navgf[first]), tuple(map(str, source.level[first])))
-    telemetry = {name: values[here] for name, values in source.telemetry.items()}
+    telemetry = {name: values[rows_read] for name, values in source.telemetry.items()}
     notched = np.zeros(len(counts), dtype=bool)
     if source.notch is not None:
         # the mean of the comb's channels is subtracted, unless bit 4 says that it is not
-        notch = source.notch[here]
+        notch = source.notch[rows_read]
         notched = ((notch & 0b111) > 0) & ((notch & 0b10000) == 0)
     with naming(source.path):
         strengths = state.strengths(telemetry, len(counts))
-    frames = source.frames[here]
-    lines, saturated = state.lines(counts, frames, notched), source.saturated[here]
+    frames = source.frames[rows_read]
+    lines, saturated = state.lines(counts, frames, notched), source.saturated[rows_read]
 
     def calibrate(spectra: reduced.Reduced, start: int, number: int) -> None:
         """Calibrate, flag and average the channels of a band, into spectra from ``start`` on."""
@@ -258,16 +258,16 @@ def _slab(
         if recipe.section.sign < 0:
             channels[:, session.IMAGINARY] *= -1.0
         finite = np.isfinite(channels)
-        present, there = finite.any(axis=2), finite[:, session.AUTOS]
+        present, with_auto = finite.any(axis=2), finite[:, session.AUTOS]
         # where a product is there, all of it has to be
-        whole = (finite | ~present[..., None]).all(axis=1) & there.any(axis=(1, 2))[:, None]
+        whole = (finite | ~present[..., None]).all(axis=1) & with_auto.any(axis=(1, 2))[:, None]
         good = whole & ~lines[:, at] & ~saturated[:, None]
         # products without an auto of their own do not tell lines
-        filled = np.where(there, channels[:, session.AUTOS], 0.0)
+        filled = np.where(with_auto, channels[:, session.AUTOS], 0.0)
         limit = flags.threshold(recipe.section.false_alarm, session.PORTS)
-        found, z = flags.line_flags(band, filled, frames, good, limit)
-        kept = good & ~found
-        mean_auto = filled.sum(axis=1) / np.maximum(there.sum(axis=1), 1)
+        outliers, z = flags.line_flags(band, filled, frames, good, limit)
+        kept = good & ~outliers
+        mean_auto = filled.sum(axis=1) / np.maximum(with_auto.sum(axis=1), 1)
         clean = np.where(finite, channels, 0.0)
         values, variance, further = band.values(clean, mean_auto, kept)
         before, _, _ = band.values(clean, mean_auto, whole)
@@ -342,8 +342,8 @@ def _flag_bursts(spectra: reduced.Reduced, false_alarm: float, number: int) -> S
     seconds = seconds_from(times[0], times)
     autos, noise = spectra.values[number, session.AUTOS].T, spectra.noise(number).T
     # what is absent neither stands out nor tells
-    there = np.isfinite(autos)
-    autos, noise = np.where(there, autos, 0.0), np.where(there & (noise > 0.0), noise, np.inf)
+    finite = np.isfinite(autos)
+    autos, noise = np.where(finite, autos, 0.0), np.where(finite & (noise > 0.0), noise, np.inf)
     reason = spectra.reason[number]
     burst, scatter = flags.burst_flags(seconds, autos, noise, reason == reduced.USED, false_alarm)
     reason[burst] = reduced.BURST
@@ -354,9 +354,9 @@ def _means(
     values: Float[np.ndarray, "... rows"], weights: Rows, first: Int[np.ndarray, " bins"]
 ) -> Float[np.ndarray, "... bins"]:
     """Weighted means of the finite values of bins from these rows on; NaN where one has none."""
-    known = np.isfinite(values) * weights
-    total = np.add.reduceat(known, first, axis=-1)
-    summed = np.add.reduceat(np.where(known > 0.0, values, 0.0) * weights, first, axis=-1)
+    weight = np.isfinite(values) * weights
+    total = np.add.reduceat(weight, first, axis=-1)
+    summed = np.add.reduceat(np.where(weight > 0.0, values, 0.0) * weights, first, axis=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         return summed / total
 

@@ -191,8 +191,8 @@ class Session(Described, Recorded):
             )
         for value in np.unique(self.navgf):
             if int(value) not in AVERAGING:
-                known = ", ".join(map(str, AVERAGING))
-                raise InputError(f"{self.path}: Navgf is {value}; the flight software has {known}")
+                valid = ", ".join(map(str, AVERAGING))
+                raise InputError(f"{self.path}: Navgf is {value}; the flight software has {valid}")
 
     @property
     def frames(self) -> Rows:
@@ -285,13 +285,13 @@ SAID = {
 }
 
 
-def session_of(path: Path, found: Content, arrays: Mapping[str, Unread], **others: Any) -> Session:
+def session_of(path: Path, parsed: Content, arrays: Mapping[str, Unread], **others: Any) -> Session:
     """Make a session of what a file holds.
 
     Parameters
     ----------
     path : Path
-    found : Content
+    parsed : Content
         Of :data:`ROWS` and :data:`SAID`.
     arrays : mapping of str to array
         All that is there, by names as in :data:`ROWS`, not yet read.
@@ -303,20 +303,20 @@ def session_of(path: Path, found: Content, arrays: Mapping[str, Unread], **other
     InputError
         If counts or gains are not as they should be.
     """
-    if not found.values["spectra/data.bitslice_restored"]:
+    if not parsed.values["spectra/data.bitslice_restored"]:
         raise InputError(
             f"{path}: the bit slices of spectra/data are not restored; ingest the session again "
             "with luseepy"
         )
-    rows, cube = found.arrays, arrays["spectra/data"]
-    n = found.sizes["row"]
+    rows, cube = parsed.arrays, arrays["spectra/data"]
+    n = parsed.sizes["row"]
     if tuple(cube.shape) != (n, 16, N_CHANNELS) or np.dtype(cube.dtype).kind != "f":
         raise InputError(
             f"{path}: spectra/data has shape {tuple(cube.shape)} and type {cube.dtype}, expected "
             f"({n}, 16, {N_CHANNELS}) real numbers"
         )
     none = np.zeros((n, PORTS), dtype=np.int64)
-    said = found.values.get("session_invariants.software_version", "unknown")
+    said = parsed.values.get("session_invariants.software_version", "unknown")
     shift2 = rows[f"{META}/Navg2_shift"]
     averaged = 2.0**shift2
     return Session(
@@ -332,8 +332,8 @@ def session_of(path: Path, found: Content, arrays: Mapping[str, Unread], **other
         errors=rows.get(f"{META}/errors", none[:, 0]),
         notch=rows.get(f"{META}/notch"),
         telemetry={x: rows[name] for x in TELEMETRY if (name := f"telemetry/{x}") in rows},
-        lon_deg=found.values["constants.lun_long_deg"],
-        lat_deg=found.values["constants.lun_lat_deg"],
+        lon_deg=parsed.values["constants.lun_long_deg"],
+        lat_deg=parsed.values["constants.lun_lat_deg"],
         # as versions of the flight software are written: 0x307 for the number 775
         software=f"{int(said):#x}" if said.isascii() and said.isdigit() else said,
         **others,

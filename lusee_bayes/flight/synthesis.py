@@ -79,12 +79,12 @@ class ChannelSpectra:
         autos = values + (at - held)[:, None] * spline(inside, 1)
         return cls(autos, np.zeros(len(at)), values)
 
-    def __call__(self, known: Float[np.ndarray, "nodes products rows"]) -> AllChannels:
+    def __call__(self, visibilities: Float[np.ndarray, "nodes products rows"]) -> AllChannels:
         """Return visibilities in all channels.
 
         Parameters
         ----------
-        known : (nodes, products, rows) array
+        visibilities : (nodes, products, rows) array
             In the package's order.
 
         Raises
@@ -92,10 +92,10 @@ class ChannelSpectra:
         InputError
             If an auto is not positive, or a matrix of visibilities not positive definite.
         """
-        autos = known[:, session.AUTOS]
+        autos = visibilities[:, session.AUTOS]
         require_positive("the autos of the visibilities", autos)
         scale = np.sqrt(autos[:, session.FIRST_PORT] * autos[:, session.SECOND_PORT])
-        matrices = np.moveaxis(to_matrix(np.moveaxis(known / scale, 1, 0)), (0, 1), (-2, -1))
+        matrices = np.moveaxis(to_matrix(np.moveaxis(visibilities / scale, 1, 0)), (0, 1), (-2, -1))
         advice = "voltages cannot have these correlations; check beams and sky"
         wrong = f"the visibilities of a time are not positive definite: {advice}"
         with refusing(wrong, np.linalg.LinAlgError):
@@ -153,12 +153,12 @@ class Counting:
 
     @cached_property
     def _basis(self) -> Float[np.ndarray, "ports 3 channels"]:
-        found = []
+        bases = []
         for port, level in enumerate(self.levels):
             anchors = self.table.anchor_mhz[LETTERS.index(level), port]
             inside = np.clip(session.channel_mhz(self.origin), anchors[0], anchors[-1])
-            found.append(self.table.basis(level, port, inside))
-        return np.array(found)
+            bases.append(self.table.basis(level, port, inside))
+        return np.array(bases)
 
     def __call__(self, spectra: AllChannels, telemetry: session.Telemetry) -> Counts:
         """Return counts before they are rounded.
@@ -182,12 +182,12 @@ class Counting:
             root.append(np.sqrt(np.maximum(gain, 0.0)))
         averaging = session.AVERAGING[self.navgf]
         members = averaging.channels()
-        found = np.empty((spectra.shape[1], len(spectra), averaging.n_bins))
+        summed = np.empty((spectra.shape[1], len(spectra), averaging.n_bins))
         for k, product in enumerate(spectra):
             counts = product * (root[session.FIRST_PORT[k]] * root[session.SECOND_PORT[k]]) / NANO2
             counts = counts[:, members].sum(axis=2) / averaging.stride
-            found[:, session.OF_FLIGHT[k]] = counts * (self.sign if session.IMAGINARY[k] else 1)
-        return found
+            summed[:, session.OF_FLIGHT[k]] = counts * (self.sign if session.IMAGINARY[k] else 1)
+        return summed
 
 
 def bit_slices(counts: Counts) -> Int[np.ndarray, " products"]:
@@ -303,9 +303,9 @@ class Disturbances:
             length_s = step_s * max(section.burst_s / step_s, 1.0) ** generator.uniform()
             # at least one spectrum, up to the end of the burst
             first = int(np.searchsorted(hours, at))
-            here = slice(first, max(first + 1, np.searchsorted(hours, at + length_s / 3600.0)))
-            burst[here] = True
-            phase[here] = generator.uniform(0.0, 2.0 * np.pi, session.PORTS)
+            stretch = slice(first, max(first + 1, np.searchsorted(hours, at + length_s / 3600.0)))
+            burst[stretch] = True
+            phase[stretch] = generator.uniform(0.0, 2.0 * np.pi, session.PORTS)
         return cls(section, level, absent, saturated, tone, tones, comb, burst, phase)
 
     def add(self, t: Covariances, rows: slice, frames: float) -> None:
@@ -324,10 +324,10 @@ class Disturbances:
         lines = self.section.tone_factor * (self.tone[rows, None] & self.tone_channel)
         lines = lines + self.section.comb_factor * (self.comb[rows, None] & comb)
         t += level * lines
-        if (here := np.flatnonzero(self.burst[rows])).size:
-            wave = np.exp(1j * self.phase[rows][here]).T
-            power = level[here] * self.section.burst_factor / np.sqrt(BURST_CHANNELS)
-            t[:, :, here] += wave[:, None, :, None] * wave.conj()[None, :, :, None] * power
+        if (bursts := np.flatnonzero(self.burst[rows])).size:
+            wave = np.exp(1j * self.phase[rows][bursts]).T
+            power = level[bursts] * self.section.burst_factor / np.sqrt(BURST_CHANNELS)
+            t[:, :, bursts] += wave[:, None, :, None] * wave.conj()[None, :, :, None] * power
 
     def truth(self) -> dict[str, np.ndarray]:
         """Return the table of what is where."""
@@ -346,10 +346,10 @@ def _tone_channels(
         far = np.abs(mhz - tone_mhz)
         channel = int(far.argmin())
         if not kept[channel]:
-            there = mhz[np.where(kept, far, np.inf).argmin()]
+            nearest = mhz[np.where(kept, far, np.inf).argmin()]
             raise InputError(
                 f"the tone at {tone_mhz:g} MHz is in channel {channel}, which Navgf {navgf} drops, "
-                f"so that it would be in no spectrum; use {there:.6g} MHz in "
+                f"so that it would be in no spectrum; use {nearest:.6g} MHz in "
                 "flight.simulated.tones_mhz, or another flight.simulated.navgf"
             )
         tones[channel] = True
@@ -358,9 +358,9 @@ def _tone_channels(
 
 def _drawn_stretches(generator: np.random.Generator, n: int, share: float, length: int) -> RowFlags:
     """About this share of the spectra, in stretches."""
-    found = np.zeros(n, dtype=bool)
+    chosen = np.zeros(n, dtype=bool)
     if share == 0.0:
-        return found
+        return chosen
     for start in np.flatnonzero(generator.uniform(size=n) < share / length):
-        found[start : start + length] = True
-    return found
+        chosen[start : start + length] = True
+    return chosen
