@@ -160,9 +160,9 @@ class TimeBandedFactor(Factor):
         flat = grid.reshape(layout.n_times * layout.n_products, -1)
         padded = jnp.pad(flat, ((0, n * rows - len(flat)), (0, 0)))
         parts = (self.left, across, padded.reshape(n, rows, -1))
-        _, found = jax.lax.scan(step, jnp.zeros((window, flat.shape[1])), parts, reverse=reverse)
-        found = found.reshape(n * rows, -1)[: len(flat)]
-        return layout.from_times(found.reshape(grid.shape), x.shape)
+        _, swept = jax.lax.scan(step, jnp.zeros((window, flat.shape[1])), parts, reverse=reverse)
+        swept = swept.reshape(n * rows, -1)[: len(flat)]
+        return layout.from_times(swept.reshape(grid.shape), x.shape)
 
     @eqx.filter_jit
     def whiten(self, x):
@@ -323,9 +323,9 @@ def _cholesky(left: Array, diagonal: Array) -> tuple[Array, Array]:
         before, on = row
         solved = linalg.solve_lower(reach, before.T, transpose=False).T
         # Cholesky's value needs the lower triangle only, its derivative a symmetric matrix
-        rest = jnp.tril(on - solved @ solved.T)
-        rest = rest + jnp.tril(rest, -1).T
-        lower = jax.lax.linalg.cholesky(rest, symmetrize_input=False)
+        schur = jnp.tril(on - solved @ solved.T)
+        schur = schur + jnp.tril(schur, -1).T
+        lower = jax.lax.linalg.cholesky(schur, symmetrize_input=False)
         shifted = jnp.zeros_like(reach).at[:-rows, :-rows].set(reach[rows:, rows:])
         new = jnp.concatenate([solved[:, rows:], jnp.tril(lower)], axis=1)
         return shifted.at[-rows:].set(new), (solved, jnp.tril(lower))
