@@ -22,6 +22,7 @@ from .runs.data_run import run_average as run_average
 from .runs.data_run import run_reduce as run_reduce
 from .runs.data_run import run_simulate as run_simulate
 from .runs.data_run import run_simulate_flight as run_simulate_flight
+from .runs.export_run import run_export as run_export
 from .runs.map_run import run_map as run_map
 from .runs.paper_run import run_paper as run_paper
 from .runs.plan_run import run_plan as run_plan

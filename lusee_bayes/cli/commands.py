@@ -24,6 +24,7 @@ from lusee_bayes.cli.options import (
     EngineOptions,
     Flag,
     Frequencies,
+    Licence,
     Many,
     Number,
     Options,
@@ -476,6 +477,50 @@ def report_command(folder: Path, *, quiet: Quiet = False) -> None:
     from lusee_bayes.report.pages import write_report
 
     say(Console(quiet=quiet, soft_wrap=True), f"look at {write_report(folder)}")
+
+
+@app.command(name="export", group="Results")
+def export_command(
+    run: Path,
+    *,
+    release: Path,
+    creator: Annotated[tuple[str, ...], Repeated] = (),
+    doi: str = "",
+    license: Licence = "CC-BY-4.0",
+    quiet: Quiet = False,
+) -> None:
+    """Bundle a finished run for publication, with checksums, DataCite metadata and a licence.
+
+    The folder has no subfolders, as archives expect. read_it.py in it reads the map without
+    lusee_bayes. The command lists what is still to be filled in.
+
+    **Examples**
+
+    - ``lusee-bayes export output/fiducial --release fiducial_release``
+    - ``lusee-bayes export output/fiducial --release out --creator "Galilei, Galileo"``
+
+    Parameters
+    ----------
+    run
+        Results of map, sample or validate.
+    release
+        Folder to write; it must not exist.
+    creator
+        Creator of the data set: "Family, Given", or the name of a group; may be repeated.
+    doi
+        DOI of the data set, without https, such as one reserved at the archive.
+    license
+        Licence of the files (SPDX identifier).
+    quiet
+        Print only errors.
+    """
+    from lusee_bayes.runs.export_run import BLANK, METADATA, run_export
+
+    written = run_export(run, release, creators=creator, doi=doi, licence=license)
+    lines = [f"{len(written.files)} files in {release}"]
+    for blank in written.result:
+        lines.append(f"{blank}: replace {BLANK} in {release / METADATA}")
+    say(Console(quiet=quiet, soft_wrap=True), *lines)
 
 
 @app.command(name="info", group="Data")

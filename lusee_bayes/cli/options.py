@@ -224,6 +224,7 @@ class EngineOptions:
 
 
 Algorithm = Literal["nuts", "hmc", "crank-nicolson"]
+Licence = Literal["CC-BY-4.0", "CC0-1.0"]
 
 
 @Parameter(name="*")

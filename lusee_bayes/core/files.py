@@ -371,3 +371,29 @@ def replacing(path: str | Path) -> Iterator[Path]:
         os.replace(partial, path)
     finally:
         partial.unlink(missing_ok=True)
+
+
+@contextmanager
+def new_folder(folder: Path) -> Iterator[Path]:
+    """Write a new folder whole or not at all.
+
+    Yields
+    ------
+    Path
+        A scratch folder beside ``folder``, which takes its name when all is done.
+
+    Raises
+    ------
+    InputError
+        If ``folder`` exists, and as :func:`require_folder`.
+    """
+    require_folder(folder)
+    if folder.exists():
+        raise InputError(f"'{folder}' exists already; give the name of a new folder")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=SCRATCH, dir=folder.parent) as scratch:
+        # not the scratch folder itself, which only its owner may read
+        stage = Path(scratch) / folder.name
+        stage.mkdir()
+        yield stage
+        os.rename(stage, folder)

@@ -1,0 +1,93 @@
+"""A finished run as a folder to be published, for readers who do not have the package.
+
+The run's files, checksums, metadata of DataCite, a licence and a reader. Their texts are templates
+in ``report/templates/release``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+from lusee_bayes.core import files
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.reading import parse_yaml, read_text
+from lusee_bayes.report.describe import describe_folder
+from lusee_bayes.report.rendering import render_text
+from lusee_bayes.results.finished_runs import NAME, Provenance
+from lusee_bayes.runs.folder import RunOutcome
+
+# of one frequency, and of several
+MAPS = {"map.fits", "mean.fits"}
+BLANK = "TO BE FILLED IN"
+METADATA, SUMS = "datacite.json", "SHA256SUMS"
+TEXTS = (METADATA, "LICENSE", "README.md", "read_it.py")
+
+
+def run_export(
+    run: str | Path,
+    folder: str | Path,
+    *,
+    creators: Sequence[str] = (),
+    doi: str = "",
+    licence: str = "CC-BY-4.0",
+) -> RunOutcome[list[str]]:
+    """Bundle a finished run for publication, whole or not at all.
+
+    Parameters
+    ----------
+    run : path
+        Folder of a finished run of ``map``, ``sample`` (of one frequency) or ``validate``.
+    folder : path
+        Of the release, which must not exist. All files are at its top, since archives know no
+        folders; ``report.html`` contains the figures.
+    creators : sequence of str
+        ``"Family, Given"``, or the name of a group.
+    doi : str
+        Of the release, if it is known.
+    licence : str
+        ``CC-BY-4.0`` or ``CC0-1.0``.
+
+    Returns
+    -------
+    RunOutcome
+        Its result lists the entries of ``datacite.json`` that are still to be filled in. This file
+        is meant to be edited, and not in ``SHA256SUMS``.
+
+    Raises
+    ------
+    InputError
+        If ``run`` is not the folder of such a run or lacks a file, if ``folder`` exists already, or
+        if ``doi`` is not a DOI.
+    """
+    run, folder = files.user_path(run), files.user_path(folder)
+    (_, *lines, _), manifest = describe_folder(run), files.read_manifest(run)
+    names = [name for name in manifest["files"] if "/" not in name]
+    if NAME not in names or not MAPS & {*names}:
+        raise InputError(f"'{run}' has no map; give the folder of a run of map, sample or validate")
+    files.require_files(run, names, manifest["kind"])
+    if doi and not (doi.startswith("10.") and "/" in doi):
+        raise InputError(f"'{doi}' is not a DOI; give it without https, such as 10.5281/zenodo.1")
+    scenario = parse_yaml(read_text(run / "scenario.yaml", "a scenario"), "scenario.yaml")
+    origin = {"lines": lines, "scenario": scenario, "provenance": Provenance.read(run)}
+    given = {"creators": creators or [BLANK], "doi": doi or BLANK, "licence": licence}
+    context = origin | given | {"names": names, "year": datetime.now(UTC).year}
+    with files.new_folder(folder) as stage:
+        for name in names:
+            shutil.copyfile(run / name, stage / name)
+        for name in TEXTS:
+            text = render_text(f"release/{name}.jinja", **context)
+            (stage / name).write_text(text, encoding="utf-8")
+        summed = sorted({*names, *TEXTS} - {METADATA})
+        sums = "".join(f"{_sha256(stage / name)}  {name}\n" for name in summed)
+        (stage / SUMS).write_text(sums, encoding="utf-8")
+    blanks = [name for name, value in {"creators": creators, "doi": doi}.items() if not value]
+    return RunOutcome(blanks, folder, [folder / name for name in (*summed, METADATA, SUMS)])
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
