@@ -107,9 +107,9 @@ def sky_above(
     parameters : (parameters,) array, optional
         Of the setup's family of priors, learned from the data; by default what is expected of them.
     """
-    scenario, n, known = setup.scenario, setup.prior.size, setup.above
+    scenario, n, above = setup.scenario, setup.prior.size, setup.above
     frequency_mhz, lmax = scenario.frequency_mhz, scenario.noise.above_lmax.top(scenario.lmax)
-    if known is None:
+    if above is None:
         sky, family = (
             scenario.sky.at(frequency_mhz, lmax),
             scenario.prior.family(frequency_mhz, lmax),
@@ -117,7 +117,7 @@ def sky_above(
         coupling, modes = _coupling(setup, lmax), np.asarray(sky.modes)[n:]
         prior = None if family is not None else scenario.prior.prior(sky)
     else:
-        coupling, modes, family = known.coupling, known.modes, known.family
+        coupling, modes, family = above.coupling, above.modes, above.family
     if family is None:
         covariance, mean = prior.covariance(), prior.mean
     else:

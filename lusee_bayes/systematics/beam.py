@@ -127,8 +127,8 @@ def _true(section: BeamErrorSection, setup: Setup, values: Values) -> tuple[Beam
         # behind the same receivers, turned as the scenario's
         other = setup.scenario.beam.of_file(section.file).source()
         return other.behind(setup.receiver), frequency_mhz
-    own = {name: values[name] for name in section.parameters}
-    return source.with_values(own), frequency_mhz
+    chosen = {name: values[name] for name in section.parameters}
+    return source.with_values(chosen), frequency_mhz
 
 
 def difference_of_beams(section: BeamErrorSection, setup: Setup) -> BeamModes:
@@ -138,8 +138,8 @@ def difference_of_beams(section: BeamErrorSection, setup: Setup) -> BeamModes:
     modes = instrument_errors.difference(other, setup.instrument.beams()).modes
     if horizon is None:
         return modes
-    there = Horizon.build(horizon, replace(setup, beam_source=source, beams=other), Around())
-    return modes + there.hidden(dict.fromkeys(there.names, 0.0)) - setup.hidden
+    terrain = Horizon.build(horizon, replace(setup, beam_source=source, beams=other), Around())
+    return modes + terrain.hidden(dict.fromkeys(terrain.names, 0.0)) - setup.hidden
 
 
 class BeamError(BeamErrors):
@@ -201,10 +201,10 @@ class InstrumentParameters(ChangedBeams, BeamErrors):
         InputError
             For unknown names, and for a prior that reaches out of a parameter's domain.
         """
-        known = {name: instrument.source.parameter(name) for name in stds}
+        parameters = {name: instrument.source.parameter(name) for name in stds}
         priors = tuple(
             Unknown(name, float(p.value), float(stds[name]), low=float(p.low), high=float(p.high))
-            for name, p in known.items()
+            for name, p in parameters.items()
         )
         for unknown in priors:
             unknown.prior()

@@ -64,8 +64,8 @@ class Above:
 
     def kept(self, place: Callable[[Array], Array]) -> Above:
         """The same for other data; ``place`` finds theirs in an array of these."""
-        own = {name: place(getattr(self, name)) for name in ("coupling", "root", "mean")}
-        return replace(self, **own)
+        arrays = {name: place(getattr(self, name)) for name in ("coupling", "root", "mean")}
+        return replace(self, **arrays)
 
 
 @dataclass(frozen=True)

@@ -117,12 +117,12 @@ class FieldErrors(ChangedBeams):
         grid, sky = SphereGrid.of(band, band), HemisphereGrid.for_lmax(band)
         source, mhz = setup.beam_source, setup.frequency_mhz
         with naming(cls.key):
-            found = source.fields(mhz, sky)
-        theta, phi = np.asarray(found.e_theta), np.asarray(found.e_phi)
+            beam = source.fields(mhz, sky)
+        theta, phi = np.asarray(beam.e_theta), np.asarray(beam.e_phi)
         cos, sin = np.cos(sky.phi), np.sin(sky.phi)
         fields = np.stack([cos * theta - sin * phi, sin * theta + cos * phi], axis=1)
         power = sky.integrate((np.abs(fields) ** 2).sum(1))
-        unit = np.sqrt(beam_scale(found, source.beams(mhz, 0)) / 2.0)
+        unit = np.sqrt(beam_scale(beam, source.beams(mhz, 0)) / 2.0)
         parts = np.stack([fields.real, fields.imag, np.ones_like(fields.real)])
         real, imaginary, above = grid.synthesise(sky.modes(parts, band))
         return cls(
@@ -138,12 +138,12 @@ class FieldErrors(ChangedBeams):
     @classmethod
     def moved(cls, section: FieldErrorsSection, setup: Setup, values: Values) -> Setup:
         """With the beams of these errors."""
-        found = cls.build(section, setup, Around(values=values))
-        if not any(name in values for name in (found.names[0], found.unknowns[0].name)):
+        errors = cls.build(section, setup, Around(values=values))
+        if not any(name in values for name in (errors.names[0], errors.unknowns[0].name)):
             return setup
-        if found.names[0] in values:
-            values = found.values(found.centre(values))
-        modes = found.modes(np.asarray(setup.beams.modes), values)
+        if errors.names[0] in values:
+            values = errors.values(errors.centre(values))
+        modes = errors.modes(np.asarray(setup.beams.modes), values)
         beams = replace(setup.beams, modes=modes)
         return replace(setup, beams=beams, coupling=setup.coupling.of(modes=modes))
 
@@ -173,8 +173,8 @@ class FieldErrors(ChangedBeams):
     def linearised(self, model, centre):
         """Through what every Y_k conj(E_jc + e_jc) sees, of which all derivatives are made."""
         coupling, n, ells = model.coupling, len(self.sizes), np.arange(len(self.of_ell))
-        there = np.conj(self.fields + self.above * self.errors(self.values(centre)))
-        parts, size = np.stack([there.real, there.imag]), coupling.modes.shape[-1]
+        field = np.conj(self.fields + self.above * self.errors(self.values(centre)))
+        parts, size = np.stack([field.real, field.imag]), coupling.modes.shape[-1]
         rows = [self.grid.analyse(parts * y)[..., :size].reshape(-1, size) for y in self.harmonics]
         # in sets of as many as there are products
         used = np.concatenate(rows)
@@ -191,7 +191,7 @@ class FieldErrors(ChangedBeams):
             seen = seen.reshape(-1, 2, n, 2, layout.n_times)
             # ports, components, harmonics, times
             seen = np.moveaxis(seen[:, 0] + 1j * seen[:, 1], 0, 2) * scale[:, None]
-            found = np.empty((len(first), len(self.names)))
+            matrix = np.empty((len(first), len(self.names)))
             for rows in np.array_split(np.arange(len(first)), 1 + len(first) // BLOCK):
                 at = np.asarray(layout.time)[rows]
                 straight = by_first[rows] * seen[second[rows], :, :, at][:, None]
@@ -200,8 +200,8 @@ class FieldErrors(ChangedBeams):
                 both = np.where(imaginary[rows, None, None, None, None], both.imag, both.real)
                 both = both * self.sizes[:, None, None]
                 parts = [both[..., k].reshape(len(rows), -1) for k in place]
-                found[rows] = np.concatenate(parts, axis=1)
-            return found
+                matrix[rows] = np.concatenate(parts, axis=1)
+            return matrix
 
         return columns
 
@@ -212,8 +212,8 @@ class FieldErrors(ChangedBeams):
     def relearned(self, mean: Vector, variance: Vector) -> dict[str, float]:
         expected = self.expectation
         now = np.asarray(self.of_ell)[0] / of_ell(1.0, expected.slope, expected.lmax)[0]
-        found = float(now * np.sqrt(np.mean(mean**2 + variance)))
-        return {STD: min(max(found, expected.std), LARGEST)}
+        std = float(now * np.sqrt(np.mean(mean**2 + variance)))
+        return {STD: min(max(std, expected.std), LARGEST)}
 
 
 def of_ell(std: float, slope: float, lmax: int) -> Float[np.ndarray, " ells"]:

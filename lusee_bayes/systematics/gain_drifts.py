@@ -328,9 +328,9 @@ class GainCoordinates(Chart):
         log_det = (noise.size - 2 * x[SKY].size) * scale
         if self.factorises:
             before, after = self._shapes(x)
-            own, mixed = self._covariances(before, after)
-            noise = noise + jnp.linalg.solve(own, (noise @ (before - after)).T).T @ after.T
-            change = jnp.linalg.slogdet(mixed)[1] - jnp.linalg.slogdet(own)[1]
+            gains, mixed = self._covariances(before, after)
+            noise = noise + jnp.linalg.solve(gains, (noise @ (before - after)).T).T @ after.T
+            change = jnp.linalg.slogdet(mixed)[1] - jnp.linalg.slogdet(gains)[1]
             log_det = log_det + self.n_antennas * change
         return values | {GAIN_NOISE: noise}, log_det
 

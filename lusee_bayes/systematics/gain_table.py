@@ -111,9 +111,9 @@ class GainTable(Systematic):
     def factors(self, z: Float[Array, " errors"]) -> DataVector:
         """Compute F of every datum, of values in prior standard deviations."""
         n_ports = round(np.sqrt(self.layout.n_products))
-        own = (np.arange(n_ports)[:, None] == np.array(self.port)[None]).astype(np.float64)
+        at_port = (np.arange(n_ports)[:, None] == np.array(self.port)[None]).astype(np.float64)
         first, second, _ = ports(n_ports)
-        gains = 1.0 + own @ (z[:, None] * self.slope)
+        gains = 1.0 + at_port @ (z[:, None] * self.slope)
         return self.layout.gather(namespace(gains).sqrt(gains[first] * gains[second]))
 
     def effect(self, model, values):

@@ -175,17 +175,17 @@ class Horizon(ChangedBeams):
         source, beams, whole = setup.beam_source, setup.beams, HemisphereGrid.for_lmax(0)
         ahead = np.radians(np.array(setup.observation.turntable_deg))[:, None]
         azimuth = np.pi / 2.0 - ahead - 2.0 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS
-        known = section.known(azimuth)
-        highest = min(float(known.max() + np.radians(REACH * section.std_deg)), np.pi / 2.0)
+        altitude = section.known(azimuth)
+        highest = min(float(altitude.max() + np.radians(REACH * section.std_deg)), np.pi / 2.0)
         # polynomials that follow the harmonics, lmax radians for each of angle, and the patterns
         grids = _rings(24 + int(highest * beams.lmax), highest), whole
-        found = [to_real(source.patterns(beams.frequency_mhz, grid)) for grid in grids]
-        patterns, all_round = map(np.asarray, found)
+        sampled = [to_real(source.patterns(beams.frequency_mhz, grid)) for grid in grids]
+        patterns, all_round = map(np.asarray, sampled)
         autos = auto_indices(source.n_ports)
         scale = np.asarray(beams.modes)[autos, 0].mean() / whole.modes(all_round, 0)[autos].mean()
         before = 0.0 if setup.hidden is None else setup.hidden
         series = section.std_deg / (1.0 + section.harmonics) ** 0.5, section.harmonics
-        parts = patterns * scale, azimuth, known, before, highest, beams.lmax, *series
+        parts = patterns * scale, azimuth, altitude, before, highest, beams.lmax, *series
         return cls(*parts, section.moon_temperature_k)
 
     @classmethod
@@ -196,9 +196,9 @@ class Horizon(ChangedBeams):
         """
         names = offset_names(("turntable_deg",), setup.observation.n_runs)
         observation = with_offsets(setup.observation, {n: values[n] for n in names if n in values})
-        found = cls.build(section, replace(setup, observation=observation), Around())
-        hidden = np.asarray(found.hidden({name: values.get(name, 0.0) for name in found.names}))
-        emitted = (found.before - hidden)[..., 0] * found.uniform[0]
+        terrain = cls.build(section, replace(setup, observation=observation), Around())
+        hidden = np.asarray(terrain.hidden({name: values.get(name, 0.0) for name in terrain.names}))
+        emitted = (terrain.before - hidden)[..., 0] * terrain.uniform[0]
         made = replace(
             setup,
             coupling=setup.coupling.of(modes=np.asarray(setup.beams.modes) + hidden),

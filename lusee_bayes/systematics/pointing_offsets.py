@@ -150,7 +150,7 @@ class PointingOffsets(Systematic):
         sources = None
         if setup.responses and setup.scenario.sources.treatment != "ignored":
             sources = MovingSources.of(setup)
-        found = cls(
+        offsets = cls(
             tuple(stds),
             np.array(list(stds.values())),
             np.array([values.get(name, 0.0) for name in CLOCK]),
@@ -161,11 +161,11 @@ class PointingOffsets(Systematic):
             sources,
         )
         if sources is None:
-            return found
+            return offsets
         # those of the setup are there already
-        orientation = found.orientation(dict.fromkeys(stds, 0.0) | dict(values))
-        known = np.asarray(sources.seen(orientation, setup.layout))
-        return replace(found, sources=replace(sources, known=known))
+        orientation = offsets.orientation(dict.fromkeys(stds, 0.0) | dict(values))
+        seen = np.asarray(sources.seen(orientation, setup.layout))
+        return replace(offsets, sources=replace(sources, known=seen))
 
     @classmethod
     def moved(cls, section: PointingSection, setup: Setup, values: Values) -> Setup:
@@ -180,8 +180,8 @@ class PointingOffsets(Systematic):
 
     def turned(self, values: Values) -> Pointing:
         """The pointing of values by name."""
-        known = dict(zip(CLOCK, self.about, strict=True))
-        left = {name: values[name] - known.get(name, 0.0) for name in self.offsets}
+        clock = dict(zip(CLOCK, self.about, strict=True))
+        left = {name: values[name] - clock.get(name, 0.0) for name in self.offsets}
         return turned_by_offsets(self.pointing, self.hours, left)
 
     def effect(self, model, values):
@@ -313,10 +313,10 @@ class MovingSources(eqx.Module):
         """What they add to the data, in K; differentiable but where a source rises or sets."""
         turned = jnp.einsum("sti,tij->stj", self.directions, orientation[self.sample])
         shape = (layout.n_products, *turned.shape[:2])
-        known = (self.frequency_mhz, turned.reshape(-1, 3), self.monopoles)
-        response = beams_towards(*known).reshape(shape)
+        inputs = (self.frequency_mhz, turned.reshape(-1, 3), self.monopoles)
+        response = beams_towards(*inputs).reshape(shape)
         if self.stokes_v is not None:
-            circular = beams_towards(*known, stokes="V").reshape(shape)
+            circular = beams_towards(*inputs, stokes="V").reshape(shape)
             response = response + self.stokes_v[None, :, None] * circular
         both = jnp.einsum("kst,s,t->kt", response, self.fluxes, self.weight)
         grid = jnp.zeros((layout.n_products, layout.n_times)).at[:, self.sample].add(both)

@@ -60,8 +60,8 @@ class SpectrumSection(Section):
     @property
     def samples(self) -> bool:
         """Whether something of the prior is to be sampled."""
-        known = self.log_amplitude_std is None and self.tilt_std is None
-        return not known or bool(self.band_edges)
+        fixed = self.log_amplitude_std is None and self.tilt_std is None
+        return not fixed or bool(self.band_edges)
 
 
 class PriorSpectrum(Scale):
@@ -105,15 +105,15 @@ class PriorSpectrum(Scale):
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
         """The sites ``amplitude`` and ``tilt``, or ``band_power``: lowest ells first."""
-        found = []
+        sites = []
         if self.log_amplitude_std is not None:
-            found.append(Unknown("amplitude", 1.0, self.log_amplitude_std, log=True))
+            sites.append(Unknown("amplitude", 1.0, self.log_amplitude_std, log=True))
         if self.tilt_std is not None:
-            found.append(Unknown("tilt", 0.0, self.tilt_std))
+            sites.append(Unknown("tilt", 0.0, self.tilt_std))
         if self.edges:
             n_bands = len(self.edges) + 1
-            found.append(Unknown("band_power", 1.0, self.log_band_std, n_bands, log=True))
-        return tuple(found)
+            sites.append(Unknown("band_power", 1.0, self.log_band_std, n_bands, log=True))
+        return tuple(sites)
 
     def effect(self, model, values):
         """Multiply C_ell by the factor of each ell.

@@ -95,9 +95,9 @@ class Receivers(Temperatures):
     @classmethod
     def build(cls, section: ReceiverNoiseSection, setup: Setup, around: Around) -> Receivers:
         powers = section.powers(setup.beam_source, setup.frequency_mhz)
-        own = np.asarray(setup.layout.product)[:, None] == auto_indices(len(powers))[None]
+        on_auto = np.asarray(setup.layout.product)[:, None] == auto_indices(len(powers))[None]
         sites = tuple(f"receiver_{port}_k" for port in range(len(powers)))
-        return cls(sites, powers, section.relative_std * powers, own.astype(np.float64))
+        return cls(sites, powers, section.relative_std * powers, on_auto.astype(np.float64))
 
     @classmethod
     def truth(cls, section: ReceiverNoiseSection, setup: Setup, key: PRNGKeyArray) -> Truth:
@@ -105,8 +105,8 @@ class Receivers(Temperatures):
             return super().truth(section, setup, key)
         octave = float(np.log2(setup.frequency_mhz))
         receivers = cls.build(section, setup, Around())
-        own, n = cls.own_key(key), len(receivers.unknowns)
-        return receivers.values(_smooth_spectra(own, n, octave / section.smooth_octaves))
+        own_key, n = cls.own_key(key), len(receivers.unknowns)
+        return receivers.values(_smooth_spectra(own_key, n, octave / section.smooth_octaves))
 
 
 def _smooth_spectra(key: PRNGKeyArray, n_ports: int, x: float) -> Float[np.ndarray, " ports"]:

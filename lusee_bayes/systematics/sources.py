@@ -84,13 +84,13 @@ class SourceSection(Section):
             return galactic_unit_vector(self.ra_deg, self.dec_deg)
         if self.name in BODIES:
             return body_direction(self.name, observation)
-        known = CATALOGUE.get(self.name)
-        if known is None:
+        source = CATALOGUE.get(self.name)
+        if source is None:
             raise InputError(
                 f"unknown source '{self.name}'; {nearest(self.name, [*CATALOGUE, *BODIES])} (or "
                 "give ra_deg and dec_deg)"
             )
-        return galactic_unit_vector(known.ra_deg, known.dec_deg)
+        return galactic_unit_vector(source.ra_deg, source.dec_deg)
 
     def blocks(self, observation: Observation) -> Int[np.ndarray, " times"]:
         """Which of its amplitudes belongs to each time."""

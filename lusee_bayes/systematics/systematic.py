@@ -286,10 +286,10 @@ class Systematic(eqx.Module):
         key : PRNG key
             Of :meth:`true_seed`.
         """
-        found = cls.build(section, setup, Around())
-        z = np.asarray(jax.random.normal(cls.own_key(key), (len(found.names),)))
+        built = cls.build(section, setup, Around())
+        z = np.asarray(jax.random.normal(cls.own_key(key), (len(built.names),)))
         drawn = {
-            name: value if value.ndim else float(value) for name, value in found.values(z).items()
+            name: value if value.ndim else float(value) for name, value in built.values(z).items()
         }
         said = getattr(section, "true_values", {})
         for name in said:
@@ -327,8 +327,8 @@ class Systematic(eqx.Module):
         """
         if cls.moves_setup:
             return model
-        found = cls.build(section, setup, Around())
-        return found.effect(model, {u.name: truth[u.name] for u in found.unknowns})
+        built = cls.build(section, setup, Around())
+        return built.effect(model, {u.name: truth[u.name] for u in built.unknowns})
 
     # --- its unknowns ---
 
@@ -363,12 +363,12 @@ class Systematic(eqx.Module):
 
     def values(self, z: Float[Array, " n"]) -> dict[str, float | Float[Array, "..."]]:
         """Values by site, of numbers in prior standard deviations from the prior mean."""
-        found, first = {}, 0
+        by_site, first = {}, 0
         for u in self.unknowns:
-            own = z[first] if u.size is None else z[first : first + u.size]
-            found[u.name] = u.at(own)
+            numbers = z[first] if u.size is None else z[first : first + u.size]
+            by_site[u.name] = u.at(numbers)
             first += u.size or 1
-        return found
+        return by_site
 
     def stacked(self, values: Values) -> Float[Array, " n"]:
         """Values by site as one array."""
@@ -384,8 +384,8 @@ class Systematic(eqx.Module):
 
         What has no value is at its mean.
         """
-        own = zip(self.names, self.means, strict=True)
-        return np.array([values.get(name, mean) - mean for name, mean in own]) / self.stds
+        pairs = zip(self.names, self.means, strict=True)
+        return np.array([values.get(name, mean) - mean for name, mean in pairs]) / self.stds
 
     def true(self, truth: Truth) -> dict[str, float]:
         """True values by name, of those by site."""
@@ -788,8 +788,8 @@ class Scale(Systematic):
 
 def present(systematics: Sequence[type[Systematic]], scenario: Any) -> list[tuple[type, Any]]:
     """Those of which a scenario has something, with their sections."""
-    found = [cls for cls in systematics if cls.treatment(scenario) is not None]
-    return [(cls, attrgetter(cls.key)(scenario)) for cls in found]
+    classes = [cls for cls in systematics if cls.treatment(scenario) is not None]
+    return [(cls, attrgetter(cls.key)(scenario)) for cls in classes]
 
 
 def sky_is_sampled(systematics: Sequence[Systematic | Marginalised]) -> bool:
