@@ -142,8 +142,8 @@ def _with_coordinates(tree: xr.DataTree, model: LinearGaussian, data: Visibiliti
     }
 
     def labelled(dataset: xr.Dataset) -> xr.Dataset:
-        own = {name: given for name, given in coordinates.items() if given[0] in dataset.dims}
-        dataset = dataset.assign_coords(own)
+        chosen = {name: given for name, given in coordinates.items() if given[0] in dataset.dims}
+        dataset = dataset.assign_coords(chosen)
         for values in dataset.data_vars.values():
             if {"mode", "datum"} & set(values.dims):
                 values.attrs["units"] = "K"

@@ -301,12 +301,12 @@ class Checkpoints:
                 f"'{self.folder}' contains an unfinished run ({done} iterations done); continue "
                 "with --resume, or delete the folder"
             )
-        found = read_json(marker, IDENTITY_LAYOUT)
-        for name in sorted({*found, *described}):
-            if found.get(name) != described.get(name):
+        saved = read_json(marker, IDENTITY_LAYOUT)
+        for name in sorted({*saved, *described}):
+            if saved.get(name) != described.get(name):
                 raise InputError(
                     f"the unfinished run in '{self.folder}' has another {name}: "
-                    f"{found.get(name)!s:.40}, now {described.get(name)!s:.40}; resume it with the "
+                    f"{saved.get(name)!s:.40}, now {described.get(name)!s:.40}; resume it with the "
                     "same value, or delete the folder"
                 )
 
@@ -394,21 +394,21 @@ class CrankNicolson(MCMCKernel):
         with numpyro.handlers.trace() as sites:
             returned = given(*args, **kwargs)
         to_draw = jax.tree.leaves(returned, is_leaf=lambda x: isinstance(x, LinearGaussian))
-        total, found = jnp.zeros(()), {self.site: z}
+        total, drawn = jnp.zeros(()), {self.site: z}
         for name, site in sites.items():
             if site["type"] != "sample":
                 continue
             fn, value = site["fn"], site["value"]
             if isinstance(fn, Marginal) and any(fn.model is one for one in to_draw):
                 posterior = fn.model.condition(value).posterior
-                key, own = jax.random.split(key)
-                found[name.removesuffix(programs.DATA) + SKY] = posterior.sample(own)
+                key, subkey = jax.random.split(key)
+                drawn[name.removesuffix(programs.DATA) + SKY] = posterior.sample(subkey)
                 density = posterior.log_evidence
             else:
                 density = fn.log_prob(value).sum()
             scale = site.get("scale")
             total = total - (density if scale is None else scale * density)
-        return jnp.where(jnp.isnan(total), jnp.inf, total), found
+        return jnp.where(jnp.isnan(total), jnp.inf, total), drawn
 
     def init(self, rng_key, num_warmup, init_params, model_args, model_kwargs):
         """The first state, of one chain or of all: a draw of N(0, 1)."""
@@ -432,9 +432,9 @@ class CrankNicolson(MCMCKernel):
         key, of_turn, of_skies, of_choice = jax.random.split(state.rng_key, 4)
         z, turn = state.z[self.site], state.adapt_state.step_size
         p = jax.random.normal(of_turn, z.shape)
-        there = z * jnp.cos(turn) + p * jnp.sin(turn)
-        potential, new = self._looked(model_args, model_kwargs, there, of_skies)
-        gained = state.potential_energy - potential + (there @ there - z @ z) / 2.0
+        proposal = z * jnp.cos(turn) + p * jnp.sin(turn)
+        potential, new = self._looked(model_args, model_kwargs, proposal, of_skies)
+        gained = state.potential_energy - potential + (proposal @ proposal - z @ z) / 2.0
         accept = jnp.exp(jnp.minimum(gained, 0.0))
         taken, i = jax.random.uniform(of_choice) < accept, state.i + 1
         in_warmup = i <= self.warmup
@@ -457,8 +457,8 @@ class CrankNicolson(MCMCKernel):
         given = self.model, model_args, model_kwargs
 
         def sites(z: dict[str, Array]) -> dict[str, Array]:
-            own = {self.site: z[self.site]}
-            return z | constrain_fn(*given, own, return_deterministic=True)
+            site = {self.site: z[self.site]}
+            return z | constrain_fn(*given, site, return_deterministic=True)
 
         return sites
 

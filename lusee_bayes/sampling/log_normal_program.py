@@ -128,15 +128,15 @@ class StraightSky(Chart):
     def from_values(self, values):
         sky, scales, along, white = self._begun(values)
         shift = self.across.T @ (white - self.white)
-        found = jnp.zeros_like(along)
+        straight = jnp.zeros_like(along)
         for group in self._groups():
             push = self._correction(sky, white, scales, group)
             shift = shift.at[group.start :].add(push)
-            own = (along - shift)[group]
-            found = found.at[group].set(own / scales[group])
-            push = push.at[: group.stop - group.start].add(own)
+            part = (along - shift)[group]
+            straight = straight.at[group].set(part / scales[group])
+            push = push.at[: group.stop - group.start].add(part)
             white = white + self.across[:, group.start :] @ push
-        return {**values, STRUCTURE: values[STRUCTURE] + self.across @ (found - along)}
+        return {**values, STRUCTURE: values[STRUCTURE] + self.across @ (straight - along)}
 
     def _groups(self) -> list[slice]:
         return [slice(first, end) for first, end in pairwise(self.bounds)]
@@ -229,25 +229,25 @@ def find_mode(
     require_shape("the information", information.matrix, (sky.n_modes, sky.n_modes))
     white = np.zeros(sky.size) if start is None else np.array(start, dtype=np.float64)
     require_shape("the start", white, (sky.size,))
-    here, moved, damping, least = information.recentred(sky.modes(white)), np.inf, 0.0, 0.0
+    local, moved, damping, least = information.recentred(sky.modes(white)), np.inf, 0.0, 0.0
     for steps in range(MAX_STEPS + 1):
         jacobian = sky.jacobian(white)
-        curvature = linalg.symmetric_product(jacobian.T @ here.matrix, jacobian)
+        curvature = linalg.symmetric_product(jacobian.T @ local.matrix, jacobian)
         curvature[np.diag_indices(len(curvature))] += 1.0
         lower = linalg.checked_cholesky("the curvature of the posterior", curvature)
-        slope = white - jacobian.T @ here.vector
+        slope = white - jacobian.T @ local.vector
         half = linalg.solve_lower(lower, slope[:, None], transpose=False)
         moved = float(np.linalg.norm(half))
         if moved < (SETTLED if steps < PATIENCE else ROUGH):
-            return LogNormalMode(sky, here, white, jacobian, lower)
+            return LogNormalMode(sky, local, white, jacobian, lower)
         if damping:
             damped = curvature + damping * np.eye(sky.size)
             lower = linalg.checked_cholesky("the damped curvature", damped)
             half = linalg.solve_lower(lower, slope[:, None], transpose=False)
-        step, energy = linalg.solve_lower(lower, half, transpose=True)[:, 0], _energy(here, white)
-        white, here = _descended(sky, here, white, step, moved < SHORT)
+        step, energy = linalg.solve_lower(lower, half, transpose=True)[:, 0], _energy(local, white)
+        white, local = _descended(sky, local, white, step, moved < SHORT)
         promised = float(2.0 * step @ slope - step @ curvature @ step)
-        gained = (energy - _energy(here, white)) / max(promised, ROUNDING)
+        gained = (energy - _energy(local, white)) / max(promised, ROUNDING)
         if promised > ROUNDING and gained < POOR:
             damping = max(DAMPING * damping, 1.0)
             least = damping if moved < SHORT else least
@@ -266,19 +266,19 @@ def _energy(information: Information, white: Unknowns) -> float:
 
 
 def _descended(
-    sky: LogNormalSky, here: Information, white: Unknowns, step: Unknowns, short: bool
+    sky: LogNormalSky, local: Information, white: Unknowns, step: Unknowns, short: bool
 ) -> tuple[Unknowns, Information]:
     """The unknowns behind a step, and the information about their sky."""
-    energy = _energy(here, white)
+    energy = _energy(local, white)
     for _ in range(HALVINGS):
         trial = white - step
         # far from the mode the sky may leave the range of numbers, which no energy is below
         with np.errstate(over="ignore", invalid="ignore"):
-            there = here.recentred(sky.modes(trial))
-            if short or _energy(there, trial) < energy:
-                return trial, there
+            moved = local.recentred(sky.modes(trial))
+            if short or _energy(moved, trial) < energy:
+                return trial, moved
         step = 0.5 * step
-    return white, here
+    return white, local
 
 
 def learn_spectrum(prior: LogNormalPrior, information: Information) -> LogNormalMode:
@@ -377,9 +377,9 @@ def straight_coordinates(mode: LogNormalMode) -> Whitening:
     log_det, mean = -np.log(np.diagonal(mode.lower)).sum(), mode.white
     sites: tuple[tuple[str, tuple[int, ...]], ...] = ((STRUCTURE, (mode.sky.size,)),)
     if mode.power_law is not None:
-        own = np.linalg.cholesky(mode.covariance)
-        log_det = log_det + np.log(np.diagonal(own)).sum()
-        mean, root = np.concatenate([mode.power_law, mean]), block_diag(own, root)
+        law_root = np.linalg.cholesky(mode.covariance)
+        log_det = log_det + np.log(np.diagonal(law_root)).sum()
+        mean, root = np.concatenate([mode.power_law, mean]), block_diag(law_root, root)
         sites = ((AMPLITUDE, ()), (TILT, ()), *sites)
     return on_device(Whitening(mean, root, np.asarray(log_det), sites, chart))
 

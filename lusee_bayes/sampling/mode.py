@@ -262,9 +262,9 @@ def laplace_approximation(
     heights = jax.lax.map(problem.value, drawn)
     best = jnp.argsort(jnp.where(jnp.isnan(heights), jnp.inf, heights))[: starts - 1]
     places = jnp.concatenate([first[None], drawn[best]])
-    found = jax.lax.map(lambda place: _climb(problem, place, free, scale), places)
-    weight = jnp.where(found.converged, found.log_evidence, -jnp.inf)
-    return jax.tree.map(lambda leaf: leaf[jnp.argmax(weight)], found)
+    modes = jax.lax.map(lambda place: _climb(problem, place, free, scale), places)
+    weight = jnp.where(modes.converged, modes.log_evidence, -jnp.inf)
+    return jax.tree.map(lambda leaf: leaf[jnp.argmax(weight)], modes)
 
 
 def _unconstrained(site: dict) -> Float[Array, "..."]:

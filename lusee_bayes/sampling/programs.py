@@ -166,17 +166,17 @@ def load_program(source: str | Path) -> Program:
         raise InputError(
             f"'{path}' has no function 'model'; a program is def model(..., data=None)"
         )
-    asked, known = inspect.signature(model).parameters, [*PIECES, *EXPERIMENT_PIECES]
+    asked, pieces = inspect.signature(model).parameters, [*PIECES, *EXPERIMENT_PIECES]
     for name, argument in asked.items():
         if argument.kind not in (argument.POSITIONAL_OR_KEYWORD, argument.KEYWORD_ONLY):
             raise InputError(
                 f"model in '{path}' takes '{name}' by position, or variably many; arguments are "
                 "passed by name: def model(coupling, prior, noise, data=None)"
             )
-        if name != DATA and name not in known:
+        if name != DATA and name not in pieces:
             raise InputError(
                 f"model in '{path}' asks for '{name}', which is neither data nor a piece; "
-                f"{nearest(name, known)}"
+                f"{nearest(name, pieces)}"
             )
     if DATA not in asked or asked[DATA].default is not None:
         raise InputError(
@@ -190,24 +190,24 @@ def _find(source: str | Path) -> Path:
     names = program_names()
     if str(source) in names:
         return next(f / f"{source}.py" for f in FOLDERS if (f / f"{source}.py").exists())
-    path, own = user_path(source), ", ".join(names)
+    path, programs = user_path(source), ", ".join(names)
     if path.suffix == ".py":
-        return require_file(path, "program", f"the package has {own}")
-    raise InputError(f"no program '{source}': give the path of a Python file, or one of {own}")
+        return require_file(path, "program", f"the package has {programs}")
+    raise InputError(f"no program '{source}': give the path of a Python file, or one of {programs}")
 
 
 def traced(program: Callable, arguments: Mapping[str, Any]) -> tuple[dict[str, dict], Any]:
     """Return the sites of a program by name, and what it returns, without running it."""
-    found = []
+    traces = []
 
     def run(arguments):
         with handlers.trace() as sites:
             returned = handlers.seed(program, 0)(**arguments)
-        found.append((dict(sites), returned))
+        traces.append((dict(sites), returned))
 
     with numpyro_promotion():
         eqx.filter_eval_shape(run, dict(arguments))
-    return found[0]
+    return traces[0]
 
 
 def is_collapsed(program: Program, arguments: dict[str, Any], data: Array) -> bool:
@@ -362,8 +362,8 @@ def _blaming(who: str, doing: str) -> Iterator[None]:
         yield
     except (Exception, SystemExit) as error:
         frames = traceback.extract_tb(error.__traceback__)
-        own = [frame.lineno for frame in frames if f"'{frame.filename}'" in who]
-        at = f" (line {own[-1]})" if own else ""
+        lines = [frame.lineno for frame in frames if f"'{frame.filename}'" in who]
+        at = f" (line {lines[-1]})" if lines else ""
         raise InputError(f"{who} fails {doing}{at}: {type(error).__name__}: {error}") from error
 
 
@@ -386,6 +386,6 @@ def _require_site(name: str, site: dict[str, Any], latent: bool, who: str) -> No
 
 def _require_shape(site: dict[str, Any], shape: tuple[int, ...], what: str) -> None:
     density = tuple(site["fn"].shape()) if site["type"] == "sample" else shape
-    for found in (jnp.shape(site["value"]), density):
-        if found != shape:
-            raise InputError(f"{what} '{site['name']}' with shape {found}; expected {shape}")
+    for given in (jnp.shape(site["value"]), density):
+        if given != shape:
+            raise InputError(f"{what} '{site['name']}' with shape {given}; expected {shape}")

@@ -39,12 +39,12 @@ def site_in(channel: str, name: str) -> str:
 def of_channel(chains: Chains, channel: str) -> Chains:
     """The draws of one channel, with its own names of sites."""
     start = site_in(channel, "")
-    own = {n.removeprefix(start): v for n, v in chains.sites.items() if n.startswith(start)}
-    return Chains(own, chains.statistics)
+    sites = {n.removeprefix(start): v for n, v in chains.sites.items() if n.startswith(start)}
+    return Chains(sites, chains.statistics)
 
 
 def gaussian_of_sites(
-    known: Mapping[str, Amplitudes],
+    amplitudes: Mapping[str, Amplitudes],
     unknowns: Sequence[Unknown],
     frequencies_mhz: Mapping[str, float],
     octaves: Mapping[str, float],
@@ -54,7 +54,7 @@ def gaussian_of_sites(
 
     Parameters
     ----------
-    known : mapping of Amplitudes
+    amplitudes : mapping of Amplitudes
         What each channel's own data tell of its unknowns.
     unknowns : sequence of Unknown
         Of every channel.
@@ -63,15 +63,15 @@ def gaussian_of_sites(
     latent : sequence of str
         The sites that are sampled: of a single channel by their own names.
     """
-    mhz = np.array([frequencies_mhz[channel] for channel in known])
+    mhz = np.array([frequencies_mhz[channel] for channel in amplitudes])
     sizes = [u.size or 1 for u in unknowns]
-    own = np.eye(len(mhz))
-    tying = [kernel(mhz, octaves[u.name]) if u.name in octaves else own for u in unknowns]
-    mean = np.stack([one.mean for one in known.values()])
-    covariance = np.stack([one.covariance for one in known.values()])
+    untied = np.eye(len(mhz))
+    tying = [kernel(mhz, octaves[u.name]) if u.name in octaves else untied for u in unknowns]
+    mean = np.stack([one.mean for one in amplitudes.values()])
+    covariance = np.stack([one.covariance for one in amplitudes.values()])
     tied = tie(mean, covariance, np.repeat(tying, sizes, axis=0), np.zeros((0, mean.size)))
     sites, parts = [], []
-    for number, channel in enumerate(known):
+    for number, channel in enumerate(amplitudes):
         ends = np.cumsum(sizes)
         for unknown, first, end in zip(unknowns, ends - sizes, ends, strict=True):
             name = unknown.name if unknown.name in latent else site_in(channel, unknown.name)
@@ -112,8 +112,8 @@ class SharedSites:
         returned = []
         for channel, arguments in channels.items():
             with _Channel(self, channel, known):
-                own = None if data is None else data[channel]
-                returned.append(self.program(**arguments, data=own))
+                observed = None if data is None else data[channel]
+                returned.append(self.program(**arguments, data=observed))
         return returned
 
 
