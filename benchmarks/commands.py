@@ -29,7 +29,7 @@ COMMANDS = {
     "--help": ["--help"],
     "info posterior.nc": ["info", "{map}/posterior.nc"],
     "info diagnostics.nc": ["info", "{map}/diagnostics.nc"],
-    "info mean.fits": ["info", "{map}/mean.fits"],
+    "info map.fits": ["info", "{map}/map.fits"],
     "map fiducial": ["map", "fiducial", "-o", "{map}"],
     "map, means over windows": ["map", "fiducial", *MEANS, "-o", "{means}"],
     "map, clock and pointing": ["map", "fiducial", *MEANS, *POINTING, "-o", "{pointing}"],

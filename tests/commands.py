@@ -26,7 +26,7 @@ def judged_map(data: Path, overrides: list[str], out: Path) -> tuple[np.ndarray,
     """Map data that hold their truth; rho of every ell, and the summary of the channel."""
     command = ["map", "fiducial", "--data", data, "--truth", "-o", out, "--quiet"]
     assert run(*command, *sets(*overrides)) == 0
-    rho = np.array([float(row["rho"]) for row in table_of(out / "spectra.csv")])
+    rho = np.array([float(row["rho"]) for row in table_of(out / "spectra.ecsv")])
     (summary,) = json.loads((out / "summary.json").read_text())["channels"]
     return rho, summary
 
@@ -53,9 +53,9 @@ def assert_drawn(*figures: Path) -> None:
 
 
 def table_of(path: Path) -> list[dict[str, str]]:
-    """The rows of a CSV file."""
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+    """The rows of a CSV or ECSV file."""
+    lines = [line for line in path.read_text().splitlines() if not line.startswith("#")]
+    return list(csv.DictReader(lines))
 
 
 def posterior_of(folder: Path) -> xr.DataTree:

@@ -10,7 +10,7 @@ import json
 import os
 import stat
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from io import StringIO
@@ -150,10 +150,10 @@ def read_json(path: str | Path, layout: Layout, hint: str = "") -> dict[str, Any
         If the file cannot be read, is no object, or lacks a value.
     """
     with reading(path, layout.what, hint):
-        found = json.loads(read_text(path, layout.what))
-    if not isinstance(found, dict):
-        raise InputError(f"{path} contains a {type(found).__name__}; expected {layout.what}")
-    return found | layout.checked(path, {}, found).values
+        tree = json.loads(read_text(path, layout.what))
+    if not isinstance(tree, dict):
+        raise InputError(f"{path} contains a {type(tree).__name__}; expected {layout.what}")
+    return tree | layout.checked(path, {}, tree).values
 
 
 def read_model(path: str | Path, kind: type[Model], what: str, hint: str = "") -> Model:
@@ -231,9 +231,9 @@ def read_arrays(path: str | Path, layout: Layout, hint: str = "") -> Content:
     ):
         if not isinstance(arrays, np.lib.npyio.NpzFile):
             raise InputError(f"{path} contains a single array; expected {layout.what}")
-        there = {name: _unloaded(arrays, name) for name in arrays.files}
-        values = {name: arrays[name] for name in layout.attributes if name in there}
-        return layout.checked(path, there, values)
+        members = {name: _unloaded(arrays, name) for name in arrays.files}
+        values = {name: arrays[name] for name in layout.attributes if name in members}
+        return layout.checked(path, members, values)
 
 
 def _unloaded(arrays: np.lib.npyio.NpzFile, name: str) -> Unloaded:
@@ -242,14 +242,6 @@ def _unloaded(arrays: np.lib.npyio.NpzFile, name: str) -> Unloaded:
         major, _ = np.lib.format.read_magic(file)
         header = getattr(np.lib.format, f"read_array_header_{major}_0")(file)
     return Unloaded(header[0], header[2], partial(arrays.__getitem__, name))
-
-
-def write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
-    """Write rows with the keys of the first one as header."""
-    with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
-        writer = csv.DictWriter(file, rows[0])
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 class _Constructor(SafeConstructor):

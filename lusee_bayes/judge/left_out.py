@@ -141,14 +141,16 @@ def groups_of(data: Visibilities) -> list[DataGroup]:
     Returns
     -------
     list of DataGroup
-        Days of 24 hours from the first sample. Runs of one turntable angle are one group.
+        Days of 24 hours from the first sample, by the date on which they begin. Runs of one
+        turntable angle are one group.
     """
     observation, present = data.observation, np.asarray(data.layout.present)
-    day = observation.day
+    day, first = observation.day, np.datetime64(str(observation.times[0].isot)[:19])
     angle = np.asarray(observation.turntable_deg)[observation.run]
     product = np.arange(len(present))[:, None]
     found = [("product", label, product == k) for k, label in enumerate(data.labels)]
-    found += [("day", f"{k}", (day == k)[None]) for k in np.unique(day)]
+    dates = {k: str(first + np.timedelta64(int(k), "D"))[:10] for k in np.unique(day)}
+    found += [("day", date, (day == k)[None]) for k, date in dates.items()]
     found += [("turntable angle", f"{x:g}", (angle == x)[None]) for x in np.unique(angle)]
     groups = [DataGroup(*one, np.broadcast_to(flags, present.shape)) for *one, flags in found]
     return [group for group in groups if (group.data & present).any()]

@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 
 from lusee_bayes.core.files import require_files
-from lusee_bayes.core.harmonics import modes_to_map
+from lusee_bayes.core.harmonics import lmax_of
 from lusee_bayes.flight.reduced import REASONS, REDUCED, Reduced, read_reduced
 from lusee_bayes.judge.chi2 import stands_out
 from lusee_bayes.judge.cube_fit import N_TESTS
 from lusee_bayes.judge.left_out import KINDS
+from lusee_bayes.report.figures.drawing import taper_fwhm_deg
 from lusee_bayes.report.rendering import render_run
-from lusee_bayes.report.viewer import resolution, viewer
-from lusee_bayes.results.channel import ChannelResult, Judged
+from lusee_bayes.report.viewer import viewer
+from lusee_bayes.results.channel import Judged
 from lusee_bayes.results.finished_runs import FinishedRun
 
 # days in the table, the worst first
@@ -50,30 +51,10 @@ def map_page(folder: Path, name: str) -> str:
         judged=[_groups(c.judged) for c in channels],
         unfit=[test.level != "consistent" for test in summary.tests],
         bad=[stands_out(channel.instrument.p, tests) for channel in channels],
-        viewer=_viewer(channels),
+        viewer=viewer(name, channels),
+        smoothing_deg=taper_fwhm_deg(max(lmax_of(len(channels[0].mean)), 1)),
         flight=flight_section(folder),
     )
-
-
-def _viewer(channels: tuple[ChannelResult, ...]) -> dict[str, Any]:
-    nside, frequencies = channels[0].nside, [channel.frequency_mhz for channel in channels]
-    altitude = channels[0].highest_altitude
-    maps = {
-        "mean": np.stack([modes_to_map(channel.mean, nside) for channel in channels]),
-        "std": np.stack([channel.pixel_std for channel in channels]),
-    }
-    if all(channel.truth is not None for channel in channels):
-        maps["truth"] = np.stack([modes_to_map(channel.truth, nside) for channel in channels])
-    details = channels[0].details
-    if details is None:
-        return viewer(frequencies, maps, highest_altitude=altitude)
-    maps["prior_fraction"] = details.prior_fraction[None]
-    for k, sky in enumerate(details.draws, 1):
-        maps[f"draw{k}"] = modes_to_map(sky, nside)[None]
-    names = ("mean", "std", "prior_fraction")
-    regions = {name: getattr(details, f"region_{name}")[None] for name in names}
-    more = {"regions": regions, "resolutions": [resolution(details)]}
-    return viewer(frequencies, maps, highest_altitude=altitude, **more)
 
 
 def _groups(judged: Judged | None) -> dict[str, dict[str, Any]]:

@@ -49,8 +49,8 @@ def render(template: str, folder: Path, **context: Any) -> str:
     InputError
         If the template shows a picture that the folder lacks.
     """
-    pictures = {"picture": partial(picture, folder), "has_picture": partial(has_picture, folder)}
-    return printable(ENVIRONMENT.get_template(template).render(context | pictures))
+    shown = {f.__name__: partial(f, folder) for f in (picture, pictures, has_picture)}
+    return printable(ENVIRONMENT.get_template(template).render(context | shown))
 
 
 def render_text(template: str, **context: Any) -> str:
@@ -61,6 +61,15 @@ def render_text(template: str, **context: Any) -> str:
 def has_picture(folder: Path, name: str) -> bool:
     """Whether a run has a picture of this name."""
     return (folder / "figures" / f"{name}.png").is_file()
+
+
+def pictures(folder: Path, name: str) -> list[str]:
+    """The names of a run's pictures that stand side by side, in their order."""
+    numbered = {
+        int(path.stem.removeprefix(f"{name}_").partition("_")[0]): path.stem
+        for path in (folder / "figures").glob(f"{name}_[0-9]*_*.png")
+    }
+    return [numbered[k] for k in sorted(numbered)]
 
 
 def picture(folder: Path, name: str) -> str:

@@ -297,7 +297,7 @@ class ChannelResult(ChannelData, Described):
         return measures.effective_resolution_deg(self.prior_fraction)
 
     def spectra(self) -> dict[str, Shaped[np.ndarray, " ells"]]:
-        """Columns of spectra.csv; rho, snr and cl_truth only where the truth is known."""
+        """Columns of spectra.ecsv; rho, snr and cl_truth only where the truth is known."""
         truth, alone = self.truth, self.independent
         columns = {
             "ell": np.arange(len(self.prior_fraction)),

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from astropy.io import fits
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from pydantic import BaseModel
 
 from lusee_bayes.core import formats
@@ -66,12 +66,31 @@ def text_hash(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def write_maps(folder: Path, maps: Mapping[str, Pixels], scenario: Scenario) -> None:
-    """Write NAME.fits of maps: HEALPix RING, Galactic, K, float64, for healpy.read_map."""
-    for name, pixels in maps.items():
-        extra = [(key, *value) for key, value in cards(name, scenario).items()]
-        column = {"column_names": [name.upper()], "column_units": "K", "dtype": np.float64}
-        healpy.write_map(folder / f"{name}.fits", pixels, coord="G", extra_header=extra, **column)
+def write_map(
+    path: Path,
+    maps: Mapping[str, Pixels],
+    observed: Bool[np.ndarray, " pixels"],
+    scenario: Scenario,
+) -> None:
+    """Write maps as the columns of a HEALPix file, for ``healpy.read_map(path, field=...)``.
+
+    Parameters
+    ----------
+    path : Path
+    maps : mapping of (pixels,) arrays
+        In K, RING, Galactic, by the names of their columns: the mean first.
+    observed : (pixels,) array of bool
+        Whether the pixel ever rose above the horizon: the third column, OBSERVED, 1 or 0.
+    scenario : Scenario
+    """
+    columns = {name: (pixels, np.float64, "K") for name, pixels in maps.items()}
+    names = list(columns)
+    columns["observed"] = observed, np.uint8, ""
+    order = [*names[:2], "observed", *names[2:]]
+    values, dtypes, units = zip(*(columns[name] for name in order), strict=True)
+    extra = [(key, *value) for key, value in cards("maps", scenario).items()]
+    named = {"column_names": [name.upper() for name in order], "column_units": list(units)}
+    healpy.write_map(path, values, coord="G", extra_header=extra, dtype=list(dtypes), **named)
 
 
 def write_cubes(
@@ -212,10 +231,10 @@ def read_draws(folder: str | Path, frequency_mhz: float | None = None) -> Draws:
     with opened_tree(path, formats.POSTERIOR, "a posterior of lusee-bayes map") as tree:
         if "posterior" not in tree.children:
             raise InputError(f"{path} has no draws; map again with --draws N")
-        known = np.asarray(tree.variables["frequency"])
-        near = np.isclose(known, known if frequency_mhz is None else frequency_mhz)
+        mhz = np.asarray(tree.variables["frequency"])
+        near = np.isclose(mhz, mhz if frequency_mhz is None else frequency_mhz)
         if near.sum() != 1:
-            names = ", ".join(f"{f:g}" for f in known)
+            names = ", ".join(f"{f:g}" for f in mhz)
             raise InputError(f"{path} has channels of {names} MHz; give one as frequency_mhz")
         skies = np.asarray(tree.children["posterior"].variables["sky"])
         return skies[0, :, np.flatnonzero(near)[0]]
@@ -248,13 +267,13 @@ def read_information(path: Path, channel: Scenario) -> SavedInformation:
                 f"{path} is for {', '.join(kept.children)} MHz, the scenario for {name} MHz; use "
                 f"--set frequency_mhz={next(iter(kept.children))}"
             )
-        found = from_tree(SavedInformation, kept.children[name], str(path))
-    if found.information.n_modes != n_modes(channel.lmax):
-        lmax = round(np.sqrt(found.information.n_modes)) - 1
+        saved = from_tree(SavedInformation, kept.children[name], str(path))
+    if saved.information.n_modes != n_modes(channel.lmax):
+        lmax = round(np.sqrt(saved.information.n_modes)) - 1
         raise InputError(
             f"{path} has lmax = {lmax}, the scenario lmax = {channel.lmax}; use --set lmax={lmax}"
         )
-    return found
+    return saved
 
 
 def diagnostics_tree(result: MapResult) -> xr.DataTree:
@@ -421,11 +440,11 @@ class FinishedRun:
         require_files(folder, ("summary.json", "diagnostics.nc"), "map")
         summary = read_model(folder / "summary.json", MapSummary, "the figures of a map run")
         channels = read_channels(folder / "diagnostics.nc")
-        found = [channel.frequency_mhz for channel in channels]
-        if found != summary.frequencies_mhz:
+        mhz = [channel.frequency_mhz for channel in channels]
+        if mhz != summary.frequencies_mhz:
             raise InputError(
                 f"'{folder}' contains files of different runs: summary.json is for "
-                f"{_in_mhz(summary.frequencies_mhz)}, diagnostics.nc for {_in_mhz(found)}; make "
+                f"{_in_mhz(summary.frequencies_mhz)}, diagnostics.nc for {_in_mhz(mhz)}; make "
                 "the map again"
             )
         return cls(folder.resolve().name, summary, channels, Provenance.read(folder))
@@ -470,21 +489,21 @@ def evidence_caveat(runs: Sequence[FinishedRun]) -> str | None:
 
 def _difference(first: FinishedRun, run: FinishedRun) -> str | None:
     """How the data of a run differ from those of the first, in words; None if they do not."""
-    here, there = (one.channel.data for one in (first, run))
+    ours, theirs = (one.channel.data for one in (first, run))
     frequencies = [one.channel.frequency_mhz for one in (first, run)]
     if frequencies[0] != frequencies[1]:
         return f"is at {frequencies[1]:g} MHz instead of {frequencies[0]:g}"
-    if here.shape != there.shape:
-        sizes = [f"{a.shape[0]} products at {a.shape[1]} times" for a in (here, there)]
+    if ours.shape != theirs.shape:
+        sizes = [f"{a.shape[0]} products at {a.shape[1]} times" for a in (ours, theirs)]
         return f"has {sizes[1]} instead of {sizes[0]}"
-    if (np.isnan(here) != np.isnan(there)).any():
-        counts = [int(np.isfinite(a).sum()) for a in (here, there)]
+    if (np.isnan(ours) != np.isnan(theirs)).any():
+        counts = [int(np.isfinite(a).sum()) for a in (ours, theirs)]
         return f"uses {counts[1]} samples instead of {counts[0]}, or different ones"
-    known = np.isfinite(here)
-    if np.array_equal(here[known], there[known]):
+    used = np.isfinite(ours)
+    if np.array_equal(ours[used], theirs[used]):
         return None
-    scale = float(np.vdot(here[known], there[known]) / np.vdot(here[known], here[known]))
-    if np.allclose(there[known], scale * here[known], rtol=1e-6, atol=0.0):
+    scale = float(np.vdot(ours[used], theirs[used]) / np.vdot(ours[used], ours[used]))
+    if np.allclose(theirs[used], scale * ours[used], rtol=1e-6, atol=0.0):
         return f"has the same data in a different unit (factor {scale:.6g})"
     if not np.array_equal(first.channel.hours, run.channel.hours):
         return "was observed at different times"

@@ -13,6 +13,7 @@ from textwrap import wrap
 
 import numpy as np
 import pandas as pd
+from astropy.table import Table
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array
@@ -36,10 +37,10 @@ from lusee_bayes.sky.spectral_prior import SpectralPrior
 
 def prior_sentence(experiment: Experiment) -> str:
     """The prior's model, where its C_ell comes from and, if it was learned, its parameters."""
-    section, learned = experiment.scenario.prior, experiment.learned
-    rows = [] if learned is None else learned.as_rows()
-    found = ", ".join(f"{r['name']} {r['value']:.2f} +- {r['std']:.2f}" for r in rows)
-    return f"Prior {section.model}, C_ell {section.origin}{': ' if found else ''}{found}."
+    section, found = experiment.scenario.prior, experiment.learned
+    rows = [] if found is None else found.as_rows()
+    learned = ", ".join(f"{r['name']}: {r['value']:.2f} +- {r['std']:.2f}" for r in rows)
+    return f"Prior {section.model}, C_ell {section.origin}{'; ' if rows else ''}{learned}."
 
 
 def joint_prior_sentence(scenario: Scenario) -> str:
@@ -398,10 +399,14 @@ class MapResult(Described):
         same = set(JointSummary.model_fields) - set(named)
         return JointSummary(**named, **{name: getattr(joint, name) for name in same})
 
-    def spectra(self) -> list[dict[str, float]]:
-        """Rows of spectra.csv: one for every channel and ell."""
+    def spectra(self) -> Table:
+        """spectra.ecsv: a row for every channel and ell."""
         tables = {c.frequency_mhz: pd.DataFrame(c.spectra()) for c in self.channels}
-        return below(tables).to_dict("records")
+        table = Table.from_pandas(below(tables))
+        for name in table.colnames:
+            table[name].unit = "K2" if name.startswith("cl_") else None
+        table["frequency_mhz"].unit = "MHz"
+        return table
 
     def maps(self) -> dict[str, Float[np.ndarray, "channels pixels"]]:
         """Cubes by name, in K: mean, std and, where the truth is known, truth and residual."""

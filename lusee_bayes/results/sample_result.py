@@ -13,10 +13,12 @@ import numpy as np
 import pandas as pd
 import xarray as xr
 
+from lusee_bayes.core.arrays import Pixels
 from lusee_bayes.core.progress import about_run
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.judge.convergence import warnings_of
+from lusee_bayes.judge.measures import highest_altitude
 from lusee_bayes.results.summaries import SamplingSummary, ValidationSummary
 from lusee_bayes.sampling import mode
 from lusee_bayes.sampling.validation import Check, Comparison, Ranks
@@ -72,6 +74,12 @@ class SampleResult:
     def maps(self) -> dict[str, np.ndarray]:
         """Mean, standard deviation and the ends of the 90 % interval of every pixel, in K."""
         return mode.pixel_statistics(self.skies, self.experiment.scenario.map_nside)
+
+    @cached_property
+    def highest_altitude(self) -> Pixels:
+        """sin of the highest altitude of every pixel."""
+        observation, scenario = self.experiment.data.observation, self.experiment.scenario
+        return highest_altitude(observation, scenario.map_nside)
 
     def headline(self) -> str:
         """The few figures that matter, in one line."""

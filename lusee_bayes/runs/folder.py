@@ -14,18 +14,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
+from astropy.table import Table
 from matplotlib.figure import Figure
 from pandas import DataFrame
 from pydantic import BaseModel
 from xarray import Dataset, DataTree
 
-from lusee_bayes.core import files, reading
+from lusee_bayes.core import files
 from lusee_bayes.core.arrays import use_compilation_cache
 from lusee_bayes.core.errors import InputError, WorkersLost
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import Data, digest_of, files_of, names_of_data
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.report.figures.drawing import save
+from lusee_bayes.report.figures.drawing import named_parts, save
 from lusee_bayes.report.pages import PAGES, REPORT
 from lusee_bayes.results.finished_runs import Provenance
 
@@ -172,9 +173,10 @@ class Output:
         return cls.text(name, lambda run: figures(run).model_dump_json(indent=2) + "\n")
 
     @classmethod
-    def rows(cls, name: str, rows: Callable[[Any], Sequence[Mapping[str, object]]]) -> Output:
-        """A table, row by row."""
-        return cls(lambda run, folder: reading.write_csv(folder / name, rows(run)))
+    def ecsv(cls, name: str, table: Callable[[Any], Table]) -> Output:
+        """A table of astropy, with its units."""
+        options = {"format": "ascii.ecsv", "delimiter": ","}
+        return cls(lambda run, folder: table(run).write(folder / name, **options))
 
     @classmethod
     def table(cls, name: str, table: Callable[[Any], DataFrame | None]) -> Output:
@@ -203,7 +205,8 @@ class RunKind:
         Kept in ``manifest.json``; a page of this name in ``PAGES`` becomes ``report.html``.
     outputs : sequence of Output
     figures : mapping
-        ``draw(result)`` by the name of its PNG in ``figures/``; None where there is none.
+        ``draw(result)`` by the name of its PNG in ``figures/``: a figure, several by their titles,
+        or None where there is none.
     unfinished : str
         The folder that holds unfinished work, removed when the results are there.
     dpi : int
@@ -216,7 +219,7 @@ class RunKind:
 
     name: str
     outputs: Sequence[Output]
-    figures: Mapping[str, Callable[[Any], Figure | None]]
+    figures: Mapping[str, Callable[[Any], Figure | dict[str, Figure] | None]]
     unfinished: str = ""
     dpi: int = 110
     after: Sequence[str] = ()
@@ -265,8 +268,8 @@ class RunFolder:
                 (stage / FIGURES).mkdir()
                 with stages("figures"):
                     for name, draw in kind.figures.items():
-                        if (figure := draw(result)) is not None:
-                            save(figure, stage / FIGURES / f"{name}.png", kind.dpi)
+                        for part, figure in named_parts(name, draw(result)).items():
+                            save(figure, stage / FIGURES / f"{part}.png", kind.dpi)
             with stages("files"):
                 for output in kind.outputs:
                     if output.wanted(result):

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from lusee_bayes.core.engine import Engine
+from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import Data, are_sessions, reduced_of, visibilities_of
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
@@ -113,9 +114,19 @@ def _as_used(reduced: Reduced, result: MapResult) -> Reduced:
     return reduced
 
 
+# a FITS table has 999 columns; posterior.nc has all draws
+MOST_DRAWS = 100
+
+
 def _write_maps(result: MapResult, folder: Path) -> None:
     if result.single:
-        finished_runs.write_maps(folder, result.channel.maps(), result.scenario)
+        channel = result.channel
+        draws = channel.draws[:MOST_DRAWS] if len(channel.draws) else channel.details.draws
+        skies = {f"draw_{k}": modes_to_map(sky, channel.nside) for k, sky in enumerate(draws, 1)}
+        observed = channel.highest_altitude >= 0
+        finished_runs.write_map(
+            folder / "map.fits", channel.maps() | skies, observed, result.scenario
+        )
     else:
         finished_runs.write_cubes(folder, result.maps(), result.frequencies_mhz, result.scenario)
 
@@ -133,7 +144,7 @@ MAP = RunKind(
         Output.netcdf("diagnostics.nc", finished_runs.diagnostics_tree),
         Output(_write_maps),
         Output(_write_coefficients, wanted=lambda result: result.single),
-        Output.rows("spectra.csv", lambda result: result.spectra()),
+        Output.ecsv("spectra.ecsv", lambda result: result.spectra()),
         Output.table("sources.csv", lambda result: result.table("fluxes")),
         Output.table("pointing.csv", lambda result: result.table("pointing", "offsets")),
         Output.table("pointing_by_day.csv", lambda result: result.table("pointing", "preferred")),

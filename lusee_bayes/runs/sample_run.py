@@ -32,7 +32,7 @@ from lusee_bayes.judge.coverage import LEVELS
 from lusee_bayes.linear.amplitudes import Amplitudes, template_amplitudes
 from lusee_bayes.report.figures import sampling as figures
 from lusee_bayes.report.rendering import render_text
-from lusee_bayes.results.finished_runs import Provenance, write_cubes, write_maps
+from lusee_bayes.results.finished_runs import Provenance, write_cubes, write_map
 from lusee_bayes.results.sample_result import CHAINS, SAMPLES, SampleResult, ValidationResult
 from lusee_bayes.runs.cost import demand_of, measured_experiment
 from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, run_folder
@@ -100,9 +100,9 @@ def sample_together(
         "versions": versions(with_commit=False),
     }
     if resume and not (folder / CHAINS).exists():
-        found = [_finished(folder / name / SAMPLES, identity, sampler) for name in experiments]
-        if all(one is not None for one in found):
-            made = zip(experiments.values(), inferences.values(), found, strict=True)
+        trees = [_finished(folder / name / SAMPLES, identity, sampler) for name in experiments]
+        if all(one is not None for one in trees):
+            made = zip(experiments.values(), inferences.values(), trees, strict=True)
             return tuple(SampleResult(*one, stages.seconds, None) for one in made)
     arguments, latent = {}, {}
     for name, one in experiments.items():
@@ -142,7 +142,7 @@ def sample_together(
     speed, results = _speed(times, chains, sampler.warmup), []
     for name, one in experiments.items():
         with stages("data tree"):
-            own, scenario = inferences[name], one.scenario
+            inference, scenario = inferences[name], one.scenario
             said = {
                 "coordinates": "learned in warmup" if whitening is None else "white",
                 "identity": json.dumps(identity),
@@ -151,10 +151,10 @@ def sample_together(
                 "scenario": scenario.to_yaml(),
             }
             drawn = of_channel(chains, name) if several else chains
-            given = drawn, program, own.model, own.posterior, one.data
+            given = drawn, program, inference.model, inference.posterior, one.data
             more = {"arguments": arguments[name], "truth": true_values(one.setup)}
             tree = to_datatree(*given, seed=sampler.seed, attributes=said, **more)
-        results.append(SampleResult(one, own, tree, stages.seconds, speed))
+        results.append(SampleResult(one, inference, tree, stages.seconds, speed))
     return tuple(results)
 
 
@@ -172,8 +172,8 @@ def coordinates(
     start, arguments = values_found(inference, latent), {**arguments, "data": data.data}
     starts = 1 if SKY in latent else STARTS
     chart = _chart(arguments, latent)
-    found = laplace_approximation(program.model, arguments, start, SCALES, starts, chart)
-    return found.whitening if bool(found.converged) else None
+    mode = laplace_approximation(program.model, arguments, start, SCALES, starts, chart)
+    return mode.whitening if bool(mode.converged) else None
 
 
 def found_in_rounds(
@@ -183,26 +183,26 @@ def found_in_rounds(
 
     None where others are sampled, too; ``latent``: what is, in each channel.
     """
-    known, unknowns = {}, []
-    for channel, found in inferences.items():
+    amplitudes, unknowns = {}, []
+    for channel, one in inferences.items():
         sites = set(latent[channel])
-        own = [p for p in found.expanded if {u.name for u in p.systematic.unknowns} <= sites]
-        unknowns = [u for part in own for u in part.systematic.unknowns]
-        known_well = found.moving or not any(part.systematic.scales_sky for part in own)
+        held = [p for p in one.expanded if {u.name for u in p.systematic.unknowns} <= sites]
+        unknowns = [u for part in held for u in part.systematic.unknowns]
+        known_well = one.moving or not any(part.systematic.scales_sky for part in held)
         if not known_well or {u.name for u in unknowns} != sites:
             return None
-        told = template_amplitudes(found.solution, np.concatenate([p.columns for p in own], axis=1))
-        expected = np.concatenate([part.expected for part in own])
-        known[channel] = replace_fields(told, mean=expected + told.mean)
-    return known, unknowns
+        given = template_amplitudes(one.solution, np.concatenate([p.columns for p in held], axis=1))
+        expected = np.concatenate([part.expected for part in held])
+        amplitudes[channel] = replace_fields(given, mean=expected + given.mean)
+    return amplitudes, unknowns
 
 
 def values_found(inference: Inference, latent: Sequence[str]) -> dict[str, np.ndarray]:
     """Where the mode is looked for: at what rounds have found, if there were any."""
     start = {SKY: inference.posterior.mean} if SKY in latent else {}
     for part in inference.expanded if inference.moving else ():
-        found = part.systematic.values(part.expected + inference.amplitudes(part).mean)
-        start |= {name: np.asarray(value) for name, value in found.items() if name in latent}
+        values = part.systematic.values(part.expected + inference.amplitudes(part).mean)
+        start |= {name: np.asarray(value) for name, value in values.items() if name in latent}
     return start
 
 
@@ -335,13 +335,13 @@ def run_sample(
             )
             for name, result in zip(channels, drawn, strict=True):
                 given_to = run.path / name, SAMPLE, channels[name], data, program.path
-                with run_folder(*given_to, **given) as own:
+                with run_folder(*given_to, **given) as channel_run:
                     origin = Provenance.of_experiment(experiments[name], data)
-                    runs.append(own.write(result, stages, origin))
+                    runs.append(channel_run.write(result, stages, origin))
         else:
             for name, channel in channels.items():
-                told = Stages(stages.console, verbose=stages.verbose)
-                runs.append(one(channel, run.path / name, told))
+                progress = Stages(stages.console, verbose=stages.verbose)
+                runs.append(one(channel, run.path / name, progress))
         results = tuple(each.result for each in runs)
         runs.append(run.write((scenario, results), stages))
         return RunOutcome(results, run.path, [file for each in runs for file in each.files])
@@ -367,7 +367,11 @@ def _write_cubes(sampled: tuple[Scenario, tuple[SampleResult, ...]], folder: Pat
 
 SAMPLE_OUTPUTS = (
     Output.netcdf(SAMPLES, lambda run: run.tree),
-    Output(lambda run, folder: write_maps(folder, run.maps, run.experiment.scenario)),
+    Output(
+        lambda run, folder: write_map(
+            folder / "map.fits", run.maps, run.highest_altitude >= 0, run.experiment.scenario
+        )
+    ),
     Output.text("summary.csv", lambda run: run.summary.to_csv(index_label="quantity")),
     Output.text("scenario.yaml", lambda run: run.experiment.scenario.to_yaml()),
     Output.model("sampling.json", lambda run: run.figures()),
@@ -465,13 +469,13 @@ def run_validate(
         posterior, model = drawn.inference.posterior, drawn.inference.model
         with stages("comparison"):
             stats = drawn.tree["sample_stats"]
-            told = stats["diverging"].values, stats["energy"].values
-            found = validate_draws(drawn.skies, posterior, *told)
+            statistics = stats["diverging"].values, stats["energy"].values
+            validated = validate_draws(drawn.skies, posterior, *statistics)
         if engine is not None:
             engine.work_in(run.path)
         more = {"seed": scenario.seed, "engine": engine, "stages": stages}
         ranks = calibrate_sky(model, model, n_simulations=simulations, **more)
-        result = ValidationResult(name, drawn, found, ranks)
+        result = ValidationResult(name, drawn, validated, ranks)
         return run.write(result, stages, Provenance.of_experiment(experiment, data))
 
 

@@ -21,6 +21,7 @@ import pytest
 import xarray as xr
 from assertions import raising, refuse
 from astropy.io import fits
+from astropy.table import Table
 from commands import assert_drawn, content, posterior_of, refused, run, sky_draws_of, table_of
 from rich.console import Console
 
@@ -33,7 +34,12 @@ from lusee_bayes.core.harmonics import from_healpy, modes_to_map, pixel_matrix
 from lusee_bayes.core.version import COMMAND
 from lusee_bayes.experiment.scenario import OutputSection, load_scenario, scenario_names
 from lusee_bayes.judge.chi2 import HEADLINES
-from lusee_bayes.results.finished_runs import FinishedRun, comparison_rows, evidence_caveat
+from lusee_bayes.results.finished_runs import (
+    FinishedRun,
+    comparison_rows,
+    evidence_caveat,
+    read_channels,
+)
 from lusee_bayes.results.map_result import MapResult
 from lusee_bayes.runs import map_run as runs
 from lusee_bayes.runs.folder import Output
@@ -49,10 +55,10 @@ def folder(small_map):
 
 
 def test_map_writes_what_it_promises(folder):
-    files = "posterior.nc mean.fits mean_alm.fits std.fits truth.fits residual.fits spectra.csv "
-    files += "summary.json scenario.yaml diagnostics.nc report.html figures manifest.json"
+    files = "posterior.nc map.fits mean_alm.fits spectra.ecsv summary.json scenario.yaml "
+    files += "diagnostics.nc report.html figures manifest.json"
     assert {p.name for p in folder.iterdir()} == {*files.split(), "provenance.json"}
-    names = ("maps", "data_vector", "beams", "fidelity", "spectra", "draws", "residuals")
+    names = ("data_vector", "beams", "spectra", "residuals", "maps_1_truth", "draws_4_draw_4")
     assert_drawn(*(folder / "figures" / f"{name}.png" for name in names))
 
 
@@ -65,19 +71,26 @@ def test_the_files_agree_with_each_other(folder):
     # rounding of products of numbers that span 1e10 in the covariance
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), std, rtol=1e-7)
     nside = 8
-    kelvin = healpy.read_map(folder / "mean.fits", dtype=np.float64)
+    columns = healpy.read_map(folder / "map.fits", field=None, dtype=np.float64)
+    kelvin, got, observed, truth, residual, *drawn = columns
     np.testing.assert_allclose(kelvin, modes_to_map(mean, nside), rtol=1e-12)
     y = pixel_matrix(nside, 8)
     expected = np.sqrt(np.einsum("pi,ij,pj->p", y, covariance, y))
-    got = healpy.read_map(folder / "std.fits", dtype=np.float64)
     np.testing.assert_allclose(got, expected, rtol=1e-6)
+    np.testing.assert_allclose(kelvin - truth, residual, rtol=0, atol=1e-9 * kelvin.max())
+    (channel,) = read_channels(folder / "diagnostics.nc")
+    np.testing.assert_array_equal(observed, channel.highest_altitude >= 0)
+    skies = sky_draws_of(folder)[0][:100]
+    assert len(drawn) == 100
+    np.testing.assert_allclose(drawn[7], modes_to_map(skies[7], nside), rtol=1e-10)
     # 400 draws: each variance to 5 sigma of sqrt(2 / 400), 81 of them
     ratio = sky_draws_of(folder)[0].var(axis=0, ddof=1) / std**2
     assert np.abs(ratio - 1).max() < 5 * np.sqrt(2 / 400)
     # sqrt(2) there and back again
     alm = healpy.read_alm(folder / "mean_alm.fits")
     np.testing.assert_allclose(from_healpy(alm), mean, rtol=4e-16)
-    rows = table_of(folder / "spectra.csv")
+    rows = table_of(folder / "spectra.ecsv")
+    assert Table.read(folder / "spectra.ecsv")["cl_mean"].unit == "K2"
     columns = "frequency_mhz ell rho snr cl_prior cl_mean cl_truth cl_posterior_variance"
     assert list(rows[0])[:8] == columns.split()
     assert float(rows[2]["cl_posterior_variance"]) == pytest.approx(np.mean(std[4:9] ** 2))
@@ -87,11 +100,11 @@ def test_the_files_agree_with_each_other(folder):
 
 def test_headers_say_where_the_numbers_come_from(folder):
     text = (folder / "scenario.yaml").read_text()
-    for name in ("mean", "std", "truth", "residual", "mean_alm"):
+    for name, what in (("map", "maps"), ("mean_alm", "mean")):
         with fits.open(folder / f"{name}.fits") as hdus:
             header = hdus[1].header
         said = [header[key] for key in ("CONTENT", "FREQ", "LMAX", "FRAME", "BEAM")]
-        assert said == [name.removesuffix("_alm"), 25.0, 8, "galactic", "monopole"]
+        assert said == [what, 25.0, 8, "galactic", "monopole"]
         assert (header["SITELON"], header["SITELAT"]) == (182.258, -23.814)
         assert header["SCENHASH"] == hashlib.sha256(text.encode()).hexdigest()
         assert header["CREATOR"] == f"lusee_bayes {lusee_bayes.__version__}"
@@ -158,7 +171,7 @@ def test_info_recognises_files_and_folders(small_map, folder, tmp_path, capsys):
     for path, words in [
         (tmp_path / "data.nc", ["Visibilities: 16 products x"]),
         (folder / "posterior.nc", ["posterior over 81 modes"]),
-        (folder / "mean.fits", ["HEALPix sky map, NSIDE 8", "mean of the posterior at 25 MHz up"]),
+        (folder / "map.fits", ["HEALPix sky map, NSIDE 8", "maps of the posterior at 25 MHz up"]),
         (folder / "diagnostics.nc", [f"residuals by {days} days, 16 products, 2 turntable angles"]),
         (folder / "mean_alm.fits", ["coefficients of one sky up to ell = 8"]),
         (folder, [*simulated, small_map.result.verdict(), "mean_alm.fits"]),
@@ -188,9 +201,9 @@ def test_data_without_truth(tmp_path):
     data.drop_vars("truth").to_netcdf(tmp_path / "real.nc", engine="h5netcdf")
     out = tmp_path / "out"
     assert run("map", "fiducial", *SMALL, "--data", tmp_path / "real.nc", "-o", out, "-q") == 0
-    assert not (out / "truth.fits").exists()
+    assert "TRUTH" not in fits.getdata(out / "map.fits", 1).names
     assert json.loads((out / "summary.json").read_text())["channels"][0]["ell_cross"] is None
-    assert "rho" not in (out / "spectra.csv").read_text()
+    assert "rho" not in (out / "spectra.ecsv").read_text()
 
 
 def test_an_interrupted_write_leaves_the_old_result_whole(small_map, tmp_path, monkeypatch, capsys):
@@ -246,7 +259,7 @@ def test_force_does_not_replace_what_the_run_reads(small_map, tmp_path, capsys):
     before = content(out)
     for command in (
         ["map", out / "scenario.yaml", "-o", out],
-        ["map", "fiducial", *SMALL, "--set", f"sky.file={out}/mean.fits", "-o", out],
+        ["map", "fiducial", *SMALL, "--set", f"sky.file={out}/map.fits", "-o", out],
         ["map", "fiducial", *SMALL, "--data", out / "diagnostics.nc", "-o", out],
         ["map", "fiducial", *SMALL, "--add", out, "-o", out],
         ["compare", out, small_map.folder, "-o", out],
@@ -261,7 +274,7 @@ def test_names_that_are_no_text_are_shown_by_their_escapes(small_map, tmp_path, 
     for name in ("a\udcff", "b[red]"):
         shutil.copytree(small_map.folder, tmp_path / name)
     with contextlib.chdir(tmp_path):
-        assert run("info", "a\udcff/mean.fits") == 0
+        assert run("info", "a\udcff/map.fits") == 0
         assert run("compare", "a\udcff", "b[red]", "-o", "c\udcff") == 0
     shown = capsys.readouterr().out
     assert r"a\udcff" in shown and "b[red]" in shown
@@ -415,7 +428,7 @@ def test_help_waits_for_no_library(arguments):
 SPARED = [
     ("posterior.nc", {"jax", "healpy", "matplotlib", "scipy"}),
     ("diagnostics.nc", {"jax", "healpy", "matplotlib", "scipy"}),
-    ("mean.fits", {"numpyro", "xarray", "lunarsky", "scipy.stats", "healpy", "matplotlib"}),
+    ("map.fits", {"numpyro", "xarray", "lunarsky", "scipy.stats", "healpy", "matplotlib"}),
 ]
 
 

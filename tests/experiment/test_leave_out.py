@@ -109,7 +109,7 @@ def test_a_bad_day_is_found_alone(experiment):
     assert bad.sum() == 12
     found = found_in(experiment, spoilt(experiment, bad[experiment.data.layout.time], 0.7, seed=9))
     np.testing.assert_array_equal(found.flagged, np.broadcast_to(bad, found.flagged.shape))
-    assert [(group.kind, group.name) for group in found.groups] == [("day", "3")]
+    assert [(group.kind, group.name) for group in found.groups] == [("day", "2027-01-18")]
 
 
 @pytest.mark.parametrize("strength", [2.0, 30.0])

@@ -104,7 +104,7 @@ def files(tmp_path_factory, small_map, small_cube) -> Path:
     shutil.copy(run.folder / "posterior.nc", folder / "information.nc")
     for name in ("posterior.nc", "diagnostics.nc"):
         shutil.copy(small_map.folder / name, folder / name)
-    shutil.copy(small_map.folder / "mean.fits", folder / "map.fits")
+    shutil.copy(small_map.folder / "map.fits", folder / "map.fits")
     shutil.copy(small_cube.folder / "posterior.nc", folder / "cube.nc")
     shutil.copy(small_cube.folder / "mean.fits", folder / "cube.fits")
     write_alms(folder / "alm.fits", np.arange(1.0, 10.0), {"FREQ": 25.0})

@@ -174,7 +174,7 @@ def corrupted(data, where, by):
 
 
 @pytest.mark.parametrize(
-    ("kind", "name"), [("product", "22R"), ("day", "1"), ("turntable angle", "40")]
+    ("kind", "name"), [("product", "22R"), ("day", "2027-01-16"), ("turntable angle", "40")]
 )
 def test_what_is_wrong_is_pointed_at(kind, name):
     model, data = simulated()

@@ -12,14 +12,14 @@ import astropy.units as u
 import healpy
 import numpy as np
 import pytest
-from assertions import refuse
 from astropy.coordinates import SkyCoord
-from astropy.io import fits
+from matplotlib.colors import Normalize
 from reference_linear import resolution_rows
 
 import lusee_bayes as lb
-from lusee_bayes.core.harmonics import mode_numbers, pixel_matrix, synthesis_matrix
-from lusee_bayes.report.viewer import BUDGET, KERNEL_NSIDE, nside_of_page, viewer
+from lusee_bayes.core.harmonics import mode_numbers, pixel_matrix, synthesis_matrix, to_healpy
+from lusee_bayes.report.figures import drawing
+from lusee_bayes.report.viewer import BUDGET, KERNEL_NSIDE, nside_of_page
 from lusee_bayes.results.finished_runs import read_channels
 
 NODE = shutil.which("node")
@@ -79,13 +79,46 @@ def test_pixels_and_equatorial_coordinates(page, small_map, tmp_path):
     rng = np.random.default_rng(3)
     lon, lat = rng.uniform(0, 360, 300), np.degrees(np.arcsin(rng.uniform(-1, 1, 300)))
     points = json.dumps(np.stack([lon, lat], 1).tolist())
-    told = run_page(page, tmp_path, f"told.at = {points}.map((p) => viewer.at(...p));")["at"]
-    expected = healpy.ang2pix(small_map.result.channel.nside, lon, lat, lonlat=True)
-    np.testing.assert_array_equal([one["pixel"] for one in told], expected)
+    commands = f"told.at = {points}.map((p) => viewer.at(...p));"
+    commands += f"told.pixels = {points}.map((p) => viewer.pixel(...p));"
+    found = run_page(page, tmp_path, commands)
+    np.testing.assert_array_equal(found["pixels"], healpy.ang2pix(64, lon, lat, lonlat=True))
+    told = found["at"]
     icrs = SkyCoord(lon, lat, unit="deg", frame="galactic").icrs
     found = SkyCoord([x["ra"] for x in told], [x["dec"] for x in told], unit="deg")
     # the rotation is kept with 16 digits; asin near the poles loses half of them
     assert found.separation(icrs).max() < 1e-5 * u.deg
+
+
+@needs_node
+def test_maps_are_those_of_the_files_at_nside_64(page, small_map, tmp_path):
+    """Coefficients by healpy's own synthesis; pixels by its interpolation; a file that it reads."""
+    names = ("mean", "truth", "draw2", "std", "prior_fraction", "pull")
+    commands = f"for (const name of {json.dumps(names)}) told[name] = viewer.map(name);"
+    commands += """for (const layer of ["mean", "residual"]) {
+      elements["viewer-layer"].value = layer; elements["viewer-layer"].listeners.change();
+      require("fs").writeFileSync(`${layer}.fits`, Buffer.concat(viewer.fits()));
+    } told.mean_at = viewer.at(96, 30).mean;"""
+    got = {name: np.array(x) for name, x in run_page(page, tmp_path, commands).items()}
+    channel = small_map.result.channel
+    skies = {"mean": channel.mean, "truth": channel.truth, "draw2": channel.details.draws[1]}
+    maps = {name: healpy.alm2map(to_healpy(modes), 64, lmax=8) for name, modes in skies.items()}
+    for name, expected in maps.items():  # single precision
+        np.testing.assert_allclose(got[name], expected, rtol=0, atol=1e-6 * expected.max())
+    theta, phi = healpy.pix2ang(64, np.arange(12 * 64**2))
+    pixels = {"std": channel.pixel_std, "prior_fraction": channel.details.prior_fraction}
+    for name, coarse in pixels.items():  # half a step of 65535
+        maps[name] = healpy.get_interp_val(coarse, theta, phi)
+        np.testing.assert_allclose(got[name], maps[name], rtol=0, atol=1e-5 * np.ptp(coarse))
+    pull = (maps["mean"] - maps["truth"]) / maps["std"]
+    np.testing.assert_allclose(got["pull"], pull, rtol=0, atol=1e-3 * np.abs(pull).max())
+    np.testing.assert_array_equal(healpy.read_map(tmp_path / "mean.fits"), got["mean"])
+    percent = 100.0 * (maps["mean"] - maps["truth"]) / maps["mean"].mean()
+    saved, header = healpy.read_map(tmp_path / "residual.fits", h=True)
+    np.testing.assert_allclose(saved, percent, rtol=0, atol=1e-3)
+    assert dict(header)["COORDSYS"] == "G"
+    y = synthesis_matrix(np.array([np.pi / 3]), np.radians([96.0]), 8)
+    assert got["mean_at"] == pytest.approx(float(y[0] @ channel.mean), rel=1e-6)
 
 
 @needs_node
@@ -184,13 +217,15 @@ def test_channels_of_the_page_are_those_of_the_files(small_cube, tmp_path):
     # the slider, and every selector of the page, choose the channel that is told of
     assert told["hidden"] == [True, True, False] and told["chosen"] == [1, 1]
     assert told["shown"] == [False, True, False]
-    pixels = healpy.ang2pix(small_cube.result.scenario.map_nside, lon, lat, lonlat=True)
-    for name in ("mean", "std", "truth"):
-        cube = fits.getdata(small_cube.folder / f"{name}.fits")
-        step = np.ptp(cube, axis=1) / 65535
-        got = np.array([[one[name] for one in channel] for channel in told["at"]])
+    y = synthesis_matrix(np.pi / 2 - np.radians(lat), np.radians(lon), 4)
+    for k, channel in enumerate(small_cube.result.channels):
+        got = {name: np.array([one[name] for one in told["at"][k]]) for name in told["at"][k][0]}
+        for name in ("mean", "truth"):
+            expected = y @ getattr(channel, name)
+            np.testing.assert_allclose(got[name], expected, rtol=0, atol=1e-6 * expected.max())
+        std = healpy.get_interp_val(channel.pixel_std, lon, lat, lonlat=True)
         # half a step, and what rounding adds
-        assert (np.abs(got - cube[:, pixels]) <= 0.501 * step[:, None]).all()
+        assert (np.abs(got["std"] - std) <= 0.501 * np.ptp(channel.pixel_std) / 65535).all()
     assert told["texts"] == ["20 MHz", "30 MHz"]
     assert told["options"] == ["mean", "std", "truth", "residual", "pull"]
     assert "30 MHz" in told["rows"]
@@ -221,19 +256,18 @@ def test_keys_move_the_direction_and_parts_are_those_that_the_page_has(which, re
     assert ("peak of the point-spread function" in told["rows"]) != many
 
 
-def test_maps_that_do_not_go_together_are_refused():
-    mean, up = np.ones((2, 12)), {"highest_altitude": np.ones(12)}
-    for other in (np.ones((1, 12)), np.ones((2, 48))):
-        maps = {"mean": mean, "std": other}
-        refuse("maps of std have the shape", viewer, [10.0, 20.0], maps, **up)
-    maps, up = dict.fromkeys(("mean", "std"), np.ones((1, 13))), {"highest_altitude": np.ones(13)}
-    refuse("on a HEALPix grid", viewer, [10.0], maps, **up)
-
-
 def test_a_sky_below_zero_has_a_linear_scale():
-    maps = {"mean": np.linspace(-2.0, -1.0, 24).reshape(2, 12), "std": np.ones((2, 12))}
-    for scale in viewer([10.0, 20.0], maps, highest_altitude=np.ones(12))["scales"]["temperature"]:
-        assert not scale["log"] and -2.0 <= scale["low"] < scale["high"] <= -1.0
+    scale = drawing.temperatures(np.linspace(-2.0, -1.0, 24))
+    assert type(scale) is Normalize and -2.0 <= scale.vmin < scale.vmax <= -1.0
+
+
+def test_the_rim_is_a_circle_about_the_pole_that_never_sets():
+    """A site on a fixed axis sees all within 90 degrees + |latitude| of one pole of the Moon."""
+    angles = np.array(healpy.pix2ang(16, np.arange(3072)))
+    line = np.concatenate(drawing.rim(np.cos(healpy.rotator.angdist([0.5, 1.0], angles)) + 0.9))
+    apart = healpy.rotator.angdist([0.5, 1.0], np.radians([90.0 - line[:, 1], line[:, 0]]))
+    # bilinear in pixels of 3.7 degrees
+    np.testing.assert_allclose(np.cos(apart), -0.9, atol=0.01)
 
 
 def test_pages_stay_within_their_size():

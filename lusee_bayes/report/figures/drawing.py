@@ -11,11 +11,13 @@ figures; files and numbers are unsmoothed.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+from contourpy import contour_generator
 from jaxtyping import Float
 from matplotlib import colormaps
 from matplotlib.axes import Axes
@@ -43,6 +45,8 @@ BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#666666"
 # distinct without colour vision (Okabe-Ito), and by their lines
 COLOURS = (BLUE, ORANGE, "#009E73", "#CC79A7", "#56B4E9", "#000000")
 LINES = ("-", "--", "-.", ":")
+# of a map whose pixels may be larger than those of what is drawn
+Coarse = Float[np.ndarray, " coarse_pixels"]
 # inches, across and down
 Size = tuple[float | int, float | int]
 # of PNGs: a fifth larger than with 6, and written in a third of the time
@@ -59,6 +63,15 @@ def save(figure: Figure, path: Path, dpi: int) -> None:
     imsave(path, canvas.buffer_rgba(), dpi=dpi, pil_kwargs={"compress_level": COMPRESSION})
 
 
+def named_parts(name: str, drawn: Figure | dict[str, Figure] | None) -> dict[str, Figure]:
+    """Figures by the names of their files: ``maps``, or ``maps_1_truth`` and so on of several."""
+    if not isinstance(drawn, dict):
+        return {} if drawn is None else {name: drawn}
+    titles = [re.sub(r"[^\w.]+", "_", title) for title in drawn]
+    numbered = zip(titles, drawn.values(), strict=True)
+    return {f"{name}_{k}_{title}": figure for k, (title, figure) in enumerate(numbered, 1)}
+
+
 def framed(size: Size, rows: int = 1, columns: int = 1, **options: object):
     """Make a figure of some size and its axes, one or an array of them, laid out by themselves."""
     figure = Figure(figsize=size, layout="constrained")
@@ -73,9 +86,14 @@ def in_places(
     return figure, list(figure.subplots(rows, columns, gridspec_kw=places, squeeze=False).flat)
 
 
-def temperatures(pixels: Float[np.ndarray, "..."], lowest: float = 0.5) -> LogNorm:
-    """A logarithmic scale over all positive pixels but the extreme ones (per cent: ``lowest``)."""
-    return LogNorm(*np.percentile(pixels[pixels > 0], [lowest, 99.8]))
+def temperatures(pixels: Float[np.ndarray, "..."], lowest: float = 0.05) -> Normalize:
+    """A logarithmic scale over all positive pixels but the extreme ones (per cent: ``lowest``).
+
+    Linear where no pixel is positive.
+    """
+    positive = pixels[pixels > 0]
+    bounds = np.percentile(positive if positive.size else pixels, [lowest, 99.8])
+    return LogNorm(*bounds) if positive.size else Normalize(*bounds)
 
 
 def seen_range(std: Float[np.ndarray, "..."], altitude: Pixels) -> tuple[float, float]:
@@ -181,7 +199,7 @@ def mollweide(
     *,
     norm: Normalize,
     cmap: str = SEQUENTIAL,
-    highest_altitude: Pixels | None = None,
+    highest_altitude: Coarse | None = None,
 ) -> AxesImage:
     """Draw a Galactic HEALPix RING map: centre l = 0, longitude grows to the left.
 
@@ -214,13 +232,21 @@ def sky_panel(
     cmap: str = SEQUENTIAL,
     unit: str = "K",
     *,
-    altitude: Pixels | None = None,
+    altitude: Coarse | None = None,
     **bar: float,
 ) -> None:
     """Draw a map (:func:`mollweide`) with its title and a colour bar of its own."""
     image = mollweide(axes, pixels, norm=norm, cmap=cmap, highest_altitude=altitude)
     colour_bar(axes.figure, image, axes, label=unit, extend="both", **bar)
     axes.set_title(title)
+
+
+def sky_figure(title: str, *panel: object, **options: object) -> Figure:
+    """A figure of one :func:`sky_panel`, as wide as a phone or half a page."""
+    places = {"left": 0.01, "right": 0.97, "bottom": 0.02, "top": 0.9}
+    figure, (axes,) = in_places((6.4, 3.0), **places)
+    sky_panel(axes, title, *panel, shrink=0.8, pad=0.03, **options)
+    return figure
 
 
 def view(pixels: Pixels) -> Float[np.ndarray, "height width"]:
@@ -270,6 +296,19 @@ def unprojected(
     t = np.arcsin(y)
     lat = np.arcsin((2.0 * t + np.sin(2.0 * t)) / np.pi)
     return -180.0 * np.clip(x / np.cos(t), -1.0, 1.0), np.degrees(lat)
+
+
+def rim(highest_altitude: Pixels) -> list[Float[np.ndarray, "points 2"]]:
+    """Lines round the region that never rose: l and b in degrees of their points.
+
+    Parameters
+    ----------
+    highest_altitude : (pixels,) array
+        sin of the highest altitude of each pixel.
+    """
+    lon, lat = np.linspace(-180.0, 180.0, 361), np.linspace(-90.0, 90.0, 181)
+    heights = healpy.get_interp_val(highest_altitude, *np.meshgrid(lon, lat), lonlat=True)
+    return contour_generator(lon, lat, heights).lines(0.0)
 
 
 def _graticule(axes: Axes) -> None:

@@ -21,6 +21,11 @@ from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.finished_runs import FinishedRun
 from lusee_bayes.results.map_result import MapResult
 
+# figures that stand side by side, or below each other on a phone, by their titles
+Panels = dict[str, Figure]
+# of what is drawn, at least
+NSIDE = 64
+
 
 def data_vector(result: MapResult) -> Figure | None:
     """The data vector as the paper draws it: products side by side, time running within each."""
@@ -53,28 +58,38 @@ def beams(result: MapResult) -> Figure | None:
     return figure
 
 
-def draws(result: MapResult) -> Figure | None:
-    """A few draws of the posterior as Galactic maps, on one scale."""
+def draws(result: MapResult) -> Panels | None:
+    """A few draws of the posterior as Galactic maps, on the scale of the mean."""
     channel = result.channel
     if channel.details is None:
         return None
-    found = np.stack([modes_to_map(sky, channel.nside) for sky in channel.details.draws])
-    scale, altitude = drawing.temperatures(found), channel.highest_altitude
-    rows = (len(found) + 1) // 2
-    places = {"left": 0.01, "right": 0.98, "bottom": 0.01, "top": 0.9, "wspace": 0.02}
-    figure, grid_of_axes = drawing.in_places((12, 3.6 * rows), rows, 2, **places, hspace=0.12)
-
-    for k, (axes, pixels) in enumerate(zip(grid_of_axes, found, strict=True)):
-        image = drawing.mollweide(axes, pixels, norm=scale, highest_altitude=altitude)
-        axes.set_title(f"draw {k + 1}")
-    drawing.colour_bar(figure, image, figure.axes, label="K", shrink=0.7, extend="both", pad=0.02)
-    figure.suptitle(f"Posterior draws at {channel.frequency_mhz:g} MHz")
-    return figure
+    norm, nside = scales(channel)["temperature"], max(NSIDE, channel.nside)
+    found = {
+        f"draw {k}": (modes_to_map(sky, nside), norm)
+        for k, sky in enumerate(channel.details.draws, 1)
+    }
+    return _figures(found, channel)
 
 
-def sky_maps(result: MapResult) -> Figure:
+def sky_maps(result: MapResult) -> Panels:
     """The maps of one channel, or of a few of many."""
-    return channel_maps(result) if len(result.channels) > 1 else channel_map(result.channel)
+    if result.single:
+        return _figures(channel_panels(result.channel), result.channel)
+    shown = [result.channels[k] for k in _few_of(len(result.channels), SHOWN)]
+    return {
+        f"{channel.frequency_mhz:g} MHz: {title}": figure
+        for channel in shown
+        for title, figure in _figures(channel_panels(channel), channel).items()
+        if title.startswith("posterior")
+    }
+
+
+def _figures(panels: Mapping[str, tuple], channel: ChannelResult) -> Panels:
+    altitude = channel.highest_altitude
+    return {
+        title: drawing.sky_figure(title, *panel, altitude=altitude)
+        for title, panel in panels.items()
+    }
 
 
 def spectra(result: MapResult) -> Figure:
@@ -88,8 +103,9 @@ def plot_map(sky: MapResult | Posterior | Modes, nside: int = 64) -> Figure:
     Parameters
     ----------
     sky : MapResult, Posterior or (modes,) array
-        Real harmonic coefficients, Galactic, in K. Of a result (``lb.run_map(...).result``) also
-        truth and residual, if the truth is known, and the region that never rises.
+        Real harmonic coefficients, Galactic, in K. Of a result (``lb.run_map(...).result``) the
+        first channel, with truth and residual if the truth is known, and the region that never
+        rises.
     nside : int
         HEALPix resolution of what is drawn; a result has its own.
 
@@ -99,10 +115,10 @@ def plot_map(sky: MapResult | Posterior | Modes, nside: int = 64) -> Figure:
         Of Matplotlib: ``savefig(path)`` writes it.
     """
     if isinstance(sky, MapResult):
-        return sky_maps(sky)
+        return channel_map(sky.channel)
     mean = np.asarray(sky.mean if isinstance(sky, Posterior) else sky)
     pixels = drawing.shown(mean, nside)
-    panels = {"sky": (pixels, drawing.temperatures(pixels, 0.05))}
+    panels = {"sky": (pixels, drawing.temperatures(pixels))}
     if isinstance(sky, Posterior):
         std = pixel_std(np.asarray(sky.covariance()), nside)
         panels = {"posterior mean": panels["sky"]}
@@ -113,26 +129,44 @@ def plot_map(sky: MapResult | Posterior | Modes, nside: int = 64) -> Figure:
     return figure
 
 
-def channel_map(channel: ChannelResult) -> Figure:
+def scales(channel: ChannelResult) -> dict[str, Normalize]:
+    """The colours of a channel's maps, on paper and on screen, by what they show."""
+    nside, altitude = max(NSIDE, channel.nside), channel.highest_altitude
+    sky = mean = drawing.shown(channel.mean, nside)
+    found = {}
+    if channel.truth is not None:
+        sky = drawing.shown(channel.truth, nside)
+        span = 100.0 * np.percentile(np.abs(mean - sky), 99.0) / mean.mean()
+        found["residual"] = Normalize(-span, span)
+    found["temperature"] = drawing.temperatures(sky)
+    found["std"] = LogNorm(*drawing.seen_range(channel.pixel_std, altitude))
+    if channel.details is not None:
+        share = np.percentile(channel.details.prior_fraction, [0.5, 99.5])
+        found["prior_fraction"] = Normalize(*share)
+    return found
+
+
+def channel_panels(channel: ChannelResult) -> dict[str, tuple]:
     """Truth, posterior mean, residual over the mean temperature, and standard deviation.
 
     All but the standard deviation are drawn through the beam of :mod:`.drawing`.
     """
-    sky = mean = drawing.shown(channel.mean, channel.nside)
-    level, extra = mean.mean(), {}
+    nside, norms = max(NSIDE, channel.nside), scales(channel)
+    mean, panels = drawing.shown(channel.mean, nside), {}
     if channel.truth is not None:
-        sky = drawing.shown(channel.truth, channel.nside)
-        percent = 100.0 * (mean - sky) / level
-        span = np.percentile(np.abs(percent), 99.0)
-        extra = {"mean - truth": (percent, Normalize(-span, span), DIVERGING, "% of the mean sky")}
-    altitude, scale = channel.highest_altitude, drawing.temperatures(sky, 0.05)
-    spread = LogNorm(*drawing.seen_range(channel.pixel_std, altitude))
-    panels = {
-        **({"truth": (sky, scale)} if extra else {}),
-        "posterior mean": (mean, scale),
-        **extra,
-        "posterior standard deviation": (channel.pixel_std, spread),
-    }
+        truth = drawing.shown(channel.truth, nside)
+        percent = 100.0 * (mean - truth) / mean.mean()
+        panels["truth"] = truth, norms["temperature"]
+        panels["mean - truth"] = percent, norms["residual"], DIVERGING, "% of the mean sky"
+    panels["posterior mean"] = mean, norms["temperature"]
+    panels["posterior standard deviation"] = channel.pixel_std, norms["std"]
+    order = ("truth", "posterior mean", "mean - truth", "posterior standard deviation")
+    return {title: panels[title] for title in order if title in panels}
+
+
+def channel_map(channel: ChannelResult) -> Figure:
+    """:func:`channel_panels` in one figure."""
+    panels, altitude = channel_panels(channel), channel.highest_altitude
     rows = (len(panels) + 1) // 2
     places = {"left": 0.01, "right": 0.98, "bottom": 0.01, "top": 0.88, "wspace": 0.06}
     figure, grid_of_axes = drawing.in_places((12, 3.6 * rows), rows, 2, **places, hspace=0.12)
@@ -146,16 +180,15 @@ def channel_map(channel: ChannelResult) -> Figure:
     return figure
 
 
-def map_fidelity(channel: ChannelResult) -> Figure:
+def map_fidelity(channel: ChannelResult) -> Panels:
     """rho_ell and SNR_ell where the truth is known, and how much of each ell the prior supplies."""
     spectra = channel.spectra()
-    known = "snr" in spectra
-    places = {"left": 0.06 if known else 0.14, "right": 0.98, "bottom": 0.13, "top": 0.9}
-    width, columns = (12, 3) if known else (5, 1)
-    figure, panels = drawing.in_places((width, 4), 1, columns, **places, wspace=0.25)
+    names = ["correlation", "signal-to-noise", "share of the prior"][0 if "snr" in spectra else 2 :]
+    drawn = {name: drawing.framed((5, 3.6)) for name in names}
+    panels = [axes for _, axes in drawn.values()]
     _fidelity(panels, spectra, color=BLUE)
     panels[-1].axhline(0.5, color=GREY, lw=0.8, ls=":")
-    if known:
+    if "snr" in spectra:
         panels[0].axhline(0.0, color=GREY, lw=0.8)
         panels[1].axhline(1.0, color=GREY, lw=0.8, ls=":")
         drawing.without_minor_ticks(panels[1].yaxis)
@@ -165,8 +198,7 @@ def map_fidelity(channel: ChannelResult) -> Figure:
             panels[1].legend(frameon=False)
     for axes in panels:
         axes.set(xlim=(1, spectra["ell"][-1]))
-    figure.suptitle(f"Fidelity at {channel.frequency_mhz:g} MHz")
-    return figure
+    return {name: figure for name, (figure, _) in drawn.items()}
 
 
 def _fidelity(
@@ -210,55 +242,38 @@ def sky_spectra(channel: ChannelResult) -> Figure:
 SHOWN = 3
 
 
-def channel_maps(cube: MapResult) -> Figure:
-    """Posterior mean and standard deviation of a few channels from the lowest to the highest."""
-    channels = [cube.channels[k] for k in _few_of(len(cube.channels), SHOWN)]
-    return _rows_of_maps({f"{channel.frequency_mhz:g} MHz": channel for channel in channels})
-
-
 def _few_of(n: int, most: int) -> np.ndarray:
     """Numbers of the first of n, of the last, and of some between."""
     return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int))
 
 
-def instrument_share(result: MapResult) -> Figure | None:
+def instrument_share(result: MapResult) -> Panels | None:
     """Share of each pixel's variance that comes from unknowns of the instrument."""
     known = [channel for channel in result.channels if channel.theta is not None]
-    if not known:
-        return None
-    chosen = _few_of(len(known), SHOWN)
-    figure, grid = drawing.framed((6.4 * len(chosen), 3.8), 1, len(chosen), squeeze=False)
-    for axes, channel in zip(grid.flat, (known[k] for k in chosen), strict=True):
+    figures = {}
+    for channel in [known[k] for k in _few_of(len(known), SHOWN)] if known else []:
         share, title = 100.0 * channel.theta.pixel_share, f"{channel.frequency_mhz:g} MHz"
         scale = Normalize(0.0, max(float(np.percentile(share, 99.5)), 1e-3))
-        options = {"altitude": channel.highest_altitude, "shrink": 0.8, "unit": "% of the variance"}
-        drawing.sky_panel(axes, title, share, scale, **options)
-    return figure
+        options = {"altitude": channel.highest_altitude, "unit": "% of the variance"}
+        figures[title] = drawing.sky_figure(title, share, scale, **options)
+    return figures or None
 
 
-def maps_of_runs(runs: Sequence[FinishedRun]) -> Figure:
+def maps_of_runs(runs: Sequence[FinishedRun]) -> Panels:
     """Posterior mean and standard deviation of every run, each kind on one scale."""
     channels = [run.channel for run in runs]
-    means = [modes_to_map(channel.mean, channel.nside) for channel in channels]
+    means = [drawing.shown(one.mean, max(NSIDE, one.nside)) for one in channels]
     bounds = [drawing.seen_range(one.pixel_std, one.highest_altitude) for one in channels]
     spread = LogNorm(min(low for low, _ in bounds), max(high for _, high in bounds))
-    scales = drawing.temperatures(np.concatenate(means)), spread
-    return _rows_of_maps({run.name: run.channel for run in runs}, scales)
-
-
-def _rows_of_maps(
-    named: Mapping[str, ChannelResult], scales: tuple[LogNorm, LogNorm] | None = None
-) -> Figure:
-    """Mean and standard deviation side by side, on the same scales or each on its own."""
-    figure, rows = drawing.framed((12, 3.4 * len(named) + 0.4), len(named), 2, squeeze=False)
-    for (name, channel), (left, right) in zip(named.items(), rows, strict=True):
-        mean, std = modes_to_map(channel.mean, channel.nside), channel.pixel_std
-        altitude = channel.highest_altitude
-        options = {"altitude": altitude, "shrink": 0.85}
-        own = scales or (drawing.temperatures(mean), LogNorm(*drawing.seen_range(std, altitude)))
-        drawing.sky_panel(left, f"{name}: posterior mean", mean, own[0], **options)
-        drawing.sky_panel(right, f"{name}: standard deviation", std, own[1], **options)
-    return figure
+    level, figures = drawing.temperatures(np.concatenate(means)), {}
+    for run, mean in zip(runs, means, strict=True):
+        panels = {
+            "posterior mean": (mean, level),
+            "standard deviation": (run.channel.pixel_std, spread),
+        }
+        named = {f"{run.name}: {title}": panel for title, panel in panels.items()}
+        figures |= _figures(named, run.channel)
+    return figures
 
 
 def channel_spectra(cube: MapResult) -> Figure:
@@ -278,7 +293,7 @@ def channel_spectra(cube: MapResult) -> Figure:
     return figure
 
 
-def fidelity(cube: MapResult) -> Figure:
+def fidelity(cube: MapResult) -> Figure | Panels:
     """SNR_ell (or, without a truth, the prior's share) over frequency and ell, and its mean.
 
     Of one channel, as :func:`map_fidelity`.

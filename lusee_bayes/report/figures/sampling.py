@@ -15,7 +15,6 @@ from matplotlib.figure import Figure
 
 from lusee_bayes.core.harmonics import mode_numbers
 from lusee_bayes.judge.coverage import LEVELS
-from lusee_bayes.judge.measures import highest_altitude
 from lusee_bayes.report.figures import drawing
 from lusee_bayes.results.sample_result import SampleResult
 from lusee_bayes.sampling.least import N_BINS
@@ -101,11 +100,10 @@ def against_analytic(tree: xr.DataTree) -> Figure:
     return figure
 
 
-def uncertainty(run: SampleResult) -> Figure:
+def uncertainty(run: SampleResult) -> Figure | dict[str, Figure]:
     """Mean, standard deviation and 90 % interval of the drawn maps, and how skewed it is."""
     maps = run.maps
-    chains, draws = run.skies.shape[:2]
-    if chains * draws < 2:
+    if run.skies.shape[0] * run.skies.shape[1] < 2:
         why = "not drawn: a single draw has no standard deviation"
         return drawing.note("Uncertainty of the drawn maps", why)
     level = maps["mean"].mean()
@@ -124,16 +122,10 @@ def uncertainty(run: SampleResult) -> Figure:
         ("width of the 90 % interval", interval, _range(interval), drawing.SEQUENTIAL, percent),
         (skewed, skewness, signed, drawing.DIVERGING, chance),
     ]
-    altitude = highest_altitude(run.experiment.data.observation, run.experiment.scenario.map_nside)
-    figure, grid_of_axes = drawing.framed((12, 7.2), 2, 2)
-    for axes, panel in zip(grid_of_axes.flat, panels, strict=True):
-        drawing.sky_panel(axes, *panel, altitude=altitude, shrink=0.85)
-    figure.suptitle(
-        f"{chains} x {draws} draws from {run.tree.attrs['program']} at "
-        f"{run.experiment.scenario.frequency_mhz:g} MHz, Galactic coordinates; dashed line: region "
-        "that never rises"
-    )
-    return figure
+    return {
+        title: drawing.sky_figure(title, *panel, altitude=run.highest_altitude)
+        for title, *panel in panels
+    }
 
 
 def _range(values: Float[np.ndarray, " pixels"]) -> Normalize:

@@ -189,23 +189,31 @@ const skyView = (function () {
       context.putImageData(image, 0, 0);
       return context;
     }
-    // dashes round the pixels of which ``inside`` is true
-    rim(nside, inside) {
-      const found = this.indices(nside);
-      const { width, height } = this.canvas;
+    // a line through points (z, longitude), broken where it leaves the view at the other side
+    curve(points) {
       const context = this.canvas.getContext("2d");
-      context.fillStyle = "#ffffff";
-      for (let row = 1; row < height; row += 1) {
-        for (let column = 1; column < width; column += 1) {
-          const k = row * width + column;
-          if ((row + column) % 6 > 3 || found[k] < 0) continue;
-          for (const other of [k - 1, k - width]) {
-            if (found[other] >= 0 && inside(found[k]) !== inside(found[other])) {
-              context.fillRect(column - 1, row - 1, 2, 2);
-            }
-          }
-        }
+      let before = null;
+      context.beginPath();
+      for (const { z, longitude } of points) {
+        const [x, y] = this.point(z, longitude);
+        const far = before && Math.hypot(x - before[0], y - before[1]) > 0.2 * this.canvas.width;
+        if (!before || far) context.moveTo(x, y);
+        else context.lineTo(x, y);
+        before = [x, y];
       }
+      context.stroke();
+    }
+    // dashes along lines of l and b in degrees: light on a dark map, dark on a light one
+    rim(lines, colour) {
+      const context = this.canvas.getContext("2d");
+      const growth = this.growth();
+      context.strokeStyle = colour;
+      context.lineWidth = 2 * growth;
+      context.setLineDash([9 * growth, 6 * growth]);
+      for (const line of lines) {
+        this.curve(line.map(([l, b]) => ({ z: Math.sin(radians(b)), longitude: radians(l) })));
+      }
+      context.setLineDash([]);
     }
     graticule() {
       if (this.grid === "none") return;
@@ -216,19 +224,7 @@ const skyView = (function () {
         const at = { z, longitude: radians(lon) };
         return galactic ? at : turned(this.rotation, z, at.longitude, true);
       };
-      const curve = (points) => {
-        let before = null;
-        context.beginPath();
-        for (const [lon, lat] of points) {
-          const at = to(lon, lat);
-          const [x, y] = this.point(at.z, at.longitude);
-          const far = before && Math.hypot(x - before[0], y - before[1]) > 0.2 * this.canvas.width;
-          if (!before || far) context.moveTo(x, y);
-          else context.lineTo(x, y);
-          before = [x, y];
-        }
-        context.stroke();
-      };
+      const curve = (points) => this.curve(points.map((one) => to(...one)));
       context.strokeStyle = "rgb(200 200 200 / 45%)";
       context.lineWidth = 1;
       const steps = Array.from({ length: 91 }, (_, k) => k);

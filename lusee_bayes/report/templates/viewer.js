@@ -9,60 +9,89 @@
   const frequencies = page.frequencies;
   const many = frequencies.length > 1;
 
-  // a map as a function of channel and pixel: single precision, or steps above its least value
-  function unpacked(map) {
-    if (map.values) {
-      const values = floats(map.values);
-      return (channel, pixel) => values[channel * n + pixel];
-    }
-    const levels = new Uint16Array(bytes(map.levels).buffer);
-    return (channel, pixel) =>
-      map.low[channel] + map.step[channel] * levels[channel * n + pixel];
+  const part = (values, channel) => {
+    const size = values.length / frequencies.length;
+    return values.slice(channel * size, (channel + 1) * size);
+  };
+  const cached = (make) => {
+    const made = [];
+    return (channel) => (made[channel] = made[channel] || make(channel));
+  };
+  // by name: of(channel) is the map at NSIDE, at(channel, z, longitude) its value in any direction
+  const maps = {};
+  // of coefficients
+  for (const [name, text] of Object.entries(page.skies)) {
+    const modes = floats(text);
+    const lmax = Math.round(Math.sqrt(modes.length / frequencies.length)) - 1;
+    maps[name] = {
+      of: cached((channel) => sphere.synthesis(part(modes, channel), page.nside)),
+      at: (channel, z, longitude) => {
+        const y = sphere.harmonics(lmax, z, longitude);
+        return part(modes, channel).reduce((sum, mode, k) => sum + mode * y[k], 0);
+      },
+    };
   }
-  const maps = Object.fromEntries(
-    Object.entries(page.maps).map(([name, map]) => [name, unpacked(map)])
-  );
+  // of coarser pixels
+  for (const [name, { nside, low, step, levels }] of Object.entries(page.pixels)) {
+    const steps = new Uint16Array(bytes(levels).buffer);
+    const value = cached((channel) => {
+      const coarse = Float64Array.from(part(steps, channel), (k) => low[channel] + step[channel] * k);
+      return sphere.between(coarse, nside);
+    });
+    maps[name] = {
+      of: cached((channel) => sphere.sampled(value(channel), page.nside)),
+      at: (channel, z, longitude) => value(channel)(z, longitude),
+    };
+  }
+  // of others: f(channel, values)
+  const combine = (names, f) => ({
+    of: cached((channel) => {
+      const given = names.map((name) => maps[name].of(channel));
+      return Float32Array.from({ length: n }, (_, k) => f(channel, given.map((map) => map[k])));
+    }),
+    at: (channel, ...place) => f(channel, names.map((name) => maps[name].at(channel, ...place))),
+  });
+  if (maps.truth) {
+    const percent = (channel, [mean, truth]) => (100 * (mean - truth)) / page.mean_k[channel];
+    maps.residual = combine(["mean", "truth"], percent);
+    maps.pull = combine(["mean", "truth", "std"], (_, [mean, truth, std]) => (mean - truth) / std);
+  }
   const tables = Object.fromEntries(
     Object.entries(page.colours).map(([name, text]) => [name, bytes(text)])
   );
-  const never = page.highest_altitude && floats(page.highest_altitude);
-  const hidden = never && ((pixel) => never[pixel] < 0);
+  const heights = floats(page.highest_altitude);
+  const altitude = sphere.between(heights, Math.round(Math.sqrt(heights.length / 12)));
+  const highest = sphere.sampled(altitude, page.nside);
   const regions = page.regions && Object.fromEntries(
     ["mean", "std", "prior_fraction"].map((name) => [name, floats(page.regions[name])])
   );
-  const spreads = [];
-  const spread = (channel) =>
-    (spreads[channel] = spreads[channel] || pointSpread(page.resolutions[channel]));
+  const spread = cached((channel) => pointSpread(page.resolutions[channel]));
 
-  const residual = (channel, pixel) => maps.mean(channel, pixel) - maps.truth(channel, pixel);
-  const pull = (channel, pixel) => residual(channel, pixel) / maps.std(channel, pixel);
   const layers = [
-    { key: "mean", title: "posterior mean", unit: "K", of: maps.mean, scale: "temperature" },
-    { key: "std", title: "standard deviation", unit: "K", of: maps.std, scale: "std" },
+    { key: "mean", title: "posterior mean", unit: "K", scale: "temperature" },
+    { key: "std", title: "standard deviation", unit: "K", scale: "std" },
   ];
   if (maps.truth) {
     layers.push(
-      { key: "truth", title: "truth", unit: "K", of: maps.truth, scale: "temperature" },
+      { key: "truth", title: "truth", unit: "K", scale: "temperature" },
       {
-        key: "residual", title: "mean - truth", unit: "K", of: residual, scale: "residual",
+        key: "residual", title: "mean - truth", unit: "% of the mean sky", scale: "residual",
         colours: "diverging",
       },
       {
-        key: "pull", title: "pull, (mean - truth) / standard deviation", unit: "sigma", of: pull,
+        key: "pull", title: "pull, (mean - truth) / standard deviation", unit: "sigma",
         bounds: { low: -4, high: 4, log: false }, colours: "diverging",
       }
     );
   }
   if (maps.prior_fraction) {
     layers.push({
-      key: "prior_fraction", title: "share from the prior", unit: "", of: maps.prior_fraction,
-      scale: "prior_fraction",
+      key: "prior_fraction", title: "share from the prior", unit: "", scale: "prior_fraction",
     });
   }
   for (let k = 1; maps[`draw${k}`]; k += 1) {
     layers.push({
-      key: `draw${k}`, title: `draw ${k} of the posterior`, unit: "K", of: maps[`draw${k}`],
-      scale: "temperature",
+      key: `draw${k}`, title: `posterior draw ${k}`, unit: "K", scale: "temperature",
     });
   }
 
@@ -89,8 +118,9 @@
     const one = chosen();
     const scale = one.bounds || page.scales[one.scale][state.channel];
     const table = tables[one.colours || "sequential"];
-    map.paint(page.nside, state.values, scale, table, one.key === "std" ? hidden : null);
-    if (hidden) map.rim(page.nside, hidden);
+    const hatched = one.key === "std" && ((pixel) => highest[pixel] < 0);
+    map.paint(page.nside, state.values, scale, table, hatched);
+    map.rim(page.rim, one.colours === "diverging" ? "#1b1b1b" : "#ffffff");
     map.graticule();
     map.marks();
     map.ring(state.z, state.longitude, 8, "#4fc3f7");
@@ -100,7 +130,7 @@
   // anew for another layer or channel
   function select() {
     const one = chosen();
-    state.values = Float64Array.from({ length: n }, (_, pixel) => one.of(state.channel, pixel));
+    state.values = maps[one.key].of(state.channel);
     if (many) {
       const text = `${frequencies[state.channel]} MHz`;
       element("frequency").textContent = text;
@@ -120,12 +150,12 @@
     below.paint(nside, kernel, { low: -most, high: most }, tables.diverging);
     below.ring(state.z, state.longitude, 6, "#4fc3f7");
   }
-  function drawSpectrum(pixel) {
+  const here = (name, channel) => maps[name].at(channel, state.z, state.longitude);
+  function drawSpectrum() {
     const canvas = element("spectrum");
     const context = canvas.getContext("2d");
     const points = frequencies.map((f, k) => ({
-      f, mean: maps.mean(k, pixel), std: maps.std(k, pixel),
-      truth: maps.truth ? maps.truth(k, pixel) : NaN,
+      f, mean: here("mean", k), std: here("std", k), truth: maps.truth ? here("truth", k) : NaN,
     }));
     const known = points.flatMap((p) => [p.mean - p.std, p.mean, p.mean + p.std, p.truth]);
     const positive = known.filter((x) => x > 0);
@@ -172,25 +202,26 @@
     });
   }
 
-  function rows(pixel) {
+  function rows() {
     const at = coordinates(state);
-    const of = (name) => maps[name](state.channel, pixel);
+    const of = (name) => here(name, state.channel);
+    const observed = altitude(state.z, state.longitude) >= 0;
     const found = [
       ["Galactic longitude, latitude", at.galactic],
       ["right ascension, declination (ICRS)", at.equatorial],
     ];
-    if (page.nside === page.full_nside) found.push(["pixel (RING)", String(pixel)]);
     if (many) found.push(["frequency", `${frequencies[state.channel]} MHz`]);
     found.push(["posterior mean", number(of("mean"), "K")]);
     found.push(["standard deviation", number(of("std"), "K")]);
     if (maps.truth) {
       found.push(["truth", number(of("truth"), "K")]);
-      found.push(["mean - truth", `${number(pull(state.channel, pixel))} standard deviations`]);
+      found.push(["mean - truth", `${number(of("pull"))} standard deviations`]);
     }
     if (maps.prior_fraction) {
-      found.push(["share from the prior (ell ≥ 1)", number(of("prior_fraction"))]);
+      const share = observed ? number(of("prior_fraction")) : "not observed";
+      found.push(["share from the prior (ℓ ≥ 1)", share]);
     }
-    if (never) found.push(["ever above the horizon", hidden(pixel) ? "no" : "yes"]);
+    found.push(["ever above the horizon", observed ? "yes" : "no"]);
     if (regions) {
       const { nside } = page.regions;
       const region = 12 * nside ** 2 * state.channel + pixelOf(nside, state.z, state.longitude);
@@ -198,19 +229,19 @@
         [`region of ${page.regions.size_deg.toFixed(1)}° around it: mean`,
           number(regions.mean[region], "K")],
         ["its standard deviation", number(regions.std[region], "K")],
-        ["its share from the prior", number(regions.prior_fraction[region])]
+        ["its share from the prior",
+          observed ? number(regions.prior_fraction[region]) : "not observed"]
       );
     }
     if (below) found.push(["peak of the point-spread function", number(state.peak, "per sr")]);
     return found;
   }
   function describe() {
-    const pixel = pixelOf(page.nside, state.z, state.longitude);
     if (below) drawSpread();
-    if (many) drawSpectrum(pixel);
+    if (many) drawSpectrum();
     const list = element("values");
     list.replaceChildren();
-    for (const [name, value] of rows(pixel)) {
+    for (const [name, value] of rows()) {
       const [term, text] = ["dt", "dd"].map((tag) => document.createElement(tag));
       term.textContent = name;
       text.textContent = value;
@@ -234,7 +265,7 @@
     }
     const one = chosen();
     const there = coordinates(at);
-    const value = number(state.values[pixelOf(page.nside, at.z, at.longitude)], one.unit);
+    const value = number(maps[one.key].at(state.channel, at.z, at.longitude), one.unit);
     element("hover").textContent =
       `${one.title}: ${value} at l, b ${there.galactic}; RA, Dec ${there.equatorial}`;
   }
@@ -272,21 +303,35 @@
     }
   }
   skyView.controls(map, element, () => skyView.place(state.z, state.longitude), draw);
+  const file = (kind) =>
+    `${page.name}_${frequencies[state.channel]}MHz_${chosen().key}.${kind}`.replace(/\s/g, "_");
+  const header = () => {
+    const { title, unit } = chosen();
+    return `${page.name}: ${title} at ${frequencies[state.channel]} MHz${unit && ` [${unit}]`}`;
+  };
+  const fits = () => downloads.fits(state.values, page.nside, chosen().title, chosen().unit);
+  element("png").addEventListener("click", () => {
+    downloads.picture(map.canvas, element("bar"), header(), file("png"));
+  });
+  element("fits").addEventListener("click", () => {
+    downloads.save(new Blob(fits(), { type: "application/fits" }), file("fits"));
+  });
   select();
   choose(0, 0);
   // for checks of the page: what is shown of a direction, in degrees
   window.viewer = {
     choose: (l, b) => choose(radians(l), radians(b)),
     at: (l, b, channel = 0) => {
-      const z = Math.sin(radians(b));
-      const pixel = pixelOf(page.nside, z, radians(l));
-      const values = ["mean", "std", "truth"].filter((name) => maps[name])
-        .map((name) => [name, maps[name](channel, pixel)]);
-      const { ra, dec } = skyView.equatorial(page.rotation, z, radians(l));
-      return { pixel, ra, dec, ...Object.fromEntries(values) };
+      const place = [Math.sin(radians(b)), radians(l)];
+      const known = ["mean", "std", "truth", "prior_fraction"].filter((name) => maps[name]);
+      const values = known.map((name) => [name, maps[name].at(channel, ...place)]);
+      return { ...skyView.equatorial(page.rotation, ...place), ...Object.fromEntries(values) };
     },
+    map: (name, channel = 0) => Array.from(maps[name].of(channel)),
+    pixel: (l, b) => pixelOf(page.nside, Math.sin(radians(b)), radians(l)),
     kernel: (l, b, channel = 0) =>
       Array.from(spread(channel).kernel(Math.sin(radians(b)), radians(l))),
     ticks: skyView.ticks,
+    fits,
   };
 })();
