@@ -127,8 +127,8 @@ def use_compilation_cache() -> None:
     finds, and reads the level of its messages no more.
     """
     wanted = os.environ.get(SWITCH, "")
-    known = jax.config.jax_compilation_cache_dir is not None
-    if known or wanted == OFF or os.environ.get(MESSAGES) == CHATTY:
+    is_set = jax.config.jax_compilation_cache_dir is not None
+    if is_set or wanted == OFF or os.environ.get(MESSAGES) == CHATTY:
         return
     folder = (Path(wanted) if wanted else user_cache_path("lusee_bayes")) / "programs" / _machine()
     try:

@@ -74,8 +74,8 @@ class DaskEngine(engine.Engine):
 
     def each(self, tasks: Tasks[T, R], stages: Stages, stage: str) -> list[R]:
         with self._submitted(tasks, None, stages, stage) as (_, _, finished):
-            found = {number: future.result() for number, future in finished}
-        return [found[number] for number in range(len(tasks.items))]
+            results = {number: future.result() for number, future in finished}
+        return [results[number] for number in range(len(tasks.items))]
 
     def reduced(self, tasks: Tasks[T, R], merge: Merge[R], stages: Stages, stage: str) -> R:
         with self._submitted(tasks, merge, stages, stage) as (job, futures, finished):
@@ -245,8 +245,8 @@ def own_workers(n: int, demand: engine.Demand) -> Iterator[distributed.LocalClus
     try:
         with dask.config.set(settings):
             each = {"threads_per_worker": side_by_side, "memory_limit": memory_limit() // n}
-            here = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
-            more = each | here | {"silence_logs": logging.CRITICAL}
+            address = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
+            more = each | address | {"silence_logs": logging.CRITICAL}
             cluster = distributed.LocalCluster(n_workers=n, **more)
     finally:
         signal.signal(signal.SIGINT, before)

@@ -202,9 +202,9 @@ def _decoded(dataset: xarray.Dataset, name: str, variable: xarray.Variable) -> x
     """
     bounding = (v.attrs for v in dataset.variables.values() if v.attrs.get("bounds") == name)
     units = {key: v for attrs in bounding for key, v in attrs.items() if key in CF_TIME}
-    known = variable.copy(deep=False)
-    known.attrs = units | dict(variable.attrs)
-    return xarray.conventions.decode_cf_variable(name, known)
+    with_units = variable.copy(deep=False)
+    with_units.attrs = units | dict(variable.attrs)
+    return xarray.conventions.decode_cf_variable(name, with_units)
 
 
 def as_dataset(
@@ -254,10 +254,10 @@ def require_format(path: str | Path, format_: str, what: str, hint: str = "") ->
         If the file is missing, damaged or of another kind.
     """
     path = require_file(path, what, hint)
-    found = format_of(path)
-    if found != format_:
+    actual = format_of(path)
+    if actual != format_:
         raise InputError(
-            f"{path} does not contain {what}: its format is '{found or 'absent'}', expected "
+            f"{path} does not contain {what}: its format is '{actual or 'absent'}', expected "
             f"'{format_}'" + (f"; {hint}" if hint else "")
         )
     return path

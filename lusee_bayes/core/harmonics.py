@@ -236,9 +236,9 @@ def order_products(matrix: Square, heights: Angles) -> Float[np.ndarray, "points
     for order, rows in enumerate(np.split(np.arange(len(m)), first[1:])):
         # the matrix is symmetric: those of m < m' count twice, those of m > m' are left out
         begin, starts = rows[0], first[order:] - rows[0]
-        here = matrix[by_order[rows]].take(by_order[begin:], axis=1)
-        here[:, len(rows) :] *= 2.0
-        even_part, odd_part = (polar[:, rows[x]] @ here[x] for x in (~odd[rows], odd[rows]))
+        block = matrix[by_order[rows]].take(by_order[begin:], axis=1)
+        block[:, len(rows) :] *= 2.0
+        even_part, odd_part = (polar[:, rows[x]] @ block[x] for x in (~odd[rows], odd[rows]))
         # the equator is its own mirror image
         north, south = both[order, : len(polar)], both[order, ::-1][: len(polar)]
         total = even_part + odd_part

@@ -204,32 +204,32 @@ class Layout:
         InputError
             If the file lacks something, or something is not as declared.
         """
-        for known, given in ((self.variables, arrays), (self.attributes, values)):
-            for name, one in known.items():
+        for expected, given in ((self.variables, arrays), (self.attributes, values)):
+            for name, one in expected.items():
                 if not one.optional and given.get(name) is None:
-                    there = f"it has {', '.join(map(str, given))}" if len(given) else "it has none"
-                    raise InputError(f"{path} has no {name} ({there}); expected {self.what}")
-        found = {
+                    has = f"it has {', '.join(map(str, given))}" if len(given) else "it has none"
+                    raise InputError(f"{path} has no {name} ({has}); expected {self.what}")
+        attributes = {
             name: _checked_value(f"{path}: {name}", values[name], declared)
             for name, declared in self.attributes.items()
             if values.get(name) is not None
         }
-        here = {name: declared for name, declared in self.variables.items() if name in arrays}
+        present = {name: declared for name, declared in self.variables.items() if name in arrays}
         sizes: dict[str, int] = {}
-        for name, declared in here.items():
+        for name, declared in present.items():
             _require_form(f"{path}: {name}", arrays[name], declared, sizes)
-        n_bytes = sum(8 * int(np.prod(arrays[n].shape, dtype=object)) for n in here)
+        n_bytes = sum(8 * int(np.prod(arrays[n].shape, dtype=object)) for n in present)
         if n_bytes > memory_limit():
             raise InputError(
                 f"{path} declares {gigabytes(n_bytes)} of numbers; this machine has "
                 f"{gigabytes(memory_limit())} of memory"
             )
         read = {}
-        for name, declared in here.items():
+        for name, declared in present.items():
             factor = factor_to(f"{path}: {name}", declared.unit, values.get(f"{name}.units"))
             array = np.asarray(arrays[name])
             read[name] = _checked_array(f"{path}: {name}", array, declared, factor)
-        return Content(read, found, sizes, frozenset(map(str, arrays)))
+        return Content(read, attributes, sizes, frozenset(map(str, arrays)))
 
 
 def _require_form(where: str, array: Unread, declared: Variable, sizes: dict[str, int]) -> None:

@@ -171,10 +171,10 @@ def times_lower(x: Tall, lower: Matrix, *, transpose: bool) -> Tall:
     """Return x L, or x L^T with ``transpose``, for lower triangular L with zeros above."""
     if namespace(x, lower) is not np:
         return x @ (lower.T if transpose else lower)
-    lower, found, one = np.ascontiguousarray(lower), np.array(x, order="C"), max(1, len(lower))
-    letters, shape = (b"L", b"U", b"T" if transpose else b"N", b"N"), found.T.shape
-    _called("dtrmm", *letters, *shape, 1.0, lower, one, found, one)
-    return found
+    lower, product, one = np.ascontiguousarray(lower), np.array(x, order="C"), max(1, len(lower))
+    letters, shape = (b"L", b"U", b"T" if transpose else b"N", b"N"), product.T.shape
+    _called("dtrmm", *letters, *shape, 1.0, lower, one, product, one)
+    return product
 
 
 def sandwich(matrix: Matrix, lower: Matrix) -> Matrix:
@@ -196,9 +196,9 @@ def inverse_sandwich(matrix: Matrix, lower: Matrix, *, transpose: bool = False) 
 
 def _sandwiched(kind: int, matrix: np.ndarray, lower: np.ndarray) -> np.ndarray:
     """LAPACK's reduction of symmetric problems: n^3 operations in place of 3 n^3."""
-    n, found = len(lower), np.array(matrix, order="C")
-    _called("dsygst", kind, b"U", n, found, n, np.ascontiguousarray(lower), n)
-    return mirrored(found)
+    n, reduced = len(lower), np.array(matrix, order="C")
+    _called("dsygst", kind, b"U", n, reduced, n, np.ascontiguousarray(lower), n)
+    return mirrored(reduced)
 
 
 def outer_sandwich(matrix: Matrix, lower: Matrix) -> Matrix:
@@ -280,17 +280,17 @@ def spanning_rows(
         Factors: the product with the few rows is the matrix, to ``SPANNED`` of its largest row.
     """
     # rows of fewer numbers, with the same products
-    rest = np.linalg.qr(matrix.T, mode="r").T.copy()
+    residual = np.linalg.qr(matrix.T, mode="r").T.copy()
     picked, along = [], []
-    least = SPANNED**2 * (rest**2).sum(axis=1).max()
-    while (squares := (rest**2).sum(axis=1)).max() > least:
+    least = SPANNED**2 * (residual**2).sum(axis=1).max()
+    while (squares := (residual**2).sum(axis=1)).max() > least:
         k = int(squares.argmax())
-        unit = rest[k] / np.sqrt(squares[k])
+        unit = residual[k] / np.sqrt(squares[k])
         # not by BLAS, whose threads would wait for each other every time
-        products = np.einsum("rc,c->r", rest, unit)
+        products = np.einsum("rc,c->r", residual, unit)
         along.append(np.where(kind == kind[k], products, 0.0))
         picked.append(k)
-        rest -= along[-1][:, None] * unit
+        residual -= along[-1][:, None] * unit
     coordinates = np.stack(along, axis=1)
     return np.array(picked), np.linalg.solve(coordinates[picked].T, coordinates.T).T
 

@@ -73,14 +73,14 @@ class Section(BaseModel):
 
     def anchored(self: S) -> S:
         """The same with absolute names of files, which are then the same in any folder."""
-        found: dict[str, Any] = {}
+        absolute: dict[str, Any] = {}
         for name, declared in type(self).model_fields.items():
             value = getattr(self, name)
             if isinstance(value, Section):
-                found[name] = value.anchored()
+                absolute[name] = value.anchored()
             elif name in FILES and value is not None and value != declared.default:
-                found[name] = os.path.abspath(value)
-        return self.model_copy(update=found)
+                absolute[name] = os.path.abspath(value)
+        return self.model_copy(update=absolute)
 
     @model_validator(mode="before")
     @classmethod
@@ -88,9 +88,9 @@ class Section(BaseModel):
         """YAML has lists where sections have tuples, and ``~`` in the names of files."""
         if not isinstance(tree, Mapping):
             return tree
-        found = {key: tuple(v) if isinstance(v, list) else v for key, v in tree.items()}
-        names = {key: found[key] for key in FILES if isinstance(found.get(key), str)}
-        return found | {key: str(user_path(n)) for key, n in names.items() if n.startswith("~")}
+        entries = {key: tuple(v) if isinstance(v, list) else v for key, v in tree.items()}
+        names = {key: entries[key] for key in FILES if isinstance(entries.get(key), str)}
+        return entries | {key: str(user_path(n)) for key, n in names.items() if n.startswith("~")}
 
 
 def requires(holds: Callable[[Any], Any], message: str) -> Any:
@@ -167,13 +167,13 @@ def without_other_kinds(tree: dict[str, Any], kinds: Kinds, *, strict: bool) -> 
     ValueError
         For such a key, where ``strict``.
     """
-    own = kinds.get(tree["model"]) if isinstance(tree["model"], str) else None
-    if own is None:
+    chosen = kinds.get(tree["model"]) if isinstance(tree["model"], str) else None
+    if chosen is None:
         return tree
     kept = {}
     for key, value in tree.items():
         others = [k for k in kinds.values() if key in k.model_fields]
-        if key in own.model_fields or not others:
+        if key in chosen.model_fields or not others:
             kept[key] = value
             continue
         default = others[0].model_fields[key].get_default(call_default_factory=True)

@@ -181,13 +181,13 @@ class SphereGrid(eqx.Module):
             # cos m'phi and sin m'phi, times cos m phi and sin m phi
             cosine = (low + high).real, (low + high).imag
             sine = (high - low).imag, (low - high).real
-            for own, factors in enumerate([cosine, sine][: 1 + (m > 0)]):
-                first = starts[m] + own * (highest + 1 - m)
+            for part, factors in enumerate([cosine, sine][: 1 + (m > 0)]):
+                first = starts[m] + part * (highest + 1 - m)
                 for negative, factor in enumerate(factors):
                     blocks = transposed[others] @ (table[m][:, m:] * (0.5 * factor)[:, :, None])
                     to = np.flatnonzero(((order < 0) == negative) & (np.abs(order) >= others[0]))
-                    found = blocks[np.abs(order[to]) - others[0], ell[to]]
-                    matrix[to, first : first + highest + 1 - m] = found
+                    values = blocks[np.abs(order[to]) - others[0], ell[to]]
+                    matrix[to, first : first + highest + 1 - m] = values
         if square:
             matrix = linalg.mirrored(matrix)
         rows, columns = np.argsort(rows), np.argsort(columns)

@@ -175,8 +175,8 @@ class StoredTree:
     @cached_property
     def attrs(self) -> dict[str, Any]:
         """Attributes, of one entry each as numbers and text."""
-        found = {name: np.asarray(value) for name, value in self._group.attrs.items()}
-        return {name: v.item() if v.size == 1 else v for name, v in found.items()}
+        arrays = {name: np.asarray(value) for name, value in self._group.attrs.items()}
+        return {name: v.item() if v.size == 1 else v for name, v in arrays.items()}
 
     @cached_property
     def variables(self) -> dict[str, Unread]:
@@ -239,7 +239,7 @@ def from_tree(kind: type[T], tree: xarray.DataTree | StoredTree, where: str) -> 
     InputError
         If something is absent, or of another type or another number of dimensions.
     """
-    kinds, found = _fields(kind), dict[str, Any]()
+    kinds, entries = _fields(kind), dict[str, Any]()
     empty = _json(where, tree.attrs.get(EMPTY, "{}"))
     said = {n: k for n, k in kinds.items() if k.declared is not None and n not in empty}
     arrays = {name: one.declared for name, one in said.items() if one.what == "array"}
@@ -248,19 +248,19 @@ def from_tree(kind: type[T], tree: xarray.DataTree | StoredTree, where: str) -> 
     for name, one in kinds.items():
         place = f"{where}: {name}"
         if name in content.arrays:
-            found[name] = content.arrays[name].astype(one.of, copy=False)
+            entries[name] = content.arrays[name].astype(one.of, copy=False)
         elif name in content.values:
             value = content.values[name]
-            found[name] = _of_json(one.of, value, place) if one.what == "json" else value
+            entries[name] = _of_json(one.of, value, place) if one.what == "json" else value
         elif name in empty:
-            found[name] = np.zeros([int(n) for n in empty[name]], dtype=one.of)
+            entries[name] = np.zeros([int(n) for n in empty[name]], dtype=one.of)
         elif name in tree.children:
-            found[name] = _of_group(one, tree.children[name], place)
+            entries[name] = _of_group(one, tree.children[name], place)
         elif one.optional:
-            found[name] = None
+            entries[name] = None
         elif one.required:
             raise InputError(f"{where} has no {name} (it has {', '.join(tree.children)})")
-    return kind(**found)
+    return kind(**entries)
 
 
 _checker = lru_cache(maxsize=128)(TypeAdapter)
@@ -273,14 +273,14 @@ def _for_json(value: Any) -> Any:
 
 @lru_cache(maxsize=128)
 def _fields(kind: type) -> dict[str, _Kind]:
-    hints, found = get_type_hints(kind), {}
+    hints, by_name = get_type_hints(kind), {}
     for one in fields(kind):
         what = _kind_of(hints[one.name], one.metadata.get("checks", ANY))
         required = not what.optional and one.default is one.default_factory is MISSING
         declared = what.declared and replace(what.declared, optional=not required)
         written = {n: x for n, x in one.metadata.items() if n in ("attributes", "encoding")}
-        found[one.name] = replace(what, required=required, declared=declared, **written)
-    return found
+        by_name[one.name] = replace(what, required=required, declared=declared, **written)
+    return by_name
 
 
 def _kind_of(hint: Any, checks: Mapping[str, Any] = ANY) -> _Kind:
@@ -311,11 +311,11 @@ def _kind_of(hint: Any, checks: Mapping[str, Any] = ANY) -> _Kind:
 
 def _table(name: str, columns: Mapping[str, list]) -> xarray.DataTree:
     """Columns as variables; one of numbers may have gaps."""
-    found = {}
+    arrays = {}
     for key, values in columns.items():
         array = np.array([np.nan if value is None else value for value in values])
-        found[key] = (f"{name}_row", array.astype(np.int8) if array.dtype == bool else array)
-    rows = {} if not columns or not len(next(iter(columns.values()))) else found
+        arrays[key] = (f"{name}_row", array.astype(np.int8) if array.dtype == bool else array)
+    rows = {} if not columns or not len(next(iter(columns.values()))) else arrays
     return xarray.DataTree(xarray.Dataset(rows, attrs={"columns": json.dumps(list(columns))}))
 
 
@@ -345,8 +345,8 @@ def _rows(kind: type[T], tree: xarray.DataTree | StoredTree, where: str) -> Iter
         # gaps make whole numbers real
         as_real = {"kind": "real"} if one.optional else {}
         columns[name] = replace(one.declared, dims=("row",), optional=False, **as_real)
-    found = Layout(kind.__name__, columns).checked(where, tree.variables, {}).arrays
-    for row in zip(*(found[name].tolist() for name in kinds), strict=True):
+    arrays = Layout(kind.__name__, columns).checked(where, tree.variables, {}).arrays
+    for row in zip(*(arrays[name].tolist() for name in kinds), strict=True):
         values = zip(kinds.items(), row, strict=True)
         yield kind(**{n: None if k.optional and x != x else k.of(x) for (n, k), x in values})
 

@@ -42,8 +42,8 @@ def versions(*, with_commit: bool = True) -> dict[str, str]:
         Include the package's commit, where it is known.
     """
     libraries = ("jax", "numpyro", "arviz-stats", "numpy", "scipy", "healpy", "astropy", "lunarsky")
-    own = {"commit": commit()} if with_commit and commit() else {}
-    return {"lusee_bayes": __version__, **own, **{name: installed(name) for name in libraries}}
+    package = {"commit": commit()} if with_commit and commit() else {}
+    return {"lusee_bayes": __version__, **package, **{name: installed(name) for name in libraries}}
 
 
 # every file that is written asks
