@@ -86,8 +86,7 @@ def test_the_main_job_on_ulsa(test_data):
     scenario = lb.load_scenario("fiducial", [f"sky.file={path}", "frequency_mhz=10"])
     _, channel = mapped(lb.build(scenario))
     spectra = channel.spectra()
-    assert spectra["rho"][1:11].min() > 0.9
-    assert spectra["rho"][1:29].min() > 0.5
+    assert spectra["rho"][1:11].min() > 0.9 and spectra["rho"][1:29].min() > 0.5
     assert channel.ell_cross >= 20
     # residuals at the few per cent level away from the cap that never rises
     maps = channel.maps()

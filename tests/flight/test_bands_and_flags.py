@@ -49,8 +49,7 @@ def test_lines_are_found_in_their_channel_alone(strength):
     flagged, _ = flags_of(band, spectra)
     injected = np.zeros(flagged.shape, dtype=bool)
     injected[rows, channel - band.first] = True
-    assert flagged[injected].mean() > 0.95
-    assert flagged[~injected].mean() < 1e-3
+    assert flagged[injected].mean() > 0.95 and flagged[~injected].mean() < 1e-3
 
 
 def test_several_lines_hide_none():
@@ -73,8 +72,7 @@ def test_a_comb_far_below_the_noise_of_a_channel_is_found(navgf):
     assert np.abs(before).max() < fl.COMB_LIMIT / 1.5
     spectra[::2, :, fl.comb_bins(averaging)] *= 1.0 + 1.0 / np.sqrt(FRAMES)
     found = np.abs(fl.comb_strength(spectra, frames, averaging, MHZ)) > fl.COMB_LIMIT
-    assert found[::2].all()
-    assert not found[1::2].any()
+    assert found[::2].all() and not found[1::2].any()
 
 
 def test_a_notch_is_a_comb_below_and_a_strong_line_is_none():
@@ -138,8 +136,7 @@ def bursts_found(seed, offsets, length, strength):
 @pytest.mark.parametrize(("length", "strength"), [(1, 10.0), (4, 8.0), (20, 6.0), (60, 20.0)])
 def test_bursts_are_found(length, strength):
     found, burst = bursts_found(11, (0,), length, strength)
-    assert found[burst].mean() >= 0.95
-    assert found[~burst].mean() <= 1e-3
+    assert found[burst].mean() >= 0.95 and found[~burst].mean() <= 1e-3
 
 
 def test_what_is_between_weak_bursts_stays():
@@ -149,8 +146,7 @@ def test_what_is_between_weak_bursts_stays():
     sqrt(8) = 2.2 sigma: one is expected in all, and more than five are rare.
     """
     found, burst = bursts_found(13, (0, 16), 8, 4.5)
-    assert found[burst].mean() >= 0.95
-    assert (found & ~burst).sum() <= 5
+    assert found[burst].mean() >= 0.95 and (found & ~burst).sum() <= 5
 
 
 def test_noise_that_is_larger_than_expected_is_no_burst():

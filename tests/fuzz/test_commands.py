@@ -102,7 +102,6 @@ WRONG = [
     ("sample fiducial --model program.py", "no observed site"),
     ("info [red]x[/red].nc", r"no file at '\[red\]x\[/red\].nc'"),
     (f"info {OTHER}", r"no file at 'x\\udcff.nc'"),
-    ("report .", "neither posterior.nc"),
     ("export . --release out", "not the folder of a run"),
 ]
 

@@ -21,8 +21,7 @@ from lusee_bayes.instrument.times import unannounced_leap_seconds
 
 def test_the_fiducial_cycle_and_three_of_them():
     one = lb.Observation.from_runs()
-    assert one.n_times == 327
-    assert one.times[0].isot == "2027-01-15T00:00:00.000"
+    assert one.n_times == 327 and one.times[0].isot == "2027-01-15T00:00:00.000"
     within(one.hours, 2.0 * np.arange(327), 1e-6)  # a double JD: 20 ns
     np.testing.assert_array_equal(np.unique(one.day), np.arange(28))
     assert one.day[5] == 0 and one.day[-1] == 652 // 24

@@ -83,8 +83,7 @@ def test_instants_begin_before_the_end():
     ]
     o = lb.Observation.from_schedule(intervals, window="instant")
     within(seconds(o, "2027-01-15"), 3600.0 * np.array([0.0, 2.0, 5.0, 7.0, 9.0]), 1e-8)
-    assert o.windows is None
-    assert (o.live_s == 7200.0).all()
+    assert o.windows is None and (o.live_s == 7200.0).all()
     half = [Interval("2027-01-15", "2027-01-16", duty_cycle=0.5)]
     words = r"no duty cycle; use windows \(observation.window=mean\)"
     refuse(words, lb.Observation.from_schedule, half, window="instant")

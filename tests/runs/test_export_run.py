@@ -14,9 +14,7 @@ from lusee_bayes.runs import export_run
 
 
 @pytest.mark.parametrize("made", ["small_map", "small_cube"])
-def test_a_release_can_be_checked_and_read_without_the_package(
-    made, request, tmp_path, capsys, monkeypatch
-):
+def test_a_release_stands_alone(made, request, tmp_path, capsys, monkeypatch):
     made, out = request.getfixturevalue(made), tmp_path / "release"
     creator = {"name": "Galilei, Galileo", "nameType": "Personal"}
     command = ["export", made.folder, "--release", out, "--creator", creator["name"]]

@@ -82,8 +82,7 @@ def test_the_evidence_is_that_of_brute_force(name):
     found = [evidence(name, seed) for seed in (0, 1)]
     assert found[0].log_evidence != found[1].log_evidence
     for got in found:
-        assert got.error < 0.1
-        assert abs(got.log_evidence - expected) < 5 * got.error
+        assert got.error < 0.1 and abs(got.log_evidence - expected) < 5 * got.error
         # nearly Gaussian posteriors, of which Laplace's approximation is already good
         assert abs(float(got.laplace.log_evidence) - expected) < 0.2
     # and the other program's is not it

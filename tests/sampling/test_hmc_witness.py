@@ -61,8 +61,7 @@ def test_hmc_finds_the_analytic_posterior(noise):
     w = Witness(noise)
     found = w.judge(w.posterior)
     assert found.passed, failed(found)
-    assert found.rhat.max() < 1.01
-    assert min(found.ess_bulk.min(), found.ess_tail.min()) > 2000
+    assert found.rhat.max() < 1.01 and min(found.ess_bulk.min(), found.ess_tail.min()) > 2000
     assert not w.chains.statistics["diverging"].any()
     # 49 modes on 8000 draws, whose cosines are -0.7 on average
     assert 0.6 < found.eigenvalues[0] < 1 < found.eigenvalues[-1] < 1.5

@@ -233,8 +233,7 @@ def test_skies_at_fixed_sites_follow_the_analytic_posterior(gaussian, collapsed,
     data = np.asarray(gaussian.sample(jax.random.key(1))[1])
     arguments = program.arguments(gaussian)
     skies = programs.collapsed_draws(program, arguments, data, repeated(values), jax.random.key(2))
-    assert isinstance(skies, np.ndarray)
-    assert skies.shape == (2, 5000, 9)
+    assert isinstance(skies, np.ndarray) and skies.shape == (2, 5000, 9)
     expected = posterior(gaussian.coupling.dense(), s, n, data, offset)
     assert_draws_follow(skies.reshape(-1, 9), expected.mean, expected.covariance)
 

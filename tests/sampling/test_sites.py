@@ -63,8 +63,7 @@ def test_batches_and_draws(gaussian):
     np.testing.assert_allclose(normal.log_prob(draws)[:, :2], one_by_one, rtol=1e-12)
     for site in (lb.SkyPrior(gaussian.prior), lb.Marginal(gaussian)):
         drawn = site.sample(jax.random.key(2), (3,))
-        assert drawn.shape == (3, *site.event_shape)
-        assert site.log_prob(drawn).shape == (3,)
+        assert drawn.shape == (3, *site.event_shape) and site.log_prob(drawn).shape == (3,)
 
 
 # --- white coordinates ----------------------------------------------------------------------------

@@ -228,8 +228,7 @@ def test_a_scenario_with_a_cube(tmp_path, maps):
     one = tmp_path / "one.fits"
     healpy.write_map(one, maps[24], dtype=np.float64, column_units="K", coord="G")
     np.testing.assert_array_equal(sky.modes, lb.sky_from_file(one, 25.0, 4).modes)
-    assert "50 HEALPix sky maps, NSIDE 8" in describe(path)
-    assert "1 to 50 MHz" in describe(path)
+    assert "50 HEALPix sky maps, NSIDE 8" in describe(path) and "1 to 50 MHz" in describe(path)
 
 
 def test_cubes_that_cannot_be_used(tmp_path, maps):

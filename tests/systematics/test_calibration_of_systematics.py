@@ -230,8 +230,7 @@ def test_simulation_based_calibration(response_file):
         ranks.append((draws < true).sum(0)[picked])
         # along the null direction, in prior standard deviations
         report = ex.unknowns_report(experiment, found)
-        assert report.null.names[0] == SKY
-        assert report.null.names[-1] == COMMON_GAIN
+        assert report.null.names[0] == SKY and report.null.names[-1] == COMMON_GAIN
         off = true - mean
         parts = np.concatenate([off[:1] / sky_std[0], off[16:21], [off[21:].sum() / 2.0]])
         null.append(report.null.weights @ parts)
