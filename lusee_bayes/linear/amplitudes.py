@@ -170,19 +170,19 @@ class AmplitudesOfSky:
         with_all = covariance @ reach.T
         return Amplitudes(least, left + reach @ with_all, with_all[:n])
 
-    def given(self, precision: Square, vector: Vector, about: Vector) -> AmplitudesOfSky:
+    def given(self, precision: Square, vector: Vector, expected: Vector) -> AmplitudesOfSky:
         """Take in what is known of the amplitudes besides: exp(-x^T Q x / 2 + q^T x), x = z - t.
 
         Parameters
         ----------
         precision : (n, n) array
             Q.
-        vector, about : (n,) array
+        vector, expected : (n,) array
             q and t.
         """
         kept = np.linalg.inv(np.eye(len(vector)) + self.covariance @ precision)
         covariance = kept @ self.covariance
-        mean = self.mean + covariance @ (vector - precision @ (self.mean - about))
+        mean = self.mean + covariance @ (vector - precision @ (self.mean - expected))
         return AmplitudesOfSky(mean, kept @ self.pull, covariance, self.reference)
 
 
@@ -210,19 +210,19 @@ class Shared:
         sky : (modes,) array
             m0, in K.
         """
-        here, inverse = information.recentred(sky), np.linalg.inv(self.covariance)
+        local, inverse = information.recentred(sky), np.linalg.inv(self.covariance)
         at = np.linalg.lstsq(self.root, self.mean, rcond=None)[0]
-        told, pulled = self.root.T @ inverse, self.pull.T @ inverse
-        across, among = told @ self.pull, (told - self.root.T) @ self.root
-        matrix = np.block([[here.matrix + pulled @ self.pull, across.T], [across, among]])
-        vector = np.concatenate([here.vector, self.root.T @ self.mean])
+        weight, pulled = self.root.T @ inverse, self.pull.T @ inverse
+        across, among = weight @ self.pull, (weight - self.root.T) @ self.root
+        matrix = np.block([[local.matrix + pulled @ self.pull, across.T], [across, among]])
+        vector = np.concatenate([local.vector, self.root.T @ self.mean])
         return replace(
-            here,
+            local,
             matrix=matrix,
             vector=vector,
             reference=np.concatenate([sky, at]),
-            misfit=np.asarray(here.misfit - self.mean @ self.mean),
-            log_det=np.asarray(here.log_det + np.linalg.slogdet(self.covariance)[1]),
+            misfit=np.asarray(local.misfit - self.mean @ self.mean),
+            log_det=np.asarray(local.log_det + np.linalg.slogdet(self.covariance)[1]),
         )
 
 
@@ -346,12 +346,12 @@ class Patterns(eqx.Module):
         z : (skies, patterns) array
             Draws of independent unit normals; zero for the mean.
         """
-        there = diffuse + self.expected
-        pull = self.information.vector - (there - self.information.reference) @ (
+        shifted = diffuse + self.expected
+        pull = self.information.vector - (shifted - self.information.reference) @ (
             self.information.matrix
         )
         half = solve_lower(self.lower, self.patterns @ pull.T, transpose=False) + z.T
-        return there + solve_lower(self.lower, half, transpose=True).T @ self.patterns
+        return shifted + solve_lower(self.lower, half, transpose=True).T @ self.patterns
 
     def whole_covariance(self, covariance: ModesMatrix) -> ModesMatrix:
         """Compute the covariance of m from that of d, in K^2.
@@ -466,13 +466,13 @@ def tie(
         )
     blocks = root_of_kernels(kernels)
     root = blocks.reshape(n_channels * n, -1)
-    told = np.linalg.inv(covariance)
-    pulled = np.einsum("kij,kjw->kiw", told - np.eye(n), blocks)
+    inverse = np.linalg.inv(covariance)
+    pulled = np.einsum("kij,kjw->kiw", inverse - np.eye(n), blocks)
     precision = np.eye(root.shape[1]) + root.T @ pulled.reshape(root.shape)
     lower = np.linalg.cholesky(precision)
     white, z = np.zeros(root.shape[1]), np.zeros(mean.shape)
     for _ in range(1 + REFINEMENTS):
-        pull = np.einsum("kij,kj->ki", told, mean - z) + z
+        pull = np.einsum("kij,kj->ki", inverse, mean - z) + z
         left = (root.T @ pull.ravel() - white)[:, None]
         step = solve_lower(lower, solve_lower(lower, left, transpose=False), transpose=True)
         white = white + step[:, 0]
@@ -480,7 +480,7 @@ def tie(
     half = solve_lower(lower, root.T, transpose=False).T.reshape(n_channels, n, -1)
     draws = solve_lower(lower, normals[:, : root.shape[1]].T, transpose=True).T @ root.T
     off = mean - z
-    quadratic = np.einsum("ki,kij,kj->", off, told, off) - (z**2).sum() + white @ white
+    quadratic = np.einsum("ki,kij,kj->", off, inverse, off) - (z**2).sum() + white @ white
     log_dets = np.linalg.slogdet(covariance)[1].sum() + 2.0 * np.log(np.diagonal(lower)).sum()
     drawn, evidence = z + draws.reshape(-1, n_channels, n), float(-0.5 * (quadratic + log_dets))
     return Tied(z, half, white, blocks, drawn, evidence)
@@ -490,8 +490,8 @@ def told_by_others(
     mean: Vector, covariance: Square, tied_mean: Vector, tied_covariance: Square
 ) -> tuple[Square, Vector]:
     """Q and q of one channel about E', from its own posterior and that given all data."""
-    own = np.linalg.inv(covariance)
-    return np.linalg.inv(tied_covariance) - own, own @ (tied_mean - mean)
+    inverse = np.linalg.inv(covariance)
+    return np.linalg.inv(tied_covariance) - inverse, inverse @ (tied_mean - mean)
 
 
 def information_given(
@@ -499,7 +499,7 @@ def information_given(
     amplitudes: AmplitudesOfSky,
     precision: Square,
     vector: Vector,
-    about: Vector,
+    expected: Vector,
 ) -> Information:
     """What data say of the sky where amplitudes are N(0, 1) times exp(-x^T Q x / 2 + q^T x).
 
@@ -518,17 +518,17 @@ def information_given(
         About the same reference sky.
     precision : (n, n) array
         Q.
-    vector, about : (n,) array
+    vector, expected : (n,) array
         q and t.
     """
-    off, pull, inner = amplitudes.mean - about, amplitudes.pull, amplitudes.covariance
-    one, rest = np.eye(len(off)), vector - about
+    off, pull, inner = amplitudes.mean - expected, amplitudes.pull, amplitudes.covariance
+    one, beyond = np.eye(len(off)), vector - expected
     mixed = one + precision @ inner
     gradient = np.linalg.solve(mixed, vector - precision @ off)
     weight = np.linalg.solve(mixed, precision)
     least = off + inner @ gradient
     misfit = gradient @ inner @ gradient + least @ (precision @ least - 2.0 * vector)
-    misfit += rest @ np.linalg.solve(one + precision, rest) - about @ about
+    misfit += beyond @ np.linalg.solve(one + precision, beyond) - expected @ expected
     log_det = np.linalg.slogdet(mixed)[1] - np.linalg.slogdet(one + precision)[1]
     return replace(
         information,

@@ -122,9 +122,9 @@ class Information(Described, eqx.Module):
             If it is for another number of modes.
         """
         require_shape("the other reference sky", other.reference, (self.n_modes,))
-        here = other.recentred(self.reference)
+        moved = other.recentred(self.reference)
         names = ("matrix", "vector", "misfit", "log_det", "n_data")
-        return replace(self, **{n: np.asarray(getattr(self, n) + getattr(here, n)) for n in names})
+        return replace(self, **{n: np.asarray(getattr(self, n) + getattr(moved, n)) for n in names})
 
     def raised(self, factor: float) -> Information:
         """The information of the same data under N times a factor.
@@ -193,8 +193,8 @@ class Information(Described, eqx.Module):
         (n,) array
             For data in K.
         """
-        rest = float(self.log_det + self.n_data * np.log(2.0 * np.pi))
-        return np.array([-0.5 * (float(self.chi2(sky)) + rest) for sky in skies])
+        constant = float(self.log_det + self.n_data * np.log(2.0 * np.pi))
+        return np.array([-0.5 * (float(self.chi2(sky)) + constant) for sky in skies])
 
     def posterior(self, prior: Prior, lower: ModesMatrix | None = None) -> Posterior:
         """Compute the posterior over the sky.
@@ -265,25 +265,25 @@ class Information(Described, eqx.Module):
             The last step, in posterior standard deviations.
         """
         start, expected = prior.whiten(self.reference), prior.white_mean
-        here, correction = self.recentred(prior.colour(start)), np.zeros_like(start)
+        local, correction = self.recentred(prior.colour(start)), np.zeros_like(start)
         moved, before, count = np.inf, np.inf, 0
         while unfinished(moved, before, count, most):
             shift = prior.colour(correction)
             if precise:
-                pull = precise_residual(here.vector, here.matrix, shift)
+                pull = precise_residual(local.vector, local.matrix, shift)
             else:
-                pull = here.vector - here.matrix @ shift
+                pull = local.vector - local.matrix @ shift
             gradient = prior.colour_columns(pull[None])[0] - (start + correction - expected)
             half = solve_lower(lower, gradient[:, None], transpose=False)
             correction = correction + solve_lower(lower, half, transpose=True)[:, 0]
             moved, before, count = float(np.linalg.norm(half)), moved, count + 1
         u = start + correction
         log_evidence = -0.5 * (
-            here.recentred(prior.colour(u)).misfit
+            local.recentred(prior.colour(u)).misfit
             + (u - expected) @ (u - expected)
-            + here.log_det
+            + local.log_det
             + 2.0 * np.log(np.diagonal(lower)).sum()
-            + here.n_data * np.log(2.0 * np.pi)
+            + local.n_data * np.log(2.0 * np.pi)
         )
         return u, float(log_evidence), moved
 
@@ -341,13 +341,13 @@ def integrated_out(information: Information, n: int, variance: Modes) -> Informa
     """
     others = information.n_modes - n
     require_shape("the variance", variance, (others,))
-    here = information.recentred(np.concatenate([information.reference[:n], np.zeros(others)]))
+    local = information.recentred(np.concatenate([information.reference[:n], np.zeros(others)]))
     scale = np.sqrt(variance)
-    lower = cholesky(scaled(here.matrix[n:, n:], scale) + np.eye(others))
-    across = solve_lower(lower, scale[:, None] * here.matrix[n:, :n], transpose=False)
-    pull = solve_lower(lower, (scale * here.vector[n:])[:, None], transpose=False)
-    misfit = np.asarray(here.misfit - (pull**2).sum())
-    log_det = np.asarray(here.log_det + 2.0 * np.log(np.diagonal(lower)).sum())
-    matrix = here.matrix[:n, :n] - across.T @ across
-    vector = here.vector[:n] - (across.T @ pull)[:, 0]
-    return Information(matrix, vector, here.reference[:n], misfit, log_det, here.n_data)
+    lower = cholesky(scaled(local.matrix[n:, n:], scale) + np.eye(others))
+    across = solve_lower(lower, scale[:, None] * local.matrix[n:, :n], transpose=False)
+    pull = solve_lower(lower, (scale * local.vector[n:])[:, None], transpose=False)
+    misfit = np.asarray(local.misfit - (pull**2).sum())
+    log_det = np.asarray(local.log_det + 2.0 * np.log(np.diagonal(lower)).sum())
+    matrix = local.matrix[:n, :n] - across.T @ across
+    vector = local.vector[:n] - (across.T @ pull)[:, 0]
+    return Information(matrix, vector, local.reference[:n], misfit, log_det, local.n_data)

@@ -226,10 +226,10 @@ def summed_information(
     common = common.recentred(common_of(prior, channel, sums.reference))
     parts = [*[slice(0, n)] * k, slice(n, None)]
     for (i, j), total in zip(_indices(k), sums.blocks, strict=True):
-        weight, own = weights[i] * weights[j], common.matrix[parts[i], parts[j]]
+        weight, block = weights[i] * weights[j], common.matrix[parts[i], parts[j]]
         for first in range(0, len(total), ROWS):  # products that fit into a cache
             lower = slice(first, first + ROWS), slice(0, first + ROWS if i < k else None)
-            total[lower] += weight * own[lower]
+            total[lower] += weight * block[lower]
     maps = weights[:k, None] * common.vector[:n]
     vector = sums.vector + np.concatenate([maps.reshape(-1), common.vector[n:]])
     return replace(sums, vector=vector)._plus(common, "misfit", "log_det", "n_data")

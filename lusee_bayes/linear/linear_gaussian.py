@@ -318,10 +318,10 @@ class Solution(Described):
     def less(self, excess: float) -> Solution:
         """The same, with chi^2 and -2 ln p(d) lower by a number."""
         evidence = np.asarray(self.posterior.log_evidence + excess / 2.0)
-        posterior, known = replace(self.posterior, log_evidence=evidence), self.known
-        if known is not None:
-            known = replace(known, misfit=np.asarray(known.misfit - excess))
-        return replace(self, posterior=posterior, known=known, excess=excess)
+        posterior, information = replace(self.posterior, log_evidence=evidence), self.known
+        if information is not None:
+            information = replace(information, misfit=np.asarray(information.misfit - excess))
+        return replace(self, posterior=posterior, known=information, excess=excess)
 
     def under(self, prior: Prior) -> Solution:
         """Solve for the same data under another prior; A^T N^-1 A is not computed again.
@@ -339,8 +339,8 @@ class Solution(Described):
         model = replace(self.model, prior=prior)
         if form_of(model) is not FromInformation:
             return model.condition(self.data)
-        known = self.information.matrix, self.of_noise
-        return FromInformation.of(model, *known).condition(self.data)
+        matrices = self.information.matrix, self.of_noise
+        return FromInformation.of(model, *matrices).condition(self.data)
 
 
 def form_of(model: LinearGaussian, *, transformed: bool = False) -> type[Form]:

@@ -128,13 +128,13 @@ def _rows_of_order(m: int, beams: Beams, f: Sums) -> Blocks:
     Rows of degrees from ``m``; columns of all degrees, with zeros where there is no mode.
     """
     n, zero = beams.shape[0], len(f) // 2
-    own, others = beams[m][..., m:], beams[: m + 1]
+    beam, others = beams[m][..., m:], beams[: m + 1]
     p = f[zero : zero + m + 1][::-1] @ others.conj()
     q = f[zero + m : zero + 2 * m + 1] @ others
-    own = own.reshape(-1, own.shape[-1]).T / 2.0
+    beam = beam.reshape(-1, beam.shape[-1]).T / 2.0
     # (rows, orders and degrees)
     u, v = (
-        (own @ x.reshape(m + 1, -1, n)).swapaxes(0, 1).reshape(n - m, -1) for x in (p + q, p - q)
+        (beam @ x.reshape(m + 1, -1, n)).swapaxes(0, 1).reshape(n - m, -1) for x in (p + q, p - q)
     )
     return np.block([[u.real, -v.imag], [u.imag, v.real]])
 
@@ -269,10 +269,10 @@ def _turned(rotation: Rotation, matrix: ModesMatrix, place: Places) -> ModesMatr
     """R^T M R degree by degree, on and below the diagonal: what is worked on fits into a cache."""
     turned = np.empty_like(matrix)
     spans = [slice(ell**2, (ell + 1) ** 2) for ell in range(len(rotation.blocks))]
-    for ell, (left, here) in enumerate(zip(rotation.blocks, spans, strict=True)):
-        rows = left.T @ matrix[place[here]].take(place[: here.stop], axis=1)
-        for right, there in zip(rotation.blocks[: ell + 1], spans[: ell + 1], strict=True):
-            turned[here, there] = rows[:, there] @ right
+    for ell, (left, span) in enumerate(zip(rotation.blocks, spans, strict=True)):
+        rows = left.T @ matrix[place[span]].take(place[: span.stop], axis=1)
+        for right, other in zip(rotation.blocks[: ell + 1], spans[: ell + 1], strict=True):
+            turned[span, other] = rows[:, other] @ right
     return mirrored(turned)
 
 

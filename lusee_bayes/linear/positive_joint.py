@@ -86,8 +86,8 @@ class ChannelsInMemory:
 
     def each(self, function: OfChannel, shapes: Shapes) -> Arrays:
         """Call a function with number and information of every channel; its arrays, stacked."""
-        found = [function(k, information) for k, information in enumerate(self.informations)]
-        return {name: np.stack([part[name] for part in found]) for name in shapes}
+        parts = [function(k, information) for k, information in enumerate(self.informations)]
+        return {name: np.stack([part[name] for part in parts]) for name in shapes}
 
     def summed(
         self, prior: SpectralPrior, reference: Exponents, function: Linearised
@@ -179,10 +179,10 @@ def linearised(
         Without unit, point sources integrated out.
     """
     diffuse = diffuse_part(skies, channel, information).without()
-    here = diffuse.recentred(_whole(skies, channel, exponent))
+    local = diffuse.recentred(_whole(skies, channel, exponent))
     slope = _slope(skies, channel, exponent)
-    matrix, vector = symmetric_product(slope.T @ here.matrix, slope), here.vector @ slope
-    return replace(here, matrix=matrix, vector=vector, reference=exponent)
+    matrix, vector = symmetric_product(slope.T @ local.matrix, slope), local.vector @ slope
+    return replace(local, matrix=matrix, vector=vector, reference=exponent)
 
 
 @dataclass(frozen=True)
@@ -197,9 +197,9 @@ class _Point:
         """E under a prior."""
         k, n = np.shape(prior.roots)
         fields, shared = self.unknowns[: k * n].reshape(k, n), self.unknowns[k * n :]
-        rest = self.exponents[:, :n] - np.asarray(prior.mixing) @ fields
+        residuals = self.exponents[:, :n] - np.asarray(prior.mixing) @ fields
         roots = np.stack([prior.residual_root(k) for k in range(prior.n_channels)])
-        parts = (fields / np.asarray(prior.roots), rest / roots, shared)
+        parts = (fields / np.asarray(prior.roots), residuals / roots, shared)
         return self.chi2 + sum(float((part**2).sum()) for part in parts)
 
 
@@ -236,27 +236,27 @@ def find_joint_mode(
     shared = np.zeros(0) if shared is None else shared
     start = np.concatenate([np.zeros(len(skies.names) * skies.n_fields), shared])
     exponents = np.tile(np.append(np.zeros(skies.n_fields), shared), (len(skies.levels), 1))
-    here = _Point(start, exponents, _chi2(skies, channels, exponents))
+    point = _Point(start, exponents, _chi2(skies, channels, exponents))
     shapes: Shapes = {"exponent": exponents.shape[1:], "chi2": ()}
     if learn:
         shapes |= dict.fromkeys(("power", "known"), (skies.grid.lmax + 1,))
     last = np.zeros_like(laws.parameters)
     for rounds in range(MAX_ROUNDS):
         prior = laws.prior(skies)
-        posterior, there, found = _linear_round(skies, channels, prior, here.exponents, shapes)
-        energy = here.energy(prior)
-        moved = np.sqrt(max(energy - there.energy(prior), 0.0))
+        posterior, mean, arrays = _linear_round(skies, channels, prior, point.exponents, shapes)
+        energy = point.energy(prior)
+        moved = np.sqrt(max(energy - mean.energy(prior), 0.0))
         if report is not None:
             report(rounds, f"{moved:.2g} sigma")
         change = np.zeros_like(laws.parameters)
         if learn:
-            change = laws.matched(*_powers(posterior, prior, found)).parameters - laws.parameters
+            change = laws.matched(*_powers(posterior, prior, arrays)).parameters - laws.parameters
             # a law that nothing depends on may go to and fro
             change = np.where(change * last < 0, 0.5, 1.0) * change
         if moved < SETTLED and np.abs(change).max() < SETTLED_LAW:
-            known = skies, laws, here.exponents, posterior
-            return PositiveMode(*known, energy, float(moved), rounds)
-        here = _descended(skies, channels, prior, here, there)
+            result = skies, laws, point.exponents, posterior
+            return PositiveMode(*result, energy, float(moved), rounds)
+        point = _descended(skies, channels, prior, point, mean)
         laws, last = replace(laws, parameters=laws.parameters + change), change
     raise InputError(
         f"the positive skies did not converge in {MAX_ROUNDS} rounds: the last step was "
@@ -293,8 +293,8 @@ def _linear_round(
     def judged(channel: int, information: Information) -> Arrays:
         return _judged(prior, channel, relative(channel, information), mean, spread)
 
-    found = channels.each(judged, shapes)
-    return posterior, _Point(mean, found["exponent"], float(found["chi2"].sum())), found
+    arrays = channels.each(judged, shapes)
+    return posterior, _Point(mean, arrays["exponent"], float(arrays["chi2"].sum())), arrays
 
 
 def _judged(
@@ -307,9 +307,9 @@ def _judged(
     """Exponent and chi^2 of a channel at the mean of a linear round, and its residual's power."""
     none = np.zeros((0, len(mean)))
     sky = joint.channel_sky(prior, channel, information, mean, None, none, jax.random.key(0))
-    found = {"exponent": sky.mean, "chi2": sky.chi2}
+    judged = {"exponent": sky.mean, "chi2": sky.chi2}
     if spread is None:
-        return found
+        return judged
     root = prior.residual_root(channel)
     inverse = inverse_from_cholesky(joint.residual_lower(information, root))
     common = joint.common_covariance(prior, channel, spread)
@@ -317,32 +317,32 @@ def _judged(
     pull = (inverse * root[None]) @ information.matrix[: len(root)]
     variance = np.diagonal(inverse) + np.einsum("ij,ij->i", pull @ common, pull)
     white = ((sky.mean - joint.common_of(prior, channel, mean))[: len(root)]) / root
-    return {**found, "power": sum_over_m(white**2), "known": sum_over_m(1.0 - variance)}
+    return {**judged, "power": sum_over_m(white**2), "known": sum_over_m(1.0 - variance)}
 
 
-def _powers(posterior: Posterior, prior: SpectralPrior, found: Arrays) -> tuple[OfLaws, OfLaws]:
+def _powers(posterior: Posterior, prior: SpectralPrior, arrays: Arrays) -> tuple[OfLaws, OfLaws]:
     """sum_m u^2 and sum_m (1 - var u) of all fields and residuals."""
     shape = prior.n_components, -1
     variance = np.diagonal(inverse_from_cholesky(np.asarray(posterior.lower))).reshape(shape)
     power = sum_over_m(np.asarray(posterior.white_mean).reshape(shape) ** 2)
     known = sum_over_m(1.0 - variance)
-    return np.concatenate([power, found["power"]]), np.concatenate([known, found["known"]])
+    return np.concatenate([power, arrays["power"]]), np.concatenate([known, arrays["known"]])
 
 
 def _descended(
-    skies: PositiveSkies, channels: Channels, prior: SpectralPrior, here: _Point, there: _Point
+    skies: PositiveSkies, channels: Channels, prior: SpectralPrior, point: _Point, end: _Point
 ) -> _Point:
     """The end of a step, or of a half, a quarter, ... of it, if E is not higher there."""
-    part, energy = 1.0, here.energy(prior)
+    part, energy = 1.0, point.energy(prior)
     for _ in range(HALVINGS):
-        unknowns = here.unknowns + part * (there.unknowns - here.unknowns)
-        exponents = here.exponents + part * (there.exponents - here.exponents)
+        unknowns = point.unknowns + part * (end.unknowns - point.unknowns)
+        exponents = point.exponents + part * (end.exponents - point.exponents)
         trial = _Point(unknowns, exponents, _chi2(skies, channels, exponents))
         # what a short step gains may be rounding
         if trial.energy(prior) < energy + SETTLED**2:
             return trial
         part /= 2.0
-    return here
+    return point
 
 
 # draws whose fields are on the grid at once
@@ -384,18 +384,18 @@ def positive_sky(
     skies, exponent = mode.skies, mode.exponents[channel]
     relative = linearised(skies, channel, information, exponent)
     unknowns = np.asarray(mode.posterior.mean)
-    found = joint.channel_sky(mode.prior, channel, relative, unknowns, spread, draws, key)
+    joint_sky = joint.channel_sky(mode.prior, channel, relative, unknowns, spread, draws, key)
     beside = diffuse_part(skies, channel, information)
     slope = _slope(skies, channel, exponent)
-    covariance = beside.whole_covariance(symmetric_product(slope @ found.covariance, slope.T))
-    mean = beside.whole_sky(_whole(skies, channel, found.mean))
+    covariance = beside.whole_covariance(symmetric_product(slope @ joint_sky.covariance, slope.T))
+    mean = beside.whole_sky(_whole(skies, channel, joint_sky.mean))
     shape = len(draws), len(beside.patterns)
     flux_key = jax.random.fold_in(jax.random.fold_in(key, channel), 1)
     z = np.asarray(jax.random.normal(flux_key, shape, dtype=jnp.float64))
     drawn = np.empty((len(draws), len(mean)))
     for first in range(0, len(draws), CHUNK):
-        here = slice(first, first + CHUNK)
-        drawn[here] = _whole(skies, channel, found.draws[here])
+        chunk = slice(first, first + CHUNK)
+        drawn[chunk] = _whole(skies, channel, joint_sky.draws[chunk])
     return joint.ChannelSky(mean, covariance, beside.whole_skies(drawn, z), information.chi2(mean))
 
 
@@ -442,10 +442,10 @@ def _large_scales(skies: PositiveSkies, channels: Channels, n: int) -> ChannelsI
         return {name: getattr(information, name) for name in names}
 
     shapes = dict(zip(names, ((n, n), (n,), (n,), (), (), ()), strict=True))
-    found = channels.each(large, shapes)
+    arrays = channels.each(large, shapes)
     return ChannelsInMemory(
         tuple(
-            Information(*(np.asarray(found[name][k]) for name in names))
+            Information(*(np.asarray(arrays[name][k]) for name in names))
             for k in range(len(skies.levels))
         )
     )

@@ -390,6 +390,6 @@ def _rings(nside: int, lmax: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _on_pixels(values: Float[np.ndarray, "rings longest"], place: np.ndarray) -> Pixels:
-    found = np.empty(place.max() + 1)
-    found[place] = values
-    return found
+    pixels = np.empty(place.max() + 1)
+    pixels[place] = values
+    return pixels

@@ -154,10 +154,10 @@ class Hyperprior:
 
         Factors of cells have means, those of variables of a Student distribution have none.
         """
-        found, n = self.of_scores(drawn), len(self.centre)
+        values, n = self.of_scores(drawn), len(self.centre)
         linear = self.of_scores(scores) + self.slopes_of_scores(scores) * (drawn - scores)
-        found[..., :n] = linear[..., :n]
-        return found
+        values[..., :n] = linear[..., :n]
+        return values
 
     def moments(self, scores: Parameters, covariance: Square) -> tuple[Parameters, Square]:
         """Mean and covariance of :meth:`near` for normal scores, with their correlation."""

@@ -97,23 +97,23 @@ def normal_scores(hyperprior: Hyperprior, parameters: Parameters, covariance: Sq
     InputError
         If the data's curvature is far from positive.
     """
-    known = np.linalg.inv(covariance) - np.diag(hyperprior.curvature(parameters))
+    of_data = np.linalg.inv(covariance) - np.diag(hyperprior.curvature(parameters))
     slope = -hyperprior.gradient(parameters)
 
     def value(z: Parameters) -> float:
         off = hyperprior.of_scores(z) - parameters
-        return float(slope @ off - 0.5 * off @ known @ off - 0.5 * z @ z)
+        return float(slope @ off - 0.5 * off @ of_data @ off - 0.5 * z @ z)
 
     def precision(z: Parameters) -> np.ndarray:
         j = hyperprior.slopes_of_scores(z)
-        return j[:, None] * known * j + np.eye(len(z))
+        return j[:, None] * of_data * j + np.eye(len(z))
 
     z = hyperprior.scores(parameters)
     for _ in range(STEPS):
-        pull = slope - known @ (hyperprior.of_scores(z) - parameters)
+        pull = slope - of_data @ (hyperprior.of_scores(z) - parameters)
         step = np.linalg.solve(precision(z), hyperprior.slopes_of_scores(z) * pull - z)
         tried = (z + 0.5**k * step for k in range(HALVINGS))
-        z = next((there for there in tried if value(there) >= value(z)), z)
+        z = next((trial for trial in tried if value(trial) >= value(z)), z)
     lower = checked_cholesky("the curvature of the parameters", precision(z))
     log_gain = value(z) - float(np.log(np.diagonal(lower)).sum())
     return Scores(z, inverse_from_cholesky(lower), log_gain)
@@ -257,18 +257,18 @@ def _uphill(
 ) -> tuple[_Point, Generator, int]:
     """The most probable parameters, random numbers for more, and the steps that were taken."""
     rng, before, moves = np.random.default_rng(seed), None, []
-    here = _at(family, information, family.hyperprior.start() if start is None else start)
+    point = _at(family, information, family.hyperprior.start() if start is None else start)
     for steps in range(MAX_STEPS + 1):
-        gradient = here.slope(family)
+        gradient = point.slope(family)
         if before is not None:
-            moves.append((here.parameters - before[0], before[1] - gradient))
-        before = here.parameters, gradient
-        curvature = _corrected(here.curvature(family, rng, SIMULATIONS), moves)
+            moves.append((point.parameters - before[0], before[1] - gradient))
+        before = point.parameters, gradient
+        curvature = _corrected(point.curvature(family, rng, SIMULATIONS), moves)
         step = np.linalg.solve(curvature, gradient)
         gain = 0.5 * float(gradient @ step)
         if gain < SETTLED:
-            return here, rng, steps
-        here = _climb(family, information, here, step * min(1.0, LONGEST / np.abs(step).max()))
+            return point, rng, steps
+        point = _climb(family, information, point, step * min(1.0, LONGEST / np.abs(step).max()))
     raise NotSettled(
         f"the prior's parameters did not converge in {MAX_STEPS} steps: the next would still add "
         f"{gain:.2g} to ln p (accepted: {SETTLED:g})"
@@ -303,10 +303,10 @@ def learn_whatever_fits(
     demanded = demanded_factor(information, family.expected())
     for factor in demanded * HIGHER:
         with suppress(InputError):
-            found = learn(family, information.raised(factor), start, seed)
+            learned = learn(family, information.raised(factor), start, seed)
             if factor > 1.0:  # a posterior under N itself is what it is for
-                information.posterior(found.prior)
-            return replace(found, noise_factor=float(factor))
+                information.posterior(learned.prior)
+            return replace(learned, noise_factor=float(factor))
     return _fixed(family, information, float(demanded * HIGHER[-1]))
 
 
@@ -345,8 +345,8 @@ def _fixed(family: PriorFamily, information: Information, factor: float) -> Lear
     """
     prior, n_data = family.expected(), int(information.n_data)
     raised = information.raised(factor).posterior(prior)
-    known = max(n_data - expected_chi2(raised, n_data), 1.0)
-    prior = prior.widened(max(1.0, float(np.sqrt(float(raised.prior_chi2()) / known))))
+    n_known = max(n_data - expected_chi2(raised, n_data), 1.0)
+    prior = prior.widened(max(1.0, float(np.sqrt(float(raised.prior_chi2()) / n_known))))
     for _ in range(MOST_WIDENINGS):
         try:
             evidence = float(information.posterior(prior).log_evidence)
@@ -364,44 +364,44 @@ def _at(family: PriorFamily, information: Information, parameters: Parameters) -
     return _Point(parameters, member, posterior, value)
 
 
-def _climb(family: PriorFamily, information: Information, here: _Point, step: Parameters) -> _Point:
+def _climb(family: PriorFamily, information: Information, base: _Point, step: Parameters) -> _Point:
     """The end of a step, or of a half, a quarter, ... of it, if ln p is not lower there."""
     part = 1.0
     while part >= SHORTEST:
         with suppress(InputError):  # too far: S has no Cholesky factor there
-            there = _at(family, information, here.parameters + part * step)
-            if there.value >= here.value - SETTLED / 10.0:
-                return there
+            trial = _at(family, information, base.parameters + part * step)
+            if trial.value >= base.value - SETTLED / 10.0:
+                return trial
         part /= 2.0
     raise NotSettled(
         "the prior's parameters do not converge: ln p decreases along its gradient, by rounding"
     )
 
 
-def _root(known: Square) -> Float[np.ndarray, "n k"]:
+def _root(covariance: Square) -> Float[np.ndarray, "n k"]:
     """A root of a covariance with eigenvalues from 0 to 1.
 
     Of data that are very precise, those near 0 are wrong by more than ``ROUNDING``; then what lies
     outside of 0 to 1 is left out.
     """
-    root = cholesky(known + ROUNDING * np.eye(len(known)))
+    root = cholesky(covariance + ROUNDING * np.eye(len(covariance)))
     if np.isfinite(np.diagonal(root)).all():
         return np.tril(root)
-    values, vectors = np.linalg.eigh(known)
+    values, vectors = np.linalg.eigh(covariance)
     return vectors * np.sqrt(np.clip(values, 0.0, 1.0))
 
 
 def _learned(
-    family: PriorFamily, information: Information, here: _Point, rng: Generator, steps: int
+    family: PriorFamily, information: Information, point: _Point, rng: Generator, steps: int
 ) -> Learned:
-    covariance = np.linalg.inv(here.curvature(family, rng, FINAL_SIMULATIONS))
-    scores = normal_scores(family.hyperprior, here.parameters, covariance)
-    mean, about = family.hyperprior.moments(scores.mean, scores.covariance)
+    covariance = np.linalg.inv(point.curvature(family, rng, FINAL_SIMULATIONS))
+    scores = normal_scores(family.hyperprior, point.parameters, covariance)
+    mean, second = family.hyperprior.moments(scores.mean, scores.covariance)
 
     def spread(rows: Float[np.ndarray, "rows parameters"]) -> Float[np.ndarray, " rows"]:
-        return np.einsum("ij,ij->i", rows @ about, rows)
+        return np.einsum("ij,ij->i", rows @ second, rows)
 
-    evidence = float(here.posterior.log_evidence) + scores.log_gain
+    evidence = float(point.posterior.log_evidence) + scores.log_gain
 
     # the variances are a constant, and one that goes with the level
     doubled = np.concatenate([[mean[0] + np.log(2.0)], mean[1:]])
@@ -417,7 +417,7 @@ def _learned(
     moved = np.zeros(len(mean))
     moved[0] = shift / family.hyperprior.slopes_of_scores(scores.mean)[0]
     prior, scores = at_level(shift).prior, replace(scores, mean=scores.mean + moved)
-    return Learned(prior, family.names, here.parameters, covariance, scores, evidence, steps)
+    return Learned(prior, family.names, point.parameters, covariance, scores, evidence, steps)
 
 
 # skies that are drawn with the same theta, at most, and the number of theta from which on it is
@@ -459,9 +459,9 @@ def draws_with_parameters(
     sets = max(min(-(-n // 2), LEAST), -(-n // SHARED))
 
     def some(k: int) -> None:
-        own = jax.random.fold_in(key, k)
-        there = _under_drawn_parameters(family, learned, root, information, own)
-        drawn[k::sets] = there.sample(jax.random.fold_in(own, ATTEMPTS), len(drawn[k::sets]))
+        subkey = jax.random.fold_in(key, k)
+        posterior = _under_drawn_parameters(family, learned, root, information, subkey)
+        drawn[k::sets] = posterior.sample(jax.random.fold_in(subkey, ATTEMPTS), len(drawn[k::sets]))
 
     in_threads(some, range(sets))
     return drawn

@@ -128,9 +128,9 @@ def windows(lmax: int) -> Float[np.ndarray, "bands ells"]:
     octaves = np.clip(np.log2(ell[None] / edges[:, None]), 0.0, 1.0)
     below = np.cos(0.5 * np.pi * octaves) ** 2
     shares = np.diff(np.concatenate([np.zeros((1, lmax)), below, np.ones((1, lmax))]), axis=0)
-    found = np.zeros((n, lmax + 1))
-    found[:, 1:] = np.sqrt(np.where(shares > 1e-12, shares, 0.0))
-    return found
+    bands = np.zeros((n, lmax + 1))
+    bands[:, 1:] = np.sqrt(np.where(shares > 1e-12, shares, 0.0))
+    return bands
 
 
 def _middle(window: Ells) -> float:

@@ -112,11 +112,11 @@ def check_covariance(cov: Covariance, dense: np.ndarray, *, slopes: bool = True)
     # the square root: L L^T = N, whiten = L^-1, whiten_transpose = L^-T
     root = np.asarray(got["root"])
     close(root @ root.T, dense)
-    own = np.linalg.inv(root)
-    close(got["inverse_root"], own)
-    close(got["inverse_root_transpose"], own.T)
+    inverse_root = np.linalg.inv(root)
+    close(got["inverse_root"], inverse_root)
+    close(got["inverse_root_transpose"], inverse_root.T)
     close(got["back"], xs)
-    for value, matrix in zip(got["one"], (root, own, own.T), strict=True):
+    for value, matrix in zip(got["one"], (root, inverse_root, inverse_root.T), strict=True):
         close(value, matrix @ x)
 
     # scaled
@@ -142,11 +142,11 @@ def _assert_draws_follow(
     """Moments of draws scatter by sqrt(C_ii / n), and sqrt((C_ii C_jj + C_ij^2) / n) (Wick)."""
     variance, deviations = np.diag(covariance), draws - mean
     second = np.sqrt(np.outer(variance, variance) + covariance**2)
-    for found, expected, scatter in (
+    for moment, expected, scatter in (
         (deviations.mean(0), 0.0, np.sqrt(variance)),
         (deviations.T @ deviations / len(draws), covariance, second),
     ):
-        worst = np.abs(found - expected) * np.sqrt(len(draws))
+        worst = np.abs(moment - expected) * np.sqrt(len(draws))
         # what has no variance is exact, but for the rounding of a square root
         limit = norm.isf(FALSE_ALARM / (2 * worst.size)) * scatter + 1e-9 * second.max()
         assert (worst < limit).all()
@@ -364,17 +364,17 @@ def check_prior(prior: Prior, covariance: np.ndarray, mean: np.ndarray | None = 
     u, a = rng.normal(size=(2, 3, n)), rng.normal(size=(70, n))
     white, matrix = rng.normal(size=(2, n, n))
     inputs = u, a, white @ white.T, matrix @ matrix.T
-    found = on_host(eqx.filter_jit(_numbers_of_prior)(on_device(prior), *map(jnp.asarray, inputs)))
+    traced = on_host(eqx.filter_jit(_numbers_of_prior)(on_device(prior), *map(jnp.asarray, inputs)))
     for name, value in _numbers_of_prior(on_host(prior), *map(np.array, inputs)).items():
-        close(value, found[name])
-    root = found["root"]
+        close(value, traced[name])
+    root = traced["root"]
     close(root @ root.T, covariance)
-    close(found["covariance"], covariance)
-    close(found["variance"], np.diag(covariance))
-    close(found["coloured"], u @ root.T)
-    close(found["columns"], a @ root)
-    close(found["sandwich"], root.T @ inputs[3] @ root)
-    close(found["colour_covariance"], root @ inputs[2] @ root.T)
+    close(traced["covariance"], covariance)
+    close(traced["variance"], np.diag(covariance))
+    close(traced["coloured"], u @ root.T)
+    close(traced["columns"], a @ root)
+    close(traced["sandwich"], root.T @ inputs[3] @ root)
+    close(traced["colour_covariance"], root @ inputs[2] @ root.T)
     expected = np.zeros(n) if mean is None else mean
     _check_inverse(prior, covariance, root, u, a @ root)
     close(prior.colour(prior.white_mean), expected)
