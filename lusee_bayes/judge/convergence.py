@@ -25,12 +25,12 @@ def warnings_of(table: Mapping[str, np.ndarray], *, chains: int, divergences: in
     chains, divergences : int
         Of the run.
     """
-    found = []
+    warnings = []
     names, r_hat = table["quantity"], np.nan_to_num(table["r_hat"], nan=-np.inf, posinf=np.inf)
     above = int((r_hat > AGREE).sum())
     if above:
         furthest = int(np.argmax(r_hat))
-        found.append(
+        warnings.append(
             f"Not converged: R-hat is above {AGREE:g} for {above} of {len(names)} quantities, "
             f"largest for {names[furthest]} ({r_hat[furthest]:.3f}). Raise --draws."
         )
@@ -42,14 +42,14 @@ def warnings_of(table: Mapping[str, np.ndarray], *, chains: int, divergences: in
         few = int((size < least).sum())
         if few:
             worst = int(np.argmin(size))
-            found.append(
+            warnings.append(
                 f"The {what} effective size is below {least} for {few} of {len(names)} quantities, "
                 f"smallest for {names[worst]} ({size[worst]:.0f}): raise --draws."
             )
     if divergences:
-        found.append(
+        warnings.append(
             f"{divergences} trajectories diverged: the steps are too long where the posterior is "
             "narrow. Raise --warmup; if that does not help, reparametrise the program so that its "
             "posterior is nowhere narrow."
         )
-    return found
+    return warnings

@@ -136,12 +136,12 @@ def _statistics(
     pulls: Vector, parts: Iterable[Bool[np.ndarray, " n"]]
 ) -> Float[np.ndarray, "parts statistics"]:
     limits = special.ndtri(0.5 + 0.5 * np.array(LEVELS))
-    found = []
+    rows = []
     for inside in parts:
         size = np.abs(pulls[inside])
         held = [(size < limit).mean() for limit in limits]
-        found.append([*held, np.sqrt((size**2).mean()), size.max()])
-    return np.array(found)
+        rows.append([*held, np.sqrt((size**2).mean()), size.max()])
+    return np.array(rows)
 
 
 def latitudes(nside: int) -> dict[str, Bool[np.ndarray, " pixels"]]:

@@ -138,17 +138,17 @@ class ChannelFits:
             f"but the skies are {self.rest.of_sky}.",
             "does not fit": contradiction or f"{misfit}.",
         }
-        told = [verdicts[level]]
+        sentences = [verdicts[level]]
         for test in tests:
             p_value = probability(min(1.0, test.n * test.p))
             times = f" among {test.n}" if test.n > 1 else ""
-            told.append(f"{test.name.capitalize()}: {test.found} (p {p_value}{times}).")
+            sentences.append(f"{test.name.capitalize()}: {test.found} (p {p_value}{times}).")
         extremes = self.extremes()
         if extremes:
             frequencies = self.frequencies_mhz
             names = [f"{frequencies[k]:g} MHz (p {probability(float(p[k]))})" for k in extremes]
-            told.append(f"{len(extremes)} of {len(p)} channels flagged: {in_brief(names)}.")
-        return Fit(level, " ".join([*told, *([] if contradiction else self._advice(level))]))
+            sentences.append(f"{len(extremes)} of {len(p)} channels flagged: {in_brief(names)}.")
+        return Fit(level, " ".join([*sentences, *([] if contradiction else self._advice(level))]))
 
     def _too_quiet(self) -> bool:
         """Whether all channels together, or the one furthest out if that is less probable, have
@@ -163,8 +163,8 @@ class ChannelFits:
             return ["Map the flagged channels one by one: this also tests their products and days."]
         if level == "unlike the prior" and self.rest.too_small:
             narrower = "smaller spectral.residual" if self.joint else "narrower prior"
-            found = "The prior is wider than the skies require, and error bars are too wide"
-            return [f"{found}: a {narrower} would give a sharper map (compare the evidence)."]
+            finding = "The prior is wider than the skies require, and error bars are too wide"
+            return [f"{finding}: a {narrower} would give a sharper map (compare the evidence)."]
         if level == "unlike the prior" and self.joint:
             return [
                 "The skies may not follow the spectral prior, and error bars be too small: compare "
@@ -232,36 +232,36 @@ def shared_tests(
     frequencies_mhz : sequence of float
         Of the channels.
     """
-    told, blocks = np.linalg.inv(covariance), root_of_kernels(kernels)
-    pull = np.einsum("kij,kj->ki", told, mean)
-    precision = told - np.eye(len(names))
+    inverse, blocks = np.linalg.inv(covariance), root_of_kernels(kernels)
+    pull = np.einsum("kij,kj->ki", inverse, mean)
+    precision = inverse - np.eye(len(names))
     seen = np.swapaxes(blocks, 1, 2) @ precision @ blocks
     pulled = np.einsum("kiw,ki->kw", blocks, pull)
-    agree, found = list(range(len(mean))), [(0.0, 0)] * len(mean)
+    agree, tests = list(range(len(mean))), [(0.0, 0)] * len(mean)
 
     def compared(k: int) -> tuple[float, int]:
         """chi^2 of channel k and its degrees of freedom."""
-        rest = [j for j in agree if j != k]
-        others = np.eye(blocks.shape[2]) + seen[rest].sum(0)
-        predicted = blocks[k] @ np.linalg.solve(others, pulled[rest].sum(0))
+        peers = [j for j in agree if j != k]
+        others = np.eye(blocks.shape[2]) + seen[peers].sum(0)
+        predicted = blocks[k] @ np.linalg.solve(others, pulled[peers].sum(0))
         spread = blocks[k] @ np.linalg.solve(others, blocks[k].T)
         values, axes = np.linalg.eigh(precision[k])
         kept = values > max(LEAST_INFORMATION, len(values) * np.finfo(float).eps * values[-1])
         # in units of the channel's own errors: chi^2 = r^T (1 + L^1/2 P L^1/2)^-1 r
         white = axes[:, kept] / np.sqrt(values[kept])
-        off = white.T @ (told[k] @ (mean[k] - predicted) + predicted)
+        off = white.T @ (inverse[k] @ (mean[k] - predicted) + predicted)
         half = precision[k] @ white
         variance = np.eye(len(off)) + half.T @ spread @ half
         return float(off @ np.linalg.solve(variance, off)), len(off)
 
     def excess(k: int) -> float:
-        return (found[k][0] - found[k][1]) / np.sqrt(2.0 * found[k][1] or 1.0)
+        return (tests[k][0] - tests[k][1]) / np.sqrt(2.0 * tests[k][1] or 1.0)
 
     while len(agree) > 1:
         for k in agree:
-            found[k] = compared(k)
+            tests[k] = compared(k)
         worst = max(agree, key=excess)
-        if not stands_out(float(chdtrc(max(found[worst][1], 1), found[worst][0])), len(mean)):
+        if not stands_out(float(chdtrc(max(tests[worst][1], 1), tests[worst][0])), len(mean)):
             break
         # of two that differ, neither is known to be right
         agree = [k for k in agree if k != worst] if len(agree) > 2 else []
@@ -270,7 +270,7 @@ def shared_tests(
     total = alone.sum(0)
     shares = np.divide(alone, total, out=np.zeros(alone.shape), where=total > 0)
     return tuple(
-        SharedTest(f, *found[k], k not in agree, {names[i]: float(shares[k, i]) for i in common})
+        SharedTest(f, *tests[k], k not in agree, {names[i]: float(shares[k, i]) for i in common})
         for k, f in enumerate(frequencies_mhz)
     )
 

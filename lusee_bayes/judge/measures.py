@@ -77,10 +77,10 @@ def preferences(solution: Solution, templates: Float[np.ndarray, "data n"]) -> P
     solved = np.asarray(solution.factor.solve(templates))
     # rows of P^T
     seen = np.asarray(model.coupling.transpose_mv(solved)).T
-    known = (templates * solved).sum(0) - ((seen @ solution.covariance) * seen).sum(1)
+    precision = (templates * solved).sum(0) - ((seen @ solution.covariance) * seen).sum(1)
     # what the sky can take up altogether is left with rounding alone
-    told = known > ROUNDING * (templates * solved).sum(0)
-    inverse = np.divide(1.0, known, out=np.full(len(known), np.nan), where=told)
+    determined = precision > ROUNDING * (templates * solved).sum(0)
+    inverse = np.divide(1.0, precision, out=np.full(len(precision), np.nan), where=determined)
     return Preferences(pull * inverse, np.sqrt(inverse), pull**2 * inverse)
 
 
@@ -114,11 +114,11 @@ def strengths(deviation: Modes, of_modes: Modes, of_pixels: Pixels) -> dict[str,
     }
 
 
-def strengths_in_words(found: Mapping[str, float]) -> str:
+def strengths_in_words(ratios: Mapping[str, float]) -> str:
     """A sentence of them; empty if there are none."""
-    if not found:
+    if not ratios:
         return ""
-    listed = ", ".join(f"{value:.2g} at {name}" for name, value in found.items())
+    listed = ", ".join(f"{value:.2g} at {name}" for name, value in ratios.items())
     return f"Sky power relative to the prior: {listed}."
 
 

@@ -91,11 +91,11 @@ def _about_range(
     if not present.any():
         return ()
     ratio = float(np.median(autos[present] / modelled[present]))
-    found = f"auto-correlations are {ratio:.2g} times those of the modelled sky"
+    finding = f"auto-correlations are {ratio:.2g} times those of the modelled sky"
     if not 1.0 / IMPOSSIBLE < ratio < IMPOSSIBLE:
         advice = "check the unit of the data, their frequency and the beams"
-        raise InputError(f"the {found}; {advice}")
-    doubt = f"The {found}: check the unit of the data, their frequency and the beams."
+        raise InputError(f"the {finding}; {advice}")
+    doubt = f"The {finding}: check the unit of the data, their frequency and the beams."
     return () if 1.0 / DOUBTFUL < ratio < DOUBTFUL else (doubt,)
 
 

@@ -105,8 +105,8 @@ class Residuals:
 
     def extremes(self) -> list[Group]:
         """Groups that stand out from what all others predict, the least probable first."""
-        found = [group for group in self.compared() if stands_out(group.p, self.n_tests)]
-        return sorted(found, key=lambda group: group.p)
+        groups = [group for group in self.compared() if stands_out(group.p, self.n_tests)]
+        return sorted(groups, key=lambda group: group.p)
 
     def level(self) -> Level:
         """The verdict in a word.
@@ -130,8 +130,8 @@ class Residuals:
         if self.level() != "does not fit":
             return []
         looked_at = self.extremes() or self.compared()
-        found = [one for one in looked_at if not stands_out(one.others_p, self.n_tests)]
-        return sorted(found, key=lambda group: (KINDS.index(group.kind), group.p))
+        groups = [one for one in looked_at if not stands_out(one.others_p, self.n_tests)]
+        return sorted(groups, key=lambda group: (KINDS.index(group.kind), group.p))
 
     def fit(self, strengths: str = "") -> Fit:
         """Judge whether the data fit, and say what to do if not.
@@ -218,9 +218,9 @@ def residuals(solution: Solution, data: Visibilities) -> Residuals:
         return Group(kind, name, n, degrees, missed.chi2, p, others.p)
 
     groups = groups_of(data)
-    found = tuple(map(judged, groups, left_out.each([group.data for group in groups])))
+    tests = tuple(map(judged, groups, left_out.each([group.data for group in groups])))
     z = layout.gather(left_out.u) / np.sqrt(layout.gather(left_out.inverse_diagonal))
-    return Residuals(predicted, z, split, found)
+    return Residuals(predicted, z, split, tests)
 
 
 @dataclass(frozen=True)
@@ -269,10 +269,10 @@ def held_out(solution: Solution, data: Visibilities) -> tuple[HeldOut, ...]:
     left_out = LeftOut.of(solution.model, data, solution.posterior)
     if left_out is None:
         return ()
-    groups, found = groups_of(data), []
+    groups, parts = groups_of(data), []
     for kind in ("product", "day"):
         missed = left_out.each([group.data for group in groups if group.kind == kind])
         if len(missed) > 1:
             sums = zip(*((one.n, one.chi2, one.log_density) for one in missed), strict=True)
-            found.append(HeldOut(kind, len(missed), *map(sum, sums)))
-    return tuple(found)
+            parts.append(HeldOut(kind, len(missed), *map(sum, sums)))
+    return tuple(parts)

@@ -63,8 +63,8 @@ class Split:
         InputError
             As :func:`widened`.
         """
-        known = n_data - (expected_chi2(posterior, n_data) if expected is None else expected)
-        size = max(1.0, np.sqrt(float(posterior.prior_chi2()) / known)) if known > 0 else 1.0
+        n_known = n_data - (expected_chi2(posterior, n_data) if expected is None else expected)
+        size = max(1.0, np.sqrt(float(posterior.prior_chi2()) / n_known)) if n_known > 0 else 1.0
         try:
             wide, less = widened(posterior, WIDER * size, matrix)
         except InputError:
@@ -132,8 +132,8 @@ def widened(
     less = (1.0 - factor**-2) * float(inside @ (inside + step))
     moved = step if posterior.basis is None else posterior.basis @ step
     log_evidence = posterior.log_evidence + 0.5 * (less + log_det - log_det_of(root))
-    mean, known = (posterior.white_mean + moved) / factor, np.asarray(log_evidence)
-    parts = prior.widened(factor), mean, root, posterior.basis, known, posterior.refinement
+    mean, evidence = (posterior.white_mean + moved) / factor, np.asarray(log_evidence)
+    parts = prior.widened(factor), mean, root, posterior.basis, evidence, posterior.refinement
     return Posterior(*parts), less
 
 
