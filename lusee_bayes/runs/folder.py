@@ -20,7 +20,7 @@ from pandas import DataFrame
 from pydantic import BaseModel
 from xarray import Dataset, DataTree
 
-from lusee_bayes.core import files
+from lusee_bayes.core import files, reading
 from lusee_bayes.core.arrays import use_compilation_cache
 from lusee_bayes.core.errors import InputError, WorkersLost
 from lusee_bayes.core.progress import Stages
@@ -171,6 +171,11 @@ class Output:
     def model(cls, name: str, figures: Callable[[Any], BaseModel]) -> Output:
         """A pydantic model as JSON."""
         return cls.text(name, lambda run: figures(run).model_dump_json(indent=2) + "\n")
+
+    @classmethod
+    def rows(cls, name: str, rows: Callable[[Any], Sequence[Mapping[str, object]]]) -> Output:
+        """A table, row by row."""
+        return cls(lambda run, folder: reading.write_csv(folder / name, rows(run)))
 
     @classmethod
     def ecsv(cls, name: str, table: Callable[[Any], Table]) -> Output:
