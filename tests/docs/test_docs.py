@@ -125,7 +125,12 @@ def test_the_citation_is_whole():
     # what the standard asks for
     assert {"authors", "message", "title"} <= set(citation)
     assert f"version = {{{lb.__version__}}}" in (DOCS / "citing.md").read_text()
-    assert citation["preferred-citation"]["url"] in (ROOT / "README.md").read_text()
+    method = citation["preferred-citation"]
+    assert method["url"] in (ROOT / "README.md").read_text()
+    # and what a release says of software and method
+    metadata = (ROOT / "lusee_bayes/report/templates/release/datacite.json.jinja").read_text()
+    cited = citation["title"], citation["authors"][0]["name"], method["identifiers"][0]["value"]
+    assert all(f'"{name}"' in metadata for name in cited)
 
 
 def test_the_scenarios_of_the_pages_are_scenarios(tmp_path):

@@ -364,8 +364,7 @@ def test_windows_come_back_to_the_last_bit(data, tmp_path):
     for name in ("sample", "start_s", "end_s", "live_s"):
         there, here = (getattr(d.observation.windows, name) for d in (data, again))
         np.testing.assert_array_equal(here, there)
-    assert again.says_window
-    assert again.digest() == data.digest()
+    assert again.says_window and again.digest() == data.digest()
 
 
 def test_the_digest_knows_windows(data):

@@ -164,11 +164,9 @@ def test_sums_keep_the_structure():
         assert isinstance(term, covariance.DenseCovariance)
     for other in (diagonal, blocks, banded):
         for term in (banded + other, other + banded):
-            assert isinstance(term, time_blocks.TimeBandedCovariance)
-            assert term.band.shape[1] == 3
+            assert isinstance(term, time_blocks.TimeBandedCovariance) and term.band.shape[1] == 3
         for term in (other + directions, directions + other, other + low_rank, low_rank + other):
-            assert isinstance(term, covariance.LowRankUpdate)
-            assert isinstance(term.base, type(other))
+            assert isinstance(term, covariance.LowRankUpdate) and isinstance(term.base, type(other))
     assert (low_rank + directions).update.root.shape[1] == 4
     assert isinstance(directions + directions, covariance.LowRankCovariance)
 
