@@ -180,10 +180,10 @@ def read_data(data: Data, scenario: Scenario) -> Visibilities:
 def _is_waterfall(path: Path) -> bool:
     """Whether a file holds a waterfall of luseepy, not our visibilities. InputError if neither."""
     kind, is_waterfall = format_of(path), is_fits(path)
-    known = kind == formats.VISIBILITIES
+    is_data = kind == formats.VISIBILITIES
     if is_waterfall:
-        known = bool(WATERFALL_IMAGES & set(image_names(path)))
-    if not known:
+        is_data = bool(WATERFALL_IMAGES & set(image_names(path)))
+    if not is_data:
         said = f" (its format is '{kind}')" if kind else ""
         raise InputError(f"{path} contains no data to map{said}; give {ACCEPTED}")
     return is_waterfall
@@ -193,8 +193,8 @@ def _nearest(sets: Sequence[Visibilities], frequency_mhz: float) -> Visibilities
     """The one set, or the one of a frequency. InputError if there is none."""
     apart = [abs(data.frequency_mhz - frequency_mhz) for data in sets]
     if len(sets) > 1 and min(apart) > SAME_FREQUENCY_MHZ:
-        known = ", ".join(f"{data.frequency_mhz:.9g}" for data in sets)
-        raise InputError(f"the data are at {known} MHz, none of them at {frequency_mhz:.15g} MHz")
+        mhz = ", ".join(f"{data.frequency_mhz:.9g}" for data in sets)
+        raise InputError(f"the data are at {mhz} MHz, none of them at {frequency_mhz:.15g} MHz")
     return sets[int(np.argmin(apart))]
 
 
@@ -230,9 +230,9 @@ def _require_same_instrument(waterfall: Waterfall, scenario: Scenario) -> None:
         )
     rule, said = source.interpolated(frequency), waterfall.interpolation
     if rule is not None and said is not None and said != INTERPOLATIONS[rule]:
-        known = {w: f"use --set beam.interpolation={name}" for name, w in INTERPOLATIONS.items()}
-        other = f"expected one of {', '.join(known)}, or a response that includes it"
-        what_to_do = known.get(said, other)
+        remedies = {w: f"use --set beam.interpolation={name}" for name, w in INTERPOLATIONS.items()}
+        other = f"expected one of {', '.join(remedies)}, or a response that includes it"
+        what_to_do = remedies.get(said, other)
         raise InputError(
             f"{section.file} does not contain the frequency {frequency:.15g} MHz; {waterfall.path} "
             f"uses FREQINT = '{said}', the scenario by beam.interpolation={rule}; {what_to_do}"
@@ -282,9 +282,9 @@ def reduce_files(
     """
     stages = stages or Stages()
     paths = [user_path(path) for path in paths]
-    known = [path.resolve() for path in paths]
-    for k, path in enumerate(known):
-        if path in known[:k]:
+    resolved = [path.resolve() for path in paths]
+    for k, path in enumerate(resolved):
+        if path in resolved[:k]:
             raise InputError(f"'{paths[k]}' is listed twice; list every session once")
         if format_of(path) == formats.REDUCED:
             raise InputError(f"'{paths[k]}' is reduced already; give it to lusee-bayes map --data")
@@ -324,13 +324,13 @@ def recipe_of(scenario: Scenario) -> Recipe:
             "the sessions do not specify whether times are the start, middle or end of "
             "integrations; use --set observation.timestamp=middle (or start, end, instant)"
         )
-    here = scenario.observation
+    observation = scenario.observation
     frequencies = scenario.frequencies_mhz or (scenario.frequency_mhz,)
-    known = section, gain_table_of(section), timestamp, frequencies, here.average_s
+    parts = section, gain_table_of(section), timestamp, frequencies, observation.average_s
     lines = () if section.lines is None else read_lines(section.lines)
     clock = None if section.clock is None else read_clock(section.clock)
-    site = (here.lon_deg, here.lat_deg) if section.site == "scenario" else None
-    return Recipe(*known, lines, clock, site)
+    site = (observation.lon_deg, observation.lat_deg) if section.site == "scenario" else None
+    return Recipe(*parts, lines, clock, site)
 
 
 def visibilities_of(reduced: Reduced, scenario: Scenario) -> Visibilities:

@@ -296,32 +296,32 @@ class MixedProducts:
     q: Float[np.ndarray, "columns columns"]
 
     @classmethod
-    def of(cls, here: UnderAnySky, posterior: Posterior) -> MixedProducts:
+    def of(cls, judge: UnderAnySky, posterior: Posterior) -> MixedProducts:
         """Of data and their posterior under the wide prior."""
-        grid, layout, offset = filled(here.data), here.data.layout, here.model.offset
+        grid, layout, offset = filled(judge.data), judge.data.layout, judge.model.offset
         n, product, time = len(grid), layout.product, layout.time
         mixed = np.zeros((layout.size, n, n))
         mixed[np.arange(layout.size), product] = grid[:, time].T
         steady = np.zeros(layout.size) if offset is None else np.asarray(offset)
         columns = [mixed.reshape(layout.size, -1), np.eye(n)[product]]
         columns += [np.stack([grid[:, ::-1][product, time], steady], axis=1)]
-        return cls(here, posterior, grid, _gram(here, posterior, np.concatenate(columns, axis=1)))
+        return cls(judge, posterior, grid, _gram(judge, posterior, np.concatenate(columns, axis=1)))
 
     def tried(self) -> Iterator[tuple[float, DataMistake]]:
         """Every mistake with its chi^2."""
         n_ports, n = self.here.setup.beam_source.n_ports, len(self.grid)
         first, second, _ = ports(n_ports)
         autos = first == second
-        known = [DataMistake(*one, weights(mixing)) for *one, mixing in data_mistakes(n_ports)]
+        mistakes = [DataMistake(*one, weights(mixing)) for *one, mixing in data_mistakes(n_ports)]
         turned = weights(np.zeros((n, n)), reversed_times=True)
-        known.append(DataMistake("the times are reversed", "sort the data by time", turned))
+        mistakes.append(DataMistake("the times are reversed", "sort the data by time", turned))
         names = [f"product {product.label}" for product in all_products(n_ports)]
         some = np.asarray(self.here.data.layout.present).any(1)
-        known += [self._factor(names[k], np.eye(n)[k]) for k in np.flatnonzero(some)]
-        known.append(self._factor("every auto", autos * 1.0))
-        known += [self._gain(k, 1.0 * (first == k) + (second == k)) for k in range(n_ports)]
-        known.append(self._constant(np.flatnonzero(autos)))
-        yield from ((self.chi2(mistake.w), mistake) for mistake in known)
+        mistakes += [self._factor(names[k], np.eye(n)[k]) for k in np.flatnonzero(some)]
+        mistakes.append(self._factor("every auto", autos * 1.0))
+        mistakes += [self._gain(k, 1.0 * (first == k) + (second == k)) for k in range(n_ports)]
+        mistakes.append(self._constant(np.flatnonzero(autos)))
+        yield from ((self.chi2(mistake.w), mistake) for mistake in mistakes)
         yield from self._times()
 
     def chi2(self, w: Columns) -> float:
@@ -362,23 +362,23 @@ class MixedProducts:
 
     def _times(self) -> Iterator[tuple[float, DataMistake]]:
         """A factor of all products of one time."""
-        here, layout, values = self.here, self.here.data.layout, np.asarray(self.here.data.data)
-        factor = here.model.noise.factor()
+        judge, layout, values = self.here, self.here.data.layout, np.asarray(self.here.data.data)
+        factor = judge.model.noise.factor()
         # K^-1 (d - b)
-        off = values - np.asarray(here.model.predict(self.posterior.mean))
+        off = values - np.asarray(judge.model.predict(self.posterior.mean))
         left = np.asarray(factor.solve(off))
         pull = np.bincount(layout.time, values * left, layout.n_times)
         most = np.bincount(layout.time, values * np.asarray(factor.solve(values)), layout.n_times)
         worst = np.argsort(-(pull**2) / np.where(most > 0.0, most, np.inf))[:TIMES]
         worst = worst[most[worst] > 0.0]
         columns = np.where(layout.time[:, None] == worst, values[:, None], 0.0)
-        curvature = np.diagonal(_gram(here, self.posterior, columns))
+        curvature = np.diagonal(_gram(judge, self.posterior, columns))
         whole = weights(np.eye(len(self.grid)))
         for time, bend in zip(worst.tolist(), curvature.tolist(), strict=True):
             if not bend > 0.0:  # the others predict nothing
                 continue
             factor = 1.0 - pull[time] / bend
-            when = here.data.observation.times[time].isot[:19]
+            when = judge.data.observation.times[time].isot[:19]
             wrong = (
                 f"all products at {when} are {_number(1.0 / factor, bend**-0.5)} times the "
                 "prediction from other times"
@@ -393,10 +393,10 @@ def _number(factor: float, std: float) -> str:
     return f"{factor:.5g} +- {std * factor**2:.1g}"
 
 
-def _gram(here: UnderAnySky, posterior: Posterior, columns: Float[np.ndarray, "data n"]) -> Square:
+def _gram(judge: UnderAnySky, posterior: Posterior, columns: Float[np.ndarray, "data n"]) -> Square:
     """X^T K^-1 X, K^-1 = N^-1 - N^-1 A C A^T N^-1."""
-    solved = np.asarray(here.model.noise.factor().solve(columns))
-    seen = np.asarray(here.model.coupling.transpose_mv(solved)).T
+    solved = np.asarray(judge.model.noise.factor().solve(columns))
+    seen = np.asarray(judge.model.coupling.transpose_mv(solved)).T
     white = np.asarray(posterior.prior.colour_columns(seen)).T
     half = solve_lower(posterior.lower, white, transpose=False)
     return columns.T @ solved - half.T @ half
@@ -473,7 +473,7 @@ class Diagnosis:
         ]
 
 
-def diagnose(experiment: Experiment, inference: Inference, found: Residuals) -> Diagnosis:
+def diagnose(experiment: Experiment, inference: Inference, residuals: Residuals) -> Diagnosis:
     """Try the usual mistakes on the data of an experiment.
 
     Parameters
@@ -481,7 +481,7 @@ def diagnose(experiment: Experiment, inference: Inference, found: Residuals) -> 
     experiment : Experiment
     inference : Inference
         Of its data alone.
-    found : Residuals
+    residuals : Residuals
         Of the map.
 
     Returns
@@ -489,32 +489,32 @@ def diagnose(experiment: Experiment, inference: Inference, found: Residuals) -> 
     Diagnosis
     """
     setup, data = experiment.setup, experiment.data
-    here = UnderAnySky.of(setup, data, inference.model)
-    base, posterior = here.wide(here.model.coupling)
+    judge = UnderAnySky.of(setup, data, inference.model)
+    base, posterior = judge.wide(judge.model.coupling)
 
     def best(tried: Sequence[tuple[float, object]], most: float) -> list:
         """Those of the smallest chi^2."""
-        found = sorted((one for one in tried if one[0] < most), key=lambda one: one[0])
-        return [one for _, one in found[:TRIED]]
+        better = sorted((one for one in tried if one[0] < most), key=lambda one: one[0])
+        return [one for _, one in better[:TRIED]]
 
-    of_data = list(MixedProducts.of(here, posterior).tried())
+    of_data = list(MixedProducts.of(judge, posterior).tried())
     promising = base.degrees + PROMISING * abs(base.chi2 - base.degrees)
-    proposals = [Proposal(m.words, m.remedy, here.without(m)) for m in best(of_data, promising)]
+    proposals = [Proposal(m.words, m.remedy, judge.without(m)) for m in best(of_data, promising)]
     low = Pointing.of(setup.observation, min(SCREENED_LMAX, setup.scenario.lmax))
-    known = list(model_mistakes(setup))
-    screened = [here.under(m.beams, m.observation, low).chi2 for m in known]
+    mistakes = list(model_mistakes(setup))
+    screened = [judge.under(m.beams, m.observation, low).chi2 for m in mistakes]
     # at low ell, what the sky has beyond is left
-    whole = here.under(setup.beams, setup.observation, low).chi2
-    of_model = [*zip(screened, known, strict=True), *_offsets(here, low)]
+    whole = judge.under(setup.beams, setup.observation, low).chi2
+    of_model = [*zip(screened, mistakes, strict=True), *_offsets(judge, low)]
     proposals += [
-        Proposal(m.words, m.remedy, here.under(m.beams, m.observation, setup.pointing))
+        Proposal(m.words, m.remedy, judge.under(m.beams, m.observation, setup.pointing))
         for m in best(of_model, whole)
     ]
     excess = EXPLAINED * abs(base.chi2 - base.degrees)
     nearly = [one for one in proposals if one.excess < excess]
     # these always absorb some of what is wrong, and count only if they absorb all of it
-    proposals += _noise_level(found, data)
-    finer = [] if any(one.chi2.fits for one in proposals) else list(_finer(here))
+    proposals += _noise_level(residuals, data)
+    finer = [] if any(one.chi2.fits for one in proposals) else list(_finer(judge))
     proposals += finer
     listed = [one for one in proposals if one.chi2.fits] or nearly
     listed.sort(key=lambda one: one.excess)
@@ -524,26 +524,26 @@ def diagnose(experiment: Experiment, inference: Inference, found: Residuals) -> 
 def _merged(proposals: list[Proposal]) -> Iterator[Proposal]:
     """Those of one chi^2 as one: antennas that are alike do not distinguish them."""
     while proposals:
-        first, *rest = proposals
-        alike = [p for p in rest if abs(p.chi2.chi2 - first.chi2.chi2) < SAME * first.chi2.chi2]
-        proposals = [p for p in rest if p not in alike]
+        first, *others = proposals
+        alike = [p for p in others if abs(p.chi2.chi2 - first.chi2.chi2) < SAME * first.chi2.chi2]
+        proposals = [p for p in others if p not in alike]
         yield replace(first, words=", or ".join(p.words for p in (first, *alike)))
 
 
-def _finer(here: UnderAnySky) -> Iterator[Proposal]:
+def _finer(judge: UnderAnySky) -> Iterator[Proposal]:
     """A map of more ells."""
-    setup, lmax = here.setup, here.setup.scenario.lmax + MORE_ELLS
+    setup, lmax = judge.setup, judge.setup.scenario.lmax + MORE_ELLS
     try:
         beams = setup.beam_source.beams(setup.scenario.frequency_mhz, lmax)
     except InputError:  # a file's beams end before
         return
-    chi2 = here.under(beams, setup.observation, Pointing.of(setup.observation, lmax))
+    chi2 = judge.under(beams, setup.observation, Pointing.of(setup.observation, lmax))
     yield Proposal("the sky has structure beyond lmax", f"use --set lmax={lmax}", chi2)
 
 
-def _offsets(here: UnderAnySky, low: Pointing) -> Iterator[tuple[float, ModelMistake]]:
+def _offsets(judge: UnderAnySky, low: Pointing) -> Iterator[tuple[float, ModelMistake]]:
     """Angles that are off by what fits best: by parabolas through three values, ever closer."""
-    setup = here.setup
+    setup = judge.setup
     for name in offset_names(OFFSETS, setup.observation.n_runs):
 
         def shifted(value: float, name: str = name) -> Observation:
@@ -552,7 +552,7 @@ def _offsets(here: UnderAnySky, low: Pointing) -> Iterator[tuple[float, ModelMis
         value, chi2 = 0.0, np.inf
         for reach in REACHES:
             values = value + reach * np.array([-1.0, 0.0, 1.0])
-            seen = [here.under(setup.beams, shifted(v), low).chi2 for v in values]
+            seen = [judge.under(setup.beams, shifted(v), low).chi2 for v in values]
             if (curvature := seen[0] - 2.0 * seen[1] + seen[2]) > 0.0:
                 value += reach * np.clip(0.5 * (seen[0] - seen[2]) / curvature, -3.0, 3.0)
             chi2 = min(seen)
@@ -564,14 +564,14 @@ def _offsets(here: UnderAnySky, low: Pointing) -> Iterator[tuple[float, ModelMis
         yield chi2, ModelMistake(words, remedy, setup.beams, shifted(value))
 
 
-def _noise_level(found: Residuals, data: Visibilities) -> Iterator[Proposal]:
+def _noise_level(residuals: Residuals, data: Visibilities) -> Iterator[Proposal]:
     """Another noise level, if what is left is white: alike in all groups, and from time to time."""
-    whole, groups = found.split.instrument, [g for g in found.compared() if g.degrees > 1.0]
+    whole, groups = residuals.split.instrument, [g for g in residuals.compared() if g.degrees > 1.0]
     factor = whole.chi2 / whole.degrees
     if not groups or not factor > 0.0:
         return
     least = min(two_sided(group.chi2 / factor, group.degrees) for group in groups)
-    z = np.where(data.layout.present, data.layout.scatter(found.z), np.nan) / np.sqrt(factor)
+    z = np.where(data.layout.present, data.layout.scatter(residuals.z), np.nan) / np.sqrt(factor)
     pairs = (z[:, 1:] * z[:, :-1])[np.isfinite(z[:, 1:] * z[:, :-1])]
     if stands_out(least, len(groups)) or abs(pairs.sum()) > WHITE * np.sqrt(len(pairs)):
         return

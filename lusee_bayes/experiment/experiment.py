@@ -181,13 +181,13 @@ def _fitting(experiment: Experiment, stages: Stages) -> Experiment:
     if section is None or not section.leave_out or data.calibration is None:
         return experiment
     with stages("inconsistent times"):
-        found = fitting(experiment.setup, data, section.false_alarm, stages)
-        setup, kept = without(experiment.setup, data, found.flagged)
+        fit = fitting(experiment.setup, data, section.false_alarm, stages)
+        setup, kept = without(experiment.setup, data, fit.flagged)
     doubts = experiment.doubts
-    if found.remark:
-        stages.say(f"  {found.remark}")
-        doubts = (*doubts, found.remark)
-    return replace(experiment, setup=setup, data=kept, doubts=doubts, fitting=found)
+    if fit.remark:
+        stages.say(f"  {fit.remark}")
+        doubts = (*doubts, fit.remark)
+    return replace(experiment, setup=setup, data=kept, doubts=doubts, fitting=fit)
 
 
 def _learned(
@@ -203,8 +203,8 @@ def _learned(
             experiment if start is None else replace(experiment, found=settled(setup, data, start))
         )
     with rounds_of(experiment, stages, "prior") as report:
-        setup, found = with_learned_prior(setup, data, earlier, start, report)
-    return replace(experiment, setup=setup, learned=found.learned, found=found)
+        setup, inference = with_learned_prior(setup, data, earlier, start, report)
+    return replace(experiment, setup=setup, learned=inference.learned, found=inference)
 
 
 def with_truth(experiment: Experiment) -> Experiment:
@@ -280,7 +280,7 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
                 f"{cls.key}.treatment=sampled"
             )
 
-    def own(cls: type[Systematic]) -> Systematic:
+    def built(cls: type[Systematic]) -> Systematic:
         if cls.treatment(experiment.scenario) is None:
             raise InputError(f"the scenario has no {cls.key} to sample")
         require_free(cls)
@@ -306,9 +306,9 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
     return {
         "gaussian": lambda: to_sample()[0],
         "systematics": lambda: to_sample()[1],
-        "gain_drifts": lambda: own(GainDrifts),
+        "gain_drifts": lambda: built(GainDrifts),
         "instrument": instrument,
-        "sources": lambda: own(PointSources),
+        "sources": lambda: built(PointSources),
         "log_normal": lambda: on_device(log_normal.prior(setup.sky.frequency_mhz, setup.sky.lmax)),
         "layout": lambda: data.layout,
     }
@@ -316,12 +316,12 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
 
 def sampled_together(experiment: Experiment) -> dict[str, float]:
     """Over how many octaves channels share each sampled site (:meth:`.Systematic.octaves`)."""
-    scenario, found = experiment.scenario, {}
-    for treatment, own in systematics(experiment.setup):
-        octaves = own.octaves(attrgetter(own.key)(scenario))
+    scenario, octaves_of = experiment.scenario, {}
+    for treatment, systematic in systematics(experiment.setup):
+        octaves = systematic.octaves(attrgetter(systematic.key)(scenario))
         if treatment == "sampled" and octaves:
-            found |= {unknown.name: octaves for unknown in own.unknowns}
-    return found
+            octaves_of |= {unknown.name: octaves for unknown in systematic.unknowns}
+    return octaves_of
 
 
 # what the seed is folded with for posterior draws
@@ -384,27 +384,27 @@ def interpolation_error(setup: Setup) -> dict[str, float]:
 
 def doubts(experiment: Experiment, inference: Inference) -> tuple[str, ...]:
     """What is doubtful about an experiment's data, its prior and its rounds."""
-    learned, found = experiment.learned, list(experiment.doubts)
+    learned, notes = experiment.learned, list(experiment.doubts)
     errors = interpolation_error(experiment.setup)
     worst = max(errors, key=errors.__getitem__, default="")
     if worst and errors[worst] > MOST_OFF:
-        found.append(
+        notes.append(
             f"Beams interpolated between the files of {experiment.scenario.beam.label} may be "
             f"wrong by up to {errors[worst]:.2g} radiometer standard deviations (rms), tested by "
             f"omitting the files of {worst}; use more files, in smaller steps."
         )
     if learned is not None and not learned.settled:
-        found.append("The prior is fixed and wide: its parameters do not converge for any noise.")
+        notes.append("The prior is fixed and wide: its parameters do not converge for any noise.")
     elif learned is not None and learned.noise_factor > 1.0:
-        found.append(
+        notes.append(
             f"The prior was learned with N times {learned.noise_factor:.2g}, to match residual "
             "chi2; the map uses the scenario's N."
         )
     if learned is not None and learned.still_moves > 0.0:
-        found.append(
+        notes.append(
             "Learning the prior did not converge: the map still changes by "
             f"{learned.still_moves:.2g} standard deviations per round."
         )
     if inference.unsettled:
-        found.append(inference.unsettled)
-    return tuple(found)
+        notes.append(inference.unsettled)
+    return tuple(notes)

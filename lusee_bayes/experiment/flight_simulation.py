@@ -179,9 +179,9 @@ class FlightSimulation:
         levels = "".join(self.disturbances.level[rows.start])
         counts = self._counting(levels)(to_real(t), self._telemetry(rows))
         counts[self.disturbances.saturated[rows]] *= synthesis.SATURATED_FACTOR
-        found = synthesis.rounded(counts, np.broadcast_to(self._slices[levels], counts.shape[:2]))
-        found[self.disturbances.absent[rows]] = np.nan
-        return found
+        rounded = synthesis.rounded(counts, np.broadcast_to(self._slices[levels], counts.shape[:2]))
+        rounded[self.disturbances.absent[rows]] = np.nan
+        return rounded
 
     @cached_property
     def _slices(self) -> dict[str, Int[np.ndarray, " products"]]:
@@ -193,8 +193,8 @@ class FlightSimulation:
         return {levels: synthesis.bit_slices(one) for levels, one in counts.items()}
 
     def _counting(self, levels: str) -> synthesis.Counting:
-        known = self.section.navgf, self.origin, flight_of(self.scenario).sign
-        return synthesis.Counting(self.gains, levels, *known)
+        settings = self.section.navgf, self.origin, flight_of(self.scenario).sign
+        return synthesis.Counting(self.gains, levels, *settings)
 
     def _telemetry(self, rows: slice) -> Mapping[str, Float[np.ndarray, " _"]]:
         turns = 2.0 * np.pi * self.observation.hours[rows]
@@ -317,19 +317,19 @@ def true_visibilities(
     noise, n = scenario.noise, observation.n_times
     whole = noise.gain is not None or noise.pointing is not None or bool(scenario.sources.list)
     piece = n if whole else PIECE
-    found = np.empty((len(channels), len(first), n))
+    volts = np.empty((len(channels), len(first), n))
     with stages.progress("visibilities", n * len(channels)) as done:
         for start in range(0, n, piece):
-            here = np.arange(n) // piece == start // piece
-            part = observation.select(here)
+            rows = np.arange(n) // piece == start // piece
+            part = observation.select(rows)
             for number, (channel, scale) in enumerate(zip(channels, scales, strict=True)):
                 nothing = np.zeros(len(first) * part.n_times)
                 layout = DataLayout(len(first), part.n_times)
                 setup = set_up(channel, Visibilities(nothing, layout, part, channel.frequency_mhz))
                 kelvin = np.asarray(true_signal(setup, true_values(setup)))
-                found[number, :, here] = (scale[:, None] * kelvin).T
+                volts[number, :, rows] = (scale[:, None] * kelvin).T
                 done(start * len(channels) + (number + 1) * part.n_times)
-    return found
+    return volts
 
 
 def _drawn_gains(scenario: Scenario, flight: FlightSection) -> tuple[GainModel, GainModel, Errors]:

@@ -296,8 +296,8 @@ class _LuseepySection(_FileSection):
     def asked(self) -> dict[str, Any]:
         """What is asked of every file, as its beams take it."""
         luseepys = self.quadrature == "luseepy"
-        own = {"luseepy_quadrature": luseepys, "moon_k": self.moon_temperature_k}
-        return own | self.model_dump(include={"interpolation", "turntable_offset_deg"})
+        options = {"luseepy_quadrature": luseepys, "moon_k": self.moon_temperature_k}
+        return options | self.model_dump(include={"interpolation", "turntable_offset_deg"})
 
 
 class ScalarBeamSection(_LuseepySection):

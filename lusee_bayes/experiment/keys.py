@@ -75,11 +75,11 @@ def scenario_keys(within: str = "") -> list[Key]:
     keys = list(_keys_of(schema, schema["$defs"], "", ""))
     if not within:
         return keys
-    found = [k for k in keys if k.path == within or k.path.startswith(f"{within}.")]
-    if not found:
-        known = {k.path.rsplit(".", n)[0] for k in keys for n in range(k.path.count(".") + 1)}
-        raise InputError(f"a scenario has no key '{within}'; {nearest(within, sorted(known))}")
-    return found
+    inside = [k for k in keys if k.path == within or k.path.startswith(f"{within}.")]
+    if not inside:
+        paths = {k.path.rsplit(".", n)[0] for k in keys for n in range(k.path.count(".") + 1)}
+        raise InputError(f"a scenario has no key '{within}'; {nearest(within, sorted(paths))}")
+    return inside
 
 
 def keys_as_markdown(keys: Iterable[Key]) -> str:

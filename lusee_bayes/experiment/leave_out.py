@@ -68,8 +68,8 @@ class GroupsCompared:
         chi2[some], degrees[some] = _judged(left_out.each(of_time))
         with np.errstate(invalid="ignore"):
             z = left_out.u / np.sqrt(left_out.inverse_diagonal)
-        known = present & np.isfinite(z) & (degrees > 0.0)
-        return cls(data, left_out, chi2, degrees, np.where(known, z, 0.0))
+        usable = present & np.isfinite(z) & (degrees > 0.0)
+        return cls(data, left_out, chi2, degrees, np.where(usable, z, 0.0))
 
     def without(self, gone: GridFlags) -> GroupsCompared:
         """Compare the others, with the same model."""
@@ -107,11 +107,11 @@ class GroupsCompared:
         single = np.where(self.degrees > 0.0, special.chdtrc(1.0, most), 1.0) * len(squares)
         out = (tail < false_alarm) | (single < false_alarm)
         out &= self.size >= max(WORST * self.size.max(), least)
-        rest = _tail(self.chi2 - most, self.degrees - 1.0)
-        alone = out & (self.degrees > 1.5) & (rest >= false_alarm)
-        found = np.broadcast_to(out & ~alone, squares.shape).copy()
-        found[product[alone], np.flatnonzero(alone)] = True
-        return found
+        others = _tail(self.chi2 - most, self.degrees - 1.0)
+        alone = out & (self.degrees > 1.5) & (others >= false_alarm)
+        flags = np.broadcast_to(out & ~alone, squares.shape).copy()
+        flags[product[alone], np.flatnonzero(alone)] = True
+        return flags
 
     def worst_group(self, false_alarm: float) -> DataGroup | None:
         """Find the product or day that stands out and without which chi^2 falls most.
@@ -138,15 +138,15 @@ class GroupsCompared:
 def _judged(missed: list[Missed]) -> tuple[Vector, Vector]:
     """chi^2 of groups and its means; 0 where the others tell less than half a datum."""
     chi2, degrees = np.reshape([(one.chi2, one.degrees) for one in missed], (-1, 2)).T
-    told = np.isfinite(chi2) & (degrees >= 0.5)
-    return np.where(told, chi2, 0.0), np.where(told, degrees, 0.0)
+    predicted = np.isfinite(chi2) & (degrees >= 0.5)
+    return np.where(predicted, chi2, 0.0), np.where(predicted, degrees, 0.0)
 
 
 def _tail(chi2: Vector, degrees: Vector) -> Vector:
     """Probability of this chi^2 or more; 1 where there are no degrees of freedom."""
     some = degrees > 0.0
-    found = special.chdtrc(np.where(some, degrees, 1.0), np.maximum(chi2, 0.0))
-    return np.where(some, found, 1.0)
+    tail = special.chdtrc(np.where(some, degrees, 1.0), np.maximum(chi2, 0.0))
+    return np.where(some, tail, 1.0)
 
 
 def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> GroupsCompared | None:
@@ -173,9 +173,9 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Groups
     n, across = data.layout.size, is_modelled(setup.scenario.noise.gain)
     if 8.0 * ARRAYS * n * (setup.prior.size + n * across) > MOST_MEMORY * memory_limit():
         return None
-    found = settled(setup, data) if settle else None
-    if found is not None and not found.unsettled:
-        model, posterior = found.model, found.posterior
+    inference = settled(setup, data) if settle else None
+    if inference is not None and not inference.unsettled:
+        model, posterior = inference.model, inference.posterior
     else:  # bad data may let no rounds settle
         model = full_model(setup, Around(data))
         posterior = model.condition(data.data).posterior if settle else None
@@ -332,13 +332,13 @@ class _Rules:
         Of what is left, and what goes in all; or of what was left before that was too much, and
         None.
         """
-        found = start
-        while (worst := found.worst(self.false_alarm, least)).any():
+        left = start
+        while (worst := left.worst(self.false_alarm, least)).any():
             gone = gone | worst
             if self.broken(gone, groups):
-                return found, None
-            found = found.without(worst)
-        return found, gone
+                return left, None
+            left = left.without(worst)
+        return left, gone
 
     def eliminated(
         self, start: GroupsCompared, gone: GridFlags
@@ -351,12 +351,12 @@ class _Rules:
         of_groups = np.zeros_like(gone)
         while True:
             whole, least = gone | of_groups, FAR * float(base.size.max())
-            found, flagged = self.one_by_one(base, whole, whole, least)
+            left, flagged = self.one_by_one(base, whole, whole, least)
             result = None if flagged is None else (flagged & ~gone, groups)
             first = first if groups else result
-            if result is not None and found.worst(self.false_alarm).any():
+            if result is not None and left.worst(self.false_alarm).any():
                 return result, ""
-            if (group := found.worst_group(self.false_alarm)) is None:
+            if (group := left.worst_group(self.false_alarm)) is None:
                 # where no few groups are to blame: what was found without blaming any
                 return result or first, ""
             of_groups = of_groups | group.data

@@ -143,18 +143,18 @@ def require_fitting(data: Visibilities, scenario: Scenario) -> None:
             f"the data are at {data.frequency_mhz} MHz, the scenario at "
             f"{scenario.frequency_mhz}; use --set frequency_mhz={data.frequency_mhz}"
         )
-    here, there = data.observation, scenario.observation
-    east = (here.lon_deg - there.lon_deg + 180.0) % 360.0 - 180.0
-    if max(abs(east), abs(here.lat_deg - there.lat_deg)) > SAME_SITE_DEG:
+    seen, stated = data.observation, scenario.observation
+    east = (seen.lon_deg - stated.lon_deg + 180.0) % 360.0 - 180.0
+    if max(abs(east), abs(seen.lat_deg - stated.lat_deg)) > SAME_SITE_DEG:
         # luseepy writes a site of its own where it is told none
         unsettled = (
             ", or, if the site in the sessions is a placeholder, --set flight.site=scenario when "
             "reducing them"
         )
         raise InputError(
-            f"the data were taken at longitude {here.lon_deg:g}, latitude {here.lat_deg:g} "
-            f"degrees, the scenario's site is {there.lon_deg:g}, {there.lat_deg:g}; use --set "
-            f"observation.lon_deg={here.lon_deg:.15g} --set observation.lat_deg={here.lat_deg:.15g}"
+            f"the data were taken at longitude {seen.lon_deg:g}, latitude {seen.lat_deg:g} "
+            f"degrees, the scenario's site is {stated.lon_deg:g}, {stated.lat_deg:g}; use --set "
+            f"observation.lon_deg={seen.lon_deg:.15g} --set observation.lat_deg={seen.lat_deg:.15g}"
             + ("" if data.calibration is None else unsettled)
         )
 
@@ -191,12 +191,12 @@ def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, S
     are, too: gains multiply, and sources are seen, where the antennas then pointed.
     """
     around = around or Around()
-    there = moved(setup, around.values)
+    moved_setup = moved(setup, around.values)
     treated = [
         (cls.treatment(setup.scenario), cls, section)
         for cls, section in present(SYSTEMATICS, setup.scenario)
     ]
-    return [(t, cls.build(s, there, around)) for t, cls, s in treated if t != "ignored"]
+    return [(t, cls.build(s, moved_setup, around)) for t, cls, s in treated if t != "ignored"]
 
 
 def base_model(setup: Setup, around: Around | None = None) -> LinearGaussian:
@@ -206,7 +206,7 @@ def base_model(setup: Setup, around: Around | None = None) -> LinearGaussian:
 
 
 def in_noise(
-    setup: Setup, model: LinearGaussian, found: Iterable[Systematic], around: Around
+    setup: Setup, model: LinearGaussian, terms: Iterable[Systematic], around: Around
 ) -> list[Marginalised]:
     """Systematics as N holds them, one after the other, about what the terms are built around.
 
@@ -215,14 +215,14 @@ def in_noise(
     setup : Setup
     model : LinearGaussian
         Without them.
-    found : iterable of Systematic
+    terms : iterable of Systematic
         In their order.
     around : Around
     """
     if around.sky is None:
         around = replace(around, sky=setup.sky.modes)
     values, stages = around.values or {}, []
-    for systematic in found:
+    for systematic in terms:
         before = model
         if systematic.first_order:
             model = systematic.effect(model, systematic.values(systematic.centre(values)))
@@ -250,8 +250,8 @@ def model_about(
     moving : bool
         Whether those are part of it that are found in rounds.
     """
-    model, found = base_model(setup, around), (s for _, s in systematics(setup, around))
-    held = in_noise(setup, model, (s for s in found if moving or not s.moves), around)
+    model, parts = base_model(setup, around), (s for _, s in systematics(setup, around))
+    held = in_noise(setup, model, (s for s in parts if moving or not s.moves), around)
     for systematic in held:
         model = systematic.marginalised(model)
     return model, tuple(held)
@@ -275,11 +275,11 @@ def model_to_sample(
     or the prior is sampled, on which it depends.
     """
     model, later = on_device(base_model(setup, around)), []
-    found, whole = systematics(setup, around), model
-    sampled = [systematic for treatment, systematic in found if treatment == "sampled"]
-    others = (s for t, s in found if t != "sampled" or not s.scales_sky)
+    treated, whole = systematics(setup, around), model
+    sampled = [systematic for treatment, systematic in treated if treatment == "sampled"]
+    others = (s for t, s in treated if t != "sampled" or not s.scales_sky)
     held = iter(in_noise(setup, model, others, around))
-    for treatment, systematic in found:
+    for treatment, systematic in treated:
         as_noise = None if treatment == "sampled" and systematic.scales_sky else next(held)
         if treatment == "sampled":
             later.append(systematic)
@@ -314,10 +314,10 @@ def true_values(setup: Setup) -> Truth:
 def true_model(setup: Setup, truth: Truth) -> LinearGaussian:
     """The model of simulated data: the true instrument and values, and the radiometer noise."""
     key = jax.random.key(setup.scenario.seed)
-    there = moved(setup, truth)
-    model = LinearGaussian(there.coupling, setup.prior, radiometer(setup), there.offset)
+    true = moved(setup, truth)
+    model = LinearGaussian(true.coupling, setup.prior, radiometer(setup), true.offset)
     for cls, section in present(SYSTEMATICS, setup.scenario):
-        model = cls.in_data(section, there, model, truth, key)
+        model = cls.in_data(section, true, model, truth, key)
     return model
 
 

@@ -131,8 +131,8 @@ class Inference:
             solved = solution.weighted_residual()
             residual = residual - noise.update.root @ (noise.update.root.T @ solved)
             for part in self.expanded:
-                here = part.expected + part.columns.T @ solved - part.centre
-                residual = residual + part.columns @ here
+                shift = part.expected + part.columns.T @ solved - part.centre
+                residual = residual + part.columns @ shift
             factor = factor.base
         white = np.asarray(factor.whiten(residual))
         return float(white @ white) / len(white)
@@ -228,45 +228,45 @@ def settled(
     start = start or Around(data)
     if start.sky is None:
         if (few := _fewer(setup, data)) is not None:
-            found, step = _nearby(*few, beginning(*few, start.values), report)
+            inference, step = _nearby(*few, beginning(*few, start.values), report)
             fixed = {
                 name
-                for s in found.expanded
+                for s in inference.expanded
                 if not s.systematic.moves
                 for name in s.systematic.names
             }
-            values = (found.around.values or {}).items()
+            values = (inference.around.values or {}).items()
             start = replace(start, values={n: v for n, v in values if n not in fixed})
         start = beginning(setup, data, start.values)
-    found, step = _nearby(setup, data, start, report)
+    inference, step = _nearby(setup, data, start, report)
     moves, n_learned, learned, in_rounds = np.inf, 0, None, rebuilds(setup)
     while True:
-        last, at_rest = not in_rounds or found.rounds >= MAX_ROUNDS, moves < SETTLED
+        last, at_rest = not in_rounds or inference.rounds >= MAX_ROUNDS, moves < SETTLED
         if learn is not None and n_learned < MAX_LEARNED and (at_rest or last or learned is None):
-            known = None if learned is None or not learned.settled else learned.parameters
-            learned, n_learned = learn(found.solution.information, known), n_learned + 1
-            told = found.under(learned.prior, learned)
-            changed, found = told.moves_from(found.posterior.mean), told
+            before = None if learned is None or not learned.settled else learned.parameters
+            learned, n_learned = learn(inference.solution.information, before), n_learned + 1
+            relearned = inference.under(learned.prior, learned)
+            changed, inference = relearned.moves_from(inference.posterior.mean), relearned
             if in_rounds and changed > PRIOR_SETTLED:
                 at_rest = False
-                found = replace(told, learned=replace(learned, still_moves=changed))
+                inference = replace(relearned, learned=replace(learned, still_moves=changed))
             setup = replace(setup, prior=learned.prior)
         if last or at_rest:
             break
-        around, step = _around(setup, found, step)
-        mean, n, as_learned = found.posterior.mean, found.rounds + 1, found.learned
-        del found  # its N
-        found = replace(_conditioned(setup, data, around, n), learned=as_learned)
-        report(found.rounds, found.remark)
-        moves = found.moves_from(mean) if around.tempered == 1.0 else np.inf
+        around, step = _around(setup, inference, step)
+        mean, n, as_learned = inference.posterior.mean, inference.rounds + 1, inference.learned
+        del inference  # its N
+        inference = replace(_conditioned(setup, data, around, n), learned=as_learned)
+        report(inference.rounds, inference.remark)
+        moves = inference.moves_from(mean) if around.tempered == 1.0 else np.inf
     if at_rest or not in_rounds:
-        return found
+        return inference
     keys = [f"{cls.key}.treatment=sampled" for cls in first_order(setup.scenario)]
     advice = f"; use {keys[0]}" if keys else "; use noise.gain.visibilities=model"
     return replace(
-        found,
-        unsettled=f"The map did not converge: after {found.rounds} rounds of updating N, it still "
-        f"changes by {moves:.2g} standard deviations{advice}.",
+        inference,
+        unsettled=f"The map did not converge: after {inference.rounds} rounds of updating N, it "
+        f"still changes by {moves:.2g} standard deviations{advice}.",
     )
 
 
@@ -284,47 +284,47 @@ def _nearby(
     setup: Setup, data: Visibilities, around: Around, report: Report
 ) -> tuple[Inference, _Step]:
     """Rounds until the map has nearly settled, and where it does not fit, from elsewhere."""
-    found, step = _approached(setup, data, around, report)
+    best, step = _approached(setup, data, around, report)
     for way in range(OTHER_WAYS):
-        if found.moving and not found.fits:
-            begin = _elsewhere(setup, data, found, way)
+        if best.moving and not best.fits:
+            begin = _elsewhere(setup, data, best, way)
             other = _approached(setup, data, begin, report)
-            if other[0].posterior.log_evidence > found.posterior.log_evidence:
-                found, step = other
-    return found, step
+            if other[0].posterior.log_evidence > best.posterior.log_evidence:
+                best, step = other
+    return best, step
 
 
 def _approached(
     setup: Setup, data: Visibilities, around: Around, report: Report
 ) -> tuple[Inference, _Step]:
     """Rounds until the map has nearly settled, and the step there."""
-    found, step = _conditioned(setup, data, around, 1), _Step()
+    inference, step = _conditioned(setup, data, around, 1), _Step()
     moves, stalled = np.inf if rebuilds(setup) else 0.0, False
-    while moves > NEARLY and not stalled and found.rounds < MAX_TEMPERED_ROUNDS:
-        (around, step), exact = _around(setup, found, step), None
-        mean, n, excess = found.posterior.mean, found.rounds + 1, found.excess
+    while moves > NEARLY and not stalled and inference.rounds < MAX_TEMPERED_ROUNDS:
+        (around, step), exact = _around(setup, inference, step), None
+        mean, n, excess = inference.posterior.mean, inference.rounds + 1, inference.excess
         at_rest = step.whole is None or np.abs(step.whole).max() < NEARLY
         if around.tempered > 1.0:
             # what larger noise does not explain leads nowhere from where nothing moves
-            stalled = at_rest and not found.fits
-        del found  # its N
+            stalled = at_rest and not inference.fits
+        del inference  # its N
         if around.tempered > 1.0:
             exact = _exact(setup, around)
             around = exact.around
             if at_rest:
                 around, exact = replace(around, tempered=1.0), None
-        found = _conditioned(setup, data, around, n, exact)
-        report(found.rounds, found.remark)
-        moved_by = float(found.posterior.rms_shift_from(mean))
+        inference = _conditioned(setup, data, around, n, exact)
+        report(inference.rounds, inference.remark)
+        moved_by = float(inference.posterior.rms_shift_from(mean))
         moves = moved_by if around.tempered == 1.0 else np.inf
-        stalled = stalled or (found.excess > STALLED * excess and not found.fits)
-    return found, step
+        stalled = stalled or (inference.excess > STALLED * excess and not inference.fits)
+    return inference, step
 
 
-def _elsewhere(setup: Setup, data: Visibilities, found: Inference, way: int) -> Around:
+def _elsewhere(setup: Setup, data: Visibilities, inference: Inference, way: int) -> Around:
     """Where else rounds may begin: the likeliest of draws, which may keep half of the values."""
     rng, best = np.random.default_rng(way), None
-    parts = [part for part in found.expanded if not part.systematic.learns]
+    parts = [part for part in inference.expanded if not part.systematic.learns]
     for _ in range(CANDIDATES):
         values, log_prior = {}, 0.0
         for part in parts:
@@ -387,33 +387,33 @@ class _Step:
         return _Step(whole, swing, size)
 
 
-def _around(setup: Setup, found: Inference, step: _Step) -> tuple[Around, _Step]:
+def _around(setup: Setup, inference: Inference, step: _Step) -> tuple[Around, _Step]:
     """What the terms of N are built around next, given a posterior, and the step there."""
-    around, solution = found.around, found.solution
+    around, solution = inference.around, inference.solution
     solved = solution.weighted_residual()
-    if found.moving:
-        ways = [s.expected + s.columns.T @ solved - s.centre for s in found.expanded]
+    if inference.moving:
+        ways = [s.expected + s.columns.T @ solved - s.centre for s in inference.expanded]
         # where the prior is learned, its widths say nothing of how far the first order reaches
         far = [
             way
-            for s, way in zip(found.expanded, ways, strict=True)
+            for s, way in zip(inference.expanded, ways, strict=True)
             if s.systematic.moves and not s.systematic.learns
         ]
         step = step.after(np.concatenate(far)) if far else step
         values = {}
-        for s, way in zip(found.expanded, ways, strict=True):
+        for s, way in zip(inference.expanded, ways, strict=True):
             values |= s.systematic.in_units(s.centre + step.size * way)
             if s.systematic.learns and around.tempered == 1.0:
-                told = found.amplitudes(s)
-                values |= s.systematic.relearned(s.expected + told.mean, told.std**2)
-        sky = around.sky + step.size * (found.posterior.mean - around.sky)
-        fits = around.tempered == 1.0 and found.fits
-        tempered = 1.0 if fits else _tempered(around.tempered * found.misfit(), found.rounds)
+                amplitudes = inference.amplitudes(s)
+                values |= s.systematic.relearned(s.expected + amplitudes.mean, amplitudes.std**2)
+        sky = around.sky + step.size * (inference.posterior.mean - around.sky)
+        ok = around.tempered == 1.0 and inference.fits
+        tempered = 1.0 if ok else _tempered(around.tempered * inference.misfit(), inference.rounds)
         around = replace(around, sky=sky, values=values, tempered=tempered)
         if tempered == 1.0:
             around = replace(around, volume=_volume(solution))
     if rebuilds_visibilities(setup):
-        seen = prediction(moved(setup, around.values), found, solved)
+        seen = prediction(moved(setup, around.values), inference, solved)
         around = replace(around, visibilities=seen)
     return around, step
 
@@ -435,8 +435,8 @@ def beginning(
 
 def _exact(setup: Setup, around: Around) -> Inference:
     """What data tell of the sky if values are these, about that sky."""
-    there = moved(setup, around.values)
-    model, held = model_about(there, replace(around, values=None), moving=False)
+    moved_setup = moved(setup, around.values)
+    model, held = model_about(moved_setup, replace(around, values=None), moving=False)
     solution = model.condition(around.data.data)
     return Inference(solution, held, 0, replace(around, sky=solution.posterior.mean))
 
@@ -475,20 +475,20 @@ def rebuilds_visibilities(setup: Setup) -> bool:
     return gains or radiometer_about(setup) == "posterior"
 
 
-def prediction(setup: Setup, found: Inference, solved: DataVector) -> Grid:
+def prediction(setup: Setup, inference: Inference, solved: DataVector) -> Grid:
     """Visibilities of the mean map, with all else that N holds but drifts and noise, in K.
 
     Parameters
     ----------
     setup : Setup
         Pointed as the data tell.
-    found : Inference
+    inference : Inference
     solved : (data,) array
         N^-1 (d - A m), of the mean map.
     """
-    mean = replace(setup.sky, modes=found.posterior.mean)
+    mean = replace(setup.sky, modes=inference.posterior.mean)
     besides = np.zeros(len(solved))
-    for part in found.expanded:
+    for part in inference.expanded:
         if not part.changes_coupling:
             besides = besides + part.columns @ (part.columns.T @ solved)
     return setup.under(mean).signal + setup.layout.scatter(besides)
@@ -525,21 +525,21 @@ def with_learned_prior(
         Under that prior, with how it was learned.
     """
 
-    known = None
+    first = None
 
     def whole(information: Information) -> Information:
         return information if earlier is None else information + earlier
 
     def learn(information: Information, at: Vector | None) -> Learned:
-        return learned_prior(setup, setup.family, whole(information), known if at is None else at)
+        return learned_prior(setup, setup.family, whole(information), first if at is None else at)
 
     if AboveLmax.treatment(setup.scenario) == "marginalised":
         # what is expected above lmax follows from what is learned below
-        found = settled(setup, data, start, report=report)
-        known, start = first_parameters(setup, whole(found.solution.information)), found.around
-        setup = with_sky_above(setup, known)
-    found = settled(setup, data, start, learn, report)
-    return replace(setup, prior=found.learned.prior), found
+        result = settled(setup, data, start, report=report)
+        first, start = first_parameters(setup, whole(result.solution.information)), result.around
+        setup = with_sky_above(setup, first)
+    result = settled(setup, data, start, learn, report)
+    return replace(setup, prior=result.learned.prior), result
 
 
 def first_parameters(setup: Setup, information: Information) -> Vector | None:
@@ -550,8 +550,8 @@ def first_parameters(setup: Setup, information: Information) -> Vector | None:
         coarse = scenario.prior.family(scenario.frequency_mhz, COARSE_LMAX)
         n = n_modes(COARSE_LMAX)
         information = integrated_out(information, n, np.asarray(setup.prior.variance())[n:])
-    found = most_probable(coarse, information, seed)
-    return None if found is None else family.start_from(coarse, found)
+    parameters = most_probable(coarse, information, seed)
+    return None if parameters is None else family.start_from(coarse, parameters)
 
 
 def learned_prior(
@@ -623,9 +623,9 @@ def named_priors(
             f"--priors: {OF_TRUE_SKY} needs C_ell of the scenario's sky, which is unknown for "
             "measured data; omit it, or give --truth if the data were simulated from that sky"
         )
-    own, named = scenario.prior, {name: NAMED[name] for name in names}
+    given, named = scenario.prior, {name: NAMED[name] for name in names}
     # isotropic priors differ in where C_ell comes from
     return {
-        name: own if (own.model, own.origin) == (one.model, one.origin) else one
+        name: given if (given.model, given.origin) == (one.model, one.origin) else one
         for name, one in named.items()
     }

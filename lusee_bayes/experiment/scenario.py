@@ -76,8 +76,8 @@ def one_sentence(error: ValidationError, source: str, model: type[BaseModel]) ->
     path, sections = _resolved(first["loc"], model)
     where = ".".join(path)
     if first["type"] == "extra_forbidden":
-        known = {name for section in sections for name in section.model_fields}
-        return f"{source}: unknown key '{where}'; {nearest(path[-1], known)}"
+        keys = {name for section in sections for name in section.model_fields}
+        return f"{source}: unknown key '{where}'; {nearest(path[-1], keys)}"
     more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
     if first["type"] == "union_tag_invalid":
         models = first["ctx"]["expected_tags"].replace("'", "").split(", ")
@@ -117,9 +117,9 @@ def _resolved(
         if isinstance(key, int) or section is None or number == len(location) - 1:
             continue
         field = section.model_fields.get(key)
-        found = [] if field is None else _models_in(field.annotation)
-        kinds = {str(m.model_fields["model"].default): m for m in found if len(found) > 1}
-        section, sections = (found[0] if len(found) == 1 else None), found
+        models = [] if field is None else _models_in(field.annotation)
+        kinds = {str(m.model_fields["model"].default): m for m in models if len(models) > 1}
+        section, sections = (models[0] if len(models) == 1 else None), models
     return path, sections
 
 
@@ -275,8 +275,8 @@ class Scenario(Section):
             return self.with_section("noise", above_lmax=AboveLmaxSection()).of_measured()
         if self.beam.exact or self.noise.beam is not None or self.noise.fields is not None:
             return self
-        known = {name: error * getattr(self.beam, name) for name, error in self.beam.errors.items()}
-        stds = {name: std for name, std in known.items() if std > 0.0}
+        sizes = {name: error * getattr(self.beam, name) for name, error in self.beam.errors.items()}
+        stds = {name: std for name, std in sizes.items() if std > 0.0}
         beam = BeamErrorSection(parameters=stds) if stds else None
         fields = FieldErrorsSection() if self.beam.source().has_fields else None
         return self.with_section("noise", beam=beam, fields=fields)

@@ -137,8 +137,8 @@ class IsotropicPriorSection(SpectrumSection):
         if not isinstance(value, dict) or value.get("spectrum") is not None:
             return value
         acting = ("scale", "mean_file", "log_amplitude_std", "tilt_std", "band_edges")
-        known = any(value.get(name) for name in acting)
-        return {**value, "spectrum": "sky" if known else "learned"}
+        acts = any(value.get(name) for name in acting)
+        return {**value, "spectrum": "sky" if acts else "learned"}
 
     _known_where_it_is_changed = requires(
         lambda section: (
@@ -218,8 +218,8 @@ PRIOR_SECTIONS = kinds_of(LocalScalesPriorSection, IsotropicPriorSection)
 def _complete_prior(tree: dict[str, Any]) -> None:
     """``prior`` without a model is that of its entries: isotropic, as scenarios had it before."""
     if not tree.get("model"):
-        told = set(tree) & set(IsotropicPriorSection.model_fields) - {"model"}
-        default = IsotropicPriorSection if told else LocalScalesPriorSection
+        isotropic = set(tree) & set(IsotropicPriorSection.model_fields) - {"model"}
+        default = IsotropicPriorSection if isotropic else LocalScalesPriorSection
         tree["model"] = default.model_fields["model"].default
     if tree["model"] != "isotropic":  # another kind in the place of the paper's prior
         tree.pop("spectrum", None)
@@ -365,10 +365,10 @@ class SpectralSection(Section):
         modes = [[source.modes(f, lmax) for source in catalogue] for f in frequencies_mhz]
         sources = np.reshape(modes, (len(modes), len(catalogue), n_modes(lmax)))
         templates = [partial(diffuse_brightness, f) for f in frequencies_mhz]
-        own = self.model_dump(include={"reference_mhz", "turnover_mhz"})
-        own |= {"weight": galactic_share, "lmax_fields": self.lmax_of_fields(lmax)}
+        options = self.model_dump(include={"reference_mhz", "turnover_mhz"})
+        options |= {"weight": galactic_share, "lmax_fields": self.lmax_of_fields(lmax)}
         skies = np.array(frequencies_mhz), templates, lmax, self.fields
-        return PositiveSkies.of(*skies, sources=sources, **own)
+        return PositiveSkies.of(*skies, sources=sources, **options)
 
     def n_maps(self, frequencies_mhz: tuple[float, ...]) -> int:
         """How many maps the skies of these channels are made of."""

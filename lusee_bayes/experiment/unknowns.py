@@ -142,18 +142,18 @@ class UnknownsReport:
 
     def notes(self) -> list[str]:
         """What has to be known to read the table, a sentence each."""
-        found = []
+        sentences = []
         if self.common is not None and self.common > UNTOLD:
-            found.append(
+            sentences.append(
                 "The common gain of all ports is unconstrained (standard deviation "
                 f"{self.common:.2f} of the prior's): it is degenerate with the sky's brightness."
             )
         if self.onto:
-            found.append(
+            sentences.append(
                 "Receivers, ground and gains are constrained here by the new data only; for the "
                 "earlier data, see the folder of the earlier map."
             )
-        return found
+        return sentences
 
     def lines(self) -> list[str]:
         """One line for every unknown, the sentence of the null direction, and the notes."""
@@ -167,12 +167,12 @@ class UnknownsReport:
     def summary(self) -> dict[str, Any]:
         """Entry of summary.json."""
         rows, notes = self.table.to_dict("records"), self.notes()
-        found: dict[str, Any] = {"rows": rows, "common_gain_std_share": self.common, "notes": notes}
+        entry: dict[str, Any] = {"rows": rows, "common_gain_std_share": self.common, "notes": notes}
         if self.null is not None:
             weights = zip(self.null.names, self.null.weights.tolist(), strict=True)
-            found |= {"null_direction": dict(weights), "null_share": self.null.share}
-            found["null_sentence"] = self.null_sentence()
-        return found
+            entry |= {"null_direction": dict(weights), "null_share": self.null.share}
+            entry["null_sentence"] = self.null_sentence()
+        return entry
 
 
 def _line(name: str, row: Mapping[str, Any]) -> str:
@@ -258,36 +258,36 @@ class Unknowns:
     sky_std: float
 
     @classmethod
-    def of(cls, experiment: Experiment, found: Inference) -> Unknowns | None:
+    def of(cls, experiment: Experiment, inference: Inference) -> Unknowns | None:
         """Of data and their model; None if that has no such unknowns.
 
         Parameters
         ----------
         experiment : Experiment
-        found : Inference
+        inference : Inference
             Of these data alone.
         """
-        held = [part for part in found.expanded if not isinstance(part.systematic, PointSources)]
+        held = [s for s in inference.expanded if not isinstance(s.systematic, PointSources)]
         if not held:
             return None
         octaves, alike = [], []
         for part in held:
-            own, none = part.systematic, ((), np.zeros((0, len(part.expected))))
-            over = own.octaves(attrgetter(own.key)(experiment.scenario))
+            systematic, none = part.systematic, ((), np.zeros((0, len(part.expected))))
+            over = systematic.octaves(attrgetter(systematic.key)(experiment.scenario))
             octaves.append(np.full(len(part.expected), over))
-            alike.append(none if own.has_table else own.like_the_sky())
+            alike.append(none if systematic.has_table else systematic.like_the_sky())
         data, columns = experiment.data, np.concatenate([s.columns for s in held], axis=1)
         # of spectra, the sky behind them may be known, but not what the scenario would have drawn
-        known = data.truth is not None and data.calibration is None
-        rows = before_data(held, true_values(experiment.setup) if known else None)
+        has_truth = data.truth is not None and data.calibration is None
+        rows = before_data(held, true_values(experiment.setup) if has_truth else None)
         return cls(
             tuple(rows.to_dict("records")),
-            amplitudes_of_sky(found.solution, columns),
+            amplitudes_of_sky(inference.solution, columns),
             np.concatenate([s.expected for s in held]),
             np.concatenate(octaves),
             tuple(name for names, _ in alike for name in names),
             block_diag(*(parts for _, parts in alike)),
-            float(np.sqrt(np.asarray(found.model.prior.variance())[0])),
+            float(np.sqrt(np.asarray(inference.model.prior.variance())[0])),
         )
 
     @property
@@ -334,8 +334,8 @@ class Unknowns:
         mean, covariance : (modes + w,) and square array
             Of the sky and w, in K and K^2.
         """
-        told = self.amplitudes.with_shared(self._of(tied, number), mean, covariance)
-        return replace(self, amplitudes=told)
+        amplitudes = self.amplitudes.with_shared(self._of(tied, number), mean, covariance)
+        return replace(self, amplitudes=amplitudes)
 
     def table(self, mean: Modes, covariance: ModesMatrix) -> pd.DataFrame:
         """All of them with value and std, the sky integrated out; parameters are of the report."""
@@ -353,15 +353,15 @@ class Unknowns:
         joint : bool
             It is also that of other data: no null direction is looked for.
         """
-        told, rows = self.amplitudes.integrated(mean, covariance), self.table(mean, covariance)
+        posterior, rows = self.amplitudes.integrated(mean, covariance), self.table(mean, covariance)
         rows = rows[rows["listed"]]
         if rows.empty:
             return None
-        null = None if joint else self._null_direction(told, float(covariance[0, 0]))
+        null = None if joint else self._null_direction(posterior, float(covariance[0, 0]))
         common = None
         if COMMON_GAIN in self.names:
             gain = self.parts[self.names.index(COMMON_GAIN)]
-            common = float(np.sqrt(gain @ told.covariance @ gain))
+            common = float(np.sqrt(gain @ posterior.covariance @ gain))
         columns = [*UNKNOWN_COLUMNS, *(["true"] if "true" in rows else [])]
         return UnknownsReport(rows[columns], null, common)
 
@@ -377,28 +377,28 @@ class Unknowns:
         pixels : (pixels,) array
             Posterior standard deviation of each pixel, in K.
         """
-        told, total = self.amplitudes.integrated(mean, covariance), float(np.trace(covariance))
-        rows = given_data(pd.DataFrame(self.rows), told)
+        given, total = self.amplitudes.integrated(mean, covariance), float(np.trace(covariance))
+        rows = given_data(pd.DataFrame(self.rows), given)
 
-        correlation = told.covariance / np.outer(told.std, told.std)
+        correlation = given.covariance / np.outer(given.std, given.std)
 
         def root(which: Int[np.ndarray, " which"]) -> Float[np.ndarray, "modes kept"]:
             """R of W V^-1 W^T = R R^T."""
             values, axes = np.linalg.eigh(correlation[np.ix_(which, which)])
             kept = values > len(values) * np.finfo(np.float64).eps
-            return (told.with_sky / told.std)[:, which] @ (axes[:, kept] / np.sqrt(values[kept]))
+            return (given.with_sky / given.std)[:, which] @ (axes[:, kept] / np.sqrt(values[kept]))
 
         every = root(np.arange(len(rows)))
         kinds = rows.groupby("systematic", sort=False).indices
         parts = {ALL_TOGETHER: every} | {name: root(at) for name, at in kinds.items()}
         moved = (rows["value"] - rows["prior"]) / rows["prior_std"]
-        squares = rows.assign(n=1, moved=moved**2, width=told.std**2)
+        squares = rows.assign(n=1, moved=moved**2, width=given.std**2)
         named = squares.rename(columns={"unknown": "one", "site": "unknown"})
         groups = named.groupby(["systematic", "unknown"], sort=False)
         table = groups.agg({"n": "sum", "moved": "mean", "width": "mean"}).reset_index()
         table[["moved", "width"]] **= 0.5
         single = np.flatnonzero(rows["site"] == rows["unknown"])
-        best = np.lexsort((told.std[single], self.octaves[single] == 0))[:MOST_IN_CORNER]
+        best = np.lexsort((given.std[single], self.octaves[single] == 0))[:MOST_IN_CORNER]
         corner = np.sort(single[best])
         columns = [*UNKNOWN_COLUMNS, *(["true"] if "true" in rows else [])]
         nside = round(np.sqrt(len(pixels) / 12))
@@ -410,9 +410,9 @@ class Unknowns:
             (pixel_std(every @ every.T, nside) / pixels) ** 2,
         )
 
-    def _null_direction(self, told: Amplitudes, variance: float) -> NullDirection:
-        mixed = self.parts @ told.with_sky[0] / self.sky_std
-        inner = self.parts @ told.covariance @ self.parts.T
+    def _null_direction(self, posterior: Amplitudes, variance: float) -> NullDirection:
+        mixed = self.parts @ posterior.with_sky[0] / self.sky_std
+        inner = self.parts @ posterior.covariance @ self.parts.T
         sky = variance / self.sky_std**2
         blocks = np.block([[np.full((1, 1), sky), mixed[None]], [mixed[:, None], inner]])
         return NullDirection.of((SKY, *self.names), blocks)
@@ -436,32 +436,32 @@ def before_data(parts: Sequence[Expanded], truth: Truth | None) -> pd.DataFrame:
     """
     tables = []
     for part in parts:
-        own = part.systematic
+        systematic = part.systematic
         columns = {
-            "expected": own.in_units(part.expected),
-            "prior": own.in_units(0.0 * own.stds),
-            "prior_std": dict(zip(own.names, own.stds.tolist(), strict=True)),
-            "true": {} if truth is None else own.true(truth),
+            "expected": systematic.in_units(part.expected),
+            "prior": systematic.in_units(0.0 * systematic.stds),
+            "prior_std": dict(zip(systematic.names, systematic.stds.tolist(), strict=True)),
+            "true": {} if truth is None else systematic.true(truth),
         }
         table = pd.DataFrame({name: values for name, values in columns.items() if values})
         table = table.rename_axis("unknown").reset_index()
-        sites = [u.name for u in own.unknowns for _ in range(u.size or 1)]
-        sites = sites if own.has_table else own.names
-        table = table.assign(unit=own.unit, listed=not own.has_table, site=sites)
-        tables.append(table.assign(systematic=own.words))
+        sites = [u.name for u in systematic.unknowns for _ in range(u.size or 1)]
+        sites = sites if systematic.has_table else systematic.names
+        table = table.assign(unit=systematic.unit, listed=not systematic.has_table, site=sites)
+        tables.append(table.assign(systematic=systematic.words))
     return pd.concat(tables, ignore_index=True)
 
 
-def given_data(table: pd.DataFrame, told: Amplitudes) -> pd.DataFrame:
+def given_data(table: pd.DataFrame, amplitudes: Amplitudes) -> pd.DataFrame:
     """The same with value and std, from amplitudes in prior standard deviations."""
-    value = table["expected"] + table["prior_std"] * told.mean
-    return table.assign(value=value, std=table["prior_std"] * told.std)
+    value = table["expected"] + table["prior_std"] * amplitudes.mean
+    return table.assign(value=value, std=table["prior_std"] * amplitudes.std)
 
 
-def _alone(experiment: Experiment, found: Inference, part: Expanded) -> pd.DataFrame:
+def _alone(experiment: Experiment, inference: Inference, part: Expanded) -> pd.DataFrame:
     """The table of one systematic."""
     truth = None if experiment.data.truth is None else true_values(experiment.setup)
-    return given_data(before_data([part], truth), found.amplitudes(part))
+    return given_data(before_data([part], truth), inference.amplitudes(part))
 
 
 # offsets that are tested whatever the scenario says, and how far apart the two sides of their
@@ -490,10 +490,10 @@ class PointingReport:
     offsets: pd.DataFrame | None
     preferred: pd.DataFrame
 
-    def given(self, told: pd.DataFrame) -> PointingReport:
+    def given(self, unknowns: pd.DataFrame) -> PointingReport:
         """The same with the value and std of each offset that a table of unknowns has."""
-        told, table = told.set_index("unknown"), self.offsets
-        columns = {name: table["offset"].map(told[name]) for name in ("value", "std")}
+        unknowns, table = unknowns.set_index("unknown"), self.offsets
+        columns = {name: table["offset"].map(unknowns[name]) for name in ("value", "std")}
         return replace(self, offsets=table.assign(**columns))
 
     def lines(self) -> list[str]:
@@ -508,40 +508,40 @@ class PointingReport:
         return lines
 
 
-def pointing_report(experiment: Experiment, found: Inference) -> PointingReport:
+def pointing_report(experiment: Experiment, inference: Inference) -> PointingReport:
     """Work out the offsets of the model, and those that the data prefer besides.
 
     Parameters
     ----------
     experiment : Experiment
-    found : Inference
+    inference : Inference
         Of these data alone.
     """
-    table = None if found.offsets is None else _table(experiment, found)
+    table = None if inference.offsets is None else _table(experiment, inference)
     values = {} if table is None else dict(zip(table["offset"], table["value"], strict=True))
-    return PointingReport(table, _preferred(experiment, found, values))
+    return PointingReport(table, _preferred(experiment, inference, values))
 
 
-def _table(experiment: Experiment, found: Inference) -> pd.DataFrame:
-    table = _alone(experiment, found, found.offsets)
-    about = np.asarray(table["std"] / table["prior_std"])  # what is left of the offsets
+def _table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
+    table = _alone(experiment, inference, inference.offsets)
+    shares = np.asarray(table["std"] / table["prior_std"])  # what is left of the offsets
     noise = np.sqrt(np.asarray(radiometer(experiment.setup).diagonal()))
     model = base_model(experiment.setup)
-    left = found.offsets.systematic.beyond_first_order(model, found.posterior.mean, about)
+    left = inference.offsets.systematic.beyond_first_order(model, inference.posterior.mean, shares)
     beyond = [float(np.sqrt(np.mean((left[name] / noise) ** 2))) for name in table["unknown"]]
     table = table.assign(beyond_first_order=beyond).rename(columns={"unknown": "offset"})
     columns = ["offset", "value", "std", "prior_std", "beyond_first_order", "true"]
     return table[[name for name in columns if name in table]]
 
 
-def _preferred(experiment: Experiment, found: Inference, values: dict[str, float]) -> pd.DataFrame:
-    setup, data, sky = experiment.setup, experiment.data, found.posterior.mean
+def _preferred(experiment: Experiment, result: Inference, values: dict[str, float]) -> pd.DataFrame:
+    setup, data, sky = experiment.setup, experiment.data, result.posterior.mean
     n_runs = setup.observation.n_runs
     steps = {name: step for kind, step in TESTED.items() for name in offset_names((kind,), n_runs)}
     centre = dict.fromkeys(steps, 0.0) | values
     offsets = PointingOffsets.of(shifted(setup, centre), steps, centre)
-    about = Expanded.about(offsets, base_model(setup), Around(sky=sky, values=centre))
-    per_unit = np.asarray(about.columns) / offsets.stds
+    expanded = Expanded.about(offsets, base_model(setup), Around(sky=sky, values=centre))
+    per_unit = np.asarray(expanded.columns) / offsets.stds
     day = setup.observation.day
     length = -(-(int(day.max()) + 1) // MOST_STRETCHES)
     stretches = [(-1, -1, np.ones(len(day), dtype=bool))]
@@ -554,9 +554,9 @@ def _preferred(experiment: Experiment, found: Inference, values: dict[str, float
             if first < 0 or column.any():
                 rows.append((name, first, last))
                 columns.append(column)
-    told = preferences(found.solution, np.stack(columns, axis=1))
+    preferred = preferences(result.solution, np.stack(columns, axis=1))
     table = pd.DataFrame(rows, columns=["offset", "first_day", "last_day"])
-    return table.assign(value=told.amplitude, std=told.std, chi2_gain=told.gain)
+    return table.assign(value=preferred.amplitude, std=preferred.std, chi2_gain=preferred.gain)
 
 
 def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
@@ -576,19 +576,19 @@ def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
         its flux is known from the prior only.
     """
     held = next(s for s in inference.expanded if isinstance(s.systematic, PointSources))
-    told = _alone(experiment, inference, held)
+    fluxes = _alone(experiment, inference, held)
     jansky = 1.0 / kelvin_steradian(1.0, experiment.scenario.frequency_mhz)
     sources = held.systematic.sources
     blocks = [(s.name, block, bool(up)) for s in sources for block, up in enumerate(s.seen())]
     table = pd.DataFrame(blocks, columns=["source", "block", "above_horizon"]).assign(
-        flux_jy=told["value"] * jansky,
-        std_jy=told["std"] * jansky,
-        flux_k_sr=told["value"],
-        std_k_sr=told["std"],
-        prior_jy=told["prior"] * jansky,
-        prior_std_jy=told["prior_std"] * jansky,
+        flux_jy=fluxes["value"] * jansky,
+        std_jy=fluxes["std"] * jansky,
+        flux_k_sr=fluxes["value"],
+        std_k_sr=fluxes["std"],
+        prior_jy=fluxes["prior"] * jansky,
+        prior_std_jy=fluxes["prior_std"] * jansky,
     )
-    return table.assign(true_jy=told["true"] * jansky) if "true" in told else table
+    return table.assign(true_jy=fluxes["true"] * jansky) if "true" in fluxes else table
 
 
 def flux_lines(fluxes: pd.DataFrame) -> list[str]:

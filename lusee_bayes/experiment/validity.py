@@ -63,7 +63,7 @@ LITTLE = 0.1
 MOST_NAMED = 4
 
 
-def weighed(setup: Setup, data: np.ndarray, found: Inference) -> tuple[float, float] | None:
+def weighed(setup: Setup, data: np.ndarray, inference: Inference) -> tuple[float, float] | None:
     """Weigh draws of sky and unknowns from the Gaussian of an inference.
 
     Parameters
@@ -71,7 +71,7 @@ def weighed(setup: Setup, data: np.ndarray, found: Inference) -> tuple[float, fl
     setup : Setup
     data : (data,) array
         In K.
-    found : Inference
+    inference : Inference
 
     Returns
     -------
@@ -79,21 +79,21 @@ def weighed(setup: Setup, data: np.ndarray, found: Inference) -> tuple[float, fl
         Pareto k of the weights, -inf where they hardly differ, and by how much what is beyond first
         order moves the map, rms in standard deviations; None where nothing was found in rounds.
     """
-    parts, factor = found.expanded, found.solution.factor
-    if not found.moving or not isinstance(factor, LowRankFactor):
+    parts, factor = inference.expanded, inference.solution.factor
+    if not inference.moving or not isinstance(factor, LowRankFactor):
         return None
     columns = np.concatenate([part.columns for part in parts], axis=1)
-    told = amplitudes_of_sky(found.solution, columns)
+    amplitudes = amplitudes_of_sky(inference.solution, columns)
     keys = jax.random.split(jax.random.key(setup.scenario.seed), 2)
-    skies = np.asarray(found.posterior.sample(keys[0], N_WEIGHED))
-    values, axes = np.linalg.eigh(told.covariance)
+    skies = np.asarray(inference.posterior.sample(keys[0], N_WEIGHED))
+    values, axes = np.linalg.eigh(amplitudes.covariance)
     spread = axes * np.sqrt(np.maximum(values, 0.0))
-    normals = np.asarray(jax.random.normal(keys[1], (N_WEIGHED, len(told.mean))))
-    off = told.mean + normals @ spread.T - (skies - told.reference) @ told.pull.T
+    normals = np.asarray(jax.random.normal(keys[1], (N_WEIGHED, len(amplitudes.mean))))
+    off = amplitudes.mean + normals @ spread.T - (skies - amplitudes.reference) @ amplitudes.pull.T
     expected = np.concatenate([part.expected for part in parts])
     ends = np.cumsum([len(part.centre) for part in parts])[:-1]
-    base = base_model(setup, found.around)
-    built = [found for _, found in systematics(setup, found.around)]
+    base = base_model(setup, inference.around)
+    built = [systematic for _, systematic in systematics(setup, inference.around)]
     first_order, beyond = np.empty((2, len(data), N_WEIGHED))
 
     def drawn(k: int) -> None:
@@ -102,14 +102,14 @@ def weighed(setup: Setup, data: np.ndarray, found: Inference) -> tuple[float, fl
         model = base
         for systematic in built:
             if type(systematic) in z:
-                own = systematic.values(z[type(systematic)])
-                model = systematic.effect(model, own)
+                sites = systematic.values(z[type(systematic)])
+                model = systematic.effect(model, sites)
             elif not systematic.first_order:
                 model = systematic.averaged(model)
-        first_order[:, k] = found.model.predict(sky) + columns @ a
+        first_order[:, k] = inference.model.predict(sky) + columns @ a
         beyond[:, k] = model.predict(sky) - first_order[:, k]
 
-    root, begin = np.asarray(found.posterior.root()), 0
+    root, begin = np.asarray(inference.posterior.root()), 0
     for n in (N_FIRST, N_WEIGHED):
         in_threads(drawn, range(begin, n))
         begin, steps, linear, more = n, off[:n], first_order[:, :n], beyond[:, :n]
@@ -117,7 +117,7 @@ def weighed(setup: Setup, data: np.ndarray, found: Inference) -> tuple[float, fl
         exact, linear = (np.asarray(factor.base.whiten(one)) for one in (left - more, left))
         misfit = (linear**2).sum(0) - (exact**2).sum(0)
         log_weights = 0.5 * (misfit + (steps**2).sum(1) - ((steps + expected) ** 2).sum(1))
-        pulls = np.asarray(found.model.coupling.transpose_mv(np.asarray(factor.solve(more))))
+        pulls = np.asarray(inference.model.coupling.transpose_mv(np.asarray(factor.solve(more))))
         moved_by = float(np.sqrt(np.mean((root.T @ pulls) ** 2)))
         if log_weights.std() < EVEN:
             return -np.inf, moved_by
@@ -184,10 +184,10 @@ def errors_of(
         section = FieldErrorsSection(std=FIELDS, lmax=FIELD_LMAX, learned=False)
         fields = FieldErrors.build(section, setup, Around())
         yield FIELDS_NAME, 100.0 * FIELDS, " %", fields, slice(None)
-    known = {name: float(p.value) for name, p in source.parameters().items() if float(p.value)}
-    priors = tuple(Unknown(name, value, PARAMETERS * abs(value)) for name, value in known.items())
+    values = {name: float(p.value) for name, p in source.parameters().items() if float(p.value)}
+    priors = tuple(Unknown(name, value, PARAMETERS * abs(value)) for name, value in values.items())
     parameters = InstrumentParameters(setup.instrument, priors)
-    for k, name in enumerate(known):
+    for k, name in enumerate(values):
         yield name, 100.0 * PARAMETERS, " %", parameters, slice(k, k + 1)
     if not pointing:
         return
@@ -199,35 +199,35 @@ def errors_of(
 
 
 def blind_spots(
-    setup: Setup, found: Inference, sky: Modes, *, pointing: bool = True
+    setup: Setup, inference: Inference, sky: Modes, *, pointing: bool = True
 ) -> tuple[BlindSpot, ...]:
     """Work out what errors of the instrument do that the model does not have.
 
     Parameters
     ----------
     setup : Setup
-    found : Inference
+    inference : Inference
     sky : (modes,) array
         In K.
     pointing : bool
         Clock and pointing, too, besides fields and antennas.
     """
-    has = {name for part in found.expanded for name in part.systematic.names}
-    if any(isinstance(part.systematic, FieldErrors) for part in found.expanded):
+    has = {name for part in inference.expanded for name in part.systematic.names}
+    if any(isinstance(part.systematic, FieldErrors) for part in inference.expanded):
         has.add(FIELDS_NAME)
-    there = moved(setup, found.around.values)
-    solution, model = found.solution, base_model(there, found.around)
+    moved_setup = moved(setup, inference.around.values)
+    solution, model = inference.solution, base_model(moved_setup, inference.around)
     root = solution.posterior.root()
-    wide = solution.under(found.model.prior.widened(WIDE)).posterior.root()
-    spots, slopes, degrees = [], {}, max(found.model.n_data - len(sky), 1)
-    for name, size, unit, systematic, which in errors_of(there, pointing=pointing):
+    wide = solution.under(inference.model.prior.widened(WIDE)).posterior.root()
+    spots, slopes, degrees = [], {}, max(inference.model.n_data - len(sky), 1)
+    for name, size, unit, systematic, which in errors_of(moved_setup, pointing=pointing):
         if name in has:
             continue
         if type(systematic) not in slopes:
             centre = np.zeros(len(systematic.names))
             columns = np.asarray(systematic.linearised(model, centre)(sky))
             solved = np.asarray(solution.factor.solve(columns))
-            pull = np.asarray(found.model.coupling.transpose_mv(solved))
+            pull = np.asarray(inference.model.coupling.transpose_mv(solved))
             moves = ((root.T @ pull) ** 2).sum(0)
             left = (columns * solved).sum(0) - ((wide.T @ pull) ** 2).sum(0)
             slopes[type(systematic)] = moves, left
@@ -244,8 +244,8 @@ def about_sky_above(setup: Setup) -> str:
         return ""
     if (added := float(np.sqrt(above.power.sum() / len(above.root)))) < LITTLE:
         return ""
-    lmax, rest = setup.scenario.lmax, np.append(np.cumsum(above.power[::-1])[::-1], 0.0)
-    enough = lmax + int(np.argmax(rest < np.sqrt(2.0 * len(above.root))))
+    lmax, above_ell = setup.scenario.lmax, np.append(np.cumsum(above.power[::-1])[::-1], 0.0)
+    enough = lmax + int(np.argmax(above_ell < np.sqrt(2.0 * len(above.root))))
     return (
         f"The sky above lmax = {lmax} adds about {added:.2g} standard deviations of the noise to "
         "every datum (rms). It is marginalised: the error bars are valid, but larger. Above lmax = "
@@ -253,19 +253,19 @@ def about_sky_above(setup: Setup) -> str:
     )
 
 
-def reach(experiment: Experiment, found: Inference) -> list[str]:
+def reach(experiment: Experiment, inference: Inference) -> list[str]:
     """What is doubtful about the Gaussian, and what data would not show, a sentence each.
 
     Parameters
     ----------
     experiment : Experiment
-    found : Inference
+    inference : Inference
         Of its data.
     """
     sentences, setup = [], experiment.setup
-    k, moved_by = weighed(setup, np.asarray(experiment.data.data), found) or (0.0, 0.0)
+    k, moved_by = weighed(setup, np.asarray(experiment.data.data), inference) or (0.0, 0.0)
     if k > LARGEST_K:
-        keys = ", ".join(dict.fromkeys(part.systematic.key for part in found.moving))
+        keys = ", ".join(dict.fromkeys(part.systematic.key for part in inference.moving))
         holds = "its errors are valid" if moved_by < LARGEST_MOVE else "its errors are not valid"
         sentences.append(
             f"The posterior of {keys} is not Gaussian (Pareto k = {k:.2g}, accepted: "
@@ -275,6 +275,6 @@ def reach(experiment: Experiment, found: Inference) -> list[str]:
         )
     sentences += filter(None, [about_sky_above(setup)])
     if setup.measured:
-        spots = blind_spots(setup, found, found.posterior.mean, pointing=False)
+        spots = blind_spots(setup, inference, inference.posterior.mean, pointing=False)
         sentences += filter(None, [blind_sentence(spots)])
     return sentences
