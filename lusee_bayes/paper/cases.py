@@ -54,13 +54,13 @@ def sky_frequency_mhz(path: str | Path) -> float:
     InputError if the file is missing or its name has no frequency.
     """
     path = require_file(path, "sky map")
-    found = re.search(r"exp(\d+(?:\.\d+)?)MHz", Path(path).name)
-    if found is None or float(found[1]) == 0.0:
+    match = re.search(r"exp(\d+(?:\.\d+)?)MHz", Path(path).name)
+    if match is None or float(match[1]) == 0.0:
         raise InputError(
             f"'{Path(path).name}' has no frequency as exp<F>MHz; name the file exp<F>MHz..., for "
             "example exp10.0MHz_sky_map.hdf5"
         )
-    return float(found[1])
+    return float(match[1])
 
 
 def is_case(path: Path, scenario: Scenario) -> bool:

@@ -364,17 +364,17 @@ def _linear_gain(cases: Cases) -> Verdict:
 
 def _marginalising(cases: Cases) -> Verdict:
     pairs = [("gain_ignored", "gain_1e-2"), ("beam_ignored", "beam_4MHz")]
-    found = [(bad, cross(cases[bad]), cross(cases[good])) for bad, good in pairs]
-    text = ", ".join(f"{bad}: SNR < 1 from ell {a}, marginalised {b}" for bad, a, b in found)
-    loss = [a < 0.5 * b for _, a, b in found]
+    crossings = [(bad, cross(cases[bad]), cross(cases[good])) for bad, good in pairs]
+    text = ", ".join(f"{bad}: SNR < 1 from ell {a}, marginalised {b}" for bad, a, b in crossings)
+    loss = [a < 0.5 * b for _, a, b in crossings]
     return grade(text, all(loss), any(loss))
 
 
 def _rmsd(cases: Cases, case: str, percent: float) -> Verdict:
     """Whether a case's beams differ by ``percent`` rms, to 30 % (partly: to a factor of two)."""
-    found = 100 * cases[case].attrs["beam_rms_difference"]
-    near = 0.7 * percent <= found <= 1.3 * percent
-    return grade(f"{found:.1f} %", near, 0.5 * percent <= found <= 2 * percent)
+    rms = 100 * cases[case].attrs["beam_rms_difference"]
+    near = 0.7 * percent <= rms <= 1.3 * percent
+    return grade(f"{rms:.1f} %", near, 0.5 * percent <= rms <= 2 * percent)
 
 
 def _beam_cross(cases: Cases) -> Verdict:

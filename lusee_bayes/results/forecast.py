@@ -101,7 +101,7 @@ def forecast_rows(forecasts: Sequence[Forecast]) -> list[dict[str, object]]:
     for row in forecasts:
         it, resolution = row.variation, row.resolution_deg
         more = row.information_bits - first[it.source].information_bits
-        told = {
+        columns = {
             "scenario": it.source,
             "family": it.family,
             "variation": it.name,
@@ -115,5 +115,5 @@ def forecast_rows(forecasts: Sequence[Forecast]) -> list[dict[str, object]]:
             "clock_and_pointing": row.offsets_line().replace(",", ";"),
             "unnoticed_errors": row.unnoticed.replace(",", ";"),
         }
-        rows.append(told)
+        rows.append(columns)
     return rows

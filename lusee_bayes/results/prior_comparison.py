@@ -58,7 +58,7 @@ class UnderPrior:
 
     def summary(self) -> PriorSummary:
         """Its entry of priors.json."""
-        channel, known = self.channel, self.channel.truth is not None
+        channel, has_truth = self.channel, self.channel.truth is not None
         return PriorSummary(
             name=self.name,
             prior=self.words,
@@ -68,8 +68,8 @@ class UnderPrior:
             instrument=self.split.instrument,
             rest=self.split.prior,
             coverage=channel.coverage,
-            errors=channel.errors_by_latitude() if known else (),
-            snr=channel.snr_at_some_ell() if known else {},
+            errors=channel.errors_by_latitude() if has_truth else (),
+            snr=channel.snr_at_some_ell() if has_truth else {},
         )
 
 
@@ -159,12 +159,12 @@ class PriorComparison:
 
     def lines(self) -> list[str]:
         """What a terminal shows below the table."""
-        found = [f"{self.headline()}."]
+        sentences = [f"{self.headline()}."]
         for k, kind in enumerate(held.kind for held in self.best.held_out):
             best = max(self.priors, key=lambda one, k=k: one.held_out[k].log_density)
             if best is not self.best:
-                found.append(f"{best.name} predicts each {kind} best from the others.")
-        return [*found, HELD_OUT]
+                sentences.append(f"{best.name} predicts each {kind} best from the others.")
+        return [*sentences, HELD_OUT]
 
     def table(self) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
         """Header and rows, a column for each prior."""
@@ -199,8 +199,8 @@ def _row(one: PriorSummary, best: float) -> dict[str, object]:
     for name, part in (("instrument", one.instrument), ("prior", one.rest)):
         row |= {f"chi2_{name}": part.chi2, f"degrees_{name}": part.degrees}
     for part, error in zip(one.coverage, one.errors, strict=True):
-        told = part.row() | vars(error)
-        row |= {f"{part.name}: {key}": x for key, x in told.items() if key not in ("name", "n")}
+        numbers = part.row() | vars(error)
+        row |= {f"{part.name}: {key}": x for key, x in numbers.items() if key not in ("name", "n")}
     return row | {f"snr_{ell}": value for ell, value in one.snr.items()}
 
 

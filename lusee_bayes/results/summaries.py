@@ -54,10 +54,10 @@ class ChannelSummary(BaseModel, from_attributes=True):
 
     @field_validator("unknowns", "theta", "pointing", mode="before")
     @classmethod
-    def _as_rows(cls, told: Any) -> Any:
-        if isinstance(told, PointingReport):
-            return None if told.offsets is None else told.offsets.to_dict("records")
-        return told.summary() if isinstance(told, UnknownsReport | InstrumentPosterior) else told
+    def _as_rows(cls, value: Any) -> Any:
+        if isinstance(value, PointingReport):
+            return None if value.offsets is None else value.offsets.to_dict("records")
+        return value.summary() if isinstance(value, UnknownsReport | InstrumentPosterior) else value
 
 
 class JointSummary(BaseModel, from_attributes=True):

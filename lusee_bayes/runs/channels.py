@@ -189,7 +189,7 @@ class ChannelInformation:
             The prior of what is shared.
         components : Components
         """
-        information, unknowns, known = self.information, self.unknowns, self.known
+        information, unknowns, data = self.information, self.unknowns, self.known
         n, key, n_draws = information.n_modes, draw_key(scenario), scenario.output.draws
         if unknowns is not None and tied is not None:
             information = unknowns.whole(information, tied, number)
@@ -204,10 +204,10 @@ class ChannelInformation:
         if unknowns is not None:
             if tied is not None:
                 unknowns = unknowns.given_all(tied, number, sky.mean, sky.covariance)
-                known = known.given(unknowns.table(mean, covariance))
+                data = data.given(unknowns.table(mean, covariance))
             report = unknowns.report(mean, covariance, joint=True)
         return channel_result(
-            known,
+            data,
             mean,
             covariance,
             drawn[:n_draws],
@@ -260,8 +260,8 @@ class ChannelsInFiles:
             return function(number, files.information(channels[number], number, tied))
 
         tasks = Tasks(call, range(len(channels)), [names_of((one,)) for one in channels])
-        found = self.engine.each(tasks, self.stages, "joint sums")
-        return {name: np.stack([np.asarray(one[name]) for one in found]) for name in shapes}
+        parts = self.engine.each(tasks, self.stages, "joint sums")
+        return {name: np.stack([np.asarray(one[name]) for one in parts]) for name in shapes}
 
     def summed(
         self,
@@ -275,8 +275,8 @@ class ChannelsInFiles:
         def add(numbers: range) -> joint.ComponentSums:
             sums = joint.ComponentSums.empty(prior, reference)
             for number in numbers:
-                own = function(number, files.information(channels[number], number, tied))
-                sums = joint.summed_information(sums, prior, number, own)
+                relative = function(number, files.information(channels[number], number, tied))
+                sums = joint.summed_information(sums, prior, number, relative)
             return sums
 
         # the same blocks, and the same tree of them, whatever carries out the tasks
@@ -376,15 +376,15 @@ class Share:
 
     @classmethod
     def of(
-        cls, unknowns: Unknowns, mean: Vector, covariance: Square, n_draws: int, found: Inference
+        cls, unknowns: Unknowns, mean: Vector, covariance: Square, n_draws: int, inferred: Inference
     ) -> Share:
         """Of a channel's unknowns under its own posterior of the sky, in K and K^2."""
-        told, own = unknowns.amplitudes.integrated(mean, covariance), unknowns.shared
-        octaves = dict(zip(unknowns.shared_names, unknowns.octaves[own].tolist(), strict=True))
+        posterior, shared = unknowns.amplitudes.integrated(mean, covariance), unknowns.shared
+        octaves = dict(zip(unknowns.shared_names, unknowns.octaves[shared].tolist(), strict=True))
         priors = {row["unknown"]: (row["prior"], row["prior_std"]) for row in unknowns.rows}
-        spread = told.covariance[np.ix_(own, own)]
-        figures = n_draws, priors, found.fits, float(found.posterior.log_evidence)
-        return cls(octaves, (unknowns.expected + told.mean)[own], spread, *figures)
+        spread = posterior.covariance[np.ix_(shared, shared)]
+        figures = n_draws, priors, inferred.fits, float(inferred.posterior.log_evidence)
+        return cls(octaves, (unknowns.expected + posterior.mean)[shared], spread, *figures)
 
 
 class Seen(NamedTuple):
@@ -456,34 +456,34 @@ class ChannelAlone:
         tied : Tied
             E', V' and draws of what is shared.
         """
-        own, at = self.unknowns.shared, self.unknowns.among(tied)
-        told = self.unknowns.amplitudes.integrated(self.mean, self.covariance)
-        expected = self.unknowns.expected[own]
+        shared, at = self.unknowns.shared, self.unknowns.among(tied)
+        posterior = self.unknowns.amplitudes.integrated(self.mean, self.covariance)
+        expected = self.unknowns.expected[shared]
         mean, draws = tied.mean[number, at] - expected, tied.draws[:, number, at] - expected
         covariance = tied.covariance[number][np.ix_(at, at)]
         key = jax.random.fold_in(draw_key(scenario), TIED + 1)
-        e, v = told.mean[own], told.covariance[np.ix_(own, own)]
-        gain = np.linalg.solve(v, told.with_sky[:, own].T).T
+        e, v = posterior.mean[shared], posterior.covariance[np.ix_(shared, shared)]
+        gain = np.linalg.solve(v, posterior.with_sky[:, shared].T).T
         moved = self.mean + gain @ (mean - e)
         left = self.covariance + gain @ (covariance - v) @ gain.T
         # values that go with the channel's own draws, less their mean
         amplitudes = self.unknowns.amplitudes
-        inner = amplitudes.covariance[np.ix_(own, own)]
-        normals = np.asarray(jax.random.normal(key, (len(self.deviations), len(own))))
+        inner = amplitudes.covariance[np.ix_(shared, shared)]
+        normals = np.asarray(jax.random.normal(key, (len(self.deviations), len(shared))))
         variances, axes = np.linalg.eigh(inner)
         normals = (normals * np.sqrt(np.maximum(variances, 0.0))) @ axes.T
-        with_them = normals - self.deviations @ amplitudes.pull[own].T
+        with_them = normals - self.deviations @ amplitudes.pull[shared].T
         deviations = self.deviations + (draws - mean - with_them) @ gain.T
         # what the other channels tell of this one's unknowns
         n = len(amplitudes.mean)
-        precision, vector, about = np.zeros((n, n)), np.zeros(n), np.zeros(n)
-        precision[np.ix_(own, own)], vector[own] = told_by_others(e, v, mean, covariance)
-        about[own] = mean
-        unknowns = replace(self.unknowns, amplitudes=amplitudes.given(precision, vector, about))
+        precision, vector, expansion = np.zeros((n, n)), np.zeros(n), np.zeros(n)
+        precision[np.ix_(shared, shared)], vector[shared] = told_by_others(e, v, mean, covariance)
+        expansion[shared] = mean
+        unknowns = replace(self.unknowns, amplitudes=amplitudes.given(precision, vector, expansion))
         sky_share = np.linalg.solve(v, (np.linalg.solve(v, v - inner)).T)
-        gained = np.linalg.slogdet(np.eye(len(own)) + (covariance - v) @ sky_share)[1]
+        gained = np.linalg.slogdet(np.eye(len(shared)) + (covariance - v) @ sky_share)[1]
         bits = self.figures["information_bits"] - 0.5 * gained / np.log(2.0)
-        information = information_given(self.information, amplitudes, precision, vector, about)
+        information = information_given(self.information, amplitudes, precision, vector, expansion)
         skies = moved + deviations[: self.n_draws]
         return channel_result(
             self.known.given(unknowns.table(moved, left)),
@@ -600,17 +600,17 @@ def map_channels(
     kept = None if earlier is None else information_file(earlier)
 
     def condition(
-        channel: Scenario, told: Stages, values: dict[str, float] | None = None
+        channel: Scenario, progress: Stages, values: dict[str, float] | None = None
     ) -> Conditioned:
         before = None if kept is None else read_information(kept, channel)
         make = partial(build, earlier=None if before is None else before.information, values=values)
-        experiment = measured_experiment(channel, data, told, truth=truth, make=make)
-        return conditioned(experiment, before, told)
+        experiment = measured_experiment(channel, data, progress, truth=truth, make=make)
+        return conditioned(experiment, before, progress)
 
     if single:
         made = condition(scenario, stages)
-        known = made.known(stages, alone=True, thorough=thorough)
-        return MapResult(scenario, (made.result(known, stages),), seconds=stages.seconds)
+        channel_data = made.known(stages, alone=True, thorough=thorough)
+        return MapResult(scenario, (made.result(channel_data, stages),), seconds=stages.seconds)
     engine.work_in(folder)
     digest = None if kept is None else digest_of(kept)
     files = ChannelFiles(folder.resolve(), identity_of(scenario, data, truth, digest, thorough))
@@ -627,8 +627,8 @@ def map_channels(
             made = condition(channel, Stages(), begin)
             if begin is not None and not made.own.fits:
                 made = condition(channel, Stages())
-            known = made.known(alone=False, thorough=thorough)
-            return made.result(known) if alone else kind.of(made, known)
+            channel_data = made.known(alone=False, thorough=thorough)
+            return made.result(channel_data) if alone else kind.of(made, channel_data)
 
         try:
             kept = files.kept(channel, kind, make)
@@ -636,14 +636,14 @@ def map_channels(
             return str(error)
         return Seen(None) if alone else kept.seen()
 
-    names, found = [names_of((channel,)) for channel in channels], []
+    names, views = [names_of((channel,)) for channel in channels], []
     if scenario.shared:  # the others begin with the instrument of the first
-        found = engine.each(Tasks(observe, channels[:1], names[:1]), stages, "first channel")
-        if isinstance(found[0], Seen) and found[0].share.fits:
-            begin = told_by_fitting(scenario, [channels[0].frequency_mhz], [found[0].share]) or None
-    left = channels[len(found) :], names[len(found) :]
-    found = [*found, *engine.each(Tasks(observe, *left), stages, "channels")]
-    by_channel = list(zip(channels, found, strict=True))
+        views = engine.each(Tasks(observe, channels[:1], names[:1]), stages, "first channel")
+        if isinstance(views[0], Seen) and views[0].share.fits:
+            begin = told_by_fitting(scenario, [channels[0].frequency_mhz], [views[0].share]) or None
+    left = channels[len(views) :], names[len(views) :]
+    views = [*views, *engine.each(Tasks(observe, *left), stages, "channels")]
+    by_channel = list(zip(channels, views, strict=True))
     unmapped = {channel.frequency_mhz: why for channel, why in by_channel if isinstance(why, str)}
     if len(unmapped) == len(channels):
         raise InputError(f"no channel can be mapped: {_reasons(unmapped)}")
@@ -721,4 +721,4 @@ def _reasons(unmapped: dict[float, str]) -> str:
     alike: dict[str, list[str]] = {}
     for frequency, reason in unmapped.items():
         alike.setdefault(reason, []).append(f"{frequency:g}")
-    return "; ".join(f"{', '.join(known)} MHz: {reason}" for reason, known in alike.items())
+    return "; ".join(f"{', '.join(mhz)} MHz: {reason}" for reason, mhz in alike.items())

@@ -121,10 +121,10 @@ def run_compare_priors(
     with run_folder(folder, COMPARE_PRIORS, scenario, data, replace=replace, **origin) as run:
         experiment = measured_experiment(scenario, data, stages, truth=truth, make=observed)
         with stages("data"):
-            found = settled(experiment.setup, experiment.data)
+            inferred = settled(experiment.setup, experiment.data)
 
         def under(prior: str) -> UnderPrior:
-            return _under(prior, experiment.setup.with_prior(sections[prior]), experiment, found)
+            return _under(prior, experiment.setup.with_prior(sections[prior]), experiment, inferred)
 
         engine.work_in(run.path)
         mapped = engine.each(Tasks(under, list(sections), list(sections)), stages, "priors")
@@ -132,22 +132,22 @@ def run_compare_priors(
         return run.write(result, stages, Provenance.of_experiment(experiment, data))
 
 
-def _under(name: str, setup: Setup, experiment: Experiment, found: Inference) -> UnderPrior:
+def _under(name: str, setup: Setup, experiment: Experiment, inferred: Inference) -> UnderPrior:
     """Map the data under one prior, or a family of them, and leave out groups of them."""
-    information = found.solution.information
+    information = inferred.solution.information
     if setup.family is None:
         learned, evidence = None, float(information.posterior(setup.prior).log_evidence)
     else:
         learned = learned_prior(setup, setup.family, information)
         setup, evidence = replace(setup, prior=learned.prior), learned.log_evidence
-    known = None if rebuilds(setup) else found.under(setup.prior)
-    mapped = replace(experiment, setup=setup, learned=learned, found=known)
+    solved = None if rebuilds(setup) else inferred.under(setup.prior)
+    mapped = replace(experiment, setup=setup, learned=learned, found=solved)
     made = conditioned(mapped)
     channel = made.result(made.known(alone=False))
-    own = made.own.solution
+    solution = made.own.solution
     n_parameters = 0 if learned is None else len(learned.parameters)
-    split = Split.of(own.posterior, channel.chi2_model, own.model.n_data)
-    judged = held_out(own, mapped.data), split
+    split = Split.of(solution.posterior, channel.chi2_model, solution.model.n_data)
+    judged = held_out(solution, mapped.data), split
     return UnderPrior(name, channel.prior, channel, evidence, n_parameters, *judged)
 
 

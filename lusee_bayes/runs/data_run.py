@@ -111,8 +111,8 @@ def reduced_lines(reduced: Reduced) -> list[str]:
     lines = [reduced.description()[0], *reduced.notes()]
     for band, frequency in enumerate(reduced.frequencies_mhz):
         noise = reduced.scatter[band]
-        told = "" if np.isnan(noise) else f"; scatter {noise:.2f} times the radiometer's"
-        lines.append(f"{frequency:g} MHz: {reduced.flag_line(band)}{told}")
+        scatter = "" if np.isnan(noise) else f"; scatter {noise:.2f} times the radiometer's"
+        lines.append(f"{frequency:g} MHz: {reduced.flag_line(band)}{scatter}")
         lines += [f"  {text}" for text in reduced.doubts(band)]
     return lines
 
@@ -216,9 +216,9 @@ def run_simulate_flight(
         As :func:`.simulate_flight`, and if the folder has sessions already, or cannot be written.
     """
     scenario, folder, stages = load_scenario(scenario), user_path(folder), stages or Stages()
-    if not replace and (there := sorted(folder.glob("session_*"))):
+    if not replace and (earlier := sorted(folder.glob("session_*"))):
         raise InputError(
-            f"'{folder}' already contains sessions ({there[0].name}); give -o another folder, or "
+            f"'{folder}' already contains sessions ({earlier[0].name}); give -o another folder, or "
             "--force"
         )
     with run_folder(folder, FLIGHT, scenario, replace=replace) as run:

@@ -59,8 +59,8 @@ def run_paper(
         def path_of(name: str) -> Path:
             """Where a case is, if it has been computed, or else will be."""
             earlier, kept = home / UNFINISHED / f"{name}.nc", home / CASES / f"{name}.nc"
-            there = not is_case(earlier, scenarios[name]) and is_case(kept, scenarios[name])
-            return kept if there else earlier
+            is_kept = not is_case(earlier, scenarios[name]) and is_case(kept, scenarios[name])
+            return kept if is_kept else earlier
 
         def compute(name: str) -> None:
             if is_case(path := path_of(name), scenarios[name]):

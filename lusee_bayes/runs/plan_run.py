@@ -94,15 +94,15 @@ def expected_inference(setup: Setup) -> Inference:
     return Inference(model.condition(np.zeros(model.n_data)), held, 1, Around())
 
 
-def expected_offsets(found: Inference) -> dict[str, float]:
+def expected_offsets(inference: Inference) -> dict[str, float]:
     """Expected standard deviations of clock and pointing, in the units that their names end with.
 
     To first order about the scenario's sky and no offsets; empty where the model has none.
     """
-    if found.offsets is None:
+    if inference.offsets is None:
         return {}
-    amplitudes = template_amplitudes(found.solution, found.offsets.columns)
-    return found.offsets.systematic.in_units(amplitudes.std)
+    amplitudes = template_amplitudes(inference.solution, inference.offsets.columns)
+    return inference.offsets.systematic.in_units(amplitudes.std)
 
 
 def turned(family: str) -> bool:
@@ -110,11 +110,11 @@ def turned(family: str) -> bool:
     return family in (AS_GIVEN, "turned, same time", "turned, more time") or "runs" in family
 
 
-def unnoticed(setup: Setup, found: Inference) -> str:
+def unnoticed(setup: Setup, inference: Inference) -> str:
     """Errors that the residual chi^2 would not show, those first that move the map most."""
-    spots = blind_spots(setup, found, np.asarray(setup.sky.modes))
-    told = sorted((s for s in spots if s.shown > NOTHING), key=lambda s: -s.unnoticed[1])
-    return ", ".join(f"{s.name} {s.unnoticed[0]:.2g}{s.unit} ({s.unnoticed[1]:.2g})" for s in told)
+    spots = blind_spots(setup, inference, np.asarray(setup.sky.modes))
+    shown = sorted((s for s in spots if s.shown > NOTHING), key=lambda s: -s.unnoticed[1])
+    return ", ".join(f"{s.name} {s.unnoticed[0]:.2g}{s.unit} ({s.unnoticed[1]:.2g})" for s in shown)
 
 
 def forecast(variation: Variation) -> Forecast:
@@ -129,8 +129,8 @@ def forecast(variation: Variation) -> Forecast:
         setup = set_up(variation.scenario)
         if variation.lost:
             setup = without_ports(setup, variation.lost)
-        found = expected_inference(setup)
-        posterior = found.posterior
+        inference = expected_inference(setup)
+        posterior = inference.posterior
         return Forecast(
             variation=variation,
             days=float(setup.observation.live_s.sum()) / 86400.0,
@@ -139,8 +139,8 @@ def forecast(variation: Variation) -> Forecast:
             modes=informed_modes(posterior),
             snr_squared=expected_snr_squared(posterior),
             resolution_deg=effective_resolution_deg(prior_fraction_per_ell(posterior)),
-            offsets=expected_offsets(found),
-            unnoticed=unnoticed(setup, found) if turned(variation.family) else "",
+            offsets=expected_offsets(inference),
+            unnoticed=unnoticed(setup, inference) if turned(variation.family) else "",
         )
 
 
@@ -165,22 +165,22 @@ def variations_of(
     InputError
         If a scenario is given twice, and as :func:`given_variations`.
     """
-    found: list[Variation] = []
+    variations: list[Variation] = []
     for number, source in enumerate(sources):
         if source in sources[:number]:
             raise InputError(f"the scenario '{source}' is listed twice; list each once")
         if vary:
-            found += given_variations(source, vary, overrides)
+            variations += given_variations(source, vary, overrides)
             continue
         first, *others = default_variations(source, load_scenario(source, overrides))
-        found.append(first)
+        variations.append(first)
         for one in others:
             try:
                 one.scenario.observation.observation()
-                found.append(one)
+                variations.append(one)
             except InputError as why:  # samples that cannot be taken: a run without any night, ...
                 stages.say(f"  left out: {source}, {one.family}, {one.name}: {why}")
-    return found
+    return variations
 
 
 def given_variations(source: str, vary: Sequence[str], overrides: Sequence[str]) -> list[Variation]:
@@ -188,7 +188,7 @@ def given_variations(source: str, vary: Sequence[str], overrides: Sequence[str])
 
     InputError if one of them is not of that form, or its values are not the scenario's.
     """
-    found = [Variation(source, AS_GIVEN, AS_GIVEN, load_scenario(source, overrides))]
+    variations = [Variation(source, AS_GIVEN, AS_GIVEN, load_scenario(source, overrides))]
     for text in vary:
         key, _, listed = text.partition("=")
         values = parse_yaml(f"[{listed}]", f"--vary {text}")
@@ -200,8 +200,8 @@ def given_variations(source: str, vary: Sequence[str], overrides: Sequence[str])
         for value in values:
             change = f"{key}={json.dumps(value, default=str)}"
             scenario = load_scenario(source, [*overrides, change])
-            found.append(Variation(source, key, f"{value}", scenario))
-    return found
+            variations.append(Variation(source, key, f"{value}", scenario))
+    return variations
 
 
 # one turn of the table
@@ -218,7 +218,7 @@ def default_variations(source: str, scenario: Scenario) -> list[Variation]:
     A schedule keeps its dates and angles.
     """
     observation, radiometer = scenario.observation, scenario.noise.radiometer
-    found, runs = {(AS_GIVEN, AS_GIVEN): scenario}, observation.runs
+    scenarios, runs = {(AS_GIVEN, AS_GIVEN): scenario}, observation.runs
     families: dict[str, list[tuple[str, Runs]]] = {}
     if observation.schedule is None:
         total = sum(run.cycles for run in runs)
@@ -234,13 +234,13 @@ def default_variations(source: str, scenario: Scenario) -> list[Variation]:
         }
     for family, members in families.items():
         for name, varied in members:
-            found[family, name] = scenario.with_section("observation", runs=varied)
+            scenarios[family, name] = scenario.with_section("observation", runs=varied)
     for duty in DUTY_CYCLES:
         section = radiometer.model_copy(update={"duty_cycle": duty})
-        found["duty cycle", f"{duty:g}"] = scenario.with_section("noise", radiometer=section)
+        scenarios["duty cycle", f"{duty:g}"] = scenario.with_section("noise", radiometer=section)
     ports = range(scenario.beam.n_ports if scenario.beam.n_ports > 1 else 0)
     lost = [Variation(source, "antenna lost", f"port {k}", scenario, (k,)) for k in ports]
-    return [Variation(source, *named, varied) for named, varied in found.items()] + lost
+    return [Variation(source, *named, varied) for named, varied in scenarios.items()] + lost
 
 
 Runs = tuple[RunSection, ...]
@@ -260,8 +260,8 @@ def changed(
 
     def one(run: RunSection, number: int) -> RunSection:
         turned = run.turntable_deg + number * turn_deg
-        own = {"cycles": run.cycles * factor, "turntable_deg": turned}
-        return RunSection(**run.model_dump() | values | own)
+        scaled = {"cycles": run.cycles * factor, "turntable_deg": turned}
+        return RunSection(**run.model_dump() | values | scaled)
 
     return tuple(one(run, number) for number in range(times) for run in runs)
 
@@ -330,17 +330,17 @@ def forecasts_of(
     first, *others = different.values()
     start = time.perf_counter()
     with stages("first forecast"):
-        found = [kept_forecast(folder, first)]
+        made = [kept_forecast(folder, first)]
     if others:
         longest = len(others) * (time.perf_counter() - start)
         stages.say(f"  the other {len(others)} take about {duration(longest)}, or less")
         names = [f"{other.source}, {other.name}" for other in others]
         tasks = Tasks(partial(kept_forecast, folder), others, names)
-        found += engine.each(tasks, stages, "planning")
-    known = {_digest(one.variation): one for one in found}
+        made += engine.each(tasks, stages, "planning")
+    by_digest = {_digest(one.variation): one for one in made}
     return [
-        replace(known[_digest(there)], variation=here)
-        for here, there in zip(variations, anchored, strict=True)
+        replace(by_digest[_digest(whole)], variation=as_given)
+        for as_given, whole in zip(variations, anchored, strict=True)
     ]
 
 
@@ -380,8 +380,8 @@ def run_plan(
     for v in variations:
         with naming(f"{v.source}, {v.family}, {v.name}"):
             require_fits(posterior_cost(v.scenario), v.scenario)
-    told = {f"{v.source}, {v.family}, {v.name}": v.scenario for v in variations}
-    digests = {name: sha256(s.to_yaml().encode()).hexdigest()[:12] for name, s in told.items()}
+    scenarios = {f"{v.source}, {v.family}, {v.name}": v.scenario for v in variations}
+    digests = {name: sha256(s.to_yaml().encode()).hexdigest()[:12] for name, s in scenarios.items()}
     inputs = [path for v in variations for path in inputs_of(v.scenario)]
     with run_folder(folder, PLAN, None, None, *inputs, replace=replace, **digests) as run:
         engine.work_in(run.path)

@@ -166,9 +166,9 @@ def _in_unit(source: BeamSource, unit: Circuit | None, frequency_mhz: float, lma
     both = np.concatenate([np.asarray(modes), np.asarray(ground)[:, None]], axis=1)
     if unit is None:
         return both
-    own, other = (c.per_kelvin.diagonal().real for c in (source.circuit(frequency_mhz), unit))
+    ours, other = (c.per_kelvin.diagonal().real for c in (source.circuit(frequency_mhz), unit))
     first, second, _ = map(list, zip(*all_products(source.n_ports), strict=True))
-    return both * np.sqrt((own / other)[first] * (own / other)[second])[:, None]
+    return both * np.sqrt((ours / other)[first] * (ours / other)[second])[:, None]
 
 
 def weights_along(nodes: Nodes, value: float | Float[Array, ""]) -> Float[Array, " nodes"]:
