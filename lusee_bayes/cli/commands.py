@@ -483,21 +483,24 @@ def report_command(folder: Path, *, quiet: Quiet = False) -> None:
 def export_command(
     run: Path,
     *,
-    release: Path,
+    release: Path | None = None,
+    skyh5: Path | None = None,
     creator: Annotated[tuple[str, ...], Repeated] = (),
     doi: str = "",
     license: Licence = "CC-BY-4.0",
     quiet: Quiet = False,
 ) -> None:
-    """Bundle a finished run for publication, with checksums, DataCite metadata and a licence.
+    """Bundle a finished run for publication, or write its map for pyradiosky.
 
-    The folder has no subfolders, as archives expect. read_it.py in it reads the map without
-    lusee_bayes. The command lists what is still to be filled in.
+    --release writes a folder with checksums, DataCite metadata, a licence and read_it.py, which
+    reads the map without lusee_bayes; the command lists what is still to be filled in. --skyh5
+    writes the posterior mean as a SkyH5 file.
 
     **Examples**
 
     - ``lusee-bayes export output/fiducial --release fiducial_release``
     - ``lusee-bayes export output/fiducial --release out --creator "Galilei, Galileo"``
+    - ``lusee-bayes export output/fiducial --skyh5 sky.skyh5``
 
     Parameters
     ----------
@@ -505,6 +508,8 @@ def export_command(
         Results of map, sample or validate.
     release
         Folder to write; it must not exist.
+    skyh5
+        File to write, of a run of map.
     creator
         Creator of the data set: "Family, Given", or the name of a group; may be repeated.
     doi
@@ -514,12 +519,18 @@ def export_command(
     quiet
         Print only errors.
     """
-    from lusee_bayes.runs.export_run import BLANK, METADATA, run_export
+    from lusee_bayes.core.errors import InputError
+    from lusee_bayes.runs.export_run import BLANK, METADATA, run_export, write_skyh5
 
-    written = run_export(run, release, creators=creator, doi=doi, licence=license)
-    lines = [f"{len(written.files)} files in {release}"]
-    for blank in written.result:
-        lines.append(f"{blank}: replace {BLANK} in {release / METADATA}")
+    if (release is None) == (skyh5 is None):
+        raise InputError("export needs either --release FOLDER or --skyh5 FILE")
+    if release is None:
+        lines = [str(file) for file in write_skyh5(run, skyh5).files]
+    else:
+        written = run_export(run, release, creators=creator, doi=doi, licence=license)
+        lines = [f"{len(written.files)} files in {release}"]
+        for blank in written.result:
+            lines.append(f"{blank}: replace {BLANK} in {release / METADATA}")
     say(Console(quiet=quiet, soft_wrap=True), *lines)
 
 

@@ -12,12 +12,16 @@ from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
+import h5py
+import numpy as np
+
 from lusee_bayes.core import files
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.reading import parse_yaml, read_text
+from lusee_bayes.core.version import __version__
 from lusee_bayes.report.describe import describe_folder
 from lusee_bayes.report.rendering import render_text
-from lusee_bayes.results.finished_runs import NAME, Provenance
+from lusee_bayes.results.finished_runs import NAME, FinishedRun, Provenance
 from lusee_bayes.runs.folder import RunOutcome
 
 # of one frequency, and of several
@@ -86,6 +90,44 @@ def run_export(
         (stage / SUMS).write_text(sums, encoding="utf-8")
     blanks = [name for name, value in {"creators": creators, "doi": doi}.items() if not value]
     return RunOutcome(blanks, folder, [folder / name for name in (*summed, METADATA, SUMS)])
+
+
+def write_skyh5(run: str | Path, path: str | Path) -> RunOutcome[list[str]]:
+    """Write the posterior mean of a map run for pyradiosky.
+
+    Parameters
+    ----------
+    run : path
+        Folder of a finished run of ``map``, of one frequency or of several.
+    path : path
+        The SkyH5 file: HEALPix, RING, Galactic, Stokes I in K.
+
+    Raises
+    ------
+    InputError
+        If ``run`` is not the folder of a map run.
+    """
+    finished, path = FinishedRun.read(run), files.user_path(path)
+    stokes_i = np.stack([channel.maps()["mean"] for channel in finished.channels])
+    hertz = [1e6 * channel.frequency_mhz for channel in finished.channels]
+    text = {"component_type": "healpix", "spectral_type": "full", "hpx_order": "ring"}
+    text |= {"hpx_frame/frame": "galactic", "history": f"lusee_bayes {__version__}: {run}"}
+    content = {f"Header/{name}": np.bytes_(value) for name, value in text.items()} | {
+        "Header/Ncomponents": stokes_i.shape[1],
+        "Header/Nfreqs": len(stokes_i),
+        "Header/freq_array": hertz,
+        "Header/hpx_inds": np.arange(stokes_i.shape[1]),
+        "Header/nside": finished.channel.nside,
+        # I, Q, U, V
+        "Data/stokes": np.stack([stokes_i, *np.zeros((3, *stokes_i.shape))]),
+    }
+    units = {"Header/freq_array": "Hz", "Data/stokes": "K"}
+    with files.replacing(path) as partial, h5py.File(partial, "w") as file:
+        for name, value in content.items():
+            file[name] = value
+            if name in units:
+                file[name].attrs["unit"] = units[name]
+    return RunOutcome([], path.parent, [path])
 
 
 def _sha256(path: Path) -> str:

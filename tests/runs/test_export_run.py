@@ -5,6 +5,8 @@ import json
 import subprocess
 import sys
 
+import h5py
+import numpy as np
 import pytest
 from assertions import raising
 from commands import content, refused, run
@@ -42,3 +44,23 @@ def test_a_release_stands_alone(made, request, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(export_run, "render_text", raising(KeyboardInterrupt()))
     assert run("export", made.folder, "--release", tmp_path / "other") == 130
     assert list(tmp_path.iterdir()) == [out]
+
+
+@pytest.mark.parametrize("made", ["small_map", "small_cube"])
+def test_the_mean_is_a_sky_of_pyradiosky(made, request, tmp_path, capsys):
+    """SkyH5 as its memo has it: what is required, units, Stokes I alone."""
+    made, path = request.getfixturevalue(made), tmp_path / "sky.skyh5"
+    assert run("export", made.folder, "--skyh5", path) == 0
+    with h5py.File(path) as file:
+        header = {name: item[()] for name, item in file["Header"].items() if name != "hpx_frame"}
+        assert file["Header/hpx_frame/frame"][()] == b"galactic"
+        stokes = file["Data/stokes"]
+        assert (stokes.attrs["unit"], file["Header/freq_array"].attrs["unit"]) == ("K", "Hz")
+        for k, one in enumerate(made.result.channels):
+            y = pixel_matrix(one.nside, made.result.scenario.lmax)
+            np.testing.assert_allclose(stokes[0, k], y @ one.mean, rtol=1e-9)
+        assert stokes.shape[0] == 4 and not stokes[1:].any()
+    assert header["component_type"] == b"healpix" and header["hpx_order"] == b"ring"
+    np.testing.assert_allclose(header["freq_array"] / 1e6, made.result.frequencies_mhz)
+    assert header["Ncomponents"] == len(header["hpx_inds"]) == 12 * header["nside"] ** 2
+    assert "either --release" in refused(capsys, "export", made.folder)
