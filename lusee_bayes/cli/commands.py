@@ -7,6 +7,7 @@ The docstrings are the help text, in the subset that Markdown (terminal) and reS
 from __future__ import annotations
 
 import json
+import webbrowser
 from contextlib import nullcontext
 from itertools import takewhile
 from pathlib import Path
@@ -68,6 +69,7 @@ def map_command(
     diagnose: Flag = False,
     frequencies: Frequencies | None = None,
     joint: Flag = False,
+    open: Flag = False,
     options: DataOptions = DataOptions(),
     engine: EngineOptions = EngineOptions(),
 ) -> None:
@@ -109,6 +111,8 @@ def map_command(
         interrupted run, repeat the command.
     joint
         Fit one posterior to all channels, using the scenario's spectral prior.
+    open
+        Open the report in a browser.
     """
     from lusee_bayes.runs.cost import demand_of
     from lusee_bayes.runs.map_run import run_map
@@ -126,7 +130,14 @@ def map_command(
         given = {"truth": truth, "earlier": add, "thorough": diagnose}
         run = run_map(loaded, options.folder(scenario), engine=opened, **given, **options.running())
     lines = run.result.lines(verbose=options.verbose)
-    options.tell(*lines, f"look at {run.page}", files=run.files)
+    options.tell(*lines, look_at(run.page, open), files=run.files)
+
+
+def look_at(page: Path, open_it: bool) -> str:
+    """The line that names a page, which is also opened in a browser if that was asked for."""
+    if open_it:
+        webbrowser.open(page.resolve().as_uri())
+    return f"look at {page}"
 
 
 @app.command(name="simulate", group="Data")
@@ -460,7 +471,7 @@ def compare_priors_command(
 
 
 @app.command(name="report", group="Results")
-def report_command(folder: Path, *, quiet: Quiet = False) -> None:
+def report_command(folder: Path, *, open: Flag = False, quiet: Quiet = False) -> None:
     """Rebuild report.html from the results in a run folder.
 
     **Examples**
@@ -471,12 +482,14 @@ def report_command(folder: Path, *, quiet: Quiet = False) -> None:
     ----------
     folder
         Results of map, sample, validate or compare-priors.
+    open
+        Open it in a browser.
     quiet
         Print only errors.
     """
     from lusee_bayes.report.pages import write_report
 
-    say(Console(quiet=quiet, soft_wrap=True), f"look at {write_report(folder)}")
+    say(Console(quiet=quiet, soft_wrap=True), look_at(write_report(folder), open))
 
 
 @app.command(name="export", group="Results")

@@ -124,14 +124,17 @@ def test_a_page_of_many_channels_has_a_part_for_each(small_cube):
 
 @pytest.mark.parametrize("which", [MAP, CUBE, SAMPLED])
 @pytest.mark.parametrize("manifest", [True, False], ids=["manifest", "an older folder without"])
-def test_report_makes_a_page_anew(which, manifest, request, tmp_path, capsys):
+def test_report_makes_a_page_anew(which, manifest, request, tmp_path, capsys, monkeypatch):
     # the title is the folder's name
     folder = request.getfixturevalue(which).folder
     mine = shutil.copytree(folder, tmp_path / folder.name)
     (mine / "report.html").unlink()
     if not manifest:
         (mine / "manifest.json").unlink()
-    assert run("report", mine) == 0
+    seen = []
+    monkeypatch.setattr("webbrowser.open", seen.append)
+    assert run("report", mine, "--open") == 0
+    assert seen == [(mine / "report.html").as_uri()]
     assert capsys.readouterr().out.split() == ["look", "at", f"{mine}/report.html"]
     assert (mine / "report.html").read_text() == (folder / "report.html").read_text()
     assert not list(mine.glob(".*"))
