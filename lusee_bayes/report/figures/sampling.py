@@ -113,7 +113,7 @@ def uncertainty(run: SampleResult) -> Figure | dict[str, Figure]:
     # draws that are all the same have no width, and no asymmetry
     skewness = np.divide(excess, width, out=np.zeros_like(width), where=width > 0)
     limit = np.percentile(np.abs(skewness), 99.0)
-    percent, chance = "% of the mean sky", "fraction of its width (noise only if Gaussian)"
+    percent, chance = "% of the mean sky", "fraction of the width"
     skewed = "asymmetry of the 90 % interval about the mean"
     signed, kelvin = Normalize(-limit, limit), drawing.temperatures(maps["mean"])
     panels = [
