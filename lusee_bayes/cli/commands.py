@@ -130,7 +130,7 @@ def map_command(
         given = {"truth": truth, "earlier": add, "thorough": diagnose}
         run = run_map(loaded, options.folder(scenario), engine=opened, **given, **options.running())
     lines = run.result.lines(verbose=options.verbose)
-    options.tell(*lines, look_at(run.page, open), files=run.files)
+    options.print(*lines, look_at(run.page, open), files=run.files)
 
 
 def look_at(page: Path, open_it: bool) -> str:
@@ -173,11 +173,11 @@ def simulate_command(
     loaded = options.load(scenario, frequencies_mhz=frequencies)
     if flight:
         files = run_simulate_flight(loaded, options.output or Path("flight"), **options.running())
-        options.tell(*files.lines())
+        options.print(*files.lines())
         return
     path = options.output or Path("data.nc")
     data = run_simulate(loaded, path, **options.running())
-    options.tell(
+    options.print(
         f"{sum(d.layout.size for d in data)} visibilities of {data[0].layout.n_products} products "
         f"at {', '.join(f'{d.frequency_mhz:g}' for d in data)} MHz -> {path}",
     )
@@ -223,7 +223,7 @@ def reduce_command(
     path = options.output or Path("reduced.nc")
     reduced = run_reduce(loaded, files, path, **options.running())
     bands = counted(len(reduced.frequencies_mhz), "band")
-    options.tell(*reduced_lines(reduced), f"{bands} -> {path}")
+    options.print(*reduced_lines(reduced), f"{bands} -> {path}")
 
 
 @app.command(name="average", group="Data")
@@ -262,7 +262,7 @@ def average_command(
     path = options.output or Path("averaged.nc")
     loaded, information = options.load(scenario), not no_information
     run = run_average(loaded, data, to, path, information=information, **options.running())
-    options.tell(*run.lines(), f"{run.averaged.layout.size} visibilities -> {path}")
+    options.print(*run.lines(), f"{run.averaged.layout.size} visibilities -> {path}")
 
 
 @app.command(name="sample", group="Maps")
@@ -311,8 +311,8 @@ def sample_command(
     several, lines = bool(loaded.frequencies_mhz), []
     for result in run.result:
         lines += [f"{result.experiment.scenario.frequency_mhz:g} MHz"] * several + result.lines()
-    there = f"the {run.page.name} of every channel in {run.folder}" if several else run.page
-    options.tell(*lines, f"look at {there}", files=run.files)
+    page = f"the {run.page.name} of every channel in {run.folder}" if several else run.page
+    options.print(*lines, f"look at {page}", files=run.files)
 
 
 @app.command(name="validate", group="Maps")
@@ -353,7 +353,7 @@ def validate_command(
         given |= chains.running(loaded.seed) | options.running()
         run = run_validate(loaded, options.folder(scenario, "-validation"), **given)
     verdict = f"{run.result.headline()}; look at {run.page}"
-    options.tell(verdict, files=run.files, table=checks_table(run.result.checks))
+    options.print(verdict, files=run.files, table=checks_table(run.result.checks))
     return 0 if run.result.passed else 1
 
 
@@ -396,9 +396,9 @@ def plan_command(
         run = run_plan(variations, options.output or Path("output/plan"), engine=opened, **given)
     by_source = [[f for f in run.result if f.variation.source == source] for source in sources]
     for forecasts in by_source:
-        options.tell(table=forecast_table(forecasts))
+        options.print(table=forecast_table(forecasts))
     lines = [line for forecasts in by_source for line in forecast_lines(forecasts)]
-    options.tell(*lines, f"look at {run.folder}/figures/plan.png", files=run.files)
+    options.print(*lines, f"look at {run.folder}/figures/plan.png", files=run.files)
 
 
 @app.command(name="compare", group="Results")
@@ -423,7 +423,7 @@ def compare_command(*folders: Path, options: Options = Options()) -> None:
 
     run = run_compare(folders, options.output or Path("output/comparison"), **options.running())
     lines = filter(None, [evidence_caveat(run.result), f"look at {run.folder}/comparison.html"])
-    options.tell(*lines, files=run.files, table=comparison_table(run.result))
+    options.print(*lines, files=run.files, table=comparison_table(run.result))
 
 
 @app.command(name="compare-priors", group="Maps")
@@ -467,7 +467,7 @@ def compare_priors_command(
         given = {"truth": truth, "name": Path(scenario).stem, "engine": opened}
         run = run_compare_priors(loaded, folder, names, **given, **options.running())
     lines = [*run.result.lines(), f"look at {run.page}"]
-    options.tell(*lines, files=run.files, table=table_of_numbers(*run.result.table()))
+    options.print(*lines, files=run.files, table=table_of_numbers(*run.result.table()))
 
 
 @app.command(name="report", group="Results")
@@ -571,13 +571,13 @@ def info_command(files: Annotated[list[Path], Parameter(required=True)], /) -> i
     refused = 0
     for number, file in enumerate(files):
         try:
-            told = describe(file)
+            text = describe(file)
         except InputError as error:
             say(errors, f"lusee-bayes: {error}")
             refused += 1
         else:
             # one block per file
-            say(console, f"\n{told}" if number else told)
+            say(console, f"\n{text}" if number else text)
     return 2 if refused else 0
 
 
@@ -686,4 +686,4 @@ def paper_command(
         run = run_paper(folder, skies=sky, engine=opened, **options.running())
     verdict = (run.folder / "claims.md").read_text(encoding="utf-8").splitlines()[0]
     files = [path for path in run.files if path.suffix != ".nc"]
-    options.tell(verdict, f"look at {run.folder}/claims.md", files=files)
+    options.print(verdict, f"look at {run.folder}/claims.md", files=files)

@@ -61,7 +61,7 @@ def main(arguments: list[str] | None = None) -> int:
     gc.set_threshold(100_000, 20, 100)
     given = sys.argv[1:] if arguments is None else arguments
     # the shell does not expand ~ within an option, as in --data=~/a.nc
-    expanded = [HOME.sub(lambda own: (own[1] or "") + expanduser(own[2]), one) for one in given]
+    expanded = [HOME.sub(lambda m: (m[1] or "") + expanduser(m[2]), one) for one in given]
     for stream in (sys.stdout, sys.stderr):
         # file names and reports may contain bytes or letters that the terminal's encoding lacks
         if isinstance(stream, io.TextIOWrapper):
@@ -90,8 +90,8 @@ def _outcome(arguments: list[str], came: list[int]) -> tuple[int, str]:
     except OSError as error:
         if error.errno is None:
             raise
-        at = f" ('{error.filename}')" if error.filename else ""
-        return 1, f"{error.strerror}{at}; {UNCHANGED}"
+        file = f" ('{error.filename}')" if error.filename else ""
+        return 1, f"{error.strerror}{file}; {UNCHANGED}"
     except WorkersLost as error:
         return 1, str(error)
     except (MemoryError, RuntimeError) as error:

@@ -40,8 +40,8 @@ def whole(least: int, text: str) -> int:
 
 def parse_duration(text: str) -> float:
     """Seconds from ``30s``, ``10min``, ``2h`` or ``1d``. InputError otherwise."""
-    found = DURATION.fullmatch(text)
-    seconds = float(found[1]) * SECONDS[found[2]] if found else 0.0
+    match = DURATION.fullmatch(text)
+    seconds = float(match[1]) * SECONDS[match[2]] if match else 0.0
     if not 0.0 < seconds < inf:
         raise InputError(
             f"'{text[:40]}' is not a duration; give a positive number with its unit (s, min, h or "
@@ -55,24 +55,24 @@ def parse_frequencies(text: str) -> list[float]:
 
     InputError if it is neither.
     """
-    found, count = [], 0
+    mhz, count = [], 0
     with suppress(ValueError, ZeroDivisionError, OverflowError):
         if ":" not in text:
-            found = [float(part) for part in text.split(",")]
+            mhz = [float(part) for part in text.split(",")]
         else:
             first, last, step = (float(part) for part in text.split(":"))
             count = round((last - first) / step)
             if step > 0 and isclose(first + count * step, last, rel_tol=1e-5, abs_tol=1e-8):
-                found = [first + k * step for k in range(min(count, MOST_CHANNELS) + 1)]
+                mhz = [first + k * step for k in range(min(count, MOST_CHANNELS) + 1)]
     if count >= MOST_CHANNELS:
         raise InputError(
             f"{text} gives {count + 1} channels; one run allows at most {MOST_CHANNELS}"
         )
-    if not found or any(b <= a for a, b in pairwise(found)):
+    if not mhz or any(b <= a for a, b in pairwise(mhz)):
         raise InputError(
             f"expected increasing MHz, as 10,25,30 or 5:50:5 (first:last:step), got {text[:40]}"
         )
-    return found
+    return mhz
 
 
 def _read_by(read: Callable[[str], Any]) -> Parameter:
@@ -118,7 +118,7 @@ class Options:
         stages = Stages(Console(quiet=self.quiet, soft_wrap=True), verbose=self.verbose)
         return {"replace": self.force, "stages": stages}
 
-    def tell(self, *lines: object, files: Sequence[Path] = (), table: Table | None = None) -> None:
+    def print(self, *lines: object, files: Sequence[Path] = (), table: Table | None = None) -> None:
         """Print the files with --verbose, the table and the lines."""
         console = Console(quiet=self.quiet, soft_wrap=True)
         say(console, *(f"  {path}" for path in files if self.verbose))

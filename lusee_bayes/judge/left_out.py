@@ -148,11 +148,11 @@ def groups_of(data: Visibilities) -> list[DataGroup]:
     day, first = observation.day, np.datetime64(str(observation.times[0].isot)[:19])
     angle = np.asarray(observation.turntable_deg)[observation.run]
     product = np.arange(len(present))[:, None]
-    found = [("product", label, product == k) for k, label in enumerate(data.labels)]
+    kinds = [("product", label, product == k) for k, label in enumerate(data.labels)]
     dates = {k: str(first + np.timedelta64(int(k), "D"))[:10] for k in np.unique(day)}
-    found += [("day", date, (day == k)[None]) for k, date in dates.items()]
-    found += [("turntable angle", f"{x:g}", (angle == x)[None]) for x in np.unique(angle)]
-    groups = [DataGroup(*one, np.broadcast_to(flags, present.shape)) for *one, flags in found]
+    kinds += [("day", date, (day == k)[None]) for k, date in dates.items()]
+    kinds += [("turntable angle", f"{x:g}", (angle == x)[None]) for x in np.unique(angle)]
+    groups = [DataGroup(*one, np.broadcast_to(flags, present.shape)) for *one, flags in kinds]
     return [group for group in groups if (group.data & present).any()]
 
 
@@ -332,9 +332,9 @@ class LeftOut:
         else:
             missing = np.unique(self._stretch_of[np.isnan(self._lost[:, 0])])
             in_threads(self._stretch, missing.tolist())
-        own = diagonal_of(self._weights)
-        own = np.where(own > self._lost, own - self._lost, np.nan)
-        return self._layout.scatter(self._cells.gather(own.T))
+        precision = diagonal_of(self._weights)
+        precision = np.where(precision > self._lost, precision - self._lost, np.nan)
+        return self._layout.scatter(self._cells.gather(precision.T))
 
     # --- the model ----------------------------------------------------------------------------
 
@@ -376,15 +376,15 @@ class LeftOut:
     def _weighted_residuals(self) -> Cells:
         """u = D (d - E[d] - F z), with z = Q^-1 F^T D (d - E[d])."""
         model, z = self._model, np.zeros(len(self._lower))
-        rest = np.asarray(self._data.data) - (0.0 if model.offset is None else model.offset)
-        rest = rest - model.coupling @ model.prior.colour(model.prior.white_mean)
-        n, weighted = self._n_templates, weigh(self._weights, self._by_cell(rest[:, None]))
+        centred = np.asarray(self._data.data) - (0.0 if model.offset is None else model.offset)
+        centred = centred - model.coupling @ model.prior.colour(model.prior.white_mean)
+        n, weighted = self._n_templates, weigh(self._weights, self._by_cell(centred[:, None]))
         for _ in range(1 + REFINEMENTS):
             step = (self._pull(weighted)[:, 0] - z)[:, None]
             half = linalg.solve_lower(self._lower, step, transpose=False)
             z = z + linalg.solve_lower(self._lower, half, transpose=True)[:, 0]
             seen = self._templates @ z[:n] + model.coupling @ model.prior.colour(z[n:])
-            weighted = weigh(self._weights, self._by_cell((rest - seen)[:, None]))
+            weighted = weigh(self._weights, self._by_cell((centred - seen)[:, None]))
         return weighted[..., 0]
 
     def _by_cell(self, columns: Shaped[np.ndarray, "data *rest"]) -> np.ndarray:
@@ -443,8 +443,8 @@ class LeftOut:
         within = np.einsum("krm,lsm->krls", half, half, optimize=True)
         for part in pieces(np.arange(len(times)), CHUNK):
             u = factors[part]
-            found = np.einsum("tr,krls,ts->tkl", u, within, u, optimize=True)
-            self._lost[times[part]] = ((weights[part] @ found) * weights[part]).sum(-1)
+            covariance = np.einsum("tr,krls,ts->tkl", u, within, u, optimize=True)
+            self._lost[times[part]] = ((weights[part] @ covariance) * weights[part]).sum(-1)
         return stretch
 
     def _stretch_at(self, times: Int[np.ndarray, " n"], span: Span) -> Stretch:

@@ -84,27 +84,27 @@ class _Skies:
 def describe_posterior(path: Path) -> list[str]:
     """A posterior at one frequency or at several."""
     with opened_tree(path, formats.POSTERIOR, "a posterior of lusee-bayes map") as tree:
-        found = from_tree(_Skies, tree, str(path))
+        skies = from_tree(_Skies, tree, str(path))
         held = [name for name in HOLDS if name in tree.variables or name in tree.children]
         joint = "component_mean" in tree.variables
-    if not found.mean.size:
+    if not skies.mean.size:
         raise InputError(f"{path} contains no sky; rerun that map")
-    frequencies, (n, n_modes) = found.frequency, found.mean.shape
-    at = f"{frequencies[0]:g} MHz"
+    frequencies, (n, n_modes) = skies.frequency, skies.mean.shape
+    where = f"{frequencies[0]:g} MHz"
     if n > 1:
         kind = "one joint posterior" if joint else "independent posteriors"
-        at = f"{n} frequencies from {frequencies[0]:g} to {frequencies[-1]:g} MHz, {kind}"
-    ends = np.stack([found.mean[[0, -1], 0], found.std[[0, -1], 0]], axis=1) / MONOPOLE
+        where = f"{n} frequencies from {frequencies[0]:g} to {frequencies[-1]:g} MHz, {kind}"
+    ends = np.stack([skies.mean[[0, -1], 0], skies.std[[0, -1], 0]], axis=1) / MONOPOLE
     temperatures = [f"{mean:.6g} K +- {std:.3g} K" for mean, std in ends]
-    known = (found.std < 0.5 * found.prior_std).sum(axis=1)
+    count = (skies.std < 0.5 * skies.prior_std).sum(axis=1)
     return [
-        f"posterior over {n_modes} modes (lmax {found.lmax}) at {at}, {found.frame}",
+        f"posterior over {n_modes} modes (lmax {skies.lmax}) at {where}, {skies.frame}",
         f"mean temperature {' to '.join(dict.fromkeys(temperatures))}",
-        f"{' to '.join(dict.fromkeys((str(known.min()), str(known.max()))))} modes constrained to "
+        f"{' to '.join(dict.fromkeys((str(count.min()), str(count.max()))))} modes constrained to "
         "better than half their prior width",
-        *found.unmapped.splitlines(),
+        *skies.unmapped.splitlines(),
         f"also contains: {', '.join(held) or 'nothing else'}",
-        f"versions: {json.dumps(found.versions)}",
+        f"versions: {json.dumps(skies.versions)}",
     ]
 
 
@@ -143,15 +143,15 @@ def describe_folder(folder: Path) -> list[str]:
             "folder of a finished run"
         )
     lines = [f"results of lusee-bayes {manifest['kind']}"]
-    found = resolve_name("lusee_bayes.results.finished_runs:Provenance").read(folder)
-    if found is not None:
+    facts = resolve_name("lusee_bayes.results.finished_runs:Provenance").read(folder)
+    if facts is not None:
         lines += [
-            f"data: {found.data_line()}",
-            f"{found.first} to {found.last} UTC, {found.n_times} times, site {found.lon_deg:g}, "
-            f"{found.lat_deg:g} degrees",
-            f"up to ell = {found.lmax}; made {found.made} UTC by lusee_bayes {found.version}",
+            f"data: {facts.data_line()}",
+            f"{facts.first} to {facts.last} UTC, {facts.n_times} times, site {facts.lon_deg:g}, "
+            f"{facts.lat_deg:g} degrees",
+            f"up to ell = {facts.lmax}; made {facts.made} UTC by lusee_bayes {facts.version}",
         ]
-        lines += [f"command: {found.command}"] if found.command else []
+        lines += [f"command: {facts.command}"] if facts.command else []
     for name in FIGURES:
         if (folder / name).is_file():
             figures = read_json(folder / name, Layout("the figures of a run"))
@@ -166,9 +166,9 @@ def _cards(path: Path) -> list[str]:
         if not headers:
             return []
         (header, *_) = headers
-        at = f" at {header['FREQ']:g} MHz" if "FREQ" in header else ""
+        where = f" at {header['FREQ']:g} MHz" if "FREQ" in header else ""
         return [
-            f"{header['CONTENT']} of the posterior{at} up to ell = {header['LMAX']}, beam "
+            f"{header['CONTENT']} of the posterior{where} up to ell = {header['LMAX']}, beam "
             f"{header['BEAM']}, site {header['SITELON']:g}, {header['SITELAT']:g} degrees",
             f"{header['CREATOR']}, scenario {header['SCENHASH'][:12]}",
         ]

@@ -64,11 +64,11 @@ def priors_page(folder: Path, name: str) -> str:
     """The page as text, of the folder and the name of a run. InputError as :func:`.map_page`."""
     require_files(folder, ("priors.json", "scenario.yaml", "figures/priors.png"), "compare-priors")
     path = folder / "priors.json"
-    found = read_model(path, PriorsSummary, "a comparison of priors")
-    header, rows = prior_table(found.priors)
-    words = [(one.name, one.prior) for one in found.priors]
-    shown = {"header": header, "rows": rows, "words": words, "notes": found.notes}
-    return render_run("priors.html", path, found.model_dump(), name=name, **shown)
+    comparison = read_model(path, PriorsSummary, "a comparison of priors")
+    header, rows = prior_table(comparison.priors)
+    words = [(one.name, one.prior) for one in comparison.priors]
+    shown = {"header": header, "rows": rows, "words": words, "notes": comparison.notes}
+    return render_run("priors.html", path, comparison.model_dump(), name=name, **shown)
 
 
 REPORT = "report.html"

@@ -76,13 +76,13 @@ def resolution(details: Details) -> dict[str, Any]:
     """The resolution matrix of a channel in units of the prior, for point_spread.js."""
     lmax = min(LARGEST_ELL, lmax_of(len(details.prior_width)))
     n = n_modes(lmax)
-    known = details.resolution[:n, :n].astype(np.int8)
-    symmetric = bool((known == known.T).all())
+    entries = details.resolution[:n, :n].astype(np.int8)
+    symmetric = bool((entries == entries.T).all())
     return {
         "lmax": lmax,
         "nside": KERNEL_NSIDE,
         "symmetric": symmetric,
-        "entries": _base64(known[np.triu_indices(n)] if symmetric else known),
+        "entries": _base64(entries[np.triu_indices(n)] if symmetric else entries),
         "steps": packed(details.resolution_step[: lmax + 1, : lmax + 1]),
         "prior_std": packed(details.prior_width[:n]),
     }

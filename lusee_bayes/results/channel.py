@@ -334,12 +334,12 @@ class ChannelResult(ChannelData, Described):
     def errors_by_latitude(self) -> tuple[SkyErrors, ...]:
         """Errors of the map by latitude, of a channel with its truth."""
         truth, mean = (modes_to_map(m, self.nside) for m in (self.truth, self.mean))
-        found = []
+        errors = []
         for name, inside in latitudes(self.nside).items():
             rms = float(np.sqrt(((mean - truth)[inside] ** 2).mean()))
             relative = float(self.pixel_std[inside].mean() / truth[inside].mean())
-            found.append(SkyErrors(name, rms, relative))
-        return tuple(found)
+            errors.append(SkyErrors(name, rms, relative))
+        return tuple(errors)
 
     def snr_at_some_ell(self) -> dict[int, float]:
         """SNR_ell at 5, 10, 20 and 30, as far as the map goes, of a channel with its truth."""

@@ -72,17 +72,17 @@ def conditioned(
         For data that the earlier ones hold already, and as :func:`infer`.
     """
     with rounds_of(experiment, stages or Stages(), "posterior") as report:
-        own, data = infer(experiment, report), experiment.data
-        made = Conditioned(experiment, own, own, own, (data.digest(),))
+        new, data = infer(experiment, report), experiment.data
+        made = Conditioned(experiment, new, new, new, (data.digest(),))
         if earlier is not None:
             information = earlier.with_more(made.information, data.digest())
-            prior = own.model.prior
+            prior = new.model.prior
             posterior = information.posterior(prior)
             information = information.recentred(posterior.mean)
             before = _given_earlier(earlier.information.posterior(prior))
-            found = replace(own, solution=Solution(own.model, data.data, posterior, information))
-            judged = replace(own, solution=own.solution.under(before))
-            made = Conditioned(experiment, own, found, judged, (*earlier.digests, data.digest()))
+            total = replace(new, solution=Solution(new.model, data.data, posterior, information))
+            judged = replace(new, solution=new.solution.under(before))
+            made = Conditioned(experiment, new, total, judged, (*earlier.digests, data.digest()))
         return made
 
 
@@ -171,8 +171,8 @@ class Conditioned:
     @cached_property
     def drawn(self) -> Float[np.ndarray, "n modes"]:
         """All draws that are needed, in K; parameters of the prior are drawn once for all."""
-        known = self.experiment.data.truth is not None
-        n = max(self.experiment.scenario.output.draws, FEW) + known * N_DRAWS
+        with_truth = self.experiment.data.truth is not None
+        n = max(self.experiment.scenario.output.draws, FEW) + with_truth * N_DRAWS
         return posterior_draws(self.experiment, self.posterior, lambda: self.information, n)
 
     @property
@@ -191,14 +191,14 @@ class Conditioned:
         chi2 = np.array([float(one @ one) for one in white])
         return -0.5 * (chi2 + float(factor.log_det()) + model.n_data * np.log(2.0 * np.pi))
 
-    def of_all(self, known: ChannelData) -> ChannelData:
+    def of_all(self, data: ChannelData) -> ChannelData:
         """The same with number and chi^2 of all data: a joint posterior is given their sum."""
         if not self.onto:
-            return known
+            return data
         posterior, n_data = self.posterior, int(self.information.n_data)
         chi2 = float(self.information.chi2(posterior.mean) + posterior.prior_chi2())
         instrument = Split.of(posterior, chi2, n_data).instrument
-        return replace(known, n_data=n_data, instrument=instrument)
+        return replace(data, n_data=n_data, instrument=instrument)
 
     def compared(self) -> Float[np.ndarray, "more modes"] | None:
         """Draws less the mean for :class:`.Counts`, in K; None where no truth is known."""
@@ -219,15 +219,15 @@ class Conditioned:
             "covariance_kept": self.experiment.scenario.output.covariance,
         }
 
-    def result(self, known: ChannelData, stages: Stages | None = None) -> ChannelResult:
+    def result(self, data: ChannelData, stages: Stages | None = None) -> ChannelResult:
         """The channel's result under this posterior."""
         with (stages or Stages())("standard deviations"):
             report = None
             if self.unknowns is not None:
-                own = self.own.solution
-                report = self.unknowns.report(own.posterior.mean, own.covariance)
+                solution = self.own.solution
+                report = self.unknowns.report(solution.posterior.mean, solution.covariance)
                 report = report and replace(report, onto=self.onto)
-            given = (known, self.posterior.mean, self.covariance, self.draws, self.log_likelihood())
+            given = (data, self.posterior.mean, self.covariance, self.draws, self.log_likelihood())
             more = {"unknowns": report, "pixels": self.pixel_std, **self.figures()}
             more["instrument"] = self.unknowns
             return channel_result(*given, self.compared(), **more)
@@ -246,16 +246,16 @@ class Conditioned:
         thorough : bool
             Judge groups of data and try the usual mistakes even if the data fit.
         """
-        experiment, own, stages = self.experiment, self.own, stages or Stages()
+        experiment, inference, stages = self.experiment, self.own, stages or Stages()
         scenario, data, learned = experiment.scenario, experiment.data, experiment.learned
         fluxes, pointing, diagnosis, left, judged = None, None, None, None, None
         judge = self.judged.solution
         if experiment.setup.responses and scenario.sources.treatment != "ignored":
             with stages("fluxes"):
-                fluxes = flux_table(experiment, own)
+                fluxes = flux_table(experiment, inference)
         with stages("diagnostics"):
             if not (alone or thorough):
-                given = judge.posterior, judge.chi2, own.model.n_data, judge.matrix
+                given = judge.posterior, judge.chi2, inference.model.n_data, judge.matrix
                 instrument = Split.of(*given, self.expected).instrument
             if alone or thorough or instrument.p < DOUBTFUL:
                 left = residuals(judge, data)
@@ -264,14 +264,14 @@ class Conditioned:
         bad = judged is not None and judged.level == "does not fit"
         if bad or (thorough and left is not None):
             with stages("usual mistakes"):
-                diagnosis = diagnose(experiment, own, left)
+                diagnosis = diagnose(experiment, inference, left)
         if scenario.noise.pointing is not None or bad:
             with stages("clock and pointing"):
-                pointing = pointing_report(experiment, own)
-        doubtful = list(doubts(experiment, own))
+                pointing = pointing_report(experiment, inference)
+        doubtful = list(doubts(experiment, inference))
         if alone:
             with stages("first order"):
-                doubtful += reach(experiment, own)
+                doubtful += reach(experiment, inference)
         fitting = experiment.fitting
         return ChannelData(
             frequency_mhz=scenario.frequency_mhz,
@@ -280,12 +280,12 @@ class Conditioned:
             hours=np.asarray(data.observation.hours),
             turntable_deg=np.asarray(data.observation.turntable_deg)[data.observation.run],
             data=np.asarray(data.grid()),
-            n_data=own.model.n_data,
+            n_data=inference.model.n_data,
             n_missing=data.n_missing,
-            rounds=own.rounds,
+            rounds=inference.rounds,
             flagged=None if fitting is None or not fitting.flagged.any() else fitting.flagged,
             flagged_share=0.0 if fitting is None else fitting.share,
-            prior_std=np.sqrt(np.asarray(own.model.prior.variance())),
+            prior_std=np.sqrt(np.asarray(inference.model.prior.variance())),
             truth=None if data.truth is None else np.asarray(data.truth),
             highest_altitude=measures.highest_altitude(data.observation, scenario.map_nside),
             instrument=instrument,
@@ -303,7 +303,7 @@ class Conditioned:
             information=self.information if scenario.output.information else None,
         )
 
-    def _judged(self, found: Residuals) -> Judged:
+    def _judged(self, misfit: Residuals) -> Judged:
         """The residuals, with the verdict in words."""
         data = self.experiment.data
         prior = self.found.model.prior
@@ -311,7 +311,7 @@ class Conditioned:
         left, before = self.without_monopole
         moved = self.posterior.mean - prior.colour(prior.white_mean)
         strong = measures.strengths(moved, expected, before - left)
-        fit = found.fit(measures.strengths_in_words(strong))
+        fit = misfit.fit(measures.strengths_in_words(strong))
 
         def on_grid(values: np.ndarray) -> np.ndarray:
             return np.where(data.layout.present, data.layout.scatter(values), np.nan)
@@ -319,17 +319,17 @@ class Conditioned:
         return Judged(
             level=fit.level,
             verdict=fit.text,
-            prior=found.split.prior,
-            extremes=tuple(map(str, found.extremes())),
-            suspects=tuple(map(str, found.suspects())),
-            predicted=on_grid(found.predicted),
-            z=on_grid(found.z),
-            groups=found.groups,
+            prior=misfit.split.prior,
+            extremes=tuple(map(str, misfit.extremes())),
+            suspects=tuple(map(str, misfit.suspects())),
+            predicted=on_grid(misfit.predicted),
+            z=on_grid(misfit.z),
+            groups=misfit.groups,
         )
 
 
 def channel_result(
-    known: ChannelData,
+    data: ChannelData,
     mean: Modes,
     covariance: ModesMatrix,
     draws: Float[np.ndarray, "n modes"],
@@ -346,7 +346,7 @@ def channel_result(
 
     Parameters
     ----------
-    known : ChannelData
+    data : ChannelData
         Of its own data.
     mean, covariance : (modes,) and (modes, modes) array
         In K and K^2.
@@ -368,13 +368,13 @@ def channel_result(
     mean, covariance = np.asarray(mean), np.asarray(covariance)
     width, held, variance = pixels, (), np.diagonal(covariance)
     if width is None:
-        width = pixel_std(covariance, round(np.sqrt(known.highest_altitude.size / 12)))
-    if compared is not None and known.truth is not None:
-        held = Counts.of_pixels(width, known.truth - mean, np.asarray(compared)).coverage()
-    power = known.prior_std**2
+        width = pixel_std(covariance, round(np.sqrt(data.highest_altitude.size / 12)))
+    if compared is not None and data.truth is not None:
+        held = Counts.of_pixels(width, data.truth - mean, np.asarray(compared)).coverage()
+    power = data.prior_std**2
     share = np.divide(variance, power, out=np.zeros(len(variance)), where=power > 0)
     return ChannelResult(
-        **(vars(known) | {"doubts": (*known.doubts, *about_information(information_bits))}),
+        **(vars(data) | {"doubts": (*data.doubts, *about_information(information_bits))}),
         **figures,
         mean=mean,
         std=np.sqrt(variance),
@@ -394,7 +394,7 @@ def _details(channel: Conditioned) -> Details:
     setup, covariance = channel.experiment.setup, channel.covariance
     lmax, nside = setup.scenario.lmax, setup.scenario.map_nside
     prior = channel.found.model.prior
-    known, steps, widths = packed_resolution(covariance, prior)
+    resolution, steps, widths = packed_resolution(covariance, prior)
     left, before = channel.without_monopole
     rows = region_rows(nside, lmax)
     seen = rows @ covariance
@@ -415,7 +415,7 @@ def _details(channel: Conditioned) -> Details:
         region_mean=rows @ channel.posterior.mean,
         region_std=np.sqrt(of_regions),
         region_prior_fraction=(of_regions - rows[:, 0] * with_monopole) / region_prior,
-        resolution=known,
+        resolution=resolution,
         resolution_step=steps,
         prior_width=widths,
         patterns=np.stack([np.abs(pattern) for _, pattern in drawn]),

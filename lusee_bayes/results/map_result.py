@@ -37,8 +37,8 @@ from lusee_bayes.sky.spectral_prior import SpectralPrior
 
 def prior_sentence(experiment: Experiment) -> str:
     """The prior's model, where its C_ell comes from and, if it was learned, its parameters."""
-    section, found = experiment.scenario.prior, experiment.learned
-    rows = [] if found is None else found.as_rows()
+    section, prior = experiment.scenario.prior, experiment.learned
+    rows = [] if prior is None else prior.as_rows()
     learned = ", ".join(f"{r['name']}: {r['value']:.2f} +- {r['std']:.2f}" for r in rows)
     return f"Prior {section.model}, C_ell {section.origin}{'; ' if rows else ''}{learned}."
 
@@ -80,13 +80,13 @@ class ChannelUnknowns:
         untold = Counter(name for one in reports for name in one.table["unknown"][~one.told])
         counts = [f"{name} (at {k} of {n} frequencies)" for name, k in untold.items()]
         what = f"do not constrain {', '.join(counts)}" if counts else "constrain all of them"
-        found = [f"Receivers, ground and gain table: the data {what}."]
+        lines = [f"Receivers, ground and gain table: the data {what}."]
         for words, octaves in self.shared.items():
             like = "the same" if np.isinf(octaves) else f"smooth over {octaves:g} octaves"
             given = "every channel uses the constraints from all others"
-            found.append(f"Unknowns of {words} are {like} at all frequencies: {given}.")
+            lines.append(f"Unknowns of {words} are {like} at all frequencies: {given}.")
         sentence = self._null_sentence()
-        return [*found, sentence] if sentence else found
+        return [*lines, sentence] if sentence else lines
 
     def _null_sentence(self) -> str:
         """Of the channel whose data leave most open; empty where all tell most of it."""
@@ -105,10 +105,10 @@ class ChannelUnknowns:
 
 def below(tables: dict[float, pd.DataFrame | None]) -> pd.DataFrame | None:
     """Tables of channels, one below the other, with ``frequency_mhz`` first; None without any."""
-    known = {f: table.copy() for f, table in tables.items() if table is not None}
-    for frequency, table in known.items():
+    present = {f: table.copy() for f, table in tables.items() if table is not None}
+    for frequency, table in present.items():
         table.insert(0, "frequency_mhz", frequency)
-    return pd.concat(known.values(), ignore_index=True) if known else None
+    return pd.concat(present.values(), ignore_index=True) if present else None
 
 
 @dataclass(frozen=True)
@@ -236,22 +236,22 @@ class MapResult(Described):
         chi2, degrees = (np.array([getattr(p, n) for p in parts]) for n in ("chi2", "degrees"))
         n_data = float(self.stacked("n_data").sum())
         total = float(self.stacked("chi2_model").sum()) if self.joint is None else self.joint.chi2
-        rest = ChiSquare(total - float(chi2.sum()), n_data - float(degrees.sum()))
+        prior = ChiSquare(total - float(chi2.sum()), n_data - float(degrees.sum()))
         joint = self.joint is not None
-        return ChannelFits(self.frequencies_mhz, chi2, degrees, rest, joint, self.shared_tests)
+        return ChannelFits(self.frequencies_mhz, chi2, degrees, prior, joint, self.shared_tests)
 
     @cached_property
     def fit(self) -> Fit:
         """Whether the data of all channels fit."""
         if self.single:
             return self.channel.judged.fit
-        found = self.fits().fit()
+        fit = self.fits().fit()
         blamed = [
             f"{c.frequency_mhz:g} MHz: {c.judged.fit.details}"
             for c in self.channels
             if c.judged is not None and c.judged.level == "does not fit"
         ]
-        return Fit(found.level, " ".join([found.details, *blamed[:NAMED]]))
+        return Fit(fit.level, " ".join([fit.details, *blamed[:NAMED]]))
 
     @cached_property
     def unknowns(self) -> ChannelUnknowns | None:
@@ -261,10 +261,10 @@ class MapResult(Described):
 
     def table(self, name: str, part: str = "") -> pd.DataFrame | None:
         """A table of all channels, or a part of what they have by that name."""
-        found = {c.frequency_mhz: getattr(c, name) for c in self.channels}
+        columns = {c.frequency_mhz: getattr(c, name) for c in self.channels}
         if part:
-            found = {f: held and getattr(held, part) for f, held in found.items()}
-        return below(found)
+            columns = {f: held and getattr(held, part) for f, held in columns.items()}
+        return below(columns)
 
     def verdict(self) -> str:
         """What the residuals say, in sentences."""
@@ -298,17 +298,17 @@ class MapResult(Described):
         return [*details, *remarks, self.fit.headline, self.headline()]
 
     def _details(self) -> list[str]:
-        told = [self.fit.details]
+        lines = [self.fit.details]
         for channel in self.channels:
-            at = "" if self.single else f"{channel.frequency_mhz:g} MHz: "
+            label = "" if self.single else f"{channel.frequency_mhz:g} MHz: "
             causes = [] if channel.diagnosis is None else channel.diagnosis.sentences()
             fluxes = [] if channel.fluxes is None else flux_lines(channel.fluxes)
             offsets = [] if channel.pointing is None else channel.pointing.lines()
             prior = [channel.prior] if self.single else []
-            told += [f"{at}{line}" for line in (*causes, *prior, *fluxes, *offsets)]
-        told += [] if self.joint is None else [joint_prior_sentence(self.scenario)]
-        told += [] if self.unknowns is None else self.unknowns.lines()
-        return [*told, f"{RULE}."]
+            lines += [f"{label}{line}" for line in (*causes, *prior, *fluxes, *offsets)]
+        lines += [] if self.joint is None else [joint_prior_sentence(self.scenario)]
+        lines += [] if self.unknowns is None else self.unknowns.lines()
+        return [*lines, f"{RULE}."]
 
     def _flags(self) -> list[str]:
         """How much of flight data was flagged, and what is doubtful about them."""
@@ -348,27 +348,27 @@ class MapResult(Described):
         """Brightness, its standard deviation and, if known, the truth of some directions."""
         nside = self.scenario.map_nside
         mean, pixel_std, truth = (self.stacked(n) for n in ("mean", "pixel_std", "truth"))
-        found = {}
+        values = {}
         for name, (lon, lat) in LANDMARKS.items():
             pixel = healpy.ang2pix(nside, lon, lat, lonlat=True)
             theta, phi = healpy.pix2ang(nside, pixel)
             y = synthesis_matrix(np.array([theta]), np.array([phi]), self.scenario.lmax)[0]
-            found[name] = {"mean": mean @ y, "std": pixel_std[:, pixel]}
+            values[name] = {"mean": mean @ y, "std": pixel_std[:, pixel]}
             if truth is not None:
-                found[name]["truth"] = truth @ y
-        return found
+                values[name]["truth"] = truth @ y
+        return values
 
     def pulls(self) -> list[PullSummary]:
         """How far the means of some directions are from the truth, in standard deviations."""
-        found = []
+        pulls = []
         for name, values in self.landmarks().items():
             if "truth" not in values:
                 return []
             pull = (values["mean"] - values["truth"]) / values["std"]
             worst = int(np.argmax(np.abs(pull)))
             where = {"direction": name, "worst_mhz": self.frequencies_mhz[worst]}
-            found.append(PullSummary(**where, rms=np.sqrt((pull**2).mean()), worst=pull[worst]))
-        return found
+            pulls.append(PullSummary(**where, rms=np.sqrt((pull**2).mean()), worst=pull[worst]))
+        return pulls
 
     def summary(self) -> MapSummary:
         """Figures of summary.json."""

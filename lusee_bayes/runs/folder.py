@@ -57,14 +57,14 @@ def origin_of(
     InputError
         If there is no file of data.
     """
-    found: dict[str, str] = {}
+    origin: dict[str, str] = {}
     if scenario is not None:
         tree = scenario.model_dump(mode="json", exclude={"output"})
-        found |= {name: json.dumps(value) for name, value in _entries(tree)}
+        origin |= {name: json.dumps(value) for name, value in _entries(tree)}
     if data is not None:
         names = ", ".join(f"'{Path(name).name}'" for name in names_of_data(data))
-        found["data"] = f"{names} ({digest_of(data)[:12]})"
-    return found | {name: str(value) for name, value in others.items() if value is not None}
+        origin["data"] = f"{names} ({digest_of(data)[:12]})"
+    return origin | {name: str(value) for name, value in others.items() if value is not None}
 
 
 def inputs_of(
@@ -104,11 +104,11 @@ def require_own(folder: Path, kinds: Sequence[str], origin: Origin) -> None:
     manifest = files.read_manifest(folder)
     if manifest is None:
         return
-    there, advice = manifest["origin"], "give another folder with -o, or --force to replace them"
+    before, advice = manifest["origin"], "give another folder with -o, or --force to replace them"
     if manifest["kind"] not in kinds:
         raise InputError(f"'{folder}' contains results of lusee-bayes {manifest['kind']}; {advice}")
-    for name in [*origin, *there]:
-        old, new = there.get(name), origin.get(name)
+    for name in [*origin, *before]:
+        old, new = before.get(name), origin.get(name)
         if old != new:
             old, new = (f"{value or 'not given':.60}" for value in (old, new))
             raise InputError(

@@ -82,9 +82,9 @@ def run_map(
         given = _given(data, reduced, scenario, run.path)
         more = {"truth": truth, "earlier": earlier, "thorough": thorough, "engine": engine}
         made = map_channels(scenario, run.path, data=given, stages=stages, **more)
-        known, times = made.stacked("truth") is not None, made.channel.taken
+        known_sky, times = made.stacked("truth") is not None, made.channel.taken
         made = replace_fields(made, reduced=reduced and _as_used(reduced, made))
-        provenance = finished_runs.Provenance.of(scenario, times, data, known_sky=known)
+        provenance = finished_runs.Provenance.of(scenario, times, data, known_sky=known_sky)
         return run.write(made, stages, provenance)
 
 

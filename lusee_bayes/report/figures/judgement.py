@@ -67,9 +67,9 @@ def groups_by_frequency(result: MapResult) -> Figure | None:
     judged = [channel for channel in result.channels if channel.judged is not None]
     if result.single or not judged:
         return None
-    found = [{str(group): group.p for group in channel.judged.groups} for channel in judged]
-    names = list(dict.fromkeys(name for one in found for name in one))
-    p = np.array([[one.get(name, np.nan) for one in found] for name in names])
+    p_values = [{str(group): group.p for group in channel.judged.groups} for channel in judged]
+    names = list(dict.fromkeys(name for one in p_values for name in one))
+    p = np.array([[one.get(name, np.nan) for one in p_values] for name in names])
     figure, axes = drawing.framed((max(5.0, 2.5 + 0.3 * len(judged)), 1.0 + 0.2 * len(names)))
     scale = Normalize(np.log10(LEAST_P), 0.0)
     image = axes.imshow(np.log10(np.maximum(p, LEAST_P)), cmap="magma", norm=scale, aspect="auto")
@@ -202,8 +202,8 @@ def corner(result: MapResult) -> Figure | None:
                 axes.plot(*pair, color=drawing.GREY, alpha=0.5, lw=1.2 / k)
                 axes.plot(k * across, k * up, color=drawing.BLUE, lw=1.2 / k)
             axes.plot(true[j], true[i], "x", color=drawing.ORANGE, ms=6)
-    at = "" if result.single else f" (channel of {channel.frequency_mhz:g} MHz)"
-    figure.suptitle(f"Unknowns of the instrument{at}", fontsize=10)
+    suffix = "" if result.single else f" (channel of {channel.frequency_mhz:g} MHz)"
+    figure.suptitle(f"Unknowns of the instrument{suffix}", fontsize=10)
     figure.supxlabel("posterior standard deviations from the mean", fontsize=9)
     return figure
 
@@ -284,8 +284,8 @@ def calibration(reduced: Reduced) -> Figure:
     _scatter(right, reduced)
     right.axhline(1.0, color=drawing.GREY, lw=0.8)
     right.set(ylabel="scatter / radiometer noise", title="Measured / expected noise")
-    found = np.concatenate([reduced.line_scatter, reduced.scatter, [1.0]])
-    right.set_ylim(0.0, 1.3 * float(np.nanmax(found)))
+    ratios = np.concatenate([reduced.line_scatter, reduced.scatter, [1.0]])
+    right.set_ylim(0.0, 1.3 * float(np.nanmax(ratios)))
     return figure
 
 
@@ -302,14 +302,14 @@ def _gains(left: Axes, reduced: Reduced) -> None:
             left.fill_between(mhz, low, gain + std, color=colour, alpha=0.25, lw=0)
             if alone:
                 f = reduced.frequencies_mhz
-                at, error = (np.interp(f, mhz, y) for y in (gain, std))
-                left.errorbar(f, at, error, fmt="o", ms=4, capsize=3, color=colour)
+                value, error = (np.interp(f, mhz, y) for y in (gain, std))
+                left.errorbar(f, value, error, fmt="o", ms=4, capsize=3, color=colour)
     for f in reduced.frequencies_mhz:
         left.axvline(f, color=drawing.GREY, lw=0.5, zorder=0)
-    known = bool((curves.std > 0).any())
-    largest = float(np.nanmax(curves.std / curves.gain)) if known else 0.0
-    told = f"{100 * largest:.2g} % or better" if known else "unknown"
-    left.set(xlabel="frequency [MHz]", ylabel="counts for 1 nV²/Hz", title=f"Gain errors: {told}")
+    with_errors = bool((curves.std > 0).any())
+    largest = float(np.nanmax(curves.std / curves.gain)) if with_errors else 0.0
+    words = f"{100 * largest:.2g} % or better" if with_errors else "unknown"
+    left.set(xlabel="frequency [MHz]", ylabel="counts for 1 nV²/Hz", title=f"Gain errors: {words}")
     left.legend(frameon=False, ncols=2, fontsize=8)
 
 
@@ -320,12 +320,12 @@ def _scatter(right: Axes, reduced: Reduced) -> None:
     )
     alone = len(reduced.frequencies_mhz) == 1
     for place, (values, colour, mark, name) in enumerate(kinds):
-        known = np.isfinite(values).any()
-        if known and alone:
+        measured = np.isfinite(values).any()
+        if measured and alone:
             right.plot([place], values, mark, ms=8, color=colour)
-            at = (place, values[0])
-            right.annotate(f"{values[0]:.3f}", at, (12, 8), textcoords="offset points")
-        elif known:
+            point = (place, values[0])
+            right.annotate(f"{values[0]:.3f}", point, (12, 8), textcoords="offset points")
+        elif measured:
             style = {"color": colour, "label": name.replace("\n", " "), "fillstyle": "none"}
             right.plot(reduced.frequencies_mhz, values, mark, **style)
         elif alone:

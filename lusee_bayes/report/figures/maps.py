@@ -64,11 +64,11 @@ def draws(result: MapResult) -> Panels | None:
     if channel.details is None:
         return None
     norm, nside = scales(channel)["temperature"], max(NSIDE, channel.nside)
-    found = {
+    panels = {
         f"draw {k}": (modes_to_map(sky, nside), norm)
         for k, sky in enumerate(channel.details.draws, 1)
     }
-    return _figures(found, channel)
+    return _figures(panels, channel)
 
 
 def sky_maps(result: MapResult) -> Panels:
@@ -133,17 +133,17 @@ def scales(channel: ChannelResult) -> dict[str, Normalize]:
     """The colours of a channel's maps, on paper and on screen, by what they show."""
     nside, altitude = max(NSIDE, channel.nside), channel.highest_altitude
     sky = mean = drawing.shown(channel.mean, nside)
-    found = {}
+    norms = {}
     if channel.truth is not None:
         sky = drawing.shown(channel.truth, nside)
         span = 100.0 * np.percentile(np.abs(mean - sky), 99.0) / mean.mean()
-        found["residual"] = Normalize(-span, span)
-    found["temperature"] = drawing.temperatures(sky)
-    found["std"] = LogNorm(*drawing.seen_range(channel.pixel_std, altitude))
+        norms["residual"] = Normalize(-span, span)
+    norms["temperature"] = drawing.temperatures(sky)
+    norms["std"] = LogNorm(*drawing.seen_range(channel.pixel_std, altitude))
     if channel.details is not None:
         share = np.percentile(channel.details.prior_fraction, [0.5, 99.5])
-        found["prior_fraction"] = Normalize(*share)
-    return found
+        norms["prior_fraction"] = Normalize(*share)
+    return norms
 
 
 def channel_panels(channel: ChannelResult) -> dict[str, tuple]:
@@ -249,9 +249,9 @@ def _few_of(n: int, most: int) -> np.ndarray:
 
 def instrument_share(result: MapResult) -> Panels | None:
     """Share of each pixel's variance that comes from unknowns of the instrument."""
-    known = [channel for channel in result.channels if channel.theta is not None]
+    with_theta = [channel for channel in result.channels if channel.theta is not None]
     figures = {}
-    for channel in [known[k] for k in _few_of(len(known), SHOWN)] if known else []:
+    for channel in [with_theta[k] for k in _few_of(len(with_theta), SHOWN)] if with_theta else []:
         share, title = 100.0 * channel.theta.pixel_share, f"{channel.frequency_mhz:g} MHz"
         scale = Normalize(0.0, max(float(np.percentile(share, 99.5)), 1e-3))
         options = {"altitude": channel.highest_altitude, "unit": "% of the variance"}
@@ -301,10 +301,10 @@ def fidelity(cube: MapResult) -> Figure | Panels:
     if len(cube.channels) == 1:
         return map_fidelity(cube.channel)
     snr, alone = cube.snr(), cube.snr(independent=True)
-    known = snr is not None
-    values = snr if known else cube.stacked("prior_fraction")
-    label = r"$\mathrm{SNR}_\ell$" if known else "fraction of the variance from the prior"
-    norm = LogNorm(0.3, 30.0) if known else Normalize(0.0, 1.0)
+    with_truth = snr is not None
+    values = snr if with_truth else cube.stacked("prior_fraction")
+    label = r"$\mathrm{SNR}_\ell$" if with_truth else "fraction of the variance from the prior"
+    norm = LogNorm(0.3, 30.0) if with_truth else Normalize(0.0, 1.0)
     figure, (left, right) = drawing.framed((12, 4.4), 1, 2)
     ell, channel = np.arange(values.shape[1]), np.arange(values.shape[0])
     style = {"norm": norm, "cmap": drawing.SEQUENTIAL, "shading": "nearest"}
@@ -312,12 +312,12 @@ def fidelity(cube: MapResult) -> Figure | Panels:
     ticks = _few_of(len(channel), 8)
     left.set_yticks(ticks, [f"{cube.frequencies_mhz[k]:g}" for k in ticks])
     left.set(xlabel=r"multipole $\ell$", ylabel="frequency [MHz]", title=label)
-    figure.colorbar(image, ax=left, label=label, extend="both" if known else "neither")
+    figure.colorbar(image, ax=left, label=label, extend="both" if with_truth else "neither")
     right.plot(ell[1:], values[:, 1:].mean(0), color=BLUE, label="this run")
     if alone is not None:
         style = {"color": ORANGE, "ls": "--", "label": "each channel independently"}
         right.plot(ell[1:], alone[:, 1:].mean(0), **style)
-    if known:
+    if with_truth:
         right.set_yscale("log")
         right.axhline(1.0, color=GREY, lw=0.8, ls=":")
     right.set(xlabel=r"multipole $\ell$", ylabel=label, title="mean over channels")
@@ -345,13 +345,13 @@ def chi2(cube: MapResult) -> Figure | None:
 def curves_of_runs(runs: Sequence[FinishedRun]) -> Figure:
     """rho_ell and SNR_ell where the truth is known, and the prior's share, of every run."""
     spectra = [run.channel.spectra() for run in runs]
-    known = all("snr" in one for one in spectra)
-    figure, panels = drawing.framed((12 if known else 6, 4.2), 1, 3 if known else 1, squeeze=False)
+    snr = all("snr" in one for one in spectra)
+    figure, panels = drawing.framed((12 if snr else 6, 4.2), 1, 3 if snr else 1, squeeze=False)
     panels = list(panels.flat)
     for k, run in enumerate(runs):
         style = {"color": COLOURS[k % len(COLOURS)], "ls": LINES[k % len(LINES)], "lw": 1.3}
         _fidelity(panels, spectra[k], run.name, **style)
-    if known:
+    if snr:
         panels[1].axhline(1.0, color=GREY, lw=0.8)
     panels[-1].legend(frameon=False, fontsize=8)
     return figure

@@ -40,9 +40,9 @@ def forecasts(planned: Sequence[Forecast]) -> Figure:
         mine = [f for f in planned if f.variation.source == source]
         # beside one another, so that equal values do not hide
         lower = 0.2 * (number - (len(sources) - 1) / 2)
-        own = {row: y + lower for row, y in rows.items()}
+        places = {row: y + lower for row, y in rows.items()}
         for name, axis in zip(PANELS, axes, strict=True):
-            _marks(axis, name, mine, own, STYLES[number % len(STYLES)], len(sources) == 1)
+            _marks(axis, name, mine, places, STYLES[number % len(STYLES)], len(sources) == 1)
     for label, axis in zip(PANELS.values(), axes, strict=True):
         axis.set_xlabel(label)
         axis.xaxis.set_major_locator(MaxNLocator(6, integer=True))
@@ -74,9 +74,9 @@ def _row_positions(planned: Sequence[Forecast]) -> Rows:
 
 
 def _marks(
-    axes: Axes, name: str, mine: Sequence[Forecast], rows: Rows, style: tuple[str, str], told: bool
+    axes: Axes, name: str, mine: Sequence[Forecast], rows: Rows, style: tuple[str, str], texts: bool
 ) -> None:
-    """The marks of one scenario in one panel; ``told``: with their values beside them."""
+    """The marks of one scenario in one panel; ``texts``: with their values beside them."""
     colour, marker = style
     for forecast in mine:
         value = getattr(forecast, name)
@@ -86,7 +86,7 @@ def _marks(
         face = "white" if value is None else colour
         label = forecast.variation.source if forecast is mine[0] else None
         axes.plot(x, y, marker, color=colour, mfc=face, ms=6, label=label)
-        if told:
+        if texts:
             text = f"> {x - 1}" if value is None else f"{value:.0f}"
             box = {"fc": "white", "ec": "none", "pad": 0.8}
             style = {"textcoords": "offset points", "va": "center", "fontsize": 8, "bbox": box}
@@ -110,12 +110,12 @@ def _label_rows(axes: Axes, rows: Rows) -> None:
 def _title(planned: Sequence[Forecast], sources: Sequence[str]) -> str:
     """What was planned, with frequency and lmax where all have the same."""
     scenarios = [f.variation.scenario for f in planned]
-    found = ", ".join(sources) if len(sources) == 1 else f"{len(sources)} scenarios"
+    scope = ", ".join(sources) if len(sources) == 1 else f"{len(sources)} scenarios"
     if len({s.frequency_mhz for s in scenarios}) == 1:
-        found += f" at {scenarios[0].frequency_mhz:g} MHz"
+        scope += f" at {scenarios[0].frequency_mhz:g} MHz"
     if len({s.lmax for s in scenarios}) == 1:
-        found += rf", up to $\ell$ = {scenarios[0].lmax}"
-    return f"Information content: {found} (dashed: scenario as given)"
+        scope += rf", up to $\ell$ = {scenarios[0].lmax}"
+    return f"Information content: {scope} (dashed: scenario as given)"
 
 
 # of the interval whose coverage is drawn
@@ -128,10 +128,10 @@ MARKERS = {"product": "s", "day": "o"}
 
 def priors(result: PriorComparison) -> Figure:
     """Draw differences of ln evidence and of ln p, coverage by latitude, and spectra of errors."""
-    known = result.known_sky
-    figure, panels = framed((14 if known else 9.5, 4.4), 1, 3 if known else 2)
+    with_truth = result.known_sky
+    figure, panels = framed((14 if with_truth else 9.5, 4.4), 1, 3 if with_truth else 2)
     _evidence(panels[0], result)
-    if known:
+    if with_truth:
         _coverage(panels[1], result)
     _errors(panels[-1], result)
     figure.suptitle(f"{result.scenario.frequency_mhz:g} MHz: one data set under several priors")

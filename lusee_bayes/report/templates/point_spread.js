@@ -14,7 +14,7 @@ function pointSpread(page) {
     const y = sphere.harmonics(lmax, z, phi);
     const white = new Float64Array(n);
     for (let i = 0; i < n; i += 1) white[i] = y[i] * width[i];
-    const known = new Float64Array(n);
+    const resolved = new Float64Array(n);
     let k = 0;
     for (let i = 0; i < n; i += 1) {
       const ofEll = (lmax + 1) * ellOf[i];
@@ -23,12 +23,12 @@ function pointSpread(page) {
         if (!packed[k]) continue;
         const value = packed[k] * steps[ofEll + ellOf[j]];
         if (page.symmetric) sum += value * white[j];
-        if (j > i || !page.symmetric) known[j] += value * white[i];
+        if (j > i || !page.symmetric) resolved[j] += value * white[i];
       }
-      known[i] += sum;
+      resolved[i] += sum;
     }
-    for (let i = 0; i < n; i += 1) known[i] = width[i] > 0 ? known[i] / width[i] : 0;
-    return known;
+    for (let i = 0; i < n; i += 1) resolved[i] = width[i] > 0 ? resolved[i] / width[i] : 0;
+    return resolved;
   }
   // the kernel of a direction as a map of nside: per steradian
   return { kernel: (z, phi) => sphere.synthesis(row(z, phi), nside) };

@@ -63,8 +63,8 @@ const skyView = (function () {
     return { z: Math.min(1, Math.max(-1, w[2])), longitude: Math.atan2(w[1], w[0]) };
   }
   function equatorial(rotation, z, longitude) {
-    const at = turned(rotation, z, longitude, false);
-    return { ra: (degrees(at.longitude) + 360) % 360, dec: degrees(Math.asin(at.z)) };
+    const icrs = turned(rotation, z, longitude, false);
+    return { ra: (degrees(icrs.longitude) + 360) % 360, dec: degrees(Math.asin(icrs.z)) };
   }
 
   function number(value, unit) {
@@ -79,12 +79,12 @@ const skyView = (function () {
 
   // ticks of a scale: 1, 2, 5 times powers of ten, evenly spaced unless logarithmic
   function ticks(low, high, log) {
-    const found = [];
+    const values = [];
     if (log) {
       for (let e = Math.floor(Math.log10(low)); e <= Math.ceil(Math.log10(high)); e += 1) {
-        for (const m of [1, 2, 5]) found.push(m * 10 ** e);
+        for (const m of [1, 2, 5]) values.push(m * 10 ** e);
       }
-      const inside = found.filter((x) => x >= low && x <= high);
+      const inside = values.filter((x) => x >= low && x <= high);
       if (inside.length < 3) return ticks(low, high, false).filter((x) => x >= low);
       return inside.length > 7 ? inside.filter((x) => /^1/.test(x.toExponential())) : inside;
     }
@@ -92,9 +92,9 @@ const skyView = (function () {
     const power = 10 ** Math.floor(Math.log10(raw));
     const step = power * [1, 2, 5, 10].find((m) => m * power >= raw);
     for (let x = Math.ceil(low / step) * step; x <= high + step * 1e-9; x += step) {
-      found.push(Math.abs(x) < step * 1e-9 ? 0 : x);
+      values.push(Math.abs(x) < step * 1e-9 ? 0 : x);
     }
-    return found;
+    return values;
   }
   function shareOf(scale, value) {
     if (!scale.log) return (value - scale.low) / (scale.high - scale.low);
@@ -127,7 +127,7 @@ const skyView = (function () {
 
   class View {
     constructor(canvas, rotation, sources) {
-      Object.assign(this, { canvas, rotation, sources, zoom: 1, u: 0, v: 0, found: new Map() });
+      Object.assign(this, { canvas, rotation, sources, zoom: 1, u: 0, v: 0, cache: new Map() });
       this.grid = "galactic";
       this.names = true;
     }
@@ -135,14 +135,14 @@ const skyView = (function () {
     whole(x, y) {
       return [this.u + x / this.zoom, this.v + y / this.zoom];
     }
-    at(x, y) {
+    directionAt(x, y) {
       return direction(...this.whole(x, y));
     }
     point(z, longitude) {
-      const at = place(z, longitude);
+      const position = place(z, longitude);
       return [
-        (at.u - this.u) * this.zoom * this.canvas.width,
-        (at.v - this.v) * this.zoom * this.canvas.height,
+        (position.u - this.u) * this.zoom * this.canvas.width,
+        (position.v - this.v) * this.zoom * this.canvas.height,
       ];
     }
     // zoom about a point of the canvas that stays where it is
@@ -155,34 +155,34 @@ const skyView = (function () {
       const most = 1 - 1 / this.zoom;
       this.u = Math.min(most, Math.max(0, u));
       this.v = Math.min(most, Math.max(0, v));
-      this.found.clear();
+      this.cache.clear();
       if (this.canvas.style) this.canvas.style.touchAction = this.zoom > 1 ? "none" : "auto";
     }
     indices(nside) {
-      if (this.found.has(nside)) return this.found.get(nside);
+      if (this.cache.has(nside)) return this.cache.get(nside);
       const { width, height } = this.canvas;
-      const found = new Int32Array(width * height).fill(-1);
+      const pixels = new Int32Array(width * height).fill(-1);
       for (let row = 0; row < height; row += 1) {
         for (let column = 0; column < width; column += 1) {
-          const at = this.at((column + 0.5) / width, (row + 0.5) / height);
-          if (at) found[row * width + column] = pixelOf(nside, at.z, at.longitude);
+          const hit = this.directionAt((column + 0.5) / width, (row + 0.5) / height);
+          if (hit) pixels[row * width + column] = pixelOf(nside, hit.z, hit.longitude);
         }
       }
-      this.found.set(nside, found);
-      return found;
+      this.cache.set(nside, pixels);
+      return pixels;
     }
     // scale: low, high, log; hatched: pixel -> whether it is hatched
     paint(nside, values, scale, table, hatched) {
-      const found = this.indices(nside);
+      const pixels = this.indices(nside);
       const { width, height } = this.canvas;
       const context = this.canvas.getContext("2d");
       const image = context.createImageData(width, height);
-      for (let k = 0; k < found.length; k += 1) {
-        if (found[k] < 0) continue;
-        const share = shareOf(scale, values[found[k]]);
+      for (let k = 0; k < pixels.length; k += 1) {
+        if (pixels[k] < 0) continue;
+        const share = shareOf(scale, values[pixels[k]]);
         const c = 3 * Math.round(255 * Math.min(1, Math.max(0, share)));
         const line = ((k % width) + Math.floor(k / width)) % 14 < 2;
-        const lift = line && hatched && hatched(found[k]) ? 90 : 0;
+        const lift = line && hatched && hatched(pixels[k]) ? 90 : 0;
         for (let i = 0; i < 3; i += 1) image.data[4 * k + i] = Math.abs(table[c + i] - lift);
         image.data[4 * k + 3] = 255;
       }
@@ -221,8 +221,8 @@ const skyView = (function () {
       const context = this.canvas.getContext("2d");
       const to = (lon, lat) => {
         const z = Math.sin(radians(lat));
-        const at = { z, longitude: radians(lon) };
-        return galactic ? at : turned(this.rotation, z, at.longitude, true);
+        const node = { z, longitude: radians(lon) };
+        return galactic ? node : turned(this.rotation, z, node.longitude, true);
       };
       const curve = (points) => this.curve(points.map((one) => to(...one)));
       context.strokeStyle = "rgb(200 200 200 / 45%)";
@@ -243,9 +243,9 @@ const skyView = (function () {
       const { width } = this.canvas.getBoundingClientRect();
       return Math.min(2, Math.max(1, this.canvas.width / (1.2 * width)));
     }
-    label(text, at, dx, dy, size = 15) {
+    label(text, anchor, dx, dy, size = 15) {
       const context = this.canvas.getContext("2d");
-      const [x, y] = this.point(at.z, at.longitude);
+      const [x, y] = this.point(anchor.z, anchor.longitude);
       const growth = this.growth();
       [dx, dy, size] = [dx * growth, dy * growth, size * growth];
       context.font = `${size}px system-ui, sans-serif`;
@@ -262,9 +262,9 @@ const skyView = (function () {
     marks() {
       if (!this.names) return;
       for (const source of this.sources) {
-        const at = { z: Math.sin(radians(source.b)), longitude: radians(source.l) };
-        this.ring(at.z, at.longitude, 5, "#ffffff");
-        this.label(source.name, at, 9, 5, 14);
+        const anchor = { z: Math.sin(radians(source.b)), longitude: radians(source.l) };
+        this.ring(anchor.z, anchor.longitude, 5, "#ffffff");
+        this.label(source.name, anchor, 9, 5, 14);
       }
     }
     ring(z, longitude, radius, colour) {
@@ -279,8 +279,8 @@ const skyView = (function () {
         context.stroke();
       }
     }
-    // tell(at): moved over; choose(at): clicked or tapped; draw(): to be drawn anew
-    listen({ tell, choose, draw }) {
+    // hover(hit): moved over; choose(hit): clicked or tapped; draw(): to be drawn anew
+    listen({ hover, choose, draw }) {
       const share = (event) => {
         const box = this.canvas.getBoundingClientRect();
         return [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
@@ -298,7 +298,7 @@ const skyView = (function () {
       });
       this.canvas.addEventListener("pointermove", (event) => {
         const [x, y] = share(event);
-        tell(this.at(x, y));
+        hover(this.directionAt(x, y));
         if (!grip || !event.buttons) return;
         if (Math.hypot(x - grip.x, y - grip.y) > 0.01) grip.moved = true;
         if (!grip.moved || this.zoom === 1) return;
@@ -306,15 +306,15 @@ const skyView = (function () {
         soon();
       });
       this.canvas.addEventListener("click", (event) => {
-        const at = this.at(...share(event));
-        if (at && !(grip && grip.moved)) choose(at);
+        const hit = this.directionAt(...share(event));
+        if (hit && !(grip && grip.moved)) choose(hit);
         grip = null;
       });
       this.canvas.addEventListener("dblclick", (event) => {
         this.scale(2, ...share(event));
         draw();
       });
-      this.canvas.addEventListener("pointerleave", () => tell(null));
+      this.canvas.addEventListener("pointerleave", () => hover(null));
       this.canvas.addEventListener("wheel", (event) => {
         if (!event.ctrlKey && !event.metaKey) return;
         event.preventDefault();
@@ -327,7 +327,7 @@ const skyView = (function () {
   function controls(view, element, centre, draw) {
     const zoom = (factor) => {
       const { u, v } = centre();
-      const seen = (at, start) => (at - start) * view.zoom;
+      const seen = (coordinate, start) => (coordinate - start) * view.zoom;
       const [x, y] = [seen(u, view.u), seen(v, view.v)];
       const inside = x > 0 && x < 1 && y > 0 && y < 1;
       view.scale(factor, ...(inside ? [x, y] : [0.5, 0.5]));

@@ -105,12 +105,12 @@
   const state = { z: 0, longitude: 0, channel: 0, values: null, peak: 0 };
   const chosen = () => layers.find((one) => one.key === choice.value);
 
-  const coordinates = (at) => {
-    const l = (degrees(at.longitude) + 360) % 360;
-    const there = skyView.equatorial(page.rotation, at.z, at.longitude);
+  const coordinates = (direction) => {
+    const l = (degrees(direction.longitude) + 360) % 360;
+    const icrs = skyView.equatorial(page.rotation, direction.z, direction.longitude);
     return {
-      galactic: `${l.toFixed(2)}°, ${degrees(Math.asin(at.z)).toFixed(2)}°`,
-      equatorial: `${there.ra.toFixed(2)}°, ${there.dec.toFixed(2)}°`,
+      galactic: `${l.toFixed(2)}°, ${degrees(Math.asin(direction.z)).toFixed(2)}°`,
+      equatorial: `${icrs.ra.toFixed(2)}°, ${icrs.dec.toFixed(2)}°`,
     };
   };
 
@@ -150,15 +150,15 @@
     below.paint(nside, kernel, { low: -most, high: most }, tables.diverging);
     below.ring(state.z, state.longitude, 6, "#4fc3f7");
   }
-  const here = (name, channel) => maps[name].at(channel, state.z, state.longitude);
+  const probe = (name, channel) => maps[name].at(channel, state.z, state.longitude);
   function drawSpectrum() {
     const canvas = element("spectrum");
     const context = canvas.getContext("2d");
     const points = frequencies.map((f, k) => ({
-      f, mean: here("mean", k), std: here("std", k), truth: maps.truth ? here("truth", k) : NaN,
+      f, mean: probe("mean", k), std: probe("std", k), truth: maps.truth ? probe("truth", k) : NaN,
     }));
-    const known = points.flatMap((p) => [p.mean - p.std, p.mean, p.mean + p.std, p.truth]);
-    const positive = known.filter((x) => x > 0);
+    const levels = points.flatMap((p) => [p.mean - p.std, p.mean, p.mean + p.std, p.truth]);
+    const positive = levels.filter((x) => x > 0);
     const [low, high] = [0.8 * Math.min(...positive), 1.25 * Math.max(...positive)];
     const [first, last] = [0.95 * frequencies[0], 1.05 * frequencies[frequencies.length - 1]];
     context.font = "15px system-ui, sans-serif";
@@ -203,29 +203,29 @@
   }
 
   function rows() {
-    const at = coordinates(state);
-    const of = (name) => here(name, state.channel);
+    const place = coordinates(state);
+    const of = (name) => probe(name, state.channel);
     const observed = altitude(state.z, state.longitude) >= 0;
-    const found = [
-      ["Galactic longitude, latitude", at.galactic],
-      ["right ascension, declination (ICRS)", at.equatorial],
+    const entries = [
+      ["Galactic longitude, latitude", place.galactic],
+      ["right ascension, declination (ICRS)", place.equatorial],
     ];
-    if (many) found.push(["frequency", `${frequencies[state.channel]} MHz`]);
-    found.push(["posterior mean", number(of("mean"), "K")]);
-    found.push(["standard deviation", number(of("std"), "K")]);
+    if (many) entries.push(["frequency", `${frequencies[state.channel]} MHz`]);
+    entries.push(["posterior mean", number(of("mean"), "K")]);
+    entries.push(["standard deviation", number(of("std"), "K")]);
     if (maps.truth) {
-      found.push(["truth", number(of("truth"), "K")]);
-      found.push(["mean - truth", `${number(of("pull"))} standard deviations`]);
+      entries.push(["truth", number(of("truth"), "K")]);
+      entries.push(["mean - truth", `${number(of("pull"))} standard deviations`]);
     }
     if (maps.prior_fraction) {
       const share = observed ? number(of("prior_fraction")) : "not observed";
-      found.push(["share from the prior (ℓ ≥ 1)", share]);
+      entries.push(["share from the prior (ℓ ≥ 1)", share]);
     }
-    found.push(["ever above the horizon", observed ? "yes" : "no"]);
+    entries.push(["ever above the horizon", observed ? "yes" : "no"]);
     if (regions) {
       const { nside } = page.regions;
       const region = 12 * nside ** 2 * state.channel + pixelOf(nside, state.z, state.longitude);
-      found.push(
+      entries.push(
         [`region of ${page.regions.size_deg.toFixed(1)}° around it: mean`,
           number(regions.mean[region], "K")],
         ["its standard deviation", number(regions.std[region], "K")],
@@ -233,8 +233,8 @@
           observed ? number(regions.prior_fraction[region]) : "not observed"]
       );
     }
-    if (below) found.push(["peak of the point-spread function", number(state.peak, "per sr")]);
-    return found;
+    if (below) entries.push(["peak of the point-spread function", number(state.peak, "per sr")]);
+    return entries;
   }
   function describe() {
     if (below) drawSpread();
@@ -247,8 +247,8 @@
       text.textContent = value;
       list.append(term, text);
     }
-    const at = coordinates(state).galactic;
-    map.canvas.setAttribute("aria-label", `${chosen().title}; chosen: l, b ${at}`);
+    const galactic = coordinates(state).galactic;
+    map.canvas.setAttribute("aria-label", `${chosen().title}; chosen: l, b ${galactic}`);
   }
   function choose(longitude, b) {
     state.longitude = longitude;
@@ -258,19 +258,19 @@
     inputs[0].value = ((degrees(longitude) % 360 + 360) % 360).toFixed(1);
     inputs[1].value = degrees(Math.asin(state.z)).toFixed(1);
   }
-  function tell(at) {
-    if (!at) {
+  function hover(hit) {
+    if (!hit) {
       element("hover").textContent = "\u00a0";
       return;
     }
     const one = chosen();
-    const there = coordinates(at);
-    const value = number(maps[one.key].at(state.channel, at.z, at.longitude), one.unit);
+    const place = coordinates(hit);
+    const value = number(maps[one.key].at(state.channel, hit.z, hit.longitude), one.unit);
     element("hover").textContent =
-      `${one.title}: ${value} at l, b ${there.galactic}; RA, Dec ${there.equatorial}`;
+      `${one.title}: ${value} at l, b ${place.galactic}; RA, Dec ${place.equatorial}`;
   }
 
-  map.listen({ tell, draw, choose: (at) => choose(at.longitude, Math.asin(at.z)) });
+  map.listen({ hover, draw, choose: (hit) => choose(hit.longitude, Math.asin(hit.z)) });
   map.canvas.addEventListener("keydown", (event) => {
     const step = Math.PI / 90;
     const moves = {
@@ -323,8 +323,8 @@
     choose: (l, b) => choose(radians(l), radians(b)),
     at: (l, b, channel = 0) => {
       const place = [Math.sin(radians(b)), radians(l)];
-      const known = ["mean", "std", "truth", "prior_fraction"].filter((name) => maps[name]);
-      const values = known.map((name) => [name, maps[name].at(channel, ...place)]);
+      const available = ["mean", "std", "truth", "prior_fraction"].filter((name) => maps[name]);
+      const values = available.map((name) => [name, maps[name].at(channel, ...place)]);
       return { ...skyView.equatorial(page.rotation, ...place), ...Object.fromEntries(values) };
     },
     map: (name, channel = 0) => Array.from(maps[name].of(channel)),
