@@ -110,7 +110,7 @@ def find_sky(text: str) -> tuple[str, SkySource]:
 
 def judged(name: str, made: Conditioned, n_draws: int) -> Mapped:
     """Compare a map with its truth and with draws of its posterior."""
-    channel = made.result(made.known())
+    channel = made.result(made.channel_data())
     error = channel.truth - channel.mean
     drawn = posterior_draws(made.experiment, made.posterior, lambda: made.information, n_draws)
     deviations = drawn - channel.mean

@@ -38,7 +38,7 @@ GREEN = "#009E73"  # of the same palette as BLUE and ORANGE
 def first_map() -> None:
     """Draw the maps of `lusee-bayes map`."""
     made = conditioned(lb.build(lb.load_scenario("first_map")))
-    channel_map(made.result(made.known())).savefig(HERE / "maps.png", dpi=110)
+    channel_map(made.result(made.channel_data())).savefig(HERE / "maps.png", dpi=110)
 
 
 def fixed_axis() -> None:
@@ -210,7 +210,7 @@ def point_sources() -> None:
         overrides = [f"sources.list=[{listed}]", f"sources.treatment={treatment}"]
         experiment = lb.build(lb.load_scenario("fiducial", overrides))
         made = conditioned(experiment)
-        channel = made.result(made.known())
+        channel = made.result(made.channel_data())
         mean, truth = channel.mean, channel.truth
         lines[treatment] = signal_to_noise(mean, truth)
         residuals[treatment] = shown(mean - truth, 64)

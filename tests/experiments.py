@@ -58,7 +58,7 @@ def mapped(
 ) -> tuple[Conditioned, ChannelResult]:
     """What a map run finds of one frequency, without its folder."""
     made = conditioned(experiment, earlier)
-    return made, made.result(made.known(thorough=thorough))
+    return made, made.result(made.channel_data(thorough=thorough))
 
 
 def channels_of(scenario: Scenario) -> list[lb.Visibilities]:

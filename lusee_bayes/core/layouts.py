@@ -155,14 +155,14 @@ class Content:
         Likewise.
     sizes : dict of str to int
         The lengths by name.
-    there : frozenset of str
+    names : frozenset of str
         All arrays of the file, declared or not.
     """
 
     arrays: dict[str, np.ndarray]
     values: dict[str, Any]
     sizes: dict[str, int]
-    there: frozenset[str]
+    names: frozenset[str]
 
 
 @dataclass(frozen=True)

@@ -286,11 +286,11 @@ TIMES = 32
 class MixedProducts:
     """Q of the module's equations, of some data.
 
-    here : UnderAnySky; posterior : under the wide prior; grid : (products, times) array, in K; q :
+    judge : UnderAnySky; posterior : under the wide prior; grid : (products, times) array, in K; q :
     (columns, columns) array, of every x_jk, ones in every product, the times reversed, and b
     """
 
-    here: UnderAnySky
+    judge: UnderAnySky
     posterior: Posterior
     grid: Grid
     q: Float[np.ndarray, "columns columns"]
@@ -309,14 +309,14 @@ class MixedProducts:
 
     def tried(self) -> Iterator[tuple[float, DataMistake]]:
         """Every mistake with its chi^2."""
-        n_ports, n = self.here.setup.beam_source.n_ports, len(self.grid)
+        n_ports, n = self.judge.setup.beam_source.n_ports, len(self.grid)
         first, second, _ = ports(n_ports)
         autos = first == second
         mistakes = [DataMistake(*one, weights(mixing)) for *one, mixing in data_mistakes(n_ports)]
         turned = weights(np.zeros((n, n)), reversed_times=True)
         mistakes.append(DataMistake("the times are reversed", "sort the data by time", turned))
         names = [f"product {product.label}" for product in all_products(n_ports)]
-        some = np.asarray(self.here.data.layout.present).any(1)
+        some = np.asarray(self.judge.data.layout.present).any(1)
         mistakes += [self._factor(names[k], np.eye(n)[k]) for k in np.flatnonzero(some)]
         mistakes.append(self._factor("every auto", autos * 1.0))
         mistakes += [self._gain(k, 1.0 * (first == k) + (second == k)) for k in range(n_ports)]
@@ -362,7 +362,7 @@ class MixedProducts:
 
     def _times(self) -> Iterator[tuple[float, DataMistake]]:
         """A factor of all products of one time."""
-        judge, layout, values = self.here, self.here.data.layout, np.asarray(self.here.data.data)
+        judge, layout, values = self.judge, self.judge.data.layout, np.asarray(self.judge.data.data)
         factor = judge.model.noise.factor()
         # K^-1 (d - b)
         off = values - np.asarray(judge.model.predict(self.posterior.mean))

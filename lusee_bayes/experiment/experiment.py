@@ -63,7 +63,7 @@ class Experiment(Described):
         How the setup's prior was learned; None for one that was given.
     fitting : Fitting or None
         Of flight data: the times that did not fit and are left out; None for other data.
-    found : Inference or None
+    inference : Inference or None
         Where the prior was learned: the data under it.
     """
 
@@ -72,7 +72,7 @@ class Experiment(Described):
     doubts: tuple[str, ...] = ()
     learned: Learned | None = None
     fitting: Fitting | None = None
-    found: Inference | None = None
+    inference: Inference | None = None
 
     def description(self) -> tuple[str, ...]:
         scenario = self.scenario
@@ -199,12 +199,12 @@ def _learned(
     setup, data = experiment.setup, experiment.data
     start = None if values is None else Around(data, values=values)
     if setup.family is None:
-        return (
-            experiment if start is None else replace(experiment, found=settled(setup, data, start))
-        )
+        if start is not None:
+            experiment = replace(experiment, inference=settled(setup, data, start))
+        return experiment
     with rounds_of(experiment, stages, "prior") as report:
         setup, inference = with_learned_prior(setup, data, earlier, start, report)
-    return replace(experiment, setup=setup, learned=inference.learned, found=inference)
+    return replace(experiment, setup=setup, learned=inference.learned, inference=inference)
 
 
 def with_truth(experiment: Experiment) -> Experiment:
@@ -245,7 +245,7 @@ def under_sky(setup: Setup, source: SkySource, seed: int) -> Experiment:
 
 def rounds_of(experiment: Experiment, stages: Stages, name: str) -> AbstractContextManager:
     """A stage, whose progress is that of the rounds where there are some to come."""
-    in_rounds = experiment.found is None and rebuilds(experiment.setup)
+    in_rounds = experiment.inference is None and rebuilds(experiment.setup)
     return stages.progress(name, MAX_ROUNDS) if in_rounds else stages(name)
 
 
@@ -263,7 +263,7 @@ def infer(experiment: Experiment, report: Report | None = None) -> Inference:
     InputError
         As :func:`.settled`.
     """
-    return experiment.found or settled(experiment.setup, experiment.data, report=report)
+    return experiment.inference or settled(experiment.setup, experiment.data, report=report)
 
 
 def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:

@@ -231,7 +231,7 @@ def in_noise(
     for systematic, before, response in stages:
         later = last if response is None or last is None else last / response
         if systematic.first_order:
-            held.append(on_host(Expanded.about(systematic, before, around, later)))
+            held.append(on_host(Expanded.at(systematic, before, around, later)))
         else:
             held.append(Marginalised(systematic if later is None else systematic.behind(later)))
     return held

@@ -136,7 +136,7 @@ class UnknownsReport:
     onto: bool = False
 
     @property
-    def told(self) -> pd.Series:
+    def constrained(self) -> pd.Series:
         """Whether the data tell each of them."""
         return self.table["std"] <= UNTOLD * self.table["prior_std"]
 
@@ -540,7 +540,7 @@ def _preferred(experiment: Experiment, result: Inference, values: dict[str, floa
     steps = {name: step for kind, step in TESTED.items() for name in offset_names((kind,), n_runs)}
     centre = dict.fromkeys(steps, 0.0) | values
     offsets = PointingOffsets.of(shifted(setup, centre), steps, centre)
-    expanded = Expanded.about(offsets, base_model(setup), Around(sky=sky, values=centre))
+    expanded = Expanded.at(offsets, base_model(setup), Around(sky=sky, values=centre))
     per_unit = np.asarray(expanded.columns) / offsets.stds
     day = setup.observation.day
     length = -(-(int(day.max()) + 1) // MOST_STRETCHES)

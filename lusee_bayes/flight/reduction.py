@@ -162,7 +162,7 @@ class State:
     basis : (ports, 3, bins) array
         Mean and components of the gains, averaged over the channels of every bin; NaN where there
         are none.
-    known : (bins,) array of bool
+    line_bins : (bins,) array of bool
         Bins with known lines.
     """
 
@@ -171,7 +171,7 @@ class State:
     levels: tuple[str, ...]
     bands: tuple[ChannelBand, ...]
     basis: Float[np.ndarray, "ports 3 bins"]
-    known: Bool[np.ndarray, " bins"]
+    line_bins: Bool[np.ndarray, " bins"]
 
     @classmethod
     def of(cls, recipe: Recipe, navgf: int, levels: tuple[str, ...]) -> State:
@@ -223,7 +223,7 @@ class State:
             middles = session.channel_mhz(self.recipe.section.bin_origin)
             strength = flags.comb_strength(autos, frames, averaging, middles)
             comb = comb | (np.abs(strength) > flags.COMB_LIMIT)
-        return self.known | (comb[:, None] & flags.comb_bins(averaging))
+        return self.line_bins | (comb[:, None] & flags.comb_bins(averaging))
 
 
 def _slab(

@@ -92,9 +92,9 @@ class ChiSquare:
 
     def words(self) -> str:
         """p, and chi^2 with what is expected of it."""
-        return f"p {probability(self.p)}, {self.found()}"
+        return f"p {probability(self.p)}, {self.chi2_words()}"
 
-    def found(self) -> str:
+    def chi2_words(self) -> str:
         """chi^2 with what is expected of it."""
         expected = f"{self.degrees:.0f} +- {np.sqrt(2.0 * self.degrees):.0f}"
         return f"chi2 {self.chi2:.0f}, expected {expected}"

@@ -76,7 +76,7 @@ class ChannelFits:
     frequencies_mhz : (channels,) array
     chi2, degrees : (channels,) array
         What no sky explains of each channel, and its mean if instrument and noise are right.
-    rest : ChiSquare
+    prior : ChiSquare
         Of all channels together, what the prior does not expect.
     joint : bool
         Whether channels share a posterior.
@@ -87,7 +87,7 @@ class ChannelFits:
     frequencies_mhz: Float[np.ndarray, " channels"]
     chi2: Float[np.ndarray, " channels"]
     degrees: Float[np.ndarray, " channels"]
-    rest: ChiSquare
+    prior: ChiSquare
     joint: bool = False
     shared: tuple[SharedTest, ...] = ()
 
@@ -116,12 +116,12 @@ class ChannelFits:
         least = int(np.argmin(p))
         above = int((chdtrc(self.degrees, self.chi2) < 0.5).sum())
         signs = min(1.0, 2.0 * float(bdtr(min(above, n - above), n, 0.5)))
-        where = f"{self.frequencies_mhz[least]:g} MHz, {self.by_channel[least].found()}"
+        where = f"{self.frequencies_mhz[least]:g} MHz, {self.by_channel[least].chi2_words()}"
         return [
-            JointTest("sum over all channels", self.total.p, 1, self.total.found()),
+            JointTest("sum over all channels", self.total.p, 1, self.total.chi2_words()),
             JointTest("channels above the median", signs, 1, f"{above} of {n}"),
             JointTest("most deviant channel", float(p[least]), n, where),
-            JointTest("prior", self.rest.p, 1, self.rest.found(), of_prior=True),
+            JointTest("prior", self.prior.p, 1, self.prior.chi2_words(), of_prior=True),
         ]
 
     def fit(self) -> Fit:
@@ -135,7 +135,7 @@ class ChannelFits:
         verdicts = {
             "consistent": "Instrument, noise and prior fit in all channels.",
             "unlike the prior": "Instrument and noise fit in all channels, "
-            f"but the skies are {self.rest.of_sky}.",
+            f"but the skies are {self.prior.of_sky}.",
             "does not fit": contradiction or f"{misfit}.",
         }
         sentences = [verdicts[level]]
@@ -161,7 +161,7 @@ class ChannelFits:
             return ["The assumed noise (noise.radiometer) is too large: error bars are too wide."]
         if level == "does not fit":
             return ["Map the flagged channels one by one: this also tests their products and days."]
-        if level == "unlike the prior" and self.rest.too_small:
+        if level == "unlike the prior" and self.prior.too_small:
             narrower = "smaller spectral.residual" if self.joint else "narrower prior"
             finding = "The prior is wider than the skies require, and error bars are too wide"
             return [f"{finding}: a {narrower} would give a sharper map (compare the evidence)."]

@@ -135,21 +135,21 @@ class AmplitudesOfSky:
         return Amplitudes(least, self.covariance - self.pull @ with_sky, with_sky)
 
     def shared(
-        self, own: Int[np.ndarray, " shared"], expected: Vector, root: Float[np.ndarray, "shared w"]
+        self, k: Int[np.ndarray, " shared"], expected: Vector, root: Float[np.ndarray, "shared w"]
     ) -> Shared:
         """Those that are shared, e + x = R w.
 
         Parameters
         ----------
-        own : (shared,) array
+        k : (shared,) array
             Which.
         expected : (shared,) array
             Their e.
         root : (shared, w) array
             R.
         """
-        covariance = self.covariance[np.ix_(own, own)]
-        return Shared(own, self.mean[own] + expected, self.pull[own], covariance, root)
+        covariance = self.covariance[np.ix_(k, k)]
+        return Shared(k, self.mean[k] + expected, self.pull[k], covariance, root)
 
     def with_shared(self, shared: Shared, mean: Vector, covariance: Square) -> Amplitudes:
         """Integrate a sky and what is shared out, N(mean, covariance) given any data besides.
@@ -162,11 +162,11 @@ class AmplitudesOfSky:
             In K and K^2.
         """
         n = len(self.reference)
-        slope = np.linalg.solve(shared.covariance, self.covariance[shared.own]).T
+        slope = np.linalg.solve(shared.covariance, self.covariance[shared.index]).T
         reach = np.concatenate([slope @ shared.pull - self.pull, slope @ shared.root], axis=1)
         off = np.concatenate([mean[:n] - self.reference, mean[n:]])
         least = self.mean - slope @ shared.mean + reach @ off
-        left = self.covariance - slope @ self.covariance[shared.own]
+        left = self.covariance - slope @ self.covariance[shared.index]
         with_all = covariance @ reach.T
         return Amplitudes(least, left + reach @ with_all, with_all[:n])
 
@@ -190,11 +190,11 @@ class AmplitudesOfSky:
 class Shared:
     """What a channel's data tell of z = R w given its sky, m0 where there is none.
 
-    own : which of the channel's amplitudes they are; mean : y + e; pull : P; covariance : D;
+    index : which of the channel's amplitudes they are; mean : y + e; pull : P; covariance : D;
     root : R
     """
 
-    own: Int[np.ndarray, " shared"]
+    index: Int[np.ndarray, " shared"]
     mean: Vector
     pull: Float[np.ndarray, "shared modes"]
     covariance: Square
@@ -486,7 +486,7 @@ def tie(
     return Tied(z, half, white, blocks, drawn, evidence)
 
 
-def told_by_others(
+def from_others(
     mean: Vector, covariance: Square, tied_mean: Vector, tied_covariance: Square
 ) -> tuple[Square, Vector]:
     """Q and q of one channel about E', from its own posterior and that given all data."""

@@ -259,7 +259,7 @@ class Solution(Described):
         d, in K.
     posterior : Posterior
         Over the sky, with the evidence of the data.
-    known : Information or None
+    kept_information : Information or None
         :attr:`information`, where the posterior was computed from it.
     of_noise : Factor or None
         :attr:`factor`, where it was computed.
@@ -270,7 +270,7 @@ class Solution(Described):
     model: LinearGaussian
     data: DataVector
     posterior: Posterior
-    known: Information | None = None
+    kept_information: Information | None = None
     of_noise: Factor | None = None
     excess: float = 0.0
 
@@ -285,14 +285,14 @@ class Solution(Described):
     @cached_property
     def information(self) -> Information:
         """ln p(d | m) as a function of the sky; only its reference depends on the prior."""
-        if self.known is not None:
-            return self.known
+        if self.kept_information is not None:
+            return self.kept_information
         return FromInformation.of(self.model).condition(self.data).less(self.excess).information
 
     @property
     def matrix(self) -> ModesMatrix | None:
         """A^T N^-1 A, where it has been computed."""
-        return None if self.known is None else self.known.matrix
+        return None if self.kept_information is None else self.kept_information.matrix
 
     @cached_property
     def covariance(self) -> Float[Array, "unknowns unknowns"]:
@@ -318,10 +318,10 @@ class Solution(Described):
     def less(self, excess: float) -> Solution:
         """The same, with chi^2 and -2 ln p(d) lower by a number."""
         evidence = np.asarray(self.posterior.log_evidence + excess / 2.0)
-        posterior, information = replace(self.posterior, log_evidence=evidence), self.known
-        if information is not None:
-            information = replace(information, misfit=np.asarray(information.misfit - excess))
-        return replace(self, posterior=posterior, known=information, excess=excess)
+        posterior, kept = replace(self.posterior, log_evidence=evidence), self.kept_information
+        if kept is not None:
+            kept = replace(kept, misfit=np.asarray(kept.misfit - excess))
+        return replace(self, posterior=posterior, kept_information=kept, excess=excess)
 
     def under(self, prior: Prior) -> Solution:
         """Solve for the same data under another prior; A^T N^-1 A is not computed again.

@@ -79,7 +79,7 @@ def compute_case(scenario: Scenario) -> xr.Dataset:
     """
     experiment = build(scenario)
     setup, data, made = experiment.setup, experiment.data, conditioned(experiment)
-    channel = made.result(made.known(alone=False))
+    channel = made.result(made.channel_data(alone=False))
     spectra, maps = channel.spectra(), channel.maps()
     variances = data.layout.scatter(radiometer(setup).diagonal())
     grid = HemisphereGrid.gauss_legendre(*BEAM_NODES)

@@ -206,20 +206,20 @@ class _Point:
     value: float
 
     @cached_property
-    def known(self) -> Square:
+    def resolution(self) -> Square:
         """How much of the prior's covariance of u the data take away."""
         return np.eye(self.posterior.prior.size) - inverse_from_cholesky(self.posterior.lower)
 
     def slope(self, family: PriorFamily) -> Parameters:
         """Gradient of ln p(d, theta)."""
         prior, mean = self.posterior.prior, self.posterior.white_mean
-        expected = prior.whitened_sandwich(self.known)
+        expected = prior.whitened_sandwich(self.resolution)
         of_data = self.member.forms(prior.whiten_columns((mean - prior.white_mean)[None]).T)[:, 0]
         return of_data - self.member.traces(expected) + family.hyperprior.gradient(self.parameters)
 
     def curvature(self, family: PriorFamily, rng: Generator, n: int) -> Square:
         """Its expected curvature, from simulated data sets."""
-        drawn = _root(self.known) @ rng.standard_normal((len(self.known), n))
+        drawn = _root(self.resolution) @ rng.standard_normal((len(self.resolution), n))
         scores = self.member.forms(self.posterior.prior.whiten_columns(drawn.T).T)
         scores = scores - scores.mean(1, keepdims=True)
         curvature = scores @ scores.T / (n - 1.0)

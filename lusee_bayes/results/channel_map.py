@@ -102,9 +102,9 @@ class Conditioned:
     Attributes
     ----------
     experiment : Experiment
-    own : Inference
+    from_data : Inference
         Of these data alone.
-    found : Inference
+    from_all : Inference
         The model of these data, and the posterior given all.
     judged : Inference
         The model that predicts these data, with what earlier ones tell of the sky in its prior.
@@ -113,30 +113,30 @@ class Conditioned:
     """
 
     experiment: Experiment
-    own: Inference
-    found: Inference
+    from_data: Inference
+    from_all: Inference
     judged: Inference
     digests: tuple[str, ...]
 
     @property
     def onto(self) -> bool:
         """Whether there are earlier data."""
-        return self.found is not self.own
+        return self.from_all is not self.from_data
 
     @property
     def information(self) -> Information:
         """Of all data."""
-        return self.found.solution.information
+        return self.from_all.solution.information
 
     @property
     def posterior(self) -> Posterior:
         """Given all data."""
-        return self.found.posterior
+        return self.from_all.posterior
 
     @property
     def covariance(self) -> ModesMatrix:
         """Of the posterior, in K^2."""
-        return self.found.solution.covariance
+        return self.from_all.solution.covariance
 
     @cached_property
     def pixel_std(self) -> Pixels:
@@ -154,19 +154,19 @@ class Conditioned:
         monopole = 1.0 / np.sqrt(4.0 * np.pi)
         with_mean = harmonics.modes_to_map(covariance[0], nside)
         with_monopole = 2.0 * with_mean - monopole * covariance[0, 0]
-        before = prior_pixel_std(self.found.model.prior, nside) ** 2
+        before = prior_pixel_std(self.from_all.model.prior, nside) ** 2
         return self.pixel_std**2 - monopole * with_monopole, before
 
     @cached_property
     def unknowns(self) -> Unknowns | None:
         """Receivers, ground and gain table given the sky, as these data alone tell of them."""
-        return Unknowns.of(self.experiment, self.own)
+        return Unknowns.of(self.experiment, self.from_data)
 
     @cached_property
     def expected(self) -> float:
         """Of chi^2 of these data about the mean, if the model holds."""
         variance = None if self.onto else np.diagonal(self.covariance)
-        return measures.expected_chi2(self.judged.posterior, self.own.model.n_data, variance)
+        return measures.expected_chi2(self.judged.posterior, self.from_data.model.n_data, variance)
 
     @cached_property
     def drawn(self) -> Float[np.ndarray, "n modes"]:
@@ -182,7 +182,7 @@ class Conditioned:
 
     def log_likelihood(self) -> Float[np.ndarray, " n"]:
         """ln p(d | m) of these data for every draw."""
-        model, data = self.own.model, self.experiment.data.data
+        model, data = self.from_data.model, self.experiment.data.data
         if not len(self.draws):
             return np.zeros(0)
         # factorised once: it takes far longer than a prediction where N couples times
@@ -208,7 +208,7 @@ class Conditioned:
 
     def figures(self) -> dict[str, float | bool]:
         """What :func:`channel_result` takes besides: numbers, and whether C is kept."""
-        model, posterior, data = self.found.model, self.posterior, self.experiment.data.data
+        model, posterior, data = self.from_all.model, self.posterior, self.experiment.data.data
         return {
             "log_evidence": float(posterior.log_evidence),
             "information_bits": float(posterior.information_bits()),
@@ -224,7 +224,7 @@ class Conditioned:
         with (stages or Stages())("standard deviations"):
             report = None
             if self.unknowns is not None:
-                solution = self.own.solution
+                solution = self.from_data.solution
                 report = self.unknowns.report(solution.posterior.mean, solution.covariance)
                 report = report and replace(report, onto=self.onto)
             given = (data, self.posterior.mean, self.covariance, self.draws, self.log_likelihood())
@@ -232,7 +232,7 @@ class Conditioned:
             more["instrument"] = self.unknowns
             return channel_result(*given, self.compared(), **more)
 
-    def known(
+    def channel_data(
         self, stages: Stages | None = None, *, alone: bool = True, thorough: bool = False
     ) -> ChannelData:
         """Look at these data.
@@ -246,7 +246,7 @@ class Conditioned:
         thorough : bool
             Judge groups of data and try the usual mistakes even if the data fit.
         """
-        experiment, inference, stages = self.experiment, self.own, stages or Stages()
+        experiment, inference, stages = self.experiment, self.from_data, stages or Stages()
         scenario, data, learned = experiment.scenario, experiment.data, experiment.learned
         fluxes, pointing, diagnosis, left, judged = None, None, None, None, None
         judge = self.judged.solution
@@ -306,7 +306,7 @@ class Conditioned:
     def _judged(self, misfit: Residuals) -> Judged:
         """The residuals, with the verdict in words."""
         data = self.experiment.data
-        prior = self.found.model.prior
+        prior = self.from_all.model.prior
         expected = prior.variance() - np.diagonal(self.covariance)
         left, before = self.without_monopole
         moved = self.posterior.mean - prior.colour(prior.white_mean)
@@ -393,7 +393,7 @@ def _details(channel: Conditioned) -> Details:
     """What a report shows of a single map beyond it."""
     setup, covariance = channel.experiment.setup, channel.covariance
     lmax, nside = setup.scenario.lmax, setup.scenario.map_nside
-    prior = channel.found.model.prior
+    prior = channel.from_all.model.prior
     resolution, steps, widths = packed_resolution(covariance, prior)
     left, before = channel.without_monopole
     rows = region_rows(nside, lmax)

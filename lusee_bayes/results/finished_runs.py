@@ -147,7 +147,7 @@ def posterior_tree(result: MapResult) -> xr.DataTree:
     axis = {"frequency": ("frequency", result.frequencies_mhz, {"units": "MHz"})}
     coords = {**axis, "ell": ("mode", ell), "m": ("mode", m)}
     unmapped = {"unmapped": "\n".join(result.gaps())} if result.unmapped else {}
-    attrs = formats.header(formats.POSTERIOR) | about(scenario) | unmapped
+    attrs = formats.header(formats.POSTERIOR) | attributes_of(scenario) | unmapped
     groups = {"/": xr.Dataset(variables, coords, attrs), **_observed(channels, axis)}
     draws, likely = result.stacked("draws"), result.stacked("log_likelihood")
     if draws.size:
@@ -283,7 +283,7 @@ def diagnostics_tree(result: MapResult) -> xr.DataTree:
         kept = replace(channel, draws=channel.draws[:0], log_likelihood=channel.log_likelihood[:0])
         kept = replace(kept, covariance=None, information=None)
         groups[f"{channel.frequency_mhz:.15g}"] = to_tree(kept)
-    root = xr.Dataset(attrs=formats.header(formats.DIAGNOSTICS) | about(result.scenario))
+    root = xr.Dataset(attrs=formats.header(formats.DIAGNOSTICS) | attributes_of(result.scenario))
     return xr.DataTree(root, children=groups)
 
 
@@ -295,7 +295,7 @@ def read_channels(path: str | Path) -> tuple[ChannelResult, ...]:
         return tuple(from_tree(ChannelResult, one, f"{path}: {f} MHz") for f, one in named)
 
 
-def about(scenario: Scenario) -> dict[str, object]:
+def attributes_of(scenario: Scenario) -> dict[str, object]:
     """What a file has to say of its numbers: frame, versions, scenario."""
     return {
         "lmax": scenario.lmax,

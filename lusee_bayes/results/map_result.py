@@ -77,8 +77,8 @@ class ChannelUnknowns:
         if len(self.reports) == 1:
             return next(iter(self.reports.values())).lines()
         n, reports = len(self.reports), self.reports.values()
-        untold = Counter(name for one in reports for name in one.table["unknown"][~one.told])
-        counts = [f"{name} (at {k} of {n} frequencies)" for name, k in untold.items()]
+        weak = Counter(name for one in reports for name in one.table["unknown"][~one.constrained])
+        counts = [f"{name} (at {k} of {n} frequencies)" for name, k in weak.items()]
         what = f"do not constrain {', '.join(counts)}" if counts else "constrain all of them"
         lines = [f"Receivers, ground and gain table: the data {what}."]
         for words, octaves in self.shared.items():

@@ -61,7 +61,7 @@ from lusee_bayes.experiment.unknowns import Unknowns
 from lusee_bayes.judge.coverage import N_DRAWS
 from lusee_bayes.judge.cube_fit import SharedTest, shared_tests
 from lusee_bayes.linear import joint, positive_joint
-from lusee_bayes.linear.amplitudes import Tied, information_given, kernel, tie, told_by_others
+from lusee_bayes.linear.amplitudes import Tied, from_others, information_given, kernel, tie
 from lusee_bayes.linear.information import Information
 from lusee_bayes.results.channel import ChannelData, ChannelResult, SkyModes
 from lusee_bayes.results.channel_map import Conditioned, channel_result, conditioned
@@ -163,12 +163,12 @@ class ChannelInformation:
     share: Share | None
 
     @classmethod
-    def of(cls, made: Conditioned, known: ChannelData) -> ChannelInformation:
+    def of(cls, made: Conditioned, data: ChannelData) -> ChannelInformation:
         """Of all data of a channel, earlier ones included."""
         sky, share = np.asarray(made.experiment.setup.sky.modes), None
         if made.unknowns is not None and made.unknowns.shared.size:
-            share = Share.of(made.unknowns, made.posterior.mean, made.covariance, 0, made.own)
-        return cls(made.information, made.of_all(known), made.unknowns, sky, share)
+            share = Share.of(made.unknowns, made.posterior.mean, made.covariance, 0, made.from_data)
+        return cls(made.information, made.of_all(data), made.unknowns, sky, share)
 
     def seen(self) -> Seen:
         """What the prior of all channels takes, too: the reference sky, and the model's."""
@@ -430,15 +430,15 @@ class ChannelAlone:
     share: Share
 
     @classmethod
-    def of(cls, made: Conditioned, known: ChannelData) -> ChannelAlone:
+    def of(cls, made: Conditioned, data: ChannelData) -> ChannelAlone:
         """The posterior is given earlier data, too; what is judged are its own."""
         mean, compared = made.posterior.mean, made.compared()
         deviations = made.draws - mean
         if compared is not None:
             deviations = np.concatenate([deviations, compared])
-        share = Share.of(made.unknowns, mean, made.covariance, len(deviations), made.own)
+        share = Share.of(made.unknowns, mean, made.covariance, len(deviations), made.from_data)
         kept = made.covariance, deviations, len(made.draws), made.figures(), share
-        return cls(known, made.own.solution.information, made.unknowns, mean, *kept)
+        return cls(data, made.from_data.solution.information, made.unknowns, mean, *kept)
 
     def seen(self) -> Seen:
         """What the others need of it."""
@@ -477,7 +477,7 @@ class ChannelAlone:
         # what the other channels tell of this one's unknowns
         n = len(amplitudes.mean)
         precision, vector, expansion = np.zeros((n, n)), np.zeros(n), np.zeros(n)
-        precision[np.ix_(shared, shared)], vector[shared] = told_by_others(e, v, mean, covariance)
+        precision[np.ix_(shared, shared)], vector[shared] = from_others(e, v, mean, covariance)
         expansion[shared] = mean
         unknowns = replace(self.unknowns, amplitudes=amplitudes.given(precision, vector, expansion))
         sky_share = np.linalg.solve(v, (np.linalg.solve(v, v - inner)).T)
@@ -538,7 +538,7 @@ def tie_channels(
     return replace(tie(mean, covariance, kernels, normals), names=names), tests
 
 
-def told_by_fitting(
+def from_fitting(
     scenario: Scenario, frequencies_mhz: Sequence[float], shared: Sequence[Share]
 ) -> dict[str, float]:
     """Values of what all channels have in common, by name, given the data of those that fit."""
@@ -609,7 +609,7 @@ def map_channels(
 
     if single:
         made = condition(scenario, stages)
-        channel_data = made.known(stages, alone=True, thorough=thorough)
+        channel_data = made.channel_data(stages, alone=True, thorough=thorough)
         return MapResult(scenario, (made.result(channel_data, stages),), seconds=stages.seconds)
     engine.work_in(folder)
     digest = None if kept is None else digest_of(kept)
@@ -625,9 +625,9 @@ def map_channels(
 
         def make() -> ChannelResult | ChannelInformation | ChannelAlone:
             made = condition(channel, Stages(), begin)
-            if begin is not None and not made.own.fits:
+            if begin is not None and not made.from_data.fits:
                 made = condition(channel, Stages())
-            channel_data = made.known(alone=False, thorough=thorough)
+            channel_data = made.channel_data(alone=False, thorough=thorough)
             return made.result(channel_data) if alone else kind.of(made, channel_data)
 
         try:
@@ -640,7 +640,7 @@ def map_channels(
     if scenario.shared:  # the others begin with the instrument of the first
         views = engine.each(Tasks(observe, channels[:1], names[:1]), stages, "first channel")
         if isinstance(views[0], Seen) and views[0].share.fits:
-            begin = told_by_fitting(scenario, [channels[0].frequency_mhz], [views[0].share]) or None
+            begin = from_fitting(scenario, [channels[0].frequency_mhz], [views[0].share]) or None
     left = channels[len(views) :], names[len(views) :]
     views = [*views, *engine.each(Tasks(observe, *left), stages, "channels")]
     by_channel = list(zip(channels, views, strict=True))
@@ -653,7 +653,7 @@ def map_channels(
         frequencies, shares = [channel.frequency_mhz for channel in mapped], [s.share for s in seen]
         unfit = [number for number, one in enumerate(shares) if not one.fits]
         if 0 < len(unfit) < len(mapped):
-            values = told_by_fitting(scenario, frequencies, shares)
+            values = from_fitting(scenario, frequencies, shares)
             again = frozenset(frequencies[number] for number in unfit)
             first, files = files, ChannelFiles(folder.resolve(), files.identity, again)
 
@@ -665,7 +665,7 @@ def map_channels(
                     made, before = condition(channel, Stages(), values), first.read(channel, kind)
                     if made.figures()["log_evidence"] < before.share.log_evidence:
                         return before
-                    return kind.of(made, made.known(alone=False, thorough=thorough))
+                    return kind.of(made, made.channel_data(alone=False, thorough=thorough))
 
                 return files.kept(channel, kind, make).seen()
 

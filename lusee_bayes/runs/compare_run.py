@@ -141,10 +141,10 @@ def _under(name: str, setup: Setup, experiment: Experiment, inferred: Inference)
         learned = learned_prior(setup, setup.family, information)
         setup, evidence = replace(setup, prior=learned.prior), learned.log_evidence
     solved = None if rebuilds(setup) else inferred.under(setup.prior)
-    mapped = replace(experiment, setup=setup, learned=learned, found=solved)
+    mapped = replace(experiment, setup=setup, learned=learned, inference=solved)
     made = conditioned(mapped)
-    channel = made.result(made.known(alone=False))
-    solution = made.own.solution
+    channel = made.result(made.channel_data(alone=False))
+    solution = made.from_data.solution
     n_parameters = 0 if learned is None else len(learned.parameters)
     split = Split.of(solution.posterior, channel.chi2_model, solution.model.n_data)
     judged = held_out(solution, mapped.data), split

@@ -121,7 +121,7 @@ def sample_together(
         model, observed = program.model, {**arguments[first], "data": data[first]}
     whitening = None
     with stages("coordinates"):
-        rounds = found_in_rounds(inferences, latent)
+        rounds = amplitudes_of_rounds(inferences, latent)
         if rounds is not None:
             sampler = replace_fields(sampler, algorithm=sampler.algorithm or "crank-nicolson")
             sites = programs.latent_sites(model, observed)
@@ -169,14 +169,14 @@ def coordinates(
     positive = arguments.get("log_normal")
     if positive is not None and set(latent) == set(positive.sites):
         return coordinates_of(positive, inference.solution.information)
-    start, arguments = values_found(inference, latent), {**arguments, "data": data.data}
+    start, arguments = start_values(inference, latent), {**arguments, "data": data.data}
     starts = 1 if SKY in latent else STARTS
     chart = _chart(arguments, latent)
     mode = laplace_approximation(program.model, arguments, start, SCALES, starts, chart)
     return mode.whitening if bool(mode.converged) else None
 
 
-def found_in_rounds(
+def amplitudes_of_rounds(
     inferences: Mapping[str, Inference], latent: Mapping[str, Sequence[str]]
 ) -> tuple[dict[str, Amplitudes], list[Unknown]] | None:
     """What each channel's data tell of unknowns that rounds have found or that are linear.
@@ -197,7 +197,7 @@ def found_in_rounds(
     return amplitudes, unknowns
 
 
-def values_found(inference: Inference, latent: Sequence[str]) -> dict[str, np.ndarray]:
+def start_values(inference: Inference, latent: Sequence[str]) -> dict[str, np.ndarray]:
     """Where the mode is looked for: at what rounds have found, if there were any."""
     start = {SKY: inference.posterior.mean} if SKY in latent else {}
     for part in inference.expanded if inference.moving else ():

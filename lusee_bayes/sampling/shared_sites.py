@@ -108,10 +108,10 @@ class SharedSites:
 
     def __call__(self, channels: Mapping[str, dict], data: Mapping[str, Array] | None = None):
         """Sample or observe all channels; what the program returns of each."""
-        known: dict[str, dict[str, Any]] = {}
+        site_values: dict[str, dict[str, Any]] = {}
         returned = []
         for channel, arguments in channels.items():
-            with _Channel(self, channel, known):
+            with _Channel(self, channel, site_values):
                 observed = None if data is None else data[channel]
                 returned.append(self.program(**arguments, data=observed))
         return returned
@@ -120,13 +120,13 @@ class SharedSites:
 class _Channel(Messenger):
     """Names a channel's sites, and ties those that are shared to earlier channels.
 
-    known : by site and channel, values, or z where those differ; of sites alone, not of what
+    site_values : by site and channel, values, or z where those differ; of sites alone, not of what
         follows from others
     """
 
     def __init__(self, shared: SharedSites, channel: str, known: dict[str, dict[str, Any]]):
         super().__init__()
-        self.shared, self.channel, self.known = shared, channel, known
+        self.shared, self.channel, self.site_values = shared, channel, site_values
         # name and prior of what is shared, by site
         self.sites: dict[str, tuple[str, dist.Distribution]] = {}
 
@@ -137,7 +137,7 @@ class _Channel(Messenger):
         msg["name"] = site_in(self.channel, name)
         if msg["type"] != "sample" or name not in self.shared.octaves:
             return
-        octaves, before = self.shared.octaves[name], self.known.setdefault(name, {})
+        octaves, before = self.shared.octaves[name], self.site_values.setdefault(name, {})
         if before and np.isinf(octaves):
             (value,) = before.values()
             msg |= {"type": "deterministic", "value": value}
@@ -162,4 +162,4 @@ class _Channel(Messenger):
             value = msg["value"]
             if np.isfinite(self.shared.octaves[name]):
                 value = (value - prior.loc) / prior.scale
-            self.known[name][self.channel] = value
+            self.site_values[name][self.channel] = value

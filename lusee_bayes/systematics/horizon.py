@@ -99,7 +99,7 @@ class HorizonSection(Section):
         "give file or altitude_deg: at altitude 0, where beams vanish, data do not constrain it",
     )
 
-    def known(self, azimuth: Altitudes) -> Altitudes:
+    def altitude_at(self, azimuth: Altitudes) -> Altitudes:
         """Interpolate the known altitude, all in radians.
 
         Raises
@@ -135,7 +135,7 @@ class Horizon(ChangedBeams):
         above altitude 0 and in 1/sr; azimuths from East towards North in the antennas' frame.
     azimuth : (runs, azimuths) array
         The same directions from North towards East on the ground, in radians.
-    known : (runs, azimuths) array
+    altitudes : (runs, azimuths) array
         Altitude that is known, in radians.
     before : (runs, products, modes) array
         What the modelled beams have of the horizon already; zero for none.
@@ -158,7 +158,7 @@ class Horizon(ChangedBeams):
 
     patterns: Float[Array, "products rings azimuths"]
     azimuth: Altitudes
-    known: Altitudes
+    altitudes: Altitudes
     before: Float[Array, "runs products modes"] | float
     highest: float = eqx.field(static=True)
     lmax: int = eqx.field(static=True)
@@ -175,7 +175,7 @@ class Horizon(ChangedBeams):
         source, beams, whole = setup.beam_source, setup.beams, HemisphereGrid.for_lmax(0)
         ahead = np.radians(np.array(setup.observation.turntable_deg))[:, None]
         azimuth = np.pi / 2.0 - ahead - 2.0 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS
-        altitude = section.known(azimuth)
+        altitude = section.altitude_at(azimuth)
         highest = min(float(altitude.max() + np.radians(REACH * section.std_deg)), np.pi / 2.0)
         # polynomials that follow the harmonics, lmax radians for each of angle, and the patterns
         grids = _rings(24 + int(highest * beams.lmax), highest), whole
@@ -225,7 +225,7 @@ class Horizon(ChangedBeams):
         angle, xp = orders * self.azimuth[..., None], namespace(self.azimuth, *values.values())
         waves = xp.stack([xp.cos(angle), xp.sin(angle)], axis=-1).reshape(*angle.shape[:2], -1)
         series = self.stacked(values) * (np.pi / 180.0)
-        return self.known + series[0] + waves @ series[1:]
+        return self.altitudes + series[0] + waves @ series[1:]
 
     def hidden(self, values: Values) -> Float[Array, "runs products modes"]:
         """What terrain of these values does to the beams; differentiable."""

@@ -1,6 +1,6 @@
 """Offsets of clock and pointing: A is that of antennas that lean, are turned and look later.
 
-The clock is expanded about, too: what is left of it beyond its value in :attr:`Pointing.about` is a
+The clock is expanded, too: beyond :attr:`PointingOffsets.expansion_point`, what is left of it is a
 turn of the Moon at a constant rate (:func:`.turned_by_offsets`); all angles are exact.
 """
 
@@ -97,7 +97,7 @@ class PointingOffsets(Systematic):
         Their names (:func:`.offset_names`).
     errors : (offsets,) array
         Prior standard deviations, in the units that the names end with.
-    about : (2,) array
+    expansion_point : (2,) array
         What clock and its drift are off by in :attr:`pointing`.
     pointing : Pointing
         Of a clock that is off, and all else as the observation says.
@@ -121,7 +121,7 @@ class PointingOffsets(Systematic):
 
     offsets: tuple[str, ...] = eqx.field(static=True)
     errors: Float[Array, " offsets"]
-    about: Float[Array, "2"]
+    expansion_point: Float[Array, "2"]
     pointing: Pointing
     hours: Float[Array, " times"]
     mcmf_from_lander: Float[Array, "3 3"]
@@ -165,7 +165,7 @@ class PointingOffsets(Systematic):
         # those of the setup are there already
         orientation = offsets.orientation(dict.fromkeys(stds, 0.0) | dict(values))
         seen = np.asarray(sources.seen(orientation, setup.layout))
-        return replace(offsets, sources=replace(sources, known=seen))
+        return replace(offsets, sources=replace(sources, in_signal=seen))
 
     @classmethod
     def moved(cls, section: PointingSection, setup: Setup, values: Values) -> Setup:
@@ -180,7 +180,7 @@ class PointingOffsets(Systematic):
 
     def turned(self, values: Values) -> Pointing:
         """The pointing of values by name."""
-        clock = dict(zip(CLOCK, self.about, strict=True))
+        clock = dict(zip(CLOCK, self.expansion_point, strict=True))
         left = {name: values[name] - clock.get(name, 0.0) for name in self.offsets}
         return turned_by_offsets(self.pointing, self.hours, left)
 
@@ -191,7 +191,7 @@ class PointingOffsets(Systematic):
         if self.sources is None:
             return model
         seen = self.sources.seen(self.orientation(values), self.layout)
-        return with_added(model, seen - self.sources.known)
+        return with_added(model, seen - self.sources.in_signal)
 
     def linearised(self, model, centre):
         """Through the turns of the antennas.
@@ -262,7 +262,7 @@ def _about(axis: int, angle: float | Array) -> Float[Array, "*batch 3 3"]:
 class MovingSources(eqx.Module):
     """Point sources with their mean fluxes, as antennas see them that are turned.
 
-    Between the clock's values in :attr:`PointingOffsets.about` and others, those of the solar
+    Between the clock's :attr:`PointingOffsets.expansion_point` and other values, those of the solar
     system stand still among the stars.
 
     Attributes
@@ -279,7 +279,7 @@ class MovingSources(eqx.Module):
         Of each in the mean over its sample.
     monopoles : Monopoles
     frequency_mhz : float
-    known : (data,) array or None
+    in_signal : (data,) array or None
         What of it is part of the data already, in K.
     """
 
@@ -290,7 +290,7 @@ class MovingSources(eqx.Module):
     weight: Float[Array, " instants"]
     monopoles: Monopoles
     frequency_mhz: float = eqx.field(static=True)
-    known: Float[Array, " data"] | None = None
+    in_signal: Float[Array, " data"] | None = None
 
     @classmethod
     def of(cls, setup: Setup) -> MovingSources:

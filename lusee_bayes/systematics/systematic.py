@@ -509,7 +509,7 @@ class Systematic(eqx.Module):
             The model averaged over its prior.
         """
         around = Around(sky=model.prior.colour(model.prior.white_mean))
-        return Expanded.about(self, model, around).marginalised(model)
+        return Expanded.at(self, model, around).marginalised(model)
 
     def averaged(self, model: LinearGaussian) -> LinearGaussian:
         """The same but for N, which stays as it is."""
@@ -598,7 +598,7 @@ class Expanded(Marginalised):
     shift: DataVector
 
     @classmethod
-    def about(
+    def at(
         cls,
         systematic: Systematic,
         model: LinearGaussian,

@@ -51,7 +51,7 @@ NOISES = {
 @pytest.mark.parametrize("noise", NOISES.values(), ids=list(NOISES))
 def test_likelihoods_of_draws_are_those_of_matrices(noise):
     made, channel = mapped(small_experiment("output.draws=4", *noise))
-    expected = dense_log_likelihood(made.own.model, made.experiment.data.data, channel.draws)
+    expected = dense_log_likelihood(made.from_data.model, made.experiment.data.data, channel.draws)
     # data of 1e5 standard deviations
     np.testing.assert_allclose(channel.log_likelihood, expected, atol=1e-6)
     assert len(expected) == 4 and np.ptp(expected) > 0.1
@@ -181,7 +181,7 @@ def test_modes_that_the_prior_knows_exactly_can_have_earlier_data():
     assert channel.chi2_model < 1.5 * channel.n_data
     expected = dense_z(made.judged, data.data)
     # a mean is accepted where each of its 49 coefficients is known to 1e-6 standard deviations
-    std = np.sqrt(np.asarray(made.own.model.noise.diagonal()))
+    std = np.sqrt(np.asarray(made.from_data.model.noise.diagonal()))
     reach = np.abs(setup.coupling.dense()) @ channel.std / std
     np.testing.assert_allclose(channel.judged.z.ravel(), expected, rtol=0, atol=1e-6 * reach.max())
 
@@ -227,9 +227,9 @@ def dense():
 
 def test_the_channel_is_that_of_matrices(dense):
     made, channel = dense
-    model, data = made.own.model, np.asarray(made.experiment.data.data)
+    model, data = made.from_data.model, np.asarray(made.experiment.data.data)
     (a, s, n), mean = matrices(model), np.asarray(model.prior.mean)
-    covariance = np.asarray(made.found.posterior.covariance())
+    covariance = np.asarray(made.from_all.posterior.covariance())
     # chi^2 of residuals: N_data less what the sky takes, tr(A C A^T N^-1)
     taken = np.trace(np.linalg.solve(n, a @ covariance @ a.T))
     np.testing.assert_allclose(channel.chi2_expected, len(data) - taken, rtol=1e-6)
@@ -260,6 +260,6 @@ def test_its_resolution_is_packed(dense):
     steps = details.resolution_step[np.ix_(ell, ell)]
     scale = width[:, None] / width[None]
     found = details.resolution * steps * scale
-    s = np.asarray(made.own.model.prior.covariance())
-    exact = np.eye(len(s)) - np.asarray(made.found.posterior.covariance()) @ np.linalg.inv(s)
+    s = np.asarray(made.from_data.model.prior.covariance())
+    exact = np.eye(len(s)) - np.asarray(made.from_all.posterior.covariance()) @ np.linalg.inv(s)
     assert (np.abs(found - exact) <= 0.51 * steps * scale).all()

@@ -16,10 +16,10 @@ from lusee_bayes.judge.split import WIDER
 FREQUENCIES = np.linspace(5.0, 50.0, 46)
 
 
-def fits(chi2, n=5000.0, rest=(200.0, 200.0), **more):
+def fits(chi2, n=5000.0, prior=(200.0, 200.0), **more):
     degrees = np.broadcast_to(np.float64(n), (len(chi2),)).copy()
     chi2 = np.asarray(chi2, dtype=np.float64)
-    return ChannelFits(FREQUENCIES[: len(chi2)], chi2, degrees, ChiSquare(*rest), **more)
+    return ChannelFits(FREQUENCIES[: len(chi2)], chi2, degrees, ChiSquare(*prior), **more)
 
 
 def test_each_joint_test_is_right_where_the_model_holds():
@@ -27,7 +27,7 @@ def test_each_joint_test_is_right_where_the_model_holds():
     test are of a binomial distribution; all together make a false alarm once in a thousand."""
     rng = np.random.default_rng(4)
     drawn = ((rng.chisquare(5000.0, 46), float(rng.chisquare(200.0))) for _ in range(300))
-    runs = [fits(chi2, rest=(rest, 200.0)) for chi2, rest in drawn]
+    runs = [fits(chi2, prior=(prior, 200.0)) for chi2, prior in drawn]
     by_test = np.array([[t.p for t in run.tests()] for run in runs])
     for column in (0, 3):
         assert stats.kstest(by_test[:, column], "uniform").pvalue > 1e-4
@@ -83,10 +83,10 @@ PRIORS = [
 def test_the_prior_is_judged_apart(found, joint, said, not_said):
     """Only if the instrument fits."""
     chi2 = np.random.default_rng(6).chisquare(5000.0, 46)
-    fit = fits(chi2, rest=(found, 200.0), joint=joint).fit()
+    fit = fits(chi2, prior=(found, 200.0), joint=joint).fit()
     assert fit.level == "unlike the prior"
     assert all(words in fit.text for words in said) and not_said not in fit.text
-    assert fits(1.2 * chi2, rest=(found, 200.0)).fit().level == "does not fit"
+    assert fits(1.2 * chi2, prior=(found, 200.0)).fit().level == "does not fit"
 
 
 def test_chi2_of_a_channel_is_that_of_its_data_under_the_model(small_cube):
@@ -102,8 +102,8 @@ def test_chi2_of_a_channel_is_that_of_its_data_under_the_model(small_cube):
         assert channel.instrument.chi2 == pytest.approx(expected, abs=0.02 * expected)
     fits = run.fits()
     total, n_data = (sum(getattr(c, k) for c in run.channels) for k in ("chi2_model", "n_data"))
-    assert fits.rest.chi2 + fits.chi2.sum() == pytest.approx(total)
-    assert fits.rest.degrees + fits.degrees.sum() == pytest.approx(n_data)
+    assert fits.prior.chi2 + fits.chi2.sum() == pytest.approx(total)
+    assert fits.prior.degrees + fits.degrees.sum() == pytest.approx(n_data)
     told = json.loads((small_cube.folder / "summary.json").read_text())
     assert told["level"] == run.fit.level and told["verdict"] == run.verdict()
     assert [t["name"] for t in told["tests"]][::3] == ["sum over all channels", "prior"]
@@ -118,7 +118,7 @@ def test_a_joint_run_is_judged(tmp_path):
     scenario = lb.load_scenario("fiducial", [*sizes, "joint=true", "spectral.residual=0.1"])
     run = lb.run_map(scenario, tmp_path / "joint").result
     alone = sum(channel.instrument.chi2 for channel in run.channels)
-    assert run.fits().rest.chi2 + alone == pytest.approx(run.joint.chi2)
+    assert run.fits().prior.chi2 + alone == pytest.approx(run.joint.chi2)
     # the instrument is judged as in channels of their own
     own = lb.run_map(lb.load_scenario("fiducial", sizes), tmp_path / "own").result
     np.testing.assert_allclose(run.fits().chi2, own.fits().chi2, rtol=1e-6)

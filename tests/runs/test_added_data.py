@@ -71,8 +71,8 @@ def test_a_map_is_that_of_all_data(kind, tmp_path, exact_tilt):
     if joint:
         here, there = both.fits(), whole.fits()
         np.testing.assert_allclose(here.chi2, there.chi2, rtol=1e-4)
-        assert here.rest.chi2 == pytest.approx(there.rest.chi2, rel=1e-3)
-        assert here.rest.degrees == pytest.approx(there.rest.degrees, rel=1e-3)
+        assert here.prior.chi2 == pytest.approx(there.prior.chi2, rel=1e-3)
+        assert here.prior.degrees == pytest.approx(there.prior.degrees, rel=1e-3)
     # and it can go on
     for channel in scenario.channels() or (scenario,):
         kept = read_information(information_file(tmp_path / "both"), channel)

@@ -127,7 +127,7 @@ def test_columns_are_the_derivative_of_the_effect():
 
 def test_the_prior_is_as_wide_in_every_direction():
     ((_, horizon),) = models.systematics(setup_of("altitude_deg: 1, std_deg: 1.5, harmonics: 4"))
-    ways = [horizon.altitude(horizon.values(z)) - horizon.known for z in np.eye(9)]
+    ways = [horizon.altitude(horizon.values(z)) - horizon.altitudes for z in np.eye(9)]
     np.testing.assert_allclose(np.degrees(np.sqrt(np.square(ways).sum(0))), 1.5, rtol=1e-12)
     east = np.sin(horizon.azimuth) * np.radians(1.5) / np.sqrt(5)
     np.testing.assert_allclose(ways[horizon.names.index("horizon_sin_1_deg")], east, atol=1e-15)

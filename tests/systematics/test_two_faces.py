@@ -295,7 +295,7 @@ def test_columns_are_the_derivative_of_the_effect(more):
         values |= systematic.in_units(rng.normal(size=len(systematic.names)))
     model, sky = models.base_model(setup), setup.sky.modes
     for _, systematic in systematics(setup, Around(values=values)):
-        expanded = on_host(Expanded.about(systematic, model, Around(sky=sky, values=values)))
+        expanded = on_host(Expanded.at(systematic, model, Around(sky=sky, values=values)))
         steps = 1e-4 * np.eye(len(expanded.centre))
         expected = differences(systematic, model, sky, expanded.centre, steps)
         size, off = (np.linalg.norm(x, axis=0) for x in (expected, expanded.columns - expected))

@@ -44,11 +44,11 @@ def test_draws_estimate_the_trace():
         error[k] = np.sqrt(2.0 * (((whole + whole.T) / 2.0) ** 2).sum() / N_DRAWS)
     draws = np.asarray(posterior.sample(jax.random.key(0), N_DRAWS)) - np.asarray(posterior.mean)
     around = Around(sky=setup.sky.modes, values=values, volume=(draws, draws @ a.T / noise))
-    got = np.asarray(Expanded.about(antennas, model, around).expected)
+    got = np.asarray(Expanded.at(antennas, model, around).expected)
     assert (np.abs(got - exact) < 4.0 * error).all()
     assert (np.abs(exact) > 10.0 * error).any()
     # without draws nothing is expected
-    nothing = Expanded.about(antennas, model, Around(sky=setup.sky.modes, values=values))
+    nothing = Expanded.at(antennas, model, Around(sky=setup.sky.modes, values=values))
     assert not np.any(nothing.expected)
 
 

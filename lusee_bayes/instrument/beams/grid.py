@@ -60,7 +60,7 @@ class GridBeams(Described, BeamSource):
         Present values of the parameters.
     nominal : mapping of str to float
         Values for which visibilities in volts are converted to K.
-    known : dict
+    cache : dict
         What has been computed at the nodes.
     """
 
@@ -69,7 +69,7 @@ class GridBeams(Described, BeamSource):
     sources: tuple[BeamSource, ...]
     values: Values
     nominal: Mapping[str, float]
-    known: dict[Any, np.ndarray] = field(default_factory=dict)
+    cache: dict[Any, np.ndarray] = field(default_factory=dict)
 
     def description(self) -> tuple[str, ...]:
         axes = (f"{name} {', '.join(f'{x:g}' for x in xs)}" for name, xs in self.axes.items())
@@ -113,10 +113,10 @@ class GridBeams(Described, BeamSource):
     def _at_nodes(self, frequency_mhz: float, lmax: int) -> Float[np.ndarray, "sources products n"]:
         """The same of every source, in the unit of the nominal values."""
         key = frequency_mhz, lmax
-        if key not in self.known:
+        if key not in self.cache:
             unit = self.circuit(frequency_mhz)
-            self.known[key] = np.stack([_in_unit(source, unit, *key) for source in self.sources])
-        return self.known[key]
+            self.cache[key] = np.stack([_in_unit(source, unit, *key) for source in self.sources])
+        return self.cache[key]
 
     def circuit(self, frequency_mhz: float) -> Circuit | None:
         """Return antennas and receivers at the nominal values, which say what 1 K is."""
@@ -140,7 +140,7 @@ class GridBeams(Described, BeamSource):
         return self.sources[0].interpolated(frequency_mhz)
 
     def behind(self, receiver: Receiver | None) -> GridBeams:
-        return replace(self, sources=tuple(s.behind(receiver) for s in self.sources), known={})
+        return replace(self, sources=tuple(s.behind(receiver) for s in self.sources), cache={})
 
     def interpolation_errors(self, frequency_mhz: float, lmax: int) -> dict[str, Lines]:
         """Return by how much beams are off where they are interpolated without their own file.

@@ -376,7 +376,7 @@ def read_sampled_beams(path: str | Path) -> SampledBeams:
         read = partial(formats.read_fits, path, hint=HINT)
     else:
         read = partial(formats.read_netcdf, path, formats.BEAMS, hint=HINT)
-    present = read(layout=Layout(WHAT)).there
+    present = read(layout=Layout(WHAT)).names
     names = (POWER,) if POWER in present else FIELDS
     said = {"absolute": Attribute("boolean")}
     said |= {"products": Attribute("text")} if POWER in present else {}
