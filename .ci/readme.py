@@ -1,6 +1,6 @@
 """Run the Python blocks of a Markdown file, in order, in one namespace.
 
-They run in a folder of their own, in which `lusee-bayes map fiducial --draws 100` has been run.
+They run in a folder of their own, in which `lusee-bayes map --draws 100` has been run.
 """
 
 import os
@@ -18,7 +18,7 @@ if not blocks:
     sys.exit(f"{sys.argv[1]} has no Python block to run")
 with tempfile.TemporaryDirectory() as folder:
     os.chdir(folder)
-    main(["map", "fiducial", "--draws", "100", "--quiet"])
+    main(["map", "--draws", "100", "--quiet"])
     for number, block in enumerate(blocks, 1):
         exec(compile(block, f"{sys.argv[1]} block {number}", "exec"), namespace)
     os.chdir("/")

@@ -112,7 +112,7 @@ def test_the_draws_of_the_readme_become_healpys(tmp_path, monkeypatch, no_figure
     blocks = [c for kind, c in FENCES.findall((ROOT / "README.md").read_text()) if kind == "python"]
     (block,) = [b for b in blocks if "read_draws" in b]
     monkeypatch.chdir(tmp_path)
-    run_command("lusee-bayes map fiducial --draws 100")
+    run_command("lusee-bayes map first_map --draws 100")
     made = {"lb": lb}
     exec(block, made)
     assert len(made["skies"]) == 100
