@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 from html.parser import HTMLParser
+from pathlib import Path
 
 import healpy
 import numpy as np
@@ -184,28 +185,14 @@ def test_a_page_without_groups(tmp_path, monkeypatch):
 
 # --- in a browser -------------------------------------------------------------------------------
 
-CHECK = """<script>
-const beyond = (e) => e.getBoundingClientRect().right > innerWidth + 1;
-const shown = [...document.querySelectorAll("img, canvas, dl, p, h1, h2")];
-const found = {
-  errors: window.problems, width: innerWidth, needed: document.documentElement.scrollWidth,
-  cut: shown.filter((e) => beyond(e) && !e.closest(".scroll, figure")).length, pixels: []};
-if (window.viewer) for (const [l, b] of POINTS) found.pixels.push(viewer.at(l, b));
-if (window.viewer) { viewer.choose(POINTS[0][0], POINTS[0][1]);
-  found.values = document.getElementById("viewer-values").textContent; }
-const text = document.createElement("pre"); text.id = "found";
-text.textContent = JSON.stringify(found); document.body.append(text);
-</script>"""
-LISTEN = """<script>window.problems = [];
-addEventListener("error", (e) => problems.push(String(e.message)));
-for (const kind of ["error", "warn"]) console[kind] = (...a) => problems.push(a.join(" "));
-</script>"""
+LISTEN, CHECK = (Path(__file__).parent / "in_browser.js").read_text().split("// ---")
 
 
 def in_browser(page: str, tmp_path, width: int, points) -> dict:
     """What a page says of itself in headless Chromium, at a width in pixels."""
     check = CHECK.replace("POINTS", json.dumps([list(map(float, p)) for p in points]))
-    text = page.replace("<style>", LISTEN + "<style>", 1).replace("</body>", check + "</body>")
+    text = page.replace("<style>", f"<script>{LISTEN}</script><style>", 1)
+    text = text.replace("</body>", f"<script>{check}</script></body>")
     (tmp_path / "inner.html").write_text(text)
     # a frame is as narrow as it is told, a window is not
     outer = (

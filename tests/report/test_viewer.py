@@ -7,6 +7,7 @@ import json
 import re
 import shutil
 import subprocess
+from pathlib import Path
 
 import astropy.units as u
 import healpy
@@ -23,32 +24,7 @@ from lusee_bayes.report.viewer import BUDGET, KERNEL_NSIDE, nside_of_page
 from lusee_bayes.results.finished_runs import read_channels
 
 NODE = shutil.which("node")
-# elements that remember; a canvas whose context keeps the last image
-STUB = """
-const elements = {};
-function element(id) {
-  if (elements[id]) return elements[id];
-  const context = new Proxy({ measureText: (t) => ({ width: 7 * t.length }),
-    createImageData: (w, h) => ({ data: new Uint8ClampedArray(4 * w * h), width: w, height: h }),
-    putImageData(image) { elements[id].image = image; },
-    fillText(text) { elements[id].texts.push(text); } },
-    { get: (o, k) => (k in o ? o[k] : () => {}), set: () => true });
-  const size = SIZES[id] || [400, 42];
-  return (elements[id] = { id, width: size[0], height: size[1], textContent: "", value: "",
-    texts: [], style: {}, options: [], listeners: {}, rows: [], getContext: () => context,
-    add(o) { this.options.push(o); if (!this.value) this.value = o.value; },
-    addEventListener(kind, f) { this.listeners[kind] = f; }, setAttribute() {},
-    replaceChildren() { this.rows = []; }, append(...x) { this.rows.push(...x); },
-    getBoundingClientRect: () => ({ left: 0, top: 0, width: size[0], height: size[1] }) });
-}
-const parts = [0, 1, 2].map((k) => ({ dataset: { channel: String(k) }, hidden: k > 0 }));
-const selectors = [element("first"), element("second")];
-globalThis.document = { getElementById: element, createElement: () => ({}),
-  querySelectorAll: (of) => (of === "select.channel" ? selectors : parts) };
-globalThis.Option = function (text, value) { this.text = text; this.value = value; };
-globalThis.window = globalThis;
-globalThis.requestAnimationFrame = (f) => f();
-"""
+DOCUMENT = (Path(__file__).parent / "document.js").read_text()
 SIZES = {"viewer-map": [400, 200], "viewer-psf": [120, 60]}
 
 
@@ -59,7 +35,7 @@ def run_page(page: str, tmp_path, commands: str) -> dict:
     scripts = re.findall(r"<script>\n(.*?)\n</script>", page, re.DOTALL)
     given = f"element('viewer-data').textContent = {json.dumps(data)};"
     last = "require('fs').writeFileSync('told.json', JSON.stringify(told));"
-    text = [STUB, given, *scripts, "const told = {};", commands, last]
+    text = [DOCUMENT, given, *scripts, "const told = {};", commands, last]
     (tmp_path / "page.js").write_text("\n".join(text).replace("SIZES", json.dumps(SIZES), 1))
     subprocess.run([NODE, "page.js"], cwd=tmp_path, check=True, timeout=120)
     return json.loads((tmp_path / "told.json").read_text())

@@ -75,13 +75,12 @@ def sky_maps(result: MapResult) -> Panels:
     """The maps of one channel, or of a few of many."""
     if result.single:
         return _figures(channel_panels(result.channel), result.channel)
-    shown = [result.channels[k] for k in _few_of(len(result.channels), SHOWN)]
-    return {
-        f"{channel.frequency_mhz:g} MHz: {title}": figure
-        for channel in shown
-        for title, figure in _figures(channel_panels(channel), channel).items()
-        if title.startswith("posterior")
-    }
+    figures: Panels = {}
+    for channel in (result.channels[k] for k in _few_of(len(result.channels), SHOWN)):
+        panels, mhz = channel_panels(channel), f"{channel.frequency_mhz:g} MHz"
+        posterior = {f"{mhz}: {t}": p for t, p in panels.items() if t.startswith("posterior")}
+        figures |= _figures(posterior, channel)
+    return figures
 
 
 def _figures(panels: Mapping[str, tuple], channel: ChannelResult) -> Panels:
