@@ -91,7 +91,7 @@ def _figures(panels: Mapping[str, tuple], channel: ChannelResult) -> Panels:
     }
 
 
-def spectra(result: MapResult) -> Figure:
+def spectra(result: MapResult) -> Figure | Panels:
     """Power spectra of a channel, or brightness against frequency of many."""
     return channel_spectra(result) if len(result.channels) > 1 else sky_spectra(result.channel)
 
@@ -275,10 +275,11 @@ def maps_of_runs(runs: Sequence[FinishedRun]) -> Panels:
     return figures
 
 
-def channel_spectra(cube: MapResult) -> Figure:
+def channel_spectra(cube: MapResult) -> Panels:
     """Brightness against frequency in some directions, with one standard deviation."""
-    figure, panels = drawing.framed((11, 7), 2, 2, sharex=True)
-    for axes, (name, values) in zip(panels.flat, cube.landmarks().items(), strict=True):
+    figures: Panels = {}
+    for name, values in cube.landmarks().items():
+        figures[name], axes = drawing.framed((5.6, 3.6))
         f, mean, std = cube.frequencies_mhz, values["mean"], values["std"]
         axes.errorbar(f, mean, std, color=BLUE, fmt=".", ms=4, lw=1, label="posterior")
         if "truth" in values:
@@ -288,8 +289,8 @@ def channel_spectra(cube: MapResult) -> Figure:
         axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
         axes.xaxis.set_minor_locator(NullLocator())
         axes.set(xlabel="frequency [MHz]", ylabel="brightness temperature [K]")
-    axes.legend(frameon=False)
-    return figure
+        axes.legend(frameon=False)
+    return figures
 
 
 def fidelity(cube: MapResult) -> Figure | Panels:
