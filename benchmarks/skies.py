@@ -63,7 +63,7 @@ class Mapped:
     pixels: Counts
     modes: Counts
     # chi^2 per direction of each of SUBSPACES, share of C_ell, pull of the mean temperature
-    known: tuple[float, ...]
+    ratios: tuple[float, ...]
     spectrum: float
     temperature: float
 
@@ -118,17 +118,17 @@ def judged(name: str, made: Conditioned, n_draws: int) -> Mapped:
     modes = Counts.of_modes(channel.std, error, deviations)
     left, directions = eigh(made.covariance, made.posterior.prior.covariance())
     chi2 = (directions.T @ error) ** 2 / left
-    known = tuple(float(chi2[left < share].mean()) for share in SUBSPACES)
+    ratios = tuple(float(chi2[left < share].mean()) for share in SUBSPACES)
     below = (power_spectrum(drawn) < power_spectrum(channel.truth)).mean(0)
     spectrum = float((np.abs(below[1:] - 0.5) < 0.34).mean())
-    return Mapped(name, channel, pixels, modes, known, spectrum, float(error[0] / channel.std[0]))
+    return Mapped(name, channel, pixels, modes, ratios, spectrum, float(error[0] / channel.std[0]))
 
 
 def summed_up(mapped: list[Mapped]) -> Table:
     """What is known best, the spectra and the mean temperatures, and their means."""
     names = (*(f"< {share}" for share in SUBSPACES), "C_ell in 68 %", "z of the mean T")
     table = Table("sky", *names, title="chi^2 per direction with so much of the prior's variance")
-    rows = np.array([(*sky.known, sky.spectrum, sky.temperature) for sky in mapped])
+    rows = np.array([(*sky.ratios, sky.spectrum, sky.temperature) for sky in mapped])
     for sky, row in zip(mapped, rows, strict=True):
         table.add_row(sky.name, *(f"{x:.2f}" for x in row))
     means = [*rows[:, :-1].mean(0), np.sqrt((rows[:, -1] ** 2).mean())]

@@ -178,7 +178,7 @@ class DenseChannels(NamedTuple):
     couplings: list[np.ndarray]
     templates: list[np.ndarray]
     noise: list[np.ndarray]
-    rest: list[np.ndarray]
+    data: list[np.ndarray]
     prior: list[np.ndarray]
 
     @classmethod

@@ -124,7 +124,7 @@ class _Channel(Messenger):
         follows from others
     """
 
-    def __init__(self, shared: SharedSites, channel: str, known: dict[str, dict[str, Any]]):
+    def __init__(self, shared: SharedSites, channel: str, site_values: dict[str, dict[str, Any]]):
         super().__init__()
         self.shared, self.channel, self.site_values = shared, channel, site_values
         # name and prior of what is shared, by site

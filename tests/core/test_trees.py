@@ -63,7 +63,7 @@ class Everything:
     asked: bool = False
     evidence: float | None = None
     labels: tuple[str, ...] = ()
-    told: dict[str, Any] = field(default_factory=dict)
+    notes: dict[str, Any] = field(default_factory=dict)
     rows: tuple[Row, ...] = ()
     remarks: tuple[Remark, ...] = ()
     inner: Inner
@@ -95,7 +95,7 @@ words = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=
 numbers = st.floats(width=64)
 whole = st.integers(-(2**40), 2**40)
 sizes = st.integers(0, 3)
-told = st.dictionaries(words, st.none() | st.booleans() | whole | words | st.lists(whole))
+notes = st.dictionaries(words, st.none() | st.booleans() | whole | words | st.lists(whole))
 
 
 def floats(*shape: int) -> st.SearchStrategy[np.ndarray]:
@@ -137,7 +137,7 @@ def everything(draw) -> Everything:
         asked=draw(st.booleans()),
         evidence=draw(st.none() | st.floats(allow_nan=False)),
         labels=tuple(draw(st.lists(words, max_size=3))),
-        told=draw(told),
+        notes=draw(notes),
         rows=tuple(draw(st.lists(rows, max_size=3))),
         remarks=tuple(draw(st.lists(st.builds(Remark, words, st.none() | words), max_size=3))),
         inner=draw(inner(part)),
@@ -248,7 +248,7 @@ def test_what_fields_ask_for_is_checked(changes, words):
 def test_what_is_absent_has_its_default():
     """As in a file of a version that did not have the field yet."""
     tree = to_tree(example())
-    for name in ("labels", "told", "open", "remarks"):
+    for name in ("labels", "notes", "open", "remarks"):
         del tree.attrs[name]
     del tree["rows"], tree["table"]
     expected = example(labels=(), rows=(), table=None)
@@ -278,8 +278,8 @@ DAMAGED = [
     (lambda t: t.attrs.update(name=3), "name is 3, expected text"),
     (lambda t: t.attrs.update(labels="{one"), "labels is '{one', expected JSON"),
     (lambda t: t.attrs.update(labels="[1, 2]"), "labels is '[1, 2]': Input should be a valid str"),
-    (lambda t: t.attrs.update(told="[]"), "told is '[]': Input should be a valid dict"),
-    (lambda t: t.attrs.update(told=5), "told is 5, expected text"),
+    (lambda t: t.attrs.update(notes="[]"), "notes is '[]': Input should be a valid dict"),
+    (lambda t: t.attrs.update(notes=5), "notes is 5, expected text"),
     (lambda t: put(t, "sky", np.ones((4, 4)), "mode", "mode_2"), "sky has shape (4, 4), expected"),
     (lambda t: put(t, "draws", np.ones((3, 5)), "draw", "other"), "expected draw x 4 (mode)"),
     (lambda t: put(t, "sky", np.ones(4, dtype=complex), "mode"), "sky has .* complex128, expe"),

@@ -144,7 +144,7 @@ def test_a_run_writes_them(experiment, tmp_path):
         assert text in page
 
 
-def known(setup: Setup) -> Setup:
+def at_truth(setup: Setup) -> Setup:
     """The same with receivers and ground that are known to be the truth."""
     noise, truth = setup.scenario.noise, true_values(setup)
     ignored = {"treatment": "ignored"}
@@ -165,13 +165,13 @@ def test_receivers_and_ground_that_are_not_known_cost_the_monopole_alone(respons
     for seed in range(20):
         experiment = drawn(first, seed)
         setup, data = experiment.setup, experiment.data
-        unknown, told = (lb.infer(Experiment(s, data)).posterior for s in (setup, known(setup)))
-        off = np.asarray(unknown.mean) - np.asarray(told.mean)
+        unknown, exact = (lb.infer(Experiment(s, data)).posterior for s in (setup, at_truth(setup)))
+        off = np.asarray(unknown.mean) - np.asarray(exact.mean)
         moved.append(off / np.asarray(unknown.std()))
     moved = np.abs(moved)
     assert moved[:, 1:].max() < 0.1 and moved[:, 0].max() > 0.1
     # taken for their prior means they move them by many: the test can tell
-    wrong = known(first)
+    wrong = at_truth(first)
     wrong = replace(wrong, scenario=wrong.scenario.model_copy(update={"seed": 19}))
     wrong = replace(wrong, background=first.background)
     off = np.asarray(lb.infer(Experiment(wrong, data)).posterior.mean) - np.asarray(unknown.mean)

@@ -126,14 +126,14 @@ def test_what_a_session_of_layout_4_says(newer):
 
 
 def test_families_that_are_not_used_are_named(newer, capsys):
-    def told():
+    def not_used():
         assert main(["info", str(newer)]) == 0
         return [line for line in capsys.readouterr().out.splitlines() if "not used" in line]
 
-    assert not told()
+    assert not not_used()
     rows = {"calibrator__zoom_spectra": 12, "tr_spectra": 2, "calibrator__data": 3}
     write_families(newer, **rows, grimm_spectra=1, housekeeping=4)
-    (line,) = told()
+    (line,) = not_used()
     for name, n in (("time-resolved spectra", 2), ("zoom spectra", 12), ("calibrator data", 3)):
         assert f"{name} ({n} rows)" in line
     assert "Grimm's spectra (1 row)" in line and "housekeeping (4 rows)" in line

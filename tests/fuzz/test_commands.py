@@ -24,7 +24,7 @@ SMALL = ("--set", "lmax=2", "--set", "observation.runs.0.cycles=0.02", "-q")
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
+def folder(tmp_path, monkeypatch):
     """An empty folder to work in."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("a file")
@@ -107,17 +107,17 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("line", "message"), WRONG, ids=lambda text: ascii(text)[:50])
-def test_wrong_input_is_a_sentence(line, message, here, capsys):
+def test_wrong_input_is_a_sentence(line, message, folder, capsys):
     words = line.split(" ")
     if words[1:2] == ["fiducial"]:
         words[2:2] = SMALL
-    before = sorted(p.name for p in here.rglob("*"))
+    before = sorted(p.name for p in folder.rglob("*"))
     said = refused(capsys, *words)
     assert re.search(message, said) and "Section" not in said, said
-    assert sorted(p.name for p in here.rglob("*")) == before
+    assert sorted(p.name for p in folder.rglob("*")) == before
 
 
-def test_results_of_another_run_stay(here, capsys, small_map):
+def test_results_of_another_run_stay(folder, capsys, small_map):
     """Another frequency into the same folder: refused, unless it is asked for."""
     before = {p: p.read_bytes() for p in small_map.folder.rglob("*") if p.is_file()}
     other = ("--set", "frequency_mhz=15", "-o", small_map.folder)
@@ -131,7 +131,7 @@ WORDS += ["lmax=2", "file", "pipe", ".", "/", "", "-1", "1e9", "--", "--help", "
 
 
 @pytest.mark.parametrize("n", [FEW, pytest.param(MANY, marks=pytest.mark.long)])
-def test_any_words(n, here, capsys, monkeypatch):
+def test_any_words(n, folder, capsys, monkeypatch):
     """The runs themselves are left out: what comes before them is tried."""
 
     def stop(*_, **__):
@@ -140,7 +140,7 @@ def test_any_words(n, here, capsys, monkeypatch):
     runs = {name: name for name in ("compare", "map", "paper", "plan", "sample")}
     for name, file in (runs | {"validate": "sample", "simulate": "data"}).items():
         monkeypatch.setattr(f"lusee_bayes.runs.{file}_run.run_{name}", stop)
-    before = sorted(p.name for p in here.rglob("*"))
+    before = sorted(p.name for p in folder.rglob("*"))
     commands = ["map", "sample", "simulate", "validate", "plan", "compare", "report", "info"]
 
     @settings(max_examples=n)
@@ -159,7 +159,7 @@ def test_any_words(n, here, capsys, monkeypatch):
             assert all(line.startswith("lusee-bayes: ") for line in told), said.err
 
     check()
-    assert sorted(p.name for p in here.rglob("*")) == before
+    assert sorted(p.name for p in folder.rglob("*")) == before
 
 
 # --- scenarios of any content are taken or refused, and come back as they were --------------------

@@ -140,7 +140,7 @@ def test_jax_has_the_same_beams_and_slopes_hold_the_ground(tables):
     assert np.isfinite(density_of(lb.build(setup.scenario), values))
 
 
-def found(table, step, seed):
+def judged_map(table, step, seed):
     """Judge a map through the grid of data that have the exact beams between its files."""
     truth, model = set_up(scenario(None, step, seed=seed)), scenario(table, step, seed=seed)
     experiment = lb.build(model, data=simulate(truth))
@@ -157,10 +157,10 @@ def found(table, step, seed):
 
 @pytest.mark.parametrize("seed", [1, *(pytest.param(k, marks=pytest.mark.long) for k in (2, 3))])
 def test_data_tell_parameters_between_files(tables, seed):
-    full, pulls, widths, error, said = found(tables[0.06], 0.06, seed)
+    full, pulls, widths, error, said = judged_map(tables[0.06], 0.06, seed)
     assert full < 1.3 and np.abs(pulls).max() < 3.0 and widths.max() < 0.4
     assert error < 0.1 and not said
-    full, pulls, _, error, said = found(tables[0.4], 0.4, seed)
+    full, pulls, _, error, said = judged_map(tables[0.4], 0.4, seed)
     assert full > 1.3 and np.abs(pulls).max() > 4.0
     assert error > 1.0 and "of surface_permittivity 3.7" in said[0]
 

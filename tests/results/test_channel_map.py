@@ -115,12 +115,12 @@ def run_of(bad, folder, **options):
 
 
 @pytest.fixture(scope="module")
-def found(bad, tmp_path_factory):
+def judged_run(bad, tmp_path_factory):
     return run_of(bad, tmp_path_factory.mktemp("bad") / "run")
 
 
-def test_groups_of_a_channel_are_judged_where_it_does_not_fit(found):
-    first, second, third = found.result.channels
+def test_groups_of_a_channel_are_judged_where_it_does_not_fit(judged_run):
+    first, second, third = judged_run.result.channels
     assert first.judged is None and third.judged is None
     assert first.diagnosis is None and third.diagnosis is None
     judged = second.judged
@@ -131,24 +131,24 @@ def test_groups_of_a_channel_are_judged_where_it_does_not_fit(found):
     assert second.diagnosis is not None and second.pointing is not None
 
 
-def test_they_are_named_wherever_the_verdict_is(found):
-    result, summary = found.result, FinishedRun.read(found.folder).summary
+def test_they_are_named_wherever_the_verdict_is(judged_run):
+    result, summary = judged_run.result, FinishedRun.read(judged_run.folder).summary
     assert result.fit.level == summary.level == "does not fit"
     assert f"25 MHz: {result.channels[1].judged.fit.details}" in result.verdict()
     assert summary.verdict == result.verdict()
     assert summary.channels[1].judged.suspects == list(result.channels[1].judged.suspects)
     assert summary.channels[0].judged is None
     assert any(line.startswith("25 MHz: ") for line in result.lines()[1:])
-    page = (found.folder / "report.html").read_text()
+    page = (judged_run.folder / "report.html").read_text()
     assert "Did you mean?" in page and "<tr class=bad><td>12R</td>" in page
     assert "groups were not tested" in page
-    assert (found.folder / "figures" / "groups.png").is_file()
+    assert (judged_run.folder / "figures" / "groups.png").is_file()
 
 
-def test_as_in_a_map_of_its_own(bad, found):
+def test_as_in_a_map_of_its_own(bad, judged_run):
     scenario, data = bad
     _, expected = mapped(lb.build(scenario.channels()[1], data[1]))
-    here, there = found.result.channels[1].judged, expected.judged
+    here, there = judged_run.result.channels[1].judged, expected.judged
     assert here.suspects == there.suspects and here.level == there.level
     np.testing.assert_allclose(here.z, there.z, rtol=0, atol=1e-6)
     for one, other in zip(here.groups, there.groups, strict=True):

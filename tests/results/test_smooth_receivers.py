@@ -73,14 +73,14 @@ def cube(scenario, folder):
 
 def solved(dense: DenseChannels, used: tuple[int, ...]) -> Answer:
     """Given the data of some channels: a sky and five unknowns of every one."""
-    n, size = len(dense.rest), N_MODES + N_OWN
+    n, size = len(dense.data), N_MODES + N_OWN
     root = np.linalg.cholesky(ties(FREQUENCIES))
     unmixed = block_diag(*(np.diag([*std, 0.0, 0.0, 0.0, 0.0, 1.0]) for std in dense.prior))
     for port in range(N_MODES, N_MODES + N_PORTS):
         unmixed[port::size, port::size] = root
     own = (np.concatenate(x, axis=1) for x in zip(dense.couplings, dense.templates, strict=True))
-    taken = np.repeat([k in used for k in range(n)], [len(rest) for rest in dense.rest])
-    every = (block_diag(*own), np.concatenate(dense.noise), np.concatenate(dense.rest))
+    taken = np.repeat([k in used for k in range(n)], [len(rest) for rest in dense.data])
+    every = (block_diag(*own), np.concatenate(dense.noise), np.concatenate(dense.data))
     rows, noise, rest = (x[taken] for x in every)
     white = white_posterior(rows @ unmixed, np.ones(n * size), noise, rest)
     return Answer(unmixed @ white.mean, unmixed @ white.covariance @ unmixed.T, white.log_prob)
@@ -114,7 +114,7 @@ def test_chi2_is_about_what_the_others_tell_of_the_receivers(cube, dense, expect
         others = solved(dense, tuple(j for j in range(3) if j != k))
         t, a, z = dense.templates[k], dense.couplings[k], part(k, sky=False)
         noise = np.diag(dense.noise[k] ** 2) + t @ others.covariance[z, z] @ t.T
-        rest = dense.rest[k] - t @ others.mean[z] - a @ expected.mean[part(k)]
+        rest = dense.data[k] - t @ others.mean[z] - a @ expected.mean[part(k)]
         chi2 = rest @ np.linalg.solve(noise, rest)
         information = a.T @ np.linalg.solve(noise, a)
         degrees = len(rest) - np.vdot(information, expected.covariance[part(k), part(k)])
@@ -281,7 +281,7 @@ def test_in_a_joint_posterior_they_are_those_of_all_skies_and_unknowns(
     skies[:, N_MODES : 4 * N_MODES] = np.eye(3 * N_MODES)
     a = block_diag(*dense.couplings) @ skies
     a[:, 4 * N_MODES :] = block_diag(*dense.templates) @ unmixed[4 * N_MODES :, 4 * N_MODES :]
-    noise, rest = np.concatenate(dense.noise), np.concatenate(dense.rest)
+    noise, rest = np.concatenate(dense.noise), np.concatenate(dense.data)
     expected = white_posterior(a, stds, noise, rest)
     experiments = [lb.build(channel) for channel in scenario.channels()]
     tables = [unknowns_report(e, lb.infer(e)).table for e in experiments]

@@ -35,10 +35,10 @@ if __name__ == "__main__":
 """
 
 
-def wait_for(there, seconds=60):
+def wait_for(condition, seconds=60):
     """Until it is so."""
     deadline = time.monotonic() + seconds
-    while not there():
+    while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.01)
 
@@ -128,11 +128,11 @@ def finished(folder: Path) -> dict[str, int]:
 
 
 def when_some_are_there(process: subprocess.Popen, folder: Path, n: int = 3):
-    def there():
+    def enough():
         assert process.poll() is None, process.communicate()
         return len(finished(folder)) >= n
 
-    wait_for(there, 120)
+    wait_for(enough, 120)
 
 
 def goes_on(cluster: Cluster, folder: Path, *more):
