@@ -612,7 +612,7 @@ def keys_command(key: str = "", *, markdown: Flag = False, schema: Flag = False)
 
 @app.command(name="scenarios", group="Scenarios")
 def scenarios_command() -> None:
-    """List the scenarios of the package.
+    """List the built-in scenarios.
 
     **Examples**
 
@@ -627,7 +627,7 @@ def scenarios_command() -> None:
 
 @app.command(name="init", group="Scenarios")
 def init_command(file: Path, *, like: str = FIRST_MAP, force: Flag = False) -> None:
-    """Write a scenario with comments, to be changed.
+    """Write a commented scenario to edit.
 
     **Examples**
 
@@ -637,11 +637,11 @@ def init_command(file: Path, *, like: str = FIRST_MAP, force: Flag = False) -> N
     Parameters
     ----------
     file
-        The YAML file to write.
+        YAML file to write.
     like
-        The scenario of the package to begin with.
+        Built-in scenario to start from.
     force
-        Replace the file if it exists.
+        Overwrite an existing file.
     """
     from lusee_bayes.core.files import replacing, require_new
     from lusee_bayes.experiment.scenario import scenario_text

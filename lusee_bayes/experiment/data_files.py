@@ -117,7 +117,7 @@ def are_sessions(data: Data) -> bool:
     sessions = [is_session(require_file(path, "data", HINT)) for path in files]
     if len(files) > 1 and not all(sessions):
         odd = files[sessions.index(False)]
-        raise InputError(f"'{odd}' is no session of the spectrometer; give other data as one file")
+        raise InputError(f"'{odd}' is not a spectrometer session; give other data as one file")
     return bool(files) and all(sessions)
 
 

@@ -276,7 +276,7 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
     def require_free(cls: type[Systematic]) -> None:
         if cls.treatment(experiment.scenario) == "marginalised":
             raise InputError(
-                "the program samples what the scenario marginalises, which would count twice; set "
+                "the program samples an unknown that the scenario marginalises, too; set "
                 f"{cls.key}.treatment=sampled"
             )
 

@@ -1,8 +1,8 @@
 """Sections of a scenario on the instrument.
 
-They say where, when and with which turntable angles; the beams, and what is connected to their
+They specify site, times and turntable angles; the beams, and the receivers at their
 ports. How sessions of the spectrometer become visibilities is a section of
-:mod:`lusee_bayes.flight.recipe`. Beams and receivers have one section for each kind, told by
+:mod:`lusee_bayes.flight.recipe`. Beams and receivers have one section for each kind, selected by
 ``model``. A new kind of beams is a subclass of :class:`BaseBeamSection` here, with its
 :class:`BeamSource`, and its name in ``BEAM_SECTIONS``.
 """
@@ -113,8 +113,8 @@ class ObservationSection(Section):
         for name in ("start", "runs"):
             if getattr(self, name) != type(self).model_fields[name].default:
                 raise ValueError(
-                    f"schedule {self.schedule} says when data are taken, and so does {name}; leave "
-                    "out one of them"
+                    f"schedule {self.schedule} and {name} both set the observing times; remove one "
+                    "of them"
                 )
         return self
 

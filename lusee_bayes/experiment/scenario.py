@@ -47,7 +47,7 @@ def apply_override(tree: dict[str, Any], override: str) -> None:
             node[place] = {}
         node = node[place]
         if not isinstance(node, dict | list):
-            raise InputError(f"--set {override}: '{parent}' holds a value, not a section")
+            raise InputError(f"--set {override}: '{parent}' is a value, not a section")
     node[_place(node, last, override)] = parse_yaml(text, f"--set {override}: the value")
 
 
@@ -217,7 +217,7 @@ class Scenario(Section):
     @classmethod
     def _nside_is_healpix(cls, nside: int | None) -> int | None:
         if nside is not None and nside & (nside - 1):
-            raise ValueError("a power of two is expected, as HEALPix's ring maps have it")
+            raise ValueError("expected a power of two, as HEALPix requires")
         return nside
 
     @model_validator(mode="after")
@@ -225,32 +225,32 @@ class Scenario(Section):
         many, own_sources = self.frequencies_mhz, self.sources.list
         prior, error = self.prior, self.noise.beam
         if any(b <= a for a, b in pairwise(many)):
-            raise ValueError("frequencies_mhz must grow from one to the next")
+            raise ValueError("frequencies_mhz must increase")
         if self.joint and not many:
             raise ValueError("joint needs frequencies_mhz, the channels that share a posterior")
         if self.joint:
             self.spectral.require_channels(len(many))
         if self.sky.sources and own_sources:
             raise ValueError(
-                "the embedded sky holds the catalogue's sources already; with sources.list of its "
-                "own, set sky.sources=false"
+                "the embedded sky already contains the catalogue's sources; set sky.sources=false "
+                "to use your own sources.list"
             )
         if error is not None and error.parameters and not self.beam.has_parameters:
             raise ValueError(
-                "noise.beam.parameters are those of the embedded antennas, which beam.file "
+                "noise.beam.parameters describe the embedded antennas, which beam.file "
                 "replaces; use noise.beam.shift_mhz or noise.beam.file, or files over a grid of "
                 "parameters (beam.model=grid)"
             )
         if (self.beam.is_file or (error is not None and error.file is not None)) and own_sources:
             raise ValueError(
-                "sources.list needs the exact beams of the embedded antennas; leave out beam.file "
+                "sources.list needs the exact beams of the embedded antennas; remove beam.file "
                 "and noise.beam.file, or the sources"
             )
         if self.joint and prior.has_files:
-            raise ValueError("joint takes the spectral prior; leave out the files of the prior")
+            raise ValueError("joint uses the spectral prior; remove the files of the prior")
         if many and prior.has_files and prior.file_frequency_mhz is None:
             raise ValueError(
-                "the files of the prior are of one frequency; with frequencies_mhz, say which in "
+                "the files of the prior are for one frequency; with frequencies_mhz, give it as "
                 "prior.file_frequency_mhz"
             )
         return self
@@ -311,7 +311,7 @@ class Scenario(Section):
         """InputError where what makes maps is to sample something."""
         if self.samples:
             raise InputError(
-                f"the scenario says that something is to be sampled, and {what} can only "
+                f"in this scenario something is to be sampled, but {what} can only "
                 f"marginalise; {advice}"
             )
 
@@ -387,5 +387,5 @@ def _read_yaml(source: str | Path) -> dict[Any, Any]:
         )
     tree = {} if tree is None else tree
     if not isinstance(tree, dict):
-        raise InputError(f"{source} must hold keys and values, got a {type(tree).__name__}")
+        raise InputError(f"{source} must contain keys and values, got a {type(tree).__name__}")
     return tree

@@ -2,7 +2,7 @@
 
 Sky and prior have one section for each kind, selected by ``model``. A new kind is a class here,
 which is a :class:`SkySource` or has a :class:`Prior`, and its name in ``SKY_SECTIONS`` or
-``PRIOR_SECTIONS``. The prior on skies of several frequencies has a section of its own.
+``PRIOR_SECTIONS``. The prior on skies of several frequencies has a separate section.
 """
 
 from __future__ import annotations
@@ -145,8 +145,8 @@ class IsotropicPriorSection(SpectrumSection):
             not section.is_learned
             or (not section.samples and section.scale == 1.0 and section.mean_file is None)
         ),
-        "a learned C_ell has no scale, no mean_file and nothing to sample; give spectrum=sky or a "
-        "spectrum_file with them",
+        "scale, mean_file and sampled parameters modify a known C_ell, not a learned one; give "
+        "spectrum=sky or a spectrum_file with them",
     )
 
     @property
@@ -253,7 +253,7 @@ class LogNormalSection(Section):
 
     _both_or_neither = requires(
         lambda section: (section.amplitude is None) == (section.tilt is None),
-        "give both amplitude and tilt, or neither, and they are sampled",
+        "give both amplitude and tilt, or neither to sample them",
     )
 
     def prior(self, frequency_mhz: float, lmax: int) -> LogNormalPrior:

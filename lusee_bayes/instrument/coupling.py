@@ -106,7 +106,7 @@ class Coupling(Described, eqx.Module):
         """
         require_shape("the direction", direction, self.shape)
         if direction.response is not None:
-            raise InputError("the direction must have no response of its own")
+            raise InputError("the direction must be a matrix without a separate response")
         return DenseCoupling(self._matrix() + amplitude * direction.dense(), response=self.response)
 
     @abstractmethod

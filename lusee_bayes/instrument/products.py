@@ -175,7 +175,7 @@ def real_products(data: Any, products: Any, flags: Any, convention: str, n_anten
     if np.isinf(data[~absent]).any():
         first = np.argwhere(np.isinf(data) & ~absent)[0]
         raise InputError(
-            f"the data contain infinity at time {first[0]}, product {first[1]}; flag such samples"
+            f"the data contain infinity at time {first[0]}, product {first[1]}; flag these samples"
         )
     columns: list[tuple[str, np.ndarray]] = []
     for (i, j, part), values, gone in zip(ports_and_parts, data.T, absent.T, strict=True):
@@ -227,7 +227,7 @@ def _columns(products: Any, is_complex: bool, n_antennas: int) -> list[tuple[int
                 "n_antennas for more ports"
             )
         if is_complex and part:
-            raise InputError(f"the data are complex; name the ports of '{name}' alone, '{i}{j}'")
+            raise InputError(f"the data are complex; replace '{name}' by its ports, '{i}{j}'")
         if not is_complex and not part and i != j:
             raise InputError(f"the data are real; name the part of '{name}', {name}R or {name}I")
         if i == j and part == "I":

@@ -173,7 +173,7 @@ def normal_matrix(
     if not has_structure(coupling, noise):
         raise InputError(
             f"{type(noise).__name__} has no structure in time to compute A^T N^-1 A with, or the "
-            "coupling has a response of its own; use the dense form"
+            "coupling has a separate response; use the dense form"
         )
     factor = noise.factor() if factor is None else factor
     return NORMAL_MATRICES[type(noise)](*on_host((coupling, noise, factor)))

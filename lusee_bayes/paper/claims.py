@@ -414,7 +414,7 @@ def _half_cycle(cases: Cases) -> Verdict:
     half, full = cases["half_cycle"], cases["fiducial"]
     share = ever_up(half).sum() / ever_up(full).sum()
     data, of_full = (case.attrs["n_data"] / case.attrs["n_modes"] for case in (half, full))
-    text = f"half a cycle sees {100 * share:.1f} % of what a full one sees, {data:.2f} data "
+    text = f"half a cycle sees {100 * share:.1f} % of a full one's sky, {data:.2f} data "
     text += f"per mode (full {of_full:.2f}); SNR < 1 from ell {cross(half)}"
     return grade(text, bool(share > 0.98 and data > 1), bool(share > 0.9))
 
@@ -447,7 +447,7 @@ def claim_table(cases: Cases) -> list[dict[str, object]]:
     rows = []
     for claim in CLAIMS:
         row = {"section": claim.section, "paper": claim.paper} | asdict(claim.verdict(cases))
-        rows.append(row | {"reason": "it holds" if row["agrees"] == "yes" else claim.otherwise})
+        rows.append(row | {"reason": "agrees" if row["agrees"] == "yes" else claim.otherwise})
     return rows
 
 
@@ -455,7 +455,7 @@ def claims_as_markdown(rows: Sequence[Mapping[str, object]]) -> str:
     """The claims as a table, with a count of the verdicts above it."""
     verdicts = [row["agrees"] for row in rows]
     counts = ", ".join(f"{verdicts.count(v)} {v}" for v in ("yes", "partly", "no"))
-    head = "| section | the paper says | obtained | agrees | if not, why |\n" + "| --- " * 5 + "|\n"
+    head = "| section | claim | obtained | agrees | if not, why |\n" + "| --- " * 5 + "|\n"
     lines = []
     for row in rows:
         cells = [str(value).replace("|", "\\|") for value in row.values()]

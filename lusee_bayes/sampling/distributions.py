@@ -170,8 +170,8 @@ class TimesStudentT(Prediction):
         if self.factor.couples_times:
             raise InputError(
                 "a Student-t for every time needs noise without correlation in time, not "
-                f"{type(noise).__name__}; sample what correlates times (gains, receivers, sources) "
-                "instead of marginalising it, or leave it out"
+                f"{type(noise).__name__}; sample the terms that correlate times (gains, receivers, "
+                "sources) instead of marginalising them, or remove them"
             )
         self.layout = layout
         self.nu = nu

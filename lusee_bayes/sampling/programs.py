@@ -170,7 +170,7 @@ def load_program(source: str | Path) -> Program:
     for name, argument in asked.items():
         if argument.kind not in (argument.POSITIONAL_OR_KEYWORD, argument.KEYWORD_ONLY):
             raise InputError(
-                f"model in '{path}' takes '{name}' by position, or variably many; arguments are "
+                f"model in '{path}' has the positional or starred argument '{name}'; arguments are "
                 "passed by name: def model(coupling, prior, noise, data=None)"
             )
         if name != DATA and name not in pieces:
@@ -337,7 +337,7 @@ def require_sampleable(
         drawn = latent_sites(program.model, {**arguments, DATA: None})
     if DATA not in drawn:
         raise InputError(
-            f"{who} draws no data where data=None; sample('data', ..., obs=data) in both cases"
+            f"{who} draws no data if data=None; sample('data', ..., obs=data) in both cases"
         )
     if differing := {*drawn} ^ {*latent, DATA}:
         raise InputError(

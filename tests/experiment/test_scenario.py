@@ -85,7 +85,7 @@ REFUSED = [
     # what --set takes
     ("seed", "--set takes key.path=value, got 'seed'"),
     ("observation.runs.3.cycles=1", "'3' is not one of the entries 0..0"),
-    ("lmax.x=1", "'lmax' holds a value, not a section"),
+    ("lmax.x=1", "'lmax' is a value, not a section"),
     ("seed=[", "not valid YAML"),
     # entries of another kind, and those that have to be there
     ("beam.receiver=open", "fiducial: beam: receiver belongs to model response, grid, not"),
@@ -109,11 +109,11 @@ REFUSED = [
     ("sky.sources=true sources.list=[{name: Cas A}]", "set sky.sources=false"),
     ("sources.list=[{name: Cas A}, {name: Vir A}, {name: Cas A}]", "'Cas A' is listed twice"),
     ("sources.list=[{name: X, ra_deg: 10}]", "give both ra_deg and dec_deg, or none"),
-    (f"prior.spectrum_file=a.txt {FOUR}", "say which in prior.file_frequency_mhz"),
-    (f"prior.spectrum_file=a.txt {FOUR} joint=true", "joint takes the spectral prior"),
+    (f"prior.spectrum_file=a.txt {FOUR}", "give it as prior.file_frequency_mhz"),
+    (f"prior.spectrum_file=a.txt {FOUR} joint=true", "joint uses the spectral prior"),
     (f"frequencies_mhz=[10] joint=true spectral={POSITIVE}", "2 fields .* need at least as many"),
-    (SCHEDULE % "start: 2027-01-16", "says when data are taken, and so does start"),
-    (SCHEDULE % "runs: [{cycles: 2}]", "and so does runs; leave out one of them"),
+    (SCHEDULE % "start: 2027-01-16", "and start both set the observing times"),
+    (SCHEDULE % "runs: [{cycles: 2}]", "and runs both set the observing times"),
     (SCHEDULE % "fixed_axis: true", "add window: instant"),
     ("observation.schedule=12", "observation.schedule"),
 ]  # fmt: skip
@@ -129,7 +129,7 @@ def test_errors_name_what_is_wrong(overrides, message):
 
 def test_errors_of_the_file_itself(short):
     refuse("no scenario 'fiducail'.*did you mean 'fiducial'", load_scenario, "fiducail")
-    refuse("must hold keys and values, got a list", short, "- 1\n")
+    refuse("must contain keys and values, got a list", short, "- 1\n")
     refuse("not valid YAML", short, "a: [1\n")
 
 

@@ -265,7 +265,7 @@ def test_what_cannot_be_is_refused(coupling, instrument, base, pointing):
     # a direction has no gains, and the same samples
     one, plus = jnp.ones(()), base.coupling.plus
     error = instrument.coupling_of(instrument.beams())
-    refuse("no response of its own", plus, one, error.with_response(jnp.ones(error.shape[0])))
+    refuse("without a separate response", plus, one, error.with_response(jnp.ones(error.shape[0])))
     complete = lb.CouplingMatrix.build(instrument.beams(), pointing)
     refuse("contain different samples", plus, one, complete)
     wide = DenseCoupling(jnp.ones((3, 2)))

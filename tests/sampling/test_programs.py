@@ -302,7 +302,7 @@ BAD = {
     ),
     "no data": (
         '    if data is not None:\n        numpyro.sample("data", dist.Normal(loc, 1), obs=data)\n',
-        "draws no data where data=None",
+        "draws no data if data=None",
     ),
     "unobserved": ('    numpyro.sample("data", dist.Normal(loc, 1))\n', "no observed site 'data'"),
 }  # fmt: skip
@@ -351,7 +351,7 @@ def test_bad_programs_are_one_sentence(name, write, pieces):
 @pytest.mark.parametrize("argument", ["coupling, /, ", "*, coupling, *noise, ", "**others, "])
 def test_arguments_are_given_by_name(argument, write):
     path = write(f"def model({argument}data=None):\n    pass\n")
-    refuse("fails when it is loaded|by position, or variably many", lb.load_program, path)
+    refuse("fails when it is loaded|positional or starred argument", lb.load_program, path)
 
 
 def test_a_density_that_is_nan_names_the_program(tmp_path, capsys):
