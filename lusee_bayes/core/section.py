@@ -94,7 +94,7 @@ class Section(BaseModel):
 
 
 def requires(holds: Callable[[Any], Any], message: str) -> Any:
-    """A validator of a section: ValueError with this message unless a rule holds of it."""
+    """A validator of a section: ValueError with this message unless it obeys a rule."""
 
     def checked(section: Any) -> Any:
         if not holds(section):
@@ -146,7 +146,7 @@ def without_other_kinds(tree: dict[str, Any], kinds: Kinds, *, strict: bool) -> 
     """A section's entries without those that only other kinds of it have.
 
     Scenarios that were written with all keys, or in which one kind is put in another's place by
-    ``--set``, still hold the keys of the other kind.
+    ``--set``, still contain the keys of the other kind.
 
     Parameters
     ----------

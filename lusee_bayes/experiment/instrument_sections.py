@@ -294,7 +294,7 @@ class _LuseepySection(_FileSection):
     moon_temperature_k: Temperature = 0.0
 
     def asked(self) -> dict[str, Any]:
-        """What is asked of every file, as its beams take it."""
+        """Settings of every file, as its beams accept them."""
         luseepys = self.quadrature == "luseepy"
         options = {"luseepy_quadrature": luseepys, "moon_k": self.moon_temperature_k}
         return options | self.model_dump(include={"interpolation", "turntable_offset_deg"})
@@ -388,7 +388,7 @@ class SampledBeamSection(_FileSection):
 
 
 class GridBeamSection(ScalarBeamSection, ResponseSection, SampledBeamSection):
-    """Beams from files on a grid of parameters; each file uses the keys of its own kind.
+    """Beams from files on a grid of parameters; each file uses the keys of its kind.
 
     Attributes
     ----------
@@ -419,7 +419,7 @@ BEAM_SECTIONS = kinds_of(
 
 
 def _complete_beam(tree: dict[str, Any]) -> None:
-    """``beam: {file: ...}`` without a model, as scenarios had it before: the file tells."""
+    """``beam: {file: ...}`` without a model, as in older scenarios: the file decides."""
     default = MonopoleBeamSection.model_fields["model"].default
     tree["model"] = tree.get("model") or default
     file = tree.get("file")

@@ -1,6 +1,6 @@
 """A scenario: everything that determines a run, as YAML, validated before anything is computed.
 
-``--set key.path=value`` changes one entry. What is wrong with a scenario is said in one sentence;
+``--set key.path=value`` changes one entry. A mistake in a scenario is reported in one sentence;
 unknown keys are errors that name the nearest known one. ``to_yaml`` writes the resolved scenario,
 defaults included; running that file again gives the same numbers.
 """
@@ -61,7 +61,7 @@ def _place(node: dict[str, Any] | list[Any], key: str, override: str) -> int | s
 
 
 def one_sentence(error: ValidationError, source: str, model: type[BaseModel]) -> str:
-    """What was found, what was expected and where, for the first thing that is wrong.
+    """The first mistake: the entry, its value and the expected one.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def _resolved(
     """The path as a user writes it, and the section that its last key belongs to, of every kind.
 
     pydantic puts the ``model`` of a section that comes in several kinds into the path. A key may be
-    meant for another kind than the one that was found: ``sky.fil=X`` is taken for a galaxy's.
+    meant for another kind than the one that was found: ``sky.fil=X`` is read as a key of a galaxy's.
     """
     path: list[str] = []
     section: type[BaseModel] | None = model
@@ -257,7 +257,7 @@ class Scenario(Section):
 
     @property
     def shared(self) -> dict[str, float]:
-        """What channels share of the instrument: words and octaves."""
+        """Unknowns of the instrument that channels share: words and octaves."""
         if not self.frequencies_mhz:
             return {}
         return {
@@ -291,7 +291,7 @@ class Scenario(Section):
         return not self.frequencies_mhz
 
     def channels(self) -> tuple[Scenario, ...]:
-        """The scenario of every channel; draws of each have a seed of their own, one further."""
+        """The scenario of every channel; the seeds of their draws differ by one."""
         alone: dict[str, Any] = {"frequencies_mhz": (), "joint": False}
         if self.joint:  # theirs is the spectral prior, of the sky's own C_ell
             alone["prior"] = sky_sections.IsotropicPriorSection(spectrum="sky")

@@ -151,7 +151,7 @@ class IsotropicPriorSection(SpectrumSection):
 
     @property
     def is_learned(self) -> bool:
-        """Whether the data tell C_ell."""
+        """Whether C_ell is learned from the data."""
         return self.spectrum == "learned" and self.spectrum_file is None
 
     def family(self, frequency_mhz: float, lmax: int) -> PriorFamily | None:
@@ -371,7 +371,7 @@ class SpectralSection(Section):
         return PositiveSkies.of(*skies, sources=sources, **options)
 
     def n_maps(self, frequencies_mhz: tuple[float, ...]) -> int:
-        """How many maps the skies of these channels are made of."""
+        """Number of maps from which the skies of these channels are composed."""
         if self.model == "positive":
             return len(self.fields)
         if self.model == "components":
