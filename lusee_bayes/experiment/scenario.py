@@ -103,7 +103,7 @@ def _resolved(
     """The path as a user writes it, and the section that its last key belongs to, of every kind.
 
     pydantic puts the ``model`` of a section that comes in several kinds into the path. A key may be
-    meant for another kind than the one that was found: ``sky.fil=X`` is read as a key of a galaxy's.
+    meant for another kind than the one found: ``sky.fil=X`` is read as a key of a galaxy's.
     """
     path: list[str] = []
     section: type[BaseModel] | None = model

@@ -62,7 +62,7 @@ WRONG = [
     ("compare-priors fiducial --priors isotropic,isotropic", "at least two different ones"),
     ("compare-priors fiducial --priors isotropic,isotropic-sky --data file", "scenario's sky"),
     ("compare-priors fiducial --set frequencies_mhz=[10,20]", "works on a single frequency"),
-    ("compare-priors fiducial --set prior.tilt_std=0.1", "something is to be sampled"),
+    ("compare-priors fiducial --set prior.tilt_std=0.1", "to be sampled, but"),
     ("plan fiducial fiducial", "'fiducial' is listed twice; list each once"),
     ("plan fiducial --vary lmax", "--vary expects key.path=value,value"),
     ("plan fiducial --vary lmx=3,4", "unknown key 'lmx'; did you mean 'lmax'"),

@@ -24,7 +24,10 @@ from lusee_bayes.report.viewer import BUDGET, KERNEL_NSIDE, nside_of_page
 from lusee_bayes.results.finished_runs import read_channels
 
 NODE = shutil.which("node")
-DOCUMENT = (Path(__file__).parent / "document.js").read_text()
+HERE = Path(__file__).parent
+DOCUMENT = (HERE / "document.js").read_text()
+_, *PARTS = re.split("// === ([a-z]+)\n", (HERE / "on_the_page.js").read_text())
+PARTS = dict(zip(PARTS[::2], PARTS[1::2], strict=True))
 SIZES = {"viewer-map": [400, 200], "viewer-psf": [120, 60]}
 
 
@@ -125,22 +128,7 @@ def test_point_spread_functions_are_those_of_the_posterior(which, request, tmp_p
 
 @needs_node
 def test_what_a_direction_and_the_pointer_tell(page, tmp_path):
-    told = run_page(
-        page,
-        tmp_path,
-        """viewer.choose(280, -30);
-        told.rows = elements["viewer-values"].rows.map((one) => one.textContent);
-        elements["viewer-map"].listeners.pointermove({ clientX: 200, clientY: 100, buttons: 0 });
-        told.hover = elements["viewer-hover"].textContent;
-        told.texts = elements["viewer-map"].texts;
-        told.options = elements["viewer-layer"].options.map((one) => one.value);
-        told.ticks = [viewer.ticks(1, 1000, true), viewer.ticks(-4, 4, false),
-          viewer.ticks(3700, 6300, true)];
-        const seen = (id) => elements[id].image.data.filter((x, k) => k % 4 === 3 && x).length;
-        told.seen = [seen("viewer-map"), seen("viewer-psf")];
-        elements["viewer-in"].listeners.click();
-        told.zoomed = seen("viewer-map");""",
-    )
+    told = run_page(page, tmp_path, PARTS["pointer"])
     # of each row the name and the value
     told["rows"] = dict(zip(told["rows"][::2], told["rows"][1::2], strict=True))
     assert {"right ascension, declination (ICRS)", "ever above the horizon"} <= set(told["rows"])
@@ -173,23 +161,8 @@ def test_channels_of_the_page_are_those_of_the_files(small_cube, tmp_path):
     rng = np.random.default_rng(3)
     lon, lat = rng.uniform(0, 360, 40), np.degrees(np.arcsin(rng.uniform(-1, 1, 40)))
     points = json.dumps(np.stack([lon, lat], 1).tolist())
-    told = run_page(
-        page,
-        tmp_path,
-        f"""told.at = [0, 1, 2].map((k) => {points}.map((p) => viewer.at(...p, k)));
-        told.texts = [0, 2].map((k) => {{
-          elements["viewer-channel"].value = k;
-          elements["viewer-channel"].listeners.input();
-          return elements["viewer-frequency"].textContent;
-        }});
-        told.options = elements["viewer-layer"].options.map((one) => one.value);
-        told.rows = elements["viewer-values"].rows.map((one) => one.textContent);
-        told.hidden = parts.map((one) => one.hidden);
-        elements["second"].value = 1;
-        elements["second"].listeners.input();
-        told.chosen = ["viewer-channel", "first"].map((id) => elements[id].value);
-        told.shown = parts.map((one) => !one.hidden);""",
-    )
+    commands = f"const points = {points};" + PARTS["channels"]
+    told = run_page(page, tmp_path, commands)
     # the slider, and every selector of the page, choose the channel that is told of
     assert told["hidden"] == [True, True, False] and told["chosen"] == [1, 1]
     assert told["shown"] == [False, True, False]
@@ -214,19 +187,7 @@ def test_keys_move_the_direction_and_parts_are_those_that_the_page_has(which, re
     many = which == "small_cube"
     assert ('id="viewer-channel"' in page, 'id="viewer-spectrum"' in page) == (many, many)
     assert ('id="viewer-psf"' in page) != many and ('class="channel"' in page) == many
-    told = run_page(
-        page,
-        tmp_path,
-        """const place = () => ["l", "b"].map((name) => Number(elements[`viewer-${name}`].value));
-        const press = (key) => {
-          elements["viewer-map"].listeners.keydown({ key, preventDefault() {} });
-          return place();
-        };
-        told.places = [place(), ...["ArrowLeft", "ArrowUp", "ArrowRight", "ArrowDown"].map(press)];
-        elements["viewer-l"].value = "30"; elements["viewer-b"].value = "-45";
-        elements["viewer-l"].listeners.change();
-        told.rows = elements["viewer-values"].rows.map((one) => one.textContent);""",
-    )
+    told = run_page(page, tmp_path, PARTS["keys"])
     assert told["places"] == [[0, 0], [2, 0], [2, 2], [0, 2], [0, 0]]
     assert "30.00°, -45.00°" in told["rows"]
     assert ("peak of the point-spread function" in told["rows"]) != many
