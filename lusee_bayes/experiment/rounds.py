@@ -53,6 +53,8 @@ FAR_OFF, OTHER_WAYS = 10.0, 6
 # of so many instruments each other way begins with the likeliest; rounds that leave more than this
 # part of what chi^2 is too large by do not lead to one that fits
 CANDIDATES, STALLED = 8, 0.5
+# so many such rounds one after the other are the last
+IDLE = 3
 # the part of the values found that these keep, way after way: where most are right, half are the
 # quickest, and where they all are wrong, none
 KEPT = 0.5, 0.0
@@ -217,7 +219,8 @@ def settled(
     Returns
     -------
     Inference
-        Of the last round. Where the map does not settle in 30 rounds, ``unsettled`` says so.
+        Of the last round. Where the map does not settle in 30 rounds, or no instrument fits and
+        rounds lead no nearer to one, ``unsettled`` says so.
 
     Raises
     ------
@@ -239,9 +242,10 @@ def settled(
             start = replace(start, values={n: v for n, v in values if n not in fixed})
         start = beginning(setup, data, start.values)
     inference, step = _nearby(setup, data, start, report)
-    moves, n_learned, learned, in_rounds = np.inf, 0, None, rebuilds(setup)
+    moves, n_learned, learned, in_rounds, idle = np.inf, 0, None, rebuilds(setup), 0
     while True:
-        last, at_rest = not in_rounds or inference.rounds >= MAX_ROUNDS, moves < SETTLED
+        last = not in_rounds or inference.rounds >= MAX_ROUNDS or idle == IDLE
+        at_rest = moves < SETTLED
         if learn is not None and n_learned < MAX_LEARNED and (at_rest or last or learned is None):
             before = None if learned is None or not learned.settled else learned.parameters
             learned, n_learned = learn(inference.solution.information, before), n_learned + 1
@@ -255,10 +259,13 @@ def settled(
             break
         around, step = _around(setup, inference, step)
         mean, n, as_learned = inference.posterior.mean, inference.rounds + 1, inference.learned
+        excess = inference.excess
         del inference  # its N
         inference = replace(_conditioned(setup, data, around, n), learned=as_learned)
         report(inference.rounds, inference.remark)
         moves = inference.moves_from(mean) if around.tempered == 1.0 else np.inf
+        hopeless = inference.moving and inference.excess > STALLED * excess and not inference.fits
+        idle = idle + 1 if hopeless else 0
     if at_rest or not in_rounds:
         return inference
     keys = [f"{cls.key}.treatment=sampled" for cls in first_order(setup.scenario)]
