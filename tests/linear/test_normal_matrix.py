@@ -119,7 +119,7 @@ def test_what_has_no_structure_is_refused():
     for noise in (dense, dense + cov.LowRankCovariance(jnp.ones((layout.size, 1)))):
         refuse("no structure in time", normal_matrix, coupling, noise)
     response = coupling.with_response(jnp.ones(layout.size))
-    refuse("response of its own", normal_matrix, response, diagonal)
+    refuse("separate response", normal_matrix, response, diagonal)
     refuse("N has shape", normal_matrix, coupling, lb.DiagonalCovariance(jnp.ones(7)))
 
 
