@@ -178,7 +178,7 @@ def test_a_report_has_the_share_of_the_variance_that_they_add(tmp_path):
     assert summary["shares"] == pytest.approx(theta.shares, rel=1e-12)
     page = (run.folder / "report.html").read_text(encoding="utf-8")
     assert "<td>field_error_1</td><td>48</td>" in page and "Posterior of pairs of unknowns" in page
-    assert "Galactic maps of the fraction of the variance" in page
+    assert "fraction of the variance due to unknowns" in page
 
 
 @pytest.mark.long

@@ -135,7 +135,7 @@
       const text = `${frequencies[state.channel]} MHz`;
       element("frequency").textContent = text;
       slider.setAttribute("aria-valuetext", text);
-      // what the page says of each channel
+      // the parts of the page that belong to one channel
       for (const part of document.querySelectorAll("[data-channel]")) {
         part.hidden = Number(part.dataset.channel) !== state.channel;
       }
@@ -318,7 +318,7 @@
   });
   select();
   choose(0, 0);
-  // for checks of the page: what is shown of a direction, in degrees
+  // for checks of the page: the values shown in a direction, in degrees
   window.viewer = {
     choose: (l, b) => choose(radians(l), radians(b)),
     at: (l, b, channel = 0) => {
