@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from rich.box import SIMPLE
 from rich.markup import escape
 from rich.table import Table
 
@@ -53,7 +54,7 @@ def checks_table(checks: list[Check]) -> Table:
 
 def table_of_numbers(header: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
     """A table with a column of names and columns of numbers."""
-    table = Table()
+    table = Table(box=SIMPLE, padding=(0, 1, 0, 0))  # ten columns fit a terminal of 80
     for number, name in enumerate(header):
         table.add_column(escape(name), justify="right" if number else "left", overflow="fold")
     for row in rows:
@@ -63,7 +64,7 @@ def table_of_numbers(header: Sequence[str], rows: Iterable[Sequence[str]]) -> Ta
 
 def comparison_table(runs: Sequence[FinishedRun]) -> Table:
     """A comparison of finished runs."""
-    header = "run", "MHz", "verdict", "SNR<1 at ell", "bits", "ln evidence", "- best"
+    header = "run", "MHz", "verdict", "SNR<1\nat ell", "bits", "ln\nevidence", "-\nbest"
     rows = [
         (
             run.name,
@@ -78,4 +79,4 @@ def comparison_table(runs: Sequence[FinishedRun]) -> Table:
         )
         for run, row in zip(runs, comparison_rows(runs), strict=True)
     ]
-    return table_of_numbers((*header, "p instr.", "p prior"), rows)
+    return table_of_numbers((*header, "p\ninstr.", "p\nprior"), rows)
