@@ -1,7 +1,7 @@
 """Sky and gain drifts together: d = (1 + g_i(t)) (1 + g_j(t)) (A m)_ij + n, exactly.
 
-The drifts are Gaussian processes g_i = sigma_g h_i made of white noise (site ``gain_noise``);
-``gains`` (antennas, times) is kept with the draws.
+The drifts are Gaussian processes g_i = sigma_g h_i built from white noise (site ``gain_noise``);
+``gains`` (antennas, times) is stored with the draws.
 """
 
 import numpyro

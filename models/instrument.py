@@ -1,7 +1,7 @@
-"""The ground, the antennas and the map from one run: the sky is integrated out for every beam.
+"""Ground, antennas and map from one run: the sky is integrated out for every beam.
 
-Change the names and priors to those of your own question; ``instrument.coupling`` takes every
-parameter of the embedded antennas, or of a grid of beam files (docs/files.md).
+Adapt the names and priors to your question. ``instrument.coupling`` accepts every parameter of the
+embedded antennas, or of a grid of beam files (docs/files.md).
 """
 
 import numpyro
@@ -11,7 +11,7 @@ import lusee_bayes as lb
 
 
 def model(instrument, gaussian, data=None):
-    """``gaussian``: S and N; its A is replaced by that of the sampled antennas."""
+    """``gaussian``: S and N; the sampled antennas' A replaces its A."""
     values = {
         "surface_permittivity": dist.Uniform(2.5, 5.0),
         "deep_permittivity": dist.Uniform(5.0, 8.0),

@@ -1,7 +1,7 @@
-"""How strong the sky is, and how steep its spectrum: C_ell -> A C_ell ((ell + 1) / 10)^tilt.
+"""Amplitude and tilt of the sky's power spectrum: C_ell -> A C_ell ((ell + 1) / 10)^tilt.
 
-A (``amplitude``) and ``tilt`` are sampled with the sky integrated out, the sky is then drawn given
-each of them: its uncertainty holds theirs.
+A (``amplitude``) and ``tilt`` are sampled with the sky integrated out. A sky is then drawn given
+each sample, so that the sky's uncertainty includes theirs.
 """
 
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ import lusee_bayes as lb
 
 
 def model(coupling, offset, prior, noise, data=None):
-    """``prior``: the spectrum that A = 1 and tilt = 0 stand for."""
+    """``prior``: the spectrum for A = 1 and tilt = 0."""
     amplitude = numpyro.sample("amplitude", dist.LogNormal(0.0, 0.5))
     tilt = numpyro.sample("tilt", dist.Normal(0.0, 0.5))
     ell = jnp.arange(float(prior.spectrum.shape[0]))

@@ -1,7 +1,7 @@
-"""The data alone, the sky integrated out: d ~ N(0, A S A^T + N), with free noise level.
+"""The data with the sky integrated out: d ~ N(offset, A S A^T + N), with free noise level.
 
-The sky needs no sampling: given each sampled noise level its draws are exact. Returning the linear
-Gaussian model is what asks for them.
+The sky needs no sampling: it is drawn exactly given each sampled noise level. Returning the linear
+Gaussian model requests these draws.
 """
 
 import numpyro

@@ -1,6 +1,6 @@
-"""Point sources of unknown flux beside the map: d = A m + sum_s f_s t_s + n.
+"""Point sources of unknown flux in addition to the map: d = A m + sum_s f_s t_s + n.
 
-One site for each source of the scenario (``flux_Cas_A``, in K sr). The sky, now without the
+Each source of the scenario has one site (``flux_Cas_A``, in K sr). The sky, now without the
 sources, is integrated out.
 """
 

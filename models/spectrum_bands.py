@@ -1,4 +1,4 @@
-"""The power spectrum in free bands: C_ell times one factor for every band of ells."""
+"""The power spectrum in free bands: C_ell times one factor per band of ells."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -7,12 +7,12 @@ from numpyro import distributions as dist
 
 import lusee_bayes as lb
 
-# the first ell of every band but the lowest; those above the highest ell are left out
+# the first ell of every band except the lowest; bands above the highest ell are ignored
 EDGES = np.array([1, 3, 6, 12, 24])
 
 
 def model(coupling, offset, prior, noise, data=None):
-    """``prior``: the spectrum that factors of one stand for; ln of each is uncertain by 1."""
+    """``prior``: the spectrum when all factors are one; ln of each factor is uncertain by 1."""
     n_ells = prior.spectrum.shape[0]
     edges = EDGES[n_ells > EDGES]
     band = np.searchsorted(edges, np.arange(n_ells), side="right")

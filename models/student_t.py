@@ -1,16 +1,16 @@
-"""The sky and data with bad times: m ~ N(0, S), d_t ~ N((A m)_t, N_t / w_t), w_t integrated out.
+"""Sky and data with bad times: m ~ N(0, S), d_t ~ N((A m)_t, N_t / w_t), w_t integrated out.
 
-The data of every time are a multivariate Student-t: a burst gets a small weight w_t, and needs no
-flag. ``weight`` (times), kept with the draws, is what each time counts for: about 1 where the data
-fit, 1e-3 where they are 30 sigma off.
+The data of every time follow a multivariate Student-t: a burst gets a small weight w_t and needs no
+flag. ``weight`` (times), stored with the draws, is the weight of each time: about 1 where the data
+fit, 1e-3 where they deviate by 30 sigma.
 """
 
 import numpyro
 
 import lusee_bayes as lb
 
-# nu is fixed: a few strong bursts would pull it down to about 2, and with it the weights of the
-# good times towards chance
+# nu is fixed: a few strong bursts would pull it down to about 2, and make the weights of good times
+# nearly random
 FREEDOM = 4.0
 
 

@@ -1,7 +1,7 @@
-"""Whatever the scenario says is to be sampled, and the sky: ``treatment: sampled``.
+"""The sky and everything that the scenario samples (``treatment: sampled``).
 
-The sky is integrated out, and drawn exactly for every draw of the others, unless these are so many
-(gain drifts, errors of fields) that they are better sampled together with the sky.
+The sky is integrated out, and drawn exactly for every draw of the other parameters. If these are
+numerous (gain drifts, errors of fields), it is more efficient to sample the sky with them.
 """
 
 import numpyro
@@ -10,7 +10,7 @@ import lusee_bayes as lb
 
 
 def model(gaussian, systematics, data=None):
-    """``gaussian``: the model without ``systematics``, which are applied one after the other."""
+    """``gaussian``: the model without ``systematics``, which are applied one after another."""
     for systematic in systematics:
         gaussian = systematic.sampled(gaussian)
     if lb.sky_is_sampled(systematics):

@@ -1,1 +1,1 @@
-"""What every other folder needs: checks, harmonics, rotations, linear algebra, files, progress."""
+"""Basics for all other folders: checks, harmonics, rotations, linear algebra, files, progress."""

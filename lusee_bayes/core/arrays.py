@@ -1,13 +1,13 @@
-"""One text for NumPy and for JAX.
+"""The same functions for NumPy and for JAX.
 
-What prepares a run needs neither derivatives nor a GPU, and compiling it takes a thousand times
-longer than computing it. Functions that may also be differentiated are written once, with the array
-namespace of their input (as in the array API standard): of NumPy arrays they make NumPy arrays at
-once; of JAX arrays and tracers they make JAX arrays, in one compiled program.
+Preparing a run needs neither derivatives nor a GPU, and compiling it takes a thousand times longer
+than computing it. Functions that may also be differentiated are written once, with the array
+namespace of their input (as in the array API standard). They return NumPy arrays for NumPy arrays,
+without compiling, and JAX arrays for JAX arrays and tracers, from one compiled program.
 
 JAX keeps compiled programs from one run to the next in the user's cache folder
-(:func:`use_compilation_cache`). ``LUSEE_BAYES_CACHE`` names another folder, or says ``off``; a
-cache that JAX itself has been told to use is left alone.
+(:func:`use_compilation_cache`). ``LUSEE_BAYES_CACHE`` names another folder, or is ``off``. A cache
+that is configured in JAX itself takes precedence.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from jaxtyping import Bool, Float
 from platformdirs import user_cache_path
 
 Array = jax.Array | np.ndarray
-# arrays that recur, with their shapes
+# recurring array types, with their shapes
 DataVector = Float[Array, " data"]
 Grid = Float[Array, "products times"]
 Times = Float[np.ndarray, " times"]
@@ -38,7 +38,7 @@ RowFlags = Bool[np.ndarray, " rows"]
 GridFlags = Bool[np.ndarray, "products times"]
 TimeFlags = Bool[np.ndarray, " times"]
 Modes = Float[Array, " modes"]
-# of one field, or of any number of fields
+# coefficients of one field or of several
 Fields = Float[Array, "*batch modes"]
 ModesMatrix = Float[Array, "modes modes"]
 Draws = Float[np.ndarray, "draws modes"]
@@ -46,7 +46,7 @@ Ells = Float[np.ndarray, " ells"]
 Pixels = Float[np.ndarray, " pixels"]
 Vector = Float[np.ndarray, " n"]
 Square = Float[np.ndarray, "n n"]
-# of parameters, by name
+# parameter values by name
 Values = Mapping[str, float | Float[Array, ""]]
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -54,7 +54,7 @@ T = TypeVar("T")
 
 
 def namespace(*arrays: Any) -> ModuleType:
-    """Return jax.numpy if one of the arrays, or of the leaves of trees, is JAX's; else numpy."""
+    """Return jax.numpy if any array, or any leaf of a tree, is a JAX array; else numpy."""
     return jnp if _of_jax(arrays) else np
 
 
@@ -66,14 +66,14 @@ def as_complex(real: Array, imaginary: Array) -> Array:
 
 
 def scalar(value: Any) -> Array:
-    """Convert a number to a float64 array of JAX: a run value that it traces, not structure."""
+    """Convert a number to a float64 JAX array: a value that JAX traces, not part of the program."""
     return jnp.asarray(value, dtype=jnp.float64)
 
 
 def compiled(function: F) -> F:
-    """Compile a function for JAX arrays; with NumPy arrays alone it runs as it is.
+    """Compile a function for JAX arrays; with NumPy arrays only, run it without compiling.
 
-    Other arguments than arrays are constants of the program.
+    Arguments other than arrays are constants of the program.
     """
     jitted = eqx.filter_jit(function)
 
@@ -85,7 +85,7 @@ def compiled(function: F) -> F:
 
 
 def placed(array: Array, where: Any, values: Array) -> Array:
-    """Return the array with values at an index; a NumPy array is changed in place."""
+    """Return the array with values set at an index; a NumPy array is changed in place."""
     if namespace(array, values) is not np:
         return array.at[where].set(values)
     array[where] = values
@@ -93,12 +93,12 @@ def placed(array: Array, where: Any, values: Array) -> Array:
 
 
 def on_device(tree: T) -> T:
-    """Return the same tree with JAX arrays in place of NumPy's."""
+    """Return the tree with its NumPy arrays converted to JAX arrays."""
     return jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, tree)
 
 
 def on_host(tree: T) -> T:
-    """Return the same tree with NumPy arrays in place of JAX's, on a CPU without copying them."""
+    """Return the tree with its JAX arrays converted to NumPy arrays, without a copy on a CPU."""
     return jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, tree)
 
 
@@ -107,24 +107,24 @@ def _of_jax(tree: Any) -> bool:
 
 
 SWITCH, OFF = "LUSEE_BAYES_CACHE", "off"
-# the level of XLA's messages, and what JAX sets where it is imported before this package: XLA then
-# warns of every program that it finds in the cache, in red
+# XLA's log level, and the value that JAX sets if it is imported before this package: XLA then
+# warns, in red, about every program that it finds in the cache
 MESSAGES, CHATTY = "TF_CPP_MIN_LOG_LEVEL", "1"
 SETTINGS = {
-    # a map needs some 10 MB; the size makes JAX lock the folder, which several processes may use
+    # a map needs some 10 MB; with a size limit JAX locks the folder, so that processes can share it
     "jax_compilation_cache_max_size": 500_000_000,
     "jax_persistent_cache_min_compile_time_secs": 0.0,
     "jax_persistent_cache_min_entry_size_bytes": -1,
-    # the names of XLA's own caches, which lie in the folder, would enter the names of programs
+    # the paths of XLA's own caches, inside this folder, would become part of the programs' names
     "jax_persistent_cache_enable_xla_caches": "none",
 }
 
 
 def use_compilation_cache() -> None:
-    """Let JAX keep what it compiles from now on.
+    """Let JAX keep every program that it compiles from now on.
 
-    Does nothing where JAX was imported before this package: XLA would warn of every program that it
-    finds, and reads the level of its messages no more.
+    Does nothing if JAX was imported before this package: XLA would warn about every cached program,
+    and no longer reads its log level.
     """
     wanted = os.environ.get(SWITCH, "")
     is_set = jax.config.jax_compilation_cache_dir is not None
@@ -134,14 +134,14 @@ def use_compilation_cache() -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
-        # a home that cannot be written to: programs are compiled anew
+        # the home folder is not writable: compile every time
         return
     for name, value in {**SETTINGS, "jax_compilation_cache_dir": str(folder)}.items():
         jax.config.update(name, value)
 
 
 def _machine() -> str:
-    """A name for what programs are compiled for: those of one processor may fail on another."""
+    """A name for the processor: programs compiled for one processor may fail on another."""
     features, info = platform.processor(), Path("/proc/cpuinfo")
     if info.is_file():
         lines = info.read_text(encoding="utf-8").splitlines()

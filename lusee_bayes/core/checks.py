@@ -1,10 +1,9 @@
-"""Checks of input that raise one clear sentence where bad input enters.
+"""Input checks that raise one clear sentence at the point where bad input enters.
 
-Inside a JAX transformation an array is a tracer and its values are not known: the checks of values
-pass it through, those of dtype and shape do not.
+Inside a JAX transformation, an array is a tracer without known values. Checks of values then let it
+pass; checks of dtype and shape still apply.
 
-An object that is :class:`Described` says what it is in about three lines, for a prompt and for a
-notebook.
+A :class:`Described` object describes itself in about three lines, for a prompt or a notebook.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ def is_traced(*arrays: Any) -> bool:
 
 
 def require_whole(name: str, value: Any, least: int, most: int) -> None:
-    """Check that a number is whole and in a range.
+    """Check that a number is an integer within a range.
 
     Parameters
     ----------
@@ -36,7 +35,7 @@ def require_whole(name: str, value: Any, least: int, most: int) -> None:
     Raises
     ------
     InputError
-        If it is not; libraries in C may end the process for such a number.
+        If it is not; C libraries may crash the process on such a number.
     """
     whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
     if not (whole and least <= value <= most):
@@ -44,7 +43,7 @@ def require_whole(name: str, value: Any, least: int, most: int) -> None:
 
 
 def require_float64(name: str, array: Any) -> None:
-    """Check that an array holds 64-bit floats; Lambda's condition number is about 1e10.
+    """Check that an array is float64; Lambda's condition number is about 1e10.
 
     Parameters
     ----------
@@ -95,7 +94,7 @@ def _first_offenders(bad: np.ndarray) -> str:
 
 
 def require_finite(name: str, array: Any) -> None:
-    """Check that an array holds no NaN and no infinity.
+    """Check that an array contains no NaN or infinity.
 
     Parameters
     ----------
@@ -107,7 +106,7 @@ def require_finite(name: str, array: Any) -> None:
     Raises
     ------
     InputError
-        If an entry is not finite; the message names the first ones.
+        If an entry is not finite; the message lists the first such entries.
     """
     if is_traced(array):
         return
@@ -119,17 +118,17 @@ def require_finite(name: str, array: Any) -> None:
 
 
 def require_array(name: str, array: Any, shape: tuple[int | None, ...] | None = None) -> None:
-    """Check that an array holds finite 64-bit floats, and its shape where one is given.
+    """Check that an array is float64 and finite and, if a shape is given, has that shape.
 
     Parameters
     ----------
     name, array, shape
-        As of :func:`require_float64`, :func:`require_shape` and :func:`require_finite`.
+        As in :func:`require_float64`, :func:`require_shape` and :func:`require_finite`.
 
     Raises
     ------
     InputError
-        As these do.
+        As in these functions.
     """
     require_float64(name, array)
     if shape is not None:
@@ -147,7 +146,7 @@ def require_positive(name: str, array: Any, hint: str = "") -> None:
     array : float or array
         Not checked if it is a tracer.
     hint : str
-        What to do about it, added to the message.
+        Advice to append to the message.
 
     Raises
     ------
@@ -163,13 +162,13 @@ def require_positive(name: str, array: Any, hint: str = "") -> None:
         raise InputError(f"{name} must be positive, {detail}" + (f"; {hint}" if hint else ""))
 
 
-# a matrix that is meant to be symmetric differs from its transpose by rounding, relative to its
+# largest difference by rounding between a symmetric matrix and its transpose, relative to the
 # largest entry
 SYMMETRY_TOLERANCE = 1e-12
 
 
 def require_symmetric(name: str, matrices: Any) -> None:
-    """Check that a matrix, or each of a stack, is symmetric.
+    """Check that a matrix, or every matrix of a stack, is symmetric.
 
     Parameters
     ----------
@@ -196,26 +195,26 @@ def require_symmetric(name: str, matrices: Any) -> None:
 
 
 class Described:
-    """An object that says what it is: its kind, shapes, units, frequencies, dates.
+    """An object that describes itself: its kind, shapes, units, frequencies and dates.
 
-    Dataclasses need ``repr=False``, or they write a representation of their own.
+    Dataclasses need ``repr=False``; otherwise they generate their own representation.
     """
 
     @abstractmethod
     def description(self) -> tuple[str, ...]:
-        """Return a few lines: first what the object is, then what it holds."""
+        """Return a few lines: first the kind of object, then its contents."""
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}: " + "\n  ".join(self.description())
 
 
 def number(value: Any, form: str = ".6g") -> str:
-    """Return a number as text; of a tracer, whose value is not known, that it is one."""
+    """Format a number; a tracer, whose value is unknown, becomes ``traced``."""
     return "traced" if is_traced(value) else format(float(value), form)
 
 
 def extent(values: Any, unit: str, form: str = ".4g") -> str:
-    """Return the smallest and the largest of some numbers with their unit."""
+    """Format the range of some numbers, with their unit."""
     if is_traced(values):
         return f"values in {unit}, traced"
     values = np.asarray(values)
@@ -223,7 +222,7 @@ def extent(values: Any, unit: str, form: str = ".4g") -> str:
 
 
 def listed(names: tuple[str, ...], shown: int = 4) -> str:
-    """Return names one after the other, the middle of many left out."""
+    """Join names with commas; of a long list, omit the middle."""
     if len(names) <= 2 * shown:
         return ", ".join(names)
     return ", ".join([*names[:shown], "...", *names[-2:]])

@@ -1,9 +1,9 @@
-"""The tasks of a run on the workers of Dask.
+"""Run tasks on Dask workers.
 
-Tasks are functions of files: what they share is written into the run's folder, and so is what they
-find out. So Dask carries no more than numbers of tasks, and the sums of a reduction. Whatever
-worker, scheduler or command ends, nothing is lost that was finished. A task whose worker ends is
-repeated elsewhere, by Dask.
+Tasks are functions of files: their shared input and their results are files in the run's folder.
+Dask transfers only the numbers of tasks and the sums of a reduction. Finished work therefore
+survives the end of any worker, of the scheduler or of the command. If a worker ends, Dask repeats
+its task elsewhere.
 """
 
 from __future__ import annotations
@@ -37,27 +37,27 @@ from lusee_bayes.core.files import scratch_folder
 from lusee_bayes.core.progress import Stages, gigabytes, memory_limit
 from lusee_bayes.core.version import __version__
 
-# of a task that fails: memory or disk may have been full
+# retries of a failed task: memory or disk may have been full
 REPEATS = 3
 ENVIRONMENT = "distributed.nanny.pre-spawn-environ"
-# seconds in which a scheduler has to answer
+# seconds within which a scheduler has to answer
 ANSWER_S = 10.0
 
 _reading = Lock()
 
 
 class DaskEngine(engine.Engine):
-    """Carries tasks out on the workers of a Dask cluster.
+    """Runs tasks on the workers of a Dask cluster.
 
-    The workers have this package and share a disk with this process: tasks write into the run's
-    folder.
+    The workers need this package and a disk shared with this process, because tasks write into the
+    run's folder.
 
     Parameters
     ----------
     client : distributed.Client
-        Of the cluster; it stays open.
+        Client of the cluster; it stays open.
     demand : Demand, optional
-        What the tasks take; workers whose memory would not suffice are refused.
+        Memory that the tasks need; workers with too little memory are refused.
     """
 
     def __init__(self, client: distributed.Client, demand: engine.Demand | None = None):
@@ -79,10 +79,10 @@ class DaskEngine(engine.Engine):
 
     def reduced(self, tasks: Tasks[T, R], merge: Merge[R], stages: Stages, stage: str) -> R:
         with self._submitted(tasks, merge, stages, stage) as (job, futures, finished):
-            # before other tasks, so that few parts wait
+            # merges go before other tasks, so that few parts wait
             merged = partial(self._submit, run_merge, job, priority=1)
             total = engine.merged_as_tree(iter(futures), len(futures), merged)
-            # what the tasks give is left with the workers
+            # results of tasks stay on the workers; only errors are fetched
             for _, future in finished:
                 if future.status != "finished":
                     future.result()
@@ -95,11 +95,11 @@ class DaskEngine(engine.Engine):
     def _submitted(
         self, tasks: Tasks[T, R], merge: Merge[R] | None, stages: Stages, stage: str
     ) -> Iterator[tuple[Path, list[distributed.Future], Iterator[tuple[int, distributed.Future]]]]:
-        """Give all tasks to the workers, and say in a sentence which of them end.
+        """Submit all tasks, and report in one sentence any worker that ends.
 
-        Yields the file with what the tasks share, where the workers see it; their futures; and
-        these again with their numbers as they finish, well or not. Then the list is emptied, so
-        that results are freed.
+        Yields the job file, which the workers can read; the futures of all tasks; and an iterator
+        over numbers and futures as tasks finish, successfully or not. Starting the iterator empties
+        the list, so that results are freed.
         """
         if self._folder is None:
             raise RuntimeError("the engine has no folder: call work_in first")
@@ -131,7 +131,7 @@ class DaskEngine(engine.Engine):
                 cloudpickle.dump((os.getpid(), tasks.function, tasks.items, merge), file)
             futures = [self._submit(run_task, job, number) for number in range(len(tasks.items))]
             numbers |= {future.key: number for number, future in enumerate(futures)}
-            # closed at once if something is raised
+            # closed immediately if an error is raised
             with closing(finished()) as by_number:
                 yield job, futures, by_number
         except distributed.KilledWorker as error:
@@ -163,8 +163,8 @@ def run_merge(job: Path, one: Any, other: Any) -> Any:
 
 
 def read_job(path: Path) -> tuple[Callable[..., Any], Any, Any]:
-    """Function, items and merging of a job, read once by every worker."""
-    # both threads of a worker need it at the same time
+    """Function, items and merge of a job; every worker reads them once."""
+    # both threads of a worker need them at the same time
     with _reading:
         return _read_job(path)
 
@@ -174,33 +174,33 @@ def _read_job(path: Path) -> tuple[Callable[..., Any], Any, Any]:
     with path.open("rb") as file:
         command, *job = pickle.load(file)
     if os.getpid() != command:
-        # this process works as one of a command does
+        # configure this worker like the process of a command
         gc.set_threshold(100_000, 20, 100)
         use_compilation_cache()
-        # xarray would ask the scheduler for a lock for every file, over a client of its own
+        # otherwise xarray asks the scheduler for a lock per file, through another client
         dask.config.set(scheduler="threads")
     return tuple(job)
 
 
 def code_versions() -> str:
-    """Those that code is sent between processes by."""
+    """Versions that command and workers must share to exchange code."""
     return f"lusee_bayes {__version__} and Python {sys.version_info.major}.{sys.version_info.minor}"
 
 
 def refusal_of(
     wanted: str, folder: Path, demand: engine.Demand | None, dask_worker: distributed.Worker
 ) -> str | None:
-    """Why a worker cannot do what a command asks for, in one sentence; None if it can.
+    """The reason why a worker cannot serve a command, in one sentence; None if it can.
 
     Parameters
     ----------
     wanted : str
         The command's :func:`code_versions`.
     folder : Path
-        Of the run.
+        Folder of the run.
     demand : Demand or None
     dask_worker : distributed.Worker
-        Dask gives the worker to an argument of this name.
+        Dask passes the worker to an argument with this name.
     """
     if code_versions() != wanted:
         return f"it has {code_versions()}, the command {wanted}; install the same versions on both"
@@ -217,12 +217,12 @@ def refusal_of(
 
 @contextmanager
 def own_workers(n: int, demand: engine.Demand) -> Iterator[distributed.LocalCluster]:
-    """A cluster of this machine alone, whose processors and memory its workers share.
+    """A cluster on this machine; its workers divide the processors and the memory.
 
     Raises
     ------
     InputError
-        If they do not fit into the memory.
+        If the workers do not fit into the memory.
     """
     side_by_side = min(demand.side_by_side, max(1, engine.processors() // n))
     needed = n * demand.process_bytes(side_by_side)
@@ -232,15 +232,15 @@ def own_workers(n: int, demand: engine.Demand) -> Iterator[distributed.LocalClus
             f"{gigabytes(memory_limit())}: use fewer"
         )
     settings = {
-        # Dask makes glibc return memory early (MALLOC_TRIM_THRESHOLD_), which fixes at 128 kB the
-        # size from which every array is new memory that the system clears: a third more time for a
-        # channel; this is the largest size
+        # Dask makes glibc return memory early (MALLOC_TRIM_THRESHOLD_). This also fixes at 128 kB
+        # the size above which the system maps and clears new memory for every array, and a channel
+        # takes a third longer; 32 MB is the largest size allowed
         f"{ENVIRONMENT}.MALLOC_MMAP_THRESHOLD_": 32 << 20,
         f"{ENVIRONMENT}.OPENBLAS_NUM_THREADS": max(1, engine.processors() // (n * side_by_side)),
-        # no worker has tasks that wait for others
+        # no worker queues tasks that another could run
         "distributed.scheduler.worker-saturation": 1.0,
     }
-    # Ctrl-C ends the command, which ends them: they do not hear it
+    # workers ignore Ctrl-C: it ends the command, which then ends them
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         with dask.config.set(settings):
@@ -256,7 +256,7 @@ def own_workers(n: int, demand: engine.Demand) -> Iterator[distributed.LocalClus
 
 @contextmanager
 def connected(place: str | distributed.LocalCluster, demand: engine.Demand) -> Iterator[DaskEngine]:
-    """The engine of a cluster, which is connected to during the block.
+    """The engine of a cluster, connected during the block.
 
     Parameters
     ----------
@@ -271,7 +271,7 @@ def connected(place: str | distributed.LocalCluster, demand: engine.Demand) -> I
     """
     if isinstance(place, str):
         _require_answer(place)
-    # what Dask would write into the terminal is said in one sentence
+    # silence Dask's log: errors become one sentence
     for name in [name for name in logging.root.manager.loggerDict if "distributed" in name]:
         logging.getLogger(name).setLevel(logging.CRITICAL + 1)
     with distributed.Client(place, timeout=ANSWER_S, set_as_default=False) as client:
@@ -279,7 +279,7 @@ def connected(place: str | distributed.LocalCluster, demand: engine.Demand) -> I
 
 
 def _require_answer(address: str) -> None:
-    """Ask a scheduler who it is; a Client waits for ever where connections meet silence."""
+    """Ask a scheduler for its identity; a Client waits forever if nothing answers."""
 
     async def ask() -> None:
         arguments = distributed.Security().get_connection_args("client")
@@ -287,12 +287,12 @@ def _require_answer(address: str) -> None:
             await asyncio.wait_for(server.identity(), ANSWER_S)
 
     try:
-        # in a thread: this one may have a loop that runs, as in a notebook
+        # in a new thread: this one may have a running event loop, as in a notebook
         with engine.threads(1) as pool:
             pool.submit(asyncio.run, ask()).result()
     except (OSError, ValueError, TypeError, MemoryError) as error:
-        # TypeError: TLS without certificates; MemoryError: Dask reads the length of a message from
-        # whatever a web server answers
+        # TypeError: TLS without certificates; MemoryError: Dask reads the answer of a web server as
+        # the length of a message
         why = " ".join(str(error).split())[:200] or f"silent for {ANSWER_S:g} s"
         raise InputError(
             f"no Dask scheduler answers at '{address}' ({why}); start one with: dask scheduler, "

@@ -1,14 +1,13 @@
-"""The independent tasks of a run, and what carries them out.
+"""The independent tasks of a run, and the engines that run them.
 
-A run of many channels, scenarios or data sets is a list of tasks that do not wait for each other,
-and here and there a sum over all of them. An engine carries them out: in threads of this process,
-or on the workers of Dask (:mod:`.dask_engine`). What a sum adds to what does not depend on it, so
-that the numbers are the same to the last bit wherever they are made, by the same number of threads
-for products of matrices.
+A run over many channels, scenarios or data sets is a list of independent tasks, sometimes followed
+by a sum over all of them. An engine runs the tasks in threads of this process or on Dask workers
+(:mod:`.dask_engine`). The order of summation does not depend on the engine. Results are therefore
+identical to the last bit everywhere, if matrix products use the same number of threads.
 
-Smaller pieces of work run in as many threads as there are processors (:func:`in_threads`). NumPy
-and LAPACK (:mod:`.linalg`) let other threads go on while they compute. A thread with one processor
-of its own does more than two that share both for every product of matrices.
+Smaller pieces of work run in up to one thread per processor (:func:`in_threads`). NumPy and LAPACK
+(:mod:`.linalg`) release the interpreter's lock while they compute. Two threads with one processor
+each achieve more than two threads that share both processors for every matrix product.
 """
 
 from __future__ import annotations
@@ -31,35 +30,36 @@ from threadpoolctl import threadpool_limits
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages, memory_limit
 
-# each has its own memory to work in
+# most threads at once: each needs its own working memory
 MOST = 8
 
 T = TypeVar("T")
 R = TypeVar("R")
-# of two results
+# combines two results
 Merge = Callable[[R, R], R]
 
 
 def processors() -> int:
-    """How many processors this process may use."""
+    """The number of processors that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def in_threads(function: Callable[[T], R], items: Sequence[T]) -> list[R]:
-    """Call a function with every item; what it gives, in their order.
+    """Call a function with every item, in parallel threads.
 
     Parameters
     ----------
     function : callable
-        Safe to be called by several threads.
+        Must be thread-safe.
     items : sequence
         Its arguments.
 
     Returns
     -------
     list
+        Results in the order of the items.
     """
     n_threads = min(len(items), processors(), MOST)
     if n_threads < 2:
@@ -70,7 +70,7 @@ def in_threads(function: Callable[[T], R], items: Sequence[T]) -> list[R]:
 
 @contextmanager
 def threads(n: int) -> Iterator[ThreadPoolExecutor]:
-    """Start so many threads, each with its share of the processors for products of matrices."""
+    """Start n threads, each with its share of the processors for matrix products."""
     with threadpool_limits(max(1, processors() // n), "blas"), ThreadPoolExecutor(n) as pool:
         yield pool
 
@@ -87,22 +87,22 @@ class once(cached_property):
             return super().__get__(instance, owner)
 
 
-# tasks of one process at a time: one on each of two processors takes less than two after another
-# on both, and more than two wait for each other, and take memory
+# tasks that a process runs at once: two side by side, on one processor each, take less time than
+# two in succession on both; more than two wait for each other and need memory
 SIDE_BY_SIDE = 2
 
 
 @dataclass(frozen=True)
 class Tasks(Generic[T, R]):
-    """A function, and all that it is to be called with.
+    """A function and the items to call it with.
 
     Attributes
     ----------
     function : callable
-        Of one item; safe to be called by several threads, and again with the same item.
+        Of one item; thread-safe, and may be called again with the same item.
     items : sequence
     names : sequence of str
-        Of the items, for progress and for what is said if one fails.
+        Names of the items, for progress and error messages.
     """
 
     function: Callable[[T], R]
@@ -112,16 +112,16 @@ class Tasks(Generic[T, R]):
 
 @dataclass(frozen=True)
 class Demand:
-    """What the tasks of a run take, about.
+    """The approximate memory that the tasks of a run need.
 
     Attributes
     ----------
     base_bytes : float
-        Memory of a process before it does anything.
+        Memory of an idle process.
     task_bytes : float
-        What every task adds that is carried out at a time.
+        Additional memory of every task that runs at the same time.
     side_by_side : int
-        How many a process carries out at a time; one where a task uses all processors.
+        Number of tasks that a process runs at once; one if a task uses all processors.
     """
 
     base_bytes: float
@@ -129,43 +129,42 @@ class Demand:
     side_by_side: int = SIDE_BY_SIDE
 
     def process_bytes(self, side_by_side: int | None = None) -> float:
-        """Memory of a process that carries out so many tasks at a time."""
+        """Memory of a process that runs this number of tasks at once."""
         at_once = self.side_by_side if side_by_side is None else side_by_side
         return self.base_bytes + at_once * self.task_bytes
 
 
 class Engine(ABC):
-    """What carries out the tasks of a run."""
+    """Runs the tasks of a run."""
 
     @abstractmethod
     def each(self, tasks: Tasks[T, R], stages: Stages, stage: str) -> list[R]:
-        """Carry out all tasks.
+        """Run all tasks.
 
         Parameters
         ----------
         tasks : Tasks
         stages : Stages
-            Told how many are done.
+            Shows how many are done.
         stage : str
-            What the stage is called.
+            Name of the stage.
 
         Returns
         -------
         list
-            What the function gives, in the order of the items.
+            Results of the function, in the order of the items.
 
         Raises
         ------
         Exception
-            That of the first task, in their order, that raises one; those that wait then are not
-            begun.
+            That of the first task, in order, that raises one; waiting tasks are then not started.
         WorkersLost
-            If a task cannot be carried out because its workers fail.
+            If a task cannot be completed because its workers fail.
         """
 
     @abstractmethod
     def reduced(self, tasks: Tasks[T, R], merge: Merge[R], stages: Stages, stage: str) -> R:
-        """Carry out all tasks, and merge what they give: neighbours first, as a tree.
+        """Run all tasks and merge their results as a tree, neighbours first.
 
         Parameters
         ----------
@@ -174,17 +173,17 @@ class Engine(ABC):
         merge : callable
             Of two results; it must not change them.
         stages, stage
-            As for :meth:`each`.
+            As in :meth:`each`.
 
         Raises
         ------
         Exception
-            As :meth:`each`.
+            As in :meth:`each`.
         """
 
     @abstractmethod
     def work_in(self, folder: Path) -> None:
-        """Say in which folder the tasks write.
+        """Set the folder into which the tasks write.
 
         Raises
         ------
@@ -195,12 +194,12 @@ class Engine(ABC):
 
 @dataclass(frozen=True)
 class ThisProcess(Engine):
-    """Carries tasks out in threads of this process.
+    """Runs tasks in threads of this process.
 
     Attributes
     ----------
     side_by_side : int
-        How many at a time.
+        Number of tasks at once.
     """
 
     side_by_side: int = SIDE_BY_SIDE
@@ -218,14 +217,14 @@ class ThisProcess(Engine):
 
     @contextmanager
     def _results(self, tasks: Tasks[T, R], stages: Stages, stage: str) -> Iterator[Iterator[R]]:
-        """What the function gives, in the order of the items."""
+        """Yield an iterator over the results, in the order of the items."""
         n_threads = max(1, min(self.side_by_side, len(tasks.items)))
         with stages.progress(stage, len(tasks.items)) as done, threads(n_threads) as pool:
             given = pool.map(partial(carry_out, tasks.function), tasks.items)
 
             def in_order() -> Iterator[R]:
                 for number, name in enumerate(tasks.names, start=1):
-                    # a list that is emptied: what was given is not kept here
+                    # popped from a list, so that no reference to the result is kept here
                     result = [next(given)]
                     done(number, name)
                     yield result.pop()
@@ -237,7 +236,7 @@ class ThisProcess(Engine):
 
 
 def carry_out(function: Callable[[T], R], item: T) -> R:
-    """Call a function, and free at once what it leaves: it may refer to itself, and is large."""
+    """Call a function, then collect garbage: it may be large and contain reference cycles."""
     try:
         return function(item)
     finally:
@@ -245,9 +244,9 @@ def carry_out(function: Callable[[T], R], item: T) -> R:
 
 
 def merged_as_tree(parts: Iterator[R], n: int, merge: Merge[R]) -> R:
-    """Merge n parts as they come: neighbours first, then their neighbours.
+    """Merge n parts as they arrive: first neighbours, then their sums.
 
-    Which with which depends on n alone. Besides the last part, one for each level is kept.
+    The pairing depends only on n. Besides the last part, one sum per level is kept in memory.
     """
     if n == 1:
         return next(parts)
@@ -255,7 +254,7 @@ def merged_as_tree(parts: Iterator[R], n: int, merge: Merge[R]) -> R:
     return merge(merged_as_tree(parts, half, merge), merged_as_tree(parts, n - half, merge))
 
 
-# the variable by which Dask's own programs are told of a cluster
+# the environment variable that gives Dask's own programs the address of a cluster
 SCHEDULER = "DASK_SCHEDULER_ADDRESS"
 
 
@@ -263,17 +262,17 @@ SCHEDULER = "DASK_SCHEDULER_ADDRESS"
 def open_engine(
     demand: Demand, workers: int | None = None, cluster: str | None = None
 ) -> Iterator[Engine]:
-    """Start what is to carry out the tasks of a run, and end it after the block.
+    """Start the engine for the tasks of a run, and end it after the block.
 
     Parameters
     ----------
     demand : Demand
-        What the tasks take.
+        Memory that the tasks need.
     workers : int, optional
-        Processes of this machine; one, as by default, is this process, without any server.
+        Number of processes on this machine; 1 (the default) uses this process and no server.
     cluster : str, optional
-        Address of the scheduler of a Dask cluster, as tcp://host:8786; by default that of the
-        environment variable ``DASK_SCHEDULER_ADDRESS``, if it is set.
+        Address of a Dask scheduler, such as tcp://host:8786; by default the environment variable
+        ``DASK_SCHEDULER_ADDRESS``, if set.
 
     Yields
     ------
@@ -283,14 +282,14 @@ def open_engine(
     ------
     InputError
         If Dask is not installed, the workers do not fit into the memory, no scheduler answers, or
-        as :class:`.DaskEngine`.
+        as in :class:`.DaskEngine`.
     """
     if workers is not None and cluster is not None:
         raise InputError("--workers starts local workers, --cluster uses existing ones; give one")
     if workers is None:
         cluster, workers = cluster or os.environ.get(SCHEDULER), 1
     if not cluster and workers == 1:
-        gc.freeze()  # modules stay: they need not be searched
+        gc.freeze()  # modules are permanent: exclude them from collection
         yield ThisProcess(demand.side_by_side if demand.process_bytes() <= memory_limit() else 1)
         return
     if find_spec("distributed") is None:
@@ -298,7 +297,7 @@ def open_engine(
             "--workers and --cluster need Dask; install it with pip install '.[cluster]' in the "
             "clone of lusee_bayes"
         )
-    # an optional library, which takes a second
+    # an optional library, whose import takes a second
     from lusee_bayes.core.dask_engine import connected, own_workers
 
     # before JAX starts: workers on the same GPU as this process need some of its memory

@@ -1,4 +1,4 @@
-"""What goes wrong in ways that a user can understand: one sentence, no traceback."""
+"""Errors that a user can understand: one sentence, no traceback."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import difflib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
-# characters of a message, which quotes what was given
+# characters of a message, since it quotes the user's input
 LONGEST = 1000
 
 
 class InputError(ValueError):
-    """Invalid input. The message states what is wrong, where, and what to do.
+    """Invalid input; the message states the problem, its place and the remedy.
 
-    It is always one line: characters that cannot be printed are escaped, and the middle of a long
-    message is omitted.
+    The message is one line: unprintable characters are escaped, and the middle of a long message is
+    omitted.
     """
 
     def __init__(self, message: object):
@@ -26,7 +26,7 @@ class InputError(ValueError):
 
 
 class WorkersLost(RuntimeError):
-    """Raised when workers fail again and again, or are gone; the message is one sentence."""
+    """Raised when workers fail repeatedly or are gone; the message is one sentence."""
 
 
 @contextmanager
@@ -39,7 +39,7 @@ def refusing(message: str, *kinds: type[Exception]) -> Iterator[None]:
 
 
 def require_known(what: str, word: str, known: Iterable[str]) -> None:
-    """InputError with the nearest known word, if this one is not known."""
+    """Raise InputError with the nearest known word if this word is unknown."""
     if word not in known:
         raise InputError(f"{what} '{word}'; {nearest(word, known)}")
 

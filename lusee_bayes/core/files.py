@@ -1,12 +1,11 @@
 """Files and folders that are written whole or not at all.
 
-A folder of results changes in one transaction. Everything is written into a scratch folder first;
-renaming that one is the moment from which the new results count. Its files are then moved into
-place, and where that is interrupted, whoever opens the folder next (:func:`recover`) completes it.
-The folder itself is not replaced: it holds files of the user's own, a shell may stand in it, and it
-may be a mount point.
+A results folder changes in one transaction. All files are first written into a scratch folder;
+renaming that folder commits the new results. Its files are then moved into place. If this is
+interrupted, the next reader of the folder completes it (:func:`recover`). The folder itself is not
+replaced: it may contain the user's files, be the working directory of a shell, or be a mount point.
 
-Where results cannot be written is found out before anything is computed (:func:`require_folder`,
+Runs check that results can be written before they compute anything (:func:`require_folder`,
 :func:`require_target`).
 """
 
@@ -30,12 +29,12 @@ from lusee_bayes.core.errors import InputError
 
 
 def user_path(path: str | os.PathLike[str]) -> Path:
-    """A path, with the user's folder in place of a leading ``~``."""
+    """A path with a leading ``~`` expanded to the user's home folder."""
     return Path(os.path.expanduser(path))
 
 
 def require_folder(folder: str | Path) -> None:
-    """Check that results can be written into a folder, which need not be there yet.
+    """Check that results can be written into a folder, which need not exist yet.
 
     Parameters
     ----------
@@ -44,8 +43,8 @@ def require_folder(folder: str | Path) -> None:
     Raises
     ------
     InputError
-        If it, or what it would lie in, is no folder or cannot be written into; if its name is too
-        long; and for the root of all files.
+        If it, or its nearest existing parent, is not a writable folder; if its name is too long; or
+        if it is the root of the file system.
     """
     folder = user_path(folder)
     _require_name(folder)
@@ -56,7 +55,7 @@ def require_folder(folder: str | Path) -> None:
         kind = "a file" if place.is_file() else "neither a file nor a folder"
         raise InputError(f"'{place}' is {kind}; give a folder for the results")
     try:
-        # a file without a name: whatever happens, nothing of it is left
+        # an unnamed file: nothing remains of it, whatever happens
         tempfile.TemporaryFile(dir=place).close()
     except OSError as error:
         raise InputError(
@@ -74,7 +73,7 @@ def require_target(path: str | Path) -> None:
     Raises
     ------
     InputError
-        If it is a folder, a pipe or a device, or as :func:`require_folder` for what it lies in.
+        If it is a folder, a pipe or a device, or as in :func:`require_folder` for its parent.
     """
     path = user_path(path)
     _require_name(path)
@@ -88,20 +87,20 @@ def require_target(path: str | Path) -> None:
 
 
 def require_new(path: str | Path, *, replace: bool, inputs: Iterable[str | Path] = ()) -> None:
-    """As :func:`require_target`, for a file that another is only replaced by if that is asked for.
+    """Check, as :func:`require_target`, a file that replaces another only if ``replace`` is set.
 
     Parameters
     ----------
     path : path
     replace : bool
-        Replace what is there.
+        Allow an existing file to be replaced.
     inputs : iterable of path
-        Files that are read for it, and not to be replaced.
+        Input files of the run, which must not be replaced.
 
     Raises
     ------
     InputError
-        If something is there, unless ``replace``; if it is one of ``inputs``; as
+        If the path exists, unless ``replace``; if it is one of ``inputs``; as in
         :func:`require_target`.
     """
     require_target(path)
@@ -117,7 +116,7 @@ def _require_name(path: Path) -> None:
 
 
 def _is_there(path: Path) -> bool:
-    """Whether something is at a path. A link to nothing is something that cannot be used."""
+    """Whether a path exists; a broken link raises InputError."""
     try:
         path.stat()
     except (FileNotFoundError, NotADirectoryError):
@@ -129,23 +128,23 @@ def _is_there(path: Path) -> bool:
     return True
 
 
-# names inside a folder of results: the lock of the run that works in it, which says whose it is,
-# scratch folders, the new results that are still to be moved into place, and the list of what the
-# last run has written
+# names inside a results folder: the lock of the current run, which names its process; scratch
+# folders; committed results that are not yet in place; and the list of files that the last run
+# wrote
 LOCK, SCRATCH, COMMITTED, MANIFEST = ".lock", ".partial-", ".committed", "manifest.json"
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Keep other runs out of a folder, which is there, during the block.
+    """Keep other runs out of an existing folder during the block.
 
-    The lock ends with the process, however that ends. What a run that was killed has left in
-    scratch folders is removed.
+    The lock ends with the process, even if it is killed. Scratch folders of killed runs are
+    removed.
 
     Raises
     ------
     InputError
-        If another run works in it.
+        If another run uses the folder.
     """
     path, lock, owner = folder / LOCK, FileLock(folder / LOCK), "another process"
     try:
@@ -167,7 +166,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def require_files(folder: Path, names: Sequence[str], command: str) -> None:
-    """InputError if ``folder`` lacks one of the files that ``lusee-bayes command`` writes."""
+    """Raise InputError if ``folder`` lacks a file that ``lusee-bayes command`` writes."""
     for name in names:
         if not (folder / name).is_file():
             raise InputError(
@@ -182,7 +181,7 @@ def _is_inside(name: str) -> str:
     return name
 
 
-# the name of something in the folder, and not of the folder itself
+# a name inside the folder, not the folder itself
 _Inside = Annotated[str, AfterValidator(_is_inside)]
 
 
@@ -194,7 +193,7 @@ class _Manifest(BaseModel):
 
 
 def read_manifest(folder: Path) -> dict[str, Any] | None:
-    """What the last run has written into a folder, and of what; None if it is not said.
+    """The files that the last run wrote into a folder, and their origin; None without a manifest.
 
     Raises
     ------
@@ -222,19 +221,19 @@ def transaction(
 ) -> Iterator[Path]:
     """Write a run's results into a folder: all of them take effect at once, or none does.
 
-    Files that an earlier run has left there and this one does not write are removed; files that no
-    run has written stay.
+    Files of an earlier run that this run does not write are removed; files that no run wrote are
+    kept.
 
     Parameters
     ----------
     folder : path
-        Folder of the results; made if there is none. :func:`locked`, where several runs may write.
+        Results folder, created if necessary. Use :func:`locked` if several runs may write to it.
     kind : str
-        The kind of run, kept in ``manifest.json``.
+        The kind of run, recorded in ``manifest.json``.
     discard : sequence of str
-        Folders inside ``folder`` that hold unfinished work, removed with the old results.
+        Folders of unfinished work inside ``folder``, removed with the old results.
     origin : mapping, optional
-        What the results are made of, kept in ``manifest.json``.
+        Origin of the results, recorded in ``manifest.json``.
 
     Yields
     ------
@@ -244,8 +243,8 @@ def transaction(
     Raises
     ------
     InputError
-        If ``folder``, or what it would lie in, is a file; if one of the results has the name of a
-        folder there; and as :func:`recover`.
+        If ``folder`` or a parent is a file; if a result has the name of a folder there; and as in
+        :func:`recover`.
     """
     folder = user_path(folder)
     require_folder(folder)
@@ -256,7 +255,7 @@ def transaction(
         try:
             yield stage
         except OSError as error:
-            # of several files the one that was written last, where it will lie
+            # name the file that was written last, by its final path
             written = [path for path in stage.rglob("*") if path.is_file()]
             last = max(written, key=lambda path: path.stat().st_mtime_ns, default=stage)
             with naming_disk(folder / last.relative_to(stage)):
@@ -275,14 +274,14 @@ def transaction(
 
 
 def scratch_folder(folder: Path) -> Path:
-    """Make a folder in ``folder`` for the run that has locked it."""
+    """Create a scratch folder in ``folder`` for the run that has locked it."""
     return Path(tempfile.mkdtemp(prefix=SCRATCH, dir=folder))
 
 
 def recover(folder: str | Path) -> None:
-    """Complete what an interrupted transaction has begun.
+    """Complete an interrupted transaction.
 
-    Harmless at any time; every reader of a folder of results calls it first.
+    It is harmless at any time; every reader of a results folder calls it first.
 
     Raises
     ------
@@ -292,15 +291,15 @@ def recover(folder: str | Path) -> None:
     folder = user_path(folder)
     committed = folder / COMMITTED
     old, new = read_manifest(folder), read_manifest(committed)
-    # a new manifest is moved last: until then this can be begun again, and where there is none the
-    # new results are in place
+    # the new manifest is moved last: until then this can be restarted; if there is none, the new
+    # results are in place
     if new is not None:
         for name in new["files"]:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             _move(committed / name, folder / name)
         for name in sorted(set(old["files"] if old else ()) - set(new["files"])):
             (folder / name).unlink(missing_ok=True)
-            # and the folders that it was in, as far as they are empty
+            # and its parent folders, if empty
             for place in PurePosixPath(name).parents:
                 with suppress(OSError):
                     (folder / place).rmdir()
@@ -311,13 +310,13 @@ def recover(folder: str | Path) -> None:
 
 
 def _move(source: Path, target: Path) -> None:
-    # moved already, by what was interrupted or by another process that completes the same
+    # already moved, before the interruption or by another process that also recovers
     with suppress(FileNotFoundError):
         os.replace(source, target)
 
 
 def require_apart(folder: Path, inputs: Iterable[str | Path]) -> None:
-    """InputError where a run would replace its inputs: results in its folder, or its file."""
+    """Raise InputError if a run would replace its inputs: results in its folder, or its file."""
     manifest = read_manifest(folder)
     names = manifest["files"] if manifest else ()
     written = {folder.resolve(), *((folder / name).resolve() for name in names)}
@@ -331,9 +330,9 @@ def require_apart(folder: Path, inputs: Iterable[str | Path]) -> None:
 
 @contextmanager
 def naming_disk(path: Path) -> Iterator[None]:
-    """Put the name of the file that is written into an OSError of the block that has none.
+    """Add the name of the written file to an OSError of the block that has none.
 
-    HDF5 puts the error's number into its message alone, and astropy gives none.
+    HDF5 gives the error number only in its message, and astropy gives none.
     """
     try:
         yield
@@ -353,13 +352,13 @@ def replacing(path: str | Path) -> Iterator[Path]:
     Yields
     ------
     Path
-        A scratch name beside ``path``; what is written there takes its place when all is done. If
-        anything fails or is interrupted before that, the previous file stays as it was.
+        A scratch name beside ``path``; the file written there replaces ``path`` after the block. If
+        the block fails or is interrupted, the previous file stays unchanged.
 
     Raises
     ------
     InputError
-        If the file cannot be written, or something else than a file has its name.
+        If the file cannot be written, or its name belongs to something other than a file.
     """
     path = user_path(path)
     require_target(path)
@@ -380,19 +379,19 @@ def new_folder(folder: Path) -> Iterator[Path]:
     Yields
     ------
     Path
-        A scratch folder beside ``folder``, which takes its name when all is done.
+        A scratch folder beside ``folder``, renamed to ``folder`` after the block.
 
     Raises
     ------
     InputError
-        If ``folder`` exists, and as :func:`require_folder`.
+        If ``folder`` exists, and as in :func:`require_folder`.
     """
     require_folder(folder)
     if folder.exists():
         raise InputError(f"'{folder}' exists already; give the name of a new folder")
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=SCRATCH, dir=folder.parent) as scratch:
-        # not the scratch folder itself, which only its owner may read
+        # a subfolder, since only the owner may read the scratch folder itself
         stage = Path(scratch) / folder.name
         stage.mkdir()
         yield stage

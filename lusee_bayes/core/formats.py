@@ -1,8 +1,8 @@
 """HDF5, netCDF and FITS files, read by their declared layouts.
 
-Every file of the package says which of its formats it has, in ``format``. On damaged metadata
-HDF5's library may run for ever, or end the process, and nothing in Python can interrupt it: so a
-file is tried first in a process of its own, with a time limit.
+Every file of the package states its format in the attribute ``format``. On damaged metadata, the
+HDF5 library may loop forever or crash, and Python cannot interrupt it. A separate process therefore
+reads each file first, with a time limit.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ from lusee_bayes.core.lazy import astropy_exceptions, fits, xarray
 from lusee_bayes.core.reading import reading, require_file
 from lusee_bayes.core.version import __version__
 
-# a file is read whole up to this size; of a larger one, all metadata and the first value of each
+# files up to this size are read whole; of a larger one, all metadata and the first value of each
 # array
 WHOLE_BYTES = 200_000_000
-# a whole file of that size takes less than a tenth of it
+# reading a whole file of that size takes less than a tenth of this
 LIMIT_S = 20.0
-# what HDF5's library raises for a file that is damaged
+# errors that the HDF5 library raises for a damaged file
 DAMAGE = (OSError, KeyError, RuntimeError, ValueError, TypeError)
 
 
 def require_readable_hdf5(path: Path) -> None:
-    """Check that HDF5's library comes to an end with a file. What it raises is left to the reader.
+    """Check that the HDF5 library finishes reading a file; its errors are left to the reader.
 
     Raises
     ------
     InputError
-        If it does not within ``LIMIT_S``, or if it ends the process.
+        If it does not finish within ``LIMIT_S``, or crashes the process.
     """
     status = path.stat()
     _probe(str(path), status.st_mtime_ns, status.st_size)
@@ -50,11 +50,11 @@ def require_readable_hdf5(path: Path) -> None:
 
 @lru_cache(maxsize=64)
 def _probe(path: str, mtime_ns: int, size: int) -> None:
-    # a process of macOS may not go on behind a fork
+    # on macOS, a forked process may not continue
     if sys.platform != "linux":
         return
     with warnings.catch_warnings():
-        # of threads that are not copied: the child needs none of them
+        # ignore the warning that threads are not copied: the child needs none of them
         warnings.simplefilter("ignore")
         child = os.fork()
     if child == 0:
@@ -70,13 +70,13 @@ def _probe(path: str, mtime_ns: int, size: int) -> None:
 
 
 def _read_all(path: str, size: int) -> None:
-    """In the child: read, and leave without a word."""
+    """In the child process: read the file, then exit silently."""
     try:
-        # whatever it prints is of no use
+        # discard everything that it prints
         faulthandler.disable()
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
         with h5py.File(path) as file:
-            # to look a name up may take forever where to list them fails at once
+            # looking up a name may loop forever where listing the names fails immediately
             with suppress(*DAMAGE):
                 file.attrs.get("format")
             _read(file, size)
@@ -87,7 +87,7 @@ def _read_all(path: str, size: int) -> None:
 
 def _read(item: h5py.Group | h5py.Dataset, size: int) -> None:
     for name in item.attrs:
-        with suppress(*DAMAGE):  # the reader says it
+        with suppress(*DAMAGE):  # the reader reports it
             item.attrs[name]
     if isinstance(item, h5py.Dataset) and item.size:
         whole = size <= WHOLE_BYTES and item.size * item.dtype.itemsize <= 5 * WHOLE_BYTES
@@ -105,7 +105,7 @@ DIAGNOSTICS = "lusee_bayes diagnostics 3"
 CHANNEL = "lusee_bayes unfinished channel 1"
 PAPER_CASE = "lusee_bayes paper case 1"
 
-# words of the primary header that tell pyuvdata's beams from other FITS files
+# keywords of the primary header that distinguish pyuvdata's beams from other FITS files
 UVBEAM_WORDS = ("NORMSTD", "FEEDLIST")
 
 
@@ -115,7 +115,7 @@ def format_of(path: str | Path) -> str | None:
     Raises
     ------
     InputError
-        If there is no file, or it is HDF5 and damaged.
+        If there is no file, or it is a damaged HDF5 file.
     """
     path = require_file(path, "file")
     with reading(path, "HDF5"):
@@ -138,7 +138,7 @@ def header(format_: str) -> dict[str, str]:
 
 
 def with_grid(dataset: xarray.Dataset) -> xarray.Dataset:
-    """The same with the grid of all arrays in pixels, of whole maps, as CF 1.13 has it."""
+    """Return the dataset with the CF 1.13 grid mapping of its HEALPix arrays, all whole maps."""
     for dim in {*HEALPIX} & {*dataset.dims}:
         n = dataset.sizes[dim]
         grid, index = f"{dim}_grid", f"{dim}_index"
@@ -153,15 +153,15 @@ def with_grid(dataset: xarray.Dataset) -> xarray.Dataset:
     return dataset
 
 
-# what the CF conventions call times, and what bounds may leave to the variable that they bound
+# time attributes of the CF conventions; bounds may inherit them from the variable that they bound
 CF_TIME = ("units", "calendar")
 
 
 def read_netcdf(path: str | Path, format_: str, layout: Layout, hint: str = "") -> Content:
     """Read one of the package's own files.
 
-    Dimensions are told by their names: an array whose dimensions are in another order is turned.
-    Attributes of a variable are those of the file by the name ``variable.attribute``.
+    Dimensions are identified by name: arrays with their dimensions in another order are transposed.
+    An attribute of a variable counts as an attribute ``variable.attribute`` of the file.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ def read_netcdf(path: str | Path, format_: str, layout: Layout, hint: str = "") 
         Its ``format``, one of :mod:`.formats`.
     layout : Layout
     hint : str
-        What to do if there is no such file.
+        Advice in case there is no such file.
 
     Returns
     -------
@@ -179,7 +179,7 @@ def read_netcdf(path: str | Path, format_: str, layout: Layout, hint: str = "") 
     Raises
     ------
     InputError
-        If the file is missing, damaged or of another kind, or not as declared.
+        If the file is missing, damaged, of another kind, or not as declared.
     """
     path = require_format(path, format_, layout.what, hint)
     opened_as = {"engine": "h5netcdf", "decode_times": False}
@@ -196,9 +196,9 @@ def read_netcdf(path: str | Path, format_: str, layout: Layout, hint: str = "") 
 
 
 def _decoded(dataset: xarray.Dataset, name: str, variable: xarray.Variable) -> xarray.Variable:
-    """Times by the CF conventions: bounds have the units of what they bound, if none of their own.
+    """Decode times by the CF conventions; bounds without units inherit those of their variable.
 
-    Without units they stay numbers.
+    Times without any units stay numbers.
     """
     bounding = (v.attrs for v in dataset.variables.values() if v.attrs.get("bounds") == name)
     units = {key: v for attrs in bounding for key, v in attrs.items() if key in CF_TIME}
@@ -210,7 +210,7 @@ def _decoded(dataset: xarray.Dataset, name: str, variable: xarray.Variable) -> x
 def as_dataset(
     format_: str, layout: Layout, arrays: Mapping[str, Any], values: Mapping[str, Any]
 ) -> xarray.Dataset:
-    """Lay out what :func:`read_netcdf` reads, on the dimensions and in the units of a layout.
+    """Build the dataset that :func:`read_netcdf` reads, with the dimensions and units of a layout.
 
     Parameters
     ----------
@@ -218,9 +218,9 @@ def as_dataset(
         One of :mod:`.formats`.
     layout : Layout
     arrays : mapping of str to array or None
-        By their names in the layout; None is absent.
+        Arrays by their names in the layout; None is absent.
     values : mapping of str to object
-        Attributes, likewise; ``variable.attribute`` is one of a variable.
+        Attributes by name; ``variable.attribute`` is an attribute of a variable. None is absent.
     """
     variables = {}
     for name in (name for name, array in arrays.items() if array is not None):
@@ -236,7 +236,7 @@ def as_dataset(
 
 
 def require_format(path: str | Path, format_: str, what: str, hint: str = "") -> Path:
-    """Check that a file is of one format of the package.
+    """Check that a file has a given format of the package.
 
     Parameters
     ----------
@@ -244,9 +244,9 @@ def require_format(path: str | Path, format_: str, what: str, hint: str = "") ->
     format_ : str
         Its ``format``, one of :mod:`.formats`.
     what : str
-        What it should be, for messages.
+        Description of the expected file, for messages.
     hint : str
-        What to do if there is no such file.
+        Advice in case there is no such file.
 
     Raises
     ------
@@ -264,9 +264,9 @@ def require_format(path: str | Path, format_: str, what: str, hint: str = "") ->
 
 
 def says(path: Path, attributes: Mapping[str, str]) -> bool:
-    """Tell whether a netCDF file of unfinished work is whole, and says so of itself.
+    """Whether a netCDF file of unfinished work is readable and has these attributes.
 
-    What is damaged is made anew, as what is not there.
+    A damaged file counts as missing, so that it is computed again.
     """
     try:
         with reading(path, "unfinished work"), h5py.File(path) as file:
@@ -275,12 +275,12 @@ def says(path: Path, attributes: Mapping[str, str]) -> bool:
         return False
 
 
-# words that say how a file is built
+# FITS keywords that describe the structure of a file
 STRUCTURE = ("SIMPLE", "BITPIX", "NAXIS", "EXTEND", "COMMENT", "HISTORY")
 
 
 def is_fits(path: str | Path) -> bool:
-    """Return whether a file begins like FITS."""
+    """Return whether a file begins like a FITS file."""
     with Path(path).open("rb") as file:
         return file.read(6) == b"SIMPLE"
 
@@ -291,19 +291,19 @@ def image_names(path: str | Path) -> list[str]:
     Raises
     ------
     InputError
-        If the file cannot be read or is cut short.
+        If the file is unreadable or truncated.
     """
     with opened(path) as hdus:
         return [hdu.name.lower() for hdu in hdus]
 
 
 def has_words(path: str | Path, words: Iterable[str]) -> bool:
-    """Return whether a file is FITS and its primary header has all of these words.
+    """Return whether a file is FITS and its primary header has all of these keywords.
 
     Raises
     ------
     InputError
-        If it is FITS and cannot be read.
+        If it is FITS but cannot be read.
     """
     if not is_fits(path):
         return False
@@ -312,17 +312,17 @@ def has_words(path: str | Path, words: Iterable[str]) -> bool:
 
 
 def read_fits(path: str | Path, layout: Layout, hint: str = "") -> Content:
-    """Read images, columns of tables and words of the primary header.
+    """Read images, table columns and keywords of the primary header.
 
-    Variables are images by their names, or columns as ``table.column``; upper and lower case are
-    the same. Attributes are words of the primary header. Units are BUNIT and TUNITn.
+    Variables are images by name, or columns as ``table.column``; case is ignored. Attributes are
+    keywords of the primary header. Units come from BUNIT and TUNITn.
 
     Parameters
     ----------
     path : str or Path
     layout : Layout
     hint : str
-        What to do if there is no such file.
+        Advice in case there is no such file.
 
     Returns
     -------
@@ -331,7 +331,7 @@ def read_fits(path: str | Path, layout: Layout, hint: str = "") -> Content:
     Raises
     ------
     InputError
-        If the file is missing or damaged, or not as declared.
+        If the file is missing, damaged, or not as declared.
     """
     with opened(path, layout.what, hint) as hdus:
         arrays: dict[str, Any] = {}
@@ -356,7 +356,7 @@ def read_fits(path: str | Path, layout: Layout, hint: str = "") -> Content:
 
 
 def unread_image(hdu: fits.PrimaryHDU | fits.ImageHDU) -> Unloaded:
-    """The image of an open FITS file."""
+    """The image of an HDU, not yet read."""
     dtype = np.dtype(fits.BITPIX2DTYPE[hdu.header["BITPIX"]])
     return Unloaded(tuple(hdu.shape), dtype, partial(getattr, hdu, "data"))
 
@@ -368,10 +368,10 @@ def opened(path: str | Path, what: str = "FITS", hint: str = "") -> Iterator[fit
     Raises
     ------
     InputError
-        If the file, or what the block reads of it, is cut short or damaged.
+        If the file, or a part that the block reads, is truncated or damaged.
     """
     with reading(path, what, hint) as place, place.open("rb") as file:
-        # astropy only warns of a file that is cut short
+        # astropy only warns about a truncated file
         warnings.simplefilter("error", astropy_exceptions.AstropyWarning)
         try:
             hdus = fits.open(file, memmap=False)
@@ -384,12 +384,12 @@ def opened(path: str | Path, what: str = "FITS", hint: str = "") -> Iterator[fit
 
 
 def is_session(path: str | Path) -> bool:
-    """Return whether a file says that it is a session of the spectrometer.
+    """Return whether a file is marked as a spectrometer session.
 
     Raises
     ------
     InputError
-        If there is no file, or it is damaged.
+        If the file is missing or damaged.
     """
     path = require_file(path, "data")
     with reading(path, "a session in HDF5"):

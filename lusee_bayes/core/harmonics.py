@@ -1,6 +1,6 @@
 """Real spherical harmonics: packing, transforms, spectra, quadratic forms and rotations.
 
-A real field f = sum_c a_c y_c with the orthonormal real harmonics ::
+A real field is f = sum_c a_c y_c with the orthonormal real harmonics ::
 
     y_l0 = Y_l0,   y_lm = sqrt(2) Re Y_lm,   y_l,-m = -sqrt(2) Im Y_lm     (m > 0)
 
@@ -8,16 +8,15 @@ so that a_l0 = a_l0 (complex convention), a_lm = sqrt(2) Re a_lm, a_l,-m = sqrt(
 are packed at index ell^2 + ell + m, m = -ell..ell; a smaller lmax is a slice. An isotropic field
 has variance C_ell in every coefficient. Y_lm as in healpy (Condon-Shortley phase included).
 
-**Quadratic forms** y^T C y in every direction (:func:`order_products`). On a ring y_lm =
-lambda_l|m|(theta) f_m(phi), so that C shrinks to a matrix over m and m' of that ring before any of
-its points is looked at: N_modes^2 operations a ring, where products with y take N_modes^2 a point.
-A ring and its mirror image in the south, where lambda has the sign (-1)^(l + m), share half of
-them.
+**Quadratic forms** are y^T C y in every direction (:func:`order_products`). On a ring, y_lm =
+lambda_l|m|(theta) f_m(phi), so C first reduces to one matrix over m and m' for all points of the
+ring. This takes N_modes^2 operations per ring, where products with y take N_modes^2 per point. A
+ring and its mirror image in the south, where lambda has the sign (-1)^(l + m), share half of them.
 
-**Rotations** are orthogonal matrices, block-diagonal in ell. D(g) turns a field: (D(g) f)(n) =
-f(g^-1 n), so that D(g h) = D(g) D(h). For the rotation vector w (axis times angle) D = exp(w . K),
-with K_x, K_y, K_z the real antisymmetric generators, that is -i times the angular momentum
-operators in this basis. K_z couples only m with -m, K_x and K_y only ``|m|`` with ``|m| +- 1``.
+**Rotations** are orthogonal matrices, block-diagonal in ell. D(g) rotates a field: (D(g) f)(n) =
+f(g^-1 n), so that D(g h) = D(g) D(h). For the rotation vector w (axis times angle), D = exp(w . K).
+K_x, K_y and K_z are the real antisymmetric generators, i.e. -i times the angular momentum operators
+in this basis. K_z couples only m with -m, K_x and K_y only ``|m|`` with ``|m| +- 1``.
 """
 
 from __future__ import annotations
@@ -36,12 +35,12 @@ from lusee_bayes.core.lazy import healpy, rotations, special
 SQRT2 = np.sqrt(2.0)
 Angles = Float[np.ndarray, " points"]
 AtPoints = Float[np.ndarray, "points modes"]
-# beyond these, indices and memory of libraries in C give out
+# beyond these, C libraries run out of index range or memory
 LARGEST_LMAX, LARGEST_NSIDE = 2047, 2048
 
 
 def require_nside(nside: object) -> None:
-    """InputError if it is no NSIDE of a HEALPix map."""
+    """Raise InputError unless it is the NSIDE of a HEALPix map."""
     require_whole("nside", nside, 1, LARGEST_NSIDE)
     if not healpy.isnsideok(nside, nest=True):
         raise InputError(f"nside is {nside}, expected a power of two; use 64, for example")
@@ -93,7 +92,7 @@ def to_healpy(modes: Float[Array, " modes"]) -> Complex[np.ndarray, " alms"]:
 
 
 def map_to_modes(pixels: Float[np.ndarray, " pixels"], lmax: int) -> Float[np.ndarray, " modes"]:
-    """Analyse a HEALPix map, by healpy's iterated quadrature.
+    """Analyse a HEALPix map by healpy's iterated quadrature.
 
     Parameters
     ----------
@@ -109,8 +108,8 @@ def map_to_modes(pixels: Float[np.ndarray, " pixels"], lmax: int) -> Float[np.nd
     Raises
     ------
     InputError
-        If the map has no valid NSIDE, holds NaN, or is too coarse (lmax > 3 NSIDE - 1), or if lmax
-        is negative or no whole number.
+        If the map has no valid NSIDE, contains NaN, or is too coarse (lmax > 3 NSIDE - 1), or if
+        lmax is negative or not an integer.
     """
     require_whole("lmax", lmax, 0, LARGEST_LMAX)
     pixels = np.asarray(pixels, dtype=np.float64)
@@ -134,7 +133,7 @@ def modes_to_map(modes: Float[Array, " modes"], nside: int) -> Float[np.ndarray,
 
 @lru_cache(maxsize=8)
 def _polar_functions(theta: tuple[float, ...], lmax: int) -> np.ndarray:
-    """Y_lm at azimuth zero for every packed mode, which depends on ``|m|`` alone."""
+    """Y_lm at azimuth zero for every packed mode; it depends on m only through ``|m|``."""
     ell, m = mode_numbers(lmax)
     table = special.sph_legendre_p_all(lmax, lmax, np.array(theta))[0]
     return np.ascontiguousarray(table[ell, np.abs(m)].T)
@@ -155,7 +154,7 @@ def azimuth_functions(phi: Angles, lmax: int) -> Float[np.ndarray, "points order
 def synthesis_matrix(theta: Angles, phi: Angles, lmax: int) -> AtPoints:
     """Return the real harmonics in given directions: f(theta_i, phi_i) = sum_c matrix[i, c] a_c.
 
-    Each distinct theta is computed once, so that HEALPix rings are cheap.
+    Each distinct theta is computed only once, which makes HEALPix rings cheap.
 
     Parameters
     ----------
@@ -182,13 +181,13 @@ def pixel_matrix(nside: int, lmax: int) -> Float[np.ndarray, "pixels modes"]:
 
 
 def sum_over_m(values: Fields) -> Float[np.ndarray, "*batch ells"]:
-    """Sum a quantity that is given per mode over the modes of each ell = 0..lmax."""
+    """Sum a per-mode quantity over the modes of each ell = 0..lmax."""
     lmax = lmax_of(values.shape[-1])
     return np.add.reduceat(np.asarray(values), np.arange(lmax + 1) ** 2, axis=-1)
 
 
 def mean_over_m(values: Fields) -> Float[np.ndarray, "*batch ells"]:
-    """Average a quantity that is given per mode over the modes of each ell = 0..lmax."""
+    """Average a per-mode quantity over the modes of each ell = 0..lmax."""
     return sum_over_m(values) / (2.0 * np.arange(lmax_of(values.shape[-1]) + 1) + 1.0)
 
 
@@ -198,35 +197,35 @@ def power_spectrum(modes: Fields) -> Float[np.ndarray, "*batch ells"]:
 
 
 def per_mode(spectrum: Float[Array, "*batch ells"]) -> Fields:
-    """Repeat a quantity that is given per ell for every mode of that ell."""
+    """Repeat a per-ell quantity for every mode of that ell."""
     ell, _ = mode_numbers(spectrum.shape[-1] - 1)
     return spectrum[..., ell]
 
 
 @lru_cache(maxsize=8)
 def modes_by_size_of_order(lmax: int) -> Int[np.ndarray, " modes"]:
-    """Packed modes by growing ``|m|``: for each first the a_lm, then the a_l,-m, by growing ell."""
+    """Order packed modes by ``|m|``; for each, first the a_lm, then the a_l,-m, both by ell."""
     ell, m = mode_numbers(lmax)
     return np.lexsort((ell, m < 0, np.abs(m)))
 
 
 def order_products(matrix: Square, heights: Angles) -> Float[np.ndarray, "points orders orders"]:
-    """Compute B of every ring, with y^T C y = f(phi)^T B f(phi), f the azimuth functions.
+    """Compute B of every ring, where y^T C y = f(phi)^T B f(phi) and f are the azimuth functions.
 
     Parameters
     ----------
     matrix : (modes, modes) array
         C, symmetric, over real harmonics.
     heights : (rings,) array
-        theta of each, growing, in radians; symmetric about the equator.
+        theta of each ring in radians, increasing and symmetric about the equator.
 
     Returns
     -------
     (rings, orders, orders) array
-        Over m = -lmax..lmax; not symmetric: only its sum with the transpose counts.
+        Over m = -lmax..lmax; not symmetric: only its sum with its transpose matters.
     """
     lmax = lmax_of(matrix.shape[0])
-    # rings from the equator on are in the south
+    # the remaining rings are southern mirror images
     polar = polar_functions(heights[: (len(heights) + 1) // 2], lmax)
     by_order, first = modes_by_order(lmax)
     ell, m = mode_numbers(lmax)
@@ -234,7 +233,7 @@ def order_products(matrix: Square, heights: Angles) -> Float[np.ndarray, "points
     mirrored = np.where(odd, -polar, polar)
     both = np.zeros((2 * lmax + 1, len(heights), 2 * lmax + 1))
     for order, rows in enumerate(np.split(np.arange(len(m)), first[1:])):
-        # the matrix is symmetric: those of m < m' count twice, those of m > m' are left out
+        # the matrix is symmetric: entries with m < m' count twice, those with m > m' are omitted
         begin, starts = rows[0], first[order:] - rows[0]
         block = matrix[by_order[rows]].take(by_order[begin:], axis=1)
         block[:, len(rows) :] *= 2.0
@@ -251,7 +250,7 @@ def order_products(matrix: Square, heights: Angles) -> Float[np.ndarray, "points
 
 
 def modes_by_order(lmax: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the packed modes by growing m, and where each m begins."""
+    """Return the packed modes ordered by m, and the position where each m begins."""
     _, m = mode_numbers(lmax)
     by_order = np.argsort(m, kind="stable")
     return by_order, np.searchsorted(m[by_order], np.arange(-lmax, lmax + 1))
@@ -261,14 +260,14 @@ def modes_by_order(lmax: int) -> tuple[np.ndarray, np.ndarray]:
 def generators(ell: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return K_x, K_y, K_z within one ell, each (2 ell + 1, 2 ell + 1) with rows m = -ell..ell.
 
-    They follow from ``(J_+ a)_m = alpha_m a_(m-1)``, ``(J_- a)_m = alpha_(m+1) a_(m+1)``, with
+    They follow from ``(J_+ a)_m = alpha_m a_(m-1)`` and ``(J_- a)_m = alpha_(m+1) a_(m+1)``, with
     alpha_m = sqrt((ell + m)(ell - m + 1)), written for c_m = sqrt(2) Re a_m, s_m = sqrt(2) Im a_m.
     """
     k_x, k_y, k_z = np.zeros((3, 2 * ell + 1, 2 * ell + 1))
     m = np.arange(1, ell + 1)
     cosine, sine = ell + m, ell - m
     k_z[cosine, sine], k_z[sine, cosine] = m, -m
-    # how m - 1 enters row m; with a_0 real its coefficient has no sqrt(2) to share
+    # coupling of row m to m - 1; a_0 is real, so its coefficient has no factor sqrt(2)
     lowering = np.sqrt((ell + m) * (ell - m + 1.0)) / 2
     lowering[:1] *= np.sqrt(2.0)
     k_y[cosine, cosine - 1] = -lowering
@@ -291,9 +290,9 @@ class Rotation(eqx.Module):
 
     @classmethod
     def from_matrix(cls, matrix: Float[np.ndarray, "3 3"], lmax: int) -> Rotation:
-        """Return D(g) for the proper rotation matrix g that takes vectors n to g n.
+        """Return D(g) for the proper rotation matrix g that maps vectors n to g n.
 
-        What was asked for before, as all channels of a site do, is there.
+        Results are cached, since all channels of a site need the same rotations.
         """
         return _rotation(np.ascontiguousarray(matrix, dtype=np.float64).tobytes(), lmax)
 
@@ -303,7 +302,7 @@ class Rotation(eqx.Module):
         return Rotation(tuple(b.T for b in self.blocks))
 
     def __call__(self, modes: Fields) -> Fields:
-        """Turn the field, or fields, with these coefficients."""
+        """Rotate the field, or fields, with these coefficients."""
         turned = [modes[..., ell**2 : (ell + 1) ** 2] @ d.T for ell, d in enumerate(self.blocks)]
         return namespace(modes, self).concatenate(turned, axis=-1)
 
@@ -315,7 +314,7 @@ def _rotation(matrix: bytes, lmax: int) -> Rotation:
     axis = turn / angle if angle else turn
     blocks = []
     for ell in range(lmax + 1):
-        # the eigenvalues of i axis . K are whole numbers
+        # the eigenvalues of i axis . K are integers
         values, vectors = np.linalg.eigh(1j * np.tensordot(axis, generators(ell), 1))
         waves = vectors * np.exp(-1j * angle * np.rint(values))
         blocks.append(np.real(waves @ vectors.conj().T))
@@ -323,7 +322,7 @@ def _rotation(matrix: bytes, lmax: int) -> Rotation:
 
 
 def turn_about_z(modes: Fields, angle: float | Float[Array, ""]) -> Fields:
-    """Turn fields about z.
+    """Rotate fields about z.
 
     Parameters
     ----------
@@ -345,11 +344,11 @@ def turn_about_z(modes: Fields, angle: float | Float[Array, ""]) -> Fields:
 
 
 def turn_about(axis: int, modes: Fields, angle: float | Float[Array, ""]) -> Fields:
-    """Turn fields about x (axis 0), from y towards z, or about y (1), from z towards x.
+    """Rotate fields about x (axis 0), from y towards z, or about y (1), from z towards x.
 
-    Else as :func:`turn_about_z`.
+    Otherwise as :func:`turn_about_z`.
     """
-    # takes the axis to z: a cyclic swap of the axes
+    # maps the axis to z by a cyclic permutation of the axes
     swap, lmax = np.roll(np.eye(3), -(axis + 1), axis=1).T, round(np.sqrt(modes.shape[-1])) - 1
     from_axis = Rotation.from_matrix(swap, lmax)
     return from_axis.T(turn_about_z(from_axis(modes), angle))
@@ -359,7 +358,7 @@ def turn_about(axis: int, modes: Fields, angle: float | Float[Array, ""]) -> Fie
 def _horizontal_generators(lmax: int) -> tuple[np.ndarray, np.ndarray]:
     """K_x and K_y over all packed modes, as two columns and their weights for every row.
 
-    A row (ell, m) has entries only in columns (ell, +-(|m| +- 1)), two of them non-zero.
+    A row (ell, m) has at most two non-zero entries, in columns (ell, +-(|m| +- 1)).
     """
     columns = np.zeros((2, n_modes(lmax), 2), dtype=int)
     weights = np.zeros((2, n_modes(lmax), 2))

@@ -1,10 +1,10 @@
-"""What a file has to hold, declared: names, dimensions, kinds, ranges, what may be absent.
+"""Declared contents of files: names, dimensions, kinds, ranges, optional parts.
 
-A reader declares a :class:`Layout` and gives :meth:`Layout.checked` what it has found, not yet
-read. Names, kinds, shapes and sizes are checked before a number is read, the numbers before one is
-used. Whatever is wrong becomes one sentence with the name of the file.
+A reader declares a :class:`Layout` and passes the unread contents of a file to
+:meth:`Layout.checked`. It checks names, kinds, shapes and sizes before it reads any number, and all
+numbers before they are used. Every error becomes one sentence with the name of the file.
 
-Files may state units (:func:`factor_to`); Hz in place of MHz is a mistake that is named.
+Files may state units (:func:`factor_to`). An error message points out Hz in place of MHz.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ from lusee_bayes.core.errors import InputError, refusing, require_known
 from lusee_bayes.core.lazy import units
 from lusee_bayes.core.progress import gigabytes, memory_limit
 
-# words for units that astropy does not know
+# names of units that astropy does not know
 ALIASES = {"kelvin": "K", "degrees": "deg", "seconds": "s"}
-# what software writes that was not given a word or a unit, in lower case
+# placeholders that software writes for a missing word or unit, in lower case
 UNSTATED = ("", "unknown", "unspecified", "none")
-# LuSEE-Night ends at 50 MHz; what is larger was meant in Hz or kHz
+# LuSEE-Night's band ends at 50 MHz; larger numbers are in Hz or kHz
 LARGEST_MHZ = 1000.0
 NOT_HZ = f"expected at most {LARGEST_MHZ:g} MHz; is this Hz? Divide by 1e6"
 
 
 def factor_to(where: str, unit: str, stated: Any) -> float:
-    """Return the factor from the unit that a file states to the package's.
+    """Return the factor that converts from a file's unit to the package's.
 
     Parameters
     ----------
     where : str
         The file and its variable, for the message.
     unit : str
-        The package's; empty for a quantity without one.
+        The package's unit; empty for a quantity without one.
     stated : object
-        The file's; None or one of :data:`UNSTATED` if it states none: then it is the package's.
+        The file's unit; None or one of :data:`UNSTATED` means the package's unit.
 
     Raises
     ------
     InputError
-        If it is another quantity's unit, or unknown.
+        If the unit is unknown or belongs to another quantity.
     """
     stated = stated.decode(errors="replace") if isinstance(stated, bytes) else stated
     text = "" if stated is None else str(stated).strip()
@@ -57,14 +57,14 @@ def factor_to(where: str, unit: str, stated: Any) -> float:
 
 
 def require_mhz(where: str, mhz: Any) -> None:
-    """Check that frequencies may be in MHz. InputError if one is so high that it must be in Hz."""
+    """Check that frequencies are plausible in MHz; InputError if one is too high to be."""
     largest = float(np.max(mhz))
     if largest > LARGEST_MHZ:
         raise InputError(f"{where}: got {largest:g} MHz, {NOT_HZ}")
 
 
 Kind = Literal["real", "complex", "integer", "boolean", "text", "word", "time"]
-# numpy's kinds of dtypes that each takes, what it becomes, and how it is called
+# for each: the accepted kinds of NumPy dtypes, the type to convert to, and its name in messages
 KINDS: dict[str, tuple[str, type, str]] = {
     "real": ("fiu", np.float64, "real numbers"),
     "complex": ("fiuc", np.complex128, "complex numbers"),
@@ -75,13 +75,13 @@ KINDS: dict[str, tuple[str, type, str]] = {
     "time": ("M", np.datetime64, "times (such as seconds since 2027-01-01)"),
 }
 
-# no quantity of this field is larger in any unit, and fourth powers have room in 64 bits
+# no quantity in this field is larger in any unit, and fourth powers fit into a 64-bit float
 LARGEST = 1e60
 
 
 @runtime_checkable
 class Unread(Protocol):
-    """An array in a file: known, but not read before ``numpy.asarray``."""
+    """An array in a file, whose numbers are only read by ``numpy.asarray``."""
 
     shape: tuple[int, ...]
     dtype: np.dtype
@@ -89,7 +89,7 @@ class Unread(Protocol):
 
 @dataclass(frozen=True)
 class Unloaded:
-    """An array of an open file, of which the header alone has been read."""
+    """An array of an open file of which only the header has been read."""
 
     shape: tuple[int, ...]
     dtype: np.dtype
@@ -108,23 +108,23 @@ class Variable:
     dims : sequence of str or int
         Names of lengths, which all arrays of the file share, or lengths.
     kind : {"real", "complex", "integer", "boolean", "text", "word", "time"}
-        What it holds; it is read as float64, complex128, int64, bool, str or datetime64[ns].
-        Attributes alone are words: text, or a whole number that is read as text.
+        Kind of its values; read as float64, complex128, int64, bool, str or datetime64[ns]. Only
+        attributes can be words: text, or an integer that is read as text.
     low, high : float
-        The range of its numbers, ends included, as far as they are finite.
+        Range of its finite numbers, limits included.
     finite : bool
-        Whether every number is to be finite; else there may be NaN.
+        Whether NaN is an error; infinity is one in any case, unless ``missing``.
     missing : bool
-        Whether there may be NaN and infinity.
+        Whether NaN and infinity are allowed.
     grows : bool
-        Whether every number is to be above the one before.
+        Whether the numbers must increase strictly.
     choices : sequence of str
-        All texts that may be there; any, if there are none.
+        All allowed texts; if empty, any text is allowed.
     optional : bool
         Whether it may be absent.
     unit : str
-        The package's unit, as astropy writes it. Numbers are converted from the unit that the file
-        states, if it states one.
+        The package's unit, in astropy's notation. If the file states another unit, numbers are
+        converted from it.
     """
 
     dims: Sequence[str | int]
@@ -139,24 +139,24 @@ class Variable:
     unit: str = ""
 
 
-# a number, or a text, that a file says of itself: it has no dimensions
+# a number or text that describes the file: a variable without dimensions
 Attribute = partial(Variable, ())
 
 
 @dataclass(frozen=True)
 class Content:
-    """What a file holds, checked.
+    """The checked contents of a file.
 
     Attributes
     ----------
     arrays : dict of str to array
-        Without optional ones that are absent.
+        Declared arrays, without absent optional ones.
     values : dict of str to float, int, bool or str
-        Likewise.
+        Declared attributes, without absent optional ones.
     sizes : dict of str to int
-        The lengths by name.
+        Lengths of dimensions by name.
     names : frozenset of str
-        All arrays of the file, declared or not.
+        Names of all arrays of the file, declared or not.
     """
 
     arrays: dict[str, np.ndarray]
@@ -167,12 +167,12 @@ class Content:
 
 @dataclass(frozen=True)
 class Layout:
-    """What files of one kind hold. More than that may be there, and is not looked at.
+    """Declared contents of one kind of file; anything else in a file is ignored.
 
     Attributes
     ----------
     what : str
-        Such as "visibilities of lusee-bayes simulate", for messages.
+        Description for messages, such as "visibilities of lusee-bayes simulate".
     variables : mapping of str to Variable
     attributes : mapping of str to Variable
     """
@@ -184,16 +184,16 @@ class Layout:
     def checked(
         self, path: str | Path, arrays: Mapping[str, Unread], values: Mapping[str, Any]
     ) -> Content:
-        """Read what is declared.
+        """Read the declared contents.
 
         Parameters
         ----------
         path : str or Path
             The file, for messages.
         arrays : mapping of str to array
-            What is there; numpy.asarray reads it.
+            Arrays of the file; numpy.asarray reads their numbers.
         values : mapping of str to object
-            Likewise, read; ``NAME.units`` is what the file states as the unit of an array.
+            Attributes of the file, already read; ``NAME.units`` is the unit stated for an array.
 
         Returns
         -------
@@ -202,7 +202,7 @@ class Layout:
         Raises
         ------
         InputError
-            If the file lacks something, or something is not as declared.
+            If something is missing or not as declared.
         """
         for expected, given in ((self.variables, arrays), (self.attributes, values)):
             for name, one in expected.items():
@@ -233,9 +233,9 @@ class Layout:
 
 
 def _require_form(where: str, array: Unread, declared: Variable, sizes: dict[str, int]) -> None:
-    """InputError for another kind or shape than declared; lengths that are new become known."""
+    """Raise InputError if kind or shape differ from the declared ones; add new lengths to sizes."""
     kind, (allowed, _, words) = np.dtype(array.dtype).kind, KINDS[declared.kind]
-    # text of any length is kept as objects
+    # text of variable length is stored as objects
     if kind not in allowed and not (declared.kind == "text" and kind == "O"):
         raise InputError(f"{where} has values of type {array.dtype}, expected {words}")
     shape = tuple(array.shape)
@@ -311,7 +311,7 @@ def _checked_value(where: str, value: Any, declared: Variable) -> Any:
         if declared.choices:
             require_known(f"{where} is", text, declared.choices)
         return text
-    # lists of lists of different lengths are no array
+    # a list of lists of different lengths is not an array
     number = np.asarray(None if isinstance(value, list) else value)
     good = number.ndim == 0 and number.dtype.kind in KINDS[kind][0]
     if good and kind != "boolean" and not (declared.missing and not np.isfinite(number)):

@@ -1,7 +1,7 @@
-"""Libraries that take long to import and that most uses do without: imported when first used.
+"""Libraries that are slow to import and rarely needed: imported when first used.
 
-``importlib.util.LazyLoader``, on which lazy_loader builds, puts an unfinished module where every
-search through ``sys.modules`` finishes it, in the middle of other imports; these are plain objects.
+``importlib.util.LazyLoader``, used by lazy_loader, leaves an unfinished module in ``sys.modules``.
+Any search through it finishes that module, in the middle of other imports. These are plain objects.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from typing import Any
 
 
 class LazyModule:
-    """A module that is imported when one of its names is first asked for.
+    """A module that is imported when one of its names is first used.
 
     Parameters
     ----------
     name : str
-        Of the module.
+        Name of the module.
     """
 
     def __init__(self, name: str):
@@ -26,10 +26,10 @@ class LazyModule:
         return getattr(import_module(self._name), name)
 
 
-# healpy brings matplotlib and astropy.coordinates with it
+# healpy imports matplotlib and astropy.coordinates
 healpy = LazyModule("healpy")
 coordinates = LazyModule("astropy.coordinates")
-# for whoever checks whether something is traced, and shows numbers
+# for checks of whether a value is traced, and for printing numbers
 jax = LazyModule("jax")
 numpyro = LazyModule("numpyro")
 interpolate = LazyModule("scipy.interpolate")

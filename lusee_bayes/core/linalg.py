@@ -1,14 +1,14 @@
-"""Linear algebra: LAPACK's for NumPy arrays; for JAX arrays, at less than XLA's own cost.
+"""Linear algebra: LAPACK for NumPy arrays; for JAX arrays, cheaper than XLA's own routines.
 
 XLA has no symmetric rank-k update on the CPU: ``W.T @ W`` computes both triangles. Splitting the
 columns and forming only the blocks on and below the diagonal does 5/8 of the work. XLA also solves
-triangular systems as if their right-hand sides were full. Inverting L by halves, and leaving out
-the zeros of L^-1 in L^-T L^-1, takes n^3 / 3 multiplications each, in matrix products.
+triangular systems as if their right-hand sides were full. Inverting L by halves, and omitting the
+zeros of L^-1 in L^-T L^-1, each take n^3 / 3 multiplications, in matrix products.
 
 SciPy's wrappers of LAPACK keep the interpreter's lock while they compute, so that channels in two
-threads would wait for each other. The same routines are taken from
-:mod:`scipy.linalg.cython_lapack` and called through ctypes, which lets go of the lock. The lower
-triangle of an array in C order is the upper one in LAPACK's.
+threads would wait for each other. We call the same routines in :mod:`scipy.linalg.cython_lapack`
+through ctypes, which releases the lock. The lower triangle of an array in C order is the upper
+triangle for LAPACK.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from lusee_bayes.core.checks import is_traced, require_float64
 from lusee_bayes.core.errors import InputError
 
 Matrix = Float[Array, "n n"]
-# a matrix, or a stack of them, and what they are multiplied with
+# a matrix or a stack of matrices, and right-hand sides for them
 Matrices = Float[Array, "*batch n n"]
 Columns = Float[Array, "*batch n columns"]
 Tall = Float[Array, "rows n"]
@@ -38,7 +38,7 @@ Tall = Float[Array, "rows n"]
 
 @lru_cache
 def _routine(name: str) -> Callable[..., None]:
-    """A routine of LAPACK or BLAS, all of whose arguments are pointers."""
+    """A LAPACK or BLAS routine; all its arguments are pointers."""
     module = cython_lapack if name in cython_lapack.__pyx_capi__ else cython_blas
     capsule = module.__pyx_capi__[name]
     name_of = ctypes.PYFUNCTYPE(ctypes.c_char_p, ctypes.py_object)
@@ -49,7 +49,7 @@ def _routine(name: str) -> Callable[..., None]:
 
 
 def _called(name: str, *arguments: bytes | int | float | np.ndarray) -> int:
-    """Call a routine with its arguments but for info, which is returned; arrays are overwritten."""
+    """Call a routine with all arguments except info, and return info; arrays are overwritten."""
     routine, info, pointers = _routine(name), ctypes.c_int(0), []
     for argument in arguments:
         if isinstance(argument, np.ndarray):
@@ -64,24 +64,24 @@ def _called(name: str, *arguments: bytes | int | float | np.ndarray) -> int:
     return info.value
 
 
-# strips into which a triangle is split: measured for W^T W at 5232 x 2304 on two cores, 4 strips
-# take 0.40 s, one product 0.49 s; halving recursively takes 0.35 s but 0.1 GB more memory
+# strips into which a triangle is split. For W^T W at 5232 x 2304 on two cores, 4 strips take
+# 0.40 s and one product 0.49 s; recursive halving takes 0.35 s, but 0.1 GB more memory
 N_BLOCKS = 4
 
-# rows of a lower triangle that are mirrored at once
+# rows of a lower triangle to mirror at once
 MIRRORED = 128
 
-# of the largest row of a matrix, what combinations of a few of its rows may miss
+# error of combinations of a few rows of a matrix, relative to its largest row
 SPANNED = 1e-12
 
-# largest triangle that is inverted by substitution
+# largest triangle to invert by substitution
 MAX_SUBSTITUTED = 160
 
 
 def cholesky(matrix: Matrices, *, overwrite: bool = False) -> Matrices:
-    """Return the lower Cholesky factor, NaN where there is none; reads the lower triangle only.
+    """Return the lower Cholesky factor, NaN if there is none; read only the lower triangle.
 
-    With ``overwrite`` it takes the place of NumPy's matrix.
+    With ``overwrite``, it replaces a NumPy matrix in memory.
     """
     if namespace(matrix) is np:
         if matrix.ndim > 2:
@@ -96,7 +96,7 @@ def cholesky(matrix: Matrices, *, overwrite: bool = False) -> Matrices:
 
 
 def checked_cholesky(name: str, matrix: Matrices) -> Matrices:
-    """Return the lower Cholesky factor of a matrix, or of each of a stack.
+    """Return the lower Cholesky factor of a matrix, or of every matrix of a stack.
 
     Parameters
     ----------
@@ -112,8 +112,8 @@ def checked_cholesky(name: str, matrix: Matrices) -> Matrices:
     Raises
     ------
     InputError
-        If a matrix is not positive definite; the message gives its lowest eigenvalue. Not inside
-        a JAX transformation, where the factor holds NaN instead.
+        If a matrix is not positive definite; the message gives its lowest eigenvalue. Inside a JAX
+        transformation, the factor contains NaN instead.
     """
     lower = cholesky(matrix)
     if not is_traced(lower) and not np.isfinite(np.asarray(lower)).all():
@@ -145,9 +145,9 @@ def gram_matrix(w: Float[Array, "rows columns"]) -> Float[Array, "columns column
 
 
 def symmetric_product(left: Float[Array, "n inner"], right: Float[Array, "inner n"]) -> Matrix:
-    """Return the product of two matrices that is known to be symmetric.
+    """Return the product of two matrices whose product is symmetric.
 
-    Only the lower triangle is computed, so that the result is symmetric to the last bit.
+    Only the lower triangle is computed, so the result is symmetric to the last bit.
     """
     n = right.shape[1]
     if namespace(left, right) is np:
@@ -159,7 +159,7 @@ def symmetric_product(left: Float[Array, "n inner"], right: Float[Array, "inner 
 
 
 def scaled(matrix: Matrix, scale: Float[Array, " n"], *, overwrite: bool = False) -> Matrix:
-    """Return M_ij s_i s_j; with ``overwrite`` NumPy's M becomes it."""
+    """Return M_ij s_i s_j; with ``overwrite``, it replaces a NumPy M in memory."""
     if namespace(matrix, scale) is not np:
         return scale[:, None] * matrix * scale[None]
     product = np.multiply(matrix, scale[None], out=matrix if overwrite else None)
@@ -189,13 +189,13 @@ def inverse_sandwich(matrix: Matrix, lower: Matrix, *, transpose: bool = False) 
     if namespace(matrix, lower) is not np:
         solved = solve_lower(lower, matrix, transpose=transpose)
         return solve_lower(lower, solved.T, transpose=transpose)
-    if transpose:  # with rows and columns in reverse order it is the other one
+    if transpose:  # reversing rows and columns turns one into the other
         return _reversed(_sandwiched(1, _reversed(matrix), _reversed(lower.T)))
     return _sandwiched(1, matrix, lower)
 
 
 def _sandwiched(kind: int, matrix: np.ndarray, lower: np.ndarray) -> np.ndarray:
-    """LAPACK's reduction of symmetric problems: n^3 operations in place of 3 n^3."""
+    """LAPACK's reduction of symmetric problems, in n^3 operations instead of 3 n^3."""
     n, reduced = len(lower), np.array(matrix, order="C")
     _called("dsygst", kind, b"U", n, reduced, n, np.ascontiguousarray(lower), n)
     return mirrored(reduced)
@@ -203,17 +203,17 @@ def _sandwiched(kind: int, matrix: np.ndarray, lower: np.ndarray) -> np.ndarray:
 
 def outer_sandwich(matrix: Matrix, lower: Matrix) -> Matrix:
     """Return L M L^T for symmetric M and lower triangular L, symmetric to the last bit."""
-    # with rows and columns in reverse order it is the other one
+    # reversing rows and columns turns L^T M L into L M L^T
     return _reversed(sandwich(_reversed(matrix), _reversed(lower.T)))
 
 
 def precise_residual(
     vector: Float[Array, " rows"], matrix: Tall, x: Float[Array, " n"]
 ) -> Float[Array, " rows"]:
-    """Return v - M x, as if products were summed with half as many digits more.
+    """Return v - M x, as precisely as if sums had half as many digits more.
 
-    The leading bits of M and x, as many as leave room for the sums, are multiplied without any
-    rounding; what is left is smaller by as many bits, and so is its rounding.
+    The leading bits of M and x, few enough to leave room for the sums, are multiplied without
+    rounding. The remainder is smaller by this number of bits, and so is its rounding error.
 
     References
     ----------
@@ -234,7 +234,7 @@ def precise_residual(
 def invert_lower(lower: Matrix, *, overwrite: bool = False) -> Matrix:
     """Return L^-1 for lower triangular L; entries above the diagonal are not read.
 
-    With ``overwrite`` it takes the place of NumPy's L, which has zeros above the diagonal.
+    With ``overwrite``, it replaces a NumPy L, which must have zeros above the diagonal.
     """
     if namespace(lower) is np:
         inverse = lower if overwrite else np.tril(lower)
@@ -264,29 +264,29 @@ def inverse_from_cholesky(lower: Matrix) -> Matrix:
 def spanning_rows(
     matrix: Float[np.ndarray, "rows columns"], kind: np.ndarray
 ) -> tuple[np.ndarray, Float[np.ndarray, "rows few"]]:
-    """Find few rows of a matrix that all of its rows are combinations of.
+    """Find a few rows of a matrix whose combinations give all of its rows.
 
     Parameters
     ----------
     matrix : (rows, columns) array
     kind : (rows,) array
-        Rows are combined with those of their kind only.
+        Rows are combined only with rows of their own kind.
 
     Returns
     -------
     (few,) array of int
-        Which rows.
+        Indices of these rows.
     (rows, few) array
-        Factors: the product with the few rows is the matrix, to ``SPANNED`` of its largest row.
+        Factors: their product with these rows is the matrix, to ``SPANNED`` of its largest row.
     """
-    # rows of fewer numbers, with the same products
+    # shorter rows with the same scalar products
     residual = np.linalg.qr(matrix.T, mode="r").T.copy()
     picked, along = [], []
     least = SPANNED**2 * (residual**2).sum(axis=1).max()
     while (squares := (residual**2).sum(axis=1)).max() > least:
         k = int(squares.argmax())
         unit = residual[k] / np.sqrt(squares[k])
-        # not by BLAS, whose threads would wait for each other every time
+        # einsum, since the threads of BLAS would wait for each other every time
         products = np.einsum("rc,c->r", residual, unit)
         along.append(np.where(kind == kind[k], products, 0.0))
         picked.append(k)
@@ -296,7 +296,7 @@ def spanning_rows(
 
 
 def mirrored(lower: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """Make a lower triangle symmetric, in place; block by block, as caches like it."""
+    """Make a lower triangle symmetric in place, in blocks that fit the cache."""
     for first, end in pairwise([*range(0, len(lower), MIRRORED), len(lower)]):
         lower[:first, first:end] = lower[first:end, :first].T
         block = lower[first:end, first:end]
@@ -305,7 +305,7 @@ def mirrored(lower: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
 
 
 def _reversed(matrix: Matrix) -> Matrix:
-    """Rows and columns in reverse order; BLAS has no negative strides."""
+    """Reverse rows and columns; copied for NumPy, since BLAS has no negative strides."""
     turned = matrix[::-1, ::-1]
     return np.ascontiguousarray(turned) if namespace(matrix) is np else turned
 
@@ -316,7 +316,7 @@ def _strips(n: int) -> Iterator[tuple[int, int]]:
 
 
 def _from_strips(strips: list[Float[Array, "_ _"]]) -> Matrix:
-    """The symmetric matrix whose rows, up to their diagonal block, are these."""
+    """The symmetric matrix with these strips of rows, each up to its diagonal block."""
     n = strips[-1].shape[1]
     rows = [jnp.pad(strip, ((0, 0), (0, n - strip.shape[1]))) for strip in strips]
     lower = jnp.tril(jnp.concatenate(rows))

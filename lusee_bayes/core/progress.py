@@ -1,4 +1,4 @@
-"""Progress of a run: the stage that is running, how long each one took, and how much memory."""
+"""Progress of a run: the current stage, the time of each stage, and memory."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from lusee_bayes.core.version import versions
 # limits of the process's control group, of either version
 CGROUPS = Path("/sys/fs/cgroup")
 CGROUP_LIMITS = (CGROUPS / "memory.max", CGROUPS / "memory" / "memory.limit_in_bytes")
-# addresses that libraries and threads reserve without using the memory, below which XLA aborts
+# address space that libraries and threads reserve without using it; XLA aborts with less
 RESERVED = 1_500_000_000
-# seconds and share of a stage between lines of its progress in a file
+# least seconds and fraction of a stage between lines of progress in a file
 LINE_S, LINE_SHARE = 10.0, 0.05
 
 
@@ -37,7 +37,7 @@ class Stages:
     console : Console or None
         Where to print; None prints nothing.
     seconds : dict of str to float
-        Wall-clock time of every finished stage; a stage that runs twice is added up.
+        Wall-clock time of every finished stage, summed over repetitions.
     verbose : bool
         Also print the peak memory after every stage.
     """
@@ -48,7 +48,7 @@ class Stages:
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        """Run a ``with`` block as a stage: a spinner while it runs, its time when it is done."""
+        """Run a ``with`` block as a stage: show a spinner, then print its time."""
         start = time.perf_counter()
         with nullcontext() if self.console is None else self.console.status(escape(f"{name} ...")):
             yield
@@ -56,7 +56,7 @@ class Stages:
 
     @contextmanager
     def progress(self, name: str, total: int) -> Iterator[Callable[[int, str], None]]:
-        """Run a ``with`` block as a stage with a progress bar, or lines where it is no terminal.
+        """Run a ``with`` block as a stage with a progress bar, or with lines outside a terminal.
 
         Parameters
         ----------
@@ -89,7 +89,7 @@ class Stages:
         self._finish(name, start)
 
     def _lines(self, name: str, total: int) -> Callable[[int, str], None]:
-        """Progress in a file: a line when 10 s and 5 % have passed since the last one."""
+        """Progress in a file: a line once 10 s and 5 % of the stage have passed since the last."""
         said, last = time.perf_counter(), 0
         counting = threading.Lock()
 
@@ -122,7 +122,7 @@ def peak_memory_gb() -> float:
 
 
 def about_run(seconds: Mapping[str, float]) -> dict[str, object]:
-    """What a file of results says of the run itself: seconds by stage, memory, versions."""
+    """Properties of a run to store with its results: seconds by stage, memory, versions."""
     return {
         "seconds": {name: round(s, 3) for name, s in seconds.items()},
         "peak_memory_gb": round(peak_memory_gb(), 3),
@@ -132,7 +132,7 @@ def about_run(seconds: Mapping[str, float]) -> dict[str, object]:
 
 @lru_cache(maxsize=1)
 def memory_limit() -> int:
-    """Bytes of this machine's memory, or of the share of it that the process is limited to."""
+    """Memory of this machine in bytes, or the limit of this process if that is lower."""
     limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
     addresses, _ = resource.getrlimit(resource.RLIMIT_AS)
     if addresses != resource.RLIM_INFINITY:

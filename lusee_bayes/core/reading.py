@@ -1,6 +1,6 @@
-"""The door for every file: what cannot be read is said in one sentence, with the file's name.
+"""Reading of all files: one that cannot be read raises one sentence with its name.
 
-JSON, CSV, NumPy's .npz and YAML are read here. YAML is that of version 1.2, but dates stay text.
+This module reads JSON, CSV, NumPy's .npz and YAML (version 1.2, except that dates stay text).
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ from lusee_bayes.core.files import user_path
 from lusee_bayes.core.layouts import Content, Layout, Unloaded
 
 Model = TypeVar("Model", bound=BaseModel)
-# a text file that is larger is none that a person or this package has written
+# no person and no part of this package writes a larger text file
 LARGEST_TEXT = 50_000_000
 
 
 def require_file(path: str | Path, what: str, hint: str = "") -> Path:
-    """Check that there is a regular file that may be read.
+    """Check that a path is a readable regular file.
 
     Parameters
     ----------
     path : str or Path
     what : str
-        What it should be, for the message.
+        Description of the expected file, for the message.
     hint : str
-        What to do if there is none.
+        Advice in case there is none.
 
     Returns
     -------
@@ -49,7 +49,7 @@ def require_file(path: str | Path, what: str, hint: str = "") -> Path:
     Raises
     ------
     InputError
-        If there is none, or a folder, a pipe or a device.
+        If there is none, it is a folder, a pipe or a device, or the user may not read it.
     """
     path = user_path(path)
     try:
@@ -58,7 +58,7 @@ def require_file(path: str | Path, what: str, hint: str = "") -> Path:
         hint = f"; {hint}" if hint else ""
         raise InputError(f"no {_kind(what)} at '{path}'{hint}") from error
     except (OSError, ValueError) as error:
-        # a name that is too long, holds a NUL, or lies behind a file
+        # the name is too long, contains NUL, or has a file as a parent
         raise InputError(f"no {_kind(what)} at '{path}': {_reason(error)}") from error
     if not stat.S_ISREG(mode):
         kind = "a folder" if stat.S_ISDIR(mode) else "neither a file nor a folder"
@@ -70,18 +70,18 @@ def require_file(path: str | Path, what: str, hint: str = "") -> Path:
 
 @contextmanager
 def reading(path: str | Path, what: str, hint: str = "") -> Iterator[Path]:
-    """Read a file within the block, and turn whatever a library raises there into one sentence.
+    """Read a file within the block, and turn any error of a library into one sentence.
 
-    Libraries raise errors of every kind for files that are cut short or damaged: HDF5 alone
-    OSError, KeyError, RuntimeError, ValueError and more. Keep to reading in the block.
+    Libraries raise many kinds of errors for truncated or damaged files: HDF5 alone raises OSError,
+    KeyError, RuntimeError, ValueError and more. The block should do nothing but read.
 
     Parameters
     ----------
     path : str or Path
     what : str
-        What the file should be.
+        Description of the expected file.
     hint : str
-        What to do if there is none.
+        Advice in case there is none.
 
     Yields
     ------
@@ -90,12 +90,12 @@ def reading(path: str | Path, what: str, hint: str = "") -> Iterator[Path]:
     Raises
     ------
     InputError
-        As :func:`require_file`; for whatever the block raises, with its reason.
+        As in :func:`require_file`; and with its reason for any error of the block.
     """
     path = require_file(path, what, hint)
     try:
         with warnings.catch_warnings():
-            # what is said of a damaged file is said by the error, if by anything
+            # about a damaged file, the error is enough
             warnings.simplefilter("ignore")
             yield path
     except (InputError, MemoryError):
@@ -109,7 +109,7 @@ def reading(path: str | Path, what: str, hint: str = "") -> Iterator[Path]:
 
 @contextmanager
 def naming(path: str | Path) -> Iterator[None]:
-    """Put the name of a file, or of what else is to blame, before an InputError of the block."""
+    """Put the name of a file, or of another cause, before an InputError of the block."""
     try:
         yield
     except InputError as error:
@@ -117,12 +117,12 @@ def naming(path: str | Path) -> Iterator[None]:
 
 
 def _kind(what: str) -> str:
-    """What it should be, without its article."""
+    """The description of a file without its article."""
     return what.removeprefix("a ").removeprefix("an ").removeprefix("the ")
 
 
 def _reason(error: BaseException) -> str:
-    """The first line of an error, short."""
+    """The message of an error on one line, shortened."""
     text = " ".join(str(error).split()) or type(error).__name__
     if isinstance(error, KeyError):
         text = text.strip("'\"") if " " in text else f"missing {text}"
@@ -130,7 +130,7 @@ def _reason(error: BaseException) -> str:
 
 
 def read_text(path: str | Path, what: str, hint: str = "") -> str:
-    """Read a text file in UTF-8. InputError if it cannot be, or is too large to be one."""
+    """Read a text file in UTF-8. InputError if it is unreadable or too large."""
     with reading(path, what, hint) as file:
         size = file.stat().st_size
         if size > LARGEST_TEXT:
@@ -142,12 +142,12 @@ def read_text(path: str | Path, what: str, hint: str = "") -> str:
 
 
 def read_json(path: str | Path, layout: Layout, hint: str = "") -> dict[str, Any]:
-    """Read an object in JSON, and check its values against a layout; others are kept as they are.
+    """Read a JSON object, and check its values against a layout; undeclared values are kept as is.
 
     Raises
     ------
     InputError
-        If the file cannot be read, is no object, or lacks a value.
+        If the file cannot be read, is not an object, or lacks a value.
     """
     with reading(path, layout.what, hint):
         tree = json.loads(read_text(path, layout.what))
@@ -157,7 +157,7 @@ def read_json(path: str | Path, layout: Layout, hint: str = "") -> dict[str, Any
 
 
 def read_model(path: str | Path, kind: type[Model], what: str, hint: str = "") -> Model:
-    """Read an object in JSON into a pydantic model.
+    """Read a JSON object into a pydantic model.
 
     Parameters
     ----------
@@ -165,14 +165,14 @@ def read_model(path: str | Path, kind: type[Model], what: str, hint: str = "") -
     kind : type
         The model.
     what : str
-        What it should be, for messages.
+        Description of the expected file, for messages.
     hint : str
-        What to do if there is no such file.
+        Advice in case there is no such file.
 
     Raises
     ------
     InputError
-        If the file cannot be read, or the first thing in it that is not as the model has it.
+        If the file cannot be read or violates the model; the message gives the first violation.
     """
     try:
         return kind.model_validate_json(read_text(path, what, hint))
@@ -185,12 +185,12 @@ def read_model(path: str | Path, kind: type[Model], what: str, hint: str = "") -
 
 
 def read_table(path: str | Path, layout: Layout, hint: str = "") -> dict[str, np.ndarray]:
-    """Read a CSV table with a header: every column by its name, numbers where all are.
+    """Read a CSV table with a header: columns by name, as numbers if all entries are numbers.
 
     Raises
     ------
     InputError
-        If the file cannot be read, rows are of different lengths, or a column is missing or not as
+        If the file cannot be read, rows differ in length, or a column is missing or not as
         declared.
     """
     with reading(path, layout.what, hint):
@@ -216,14 +216,14 @@ def read_table(path: str | Path, layout: Layout, hint: str = "") -> dict[str, np
 
 
 def read_arrays(path: str | Path, layout: Layout, hint: str = "") -> Content:
-    """Read NumPy's .npz: arrays; values are arrays of one entry.
+    """Read arrays from NumPy's .npz; values are stored as arrays with one entry.
 
     Raises
     ------
     InputError
         If the file cannot be read, or is not as declared.
     """
-    # opened here: where NumPy fails to read a file that it has opened itself, it leaves it open
+    # opened here, because NumPy does not close a file that it opened itself and fails to read
     with (
         reading(path, layout.what, hint) as whole,
         whole.open("rb") as file,
@@ -237,7 +237,7 @@ def read_arrays(path: str | Path, layout: Layout, hint: str = "") -> Content:
 
 
 def _unloaded(arrays: np.lib.npyio.NpzFile, name: str) -> Unloaded:
-    """The array with the shape and dtype of its header."""
+    """The unread array, with shape and dtype from its header."""
     with arrays.zip.open(f"{name}.npy") as file:
         major, _ = np.lib.format.read_magic(file)
         header = getattr(np.lib.format, f"read_array_header_{major}_0")(file)
@@ -245,7 +245,7 @@ def _unloaded(arrays: np.lib.npyio.NpzFile, name: str) -> Unloaded:
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
-    """Write rows with the keys of the first one as header."""
+    """Write rows, with the keys of the first row as the header."""
     with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
         writer = csv.DictWriter(file, rows[0])
         writer.writeheader()
@@ -253,7 +253,7 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
 
 
 class _Constructor(SafeConstructor):
-    """The safe one, without dates."""
+    """The safe constructor, without dates."""
 
 
 _Constructor.add_constructor("tag:yaml.org,2002:timestamp", lambda _, node: node.value)
@@ -262,7 +262,7 @@ _Constructor.add_constructor("tag:yaml.org,2002:timestamp", lambda _, node: node
 def _yaml() -> YAML:
     plain = YAML(typ="safe", pure=True)
     plain.Constructor = _Constructor
-    plain.allow_unicode = False  # line breaks of Unicode would not come back
+    plain.allow_unicode = False  # Unicode line breaks would be lost
     plain.sort_base_mapping_type_on_output = False
     return plain
 
@@ -274,7 +274,7 @@ def parse_yaml(text: str, where: str) -> Any:
     ----------
     text : str
     where : str
-        What it is, for messages.
+        Name of the text, for messages.
 
     Returns
     -------
@@ -296,12 +296,12 @@ def parse_yaml(text: str, where: str) -> Any:
 
 
 def read_yaml(path: str | Path, what: str) -> Any:
-    """Read a YAML file. InputError if it cannot be read, or as :func:`parse_yaml`."""
+    """Read a YAML file. InputError if it cannot be read, or as in :func:`parse_yaml`."""
     return parse_yaml(read_text(path, what), str(path))
 
 
 def as_yaml(tree: Any, *, flow: bool = False) -> str:
-    """Write lists, mappings and plain values as YAML, in a line if ``flow``."""
+    """Write lists, mappings and plain values as YAML, on one line if ``flow``."""
     written, plain = StringIO(), _yaml()
     plain.default_flow_style = flow
     plain.dump(tree, written)

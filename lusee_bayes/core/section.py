@@ -1,4 +1,4 @@
-"""What all sections of a scenario have in common: types of entries, validators, kinds."""
+"""Common parts of all sections of a scenario: types of entries, validators, kinds."""
 
 from __future__ import annotations
 
@@ -29,28 +29,28 @@ def _not_hz(value: Any) -> Any:
     return value
 
 
-# what is smaller or larger has no meaning here, and its powers no room in 64 bits
+# numbers outside this range are meaningless here, and their powers overflow or underflow
 SMALLEST, LARGEST = 1e-30, 1e30
 NOT_TINY = AfterValidator(_not_tiny)
 Positive = Annotated[float, Field(gt=0, le=LARGEST), NOT_TINY]
 Temperature = Annotated[float, Field(ge=0, le=1e6)]
 Angle = Annotated[float, Field(ge=-3600, le=3600)]
-# of random numbers; channels have one each, so that some room is left below 64 bits
+# seed of random numbers; below 64 bits, to leave room for one seed per channel
 Seed = Annotated[int, Field(ge=0, lt=2**62)]
-# of LuSEE-Night's band, in MHz
+# a frequency in LuSEE-Night's band, in MHz
 Frequency = Annotated[float, Field(ge=1, le=50), BeforeValidator(_not_hz)]
-# of a file, or of a spectrum
+# a frequency in a file or of a spectrum
 Megahertz = Annotated[Positive, BeforeValidator(_not_hz)]
-# what is done about something that is not known
+# treatment of an unknown quantity
 Treatment = Literal["marginalised", "sampled", "ignored"]
 
 
-# entries that name files; one that has its default names none
+# entries that name files; an entry with its default value does not
 FILES = ("clock", "file", "gain_table", "lines", "mean_file", "schedule", "spectrum_file")
 
 
 def _described(schema: dict[str, Any], section: type[BaseModel]) -> None:
-    """Give the entries of a JSON schema the meanings that docstrings of the section have."""
+    """Copy the descriptions in a section's docstrings into its JSON schema."""
     for cls in reversed(section.__mro__):
         if not issubclass(cls, Section) or cls is Section:
             continue
@@ -62,9 +62,9 @@ def _described(schema: dict[str, Any], section: type[BaseModel]) -> None:
 
 
 class Section(BaseModel):
-    """Part of a scenario: no key that is not declared, no NaN, nothing changed once made.
+    """Part of a scenario: undeclared keys and NaN are errors, and instances are immutable.
 
-    Types are strict: no text for numbers, no ``true`` for 1, no 12.0 for 12.
+    Types are strict: text is not a number, ``true`` is not 1, and 12.0 is not 12.
     """
 
     model_config = ConfigDict(
@@ -72,7 +72,7 @@ class Section(BaseModel):
     )
 
     def anchored(self: S) -> S:
-        """The same with absolute names of files, which are then the same in any folder."""
+        """Return a copy with absolute file names, which are valid from any folder."""
         absolute: dict[str, Any] = {}
         for name, declared in type(self).model_fields.items():
             value = getattr(self, name)
@@ -85,7 +85,7 @@ class Section(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _as_sections_have_it(cls, tree: Any) -> Any:
-        """YAML has lists where sections have tuples, and ``~`` in the names of files."""
+        """Convert YAML's lists to tuples, and expand ``~`` in file names."""
         if not isinstance(tree, Mapping):
             return tree
         entries = {key: tuple(v) if isinstance(v, list) else v for key, v in tree.items()}
@@ -94,7 +94,7 @@ class Section(BaseModel):
 
 
 def requires(holds: Callable[[Any], Any], message: str) -> Any:
-    """A validator of a section: ValueError with this message unless it obeys a rule."""
+    """A validator of a section: raises ValueError with this message unless the rule holds."""
 
     def checked(section: Any) -> Any:
         if not holds(section):
@@ -104,24 +104,24 @@ def requires(holds: Callable[[Any], Any], message: str) -> Any:
     return model_validator(mode="after")(checked)
 
 
-# the kinds that a section comes in, by what their model says
+# the kinds of a section, by their ``model``
 Kinds = Mapping[str, type[Section]]
 
 
 def kinds_of(*sections: type[Section]) -> dict[str, type[Section]]:
-    """The kinds that a section comes in."""
+    """Return the kinds of a section, by their ``model``."""
     return {section.model_fields["model"].default: section for section in sections}
 
 
 def one_of(kinds: Kinds, complete: Callable[[dict[str, Any]], None], *, strict: bool = True) -> Any:
-    """The type of a section that comes in kinds.
+    """The type of a section that has several kinds.
 
     Parameters
     ----------
     kinds : mapping
         The section of each ``model``.
     complete : callable
-        Adds to a tree that is read, in place, what it leaves out: at least ``model``.
+        Adds missing entries to the section's tree in place: at least ``model``.
     strict : bool
         As in :func:`without_other_kinds`.
     """
@@ -138,20 +138,20 @@ def one_of(kinds: Kinds, complete: Callable[[dict[str, Any]], None], *, strict: 
 
 
 def is_modelled(section: Any) -> bool:
-    """Whether there is a section, and what it has is not ignored."""
+    """Whether a section is present and its treatment is not ``ignored``."""
     return section is not None and section.treatment != "ignored"
 
 
 def without_other_kinds(tree: dict[str, Any], kinds: Kinds, *, strict: bool) -> dict[str, Any]:
-    """A section's entries without those that only other kinds of it have.
+    """Return a section's entries without those that only its other kinds have.
 
-    Scenarios that were written with all keys, or in which one kind is put in another's place by
-    ``--set``, still contain the keys of the other kind.
+    Scenarios that were written with all keys, or in which ``--set`` replaces one kind by another,
+    still contain keys of the other kind.
 
     Parameters
     ----------
     tree : dict
-        The section's entries, ``model`` among them.
+        The section's entries, including ``model``.
     kinds : mapping
         The section of each ``model``.
     strict : bool
@@ -160,12 +160,12 @@ def without_other_kinds(tree: dict[str, Any], kinds: Kinds, *, strict: bool) -> 
     Returns
     -------
     dict
-        The entries that the kind has, and those that no kind has.
+        The entries that this kind has, and those that no kind has.
 
     Raises
     ------
     ValueError
-        For such a key, where ``strict``.
+        For such a key, if ``strict``.
     """
     chosen = kinds.get(tree["model"]) if isinstance(tree["model"], str) else None
     if chosen is None:

@@ -1,8 +1,8 @@
 """Products of fields on the sphere: harmonic transforms on Gauss-Legendre rings.
 
-The rule is exact up to degree 2 ``band``. With ``band`` twice that of the harmonics, it
-integrates their products with each other and with a field of the same band exactly. A transform
-takes one matrix product for every order m, and one FFT for every ring.
+The rule is exact up to degree 2 ``band``. If ``band`` is twice the band limit of the harmonics, it
+integrates products of two harmonics with a field of band limit ``band`` exactly. A transform takes
+one matrix product per order m and one FFT per ring.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ class SphereGrid(eqx.Module):
     Attributes
     ----------
     theta : (rings,) array
-        Of each ring, from the pole, in radians.
+        Colatitude of each ring in radians.
     weights : (rings,) array
-        Solid angle of each point of a ring; those of all points add up to 4 pi.
+        Solid angle of each point of a ring; the sum over all points is 4 pi.
     legendre : (orders, rings, ells) array
         lambda_lm(theta) for m = 0..lmax, times sqrt(2) where m > 0.
     n_phi : int
@@ -40,7 +40,7 @@ class SphereGrid(eqx.Module):
 
     @classmethod
     def of(cls, lmax: int, band: int) -> SphereGrid:
-        """Make the grid, in NumPy.
+        """Build the grid in NumPy.
 
         Parameters
         ----------
@@ -52,7 +52,7 @@ class SphereGrid(eqx.Module):
         Raises
         ------
         InputError
-            If ``band`` is below ``lmax``: the harmonics are not orthogonal on such a grid.
+            If ``band`` is below ``lmax``, since the harmonics are not orthogonal on such a grid.
         """
         if band < lmax:
             raise InputError(
@@ -74,7 +74,7 @@ class SphereGrid(eqx.Module):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Number of rings, and of points on each."""
+        """Number of rings, and number of points on each ring."""
         return self.legendre.shape[1], self.n_phi
 
     def directions(self) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
@@ -83,7 +83,7 @@ class SphereGrid(eqx.Module):
         return np.repeat(np.asarray(self.theta), self.n_phi), np.tile(phi, self.shape[0])
 
     def synthesise(self, modes: Fields) -> Float[Array, "*batch rings phi"]:
-        """Compute the fields of real packed coefficients at the grid's points.
+        """Evaluate fields with these real packed coefficients at the grid's points.
 
         Parameters
         ----------
@@ -92,7 +92,7 @@ class SphereGrid(eqx.Module):
         Raises
         ------
         InputError
-            For coefficients of another lmax.
+            If the coefficients have another lmax.
         """
         batch = modes.shape[:-1]
         require_shape("the coefficients", modes, (*batch, harmonics.n_modes(self.lmax)))
@@ -101,7 +101,7 @@ class SphereGrid(eqx.Module):
         plus = np.where(ell >= order, ell * (ell + 1) + order, 0)
         minus = np.where(ell >= order, ell * (ell + 1) - order, 0)
         flat = modes.reshape(-1, modes.shape[-1])
-        # where ell < m the table is zero; the sine of m = 0 is left out below
+        # where ell < m, the table is zero; the sine of m = 0 is dropped below
         both = xp.stack([flat[:, plus], flat[:, minus]])
         columns = both.reshape(-1, lmax + 1, lmax + 1).transpose(1, 2, 0)
         rings = (self.legendre @ columns).transpose(2, 1, 0).reshape(2, *batch, -1, lmax + 1)
@@ -112,7 +112,7 @@ class SphereGrid(eqx.Module):
         return xp.fft.irfft(amplitude, n=self.n_phi, axis=-1)
 
     def analyse(self, field: Float[Array, "*batch rings phi"]) -> Fields:
-        """Integrate fields with every harmonic: coefficients of their part up to lmax.
+        """Integrate fields times every harmonic: the fields' coefficients up to lmax.
 
         Parameters
         ----------
@@ -122,7 +122,7 @@ class SphereGrid(eqx.Module):
         Raises
         ------
         InputError
-            For values of another grid.
+            If the values belong to another grid.
         """
         batch = field.shape[:-2]
         require_shape("the field", field, (*batch, *self.shape))
@@ -143,24 +143,24 @@ class SphereGrid(eqx.Module):
         """Compute int y_i f y_j dOmega: multiplication by a field, as a matrix over harmonics.
 
         On a ring, products of cosines and sines of m phi and m' phi only need the field's Fourier
-        amplitudes at m - m' and m + m'; no harmonic is formed on the grid.
+        amplitudes at m - m' and m + m'; no harmonic is evaluated on the grid.
 
         Parameters
         ----------
         field : (rings, phi) array
             f at the grid's points.
         lmax : int, optional
-            Highest ell of i; by default, and at most, that of the grid, which is that of j.
+            Highest ell of i: at most, and by default, the grid's lmax, which applies to j.
 
         Returns
         -------
         (rows, modes) array
-            Symmetric, where both have the same lmax.
+            Symmetric if both have the same lmax.
 
         Raises
         ------
         InputError
-            For values of another grid.
+            If the values belong to another grid.
         """
         require_shape("the field", field, self.shape)
         highest, table = self.lmax, np.asarray(self.legendre)
@@ -168,7 +168,7 @@ class SphereGrid(eqx.Module):
         square = lmax == highest
         fourier = np.fft.fft(np.asarray(field) * np.asarray(self.weights)[:, None], axis=1).T
         transposed = np.ascontiguousarray(table[: lmax + 1, :, : lmax + 1].transpose(0, 2, 1))
-        # rows and columns by growing |m|
+        # rows and columns ordered by |m|
         rows, columns = (harmonics.modes_by_size_of_order(x) for x in (lmax, highest))
         ell, order = (x[rows] for x in harmonics.mode_numbers(lmax))
         starts = np.searchsorted(
@@ -194,12 +194,12 @@ class SphereGrid(eqx.Module):
         return matrix[rows].take(columns, axis=1)
 
     def diagonal(self, matrix: Float[np.ndarray, "modes modes"]) -> Float[np.ndarray, "rings phi"]:
-        """Compute y^T C y at the grid's points: the variance of a field of covariance C.
+        """Compute y^T C y at the grid's points: the variance of a field with covariance C.
 
         Parameters
         ----------
         matrix : (modes, modes) array
-            C, symmetric, of harmonics up to any lmax.
+            C, symmetric, over harmonics up to any lmax.
         """
         between = harmonics.order_products(matrix, np.asarray(self.theta))
         phi = 2.0 * np.pi * np.arange(self.n_phi) / self.n_phi

@@ -1,15 +1,15 @@
-"""Dataclasses as trees of datasets: what the package writes of its own, and reads again.
+"""Dataclasses as trees of datasets: the package's own files, written and read.
 
-The types of the fields say what becomes of them. Arrays (``Float[np.ndarray, "draw mode"]``) are
-variables on the dimensions that they name; numbers and text are attributes; None is absent;
-dataclasses with arrays are groups, and tuples of dataclasses of numbers and text alone are tables.
-Whatever else JSON holds, other dataclasses too, is an attribute in JSON.
+The type of a field determines how it is stored. Arrays (``Float[np.ndarray, "draw mode"]``) become
+variables on the dimensions that they name; numbers and text become attributes; None is omitted.
+Dataclasses with arrays become groups, and tuples of dataclasses with only numbers and text become
+tables. Anything else in JSON's range, including other dataclasses, becomes a JSON attribute.
 
-Arrays say their unit and what they are with :func:`quantity`, as the CF conventions have it. Those
-on one of the dimensions :data:`.HEALPIX` have the grid mapping of HEALPix of CF 1.13: a variable
-that names grid and order, and the index of every pixel.
+:func:`quantity` gives an array its unit and name, following the CF conventions. Arrays on one of
+the dimensions :data:`.HEALPIX` have CF 1.13's HEALPix grid mapping: a variable that names grid and
+order, and the index of every pixel.
 
-Files are written with xarray, and read with h5py, which takes a tenth of the time.
+Files are written with xarray and read with h5py, which takes a tenth of the time.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ from lusee_bayes.core.lazy import pandas, xarray
 from lusee_bayes.core.reading import reading
 
 T = TypeVar("T")
-# an attribute that lists arrays without entries, which files do not hold
+# an attribute that lists empty arrays, which are not written as variables
 EMPTY = "empty"
-# kinds that are attributes, and numbers by their types
+# kinds stored as attributes, and the kind of number of each type
 ATTRIBUTES = ("number", "text", "json")
 NUMBERS = {int: "integer", float: "real", bool: "boolean"}
-# what an array is declared as by the kind of its dtype, and how one that may have any numbers is
+# the declared kind of an array by the kind of its dtype, and the checks that allow any numbers
 KINDS = {"f": "real", "c": "complex", "i": "integer", "u": "integer", "b": "boolean", "U": "text"}
 ANY = {"missing": True, "low": -np.inf, "high": np.inf}
-# how netCDF marks arrays in HDF5 that stand for a dimension alone
+# netCDF's mark for HDF5 arrays that only stand for a dimension
 DIMENSION = b"This is a netCDF dimension but not a netCDF variable"
 
 
@@ -56,23 +56,23 @@ def quantity(
     packed: bool = False,
     **options: Any,
 ) -> Any:
-    """A field of a dataclass: an array with its unit, as UDUNITS writes it, and what it is.
+    """A dataclass field for an array, with its unit in UDUNITS notation and its description.
 
     Parameters
     ----------
     units : str
-        Such as "K" or "MHz"; "1" for numbers without one, empty for text.
+        Such as "K" or "MHz"; "1" for numbers without a unit, empty for text.
     long_name : str
         A few words.
     checks : mapping, optional
-        What a file is checked for, as of :class:`.Variable`: ``low``, ``grows`` and others. By
-        default there may be any numbers.
+        Checks when reading a file, as in :class:`.Variable`: ``low``, ``grows`` and others. By
+        default, any numbers are allowed.
     attributes : mapping, optional
-        Further ones of CF's, such as ``flag_meanings``.
+        Further CF attributes, such as ``flag_meanings``.
     packed : bool
-        Compress it in files.
+        Compress the array in files.
     **options
-        As of ``dataclasses.field``.
+        As in ``dataclasses.field``.
     """
     said = {"units": units, "long_name": long_name}
     attributes = {name: words for name, words in said.items() if words} | dict(attributes or {})
@@ -86,11 +86,11 @@ def quantity(
 
 @dataclass(frozen=True)
 class _Kind:
-    """What becomes of a field.
+    """How a field is stored.
 
     what : "array", "number", "text", "json", "group", "table" or "frame"; of : the type of the
     value or of its rows; optional : whether it may be None; required : whether it has no default;
-    declared : of an array or an attribute; attributes, encoding : of an array
+    declared : layout of an array or attribute; attributes, encoding : for an array
     """
 
     what: str
@@ -103,7 +103,7 @@ class _Kind:
 
 
 def to_tree(value: Any) -> xarray.DataTree:
-    """Lay out a dataclass.
+    """Convert a dataclass to a tree of datasets.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ def write_tree(
     format_ : str
         One of :mod:`.formats`.
     attributes : mapping, optional
-        Further ones of the file.
+        Further attributes of the file.
     """
     tree = to_tree(value)
     tree.attrs |= header(format_) | dict(attributes or {})
@@ -162,7 +162,7 @@ def write_tree(
 
 
 class StoredTree:
-    """A group of a netCDF file that is open, with what :func:`from_tree` looks at in a tree.
+    """A group of an open netCDF file, with the parts of a tree that :func:`from_tree` uses.
 
     Parameters
     ----------
@@ -174,7 +174,7 @@ class StoredTree:
 
     @cached_property
     def attrs(self) -> dict[str, Any]:
-        """Attributes, of one entry each as numbers and text."""
+        """Attributes; those with one entry as numbers or text."""
         arrays = {name: np.asarray(value) for name, value in self._group.attrs.items()}
         return {name: v.item() if v.size == 1 else v for name, v in arrays.items()}
 
@@ -190,7 +190,7 @@ class StoredTree:
 
     @cached_property
     def children(self) -> dict[str, StoredTree]:
-        """Groups in this one."""
+        """Groups inside this group."""
         return {n: StoredTree(x) for n, x in self._group.items() if isinstance(x, h5py.Group)}
 
 
@@ -201,12 +201,12 @@ def _stored(variable: h5py.Dataset) -> np.ndarray:
 
 @contextmanager
 def opened_tree(path: str | Path, format_: str, what: str, hint: str = "") -> Iterator[StoredTree]:
-    """Open a file of the package; what is not asked for is not read.
+    """Open a file of the package; arrays are read when used.
 
     Parameters
     ----------
     path, format_, what, hint
-        As of :func:`.require_format`.
+        As in :func:`.require_format`.
 
     Raises
     ------
@@ -219,7 +219,7 @@ def opened_tree(path: str | Path, format_: str, what: str, hint: str = "") -> It
 
 
 def from_tree(kind: type[T], tree: xarray.DataTree | StoredTree, where: str) -> T:
-    """Make a dataclass of what :func:`to_tree` made of one.
+    """Rebuild a dataclass from the tree that :func:`to_tree` built.
 
     Parameters
     ----------
@@ -232,12 +232,12 @@ def from_tree(kind: type[T], tree: xarray.DataTree | StoredTree, where: str) -> 
     Returns
     -------
     object
-        Of this type.
+        An instance of the dataclass.
 
     Raises
     ------
     InputError
-        If something is absent, or of another type or another number of dimensions.
+        If an entry is missing, or has another type or another number of dimensions.
     """
     kinds, entries = _fields(kind), dict[str, Any]()
     empty = _json(where, tree.attrs.get(EMPTY, "{}"))
@@ -267,7 +267,7 @@ _checker = lru_cache(maxsize=128)(TypeAdapter)
 
 
 def _for_json(value: Any) -> Any:
-    """What JSON has no words for: dataclasses, NumPy's numbers."""
+    """Convert values that JSON lacks: dataclasses and NumPy's numbers."""
     return asdict(value) if is_dataclass(value) else value.item()
 
 
@@ -286,12 +286,12 @@ def _fields(kind: type) -> dict[str, _Kind]:
 def _kind_of(hint: Any, checks: Mapping[str, Any] = ANY) -> _Kind:
     arguments = get_args(hint)
     if get_origin(hint) in (Union, types.UnionType):
-        # arrays of NumPy's or of JAX's are one
+        # a union of NumPy and JAX arrays counts as one type
         others = [one for one in arguments if one is not type(None)]
         return replace(_kind_of(others[0], checks), optional=len(others) < len(arguments))
     if hasattr(hint, "dim_str"):
         names, dtype = hint.dim_str.split(), _dtype(hint.dtypes)
-        # a matrix has the same dimension twice, which datasets do not allow
+        # rename repeated dimensions, as of a square matrix, which datasets do not allow
         dims = [n if n not in names[:k] else f"{n}_{k + 1}" for k, n in enumerate(names)]
         return _Kind("array", dtype, declared=Variable(tuple(dims), KINDS[dtype.kind], **checks))
     if get_origin(hint) is tuple and is_dataclass(arguments[0]):
@@ -310,7 +310,7 @@ def _kind_of(hint: Any, checks: Mapping[str, Any] = ANY) -> _Kind:
 
 
 def _table(name: str, columns: Mapping[str, list]) -> xarray.DataTree:
-    """Columns as variables; one of numbers may have gaps."""
+    """Store columns as variables; a column of numbers may have gaps."""
     arrays = {}
     for key, values in columns.items():
         array = np.array([np.nan if value is None else value for value in values])
@@ -342,7 +342,7 @@ def _rows(kind: type[T], tree: xarray.DataTree | StoredTree, where: str) -> Iter
     kinds = _fields(kind)
     columns = {}
     for name, one in kinds.items():
-        # gaps make whole numbers real
+        # gaps are NaN, which turns integers into real numbers
         as_real = {"kind": "real"} if one.optional else {}
         columns[name] = replace(one.declared, dims=("row",), optional=False, **as_real)
     arrays = Layout(kind.__name__, columns).checked(where, tree.variables, {}).arrays
@@ -352,7 +352,7 @@ def _rows(kind: type[T], tree: xarray.DataTree | StoredTree, where: str) -> Iter
 
 
 def _dtype(names: Any) -> np.dtype:
-    """The widest that an annotation allows; that of text for Shaped, which has none."""
+    """The widest dtype that an annotation allows; for Shaped, which names none, that for text."""
     if not isinstance(names, list | tuple):
         return np.dtype(str)
     widest = [n for n in ("float64", "complex128", "int64", "bool") if n in names]

@@ -1,4 +1,4 @@
-"""What made a result: versions of the package and its libraries, and the command line, if any."""
+"""Origin of a result: versions of the package and its libraries, and the command line, if any."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ __version__ = "0.2.0"
 
 @lru_cache(maxsize=1)
 def commit() -> str | None:
-    """The commit of the clone that the package lies in, with -dirty if it was changed since.
+    """The commit of the clone that contains the package, with -dirty if files have changed since.
 
-    None where it lies in none, or Git is not installed.
+    None if the package is not in a clone, or Git is not installed.
     """
     clone = Path(__file__).resolve().parents[2]
     if not (clone / ".git").exists():
@@ -29,28 +29,28 @@ def commit() -> str | None:
 
 
 def release() -> str:
-    """The version, and the commit where it is known."""
+    """The version, and the commit if known."""
     return f"{__version__} (commit {commit()})" if commit() else __version__
 
 
 def versions(*, with_commit: bool = True) -> dict[str, str]:
-    """Return the versions of the package and of the libraries that its numbers depend on.
+    """Return the versions of the package and of the libraries that affect its numbers.
 
     Parameters
     ----------
     with_commit : bool
-        Include the package's commit, where it is known.
+        Include the package's commit if known.
     """
     libraries = ("jax", "numpyro", "arviz-stats", "numpy", "scipy", "healpy", "astropy", "lunarsky")
     package = {"commit": commit()} if with_commit and commit() else {}
     return {"lusee_bayes": __version__, **package, **{name: installed(name) for name in libraries}}
 
 
-# every file that is written asks
+# cached, since every written file needs it
 installed = lru_cache(metadata.version)
 COMMAND: ContextVar[str] = ContextVar("COMMAND", default="")
 
 
 def printable(text: str) -> str:
-    """Text in which the bytes of file names that are not UTF-8 are shown by their escapes."""
+    """Return the text with non-UTF-8 bytes of file names as escapes."""
     return text.encode(errors="backslashreplace").decode()

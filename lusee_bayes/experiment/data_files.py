@@ -1,4 +1,4 @@
-"""Measured data of a scenario, from whatever file holds them; sessions are reduced as it says."""
+"""Measured data of a scenario, from any supported file; sessions are reduced on reading."""
 
 from __future__ import annotations
 
@@ -33,32 +33,32 @@ ACCEPTED = (
     "visibilities (lusee-bayes simulate), a waterfall of luseepy, sessions of its lusee.ingest, or "
     "spectra of lusee-bayes reduce"
 )
-# what luseepy's waterfalls have, and no other FITS file
+# images that only luseepy's waterfalls have among FITS files
 WATERFALL_IMAGES = {"combinations", "products"}
 
-# beams and data hold the impedances with 24 bits
+# relative; beams and data store impedances with 24 bits
 SAME_SCALE = 1e-5
-# relative; a header holds 15 digits of a temperature
+# relative; a header stores 15 digits of a temperature
 SAME_TEMPERATURE = 1e-12
 
 
-# visibilities in memory, of several frequencies a set for each; a file of visibilities or of
-# reduced spectra; or sessions of the spectrometer
+# visibilities in memory, one set per frequency; a file of visibilities or of reduced spectra; or
+# spectrometer sessions
 Data = Visibilities | str | Path | Sequence[Visibilities] | Sequence[str | Path]
 
 
 def items_of(data: object) -> tuple[Visibilities, ...] | tuple[Path, ...]:
-    """The sets in memory, or the files that data are in.
+    """The sets in memory, or the files that contain the data.
 
     Parameters
     ----------
     data : Data
-        Or whatever else is given for it.
+        Or any other object that a user passes.
 
     Raises
     ------
     InputError
-        For nothing, for anything else, and for sets and files together.
+        If there are no data, another type, or both sets and files.
     """
     one = Visibilities | str | Path
     given = (data,) if isinstance(data, one) else data
@@ -77,22 +77,22 @@ def items_of(data: object) -> tuple[Visibilities, ...] | tuple[Path, ...]:
 
 
 def files_of(data: Data) -> tuple[Path, ...]:
-    """The files that data are in; none for visibilities in memory."""
+    """The files that contain the data; none for visibilities in memory."""
     return tuple(item for item in items_of(data) if isinstance(item, Path))
 
 
 def anchored(data: Data) -> tuple[Visibilities, ...] | tuple[Path, ...]:
-    """The same from any folder."""
+    """The data, with absolute paths of files."""
     return tuple(path.absolute() for path in files_of(data)) or items_of(data)
 
 
 def names_of_data(data: Data) -> tuple[str, ...]:
-    """Paths of the files, or that there are none."""
+    """Paths of the files, or ``visibilities in memory``."""
     return tuple(map(str, files_of(data))) or ("visibilities in memory",)
 
 
 def digest_of(data: Data) -> str:
-    """Hash of the content, whatever the names of files are. InputError if there is no file."""
+    """Hash of the contents, independent of file names. InputError if a file is missing."""
     digests = []
     for item in items_of(data):
         if isinstance(item, Visibilities):
@@ -106,12 +106,12 @@ def digest_of(data: Data) -> str:
 
 
 def are_sessions(data: Data) -> bool:
-    """Whether data are sessions of the spectrometer.
+    """Whether data are spectrometer sessions.
 
     Raises
     ------
     InputError
-        If there are several files, and one is no session.
+        If one of several files is not a session.
     """
     files = files_of(data)
     sessions = [is_session(require_file(path, "data", HINT)) for path in files]
@@ -122,12 +122,12 @@ def are_sessions(data: Data) -> bool:
 
 
 def reduced_of(data: Data, scenario: Scenario, stages: Stages | None = None) -> Reduced | None:
-    """Reduced spectra, of their file or made of sessions; None of other data.
+    """Reduced spectra, read from a file or computed from sessions; None for other data.
 
     Raises
     ------
     InputError
-        As :func:`.reduce_files` and :func:`.read_reduced`.
+        As in :func:`.reduce_files` and :func:`.read_reduced`.
     """
     files = files_of(data)
     if are_sessions(data):
@@ -142,8 +142,8 @@ def read_data(data: Data, scenario: Scenario) -> Visibilities:
     Parameters
     ----------
     data : Visibilities, path, or sequence of them
-        Visibilities in memory (of several, those at the scenario's frequency are used), a file, or
-        sessions of the spectrometer, which are reduced.
+        Visibilities in memory (the set at the scenario's frequency is used), a file, or
+        spectrometer sessions, which are reduced.
     scenario : Scenario
         Sets the frequency to read, the instrument that a waterfall must match, the meaning of the
         times if a file does not specify it, and the time to average over.
@@ -167,7 +167,7 @@ def read_data(data: Data, scenario: Scenario) -> Visibilities:
         data = waterfall.at(scenario.frequency_mhz, scenario.beam.n_ports)
         if waterfall.per_kelvin is not None:
             _require_same_instrument(waterfall, scenario)
-        # samples of luseepy's simulators are instants; its layout cannot say that others are not
+        # samples of luseepy's simulators are instants; its format cannot declare windows
         if timestamp is not None:
             with naming(path):
                 data = data.stamped(timestamp)
@@ -178,7 +178,7 @@ def read_data(data: Data, scenario: Scenario) -> Visibilities:
 
 
 def _is_waterfall(path: Path) -> bool:
-    """Whether a file holds a waterfall of luseepy, not our visibilities. InputError if neither."""
+    """Whether a file is a luseepy waterfall, not our visibilities. InputError if neither."""
     kind, is_waterfall = format_of(path), is_fits(path)
     is_data = kind == formats.VISIBILITIES
     if is_waterfall:
@@ -190,7 +190,7 @@ def _is_waterfall(path: Path) -> bool:
 
 
 def _nearest(sets: Sequence[Visibilities], frequency_mhz: float) -> Visibilities:
-    """The one set, or the one of a frequency. InputError if there is none."""
+    """The only set, or the set at a frequency. InputError if there is none."""
     apart = [abs(data.frequency_mhz - frequency_mhz) for data in sets]
     if len(sets) > 1 and min(apart) > SAME_FREQUENCY_MHZ:
         mhz = ", ".join(f"{data.frequency_mhz:.9g}" for data in sets)
@@ -199,7 +199,7 @@ def _nearest(sets: Sequence[Visibilities], frequency_mhz: float) -> Visibilities
 
 
 def _stamped(path: str | Path, data: Visibilities, timestamp: Timestamp | None) -> Visibilities:
-    """Times are what the data say, or else what the scenario says."""
+    """Give the times the meaning stated by the data, or otherwise by the scenario."""
     if not data.says_window:
         if timestamp is None:
             raise InputError(
@@ -220,7 +220,7 @@ def _stamped(path: str | Path, data: Visibilities, timestamp: Timestamp | None) 
 
 
 def _require_same_instrument(waterfall: Waterfall, scenario: Scenario) -> None:
-    """InputError unless data in V^2/Hz are those of these antennas, receivers and temperatures."""
+    """Raise InputError unless data in V^2/Hz match these antennas, receivers and temperatures."""
     section, frequency = scenario.beam, scenario.frequency_mhz
     source = section.source().behind(waterfall.receiver)
     if (circuit := source.circuit(frequency)) is None:
@@ -269,16 +269,16 @@ def reduce_files(
     Parameters
     ----------
     paths : sequence of paths
-        HDF5 or FITS of luseepy's ``lusee.ingest``, in any order.
+        HDF5 or FITS files of luseepy's ``lusee.ingest``, in any order.
     scenario : Scenario
     stages : Stages, optional
-        Told how far it is.
+        Shows the progress.
 
     Raises
     ------
     InputError
-        If the scenario does not say what the files leave open, a file is given twice or reduced
-        already, or as :func:`.read_session` and :func:`.reduce_sessions`.
+        If the scenario does not supply what the files lack, a file is listed twice or already
+        reduced, or as in :func:`.read_session` and :func:`.reduce_sessions`.
     """
     stages = stages or Stages()
     paths = [user_path(path) for path in paths]
@@ -295,12 +295,12 @@ def reduce_files(
 
 
 def recipe_of(scenario: Scenario) -> Recipe:
-    """How a scenario reduces sessions.
+    """The recipe by which a scenario reduces sessions.
 
     Raises
     ------
     InputError
-        If it does not say what the files leave open: gains, bin origin, what the times are.
+        If it does not supply what the files lack: gains, bin origin, meaning of the times.
     """
     if (section := scenario.flight) is None:
         raise InputError(
@@ -334,23 +334,23 @@ def recipe_of(scenario: Scenario) -> Recipe:
 
 
 def visibilities_of(reduced: Reduced, scenario: Scenario) -> Visibilities:
-    """One band of reduced spectra, in K, as the scenario's beams have it.
+    """One band of reduced spectra, converted to K with the scenario's beams.
 
     Raises
     ------
     InputError
-        If there is no such band, nothing is left of it, or the beams know no volts.
+        If there is no such band, no data remain in it, or the beams are not calibrated in volts.
     """
     return reduced.at(scenario.frequency_mhz, per_kelvin_of(scenario))
 
 
 def per_kelvin_of(scenario: Scenario) -> Float[np.ndarray, " ports"]:
-    """V^2/Hz that an enclosure of 1 K makes at each port.
+    """Power in V^2/Hz that an enclosure at 1 K produces at each port.
 
     Raises
     ------
     InputError
-        If neither the beams nor the scenario say it.
+        If neither the beams nor the scenario specify it, or both do.
     """
     said = None if scenario.flight is None else scenario.flight.per_kelvin_v2_hz
     circuit = scenario.beam.source().circuit(scenario.frequency_mhz)
@@ -371,12 +371,12 @@ def per_kelvin_of(scenario: Scenario) -> Float[np.ndarray, " ports"]:
 
 
 def gain_table_of(section: FlightSection) -> GainModel:
-    """The gain table that a scenario names, or a synthetic one, with what it says of its errors.
+    """The gain table that a scenario names, or a synthetic one, with the scenario's errors.
 
     Raises
     ------
     InputError
-        If the table cannot be read, or says itself what the scenario says of its components.
+        If the table cannot be read, or both table and scenario give the errors of its components.
     """
     path = section.gain_table
     table = synthetic_gains() if path is None else read_gain_table(path, section.gain_model)

@@ -1,20 +1,20 @@
 """Usual mistakes in data and model: which of them would make the data fit.
 
-Where no sky explains data, each of the usual mistakes is undone, and the residual chi^2 of that,
-what a prior wide enough for any sky leaves (:mod:`lusee_bayes.judge.chi2`), tells whether the data
-would fit. A mistake in the data is undone by mixing the products of every time. One in the model is
-undone by other beams, or by another observation: other times, angles or another site.
+If no sky explains the data, we undo each of the usual mistakes in turn. The residual chi^2 under a
+prior wide enough for any sky (:mod:`lusee_bayes.judge.chi2`) shows whether the data would then fit.
+To undo a mistake in the data, we mix the products of every time. To undo one in the model, we use
+other beams, or another observation with other times, angles or another site.
 
-Changes of data that mix the products of each time are tried all at once: d' = sum_jk W_jk x_jk,
-where x_jk has product k in the place of product j. With K the covariance of the data under a prior
-that allows any sky, and b the model without a sky, ::
+All changes of data that mix the products of each time are tried at once: d' = sum_jk W_jk x_jk,
+where x_jk has product k in the place of product j. Let K be the covariance of the data under a
+prior that allows any sky, and b the model without a sky. Then ::
 
     chi^2(W) = (X w - b)^T K^-1 (X w - b) = (w, -1)^T Q (w, -1),    Q = (X, b)^T K^-1 (X, b).
 
-With Q at hand exchanges, signs and reversals cost nothing; factors and constants are solved for.
+Given Q, exchanges, signs and reversals cost nothing; factors and constants are solved for.
 
-A change of the model needs a normal matrix of its own; these are compared up to ``SCREENED_LMAX``
-first. The best of both are computed as the scenario has it, with N for the changed data.
+Each change of the model needs another normal matrix, so these are first compared up to
+``SCREENED_LMAX``. The best of both kinds are computed at the scenario's lmax, with N for the data.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.prior import HarmonicPrior
 from lusee_bayes.systematics.context import Around, Setup
 
-# arrays that recur
+# recurring array types
 Products = Float[np.ndarray, " products"]
 Columns = Float[np.ndarray, " columns"]
 Mixing = Float[np.ndarray, "products products"]
 
-# seconds to be added to times that are not what they are taken for
+# mistakes in the clock, and the seconds to add to the times
 CLOCKS = {
     "the times are TT or TDB, not UTC": -69.184,
     "the times are TAI, not UTC": -37.0,
@@ -72,11 +72,11 @@ class DataMistake(NamedTuple):
     Attributes
     ----------
     words, remedy : str
-        What is wrong, and what to do.
+        The mistake, and the remedy.
     w : (columns,) array
-        Of the module's equations, b included: what makes the right data of the wrong ones.
+        As in the module's equations, including b: turns the wrong data into the right ones.
     time : int or None
-        The only time that is wrong; None for all.
+        The only wrong time; None for all times.
     """
 
     words: str
@@ -95,7 +95,7 @@ class DataMistake(NamedTuple):
 
 
 class ModelMistake(NamedTuple):
-    """A mistake in the model: what is wrong, what to do, and beams and observation without it."""
+    """A mistake in the model: the mistake, the remedy, and beams and observation without it."""
 
     words: str
     remedy: str
@@ -104,19 +104,19 @@ class ModelMistake(NamedTuple):
 
 
 def weights(mixing: Mixing, *, reversed_times: bool = False, b: float = -1.0) -> Columns:
-    """(w, -1) of a mixing, with no constant; or, of ``b`` 0, what is added to one."""
+    """(w, -1) of a mixing without a constant; with ``b`` = 0, a change to such a vector."""
     return np.concatenate([mixing.ravel(), np.zeros(len(mixing)), [float(reversed_times), b]])
 
 
 def port_mixing(numbers: Sequence[int], signs: Sequence[float] | None = None) -> Mixing:
-    """What makes the products of ports 0, 1, ... of data that have them as ``numbers``.
+    """The mixing that restores the products of ports 0, 1, ... in data with other port numbers.
 
     Parameters
     ----------
     numbers : sequence of int
-        Of each port, under which number the data have it.
+        Number of each port in the data.
     signs : sequence of float, optional
-        Of each port, the sign of its voltage.
+        Sign of each port's voltage in the data.
     """
     products, signs = all_products(len(numbers)), signs or np.ones(len(numbers))
     place = {tuple(product): k for k, product in enumerate(products)}
@@ -129,7 +129,7 @@ def port_mixing(numbers: Sequence[int], signs: Sequence[float] | None = None) ->
 
 
 def data_mistakes(n_ports: int) -> Iterator[tuple[str, str, Mixing]]:
-    """Conjugation, signs and exchanges: what is wrong, what to do, and what mixes the products."""
+    """Conjugation, signs and exchanges: the mistake, the remedy and the mixing of products."""
     products, numbers = all_products(n_ports), range(n_ports)
     first, second, imaginary = ports(n_ports)
     wrong = "the data are conjugated: the imaginary parts have the wrong sign"
@@ -139,7 +139,7 @@ def data_mistakes(n_ports: int) -> Iterator[tuple[str, str, Mixing]]:
     yield wrong, "change their sign", np.diag(np.where(first != second, -1.0, 1.0))
     for size in range(1, n_ports // 2 + 1):
         for flipped in combinations(numbers, size):
-            if 2 * size == n_ports and 0 not in flipped:  # as if the others were flipped
+            if 2 * size == n_ports and 0 not in flipped:  # the same as flipping the others
                 continue
             named = " and ".join(map(str, flipped))
             wrong = f"the voltages of port {named} have the wrong sign"
@@ -200,7 +200,7 @@ def model_mistakes(setup: Setup) -> Iterator[ModelMistake]:
     for frequency in (beams.frequency_mhz - width, beams.frequency_mhz + width):
         try:
             other = setup.beam_source.beams(frequency, beams.lmax)
-        except InputError:  # the source has none there
+        except InputError:  # the source has no beams at this frequency
             continue
         wrong = f"the data are from the neighbouring channel, {frequency:g} MHz"
         yield ModelMistake(wrong, f"use --set frequency_mhz={frequency:g}", other, observation)
@@ -208,14 +208,14 @@ def model_mistakes(setup: Setup) -> Iterator[ModelMistake]:
 
 @dataclass(frozen=True)
 class UnderAnySky:
-    """Data, and the model that their residual chi^2 is computed in, under a wide prior.
+    """Data, and the model and wide prior for their residual chi^2.
 
     Attributes
     ----------
     setup : Setup
     data : Visibilities
     model : LinearGaussian
-        Of these data.
+        Model of these data.
     spectrum : (ells,) array
         C_ell of the wide prior, in K^2.
     """
@@ -227,7 +227,7 @@ class UnderAnySky:
 
     @classmethod
     def of(cls, setup: Setup, data: Visibilities, model: LinearGaussian) -> UnderAnySky:
-        """Under a prior that allows any sky, as bright as the data ask for."""
+        """Choose a prior that allows any sky as bright as the data suggest."""
         prior = setup.prior if setup.family is None else setup.family.expected()
         power = np.asarray(prior.variance() + prior.colour(prior.white_mean) ** 2)
         autos = auto_indices(setup.beam_source.n_ports)
@@ -251,7 +251,7 @@ class UnderAnySky:
     def under(self, beams: ProductBeams, observation: Observation, pointing: Pointing) -> ChiSquare:
         """Residual chi^2 with other beams or another observation.
 
-        ``pointing`` is that of the data's own observation, up to the ell that counts.
+        ``pointing`` belongs to the data's own observation, and sets lmax.
         """
         lmax = len(pointing.pole_from_galactic.blocks) - 1
         same = (observation.times == self.setup.observation.times).all()
@@ -261,33 +261,33 @@ class UnderAnySky:
         return self.wide(CouplingMatrix.of_modes(modes, pointing, self.data.layout))[0]
 
     def without(self, mistake: DataMistake) -> ChiSquare:
-        """Residual chi^2 of the data without a mistake, with N for them."""
+        """Residual chi^2 of the data without a mistake, with N rebuilt for them."""
         layout = self.data.layout
         right = np.asarray(layout.gather(mistake.undone(filled(self.data))))
         data = replace(self.data, data=right)
         try:
             model = full_model(self.setup, Around(data))
-        except InputError:  # without it, some auto is not positive
+        except InputError:  # undoing it makes some auto negative or zero
             return ChiSquare(np.inf, float(layout.size))
         return replace(self, data=data, model=model).wide(model.coupling)[0]
 
 
 def filled(data: Visibilities) -> Grid:
-    """The data on the full grid, absent samples interpolated in time."""
+    """The data on the full grid, with missing samples interpolated in time."""
     grid = pd.DataFrame(np.asarray(data.grid()).T).interpolate(limit_direction="both")
     return grid.fillna(0.0).to_numpy().T
 
 
-# times that are tried one by one, the worst first
+# number of times to try one by one, the worst first
 TIMES = 32
 
 
 @dataclass(frozen=True)
 class MixedProducts:
-    """Q of the module's equations, of some data.
+    """Q of the module's equations for some data.
 
     judge : UnderAnySky; posterior : under the wide prior; grid : (products, times) array, in K; q :
-    (columns, columns) array, of every x_jk, ones in every product, the times reversed, and b
+    (columns, columns) array, for every x_jk, ones in every product, the reversed times, and b
     """
 
     judge: UnderAnySky
@@ -297,7 +297,7 @@ class MixedProducts:
 
     @classmethod
     def of(cls, judge: UnderAnySky, posterior: Posterior) -> MixedProducts:
-        """Of data and their posterior under the wide prior."""
+        """Compute Q from data and their posterior under the wide prior."""
         grid, layout, offset = filled(judge.data), judge.data.layout, judge.model.offset
         n, product, time = len(grid), layout.product, layout.time
         mixed = np.zeros((layout.size, n, n))
@@ -308,7 +308,7 @@ class MixedProducts:
         return cls(judge, posterior, grid, _gram(judge, posterior, np.concatenate(columns, axis=1)))
 
     def tried(self) -> Iterator[tuple[float, DataMistake]]:
-        """Every mistake with its chi^2."""
+        """Yield every mistake in the data with its chi^2."""
         n_ports, n = self.judge.setup.beam_source.n_ports, len(self.grid)
         first, second, _ = ports(n_ports)
         autos = first == second
@@ -329,7 +329,7 @@ class MixedProducts:
         return float(w @ self.q @ w)
 
     def _factor(self, name: str, which: Products) -> DataMistake:
-        """A factor of some products: chi^2 is a parabola in what is missing."""
+        """A factor of some products: chi^2 is a parabola in the missing part."""
         whole, step = weights(np.eye(len(which))), weights(np.diag(which), b=0.0)
         curvature = self.chi2(step)
         missing = -float(step @ self.q @ whole) / curvature
@@ -338,7 +338,7 @@ class MixedProducts:
         return DataMistake(wrong, f"check the calibration of {name}", whole + missing * step)
 
     def _gain(self, port: int, powers: Products) -> DataMistake:
-        """A gain of a port's voltage, squared in its auto: chi^2 is of fourth order in it."""
+        """A gain of a port's voltage, squared in its auto: chi^2 is a quartic in the gain."""
         parts = [weights(np.diag((powers == k) * 1.0), b=-1.0 * (k == 0)) for k in range(3)]
         gram = np.array([[u @ self.q @ v for v in parts] for u in parts])
         powers_of_gain = [np.trace(gram[:, ::-1], offset=2 - order) for order in range(5)]
@@ -361,7 +361,7 @@ class MixedProducts:
         return DataMistake(wrong, "give noise.receiver, or subtract it", whole)
 
     def _times(self) -> Iterator[tuple[float, DataMistake]]:
-        """A factor of all products of one time."""
+        """A factor of all products at one time, for each of the worst times."""
         judge, layout, values = self.judge, self.judge.data.layout, np.asarray(self.judge.data.data)
         factor = judge.model.noise.factor()
         # K^-1 (d - b)
@@ -375,7 +375,7 @@ class MixedProducts:
         curvature = np.diagonal(_gram(judge, self.posterior, columns))
         whole = weights(np.eye(len(self.grid)))
         for time, bend in zip(worst.tolist(), curvature.tolist(), strict=True):
-            if not bend > 0.0:  # the others predict nothing
+            if not bend > 0.0:  # other times do not predict this one
                 continue
             factor = 1.0 - pull[time] / bend
             when = judge.data.observation.times[time].isot[:19]
@@ -394,7 +394,7 @@ def _number(factor: float, std: float) -> str:
 
 
 def _gram(judge: UnderAnySky, posterior: Posterior, columns: Float[np.ndarray, "data n"]) -> Square:
-    """X^T K^-1 X, K^-1 = N^-1 - N^-1 A C A^T N^-1."""
+    """X^T K^-1 X with K^-1 = N^-1 - N^-1 A C A^T N^-1."""
     solved = np.asarray(judge.model.noise.factor().solve(columns))
     seen = np.asarray(judge.model.coupling.transpose_mv(solved)).T
     white = np.asarray(posterior.prior.colour_columns(seen)).T
@@ -402,20 +402,20 @@ def _gram(judge: UnderAnySky, posterior: Posterior, columns: Float[np.ndarray, "
     return columns.T @ solved - half.T @ half
 
 
-# changes of the model are compared up to this ell
+# highest ell when comparing changes of the model
 SCREENED_LMAX = 12
-# computed as the scenario has it: so many of the data and of the model, the best first; those of
-# the data only if they leave less than this share of what is too much
+# number of the best mistakes, in data and in model, to compute at the scenario's lmax; those in the
+# data only if less than this fraction of the excess chi^2 remains
 TRIED, PROMISING = 3, 0.1
-# where nothing makes the data fit, those are listed that leave less than this share
+# if nothing makes the data fit, list mistakes that leave less than this fraction of the excess
 EXPLAINED = 0.03
-# two mistakes are one for these antennas if their chi^2 differ by less, relative
+# mistakes are indistinguishable for these antennas if their chi^2 differ by less, relative
 SAME = 1e-5
-# lmax is tried with so many more
+# ells to add to lmax
 MORE_ELLS = 8
-# offsets are solved for from so many degrees on either side, in steps that shrink
+# offsets to solve for, and decreasing steps in degrees to either side
 OFFSETS, REACHES = ("turntable_deg", "tilt_east_deg", "tilt_north_deg"), (4.0, 0.5)
-# of white noise, sums over neighbouring times are within so many standard deviations
+# limit on the sum of products of neighbouring times, in standard deviations for white noise
 WHITE = 5.0
 
 
@@ -426,7 +426,7 @@ class Proposal:
     Attributes
     ----------
     words, remedy : str
-        What is wrong, and what to do.
+        The mistake, and the remedy.
     chi2 : ChiSquare
         Residual chi^2 of the data without the mistake.
     """
@@ -437,7 +437,7 @@ class Proposal:
 
     @property
     def excess(self) -> float:
-        """How far chi^2 is from what is expected."""
+        """Distance of chi^2 from its expected value."""
         return abs(self.chi2.chi2 - self.chi2.degrees)
 
 
@@ -450,10 +450,10 @@ class Diagnosis:
     chi2 : ChiSquare
         Residual chi^2 of the data as they are.
     proposals : tuple of Proposal
-        The best first: those without which the data fit, or, if there are none, those that explain
-        nearly all of what is too much.
+        The best first: mistakes without which the data fit or, if there are none, those that
+        explain nearly all of the excess chi^2.
     n_tried : int
-        How many mistakes were tried.
+        Number of mistakes tried.
     """
 
     chi2: ChiSquare
@@ -461,7 +461,7 @@ class Diagnosis:
     n_tried: int
 
     def sentences(self) -> list[str]:
-        """The proposals in words, one each; or that there are none."""
+        """The proposals, one sentence each; or one sentence if there are none."""
         if self.chi2.fits:
             return [f"The data fit without assuming a mistake ({self.chi2.words()})."]
         if not self.proposals:
@@ -480,9 +480,9 @@ def diagnose(experiment: Experiment, inference: Inference, residuals: Residuals)
     ----------
     experiment : Experiment
     inference : Inference
-        Of its data alone.
+        Inference from its data alone.
     residuals : Residuals
-        Of the map.
+        Residuals of the map.
 
     Returns
     -------
@@ -493,7 +493,7 @@ def diagnose(experiment: Experiment, inference: Inference, residuals: Residuals)
     base, posterior = judge.wide(judge.model.coupling)
 
     def best(tried: Sequence[tuple[float, object]], most: float) -> list:
-        """Those of the smallest chi^2."""
+        """The mistakes with the smallest chi^2, below ``most``."""
         better = sorted((one for one in tried if one[0] < most), key=lambda one: one[0])
         return [one for _, one in better[:TRIED]]
 
@@ -503,7 +503,7 @@ def diagnose(experiment: Experiment, inference: Inference, residuals: Residuals)
     low = Pointing.of(setup.observation, min(SCREENED_LMAX, setup.scenario.lmax))
     mistakes = list(model_mistakes(setup))
     screened = [judge.under(m.beams, m.observation, low).chi2 for m in mistakes]
-    # at low ell, what the sky has beyond is left
+    # at low lmax, sky structure above it remains in the residuals
     whole = judge.under(setup.beams, setup.observation, low).chi2
     of_model = [*zip(screened, mistakes, strict=True), *_offsets(judge, low)]
     proposals += [
@@ -512,7 +512,7 @@ def diagnose(experiment: Experiment, inference: Inference, residuals: Residuals)
     ]
     excess = EXPLAINED * abs(base.chi2 - base.degrees)
     nearly = [one for one in proposals if one.excess < excess]
-    # these always absorb some of what is wrong, and count only if they absorb all of it
+    # these always absorb part of any misfit, and count only if they absorb all of it
     proposals += _noise_level(residuals, data)
     finer = [] if any(one.chi2.fits for one in proposals) else list(_finer(judge))
     proposals += finer
@@ -522,7 +522,7 @@ def diagnose(experiment: Experiment, inference: Inference, residuals: Residuals)
 
 
 def _merged(proposals: list[Proposal]) -> Iterator[Proposal]:
-    """Those of one chi^2 as one: antennas that are alike do not distinguish them."""
+    """Merge proposals with equal chi^2, which identical antennas cannot distinguish."""
     while proposals:
         first, *others = proposals
         alike = [p for p in others if abs(p.chi2.chi2 - first.chi2.chi2) < SAME * first.chi2.chi2]
@@ -531,18 +531,18 @@ def _merged(proposals: list[Proposal]) -> Iterator[Proposal]:
 
 
 def _finer(judge: UnderAnySky) -> Iterator[Proposal]:
-    """A map of more ells."""
+    """Try a map with a larger lmax."""
     setup, lmax = judge.setup, judge.setup.scenario.lmax + MORE_ELLS
     try:
         beams = setup.beam_source.beams(setup.scenario.frequency_mhz, lmax)
-    except InputError:  # a file's beams end before
+    except InputError:  # the beams of a file end at a lower ell
         return
     chi2 = judge.under(beams, setup.observation, Pointing.of(setup.observation, lmax))
     yield Proposal("the sky has structure beyond lmax", f"use --set lmax={lmax}", chi2)
 
 
 def _offsets(judge: UnderAnySky, low: Pointing) -> Iterator[tuple[float, ModelMistake]]:
-    """Angles that are off by what fits best: by parabolas through three values, ever closer."""
+    """Best-fitting offsets of angles, from parabolas through three ever closer values."""
     setup = judge.setup
     for name in offset_names(OFFSETS, setup.observation.n_runs):
 
@@ -565,7 +565,7 @@ def _offsets(judge: UnderAnySky, low: Pointing) -> Iterator[tuple[float, ModelMi
 
 
 def _noise_level(residuals: Residuals, data: Visibilities) -> Iterator[Proposal]:
-    """Another noise level, if what is left is white: alike in all groups, and from time to time."""
+    """Another noise level, if residuals are white: equal in all groups, uncorrelated in time."""
     whole, groups = residuals.split.instrument, [g for g in residuals.compared() if g.degrees > 1.0]
     factor = whole.chi2 / whole.degrees
     if not groups or not factor > 0.0:

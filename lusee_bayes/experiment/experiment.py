@@ -1,7 +1,7 @@
 """A scenario with its data, ready to be mapped or sampled.
 
-An :class:`Experiment` is a setup and the data that were taken with it, measured or simulated. It
-gives the posterior over its sky, and the pieces that programs can ask for.
+An :class:`Experiment` is a setup with its data, measured or simulated. It provides the posterior
+over the sky, and the pieces that programs can request.
 """
 
 from __future__ import annotations
@@ -49,22 +49,22 @@ from lusee_bayes.systematics.systematic import Systematic
 
 @dataclass(frozen=True, repr=False)
 class Experiment(Described):
-    """The pieces of d = A m + n, with d. :func:`build` makes one of a scenario.
+    """The pieces of d = A m + n, including d; :func:`build` builds one from a scenario.
 
     Attributes
     ----------
     setup : Setup
-        A, S, the model sky and what N is made of.
+        A, S, the model sky and the ingredients of N.
     data : Visibilities
         d, measured or simulated.
     doubts : tuple of str
-        What is doubtful about measured data, a sentence each.
+        Doubts about measured data, one sentence each.
     learned : Learned or None
-        How the setup's prior was learned; None for one that was given.
+        How the setup's prior was learned; None for a given prior.
     fitting : Fitting or None
-        Of flight data: the times that did not fit and are left out; None for other data.
+        For flight data: the inconsistent data that are left out; None for other data.
     inference : Inference or None
-        Where the prior was learned: the data under it.
+        Inference under a learned prior, or from given starting values; None otherwise.
     """
 
     setup: Setup
@@ -83,11 +83,11 @@ class Experiment(Described):
 
     @property
     def scenario(self) -> Scenario:
-        """What the experiment was built of."""
+        """The scenario of the experiment."""
         return self.setup.scenario
 
 
-# numbers of the largest matrix of data and modes above lmax that is made: 4 GB
+# largest matrix of data and modes above lmax, in numbers: 4 GB
 MOST_ABOVE = 5e8
 GAIN_ERRORS = (
     "The stated errors of the gains (flight.gain_std, or the gain table's) are not part of N: give "
@@ -108,14 +108,14 @@ def build(
     Parameters
     ----------
     scenario : Scenario
-        Of one frequency.
+        With one frequency.
     data : Visibilities, optional
-        Measured data; if omitted, data are simulated from the scenario. A truth of another lmax is
-        truncated, or padded with zeros.
+        Measured data; if omitted, data are simulated from the scenario. A truth with another lmax
+        is truncated, or padded with zeros.
     stages : Stages, optional
-        Told what is being done.
+        Shows the progress.
     earlier : Information, optional
-        Of earlier data, from which the prior is also learned.
+        Information in earlier data, from which the prior is also learned.
     values : mapping of float, optional
         Starting values of the instrument's unknowns, by name.
 
@@ -123,7 +123,7 @@ def build(
     ------
     InputError
         If the data have another frequency, site or number of ports, if they are implausible
-        (:func:`.require_plausible`), and if the prior's parameters do not converge.
+        (:func:`.require_plausible`), or if the prior's parameters do not converge.
     """
     stages = stages or Stages()
     return _learned(_fitting(observed(scenario, data, stages), stages), stages, earlier, values)
@@ -132,14 +132,14 @@ def build(
 def observed(
     scenario: Scenario, data: Visibilities | None = None, stages: Stages | None = None
 ) -> Experiment:
-    """Build the experiment of a scenario; what its prior could learn of the data is left out.
+    """Build the experiment of a scenario without learning its prior.
 
-    Parameters and errors are those of :func:`build`, but that no prior has to settle.
+    Parameters and errors are as in :func:`build`, except that no prior has to converge.
     """
     stages = stages or Stages()
     doubts, above = [], scenario.noise.above_lmax
     if data is not None and data.truth is not None:
-        if len(data.truth) <= n_modes(scenario.lmax):  # of a sky that ends there
+        if len(data.truth) <= n_modes(scenario.lmax):  # the true sky ends at lmax
             above = None
         data = data.with_truth_up_to(scenario.lmax)
     scenario = scenario.with_section("noise", above_lmax=above)
@@ -150,7 +150,7 @@ def observed(
     except InputError as error:
         if above is None or data is None:
             raise
-        # what is wrong without the sky above lmax, too, is raised here
+        # this raises any error that does not come from the sky above lmax
         setup = set_up(scenario.with_section("noise", above_lmax=None), data, stages)
         doubts.append(f"The model ends at lmax = {scenario.lmax}, but the sky does not: {error}.")
     if data is None:
@@ -167,7 +167,7 @@ def observed(
 
 
 def _require_room(n_data: int, lmax: int) -> None:
-    """InputError if a matrix of data and modes is too large."""
+    """Raise InputError if a matrix of data and modes is too large."""
     if n_data * n_modes(lmax) > MOST_ABOVE:
         raise InputError(
             f"with {n_data:,} data, the sky up to lmax = {lmax} takes too much memory; average the "
@@ -176,7 +176,7 @@ def _require_room(n_data: int, lmax: int) -> None:
 
 
 def _fitting(experiment: Experiment, stages: Stages) -> Experiment:
-    """Without times that do not fit, where the data are flight data."""
+    """Remove inconsistent data from an experiment with flight data."""
     section, data = experiment.scenario.flight, experiment.data
     if section is None or not section.leave_out or data.calibration is None:
         return experiment
@@ -208,24 +208,24 @@ def _learned(
 
 
 def with_truth(experiment: Experiment) -> Experiment:
-    """The same, its data being of the scenario's own sky."""
+    """Return the experiment with the scenario's sky as the truth of its data."""
     data = replace(experiment.data, truth=experiment.setup.sky.modes)
     return replace(experiment, data=data)
 
 
 def under_sky(setup: Setup, source: SkySource, seed: int) -> Experiment:
-    """Simulate data of a given sky, to be mapped with the prior of the scenario.
+    """Simulate data of a given sky, to be mapped with the scenario's prior.
 
-    The noise, in the data as in N, is that of the given sky; the prior knows nothing of it.
+    The noise, both in the data and in N, follows from the given sky; the prior does not.
 
     Parameters
     ----------
     setup : Setup
-        Of the scenario.
+        Setup of the scenario.
     source : SkySource
-        The sky; what it has above the scenario's lmax is left out, but for what the model knows of.
+        The sky; modes above the scenario's lmax are dropped, unless the model includes them.
     seed : int
-        Of the noise and of the systematics.
+        Seed of the noise and the systematics.
 
     Raises
     ------
@@ -244,7 +244,7 @@ def under_sky(setup: Setup, source: SkySource, seed: int) -> Experiment:
 
 
 def rounds_of(experiment: Experiment, stages: Stages, name: str) -> AbstractContextManager:
-    """A stage, whose progress is that of the rounds where there are some to come."""
+    """A stage; it shows the progress of rounds if the inference still needs them."""
     in_rounds = experiment.inference is None and rebuilds(experiment.setup)
     return stages.progress(name, MAX_ROUNDS) if in_rounds else stages(name)
 
@@ -256,20 +256,20 @@ def infer(experiment: Experiment, report: Report | None = None) -> Inference:
     ----------
     experiment : Experiment
     report : callable, optional
-        Told of every round.
+        Called after every round.
 
     Raises
     ------
     InputError
-        As :func:`.settled`.
+        As in :func:`.settled`.
     """
     return experiment.inference or settled(experiment.setup, experiment.data, report=report)
 
 
 def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
-    """What makes the pieces of an experiment that programs can ask for, by name.
+    """Functions that build the pieces of an experiment that programs can request, by name.
 
-    A piece raises InputError, once made, for a systematic that the scenario marginalises as well.
+    When called, a function raises InputError for a systematic that the scenario also marginalises.
     """
     setup, data, log_normal = experiment.setup, experiment.data, experiment.scenario.log_normal
 
@@ -297,7 +297,7 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
 
     @cache
     def around() -> Around:
-        # about none, large offsets are not described, and gains are those of other antennas
+        # without such values, large offsets are not described, and gains belong to other antennas
         if not rebuilds(setup):
             return Around(data)
         return infer(experiment).around
@@ -315,7 +315,7 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
 
 
 def sampled_together(experiment: Experiment) -> dict[str, float]:
-    """Over how many octaves channels share each sampled site (:meth:`.Systematic.octaves`)."""
+    """Octaves over which channels share each sampled site (:meth:`.Systematic.octaves`)."""
     scenario, octaves_of = experiment.scenario, {}
     for treatment, systematic in systematics(experiment.setup):
         octaves = systematic.octaves(attrgetter(systematic.key)(scenario))
@@ -324,7 +324,7 @@ def sampled_together(experiment: Experiment) -> dict[str, float]:
     return octaves_of
 
 
-# what the seed is folded with for posterior draws
+# number to fold into the seed for posterior draws
 DRAWS = 1
 
 
@@ -336,10 +336,10 @@ def draw_key(scenario: Scenario) -> PRNGKeyArray:
 def posterior_draws(
     experiment: Experiment, posterior: Posterior, information: Callable[[], Information], n: int
 ) -> Draws:
-    """Draw the sky.
+    """Draw skies from the posterior.
 
-    Where the prior was learned, its parameters are drawn, too (:mod:`.learning`); not for
-    data that do not fit, which would not let them be uncertain.
+    If the prior was learned, its parameters are also drawn (:mod:`.learning`), unless the data do
+    not fit: these would make the parameters too certain.
 
     Parameters
     ----------
@@ -347,7 +347,7 @@ def posterior_draws(
     posterior : Posterior
         The Gaussian posterior.
     information : callable
-        ``information()`` of the data behind it, asked for where parameters are drawn.
+        ``information()`` of the data, called only if parameters are drawn.
     n : int
 
     Returns
@@ -362,15 +362,15 @@ def posterior_draws(
     return posterior.sample(key, n)
 
 
-# rms error of interpolated beams in the data, in radiometer noise, above which it is doubtful
+# rms error of interpolated beams in the data, over radiometer noise, above which to warn
 MOST_OFF = 0.1
 
 
 def interpolation_error(setup: Setup) -> dict[str, float]:
     """RMS error of interpolated beams in the model sky's data, over the radiometer noise.
 
-    By where it is found, such as "zenith_angle_deg 75" (:meth:`.BeamSource.interpolation_errors`),
-    the largest of each; nothing where beams are not interpolated in parameters.
+    Returns the largest error at each place, such as "zenith_angle_deg 75"
+    (:meth:`.BeamSource.interpolation_errors`); empty if beams are not interpolated in parameters.
     """
     std = np.sqrt(np.asarray(radiometer(setup).diagonal()))
     off = setup.beam_source.interpolation_errors(setup.frequency_mhz, setup.scenario.lmax)
@@ -383,7 +383,7 @@ def interpolation_error(setup: Setup) -> dict[str, float]:
 
 
 def doubts(experiment: Experiment, inference: Inference) -> tuple[str, ...]:
-    """What is doubtful about an experiment's data, its prior and its rounds."""
+    """Doubts about an experiment's data, its prior and its rounds."""
     learned, notes = experiment.learned, list(experiment.doubts)
     errors = interpolation_error(experiment.setup)
     worst = max(errors, key=errors.__getitem__, default="")

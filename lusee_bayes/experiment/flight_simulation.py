@@ -1,7 +1,7 @@
-"""Sessions of the spectrometer, simulated: counts, gains, telemetry and clock of a scenario's sky.
+"""Simulated spectrometer sessions: counts, gains, telemetry and clock for a scenario's sky.
 
-The inverse of :mod:`lusee_bayes.flight`: visibilities become spectra of all channels, with the
-radiometer noise of each and with what disturbs them, and those become counts.
+This inverts :mod:`lusee_bayes.flight`: visibilities become spectra of all channels, with radiometer
+noise and disturbances, and spectra become counts.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ from lusee_bayes.instrument.times import Windows
 from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.noise.radiometer import sample_covariances
 
-# spectra whose A is in memory at once
+# number of spectra whose A is in memory at once
 PIECE = 2048
-# spectra that a thread works on at once
+# number of spectra that a thread processes at once
 BLOCK = 16
-# the clock was started so long before the observation, and showed so much
+# days before the observation when the clock was set, and its reading then
 CLOCK_DAYS, CLOCK_S = 100, 1000.0
-# rms of the ADC at each gain, its extremes in these, and what it has where it is at its ends
+# rms of the ADC at each gain, its extremes in units of the rms, and its numbers when saturated
 ADC_RMS, ADC_PEAK = {"L": 55.0, "M": 310.0, "H": 1700.0}, 4.6
 SATURATED_RMS, OUT_OF_RANGE = 6200.0, 1000
 SOFTWARE = 0x307
@@ -55,29 +55,29 @@ TELEMETRY = {
 
 @dataclass(frozen=True, eq=False)
 class FlightSimulation:
-    """Sessions, made when they are asked for.
+    """Simulated sessions, computed on demand.
 
     Attributes
     ----------
     scenario : Scenario
     section : FlightSimulatedSection
     observation : Observation
-        A sample for each spectrum.
+        With one sample per spectrum.
     frequencies_mhz : (nodes,) array
-        Where the visibilities are those of the sky; others lie smoothly between.
+        Frequencies of the visibilities; other channels are interpolated smoothly.
     visibilities : (nodes, products, rows) array
         Without noise, in V^2/Hz.
     disturbances : synthesis.Disturbances
     table : GainModel
-        By which the counts are to be divided.
+        Gains to divide the counts by.
     gains : GainModel
-        By which they are multiplied: the table's, or drawn about it.
+        True gains, which multiply the spectra: the table's, or drawn around them.
     gain_errors : dict
-        What was drawn, in standard deviations, by names as M0 and M0 PC1.
+        Drawn gain errors in standard deviations, by names such as M0 and M0 PC1.
     origin : {"centre", "edge"}
-        What of channel k lies at k times 25 kHz.
+        Part of channel k that lies at k times 25 kHz.
     navg_shift : int
-        Logarithm of the number of frames that a spectrum averages, to base 2.
+        Base-2 logarithm of the number of frames averaged in a spectrum.
     clock : Clock
     """
 
@@ -96,7 +96,7 @@ class FlightSimulation:
 
     @property
     def frames(self) -> float:
-        """How many frames each spectrum averages."""
+        """Number of frames averaged in each spectrum."""
         return 2.0**self.navg_shift
 
     @cached_property
@@ -105,19 +105,19 @@ class FlightSimulation:
 
     @cached_property
     def sessions(self) -> tuple[slice, ...]:
-        """Which spectra each session has."""
+        """The spectra of each session."""
         hours = self.observation.hours
         number = np.floor((hours - hours[0]) / self.section.session_h + 1e-9)
         edges = np.flatnonzero(np.diff(number, prepend=-1.0, append=np.inf)).tolist()
         return tuple(slice(start, end) for start, end in pairwise(edges))
 
     def rows(self, session: slice) -> SessionRows:
-        """Return what a session says of its spectra.
+        """Return the metadata of a session's spectra.
 
         Parameters
         ----------
         session : slice
-            Of :attr:`sessions`.
+            One of :attr:`sessions`.
         """
         level = self.disturbances.level[session]
         saturated = self.disturbances.saturated[session, None]
@@ -144,17 +144,17 @@ class FlightSimulation:
         )
 
     def blocks(self, session: slice) -> Iterator[Float32[np.ndarray, "_ products bins"]]:
-        """Make the counts of a session, some spectra after the other.
+        """Yield the counts of a session, a few spectra at a time.
 
         Parameters
         ----------
         session : slice
-            Of :attr:`sessions`.
+            One of :attr:`sessions`.
 
         Raises
         ------
         InputError
-            If the visibilities are none that voltages have.
+            If no voltages can have these visibilities.
         """
         level = self.disturbances.level
         changes = np.flatnonzero((level[1:] != level[:-1]).any(axis=1)) + 1
@@ -202,7 +202,7 @@ class FlightSimulation:
 
 
 def flight_of(scenario: Scenario) -> FlightSection:
-    """Return what a scenario says about flight data; defaults if it says nothing."""
+    """Return a scenario's section on flight data, or its defaults."""
     return scenario.flight or FlightSection()
 
 
@@ -212,15 +212,15 @@ def simulate_flight(scenario: Scenario, stages: Stages | None = None) -> FlightS
     Parameters
     ----------
     scenario : Scenario
-        Of one frequency, or several.
+        With one frequency, or several.
     stages : Stages, optional
-        Told how far it is.
+        Shows the progress.
 
     Raises
     ------
     InputError
-        If the beams know no volts, the scenario's samples are no spectra, the gain table cannot be
-        read, a tone is in no bin, or the scenario has noise that no spectra have.
+        If the beams are not calibrated in volts, the scenario's samples or noise cannot be those of
+        spectra, the gain table cannot be read, or a tone is in no bin.
     """
     stages = stages or Stages()
     flight = flight_of(scenario)
@@ -260,15 +260,15 @@ def spectra_observation(scenario: Scenario, window_s: float) -> Observation:
     ----------
     scenario : Scenario
     window_s : float
-        Length of each, in seconds, about the middle of the sample.
+        Length of each window in seconds, centred on the sample.
 
     Raises
     ------
     InputError
-        If the axis of the Moon is fixed, no sample lasts for so long, or the turntable turns:
-        sessions do not say its angle.
+        If the Moon's axis is fixed, no sample is live for this time, or the turntable rotates:
+        sessions do not contain its angle.
     """
-    # whatever the samples of other data would be
+    # spectra are means, independent of the scenario's observation.window
     planned = scenario.observation.model_copy(update={"window": "mean"}).observation()
     bounds, live = planned.windows.bounds_s, planned.windows.live_per_sample_s
     whole = live > (bounds[:, 1] - bounds[:, 0]) * (1.0 - 1e-9)
@@ -294,26 +294,26 @@ def true_visibilities(
 ) -> Float[np.ndarray, "frequencies products times"]:
     """Return visibilities of the scenario's sky with the true instrument, in V^2/Hz.
 
-    Errors of the gain table are none of the instrument's: they are in the counts.
+    Errors of the gain table are not part of the instrument here: they enter the counts.
 
     Parameters
     ----------
     scenario : Scenario
-        Of one frequency, or several.
+        With one frequency, or several.
     observation : Observation
     stages : Stages
-        Told how far it is.
+        Shows the progress.
 
     Raises
     ------
     InputError
-        If the beams know no volts.
+        If the beams are not calibrated in volts.
     """
     scenario = scenario.with_section("noise", gain_table=None)
     channels = scenario.channels() or (scenario,)
     first, second, _ = ports()
     scales = [np.sqrt(v[first] * v[second]) for v in map(per_kelvin_of, channels)]
-    # what changes with time has to be drawn for all of it
+    # quantities that vary in time must be drawn for all times at once
     noise, n = scenario.noise, observation.n_times
     whole = noise.gain is not None or noise.pointing is not None or bool(scenario.sources.list)
     piece = n if whole else PIECE
@@ -333,7 +333,7 @@ def true_visibilities(
 
 
 def _drawn_gains(scenario: Scenario, flight: FlightSection) -> tuple[GainModel, GainModel, Errors]:
-    """The table, the gains of which it is the mean, and by how much they are off."""
+    """The gain table, true gains drawn around it, and their errors."""
     table, section = gain_table_of(flight), scenario.noise.gain_table
     if section is None:
         return table, table, {}

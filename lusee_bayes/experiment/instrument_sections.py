@@ -1,10 +1,10 @@
 """Sections of a scenario on the instrument.
 
-They specify site, times and turntable angles; the beams, and the receivers at their
-ports. How sessions of the spectrometer become visibilities is a section of
-:mod:`lusee_bayes.flight.recipe`. Beams and receivers have one section for each kind, selected by
-``model``. A new kind of beams is a subclass of :class:`BaseBeamSection` here, with its
-:class:`BeamSource`, and its name in ``BEAM_SECTIONS``.
+They specify site, times and turntable angles, the beams, and the receivers at their ports. A
+section in :mod:`lusee_bayes.flight.recipe` specifies how spectrometer sessions become visibilities.
+Beams and receivers have one section per kind, selected by ``model``. To add a kind of beams, write
+a subclass of :class:`BaseBeamSection` here, with its :class:`BeamSource`, and add it to
+``BEAM_SECTIONS``.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class ObservationSection(Section):
     @model_validator(mode="before")
     @classmethod
     def _before_there_were_windows(cls, tree: Any) -> Any:
-        """Scenarios that were written with all entries, but without this one, had instants."""
+        """Older scenarios, with all entries except this one, had instants."""
         if isinstance(tree, Mapping) and "fixed_axis" in tree and "window" not in tree:
             return {**tree, "window": "instant"}
         return tree
@@ -123,7 +123,7 @@ class ObservationSection(Section):
         return _observation(self, self._intervals)
 
     def n_samples(self) -> int:
-        """Count the samples, those by day among them."""
+        """Count the samples, including those by day."""
         if self.schedule is None:
             return sum(int(run.cycles * CYCLE_DAYS * 86400.0 // self.step_s) for run in self.runs)
         return sum(interval.n_samples(self.step_s) for interval in self._intervals)
@@ -135,7 +135,7 @@ class ObservationSection(Section):
 
 @lru_cache(maxsize=2)
 def _observation(section: ObservationSection, intervals: tuple[Interval, ...]) -> Observation:
-    """One for all channels, with their times' orientations."""
+    """The observation, cached for all channels with its orientations."""
     common = section.model_dump(include={"step_s", "lon_deg", "lat_deg", "fixed_axis", "window"})
     if intervals:
         return Observation.from_schedule(intervals, **common)
@@ -171,7 +171,7 @@ class OpenSection(Section):
 
 
 def _named(value: Any) -> Any:
-    """``receiver: open`` is ``receiver: {model: open}``."""
+    """``receiver: open`` means ``receiver: {model: open}``."""
     return {"model": value} if isinstance(value, str) else value
 
 
@@ -192,15 +192,15 @@ class BaseBeamSection(Section):
         ``noise.fields`` is set, ground, arms and fields are unknowns of the map.
     """
 
-    # whether something about them can be an unknown
+    # whether the beams have parameters that can be unknowns
     has_parameters: ClassVar[bool] = False
-    # standard deviations of what is not known of them by default, relative
+    # relative standard deviations of the parameters that are unknown by default
     errors: ClassVar[Mapping[str, float]] = {}
 
     exact: bool = False
 
     def of_file(self, file: str) -> Any:
-        """The section of beams of a file that are turned as these are."""
+        """The section for the beams in a file, with the settings that it shares with this one."""
         kind = BEAM_SECTIONS[beam_kind(file)]
         shared = set(kind.model_fields) - {"model", "file", "exact"}
         return kind(file=file, **self.model_dump(include=shared))
@@ -229,7 +229,7 @@ class MonopoleBeamSection(BaseBeamSection):
 
     is_file: ClassVar[bool] = False
     has_parameters: ClassVar[bool] = True
-    # for the header of a file, and number of antennas
+    # name for file headers, and number of antennas
     label: ClassVar[str] = "monopole"
     n_ports: ClassVar[int] = N_ANTENNAS
 
@@ -274,7 +274,7 @@ class _FileSection(BaseBeamSection):
 
     @property
     def label(self) -> str:
-        """Which antennas, for the header of a file."""
+        """Name of the antennas, for file headers."""
         return Path(self.file).name
 
 
@@ -294,7 +294,7 @@ class _LuseepySection(_FileSection):
     moon_temperature_k: Temperature = 0.0
 
     def asked(self) -> dict[str, Any]:
-        """Settings of every file, as its beams accept them."""
+        """Settings of every file, as arguments of its beams."""
         luseepys = self.quadrature == "luseepy"
         options = {"luseepy_quadrature": luseepys, "moon_k": self.moon_temperature_k}
         return options | self.model_dump(include={"interpolation", "turntable_offset_deg"})
@@ -327,7 +327,7 @@ class ScalarBeamSection(_LuseepySection):
         return len(self.rotations_deg)
 
     def source(self) -> BeamSource:
-        """The pattern of the file, turned to every angle."""
+        """The pattern of the file, rotated to every angle."""
         beam, own = read_scalar_beam(self.file), self.model_dump(include={"taper", "rotations_deg"})
         return replace(beam, **own, **self.asked())
 
@@ -419,14 +419,14 @@ BEAM_SECTIONS = kinds_of(
 
 
 def _complete_beam(tree: dict[str, Any]) -> None:
-    """``beam: {file: ...}`` without a model, as in older scenarios: the file decides."""
+    """Complete ``beam: {file: ...}`` without a model, as in older scenarios: the file decides."""
     default = MonopoleBeamSection.model_fields["model"].default
     tree["model"] = tree.get("model") or default
     file = tree.get("file")
     if tree["model"] == default and file is not None:
         tree["model"] = beam_kind(file) if isinstance(file, str) else "luseepy"
     if tree["model"] not in ("response", "grid") and tree.get("receiver") == "jfet":
-        del tree["receiver"]  # scenarios of 0.1 held all keys of all kinds
+        del tree["receiver"]  # scenarios of version 0.1 contained the keys of all kinds
 
 
 BeamSection = one_of(BEAM_SECTIONS, _complete_beam)

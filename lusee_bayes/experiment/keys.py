@@ -1,7 +1,7 @@
 """Every key of a scenario: meaning, unit, choices and default, from its JSON schema.
 
-Units are the endings of names; all else is in ``Scenario.model_json_schema()``, which editors of
-YAML read, too.
+Units follow from the endings of names. Everything else is in ``Scenario.model_json_schema()``,
+which YAML editors also read.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from lusee_bayes.experiment.scenario import Scenario
 SAME = ("MHz", "Hz", "m", "s", "h", "K", "Jy", "pF", "nH", "Ohm")
 UNITS = {unit.lower(): unit for unit in SAME} | {"deg": "degrees", "day": "s/day"}
 TYPES = {"number": "number", "integer": "integer", "string": "text", "boolean": "true, false"}
-# JSON schema's names of bounds, as they are written
+# notation for the bounds in a JSON schema
 BOUNDS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
-# bounds that only keep numbers within what floats and seeds can hold
+# larger bounds only keep numbers within the range of floats and seeds, and are not listed
 WIDEST = 1e18
 
 Schema = Mapping[str, Any]
@@ -32,11 +32,11 @@ class Key:
     Attributes
     ----------
     path : str
-        With the sections that it is in, as ``--set`` takes it.
+        With its sections, as in ``--set``.
     kind : str
-        The ``model`` that has it, where a section has several kinds; else empty.
+        The ``model`` that has the key if a section has several kinds; else empty.
     unit : str
-        Empty for what has none.
+        Empty if the key has none.
     choices : str
         Type, bounds or list of values.
     default : str
@@ -64,7 +64,7 @@ def scenario_keys(within: str = "") -> list[Key]:
     Parameters
     ----------
     within : str
-        Only this key, or those of this section.
+        List only this key, or the keys of this section.
 
     Raises
     ------
@@ -97,7 +97,7 @@ def _keys_of(section: Schema, sections: Schema, prefix: str, kind: str) -> Itera
             continue
         path, meaning = f"{prefix}{name}", entry.get("description", "")
         inner = [sections[reference] for reference in _references(entry)]
-        # where nothing is said of an entry, what its section says of itself
+        # an entry without a description has that of its section
         if not meaning and len(inner) == 1:
             meaning = str(inner[0].get("description", "")).rstrip(".").replace("``", "`")
         default = "required" if name in section.get("required", ()) else _default(entry)
@@ -118,12 +118,12 @@ def _keys_of(section: Schema, sections: Schema, prefix: str, kind: str) -> Itera
 
 
 def _alternatives(entry: Schema) -> list[Schema]:
-    """What an entry may be, besides null."""
+    """Schemas that an entry allows, except null."""
     return [one for one in entry.get("anyOf", [entry]) if one.get("type") != "null"]
 
 
 def _references(entry: Schema) -> Iterator[str]:
-    """Names of the sections that an entry may be, or may be a list of."""
+    """Names of the sections that an entry, or an item of its list, may be."""
     for one in _alternatives(entry):
         for kind in one.get("oneOf", [one.get("items", one)]):
             if "$ref" in kind:
@@ -151,7 +151,7 @@ def _choices(entry: Schema) -> str:
 
 
 def _default(entry: Schema) -> str:
-    """As in YAML; where a function makes it, as that of a mapping, it is empty."""
+    """Format the default as in YAML; a default from a factory, as for a mapping, is empty."""
     value = entry.get("default", {})
     if value is None or isinstance(value, str):
         return value or "none"

@@ -1,14 +1,14 @@
-"""Data that disagree with all others, and the fit without them.
+"""Flag data that are inconsistent with the rest.
 
-Times, values, products and days are compared with what the model predicts from all others. The
-worst times are flagged, or a single product of theirs without which the time fits; what is left is
-compared again under the same model, and so on, until none has a chi^2 that noise gives with less
-than the rate of false alarms. Then products and days are compared in the same way. A bad product or
-day spoils the predictions of all times: where more times do not fit than may be flagged, it goes
-first. What is left is fitted again, since N is built around the data, until nothing more goes.
+We compare times, values, products and days with the model's predictions from all other data. The
+worst times are flagged, or only one product of a time if the others then fit. The remaining data
+are compared again under the same model, until noise explains every chi^2 at the false-alarm rate.
+Then products and days are compared in the same way. A bad product or day spoils the predictions of
+all times, so it is flagged first if more times are inconsistent than may be flagged. Since N is
+built around the data, the remaining data are then fitted again, until nothing more is flagged.
 
-All rules together, those of the reduction included, take a fifth of the data at most. A port's auto
-never goes whole while its crosses stay, whose noise depends on it.
+All rules together, including those of the reduction, flag at most a fifth of the data. A port's
+auto is never flagged completely while its crosses stay, because their noise depends on it.
 """
 
 from __future__ import annotations
@@ -31,25 +31,25 @@ from lusee_bayes.judge.left_out import DataGroup, LeftOut, Missed, groups_of
 from lusee_bayes.judge.split import WIDER, Split
 from lusee_bayes.systematics.context import Around, Setup
 
-# of the times beyond the limit, those within this share of the worst go in one round
+# one round flags the times beyond the limit whose size is at least this fraction of the worst
 WORST = 0.3
-# arrays of the size of A that are in memory at once, and the share of it that they may take
+# number of arrays of the size of A in memory at once, and the fraction of memory allowed for them
 ARRAYS, MOST_MEMORY = 5, 0.5
 
 
 @dataclass(frozen=True)
 class GroupsCompared:
-    """Times and data against their prediction by all others.
+    """Times and data compared with their predictions from all others.
 
     Attributes
     ----------
     data : Visibilities
-        With the times and the labels; which of them are compared, ``left_out`` knows.
+        Gives times and labels; ``left_out`` defines which of the data are compared.
     left_out : LeftOut
     chi2, degrees : (times,) arrays
-        Of each time, and its mean; 0 where there is nothing to compare with.
+        chi^2 of each time and its mean; 0 without a prediction.
     z : (products, times) array
-        Of each datum, in standard deviations; 0 where there is nothing to compare with.
+        Deviation of each datum, in standard deviations; 0 without a prediction.
     """
 
     data: Visibilities
@@ -60,7 +60,7 @@ class GroupsCompared:
 
     @classmethod
     def of(cls, left_out: LeftOut, data: Visibilities) -> GroupsCompared:
-        """Leave out every time, one after the other."""
+        """Leave out each time in turn."""
         present, times = left_out.present, np.arange(data.layout.n_times)
         some = np.flatnonzero(present.any(axis=0))
         of_time = [np.broadcast_to(times == k, present.shape) for k in some]
@@ -72,30 +72,30 @@ class GroupsCompared:
         return cls(data, left_out, chi2, degrees, np.where(usable, z, 0.0))
 
     def without(self, gone: GridFlags) -> GroupsCompared:
-        """Compare the others, with the same model."""
+        """Compare the remaining data with the same model."""
         return GroupsCompared.of(self.left_out.without(gone), self.data)
 
     @property
     def ratio(self) -> Float[np.ndarray, " times"]:
-        """chi^2 of the times over their means, or 0."""
+        """chi^2 of each time over its mean, or 0."""
         return np.where(self.degrees > 0.0, self.chi2 / np.maximum(self.degrees, 0.5), 0.0)
 
     @property
     def size(self) -> Float[np.ndarray, " times"]:
-        """By how much times, or one of their data, stand out: chi^2 over its mean."""
+        """How far each time, or its worst datum, stands out: chi^2 over its mean."""
         return np.maximum(self.ratio, (self.z**2).max(axis=0) / len(self.z))
 
     def worst(self, false_alarm: float, least: float = 0.0) -> GridFlags:
-        """The worst of what stands out: whole times, or a value without which its time fits.
+        """Flag the worst outliers: whole times, or a value without which its time fits.
 
-        chi^2 of a time less z^2 of one of its data is that of its other data.
+        chi^2 of a time minus z^2 of one datum is chi^2 of the time's other data.
 
         Parameters
         ----------
         false_alarm : float
-            Chance that a time of noise alone is flagged, or one of its products.
+            Probability that noise alone flags a time, or one of its products.
         least : float
-            ``size`` of what is looked at.
+            Ignore times with a smaller ``size``.
 
         Returns
         -------
@@ -114,17 +114,17 @@ class GroupsCompared:
         return flags
 
     def worst_group(self, false_alarm: float) -> DataGroup | None:
-        """Find the product or day that stands out and without which chi^2 falls most.
+        """Find the inconsistent product or day whose removal lowers chi^2 most.
 
         Parameters
         ----------
         false_alarm : float
-            Chance that one of noise alone stands out.
+            Probability that noise alone makes a product or day stand out.
 
         Returns
         -------
         DataGroup or None
-            None if none stands out.
+            None if no product or day stands out.
         """
         groups = [one for one in groups_of(self.data) if one.kind in ("product", "day")]
         groups = [one for one in groups if (one.data & self.left_out.present).any()]
@@ -136,7 +136,7 @@ class GroupsCompared:
 
 
 def _judged(missed: list[Missed]) -> tuple[Vector, Vector]:
-    """chi^2 of groups and its means; 0 where the others tell less than half a datum."""
+    """chi^2 of groups and its means; 0 where the mean is below half a datum."""
     chi2, degrees = np.reshape([(one.chi2, one.degrees) for one in missed], (-1, 2)).T
     predicted = np.isfinite(chi2) & (degrees >= 0.5)
     return np.where(predicted, chi2, 0.0), np.where(predicted, degrees, 0.0)
@@ -150,10 +150,10 @@ def _tail(chi2: Vector, degrees: Vector) -> Vector:
 
 
 def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> GroupsCompared | None:
-    """Leave out every time.
+    """Leave out each time in turn.
 
-    Under a prior that is wide enough for any sky (:mod:`lusee_bayes.judge.residuals`), so that
-    neither the prior nor what only that time sees is held against it.
+    The prior is wide enough for any sky (:mod:`lusee_bayes.judge.residuals`), so that a time is
+    judged neither by the prior nor by the part of the sky that only it sees.
 
     Parameters
     ----------
@@ -161,22 +161,22 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Groups
     data : Visibilities
         Measured.
     settle : bool
-        In as many rounds as N needs to be built around what the data say, if they settle; else in
-        one, and under a prior whose width asks nothing of them: for what stands out in any case.
+        Rebuild N around the inference until rounds converge, if they do. Otherwise use one round,
+        and a prior whose width does not depend on the data: this finds obvious outliers.
 
     Returns
     -------
     GroupsCompared or None
-        None where it would need too much memory.
+        None if it would need too much memory.
     """
-    # where N couples times, it is a matrix of all data, too
+    # if N couples times, it is also a matrix of all data
     n, across = data.layout.size, is_modelled(setup.scenario.noise.gain)
     if 8.0 * ARRAYS * n * (setup.prior.size + n * across) > MOST_MEMORY * memory_limit():
         return None
     inference = settled(setup, data) if settle else None
     if inference is not None and not inference.unsettled:
         model, posterior = inference.model, inference.posterior
-    else:  # bad data may let no rounds settle
+    else:  # with bad data, rounds may never converge
         model = full_model(setup, Around(data))
         posterior = model.condition(data.data).posterior if settle else None
     wide = None if posterior is None else Split.of(posterior, 0.0, data.layout.size).wide
@@ -197,32 +197,32 @@ KEPT = (
     "Product {port}{port}R is inconsistent with the rest but was kept, because the noise of port "
     "{port}'s other products depends on it: check the gain and the receiver of port {port}."
 )
-# where all rules together would take more, it is not the data but noise, gains or beams
+# fraction of the data that all rules may flag together; beyond, noise, gains or beams are wrong
 MOST = 0.2
-# may always go, whatever the rules of the reduction took
+# fraction that may always be flagged, however much the reduction flagged
 SMALL = 0.05
-# what stands out less than this part of the worst waits for the next fit; what stands out this much
-# more than half of the times goes before N is built around what all others say: it would take N
-# along, which then settles nowhere
+# FAR: outliers below this fraction of the worst wait for the next fit. OBVIOUS: times above this
+# multiple of the median are flagged before N is built around the inference, because they would
+# distort N so that it never converges
 FAR, OBVIOUS = 1e-2, 1e2
 
 
 @dataclass(frozen=True)
 class Fitting:
-    """Which data do not fit.
+    """The data that are inconsistent with the rest.
 
     Attributes
     ----------
     flagged : (products, times) array of bool
     chi2 : (times,) array
-        Of each time against its prediction by the others, before anything was flagged, over its
-        mean; 0 where the others do not tell.
+        chi^2 of each time relative to its prediction from the others, over its mean, before
+        anything was flagged; 0 without a prediction.
     remark : str
-        What is to be said; empty if there is nothing.
-    groups : tuple of Group
+        A remark for the report, or empty.
+    groups : tuple of DataGroup
         Products and days that are flagged as a whole.
     share : float
-        Of the values, flagged.
+        Fraction of the values that is flagged.
     """
 
     flagged: GridFlags
@@ -235,7 +235,7 @@ class Fitting:
 def fitting(
     setup: Setup, data: Visibilities, false_alarm: float, stages: Stages | None = None
 ) -> Fitting:
-    """Find data that do not fit.
+    """Find data that are inconsistent with the rest.
 
     Parameters
     ----------
@@ -243,15 +243,14 @@ def fitting(
     data : Visibilities
         Measured.
     false_alarm : float
-        Chance that a time of noise alone is flagged, one of its products, or a whole product or
-        day.
+        Probability that noise alone flags a time, one of its products, or a whole product or day.
     stages : Stages, optional
-        Told how far it is.
+        Shows the progress.
 
     Returns
     -------
     Fitting
-        With nothing flagged, and a remark, if so many data do not fit that it is not them.
+        Without flags, but with a remark, if too many data are inconsistent.
     """
     rules, stages = _Rules.of(data, false_alarm), stages or Stages()
     gone = nothing = np.zeros(rules.present.shape, dtype=bool)
@@ -285,10 +284,10 @@ def fitting(
 
 @dataclass(frozen=True)
 class _Rules:
-    """What goes, and how much may.
+    """Rules for which data to flag, and how many.
 
-    false_alarm : as in :func:`fitting`; present : (products, times) array of bool; values : how
-    many may go
+    false_alarm : as in :func:`fitting`; present : (products, times) array of bool; values : largest
+    number of values to flag
     """
 
     false_alarm: float
@@ -297,24 +296,24 @@ class _Rules:
 
     @classmethod
     def of(cls, data: Visibilities, false_alarm: float) -> _Rules:
-        """A fifth of what there was, less what the rules of the reduction took."""
+        """Allow a fifth of the original data, minus those that the reduction flagged."""
         n = data.layout.size
         lost = 0.0 if data.calibration is None else data.calibration.lost
         left = max((MOST - lost) / (1.0 - lost) * n, SMALL * n, data.layout.n_products)
         return cls(false_alarm, np.asarray(data.layout.present), left)
 
     def count(self, gone: GridFlags) -> int:
-        """Number of values that there were."""
+        """Number of flags on values that are present."""
         return int((gone & self.present).sum())
 
     def broken(self, gone: GridFlags, groups: GridFlags) -> bool:
-        """Whether too much goes, ``groups`` as a whole, or an auto without its port's crosses."""
+        """Whether too much is flagged (times outside ``groups``, values), or an auto alone."""
         times = (gone & ~groups).any(axis=0).sum()
         too_many = times > max(MOST * gone.shape[1], 1.0) or self.count(gone) > self.values
         return bool(too_many) or self.auto_alone(gone) is not None
 
     def auto_alone(self, gone: GridFlags) -> int | None:
-        """The port whose auto goes while crosses stay."""
+        """The port whose auto is completely flagged while crosses remain."""
         n_ports = round(np.sqrt(len(gone)))
         first, second, _ = ports(n_ports)
         used, left = self.present.any(axis=1), (self.present & ~gone).any(axis=1)
@@ -327,10 +326,9 @@ class _Rules:
     def one_by_one(
         self, start: GroupsCompared, gone: GridFlags, groups: GridFlags, least: float
     ) -> tuple[GroupsCompared, GridFlags | None]:
-        """Flag the worst first; ``groups`` are among what is ``gone`` from ``start``.
+        """Flag the worst data first; ``gone``, missing from ``start``, includes ``groups``.
 
-        Of what is left, and what goes in all; or of what was left before that was too much, and
-        None.
+        Returns the last comparison, and all flags; None in their place if they are too many.
         """
         left = start
         while (worst := left.worst(self.false_alarm, least)).any():
@@ -343,9 +341,9 @@ class _Rules:
     def eliminated(
         self, start: GroupsCompared, gone: GridFlags
     ) -> tuple[tuple[GridFlags, tuple[DataGroup, ...]] | None, str]:
-        """What goes under one model, besides what is ``gone``; None if that is too much.
+        """Flags under one model in addition to ``gone``, and their groups; None if too many.
 
-        And what is to be said of an auto that cannot go.
+        Also returns a remark on an auto that had to be kept, or an empty text.
         """
         base, groups, first = start, (), None
         of_groups = np.zeros_like(gone)
@@ -357,7 +355,7 @@ class _Rules:
             if result is not None and left.worst(self.false_alarm).any():
                 return result, ""
             if (group := left.worst_group(self.false_alarm)) is None:
-                # where no few groups are to blame: what was found without blaming any
+                # no group stands out: if this result flags too much, use the first, without groups
                 return result or first, ""
             of_groups = of_groups | group.data
             if self.broken(gone | of_groups, gone | of_groups):
@@ -366,7 +364,7 @@ class _Rules:
             groups, base = (*groups, group), start.without(of_groups)
 
     def remark(self, gone: GridFlags, groups: tuple[DataGroup, ...], share: float) -> str:
-        """What goes, in words."""
+        """The flags in words."""
         single = gone & ~np.any([np.zeros_like(gone), *(group.data for group in groups)], axis=0)
         whole = gone.all(axis=0) & single.any(axis=0)
         n_single, n = int(single[:, ~whole].sum()), gone.shape[1]
@@ -383,12 +381,12 @@ class _Rules:
 
 
 def without(setup: Setup, data: Visibilities, gone: GridFlags) -> tuple[Setup, Visibilities]:
-    """Setup and data without some of the data.
+    """Return setup and data without the flagged data.
 
     Raises
     ------
     InputError
-        If nothing is left.
+        If no data remain.
     """
     if not gone.any():
         return setup, data

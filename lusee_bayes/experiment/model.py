@@ -1,9 +1,9 @@
-"""A scenario's instrument pointed at its sky, the model of that, and data simulated from it.
+"""A scenario's instrument pointed at its sky, its model, and data simulated from it.
 
-A setup is all that is fixed before there are data: A, S, the sky, and what antennas and receivers
-add to every visibility, whatever the sky. Its model d = A m + n has radiometer noise alone, or
-every systematic. Simulated data hold the true instrument, its drifts and fluxes, drawn with the
-scenario's seed.
+A setup contains everything that is fixed before there are data: A, S, the sky, and the emission of
+antennas and receivers, which does not depend on the sky. The model d = A m + n includes only
+radiometer noise, or every systematic. Simulated data come from the true instrument, with drifts and
+fluxes drawn with the scenario's seed.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from lusee_bayes.systematics.systematic import (
     present,
 )
 
-# two sites closer than that are one: 30 m
+# sites closer than this, 30 m, count as one
 SAME_SITE_DEG = 1e-3
 
 
@@ -56,16 +56,15 @@ def set_up(
     ----------
     scenario : Scenario
     data : Visibilities, optional
-        Take the times and the samples that these data have, not the scenario's.
+        Use the times and samples of these data, not the scenario's.
     stages : Stages, optional
-        Told what is being done.
+        Shows the progress.
 
     Raises
     ------
     InputError
-        If the data are of another frequency, another site or other ports, or do not say what
-        their times are, or the scenario's receivers or ground need to know of the beams what these
-        do not say.
+        If the data have another frequency, site or number of ports, or times of unknown meaning, or
+        if the scenario's receivers or ground need information that the beams lack.
     """
     stages = stages or Stages()
     if data is not None:
@@ -86,7 +85,7 @@ def set_up(
         beams = source.beams(scenario.frequency_mhz, scenario.lmax)
         background = np.array(source.background(scenario.frequency_mhz))
         if scenario.noise.regolith is not None:
-            ground_per_kelvin(source, scenario.frequency_mhz)  # refuses what has no ground
+            ground_per_kelvin(source, scenario.frequency_mhz)  # refuses beams without a ground
         if (noise := scenario.noise.receiver) is not None:
             autos = auto_indices(source.n_ports)
             background[autos] += noise.powers(source, scenario.frequency_mhz)
@@ -112,13 +111,13 @@ def set_up(
 
 
 def with_sky_above(setup: Setup, parameters: Vector | None = None) -> Setup:
-    """The setup with the sky above lmax, where that is part of the model.
+    """Add the sky above lmax to a setup, if it is part of the model.
 
     Parameters
     ----------
     setup : Setup
     parameters : (parameters,) array, optional
-        Of the family of priors, learned from the data.
+        Parameters of the family of priors, learned from the data.
     """
     if AboveLmax.treatment(setup.scenario) is None:
         return setup
@@ -127,7 +126,7 @@ def with_sky_above(setup: Setup, parameters: Vector | None = None) -> Setup:
 
 
 def require_fitting(data: Visibilities, scenario: Scenario) -> None:
-    """InputError unless data are of the scenario's frequency and site, with known times."""
+    """Raise InputError unless the data match frequency and site, and their times have a meaning."""
     if not data.says_window:
         raise InputError(
             "the data do not specify the meaning of their times; use data.stamped('start') (or "
@@ -146,7 +145,7 @@ def require_fitting(data: Visibilities, scenario: Scenario) -> None:
     seen, stated = data.observation, scenario.observation
     east = (seen.lon_deg - stated.lon_deg + 180.0) % 360.0 - 180.0
     if max(abs(east), abs(seen.lat_deg - stated.lat_deg)) > SAME_SITE_DEG:
-        # luseepy writes a site of its own where it is told none
+        # luseepy writes a placeholder if no site is configured
         unsettled = (
             ", or, if the site in the sessions is a placeholder, --set flight.site=scenario when "
             "reducing them"
@@ -160,9 +159,9 @@ def require_fitting(data: Visibilities, scenario: Scenario) -> None:
 
 
 def radiometer(setup: Setup, around: Around | None = None) -> Covariance:
-    """Radiometer term of N, from the visibilities of :func:`.radiometer_about`; in K^2.
+    """Radiometer term of N in K^2, from the visibilities of :func:`.radiometer_about`.
 
-    Averages of spectra say themselves how many samples they are made of; other data have the
+    Averages of spectra contain the number of samples averaged; for other data, it follows from the
     scenario's bandwidth and duty cycle.
     """
     section = setup.scenario.noise.radiometer
@@ -178,17 +177,17 @@ def radiometer(setup: Setup, around: Around | None = None) -> Covariance:
 
 
 def moved(setup: Setup, values: Truth | None) -> Setup:
-    """The setup with the instrument that has these values, its signal with it."""
+    """The setup with these values of the instrument, and its signal for them."""
     for cls, section in present(SYSTEMATICS, setup.scenario) if values else ():
         setup = cls.moved(section, setup, values)
     return setup
 
 
 def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, Systematic]]:
-    """Treatment and systematic, for all that the scenario does not ignore, in their order.
+    """Treatment and systematic, for all that the scenario does not ignore, in order.
 
-    Where the instrument is built around values, such as those of clock and pointing, the others
-    are, too: gains multiply, and sources are seen, where the antennas then pointed.
+    If the instrument is expanded around values, such as clock and pointing offsets, all systematics
+    are: gains and sources then belong to the corrected pointing.
     """
     around = around or Around()
     moved_setup = moved(setup, around.values)
@@ -208,15 +207,15 @@ def base_model(setup: Setup, around: Around | None = None) -> LinearGaussian:
 def in_noise(
     setup: Setup, model: LinearGaussian, terms: Iterable[Systematic], around: Around
 ) -> list[Marginalised]:
-    """Systematics as N holds them, one after the other, about what the terms are built around.
+    """Systematics as terms of N, in order, built around given values.
 
     Parameters
     ----------
     setup : Setup
     model : LinearGaussian
-        Without them.
+        Model without them.
     terms : iterable of Systematic
-        In their order.
+        In order.
     around : Around
     """
     if around.sky is None:
@@ -246,9 +245,9 @@ def model_about(
     ----------
     setup : Setup
     around : Around
-        What N is built around.
+        Values that N is built around.
     moving : bool
-        Whether those are part of it that are found in rounds.
+        Include systematics whose values are found in rounds.
     """
     model, parts = base_model(setup, around), (s for _, s in systematics(setup, around))
     held = in_noise(setup, model, (s for s in parts if moving or not s.moves), around)
@@ -260,7 +259,7 @@ def model_about(
 def full_model(setup: Setup, around: Around | None = None) -> LinearGaussian:
     """d = A m + n with every systematic in N that is not ignored.
 
-    Those that are to be sampled, too, to first order: what a Gaussian can say about them.
+    Sampled systematics are included to first order, in the Gaussian approximation.
     """
     return model_about(setup, around or Around())[0]
 
@@ -268,11 +267,11 @@ def full_model(setup: Setup, around: Around | None = None) -> LinearGaussian:
 def model_to_sample(
     setup: Setup, around: Around
 ) -> tuple[LinearGaussian, tuple[Systematic | Marginalised, ...]]:
-    """The model before anything is sampled, and what is then to be applied to it.
+    """The model before sampling, and the systematics to apply to it.
 
-    Systematics that are marginalised come in their place in the order, as sampled ones without a
-    site. Gains that are sampled multiply these, too. N is factorised once, unless the noise level
-    or the prior is sampled, on which it depends.
+    Marginalised systematics keep their place in the order, like sampled ones without a site, since
+    sampled gains also multiply them. N is factorised once, unless it depends on a sampled noise
+    level or prior.
     """
     model, later = on_device(base_model(setup, around)), []
     treated, whole = systematics(setup, around), model
@@ -303,7 +302,7 @@ def model_to_sample(
 
 
 def true_values(setup: Setup) -> Truth:
-    """True values of what simulated data hold, by the names of their sites."""
+    """True values of the systematics in simulated data, by the names of their sites."""
     truth: Truth = {}
     for cls, section in present(SYSTEMATICS, setup.scenario):
         key = jax.random.key(cls.true_seed(section, setup.scenario))
@@ -312,7 +311,7 @@ def true_values(setup: Setup) -> Truth:
 
 
 def true_model(setup: Setup, truth: Truth) -> LinearGaussian:
-    """The model of simulated data: the true instrument and values, and the radiometer noise."""
+    """The model of simulated data: true instrument, true values and radiometer noise."""
     key = jax.random.key(setup.scenario.seed)
     true = moved(setup, truth)
     model = LinearGaussian(true.coupling, setup.prior, radiometer(setup), true.offset)
@@ -327,9 +326,9 @@ def true_signal(setup: Setup, truth: Truth) -> Grid:
 
 
 def simulate(setup: Setup) -> Visibilities:
-    """Visibilities of the scenario's sky, with every draw from its seed.
+    """Simulate visibilities of the scenario's sky, with all draws from its seed.
 
-    The truth is the sky that they hold, above lmax, too.
+    The truth is the simulated sky, including modes above lmax.
     """
     model, truth = true_model(setup, true_values(setup)), setup.sky.modes
     noise = model.noise.sample(jax.random.key(setup.scenario.seed))

@@ -1,7 +1,7 @@
-"""Inference in rounds: the prior, and N about the map, until neither moves.
+"""Inference in rounds: update the prior, and N around the map, until neither moves.
 
-N may be built around what the data tell, and the parameters of the prior be told by the data.
-Priors also come by name, for a comparison under which of them data are most probable.
+N may be built around the inference, and the prior's parameters may be learned from the data. This
+module also provides priors by name, to compare how probable the data are under each.
 """
 
 from __future__ import annotations
@@ -39,33 +39,33 @@ from lusee_bayes.systematics.systematic import Expanded, Marginalised, Systemati
 
 # N is rebuilt until the map moves by less than this (rms, in standard deviations)
 SETTLED, MAX_ROUNDS = 1e-2, 30
-# no unknown moves further in a round, in prior standard deviations: beyond, the first order that
-# the move comes from says little
+# largest move of an unknown in one round, in prior standard deviations: the first order behind a
+# longer move is unreliable
 FARTHEST = 2.0
-# while chi^2 of what N is built around is more than TEMPERED per datum, in the first rounds,
-# radiometer noise is taken for as much larger
+# in the first rounds, while chi^2 at the expansion point exceeds TEMPERED per datum, radiometer
+# noise is assumed larger to match
 TEMPERED, MAX_TEMPERED_ROUNDS = 10.0, 20
-# how much wider than the prior the sky is where all of the data's skies are let in
+# factor that widens the prior to allow any sky
 WIDE = 1e2
-# where chi^2 is too large by so many of its standard deviations, even so, as many other ways are
-# tried
+# if, even then, chi^2 is too large by FAR_OFF of its standard deviations, up to OTHER_WAYS other
+# starting points are tried
 FAR_OFF, OTHER_WAYS = 10.0, 6
-# of so many instruments each other way begins with the likeliest; rounds that leave more than this
-# part of what chi^2 is too large by do not lead to one that fits
+# each other way starts from the likeliest of CANDIDATES instruments; a round has stalled if more
+# than this fraction of the excess chi^2 remains after it
 CANDIDATES, STALLED = 8, 0.5
-# so many such rounds one after the other are the last
+# stop after this number of stalled rounds in a row
 IDLE = 3
-# the part of the values found that these keep, way after way: where most are right, half are the
-# quickest, and where they all are wrong, none
+# fraction of the current values that these instruments keep, alternating: one half is quickest if
+# most values are right, none if all are wrong
 KEPT = 0.5, 0.0
-# an instrument is found with some of the times first, which have so many data a mode of the sky
+# an instrument is first found from some of the times, with this number of data per sky mode
 ENOUGH = 8
-# a prior is learned first when the map moves by less than this, and last when learning it again
-# moves the map by less than PRIOR_SETTLED; a step of learning that is not taken moves it by 0.01
+# a prior is first learned when the map moves by less than NEARLY, and last when learning it again
+# moves the map by less than PRIOR_SETTLED; a rejected step of learning moves it by 0.01
 NEARLY, PRIOR_SETTLED, MAX_LEARNED = 0.5, 0.05, 8
-# draws of noise that the volume of skies that fit is estimated with; always the same ones
+# number of noise draws, always the same, that estimate the volume of skies that fit
 VOLUME_DRAWS = 8
-# steps that swing about where they lead to are halved, down to this part of the whole
+# steps that oscillate are halved, down to this fraction of the full step
 SHORTEST = 0.125
 
 
@@ -76,13 +76,13 @@ class Inference:
     Attributes
     ----------
     solution : Solution
-        Of the model with every systematic in N that the scenario does not ignore.
+        For the model with every systematic in N that the scenario does not ignore.
     systematics : tuple of Marginalised
-        Those, as they are in N.
+        These systematics as terms of N.
     rounds : int
-        How often N was built.
+        Number of times that N was built.
     around : Around
-        What it was built around.
+        Expansion point of N.
     unsettled : str
         A sentence if the map still moves from round to round; empty otherwise.
     learned : Learned or None
@@ -98,35 +98,35 @@ class Inference:
 
     @property
     def model(self) -> LinearGaussian:
-        """Of the solution."""
+        """Model of the solution."""
         return self.solution.model
 
     @property
     def posterior(self) -> Posterior:
-        """Of the solution."""
+        """Posterior of the solution."""
         return self.solution.posterior
 
     @property
     def expanded(self) -> tuple[Expanded, ...]:
-        """What is to first order about values, as it is in N."""
+        """Systematics that are expanded to first order, as terms of N."""
         return tuple(s for s in self.systematics if isinstance(s, Expanded))
 
     @property
     def moving(self) -> tuple[Expanded, ...]:
-        """What is so about values that the data determine."""
+        """Systematics that are expanded around values that the data determine."""
         return tuple(s for s in self.expanded if s.systematic.moves)
 
     @property
     def offsets(self) -> Expanded | None:
-        """Of clock and pointing, as they are in N."""
+        """Clock and pointing offsets, as a term of N."""
         return next((s for s in self.expanded if isinstance(s.systematic, PointingOffsets)), None)
 
     def amplitudes(self, part: Expanded) -> Amplitudes:
-        """What these data tell of a systematic's unknowns, in prior standard deviations."""
+        """Posterior of a systematic's unknowns from these data, in prior standard deviations."""
         return template_amplitudes(self.solution, part.columns)
 
     def misfit(self) -> float:
-        """Chi^2 per datum of the sky and the values that N is built around, under the rest of N."""
+        """Chi^2 per datum of the sky and the values at the expansion point, under the rest of N."""
         factor, solution, noise = self.solution.factor, self.solution, self.model.noise
         residual = solution.data - self.model.predict(self.around.sky)
         if isinstance(factor, LowRankFactor):
@@ -141,19 +141,19 @@ class Inference:
 
     @property
     def excess(self) -> float:
-        """How much chi^2 is above its mean; none of larger noise, which says little."""
+        """Chi^2 minus its mean; NaN if the noise is larger, since chi^2 then means little."""
         tempered = self.around.tempered > 1.0
         return np.nan if tempered else self.solution.chi2 - len(self.solution.data)
 
     @property
     def remark(self) -> str:
-        """Chi^2, for a line on the rounds."""
+        """Chi^2, for the progress of the rounds."""
         larger = " of larger noise" if self.around.tempered > 1.0 else ""
         return f"chi2 {self.solution.chi2:.0f} for {len(self.solution.data)} data{larger}"
 
     @property
     def fits(self) -> bool:
-        """Whether chi^2 does not stand out by far, whatever the prior expects of the sky."""
+        """Whether chi^2 is acceptable, under the prior or one that allows any sky."""
         n, solution = len(self.solution.data), self.solution
         most = n + FAR_OFF * math.sqrt(2.0 * n)
         if solution.chi2 >= most:
@@ -161,7 +161,7 @@ class Inference:
         return solution.chi2 < most
 
     def moves_from(self, mean: Modes) -> float:
-        """By how much the map has moved, or is from the sky that N is built around if that is more.
+        """Distance of the map from ``mean``, or from the sky at the expansion point if larger.
 
         Rms, in standard deviations.
         """
@@ -169,14 +169,14 @@ class Inference:
         return max(float(self.posterior.rms_shift_from(sky)) for sky in skies)
 
     def under(self, prior: Prior, learned: Learned | None = None) -> Inference:
-        """The same under another prior, one that was learned."""
+        """The inference under another prior, with how it was learned."""
         solution = self.solution.under(prior)
         return replace(self, solution=_less_moved(solution, self.expanded), learned=learned)
 
 
-# learns a prior from the information in data, from given parameters on
+# learns a prior from the information in data, starting at given parameters
 Learning = Callable[[Information, Float[np.ndarray, " parameters"] | None], Learned]
-# is told how many rounds are done, and a remark
+# receives the number of rounds done, and a remark
 Report = Callable[[int, str], None]
 
 
@@ -189,38 +189,37 @@ def settled(
 ) -> Inference:
     """Condition the model on data, in as many rounds as its N needs.
 
-    One round, unless a term of N is built around what the data tell: the gains around the
-    posterior's own prediction, or the instrument around its sky and values of its own. Then N and
-    the map are repeated until the map moves by less than 0.01 standard deviations (rms).
+    One round is enough, unless a term of N is built around the inference: the gains around the
+    posterior's prediction, or the instrument around its inferred sky and values. Then N and the map
+    are recomputed until the map moves by less than 0.01 standard deviations (rms).
 
-    What is second order in values that are far off may outweigh by orders of magnitude what tells
-    two of them apart. Rounds therefore begin with radiometer noise that is larger, so that chi^2
-    of what N is built around is 10 per datum, and the sky of each instrument is found anew
-    (variable projection: first order in values then has no product with a change of the sky).
-    Where data are many, this is done with every so many of the times first.
-    Values go part of the way where they would go far, or swing. Where no sky fits at their end,
-    whatever the prior expects of it, they begin again, up to six times: where about half of the
-    values found, or all, are drawn anew from their prior, with the likeliest of eight such
-    instruments. The end of the largest ln p counts.
+    If values are far off, their second order may exceed, by orders of magnitude, the signal that
+    distinguishes them. Rounds therefore start with larger radiometer noise, so that chi^2 at the
+    expansion point is 10 per datum, and solve for the sky of each instrument (variable projection:
+    the first order in values then has no product with a change of the sky). With many data, this is
+    first done with a regular subset of the times. Values move only part of the way if the step is
+    long or oscillates. If no sky fits at the end, under any prior, the rounds restart up to six
+    times: about half of the values, or all, are drawn again from their prior, and the likeliest of
+    eight such instruments is the start. The result with the largest ln p counts.
 
     Parameters
     ----------
     setup : Setup
     data : Visibilities
     start : Around, optional
-        What N is built around in the first round; by default the data and, where the instrument
-        is found, the sky of one with these values, or as it is expected.
+        Expansion point of N in the first round. By default, the data and, if the instrument is
+        inferred, the sky for the given or else the expected values.
     learn : callable, optional
-        ``learn(information, start)`` learns the prior, in the rounds: first when they have nearly
-        settled, last when that moves the map by less than 0.05 standard deviations.
+        ``learn(information, start)`` learns the prior during the rounds: first when they have
+        nearly converged, last when it moves the map by less than 0.05 standard deviations.
     report : callable, optional
-        ``report(rounds, remark)`` is told of every round.
+        ``report(rounds, remark)`` is called after every round.
 
     Returns
     -------
     Inference
-        Of the last round. Where the map does not settle in 30 rounds, or no instrument fits and
-        rounds lead no nearer to one, ``unsettled`` says so.
+        Result of the last round. ``unsettled`` explains if the map does not converge in 30 rounds,
+        or if no instrument fits and further rounds do not help.
 
     Raises
     ------
@@ -278,7 +277,7 @@ def settled(
 
 
 def _fewer(setup: Setup, data: Visibilities) -> tuple[Setup, Visibilities] | None:
-    """Every so many of the times, where an instrument is to be found and these are enough."""
+    """Setup and data at a regular subset of times that suffices to find the instrument, or None."""
     run = setup.observation.run
     stride = len(data.data) // (ENOUGH * setup.prior.size)
     if stride < 2 or not first_order(setup.scenario):
@@ -290,7 +289,7 @@ def _fewer(setup: Setup, data: Visibilities) -> tuple[Setup, Visibilities] | Non
 def _nearby(
     setup: Setup, data: Visibilities, around: Around, report: Report
 ) -> tuple[Inference, _Step]:
-    """Rounds until the map has nearly settled, and where it does not fit, from elsewhere."""
+    """Run rounds until the map has nearly converged; if it does not fit, restart elsewhere."""
     best, step = _approached(setup, data, around, report)
     for way in range(OTHER_WAYS):
         if best.moving and not best.fits:
@@ -304,7 +303,7 @@ def _nearby(
 def _approached(
     setup: Setup, data: Visibilities, around: Around, report: Report
 ) -> tuple[Inference, _Step]:
-    """Rounds until the map has nearly settled, and the step there."""
+    """Run rounds until the map has nearly converged; also return the last step."""
     inference, step = _conditioned(setup, data, around, 1), _Step()
     moves, stalled = np.inf if rebuilds(setup) else 0.0, False
     while moves > NEARLY and not stalled and inference.rounds < MAX_TEMPERED_ROUNDS:
@@ -312,7 +311,7 @@ def _approached(
         mean, n, excess = inference.posterior.mean, inference.rounds + 1, inference.excess
         at_rest = step.whole is None or np.abs(step.whole).max() < NEARLY
         if around.tempered > 1.0:
-            # what larger noise does not explain leads nowhere from where nothing moves
+            # at rest, a misfit that larger noise does not explain will not improve
             stalled = at_rest and not inference.fits
         del inference  # its N
         if around.tempered > 1.0:
@@ -329,7 +328,7 @@ def _approached(
 
 
 def _elsewhere(setup: Setup, data: Visibilities, inference: Inference, way: int) -> Around:
-    """Where else rounds may begin: the likeliest of draws, which may keep half of the values."""
+    """Another starting point: the likeliest of several draws, which may keep half of the values."""
     rng, best = np.random.default_rng(way), None
     parts = [part for part in inference.expanded if not part.systematic.learns]
     for _ in range(CANDIDATES):
@@ -350,7 +349,7 @@ def _elsewhere(setup: Setup, data: Visibilities, inference: Inference, way: int)
 def _conditioned(
     setup: Setup, data: Visibilities, around: Around, rounds: int, exact: Inference | None = None
 ) -> Inference:
-    """``exact``: the sky if values are these, whose A^T N_0^-1 A serves here, too."""
+    """Solve one round; ``exact``, the solution at these values, supplies A^T N_0^-1 A for reuse."""
     model, held = model_about(setup, around)
     if exact is None or exact.solution.matrix is None:
         solution = model.condition(data.data)
@@ -361,7 +360,7 @@ def _conditioned(
 
 
 def _less_moved(solution: Solution, held: Sequence[Marginalised]) -> Solution:
-    """With chi^2 and evidence as if the prior means of unknowns had not been moved."""
+    """Correct chi^2 and evidence for the moved prior means of unknowns."""
     solved, excess = solution.weighted_residual(), 0.0
     for part in held:
         if isinstance(part, Expanded):
@@ -372,10 +371,10 @@ def _less_moved(solution: Solution, held: Sequence[Marginalised]) -> Solution:
 
 @dataclass(frozen=True)
 class _Step:
-    """Of all that moves, from what N is built around to what the data then tell.
+    """The step of all moving values, from the expansion point towards the new posterior.
 
-    whole : (n,) array, the way there in prior standard deviations, None before the first;
-    swing : how much of it is gone unless it is far; size : how much of it is gone
+    whole : (n,) array, the full step in prior standard deviations, None before the first;
+    swing : the fraction to move unless the step is long; size : the fraction to move
     """
 
     whole: Vector | None = None
@@ -383,7 +382,7 @@ class _Step:
     size: float = 1.0
 
     def after(self, whole: Vector) -> _Step:
-        """The next step: a smaller part if it turns back without becoming short."""
+        """The next step: a smaller fraction if it reverses without getting much shorter."""
         back = (
             self.whole is not None
             and whole @ self.whole < 0.0
@@ -395,12 +394,12 @@ class _Step:
 
 
 def _around(setup: Setup, inference: Inference, step: _Step) -> tuple[Around, _Step]:
-    """What the terms of N are built around next, given a posterior, and the step there."""
+    """The next expansion point of N, given a posterior, and the step to it."""
     around, solution = inference.around, inference.solution
     solved = solution.weighted_residual()
     if inference.moving:
         ways = [s.expected + s.columns.T @ solved - s.centre for s in inference.expanded]
-        # where the prior is learned, its widths say nothing of how far the first order reaches
+        # learned prior widths do not indicate how far the first order is valid
         far = [
             way
             for s, way in zip(inference.expanded, ways, strict=True)
@@ -428,10 +427,10 @@ def _around(setup: Setup, inference: Inference, step: _Step) -> tuple[Around, _S
 def beginning(
     setup: Setup, data: Visibilities, values: Mapping[str, float] | None = None
 ) -> Around:
-    """What N is built around first: the data and, where the instrument is found, a sky.
+    """The first expansion point of N: the data and, if the instrument is inferred, a sky.
 
-    That of the instrument with these values, by default as it is expected, with larger noise where
-    it does not fit.
+    The sky is solved for the instrument with these values (default: the expected ones). The noise
+    is increased if it does not fit.
     """
     around = Around(data, values=values)
     if not first_order(setup.scenario):
@@ -441,7 +440,7 @@ def beginning(
 
 
 def _exact(setup: Setup, around: Around) -> Inference:
-    """What data tell of the sky if values are these, about that sky."""
+    """Infer the sky with the instrument fixed at these values, and expand around that sky."""
     moved_setup = moved(setup, around.values)
     model, held = model_about(moved_setup, replace(around, values=None), moving=False)
     solution = model.condition(around.data.data)
@@ -449,7 +448,7 @@ def _exact(setup: Setup, around: Around) -> Inference:
 
 
 def _tempered(misfit: float, rounds: int) -> float:
-    """What radiometer noise is multiplied by; little more than one is not worth a round."""
+    """Factor of radiometer noise; a factor below two is not worth a round."""
     tempered = misfit / TEMPERED
     return 1.0 if tempered < 2.0 or rounds >= MAX_TEMPERED_ROUNDS else tempered
 
@@ -463,12 +462,12 @@ def _volume(solution: Solution) -> tuple[Float[np.ndarray, "..."], Float[np.ndar
 
 
 def rebuilds(setup: Setup) -> bool:
-    """Whether some term of N is built around what the data tell."""
+    """Whether any term of N is built around the inference."""
     return rebuilds_visibilities(setup) or bool(first_order(setup.scenario))
 
 
 def first_order(scenario: Scenario) -> tuple[type[Systematic], ...]:
-    """Those that are to first order about values that the data tell."""
+    """Systematics that are expanded to first order around values inferred from the data."""
     return tuple(
         cls
         for cls, section in present(SYSTEMATICS, scenario)
@@ -477,21 +476,21 @@ def first_order(scenario: Scenario) -> tuple[type[Systematic], ...]:
 
 
 def rebuilds_visibilities(setup: Setup) -> bool:
-    """Whether gains or radiometer noise are built around the posterior's own prediction."""
+    """Whether gains or radiometer noise are built around the posterior's prediction."""
     gains = is_modelled(setup.scenario.noise.gain) and gains_about(setup) == "posterior"
     return gains or radiometer_about(setup) == "posterior"
 
 
 def prediction(setup: Setup, inference: Inference, solved: DataVector) -> Grid:
-    """Visibilities of the mean map, with all else that N holds but drifts and noise, in K.
+    """Visibilities of the mean map and of all terms of N except drifts and noise, in K.
 
     Parameters
     ----------
     setup : Setup
-        Pointed as the data tell.
+        With the inferred pointing.
     inference : Inference
     solved : (data,) array
-        N^-1 (d - A m), of the mean map.
+        N^-1 (d - A m) of the mean map.
     """
     mean = replace(setup.sky, modes=inference.posterior.mean)
     besides = np.zeros(len(solved))
@@ -501,7 +500,7 @@ def prediction(setup: Setup, inference: Inference, solved: DataVector) -> Grid:
     return setup.under(mean).signal + setup.layout.scatter(besides)
 
 
-# parameters are learned up to this ell first, in a tenth of the time, where there are more
+# a larger problem first learns its parameters up to this ell, in a tenth of the time
 COARSE_LMAX = 24
 
 
@@ -512,7 +511,7 @@ def with_learned_prior(
     start: Around | None = None,
     report: Report | None = None,
 ) -> tuple[Setup, Inference]:
-    """Learn the prior from data, with all that is in N (:func:`settled`).
+    """Learn the prior from data, with all terms of N (:func:`settled`).
 
     Parameters
     ----------
@@ -520,14 +519,14 @@ def with_learned_prior(
         With a family of priors.
     data : Visibilities
     earlier : Information, optional
-        Of earlier data, which are learned from, too.
+        Information in earlier data, from which the prior is also learned.
     start, report : Around and callable, optional
-        As of :func:`settled`.
+        As in :func:`settled`.
 
     Returns
     -------
     Setup
-        With the prior.
+        With the learned prior.
     Inference
         Under that prior, with how it was learned.
     """
@@ -541,7 +540,7 @@ def with_learned_prior(
         return learned_prior(setup, setup.family, whole(information), first if at is None else at)
 
     if AboveLmax.treatment(setup.scenario) == "marginalised":
-        # what is expected above lmax follows from what is learned below
+        # the expected sky above lmax follows from the prior learned below
         result = settled(setup, data, start, report=report)
         first, start = first_parameters(setup, whole(result.solution.information)), result.around
         setup = with_sky_above(setup, first)
@@ -550,7 +549,7 @@ def with_learned_prior(
 
 
 def first_parameters(setup: Setup, information: Information) -> Vector | None:
-    """Parameters of the setup's family that are learned up to a lower ell, if there are some."""
+    """Parameters of the setup's family, learned up to a lower ell; None if they do not converge."""
     scenario, family, seed = setup.scenario, setup.family, setup.scenario.seed
     coarse = family
     if scenario.lmax > COARSE_LMAX:
@@ -567,24 +566,24 @@ def learned_prior(
     information: Information,
     start: Float[np.ndarray, " parameters"] | None = None,
 ) -> Learned:
-    """Learn the prior of a family, up to a lower ell first where there are many.
+    """Learn the prior of a family; if lmax is high, first up to a lower ell.
 
     Parameters
     ----------
     setup : Setup
-        Of the scenario that the family is of.
+        Setup of the family's scenario.
     family : PriorFamily
     information : Information
-        What the data say of the sky.
+        The data's information about the sky.
     start : (parameters,) array, optional
-        Where to begin.
+        Starting point.
     """
     if start is None and setup.scenario.lmax > COARSE_LMAX:
         start = first_parameters(setup, information)
     return learn_whatever_fits(family, information, start, setup.scenario.seed)
 
 
-# takes C_ell of the scenario's sky, which only simulations know
+# uses C_ell of the scenario's sky, which is only known in simulations
 OF_TRUE_SKY = "isotropic-sky"
 NAMED: dict[str, sky_sections.PriorSection] = {
     "isotropic": sky_sections.IsotropicPriorSection(),
@@ -596,25 +595,24 @@ NAMED: dict[str, sky_sections.PriorSection] = {
 def named_priors(
     names: Sequence[str] | None, scenario: Scenario, *, known_sky: bool
 ) -> dict[str, sky_sections.PriorSection]:
-    """Find the sections of priors.
+    """Find the sections of named priors.
 
-    The scenario's own section is taken where it is of the kind that is named, so that a template
-    or an amplitude of its own counts.
+    If the scenario's own section has a named kind, it is used, including its template or amplitude.
 
     Parameters
     ----------
     names : sequence of str or None
-        Two or more of ``isotropic`` (C_ell learned), ``isotropic-sky`` (that of the scenario's
-        sky) and ``local_scales``; None for all that can be.
+        Two or more of ``isotropic`` (C_ell learned), ``isotropic-sky`` (C_ell of the scenario's
+        sky) and ``local_scales``; None for all that apply.
     scenario : Scenario
     known_sky : bool
-        Whether the data are of the scenario's sky.
+        Whether the data come from the scenario's sky.
 
     Raises
     ------
     InputError
-        For an unknown name, one that is given twice, fewer than two, and ``isotropic-sky`` where
-        the sky is not known.
+        For an unknown or repeated name, for fewer than two, and for ``isotropic-sky`` if the sky is
+        not known.
     """
     if names is None:
         names = [name for name in NAMED if known_sky or name != OF_TRUE_SKY]
@@ -631,7 +629,7 @@ def named_priors(
             "measured data; omit it, or give --truth if the data were simulated from that sky"
         )
     given, named = scenario.prior, {name: NAMED[name] for name in names}
-    # isotropic priors differ in where C_ell comes from
+    # isotropic priors differ in the origin of C_ell
     return {
         name: given if (given.model, given.origin) == (one.model, one.origin) else one
         for name, one in named.items()

@@ -1,8 +1,8 @@
 """A scenario: everything that determines a run, as YAML, validated before anything is computed.
 
-``--set key.path=value`` changes one entry. A mistake in a scenario is reported in one sentence;
-unknown keys are errors that name the nearest known one. ``to_yaml`` writes the resolved scenario,
-defaults included; running that file again gives the same numbers.
+``--set key.path=value`` changes one entry. A mistake in a scenario is reported in one sentence; for
+an unknown key it names the nearest known one. ``to_yaml`` writes the resolved scenario with its
+defaults; running that file again gives the same numbers.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from lusee_bayes.systematics.systematic import present
 def apply_override(tree: dict[str, Any], override: str) -> None:
     """Set one entry of ``tree``; list entries by number, as in observation.runs.0.cycles=2.
 
-    InputError, naming the override, if it is not of the form key.path=value or leads nowhere.
+    InputError, naming the override, if it is not of the form key.path=value or has no such place.
     """
     key, separator, text = override.partition("=")
     if not separator or not key:
@@ -52,7 +52,7 @@ def apply_override(tree: dict[str, Any], override: str) -> None:
 
 
 def _place(node: dict[str, Any] | list[Any], key: str, override: str) -> int | str:
-    """Where an entry is: in a section its key, in a list its number."""
+    """The place of an entry: its key in a section, its number in a list."""
     if isinstance(node, dict):
         return key
     if not (key.isascii() and key.isdigit() and len(key) < 10) or int(key) >= len(node):
@@ -61,16 +61,16 @@ def _place(node: dict[str, Any] | list[Any], key: str, override: str) -> int | s
 
 
 def one_sentence(error: ValidationError, source: str, model: type[BaseModel]) -> str:
-    """The first mistake: the entry, its value and the expected one.
+    """Describe the first mistake: the entry, its value and the expected one.
 
     Parameters
     ----------
     error : ValidationError
-        Of pydantic.
+        Error of pydantic.
     source : str
-        Where the scenario comes from.
+        Origin of the scenario.
     model : type
-        The model that it was validated against.
+        The model that validated it.
     """
     first = error.errors()[0]
     path, sections = _resolved(first["loc"], model)
@@ -90,7 +90,7 @@ def one_sentence(error: ValidationError, source: str, model: type[BaseModel]) ->
     if first["type"] == "value_error" and isinstance(first["input"], (dict, BaseModel)):
         return f"{source}: {where}: {expected}{more}" if where else f"{source}: {expected}{more}"
     if first["type"] in ("model_type", "model_attributes_type", "dict_type"):
-        # pydantic names the class
+        # pydantic's message names the class
         expected = "it should be a section with keys; lusee-bayes keys lists them"
     # YAML has lists where sections have tuples
     got = list(first["input"]) if isinstance(first["input"], tuple) else first["input"]
@@ -100,10 +100,10 @@ def one_sentence(error: ValidationError, source: str, model: type[BaseModel]) ->
 def _resolved(
     location: tuple[int | str, ...], model: type[BaseModel]
 ) -> tuple[list[str], list[type[BaseModel]]]:
-    """The path as a user writes it, and the section that its last key belongs to, of every kind.
+    """The path as a user writes it, and all kinds of the section that contains its last key.
 
-    pydantic puts the ``model`` of a section that comes in several kinds into the path. A key may be
-    meant for another kind than the one found: ``sky.fil=X`` is read as a key of a galaxy's.
+    For a section with several kinds, pydantic inserts the ``model`` into the path. The key may be
+    meant for another kind: ``sky.fil=X`` is read as a key of the galaxy.
     """
     path: list[str] = []
     section: type[BaseModel] | None = model
@@ -124,7 +124,7 @@ def _resolved(
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:
-    """Every section that a field's type names."""
+    """Every section in the type of a field."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [model for part in get_args(annotation) for model in _models_in(part)]
@@ -257,7 +257,7 @@ class Scenario(Section):
 
     @property
     def shared(self) -> dict[str, float]:
-        """Unknowns of the instrument that channels share: words and octaves."""
+        """Unknowns of the instrument that channels share, with the octaves over which they do."""
         if not self.frequencies_mhz:
             return {}
         return {
@@ -267,9 +267,9 @@ class Scenario(Section):
         }
 
     def of_measured(self) -> Scenario:
-        """The scenario of measured data: beams that nobody calls exact have unknowns.
+        """The scenario for measured data: beams have unknowns unless declared exact.
 
-        And the sky does not end at lmax.
+        The sky extends above lmax.
         """
         if self.noise.above_lmax is None:
             return self.with_section("noise", above_lmax=AboveLmaxSection()).of_measured()
@@ -282,18 +282,18 @@ class Scenario(Section):
         return self.with_section("noise", beam=beam, fields=fields)
 
     def with_section(self, name: str, **values: object) -> Scenario:
-        """The scenario with some values of a section changed."""
+        """Return the scenario with some values of a section changed."""
         return self.model_copy(update={name: getattr(self, name).model_copy(update=values)})
 
     @property
     def single(self) -> bool:
-        """Whether it is of one frequency."""
+        """Whether the scenario has one frequency."""
         return not self.frequencies_mhz
 
     def channels(self) -> tuple[Scenario, ...]:
-        """The scenario of every channel; the seeds of their draws differ by one."""
+        """The scenario of every channel; seeds increase by one from channel to channel."""
         alone: dict[str, Any] = {"frequencies_mhz": (), "joint": False}
-        if self.joint:  # theirs is the spectral prior, of the sky's own C_ell
+        if self.joint:  # the spectral prior uses C_ell of the sky
             alone["prior"] = sky_sections.IsotropicPriorSection(spectrum="sky")
         seed = self.instrument_seed
         alone["instrument_seed"] = self.seed if seed is None else seed
@@ -304,11 +304,11 @@ class Scenario(Section):
 
     @property
     def samples(self) -> bool:
-        """Whether something besides the sky is to be sampled."""
+        """Whether anything besides the sky is sampled."""
         return "sampled" in {cls.treatment(self) for cls in SYSTEMATICS}
 
     def require_marginal(self, what: str, advice: str) -> None:
-        """InputError where what makes maps is to sample something."""
+        """Raise InputError if anything is sampled, for commands that can only marginalise."""
         if self.samples:
             raise InputError(
                 f"in this scenario something is to be sampled, but {what} can only "
@@ -317,11 +317,11 @@ class Scenario(Section):
 
     @property
     def map_nside(self) -> int:
-        """NSIDE of maps that leave the program: at least two pixels for each ell."""
+        """NSIDE of written maps: at least two pixels per ell."""
         return self.nside or 2 ** max(3, (self.lmax // 2).bit_length())
 
     def to_yaml(self) -> str:
-        """The resolved scenario, defaults included."""
+        """The resolved scenario, including defaults."""
         return _as_yaml(json.dumps(self.model_dump(mode="json")))
 
 
@@ -330,13 +330,13 @@ _as_yaml = lru_cache(maxsize=64)(lambda text: as_yaml(json.loads(text)))
 
 
 def scenario_names() -> list[str]:
-    """Names of the scenarios that ship with the package."""
+    """Names of the built-in scenarios."""
     names = (entry.name for entry in FOLDER.iterdir())
     return sorted(name.removesuffix(".yaml") for name in names if name.endswith(".yaml"))
 
 
 def scenario_text(name: str) -> str:
-    """The YAML of a scenario of the package. InputError for an unknown name."""
+    """The YAML of a built-in scenario. InputError for an unknown name."""
     names = scenario_names()
     if name not in names:
         raise InputError(f"the package has no scenario '{name}'; {nearest(name, names)}")
@@ -346,9 +346,9 @@ def scenario_text(name: str) -> str:
 def load_scenario(
     source: str | Path | Scenario, overrides: list[str] | tuple[str, ...] = ()
 ) -> Scenario:
-    """Read a YAML file, or a scenario of the package by name, and apply ``key.path=value``.
+    """Read a YAML file, or a built-in scenario by name, and apply ``key.path=value``.
 
-    A Scenario is returned unchanged: runs accept a scenario, its file or its name.
+    A Scenario is accepted as it is, so that runs accept a scenario, its file or its name.
 
     InputError with one sentence for a missing file, bad YAML, an unknown key or a bad value.
     """
@@ -357,7 +357,7 @@ def load_scenario(
         scenario = _validate(_read_yaml(source), source)
     if not overrides:
         return scenario
-    tree = scenario.model_dump(mode="json")  # defaults included, so that any entry can be set
+    tree = scenario.model_dump(mode="json")  # includes defaults, so that any entry can be set
     for override in overrides:
         apply_override(tree, override)
     return _validate(tree, "the scenario" if isinstance(source, Scenario) else source)

@@ -1,8 +1,8 @@
 """Sections of a scenario on skies and priors.
 
-Sky and prior have one section for each kind, selected by ``model``. A new kind is a class here,
-which is a :class:`SkySource` or has a :class:`Prior`, and its name in ``SKY_SECTIONS`` or
-``PRIOR_SECTIONS``. The prior on skies of several frequencies has a separate section.
+Sky and prior have one section per kind, selected by ``model``. To add a kind, write a class here
+that is a :class:`SkySource` or has a :class:`Prior`, and add it to ``SKY_SECTIONS`` or
+``PRIOR_SECTIONS``. The prior on skies at several frequencies has a separate section.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class FileSkySection(Section, SkySource):
         Index for scaling the sky from ``file_frequency_mhz`` to the scenario's frequency.
     """
 
-    # whether the catalogue's sources are added: they are in the file, if at all
+    # the catalogue's sources are not added: the file may contain them
     sources: ClassVar[bool] = False
     model: Literal["file"] = "file"
     file: str
@@ -80,20 +80,20 @@ SKY_SECTIONS = kinds_of(GalaxySection, FileSkySection)
 
 
 def _complete_sky(tree: dict[str, Any]) -> None:
-    """``sky: {file: ...}`` without a model, as scenarios had it before."""
+    """Complete ``sky: {file: ...}`` without a model, as in older scenarios."""
     default = GalaxySection.model_fields["model"].default
     tree["model"] = tree.get("model") or default
     if tree["model"] == default and tree.get("file") is not None:
         tree["model"] = "file"
 
 
-# the sources of the embedded sky were said beside a file, too, where they had no effect
+# not strict: older scenarios also gave ``sources`` with a file, where they had no effect
 SkySection = one_of(SKY_SECTIONS, _complete_sky, strict=False)
 
 
-# where C_ell comes from
+# origin of C_ell
 LEARNED = "learned from these data"
-# what is expected of A and of the tilt where they are sampled: as of relative deviations
+# prior of A and the tilt when sampled: centred on the values for relative deviations
 AMPLITUDE, TILT = 0.04, -2.5
 LOG_AMPLITUDE_STD, TILT_STD = 1.0, 0.5
 
@@ -155,14 +155,14 @@ class IsotropicPriorSection(SpectrumSection):
         return self.spectrum == "learned" and self.spectrum_file is None
 
     def family(self, frequency_mhz: float, lmax: int) -> PriorFamily | None:
-        """The family that data choose a prior of, up to an ell; None if C_ell is given."""
+        """The family from which data select a prior, up to lmax; None if C_ell is given."""
         if not self.is_learned:
             return None
         mean = galaxy_sky(frequency_mhz, 0, seed=None, sources=()).mean_temperature
         return IsotropicFamily.around(mean, lmax)
 
     def prior(self, sky: Sky) -> Prior:
-        """S, and the mean, at the frequency and up to the lmax of a model sky."""
+        """The prior, S and mean, at the frequency and up to the lmax of a model sky."""
         read_at = self.file_frequency_mhz or sky.frequency_mhz
         steepening = (sky.frequency_mhz / read_at) ** self.spectral_index
         spectrum = sky.spectrum()
@@ -175,14 +175,14 @@ class IsotropicPriorSection(SpectrumSection):
 
     @property
     def origin(self) -> str:
-        """Where C_ell comes from."""
+        """Origin of C_ell."""
         if self.spectrum_file is not None:
             return f"of {self.spectrum_file}"
         return LEARNED if self.is_learned else "of the scenario's own sky"
 
     @property
     def has_files(self) -> bool:
-        """Whether the prior is read from files, which are of one frequency."""
+        """Whether the prior is read from files, which have one frequency."""
         return self.spectrum_file is not None or self.mean_file is not None
 
 
@@ -199,7 +199,7 @@ class LocalScalesPriorSection(Section):
         Allow for the sources of the catalogue.
     """
 
-    # as of the isotropic one
+    # as for the isotropic prior
     origin: ClassVar[str] = LEARNED
     has_files: ClassVar[bool] = False
     samples: ClassVar[bool] = False
@@ -208,7 +208,7 @@ class LocalScalesPriorSection(Section):
     sources: bool = True
 
     def family(self, frequency_mhz: float, lmax: int) -> PriorFamily:
-        """The family that data choose a prior of, up to an ell."""
+        """The family from which data select a prior, up to lmax."""
         return embedded_local_scales(frequency_mhz, lmax, BRIGHT_SOURCES if self.sources else ())
 
 
@@ -216,12 +216,12 @@ PRIOR_SECTIONS = kinds_of(LocalScalesPriorSection, IsotropicPriorSection)
 
 
 def _complete_prior(tree: dict[str, Any]) -> None:
-    """``prior`` without a model is that of its entries: isotropic, as scenarios had it before."""
+    """Choose the model by the entries if there is none: isotropic for those of older scenarios."""
     if not tree.get("model"):
         isotropic = set(tree) & set(IsotropicPriorSection.model_fields) - {"model"}
         default = IsotropicPriorSection if isotropic else LocalScalesPriorSection
         tree["model"] = default.model_fields["model"].default
-    if tree["model"] != "isotropic":  # another kind in the place of the paper's prior
+    if tree["model"] != "isotropic":  # another kind replaces the paper's prior
         tree.pop("spectrum", None)
 
 
@@ -257,7 +257,7 @@ class LogNormalSection(Section):
     )
 
     def prior(self, frequency_mhz: float, lmax: int) -> LogNormalPrior:
-        """The prior up to an ell."""
+        """The prior up to lmax."""
         amplitude, tilt, std = AMPLITUDE, TILT, np.array([LOG_AMPLITUDE_STD, TILT_STD])
         if self.amplitude is not None and self.tilt is not None:
             amplitude, tilt, std = self.amplitude, self.tilt, None
@@ -269,9 +269,9 @@ class LogNormalSection(Section):
         return LogNormalPrior(sky, np.array([np.log(amplitude), tilt]), std)
 
 
-# highest ell of fields of the logarithm, over that of the map
+# lmax of the fields of the logarithm, over the map's lmax
 FINER = 1.5
-# most fields' modes: every round factorises their matrix
+# largest number of the fields' modes: every round factorises their matrix
 MOST_UNKNOWNS = 10_000
 
 
@@ -323,26 +323,26 @@ class SpectralSection(Section):
     residual: Annotated[float, Field(ge=0, le=1)] | None = None
 
     def require_channels(self, n: int) -> None:
-        """InputError for so few channels that they cannot share a posterior."""
+        """Raise InputError if there are too few channels to share a posterior."""
         if self.model == "components":
             check_components(self.components, n, self.residual)
         if self.model == "positive":
             PositiveSkies.require_fields(self.fields, n)
 
     def lmax_of_fields(self, lmax: int) -> int:
-        """Choose the highest ell of the fields: 1.5 times that of the map, if they can be solved.
+        """Choose lmax of the fields: 1.5 times the map's, if the unknowns are not too many.
 
         Structure that a map does not resolve still changes it where the sky is steep.
 
         Parameters
         ----------
         lmax : int
-            Of the map.
+            Highest ell of the map.
 
         Raises
         ------
         InputError
-            If fields of the map's own lmax are too many unknowns.
+            If fields up to the map's lmax already have too many unknowns.
         """
         highest = int(np.sqrt(MOST_UNKNOWNS / len(self.fields))) - 1
         if highest < lmax:
@@ -354,12 +354,12 @@ class SpectralSection(Section):
         return min(round(FINER * lmax), highest)
 
     def positive_skies(self, frequencies_mhz: tuple[float, ...], lmax: int) -> PositiveSkies:
-        """The skies of channels up to an ell as functions of the fields.
+        """The skies of channels up to lmax as functions of the fields.
 
         Raises
         ------
         InputError
-            As :meth:`lmax_of_fields`.
+            As in :meth:`lmax_of_fields`.
         """
         catalogue = BRIGHT_SOURCES if self.sources else ()
         modes = [[source.modes(f, lmax) for source in catalogue] for f in frequencies_mhz]
@@ -376,7 +376,7 @@ class SpectralSection(Section):
             return len(self.fields)
         if self.model == "components":
             return len(self.components)
-        # as many principal spectra as matter
+        # number of significant principal spectra
         frequencies = np.array(frequencies_mhz)
         return self.prior(frequencies, np.ones((len(frequencies), 1))).n_components
 

@@ -1,19 +1,19 @@
-"""What the data tell besides the sky: receivers, ground, gain table, pointing, point sources.
+"""Posterior of the unknowns besides the sky: receivers, ground, gains, pointing, point sources.
 
-A uniform sky, warmer ground and noisier receivers look much alike. Of their joint posterior, each
-in units of its prior's standard deviation, the *null direction* is the one with the largest
-variance, which is 1 where the data say nothing.
+A uniform sky, warmer ground and noisier receivers look alike. In their joint posterior, in units of
+the prior standard deviations, the *null direction* has the largest variance. It is 1 if the data
+do not constrain this direction.
 
-Of a joint posterior each channel has its own unknowns z ~ N(0, 1), and given the channel's sky m no
-other channel's data tell of them: p(z | all data) is p(z | m, d) with the joint posterior of m
-integrated out.
+In a joint posterior, each channel has its own unknowns z ~ N(0, 1). Given the channel's sky m, data
+of other channels do not constrain them: p(z | all data) is p(z | m, d) integrated over the joint
+posterior of m.
 
-Of clock and pointing, the offsets of the model are told, and which each day prefers.
+For clock and pointing, reports list the offsets of the model and those that each day prefers.
 
-Together, the unknowns of the instrument are theta. With W = Cov(m, theta) and V = Cov(theta),
-fixing theta at its posterior mean lowers the covariance C of the sky by W V^-1 W^T; the ratio of
-the variances of this matrix and of C is the share of theta. The shares of single systematics, with
-blocks of W and V, need not add up.
+Let theta be all unknowns of the instrument, W = Cov(m, theta) and V = Cov(theta). Fixing theta at
+its posterior mean lowers the covariance C of the sky by W V^-1 W^T. The share of theta is the
+variance of this matrix over the variance of C. Shares of single systematics, from blocks of W and
+V, need not add up.
 """
 
 from __future__ import annotations
@@ -51,23 +51,23 @@ from lusee_bayes.systematics.pointing_offsets import PointingOffsets, shifted
 from lusee_bayes.systematics.sources import PointSources
 from lusee_bayes.systematics.systematic import Expanded, Truth
 
-# a null direction is worth a sentence where it keeps more than that of the prior's variance, and a
-# part of it a word where its weight is that large
+# report a null direction that keeps more than WORTH of its prior variance, and its parts with
+# weights of at least PART
 WORTH, PART = 0.5, 0.2
 
 
 @dataclass(frozen=True)
 class NullDirection:
-    """The combination of the sky's monopole and unknowns that the data tell least of.
+    """The combination of the sky's monopole and unknowns that the data constrain least.
 
     Attributes
     ----------
     names : tuple of str
-        Of its parts.
+        Names of its parts.
     weights : (parts,) array
-        A unit vector, in prior standard deviations of each; the largest is positive.
+        A unit vector, in prior standard deviations of the parts; the largest is positive.
     share : float
-        Its posterior variance over its prior variance.
+        Posterior variance over prior variance.
     """
 
     names: tuple[str, ...]
@@ -81,9 +81,9 @@ class NullDirection:
         Parameters
         ----------
         names : sequence of str
-            Of the parts.
+            Names of the parts.
         covariance : (parts, parts) array
-            In prior standard deviations of each; the prior is the unit matrix.
+            In prior standard deviations of the parts; the prior covariance is the unit matrix.
         """
         variances, directions = np.linalg.eigh(covariance)
         weights = directions[:, -1]
@@ -96,7 +96,7 @@ class NullDirection:
         return ", ".join(f"{self.names[k]} {self.weights[k]:+.2f}" for k in large)
 
     def sentence(self) -> str:
-        """What the data cannot tell; empty where they tell most of it."""
+        """The unconstrained combination in one sentence; empty if the data constrain it."""
         if self.share <= WORTH:
             return ""
         return (
@@ -105,29 +105,29 @@ class NullDirection:
         )
 
 
-# of the table of a report, in their order; "true" stands behind them where it is known
+# columns of a report's table, in order; "true" follows them if known
 UNKNOWN_COLUMNS = ("unknown", "unit", "value", "std", "prior", "prior_std")
-# what the sky's monopole is called beside them
+# name of the sky's monopole among the unknowns
 SKY = "uniform sky"
-# an unknown that keeps more of its prior's standard deviation is not told by the data
+# an unknown that keeps more of its prior standard deviation is unconstrained
 UNTOLD = 0.9
 
 
 @dataclass(frozen=True)
 class UnknownsReport:
-    """What a map tells of receivers, ground and gain table.
+    """A map's results on receivers, ground and gain table.
 
     Attributes
     ----------
     table : DataFrame
-        A row for each: unknown, unit, value, std, prior, prior_std and, if known, true.
+        One row per unknown: unknown, unit, value, std, prior, prior_std and, if known, true.
     null : NullDirection or None
-        None for a channel of a joint posterior, whose sky has no prior of its own.
+        None for a channel of a joint posterior, whose sky has no independent prior.
     common : float or None
-        Standard deviation of what all errors of gains have in common, over its prior's; None
-        without a gain table.
+        Standard deviation of the common error of all gains, over its prior's; None without a gain
+        table.
     onto : bool
-        Whether the map is of earlier data, too, which the table is not of.
+        Whether the map also contains earlier data, which the table does not.
     """
 
     table: pd.DataFrame
@@ -137,11 +137,11 @@ class UnknownsReport:
 
     @property
     def constrained(self) -> pd.Series:
-        """Whether the data tell each of them."""
+        """Whether the data constrain each unknown."""
         return self.table["std"] <= UNTOLD * self.table["prior_std"]
 
     def notes(self) -> list[str]:
-        """What has to be known to read the table, a sentence each."""
+        """Notes on the table, one sentence each."""
         sentences = []
         if self.common is not None and self.common > UNTOLD:
             sentences.append(
@@ -156,12 +156,12 @@ class UnknownsReport:
         return sentences
 
     def lines(self) -> list[str]:
-        """One line for every unknown, the sentence of the null direction, and the notes."""
+        """One line per unknown, the sentence on the null direction, and the notes."""
         lines = [_line(row["unknown"], row) for row in self.table.to_dict("records")]
         return [*lines, *filter(None, [self.null_sentence()]), *self.notes()]
 
     def null_sentence(self) -> str:
-        """What the data cannot tell; empty where they tell most of it, or it is not judged."""
+        """The null direction in one sentence; empty if it is constrained or not computed."""
         return "" if self.null is None else self.null.sentence()
 
     def summary(self) -> dict[str, Any]:
@@ -176,7 +176,7 @@ class UnknownsReport:
 
 
 def _line(name: str, row: Mapping[str, Any]) -> str:
-    """A row of a table in words."""
+    """Format a row of a table as text."""
     unit = f" {row['unit']}" if row.get("unit") else ""
     text = f"{name}: {row['value']:.4g} +- {row['std']:.2g}{unit}"
     if row["std"] > UNTOLD * row["prior_std"]:
@@ -184,32 +184,31 @@ def _line(name: str, row: Mapping[str, Any]) -> str:
     return text
 
 
-# unknowns in a corner plot, at most
+# largest number of unknowns in a corner plot
 MOST_IN_CORNER = 12
 ALL_TOGETHER = "all together"
 
 
 @dataclass(frozen=True)
 class InstrumentPosterior:
-    """Posterior of theta, the unknowns of the instrument, and what it does to the map.
+    """Posterior of theta, the unknowns of the instrument, and its effect on the map.
 
     Attributes
     ----------
     table : DataFrame
-        A row for each unknown, or for each ell of the errors of fields: ``systematic``,
-        ``unknown``, ``n`` (how many it stands for), ``moved`` and ``width``, the rms distance of
-        posterior means from prior means and the rms standard deviation, in prior standard
-        deviations.
+        One row per unknown, or per ell for errors of fields: ``systematic``, ``unknown``, ``n``
+        (number of unknowns in the row), ``moved`` (rms distance of posterior from prior means) and
+        ``width`` (rms standard deviation), both in prior standard deviations.
     corner : DataFrame
-        At most 12 unknowns, no errors of fields: first those that channels share, then those that
-        are best constrained relative to their priors. Columns as in :class:`UnknownsReport`.
+        At most 12 unknowns, without errors of fields: first those that channels share, then those
+        best constrained relative to their priors. Columns as in :class:`UnknownsReport`.
     correlation : (parameters, parameters) array
-        Of these.
+        Correlation of the unknowns in ``corner``.
     shares : dict of float
-        The share of the map's variance, summed over all modes, that would vanish if a systematic,
-        or all together, were known.
+        Fraction of the map's variance, summed over all modes, that would vanish if a systematic, or
+        all together, were known.
     pixel_share : (pixels,) array
-        The same share for each pixel of the map, all systematics together.
+        This fraction in each pixel of the map, for all systematics together.
     """
 
     table: pd.DataFrame
@@ -228,23 +227,24 @@ class InstrumentPosterior:
 
 @dataclass(frozen=True)
 class Unknowns:
-    """What some data tell of the instrument given the sky: what reports list, and what is shared.
+    """Posterior of the instrument's unknowns given the sky, for reports and for joint channels.
 
     Attributes
     ----------
     rows : tuple of dict
-        As of :func:`before_data`.
+        As in :func:`before_data`.
     amplitudes : AmplitudesOfSky or Amplitudes
-        Of all of them, about ``expected``; the latter given all data of a joint posterior.
+        Of all unknowns, relative to ``expected``; Amplitudes given all data of a joint posterior.
     expected : (n,) array
-        In prior standard deviations.
+        Prior means in N, in prior standard deviations.
     octaves : (n,) array
-        Over which channels share them (:meth:`.Systematic.octaves`).
+        Octaves over which channels share them (:meth:`.Systematic.octaves`).
     names : tuple of str
-        Of what may look like a uniform sky: powers and temperatures, and what all errors of gains
-        have in common.
+        Parts that may look like a uniform sky: powers, temperatures, and the common error of all
+        gains.
     parts : (parts, n) array
-        Of the latter one unit vector, since those of single ports and levels look like no sky.
+        Directions of these parts among the unknowns. Gain errors have one unit vector, since those
+        of single ports and levels do not look like a sky.
     sky_std : float
         Prior standard deviation of the monopole, in K.
     """
@@ -259,13 +259,13 @@ class Unknowns:
 
     @classmethod
     def of(cls, experiment: Experiment, inference: Inference) -> Unknowns | None:
-        """Of data and their model; None if that has no such unknowns.
+        """Collect the unknowns of a model; None if it has none.
 
         Parameters
         ----------
         experiment : Experiment
         inference : Inference
-            Of these data alone.
+            Inference from these data alone.
         """
         held = [s for s in inference.expanded if not isinstance(s.systematic, PointSources)]
         if not held:
@@ -277,7 +277,7 @@ class Unknowns:
             octaves.append(np.full(len(part.expected), over))
             alike.append(none if systematic.has_table else systematic.like_the_sky())
         data, columns = experiment.data, np.concatenate([s.columns for s in held], axis=1)
-        # of spectra, the sky behind them may be known, but not what the scenario would have drawn
+        # for spectra, the true sky may be known, but true values differ from the scenario's draws
         has_truth = data.truth is not None and data.calibration is None
         rows = before_data(held, true_values(experiment.setup) if has_truth else None)
         return cls(
@@ -292,16 +292,16 @@ class Unknowns:
 
     @property
     def shared(self) -> Int[np.ndarray, " shared"]:
-        """Which of them channels share."""
+        """Indices of the unknowns that channels share."""
         return np.flatnonzero(self.octaves)
 
     @property
     def shared_names(self) -> list[str]:
-        """Names of these."""
+        """Names of the shared unknowns."""
         return [self.rows[k]["unknown"] for k in self.shared]
 
     def among(self, tied: Tied) -> list[int]:
-        """Their places among all that is tied."""
+        """Indices of the shared unknowns in ``tied``."""
         return [tied.names.index(name) for name in self.shared_names]
 
     def _of(self, tied: Tied, number: int) -> Shared:
@@ -309,49 +309,49 @@ class Unknowns:
         return self.amplitudes.shared(self.shared, self.expected[self.shared], root)
 
     def whole(self, information: Information, tied: Tied, number: int) -> Information:
-        """What these data say of the sky and of what all channels share together.
+        """The data's information about the sky together with the shared unknowns.
 
         Parameters
         ----------
         information : Information
-            Of the sky, with the unknowns in N.
+            About the sky, with the unknowns in N.
         tied : Tied
-            The prior of what is shared.
+            Prior of the shared unknowns.
         number : int
-            Of the channel among those that are tied.
+            Index of the channel in ``tied``.
         """
         return self._of(tied, number).information(information, self.amplitudes.reference)
 
     def given_all(self, tied: Tied, number: int, mean: Vector, covariance: Square) -> Unknowns:
-        """These given all data of a joint posterior.
+        """Return the unknowns given all data of a joint posterior.
 
         Parameters
         ----------
         tied : Tied
-            The prior of what is shared.
+            Prior of the shared unknowns.
         number : int
-            Of the channel among those that are tied.
+            Index of the channel in ``tied``.
         mean, covariance : (modes + w,) and square array
-            Of the sky and w, in K and K^2.
+            Posterior of the sky and w, in K and K^2.
         """
         amplitudes = self.amplitudes.with_shared(self._of(tied, number), mean, covariance)
         return replace(self, amplitudes=amplitudes)
 
     def table(self, mean: Modes, covariance: ModesMatrix) -> pd.DataFrame:
-        """All of them with value and std, the sky integrated out; parameters are of the report."""
+        """All unknowns with value and std, sky integrated out; parameters as in :meth:`report`."""
         return given_data(pd.DataFrame(self.rows), self.amplitudes.integrated(mean, covariance))
 
     def report(
         self, mean: Modes, covariance: ModesMatrix, *, joint: bool = False
     ) -> UnknownsReport | None:
-        """What is told of those that are listed, the sky integrated out; None without any.
+        """The report on listed unknowns, with the sky integrated out; None if there are none.
 
         Parameters
         ----------
         mean, covariance : (modes,) and (modes, modes) array
             Posterior of the sky, in K and K^2.
         joint : bool
-            It is also that of other data: no null direction is looked for.
+            The posterior includes other data, so no null direction is computed.
         """
         posterior, rows = self.amplitudes.integrated(mean, covariance), self.table(mean, covariance)
         rows = rows[rows["listed"]]
@@ -368,7 +368,7 @@ class Unknowns:
     def instrument(
         self, mean: Modes, covariance: ModesMatrix, pixels: Pixels
     ) -> InstrumentPosterior:
-        """Posterior of all of them, and what it does to the map.
+        """Compute the posterior of all unknowns, and its effect on the map.
 
         Parameters
         ----------
@@ -419,20 +419,20 @@ class Unknowns:
 
 
 def before_data(parts: Sequence[Expanded], truth: Truth | None) -> pd.DataFrame:
-    """Unknowns of systematics as their priors have them.
+    """The unknowns of systematics with their priors.
 
     Parameters
     ----------
     parts : sequence of Expanded
     truth : dict or None
-        True values of all systematics; None where they are not known.
+        True values of all systematics; None if unknown.
 
     Returns
     -------
     DataFrame
-        A row for each: unknown, unit, prior, prior_std, ``expected`` (the prior mean in N),
-        ``listed`` (whether it is in the report's table: pointing has one of its own), what it
-        belongs to (``systematic``, and ``site``: the ell of errors of fields) and, if known, true.
+        One row per unknown: unknown, unit, prior, prior_std, ``expected`` (the prior mean in N),
+        ``listed`` (whether in the report's table; pointing has another table), ``systematic``,
+        ``site`` (the ell of errors of fields) and, if known, true.
     """
     tables = []
     for part in parts:
@@ -453,7 +453,7 @@ def before_data(parts: Sequence[Expanded], truth: Truth | None) -> pd.DataFrame:
 
 
 def given_data(table: pd.DataFrame, amplitudes: Amplitudes) -> pd.DataFrame:
-    """The same with value and std, from amplitudes in prior standard deviations."""
+    """Add value and std to a table, from amplitudes in prior standard deviations."""
     value = table["expected"] + table["prior_std"] * amplitudes.mean
     return table.assign(value=value, std=table["prior_std"] * amplitudes.std)
 
@@ -464,40 +464,40 @@ def _alone(experiment: Experiment, inference: Inference, part: Expanded) -> pd.D
     return given_data(before_data([part], truth), inference.amplitudes(part))
 
 
-# offsets that are tested whatever the scenario says, and how far apart the two sides of their
-# derivative are; longitude and latitude do what clock and lean do
+# offsets that are always tested, with the step of their derivatives; longitude and latitude act
+# like clock and tilt
 TESTED = {"clock_s": 10.0, "turntable_deg": 0.1, "tilt_east_deg": 0.1, "tilt_north_deg": 0.1}
-# more days than that are taken together in groups of equal length
+# if there are more days, they form groups of equal length
 MOST_STRETCHES = 31
-# what is left beyond first order may be that much of the radiometer noise, rms
+# acceptable rms of the terms beyond first order, over radiometer noise
 NEGLIGIBLE = 0.1
 
 
 @dataclass(frozen=True)
 class PointingReport:
-    """What a map tells of clock and pointing.
+    """A map's results on clock and pointing.
 
     Attributes
     ----------
     offsets : DataFrame or None
-        A row for each offset that the model has: value, std, prior_std, beyond_first_order (rms,
-        in radiometer noise) and, if known, true. None if it has none.
+        One row per offset of the model: offset, value, std, prior_std, beyond_first_order (rms,
+        over radiometer noise) and, if known, true. None without offsets.
     preferred : DataFrame
-        What the data prefer besides, of each offset for all days and for each: a row with offset,
-        first_day and last_day (-1 for all), value, std and chi2_gain.
+        Additional offsets that the data prefer, one row per offset for all days and for each group
+        of days: offset, first_day and last_day (-1 for all), value, std and chi2_gain.
     """
 
     offsets: pd.DataFrame | None
     preferred: pd.DataFrame
 
     def given(self, unknowns: pd.DataFrame) -> PointingReport:
-        """The same with the value and std of each offset that a table of unknowns has."""
+        """Return the report with value and std of each offset from a table of unknowns."""
         unknowns, table = unknowns.set_index("unknown"), self.offsets
         columns = {name: table["offset"].map(unknowns[name]) for name in ("value", "std")}
         return replace(self, offsets=table.assign(**columns))
 
     def lines(self) -> list[str]:
-        """One line for every offset."""
+        """One line per offset."""
         lines = []
         for row in [] if self.offsets is None else self.offsets.to_dict("records"):
             left = row["beyond_first_order"]
@@ -509,13 +509,13 @@ class PointingReport:
 
 
 def pointing_report(experiment: Experiment, inference: Inference) -> PointingReport:
-    """Work out the offsets of the model, and those that the data prefer besides.
+    """Compute the offsets of the model, and additional offsets that the data prefer.
 
     Parameters
     ----------
     experiment : Experiment
     inference : Inference
-        Of these data alone.
+        Inference from these data alone.
     """
     table = None if inference.offsets is None else _table(experiment, inference)
     values = {} if table is None else dict(zip(table["offset"], table["value"], strict=True))
@@ -524,7 +524,7 @@ def pointing_report(experiment: Experiment, inference: Inference) -> PointingRep
 
 def _table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
     table = _alone(experiment, inference, inference.offsets)
-    shares = np.asarray(table["std"] / table["prior_std"])  # what is left of the offsets
+    shares = np.asarray(table["std"] / table["prior_std"])  # remaining uncertainty of the offsets
     noise = np.sqrt(np.asarray(radiometer(experiment.setup).diagonal()))
     model = base_model(experiment.setup)
     left = inference.offsets.systematic.beyond_first_order(model, inference.posterior.mean, shares)
@@ -567,13 +567,13 @@ def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
     experiment : Experiment
         With sources that are not ignored.
     inference : Inference
-        Of these data alone.
+        Inference from these data alone.
 
     Returns
     -------
     DataFrame
-        A row for each source, or block of it. ``above_horizon``: whether it is ever up; if not,
-        its flux is known from the prior only.
+        One row per source, or per block of it. ``above_horizon``: whether it ever rises; if not,
+        only the prior constrains its flux.
     """
     held = next(s for s in inference.expanded if isinstance(s.systematic, PointSources))
     fluxes = _alone(experiment, inference, held)
@@ -592,7 +592,7 @@ def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
 
 
 def flux_lines(fluxes: pd.DataFrame) -> list[str]:
-    """One line for every source, or block of it."""
+    """One line per source, or per block of it."""
     lines = []
     for row in fluxes.to_dict("records"):
         name = row["source"] if row["block"] == 0 else f"{row['source']} ({row['block']})"

@@ -1,17 +1,17 @@
-"""How far a map can be trusted: what its Gaussian leaves out, and which errors it would not show.
+"""Validity of a map: limits of its Gaussian approximation, and errors that it would not reveal.
 
-**Reach.** Unknowns of the instrument are described by a Gaussian about their found values. Draws of
-sky and unknowns from it are weighed against the exact density, ::
+**Reach.** A Gaussian around the inferred values describes the unknowns of the instrument. Draws of
+sky and unknowns from it get weights w, the ratio of the exact density to it, ::
 
     ln w = -1/2 [ |L^-1 (d - v(m, z))|^2 - |L^-1 (d - v_lin(m, z))|^2 ] - z^2 / 2 + (z - e)^2 / 2,
 
-with L of the noise without them, and e the moved means of the model's prior. The tail of the
-weights says whether it is all of the posterior (Pareto k of Vehtari et al. 2024: up to 0.7). Of
-hundreds of unknowns it hardly ever is: many small second orders add up in w, and not in the map.
-What they do to the mean map, C A^T N^-1 (v - v_lin), says whether its errors hold.
+with L for the noise without the unknowns, and e the moved means of the model's prior. The tail of
+the weights shows whether the Gaussian covers the posterior (Pareto k of Vehtari et al. 2024: up to
+0.7). With hundreds of unknowns it rarely does: many small second orders add up in w, but not in
+the map. Their effect on the mean map, C A^T N^-1 (v - v_lin), shows whether its errors are valid.
 
-**Blind spots.** An error of the instrument that no unknown describes adds T z to the data. It moves
-the mean map by C A^T N^-1 T z, and raises the residual chi^2, what no sky can absorb, by ::
+**Blind spots.** An instrument error that no unknown describes adds T z to the data. It moves the
+mean map by C A^T N^-1 T z. It raises the residual chi^2, the part that no sky can absorb, by ::
 
     z^T T^T [N^-1 - N^-1 A (A^T N^-1 A)^-1 A^T N^-1] T z
 
@@ -42,29 +42,29 @@ from lusee_bayes.systematics.field_errors import FieldErrors, FieldErrorsSection
 from lusee_bayes.systematics.pointing_offsets import PointingOffsets
 from lusee_bayes.systematics.systematic import Systematic, Unknown
 
-# draws that are weighed, the first of them, and the k up to which a Gaussian serves
+# number of draws to weight, in total and first, and the largest k for a valid Gaussian
 N_WEIGHED, N_FIRST, LARGEST_K = 100, 25, 0.7
-# weights whose logarithms differ by less (rms) count for 1 / (1 + EVEN^2) = 0.92 of their number
+# if log-weights scatter by less (rms), the effective sample is 1 / (1 + EVEN^2) = 0.92 of the draws
 EVEN = 0.3
-# moves of the map, in standard deviations (rms), that make its error larger by a twentieth
+# a move of the map (rms, in standard deviations) that enlarges its error by a twentieth
 LARGEST_MOVE = 0.3
-# an error of the fields, and of each parameter of the antennas, relative
+# relative errors of the fields, and of each parameter of the antennas
 FIELDS, PARAMETERS = 1e-3, 1e-2
-# of the fields: enough to see whether anything shows
+# highest ell of field errors, enough to show whether they have an effect
 FIELD_LMAX = 3
-# a residual chi^2 is seen to be too large by so many of its standard deviations
+# excess of the residual chi^2 that is noticed, in its standard deviations
 SEEN = 3.0
 FIELDS_NAME = "the ports' fields"
-# what raises chi^2 by less is what a sky can absorb altogether, but for rounding
+# a smaller rise of chi^2 is only rounding: the sky absorbs the error completely
 NOTHING = 1e-3
-# standard deviations of the noise that the sky above lmax may add without being mentioned
+# the sky above lmax is not reported if it adds less, in standard deviations of the noise
 LITTLE = 0.1
-# errors that a sentence names
+# largest number of errors in a sentence
 MOST_NAMED = 4
 
 
 def weighed(setup: Setup, data: np.ndarray, inference: Inference) -> tuple[float, float] | None:
-    """Weigh draws of sky and unknowns from the Gaussian of an inference.
+    """Weight draws of sky and unknowns from the Gaussian of an inference.
 
     Parameters
     ----------
@@ -76,8 +76,8 @@ def weighed(setup: Setup, data: np.ndarray, inference: Inference) -> tuple[float
     Returns
     -------
     (float, float) or None
-        Pareto k of the weights, -inf where they hardly differ, and by how much what is beyond first
-        order moves the map, rms in standard deviations; None where nothing was found in rounds.
+        Pareto k of the weights, -inf if these are nearly equal, and the rms move of the map by
+        terms beyond first order, in standard deviations; None if no values were found in rounds.
     """
     parts, factor = inference.expanded, inference.solution.factor
     if not inference.moving or not isinstance(factor, LowRankFactor):
@@ -122,7 +122,7 @@ def weighed(setup: Setup, data: np.ndarray, inference: Inference) -> tuple[float
         if log_weights.std() < EVEN:
             return -np.inf, moved_by
     weights = np.exp(log_weights - log_weights.max())
-    if weights.sum() ** 2 < 2.0 * (weights**2).sum():  # one draw has nearly all of it: no tail
+    if weights.sum() ** 2 < 2.0 * (weights**2).sum():  # one draw has nearly all weight: no tail
         return np.inf, moved_by
     return float(arviz_stats.array_stats.psislw(-log_weights)[1]), moved_by
 
@@ -134,14 +134,14 @@ class BlindSpot:
     Attributes
     ----------
     name : str
-        What it is of.
+        The quantity in error.
     size : float
         Its standard deviation, in ``unit``.
     unit : str
     bias : float
-        By how much it moves the map: rms over modes, in posterior standard deviations.
+        Move of the map: rms over modes, in posterior standard deviations.
     shown : float
-        By how much it raises the residual chi^2, in standard deviations of that.
+        Rise of the residual chi^2, in standard deviations of chi^2.
     """
 
     name: str
@@ -152,17 +152,17 @@ class BlindSpot:
 
     @property
     def unnoticed(self) -> tuple[float, float]:
-        """The size up to which the residual chi^2 does not show it, and the bias of that size."""
+        """Largest size that the residual chi^2 does not reveal, and the bias of this size."""
         factor = float(np.sqrt(SEEN / max(self.shown, np.finfo(np.float64).tiny)))
         return self.size * factor, self.bias * factor
 
     def words(self) -> str:
-        """What it does, in a few words."""
+        """The error and its bias, in a few words."""
         return f"{self.name} by {self.size:g}{self.unit} ({self.bias:.2g})"
 
 
 def blind_sentence(spots: Iterable[BlindSpot]) -> str:
-    """Which errors would move the map and not be seen; empty where there are none."""
+    """Errors that would move the map unnoticed, in one sentence; empty if there are none."""
     unseen = [spot for spot in spots if spot.shown < SEEN and spot.bias > 1.0]
     if not unseen:
         return ""
@@ -178,7 +178,7 @@ def blind_sentence(spots: Iterable[BlindSpot]) -> str:
 def errors_of(
     setup: Setup, *, pointing: bool
 ) -> Iterator[tuple[str, float, str, Systematic, slice]]:
-    """Name, size and unit of errors that a model may lack, with what describes them."""
+    """Name, size and unit of errors that a model may lack, with their systematic and its index."""
     source = setup.beam_source
     if source.has_fields:
         section = FieldErrorsSection(std=FIELDS, lmax=FIELD_LMAX, learned=False)
@@ -201,7 +201,7 @@ def errors_of(
 def blind_spots(
     setup: Setup, inference: Inference, sky: Modes, *, pointing: bool = True
 ) -> tuple[BlindSpot, ...]:
-    """Work out what errors of the instrument do that the model does not have.
+    """Compute the effect of instrument errors that the model does not include.
 
     Parameters
     ----------
@@ -210,7 +210,7 @@ def blind_spots(
     sky : (modes,) array
         In K.
     pointing : bool
-        Clock and pointing, too, besides fields and antennas.
+        Include clock and pointing, besides fields and antennas.
     """
     has = {name for part in inference.expanded for name in part.systematic.names}
     if any(isinstance(part.systematic, FieldErrors) for part in inference.expanded):
@@ -238,7 +238,7 @@ def blind_spots(
 
 
 def about_sky_above(setup: Setup) -> str:
-    """What the sky above lmax adds to the data, and where it ends; empty where that is little."""
+    """Effect of the sky above lmax on the data, and the lmax that suffices; empty if negligible."""
     above, section = setup.above, setup.scenario.noise.above_lmax
     if above is None or section.treatment == "ignored":
         return ""
@@ -254,13 +254,13 @@ def about_sky_above(setup: Setup) -> str:
 
 
 def reach(experiment: Experiment, inference: Inference) -> list[str]:
-    """What is doubtful about the Gaussian, and what data would not show, a sentence each.
+    """Doubts about the Gaussian, and errors that data would not reveal, one sentence each.
 
     Parameters
     ----------
     experiment : Experiment
     inference : Inference
-        Of its data.
+        Inference from its data.
     """
     sentences, setup = [], experiment.setup
     k, moved_by = weighed(setup, np.asarray(experiment.data.data), inference) or (0.0, 0.0)
