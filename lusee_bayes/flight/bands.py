@@ -1,23 +1,23 @@
-"""One number for a band of channels: the spectrum at its middle, by a polynomial.
+"""One number for a band of channels: the spectrum at its middle, from a polynomial.
 
-Spectra are steep: the mean of f^-2.5 over 1 MHz about 10 MHz is 0.4 % above its middle, hundreds
-of times the noise. So a polynomial is fitted to the channels of every spectrum, and its value at
-the middle is taken: for degree 2, what is left out is of fourth order. A value is sum_k w_k x_k
-with weights that depend on the flags alone; its variance is that of n independent samples of
-voltages, n = frames / sum_kl w_k s_k C_kl s_l w_l, C the noise that channels share and s the shape
-of the spectrum.
+Spectra are steep: the mean of f^-2.5 over 1 MHz around 10 MHz is 0.4 % above its middle, hundreds
+of times the noise. So a polynomial is fitted to the channels of every spectrum and evaluated at the
+middle: for degree 2, the error is of fourth order. A value is sum_k w_k x_k with weights that
+depend only on the flags; its variance is that of n independent samples of voltages,
+n = frames / sum_kl w_k s_k C_kl s_l w_l, C the noise that channels share and s the shape of the
+spectrum.
 
-C is that of a polyphase filter bank. One of T taps weights T frames of N samples with a window
-times the impulse response of a channel, h, before the Fourier transform: y_k(t) = sum_n h(n)
-x(n + N t) exp(-2 pi i k n / N). For white noise, ::
+C describes a polyphase filter bank. With T taps it multiplies T frames of N samples by h, a window
+times the impulse response of a channel, before the Fourier transform:
+y_k(t) = sum_n h(n) x(n + N t) exp(-2 pi i k n / N). For white noise, ::
 
     <y_k(t) conj(y_k+d(t + s))> ~ c_d(s) = sum_n h(n) h(n - s N) exp(2 pi i d n / N),
 
 and the powers of two channels, averaged over many frames, have the covariance ::
 
-    sum_s |c_d(s)|^2,
+    sum_s |c_d(s)|^2.
 
-of which c_0(0)^2 would be that of independent frames.
+Independent frames would give c_0(0)^2.
 """
 
 from __future__ import annotations
@@ -33,14 +33,13 @@ from lusee_bayes.core.arrays import RowFlags, Rows
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.flight.session import Averaging, Middles
 
-# spectra in bands: what rows have at points of a curve, and the terms that the curve is made of;
-# values of a band
+# spectra in bands: rows at the points of a curve, the curve's terms, and values of a band
 Points = Bool[np.ndarray, "rows points"]
 PointValues = Float[np.ndarray, "rows points"]
 Basis = Float[np.ndarray, "points terms"]
 Values = Float[np.ndarray, "rows products"]
 Normals = Float[np.ndarray, "rows terms terms"]
-# a spectrum with so many flags that its value has this many times the variance is not used
+# a spectrum is not used if its flags raise the variance of its value by more than this factor
 MOST_VARIANCE = 4.0
 ROUNDING_MHZ = 1e-9
 
@@ -78,16 +77,16 @@ class ChannelBand:
         middles_mhz: Middles,
         shared_noise: tuple[float, ...] = (1.0,),
     ) -> ChannelBand:
-        """Find the bins of a band.
+        """Return the bins of a band.
 
         Parameters
         ----------
         frequency_mhz, bandwidth_mhz : float
-            Middles with their middles within the bandwidth, ends included.
+            Middle and width of the band; channels with their middle at its ends are included.
         degree : int
-            Of the polynomial.
+            Degree of the polynomial.
         averaging : Averaging
-            Which channels the bins hold.
+            The channels in each bin.
         middles_mhz : (channels,) array
         shared_noise : tuple of float
             :func:`.shared_noise`.
@@ -95,7 +94,7 @@ class ChannelBand:
         Raises
         ------
         InputError
-            If there are too few of them for the polynomial.
+            If there are too few bins for the polynomial.
         """
         channels = averaging.channels()
         x = (middles_mhz[channels] - frequency_mhz) / (bandwidth_mhz / 2.0)
@@ -117,26 +116,26 @@ class ChannelBand:
     def values(
         self, spectra: Float[np.ndarray, "rows products points"], autos: PointValues, good: Points
     ) -> tuple[Values, Rows, Values]:
-        """Return the spectrum at the middle.
+        """Return the values of spectra at the middle.
 
         Parameters
         ----------
         spectra : (rows, products, bins) array
-            Of the band's bins.
+            Spectra in the band's bins.
         autos : (rows, bins) array
-            Mean of the autos, which shape the noise.
+            Mean of the autos, which gives the shape of the noise.
         good : (rows, bins) array of bool
-            Which bins to use.
+            Bins to use.
 
         Returns
         -------
         (rows, products) array
             In the unit of the spectra.
         (rows,) array
-            Variance in units of the value's own square, for one frame; infinite where too many bins
+            Variance in units of the value's own square, for one frame; infinite if too many bins
             are flagged.
         (rows, products) array
-            What two further powers would add.
+            Change of the values by two further powers.
         """
         weights, possible = point_weights(self.basis, good)
         finer, _ = point_weights(self.finer, good)
@@ -155,12 +154,12 @@ class ChannelBand:
 
 
 def point_weights(basis: Basis, good: Points) -> tuple[PointValues, RowFlags]:
-    """Return the weights by which a least-squares polynomial is evaluated in the middle.
+    """Return the weights that evaluate a least-squares polynomial at the middle.
 
     Parameters
     ----------
     basis : (points, terms) array
-        Powers, of which the middle has the first alone.
+        Powers, of which only the first is not zero at the middle.
     good : (rows, points) array of bool
 
     Returns
@@ -177,7 +176,7 @@ def point_weights(basis: Basis, good: Points) -> tuple[PointValues, RowFlags]:
 def inverse_normals(basis: Basis, good: Points) -> tuple[Normals, RowFlags]:
     """Return the inverse normal matrix of the curve through the good points of every row.
 
-    Also whether there are enough points; it is the unit matrix where there are not.
+    Also whether there are enough points; if not, the unit matrix is returned.
     """
     normal = np.einsum("rk,ka,kb->rab", good.astype(float), basis, basis, optimize=True)
     possible = good.sum(axis=1) > basis.shape[1]
@@ -186,9 +185,9 @@ def inverse_normals(basis: Basis, good: Points) -> tuple[Normals, RowFlags]:
 
 
 Taper = Literal["rectangular", "hann", "hamming", "blackman"]
-# covariances do not depend on the length of a frame where it is long
+# length of a frame in samples; covariances do not depend on it if it is long
 FRAME = 512
-# beyond that many channels apart nothing is shared
+# channels further apart share nothing
 REACH = 6
 # coefficients of cos(2 pi j n / N T) of each window
 WINDOWS: dict[Taper, tuple[float, ...]] = {
@@ -206,15 +205,15 @@ def shared_noise(taps: int, taper: Taper) -> tuple[float, ...]:
     Parameters
     ----------
     taps : int
-        Number of frames that a spectrum is made of: 1 is a windowed Fourier transform; 0 stands for
-        channels that share nothing.
+        Number of frames that form a spectrum: 1 is a windowed Fourier transform; 0 is for channels
+        that share nothing.
     taper : {"rectangular", "hann", "hamming", "blackman"}
 
     Returns
     -------
     tuple of float
-        In units of the variance of independent frames in independent channels; the first is above
-        one where frames overlap.
+        In units of the variance of independent frames in independent channels; the first exceeds
+        one if frames overlap.
     """
     if taps == 0:
         return (1.0,)
@@ -228,7 +227,7 @@ def shared_noise(taps: int, taper: Taper) -> tuple[float, ...]:
 
 
 def impulse_response(taps: int, taper: Taper) -> Float[np.ndarray, " samples"]:
-    """Return h: a window, times the sinc of one channel where there are several taps."""
+    """Return h: a window, times the sinc of one channel if there are several taps."""
     n = taps * FRAME
     t = (np.arange(n) + 0.5) / n
     window = sum(c * np.cos(2.0 * np.pi * j * t) for j, c in enumerate(WINDOWS[taper]))

@@ -1,18 +1,18 @@
-"""The mission clock: which UTC its seconds stand for.
+"""The mission clock: the UTC of its seconds.
 
-A file of luseepy's layout 3 says it by ``mjd_epoch_offset_days``, ``raw_time_subtract_seconds`` and
-``time_scale``, which may be "unknown"; one of layout 4 by a clock reference, or not at all. A clock
-file says it from outside: luseepy's clock reference, format 1, which is JSON, ::
+A file of luseepy's layout 3 defines it by ``mjd_epoch_offset_days``, ``raw_time_subtract_seconds``
+and ``time_scale``, which may be "unknown"; one of layout 4 by a clock reference, or not at all. A
+clock file defines it from outside: luseepy's clock reference, format 1, in JSON, ::
 
     {"format_version": 1, "reference_event": "landing",
      "clock_reference_isot": "2027-01-10T00:00:00", "time_scale": "utc",
      "clocks": {"spectrometer": {"clock_reference_raw_seconds": 123.0}},
      "source": "mission timing record", "assumed": false}
 
-with ``rate``, the seconds of ``time_scale`` in a second of the clock, where it is not 1: above 1
-for a clock that runs slow. With ``stated_utc_isot`` in place of ``clocks`` the file corrects the
-UTC that sessions state: when they state that, it was ``clock_reference_isot``, and ``rate`` is the
-seconds of ``time_scale`` in a second of theirs.
+with an optional ``rate``, the seconds of ``time_scale`` in a second of the clock: 1 by default,
+above 1 for a clock that runs slow. With ``stated_utc_isot`` in place of ``clocks`` the file
+corrects the UTC of sessions: ``stated_utc_isot`` was in truth ``clock_reference_isot``, and
+``rate`` is the seconds of ``time_scale`` in a second of the sessions' UTC.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ from lusee_bayes.core.section import Section
 from lusee_bayes.instrument.times import scale_of, time_of_text, unannounced_leap_seconds, utc_of
 
 DAY_S, MJD_ZERO = 86400.0, 2400000.5
-# two clocks that differ by less are one
+# clocks that differ by less are equal
 SAME_S = 1e-3
-# a clock that is off by more is none
+# largest error of a clock's rate
 MOST_OFF = 1e-2
 
 
@@ -43,14 +43,14 @@ class _Reading(Section):
 
 
 class _Clocks(Section):
-    """What the clocks of luseepy's records showed at ``clock_reference_isot``."""
+    """Readings of the clocks in luseepy's records at ``clock_reference_isot``."""
 
     spectrometer: _Reading
     dcb: _Reading | None = None
 
 
 class _ClockFile(Section):
-    """What a clock file holds."""
+    """Contents of a clock file."""
 
     format_version: Literal[1]
     clock_reference_isot: str
@@ -71,18 +71,18 @@ class Clock:
     Attributes
     ----------
     source : str
-        Who says so, for messages.
+        Origin of the clock, for messages.
     jd1, jd2 : float
         A time, as a Julian date in two parts.
     scale : str
-        Of this time: utc, tai, tt or tdb.
+        Scale of this time: utc, tai, tt or tdb.
     raw_s : float
-        What the clock shows then.
+        Reading of the clock at this time.
     rate : float
         Seconds of ``scale`` in a second of the clock.
     stated : Time or None
-        For a clock that corrects what sessions state: the UTC that they state then; ``raw_s`` does
-        not count.
+        For a clock that corrects sessions: the UTC that they state at this time; ``raw_s`` is then
+        ignored.
     """
 
     source: str
@@ -94,17 +94,17 @@ class Clock:
     stated: Time | None = None
 
     def utc(self, raw_s: Times) -> Time:
-        """Return UTC at readings of the clock.
+        """Return UTC for readings of the clock.
 
         Parameters
         ----------
         raw_s : (times,) array
-            In seconds.
+            Readings, in seconds.
 
         Raises
         ------
         InputError
-            If one is outside the ephemeris.
+            If a time is outside the ephemeris.
         """
         days = self.rate * (raw_s - self.raw_s) / DAY_S
         whole = np.floor(days)
@@ -117,7 +117,7 @@ class Clock:
             return str(Time(self.jd1, self.jd2, format="jd", scale=self.scale, precision=9).isot)
 
     def differs_s(self, other: Clock, raw_s: Times) -> float:
-        """Return by how many seconds two clocks differ at most at some readings."""
+        """Return the largest difference between two clocks over these readings, in seconds."""
         ends = np.array([raw_s.min(), raw_s.max()])
         with unannounced_leap_seconds():
             return float(np.abs((self.utc(ends) - other.utc(ends)).sec).max())
@@ -133,8 +133,7 @@ def read_clock(path: str | Path) -> Clock:
     Raises
     ------
     InputError
-        If it cannot be read, lacks something, has an entry that is not known, or a date or scale
-        that is none.
+        If it cannot be read, lacks an entry, has an unknown entry, or an invalid date or scale.
     """
     hint = "write luseepy's clock reference (format_version 1), see docs/howto/first_light.md"
     file = read_model(path, _ClockFile, "a clock reference", hint)
@@ -161,17 +160,17 @@ def clock_of(path: str | Path, said: Clock | None, given: Clock | None, raw_s: T
     Parameters
     ----------
     path : str or Path
-        Of the session.
+        The session's file.
     said, given : Clock or None
-        By the session itself, and by the user's clock file.
+        The session's own clock, and that of the user's clock file.
     raw_s : (times,) array
         The session's readings.
 
     Raises
     ------
     InputError
-        If neither says it, both do and differ by more than a millisecond, or there is nothing to
-        correct.
+        If neither clock is given, if they differ by more than a millisecond, or if there is nothing
+        to correct.
     """
     if given is None and said is None:
         raise InputError(

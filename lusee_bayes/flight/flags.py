@@ -1,20 +1,20 @@
-"""What is no sky: channels off a smooth spectrum, combs, and spectra off a smooth curve in time.
+"""Flags: channels off a smooth spectrum, combs, and spectra off a smooth curve in time.
 
-Points off a curve are found one after the other: the worst are left out, the curve is fitted again,
-and so on until none is further out than noise allows; points that then lie on the curve come back.
-A point stands out if any of the autos does.
+Points off a curve are found iteratively: the worst are removed and the curve is fitted again, until
+none deviates by more than noise allows. Points that then lie on the curve are restored. A point is
+flagged if it stands out in any of the autos.
 
 **Lines.** The calibrator sends a comb at 50 kHz + n 100 kHz, in channels 2, 6, 10, ... counted from
 0 (coreloop's ``lusee_commands.h`` has the notch index 2 by default, for 50 + 100 n kHz), and the
-notch filter subtracts the mean of the same channels. Layout 3 does not say when either is on. So
-every spectrum is asked: the difference of these channels from their neighbours, over the whole
-band, finds a comb of a small part of the noise in a channel, and a notch as well, which makes it
-negative. Where four channels are averaged nothing looks like a line, and only time tells.
+notch filter subtracts the mean of the same channels. Layout 3 does not record when either is on. So
+every spectrum is tested: the difference of these channels from their neighbours, over the whole
+band, detects a comb far below the noise of a channel, and also a notch, which makes it negative.
+Where four channels are averaged nothing looks like a line, and only tests in time remain.
 
-**Bursts** of Jupiter and the Sun, and interference. Within a few hours the sky's visibilities
-change smoothly. A polynomial in time is fitted to the autos of a band; spectra off it, or stretches
-of them that are off together, are flagged. Noise is that of the radiometer, or what the data show
-where that is more.
+**Bursts** of Jupiter and the Sun, and interference. The sky's visibilities change smoothly within a
+few hours. A polynomial in time is fitted to the autos of a band; spectra off it, or stretches that
+are off together, are flagged. The noise is the radiometer's, or the scatter of the data if that is
+larger.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from lusee_bayes.core.reading import read_table
 from lusee_bayes.flight.bands import Basis, ChannelBand, Points, PointValues, inverse_normals
 from lusee_bayes.flight.session import CHANNEL_MHZ, Averaging, Middles
 
-# of spectra in bands: of rows, autos and points of a curve; in time: of one span, rows as points
+# of spectra in bands: rows, autos and points of a curve; in time: one span, with rows as points
 Autos = Float[np.ndarray, "rows autos points"]
 BinFlags = Bool[np.ndarray, " bins"]
 Bins = Bool[np.ndarray, "rows bins"]
@@ -44,7 +44,7 @@ Terms = Float[np.ndarray, "span terms"]
 Sums = Float[np.ndarray, "ports ends"]
 Ends = Float[np.ndarray, " ends"]
 
-# of the points beyond the threshold, those within this share of the worst go in one round
+# of the points beyond the threshold, one round removes those within this share of the worst
 WORST = 0.5
 MAX_ROUNDS = 60
 # standard deviation of a Gaussian over the median of its absolute values
@@ -52,14 +52,14 @@ MAD = 1.4826
 
 
 def threshold(false_alarm: float, n_tests: int) -> float:
-    """Return how many standard deviations out a point may be.
+    """Return the threshold for outliers, in standard deviations.
 
     Parameters
     ----------
     false_alarm : float
-        Chance that a point of pure noise is further out in any of its tests.
+        Probability that a point of pure noise exceeds it in any of its tests.
     n_tests : int
-        Tests that a point has to pass, on both sides.
+        Number of two-sided tests of a point.
     """
     return float(-special.ndtri(false_alarm / (2.0 * n_tests)))
 
@@ -67,7 +67,7 @@ def threshold(false_alarm: float, n_tests: int) -> float:
 def outliers(
     values: Autos, noise: Autos, good: Points, basis: Basis, limit: float
 ) -> tuple[Points, Autos]:
-    """Find points off a curve, in every row on its own.
+    """Find points off a curve, in every row independently.
 
     Parameters
     ----------
@@ -75,16 +75,16 @@ def outliers(
     noise : (rows, autos, points) array
         Standard deviations.
     good : (rows, points) array of bool
-        Points to be looked at.
+        Points to test.
     basis : (points, terms) array
-        What the curve is made of.
+        Terms of the curve.
     limit : float
         :func:`threshold`.
 
     Returns
     -------
     (rows, points) array of bool
-        Those that stand out.
+        Points that stand out.
     (rows, autos, points) array
         Distances from the curve through the others in standard deviations, 0 where not good.
     """
@@ -94,7 +94,7 @@ def outliers(
         z[active] = distances(values[active], noise[active], good[active], kept[active], basis)
         among = np.where(kept[active], np.abs(z[active]).max(axis=1), 0.0)
         out = (among > limit) & (among >= WORST * among.max(axis=1, keepdims=True))
-        # a curve needs more points than it has terms
+        # a curve needs more points than terms
         out &= (kept[active] & ~out).sum(axis=1, keepdims=True) > basis.shape[1]
         if not out.any():
             break
@@ -105,19 +105,19 @@ def outliers(
 
 
 def distances(values: Autos, noise: Autos, good: Points, kept: Points, basis: Basis) -> Autos:
-    """Return how far points are from the curve through some of them.
+    """Return the distances of points from the curve through some of them.
 
     Parameters
     ----------
     values, noise, good, basis
         As :func:`outliers`.
     kept : (rows, points) array of bool
-        Those that the curve goes through.
+        Points that the curve is fitted to.
 
     Returns
     -------
     (rows, autos, points) array
-        In standard deviations, the curve's own uncertainty included; 0 where not good.
+        In standard deviations, including the curve's own uncertainty; 0 where not good.
     """
     curve, leverage = fitted_curves(values, kept, basis)
     factor = np.where(kept, 1.0 - leverage, 1.0 + leverage)
@@ -126,7 +126,7 @@ def distances(values: Autos, noise: Autos, good: Points, kept: Points, basis: Ba
 
 
 def fitted_curves(values: Autos, kept: Points, basis: Basis) -> tuple[Autos, PointValues]:
-    """Return the curve through some points, and its variance in units of that of a point.
+    """Return the curve through some points, and its variance in units of a point's variance.
 
     Parameters
     ----------
@@ -140,19 +140,19 @@ def fitted_curves(values: Autos, kept: Points, basis: Basis) -> tuple[Autos, Poi
 
 
 def robust_scale(z: PointValues, good: Points) -> float:
-    """Return the standard deviation of distances by their median; NaN if there are none."""
+    """Return the standard deviation of distances, by their median; NaN if there are none."""
     return float(MAD * np.median(np.abs(z[good]))) if good.any() else np.nan
 
 
-# of the calibrator: every fourth channel, from this one on
+# the calibrator's comb: every fourth channel, from this one on
 COMB_FIRST, COMB_SPACING = 2, 4
-# where the spectrum is smooth enough for neighbours to tell a channel
+# range in which the spectrum is smooth enough to predict a channel from its neighbours
 COMB_MHZ = (5.0, 45.0)
-# neighbours by which a channel is predicted to third order, none of which is of the comb
+# neighbours that predict a channel to third order, none of them in the comb
 AROUND = ((-3, -1.0 / 16.0), (-1, 9.0 / 16.0), (1, 9.0 / 16.0), (3, -1.0 / 16.0))
-# standard deviations of a whole spectrum: no chance, since neighbours never tell it exactly
+# in standard deviations of a whole spectrum: high, since the prediction is never exact
 COMB_LIMIT = 8.0
-# a line is in its channel and those beside it; half-way between two, in four
+# a line affects its channel and those beside it; half-way between two, it affects four
 BESIDE_MHZ = 1.5 * CHANNEL_MHZ + 1e-9
 TABLE = Layout(
     "known lines",
@@ -169,7 +169,7 @@ def read_lines(path: str | Path) -> tuple[float, ...]:
     Returns
     -------
     tuple of float
-        The frequencies, in MHz, of lines that are there all of the time.
+        The frequencies, in MHz, of lines that are always present.
 
     Raises
     ------
@@ -181,13 +181,13 @@ def read_lines(path: str | Path) -> tuple[float, ...]:
 
 
 def line_bins(lines_mhz: tuple[float, ...], averaging: Averaging, middles_mhz: Middles) -> BinFlags:
-    """Return the bins that hold a known line, or a channel beside one."""
+    """Return the bins that contain a known line, or a channel beside one."""
     near = np.abs(middles_mhz[:, None] - np.array(lines_mhz)) <= BESIDE_MHZ
     return near.any(axis=1)[averaging.channels()].any(axis=1)
 
 
 def comb_bins(averaging: Averaging) -> BinFlags:
-    """Return the bins that hold a channel of the comb."""
+    """Return the bins that contain a channel of the comb."""
     return (averaging.channels() % COMB_SPACING == COMB_FIRST).any(axis=1)
 
 
@@ -205,7 +205,7 @@ def comb_strength(autos: Spectra, frames: Rows, averaging: Averaging, middles_mh
     Returns
     -------
     (rows,) array
-        Of the port where it is most; 0 where every bin holds a channel of the comb.
+        For the port with the largest difference; 0 if every bin contains a channel of the comb.
     """
     comb = comb_bins(averaging)
     if comb.all():
@@ -218,7 +218,7 @@ def comb_strength(autos: Spectra, frames: Rows, averaging: Averaging, middles_mh
     with np.errstate(divide="ignore", invalid="ignore"):
         z = (autos[..., at] - around) / noise
     finite = np.isfinite(z)
-    # a strong line of its own is no comb
+    # a single strong line is no comb
     clipped = np.clip(np.where(finite, z, 0.0), -COMB_LIMIT, COMB_LIMIT)
     strength = clipped.sum(axis=2) / np.sqrt(np.maximum(finite.sum(axis=2), 1))
     most = np.abs(strength).argmax(axis=1)
@@ -228,16 +228,16 @@ def comb_strength(autos: Spectra, frames: Rows, averaging: Averaging, middles_mh
 def line_flags(
     band: ChannelBand, autos: Spectra, frames: Rows, good: Bins, limit: float
 ) -> tuple[Bins, Spectra]:
-    """Find bins of a band that do not lie on a smooth spectrum, in each spectrum on its own.
+    """Find bins of a band off a smooth spectrum, in each spectrum independently.
 
     Parameters
     ----------
     band : ChannelBand
     autos : (rows, ports, bins) array
-        Of the band, in V^2/Hz.
+        Autos in the band, in V^2/Hz.
     frames : (rows,) array
     good : (rows, bins) array of bool
-        Bins to be looked at.
+        Bins to test.
     limit : float
         :func:`.threshold`.
 
@@ -247,7 +247,7 @@ def line_flags(
     (rows, ports, bins) array
         Distances from the spectrum, in standard deviations.
     """
-    # the level of the spectrum, which a strong line must not raise; ports that are absent are zero
+    # level of the spectrum: a median, which a strong line does not raise; absent ports are zero
     usable = np.where((good | ~good.any(axis=1)[:, None])[:, None], autos, np.nan)
     level = np.nanmedian(usable, axis=2)
     root = np.sqrt(np.diagonal(band.shared))
@@ -255,12 +255,12 @@ def line_flags(
     return outliers(autos, np.where(noise > 0.0, noise, 1.0), good, band.finer, limit)
 
 
-# a polynomial of this degree takes up what the sky does within four hours, to less than the noise
-# of a spectrum: 2e-5 of what ell = 47 has
+# a polynomial of this degree follows the sky over four hours, to less than the noise of a spectrum:
+# 2e-5 of the signal at ell = 47
 DEGREE, SPAN_S = 5, 14400.0
-# with fewer spectra within a span, there is no telling
+# with fewer spectra in a span, no test is possible
 LEAST = 16
-# lengths of stretches that are tested, in spectra
+# lengths of the tested stretches, in spectra
 LENGTHS = (1, 2, 4, 8, 16)
 
 
@@ -274,19 +274,19 @@ def burst_flags(
     seconds : (rows,) array
         Times.
     autos : (rows, ports) array
-        Of a band.
+        Autos of a band.
     noise : (rows, ports) array
         Their standard deviations; infinite for autos that are absent.
     good : (rows,) array of bool
-        Spectra to be looked at.
+        Spectra to test.
     false_alarm : float
-        Chance that one of pure noise is flagged, shared by all tests.
+        Probability that a spectrum of pure noise is flagged, over all tests.
 
     Returns
     -------
     (rows,) array of bool
     (spans,) array
-        Scatter over the noise expected, of every span of four hours; NaN where there are not enough
+        Scatter over the expected noise, for every span of four hours; NaN if there are too few
         spectra.
     """
     flagged, scatter = np.zeros(len(seconds), dtype=bool), []
@@ -301,7 +301,7 @@ def burst_flags(
 
 
 def _filled(seconds: Rows, autos: Levels, known: Bool[np.ndarray, "rows ports"]) -> Levels:
-    """Autos with what lies between their neighbours in place of others, so as to bend no curve."""
+    """Autos with unknown ones interpolated from their neighbours, so as not to bend the curve."""
     filled = autos.copy()
     for port, at in enumerate(known.T):
         if at.any():
@@ -324,12 +324,12 @@ def _one_span(
     x = np.polynomial.chebyshev.chebvander(t, DEGREE)
     values = np.where(good[:, None], autos, 0.0).T[None]
     sigma = np.where(good[:, None], noise, 1.0).T[None]
-    # noise from spectrum to spectrum, which a burst changes at its ends alone
+    # noise from spectrum to spectrum, which a burst changes only at its ends
     both = (good[1:] & good[:-1])[None]
     steps = np.diff(values[0] / sigma[0], axis=1) / np.sqrt(2.0)
     scale = np.array([robust_scale(port[None], both) for port in steps])
     kept = _without_the_highest(values, sigma * np.maximum(scale, 1.0)[:, None], good, x, limit)
-    # and about the curve
+    # scatter about the curve
     z = distances(values, sigma, good[None], kept[None], x)
     scatter = np.array([robust_scale(z[:, p], kept[None]) for p in range(autos.shape[1])])
     scale = np.maximum(scale, scatter)
@@ -342,14 +342,14 @@ def _one_span(
             break
         kept &= ~off
     kept = _with_what_fits(values, sigma, good, kept, x, limit)
-    # what lies between spectra that are flagged, each of them far off
+    # stretches that include flagged spectra: also flag those in between
     z = distances(values, sigma, good[None], kept[None], x)[0]
     kept &= ~_flagged_stretches(z, kept | (good & _curve_is_known(values, kept, x)), limit)
     return good & ~kept, float(np.median(scale))
 
 
 def _without_the_highest(values: OneRow, sigma: OneRow, good: Span, x: Terms, limit: float) -> Span:
-    """Good spectra but those above the curve, which bursts pull up when they are long."""
+    """Good spectra except those above the curve, which long bursts pull up."""
     kept = good.copy()
     for _ in range(MAX_ROUNDS):
         z = distances(values, sigma, good[None], kept[None], x)[0].max(axis=0)
@@ -364,9 +364,9 @@ def _without_the_highest(values: OneRow, sigma: OneRow, good: Span, x: Terms, li
 def _with_what_fits(
     values: OneRow, sigma: OneRow, good: Span, kept: Span, x: Terms, limit: float
 ) -> Span:
-    """Spectra that are kept, and others on the curve through them, alone and in stretches.
+    """Kept spectra, and others on the curve through them, singly and in stretches.
 
-    Where the curve is not known well, as at the ends of a span, they come back one after the other.
+    Where the curve is poorly determined, as at the ends of a span, they return one after the other.
     """
     for _ in range(MAX_ROUNDS):
         curve, _ = fitted_curves(values, kept[None], x)
@@ -381,13 +381,13 @@ def _with_what_fits(
 
 
 def _curve_is_known(values: OneRow, kept: Span, x: Terms) -> Span:
-    """Where the error of the curve, which a stretch has in common, is below its sum's noise."""
+    """Where the curve's error, common to a stretch, is below the noise of the stretch's sum."""
     _, leverage = fitted_curves(values, kept[None], x)
     return leverage[0] <= 1.0 / LENGTHS[-1]
 
 
 def _about_stretches(z: Distances, kept: Span, limit: float) -> Span:
-    """All stretches whose sum is beyond the limit, and so more than is off."""
+    """All stretches whose sum exceeds the limit, which cover more spectra than are off."""
     sums, counts = _sums(z, kept)
     beyond = np.zeros(len(kept), dtype=bool)
     for length in LENGTHS[1:]:
@@ -398,7 +398,7 @@ def _about_stretches(z: Distances, kept: Span, limit: float) -> Span:
 
 
 def _flagged_stretches(z: Distances, good: Span, limit: float) -> Span:
-    """Those in stretches whose sum is beyond the limit, the furthest first, and no more."""
+    """Only the spectra in stretches whose sum exceeds the limit, the furthest first."""
     left = good.copy()
     lengths = [length for length in LENGTHS[1:] if length <= len(good) // 2]
     while lengths:
@@ -415,22 +415,22 @@ def _flagged_stretches(z: Distances, good: Span, limit: float) -> Span:
 
 
 def _sums(z: Distances, good: Span) -> tuple[Sums, Ends]:
-    """Of all before each spectrum, and their number."""
+    """Sum of the distances before each spectrum, and their number."""
     sums = np.cumsum(np.pad(np.where(good, z, 0.0), ((0, 0), (1, 0))), axis=1)
     return sums, np.cumsum(np.pad(good, (1, 0)).astype(float))
 
 
 def _sizes_of(sums: Sums, counts: Ends, length: int) -> Float[np.ndarray, "ports starts"]:
-    """By how much stretches of a length stand out; 0 where half of them are missing."""
+    """Significance of every stretch of a length; 0 where half of it is missing."""
     n = counts[length:] - counts[:-length]
     return _sizes(sums[:, length:] - sums[:, :-length], np.where(n > length / 2, n, np.inf))
 
 
 def _part(sums: Ends, counts: Ends, limit: float) -> tuple[int, int]:
-    """First and last end of the part of a stretch that stands out most.
+    """First and last end of the most significant part of a stretch.
 
-    Not of two parts with a gap between them that fits, if they lower chi^2 by more than the limit
-    squared where each has a mean of its own: then the one of them that stands out more.
+    Two parts with a good gap between them, each with its own mean, may lower chi^2 further by more
+    than the limit squared. Then the more significant of the two is returned.
     """
     drop = np.triu(_sizes(sums - sums[:, None], counts - counts[:, None]) ** 2)
     first, last = (int(k) for k in np.unravel_index(drop.argmax(), drop.shape))

@@ -1,14 +1,14 @@
 """Gains of the spectrometer: counts for a spectral density, by level, port and frequency.
 
-As in luseepy's ``GainModel``: for each level (L, M, H) and port a mean gain and two components at
-some frequencies, with strengths that are predicted by the telemetry, ::
+As in luseepy's ``GainModel``, each level (L, M, H) of each port has a mean gain and two components,
+given at some frequencies. The telemetry predicts the components' strengths, ::
 
     G(f) = mean(f) + q_1 v_1(f) + q_2 v_2(f),    q_r = sum_k c_rk phi_k,
     phi = 1, F, A, V, D, I, F^2, A^2, F A,
 
 F the temperature of the FPGA, A that of the port's ADC (0 for ports 0 and 1, 1 for 2 and 3), V and
-I voltage and current of its 1.8 V, D the 1.2 V. Between the frequencies all three go by cubic
-splines; beyond them there is no gain. An auto in nV^2/Hz is counts / G, a cross is
+I voltage and current of its 1.8 V, D the 1.2 V. All three curves are cubic splines between the
+frequencies; beyond them no gain is defined. An auto in nV^2/Hz is counts / G, a cross is
 counts / sqrt(G_a G_b).
 """
 
@@ -31,14 +31,14 @@ from lusee_bayes.core.reading import read_table, reading, require_file
 from lusee_bayes.core.trees import from_tree, opened_tree, quantity, write_tree
 from lusee_bayes.flight.session import LETTERS, PORTS, TELEMETRY, PortLevels, Telemetry
 
-# levels of ports by their names, as M0, and where arrays have them
+# levels of ports by their names, such as M0, and their indices in arrays
 PLACES = {f"{x}{port}": (k, port) for k, x in enumerate(LETTERS) for port in range(PORTS)}
 LEAD, N_COMPONENTS, N_TERMS = (len(LETTERS), PORTS), 2, 9
 Errors = dict[str, float]
 Strengths = Float[np.ndarray, "rows components"]
 # one nV^2/Hz
 NANO2 = 1e-18
-# of gains: counts for one nV^2/Hz
+# unit of gains: counts for one nV^2/Hz
 COUNTS = "count Hz nV-2"
 
 
@@ -49,9 +49,9 @@ class GainModel(Described):
     Attributes
     ----------
     path : str
-        Where it comes from, for messages.
+        Origin of the table, for messages.
     anchor_mhz : (levels, ports, anchors) array
-        Frequencies, growing.
+        Frequencies, increasing.
     mean : (levels, ports, anchors) array
         Counts for 1 nV^2/Hz.
     components : (levels, ports, components, anchors) array
@@ -59,7 +59,7 @@ class GainModel(Described):
     coefficient : (levels, ports, components, terms) array
         c_rk, in the order of phi.
     component_std : (levels, ports, components) array or None
-        By how much the strengths q_r may be off; None if it is not known.
+        Standard deviations of the strengths q_r; None if they are unknown.
     kind : str
         How it was read, for reports.
     """
@@ -120,12 +120,12 @@ class GainModel(Described):
         return spline(frequencies_mhz).T
 
     def with_component_std(self, std: tuple[float, ...] | None) -> GainModel:
-        """Return the same with errors of the components of each level of each port, if any.
+        """Return the table with errors of the components of each level of each port, if given.
 
         Raises
         ------
         InputError
-            If the table has some itself.
+            If the table already has errors.
         """
         if std is None:
             return self
@@ -149,7 +149,7 @@ class GainModel(Described):
         Raises
         ------
         InputError
-            If something of it is missing.
+            If part of it is missing.
         """
         if lacking := [name for name in TELEMETRY if name not in telemetry]:
             raise InputError(
@@ -161,7 +161,7 @@ class GainModel(Described):
         return np.stack(phi, axis=1) @ self.coefficient[LETTERS.index(level), port].T
 
 
-# first and last frequency of curves, and how many
+# first and last frequency of curves, and number of points
 CURVE_MHZ = (0.5, 51.0, 203)
 
 
@@ -173,9 +173,9 @@ class Curves:
     ----------
     frequencies_mhz : (curve,) array
     gain : (levels, ports, curve) array
-        Counts for 1 nV^2/Hz; NaN for levels that no spectrum has.
+        Counts for 1 nV^2/Hz; NaN for levels that no spectrum uses.
     std : (levels, ports, curve) array
-        By how much they may be off; 0 where that is not known.
+        Standard deviation of the gains; 0 where it is unknown.
     """
 
     frequencies_mhz: Float[np.ndarray, " curve"] = quantity("MHz", checks={"grows": True})
@@ -186,13 +186,13 @@ class Curves:
 def gain_curves(
     table: GainModel, gain_std: float | None, levels: PortLevels, telemetry: Telemetry
 ) -> Curves:
-    """Return the gains of every level of every port that some spectrum has.
+    """Return the gains of every level of every port that occurs in the spectra.
 
     Parameters
     ----------
     table : GainModel
     gain_std : float or None
-        By how much the gains of a level of a port may be off, relative.
+        Relative standard deviation of the gains of a level of a port.
     levels : (rows, ports) array of str
     telemetry : mapping of str to (rows,) array
     """
@@ -215,7 +215,7 @@ def gain_curves(
 def draw_gains(
     table: GainModel, gain_std: float | None, generator: np.random.Generator
 ) -> tuple[GainModel, Errors]:
-    """Draw gains of which a table is the mean.
+    """Draw gains whose mean is a table.
 
     With independent standard normal z for each level of each port,
     G = (1 + gain_std z_0) (mean + q_1 v_1 + q_2 v_2) + sum_r component_std_r z_r v_r.
@@ -223,7 +223,7 @@ def draw_gains(
     Parameters
     ----------
     table : GainModel
-        With its ``component_std``, or None where its components are exact.
+        With its ``component_std``, or None if its components are exact.
     gain_std : float or None
         Relative to the gain; None if it is exact.
     generator : numpy.random.Generator
@@ -231,14 +231,14 @@ def draw_gains(
     Returns
     -------
     table : GainModel
-        The gains that are drawn, for the same telemetry.
+        The sampled gains, for the same telemetry.
     errors : dict
-        z by the names that averages of spectra have for them, as M0 and M0 PC1.
+        z, by their names in averages of spectra, such as M0 and M0 PC1.
 
     Raises
     ------
     InputError
-        If a gain is drawn below zero.
+        If a sampled gain is negative.
     """
     mean, coefficient = table.mean.copy(), table.coefficient.copy()
     errors: Errors = {}
@@ -276,12 +276,12 @@ def read_gain_table(path: str | Path, model: str = "quadratic") -> GainModel:
         A folder with ``{L,M,H}{0..3}_{mean,eigvecs,freqs}.npy`` and ``alpha_refit.csv`` of luseepy,
         or a file of :func:`write_gain_table`.
     model : {"quadratic", "linear"}
-        Which of luseepy's coefficients.
+        Set of luseepy's coefficients.
 
     Raises
     ------
     InputError
-        If something is missing or not as it should be.
+        If something is missing or invalid.
     """
     path = user_path(path)
     if path.is_dir():
@@ -292,7 +292,7 @@ def read_gain_table(path: str | Path, model: str = "quadratic") -> GainModel:
 
 
 def write_gain_table(path: str | Path, table: GainModel) -> Path:
-    """Write a gain table as netCDF, whole or not at all."""
+    """Write a gain table as netCDF, complete or not at all."""
     return write_tree(path, table, formats.GAINS)
 
 
@@ -353,7 +353,7 @@ def _terms(port: int) -> tuple[str, ...]:
 
 MEAN = {"L": 7e-4, "M": 3e-2, "H": 1.5}
 ANCHORS_MHZ = np.array([0.1, 0.7, 1.1, 3.1, *np.linspace(7.1, 70.1, 12)])
-# what q_1 and q_2 have of each feature of the telemetry: 1, F, A, V, D, I, F^2, A^2, F A
+# coefficients of q_1 and q_2 for the telemetry: 1, F, A, V, D, I, F^2, A^2, F A
 TERMS = np.array(
     [
         [0.0, 2e-4, 1e-4, 1e-2, 1e-2, 5e-2, 1e-6, 1e-6, 0.0],
@@ -365,14 +365,14 @@ LOW_MHZ, HIGH_MHZ = 0.2, 80.0
 
 
 def synthetic_gains() -> GainModel:
-    """Return a table that is made up."""
+    """Return a made-up table."""
     f = ANCHORS_MHZ
     shape = (f / (f + LOW_MHZ)) ** 2 / (1.0 + (f / HIGH_MHZ) ** 2)
     ports = 1.0 + 0.04 * np.arange(PORTS)
     mean = np.array([MEAN[level] for level in LETTERS])[:, None, None] * ports[:, None] * shape
     slope = np.log(f / 20.0) / 5.0
     component = np.stack([mean, mean * slope], axis=2)
-    # every level and port has a law of its own
+    # the law differs between levels and ports
     factor = 1.0 + 0.1 * np.arange(len(PLACES)).reshape(*LEAD, 1, 1)
     coefficient = np.broadcast_to(TERMS, (*LEAD, N_COMPONENTS, N_TERMS)) * factor
     return GainModel("made up", np.broadcast_to(f, mean.shape).copy(), mean, component, coefficient)

@@ -1,4 +1,4 @@
-"""Layout 3 of ``lusee.ingest``, in HDF5 and in FITS: the same under other names."""
+"""Layout 3 of ``lusee.ingest``, in HDF5 and in FITS: the same with other names."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lusee_bayes.flight.session import META, ROWS, SAID, TELEMETRY, Opener, Sess
 from lusee_bayes.instrument.times import scale_of
 
 INTERPOLATED = "spectra_interpolated_telemetry"
-# what luseepy makes of the scale of a mission clock that nobody has established
+# luseepy's word for the scale of a mission clock that nobody has established
 UNKNOWN = "unknown"
 CLOCK_WORDS = {
     "constants.raw_time_subtract_seconds": Attribute(),
@@ -26,9 +26,9 @@ CLOCK_WORDS = {
     "constants.time_scale": Attribute("text", optional=True),
 }
 LAYOUT_3 = Layout("a session of lusee.ingest, layout 3", ROWS, SAID | CLOCK_WORDS)
-# tables of FITS, with what comes before the names of their columns in HDF5
+# tables of FITS, and the prefixes of their columns' names in HDF5
 TABLES = {"SPECTRA_TIMES": "spectra", "SPECTRA_META": META, "SPEC_INTERP": "telemetry"}
-# columns and words that have another name there
+# columns and words that have another name in FITS
 COLUMNS = {"spectra/RAW_TIME": "spectra/raw_times", "spectra/MJD_TIME": "spectra/mjd_times"}
 WORDS = {
     ("CONSTANTS", "LUN_LAT"): "constants.lun_lat_deg",
@@ -46,7 +46,7 @@ WORDS = {
 
 
 def said_in(file: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what an open file of HDF5 says, by names as in :data:`.SAID`."""
+    """Return the attributes of an open HDF5 file, by names as in :data:`.SAID`."""
     return {
         f"{name}.{key}": value
         for name in ("constants", "session_invariants", "spectra/data")
@@ -56,7 +56,7 @@ def said_in(file: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def no_spectra(path: Path, lacking: str, names: Iterable[str]) -> InputError:
-    """Return the error of a file without spectra, with what is there."""
+    """Return the error for a file without spectra, with a list of its contents."""
     return InputError(
         f"{path} has no {lacking}: the session contains no spectra (it has "
         f"{', '.join(names) or 'nothing'})"
@@ -64,7 +64,7 @@ def no_spectra(path: Path, lacking: str, names: Iterable[str]) -> InputError:
 
 
 def session_of_hdf5(path: Path, file: h5py.File, opener: Opener) -> Session:
-    """Make a session of an open file.
+    """Create a session from an open HDF5 file.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def session_of_hdf5(path: Path, file: h5py.File, opener: Opener) -> Session:
     Raises
     ------
     InputError
-        If something is missing or not as it should be.
+        If something is missing or invalid.
     """
     if "spectra" not in file or "data" not in file["spectra"]:
         raise no_spectra(path, "spectra/data", file)
@@ -97,7 +97,7 @@ def session_of_hdf5(path: Path, file: h5py.File, opener: Opener) -> Session:
 
 
 def session_of_fits(path: Path, hdus: fits.HDUList, opener: Opener) -> Session:
-    """Make a session of an open file, as :func:`session_of_hdf5`."""
+    """Create a session from an open FITS file, as :func:`session_of_hdf5`."""
     names = [hdu.name for hdu in hdus]
     if "SPECTRA" not in names:
         raise no_spectra(path, "image SPECTRA", names[1:])
@@ -125,7 +125,7 @@ def _checked_session(
 def _clock_by_epoch(path: Path, content: Content) -> Clock | None:
     scale = content.values.get("constants.time_scale", UNKNOWN).lower()
     mjd = content.values["constants.mjd_epoch_offset_days"]
-    # luseepy writes zero where the epoch is not known
+    # luseepy writes zero if the epoch is unknown
     if mjd == 0.0:
         return None
     raw_s = content.values["constants.raw_time_subtract_seconds"]

@@ -1,8 +1,8 @@
 """Layout 4 of ``lusee.ingest`` in HDF5.
 
 It has row-aligned metadata as a union of fields (``metadata/fields/NAME/variant_000/data``), raw
-telemetry on its own clock, and a clock reference in place of an MJD offset; all is brought to the
-names of layout 3.
+telemetry with a separate clock, and a clock reference in place of an MJD offset. All is converted
+to the names of layout 3.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from lusee_bayes.flight.session import META, ROWS, SAID, TELEMETRY, Opener, Sess
 from lusee_bayes.instrument.times import scale_of, unannounced_leap_seconds
 
 LAYOUT_4 = Layout("a session of lusee.ingest, layout 4", ROWS, SAID)
-# names of layout 4 for those of layout 3
+# names in layout 4 of those in layout 3
 NAMES = [name.removeprefix(f"{META}/") for name in ROWS if name.startswith(META)]
 FIELDS = {name: name.lower() for name in (*NAMES, "actual_gain")}
-# groups of data that are no spectra of all channels, and what they are called
+# groups of data other than spectra of all channels, and their names in messages
 UNUSED = {
     "tr_spectra": "time-resolved spectra",
     "calibrator/zoom_spectra": "zoom spectra",
@@ -37,25 +37,25 @@ UNUSED = {
     "waveform": "waveforms",
     "housekeeping": "housekeeping",
 }
-# ticks of the clock of the telemetry in a second
+# ticks of the telemetry's clock in a second
 TICKS = 65536
 
 
 def session_of_4(path: Path, file: h5py.File, opener: Opener) -> Session:
-    """Make a session of a file of layout 4.
+    """Create a session from a file of layout 4.
 
     Parameters
     ----------
     path : Path
     file : h5py.File
-        Open.
+        The open file.
     opener : callable
         Opens the spectra.
 
     Raises
     ------
     InputError
-        If something is missing or not as it should be.
+        If something is missing or invalid.
     """
     if (cube := _dataset(file, "spectra/data")) is None:
         raise no_spectra(path, "spectra/data", file)
@@ -119,7 +119,7 @@ def _metadata(path: Path, file: h5py.File, n: int) -> dict[str, Unread]:
 
 
 def _values(numbers: Unread) -> str:
-    """Which values an array has."""
+    """The distinct values of an array, as text."""
     return ", ".join(map(str, np.unique(np.asarray(numbers)).tolist()))
 
 
@@ -136,7 +136,7 @@ def _clock_by_reference(path: Path, file: h5py.File) -> Clock | None:
 
 
 def _anchors(file: h5py.File) -> dict[str, float]:
-    """What each clock showed at the reference."""
+    """Reading of each clock at the reference."""
     names = _dataset(file, "clock_reference/clock_sources")
     raw_s = _dataset(file, "clock_reference/clock_reference_raw_seconds")
     if names is None or raw_s is None:
@@ -146,7 +146,7 @@ def _anchors(file: h5py.File) -> dict[str, float]:
 
 
 def _telemetry_at_rows(path: Path, file: h5py.File, clock: Clock, raw_s: Rows) -> dict[str, Unread]:
-    """Telemetry at the times of the spectra, where both clocks have a reference."""
+    """Telemetry at the times of the spectra, if both clocks have a reference."""
     if (anchor := _anchors(file).get("dcb")) is None or "telemetry" not in file:
         return {}
     parts = ("field_names", "mission_seconds", "lusee_subsecs", "values")
@@ -180,7 +180,7 @@ def _interpolated_to(where: str, raw_s: Rows, times_s: Times, values: Times) -> 
     times_s, values = times_s[order], values[order]
     good = np.isfinite(values)
     times_s, values = times_s[good], values[good]
-    # a spectrum is longer than the telemetry's step, so that its ends may lack half a step
+    # a spectrum is longer than the telemetry's step, so its ends may lack half a step
     slack = 2.0 * float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
     if not len(times_s) or raw_s[0] < times_s[0] - slack or raw_s[-1] > times_s[-1] + slack:
         raise InputError(

@@ -1,6 +1,6 @@
-"""How sessions are reduced or simulated, and all their spectra in the order of their times.
+"""How sessions are reduced or simulated, and all their spectra in order of time.
 
-The section ``flight`` of a scenario is here; a recipe is what it stands for, with its files read.
+The section ``flight`` of a scenario is defined here; a recipe is this section with its files read.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class FlightSimulatedSection(Section):
     tone_factor: Positive = 30.0
     comb_share: Share = 0.0
     comb_factor: Positive = 3.0
-    # a month with a burst every 4 s takes 10 s to draw
+    # sampling a month with a burst every 4 s takes 10 s
     burst_every_h: Annotated[float, Field(ge=1e-3, le=LARGEST)] | None = None
     burst_s: Positive = 600.0
     burst_factor: Positive = 30.0
@@ -180,7 +180,7 @@ class FlightSection(Section):
 
     @property
     def sign(self) -> int:
-        """Turns the imaginary parts of the spectrometer into those of <s_i conj(s_j)>."""
+        """Sign that converts the spectrometer's imaginary parts to those of <s_i conj(s_j)>."""
         return int(CONVENTIONS[self.convention])
 
 
@@ -194,15 +194,15 @@ class Recipe:
         With a ``bin_origin``.
     table : GainModel
     timestamp : {"start", "middle", "end", "instant"}
-        What the times of spectra are.
+        Meaning of the times of spectra.
     frequencies_mhz : tuple of float
         Middles of the bands.
     average_s : float or None
-        Length of averages in time; None for spectra as they are.
+        Length of averages in time; None for no averaging.
     lines_mhz : tuple of float
         Frequencies of known lines.
     clock : Clock or None
-        From outside.
+        Clock from outside the sessions.
     site : (float, float) or None
         Longitude and latitude in degrees, in place of those of the files.
     """
@@ -217,7 +217,7 @@ class Recipe:
     site: tuple[float, float] | None = None
 
     def words(self) -> dict[str, str]:
-        """Return how sessions are reduced, a line for each choice."""
+        """Return a description of the reduction, a line for each choice."""
         section = self.section
         bin_part = {"centre": "centre", "edge": "lower edge"}[section.bin_origin]
         times = "instants" if self.timestamp == "instant" else f"{self.timestamp} of integrations"
@@ -240,16 +240,16 @@ class Timeline:
     Attributes
     ----------
     sessions : tuple of Session
-        In the order of their times.
+        In order of time.
     observation : Observation
         A sample for each spectrum; a run for each state of the spectrometer: session, gains,
         averaging.
     session : (rows,) array of int
-        Of each spectrum.
+        Session of each spectrum.
     row : (rows,) array of int
-        Its number within the session.
+        Number of each spectrum within its session.
     bin_of : (rows,) array of int
-        The bin of time that it belongs to.
+        Time bin of each spectrum.
     """
 
     sessions: tuple[Session, ...]
@@ -260,7 +260,7 @@ class Timeline:
 
 
 def timeline(sessions: Sequence[Session], recipe: Recipe) -> Timeline:
-    """Put sessions in order, and cut their time into bins.
+    """Sort sessions by time, and assign their spectra to time bins.
 
     A bin ends where the state of the spectrometer changes.
 
@@ -272,8 +272,8 @@ def timeline(sessions: Sequence[Session], recipe: Recipe) -> Timeline:
     Raises
     ------
     InputError
-        If a clock is not known or contradicts another, sessions overlap or have different sites,
-        or instants are to be averaged.
+        If a clock is unknown or contradicts another, sessions overlap or have different sites, or
+        instants are to be averaged.
     """
     if recipe.timestamp == "instant" and recipe.average_s is not None:
         raise InputError(
@@ -298,7 +298,7 @@ def timeline(sessions: Sequence[Session], recipe: Recipe) -> Timeline:
     if recipe.timestamp != "instant":
         times = later(times, TO_MIDDLE[recipe.timestamp] * window)
         windows = Windows.whole(-window / 2.0, window / 2.0, share * window)
-    # a state has one Navgf, one length and one set of gains: as text, which the levels are
+    # a state has one Navgf, one length and one set of gains; compared as text, like the levels
     states = [np.column_stack([s.navgf, s.navg_shift, s.level]) for s in ordered]
     changes = [np.append(True, (one[1:] != one[:-1]).any(axis=1)) for one in states]
     state = np.cumsum(np.concatenate(changes)) - 1

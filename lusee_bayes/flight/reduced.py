@@ -1,4 +1,4 @@
-"""Spectra reduced to a number for each band, product and bin of time, with what was flagged."""
+"""Spectra reduced to a number for each band, product and bin of time, with their flags."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from lusee_bayes.instrument.products import DataLayout, labels
 from lusee_bayes.instrument.times import Windows, utc_of
 from lusee_bayes.instrument.visibilities import Calibration, Visibilities
 
-# bins of which something is left
+# bins that are not empty
 Left = Int[np.ndarray, " left"]
 
-# why a spectrum is not used in a band; the first is that it is
+# why a spectrum is not used in a band; the first means that it is used
 REASONS = (
     "used",
     "saturated",
@@ -42,13 +42,13 @@ REASONS = (
 )
 USED, SATURATED, NO_DATA, COMB, TOO_MANY, BURST, PRODUCT, NO_FIT = range(len(REASONS))
 
-# whose clock a session has whose own is corrected by a clock file
+# clock of a session whose own clock a clock file corrects
 CORRECTED = "session, corrected by the clock file"
 
-# beyond these, something is said: scatter over the radiometer noise, and what two more powers of
-# the frequency change, in standard deviations of a bin
+# limits for warnings: scatter over the radiometer noise, and the change by two more powers of the
+# frequency, in standard deviations of a bin
 NOISY, CURVED = 1.2, 0.5
-# likewise, the share of the spectra that is flagged
+# likewise, share of the spectra that is flagged
 MUCH = 0.2
 
 
@@ -56,8 +56,8 @@ MUCH = 0.2
 class Reduced(Described):
     """Spectra in bands, at every stage from single spectra to averages over time.
 
-    Numbers are for bands, products and bins of time. To begin with every spectrum is a bin of its
-    own; in the end a bin has all spectra of a few hours. Flags are those of spectra ("rows").
+    Numbers are for bands, products and bins of time. At first every spectrum is a separate bin; in
+    the end a bin has all spectra of a few hours. Flags are for spectra ("rows").
 
     Attributes
     ----------
@@ -66,42 +66,42 @@ class Reduced(Described):
     observation : Observation
         A sample for each spectrum; a run for each state of the spectrometer.
     bin_of : (rows,) array of int
-        The bin of time of each spectrum.
+        Time bin of each spectrum.
     average_s : float or None
         Length of the bins; None if each spectrum is one.
     reason : (bands, rows) array of uint8
-        Why a spectrum is not used, of :data:`REASONS`.
+        Why a spectrum is not used, as an index of :data:`REASONS`.
     values : (bands, products, bins) array
-        In V^2/Hz at the receivers' inputs, NaN where nothing is left.
+        In V^2/Hz at the receivers' inputs, NaN where no data remain.
     before : (bands, products, bins) array
-        The mean before anything was flagged, for figures.
+        Means before flagging, for figures.
     n_averaged : (bands, bins) array
-        Independent samples of voltages behind each value; 0 where nothing is left.
+        Independent samples of voltages behind each value; 0 where no data remain.
     level : (bins, ports) array of str
-        Of the gain.
+        Levels of the gain.
     gain : (bands, ports, bins) array
         Counts for 1 nV^2/Hz.
     slope : (bands, ports, components, bins) array
-        Change of the power gain with each component of the gain table, relative to it.
+        Relative change of the power gain with each component of the gain table.
     bend : (bands, ports, bins) array
-        What two further powers of the frequency would add to the autos, in standard deviations.
-        Of a file one number for a band, its :attr:`curvature`; so are the next two.
+        Change of the autos by two further powers of the frequency, in standard deviations. From a
+        file it is one number for a band, its :attr:`curvature`; so are the next two.
     span_scatter : (bands, spans) array
-        Scatter in time over the radiometer noise, of spans of a few hours; NaN if not known.
+        Scatter in time over the radiometer noise, for spans of a few hours; NaN if unknown.
     slab_scatter : (bands, slabs) array
-        Scatter of the channels about a smooth spectrum over the radiometer noise, of some spectra.
+        Scatter of channels about a smooth spectrum over the radiometer noise, for slabs of spectra.
     lines : (bands, rows) array
         Share of a spectrum's channels in a band that are flagged.
     component_std : (levels, ports, components) array or None
-        By how much the components may be off.
+        Standard deviations of the components.
     gain_std : float or None
-        By how much the gains of a level of a port may be off, relative.
+        Relative standard deviation of the gains of a level of a port.
     curves : Curves
-        Of the gains, for figures.
+        The gains over frequency, for figures.
     sessions : tuple of mapping
-        Where the spectra come from.
+        Origin of the spectra.
     recipe : mapping of str to str
-        How they were reduced, in words; empty where an older file does not say it.
+        How they were reduced, in words; empty if an older file lacks this.
     """
 
     frequencies_mhz: Float[np.ndarray, " bands"]
@@ -135,7 +135,7 @@ class Reduced(Described):
         level: Shaped[np.ndarray, "bins ports"],
         n_slabs: int = 0,
     ) -> Reduced:
-        """Begin with no numbers, to be filled in place.
+        """Return a reduction without numbers, to be filled in place.
 
         Parameters
         ----------
@@ -145,7 +145,7 @@ class Reduced(Described):
         bin_of : (rows,) array of int
         level : (bins, ports) array of str
         n_slabs : int
-            Spectra are looked at in so many parts.
+            Number of slabs of spectra.
         """
         bands, rows, bins = len(like["frequencies_mhz"]), len(bin_of), len(level)
         return cls(
@@ -167,22 +167,22 @@ class Reduced(Described):
 
     @cached_property
     def scatter(self) -> Float[np.ndarray, " bands"]:
-        """Scatter of the spectra in time over the radiometer noise, median; NaN if not known."""
+        """Median scatter of the spectra in time over the radiometer noise; NaN if unknown."""
         return _medians(self.span_scatter)
 
     @cached_property
     def line_scatter(self) -> Float[np.ndarray, " bands"]:
-        """Likewise of the channels about a smooth spectrum."""
+        """Median scatter of the channels about a smooth spectrum, likewise."""
         return _medians(self.slab_scatter)
 
     @cached_property
     def curvature(self) -> Float[np.ndarray, " bands"]:
-        """The mean of :attr:`bend` over bins, which noise does not have, of the worst port."""
+        """Mean of :attr:`bend` over bins, where noise averages out, for the worst port."""
         means = xarray.DataArray(self.bend, dims=("band", "port", "bin")).mean("bin")
         return np.abs(means).max("port").values
 
     def noise(self, band: int) -> Float[np.ndarray, "ports bins"]:
-        """Return the standard deviations of the autos, by the radiometer equation."""
+        """Return the standard deviations of the autos, from the radiometer equation."""
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.abs(self.values[band, AUTOS]) / np.sqrt(self.n_averaged[band])
 
@@ -201,7 +201,7 @@ class Reduced(Described):
         )
 
     def notes(self) -> tuple[str, ...]:
-        """Return what has been taken from elsewhere than the sessions, a sentence each."""
+        """Return the inputs that do not come from the sessions, a sentence each."""
         if corrected := {s["clock_file"] for s in self.sessions if s["clock"] == CORRECTED}:
             return (f"The UTC stated in the sessions is corrected by {corrected.pop()}.",)
         by_file = [s for s in self.sessions if s["clock"] == "clock file" and s.get("clock_file")]
@@ -216,16 +216,16 @@ class Reduced(Described):
         )
 
     def band(self, frequency_mhz: float) -> int:
-        """Return the number of the band at a frequency. InputError if there is none."""
+        """Return the number of the band at a frequency; InputError if there is none."""
         what = "the reduction has no band"
         return place_of(what, self.frequencies_mhz, frequency_mhz)
 
     def bins_at(self, band: int) -> Left:
-        """Return the bins of which a band has something left: the times of :meth:`at`."""
+        """Return the bins in which a band has data: the times of :meth:`at`."""
         return np.flatnonzero(np.isfinite(self.values[band]).any(axis=0))
 
     def shares(self, band: int) -> dict[str, float]:
-        """Return the share of the spectra that are used, and that are not for each reason."""
+        """Return the share of the spectra that are used, and that are rejected for each reason."""
         shares = self._counts(band) / self.reason.shape[1]
         return {name: float(shares[k]) for k, name in enumerate(REASONS) if shares[k] or not k}
 
@@ -234,14 +234,14 @@ class Reduced(Described):
         return np.bincount(rows.ravel(), minlength=len(REASONS))
 
     def flagged(self, band: int | None = None, misfit: float = 0.0) -> dict[str, float]:
-        """Return the share that each rule has flagged of the values that there were.
+        """Return the share of the existing values that each rule flagged.
 
         Parameters
         ----------
         band : int, optional
-            By default all of them.
+            By default all bands.
         misfit : float
-            Share of the values left by the other rules that does not fit the map.
+            Share of the values left by the other rules that is inconsistent with the map.
         """
         counts = self._counts(band)
         counts[[USED, NO_DATA]] = counts[USED] + counts[NO_FIT], 0
@@ -250,13 +250,13 @@ class Reduced(Described):
         return {REASONS[k]: float(shares[k]) for k in range(1, len(REASONS)) if shares[k]}
 
     def flag_line(self, band: int | None = None, misfit: float = 0.0) -> str:
-        """Say how much was flagged, as :meth:`flagged`."""
+        """Return the flagged shares in words; see :meth:`flagged`."""
         shares = self.flagged(band, misfit)
         rules = f": {_percent(shares)}" if shares else ""
         return f"flagged {sum(shares.values()):.2%} of the values{rules}"
 
     def doubts(self, band: int) -> tuple[str, ...]:
-        """Return what is doubtful about a band, a sentence each."""
+        """Return the doubts about a band, a sentence each."""
         sentences = []
         if sum(self.flagged(band).values()) > MUCH:
             sentences.append(
@@ -284,7 +284,7 @@ class Reduced(Described):
         ----------
         frequency_mhz : float
         per_kelvin : (ports,) array
-            V^2/Hz that an enclosure of 1 K makes at each port.
+            V^2/Hz at each port in an enclosure at 1 K.
 
         Returns
         -------
@@ -294,7 +294,7 @@ class Reduced(Described):
         Raises
         ------
         InputError
-            If there is no such band, or nothing is left of it.
+            If there is no such band, or it has no data.
         """
         band = self.band(frequency_mhz)
         present = np.isfinite(self.values[band])
@@ -314,7 +314,7 @@ class Reduced(Described):
         scale = np.sqrt(per_kelvin[FIRST_PORT] * per_kelvin[SECOND_PORT])
         values = np.where(present, self.values[band], 0.0)[:, bins] / scale[:, None]
         layout = DataLayout.from_flags(~present[:, bins])
-        # a run for each stretch of one turntable angle, whatever the gains were
+        # one run for each stretch at one turntable angle, whatever the gains
         angles = np.array(observation.turntable_deg)[observation.run]
         run, turntable_deg = runs_of(angles, observation.n_times)
         observation = replace(observation, run=run, turntable_deg=turntable_deg)
@@ -329,7 +329,7 @@ class Reduced(Described):
         return Visibilities(data, layout, observation, mhz, calibration=calibration)
 
     def _errors(self, band: int, bins: Left, place: str) -> Iterator[tuple[str, np.ndarray]]:
-        """What may be off about a level of a port, by one standard deviation, where it has it."""
+        """Errors of a level of a port (one standard deviation), at the times when it is used."""
         port = PLACES[place][1]
         at_level = self.level[bins, port] == place[0]
         if self.gain_std is not None:
@@ -340,7 +340,7 @@ class Reduced(Described):
                 yield f"{place} PC{number}", np.where(at_level, slope, 0.0)
 
     def without(self, band: int, gone: Bool[np.ndarray, "products bins"]) -> Reduced:
-        """Return the same without some values of a band, which do not fit the map."""
+        """Return the reduction without some values of a band, which do not fit the map."""
         values, n_averaged, reason = self.values.copy(), self.n_averaged.copy(), self.reason.copy()
         values[band][gone] = np.nan
         bins = ~np.isfinite(values[band]).any(axis=0)
@@ -358,15 +358,15 @@ def _medians(parts: Float[np.ndarray, "bands parts"]) -> Float[np.ndarray, " ban
 
 
 HINT = "make it with: lusee-bayes reduce SCENARIO SESSION..."
-# what a run calls its file of them
+# name of the file of reduced spectra in a run
 REDUCED = "reduced.nc"
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Saved:
-    """What a file holds: :class:`Reduced`, with an observation's times, windows and place.
+    """Contents of a file: :class:`Reduced`, with an observation's times, windows and place.
 
-    Numbers that are medians of parts of a band are one for a band.
+    Medians over parts of a band are one number for a band.
     """
 
     frequency: Float[np.ndarray, " frequency"] = quantity(
@@ -417,7 +417,7 @@ class _Saved:
     scenario: str = ""
 
 
-# names in files, and those of the same in Reduced
+# names in files, and the corresponding names in Reduced
 NAMES = {"frequency": "frequencies_mhz", "visibility": "values", "gain_slope": "slope"}
 NAMES |= {"line_share": "lines"}
 SAME = ("n_averaged", "level", "gain", "component_std", "gain_std", "curves", "bin_of", "reason")
@@ -425,14 +425,14 @@ NAMES |= {name: name for name in (*SAME, "bandwidth_mhz", "average_s", "sessions
 
 
 def write_reduced(path: str | Path, reduced: Reduced, scenario: str = "") -> Path:
-    """Write reduced spectra, whole or not at all.
+    """Write reduced spectra, complete or not at all.
 
     Parameters
     ----------
     path : str or Path
     reduced : Reduced
     scenario : str
-        Text of the scenario that they were reduced with.
+        Text of the scenario of the reduction.
     """
     seen, windows = reduced.observation, reduced.observation.windows
     saved = _Saved(

@@ -1,8 +1,8 @@
-"""Reduce sessions of any length: calibrate, flag and average, one piece after the other.
+"""Reduce sessions of any length: calibrate, flag and average, piece by piece.
 
-Counts are read slab by slab. All spectra of a few bins of time make a piece: calibrated and put
-into bands, each is a bin of its own, of which bursts are flagged; then they are averaged into the
-bins of the whole. No more of the spectra is ever in memory.
+Counts are read in slabs. All spectra of a few bins of time form a piece. They are calibrated and
+put into bands, each spectrum as a separate bin, and bursts are flagged; then they are averaged into
+the final bins. No more spectra than that are ever in memory.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from lusee_bayes.flight.recipe import Recipe, Timeline, timeline
 from lusee_bayes.instrument.averaging import by_the_rule
 from lusee_bayes.instrument.times import seconds_from
 
-# spectra that are worked on at once, and at least how many make a piece between two bins
+# spectra in a slab, and fewest spectra of a piece that ends between two bins
 SLAB, PIECE = 128, 1024
 # of some spectra
 Counts = Float32[np.ndarray, "rows products channels"]
@@ -49,12 +49,12 @@ def reduce_sessions(
     sessions : sequence of Session
     recipe : Recipe
     stages : Stages, optional
-        Told how far it is.
+        Receives the progress.
 
     Raises
     ------
     InputError
-        If clocks, sites or times are not known or contradict each other, a session lacks telemetry,
+        If clocks, sites or times are unknown or contradict each other, a session lacks telemetry,
         or bands have too few channels.
     """
     stages = stages or Stages()
@@ -96,7 +96,7 @@ def reduce_sessions(
 
 
 def _in_common(line: Timeline, recipe: Recipe, level: session.PortLevels) -> dict[str, Any]:
-    """What does not depend on the spectra."""
+    """Attributes that do not depend on the spectra."""
     names = line.sessions[0].telemetry
     telemetry = {n: np.concatenate([s.telemetry[n] for s in line.sessions]) for n in names}
     return {
@@ -112,7 +112,7 @@ def _in_common(line: Timeline, recipe: Recipe, level: session.PortLevels) -> dic
 
 
 def _pieces(line: Timeline) -> list[slice]:
-    """Rows of whole bins of one state, as few as ``PIECE`` allows."""
+    """Rows of whole bins of one state, as few as ``PIECE`` allows, for each piece."""
     run, bin_of = line.observation.run, line.bin_of
     ends = np.flatnonzero(np.append(np.diff(bin_of) != 0, True)) + 1
     pieces, start = [], 0
@@ -126,7 +126,7 @@ def _pieces(line: Timeline) -> list[slice]:
 def _read_ahead(
     ahead: ThreadPoolExecutor, files: ExitStack, line: Timeline, pieces: list[slice]
 ) -> Iterator[np.ndarray]:
-    """Counts of every slab of every piece; the next are read meanwhile."""
+    """Yield the counts of every slab of every piece; the next slab is read meanwhile."""
     reads: dict[int, session.Read] = {}
 
     def counts(rows: slice) -> np.ndarray:
@@ -150,14 +150,14 @@ def _read_ahead(
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What is the same for many spectra: the bands, the gains' splines, the known lines.
+    """Data that many spectra share: the bands, the gains' splines, the known lines.
 
     Attributes
     ----------
     recipe : Recipe
     navgf : int
     levels : tuple of str
-        Of the ports.
+        Levels of the ports.
     bands : tuple of ChannelBand
     basis : (ports, 3, bins) array
         Mean and components of the gains, averaged over the channels of every bin; NaN where there
@@ -198,7 +198,7 @@ class State:
         return cls(recipe, navgf, levels, bands, basis, lines)
 
     def strengths(self, telemetry: session.Telemetry, n_rows: int) -> Strengths:
-        """Return 1, q_1 and q_2 of every port; NaN where it has no level."""
+        """Return 1, q_1 and q_2 of every port; NaN if the port has no level."""
         values = np.full((n_rows, session.PORTS, 3), np.nan)
         for port, level in enumerate(self.levels):
             if level != session.NO_LEVEL:
@@ -207,15 +207,15 @@ class State:
         return values
 
     def lines(self, counts: Counts, frames: Rows, notched: RowFlags) -> flags.Bins:
-        """Return the bins with known lines, or of the comb where it is on.
+        """Return the bins with known lines, and those of the comb where it is on.
 
         Parameters
         ----------
         counts : (rows, products, channels) array
         frames : (rows,) array
-            Frames that each averages.
+            Frames in each spectrum.
         notched : (rows,) array of bool
-            Where the file says that the notch filter was on.
+            Whether the notch filter was on, according to the file.
         """
         averaging, comb = session.AVERAGING[self.navgf], notched
         if self.recipe.section.comb == "found":
@@ -229,14 +229,14 @@ class State:
 def _slab(
     line: Timeline, recipe: Recipe, state_of: StateOf, start: int, counts: np.ndarray
 ) -> Callable[[reduced.Reduced, int, int], None]:
-    """What puts the counts of some spectra, from a row on, into a band."""
+    """Return a function that puts the counts of some spectra, from a row on, into a band."""
     source, first = line.sessions[int(line.session[start])], int(line.row[start])
     rows_read = slice(first, first + len(counts))
     state = state_of(int(source.navgf[first]), tuple(map(str, source.level[first])))
     telemetry = {name: values[rows_read] for name, values in source.telemetry.items()}
     notched = np.zeros(len(counts), dtype=bool)
     if source.notch is not None:
-        # the mean of the comb's channels is subtracted, unless bit 4 says that it is not
+        # the mean of the comb's channels is subtracted, unless bit 4 negates this
         notch = source.notch[rows_read]
         notched = ((notch & 0b111) > 0) & ((notch & 0b10000) == 0)
     with naming(source.path):
@@ -259,10 +259,10 @@ def _slab(
             channels[:, session.IMAGINARY] *= -1.0
         finite = np.isfinite(channels)
         present, with_auto = finite.any(axis=2), finite[:, session.AUTOS]
-        # where a product is there, all of it has to be
+        # a bin is whole if all products that are present are finite in it
         whole = (finite | ~present[..., None]).all(axis=1) & with_auto.any(axis=(1, 2))[:, None]
         good = whole & ~lines[:, at] & ~saturated[:, None]
-        # products without an auto of their own do not tell lines
+        # absent autos are zero, and show no lines
         filled = np.where(with_auto, channels[:, session.AUTOS], 0.0)
         limit = flags.threshold(recipe.section.false_alarm, session.PORTS)
         outliers, z = flags.line_flags(band, filled, frames, good, limit)
@@ -319,7 +319,7 @@ def _finish(
     reason[good & ~used] = reduced.PRODUCT
     whole.reason[number, rows] = reason
     whole.lines[number, rows] = spectra.lines[number]
-    # each spectrum has the weight of its live time, in what is not flagged and in all of it
+    # weights are live times, both for the unflagged spectra and for all
     weights = np.where(used, live, 0.0)
     some = np.bincount(bin_of, weights, n) > 0.0
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -337,11 +337,11 @@ def _finish(
 
 
 def _flag_bursts(spectra: reduced.Reduced, false_alarm: float, number: int) -> Scatter:
-    """Flag spectra that do not fit those before and after; the scatter over the noise, by span."""
+    """Flag spectra that do not fit those before and after; return scatter over noise by span."""
     times = spectra.observation.times
     seconds = seconds_from(times[0], times)
     autos, noise = spectra.values[number, session.AUTOS].T, spectra.noise(number).T
-    # what is absent neither stands out nor tells
+    # absent autos neither stand out nor constrain the curve
     finite = np.isfinite(autos)
     autos, noise = np.where(finite, autos, 0.0), np.where(finite & (noise > 0.0), noise, np.inf)
     reason = spectra.reason[number]
@@ -353,7 +353,7 @@ def _flag_bursts(spectra: reduced.Reduced, false_alarm: float, number: int) -> S
 def _means(
     values: Float[np.ndarray, "... rows"], weights: Rows, first: Int[np.ndarray, " bins"]
 ) -> Float[np.ndarray, "... bins"]:
-    """Weighted means of the finite values of bins from these rows on; NaN where one has none."""
+    """Weighted means of the finite values of bins from these rows on; NaN if a bin has none."""
     weight = np.isfinite(values) * weights
     total = np.add.reduceat(weight, first, axis=-1)
     summed = np.add.reduceat(np.where(weight > 0.0, values, 0.0) * weights, first, axis=-1)

@@ -1,8 +1,8 @@
-"""A session of the spectrometer: what is known of every spectrum; the spectra stay in the file.
+"""A session of the spectrometer: data about every spectrum; the spectra stay in the file.
 
 Facts of the spectrometer are from the flight software (lusee-night/coreloop: ``high_prec_avg.h``,
 ``core_loop.h``) and from luseepy's ``lusee.ingest``. ADCs of 14 bits take 102.4 million samples a
-second, of which 4096 make a spectrum of 2048 channels, 25 kHz apart, every 40 microseconds.
+second, of which 4096 form a spectrum of 2048 channels, 25 kHz apart, every 40 microseconds.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from lusee_bayes.core.reading import reading
 from lusee_bayes.flight.clock import Clock
 from lusee_bayes.instrument.products import auto_indices, labels, ports
 
-# what each spectrum has, and each port of it; all channels; telemetry at the times of spectra
+# data of each spectrum, and of each port of it; all channels; telemetry at the times of spectra
 RowCounts = Int[np.ndarray, " rows"]
 PortCounts = Int[np.ndarray, "rows ports"]
 PortLevels = Shaped[np.ndarray, "rows ports"]
@@ -34,9 +34,9 @@ Telemetry = Mapping[str, Rows]
 N_CHANNELS = 2048
 CHANNEL_MHZ = 0.025
 FRAME_S = 4096 / 102.4e6
-# the ends of what an ADC of 14 bits gives
+# range of an ADC of 14 bits
 ADC_LOW, ADC_HIGH = -8192, 8191
-# gain states of the flight software (gain_state of core_loop.h) that the gain table knows
+# gain states of the flight software (gain_state of core_loop.h) that are in the gain table
 CODES = {"L": 0, "M": 1, "H": 2}
 LETTERS = tuple(CODES)
 NO_LEVEL = "-"
@@ -48,7 +48,7 @@ FLIGHT_PRODUCTS = (
     *(f"{i}{j}{part}" for i in range(PORTS) for j in range(i + 1, PORTS) for part in "RI"),
 )
 N_PRODUCTS = len(FLIGHT_PRODUCTS)
-# where the products of the package's order are in the spectrometer's, and what each of them is
+# the package's products in the spectrometer's order, and the ports and part of each of them
 OF_FLIGHT = np.array([FLIGHT_PRODUCTS.index(label) for label in labels()])
 AUTOS = auto_indices()
 FIRST_PORT, SECOND_PORT, IMAGINARY = ports()
@@ -58,14 +58,14 @@ BinOrigin = Literal["centre", "edge"]
 
 @dataclass(frozen=True)
 class Averaging:
-    """Which channels a bin of a spectrum holds, for a value of ``Navgf``.
+    """The channels in a bin of a spectrum, for a value of ``Navgf``.
 
     Attributes
     ----------
     stride : int
         Bin i begins at channel stride * i; a sum is divided by it.
     members : int
-        So many channels from there on are summed.
+        Number of channels that are summed, from there on.
     """
 
     stride: int
@@ -81,7 +81,7 @@ class Averaging:
         return self.stride * np.arange(self.n_bins)[:, None] + np.arange(self.members)
 
 
-# of Navgf = 3, which leaves out every fourth channel, the sum of three is divided by four
+# Navgf = 3 leaves out every fourth channel and divides the sum of three by four
 AVERAGING = {1: Averaging(1, 1), 2: Averaging(2, 2), 3: Averaging(4, 3), 4: Averaging(4, 4)}
 
 
@@ -96,7 +96,7 @@ def channel_mhz(origin: BinOrigin) -> Middles:
     return CHANNEL_MHZ * (np.arange(N_CHANNELS) + (0.5 if origin == "edge" else 0.0))
 
 
-# what the gain table asks of the telemetry
+# telemetry that the gain table needs
 TELEMETRY = ("THERM_FPGA", "SPE_ADC0_T", "SPE_ADC1_T", "SPE_1VAD8_V", "VMON_1V2D", "SPE_1VAD8_C")
 # counts of spectra [first:last] of all products and channels
 Read = Callable[[int, int], Float32[np.ndarray, "rows products channels"]]
@@ -105,28 +105,28 @@ Opener = Callable[[], AbstractContextManager[Read]]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Recorded:
-    """What a session that is read, and one that is written, say of their spectra.
+    """Data about the spectra of a session, read or to be written.
 
     Attributes
     ----------
     raw_s : (rows,) array
-        The mission clock, in seconds.
+        Readings of the mission clock, in seconds.
     navgf : (rows,) array of int
         Averaging over channels (:data:`.AVERAGING`).
     navg_shift : (rows,) array of int
-        Logarithm of the number of frames that a spectrum averages, to base 2.
+        Base-2 logarithm of the number of frames that a spectrum averages.
     level : (rows, ports) array of str
-        Of the gain: L, M, H, or "-" where the gain table has none.
+        Gain level: L, M, H, or "-" where the gain table has none.
     adc_low, adc_high : (rows, ports) array of int
         Extremes of the ADC.
     adc_invalid : (rows, ports) array of int
-        How many of its samples were out of range.
+        Number of its samples that were out of range.
     telemetry : mapping of str to (rows,) array
-        At the times of the spectra; some of :data:`TELEMETRY`.
+        Some of :data:`TELEMETRY`, at the times of the spectra.
     clock : Clock or None
-        None if the file does not say which UTC the clock stands for.
+        None if the file does not specify the UTC of its clock.
     lon_deg, lat_deg : float
-        Of the site, as the file has it.
+        Site according to the file.
     """
 
     raw_s: Rows
@@ -159,17 +159,17 @@ class Session(Described, Recorded):
     kind : str
         HDF5 or FITS.
     share : (rows,) array
-        The share of the frames that was not rejected; 1 where the file does not say.
+        Share of the frames that was not rejected; 1 if the file lacks it.
     errors : (rows,) array of int
-        What the flight software says of itself.
+        Errors that the flight software reports.
     notch : (rows,) array of int or None
-        Whether the average of every fourth channel is subtracted; None where the file does not say.
+        Whether the average of every fourth channel is subtracted; None if the file lacks it.
     software : str
-        Version of the flight software, as 0x307.
+        Version of the flight software, such as 0x307.
     opener : callable
         Opens the file: a context manager that gives a :data:`Read`.
     unused : mapping of str to int
-        Other families of data in the file, and how many rows they have.
+        Other families of data in the file, and their numbers of rows.
     """
 
     path: Path
@@ -196,29 +196,29 @@ class Session(Described, Recorded):
 
     @property
     def frames(self) -> Rows:
-        """How many frames each spectrum averages."""
+        """Number of frames that each spectrum averages."""
         return self.share * 2.0**self.navg_shift
 
     @property
     def window_s(self) -> Rows:
-        """From the beginning to the end of each integration, in seconds."""
+        """Time from the start to the end of each integration, in seconds."""
         return FRAME_S * 2.0**self.navg_shift
 
     @property
     def saturated(self) -> Bool[np.ndarray, " rows"]:
         """Whether an ADC was at the end of its range, or beyond."""
-        # the flight software counts from -8191 or to 8192 in some versions
+        # some versions of the flight software count from -8191 or to 8192
         ends = (self.adc_low <= ADC_LOW + 1) | (self.adc_high >= ADC_HIGH)
         return (ends | (self.adc_invalid > 0)).any(axis=1)
 
     @contextmanager
     def spectra(self) -> Iterator[Read]:
-        """Open the file, for counts to be read piece by piece.
+        """Open the file to read counts piece by piece.
 
         Raises
         ------
         InputError
-            For a file that is damaged, where it is.
+            If the file is damaged where it is read.
         """
         with reading(self.path, "a session"), self.opener() as read:
             yield read
@@ -258,10 +258,10 @@ def _counts(*more: int, low: float = -np.inf, high: float = np.inf, optional: bo
     return Variable(("row", *more), "integer", low=low, high=high, optional=optional)
 
 
-# what the layouts have in common, by the names of layout 3 in HDF5
+# fields common to all layouts, by the names of layout 3 in HDF5
 ROWS = {
     "spectra/raw_times": Variable(("row",)),
-    # NaN where the clock is not known
+    # NaN if the clock is unknown
     "spectra/mjd_times": Variable(("row",), finite=False, optional=True),
     f"{META}/Navgf": _counts(),
     **{f"{META}/Navg{k}_shift": _counts(low=0.0, high=40.0) for k in (1, 2)},
@@ -269,7 +269,7 @@ ROWS = {
     **dict.fromkeys((f"{META}/adc_min", f"{META}/adc_max"), _counts(PORTS)),
     **dict.fromkeys(ADC_INVALID, _counts(PORTS, low=0.0, optional=True)),
     f"{META}/errors": _counts(optional=True),
-    # layout 4 alone has these two
+    # only layout 4 has these two
     **dict.fromkeys((f"{META}/weight", f"{META}/notch"), _counts(low=0.0, optional=True)),
     **{f"telemetry/{name}": Variable(("row",), optional=True) for name in TELEMETRY},
 }
@@ -286,22 +286,22 @@ SAID = {
 
 
 def session_of(path: Path, parsed: Content, arrays: Mapping[str, Unread], **others: Any) -> Session:
-    """Make a session of what a file holds.
+    """Create a session from the contents of a file.
 
     Parameters
     ----------
     path : Path
     parsed : Content
-        Of :data:`ROWS` and :data:`SAID`.
+        Content with :data:`ROWS` and :data:`SAID`.
     arrays : mapping of str to array
-        All that is there, by names as in :data:`ROWS`, not yet read.
+        All arrays of the file, not yet read, by names as in :data:`ROWS`.
     **others
-        Of :class:`Session`, what these do not hold: layout, kind, clock and how it is opened.
+        Other attributes of :class:`Session`: layout, kind, clock and opener.
 
     Raises
     ------
     InputError
-        If counts or gains are not as they should be.
+        If counts or gains are invalid.
     """
     if not parsed.values["spectra/data.bitslice_restored"]:
         raise InputError(
@@ -334,14 +334,14 @@ def session_of(path: Path, parsed: Content, arrays: Mapping[str, Unread], **othe
         telemetry={x: rows[name] for x in TELEMETRY if (name := f"telemetry/{x}") in rows},
         lon_deg=parsed.values["constants.lun_long_deg"],
         lat_deg=parsed.values["constants.lun_lat_deg"],
-        # as versions of the flight software are written: 0x307 for the number 775
+        # versions of the flight software are written in hexadecimal: 0x307 for the number 775
         software=f"{int(said):#x}" if said.isascii() and said.isdigit() else said,
         **others,
     )
 
 
 def _levels(path: Path, arrays: Mapping[str, Unread], n: int) -> PortLevels:
-    """Gain levels, of the flight software's numbers or of letters."""
+    """Gain levels, from the flight software's numbers or from letters."""
     if (name := f"{META}/actual_gain") not in arrays:
         raise InputError(
             f"{path} has no {name}, the gain of every spectrum; ingest the session again with the "

@@ -1,7 +1,7 @@
 """Files of sessions: read in every layout, written in layout 3, piece by piece.
 
-What is written is what :func:`read_session` and luseepy read; of what else a session of luseepy may
-hold, such as waveforms and housekeeping packets, there is nothing.
+Written files have all entries that :func:`read_session` and luseepy read, but none of the other
+data of luseepy's sessions, such as waveforms and housekeeping packets.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ NEWEST = 4
 
 
 def read_session(path: str | Path) -> Session:
-    """Read everything of a session but its spectra, which stay in the file.
+    """Read a session except its spectra, which stay in the file.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ def read_session(path: str | Path) -> Session:
     Raises
     ------
     InputError
-        For a file that is missing, damaged, of another kind or version, and for whatever it lacks.
+        For a file that is missing, damaged, incomplete, or of another kind or version.
     """
     path = require_file(path, "a session")
     if is_fits(path):
@@ -68,7 +68,7 @@ def read_session(path: str | Path) -> Session:
 
 
 def _version_of(path: Path, version: Any) -> int:
-    """The version of a layout. InputError if it is none that this package reads."""
+    """Return the version of a layout; InputError if this package does not read it."""
     if version is None:
         raise InputError(
             f"{path} has no layout_version; expected a session of luseepy's lusee.ingest"
@@ -101,15 +101,15 @@ def _hdf5_spectra(path: Path) -> Iterator[Read]:
         yield lambda first, last: np.asarray(cube[first:last], dtype=np.float32)
 
 
-# luseepy lets h5py choose its chunks, which for a long session hold a thousand spectra of few
-# channels. Unless all chunks of these spectra are kept, each is decompressed again for every slab
+# luseepy lets h5py choose its chunks; for a long session one contains a thousand spectra of few
+# channels. Unless all chunks of these spectra are cached, each is decompressed again for every slab
 LARGEST_CACHE = 1 << 29
-# two chunks must not compete for one place, which makes for many more places than chunks
+# far more places than chunks, so that two chunks do not compete for one
 PLACES = 1_000_003
 
 
 def cache_for(chunks: tuple[int, ...] | None) -> dict[str, Any]:
-    """Return what :class:`h5py.File` has to be told, to read or write spectra piece by piece.
+    """Return options of :class:`h5py.File` for reading or writing spectra piece by piece.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def whole_spectra(path: Path, blocks: Blocks, n_rows: int) -> Iterator[tuple[int
     Raises
     ------
     InputError
-        If there are fewer rows than the session has.
+        If the blocks do not have as many rows as the session.
     """
     first = 0
     for block in blocks:
@@ -142,15 +142,15 @@ def whole_spectra(path: Path, blocks: Blocks, n_rows: int) -> Iterator[tuple[int
         raise InputError(f"{path}: counts of {first} spectra for {n_rows} rows")
 
 
-# of the frames, so many are averaged by the hardware, as a power of two; software does the rest
+# logarithm to base 2 of the frames averaged by the hardware; software does the rest
 NAVG1_SHIFT = 14
-# the offset between two samples of an ADC that have no signal
+# mean of an ADC's samples without signal
 ADC_MEAN = 0.3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SessionRows(Recorded):
-    """A session without its spectra; all its gains are in the gain table.
+    """A session without its spectra; the gain table has all its gains.
 
     Attributes
     ----------
@@ -186,12 +186,12 @@ class SessionRows(Recorded):
         }
 
     def clock_words(self) -> tuple[float, float, str, str]:
-        """Return how layout 3 says the clock.
+        """Return the clock in the terms of layout 3.
 
         Returns
         -------
         raw_s, mjd : float
-            A reading, and the MJD that it stands for; zero where that is not known.
+            A reading, and its MJD; zero if it is unknown.
         scale, source : str
         """
         if self.clock is None:
@@ -200,7 +200,7 @@ class SessionRows(Recorded):
         return self.clock.raw_s, mjd, self.clock.scale, "mission_counter"
 
     def mjd(self) -> Rows:
-        """Return the column of MJD that luseepy computes of the clock."""
+        """Return the column of MJD that luseepy computes from the clock."""
         raw_s, mjd, _, _ = self.clock_words()
         return (self.raw_s - raw_s) / DAY_S + mjd
 
@@ -208,21 +208,21 @@ class SessionRows(Recorded):
 def write_session(
     path: str | Path, rows: SessionRows, blocks: Blocks, *, kind: str = "hdf5"
 ) -> Path:
-    """Write a session whole or not at all.
+    """Write a session, complete or not at all.
 
     Parameters
     ----------
     path : str or Path
     rows : SessionRows
     blocks : iterable of (some rows, 16, bins) array
-        Counts, in the spectrometer's order of products; one after the other, so that they are never
-        in memory together. Fewer bins than 2048 are filled up with NaN.
+        Counts, in the spectrometer's order of products; in blocks, so that they are never all in
+        memory. Fewer bins than 2048 are filled up with NaN.
     kind : {"hdf5", "fits"}
 
     Raises
     ------
     InputError
-        For blocks that do not make up the rows, and a file that cannot be written.
+        If the blocks do not match the rows, or the file cannot be written.
     """
     write = {"hdf5": _write_session_hdf5, "fits": _write_session_fits}[kind]
     path = user_path(path)
@@ -252,7 +252,7 @@ def _write_session_fits(path: Path, rows: SessionRows, blocks: Blocks) -> None:
 
 
 def _fits_header(rows: SessionRows) -> fits.HDUList:
-    """All that comes before the spectra."""
+    """All HDUs before the spectra."""
     primary = fits.PrimaryHDU()
     primary.header.update({"LAYOUTV": 3, "ORIGIN": "lusee_bayes"})
     invariants = fits.ImageHDU(name="SESSION_INV")
@@ -265,10 +265,10 @@ def _fits_header(rows: SessionRows) -> fits.HDUList:
     return fits.HDUList([primary, invariants, constants])
 
 
-# as luseepy has it
+# as in luseepy
 PACKED = {"compression": "gzip", "compression_opts": 1}
 
-# what the spectra say of themselves
+# attributes of the spectra
 CUBE = {
     "units": "SDU",
     "representation": "gain_model_input_sdu",

@@ -1,10 +1,10 @@
-"""From V^2/Hz at a few frequencies to what the spectrometer sends, and what disturbs it.
+"""From V^2/Hz at a few frequencies to the spectrometer's counts, with disturbances.
 
-Spectra of all channels go through those that are known. Logarithms of autos are cubic splines of
-the logarithm of the frequency. So are the entries of the Cholesky factors of the matrices of
-correlation coefficients, the diagonal by its logarithm: then what lies between is a matrix of
-correlations, too. Beyond the known frequencies autos go on as power laws, and correlations become
-constant; a single known frequency makes power laws of index -2.5.
+Spectra of all channels are interpolated between known frequencies. Logarithms of autos are cubic
+splines of the logarithm of the frequency. So are the entries of the Cholesky factors of the
+correlation matrices (the diagonal by its logarithm), so that interpolated matrices are correlation
+matrices, too. Beyond the known frequencies autos continue as power laws, and correlations become
+constant; a single known frequency gives power laws of index -2.5.
 """
 
 from __future__ import annotations
@@ -24,32 +24,32 @@ from lusee_bayes.flight.gain_model import LETTERS, NANO2, GainModel
 from lusee_bayes.flight.recipe import FlightSimulatedSection
 from lusee_bayes.instrument.products import to_matrix, to_real
 
-# spectra; counts before they are rounded; of the voltages of antennas
+# spectra; counts before rounding; covariances of the antennas' voltages
 AllChannels = Float[np.ndarray, "products rows channels"]
 Counts = Float[np.ndarray, "rows products bins"]
 Covariances = Complex[np.ndarray, "antennas antennas rows channels"]
 Rounded = Float32[np.ndarray, "rows products bins"]
 INDEX = -2.5
-# below this share of the lowest known frequency spectra are held: what would rise further there
-# would be rounded coarsely elsewhere
+# below this share of the lowest known frequency spectra stay constant: a further rise there would
+# coarsen the rounding elsewhere
 HELD_BELOW = 0.5
 # beyond the known frequencies splines go on for this much of the logarithm, longer than a band, and
-# are then held; the larger the power, the less bends before
+# then become constant; the larger the power, the less they bend before
 BEYOND, POWER = 0.2, 8
 
 
 @dataclass(frozen=True, eq=False)
 class ChannelSpectra:
-    """Interpolates visibilities in frequency.
+    """Interpolation of visibilities in frequency.
 
     Attributes
     ----------
     autos : (channels, nodes) array
-        Takes logarithms of autos.
+        Matrix for logarithms of autos.
     offset : (channels,) array
-        Added to what that makes.
+        Added to the result.
     correlations : (channels, nodes) array
-        Takes factors of correlations.
+        Matrix for factors of correlations.
     """
 
     autos: Float[np.ndarray, "channels nodes"]
@@ -63,7 +63,7 @@ class ChannelSpectra:
         Parameters
         ----------
         nodes_mhz : (nodes,) array
-            Known frequencies, growing.
+            Known frequencies, increasing.
         channels_mhz : (channels,) array
         """
         nodes = np.log(nodes_mhz)
@@ -104,7 +104,7 @@ class ChannelSpectra:
         ports = np.arange(len(session.AUTOS))
         diagonal = np.log(factors[..., ports, ports].real)
         low[ports, ports] = np.exp(_at_channels(self.correlations, diagonal))
-        # rows of length one make correlation coefficients
+        # rows of length one give correlation coefficients
         logs = _at_channels(self.autos, np.log(np.moveaxis(autos, 1, -1)))
         length = np.sqrt((np.abs(low) ** 2).sum(axis=1))
         low *= (np.exp((logs + self.offset) / 2.0) / length)[:, None]
@@ -121,7 +121,7 @@ def _at_channels(weights: Float[np.ndarray, "channels nodes"], values: np.ndarra
     return np.moveaxis(np.tensordot(values, weights, axes=(0, 1)), 0, -2)
 
 
-# of the 31 bits of a number, so many hold the largest of a spectrum. What is rounded then is far
+# bits, of the 31 of a number, for the largest value of a spectrum; rounding errors are then far
 # below the noise, also where a spectrum has fallen to a thousandth
 BITS = 27
 REFERENCE = 31
@@ -129,20 +129,20 @@ REFERENCE = 31
 
 @dataclass(frozen=True, eq=False)
 class Counting:
-    """How spectra become counts, for one state of the spectrometer.
+    """Conversion of spectra to counts, for one state of the spectrometer.
 
     Attributes
     ----------
     table : GainModel
         Channels beyond its frequencies have the gain at its ends.
     levels : str
-        Of the gains of the ports, as MMMM.
+        Gain levels of the ports, such as MMMM.
     navgf : int
         Averaging over channels.
     origin : {"centre", "edge"}
-        What of channel k lies at k times 25 kHz.
+        Part of channel k that lies at k times 25 kHz.
     sign : {1, -1}
-        Of the imaginary parts of the spectrometer, in those of <s_i conj(s_j)>.
+        Sign of the spectrometer's imaginary parts, relative to those of <s_i conj(s_j)>.
     """
 
     table: GainModel
@@ -161,7 +161,7 @@ class Counting:
         return np.array(bases)
 
     def __call__(self, spectra: AllChannels, telemetry: session.Telemetry) -> Counts:
-        """Return counts before they are rounded.
+        """Return counts before rounding.
 
         Parameters
         ----------
@@ -178,7 +178,7 @@ class Counting:
         for port in range(session.PORTS):
             q = self.table.strengths(self.levels[port], port, telemetry)
             gain = self._basis[port, 0] + q @ self._basis[port, 1:]
-            # where a table has none, nothing is sent
+            # nothing is sent where a table has no gain
             root.append(np.sqrt(np.maximum(gain, 0.0)))
         averaging = session.AVERAGING[self.navgf]
         members = averaging.channels()
@@ -191,12 +191,12 @@ class Counting:
 
 
 def bit_slices(counts: Counts) -> Int[np.ndarray, " products"]:
-    """Return the slices for spectra like the first of some.
+    """Return the bit slices for spectra like the first.
 
     Parameters
     ----------
     counts : (rows, products, bins) array
-        In the spectrometer's order. Crosses have a slice by their autos, which bound them.
+        In the spectrometer's order. The slice of a cross follows from its autos, which bound it.
     """
     top = np.empty(counts.shape[1])
     largest = np.abs(counts[0, session.OF_FLIGHT[session.AUTOS]]).max(axis=1)
@@ -205,7 +205,7 @@ def bit_slices(counts: Counts) -> Int[np.ndarray, " products"]:
 
 
 def rounded(counts: Counts, bitslice: Int[np.ndarray, "rows products"]) -> Rounded:
-    """Return multiples of 2^(slice - 31).
+    """Return counts rounded to multiples of 2^(slice - 31).
 
     Parameters
     ----------
@@ -216,32 +216,32 @@ def rounded(counts: Counts, bitslice: Int[np.ndarray, "rows products"]) -> Round
     return (np.rint(counts / step) * step).astype(np.float32)
 
 
-# disturbances come in stretches of so many spectra, but those of single ones
+# length of disturbances in spectra, except those of single spectra
 STRETCH = 5
-# a saturated spectrum has so many times its counts
+# factor of the counts of a saturated spectrum
 SATURATED_FACTOR = 40.0
-# bursts are measured against the noise in so many channels
+# bursts are measured against the noise in this many channels
 BURST_CHANNELS = 1.0 / session.CHANNEL_MHZ
 
 
 @dataclass(frozen=True, eq=False)
 class Disturbances:
-    """What was put into each spectrum.
+    """Disturbances of each spectrum.
 
     Attributes
     ----------
     section : FlightSimulatedSection
-        How strong they are.
+        Their strengths.
     level : (rows, ports) array of str
-        Of the gains.
+        Levels of the gains.
     absent : (rows, 16) array of bool
         Products that are NaN, in the spectrometer's order.
     saturated, tone, comb : (rows,) array of bool
     tone_channel : (channels,) array of bool
-        Channels that have a tone in these spectra.
+        Channels with a tone in these spectra.
     burst : (rows,) array of bool
     phase : (rows, ports) array
-        Of bursts at the ports, in radians.
+        Phases of bursts at the ports, in radians.
     """
 
     section: FlightSimulatedSection
@@ -263,24 +263,24 @@ class Disturbances:
         origin: session.BinOrigin,
         seed: int,
     ) -> Disturbances:
-        """Draw them.
+        """Draw disturbances.
 
         Parameters
         ----------
         section : FlightSimulatedSection
-            What disturbs the spectra.
+            Rates and strengths of the disturbances.
         hours : (rows,) array
-            Of the spectra, since the first.
+            Times of the spectra since the first.
         step_s : float
-            From spectrum to spectrum.
+            Time from spectrum to spectrum.
         origin : {"centre", "edge"}
-            What of channel k lies at k times 25 kHz.
+            Part of channel k that lies at k times 25 kHz.
         seed : int
 
         Raises
         ------
         InputError
-            If a tone is in a channel that no bin holds.
+            If a tone is in a channel that is in no bin.
         """
         n, generator = len(hours), np.random.default_rng([seed, 1])
         level = np.array([list(section.levels)] * n, dtype="U1")
@@ -315,9 +315,9 @@ class Disturbances:
         ----------
         t : (antennas, antennas, rows, channels) array
         rows : slice
-            Which spectra.
+            The spectra.
         frames : float
-            Frames that each averages.
+            Frames in each spectrum.
         """
         level = np.einsum("iirc->rc", t).real / (session.PORTS * np.sqrt(frames))
         comb = np.arange(session.N_CHANNELS) % flags.COMB_SPACING == flags.COMB_FIRST
@@ -330,7 +330,7 @@ class Disturbances:
             t[:, :, bursts] += wave[:, None, :, None] * wave.conj()[None, :, :, None] * power
 
     def truth(self) -> dict[str, np.ndarray]:
-        """Return the table of what is where."""
+        """Return the table of disturbances."""
         names = ("level", "absent", "saturated", "tone", "tone_channel", "comb", "burst")
         return {name: getattr(self, name) for name in names}
 
@@ -338,7 +338,7 @@ class Disturbances:
 def _tone_channels(
     tones_mhz: tuple[float, ...], navgf: int, origin: session.BinOrigin
 ) -> Bool[np.ndarray, " channels"]:
-    """The channels nearest to the tones. InputError if the averaging leaves one of them out."""
+    """The channels nearest to the tones; InputError if the averaging leaves one of them out."""
     mhz = session.channel_mhz(origin)
     tones, kept = np.zeros((2, session.N_CHANNELS), dtype=bool)
     kept[session.AVERAGING[navgf].channels()] = True
@@ -357,7 +357,7 @@ def _tone_channels(
 
 
 def _drawn_stretches(generator: np.random.Generator, n: int, share: float, length: int) -> RowFlags:
-    """About this share of the spectra, in stretches."""
+    """Stretches of spectra, about this share of all."""
     chosen = np.zeros(n, dtype=bool)
     if share == 0.0:
         return chosen

@@ -1,31 +1,30 @@
-"""Averages over longer times, of data and of what the model predicts.
+"""Averages over longer times, of data and of model predictions.
 
-**What A knows of time** are the fewest functions that give every sample's mean over its window.
-With W_p the tilted copies of a beam (``rotations.tilts``), a row of A at one instant is the sum
+**The functions of time in A** are the fewest that give every sample's mean over its window.
+With W_p the tilted copies of a beam (``harmonics.tilts``), a row of A at one instant is the sum
 over p and the orders m of e_p(t) exp(i m phi(t)) W_p,m. Its mean over a window, where phi is
 phi_mean + delta, has the factors ::
 
     < e_p exp(i m delta) > exp(i m phi_mean),    < e_p exp(i m delta) > = sum_k (i m)^k / k! mu_pk,
 
-with mu_pk = < e_p delta^k > the moments. As functions of time they are almost all alike: a singular
-value decomposition finds u_j(t) and G_j(p, m), few of each, with ::
+with mu_pk = < e_p delta^k > the moments. Over time they are nearly linearly dependent: a singular
+value decomposition yields u_j(t) and G_j(p, m), few of each, with ::
 
     < e_p exp(i m delta) >(t) = sum_j u_j(t) G_j(p, m).
 
-The beams take up G, and time enters A through u_j(t) and exp(i m phi_mean) alone. For windows of
-one length the first function stands for the mean over a turn about a fixed axis, which is a factor
-for each order m; others for the wandering of the axis, and for windows that are partly filled.
+G is absorbed into the beams, so time enters A only through u_j(t) and exp(i m phi_mean). For
+windows of equal length the first function describes the mean over a turn about a fixed axis, a
+factor for each order m. The others describe the wandering axis and partly filled windows.
 
 **Means of data over longer times.** A is exact for a mean if all products of a sample have the same
 window. In each bin:
 
-1. samples in which every product is flagged are left out;
-2. a product that is present for less than half of the live time of the others is left out: it is
-   flagged in the bin;
-3. samples that lack one of the other products are left out.
+1. samples in which every product is flagged are dropped;
+2. a product that is present for less than half of the bin's live time is flagged in the bin;
+3. samples that lack one of the other products are dropped.
 
-Of the samples that remain, the value of the bin is the mean, each with the weight of its live time,
-and their windows are that of the bin. Bins of which nothing remains are dropped.
+A bin's value is the mean of the remaining samples, weighted by live time; their windows form the
+bin's window. Empty bins are dropped.
 """
 
 from __future__ import annotations
@@ -52,15 +51,15 @@ Functions = Float[np.ndarray, "times functions"]
 Series = Float[np.ndarray, "moments columns"]
 BinFlags, Bounds = Bool[np.ndarray, "products bins"], Float[np.ndarray, "times 2"]
 
-# of what is left out of any sample, relative to its visibility if what a beam sees of the sky falls
-# with ell to this power: less than 1e-6 of the radiometer noise in the fiducial case
+# error of any sample relative to its visibility, if the sky that a beam sees falls as ell to this
+# power: less than 1e-6 of the radiometer noise in the fiducial case
 TOLERANCE, FALLING = 5e-11, -3.5
-# of the quadrature over a piece, and of the series in moments
+# error of the quadrature over a piece, and of the series in moments
 ROUNDING = 1e-14
 
 
 def sufficient_nodes(angle: float) -> int:
-    """Return how many Gauss-Legendre instants a piece needs.
+    """Return the number of Gauss-Legendre instants that a piece needs.
 
     Parameters
     ----------
@@ -85,20 +84,20 @@ def sufficient_nodes(angle: float) -> int:
 def windowed(
     sample: Numbers, weight: Nodes, azimuth: Nodes, tilt: Tilts, order: int, lmax: int
 ) -> tuple[Times, Functions, Float[np.ndarray, "functions powers orders 2"]]:
-    """Average what A knows of time over windows.
+    """Average A's functions of time over windows.
 
     Parameters
     ----------
     sample : (nodes,) array of int
-        The sample of every instant, growing.
+        Sample number of every instant, non-decreasing.
     weight : (nodes,) array
-        One in total for each sample.
+        Weights that sum to 1 for each sample.
     azimuth : (nodes,) array
         phi, in radians.
     tilt : (nodes, 2) array
         (ex, ey), in radians.
     order : int
-        Of the expansion in the tilt.
+        Order of the expansion in the tilt.
     lmax : int
         Highest order m of the beams.
 
@@ -107,7 +106,7 @@ def windowed(
     azimuth : (times,) array
         phi_mean, in radians.
     functions : (times, functions) array
-        u_j, the most important ones first.
+        u_j, the most important first.
     factors : (functions, powers, orders, 2) array
         Real and imaginary part of G_j(p, m), for the powers in the order of
         :func:`.tilt_powers` and m = 0 .. lmax.
@@ -146,7 +145,7 @@ def terms_of_exponential(size: float, tolerance: float) -> int:
 
 
 def _importance(powers: list[tuple[int, int]], lmax: int) -> Float[np.ndarray, "powers orders"]:
-    """What each power of the tilt makes of the harmonics of one order."""
+    """Weight of each power of the tilt in the harmonics of each order."""
     ell = np.arange(1.0, max(lmax, 1) + 1.0)
     above = [ell[ell >= max(m, 1)] for m in range(lmax + 1)]
     return np.array([[(x ** (a + b + FALLING)).sum() for x in above] for a, b in powers])
@@ -173,42 +172,42 @@ def _fewest(moments: Float[np.ndarray, "times moments"], series: Series) -> tupl
     u, vt = u[:, :n], vt[:n] @ across.T
     contributions = (q @ u) * s
     size = np.sqrt((contributions**2).sum(1).max())
-    # what is left of each sample without the last functions
+    # remainder of each sample without the last functions
     missing = np.sqrt(np.cumsum((contributions**2)[:, ::-1], axis=1)[:, ::-1].max(0))
     keep = max(1, int((missing > TOLERANCE * size).sum()))
     return contributions[:, :keep], vt[:keep]
 
 
-# the sky turns once in 27 days: a longer mean is a slip, of units for instance
+# the sky turns once in 27 days: a longer mean is a mistake, for instance in units
 LONGEST_S = 30.0 * 86400.0
-# a product that is present for less of a bin's live time is left out of the bin
+# a product present for a smaller share of a bin's live time is flagged in the bin
 LEAST_SHARE = 0.5
 
 
 def averaged(data: Visibilities, to_s: float) -> Visibilities:
     """Average data over bins of a given length.
 
-    Bins begin at the start of the first window of each run, and end with the run. Where samples do
-    not fit into them, after a gap or because the length is no multiple of theirs, a bin ends before
-    the sample that would make it longer than ``to_s``.
+    Bins start with the first window of each run and end with the run. If samples do not fit (after
+    a gap, or if the length is not a multiple of theirs), a bin ends before the sample that would
+    make it longer than ``to_s``.
 
     Parameters
     ----------
     data : Visibilities
-        Of samples with windows.
+        Their samples must have windows.
     to_s : float
-        Length of the bins, in seconds; the step of what is returned.
+        Length of the bins, in seconds; the step of the result.
 
     Returns
     -------
     Visibilities
-        Times are the middles between start and end of each bin.
+        Each time is midway between the start and the end of its bin.
 
     Raises
     ------
     InputError
-        For instants, for bins that are shorter than the samples or longer than 30 days, and if
-        nothing is left.
+        For instants, for bins that are shorter than the samples or longer than 30 days, and if no
+        data remain.
     """
     require_positive("the time to average over, in seconds,", to_s)
     observation, windows = data.observation, data.observation.windows
@@ -230,7 +229,7 @@ def averaged(data: Visibilities, to_s: float) -> Visibilities:
             f"averaging over {to_s:g} s leaves no data: products have no samples in common; give a "
             "shorter time"
         )
-    # bins of which something remains, counted anew
+    # renumber the bins that are not empty
     bins, bin_of_left = np.unique(bin_of[left], return_inverse=True)
     weight = live_s[left] / np.bincount(bin_of_left, live_s[left])[bin_of_left]
     grid = np.asarray(data.layout.scatter(data.data))[:, left] * weight
@@ -242,12 +241,12 @@ def averaged(data: Visibilities, to_s: float) -> Visibilities:
 
 
 def product_live_s(data: Visibilities) -> float:
-    """Return the live time of data in seconds, that of every product counted."""
+    """Return the live time of data in seconds, summed over products."""
     return float(data.observation.live_s[data.layout.time].sum())
 
 
 def bins_of(observation: Observation, bounds_s: Bounds, to_s: float) -> Samples:
-    """Return the number of the bin of every sample.
+    """Return the bin number of every sample.
 
     Parameters
     ----------
@@ -282,7 +281,7 @@ def bins_of(observation: Observation, bounds_s: Bounds, to_s: float) -> Samples:
 
 
 def by_the_rule(present: GridFlags, bin_of: Samples, live_s: Times) -> tuple[BinFlags, TimeFlags]:
-    """Return which products each bin has, and which samples it is made of.
+    """Return which products each bin contains, and which samples it averages.
 
     Parameters
     ----------
@@ -296,7 +295,7 @@ def by_the_rule(present: GridFlags, bin_of: Samples, live_s: Times) -> tuple[Bin
     first = np.searchsorted(bin_of, np.arange(bin_of[-1] + 1))
     total = np.add.reduceat(live_s * some, first)
     share = np.add.reduceat(live_s * present, first, axis=1)
-    # of times that are not powers of two, a half may be short of it by rounding
+    # rounding may put an exact half slightly below it
     kept = (share >= LEAST_SHARE * total * (1.0 - 1e-12)) & (total > 0.0)
     used = some & kept.any(axis=0)[bin_of] & (present | ~kept[:, bin_of]).all(axis=0)
     return kept, used
@@ -308,11 +307,11 @@ def binned(observation: Observation, left: Samples, bin_of: Samples, to_s: float
     Parameters
     ----------
     observation : Observation
-        Of samples with windows.
+        Its samples have windows.
     left : (samples,) array of int
-        The samples that the bins are made of.
+        The samples that the bins average.
     bin_of : (samples,) array of int
-        The bin of each of them: 0, 1, ... without a gap.
+        The bin of each of these samples: 0, 1, ... without a gap.
     to_s : float
         Length of the bins, in seconds.
     """
@@ -323,7 +322,7 @@ def binned(observation: Observation, left: Samples, bin_of: Samples, to_s: float
     offset = seconds[windows.sample]
     start, end = windows.start_s + offset, windows.end_s + offset
     bin_of_piece, share = bin_of[windows.sample], windows.live_s / (end - start)
-    # the live time that the piece would have with the share of the one before
+    # by how much the piece's live time would change with the share of the previous piece
     differ = np.abs(np.diff(share)) * (end - start)[1:]
     same, touching = np.diff(bin_of_piece) == 0, start[1:] - end[:-1] <= ROUNDING_S
     at = np.flatnonzero(np.append(True, ~(same & touching & (differ <= ROUNDING_S))))

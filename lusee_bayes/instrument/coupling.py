@@ -1,24 +1,22 @@
-"""A, of any kind: A m, A^T d, and what is made of them.
+"""The coupling matrix A, of any kind: A m, A^T d and operations built on them.
 
-A new kind is one file: implement the abstract methods here. ``lusee_bayes.testing.check_coupling``
-tells whether it keeps the contract.
+To add a kind, implement the abstract methods of :class:`Coupling` in one file;
+``lusee_bayes.testing.check_coupling`` tests it.
 
-**A of an observation** takes sky coefficients to visibilities. Its beams are turned by the
-turntable, lean with the lander and are tilted with the pole. With b_rk the coefficients of product
-k in run r, turned into the Moon-fixed frame, and W_j what the pointing's function of time u_j has
-of its tilted copies (:mod:`.averaging`), a visibility, the mean over its window, is ::
+**A of an observation** maps sky coefficients to visibilities. The turntable turns its beams, the
+lander's lean and the pole tilt them. Let b_rk be the coefficients of product k in run r in the
+Moon-fixed frame, and W_j the combination of their tilted copies for the pointing's function of time
+u_j (:mod:`.averaging`). A visibility, the mean over its window, is ::
 
     V_k(t) = [ D_z(-phi(t)) sum_j u_j(t) W_j ] . a             (a: the sky in the mean-pole frame)
            = sum_j u_j(t) sum_m ( cos m phi(t) X_jm + sin m phi(t) Y_jm ),
     X_jm = sum_l (W_lm a_lm + W_l,-m a_l,-m),    Y_jm = sum_l (W_lm a_l,-m - W_l,-m a_lm).
 
-Time enters only through exp(i m phi) and the slow scalars u_j, beams only through b: a product of
-A with a vector never forms A, and nothing in it but the last sum grows with the number of times.
+Time enters only through exp(i m phi) and the slow scalars u_j, beams only through b. A product with
+a vector never forms A, and only its last sum grows with the number of times.
 
-**A as a linear function of the beams**, for fixed orientations and beams that change
-(:class:`Instrument`): row t of product k is b_k R(t), with R(t) block diagonal in ell: one
-rotation matrix for each ell and sample, computed once. Then A costs 16 products with (2 ell + 1)^2
-numbers per ell and sample, and derivatives cost no more.
+**A for beams that change** (:class:`Instrument`), at fixed orientations: A is linear in the beams,
+so the dA of a difference of beams is the A of that difference.
 """
 
 from __future__ import annotations
@@ -48,7 +46,7 @@ BodyBeams = Float[Array, "runs products functions modes"]
 RowNumbers = Int[np.ndarray, " rows"]
 TimeModes = Float[Array, "products times modes"]
 Factors = Float[Array, "functions powers orders 2"]
-# times whose data A^T d takes at once: it bounds the memory
+# times that A^T d processes at once, which bounds the memory
 MOST_TIMES = 8192
 
 
@@ -72,7 +70,7 @@ class Coupling(Described, eqx.Module):
     def shape(self) -> tuple[int, int]:
         """(data, unknowns)"""
 
-    # whether A^T N^-1 A can be summed over time without A (``linear.normal_matrix``)
+    # whether A^T N^-1 A can be summed over time without forming A (``linear.normal_matrix``)
     has_time_structure = False
 
     def dense(self) -> Matrix:
@@ -82,7 +80,7 @@ class Coupling(Described, eqx.Module):
 
     @abstractmethod
     def _matrix(self) -> Matrix:
-        """A as a matrix, as all of the following without the response."""
+        """A as a matrix, without the response (as in all methods below)."""
 
     def plus(self, amplitude: Float[Array, ""], direction: Coupling) -> Coupling:
         """Add a multiple of another coupling matrix: R (A + amplitude dA), with the response R.
@@ -92,7 +90,7 @@ class Coupling(Described, eqx.Module):
         amplitude : () array
             The factor of dA.
         direction : Coupling
-            dA, of the same data and unknowns, without a response of its own.
+            dA, for the same data and unknowns, without a response.
 
         Returns
         -------
@@ -102,7 +100,7 @@ class Coupling(Described, eqx.Module):
         Raises
         ------
         InputError
-            If ``direction`` has a response, or is of other data or unknowns.
+            If ``direction`` has a response, or other data or unknowns.
         """
         require_shape("the direction", direction, self.shape)
         if direction.response is not None:
@@ -111,11 +109,11 @@ class Coupling(Described, eqx.Module):
 
     @abstractmethod
     def _forward(self, sky: Modes) -> DataVector:
-        """A m, of a vector whose type and shape are right."""
+        """A m, for a vector of checked type and shape."""
 
     @abstractmethod
     def _backward(self, data: Float[Array, "data *n"]) -> Float[Array, "unknowns *n"]:
-        """A^T d, of vectors whose type and shape are right."""
+        """A^T d, for vectors of checked type and shape."""
 
     def __matmul__(self, sky: Modes) -> DataVector:
         """Compute A m: the mean data of a sky.
@@ -166,7 +164,7 @@ class Coupling(Described, eqx.Module):
         return self._backward(data)
 
     def with_response(self, factors: DataVector) -> Coupling:
-        """Multiply every row by a factor, on top of those it has.
+        """Multiply every row by a factor, in addition to the present response.
 
         Parameters
         ----------
@@ -190,7 +188,7 @@ class Coupling(Described, eqx.Module):
 
 @compiled
 def body_beams(modes: BeamModes, pointing: Pointing) -> BodyBeams:
-    """Turn beams into the Moon-fixed frame, as every function of time of the pointing sees them.
+    """Turn beams into the Moon-fixed frame, for each of the pointing's functions of time.
 
     Parameters
     ----------
@@ -226,7 +224,7 @@ def _taken_up(
     """sum_p G_j(p, m) W_p, a complex factor for each pair c_m + i c_-m."""
     ell, m = mode_numbers(lmax_of(tilted.shape[-1]))
     xp = namespace(tilted, factors)
-    # modes side by side in memory, as products of matrices want them
+    # contiguous modes, as matrix products need them
     mirrored = xp.take(tilted, ell * (ell + 1) - m, axis=-1)
     real = xp.take(factors[..., 0], np.abs(m), axis=-1)
     sign = np.sign(m).astype(np.float64)[None, None]
@@ -250,7 +248,7 @@ class DenseCoupling(Coupling):
     Raises
     ------
     InputError
-        If ``matrix`` is not a float64 matrix, or holds NaN or infinity. Values are not checked
+        If ``matrix`` is not a float64 matrix, or contains NaN or infinity. Values are not checked
         inside a JAX transformation.
     """
 
@@ -282,13 +280,13 @@ class CouplingMatrix(Coupling):
     """A of the beams of an observation, in Galactic coordinates, with its structure in time.
 
     ``A @ sky`` and ``A.transpose_mv(data)`` use the structure; :meth:`rows` and :meth:`dense` give
-    the numbers. Differentiable in the beams and the response. Made by :meth:`observe`,
-    :meth:`build` or :meth:`of_modes`.
+    the numbers. Differentiable in beams and response. Create it with :meth:`observe`, :meth:`build`
+    or :meth:`of_modes`.
 
     Attributes
     ----------
     body_beams : (runs, products, functions, modes) array
-        Beams turned by the turntable into the Moon-fixed frame, as each function of time sees them.
+        Beams turned by the turntable into the Moon-fixed frame, for each function of time.
     by_order : (runs, orders, beams, degrees) array
         The same coefficients order by order: the matrices behind X and Y of the module's equations.
     pointing : Pointing
@@ -296,7 +294,7 @@ class CouplingMatrix(Coupling):
     layout : DataLayout
         The product and the time of every row.
     modes : (products, modes) or (runs, products, modes) array
-        The beams in the frame of the lander, of which all else is made; those of every run where
+        The beams in the lander's frame, from which the rest is computed; one set per run if the
         terrain does not turn with the turntable.
     """
 
@@ -319,7 +317,7 @@ class CouplingMatrix(Coupling):
         pointing : Pointing
             The orientations at every sample.
         layout : DataLayout, optional
-            Leaves out missing samples; without it none is missing.
+            The samples that are present; by default all.
 
         Returns
         -------
@@ -343,12 +341,12 @@ class CouplingMatrix(Coupling):
 
     @classmethod
     def of_modes(cls, modes: BeamModes, pointing: Pointing, layout: DataLayout) -> CouplingMatrix:
-        """Build A of any number of beams from their coefficients; nothing is checked.
+        """Build A for any number of beams from their coefficients, without checks.
 
         Parameters
         ----------
         modes : (beams, modes) array
-            Harmonic coefficients in the topocentric frame, real packed.
+            Harmonic coefficients in the frame of the lander, real packed.
         pointing : Pointing
             The orientations at every sample.
         layout : DataLayout
@@ -365,12 +363,12 @@ class CouplingMatrix(Coupling):
 
     @classmethod
     def observe(cls, beams: ProductBeams, observation: Observation) -> CouplingMatrix:
-        """Build A of a complete observation.
+        """Build A for a complete observation.
 
         Parameters
         ----------
         beams : ProductBeams
-            Beams of all products; their lmax is that of the sky.
+            Beams of all products, up to the lmax of the sky.
         observation : Observation
             Place, times and turntable angles.
 
@@ -410,19 +408,19 @@ class CouplingMatrix(Coupling):
     def along(
         self, beams: Iterable[BeamModes], pointing: Pointing | None = None
     ) -> Callable[[Modes], Float[Array, "beams products times"]]:
-        """Prepare what several sets of beams see, for any sky, without the response.
+        """Prepare the visibilities of several sets of beams for any sky, without the response.
 
         Parameters
         ----------
         beams : iterable of (products, modes) array
             In the frame of the lander.
         pointing : Pointing, optional
-            Another one.
+            Orientations; by default those of this matrix.
 
         Returns
         -------
         callable
-            Of a (modes,) sky, which gives (beams, products, times) visibilities, missing ones too.
+            Maps a (modes,) sky to (beams, products, times) visibilities, missing samples included.
         """
         stacked = np.concatenate(list(beams), axis=-2)
         shape = -1, self.layout.n_products, self.layout.n_times
@@ -433,7 +431,7 @@ class CouplingMatrix(Coupling):
     def of(
         self, *, modes: BeamModes | None = None, pointing: Pointing | None = None
     ) -> CouplingMatrix:
-        """The same with other beams, or seen from elsewhere; differentiable in both.
+        """Return the same matrix for other beams or another pointing; differentiable in both.
 
         Parameters
         ----------
@@ -447,7 +445,7 @@ class CouplingMatrix(Coupling):
         return replace(made, response=self.response)
 
     def rows(self, product: RowNumbers, time: RowNumbers) -> Float[Array, "rows modes"]:
-        """Compute chosen rows of A, flagged or not, without the response.
+        """Compute selected rows of A, flagged or not, without the response.
 
         Parameters
         ----------
@@ -457,7 +455,7 @@ class CouplingMatrix(Coupling):
         Returns
         -------
         (rows, modes) array
-            The rows, in the order asked for.
+            The rows, in the requested order.
 
         Raises
         ------
@@ -479,7 +477,7 @@ class CouplingMatrix(Coupling):
         return namespace(*blocks).concatenate(blocks)[np.argsort(np.concatenate(places))]
 
     def time_features(self, times: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n features"]:
-        """Return all that rows of A know of time: of one run they are linear in these numbers.
+        """Return the functions of time in A: rows of one run are linear in these numbers.
 
         Parameters
         ----------
@@ -536,7 +534,7 @@ class CouplingMatrix(Coupling):
                     seen = seen.reshape(n, n_functions, n_products, -1).swapaxes(1, 2)
                     waves.append(seen.reshape(n, n_products * n_functions, -1))
                 both = both + self.by_order[run].swapaxes(1, 2) @ xp.concatenate(waves, axis=-1)
-        # (orders, degrees, columns): of pairs, and of what they are crossed to
+        # (orders, degrees, columns): for the pairs, and for the crossed pairs
         half = both.shape[-1] // 2
         straight, crossed = both[..., :half], both[..., half:]
         plus, minus = straight[:, :n] - crossed[:, n:], straight[:, n:] + crossed[:, :n]
@@ -572,8 +570,8 @@ def turned_about_pole(beams: TimeModes, azimuth: Float[Array, " times"]) -> Time
     signed, mirror = sine * np.sign(m).astype(np.float64)[None], np.arange(len(m)) - 2 * m
     if xp is not np:
         return beams * cosine[None] - xp.take(beams, mirror, axis=-1) * signed[None]
-    # one product after the other stays in the processor's memory; an index in place of take, or
-    # all products at once, would take several times as long
+    # one product at a time stays in the processor's cache; indexing in place of take, or all
+    # products at once, would take several times as long
     return np.stack([one * cosine - np.take(one, mirror, axis=1) * signed for one in beams])
 
 
@@ -587,7 +585,7 @@ def _phases(azimuth: Float[Array, " times"], lmax: int) -> tuple[Array, Array]:
 def _by_order(body_beams: BodyBeams, lmax: int) -> Float[Array, "runs orders beams degrees"]:
     """W_lm and W_l,-m side by side for every order: the matrices behind X and Y.
 
-    A tenth of the time of sums over modes that lie in the packed order (fiducial size).
+    Takes a tenth of the time of sums over modes in packed order (fiducial size).
     """
     pair = _pairs(body_beams, lmax)
     n_runs, n_beams = body_beams.shape[0], body_beams.shape[1] * body_beams.shape[2]
@@ -595,7 +593,7 @@ def _by_order(body_beams: BodyBeams, lmax: int) -> Float[Array, "runs orders bea
 
 
 def _pairs(modes: Float[Array, "*batch modes"], lmax: int) -> Float[Array, "*batch degrees orders"]:
-    """c_lm for l = 0..lmax, then c_l,-m, of m = 0..lmax; zero for l < m, and for c_l,-0."""
+    """c_lm for l = 0..lmax, then c_l,-m, for m = 0..lmax; zero for l < m, and for c_l,-0."""
     ell, m = np.arange(lmax + 1)[:, None], np.arange(lmax + 1)[None]
     centre = ell**2 + ell
     xp = namespace(modes)
@@ -606,7 +604,7 @@ def _pairs(modes: Float[Array, "*batch modes"], lmax: int) -> Float[Array, "*bat
 
 
 class Instrument(eqx.Module):
-    """Antennas whose parameters may change, with everything else that A is made of.
+    """Antennas whose parameters may change, and all else that A depends on.
 
     Attributes
     ----------
@@ -639,7 +637,7 @@ class Instrument(eqx.Module):
         Returns
         -------
         () array
-            In the unit that the name ends with.
+            In the unit at the end of the name.
 
         Raises
         ------
@@ -669,7 +667,7 @@ class Instrument(eqx.Module):
         return self.source.with_values(values or {}).beams(self.frequency_mhz, self.lmax)
 
     def coupling(self, values: Values | None = None) -> CouplingMatrix:
-        """Compute A of antennas with these values.
+        """Compute A for these values of the antennas' parameters.
 
         Parameters
         ----------
@@ -689,7 +687,7 @@ class Instrument(eqx.Module):
         return self.coupling_of(self.beams(values))
 
     def coupling_of(self, beams: ProductBeams) -> CouplingMatrix:
-        """Compute A of given beams, or dA of a difference of beams.
+        """Compute A for given beams, or dA for a difference of beams.
 
         Parameters
         ----------

@@ -1,16 +1,15 @@
-"""An observation: where the sky stands in the antennas' frame at every time.
+"""An observation: the orientation of the sky in the antennas' frame at every time.
 
 Frames: Galactic (of the sky), MCMF (fixed to the Moon, from lunarsky), topocentric (x East,
 y North, z up). Orientations come from lunarsky's own coordinate transformation at every time:
-nothing assumes that the Moon turns about a fixed axis, unless ``fixed_axis`` asks for it.
+the Moon's axis is fixed only if ``fixed_axis`` is set.
 
-Sites and turntable angles of arrays are said in many ways: :func:`site_of` and :func:`runs_of` take
-them.
+:func:`site_of` and :func:`runs_of` convert the sites and turntable angles that come with arrays.
 
-Where the Sun, the Earth and the planets stand, seen from the lander, comes from ERFA's analytical
-series (astropy's ``builtin``; nothing is downloaded): the Earth to 1e-7 au and the Moon to 10
-arcseconds, the Sun as good as the Earth, Jupiter, Saturn and Uranus to 90 arcseconds, the other
-planets to 20 (notes of erfa.epv00, moon98 and plan94).
+Directions from the lander to the Sun, the Earth and the planets come from ERFA's analytical series
+(astropy's ``builtin``; nothing is downloaded). They are accurate to 1e-7 au for the Earth and the
+Sun, 10 arcseconds for the Moon, 90 arcseconds for Jupiter, Saturn and Uranus, and 20 for the other
+planets (notes of erfa.epv00, moon98 and plan94).
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ from lusee_bayes.instrument.schedule import Cut, Interval, Run, cut_intervals, c
 Vectors, Turn = Float[np.ndarray, "times 3"], Float[np.ndarray, "3 3"]
 Window = Literal["instant", "mean"]
 ONE_CYCLE = (Run(),)
-# period after which the sky repeats itself in luseepy's engine croissant
+# rotation period of the sky in luseepy's engine croissant
 LUSEEPY_MONTH_HOURS = 655.72
 
 
@@ -51,27 +50,27 @@ class Observation(checks.Described):
     lon_deg, lat_deg : float
         Selenographic longitude and latitude of the site.
     times : (times,) Time
-        UTC of every sample, one run after the other: the middles of their windows, or instants.
+        UTC of every sample, run by run: the middle of its window, or the instant.
     run : (times,) array of int
-        The run that each sample belongs to: 0, 1, ... without going back.
+        Run number of each sample: 0, 1, ..., non-decreasing.
     turntable_deg : (runs,) tuple of float
         Turntable angle of each run.
     step_s : float
-        Time from sample to sample, in seconds; without windows the integration time, too.
+        Time from sample to sample, in seconds; without windows also the integration time.
     fixed_axis : bool
-        Turn the sky once in 655.72 hours about the axis of the first sample, as
-        luseepy's engine croissant does. Wrong by several times the radiometer noise, but so are
-        its data, which have no windows.
+        Turn the sky once in 655.72 hours about the axis of the first sample, as luseepy's engine
+        croissant does. The error is several times the radiometer noise, but luseepy's data, which
+        have no windows, contain it too.
     windows : Windows or None
-        What each sample is the mean of; None for instants.
+        The windows over which samples are means; None for instants.
     tilt_deg : (float, float)
-        By how much the lander leans towards East and towards North.
+        How far the lander leans towards East and towards North.
 
     Raises
     ------
     InputError
-        For a latitude, step, time or run number that is impossible, for times outside the
-        ephemeris, and for windows that overlap or are longer than a step.
+        For an impossible latitude, step, time or run number, for times outside the ephemeris, and
+        for windows that overlap or are longer than a step.
     """
 
     lon_deg: float
@@ -140,7 +139,7 @@ class Observation(checks.Described):
         fixed_axis: bool = False,
         window: Window = "instant",
     ) -> Observation:
-        """Return an observation of runs that follow one another; defaults as in the paper.
+        """Return an observation of consecutive runs; defaults as in the paper.
 
         A run of c cycles has floor(c cycle / step_s) samples, start + k step_s; the next begins
         c cycles later.
@@ -186,13 +185,13 @@ class Observation(checks.Described):
     ) -> Observation:
         """Return an observation of the intervals of a schedule.
 
-        Each is cut into windows of ``step_s`` from its start, of which the last is shorter where it
-        does not end on a step. A run begins wherever the turntable has turned.
+        Each is cut into windows of ``step_s`` from its start; the last is shorter if the interval
+        does not end on a step. A run begins wherever the turntable angle changes.
 
         Parameters
         ----------
         intervals : sequence of Interval
-            In order, such as :func:`.read_schedule` gives them.
+            In order of time, for example from :func:`.read_schedule`.
         step_s : float
             Time from sample to sample within an interval, in seconds.
         lon_deg, lat_deg : float
@@ -208,8 +207,8 @@ class Observation(checks.Described):
         Raises
         ------
         InputError
-            For intervals that overlap or are not in order, for a duty cycle of instants, and where
-            an interval of nights holds none.
+            If intervals overlap or are out of order, if instants have a duty cycle, and if a
+            night-only interval contains no night.
         """
         cuts, angles = cut_intervals(intervals, step_s), [one.turntable_deg for one in intervals]
         place = {"lon_deg": lon_deg, "lat_deg": lat_deg, "step_s": step_s, "fixed_axis": fixed_axis}
@@ -220,9 +219,9 @@ class Observation(checks.Described):
     def _of_cuts(
         cls, cuts: Sequence[Cut], t0: Time, number: times.Numbers, window: Window, **place: Any
     ) -> Observation:
-        """Of the samples of cuts, by night alone where asked for; ``number``: the run of each.
+        """Build from samples of cuts, only at night if requested; ``number``: the run of each cut.
 
-        A window of a schedule is dark from end to end, that of a run in its middle.
+        A window of a schedule must be dark from start to end, a window of a run at its middle.
         """
         parts = [(cut.start_s, cut.length_s, cut.live_s) for cut in cuts]
         times_s, length_s, live_s = (np.concatenate(part) for part in zip(*parts, strict=True))
@@ -257,7 +256,7 @@ class Observation(checks.Described):
     def select(self, keep: Bool[np.ndarray, " times"]) -> Observation:
         """Return the observation with only the samples where ``keep`` is True.
 
-        Runs without any sample are left out.
+        Runs without any sample are dropped.
 
         Raises
         ------
@@ -286,7 +285,7 @@ class Observation(checks.Described):
         return steps if self.windows is None else self.windows.live_per_sample_s
 
     def at_nodes(self, n: int) -> tuple[Observation, times.Numbers, times.Nodes]:
-        """Return the observation at instants whose weighted means are those over the windows.
+        """Return the observation at instants whose weighted means equal those over the windows.
 
         Parameters
         ----------
@@ -296,11 +295,11 @@ class Observation(checks.Described):
         Returns
         -------
         observation : Observation
-            Of the instants; itself if it has no windows.
+            At the instants; ``self`` if it has no windows.
         sample : (nodes,) array of int
-            The sample of every instant, growing.
+            Sample number of every instant, non-decreasing.
         weight : (nodes,) array
-            One in total for each sample.
+            Weights that sum to 1 for each sample.
         """
         if self.windows is None:
             return self, np.arange(self.n_times), np.ones(self.n_times)
@@ -317,12 +316,12 @@ class Observation(checks.Described):
 
     @property
     def day(self) -> Int[np.ndarray, " times"]:
-        """Number of the day of 24 hours since the first sample."""
+        """Number of whole 24-hour days since the first sample."""
         return np.floor(self.hours / 24.0).astype(int)
 
     @cached_property
     def mcmf_from_galactic(self) -> Float[np.ndarray, "times 3 3"]:
-        """The rotations that take Galactic unit vectors to MCMF ones at every time."""
+        """Rotations from Galactic to MCMF unit vectors at every time."""
         if self.fixed_axis:
             angle = 2.0 * np.pi * self.hours / LUSEEPY_MONTH_HOURS
             about_z = SpatialRotation.from_rotvec(np.outer(-angle, [0.0, 0.0, 1.0])).as_matrix()
@@ -333,7 +332,7 @@ class Observation(checks.Described):
         return rotations
 
     def topocentric_from_mcmf(self) -> Turn:
-        """Return the rotation from MCMF to the East, North and up of the site, its rows."""
+        """Return the rotation from MCMF to the site's East, North and up, its rows."""
         lon, lat = np.radians(self.lon_deg), np.radians(self.lat_deg)
         up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
         east = np.array([-np.sin(lon), np.cos(lon), 0.0])
@@ -342,7 +341,7 @@ class Observation(checks.Described):
     def lander_from_mcmf(self) -> Turn:
         """Return the rotation from MCMF to the lander's axes: East, North and up if it is level.
 
-        It leans first towards North, about East, then towards East, about North.
+        The lander leans first towards North, about East, then towards East, about North.
         """
         east, north = np.radians(self.tilt_deg)
         turned = SpatialRotation.from_rotvec([0.0, east, 0.0])
@@ -356,9 +355,8 @@ class Observation(checks.Described):
     def antenna_directions(self, galactic: Float[np.ndarray, "..."]) -> Vectors:
         """Return the direction of a source in the frame of the antennas at every sample.
 
-        The frame turns with the antennas: seen from antennas that are turned by psi from East
-        towards North, a source has turned by -psi. As for all skies here, stellar aberration (0.006
-        degrees) is left out.
+        The frame turns with the antennas: if they turn by psi from East towards North, a source
+        turns by -psi. Stellar aberration (0.006 degrees) is neglected, as for all skies here.
 
         Parameters
         ----------
@@ -373,7 +371,7 @@ class Observation(checks.Described):
         Raises
         ------
         InputError
-            Unless ``galactic`` is a finite float64 array of such a shape.
+            If ``galactic`` is not a finite float64 array of one of these shapes.
         """
         shape = (3,) if galactic.ndim == 1 else (self.n_times, 3)
         checks.require_array("galactic", galactic, shape)
@@ -394,7 +392,7 @@ class Observation(checks.Described):
 
 
 def mcmf_from_galactic(at: Time) -> Float[np.ndarray, "times 3 3"]:
-    """Return the rotations that take Galactic unit vectors to MCMF ones.
+    """Return the rotations from Galactic to MCMF unit vectors.
 
     The three Galactic axes go through lunarsky's ICRS -> MCMF transformation in one call.
     """
@@ -410,15 +408,15 @@ BODIES = ("Sun", "Mercury", "Venus", "Earth", "Mars", "Jupiter", "Saturn", "Uran
 MOON_RADIUS_KM = 1737.4  # IAU mean radius
 LIGHT_KM_PER_S = c.to_value(u.km / u.s)
 
-# each iteration leaves v / c < 2e-4 of the light time's error: three of them leave 0.1 us
+# each iteration reduces the light time's error by v / c < 2e-4: three leave 0.1 us
 LIGHT_TIME_ITERATIONS = 3
 
 
 def body_direction(body: str, observation: Observation) -> Vectors:
     """Return the direction from the lander to a body at every sample.
 
-    The direction is that from the lander's place on the Moon to where the body was when its light
-    left. As for all skies here, stellar aberration (0.006 degrees) is left out.
+    It points from the lander to the body's position when its light left. Stellar aberration (0.006
+    degrees) is neglected, as for all skies here.
 
     Parameters
     ----------
@@ -451,7 +449,7 @@ def body_direction(body: str, observation: Observation) -> Vectors:
 
 
 def _barycentric_km(body: str, at: Time) -> Vectors:
-    """Place from the barycentre of the Solar System along Galactic axes."""
+    """Position relative to the barycentre of the Solar System, along Galactic axes."""
     with times.unannounced_leap_seconds():
         place = get_body_barycentric(body, at, ephemeris="builtin").xyz.to_value(u.km)
     axes = ICRS(CartesianRepresentation(np.eye(3))).transform_to(Galactic())
@@ -463,7 +461,7 @@ SITES = {"LuSEE-Night": (182.258, -23.814)}
 
 
 def site_of(site: Any) -> tuple[float, float]:
-    """Return longitude and latitude in degrees of a pair, or of a site of ``SITES`` by name.
+    """Return longitude and latitude in degrees, from a pair or from a name in ``SITES``.
 
     Raises
     ------
@@ -484,12 +482,12 @@ def site_of(site: Any) -> tuple[float, float]:
 
 
 def numbers_of_times(name: str, values: Any, n_times: int) -> Times:
-    """Return a finite number for each time, of as many or of one that stands for all.
+    """Return a finite number for each time, from one per time or one for all.
 
     Raises
     ------
     InputError
-        If there are others; with the name.
+        If shape or values are wrong; the message starts with ``name``.
     """
     expected = f"give one finite number, or one for each of {n_times} times"
     try:
@@ -513,7 +511,7 @@ def runs_of(turntable_deg: Any, n_times: int) -> tuple[np.ndarray, tuple[float, 
     Raises
     ------
     InputError
-        If there are neither one angle nor as many as times, or they are not finite.
+        If there is neither one finite angle nor one for each time.
     """
     angles = numbers_of_times("turntable_deg", turntable_deg, n_times)
     run = np.concatenate([[0], np.cumsum(np.diff(angles) != 0.0)]).astype(np.int64)

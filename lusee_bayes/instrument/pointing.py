@@ -1,4 +1,4 @@
-"""Pointing: turntable, tilt, azimuth and clock, and how far each may be off.
+"""Pointing: turntable, tilt, azimuth and clock, and their possible offsets.
 
 The orientation of the lander at every time is split so that time enters only through scalars. In
 the frame P whose z axis is the mean pole of the Moon over the samples, the rotation to the
@@ -8,14 +8,14 @@ Moon-fixed frame is a turn phi(t) about z followed by a small tilt, exactly::
 
 The pole wanders by 0.04 degrees over one cycle, so the tilt is expanded in powers of (ex, ey); the
 order is chosen such that the largest neglected term is below ``TILT_TOLERANCE`` of any mode.
-Means over windows, and what of all this depends on time, are left to :mod:`.averaging`.
+:mod:`.averaging` computes means over windows, and the functions of time in A.
 
-**Offsets** of clock and pointing are by what times, turntable angles and the site may be off. Each
-is what has to be added to the value that data or scenario say. They shift an observation
-exactly (:func:`with_offsets`: times, turntable angles, site and lean of the lander), or a pointing
-inside a compiled function (:func:`turned_by_offsets`), where the Moon turns at a constant rate
-about a pole that does not wander within the clock's offset: that errs by less than 1e-3 of what
-the offset itself does to the data.
+**Offsets** of clock and pointing are errors of times, turntable angles and the site. Each is the
+correction to add to the value of data or scenario. They shift an observation exactly
+(:func:`with_offsets`: times, turntable angles, site and lean of the lander), or a pointing inside a
+compiled function (:func:`turned_by_offsets`). The latter assumes that within the clock's offset the
+Moon turns at a constant rate about a fixed pole: its error is less than 1e-3 of the offset's own
+effect on the data.
 """
 
 from __future__ import annotations
@@ -37,28 +37,28 @@ from lusee_bayes.instrument.schedule import CYCLE_DAYS
 from lusee_bayes.instrument.times import Windows, later
 
 Tilts = Float[np.ndarray, "times 2"]
-# bound on the relative error of a mode at lmax, and least order for any lmax
+# bound on the relative error of a mode at lmax, and lowest order for any lmax
 TILT_TOLERANCE = 1e-7
 LEAST_ORDER = 2
-# by which the Moon turns in a second, in radians, never less than in truth
+# upper bound on the Moon's rotation rate, in radians per second
 FASTEST_TURN = 2.0 * np.pi / (27.3 * 86400.0)
 
 
 class Pointing(eqx.Module):
-    """How an observation turns the sky above the antennas, for harmonics up to one lmax.
+    """Orientation of the sky above the antennas at every sample, for harmonics up to one lmax.
 
     Attributes
     ----------
     azimuth : (times,) array
         phi(t) in radians, its mean over the window of each sample.
     functions : (times, functions) array
-        u_j(t), what else A knows of time.
+        u_j(t), the other functions of time in A.
     factors : (functions, powers, orders, 2) array
-        G_j(p, m), real and imaginary part: what the beams take up for each function.
+        Real and imaginary part of G_j(p, m), which the beams absorb for each function.
     pole_frame : (3, 3) array
         The rotation of vectors from Galactic coordinates to the frame P.
     pole_from_galactic : Rotation
-        The same of harmonics.
+        The same rotation for harmonics.
     mcmf_from_lander : Rotation
         From the frame of the lander, at turntable angle zero, to the Moon-fixed one.
     turntable : (runs,) array
@@ -66,10 +66,10 @@ class Pointing(eqx.Module):
     run_starts : tuple of int
         First sample of each run, and the number of samples.
     order : int
-        Of the expansion in the tilt.
+        Order of the expansion in the tilt.
     turns : (4,) array or None
-        Further turns in radians, where offsets are not known: of the site in longitude and
-        latitude, and of the lander towards East and towards North. None for none.
+        Further turns in radians if offsets are unknowns: of the site in longitude and latitude, and
+        of the lander towards East and towards North. None for no turns.
     """
 
     azimuth: Float[Array, " times"]
@@ -94,11 +94,11 @@ class Pointing(eqx.Module):
         observation : Observation
         lmax : int
         order : int, optional
-            Of the expansion in the tilt: 0 fixes the axis at its mean; by default the lowest one
-            whose error is negligible, see :func:`sufficient_order`.
+            Order of the expansion in the tilt: 0 fixes the axis at its mean; by default the lowest
+            one whose error is negligible, see :func:`sufficient_order`.
         pole_frame : (3, 3) array, optional
-            That of another observation about the same time; by default of the mean pole over this
-            one.
+            The frame of another observation at about the same time; by default that of this one's
+            mean pole.
 
         Returns
         -------
@@ -130,7 +130,7 @@ class Pointing(eqx.Module):
         Parameters
         ----------
         observation : Observation
-            With its own site, lean and turntable angles.
+            Provides site, lean and turntable angles.
         """
         lander, turntable = _lander(observation, len(self.mcmf_from_lander.blocks) - 1)
         return replace(self, mcmf_from_lander=lander, turntable=turntable)
@@ -175,10 +175,10 @@ def split(rotations: Float[np.ndarray, "times 3 3"]) -> tuple[Times, Tilts]:
     tilt : (times, 2) array
         (ex, ey) in radians.
     """
-    pole = rotations[:, :, 2]  # where z goes: only the tilt moves it
+    pole = rotations[:, :, 2]  # image of z: only the tilt moves it
     horizontal = np.hypot(pole[:, 0], pole[:, 1])
     angle = np.arctan2(horizontal, pole[:, 2])
-    # angle / sin(angle) -> 1 where the axis does not move at all
+    # angle / sin(angle) -> 1 if the axis does not move at all
     stretch = np.divide(angle, horizontal, out=np.ones_like(angle), where=horizontal > 0)
     tilt = np.stack([-pole[:, 1], pole[:, 0]], axis=1) * stretch[:, None]
     vectors = np.concatenate([tilt, np.zeros((len(tilt), 1))], axis=1)
@@ -195,19 +195,19 @@ def sufficient_order(tilt: Tilts, lmax: int) -> int:
     return max(terms_of_exponential(size, TILT_TOLERANCE) - 1, LEAST_ORDER)
 
 
-# later than the data say, in seconds, and later by so much more every day from the first sample on
+# true time minus the data's at the first sample, in seconds, and its increase per day
 CLOCK = ("clock_s", "clock_drift_s_per_day")
 # lean of the lander towards East and towards North
 TILTS = ("tilt_east_deg", "tilt_north_deg")
 SITE = ("lon_deg", "lat_deg")
 # these, and the turntable of every run, from East towards North
 OFFSETS = (*CLOCK, "turntable_deg", *SITE, *TILTS)
-# by which the Moon turns against the sky, as azimuths of the sky count it, in radians per hour
+# change of the azimuth phi per hour as the Moon turns, in radians
 TURN_PER_HOUR = -2.0 * np.pi / (CYCLE_DAYS * 24.0)
 
 
 def offset_names(kinds: tuple[str, ...], n_runs: int) -> tuple[str, ...]:
-    """Return the name of every single offset: each run has a turntable angle of its own.
+    """Return the name of every offset: each run has its own turntable angle.
 
     Parameters
     ----------
@@ -219,12 +219,12 @@ def offset_names(kinds: tuple[str, ...], n_runs: int) -> tuple[str, ...]:
     Returns
     -------
     tuple of str
-        ``turntable_deg`` becomes turntable_0_deg, turntable_1_deg, ... where there are several.
+        ``turntable_deg`` becomes turntable_0_deg, turntable_1_deg, ... for several runs.
 
     Raises
     ------
     InputError
-        If there is no such kind of offset.
+        If a kind is unknown.
     """
     names: list[str] = []
     for kind in kinds:
@@ -243,14 +243,14 @@ def _of_runs(n_runs: int) -> list[str]:
 
 
 def with_offsets(observation: Observation, values: Values) -> Observation:
-    """Return the observation as it was, where the one that is said is off.
+    """Return the true observation from the nominal one and its offsets.
 
     Parameters
     ----------
     observation : Observation
-        As data or a scenario say it.
+        The nominal one, from data or a scenario.
     values : mapping of float
-        By the names of :func:`offset_names`; what is left out is zero.
+        By the names of :func:`offset_names`; missing ones are zero.
 
     Returns
     -------
@@ -274,21 +274,21 @@ def with_offsets(observation: Observation, values: Values) -> Observation:
 
 
 def turned_by_offsets(pointing: Pointing, hours: Array, values: Values) -> Pointing:
-    """Return the pointing that offsets make of another, differentiable in them.
+    """Apply offsets to a pointing; differentiable in the offsets.
 
     Parameters
     ----------
     pointing : Pointing
-        Without offsets.
+        The pointing without offsets.
     hours : (times,) array
-        Since the first sample.
+        Hours since the first sample.
     values : mapping of () array
-        By the names of :func:`offset_names`; what is left out is zero.
+        By the names of :func:`offset_names`; missing ones are zero.
 
     Returns
     -------
     Pointing
-        With ``turns``, and turntable and azimuth shifted.
+        With ``turns``, and with turntable and azimuth shifted.
     """
     xp = namespace(pointing, *values.values())
     given = {name: xp.asarray(value, dtype=np.float64) for name, value in values.items()}

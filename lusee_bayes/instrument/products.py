@@ -4,13 +4,12 @@ Voltages s_i give V_ij = <s_i conj(s_j)>: one real number for each antenna (auto
 each pair (Re, Im). They are ordered and labelled as in luseepy:
 ``00R, 01R, 01I, 02R, 02I, 03R, 03I, 11R, 12R, ... 33R``, n^2 real products in all.
 
-Arrays of measured correlations come as instruments and their software have them: names of products
-and signs of imaginary parts are said in many ways, which :meth:`.Visibilities.from_arrays` takes
-through the functions of this module.
+Names of products and signs of imaginary parts vary with the instrument and its software;
+:meth:`.Visibilities.from_arrays` converts them with the functions of this module.
 
-A :class:`DataLayout` says where each entry of the data vector d belongs: which product, which time.
-d is stacked product by product with time running fastest. Samples that are flagged or were never
-taken are not in d at all, so the positions are explicit.
+A :class:`DataLayout` gives the product and the time of each entry of the data vector d.
+d is stacked product by product with time running fastest. Flagged and missing samples are not in d
+at all, so the positions are explicit.
 """
 
 from __future__ import annotations
@@ -64,12 +63,12 @@ def labels(n_antennas: int = N_ANTENNAS) -> tuple[str, ...]:
 
 
 def labels_of(n_products: int) -> tuple[str, ...]:
-    """Return the labels of so many products. InputError if no number of antennas has as many."""
+    """Return the labels of ``n_products`` products; InputError if it is not a square number."""
     return labels(antennas_of(n_products))
 
 
 def antennas_of(n_products: int) -> int:
-    """Return the number of antennas that have so many products. InputError if none has."""
+    """Return the number of antennas; InputError if ``n_products`` is not a square number."""
     n = round(np.sqrt(n_products))
     if n * n != n_products:
         raise InputError(f"{n_products} products do not match any number of antennas; expected n^2")
@@ -108,9 +107,9 @@ def to_matrix(products: Products) -> Hermitian:
     return xp.stack(rows).reshape(n, n, *products.shape[1:])
 
 
-# what an imaginary part can be that of, and the sign that turns it into <s_i conj(s_j)>
+# meaning of an imaginary part, and the sign that turns it into that of <s_i conj(s_j)>
 CONVENTIONS = {"s_i conj(s_j)": 1.0, "conj(s_i) s_j": -1.0}
-# an auto is real; rounding of 32-bit numbers is below this share of it
+# an auto is real; rounding of 32-bit numbers is below this relative error
 AUTO_TOLERANCE = 1e-5
 NAME = re.compile(r"\s*(\d)\s*[-_x, ]?\s*(\d)\s*([RI]?)\s*", re.IGNORECASE)
 
@@ -118,12 +117,12 @@ NAME = re.compile(r"\s*(\d)\s*[-_x, ]?\s*(\d)\s*([RI]?)\s*", re.IGNORECASE)
 def in_order(
     columns: Sequence[tuple[str, Float[np.ndarray, "*shape"]]], n_antennas: int = N_ANTENNAS
 ) -> Float[np.ndarray, "products *shape"]:
-    """Return named columns in the package's order of products, NaN for those without one.
+    """Return named columns in the package's order of products, NaN for missing products.
 
     Raises
     ------
     InputError
-        For a name that is no product's, or that is given twice.
+        For a name that is unknown or given twice.
     """
     places = {label: place for place, label in enumerate(labels(n_antennas))}
     grid = np.full((len(places), *columns[0][1].shape), np.nan)
@@ -146,7 +145,7 @@ def real_products(data: Any, products: Any, flags: Any, convention: str, n_anten
     products : sequence of str or None
         The name of each column; see :meth:`.Visibilities.from_arrays`.
     flags : (times, names) or (times,) array of bool, optional
-        True where a sample is not to be used.
+        True where a sample is not used.
     convention : str
         A key of ``CONVENTIONS``.
     n_antennas : int
@@ -159,8 +158,8 @@ def real_products(data: Any, products: Any, flags: Any, convention: str, n_anten
     Raises
     ------
     InputError
-        For names that are unknown or given twice, shapes that do not fit, autos that are not real,
-        infinities, and another convention.
+        For names that are unknown or given twice, wrong shapes, autos that are not real,
+        infinities, and an unknown convention.
     """
     masked = np.ma.getmaskarray(data) if isinstance(data, np.ma.MaskedArray) else False
     data = _numbers(data)
@@ -291,12 +290,12 @@ class DataLayout(Described, eqx.Module):
 
     @property
     def product(self) -> np.ndarray:
-        """Number of the product of every entry, shape (data,)."""
+        """Product number of every entry, shape (data,)."""
         return self._positions() // self.n_times
 
     @property
     def time(self) -> np.ndarray:
-        """Number of the time of every entry, shape (data,)."""
+        """Time number of every entry, shape (data,)."""
         return self._positions() % self.n_times
 
     @property
@@ -308,7 +307,7 @@ class DataLayout(Described, eqx.Module):
         return np.arange(self.size) if self.index is None else np.asarray(self.index)
 
     def require_same(self, other: DataLayout) -> None:
-        """Check that another layout holds the same samples, where both are known.
+        """Check that another layout has the same samples, if both are known.
 
         Raises
         ------
@@ -326,7 +325,7 @@ class DataLayout(Described, eqx.Module):
             )
 
     def gather(self, grid: Shaped[Array, "products times *rest"]) -> Shaped[Array, "data *rest"]:
-        """Return the entries of d, with any trailing axes, of a full grid."""
+        """Return the entries of d from a full grid, with any trailing axes."""
         flat = grid.reshape(self.n_products * self.n_times, *grid.shape[2:])
         return flat if self.index is None else flat[self.index]
 
@@ -345,23 +344,23 @@ class DataLayout(Described, eqx.Module):
         return grid.reshape(*grid.shape[:2], -1).swapaxes(0, 1)
 
     def from_times(self, grid: ByTime, shape: tuple[int, ...]) -> Columns:
-        """Return the array of this shape that :meth:`by_time` has made ``grid`` of."""
+        """Return the array of this shape from which :meth:`by_time` computed ``grid``."""
         return self.gather(grid.swapaxes(0, 1)).reshape(shape)
 
 
 def without_gaps(visibilities: Grid, layout: DataLayout) -> Grid:
-    """Return visibilities with a value at every sample, for the noise around them.
+    """Return visibilities with a value at every sample, for computing noise.
 
-    The noise of a sample depends on the antenna temperatures of its ports, and in the exact form
-    on all products of its time. Where one of these is absent, it is interpolated linearly between
-    the samples of the same product before and after it (at the ends the nearest one is taken). A
-    cross that was never measured is zero: its ports are taken to be uncorrelated. The auto of a
-    port that was never used is the mean of the others, and no sample depends on it.
+    The noise of a sample depends on the antenna temperatures of its ports, and in the exact form on
+    all products at its time. Missing values are interpolated linearly between the nearest samples
+    of the same product before and after (at the ends the nearest one is used). A cross that was
+    never measured is zero: its ports are assumed to be uncorrelated. The auto of a port that was
+    never used is the mean of the others, and no sample depends on it.
 
     Parameters
     ----------
     visibilities : (products, times) array
-        In K. A sample is absent where it is not in the layout, and its value is 0 (as
+        In K. A sample is absent if it is not in the layout and its value is 0 (as
         :meth:`DataLayout.scatter` leaves it) or NaN; a model's values at absent samples are kept.
     layout : DataLayout
 

@@ -1,14 +1,14 @@
-"""When is observed: runs, the intervals of a schedule, and the samples that they are cut into.
+"""Times of observation: runs, the intervals of a schedule, and the samples cut from them.
 
-Runs follow one another and are told by their length; the intervals of a schedule have dates, and
-time may pass between them. Schedules are tables of intervals in CSV, or command tables of
-LuSEE-Night's OpSim.
+Runs are consecutive and given by their length; the intervals of a schedule have dates, and gaps may
+lie between them. Schedules are tables of intervals in CSV, or command tables of LuSEE-Night's
+OpSim.
 
-OpSim (https://github.com/lusee-night/opsim) has its schedules in YAML: ``config/comtable-*.yml``,
-and the same with the states of battery and storage in the logs of its simulator. An entry holds a
-``start`` (MJD, UTC) and a ``mode`` of the spacecraft, which lasts until the start of the next
-entry. In one mode alone, ``science``, the spectrometer takes data (``config/modes.yml`` and
-``devices.yml`` there). Such a table knows of no turntable.
+OpSim (https://github.com/lusee-night/opsim) stores schedules in YAML: ``config/comtable-*.yml``,
+and the same with the states of battery and storage in its simulator's logs. An entry has a
+``start`` (MJD, UTC) and a ``mode`` of the spacecraft, which lasts until the next entry starts. The
+spectrometer takes data only in the mode ``science`` (``config/modes.yml`` and ``devices.yml``
+there). Such a table has no turntable angles.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ CYCLE_DAYS = 27.321661
 
 @dataclass(frozen=True)
 class Run:
-    """A stretch of data taken at one turntable angle.
+    """A stretch of data at one turntable angle.
 
     Attributes
     ----------
@@ -65,16 +65,16 @@ class Interval:
     turntable_deg : float
         A positive angle turns the antennas from East towards North.
     duty_cycle : float
-        Fraction of the time in which the spectrometer integrates, spread evenly over the interval.
+        Fraction of the time spent integrating, spread evenly over the interval.
     night_only : bool
-        Keep only the windows with the Sun below the horizon at their beginning, middle and end.
+        Keep only the windows with the Sun below the horizon at their start, middle and end.
     where : str
-        What messages call it, as the line of a file; by default its number in the schedule.
+        Name in messages, such as the line of a file; by default its number in the schedule.
 
     Raises
     ------
     InputError
-        For a bad date or number, and for an end that does not come after the start.
+        For a bad date or number, and for an end that is not after the start.
     """
 
     start: str
@@ -101,11 +101,11 @@ class Interval:
 
     @cached_property
     def length_s(self) -> float:
-        """Length in seconds, the time without integration among them."""
+        """Length in seconds, including time without integration."""
         return float(times.seconds_from(self.start_time, times.time_of_text("end", self.end)))
 
     def n_samples(self, step_s: float) -> int:
-        """Count the samples of a step, by day and night; the last one may be shorter."""
+        """Count the samples of ``step_s``, by day and night; the last one may be shorter."""
         return max(1, int(np.ceil((self.length_s - times.ROUNDING_S) / step_s)))
 
 
@@ -116,12 +116,12 @@ class Cut:
     Attributes
     ----------
     start_s : (samples,) array
-        Beginning of every sample, in seconds from the first of all.
+        Start of every sample, in seconds from the start of the first cut.
     length_s, live_s : (samples,) array
-        How long it lasts, and what of that was integrated, in seconds.
+        Duration of every sample, and the time integrated in it, in seconds.
     of : Run or Interval
     name : str
-        What messages call it.
+        Name in messages.
     """
 
     start_s: Float[np.ndarray, " samples"]
@@ -132,7 +132,7 @@ class Cut:
 
 
 def cut_runs(runs: Sequence[Run], step_s: float) -> list[Cut]:
-    """Cut runs that follow one another into whole steps; see :meth:`.Observation.from_runs`.
+    """Cut consecutive runs into whole steps; see :meth:`.Observation.from_runs`.
 
     Raises
     ------
@@ -157,7 +157,7 @@ def cut_runs(runs: Sequence[Run], step_s: float) -> list[Cut]:
 
 
 def cut_intervals(intervals: Sequence[Interval], step_s: float) -> list[Cut]:
-    """Cut every interval into steps from its start, of which the last may be shorter.
+    """Cut every interval into steps from its start; the last step may be shorter.
 
     Raises
     ------
@@ -175,12 +175,12 @@ def cut_intervals(intervals: Sequence[Interval], step_s: float) -> list[Cut]:
 
 
 def named_in_order(intervals: Sequence[Interval]) -> list[tuple[str, Interval]]:
-    """Return intervals that come one after the other, each with what messages call it.
+    """Return consecutive intervals, each with its name in messages.
 
     Raises
     ------
     InputError
-        If there is none, or if two are not in order or overlap.
+        If there is none, or if two overlap or are out of order.
     """
     if not intervals:
         raise InputError("a schedule needs at least one interval, got none")
@@ -202,7 +202,7 @@ def named_in_order(intervals: Sequence[Interval]) -> list[tuple[str, Interval]]:
 WHAT = "a schedule, a table in CSV or OpSim's in YAML"
 REQUIRED = {"start", "end", "turntable_deg"}
 OPTIONAL = {"duty_cycle", "night_only"}
-# of OpSim, in which data are taken
+# OpSim's mode for taking data
 OBSERVING = "science"
 
 
@@ -212,28 +212,28 @@ def read_schedule(path: str | Path) -> tuple[Interval, ...]:
     Parameters
     ----------
     path : str or Path
-        CSV with the columns ``start``, ``end`` (UTC, ISO) and ``turntable_deg``, and, if they are
-        wanted, ``duty_cycle`` and ``night_only`` (true or false); what follows a # is a comment.
-        Or, if the name ends in .yaml or .yml, a command table of OpSim, whose intervals in the
-        mode ``science`` are taken, with the turntable at zero.
+        CSV with the columns ``start``, ``end`` (UTC, ISO) and ``turntable_deg``, and optionally
+        ``duty_cycle`` and ``night_only`` (true or false); a # starts a comment. Or, if the name
+        ends in .yaml or .yml, a command table of OpSim: its intervals in the mode ``science``, with
+        the turntable at zero.
 
     Returns
     -------
     tuple of Interval
-        In order.
+        In order of time.
 
     Raises
     ------
     InputError
-        With file and row, for a missing column, a bad value, intervals that overlap or are not in
-        order, and a schedule without any.
+        With file and row, for a missing column, a bad value, intervals that overlap or are out of
+        order, and a schedule without intervals.
     """
     return _parsed(str(path), read_text(path, WHAT))
 
 
 @lru_cache(maxsize=4)
 def _parsed(path: str, text: str) -> tuple[Interval, ...]:
-    """Channels of several frequencies and estimates of their cost read the same file again."""
+    """Parse a file once: several channels and estimates of their cost read it again."""
     is_yaml = Path(path).suffix in (".yaml", ".yml")
     intervals = _of_commands(path, text) if is_yaml else _of_table(path, text)
     with naming(path):
@@ -271,7 +271,7 @@ def _interval(place: str, row: dict[str, str]) -> Interval:
 
 
 def _of_commands(path: str, text: str) -> tuple[Interval, ...]:
-    """Every stretch in the mode science."""
+    """Return every interval in the mode science."""
     root = parse_yaml(text, path)
     if not isinstance(root, dict):
         raise InputError(
@@ -297,7 +297,7 @@ def _of_commands(path: str, text: str) -> tuple[Interval, ...]:
 
 
 def _command(place: str, entry: object) -> tuple[str, float, str]:
-    """Where an entry is, its start as MJD and its mode."""
+    """Return the place of an entry, its start as MJD and its mode."""
     expected = "a start (modified Julian date, UTC, e.g. 61050.8) and a mode in each entry"
     wrong = f"a command table of OpSim needs {expected}"
     with naming(place):
@@ -308,6 +308,6 @@ def _command(place: str, entry: object) -> tuple[str, float, str]:
 
 
 def _date(mjd: float) -> str:
-    """To the microsecond, which is all that a double holds of it."""
+    """Return the ISO date to the microsecond, the precision of an MJD in one double."""
     with times.unannounced_leap_seconds():
         return str(Time(mjd, format="mjd", scale="utc", precision=6).isot)

@@ -1,17 +1,17 @@
-"""Times of data: leap seconds, the ephemeris' reach, windows and what a stamp stands for.
+"""Times of data: leap seconds, the ephemeris' reach, windows and the meaning of time stamps.
 
-Times are in UTC, of whatever kind files and users give them.
+Times of any kind that files and users give are converted to UTC.
 
-**Windows** are what samples were integrated over: what a visibility is the mean of. A sample has
-one or more pieces, within each of which its live time is spread evenly: one piece where the
-spectrometer integrated without a gap, or with a duty cycle far faster than the sky turns; several
-where something was left out. The mean over a window is that over its pieces, each with the weight
-of its live time.
+**Windows** are the periods over which samples were integrated: a visibility is the mean over its
+window. A sample has one or more pieces, within each of which its live time is spread evenly: one
+piece if the spectrometer integrated without a gap, or with a duty cycle far faster than the sky
+turns; several if part of the time was left out. The mean over a window is the mean over its pieces,
+weighted by live time.
 
-The times of samples are starts, middles or ends of their windows, or instants. Times and bounds
-that were rounded, such as single-precision seconds or Julian dates in one number, make windows
-overlap by as much. Such overlaps are halved between the two samples, and a live time that is longer
-than its window by as little is that of the window.
+The times of samples are starts, middles or ends of their windows, or instants. Rounded times and
+bounds, such as single-precision seconds or Julian dates in one number, make windows overlap
+slightly. Each such overlap is halved between the two samples, and a live time that exceeds its
+window by as little is cut to the window.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from lusee_bayes.core.reading import naming
 Numbers, Nodes = Int[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]
 EPHEMERIS_YEARS = (1900, 2050)
 EPHEMERIS_JD = [float(Time(f"{year}-01-01", scale="tdb").jd) for year in EPHEMERIS_YEARS]
-# scales of time that files may state
+# time scales that files may state
 SCALES = ("utc", "tai", "tt", "tdb")
-# what a file of Julian dates in two parts, jd1 and jd2, may state of them
+# attributes of Julian dates in two parts, jd1 and jd2, in a file
 JD_SCALES = {name: Attribute("text", optional=True) for name in ("jd1.scale", "jd2.scale")}
 
 
@@ -59,22 +59,22 @@ def seconds_from(origin: Time, times: Time) -> Any:
 
 
 def later(times: Time, seconds: Any) -> Time:
-    """Return the times so many seconds later."""
+    """Return the times ``seconds`` later."""
     with unannounced_leap_seconds():
         return times + seconds * u.s
 
 
 def time_of_text(name: str, text: str, scale: str = "utc") -> Time:
-    """Return the time of an ISO date in a scale.
+    """Return the time of an ISO date in a time scale.
 
     Raises
     ------
     InputError
-        If it is none, or outside the ephemeris; the message begins with ``name``.
+        If ``text`` is no date, or outside the ephemeris; the message begins with ``name``.
     """
     wrong = f"{name} '{text}' is not a date; write e.g. 2027-01-15T00:00:00"
     with refusing(wrong, ValueError, TypeError), unannounced_leap_seconds():
-        # astropy knows no Z, which ISO has for UTC
+        # astropy does not accept ISO's Z for UTC
         time = Time(text.removesuffix("Z"), scale=scale)
     require_ephemeris(np.atleast_1d(time.jd))
     return time
@@ -103,7 +103,7 @@ def require_ephemeris(jd: Times) -> None:
 
 
 def utc_of(jd1: Times, jd2: Times, scale: str = "utc") -> Time:
-    """Return times of Julian dates in two parts, in UTC.
+    """Return times in UTC from Julian dates in two parts.
 
     Raises
     ------
@@ -116,7 +116,7 @@ def utc_of(jd1: Times, jd2: Times, scale: str = "utc") -> Time:
 
 
 def scale_of(name: str, stated: str) -> str:
-    """Return a scale of time that a file states as ``name``. InputError if it is not known."""
+    """Return the time scale that a file states as ``name``; InputError if it is unknown."""
     if (scale := stated.strip().lower()) not in SCALES:
         raise InputError(f"{name} is '{stated}'; {nearest(scale, SCALES)}")
     return scale
@@ -125,12 +125,12 @@ def scale_of(name: str, stated: str) -> str:
 def utc_of_jd(content: Content) -> Time:
     """Return times of a file's ``jd1`` and ``jd2``, in UTC.
 
-    They are in the scale that the file states (:data:`JD_SCALES`), or in UTC.
+    Their scale is the one that the file states (:data:`JD_SCALES`), or UTC.
 
     Raises
     ------
     InputError
-        If the scale is not known or differs between the two, and as :func:`utc_of`.
+        If the scale is unknown or differs between the two, and as :func:`utc_of`.
     """
     scales = {scale_of(n, content.values[n]) for n in JD_SCALES if n in content.values} or {"utc"}
     if len(scales) > 1:
@@ -139,17 +139,17 @@ def utc_of_jd(content: Content) -> Time:
 
 
 def utc_times(times: Any) -> Time:
-    """Return times of any kind in UTC.
+    """Convert times of any kind to UTC.
 
     Parameters
     ----------
     times : (times,) Time, or sequence of datetime, datetime64 or str
-        A datetime without zone and an ISO date are in UTC.
+        A datetime without time zone and an ISO date are in UTC.
 
     Raises
     ------
     InputError
-        If they are none, or outside the ephemeris.
+        If they are not times, or outside the ephemeris.
     """
     if isinstance(times, Time):
         require_ephemeris(np.ravel(times.jd))
@@ -162,7 +162,7 @@ def utc_times(times: Any) -> Time:
         with unannounced_leap_seconds():
             parsed = Time(texts, scale="utc")
     except ValueError:
-        # dates of several forms, or something else that the message names
+        # dates of several formats, or an invalid one, which the message names
         return Time([time_of_text(f"time {k}", text) for k, text in enumerate(texts)])
     require_ephemeris(parsed.jd)
     return parsed
@@ -176,17 +176,17 @@ def _as_text(number: int, one: Any) -> str:
             f"time {number} is {one!r}, of type {type(one).__name__}; give datetimes, ISO dates in "
             "UTC, or an astropy Time"
         )
-    # astropy knows no Z, which ISO has for UTC
+    # astropy does not accept ISO's Z for UTC
     return one.removesuffix("Z")
 
 
 def step_of(times: Time, step_s: float | None) -> float:
-    """Return the integration time in seconds: the one given, or the median step of the times.
+    """Return the integration time in seconds: ``step_s``, or the median step of the times.
 
     Raises
     ------
     InputError
-        If there is one time only, and no step is given.
+        If there is only one time, and no step is given.
     """
     if step_s is not None:
         return float(step_s)
@@ -196,13 +196,13 @@ def step_of(times: Time, step_s: float | None) -> float:
 
 
 def counts_up(numbers: Int[np.ndarray, " n"]) -> bool:
-    """Return whether whole numbers count 0, 1, ... without going back or leaving one out."""
+    """Return whether integers count 0, 1, ... without going back or skipping one."""
     return numbers[0] == 0 and bool(np.isin(np.diff(numbers), (0, 1)).all())
 
 
-# times of a Julian date in two parts are exact to less than a nanosecond, others to a few of them
+# Julian dates in two parts are exact to less than a nanosecond, other times to a few
 ROUNDING_S = 1e-6
-# for people they are written to the millisecond
+# tolerance of times for people, which are written to the millisecond
 EYE_S = 0.01
 
 
@@ -213,16 +213,16 @@ class Windows(Described):
     Attributes
     ----------
     sample : (pieces,) array of int
-        The sample that each piece belongs to: 0, 1, ... without going back.
+        Sample number of each piece: 0, 1, ..., non-decreasing.
     start_s, end_s : (pieces,) array
         In seconds from the sample's time.
     live_s : (pieces,) array
-        What was integrated between them, in seconds.
+        Time integrated between them, in seconds.
 
     Raises
     ------
     InputError
-        For a piece that ends before it begins, overlaps the one before it, or was live for longer
+        For a piece that ends before it begins, overlaps the previous one, or was live for longer
         than it lasts or not at all, and for a sample without a piece.
     """
 
@@ -265,7 +265,7 @@ class Windows(Described):
 
     @classmethod
     def whole(cls, start_s: Times, end_s: Times, live_s: Times | None = None) -> Windows:
-        """Return windows of one piece each, live all of the time unless ``live_s`` says less."""
+        """Return windows of one piece each; ``live_s`` is by default their whole length."""
         live_s = end_s - start_s if live_s is None else live_s
         return cls(np.arange(len(start_s)), start_s, end_s, live_s)
 
@@ -296,13 +296,13 @@ class Windows(Described):
         return np.searchsorted(self.sample, np.arange(self.n_samples))
 
     def require_fitting(self, times: Time, step_s: float) -> None:
-        """Check that windows are those of samples at these times, a step apart.
+        """Check that windows match samples at these times, a step apart.
 
         Raises
         ------
         InputError
-            If there are more or fewer of them, and if one is longer than a step or overlaps the
-            next.
+            If their number is not that of the times, and if one is longer than a step or overlaps
+            the next.
         """
         if self.n_samples != len(times):
             raise InputError(f"windows of {self.n_samples} samples for {len(times)} times")
@@ -323,7 +323,7 @@ class Windows(Described):
             )
 
     def require_bounds(self, times: Time, bounds: Any) -> None:
-        """Check that windows of samples at these times have these bounds, which people read.
+        """Check bounds that were written for people against the windows of samples at these times.
 
         Raises
         ------
@@ -332,7 +332,7 @@ class Windows(Described):
         """
         seconds = seconds_from(times[:, None], utc_bounds(bounds, len(times)))
         if self.n_samples != len(times):
-            return  # an Observation says so
+            return  # an Observation reports this
         off = np.abs(seconds - self.bounds_s).max(axis=1)
         if (off > EYE_S).any():
             first = int(np.argmax(off > EYE_S))
@@ -348,7 +348,7 @@ class Windows(Described):
         return Windows(sample, self.start_s[kept], self.end_s[kept], self.live_s[kept])
 
     def nodes(self, n: int) -> tuple[Numbers, Nodes, Nodes]:
-        """Return instants whose weighted means are those over the windows (Gauss-Legendre).
+        """Return instants whose weighted means equal those over the windows (Gauss-Legendre).
 
         Parameters
         ----------
@@ -358,11 +358,11 @@ class Windows(Described):
         Returns
         -------
         sample : (nodes,) array of int
-            The sample of every instant, growing.
+            Sample number of every instant, non-decreasing.
         offset_s : (nodes,) array
-            Seconds from the sample's time, growing within each sample.
+            Seconds from the sample's time, increasing within each sample.
         weight : (nodes,) array
-            One in total for each sample.
+            Weights that sum to 1 for each sample.
         """
         x, w = np.polynomial.legendre.leggauss(n)
         middle, half = (self.start_s + self.end_s) / 2.0, (self.end_s - self.start_s) / 2.0
@@ -375,9 +375,9 @@ class Windows(Described):
 Timestamp = Literal["start", "middle", "end", "instant"]
 # from the time of a sample to the middle of its window, in lengths of the window
 TO_MIDDLE = {"start": 0.5, "middle": 0.0, "end": -0.5}
-# overlaps up to these are rounding of times: in seconds, and as a share of the step
+# largest overlaps due to rounded times: in seconds, and as a share of the step
 ROUNDED_S, ROUNDED_SHARE = 1e-3, 1e-4
-# what need not be given: from sample to sample, and what of it was integrated, in seconds
+# optional arguments: time from sample to sample, and the time integrated, in seconds
 Step, Live = float | None, Times | None
 # middles, step and windows of samples
 Windowed = tuple[Time, float, Windows | None]
@@ -391,20 +391,20 @@ def windows_of(
     Parameters
     ----------
     times : (times,) Time
-        With bounds, anywhere within the samples.
+        Times of the samples; with bounds, anywhere within them.
     timestamp : {"start", "middle", "end", "instant"}
-        What they are; without bounds samples last for a step each.
+        Meaning of the times; without bounds each sample lasts for a step.
     step_s : float, optional
-        From sample to sample, in seconds; by default the median.
+        Time from sample to sample, in seconds; by default the median.
     live_s : (times,) array, optional
-        What was integrated, in seconds; all of the time by default.
+        Time integrated in each sample, in seconds; by default all of it.
     bounds : (times, 2) array of any kind of times, optional
-        Start and end of each.
+        Start and end of each sample.
 
     Returns
     -------
     Time
-        The middles; for instants the times as they are.
+        The middles; for instants the unchanged times.
     float
         The step in seconds.
     Windows or None
@@ -413,8 +413,8 @@ def windows_of(
     Raises
     ------
     InputError
-        For another timestamp, for instants with live times or bounds, for a time outside its
-        bounds, without a step for a single sample, and as :class:`.Windows`.
+        For an unknown timestamp, for instants with live times or bounds, for a time outside its
+        bounds, for a single sample without a step, and as :class:`.Windows`.
     """
     if bounds is not None and timestamp != "instant":
         return _bounded(times, utc_bounds(bounds, len(times)), step_s, live_s)
@@ -449,7 +449,7 @@ def _bounded(times: Time, bounds: Time, step_s: Step, live_s: Live) -> Windowed:
 
 
 def utc_bounds(bounds: Any, n_times: int) -> Time:
-    """Return bounds of any kind of times in UTC.
+    """Convert bounds, of any kind of times, to UTC.
 
     Parameters
     ----------
@@ -476,7 +476,7 @@ def _rounding(step_s: float) -> float:
 
 
 def _windowed(times: Time, start_s: Times, end_s: Times, step_s: float, live_s: Live) -> Windowed:
-    """Middles of windows of one piece each, and these, with overlaps by rounding cut off."""
+    """Middles, step and windows of one piece each, with overlaps by rounding cut off."""
     middles, half = later(times, (start_s + end_s) / 2.0), (end_s - start_s) / 2.0
     overlap = end_s[:-1] - start_s[1:] - np.diff(seconds_from(times[0], times))
     cut = np.where((overlap > 0.0) & (overlap <= _rounding(step_s)), overlap / 2.0, 0.0)

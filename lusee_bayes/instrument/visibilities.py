@@ -1,14 +1,13 @@
 """Visibilities: the data set d of one frequency with its times, products and flags, and its file.
 
-The file is netCDF. Of the windows of samples, ``time_bounds`` is that of the CF conventions, for
-people and other software, and ``live_time`` goes with it. The pieces are exact: seconds from the
-time of their sample. Instants are declared by the attribute ``window``. A file with none of these
-does not say what its times are.
+The file is netCDF. Windows of samples are stored twice. ``time_bounds`` follows the CF conventions,
+for people and other software, and ``live_time`` goes with it. The pieces are exact: seconds from
+the time of their sample. The attribute ``window`` declares instants. In a file with none of these
+the meaning of the times is open.
 
-A :class:`Calibration` is what is left of a spectrometer's spectra in their averages. An average
-over channels and spectra has the radiometer noise of the independent samples of the voltages that
-it is the mean of; its gain is off by the errors of the gain table, which all spectra of one level
-of one port share.
+A :class:`Calibration` describes averages of a spectrometer's spectra. An average over channels and
+spectra has the radiometer noise of the independent voltage samples behind it. Its gain has the
+errors of the gain table, which all spectra of one level of one port share.
 """
 
 from __future__ import annotations
@@ -47,26 +46,26 @@ def _datetimes(times: Time) -> np.ndarray:
 
 
 def read_windows(content: Content, times: Time) -> tuple[Time, Windows | None]:
-    """Return what a file says of the windows of its samples.
+    """Return the windows of samples that a file specifies.
 
     Parameters
     ----------
     content : Content
-        Of :data:`LAYOUT`.
+        Content of a file with :data:`LAYOUT`.
     times : (times,) Time
-        Of its samples.
+        Times of its samples.
 
     Returns
     -------
     Time
-        The middles of the windows; the times as they are where there are none.
+        The middles of the windows; the unchanged times if there are no windows.
     Windows or None
 
     Raises
     ------
     InputError
-        For variables that belong together and are not all there, or contradict each other, and
-        as :class:`.Windows`.
+        If variables that belong together are incomplete or contradict each other, and as
+        :class:`.Windows`.
     """
     arrays, said = content.arrays, content.values.get("window")
     given = [name for name in (*PIECES, "time_bounds", "live_time") if name in arrays]
@@ -95,27 +94,27 @@ def read_windows(content: Content, times: Time) -> tuple[Time, Windows | None]:
 
 @dataclass(frozen=True)
 class Calibration:
-    """Samples behind every time, and what is not known about its gains.
+    """Number of samples behind every time, and errors of its gains.
 
     Attributes
     ----------
     n_averaged : (times,) array
-        Independent samples of complex voltages behind every time: bandwidth times live time, less
-        what unequal weights and overlapping channels cost.
+        Independent samples of complex voltages behind every time: bandwidth times live time, minus
+        the loss by unequal weights and overlapping channels.
     gain_names : tuple of str
         Errors of the gain table, such as "M0 PC1": level, port and component.
     gain_port : (errors,) array of int
-        The port of each.
+        Port of each error.
     gain_slope : (errors, times) array
-        By how much a port's power gain is above the table's, relative to it, where the error is
-        one prior standard deviation; 0 at times when the port has another level.
+        Relative excess of a port's power gain over the table's, for an error of one prior standard
+        deviation; 0 at times when the port has another level.
     lost : float
-        Share of the spectra that rules of the reduction flagged.
+        Share of the spectra that the reduction's rules flagged.
 
     Raises
     ------
     InputError
-        If lengths do not fit, or something is not finite or positive.
+        If lengths do not match, ``n_averaged`` is not positive, or ``gain_slope`` not finite.
     """
 
     n_averaged: Float[np.ndarray, " times"]
@@ -133,13 +132,13 @@ class Calibration:
             checks.require_finite("gain_slope", self.gain_slope)
 
     def select(self, keep: Bool[np.ndarray, " times"]) -> Calibration:
-        """Return that of the times where ``keep`` is True."""
+        """Return the calibration of the times where ``keep`` is True."""
         slope = None if self.gain_slope is None else self.gain_slope[:, keep]
         return replace(self, n_averaged=self.n_averaged[keep], gain_slope=slope)
 
 
 LOADS, LOAD = ("load_ohm_real", "load_ohm_imag"), ("load_frequency", "port", "port_2")
-# what to do where there is no file of them
+# advice if there is no file
 HINT = "make some with: lusee-bayes simulate SCENARIO"
 
 
@@ -169,7 +168,7 @@ class Visibilities(checks.Described):
     Raises
     ------
     InputError
-        If data, layout and observation do not fit each other, or data are not finite.
+        If data, layout and observation do not match, or data are not finite.
     """
 
     data: Float[Array, " data"]
@@ -207,7 +206,7 @@ class Visibilities(checks.Described):
         step_s: float | None = None,
         n_antennas: int = N_ANTENNAS,
     ) -> Visibilities:
-        """Make a data set of arrays.
+        """Create a data set from arrays.
 
         Parameters
         ----------
@@ -215,7 +214,7 @@ class Visibilities(checks.Described):
             In K. Complex correlations V_ij of pairs of ports, or their real and imaginary parts as
             real columns; NaN, or masked, where a sample is absent.
         times : (times,) sequence
-            Of the samples, growing: datetimes, ISO dates (UTC) or an astropy Time.
+            Times of the samples, increasing: datetimes, ISO dates (UTC) or an astropy Time.
         frequency_mhz : float
         products : sequence of str, optional
             The name of each column, in any order: "01" for complex data, "01R" and "01I" for real
@@ -224,20 +223,20 @@ class Visibilities(checks.Described):
         site : str or (float, float)
             Name, or selenographic longitude and latitude in degrees.
         flags : (times, products) or (times,) array of bool, optional
-            True where a sample is not to be used.
+            True where a sample is not used.
         turntable_deg : float or (times,) array
             Turntable angle in degrees, from East towards North.
         convention : {"s_i conj(s_j)", "conj(s_i) s_j"}
-            What "ij" is the mean of, for voltages that vary as exp(+i w t). With exp(-i w t), the
-            imaginary part changes sign.
+            The quantity averaged as "ij", for voltages that vary as exp(+i w t). With exp(-i w t),
+            the imaginary part changes sign.
         timestamp : {"middle", "start", "end", "instant"}
             Meaning of the times. Samples are means over windows of ``step_s``, unless they are
             instants.
         bounds : (times, 2) sequence, optional
-            Start and end of every sample, of any kind of times, if they do not follow from
-            ``timestamp`` and ``step_s``. The times may then lie anywhere between.
+            Start and end of every sample, as any kind of times, if ``timestamp`` and ``step_s`` do
+            not give them. The times may then lie anywhere between.
         live_s : float or (times,) array, optional
-            How long each sample was integrated, in seconds; by default all of its window.
+            Time integrated in each sample, in seconds; by default all of its window.
         step_s : float, optional
             Time between samples, in seconds; by default the median.
         n_antennas : int
@@ -305,7 +304,7 @@ class Visibilities(checks.Described):
         return np.where(present, np.asarray(self.layout.scatter(self.data)), np.nan)
 
     def stamped(self, timestamp: str) -> Visibilities:
-        """Return the same data with this meaning of their times; windows last for a step.
+        """Return the same data with this meaning of their times; each window lasts for a step.
 
         Parameters
         ----------
@@ -323,7 +322,7 @@ class Visibilities(checks.Described):
         return replace(self, observation=seen, says_window=True)
 
     def select(self, keep: Bool[np.ndarray, " times"]) -> Visibilities:
-        """Return the same at those times only where ``keep`` is True."""
+        """Return the data at the times where ``keep`` is True."""
         layout = DataLayout.from_flags(~np.asarray(self.layout.present)[:, keep])
         data = layout.gather(self.layout.scatter(self.data)[:, keep])
         said = None if self.calibration is None else self.calibration.select(keep)
@@ -331,7 +330,7 @@ class Visibilities(checks.Described):
         return replace(self, data=data, layout=layout, observation=seen, calibration=said)
 
     def with_truth_up_to(self, lmax: int) -> Visibilities:
-        """Return the same with the truth of a map of this lmax: cut, or zero above its own."""
+        """Return the same data with the truth cut, or padded with zeros, to this lmax."""
         if self.truth is None or len(self.truth) == n_modes(lmax):
             return self
         truth = np.asarray(self.truth)[: n_modes(lmax)]
@@ -340,7 +339,7 @@ class Visibilities(checks.Described):
     def to_dataset(self) -> xr.Dataset:
         """Return a Dataset with dims product, time and run_number.
 
-        With the dims piece and bounds for windows, and mode if the truth is known.
+        Windows add the dims piece and bounds, a known truth adds mode.
         """
         seen, windows, receiver = self.observation, self.observation.windows, self.receiver
         arrays = {
@@ -374,7 +373,7 @@ class Visibilities(checks.Described):
         return dataset.assign(time_bounds=(("time", "bounds"), bounds, {}, ENCODING))
 
     def write(self, path: str | Path, attrs: dict[str, str] | None = None) -> Path:
-        """Write a netCDF file, whole or not at all.
+        """Write a netCDF file, complete or not at all.
 
         Parameters
         ----------
@@ -405,7 +404,7 @@ LAYOUT = Layout(
         "piece_sample": Variable(("piece",), "integer", low=0.0, optional=True),
         **{name: Variable(("piece",), optional=True, unit="s") for name in PIECES[1:]},
         "truth": Variable(("mode",), optional=True, unit="K"),
-        # the receivers' loads ZL, where they are known
+        # the receivers' loads ZL, if known
         "load_frequency_mhz": Variable(LOAD[:1], low=0.0, grows=True, optional=True, unit="MHz"),
         **dict.fromkeys(LOADS, Variable(LOAD, optional=True, unit="Ohm")),
     },
@@ -421,7 +420,7 @@ LAYOUT = Layout(
 
 
 def read_visibilities(path: str | Path) -> Visibilities:
-    """Read a file that :meth:`Visibilities.write` has written.
+    """Read a file written by :meth:`Visibilities.write`.
 
     Parameters
     ----------
@@ -434,8 +433,8 @@ def read_visibilities(path: str | Path) -> Visibilities:
     Raises
     ------
     InputError
-        If the file is missing or of another kind, holds NaN that is not flagged, or has nothing
-        but flagged samples.
+        If the file is missing or of another kind, contains NaN that is not flagged, or only flagged
+        samples.
     """
     require_file(path, "data", HINT)
     content = read_netcdf(path, formats.VISIBILITIES, LAYOUT, HINT)

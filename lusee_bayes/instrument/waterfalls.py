@@ -1,25 +1,25 @@
 """luseepy's waterfalls: files of many frequencies, read and written.
 
-They hold visibilities of all times, products and frequencies.
+They contain visibilities of all times, products and frequencies.
 
-**LUNAR_DAY** says where luseepy's ranges of time begin. It is "UTC to UTC"; a calendar year, CY2026
-or CY26, which luseepy begins at one o'clock on the first of January; a fiscal year, FY2026 or FY26,
-from the first of October of the year before; or the number of a lunar day: 2603 is the fourth of
-those that begin in 2026. A lunar day begins when the Sun is highest at 180 degrees of longitude on
-the Moon's equator. luseepy finds that to a few seconds, and so does this module.
+**LUNAR_DAY** gives the start of luseepy's ranges of time. It is "UTC to UTC"; a calendar year,
+CY2026 or CY26, which in luseepy begins at one o'clock on the first of January; a fiscal year,
+FY2026 or FY26, from the first of October of the year before; or the number of a lunar day: 2603 is
+the fourth that begins in 2026. A lunar day begins when the Sun is highest at 180 degrees of
+longitude on the Moon's equator. Both luseepy and this module compute that to a few seconds.
 
-**Those of its scalar simulator** are in K. FITS: image ``data`` (time, product, frequency),
+**Files of its scalar simulator** are in K. FITS: image ``data`` (time, product, frequency),
 ``freq`` in MHz, ``combinations`` (pairs of ports; an auto has one column, a cross two, Re and Im).
-Header: LUNAR_DAY, DELTAT_SEC, LUN_LAT_DEG, LUN_LONG_DEG; times are start + k DELTAT_SEC. Impedances
-of the ports in Ohm, ZRe_i and ZIm_i, are there for luseepy's conversion to V^2/Hz.
+Header: LUNAR_DAY, DELTAT_SEC, LUN_LAT_DEG, LUN_LONG_DEG; times are start + k DELTAT_SEC. The ports'
+impedances in Ohm, ZRe_i and ZIm_i, serve luseepy's conversion to V^2/Hz.
 
-**Those of its four-port simulator** are covariances at the receivers' inputs, in V^2/Hz. FITS
-version 3: image ``data`` (time, product, frequency); ``freq`` in MHz; ``time`` (JD1, JD2) in
-the scale TIMESYS; table ``products`` with a column ``label``; U (frequency, port, port), the
-covariance that an enclosure of 1 K makes, as ``blackbody_normalization``; the receivers' loads ZL
-(frequency, port, port) in Ohm. Header: LUN_LAT_DEG, LUN_LONG_DEG, DELTAT_SEC, TMOON_K, TANT_K and
-FREQINT, the interpolation of the response between its frequencies. Divided by sqrt(U_aa U_bb),
-visibilities are in K.
+**Files of its four-port simulator** are covariances at the receivers' inputs, in V^2/Hz. FITS
+version 3: image ``data`` (time, product, frequency); ``freq`` in MHz; ``time`` (JD1, JD2) in the
+scale TIMESYS; table ``products`` with a column ``label``; U (frequency, port, port), the covariance
+in an enclosure at 1 K, as ``blackbody_normalization``; the receivers' loads ZL (frequency, port,
+port) in Ohm. Header: LUN_LAT_DEG, LUN_LONG_DEG, DELTAT_SEC, TMOON_K, TANT_K and FREQINT, the
+interpolation of the response between its frequencies. Visibilities divided by sqrt(U_aa U_bb) are
+in K.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ from lusee_bayes.instrument.observation import Observation, body_direction
 from lusee_bayes.instrument.visibilities import Visibilities
 
 ByTime, Hdu = Float[np.ndarray, "times products frequencies"], fits.ImageHDU | fits.BinTableHDU
-# words of the header that both kinds of files have
+# header entries that both kinds of files have
 SITE_AND_STEP = {
     "LUN_LONG_DEG": Attribute(low=-360.0, high=360.0),
     "LUN_LAT_DEG": Attribute(low=-90.0, high=90.0),
@@ -71,16 +71,16 @@ class Waterfall(Described):
         In K, in the package's order of products; NaN where a sample is missing.
     frequencies_mhz : (frequencies,) array
     observation : Observation
-        Of instants: luseepy's simulators evaluate the sky at the times, and neither layout has
-        windows.
+        Its samples are instants: luseepy's simulators evaluate the sky at the times, and neither
+        layout has windows.
     per_kelvin : (frequencies, ports) array or None
-        V^2/Hz that 1 K makes at each port; None unless the file is in V^2/Hz.
+        V^2/Hz for 1 K at each port; None unless the file is in V^2/Hz.
     moon_k, antenna_k : float
         Temperatures in K of the Moon and of the antennas, whose emission the visibilities contain.
     receiver : MeasuredReceiver or None
-        The receivers' loads at the channels; None unless the file holds them.
+        The receivers' loads at the channels; None if the file lacks them.
     interpolation : str or None
-        How luseepy calls its interpolation of the response between channels; None if not said.
+        luseepy's name of its interpolation of the response between channels; None if not stated.
     """
 
     path: str
@@ -113,7 +113,7 @@ class Waterfall(Described):
         Raises
         ------
         InputError
-            If the file has none there.
+            If the file has no such channel.
         """
         return place_of(f"{self.path} has no channel", self.frequencies_mhz, frequency_mhz)
 
@@ -133,7 +133,7 @@ class Waterfall(Described):
         Raises
         ------
         InputError
-            If the file has no such channel, has products of other ports, or nothing is left.
+            If the file has no such channel, has products of other ports, or no data remain.
         """
         channel = self.channel(frequency_mhz)
         values = self.grid[:, :, channel]
@@ -155,12 +155,12 @@ YEAR = re.compile(r"(CY|FY)([0-9]{2}|[0-9]{4})")
 LUNAR_DAY = re.compile(r"[0-9]{3,4}")
 # luseepy looks for noons day by day until the end of January of the next year
 DAYS_AFTER_NEW_YEAR = 30
-# of the noon of a lunar day, a tenth of a second
+# tolerance of the noon of a lunar day: a tenth of a second
 NOON_JD = 1e-6
 
 
 def start_of(text: str) -> Time:
-    """Return the first time of a range, in UTC.
+    """Return the start of a range of time, in UTC.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ def start_of(text: str) -> Time:
     Raises
     ------
     InputError
-        If the range is of no known kind, or outside the ephemeris.
+        If the kind of range is unknown, or it starts outside the ephemeris.
     """
     word = text.strip()
     if named := YEAR.fullmatch(word):
@@ -211,7 +211,7 @@ def _noon(number: int) -> Time:
 
 
 def _sun_height(jd: Float[np.ndarray, " times"]) -> Float[np.ndarray, " times"]:
-    """Sine of the Sun's altitude in the middle of the far side."""
+    """Sine of the Sun's altitude at the centre of the far side."""
     zeros = np.zeros(len(jd), dtype=int)
     far_side = Observation(180.0, 0.0, times.utc_of(jd, np.zeros(len(jd))), zeros, (0.0,), 1.0)
     return np.einsum("ti,ti->t", body_direction("Sun", far_side), far_side.zenith_galactic())
@@ -243,13 +243,13 @@ def read_scalar(path: Path) -> Waterfall:
     Raises
     ------
     InputError
-        For a truncated file, a missing image or header entry, columns that do not fit the
+        For a truncated file, a missing image or header entry, columns that do not match the
         products, ports beyond 0..3, or a bad date.
     """
     content = read_fits(path, SCALAR_WATERFALL)
     data, columns = content.arrays["data"], []
     for i, j in content.arrays["combinations"]:
-        # V_ji is V_ij conjugated
+        # V_ji is the conjugate of V_ij
         pair, sign = f"{min(i, j)}{max(i, j)}", 1.0 if i < j else -1.0
         columns += [(f"{pair}R", 1.0)] if i == j else [(f"{pair}R", 1.0), (f"{pair}I", sign)]
     if data.shape[1] != len(columns):
@@ -272,7 +272,7 @@ def _observation(at: Time, said: Mapping[str, Any]) -> Observation:
 
 
 UNIT = "V^2/Hz"
-# what FREQINT calls the interpolation of responses between their frequencies
+# FREQINT's names of the interpolation of responses between their frequencies
 INTERPOLATIONS: dict[Interpolation, str] = {"linear": "linear-native-alm", "spline": "cubic-spline"}
 FOUR_PORT_WATERFALL = Layout(
     "a waterfall of luseepy's four-port simulator",
@@ -310,8 +310,8 @@ def read_four_port(path: Path) -> Waterfall:
     Raises
     ------
     InputError
-        For a truncated file, a missing image or header entry, shapes or a unit that do not fit,
-        unknown products, or times that do not grow.
+        For a truncated file, a missing image or header entry, wrong shapes or a wrong unit, unknown
+        products, or times that do not increase.
     """
     content = read_fits(path, FOUR_PORT_WATERFALL)
     images, said = content.arrays, content.values
@@ -364,7 +364,7 @@ def write_waterfall(
     impedance_ohm: Complex[np.ndarray, " frequencies"] | None = None,
     scenario: str | None = None,
 ) -> Path:
-    """Write channels of one observation as luseepy's scalar simulator does, whole or not at all.
+    """Write channels of one observation like luseepy's scalar simulator, complete or not at all.
 
     Missing samples become NaN.
 
@@ -373,7 +373,7 @@ def write_waterfall(
     path : str or Path
     channels : sequence of Visibilities
     impedance_ohm : (frequencies,) complex array, optional
-        Of the arms; NaN where it is not known.
+        Impedance of the arms; NaN where it is unknown.
     scenario : str, optional
         Text of the scenario, stored as an image of bytes that luseepy ignores.
 
@@ -384,9 +384,9 @@ def write_waterfall(
     Raises
     ------
     InputError
-        For what the layout cannot hold: windows, times other than start + k step, turntable angles
-        other than 0, other than four ports, channels of different observations, fewer than two
-        channels.
+        For anything the layout cannot store: windows, times other than start + k step, turntable
+        angles other than 0, other than four ports, channels of different observations, fewer than
+        two channels.
     """
     path, first = user_path(path), channels[0].observation
     if len(channels) < 2:
@@ -411,7 +411,7 @@ def write_waterfall(
 
 
 def _kelvin(path: Path, channels: Sequence[Visibilities]) -> ByTime:
-    """Samples of all channels, NaN where they are missing; InputError if there is no room."""
+    """Samples of all channels, NaN where missing; InputError if the layout cannot store them."""
     first = channels[0].observation
     for channel in channels:
         if (observation := channel.observation).windows is not None:
@@ -429,8 +429,8 @@ def _kelvin(path: Path, channels: Sequence[Visibilities]) -> ByTime:
 
 
 def _site_and_times(observation: Observation) -> dict[str, Any]:
-    """The words of the header that say where and when."""
-    # luseepy counts steps up to the end: half a step less leaves no room for rounding
+    """Header entries for site and times."""
+    # luseepy counts steps up to the end: half a step less makes rounding harmless
     last = times.later(observation.times[-1], -0.5 * observation.step_s)
     ends = [Time(t, format="iso", precision=9).value for t in (observation.times[0], last)]
     return {
@@ -443,7 +443,7 @@ def _site_and_times(observation: Observation) -> dict[str, Any]:
 
 
 def _write(path: Path, hdus: list[Hdu], header: dict[str, Any], scenario: str | None) -> Path:
-    """Write a FITS file, whole or not at all; the first image, ``data``, becomes the primary."""
+    """Write a FITS file, complete or not at all; the first image, ``data``, is the primary."""
     primary = fits.PrimaryHDU(hdus[0].data)
     for key, value in ({"EXTNAME": "data"} | header).items():
         primary.header[key if len(key) <= 8 else f"HIERARCH {key}"] = value
@@ -468,24 +468,24 @@ def write_four_port(
     response: str = "unknown",
     scenario: str | None = None,
 ) -> Path:
-    """Write channels of one observation in V^2/Hz, whole or not at all.
+    """Write channels of one observation in V^2/Hz, complete or not at all.
 
-    Times are written as they are. Missing samples become NaN, and with them what is computed of the
+    Times are written unchanged. Missing samples become NaN, and so do all numbers computed from the
     covariance at their time.
 
     Parameters
     ----------
     path : str or Path
     channels : sequence of Visibilities
-        In K, with the emission of Moon and antennas.
+        In K, including the emission of Moon and antennas.
     circuits : sequence of Circuit
         Antennas and loads of each channel.
     moon_k, antenna_k : float
         Temperatures of the Moon and of the antennas.
     interpolation : {"linear", "spline"}
-        Of the response between its own frequencies.
+        Interpolation of the response between its own frequencies.
     response : str
-        Name of its file.
+        Name of the response's file.
     scenario : str, optional
         Text of the scenario, stored as an image of bytes that luseepy ignores.
 
@@ -496,8 +496,8 @@ def write_four_port(
     Raises
     ------
     InputError
-        For what the layout cannot hold: open ports, windows, turntable angles other than 0, other
-        than four ports, channels of different observations.
+        For anything the layout cannot store: open ports, windows, turntable angles other than 0,
+        other than four ports, channels of different observations.
     """
     path, observation = user_path(path), channels[0].observation
     if (receiver := circuits[0].receiver) is None:
@@ -564,7 +564,7 @@ def write_four_port(
 
 
 def _hdus(name: str, values: Any, unit: str) -> list[fits.ImageHDU]:
-    """An image, or those of the real and the imaginary part."""
+    """An image, or two for the real and the imaginary part."""
     parts = {name: np.asarray(values)}
     if np.iscomplexobj(values):
         parts = {f"{name}_real": np.real(values).copy(), f"{name}_imag": np.imag(values).copy()}
@@ -573,7 +573,7 @@ def _hdus(name: str, values: Any, unit: str) -> list[fits.ImageHDU]:
 
 
 def _eigenvalues(data: ByTime) -> Float[np.ndarray, "times frequencies ports"]:
-    """Of the covariance of the ports at every time; NaN where a product is missing."""
+    """Eigenvalues of the ports' covariance at every time; NaN where a product is missing."""
     covariance = np.moveaxis(products.to_matrix(np.moveaxis(data, 1, 0)), (0, 1), (2, 3))
     complete = np.isfinite(data).all(1)
     values = np.full((*complete.shape, covariance.shape[-1]), np.nan)

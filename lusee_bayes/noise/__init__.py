@@ -1,1 +1,1 @@
-"""The terms of N: covariances of what the instrument adds to the visibilities of the sky."""
+"""The terms of N: covariances of the instrument's contributions to the visibilities."""

@@ -1,20 +1,20 @@
-"""N: what every kind of covariance of the noise answers, and the kinds.
+"""N: the interface of covariances of the noise, and its kinds.
 
 A :class:`Covariance` describes N by its dense form and its diagonal. :meth:`Covariance.factor` does
 the expensive part once and returns a :class:`Factor`, a square root N = L L^T that whitens vectors
 (L^-1 x), colours them (L z) and solves with N.
 
-A new structure is one file, as :mod:`.time_blocks` is: implement the abstract methods here, and
+A new structure is one file, such as :mod:`.time_blocks`: implement the abstract methods here, and
 ``absorb`` for the sums that keep the structure. ``a + b`` tries whether either side can absorb the
 other.
 
-**Noise along a few directions**, such as templates with prior variances or beam errors: U U^T alone
-is singular; added to any other covariance N_0 it gives N_0 + U U^T, which is solved through the
+**Noise along a few directions**, such as templates with prior variances or beam errors: U U^T is
+singular, but added to another covariance N_0 it gives N_0 + U U^T, which is solved through the
 small matrix C = 1 + V^T V, V = L_0^-1 U (Woodbury). With C = R R^T, ::
 
     B = 1 - V R^-T (R + 1)^-1 V^T     satisfies     B B^T = (1 + V V^T)^-1,
 
-so that L = L_0 B^-T is a square root of the sum, applied by products with V. Nothing is subtracted
+so L = L_0 B^-T is a square root of the sum, applied by products with V. Nothing is subtracted
 from N_0^-1, which would leave a small difference of large numbers.
 """
 
@@ -39,14 +39,14 @@ from lusee_bayes.instrument.products import Columns, DataLayout
 class Factor(eqx.Module):
     """A square root L of a covariance: N = L L^T.
 
-    L need not be triangular, and each kind of factor orders whitened entries as it likes: only L z
-    of independent normals z, and products of whitened vectors with each other, have a meaning.
+    L need not be triangular, and each kind of factor has its own order of whitened entries.
+    Only L z of independent normals z, and products of whitened vectors, are meaningful.
 
     Attributes
     ----------
     couples_times : bool
-        Whether N may couple different times. If not, every whitened entry is made of data of its
-        own time.
+        Whether N may couple different times. If not, every whitened entry depends only on data of
+        its time.
     """
 
     couples_times: ClassVar[bool] = True
@@ -61,7 +61,7 @@ class Factor(eqx.Module):
 
     @abstractmethod
     def colour(self, z: Columns) -> Columns:
-        """Return L z, which turns independent unit normals into draws of N(0, N)."""
+        """Return L z, which turns independent unit normals into samples from N(0, N)."""
 
     @abstractmethod
     def log_det(self) -> Float[Array, ""]:
@@ -103,19 +103,19 @@ class Covariance(checks.Described, eqx.Module):
 
     @abstractmethod
     def absorb(self, other: Covariance) -> Covariance | None:
-        """Return ``self + other`` if ``self`` has a structure that can hold it, None otherwise."""
+        """Return ``self + other`` if the structure of ``self`` can represent it, None otherwise."""
 
     @abstractmethod
     def scaled(self, factor: float | Float[Array, ""]) -> Covariance:
         """Return ``factor * N`` for a positive factor."""
 
     def time_weights(self, layout: DataLayout) -> Float[Array, "..."] | None:
-        """Return N^-1 on the full grid, if N couples no two times.
+        """Return N^-1 on the full grid, if N does not couple different times.
 
         Parameters
         ----------
         layout : DataLayout
-            Of the data.
+            Layout of the data.
 
         Returns
         -------
@@ -140,11 +140,11 @@ class Covariance(checks.Described, eqx.Module):
 
     @property
     def rank(self) -> int:
-        """Number of independent normals behind a draw of N(0, N)."""
+        """Number of independent normals behind a sample from N(0, N)."""
         return self.size
 
     def colour(self, z: Float[Array, "white *columns"]) -> Columns:
-        """Turn ``rank`` independent normals, or columns of them, into draws of N(0, N)."""
+        """Turn ``rank`` independent normals, or columns of them, into samples from N(0, N)."""
         return self.factor().colour(z)
 
     def sample(self, key: PRNGKeyArray, n: int | None = None) -> Float[Array, "..."]:
@@ -172,7 +172,7 @@ class Covariance(checks.Described, eqx.Module):
 
 
 def log_det_of_lower(lower: Float[Array, "*batch n n"]) -> Float[Array, ""]:
-    """ln|L L^T|, of all blocks together."""
+    """ln|L L^T|, summed over all blocks."""
     xp = namespace(lower)
     return xp.asarray(2.0 * xp.log(xp.diagonal(lower, axis1=-2, axis2=-1)).sum())
 
@@ -208,19 +208,19 @@ class CholeskyFactor(Factor):
 
 
 class DenseCovariance(Covariance):
-    """A covariance that is given as a matrix.
+    """A covariance given as a matrix.
 
     Attributes
     ----------
     matrix : (data, data) array
         N in K^2.
     name : str
-        Of the term, for error messages.
+        Name of the term, for error messages.
 
     Raises
     ------
     InputError
-        Unless the matrix is square, finite and symmetric.
+        If the matrix is not square, finite and symmetric.
     """
 
     matrix: Float[Array, "data data"]
@@ -333,7 +333,7 @@ class LowRankCovariance(Covariance):
     root : (data, rank) array
         U in K.
     name : str
-        Of the term, for error messages.
+        Name of the term, for error messages.
 
     Raises
     ------
@@ -410,7 +410,7 @@ class LowRankUpdate(Covariance):
         return self.base.dense() + self.update.dense()
 
     def factor(self, base: Factor | None = None):
-        """L, where that of N_0 may be known."""
+        """Return L; the factor of N_0 may be given."""
         base = self.base.factor() if base is None else base
         v = base.whiten(self.update.root)
         small = np.eye(v.shape[1]) + v.T @ v
@@ -429,14 +429,14 @@ class LowRankUpdate(Covariance):
 
 
 class KnownFactor(Covariance):
-    """N with its square root, computed once: programs would do it at every evaluation.
+    """N with its square root, computed once and not at every evaluation of a program.
 
     Attributes
     ----------
     covariance : Covariance
         N.
     root : Factor
-        Of N.
+        Square root of N.
     """
 
     covariance: Covariance
@@ -444,7 +444,7 @@ class KnownFactor(Covariance):
 
     @classmethod
     def of(cls, noise: Covariance) -> KnownFactor:
-        """Factorise it. InputError if it is not positive definite."""
+        """Factorise N; InputError if it is not positive definite."""
         return cls(noise, noise.factor())
 
     @property

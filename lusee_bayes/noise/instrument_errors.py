@@ -1,6 +1,6 @@
 """Errors of gains and beams as terms of N.
 
-Besides, noise along templates of the user, T P T^T.
+Also noise along templates of the user, T P T^T.
 
 **Gain drifts** are Gaussian processes g_i(t), one per antenna, that multiply the visibilities, ::
 
@@ -16,10 +16,10 @@ and with the mean sigma_g^2 d_ii in the autos. The quadratic part is not negligi
 0.01 it is 1e-4 of the signal, ten times the radiometer noise.
 
 **Errors of the beams** in A: N_beam = dA (S + mu mu^T) dA^T along known directions dA. If the true
-coupling matrix is A + dA, the data hold dA m besides A m; over skies of the prior, that is noise of
-covariance dA S dA^T (paper, section on beam precision). Directions: the difference to another beam
-(a frequency shift, another file), or the derivative with respect to a parameter of the embedded
-beam times its standard deviation.
+coupling matrix is A + dA, the data contain dA m besides A m; over skies from the prior, that is
+noise of covariance dA S dA^T (paper, section on beam precision). Directions: the difference to
+another beam (a frequency shift, another file), or the derivative with respect to a parameter of the
+embedded beam times its standard deviation.
 """
 
 from __future__ import annotations
@@ -80,14 +80,14 @@ def template_noise(
     return LowRankCovariance(templates @ root, "the templates")
 
 
-# C_g is dropped where it is below double precision relative to sigma_g^2: exp(-x^2 / 2) = eps
+# C_g is dropped below double precision relative to sigma_g^2: exp(-x^2 / 2) = eps
 REACH = float(np.sqrt(-2.0 * np.log(np.finfo(np.float64).eps)))
 
 
 class GainDrift(eqx.Module):
-    """Gain drifts, independent between antennas and alike for all of them.
+    """Gain drifts, independent between antennas and of equal statistics.
 
-    Differentiable in both parameters where the width of the band is given.
+    Differentiable in both parameters if the width of the band is given.
 
     Attributes
     ----------
@@ -114,7 +114,7 @@ class GainDrift(eqx.Module):
         return self.sigma**2 * jnp.exp(-((lag_h / self.correlation_h) ** 2) / 2.0)
 
     def width(self, hours: Hours) -> int:
-        """Return how many samples apart two times can be and still be correlated."""
+        """Return the largest distance in samples between times that are correlated."""
         first = np.searchsorted(hours, np.asarray(hours) - REACH * float(self.correlation_h))
         return int((np.arange(len(hours)) - first).max())
 
@@ -130,10 +130,10 @@ class GainDrift(eqx.Module):
         visibilities : (products, times) array
             d_k(t) on the full grid, in K.
         hours : (times,) array
-            Growing times of the samples.
+            Increasing times of the samples.
         layout : DataLayout
         width : int, optional
-            Of the band in samples, by default as far as C_g reaches.
+            Width of the band in samples, by default the reach of C_g.
 
         Returns
         -------
@@ -143,7 +143,7 @@ class GainDrift(eqx.Module):
         Raises
         ------
         InputError
-            If shapes do not fit, visibilities are not finite or times do not grow.
+            If shapes do not match, visibilities are not finite or times do not increase.
         """
         checks.require_array("the visibilities", visibilities, (layout.n_products, layout.n_times))
         checks.require_shape("hours", hours, (layout.n_times,))
@@ -153,7 +153,7 @@ class GainDrift(eqx.Module):
         earlier = np.arange(layout.n_times)[:, None] - np.arange(width + 1)[None]
         lag = jnp.asarray(hours)[:, None] - jnp.asarray(hours)[np.maximum(earlier, 0)]
         kernel = jnp.where(jnp.asarray(earlier >= 0), self.kernel(lag), 0.0)
-        # how many antennas two products share, and in how many ways two of them
+        # number of antennas that two products share, and of ways in which they share two
         i, j, _ = ports(round(np.sqrt(layout.n_products)))
         ii, ij, ji, jj = (np.equal.outer(a, b).astype(np.float64) for a in (i, j) for b in (i, j))
         linear, quadratic = ii + ij + ji + jj, ii * jj + ij * ji
@@ -175,7 +175,7 @@ class GainDrift(eqx.Module):
     def history(
         self, white: Float[Array, "antennas grid"], hours: Hours, grid: Float[Array, " grid"]
     ) -> Gains:
-        """Return the gains that white noise on an even grid of times makes.
+        """Return the gains from white noise on an even grid of times.
 
         The noise is convolved with a Gaussian of width sigma_t / sqrt(2); a sum over a spacing of
         sigma_t / 3 or less equals the integral to exp(-9 pi^2 / 2). Differentiable in everything.
@@ -186,7 +186,7 @@ class GainDrift(eqx.Module):
             Independent unit normals.
         hours : (times,) array
         grid : (grid,) array
-            Even times in hours, as of :func:`white_grid`.
+            Even times in hours, as from :func:`white_grid`.
 
         Returns
         -------
@@ -212,13 +212,13 @@ def white_grid(
     Parameters
     ----------
     hours : (times,) array
-        Of the samples.
+        Times of the samples.
     shortest_h, longest_h : float
-        Range of correlation times in hours that the grid has to serve; by default one.
+        Range of correlation times in hours that the grid serves; by default a single one.
     per_correlation : float
         Number of grid times in the shortest correlation time.
     margin : float
-        How far the grid goes on beyond the samples, in longest correlation times.
+        Reach of the grid beyond the samples, in longest correlation times.
 
     Returns
     -------
@@ -284,7 +284,7 @@ def difference(true: ProductBeams, model: ProductBeams) -> ProductBeams:
 def rms_difference(true: ProductBeams, model: ProductBeams) -> float:
     """Return the RMS difference of two beams, relative to the RMS of ``model``.
 
-    Over products and directions, by Parseval's theorem from the coefficients up to lmax.
+    Computed over products and directions, by Parseval's theorem from the coefficients up to lmax.
     """
     error = difference(true, model).modes
     return float(jnp.sqrt((error**2).sum() / (model.modes**2).sum()))

@@ -1,9 +1,9 @@
 """Radiometer noise: its variances, and covariances between products.
 
-**Sample covariances** of complex Gaussian voltages, for as many samples as a spectrum averages: the
-mean of v v* over N independent samples of covariance T = L L* is T + L H L* / sqrt(N), where H is
-Hermitian and for large N Gaussian: real numbers of variance one on its diagonal, complex ones of
-mean square one beside it. Its covariances are those of :func:`.exact_blocks`, divided by N.
+**Sample covariances** of complex Gaussian voltages: the mean of v v* over the N independent samples
+in a spectrum, of covariance T = L L*, is T + L H L* / sqrt(N). H is Hermitian and for large N
+Gaussian: real numbers of variance one on its diagonal, complex ones of mean square one off it. Its
+covariances are those of :func:`.exact_blocks`, divided by N.
 
 **N has two forms.** With T_ij(t) the visibilities of the antennas in K, bandwidth df and
 integration time dt (times the duty cycle)::
@@ -38,13 +38,13 @@ def sample_covariances(t: Matrices, n_averaged: float, generator: np.random.Gene
     t : (antennas, antennas, ...) array
         The covariances T.
     n_averaged : float
-        Independent samples behind each.
+        Number of independent samples in each.
     generator : Generator
 
     Raises
     ------
     InputError
-        If one of the T is not positive definite: no voltages have it.
+        If a T is not positive definite, as that of voltages must be.
     """
     wrong = (
         "the covariance of the voltages is not positive definite, so that its radiometer noise is "
@@ -85,16 +85,16 @@ def radiometer_noise(
     ----------
     visibilities : (products, times) array
         Modelled or measured V_k(t) on the full grid, in K. Samples that are absent from the
-        layout may be 0 or NaN; :func:`.without_gaps` fills them where noise depends on them.
+        layout may be 0 or NaN; :func:`.without_gaps` fills them if noise depends on them.
     layout : DataLayout
     bandwidth_hz : float
     step_s : float or (times,) array
-        Integration time in seconds: of all samples, or the live time of each.
+        Integration time in seconds: one for all samples, or the live time of each.
     form : {"paper", "exact"}
     duty_cycle : float
         Fraction of ``step_s`` spent integrating.
     factor : float
-        Multiplies the variance: 10 for ten times the noise power.
+        Factor of the variance: 10 for ten times the noise power.
 
     Returns
     -------

@@ -2,9 +2,9 @@
 
 **Noise that couples the products of one time** has a block for each time. **Noise that is
 correlated in time** has blocks for times up to some number of samples apart. The matrix is banded
-where the products of one time stand together. Its Cholesky factor fills only the band, so that
-factorising costs O(times x bandwidth^2). Several times make up one block row, large enough for
-matrix products to run at full speed and small enough to follow the edge of the band.
+if the products of one time are adjacent. Its Cholesky factor fills only the band, so factorising
+costs O(times x bandwidth^2). Several times form one block row, large enough for matrix products to
+run at full speed and small enough to follow the edge of the band.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Band = Float[Array, "times widths products products"]
 
 
 class _OverLayout(Covariance):
-    """A covariance that knows which product and time each of its data has."""
+    """A covariance with the product and the time of each of its data."""
 
     layout: DataLayout
 
@@ -37,7 +37,7 @@ class _OverLayout(Covariance):
 
 
 def _masked(band: Band, layout: DataLayout) -> Band:
-    """The band with blocks before the first time, and missing samples, as of the unit matrix."""
+    """Replace blocks before the first time, and missing samples, by those of the unit matrix."""
     n_times, widths, products = band.shape[:3]
     time, back = np.arange(n_times)[:, None], np.arange(widths)[None]
     row = layout.present.T
@@ -80,7 +80,7 @@ class TimeBlockCovariance(_OverLayout):
     Raises
     ------
     InputError
-        If the blocks do not fit the layout, are not finite or not symmetric.
+        If the blocks do not match the layout, are not finite or not symmetric.
     """
 
     blocks: Float[Array, "times products products"]
@@ -106,7 +106,7 @@ class TimeBlockCovariance(_OverLayout):
         return TimeBlockFactor(lower, self.layout)
 
     def time_weights(self, layout):
-        self.factor()  # raises where a block is not positive definite
+        self.factor()  # raises if a block is not positive definite
         xp, present = namespace(self), self.layout.present.T
         both = present[:, :, None] & present[:, None, :]
         return xp.moveaxis(xp.where(both, xp.linalg.inv(self.blocks), 0.0), 0, 2)
@@ -114,7 +114,7 @@ class TimeBlockCovariance(_OverLayout):
     def absorb(self, other):
         if isinstance(other, TimeBlockCovariance):
             self.layout.require_same(other.layout)
-            # a missing sample's unit row must stay a unit row: the constructor puts it back
+            # a missing sample's unit row must stay a unit row: the constructor restores it
             return TimeBlockCovariance(self.blocks + other.blocks, self.layout)
         if isinstance(other, DiagonalCovariance):
             added = self.layout.scatter(other.variance).T
@@ -134,13 +134,13 @@ ROWS = 176
 class TimeBandedFactor(Factor):
     """The Cholesky factor of a banded covariance, in block rows.
 
-    Its products are compiled: outside of a program, JAX compiles a loop anew in every call. The
+    Its products are compiled: outside a program, JAX compiles a loop anew in every call. The
     last block row is padded with rows of the unit matrix.
 
     Attributes
     ----------
     left : (blocks, rows, window) array
-        L before the diagonal blocks, as far as the band reaches.
+        L to the left of the diagonal blocks, as far as the band reaches.
     diagonal : (blocks, rows, rows) array
         The diagonal blocks of L, lower triangular.
     inverse : (blocks, rows, rows) array
@@ -154,7 +154,7 @@ class TimeBandedFactor(Factor):
     layout: DataLayout
 
     def _swept(self, step: Callable, across: Array, x: Columns, reverse: bool = False) -> Columns:
-        """x with a step for each block row: of what it hands on, and L before and in its row."""
+        """Apply ``step`` to every block row of x, with its carry and L before and in the row."""
         (n, rows, window), layout = self.left.shape, self.layout
         grid = layout.by_time(x)
         flat = grid.reshape(layout.n_times * layout.n_products, -1)
@@ -208,12 +208,12 @@ class TimeBandedCovariance(_OverLayout):
         first time are ignored.
     layout : DataLayout
     name : str
-        Of the term, for error messages.
+        Name of the term, for error messages.
 
     Raises
     ------
     InputError
-        If the band does not fit the layout, is not finite, or is not symmetric within one time.
+        If the band does not match the layout, is not finite, or is not symmetric within one time.
     """
 
     band: Band
@@ -253,14 +253,14 @@ class TimeBandedCovariance(_OverLayout):
         return TimeBandedFactor(left, diagonal, inverse, self.layout)
 
     def _require_positive(self, diagonal: Float[Array, "blocks rows rows"]) -> None:
-        """InputError, with the lowest eigenvalue of the samples where the factorisation broke."""
+        """Raise InputError with the lowest eigenvalue of the samples where factorisation broke."""
         broken = ~np.isfinite(np.asarray(diagonal)).all(axis=(1, 2))
         if not broken.any():
             return
         end = (int(np.argmax(broken)) + 1) * (diagonal.shape[1] // self.layout.n_products)
         end = min(end, self.layout.n_times)
         start, lowest = end, np.inf
-        while lowest > 0 and start > 0:  # a short stretch may be positive by itself
+        while lowest > 0 and start > 0:  # a short stretch alone may be positive
             start = max(0, end - 2 * max(self.band.shape[1], end - start))
             layout = DataLayout(self.layout.n_products, end - start)
             part = TimeBandedCovariance(self.band[start:end], layout, self.name)

@@ -1,7 +1,7 @@
 """The embedded Galaxy: synchrotron, absorption, bright sources.
 
 **Ionised gas.** The absorption coefficient at frequency nu is k(nu) <n_e^2>. <n_e^2> follows NE2001
-(Cordes & Lazio 2002, astro-ph/0207156), reduced to what a degree-scale sky below 50 MHz shows: the
+(Cordes & Lazio 2002, astro-ph/0207156), reduced to features of a degree-scale sky below 50 MHz: the
 thick disc, the annular thin disc, the low-density regions around the Sun, and the one nearby HII
 shell that is opaque at 10 MHz. Its spiral arms are left out: the sky agrees with ULSA without them.
 
@@ -9,12 +9,12 @@ Positions are in kpc, Galactocentric, NE2001's axes: x towards l = 90 degrees, y
 towards the Sun, z towards the north Galactic pole; the Sun is at (0, 8.5, 0).
 
 **The brightest discrete sources.** Spectra are log-polynomials where they were measured. Below, no
-flux scale exists: the power law of the last two octaves is carried on, through a turnover
+flux scale exists: the power law of the last two octaves continues, with a turnover
 exp(-(nu/nu_t)^-2.1) by free-free absorption on the way, ::
 
     S(nu) = S(nu_0) (nu/nu_0)^alpha exp(-(nu/nu_t)^-2.1 + (nu_0/nu_t)^-2.1),   nu < nu_0.
 
-Expect 10 % at 50 MHz, 20 % at 20 MHz and no more than the order of magnitude below 10 MHz.
+Expect errors of 10 % at 50 MHz, 20 % at 20 MHz, and only the order of magnitude below 10 MHz.
 
 **The diffuse sky** is an ULSA-like model of the Galaxy between 1 and 50 MHz (Cong et al. 2021,
 arXiv:2104.03170): synchrotron emissivity of an axisymmetric Galaxy, integrated
@@ -23,9 +23,9 @@ along every line of sight through ionised gas, in front of an isotropic backgrou
     T(l, b) = int [j(s) + kappa(s) T_e] exp(-tau(s)) ds + T_bg exp(-tau(inf)),
     tau(s) = int_0^s kappa ds'.
 
-The emissivity and the background are theirs. The electrons' thermal emission kappa T_e, which ULSA
-leaves out, and what a seed adds are ours: a random factor, loops and spurs, nearby clouds and faint
-sources. No file is read: the map is computed.
+The emissivity and the background are ULSA's. We add the electrons' thermal emission kappa T_e,
+which ULSA leaves out, and structures from a seed: a random factor, loops and spurs, nearby clouds
+and faint sources. The map is computed; no file is read.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ ELECTRON_TEMPERATURE_K = 8000.0
 SUN_RADIUS_KPC = 8.5
 
 # Densities, heights and radii are NE2001's (n1h1/h1, h1, A1; n2, h2, A2). The clumping factor
-# <n^2>/<n>^2 of the thick disc is tuned by hand against ULSA's mean at 1 MHz; it is that of gas
-# filling 30 % of the volume (Gaensler et al. 2008, PASA 25, 184, find 4 to 30 %). That of the thin
-# disc is NE2001's F2; F1 = 0.18, made for scattering, would leave 1 MHz four times too bright.
+# <n^2>/<n>^2 of the thick disc is tuned by hand against ULSA's mean at 1 MHz; it matches gas
+# filling 30 % of the volume (Gaensler et al. 2008, PASA 25, 184, find 4 to 30 %). For the thin disc
+# it is NE2001's F2; F1 = 0.18, meant for scattering, would leave 1 MHz four times too bright.
 THICK_DENSITY_CM3 = 0.034
 THICK_HEIGHT_KPC = 0.97
 THICK_EDGE_KPC = 17.5
@@ -114,9 +114,9 @@ class Region:
     centre_kpc : tuple of float
         Its centre, Galactocentric.
     semi_axes_kpc : tuple of float
-        Along the major axis, across it in the plane, and vertical.
+        Semi-axes along the major axis, across it in the plane, and vertical.
     angle_deg : float
-        Of the major axis from +x towards +y.
+        Angle of the major axis from +x towards +y.
     n_squared_cm6 : float
         <n_e^2> in cm^-6.
     """
@@ -128,7 +128,7 @@ class Region:
     n_squared_cm6: float
 
     def chord(self, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Find where lines of sight enter and leave the ellipsoid.
+        """Compute where lines of sight enter and leave the ellipsoid.
 
         Parameters
         ----------
@@ -138,7 +138,7 @@ class Region:
         Returns
         -------
         enter, leave : (...) arrays
-            Distances from the Sun in kpc; both are equal where the line misses the ellipsoid.
+            Distances from the Sun in kpc; both are equal if the line misses the ellipsoid.
         """
         c, s = np.cos(np.radians(self.angle_deg)), np.sin(np.radians(self.angle_deg))
         to_ball = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -152,9 +152,9 @@ class Region:
 
 
 # NE2001's local interstellar medium and one of its clumps, <n^2> = F n^2 with its n and F. Where
-# two overlap the first one listed counts, as in NE2001; its local hot bubble, a slanted cylinder,
+# two overlap the first in the list counts, as in NE2001; its local hot bubble, a slanted cylinder,
 # and its Loop I, a half sphere, are upright ellipsoids here. The Vela shell lies at l = 263.25,
-# b = -9, 0.25 kpc away, and is opaque at 10 MHz: it makes much of ULSA's odd multipoles there.
+# b = -9, 0.25 kpc away, and is opaque at 10 MHz: it causes much of ULSA's odd multipoles there.
 REGIONS = (
     Region("IRAS Vela shell", (-0.2452, 8.5290, -0.0391), (0.038,) * 3, 0.0, 4.0**2 * 3.0),
     Region("local hot bubble", (0.01, 8.45, 0.17), (0.085, 0.10, 0.33), 0.0, 0.005**2 * 0.01),
@@ -181,7 +181,7 @@ FREE_FREE_SLOPE = -2.1
 
 @dataclass(frozen=True)
 class PointSource:
-    """A source small against LuSEE-Night's resolution (Cen A's lobes, 8 degrees long, least so).
+    """A source below LuSEE-Night's resolution (largest: Cen A's lobes, 8 degrees long).
 
     Attributes
     ----------
@@ -267,15 +267,15 @@ class PointSource:
 
 @dataclass(frozen=True)
 class ExtendedObject:
-    """A disc or a shell of the sky whose brightness is not known.
+    """A disc or a shell on the sky with unknown brightness.
 
     Attributes
     ----------
     name : str
     l_deg, b_deg : float
-        Its centre, Galactic.
+        Centre, Galactic.
     radius_deg : float
-        Of a shell; 0 for a disc.
+        Radius of a shell; 0 for a disc.
     width_deg : float
         FWHM of the shell, or of the disc.
     strength : float
@@ -290,12 +290,12 @@ class ExtendedObject:
     strength: float
 
     def profile(self, polar: np.ndarray) -> np.ndarray:
-        """Brightness at angles from the centre, in radians, over the largest."""
+        """Brightness at angles from the centre, in radians, relative to the largest."""
         away = (np.degrees(polar) - self.radius_deg) / self.width_deg
         return np.exp(-4.0 * np.log(2.0) * away**2)
 
     def modes(self, lmax: int) -> Float[np.ndarray, " modes"]:
-        """Coefficients of a brightness that is one where the object is brightest."""
+        """Coefficients of the object with a peak brightness of one."""
         polar = (np.arange(N_POLAR) + 0.5) * np.pi / N_POLAR
         profile = self.profile(polar) * np.sin(polar)
         zonal = np.polynomial.legendre.legvander(np.cos(polar), lmax).T @ profile
@@ -352,12 +352,12 @@ def galactic_unit_vector(ra_deg: float, dec_deg: float) -> Float[np.ndarray, "3"
 
 # Positions: NED and SIMBAD. Polynomials and their lower ends: Perley & Butler 2017 (ApJS 230, 7),
 # table 6, epoch 2016 for the two supernova remnants. Cen A: 2740 Jy at 408 MHz with its giant lobes
-# (Cooper, Price & Cole 1965, Aust. J. Phys. 18, 589) and the one index, -0.70, that holds from 10
-# to 4750 MHz (Alvarez et al. 2000, A&A 355, 863).
+# (Cooper, Price & Cole 1965, Aust. J. Phys. 18, 589) and a single index, -0.70, from 10 to 4750 MHz
+# (Alvarez et al. 2000, A&A 355, 863).
 # Turnovers: Cyg A from 13.5 kJy at 10.05 MHz and Cas A from 28 kJy there in 1965 (Bridle 1967, in
 # Baars et al. 1977, A&A 61, 99), 18.5 kJy in 2016 if fading by 0.8 % a year (Helmboldt & Kassim
-# 2009, AJ 138, 838); the others from the column of electrons in :mod:`.galaxy`, which
-# for Tau A, 2 kpc away, is an upper limit.
+# 2009, AJ 138, 838); the others from this module's column of electrons, which is an upper limit for
+# Tau A, 2 kpc away.
 BRIGHT_SOURCES = (
     PointSource("Cas A", 350.8500, 58.8150, (3.3584, -0.7518, -0.035, -0.071), 200.0, 11.9),
     PointSource("Cyg A", 299.8682, 40.7339, (3.3498, -1.0022, -0.225, 0.023, 0.043), 50.0, 12.7),
@@ -387,8 +387,8 @@ BACKGROUND_REFERENCE_MHZ = 1000.0
 BACKGROUND_INDEX = -2.58
 
 # Random component: rms of ln(synchrotron emission) over 2 <= ell <= FLUCTUATION_LMAX and the slope
-# of its C_ell, that of Galactic synchrotron (La Porta et al. 2008, A&A 479, 641). The rms is tuned:
-# the largest that leaves ULSA's contrast between odd and even multipoles at 10 MHz.
+# of its C_ell, as for Galactic synchrotron (La Porta et al. 2008, A&A 479, 641). The rms is tuned:
+# the largest that keeps ULSA's contrast between odd and even multipoles at 10 MHz.
 FLUCTUATION_RMS = 0.05
 FLUCTUATION_SLOPE = -2.7
 FLUCTUATION_LMAX = 191
@@ -396,7 +396,7 @@ FLUCTUATION_LMAX = 191
 # Spurs: parts of shells, besides loops I to IV, that are brighter by up to this share. Clouds of
 # ionised gas within some 300 pc, in front of most of the emission: FWHM in degrees, scale height of
 # b, median and scatter of the emission measure in pc cm^-6 (the Gum nebula's is 100 to 300), and
-# the share of a cloud that is covered
+# covered share of a cloud
 N_SPURS, SPUR = 8, 0.15
 N_CLOUDS, CLOUD_WIDTH_DEG, CLOUD_HEIGHT_DEG = 15, (2.0, 9.0), 8.0
 CLOUD_EMISSION_MEASURE, CLOUD_SCATTER, CLOUD_COVERED = 30.0, 0.8, (0.3, 1.0)
@@ -407,7 +407,7 @@ N_FAINT, FAINT_JY, FAINT_MHZ, FAINT_INDEX = 2300, (10.0, 200.0), 25.0, -0.7
 MINIMUM_MHZ = 1.0
 MAXIMUM_MHZ = 50.0
 
-# Lines of sight end 50 kpc away (Cong et al.) or 10 kpc above the plane, where exp(-15) is left.
+# Lines of sight end 50 kpc away (Cong et al.) or 10 kpc above the plane, where exp(-15) remains.
 DEPTH_KPC = 50.0
 TOP_KPC = 10.0
 
@@ -450,7 +450,7 @@ class Slabs:
     """Lines of sight in slabs of constant emission and absorption, the nearest first.
 
     Each quadrature node stands for a slab of constant j and kappa, for which the transfer equation
-    is solved exactly: it adds j/kappa (1 - exp(-dtau)) exp(-tau). So a transparent slab adds j ds
+    is solved exactly: it adds j/kappa (1 - exp(-dtau)) exp(-tau). A transparent slab then adds j ds
     to the order of the quadrature, and an opaque one the source function. The error, against
     200 000 steps, is below 1 % at 1 MHz and 0.1 % at 10 MHz; 3 % and 1 % towards the opaque Vela
     shell, whose near side falls inside a slab.
@@ -458,9 +458,9 @@ class Slabs:
     Attributes
     ----------
     emitted : (slabs, lines) array
-        Brightness of each at 408 MHz without absorption, in K.
+        Brightness of each slab at 408 MHz without absorption, in K.
     column : (slabs, 2, lines) array
-        Its int n_e^2 ds in cm^-6 kpc, at ``+|latitude|`` and ``-|latitude|``.
+        int n_e^2 ds of each slab in cm^-6 kpc, at ``+|latitude|`` and ``-|latitude|``.
     """
 
     emitted: np.ndarray
@@ -468,19 +468,19 @@ class Slabs:
 
     @classmethod
     def towards(cls, lon_deg: np.ndarray, lat_deg: np.ndarray) -> Slabs:
-        """Make the slabs of Galactic directions (n,) in degrees, at both signs of ``lat_deg``."""
+        """Compute slabs for Galactic directions (n,) in degrees, at both signs of ``lat_deg``."""
         lon, lat = np.radians(lon_deg), np.radians(np.abs(lat_deg))
         cos_lon, cos_lat, sin_lat = np.cos(lon), np.cos(lat), np.sin(lat)
         up = np.stack([np.sin(lon) * cos_lat, -cos_lon * cos_lat, sin_lat], axis=-1)
         direction = np.stack([up, up * [1.0, 1.0, -1.0]])
         chords = [(region.chord(direction), region) for region in REGIONS]
 
-        # The discs do not tell l from -l: they are computed once for both.
+        # The discs are symmetric in l: they are computed once for l and -l.
         places = np.round(np.stack([cos_lon, sin_lat]), 12)
         _, one, of_line = np.unique(places, axis=1, return_index=True, return_inverse=True)
         cos_lon, cos_lat, sin_lat = cos_lon[one], cos_lat[one], sin_lat[one]
         of_line = of_line.ravel()
-        # Near a pole the same panels are used, shortened, so that the discs stay resolved.
+        # Near a pole the same panels are shortened, so that the discs stay resolved.
         stretch = np.minimum(1.0, TOP_KPC / DEPTH_KPC / np.maximum(sin_lat, 1e-9))
         nodes, weights = _nodes()
         emitted = np.empty((len(nodes), len(lon)))
@@ -495,7 +495,7 @@ class Slabs:
             disc = emissivity_in_plane(radius) * emissivity_height_profile(z) * ds
             emitted[k], smooth = disc[of_line], n_squared[of_line]
 
-            # The regions enter by the exact share of the slab inside them: no ragged outlines.
+            # Each region counts by the exact share of the slab inside it, to avoid ragged outlines.
             begin, length = (near * stretch)[of_line], ds[of_line]
             near = near + weight
             left, local = 1.0, 0.0
@@ -527,7 +527,7 @@ class Slabs:
         transmission = np.ones(self.column.shape[1:])
         for emitted, column in zip(self.emitted, self.column, strict=True):
             slab = kappa * column
-            # The tiny addend keeps 0/0 away where there are no electrons.
+            # The tiny addend avoids 0/0 where there are no electrons.
             absorbed = -np.expm1(-slab)
             synchrotron += transmission * (scale * emitted) * (absorbed + 1e-300) / (slab + 1e-300)
             transmission *= 1.0 - absorbed
@@ -541,7 +541,7 @@ def brightness(synchrotron: np.ndarray, depth: np.ndarray, frequency_mhz: float)
     Parameters
     ----------
     synchrotron : array
-        What is left of the synchrotron emission after absorption, in K.
+        Synchrotron emission that remains after absorption, in K.
     depth : array
         Optical depth of the whole line of sight.
     frequency_mhz : float
@@ -560,7 +560,7 @@ def _towards(theta: Vector, phi: Vector) -> tuple[Slabs, tuple[np.ndarray, np.nd
 @lru_cache(maxsize=2)
 def _slabs(points: bytes) -> tuple[Slabs, tuple[np.ndarray, np.ndarray]]:
     theta, phi = np.frombuffer(points).reshape(2, -1)
-    # lines of sight above and below the plane share what is symmetric: each once for both
+    # lines of sight above and below the plane share their symmetric parts, computed once
     key = np.abs(0.5 * np.pi - theta).round(12) + 1j * phi.round(12)
     _, first, line = np.unique(key, return_index=True, return_inverse=True)
     order = np.argsort(first)
@@ -583,14 +583,14 @@ def _fluctuations(nside: int, seed: int) -> np.ndarray:
     spectrum *= FLUCTUATION_RMS**2 / variance
     z = np.random.default_rng(seed).standard_normal((ell.size, 2)) @ np.array([1.0, 1.0j])
     alm = np.empty(ell.size, dtype=np.complex128)
-    alm[np.lexsort((m, ell))] = z / np.sqrt(2.0)  # rows are taken ell by ell
+    alm[np.lexsort((m, ell))] = z / np.sqrt(2.0)  # in order of ell
     alm[m == 0] = np.sqrt(2.0) * alm[m == 0].real
     return healpy.alm2map(alm * np.sqrt(spectrum[ell]), nside, lmax=lmax)
 
 
 @dataclass(frozen=True)
 class Structures:
-    """What a seed adds to the smooth Galaxy, on a HEALPix grid.
+    """Random structures that a seed adds to the smooth Galaxy, on a HEALPix grid.
 
     Attributes
     ----------
@@ -599,9 +599,9 @@ class Structures:
     clouds : (clouds, pixels) array
         Emission measure of each cloud, in pc cm^-6.
     covered : (clouds,) array
-        The share of each that it covers, densely; the rest is empty.
+        Share of each cloud that is dense; the rest of it is empty.
     flux_jy : (pixels,) array
-        Of extragalactic sources, at ``FAINT_MHZ``.
+        Flux of extragalactic sources, at ``FAINT_MHZ``.
     """
 
     emission: Vector
@@ -612,7 +612,7 @@ class Structures:
     @classmethod
     @lru_cache(maxsize=1)
     def of(cls, nside: int, seed: int) -> Structures:
-        """Draw them: the same at every ``nside``."""
+        """Draw the structures, which are the same at every ``nside``."""
         rng = np.random.default_rng([seed, 1])
         l_deg, b_deg = healpy.pix2ang(nside, np.arange(12 * nside**2), lonlat=True)
         loops = [one for one in EXTENDED_OBJECTS if one.radius_deg]
@@ -649,14 +649,14 @@ def _seen_from(one: ExtendedObject, l_deg: Vector, b_deg: Vector) -> tuple[Vecto
 def galaxy_map(frequency_mhz: float, nside: int = 64, seed: int | None = 1) -> np.ndarray:
     """Compute the brightness temperature of the diffuse sky.
 
-    What ``seed`` draws (:class:`Structures`) is the same at all frequencies: the synchrotron
-    emission is multiplied by a positive factor of mean one, clouds in front absorb and emit, and
+    The structures from ``seed`` (:class:`Structures`) are the same at all frequencies: a positive
+    factor of mean one multiplies the synchrotron emission, clouds in front absorb and emit, and
     faint sources shine through the whole Galactic column, as the background does.
 
-    Two numbers were tuned against ULSA's maps, by hand: the clumping of the thick disc
-    (:mod:`.galaxy`) and FLUCTUATION_RMS. With seed 1 the mean is within 4 % of ULSA's at 1, 3
-    and 10 MHz, and C_ell at 10 MHz within 40 % for 1 <= ell <= 30. At 1 MHz the local gas rules
-    the sky, and only the largest scales agree.
+    Two numbers were tuned by hand against ULSA's maps: the clumping of the thick disc
+    (THICK_CLUMPING) and FLUCTUATION_RMS. With seed 1 the mean is within 4 % of ULSA's at 1, 3 and
+    10 MHz, and C_ell at 10 MHz within 40 % for 1 <= ell <= 30. At 1 MHz the local gas dominates the
+    sky, and only the largest scales agree.
 
     Parameters
     ----------
@@ -665,7 +665,7 @@ def galaxy_map(frequency_mhz: float, nside: int = 64, seed: int | None = 1) -> n
     nside : int
         A power of two.
     seed : int or None
-        Of the random structures, not negative; None leaves them out.
+        Seed of the random structures, not negative; None for no structures.
 
     Returns
     -------

@@ -4,9 +4,9 @@
 
     m = P[T exp(Y a)] + sum_j F_j g(eta_j) y(n_j),    a ~ N(0, C_ell),    eta_j ~ N(0, 1)
 
-T is a template, Y synthesis on a grid, P integration with the harmonics of the map, F_j the
-catalogued flux of a source in the direction n_j, and g(eta) = -ln Phi(-eta), so that its flux has
-an exponential distribution of mean F_j: it is positive and may be absent. The unknowns are white:
+T is a template, Y synthesis on a grid, P integration with the harmonics of the map, and F_j the
+catalogued flux of a source in the direction n_j. With g(eta) = -ln Phi(-eta) its flux has an
+exponential distribution of mean F_j: it is positive and may be negligible. The unknowns are white:
 u = (xi, eta) ~ N(0, 1) with a = C^(1/2) xi.
 
 **Several frequencies**::
@@ -17,17 +17,17 @@ u = (xi, eta) ~ N(0, 1) with a = C^(1/2) xi.
 with a template T_f at every frequency, a_0 its level at nu_ref, a_1 the change of its spectral
 index, a_2 that of its curvature, a_3 the change of the optical depth of ionised gas at nu_turnover
 (Altenhoff et al. 1960), and a residual r_f of every channel; all of them vary over the sky and have
-no unit. The weight w says how strong they are from place to place, the same at all frequencies. The
-exponent of a channel is linear in them, its sky is positive. About any exponent phi, ::
+no unit. The weight w is their strength from place to place, the same at all frequencies. The
+exponent of a channel is linear in them, and its sky is positive. About any exponent phi, ::
 
     dm_f = W d(phi),    W_ij = int y_i w T_f exp(w phi) y_j dOmega.
 
-**Power laws in ell** are what is expected of the logarithm, ::
+**Power laws in ell** are the expected spectra of the logarithm, ::
 
     C_ell = A^2 ((ell + 1) / 10)^tilt,    ell > 0,
 
-of every field, too, and of every channel's residual; the mean over the sky has a width of its own.
-A and tilt may be learned: their logarithm and themselves are normal around what is expected.
+of every field, too, and of every channel's residual; the mean over the sky has a separate width. A
+and tilt may be learned: ln A and tilt are normal around their expected values.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ Pair = Float[np.ndarray, "2"]
 # a brightness temperature in K, of Galactic theta and phi in radians
 Template = Callable[[Vector, Vector], Vector]
 
-# steps of Newton's method, of which each closes in on the root; longest change of a parameter
+# steps of Newton's method, each of which approaches the root; largest change of a parameter
 NEWTON, REACH = 30, 2.0
 
 
@@ -85,7 +85,7 @@ def deviation_spectrum(
 
 
 def slopes(lmax: int) -> Float[np.ndarray, "2 ells"]:
-    """Return d ln C_ell^(1/2) by ln A and by the tilt."""
+    """Return the derivatives of ln C_ell^(1/2) with respect to ln A and the tilt."""
     ell = np.arange(lmax + 1.0)
     return np.stack([np.ones(lmax + 1), 0.5 * np.log((ell + 1.0) / PIVOT)])
 
@@ -93,19 +93,19 @@ def slopes(lmax: int) -> Float[np.ndarray, "2 ells"]:
 def matching_step(
     power: Vector, known: Vector, slope: Float[np.ndarray, "2 n"], away: Pair, narrow: Pair
 ) -> Pair:
-    """Compute the change of ln A and the tilt after which modes have as much power as they should.
+    """Compute the change of ln A and the tilt that gives modes their expected power.
 
-    At the maximum of the evidence sum u^2 = sum (1 - var u) in units of the prior, for all that a
-    parameter changes (MacKay 1992, Neural Comp. 4, 415). This goes far where a slope does not.
+    At the maximum of the evidence sum u^2 = sum (1 - var u), in units of the prior, over all modes
+    that a parameter changes (MacKay 1992, Neural Comp. 4, 415). It reaches further than a gradient.
 
     Parameters
     ----------
     power, known : (n,) array
         u^2, u being the posterior mean in units of the prior, and 1 - var u.
     slope : (2, n) array
-        d ln C^(1/2) by ln A and by the tilt.
+        Derivatives of ln C^(1/2) with respect to ln A and the tilt.
     away, narrow : (2,) array
-        How far the parameters are from what is expected of them, and the inverse of its variance.
+        Distance of the parameters from their expected values, and inverse prior variances.
     """
     step = np.zeros(2)
     for _ in range(NEWTON):
@@ -115,8 +115,8 @@ def matching_step(
     return np.clip(step, -REACH, REACH)
 
 
-# band limit of the grid of one frequency: this many times that of the map, and at least so much,
-# since what the grid does not resolve of the template folds back into the map
+# band limit of the grid for one frequency: this multiple of the map's, and at least LEAST_GRID,
+# since unresolved parts of the template fold back into the map
 GRID, LEAST_GRID = 3, 96
 
 
@@ -126,10 +126,10 @@ class LogNormalSky(eqx.Module):
     Attributes
     ----------
     spectrum : (ells,) array
-        C_ell of the logarithm, without unit; of the map's lmax, which is what the data can tell
-        apart: twice that changes ln evidence by 0.4 and standard deviations by 0.4 %.
+        C_ell of the logarithm, without unit, up to the map's lmax. The data resolve no more: twice
+        that changes ln evidence by 0.4 and standard deviations by 0.4 %.
     grid : SphereGrid
-        Where products are taken.
+        Grid on which products are computed.
     level : (rings, phi) array
         T on the grid, in K.
     source_modes : (sources, modes) array
@@ -151,17 +151,17 @@ class LogNormalSky(eqx.Module):
         *,
         band: int | None = None,
     ) -> LogNormalSky:
-        """Make it, in NumPy.
+        """Create the sky, in NumPy.
 
         Parameters
         ----------
         template : callable
-            T in K, of Galactic theta and phi in radians, such as
+            T in K, a function of Galactic theta and phi in radians, such as
             :func:`.diffuse_brightness` at the frequency.
         spectrum : (ells,) array
             C_ell of the logarithm; its lmax is the map's.
         frequency_mhz : float
-            Of template and sources.
+            Frequency of template and sources.
         sources : tuple of PointSource
         band : int, optional
             Band limit of the grid; by default three times lmax, and at least 96.
@@ -196,7 +196,7 @@ class LogNormalSky(eqx.Module):
         return self.n_modes + len(self.source_modes)
 
     def with_power_law(self, amplitude: Number, tilt: Number) -> LogNormalSky:
-        """Return the same with C_ell = A^2 ((ell + 1) / 10)^tilt for ell > 0.
+        """Return the sky with C_ell = A^2 ((ell + 1) / 10)^tilt for ell > 0.
 
         Parameters
         ----------
@@ -207,7 +207,7 @@ class LogNormalSky(eqx.Module):
         return replace(self, spectrum=deviation_spectrum(self.lmax, amplitude, tilt, level))
 
     def power_law_slopes(self) -> Float[np.ndarray, "2 modes"]:
-        """Return the derivatives of ln C_ell^(1/2) by ln A and by the tilt, for every mode."""
+        """Return the derivatives of ln C_ell^(1/2) with respect to ln A and tilt, for all modes."""
         slope = slopes(self.lmax)
         slope[:, 0] = 0.0
         return per_mode(slope)
@@ -225,7 +225,7 @@ class LogNormalSky(eqx.Module):
         return field * self.level.reshape(*(1,) * (white.ndim - 1), *self.level.shape)
 
     def source_factors(self, white: White) -> Float[Array, "*batch sources"]:
-        """Compute g(eta): fluxes of the sources over the catalogued ones."""
+        """Compute g(eta): fluxes of the sources relative to the catalogue."""
         log_share = log_ndtr if namespace(white) is np else jax.scipy.special.log_ndtr
         return -log_share(-white[..., self.n_modes :])
 
@@ -269,14 +269,14 @@ class LogNormalSky(eqx.Module):
         return matrix
 
 
-# how fields enter the logarithm: x is frequency / reference, y frequency / turnover
+# factors of the fields in the logarithm: x is frequency / reference, y frequency / turnover
 FIELDS = {
     "level": lambda x, y: np.ones_like(x),
     "index": lambda x, y: np.log(x),
     "curvature": lambda x, y: np.log(x) ** 2,
     "absorption": lambda x, y: -(y**FREE_FREE_SLOPE),
 }
-# least band limit of their grid: what it does not resolve of a template folds back into the map, at
+# lowest band limit of the fields' grid: unresolved parts of a template fold back into the map, at
 # 96 by 5 % of it in the plane
 FIELDS_GRID = 192
 
@@ -288,19 +288,19 @@ class PositiveSkies(eqx.Module):
     ----------
     frequencies_mhz : (channels,) array
     mixing : (channels, fields) array
-        What the fields are multiplied with in the logarithm.
+        Factors of the fields in the logarithm.
     grid : SphereGrid
-        Where products are taken; its lmax is that of the exponents.
+        Grid on which products are computed; its lmax is that of the exponents.
     levels : (channels, rings, phi) array
         T_f on the grid, in K.
     weight : (rings, phi) array
         w on the grid.
     sources : (channels, sources, modes) array
-        F_fj y(n_j) of point sources that may be there besides, in K.
+        F_fj y(n_j) of point sources to be added, in K.
     lmax : int
-        Of the maps.
+        Highest ell of the maps.
     names : tuple of str
-        Of the fields.
+        Names of the fields.
     """
 
     frequencies_mhz: Float[np.ndarray, " channels"]
@@ -327,28 +327,28 @@ class PositiveSkies(eqx.Module):
         lmax_fields: int | None = None,
         band: int | None = None,
     ) -> PositiveSkies:
-        """Make them of a template for every frequency.
+        """Create the skies from a template for every frequency.
 
         Parameters
         ----------
         frequencies_mhz : (channels,) array
             Frequencies in MHz.
         templates : sequence of callable
-            T_f in K, in the same order; each of theta and phi, as ``weight``.
+            T_f in K, in the same order; each a function of theta and phi, as ``weight``.
         lmax : int
-            Of the maps.
+            Highest ell of the maps.
         names : tuple of str
             Keys of ``FIELDS``.
         reference_mhz, turnover_mhz : float
             nu_ref and nu_turnover.
         sources : (channels, sources, modes) array, optional
-            Of point sources, in K.
+            Coefficients of point sources, in K.
         weight : callable, optional
-            w of theta and phi, Galactic, in radians; by default one.
+            w, a function of Galactic theta and phi in radians; by default one.
         lmax_fields : int, optional
-            Highest ell of the exponents, ``lmax`` at least; by default ``lmax``.
+            Highest ell of the exponents, at least ``lmax``; by default ``lmax``.
         band : int, optional
-            Band limit of the grid; by default 192, or three times that of the exponents.
+            Band limit of the grid; by default three times that of the exponents, and at least 192.
 
         Raises
         ------
@@ -374,11 +374,11 @@ class PositiveSkies(eqx.Module):
 
     @staticmethod
     def require_fields(names: tuple[str, ...], n_channels: int) -> None:
-        """Refuse fields that are not known, and more of them than channels."""
+        """Refuse unknown fields, and more fields than channels."""
         require_names("field", "fields of the logarithm", names, FIELDS, n_channels)
 
     def coarser(self, lmax: int, lmax_fields: int) -> PositiveSkies:
-        """Make the same of maps and fields with fewer modes.
+        """Return the skies with fewer modes of maps and fields.
 
         Parameters
         ----------
@@ -390,11 +390,11 @@ class PositiveSkies(eqx.Module):
 
     @property
     def n_fields(self) -> int:
-        """Modes of every field."""
+        """Number of modes of every field."""
         return n_modes(self.grid.lmax)
 
     def values(self, channel: int, exponent: Exponents) -> Float[np.ndarray, "*batch rings phi"]:
-        """Compute T_f exp(w phi) on the grid, in K: positive; too large a phi makes it infinite.
+        """Compute T_f exp(w phi) on the grid, in K: positive, and infinite if phi is too large.
 
         Parameters
         ----------
@@ -430,7 +430,7 @@ class PositiveSkies(eqx.Module):
 
 
 # A of each field, whose rms over the sky is seven times that, and the width of its mean: a template
-# good to a fifth (its mean to a half), indices that differ by 0.06, optical depths by a fifth
+# accurate to a fifth (its mean to a half), indices to 0.06, optical depths to a fifth
 EXPECTED = {
     "level": (0.03, 0.5),
     "index": (0.01, 0.2),
@@ -438,7 +438,7 @@ EXPECTED = {
     "absorption": (0.03, 0.5),
 }
 RESIDUAL, TILT = 0.003, -2.4
-# how far ln A and the tilt may be from that
+# prior standard deviations of ln A and the tilt
 LOG_WIDTH, TILT_WIDTH = 1.5, 0.5
 
 
@@ -449,11 +449,11 @@ class FieldLaws:
     Attributes
     ----------
     parameters : (fields + channels, 2) array
-        ln A and tilt, of the fields first.
+        ln A and tilt; the fields come first.
     means : (fields,) array
         Standard deviation of each field's mean over the sky.
     expected : (fields + channels, 2) array
-        What is expected of the parameters before there are data.
+        Expected values of the parameters before there are data.
     """
 
     parameters: Float[np.ndarray, "laws 2"]
@@ -462,14 +462,14 @@ class FieldLaws:
 
     @classmethod
     def of(cls, skies: PositiveSkies) -> FieldLaws:
-        """Those that are expected of skies before there are data."""
+        """Return the laws that are expected before there are data."""
         amplitudes, means = np.array([EXPECTED[name] for name in skies.names]).T
         levels = np.concatenate([amplitudes, np.full(len(skies.levels), RESIDUAL)])
         parameters = np.column_stack([np.log(levels), np.full(len(levels), TILT)])
         return cls(parameters, means, parameters)
 
     def prior(self, skies: PositiveSkies) -> SpectralPrior:
-        """The prior of the fields: a spectral prior whose maps have no unit."""
+        """Return the prior of the fields: a spectral prior whose maps have no unit."""
         spectra = np.exp(2.0 * self.parameters @ slopes(skies.grid.lmax))
         fields = len(self.means)
         spectra[:fields, 0] = 4.0 * np.pi * self.means**2
@@ -477,7 +477,7 @@ class FieldLaws:
         return SpectralPrior(skies.frequencies_mhz, skies.mixing, *of_each, skies.names)
 
     def matched(self, powers: OfLaws, known: OfLaws) -> FieldLaws:
-        """Compute the parameters of :func:`matching_step`, law by law.
+        """Apply :func:`matching_step` to every law.
 
         Parameters
         ----------
@@ -489,7 +489,7 @@ class FieldLaws:
         slope, parameters = slopes(powers.shape[1] - 1), self.parameters.copy()
         narrow = np.array([LOG_WIDTH, TILT_WIDTH]) ** -2.0
         for k, (power, left) in enumerate(zip(powers, known, strict=True)):
-            # the mean over the sky has a width that is given
+            # the mean over the sky has a fixed width
             of = slice(1 if k < len(self.means) else 0, None)
             away = self.parameters[k] - self.expected[k]
             parameters[k] += matching_step(power[of], left[of], slope[:, of], away, narrow)

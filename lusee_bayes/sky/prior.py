@@ -1,8 +1,8 @@
-"""S as a square root: what every prior on the sky answers, and its kinds.
+"""S as a square root: the interface of priors on the sky, and its kinds.
 
-m ~ N(mu, S) goes through a square root S = G G^T. Everything downstream works with the whitened sky
-u = G^-1 m ~ N(G^-1 mu, 1). S itself is never inverted, so a mode without variance is one that is
-known to be zero, not an error.
+m ~ N(mu, S) is expressed by a square root S = G G^T. All later steps work with the whitened sky
+u = G^-1 m ~ N(G^-1 mu, 1). S is never inverted, so a mode without variance is known to be zero; it
+is not an error.
 
 Kinds: correlated coefficients, S = G G^T as a matrix; independent unknowns, S = diag(root^2); an
 isotropic Gaussian sky in real harmonic coefficients, S = diag(C_ell). C_ell can be read from a
@@ -32,21 +32,21 @@ from lusee_bayes.sky.sky_source import read_sky_file
 
 Unknowns = Float[Array, " unknowns"]
 Covered = Float[Array, "unknowns unknowns"]
-# ell + 1 at which the amplitude is that of the spectrum
+# ell + 1 at which C_ell is the square of the amplitude
 PIVOT = 10.0
 
 
 class Prior(Described, eqx.Module):
-    """N(mu, S) over the sky's unknowns, as m = G u of independent normals u of unit variance.
+    """N(mu, S) over the sky's unknowns: m = G u, with independent normals u of unit variance.
 
     Attributes
     ----------
     independent : bool
-        Whether S is diagonal; it may save work.
+        Whether S is diagonal, which may save work.
     """
 
     independent: ClassVar[bool] = False
-    # kinds that have one make it a field; None is zero
+    # kinds with a mean make it a field; None means zero
     mean: ClassVar[None] = None
 
     def description(self) -> tuple[str, ...]:
@@ -75,14 +75,14 @@ class Prior(Described, eqx.Module):
 
     @abstractmethod
     def sandwich(self, matrix: Covered) -> Float[Array, "white white"]:
-        """Compute G^T M G of a symmetric M, which may be an information about m: that about u."""
+        """Compute G^T M G for a symmetric M: information about m becomes information about u."""
 
     def whitened_sandwich(self, matrix: Float[Array, "white white"]) -> Covered:
-        """Compute G^-T M G^-1 of a symmetric M."""
+        """Compute G^-T M G^-1 for a symmetric M."""
         return self.whiten_columns(self.whiten_columns(matrix).T)
 
     def colour_covariance(self, white: Float[Array, "white white"]) -> Covered:
-        """Compute G C G^T of a symmetric C, such as the covariance of u: that of m.
+        """Compute G C G^T for a symmetric C: the covariance of u becomes that of m.
 
         NumPy's C may be overwritten.
         """
@@ -98,7 +98,7 @@ class Prior(Described, eqx.Module):
 
     @abstractmethod
     def widened(self, factor: float) -> Prior:
-        """Return the prior about the same mean whose standard deviations are multiplied."""
+        """Return the prior with the same mean and with standard deviations times ``factor``."""
 
     @abstractmethod
     def log_det(self) -> Float[Array, ""]:
@@ -125,9 +125,9 @@ class Prior(Described, eqx.Module):
         Parameters
         ----------
         key : PRNG key
-            For the draw.
+            Key of the random numbers.
         n : int, optional
-            How many; by default one.
+            Number of skies; by default one.
 
         Returns
         -------
@@ -155,8 +155,8 @@ class DensePrior(Prior):
     Raises
     ------
     InputError
-        If they are not float64 or not finite, have other shapes, or G is not lower triangular or
-        has a diagonal that is not positive.
+        If they are not float64, not finite or of the wrong shape, or G is not lower triangular with
+        a positive diagonal.
     """
 
     root: Float[Array, "modes white"]
@@ -180,14 +180,14 @@ class DensePrior(Prior):
     def of_covariance(
         cls, covariance: Float[Array, "modes columns"], mean: Unknowns | None = None
     ) -> DensePrior:
-        """Make the prior of a covariance.
+        """Create the prior from a covariance.
 
         Parameters
         ----------
         covariance : (modes, modes) array
             S, in K^2.
         mean : (modes,) array, optional
-            In K.
+            Prior mean, in K.
 
         Returns
         -------
@@ -207,14 +207,14 @@ class DensePrior(Prior):
     def of_root(
         cls, root: Float[np.ndarray, "modes columns"], mean: Unknowns | None = None
     ) -> DensePrior:
-        """Make the prior of any R with S = R R^T, which is not formed: it may be ill conditioned.
+        """Create the prior from any R with S = R R^T, without forming S: it may be ill conditioned.
 
         Parameters
         ----------
         root : (modes, columns) array
             R, in K, with as many columns as modes or more.
         mean : (modes,) array, optional
-            In K.
+            Prior mean, in K.
 
         Raises
         ------
@@ -272,7 +272,7 @@ class DensePrior(Prior):
         return xp.asarray(xp.log(xp.diagonal(self.root)).sum())
 
     def require_density(self) -> None:
-        """G has an inverse."""
+        """Raise nothing, since G has an inverse."""
 
 
 def _require_symmetric_prior(covariance: Float[np.ndarray, "modes modes"]) -> None:
@@ -414,7 +414,7 @@ class HarmonicPrior(DiagonalPrior):
 
     @property
     def widths(self) -> Float[Array, " modes"]:
-        # the derivative of sqrt at an ell without power is zero here, not infinite
+        # at an ell without power the derivative of sqrt is zero here, not infinite
         xp, power = namespace(self.spectrum), self.spectrum > 0
         root = xp.sqrt(xp.where(power, self.spectrum, 1.0))
         return per_mode(xp.where(power, root, 0.0))
@@ -449,8 +449,8 @@ SPECTRUM = Layout(
 def read_spectrum(path: str | Path, lmax: int) -> Float[np.ndarray, " ells"]:
     """Read C_ell from a text file.
 
-    Each line has ell and C_ell, divided by spaces or a comma; the rest of a line after # is a
-    comment, and so is a first line of names.
+    Each line has ell and C_ell, separated by spaces or a comma. Text after # is a comment, and so
+    is a first line of names.
 
     Parameters
     ----------
@@ -467,7 +467,7 @@ def read_spectrum(path: str | Path, lmax: int) -> Float[np.ndarray, " ells"]:
     ------
     InputError
         If the file cannot be read, a line is not two numbers, C_ell is negative or not finite, or
-        zero at every ell, or an ell is missing or not in its place.
+        zero at every ell, or an ell is missing or out of order.
     """
     require_whole("lmax", lmax, 0, LARGEST_LMAX)
     text = read_text(path, SPECTRUM.what, "check prior.spectrum_file").splitlines()
@@ -501,9 +501,9 @@ def read_mean(path: str | Path, frequency_mhz: float, lmax: int) -> Float[np.nda
     ----------
     path : str or Path
     frequency_mhz : float
-        For files that say their frequencies.
+        For files that state their frequencies.
     lmax : int
-        Highest ell of the map's coefficients that are used.
+        Highest ell of the coefficients to use.
 
     Returns
     -------

@@ -1,16 +1,16 @@
-"""A sky at one frequency, and what can tell it: the embedded Galaxy, or a file.
+"""A sky at one frequency, and its sources: the embedded Galaxy, or a file.
 
 Skies are real harmonic coefficients in Galactic coordinates, in K. Files have one of three layouts.
 
 **Maps** are ULSA's HDF5 or HEALPix FITS.
 
-**Coefficients** are in healpy's packing. FITS, as healpy.write_alm makes it: columns
+**Coefficients** are in healpy's packing. FITS, as healpy.write_alm writes it: columns
 index = ell^2 + ell + m + 1, real, imag, for m >= 0. NumPy's .npz: ``alm`` (frequency, coefficient)
 and ``freq`` in MHz. Galactic, K.
 
-**Cubes** are maps of many frequencies, in the layout of luseepy's ULSA file, which lowsky writes
-too. FITS: one primary image (frequency, pixel) of HEALPix maps, RING, Galactic, K; the header has
-FREQ_START, FREQ_END and FREQ_STEP in MHz. The file does not say its frame and order.
+**Cubes** are maps of many frequencies, in the layout of luseepy's ULSA file, which lowsky also
+writes. FITS: one primary image (frequency, pixel) of HEALPix maps, RING, Galactic, K; the header
+has FREQ_START, FREQ_END and FREQ_STEP in MHz. The file does not state its frame and order.
 """
 
 from __future__ import annotations
@@ -96,12 +96,12 @@ class SkyFile(Described, ABC):
     @classmethod
     @abstractmethod
     def recognises(cls, path: Path) -> bool:
-        """Tell whether an existing file has this layout.
+        """Return whether an existing file has this layout.
 
         Raises
         ------
         InputError
-            If finding out needs more of the file than can be read.
+            If this needs more of the file than can be read.
         """
 
     @classmethod
@@ -114,12 +114,12 @@ class SkyFile(Described, ABC):
         path : str or Path
             The file.
         dataset : str, optional
-            Which of its data sets to read, for layouts that have several.
+            Data set to read, for layouts with several.
 
         Raises
         ------
         InputError
-            If the file cannot be used. The message says what is wrong and how to mend it.
+            If the file cannot be used; the message states the error and its remedy.
         """
 
     @abstractmethod
@@ -129,7 +129,7 @@ class SkyFile(Described, ABC):
         Parameters
         ----------
         frequency_mhz : float
-            Frequency in MHz. Layouts that do not say their frequency return the same sky at all.
+            Frequency in MHz. Layouts without a frequency return the same sky at any frequency.
         lmax : int
             Highest ell.
 
@@ -141,7 +141,7 @@ class SkyFile(Described, ABC):
         Raises
         ------
         InputError
-            If the file holds no sky at this frequency, or not up to this ell.
+            If the file has no sky at this frequency, or not up to this ell.
         """
 
 
@@ -152,13 +152,13 @@ def modes_of_map(path: str | Path, pixels: Pixels, lmax: int) -> Modes:
 
 
 ULSA_DATASET = "smooth_absorb"
-# what healpy writes into pixels without a value; healpy itself takes a second to import
+# healpy's value of pixels without data; importing healpy takes a second
 UNSEEN = -1.6375e30
 
 
 @dataclass(frozen=True, repr=False)
 class SkyMap(SkyFile):
-    """One HEALPix map, whose frequency the file does not say.
+    """One HEALPix map of unstated frequency.
 
     Attributes
     ----------
@@ -179,8 +179,8 @@ class SkyMap(SkyFile):
     def read(cls, path: str | Path, dataset: str | None = None) -> SkyMap:
         """Read a map from HDF5 or FITS.
 
-        The FITS map is the first column of the first binary table. Its header must say
-        ORDERING = RING; COORDSYS, where present, must be Galactic, and the unit a temperature.
+        The FITS map is the first column of the first binary table. Its header must state
+        ORDERING = RING; COORDSYS, if present, must be Galactic, and the unit a temperature.
 
         Parameters
         ----------
@@ -192,7 +192,7 @@ class SkyMap(SkyFile):
         Raises
         ------
         InputError
-            If the file cannot be used. The message says what is wrong and how to mend it.
+            If the file cannot be used; the message states the error and its remedy.
         """
         path = user_path(path)
         hdf5 = h5py.is_hdf5(path)
@@ -290,7 +290,7 @@ class SkyAlms(SkyFile):
     path : str
         The file, for messages.
     frequencies_mhz : (frequencies,) array or None
-        None where the file does not say its frequency.
+        None if the file does not state its frequency.
     modes : (frequencies, modes) array
         Real packed coefficients, Galactic, in K.
     """
@@ -316,7 +316,7 @@ class SkyAlms(SkyFile):
         Raises
         ------
         InputError
-            For a file that cannot be read, arrays that are missing or do not fit, coefficients
+            For a file that cannot be read, arrays that are missing or do not match, coefficients
             that do not fill an lmax, and numbers that are not finite.
         """
         path = user_path(path)
@@ -399,7 +399,7 @@ def _read_alm_fits(path: Path) -> np.ndarray:
     index, real, imag = (arrays[name] for name in COLUMNS)
     ell = np.floor(np.sqrt(index - 1.0) + 1e-9).astype(int)
     m = index - 1 - ell**2 - ell
-    # what does not fit into memory, or is written twice, fills no lmax either
+    # coefficients beyond the largest lmax, or written twice, fill no lmax either
     once = index.max() <= harmonics.LARGEST_LMAX**2 and len(set(index.tolist())) == len(index)
     if not once or (m < 0).any() or (m > ell).any():
         raise InputError(
@@ -435,7 +435,7 @@ class SkyCube(SkyFile):
     path : str
         The file, for messages.
     frequencies_mhz : (frequencies,) array
-        Growing in equal steps.
+        Increasing in equal steps.
     pixels : (frequencies, pixels) array
         HEALPix RING, Galactic, in K.
     """
@@ -455,7 +455,7 @@ class SkyCube(SkyFile):
         Raises
         ------
         InputError
-            For a truncated file, steps of frequency that do not fit the maps, maps that are not
+            For a truncated file, steps of frequency that do not match the maps, maps that are not
             HEALPix, and numbers that are not finite.
         """
         with opened(path, "sky maps of many frequencies") as hdus:
@@ -474,7 +474,7 @@ class SkyCube(SkyFile):
         return cls(str(path), start + step * np.arange(count), pixels)
 
     def map_at(self, frequency_mhz: float) -> Float[np.ndarray, " pixels"]:
-        """Return the map at a frequency; between two maps, by the power law of each pixel.
+        """Return the map at a frequency; between two maps, each pixel follows a power law.
 
         Parameters
         ----------
@@ -489,8 +489,8 @@ class SkyCube(SkyFile):
         Raises
         ------
         InputError
-            Outside the file's frequencies, or where a pixel between two frequencies is not
-            positive in both.
+            Outside the file's frequencies, or if a pixel between two frequencies is not positive in
+            both.
         """
         mhz = self.frequencies_mhz
         if not mhz[0] <= frequency_mhz <= mhz[-1]:
@@ -525,12 +525,12 @@ class SkyCube(SkyFile):
         )
 
 
-# the first that recognises a file reads it: every FITS file that is nothing else is a map
+# the first that recognises a file reads it; any other FITS file is a map
 SKY_READERS: tuple[type[SkyFile], ...] = (SkyAlms, SkyCube, SkyMap)
 
 
 class SkySource(ABC):
-    """A sky that is known at many frequencies."""
+    """A sky at many frequencies."""
 
     @abstractmethod
     def at(self, frequency_mhz: float, lmax: int) -> Sky:
@@ -564,14 +564,14 @@ def _galaxy_modes(frequency_mhz: float, seed: int | None, lmax: int) -> np.ndarr
 
 
 def read_sky_file(path: str | Path, dataset: str | None = None) -> SkyFile:
-    """Read a file of skies, of whichever layout.
+    """Read a file of skies, in any known layout.
 
     Parameters
     ----------
     path : str or Path
         The file.
     dataset : str, optional
-        Which of its data sets to read, for layouts that have several.
+        Data set to read, for layouts with several.
 
     Raises
     ------
@@ -598,10 +598,10 @@ def galaxy_sky(
     frequency_mhz : float
     lmax : int
     seed : int or None
-        Chooses the random structure (:class:`.Structures`), which is the same at all frequencies;
-        None leaves it out.
+        Seed of the random structure (:class:`.Structures`), which is the same at all frequencies;
+        None for no structure.
     sources : tuple of PointSource
-        The sources that are added to the diffuse sky.
+        Sources to add to the diffuse sky.
 
     Raises
     ------
@@ -623,7 +623,7 @@ def sky_from_file(
     file_frequency_mhz: float | None = None,
     spectral_index: float = -2.5,
 ) -> Sky:
-    """Read the sky of a file of one of the layouts in :data:`SKY_READERS`.
+    """Read the sky from a file in one of the layouts of :data:`SKY_READERS`.
 
     Parameters
     ----------
@@ -632,18 +632,18 @@ def sky_from_file(
     frequency_mhz : float
     lmax : int
     dataset : str, optional
-        Which of its data sets to read, for layouts that have several.
+        Data set to read, for layouts with several.
     file_frequency_mhz : float, optional
-        The frequency in MHz that the file was made for, or at which it is read. The sky is then
-        scaled by (frequency / file frequency)^spectral_index. By default the file is read at
-        the frequency asked for.
+        Frequency in MHz for which the file was made, or at which it is read. The sky is then scaled
+        by (frequency / file frequency)^spectral_index. By default the file is read at
+        ``frequency_mhz``.
     spectral_index : float
         Index of that power law.
 
     Raises
     ------
     InputError
-        For files that are missing, unreadable, in another order or frame, hold NaN, or have
+        For files that are missing, unreadable, in another order or frame, contain NaN, or have
         other frequencies; if ``file_frequency_mhz`` is not positive.
     """
     read_at = frequency_mhz if file_frequency_mhz is None else file_frequency_mhz

@@ -1,11 +1,11 @@
-"""The prior on skies of several frequencies: few maps with known spectra, and a residual of each.
+"""The prior on skies of several frequencies: few maps with known spectra, and residuals.
 
 ::
 
     m_f = sum_c s_fc a_c + r_f,    a_c ~ N(0, C^c_ell),    r_f ~ N(0, R^f_ell),
 
-so S = sum_c s_c s_c^T (x) C^c + diag(R^f). The spectra are those of a power law, its curvature and
-its turnover, or the principal ones of a kernel in ln frequency; the residual is what they leave.
+so S = sum_c s_c s_c^T (x) C^c + diag(R^f). The spectra are a power law, its curvature and its
+turnover, or the principal ones of a kernel in ln frequency; the residual is the remainder.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ from lusee_bayes.core.arrays import Array, namespace
 from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.harmonics import per_mode, power_spectrum
 
-# spectra over the power law: x is frequency / reference, y frequency / turnover; ionised gas takes
-# 1 - exp(-tau) away, and tau goes as nu^-2.1 (Altenhoff et al. 1960)
+# spectra relative to the power law: x is frequency / reference, y frequency / turnover; ionised gas
+# absorbs 1 - exp(-tau), with tau proportional to nu^-2.1 (Altenhoff et al. 1960)
 SPECTRA = {
     "power_law": lambda x, y: np.ones_like(x),
     "curvature": lambda x, y: np.log(x),
     "turnover": lambda x, y: -np.expm1(-(y**-2.1)),
 }
-# principal spectra of a kernel with a smaller share of the variance are left out
+# principal spectra of a kernel with a smaller share of the variance are dropped
 KERNEL_TOLERANCE = 1e-10
 
 
 def require_names(
     kind: str, several: str, names: tuple[str, ...], known: Mapping[str, Callable], n_channels: int
 ) -> None:
-    """Refuse names that are not known, and more of them than channels.
+    """Refuse unknown names, and more names than channels.
 
     Parameters
     ----------
     kind, several : str
-        What they name, one and many; for the message.
+        Singular and plural of the named things, for the message.
     names : tuple of str
     known : mapping
-        By name.
+        Known names.
     n_channels : int
 
     Raises
@@ -62,7 +62,7 @@ def require_names(
 
 
 def check_components(names: tuple[str, ...], n_channels: int, residual: float | None) -> None:
-    """Refuse spectral components that so many channels cannot tell apart.
+    """Refuse spectral components that ``n_channels`` channels cannot separate.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def check_components(names: tuple[str, ...], n_channels: int, residual: float | 
         Keys of ``SPECTRA``.
     n_channels : int
     residual : float, optional
-        None if it is what a fit of the components leaves, for which it must leave something.
+        None for the residual of a fit of the components, which then must not be exact.
 
     Raises
     ------
@@ -104,7 +104,7 @@ class SpectralPrior(checks.Described, eqx.Module):
     Raises
     ------
     InputError
-        If shapes do not fit, or numbers are not finite or not positive.
+        If shapes do not match, or numbers are not finite or not positive.
     """
 
     frequencies_mhz: Float[Array, " channels"]
@@ -153,8 +153,8 @@ class SpectralPrior(checks.Described, eqx.Module):
         reference_mhz, turnover_mhz : float
             Frequencies of ``SPECTRA`` in MHz.
         residual : float, optional
-            Rms of each channel's residual over that of its sky. 0 is no residual; None takes
-            what the fit leaves.
+            Rms of each channel's residual over that of its sky. 0 is no residual; None uses the
+            residual of the fit.
 
         Raises
         ------
@@ -166,10 +166,10 @@ class SpectralPrior(checks.Described, eqx.Module):
         x, y = frequencies / reference_mhz, frequencies / turnover_mhz
         power_law = x**index
         shapes = np.stack([SPECTRA[name](x, y) for name in names], axis=1)
-        # in units of the power law, so that no channel rules the fit
+        # in units of the power law, so that no channel dominates the fit
         maps, *_ = np.linalg.lstsq(shapes, skies / power_law[:, None], rcond=None)
         mixing = shapes * power_law[:, None]
-        # the fit has taken its share of the residuals' variance
+        # correct for the residuals' variance that the fit absorbs
         free = len(frequencies) / max(len(frequencies) - len(names), 1)
         left_over = np.sqrt(free) * (skies - mixing @ maps)
         residuals = (left_over, 1.0) if residual is None else (skies, residual)
@@ -190,8 +190,8 @@ class SpectralPrior(checks.Described, eqx.Module):
         """Use the principal spectra of a kernel in ln frequency.
 
         S = C_ell (x) K with K = (x x')^index exp(-ln^2(x / x') / 2 length^2), x = nu / reference.
-        C_ell is the mean over channels of the model skies' over the power law's square. Principal
-        spectra below ``KERNEL_TOLERANCE`` of the first are left out.
+        C_ell is the mean over channels of the model skies' C_ell over the power law's square.
+        Principal spectra below ``KERNEL_TOLERANCE`` of the first are dropped.
 
         Parameters
         ----------
@@ -274,7 +274,7 @@ class SpectralPrior(checks.Described, eqx.Module):
 
 
 def _residual_spectra(skies: np.ndarray, residual: float) -> Float[Array, "channels ells"] | None:
-    """R^f_ell: that of a share of the skies; None for no residual."""
+    """R^f_ell for a share of the skies; None for no residual."""
     if residual < 0:
         raise InputError(f"the residual must not be negative, got {residual}")
     return None if residual == 0 else jnp.asarray(residual**2 * power_spectrum(skies))

@@ -1,16 +1,16 @@
-"""Fields of antennas on the sphere, and the beams of products made of them.
+"""Fields of antennas on the sphere, and the beams of products computed from them.
 
-**Quadrature.** A beam ends at the horizon. Gauss-Legendre nodes in cos theta over [0, 1] never see
-the cut, so harmonic coefficients converge exponentially where pixel sums ring. Azimuth is uniform:
-a Fourier sum there is exact up to aliasing.
+**Quadrature.** Beams end at the horizon. Gauss-Legendre nodes in cos theta over [0, 1] never see
+the cut, so harmonic coefficients converge exponentially, whereas pixel sums ring. Azimuths are
+uniform: a Fourier sum over them is exact up to aliasing.
 
 **HEALPix pixels** are interpolated to other directions above the horizon. A ring of pixels is a
-Fourier series in phi. Order m of a smooth function passes the zenith as f_m(-theta) = (-1)^m
-f_m(theta), and is zero there unless m is: splines in theta need no end at the zenith, and no rings
-that have too few pixels for an order (4 i in ring number i). The error is that of cubic splines
-with the distance h = 1 / NSIDE of rings at most, 5/384 (h l)^4 of a pattern of degree l, and in the
-last step to the horizon, which is extrapolated, up to 35 times that. Orders 3 pass for orders 1 in
-the first ring, by (h l)^3 / 43 of the pattern there.
+Fourier series in phi. Order m of a smooth function continues across the zenith as
+f_m(-theta) = (-1)^m f_m(theta), and is zero there unless m is. So splines in theta need no boundary
+condition at the zenith, and no rings with too few pixels for an order (ring number i has 4 i). The
+error is that of cubic splines with ring spacings of at most h = 1 / NSIDE: 5/384 (h l)^4 for a
+pattern of degree l, and up to 35 times that in the last step to the horizon, which is extrapolated.
+In the first ring orders 3 alias to orders 1, by (h l)^3 / 43 of the pattern there.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ class HemisphereGrid(eqx.Module):
         Raises
         ------
         InputError
-            If ``f`` does not fit the grid, or its azimuths are too few for ``lmax``.
+            If ``f`` does not match the grid, or the grid has too few azimuths for ``lmax``.
         """
         checks.require_shape("the field", f, (*f.shape[:-2], len(self.theta), self.n_phi))
         if self.n_phi <= 2 * lmax:
@@ -118,7 +118,7 @@ class HemisphereGrid(eqx.Module):
         fourier = xp.fft.rfft(f, axis=-1)[..., : lmax + 1] * (2.0 * np.pi / self.n_phi)
         sines, cosines = SQRT2 * fourier.imag[..., :0:-1], SQRT2 * fourier.real[..., 1:]
         parts = xp.concatenate([sines, fourier.real[..., :1], cosines], axis=-1)
-        # for every order a product with its functions of theta, zero where there is no mode
+        # multiply every order by its functions of theta, which are zero where there is no mode
         polar = np.zeros((2 * lmax + 1, len(self.theta), lmax + 1))
         polar[m + lmax, :, ell] = self.polar_weights(lmax).T
         by_order = xp.moveaxis(parts, -1, 0).reshape(2 * lmax + 1, -1, len(self.theta)) @ polar
@@ -166,15 +166,15 @@ class AntennaFields(checks.Described, eqx.Module):
         return self.e_theta.shape[0]
 
 
-# between the frequencies of a file: luseepy's rule, straight lines between products of fields and
-# between impedances, or cubic splines through fields and impedances
+# between the frequencies of a file: luseepy's rule (linear in products of fields and in
+# impedances), or cubic splines through fields and impedances
 Interpolation = Literal["linear", "spline"]
-# frequencies that differ by less are one, as in luseepy; a header holds 15 digits of them
+# frequencies that differ by less are equal, as in luseepy; a header stores 15 digits
 SAME_FREQUENCY_MHZ = 1e-6
 
 
 def place_of(what: str, known_mhz: Frequencies, frequency_mhz: float) -> int:
-    """Return the place of a frequency among known ones. InputError if it is not among them."""
+    """Return the index of a frequency among known ones; InputError if it is not among them."""
     nearest = int(np.argmin(np.abs(known_mhz - frequency_mhz)))
     if abs(known_mhz[nearest] - frequency_mhz) > SAME_FREQUENCY_MHZ:
         raise InputError(
@@ -186,25 +186,25 @@ def place_of(what: str, known_mhz: Frequencies, frequency_mhz: float) -> int:
 
 
 def neighbours(path: str, known_mhz: Frequencies, frequency_mhz: float) -> list[tuple[int, float]]:
-    """Return the frequencies of a file that linear interpolation takes, and their weights.
+    """Return the frequencies of a file that linear interpolation uses, and their weights.
 
     Parameters
     ----------
     path : str
         File that the frequencies come from, for the error message.
     known_mhz : (frequencies,) array
-        Growing.
+        Increasing.
     frequency_mhz : float
 
     Returns
     -------
     list of (int, float)
-        Place and weight: one of them where the file has the frequency, else two.
+        Index and weight: one pair if the file has the frequency, else two.
 
     Raises
     ------
     InputError
-        Outside the known frequencies.
+        If the frequency is outside the known ones.
     """
     nearest = int(np.argmin(np.abs(known_mhz - frequency_mhz)))
     if abs(known_mhz[nearest] - frequency_mhz) <= SAME_FREQUENCY_MHZ:
@@ -234,7 +234,7 @@ def at_frequency(
     path : str
         File that the arrays come from, for the error message.
     known_mhz : (frequencies,) array
-        Growing.
+        Increasing.
     frequency_mhz : float
     *parts : (frequencies, ...) array
     rule : {"linear", "spline"}
@@ -242,13 +242,13 @@ def at_frequency(
     Returns
     -------
     list of array
-        The parts at ``frequency_mhz``, without their first axis; exactly those of the file where
-        it has this frequency.
+        The parts at ``frequency_mhz``, without their first axis; exactly the file's values if it
+        has this frequency.
 
     Raises
     ------
     InputError
-        Outside the known frequencies.
+        If the frequency is outside the known ones.
     """
     places = neighbours(path, known_mhz, frequency_mhz)
     if len(places) == 1 or rule == "linear":
@@ -266,9 +266,9 @@ def on_grid(rows: Pattern, theta: Angles, grid: HemisphereGrid, angle_deg: float
     rows : (theta, phi) array
         The pattern at azimuths 2 pi k / n.
     theta : (theta,) array
-        Of the pattern, in radians.
+        Angles of the pattern, in radians.
     grid : HemisphereGrid
-        Nothing is interpolated where its directions are those of the pattern.
+        Target of the interpolation; directions that equal the pattern's are not interpolated.
     angle_deg : float
         How far to turn the pattern, from East towards North.
 
@@ -304,8 +304,8 @@ def stokes_pairs(e_theta: Fields, e_phi: Fields, stokes: str = "I") -> Pairs:
         U: (Et Fp* + Ep Ft*) / 2      V: i (Ep Ft* - Et Fp*) / 2
 
     from <e_a conj(e_b)> = [[I + Q, U - i V], [U + i V, I - Q]] / 2 in the basis (theta, phi), with
-    exp(+i w t). V is the IAU's, right-handed minus left-handed: where it is positive, a receiver
-    that looks towards the source sees the electric field turn counter-clockwise. The paper's U and
+    exp(+i w t). V is the IAU's, right-handed minus left-handed: if it is positive, a receiver that
+    looks towards the source sees the electric field turn counter-clockwise. The paper's U and
     V lack the factor 1/2; with it a fully polarised wave gives ``|E.e|^2``.
 
     Parameters
@@ -353,7 +353,7 @@ class ProductBeams(checks.Described, eqx.Module):
     Raises
     ------
     InputError
-        If the shape of ``modes`` fits no number of antennas or no lmax.
+        If the shape of ``modes`` matches no number of antennas or no lmax.
     """
 
     modes: Float[Array, "products modes"]
@@ -400,7 +400,7 @@ def product_beams(
     frequency_mhz : float
     lmax : int
     **options
-        ``stokes`` and ``normalise``, as of :func:`product_modes`.
+        ``stokes`` and ``normalise``, as for :func:`product_modes`.
 
     Returns
     -------
@@ -444,13 +444,13 @@ def product_modes(
 
 
 def beam_scale(fields: AntennaFields, beams: ProductBeams) -> float:
-    """Return what makes products of fields beams in K per K, whatever unit the fields have.
+    """Return the factor that turns products of fields, in any unit, into beams in K per K.
 
     Parameters
     ----------
     fields : AntennaFields
     beams : ProductBeams
-        Of the same antennas: the scale is that of the mean integral of their autos.
+        Of the same antennas: the mean integral of their autos sets the scale.
     """
     autos = beams.modes[auto_indices(fields.n_antennas), 0]
     return float(np.sqrt(4.0 * np.pi) * autos.mean() / mean_auto_integral(fields))
@@ -487,7 +487,7 @@ def from_rings(
     starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
     ring_theta, first_phi = healpy.pix2ang(nside, starts)
     orders = np.arange(1 - 2 * nside, 2 * nside)
-    # f_m of every ring; orders that a ring has too few pixels for are not looked at
+    # f_m of every ring; orders for which a ring has too few pixels are not used
     series = np.zeros((*pixels.shape[:-1], len(sizes), len(orders)), dtype=np.complex128)
     for ring, (n, start) in enumerate(zip(sizes, starts, strict=True)):
         spectrum = np.fft.fft(pixels[..., start : start + n], axis=-1) / n

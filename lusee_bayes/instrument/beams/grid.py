@@ -1,18 +1,17 @@
 """Beams of files over a grid of parameters, interpolated between them.
 
-Somebody's simulations of the antennas at several values of, say, permittivity and tilt are one
-source of beams, whose parameters can be unknowns. A table in CSV says what each file is of: a
-column ``file``, relative to the table, and a column for each parameter, with a row for every
-combination of their values.
+Simulations of the antennas at several values of, for example, permittivity and tilt form one source
+of beams, whose parameters can be unknowns. A table in CSV describes the files: a column ``file``,
+relative to the table, and a column for each parameter, with a row for every combination of their
+values.
 
-Beams are sums over the files, B(p) = sum_k w_k(p) B_k, with products of weights along each
-parameter: polynomials through all of up to five values, cubic splines through more. So is what the
-ground and the antennas' losses emit.
+Beams are sums over the files, B(p) = sum_k w_k(p) B_k. The weights are products over the
+parameters: polynomials through up to five values, cubic splines through more. The emission of the
+ground and of the antennas' losses is interpolated likewise.
 
-**Unit.** What is measured are volts, and 1 K stays what it is for the antennas at nominal values
-p_0, U(p_0), whatever their impedances are at p: what is interpolated are B_k U_k / U(p_0), U being
-the root of U_aa U_bb of a product's ports (:mod:`.luseepy_files`). Sources that know no volts are
-interpolated as they are.
+**Unit.** Receivers measure volts, and 1 K is defined by the antennas at nominal values p_0, U(p_0),
+whatever the impedances at p: B_k U_k / U(p_0) is interpolated, with U the root of U_aa U_bb of a
+product's ports (:mod:`.luseepy_files`). Sources without volts are interpolated unchanged.
 """
 
 from __future__ import annotations
@@ -39,29 +38,29 @@ from lusee_bayes.instrument.beams.source import BeamSource, Circuit, Lines, Para
 from lusee_bayes.instrument.products import all_products
 
 Nodes = Float[np.ndarray, " nodes"]
-# values of a parameter through which one polynomial goes; through more go cubic splines
+# largest number of values for one polynomial; more values get cubic splines
 MOST_IN_ONE = 5
 WHAT = "a table of beam files: a column file, and one with two or more values for each parameter"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GridBeams(Described, BeamSource):
-    """Sources of beams at the nodes of a grid of parameters, interpolated to values of these.
+    """Beams interpolated between sources at the nodes of a grid of parameters.
 
     Attributes
     ----------
     path : str
         The table, for error messages.
     axes : mapping of str to (nodes,) array
-        Growing values of each parameter.
+        Increasing values of each parameter.
     sources : tuple of BeamSource
-        For every combination of these values, those of the last parameter changing first.
+        For every combination of these values; the last parameter changes fastest.
     values : mapping of str to () array
         Present values of the parameters.
     nominal : mapping of str to float
-        Values for which visibilities in volts are converted to K.
+        Values that define the conversion of visibilities from volts to K.
     cache : dict
-        What has been computed at the nodes.
+        Results computed at the nodes.
     """
 
     path: str
@@ -93,7 +92,7 @@ class GridBeams(Described, BeamSource):
         return replace(self, values={**self.values, **values})
 
     def weights(self, values: Values) -> Float[Array, " sources"]:
-        """Return the weights of the sources at these values of all parameters."""
+        """Return the weights of the sources for these values of all parameters."""
         combined = np.ones(1)
         for name, nodes in self.axes.items():
             combined = (combined[:, None] * weights_along(nodes, values[name])[None]).reshape(-1)
@@ -106,12 +105,12 @@ class GridBeams(Described, BeamSource):
         return self._seen(frequency_mhz, 0)[:, -1]
 
     def _seen(self, frequency_mhz: float, lmax: int) -> Float[Array, "products columns"]:
-        """Coefficients of the beams, and what comes without any sky."""
+        """Coefficients of the beams, and the visibilities without any sky."""
         nodes = self._at_nodes(frequency_mhz, lmax)
         return (self.weights(self.values) @ nodes.reshape(len(nodes), -1)).reshape(nodes.shape[1:])
 
     def _at_nodes(self, frequency_mhz: float, lmax: int) -> Float[np.ndarray, "sources products n"]:
-        """The same of every source, in the unit of the nominal values."""
+        """The same for every source, in the unit of the nominal values."""
         key = frequency_mhz, lmax
         if key not in self.cache:
             unit = self.circuit(frequency_mhz)
@@ -119,7 +118,7 @@ class GridBeams(Described, BeamSource):
         return self.cache[key]
 
     def circuit(self, frequency_mhz: float) -> Circuit | None:
-        """Return antennas and receivers at the nominal values, which say what 1 K is."""
+        """Return antennas and receivers at the nominal values, which define 1 K."""
         circuits = [source.circuit(frequency_mhz) for source in self.sources]
         if None in circuits:
             return None
@@ -143,11 +142,11 @@ class GridBeams(Described, BeamSource):
         return replace(self, sources=tuple(s.behind(receiver) for s in self.sources), cache={})
 
     def interpolation_errors(self, frequency_mhz: float, lmax: int) -> dict[str, Lines]:
-        """Return by how much beams are off where they are interpolated without their own file.
+        """Return errors of beams that are interpolated without their own file.
 
-        For each value of a parameter between its ends: the beams of its other values, interpolated
-        along this parameter, minus those of the files. It is more than the error of the whole grid,
-        whose polynomials have a degree more, or half the step.
+        For each inner value of a parameter: the beams interpolated along this parameter from its
+        other values, minus those of the files. This exceeds the error of the whole grid, whose
+        polynomials have one degree more, or half the step.
         """
         nodes, errors = self._at_nodes(frequency_mhz, lmax)[..., :-1], {}
         whole = nodes.reshape(*map(len, self.axes.values()), *nodes.shape[1:])
@@ -161,7 +160,7 @@ class GridBeams(Described, BeamSource):
 
 
 def _in_unit(source: BeamSource, unit: Circuit | None, frequency_mhz: float, lmax: int):
-    """A source's coefficients and background, where 1 K is what it is in another circuit."""
+    """A source's coefficients and background, with 1 K as defined by another circuit."""
     modes, ground = source.beams(frequency_mhz, lmax).modes, source.background(frequency_mhz)
     both = np.concatenate([np.asarray(modes), np.asarray(ground)[:, None]], axis=1)
     if unit is None:
@@ -172,25 +171,25 @@ def _in_unit(source: BeamSource, unit: Circuit | None, frequency_mhz: float, lma
 
 
 def weights_along(nodes: Nodes, value: float | Float[Array, ""]) -> Float[Array, " nodes"]:
-    """Return the weights of values at nodes that interpolate to another place.
+    """Return the weights of values at nodes that interpolate them to a point.
 
     Parameters
     ----------
     nodes : (nodes,) array
-        Growing, at least two.
+        Increasing, at least two.
     value : () array
-        The place, between the first and the last node.
+        The point, between the first and the last node.
 
     Returns
     -------
     (nodes,) array
-        Differentiable in ``value``, twice where there are more than five nodes.
+        Differentiable in ``value``, twice if there are more than five nodes.
     """
     n, xp = len(nodes), namespace(value)
     degree = n - 1 if n <= MOST_IN_ONE else 3
     spline = interpolate.make_interp_spline(nodes, np.eye(n), k=degree)
     starts = np.unique(spline.t)[:-1]
-    # Taylor's coefficients of every weight, at the start of every piece
+    # Taylor coefficients of every weight, at the start of every piece
     taylor = np.stack([spline(starts, nu=d) / factorial(d) for d in range(degree + 1)], axis=1)
     piece = xp.searchsorted(xp.asarray(starts[1:]), value, side="right")
     step, terms = value - xp.asarray(starts)[piece], xp.asarray(taylor)[piece]
@@ -208,9 +207,9 @@ def read_beam_grid(
     ----------
     path : str or Path
     values : mapping of float, optional
-        Of parameters; by default they are in the middle of the grid.
+        Values of parameters; by default the middle of the grid.
     read : callable
-        Makes the beams of a file.
+        Reads the beams of a file.
 
     Returns
     -------
@@ -230,12 +229,12 @@ def read_beam_grid(
 
 
 def read_grid_table(path: str | Path) -> tuple[tuple[str, ...], dict[str, Nodes]]:
-    """Read the names of files over a grid, the last parameter changing first, and its axes.
+    """Read the names of files over a grid, the last parameter changing fastest, and its axes.
 
     Raises
     ------
     InputError
-        For a table that is missing or damaged, lacks a combination of values, or has one twice.
+        If the table is missing or damaged, lacks a combination of values, or has one twice.
     """
     columns = read_table(path, Layout(WHAT, {"file": Variable(("row",), "text")}))
     names = [name for name in columns if name != "file"]

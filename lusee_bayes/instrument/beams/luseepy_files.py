@@ -1,11 +1,11 @@
 """Beams in luseepy's files: responses of the ports, and scalar beams.
 
-Their headers may state their conventions, which are checked; a word that is absent, or "UNKNOWN",
-as luseepy writes where it was not given any, states nothing. For data that luseepy has made there
-are its own quadratures over the directions of a file.
+Their headers may state conventions, which are checked; an absent word, or "UNKNOWN" (luseepy's
+placeholder), states nothing. For data made by luseepy, its own quadratures over the directions of a
+file are available.
 
-**Responses** are those of coupled antennas over ground, with their receivers. FITS version 3: bare
-effective lengths H_theta, H_phi (port, frequency, theta, phi) in m, RMS, of a wave arriving from
+**Responses** describe coupled antennas over ground, with their receivers. FITS version 3: bare
+effective lengths H_theta, H_phi (port, frequency, theta, phi) in m, RMS, for a wave arriving from
 (theta, phi), phi from East towards North; impedance ZA and its resistive parts Rsky, Rmoon, Rloss
 (frequency, port, port) in Ohm, with ZA + ZA^H = 2 (Rsky + Rmoon + Rloss); freq in MHz, theta and
 phi in degrees. At the receivers' inputs, one-sided, ::
@@ -13,19 +13,19 @@ phi in degrees. At the receivers' inputs, one-sided, ::
     V_ab = k eta0 / lambda^2 int (M Ht)_a conj((M Ht)_b) + (M Hp)_a conj((M Hp)_b) T dOmega
            + 4 k (M (T_moon Rmoon + T_antenna Rloss) M^H)_ab    in V^2/Hz.
 
-An enclosure of 1 K makes U = 4 k M (ZA + ZA^H) / 2 M^H; V_ab / sqrt(U_aa U_bb) is in K. Between the
-frequencies of the file luseepy interpolates impedances and the integrals of open ports (M left out)
-linearly, and takes M of the interpolated ZA.
+An enclosure at 1 K gives U = 4 k M (ZA + ZA^H) / 2 M^H; V_ab / sqrt(U_aa U_bb) is in K. Between the
+file's frequencies luseepy interpolates impedances and the integrals of open ports (without M)
+linearly, and computes M from the interpolated ZA.
 
-**Scalar beams** are the field pattern of one arm, used once for each port. FITS version 2: images
+**Scalar beams** are the field pattern of one arm, used for every port. FITS version 2: images
 Etheta_real, Etheta_imag, EPhi_real, EPhi_imag (frequency, theta, phi), the response to a wave
 arriving from (theta, phi), phi from East towards North, time convention exp(+i w t); gain_conv
 g(frequency), freq in MHz, Z_real and Z_imag in Ohm. Visibilities in K are ::
 
     T_ij = sqrt(g_i g_j) / (4 pi) int (Et_i conj(Et_j) + Ep_i conj(Ep_j)) I dOmega,
 
-so that fields times sqrt(2 g / 4 pi) give product beams without any other normalisation. Between
-the frequencies of the file luseepy interpolates g and the integrals linearly, not the fields.
+so fields times sqrt(2 g / 4 pi) give product beams without any other normalisation. Between the
+file's frequencies luseepy interpolates g and the integrals linearly, not the fields.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ from lusee_bayes.instrument.beams.fields import (
 from lusee_bayes.instrument.beams.source import BeamSource, Circuit, JFETReceiver, Receiver
 from lusee_bayes.instrument.products import N_ANTENNAS, auto_indices, to_matrix, to_real
 
-# what this package assumes of the images, in lower case
+# conventions of the images that this package assumes, in lower case
 CONVENTIONS: Mapping[str, str] = {
     "TIMECONV": "e+jwt",
     "COORDSYS": "instrument-topocentric",
@@ -72,7 +72,7 @@ CONVENTIONS: Mapping[str, str] = {
     "PORTS": "0123",
     "CANONICAL": "h[m],si-rms",
 }
-# of responses: what luseepy has converted to effective lengths in m, and how, by NORM_KIND
+# of responses: the input that luseepy converts to effective lengths in m, by NORM_KIND
 SOURCES = ("NORM_KIND", "INPUT_KIND", "FIELD_KIND", "FIELD_UNIT")
 CONVERTED: Mapping[str, tuple[str, str, tuple[str, ...]]] = {
     "already-effective-length": ("bare", "effective-length", ("m",)),
@@ -84,19 +84,19 @@ CONVERTED: Mapping[str, tuple[str, str, tuple[str, ...]]] = {
 
 
 def require_conventions(path: str | Path, said: Mapping[str, Any]) -> None:
-    """Check the words of a header against what this package assumes.
+    """Check the words of a header against the conventions of this package.
 
     Parameters
     ----------
     path : str or Path
         The file, for the message.
     said : mapping of str to str
-        Its words.
+        Words of the header.
 
     Raises
     ------
     InputError
-        If one contradicts it.
+        If a word contradicts them.
     """
     stated = {key: str(value).strip().lower() for key, value in said.items()}
     stated = {key: text for key, text in stated.items() if text not in UNSTATED}
@@ -113,10 +113,10 @@ def require_conventions(path: str | Path, said: Mapping[str, Any]) -> None:
 
 
 class BandLimitedGrid(HemisphereGrid):
-    """luseepy's rule for responses: the pattern as a band-limited function on the whole sphere.
+    """luseepy's rule for responses: the pattern is band-limited on the whole sphere.
 
-    The samples above the horizon are continued by zeros below it, those on it count half, and the
-    trigonometric polynomial in theta through all of them is integrated exactly.
+    Samples below the horizon are zeros, and samples on it count half. The trigonometric polynomial
+    in theta through all of them is integrated exactly.
 
     References
     ----------
@@ -158,8 +158,8 @@ def cardinal_functions(theta: Angles, intervals: int, parity: int) -> np.ndarray
         Where to evaluate them, in radians.
     intervals : int
     parity : {0, 1}
-        Whether they continue beyond the poles evenly (0) or oddly (1), as the Fourier coefficients
-        of a smooth function on the sphere do for even and odd m.
+        Whether they continue beyond the poles evenly (0) or oddly (1), like the Fourier
+        coefficients of a smooth function on the sphere for even and odd m.
 
     Returns
     -------
@@ -185,7 +185,7 @@ MATRIX = Variable(("freq", N_ANTENNAS, N_ANTENNAS), unit="Ohm")
 
 
 def parts_of(*names: str) -> list[str]:
-    """Return the names of the images that hold real and imaginary parts."""
+    """Return the names of the images of real and imaginary parts."""
     return [f"{name}_{part}" for name in names for part in ("real", "imag")]
 
 
@@ -199,13 +199,13 @@ RESPONSE_LAYOUT = Layout(
     },
     dict.fromkeys((*CONVENTIONS, *SOURCES), Attribute("word", optional=True)),
 )
-# files hold the matrices in single precision; three of them are added up
+# files store the matrices in single precision, and three of them are added
 RESISTANCE_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LuseepyBeam(Described, BeamSource):
-    """What a file holds in directions of a grid, at several frequencies.
+    """The fields of a file in directions of a grid, at several frequencies.
 
     Attributes
     ----------
@@ -217,12 +217,12 @@ class LuseepyBeam(Described, BeamSource):
     e_theta, e_phi : (frequencies, ..., theta, phi) complex array
         Response to the theta and phi components of the incident field.
     interpolation : {"linear", "spline"}
-        Between the frequencies: luseepy's rule, products of fields linearly and so impedances, or
+        Rule between the frequencies: luseepy's (linear in products of fields and in impedances), or
         cubic splines through fields and impedances.
     turntable_offset_deg : float
-        How much further the turntable is than it says, from East towards North.
+        True minus stated turntable angle, from East towards North.
     luseepy_quadrature : bool
-        Integrate with luseepy's own rule, for data that luseepy has made.
+        Integrate with luseepy's own rule, for data made by luseepy.
     moon_k : float
         Temperature of the ground in K.
     """
@@ -262,7 +262,7 @@ class LuseepyBeam(Described, BeamSource):
         """Coefficients of the beams of all products by luseepy's rule."""
 
     def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
-        # nodes integrate across the horizon exactly
+        # these nodes treat the cut at the horizon exactly
         exact = HemisphereGrid.gauss_legendre(2 * len(self.theta), self.n_phi)
         grid = self.luseepy_grid if self.luseepy_quadrature else exact
         if self.interpolation == "spline":
@@ -295,9 +295,9 @@ class PortResponse(LuseepyBeam):
     moon_ohm, loss_ohm : (frequencies, ports, ports) complex array
         Rmoon and Rloss.
     receiver : Receiver or None
-        What is connected to the ports; None leaves them open.
+        Receivers at the ports; None leaves them open.
     receiver_said : bool
-        Whether these receivers are to be used for all data; else those that data say.
+        Whether to use these receivers for all data, in place of those that data state.
     antenna_k : float
         Temperature of the lossy antennas in K.
     """
@@ -325,19 +325,19 @@ class PortResponse(LuseepyBeam):
         return *super().description(), f"1 K is {extent(kelvin, 'V^2/Hz')} behind the receivers"
 
     def circuit(self, frequency_mhz: float) -> Circuit:
-        """Return antennas and receivers. InputError outside the frequencies of the file."""
+        """Return antennas and receivers; InputError outside the frequencies of the file."""
         parts = (self.impedance_ohm, self.moon_ohm, self.loss_ohm)
         return Circuit(frequency_mhz, *self._at(frequency_mhz, *parts), self.receiver)
 
     def per_kelvin(self, frequency_mhz: float) -> Float[np.ndarray, " ports"]:
-        """Return U_aa, the V^2/Hz that an enclosure of 1 K makes at each receiver's input."""
+        """Return U_aa, the V^2/Hz at each receiver's input in an enclosure at 1 K."""
         return self.circuit(frequency_mhz).per_kelvin.diagonal().real
 
     def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
         """Return the fields of the ports; their products are beams in K per K and sr.
 
-        Between the frequencies of the file this is so with splines only. With linear interpolation
-        the fields themselves are interpolated here, for pictures; use :meth:`beams` for products.
+        Between the file's frequencies this needs splines. With linear interpolation the fields
+        themselves are interpolated here, for pictures; use :meth:`beams` for products.
         """
         opened = self._open(self._at(frequency_mhz, self.e_theta, self.e_phi), grid)
         mixing = self._mixing(frequency_mhz) / (speed_of_light / (1e6 * frequency_mhz))
@@ -363,13 +363,13 @@ class PortResponse(LuseepyBeam):
         return to_real(seen / (root[:, None] * root[None]))
 
     def _mixing(self, frequency_mhz: float) -> Complex[np.ndarray, "ports ports"]:
-        """M, scaled such that products of open ports' fields / wavelength become beams."""
+        """M, scaled so that products of open ports' fields / wavelength become beams."""
         # product beams are halves of the sums over polarisations
         scale = np.sqrt(2.0 * Boltzmann * VACUUM_OHM) / np.sqrt(self.per_kelvin(frequency_mhz))
         return scale[:, None] * self.circuit(frequency_mhz).loading
 
     def _open(self, parts: list[np.ndarray], grid: HemisphereGrid) -> AntennaFields:
-        """The effective lengths of one frequency on a grid, of ports that are open."""
+        """The effective lengths of the open ports at one frequency, on a grid."""
         turn_deg = self.turntable_offset_deg
         turned = (np.stack([on_grid(h, self.theta, grid, turn_deg) for h in p]) for p in parts)
         return AntennaFields(*turned, grid)
@@ -390,9 +390,9 @@ def read_response(path: str | Path) -> PortResponse:
     Raises
     ------
     InputError
-        For a missing or truncated file, a missing image, shapes that do not fit, directions other
-        than the hemisphere above the horizon, frequencies that do not grow, numbers that are not
-        finite, resistances that do not add up, or a header that states other conventions.
+        For a missing or truncated file, a missing image, wrong shapes, directions other than the
+        hemisphere above the horizon, frequencies that do not increase, numbers that are not finite,
+        resistances that do not add up, or a header that states other conventions.
     """
     response = read_fits(path, RESPONSE_LAYOUT, "check beam.file")
     require_conventions(path, response.values)
@@ -405,7 +405,7 @@ def read_response(path: str | Path) -> PortResponse:
                 f"equal steps from 0 to {last:g}"
             )
     complex_ = {n: images[f"{n}_real"] + 1j * images[f"{n}_imag"] for n in (*LENGTHS, *MATRICES)}
-    # the last azimuth is the first once more
+    # the last azimuth repeats the first
     h_theta, h_phi = (np.moveaxis(complex_[name], 0, 1)[..., :-1] for name in LENGTHS)
     impedance, sky, moon, loss = (complex_[name] for name in MATRICES)
     resistance = (impedance + impedance.conj().swapaxes(1, 2)) / 2.0
@@ -445,7 +445,7 @@ TAPER_WIDTH = 0.03
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ScalarBeam(LuseepyBeam):
-    """The pattern of one arm, used once for every port; nothing couples the arms.
+    """The pattern of one arm, used for every port, without coupling between arms.
 
     Attributes
     ----------
@@ -454,11 +454,11 @@ class ScalarBeam(LuseepyBeam):
     gain : (frequencies,) array
         gain_conv of the file.
     impedance_ohm : (frequencies,) complex array or None
-        Of the arm; None where the file has none.
+        Impedance of the arm; None if the file has none.
     taper : bool
         Fade out towards the horizon as luseepy does.
     rotations_deg : tuple of float
-        How far the pattern is turned for each port, from East towards North.
+        Rotation of the pattern for each port, from East towards North.
     """
 
     gain: Float[np.ndarray, " frequencies"]
@@ -478,8 +478,8 @@ class ScalarBeam(LuseepyBeam):
     def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
         """Return the fields of the arms in sqrt(1 / sr); their products are beams in K per K.
 
-        Between the frequencies of the file this is so with splines only. With linear interpolation
-        the fields themselves are interpolated here, for pictures; use :meth:`beams` for products.
+        Between the file's frequencies this needs splines. With linear interpolation the fields
+        themselves are interpolated here, for pictures; use :meth:`beams` for products.
         """
         *parts, gain = self._at(frequency_mhz, self.e_theta, self.e_phi, self.gain)
         return self._put_up(parts, float(gain), grid)
@@ -499,11 +499,11 @@ class ScalarBeam(LuseepyBeam):
         return complex(ohm)
 
     def background(self, frequency_mhz: float) -> Float[Array, " products"]:
-        """Return the visibilities without any sky: what the ground emits.
+        """Return the visibilities without any sky: the emission of the ground.
 
-        An auto receives from the ground the part of its beam that the sky leaves. Arms in an
-        enclosure of one temperature are taken to be uncorrelated, as they are where nothing
-        couples them, so that a cross receives the part of the sky with the opposite sign.
+        The ground fills the part of an auto's beam that the sky does not. Arms in an enclosure of
+        one temperature are assumed to be uncorrelated, as they are without coupling, so a cross
+        receives the sky's part with the opposite sign.
         """
         if self.moon_k == 0.0:
             return super().background(frequency_mhz)
@@ -511,7 +511,7 @@ class ScalarBeam(LuseepyBeam):
         return self.moon_k * (to_real(np.eye(self.n_ports, dtype=np.complex128)) - sky)
 
     def _put_up(self, parts: list[np.ndarray], gain: float, grid: HemisphereGrid) -> AntennaFields:
-        """The fields of one arm, one for each port, with the scale that the gain gives them."""
+        """The fields of one arm, turned for each port and scaled by the gain."""
         scale = np.full(len(grid.theta), np.sqrt(2.0 * gain / (4.0 * np.pi)))
         if self.taper:
             below = np.arctan((grid.theta - np.pi / 2.0) / TAPER_WIDTH) / np.pi + 0.5
@@ -535,9 +535,9 @@ def read_scalar_beam(path: str | Path) -> ScalarBeam:
     Raises
     ------
     InputError
-        For a missing or truncated file, a missing image, shapes that do not fit, directions other
-        than the hemisphere above the horizon, frequencies that do not grow, numbers that are
-        not finite, or a header that states other conventions.
+        For a missing or truncated file, a missing image, wrong shapes, directions other than the
+        hemisphere above the horizon, frequencies that do not increase, numbers that are not finite,
+        or a header that states other conventions.
     """
     beam = read_fits(path, SCALAR_LAYOUT, "check beam.file")
     images, said, sizes = beam.arrays, beam.values, beam.sizes
@@ -554,7 +554,7 @@ def read_scalar_beam(path: str | Path) -> ScalarBeam:
             f"gives {said['THETA_N']} x {said['PHI_N']} (THETA_N, PHI_N)"
         )
     pair = [images[f"{name}_real"] + 1j * images[f"{name}_imag"] for name in FIELD_NAMES]
-    # the last azimuth is the first once more
+    # the last azimuth repeats the first
     e_theta, e_phi = (part[..., :-1] for part in pair)
     theta = np.linspace(0.0, np.pi / 2.0, sizes["theta"])
     z = images["Z_real"] + 1j * images["Z_imag"] if set(IMPEDANCE) <= set(images) else None

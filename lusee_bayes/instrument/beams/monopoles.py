@@ -7,13 +7,13 @@ phi components is
 
     E = int I(s) [ u.e exp(i k n.r) + u.e' exp(i k n'.r - 2 i k h n_z) ] ds,   r = s u,
 
-with u the arm, n' = n mirrored in the ground and e' the reflected polarisation. No coupling
-between arms, no lander: this is good enough for the paper's findings, and differentiable in all
-parameters.
+with u the arm, n' = n mirrored in the ground and e' the reflected polarisation. No coupling between
+arms, no lander: this suffices for the paper's findings, and is differentiable in all parameters.
 
 **Point sources** are blurred by harmonic coefficients up to lmax, but not by the field pattern
-itself (:func:`beams_towards`). One of x K sr in the direction n(t), in the frame of the antennas,
-gives V_k(t) = x B_k(n(t)) (:func:`source_response`). It rises and sets sharply, and it may move.
+itself (:func:`beams_towards`). A source of x K sr in the direction n(t), in the frame of the
+antennas, gives V_k(t) = x B_k(n(t)) (:func:`source_response`). It rises and sets sharply, and may
+move.
 """
 
 from __future__ import annotations
@@ -167,9 +167,9 @@ class Monopoles(BeamSource, eqx.Module):
     azimuths_deg : (antennas,) array
         Directions of the arms at turntable angle zero, from East towards North.
     turntable_offset_deg : float
-        How much further the turntable is than it says, from East towards North.
+        True minus stated turntable angle, from East towards North.
     nodes : (int, int) or None
-        Of the grid on which beams are computed; see :func:`monopole_beams`.
+        Nodes of the grid on which beams are computed; see :func:`monopole_beams`.
 
     Raises
     ------
@@ -291,7 +291,7 @@ def monopole_beams(
         By default the paper's four arms on its ground.
     stokes : {"I", "Q", "U", "V"}
     nodes : tuple of int, optional
-        Number of nodes in theta and in phi, by default enough to be exact to rounding; fewer are
+        Number of nodes in theta and in phi; by default enough to be exact to rounding. Fewer are
         faster.
 
     Returns
@@ -317,7 +317,7 @@ def _modes(
     return product_modes(monopoles.fields(frequency_mhz, grid), lmax, stokes=stokes)
 
 
-# where each parameter of the antennas is, and the ends of its domain
+# access to each parameter of the antennas, and the ends of its domain
 PARAMETERS: Mapping[str, tuple[Callable[[Monopoles], Float[Array, ""]], float, float]] = {
     "length_m": (lambda m: m.length_m, 0.0, np.inf),
     "zenith_angle_deg": (lambda m: m.zenith_angle_deg, 0.0, 180.0),
@@ -329,10 +329,10 @@ PARAMETERS: Mapping[str, tuple[Callable[[Monopoles], Float[Array, ""]], float, f
 }
 
 
-# rotations keep |n| = 1 to rounding; a vector that is further from it is a mistake
+# rotations keep |n| = 1 to rounding; a larger deviation is a mistake
 UNIT_TOLERANCE = 1e-9
 
-# the autos' integral is converged on this grid, the one of every lmax up to 63
+# the autos' integral is converged on this grid, which serves every lmax up to 63
 NORMALISATION_LMAX = 63
 
 
@@ -392,7 +392,7 @@ def _patterns(
     frequency_mhz: Scalar, directions: Vectors, monopoles: Monopoles, stokes: str
 ) -> Patterns:
     visible = directions[:, 2] > 0.0
-    # a visible direction replaces the hidden ones: its field and its slopes are finite
+    # a visible direction replaces the hidden ones, for finite fields and derivatives
     xp = namespace(frequency_mhz, directions, monopoles)
     stand_in = np.array([0.6, 0.0, 0.8])[None]
     east, north, up = xp.where(visible[:, None], directions, stand_in).T
@@ -424,12 +424,12 @@ def source_response(
     ----------
     observation : Observation
     galactic : (3,) or (times, 3) array
-        As of :meth:`.Observation.antenna_directions`.
+        As for :meth:`.Observation.antenna_directions`.
     frequency_mhz : float
     monopoles : Monopoles, optional
         By default the paper's antennas.
     stokes_v : float
-        V / I with the IAU's sign. Where it is positive, a receiver that looks towards the source
+        V / I with the IAU's sign. If it is positive, a receiver that looks towards the source
         sees the electric field turn counter-clockwise (right-handed).
 
     Returns

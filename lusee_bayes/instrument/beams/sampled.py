@@ -1,18 +1,18 @@
-"""Beams that were sampled: on a grid of directions, by another program, in a file.
+"""Sampled beams: on a grid of directions, from another program, in a file.
 
-They are known in directions of a grid or of HEALPix pixels, at some frequencies: either E_theta and
+They are given in directions of a grid or of HEALPix pixels, at some frequencies: either E_theta and
 E_phi of every antenna, or the beam of every product. Frame: topocentric at turntable angle zero,
 theta from the zenith, phi from East towards North; time goes as exp(+i w t). Nothing is received
 from below the horizon.
 
 **Files** of the package are netCDF, or FITS with images of the same names. ``frequency_mhz``
-(frequency), growing; then either ``e_theta_real``, ``e_theta_imag``, ``e_phi_real`` and
+(frequency), increasing; then either ``e_theta_real``, ``e_theta_imag``, ``e_phi_real`` and
 ``e_phi_imag`` (frequency, antenna, directions), or ``product_beam`` (frequency, product,
 directions). Directions are (theta, phi) with ``theta_deg`` (theta) and ``phi_deg`` (phi), or
-(pixel): HEALPix, RING. Attributes, words of the primary header in FITS: ``format``, ``absolute`` (0
+(pixel): HEALPix, RING. Attributes (in FITS, primary header words): ``format``, ``absolute`` (0
 or 1, see :class:`.SampledBeams`), and ``products``, the labels of product beams in their order.
 
-**pyuvdata** is optional (the extra ``uvdata``). A UVBeam of type efield holds, for every feed, the
+**pyuvdata** is optional (the extra ``uvdata``). A UVBeam of type efield gives, for every feed, the
 response to the components of the field along azimuth and zenith angle (``az_za``), or along phi and
 theta (``healpix``); azimuth is phi, from East towards North.
 
@@ -54,7 +54,7 @@ from lusee_bayes.instrument.products import antennas_of, auto_indices, labels, t
 # functions in the directions that were sampled, and on a grid
 Sampled = Inexact[np.ndarray, "n *directions"]
 OnGrid = Inexact[np.ndarray, "n theta phi"]
-# of angles in degrees that are written with few digits
+# tolerance of angles in degrees that are written with few digits
 ANGLE_TOLERANCE = 1e-6
 
 
@@ -62,8 +62,8 @@ ANGLE_TOLERANCE = 1e-6
 class Directions:
     """A grid of theta and phi, or HEALPix pixels, above the horizon.
 
-    Programs differ in whether a direction on the horizon counts as above it: none is used, and the
-    last step to the horizon is extrapolated.
+    Programs differ in whether a direction on the horizon counts as above it. Such directions are
+    not used, and the last step to the horizon is extrapolated.
 
     Attributes
     ----------
@@ -72,7 +72,7 @@ class Directions:
     n_phi : int
         Azimuths 2 pi k / n_phi.
     nside : int
-        Of the pixels; 0 for a grid.
+        NSIDE of the pixels; 0 for a grid.
     """
 
     theta: Float[np.ndarray, " theta"] | None
@@ -81,21 +81,21 @@ class Directions:
 
     @classmethod
     def of(cls, theta: Any, phi: Any, n_last: int, path: str) -> Directions:
-        """Return the directions of the last axes of arrays.
+        """Return the directions along the last axes of arrays.
 
         Parameters
         ----------
         theta, phi : array or None
             In degrees; see :func:`.sampled_beams`.
         n_last : int
-            Length of the last axis: the pixels, where there are no angles.
+            Length of the last axis: the number of pixels if there are no angles.
         path : str
             For messages.
 
         Raises
         ------
         InputError
-            If angles do not cover the hemisphere, or there are not the pixels of a map.
+            If angles do not cover the hemisphere, or ``n_last`` pixels are no HEALPix map.
         """
         if theta is None or phi is None:
             if not healpy.isnpixok(n_last):
@@ -119,17 +119,17 @@ class Directions:
         return cls(np.radians(used), n)
 
     def above(self, values: np.ndarray, what: str) -> np.ndarray:
-        """Return the values in these directions of those in all directions that were given.
+        """Select the values in these directions from those in all given directions.
 
         Raises
         ------
         InputError
-            If one is not finite.
+            If a value is not finite.
         """
         if self.theta is not None:
             kept = values[..., : len(self.theta), : self.n_phi]
         else:
-            # pixels below the horizon are zeros, whatever a file has there
+            # pixels below the horizon become zeros, whatever the file contains
             theta, _ = healpy.pix2ang(self.nside, np.arange(values.shape[-1]))
             kept = np.where(theta < np.pi / 2.0, values, 0.0)
         if (bad := ~np.isfinite(kept)).any():
@@ -156,8 +156,8 @@ class Directions:
     ) -> tuple[OnGrid, OnGrid]:
         """Interpolate theta and phi components of vectors, turned likewise, to a grid.
 
-        Between pixels the components along three fixed axes are interpolated: those along theta
-        and phi have no value at the zenith.
+        Between pixels the components along three fixed axes are interpolated, since those along
+        theta and phi are undefined at the zenith.
         """
         if self.theta is not None:
             return tuple(self.scalars_on(one, grid, turn_deg) for one in (e_theta, e_phi))
@@ -181,27 +181,27 @@ def _axes(theta: np.ndarray, phi: np.ndarray) -> tuple[list[np.ndarray], list[np
 class SampledBeams(Described, BeamSource):
     """Fields of antennas, or beams of products, in directions of a grid or of HEALPix pixels.
 
-    :func:`sampled_beams` makes them of arrays.
+    Create them from arrays with :func:`sampled_beams`.
 
     Attributes
     ----------
     frequencies_mhz : (frequencies,) array
-        Growing.
+        Increasing.
     directions : Directions
-        What the last axes of the arrays are.
+        Directions along the last axes of the arrays.
     e_theta, e_phi : (frequencies, antennas, ...) complex array or None
         Response to the theta and phi components of the incident field.
     products : (frequencies, products, ...) array or None
-        The beam of every real product, in place of the fields.
+        The beam of every real product, instead of the fields.
     absolute : bool
         Whether B_k = V_k for a source of 1 K sr: the scale is that of the data in K. Otherwise the
         autos are scaled to integrate to one on average.
     path : str
-        Where they come from, for messages.
+        Origin of the beams, for messages.
     turntable_offset_deg : float
-        How much further the turntable is than it says, from East towards North.
+        True minus stated turntable angle, from East towards North.
     normalise : bool or None
-        Scale the beams so that autos integrate to one on average; by default unless they are
+        Scale the beams so that autos integrate to one on average; by default if they are not
         absolute.
     """
 
@@ -256,8 +256,7 @@ class SampledBeams(Described, BeamSource):
         Raises
         ------
         InputError
-            Outside the frequencies, or if autos that are to be scaled do not integrate to anything
-            positive.
+            Outside the frequencies, or if autos that must be scaled have no positive integral.
         """
         grid = self.directions.quadrature(lmax)
         patterns = to_real(self.patterns(frequency_mhz, grid))
@@ -282,28 +281,28 @@ def sampled_beams(
     absolute: bool = False,
     path: str = "the beams",
 ) -> SampledBeams:
-    """Make beams of arrays.
+    """Create beams from arrays.
 
     Give either ``e_theta`` and ``e_phi``, or ``products``; either ``theta_deg`` and ``phi_deg``, or
-    none of them for HEALPix pixels (RING; theta from the zenith, phi from East towards North).
+    neither for HEALPix pixels (RING; theta from the zenith, phi from East towards North).
 
     Parameters
     ----------
     frequencies_mhz : float or (frequencies,) array
-        Growing. With a single number the arrays have no axis of frequencies.
+        Increasing. For a single number the arrays have no axis of frequencies.
     e_theta, e_phi : (frequencies, antennas, theta, phi) or (frequencies, antennas, pixels) array
         Complex response of each antenna to the theta and phi components of the incident field,
         with one phase centre for all antennas, exp(+i w t).
     products : (frequencies, products, theta, phi) or (frequencies, products, pixels) array
-        Real beams of the products 00R, 01R, 01I, 02R, ..., as of :func:`.products.labels`.
+        Real beams of the products 00R, 01R, 01I, 02R, ..., as in :func:`.products.labels`.
     theta_deg : (theta,) array
-        Growing from the zenith to the horizon, or further; what is on or below it is not used.
+        Increasing from the zenith to the horizon or beyond; only directions above it are used.
     phi_deg : (phi,) array
-        360 k / n, k = 0 .. n - 1, from East towards North; 360 may be there, too.
+        360 k / n, k = 0 .. n - 1, from East towards North; 360 may be included.
     absolute : bool
         See :class:`SampledBeams`.
     path : str
-        Where they come from, for messages.
+        Origin of the beams, for messages.
 
     Returns
     -------
@@ -312,7 +311,7 @@ def sampled_beams(
     Raises
     ------
     InputError
-        If the arrays do not fit, are not finite above the horizon, or do not cover it.
+        If the arrays do not match, are not finite above the horizon, or do not cover it.
     """
     fields = {"e_theta": e_theta, "e_phi": e_phi} if products is None else {"products": products}
     if (e_theta is None) != (e_phi is None) or (e_theta is None) == (products is None):
@@ -343,10 +342,10 @@ HINT = "lusee_bayes.instrument.beams.sampled.write_sampled_beams writes one"
 
 
 def layout(names: tuple[str, ...], grid: bool, kind: Kind = "real", said: Any = None) -> Layout:
-    """Return what a file, or arrays, hold: these fields or beams on a grid or on HEALPix pixels."""
+    """Return the layout of a file or of arrays: fields or beams on a grid or on HEALPix pixels."""
     first = "product" if names[0] in ("products", POWER) else "antenna"
     directions = ("theta", "phi") if grid else ("pixel",)
-    # below the horizon there may be anything
+    # values below the horizon are arbitrary
     values = Variable(("frequency", first, *directions), kind, missing=True)
     angle = partial(Variable, low=0.0, grows=True, unit="deg")
     angles = {"theta_deg": angle(("theta",), high=180.0), "phi_deg": angle(("phi",), high=360.0)}
@@ -356,7 +355,7 @@ def layout(names: tuple[str, ...], grid: bool, kind: Kind = "real", said: Any = 
 
 
 def read_sampled_beams(path: str | Path) -> SampledBeams:
-    """Read a file that :func:`write_sampled_beams` has written, or one of the same layout.
+    """Read a file written by :func:`write_sampled_beams`, or one of the same layout.
 
     Parameters
     ----------
@@ -403,7 +402,7 @@ def read_sampled_beams(path: str | Path) -> SampledBeams:
 
 
 def write_sampled_beams(path: str | Path, beams: SampledBeams) -> Path:
-    """Write beams to netCDF, or to FITS where the name ends in .fits; whole or not at all.
+    """Write beams to netCDF, or to FITS if the name ends in .fits; complete or not at all.
 
     Parameters
     ----------
@@ -465,17 +464,17 @@ def read_uvbeam(path: str | Path) -> SampledBeams:
 
 
 def from_uvbeam(beam: Any, *, conjugate: bool = False, path: str = "the UVBeam") -> SampledBeams:
-    """Convert a UVBeam of type efield, one port for every feed.
+    """Convert a UVBeam of type efield, with one port for every feed.
 
     Parameters
     ----------
     beam : pyuvdata.UVBeam
         Of type efield, in coordinates az_za or healpix (RING); scaled so that the autos integrate
-        to one, as UVBeams are in units of their own.
+        to one, since the unit of UVBeams is arbitrary.
     conjugate : bool
-        Take the complex conjugates: for fields that were made with exp(-i w t).
+        Use the complex conjugates, for fields computed with exp(-i w t).
     path : str
-        Where it comes from, for messages.
+        Origin of the beam, for messages.
 
     Returns
     -------
@@ -521,10 +520,10 @@ def from_uvbeam(beam: Any, *, conjugate: bool = False, path: str = "the UVBeam")
 
 
 def read_beam(path: str | Path) -> BeamSource:
-    """Read a beam file of whichever kind.
+    """Read a beam file of any supported kind.
 
-    luseepy's scalar beams (FITS version 2) and responses (version 3), sampled beams
-    (:mod:`.sampled`), and pyuvdata's beam FITS (:mod:`.sampled`).
+    These are luseepy's scalar beams (FITS version 2) and responses (version 3), sampled beams and
+    pyuvdata's beam FITS (both :mod:`.sampled`).
 
     Parameters
     ----------
@@ -545,12 +544,12 @@ def read_beam(path: str | Path) -> BeamSource:
 
 
 def beam_kind(path: str | Path) -> str:
-    """Return the kind of a beam file, the ``model`` of a scenario; others are luseepy's scalar.
+    """Return a beam file's kind, the ``model`` of a scenario; by default luseepy's scalar.
 
     Raises
     ------
     InputError
-        If the file is FITS or HDF5, and damaged.
+        If the file is FITS or HDF5, but damaged.
     """
     try:
         path = require_file(path, "beam file")
@@ -565,7 +564,7 @@ def beam_kind(path: str | Path) -> str:
 
 
 def read_sampled(path: str | Path) -> SampledBeams:
-    """Read sampled beams, the package's own files or pyuvdata's.
+    """Read sampled beams, from the package's own files or pyuvdata's.
 
     Raises
     ------

@@ -1,11 +1,11 @@
-"""Where the beams of an instrument come from, and what is connected to its ports.
+"""Sources of an instrument's beams, and the receivers at its ports.
 
 Every kind of beams is one :class:`BeamSource`: the embedded antennas, luseepy's files, or beams in
-directions. What uses beams asks nothing about the kind. A new kind is one class and one line in
-the test of the contract, :func:`lusee_bayes.testing.check_beam_source`.
+directions. Code that uses beams does not depend on the kind. A new kind is one class and one line
+in the test of the contract, :func:`lusee_bayes.testing.check_beam_source`.
 
-**Circuit.** Antennas of impedance matrix ZA with open-circuit voltages v make the voltages M v at
-the inputs of receivers of impedance ZL (Thevenin's theorem), M = ZL (ZA + ZL)^-1. ZL is that of
+**Circuit.** Antennas of impedance matrix ZA with open-circuit voltages v cause the voltages M v at
+the inputs of receivers of impedance ZL (Thevenin's theorem), M = ZL (ZA + ZL)^-1. ZL follows
 luseepy's models of receivers.
 """
 
@@ -52,14 +52,14 @@ LOADS_LAYOUT = Layout(
 
 
 class Receiver(ABC):
-    """What is connected to the ports.
+    """A receiver at the ports.
 
     Attributes
     ----------
     luseepy_name : str
-        Of the class that luseepy has for it.
+        Name of luseepy's class for it.
     luseepy_parameters : dict of str
-        What that class takes, by its names: the names of the attributes here.
+        Names of that class's parameters, and of the attributes here that give them.
     """
 
     luseepy_name: ClassVar[str]
@@ -67,15 +67,15 @@ class Receiver(ABC):
 
     @abstractmethod
     def load(self, frequency_mhz: float) -> Ohms:
-        """Return ZL in Ohm. InputError at a frequency that the receiver does not know."""
+        """Return ZL in Ohm; InputError at a frequency that the receiver does not cover."""
 
     def receiver(self) -> Receiver:
-        """The receiver: those that parameters determine are sections of a scenario themselves."""
+        """Return ``self``: receivers given by parameters are sections of a scenario themselves."""
         return self
 
 
 def _each_port(value: Any) -> Any:
-    """One number stands for all ports."""
+    """Expand one number to all ports."""
     number = isinstance(value, int | float) and not isinstance(value, bool)
     return (value,) * N_ANTENNAS if number else value
 
@@ -158,7 +158,7 @@ class CapacitorReceiver(Section, Receiver):
 
 @dataclass(frozen=True)
 class MeasuredReceiver(Receiver):
-    """Loads that were measured, or that a file of data holds; they may couple the ports.
+    """Loads from a measurement or from a data file; they may couple the ports.
 
     Attributes
     ----------
@@ -166,7 +166,7 @@ class MeasuredReceiver(Receiver):
         The file, for error messages.
     frequencies_mhz : (frequencies,) array
     load_ohm : (frequencies, ports, ports) complex array
-        ZL; linear between these frequencies, as in luseepy.
+        ZL; interpolated linearly between these frequencies, as in luseepy.
     """
 
     luseepy_name: ClassVar[str] = "MeasuredReceiver"
@@ -183,7 +183,7 @@ class MeasuredReceiver(Receiver):
 def receiver_of(
     path: str | Path, arrays: Mapping[str, np.ndarray], mhz: str, real: str, imaginary: str
 ) -> MeasuredReceiver | None:
-    """Return the loads of a file's arrays with these names; None where it has none."""
+    """Return the loads from a file's arrays with these names; None if it has none."""
     if not {mhz, real, imaginary} <= set(arrays):
         return None
     return MeasuredReceiver(str(path), arrays[mhz], arrays[real] + 1j * arrays[imaginary])
@@ -204,7 +204,7 @@ def read_receiver(path: str | Path) -> MeasuredReceiver:
     Raises
     ------
     InputError
-        For a missing or damaged file, or one that has no such images.
+        For a missing or damaged file, or one without such images.
     """
     images = read_fits(path, LOADS_LAYOUT, "check beam.receiver").arrays
     return receiver_of(path, images, "freq", *LOADS)
@@ -212,7 +212,7 @@ def read_receiver(path: str | Path) -> MeasuredReceiver:
 
 @dataclass(frozen=True)
 class Circuit:
-    """Antennas, what dissipates in them, and receivers.
+    """Antennas with their losses, and receivers.
 
     Attributes
     ----------
@@ -250,11 +250,11 @@ class Circuit:
 
     @property
     def per_kelvin(self) -> Ohms:
-        """U = 4 k M (ZA + ZA^H) / 2 M^H, the V^2/Hz that an enclosure of 1 K makes."""
+        """U = 4 k M (ZA + ZA^H) / 2 M^H, the V^2/Hz in an enclosure at 1 K."""
         return self.emitted(self.resistance_ohm)
 
     def emitted(self, kelvin_ohm: Ohms) -> Ohms:
-        """Return the V^2/Hz at the receivers of resistances times their temperatures in K."""
+        """Return the V^2/Hz at the receivers, from resistances times their temperatures in K."""
         return 4.0 * Boltzmann * self.loading @ kelvin_ohm @ self.loading.conj().T
 
 
@@ -264,7 +264,7 @@ class Parameter(NamedTuple):
     Attributes
     ----------
     value : () array
-        The present one, in the unit that the parameter's name ends with.
+        Present value, in the unit at the end of the parameter's name.
     low, high : float
         Ends of its domain.
     """
@@ -275,7 +275,7 @@ class Parameter(NamedTuple):
 
 
 class BeamSource(ABC):
-    """The antennas of an instrument at every frequency, and what they receive from the ground.
+    """The antennas of an instrument at every frequency, and the ground emission they receive.
 
     Frame: topocentric at turntable angle zero, theta from the zenith, phi from East towards North.
     """
@@ -285,7 +285,7 @@ class BeamSource(ABC):
     def n_ports(self) -> int:
         """Number of ports; there are n_ports^2 real products."""
 
-    # whether there are fields of antennas, not beams of products alone
+    # whether fields of antennas are available, not only beams of products
     has_fields = True
 
     @abstractmethod
@@ -340,7 +340,7 @@ class BeamSource(ABC):
         """
 
     def background(self, frequency_mhz: float) -> Float[Array, " products"]:
-        """Return the visibilities without any sky: what the ground and lossy antennas emit.
+        """Return the visibilities without any sky: emission of the ground and of lossy antennas.
 
         Parameters
         ----------
@@ -349,7 +349,7 @@ class BeamSource(ABC):
         Returns
         -------
         (products,) array
-            In K; zeros where nothing emits.
+            In K; zeros if nothing emits.
 
         Raises
         ------
@@ -359,7 +359,7 @@ class BeamSource(ABC):
         return np.zeros(self.n_ports**2)
 
     def impedance(self, frequency_mhz: float) -> complex | None:
-        """Return the impedance of one arm in Ohm; None where it is not known.
+        """Return the impedance of one arm in Ohm; None if it is unknown.
 
         Raises
         ------
@@ -369,17 +369,17 @@ class BeamSource(ABC):
         return None
 
     def circuit(self, frequency_mhz: float) -> Circuit | None:
-        """Return the antennas' impedances and their receivers; None if the source knows no volts.
+        """Return the antennas' impedances and their receivers; None for a source without volts.
 
         Raises
         ------
         InputError
-            If the source knows volts, but not at this frequency.
+            If the source has volts, but not at this frequency.
         """
         return None
 
     def interpolated(self, frequency_mhz: float) -> Interpolation | None:
-        """Return how beams are interpolated to this frequency; None where they are not.
+        """Return how beams are interpolated to this frequency; None if they are not.
 
         Raises
         ------
@@ -389,11 +389,11 @@ class BeamSource(ABC):
         return None
 
     def behind(self, receiver: Receiver | None) -> BeamSource:
-        """Return the source with the receivers of data, where they and nothing else say them."""
+        """Return the source with the receivers that data state, unless the source fixes its own."""
         return self
 
     def parameters(self) -> Mapping[str, Parameter]:
-        """Return what can be changed about the antennas, by name; nothing about those of a file."""
+        """Return the antennas' adjustable parameters, by name; there are none for a file's."""
         return {}
 
     def parameter(self, name: str) -> Parameter:
@@ -402,31 +402,31 @@ class BeamSource(ABC):
         Raises
         ------
         InputError
-            If there is none; the message gives the nearest name.
+            If there is no such parameter; the message gives the nearest name.
         """
         parameters = self.parameters()
         require_known("unknown beam parameter", name, parameters)
         return parameters[name]
 
     def with_values(self, values: Values) -> BeamSource:
-        """Return the antennas with other values of the named parameters, differentiable in these.
+        """Return the antennas with other values of the named parameters, differentiably.
 
         Raises
         ------
         InputError
-            If a name is unknown, or a value outside what the source can have.
+            If a name is unknown, or a value outside the source's range.
         """
         for name in values:
             self.parameter(name)
         return self
 
     def interpolation_errors(self, frequency_mhz: float, lmax: int) -> Mapping[str, Lines]:
-        """Return errors of beams that are interpolated in parameters, by what they are found at."""
+        """Return errors of beams that are interpolated in parameters, by the node of each."""
         return {}
 
     @property
     def monopoles(self) -> BeamSource:
-        """The embedded antennas. InputError where the beams are those of a file."""
+        """The embedded antennas; InputError if the beams come from a file."""
         raise InputError(
             "this needs the embedded antennas, which beam.file replaces; remove beam.file"
         )
