@@ -1,4 +1,4 @@
-"""The paper's cases: which scenarios they are, and what figures and claims need of each."""
+"""The paper's cases: their scenarios, and the quantities that figures and claims need."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from lusee_bayes.instrument.beams.fields import HemisphereGrid, stokes_beam
 from lusee_bayes.paper.claims import TABLE, Cases, cross
 from lusee_bayes.results.channel_map import conditioned
 
-# by name: a scenario of the package and what differs from it
+# by name: a scenario of the package, and changes to it
 CASES = {name: (one.get("scenario", name), one.get("changes", [])) for name, one in TABLE.items()}
 
-# of a channel, as a case file has them
+# a channel's attributes in a case file
 MODES, NUMBERS = ("mean", "truth", "std"), ("log_evidence", "chi2", "chi2_expected", "n_data")
-# nodes in zenith angle and azimuth of the beams that a case file keeps for the figure
+# nodes in zenith angle and azimuth of the beams in a case file, for the figure
 BEAM_NODES = (48, 96)
 
 
@@ -64,18 +64,18 @@ def sky_frequency_mhz(path: str | Path) -> float:
 
 
 def is_case(path: Path, scenario: Scenario) -> bool:
-    """Whether a file holds the case of a scenario, computed by this version of the package."""
+    """Whether a file contains a scenario's case, computed by this version of the package."""
     return formats.says(path, formats.header(formats.PAPER_CASE) | {"scenario": scenario.to_yaml()})
 
 
 def compute_case(scenario: Scenario) -> xr.Dataset:
-    """Simulate and map a scenario; all that figures and claims need of it.
+    """Simulate and map a scenario, and collect everything that figures and claims need.
 
     Returns
     -------
     xarray.Dataset
         On dims ell, mode, pixel (HEALPix RING, Galactic), product and time, pattern and theta and
-        phi; temperatures in K. Attributes: the scenario, the versions and what is one number.
+        phi; temperatures in K. Attributes: scenario, versions and single numbers.
     """
     experiment = build(scenario)
     setup, data, made = experiment.setup, experiment.data, conditioned(experiment)

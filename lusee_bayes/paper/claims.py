@@ -1,7 +1,7 @@
-"""The judges of the paper's quantitative claims, which stand in claims.yaml.
+"""Tests of the paper's quantitative claims, which are listed in claims.yaml.
 
-A claim's judge turns the cases into what was obtained and whether that agrees: yes, partly or no,
-by the two conditions given to :func:`grade`. Every number in it is computed here from the cases.
+A claim's judge computes a result from the cases, and decides whether it agrees: yes, partly or no,
+by the two conditions given to :func:`grade`. All numbers are computed here from the cases.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.judge.measures import ell_cross
 
 Cases = Mapping[str, xr.Dataset]
-# the cases by name: their scenarios, and what figures call them
+# the cases by name: their scenarios, and their labels in figures
 TABLE = read_yaml(Path(__file__).with_name("cases.yaml"), "the paper's cases")
 
 FREQUENCIES = tuple(range(5, 51, 5))
@@ -32,7 +32,7 @@ SIDEREAL_MONTH_DAYS = 27.3
 
 @dataclass(frozen=True)
 class Verdict:
-    """What was obtained, and whether it agrees with the paper: yes, partly or no."""
+    """The result obtained, and whether it agrees with the paper: yes, partly or no."""
 
     obtained: str
     agrees: str
@@ -40,12 +40,12 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim of the paper, as claims.yaml has it.
+    """A claim of the paper from claims.yaml.
 
     Attributes
     ----------
     section, paper : str
-        Where the paper says what.
+        Section of the paper, and its claim.
     otherwise : str
         Why it may fail with this beam and sky.
     judge : str
@@ -61,7 +61,7 @@ class Claim:
     of: tuple[str | float, ...] = ()
 
     def verdict(self, cases: Cases) -> Verdict:
-        """Judge the claim by the cases."""
+        """Test the claim with the cases."""
         return globals()[f"_{self.judge}"](cases, *self.of)
 
 
@@ -75,12 +75,12 @@ def grade(obtained: str, agrees: bool | np.bool_, partly: bool | np.bool_ = Fals
 
 
 def frequency_case(frequency_mhz: int) -> str:
-    """Name of the fiducial experiment's case at a frequency."""
+    """Name of the fiducial experiment's case at some frequency."""
     return "fiducial" if frequency_mhz == 25 else f"at_{frequency_mhz}MHz"
 
 
 def bands(cases: Cases, frequencies: tuple[int, ...] = FREQUENCIES) -> list[xr.Dataset]:
-    """The fiducial experiment at the frequencies."""
+    """Cases of the fiducial experiment at these frequencies."""
     return [cases[frequency_case(f)] for f in frequencies]
 
 
@@ -91,23 +91,23 @@ def cross(case: xr.Dataset) -> int:
 
 
 def first_below(values: Float[np.ndarray, " ells"], level: float) -> int:
-    """First ell >= 1 where ``values`` fall below ``level``; lmax + 1 if nowhere."""
+    """First ell >= 1 at which ``values`` fall below ``level``; lmax + 1 if there is none."""
     below = np.flatnonzero(~(values[1:] >= level))
     return int(below[0]) + 1 if below.size else values.size
 
 
 def middle(values: Shaped[np.ndarray, " n"]) -> float:
-    """Median, NaN for nothing at all (ells beyond lmax)."""
+    """Median; NaN for no values (ells beyond lmax)."""
     return float(np.median(values)) if values.size else float("nan")
 
 
 def snr_ratio(cases: Cases, name: str, low: int, high: int) -> float:
-    """Median over low <= ell <= high of a case's SNR over the fiducial one."""
+    """Median over low <= ell <= high of a case's SNR relative to the fiducial one."""
     return middle((cases[name]["snr"].values / cases["fiducial"]["snr"].values)[low : high + 1])
 
 
 def power_ratio(case: xr.Dataset, low: int, high: int) -> float:
-    """Median over low <= ell <= high of the map's power over the true sky's."""
+    """Median over low <= ell <= high of the map's power relative to the true sky's."""
     return middle((case["cl_mean"].values / case["cl_truth"].values)[low : high + 1])
 
 
@@ -117,24 +117,24 @@ def ever_up(case: xr.Dataset) -> Bool[np.ndarray, " pixels"]:
 
 
 def residual_percent(case: xr.Dataset) -> float:
-    """Median over the observed sky of |mean - truth|, in per cent of the true mean."""
+    """Median of |mean - truth| over the observed sky, in per cent of the true sky's mean."""
     mean, truth = case["mean"].values, case["truth"].values
     return 100.0 * middle(np.abs(mean - truth)[ever_up(case)]) / float(truth.mean())
 
 
 def likeness(case: xr.Dataset) -> float:
-    """Correlation of map and truth over the observed pixels, means removed."""
+    """Correlation of map and truth over the observed pixels, with means removed."""
     seen = ever_up(case)
     return float(np.corrcoef(case["mean"].values[seen], case["truth"].values[seen])[0, 1])
 
 
 def span(values: list[float] | list[int], form: str = "d") -> str:
-    """The least and the greatest, as text."""
+    """The smallest and the largest value, as text."""
     return f"{min(values):{form}} to {max(values):{form}}"
 
 
 def entry(case: xr.Dataset, path: str) -> float:
-    """An entry of the case's scenario, by its path with dots."""
+    """An entry of the case's scenario, by its dotted path."""
     node = parse_yaml(case.attrs["scenario"], "the scenario of a case")
     for key in path.split("."):
         node = node[int(key)] if isinstance(node, list) else node[key]
@@ -346,7 +346,7 @@ def _five_degrees(cases: Cases) -> Verdict:
 
 
 def _kept(cases: Cases, *names: str) -> Verdict:
-    """Whether cases keep rho > 0.9 to ell 10 (partly: to 5) and ell_cross within 10."""
+    """Whether cases keep rho > 0.9 up to ell 10 (partly: 5), with ell_cross within 10."""
     low = [first_below(cases[name]["rho"].values, 0.9) for name in names]
     first = [cross(cases[name]) for name in names]
     fiducial = cross(cases["fiducial"])
@@ -371,7 +371,7 @@ def _marginalising(cases: Cases) -> Verdict:
 
 
 def _rmsd(cases: Cases, case: str, percent: float) -> Verdict:
-    """Whether a case's beams differ by ``percent`` rms, to 30 % (partly: to a factor of two)."""
+    """Whether a case's beams differ by ``percent`` rms, within 30 % (partly: a factor of two)."""
     rms = 100 * cases[case].attrs["beam_rms_difference"]
     near = 0.7 * percent <= rms <= 1.3 * percent
     return grade(f"{rms:.1f} %", near, 0.5 * percent <= rms <= 2 * percent)
@@ -452,7 +452,7 @@ def claim_table(cases: Cases) -> list[dict[str, object]]:
 
 
 def claims_as_markdown(rows: Sequence[Mapping[str, object]]) -> str:
-    """The claims as a table, with a count of the verdicts above it."""
+    """The claims as a table, after a count of the verdicts."""
     verdicts = [row["agrees"] for row in rows]
     counts = ", ".join(f"{verdicts.count(v)} {v}" for v in ("yes", "partly", "no"))
     head = "| section | claim | obtained | agrees | if not, why |\n" + "| --- " * 5 + "|\n"

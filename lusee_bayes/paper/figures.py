@@ -1,4 +1,4 @@
-"""The paper's figures 2 to 9 in content, drawn from the computed cases."""
+"""Figures with the content of the paper's figures 2 to 9, drawn from the computed cases."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.paper.claims import FREQUENCIES, SHOWN_FREQUENCIES, TABLE, Cases, frequency_case
 from lusee_bayes.report.figures import drawing
 
-# the paper's colours by group, of lightness different enough for colour-blind readers; the lines
+# the paper's colours by group, with lightness that colour-blind readers can distinguish; the lines
 # within a group differ in style
 COLOURS = {
     "radiometer noise": "#E08A00",
@@ -32,7 +32,7 @@ MAP_CASES = (
 
 
 def beam_panels(cases: Cases) -> Figure:
-    """Figure 2: an auto and two crosses at five frequencies, each over its peak."""
+    """Figure 2: an auto and two crosses at five frequencies, each relative to its peak."""
     figure, panels = drawing.framed((13, 8), 3, len(SHOWN_FREQUENCIES))
     for column, frequency in enumerate(SHOWN_FREQUENCIES):
         beam = cases[frequency_case(frequency)]["beam"]
@@ -59,7 +59,7 @@ def data_by_product(cases: Cases) -> Figure:
 
 
 def frequency_maps(cases: Cases) -> Figure:
-    """Figure 4: truth, posterior mean and difference over the mean, at five frequencies."""
+    """Figure 4: truth, posterior mean and relative difference, at five frequencies."""
     figure, panels = drawing.framed((18, 9), 3, len(SHOWN_FREQUENCIES))
     for column, frequency in enumerate(SHOWN_FREQUENCIES):
         case = cases[frequency_case(frequency)]
@@ -83,18 +83,18 @@ def frequency_maps(cases: Cases) -> Figure:
 
 
 def _how_drawn(case: xr.Dataset) -> str:
-    """What a figure of maps says of its lines and its resolution."""
+    """Note on the lines and the resolution in a figure of maps."""
     width = drawing.taper_fwhm_deg(lmax_of(case.sizes["mode"]))
     return f"dashed: never observed; drawn through a beam of {width:.1f}° (FWHM)"
 
 
 def drawn(case: xr.Dataset, name: str) -> Float[np.ndarray, " pixels"]:
-    """Map of ``mean`` or ``truth`` as reports draw it, through the beam of the taper."""
+    """Map of ``mean`` or ``truth``, smoothed with the taper's beam as in reports."""
     return drawing.shown(case[f"{name}_modes"].values, healpy.npix2nside(case.sizes["pixel"]))
 
 
 def flat_bar(figure: Figure, axes: Axes | list[Axes], image, unit: str) -> None:
-    """A flat bar below; three round numbers on a logarithmic one."""
+    """A flat colour bar below the axes; a logarithmic one has three rounded numbers."""
     style = {"location": "bottom", "shrink": 0.7, "extend": "both", "pad": 0.04}
     aspect = 30 if isinstance(axes, Axes) else 60
     bar = figure.colorbar(image, ax=axes, label=unit, aspect=aspect, **style)
@@ -107,7 +107,7 @@ def flat_bar(figure: Figure, axes: Axes | list[Axes], image, unit: str) -> None:
 
 
 def by_frequency(cases: Cases, metric: str) -> Figure:
-    """Figures 5, 6: rho_ell or SNR_ell, one curve for each frequency, from dark (low) to light."""
+    """Figures 5, 6: rho_ell or SNR_ell, one curve per frequency, from dark (low) to light."""
     figure, axes = drawing.framed((8, 4.8))
     shades = colormaps["viridis"](np.linspace(0.0, 0.92, len(FREQUENCIES)))
     for k, (frequency, shade) in enumerate(zip(FREQUENCIES, shades, strict=True)):
@@ -121,7 +121,7 @@ def by_frequency(cases: Cases, metric: str) -> Figure:
 
 
 def dress(axes: Axes, metric: str, lmax: int) -> None:
-    """Labels, limits and the levels that the text speaks of."""
+    """Add labels, limits and the levels discussed in the text."""
     axes.set(xlabel=r"multipole $\ell$", xlim=(1, lmax))
     if metric == "rho":
         axes.set(ylabel=r"correlation with the truth $\rho_\ell$", ylim=(-0.35, 1.05))
@@ -136,7 +136,7 @@ def dress(axes: Axes, metric: str, lmax: int) -> None:
 def by_scenario(cases: Cases, metric: str) -> Figure:
     """Figures 7, 8: rho_ell or SNR_ell at 25 MHz, a panel for each group of scenarios.
 
-    The fiducial one is black in all of them.
+    The fiducial scenario is black in all panels.
     """
     figure, panels = drawing.framed((12, 8), 2, 2, sharex=True, sharey=True)
     for axes, (title, colour) in zip(panels.flat, COLOURS.items(), strict=True):
@@ -150,7 +150,7 @@ def by_scenario(cases: Cases, metric: str) -> Figure:
         axes.label_outer()
         axes.set_title(title)
         axes.legend(frameon=False, fontsize=9, ncols=2, loc="upper center")
-    # room above the curves for the legends
+    # space above the curves for the legends
     low, high = axes.get_ylim()
     axes.set_ylim(low, 8 * high if metric == "snr" else 1.4)
     if metric == "rho":

@@ -26,9 +26,9 @@ def _has_image(*names: str) -> Callable[[Path], bool]:
 
 
 BEAM = "instrument.beams.sampled:read_beam"
-# what reads the package's own netCDF files, by their attribute ``format``, and how other files are
-# recognised; what is none of them is a sky. Readers are named by path and imported when there is
-# such a file: each needs libraries that others do not
+# readers of the package's own netCDF files, by their attribute ``format``, and tests that recognise
+# other files; a file that fails all of them is a sky. Readers are named by path and imported only
+# for their files, because each needs other libraries
 READERS = {
     formats.VISIBILITIES: "instrument.visibilities:read_visibilities",
     formats.BEAMS: BEAM,
@@ -45,14 +45,14 @@ KINDS: tuple[tuple[Callable[[Path], bool], str], ...] = (
 )
 
 
-# a uniform sky of 1 K
+# coefficient of a uniform sky of 1 K
 MONOPOLE = np.sqrt(4.0 * np.pi)
 HOLDS = ("truth", "covariance", "independent_mean")
 HOLDS += ("posterior", "log_likelihood", "observed_data", "constant_data", "information")
 
 
 def describe_diagnostics(path: Path) -> list[str]:
-    """The diagnostics of a map."""
+    """Describe the diagnostics of a map."""
     lines = []
     with opened_tree(path, formats.DIAGNOSTICS, "diagnostics of lusee-bayes map") as tree:
         for frequency, channel in sorted(tree.children.items(), key=lambda one: float(one[0])):
@@ -69,7 +69,7 @@ def describe_diagnostics(path: Path) -> list[str]:
 
 @dataclass(frozen=True)
 class _Skies:
-    """What is said of a posterior: skies in K, where they are, and where they come from."""
+    """Contents of a posterior's file that are described: skies in K, frame and versions."""
 
     frequency: Float[np.ndarray, " frequency"]
     mean: Float[np.ndarray, "frequency mode"]
@@ -82,7 +82,7 @@ class _Skies:
 
 
 def describe_posterior(path: Path) -> list[str]:
-    """A posterior at one frequency or at several."""
+    """Describe a posterior at one or several frequencies."""
     with opened_tree(path, formats.POSTERIOR, "a posterior of lusee-bayes map") as tree:
         skies = from_tree(_Skies, tree, str(path))
         held = [name for name in HOLDS if name in tree.variables or name in tree.children]
@@ -109,8 +109,8 @@ def describe_posterior(path: Path) -> list[str]:
 
 
 def describe_samples(path: Path) -> list[str]:
-    """Draws of a program."""
-    # most of what info describes needs no sampler
+    """Describe draws of a program."""
+    # imported here because other files need no sampler
     tree = resolve_name("lusee_bayes.sampling.datatree:read_datatree")(path)
     posterior, statistics = tree["posterior"], tree["sample_stats"]
     sites = ", ".join(f"{name} {v.shape[2:]}" for name, v in posterior.data_vars.items())
@@ -128,12 +128,12 @@ FIGURES = ("summary.json", "sampling.json", "priors.json")
 
 
 def describe_folder(folder: Path) -> list[str]:
-    """A finished run: its kind, origin, verdict and files.
+    """Describe a finished run: its kind, origin, verdict and files.
 
     Raises
     ------
     InputError
-        If no run has written the folder.
+        If the folder is not that of a finished run.
     """
     recover(folder)
     manifest = read_manifest(folder)
@@ -160,7 +160,7 @@ def describe_folder(folder: Path) -> list[str]:
 
 
 def _cards(path: Path) -> list[str]:
-    """The header of a FITS file of the package, in words."""
+    """The header of the package's FITS files, in words."""
     with formats.opened(path) as hdus:
         headers = [hdu.header for hdu in hdus if "SCENHASH" in hdu.header]
         if not headers:
@@ -182,14 +182,14 @@ DESCRIBED: dict[str, Callable[[Path], list[str]]] = {
 
 
 def describe(path: str | Path) -> str:
-    """A few lines on a file (visibilities, a posterior, samples, beams, a sky), or a run's folder.
+    """Describe a file (visibilities, a posterior, samples, beams, a sky) or a run's folder.
 
-    Of most files, what the object says of itself that they hold.
+    For most files this is the ``repr`` of the object that they contain.
 
     Raises
     ------
     InputError
-        If the file is missing, or of none of these kinds; for a folder that no run has written.
+        If the file is missing, or of none of these kinds; for a folder of no finished run.
     """
     if Path(path).is_dir():
         lines = describe_folder(Path(path))

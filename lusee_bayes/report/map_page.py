@@ -1,4 +1,4 @@
-"""The report of a map run of one channel or many, out of what it has left in its folder."""
+"""The report of a map run with one or several channels, made from the files in its folder."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ from lusee_bayes.report.viewer import viewer
 from lusee_bayes.results.channel import Judged
 from lusee_bayes.results.finished_runs import FinishedRun
 
-# days in the table, the worst first
+# number of days in the table, worst first
 WORST_DAYS = 5
 
 
 def map_page(folder: Path, name: str) -> str:
-    """The page as text.
+    """The page of a map as text.
 
     Parameters
     ----------
     folder : Path
         With the files of a run.
     name : str
-        Of the run, for the title.
+        Name of the run, for the title.
 
     Raises
     ------
     InputError
-        If something is missing in the folder.
+        If a file is missing in the folder.
     """
     require_files(folder, ("summary.json", "scenario.yaml", "diagnostics.nc"), "map")
     run = FinishedRun.read(folder)
@@ -58,9 +58,9 @@ def map_page(folder: Path, name: str) -> str:
 
 
 def _groups(judged: Judged | None) -> dict[str, dict[str, Any]]:
-    """By kind: how many groups were left out, and those that are shown, with the bad ones marked.
+    """By kind: the number of groups tested, and those shown, with the bad ones marked.
 
-    There is none where there are too many data whose noise couples times: the verdict says so.
+    Empty if noise couples too many data in time for tests of groups (the verdict notes it).
     """
     shown: dict[str, dict[str, Any]] = {}
     if judged is None:
@@ -82,7 +82,7 @@ def flight_section(folder: Path) -> dict[str, Any] | None:
     Parameters
     ----------
     folder : Path
-        Of a run.
+        Folder of a run.
     """
     if not (folder / REDUCED).is_file():
         return None
@@ -96,7 +96,7 @@ def flight_section(folder: Path) -> dict[str, Any] | None:
 
 
 def _band(reduced: Reduced, band: int, reasons: list[int]) -> dict[str, Any]:
-    """Shares of the spectra by reason, of the flagged channels of those used, and the noise."""
+    """Shares of spectra by reason, the share of flagged channels in used ones, and the noise."""
     used = reduced.reason[band] == 0
     return {
         "frequency_mhz": reduced.frequencies_mhz[band],

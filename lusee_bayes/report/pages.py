@@ -29,7 +29,7 @@ SUMMARY_TABLE = Layout("a summary of draws", SUMMARY_COLUMNS)
 
 
 def sample_page(folder: Path, name: str) -> str:
-    """The page as text, of the folder and the name of a run. InputError as :func:`.map_page`."""
+    """The page of a sampled run as text, from its folder. InputError as :func:`.map_page`."""
     require_files(folder, ("summary.csv", "sampling.json", "scenario.yaml"), "sample")
     path, validation = folder / "sampling.json", folder / "validation.json"
     sampling = read_model(path, SamplingSummary, "the figures of a sampled run")
@@ -54,14 +54,14 @@ def sample_page(folder: Path, name: str) -> str:
 
 
 def comparison_page(runs: Sequence[FinishedRun], folder: Path) -> str:
-    """The page as text; ``folder`` has the figures maps and curves."""
+    """The page of a comparison of runs as text; ``folder`` has its figures."""
     pairs = zip(comparison_rows(runs), runs, strict=True)
     rows = [row | {"ell_cross": run.cross_in_words()} for row, run in pairs]
     return render("comparison.html", folder, runs=runs, rows=rows, caveat=evidence_caveat(runs))
 
 
 def priors_page(folder: Path, name: str) -> str:
-    """The page as text, of the folder and the name of a run. InputError as :func:`.map_page`."""
+    """The page of a comparison of priors as text. InputError as :func:`.map_page`."""
     require_files(folder, ("priors.json", "scenario.yaml", "figures/priors.png"), "compare-priors")
     path = folder / "priors.json"
     comparison = read_model(path, PriorsSummary, "a comparison of priors")
@@ -72,7 +72,7 @@ def priors_page(folder: Path, name: str) -> str:
 
 
 REPORT = "report.html"
-# by the kind of run: the page as text, of a folder and the run's name
+# by kind of run: makes the page as text, from the folder and the name of the run
 PAGES: dict[str, Callable[[Path, str], str]] = {
     "map": map_page,
     "sample": sample_page,
@@ -82,19 +82,19 @@ PAGES: dict[str, Callable[[Path, str], str]] = {
 
 
 def write_report(folder: str | Path) -> Path:
-    """Write report.html of the results in a folder again, whole or not at all.
+    """Rewrite report.html in the folder of a finished run, completely or not at all.
 
     Raises
     ------
     InputError
-        If the folder does not hold the results of ``map``, ``sample`` or ``validate``.
+        If the folder has no results of a kind with a page (``PAGES``).
     """
     folder = Path(folder)
     if not os.path.isdir(folder):
         raise InputError(f"'{folder}' is not a folder; give the folder of a finished run")
     recover(folder)
     manifest, old = read_manifest(folder), {"samples.nc": "sample", "posterior.nc": "map"}
-    # folders that were written before there were manifests
+    # folders of earlier versions have no manifest
     guessed = [kind for name, kind in old.items() if (folder / name).is_file()]
     kind = manifest["kind"] if manifest is not None else next(iter(guessed), None)
     if kind not in PAGES:

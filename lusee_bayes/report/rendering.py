@@ -1,9 +1,9 @@
 """Rendering pages from templates: functions for all templates, and context for pages of runs.
 
-The words of a page, its tables and its captions stand in ``templates/``; the modules beside this
-one read and compute what they show. A page is one file with everything inside. That of a run begins
-with its verdict and where the data come from, and ends with links to its files, how to cite it, and
-how it was made: scenario, versions, times, memory.
+``templates/`` contains the text, tables and captions of a page; the modules of this package read
+and compute the values. A page is one self-contained file. The page of a run begins with its verdict
+and the origin of the data. It ends with links to its files, how to cite it, and how it was made:
+scenario, versions, times, memory.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from lusee_bayes.judge.chi2 import HEADLINES, RULE, probability
 from lusee_bayes.judge.convergence import CRITERIA
 from lusee_bayes.results.finished_runs import Provenance, text_hash
 
-# words of a terminal, and what pages have in their place
+# symbols as terminals write them, and as pages do
 SYMBOLS = {r"\bchi(2\b|\^2)": "chi²", r"\+-": "±", r"\bell\b": "\N{SCRIPT SMALL L}"}
 
 
 def render(template: str, folder: Path, **context: Any) -> str:
-    """A page, or a part of one, as text.
+    """Render a page, or a part of one, as text.
 
-    Bytes of file names that are no UTF-8 are shown by their escapes.
+    Bytes of file names that are not UTF-8 are shown as escapes.
 
     Parameters
     ----------
     template : str
-        Name of a file of ``templates/``.
+        Name of a file in ``templates/``.
     folder : Path
-        Of the results, with pictures in ``figures/``.
+        Folder of the results, with pictures in ``figures/``.
     **context
-        What else the template names.
+        Other variables of the template.
 
     Raises
     ------
@@ -54,7 +54,7 @@ def render(template: str, folder: Path, **context: Any) -> str:
 
 
 def render_text(template: str, **context: Any) -> str:
-    """A file in Markdown of ``templates/``, which shows no pictures, as text."""
+    """Render a Markdown file of ``templates/``, without pictures, as text."""
     return ENVIRONMENT.get_template(template).render(context).rstrip() + "\n"
 
 
@@ -64,7 +64,7 @@ def has_picture(folder: Path, name: str) -> bool:
 
 
 def pictures(folder: Path, name: str) -> list[str]:
-    """The names of a run's pictures that stand side by side, in their order."""
+    """Names of a run's pictures that belong side by side, in order."""
     numbered = {
         int(path.stem.removeprefix(f"{name}_").partition("_")[0]): path.stem
         for path in (folder / "figures").glob(f"{name}_[0-9]*_*.png")
@@ -73,14 +73,14 @@ def pictures(folder: Path, name: str) -> list[str]:
 
 
 def picture(folder: Path, name: str) -> str:
-    """A picture of a run as an address that holds it. InputError if the run has none."""
+    """A picture of a run as a data URL. InputError if the run has none."""
     require_files(folder, (f"figures/{name}.png",), "map")
     data = (folder / "figures" / f"{name}.png").read_bytes()
     return f"data:image/png;base64,{base64.b64encode(data).decode()}"
 
 
 def asset(name: str) -> Markup:
-    """A style sheet or script of ``templates/`` as it is."""
+    """A style sheet or script of ``templates/``, unchanged."""
     return Markup(ENVIRONMENT.loader.get_source(ENVIRONMENT, name)[0])
 
 
@@ -90,11 +90,11 @@ def formatted(value: Any, form: str, missing: str = "") -> str:
     Parameters
     ----------
     value : number or None
-        Text stays as it is.
+        Text is returned unchanged.
     form : str
-        Of Python's ``format``.
+        Format of Python's ``format``.
     missing : str
-        In place of None and NaN.
+        Replaces None and NaN.
     """
     if value is None or value != value:
         return missing
@@ -102,12 +102,12 @@ def formatted(value: Any, form: str, missing: str = "") -> str:
 
 
 def p_value(p: float, missing: str = "") -> str:
-    """Format a probability (:func:`.probability`) for a column of them; ``missing`` for NaN."""
+    """Format a probability (:func:`.probability`) for a column; ``missing`` for NaN."""
     return missing if p != p else probability(p).removeprefix("= ")
 
 
 def typeset(value: Any) -> Any:
-    """Text of the terminal as a page writes it: chi², ± and the script l."""
+    """Replace symbols in a terminal's text by those of a page: chi², ± and the script l."""
     if not isinstance(value, str) or isinstance(value, Markup):
         return value
     for plain, symbol in SYMBOLS.items():
@@ -129,13 +129,13 @@ ENVIRONMENT.globals |= {"RULE": RULE, "HEADLINES": HEADLINES}
 
 
 def render_run(template: str, path: Path, run: Mapping[str, Any], **context: Any) -> str:
-    """The page of a run, of a template that extends ``run.html``.
+    """Render the page of a run from a template that extends ``run.html``.
 
     Parameters
     ----------
     template : str
     path : Path
-        Of the run's figures, in its folder.
+        File of the run's figures, in its folder.
     run : mapping
         The figures, with the run's seconds, versions and peak memory.
     **context
@@ -144,7 +144,7 @@ def render_run(template: str, path: Path, run: Mapping[str, Any], **context: Any
     Raises
     ------
     InputError
-        As in :func:`render`; if the scenario is missing.
+        If the scenario is missing, and as :func:`render`.
     """
     folder = path.parent
     scenario = read_text(folder / "scenario.yaml", "a scenario")

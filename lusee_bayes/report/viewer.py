@@ -1,7 +1,7 @@
-"""Maps to look into: what ``viewer.js`` draws, packed into the page.
+"""Interactive maps: the data that ``viewer.js`` draws, packed into the page.
 
-The page has the coefficients of the skies and draws them at any NSIDE, for any number of channels;
-standard deviations are kept as coarser pixels of two bytes, between which it interpolates.
+The page has the coefficients of the skies and draws them at any NSIDE, for any number of channels.
+Standard deviations are stored as coarser pixels of two bytes, which it interpolates.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from lusee_bayes.report.figures.maps import NSIDE, scales
 from lusee_bayes.results.channel import ChannelResult, Details
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
 
-# of the map that point-spread functions are drawn on
+# NSIDE at which point-spread functions are drawn
 KERNEL_NSIDE = 64
-# multipoles of point-spread functions, at most: a page with more would be too large
+# largest multipole of point-spread functions: a page with more would be too large
 LARGEST_ELL = 47
-# what pixels may take, in bytes, before base64; two bytes a number
+# largest size of all pixels in bytes, before base64; two bytes per number
 BUDGET = 3_500_000
 LEVELS = 65535
 
@@ -34,15 +34,15 @@ Maps = Float[np.ndarray, "channels pixels"]
 
 
 def viewer(name: str, channels: Sequence[ChannelResult]) -> dict[str, Any]:
-    """What ``viewer.html`` shows of one channel or many.
+    """Data that ``viewer.html`` shows for one or several channels.
 
     Parameters
     ----------
     name : str
-        Of the run, for downloads.
+        Name of the run, for downloads.
     channels : sequence of ChannelResult
-        Draws, regions, the prior's share and point-spread functions are shown of a channel with
-        details. Where the truth is known for all, differences from it are shown, too.
+        A channel with details also shows draws, regions, the prior's share and point-spread
+        functions. If the truth of all is known, differences from it are shown, too.
     """
     skies = {"mean": [channel.mean for channel in channels]}
     pixels = {"std": np.stack([channel.pixel_std for channel in channels])}
@@ -89,14 +89,14 @@ def resolution(details: Details) -> dict[str, Any]:
 
 
 def nside_of_page(nside: int, n_maps: int) -> int:
-    """The finest NSIDE, down from that of the maps, with which they stay within the budget."""
+    """The finest NSIDE, at most that of the maps, that keeps them within the budget."""
     while nside > 1 and 2 * 12 * nside**2 * n_maps > BUDGET:
         nside //= 2
     return nside
 
 
 def packed(values: np.ndarray) -> str:
-    """Single precision, base64."""
+    """Encode numbers in single precision and base64."""
     return _base64(np.asarray(values, dtype="<f4"))
 
 
@@ -107,7 +107,7 @@ def _degraded(cube: Maps, nside: int) -> Maps:
 
 
 def _quantised(cube: Maps) -> dict[str, Any]:
-    """Every channel from its least to its largest value in 65535 steps, and its scale."""
+    """Quantise each channel from its smallest to its largest value in 65535 steps."""
     low, high = cube.min(axis=1), cube.max(axis=1)
     step = np.where(high > low, high - low, 1.0) / LEVELS
     levels = np.rint((cube - low[:, None]) / step[:, None]).astype("<u2")

@@ -1,1 +1,1 @@
-"""What runs have found, as objects and as files."""
+"""Results of runs, as objects and as files."""

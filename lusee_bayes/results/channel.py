@@ -1,7 +1,7 @@
-"""The posterior over the sky at one frequency, and what judges it: a map is one channel or several.
+"""The posterior over the sky at one frequency, with its tests; a map has one or more channels.
 
-It tells how far it is from a known truth, by latitude and at some multipoles, and whether
-instrument, noise and prior are those of the data.
+A channel reports its distance from a known truth, by latitude and at some multipoles, and whether
+instrument, noise and prior agree with the data.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from lusee_bayes.judge.coverage import Coverage, latitudes
 from lusee_bayes.judge.residuals import Group
 from lusee_bayes.linear.information import Information
 
-# arrays that recur, of NumPy's
+# recurring types of NumPy arrays
 SkyModes = Float[np.ndarray, " mode"]
 SkyMatrix = Float[np.ndarray, "mode mode_2"]
 OnGrid = Float[np.ndarray, "product time"]
@@ -33,20 +33,20 @@ OnGrid = Float[np.ndarray, "product time"]
 
 @dataclass(frozen=True)
 class Judged:
-    """The data of a channel against what all others predict, group by group.
+    """The data of a channel compared, group by group, with predictions from all other data.
 
     Attributes
     ----------
     level, verdict : str
-        Whether they fit, in a word and in sentences.
+        Whether they fit, as a level and in sentences.
     prior : ChiSquare
-        What the prior does not expect.
+        The part of chi^2 that tests the prior.
     extremes, suspects : tuple of str
         Groups that stand out, and those without which the others fit.
     predicted, z : (products, times) array
-        Of each datum, in K and in standard deviations; NaN where a sample is missing.
+        Data predicted by the mean map, in K, and z of each datum given all others; NaN if missing.
     groups : tuple of Group
-        Products, days and turntable angles; none where groups are not judged.
+        Products, days and turntable angles; empty if groups are not judged.
     """
 
     level: Level
@@ -64,27 +64,27 @@ class Judged:
         return Fit(self.level, self.verdict.removeprefix(f"{HEADLINES[self.level]} "))
 
     def of_kind(self, kind: str) -> list[Group]:
-        """The products, for example."""
+        """Return the groups of one kind, e.g. the products."""
         return [group for group in self.groups if group.kind == kind]
 
 
 @dataclass(frozen=True)
 class Details:
-    """What a report shows of a single map beyond it.
+    """Extra quantities that a report shows for a single map.
 
     Attributes
     ----------
     prior_fraction : (pixels,) array
-        The prior's share of each pixel's variance, the monopole taken for known.
+        The prior's share of each pixel's variance, monopole excluded.
     region_mean, region_std, region_prior_fraction : (regions,) array
-        Of coarse HEALPix RING pixels; the first two in K.
+        Statistics of coarse HEALPix RING pixels; the first two in K.
     resolution, resolution_step, prior_width : array
         The resolution matrix (:func:`.packed_resolution`).
     patterns : (patterns, nodes, azimuths) array
-        Beams over their peaks, on the nodes of ``HemisphereGrid.gauss_legendre``.
+        Beams relative to their peaks, on the nodes of ``HemisphereGrid.gauss_legendre``.
     pattern_names : tuple of str
     draws : (draws, modes) array
-        A few draws of the posterior, in K.
+        A few samples from the posterior, in K.
     """
 
     pattern_names: tuple[str, ...]
@@ -99,7 +99,7 @@ class Details:
     patterns: Float[np.ndarray, "pattern node azimuth"] = quantity("1", "beams over their peaks")
 
 
-# at which SNR is told
+# multipoles at which SNR is reported
 ELLS = (5, 10, 20, 30)
 
 
@@ -107,8 +107,8 @@ ELLS = (5, 10, 20, 30)
 class SkyErrors:
     """Errors of a map in a band of latitude.
 
-    name : of the band; rms_error_k : in K; std_over_sky : width of error bars over the sky's
-    brightness
+    name : of the band; rms_error_k : in K; std_over_sky : width of error bars relative to the
+    sky's brightness
     """
 
     name: str
@@ -118,57 +118,57 @@ class SkyErrors:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class ChannelData:
-    """What is known of a channel besides its sky.
+    """Everything about a channel except its sky.
 
     Attributes
     ----------
     frequency_mhz : float
     taken : dict
-        When and where its data were taken (:func:`.taken`).
+        When and where its data were observed (:func:`.taken`).
     labels : tuple of str
-        Of the products.
+        Names of the products.
     hours, turntable_deg : (times,) array
         Time since the first sample, and the turntable's angle.
     data : (products, times) array
         In K; NaN where a sample is missing.
     n_data, n_missing, rounds : int
-        Data, samples left out, and how often N was built.
+        Numbers of data, of missing samples, and of rounds, each of which builds N.
     flagged : (products, times) array or None
-        Of flight data: what did not fit and is left out.
+        Flight data that do not fit and are left out.
     flagged_share : float
-        Of the values.
+        Fraction of the values that is flagged.
     prior_std : (modes,) array
-        Of the channel's own prior, in K.
+        Standard deviation of the channel's own prior, in K.
     truth : (modes,) array or None
         The sky behind simulated data, in K.
     highest_altitude : (pixels,) array
         sin of the highest altitude that each pixel (HEALPix RING) reached.
     instrument : ChiSquare
-        Of the channel's own data, what no sky explains (:mod:`.chi2`).
+        The part of its data's chi^2 that tests instrument and noise (:mod:`.chi2`).
     prior : str
         Where its prior comes from, in a sentence.
     parameters : tuple of dict
-        Of the prior, where they were learned: name, value and std.
+        Learned parameters of the prior: name, value and std.
     log_evidence_learned : float or None
         ln p with the prior's parameters integrated out.
     beam_rms_difference : float or None
-        Of true and modelled beams, where they differ.
+        Rms difference between true and modelled beams, where they differ.
     doubts : tuple of str
-        What is doubtful about measured data, a sentence each.
+        Doubts about the data, a sentence each.
     judged : Judged or None
-        Group by group; None for a channel of many that fits.
+        Tests group by group; None for one of several channels if it fits.
     details : Details or None
-        Of a map of one frequency.
+        For a map of one frequency.
     pointing : PointingReport or None
-        Of clock and pointing, where the scenario has them or the data do not fit.
+        Clock and pointing, if the scenario has them or the data do not fit.
     fluxes : DataFrame or None
-        Of the point sources beside the map, a row each.
+        Point sources in addition to the map, a row each.
     diagnosis : Diagnosis or None
-        The usual mistakes that would explain the data, where they were tried.
+        Usual mistakes that would explain the data, if they were tried.
     digests : tuple of str
-        Of all data behind the map.
+        Digests of all data behind the map.
     information : Information or None
-        Of all these data, where it is kept for data to be added.
+        Information in all these data, if it is kept for updates with new data.
     """
 
     frequency_mhz: float
@@ -200,7 +200,7 @@ class ChannelData:
     information: Information | None = None
 
     def given(self, table: pd.DataFrame) -> ChannelData:
-        """The same, where other channels tell of the offsets in a table of unknowns, too."""
+        """Replace the offsets by those in a table of unknowns, given all channels."""
         if self.pointing is None or self.pointing.offsets is None:
             return self
         return replace(self, pointing=self.pointing.given(table))
@@ -208,40 +208,40 @@ class ChannelData:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class ChannelResult(ChannelData, Described):
-    """The posterior over the sky at one frequency, and what judges it. Skies in K, Galactic.
+    """The posterior over the sky at one frequency, with its tests. Skies in K, Galactic.
 
     Attributes
     ----------
     mean, std : (modes,) array
-        Of the real harmonic coefficients.
+        Mean and standard deviation of the real harmonic coefficients.
     prior_fraction : (ells,) array
-        Share of the variance that the prior supplies, mean over m.
+        Share of the variance that comes from the prior, mean over m.
     pixel_std : (pixels,) array
         Standard deviation of HEALPix RING pixels.
     draws : (n, modes) array
-        Of the posterior; none, if none were asked for.
+        Samples from the posterior; empty unless requested.
     log_likelihood : (n,) array
-        ln p(d | m) of each draw, with all of N in it.
+        ln p(d | m) of each draw, with the full N.
     covariance : (modes, modes) array or None
-        Where it was asked for, in K^2.
+        In K^2, if requested.
     independent : (modes,) array or None
-        Mean given this channel's data alone, where ``mean`` is given those of all.
+        Mean given this channel's data alone, if ``mean`` is given the data of all.
     log_evidence, information_bits : float
-        NaN for a channel of a joint posterior, where only those of all channels are known. Where
+        NaN for a channel of a joint posterior, which has one value for all channels. Where
         channels share unknowns, ln p of the channel's own data alone.
     chi2, chi2_expected : float
-        Of the residuals about the mean, and its mean if the model holds.
+        chi^2 of the residuals about the mean, and its expectation if the model is right.
     chi2_model : float
-        Of the data under the model, sky included: a chi^2 distribution of ``n_data`` degrees of
-        freedom. NaN for a channel of a joint posterior, which has no model of its own.
+        chi^2 of the data under the model, sky included: a chi^2 distribution of ``n_data`` degrees
+        of freedom. NaN for a channel of a joint posterior, which has no separate model.
     refinement : float
         Last correction of the mean, in standard deviations.
     coverage : tuple of Coverage
-        How often error bars hold the truth, by latitude; empty where it is not known.
+        How often error bars cover the truth, by latitude; empty if the truth is unknown.
     unknowns : UnknownsReport or None
-        Of receivers, ground and gain table, where the model has them.
+        Receivers, ground and gain table, where the model has them.
     theta : InstrumentPosterior or None
-        Of all unknowns of the instrument, and what they do to the map.
+        All unknowns of the instrument, and their effect on the map.
     """
 
     mean: SkyModes = quantity("K", "posterior mean")
@@ -280,7 +280,7 @@ class ChannelResult(ChannelData, Described):
         return float((self.highest_altitude < 0).mean())
 
     def snr(self, mean: SkyModes | None = None) -> np.ndarray | None:
-        """SNR_ell of the map, or of another mean; None where the truth is not known."""
+        """SNR_ell of the map, or of another mean; None if the truth is unknown."""
         if self.truth is None:
             return None
         return measures.signal_to_noise(self.mean if mean is None else mean, self.truth)
@@ -293,11 +293,11 @@ class ChannelResult(ChannelData, Described):
 
     @property
     def resolution_deg(self) -> float | None:
-        """180 degrees over the first ell of which the prior supplies more than half."""
+        """180 degrees over the first ell whose variance comes mostly from the prior."""
         return measures.effective_resolution_deg(self.prior_fraction)
 
     def spectra(self) -> dict[str, Shaped[np.ndarray, " ells"]]:
-        """Columns of spectra.ecsv; rho, snr and cl_truth only where the truth is known."""
+        """Columns of spectra.ecsv; rho, snr and cl_truth only if the truth is known."""
         truth, alone = self.truth, self.independent
         columns = {
             "ell": np.arange(len(self.prior_fraction)),
@@ -313,7 +313,7 @@ class ChannelResult(ChannelData, Described):
         return {name: values for name, values in columns.items() if values is not None}
 
     def maps(self) -> dict[str, Pixels]:
-        """HEALPix RING maps by name, in K: mean, std and, where known, truth and residual."""
+        """HEALPix RING maps by name, in K: mean, std and, if known, truth and residual."""
         maps = {"mean": modes_to_map(self.mean, self.nside), "std": self.pixel_std}
         if self.truth is not None:
             truth = modes_to_map(self.truth, self.nside)
@@ -321,7 +321,7 @@ class ChannelResult(ChannelData, Described):
         return maps
 
     def figures(self) -> list[str]:
-        """The few figures that matter, in words."""
+        """The main figures, in words."""
         parts = []
         if self.truth is not None:
             cross = self.ell_cross
@@ -332,7 +332,7 @@ class ChannelResult(ChannelData, Described):
         return [*parts, f"{self.information_bits:.0f} bits"]
 
     def errors_by_latitude(self) -> tuple[SkyErrors, ...]:
-        """Errors of the map by latitude, of a channel with its truth."""
+        """Errors of the map by latitude, for a channel with a known truth."""
         truth, mean = (modes_to_map(m, self.nside) for m in (self.truth, self.mean))
         errors = []
         for name, inside in latitudes(self.nside).items():
@@ -342,6 +342,6 @@ class ChannelResult(ChannelData, Described):
         return tuple(errors)
 
     def snr_at_some_ell(self) -> dict[int, float]:
-        """SNR_ell at 5, 10, 20 and 30, as far as the map goes, of a channel with its truth."""
+        """SNR_ell at 5, 10, 20 and 30 (up to the map's lmax), for a channel with a known truth."""
         snr = self.snr()
         return {ell: float(snr[ell]) for ell in ELLS if ell < len(snr)}

@@ -1,9 +1,9 @@
-"""The map of one channel: its posterior, what its data fit and tell, and the result.
+"""The map of one channel: its posterior, tests of its data, and the result.
 
-A channel is conditioned on its own data (:func:`conditioned`), which are looked at once: chi^2,
-group by group where that is asked for or needed, unknowns, and the usual mistakes where they do not
-fit. The result (:func:`channel_result`) takes the posterior of the sky, which may be that given
-other channels, too.
+A channel is conditioned on its own data (:func:`conditioned`). They are examined once: chi^2 (group
+by group if requested or needed), unknowns, and the usual mistakes if the data do not fit.
+:func:`channel_result` then makes the result from the posterior of the sky, given this channel's
+data or those of all channels.
 """
 
 from __future__ import annotations
@@ -39,37 +39,37 @@ from lusee_bayes.results.map_result import prior_sentence
 from lusee_bayes.sky.prior import DensePrior, Prior
 from lusee_bayes.systematics.beam import beam_rms_difference
 
-# standard deviation of modes without prior variance, over the widest
+# standard deviation of modes without prior variance, relative to the widest
 EXACT = 1e-12
-# groups of the data of a channel of many are judged where what no sky explains is less probable
+# of several channels, groups of data are tested where p of instrument and noise is below this
 DOUBTFUL = 0.01
 REGION_NSIDE = 8
-# draws that a report shows
+# number of draws in a report
 FEW = 4
-# of a byte with its sign
+# largest value of a signed byte
 LARGEST_STEP = 127
-# the nodes of the beams that are drawn, and which: an auto, and its crosses with the antennas
-# opposite and beside
+# nodes of the drawn beams, and the products drawn: an auto, and its crosses with the opposite and
+# the adjacent antenna
 BEAM_NODES, BEAMS = (48, 120), (0, 2, 1)
 
 
 def conditioned(
     experiment: Experiment, earlier: SavedInformation | None = None, stages: Stages | None = None
 ) -> Conditioned:
-    """Condition an experiment's model on its data, and on earlier ones.
+    """Condition an experiment's model on its data, and on earlier data.
 
     Parameters
     ----------
     experiment : Experiment
     earlier : SavedInformation, optional
-        Of earlier data, to which these are added.
+        Information in earlier data, to be combined with these.
     stages : Stages, optional
-        Told what is being done.
+        Reports progress.
 
     Raises
     ------
     InputError
-        For data that the earlier ones hold already, and as :func:`infer`.
+        If the earlier data already include these, and as :func:`infer`.
     """
     with rounds_of(experiment, stages or Stages(), "posterior") as report:
         new, data = infer(experiment, report), experiment.data
@@ -87,9 +87,9 @@ def conditioned(
 
 
 def _given_earlier(posterior: Posterior) -> DensePrior:
-    """What earlier data leave of the sky, as the prior of data to come."""
+    """The posterior given earlier data, as the prior for new data."""
     width = np.sqrt(np.asarray(posterior.prior.variance()))
-    # a prior has no density where modes are known exactly
+    # a prior without variance in a mode has no density
     exact = np.diag(EXACT * width.max() * (width == 0))[:, width == 0]
     root = np.concatenate([np.asarray(posterior.root()), exact], axis=1)
     return DensePrior.of_root(root, np.asarray(posterior.mean))
@@ -97,19 +97,19 @@ def _given_earlier(posterior: Posterior) -> DensePrior:
 
 @dataclass(frozen=True)
 class Conditioned:
-    """A channel conditioned on its own data, and on earlier ones of the same frequency.
+    """A channel conditioned on its own data, and on earlier data at the same frequency.
 
     Attributes
     ----------
     experiment : Experiment
     from_data : Inference
-        Of these data alone.
+        Given these data alone.
     from_all : Inference
-        The model of these data, and the posterior given all.
+        The model of these data, and the posterior given all data.
     judged : Inference
-        The model that predicts these data, with what earlier ones tell of the sky in its prior.
+        The model that predicts these data: its prior is the posterior given the earlier data.
     digests : tuple of str
-        Of all data.
+        Digests of all data.
     """
 
     experiment: Experiment
@@ -125,17 +125,17 @@ class Conditioned:
 
     @property
     def information(self) -> Information:
-        """Of all data."""
+        """The information in all data."""
         return self.from_all.solution.information
 
     @property
     def posterior(self) -> Posterior:
-        """Given all data."""
+        """The posterior given all data."""
         return self.from_all.posterior
 
     @property
     def covariance(self) -> ModesMatrix:
-        """Of the posterior, in K^2."""
+        """Covariance of the posterior, in K^2."""
         return self.from_all.solution.covariance
 
     @cached_property
@@ -145,10 +145,10 @@ class Conditioned:
 
     @cached_property
     def without_monopole(self) -> tuple[Pixels, Pixels]:
-        """Variances of pixels, of posterior and prior, the monopole taken for known.
+        """Variances of pixels under posterior and prior, monopole excluded.
 
-        The prior leaves the monopole wide open, which any data settle; with it the prior's share
-        would be close to zero everywhere.
+        The prior of the monopole is very wide, but any data measure it: including it would bring
+        the prior's share close to zero everywhere.
         """
         covariance, nside = self.covariance, self.experiment.scenario.map_nside
         monopole = 1.0 / np.sqrt(4.0 * np.pi)
@@ -159,25 +159,25 @@ class Conditioned:
 
     @cached_property
     def unknowns(self) -> Unknowns | None:
-        """Receivers, ground and gain table given the sky, as these data alone tell of them."""
+        """Receivers, ground and gain table given the sky, from these data alone."""
         return Unknowns.of(self.experiment, self.from_data)
 
     @cached_property
     def expected(self) -> float:
-        """Of chi^2 of these data about the mean, if the model holds."""
+        """Expected chi^2 of these data about the mean, if the model is right."""
         variance = None if self.onto else np.diagonal(self.covariance)
         return measures.expected_chi2(self.judged.posterior, self.from_data.model.n_data, variance)
 
     @cached_property
     def drawn(self) -> Float[np.ndarray, "n modes"]:
-        """All draws that are needed, in K; parameters of the prior are drawn once for all."""
+        """All draws, in K, so that the prior's parameters are drawn only once."""
         with_truth = self.experiment.data.truth is not None
         n = max(self.experiment.scenario.output.draws, FEW) + with_truth * N_DRAWS
         return posterior_draws(self.experiment, self.posterior, lambda: self.information, n)
 
     @property
     def draws(self) -> Float[np.ndarray, "n modes"]:
-        """So many draws as the scenario's output asks for, in K."""
+        """The number of draws that the scenario's output requests, in K."""
         return self.drawn[: self.experiment.scenario.output.draws]
 
     def log_likelihood(self) -> Float[np.ndarray, " n"]:
@@ -185,14 +185,14 @@ class Conditioned:
         model, data = self.from_data.model, self.experiment.data.data
         if not len(self.draws):
             return np.zeros(0)
-        # factorised once: it takes far longer than a prediction where N couples times
+        # factorised once: this takes far longer than a prediction if N couples times
         factor = model.noise.factor()
         white = [factor.whiten(data - model.predict(sky)) for sky in self.draws]
         chi2 = np.array([float(one @ one) for one in white])
         return -0.5 * (chi2 + float(factor.log_det()) + model.n_data * np.log(2.0 * np.pi))
 
     def of_all(self, data: ChannelData) -> ChannelData:
-        """The same with number and chi^2 of all data: a joint posterior is given their sum."""
+        """Replace n_data and chi^2 by those of all data, which a joint posterior uses."""
         if not self.onto:
             return data
         posterior, n_data = self.posterior, int(self.information.n_data)
@@ -201,13 +201,13 @@ class Conditioned:
         return replace(data, n_data=n_data, instrument=instrument)
 
     def compared(self) -> Float[np.ndarray, "more modes"] | None:
-        """Draws less the mean for :class:`.Counts`, in K; None where no truth is known."""
+        """Draws minus the mean for :class:`.Counts`, in K; None if the truth is unknown."""
         if self.experiment.data.truth is None:
             return None
         return self.drawn[-N_DRAWS:] - self.posterior.mean
 
     def figures(self) -> dict[str, float | bool]:
-        """What :func:`channel_result` takes besides: numbers, and whether C is kept."""
+        """Further arguments of :func:`channel_result`: numbers, and whether C is kept."""
         model, posterior, data = self.from_all.model, self.posterior, self.experiment.data.data
         return {
             "log_evidence": float(posterior.log_evidence),
@@ -235,16 +235,16 @@ class Conditioned:
     def channel_data(
         self, stages: Stages | None = None, *, alone: bool = True, thorough: bool = False
     ) -> ChannelData:
-        """Look at these data.
+        """Examine these data.
 
         Parameters
         ----------
         stages : Stages, optional
-            Told what is being done.
+            Reports progress.
         alone : bool
-            It is the only channel: a report shows more of it.
+            Whether this is the only channel: the report then shows more.
         thorough : bool
-            Judge groups of data and try the usual mistakes even if the data fit.
+            Test groups of data and try the usual mistakes even if the data fit.
         """
         experiment, inference, stages = self.experiment, self.from_data, stages or Stages()
         scenario, data, learned = experiment.scenario, experiment.data, experiment.learned
@@ -304,7 +304,7 @@ class Conditioned:
         )
 
     def _judged(self, misfit: Residuals) -> Judged:
-        """The residuals, with the verdict in words."""
+        """Describe the residuals, with the verdict in words."""
         data = self.experiment.data
         prior = self.from_all.model.prior
         expected = prior.variance() - np.diagonal(self.covariance)
@@ -342,28 +342,28 @@ def channel_result(
     information_bits: float = np.nan,
     **figures: Any,
 ) -> ChannelResult:
-    """The channel of a mean and a covariance.
+    """Make a channel's result from a mean and a covariance.
 
     Parameters
     ----------
     data : ChannelData
-        Of its own data.
+        The channel's own data.
     mean, covariance : (modes,) and (modes, modes) array
         In K and K^2.
     draws : (n, modes) array
         In K.
     log_likelihood : (n,) array
-        Of the draws.
+        For each of the draws.
     compared : (more, modes) array, optional
-        Draws less mean for :class:`.Counts`, where the truth is known, in K.
+        Draws minus mean for :class:`.Counts`, in K, if the truth is known.
     pixels : (pixels,) array, optional
-        Standard deviations of pixels in K, where they are known already.
+        Standard deviations of pixels in K; computed if omitted.
     instrument : Unknowns, optional
-        Of the instrument given the sky, where the model has them.
+        Unknowns of the instrument given the sky, where the model has them.
     covariance_kept : bool
         Keep the covariance with the result.
     information_bits, **figures
-        Whatever else a :class:`.ChannelResult` has: ``chi2``, ``unknowns``, ``independent`` ...
+        Other attributes of :class:`.ChannelResult`: ``chi2``, ``unknowns``, ``independent`` ...
     """
     mean, covariance = np.asarray(mean), np.asarray(covariance)
     width, held, variance = pixels, (), np.diagonal(covariance)
@@ -390,7 +390,7 @@ def channel_result(
 
 
 def _details(channel: Conditioned) -> Details:
-    """What a report shows of a single map beyond it."""
+    """Extra quantities that a report shows for a single map."""
     setup, covariance = channel.experiment.setup, channel.covariance
     lmax, nside = setup.scenario.lmax, setup.scenario.map_nside
     prior = channel.from_all.model.prior
@@ -425,24 +425,24 @@ def _details(channel: Conditioned) -> Details:
 def packed_resolution(
     covariance: ModesMatrix, prior: Prior
 ) -> tuple[Int8[np.ndarray, "modes modes"], Float[np.ndarray, "ells ells"], Modes]:
-    """Pack what the data know of the modes, for point-spread functions of any direction.
+    """Pack the resolution matrix, for the point-spread function of any direction.
 
-    The resolution matrix is R = 1 - C S^-1 = D K D^-1, with D the prior's standard deviations; of
-    modes that are correlated, those of whole multipoles, since one mode may be 60 times as wide as
-    another. K, which is symmetric where S is diagonal, is kept with a byte for each entry, in steps
-    of its pair of multipoles.
+    The resolution matrix is R = 1 - C S^-1 = D K D^-1, with D the prior's standard deviations; if
+    the prior correlates modes, D is the rms over each multipole, since one mode may be 60 times as
+    wide as another. K is symmetric if S is diagonal. It is stored with one byte for each entry, in
+    steps that depend on the pair of multipoles.
 
     Parameters
     ----------
     covariance : (modes, modes) array
-        Of the posterior, in K^2.
+        Posterior covariance, in K^2.
     prior : Prior
         S, over the same modes, with NumPy's arrays.
 
     Returns
     -------
     (modes, modes) array of int8
-        In steps; zero for modes without prior variance.
+        K in steps; zero for modes without prior variance.
     (ells, ells) array
         The steps.
     (modes,) array
@@ -466,18 +466,18 @@ def packed_resolution(
 
 
 def region_of(nside: int) -> np.ndarray:
-    """The region (HEALPix RING) that each pixel (RING) belongs to."""
+    """The region (HEALPix RING) that contains each pixel (RING)."""
     nested = healpy.ring2nest(nside, np.arange(healpy.nside2npix(nside)))
     coarse = min(REGION_NSIDE, nside)
     return healpy.nest2ring(coarse, nested // (nside // coarse) ** 2)
 
 
 def region_rows(nside: int, lmax: int) -> Float[np.ndarray, "regions modes"]:
-    """Rows that average the pixels of a map over each region."""
+    """Rows that average a map's pixels over each region."""
     of = region_of(nside)
     theta, phi = healpy.pix2ang(nside, np.arange(len(of)))
     heights, ring = np.unique(theta, return_inverse=True)
-    # pixels of a region on one ring have lambda_l|m|(theta) in common
+    # pixels of a region on one ring share lambda_l|m|(theta)
     part = of * len(heights) + ring
     by_part = np.argsort(part, kind="stable")
     _, first = np.unique(part[by_part], return_index=True)

@@ -1,7 +1,7 @@
-"""What finished runs leave in their folders, read back to be set side by side.
+"""Files of finished runs: writing them, and reading them back for comparisons.
 
-A map leaves posterior.nc, diagnostics.nc, and HEALPix FITS with their origin in them. The
-provenance of a run says which data it is of, of which site and dates, by which command and when.
+A map writes posterior.nc, diagnostics.nc, and HEALPix FITS files with their origin in the header.
+The provenance of a run records its data, site, dates and command, and when it was made.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from lusee_bayes.results.summaries import MapSummary
 
 
 def cards(name: str, scenario: Scenario) -> dict[str, tuple]:
-    """Header cards of a result: what it is, of which frequency, beam, site and scenario.
+    """Header cards of a result: content, frequency, beam, site and scenario.
 
     Values are (value, comment), or (value,) for text that leaves no room for a comment.
     """
@@ -78,7 +78,7 @@ def write_map(
     ----------
     path : Path
     maps : mapping of (pixels,) arrays
-        In K, RING, Galactic, by the names of their columns: the mean first.
+        In K, RING, Galactic, by column name: the mean first.
     observed : (pixels,) array of bool
         Whether the pixel ever rose above the horizon: the third column, OBSERVED, 1 or 0.
     scenario : Scenario
@@ -99,10 +99,10 @@ def write_cubes(
     frequencies_mhz: Float[np.ndarray, " frequencies"],
     scenario: Scenario,
 ) -> None:
-    """Write NAME.fits of maps at a scenario's frequencies, in the layout of ``sky.cubes``.
+    """Write maps at a scenario's frequencies as NAME.fits, in the layout of ``sky.cubes``.
 
-    One image (frequency, pixel), HEALPix RING, Galactic, K, float64; the frequencies, which its
-    header can only give in even steps, are in a table behind it.
+    Each file has one image (frequency, pixel), HEALPix RING, Galactic, K, float64. A table after it
+    lists the frequencies, because the header can only give even steps.
     """
     steps = np.diff(frequencies_mhz)
     for name, pixels in cubes.items():
@@ -121,12 +121,11 @@ def write_cubes(
 
 
 def posterior_tree(result: MapResult) -> xr.DataTree:
-    """What posterior.nc holds, for xarray and, where draws were asked for, for ArviZ.
+    """Contents of posterior.nc, for xarray and, if draws were requested, for ArviZ.
 
-    At its root the sky of every channel, in K, on ``frequency`` and ``mode`` with coordinates
-    ``ell`` and ``m``; ``posterior`` (draws), ``log_likelihood``, ``observed_data`` and
-    ``constant_data`` as ArviZ has them; ``information``, where it was asked for, a group for each
-    frequency.
+    The root has the sky of every channel, in K, on ``frequency`` and ``mode`` with coordinates
+    ``ell`` and ``m``. ``posterior`` (draws), ``log_likelihood``, ``observed_data`` and
+    ``constant_data`` follow ArviZ; ``information``, if requested, has a group for each frequency.
     """
     scenario, joint, channels = result.scenario, result.joint, result.channels
     ell, m = mode_numbers(scenario.lmax)
@@ -165,7 +164,7 @@ def posterior_tree(result: MapResult) -> xr.DataTree:
 
 
 def _observed(channels: Sequence[ChannelResult], axis: dict) -> dict[str, xr.Dataset]:
-    """The data, and when they were taken; of channels that have other times, NaN between."""
+    """The data and their times; NaN at times that a channel lacks."""
     parts, turns = [], []
     for channel in channels:
         coords = {"product": list(channel.labels), "time": ("time", channel.hours, HOURS)}
@@ -186,7 +185,7 @@ HOURS = {"units": "h", "long_name": "time since the first sample"}
 
 @dataclass(frozen=True)
 class SavedInformation:
-    """What data say of the sky at one frequency, and the digests of these data."""
+    """The information in data about the sky at one frequency, and the digests of these data."""
 
     information: Information
     digests: tuple[str, ...]
@@ -197,7 +196,7 @@ class SavedInformation:
         Raises
         ------
         InputError
-            If they are among these.
+            If they are already included.
         """
         if digest in self.digests:
             raise InputError(
@@ -213,9 +212,9 @@ def read_draws(folder: str | Path, frequency_mhz: float | None = None) -> Draws:
     Parameters
     ----------
     folder : str or Path
-        Of the run.
+        Folder of the run.
     frequency_mhz : float, optional
-        The channel; by default the only one.
+        The channel; required if there are several.
 
     Returns
     -------
@@ -225,7 +224,7 @@ def read_draws(folder: str | Path, frequency_mhz: float | None = None) -> Draws:
     Raises
     ------
     InputError
-        If the run has kept no draws, or there is no such channel.
+        If the run has saved no draws, or there is no such channel.
     """
     path = require_file(user_path(folder) / "posterior.nc", "a posterior of lusee-bayes map")
     with opened_tree(path, formats.POSTERIOR, "a posterior of lusee-bayes map") as tree:
@@ -244,15 +243,15 @@ KEPT = "a posterior of lusee-bayes map --information"
 
 
 def information_file(folder: str | Path) -> Path:
-    """The file in which a run has kept its information. InputError if the folder has none."""
+    """The file with a run's saved information. InputError if the folder has none."""
     recover(folder)
     return require_file(user_path(folder).resolve() / "posterior.nc", KEPT)
 
 
 def read_information(path: Path, channel: Scenario) -> SavedInformation:
-    """The information of a channel that a run has kept (:func:`information_file`).
+    """Read a channel's information that a run has saved (:func:`information_file`).
 
-    InputError if there is none, or none of this frequency or lmax.
+    InputError if there is none, or none for this frequency or lmax.
     """
     name = f"{channel.frequency_mhz:.15g}"
     with opened_tree(path, formats.POSTERIOR, KEPT) as tree:
@@ -277,7 +276,7 @@ def read_information(path: Path, channel: Scenario) -> SavedInformation:
 
 
 def diagnostics_tree(result: MapResult) -> xr.DataTree:
-    """What diagnostics.nc holds: everything else that was found, a group for each frequency."""
+    """Contents of diagnostics.nc: all other results, a group for each frequency."""
     groups = {}
     for channel in result.channels:
         kept = replace(channel, draws=channel.draws[:0], log_likelihood=channel.log_likelihood[:0])
@@ -288,7 +287,7 @@ def diagnostics_tree(result: MapResult) -> xr.DataTree:
 
 
 def read_channels(path: str | Path) -> tuple[ChannelResult, ...]:
-    """The channels of a finished run, of its diagnostics.nc. InputError for anything else."""
+    """Read the channels of a finished run from its diagnostics.nc. InputError for anything else."""
     what = "diagnostics of lusee-bayes map"
     with opened_tree(path, formats.DIAGNOSTICS, what, "lusee-bayes map writes one") as tree:
         named = sorted(tree.children.items(), key=lambda one: float(one[0]))
@@ -296,7 +295,7 @@ def read_channels(path: str | Path) -> tuple[ChannelResult, ...]:
 
 
 def attributes_of(scenario: Scenario) -> dict[str, object]:
-    """What a file has to say of its numbers: frame, versions, scenario."""
+    """Metadata of a file's numbers: lmax, frame, basis, versions, scenario."""
     return {
         "lmax": scenario.lmax,
         "frame": "galactic",
@@ -310,7 +309,7 @@ NAME = "provenance.json"
 
 
 def taken(observation: Observation) -> dict[str, Any]:
-    """When and where data were taken: first and last time, step, number of times, site."""
+    """When and where data were observed: first and last time, step, number of times, site."""
     return {
         "first": str(observation.times[0].isot)[:19],
         "last": str(observation.times[-1].isot)[:19],
@@ -327,24 +326,24 @@ class Provenance(BaseModel, frozen=True):
     Attributes
     ----------
     file : str
-        Of the data; empty if the run has simulated them.
+        File of the data; empty if the run simulated them.
     known_sky : bool
-        Whether the sky behind the data is known: they are simulated, by this run or another.
+        Whether the data are simulated, by this run or another, so that their sky is known.
     seed : int
-        Of the scenario.
+        Seed of the scenario.
     first, last : str
         Times of the first and the last sample, UTC.
     step_s : float
     n_times : int
     lon_deg, lat_deg : float
-        Selenographic, of the site.
+        Selenographic coordinates of the site.
     lmax : int
     command : str
         The command line; empty for a call of the library.
     version : str
-        Of the package, with its commit where that is known.
+        Version of the package, with its commit if known.
     made : str
-        When, UTC.
+        When the results were made, UTC.
     """
 
     file: str
@@ -365,7 +364,7 @@ class Provenance(BaseModel, frozen=True):
     def of(
         cls, scenario: Scenario, times: Mapping[str, Any], data: Data | None, *, known_sky: bool
     ) -> Provenance:
-        """Of a run that has used data of an observation (:func:`taken`), given or simulated."""
+        """Provenance of a run with an observation's data (:func:`taken`), given or simulated."""
         return cls(
             file="" if data is None else ", ".join(names_of_data(data)),
             known_sky=known_sky,
@@ -379,13 +378,13 @@ class Provenance(BaseModel, frozen=True):
 
     @classmethod
     def of_experiment(cls, experiment: Experiment, data: Data | None) -> Provenance:
-        """Of a run with an experiment's data."""
+        """Provenance of a run with an experiment's data."""
         times = taken(experiment.data.observation)
         return cls.of(experiment.scenario, times, data, known_sky=experiment.data.truth is not None)
 
     @classmethod
     def read(cls, folder: Path) -> Provenance | None:
-        """What :meth:`write` wrote; None for a folder of an older version.
+        """Read what :meth:`write` wrote; None for a folder of an older version.
 
         InputError if the file cannot be read.
         """
@@ -399,7 +398,7 @@ class Provenance(BaseModel, frozen=True):
         (folder / NAME).write_text(self.model_dump_json(indent=2) + "\n", encoding="utf-8")
 
     def data_line(self) -> str:
-        """Whether the data are measured or simulated, and from where."""
+        """Whether the data are measured or simulated, and where they come from."""
         if not self.file:
             return f"simulated by this run, seed {self.seed}"
         if self.known_sky:
@@ -409,7 +408,7 @@ class Provenance(BaseModel, frozen=True):
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """What a map run has left: the name of its folder, its figures, and its channels.
+    """A finished map run: the name of its folder, its figures, and its channels.
 
     ``provenance`` is None for a folder of an earlier version, which did not record it.
     """
@@ -421,11 +420,11 @@ class FinishedRun:
 
     @property
     def channel(self) -> ChannelResult:
-        """The first channel: of a map of one frequency, the only one."""
+        """The first channel, which is the only one in a map of one frequency."""
         return self.channels[0]
 
     def cross_in_words(self) -> str:
-        """First ell with SNR < 1: above the last one, or unknown without a truth."""
+        """First ell with SNR < 1, "> lmax" if there is none, or "no truth"."""
         cross = self.channel.ell_cross
         if cross is not None:
             return str(cross)
@@ -434,7 +433,7 @@ class FinishedRun:
 
     @classmethod
     def read(cls, folder: str | Path) -> FinishedRun:
-        """InputError if the folder is not one of a finished map run."""
+        """Read a folder; InputError unless it is that of a finished map run."""
         folder = user_path(folder)
         recover(folder)
         require_files(folder, ("summary.json", "diagnostics.nc"), "map")
@@ -455,7 +454,7 @@ def _in_mhz(frequencies: Sequence[float]) -> str:
 
 
 def read_runs(folders: Sequence[str | Path]) -> list[FinishedRun]:
-    """Two runs or more, with names that tell them apart. InputError for fewer."""
+    """Read two or more runs with different names; InputError for fewer."""
     if len(folders) < 2:
         raise InputError(f"give at least two folders to compare, got {len(folders)}")
     runs = [FinishedRun.read(folder) for folder in folders]
@@ -472,12 +471,12 @@ def read_runs(folders: Sequence[str | Path]) -> list[FinishedRun]:
 
 
 def evidence_caveat(runs: Sequence[FinishedRun]) -> str | None:
-    """Say why the evidences of runs must not be compared: their data differ.
+    """State why the evidences of runs must not be compared: their data differ.
 
     Returns
     -------
     str or None
-        None if all runs map the very same data.
+        None if all runs map the same data.
     """
     first, *others = runs
     reasons = [f"{run.name} {why}" for run in others if (why := _difference(first, run))]
@@ -488,7 +487,7 @@ def evidence_caveat(runs: Sequence[FinishedRun]) -> str | None:
 
 
 def _difference(first: FinishedRun, run: FinishedRun) -> str | None:
-    """How the data of a run differ from those of the first, in words; None if they do not."""
+    """How the data of a run differ from those of the first, in words; None if they agree."""
     ours, theirs = (one.channel.data for one in (first, run))
     frequencies = [one.channel.frequency_mhz for one in (first, run)]
     if frequencies[0] != frequencies[1]:
@@ -510,15 +509,15 @@ def _difference(first: FinishedRun, run: FinishedRun) -> str | None:
     return "has different values at the same times (a different file, noise, sky or seed)"
 
 
-# figures of channels that are set side by side
+# figures of channels that are compared
 COMPARED = ("frequency_mhz", "n_data", "ell_cross", "resolution_deg", "information_bits")
 COMPARED += ("log_evidence", "chi2", "chi2_expected")
 
 
 def comparison_rows(runs: Sequence[FinishedRun]) -> list[dict[str, object]]:
-    """One row for each run: the figures that say which map is better.
+    """One row for each run, with the figures that show which map is better.
 
-    The difference of ln evidence is None where data differ.
+    The difference of ln evidence is None if the data differ.
     """
     best = max(run.channel.log_evidence for run in runs)
     comparable = evidence_caveat(runs) is None

@@ -1,15 +1,15 @@
 """The information in an observation, from the posterior covariance alone: no data are needed.
 
-C = Lambda^-1 does not depend on d. Three numbers are taken from it:
+C = Lambda^-1 does not depend on d. It gives three numbers:
 
 - information, ln|S C^-1| / 2 = ln|Lambda| / 2 of the white posterior: the mean of
   ln p(m | d) / p(m) over skies and data of the model;
-- modes with SNR > 1: independent directions of the sky of which (S - C) / C > 1, that is whose
-  posterior variance is less than half of the prior's. They are eigenvectors of C relative to S, so
-  that their number does not depend on the basis in which m is written;
+- modes with SNR > 1: independent directions of the sky with (S - C) / C > 1, i.e. whose posterior
+  variance is less than half of the prior's. They are eigenvectors of C relative to S, so their
+  number does not depend on the basis of m;
 - the expected SNR_ell. Over skies and data of the model, S = Cov(mean) + C: the mean map has
-  covariance S - C and its error C. What :func:`metrics.signal_to_noise` divides, sum_m mean^2 by
-  sum_m (mean - m)^2, has the expectations sum_m (S - C) and sum_m C.
+  covariance S - C and its error C. SNR_ell^2 (:func:`.measures.signal_to_noise`) is the ratio of
+  sum_m mean^2 to sum_m (mean - m)^2, whose expectations are sum_m (S - C) and sum_m C.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ AS_GIVEN = "as given"
 class Variation:
     """A scenario to be compared with others.
 
-    source : what it is a variation of; family, name : what differs; lost : ports that are dead,
-    of which every product is flagged
+    source : original scenario; family, name : what differs; lost : dead ports, whose products are
+    all flagged
     """
 
     source: str
@@ -45,10 +45,10 @@ class Forecast:
 
     days : of observing; n_data : samples of all products; information_bits : about the whole sky;
     modes : how many have SNR > 1; snr_squared : (ells,) expected SNR_ell^2 for ell = 0..lmax;
-    resolution_deg : as in a map's summary, 180 degrees / ell_cross, None if there is none;
-    offsets : expected standard deviation of every offset of clock and pointing that the model has,
-    by name; unnoticed : errors of the instrument that the model does not have, as large as the
-    residual chi^2 would not show, and by how many standard deviations (rms) each moves the map
+    resolution_deg : as in a map's summary, 180 degrees over the first ell whose variance comes
+    mostly from the prior, or None; offsets : expected standard deviations of the model's clock and
+    pointing offsets, by name; unnoticed : largest instrument errors outside the model that the
+    residual chi^2 would not reveal, each with the rms shift of the map in standard deviations
     """
 
     variation: Variation
@@ -62,7 +62,7 @@ class Forecast:
     unnoticed: str = ""
 
     def offsets_line(self) -> str:
-        """How well clock and pointing will be known; empty where the model has no such offsets."""
+        """Expected errors of clock and pointing; empty if the model has no such offsets."""
         return ", ".join(f"{name} +- {std:.2g}" for name, std in self.offsets.items())
 
     @property
@@ -77,7 +77,7 @@ def forecast_lines(forecasts: Sequence[Forecast]) -> list[str]:
     Parameters
     ----------
     forecasts : sequence of Forecast
-        Of one source, the scenario as it is first.
+        All of one source, the unchanged scenario first.
     """
     first, best = forecasts[0], max(forecasts, key=lambda one: one.information_bits)
     source = first.variation.source
@@ -96,7 +96,7 @@ def forecast_lines(forecasts: Sequence[Forecast]) -> list[str]:
 
 
 def forecast_rows(forecasts: Sequence[Forecast]) -> list[dict[str, object]]:
-    """Rows of plan.csv; ``difference_bits`` is that to the same source's first variation."""
+    """Rows of plan.csv; ``difference_bits`` is relative to the same source's first variation."""
     rows, first = [], {row.variation.source: row for row in reversed(forecasts)}
     for row in forecasts:
         it, resolution = row.variation, row.resolution_deg

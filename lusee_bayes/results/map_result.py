@@ -1,7 +1,7 @@
-"""What a map run has found: the posterior of every channel's sky, and whether the data fit.
+"""The result of a map run: the posterior of every channel's sky, and whether the data fit.
 
-A map of one frequency is one channel. Channels have a posterior each, or share that of component
-maps.
+A map of one frequency has one channel. Several channels have independent posteriors, or share the
+posterior of component maps.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from lusee_bayes.sky.spectral_prior import SpectralPrior
 
 
 def prior_sentence(experiment: Experiment) -> str:
-    """The prior's model, where its C_ell comes from and, if it was learned, its parameters."""
+    """The prior's model, the source of its C_ell and, if it was learned, its parameters."""
     section, prior = experiment.scenario.prior, experiment.learned
     rows = [] if prior is None else prior.as_rows()
     learned = ", ".join(f"{r['name']}: {r['value']:.2f} +- {r['std']:.2f}" for r in rows)
@@ -44,7 +44,7 @@ def prior_sentence(experiment: Experiment) -> str:
 
 
 def joint_prior_sentence(scenario: Scenario) -> str:
-    """Which prior the skies of a scenario's joint posterior have."""
+    """The prior of the skies in a scenario's joint posterior, in a sentence."""
     section, kept = scenario.spectral, f"prior.model={scenario.prior.model} is not used"
     if section.model == "positive":
         sky = f"the embedded template times the exponential of {', '.join(section.fields)}"
@@ -54,14 +54,14 @@ def joint_prior_sentence(scenario: Scenario) -> str:
 
 @dataclass(frozen=True)
 class ChannelUnknowns:
-    """What is told of the unknowns of every channel.
+    """Reports on the unknowns of every channel.
 
     Attributes
     ----------
     reports : dict of UnknownsReport
         By frequency in MHz.
     shared : dict of float
-        What channels share, :attr:`.Scenario.shared`.
+        Unknowns that channels share, :attr:`.Scenario.shared`.
     """
 
     reports: dict[float, UnknownsReport]
@@ -69,11 +69,11 @@ class ChannelUnknowns:
 
     @property
     def table(self) -> pd.DataFrame:
-        """unknowns.csv: the channels' tables, one below the other, with ``frequency_mhz``."""
+        """unknowns.csv: the channels' tables, concatenated, with ``frequency_mhz``."""
         return below({f: report.table for f, report in self.reports.items()})
 
     def lines(self) -> list[str]:
-        """What a terminal shows: which of them, and which combination, the data do not tell."""
+        """Lines for a terminal: the unknowns and the combination that are unconstrained."""
         if len(self.reports) == 1:
             return next(iter(self.reports.values())).lines()
         n, reports = len(self.reports), self.reports.values()
@@ -89,7 +89,7 @@ class ChannelUnknowns:
         return [*lines, sentence] if sentence else lines
 
     def _null_sentence(self) -> str:
-        """Of the channel whose data leave most open; empty where all tell most of it."""
+        """Describe the least constrained combination of all channels; empty if there is none."""
         nulls = {f: report.null for f, report in self.reports.items() if report.null is not None}
         left_open = [f for f, null in nulls.items() if null.sentence()]
         if not left_open:
@@ -104,7 +104,7 @@ class ChannelUnknowns:
 
 
 def below(tables: dict[float, pd.DataFrame | None]) -> pd.DataFrame | None:
-    """Tables of channels, one below the other, with ``frequency_mhz`` first; None without any."""
+    """Concatenate tables of channels, with ``frequency_mhz`` first; None without any."""
     present = {f: table.copy() for f, table in tables.items() if table is not None}
     for frequency, table in present.items():
         table.insert(0, "frequency_mhz", frequency)
@@ -113,23 +113,23 @@ def below(tables: dict[float, pd.DataFrame | None]) -> pd.DataFrame | None:
 
 @dataclass(frozen=True)
 class Components:
-    """The joint posterior of the component maps: in K, of positive skies fields without unit.
+    """The joint posterior of the component maps, in K (for positive skies: unitless fields).
 
     Attributes
     ----------
     prior : SpectralPrior
     mean : (unknowns,) array
-        One map behind the other, then what channels share of the instrument.
+        The maps one after another, then the instrument's shared unknowns.
     spread : tuple of arrays
         Their covariance (:func:`.paired`).
     draws : (n, unknowns) array
     chi2 : float
-        Of all data under the model, prior included: chi^2 of N_data if it holds.
+        chi^2 of all data under the model, prior included: N_data degrees of freedom.
     log_evidence, information_bits : float
     refinement : float
-        Distance left, in standard deviations.
+        Last correction of the mean, in standard deviations.
     mode : PositiveMode or None
-        Of positive skies.
+        For positive skies.
     """
 
     prior: SpectralPrior
@@ -150,12 +150,12 @@ class Components:
 
     @property
     def solver(self) -> str:
-        """How the mean was found."""
+        """How the mean was computed."""
         return "direct" if self.mode is None else "Gauss-Newton rounds"
 
     @property
     def iterations(self) -> int:
-        """Rounds of positive skies."""
+        """Number of rounds for positive skies, else 0."""
         return 0 if self.mode is None else self.mode.rounds
 
 
@@ -166,21 +166,21 @@ class MapResult(Described):
     Attributes
     ----------
     scenario : Scenario
-        Of one frequency or of several, those that could not be mapped included.
+        With one or several frequencies, including those that could not be mapped.
     channels : tuple of ChannelResult
-        That could be mapped.
+        The mapped channels.
     joint : Components or None
-        The component maps that all channels share; None where each has a posterior of its own.
+        The component maps that all channels share; None if channels have separate posteriors.
     seconds : dict
         By stage.
     unmapped : dict
         Why the other channels could not be mapped, by frequency in MHz.
     reduced : Reduced or None
-        Of flight data: the spectra behind them.
+        The spectra behind flight data.
     tie_log_evidence : float
-        What it adds that channels share the instrument to the sum of the channels' ln evidence.
+        ln evidence that sharing the instrument adds to the sum over channels.
     shared_tests : tuple of SharedTest
-        Whether each channel agrees with the others about the instrument that they share.
+        Whether each channel agrees with the others about the shared instrument.
     """
 
     scenario: Scenario
@@ -211,27 +211,27 @@ class MapResult(Described):
 
     @property
     def channel(self) -> ChannelResult:
-        """The first channel: of a map of one frequency, the only one."""
+        """The first channel, which is the only one in a map of one frequency."""
         return self.channels[0]
 
     @property
     def frequencies_mhz(self) -> Float[np.ndarray, " channels"]:
-        """Of the channels that could be mapped."""
+        """Frequencies of the mapped channels."""
         return np.array([channel.frequency_mhz for channel in self.channels])
 
     def stacked(self, name: str) -> np.ndarray | None:
-        """An attribute of the channels, channels first; None where it is not known of all."""
+        """Stack an attribute of the channels, channels first; None if any channel lacks it."""
         values = [getattr(channel, name) for channel in self.channels]
         return None if any(v is None for v in values) else np.stack(values)
 
     def snr(self, *, independent: bool = False) -> Float[np.ndarray, "channels ells"] | None:
-        """SNR_ell of every channel, or of the means given its own data alone; None if unknown."""
+        """SNR_ell of every channel, or of its mean given its own data; None if unknown."""
         if self.stacked("truth") is None or (independent and self.stacked("independent") is None):
             return None
         return np.stack([c.snr(c.independent if independent else None) for c in self.channels])
 
     def fits(self) -> ChannelFits:
-        """chi^2 of every channel, and the tests of all of them together."""
+        """chi^2 of every channel, and the joint tests."""
         parts = [channel.instrument for channel in self.channels]
         chi2, degrees = (np.array([getattr(p, n) for p in parts]) for n in ("chi2", "degrees"))
         n_data = float(self.stacked("n_data").sum())
@@ -260,18 +260,18 @@ class MapResult(Described):
         return ChannelUnknowns(reports, self.scenario.shared) if reports else None
 
     def table(self, name: str, part: str = "") -> pd.DataFrame | None:
-        """A table of all channels, or a part of what they have by that name."""
+        """A table of all channels: an attribute of each, or a part of that attribute."""
         columns = {c.frequency_mhz: getattr(c, name) for c in self.channels}
         if part:
             columns = {f: held and getattr(held, part) for f, held in columns.items()}
         return below(columns)
 
     def verdict(self) -> str:
-        """What the residuals say, in sentences."""
+        """The verdict on the residuals, in sentences."""
         return self.fit.text
 
     def headline(self) -> str:
-        """The few figures that matter, in one line."""
+        """The main figures, in one line."""
         if self.single:
             return ", ".join(self.channel.figures())
         kind = "solved independently" if self.joint is None else "one posterior"
@@ -288,10 +288,10 @@ class MapResult(Described):
         return ", ".join(parts)
 
     def lines(self, *, verbose: bool = True) -> list[str]:
-        """What a terminal shows: remarks, and at the end the verdict and the main numbers.
+        """Lines for a terminal: remarks, then the verdict and the main numbers.
 
-        Details of the verdict, its causes, prior and unknowns come first, where it is bad or
-        ``verbose`` asks for them.
+        Details of the verdict, its causes, prior and unknowns come first, unless the verdict is
+        "consistent" and ``verbose`` is false.
         """
         details = self._details() if verbose or self.fit.level != "consistent" else []
         remarks = *self.doubts(), *self.gaps(), *self._flags()
@@ -311,7 +311,7 @@ class MapResult(Described):
         return [*lines, f"{RULE}."]
 
     def _flags(self) -> list[str]:
-        """How much of flight data was flagged, and what is doubtful about them."""
+        """The flagged share of flight data, and doubts about them."""
         reduced = self.reduced
         if reduced is None:
             return []
@@ -323,17 +323,17 @@ class MapResult(Described):
 
     @property
     def band(self) -> int:
-        """The number of the first channel's band among the reduced spectra."""
+        """Index of the first channel's band in the reduced spectra."""
         return 0 if self.reduced is None else self.reduced.band(self.channel.frequency_mhz)
 
     def doubts(self) -> list[str]:
-        """What is doubtful about the data, with the channel where there are several."""
+        """Doubts about the data, with the frequency if there are several channels."""
         if self.single:
             return list(self.channel.doubts)
         return [f"{c.frequency_mhz:g} MHz: {d}" for c in self.channels for d in c.doubts]
 
     def gaps(self) -> list[str]:
-        """Which channels could not be mapped, and why, a sentence each."""
+        """The channels that could not be mapped, and why, a sentence each."""
         return [f"Not mapped, {f:g} MHz: {reason}" for f, reason in self.unmapped.items()]
 
     @property
@@ -345,7 +345,7 @@ class MapResult(Described):
         return alone + self.tie_log_evidence
 
     def landmarks(self) -> dict[str, dict[str, np.ndarray]]:
-        """Brightness, its standard deviation and, if known, the truth of some directions."""
+        """Brightness, its standard deviation and, if known, its truth in some directions."""
         nside = self.scenario.map_nside
         mean, pixel_std, truth = (self.stacked(n) for n in ("mean", "pixel_std", "truth"))
         values = {}
@@ -409,10 +409,10 @@ class MapResult(Described):
         return table
 
     def maps(self) -> dict[str, Float[np.ndarray, "channels pixels"]]:
-        """Cubes by name, in K: mean, std and, where the truth is known, truth and residual."""
+        """Cubes by name, in K: mean, std and, if the truth is known, truth and residual."""
         parts = [channel.maps() for channel in self.channels]
         return {name: np.stack([part[name] for part in parts]) for name in parts[0]}
 
 
-# channels whose verdicts are in that of the run
+# number of channels whose verdicts the run's verdict includes
 NAMED = 4

@@ -1,7 +1,7 @@
-"""One data set under several priors: which of them it prefers, and what each says of it.
+"""One data set under several priors: which one the data prefer, and how well each fits.
 
-Evidence judges all data at once. Groups that are left out judge what the others predict of them,
-with the prior that was learned from all. Where the sky is known, so is how often error bars hold.
+Evidence judges all data at once. Held-out groups test the predictions of the other data, with the
+prior learned from all. If the sky is known, so is how often error bars cover it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lusee_bayes.judge.residuals import HeldOut
 from lusee_bayes.judge.split import Split
 from lusee_bayes.results.channel import ChannelResult, SkyErrors
 
-# a difference of two evidences of which each is good to one or two
+# a clear difference of two ln evidences, each of which is accurate to one or two
 CLEAR = 3.0
 HELD_OUT = (
     "Left out: each product, or each day, is predicted from all other data with the prior learned "
@@ -36,16 +36,16 @@ class UnderPrior:
     ----------
     name : str
     words : str
-        The prior's model, where its C_ell comes from and its parameters.
+        The prior's model, the source of its C_ell, and its parameters.
     channel : ChannelResult
     log_evidence : float
         ln p(d), with the sky and the prior's parameters, if it has any, integrated out (Laplace).
     n_parameters : int
-        That were learned.
+        Number of learned parameters.
     held_out : tuple of HeldOut
-        Empty where groups are not judged.
+        Empty if groups are not judged.
     split : Split
-        chi^2 of what no sky explains, and of what the prior does not expect.
+        The parts of chi^2 that test instrument and noise, and the prior.
     """
 
     name: str
@@ -57,7 +57,7 @@ class UnderPrior:
     split: Split
 
     def summary(self) -> PriorSummary:
-        """Its entry of priors.json."""
+        """The prior's entry in priors.json."""
         channel, has_truth = self.channel, self.channel.truth is not None
         return PriorSummary(
             name=self.name,
@@ -76,8 +76,8 @@ class UnderPrior:
 class PriorSummary(BaseModel):
     """The data under a prior, in priors.json.
 
-    ``instrument`` and ``rest`` are chi^2 of what no sky explains and of what the prior does not
-    expect; ``coverage``, ``errors`` and ``snr`` (by multipole) are there where the sky is known.
+    ``instrument`` and ``rest`` are the parts of chi^2 that test instrument and noise, and the
+    prior. ``coverage``, ``errors`` and ``snr`` (by multipole) are empty unless the sky is known.
     """
 
     name: str
@@ -92,13 +92,13 @@ class PriorSummary(BaseModel):
     snr: dict[int, float]
 
     def tells(self) -> tuple[object, ...]:
-        """What of it differs from run to run: kinds of groups, parts of the sky, multipoles."""
+        """Entries that differ from run to run: kinds of groups, parts of the sky, multipoles."""
         kinds, parts = ([held.kind for held in self.held_out], [c.name for c in self.coverage])
         return kinds, parts, [error.name for error in self.errors], list(self.snr)
 
 
 class PriorsSummary(BaseModel):
-    """priors.json."""
+    """Contents of priors.json."""
 
     verdict: str
     notes: list[str]
@@ -124,7 +124,7 @@ class PriorComparison:
     Attributes
     ----------
     name : str
-        Of the scenario.
+        Name of the scenario.
     scenario : Scenario
     priors : tuple of UnderPrior
         Two or more.
@@ -139,7 +139,7 @@ class PriorComparison:
 
     @property
     def best(self) -> UnderPrior:
-        """The prior of the highest evidence."""
+        """The prior with the highest evidence."""
         return max(self.priors, key=lambda one: one.log_evidence)
 
     @property
@@ -158,7 +158,7 @@ class PriorComparison:
         return f"The data prefer {first.name}: its ln evidence is {margin:.1f} above {second.name}"
 
     def lines(self) -> list[str]:
-        """What a terminal shows below the table."""
+        """Lines for a terminal, below the table."""
         sentences = [f"{self.headline()}."]
         for k, kind in enumerate(held.kind for held in self.best.held_out):
             best = max(self.priors, key=lambda one, k=k: one.held_out[k].log_density)
@@ -171,11 +171,11 @@ class PriorComparison:
         return prior_table([one.summary() for one in self.priors])
 
     def rows(self) -> list[dict[str, object]]:
-        """Rows of priors.csv, one for each prior; empty where something is not known."""
+        """Rows of priors.csv, one for each prior."""
         return [_row(one.summary(), self.best.log_evidence) for one in self.priors]
 
     def summary(self) -> PriorsSummary:
-        """priors.json."""
+        """Contents of priors.json."""
         return PriorsSummary(
             verdict=f"{self.headline()}.",
             notes=self.lines()[1:],

@@ -1,6 +1,6 @@
-"""A sampled scenario: draws that survive a kill, what they say of the sky, and their validation.
+"""A sampled scenario: its draws, statistics of the sky, and their validation.
 
-A validation compares HMC and simulated data sets with the analytic posterior: it has checks, and a
+A validation compares HMC and simulated data sets with the analytic posterior. It has checks, and a
 verdict.
 """
 
@@ -30,7 +30,7 @@ SAMPLES, CHAINS = "samples.nc", "chains"
 
 @dataclass(frozen=True)
 class SampleResult:
-    """Draws of a program given an experiment's data, with the analytic posterior beside them.
+    """Draws of a program given an experiment's data, together with the analytic posterior.
 
     Attributes
     ----------
@@ -38,11 +38,11 @@ class SampleResult:
     inference : Inference
         The linear model with every systematic in N, and its posterior.
     tree : xarray.DataTree
-        The draws, as ArviZ has them.
+        The draws, in ArviZ's groups.
     seconds : dict
         By stage.
     steps_per_second : float or None
-        Of all chains together while drawing; None if too little was drawn in this session to tell.
+        All chains together while drawing; None if this session drew too little to measure it.
     """
 
     experiment: Experiment
@@ -57,7 +57,7 @@ class SampleResult:
         return self.tree["posterior"][SKY].values
 
     def quantities(self) -> dict[str, np.ndarray]:
-        """Draws (chains, draws) of the other sites, landmarks, powers and lowest modes."""
+        """Draws (chains, draws) of scalar sites, landmarks, powers and lowest modes."""
         lmax = self.experiment.scenario.lmax
         sites = self.tree["posterior"].data_vars.items()
         others = {name: x.values for name, x in sites if name != SKY and x.ndim == 2}
@@ -72,7 +72,7 @@ class SampleResult:
 
     @cached_property
     def maps(self) -> dict[str, np.ndarray]:
-        """Mean, standard deviation and the ends of the 90 % interval of every pixel, in K."""
+        """Mean, standard deviation and 90 % interval of every pixel, in K."""
         return mode.pixel_statistics(self.skies, self.experiment.scenario.map_nside)
 
     @cached_property
@@ -82,7 +82,7 @@ class SampleResult:
         return highest_altitude(observation, scenario.map_nside)
 
     def headline(self) -> str:
-        """The few figures that matter, in one line."""
+        """The main figures, in one line."""
         table, figures = self.summary, self.figures()
         parts = [
             f"{figures.chains} x {figures.draws} draws of {figures.program}",
@@ -95,7 +95,7 @@ class SampleResult:
         return ", ".join(parts)
 
     def lines(self) -> list[str]:
-        """What a terminal shows."""
+        """Lines for a terminal."""
         table = self.summary.rename_axis("quantity").reset_index()
         figures = self.figures()
         columns = {name: table[name].to_numpy() for name in table}
@@ -103,7 +103,7 @@ class SampleResult:
         return [self.headline(), *reasons, *self.experiment.doubts]
 
     def figures(self) -> SamplingSummary:
-        """What sampling.json tells: sizes, speeds, times, memory, versions."""
+        """Contents of sampling.json: sizes, speeds, times, memory, versions."""
         stats = self.tree["sample_stats"]
         chains, draws = self.skies.shape[:2]
         return SamplingSummary(
@@ -120,22 +120,22 @@ class SampleResult:
         )
 
 
-# what a comparison has mode by mode
+# statistics that a comparison has for each mode
 OF_MODES = ("mean_z", "variance_ratio", "variance_error", "eigenvalues", "null_eigenvalues")
 OF_MODES += ("ess_bulk", "ess_tail")
 
 
 @dataclass(frozen=True)
 class ValidationResult:
-    """A sampled run judged against the analytic posterior.
+    """A sampled run compared with the analytic posterior.
 
     Attributes
     ----------
     name : str
-        Of the scenario.
+        Name of the scenario.
     sampled : SampleResult
     comparison : Comparison
-        Draws against mean, variances and covariance.
+        Draws compared with mean, variances and covariance.
     ranks : Ranks
         Simulation-based calibration.
     """
@@ -147,7 +147,7 @@ class ValidationResult:
 
     @property
     def checks(self) -> list[Check]:
-        """All of them, calibration last."""
+        """All checks, calibration last."""
         n, least = len(self.ranks.names), float(self.ranks.p_values().min())
         n_simulations, limit = self.ranks.n_simulations, self.ranks.threshold
         meaning = f"smallest p-value of {n} rank histograms over {n_simulations} simulations"
@@ -165,7 +165,7 @@ class ValidationResult:
         return f"{verdict}: {sum(c.passed for c in checks)} of {len(checks)} checks pass"
 
     def summary(self) -> ValidationSummary:
-        """validation.json."""
+        """Contents of validation.json."""
         ranks = self.ranks
         levels = ranks.coverage().items()
         return ValidationSummary(
@@ -178,7 +178,7 @@ class ValidationResult:
 
     @staticmethod
     def allowed(check: Check) -> str:
-        """The interval of a check in words."""
+        """The interval that a check allows, in words."""
         if check.lower == check.upper:
             return f"{check.upper:g}"
         if not np.isfinite(check.upper):

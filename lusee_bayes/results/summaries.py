@@ -1,4 +1,4 @@
-"""What the JSON files in the folders of runs hold: written by runs, read back by pages."""
+"""Contents of the JSON files in run folders: written by runs, read back by pages."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lusee_bayes.judge.cube_fit import JointTest, SharedTest
 
 
 class JudgedSummary(BaseModel, from_attributes=True):
-    """How the data of a channel fit, in summary.json."""
+    """How well the data of a channel fit, in summary.json."""
 
     level: Level
     verdict: str
@@ -24,7 +24,7 @@ class JudgedSummary(BaseModel, from_attributes=True):
 
 
 class ChannelSummary(BaseModel, from_attributes=True):
-    """Figures of a channel in summary.json; null where they are not known."""
+    """Figures of a channel in summary.json; null where unknown."""
 
     frequency_mhz: float
     instrument: ChiSquare
@@ -83,7 +83,7 @@ class PullSummary(BaseModel):
 
 
 class MapSummary(BaseModel):
-    """summary.json of a map run."""
+    """Contents of summary.json of a map run."""
 
     frequencies_mhz: list[float]
     unmapped: list[str]
@@ -106,7 +106,7 @@ class MapSummary(BaseModel):
 
 
 class SamplingSummary(BaseModel):
-    """sampling.json of a sampled run."""
+    """Contents of sampling.json of a sampled run."""
 
     program: str
     chains: int
@@ -134,7 +134,7 @@ class CheckSummary(BaseModel, from_attributes=True):
 
 
 class ValidationSummary(BaseModel):
-    """validation.json: every check, and mode by mode what there is."""
+    """Contents of validation.json: every check, and the statistics of each mode."""
 
     passed: bool
     checks: list[CheckSummary]

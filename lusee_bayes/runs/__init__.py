@@ -1,1 +1,1 @@
-"""One function for each command: it computes, and writes its folder whole or not at all."""
+"""One function for each command: it computes, and writes its folder completely or not at all."""

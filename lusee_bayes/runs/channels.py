@@ -1,33 +1,33 @@
-"""The channels of a cube, each by itself, tied, or in one posterior; a stopped run goes on.
+"""The channels of a cube: independent, tied, or in one posterior; a stopped run can be resumed.
 
-Channels are worked out alone, and then all together where a joint posterior of component maps, or
-positive skies, are asked for, from the information of every channel.
+Channels are solved independently. A joint posterior of component maps, or of positive skies, is
+then computed from the information in all channels.
 
-Channels share the instrument. What an unknown is off by, z(f) in prior standard deviations, is a
+Channels share the instrument. The error of an unknown, z(f) in prior standard deviations, is a
 Gaussian process over frequency, independent of other unknowns, ::
 
-    K(f, f') = exp(-(log2 f - log2 f')^2 / (2 octaves^2)),
+    K(f, f') = exp(-(log2 f - log2 f')^2 / (2 octaves^2)).
 
-of the octaves that its systematic says (:meth:`.Systematic.octaves`): those of smooth spectra of
-receivers, infinitely many for antennas, clock, pointing and horizon, which have one value, none for
-gains, ground and whatever else is each channel's own. A channel alone has z ~ N(0, 1), as the
-diagonal says. Its posterior of sky m and z, with means E and covariance V of z, becomes that given
-all data (:mod:`.amplitudes`) by ::
+Its systematic sets ``octaves`` (:meth:`.Systematic.octaves`): finite for receivers, which have
+smooth spectra; infinite for antennas, clock, pointing and horizon, which have one value; zero for
+gains, ground and all else that differs by channel. The diagonal of K gives z ~ N(0, 1) for a
+channel alone. Its posterior of sky m and z, with mean E and covariance V of z, is updated with
+all data (:mod:`.amplitudes`) to ::
 
     mean of m + G (E' - E),    covariance of m + G (V' - V) G^T,    G = Cov(m, z) V^-1,
 
-since m depends on other channels through z alone, and so does all else that is not known. Unknowns
-are tied by name; a channel without one tells nothing of it. Each channel is to first order about
-what its own data tell. The tied values are within about one of its own widths of that, where the
-first order holds as well as for the channel alone.
+because m, like all other unknowns, depends on other channels only through z. Unknowns are tied by
+name; a channel that lacks one does not constrain it. Each channel is linearised about the values
+from its own data. Tied values differ from these by at most about one of its standard deviations, so
+the linearisation is as accurate as for the channel alone.
 
-In a joint posterior z = R w of all channels, w ~ N(0, 1), is unknown beside the component maps, and
-each channel's data constrain both together (:mod:`.joint`).
+In a joint posterior, z = R w of all channels, w ~ N(0, 1), is unknown in addition to the component
+maps, and each channel's data constrain both together (:mod:`.joint`).
 
-Unfinished work is kept in files: ``DIR/channels/25.information.nc`` holds what its data say,
-``25.alone.nc`` its posterior given its own data, ``25.result.nc`` that given all. So memory stays
-bounded, and an interrupted run goes on where it was. Files of other scenarios or data are made
-anew. A joint posterior adds up what the files of all channels say.
+Files store unfinished work: ``DIR/channels/25.information.nc`` the information in a channel's data,
+``25.alone.nc`` its posterior given its own data, ``25.result.nc`` its posterior given all data. So
+memory stays bounded, and an interrupted run can be resumed. Files of other scenarios or data are
+replaced. A joint posterior sums the information in the files of all channels.
 """
 
 from __future__ import annotations
@@ -79,11 +79,11 @@ class ChannelFiles:
     Parameters
     ----------
     folder : Path
-        Of the run.
+        Folder of the run.
     identity : str
-        Of the run (:func:`identity_of`), whose files alone are taken up again.
+        Identity of the run (:func:`identity_of`); files with another one are not used.
     again : set of float
-        Frequencies of channels that have been looked at twice: what counts is the second.
+        Frequencies of channels that were solved twice: the second solution is used.
     """
 
     def __init__(self, folder: Path, identity: str, again: frozenset[float] = frozenset()):
@@ -91,14 +91,14 @@ class ChannelFiles:
         self.identity, self.again = identity, again
 
     def path(self, channel: Scenario, kind: type) -> Path:
-        """Of what is kept of a channel, a dataclass such as :class:`ChannelInformation`."""
+        """File of a channel's stored dataclass, such as :class:`ChannelInformation`."""
         name = kind.__name__.removeprefix("Channel").lower()
         if kind is not ChannelResult and channel.frequency_mhz in self.again:
             name += ".again"
         return self.folder / f"{channel.frequency_mhz:.15g}.{name}.nc"
 
     def kept(self, channel: Scenario, kind: type[T], make: Callable[[], T]) -> T:
-        """What is there, whole and of this run; else what is made now, and written."""
+        """Read the file if it is complete and of this run; otherwise make and write it."""
         path = self.path(channel, kind)
         if says(path, {"identity": self.identity}):
             return self.read(channel, kind)
@@ -107,7 +107,7 @@ class ChannelFiles:
         return made
 
     def read(self, channel: Scenario, kind: type[T]) -> T:
-        """Read what is kept."""
+        """Read a stored dataclass."""
         path = self.path(channel, kind)
         with h5py.File(path) as file:
             return from_tree(kind, StoredTree(file), str(path))
@@ -115,7 +115,7 @@ class ChannelFiles:
     def information(
         self, channel: Scenario, number: int = 0, tied: Tied | None = None
     ) -> Information:
-        """Of a :class:`ChannelInformation` this part alone, of what is tied, too."""
+        """Read only the information of a :class:`ChannelInformation`, with tied unknowns if any."""
         path = self.path(channel, ChannelInformation)
         with h5py.File(path) as file:
             tree = StoredTree(file)
@@ -127,12 +127,12 @@ class ChannelFiles:
 
 
 def identity_of(scenario: Scenario, data: Data | None, *others: object) -> str:
-    """Of all that the results of a run depend on: scenario, data, others, and the package.
+    """Digest of everything that determines a run's results: scenario, data, others, and version.
 
     Raises
     ------
     InputError
-        If there are no data at the path.
+        If a data file does not exist.
     """
     parts = [scenario.to_yaml(), *map(str, others), __version__]
     if data is not None:
@@ -142,7 +142,7 @@ def identity_of(scenario: Scenario, data: Data | None, *others: object) -> str:
 
 @dataclass(frozen=True)
 class ChannelInformation:
-    """What a channel's data say, with what it takes to make a posterior of it and to judge it.
+    """The information in a channel's data, with everything needed for its posterior and tests.
 
     Attributes
     ----------
@@ -153,7 +153,7 @@ class ChannelInformation:
     sky : (modes,) array
         The scenario's model sky, in K.
     share : Share or None
-        What it has of the instrument that channels share.
+        Its constraints on the shared instrument.
     """
 
     information: Information
@@ -164,14 +164,14 @@ class ChannelInformation:
 
     @classmethod
     def of(cls, made: Conditioned, data: ChannelData) -> ChannelInformation:
-        """Of all data of a channel, earlier ones included."""
+        """Make it from all data of a channel, earlier data included."""
         sky, share = np.asarray(made.experiment.setup.sky.modes), None
         if made.unknowns is not None and made.unknowns.shared.size:
             share = Share.of(made.unknowns, made.posterior.mean, made.covariance, 0, made.from_data)
         return cls(made.information, made.of_all(data), made.unknowns, sky, share)
 
     def seen(self) -> Seen:
-        """What the prior of all channels takes, too: the reference sky, and the model's."""
+        """Inputs for the joint posterior: share, reference sky and model sky."""
         return Seen(self.share, np.asarray(self.information.reference), self.sky)
 
     def given(
@@ -182,11 +182,11 @@ class ChannelInformation:
         Parameters
         ----------
         number : int
-            Of the channel among those of the components.
+            Index of the channel in the joint posterior.
         scenario : Scenario
-            Of all channels.
+            The scenario of all channels.
         tied : Tied or None
-            The prior of what is shared.
+            The prior of the shared unknowns.
         components : Components
         """
         information, unknowns, data = self.information, self.unknowns, self.known
@@ -221,25 +221,25 @@ class ChannelInformation:
         )
 
 
-# channels that one task adds up, one after the other
+# number of channels that one task sums, one after the other
 BLOCK = 8
 
 
 @dataclass(frozen=True)
 class ChannelsInFiles:
-    """Channels whose information is read from files, by whatever carries out the tasks.
+    """Channels whose information tasks read from files, wherever they run.
 
     Attributes
     ----------
     channels : tuple of Scenario
-        Of the whole run.
+        All channels of the joint posterior.
     files : ChannelFiles
         With the information of every channel.
     engine : Engine
     stages : Stages
-        Told what is being done.
+        Reports progress.
     tied : Tied or None
-        The prior of what channels share, which is then an unknown, too.
+        The prior of the shared unknowns, which are then unknowns of the joint posterior, too.
     """
 
     channels: tuple[Scenario, ...]
@@ -253,7 +253,7 @@ class ChannelsInFiles:
         function: Callable[[int, Information], dict[str, np.ndarray]],
         shapes: dict[str, tuple[int, ...]],
     ) -> dict[str, np.ndarray]:
-        """Call a function with number and information of every channel; its arrays, stacked."""
+        """Call a function with number and information of every channel, and stack its arrays."""
         files, channels, tied = self.files, self.channels, self.tied
 
         def call(number: int) -> dict[str, np.ndarray]:
@@ -269,7 +269,7 @@ class ChannelsInFiles:
         reference: Float[np.ndarray, "channels modes"],
         function: Callable[[int, Information], Information],
     ) -> Information:
-        """What a function of every channel's information says of the component maps."""
+        """Apply a function to every channel's information, and sum it for the component maps."""
         files, channels, tied = self.files, self.channels, self.tied
 
         def add(numbers: range) -> joint.ComponentSums:
@@ -279,7 +279,7 @@ class ChannelsInFiles:
                 sums = joint.summed_information(sums, prior, number, relative)
             return sums
 
-        # the same blocks, and the same tree of them, whatever carries out the tasks
+        # the same blocks and the same summation tree, wherever tasks run
         blocks = [
             range(first, min(first + BLOCK, len(channels)))
             for first in range(0, len(channels), BLOCK)
@@ -291,7 +291,7 @@ class ChannelsInFiles:
 
 
 def names_of(channels: tuple[Scenario, ...]) -> str:
-    """What one channel, or neighbouring ones, are called: 25 MHz, or 25 to 28 MHz."""
+    """Name of one channel, or of neighbouring ones: 25 MHz, or 25 to 28 MHz."""
     first, last = (f"{c.frequency_mhz:g}" for c in (channels[0], channels[-1]))
     return f"{first} MHz" if len(channels) == 1 else f"{first} to {last} MHz"
 
@@ -299,22 +299,22 @@ def names_of(channels: tuple[Scenario, ...]) -> str:
 def solve_components(
     scenario: Scenario, channels: ChannelsInFiles, seen: Sequence[Seen], n_draws: int
 ) -> Components:
-    """Work out the joint posterior of all channels.
+    """Compute the joint posterior of all channels.
 
     Parameters
     ----------
     scenario : Scenario
-        Of the channels.
+        The scenario of the channels.
     channels : ChannelsInFiles
     seen : sequence of Seen
-        Of each.
+        One for each channel.
     n_draws : int
-        Draws of the component maps.
+        Number of draws of the component maps.
 
     Raises
     ------
     InputError
-        If data are too precise to be solved for, or positive skies do not settle.
+        If data are too precise for a solution, or positive skies do not converge.
     """
     spectral, stages, frequencies = scenario.spectral, channels.stages, scenario.frequencies_mhz
     tied, mode = channels.tied, None
@@ -353,15 +353,15 @@ def solve_components(
         )
 
 
-# what the key of draws is folded with: numbers of channels are smaller
+# folded into the random key of the draws; channel numbers are smaller
 TIED = 1 << 20
 
 
 @dataclass(frozen=True)
 class Share:
-    """What channels that share unknowns need of a channel.
+    """Constraints from one channel on shared unknowns, for the other channels.
 
-    octaves : of what is shared, by name; mean, covariance : its E and V; n_draws : of the sky;
+    octaves : of each shared unknown, by name; mean, covariance : its E and V; n_draws : of the sky;
     priors : mean and standard deviation of each unknown, by name; fits : whether its data fit;
     log_evidence : of its own data
     """
@@ -378,7 +378,7 @@ class Share:
     def of(
         cls, unknowns: Unknowns, mean: Vector, covariance: Square, n_draws: int, inferred: Inference
     ) -> Share:
-        """Of a channel's unknowns under its own posterior of the sky, in K and K^2."""
+        """Make it from a channel's unknowns and its own posterior of the sky, in K and K^2."""
         posterior, shared = unknowns.amplitudes.integrated(mean, covariance), unknowns.shared
         octaves = dict(zip(unknowns.shared_names, unknowns.octaves[shared].tolist(), strict=True))
         priors = {row["unknown"]: (row["prior"], row["prior_std"]) for row in unknowns.rows}
@@ -388,7 +388,7 @@ class Share:
 
 
 class Seen(NamedTuple):
-    """What is needed of a channel to solve for all: its share, of joint skies what these take."""
+    """Inputs from one channel for all: its share and, for joint skies, reference and model sky."""
 
     share: Share | None
     reference: SkyModes | None = None
@@ -397,26 +397,25 @@ class Seen(NamedTuple):
 
 @dataclass(frozen=True)
 class ChannelAlone:
-    """A channel's posterior given its own data, as it is kept until all channels are known.
+    """A channel's posterior given its own data, stored until all channels are done.
 
     Attributes
     ----------
     known : ChannelData
     information : Information
-        Of its own data, without earlier ones.
+        Information in its own data, without earlier data.
     unknowns : Unknowns
-        Of the instrument, given the sky.
+        Unknowns of the instrument, given the sky.
     mean, covariance : (modes,) and (modes, modes) array
         In K and K^2.
     deviations : (all, modes) array
-        Draws less the mean, those that are kept first, then those that coverage is compared with,
-        in K.
+        Draws minus the mean, in K: first the ``n_draws`` of the result, then those for coverage.
     n_draws : int
-        That are kept.
+        Number of draws in the result.
     figures : dict
         :meth:`.Conditioned.figures`.
     share : Share
-        What it has of the instrument that channels share.
+        Its constraints on the shared instrument.
     """
 
     known: ChannelData
@@ -431,7 +430,7 @@ class ChannelAlone:
 
     @classmethod
     def of(cls, made: Conditioned, data: ChannelData) -> ChannelAlone:
-        """The posterior is given earlier data, too; what is judged are its own."""
+        """Make it from a channel: its posterior includes earlier data, its tests do not."""
         mean, compared = made.posterior.mean, made.compared()
         deviations = made.draws - mean
         if compared is not None:
@@ -441,7 +440,7 @@ class ChannelAlone:
         return cls(data, made.from_data.solution.information, made.unknowns, mean, *kept)
 
     def seen(self) -> Seen:
-        """What the others need of it."""
+        """Inputs for the other channels."""
         return Seen(self.share)
 
     def given(self, number: int, scenario: Scenario, tied: Tied) -> ChannelResult:
@@ -450,11 +449,11 @@ class ChannelAlone:
         Parameters
         ----------
         number : int
-            Of the channel among those that are tied.
+            Index of the channel among the tied channels.
         scenario : Scenario
-            Of the channel.
+            The channel's scenario.
         tied : Tied
-            E', V' and draws of what is shared.
+            E', V' and draws of the shared unknowns.
         """
         shared, at = self.unknowns.shared, self.unknowns.among(tied)
         posterior = self.unknowns.amplitudes.integrated(self.mean, self.covariance)
@@ -466,7 +465,7 @@ class ChannelAlone:
         gain = np.linalg.solve(v, posterior.with_sky[:, shared].T).T
         moved = self.mean + gain @ (mean - e)
         left = self.covariance + gain @ (covariance - v) @ gain.T
-        # values that go with the channel's own draws, less their mean
+        # amplitudes that match the channel's own draws, minus their mean
         amplitudes = self.unknowns.amplitudes
         inner = amplitudes.covariance[np.ix_(shared, shared)]
         normals = np.asarray(jax.random.normal(key, (len(self.deviations), len(shared))))
@@ -474,7 +473,7 @@ class ChannelAlone:
         normals = (normals * np.sqrt(np.maximum(variances, 0.0))) @ axes.T
         with_them = normals - self.deviations @ amplitudes.pull[shared].T
         deviations = self.deviations + (draws - mean - with_them) @ gain.T
-        # what the other channels tell of this one's unknowns
+        # constraints from the other channels on this one's unknowns
         n = len(amplitudes.mean)
         precision, vector, expansion = np.zeros((n, n)), np.zeros(n), np.zeros(n)
         precision[np.ix_(shared, shared)], vector[shared] = from_others(e, v, mean, covariance)
@@ -501,18 +500,18 @@ class ChannelAlone:
 def tie_channels(
     scenario: Scenario, frequencies_mhz: Sequence[float], shared: Sequence[Share]
 ) -> tuple[Tied, tuple[SharedTest, ...]]:
-    """What channels share given the data of all of them, and whether each agrees with the others.
+    """Tie shared unknowns given all data, and test whether each channel agrees with the others.
 
-    One that does not is tied to none.
+    A channel that disagrees is not tied to any other.
 
     Parameters
     ----------
     scenario : Scenario
-        Of all channels.
+        The scenario of all channels.
     frequencies_mhz : sequence of float
-        Of those that could be mapped.
+        Frequencies of the mapped channels.
     shared : sequence of Share
-        Of these.
+        One for each of these.
 
     Raises
     ------
@@ -521,7 +520,7 @@ def tie_channels(
     """
     octaves = {name: over for one in shared for name, over in one.octaves.items()}
     names, n_channels = tuple(octaves), len(shared)
-    # data that tell nothing of what they do not have
+    # channels do not constrain unknowns that they lack
     mean = np.zeros((n_channels, len(names)))
     covariance = np.tile(np.eye(len(names)), (n_channels, 1, 1))
     for number, one in enumerate(shared):
@@ -541,7 +540,7 @@ def tie_channels(
 def from_fitting(
     scenario: Scenario, frequencies_mhz: Sequence[float], shared: Sequence[Share]
 ) -> dict[str, float]:
-    """Values of what all channels have in common, by name, given the data of those that fit."""
+    """Values, by name, of the unknowns common to all channels, given those that fit."""
     fitting = [(f, one) for f, one in zip(frequencies_mhz, shared, strict=True) if one.fits]
     tied, _ = tie_channels(scenario, *zip(*fitting, strict=True))
     common = [n for n, over in fitting[0][1].octaves.items() if np.isinf(over)]
@@ -561,41 +560,41 @@ def map_channels(
     engine: Engine | None = None,
     stages: Stages | None = None,
 ) -> MapResult:
-    """Work out all channels, going on from what an interrupted run has left in ``folder``.
+    """Map all channels, continuing an interrupted run in ``folder``.
 
-    Where channels share unknowns, each is worked out alone, from the instrument that the first one
-    finds, and then given what the others tell of its instrument. One whose data do not fit is
-    worked out again, from the instrument of those that do, and the likelier of both counts. A
-    channel that cannot be mapped leaves the others as they are: it is named in the result, and a
-    joint posterior is that of the others. Of a single frequency nothing unfinished is kept.
+    If channels share unknowns, each is first solved independently, starting from the instrument of
+    the first one, and then updated with the constraints from the others. A channel whose data do
+    not fit is solved again, starting from the instrument of those that fit; the solution with the
+    higher evidence is used. A channel that cannot be mapped does not affect the others: the result
+    names it, and a joint posterior excludes it. A single frequency leaves no unfinished work.
 
     Parameters
     ----------
     scenario : Scenario
-        Of one frequency or of several.
+        With one or several frequencies.
     folder : Path
-        Of the run; unfinished work is kept in it.
+        Folder of the run, including unfinished work.
     data : Visibilities, path, or sequence of them, optional
-        Measured; without them the scenario's own are simulated.
+        Measured data; if omitted, data are simulated from the scenario.
     truth : bool
-        The data are of the scenario's own sky.
+        The data were simulated from this scenario's sky.
     earlier : path, optional
-        Folder of a run that has kept its information, to whose data these are added.
+        Folder of a run with saved information, to be combined with these data.
     thorough : bool
-        Judge groups of data and try the usual mistakes even if the data fit.
+        Test groups of data and try the usual mistakes even if the data fit.
     engine : Engine, optional
-        What carries out the channels; by default this process.
+        Where channels are computed; by default in this process.
     stages : Stages, optional
-        Told what is being done.
+        Reports progress.
 
     Raises
     ------
     InputError
-        If no channel can be mapped, if too few of them can for a joint posterior, or as
+        If no channel can be mapped, if a joint posterior has too few channels, or as
         :func:`.conditioned`.
     """
     engine, stages, single = engine or ThisProcess(), stages or Stages(), scenario.single
-    # workers may have other folders of their own
+    # workers may have another working directory
     data = None if data is None else anchored(data)
     kept = None if earlier is None else information_file(earlier)
 
@@ -621,7 +620,7 @@ def map_channels(
     begin: dict[str, float] | None = None
 
     def observe(channel: Scenario) -> Seen | str:
-        """Look at the data of a channel: what the others need of it, or why it cannot be mapped."""
+        """Solve a channel; return the inputs for the others, or why it cannot be mapped."""
 
         def make() -> ChannelResult | ChannelInformation | ChannelAlone:
             made = condition(channel, Stages(), begin)
@@ -637,7 +636,7 @@ def map_channels(
         return Seen(None) if alone else kept.seen()
 
     names, views = [names_of((channel,)) for channel in channels], []
-    if scenario.shared:  # the others begin with the instrument of the first
+    if scenario.shared:  # the others start from the instrument of the first
         views = engine.each(Tasks(observe, channels[:1], names[:1]), stages, "first channel")
         if isinstance(views[0], Seen) and views[0].share.fits:
             begin = from_fitting(scenario, [channels[0].frequency_mhz], [views[0].share]) or None
@@ -658,7 +657,7 @@ def map_channels(
             first, files = files, ChannelFiles(folder.resolve(), files.identity, again)
 
             def look_again(number: int) -> Seen:
-                """Look at the data of a channel from what the others tell of the instrument."""
+                """Solve a channel again, starting from the instrument of the others."""
                 channel = mapped[number]
 
                 def make() -> ChannelInformation | ChannelAlone:
@@ -676,12 +675,12 @@ def map_channels(
         tied, tests = tie_channels(scenario, frequencies, [one.share for one in seen])
     if scenario.joint:
         at_hand = ChannelsInFiles(mapped, files, engine, stages, tied)
-        # coverage is compared with draws
+        # coverage needs draws
         n_draws = max(scenario.output.draws, N_DRAWS if data is None or truth else 0)
         components = solve_components(_without(unmapped, scenario), at_hand, seen, n_draws)
 
     def finish(number: int) -> None:
-        """Write the result of a channel, given what all have in common."""
+        """Write the result of a channel, given the data of all channels."""
         channel = mapped[number]
         common = (channel, tied) if components is None else (scenario, tied, components)
 
@@ -707,7 +706,7 @@ def map_channels(
 
 
 def _without(unmapped: dict[float, str], scenario: Scenario) -> Scenario:
-    """A joint scenario of the channels that can be mapped. InputError if these are too few."""
+    """A joint scenario of the mapped channels. InputError if there are too few."""
     left = tuple(f for f in scenario.frequencies_mhz if f not in unmapped)
     try:
         scenario.spectral.require_channels(len(left))

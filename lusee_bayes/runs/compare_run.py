@@ -34,21 +34,21 @@ def run_compare(
     replace: bool = False,
     stages: Stages | None = None,
 ) -> RunOutcome[list[FinishedRun]]:
-    """Set finished map runs side by side, and write page, table and figures in one transaction.
+    """Compare finished map runs, and write page, table and figures in one transaction.
 
     Parameters
     ----------
     folders : sequence of paths
-        Of finished map runs, two or more.
+        Folders of two or more finished map runs.
     folder : path
-        Of the results.
+        Folder of the results.
     replace, stages : bool and Stages, optional
         As in :func:`.run_map`.
 
     Raises
     ------
     InputError
-        For fewer than two folders, or one that is not of a finished map run.
+        For fewer than two folders, or one that is not the folder of a finished map run.
     """
     with run_folder(folder, COMPARISON, None, None, *folders, replace=replace) as run:
         return run.write(read_runs(folders), stages or Stages())
@@ -58,7 +58,7 @@ def _write_page(runs: list[FinishedRun], folder: Path) -> None:
     (folder / "comparison.html").write_text(comparison_page(runs, folder), encoding="utf-8")
 
 
-# what the folder of a comparison holds; a new file is one line here
+# contents of the folder of a comparison; a new file is one line here
 COMPARISON = RunKind(
     "compare",
     outputs=(Output(_write_page), Output.rows("comparison.csv", comparison_rows)),
@@ -87,27 +87,27 @@ def run_compare_priors(
     Parameters
     ----------
     scenario : Scenario, or its file or name
-        Of one frequency.
+        With one frequency.
     folder : path
-        Of the results.
+        Folder of the results.
     priors : sequence of str, optional
-        Names (:func:`.named_priors`), two or more; by default all that can be.
+        Two or more names (:func:`.named_priors`); by default all possible ones.
     data : Visibilities, path, or sequence of them, optional
-        Visibilities to map; without them the scenario's own are simulated.
+        Visibilities to map; if omitted, data are simulated from the scenario.
     truth : bool
-        The given data are of the scenario's own sky.
+        The given data were simulated from this scenario's sky.
     name : str
-        Of the scenario, for the title.
+        Name of the scenario, for the title.
     engine : Engine, optional
-        What maps the data under each prior; by default this process, one after the other.
+        Where priors are computed; by default in this process, one after the other.
     replace, stages : bool and Stages, optional
         As in :func:`.run_map`.
 
     Raises
     ------
     InputError
-        As :func:`.named_priors`, for a scenario of several frequencies or one that samples
-        something, and as :func:`run_map`.
+        If the scenario has several frequencies or samples an unknown, and as
+        :func:`.named_priors` and :func:`run_map`.
     """
     scenario = load_scenario(scenario)
     scenario = scenario if data is None else scenario.of_measured()
@@ -133,7 +133,7 @@ def run_compare_priors(
 
 
 def _under(name: str, setup: Setup, experiment: Experiment, inferred: Inference) -> UnderPrior:
-    """Map the data under one prior, or a family of them, and leave out groups of them."""
+    """Map the data under one prior or a family of priors, and predict held-out groups."""
     information = inferred.solution.information
     if setup.family is None:
         learned, evidence = None, float(information.posterior(setup.prior).log_evidence)
@@ -151,7 +151,7 @@ def _under(name: str, setup: Setup, experiment: Experiment, inferred: Inference)
     return UnderPrior(name, channel.prior, channel, evidence, n_parameters, *judged)
 
 
-# what the folder of a comparison of priors holds; a new file is one line here
+# contents of the folder of a comparison of priors; a new file is one line here
 COMPARE_PRIORS = RunKind(
     "compare-priors",
     outputs=(

@@ -1,8 +1,8 @@
-"""What a run will take, known from its scenario alone: memory, and so much time.
+"""The memory and time that a run needs, estimated from its scenario alone.
 
-The largest arrays are those of the unknowns, 8 n^2 bytes each, of which a posterior with its
-diagnostics holds eight at its peak, and, where noise couples different times, N and A themselves.
-Factorisations of them take nearly all of the time.
+The largest arrays are those of the unknowns, 8 n^2 bytes each, and N and A themselves if noise
+couples different times. A posterior with its diagnostics needs eight arrays of the unknowns at its
+peak. Factorisations take nearly all of the time.
 """
 
 from __future__ import annotations
@@ -25,43 +25,43 @@ from lusee_bayes.experiment.rounds import first_order
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.visibilities import Visibilities
 
-# measured at lmax 12 to 80 and up to 3e5 data (docs/commands.md): what is there before anything is
-# computed, and what each datum takes from reading to the report
+# measured at lmax 12 to 80 and up to 3e5 data (docs/commands.md): memory before any computation,
+# and memory per datum from reading to the report
 BASE_BYTES, BYTES_A_DATUM = 0.75e9, 450
-# n x n arrays at the peak of a posterior, of one channel or of all together, and floating-point
-# operations in n^3
+# n x n arrays at the peak of a posterior, for one channel or for a joint posterior, and
+# floating-point operations in n^3
 SQUARES, JOINT_SQUARES, OPERATIONS = 8, 4, 12
-# of positive joint skies, those that learn the laws of their fields among them
+# rounds of positive joint skies, including those that learn the laws of their fields
 ROUNDS = 8
-# what learning a prior adds to them: about five steps with all modes
+# arrays and operations for learning a prior: about five steps with all modes
 LEARNING_SQUARES, LEARNING_OPERATIONS = 4, 80
-# what rounds that find an instrument add to operations, a datum and unknown, and arrays of data for
-# each error of the fields
+# rounds that infer an instrument: operations per datum and unknown, and arrays of data for each
+# error of the fields
 IN_ROUNDS, FIELD_ARRAYS = 3e5, 8
-# what comparing times of flight data adds, in n_data n^2
+# operations for comparing times of flight data, in n_data n^2
 COMPARING_OPERATIONS = 40
-# of the sky above lmax: arrays of data, and floating-point operations a datum and in n^3
+# the sky above lmax: arrays of data, and floating-point operations in n_data n^2 + n^3
 ABOVE_ARRAYS, ABOVE_OPERATIONS = 4, 12
-# pixels of every map of a report, and of what each is made of
+# arrays of pixels for the maps of a report, intermediate results included
 MAPS = 12
-# arrays of data for each source that is in the model
+# arrays of data for each source in the model
 SOURCE_ARRAYS = 3
-# seconds of everything that is not linear algebra: of a run, of each channel, of each datum
+# seconds of everything except linear algebra: per run, per channel, per datum
 OVERHEAD_S, CHANNEL_S, DATUM_S = 8.0, 0.8, 4e-5
 
 
 @dataclass(frozen=True)
 class Cost:
-    """What a run will take at its peak, about.
+    """Approximate resources of a run.
 
     Attributes
     ----------
     n_data, n_unknowns, n_channels : int
-        Data and unknowns of one channel.
+        Data and unknowns of one channel, and the number of channels.
     memory : float
-        Bytes.
+        Peak memory in bytes.
     operations : float
-        Of floating-point numbers, in all.
+        Total number of floating-point operations.
     """
 
     n_data: int
@@ -72,16 +72,16 @@ class Cost:
 
     @property
     def seconds(self) -> float:
-        """Wall-clock time on this machine, good to a factor of two or three."""
+        """Wall-clock time on this machine, within a factor of two or three."""
         each = CHANNEL_S + DATUM_S * self.n_data
         return OVERHEAD_S + self.n_channels * each + self.operations / _operations_a_second()
 
     def line(self) -> str:
-        """What a terminal shows."""
+        """Line for a terminal."""
         return f"{self.sizes()} and {duration(self.seconds)}"
 
     def sizes(self) -> str:
-        """The same without the time, which is another where chains are drawn."""
+        """:meth:`line` without the time, which does not include sampling."""
         channels = f"{self.n_channels} channels of " if self.n_channels > 1 else ""
         return (
             f"  {channels}{self.n_data:,} data, {self.n_unknowns:,} unknowns: about "
@@ -90,18 +90,18 @@ class Cost:
 
 
 def demand_of(*scenarios: Scenario, n_draws: int = 0) -> Demand:
-    """What independent posteriors take, or the channels of a scenario of several frequencies."""
+    """Resources for independent posteriors, or for the channels of a scenario."""
     alone = [one if one.single else one.channels()[0] for one in scenarios]
     task_bytes = max(posterior_cost(one, n_draws).memory for one in alone) - BASE_BYTES
     if scenarios[0].joint:
-        # sums over channels, of every pair of components, and another one that is added
+        # sums over channels for every pair of components, and a second set that is added to them
         count = scenarios[0].spectral.n_maps(scenarios[0].frequencies_mhz)
         task_bytes += 16.0 * (count * (count + 1) / 2) * (scenarios[0].lmax + 1) ** 4
     return Demand(BASE_BYTES, task_bytes)
 
 
 def duration(seconds: float) -> str:
-    """Format a time of which two digits at most are known: 20 s, 5 min, 3 h, 2 days."""
+    """Format a time with at most two significant digits: 20 s, 5 min, 3 h, 2 days."""
     for unit, length, limit in (("s", 1.0, 100.0), ("min", 60.0, 6000.0), ("h", 3600.0, 172800.0)):
         if seconds < limit:
             return f"{float(f'{seconds / length:.2g}'):g} {unit}"
@@ -110,7 +110,7 @@ def duration(seconds: float) -> str:
 
 @lru_cache(maxsize=1)
 def _operations_a_second() -> float:
-    """Of products of matrices on this machine."""
+    """Floating-point operations per second in matrix products on this machine."""
     matrix = np.ones((1024, 1024))
     matrix @ matrix
     start = time.perf_counter()
@@ -119,7 +119,7 @@ def _operations_a_second() -> float:
 
 
 def simulation_cost(scenario: Scenario, n_channels: int = 1) -> Cost:
-    """Work out what the visibilities of a scenario take."""
+    """Estimate the resources for simulating a scenario's visibilities."""
     n_data = 16 * scenario.observation.n_samples()
     n_modes = (scenario.lmax + 1) ** 2
     memory = BASE_BYTES + n_channels * n_data * BYTES_A_DATUM + 64.0 * n_modes
@@ -127,16 +127,16 @@ def simulation_cost(scenario: Scenario, n_channels: int = 1) -> Cost:
 
 
 def posterior_cost(scenario: Scenario, n_draws: int = 0, n_data: int | None = None) -> Cost:
-    """Work out what the posterior of a scenario takes, with its report.
+    """Estimate the resources for the posterior of a scenario, with its report.
 
     Parameters
     ----------
     scenario : Scenario
-        Of one frequency or of several.
+        With one or several frequencies.
     n_draws : int
-        Draws of the sky that are kept at once, besides those of the scenario's output.
+        Draws of the sky in memory, in addition to those of the scenario's output.
     n_data : int, optional
-        Of given data; without them, those of the scenario's observation.
+        Number of given data; by default that of the scenario's observation.
     """
     n_channels = max(1, len(scenario.frequencies_mhz))
     n_data = 16 * scenario.observation.n_samples() if n_data is None else n_data
@@ -166,11 +166,11 @@ def posterior_cost(scenario: Scenario, n_draws: int = 0, n_data: int | None = No
         operations += ABOVE_OPERATIONS * n_channels * (n_data * n_above**2 + n_above**3)
     if scenario.flight is not None and scenario.flight.leave_out:
         operations += n_channels * COMPARING_OPERATIONS * float(n_data) * float(n_modes) ** 2
-        # without room for it they are not compared
+        # times are not compared if memory is too small
         squares += min(ARRAYS * float(n_data) * n_modes, MOST_MEMORY * memory_limit() / 8.0)
     gain = scenario.noise.gain
     if gain is not None and gain.treatment == "marginalised":
-        # N couples all times, and A is formed
+        # N couples all times, so A is formed
         squares += 3.0 * n_data**2 + 3.0 * n_data * n_modes
         operations += n_channels * (float(n_data) ** 3 + 2.0 * n_data * float(n_modes) ** 2)
     if scenario.sources.treatment != "ignored":
@@ -179,7 +179,7 @@ def posterior_cost(scenario: Scenario, n_draws: int = 0, n_data: int | None = No
         operations += 2.0 * n_channels * n_data * n_sources * (n_modes + n_sources)
     pixels = 12.0 * scenario.map_nside**2
     if not scenario.joint:
-        # means, errors and spectra of channels that are finished
+        # means, errors and spectra of finished channels
         squares += (n_channels - 1) * (3.0 * pixels + 4.0 * n_modes)
     kept = 3.0 * (n_draws + scenario.output.draws) * n_modes
     memory = BASE_BYTES + BYTES_A_DATUM * n_data + 8.0 * (squares + MAPS * pixels + kept)
@@ -189,20 +189,20 @@ def posterior_cost(scenario: Scenario, n_draws: int = 0, n_data: int | None = No
 def require_fits(
     cost: Cost, scenario: Scenario, n_draws: int = 0, n_data: int | None = None
 ) -> None:
-    """Check that a run fits into the memory.
+    """Check that a run fits into memory.
 
     Parameters
     ----------
     cost : Cost
     scenario : Scenario
-        What it is the cost of.
+        The scenario with this cost.
     n_draws, n_data : int
         As in :func:`posterior_cost`.
 
     Raises
     ------
     InputError
-        If it does not; the message says what would.
+        If it does not; the message suggests a setting that would fit.
     """
     limit = memory_limit()
     if cost.memory <= limit:
@@ -223,7 +223,7 @@ def require_fits(
 def require_resources(
     scenario: Scenario, data: Visibilities | None, stages: Stages, n_draws: int = 0
 ) -> None:
-    """Say what a posterior will take. InputError as :func:`require_fits`.
+    """Report the resources for a posterior. InputError as :func:`require_fits`.
 
     Parameters
     ----------
@@ -231,7 +231,7 @@ def require_resources(
     data : Visibilities or None
         Given data.
     stages : Stages
-        Told what it will take.
+        Shows the estimate.
     n_draws : int
         As in :func:`posterior_cost`.
     """
@@ -251,19 +251,19 @@ def measured_experiment(
     truth: bool = False,
     make: Callable[..., Experiment] = build,
 ) -> Experiment:
-    """Read data, say what their posterior will take, and make the experiment.
+    """Read data, report the resources for their posterior, and make the experiment.
 
     Parameters
     ----------
     scenario : Scenario
     data : Visibilities, path, or sequence of them, or None
-        Measured; without them the scenario's own are simulated.
+        Given data; if None, data are simulated from the scenario.
     stages : Stages
-        Told what it will take.
+        Shows the estimate.
     n_draws : int
         As in :func:`posterior_cost`.
     truth : bool
-        The data are of the scenario's own sky.
+        The data were simulated from this scenario's sky.
     make : callable
         ``make(scenario, data, stages)``.
 
@@ -279,7 +279,7 @@ def measured_experiment(
 
 
 def _smaller(scenario: Scenario) -> Iterator[tuple[str, float | str, Scenario]]:
-    """The scenario with less of one thing at a time."""
+    """Yield key, value and scenario for smaller settings, one key at a time."""
 
     if scenario.nside is not None:
         yield "nside", 64, scenario.model_copy(update={"nside": 64})

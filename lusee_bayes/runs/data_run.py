@@ -1,7 +1,7 @@
-"""Data in files: visibilities that are simulated, sessions that are reduced or simulated, averages.
+"""Data in files: simulated visibilities, reduced or simulated sessions, and averages.
 
-Sessions are the spectrometer's, in luseepy's layout; averages are means of data over longer times,
-with what these cost.
+Sessions are files of the spectrometer, in luseepy's layout. Averages are means of data over longer
+times, reported with the information they lose.
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ def run_simulate(
     replace: bool = False,
     stages: Stages | None = None,
 ) -> list[Visibilities]:
-    """Simulate the visibilities of a scenario, and write them whole or not at all.
+    """Simulate the visibilities of a scenario, and write them completely or not at all.
 
     Parameters
     ----------
     scenario : Scenario, or its file or name
-        At one frequency, or at those of a waterfall; each channel's noise has its own seed, which
-        increases by one from channel to channel.
+        With one frequency, or several for a waterfall; the seed of the noise increases by one from
+        channel to channel.
     path : path
         The file: netCDF, or luseepy's waterfall if the name ends in ``.fits``.
     replace : bool
         Replace the file if it exists already.
     stages : Stages, optional
-        Told what is being done.
+        Reports progress.
 
     Returns
     -------
@@ -90,7 +90,7 @@ def run_simulate(
 
 
 def _write_waterfall(path: Path, experiments: Sequence[Experiment], scenario: Scenario) -> None:
-    """In luseepy's layout of four ports where the beams know volts, else in its scalar one."""
+    """Write luseepy's four-port layout if the beams have circuits, else its scalar layout."""
     data = [experiment.data for experiment in experiments]
     sources = [(e.setup.beam_source, e.scenario.frequency_mhz) for e in experiments]
     circuits = [circuit for source, f in sources if (circuit := source.circuit(f)) is not None]
@@ -107,7 +107,7 @@ def _write_waterfall(path: Path, experiments: Sequence[Experiment], scenario: Sc
 
 
 def reduced_lines(reduced: Reduced) -> list[str]:
-    """What was flagged in each band, and how its noise compares with the radiometer's."""
+    """Flags of each band, and its noise relative to the radiometer's, in lines."""
     lines = [reduced.description()[0], *reduced.notes()]
     for band, frequency in enumerate(reduced.frequencies_mhz):
         noise = reduced.scatter[band]
@@ -125,7 +125,7 @@ def run_reduce(
     replace: bool = False,
     stages: Stages | None = None,
 ) -> Reduced:
-    """Reduce sessions to the scenario's frequencies, and write them whole or not at all.
+    """Reduce sessions to the scenario's frequencies, and write them completely or not at all.
 
     Parameters
     ----------
@@ -140,8 +140,8 @@ def run_reduce(
     Raises
     ------
     InputError
-        As :func:`.reduce_files`, if the file would replace a session, if it is there already,
-        unless ``replace``, and if the sessions have no number in any band.
+        If the file would replace a session, if it exists already (unless ``replace``), if the
+        sessions have no number in any band, and as :func:`.reduce_files`.
     """
     scenario = load_scenario(scenario)
     stages, path = stages or Stages(), user_path(path)
@@ -159,20 +159,20 @@ def run_reduce(
 
 SUFFIX = {"hdf5": "h5", "fits": "fits"}
 GAINS, CLOCK, TRUTH, SCENARIO = "gains.nc", "clock.json", "truth.npz", "scenario.yaml"
-# how long spectra are averaged for a map, where the scenario does not say it
+# averaging time of spectra for a map, unless the scenario sets it
 AVERAGE_S = 7200.0
 FLIGHT = RunKind("simulated sessions", outputs=(), figures={})
 
 
 @dataclass(frozen=True)
 class FlightFiles:
-    """What a simulation has written.
+    """Files that a simulation has written.
 
     Attributes
     ----------
     sessions : tuple of Path
     scenario : Path
-        By which they are mapped.
+        Scenario with which to map them.
     n_spectra : int
     """
 
@@ -181,7 +181,7 @@ class FlightFiles:
     n_spectra: int
 
     def lines(self) -> tuple[str, str]:
-        """What was written, and the command that maps it."""
+        """The files written, and the command that maps them."""
         return (
             f"{self.n_spectra} spectra of {len(self.sessions)} sessions -> {self.scenario.parent}",
             f"lusee-bayes map {self.scenario} --data {' '.join(map(str, self.sessions))}",
@@ -195,25 +195,25 @@ def run_simulate_flight(
     replace: bool = False,
     stages: Stages | None = None,
 ) -> FlightFiles:
-    """Simulate sessions, and write them with all that it takes to map them.
+    """Simulate sessions, and write them with everything needed to map them.
 
     Parameters
     ----------
     scenario : Scenario, or its file or name
-        Of one frequency, or several.
+        With one or several frequencies.
     folder : path
-        Takes ``session_000.h5``, ... , ``truth.npz`` with what is in which spectrum,
-        ``scenario.yaml``, and ``gains.nc`` and ``clock.json`` where the scenario has no gain table
-        and the files no clock.
+        Folder for ``session_000.h5``, ... , ``truth.npz`` with the content of every spectrum,
+        ``scenario.yaml``, ``gains.nc`` if the scenario has no gain table, and ``clock.json`` if the
+        files have no clock.
     replace : bool
         Replace sessions that are in the folder already.
     stages : Stages, optional
-        Told how far it is.
+        Reports progress.
 
     Raises
     ------
     InputError
-        As :func:`.simulate_flight`, and if the folder has sessions already, or cannot be written.
+        If the folder has sessions already or is not writable, and as :func:`.simulate_flight`.
     """
     scenario, folder, stages = load_scenario(scenario), user_path(folder), stages or Stages()
     if not replace and (earlier := sorted(folder.glob("session_*"))):
@@ -230,7 +230,7 @@ def run_simulate_flight(
 
 
 def _write_flight(made: FlightSimulation, stage: Path, folder: Path, stages: Stages) -> list[str]:
-    """Write what ``folder`` is to hold into ``stage``; the names of the sessions."""
+    """Write the files for ``folder`` into ``stage``; return the names of the sessions."""
     suffix = SUFFIX[made.section.kind]
     names = [f"session_{number:03d}.{suffix}" for number in range(len(made.sessions))]
     if flight_of(made.scenario).gain_table is None:
@@ -256,11 +256,11 @@ def _told(
 
 
 def _to_be_mapped(made: FlightSimulation, folder: Path) -> Scenario:
-    """The scenario, with what the files leave open."""
+    """The scenario, completed with everything that the files lack."""
     flight, observation = flight_of(made.scenario), made.scenario.observation
     said = {
         "gain_table": flight.gain_table or str(folder / GAINS),
-        # a table that is written has its own
+        # a table written by the simulation contains it
         "component_std": flight.component_std if flight.gain_table else None,
         "bin_origin": made.origin,
         "clock": str(folder / CLOCK) if made.section.clock == "unknown" else None,
@@ -295,7 +295,7 @@ def _clock_text(clock: Clock) -> str:
 
 
 def _truth(made: FlightSimulation) -> dict[str, np.ndarray]:
-    """What was put into which spectrum, in the order of all sessions."""
+    """The content of every spectrum, in the order of all sessions."""
     session = np.repeat(np.arange(len(made.sessions)), [s.stop - s.start for s in made.sessions])
     return {
         "session": session,
@@ -311,7 +311,7 @@ def _truth(made: FlightSimulation) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True)
 class Averages:
-    """Data, their averages, and what these cost.
+    """Data, their averages, and the information lost.
 
     Attributes
     ----------
@@ -319,7 +319,7 @@ class Averages:
         Before and after.
     bits : tuple of float, or None
         Information about the map in both, ``ln|1 + S^1/2 A^T N^-1 A S^1/2| / (2 ln 2)``; None if
-        it was not asked for.
+        it was not requested.
     """
 
     data: Visibilities
@@ -328,16 +328,16 @@ class Averages:
 
     @property
     def lost_share(self) -> float:
-        """Share of the live time of all products that the rule for flags has left out."""
+        """Share of the live time of all products that averaging drops because of flags."""
         return 1.0 - product_live_s(self.averaged) / product_live_s(self.data)
 
     @property
     def lost_bits(self) -> float | None:
-        """Information about the map that the averages lack, in bits; None if it is not known."""
+        """Information about the map that the averages lack, in bits; None if unknown."""
         return None if self.bits is None else self.bits[0] - self.bits[1]
 
     def lines(self) -> tuple[str, ...]:
-        """Return what there is to say about it."""
+        """Lines for a terminal."""
         before, after = (d.observation for d in (self.data, self.averaged))
         said = [
             f"{before.n_times} samples of {before.step_s:g} s -> {after.n_times} of "
@@ -376,15 +376,15 @@ def run_average(
     path : path
         The netCDF file to write.
     information : bool
-        Work out the information about the map, in the data and in their averages.
+        Compute the information about the map, in the data and in their averages.
     replace, stages : bool and Stages, optional
         As in :func:`run_simulate`.
 
     Raises
     ------
     InputError
-        As :func:`.read_data` and :func:`.averaged`, for a scenario that the data do not fit or that
-        needs more memory than there is, and if the file is there already, unless ``replace``.
+        If the data do not fit the scenario, if it needs too much memory, if the file exists already
+        (unless ``replace``), and as :func:`.read_data` and :func:`.averaged`.
     """
     scenario = load_scenario(scenario)
     stages, path = stages or Stages(), user_path(path)

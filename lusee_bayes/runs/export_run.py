@@ -1,7 +1,7 @@
-"""A finished run as a folder to be published, for readers who do not have the package.
+"""Export of finished runs as folders to publish, for readers without the package.
 
-The run's files, checksums, metadata of DataCite, a licence and a reader. Their texts are templates
-in ``report/templates/release``.
+A folder has the run's files, checksums, DataCite metadata, a licence and a reader. Templates for
+its texts are in ``report/templates/release``.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from lusee_bayes.report.rendering import render_text
 from lusee_bayes.results.finished_runs import NAME, FinishedRun, Provenance
 from lusee_bayes.runs.folder import RunOutcome
 
-# of one frequency, and of several
+# map files for one frequency, and for several
 MAPS = {"map.fits", "mean.fits"}
 BLANK = "TO BE FILLED IN"
 METADATA, SUMS = "datacite.json", "SHA256SUMS"
@@ -39,27 +39,27 @@ def run_export(
     doi: str = "",
     licence: str = "CC-BY-4.0",
 ) -> RunOutcome[list[str]]:
-    """Bundle a finished run for publication, whole or not at all.
+    """Bundle a finished run for publication, completely or not at all.
 
     Parameters
     ----------
     run : path
         Folder of a finished run of ``map``, ``sample`` (of one frequency) or ``validate``.
     folder : path
-        Of the release, which must not exist. All files are at its top, since archives know no
-        folders; ``report.html`` contains the figures.
+        Folder of the release, which must not exist. All files are at its top level, because
+        archives have no folders; ``report.html`` contains the figures.
     creators : sequence of str
         ``"Family, Given"``, or the name of a group.
     doi : str
-        Of the release, if it is known.
+        DOI of the release, if known.
     licence : str
         ``CC-BY-4.0`` or ``CC0-1.0``.
 
     Returns
     -------
     RunOutcome
-        Its result lists the entries of ``datacite.json`` that are still to be filled in. This file
-        is meant to be edited, and not in ``SHA256SUMS``.
+        Its result lists the entries still missing from ``datacite.json``. This file is meant to be
+        edited, and is not in ``SHA256SUMS``.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def write_skyh5(run: str | Path, path: str | Path) -> RunOutcome[list[str]]:
     Parameters
     ----------
     run : path
-        Folder of a finished run of ``map``, of one frequency or of several.
+        Folder of a finished run of ``map``, with one or several frequencies.
     path : path
         The SkyH5 file: HEALPix, RING, Galactic, Stokes I in K.
 

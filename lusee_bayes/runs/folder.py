@@ -1,7 +1,7 @@
-"""The folder of a run: written in one transaction, and what its results were made of.
+"""The folder of a run: written in one transaction, with a record of the inputs.
 
-Results of something else are not replaced unless that is asked for, and a run that is interrupted
-says what its folder holds.
+Results of another run are replaced only on request. An interrupted run reports the state of its
+folder.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ Origin = Mapping[str, str]
 def origin_of(
     scenario: Scenario | None = None, data: Data | None = None, **others: object
 ) -> dict[str, str]:
-    """What determines the numbers of a run, as text by name.
+    """Everything that determines the numbers of a run, as text by name.
 
     Parameters
     ----------
     scenario : Scenario, optional
-        What it says of output does not count.
+        Its section ``output`` is ignored.
     data : Visibilities, path, or sequence of them, optional
-        Their content counts, not the names of files.
+        Identified by the names of their files and a digest of their content.
     **others
-        Whatever else does; None for what is not there.
+        Other inputs; None is left out.
 
     Returns
     -------
@@ -55,7 +55,7 @@ def origin_of(
     Raises
     ------
     InputError
-        If there is no file of data.
+        If a data file does not exist.
     """
     origin: dict[str, str] = {}
     if scenario is not None:
@@ -70,7 +70,7 @@ def origin_of(
 def inputs_of(
     scenario: Scenario | None, data: Data | None = None, *others: str | Path | None
 ) -> list[str | Path]:
-    """The files that a run reads: data, those that its scenario names, and others if given."""
+    """The files that a run reads: data, files named by its scenario, and others if given."""
     tree = {} if scenario is None else scenario.model_dump(mode="json")
     named = [value for _, value in _entries(tree) if isinstance(value, str)]
     given = [] if data is None else files_of(data)
@@ -86,20 +86,20 @@ def _entries(tree: Mapping[str, Any], parents: str = "") -> Iterator[tuple[str, 
 
 
 def require_own(folder: Path, kinds: Sequence[str], origin: Origin) -> None:
-    """Check that a folder holds no results of another run.
+    """Check that a folder has no results of another run.
 
     Parameters
     ----------
     folder : Path
     kinds : sequence of str
-        Of the run that is to write there, and of those whose results it goes on from.
+        Kind of the new run, and kinds of runs whose results it may continue.
     origin : mapping
-        What it is made of.
+        Inputs of the new run (:func:`.origin_of`).
 
     Raises
     ------
     InputError
-        If it does; the first difference is named.
+        If it has; the message names the first difference.
     """
     manifest = files.read_manifest(folder)
     if manifest is None:
@@ -121,7 +121,7 @@ Result = TypeVar("Result")
 
 
 class RunInterrupted(KeyboardInterrupt):
-    """A run was interrupted; the message says what its folder holds."""
+    """Raised if a run is interrupted; the message gives the state of its folder."""
 
 
 @dataclass(frozen=True)
@@ -131,10 +131,9 @@ class RunOutcome(Generic[Result]):
     Attributes
     ----------
     result : object
-        What it has found.
     folder : Path
     files : list of Path
-        What was written.
+        The files written.
     """
 
     result: Result
@@ -143,20 +142,20 @@ class RunOutcome(Generic[Result]):
 
     @property
     def page(self) -> Path:
-        """The page for people, of runs that have one."""
+        """The page for people, for runs that have one."""
         return self.folder / REPORT
 
 
 @dataclass(frozen=True)
 class Output:
-    """A file, or several, of a run's folder.
+    """One or several files in a run's folder.
 
     Attributes
     ----------
     write : callable
         ``write(result, folder)`` writes into a folder.
     wanted : callable
-        ``wanted(result)``: whether the run has it.
+        ``wanted(result)``: whether the run has this output.
     """
 
     write: Callable[[Any, Path], None]
@@ -164,7 +163,7 @@ class Output:
 
     @classmethod
     def text(cls, name: str, text: Callable[[Any], str]) -> Output:
-        """A file of text, UTF-8."""
+        """A text file, UTF-8."""
         return cls(lambda run, folder: (folder / name).write_text(text(run), encoding="utf-8"))
 
     @classmethod
@@ -179,13 +178,13 @@ class Output:
 
     @classmethod
     def ecsv(cls, name: str, table: Callable[[Any], Table]) -> Output:
-        """A table of astropy, with its units."""
+        """An astropy table, with its units."""
         options = {"format": "ascii.ecsv", "delimiter": ","}
         return cls(lambda run, folder: table(run).write(folder / name, **options))
 
     @classmethod
     def table(cls, name: str, table: Callable[[Any], DataFrame | None]) -> Output:
-        """A table of pandas; None where the run has none."""
+        """A pandas table; None if the run has none."""
         return cls(
             lambda run, folder: table(run).to_csv(folder / name, index=False),
             lambda run: table(run) is not None,
@@ -193,7 +192,7 @@ class Output:
 
     @classmethod
     def netcdf(cls, name: str, content: Callable[[Any], Dataset | DataTree]) -> Output:
-        """A netCDF file, of a dataset or a tree of them."""
+        """A netCDF file from a dataset or a data tree."""
         return cls(lambda run, folder: content(run).to_netcdf(folder / name, engine="h5netcdf"))
 
 
@@ -202,24 +201,24 @@ SCENARIO = Output.text("scenario.yaml", lambda result: result.scenario.to_yaml()
 
 @dataclass(frozen=True)
 class RunKind:
-    """What the folder of one kind of run holds.
+    """Contents of the folder of one kind of run.
 
     Attributes
     ----------
     name : str
-        Kept in ``manifest.json``; a page of this name in ``PAGES`` becomes ``report.html``.
+        Stored in ``manifest.json``; a page of this name in ``PAGES`` becomes ``report.html``.
     outputs : sequence of Output
     figures : mapping
         ``draw(result)`` by the name of its PNG in ``figures/``: a figure, several by their titles,
-        or None where there is none.
+        or None.
     unfinished : str
-        The folder that holds unfinished work, removed when the results are there.
+        The folder of unfinished work, removed when the results are complete.
     dpi : int
-        Of the figures.
+        Resolution of the figures.
     after : sequence of str
-        Kinds of runs whose results in the folder, of the same origin, it takes over.
+        Kinds of runs whose results in the folder, of the same origin, it may continue.
     resume : str
-        How a run that was stopped is gone on with.
+        How to resume a stopped run.
     """
 
     name: str
@@ -240,7 +239,7 @@ class RunFolder:
     path : Path
     kind : RunKind
     origin : mapping
-        What the results are made of (:func:`.origin_of`).
+        Inputs of the results (:func:`.origin_of`).
     """
 
     path: Path
@@ -255,15 +254,15 @@ class RunFolder:
         Parameters
         ----------
         result : object
-            What the outputs and figures of the kind take.
+            Argument of the kind's outputs and figures.
         stages : Stages
-            Told what is being done.
+            Reports progress.
         provenance : Provenance, optional
-            Where the data come from, for the head of the page.
+            Origin of the data, for the head of the page.
 
         Returns
         -------
-        Run
+        RunOutcome
             With the files in the folder.
         """
         kind, folder = self.kind, self.path
@@ -298,7 +297,7 @@ def run_folder(
     replace: bool = False,
     **others: object,
 ) -> Iterator[RunFolder]:
-    """Open a folder for a run, and say what it holds if the run is interrupted.
+    """Open a folder for a run, and report its state if the run is interrupted.
 
     Parameters
     ----------
@@ -311,22 +310,22 @@ def run_folder(
     replace : bool
         Replace results of another run.
     **others
-        What else determines the numbers (:func:`origin_of`).
+        Other inputs that determine the numbers (:func:`origin_of`).
 
     Yields
     ------
     RunFolder
-        An interrupted transaction of an earlier run is completed.
+        An interrupted transaction of an earlier run is completed first.
 
     Raises
     ------
     InputError
-        If ``folder``, or what it would lie in, is a file; if another run works in it, or has left
-        its results there; if what the run reads is among the results that would be replaced.
+        If ``folder`` or one of its parents is a file, if another run works in it or has left its
+        results there, or if the results to be replaced include a file that the run reads.
     RunInterrupted
         Instead of KeyboardInterrupt.
     WorkersLost
-        With what the folder holds added to its message.
+        With the state of the folder added to its message.
     """
     origin, read = origin_of(scenario, data, **others), inputs_of(scenario, data, *inputs)
     folder = files.user_path(folder)
@@ -345,14 +344,14 @@ def run_folder(
             try:
                 yield RunFolder(folder, kind, origin)
             except RunInterrupted:
-                # of a run in a folder inside this one
+                # raised by a run in a folder inside this one
                 raise
             except KeyboardInterrupt as interrupt:
                 raise RunInterrupted(_state(folder, before, kind)) from interrupt
             except WorkersLost as error:
                 raise WorkersLost(f"{error}; {_state(folder, before, kind)}") from error
     finally:
-        # nothing written: nothing left
+        # remove folders that stayed empty
         for place in ([folder / kind.unfinished] if kind.unfinished else []) + made:
             with suppress(OSError):
                 place.rmdir()

@@ -36,15 +36,15 @@ def run_map(
 ) -> RunOutcome[MapResult]:
     """Make a posterior map of a scenario, or of given data, and write its folder.
 
-    The folder is written in one transaction. A run of several frequencies that was stopped goes on
-    with the same call.
+    The folder is written in one transaction. The same call resumes a stopped run of several
+    frequencies.
 
     Parameters
     ----------
     scenario : Scenario, or its file or name
-        At one or several frequencies; ``output`` lists what is written besides the maps.
+        With one or several frequencies; ``output`` selects results in addition to the maps.
     folder : path
-        Of the results.
+        Folder of the results.
     data : Visibilities, path, or sequence of them, optional
         Visibilities to map, in memory or in a file, or sessions of the spectrometer; if omitted,
         data are simulated from the scenario.
@@ -61,7 +61,7 @@ def run_map(
     replace : bool
         Replace results of another run in the folder.
     stages : Stages, optional
-        Told what is being done.
+        Reports progress.
 
     Raises
     ------
@@ -91,7 +91,7 @@ def run_map(
 def _given(
     data: Data | None, reduced: Reduced | None, scenario: Scenario, folder: Path
 ) -> Data | None:
-    """What channels read: of sessions their reduced spectra, of several channels in a file."""
+    """The data that channels read: sessions as reduced spectra, in a file for several channels."""
     if reduced is None:
         return data
     if scenario.single:
@@ -104,7 +104,7 @@ def _given(
 
 
 def _as_used(reduced: Reduced, result: MapResult) -> Reduced:
-    """Reduced spectra without what did not fit."""
+    """Reduced spectra without the data that did not fit."""
     for channel in result.channels:
         if channel.flagged is not None:
             band = reduced.band(channel.frequency_mhz)
@@ -136,7 +136,7 @@ def _write_coefficients(result: MapResult, folder: Path) -> None:
     write_alms(folder / "mean_alm.fits", result.channel.mean, header)
 
 
-# what the folder of a map holds; a new file is one line here
+# contents of the folder of a map; a new file is one line here
 MAP = RunKind(
     "map",
     outputs=(

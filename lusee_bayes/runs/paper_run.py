@@ -1,4 +1,4 @@
-"""The reference paper in one run: cases computed once and kept, then figures and judged claims."""
+"""Reproduction of the reference paper: cases computed once, then figures and tested claims."""
 
 from __future__ import annotations
 
@@ -26,38 +26,38 @@ def run_paper(
     replace: bool = False,
     stages: Stages | None = None,
 ) -> RunOutcome[Cases]:
-    """Compute what is missing of the paper's cases, then draw the figures and judge the claims.
+    """Compute the paper's missing cases, then draw the figures and test the claims.
 
-    Cases that were computed before with the same scenario and version are kept. The folder changes
-    in one transaction, when all are there.
+    Cases computed earlier with the same scenario and version are kept. The folder changes in one
+    transaction, once all cases are complete.
 
     Parameters
     ----------
     folder : path
-        Of the results.
+        Folder of the results.
     overrides : sequence of str
         ``key.path=value``, applied to every case.
     skies : sequence of paths
         ULSA HDF5 files with the frequency in their names; each case scales the nearest one.
     engine : Engine, optional
-        What computes the cases; by default this process.
+        Where cases are computed; by default in this process.
     replace, stages : bool and Stages, optional
         As in :func:`.run_map`.
 
     Raises
     ------
     InputError
-        For skies without a frequency in their names, and for overrides that do not fit.
+        For skies without a frequency in their names, and for invalid overrides.
     """
     engine, stages = engine or ThisProcess(), stages or Stages()
     scenarios = paper_scenarios(overrides, skies)
     with run_folder(folder, PAPER, replace=replace) as run:
         engine.work_in(run.path)
-        # workers may have other folders of their own
+        # workers may have another working directory
         home = run.path.resolve()
 
         def path_of(name: str) -> Path:
-            """Where a case is, if it has been computed, or else will be."""
+            """The file of a case, whether it has been computed or not."""
             earlier, kept = home / UNFINISHED / f"{name}.nc", home / CASES / f"{name}.nc"
             is_kept = not is_case(earlier, scenarios[name]) and is_case(kept, scenarios[name])
             return kept if is_kept else earlier
@@ -80,7 +80,7 @@ def _write_cases(cases: Cases, folder: Path) -> None:
         case.to_netcdf(folder / CASES / f"{name}.nc", engine="h5netcdf")
 
 
-# what the folder of the paper's run holds; a new file is one line here
+# contents of the folder of the paper's run; a new file is one line here
 PAPER = RunKind(
     "paper",
     outputs=(

@@ -1,9 +1,9 @@
 """A plan: forecasts of the information in observations, from the posterior covariance alone.
 
-No data are needed. A plan looks at variations of a scenario, by itself at those of turntable,
-duration, nights, duty cycle and lost antennas: turned in the same time and repeated at the same
-angles, so that a turn is compared with standing still for as long. Each forecast is kept in a file
-as soon as it is made.
+No data are needed. A plan compares variations of a scenario, by default of turntable, duration,
+nights, duty cycle and lost antennas. Some turn the table within the same time, others last longer
+at the same angles, so that a turn is compared with standing still for as long. Each forecast is
+written to a file as soon as it is made.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from lusee_bayes.systematics.context import Around, Setup
 
 
 def expected_snr_squared(posterior: Posterior) -> Float[np.ndarray, " ells"]:
-    """sum_m (S - C) / sum_m C for each ell, of a posterior over harmonic coefficients.
+    """sum_m (S - C) / sum_m C for each ell, for a posterior over harmonic coefficients.
 
     NaN at an ell where the prior has no power.
     """
@@ -56,10 +56,10 @@ def expected_snr_squared(posterior: Posterior) -> Float[np.ndarray, " ells"]:
 
 
 def informed_modes(posterior: Posterior) -> int:
-    """How many eigen-directions of C relative to S keep less than half of the prior's variance.
+    """Number of eigenvectors of C relative to S with less than half of the prior's variance.
 
-    Counted on the covariance of the whitened sky, whose eigenvalues lie between 0 and 1: on
-    Lambda, whose largest is 1e13, rounding would blur the threshold.
+    They are counted on the covariance of the whitened sky, whose eigenvalues lie between 0 and 1.
+    On Lambda, whose largest eigenvalue is 1e13, rounding would blur the threshold.
     """
     xp = namespace(posterior.lower)
     lower = xp.tril(posterior.lower)
@@ -73,7 +73,7 @@ def without_ports(setup: Setup, lost: Sequence[int]) -> Setup:
     Raises
     ------
     InputError
-        For a port that does not exist, or if none is left.
+        For a port that does not exist, or if no port remains.
     """
     layout = setup.layout
     n_ports = round(np.sqrt(layout.n_products))
@@ -85,19 +85,19 @@ def without_ports(setup: Setup, lost: Sequence[int]) -> Setup:
 
 
 def expected_inference(setup: Setup) -> Inference:
-    """The model of a setup, and its posterior, of which all but the mean is known without data.
+    """The model of a setup, and its posterior, which needs no data except for the mean.
 
     N is the model's, with marginalised systematics and noise levels from the modelled sky.
     """
     model, held = model_about(setup, Around())
-    # the covariance is that of any data; these are the shortest to write
+    # the covariance does not depend on the data, so use zeros
     return Inference(model.condition(np.zeros(model.n_data)), held, 1, Around())
 
 
 def expected_offsets(inference: Inference) -> dict[str, float]:
-    """Expected standard deviations of clock and pointing, in the units that their names end with.
+    """Expected standard deviations of clock and pointing, in the units that end their names.
 
-    To first order about the scenario's sky and no offsets; empty where the model has none.
+    Linearised about the scenario's sky and zero offsets; empty if the model has no offsets.
     """
     if inference.offsets is None:
         return {}
@@ -106,24 +106,24 @@ def expected_offsets(inference: Inference) -> dict[str, float]:
 
 
 def turned(family: str) -> bool:
-    """Whether variations are looked at for errors that pass unnoticed, whose cure are angles."""
+    """Whether to look for unnoticed errors, which turntable angles can reveal, in a variation."""
     return family in (AS_GIVEN, "turned, same time", "turned, more time") or "runs" in family
 
 
 def unnoticed(setup: Setup, inference: Inference) -> str:
-    """Errors that the residual chi^2 would not show, those first that move the map most."""
+    """Errors that the residual chi^2 would not reveal, sorted by their effect on the map."""
     spots = blind_spots(setup, inference, np.asarray(setup.sky.modes))
     shown = sorted((s for s in spots if s.shown > NOTHING), key=lambda s: -s.unnoticed[1])
     return ", ".join(f"{s.name} {s.unnoticed[0]:.2g}{s.unit} ({s.unnoticed[1]:.2g})" for s in shown)
 
 
 def forecast(variation: Variation) -> Forecast:
-    """Build A, S and N of a variation and take the numbers from its posterior covariance.
+    """Build A, S and N of a variation, and compute the forecast from its posterior covariance.
 
     Raises
     ------
     InputError
-        With the variation's name, for whatever is wrong with its scenario.
+        With the variation's name, if its scenario is invalid.
     """
     with naming(f"{variation.source}, {variation.name}"):
         setup = set_up(variation.scenario)
@@ -147,7 +147,7 @@ def forecast(variation: Variation) -> Forecast:
 def variations_of(
     sources: Sequence[str], overrides: Sequence[str], vary: Sequence[str], stages: Stages
 ) -> list[Variation]:
-    """List what a plan is to forecast: every scenario as it is, and its variations.
+    """List the variations to forecast: every scenario as it is, then its variations.
 
     Parameters
     ----------
@@ -156,9 +156,9 @@ def variations_of(
     overrides : sequence of str
         ``key.path=value``, for all of them.
     vary : sequence of str
-        ``key.path=value,value,...``; without it, :func:`default_variations`.
+        ``key.path=value,value,...``; if empty, :func:`default_variations`.
     stages : Stages
-        Told which of these are left out, since they cannot be observed.
+        Reports default variations that are left out because they cannot be observed.
 
     Raises
     ------
@@ -178,7 +178,7 @@ def variations_of(
             try:
                 one.scenario.observation.observation()
                 variations.append(one)
-            except InputError as why:  # samples that cannot be taken: a run without any night, ...
+            except InputError as why:  # cannot be observed: a run without any night, ...
                 stages.say(f"  left out: {source}, {one.family}, {one.name}: {why}")
     return variations
 
@@ -186,7 +186,7 @@ def variations_of(
 def given_variations(source: str, vary: Sequence[str], overrides: Sequence[str]) -> list[Variation]:
     """The scenario as baseline, and with every value of every ``key.path=value,value,...``.
 
-    InputError if one of them is not of that form, or its values are not the scenario's.
+    InputError if one of them does not have that form, or a value is invalid for the scenario.
     """
     variations = [Variation(source, AS_GIVEN, AS_GIVEN, load_scenario(source, overrides))]
     for text in vary:
@@ -206,14 +206,14 @@ def given_variations(source: str, vary: Sequence[str], overrides: Sequence[str])
 
 # one turn of the table
 TURN_DEG = 30.0
-# each run in so many parts, or all of them repeated so often
+# numbers of parts of each run, or of repetitions of all runs
 PARTS = (1, 2, 3)
 CYCLES = (0.25, 0.5, 1.0, 2.0, 3.0)
 DUTY_CYCLES = (0.25, 0.5, 1.0)
 
 
 def default_variations(source: str, scenario: Scenario) -> list[Variation]:
-    """The scenario as it is, then turntable, duration, nights, duty cycle and lost antennas.
+    """The scenario as it is, then with other turntable, duration, nights, duty cycle and antennas.
 
     A schedule keeps its dates and angles.
     """
@@ -253,9 +253,9 @@ def changed(
     turn_deg: float = 0.0,
     **values: Any,
 ) -> Runs:
-    """Runs that last ``factor`` times as long, and all of them again and again.
+    """Scale the length of runs by ``factor``, and repeat all of them ``times`` times.
 
-    Each time they are turned by ``turn_deg`` more. ``values`` are others of every run.
+    Each repetition adds ``turn_deg`` to the angles. ``values`` replace other keys of every run.
     """
 
     def one(run: RunSection, number: int) -> RunSection:
@@ -267,12 +267,12 @@ def changed(
 
 
 def angles(runs: Sequence[RunSection]) -> str:
-    """Their turntable angles, in words."""
+    """Turntable angles of runs, in words."""
     return ", ".join(f"{run.turntable_deg:g}°" for run in runs)
 
 
 def length(runs: Sequence[RunSection]) -> str:
-    """How long they last, in words."""
+    """Total length of runs, in words."""
     cycles = sum(run.cycles for run in runs)
     return f"{cycles:g} cycle{'' if cycles == 1.0 else 's'}"
 
@@ -292,7 +292,7 @@ def kept_forecast(folder: Path, variation: Variation) -> Forecast:
 
 
 def _digest(variation: Variation) -> str:
-    """Of all that a forecast depends on."""
+    """Digest of everything that determines a forecast."""
     parts = [variation.scenario.to_yaml(), list(variation.lost), __version__]
     return sha256(json.dumps(parts).encode()).hexdigest()[:32]
 
@@ -300,16 +300,16 @@ def _digest(variation: Variation) -> str:
 def forecasts_of(
     variations: Sequence[Variation], folder: Path, engine: Engine, stages: Stages
 ) -> list[Forecast]:
-    """Make a forecast of every variation; what is there twice is computed once.
+    """Make a forecast of every variation; duplicates are computed once.
 
     Parameters
     ----------
     variations : sequence of Variation
     folder : Path
-        Of unfinished work: what an interrupted plan has made is taken from it.
+        Folder of unfinished work: forecasts of an interrupted plan are read from it.
     engine : Engine
     stages : Stages
-        Told how many there are, and after the first about how long the others take.
+        Reports the number of variations and, after the first, an estimate of the remaining time.
 
     Returns
     -------
@@ -321,7 +321,7 @@ def forecasts_of(
     InputError
         As :func:`.forecast`.
     """
-    # workers may have other folders of their own
+    # workers may have another working directory
     anchored = [replace(v, scenario=v.scenario.anchored()) for v in variations]
     different: dict[str, Variation] = {}
     for variation in anchored:
@@ -362,9 +362,9 @@ def run_plan(
     Parameters
     ----------
     variations : sequence of Variation
-        Such as those of :func:`.default_variations`.
+        E.g. from :func:`.default_variations`.
     folder : path
-        Of the results.
+        Folder of the results.
     engine : Engine, optional
         Where forecasts are computed; by default in this process.
     replace, stages : bool and Stages, optional
@@ -389,7 +389,7 @@ def run_plan(
         return run.write(forecasts_of(variations, made, engine, stages), stages)
 
 
-# what the folder of a plan holds; a new file is one line here
+# contents of the folder of a plan; a new file is one line here
 PLAN = RunKind(
     "plan",
     outputs=(Output.rows("plan.csv", forecast_rows),),

@@ -1,7 +1,7 @@
-"""Sampling of a program given an experiment's data: draws survive a kill.
+"""Runs that sample a program given an experiment's data; their draws survive a kill.
 
-A sampling run: draws from the posterior of a NumPyro program. A validation: HMC and simulated data
-sets against the analytic posterior.
+A sampling run draws from the posterior of a NumPyro program. A validation compares HMC and
+simulated data sets with the analytic posterior.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from lusee_bayes.systematics.gain_drifts import SCALES
 from lusee_bayes.systematics.registered import SYSTEMATICS
 from lusee_bayes.systematics.systematic import SKY, Chart, Systematic, Unknown, present
 
-# where the mode of a collapsed program is looked for
+# number of starts of the search for the mode of a collapsed program
 STARTS = 4
 
 
@@ -63,27 +63,27 @@ def sample_together(
     resume: bool = False,
     stages: Stages | None = None,
 ) -> tuple[SampleResult, ...]:
-    """Sample ``program`` given experiments' data; draws are kept in ``folder``/chains.
+    """Sample ``program`` given experiments' data; draws are saved in ``folder``/chains.
 
-    Programs of several channels, which share unknowns, are sampled as one.
+    Several channels, which share unknowns, are sampled as one program.
 
     Parameters
     ----------
     experiments : mapping of Experiment
-        Of each channel, by the folder of its results in ``folder``; that of one alone is empty.
+        One for each channel, by its results folder in ``folder`` (empty for a single channel).
     program : Program
     sampler : Sampler
     folder : Path
-        Of the run; unfinished chains are kept in it.
+        Folder of the run, including unfinished chains.
     resume : bool
-        Go on with an unfinished run of the same settings, or take over a finished one.
+        Continue an unfinished run with the same settings, or read a finished one.
     stages : Stages, optional
-        Told what is being done.
+        Reports progress.
 
     Raises
     ------
     InputError
-        If ``folder`` holds an unfinished run and ``resume`` is not given, if the unfinished run has
+        If ``folder`` has an unfinished run and ``resume`` is not given, if the unfinished run has
         other settings, or if the program does not end with draws of the sky.
     """
     stages = stages or Stages()
@@ -161,9 +161,9 @@ def sample_together(
 def coordinates(
     program: Program, arguments: dict, data: Visibilities, inference: Inference, latent: list[str]
 ) -> Whitening | None:
-    """White coordinates for a program: those of the analytic posterior where it samples the sky
-    alone, and data are Gaussian about it; the straight ones of a log-normal sky; else those about
-    its mode. None if no mode is found: warmup then learns scales."""
+    """White coordinates for a program: of the analytic posterior if it samples only the sky and the
+    data are Gaussian about it, of :func:`.coordinates_of` for a log-normal sky, else about its
+    mode. None if no mode is found: warmup then learns scales."""
     if latent == [SKY] and not programs.predicts(program.model, arguments, TimesStudentT):
         return Whitening.of(inference.posterior)
     positive = arguments.get("log_normal")
@@ -179,9 +179,9 @@ def coordinates(
 def amplitudes_of_rounds(
     inferences: Mapping[str, Inference], latent: Mapping[str, Sequence[str]]
 ) -> tuple[dict[str, Amplitudes], list[Unknown]] | None:
-    """What each channel's data tell of unknowns that rounds have found or that are linear.
+    """Constraints from each channel's data on unknowns that are linear or inferred in rounds.
 
-    None where others are sampled, too; ``latent``: what is, in each channel.
+    None if others are sampled, too. ``latent`` lists the sampled sites of each channel.
     """
     amplitudes, unknowns = {}, []
     for channel, one in inferences.items():
@@ -198,7 +198,7 @@ def amplitudes_of_rounds(
 
 
 def start_values(inference: Inference, latent: Sequence[str]) -> dict[str, np.ndarray]:
-    """Where the mode is looked for: at what rounds have found, if there were any."""
+    """Start values of the search for the mode: results of the rounds, if there were any."""
     start = {SKY: inference.posterior.mean} if SKY in latent else {}
     for part in inference.expanded if inference.moving else ():
         values = part.systematic.values(part.expected + inference.amplitudes(part).mean)
@@ -207,7 +207,7 @@ def start_values(inference: Inference, latent: Sequence[str]) -> dict[str, np.nd
 
 
 def _chart(arguments: dict, latent: list[str]) -> Chart | None:
-    """The curved coordinates that a systematic among a program's arguments knows."""
+    """The curved coordinates of a systematic among a program's arguments, if any."""
     gaussian = arguments.get("gaussian")
     for piece in arguments.values():
         for systematic in piece if isinstance(piece, tuple) else (piece,):
@@ -219,7 +219,7 @@ def _chart(arguments: dict, latent: list[str]) -> Chart | None:
 
 
 def _finished(path: Path, identity: dict, sampler: Sampler) -> xr.DataTree | None:
-    """The samples that an earlier run of the same settings has left, if there are enough."""
+    """Read the samples of a finished run; None without a file, InputError if settings differ."""
     if not path.exists():
         return None
     tree = read_datatree(path)
@@ -254,7 +254,7 @@ RESUME = "continue with --resume"
 
 
 def default_program(scenario: Scenario) -> Program:
-    """``systematics`` where something is sampled, or ``sky``."""
+    """``systematics`` if the scenario samples an unknown, else ``sky``."""
     return programs.load_program("systematics" if scenario.samples else "sky")
 
 
@@ -271,30 +271,30 @@ def run_sample(
 ) -> RunOutcome[tuple[SampleResult, ...]]:
     """Sample the posterior of a program, and write the folder in one transaction.
 
-    Several frequencies are sampled one after the other, or all together where they share what is
-    sampled. Each has a folder of its own, and their maps are put together in cubes.
+    Several frequencies are sampled one after the other, or together if they share sampled unknowns.
+    Each has its own folder, and their maps are combined into cubes.
 
     Parameters
     ----------
     scenario : Scenario, or its file or name
     folder : path
-        Of the results; draws are kept in it as they come.
+        Folder of the results; draws are saved in it while sampling.
     program : Program, optional
         By default :func:`default_program`.
     sampler : Sampler, optional
         By default with the scenario's seed.
     data : Visibilities, path, or sequence of them, optional
-        Visibilities to use; without them the scenario's own are simulated.
+        Visibilities to use; if omitted, data are simulated from the scenario.
     resume : bool
-        Go on with the unfinished run in the folder, or take over a finished one.
+        Continue the unfinished run in the folder, or read a finished one.
     replace, stages : bool and Stages, optional
         As in :func:`.run_map`.
 
     Raises
     ------
     InputError
-        For a joint scenario, an unfinished run in the folder that is not to be resumed, and for
-        whatever is wrong with scenario, program, data or folder.
+        For a joint scenario, for an unfinished run in the folder unless ``resume``, and if
+        scenario, program, data or folder are invalid.
     """
     scenario = load_scenario(scenario)
     scenario = scenario if data is None else scenario.of_measured()
@@ -348,14 +348,14 @@ def run_sample(
 
 
 def samples_together(scenario: Scenario) -> bool:
-    """Whether channels share something that is sampled."""
+    """Whether channels share a sampled unknown."""
     treated = present(SYSTEMATICS, scenario)
     sampled = [one for one in treated if one[0].treatment(scenario) == "sampled"]
     return any(cls.octaves(section) for cls, section in sampled)
 
 
 def named(program: Program) -> str:
-    """What tells a program from others: its name, and a digest of its text."""
+    """Identify a program by its name and a digest of its text."""
     return f"{program.name} ({program.digest[:12]})"
 
 
@@ -377,7 +377,7 @@ SAMPLE_OUTPUTS = (
     Output.model("sampling.json", lambda run: run.figures()),
 )
 
-# what the folder of a sampled program holds; a new file is one line here
+# contents of the folder of a sampled program; a new file is one line here
 SAMPLE = RunKind(
     "sample",
     outputs=SAMPLE_OUTPUTS,
@@ -393,7 +393,7 @@ SAMPLE = RunKind(
     resume=RESUME,
 )
 
-# what the folder of several channels holds, besides a folder of each
+# contents of the folder of several channels, in addition to a folder for each
 CUBES = RunKind(
     "sampled cubes",
     outputs=(
@@ -407,7 +407,7 @@ CUBES = RunKind(
 
 
 def demand_of_calibration(scenario: Scenario) -> Demand:
-    """What simulation-based calibration takes, in batches that use all processors."""
+    """Resources for simulation-based calibration, in batches that use all processors."""
     return replace_fields(demand_of(scenario, n_draws=BATCH * N_DRAWS), side_by_side=1)
 
 
@@ -424,7 +424,7 @@ def run_validate(
     replace: bool = False,
     stages: Stages | None = None,
 ) -> RunOutcome[ValidationResult]:
-    """Check the analytic posterior of a scenario by HMC and by simulated data sets.
+    """Check the analytic posterior of a scenario with HMC and with simulated data sets.
 
     The folder is written in one transaction.
 
@@ -432,19 +432,19 @@ def run_validate(
     ----------
     scenario : Scenario, or its file or name
     folder : path
-        Of the results; draws are kept in it as they come.
+        Folder of the results; draws are saved in it while sampling.
     name : str
-        Of the scenario, for the title.
+        Name of the scenario, for the title.
     sampler : Sampler, optional
         By default with the scenario's seed.
     simulations : int
-        Data sets for simulation-based calibration.
+        Number of data sets for simulation-based calibration.
     data : Visibilities, path, or sequence of them, optional
-        Visibilities to use; without them the scenario's own are simulated.
+        Visibilities to use; if omitted, data are simulated from the scenario.
     resume : bool
-        Go on with the unfinished run in the folder, or judge the finished one again.
+        Continue the unfinished run in the folder, or test the finished one again.
     engine : Engine, optional
-        What works on the simulated data sets; by default this process.
+        Where simulated data sets are computed; by default in this process.
     replace, stages : bool and Stages, optional
         As in :func:`.run_map`.
 
@@ -479,7 +479,7 @@ def run_validate(
         return run.write(result, stages, Provenance.of_experiment(experiment, data))
 
 
-# what the folder of a validation holds; a new file is one line here
+# contents of the folder of a validation; a new file is one line here
 VALIDATION = RunKind(
     "validate",
     outputs=(

@@ -1,1 +1,1 @@
-"""p(m | d) by Hamiltonian Monte Carlo, and what it takes to trust the draws."""
+"""p(m | d) by Hamiltonian Monte Carlo, and validation of the draws."""

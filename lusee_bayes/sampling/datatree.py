@@ -1,4 +1,4 @@
-"""Draws as an ArviZ DataTree: every group that belongs to a sampled model, on netCDF."""
+"""Draws as an ArviZ DataTree, with every group of a sampled model, in netCDF."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from lusee_bayes.sampling import programs
 from lusee_bayes.sampling.hmc import Chains
 from lusee_bayes.systematics.systematic import SKY
 
-# what a file of samples holds at least
+# required contents of a file of samples
 STATISTIC = ("chain", "draw")
 GROUPS = Layout(
     "samples of lusee-bayes sample",
@@ -59,7 +59,7 @@ def to_datatree(
 
     The groups are posterior, sample_stats, prior, prior and posterior predictive, data and
     constants. Skies are on dims (chain, draw, mode) with coords ell and m, in K; data on (datum)
-    with coords product and time. Skies that programs integrate out are drawn unless they have been.
+    with coords product and time. If the program integrates the sky out, missing skies are drawn.
 
     Parameters
     ----------
@@ -70,17 +70,17 @@ def to_datatree(
     model : LinearGaussian
         The model with all systematics in N.
     posterior : Posterior
-        Its analytic posterior, kept among the constants.
+        Its analytic posterior, stored among the constants.
     data : Visibilities
         The data.
     seed : int
-        Of the predictive draws.
+        Seed of the predictive draws.
     n_predictive : int
-        Number of draws of the prior and of each predictive group.
+        Number of draws from the prior and in each predictive group.
     arguments : dict, optional
-        The program's arguments without the data, if they are not those of ``model``.
+        The program's arguments without the data, if they differ from those of ``model``.
     truth : dict, optional
-        True values of sites, kept among the constants as true_NAME.
+        True values of sites, stored among the constants as true_NAME.
     attributes : dict, optional
         Further attributes of the tree.
     """
@@ -132,7 +132,7 @@ def to_datatree(
 
 
 def _with_coordinates(tree: xr.DataTree, model: LinearGaussian, data: Visibilities) -> xr.DataTree:
-    """ell and m of every mode, product and time of every sample, and units."""
+    """Add ell and m of every mode, product and time of every sample, and units."""
     ell, m = mode_numbers(lmax_of(model.prior.size))
     coordinates = {
         "ell": ("mode", ell),
@@ -153,7 +153,7 @@ def _with_coordinates(tree: xr.DataTree, model: LinearGaussian, data: Visibiliti
 
 
 def read_datatree(path: str | Path) -> xr.DataTree:
-    """Read a file of samples, as ``lusee-bayes sample`` writes it.
+    """Read a file of samples that ``lusee-bayes sample`` has written.
 
     Raises
     ------

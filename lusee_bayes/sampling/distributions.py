@@ -1,6 +1,6 @@
-"""NumPyro pieces built on the package's objects, for use at sample sites.
+"""NumPyro distributions built from the package's objects, for use at sample sites.
 
-They say what is drawn of what, ::
+They are ::
 
     m ~ SkyPrior(S),    d ~ CorrelatedNormal(A m, N)
                         d ~ TimesStudentT(A m, N, layout, nu)    the same with bad times
@@ -54,7 +54,7 @@ class SkyPrior(dist.Distribution):
         super().__init__(event_shape=(prior.size,))
 
     def sample(self, key: PRNGKeyArray, sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
-        """Skies of the prior, ``(*sample_shape, unknowns)``, in K."""
+        """Skies from the prior, ``(*sample_shape, unknowns)``, in K."""
         n = int(np.prod(sample_shape))
         return self.prior.sample(key, n).reshape(*sample_shape, self.prior.size)
 
@@ -66,7 +66,7 @@ class SkyPrior(dist.Distribution):
 
 
 class Prediction(dist.Distribution):
-    """Data about a prediction: what a search for the mode needs to know besides ln p(d)."""
+    """Data about a prediction, with the misfit and residual for a search for the mode."""
 
     support = dist.constraints.real_vector
     pytree_data_fields = ("factor", "loc")
@@ -78,17 +78,17 @@ class Prediction(dist.Distribution):
 
     @abstractmethod
     def misfit(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Compute the part of -ln p(d) that depends on d, of every row of an array."""
+        """Compute the part of -ln p(d) that depends on d, for every row of an array."""
 
     @abstractmethod
     def residual(self, value: DataVector) -> DataVector:
-        """Compute r, with J^T r the gradient of the misfit by the prediction, J that of r.
+        """Compute r such that J^T r, with J its Jacobian, is the gradient of the misfit.
 
-        J^T J is the misfit's curvature, as Gauss and Newton take it.
+        Both derivatives are with respect to the prediction; J^T J is the Gauss-Newton curvature.
         """
 
     def _white(self, value: Float[Array, "..."]) -> Float[Array, "data rows"]:
-        """L^-1 (d - loc) of every row d of an array, N = L L^T."""
+        """L^-1 (d - loc) for every row d of an array, N = L L^T."""
         residual = value - self.loc.reshape(*(1,) * (value.ndim - 1), -1)
         return self.factor.whiten(residual.reshape(-1, self.loc.shape[0]).T)
 
@@ -101,7 +101,7 @@ class CorrelatedNormal(Prediction):
     loc : (data,) array
         Mean, in K.
     noise : Covariance or Factor
-        N. Where it is fixed, give ``noise.factor()``: it is then factorised once and not at every
+        N. If it is fixed, give ``noise.factor()``, so that it is factorised once and not at every
         evaluation of a model.
     """
 
@@ -117,7 +117,7 @@ class CorrelatedNormal(Prediction):
         return constant - self.misfit(value)
 
     def misfit(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Compute chi^2 / 2, of every row of an array."""
+        """Compute chi^2 / 2 for every row of an array."""
         return 0.5 * (self._white(value) ** 2).sum(0).reshape(value.shape[:-1])
 
     def residual(self, value: DataVector) -> DataVector:
@@ -140,7 +140,7 @@ class TimesStudentT(Prediction):
     loc : (data,) array
         Centre, in K.
     noise : Covariance or Factor
-        N, which must not couple different times: diagonal, or a block for each time. Where it is
+        N, which must not couple different times: diagonal, or a block for each time. If it is
         fixed, give ``noise.factor()``, as in CorrelatedNormal.
     layout : DataLayout
         The product and the time of every datum.
@@ -197,17 +197,17 @@ class TimesStudentT(Prediction):
         return constant - self.misfit(value)
 
     def misfit(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Compute the sum of (nu + n_t) / 2 ln(1 + chi^2_t / nu), of every row of an array."""
+        """Compute the sum of (nu + n_t) / 2 ln(1 + chi^2_t / nu) for every row of an array."""
         return jnp.log1p(self._chi2(value) / self.nu) @ (self.nu + self._data_of_times()) / 2.0
 
     def residual(self, value: DataVector) -> DataVector:
-        """Compute sqrt(w_t) L^-1 (d - loc), N = L L^T, with the weights w_t held."""
+        """Compute sqrt(w_t) L^-1 (d - loc), N = L L^T, with fixed weights w_t."""
         held = jax.lax.stop_gradient(jnp.sqrt(self.weights(value)))
         grid = jnp.broadcast_to(held[None], (self.layout.n_products, self.layout.n_times))
         return self.layout.gather(grid) * self.factor.whiten(value - self.loc)
 
     def weights(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Compute E[w_t | d, loc] = (nu + n_t) / (nu + chi^2_t) of n_t data, ``(..., times)``.
+        """Compute E[w_t | d, loc] = (nu + n_t) / (nu + chi^2_t) for n_t data, ``(..., times)``.
 
         Parameters
         ----------
@@ -221,7 +221,7 @@ class TimesStudentT(Prediction):
         return jnp.asarray(self.layout.present.sum(0), dtype=jnp.float64)
 
     def _chi2(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Chi^2 of the data of every time, (..., times)."""
+        """Chi^2 of the data at every time, (..., times)."""
         white = self.layout.scatter(self._white(value))
         return (white**2).sum(0).T.reshape(*value.shape[:-1], self.layout.n_times)
 
@@ -243,7 +243,7 @@ class Marginal(dist.Distribution):
         super().__init__(event_shape=(model.n_data,))
 
     def sample(self, key: PRNGKeyArray, sample_shape: tuple[int, ...] = ()) -> Float[Array, "..."]:
-        """Data vectors of skies of the prior, ``(*sample_shape, data)``, in K."""
+        """Data vectors for skies from the prior, ``(*sample_shape, data)``, in K."""
         keys = jax.random.split(key, int(np.prod(sample_shape)))
         return jax.vmap(lambda k: self.model.sample(k)[1])(keys).reshape(*sample_shape, -1)
 

@@ -1,7 +1,6 @@
-"""Which program suits the data better: evidences.
+"""Evidences, which compare how well programs fit the data.
 
-By importance sampling from the Gaussian about the posterior's mode (heavier in the tails), with the
-error.
+They are estimated, with errors, by importance sampling from a Student t about the posterior's mode.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ class Evidence:
     effective : float
         Effective number of draws.
     laplace : LaplaceApproximation
-        The Gaussian that the draws were proposed from.
+        The Gaussian about the mode, behind the proposal.
     """
 
     log_evidence: float
@@ -60,7 +59,7 @@ def estimate_evidence(
 ) -> Evidence:
     """Estimate ln p(d) with everything that the program samples integrated out.
 
-    Meant for programs of few sites, the sky integrated out. Trust it if the effective number of
+    Use it for programs with few sites, the sky integrated out. Trust it if the effective number of
     draws is a good share of ``n``.
 
     Parameters
@@ -68,18 +67,18 @@ def estimate_evidence(
     program : Program
         The program.
     arguments : mapping
-        What it asks for, without the data.
+        Its arguments, without the data.
     data : (data,) array
         d, in K.
     n : int
         Number of draws.
     seed : int
-        Of the draws.
+        Seed of the draws.
 
     Raises
     ------
     InputError
-        If the mode of the posterior is not found.
+        If the search for the posterior's mode does not converge.
     """
     arguments = {**arguments, DATA: jnp.asarray(data)}
     laplace = laplace_approximation(program.model, arguments)
@@ -101,7 +100,7 @@ def estimate_evidence(
 def _log_weights(
     program: Program, arguments: dict[str, Any], laplace: LaplaceApproximation, n: int, key
 ) -> Float[Array, " draws"]:
-    """ln of density over proposal, a Student t in the white coordinates."""
+    """ln of density over proposal, which is a Student t in the white coordinates."""
     whitening = laplace.whitening
     size = whitening.root.shape[1]
     proposal = dist.MultivariateStudentT(TAILS, jnp.zeros(size), jnp.eye(size))

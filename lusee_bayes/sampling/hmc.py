@@ -1,13 +1,13 @@
-"""Hamiltonian Monte Carlo of any NumPyro program: chains side by side that survive a kill.
+"""Hamiltonian Monte Carlo for any NumPyro program: parallel chains that survive a kill.
 
-Programs are sampled in coordinates in which their posterior is nearly round, if such are known:
-those of the sky's analytic posterior, or of :mod:`lusee_bayes.sampling.mode`. They change the speed
-of sampling, not its density, which is the program's own: ``whitened(program, whitening)`` samples m
-through z, m = mean + R z.
+Programs are sampled in coordinates in which their posterior is nearly round, if these are known
+from the sky's analytic posterior or from :mod:`lusee_bayes.sampling.mode`:
+``whitened(program, whitening)`` samples m through z, m = mean + R z. The coordinates change the
+speed of sampling, not the program's density.
 
-Draws are kept on disk as they come: a run that is killed at any moment goes on where it stopped.
-One file a chunk: the draws of that chunk and the state of the chains behind it, written whole or
-not at all. The last file is the place to go on from; nothing else needs to be consistent with it.
+Draws are saved while sampling: a run that is killed at any moment can be resumed. Each chunk has
+one file, with its draws and the state of the chains after it, written completely or not at all. A
+run resumes from the last file; nothing else needs to be consistent with it.
 """
 
 from __future__ import annotations
@@ -73,9 +73,9 @@ class Chains:
 
     @property
     def gradients(self) -> int:
-        """Evaluations of density and gradient, all chains together, warmup left out.
+        """Number of evaluations of density and gradient in all chains, without warmup.
 
-        Of the density alone for "crank-nicolson".
+        For "crank-nicolson", evaluations of the density only.
         """
         return int(self.statistics["n_steps"].sum())
 
@@ -83,8 +83,8 @@ class Chains:
 class Whitening(eqx.Module):
     """Coordinates z of one or more sites, x = mean + R z, in which a posterior is round.
 
-    x are the sites' values, unconstrained (numpyro's ``biject_to``), one site after the other;
-    with a chart, its coordinates of them.
+    x contains the sites' unconstrained values (numpyro's ``biject_to``), one site after the other;
+    with a chart, its coordinates for them.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class Whitening(eqx.Module):
     Raises
     ------
     InputError
-        If the sites have another number of values than the mean.
+        If the sites and the mean have different numbers of values.
     """
 
     mean: Float[Array, " unknowns"]
@@ -142,7 +142,7 @@ class Whitening(eqx.Module):
         return tuple(name for name, _ in self.sites)
 
     def split(self, x: Float[Array, " unknowns"]) -> dict[str, Float[Array, "..."]]:
-        """Split x by site, each in its shape."""
+        """Split x by site, and restore shapes."""
         ends = np.cumsum([math.prod(shape) for _, shape in self.sites])
         parts = zip(self.sites, jnp.split(x, ends[:-1]), strict=True)
         return {name: part.reshape(shape) for (name, shape), part in parts}
@@ -152,14 +152,14 @@ class Whitening(eqx.Module):
     ) -> tuple[dict[str, Float[Array, "..."]], Float[Array, ""]]:
         """Compute the sites' unconstrained values at x, and ln|det| of their derivative by x.
 
-        There are no derivatives by the sites ``hold``.
+        The sites ``hold`` have no derivatives.
         """
         values = self.split(x)
         values |= {n: jax.lax.stop_gradient(values[n]) for n in hold if n in values}
         return (values, jnp.zeros(())) if self.chart is None else self.chart.to_values(values)
 
     def from_values(self, values: Mapping[str, Float[Array, "..."]]) -> Float[Array, " unknowns"]:
-        """Compute x of the sites' unconstrained values."""
+        """Compute x from the sites' unconstrained values."""
         values = values if self.chart is None else self.chart.from_values(values)
         return jnp.concatenate([values[name].reshape(-1) for name in self.names])
 
@@ -167,8 +167,8 @@ class Whitening(eqx.Module):
 def whitened(program: Callable, whitening: Whitening) -> Callable:
     """Return a program that samples sites through z, x = mean + R z.
 
-    The density stays the program's own: its prior at x, times ``|det R|``. Only the coordinates are
-    those of some Gaussian; where it is not the posterior, sampling is slower and not wrong.
+    The density is still the program's: its prior at x, times ``|det R|``. A Gaussian only sets the
+    coordinates; if it differs from the posterior, sampling is slower but not wrong.
 
     Parameters
     ----------
@@ -180,13 +180,13 @@ def whitened(program: Callable, whitening: Whitening) -> Callable:
     Returns
     -------
     callable
-        The model with an improper site z, NAME_white of the first site. It cannot be drawn from
-        without a value for z; draw from ``program`` itself.
+        The model with an improper site z, called NAME_white after the first site. It needs a value
+        for z: to sample from the prior, use ``program``.
 
     Raises
     ------
     InputError
-        When it runs, if one of the sites is observed.
+        When the model runs, if one of the sites is observed.
     """
 
     def model(*args, **kwargs):
@@ -194,7 +194,7 @@ def whitened(program: Callable, whitening: Whitening) -> Callable:
         free = dist.ImproperUniform(dist.constraints.real_vector, (), (whitening.root.shape[1],))
         z = numpyro.sample(f"{first}{programs.WHITE_SUFFIX}", free)
         values, log_det = whitening.to_values(whitening.mean + whitening.root @ z)
-        # the determinant of all coordinates is counted once, with the first site
+        # the determinant of all coordinates is included once, with the first site
         log_dets = dict.fromkeys(whitening.names, 0.0) | {first: whitening.log_det + log_det}
         config = {name: _given(values[name], log_dets[name]) for name in whitening.names}
         with numpyro.handlers.reparam(config=config):
@@ -204,9 +204,9 @@ def whitened(program: Callable, whitening: Whitening) -> Callable:
 
 
 def _given(value: Float[Array, "..."], log_det: float | Float[Array, ""]) -> Callable:
-    """What makes a site with a given unconstrained value a deterministic one and its density.
+    """Reparametrise a site: its given unconstrained value is fixed, its density is a factor.
 
-    ``log_det``: of coordinates that the value was made of, added to the density.
+    ``log_det`` of the coordinates behind the value is added to the density.
     """
 
     def reparametrised(name, fn, obs):
@@ -271,15 +271,15 @@ class Checkpoints:
     folder : str or Path
         The folder.
     identity : dict
-        JSON values that tell the run from others.
+        JSON values that identify the run.
     resume : bool
-        Whether to go on with an unfinished run.
+        Whether to continue an unfinished run.
 
     Raises
     ------
     InputError
-        If the folder holds an unfinished run and ``resume`` is False, or another run, or draws of
-        an unknown one.
+        If the folder has an unfinished run and ``resume`` is False, or another run, or draws of an
+        unknown one.
     """
 
     def __init__(self, folder: str | Path, identity: dict[str, object], *, resume: bool):
@@ -333,7 +333,7 @@ class Checkpoints:
         return chunks
 
     def append(self, chunk: Chunk) -> None:
-        """Write the next chunk's file whole or not at all."""
+        """Write the next chunk's file completely or not at all."""
         arrays = {f"state:{i:03d}": leaf for i, leaf in enumerate(chunk.state)}
         arrays |= {f"draws:{name}": values for name, values in chunk.draws.items()}
         path = self.folder / f"chunk-{chunk.iteration:08d}.npz"
@@ -357,17 +357,17 @@ WHITE_DEPTH = 6
 
 
 class CrankNicolson(MCMCKernel):
-    """Turns of white coordinates, for a posterior near N(0, 1) whose gradient is dear.
+    """Rotations of white coordinates, for a posterior near N(0, 1) with an expensive gradient.
 
-    ::
+    The proposal ::
 
         z' = z cos a + p sin a,    p ~ N(0, 1),
 
-    is where Hamiltonian Monte Carlo arrives if the potential is z^2 / 2. It is taken with
-    probability min(1, w(z') / w(z)), w = p(z | d) / N(z; 0, 1): the draws are those of p(z | d)
-    (preconditioned Crank-Nicolson; Cotter et al. 2013, Statistical Science 28, 424). A quarter turn
-    forgets z. Warmup makes turns shorter while fewer are taken than is aimed at. Skies that the
-    program integrates out and returns are drawn with every z.
+    is the end of a Hamiltonian trajectory in the potential z^2 / 2. Accepting it with probability
+    min(1, w(z') / w(z)), w = p(z | d) / N(z; 0, 1), gives draws from p(z | d) (preconditioned
+    Crank-Nicolson; Cotter et al. 2013, Statistical Science 28, 424). After a quarter turn, z' does
+    not depend on z. Warmup makes turns shorter if the acceptance rate is below its target. Skies
+    that the program integrates out and returns are drawn with every z.
 
     Parameters
     ----------
@@ -376,9 +376,9 @@ class CrankNicolson(MCMCKernel):
     site : str
         Its only latent site, unconstrained.
     size : int
-        Of that.
+        Size of that site.
     turn, target : float
-        Longest a, and the acceptance rate that is aimed at.
+        Longest a, and the target of the acceptance rate.
     """
 
     sample_field = "z"
@@ -389,7 +389,7 @@ class CrankNicolson(MCMCKernel):
     def _looked(
         self, args: tuple, kwargs: dict, z: Array, key: PRNGKeyArray
     ) -> tuple[Float[Array, ""], dict[str, Array]]:
-        """-ln p at z, with z itself, and draws of the skies that are integrated out there."""
+        """-ln p at z; and z with draws of the skies that the program integrates out."""
         given = numpyro.handlers.substitute(numpyro.handlers.seed(self.model, key), {self.site: z})
         with numpyro.handlers.trace() as sites:
             returned = given(*args, **kwargs)
@@ -411,7 +411,7 @@ class CrankNicolson(MCMCKernel):
         return jnp.where(jnp.isnan(total), jnp.inf, total), drawn
 
     def init(self, rng_key, num_warmup, init_params, model_args, model_kwargs):
-        """The first state, of one chain or of all: a draw of N(0, 1)."""
+        """The first state of one chain, or of all: a sample from N(0, 1)."""
         self.warmup = num_warmup
         if rng_key.ndim > 1:
             given = num_warmup, init_params, model_args, model_kwargs
@@ -426,7 +426,7 @@ class CrankNicolson(MCMCKernel):
         return HMCState(**fields | {"accept_prob": zero, "mean_accept_prob": zero})
 
     def sample(self, state, model_args, model_kwargs):
-        """The next state, of one chain or of all."""
+        """The next state of one chain, or of all."""
         if state.rng_key.ndim > 1:
             return jax.vmap(lambda one: self.sample(one, model_args, model_kwargs))(state)
         key, of_turn, of_skies, of_choice = jax.random.split(state.rng_key, 4)
@@ -453,7 +453,7 @@ class CrankNicolson(MCMCKernel):
         )
 
     def postprocess_fn(self, model_args, model_kwargs):
-        """All sites of a draw, and its skies."""
+        """A function that returns all sites of a draw, and its skies."""
         given = self.model, model_args, model_kwargs
 
         def sites(z: dict[str, Array]) -> dict[str, Array]:
@@ -465,7 +465,7 @@ class CrankNicolson(MCMCKernel):
 
 @dataclass(frozen=True)
 class Sampler:
-    """How to sample.
+    """Settings of sampling.
 
     If all sites are white, the metric is known; otherwise warmup learns a diagonal one.
 
@@ -474,17 +474,17 @@ class Sampler:
     chains : int
         Number of chains.
     warmup : int
-        Iterations of each chain that find the step size, and are not kept.
+        Iterations of each chain that adapt the step size, and are discarded.
     draws : int
-        Draws of each chain that are kept.
+        Number of draws of each chain.
     seed : int
         Seed of all chains.
     algorithm : str or None
         "nuts"; "hmc" with trajectories of a fixed length; or "crank-nicolson", without gradients,
-        for a posterior that is known nearly. By default the last where rounds have found one, else
-        "nuts".
+        for a posterior with a close approximation. The default is the last if all sampled unknowns
+        are linear or inferred in rounds, else "nuts".
     target_accept : float
-        Acceptance rate at which the step size aims.
+        Target of the acceptance rate for the step size.
     trajectory : float
         Length of a trajectory of "hmc", longest of "crank-nicolson"; pi / 2 makes draws of a
         whitened Gaussian nearly independent.
@@ -513,14 +513,14 @@ class Sampler:
         require_known("unknown algorithm", self.algorithm or ALGORITHMS[0], ALGORITHMS)
 
     def identity(self) -> dict[str, object]:
-        """Return all settings but the number of draws: a run is resumed only with the same."""
+        """Return all settings except the number of draws: a resumed run must have the same."""
         return {name: value for name, value in asdict(self).items() if name != "draws"}
 
     def kernel(self, model: Callable, white: Whitening | None) -> HMC | CrankNicolson:
         """Make the NumPyro kernel of these settings.
 
-        In white coordinates the metric is known, the step size is near 1.5 n^-1/4, and after
-        half a period, pi / step, a trajectory only goes round: 2^6 - 1 steps are enough.
+        In white coordinates the metric is known, and the step size is near 1.5 n^-1/4. A trajectory
+        need not exceed half a period, pi / step: 2^6 - 1 steps are enough.
 
         Parameters
         ----------
@@ -532,7 +532,7 @@ class Sampler:
         Raises
         ------
         InputError
-            For "crank-nicolson" where not all coordinates are white.
+            For "crank-nicolson" unless all coordinates are white.
 
         References
         ----------
@@ -565,7 +565,7 @@ def sample(
 ) -> Chains:
     """Draw from the posterior of ``program(**arguments)``.
 
-    With several JAX devices, each takes as many chains if the number of chains allows it.
+    Several JAX devices share the chains equally, if their number allows it.
 
     Parameters
     ----------
@@ -574,12 +574,11 @@ def sample(
     arguments : mapping
         Its arguments, with the data.
     sampler : Sampler
-        How to sample.
+        Settings.
     whitening : Whitening, optional
         Coordinates of some of its sites.
     checkpoints : Checkpoints, optional
-        Where draws are kept. Draws that are there already are not drawn again; the result is the
-        same.
+        Saves draws. Draws saved earlier are read instead of repeated; the result is the same.
     report : callable
         Called with iteration and state after each chunk.
 
@@ -620,7 +619,7 @@ def sample(
 
 
 class _Run:
-    """A kernel with its model's arguments, and chunks of its iterations compiled once."""
+    """A kernel with its model's arguments; its chunks of iterations are compiled once."""
 
     def __init__(
         self, program: Callable, arguments: dict, sampler: Sampler, whitening: Whitening | None
@@ -637,19 +636,19 @@ class _Run:
                 f"{', '.join(latent)}"
             )
         self.sampler = sampler
-        # leaves of the model's arguments that are arrays are traced, the rest is structure
+        # arrays in the model's arguments are traced, everything else is static
         self.dynamic, static = eqx.partition((whitening, arguments), eqx.is_array)
         all_white = whitening if set(latent) == white else None
         self.kernel = sampler.kernel(lambda given: model(*eqx.combine(given, static)), all_white)
-        # XLA may stand still over batches of matrices to factorise where cores are few; several
-        # devices, each with a chain of its own, would only stand idle
+        # with few cores, XLA may hang in factorising batches of matrices; several devices, with one
+        # chain each, would only stand idle
         chart = None if whitening is None else whitening.chart
         factorises = not programs.predicts(program, arguments) or bool(chart and chart.factorises)
         self.one_by_one = len(jax.local_devices()) == 1 and factorises
         self.advance = jax.jit(self._advance)
 
     def _of_chains(self, function: Callable[[Any], HMCState], chains: Any) -> HMCState:
-        """Apply a function of NumPyro's that takes one chain or all of them."""
+        """Apply a NumPyro function, which takes one chain or all of them."""
         return jax.lax.map(function, chains) if self.one_by_one else function(chains)
 
     def start(self) -> HMCState:
@@ -663,7 +662,7 @@ class _Run:
         return self._shared_out(jax.jit(first)(keys, self.dynamic))
 
     def restore(self, like: HMCState, leaves: list[np.ndarray]) -> HMCState:
-        """The state whose leaves these are; ``like``: any state of this run."""
+        """Restore a state from its leaves; ``like``: any state of this run."""
         arrays = [
             jnp.asarray(new, dtype=old.dtype)
             for new, old in zip(leaves, jax.tree.leaves(like), strict=True)
@@ -671,9 +670,9 @@ class _Run:
         return self._shared_out(jax.tree.unflatten(jax.tree.structure(like), arrays))
 
     def _advance(self, state: HMCState, n, dynamic) -> tuple[HMCState, dict[str, Array]]:
-        """``n`` iterations: the state behind them, and rows (CHUNK, chains, ...), draws the first.
+        """Run ``n`` iterations: return the state after them, and rows (CHUNK, chains, ...).
 
-        ``n`` is traced: every chunk runs one compiled program.
+        The first ``n`` rows are draws. ``n`` is traced: every chunk runs one compiled program.
         """
 
         def sample(state):

@@ -1,10 +1,10 @@
-"""How many draws and simulations a judgement needs at least; nothing heavy is imported."""
+"""The fewest draws and simulations that a validation needs; imports nothing heavy."""
 
 from __future__ import annotations
 
 from lusee_bayes.core.errors import InputError
 
-# bins of a rank histogram, and the simulations that each should expect
+# number of bins of a rank histogram, and simulations expected in each
 N_BINS, PER_BIN = 20, 5
 
 
@@ -12,7 +12,7 @@ LEAST_DRAWS = 100
 
 
 def require_simulations(n: int) -> None:
-    """Raise InputError for too few data sets: each bin of the histogram should expect five."""
+    """Raise InputError for too few data sets: a histogram needs an average of five in each bin."""
     if n < PER_BIN * N_BINS:
         raise InputError(
             f"calibration needs at least {PER_BIN * N_BINS} simulations, {PER_BIN} for each of "
@@ -21,7 +21,7 @@ def require_simulations(n: int) -> None:
 
 
 def require_draws(n: int) -> None:
-    """Raise InputError for fewer draws of a chain than a comparison needs."""
+    """Raise InputError if a chain has fewer draws than a comparison needs."""
     if n < LEAST_DRAWS:
         raise InputError(
             f"a comparison needs {LEAST_DRAWS} draws of each chain, got {n}; raise --draws"

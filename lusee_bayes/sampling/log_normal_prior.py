@@ -1,4 +1,4 @@
-"""The prior of a positive sky, its C_ell known or not: what the program log_normal samples."""
+"""The prior of a positive sky, with fixed or sampled C_ell, for the program log_normal."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.sky.positive_skies import LogNormalSky
 from lusee_bayes.systematics.systematic import SKY
 
-# the sites: white unknowns of the sky, and what C_ell of its logarithm is made of
+# the sites: white unknowns of the sky, and the parameters of C_ell of its logarithm
 STRUCTURE, AMPLITUDE, TILT = "structure", "amplitude", "tilt"
 
 
 class LogNormalPrior(eqx.Module):
     """A log-normal sky with C_ell = A^2 ((ell + 1) / 10)^tilt of its logarithm.
 
-    ln A and the tilt are known, or Gaussian about these values.
+    ln A and the tilt are fixed, or have a Gaussian prior.
 
     Attributes
     ----------
     sky : LogNormalSky
-        With the expected C_ell, which are sampled beyond ell = 0 where they are not known.
+        With the expected C_ell. If these are not fixed, those beyond ell = 0 are sampled.
     expected : (2,) array
-        ln A and the tilt; their means, if they are not known.
+        ln A and the tilt, or their prior means.
     std : (2,) array or None
-        Standard deviations of both; None if they are known.
+        Prior standard deviations of both; None if they are fixed.
 
     Raises
     ------
@@ -52,14 +52,14 @@ class LogNormalPrior(eqx.Module):
 
     @property
     def sites(self) -> tuple[str, ...]:
-        """The sites that are sampled."""
+        """The sampled sites."""
         return (AMPLITUDE, TILT, STRUCTURE) if self.samples_spectrum else (STRUCTURE,)
 
     def sampled(self) -> Float[Array, " modes"]:
         """Sample the sky inside a NumPyro program.
 
-        The sites are ``structure``, white unknowns; where C_ell is not known, ``amplitude`` and
-        ``tilt``; and, following from these, ``sky``.
+        The sites are ``structure``, white unknowns; ``amplitude`` and ``tilt``, if C_ell is not
+        fixed; and ``sky``, which is computed from these.
 
         Returns
         -------

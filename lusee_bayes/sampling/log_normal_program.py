@@ -1,39 +1,38 @@
-"""A log-normal sky as a program samples it.
+"""Coordinates in which the posterior of a log-normal sky is straight.
 
-The program ``log_normal`` samples a positive sky whose C_ell are known or not, in coordinates in
-which its posterior is straight.
+The program ``log_normal`` uses them to sample a positive sky with fixed or sampled C_ell.
 
-The data know some combinations of the map to 1e-6 of what the prior allows. In the logarithm s of
-the sky these are curved surfaces: what the data leave open moves the map by s + s^2 / 2 + ..., and
-the second term alone is hundreds of standard deviations of what they know. With the white unknowns
-u of :class:`.LogNormalSky`, the information of the data and ::
+The data measure some combinations of the map to 1e-6 of the prior's width. In the logarithm s of
+the sky these are curved surfaces: unconstrained directions move the map by s + s^2 / 2 + ..., and
+the second term alone is hundreds of standard deviations of the measured combinations. With the
+white unknowns u of :class:`.LogNormalSky`, the information in the data and ::
 
     E(u) = chi^2(m(u)) / 2 + |u|^2 / 2,    H = J^T M J + 1,    J = dm/du,
 
-the mode u* is found by steps -(H + damping)^-1 grad E, halved until they lead downwards. H leaves
-out the second derivative of m, which the residuals multiply. Where steps are too long for that, as
-for sources of which there is less than catalogued, they are damped: what the data know is not, so
-that they stay where chi^2 is low. With H = V diag(w) V^T there, and directions V_g in groups of
-rising w, x is made u by ::
+the search for the mode u* takes steps -(H + damping)^-1 grad E, halved until they lead downwards.
+H omits the second derivative of m times the residuals. Steps that are too long for this, e.g. for
+sources fainter than catalogued, are damped. Damping leaves measured directions nearly unchanged, so
+chi^2 stays low. With H = V diag(w) V^T at the mode, and directions V_g in groups of increasing w, u
+is computed from x by ::
 
     u = u* + V_0 x_0 + sum_g V_g (k_g x_g + D_g(x_0, ..., x_g-1)),
 
-where D_g keeps what the data know of the map, J^T M (m - m*) along all stiffer directions, as it is
-at the mode. What D_g depends on are softer coordinates only, so that the determinant is one (that
-of the scales k, which are not one where C_ell is sampled), however well D_g does its work. A
-correction gains a factor of about the rms of what the data leave open of s, so that one is enough
-where groups differ by as much.
+where D_g keeps the measured part of the map, J^T M (m - m*) along all stiffer directions, at its
+value at the mode. D_g depends only on softer coordinates. So the determinant is exactly one (or
+that of the scales k, which are not one if C_ell is sampled), however accurate D_g is. A correction
+reduces the error by about the rms of the unconstrained part of s, so one is enough if groups differ
+by that factor.
 
-Where A and the tilt of C_ell are sampled, the mode is that of the most probable ones. With
+If A and the tilt of C_ell are sampled, the mode is the one at their most probable values. With
 r = d ln C^(1/2) / d theta, ::
 
     d ln p(d) / d theta = sum_i r_i (u_i^2 + (H^-1)_ii - 1),
     F = 2 sum_ij r_i (1 - H^-1)_ij^2 r_j
 
-are the slope of the evidence (the prior's own slope, averaged over a Gaussian posterior) and the
-Fisher information of data about theta. Steps F^-1 times the slope find where it is zero. F^-1 is
-also the covariance for the coordinates of theta; that of the slopes themselves was 0.8 to 1.5 times
-as large, which makes no difference to sampling.
+are the slope of the evidence (the slope of the prior, averaged over a Gaussian posterior) and the
+Fisher information of data about theta. Steps of F^-1 times the slope lead to its zero. F^-1 is also
+the covariance for the coordinates of theta; the covariance of the slopes themselves was 0.8 to 1.5
+times as large, which does not affect sampling.
 """
 
 from __future__ import annotations
@@ -57,38 +56,38 @@ from lusee_bayes.sampling.log_normal_prior import AMPLITUDE, STRUCTURE, TILT, Lo
 from lusee_bayes.sky.positive_skies import LogNormalSky, Pair, matching_step
 from lusee_bayes.systematics.systematic import Chart
 
-# arrays that recur
+# recurring types of arrays
 PairMatrix = Float[np.ndarray, "2 2"]
 Unknowns = Float[np.ndarray, " unknowns"]
 White = Float[Array, " unknowns"]
 
-# the mode is found when a step is shorter than this, in standard deviations, all unknowns together
+# the search ends when a step is shorter than this, in standard deviations of all unknowns together
 SETTLED = 1e-3
-# ... or than that after so many steps: where the curvature is far from H, the last ones are slow
+# ... or shorter than ROUGH after PATIENCE steps: if the curvature is far from H, the end is slow
 ROUGH, PATIENCE = 0.1, 40
-# a step of less than one standard deviation is taken as it is: what it gains may be rounding
+# a step shorter than this, in standard deviations, is not halved: its gain may be rounding
 SHORT = 1.0
 MAX_STEPS, HALVINGS = 100, 20
-# factor by which steps are damped more, after one that gains less than this part of what H
-# promises, or less, after one that gains more; near the mode not much less than what helped. What
-# a step gains is told from rounding if so much is promised
+# factor by which damping increases if a step gains less than the fraction POOR of the gain that H
+# predicts, and decreases above GOOD, near the mode not far below the value that helped; smaller
+# predictions than ROUNDING change nothing
 DAMPING, POOR, GOOD, ROUNDING = 4.0, 0.25, 0.75, 1e-5
-# A and the tilt are found when a step is shorter than this, in standard deviations
+# the search for A and the tilt ends when a step is shorter than this, in standard deviations
 SPECTRUM_SETTLED = 0.02
 SPECTRUM_STEPS = 30
-# steps of ln A and of the tilt up to which the slope is nearly straight
+# steps of ln A and of the tilt up to which the slope is nearly linear
 NEAR = 0.2
-# curvature from which on directions are made straight; the prior's is one
+# directions with more curvature than this are straightened; the prior's is one
 STIFF = 1.5
-# a correction gains the rms of s that is left open times this: with 1.25, the energy of 2304
-# unknowns differs from that of a Gaussian by 0.8 +- 1.1, with 0.4 by 3.2 +- 2.5
+# a correction reduces errors by this times the rms of the unconstrained s: with 1.25, the energy of
+# 2304 unknowns differs from a Gaussian's by 0.8 +- 1.1, with 0.4 by 3.2 +- 2.5
 GAIN = 1.25
-# least ln of the factor between groups: where the data leave s open, corrections gain nothing
+# smallest ln of the factor between groups: if s is unconstrained, corrections gain nothing
 LEAST = 1.0
 
 
 class StraightSky(Chart):
-    """The coordinates of the module's equations; without C_ell as unknowns, or with them.
+    """The coordinates of the module's equations, with fixed or sampled C_ell.
 
     Attributes
     ----------
@@ -103,7 +102,7 @@ class StraightSky(Chart):
     down : (directions, modes) array
         (w - 1)^-1 V^T J^T M: the inverse of J V on its span, in 1/K.
     bounds : tuple of int
-        Where each group of directions begins, and where the last ends.
+        Start of each group of directions, and the end of the last one.
     """
 
     sky: LogNormalSky
@@ -144,7 +143,7 @@ class StraightSky(Chart):
     def _begun(self, values: dict[str, Array]) -> tuple[LogNormalSky, Array, Array, White]:
         """The sky with the sites' C_ell, k, V^T (x - u*), and u* + V_0 x_0.
 
-        Where C_ell is not that of the mode, u* is what keeps the logarithm as it is there.
+        If C_ell differs from the mode's, u* is rescaled so that the logarithm is still the mode's.
         """
         linear = values[STRUCTURE] - self.white
         along = self.across.T @ linear
@@ -161,30 +160,30 @@ class StraightSky(Chart):
     def _correction(
         self, sky: LogNormalSky, white: White, scales: Float[Array, " directions"], group: slice
     ) -> Float[Array, " free"]:
-        """Steps along a group and all stiffer ones that bring the map nearer to the mode's."""
+        """Steps along a group and all stiffer ones that move the map towards the mode's."""
         off = sky.modes(white) - self.modes
         return -scales[group.start :] * (self.down[group.start :] @ off)
 
 
 @dataclass(frozen=True)
 class LogNormalMode:
-    """The likeliest sky, and the curvature there.
+    """The most probable sky, and the curvature there.
 
     Attributes
     ----------
     sky : LogNormalSky
     information : Information
-        Of the data; its reference is the sky of the mode.
+        Information in the data; its reference is the mode's sky.
     white : (unknowns,) array
-        u of the mode.
+        u at the mode.
     jacobian : (modes, unknowns) array
-        J there, in K.
+        J at the mode, in K.
     lower : (unknowns, unknowns) array
         L of H = L L^T.
     power_law : (2,) array, optional
-        ln A and the tilt of C_ell, where they are unknowns as well.
+        ln A and the tilt of C_ell, if they are unknowns.
     covariance : (2, 2) array, optional
-        Of these.
+        Covariance of ln A and the tilt.
     """
 
     sky: LogNormalSky
@@ -197,33 +196,33 @@ class LogNormalMode:
 
     @property
     def modes(self) -> Float[np.ndarray, " modes"]:
-        """The sky of the mode: real packed coefficients, Galactic, in K."""
+        """The mode's sky: real packed coefficients, Galactic, in K."""
         return np.asarray(self.information.reference)
 
 
 def find_mode(
     sky: LogNormalSky, information: Information, start: Unknowns | None = None
 ) -> LogNormalMode:
-    """Climb to the mode of p(u | d).
+    """Find the mode of p(u | d).
 
     Parameters
     ----------
     sky : LogNormalSky
         The prior.
     information : Information
-        Of the data.
+        Information in the data.
     start : (unknowns,) array, optional
-        u to begin from; by default zero, the template itself.
+        u of the start; by default zero, i.e. the template.
 
     Returns
     -------
     LogNormalMode
-        In NumPy's arrays.
+        In NumPy arrays.
 
     Raises
     ------
     InputError
-        If the information is of another lmax, or no mode is found in 100 steps.
+        If the information has another lmax, or the search does not converge in 100 steps.
     """
     sky, information = on_host((sky, information))
     require_shape("the information", information.matrix, (sky.n_modes, sky.n_modes))
@@ -261,18 +260,18 @@ def find_mode(
 
 
 def _energy(information: Information, white: Unknowns) -> float:
-    """2 E, at the sky that the information is about."""
+    """2 E at the reference sky of the information."""
     return float(information.misfit) + float(white @ white)
 
 
 def _descended(
     sky: LogNormalSky, local: Information, white: Unknowns, step: Unknowns, short: bool
 ) -> tuple[Unknowns, Information]:
-    """The unknowns behind a step, and the information about their sky."""
+    """The unknowns after a step, and the information about their sky."""
     energy = _energy(local, white)
     for _ in range(HALVINGS):
         trial = white - step
-        # far from the mode the sky may leave the range of numbers, which no energy is below
+        # far from the mode the sky may overflow: such a step is halved
         with np.errstate(over="ignore", invalid="ignore"):
             moved = local.recentred(sky.modes(trial))
             if short or _energy(moved, trial) < energy:
@@ -287,14 +286,14 @@ def learn_spectrum(prior: LogNormalPrior, information: Information) -> LogNormal
     Parameters
     ----------
     prior : LogNormalPrior
-        With A and tilt not known.
+        With sampled A and tilt.
     information : Information
-        Of the data.
+        Information in the data.
 
     Raises
     ------
     InputError
-        If no maximum is found in 30 steps, or for one of them no mode.
+        If the search does not converge in 30 steps, or one of them finds no mode.
     """
     sky, start = prior.sky, None
     centre, narrow = prior.expected, prior.std**-2.0
@@ -310,7 +309,7 @@ def learn_spectrum(prior: LogNormalPrior, information: Information) -> LogNormal
         if np.abs(step).max() > NEAR:
             power = mode.white[: sky.n_modes] ** 2
             step = matching_step(power, known, sky.power_law_slopes(), theta - centre, narrow)
-        # near by, the logarithm stays as it is: the data know it
+        # after a short step, keep the logarithm, which the data measure
         theta = theta + step
         ratio = sky.root() / sky.with_power_law(np.exp(theta[0]), theta[1]).root()
         start = mode.white * ratio if np.abs(step).max() < NEAR else None
@@ -321,7 +320,7 @@ def learn_spectrum(prior: LogNormalPrior, information: Information) -> LogNormal
 
 
 def _evidence_about(mode: LogNormalMode) -> tuple[Pair, PairMatrix, Unknowns]:
-    """Slope of the evidence, Fisher information, and 1 - (H^-1)_ii of every mode of the map."""
+    """Slope of the evidence, Fisher information, and 1 - (H^-1)_ii for every mode of the map."""
     sky, slopes = mode.sky, mode.sky.power_law_slopes()
     left = linalg.inverse_from_cholesky(mode.lower)[: sky.n_modes, : sky.n_modes]
     slope = slopes @ (mode.white[: sky.n_modes] ** 2 + np.diagonal(left) - 1.0)
@@ -336,7 +335,7 @@ def coordinates_of(prior: LogNormalPrior, information: Information) -> Whitening
     ----------
     prior : LogNormalPrior
     information : Information
-        Of the data.
+        Information in the data.
 
     Raises
     ------
@@ -359,8 +358,8 @@ def straight_coordinates(mode: LogNormalMode) -> Whitening:
     Returns
     -------
     Whitening
-        Of the site ``structure``, behind ``amplitude`` and ``tilt`` where they are unknowns; in
-        JAX's arrays.
+        For the site ``structure``, after ``amplitude`` and ``tilt`` if they are unknowns; in JAX
+        arrays.
     """
     strength, vectors = np.linalg.eigh(mode.lower @ mode.lower.T)
     stiff = slice(int(np.searchsorted(strength, STIFF)), None)
@@ -369,7 +368,7 @@ def straight_coordinates(mode: LogNormalMode) -> Whitening:
     down = pulled / (strength[stiff] - 1.0)[:, None]
     root = vectors / np.sqrt(strength)[None]
     left_open = ((mode.sky.root()[:, None] * root)[: mode.sky.n_modes] ** 2).sum() / (4.0 * np.pi)
-    if mode.covariance is not None:  # C_ell moves the logarithm, too, where it is not known
+    if mode.covariance is not None:  # a sampled C_ell moves the logarithm, too
         slopes = mode.sky.power_law_slopes()[:, 1:]
         left_open += np.einsum("im,ij,jm->m", slopes, mode.covariance, slopes).max()
     bounds = _bounds(strength[stiff], GAIN**2 * left_open)
@@ -385,7 +384,7 @@ def straight_coordinates(mode: LogNormalMode) -> Whitening:
 
 
 def _bounds(strength: Float[np.ndarray, " directions"], gain: float) -> tuple[int, ...]:
-    """Where groups begin in which curvatures differ by less than the squared gain."""
+    """Bounds of groups in which curvatures differ by less than a factor max(1 / gain, e^LEAST)."""
     group = np.floor(np.log(strength / STIFF) / max(np.log(1.0 / gain), LEAST)).astype(int)
     first = np.flatnonzero(np.diff(group, prepend=-1))
     return (*first.tolist(), len(strength))

@@ -1,15 +1,15 @@
-"""The mode of a program, the curvature there, and how uncertain quantities are.
+"""The mode of a program, the curvature there, and the uncertainty of quantities.
 
-Mode and curvature say where sampling is to begin, and in which coordinates. The curvature is the
-Hessian where few sites are sampled (the sky integrated out). Where a program predicts the data at a
-site CorrelatedNormal, as d ~ N(f(x), N), it is that of Gauss and Newton, J^T N^-1 J plus that of
-the prior, J the derivative of f: for the sky and thousands of other unknowns at once. At a site
-TimesStudentT every time has its weight in N^-1. Both only serve as coordinates; the density sampled
-is the program's own.
+Mode and curvature give the start and the coordinates of sampling. The curvature is the Hessian if
+few sites are sampled (the sky integrated out). If a program predicts the data at a site
+CorrelatedNormal, as d ~ N(f(x), N), the curvature is that of Gauss and Newton, J^T N^-1 J plus the
+prior's, J the derivative of f: it handles the sky and thousands of other unknowns at once. At a
+site TimesStudentT, N^-1 includes a weight for every time. Mode and curvature only set coordinates;
+the density sampled is the program's own.
 
-Of draws of the sky there are maps of standard deviations and intervals, and which region is
-brighter. Skies are draws (chains, draws, modes) of Galactic harmonic coefficients in K, by HMC or
-:meth:`Posterior.sample`; maps are HEALPix RING, Galactic, in K.
+Draws of the sky give maps of standard deviations and intervals, and statistics of chosen
+quantities. Skies are draws (chains, draws, modes) of Galactic harmonic coefficients in K, from HMC
+or :meth:`Posterior.sample`; maps are HEALPix RING, Galactic, in K.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from lusee_bayes.sampling.hmc import Whitening
 from lusee_bayes.sampling.programs import latent_of, numpyro_promotion
 from lusee_bayes.systematics.systematic import MOST_COLLAPSED, Chart
 
-# arrays that recur
+# recurring types of arrays
 Coordinates = Float[Array, " n"]
 Matrix = Float[Array, "n n"]
 Skies = Float[np.ndarray, "chains draws modes"]
@@ -46,12 +46,12 @@ Quantity = Float[np.ndarray, "chains draws"]
 
 # step of the differences that give the Hessian, in standard deviations
 DIFFERENCE = 0.1
-# columns of the Jacobian at once: more would take more memory than time they save
+# columns of the Jacobian at once: more would cost memory and save little time
 COLUMNS = 64
 
 
 class Potential(eqx.Module):
-    """Minus the log posterior of a program's unconstrained coordinates x.
+    """Minus the log posterior as a function of a program's unconstrained coordinates x.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class Potential(eqx.Module):
     predicts : bool
         Whether the program predicts the data, at sites CorrelatedNormal or TimesStudentT.
     hold : tuple of str
-        Sites that are held where they are.
+        Fixed sites.
     """
 
     program: Callable = eqx.field(static=True)
@@ -74,22 +74,22 @@ class Potential(eqx.Module):
     hold: tuple[str, ...] = eqx.field(static=True)
 
     def held(self) -> np.ndarray:
-        """Return the positions in x of what is held."""
+        """Return the positions of fixed sites in x."""
         sites = self.shapes.sites
         parts = [np.full(int(np.prod(shape)), name in self.hold) for name, shape in sites]
         return np.flatnonzero(np.concatenate(parts))
 
     def value(self, x: Coordinates, still: bool = False) -> Float[Array, ""]:
-        """Return it at x; ``still``: without derivatives by what is held."""
+        """Return the potential at x; ``still``: without derivatives by fixed sites."""
         values, log_det = self.shapes.to_values(x, self.hold if still else ())
         return potential_energy(self.program, (), self.arguments, values) - log_det
 
     def residual(self, x: Coordinates, still: bool = False) -> Float[Array, " data"]:
-        """Return the residuals of all sites that predict, such as L^-1 (d - f(x)), N = L L^T."""
+        """Return the residuals of all predicting sites, e.g. L^-1 (d - f(x)), N = L L^T."""
         return jnp.concatenate([fn.residual(value) for fn, value in self._predictions(x, still)])
 
     def misfit(self, x: Coordinates, still: bool = False) -> Float[Array, ""]:
-        """Return the misfit of all sites that predict, such as chi^2 / 2."""
+        """Return the misfit of all predicting sites, e.g. chi^2 / 2."""
         return sum((fn.misfit(value) for fn, value in self._predictions(x, still)), jnp.zeros(()))
 
     def _predictions(self, x: Coordinates, still: bool) -> list[tuple[Prediction, Array]]:
@@ -105,12 +105,12 @@ class Potential(eqx.Module):
     def gradient_and_curvature(self, x: Coordinates, scale: Coordinates) -> tuple[Array, Array]:
         """Return both at x; ``scale``: lengths over which the potential is a parabola.
 
-        The curvature is that of Gauss and Newton where the program predicts the data, else the
-        Hessian by differences of gradients.
+        The curvature is that of Gauss and Newton if the program predicts the data, else the
+        Hessian from differences of gradients.
         """
         slope = jax.grad(self.value)
         if not self.predicts:
-            # all in one map: second derivatives of banded factors take minutes to compile
+            # one map of gradients: second derivatives of banded factors take minutes to compile
             steps = DIFFERENCE * jnp.diag(scale)
             places = jnp.concatenate([x[None], x[None] + steps, x[None] - steps])
             gradients = jax.lax.map(slope, places)
@@ -128,8 +128,8 @@ class Potential(eqx.Module):
     def _derivatives(self, f: Callable[..., Array], x: Coordinates) -> Float[Array, "n m"]:
         """The transposed Jacobian of f(x, still).
 
-        Apart for what is held: charts need matrices that only scales change, and products of
-        those with every other direction would take longer than all the rest.
+        Fixed sites are differentiated separately: a chart's matrices depend only on scales, and
+        their products with every other direction would take longer than everything else.
         """
         held = self.held()
         unit = jnp.eye(x.shape[0])
@@ -142,18 +142,18 @@ class Potential(eqx.Module):
 
 
 def root_of_inverse(curvature: Matrix, problem: Potential) -> tuple[Array, Array]:
-    """Return R and whether all curvature is positive; R R^T inverts its absolute value."""
+    """Return R, where R R^T inverts the absolute curvature, and whether all of it is positive."""
     if not problem.predicts:
         return _root_of_any_sign(curvature)
     lower = jnp.linalg.cholesky(curvature)
     root = jax.scipy.linalg.solve_triangular(lower, jnp.eye(len(lower)), lower=True).T
-    # priors need not curve upwards everywhere
+    # the curvature of a prior need not be positive everywhere
     positive = jnp.isfinite(root).all()
     return jax.lax.cond(positive, lambda: (root, positive), lambda: _root_of_any_sign(curvature))
 
 
 def _root_of_any_sign(curvature: Matrix) -> tuple[Array, Array]:
-    # in units of its own diagonal, since parameters come in any
+    # in units of its diagonal, because parameters have any units
     scale = 1.0 / jnp.sqrt(jnp.abs(jnp.diagonal(curvature)))
     values, vectors = jnp.linalg.eigh(curvature * scale[:, None] * scale[None])
     least = np.finfo(np.float64).eps * jnp.abs(values).max()
@@ -161,15 +161,15 @@ def _root_of_any_sign(curvature: Matrix) -> tuple[Array, Array]:
     return scale[:, None] * vectors / jnp.sqrt(strength)[None], (values > 0).all()
 
 
-# the mode is found when a step is shorter than this, rms in standard deviations: near enough for
-# coordinates, and longer than what rounding of a log evidence makes (1e-7, or 5e-4 of one)
+# the search ends when a step is shorter than this, rms in standard deviations: near enough for
+# coordinates, and longer than steps from rounding of a log evidence (1e-7, or 5e-4 of one)
 SETTLED = 1e-2
 MAX_STEPS = 100
-# a step is halved this often at most until it leads downwards
+# most halvings of a step until it leads downwards
 HALVINGS = 20
-# what is tried at first, in standard deviations of the prior
+# first scale for differences, in standard deviations of the prior
 FIRST = 1e-3
-# draws of the prior that are looked at for every further start
+# samples from the prior that are compared for every further start
 CANDIDATES = 12
 
 
@@ -185,7 +185,7 @@ class LaplaceApproximation(eqx.Module):
     moved : () array
         Length of the last step, rms in standard deviations.
     steps : () array
-        How many steps were taken.
+        Number of steps.
     """
 
     whitening: Whitening
@@ -195,7 +195,7 @@ class LaplaceApproximation(eqx.Module):
 
     @property
     def converged(self) -> Bool[Array, "..."]:
-        """Whether the mode was found."""
+        """Whether the search reached the mode."""
         return self.moved < SETTLED
 
 
@@ -217,13 +217,13 @@ def laplace_approximation(
     arguments : mapping
         Its arguments, with the data.
     start : mapping of array, optional
-        Values of sites to begin from, by default the medians of their priors.
+        Start values of sites, by default the medians of their priors.
     hold : sequence of str
-        Sites that stay there, such as the standard deviation of thousands of others: where both
+        Sites fixed at the start, such as the standard deviation of thousands of others: if both
         are sampled, the joint mode lies far from the bulk of the posterior.
     starts : int
-        How many places to climb from: the first, and the likeliest of some draws of the prior.
-        Of several modes, the one with the most weight is taken.
+        Number of starting points: ``start``, and the most probable of some samples from the prior.
+        Of several modes, the one with the highest evidence is returned.
     chart : Chart, optional
         Coordinates in which ridges are straight.
 
@@ -274,7 +274,7 @@ def _unconstrained(site: dict) -> Float[Array, "..."]:
 def _drawn(
     program: Callable, arguments: dict, shapes: Whitening, n: int
 ) -> Float[Array, "draws unknowns"]:
-    """Coordinates of sites drawn from the prior."""
+    """Coordinates of samples from the prior."""
 
     def one(key):
         trace = handlers.trace(handlers.seed(program, key)).get_trace(**arguments)
@@ -308,15 +308,15 @@ def _prior_scale(latent: dict) -> Coordinates:
 def _climb(
     problem: Potential, first: Coordinates, free: Coordinates, scale: Coordinates
 ) -> LaplaceApproximation:
-    """Newton's method with halved steps; where the curvature is negative, its absolute value.
+    """Newton's method with halved steps, using absolute values of negative curvature.
 
-    free : 1 where x may move, 0 where it is held
+    free : 1 where x may move, 0 where it is fixed
     """
 
     def look(x, scale):
         """Newton's step at x, its length, and the coordinates' root."""
         gradient, curvature = problem.gradient_and_curvature(x, scale)
-        # of what is held only the diagonal stays, made positive: its block may not be
+        # fixed sites keep only the diagonal, made positive: their block may not be
         diagonal = jnp.abs(jnp.diagonal(curvature))
         curvature = curvature * free[:, None] * free[None] + jnp.diag((1.0 - free) * diagonal)
         root, positive = root_of_inverse(curvature, problem)
@@ -341,7 +341,7 @@ def _climb(
         length, trial, _ = jax.lax.while_loop(worse, halve, start)
         better = trial <= value
         x = jnp.where(better, x - length * direction, x)
-        # where no step leads downwards, the search has failed
+        # if no step leads downwards, the search has failed
         n = jnp.where(better, n + 1, MAX_STEPS)
         return x, jnp.where(better, trial, value), *look(x, scale), n
 
@@ -357,7 +357,7 @@ def _climb(
     return LaplaceApproximation(whitening, log_evidence, moved, n)
 
 
-# pixels of which all draws are held at once
+# number of pixels whose draws are in memory at once
 CHUNK = 1024
 
 # columns of summaries: the same with ArviZ 0.8 and 1.x
@@ -365,7 +365,7 @@ INTERVAL = 0.9
 
 
 def pixel_statistics(skies: Skies, nside: int) -> dict[str, Float[np.ndarray, " pixels"]]:
-    """Compute what the draws say of every pixel.
+    """Compute statistics of every pixel from the draws.
 
     Parameters
     ----------
@@ -406,9 +406,9 @@ def sky_quantities(
     modes : sequence of (int, int)
         Modes (ell, m).
     ells : sequence of int
-        Of powers C_ell.
+        Multipoles of powers C_ell.
     pixels : mapping of (float, float), optional
-        Galactic longitude and latitude in degrees of brightnesses, by name.
+        Directions of brightnesses by name: Galactic longitude and latitude in degrees.
 
     Raises
     ------
@@ -444,5 +444,5 @@ def summary(quantities: Mapping[str, Quantity]) -> pd.DataFrame:
         Draws by name.
     """
     tree = arviz_base.from_dict({"posterior": dict(quantities)}, check_conventions=False)
-    with np.errstate(all="ignore"):  # of chains that have not moved; NaN then says so
+    with np.errstate(all="ignore"):  # NaN marks chains that have not moved
         return arviz_stats.summary(tree, ci_prob=INTERVAL, ci_kind="eti", round_to="none")

@@ -1,4 +1,4 @@
-"""NumPyro programs: files with a ``model``, what they can ask for, and what their sites must be.
+"""NumPyro programs: files with a ``model``, their possible arguments, and rules for their sites.
 
 NumPyro runs under JAX's standard rules of types and ranks, the package under strict ones
 (:func:`numpyro_promotion`).
@@ -43,23 +43,23 @@ from lusee_bayes.systematics.systematic import SKY
 def numpyro_promotion() -> Iterator[None]:
     """Allow JAX's standard promotion of types and ranks.
 
-    NumPyro's own code mixes types and ranks, whatever rules are set for ours. Use it around calls
-    of NumPyro, or as the decorator ``@numpyro_promotion()`` of functions that make them.
+    NumPyro's code mixes types and ranks, whatever rules our code follows. Use this around calls of
+    NumPyro, or as the decorator ``@numpyro_promotion()`` of functions that make them.
     """
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         yield
 
 
-# the programs that come along: beside the package in a checkout, inside it once installed
+# folders of the package's programs: beside it in a checkout, inside it once installed
 PACKAGE = Path(__file__).parents[1]
 FOLDERS = (PACKAGE / "models", PACKAGE.parent / "models")
 
 # the site of the data, and the argument that it observes
 DATA = "data"
-# a site in white coordinates is that of the program with this appended
+# suffix of a program's site in white coordinates
 WHITE_SUFFIX = "_white"
 
-# what a program's arguments may be called: pieces of the model with all systematics in N, ...
+# possible names of a program's arguments: pieces of the model with all systematics in N, ...
 PIECES: dict[str, Callable[[LinearGaussian], Any]] = {
     "coupling": lambda model: model.coupling,
     "offset": lambda model: jnp.zeros(model.n_data) if model.offset is None else model.offset,
@@ -68,8 +68,8 @@ PIECES: dict[str, Callable[[LinearGaussian], Any]] = {
     "fixed_noise": lambda model: model.noise.factor(),
 }
 
-# ... and of the experiment: the model without those that are to be sampled, they themselves, and
-# the product and time of every datum
+# ... and of the experiment: the model without sampled systematics, these systematics, and the
+# product and time of every datum
 EXPERIMENT_PIECES = ("gaussian", "systematics", "gain_drifts", "instrument")
 EXPERIMENT_PIECES += ("sources", "log_normal", "layout")
 
@@ -78,8 +78,8 @@ EXPERIMENT_PIECES += ("sources", "log_normal", "layout")
 class Program:
     """A NumPyro model whose arguments are ``data`` and pieces of a model or an experiment.
 
-    Called with ``data=None`` it is the prior predictive. If it returns a LinearGaussian, it has
-    integrated the sky out; :func:`collapsed_draws` then draws it.
+    Called with ``data=None``, it is the prior predictive. If it returns a LinearGaussian, it has
+    integrated the sky out; :func:`collapsed_draws` then draws the sky.
 
     Attributes
     ----------
@@ -101,21 +101,21 @@ class Program:
     def arguments(
         self, model: LinearGaussian, more: Mapping[str, Callable[[], Any]] | None = None
     ) -> dict[str, Any]:
-        """Collect what the program asks for; all but the data.
+        """Collect the program's arguments except for the data.
 
         Parameters
         ----------
         model : LinearGaussian
             With all systematics in N; its pieces are ``PIECES``.
         more : mapping of callable, optional
-            What makes the pieces of an experiment, by name
+            Functions that make the pieces of an experiment, by name
             (:func:`lusee_bayes.experiment.experiment.program_pieces`).
 
         Raises
         ------
         InputError
-            If the program asks for a piece that is not there, or for A alone where the data hold
-            more than the sky.
+            If the program asks for a missing piece, or for A without the offset although the data
+            contain more than the sky.
         """
         names = inspect.signature(self.model).parameters
         if "coupling" in names and "offset" not in names and model.offset is not None:
@@ -150,14 +150,14 @@ def load_program(source: str | Path) -> Program:
     Raises
     ------
     InputError
-        If there is none, if it cannot be run, or if it asks for something unknown.
+        If there is no such program, if it fails to load, or if it asks for an unknown argument.
     """
     path = _find(source)
     text = read_text(path, "a program in Python").encode()
     module = ModuleType(f"lusee_bayes_program_{path.stem}")
     module.__file__ = str(path)
-    # compiled from the text that is hashed, never from a cache of an earlier one; dataclasses look
-    # their module up by name
+    # compiled from the hashed text, never from a cache of an earlier one; dataclasses look up their
+    # module by name
     sys.modules[module.__name__] = module
     with _blaming(f"the program '{path}'", "when it is loaded"):
         exec(compile(text, printable(str(path)), "exec", dont_inherit=True), module.__dict__)
@@ -197,7 +197,7 @@ def _find(source: str | Path) -> Path:
 
 
 def traced(program: Callable, arguments: Mapping[str, Any]) -> tuple[dict[str, dict], Any]:
-    """Return the sites of a program by name, and what it returns, without running it."""
+    """Return the sites of a program by name, and its result, without running it."""
     traces = []
 
     def run(arguments):
@@ -211,26 +211,26 @@ def traced(program: Callable, arguments: Mapping[str, Any]) -> tuple[dict[str, d
 
 
 def is_collapsed(program: Program, arguments: dict[str, Any], data: Array) -> bool:
-    """Tell whether the program integrates the sky out: its model returns a LinearGaussian."""
+    """Return whether the program integrates the sky out: its model returns a LinearGaussian."""
     return isinstance(traced(program.model, {**arguments, DATA: data})[1], LinearGaussian)
 
 
 def predicts(program: Callable, arguments: dict, kind: type[Prediction] = Prediction) -> bool:
-    """Tell whether a program has a site CorrelatedNormal or TimesStudentT, or of one ``kind``.
+    """Return whether a program has a site CorrelatedNormal or TimesStudentT, or of one ``kind``.
 
-    It then samples everything that they depend on, and its density needs matrix products only.
+    It then samples everything that they depend on, and its density needs only matrix products.
     """
     sites = traced(program, arguments)[0].values()
     return any(site["type"] == "sample" and isinstance(site["fn"], kind) for site in sites)
 
 
 def latent_sites(program: Callable, arguments: dict) -> list[str]:
-    """Return the names of the sites that a program samples and does not observe."""
+    """Return the names of a program's latent sites: sampled, but not observed."""
     return latent_of(traced(program, arguments)[0])
 
 
 def latent_of(sites: Mapping[str, dict]) -> list[str]:
-    """Return the names of those of a program's sites that it samples and does not observe."""
+    """Return the names of the latent sites among a program's sites."""
     return [n for n, s in sites.items() if s["type"] == "sample" and not s["is_observed"]]
 
 
@@ -248,22 +248,22 @@ def collapsed_draws(
     Parameters
     ----------
     program : Program
-        One that integrates the sky out.
+        A program that integrates the sky out.
     arguments : dict
-        What it asks for, without the data.
+        Its arguments, without the data.
     data : (data,) array
         d, in K.
     sites : dict of (chains, draws, ...) array
         Draws by site.
     key : PRNG key
-        Of the skies, or of the noise.
+        Key for the skies, or for the noise.
     skies : (chains, draws, modes) array, optional
-        Those that were drawn, in K.
+        Skies drawn earlier, in K.
 
     Returns
     -------
     (chains, draws, modes) or (chains, draws, data) array
-        Skies; or, of skies that are given, data with new noise. In K.
+        Skies; or, if ``skies`` are given, their data with new noise. In K.
     """
 
     def model():
@@ -278,16 +278,16 @@ def collapsed_draws(
     return np.asarray(Predictive(model, given, batch_ndims=2, return_sites=[drawn])(key)[drawn])
 
 
-# names that samples.nc uses for something else
+# names that samples.nc reserves
 TAKEN = ("chain", "draw", "mode", "datum", "ell", "m", "product", "time")
-# what netCDF, summaries and tables can name without quotes
+# names that netCDF, summaries and tables accept without quotes
 NAME = re.compile(r"[^\W\d][\w.\-]*")
 
 
 def require_sampleable(
     program: Program, arguments: dict[str, Any], data: Float[Array, " data"], n_modes: int
 ) -> list[str]:
-    """Check that a program can be sampled, and that draws of the sky come of it.
+    """Check that a program can be sampled, and that it gives draws of the sky.
 
     The program is traced, not run: no density is computed.
 
@@ -295,11 +295,11 @@ def require_sampleable(
     ----------
     program : Program
     arguments : dict
-        What it asks for, without the data.
+        Its arguments, without the data.
     data : (data,) array
         d, in K.
     n_modes : int
-        Harmonic coefficients of the sky.
+        Number of harmonic coefficients of the sky.
 
     Returns
     -------
@@ -309,9 +309,9 @@ def require_sampleable(
     Raises
     ------
     InputError
-        If it fails when it is called, with or without data; if one of its sites cannot be sampled
-        or kept; if ``data`` is not what it observes; or if it neither samples or computes the sky
-        nor returns a LinearGaussian to draw it from.
+        If it fails when called with or without data, if a site cannot be sampled or stored, if it
+        does not observe ``data``, or if it neither has a site for the sky nor returns a
+        LinearGaussian to draw it from.
     """
     who, given = f"the program '{program.path or program.name}'", {**arguments, DATA: data}
     with _blaming(who, "when it is called"):
@@ -357,7 +357,7 @@ def require_sampleable(
 
 @contextmanager
 def _blaming(who: str, doing: str) -> Iterator[None]:
-    """Whatever a user's program may raise: it is not our failure, and it is said in a sentence."""
+    """Turn any error of a user's program into an InputError that names the program and line."""
     try:
         yield
     except (Exception, SystemExit) as error:

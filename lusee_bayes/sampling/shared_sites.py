@@ -1,13 +1,13 @@
-"""The programs of several channels as one, in which unknowns that channels share are tied.
+"""The programs of several channels as one, in which shared unknowns are tied.
 
-A site of a channel is called ``CHANNEL/NAME``. In prior standard deviations from its prior mean, an
-unknown that channels share is a Gaussian process z over frequency (:func:`.kernel`). Given z at the
-frequencies of earlier channels, a later channel has (k: covariance with those, K: of those) ::
+A site of a channel is called ``CHANNEL/NAME``. In prior standard deviations from its prior mean, a
+shared unknown is a Gaussian process z over frequency (:func:`.kernel`). Given z at the frequencies
+of earlier channels, a later channel has ::
 
     z ~ N(k^T K^-1 z, 1 - k^T K^-1 k),
 
-and where that variance vanishes, as of values that are the same in all channels, it has no site of
-its own, but that value.
+where K is the covariance of the earlier z, and k their covariance with the new one. If that
+variance vanishes, as for values common to all channels, the channel has the mean instead of a site.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from lusee_bayes.linear.amplitudes import Amplitudes, kernel, tie
 from lusee_bayes.sampling.hmc import Chains, Whitening
 from lusee_bayes.systematics.systematic import Unknown
 
-# variances below this are rounding: of K's own, 1e-5 of a standard deviation
+# variances below this (1e-5 of a standard deviation) are rounding of K
 NOTHING_LEFT = 1e-10
 
 
@@ -37,7 +37,7 @@ def site_in(channel: str, name: str) -> str:
 
 
 def of_channel(chains: Chains, channel: str) -> Chains:
-    """The draws of one channel, with its own names of sites."""
+    """The draws of one channel, with site names without the channel."""
     start = site_in(channel, "")
     sites = {n.removeprefix(start): v for n, v in chains.sites.items() if n.startswith(start)}
     return Chains(sites, chains.statistics)
@@ -55,13 +55,13 @@ def gaussian_of_sites(
     Parameters
     ----------
     amplitudes : mapping of Amplitudes
-        What each channel's own data tell of its unknowns.
+        Posterior of each channel's unknowns given its own data.
     unknowns : sequence of Unknown
-        Of every channel.
+        The same for every channel.
     frequencies_mhz, octaves : mapping of float
-        As of :class:`SharedSites`.
+        As for :class:`SharedSites`.
     latent : sequence of str
-        The sites that are sampled: of a single channel by their own names.
+        The sampled sites; for a single channel, names without the channel.
     """
     mhz = np.array([frequencies_mhz[channel] for channel in amplitudes])
     sizes = [u.size or 1 for u in unknowns]
@@ -90,7 +90,7 @@ def gaussian_of_sites(
 
 @dataclass(frozen=True)
 class SharedSites:
-    """A NumPyro model of several channels; its arguments, and the data, are mappings by channel.
+    """A NumPyro model of several channels; arguments and data are mappings by channel.
 
     Attributes
     ----------
@@ -107,7 +107,7 @@ class SharedSites:
     octaves: Mapping[str, float]
 
     def __call__(self, channels: Mapping[str, dict], data: Mapping[str, Array] | None = None):
-        """Sample or observe all channels; what the program returns of each."""
+        """Sample or observe all channels; return the program's result for each."""
         site_values: dict[str, dict[str, Any]] = {}
         returned = []
         for channel, arguments in channels.items():
@@ -118,16 +118,16 @@ class SharedSites:
 
 
 class _Channel(Messenger):
-    """Names a channel's sites, and ties those that are shared to earlier channels.
+    """Names a channel's sites, and ties shared ones to earlier channels.
 
-    site_values : by site and channel, values, or z where those differ; of sites alone, not of what
-        follows from others
+    site_values : by site and channel: values, or z if channels differ; only of sites, not of values
+        that follow from other channels
     """
 
     def __init__(self, shared: SharedSites, channel: str, site_values: dict[str, dict[str, Any]]):
         super().__init__()
         self.shared, self.channel, self.site_values = shared, channel, site_values
-        # name and prior of what is shared, by site
+        # name and prior of shared unknowns, by site
         self.sites: dict[str, tuple[str, dist.Distribution]] = {}
 
     def process_message(self, msg: dict[str, Any]) -> None:

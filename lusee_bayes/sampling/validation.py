@@ -1,24 +1,24 @@
-"""HMC and simulated data against the posterior in closed form.
+"""Tests of the analytic posterior with HMC and with simulated data.
 
-**Simulation-based calibration** asks whether a posterior means what it says, over many data sets.
-Draw a truth from the prior, data from the truth, draws from the posterior given the data; the rank
-of the truth among the draws is uniform if and only if the posterior is right (Talts et al. 2018).
-What is ranked is a *quantity* of the unknowns, which may depend on the data too: the likelihood
-catches posteriors that leave data unused, which single modes cannot (Modrak et al. 2023).
+**Simulation-based calibration** tests over many data sets whether a posterior is right. Draw a
+truth from the prior, data from the truth, draws from the posterior given the data: the rank of the
+truth among the draws is uniform if and only if the posterior is right (Talts et al. 2018). The
+ranks are of *quantities* of the unknowns, which may depend on the data, too: the likelihood
+detects posteriors that leave data unused, which single modes cannot (Modrak et al. 2023).
 
-**HMC checks the analytic posterior**: mean, variances and covariance. Every threshold is what exact
-draws of the analytic posterior would exceed once in ``1 / FALSE_ALARM`` runs, given how many draws
-there are and how they hang together in time:
+**HMC checks the analytic posterior**: mean, variances and covariance. Exact draws of the analytic
+posterior would exceed each threshold once in ``1 / FALSE_ALARM`` runs, given the number of draws
+and their correlation in time:
 
 * means: the largest of the modes' deviations in units of their Monte Carlo errors;
-* variances: the same for chi^2 of each mode's sample variance, with its own effective sample size;
+* variances: the same for chi^2 of each mode's sample variance, with its effective sample size;
 * covariance: the extreme eigenvalues of the draws' covariance in the analytic posterior's
-  coordinates (the generalised eigenvalues of the two), against those of simulated exact chains
-  that move as far from draw to draw as the real ones. Even exact draws spread widely here:
+  coordinates (the generalised eigenvalues of the two), compared with those of simulated exact
+  chains that move as far from draw to draw as the real ones. Even exact draws scatter widely here:
   independent ones over (1 +- sqrt(modes / draws))^2 (Marchenko & Pastur 1967).
 
-The sampler's own diagnostics are judged as is common (Vehtari et al. 2021; Betancourt 2016), but
-for R-hat, whose largest value among thousands of modes passes 1.01 by chance.
+The sampler's diagnostics have the usual limits (Vehtari et al. 2021; Betancourt 2016) except for
+R-hat, whose largest value among thousands of modes exceeds 1.01 by chance.
 """
 
 from __future__ import annotations
@@ -49,16 +49,16 @@ from lusee_bayes.sampling.least import N_BINS, require_draws, require_simulation
 
 Skies = Float[np.ndarray, "chains draws modes"]
 
-# ranks among 99 draws take 100 values, so that LEVELS are met exactly
+# ranks among 99 draws have 100 values, which match LEVELS exactly
 N_DRAWS = 99
 
-# chance that a true posterior fails the verdict over all quantities
+# probability that a correct posterior fails the verdict over all quantities
 FALSE_ALARM = 1e-3
 
-# single modes of a sky that are ranked, and random directions
+# number of single modes of a sky that are ranked, and of random directions
 N_RANKED = 10
 
-# data sets worked on at once, and the numbers that their draws of the data may take up
+# data sets computed at once, and the most numbers in their draws of the data
 BATCH = 50
 MEMORY = 10_000_000
 
@@ -74,10 +74,10 @@ class Ranks:
     n_draws : int
         Number of draws.
     names : tuple of str
-        Of the quantities.
+        Names of the quantities.
     regions : tuple of str
-        Names of the quantities that grow outwards, like the distance from the mean. Their
-        coverage is that of the region inside, for the others that of the central interval.
+        Names of quantities that grow outwards, like the distance from the mean. Their coverage is
+        for the region inside, that of the others for the central interval.
     """
 
     ranks: Int[np.ndarray, "simulations quantities"]
@@ -96,12 +96,12 @@ class Ranks:
         return np.stack([np.histogram(r, edges)[0] for r in self.ranks.T])
 
     def band(self, probability: float = 0.99) -> tuple[int, int]:
-        """Return the counts between which a bin of the histogram lies with this probability."""
+        """Return the interval that contains a bin's count with this probability."""
         low, high = stats.binom.interval(probability, self.n_simulations, 1.0 / N_BINS)
         return int(low), int(high)
 
     def p_values(self) -> Float[np.ndarray, " quantities"]:
-        """Return the p-value of each histogram against a flat one, by chi^2."""
+        """Return the p-value of each histogram, from a chi^2 test against a flat one."""
         return stats.chisquare(self.histogram(), axis=1).pvalue
 
     def coverage(self) -> dict[str, dict[float, float]]:
@@ -114,18 +114,18 @@ class Ranks:
                 inside = {p: ranks < p * n for p in LEVELS}
             else:
                 off = np.abs(ranks - middle)
-                # 95 of 100 ranks do not lie evenly about the middle: the outermost count half
+                # 95 of 100 ranks are not symmetric about the middle: the outermost count half
                 inside = {p: (off < p * n / 2) + 0.5 * (off == p * n / 2) for p in LEVELS}
             table[name] = {p: float(hit.mean()) for p, hit in inside.items()}
         return table
 
     def coverage_error(self, level: float) -> float:
-        """Return the standard error of a coverage that is right."""
+        """Return the standard error of a correct coverage."""
         return float(np.sqrt(level * (1 - level) / self.n_simulations))
 
     @property
     def threshold(self) -> float:
-        """The smallest p-value has to be above this: FALSE_ALARM shared by all quantities."""
+        """Lower limit of the smallest p-value: FALSE_ALARM divided by the number of quantities."""
         return FALSE_ALARM / len(self.names)
 
     @property
@@ -162,18 +162,18 @@ def calibrate(
     n_simulations : int
         Number of data sets.
     seed : int
-        Of everything.
+        Seed of all random numbers.
     batch : int
-        Data sets worked on at once.
+        Number of data sets computed at once.
     one_by_one : bool
-        Work on the data sets of a batch one after the other: where each takes its own time, they
-        would all wait for the slowest.
+        Compute the data sets of a batch one after the other. Use it if their times differ, since
+        otherwise all wait for the slowest.
     regions : sequence of str
         See :class:`Ranks`.
     engine : Engine, optional
-        What works on the batches; by default this process, on one after the other.
+        Where batches are computed; by default in this process, one after the other.
     stages : Stages, optional
-        Told how many batches are done.
+        Reports progress.
 
     Raises
     ------
@@ -203,7 +203,7 @@ def calibrate(
 def _rank_batch(
     simulate, draw, quantities, keys: Key[Array, " n"], one_by_one: bool
 ) -> dict[str, Array]:
-    """Ranks of one batch of data sets: (simulations, ...) by name."""
+    """Ranks for one batch of data sets: (simulations, ...) by name."""
 
     def one(key):
         simulation_key, draw_key = jax.random.split(key)
@@ -226,19 +226,19 @@ def calibrate_sky(
 ) -> Ranks:
     """Calibrate the analytic posterior of the sky.
 
-    :func:`ranked_of_sky` are ranked: single modes spread over the ells, random directions in
-    units of the prior, the distance from the mean in the posterior's metric, and the likelihood.
+    It ranks :func:`ranked_of_sky`: single modes spread over the ells, random directions in units of
+    the prior, the distance from the mean in the posterior's metric, and the likelihood.
 
     Parameters
     ----------
     truth : LinearGaussian
-        The model that data sets are drawn from.
+        The model from which data sets are drawn.
     posterior : LinearGaussian
         The model that is conditioned on them; usually the same.
     n_simulations : int
         Number of data sets.
     seed : int
-        Of everything.
+        Seed of all random numbers.
     engine, stages : optional
         As for :func:`calibrate`.
 
@@ -277,7 +277,7 @@ def ranked_of_sky(
     Parameters
     ----------
     solver : Whitened
-        Of the model that is conditioned on the data.
+        Solver of the model that is conditioned on the data.
     modes : (single,) array of int
         Numbers of the single modes.
     directions : (projections, white) array
@@ -299,15 +299,15 @@ def ranked_of_sky(
 
 MIN_BFMI = 0.3
 
-# simulated chains for the eigenvalues that chance allows; their extremes scatter little, so that a
-# margin of 6 standard deviations of few is safe
+# number of simulated chains for the eigenvalues' null distribution; their extremes scatter little,
+# so a margin of 6 standard deviations from a few chains is safe
 NULL_RUNS = 12
 NULL_MARGIN = 6.0
 
 
 @dataclass(frozen=True)
 class Check:
-    """One number with the interval that it must lie in.
+    """One number with its allowed interval.
 
     Attributes
     ----------
@@ -318,7 +318,7 @@ class Check:
     lower, upper : float
         The interval.
     meaning : str
-        What the number is.
+        Meaning of the number.
     """
 
     name: str
@@ -329,24 +329,24 @@ class Check:
 
     @property
     def passed(self) -> bool:
-        """Whether the value lies in the interval; NaN does not."""
+        """Whether the value lies in the interval; false for NaN."""
         return bool(self.lower <= self.value <= self.upper)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Draws against the analytic posterior, mode by mode.
+    """Draws compared with the analytic posterior, mode by mode.
 
     Attributes
     ----------
     mean_z : (modes,) array
-        Difference of the means over its Monte Carlo error.
+        Difference of the means, in Monte Carlo errors.
     variance_ratio, variance_error : (modes,) array
-        Variance of the draws over the analytic one, and its error.
+        Ratio of the draws' variance to the analytic one, and its error.
     eigenvalues : (modes,) array
-        Of the draws' covariance in analytic coordinates, rising.
+        Eigenvalues of the draws' covariance in analytic coordinates, in increasing order.
     null_eigenvalues : (modes,) array
-        The same of simulated exact chains, their mean.
+        Mean eigenvalues of simulated exact chains.
     rhat, ess_bulk, ess_tail : (modes,) array
         ArviZ's diagnostics.
     checks : tuple of Check
@@ -388,14 +388,14 @@ def validate_draws(
     diverging : (chains, draws) array of bool
         Whether the trajectory to each draw diverged.
     energy : (chains, draws) array
-        Of each draw.
+        Energy of each draw.
     seed : int
-        Of the simulated chains whose eigenvalues are compared with.
+        Seed of the simulated chains that give null eigenvalues.
 
     Raises
     ------
     InputError
-        For draws of another number of modes, fewer than 100 of a chain, or not finite.
+        If draws have another number of modes or are not finite, or a chain has fewer than 100.
     """
     require_shape("the draws", draws, (None, None, posterior.prior.size))
     require_draws(draws.shape[1])
@@ -418,7 +418,7 @@ def validate_draws(
     low, high = null.mean(0)[0] - spread[0], null.mean(0)[-1] + spread[-1]
     total = NULL_MARGIN * float(null.mean(1).std(ddof=1))
     ess_floor = float(PER_CHAIN * n_chains)
-    # R-hat^2 - 1 of m half chains is chi^2 with m - 1 degrees over ESS: the largest of many modes
+    # R-hat^2 - 1 of m half chains is a chi^2 of m - 1 degrees / ESS: limit for the largest of modes
     halves = 2 * n_chains
     chance = stats.chi2.isf(FALSE_ALARM / n_modes, halves - 1) / np.median(ess_square)
     rhat_limit = max(AGREE, float(np.sqrt(1.0 + halves / (halves - 1) * chance)))
@@ -452,9 +452,9 @@ _ess = partial(array_stats.ess, chain_axis=0, draw_axis=1)
 
 
 def _chi2_z(ratio: Vector, dof: Vector) -> Vector:
-    """Normal scores of variance ratios that are chi^2 over ``dof``: skewness counts at 5 sigma.
+    """Normal scores of variance ratios, which are chi^2 / ``dof``: skewness matters at 5 sigma.
 
-    Where the tail is too small for a float, by Wilson and Hilferty's cube root.
+    If the tail is too small for a float, Wilson and Hilferty's cube root is used.
     """
     upper = ratio > 1
     tail = np.where(upper, stats.chi2.sf(ratio * dof, dof), stats.chi2.cdf(ratio * dof, dof))
@@ -464,7 +464,7 @@ def _chi2_z(ratio: Vector, dof: Vector) -> Vector:
 
 
 def _eigenvalues(white: Skies) -> Float[np.ndarray, " modes"]:
-    """Of the second moments about the analytic mean, rising."""
+    """Eigenvalues of the second moments about the analytic mean, in increasing order."""
     flat = white.reshape(-1, white.shape[-1])
     return np.linalg.eigvalsh(flat.T @ flat / len(flat))
 
@@ -472,13 +472,13 @@ def _eigenvalues(white: Skies) -> Float[np.ndarray, " modes"]:
 def _null_eigenvalues(white: Skies, rng: np.random.Generator) -> Float[np.ndarray, "runs modes"]:
     """Eigenvalues of exact chains that turn from draw to draw as far as ``white`` does.
 
-    In white coordinates a trajectory is a turn of all modes by one angle, x' = c x + s p with new
-    momenta p; c is the cosine between successive draws. Draws that turn by 180 degrees count once
-    in a covariance, though they halve the error of a mean: ESS of the means would mislead here.
+    In white coordinates a trajectory turns all modes by one angle, x' = c x + s p with new momenta
+    p; c is the cosine between successive draws. Draws that turn by 180 degrees count once in a
+    covariance, though they reduce the error of a mean: ESS of the means would mislead here.
     """
     unit = white / np.linalg.norm(white, axis=2, keepdims=True)
     cosine = (unit[:, 1:] * unit[:, :-1]).sum(2)
-    # not sqrt(1 - cosine^2), which rounding makes imaginary where a draw is repeated
+    # not sqrt(1 - cosine^2), which rounding makes imaginary if a draw is repeated
     sine = np.linalg.norm(unit[:, 1:] - cosine[..., None] * unit[:, :-1], axis=2)
     runs = []
     for _ in range(NULL_RUNS):

@@ -45,16 +45,16 @@ BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#666666"
 # distinct without colour vision (Okabe-Ito), and by their lines
 COLOURS = (BLUE, ORANGE, "#009E73", "#CC79A7", "#56B4E9", "#000000")
 LINES = ("-", "--", "-.", ":")
-# of a map whose pixels may be larger than those of what is drawn
+# a map whose pixels may be larger than those of the map drawn
 Coarse = Float[np.ndarray, " coarse_pixels"]
-# inches, across and down
+# width and height in inches
 Size = tuple[float | int, float | int]
-# of PNGs: a fifth larger than with 6, and written in a third of the time
+# of PNGs: files are a fifth larger than with 6, and written in a third of the time
 COMPRESSION = 2
 
 
 def save(figure: Figure, path: Path, dpi: int) -> None:
-    """Write a figure as a PNG; laid out and drawn once, where savefig alone draws it twice."""
+    """Write a figure as a PNG, drawing it once (savefig would draw it twice)."""
     figure.set_dpi(dpi)
     for text in figure.findobj(Text):
         text.set_text(printable(text.get_text()))
@@ -64,7 +64,7 @@ def save(figure: Figure, path: Path, dpi: int) -> None:
 
 
 def named_parts(name: str, drawn: Figure | dict[str, Figure] | None) -> dict[str, Figure]:
-    """Figures by the names of their files: ``maps``, or ``maps_1_truth`` and so on of several."""
+    """Figures by file name: ``maps``, or ``maps_1_truth`` and so on if there are several."""
     if not isinstance(drawn, dict):
         return {} if drawn is None else {name: drawn}
     titles = [re.sub(r"[^\w.]+", "_", title) for title in drawn]
@@ -73,7 +73,7 @@ def named_parts(name: str, drawn: Figure | dict[str, Figure] | None) -> dict[str
 
 
 def framed(size: Size, rows: int = 1, columns: int = 1, **options: object):
-    """Make a figure of some size and its axes, one or an array of them, laid out by themselves."""
+    """Make a figure with one or an array of axes, in a constrained layout."""
     figure = Figure(figsize=size, layout="constrained")
     return figure, figure.subplots(rows, columns, **options)
 
@@ -81,15 +81,15 @@ def framed(size: Size, rows: int = 1, columns: int = 1, **options: object):
 def in_places(
     size: Size, rows: int = 1, columns: int = 1, **places: float
 ) -> tuple[Figure, list[Axes]]:
-    """Make a figure and all its axes in fixed places, which needs no layout."""
+    """Make a figure with axes in fixed places, which needs no layout."""
     figure = Figure(figsize=size)
     return figure, list(figure.subplots(rows, columns, gridspec_kw=places, squeeze=False).flat)
 
 
 def temperatures(pixels: Float[np.ndarray, "..."], lowest: float = 0.05) -> Normalize:
-    """A logarithmic scale over all positive pixels but the extreme ones (per cent: ``lowest``).
+    """A logarithmic scale over all positive pixels, from percentile ``lowest`` to 99.8.
 
-    Linear where no pixel is positive.
+    Linear if no pixel is positive.
     """
     positive = pixels[pixels > 0]
     bounds = np.percentile(positive if positive.size else pixels, [lowest, 99.8])
@@ -97,10 +97,10 @@ def temperatures(pixels: Float[np.ndarray, "..."], lowest: float = 0.05) -> Norm
 
 
 def seen_range(std: Float[np.ndarray, "..."], altitude: Pixels) -> tuple[float, float]:
-    """Bounds of a logarithmic scale for standard deviations: of what was seen.
+    """Bounds of a logarithmic scale for standard deviations, from the observed region.
 
-    A cap that never rose has standard deviations that would hide the structure of the rest. What
-    lies about its rim, a few percent, has the brightest colour, too.
+    A cap that never rose has standard deviations that would hide the structure of the rest. The few
+    per cent next to its rim have the brightest colour, too.
 
     Parameters
     ----------
@@ -114,14 +114,14 @@ def seen_range(std: Float[np.ndarray, "..."], altitude: Pixels) -> tuple[float, 
 
 
 def plain_ticks(axes: Axes, n: int = 4) -> None:
-    """At most ``n`` ticks on each axis, each with its whole number: no power beside the axis."""
+    """At most ``n`` ticks on each axis, labelled with full numbers instead of an offset."""
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_locator(MaxNLocator(n))
         axis.set_major_formatter(lambda value, _: number_of_tick(value))
 
 
 def number_of_tick(value: float) -> str:
-    """A number as short as its size allows: 12,500 and 1.5e10."""
+    """A number in a short form: 12,500 or 1.5e10."""
     if value == 0 or 1e-3 <= abs(value) < 1e6:
         return f"{value:,.6g}"
     mantissa, power = f"{value:.3e}".split("e")
@@ -129,12 +129,12 @@ def number_of_tick(value: float) -> str:
 
 
 def without_minor_ticks(axis: Axis) -> None:
-    """Leave out the minor ticks of a logarithmic axis of many decades: hundreds, slow to draw."""
+    """Remove the minor ticks of a logarithmic axis: over many decades they are slow to draw."""
     axis.set_minor_locator(NullLocator())
 
 
 def side_by_side(axes: Axes, products: Sequence[str], n_times: int) -> None:
-    """Dress axes in which products follow one another, with time running within each."""
+    """Label axes with products side by side, time running within each."""
     starts = n_times * np.arange(len(products))
     for start in starts:
         axes.axvline(start, color=GREY, lw=0.4)
@@ -148,7 +148,7 @@ def orthographic(axes: Axes, grid: HemisphereGrid, pattern: Float[np.ndarray, "t
     """Draw a pattern on the plane of the horizon: x East, y North."""
     phi = np.append(grid.phi, 2 * np.pi)
     closed = np.concatenate([pattern, pattern[:, :1]], axis=1) / pattern.max()
-    # the grid has no node at the zenith itself: every azimuth of the first ring meets there
+    # the grid has no node at the zenith: use the mean over azimuth of the first ring
     closed = np.concatenate([np.full((1, closed.shape[1]), closed[0].mean()), closed])
     x, y = (np.outer(np.sin(np.append(0.0, grid.theta)), f(phi)) for f in (np.cos, np.sin))
     style = {"cmap": SEQUENTIAL, "vmin": 0, "vmax": 1, "shading": "gouraud", "rasterized": True}
@@ -165,7 +165,7 @@ def orthographic(axes: Axes, grid: HemisphereGrid, pattern: Float[np.ndarray, "t
 def colour_bar(
     figure: Figure, image: ScalarMappable, axes: Axes | list[Axes], **options: object
 ) -> Colorbar:
-    """A colour bar; on a logarithmic scale with plain numbers, more of them on a narrow one."""
+    """A colour bar; a logarithmic one has plain numbers, and more ticks if it is narrow."""
     bar = figure.colorbar(image, ax=axes, **options)
     if isinstance(image.norm, LogNorm):
         narrow = image.norm.vmax < 20.0 * image.norm.vmin
@@ -184,11 +184,11 @@ def note(title: str, text: str) -> Figure:
     return figure
 
 
-# points of a view from left to right: as many as a map of a figure has on paper or screen
+# points of a view from left to right, as in a map on paper or screen
 WIDTH = 720
 # half the axes of the ellipse
 EDGE = (2.0, 1.0)
-# seen on dark maps and on light ones
+# visible on dark and on light maps
 SEEN_ANYWHERE = [withStroke(linewidth=2.4, foreground="white", alpha=0.7)]
 MERIDIANS, PARALLELS = (120.0, 60.0, 0.0, -60.0, -120.0), (-60.0, -30.0, 0.0, 30.0, 60.0)
 
@@ -203,9 +203,9 @@ def mollweide(
 ) -> AxesImage:
     """Draw a Galactic HEALPix RING map: centre l = 0, longitude grows to the left.
 
-    ``highest_altitude``: draws a dashed line round the region that never rose.
+    ``highest_altitude`` adds a dashed line round the region that never rose.
     """
-    # negative temperatures have no logarithm: they take the darkest colour
+    # negative temperatures have no logarithm: use the darkest colour
     colours = colormaps[cmap].with_extremes(bad=colormaps[cmap](0.0))
     rim = Ellipse((0.0, 0.0), 2 * EDGE[0], 2 * EDGE[1], fill=False, color="black", lw=0.8)
     extent = (-EDGE[0], EDGE[0], -EDGE[1], EDGE[1])
@@ -235,7 +235,7 @@ def sky_panel(
     altitude: Coarse | None = None,
     **bar: float,
 ) -> None:
-    """Draw a map (:func:`mollweide`) with its title and a colour bar of its own."""
+    """Draw a map (:func:`mollweide`) with its title and a colour bar."""
     image = mollweide(axes, pixels, norm=norm, cmap=cmap, highest_altitude=altitude)
     colour_bar(axes.figure, image, axes, label=unit, extend="both", **bar)
     axes.set_title(title)
@@ -260,8 +260,8 @@ def view(pixels: Pixels) -> Float[np.ndarray, "height width"]:
     Returns
     -------
     (height, width) array
-        From the South pole up, and from l = 180 degrees at the left; beyond the rim the map goes
-        on with the rim's own values.
+        From the South pole up, and from l = 180 degrees at the left; points beyond the rim have the
+        rim's values.
     """
     neighbours, weights = _projection(healpy.npix2nside(len(pixels)))
     return np.einsum("kp,kp->p", weights, np.asarray(pixels)[neighbours]).reshape(WIDTH // 2, WIDTH)
@@ -286,7 +286,7 @@ def unprojected(
     Parameters
     ----------
     x, y : (points,) array
-        From -1 to 1; points beyond the rim are taken to lie on it.
+        From -1 to 1; points beyond the rim are moved to it.
 
     Returns
     -------
@@ -299,7 +299,7 @@ def unprojected(
 
 
 def rim(highest_altitude: Pixels) -> list[Float[np.ndarray, "points 2"]]:
-    """Lines round the region that never rose: l and b in degrees of their points.
+    """Lines round the region that never rose, as points (l, b) in degrees.
 
     Parameters
     ----------
@@ -321,7 +321,7 @@ def _graticule(axes: Axes) -> None:
     # one path with gaps is drawn faster than ten
     x, y = (np.concatenate([np.append(line[k], np.nan) for line in lines]) for k in (0, 1))
     axes.plot(EDGE[0] * x, EDGE[1] * y, color="#b0b0b0", alpha=0.4, lw=0.4)
-    # their place is known: the layout need not measure them
+    # excluded from the layout, which need not measure them
     style = {"fontsize": 7, "va": "center", "in_layout": False}
     for lon in MERIDIANS:
         label = axes.text(-EDGE[0] * lon / 180.0, 0.06, f"{lon % 360:.0f}°", ha="center", **style)
@@ -346,5 +346,5 @@ def taper_fwhm_deg(lmax: int) -> float:
 
 
 def shown(modes: Float[np.ndarray, " modes"], nside: int) -> Pixels:
-    """Synthesise the HEALPix RING map of packed coefficients, seen through the beam."""
+    """Synthesise the HEALPix RING map of packed coefficients, smoothed with the beam."""
     return modes_to_map(modes * per_mode(taper(lmax_of(len(modes)))), nside)

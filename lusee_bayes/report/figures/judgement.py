@@ -1,4 +1,4 @@
-"""Figures that judge data: draws and residuals, pointing, unknowns, and sessions with flags."""
+"""Figures that test data: residuals, pointing, unknowns, and sessions with flags."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from lusee_bayes.results.map_result import MapResult
 
 # residuals beyond this have the darkest colours
 WIDEST = 4.0
-# smaller p-values are drawn at this one
+# smaller p-values are drawn at this value
 LEAST_P = 1e-10
 
 
 def residuals_by_product(result: MapResult) -> Figure | None:
-    """Residuals of every datum given all others, and p of the rest without each product."""
+    """Residuals of every datum given all others, and p of each product and of the rest."""
     channel = result.channel
     if not result.single:
         return None
@@ -32,7 +32,7 @@ def residuals_by_product(result: MapResult) -> Figure | None:
     figure = Figure(figsize=(12, 4.8))
     places = {"left": 0.06, "right": 0.98, "bottom": 0.11, "top": 0.82, "wspace": 0.03}
     left, right = figure.subplots(1, 2, width_ratios=(3, 1), sharey=True, gridspec_kw=places)
-    # samples are not evenly spaced where runs follow one another or nights are left out
+    # samples need not be evenly spaced, e.g. between runs or without nights
     x, y = np.arange(len(hours) + 1) - 0.5, np.arange(len(labels) + 1) - 0.5
     style = {"cmap": drawing.DIVERGING, "norm": Normalize(-WIDEST, WIDEST), "rasterized": True}
     image = left.pcolormesh(x, y, z, **style)
@@ -63,7 +63,7 @@ def residuals_by_product(result: MapResult) -> Figure | None:
 
 
 def groups_by_frequency(result: MapResult) -> Figure | None:
-    """p-values of products, days and angles of every channel whose groups were judged."""
+    """p-values of products, days and angles, for every channel whose groups were tested."""
     judged = [channel for channel in result.channels if channel.judged is not None]
     if result.single or not judged:
         return None
@@ -88,7 +88,7 @@ UNITS = {"s": "s", "day": "s/day", "deg": "degrees"}
 
 
 def pointing_by_day(result: MapResult) -> Figure | None:
-    """Draw the preferred value of every offset for each day, and for all of them together."""
+    """Draw the preferred value of every offset for each day, and for all days together."""
     if not result.single or result.channel.pointing is None:
         return None
     preferred = result.channel.pointing.preferred
@@ -158,9 +158,9 @@ CORNER = 3.5, 8.0
 def corner(result: MapResult) -> Figure | None:
     """Draw the posterior of a channel's unknowns, pair by pair, with prior and truth.
 
-    The channel is the first of those that share the instrument. Axes are in posterior standard
-    deviations from the posterior mean. They go as far as the truth, up to 8; beyond, it is marked
-    at the edge.
+    The channel is the first one that agrees on the shared instrument. Axes are in posterior
+    standard deviations from the posterior mean. They extend to the truth, up to 8; a truth beyond
+    that is marked at the edge.
     """
     apart = [test.frequency_mhz for test in result.shared_tests if test.disagrees]
     of_all = (one for one in result.channels if one.frequency_mhz not in apart)
@@ -212,7 +212,7 @@ LEVEL_COLOURS = {"L": drawing.COLOURS[4], "M": drawing.BLUE, "H": drawing.COLOUR
 
 
 def time_line(reduced: Reduced) -> Figure:
-    """Draw the gain of every port and what was flagged, over time."""
+    """Draw the gain of every port, and flags, over time."""
     days = _days(reduced)
     flags = {name: (reduced.reason == k).any(axis=0) for k, name in enumerate(REASONS) if k}
     flags = {name: flagged for name, flagged in flags.items() if flagged.any()}
@@ -349,7 +349,7 @@ def _first(reduced: Reduced) -> str:
 
 
 def _range(values: Float[np.ndarray, " kept"]) -> tuple[float, float]:
-    """Bounds that show what is kept, with a tenth beyond."""
+    """Bounds of the kept values, with a margin of a tenth."""
     if not values.size:
         return 0.0, 1.0
     low, high = float(values.min()), float(values.max())

@@ -1,4 +1,4 @@
-"""Figures of maps, spectra and fidelity: of a channel, of a cube, of several finished runs."""
+"""Figures of maps, spectra and fidelity for a channel, a cube, or several finished runs."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.finished_runs import FinishedRun
 from lusee_bayes.results.map_result import MapResult
 
-# figures that stand side by side, or below each other on a phone, by their titles
+# figures shown side by side, or below each other on a phone, by their titles
 Panels = dict[str, Figure]
-# of what is drawn, at least
+# smallest NSIDE of maps that are drawn
 NSIDE = 64
 
 
 def data_vector(result: MapResult) -> Figure | None:
-    """The data vector as the paper draws it: products side by side, time running within each."""
+    """The data vector as in the paper: products side by side, time running within each."""
     if not result.single:
         return None
     channel = result.channel
@@ -42,7 +42,7 @@ def data_vector(result: MapResult) -> Figure | None:
 
 
 def beams(result: MapResult) -> Figure | None:
-    """An auto and two crosses from above: zenith in the centre, North up, horizon at the rim."""
+    """An auto and two crosses from above: zenith at the centre, North up, horizon at the rim."""
     details = result.channel.details
     if details is None:
         return None
@@ -59,7 +59,7 @@ def beams(result: MapResult) -> Figure | None:
 
 
 def draws(result: MapResult) -> Panels | None:
-    """A few draws of the posterior as Galactic maps, on the scale of the mean."""
+    """A few samples from the posterior as Galactic maps, on the scale of the mean."""
     channel = result.channel
     if channel.details is None:
         return None
@@ -72,7 +72,7 @@ def draws(result: MapResult) -> Panels | None:
 
 
 def sky_maps(result: MapResult) -> Panels:
-    """The maps of one channel, or of a few of many."""
+    """The maps of one channel, or of some of the channels of a cube."""
     if result.single:
         return _figures(channel_panels(result.channel), result.channel)
     figures: Panels = {}
@@ -92,7 +92,7 @@ def _figures(panels: Mapping[str, tuple], channel: ChannelResult) -> Panels:
 
 
 def spectra(result: MapResult) -> Figure | Panels:
-    """Power spectra of a channel, or brightness against frequency of many."""
+    """Power spectra of one channel, or brightness against frequency of several."""
     return channel_spectra(result) if len(result.channels) > 1 else sky_spectra(result.channel)
 
 
@@ -102,16 +102,15 @@ def plot_map(sky: MapResult | Posterior | Modes, nside: int = 64) -> Figure:
     Parameters
     ----------
     sky : MapResult, Posterior or (modes,) array
-        Real harmonic coefficients, Galactic, in K. Of a result (``lb.run_map(...).result``) the
-        first channel, with truth and residual if the truth is known, and the region that never
-        rises.
+        Real harmonic coefficients, Galactic, in K. For a result (``lb.run_map(...).result``), the
+        first channel is drawn, with truth and residual if known, and the region that never rises.
     nside : int
-        HEALPix resolution of what is drawn; a result has its own.
+        HEALPix resolution of the drawn map; a result has its own.
 
     Returns
     -------
     Figure
-        Of Matplotlib: ``savefig(path)`` writes it.
+        A Matplotlib figure: ``savefig(path)`` writes it.
     """
     if isinstance(sky, MapResult):
         return channel_map(sky.channel)
@@ -129,7 +128,7 @@ def plot_map(sky: MapResult | Posterior | Modes, nside: int = 64) -> Figure:
 
 
 def scales(channel: ChannelResult) -> dict[str, Normalize]:
-    """The colours of a channel's maps, on paper and on screen, by what they show."""
+    """The colour scales of a channel's maps, in figures and in the viewer, by quantity."""
     nside, altitude = max(NSIDE, channel.nside), channel.highest_altitude
     sky = mean = drawing.shown(channel.mean, nside)
     norms = {}
@@ -146,9 +145,9 @@ def scales(channel: ChannelResult) -> dict[str, Normalize]:
 
 
 def channel_panels(channel: ChannelResult) -> dict[str, tuple]:
-    """Truth, posterior mean, residual over the mean temperature, and standard deviation.
+    """Truth, posterior mean, residual relative to the mean temperature, and standard deviation.
 
-    All but the standard deviation are drawn through the beam of :mod:`.drawing`.
+    All except the standard deviation are smoothed with the beam of :mod:`.drawing`.
     """
     nside, norms = max(NSIDE, channel.nside), scales(channel)
     mean, panels = drawing.shown(channel.mean, nside), {}
@@ -180,7 +179,7 @@ def channel_map(channel: ChannelResult) -> Figure:
 
 
 def map_fidelity(channel: ChannelResult) -> Panels:
-    """rho_ell and SNR_ell where the truth is known, and how much of each ell the prior supplies."""
+    """rho_ell and SNR_ell if the truth is known, and the prior's share of each ell's variance."""
     spectra = channel.spectra()
     names = ["correlation", "signal-to-noise", "share of the prior"][0 if "snr" in spectra else 2 :]
     drawn = {name: drawing.framed((5, 3.6)) for name in names}
@@ -203,7 +202,7 @@ def map_fidelity(channel: ChannelResult) -> Panels:
 def _fidelity(
     panels: Sequence[Axes], spectra: Mapping[str, np.ndarray], label: str | None = None, **style
 ) -> None:
-    """Curves of the prior's share in the last panel, and of rho and SNR before it, if there are."""
+    """Draw the prior's share in the last panel, and rho and SNR in the others, if there are any."""
     ell = spectra["ell"][1:]
     panels[-1].plot(ell, spectra["prior_fraction"][1:], label=label, **style)
     panels[-1].set(ylabel="fraction of the variance from the prior", ylim=(0, 1.02))
@@ -237,12 +236,12 @@ def sky_spectra(channel: ChannelResult) -> Figure:
     return figure
 
 
-# channels whose maps are drawn
+# number of channels whose maps are drawn
 SHOWN = 3
 
 
 def _few_of(n: int, most: int) -> np.ndarray:
-    """Numbers of the first of n, of the last, and of some between."""
+    """At most ``most`` evenly spaced indices from the first to the last of n."""
     return np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int))
 
 
@@ -259,7 +258,7 @@ def instrument_share(result: MapResult) -> Panels | None:
 
 
 def maps_of_runs(runs: Sequence[FinishedRun]) -> Panels:
-    """Posterior mean and standard deviation of every run, each kind on one scale."""
+    """Posterior mean and standard deviation of every run, on common scales."""
     channels = [run.channel for run in runs]
     means = [drawing.shown(one.mean, max(NSIDE, one.nside)) for one in channels]
     bounds = [drawing.seen_range(one.pixel_std, one.highest_altitude) for one in channels]
@@ -276,7 +275,7 @@ def maps_of_runs(runs: Sequence[FinishedRun]) -> Panels:
 
 
 def channel_spectra(cube: MapResult) -> Panels:
-    """Brightness against frequency in some directions, with one standard deviation."""
+    """Brightness against frequency in some directions, with error bars of one sigma."""
     figures: Panels = {}
     for name, values in cube.landmarks().items():
         figures[name], axes = drawing.framed((5.6, 3.6))
@@ -296,7 +295,7 @@ def channel_spectra(cube: MapResult) -> Panels:
 def fidelity(cube: MapResult) -> Figure | Panels:
     """SNR_ell (or, without a truth, the prior's share) over frequency and ell, and its mean.
 
-    Of one channel, as :func:`map_fidelity`.
+    For one channel, as :func:`map_fidelity`.
     """
     if len(cube.channels) == 1:
         return map_fidelity(cube.channel)
@@ -326,7 +325,7 @@ def fidelity(cube: MapResult) -> Figure | Panels:
 
 
 def chi2(cube: MapResult) -> Figure | None:
-    """chi^2 that judges every channel, over its mean if the model holds."""
+    """chi^2 of every channel (instrument + noise), relative to its expectation."""
     if cube.single:
         return None
     figure, axes = drawing.framed((8, 4))
@@ -343,7 +342,7 @@ def chi2(cube: MapResult) -> Figure | None:
 
 
 def curves_of_runs(runs: Sequence[FinishedRun]) -> Figure:
-    """rho_ell and SNR_ell where the truth is known, and the prior's share, of every run."""
+    """rho_ell and SNR_ell if the truth is known, and the prior's share, for every run."""
     spectra = [run.channel.spectra() for run in runs]
     snr = all("snr" in one for one in spectra)
     figure, panels = drawing.framed((12 if snr else 6, 4.2), 1, 3 if snr else 1, squeeze=False)

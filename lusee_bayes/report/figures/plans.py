@@ -1,4 +1,4 @@
-"""Figures of forecasts, and of one data set under several priors, side by side."""
+"""Figures that compare forecasts, and one data set under several priors."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from lusee_bayes.report.figures.drawing import COLOURS, GREY, LINES, framed
 from lusee_bayes.results.forecast import AS_GIVEN, Forecast
 from lusee_bayes.results.prior_comparison import PriorComparison
 
-# distinct without colour vision and by shape; again from the first after four
+# distinct without colour vision and by shape; repeated after four
 STYLES = tuple(zip(COLOURS, "os^D", strict=False))
-# where every family and name of a variation is drawn
+# row of every family and name of a variation
 Rows = dict[tuple[str, str], float]
 # numbers of a forecast with their axis labels; None means that the threshold is not reached
 PANELS = {
@@ -28,7 +28,7 @@ PANELS = {
 
 
 def forecasts(planned: Sequence[Forecast]) -> Figure:
-    """Information, modes with SNR > 1 and ell_cross of every variation, grouped by what differs.
+    """Information, modes with SNR > 1 and ell_cross of every variation, grouped by family.
 
     Dashed: each scenario as given. An open marker beyond lmax: SNR > 1 at every ell.
     """
@@ -38,7 +38,7 @@ def forecasts(planned: Sequence[Forecast]) -> Figure:
     figure, axes = framed(size, 1, len(PANELS), sharey=True)
     for number, source in enumerate(sources):
         mine = [f for f in planned if f.variation.source == source]
-        # beside one another, so that equal values do not hide
+        # side by side, so that equal values do not overlap
         lower = 0.2 * (number - (len(sources) - 1) / 2)
         places = {row: y + lower for row, y in rows.items()}
         for name, axis in zip(PANELS, axes, strict=True):
@@ -62,7 +62,7 @@ def forecasts(planned: Sequence[Forecast]) -> Figure:
 
 
 def _row_positions(planned: Sequence[Forecast]) -> Rows:
-    """The row of every (family, variation) and of each family's own name, (family, "")."""
+    """The row of every (family, variation), and of each family's title, (family, "")."""
     rows: Rows = {}
     for family in dict.fromkeys(f.variation.family for f in planned):
         names = dict.fromkeys(f.variation.name for f in planned if f.variation.family == family)
@@ -76,7 +76,7 @@ def _row_positions(planned: Sequence[Forecast]) -> Rows:
 def _marks(
     axes: Axes, name: str, mine: Sequence[Forecast], rows: Rows, style: tuple[str, str], texts: bool
 ) -> None:
-    """The marks of one scenario in one panel; ``texts``: with their values beside them."""
+    """Draw the markers of one scenario in one panel; ``texts`` adds their values."""
     colour, marker = style
     for forecast in mine:
         value = getattr(forecast, name)
@@ -97,7 +97,7 @@ def _marks(
 
 
 def _label_rows(axes: Axes, rows: Rows) -> None:
-    """Name every row from the top down, with the families in bold."""
+    """Label every row from the top down, with the families in bold."""
     axes.set_yticks(list(rows.values()), [name or family for family, name in rows])
     axes.set_ylim(max(rows.values()) + 0.7, -0.7)
     for (_, name), tick in zip(rows, axes.get_yticklabels(), strict=True):
@@ -108,7 +108,7 @@ def _label_rows(axes: Axes, rows: Rows) -> None:
 
 
 def _title(planned: Sequence[Forecast], sources: Sequence[str]) -> str:
-    """What was planned, with frequency and lmax where all have the same."""
+    """The scenarios, with frequency and lmax if these are the same for all."""
     scenarios = [f.variation.scenario for f in planned]
     scope = ", ".join(sources) if len(sources) == 1 else f"{len(sources)} scenarios"
     if len({s.frequency_mhz for s in scenarios}) == 1:
@@ -118,11 +118,11 @@ def _title(planned: Sequence[Forecast], sources: Sequence[str]) -> str:
     return f"Information content: {scope} (dashed: scenario as given)"
 
 
-# of the interval whose coverage is drawn
+# level of the interval whose coverage is drawn
 LEVEL = 0.68
-# differences up to that are on a linear scale
+# the scale of differences is linear up to this value
 LINEAR = 3.0
-# how each kind of data that is left out is drawn
+# marker of each kind of held-out data
 MARKERS = {"product": "s", "day": "o"}
 
 
@@ -139,7 +139,7 @@ def priors(result: PriorComparison) -> Figure:
 
 
 def _evidence(axes: Axes, result: PriorComparison) -> None:
-    """How far each prior is below the best of each measure."""
+    """Draw how far each prior is below the best, for each measure."""
     rows = np.arange(len(result.priors))
     behind = np.array([result.best.log_evidence - one.log_evidence for one in result.priors])
     colours = [COLOURS[k % len(COLOURS)] for k in rows]

@@ -21,11 +21,11 @@ from lusee_bayes.sampling.least import N_BINS
 from lusee_bayes.sampling.validation import Comparison, Ranks
 from lusee_bayes.systematics.systematic import SKY
 
-# of a value for every mode
+# style of a value for every mode
 DOTS = {"ls": "", "marker": ".", "ms": 3, "color": drawing.BLUE}
-# quantities in the figures, the first of a run's list
+# numbers of quantities in the figures: the first of a run's list
 N_RANKS, N_PAIRS = 8, 5
-# draws of a chain from which ranks and densities can be estimated
+# fewest draws of a chain that give ranks and densities
 FEWEST = 4
 TOO_FEW = f"not drawn: a chain has fewer than {FEWEST} draws or did not move"
 
@@ -33,9 +33,9 @@ Quantities = dict[str, Float[np.ndarray, "chains draws"]]
 
 
 def ranks(quantities: Quantities) -> Figure:
-    """Ranks of each chain's draws among all: differences of their ECDFs from even ones.
+    """Ranks of each chain's draws among all: differences of their ECDFs from uniform ones.
 
-    The grey band holds 99 % of the curves of chains that agree.
+    The grey band contains 99 % of the curves if chains agree.
     """
     chosen = dict(list(quantities.items())[:N_RANKS])
     size = (12, 2.6 * ((len(chosen) + 3) // 4) + 0.4)
@@ -73,7 +73,7 @@ def _drawn(
     size: drawing.Size,
     **options: object,
 ) -> Figure:
-    """ArviZ's figure, which pyplot then forgets; a note where draws do not suffice for it."""
+    """ArviZ's figure, closed in pyplot; a note if there are too few draws."""
     if any(x.shape[1] < FEWEST or not (np.ptp(x, axis=1) > 0).all() for x in quantities.values()):
         return drawing.note(title, TOO_FEW)
     tree = arviz_base.from_dict({group: quantities})
@@ -85,7 +85,7 @@ def _drawn(
 
 
 def against_analytic(tree: xr.DataTree) -> Figure:
-    """Means and standard deviations of the sky's draws against the analytic posterior."""
+    """Means and standard deviations of the sky's draws, compared with the analytic posterior."""
     skies, constants = tree["posterior"][SKY].values, tree["constant_data"]
     mean, std = constants["analytic_mean"].values, constants["analytic_std"].values
     flat = skies.reshape(-1, skies.shape[-1])
@@ -101,7 +101,7 @@ def against_analytic(tree: xr.DataTree) -> Figure:
 
 
 def uncertainty(run: SampleResult) -> Figure | dict[str, Figure]:
-    """Mean, standard deviation and 90 % interval of the drawn maps, and how skewed it is."""
+    """Mean, standard deviation and 90 % interval of the drawn maps, and its asymmetry."""
     maps = run.maps
     if run.skies.shape[0] * run.skies.shape[1] < 2:
         why = "not drawn: a single draw has no standard deviation"
@@ -110,7 +110,7 @@ def uncertainty(run: SampleResult) -> Figure | dict[str, Figure]:
     width = maps["upper"] - maps["lower"]
     spread, interval = 100.0 * maps["std"] / level, 100.0 * width / level
     excess = maps["upper"] + maps["lower"] - 2.0 * maps["mean"]
-    # draws that are all the same have no width, and no asymmetry
+    # identical draws have no width, and no asymmetry
     skewness = np.divide(excess, width, out=np.zeros_like(width), where=width > 0)
     limit = np.percentile(np.abs(skewness), 99.0)
     percent, chance = "% of the mean sky", "fraction of the width"
@@ -133,12 +133,12 @@ def _range(values: Float[np.ndarray, " pixels"]) -> Normalize:
 
 
 def traces(run: SampleResult) -> Figure:
-    """Draws of other sites, of the first modes and of landmarks against time, with histograms."""
+    """Traces and histograms of the first eight of a run's quantities."""
     columns = list(run.quantities().items())[:8]
     size = (11, 1.7 * len(columns) + 0.8)
     figure, grid = drawing.framed(size, len(columns), 2, width_ratios=(3, 1), squeeze=False)
     for (left, right), (name, draws) in zip(grid, columns, strict=True):
-        # a range of a few rounding errors cannot be cut into bins
+        # a range of a few rounding errors cannot be divided into bins
         moved = np.ptp(draws) > 1e-12 * np.abs(draws).max()
         bins = np.histogram_bin_edges(draws, 40 if moved else 1)
         for number, chain in enumerate(draws):
@@ -159,7 +159,7 @@ def traces(run: SampleResult) -> Figure:
 
 
 def comparison(result: Comparison) -> Figure:
-    """HMC against the analytic posterior: means, variances, covariance, effective sizes."""
+    """HMC compared with the analytic posterior: means, variances, covariance, effective sizes."""
     figure, ((means, variances), (covariance, sizes)) = drawing.framed((11, 7), 2, 2)
     ell, _ = mode_numbers(round(np.sqrt(len(result.mean_z))) - 1)
     limit = result.checks[0].upper
@@ -189,7 +189,7 @@ def comparison(result: Comparison) -> Figure:
 
 
 def rank_statistics(ranks: Ranks) -> Figure:
-    """Rank histograms with the band of 99 % of the bins, and coverage of the regions."""
+    """Rank histograms, with a band that contains 99 % of the bins, and coverage by level."""
     shown = np.unique(np.linspace(0, len(ranks.names) - 1, 11).astype(int))
     figure, panels = drawing.framed((12, 7), 3, 4)
     low, high = ranks.band()
