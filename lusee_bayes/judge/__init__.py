@@ -1,1 +1,1 @@
-"""Do data and model agree, who disagrees, and does the error bar cover."""
+"""Tests: do data and model agree, which parts disagree, and do error bars cover the truth."""

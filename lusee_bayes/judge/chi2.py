@@ -1,30 +1,30 @@
-"""chi^2 of data and maps: tests at one rate of false alarms, and what no sky explains.
+"""chi^2 of data and maps: tests at one false-alarm rate, and the chi^2 that no sky explains.
 
-If a model holds, chi^2 of n degrees of freedom has ::
+If a model is correct, chi^2 with n degrees of freedom has ::
 
     p = 2 min(P(chi^2_n > chi^2), P(chi^2_n < chi^2)),
 
-uniform from 0 to 1: too large a chi^2 counts as much as too small a one. The best of k such
+uniform from 0 to 1: too large a chi^2 counts as much as too small a one. The smallest p of k such
 probabilities is judged by k p, which is below any bound at most that often, however they depend on
-one another (Bonferroni). A report makes all of its tests at one rate, so that a report of data that
-fit says otherwise at most once in 1 / ``FALSE_ALARM``.
+one another (Bonferroni). All tests of a report share one rate, so that at most one in
+1 / ``FALSE_ALARM`` reports flags data that fit.
 
 Maps are judged by their fidelity to a known truth, and by measures that need none.
 
-chi^2 of all data under the model, (d - A mu)^T (A S A^T + N)^-1 (d - A mu), mixes up instrument and
-prior. Give the sky a prior k times as wide, and ::
+chi^2 of all data under the model, (d - A mu)^T (A S A^T + N)^-1 (d - A mu), mixes instrument and
+prior. With a prior of the sky that is k times as wide, ::
 
     q = (d - A mu)^T (k^2 A S A^T + N)^-1 (d - A mu)
 
-is left: noise alone, since the wide prior explains any sky. In units of the prior, with Lambda =
-1 + W the precision of the whitened sky and W = sum_i lambda_i e_i e_i^T, noise enters q along e_i
+remains: noise alone, since the wide prior explains any sky. Let Lambda = 1 + W be the precision of
+the whitened sky in units of the prior, and W = sum_i lambda_i e_i e_i^T. Noise enters q along e_i
 with the weight 1 / (1 + k^2 lambda_i), and sky of variance v with v lambda_i / (1 + k^2 lambda_i),
 so that ::
 
     E q = N_data - (1 - v / k^2) (p - tr Lambda_k^-1),    Lambda_k = 1 + k^2 W  (p x p).
 
-With k^2 = 100 v the sky hardly matters. v is 1, or, where the sky is stronger than its prior, what
-it is found to be. The rest, chi^2 - q, tests the prior. Weights lie between 0 and 1: both parts
+With k^2 = 100 v the sky contributes little. v is 1, or, if the sky is stronger than its prior, its
+estimated variance. The rest, chi^2 - q, tests the prior. Weights lie between 0 and 1: both parts
 scatter like a chi^2 with their means as degrees of freedom, or less.
 """
 
@@ -40,7 +40,7 @@ from lusee_bayes.core.lazy import special
 
 Level = Literal["consistent", "unlike the prior", "does not fit"]
 LEVELS: tuple[Level, ...] = ("consistent", "unlike the prior", "does not fit")
-# of a report of data that fit: a mission makes some hundred of them
+# probability that a report flags data that fit: a mission makes some hundred reports
 FALSE_ALARM = 1e-3
 # groups or channels that are named in a sentence
 NAMED = 4
@@ -57,7 +57,7 @@ HEADLINES: dict[Level, str] = {
 
 @dataclass(frozen=True)
 class ChiSquare:
-    """A chi^2 with its degrees of freedom, which need not be whole; ``p`` goes into JSON, too.
+    """A chi^2 with its degrees of freedom, which need not be whole; JSON includes ``p``.
 
     Attributes
     ----------
@@ -70,32 +70,32 @@ class ChiSquare:
     @computed_field
     @property
     def p(self) -> float:
-        """Probability of a chi^2 as far out on its side, if the model holds."""
+        """Two-sided p-value: uniform from 0 to 1 if the model is correct."""
         return two_sided(self.chi2, self.degrees)
 
     @property
     def fits(self) -> bool:
-        """Whether it alone is what chance makes."""
+        """Whether chance explains it, as a single test."""
         return not stands_out(self.p, 1)
 
     @property
     def too_small(self) -> bool:
-        """Whether it is below what is expected, where it stands out."""
+        """Whether it is below its expectation; relevant if it stands out."""
         return bool(self.chi2 < self.degrees)
 
     @property
     def of_sky(self) -> str:
-        """What the sky is where its prior's chi^2 stands out."""
+        """The sky relative to its prior, in words, if the prior's chi^2 stands out."""
         if self.too_small:
             return "fainter, or closer to the prior's mean, than the prior assumes"
         return "inconsistent with the prior"
 
     def words(self) -> str:
-        """p, and chi^2 with what is expected of it."""
+        """p, and chi^2 with its expectation."""
         return f"p {probability(self.p)}, {self.chi2_words()}"
 
     def chi2_words(self) -> str:
-        """chi^2 with what is expected of it."""
+        """chi^2 with its expectation."""
         expected = f"{self.degrees:.0f} +- {np.sqrt(2.0 * self.degrees):.0f}"
         return f"chi2 {self.chi2:.0f}, expected {expected}"
 
@@ -108,7 +108,7 @@ class Fit:
     ----------
     level : {"consistent", "unlike the prior", "does not fit"}
     details : str
-        In sentences: what stands out, and what to do.
+        Sentences on the tests that stand out, and on remedies.
     """
 
     level: Level
@@ -126,7 +126,7 @@ class Fit:
 
 
 def two_sided(chi2: float, n: float | int) -> float:
-    """Compute how probable it is that chi^2 of n degrees of freedom is as far out on its side.
+    """Compute the two-sided p-value of a chi^2 with n degrees of freedom.
 
     Parameters
     ----------
@@ -137,19 +137,19 @@ def two_sided(chi2: float, n: float | int) -> float:
     Returns
     -------
     float
-        From 0 to 1, uniform if the model holds.
+        From 0 to 1, uniform if the model is correct.
     """
     # both tails are one half at the median, up to rounding
     return float(min(1.0, 2.0 * min(special.chdtr(n, chi2), special.chdtrc(n, chi2))))
 
 
 def stands_out(p: float, among: int) -> bool:
-    """Whether a probability, one of ``among`` of a report, is too small for chance."""
+    """Whether a p-value, one of ``among`` in a report, is too small for chance."""
     return among * p < FALSE_ALARM
 
 
 def in_brief(names: list[str]) -> str:
-    """The first ``NAMED`` of several names, and how many more there are."""
+    """The first ``NAMED`` of several names, and the number of the others."""
     more = len(names) - NAMED
     return ", ".join([*names[:NAMED], *([f"{more} more"] if more > 0 else [])])
 
@@ -165,6 +165,6 @@ def probability(p: float) -> str:
     Returns
     -------
     str
-        Such as "= 0.62", or "< 1e-300" where it is too small for a float.
+        Such as "= 0.62", or "< 1e-300" if it is too small for a float.
     """
     return f"= {p:.2g}" if p > 0 else "< 1e-300"

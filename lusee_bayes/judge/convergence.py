@@ -1,4 +1,4 @@
-"""Whether draws of chains can be trusted yet."""
+"""Check whether the draws of chains can be trusted yet."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-# R-hat and effective sizes a chain that are enough (Vehtari et al. 2021); an R-hat far from it, and
-# the share of diverged draws that is
+# sufficient R-hat and effective size per chain (Vehtari et al. 2021); bounds beyond which R-hat and
+# the fraction of diverged draws are bad
 AGREE, PER_CHAIN, FAR, FEW = 1.01, 100, 1.05, 0.01
 CRITERIA = (
     f"Required: R-hat of at most {AGREE:g}, effective sizes of {PER_CHAIN} for each chain, no "
@@ -16,7 +16,7 @@ CRITERIA = (
 
 
 def warnings_of(table: Mapping[str, np.ndarray], *, chains: int, divergences: int) -> list[str]:
-    """Why draws are not to be trusted yet, and what to do; empty if there is no reason.
+    """List reasons not to trust draws yet, with remedies; empty if there are none.
 
     Parameters
     ----------

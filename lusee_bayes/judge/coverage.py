@@ -1,9 +1,9 @@
-"""How often error bars hold the truth, and how often they would by chance.
+"""How often error bars cover the truth, and how often they would by chance.
 
-If a posterior is right, the truth is one of its draws. The pulls (truth - mean) / std are then
-those of draws, z ~ N(0, corr(C)): each is standard normal, but neighbouring pixels pull alike, so
-that counts over a band of latitude scatter far more than counts of independent pixels would. How
-much they scatter is therefore counted, too, over the pulls of a few hundred draws.
+If a posterior is correct, the truth is one of its draws. The pulls (truth - mean) / std are then
+distributed like those of draws, z ~ N(0, corr(C)): each is standard normal, but neighbouring pixels
+are correlated, so that counts over a band of latitude scatter far more than counts of independent
+pixels. This scatter is therefore measured, too, from the pulls of a few hundred draws.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from lusee_bayes.core.arrays import Draws, Modes, Pixels, Vector
 from lusee_bayes.core.harmonics import lmax_of, mode_numbers, modes_to_map
 from lusee_bayes.core.lazy import healpy, special
 
-# of the central intervals that are counted, and their names in files
+# probabilities of the central intervals, and their names in files
 LEVELS = (0.50, 0.68, 0.90, 0.95)
 NAMES = tuple(f"{100 * level:.0f}" for level in LEVELS)
 REST = ("rms", "rms_scatter", "largest", "allowed")
-# draws that tell the scatter: it is then known to 4 %
+# draws that determine the scatter, to 4 %
 N_DRAWS = 300
 # degrees of |b|: the plane, where the sky is furthest from the prior, its surroundings, the rest
 LATITUDES = (10.0, 30.0)
 # first ell of each group
 ELLS = (0, 1, 5, 10, 20, 30, 50, 100, 200)
-# share of draws whose largest pull is below the one that is called allowed
+# fraction of draws whose largest pull is below ``allowed``
 ALLOWED = 0.95
 
 
@@ -42,15 +42,15 @@ class Coverage:
     n : int
         Number of pixels or modes.
     held : tuple of float
-        Share of them whose truth lies within the central interval of each of ``LEVELS``.
+        Fraction of them whose truth lies within the central interval of each of ``LEVELS``.
     scatter : tuple of float
-        Standard deviation of ``held`` if the posterior is right.
+        Standard deviation of these fractions if the posterior is correct.
     rms, rms_scatter : float
-        Root mean square of the pulls, 1 on average if the posterior is right, and its scatter.
+        Root mean square of the pulls, 1 on average if the posterior is correct, and its scatter.
     largest : float
         The largest absolute pull.
     allowed : float
-        What the largest one of 95 % of draws does not exceed.
+        95 % of draws have a smaller largest pull than this.
     """
 
     name: str
@@ -63,7 +63,7 @@ class Coverage:
     allowed: float
 
     def row(self) -> dict[str, float | str]:
-        """All of it by name, for JSON and CSV."""
+        """All attributes by name, for JSON and CSV."""
         return {
             "name": self.name,
             "n": self.n,
@@ -84,7 +84,7 @@ class Counts:
     sizes : tuple of int
         Number of pixels or modes of each.
     values : (parts, statistics, skies) array
-        Shares within the intervals of ``LEVELS``, rms and largest absolute pull; of the truth
+        Fractions within the intervals of ``LEVELS``, rms and largest absolute pull: of the truth
         first, then of every draw.
     """
 
@@ -94,16 +94,16 @@ class Counts:
 
     @classmethod
     def of_pixels(cls, std: Pixels, error: Modes, deviations: Draws) -> Counts:
-        """By Galactic latitude.
+        """Count pixels by Galactic latitude.
 
         Parameters
         ----------
         std : (pixels,) array
             HEALPix RING, Galactic, in K.
         error : (modes,) array
-            Truth less mean, in K.
+            Truth minus mean, in K.
         deviations : (draws, modes) array
-            Draws of the posterior less its mean, in K.
+            Draws of the posterior minus its mean, in K.
         """
         nside = healpy.npix2nside(len(std))
         pulls = (modes_to_map(x, nside) / std for x in (error, *deviations))
@@ -111,7 +111,7 @@ class Counts:
 
     @classmethod
     def of_modes(cls, std: Modes, error: Modes, deviations: Draws) -> Counts:
-        """By multipole, of harmonic coefficients; what is known exactly pulls at nothing."""
+        """Count harmonic coefficients by multipole; exactly known ones have a pull of zero."""
         width = np.where(std > 0, std, np.inf)
         return cls._of(multipoles(lmax_of(len(std))), (x / width for x in (error, *deviations)))
 
@@ -121,7 +121,7 @@ class Counts:
         return cls(tuple(parts), tuple(int(inside.sum()) for inside in parts.values()), counted)
 
     def coverage(self) -> tuple[Coverage, ...]:
-        """What was counted, with its scatter, part by part."""
+        """The coverage of each part, with its scatter."""
         truth, draws = self.values[..., 0], self.values[..., 1:]
         n, allowed = len(LEVELS), np.quantile(draws[:, -1], ALLOWED, axis=1)
         columns = (x.tolist() for x in (truth, draws.std(2), truth[:, n + 1], allowed))
@@ -157,7 +157,7 @@ def latitudes(nside: int) -> dict[str, Bool[np.ndarray, " pixels"]]:
 
 
 def multipoles(lmax: int) -> dict[str, Bool[np.ndarray, " modes"]]:
-    """Which modes are of which group of multipoles."""
+    """Which modes are in each group of multipoles."""
     ell, _ = mode_numbers(lmax)
     first = [edge for edge in ELLS if edge <= lmax]
     last = [*(edge - 1 for edge in first[1:]), lmax]

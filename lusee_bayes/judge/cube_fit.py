@@ -1,11 +1,11 @@
 """Whether the data of all channels fit: instrument and noise by channel, the prior for all.
 
-What no sky explains (:mod:`.chi2`) is known of each channel by itself, whatever the prior and
-whether or not channels share a posterior. Channels are independent: their chi^2 add up, and each
-is above its median with a chance of one half. Small excesses that no channel shows by itself, such
-as 38 of 46 channels above, are seen in the sum and in the number of those above.
+The chi^2 that no sky explains (:mod:`.chi2`) is computed for each channel, independently of the
+prior and of whether channels share a posterior. Channels are independent: their chi^2 add up, and
+each is above its median with a probability of one half. The sum and the number above the median
+reveal excesses too small to be seen in single channels, such as 38 of 46 channels above.
 
-The rest of chi^2 of all data under the model tells of the prior.
+The rest of chi^2 of all data under the model tests the prior.
 
 Channels that share the instrument can contradict each other. The data of channel k constrain the
 shared unknowns by a likelihood N(y, L^-1), with L = V^-1 - 1 and L y = V^-1 E (:mod:`.amplitudes`);
@@ -13,9 +13,9 @@ all other channels, with the prior, predict N(m, P). If the instrument is the sa
 
     chi^2 = (y - m)^T (L^-1 + P)^-1 (y - m)
 
-has as many degrees of freedom as there are directions that channel k constrains. A wrong channel
-spoils the prediction of all the others. The worst channel is therefore left out, and the rest are
-tested again, until no channel stands out.
+has one degree of freedom for each direction that channel k constrains. A wrong channel spoils the
+prediction of all the others. The worst channel is therefore left out, and the others are tested
+again, until no channel stands out.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from scipy.special import bdtr, chdtrc
 from lusee_bayes.judge.chi2 import LEVELS, ChiSquare, Fit, Level, in_brief, probability, stands_out
 from lusee_bayes.linear.amplitudes import root_of_kernels
 
-# of the joint tests
+# number of joint tests
 N_TESTS = 4
 
 
@@ -43,13 +43,13 @@ class JointTest:
     ----------
     name : str
     p : float
-        Uniform, or on average larger, if the model holds.
+        Uniform, or on average larger, if the model is correct.
     n : int
-        How many probabilities ``p`` is the smallest of.
+        Number of probabilities of which ``p`` is the smallest.
     found : str
-        What was found, in words.
+        The result in words.
     of_prior : bool
-        Whether it tests the prior, else instrument and noise.
+        Whether it tests the prior; otherwise instrument and noise.
     """
 
     name: str
@@ -61,7 +61,7 @@ class JointTest:
     @computed_field
     @property
     def level(self) -> Level:
-        """The verdict of this test, one of four."""
+        """The verdict of this test, one of ``N_TESTS``."""
         if not stands_out(self.p, N_TESTS * self.n):
             return "consistent"
         return "unlike the prior" if self.of_prior else "does not fit"
@@ -75,13 +75,14 @@ class ChannelFits:
     ----------
     frequencies_mhz : (channels,) array
     chi2, degrees : (channels,) array
-        What no sky explains of each channel, and its mean if instrument and noise are right.
+        chi^2 of each channel that no sky explains, and its mean if instrument and noise are
+        correct.
     prior : ChiSquare
-        Of all channels together, what the prior does not expect.
+        Of all channels together: tests the prior.
     joint : bool
         Whether channels share a posterior.
     shared : tuple of SharedTest
-        Where they share the instrument.
+        If they share the instrument.
     """
 
     frequencies_mhz: Float[np.ndarray, " channels"]
@@ -93,12 +94,12 @@ class ChannelFits:
 
     @property
     def by_channel(self) -> list[ChiSquare]:
-        """That of every channel."""
+        """chi^2 of every channel."""
         return list(map(ChiSquare, self.chi2.tolist(), self.degrees.tolist()))
 
     @property
     def total(self) -> ChiSquare:
-        """That of all channels together."""
+        """chi^2 of all channels together."""
         return ChiSquare(float(self.chi2.sum()), float(self.degrees.sum()))
 
     def p(self) -> Float[np.ndarray, " channels"]:
@@ -111,7 +112,7 @@ class ChannelFits:
         return [int(k) for k in np.argsort(p) if stands_out(float(p[k]), N_TESTS * len(p))]
 
     def tests(self) -> list[JointTest]:
-        """The joint tests: sum, number above the median, channel furthest out, and the prior."""
+        """The joint tests: sum, number above the median, most deviant channel, and the prior."""
         p, n = self.p(), len(self.chi2)
         least = int(np.argmin(p))
         above = int((chdtrc(self.degrees, self.chi2) < 0.5).sum())
@@ -151,9 +152,7 @@ class ChannelFits:
         return Fit(level, " ".join([*sentences, *([] if contradiction else self._advice(level))]))
 
     def _too_quiet(self) -> bool:
-        """Whether all channels together, or the one furthest out if that is less probable, have
-        too small a chi^2.
-        """
+        """Whether the least probable chi^2, of a channel or of all together, is too small."""
         return min([*self.by_channel, self.total], key=lambda one: one.p).too_small
 
     def _advice(self, level: Level) -> list[str]:
@@ -184,7 +183,7 @@ LEAST_INFORMATION = 1e-2
 
 @dataclass(frozen=True)
 class SharedTest:
-    """What a channel's own data say of the shared instrument, compared with all other channels.
+    """A channel's own constraints on the shared instrument, compared with all other channels.
 
     Attributes
     ----------
@@ -196,9 +195,9 @@ class SharedTest:
     disagrees : bool
         Whether it stands out among all channels.
     shares : dict of float
-        By unknown that all channels have in common: this channel's share of the information, which
-        is 1 / variance - 1 in prior units. Each channel counts as if it were alone; zero where
-        no channel constrains the unknown.
+        By unknown that all channels have in common: this channel's fraction of the information,
+        which is 1 / variance - 1 in prior units. Each channel is counted separately; zero if no
+        channel constrains the unknown.
     """
 
     frequency_mhz: float
@@ -221,12 +220,12 @@ def shared_tests(
     names: Sequence[str],
     frequencies_mhz: Sequence[float],
 ) -> tuple[SharedTest, ...]:
-    """Test each channel against all others, and compare what each says of the instrument.
+    """Test each channel against all others, and compare their information about the instrument.
 
     Parameters
     ----------
     mean, covariance, kernels : array
-        As of :func:`.tie`, in prior standard deviations.
+        As for :func:`.tie`, in prior standard deviations.
     names : sequence of str
         Of the n unknowns.
     frequencies_mhz : sequence of float
@@ -263,7 +262,7 @@ def shared_tests(
         worst = max(agree, key=excess)
         if not stands_out(float(chdtrc(max(tests[worst][1], 1), tests[worst][0])), len(mean)):
             break
-        # of two that differ, neither is known to be right
+        # if only two differ, either may be wrong
         agree = [k for k in agree if k != worst] if len(agree) > 2 else []
     alone = np.maximum(1.0 / np.diagonal(covariance, axis1=1, axis2=2) - 1.0, 0.0)
     common = [i for i, kernel in enumerate(kernels) if (kernel == 1.0).all()]
@@ -276,7 +275,7 @@ def shared_tests(
 
 
 def disagreement(tests: Sequence[SharedTest]) -> str:
-    """Name the channels that disagree, in a sentence; empty where all agree."""
+    """Name the channels that disagree, in a sentence; empty if all agree."""
     bad = [f"{t.frequency_mhz:g} MHz (p {probability(t.p)})" for t in tests if t.disagrees]
     if not bad:
         return ""

@@ -1,13 +1,13 @@
 """Groups of data against their prediction by all others.
 
-With K = A S A^T + N the covariance of data under the model and u = K^-1 (d - E[d]), a group s
-differs from its prediction by K_ss^-1 u_s, K_ss being a block of K^-1, and ::
+Let K = A S A^T + N be the covariance of data under the model, and u = K^-1 (d - E[d]). A group s
+differs from its prediction by K_ss^-1 u_s, where K_ss is a block of K^-1, and ::
 
     chi^2_s = u_s^T K_ss^-1 u_s,
     ln p(d_s | all others) = 1/2 [ln|K_ss| - chi^2_s - n_s ln 2 pi].
 
-Of noise alone the mean of chi^2_s is the number of data, less one for every direction of the sky
-that only this group measures: tr K_ss^-1 (K^-1 A S A^T K^-1)_ss in all.
+For noise alone, the mean of chi^2_s is the number of data, minus one for each direction of the sky
+that only this group measures: tr K_ss^-1 (K^-1 A S A^T K^-1)_ss in total.
 
 With N = N_0 + T T^T, F = [T, A S^(1/2)], and D = N_0^-1, whose blocks are the data that N_0 couples
 (the products of a time, or all data), ::
@@ -18,20 +18,20 @@ With N = N_0 + T T^T, F = [T, A S^(1/2)], and D = N_0^-1, whose blocks are the d
 
     K_ss = c (1 - W W^T) c^T,    directions = |(1 - W W^T)^(-1/2) W L^-1|^2 over the sky's columns.
 
-Rows of A at times close to each other are combinations of those at a few of them, A_s = U A_few
-(:func:`.spanning_rows`), and so c^T U = q r gives W = q (r F_few L^-T). Of a day of ten-minute
-samples these are an eighth, and F_few of each of its days is in turn made of few rows of a stretch
-of ``DAYS`` days. L^-T and Q^-1 are applied to the rows of a stretch, once for all groups within it
-and for the diagonal of K^-1. Runs of at most ``SHARED`` times are one stretch; where D couples
-their products, and where A has no structure in time, Y L^-T of all data is kept.
+Rows of A at nearby times are combinations of the rows at a few of them, A_s = U A_few
+(:func:`.spanning_rows`), so that c^T U = q r gives W = q (r F_few L^-T). In a day of ten-minute
+samples the few are an eighth; the few of all days in a stretch of ``DAYS`` days are in turn spanned
+by a few of theirs. L^-T and Q^-1 are applied to the rows of a stretch, once for all groups within
+it and for the diagonal of K^-1. Up to ``SHARED`` times are one stretch; if D couples their
+products, or A has no structure in time, Y L^-T of all data is kept.
 
-**A large group** is taken out of Q, without rows of A where A and N have structure in time::
+**A large group** is removed from Q, without rows of A if A and N have structure in time::
 
     Q_s = Q - F^T D_:s D_ss^-1 D_s: F,    h = F^T D_:s D_ss^-1 u_s,
     chi^2_s = u_s^T D_ss^-1 u_s + h^T Q_s^-1 h,    |K_ss| = |D_ss| |Q_s| / |Q|,
     directions = tr (Q_s^-1 - Q^-1) of the sky.
 
-What is left without a group has N_0 without it, so that D loses ``D_:s D_ss^-1 D_s:``.
+The data that remain have N_0 without the group, so that D loses ``D_:s D_ss^-1 D_s:``.
 """
 
 from __future__ import annotations
@@ -60,12 +60,12 @@ from lusee_bayes.noise.covariance import LowRankUpdate
 DENSE_BYTES = 1.2e9
 # Y L^-T and Y Q^-1 of all data are kept up to this size (a month of hours at lmax 47: 0.4 GB)
 KEPT_BYTES = 5e8
-# steps that refine Q^-1 F^T D d, which loses what the normal equations lose
+# steps that refine Q^-1 F^T D d, to restore the digits that normal equations lose
 REFINEMENTS = 2
-# runs of no more times are one stretch, others have stretches of so many days: measured for a year
-# of ten-minute samples, 7 or 30 days take a tenth longer
+# up to SHARED times are one stretch, more have stretches of DAYS days: measured for a year of
+# ten-minute samples, 7 or 30 days take a tenth longer
 SHARED, DAYS = 1000, 15
-# times whose rows are computed at once, and data that are a small group in any case
+# times whose rows are computed at once, and number of data up to which a group is always small
 CHUNK, QUICK = 16, 500
 
 # arrays by block of D (times, or one block of all data) and place in it (products, or data)
@@ -86,12 +86,12 @@ class Missed(NamedTuple):
     n : int
         Number of its data.
     chi2 : float
-        chi^2_s; NaN where the group cannot be compared: there are no other data, or they constrain
-        so little, and the group so much, that 64 bits do not tell it from nothing.
+        chi^2_s; NaN if the group cannot be compared: there are no other data, or they constrain too
+        little next to the group, so that it is lost in rounding.
     directions : float
-        By how much its mean is below the number of data, if there is noise alone.
+        Number of data minus the mean of chi^2_s, for noise alone.
     log_det : float
-        ln|K_ss|, with K_ss in 1/K^2: large where the others predict the group well.
+        ln|K_ss|, with K_ss in 1/K^2: large if the others predict the group well.
     """
 
     n: int
@@ -101,7 +101,7 @@ class Missed(NamedTuple):
 
     @property
     def degrees(self) -> float:
-        """The mean of chi^2_s if there is noise alone."""
+        """The mean of chi^2_s for noise alone."""
         return self.n - float(np.clip(self.directions, 0.0, self.n))
 
     @property
@@ -122,7 +122,7 @@ class DataGroup(NamedTuple):
         One of ``KINDS``.
     name : str
     data : (products, times) array of bool
-        Which data it has.
+        Which data belong to it.
     """
 
     kind: str
@@ -141,8 +141,8 @@ def groups_of(data: Visibilities) -> list[DataGroup]:
     Returns
     -------
     list of DataGroup
-        Days of 24 hours from the first sample, by the date on which they begin. Runs of one
-        turntable angle are one group.
+        Days have 24 hours from the first sample, and the name of the date on which they begin. Runs
+        at the same turntable angle are one group.
     """
     observation, present = data.observation, np.asarray(data.layout.present)
     day, first = observation.day, np.datetime64(str(observation.times[0].isot)[:19])
@@ -157,7 +157,7 @@ def groups_of(data: Visibilities) -> list[DataGroup]:
 
 
 class Chosen(NamedTuple):
-    """A group: its cells, the blocks and places where it has any, those of them, c and c^-1 u_s."""
+    """A group: its cells, the blocks and places that have any, its cells there, c and c^-1 u_s."""
 
     cells: CellFlags
     blocks: Int[np.ndarray, " n"]
@@ -168,14 +168,14 @@ class Chosen(NamedTuple):
 
 
 class Span(NamedTuple):
-    """Few of some times, and U: F at all of them is U F_few."""
+    """A few of several times, and U: F at all of them is U F_few."""
 
     few: Int[np.ndarray, " few"]
     factors: Float[np.ndarray, "times few"]
 
 
 class Stretch(NamedTuple):
-    """F at some times, in order: of every product F_few L^-T and F_few Q^-1 of the sky, and U."""
+    """F at ordered times: for every product F_few L^-T and F_few Q^-1 of the sky, and U."""
 
     times: Int[np.ndarray, " times"]
     half: Float[np.ndarray, "products few rank"]
@@ -184,23 +184,23 @@ class Stretch(NamedTuple):
 
 
 class LeftOut:
-    """A model and its data, ready to leave out groups of them.
+    """A model and its data, prepared for leaving out groups of data.
 
     Parameters
     ----------
     model : LinearGaussian
-        Of any kind. Without structure in time A is formed, and where N couples times N^-1, too.
+        Of any kind. A is formed unless A and N have structure in time; N^-1, if N couples times.
     data : Visibilities
         In K.
     posterior : Posterior, optional
         Of this model, given any data: saves factorising it.
     gone : (products, times) array of bool, optional
-        Data that are left out for good.
+        Data that are left out permanently.
 
     Attributes
     ----------
     present : (products, times) array of bool
-        Which data there are.
+        Which data are present.
     u : (products, times) array
         K^-1 (d - E[d]), in 1/K; zero where there are no data.
 
@@ -244,7 +244,7 @@ class LeftOut:
     def of(
         cls, model: LinearGaussian, data: Visibilities, posterior: Posterior | None = None
     ) -> LeftOut | None:
-        """Prepare a model where it is not too large.
+        """Prepare a model unless it is too large.
 
         Parameters
         ----------
@@ -265,7 +265,7 @@ class LeftOut:
         return cls(model, data, posterior=posterior)
 
     def without(self, gone: GridFlags) -> LeftOut:
-        """Take out data for good; nothing else of the model changes.
+        """Leave out data permanently; the rest of the model does not change.
 
         Parameters
         ----------
@@ -286,7 +286,7 @@ class LeftOut:
         Returns
         -------
         Missed
-            NaN where the group cannot be compared.
+            NaN if the group cannot be compared.
         """
         cells = self._on_cells(group & self.present)
         n = int(np.count_nonzero(cells))
@@ -298,7 +298,7 @@ class LeftOut:
         b = solve_roots(root, np.where(cells[where], self._u[where], 0.0)[..., None])
         chosen = Chosen(cells, blocks, places, cells[where], root, b)
         small = self._small(chosen, stretch)
-        # all NaN where Q_s, or 1 - W W^T, has no root
+        # all NaN if Q_s, or 1 - W W^T, has no root
         answer = self._taken_out(chosen) if small is None else self._among_data(chosen, *small)
         chi2, directions, log_det = answer
         return Missed(n, chi2, directions, log_det + 2.0 * float(np.log(diagonal_of(root)).sum()))
@@ -318,7 +318,7 @@ class LeftOut:
         return [by_number[k] for k in range(len(groups))]
 
     def _within(self, group: GridFlags, neither: int) -> int:
-        """The number of the stretch that has all of a group; ``neither`` if none, or all data."""
+        """Number of the stretch with all of a group; ``neither`` if none, or for all data."""
         if not self._summable or self._whole is not None:
             return neither
         stretches = self._stretch_of[group.any(axis=0)]
@@ -326,7 +326,7 @@ class LeftOut:
 
     @once
     def inverse_diagonal(self) -> Grid:
-        """The diagonal of K^-1, in 1/K^2; NaN where 64 bits do not tell it from nothing."""
+        """The diagonal of K^-1, in 1/K^2; NaN where it is lost in rounding."""
         if self._kept is not None:
             self._lost = np.einsum("tkm,tkm->tk", self._kept[0], self._kept[0])
         else:
@@ -339,7 +339,7 @@ class LeftOut:
     # --- the model ----------------------------------------------------------------------------
 
     def _set_noise(self) -> None:
-        """D and T by block: of every time, or one of all data where N couples times."""
+        """Set D and T by block: one for each time, or one for all data if N couples times."""
         noise, self._cells = self._model.noise, self._layout
         base, self._templates = noise, np.zeros((noise.size, 0))
         if isinstance(noise, LowRankUpdate) and is_within_times(noise):
@@ -353,7 +353,7 @@ class LeftOut:
         self._t, self._n_templates = self._by_cell(self._templates), self._templates.shape[1]
 
     def _factorised(self, posterior: Posterior | None) -> Square:
-        """L, whose last rows are those of the precision of the sky alone."""
+        """L, whose lower right block is the root of the precision of the sky."""
         if posterior is None or posterior.basis is not None:
             normal = self._gram(self._weights)
             normal[np.diag_indices_from(normal)] += 1.0
@@ -414,7 +414,7 @@ class LeftOut:
         return np.block([[across[:n], across[n:].T], [across[n:], sky]])
 
     def _rows(self, blocks: Int[np.ndarray, " n"] | None) -> Float[np.ndarray, "n places rank"]:
-        """F at some times, of all products; or of all data."""
+        """F of all products at some times, or of all data."""
         prior, coupling = self._model.prior, self._model.coupling
         if blocks is None:
             sky = prior.colour_columns(coupling.dense())
@@ -425,14 +425,14 @@ class LeftOut:
         return np.concatenate([self._t[blocks], sky], axis=2)
 
     def _halves(self, rows: Float[np.ndarray, "*cells rank"]) -> tuple[np.ndarray, np.ndarray]:
-        """Rows x L^-T, and of x Q^-1 the columns of the sky."""
+        """x L^-T of rows x, and the sky's columns of x Q^-1."""
         flat = rows.reshape(-1, rows.shape[-1])
         half = linalg.solve_lower(self._lower, flat.T, transpose=False)
         sky = linalg.solve_lower(self._lower, half, transpose=True)[self._n_templates :].T
         return half.T.reshape(rows.shape), sky.reshape(*rows.shape[:-1], -1)
 
     def _stretch(self, number: int) -> Stretch:
-        """F at the times of a stretch; the diagonal of Y Q^-1 Y^T there is kept."""
+        """F at the times of a stretch; keeps the diagonal of Y Q^-1 Y^T there."""
         times = np.flatnonzero(self._stretch_of == number)
         stretch = self._stretch_at(times, self._span(times))
         half, factors, weights = stretch.half, stretch.factors, self._weights[times]
@@ -453,7 +453,7 @@ class LeftOut:
     def _halves_at(
         self, times: Int[np.ndarray, " n"], weights: Weights | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """F L^-T and the columns of the sky of F Q^-1 at some times; with weights, of D F."""
+        """F L^-T and the sky's columns of F Q^-1 at some times; with weights, D F in place of F."""
         shape, rank = (len(times), self._layout.n_products), len(self._lower)
         half, sky = np.empty((*shape, rank)), np.empty((*shape, rank - self._n_templates))
 
@@ -466,7 +466,7 @@ class LeftOut:
         return half, sky
 
     def _span(self, times: Int[np.ndarray, " n"]) -> Span:
-        """Few times that all of these are made of: first of every day, and then of all."""
+        """A few times that span all of these: first for every day, then for all days."""
         key = times.tobytes()
         if key not in self._spans:
             days = np.split(times, np.flatnonzero(np.diff(self._day[times])) + 1)
@@ -529,7 +529,7 @@ class LeftOut:
         outside = float((chosen.b**2).sum() - (inside**2).sum())
         return outside + chi2, directions, log_det_of(lower)
 
-    # --- groups that are taken out of Q -------------------------------------------------------
+    # --- groups that are removed from Q -------------------------------------------------------
 
     @once
     def _normal(self) -> Square:
@@ -561,12 +561,12 @@ class LeftOut:
 
 
 def pieces(times: Int[np.ndarray, " n"], most: int) -> list[np.ndarray]:
-    """So many times, or fewer, each."""
+    """Split times into pieces of at most ``most``."""
     return np.array_split(times, -(-len(times) // most))
 
 
 def diagonal_of(blocks: np.ndarray) -> Cells:
-    """The diagonals of blocks, which may be all of them."""
+    """The diagonals of blocks, which may be diagonals already."""
     return blocks if blocks.ndim == 2 else np.diagonal(blocks, axis1=1, axis2=2)
 
 
@@ -576,7 +576,7 @@ def weigh(weights: Weights, x: Float[np.ndarray, "blocks places k"]) -> np.ndarr
 
 
 def roots(weights: Weights, chosen: CellFlags) -> Roots:
-    """c of D_ss = c c^T in every block, at the places that any block uses; 1 where it does not."""
+    """c of D_ss = c c^T in every block, at places used by any block; 1 where this one has none."""
     used = np.flatnonzero(chosen.any(axis=0))
     some, within = chosen[:, used], weights[:, used]
     if weights.ndim == 2:
@@ -593,14 +593,14 @@ def solve_roots(root: Roots, x: np.ndarray, *, transpose: bool = False) -> np.nd
 
 
 def lost_weights(weights: Weights, chosen: CellFlags) -> Weights:
-    """What D loses without a group, ``D_:s D_ss^-1 D_s:``, all of it in the rows of the group."""
+    """The part of D lost without a group, ``D_:s D_ss^-1 D_s:``: all of D in the group's rows."""
     if weights.ndim == 2:
         return np.where(chosen, weights, 0.0)
     lost, blocks = np.zeros_like(weights), np.flatnonzero(chosen.any(axis=1))
     some, within = chosen[blocks], weights[blocks]
     used = np.flatnonzero(some.any(axis=0))
     e = solve_roots(roots(within, some), np.where(some[:, used, None], within[:, used], 0.0))
-    # the rows of the group to the last bit
+    # exact to the last bit in the group's rows
     whole = some[:, :, None] | some[:, None]
     lost[blocks] = np.where(whole, within, e.swapaxes(1, 2) @ e)
     return lost

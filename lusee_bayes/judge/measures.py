@@ -1,18 +1,17 @@
 """Score tests, the sky's strength, and how near a map is to the truth.
 
-Score tests tell what the data would prefer of something that the model leaves out. With K = A S A^T
-+ N the covariance of data under the model and u = K^-1 (d - E[d]), data that hold a t besides
-prefer ::
+Score tests estimate the amplitude a of a term t of the data that the model omits. With the
+covariance K = A S A^T + N of data under the model and u = K^-1 (d - E[d]), the data prefer ::
 
     a = t^T u / F,    F = t^T K^-1 t = t^T N^-1 t - P^T C P,    P = A^T N^-1 t,
 
-with the standard deviation F^(-1/2), C being the covariance of the sky; chi^2 of the data would be
-lower by (t^T u)^2 / F. A is not formed.
+with the standard deviation F^(-1/2), where C is the covariance of the sky. Including it would
+lower chi^2 of the data by (t^T u)^2 / F. A is not formed.
 
-How strong the sky is compared with its prior is told by Galactic latitude and by multipole. If the
-model holds, the deviation of the posterior mean from that of the prior is drawn from
-N(0, S - C): what the prior allows less what the data leave open. Its square over that expectation
-is 1 on average, larger where the prior is too narrow, and smaller where it is too wide.
+The strength of the sky relative to its prior is measured by Galactic latitude and by multipole. If
+the model is correct, the posterior mean minus the prior mean is drawn from N(0, S - C), the prior
+covariance minus the posterior covariance. Its square over that expectation is 1 on average, larger
+where the prior is too narrow, and smaller where it is too wide.
 """
 
 from __future__ import annotations
@@ -32,20 +31,20 @@ from lusee_bayes.judge.coverage import latitudes, multipoles
 from lusee_bayes.linear.linear_gaussian import Solution
 from lusee_bayes.linear.posterior import Posterior
 
-# relative, of a difference of two quadratic forms
+# relative rounding of a difference of two quadratic forms
 ROUNDING = 1e-10
 
 
 @dataclass(frozen=True)
 class Preferences:
-    """What the data prefer of each template, all others being left out.
+    """The data's preferred amplitude of each template, without all others.
 
     Attributes
     ----------
     amplitude, std : (n,) array
-        NaN where the data say nothing.
+        NaN where the data do not constrain it.
     gain : (n,) array
-        By how much chi^2 of the data would be lower.
+        Decrease of chi^2 of the data.
     """
 
     amplitude: Vector
@@ -59,7 +58,7 @@ def preferences(solution: Solution, templates: Float[np.ndarray, "data n"]) -> P
     Parameters
     ----------
     solution : Solution
-        Of the data and a model without them.
+        Of the data and a model without the templates.
     templates : (data, n) array
         t, in K per unit of their amplitudes.
 
@@ -78,28 +77,28 @@ def preferences(solution: Solution, templates: Float[np.ndarray, "data n"]) -> P
     # rows of P^T
     seen = np.asarray(model.coupling.transpose_mv(solved)).T
     precision = (templates * solved).sum(0) - ((seen @ solution.covariance) * seen).sum(1)
-    # what the sky can take up altogether is left with rounding alone
+    # if the sky can absorb a template completely, only rounding remains
     determined = precision > ROUNDING * (templates * solved).sum(0)
     inverse = np.divide(1.0, precision, out=np.full(len(precision), np.nan), where=determined)
     return Preferences(pull * inverse, np.sqrt(inverse), pull**2 * inverse)
 
 
 def strengths(deviation: Modes, of_modes: Modes, of_pixels: Pixels) -> dict[str, float]:
-    """Compute the square of a sky's deviation over what is expected, part by part.
+    """Compute the square of a sky's deviation over its expectation, part by part.
 
-    The monopole, of which priors know little, is left out.
+    The monopole, which priors barely constrain, is excluded.
 
     Parameters
     ----------
     deviation : (modes,) array
-        Posterior mean less prior mean, in K.
+        Posterior mean minus prior mean, in K.
     of_modes, of_pixels : (modes,), (pixels,) array
         The diagonal of S - C, of the modes and of the pixels without the monopole, in K^2.
 
     Returns
     -------
     dict of str to float
-        By name of the part; parts of which the data know nothing are left out.
+        By name of the part; parts that the data do not constrain are omitted.
     """
     rest = np.where(np.arange(len(deviation)) > 0, deviation, 0.0)
     nside = healpy.npix2nside(len(of_pixels))
@@ -115,7 +114,7 @@ def strengths(deviation: Modes, of_modes: Modes, of_pixels: Pixels) -> dict[str,
 
 
 def strengths_in_words(ratios: Mapping[str, float]) -> str:
-    """A sentence of them; empty if there are none."""
+    """A sentence that lists the ratios; empty if there are none."""
     if not ratios:
         return ""
     listed = ", ".join(f"{value:.2g} at {name}" for name, value in ratios.items())
@@ -123,7 +122,7 @@ def strengths_in_words(ratios: Mapping[str, float]) -> str:
 
 
 def correlation(mean: Modes, truth: Modes) -> Ells:
-    """Compute rho_ell = sum_m a a_true / sqrt(sum_m a^2 sum_m a_true^2), as the paper does.
+    """Compute rho_ell = sum_m a a_true / sqrt(sum_m a^2 sum_m a_true^2), as in the paper.
 
     Parameters
     ----------
@@ -140,7 +139,7 @@ def correlation(mean: Modes, truth: Modes) -> Ells:
 
 
 def signal_to_noise(mean: Modes, truth: Modes) -> Ells:
-    """Compute SNR_ell = sqrt( sum_m a^2 / sum_m (a - a_true)^2 ), as the paper does.
+    """Compute SNR_ell = sqrt( sum_m a^2 / sum_m (a - a_true)^2 ), as in the paper.
 
     Parameters
     ----------
@@ -178,7 +177,7 @@ def ell_cross(snr: Ells) -> int | None:
 
 
 def prior_fraction_per_ell(posterior: Posterior) -> Ells:
-    """Average the share of the prior variance that is left over m.
+    """Average over m the fraction of the prior variance that remains.
 
     Parameters
     ----------
@@ -199,7 +198,7 @@ def prior_fraction_per_ell(posterior: Posterior) -> Ells:
 
 
 def effective_resolution_deg(prior_fraction: Ells) -> float | None:
-    """Compute 180 degrees over the first ell >= 1 with more than half of the prior variance left.
+    """Compute 180 degrees over the first ell >= 1 that keeps more than half its prior variance.
 
     Parameters
     ----------
@@ -216,7 +215,7 @@ def effective_resolution_deg(prior_fraction: Ells) -> float | None:
 
 
 def expected_chi2(posterior: Posterior, n_data: int, variance: Modes | None = None) -> float:
-    """Compute the expectation of ``|L^-1 (d - A mean - offset)|^2``, N = L L^T, if the model holds.
+    """Compute the expectation of ``|L^-1 (d - A mean - offset)|^2``, N = L L^T, under the model.
 
     Parameters
     ----------
@@ -225,8 +224,8 @@ def expected_chi2(posterior: Posterior, n_data: int, variance: Modes | None = No
     n_data : int
         Number of data.
     variance : (unknowns,) array, optional
-        Of the posterior, where it is known: with a prior of independent unknowns nothing needs to
-        be inverted then.
+        Of the posterior, if it has been computed: with a prior of independent unknowns, no inverse
+        is needed then.
 
     Returns
     -------
@@ -242,7 +241,7 @@ def expected_chi2(posterior: Posterior, n_data: int, variance: Modes | None = No
 
 
 def highest_altitude(observation: Observation, nside: int) -> Pixels:
-    """Compute the highest altitude that every pixel of the sky reached.
+    """Compute the highest altitude that each pixel of the sky reached.
 
     Parameters
     ----------
@@ -254,8 +253,8 @@ def highest_altitude(observation: Observation, nside: int) -> Pixels:
     Returns
     -------
     (pixels,) array
-        Sine of the altitude, of Galactic pixels in RING order. Negative where the sky was never
-        above the horizon: there the map is prior alone.
+        Sine of the altitude, of Galactic pixels in RING order. Negative where the sky never rose
+        above the horizon: there the map comes from the prior alone.
     """
     directions = np.array(healpy.pix2vec(nside, np.arange(healpy.nside2npix(nside))))
     zeniths = observation.zenith_galactic()

@@ -1,4 +1,4 @@
-"""Whether data can be what the scenario says: correlations of its instrument under such a sky."""
+"""Check whether data are plausible as correlations of a scenario's instrument under its sky."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.instrument.products import auto_indices, to_matrix
 from lusee_bayes.instrument.visibilities import Visibilities
 
-# what noise alone does to one of 1e8 samples
+# standard deviations that noise alone exceeds in less than one of 1e8 samples
 SIGNIFICANT = 6.0
-# no sky and no gain is that far from the model: the unit is another, or the file is damaged
+# no sky and no gain differs this much from the model: the unit is wrong, or the file is damaged
 IMPOSSIBLE = 1e3
-# skies of this band are known to some ten per cent, and beams to a factor
+# skies of this band are known to some ten per cent, but beams can be wrong by a factor
 DOUBTFUL = 3.0
-# a map that knows less than that is no measurement
+# a map with less information is no measurement
 LEAST_BITS = 1.0
 
 
 def require_plausible(data: Visibilities, signal: Grid, std: DataVector) -> tuple[str, ...]:
-    """Check measured data against what every correlator and every sky obeys.
+    """Check measured data against constraints that every correlator and every sky obey.
 
-    Auto-correlations are powers, so that they are positive; ``|V_ij|^2 <= V_ii V_jj``
-    (Cauchy and Schwarz); both within the noise.
+    Auto-correlations are powers, thus positive, and ``|V_ij|^2 <= V_ii V_jj`` (Cauchy and Schwarz),
+    both within the noise.
 
     Parameters
     ----------
@@ -39,12 +39,12 @@ def require_plausible(data: Visibilities, signal: Grid, std: DataVector) -> tupl
     Returns
     -------
     tuple of str
-        What is doubtful, a sentence each, for the report.
+        Doubts for the report, a sentence each.
 
     Raises
     ------
     InputError
-        For values that no sky gives, and for auto-correlations that are negative beyond noise.
+        For values that no sky causes, and for significantly negative auto-correlations.
     """
     values, layout = np.asarray(data.grid()), data.layout
     sigma = np.asarray(layout.scatter(np.asarray(std)))
@@ -67,13 +67,13 @@ def require_plausible(data: Visibilities, signal: Grid, std: DataVector) -> tupl
 
 
 def about_information(bits: float) -> tuple[str, ...]:
-    """Say that data tell nothing, if so; NaN where the information is not known."""
+    """Warn if data contain no information; no warning if it is NaN, i.e. unknown."""
     text = f"The data contain only {bits:.2g} bits of information on the sky: the map is the prior."
     return (text,) if bits < LEAST_BITS else ()
 
 
 def _refuse(data: Visibilities, bad: GridFlags, why: str) -> None:
-    """InputError for the first of the samples that are bad."""
+    """Raise an InputError for the first bad sample, if there is one."""
     if not bad.any():
         return
     product, time = (int(index[0]) for index in np.nonzero(bad))
@@ -106,7 +106,7 @@ def _about_crosses(data: Visibilities, values: Grid, sigma: Grid) -> tuple[str, 
     for i, j in combinations(range(len(correlations)), 2):
         vi, vj = correlations[i, i].real, correlations[j, j].real
         cross = np.abs(correlations[i, j])
-        # autos within noise of zero bound nothing
+        # autos that are not positive give no bound
         usable = (vi > 0) & (vj > 0) & ~np.isnan(cross)
         vi, vj = np.where(usable, vi, 1.0), np.where(usable, vj, 1.0)
         bound = np.sqrt(vi * vj)

@@ -1,17 +1,17 @@
-"""What the model predicts of data from all other data, and what does not fit.
+"""Predictions of data from all other data, and data that do not fit.
 
-Under a prior that is wide enough for any sky (:mod:`.chi2`), with K = k^2 A S A^T + N the
-covariance of data and u = K^-1 (d - E[d]), a group s of data differs from its prediction by all
-others by K_ss^-1 u_s, K_ss being a block of K^-1, and ::
+Under a prior that is wide enough for any sky (:mod:`.chi2`), let K = k^2 A S A^T + N be the
+covariance of data, and u = K^-1 (d - E[d]). A group s of data differs from its prediction by all
+others by K_ss^-1 u_s, where K_ss is a block of K^-1, and ::
 
     chi^2_s = u_s^T K_ss^-1 u_s,    chi^2_all - chi^2_s = chi^2 of the others without s.
 
-Directions of the sky that only the group measures take a degree of freedom each: a day that sees
-what no other day does is not blamed for it. A bad group spoils the predictions for all others too;
+Each direction of the sky that only the group measures uses a degree of freedom: a day that alone
+sees a part of the sky is not blamed for it. A bad group spoils the predictions for all others, too;
 the culprit is the group whose removal makes the rest fit.
 
-The density ln p(d_s | all others) of a group is that of its prediction, whose width counts: a prior
-that predicts too much is punished as one that predicts too little is.
+The density ln p(d_s | all others) of a group also depends on the width of its prediction: it
+penalises a prior that is too wide as it does one that is too narrow.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from lusee_bayes.judge.left_out import KINDS, DataGroup, LeftOut, Missed, groups
 from lusee_bayes.judge.split import Split, with_sky
 from lusee_bayes.linear.linear_gaussian import Solution
 
-# of a prior that the sky is unlike
+# if the sky is inconsistent with the prior
 TOO_WIDE = (
     "The prior is wider than the sky requires: error bars are too wide where the sky is fainter "
     "than the prior assumes. Choose a narrower prior (lusee-bayes compare-priors)."
@@ -49,14 +49,14 @@ class Group:
     n : int
         Number of data.
     degrees : float
-        Mean of ``chi2`` if there is noise alone: ``n`` less the directions of the sky that only
-        this group measures.
+        Mean of ``chi2`` for noise alone: ``n`` minus the directions of the sky that only this group
+        measures.
     chi2 : float
         Of these data given all others.
     p : float
-        Probability of a ``chi2`` as far out on its side if instrument and noise are right.
+        Two-sided p-value of ``chi2`` if instrument and noise are correct.
     others_p : float
-        The same of the others without these; NaN if there are no others.
+        The same for all other data without these; NaN if there are no others.
     """
 
     kind: str
@@ -80,13 +80,13 @@ class Residuals:
     predicted : (data,) array
         A mean + offset, in K.
     z : (data,) array
-        Each datum less its prediction by all others, in standard deviations: N(0, 1) or narrower,
-        and not independent. NaN where groups are not judged.
+        Each datum minus its prediction by all others, in standard deviations: N(0, 1) or narrower,
+        and not independent. NaN if groups are not judged.
     split : Split
-        chi^2 of all data: what no sky explains, and what the prior does not expect.
+        chi^2 of all data: the part that no sky explains, and the part that tests the prior.
     groups : tuple of Group
-        The data of every product, day and turntable angle; none where they are not judged, since
-        noise that couples times would need too large an A (:meth:`.LeftOut.of`).
+        The data of every product, day and turntable angle; none if they are not judged because
+        the test would need too large an A (:meth:`.LeftOut.of`).
     """
 
     predicted: DataVector
@@ -95,7 +95,7 @@ class Residuals:
     groups: tuple[Group, ...]
 
     def compared(self) -> list[Group]:
-        """The groups that others predict."""
+        """Groups that other data predict."""
         return [group for group in self.groups if np.isfinite(group.others_p)]
 
     @property
@@ -104,15 +104,15 @@ class Residuals:
         return 2 + len(self.compared())
 
     def extremes(self) -> list[Group]:
-        """Groups that stand out from what all others predict, the least probable first."""
+        """Groups inconsistent with their prediction by all others, the least probable first."""
         groups = [group for group in self.compared() if stands_out(group.p, self.n_tests)]
         return sorted(groups, key=lambda group: group.p)
 
     def level(self) -> Level:
         """The verdict in a word.
 
-        Instrument, noise and groups are judged whatever the prior; only where they are right does
-        the rest of chi^2 tell of the prior.
+        Instrument, noise and groups are judged independently of the prior. Only if they are correct
+        does the rest of chi^2 test the prior.
         """
         if self.extremes() or stands_out(self.split.instrument.p, self.n_tests):
             return "does not fit"
@@ -124,8 +124,8 @@ class Residuals:
         Returns
         -------
         list of Group
-            By kind, those that say most against all others first; empty if all data fit. Only
-            groups that stand out are looked at, if any does.
+            By kind, the least probable first; empty if all data fit. If any group stands out, only
+            such groups are considered.
         """
         if self.level() != "does not fit":
             return []
@@ -134,12 +134,12 @@ class Residuals:
         return sorted(groups, key=lambda group: (KINDS.index(group.kind), group.p))
 
     def fit(self, strengths: str = "") -> Fit:
-        """Judge whether the data fit, and say what to do if not.
+        """Judge whether the data fit, and recommend a remedy if not.
 
         Parameters
         ----------
         strengths : str
-            How strong the sky is, compared with its prior, where and at which scales.
+            Sentence on the strength of the sky relative to its prior, by place and scale.
         """
         level = self.level()
         instrument, prior = (part.words() for part in (self.split.instrument, self.split.prior))
@@ -154,7 +154,7 @@ class Residuals:
         return Fit(level, " ".join([f"{why} ({instrument}).", *self._blame()]))
 
     def _blame(self) -> list[str]:
-        """Which groups stand out, and what to leave out or to look at."""
+        """Which groups stand out, and which to exclude."""
         if not self.groups:
             return [
                 "Products, days and turntable angles were not tested: the noise couples different "
@@ -179,9 +179,9 @@ class Residuals:
 
 
 def residuals(solution: Solution, data: Visibilities) -> Residuals:
-    """Compare data with what the model predicts for them, group by group.
+    """Compare data with the model's predictions for them, group by group.
 
-    Days of 24 hours are counted from the first sample. Runs of one turntable angle are one group.
+    Days have 24 hours from the first sample. Runs at the same turntable angle are one group.
 
     Parameters
     ----------
@@ -225,7 +225,7 @@ def residuals(solution: Solution, data: Visibilities) -> Residuals:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Groups of data, each against what all others predict of it, added up.
+    """Sums over groups of data, each compared with its prediction by all others.
 
     Attributes
     ----------
@@ -233,7 +233,7 @@ class HeldOut:
     groups, n : int
         Number of groups, and of their data.
     chi2 : float
-        About ``n`` if the model holds.
+        About ``n`` if the model is correct.
     log_density : float
         ln p of each group given all others, data in K.
     """
@@ -258,8 +258,8 @@ def held_out(solution: Solution, data: Visibilities) -> tuple[HeldOut, ...]:
     Returns
     -------
     tuple of HeldOut
-        One for each kind that has several groups; none where noise couples times and A would be
-        too large to be formed.
+        One for each kind that has several groups; none if A would have to be formed and be too
+        large.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""chi^2 of data in two parts: what no sky explains, and what the prior does not expect."""
+"""chi^2 of data in two parts: one that no sky explains, and one that tests the prior."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from lusee_bayes.judge.chi2 import ChiSquare
 from lusee_bayes.judge.measures import expected_chi2
 from lusee_bayes.linear.posterior import Posterior
 
-# k over the sky's own size, in units of the prior
+# k relative to the sky's strength in units of the prior
 WIDER = 10.0
 
 
@@ -24,9 +24,9 @@ class Split:
     Attributes
     ----------
     instrument : ChiSquare
-        What no sky explains: tests A and N.
+        The part that no sky explains: it tests A and N.
     prior : ChiSquare
-        The rest: tests the prior, if A and N are right.
+        The rest: it tests the prior, if A and N are correct.
     wide : Posterior
         Given the same data under the wide prior.
     """
@@ -54,9 +54,9 @@ class Split:
             Of the data under the model, sky included.
         n_data : int
         matrix : (modes, modes) array, optional
-            A^T N^-1 A, where it is known.
+            A^T N^-1 A, if it has been computed.
         expected : float, optional
-            :func:`.expected_chi2`, where it is known.
+            :func:`.expected_chi2`, if it has been computed.
 
         Raises
         ------
@@ -68,8 +68,8 @@ class Split:
         try:
             wide, less = widened(posterior, WIDER * size, matrix)
         except InputError:
-            # data that do not fit ask for a sky that is stronger by orders of magnitude, under
-            # which numbers of 64 bits do not tell noise from sky; they stand out under this, too
+            # data that do not fit require a sky that is brighter by orders of magnitude, under
+            # which float64 cannot separate noise from sky; they stand out under this one, too
             wide, less = widened(posterior, WIDER, matrix)
         degrees = n_data - with_sky(n_data - expected_chi2(wide, n_data))
         instrument = ChiSquare(chi2 - less, float(degrees))
@@ -77,7 +77,7 @@ class Split:
 
 
 def with_sky(directions: float) -> float:
-    """Degrees of freedom that measured directions of the sky take: a little is left of each."""
+    """Degrees of freedom that measured directions of the sky use: slightly less than 1 each."""
     return (1.0 - 1.0 / WIDER**2) * directions
 
 
@@ -91,16 +91,16 @@ def widened(
     posterior : Posterior
         With NumPy's arrays.
     factor : float
-        By which the prior's standard deviations are multiplied, about the same mean.
+        By which the prior's standard deviations are multiplied; its mean stays the same.
     matrix : (modes, modes) array, optional
-        A^T N^-1 A, where it is known: a prior without correlations scales it in no time.
+        A^T N^-1 A, if it has been computed: a prior without correlations scales it quickly.
 
     Returns
     -------
     Posterior
         Under the wider prior.
     float
-        By how much chi^2 of the data under the model is smaller than before.
+        Decrease of chi^2 of the data under the model.
 
     Raises
     ------
@@ -109,14 +109,14 @@ def widened(
     """
     prior, log_det = posterior.prior, log_det_of(posterior.lower)
     off = posterior.white_mean - prior.white_mean
-    # with a basis, outside of its span the posterior is the prior
+    # outside the span of a basis, the posterior is the prior
     inside = off if posterior.basis is None else posterior.basis.T @ off
     if matrix is not None and prior.independent and posterior.basis is None:
         precision = prior.sandwich(matrix)
     else:
         lower = np.tril(posterior.lower)
         precision = times_lower(lower, lower, transpose=True)
-        # as large as what follows
+        # free memory: the next matrices are as large
         del lower
         precision[np.diag_indices(len(precision))] -= 1.0
     precision *= factor**2

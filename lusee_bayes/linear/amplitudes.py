@@ -1,53 +1,53 @@
 """Amplitudes beside the sky: templates in N, patterns, and amplitudes that channels share.
 
-*Templates* are part of the noise, as point sources' fluxes are. With N = N_0 + T T^T, an amplitude
-of each column of T is N(0, 1) before there are data. With K = A S A^T + N the covariance of data
-under the model, and C that of the sky, ::
+*Templates*, such as point sources' fluxes, are part of the noise. With N = N_0 + T T^T, the
+amplitude of each column of T has the prior N(0, 1). With the data's covariance K = A S A^T + N
+under the model, and the sky's posterior covariance C, ::
 
-    mean = T^T K^-1 (d - offset) = T^T N^-1 (d - offset - A m),    m the posterior mean of the sky,
+    mean = T^T K^-1 (d - offset) = T^T N^-1 (d - offset - A m),    m: posterior mean of the sky,
     covariance = 1 - T^T K^-1 T = 1 - T^T N^-1 T + P C P^T,        P = T^T N^-1 A,
     Cov(m, amplitudes) = -S A^T K^-1 T = -C P^T.
 
-A is not formed. Data may tell an amplitude to 1e-6: 1 - T^T N^-1 T would have no digits left. With
-U of N = N_0 + U U^T (:mod:`.covariance`), of which T is some columns, and V = L_0^-1 U, nothing is
-subtracted::
+A is not formed. If data determine an amplitude to 1e-6, 1 - T^T N^-1 T has no digits left. With U
+of N = N_0 + U U^T (:mod:`.covariance`), which has the columns of T among its own, and V = L_0^-1 U,
+nothing is subtracted::
 
     N^-1 U = L_0^-T V (1 + V^T V)^-1,    1 - U^T N^-1 U = (1 + V^T V)^-1.
 
-*Patterns* of unknown strength beside a sky, such as point sources, are integrated out and put back,
+*Patterns* of unknown strength beside a sky, such as point sources, are integrated out and restored,
 ::
 
     m = d + sum_j (1 + g_j) t_j,    g_j ~ N(0, 1)
 
-With T the patterns as rows and K = 1 + T M T^T = L L^T, the information about d is that about m at
-d + sum_j t_j with ::
+With the patterns as rows of T, and K = 1 + T M T^T = L L^T, the information about d equals that
+about m at d + sum_j t_j with ::
 
     M' = M - M T^T K^-1 T M,    v' = v - M T^T K^-1 T v,
 
 and given d, g ~ N(K^-1 T v(d + sum_j t_j), K^-1).
 
-*Tied amplitudes* of several channels: channel k has amplitudes z_k, N(0, 1) when it is worked out,
-and its posterior of them is N(E_k, V_k). Its likelihood is then exp(-z^T (V_k^-1 - 1) z / 2 + z^T
-V_k^-1 E_k) up to a factor. Let the prior be another one, under which different amplitudes are
-independent, and the channels' values of amplitude i are N(0, K_i) with ones on the diagonal: all
-ones where it is one and the same for all. With the diagonal of all K_i = R R^T and z = R w, w ~
-N(0, 1), ::
+*Tied amplitudes* of several channels: channel k is solved with the prior N(0, 1) for its amplitudes
+z_k, and their posterior is N(E_k, V_k). Up to a factor, its likelihood is then
+exp(-z^T (V_k^-1 - 1) z / 2 + z^T V_k^-1 E_k). Now let another prior have independent amplitudes,
+where the channels' values of amplitude i are N(0, K_i) with ones on the diagonal (and everywhere,
+if all channels share one value). With R R^T the block diagonal matrix of all K_i, and z = R w,
+w ~ N(0, 1), ::
 
     Lambda = 1 + sum_k R_k^T (V_k^-1 - 1) R_k,    mean of w = Lambda^-1 sum_k R_k^T V_k^-1 E_k,
 
-which needs no inverse of K_i: R has as many columns as these have eigenvalues above rounding, one
-where all are ones. What follows for channel k, N(E'_k, V'_k), is its own posterior times
-exp(-x^T Q x / 2 + q^T x), x = z - E', which is what the other channels tell of its amplitudes: ::
+which needs no inverse of K_i: R has a column for each of their eigenvalues above rounding, a single
+one if all entries are ones. The result for channel k, N(E'_k, V'_k), is its own posterior times
+the other channels' constraint on its amplitudes, exp(-x^T Q x / 2 + q^T x) with x = z - E' and ::
 
     Q = V'^-1 - V^-1,    q = V^-1 (E' - E).
 
-Where N has a prior mean e to make up for the volume of skies (:mod:`.systematic`), z^T e is part of
-the likelihood, the volume at that z, and not of the prior: all this holds with the E of N(e, 1).
-About e, as an :class:`Amplitudes` is, E - e and E' - e take the places of E and E'.
+If N has a prior mean e, to make up for the volume of skies (:mod:`.systematic`), z^T e belongs to
+the likelihood (the volume at that z), not to the prior: the equations are valid with the E of
+N(e, 1). About e, as for :class:`Amplitudes`, E - e and E' - e replace E and E'.
 
-*With a joint posterior of skies*, z = R w of several channels, too, is told by all data together. A
+*With a joint posterior of skies*, all data together constrain z = R w of several channels, too. A
 channel's posterior given its sky, z - e ~ N(y - P (m - m0), D), and its information (M, v) about
-the sky make up ln p(d | m, w) = ln p(d | m) + ln p(z | m, d) - ln N(z; 0, 1), the information ::
+the sky give ln p(d | m, w) = ln p(d | m) + ln p(z | m, d) - ln N(z; 0, 1), i.e. the information ::
 
     ( M + P^T D^-1 P    P^T D^-1 R       )        ( v                 )
     ( R^T D^-1 P        R^T (D^-1 - 1) R ),       ( R^T R w0          )    about m0, R w0 = y + e.
@@ -82,7 +82,7 @@ class Amplitudes:
     ----------
     mean : (n,) array
     covariance : (n, n) array
-        The unit matrix where the data say nothing.
+        The unit matrix if the data do not constrain them.
     with_sky : (modes, n) array
         Covariance of the sky with the amplitudes, in K.
     """
@@ -97,7 +97,7 @@ class Amplitudes:
         return np.sqrt(np.diagonal(self.covariance))
 
     def integrated(self, mean: Modes, covariance: ModesMatrix) -> Amplitudes:
-        """These, in which the sky is integrated out already."""
+        """Return these amplitudes: the sky is integrated out already."""
         return self
 
 
@@ -109,13 +109,13 @@ class AmplitudesOfSky:
 
         mean = T^T N^-1 (d - offset - A m0) - P (m - m0),    covariance = 1 - T^T N^-1 T
 
-    of a sky m. Other data may tell of the sky, too, where they have amplitudes of their own: these
-    hold under any posterior of the sky.
+    for a sky m. They are valid under any posterior of the sky, which other data with other
+    amplitudes may constrain, too.
 
     Attributes
     ----------
     mean : (n,) array
-        Of the reference sky.
+        Given the reference sky.
     pull : (n, modes) array
         P, in 1/K.
     covariance : (n, n) array
@@ -129,7 +129,7 @@ class AmplitudesOfSky:
     reference: Modes
 
     def integrated(self, mean: Modes, covariance: ModesMatrix) -> Amplitudes:
-        """Integrate a sky N(mean, covariance) out, in K and K^2: given any data besides."""
+        """Integrate out a sky N(mean, covariance), in K and K^2, given any additional data."""
         with_sky = -covariance @ self.pull.T
         least = self.mean - self.pull @ (mean - self.reference)
         return Amplitudes(least, self.covariance - self.pull @ with_sky, with_sky)
@@ -137,12 +137,12 @@ class AmplitudesOfSky:
     def shared(
         self, k: Int[np.ndarray, " shared"], expected: Vector, root: Float[np.ndarray, "shared w"]
     ) -> Shared:
-        """Those that are shared, e + x = R w.
+        """Select the shared amplitudes, e + x = R w.
 
         Parameters
         ----------
         k : (shared,) array
-            Which.
+            Their indices.
         expected : (shared,) array
             Their e.
         root : (shared, w) array
@@ -152,12 +152,12 @@ class AmplitudesOfSky:
         return Shared(k, self.mean[k] + expected, self.pull[k], covariance, root)
 
     def with_shared(self, shared: Shared, mean: Vector, covariance: Square) -> Amplitudes:
-        """Integrate a sky and what is shared out, N(mean, covariance) given any data besides.
+        """Integrate out a sky and w, N(mean, covariance) given any additional data.
 
         Parameters
         ----------
         shared : Shared
-            Of these.
+            Of these amplitudes.
         mean, covariance : (modes + w,) and square array
             In K and K^2.
         """
@@ -171,7 +171,7 @@ class AmplitudesOfSky:
         return Amplitudes(least, left + reach @ with_all, with_all[:n])
 
     def given(self, precision: Square, vector: Vector, expected: Vector) -> AmplitudesOfSky:
-        """Take in what is known of the amplitudes besides: exp(-x^T Q x / 2 + q^T x), x = z - t.
+        """Add other knowledge of the amplitudes: exp(-x^T Q x / 2 + q^T x), x = z - t.
 
         Parameters
         ----------
@@ -188,10 +188,9 @@ class AmplitudesOfSky:
 
 @dataclass(frozen=True)
 class Shared:
-    """What a channel's data tell of z = R w given its sky, m0 where there is none.
+    """Posterior of a channel's z = R w given its sky, with the mean for the sky m0.
 
-    index : which of the channel's amplitudes they are; mean : y + e; pull : P; covariance : D;
-    root : R
+    index : places among the channel's amplitudes; mean : y + e; pull : P; covariance : D; root : R
     """
 
     index: Int[np.ndarray, " shared"]
@@ -201,7 +200,7 @@ class Shared:
     root: Float[np.ndarray, "shared w"]
 
     def information(self, information: Information, sky: Modes) -> Information:
-        """What the data say of the sky and w together.
+        """Compute the information about the sky and w together.
 
         Parameters
         ----------
@@ -226,7 +225,7 @@ class Shared:
         )
 
 
-# data that are looked at first to find a column among many
+# leading data that are compared first, to find a column among many
 FEW = 8
 
 
@@ -237,9 +236,9 @@ def amplitudes_of_sky(solution: Solution, templates: Float[Array, "data n"]) -> 
     ----------
     solution : Solution
         Of a model with ``templates @ templates.T`` in its noise. Its posterior mean becomes the
-        reference sky: differences from it keep their digits.
+        reference sky, so that differences from it keep their digits.
     templates : (data, n) array
-        T, columns of what N has, in K.
+        T, columns of U, in K.
 
     Raises
     ------
@@ -275,12 +274,12 @@ def template_amplitudes(solution: Solution, templates: Float[Array, "data n"]) -
 
 
 class Patterns(eqx.Module):
-    """Patterns beside a sky, as far as data know them.
+    """Patterns beside a sky, as constrained by data.
 
     Attributes
     ----------
     patterns : (patterns, modes) array
-        T: each as strong as expected, and as it is uncertain; in K.
+        T: each at its expected strength, which is also its uncertainty; in K.
     information : Information
         Of the whole sky m.
     lower : (patterns, patterns) array
@@ -293,12 +292,12 @@ class Patterns(eqx.Module):
 
     @classmethod
     def of(cls, patterns: PatternModes, information: Information) -> Patterns:
-        """Make it of patterns and of what data say of the whole sky.
+        """Build it from patterns and the information about the whole sky.
 
         Raises
         ------
         InputError
-            If they have other numbers of modes.
+            If their numbers of modes differ.
         """
         require_shape("the patterns", patterns, (None, information.n_modes))
         lower = np.eye(len(patterns))
@@ -313,7 +312,7 @@ class Patterns(eqx.Module):
         return self.patterns.sum(0)
 
     def without(self) -> Information:
-        """Integrate the patterns out: what the data say of d."""
+        """Integrate out the patterns: the information about d."""
         whole = self.information
         across = solve_lower(self.lower, self.patterns @ whole.matrix, transpose=False)
         pull = solve_lower(self.lower, (self.patterns @ whole.vector)[:, None], transpose=False)
@@ -370,7 +369,7 @@ class Patterns(eqx.Module):
         return left - left @ back.T + white.T @ white
 
 
-# the mean is repeated on what is left: rounding is then that of E - z, not of z
+# repeat the solution on the residual: rounding is then that of E - z, not of z
 REFINEMENTS = 2
 
 
@@ -390,9 +389,9 @@ class Tied:
     draws : (draws, channels, n) array
         Of all channels together.
     log_evidence : float
-        ln p of all data, less the sum of the channels' ln p with amplitudes of N(0, 1).
+        ln p of all data, minus the sum of the channels' ln p with amplitudes N(0, 1).
     names : tuple of str
-        Of the amplitudes, where they have some.
+        Of the amplitudes, if they have names.
     """
 
     mean: Float[np.ndarray, "channels n"]
@@ -405,14 +404,14 @@ class Tied:
 
     @property
     def covariance(self) -> Float[np.ndarray, "channels n n"]:
-        """Of each channel's amplitudes."""
+        """Covariance of each channel's amplitudes."""
         return self.root @ np.swapaxes(self.root, 1, 2)
 
 
 def kernel(
     frequencies_mhz: Float[np.ndarray, " channels"], octaves: float
 ) -> Float[np.ndarray, "channels channels"]:
-    """K(f, f') = exp(-(log2 f - log2 f')^2 / (2 octaves^2)), an unknown's covariance."""
+    """K(f, f') = exp(-(log2 f - log2 f')^2 / (2 octaves^2)), an unknown's prior covariance."""
     x = np.log2(frequencies_mhz) / octaves
     return np.exp(-0.5 * (x[:, None] - x[None]) ** 2)
 
@@ -442,16 +441,16 @@ def tie(
     kernels: Float[np.ndarray, "n channels channels"],
     normals: Float[np.ndarray, "draws most"],
 ) -> Tied:
-    """Give amplitudes that were independent from channel to channel a prior that ties them.
+    """Replace the independent priors of channels' amplitudes by one that ties them.
 
     Parameters
     ----------
     mean, covariance : (channels, n) and (channels, n, n) array
-        E and V: of each channel's own data, with amplitudes of N(0, 1).
+        E and V: from each channel's own data, with amplitudes N(0, 1).
     kernels : (n, channels, channels) array
         K_i, with ones on their diagonals; they may be singular.
     normals : (draws, channels * n) array
-        Standard normals, of which draws are made; as many of each as R has columns are used.
+        Standard normals for the draws; of each, one per column of R is used.
 
     Raises
     ------
@@ -489,7 +488,7 @@ def tie(
 def from_others(
     mean: Vector, covariance: Square, tied_mean: Vector, tied_covariance: Square
 ) -> tuple[Square, Vector]:
-    """Q and q of one channel about E', from its own posterior and that given all data."""
+    """Q and q of one channel about E', from its own posterior and the one given all data."""
     inverse = np.linalg.inv(covariance)
     return np.linalg.inv(tied_covariance) - inverse, inverse @ (tied_mean - mean)
 
@@ -501,19 +500,19 @@ def information_given(
     vector: Vector,
     expected: Vector,
 ) -> Information:
-    """What data say of the sky where amplitudes are N(0, 1) times exp(-x^T Q x / 2 + q^T x).
+    """Information about the sky, with amplitudes N(0, 1) times exp(-x^T Q x / 2 + q^T x).
 
     ::
 
         M + P^T W P,    v + P^T (1 + Q D)^-1 (Q x - q),    W = (1 + Q D)^-1 Q,
 
-    of x = ``amplitudes.mean`` - t, D = ``amplitudes.covariance`` and P = ``amplitudes.pull``. With
-    t where the amplitudes are, large Q leave no small differences of large numbers.
+    with x = ``amplitudes.mean`` - t, D = ``amplitudes.covariance`` and P = ``amplitudes.pull``. If
+    t is near the amplitudes, large Q cause no small differences of large numbers.
 
     Parameters
     ----------
     information : Information
-        With amplitudes of N(0, 1).
+        With amplitudes N(0, 1).
     amplitudes : AmplitudesOfSky
         About the same reference sky.
     precision : (n, n) array

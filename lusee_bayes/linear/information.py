@@ -1,16 +1,16 @@
-"""What data say of the sky: their log-likelihood as a quadratic form.
+"""The data's information about the sky: their log-likelihood as a quadratic form.
 
 ::
 
     ln p(d | m) = -1/2 [ chi^2 - 2 v.(m - m0) + (m - m0)^T M (m - m0) + ln|N| + N_data ln 2 pi ],
     M = A^T N^-1 A,    v = A^T N^-1 (d - A m0 - offset),    chi^2 = |L^-1 (d - A m0 - offset)|^2
 
-for any reference sky m0. It has the size of the sky, however many data there are. With a prior it
-gives the posterior, with those of other frequencies a joint one. m0 is chosen near the posterior
-mean: for m0 = 0 the terms are 1e10 times larger than their sum. Unknowns that are
-of no interest are integrated out.
+for any reference sky m0. Its size is the sky's, independent of the number of data. With a prior it
+gives the posterior; with the information of other frequencies, a joint posterior. m0 is chosen near
+the posterior mean: for m0 = 0 the terms are 1e10 times larger than their sum. Unknowns of no
+interest are integrated out.
 
-All of this is NumPy's; nothing here is differentiated or traced.
+All of this runs in NumPy; nothing here is differentiated or traced.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ MAX_REFINEMENTS = 10
 def unfinished(
     moved: float | Array, before: float | Array, count: int | Array, most: int = MAX_REFINEMENTS
 ) -> bool | Array:
-    """Whether a mean is to be refined once more, after ``count`` steps, at most so often.
+    """Whether to refine a mean once more, after ``count`` of at most ``most`` steps.
 
-    ``moved`` and ``before`` are the lengths of the last step and of that before.
+    ``moved`` and ``before`` are the lengths of the last step and the one before.
     """
-    # what is left may be rounding, which no refinement makes smaller
+    # the remainder may be rounding, which no refinement reduces
     gains = (moved >= CONVERGENCE) | (moved <= 0.5 * before)
     return (count < 1) | ((moved > 1e-3 * CONVERGENCE) & gains & (count < most))
 
@@ -85,7 +85,7 @@ class Information(Described, eqx.Module):
         return self.reference.shape[0]
 
     def recentred(self, sky: Modes) -> Information:
-        """Write the same function with another reference sky.
+        """Express the same function about another reference sky.
 
         Parameters
         ----------
@@ -95,7 +95,7 @@ class Information(Described, eqx.Module):
         Returns
         -------
         Information
-            With the same values for every sky.
+            With the same value for every sky.
 
         Raises
         ------
@@ -109,7 +109,7 @@ class Information(Described, eqx.Module):
         return replace(self, vector=self.vector - pulled, reference=sky, misfit=misfit)
 
     def __add__(self, other: Information) -> Information:
-        """The information of the data of both, whose noise is independent.
+        """Add the information of other data with independent noise.
 
         Parameters
         ----------
@@ -127,7 +127,7 @@ class Information(Described, eqx.Module):
         return replace(self, **{n: np.asarray(getattr(self, n) + getattr(moved, n)) for n in names})
 
     def raised(self, factor: float) -> Information:
-        """The information of the same data under N times a factor.
+        """Information of the same data with N multiplied by a factor.
 
         Parameters
         ----------
@@ -165,12 +165,12 @@ class Information(Described, eqx.Module):
         return self.recentred(sky).misfit
 
     def fit(self, mean: Modes, covariance: ModesMatrix) -> dict[str, float]:
-        """Compute chi^2 of the residuals about a mean, and its expectation if the model holds.
+        """Compute chi^2 of the residuals about a mean, and its expectation under the model.
 
         Parameters
         ----------
         mean, covariance : (modes,) and (modes, modes) array
-            Of the posterior, which may be given other data, too, in K and K^2.
+            Of the posterior, which may include other data, in K and K^2.
 
         Returns
         -------
@@ -181,7 +181,7 @@ class Information(Described, eqx.Module):
         return {"chi2": float(self.chi2(mean)), "chi2_expected": expected}
 
     def log_likelihood(self, skies: Float[Array, "n modes"]) -> Float[np.ndarray, " n"]:
-        """Compute ln p(d | m) of some skies.
+        """Compute ln p(d | m) for several skies.
 
         Parameters
         ----------
@@ -204,7 +204,7 @@ class Information(Described, eqx.Module):
         prior : Prior
             Over the same modes.
         lower : (modes, modes) array, optional
-            :func:`precision_root` under this prior, where it is known.
+            :func:`precision_root` under this prior, if it has been computed.
 
         Returns
         -------
@@ -214,15 +214,15 @@ class Information(Described, eqx.Module):
         Raises
         ------
         InputError
-            If the prior is over pixels or has another size, or the mean does not converge.
+            If the prior has another size, or the mean does not converge.
         """
         prior = on_host(prior)
         lower = precision_root(self.matrix, prior) if lower is None else lower
         u, log_evidence, moved = self.white_mean(prior, lower)
         if not moved <= CONVERGENCE:
-            # m0 is far from the mean, so that the gradient is the small difference of large numbers
+            # m0 is far from the mean, and the gradient a small difference of large numbers
             u, log_evidence, moved = self.white_mean(prior, lower, precise=True)
-        # rounding grows with u, which is of order one where the data are what the prior allows
+        # rounding grows with u, which is of order one if the data are plausible under the prior
         accepted = CONVERGENCE * max(1.0, float(np.sqrt(np.mean(np.square(u)))))
         if not moved <= accepted:
             raise InputError(
@@ -242,8 +242,8 @@ class Information(Described, eqx.Module):
     ) -> tuple[Modes, float, float]:
         """Compute the mean of u = G^-1 m.
 
-        It is found as a correction to that of m0; components without prior power are zero. The
-        solution is repeated on what is left of the gradient, as long as that gains.
+        It is computed as a correction to u of m0; components without prior power are zero. The
+        solution is repeated on the remaining gradient, as long as that improves it.
 
         Parameters
         ----------
@@ -252,9 +252,9 @@ class Information(Described, eqx.Module):
         lower : (modes, modes) array
             :func:`precision_root` under this prior.
         most : int
-            How often the solution is repeated at most.
+            Maximum number of solutions.
         precise : bool
-            Compute the gradient with more digits than float64 has.
+            Compute the gradient with more than the digits of float64.
 
         Returns
         -------
@@ -289,7 +289,7 @@ class Information(Described, eqx.Module):
 
 
 def precision_root(matrix: ModesMatrix, prior: Prior) -> ModesMatrix:
-    """Compute L of the precision 1 + G^T M G of u = G^-1 m; NaN where there is none.
+    """Compute L of the precision 1 + G^T M G of u = G^-1 m; NaN if there is none.
 
     Parameters
     ----------
@@ -301,7 +301,7 @@ def precision_root(matrix: ModesMatrix, prior: Prior) -> ModesMatrix:
     Raises
     ------
     InputError
-        If it has another size.
+        If the prior has another size.
     """
     if prior.size != len(matrix):
         raise InputError(
@@ -314,7 +314,7 @@ def precision_root(matrix: ModesMatrix, prior: Prior) -> ModesMatrix:
 
 
 def integrated_out(information: Information, n: int, variance: Modes) -> Information:
-    """Write ln p(d) as a function of the first unknowns, the others integrated out.
+    """Compute the information about the first unknowns, with the others integrated out.
 
     With b ~ N(0, D) for the others, and K = M_bb + D^-1, ::
 
@@ -325,7 +325,7 @@ def integrated_out(information: Information, n: int, variance: Modes) -> Informa
     information : Information
         Of all unknowns.
     n : int
-        How many unknowns are kept.
+        Number of unknowns that are kept.
     variance : (others,) array
         D of the others, in K^2, positive.
 

@@ -1,18 +1,18 @@
 """One posterior for the skies of several frequencies, and for the instrument that they share.
 
-With m_f = sum_c s_fc a_c + r_f (spectral_prior.py), the residual r_f of each channel is integrated
-out by itself. In units of its prior, P = R^1/2 M R^1/2, and ::
+With m_f = sum_c s_fc a_c + r_f (spectral_prior.py), each channel's residual r_f is integrated out
+independently. In units of its prior, P = R^1/2 M R^1/2, and ::
 
     M' = R^-1/2 [1 - (1 + P)^-1] R^-1/2,    v' = R^-1/2 (1 + P)^-1 R^1/2 v
 
 are the channel's information about the common part sum_c s_fc a_c. Sums over channels of
 s_fc s_fc' M' are the information of all channels about the component maps, (components x modes)
-unknowns, from which the posterior follows as for one sky. Given the components, the residual of
-each channel has a posterior of its own, from the channel's data alone.
+unknowns, from which the posterior follows as for one sky. Given the components, the posterior of
+each channel's residual depends only on that channel's data.
 
-Channels may share other unknowns, w ~ N(0, 1) (:func:`.information_with`), which stand behind the
-modes of each channel's information, and behind all component maps. With M_w the block of w and the
-sky, and v_w that of w, ::
+Channels may share other unknowns, w ~ N(0, 1) (:meth:`.Shared.information`), which follow the modes
+in each channel's information, and the component maps in the sums. With the block M_w of w and the
+sky, and the part v_w of w, ::
 
     M_w' = M_w R^1/2 (1 + P)^-1 R^-1/2,    v_w' = v_w - M_w R^1/2 (1 + P)^-1 R^1/2 v,
     M_ww' = M_ww - M_w R^1/2 (1 + P)^-1 R^1/2 M_w^T.
@@ -40,8 +40,8 @@ from lusee_bayes.sky.spectral_prior import SpectralPrior
 # rows that are added at once
 ROWS = 16
 
-# arrays that recur: blocks of a symmetric matrix row by row, down to its diagonal, and unknowns of
-# channels or draws, modes first, then what channels share
+# arrays that recur: blocks of a symmetric matrix row by row, up to its diagonal, and unknowns of
+# channels or draws, modes first, then the shared unknowns
 Blocks = tuple[Float[Array, "_ _"], ...]
 Whole = Float[Array, "count whole"]
 
@@ -59,7 +59,7 @@ def common_part(information: Information, residual_root: Modes | None) -> Inform
     Returns
     -------
     Information
-        About the common part of the channel's sky, and what channels share.
+        About the common part of the channel's sky, and the shared unknowns.
     """
     if residual_root is None:
         return information
@@ -96,19 +96,19 @@ def residual_lower(information: Information, residual_root: Modes) -> ModesMatri
 
 
 def _indices(k: int) -> zip:
-    """Rows and columns of blocks, of k components and what channels share."""
+    """Rows and columns of the blocks of k components and the shared unknowns."""
     return zip(*np.tril_indices(k + 1), strict=True)
 
 
 def _weights(prior: SpectralPrior, channel: int) -> Vector:
-    """Of every component in a channel, and of what channels share."""
+    """Weights of every component in a channel, and of the shared unknowns."""
     return np.append(prior.mixing[channel], 1.0)
 
 
 def common_of(
     prior: SpectralPrior, channel: int, unknowns: Float[Array, "*batch unknowns"]
 ) -> Float[np.ndarray, "*batch whole"]:
-    """Take the common part of a channel's sky from all unknowns, and what channels share.
+    """Extract the common part of a channel's sky, and the shared unknowns, from all unknowns.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def common_of(
     channel : int
         Number of the channel in the prior.
     unknowns : (..., unknowns) array
-        All component maps, one behind the other, and what channels share.
+        All component maps, one after the other, then the shared unknowns.
     """
     k, n = prior.n_components, n_modes(prior.lmax)
     maps = unknowns[..., : k * n].reshape(*unknowns.shape[:-1], k, n)
@@ -130,12 +130,12 @@ class ComponentSums(eqx.Module):
     Attributes
     ----------
     blocks : tuple of arrays
-        sum_f s_fc s_fc' M' for c >= c', row by row, in 1/K^2, of which nothing above the diagonal
-        counts; then those of what channels share with each component, and among themselves.
+        sum_f s_fc s_fc' M' for c >= c', row by row, in 1/K^2, of which only lower triangles are
+        used; then those of the shared unknowns with each component, and among themselves.
     vector : (unknowns,) array
-        sum_f s_fc v', in 1/K, and that of what channels share.
+        sum_f s_fc v', in 1/K, and the part of the shared unknowns.
     reference : (unknowns,) array
-        The reference maps, in K, and values of what channels share.
+        The reference maps, in K, and values of the shared unknowns.
     misfit : () array
         Sum of the channels' chi^2 at the reference.
     log_det : () array
@@ -162,13 +162,13 @@ class ComponentSums(eqx.Module):
         prior : SpectralPrior
             Of all channels.
         reference : (channels, modes + shared) array
-            A reference sky for every channel, near its posterior mean, in K, and values of what
-            channels share, the same for all.
+            A reference sky for every channel, near its posterior mean, in K, and values of the
+            shared unknowns, the same for all.
 
         Returns
         -------
         ComponentSums
-            Zeros, with the component maps that fit the reference skies best as reference maps.
+            Zeros; the reference maps are the component maps that best fit the reference skies.
         """
         k, n, reference = prior.n_components, n_modes(prior.lmax), np.asarray(reference)
         maps = np.linalg.pinv(np.asarray(prior.mixing)) @ reference[:, :n]
@@ -187,7 +187,7 @@ class ComponentSums(eqx.Module):
         return replace(self, **both)
 
     def information(self) -> Information:
-        """Information about all component maps in one vector, then what channels share."""
+        """Information about all component maps in one vector, then about the shared unknowns."""
         k, n, size = self.n_components, len(self.blocks[0]), len(self.vector)
         matrix, at = np.empty((size, size)), [slice(c * n, (c + 1) * n) for c in range(k)]
         at.append(slice(k * n, size))
@@ -227,7 +227,7 @@ def summed_information(
     parts = [*[slice(0, n)] * k, slice(n, None)]
     for (i, j), total in zip(_indices(k), sums.blocks, strict=True):
         weight, block = weights[i] * weights[j], common.matrix[parts[i], parts[j]]
-        for first in range(0, len(total), ROWS):  # products that fit into a cache
+        for first in range(0, len(total), ROWS):  # the products fit into a cache
             lower = slice(first, first + ROWS), slice(0, first + ROWS if i < k else None)
             total[lower] += weight * block[lower]
     maps = weights[:k, None] * common.vector[:n]
@@ -236,7 +236,7 @@ def summed_information(
 
 
 def component_posterior(information: Information, prior: SpectralPrior) -> Posterior:
-    """Compute the posterior of all component maps, and of what channels share.
+    """Compute the posterior of all component maps and the shared unknowns.
 
     Parameters
     ----------
@@ -248,7 +248,7 @@ def component_posterior(information: Information, prior: SpectralPrior) -> Poste
     Returns
     -------
     Posterior
-        Of the component maps in one vector, the first map first, then of what channels share.
+        Of the component maps in one vector, the first map first, then the shared unknowns.
 
     Raises
     ------
@@ -273,7 +273,7 @@ def paired(covariance: Float[Array, "unknowns unknowns"], prior: SpectralPrior) 
     Returns
     -------
     tuple of arrays
-        C_cc, and C_cc' + C_c'c for c > c', row by row, in K^2; then those of what channels share
+        C_cc, and C_cc' + C_c'c for c > c', row by row, in K^2; then those of the shared unknowns
         with each component, and among themselves.
     """
     k, n = prior.n_components, n_modes(prior.lmax)
@@ -285,7 +285,7 @@ def paired(covariance: Float[Array, "unknowns unknowns"], prior: SpectralPrior) 
 
 
 def common_covariance(prior: SpectralPrior, channel: int, covariances: Blocks) -> Square:
-    """Covariance of :func:`common_of` a channel from that of all unknowns, in K^2.
+    """Compute the covariance of :func:`common_of` from that of all unknowns, in K^2.
 
     Parameters
     ----------
@@ -306,14 +306,14 @@ def common_covariance(prior: SpectralPrior, channel: int, covariances: Blocks) -
 
 
 class ChannelSky(eqx.Module):
-    """The posterior of one channel's sky, and of what channels share, given all data.
+    """The posterior of one channel's sky and the shared unknowns, given all data.
 
     Attributes
     ----------
     mean : (modes + shared,) array
         In K.
     covariance : (modes + shared, modes + shared) array or None
-        In K^2; None if that of the component maps was not given.
+        In K^2; None if the covariance of the component maps was not given.
     draws : (n, modes + shared) array
         In K.
     chi2 : () array
@@ -346,9 +346,9 @@ def channel_sky(
     information : Information
         Of the channel's data.
     mean : (unknowns,) array
-        Of the component maps and what channels share, in K.
+        Of the component maps and the shared unknowns, in K.
     covariances : tuple of arrays or None
-        Their covariance as packed by :func:`paired`, in K^2; None if that of the sky is not wanted.
+        Their covariance as packed by :func:`paired`, in K^2; None to omit that of the sky.
     draws : (n, unknowns) array
         Draws of them, in K.
     key : PRNGKeyArray
@@ -362,7 +362,7 @@ def channel_sky(
     Raises
     ------
     InputError
-        If ``mean`` has another length than the prior and the information need.
+        If ``mean`` does not have the length that prior and information require.
     """
     n = n_modes(prior.lmax)
     shared = information.n_modes - n
@@ -370,7 +370,7 @@ def channel_sky(
     z = jax.random.normal(jax.random.fold_in(key, channel), (len(draws), n), dtype=jnp.float64)
     prior, mean, covariances, draws, z = on_host((prior, mean, covariances, draws, z))
     residual_root = prior.residual_root(channel)
-    # of the mean and of every draw
+    # for the mean and every draw
     whole = common_of(prior, channel, np.concatenate([mean[None], draws]))
     covariance = None if covariances is None else common_covariance(prior, channel, covariances)
     if residual_root is not None:
@@ -389,14 +389,14 @@ def channel_sky(
 def _with_residual(
     covariance: Square, information: Information, residual_root: Modes, lower: ModesMatrix
 ) -> Square:
-    """Of the whole sky from that of the common part; ``lower`` is overwritten."""
+    """Covariance of the whole sky from that of the common part; ``lower`` is overwritten."""
     n = len(residual_root)
     among, slope, across = covariance[n:, n:], np.zeros((n, 0)), np.zeros((n, 0))
     if len(among):
         columns = (information.matrix[:n, n:].T * residual_root, covariance[n:, :n] / residual_root)
         half = linalg.solve_lower(lower, np.concatenate(columns).T, transpose=False)
         back = residual_root[:, None] * linalg.solve_lower(lower, half, transpose=True)
-        # the residual follows what channels share by minus the first, the whole sky by the sum
+        # slope of the residual with the shared unknowns, and their covariance with the whole sky
         slope = -back[:, : len(among)]
         across = back[:, len(among) :] + slope @ among
     white = linalg.scaled(covariance[:n, :n], 1.0 / residual_root)

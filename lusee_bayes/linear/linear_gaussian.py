@@ -9,23 +9,22 @@ With N = L L^T, S = G G^T and the whitened sky u (m = G u), set W = L^-1 A G and
     Lambda = 1 + W^T W,   u | d ~ N(Lambda^-1 W^T w, Lambda^-1),
     log p(d) = -1/2 [ |w - W u|^2 + |u|^2 + ln|N| + ln|Lambda| + N_data ln 2 pi ]    (u the mean),
 
-the equations of the map-space form, preconditioned. (Where the prior has a mean mu, d is less
-A mu, and u is that of m - mu.) The forms are classes behind one interface:
+the equations of the map-space form, preconditioned. (If the prior has a mean mu, d stands for
+d - A mu, and m = G u for m - mu.) The forms are classes with one interface:
 
-- :class:`InData`, with fewer data than modes: the same in the row space of W. W^T = Q R
-  (Householder), u = Q v + (a part that only the prior knows), Lambda_v = 1 + R R^T of the size of
-  the data. It equals S A^T (A S A^T + N)^-1 d without the cancellation of S - S A^T (...)^-1 A S,
-  which loses the variance of well measured modes.
-- :class:`FromInformation`, with more data: through A^T N^-1 A in NumPy, without A where A and N
+- :class:`InData`, for fewer data than modes: the same in the row space of W. W^T = Q R
+  (Householder), u = Q v + (a part that only the prior constrains), and Lambda_v = 1 + R R^T has the
+  size of the data. It equals S A^T (A S A^T + N)^-1 d, without the cancellation in
+  S - S A^T (...)^-1 A S, which loses the variance of well measured modes.
+- :class:`FromInformation`, for more data: from A^T N^-1 A in NumPy, without forming A if A and N
   have structure in time (:mod:`.normal_matrix`).
-- :class:`InMap`, in its place where a model is differentiated, traced or over pixels: through W in
-  JAX.
+- :class:`InMap`, its replacement if a model is differentiated or traced: from W in JAX.
 
-W^T W squares the signal-to-noise ratio s of the best measured mode: in map space standard
-deviations are good to eps s^2 at worst (1e-6 in the fiducial case; Posterior.std checks it), in
-data space to eps s. The mean is refined to the same quality in all of them.
+W^T W squares the signal-to-noise ratio s of the best measured mode. Standard deviations are thus
+accurate to eps s^2 at worst in map space (1e-6 in the fiducial case; Posterior.std checks it), and
+to eps s in data space. All forms refine the mean to the same accuracy.
 
-Data with independent noise are added to earlier ones through their :class:`.Information`.
+Data sets with independent noise are combined by adding their :class:`.Information`.
 """
 
 from __future__ import annotations
@@ -66,7 +65,7 @@ class LinearGaussian(Described, eqx.Module):
     coupling : Coupling or (data, unknowns) array
         A. An array is wrapped in a ``DenseCoupling``.
     prior : Prior
-        S, in K^2, and mu where it is not zero.
+        S, in K^2, and mu if it is not zero.
     noise : Covariance
         N, in K^2.
     offset : (data,) array or None
@@ -75,7 +74,7 @@ class LinearGaussian(Described, eqx.Module):
     Raises
     ------
     InputError
-        If the sizes do not fit together, or an array is not float64 or not finite.
+        If the sizes do not match, or an array is not float64 or not finite.
     """
 
     coupling: Coupling = eqx.field(converter=as_coupling)
@@ -181,7 +180,7 @@ class LinearGaussian(Described, eqx.Module):
         return sky, self.predict(sky) + self.noise.sample(noise_key)
 
     def factorise(self, form: type[Whitened] | None = None) -> Whitened:
-        """Do all work that does not depend on the data, to condition on many data vectors.
+        """Precompute everything that does not depend on the data, to condition on many of them.
 
         Works inside JAX's transformations, as do the solver's methods.
 
@@ -260,11 +259,11 @@ class Solution(Described):
     posterior : Posterior
         Over the sky, with the evidence of the data.
     kept_information : Information or None
-        :attr:`information`, where the posterior was computed from it.
+        :attr:`information`, if the posterior was computed from it.
     of_noise : Factor or None
-        :attr:`factor`, where it was computed.
+        :attr:`factor`, if it was computed.
     excess : float
-        What chi^2 has too much where prior means of unknowns in N are moved, to make up for volume.
+        Excess of chi^2 if prior means of unknowns in N are shifted, to make up for volume.
     """
 
     model: LinearGaussian
@@ -291,7 +290,7 @@ class Solution(Described):
 
     @property
     def matrix(self) -> ModesMatrix | None:
-        """A^T N^-1 A, where it has been computed."""
+        """A^T N^-1 A, if it has been computed."""
         return None if self.kept_information is None else self.kept_information.matrix
 
     @cached_property
@@ -301,16 +300,16 @@ class Solution(Described):
 
     @cached_property
     def chi2(self) -> float:
-        """(d - E[d])^T (A S A^T + N)^-1 (d - E[d]): of the data under the model, sky included."""
+        """chi^2 of the data under the model: (d - E[d])^T (A S A^T + N)^-1 (d - E[d])."""
         white = self.factor.whiten(self.data - self.model.predict(self.posterior.mean))
         misfit = white @ white
         return float(misfit + self.posterior.prior_chi2()) - self.excess
 
     def weighted_residual(self) -> DataVector:
-        """Compute N^-1 (d - offset - A m), m the posterior mean of the sky.
+        """Compute N^-1 (d - offset - A m), where m is the posterior mean of the sky.
 
-        T^T of it is the mean of templates' amplitudes, and a term N_0 of N times it that of its
-        part in the data.
+        Multiplied by T^T, it gives the mean of templates' amplitudes; multiplied by a term N_0 of
+        N, the mean of this term's part of the data.
         """
         residual = self.data - self.model.predict(self.posterior.mean)
         return np.asarray(self.factor.solve(residual))
@@ -344,7 +343,7 @@ class Solution(Described):
 
 
 def form_of(model: LinearGaussian, *, transformed: bool = False) -> type[Form]:
-    """Choose the form in which a model is solved.
+    """Choose the form in which to solve a model.
 
     Parameters
     ----------
@@ -356,7 +355,7 @@ def form_of(model: LinearGaussian, *, transformed: bool = False) -> type[Form]:
     Returns
     -------
     type
-        The cheapest of the forms that can be used.
+        The cheapest applicable form.
     """
     if model.n_data < model.prior.size:
         return InData
@@ -364,7 +363,7 @@ def form_of(model: LinearGaussian, *, transformed: bool = False) -> type[Form]:
 
 
 class Form(eqx.Module):
-    """A factorised model, which is solved for data at the cost of a few products each.
+    """A factorised model: solving it for data costs a few products.
 
     Attributes
     ----------
@@ -409,18 +408,18 @@ class Form(eqx.Module):
         return self.condition(data).posterior.log_evidence
 
 
-# what two ways to compute an A differ by, relative; and what rounding may do to Lambda, whose
-# eigenvalues are 1 or more
+# relative difference between two computations of the same A, and acceptable rounding of Lambda,
+# whose eigenvalues are 1 or more
 SAME, SEEN_ROUNDING = 1e-9, 1e-4
 
 
 class FromInformation(Form):
-    """Through A^T N^-1 A, in NumPy; not inside JAX's transformations.
+    """Solution from A^T N^-1 A in NumPy; not for use inside JAX's transformations.
 
     Attributes
     ----------
     coupling : Coupling
-        A: a matrix, where there is no structure in time.
+        A: dense, unless A and N have structure in time.
     matrix : (modes, modes) array
         A^T N^-1 A, in 1/K^2.
     lower : (modes, modes) array
@@ -435,7 +434,7 @@ class FromInformation(Form):
     def of(
         cls, model: LinearGaussian, matrix: ModesMatrix | None = None, factor: Factor | None = None
     ) -> FromInformation:
-        """Factorise a model, of which A^T N^-1 A and L of N may be known."""
+        """Factorise a model; A^T N^-1 A and L of N can be given."""
         model = on_host(model)
         coupling = model.coupling
         factor = model.noise.factor() if factor is None else factor
@@ -450,13 +449,13 @@ class FromInformation(Form):
 
     @classmethod
     def beside(cls, solution: Solution, model: LinearGaussian) -> FromInformation:
-        """Factorise a model with the S and N_0 of one that is solved, and other U.
+        """Factorise a model with the S and N_0 of a solved one, but another U.
 
-        Of N = N_0 + U U^T, with V and R of :class:`.LowRankFactor`, ::
+        With N = N_0 + U U^T, and V and R of :class:`.LowRankFactor`, ::
 
             A^T N^-1 A = A^T N_0^-1 A - (R^-1 V^T L_0^-1 A)^T (R^-1 V^T L_0^-1 A),
 
-        unless there is no U, A is another, too, or rounding of the first would be seen in Lambda.
+        unless there is no U, A differs, too, or rounding of the first term would affect Lambda.
         """
         host, old = on_host(model), solution.factor
         if not isinstance(host.noise, LowRankUpdate):
@@ -487,7 +486,7 @@ class FromInformation(Form):
         return Solution(self.model, data, posterior, information, self.factor)
 
     def _about(self, data: DataVector, sky: Modes) -> Information:
-        """The information of data, about a reference sky."""
+        """Information of the data, about a reference sky."""
         offset, n = self.model.offset, self.model.n_data
         centred = data if offset is None else data - offset
         white = self.factor.whiten(centred - self.coupling @ sky)
@@ -497,14 +496,14 @@ class FromInformation(Form):
 
 
 class Whitened(Form):
-    """Through W = L^-1 A G, in JAX: differentiable, and inside JAX's transformations, too.
+    """Solution from W = L^-1 A G in JAX: differentiable, and usable in JAX's transformations.
 
     Attributes
     ----------
     whitened : (data, white) array
         W; in map space L^-1 A.
     lower : (rank, rank) array
-        Cholesky factor of Lambda, or of Lambda_v where ``basis`` is given.
+        Cholesky factor of Lambda, or of Lambda_v if ``basis`` is given.
     basis : (white, rank) array or None
         Q of the data-space form; None in map space.
     """
@@ -554,12 +553,12 @@ class Whitened(Form):
         prior = self.model.prior
         posterior = Posterior(prior, u, self.lower, self.basis, log_evidence, moved)
         parts = self.model, data, posterior
-        # where the evidence is differentiated outside of a program, the last step is known
+        # if the evidence is differentiated outside of jit, the last step alone is not traced
         traced = is_traced(*jax.tree.leaves(parts))
         return Solution(*(parts if traced else on_host(parts)))
 
     def surprise(self, data: DataVector) -> DataVector:
-        """Compute L^-1 (d - E[d]), where E[d] is what the prior's mean sky predicts.
+        """Compute L^-1 (d - E[d]), where E[d] is the prediction of the prior's mean sky.
 
         Parameters
         ----------
@@ -569,7 +568,7 @@ class Whitened(Form):
         Returns
         -------
         (data,) array
-            White data, of which the model says N(0, 1 + W W^T).
+            White data, N(0, 1 + W W^T) under the model.
         """
         offset = self.model.offset
         white = self.factor.whiten(data if offset is None else data - offset)
@@ -577,7 +576,7 @@ class Whitened(Form):
 
 
 class InMap(Whitened):
-    """In map space: Lambda = 1 + G^T (A^T N^-1 A) G, so that only a square is coloured."""
+    """Map-space form, which colours only a square: Lambda = 1 + G^T (A^T N^-1 A) G."""
 
     @staticmethod
     @eqx.filter_jit
@@ -597,7 +596,7 @@ class InMap(Whitened):
 
 
 class InData(Whitened):
-    """In data space: Lambda_v = 1 + R R^T, with W^T = Q R."""
+    """Data-space form: Lambda_v = 1 + R R^T, with W^T = Q R."""
 
     @staticmethod
     @eqx.filter_jit
@@ -617,7 +616,7 @@ def _root(normal: Array) -> Array:
 
 @jax.custom_jvp
 def _log_det_in_span(whitened: Array, lower: Array) -> Array:
-    """ln|1 + W W^T| from the factor of the data form, whose QR has no derivative at low rank."""
+    """ln|1 + W W^T| from the data-space form, whose QR has no derivative at low rank."""
     return 2.0 * jnp.log(jnp.diagonal(lower)).sum()
 
 
@@ -638,7 +637,7 @@ def _newton(solver: Whitened, white: Array, u: Array) -> tuple[Array, Array]:
     half = solve_lower(lower, projected[:, None], transpose=False)
     step = solve_lower(lower, half, transpose=True)[:, 0]
     if basis is not None:
-        # outside the span of W^T, Lambda is 1 and the gradient is zero but for rounding; it is
+        # outside the span of W^T, Lambda is 1 and the gradient is zero except for rounding; it is
         # kept only in derivatives
         outside = gradient - basis @ projected
         step = basis @ step + (outside - jax.lax.stop_gradient(outside))
@@ -650,8 +649,8 @@ def _solve(solver: Whitened, data: DataVector) -> tuple[Array, Array, Array]:
     """Mean of u, log evidence, and size of the last refinement in standard deviations.
 
     The normal equations square the condition number; repeating the solve on the residual
-    (corrected seminormal equations) restores what they lose. Derivatives do not go through the
-    iteration: at its fixed point one more step with live arrays carries them exactly.
+    (corrected seminormal equations) restores the lost digits. Derivatives do not pass through the
+    iteration: one more step with live arrays at its fixed point carries them exactly.
     """
     white = solver.surprise(data)
     frozen, still = jax.lax.stop_gradient((solver, white))
@@ -673,5 +672,5 @@ def _solve(solver: Whitened, data: DataVector) -> tuple[Array, Array, Array]:
         + solver._log_det()
         + white.shape[0] * np.log(2.0 * np.pi)
     )
-    # u was that of the sky's deviation from the prior's mean
+    # so far, u was the sky's deviation from the prior's mean
     return u + solver.model.prior.white_mean, log_evidence, moved

@@ -1,21 +1,21 @@
-"""A^T N^-1 A without A: from the beams and Fourier sums over time.
+"""A^T N^-1 A without A, from the beams and Fourier sums over time.
 
-Sums over times of weights, pairs of functions and exp(i q phi) hold all of time, ::
+Time enters only through sums over times of weights, pairs of functions and exp(i q phi), ::
 
     F_c,jk(q) = sum_t w_c(t) u_j(t) u_k(t) exp(i q phi(t)),    q = -2 lmax .. 2 lmax
 
-They are the only part of a normal matrix whose cost grows with the number of samples, and a small
-part of its cost.
+Only their cost grows with the number of samples, and they are a small part of the cost of a normal
+matrix.
 
 With c_lm(t) = sum_j u_j(t) beta_j,lm exp(i m phi(t)), beta_lm = W_lm + i W_l,-m (coupling.py), a
-visibility is Re sum_m conj(c_lm) (a_lm + i a_l,-m), and for noise that does not couple times ::
+visibility is Re sum_m conj(c_lm) (a_lm + i a_l,-m). For noise that does not couple times, ::
 
     sum_t w(t) c_lm conj(c'_l'm') = sum_jk beta_j,lm conj(beta'_k,l'm') F_jk(m - m') = P,
     sum_t w(t) c_lm c'_l'm'       = sum_jk beta_j,lm beta'_k,l'm' F_jk(m + m')       = Q,
 
 at each turntable angle. The four parts of the matrix follow from P + Q and P - Q.
-Noise that couples different times is whitened in order of time, a few rows of A at once. All of
-this is NumPy's, whatever arrays A and N have.
+Noise that couples times is whitened in order of time, a few rows of A at once. All of this runs in
+NumPy, whatever kind of arrays A and N have.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Beams = Complex[np.ndarray, "orders groups functions degrees"]
 Places = Int[np.ndarray, " modes"]
 Sums = Complex[np.ndarray, "q groups functions functions"]
 Blocks = Float[np.ndarray, "rows columns"]
-# times that are summed at once: it bounds the memory
+# number of times summed at once, which bounds the memory
 CHUNK = 512
 
 
@@ -54,7 +54,7 @@ def time_sums(
     Parameters
     ----------
     weights : (weights, times) array
-        w_c(t), in 1/K^2 where they are inverse variances.
+        w_c(t), in 1/K^2 if they are inverse variances.
     azimuth : (times,) array
         phi(t), in radians.
     functions : (times, functions) array
@@ -92,20 +92,20 @@ def of_one_angle(
     functions: Float[np.ndarray, "functions times"],
     n_products: int,
 ) -> ModesMatrix:
-    """The lower triangle of their part in the mean-pole frame; modes as :func:`places` has them.
+    """Lower triangle of one angle's part in the mean-pole frame; modes as :func:`places` has them.
 
-    One order after the other is one block row on and below the diagonal: only columns of orders up
-    to its own, and rows of degrees from it, are computed; the others are mirror images, or zero.
+    Each order is one block row on and below the diagonal. Only columns of orders up to its own, and
+    rows of degrees from it, are computed; the others are mirror images or zero.
     """
     n = by_order.shape[0]
     parts = by_order.reshape(n, n_products, -1, 2, n)
     beams = parts[..., 0, :] + 1j * parts[..., 1, :]
     sums = time_sums(weights.reshape(-1, azimuth.shape[0]), azimuth, functions.T, n - 1)
     f = np.moveaxis(sums.reshape(*weights.shape[:-1], *sums.shape[1:]), -1, 0)
-    if weights.ndim == 3:  # products are coupled, and count like functions
+    if weights.ndim == 3:  # products are coupled: treat them like functions
         f, beams = f.swapaxes(2, 3), beams.reshape(n, 1, -1, n)
     f = np.ascontiguousarray(f).reshape(len(f), *beams.shape[1:3], beams.shape[2])
-    # of every mode: degree, order, and whether it is a_l,-m
+    # degree and order of every mode, and whether it is a_l,-m
     ell, m = (x[modes_by_size_of_order(n - 1)] for x in mode_numbers(n - 1))
     m, s = np.abs(m), (m < 0).astype(int)
     whole = np.zeros((len(m),) * 2)
@@ -118,7 +118,7 @@ def of_one_angle(
 
 
 def places(lmax: int) -> Places:
-    """Rows of the packed modes: by growing ``|m|``, for each first the a_lm, then the a_l,-m."""
+    """Rows of the packed modes: by increasing ``|m|``, and for each the a_lm before the a_l,-m."""
     return np.argsort(modes_by_size_of_order(lmax))
 
 
@@ -144,10 +144,10 @@ def normal_matrix(
 ) -> ModesMatrix:
     """Compute A^T N^-1 A without forming A.
 
-    Exact for the coupling's own functions of time. JAX's arrays are copied to the host, so that it
-    cannot be called inside JAX's transformations. For diagonal noise and blocks in time the cost
-    hardly grows with the number of samples; for time-banded noise it grows in proportion, in
-    bounded memory.
+    Exact for the coupling's functions of time. JAX arrays are copied to the host, so that it cannot
+    be called inside JAX's transformations. For diagonal noise and blocks in time the cost is nearly
+    independent of the number of samples; for time-banded noise it is proportional to that number,
+    and the memory is bounded.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ def normal_matrix(
     noise : Covariance
         N, in K^2, of one of the kinds in ``NORMAL_MATRICES``.
     factor : Factor, optional
-        Of N, where it is known.
+        Of N, if it has been computed.
 
     Returns
     -------
@@ -180,7 +180,7 @@ def normal_matrix(
 
 
 def has_structure(coupling: Coupling, noise: covariance.Covariance) -> bool:
-    """Tell whether :func:`normal_matrix` can be used.
+    """Check whether :func:`normal_matrix` can be used.
 
     Parameters
     ----------
@@ -198,7 +198,7 @@ def has_structure(coupling: Coupling, noise: covariance.Covariance) -> bool:
 
 
 def is_within_times(noise: covariance.Covariance) -> bool:
-    """Tell whether noise couples no two times, but for templates.
+    """Check whether noise couples no two times, except through templates.
 
     Parameters
     ----------
@@ -208,7 +208,7 @@ def is_within_times(noise: covariance.Covariance) -> bool:
     Returns
     -------
     bool
-        True for independent noise and blocks in time, and these with templates.
+        True for independent noise and blocks in time, with or without templates.
     """
     return NORMAL_MATRICES.get(type(_base(noise))) is _within_times
 
@@ -231,14 +231,14 @@ def _with_templates(
 
 
 def summed(coupling: CouplingMatrix, weights: Float[np.ndarray, "..."]) -> ModesMatrix:
-    """Compute A^T W A for weights W within times.
+    """Compute A^T W A for weights W that do not couple times.
 
     Parameters
     ----------
     coupling : CouplingMatrix
         A.
     weights : (products, times) or (products, products, times) array
-        The diagonal of W, or its block of every time; zero where a sample is missing.
+        The diagonal of W, or its block for each time; zero where a sample is missing.
 
     Returns
     -------
@@ -247,7 +247,7 @@ def summed(coupling: CouplingMatrix, weights: Float[np.ndarray, "..."]) -> Modes
     """
     pointing, total = coupling.pointing, 0.0
     runs, beams, n_products = dict(pointing.runs()), coupling.by_order, coupling.body_beams.shape[1]
-    # products without weight, such as all but one that is left out
+    # drop products without weight, e.g. all but the one that is left out
     used = np.flatnonzero(weights.any(axis=-1).reshape(-1, n_products).any(axis=0))
     if len(used) < n_products:
         by_product = beams.reshape(*beams.shape[:2], n_products, -1, beams.shape[3])
@@ -266,7 +266,7 @@ def summed(coupling: CouplingMatrix, weights: Float[np.ndarray, "..."]) -> Modes
 
 
 def _turned(rotation: Rotation, matrix: ModesMatrix, place: Places) -> ModesMatrix:
-    """R^T M R degree by degree, on and below the diagonal: what is worked on fits into a cache."""
+    """R^T M R on and below the diagonal, degree by degree: the operands fit into a cache."""
     turned = np.empty_like(matrix)
     spans = [slice(ell**2, (ell + 1) ** 2) for ell in range(len(rotation.blocks))]
     for ell, (left, span) in enumerate(zip(rotation.blocks, spans, strict=True)):
@@ -276,20 +276,20 @@ def _turned(rotation: Rotation, matrix: ModesMatrix, place: Places) -> ModesMatr
     return mirrored(turned)
 
 
-# rows of A that are multiplied with each other at once, where N couples times
+# rows of A that enter one product, if N couples times
 STREAMED = 1024
 
 
 def _streamed(
     coupling: CouplingMatrix, _: covariance.Covariance, factor: time_blocks.TimeBandedFactor
 ) -> ModesMatrix:
-    """For time-banded noise: A is made, whitened and summed one block row of N after the other."""
+    """For time-banded noise: compute, whiten and sum A, one block row of N after the other."""
     pointing, layout = coupling.pointing, coupling.layout
     n_blocks, rows, window = factor.left.shape
     steps, n_modes = rows // layout.n_products, coupling.shape[1]
     present, total = layout.present.T, np.zeros((n_modes, n_modes))
     run_of = np.repeat(np.arange(len(pointing.run_starts) - 1), np.diff(pointing.run_starts))
-    # white rows: of the window before a block row, and since they were last summed
+    # white rows: the window before a block row, and all since the last sum
     white = np.zeros((window, n_modes))
     for block in range(n_blocks):
         times = slice(block * steps, (block + 1) * steps)

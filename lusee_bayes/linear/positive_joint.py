@@ -1,19 +1,19 @@
-"""One posterior for positive skies of several frequencies, by Gauss and Newton.
+"""One posterior for positive skies of several frequencies, by the Gauss-Newton method.
 
 With the exponents phi_f = sum_c s_fc a_c + r_f of :mod:`.positive_skies`, ::
 
     E = sum_f chi^2_f(m_f(phi_f)) + sum_c a_c^T (C^c)^-1 a_c + sum_f r_f^T (R^f)^-1 r_f.
 
-About given exponents m_f is linear, m_f + W_f (phi - phi_f), and what the data of a channel say of
-phi is a quadratic form: W^T M W, W^T v. So a round is a joint posterior as :mod:`.joint` finds it,
-of maps without unit, and of unknowns w of the instrument that channels share, whose w^T w is part
-of E. The step to its mean is halved until E falls, and rounds are repeated until a step would gain
-nothing. Meanwhile A and tilt of the fields may be learned.
-The last posterior is the Gaussian about the mode, its evidence Laplace's.
+The sky is linear about given exponents, m_f + W_f (phi - phi_f), so that a channel's information
+about phi is a quadratic form: W^T M W, W^T v. A round thus solves for a joint posterior
+(:mod:`.joint`) of maps without unit, and of shared unknowns w of the instrument, whose w^T w is
+part of E. The step to its mean is halved until E falls, and rounds are repeated until a step would
+gain nothing. Meanwhile A and tilt of the fields may be learned.
+The last posterior is the Gaussian about the mode; its evidence is Laplace's approximation.
 
-The laws of the fields are learned in twenty rounds from the large scales of all channels. A and
-tilt are those of a power law, of which modes up to a low ell tell nearly all: those above are
-integrated out, with the power of the template.
+The laws of the fields are learned in about twenty rounds from the large scales of all channels. A
+and tilt define a power law, which modes of low ell determine almost completely. Modes of higher ell
+are integrated out, with the power of the template.
 """
 
 from __future__ import annotations
@@ -39,20 +39,20 @@ from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.positive_skies import FieldLaws, PositiveSkies
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
-# arrays that recur; exponents have the values of what channels share behind them
+# arrays that recur; exponents are followed by the values of the shared unknowns
 Fields = Float[np.ndarray, "fields modes"]
 Exponents = Float[np.ndarray, "channels whole"]
 
 OfLaws = Float[np.ndarray, "laws ells"]
-# found when a round moves all unknowns together by less than this, in standard deviations, and no
-# ln A or tilt by more than that
+# converged if a round moves all unknowns together by less than SETTLED standard deviations, and
+# every ln A and tilt by less than SETTLED_LAW
 SETTLED, SETTLED_LAW = 0.1, 0.05
 MAX_ROUNDS, HALVINGS = 60, 20
 
 
 # arrays by name, and their shapes
 Arrays, Shapes = dict[str, np.ndarray], dict[str, tuple[int, ...]]
-# told the number of every round, and how far it moved
+# called with the number of every round, and how far it moved
 Report = Callable[[int, str], None] | None
 # functions of a channel's number and information
 OfChannel = Callable[[int, Information], Arrays]
@@ -64,17 +64,17 @@ class Channels(Protocol):
     """The channels of a joint posterior, wherever their data are."""
 
     def each(self, function: OfChannel, shapes: Shapes) -> Arrays:
-        """Call a function with number and information of every channel; its arrays, stacked."""
+        """Call a function with number and information of every channel, and stack its arrays."""
 
     def summed(
         self, prior: SpectralPrior, reference: Exponents, function: Linearised
     ) -> Information:
-        """What a function of every channel's information says of the component maps."""
+        """Information about the component maps from a function of every channel's information."""
 
 
 @dataclass(frozen=True)
 class ChannelsInMemory:
-    """Channels whose information is at hand.
+    """Channels whose information is in memory.
 
     Attributes
     ----------
@@ -85,14 +85,14 @@ class ChannelsInMemory:
     informations: tuple[Information, ...]
 
     def each(self, function: OfChannel, shapes: Shapes) -> Arrays:
-        """Call a function with number and information of every channel; its arrays, stacked."""
+        """Call a function with number and information of every channel, and stack its arrays."""
         parts = [function(k, information) for k, information in enumerate(self.informations)]
         return {name: np.stack([part[name] for part in parts]) for name in shapes}
 
     def summed(
         self, prior: SpectralPrior, reference: Exponents, function: Linearised
     ) -> Information:
-        """What a function of every channel's information says of the component maps."""
+        """Information about the component maps from a function of every channel's information."""
         sums = joint.ComponentSums.empty(prior, reference)
         for k, information in enumerate(self.informations):
             sums = joint.summed_information(sums, prior, k, function(k, information))
@@ -108,15 +108,15 @@ class PositiveMode:
     skies : PositiveSkies
     laws : FieldLaws
     exponents : (channels, modes + shared) array
-        phi_f about which the skies are linear, and what channels share.
+        phi_f about which the skies are linear, and the shared unknowns.
     posterior : Posterior
-        Of the fields in one vector, the first field first, and of what channels share; no unit.
+        Of the fields in one vector, the first field first, then the shared unknowns; no unit.
     energy : float
         E: chi^2 of all data under the model, prior included.
     moved : float
-        What the last step moved, in standard deviations of all unknowns together.
+        Length of the last step, in standard deviations of all unknowns together.
     rounds : int
-        How many were taken.
+        Number of rounds.
     """
 
     skies: PositiveSkies
@@ -129,7 +129,7 @@ class PositiveMode:
 
     @property
     def prior(self) -> SpectralPrior:
-        """Of the fields."""
+        """Prior of the fields."""
         return self.laws.prior(self.skies)
 
     @property
@@ -140,14 +140,14 @@ class PositiveMode:
 
 
 def diffuse_part(skies: PositiveSkies, channel: int, information: Information) -> Patterns:
-    """What a channel's data say of its point sources, and without them of the diffuse sky."""
+    """A channel's information, separated into point sources and the diffuse sky."""
     sources = skies.sources[channel]
     beside = np.zeros((len(sources), max(information.n_modes - sources.shape[1], 0)))
     return Patterns.of(np.concatenate([sources, beside], axis=1), information)
 
 
 def _whole(skies: PositiveSkies, channel: int, exponent: np.ndarray) -> np.ndarray:
-    """The sky of an exponent, in K, and what channels share."""
+    """The sky of an exponent, in K, and the shared unknowns."""
     n = skies.n_fields
     sky = skies.modes(channel, exponent[..., :n])
     return np.concatenate([sky, exponent[..., n:]], axis=-1)
@@ -162,21 +162,21 @@ def _slope(skies: PositiveSkies, channel: int, exponent: Vector) -> np.ndarray:
 def linearised(
     skies: PositiveSkies, channel: int, information: Information, exponent: Vector
 ) -> Information:
-    """What a channel's data say of its exponent, the sky being linear about a given one.
+    """Compute a channel's information about its exponent, with the sky linear about a given one.
 
     Parameters
     ----------
     skies : PositiveSkies
     channel : int
     information : Information
-        Of the channel's sky, in K, and what channels share.
+        Of the channel's sky, in K, and the shared unknowns.
     exponent : (modes + shared,) array
-        phi_f, and what channels share.
+        phi_f, and the shared unknowns.
 
     Returns
     -------
     Information
-        Without unit, point sources integrated out.
+        Without unit; point sources are integrated out.
     """
     diffuse = diffuse_part(skies, channel, information).without()
     local = diffuse.recentred(_whole(skies, channel, exponent))
@@ -212,7 +212,7 @@ def find_joint_mode(
     learn: bool = False,
     report: Report = None,
 ) -> PositiveMode:
-    """Find the most probable skies, beginning with the templates themselves.
+    """Find the most probable skies, starting from the templates.
 
     Parameters
     ----------
@@ -222,16 +222,16 @@ def find_joint_mode(
     channels : Channels
         Their data.
     shared : (shared,) array, optional
-        Where what channels share begins, if their information is about it.
+        Start of the shared unknowns, if the channels' information includes them.
     learn : bool
-        Learn A and tilt of every field and residual, by the maximum of the evidence.
+        Learn A and tilt of every field and residual, by maximising the evidence.
     report : callable, optional
-        Told the number of every round, and how far it moved.
+        Called with the number of every round, and how far it moved.
 
     Raises
     ------
     InputError
-        If the rounds do not settle, or the data are too precise to be solved for.
+        If the rounds do not converge, or the data are too precise to solve for.
     """
     shared = np.zeros(0) if shared is None else shared
     start = np.concatenate([np.zeros(len(skies.names) * skies.n_fields), shared])
@@ -251,7 +251,7 @@ def find_joint_mode(
         change = np.zeros_like(laws.parameters)
         if learn:
             change = laws.matched(*_powers(posterior, prior, arrays)).parameters - laws.parameters
-            # a law that nothing depends on may go to and fro
+            # a law without influence may oscillate
             change = np.where(change * last < 0, 0.5, 1.0) * change
         if moved < SETTLED and np.abs(change).max() < SETTLED_LAW:
             result = skies, laws, point.exponents, posterior
@@ -280,7 +280,7 @@ def _linear_round(
     exponents: Exponents,
     shapes: Shapes,
 ) -> tuple[Posterior, _Point, Arrays]:
-    """The posterior of skies that are linear about exponents, its mean, and every channel there."""
+    """Posterior of skies that are linear about exponents, its mean, and every channel there."""
 
     def relative(channel: int, information: Information) -> Information:
         return linearised(skies, channel, information, exponents[channel])
@@ -313,7 +313,7 @@ def _judged(
     root = prior.residual_root(channel)
     inverse = inverse_from_cholesky(joint.residual_lower(information, root))
     common = joint.common_covariance(prior, channel, spread)
-    # of the residual given the common part, and of what it follows of that
+    # variance of the residual given the common part, and of its part that follows the common one
     pull = (inverse * root[None]) @ information.matrix[: len(root)]
     variance = np.diagonal(inverse) + np.einsum("ij,ij->i", pull @ common, pull)
     white = ((sky.mean - joint.common_of(prior, channel, mean))[: len(root)]) / root
@@ -338,14 +338,14 @@ def _descended(
         unknowns = point.unknowns + part * (end.unknowns - point.unknowns)
         exponents = point.exponents + part * (end.exponents - point.exponents)
         trial = _Point(unknowns, exponents, _chi2(skies, channels, exponents))
-        # what a short step gains may be rounding
+        # the gain of a short step may be rounding
         if trial.energy(prior) < energy + SETTLED**2:
             return trial
         part /= 2.0
     return point
 
 
-# draws whose fields are on the grid at once
+# draws whose fields are synthesised at once
 CHUNK = 32
 
 
@@ -359,8 +359,8 @@ def positive_sky(
 ) -> joint.ChannelSky:
     """Compute the sky of one channel.
 
-    Its mean is the sky of the mean exponent, and draws are those of exponents' draws: all are
-    positive on the grid, but for the point sources. The covariance is W C W^T of the exponent's C.
+    The mean is the sky of the mean exponent, and draws are the skies of drawn exponents: positive
+    on the grid, except for point sources. The covariance is W C W^T, with the exponent's C.
 
     Parameters
     ----------
@@ -370,7 +370,7 @@ def positive_sky(
     information : Information
         Of the channel's data, in K.
     spread : tuple of arrays
-        Covariance of the fields and what channels share, as packed by :func:`.paired`.
+        Covariance of the fields and the shared unknowns, as packed by :func:`.paired`.
     draws : (n, unknowns) array
         Draws of them.
     key : PRNGKeyArray
@@ -379,7 +379,7 @@ def positive_sky(
     Returns
     -------
     joint.ChannelSky
-        In K, of what channels share, too.
+        In K, with the shared unknowns.
     """
     skies, exponent = mode.skies, mode.exponents[channel]
     relative = linearised(skies, channel, information, exponent)
@@ -399,14 +399,14 @@ def positive_sky(
     return joint.ChannelSky(mean, covariance, beside.whole_skies(drawn, z), information.chi2(mean))
 
 
-# highest ell of the maps that laws are learned from
+# highest ell of the maps from which laws are learned
 COARSE_LMAX = 16
 
 
 def learn_laws(
     skies: PositiveSkies, channels: Channels, *, lmax_fields: int, report: Report = None
 ) -> FieldLaws:
-    """Learn C_ell of all fields and residuals, by the maximum of the evidence.
+    """Learn C_ell of all fields and residuals by maximising the evidence.
 
     Parameters
     ----------
@@ -414,9 +414,9 @@ def learn_laws(
     channels : Channels
         Their data.
     lmax_fields : int
-        Highest ell of the exponents while laws are learned, at least that of the maps then.
+        Highest ell of the exponents while laws are learned, at least that of the coarse maps.
     report : callable, optional
-        Told the number of every round, and how far it moved.
+        Called with the number of every round, and how far it moved.
 
     Raises
     ------
@@ -430,12 +430,12 @@ def learn_laws(
 
 
 def _large_scales(skies: PositiveSkies, channels: Channels, n: int) -> ChannelsInMemory:
-    """What all channels say of the first modes."""
+    """Information of all channels about the first modes."""
     names = ("matrix", "vector", "reference", "misfit", "log_det", "n_data")
 
     def large(channel: int, information: Information) -> Arrays:
         if information.n_modes > n:
-            # small scales have the template's power, with its sources'
+            # small scales have the power of the template and its sources
             template = skies.modes(channel, np.zeros(skies.n_fields))
             power = power_spectrum(template) + power_spectrum(skies.sources[channel]).sum(0)
             information = integrated_out(information, n, per_mode(power)[n:])

@@ -1,6 +1,6 @@
 """The posterior over sky maps: mean, covariance, standard deviations, draws.
 
-The variances of all pixels of a map are diag(Y C Y^T), ring by ring; see
+The pixel variances of a map are diag(Y C Y^T), computed ring by ring; see
 :mod:`lusee_bayes.core.harmonics`.
 """
 
@@ -25,7 +25,7 @@ from lusee_bayes.sky.prior import Prior
 
 Degrees = Sequence[float] | Float[np.ndarray, " n"]
 
-# largest relative error of standard deviations that is accepted
+# largest accepted relative error of standard deviations
 PRECISION = 1e-3
 
 
@@ -39,9 +39,9 @@ class Posterior(Described, eqx.Module):
     white_mean : (white,) array
         Mean of u.
     lower : (rank, rank) array
-        L of Lambda = L L^T, the precision of u, or of v = Q^T u where ``basis`` is given.
+        L of Lambda = L L^T, the precision of u, or of v = Q^T u if ``basis`` is given.
     basis : (white, rank) array or None
-        Q. Outside of its span u keeps its prior, N(0, 1).
+        Q. Outside its span, u keeps its prior, N(0, 1).
     log_evidence : () array
         ln p(d), for data in K.
     refinement : () array
@@ -66,7 +66,7 @@ class Posterior(Described, eqx.Module):
 
     @property
     def mean(self) -> Float[Array, " unknowns"]:
-        """Posterior mean of m in K; of harmonics: Galactic, real packed."""
+        """Posterior mean of m in K; harmonic coefficients are Galactic and real packed."""
         return self.prior.colour(self.white_mean)
 
     def to_map(self, nside: int = 64) -> Pixels:
@@ -114,7 +114,7 @@ class Posterior(Described, eqx.Module):
         Parameters
         ----------
         directions : (n, unknowns) array
-            One combination a row, such as rows of ``harmonics.pixel_matrix`` for pixels.
+            One combination per row, such as rows of ``harmonics.pixel_matrix`` for pixels.
 
         Returns
         -------
@@ -157,12 +157,12 @@ class Posterior(Described, eqx.Module):
         Parameters
         ----------
         skies : (n, unknowns) array
-            One m a row, in K.
+            One m per row, in K.
 
         Returns
         -------
         (n, white) array
-            One z a row.
+            One z per row.
 
         Raises
         ------
@@ -185,7 +185,7 @@ class Posterior(Described, eqx.Module):
         Returns
         -------
         (unknowns,) or (n, unknowns) array
-            One draw, or with ``n`` that many, in K.
+            One draw, or ``n`` draws, in K.
         """
         z = jax.random.normal(key, (1 if n is None else n, self.prior.size), dtype=jnp.float64)
         if namespace(self) is np:
@@ -194,13 +194,13 @@ class Posterior(Described, eqx.Module):
         return draws[0] if n is None else draws
 
     def prior_fraction(self) -> Float[Array, " unknowns"]:
-        """Compute the share of each unknown's prior variance that is left: diag(C) / diag(S).
+        """Compute the fraction of each unknown's prior variance that remains: diag(C) / diag(S).
 
         Returns
         -------
         (unknowns,) array
-            1 where the data say nothing, 0 where they leave no uncertainty, and 0 where the prior
-            variance is zero.
+            1 where the data do not constrain the unknown, 0 where they leave no uncertainty or the
+            prior variance is zero.
 
         Raises
         ------
@@ -211,10 +211,10 @@ class Posterior(Described, eqx.Module):
         return xp.where(prior > 0, self.std() ** 2 / xp.where(prior > 0, prior, 1.0), 0.0)
 
     def prior_chi2(self) -> Float[Array, ""]:
-        """Compute the squared distance of the mean from that of the prior.
+        """Compute the squared distance between the posterior mean and the prior mean.
 
-        With the posterior mean, chi^2 of the data plus this is (d - A mu)^T (A S A^T + N)^-1
-        (d - A mu), a chi^2 distribution of N_data degrees of freedom.
+        Added to chi^2 of the data at the posterior mean, it gives (d - A mu)^T (A S A^T + N)^-1
+        (d - A mu), which follows a chi^2 distribution with N_data degrees of freedom.
 
         Returns
         -------
@@ -266,23 +266,23 @@ def _require_precise(rounding: Float[Array, ""]) -> None:
 
 
 def _rounding(posterior: Posterior, variance: Float[Array, " white"]) -> Float[Array, ""]:
-    """The relative error that rounding of Lambda makes in standard deviations.
+    """Relative error of standard deviations from rounding of Lambda.
 
-    Lambda_jj (Lambda^-1)_jj, the inflation of a mode's variance by all others, is the condition
-    number that counts: rescaling modes does not change it. Times eps it predicts the difference
-    between the two forms to within a factor 1.5 (fiducial: 1e-6).
+    Lambda_jj (Lambda^-1)_jj, the inflation of a mode's variance by all others, is the relevant
+    condition number: rescaling modes does not change it. Multiplied by eps, it predicts the
+    difference between the two forms to within a factor of 1.5 (fiducial: 1e-6).
     """
     xp = namespace(posterior)
     if posterior.basis is not None:
         return xp.zeros(())
-    lower = posterior.lower if xp is np else xp.tril(posterior.lower)  # LAPACK's is clean
+    lower = posterior.lower if xp is np else xp.tril(posterior.lower)  # LAPACK's is triangular
     inflation = xp.einsum("ij,ij->i", lower, lower) * variance
     return xp.asarray(np.finfo(np.float64).eps * inflation.max())
 
 
 @compiled
 def _std(posterior: Posterior) -> tuple[Float[Array, " unknowns"], Float[Array, ""]]:
-    """Standard deviations of m, and the :func:`_rounding` of those of u."""
+    """Standard deviations of m, and :func:`_rounding` in those of u."""
     xp, basis = namespace(posterior), posterior.basis
     eye = xp.eye(posterior.prior.size)
     # the rows of H, where H^T H is the covariance of u
@@ -295,7 +295,7 @@ def _std(posterior: Posterior) -> tuple[Float[Array, " unknowns"], Float[Array, 
 
 @compiled
 def _covariance(posterior: Posterior) -> tuple[Float[Array, "unknowns unknowns"], Float[Array, ""]]:
-    """C, and the :func:`_rounding` of its diagonal."""
+    """C, and :func:`_rounding` in its diagonal."""
     xp, rank = namespace(posterior), posterior.prior.size
     if posterior.basis is None:
         white = inverse_from_cholesky(posterior.lower)
@@ -318,7 +318,7 @@ def _times_root(posterior: Posterior, z: Float[Array, "n white"]) -> Float[Array
 
 @compiled
 def _whiten(posterior: Posterior, skies: Float[Array, "n unknowns"]) -> Float[Array, "n white"]:
-    """The inverse of :func:`_times_root`, for skies less the mean."""
+    """Inverse of :func:`_times_root`, for skies minus the mean."""
     u = posterior.prior.whiten(skies) - posterior.white_mean[None]
     inside = u if posterior.basis is None else u @ posterior.basis
     white = inside @ namespace(posterior).tril(posterior.lower)
@@ -349,7 +349,7 @@ def pixel_std(covariance: ModesMatrix, nside: int) -> Pixels:
 
 
 def prior_pixel_std(prior: Prior, nside: int) -> Pixels:
-    """Compute :func:`pixel_std` of a prior whose monopole is taken for known.
+    """Compute :func:`pixel_std` of a prior with a known monopole.
 
     Parameters
     ----------
@@ -379,9 +379,9 @@ def prior_pixel_std(prior: Prior, nside: int) -> Pixels:
 
 @lru_cache(maxsize=2)
 def _rings(nside: int, lmax: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Heights of the rings, and the pixels of each with their azimuthal functions.
+    """Colatitudes of the rings, and the pixels of each with their azimuthal functions.
 
-    Rings are padded to the longest one, by their last pixel.
+    Rings are padded to the longest one, with their last pixel.
     """
     theta, phi = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)))
     heights, first, count = np.unique(theta, return_index=True, return_counts=True)

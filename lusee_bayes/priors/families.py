@@ -1,14 +1,14 @@
-"""Families of Gaussian priors: m ~ N(mean, S(theta)), with parameters theta that data can tell.
+"""Families of Gaussian priors: m ~ N(mean, S(theta)), whose parameters theta data can constrain.
 
-What learning theta needs of a family are S and sums over its derivatives, ::
+To learn theta, we need S and sums over its derivatives, ::
 
     d ln p(d) / d theta_i = 1/2 tr[(dS / d theta_i) (g g^T - F)],
     g = S^-1 (mean of m - prior mean),    F = S^-1 - S^-1 C S^-1,
 
-C being the posterior covariance. F is the covariance of g where the family holds, so that the
+where C is the posterior covariance. If the family is correct, F is the covariance of g, and the
 Fisher information is the covariance of 1/2 h^T (dS / d theta_i) h over draws h ~ N(0, F).
 
-A C_ell that is learned has an amplitude, a tilt, a curvature and departures at half octaves, ::
+A learned C_ell has an amplitude, a tilt, a curvature and departures at half octaves, ::
 
     ln C_ell = a + tilt x + curvature x^2 / 2 + sum_k d_k hat_k(x),    x = ln((ell + 1) / 10).
 """
@@ -35,8 +35,8 @@ Parameters = Float[np.ndarray, " parameters"]
 Scored = Float[np.ndarray, "*n parameters"]
 
 Theta = Float[np.ndarray, " theta"]
-# degrees of freedom of the parameters' Student distribution: near their centre they are held as by
-# a normal one of the same width, and a few may be far from it
+# degrees of freedom of the parameters' Student distribution: near the centre it acts like a normal
+# distribution of the same width, but a few parameters may be far from it
 FREEDOM = 2.0
 
 # distance in ln(ell + 1) of the knots of departures
@@ -47,39 +47,39 @@ SPACING = 0.5 * np.log(2.0)
 TILT, TILT_WIDTH = -2.7, 0.2
 CURVATURE_WIDTH = 0.3
 DEPARTURE_WIDTH = 0.15
-# standard deviation of ln C at the pivot: hardly anything is known
+# standard deviation of ln C at the pivot: nearly unconstrained
 LOG_AMPLITUDE_WIDTH = 6.0
-# standard deviation of the logarithm of C_0, which is not part of the spectrum's form
+# standard deviation of ln C_0, which does not follow the spectrum's form
 LOG_MONOPOLE_WIDTH = 2.0
-# fluctuations relative to the mean, where the spectrum is started
+# expected fluctuations relative to the mean
 RELATIVE_STRENGTH = 0.05
 
-# of Gauss and Hermite's rule for the means of cells' factors
+# nodes of the Gauss-Hermite rule for the means of cells' factors
 NODES = 20
 
-# variance of parameters' linear combinations, one a row
+# variance of linear combinations of parameters, one per row
 Spread = Callable[[Float[np.ndarray, "rows parameters"]], Float[np.ndarray, " rows"]]
 
 
 @dataclass(frozen=True)
 class Hyperprior:
-    """What is expected of a family's parameters: theta, and then the logarithms of cells' scales.
+    """Prior of a family's parameters: theta, then the logarithms of the cells' scales.
 
     Each theta follows a Student distribution with two degrees of freedom. The logarithm t of a
     factor of the variance in a cell has the density ::
 
         p(t) ~ exp(-tail t - (tail / steepness) exp(-steepness t)),
 
-    greatest at t = 0: a power law towards large factors, and little room for small ones.
+    which peaks at t = 0: a power law towards large factors, and a steep fall towards small ones.
 
     Attributes
     ----------
     centre, width : (theta,) array
     n_cells : int
     tail : float
-        The factor's density falls as its power -(1 + tail).
+        The factor's density falls as factor^-(1 + tail).
     steepness : float
-        Its power is gamma distributed with the inverse scale, tail / steepness.
+        factor^-steepness is gamma distributed, with shape and rate tail / steepness.
     """
 
     centre: Theta
@@ -90,7 +90,7 @@ class Hyperprior:
 
     @property
     def size(self) -> int:
-        """Number of parameters, with the cells'."""
+        """Number of parameters, including the cells'."""
         return len(self.centre) + self.n_cells
 
     def start(self) -> Parameters:
@@ -112,15 +112,15 @@ class Hyperprior:
         return np.concatenate([theta + constant, cells + of_cell])
 
     def gradient(self, parameters: Parameters) -> Parameters:
-        """Compute its derivative."""
+        """Compute the derivative of ln p(theta, t)."""
         z, t = self._parts(parameters)
         theta = -(FREEDOM + 1.0) * z / (FREEDOM + z**2) / self.width
         return np.concatenate([theta, self.tail * np.expm1(-self.steepness * t)])
 
     def curvature(self, parameters: Parameters) -> Parameters:
-        """Compute positive second derivatives of -ln p, of a normal density that touches p.
+        """Compute second derivatives of -ln p, all positive: of a normal density that touches p.
 
-        That of theta is p's own at the centre and goes with the slope where p is not concave.
+        For theta: the slope over the distance from the centre, which stays positive everywhere.
         """
         z, t = self._parts(parameters)
         theta = (FREEDOM + 1.0) / (FREEDOM + z**2) / self.width**2
@@ -128,10 +128,10 @@ class Hyperprior:
         return np.concatenate([theta, cells])
 
     def scores(self, parameters: Parameters) -> Parameters:
-        """Compute z with Phi(z) = P(parameter is smaller), one by one: standard normal."""
+        """Compute the standard normal score z of each: Phi(z) = P(parameter is smaller)."""
         x, t = self._parts(parameters)
         shape = self.tail / self.steepness
-        # the smaller of both tails keeps its digits
+        # the smaller of the two tails keeps its digits
         theta = np.sign(x) * -special.ndtri(special.stdtr(FREEDOM, -np.abs(x)))
         power = shape * np.exp(-self.steepness * t)
         below, above = special.gammaincc(shape, power), special.gammainc(shape, power)
@@ -150,9 +150,9 @@ class Hyperprior:
         return np.concatenate([self.centre + self.width * theta, cells], axis=-1)
 
     def near(self, scores: Parameters, drawn: Scored) -> Scored:
-        """Compute parameters of drawn scores: theta to first order about given ones.
+        """Compute the parameters of drawn scores, theta to first order about given scores.
 
-        Factors of cells have means, those of variables of a Student distribution have none.
+        A cell's factor has a mean; the exponential of a Student variable has none.
         """
         values, n = self.of_scores(drawn), len(self.centre)
         linear = self.of_scores(scores) + self.slopes_of_scores(scores) * (drawn - scores)
@@ -160,7 +160,7 @@ class Hyperprior:
         return values
 
     def moments(self, scores: Parameters, covariance: Square) -> tuple[Parameters, Square]:
-        """Mean and covariance of :meth:`near` for normal scores, with their correlation."""
+        """Compute mean and covariance of :meth:`near` for normal scores; correlations are kept."""
         nodes, weights = np.polynomial.hermite_e.hermegauss(NODES)
         std = np.sqrt(np.diagonal(covariance))
         values = self.near(scores, scores + nodes[:, None] * std)
@@ -169,7 +169,7 @@ class Hyperprior:
         return mean, scale[:, None] * covariance * scale
 
     def slopes_of_scores(self, scores: Parameters) -> Parameters:
-        """Compute d parameter / d score of each: phi(z) over the parameter's density."""
+        """Compute each d parameter / d score: phi(z) over the parameter's density."""
         log_normal = -0.5 * (scores**2 + np.log(2.0 * np.pi))
         return np.exp(log_normal - self._log_densities(self.of_scores(scores)))
 
@@ -198,38 +198,38 @@ class Member(ABC):
 class PriorFamily(ABC):
     """Priors N(mean, S(theta)) over harmonic coefficients, in NumPy."""
 
-    # of those parameters that are reported: the first ones
+    # of the reported parameters, which come first
     names: ClassVar[tuple[str, ...]] = ("ln C at ell = 9", "tilt", "curvature")
 
     @property
     @abstractmethod
     def hyperprior(self) -> Hyperprior:
-        """What is expected of the parameters."""
+        """Prior of the parameters."""
 
     @abstractmethod
     def at(self, parameters: Parameters) -> Member:
-        """Return the member of these parameters."""
+        """Return the member with these parameters."""
 
     @property
     def centre(self) -> Float[np.ndarray, " modes"] | None:
-        """Mean of all of its priors, in K; None for zero."""
+        """Common mean of its priors, in K; None for zero."""
         return None
 
     def expected(self) -> Prior:
-        """Return the prior of the parameters that are most probable before there are data."""
+        """Return the prior with the most probable parameters under the hyperprior."""
         return self.prior(self.at(self.hyperprior.start()).covariance)
 
     @abstractmethod
     def averaged(self, parameters: Parameters, spread: Spread) -> ModesMatrix:
-        """Compute S with the parameters' uncertainty: its variances' means, in K^2.
+        """Compute S averaged over uncertain parameters: the means of its variances, in K^2.
 
         Parameters
         ----------
         parameters : (parameters,) array
             Mean of a normal distribution of the parameters.
         spread : callable
-            Variance, under it, of linear combinations of the parameters. The logarithms of
-            variances are such combinations, so that their means are those of log-normal variables.
+            Variance of linear combinations of the parameters under that distribution. Logarithms
+            of variances are such combinations, so that the variances are log-normal.
         """
 
     @abstractmethod
@@ -238,7 +238,7 @@ class PriorFamily(ABC):
 
     @abstractmethod
     def start_from(self, coarse: PriorFamily, parameters: Parameters) -> Parameters:
-        """Return parameters of this family that stand for those of one with a lower lmax.
+        """Convert the parameters of a family with a lower lmax to this family.
 
         Parameters
         ----------
@@ -257,7 +257,7 @@ class SpectrumBasis:
     ----------
     matrix : (ells, parameters) array
     centre, width : (parameters,) array
-        What is expected of the parameters.
+        Of the parameters' prior.
     """
 
     matrix: Float[np.ndarray, "ells parameters"]
@@ -286,7 +286,7 @@ class SpectrumBasis:
 
 @dataclass(frozen=True)
 class IsotropicFamily(PriorFamily):
-    """S = diag(C_ell), with C_ell of :class:`SpectrumBasis` for ell > 0 and a C_0 of its own.
+    """S = diag(C_ell), with C_ell of :class:`SpectrumBasis` for ell > 0 and a separate C_0.
 
     Attributes
     ----------
@@ -300,7 +300,7 @@ class IsotropicFamily(PriorFamily):
 
     @classmethod
     def around(cls, temperature: float, lmax: int) -> IsotropicFamily:
-        """Make the family of skies of about a mean temperature, in K."""
+        """Make the family for skies with about this mean temperature, in K."""
         power = 4.0 * np.pi * (RELATIVE_STRENGTH * temperature) ** 2 / 100.0
         return cls(SpectrumBasis.around(power, lmax), float(np.log(4.0 * np.pi * temperature**2)))
 

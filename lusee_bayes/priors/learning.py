@@ -1,32 +1,32 @@
-"""How the parameters of a family of priors are learned from data, and draws with them.
+"""Learn the parameters of a family of priors from data, and draw skies with uncertain parameters.
 
-Parameters that the data do not tell keep what is expected of them, which has heavy tails: Laplace's
-approximation misses 0.32 in ln p(d) for every such theta, and 0.11 for every cell. In normal scores
-z, theta_i = F_i^-1(Phi(z_i)) with F_i the hyperprior's distribution function, it is exact for them.
-ln p(d | theta) being quadratic about the most probable theta*, with slope g and curvature F, ::
+Parameters that the data do not constrain keep the hyperprior, which has heavy tails: Laplace's
+approximation misses 0.32 in ln p(d) for every such theta, and 0.11 for every cell. It is exact for
+them in normal scores z, theta_i = F_i^-1(Phi(z_i)), where F_i is the hyperprior's distribution
+function. ln p(d | theta) is quadratic about the most probable theta*, with slope g and curvature F.
+Newton's method, with J = d theta / d z and the precision P = J F J + 1, then maximises ::
 
     ln p(d, z) = const + g.(theta - theta*) - 1/2 (theta - theta*)^T F (theta - theta*) - 1/2 |z|^2
 
-is raised by Newton's method, J = d theta / d z, with the precision P = J F J + 1. Two steps get
-there; the quadratic form holds near theta* only, and further ones may leave for a maximum of its
-own.
+in two steps. The quadratic form is valid near theta* only: further steps may lead to a spurious
+maximum.
 
-With the sky integrated out, ln p(d, theta) is maximised by Fisher scoring: its gradient is exact,
-its curvature the Fisher information, estimated from simulated data, and that of the hyperprior,
-corrected by how the gradient has changed along earlier steps.
-Around the maximum z is taken for normal, and theta for linear in it, but for the cells' factors:
-their distribution is skewed, and where the data do not see a cell its mean is far above the most
-probable value. The prior that is returned has the variances' means over it, at the level that suits
-the data best: they tell the variances' mean over many cells, which the most probable logarithms of
-each do not give. The evidence is the integral of p(d, theta) by Laplace's approximation, in
-coordinates that know the hyperprior's tails.
+With the sky integrated out, Fisher scoring maximises ln p(d, theta). Its gradient is exact. Its
+curvature is the Fisher information, estimated from simulated data, plus the hyperprior's, corrected
+by how the gradient has changed along earlier steps.
+Around the maximum we assume that z is normal, and theta linear in z. Cells' factors are different:
+their distribution is skewed, and the mean factor of an unobserved cell is far above the most
+probable one. The returned prior has the mean variances over this distribution, at the level that
+suits the data best: the data constrain the mean variance over many cells, which the most probable
+logarithms do not give. The evidence is Laplace's approximation to the integral of p(d, theta), in
+normal scores, which account for the hyperprior's tails.
 
-Draws of a sky have the parameters as uncertain as they are, ::
+Draws of a sky include the uncertainty of the parameters, ::
 
     p(m | d) = int p(m | d, theta) p(theta | d) d theta
 
-The posterior that a run reports is one Gaussian, with the variances' means over theta as its prior.
-Where the data hardly tell how strong the sky is, its draws are all of the same strength; those of
+The posterior that a run reports is one Gaussian, whose prior has the mean variances over theta. If
+the data barely constrain the strength of the sky, its draws all have the same strength. Draws of
 p(m | d) are quieter in one sky than in another, and a few departures are far larger. Here z is
 drawn from the normal distribution about its most probable value, and skies from the posterior under
 each S(theta(z)).
@@ -72,8 +72,7 @@ class Scores:
     covariance : (parameters, parameters) array
         About them.
     log_gain : float
-        Laplace's approximation: what turns ln p(d | theta) of the most probable parameters into ln
-        p(d).
+        ln p(d) minus ln p(d | theta) at the most probable parameters (Laplace).
     """
 
     mean: Parameters
@@ -88,14 +87,14 @@ def normal_scores(hyperprior: Hyperprior, parameters: Parameters, covariance: Sq
     ----------
     hyperprior : Hyperprior
     parameters : (parameters,) array
-        Most probable, hyperprior included.
+        Most probable values, hyperprior included.
     covariance : (parameters, parameters) array
         Of the normal distribution about them.
 
     Raises
     ------
     InputError
-        If the data's curvature is far from positive.
+        If the data's curvature is far from positive definite.
     """
     of_data = np.linalg.inv(covariance) - np.diag(hyperprior.curvature(parameters))
     slope = -hyperprior.gradient(parameters)
@@ -119,30 +118,30 @@ def normal_scores(hyperprior: Hyperprior, parameters: Parameters, covariance: Sq
     return Scores(z, inverse_from_cholesky(lower), log_gain)
 
 
-# the maximum is found when the next step could not add more than this to ln p
+# converged if the next step would add less than this to ln p
 SETTLED = 0.03
 MAX_STEPS = 60
-# where ln p is less curved along a step than this part of what is expected, that is not used
+# a step does not correct the curvature if ln p curves less along it than this part of the expected
 STEEP_ENOUGH = 1e-3
 # longest step of a parameter
 LONGEST = 3.0
-# shortest part of a step that is tried
+# smallest fraction of a step that is tried
 SHORTEST = 2.0**-10
-# simulated data sets for the Fisher information: while going uphill, and at the top
+# simulated data sets for the Fisher information: on the way to the maximum, and at it
 SIMULATIONS, FINAL_SIMULATIONS = 200, 500
-# added to a covariance with eigenvalues from 0 to 1, of which a root is needed: those near 0 are
-# wrong by eps times the condition number of Lambda, up to 1e-5, and count for nothing
+# added to a covariance with eigenvalues from 0 to 1 before its root is computed: rounding makes the
+# negligible ones near 0 wrong by eps times the condition number of Lambda, up to 1e-5
 ROUNDING = 1e-4
-# of the factor of N that data that do not fit demand: what is tried, one after the other
+# multiples of the factor of N that misfitting data demand, tried one after the other
 HIGHER = np.array([1.0, 1e2, 1e4])
 # shifts of ln C at which the evidence of the averaged prior is computed, to find the best one
 LEVELS = (-1.0, -0.5, 0.0)
-# how often a fixed prior is made ten times as wide where rounding leaves no posterior mean
+# how often a fixed prior is widened tenfold if rounding prevents a posterior mean
 MOST_WIDENINGS = 4
 
 
 class NotSettled(InputError):
-    """The most probable parameters of a prior were not found."""
+    """The search for a prior's most probable parameters did not converge."""
 
 
 @dataclass(frozen=True)
@@ -163,14 +162,14 @@ class Learned:
     log_evidence : float
         ln p(d), with the sky and the parameters integrated out (Laplace).
     steps : int
-        Steps that were taken.
+        Number of steps.
     noise_factor : float
-        Factor of N with which the parameters were learned; above 1 where the data do not fit.
+        Factor of N with which the parameters were learned; above 1 if the data do not fit.
     settled : bool
         Whether the parameters are learned; otherwise the prior is a fixed, wide one.
     still_moves : float
-        By which part of its standard deviations (rms) the map still moves in the last round, where
-        prior and N are found together; 0 where they have settled.
+        How far the map still moves in the last round (rms, in its standard deviations) if prior
+        and N are inferred together; 0 once they have converged.
     """
 
     prior: Prior
@@ -186,11 +185,11 @@ class Learned:
 
     @property
     def fits(self) -> bool:
-        """Whether the parameters were learned under the model's own N."""
+        """Whether the parameters were learned under the model's N, not a raised one."""
         return self.settled and self.noise_factor == 1.0
 
     def as_rows(self) -> list[dict[str, float | str]]:
-        """Name, value and standard deviation of the parameters that have a name."""
+        """Name, value and standard deviation of the named parameters."""
         std = np.sqrt(np.diagonal(self.covariance))
         each = zip(self.names, self.parameters, std, strict=False)
         return [{"name": name, "value": float(x), "std": float(width)} for name, x, width in each]
@@ -198,7 +197,7 @@ class Learned:
 
 @dataclass(frozen=True)
 class _Point:
-    """What is known of ln p(d, theta) at some theta."""
+    """Prior, posterior and ln p(d, theta) at some theta."""
 
     parameters: Parameters
     member: Member
@@ -207,7 +206,7 @@ class _Point:
 
     @cached_property
     def resolution(self) -> Square:
-        """How much of the prior's covariance of u the data take away."""
+        """The part of the prior's covariance of u that the data remove: 1 - Lambda^-1."""
         return np.eye(self.posterior.prior.size) - inverse_from_cholesky(self.posterior.lower)
 
     def slope(self, family: PriorFamily) -> Parameters:
@@ -218,7 +217,7 @@ class _Point:
         return of_data - self.member.traces(expected) + family.hyperprior.gradient(self.parameters)
 
     def curvature(self, family: PriorFamily, rng: Generator, n: int) -> Square:
-        """Its expected curvature, from simulated data sets."""
+        """Expected curvature of -ln p(d, theta), from simulated data sets."""
         drawn = _root(self.resolution) @ rng.standard_normal((len(self.resolution), n))
         scores = self.member.forms(self.posterior.prior.whiten_columns(drawn.T).T)
         scores = scores - scores.mean(1, keepdims=True)
@@ -230,22 +229,22 @@ class _Point:
 def learn(
     family: PriorFamily, information: Information, start: Parameters | None = None, seed: int = 1
 ) -> Learned:
-    """Find the most probable parameters of a family, and the prior that they give.
+    """Find the most probable parameters of a family, and the resulting prior.
 
     Parameters
     ----------
     family : PriorFamily
     information : Information
-        What the data say of the sky.
+        The data's information about the sky.
     start : (parameters,) array, optional
-        Where to begin; by default with the most probable ones before there are data.
+        Where to begin; by default at the maximum of the hyperprior.
     seed : int
         Of the simulated data.
 
     Raises
     ------
     NotSettled
-        If the maximum is not found in 60 steps, or ln p falls along its own gradient.
+        If the search does not converge in 60 steps, or ln p falls along its gradient.
     InputError
         If S is not positive definite.
     """
@@ -255,7 +254,7 @@ def learn(
 def _uphill(
     family: PriorFamily, information: Information, start: Parameters | None, seed: int
 ) -> tuple[_Point, Generator, int]:
-    """The most probable parameters, random numbers for more, and the steps that were taken."""
+    """The most probable parameters, the random generator, and the number of steps."""
     rng, before, moves = np.random.default_rng(seed), None, []
     point = _at(family, information, family.hyperprior.start() if start is None else start)
     for steps in range(MAX_STEPS + 1):
@@ -276,7 +275,7 @@ def _uphill(
 
 
 def _corrected(curvature: Square, moves: Sequence[tuple[Parameters, Parameters]]) -> Square:
-    """The curvature that says of earlier steps how the gradient fell (Broyden, Fletcher et al.)."""
+    """Correct the curvature by how the gradient fell along earlier steps (BFGS)."""
     for step, fall in moves:
         along = curvature @ step
         if fall @ step > STEEP_ENOUGH * (step @ along):
@@ -288,12 +287,12 @@ def _corrected(curvature: Square, moves: Sequence[tuple[Parameters, Parameters]]
 def learn_whatever_fits(
     family: PriorFamily, information: Information, start: Parameters | None = None, seed: int = 1
 ) -> Learned:
-    """Learn a prior as :func:`learn`, from data that no sky explains, too.
+    """Learn a prior as :func:`learn` does, even from data that no sky explains.
 
-    Under N, such data ask for a sky that is stronger by orders of magnitude, and ln p is rough. N
-    is raised to what the residual chi^2, which no sky can absorb, demands; where ln p does not
-    settle there, by 100 and 10,000 times that. The last resort is a fixed prior: the family's
-    before there are data, wide enough for the sky that the data ask for.
+    Under N, such data require a sky that is brighter by orders of magnitude, and ln p is rough. N
+    is raised by the factor that the residual chi^2, which no sky can absorb, demands; if learning
+    fails there, by 100 and 10,000 times that factor. The last resort is a fixed prior: the
+    family's expected one, made wide enough for the sky that the data require.
 
     Parameters
     ----------
@@ -304,14 +303,14 @@ def learn_whatever_fits(
     for factor in demanded * HIGHER:
         with suppress(InputError):
             learned = learn(family, information.raised(factor), start, seed)
-            if factor > 1.0:  # a posterior under N itself is what it is for
+            if factor > 1.0:  # check that there is a posterior under N itself
                 information.posterior(learned.prior)
             return replace(learned, noise_factor=float(factor))
     return _fixed(family, information, float(demanded * HIGHER[-1]))
 
 
 def most_probable(family: PriorFamily, information: Information, seed: int) -> Parameters | None:
-    """Find where :func:`learn_whatever_fits` ends uphill; None if it does not settle."""
+    """Find the maximum of :func:`learn_whatever_fits`; None if it does not converge."""
     for factor in demanded_factor(information, family.expected()) * HIGHER:
         with suppress(InputError):
             return _uphill(family, information.raised(factor), None, seed)[0].parameters
@@ -319,29 +318,29 @@ def most_probable(family: PriorFamily, information: Information, seed: int) -> P
 
 
 def demanded_factor(information: Information, prior: Prior) -> float:
-    """Factor of N that makes the residual chi^2 what is expected; 1 where it does not stand out.
+    """Factor of N that brings the residual chi^2 to its expectation; 1 if it is not too large.
 
     Parameters
     ----------
     information : Information
     prior : Prior
-        Before there are data, over the same modes.
+        Before learning, over the same modes.
     """
     n_data = int(information.n_data)
     try:
         posterior = information.posterior(prior)
         chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
         left = Split.of(posterior, chi2, n_data).instrument
-    except InputError:  # the data are too far from any sky for these numbers: rounding rules them
+    except InputError:  # the data are too far from any sky: rounding dominates these numbers
         left = ChiSquare(float(information.misfit), float(n_data))
     return 1.0 if left.too_small or left.fits else left.chi2 / left.degrees
 
 
 def _fixed(family: PriorFamily, information: Information, factor: float) -> Learned:
-    """The family's prior before there are data, as wide as data with N raised by a factor ask for.
+    """The family's expected prior, widened as the data with N raised by a factor require.
 
-    Wider still, if under N itself no posterior mean can be computed: rounding grows with its
-    distance from the prior's, in the prior's standard deviations.
+    It is widened further if no posterior mean can be computed under N itself: rounding grows with
+    the distance from the prior mean, in the prior's standard deviations.
     """
     prior, n_data = family.expected(), int(information.n_data)
     raised = information.raised(factor).posterior(prior)
@@ -381,8 +380,8 @@ def _climb(family: PriorFamily, information: Information, base: _Point, step: Pa
 def _root(covariance: Square) -> Float[np.ndarray, "n k"]:
     """A root of a covariance with eigenvalues from 0 to 1.
 
-    Of data that are very precise, those near 0 are wrong by more than ``ROUNDING``; then what lies
-    outside of 0 to 1 is left out.
+    If the data are very precise, those near 0 are wrong by more than ``ROUNDING``; eigenvalues are
+    then clipped to 0 and 1.
     """
     root = cholesky(covariance + ROUNDING * np.eye(len(covariance)))
     if np.isfinite(np.diagonal(root)).all():
@@ -403,7 +402,7 @@ def _learned(
 
     evidence = float(point.posterior.log_evidence) + scores.log_gain
 
-    # the variances are a constant, and one that goes with the level
+    # S is a constant plus a part proportional to the level
     doubled = np.concatenate([[mean[0] + np.log(2.0)], mean[1:]])
     once, twice = (family.averaged(level, spread) for level in (mean, doubled))
 
@@ -420,23 +419,22 @@ def _learned(
     return Learned(prior, family.names, point.parameters, covariance, scores, evidence, steps)
 
 
-# skies that are drawn with the same theta, at most, and the number of theta from which on it is
-# more than two
+# at most SHARED skies have the same theta, and at most two do until there are LEAST theta
 SHARED, LEAST = 30, 10
-# how often a theta is drawn anew whose S is not positive definite to rounding
+# draws of theta before giving up, if rounding leaves no positive definite S
 ATTEMPTS = 5
 
 
 def draws_with_parameters(
     family: PriorFamily, learned: Learned, information: Information, key: PRNGKeyArray, n: int
 ) -> Draws:
-    """Draw skies; neighbouring ones have different parameters.
+    """Draw skies with uncertain parameters; consecutive skies have different ones.
 
     Parameters
     ----------
     family : PriorFamily
     learned : Learned
-        Its parameters, and how uncertain they are.
+        Its parameters and their uncertainty.
     information : Information
         Of the same data.
     key : PRNG key

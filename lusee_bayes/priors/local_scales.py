@@ -1,18 +1,18 @@
-"""A Gaussian sky whose strength varies from place to place, and is learned.
+"""A Gaussian sky whose strength varies with direction and is learned.
 
 ::
 
     m = T + s_T x_1 T + s_0 x_0 Y_00 + sum_k s_k x_k o(k) + sum_b f_b s_b y(b)
           + R sum_j w_j P [sqrt(v_j) n_j]
 
-T is a template; its scale and the monopole are wide. o(k) are extended objects that are known by
-name, y(b) point sources of the catalogue. n_j
-is white noise on the sphere, v_j(p) a positive field, P the harmonic analysis, w_j windows in ell
-an octave wide with sum_j w_j^2 = 1, and R = diag(C_ell^1/2). Where all v_j = 1 the last term is an
-isotropic field of spectrum C_ell. Its covariance is R sum_j w_j W(v_j) w_j R, W(v) being the matrix
-of multiplication by v. The logarithm of v_j is a sum of covariates: the template seen with the
-band's resolution, the same where nothing is absorbed, the Galactic plane, a field of a few large
-harmonics, and cells of 15 degrees whose factors have a power-law tail: compact departures.
+T is a template; its scale and the monopole have wide priors. o(k) are named extended objects, y(b)
+the point sources of the catalogue. n_j is white noise on the sphere, v_j(p) a positive field, P the
+harmonic analysis, w_j windows in ell an octave wide with sum_j w_j^2 = 1, and R = diag(C_ell^1/2).
+If all v_j = 1, the last term is an isotropic field with spectrum C_ell. Its covariance is
+R sum_j w_j W(v_j) w_j R, where the matrix W(v) multiplies by v. The logarithm of v_j is a sum of
+covariates: the template at the band's resolution, the same without absorption, the Galactic plane,
+a smooth field of low ell, and 15-degree cells for compact departures, whose factors have a
+power-law tail.
 """
 
 from __future__ import annotations
@@ -47,19 +47,19 @@ Covariates = Float[np.ndarray, " covariates"]
 Strengths = list[Float[np.ndarray, " _"]]
 # frequency in MHz at which the Galaxy is nearly transparent
 TRANSPARENT_MHZ = 50.0
-# fluctuations of the texture relative to the template's mean, where its spectrum is started
+# expected fluctuations of the texture, relative to the template's mean
 RELATIVE_STRENGTH = 0.05
 # standard deviations of the template's scale, and of the monopole in units of the template's
 SCALE_WIDTH = MONOPOLE_WIDTH = 1.0
-# of ln f^2: whether the catalogue's sources are there at all is left to the data
+# of ln f^2: so wide that the data decide whether the catalogue's sources exist at all
 SOURCES_WIDTH = 3.0
 # NSIDE at which templates are analysed and smoothed
 TEMPLATE_NSIDE, TEMPLATE_LMAX = 64, 96
-# a template is smoothed to this angle over a band's ell, and to this one, in degrees (FWHM)
+# a band smooths the template by RESOLUTION_DEG / ell and FINEST_DEG in quadrature (FWHM)
 RESOLUTION_DEG, FINEST_DEG = 60.0, 4.0
-# how the texture's variance goes with the template: as its square if fluctuations are relative
+# the texture's variance is this power of the template: the square if fluctuations are relative
 TEMPLATE_POWER, POWER_WIDTH = 2.0, 1.0
-# half width of the plane in degrees, and how much stronger it may be there
+# half width of the plane in degrees, and how much stronger the texture may be there
 PLANE_DEG, PLANE_WIDTH = 4.0, 1.5
 # how much flatter the spectrum may be where the template is bright, and in the plane
 TILTS_WIDTH = 0.5
@@ -68,13 +68,13 @@ FIELD_LMAX, FIELD_WIDTH = 4, 0.4
 # NSIDE of the cells
 CELLS_NSIDE = 4
 N_CELLS = 12 * CELLS_NSIDE**2
-# a band's grid resolves the plane and the cells: exact to twice this degree at least
+# a band's grid must resolve the plane and the cells: it is exact to at least twice this degree
 LEAST_BAND = 24
 
 
 @dataclass(frozen=True)
 class Band:
-    """A window in ell, and what the strength of the sky in it depends on.
+    """A window in ell, and the covariates of the sky's strength in it.
 
     Attributes
     ----------
@@ -119,12 +119,12 @@ def windows(lmax: int) -> Float[np.ndarray, "bands ells"]:
     Parameters
     ----------
     lmax : int
-        Where the last one ends.
+        Last ell of the last window.
     """
     ell = np.arange(1.0, lmax + 1.0)
     n = max(1, int(np.floor(np.log2(lmax / 1.5))) + 1)
     edges = lmax / 2.0 ** np.arange(n - 1, 0, -1)
-    # the share of each ell that is below an edge, falling over an octave
+    # the fraction of each ell that is below an edge, which falls over an octave
     octaves = np.clip(np.log2(ell[None] / edges[:, None]), 0.0, 1.0)
     below = np.cos(0.5 * np.pi * octaves) ** 2
     shares = np.diff(np.concatenate([np.zeros((1, lmax)), below, np.ones((1, lmax))]), axis=0)
@@ -162,7 +162,7 @@ class SmoothedTemplate:
         return cls(healpy.map2alm(pixels, lmax=TEMPLATE_LMAX, iter=3), float(np.log(pixels).mean()))
 
     def log(self, fwhm_deg: float, theta: Vector, phi: Vector) -> Vector:
-        """ln of the smoothed template less its mean, in given directions."""
+        """ln of the smoothed template minus :attr:`mean_log`, in given directions."""
         alm = healpy.almxfl(self.alm, healpy.gauss_beam(np.radians(fwhm_deg), lmax=TEMPLATE_LMAX))
         smooth = healpy.alm2map(alm, TEMPLATE_NSIDE, lmax=TEMPLATE_LMAX)
         require_positive("the smoothed template", smooth)
@@ -170,7 +170,7 @@ class SmoothedTemplate:
 
 
 def expected_covariates() -> tuple[Covariates, Covariates]:
-    """Return centre and width of what is expected of the covariates' coefficients."""
+    """Return centre and width of the prior of the covariates' coefficients."""
     ell = np.sqrt(np.arange(1, n_modes(FIELD_LMAX))).astype(int)
     named = [POWER_WIDTH, POWER_WIDTH, PLANE_WIDTH, TILTS_WIDTH, TILTS_WIDTH]
     width = np.concatenate([named, FIELD_WIDTH / np.sqrt(2.0 * ell + 1.0)])
@@ -195,7 +195,7 @@ class LocalScales(PriorFamily):
         C_ell.
     bands : tuple of Band
     covariates : (centre, width) arrays
-        What is expected of the coefficients of the bands' bases.
+        Prior of the covariates' coefficients.
     """
 
     mean: Modes
@@ -239,7 +239,7 @@ class LocalScales(PriorFamily):
         return np.concatenate([power, np.zeros(len(self.spectrum.centre) - len(power)), *others])
 
     def _split(self, parameters: np.ndarray) -> list[np.ndarray]:
-        """Those of the spectrum, of the sources, of the covariates and of the cells."""
+        """Parameters of the spectrum, the sources, the covariates and the cells."""
         n_spectrum, n_covariates = len(self.spectrum.centre), len(self.covariates[0])
         return np.split(parameters, np.cumsum([n_spectrum, 1, n_covariates]))
 
@@ -259,7 +259,7 @@ def _texture(family: LocalScales, spectrum: Ells, strengths: Strengths) -> Modes
 
 
 def _scale(band: Band, spectrum: Ells) -> Modes:
-    """w_j C_ell^1/2 of every mode up to the band's last."""
+    """w_j C_ell^1/2 of every mode up to the band's last ell."""
     ells = slice(band.grid.lmax + 1)
     return per_mode(band.window[ells] * np.sqrt(spectrum[ells]))
 
@@ -327,7 +327,7 @@ class LocalScalesMember(Member):
     def _gathered(
         self, ells: Float[np.ndarray, "ells n"], sources: Vector, fields: list[np.ndarray]
     ) -> Float[np.ndarray, "parameters n"]:
-        """Derivatives by the parameters, from those by ln C_ell, ln f^2 and the strengths."""
+        """Derivatives by the parameters, from the ones by ln C_ell, ln f^2 and the strengths."""
         family = self.family
         covariates = np.zeros((len(self.coefficients), len(sources)))
         cells = np.zeros((N_CELLS, len(sources)))
@@ -353,11 +353,11 @@ def embedded_local_scales(
     frequency_mhz : float
     lmax : int
     sources : tuple of PointSource
-        The catalogue: those that may be there.
+        The catalogue of possible sources.
     objects : tuple of ExtendedObject
-        Those that may be brighter or darker than their surroundings.
+        Objects that may be brighter or darker than their surroundings.
     """
-    # the template, and the same sky where hardly anything is absorbed
+    # the template, and the same sky nearly without absorption
     clear_mhz = max(TRANSPARENT_MHZ, frequency_mhz)
     smoothed = [SmoothedTemplate.of(mhz) for mhz in (frequency_mhz, clear_mhz)]
     mean = np.asarray(galaxy_sky(frequency_mhz, lmax, seed=None, sources=()).modes)

@@ -4,13 +4,13 @@
 
     d = A m + A' m' + n,    m' ~ N(mu', S'),
 
-m' being the modes from lmax + 1 up to lmax + margin, S' that part of the prior's covariance, and A'
-of the instrument as it is expected. Integrated out, A' mu' adds to the mean of the data, and A' S'
-A'^T to N. Left out of it are directions that together change chi^2 by less than one, and the
-correlation of m' with m, through which the data tell more of m' than N assumes. Where the data tell
-the prior, S' and mu' follow from the parameters that are learned at lmax.
+where m' are the modes from lmax + 1 up to the highest ell seen (:meth:`AboveLmaxSection.top`), S'
+is their part of the prior's covariance, and A' is for the expected instrument. Integrating m' out
+adds A' mu' to the mean of the data, and A' S' A'^T to N. This omits directions that together change
+chi^2 by less than one, and the correlation of m' with m, through which the data constrain m' better
+than N assumes. If the prior is learned, S' and mu' follow from the parameters learned at lmax.
 
-Simulated data hold the modes that the scenario's sky has up to lmax + margin.
+Simulated data contain the modes of the scenario's sky up to the same ell.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.systematics.context import Above, Around, Setup
 from lusee_bayes.systematics.systematic import LowRankNoise, with_added
 
-# by how much directions that are left out may change chi^2 together
+# largest change of chi^2 by all omitted directions together
 LEFT_OUT = 1.0
 
 
@@ -57,7 +57,7 @@ class AboveLmaxSection(Section):
 
 
 class AboveLmax(LowRankNoise):
-    """What the sky above lmax adds to the data; its root is A' S'^(1/2).
+    """The contribution of the sky above lmax to the data; its root is A' S'^(1/2).
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class AboveLmax(LowRankNoise):
 
     @classmethod
     def truth(cls, section, setup, key):
-        """The scenario's own sky, which is no draw."""
+        """Nothing: the true values are the scenario's sky, not drawn."""
         return {}
 
     @classmethod
@@ -90,14 +90,14 @@ class AboveLmax(LowRankNoise):
         return with_added(super().effect(model, values), self.mean)
 
     def marginalised(self, model):
-        """Add the covariance to N, and the mean to the data's."""
+        """Add the covariance to N, and the mean to that of the data."""
         return with_added(super().marginalised(model), self.mean)
 
 
 def sky_above(
     setup: Setup, std: DataVector, parameters: Float[np.ndarray, " parameters"] | None = None
 ) -> Above:
-    """What the sky above lmax may add to the data.
+    """Compute the possible contribution of the sky above lmax to the data.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def sky_above(
     std : (data,) array
         Of the radiometer noise, in K.
     parameters : (parameters,) array, optional
-        Of the setup's family of priors, learned from the data; by default what is expected of them.
+        Of the setup's family of priors, learned from the data; by default the expected ones.
     """
     scenario, n, above = setup.scenario, setup.prior.size, setup.above
     frequency_mhz, lmax = scenario.frequency_mhz, scenario.noise.above_lmax.top(scenario.lmax)

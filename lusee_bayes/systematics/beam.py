@@ -1,7 +1,7 @@
 """Errors of the beams: along the direction to other beams, or in parameters of the antennas.
 
-Marginalised, they are averaged over the skies of the prior: to first order data hold dA m besides
-A m, which adds dA (S + mu mu^T) dA^T to N, dA being the derivative of A by the unknown.
+If marginalised, they are averaged over the skies of the prior: to first order, data contain dA m
+besides A m, which adds dA (S + mu mu^T) dA^T to N. dA is the derivative of A by the unknown.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class BeamErrors(Systematic):
 
     @classmethod
     def moved(cls, section: BeamErrorSection, setup: Setup, values: Values) -> Setup:
-        """With the true beams, what the ground then adds, and the responses to sources."""
+        """Use the true beams, their ground emission, and their responses to sources."""
         if not {"beam_amplitude", *section.parameters} & set(values):
             return setup
         source, frequency_mhz = _true(section, setup, values)
@@ -119,12 +119,12 @@ class BeamErrors(Systematic):
 
 
 def _true(section: BeamErrorSection, setup: Setup, values: Values) -> tuple[BeamSource, float]:
-    """The antennas that have these values, and the frequency at which they are used."""
+    """The antennas with these values, and the frequency at which they are used."""
     source, frequency_mhz = setup.beam_source, setup.frequency_mhz
     if section.shift_mhz is not None:
         return source, frequency_mhz + section.shift_mhz
     if section.file is not None:
-        # behind the same receivers, turned as the scenario's
+        # with the same receivers, and turned like the scenario's
         other = setup.scenario.beam.of_file(section.file).source()
         return other.behind(setup.receiver), frequency_mhz
     chosen = {name: values[name] for name in section.parameters}
@@ -132,7 +132,7 @@ def _true(section: BeamErrorSection, setup: Setup, values: Values) -> tuple[Beam
 
 
 def difference_of_beams(section: BeamErrorSection, setup: Setup) -> BeamModes:
-    """The direction to other beams, those of a shift or of a file; of each run behind a horizon."""
+    """Difference to the beams of a shift or a file; one for each run if there is a horizon."""
     source, frequency_mhz = _true(section, setup, {})
     other, horizon = source.beams(frequency_mhz, setup.beams.lmax), setup.scenario.noise.horizon
     modes = instrument_errors.difference(other, setup.instrument.beams()).modes
@@ -143,7 +143,7 @@ def difference_of_beams(section: BeamErrorSection, setup: Setup) -> BeamModes:
 
 
 class BeamError(BeamErrors):
-    """Beams that are off along one direction dA by an unknown amplitude, N(0, 1).
+    """Beams that deviate along one direction dA by an unknown amplitude, N(0, 1).
 
     Attributes
     ----------
@@ -160,26 +160,26 @@ class BeamError(BeamErrors):
         return (Unknown("beam_amplitude"),)
 
     def effect(self, model, values):
-        """A + amplitude dA."""
+        """Use A + amplitude dA."""
         amplitude = values["beam_amplitude"]
         return replace(model, coupling=model.coupling.plus(amplitude, self.direction))
 
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
-        """Add dA S dA^T to N."""
+        """Add dA (S + mu mu^T) dA^T to N."""
         noise = instrument_errors.beam_error_noise(self.direction, model.prior)
         return replace(model, noise=model.noise + noise)
 
 
 class InstrumentParameters(ChangedBeams, BeamErrors):
-    """Parameters of the antennas that are not known; their priors are Gaussian.
+    """Unknown parameters of the antennas, with Gaussian priors.
 
     Attributes
     ----------
     instrument : Instrument
         The instrument with the prior means of its parameters.
     priors : tuple of Unknown
-        Those that are not known, in numbers: arrays would be traced, and the checks of the priors
-        and the ends of their domains need values.
+        The unknowns, as numbers: arrays would be traced, and the checks of the priors and the ends
+        of their domains need values.
     """
 
     instrument: Instrument
@@ -187,7 +187,7 @@ class InstrumentParameters(ChangedBeams, BeamErrors):
 
     @classmethod
     def centred(cls, instrument: Instrument, stds: Mapping[str, float]) -> InstrumentParameters:
-        """Put the priors' means at the instrument's values.
+        """Build it with the instrument's values as prior means.
 
         Parameters
         ----------
@@ -199,7 +199,7 @@ class InstrumentParameters(ChangedBeams, BeamErrors):
         Raises
         ------
         InputError
-            For unknown names, and for a prior that reaches out of a parameter's domain.
+            For unknown names, and for a prior that exceeds a parameter's domain.
         """
         parameters = {name: instrument.source.parameter(name) for name in stds}
         priors = tuple(
@@ -215,22 +215,22 @@ class InstrumentParameters(ChangedBeams, BeamErrors):
         return self.priors
 
     def modes(self, modes, values):
-        """Beams of antennas that have these values; a horizon hides what it hides without them."""
+        """Beams of antennas with these values; a horizon hides the same as without them."""
         made = self.instrument.beams(values).modes
         return made if modes.ndim == 2 else modes + (made - self.instrument.beams().modes)[None]
 
     def effect(self, model, values):
-        """A of these beams, and what ground and antennas then emit."""
+        """Use A of these beams, and the emission of ground and antennas with them."""
         return with_added(super().effect(model, values), self.emitted(values))
 
     def linearised(self, model, centre):
-        """That of :meth:`effect`."""
+        """Differentiate :meth:`effect`."""
         of_sky = super().linearised(model, centre)
         emitted = np.stack(list(self.differences(self.emitted, centre)), axis=1)
         return lambda sky: of_sky(sky) + emitted
 
     def emitted(self, values: Values) -> DataVector:
-        """What ground and antennas emit beyond the background, in K."""
+        """Emission of ground and antennas beyond the background, in K."""
         source, frequency_mhz = self.instrument.source, self.instrument.frequency_mhz
         more = source.with_values(values).background(frequency_mhz)
         more, layout = more - source.background(frequency_mhz), self.instrument.layout
@@ -239,7 +239,7 @@ class InstrumentParameters(ChangedBeams, BeamErrors):
 
 
 def true_beams(setup: Setup) -> ProductBeams:
-    """The beams that simulated data are taken with."""
+    """The beams of simulated data."""
     section = setup.scenario.noise.beam
     if section is None:
         return setup.beams
@@ -248,7 +248,7 @@ def true_beams(setup: Setup) -> ProductBeams:
 
 
 def beam_rms_difference(setup: Setup) -> float | None:
-    """RMS difference of the true beams and the model's, over the model's; None if the same."""
+    """RMS difference of the true and the model's beams, over the model's; None if the same."""
     if setup.scenario.noise.beam is None:
         return None
     return instrument_errors.rms_difference(true_beams(setup), setup.beams)

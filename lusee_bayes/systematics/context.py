@@ -1,12 +1,12 @@
-"""What systematics are built from: an instrument pointed at a sky, and what the data determine.
+"""Inputs of systematics: an instrument pointed at a sky, and quantities that the data determine.
 
-Radiometer noise and gain drifts are built around visibilities. Those of the modelled sky are right
-where it is the true one, as for simulated data. Measured visibilities hold their own noise: N is
-small where an auto came out low, and the map is pulled there. With n times of B tau samples each,
-and the exact covariance of p antennas' products, a common amplitude moves by up to
+Radiometer noise and gain drifts are built around visibilities. Those of the modelled sky are
+correct if it is the true one, as for simulated data. Measured visibilities contain their own noise:
+N is small where an auto is low by chance, and pulls the map there. With n times of B tau samples
+each, and the exact covariance of p antennas' products, a common amplitude moves by up to
 4 p sqrt(n / (B tau)) of its standard deviation. Drifts are not small, and stay in the measured
-visibilities. What neither troubles is the map's own prediction, in rounds
-(:mod:`lusee_bayes.experiment.rounds`).
+visibilities. The map's own prediction, computed in rounds (:mod:`lusee_bayes.experiment.rounds`),
+has neither problem.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ from lusee_bayes.priors.families import PriorFamily
 from lusee_bayes.sky.prior import Prior
 from lusee_bayes.sky.sky_source import Sky
 
-# visibilities that a term of N is built around: the modelled sky's, the data, or the map's own
+# visibilities around which a term of N is built: the modelled sky's, the data, or the map's
 NoiseAbout = Literal["model", "measured", "posterior"]
 
 
 @dataclass(frozen=True)
 class Above:
-    """What the sky above lmax may add to the data.
+    """The possible contribution of the sky above lmax to the data.
 
     Attributes
     ----------
@@ -46,13 +46,13 @@ class Above:
     modes : (modes,) array
         Of the modelled sky, in K.
     family : PriorFamily or None
-        Priors up to the highest ell, of which data choose one; None for a prior that is given.
+        Priors up to the highest ell, from which data choose one; None for a given prior.
     root : (data, rank) array
-        Of the covariance of what is added, in K.
+        Of the covariance of the contribution, in K.
     mean : (data,) array
         Its mean, in K.
     power : (ells,) array
-        What each ell from lmax + 1 on is expected to add to chi^2 of a model without it.
+        Expected contribution of each ell from lmax + 1 on to chi^2 of a model without it.
     """
 
     coupling: Float[Array, "data modes"]
@@ -63,14 +63,14 @@ class Above:
     power: Float[np.ndarray, " ells"]
 
     def kept(self, place: Callable[[Array], Array]) -> Above:
-        """The same for other data; ``place`` finds theirs in an array of these."""
+        """The same for other data; ``place`` maps an array of these data to those."""
         arrays = {name: place(getattr(self, name)) for name in ("coupling", "root", "mean")}
         return replace(self, **arrays)
 
 
 @dataclass(frozen=True)
 class Setup:
-    """The pieces of d = A m + n that a scenario stands for.
+    """The parts of d = A m + n that a scenario defines.
 
     Attributes
     ----------
@@ -81,30 +81,30 @@ class Setup:
         The scenario's model sky, up to lmax.
     beam_source : BeamSource
     instrument : Instrument
-        Orientations and samples, of which A is made for given beams.
+        Orientations and samples, which give A for any beams.
     beams : ProductBeams
     coupling : CouplingMatrix
         A.
     prior : Prior
-        S. Where it is to be learned, what is expected before there are data.
+        S; if it is to be learned, the expected one.
     responses : tuple of (products, times) arrays
-        Of each point source beside the map, to 1 K sr.
+        To 1 K sr of each point source outside the map.
     background : (products,) or (products, times) array
-        Visibilities without any sky, of ground, antennas, the mean receiver and terrain, in K.
+        Visibilities without any sky, from ground, antennas, the mean receiver and terrain, in K.
     signal : (products, times) array
         Visibilities of sky, background and sources through the modelled beams, in K.
     receiver : Receiver or None
-        The receivers that the data name; None for others.
+        The receivers that the data name; None for other data.
     calibration : Calibration or None
-        Of data that are averages of a spectrometer's spectra; None for others.
+        Of data that are averages of a spectrometer's spectra; None for other data.
     measured : bool
         Whether the data were given, so that their sky is not the modelled one.
     family : PriorFamily or None
-        Of which data choose the prior; None for a prior that is given.
+        From which data choose the prior; None for a given prior.
     hidden : (runs, products, modes) array or None
-        What the known horizon does to the beams, which do without it; None for flat ground.
+        Effect of the known horizon on the beams (``beams`` is without it); None for flat ground.
     above : Above or None
-        None where the model ends at lmax.
+        None if the model ends at lmax.
     """
 
     scenario: Any
@@ -127,7 +127,7 @@ class Setup:
 
     @property
     def frequency_mhz(self) -> float:
-        """Of the data."""
+        """Frequency of the data."""
         return self.scenario.frequency_mhz
 
     @property
@@ -148,7 +148,7 @@ class Setup:
 
     @property
     def offset(self) -> DataVector | None:
-        """The background in every datum, in K; None where there is none."""
+        """The background in every datum, in K; None if there is none."""
         if not np.any(self.background):
             return None
         grid = (self.layout.n_products, self.layout.n_times)
@@ -160,7 +160,7 @@ class Setup:
         Parameters
         ----------
         section : PriorSection
-            The scenario's section, in place of its own.
+            Replaces the scenario's section.
         """
         scenario = self.scenario.model_copy(update={"prior": section})
         prior, family = prior_and_family(scenario, self.sky)
@@ -179,7 +179,7 @@ class Setup:
         return replace(self, sky=sky, signal=self.signal + change)
 
     def with_layout(self, layout: DataLayout) -> Setup:
-        """Return the same for fewer of its data."""
+        """Return the same for a subset of its data."""
         above, instrument = self.above, replace(self.instrument, layout=layout)
         if above is not None:
             above = above.kept(lambda x: layout.gather(self.layout.scatter(x)))
@@ -187,7 +187,7 @@ class Setup:
         return replace(self, instrument=instrument, coupling=coupling, above=above)
 
     def select(self, keep: Bool[np.ndarray, " times"]) -> Setup:
-        """Return the same at those of its times where ``keep`` is True, some of every run."""
+        """Return the same at the times where ``keep`` is True, with some of every run."""
         observation, turns = self.observation.select(keep), self.pointing
         ends = np.searchsorted(observation.run, np.arange(observation.n_runs + 1)).tolist()
         of_time = {"azimuth": turns.azimuth[keep], "functions": turns.functions[keep]}
@@ -211,7 +211,7 @@ class Setup:
 
     @property
     def has_autos(self) -> bool:
-        """Whether every port that was used has its auto somewhere."""
+        """Whether every port that was used has its auto at some time."""
         seen, n = np.asarray(self.layout.present).any(1), self.beam_source.n_ports
         products = np.array(all_products(n), dtype=object)
         used = set(products[seen, :2].ravel())
@@ -219,14 +219,14 @@ class Setup:
 
 
 def prior_and_family(scenario: Any, sky: Sky) -> tuple[Prior, PriorFamily | None]:
-    """The scenario's prior, or what is expected of it before there are data, and its family."""
+    """The scenario's prior, or the expected one if data choose it, and its family."""
     family = scenario.prior.family(scenario.frequency_mhz, scenario.lmax)
     return (scenario.prior.prior(sky) if family is None else family.expected()), family
 
 
 @dataclass(frozen=True)
 class Around:
-    """What a systematic may be built around, besides its setup.
+    """Quantities around which a systematic may be built, besides its setup.
 
     Attributes
     ----------
@@ -239,8 +239,8 @@ class Around:
     values : mapping of float or None
         Of the unknowns about which it is linear, by name; None for their prior means.
     volume : ((draws, modes), (draws, data)) arrays or None
-        Skies s = C A^T w of noise alone, in K, and w = N^-1 n: what the volume of skies that fit is
-        estimated with. None before there is a posterior.
+        Skies s = C A^T w of noise alone, in K, and w = N^-1 n, to estimate the volume of skies that
+        fit. None before there is a posterior.
     tempered : float
         Factor of radiometer noise in first rounds.
     """
@@ -254,10 +254,10 @@ class Around:
 
 
 def noise_visibilities(setup: Setup, around: Around, about: NoiseAbout) -> Grid:
-    """The visibilities that a term of N is built around, in K.
+    """The visibilities around which a term of N is built, in K.
 
-    Before there is a prediction it is the measured ones', or, if autos that noise depends on were
-    never measured, the modelled sky's.
+    Before there is a prediction, they are the measured ones or, if autos on which noise depends
+    were never measured, the modelled sky's.
     """
     if about == "model" or around.data is None:
         return setup.signal
@@ -269,9 +269,9 @@ def noise_visibilities(setup: Setup, around: Around, about: NoiseAbout) -> Grid:
 
 
 def measured_visibilities(data: Visibilities, model: Grid) -> Grid:
-    """Visibilities that set a noise level: the measured ones, absent samples interpolated.
+    """Visibilities that set a noise level: the measured ones, with missing samples interpolated.
 
-    A time without any sample takes the model's (it enters nothing).
+    A time without any sample gets the model's, which are not used.
 
     Raises
     ------

@@ -1,23 +1,22 @@
-"""Smooth errors of each port's field: what no parameter of the antennas describes.
+"""Smooth errors of each port's field that no parameter of the antennas describes.
 
-Port i responds with E_ic + e_ic above the horizon, c being East and North as they are at the zenith
-and as parallel transport from there has them elsewhere (Ludwig's third definition), ::
+Port i responds with E_ic + e_ic above the horizon. The components c are East and North at the
+zenith, and elsewhere follow from it by parallel transport (Ludwig's third definition), ::
 
     e_ic(n) = s_i sum_k a_ick Y_k(n),    Re a_ick, Im a_ick ~ N(0, C_ell),
 
-with s_i the rms of E_i over the hemisphere, C_ell = C_0 (1 + ell)^-slope, up to ``lmax``. It is
-added, since what a lander scatters does not vanish where the antenna's own field does. Beams of
-products gain E_ic e_jc* + e_ic E_jc* + e_ic e_jc*. C_0 follows from the standard deviation of
-either part in any direction.
+with s_i the rms of E_i over the hemisphere, C_ell = C_0 (1 + ell)^-slope, up to ``lmax``. Errors
+are added, since the field that a lander scatters does not vanish where the antenna's own field
+does. Beams of products gain E_ic e_jc* + e_ic E_jc* + e_ic e_jc*. C_0 follows from the standard
+deviation of either part in any direction.
 
-How strong the errors are is learned with everything else, in rounds. Each takes the strength that
-is most probable for the n amplitudes as they were found, uncertain as they are (expectation and
-maximisation), ::
+The strength of the errors is learned with all other unknowns, in rounds. Each round uses the most
+probable strength given the posterior of the n amplitudes (expectation maximisation), ::
 
     C_0 = sum [(mean of a)^2 + Var(a)] (1 + ell)^slope / n,
 
-but never less than what is expected: where parameters of the antennas describe most of an error,
-what is left has a few shapes, and the strength of all would be found far too low for these.
+but never less than the expected strength: if parameters of the antennas describe most of an error,
+the rest has only a few shapes, for which the strength of all would be far too low.
 """
 
 from __future__ import annotations
@@ -41,9 +40,9 @@ from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.polarisation import unit_spectrum
 from lusee_bayes.systematics.systematic import ChangedBeams, Unknown, Values
 
-# what is learned, by name
+# name of the learned parameter
 STD = "field_std"
-# standard deviation in any direction, at most
+# largest standard deviation in any direction
 LARGEST = 0.1
 
 
@@ -72,7 +71,7 @@ class FieldErrorsSection(Section):
     treatment: Treatment = "marginalised"
 
 
-# data whose columns are made at once
+# data whose columns are computed at once
 BLOCK = 1024
 
 
@@ -86,7 +85,7 @@ class FieldErrors(ChangedBeams):
     fields : (ports, 2, rings, phi) complex array
         E up to the band of the grid, in sqrt(K / K / sr).
     above : (rings, phi) array
-        One above the horizon, likewise.
+        One above the horizon, up to the same band.
     sizes : (ports,) array
         s, in the unit of E.
     harmonics : (harmonics, rings, phi) array
@@ -94,7 +93,7 @@ class FieldErrors(ChangedBeams):
     grid : SphereGrid
         Exact for the beams' coefficients up to those of the map.
     expectation : FieldErrorsSection
-        What the scenario says of them.
+        The scenario's section.
     """
 
     key: ClassVar[str] = "noise.fields"
@@ -137,7 +136,7 @@ class FieldErrors(ChangedBeams):
 
     @classmethod
     def moved(cls, section: FieldErrorsSection, setup: Setup, values: Values) -> Setup:
-        """With the beams of these errors."""
+        """Use beams with these errors."""
         errors = cls.build(section, setup, Around(values=values))
         if not any(name in values for name in (errors.names[0], errors.unknowns[0].name)):
             return setup
@@ -149,7 +148,7 @@ class FieldErrors(ChangedBeams):
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
-        """Of every ell: parts, ports, components, orders."""
+        """Amplitudes of every ell: parts, ports, components, orders."""
         return tuple(
             Unknown(f"field_error_{ell}", std=std, size=4 * len(self.sizes) * (2 * ell + 1))
             for ell, std in enumerate(self.of_ell)
@@ -163,7 +162,7 @@ class FieldErrors(ChangedBeams):
         return self.sizes[:, None, None, None] * as_complex(real, imaginary)
 
     def modes(self, modes, values):
-        """Add what the errors change."""
+        """Add the change that the errors cause."""
         e = self.errors(values)
         xp = namespace(e)
         crossed = xp.einsum("icrp,jcrp->ijrp", self.fields + 0.5 * self.above * e, e.conj())
@@ -171,12 +170,12 @@ class FieldErrors(ChangedBeams):
         return modes + xp.broadcast_to(more[:, : modes.shape[-1]], modes.shape)
 
     def linearised(self, model, centre):
-        """Through what every Y_k conj(E_jc + e_jc) sees, of which all derivatives are made."""
+        """Combine all derivatives from the data that every Y_k conj(E_jc + e_jc) would give."""
         coupling, n, ells = model.coupling, len(self.sizes), np.arange(len(self.of_ell))
         field = np.conj(self.fields + self.above * self.errors(self.values(centre)))
         parts, size = np.stack([field.real, field.imag]), coupling.modes.shape[-1]
         rows = [self.grid.analyse(parts * y)[..., :size].reshape(-1, size) for y in self.harmonics]
-        # in sets of as many as there are products
+        # in sets of as many rows as products
         used = np.concatenate(rows)
         sets = np.concatenate([used, np.zeros((-len(used) % n**2, size))]).reshape(-1, n**2, size)
         see, layout, (i, j, imaginary) = coupling.along(sets), coupling.layout, ports(n)
@@ -217,5 +216,5 @@ class FieldErrors(ChangedBeams):
 
 
 def of_ell(std: float, slope: float, lmax: int) -> Float[np.ndarray, " ells"]:
-    """Square roots of C_ell, which add up to this standard deviation in any direction."""
+    """Square roots of C_ell that give this standard deviation in any direction."""
     return std * np.sqrt(unit_spectrum(lmax, 0, -slope))

@@ -30,20 +30,20 @@ from lusee_bayes.systematics.systematic import (
     scalar_or_none,
 )
 
-# how far, in standard deviations of ln, a correlation time that is not known can be off, and by
-# which factor where a program of its own says how it is not known
+# how far an unknown correlation time can be off, in standard deviations of its ln, and by which
+# factor at least, for programs that set it themselves
 CORRELATION_REACH, FACTOR = 3.0, 2.0
 # the mean of four antennas' drifts is then above -1 by ten standard deviations
 STRONGEST = 0.2
-# the sites of the drifts' white noise, and of the two
+# the sites of the drifts' white noise, and of their two scales
 GAIN_NOISE = "gain_noise"
 SCALES = ("gain_sigma", "gain_log_correlation")
-# white noise that makes drifts: three times per correlation time are exact to exp(-9 pi^2 / 2),
-# and beyond six correlation times it enters with exp(-36)
+# white noise of the drifts: three samples per correlation time are exact to exp(-9 pi^2 / 2), and
+# beyond six correlation times its weight is exp(-36)
 PER_CORRELATION, MARGIN = 3.0, 6.0
-# what the scenario's seed is folded with for the scales
+# number folded into the scenario's seed for the scales
 SCALE_DRAW = 6
-# NumPyro's handlers are those of all threads, in which channels and cases are simulated
+# all threads, in which channels and cases are simulated, share NumPyro's handlers
 _HANDLERS = threading.Lock()
 
 
@@ -87,24 +87,24 @@ class GainSection(Section):
 
 
 class GainDrifts(Systematic):
-    """Drifts of every antenna's gain, of known or of uncertain strength and correlation time.
+    """Drifts of every antenna's gain, with known or uncertain strength and correlation time.
 
     Attributes
     ----------
     drift : GainDrift
-        Their standard deviation and correlation time (medians, where uncertain).
+        Their standard deviation and correlation time (medians, if uncertain).
     visibilities : (products, times) array
-        Visibilities that the covariance is built around, in K.
+        Visibilities around which the covariance is built, in K.
     hours : (times,) array
         Sample times in hours.
     grid : (grid,) array
-        Times in hours of the white noise that drifts are made of.
+        Times in hours of the white noise from which drifts are computed.
     layout : DataLayout
         The data.
     width, widest : int
         Of the covariance's band in samples, for ``drift`` and for the longest correlation time.
     log_sigma_std, log_correlation_std : () array, optional
-        Prior standard deviations of the natural logarithms of the two; None where known.
+        Prior standard deviations of the natural logarithms of the two; None if known.
     """
 
     key: ClassVar[str] = "noise.gain"
@@ -134,20 +134,20 @@ class GainDrifts(Systematic):
         log_sigma_std: float | None = None,
         log_correlation_std: float | None = None,
     ) -> GainDrifts:
-        """Work out the grid and the bands that these drifts need.
+        """Compute the grid and the bands that these drifts need.
 
         Parameters
         ----------
         drift : GainDrift
-            Standard deviation and correlation time (medians, where uncertain).
+            Standard deviation and correlation time (medians, if uncertain).
         visibilities : (products, times) array
-            Visibilities that the covariance is built around, in K.
+            Visibilities around which the covariance is built, in K.
         hours : (times,) array
-            Sample times in hours, growing.
+            Sample times in hours, increasing.
         layout : DataLayout
             The data.
         log_sigma_std, log_correlation_std : float, optional
-            Prior standard deviations of the natural logarithms of the two; None where known.
+            Prior standard deviations of the natural logarithms of the two; None if known.
         """
         middle, log_std = float(drift.correlation_h), log_correlation_std
         factor = 1.0 if log_std is None else float(np.exp(CORRELATION_REACH * log_std))
@@ -168,7 +168,7 @@ class GainDrifts(Systematic):
 
     @classmethod
     def truth(cls, section: GainSection, setup: Setup, key: PRNGKeyArray) -> Truth:
-        """The scales, where they are not known; their prior is the program's own."""
+        """The scales: if unknown, drawn from the same prior as in programs."""
         with _HANDLERS, numpyro.handlers.seed(rng_seed=jax.random.fold_in(key, SCALE_DRAW)):
             drift = cls.build(section, setup, Around()).scales()
         return {"gain_sigma": float(drift.sigma), "gain_correlation_h": float(drift.correlation_h)}
@@ -189,8 +189,8 @@ class GainDrifts(Systematic):
     def scales(self) -> GainDrift:
         """Sample the uncertain scales of the drift.
 
-        The sites are ``gain_sigma`` and ``gain_log_correlation``, of which
-        ``gain_correlation_h`` is made.
+        The sites are ``gain_sigma`` and ``gain_log_correlation``, from which
+        ``gain_correlation_h`` is computed.
         """
         sigma, correlation_h = self.drift.sigma, self.drift.correlation_h
         if self.log_sigma_std is not None:
@@ -206,7 +206,7 @@ class GainDrifts(Systematic):
     def histories(self, drift: GainDrift) -> Float[Array, "antennas times"]:
         """Sample g_i(t), (antennas, times).
 
-        They are made of the site ``gain_noise`` (antennas, grid) and kept as ``gains``.
+        They are computed from the site ``gain_noise`` (antennas, grid) and recorded as ``gains``.
 
         Parameters
         ----------
@@ -223,9 +223,9 @@ class GainDrifts(Systematic):
         return self.layout.gather(with_gains(ones, gains))
 
     def chart(self, model: LinearGaussian) -> GainCoordinates | None:
-        """Return coordinates in which what sky, gains and scales can exchange is straight.
+        """Return coordinates in which the degeneracies of sky, gains and scales are straight.
 
-        None for drifts so strong that their mean could be -1, which the coordinates leave out.
+        None for drifts so strong that their mean could be -1, which the coordinates exclude.
         """
         sigma = float(self.drift.sigma)
         log_std = 0.0 if self.log_sigma_std is None else float(self.log_sigma_std)
@@ -247,7 +247,7 @@ class GainDrifts(Systematic):
         model : LinearGaussian
             The model without drifts.
         drift : GainDrift, optional
-            Of other scales than :attr:`drift`, with a correlation time at most twice as long.
+            With other scales than :attr:`drift`, and at most twice its correlation time.
         """
         width = self.width if drift is None else self.widest
         drift = self.drift if drift is None else drift
@@ -255,7 +255,7 @@ class GainDrifts(Systematic):
         return replace(self.averaged(model, drift), noise=model.noise + noise)
 
     def averaged(self, model: LinearGaussian, drift: GainDrift | None = None) -> LinearGaussian:
-        """Multiply by the mean response, of the same parameters."""
+        """Multiply by the mean response; parameters as for :meth:`marginalised`."""
         mean = (drift or self.drift).mean_response(self.layout.n_products)[:, None]
         grid = jnp.broadcast_to(mean, (self.layout.n_products, self.layout.n_times))
         return multiplied(model, self.layout.gather(grid))
@@ -270,19 +270,19 @@ class GainDrifts(Systematic):
 
 
 def gains_about(setup: Setup) -> NoiseAbout:
-    """Which visibilities the covariance of gain drifts is built around."""
+    """Visibilities around which the covariance of gain drifts is built."""
     return setup.scenario.noise.gain.visibilities or "posterior"
 
 
 class GainCoordinates(Chart):
-    """Coordinates that take out of gains and sky what the data do not tell apart.
+    """Coordinates that remove the degeneracy of gains and sky.
 
     (1 + g_i)(1 + g_j) A m stays the same if all 1 + g grow by exp(k) and m shrinks by its square.
-    The data say nothing of k and nearly everything of the other directions, so that the posterior
-    is a thin sheet along k, curved in g and m. With exp(k) - 1 the mean of g, the coordinates are
-    k, exp(-k) (1 + g) and exp(2 k) m, along which it is straight. Likewise where the drifts'
-    strength and correlation time are sites: the gains at the samples, far better known than their
-    scales, stay as they are when those change; what is lost in the noise does not.
+    The data do not constrain k, but tightly constrain the other directions, so that the posterior
+    is a thin sheet along k, curved in g and m. With exp(k) - 1 the mean of g, it is straight in the
+    coordinates k, exp(-k) (1 + g) and exp(2 k) m. Likewise if the drifts' strength and correlation
+    time are sites: the gains at the samples, far better determined than their scales, do not change
+    with these, except for parts lost in the noise.
 
     Attributes
     ----------
@@ -299,7 +299,7 @@ class GainCoordinates(Chart):
     sigma_is_site : bool
         Whether the drifts' standard deviation is a site.
     log_correlation_reach : () array, optional
-        Half the length of the interval of ln correlation time; None if that is no site.
+        Half the length of the interval of ln correlation time; None if it is not a site.
     """
 
     drift: GainDrift
@@ -349,7 +349,7 @@ class GainCoordinates(Chart):
     def _shared(self) -> tuple[Float[Array, "1 grid"], Float[Array, "1 grid"]]:
         """Weights of white noise in the mean gain, and white noise whose gains are all one."""
         mean = self._shape(self.drift).mean(1)[None] / self.n_antennas
-        # the same at all times: then so are the gains, the grid being wide enough
+        # white noise constant in time gives constant gains, since the grid is wide enough
         return mean, jnp.ones_like(mean) / (self.n_antennas * mean.sum())
 
     def _shape(self, drift: GainDrift) -> Float[Array, "grid times"]:
@@ -367,9 +367,9 @@ class GainCoordinates(Chart):
         return self._shape(self.drift), self._shape(GainDrift(sigma, correlation_h))
 
     def _covariances(self, before: Array, after: Array) -> tuple[Array, Array]:
-        """Covariances of the gains afterwards, and with those before; floor added to both.
+        """Covariances of the gains after, and of those before with those after; plus the floor.
 
-        Both are those of Gaussian kernels, so that neither is ever singular.
+        Both have Gaussian kernels, so that neither is ever singular.
         """
         floor = self.floor * jnp.eye(after.shape[1])
         return after.T @ after + floor, before.T @ after + floor

@@ -3,11 +3,11 @@
 With eps_i(t) = sum_e z_e s_e(t) over the errors e of port i, z ~ N(0, 1), the relative error of
 port i's power gain, the data are ::
 
-    d = F(z) v + n,    F_ij = sqrt((1 + eps_i)(1 + eps_j)),    v = A m + all that adds to it,
+    d = F(z) v + n,    F_ij = sqrt((1 + eps_i)(1 + eps_j)),    v = A m + all other signals,
 
-With errors of 1 % what the first order leaves out, 1e-4, is ten times the radiometer noise, unless
-it is about values and a sky that the data determine: then it is the Gaussian about the joint mode
-of all unknowns.
+For errors of 1 %, terms beyond first order (1e-4) are ten times the radiometer noise, unless the
+expansion is about values and a sky that the data determine: then it is the Gaussian about the joint
+mode of all unknowns.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from lusee_bayes.systematics.systematic import Systematic, Unknown, multiplied
 
 # the site of the errors, in prior standard deviations
 GAIN_TABLE = "gain_table"
-# standard deviation of a port's power gain: 1 + eps is then positive by ten of them
+# largest standard deviation of a port's power gain: 1 + eps = 0 is then ten of them away
 LARGEST = 0.1
-# what all errors have in common, in words
+# the common part of all errors, in words
 COMMON_GAIN = "common gain"
 
 
@@ -99,7 +99,7 @@ class GainTable(Systematic):
         return np.sqrt((slope**2).sum(1) / (slope != 0).sum(1))
 
     def like_the_sky(self) -> tuple[tuple[str, ...], Float[np.ndarray, "parts n"]]:
-        """What all have in common: those of single ports and levels look like no sky."""
+        """Their common part: errors of single ports and levels do not look like a sky."""
         return (COMMON_GAIN,), self.common[None]
 
     @property
@@ -109,7 +109,7 @@ class GainTable(Systematic):
         return along / max(float(np.linalg.norm(along)), np.finfo(np.float64).tiny)
 
     def factors(self, z: Float[Array, " errors"]) -> DataVector:
-        """Compute F of every datum, of values in prior standard deviations."""
+        """Compute F of every datum from values in prior standard deviations."""
         n_ports = round(np.sqrt(self.layout.n_products))
         at_port = (np.arange(n_ports)[:, None] == np.array(self.port)[None]).astype(np.float64)
         first, second, _ = ports(n_ports)
@@ -129,8 +129,8 @@ def table_errors(
     Raises
     ------
     InputError
-        If the scenario and the data both say how large they are, or none of them, and for errors
-        of more than 10 %.
+        If both the scenario and the data specify the errors, or neither does, and for errors above
+        10 %.
     """
     std, calibration = setup.scenario.noise.gain_table.std, setup.calibration
     named = calibration is not None and calibration.gain_slope is not None
@@ -140,7 +140,7 @@ def table_errors(
         )
     if not named:
         if std is None and setup.scenario.flight is not None:
-            # what it says of every level of every port: these data have one
+            # it applies to every level of every port: these data have one level
             std = setup.scenario.flight.gain_std
             if std is not None and std > LARGEST:
                 raise InputError(
@@ -156,7 +156,7 @@ def table_errors(
         ports = tuple(range(setup.beam_source.n_ports))
         slope = np.full((len(ports), setup.layout.n_times), std)
         return tuple(f"gain_{port}" for port in ports), ports, slope
-    # of levels that no port has at these times the data say nothing
+    # the data do not constrain levels that no port has at these times
     used = np.flatnonzero(calibration.gain_slope.any(1))
     port, slope = calibration.gain_port[used], calibration.gain_slope[used]
     for number in np.unique(port):

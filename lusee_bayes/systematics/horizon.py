@@ -1,31 +1,30 @@
 """The horizon: terrain that hides the sky below an altitude h, which depends on the azimuth.
 
-Antennas are modelled over flat ground: their beams end at altitude 0. Terrain takes from the
-coefficients of every product what lies below it, ::
+Antennas are modelled over flat ground: their beams end at altitude 0. Terrain removes the part
+below it from the coefficients of every product, ::
 
     delta b_lm = - int dphi int_0^h(phi) dt cos t P(t, phi) y_lm(t, phi),
 
-with the product's pattern P in the units of its beam. Beams keep their scale. What is hidden emits
-like a body of the ground's temperature T: a sky of T everywhere looks the same with and without
-terrain.
+with the product's pattern P in the units of its beam. Beams keep their scale. Terrain emits like a
+body of the ground's temperature T: a sky of T everywhere looks the same with and without terrain.
 
-**Quadrature.** P y_lm is smooth in the altitude t. As the polynomial through Gauss-Legendre nodes
-t_q in a strip that no altitude leaves it is integrated up to any h exactly::
+**Quadrature.** P y_lm is smooth in the altitude t. As a polynomial through Gauss-Legendre nodes t_q
+in a strip that contains all altitudes, it is integrated up to any h exactly::
 
     int_0^h dt f(t) = sum_q W_q(h) f(t_q),    W_q the integral of Lagrange's polynomial of node q,
 
-so that a harmonic transform on the rings t_q makes all coefficients, differentiable in h. Azimuths
-are 1440: steps of h are seen to a quarter of a degree.
+so that a harmonic transform on the rings t_q gives all coefficients, differentiable in h. There are
+1440 azimuths: they resolve steps of h to a quarter of a degree.
 
-**Altitudes below zero** look where the antennas' model has no field. They count as the same strip
-above the horizon does, with the opposite sign: W(-h) = -W(h). That is exact to first order in h,
-and, where patterns vanish at the horizon as h^2 (antennas over ground that is no conductor), to
-third. There the data do not depend on h to first order at h = 0, so that what is not known is to be
-about a known altitude that is not zero everywhere.
+**Altitudes below zero** are outside the antennas' model. They count like the same strip above the
+horizon, with the opposite sign: W(-h) = -W(h). That is exact to first order in h, and to third
+order where patterns vanish at the horizon as h^2 (antennas over non-conducting ground). There the
+data do not depend on h to first order at h = 0, so that the unknowns must be about a known altitude
+that is not zero everywhere.
 
-**Turntable.** Terrain does not turn with the antennas. In their frame it is another one in every
-run: beams are (runs, products, modes) where there is a horizon. That it does not lean with the
-lander is neglected, as is that point sources set behind it.
+**Turntable.** Terrain does not turn with the antennas. In their frame it differs from run to run:
+with a horizon, beams are (runs, products, modes). The model neglects that terrain does not tilt
+with the lander, and that point sources set behind it.
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ TABLE = Layout(
     {name: Variable(("row",), low=low, high=high) for name, (low, high) in COLUMNS.items()},
 )
 AZIMUTHS = 1440
-# how far from what is known of it the altitude may be, in prior standard deviations
+# largest deviation from the known altitude, in prior standard deviations
 REACH = 6.0
 
 
@@ -123,24 +122,24 @@ def _rings(n: int, highest: float) -> HemisphereGrid:
 
 
 class Horizon(ChangedBeams):
-    """The altitude of the terrain: what is known of it, and a Fourier series of unknowns.
+    """The altitude of the terrain: a known part, and a Fourier series of unknowns.
 
-    Coefficients are independent, of standard deviation std / sqrt(1 + harmonics): that of the sum
-    is std in every direction.
+    Coefficients are independent, with the standard deviation std / sqrt(1 + harmonics): the sum has
+    std in every direction.
 
     Attributes
     ----------
     patterns : (products, rings, azimuths) array
-        Of the antennas with the values of other unknowns about which the model is, in the strip
-        above altitude 0 and in 1/sr; azimuths from East towards North in the antennas' frame.
+        Of the antennas, at the expansion point of other unknowns, in the strip above altitude 0, in
+        1/sr; azimuths from East towards North in the antennas' frame.
     azimuth : (runs, azimuths) array
         The same directions from North towards East on the ground, in radians.
     altitudes : (runs, azimuths) array
-        Altitude that is known, in radians.
+        Known altitude, in radians.
     before : (runs, products, modes) array
-        What the modelled beams have of the horizon already; zero for none.
+        The horizon's effect that the modelled beams already include; zero for none.
     highest : float
-        Where the strip ends, in radians; altitudes above are taken for this one.
+        Upper end of the strip, in radians; higher altitudes are clipped to it.
     lmax : int
         Of the beams.
     std_deg : float
@@ -177,7 +176,7 @@ class Horizon(ChangedBeams):
         azimuth = np.pi / 2.0 - ahead - 2.0 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS
         altitude = section.altitude_at(azimuth)
         highest = min(float(altitude.max() + np.radians(REACH * section.std_deg)), np.pi / 2.0)
-        # polynomials that follow the harmonics, lmax radians for each of angle, and the patterns
+        # polynomials that follow the patterns, and the harmonics: lmax radians per radian
         grids = _rings(24 + int(highest * beams.lmax), highest), whole
         sampled = [to_real(source.patterns(beams.frequency_mhz, grid)) for grid in grids]
         patterns, all_round = map(np.asarray, sampled)
@@ -190,9 +189,9 @@ class Horizon(ChangedBeams):
 
     @classmethod
     def moved(cls, section: HorizonSection, setup: Setup, values: Values) -> Setup:
-        """Behind terrain of this altitude: A, what the terrain emits, and the signal.
+        """Add terrain of this altitude: A, the terrain's emission, and the signal.
 
-        Without values it is the known one.
+        Without values, the altitude is the known one.
         """
         names = offset_names(("turntable_deg",), setup.observation.n_runs)
         observation = with_offsets(setup.observation, {n: values[n] for n in names if n in values})
@@ -228,7 +227,7 @@ class Horizon(ChangedBeams):
         return self.altitudes + series[0] + waves @ series[1:]
 
     def hidden(self, values: Values) -> Float[Array, "runs products modes"]:
-        """What terrain of these values does to the beams; differentiable."""
+        """Effect of terrain with these values on the beams; differentiable."""
         altitude, n = self.altitude(values), self.patterns.shape[1]
         xp = namespace(altitude, self.patterns)
         sign = xp.where(altitude < 0.0, -1.0, 1.0)
@@ -236,7 +235,7 @@ class Horizon(ChangedBeams):
         legendre = [xp.ones_like(x), x]
         for k in range(1, n):
             legendre.append(((2 * k + 1) * x * legendre[k] - k * legendre[k - 1]) / (k + 1))
-        # (2 k + 1) times the integral of polynomial k from -1 on
+        # (2 k + 1) times the integral of polynomial k from -1
         integrals = [x + 1.0, *(legendre[k + 1] - legendre[k - 1] for k in range(1, n))]
         nodes, weights = leggauss(n)
         lagrange = legvander(nodes, n - 1) * weights[:, None] * (self.highest / 4.0)
@@ -244,15 +243,15 @@ class Horizon(ChangedBeams):
         return -_rings(n, self.highest).modes(self.patterns[None] * inside[:, None], self.lmax)
 
     def modes(self, modes, values):
-        """Beams behind terrain of these values, in every run."""
+        """Beams behind terrain with these values, in every run."""
         return modes + (self.hidden(values) - self.before)
 
     def effect(self, model, values):
-        """A of these beams; what they lose of a sky of the terrain's temperature, it emits."""
+        """Use A of these beams; terrain emits as the hidden sky would at its temperature."""
         made = super().effect(model, values)
         return with_added(made, model.coupling @ self.uniform - made.coupling @ self.uniform)
 
     def linearised(self, model, centre):
-        """That of :meth:`effect`: of a sky that is so much warmer than the terrain."""
+        """Differentiate :meth:`effect`: only the sky minus the terrain's temperature matters."""
         of_sky = super().linearised(model, centre)
         return lambda sky: of_sky(np.asarray(sky) - self.uniform)

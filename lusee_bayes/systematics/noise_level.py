@@ -1,6 +1,6 @@
-"""The level of the radiometer noise, and which visibilities it is built around.
+"""The level of the radiometer noise, and the visibilities around which it is built.
 
-There is no Gaussian term for a factor of a variance: marginalised, the level stays at one.
+There is no Gaussian term for a factor of a variance: if marginalised, the level stays at one.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from lusee_bayes.core.section import Positive, Section
 from lusee_bayes.systematics.context import Around, NoiseAbout, Setup
 from lusee_bayes.systematics.systematic import Scale, Unknown
 
-# in standard deviations of a common amplitude
+# acceptable bias, in standard deviations of a common amplitude
 HARMLESS_BIAS = 0.1
 
 
@@ -54,7 +54,7 @@ class RadiometerSection(Section):
 
 
 class NoiseLevel(Scale):
-    """A factor of the variance of all noise that the model holds so far.
+    """A factor of the variance of all noise that the model contains so far.
 
     Attributes
     ----------
@@ -86,7 +86,7 @@ class NoiseLevel(Scale):
 
 
 def radiometer_about(setup: Setup) -> NoiseAbout:
-    """Which visibilities set the level of the radiometer noise."""
+    """Visibilities that set the level of the radiometer noise."""
     chosen = setup.scenario.noise.radiometer.temperature
     if chosen is not None or not setup.measured:
         return chosen or "model"

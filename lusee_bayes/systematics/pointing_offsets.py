@@ -1,7 +1,7 @@
-"""Offsets of clock and pointing: A is that of antennas that lean, are turned and look later.
+"""Offsets of clock and pointing: A for antennas that are tilted, turned, and sampled later.
 
-The clock is expanded, too: beyond :attr:`PointingOffsets.expansion_point`, what is left of it is a
-turn of the Moon at a constant rate (:func:`.turned_by_offsets`); all angles are exact.
+The clock is expanded, too: a deviation from :attr:`PointingOffsets.expansion_point` turns the Moon
+at a constant rate (:func:`.turned_by_offsets`). All angles are exact.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.sources import SOURCE_NODES, expected_signal, source_responses
 from lusee_bayes.systematics.systematic import Systematic, Unknown, Values, with_added
 
-# wider priors are none: the sky looks nothing like it did
+# a wider prior is no constraint: the sky would look entirely different
 Offset = Annotated[float, Field(gt=0, le=45), NOT_TINY]
 
 
@@ -84,7 +84,7 @@ class PointingSection(Section):
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """What is not known."""
+        """Kinds of the unknown offsets."""
         return tuple(kind for kind in OFFSETS if getattr(self, kind) is not None)
 
 
@@ -98,9 +98,9 @@ class PointingOffsets(Systematic):
     errors : (offsets,) array
         Prior standard deviations, in the units that the names end with.
     expansion_point : (2,) array
-        What clock and its drift are off by in :attr:`pointing`.
+        Offsets of clock and drift in :attr:`pointing`.
     pointing : Pointing
-        Of a clock that is off, and all else as the observation says.
+        With these offsets, and otherwise as in the observation.
     hours : (times,) array
         Since the first sample.
     mcmf_from_lander : (3, 3) array
@@ -108,7 +108,7 @@ class PointingOffsets(Systematic):
     layout : DataLayout
         The data.
     sources : MovingSources or None
-        The point sources; None where the model has none.
+        The point sources; None if the model has none.
     """
 
     key: ClassVar[str] = "noise.pointing"
@@ -143,7 +143,7 @@ class PointingOffsets(Systematic):
     def of(
         cls, setup: Setup, stds: Mapping[str, float], values: Mapping[str, float]
     ) -> PointingOffsets:
-        """Of a setup that is moved to values, with these prior standard deviations."""
+        """Build it for a setup moved to values, with these prior standard deviations."""
         back = {name: -value for name, value in values.items() if name not in CLOCK}
         observation = with_offsets(setup.observation, back)
         pointing = setup.pointing.placed(observation)
@@ -162,14 +162,14 @@ class PointingOffsets(Systematic):
         )
         if sources is None:
             return offsets
-        # those of the setup are there already
+        # the setup's signal already contains its sources
         orientation = offsets.orientation(dict.fromkeys(stds, 0.0) | dict(values))
         seen = np.asarray(sources.seen(orientation, setup.layout))
         return replace(offsets, sources=replace(sources, in_signal=seen))
 
     @classmethod
     def moved(cls, section: PointingSection, setup: Setup, values: Values) -> Setup:
-        """Seen at other times, from other places: A, the responses to sources, and the signal."""
+        """Change times and places: A, the responses to sources, and the signal."""
         names = offset_names(section.kinds, setup.observation.n_runs)
         offsets = {name: value for name, value in values.items() if name in names}
         return shifted(setup, offsets) if offsets else setup
@@ -179,13 +179,13 @@ class PointingOffsets(Systematic):
         return tuple(map(Unknown, self.offsets, np.zeros(len(self.offsets)), self.errors))
 
     def turned(self, values: Values) -> Pointing:
-        """The pointing of values by name."""
+        """The pointing for values by name."""
         clock = dict(zip(CLOCK, self.expansion_point, strict=True))
         left = {name: values[name] - clock.get(name, 0.0) for name in self.offsets}
         return turned_by_offsets(self.pointing, self.hours, left)
 
     def effect(self, model, values):
-        """A of the offsets; sources with their mean fluxes move with it."""
+        """Use A with the offsets; sources with their mean fluxes move, too."""
         pointing = self.turned(values)
         model = replace(model, coupling=model.coupling.of(pointing=pointing))
         if self.sources is None:
@@ -194,14 +194,14 @@ class PointingOffsets(Systematic):
         return with_added(model, seen - self.sources.in_signal)
 
     def linearised(self, model, centre):
-        """Through the turns of the antennas.
+        """Differentiate the turns of the antennas.
 
         ::
 
             A(z) m = sum_k w_k A_k m to first order,    A_k of the beams K_k b,
 
         with the rotation vector w(t) by which the antennas turn, in their frame, and the generators
-        K_k of turns about its axes. What JAX differentiates, w(z), compiles in no time.
+        K_k of turns about its axes. JAX differentiates only w(z), which compiles quickly.
         """
         pointing = self.turned(self.values(centre))
         orientation, slopes, of_sources = _slopes(*on_device((self, centre)))
@@ -237,7 +237,7 @@ class PointingOffsets(Systematic):
 
 @eqx.filter_jit
 def _slopes(offsets: PointingOffsets, centre: Array) -> tuple[Array, Array, Array | None]:
-    """The orientation, its derivative by the offsets, and that of what sources add."""
+    """The orientation, and its derivative and that of the sources' signal by the offsets."""
 
     def seen(z: Array) -> tuple[Array, Array | None]:
         orientation = offsets.orientation(offsets.values(z))
@@ -260,10 +260,10 @@ def _about(axis: int, angle: float | Array) -> Float[Array, "*batch 3 3"]:
 
 
 class MovingSources(eqx.Module):
-    """Point sources with their mean fluxes, as antennas see them that are turned.
+    """Point sources with their mean fluxes, as seen by turned antennas.
 
-    Between the clock's :attr:`PointingOffsets.expansion_point` and other values, those of the solar
-    system stand still among the stars.
+    Between the clock's :attr:`PointingOffsets.expansion_point` and other values, solar-system
+    bodies stay fixed among the stars.
 
     Attributes
     ----------
@@ -272,7 +272,7 @@ class MovingSources(eqx.Module):
     fluxes : (sources,) array
         In K sr.
     stokes_v : (sources,) array or None
-        V / I; None where all are zero.
+        V / I; None if all are zero.
     sample : (instants,) array
         The sample of each instant.
     weight : (instants,) array
@@ -280,7 +280,7 @@ class MovingSources(eqx.Module):
     monopoles : Monopoles
     frequency_mhz : float
     in_signal : (data,) array or None
-        What of it is part of the data already, in K.
+        Their part of the data that the signal already contains, in K.
     """
 
     directions: Float[Array, "sources instants 3"]
@@ -310,7 +310,7 @@ class MovingSources(eqx.Module):
         )
 
     def seen(self, orientation: Float[Array, "times 3 3"], layout: DataLayout) -> DataVector:
-        """What they add to the data, in K; differentiable but where a source rises or sets."""
+        """Their signal in the data, in K; differentiable except where a source rises or sets."""
         turned = jnp.einsum("sti,tij->stj", self.directions, orientation[self.sample])
         shape = (layout.n_products, *turned.shape[:2])
         inputs = (self.frequency_mhz, turned.reshape(-1, 3), self.monopoles)
@@ -324,7 +324,7 @@ class MovingSources(eqx.Module):
 
 
 def shifted(setup: Setup, values: Mapping[str, float]) -> Setup:
-    """The setup with another observation, and what follows: A, responses to sources, signal."""
+    """The setup with another observation, and its A, responses to sources and signal."""
     given = ", ".join(f"{name} = {value:g}" for name, value in values.items() if value)
     with naming(f"noise.pointing, with {given or 'no offsets'}"):
         observation = with_offsets(setup.observation, values)

@@ -1,31 +1,31 @@
 """Polarised emission of the sky, which the map does not model: circular, and depolarised linear.
 
-Data hold A_V v + A_E e + A_B b besides A m: the coefficients of Stokes V, and those of the E and B
-modes of linear polarisation. They are independent and Gaussian, with isotropic spectra; integrated
-out, N gets U U^T, U = (A_V C_V^(1/2), A_E C_E^(1/2), A_B C_B^(1/2)). Faraday rotation turns E into
-B, so that at these frequencies both have the same power.
+Data contain A_V v + A_E e + A_B b besides A m, with the coefficients of Stokes V, and those of the
+E and B modes of linear polarisation. They are independent and Gaussian, with isotropic spectra;
+integrating them out adds U U^T to N, U = (A_V C_V^(1/2), A_E C_E^(1/2), A_B C_B^(1/2)). Faraday
+rotation turns E into B, so that at these frequencies both have the same power.
 
 **Linear polarisation.** Q and U refer to the directions of increasing theta and phi, in the frame
 of the antennas as in :func:`.stokes_pairs`: Q is positive along theta, U half way from theta to
-phi. These are healpy's (the IAU's U has the other sign, since its angles count from North towards
-East). A sky of modes is ::
+phi. This is healpy's convention (the IAU's U has the other sign, since its angles count from North
+towards East). The modes give the sky ::
 
     Q + i U = -sum_lm (E_lm + i B_lm) N_l D y_lm,    N_l = sqrt((l - 2)! / (l + 2)!),
     D = sin(theta) (d_theta + i d_phi / sin(theta)) (1 / sin(theta)) (d_theta + i d_phi /
         sin(theta)),
 
-D the spin-raising operator applied twice, y the real harmonics of :mod:`.core.harmonics`. With y =
-lambda(theta) f(phi) the real part of -N D y is W f, the imaginary one X df/dphi, and with
-Legendre's equation ::
+where D is the spin-raising operator applied twice, and y are the real harmonics of
+:mod:`.core.harmonics`. With y = lambda(theta) f(phi), the real part of -N D y is W f, the imaginary
+one X df/dphi. With Legendre's equation, ::
 
     W = N [2 cot lambda' + (l (l + 1) - 2 m^2 / sin^2) lambda],    X = -2 N (lambda' - cot lambda)
                                                                        / sin.
 
 A product with patterns P_Q and P_U then has the beam e_lm = int P_Q W f + P_U X f' for E, and
 b_lm = int P_U W f - P_Q X f' for B. E and B turn with the sky as scalars do, so that A_E and A_B
-are made of e and b as A is of the beams of Stokes I. The test is a sum over pixels of
-``healpy.alm2map_spin``'s Q and U. A wrong sign of U would go unseen in U U^T, since it swaps the
-sign of B alone, which has no correlation with E.
+follow from e and b as A does from the beams of Stokes I. The test is a sum over pixels of
+``healpy.alm2map_spin``'s Q and U. U U^T would not reveal a wrong sign of U, which only swaps the
+sign of B, and B is not correlated with E.
 
 References
 ----------
@@ -91,9 +91,9 @@ class PolarisationSection(Section):
 class Polarisation(LowRankNoise):
     """Stokes V, E and B modes of the sky, as noise of their angular power spectra.
 
-    It is seen by the setup's antennas, where its observation points them. Files of beams that are
-    interpolated linearly between frequencies have products, not fields: these are then taken from
-    the interpolated fields, with the scale of the beams.
+    The setup's antennas see it, as its observation points them. Beam files that are interpolated
+    linearly between frequencies have products, not fields: the polarised products then come from
+    interpolated fields, with the scale of the beams.
     """
 
     key: ClassVar[str] = "noise.polarisation"
@@ -130,7 +130,7 @@ class Polarisation(LowRankNoise):
 
 
 def unit_spectrum(lmax: int, lowest: int, slope: float) -> Float[np.ndarray, " ells"]:
-    """C_ell for ell = 0..lmax that go as (ell + 1)^slope, of a field whose rms is one.
+    """C_ell for ell = 0..lmax that scale as (ell + 1)^slope, for a field whose rms is one.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""The sky's prior spectrum, where it is known up to an amplitude and a tilt, or a factor a band.
+"""The sky's prior spectrum, known up to an amplitude and a tilt, or up to a factor per band.
 
-There is no Gaussian term for them: marginalised, they stay at their medians. Nothing of it is in
-the data.
+There is no Gaussian term for them: if marginalised, they stay at their medians. Simulated data do
+not depend on them.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class SpectrumSection(Section):
 
     @property
     def samples(self) -> bool:
-        """Whether something of the prior is to be sampled."""
+        """Whether a parameter of the prior is to be sampled."""
         fixed = self.log_amplitude_std is None and self.tilt_std is None
         return not fixed or bool(self.band_edges)
 
@@ -74,7 +74,7 @@ class PriorSpectrum(Scale):
     tilt_std : () array, optional
         Prior standard deviation of the tilt; None if it is known.
     edges : tuple of int
-        First ell of every band but the lowest, growing; none for no bands.
+        First ell of every band except the lowest, increasing; empty for no bands.
     log_band_std : () array
         Prior standard deviation of the natural logarithm of each band's factor.
     """

@@ -1,7 +1,7 @@
 """Noise of the receivers: every port's own power, constant in time, in that port's auto.
 
-The mean power is part of the background, and so of the radiometer noise; what is unknown is by how
-much each port's power differs from it.
+The mean power is part of the background, and so of the radiometer noise; the unknowns are each
+port's deviations from it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lusee_bayes.instrument.products import auto_indices
 from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.systematic import Temperatures, Truth
 
-# cosines and sines of which a smooth spectrum is made
+# number of cosines and sines in a smooth spectrum
 N_WAVES = 512
 
 
@@ -66,7 +66,7 @@ class ReceiverNoiseSection(Section):
         Raises
         ------
         InputError
-            If it is given in V^2/Hz, and the beams know no volts.
+            If it is given in V^2/Hz, and the beams are not calibrated in volts.
         """
         rise = (frequency_mhz / self.reference_mhz) ** self.slope
         if self.power_k is not None:
@@ -110,7 +110,7 @@ class Receivers(Temperatures):
 
 
 def _smooth_spectra(key: PRNGKeyArray, n_ports: int, x: float) -> Float[np.ndarray, " ports"]:
-    """Values at x of functions of covariance exp(-(x - x')^2 / 2), one for each port.
+    """Values at x of functions with covariance exp(-(x - x')^2 / 2), one for each port.
 
     ::
 

@@ -1,6 +1,6 @@
 """The systematics that a scenario may have, and its section ``noise``, which follows from them.
 
-A new one is a file beside this one, and its line here.
+To add one, add a file beside this one, and a line here.
 """
 
 from __future__ import annotations

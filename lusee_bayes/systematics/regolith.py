@@ -54,7 +54,7 @@ def ground_per_kelvin(source: BeamSource, frequency_mhz: float) -> Float[Array, 
     Raises
     ------
     InputError
-        If the beams do not say what the ground emits.
+        If the beams do not specify the ground's emission.
     """
     if not hasattr(source, "moon_k"):
         raise InputError(

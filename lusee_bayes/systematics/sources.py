@@ -1,4 +1,4 @@
-"""Point sources of known place and unknown flux, that are not part of the map.
+"""Point sources with known positions and unknown fluxes, which are not part of the map.
 
 A source of x K sr adds x times the response to it. Fluxes have independent Gaussian priors; a
 source may have one for each block of time.
@@ -28,8 +28,8 @@ from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.systematic import Systematic, Truth, Unknown, with_added
 
 CATALOGUE = {source.name: source for source in BRIGHT_SOURCES}
-# instants in each piece of a window for the response to a source: antennas see nothing smaller
-# than some degrees, and nothing at the horizon, where a source appears within a window
+# instants in each piece of a window for the response to a source: antennas resolve nothing smaller
+# than some degrees, and see nothing at the horizon, where a source appears within a window
 SOURCE_NODES = 8
 
 
@@ -68,7 +68,7 @@ class SourceSection(Section):
     )
 
     def mean_flux(self, frequency_mhz: float) -> float:
-        """Mean of the prior of its flux, in K sr. InputError if nothing is known about it."""
+        """Prior mean of its flux, in K sr; InputError if the flux is unknown."""
         if self.flux_jy is not None:
             return float(kelvin_steradian(self.flux_jy, frequency_mhz))
         if self.name in CATALOGUE:
@@ -79,7 +79,7 @@ class SourceSection(Section):
         )
 
     def direction(self, observation: Observation) -> Float[np.ndarray, "..."]:
-        """Galactic unit vector(s): its own, the catalogue's, or the ephemeris'."""
+        """Galactic unit vector(s): from its coordinates, the catalogue, or the ephemeris."""
         if self.ra_deg is not None:
             return galactic_unit_vector(self.ra_deg, self.dec_deg)
         if self.name in BODIES:
@@ -93,7 +93,7 @@ class SourceSection(Section):
         return galactic_unit_vector(source.ra_deg, source.dec_deg)
 
     def blocks(self, observation: Observation) -> Int[np.ndarray, " times"]:
-        """Which of its amplitudes belongs to each time."""
+        """Number of the amplitude that belongs to each time."""
         if self.block_h is None:
             return np.zeros(observation.n_times, dtype=int)
         hours = observation.hours / self.block_h
@@ -139,7 +139,7 @@ class Source(eqx.Module):
     Raises
     ------
     InputError
-        If the response is not finite or no matrix, or if ``std`` is not positive.
+        If the response is not finite or not a matrix, or if ``std`` is not positive.
     """
 
     columns: Float[Array, "data blocks"]
@@ -164,15 +164,15 @@ class Source(eqx.Module):
         return Unknown(f"flux_{self.name.replace(' ', '_')}", self.mean, self.std, size)
 
     def seen(self) -> np.ndarray:
-        """Tell for each block whether the source is ever above the horizon: (blocks,) booleans.
+        """Whether the source is ever above the horizon in each block: (blocks,) booleans.
 
-        If not, only the prior says how bright it is.
+        If not, only the prior constrains its flux.
         """
         return np.abs(np.asarray(self.columns)).max(0) > 0
 
 
 class PointSources(Systematic):
-    """Sources with independent Gaussian priors of their fluxes.
+    """Sources with independent Gaussian priors for their fluxes.
 
     The map is then the sky without them.
 
@@ -230,7 +230,7 @@ class PointSources(Systematic):
         return namespace(*columns).concatenate(columns, axis=1)
 
     def effect(self, model, values):
-        """Add every source, each block of it with its flux in K sr."""
+        """Add every source, with the flux of each block in K sr."""
         return with_added(model, self.columns() @ self.stacked(values))
 
 
@@ -244,7 +244,7 @@ def source_responses(
 
     Sources need the exact pattern, which only the embedded antennas have.
 
-    Their means over the windows, by instants: a source may rise and set within one.
+    Responses are means over instants of each window, in which a source may rise and set.
     """
     if not sources:
         return ()

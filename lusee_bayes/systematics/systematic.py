@@ -1,33 +1,32 @@
-"""What is not known of instrument and sky: one function of its values, marginalised or sampled.
+"""Unknowns of instrument and sky: one function of their values, marginalised or sampled.
 
 A systematic has unknowns with priors, and an effect: the model d = A m + n given their values, as a
-function that JAX can differentiate. Sampled, the unknowns are sites of a NumPyro program, and the
-model is the function of them. Marginalised, the function is taken to first order about values z_0
-of all unknowns (in prior standard deviations) and a sky m_0, ::
+function that JAX can differentiate. If sampled, the unknowns are sites of a NumPyro program, and
+the model is this function of them. If marginalised, the function is expanded to first order about
+values z_0 of all unknowns (in prior standard deviations) and a sky m_0, ::
 
     d = v(m, z) + n = v(m, z_0) + T (z - z_0) + n,    T = dv/dz at (m_0, z_0),    z ~ N(0, 1),
 
-so that N gets T T^T, a column of T for each unknown, and the data the mean -T z_0. Gains that come
-later multiply T, too. Where z_0 and m_0 are those that the data
-determine, found in rounds, this is the Gaussian about the joint mode of sky and unknowns (Gauss and
-Newton), with the term that couples z - z_0 and m - m_0 left out.
+so that N gains T T^T, with a column of T for each unknown, and the data the mean -T z_0. Later
+gains multiply T, too. If the data determine z_0 and m_0 in rounds, this is the Gaussian about the
+joint mode of sky and unknowns (Gauss-Newton), without the term that couples z - z_0 and m - m_0.
 
-That mode is not where the bulk is: a larger gain and a smaller sky fit as well, and of n modes that
-the data determine, each gains by being smaller. With the sky integrated out, ln p(d | z) has the
-volume -ln|Lambda| / 2 besides the misfit, whose slope (Fisher's identity) is ::
+That mode is away from the bulk of the posterior: a larger gain with a smaller sky fits as well, and
+each of the n modes that the data determine gains by being smaller. With the sky integrated out,
+ln p(d | z) contains the volume -ln|Lambda| / 2 besides the misfit. The volume has the slope
+(Fisher's identity) ::
 
     g = -tr(C A^T N^-1 dA/dz) = -E[T(s)^T w],    s = C A^T w,    w ~ N(0, N^-1),
 
-with T(s) the columns of a sky s. It is that of a prior mean of g in place of 0, with which rounds
-lead to the mode of p(z | d). Skies s are what maps make of noise alone: they hold what is known
-well, and a few of them give g to sqrt(2 n / draws) of the relative change of what one unknown does
-to a datum. (Draws of N(0, C) would not: an unknown that moves a mode that is not known to where
-data are seen makes them scatter without end.)
+with the columns T(s) for a sky s. A prior mean of g in place of 0 has the same slope: with it,
+rounds converge to the mode of p(z | d). Skies s are maps of noise alone: they contain the well
+determined modes, and a few of them give g to sqrt(2 n / draws) of the relative change of a datum by
+one unknown. (Draws of N(0, C) would not: if an unknown moves an undetermined mode into view of the
+data, they scatter without bound.)
 
-Some are marginalised otherwise, by a method :meth:`Systematic.marginalised` of their own: unknowns
-that are many and Gaussian have a covariance of their own (gain drifts, :class:`AdditiveNoise`),
-errors of beams one that is averaged over the skies of the prior, and scales (:class:`Scale`) have
-no Gaussian term at all.
+Some classes override :meth:`Systematic.marginalised`: many Gaussian unknowns have a separate
+covariance (gain drifts, :class:`AdditiveNoise`), errors of beams a covariance averaged over the
+skies of the prior, and scales (:class:`Scale`) have no Gaussian term at all.
 """
 
 from __future__ import annotations
@@ -65,11 +64,11 @@ from lusee_bayes.systematics.context import Around, Setup
 
 # where programs sample the sky
 SKY = "sky"
-# with more unknowns than this beside an integrated sky, no exact Hessian says how to sample them:
-# finding it takes two gradients of the evidence for each
+# with more unknowns than this beside an integrated sky, no exact Hessian guides their sampling:
+# computing it takes two gradients of the evidence for each
 MOST_COLLAPSED = 64
 
-# true values of what simulated data hold, by the names of their sites
+# true values in simulated data, by the names of their sites
 Truth = dict[str, float | np.ndarray]
 # the derivative T of the data, (data, n), for a sky
 Slopes = Callable[[Modes], Float[Array, "data n"]]
@@ -81,7 +80,7 @@ class Chart(eqx.Module):
     """One-to-one coordinates of several sites in which a posterior's ridges are straight.
 
     Values are unconstrained (numpyro's ``biject_to``). Sites that are not among :attr:`names` are
-    handed on as they are.
+    passed on unchanged.
 
     Attributes
     ----------
@@ -120,7 +119,7 @@ class Chart(eqx.Module):
 
 @dataclass(frozen=True)
 class Unknown:
-    """A number that is not known, or several alike: a site of programs.
+    """An unknown number, or several of the same kind: a site of programs.
 
     Attributes
     ----------
@@ -129,7 +128,7 @@ class Unknown:
     mean, std : float
         Of the Gaussian prior of each.
     size : int or None
-        How many there are; None for a number.
+        Number of unknowns; None for a scalar.
     log : bool
         The logarithm is Gaussian: ``mean`` is the median, ``std`` that of the natural logarithm.
     low, high : float
@@ -145,13 +144,13 @@ class Unknown:
     high: float = np.inf
 
     def prior(self) -> dist.Distribution:
-        """Return the prior, of all of them.
+        """Return the prior of all its numbers.
 
         Raises
         ------
         InputError
-            If 0.25 % or more of the Gaussian lies outside the domain: the prior then allows what
-            cannot be.
+            If more than 0.25 % of the Gaussian lies outside the domain: the prior then allows
+            impossible values.
         """
         mean, std, low, high = self.mean, self.std, self.low, self.high
         if np.isinf(low) and np.isinf(high):
@@ -172,17 +171,17 @@ class Unknown:
         return dist.TruncatedNormal(mean, std, **ends)
 
     def at(self, z: float | Float[Array, "..."]) -> float | Float[Array, "..."]:
-        """Compute values of numbers in prior standard deviations from the prior mean."""
+        """Compute values from numbers in prior standard deviations from the prior mean."""
         if self.log:
             return self.mean * namespace(z).exp(self.std * z)
         return self.mean + self.std * z
 
 
 class Systematic(eqx.Module):
-    """Something about the instrument or the sky that is not known.
+    """Something unknown about the instrument or the sky.
 
-    A subclass has :attr:`unknowns` and :meth:`effect`. For a scenario it has a section, its key and
-    :meth:`build`, too, and a line in :mod:`.systematics.registered`.
+    A subclass has :attr:`unknowns` and :meth:`effect`. For use in a scenario, it also has a
+    section, its key, :meth:`build`, and a line in :mod:`.systematics.registered`.
 
     Attributes
     ----------
@@ -191,27 +190,27 @@ class Systematic(eqx.Module):
     section : type
         The schema of that section.
     words : str
-        What it is called in messages.
+        Its name in messages.
     unit : str
-        Of all unknowns; empty for numbers, and where their names tell it.
+        Of all unknowns; empty for pure numbers, or if their names contain it.
     draw : int or None
-        What the seed of simulated data is folded with; by default a number of the key.
+        Number folded into the seed of simulated data; by default one derived from the key.
     needs_sky : bool
-        Whether the sky has to be sampled together with it, however many unknowns it has.
+        Whether the sky must be sampled with it, regardless of its number of unknowns.
     changes_coupling : bool
-        Whether A depends on it: if not, A is made dense once and for all.
+        Whether A depends on it: if not, A is made dense once.
     first_order : bool
-        Whether :meth:`marginalised` takes the effect to first order.
+        Whether :meth:`marginalised` expands the effect to first order.
     moves : bool
-        Whether that is about values and a sky that the data determine, found in rounds.
+        Whether it expands about values and a sky that the data determine in rounds.
     moves_setup : bool
-        Whether :meth:`moved` has all that its true values do to simulated data.
+        Whether :meth:`moved` includes all effects of its true values on simulated data.
     scales_sky : bool
         Whether its effect is a factor of all visibilities.
     has_table : bool
-        Whether reports have a table of its unknowns alone.
+        Whether reports have a separate table of its unknowns.
     learns : bool
-        Whether what its prior depends on is learned in rounds (:meth:`relearned`).
+        Whether a parameter of its prior is learned in rounds (:meth:`relearned`).
     """
 
     key: ClassVar[str] = ""
@@ -232,7 +231,7 @@ class Systematic(eqx.Module):
 
     @classmethod
     def treatment(cls, scenario: Any) -> str | None:
-        """What a scenario does about it; None if it has nothing of it."""
+        """Its treatment in a scenario; None if the scenario does not have it."""
         section = attrgetter(cls.key)(scenario)
         return None if section is None else section.treatment
 
@@ -245,15 +244,15 @@ class Systematic(eqx.Module):
         section : Section
             Of the type :attr:`section`.
         setup : Setup
-            Where :attr:`Around.values` move others, with these.
+            With the values of other unknowns in :attr:`Around.values`.
         around : Around
-            What it may be built around.
+            The data, sky and values around which it may be built.
         """
         raise NotImplementedError(f"{cls.__name__} has no scenario's section")
 
     @classmethod
     def moved(cls, section: Any, setup: Setup, values: Values) -> Setup:
-        """The setup with an instrument that has these values; by default no other."""
+        """The setup with an instrument that has these values; by default unchanged."""
         return setup
 
     @classmethod
@@ -263,21 +262,21 @@ class Systematic(eqx.Module):
 
     @classmethod
     def octaves(cls, section: Any) -> float:
-        """Over how many octaves of frequency its unknowns keep their values.
+        """Number of octaves of frequency over which its unknowns keep their values.
 
-        Zero where every channel has its own, infinity where all channels share one value.
+        Zero if every channel has its own, infinity if all channels share one value.
         """
         return 0.0
 
     @classmethod
     def true_seed(cls, section: Any, scenario: Any) -> int:
-        """Seed of the true values in simulated data, the instrument's where channels share them."""
+        """Seed of the true values in simulated data, the instrument's if channels share them."""
         shared = scenario.instrument_seed if cls.octaves(section) else None
         return scenario.seed if shared is None else shared
 
     @classmethod
     def truth(cls, section: Any, setup: Setup, key: PRNGKeyArray) -> Truth:
-        """Draw the true values in simulated data from their priors, but for those that it says.
+        """Draw the true values in simulated data from their priors, except for given ones.
 
         Parameters
         ----------
@@ -311,7 +310,7 @@ class Systematic(eqx.Module):
     ) -> LinearGaussian:
         """The model with the true values of simulated data.
 
-        It is the same where :attr:`moves_setup`: its A is that of the true values.
+        It is unchanged if :attr:`moves_setup`: its A already has the true values.
 
         Parameters
         ----------
@@ -323,7 +322,7 @@ class Systematic(eqx.Module):
         truth : dict
             True values of all systematics.
         key : PRNG key
-            Of the scenario's seed, for what else is drawn.
+            Of the scenario's seed, for all other draws.
         """
         if cls.moves_setup:
             return model
@@ -339,7 +338,7 @@ class Systematic(eqx.Module):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of all numbers that are not known."""
+        """Names of all unknown numbers."""
         return tuple(
             name
             for u in self.unknowns
@@ -348,7 +347,7 @@ class Systematic(eqx.Module):
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """The same in words."""
+        """Names in words."""
         return tuple(name.replace("_", " ") for name in self.names)
 
     @property
@@ -362,7 +361,7 @@ class Systematic(eqx.Module):
         return np.concatenate([np.full(u.size or 1, float(u.std)) for u in self.unknowns])
 
     def values(self, z: Float[Array, " n"]) -> dict[str, float | Float[Array, "..."]]:
-        """Values by site, of numbers in prior standard deviations from the prior mean."""
+        """Values by site, from numbers in prior standard deviations from the prior mean."""
         by_site, first = {}, 0
         for u in self.unknowns:
             numbers = z[first] if u.size is None else z[first : first + u.size]
@@ -376,24 +375,24 @@ class Systematic(eqx.Module):
         return xp.concatenate([xp.atleast_1d(xp.asarray(values[u.name])) for u in self.unknowns])
 
     def in_units(self, z: Float[np.ndarray, " n"]) -> dict[str, float]:
-        """Values by name, of numbers in prior standard deviations from the prior mean."""
+        """Values by name, from numbers in prior standard deviations from the prior mean."""
         return dict(zip(self.names, (self.means + self.stds * z).tolist(), strict=True))
 
     def centre(self, values: Mapping[str, float]) -> Vector:
-        """Numbers in prior standard deviations from the prior mean, of values by name.
+        """Numbers in prior standard deviations from the prior mean, from values by name.
 
-        What has no value is at its mean.
+        A number without a value is at its mean.
         """
         pairs = zip(self.names, self.means, strict=True)
         return np.array([values.get(name, mean) - mean for name, mean in pairs]) / self.stds
 
     def true(self, truth: Truth) -> dict[str, float]:
-        """True values by name, of those by site."""
+        """True values by name, from true values by site."""
         z = {u.name: (np.asarray(truth[u.name]) - u.mean) / u.std for u in self.unknowns}
         return self.in_units(self.stacked(z))
 
     def like_the_sky(self) -> tuple[tuple[str, ...], Float[np.ndarray, "parts n"]]:
-        """What of it may look like a uniform sky: in words, and as unit vectors of its unknowns."""
+        """Parts of it that may look like a uniform sky: words, and unit vectors of its unknowns."""
         return self.labels, np.eye(len(self.names))
 
     # --- its effect ---
@@ -416,19 +415,19 @@ class Systematic(eqx.Module):
         Parameters
         ----------
         model : LinearGaussian
-            With what comes before it.
+            With all systematics before it.
         centre : (n,) array
-            About which, in prior standard deviations.
+            Expansion point, in prior standard deviations.
 
         Returns
         -------
         callable
-            Of a (modes,) sky in K, which gives the (data, n) array T, in K.
+            Computes the (data, n) array T, in K, for a (modes,) sky in K.
         """
 
         def columns(sky: Modes) -> Float[Array, "data n"]:
             coupling, prior, unit = model.coupling, model.prior, np.ones(1)
-            if not self.changes_coupling:  # how much of this sky there is
+            if not self.changes_coupling:  # one mode: the strength of this sky
                 coupling, prior = DenseCoupling((coupling @ sky)[:, None]), IndependentPrior(unit)
                 sky = unit
             noise = DiagonalCovariance(np.ones(model.n_data))
@@ -440,7 +439,7 @@ class Systematic(eqx.Module):
     def beyond_first_order(
         self, model: LinearGaussian, sky: Modes, z: Vector
     ) -> dict[str, DataVector]:
-        """What each unknown does to the data beyond first order, in K, by name.
+        """Effect of each unknown on the data beyond first order, in K, by name.
 
         Parameters
         ----------
@@ -449,7 +448,7 @@ class Systematic(eqx.Module):
         sky : (modes,) array
             In K.
         z : (n,) array
-            How far each is off on either side, in prior standard deviations.
+            Deviation of each to either side, in prior standard deviations.
         """
 
         def seen(way: Vector) -> DataVector:
@@ -459,7 +458,7 @@ class Systematic(eqx.Module):
         return {name: (seen(way) + seen(-way)) / 2.0 - middle for name, way in ways}
 
     def relearned(self, mean: Vector, variance: Vector) -> dict[str, float]:
-        """Learn what its prior depends on from the posterior of its unknowns, by name.
+        """Learn parameters of its prior from the posterior of its unknowns, by name.
 
         Parameters
         ----------
@@ -469,7 +468,7 @@ class Systematic(eqx.Module):
         return {}
 
     def behind(self, gains: DataVector) -> Systematic:
-        """The same where gains that come later multiply its term of N; by default it is as it is.
+        """The same with its term of N multiplied by later gains; by default unchanged.
 
         Parameters
         ----------
@@ -483,7 +482,7 @@ class Systematic(eqx.Module):
         Parameters
         ----------
         model : LinearGaussian
-            What :meth:`sampled` is applied to.
+            To which :meth:`sampled` is applied.
 
         Returns
         -------
@@ -495,8 +494,8 @@ class Systematic(eqx.Module):
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Integrate it out of the model, as a term of N (and of the mean).
 
-        Here it is to first order about the prior means of the unknowns and of the sky, and nothing
-        comes after it; :class:`Expanded` is about any.
+        Here it is to first order about the prior means of the unknowns and of the sky, without
+        later systematics; :class:`Expanded` is about any values.
 
         Parameters
         ----------
@@ -512,7 +511,7 @@ class Systematic(eqx.Module):
         return Expanded.at(self, model, around).marginalised(model)
 
     def averaged(self, model: LinearGaussian) -> LinearGaussian:
-        """The same but for N, which stays as it is."""
+        """The same, except that N does not change."""
         return replace(self.marginalised(model), noise=model.noise)
 
     def sampled(self, model: LinearGaussian) -> LinearGaussian:
@@ -534,7 +533,7 @@ class Systematic(eqx.Module):
 
 
 class Marginalised(eqx.Module):
-    """A systematic as N holds it; among sampled ones it keeps its place, but has no site.
+    """A systematic as part of N; among sampled ones it keeps its place, but has no site.
 
     Attributes
     ----------
@@ -562,34 +561,34 @@ class Marginalised(eqx.Module):
 
 
 class InPlace(Marginalised):
-    """A systematic at its place among sampled ones, in a model whose N holds it already.
+    """A systematic at its place among sampled ones, in a model whose N contains it already.
 
     Attributes
     ----------
     held : Marginalised
-        As N holds it.
+        As part of N.
     """
 
     held: Marginalised
 
     def sampled(self, model: LinearGaussian) -> LinearGaussian:
-        """What it does besides."""
+        """Apply its effects except the term of N."""
         return replace(self.held.marginalised(model), noise=model.noise)
 
 
 class Expanded(Marginalised):
-    """A systematic to first order about values, as N holds it.
+    """A systematic to first order about values, as part of N.
 
     Attributes
     ----------
     centre : (n,) array
         z_0, in prior standard deviations.
     columns : (data, n) array
-        T: what one prior standard deviation of each unknown does to the data, in K.
+        T: the effect of one prior standard deviation of each unknown on the data, in K.
     expected : (n,) array
-        What the prior mean is taken for, in prior standard deviations.
+        Shifted prior mean, in prior standard deviations.
     shift : (data,) array
-        T (expected - z_0), before the gains that come later.
+        T (expected - z_0), before later gains.
     """
 
     centre: Float[Array, " n"]
@@ -611,17 +610,17 @@ class Expanded(Marginalised):
         ----------
         systematic : Systematic
         model : LinearGaussian
-            With all that comes before it, at its values.
+            With all systematics before it, at their values.
         around : Around
-            The sky m_0, and values of the unknowns by name; what is left out is at its prior mean.
+            The sky m_0, and values of the unknowns by name; others are at their prior means.
         gains : (data,) array, optional
-            That come later.
+            Later gains.
         """
         centre = systematic.centre(around.values or {})
         slopes = systematic.linearised(model, centre)
         later, expected = 1.0 if gains is None else gains, np.zeros(len(centre))
         if systematic.moves and around.volume is not None:
-            still = slopes(np.zeros(model.prior.size))  # of what is no sky
+            still = slopes(np.zeros(model.prior.size))  # of all but the sky
             for deviation, weighted in zip(*around.volume, strict=True):
                 pull = later * weighted / len(around.volume[0])
                 expected -= slopes(deviation).T @ pull - still.T @ pull
@@ -636,7 +635,7 @@ class Expanded(Marginalised):
         return self.systematic.effect(model, self.systematic.values(self.centre))
 
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
-        """Take the effect at z_0, add T T^T to N and T (expected - z_0) to the mean."""
+        """Apply the effect at z_0, add T T^T to N and T (expected - z_0) to the mean."""
         noise = model.noise + LowRankCovariance(self.columns, self.systematic.words)
         return with_added(replace(self.seen(model), noise=noise), self.shift)
 
@@ -646,7 +645,7 @@ def _columns(systematic, model, sky, centre):
     return jax.jacfwd(lambda z: systematic.effect(model, systematic.values(z)).predict(sky))(centre)
 
 
-# step of a derivative, in prior standard deviations: exact to 1e-8 / 6 of the third one
+# step of a derivative, in prior standard deviations: exact to 1e-8 / 6 times the third derivative
 STEP = 1e-4
 
 
@@ -657,7 +656,7 @@ class ChangedBeams(Systematic):
 
     @abstractmethod
     def modes(self, modes: BeamModes, values: Values) -> BeamModes:
-        """Beams in the frame of the lander with values of the unknowns, of those without them."""
+        """Beams in the frame of the lander with values of the unknowns, from beams without them."""
 
     def slopes(self, modes: BeamModes, centre: Vector) -> Iterator[BeamModes]:
         """Derivatives of :meth:`modes` by the unknowns in prior standard deviations, one by one."""
@@ -666,18 +665,18 @@ class ChangedBeams(Systematic):
     def differences(
         self, made: Callable[[Values], Array], centre: Vector
     ) -> Iterator[Float[np.ndarray, "..."]]:
-        """Derivatives of what is made of values likewise."""
+        """Derivatives of any function of the values, likewise."""
         for step in STEP * np.eye(len(centre)):
             up, down = (np.asarray(made(self.values(centre + way))) for way in (step, -step))
             yield (up - down) / (2.0 * STEP)
 
     def effect(self, model, values):
-        """A of these beams."""
+        """Use A of these beams."""
         coupling = model.coupling
         return replace(model, coupling=coupling.of(modes=self.modes(coupling.modes, values)))
 
     def linearised(self, model, centre):
-        """Through the beams."""
+        """Differentiate the beams."""
         slopes = self.slopes(np.asarray(model.coupling.modes), centre)
         see, layout, response = model.coupling.along(slopes), model.coupling.layout, 1.0
         if model.coupling.response is not None:
@@ -686,7 +685,7 @@ class ChangedBeams(Systematic):
 
 
 class AdditiveNoise(Systematic):
-    """Gaussian noise with a covariance of its own, added to the data.
+    """Gaussian noise with a separate covariance, added to the data.
 
     A new kind is a subclass with one method, :meth:`covariance`.
 
@@ -713,7 +712,7 @@ class AdditiveNoise(Systematic):
         return (Unknown(f"{self.name}_noise", size=self.covariance().rank),)
 
     def effect(self, model, values):
-        """Add the noise that (rank,) unit normals make."""
+        """Add the noise that (rank,) unit normals give."""
         return with_added(model, self.covariance().colour(values[f"{self.name}_noise"]))
 
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
@@ -740,7 +739,7 @@ class LowRankNoise(AdditiveNoise):
 
 
 class Temperatures(Systematic):
-    """Temperatures of what adds to the data, whatever the sky; independent Gaussian priors.
+    """Temperatures whose emission adds to the data of any sky; independent Gaussian priors.
 
     Their means are part of the background.
 
@@ -751,7 +750,7 @@ class Temperatures(Systematic):
     expectation, errors : (n,) array
         Means and standard deviations of the priors, in K.
     per_kelvin : (data, n) array
-        What each kelvin adds to the data.
+        Contribution of each kelvin to the data.
     """
 
     unit: ClassVar[str] = "K"
@@ -771,7 +770,7 @@ class Temperatures(Systematic):
         return tuple(name.removesuffix("_k").replace("_", " ") for name in self.sites)
 
     def effect(self, model, values):
-        """Add what they differ from their means by."""
+        """Add the emission of their deviations from the means."""
         return with_added(model, self.per_kelvin @ (self.stacked(values) - self.expectation))
 
 
@@ -782,12 +781,12 @@ class Scale(Systematic):
     first_order: ClassVar[bool] = False
 
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
-        """Return the model as it is."""
+        """Return the model unchanged."""
         return model
 
 
 def present(systematics: Sequence[type[Systematic]], scenario: Any) -> list[tuple[type, Any]]:
-    """Those of which a scenario has something, with their sections."""
+    """The systematics that a scenario has, with their sections."""
     classes = [cls for cls in systematics if cls.treatment(scenario) is not None]
     return [(cls, attrgetter(cls.key)(scenario)) for cls in classes]
 
@@ -804,7 +803,7 @@ def with_added(model: LinearGaussian, signal: DataVector) -> LinearGaussian:
 
 
 def multiplied(model: LinearGaussian, response: DataVector) -> LinearGaussian:
-    """Multiply by gains what a model's data hold: sky and offset, and unknowns that N holds."""
+    """Multiply a model's sky, offset and unknowns in N by gains."""
     offset = None if model.offset is None else model.offset * response
     coupling, noise = model.coupling.with_response(response), model.noise
     if isinstance(noise, LowRankUpdate):

@@ -1,4 +1,4 @@
-"""What tests share: one contract for each protocol, which every kind of it has to pass.
+"""Contracts for tests: one for each protocol, which every implementation must pass.
 
 Extensions can use them, too.
 """

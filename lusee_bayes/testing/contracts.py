@@ -1,7 +1,7 @@
-"""Checks that every kind of a protocol has to pass.
+"""Checks that every implementation of a protocol must pass.
 
-One function for each protocol: covariances, beam sources, coupling matrices, priors and sources of
-skies. Bad input has to be refused in a sentence.
+There is one function for each protocol: covariances, beam sources, coupling matrices, priors and
+sources of skies. Bad input must be refused in a sentence.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ from lusee_bayes.noise.covariance import Covariance, DiagonalCovariance
 from lusee_bayes.sky.prior import Prior
 from lusee_bayes.sky.sky_source import SkySource
 
-# condition numbers stay below 1e3, so a backward stable solve is good to 1e3 x 16 eps = 4e-12
+# condition numbers are below 1e3, so a backward stable solve is accurate to 1e3 x 16 eps = 4e-12
 TOL = 1e-11
-# chance that draws which are right fail
+# probability that correct draws fail
 FALSE_ALARM = 1e-4
 
 
 def close(got: object, expected: object, tol: float = TOL) -> None:
-    """Assert that arrays agree to a part of the largest entry."""
+    """Assert that arrays agree to a fraction of the largest entry."""
     expected = np.asarray(expected)
     np.testing.assert_allclose(got, expected, rtol=0, atol=tol * np.abs(expected).max())
 
 
 @eqx.filter_jit
 def _numbers_of_covariance(cov: Covariance, x, xs, factor_of_cov):
-    """All that the contract compares, compiled once for every structure."""
+    """All numbers that the contract compares, compiled once for every structure."""
     factor = cov.factor()
     unit = jnp.eye(cov.size)
     return {
@@ -75,13 +75,13 @@ def _slopes(cov: Covariance, x):
 
 
 def check_covariance(cov: Covariance, dense: np.ndarray, *, slopes: bool = True) -> None:
-    """Check what it means to be a Covariance: everything agrees with a matrix.
+    """Check the contract of a Covariance: everything agrees with a matrix.
 
     Parameters
     ----------
     cov : Covariance
     dense : (data, data) array
-        The same matrix, by hand; its condition number has to stay below 1e3.
+        The same matrix, made independently, with a condition number below 1e3.
     slopes : bool
         Check derivatives, too.
 
@@ -99,7 +99,7 @@ def check_covariance(cov: Covariance, dense: np.ndarray, *, slopes: bool = True)
     factor = cov.factor()  # outside of jit, where values are checked
     got = _numbers_of_covariance(cov, jnp.asarray(x), jnp.asarray(xs), factor)
 
-    # what it is
+    # entries, determinant and solutions
     close(got["dense"], dense, 1e-15)
     assert (np.asarray(got["dense"]) == np.asarray(got["dense"]).T).all()
     close(got["diagonal"], np.diag(dense), 1e-15)
@@ -139,7 +139,7 @@ def check_covariance(cov: Covariance, dense: np.ndarray, *, slopes: bool = True)
 def _assert_draws_follow(
     draws: np.ndarray, covariance: np.ndarray, mean: np.ndarray | float = 0.0
 ) -> None:
-    """Moments of draws scatter by sqrt(C_ii / n), and sqrt((C_ii C_jj + C_ij^2) / n) (Wick)."""
+    """Check moments, which scatter by sqrt(C_ii / n) and sqrt((C_ii C_jj + C_ij^2) / n) (Wick)."""
     variance, deviations = np.diag(covariance), draws - mean
     second = np.sqrt(np.outer(variance, variance) + covariance**2)
     for moment, expected, scatter in (
@@ -147,12 +147,12 @@ def _assert_draws_follow(
         (deviations.T @ deviations / len(draws), covariance, second),
     ):
         worst = np.abs(moment - expected) * np.sqrt(len(draws))
-        # what has no variance is exact, but for the rounding of a square root
+        # entries without variance are exact except for the rounding of a square root
         limit = norm.isf(FALSE_ALARM / (2 * worst.size)) * scatter + 1e-9 * second.max()
         assert (worst < limit).all()
 
 
-# relative error that sums of a few thousand terms may make
+# relative error of sums of a few thousand terms
 ROUNDING = 1e-12
 
 
@@ -186,7 +186,7 @@ def check_beam_source(
         The same antennas, turned by ``turned_deg`` from East towards North.
     turned_deg : float
     frequency_mhz : float
-        One that the source knows.
+        A frequency that the source supports.
     lmax : int
     quadrature : float
         Error of the source's own quadrature, relative to the largest coefficient.
@@ -205,8 +205,8 @@ def check_beam_source(
     assert beams.labels == labels(n)
     assert beams.frequency_mhz == frequency_mhz
 
-    # the coefficients are those of the patterns, in the beams' own unit, and these are the fields';
-    # a smaller lmax is a slice
+    # coefficients agree with patterns, in the beams' unit, and patterns with fields; a smaller lmax
+    # is a slice
     grid = HemisphereGrid.for_lmax(lmax)
     patterns = np.asarray(source.patterns(frequency_mhz, grid))
     assert patterns.shape == (n, n, len(grid.theta), grid.n_phi)
@@ -225,11 +225,11 @@ def check_beam_source(
     fewer = np.asarray(source.beams(frequency_mhz, lmax - 1).modes)
     np.testing.assert_allclose(fewer, modes[:, : lmax**2], **rounding)
 
-    # the voltages that a uniform sky makes have a covariance
+    # the voltages from a uniform sky have a covariance
     covariance = np.asarray(to_matrix(beams.modes))[..., 0]
     assert np.linalg.eigvalsh(covariance).min() > -ROUNDING * np.abs(covariance).max()
 
-    # antennas that are turned see a sky that is turned the other way, and the same ground
+    # turned antennas see the sky turned the other way, and the same ground
     assert turned.n_ports == n
     rotated = turn_about_z(beams.modes, np.radians(turned_deg))
     np.testing.assert_allclose(turned.beams(frequency_mhz, lmax).modes, rotated, **rounding)
@@ -251,7 +251,7 @@ def check_beam_source(
 
 @eqx.filter_jit
 def _numbers_of_coupling(coupling: Coupling, matrix: DenseCoupling, m, d, skies, responses, half):
-    """What the contract compares inside transformations, in one program."""
+    """Numbers that the contract compares inside transformations, in one program."""
     first, second = responses
     changed = coupling.with_response(first).with_response(second)
     return {
@@ -290,7 +290,7 @@ def check_coupling(coupling: Coupling, dense: Float[np.ndarray, "data unknowns"]
     m, d = jnp.asarray(sky), jnp.asarray(data)
 
     same = partial(close, tol=ROUNDING)
-    # A, A m and A^T d are those of the matrix, alone and inside transformations
+    # A, A m and A^T d agree with the matrix, outside and inside transformations
     assert coupling.shape == dense.shape
     assert coupling.response is None
     same(coupling.dense(), dense)
@@ -305,7 +305,7 @@ def check_coupling(coupling: Coupling, dense: Float[np.ndarray, "data unknowns"]
     same(got["mapped"], skies @ dense.T)
     same(got["slope"], dense.T @ data)
 
-    # responses multiply the rows, one on top of the other, and sampling goes through them
+    # responses multiply the rows and one another, and sampling can differentiate by them
     changed = coupling.with_response(arguments[3][0]).with_response(arguments[3][1])
     factors = responses.prod(0)
     rows = factors[:, None] * dense
@@ -316,14 +316,14 @@ def check_coupling(coupling: Coupling, dense: Float[np.ndarray, "data unknowns"]
     same(got["changed_transpose_mv"], rows.T @ data)
     same(got["slope_of_response"], data * (dense @ sky))
 
-    # a multiple of another matrix is added to A itself, the response stays
+    # a multiple of another matrix is added to A before the response multiplies it
     same(got["plus"], 1.5 * dense)
     same(got["changed_plus"], 1.5 * rows)
     same(got["plus_dense"], 1.5 * rows @ sky)
     same(got["slope_of_plus"], data @ (dense @ sky))
     assert_refused(lambda: coupling.plus(half, changed))
 
-    # what claims structure in time can be summed without A
+    # with structure in time, the normal matrix can be summed without A
     if coupling.has_time_structure:
         variance = rng.uniform(0.5, 2.0, n_data)
         normal = normal_matrix(coupling, DiagonalCovariance(jnp.asarray(variance)))
@@ -341,15 +341,15 @@ DRAWS = 20_000
 
 
 def check_prior(prior: Prior, covariance: np.ndarray, mean: np.ndarray | None = None) -> None:
-    """Check what it means to be a Prior: everything agrees with a matrix, in NumPy and in JAX.
+    """Check the contract of a Prior: everything agrees with a matrix, in NumPy and in JAX.
 
     Parameters
     ----------
     prior : Prior
     covariance : (unknowns, unknowns) array
-        S, by hand; without unknowns of no variance its condition number has to stay below 1e3.
+        S, made independently; its condition number, without zero variances, must be below 1e3.
     mean : (unknowns,) array, optional
-        The prior mean; zero, if it is not given.
+        The prior mean; zero by default.
 
     Raises
     ------
@@ -386,7 +386,7 @@ def check_prior(prior: Prior, covariance: np.ndarray, mean: np.ndarray | None = 
 
 
 def _numbers_of_prior(prior: Prior, u, a, white, matrix):
-    """All that NumPy and JAX have to agree on."""
+    """All numbers on which NumPy and JAX must agree."""
     return {
         "root": prior.colour(np.eye(prior.size)).T,
         "covariance": prior.covariance(),
@@ -436,10 +436,10 @@ def check_sky_source(
     frequency_mhz : float
         A frequency in MHz at which it has a sky.
     lmax : int
-        Highest ell to ask for, at least 2.
+        Highest ell to request, at least 2.
     slice_rtol : float
-        How far a sky of smaller lmax may be from a slice of it, rms over rms: 0 for coefficients,
-        and for maps what aliases from above lmax in iterated quadrature.
+        Largest relative rms difference between a sky of smaller lmax and a slice of it: 0 for
+        coefficients; for maps, aliasing from above lmax in iterated quadrature.
     missing_mhz : float, optional
         A frequency in MHz at which it has no sky.
     missing_lmax : int, optional
