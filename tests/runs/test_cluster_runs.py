@@ -206,14 +206,16 @@ def test_workers_of_a_killed_command_end_with_it(tmp_path):
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("arguments", "same"),
+    ("arguments", "same", "rtol"),
     [
-        ("plan --set lmax=6 --vary frequency_mhz=10,20,30", "plan.csv"),
-        ("compare-priors --priors isotropic,local_scales", "priors.csv"),
+        ("plan --set lmax=6 --vary frequency_mhz=10,20,30", "plan.csv", 1e-6),
+        ("compare-priors --priors isotropic,local_scales", "priors.csv", 1e-4),
     ],
 )
-def test_other_commands_say_the_same(arguments, same, cluster, tmp_path):
-    """To a millionth: sums of other numbers of threads differ, and a prior is learned of them."""
+def test_other_commands_say_the_same(arguments, same, rtol, cluster, tmp_path):
+    """Sums of other numbers of threads differ by rounding. Learning a prior ends where a step moves
+    the map by less than 0.01 standard deviations, and rounding decides where in that region: 1e-4
+    of chi^2."""
     command, *options = arguments.split()
     options += MAP[6:] if command == "compare-priors" else []
     tables = []
@@ -224,4 +226,4 @@ def test_other_commands_say_the_same(arguments, same, cluster, tmp_path):
         assert process.returncode in (0, 1), errors
         tables.append(pd.read_csv(tmp_path / name / same))
     for table in tables[1:]:
-        pd.testing.assert_frame_equal(table, tables[0], rtol=1e-6)
+        pd.testing.assert_frame_equal(table, tables[0], rtol=rtol)
