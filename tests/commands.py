@@ -26,7 +26,7 @@ def judged_map(data: Path, overrides: list[str], out: Path) -> tuple[np.ndarray,
     """Map data that hold their truth; rho of every ell, and the summary of the channel."""
     command = ["map", "fiducial", "--data", data, "--truth", "-o", out, "--quiet"]
     assert run(*command, *sets(*overrides)) == 0
-    rho = np.array([float(row["rho"]) for row in table_of(out / "spectra.ecsv")])
+    rho = np.array([float(row["rho"]) for row in table_of(out / "power_spectra.ecsv")])
     (summary,) = json.loads((out / "summary.json").read_text())["channels"]
     return rho, summary
 

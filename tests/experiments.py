@@ -27,7 +27,7 @@ from lusee_bayes.sampling.hmc import whitened
 from lusee_bayes.sampling.programs import WHITE_SUFFIX, Program, latent_sites, numpyro_promotion
 from lusee_bayes.sky.prior import DensePrior, Prior
 from lusee_bayes.systematics.context import Around, Setup
-from lusee_bayes.testing.scenarios import small_scenario
+from lusee_bayes.testing import small_scenario
 
 # nothing of these enters a setup (test_experiment.py checks it), only the data and N; the mean of
 # noise.receiver does

@@ -25,7 +25,7 @@ from functools import lru_cache
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 
 from lusee_bayes.core.arrays import Array, Fields, Square, namespace
 from lusee_bayes.core.checks import require_finite, require_whole
@@ -178,6 +178,30 @@ def pixel_matrix(nside: int, lmax: int) -> Float[np.ndarray, "pixels modes"]:
     require_nside(nside)
     theta, phi = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)))
     return synthesis_matrix(theta, phi, lmax)
+
+
+def averaging_rows(
+    inside: Bool[np.ndarray, "regions pixels"], lmax: int
+) -> Float[np.ndarray, "regions modes"]:
+    """Rows that average a field over regions: the means of the harmonics over their pixels.
+
+    Parameters
+    ----------
+    inside : (regions, pixels) array
+        Whether a HEALPix RING pixel belongs to a region.
+    lmax : int
+
+    Returns
+    -------
+    (regions, modes) array
+        Zero for a region without pixels; exact for the whole sphere.
+    """
+    n = inside.shape[1]
+    options = {"lmax": lmax, "iter": 0, "use_pixel_weights": False}
+    sums = [from_healpy(healpy.map2alm(one.astype(np.float64), **options)) for one in inside]
+    rows = np.stack(sums) * n / (4.0 * np.pi * np.fmax(inside.sum(1), 1))[:, None]
+    rows[inside.all(1)] = np.eye(1, rows.shape[1]) / np.sqrt(4.0 * np.pi)
+    return rows
 
 
 def sum_over_m(values: Fields) -> Float[np.ndarray, "*batch ells"]:

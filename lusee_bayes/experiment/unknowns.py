@@ -367,7 +367,7 @@ class Unknowns:
 
     def instrument(
         self, mean: Modes, covariance: ModesMatrix, pixels: Pixels
-    ) -> InstrumentPosterior:
+    ) -> tuple[InstrumentPosterior, dict[str, Float[np.ndarray, "modes kept"]]]:
         """Compute the posterior of all unknowns, and its effect on the map.
 
         Parameters
@@ -376,6 +376,13 @@ class Unknowns:
             Posterior of the sky, in K and K^2.
         pixels : (pixels,) array
             Posterior standard deviation of each pixel, in K.
+
+        Returns
+        -------
+        InstrumentPosterior
+        dict of (modes, kept) arrays
+            For each systematic, and all together, R of W V^-1 W^T = R R^T, the part of the sky's
+            covariance that would vanish if it were known.
         """
         given, total = self.amplitudes.integrated(mean, covariance), float(np.trace(covariance))
         rows = given_data(pd.DataFrame(self.rows), given)
@@ -402,13 +409,14 @@ class Unknowns:
         corner = np.sort(single[best])
         columns = [*UNKNOWN_COLUMNS, *(["true"] if "true" in rows else [])]
         nside = round(np.sqrt(len(pixels) / 12))
-        return InstrumentPosterior(
+        theta = InstrumentPosterior(
             table,
             rows.loc[corner, columns].reset_index(drop=True),
             {name: float((part**2).sum()) / total for name, part in parts.items()},
             correlation[np.ix_(corner, corner)],
             (pixel_std(every @ every.T, nside) / pixels) ** 2,
         )
+        return theta, parts
 
     def _null_direction(self, posterior: Amplitudes, variance: float) -> NullDirection:
         mixed = self.parts @ posterior.with_sky[0] / self.sky_std

@@ -10,7 +10,7 @@ import numpy as np
 from lusee_bayes.core.files import require_files
 from lusee_bayes.core.harmonics import lmax_of
 from lusee_bayes.flight.reduced import REASONS, REDUCED, Reduced, read_reduced
-from lusee_bayes.judge.chi2 import stands_out
+from lusee_bayes.judge.chi2 import ChiSquare, stands_out
 from lusee_bayes.judge.cube_fit import N_TESTS
 from lusee_bayes.judge.left_out import KINDS
 from lusee_bayes.report.figures.drawing import taper_fwhm_deg
@@ -18,6 +18,7 @@ from lusee_bayes.report.rendering import render_run
 from lusee_bayes.report.viewer import viewer
 from lusee_bayes.results.channel import Judged
 from lusee_bayes.results.finished_runs import FinishedRun
+from lusee_bayes.results.sky_spectrum import SkySpectrum
 
 # number of days in the table, worst first
 WORST_DAYS = 5
@@ -51,10 +52,20 @@ def map_page(folder: Path, name: str) -> str:
         judged=[_groups(c.judged) for c in channels],
         unfit=[test.level != "consistent" for test in summary.tests],
         bad=[stands_out(channel.instrument.p, tests) for channel in channels],
+        regions=_regions(run),
         viewer=viewer(name, channels),
         smoothing_deg=taper_fwhm_deg(max(lmax_of(len(channels[0].mean)), 1)),
         flight=flight_section(folder),
     )
+
+
+def _regions(run: FinishedRun) -> list[tuple[str, ChiSquare]]:
+    """chi^2 of each region's spectrum; empty for one channel and unless the truth is known."""
+    temperatures = [channel.temperatures for channel in run.channels]
+    spectrum = SkySpectrum.of(run.summary.frequencies_mhz, temperatures)
+    if len(temperatures) == 1 or spectrum is None or spectrum.truth is None:
+        return []
+    return [(region, spectrum.chi2(region)) for region in spectrum.regions]
 
 
 def _groups(judged: Judged | None) -> dict[str, dict[str, Any]]:

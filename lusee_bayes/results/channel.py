@@ -24,6 +24,7 @@ from lusee_bayes.judge.chi2 import HEADLINES, ChiSquare, Fit, Level
 from lusee_bayes.judge.coverage import Coverage, latitudes
 from lusee_bayes.judge.residuals import Group
 from lusee_bayes.linear.information import Information
+from lusee_bayes.results.sky_spectrum import Departure, Temperatures
 
 # recurring types of NumPy arrays
 SkyModes = Float[np.ndarray, " mode"]
@@ -169,6 +170,8 @@ class ChannelData:
         Digests of all data behind the map.
     information : Information or None
         Information in all these data, if it is kept for updates with new data.
+    departure : Departure or None
+        What its sky has in common with those at other frequencies.
     """
 
     frequency_mhz: float
@@ -198,6 +201,7 @@ class ChannelData:
     diagnosis: Diagnosis | None = None
     digests: tuple[str, ...] = ()
     information: Information | None = None
+    departure: Departure | None = None
 
     def given(self, table: pd.DataFrame) -> ChannelData:
         """Replace the offsets by those in a table of unknowns, given all channels."""
@@ -242,6 +246,8 @@ class ChannelResult(ChannelData, Described):
         Receivers, ground and gain table, where the model has them.
     theta : InstrumentPosterior or None
         All unknowns of the instrument, and their effect on the map.
+    temperatures : Temperatures or None
+        Of regions of the sky; None in files of earlier versions.
     """
 
     mean: SkyModes = quantity("K", "posterior mean")
@@ -261,6 +267,7 @@ class ChannelResult(ChannelData, Described):
     coverage: tuple[Coverage, ...] = ()
     unknowns: UnknownsReport | None = None
     theta: InstrumentPosterior | None = None
+    temperatures: Temperatures | None = None
 
     def description(self) -> tuple[str, ...]:
         return (
@@ -297,7 +304,7 @@ class ChannelResult(ChannelData, Described):
         return measures.effective_resolution_deg(self.prior_fraction)
 
     def spectra(self) -> dict[str, Shaped[np.ndarray, " ells"]]:
-        """Columns of spectra.ecsv; rho, snr and cl_truth only if the truth is known."""
+        """Columns of power_spectra.ecsv; rho, snr and cl_truth only if the truth is known."""
         truth, alone = self.truth, self.independent
         columns = {
             "ell": np.arange(len(self.prior_fraction)),

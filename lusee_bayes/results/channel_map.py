@@ -18,6 +18,7 @@ from jaxtyping import Float, Int8
 from lusee_bayes.core import harmonics
 from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels
 from lusee_bayes.core.lazy import healpy
+from lusee_bayes.core.linalg import solve_lower
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.diagnosis import diagnose
 from lusee_bayes.experiment.experiment import Experiment, doubts, infer, posterior_draws, rounds_of
@@ -36,6 +37,7 @@ from lusee_bayes.linear.posterior import Posterior, pixel_std, prior_pixel_std
 from lusee_bayes.results.channel import ChannelData, ChannelResult, Details, Judged
 from lusee_bayes.results.finished_runs import SavedInformation, taken
 from lusee_bayes.results.map_result import prior_sentence
+from lusee_bayes.results.sky_spectrum import Departure, Temperatures
 from lusee_bayes.sky.prior import DensePrior, Prior
 from lusee_bayes.systematics.beam import beam_rms_difference
 
@@ -273,6 +275,7 @@ class Conditioned:
             with stages("first order"):
                 doubtful += reach(experiment, inference)
         fitting = experiment.fitting
+        altitude = measures.highest_altitude(data.observation, scenario.map_nside)
         return ChannelData(
             frequency_mhz=scenario.frequency_mhz,
             taken=taken(data.observation),
@@ -287,7 +290,7 @@ class Conditioned:
             flagged_share=0.0 if fitting is None else fitting.share,
             prior_std=np.sqrt(np.asarray(inference.model.prior.variance())),
             truth=None if data.truth is None else np.asarray(data.truth),
-            highest_altitude=measures.highest_altitude(data.observation, scenario.map_nside),
+            highest_altitude=altitude,
             instrument=instrument,
             prior=prior_sentence(experiment),
             parameters=() if learned is None else tuple(learned.as_rows()),
@@ -301,7 +304,17 @@ class Conditioned:
             diagnosis=diagnosis,
             digests=self.digests,
             information=self.information if scenario.output.information else None,
+            departure=Departure.of(altitude, self.posterior, self.covariance, self._shared_root()),
         )
+
+    def _shared_root(self) -> Float[np.ndarray, "modes shared"]:
+        """Root of the covariance that would vanish if what channels share were known, in K."""
+        if self.unknowns is None:
+            return np.zeros((len(self.covariance), 0))
+        given = self.unknowns.amplitudes.integrated(self.posterior.mean, self.covariance)
+        shared = self.unknowns.shared
+        lower = np.linalg.cholesky(given.covariance[np.ix_(shared, shared)])
+        return solve_lower(lower, given.with_sky[:, shared].T, transpose=False).T
 
     def _judged(self, misfit: Residuals) -> Judged:
         """Describe the residuals, with the verdict in words."""
@@ -338,6 +351,8 @@ def channel_result(
     *,
     pixels: Pixels | None = None,
     instrument: Unknowns | None = None,
+    common: Float[np.ndarray, "modes white"] | None = None,
+    joint: Float[np.ndarray, "all modes"] | None = None,
     covariance_kept: bool = False,
     information_bits: float = np.nan,
     **figures: Any,
@@ -360,6 +375,10 @@ def channel_result(
         Standard deviations of pixels in K; computed if omitted.
     instrument : Unknowns, optional
         Unknowns of the instrument given the sky, where the model has them.
+    common : (modes, white) array, optional
+        Root of the covariance with other channels, as of :class:`.Temperatures`.
+    joint : (all, modes) array, optional
+        Draws of all channels together, in K.
     covariance_kept : bool
         Keep the covariance with the result.
     information_bits, **figures
@@ -373,6 +392,11 @@ def channel_result(
         held = Counts.of_pixels(width, data.truth - mean, np.asarray(compared)).coverage()
     power = data.prior_std**2
     share = np.divide(variance, power, out=np.zeros(len(variance)), where=power > 0)
+    theta, roots = None, {}
+    if instrument is not None:
+        theta, roots = instrument.instrument(mean, covariance, width)
+    options = {"truth": data.truth, "roots": roots, "common": common, "draws": joint}
+    options["departure"] = data.departure if joint is None else None
     return ChannelResult(
         **(vars(data) | {"doubts": (*data.doubts, *about_information(information_bits))}),
         **figures,
@@ -385,7 +409,8 @@ def channel_result(
         covariance=covariance if covariance_kept else None,
         information_bits=information_bits,
         coverage=held,
-        theta=None if instrument is None else instrument.instrument(mean, covariance, width),
+        theta=theta,
+        temperatures=Temperatures.of(data.highest_altitude, mean, covariance, **options),
     )
 
 

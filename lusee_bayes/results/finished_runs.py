@@ -286,6 +286,13 @@ def diagnostics_tree(result: MapResult) -> xr.DataTree:
     return xr.DataTree(root, children=groups)
 
 
+def spectrum_tree(result: MapResult) -> xr.DataTree:
+    """Contents of spectrum.nc: temperatures of regions with the covariance of all frequencies."""
+    tree = to_tree(result.sky_spectrum())
+    tree.attrs |= {"Conventions": "CF-1.13"} | attributes_of(result.scenario)
+    return tree
+
+
 def read_channels(path: str | Path) -> tuple[ChannelResult, ...]:
     """Read the channels of a finished run from its diagnostics.nc. InputError for anything else."""
     what = "diagnostics of lusee-bayes map"

@@ -30,6 +30,7 @@ from lusee_bayes.judge.cube_fit import ChannelFits, SharedTest
 from lusee_bayes.linear.joint import Blocks
 from lusee_bayes.linear.positive_joint import PositiveMode
 from lusee_bayes.results.channel import ChannelResult
+from lusee_bayes.results.sky_spectrum import SkySpectrum
 from lusee_bayes.results.summaries import JointSummary, MapSummary, PullSummary
 from lusee_bayes.sky.galaxy import LANDMARKS
 from lusee_bayes.sky.spectral_prior import SpectralPrior
@@ -399,8 +400,14 @@ class MapResult(Described):
         same = set(JointSummary.model_fields) - set(named)
         return JointSummary(**named, **{name: getattr(joint, name) for name in same})
 
+    def sky_spectrum(self) -> SkySpectrum | None:
+        """Temperatures of regions of the sky; None for files of earlier versions."""
+        return SkySpectrum.of(
+            self.frequencies_mhz.tolist(), [c.temperatures for c in self.channels]
+        )
+
     def spectra(self) -> Table:
-        """spectra.ecsv: a row for every channel and ell."""
+        """power_spectra.ecsv: a row for every channel and ell."""
         tables = {c.frequency_mhz: pd.DataFrame(c.spectra()) for c in self.channels}
         table = Table.from_pandas(below(tables))
         for name in table.colnames:

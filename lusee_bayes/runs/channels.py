@@ -58,7 +58,6 @@ from lusee_bayes.experiment.experiment import build, draw_key
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.unknowns import Unknowns
-from lusee_bayes.judge.coverage import N_DRAWS
 from lusee_bayes.judge.cube_fit import SharedTest, shared_tests
 from lusee_bayes.linear import joint, positive_joint
 from lusee_bayes.linear.amplitudes import Tied, from_others, information_given, kernel, tie
@@ -67,6 +66,7 @@ from lusee_bayes.results.channel import ChannelData, ChannelResult, SkyModes
 from lusee_bayes.results.channel_map import Conditioned, channel_result, conditioned
 from lusee_bayes.results.finished_runs import information_file, read_information
 from lusee_bayes.results.map_result import Components, MapResult
+from lusee_bayes.results.sky_spectrum import N_DRAWS
 from lusee_bayes.runs.cost import measured_experiment
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
@@ -215,6 +215,7 @@ class ChannelInformation:
             drawn - mean,
             unknowns=report,
             instrument=unknowns,
+            joint=drawn,
             independent=np.asarray(self.information.reference),
             covariance_kept=scenario.output.covariance,
             **information.fit(sky.mean, sky.covariance),
@@ -493,6 +494,7 @@ class ChannelAlone:
             deviations[self.n_draws :],
             unknowns=unknowns.report(moved, left),
             instrument=unknowns,
+            common=gain @ tied.root[number, at],
             **(self.figures | information.fit(moved, left) | {"information_bits": float(bits)}),
         )
 
@@ -675,8 +677,7 @@ def map_channels(
         tied, tests = tie_channels(scenario, frequencies, [one.share for one in seen])
     if scenario.joint:
         at_hand = ChannelsInFiles(mapped, files, engine, stages, tied)
-        # coverage needs draws
-        n_draws = max(scenario.output.draws, N_DRAWS if data is None or truth else 0)
+        n_draws = max(scenario.output.draws, N_DRAWS)
         components = solve_components(_without(unmapped, scenario), at_hand, seen, n_draws)
 
     def finish(number: int) -> None:

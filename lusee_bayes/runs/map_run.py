@@ -136,6 +136,11 @@ def _write_coefficients(result: MapResult, folder: Path) -> None:
     write_alms(folder / "mean_alm.fits", result.channel.mean, header)
 
 
+def _write_spectrum(result: MapResult, folder: Path) -> None:
+    Output.netcdf("spectrum.nc", finished_runs.spectrum_tree).write(result, folder)
+    Output.ecsv("spectrum.ecsv", lambda result: result.sky_spectrum().table()).write(result, folder)
+
+
 # contents of the folder of a map; a new file is one line here
 MAP = RunKind(
     "map",
@@ -144,7 +149,8 @@ MAP = RunKind(
         Output.netcdf("diagnostics.nc", finished_runs.diagnostics_tree),
         Output(_write_maps),
         Output(_write_coefficients, wanted=lambda result: result.single),
-        Output.ecsv("spectra.ecsv", lambda result: result.spectra()),
+        Output.ecsv("power_spectra.ecsv", lambda result: result.spectra()),
+        Output(_write_spectrum, wanted=lambda result: not result.single),
         Output.table("sources.csv", lambda result: result.table("fluxes")),
         Output.table("pointing.csv", lambda result: result.table("pointing", "offsets")),
         Output.table("pointing_by_day.csv", lambda result: result.table("pointing", "preferred")),
@@ -162,6 +168,7 @@ MAP = RunKind(
         "beams": maps.beams,
         "fidelity": maps.fidelity,
         "spectra": maps.spectra,
+        "sky_spectrum": maps.sky_spectrum,
         "draws": maps.draws,
         "chi2": maps.chi2,
         "residuals": judgement.residuals_by_product,

@@ -55,7 +55,7 @@ def folder(small_map):
 
 
 def test_map_writes_what_it_promises(folder):
-    files = "posterior.nc map.fits mean_alm.fits spectra.ecsv summary.json scenario.yaml "
+    files = "posterior.nc map.fits mean_alm.fits power_spectra.ecsv summary.json scenario.yaml "
     files += "diagnostics.nc report.html figures manifest.json"
     assert {p.name for p in folder.iterdir()} == {*files.split(), "provenance.json"}
     names = ("data_vector", "beams", "spectra", "residuals", "maps_1_truth", "draws_4_draw_4")
@@ -89,8 +89,8 @@ def test_the_files_agree_with_each_other(folder):
     # sqrt(2) there and back again
     alm = healpy.read_alm(folder / "mean_alm.fits")
     np.testing.assert_allclose(from_healpy(alm), mean, rtol=4e-16)
-    rows = table_of(folder / "spectra.ecsv")
-    assert Table.read(folder / "spectra.ecsv")["cl_mean"].unit == "K2"
+    rows = table_of(folder / "power_spectra.ecsv")
+    assert Table.read(folder / "power_spectra.ecsv")["cl_mean"].unit == "K2"
     columns = "frequency_mhz ell rho snr cl_prior cl_mean cl_truth cl_posterior_variance"
     assert list(rows[0])[:8] == columns.split()
     assert float(rows[2]["cl_posterior_variance"]) == pytest.approx(np.mean(std[4:9] ** 2))
@@ -203,7 +203,7 @@ def test_data_without_truth(tmp_path):
     assert run("map", "fiducial", *SMALL, "--data", tmp_path / "real.nc", "-o", out, "-q") == 0
     assert "TRUTH" not in fits.getdata(out / "map.fits", 1).names
     assert json.loads((out / "summary.json").read_text())["channels"][0]["ell_cross"] is None
-    assert "rho" not in (out / "spectra.ecsv").read_text()
+    assert "rho" not in (out / "power_spectra.ecsv").read_text()
 
 
 def test_an_interrupted_write_leaves_the_old_result_whole(small_map, tmp_path, monkeypatch, capsys):

@@ -15,7 +15,7 @@ from lusee_bayes.core.harmonics import map_to_modes
 from lusee_bayes.experiment.model import full_model, simulate
 from lusee_bayes.sky.prior import read_spectrum
 from lusee_bayes.systematics.context import measured_visibilities
-from lusee_bayes.testing.scenarios import small_scenario
+from lusee_bayes.testing import small_scenario
 
 
 def variances(setup) -> np.ndarray:

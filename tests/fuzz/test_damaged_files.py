@@ -28,7 +28,7 @@ from lusee_bayes.results.finished_runs import read_channels, read_information, r
 from lusee_bayes.runs import folder as folder_module
 from lusee_bayes.runs import map_run
 from lusee_bayes.sky.sky_source import write_alms
-from lusee_bayes.testing.scenarios import small_scenario
+from lusee_bayes.testing import small_scenario
 
 FEW, MANY = 2, 150 * changes.SCALE
 

@@ -25,7 +25,7 @@ from lusee_bayes.instrument.beams.sampled import read_beam
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.waterfalls import read_waterfall
 from lusee_bayes.systematics.beam import beam_rms_difference, difference_of_beams, true_beams
-from lusee_bayes.testing.scenarios import small_scenario
+from lusee_bayes.testing import small_scenario
 
 LMAX = 47
 

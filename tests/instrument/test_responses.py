@@ -22,7 +22,7 @@ from lusee_bayes.instrument.beams.source import CapacitorReceiver, JFETReceiver,
 from lusee_bayes.instrument.products import labels, to_matrix, to_real
 from lusee_bayes.instrument.visibilities import read_visibilities
 from lusee_bayes.instrument.waterfalls import read_waterfall, write_four_port
-from lusee_bayes.testing.scenarios import small_scenario
+from lusee_bayes.testing import small_scenario
 
 VACUUM = physical_constants["characteristic impedance of vacuum"][0]
 LMAX, MOON = 47, 250.0

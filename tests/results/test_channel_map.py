@@ -20,7 +20,7 @@ from lusee_bayes.judge.split import Split
 from lusee_bayes.linear.posterior import pixel_std
 from lusee_bayes.results.channel_map import conditioned, region_rows
 from lusee_bayes.results.finished_runs import FinishedRun, SavedInformation
-from lusee_bayes.testing.scenarios import small_scenario
+from lusee_bayes.testing import small_scenario
 
 
 def dense_log_likelihood(model, data, skies) -> np.ndarray:

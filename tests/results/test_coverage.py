@@ -16,7 +16,7 @@ from lusee_bayes.experiment.sky_sections import FileSkySection, GalaxySection
 from lusee_bayes.judge.coverage import LEVELS, Counts, Coverage
 from lusee_bayes.judge.measures import strengths, strengths_in_words
 from lusee_bayes.sky.sky_source import write_alms
-from lusee_bayes.testing.scenarios import small_scenario
+from lusee_bayes.testing import small_scenario
 
 NSIDE, LMAX = 8, 6
 N_MODES = (LMAX + 1) ** 2

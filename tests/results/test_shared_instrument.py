@@ -10,12 +10,13 @@ from scipy.linalg import block_diag
 from scipy.stats import chi2, multivariate_normal
 
 import lusee_bayes as lb
-from lusee_bayes.core.harmonics import modes_to_map
+from lusee_bayes.core.harmonics import lmax_of, modes_to_map, pixel_matrix
 from lusee_bayes.experiment.model import radiometer
 from lusee_bayes.experiment.unknowns import ALL_TOGETHER
 from lusee_bayes.judge.cube_fit import disagreement, shared_tests
 from lusee_bayes.linear.amplitudes import tie
 from lusee_bayes.report.figures.judgement import corner
+from lusee_bayes.results.sky_spectrum import UNOBSERVED, correlation_of, sky_regions
 from lusee_bayes.runs import channels
 from lusee_bayes.runs.channels import Share, kernel, map_channels, tie_channels
 
@@ -132,7 +133,7 @@ def cube(scenario, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def expected(scenario) -> tuple[Answer, np.ndarray]:
+def dense(scenario):
     """Skies, shared values and receivers about what each channel's own data tell of them."""
     skies, same, own, rest, noise, stds, constant = [], [], [], [], [], [], 0.0
     expectations, begin = [], None
@@ -165,7 +166,12 @@ def expected(scenario) -> tuple[Answer, np.ndarray]:
     mean = unmixed @ white.mean
     mean[3 * N_MODES :][:4] += before
     log_prob = white.log_prob + before @ before / 2.0 + constant
-    return Answer(mean, unmixed @ white.covariance @ unmixed.T, log_prob)
+    return Answer(mean, unmixed @ white.covariance @ unmixed.T, log_prob), skies, noise, stds
+
+
+@pytest.fixture(scope="module")
+def expected(dense) -> Answer:
+    return dense[0]
 
 
 def test_skies_are_those_of_one_normal_equation(cube, expected):
@@ -189,6 +195,50 @@ def test_tables_have_the_shared_values(cube, expected):
         mine = np.r_[:4, 4 + 4 * k : 8 + 4 * k]
         within((z - expected.mean[shared][mine]) / std[shared][mine], 0.0, 1e-6)
         np.testing.assert_allclose(np.concatenate(list(width)), std[shared][mine], rtol=1e-6)
+
+
+def test_temperatures_of_all_channels_are_those_of_one_gaussian(cube, expected, dense):
+    """Means over pixels of all skies, with their full covariance, and what each unknown adds.
+
+    Skies that are alike add what the data of each do not measure, given the instrument.
+    """
+    missed, u = [], []
+    for k, (a, noise, std) in enumerate(zip(*dense[1:], strict=True)):
+        left = np.linalg.inv(np.diag(std**-2.0) + a.T @ (a / noise[:, None] ** 2))
+        missed.append(left / std)
+        u.append(cube.channels[k].temperatures.departure.mean)
+    alike = correlation_of(u)
+    assert (alike[0, 1:] > 0.5).all()
+    spectrum, first = cube.sky_spectrum(), cube.channel
+    regions = sky_regions(first.highest_altitude)
+    inside, hidden = np.stack([*regions.values()]), ~regions["observed sky"]
+    grid = pixel_matrix(64, lmax_of(N_MODES))
+    for k, pixels in enumerate(inside):
+        row = grid[pixels].mean(0) if k else np.eye(1, N_MODES)[0] / np.sqrt(4.0 * np.pi)
+        rows = block_diag(*[row] * 3)
+        covariance = rows @ expected.covariance[: 3 * N_MODES, : 3 * N_MODES] @ rows.T
+        scale = np.sqrt(np.diagonal(covariance))
+        error = np.stack([row @ one for one in missed])
+        covariance += np.where(np.eye(3) == 1, 0.0, alike * (error @ error.T))
+        off = spectrum.temperature[k] - rows @ expected.mean[: 3 * N_MODES]
+        within(off / scale, 0.0, 1e-6)
+        within((spectrum.covariance[k] - covariance) / np.outer(scale, scale), 0.0, 1e-6)
+        never = block_diag(*[grid[pixels & hidden].sum(0) / pixels.sum()] * 3)
+        left = np.diagonal(never @ expected.covariance[: 3 * N_MODES, : 3 * N_MODES] @ never.T)
+        at = spectrum.sources.index(UNOBSERVED)
+        np.testing.assert_allclose(spectrum.shares[at, k], left / scale**2, rtol=1e-5, atol=1e-12)
+        known = 3 * N_MODES + np.arange(2)  # the beams
+        cross = rows @ expected.covariance[: 3 * N_MODES, known]
+        gone = cross @ np.linalg.solve(expected.covariance[np.ix_(known, known)], cross.T)
+        share = spectrum.shares[spectrum.sources.index("the beams"), k]
+        np.testing.assert_allclose(share, np.diagonal(gone) / scale**2, rtol=1e-4)
+    # unknowns that channels share make their errors alike
+    assert (spectrum.covariance[0, 0, 1:] > 1e-3 * spectrum.std[0, 0] * spectrum.std[0, 1:]).any()
+    off = spectrum.temperature[0] - np.array(
+        [c.truth[0] / np.sqrt(4.0 * np.pi) for c in cube.channels]
+    )
+    expected_chi2 = off @ np.linalg.inv(spectrum.covariance[0]) @ off
+    assert spectrum.chi2("mean sky").chi2 == pytest.approx(expected_chi2, rel=1e-6)
 
 
 def test_theta_adds_the_variance_that_fixing_it_would_take_away(cube, expected):

@@ -9,7 +9,7 @@ import lusee_bayes as lb
 from lusee_bayes.cli.options import parse_duration
 from lusee_bayes.instrument.averaging import averaged
 from lusee_bayes.instrument.visibilities import read_visibilities
-from lusee_bayes.testing.scenarios import small_scenario
+from lusee_bayes.testing import small_scenario
 
 LMAX = 5
 MEANS = ("observation.window=mean", "observation.step_s=1800")

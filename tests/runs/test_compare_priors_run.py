@@ -12,7 +12,7 @@ import lusee_bayes as lb
 from lusee_bayes.experiment.model import set_up
 from lusee_bayes.experiment.rounds import NAMED
 from lusee_bayes.sky.sky_source import write_alms
-from lusee_bayes.testing.scenarios import small_scenario
+from lusee_bayes.testing import small_scenario
 
 SIZES = {"lmax": 8, "cycles": 0.15}
 SMALL = ["--set", "lmax=8", "--set", "observation.runs.0.cycles=0.15"]

@@ -103,7 +103,7 @@ def test_files_of_a_cube_agree_with_each_other(joint, capsys):
             expected = modes_to_map(channels[name].values[k], nside)
             np.testing.assert_allclose(read.map_at(20.0 + 5 * k), expected, rtol=1e-12)
     assert SkyCube.read(joint / "std.fits").pixels.shape == (3, healpy.nside2npix(nside))
-    rows = table_of(joint / "spectra.ecsv")
+    rows = table_of(joint / "power_spectra.ecsv")
     assert [float(r["frequency_mhz"]) for r in rows] == list(np.repeat([20.0, 25.0, 30.0], 5))
     for name, column in (("mean", "snr"), ("independent_mean", "snr_independent")):
         snr = signal_to_noise(channels[name].values[1], channels["truth"].values[1])

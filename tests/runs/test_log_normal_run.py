@@ -13,7 +13,7 @@ from lusee_bayes.results.sample_result import SampleResult
 from lusee_bayes.runs.sample_run import coordinates
 from lusee_bayes.sampling.programs import numpyro_promotion
 from lusee_bayes.sky import positive_skies
-from lusee_bayes.testing.scenarios import small_scenario
+from lusee_bayes.testing import small_scenario
 
 LMAX = 4
 NO_SOURCES = "log_normal={sources: false}"

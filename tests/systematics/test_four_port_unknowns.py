@@ -20,7 +20,7 @@ from lusee_bayes.instrument.products import all_products, labels
 from lusee_bayes.instrument.visibilities import Calibration
 from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.gain_table import table_errors
-from lusee_bayes.testing.scenarios import small_scenario
+from lusee_bayes.testing import small_scenario
 
 RECEIVER = "noise.receiver={power_k: 2000, relative_std: 0.1, treatment: %s}"
 GROUND = "noise.regolith={std_k: 30, treatment: %s}"

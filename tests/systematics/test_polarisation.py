@@ -24,7 +24,7 @@ from lusee_bayes.instrument.beams.monopoles import Monopoles, beams_towards
 from lusee_bayes.instrument.products import all_products
 from lusee_bayes.systematics.context import Around
 from lusee_bayes.systematics.polarisation import beam_scale
-from lusee_bayes.testing.scenarios import small_scenario
+from lusee_bayes.testing import small_scenario
 
 LMAX, MHZ = 6, 25.0
 # two instants, with the antennas turned between them

@@ -29,7 +29,7 @@ from lusee_bayes.systematics.context import Setup
 from lusee_bayes.systematics.prior_spectrum import PriorSpectrum
 from lusee_bayes.systematics.sources import Source
 from lusee_bayes.systematics.systematic import Unknown
-from lusee_bayes.testing.scenarios import small_scenario
+from lusee_bayes.testing import small_scenario
 
 # Cas A is up, For A has an amplitude for every two of the six samples, and the last lies near the
 # north pole of the Moon, 24 degrees below the horizon for ever

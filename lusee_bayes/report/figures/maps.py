@@ -12,6 +12,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 
 from lusee_bayes.core.arrays import Modes
 from lusee_bayes.core.harmonics import lmax_of, modes_to_map
+from lusee_bayes.experiment.unknowns import ALL_TOGETHER
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.judge.measures import ell_cross
 from lusee_bayes.linear.posterior import Posterior, pixel_std
@@ -20,6 +21,7 @@ from lusee_bayes.report.figures.drawing import BLUE, COLOURS, DIVERGING, GREY, L
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.finished_runs import FinishedRun
 from lusee_bayes.results.map_result import MapResult
+from lusee_bayes.results.sky_spectrum import PUBLISHED
 
 # figures shown side by side, or below each other on a phone, by their titles
 Panels = dict[str, Figure]
@@ -284,12 +286,51 @@ def channel_spectra(cube: MapResult) -> Panels:
         if "truth" in values:
             axes.plot(f, values["truth"], color=ORANGE, ls="--", lw=1.2, label="truth")
         axes.set(title=name, yscale="log", xscale="log", xlim=(0.93 * f[0], 1.07 * f[-1]))
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-        axes.xaxis.set_minor_locator(NullLocator())
+        _frequency_ticks(axes)
         axes.set(xlabel="frequency [MHz]", ylabel="brightness temperature [K]")
         axes.legend(frameon=False)
     return figures
+
+
+def sky_spectrum(cube: MapResult) -> Panels | None:
+    """Temperature of each region with error bars, and what the errors of the mean sky come from."""
+    if cube.single or (spectrum := cube.sky_spectrum()) is None:
+        return None
+    f = spectrum.frequency
+    grid = np.geomspace(f.min(), f.max(), 200)
+    figure, axes = drawing.framed((5.6, 4.6))
+    for k, (region, std) in enumerate(zip(spectrum.regions, spectrum.std, strict=True)):
+        style = {"color": f"C{k}", "fmt": ".", "ms": 4, "lw": 1, "label": region}
+        axes.errorbar(f, spectrum.temperature[k], std, **style)
+        if spectrum.truth is not None:
+            label = "truth" if not k else None
+            axes.plot(f, spectrum.truth[k], color="black", ls=":", lw=1, label=label)
+    for (name, (law, measured)), line in zip(PUBLISHED.items(), ("-", "--"), strict=True):
+        if (inside := (grid >= measured[0]) & (grid <= measured[1])).any():
+            axes.plot(grid[inside], law(grid[inside]), color=GREY, ls=line, lw=1, label=name)
+    axes.set(ylabel="brightness temperature [K]", yscale="log")
+    axes.legend(frameon=False, fontsize="small")
+    errors, lower = drawing.framed((5.6, 4.6))
+    mean = 100.0 * spectrum.std[0] / spectrum.temperature[0]
+    lower.plot(f, mean, color="black", label=f"standard deviation, {spectrum.regions[0]}")
+    for name, shares in zip(spectrum.sources, spectrum.shares[:, 0], strict=True):
+        if name != ALL_TOGETHER:
+            lower.plot(f, mean * np.sqrt(shares), marker=".", lw=1, label=f"from {name}")
+    if spectrum.truth is not None:
+        off = spectrum.temperature[0] - spectrum.truth[0]
+        lower.plot(f, 100.0 * np.abs(off) / spectrum.temperature[0], "k:", label="|mean - truth|")
+    lower.set(ylabel="% of the temperature", yscale="log", ylim=(mean.min() / 50.0, None))
+    lower.legend(frameon=False, fontsize="small")
+    for one in (axes, lower):
+        one.set(xlabel="frequency [MHz]", xscale="log", xlim=(0.93 * f.min(), 1.07 * f.max()))
+        _frequency_ticks(one)
+    return {"temperature": figure, "errors": errors}
+
+
+def _frequency_ticks(axes: Axes) -> None:
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.xaxis.set_minor_locator(NullLocator())
 
 
 def fidelity(cube: MapResult) -> Figure | Panels:

@@ -1,0 +1,330 @@
+"""The spectrum of the sky: temperatures of regions at every frequency, with their covariance.
+
+The temperature of a region is the mean over its pixels, T = L m for a sky m, with the variance
+L C L^T in each channel. Two channels have two kinds of errors in common, ::
+
+    Cov(T_f, T_g) = (L W_f) (L W_g)^T + rho_fg (L E_f) (L E_g)^T,    f != g.
+
+The instrument that they share, z_f = R_f w with the posterior w ~ N(.., 1), moves the sky m_f by
+W_f = Cov(m_f, z_f) Cov(z_f)^-1 R_f per unit of w.
+
+Channels are solved with independent priors m = mu + G u, u ~ N(0, 1), but their skies are alike.
+Given z, with the covariance C_z, the error of m contains -E u with E = C_z G^-T: the structure that
+the data do not measure, which is nearly the same at all frequencies. rho_fg, the correlation of u
+at f and g, is measured: it is that of the posterior means of u, which vanish where data measure
+nothing. Both terms are at most the whole variance, so the matrix is positive definite.
+
+In a joint posterior the prior correlates the skies: the correlation of channels is that of draws.
+Parameters of a learned prior have their most probable values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from astropy.table import Table
+from jaxtyping import Bool, Float
+from scipy.constants import Boltzmann, speed_of_light
+
+from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels
+from lusee_bayes.core.harmonics import averaging_rows, lmax_of
+from lusee_bayes.core.lazy import healpy
+from lusee_bayes.core.trees import quantity
+from lusee_bayes.judge.chi2 import ChiSquare
+from lusee_bayes.linear.posterior import Posterior
+
+Frequencies = Float[np.ndarray, " frequency"]
+Rows = Float[np.ndarray, "area mode"]
+Columns = Float[np.ndarray, "mode shared"]
+
+# Galactic latitudes that bound caps and plane, in degrees
+CAP, PLANE = 60.0, 10.0
+# resolution of regions
+NSIDE = 64
+OBSERVED = "observed sky"
+UNOBSERVED, UNMEASURED = "unobserved sky", "unmeasured structure"
+# draws of a joint posterior that the correlation of its channels is computed from
+N_DRAWS = 400
+
+
+def sky_regions(highest_altitude: Pixels) -> dict[str, Bool[np.ndarray, " fine"]]:
+    """The pixels (HEALPix RING, NSIDE 64 or finer) of each region, by name.
+
+    Parameters
+    ----------
+    highest_altitude : (pixels,) array
+        sin of the highest altitude that each pixel reached.
+    """
+    nside = max(NSIDE, healpy.npix2nside(len(highest_altitude)))
+    _, latitude = healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)), lonlat=True)
+    return {
+        "mean sky": np.ones(len(latitude), dtype=bool),
+        OBSERVED: healpy.ud_grade(highest_altitude, nside) >= 0.0,
+        f"cap b > {CAP:g}": latitude > CAP,
+        f"cap b < -{CAP:g}": latitude < -CAP,
+        f"plane |b| < {PLANE:g}": np.abs(latitude) < PLANE,
+    }
+
+
+@dataclass(frozen=True)
+class Departure:
+    """What a channel's sky and its error have in common with those at other frequencies.
+
+    Attributes
+    ----------
+    mean : (white,) array
+        Posterior mean of u, the sky's departure from the prior in prior standard deviations.
+    error : (regions, white) array
+        L E: how each region's temperature misses u.
+    """
+
+    mean: Float[np.ndarray, " white"] = quantity("1", "departure of the sky from its prior")
+    error: Float[np.ndarray, "area white"] = quantity("K", "temperature missed per departure")
+
+    @classmethod
+    def of(
+        cls, highest_altitude: Pixels, posterior: Posterior, covariance: ModesMatrix, w: Columns
+    ) -> Departure:
+        """Compute it from a posterior given a channel's own data.
+
+        Parameters
+        ----------
+        highest_altitude : (pixels,) array
+        posterior : Posterior
+            With the channel's prior.
+        covariance : (modes, modes) array
+            In K^2.
+        w : (modes, shared) array
+            Root of the part of it that would vanish if what channels share were known, in K.
+        """
+        prior, mean = posterior.prior, np.asarray(posterior.mean)
+        rows = averaging_rows(np.stack([*sky_regions(highest_altitude).values()]), lmax_of(len(w)))
+        error = np.asarray(prior.whiten(rows @ covariance - (rows @ w) @ w.T))
+        return cls(np.asarray(prior.whiten(mean) - prior.white_mean), error)
+
+
+@dataclass(frozen=True)
+class Temperatures:
+    """Temperatures of regions in one channel.
+
+    Attributes
+    ----------
+    regions, sources : tuple of str
+        Names of the regions, and of the unknowns behind ``shares``.
+    mean, std : (regions,) array
+    truth : (regions,) array or None
+    common : (regions, shared) array
+        L W: per unit of what channels share.
+    departure : Departure or None
+        None in a joint posterior.
+    shares : (sources, regions) array
+        Fraction of each variance that would vanish if an unknown were known: a systematic, or the
+        sky that never rises; and the fraction from E u. The fractions need not add up.
+    draws : (draws, regions) array
+        Of a joint posterior; empty otherwise.
+    """
+
+    regions: tuple[str, ...]
+    sources: tuple[str, ...]
+    mean: Float[np.ndarray, " area"] = quantity("K", "mean temperature")
+    std: Float[np.ndarray, " area"] = quantity("K", "standard deviation")
+    truth: Float[np.ndarray, " area"] | None = quantity("K", "true temperature")
+    common: Float[np.ndarray, "area shared"] = quantity("K", "root of the shared covariance")
+    departure: Departure | None
+    shares: Float[np.ndarray, "source area"] = quantity("1", "fraction of the variance")
+    draws: Float[np.ndarray, "draw area"] = quantity("K", "draws of a joint posterior")
+
+    @classmethod
+    def of(
+        cls,
+        highest_altitude: Pixels,
+        mean: Modes,
+        covariance: ModesMatrix,
+        *,
+        truth: Modes | None = None,
+        roots: Mapping[str, Float[np.ndarray, "mode kept"]],
+        common: Columns | None = None,
+        departure: Departure | None = None,
+        draws: Float[np.ndarray, "draw mode"] | None = None,
+    ) -> Temperatures:
+        """Compute them from a posterior of the sky.
+
+        Parameters
+        ----------
+        highest_altitude : (pixels,) array
+            sin of the highest altitude that each pixel reached.
+        mean, covariance : (modes,) and (modes, modes) array
+            In K and K^2.
+        truth : (modes,) array, optional
+        roots : mapping of (modes, kept) arrays
+            For each systematic, R of the part R R^T of the covariance that would vanish if it were
+            known.
+        common : (modes, shared) array, optional
+            W.
+        departure : Departure, optional
+        draws : (draws, modes) array, optional
+            Of a joint posterior.
+        """
+        regions = sky_regions(highest_altitude)
+        inside, lmax = np.stack([*regions.values()]), lmax_of(len(mean))
+        rows, never = averaging_rows(inside, lmax), inside & ~regions[OBSERVED]
+        hidden = (never.sum(1) / inside.sum(1))[:, None] * averaging_rows(never, lmax)
+
+        def variance(rows: Rows) -> Float[np.ndarray, " area"]:
+            return np.einsum("rm,rm->r", rows @ covariance, rows)
+
+        total = variance(rows)
+        parts = {name: ((rows @ root) ** 2).sum(1) for name, root in roots.items()}
+        parts[UNOBSERVED] = variance(hidden)
+        if departure is not None:
+            parts[UNMEASURED] = (departure.error**2).sum(1)
+        none = np.zeros((0, len(mean)))
+        return cls(
+            tuple(regions),
+            tuple(parts),
+            rows @ mean,
+            np.sqrt(total),
+            None if truth is None else rows @ truth,
+            rows @ (none.T if common is None else common),
+            departure,
+            np.stack([*parts.values()]) / total,
+            (none if draws is None else draws) @ rows.T,
+        )
+
+
+@dataclass(frozen=True)
+class SkySpectrum:
+    """The temperature of each region at every frequency.
+
+    Attributes
+    ----------
+    regions, sources : tuple of str
+        As of :class:`Temperatures`.
+    frequency : (frequencies,) array
+    temperature : (regions, frequencies) array
+    covariance : (regions, frequencies, frequencies) array
+    truth : (regions, frequencies) array or None
+    shares : (sources, regions, frequencies) array
+    """
+
+    regions: tuple[str, ...]
+    sources: tuple[str, ...]
+    frequency: Frequencies = quantity("MHz", "frequency")
+    temperature: Float[np.ndarray, "area frequency"] = quantity("K", "mean temperature")
+    covariance: Float[np.ndarray, "area frequency frequency_2"] = quantity(
+        "K2", "posterior covariance of the frequencies"
+    )
+    truth: Float[np.ndarray, "area frequency"] | None = quantity("K", "true temperature")
+    shares: Float[np.ndarray, "source area frequency"] = quantity(
+        "1", "fraction of the variance that would vanish if the source were known"
+    )
+
+    @classmethod
+    def of(
+        cls, frequencies_mhz: Sequence[float], channels: Sequence[Temperatures | None]
+    ) -> SkySpectrum | None:
+        """Combine the temperatures of all channels; None if one lacks them (earlier versions)."""
+        if any(one is None for one in channels):
+            return None
+        first = channels[0]
+        std, common = np.stack([c.std for c in channels]), np.stack([c.common for c in channels])
+        if len(first.draws):
+            drawn = np.stack([c.draws for c in channels])
+            pulls = (drawn - drawn.mean(1, keepdims=True)) / drawn.std(1, keepdims=True)
+            correlation = np.einsum("fdr,gdr->rfg", pulls, pulls) / drawn.shape[1]
+            covariance = correlation * np.einsum("fr,gr->rfg", std, std)
+        else:
+            errors = np.stack([c.departure.error for c in channels])
+            covariance = np.einsum("frw,grw->rfg", common, common)
+            alike = correlation_of([c.departure.mean for c in channels])
+            covariance += alike * np.einsum("frw,grw->rfg", errors, errors)
+            covariance[:, *np.diag_indices(len(channels))] = std.T**2
+        # an unknown that a channel lacks takes no part in its errors
+        sources = tuple(dict.fromkeys(name for one in channels for name in one.sources))
+        shares = np.zeros((len(sources), len(first.regions), len(channels)))
+        for k, one in enumerate(channels):
+            shares[[sources.index(name) for name in one.sources], :, k] = one.shares
+        known = all(c.truth is not None for c in channels)
+        return cls(
+            first.regions,
+            sources,
+            np.asarray(frequencies_mhz, dtype=np.float64),
+            np.stack([c.mean for c in channels], axis=1),
+            covariance,
+            np.stack([c.truth for c in channels], axis=1) if known else None,
+            shares,
+        )
+
+    @property
+    def std(self) -> Float[np.ndarray, "area frequency"]:
+        """Standard deviations, in K."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+
+    def chi2(self, region: str) -> ChiSquare:
+        """Squared distance of a region's spectrum from the truth, with the full covariance."""
+        k = self.regions.index(region)
+        off = self.temperature[k] - self.truth[k]
+        return ChiSquare(float(off @ np.linalg.solve(self.covariance[k], off)), float(len(off)))
+
+    def table(self) -> Table:
+        """spectrum.ecsv: a row for every frequency and region."""
+        n_regions, n = self.temperature.shape
+        columns = {
+            "frequency_mhz": np.tile(self.frequency, n_regions),
+            "region": np.repeat(self.regions, n),
+            "temperature_k": self.temperature.ravel(),
+            "std_k": self.std.ravel(),
+        }
+        if self.truth is not None:
+            columns["true_k"] = self.truth.ravel()
+        for name, share in zip(self.sources, self.shares, strict=True):
+            columns[f"share of {name}"] = share.ravel()
+        units = {"frequency_mhz": "MHz", "temperature_k": "K", "std_k": "K", "true_k": "K"}
+        return Table(columns, units={name: u for name, u in units.items() if name in columns})
+
+
+def correlation_of(
+    departures: Sequence[Float[np.ndarray, " white"]],
+) -> Float[np.ndarray, "channels channels"]:
+    """rho: the correlation of the posterior means of u in different channels."""
+    u = np.stack(departures)
+    norm = np.sqrt((u**2).sum(1))
+    return u @ u.T / np.outer(norm, norm)
+
+
+def brightness_temperature(
+    intensity: Float[np.ndarray, " n"], frequencies_mhz: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
+    """T = I c^2 / (2 k f^2), in K, for I in W m^-2 Hz^-1 sr^-1."""
+    return intensity * (speed_of_light / (1e6 * frequencies_mhz)) ** 2 / (2.0 * Boltzmann)
+
+
+def cane_1979(frequencies_mhz: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Temperature of the Galactic poles, in K (Cane 1979, MNRAS 189, 465).
+
+    I_g f^-0.52 (1 - exp(-tau)) / tau + I_eg f^-0.80 exp(-tau) with tau = 5.0 f^-2.1, f in MHz,
+    I_g = 2.48e-20 and I_eg = 1.06e-20 W m^-2 Hz^-1 sr^-1.
+    """
+    f = np.asarray(frequencies_mhz)
+    tau = 5.0 * f**-2.1
+    galactic = 2.48e-20 * f**-0.52 * -np.expm1(-tau) / tau
+    return brightness_temperature(galactic + 1.06e-20 * f**-0.80 * np.exp(-tau), f)
+
+
+def novaco_brown_1978(frequencies_mhz: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Mean temperature of the sky from RAE 2, in K (Novaco and Brown 1978, ApJ 221, 114).
+
+    I = 1.38e-19 f^-0.76 exp(-3.28 f^-0.64) W m^-2 Hz^-1 sr^-1, f in MHz, as written by Zaslavsky et
+    al. 2011 (Radio Science 46, RS2008); measured up to 9 MHz.
+    """
+    f = np.asarray(frequencies_mhz)
+    return brightness_temperature(1.38e-19 * f**-0.76 * np.exp(-3.28 * f**-0.64), f)
+
+
+# published spectra by name, each with the frequencies of its measurements in MHz
+PUBLISHED: dict[str, tuple[Callable, tuple[float, float]]] = {
+    "poles: Cane 1979": (cane_1979, (0.25, 100.0)),
+    "RAE 2: Novaco and Brown 1978": (novaco_brown_1978, (0.25, 9.2)),
+}

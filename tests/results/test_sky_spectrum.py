@@ -1,0 +1,89 @@
+"""The spectrum of the sky: temperatures of regions, and what the errors of channels share."""
+
+import healpy
+import numpy as np
+import pytest
+import xarray as xr
+from assertions import within
+from astropy import units as u
+from astropy.table import Table
+
+import lusee_bayes as lb
+from lusee_bayes.core.harmonics import averaging_rows, modes_to_map
+from lusee_bayes.results.sky_spectrum import (
+    Departure,
+    SkySpectrum,
+    Temperatures,
+    cane_1979,
+    novaco_brown_1978,
+)
+
+SMALL = ["lmax=4", "observation.runs.0.cycles=0.1", "prior={model: isotropic, spectrum: sky}"]
+
+
+def test_published_spectra_are_brightness_temperatures():
+    """Against astropy's equivalency, with the formulae written out at two frequencies."""
+    for f, tau in ((5.0, 5.0 * 5.0**-2.1), (20.0, 5.0 * 20.0**-2.1)):
+        poles = 2.48e-20 * f**-0.52 * (1 - np.exp(-tau)) / tau + 1.06e-20 * f**-0.8 * np.exp(-tau)
+        whole = 1.38e-19 * f**-0.76 * np.exp(-3.28 * f**-0.64)
+        for law, intensity in ((cane_1979, poles), (novaco_brown_1978, whole)):
+            of = intensity * u.W / u.m**2 / u.Hz / u.sr
+            expected = of.to(u.Jy / u.sr).to_value(u.K, u.brightness_temperature(f * u.MHz))
+            assert law(np.array([f]))[0] == pytest.approx(expected, rel=1e-9)
+
+
+def test_rows_average_the_pixels_of_a_map():
+    rng = np.random.default_rng(1)
+    inside = rng.random((2, healpy.nside2npix(8))) < 0.2
+    sky = rng.normal(size=36)
+    means = [modes_to_map(sky, 8)[one].mean() for one in inside]
+    within(averaging_rows(inside, 5) @ sky, means, 1e-12)
+
+
+@pytest.mark.parametrize("joint", [[], ["spectral.model=components"]])
+def test_files_have_the_spectrum_with_its_covariance(joint, tmp_path):
+    frequencies = ["frequencies_mhz=[18, 20, 25, 30]", "noise.radiometer.factor=1e6"]
+    scenario = lb.load_scenario("fiducial", [*SMALL, *frequencies, *joint])
+    result = lb.run_map(scenario, tmp_path / "cube").result
+    spectrum = result.sky_spectrum()
+    table = Table.read(tmp_path / "cube" / "spectrum.ecsv")
+    assert table["temperature_k"].unit == "K" and len(table) == 20
+    with xr.open_dataset(tmp_path / "cube" / "spectrum.nc", engine="h5netcdf") as file:
+        within(file["covariance"] / spectrum.covariance, 1.0, 1e-12)
+        std = np.sqrt(np.einsum("aff->af", file["covariance"].values))
+        assert file["temperature"].attrs["units"] == "K" and file["truth"].shape == (5, 4)
+    within(table["std_k"], std.ravel(), 1e-9)
+    for k, channel in enumerate(result.channels):
+        monopole = channel.mean[0] / np.sqrt(4.0 * np.pi)
+        assert spectrum.temperature[0, k] == pytest.approx(monopole, rel=1e-9)
+        assert std[0, k] == pytest.approx(channel.std[0] / np.sqrt(4.0 * np.pi), rel=1e-6)
+    for one in spectrum.covariance:
+        assert np.linalg.eigvalsh(one).min() > 0.0
+    page = (tmp_path / "cube" / "report.html").read_text(encoding="utf-8")
+    assert "cap b &lt; -60" in page and "Novaco" not in page
+
+
+def test_skies_that_are_alike_have_errors_that_are_alike():
+    """Two channels measure some departures of their skies and miss others: errors of 4000 skies.
+
+    A measured mean is (1 - c) u + noise of variance c (1 - c), with the posterior variance c.
+    """
+    rng, rho, c = np.random.default_rng(3), 0.9, np.repeat([1e-4, 0.95], [150, 50])
+    row = rng.normal(size=200)
+    u = rng.normal(size=(4000, 2, 200))
+    u[:, 1] = rho * u[:, 0] + np.sqrt(1.0 - rho**2) * u[:, 1]
+    means = (1.0 - c) * u + np.sqrt(c * (1.0 - c)) * rng.normal(size=u.shape)
+    errors = np.cov(((means - u) @ row).T)
+    given, none = (("sky",), ()), np.zeros((1, 0))
+    std, zero = np.sqrt([row**2 @ c]), np.zeros(1)
+    channels = [
+        Temperatures(
+            *given, zero, std, None, none, Departure(mean, (row * c)[None]), none.T, none.T
+        )
+        for mean in means[0]
+    ]
+    covariance = SkySpectrum.of([10.0, 11.0], channels).covariance[0]
+    # 1 / sqrt(4000) of the draws, 1 / sqrt(150) of the measured correlation; three of each
+    np.testing.assert_allclose(np.diag(covariance), np.diag(errors), rtol=0.07)
+    assert covariance[0, 1] == pytest.approx(errors[0, 1], rel=0.15)
+    assert errors[0, 1] > 0.5 * errors[0, 0]
