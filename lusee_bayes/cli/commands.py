@@ -492,6 +492,50 @@ def report_command(folder: Path, *, open: Flag = False, quiet: Quiet = False) ->
     say(Console(quiet=quiet, soft_wrap=True), look_at(write_report(folder), open))
 
 
+@app.command(name="spectrum", group="Results")
+def spectrum_command(
+    run: Path,
+    *,
+    region: str = "observed sky",
+    signal: Annotated[tuple[str, ...], Repeated] = (),
+    order: int = 6,
+) -> None:
+    """Print the spectrum of the sky of a finished map of several channels.
+
+    --signal also limits a global signal: a template beside a smooth spectrum, with sky and
+    instrument marginalised.
+
+    **Examples**
+
+    - ``lusee-bayes spectrum output/cube``
+    - ``lusee-bayes spectrum output/cube --signal trough:17.5:3 --signal excess``
+
+    Parameters
+    ----------
+    run
+        Result folder of map.
+    region
+        mean sky, observed sky, "cap b > 60", "cap b < -60" or "plane |b| < 10".
+    signal
+        trough:MHZ:WIDTH (a Gaussian absorption), excess (index -2.6), constant, or a CSV file with
+        frequency_mhz and temperature_k; may be repeated.
+    order
+        Degree of the smooth spectrum, a polynomial of ln T in ln f.
+    """
+    from lusee_bayes.cli.tables import table_of_numbers
+    from lusee_bayes.results.finished_runs import FinishedRun
+    from lusee_bayes.results.signal_limit import named_template, signal_limit
+
+    spectrum = FinishedRun.read(run).sky_spectrum()
+    templates = [named_template(one) for one in signal]
+    rows = spectrum.rows(region)
+    limits = [signal_limit(spectrum, *one, region=region, order=order) for one in templates]
+    console = Console(soft_wrap=True)
+    console.print(table_of_numbers(*rows))
+    for limit in limits:
+        say(console, limit.sentence())
+
+
 @app.command(name="export", group="Results")
 def export_command(
     run: Path,

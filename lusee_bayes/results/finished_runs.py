@@ -37,6 +37,7 @@ from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.linear.information import Information
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.map_result import MapResult
+from lusee_bayes.results.sky_spectrum import SkySpectrum
 from lusee_bayes.results.summaries import MapSummary
 
 
@@ -437,6 +438,15 @@ class FinishedRun:
             return str(cross)
         lmax = len(self.channel.prior_fraction) - 1
         return "no truth" if self.channel.truth is None else f"> {lmax}"
+
+    def sky_spectrum(self) -> SkySpectrum:
+        """The spectrum of the sky. InputError for one channel, or a run of an earlier version."""
+        temperatures = [channel.temperatures for channel in self.channels]
+        spectrum = SkySpectrum.of(self.summary.frequencies_mhz, temperatures)
+        if len(temperatures) == 1 or spectrum is None:
+            reason = "has one frequency" if len(temperatures) == 1 else "is of an earlier version"
+            raise InputError(f"'{self.name}' {reason}; make a map with --frequencies 5:50:1")
+        return spectrum
 
     @classmethod
     def read(cls, folder: str | Path) -> FinishedRun:

@@ -29,9 +29,11 @@ from jaxtyping import Bool, Float
 from scipy.constants import Boltzmann, speed_of_light
 
 from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels
+from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import averaging_rows, lmax_of
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.trees import quantity
+from lusee_bayes.experiment.unknowns import ALL_TOGETHER
 from lusee_bayes.judge.chi2 import ChiSquare
 from lusee_bayes.linear.posterior import Posterior
 
@@ -264,9 +266,32 @@ class SkySpectrum:
 
     def chi2(self, region: str) -> ChiSquare:
         """Squared distance of a region's spectrum from the truth, with the full covariance."""
-        k = self.regions.index(region)
+        k = self.place(region)
         off = self.temperature[k] - self.truth[k]
         return ChiSquare(float(off @ np.linalg.solve(self.covariance[k], off)), float(len(off)))
+
+    def place(self, region: str) -> int:
+        """Index of a region. InputError for an unknown one."""
+        if region not in self.regions:
+            raise InputError(f"no region '{region}'; {nearest(region, self.regions)}")
+        return self.regions.index(region)
+
+    def rows(self, region: str) -> tuple[list[str], list[list[str]]]:
+        """Header and rows of a region's spectrum for a terminal."""
+        k = self.place(region)
+        columns = {"T [K]": self.temperature[k], "+- [K]": self.std[k]}
+        if self.truth is not None:
+            columns["true [K]"] = self.truth[k]
+        most = [f"{self.sources[j]} {self.shares[j, k, i]:.0%}" for i, j in enumerate(self.most(k))]
+        cells = [[f"{value:,.1f}" for value in one] for one in columns.values()]
+        mhz = [f"{value:g}" for value in self.frequency]
+        header = ["MHz", *columns, "most of the variance from"]
+        return header, [list(one) for one in zip(mhz, *cells, most, strict=True)]
+
+    def most(self, k: int) -> list[int]:
+        """Index of the source of most of the variance of region k, at each frequency."""
+        single = [j for j, name in enumerate(self.sources) if name != ALL_TOGETHER]
+        return [single[j] for j in np.argmax(self.shares[single, k], axis=0)]
 
     def table(self) -> Table:
         """spectrum.ecsv: a row for every frequency and region."""

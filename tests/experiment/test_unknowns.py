@@ -14,7 +14,7 @@ from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.model import radiometer, set_up, true_values
 from lusee_bayes.experiment.unknowns import NullDirection
 from lusee_bayes.instrument.products import auto_indices
-from lusee_bayes.report.map_page import map_page
+from lusee_bayes.report.pages import map_page
 from lusee_bayes.systematics.context import Setup
 from lusee_bayes.systematics.regolith import ground_per_kelvin
 

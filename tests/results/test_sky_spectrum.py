@@ -4,12 +4,14 @@ import healpy
 import numpy as np
 import pytest
 import xarray as xr
-from assertions import within
+from assertions import refuse, within
 from astropy import units as u
 from astropy.table import Table
+from commands import run
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import averaging_rows, modes_to_map
+from lusee_bayes.results.signal_limit import named_template, signal_limit
 from lusee_bayes.results.sky_spectrum import (
     Departure,
     SkySpectrum,
@@ -41,7 +43,7 @@ def test_rows_average_the_pixels_of_a_map():
 
 
 @pytest.mark.parametrize("joint", [[], ["spectral.model=components"]])
-def test_files_have_the_spectrum_with_its_covariance(joint, tmp_path):
+def test_files_have_the_spectrum_with_its_covariance(joint, tmp_path, capsys):
     frequencies = ["frequencies_mhz=[18, 20, 25, 30]", "noise.radiometer.factor=1e6"]
     scenario = lb.load_scenario("fiducial", [*SMALL, *frequencies, *joint])
     result = lb.run_map(scenario, tmp_path / "cube").result
@@ -59,8 +61,61 @@ def test_files_have_the_spectrum_with_its_covariance(joint, tmp_path):
         assert std[0, k] == pytest.approx(channel.std[0] / np.sqrt(4.0 * np.pi), rel=1e-6)
     for one in spectrum.covariance:
         assert np.linalg.eigvalsh(one).min() > 0.0
+    assert run("spectrum", tmp_path / "cube", "--signal", "trough:24:2", "--order", "1") == 0
+    printed = capsys.readouterr().out
+    assert "most of the variance from" in printed and "trough at 24 MHz" in printed
     page = (tmp_path / "cube" / "report.html").read_text(encoding="utf-8")
     assert "cap b &lt; -60" in page and "Novaco" not in page
+
+
+def spectrum_of(f, temperature, covariance):
+    shares = np.stack([np.full((1, len(f)), 0.9), np.full((1, len(f)), 0.1)])
+    given = ("observed sky",), ("gains", "ground"), f, temperature[None], covariance[None]
+    return SkySpectrum(*given, None, shares)
+
+
+@pytest.mark.parametrize(("injected", "found"), [(0.0, False), (-0.025, False), (800.0, True)])
+def test_limits_on_a_signal_cover_it(injected, found):
+    """100 data sets of a sky that turns over, of another family than the polynomial."""
+    f = np.arange(5.0, 51.0)
+    sky = cane_1979(f) * np.exp(-((4.0 / f) ** 2.1))
+    trough = -np.exp(-0.5 * ((f - 17.5) / 3.0) ** 2)
+    alike = np.exp(-0.5 * (np.log2(f[:, None] / f) / 0.3) ** 2)
+    covariance = np.outer(sky, sky) * (0.7 * alike + 0.3 * np.eye(len(f))) * 1e-6
+    rng, name = np.random.default_rng(5), "trough:17.5:3"
+    noise = rng.multivariate_normal(np.zeros(len(f)), covariance, size=100)
+    limits = [
+        signal_limit(
+            spectrum_of(f, sky + injected * trough + one, covariance), *named_template(name)
+        )
+        for one in noise
+    ]
+    pulls = np.array([(one.amplitude - injected) / one.std for one in limits])
+    # 100 draws: of the mean 0.1, of the rms 0.07
+    assert abs(pulls.mean()) < 0.35 and abs(np.sqrt((pulls**2).mean()) - 1.0) < 0.25
+    # 95 +- 2 of them; a limit is at least the amplitude
+    assert sum(one.limit > abs(injected) for one in limits) >= 88
+    assert all(one.limit > 1.6 * one.std for one in limits)
+    assert [one.detected for one in limits].count(not found) <= 1
+    assert sum(one.fit.fits for one in limits) >= 98
+    assert limits[0].without["gains"] == pytest.approx(limits[0].std * np.sqrt(0.1), rel=1e-6)
+    assert ("detected" if found else "without errors from gains") in limits[0].sentence()
+
+
+def test_templates_and_what_has_no_limit(tmp_path):
+    f = np.arange(5.0, 51.0)
+    bent = spectrum_of(f, 1e5 * (1.0 + 0.5 * np.sin(f)), np.eye(len(f)))
+    assert "raise --order" in signal_limit(bent, *named_template("constant")).sentence()
+    file = tmp_path / "dip.csv"
+    file.write_text("frequency_mhz,temperature_k\n10,0\n20,-1\n30,0\n")
+    name, template = named_template(str(file))
+    assert name == "dip" and template(np.array([15.0]))[0] == -0.5
+    assert named_template("excess")[1](np.array([20.0]))[0] == 1.0
+    for text in ("trough:1", "nothing"):
+        refuse("expected trough|no template", named_template, text)
+    refuse("no region", signal_limit, bent, *named_template("excess"), region="cap")
+    few = spectrum_of(f[:6], bent.temperature[0, :6], np.eye(6))
+    refuse("at least 9", signal_limit, few, *named_template("excess"))
 
 
 def test_skies_that_are_alike_have_errors_that_are_alike():

@@ -16,7 +16,7 @@ from scipy.linalg import block_diag
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import per_mode
 from lusee_bayes.experiment.model import set_up, true_values
-from lusee_bayes.report.map_page import map_page
+from lusee_bayes.report.pages import map_page
 from lusee_bayes.runs import channels, map_run
 from lusee_bayes.runs.channels import map_channels
 

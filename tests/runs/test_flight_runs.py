@@ -17,7 +17,7 @@ from lusee_bayes.experiment.data_files import reduce_files
 from lusee_bayes.flight.reduced import read_reduced, write_reduced
 from lusee_bayes.flight.session_files import read_session
 from lusee_bayes.report.figures.judgement import calibration
-from lusee_bayes.report.map_page import flight_section
+from lusee_bayes.report.pages import flight_section
 from lusee_bayes.report.rendering import render
 from lusee_bayes.runs.data_run import reduced_lines, run_simulate_flight
 

@@ -1,0 +1,202 @@
+"""Limits on a global signal: a template beside the spectrum of the sky.
+
+The spectrum y of a region, with the posterior covariance V of all frequencies
+(:mod:`.sky_spectrum`), is fitted by ::
+
+    y(f) = exp(sum_k c_k T_k(x)) + a t(f),    x = ln f scaled to -1 ... 1,
+
+a smooth sky, a polynomial of ln f, plus a template t of the amplitude a. T_k are Chebyshev
+polynomials; c and a have flat priors. Sky, gains, receivers and ground are in V.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy.polynomial.chebyshev import chebvander
+from scipy.optimize import least_squares
+from scipy.stats import foldnorm
+
+from lusee_bayes.core.arrays import Square, Vector
+from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.layouts import Layout, Variable
+from lusee_bayes.core.linalg import checked_cholesky
+from lusee_bayes.core.reading import read_table
+from lusee_bayes.experiment.unknowns import ALL_TOGETHER
+from lusee_bayes.judge.chi2 import ChiSquare
+from lusee_bayes.results.sky_spectrum import OBSERVED, Frequencies, SkySpectrum
+
+# degree of the polynomial, and the relative tolerance of its fit
+ORDER, SETTLED = 6, 1e-12
+# standard deviations of a detection, and the probability below the limit
+DETECTED, LEVEL = 5.0, 0.95
+TABLE = Layout(
+    "a template of a signal",
+    {
+        "frequency_mhz": Variable(("frequency",), grows=True),
+        "temperature_k": Variable(("frequency",)),
+    },
+)
+
+
+@dataclass(frozen=True)
+class SignalLimit:
+    """The amplitude of a template beside the sky.
+
+    Attributes
+    ----------
+    name, region : str
+    amplitude, std : float
+        In units of the template.
+    limit : float
+        The magnitude of the amplitude is below it with a probability of 95 %.
+    fit : ChiSquare
+        Of the smooth sky and the signal.
+    without : dict of float
+        Standard deviation if errors from one source (:class:`.SkySpectrum`) were absent.
+    """
+
+    name: str
+    region: str
+    amplitude: float
+    std: float
+    limit: float
+    fit: ChiSquare
+    without: dict[str, float]
+
+    @property
+    def detected(self) -> bool:
+        """Whether the smooth sky fits, and the amplitude is beyond five standard deviations."""
+        return self.fit.fits and abs(self.amplitude) > DETECTED * self.std
+
+    def sentence(self) -> str:
+        """The limit in words, with the source that sets it."""
+        found = f"{self.amplitude:.3g} +- {self.std:.2g} K"
+        if not self.fit.fits:
+            return (
+                f"{self.name}: no limit, a smooth spectrum of the {self.region} does not fit "
+                f"({self.fit.words()}); raise --order"
+            )
+        if self.detected:
+            return f"{self.name}: detected, {found}"
+        least = min(self.without, key=self.without.__getitem__)
+        return (
+            f"{self.name}: below {self.limit:.3g} K (95 %), {found}; without errors from "
+            f"{least} the error would be {self.without[least]:.2g} K"
+        )
+
+
+def signal_limit(
+    spectrum: SkySpectrum,
+    name: str,
+    template: Callable[[Frequencies], Frequencies],
+    *,
+    region: str = OBSERVED,
+    order: int = ORDER,
+) -> SignalLimit:
+    """Fit a template beside the smooth spectrum of a region.
+
+    Parameters
+    ----------
+    spectrum : SkySpectrum
+    name : str
+        Of the template.
+    template : callable
+        t(f), in K, for frequencies in MHz.
+    region : str, optional
+        One of the spectrum's regions.
+    order : int, optional
+        Degree of the polynomial of ln f.
+
+    Raises
+    ------
+    InputError
+        If the region is unknown, there are too few frequencies, or the fit does not converge.
+    """
+    k, f = spectrum.place(region), spectrum.frequency
+    if len(f) < order + 3:
+        raise InputError(
+            f"{len(f)} frequencies do not determine a polynomial of degree {order} and a signal: "
+            f"at least {order + 3} are needed; lower --order"
+        )
+    x = np.log(f / np.sqrt(f.min() * f.max())) / np.log(np.sqrt(f.max() / f.min()))
+    smooth, t, y = chebvander(x, order), template(f), spectrum.temperature[k]
+    if not (np.isfinite(y) & (y > 0.0)).all():
+        raise InputError(f"the {region} has temperatures that are not positive")
+    whitener = np.linalg.inv(
+        checked_cholesky("the covariance of the spectrum", spectrum.covariance[k])
+    )
+
+    def sky(values: Vector) -> Frequencies:
+        return np.exp(smooth @ values[:-1])
+
+    def slopes(values: Vector) -> Float[np.ndarray, "frequency columns"]:
+        return np.column_stack([sky(values)[:, None] * smooth, t])
+
+    start = np.append(np.linalg.lstsq(smooth, np.log(y), rcond=None)[0], 0.0)
+    found = least_squares(
+        lambda values: whitener @ (sky(values) + values[-1] * t - y),
+        start,
+        lambda values: whitener @ slopes(values),
+        x_scale="jac",
+        **dict.fromkeys(("ftol", "xtol", "gtol"), SETTLED),
+    )
+    if not found.success:
+        raise InputError(f"the smooth spectrum of the {region} does not converge; lower --order")
+    amplitude, off = float(found.x[-1]), found.fun
+
+    def error_under(covariance: Square) -> float:
+        columns = slopes(found.x)
+        normal = columns.T @ np.linalg.solve(covariance, columns)
+        return float(np.sqrt(np.linalg.inv(normal)[-1, -1]))
+
+    std, without = error_under(spectrum.covariance[k]), {}
+    for source, shares in zip(spectrum.sources, spectrum.shares[:, k], strict=True):
+        if source == ALL_TOGETHER:
+            continue
+        # never to nothing: shares of several sources overlap
+        kept = np.sqrt(np.clip(1.0 - shares, 1e-6, 1.0))
+        without[source] = error_under(spectrum.covariance[k] * np.outer(kept, kept))
+    limit = float(foldnorm.ppf(LEVEL, abs(amplitude) / std, scale=std))
+    fit = ChiSquare(float(off @ off), float(len(f) - order - 2))
+    return SignalLimit(name, region, amplitude, std, limit, fit, without)
+
+
+def named_template(text: str) -> tuple[str, Callable[[Frequencies], Vector]]:
+    """A template from its text on the command line, with a name.
+
+    Parameters
+    ----------
+    text : str
+        ``trough:MHZ:WIDTH``, a Gaussian absorption of 1 K; ``excess``, a background of 1 K at
+        20 MHz with the index -2.6; ``constant``, 1 K as of the CMB; or a CSV file with
+        ``frequency_mhz`` and ``temperature_k``, interpolated.
+
+    Raises
+    ------
+    InputError
+        For anything else.
+    """
+    kind, *numbers = text.split(":")
+    if kind == "excess" and not numbers:
+        return "excess background (1 K at 20 MHz)", lambda f: (f / 20.0) ** -2.6
+    if kind == "constant" and not numbers:
+        return "constant", np.ones_like
+    if kind == "trough":
+        try:
+            centre, width = map(float, numbers)
+        except ValueError:
+            raise InputError(f"got '{text}', expected trough:MHZ:WIDTH, as trough:17.5:3") from None
+        name = f"trough at {centre:g} MHz, {width:g} MHz wide"
+        return name, lambda f: -np.exp(-0.5 * ((f - centre) / width) ** 2)
+    if not Path(text).is_file():
+        raise InputError(
+            f"no template '{text}'; give trough:MHZ:WIDTH, excess, constant or a CSV file"
+        )
+    table = read_table(Path(text), TABLE)
+    mhz, kelvin = table["frequency_mhz"], table["temperature_k"]
+    return Path(text).stem, lambda f: np.interp(f, mhz, kelvin)
