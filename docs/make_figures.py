@@ -48,7 +48,7 @@ from lusee_bayes.report.figures.drawing import (
     temperatures,
     without_minor_ticks,
 )
-from lusee_bayes.report.figures.maps import channel_map
+from lusee_bayes.report.figures.maps import channel_map, sky_spectrum
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.channel_map import conditioned
 from lusee_bayes.runs.plan_run import expected_inference
@@ -640,6 +640,24 @@ def gallery_flight() -> None:
     _save(figure, "gallery_flight", dpi=125)
 
 
+# ten channels of the default scenario, with gains and receivers unknown, too
+TEN_CHANNELS = (
+    "frequencies_mhz=[6, 8, 10, 13, 17, 21, 25, 30, 36, 42]",
+    "noise.receiver={power_k: 20000, slope: -2, relative_std: 0.1, smooth_octaves: 1}",
+    "noise.gain={sigma: 0.005, correlation_h: 10}",
+)
+
+
+def spectrum() -> None:
+    """Draw the spectrum of the sky, and its errors by source."""
+    with TemporaryDirectory() as folder:
+        result = lb.run_map(lb.load_scenario("first_map", TEN_CHANNELS), f"{folder}/map").result
+    for name, figure in sky_spectrum(result).items():
+        figure.savefig(HERE / f"spectrum_{name}.png", dpi=90)
+    for region in (found := result.sky_spectrum()).regions:
+        print(region, found.chi2(region).words())
+
+
 FIGURES = (
     first_map,
     point_sources,
@@ -653,6 +671,7 @@ FIGURES = (
     gallery_cube,
     gallery_flight,
     gallery_turntable,
+    spectrum,
 )
 
 if __name__ == "__main__":
