@@ -2,6 +2,8 @@
 
 import csv
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import matplotlib.image
@@ -15,6 +17,12 @@ from lusee_bayes.core.files import LOCK
 def run(*arguments: object) -> int:
     """The exit code of a command."""
     return main([str(argument) for argument in arguments])
+
+
+def python(*arguments: object, check: bool = True, **options) -> subprocess.CompletedProcess:
+    """A Python of its own with these arguments, and what it has said."""
+    command = [sys.executable, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=check, **options)
 
 
 def sets(*overrides: str) -> list[str]:

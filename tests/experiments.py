@@ -14,7 +14,7 @@ from reference_linear import random_covariance
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.experiment import Experiment, program_pieces
-from lusee_bayes.experiment.model import full_model, radiometer, simulate
+from lusee_bayes.experiment.model import full_model, radiometer, simulate, true_values
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.unknowns import Unknowns, UnknownsReport
@@ -141,6 +141,25 @@ def differences(systematic, model, sky, centre, steps) -> np.ndarray:
 
     over = [(seen(centre + s) - seen(centre - s)) / (2.0 * np.linalg.norm(s)) for s in steps]
     return np.stack(over, axis=1)
+
+
+def rms_of_directions(found: Inference, sky: np.ndarray) -> float:
+    """How far the map is off a sky, RMS over all directions, each in its own standard deviation."""
+    posterior = found.posterior
+    away = posterior.prior.whiten(sky) - posterior.white_mean
+    return float(np.sqrt(np.mean((np.asarray(posterior.lower).T @ away) ** 2)))
+
+
+def pulls(truth: Setup, found: Inference) -> dict[str, float]:
+    """How far every parameter is off, in its standard deviations."""
+    values, off = true_values(truth), {}
+    for part in found.expanded:
+        own, told = part.systematic, found.amplitudes(part)
+        true = own.true(values)
+        z = (np.array([true[name] for name in own.names]) - own.means) / own.stds
+        away = (np.asarray(part.expected) + told.mean - z) / told.std
+        off |= dict(zip(own.names, away.tolist(), strict=True))
+    return off
 
 
 def with_known_sky(setup: Setup, scale: float) -> Setup:

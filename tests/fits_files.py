@@ -19,6 +19,25 @@ def write_images(path: Path, images: dict[str, np.ndarray], header: dict[str, ob
     return path
 
 
+PAIRS = [[i, j] for i in range(4) for j in range(i, 4)]
+HEADER = {
+    "LUNAR_DAY": "2027-02-01 00:00:00 to 2027-02-02 00:00:00",
+    "DELTAT_SEC": 7200.0,
+    "LUN_LAT_DEG": -23.814,
+    "LUN_LONG_DEG": 182.258,
+}
+
+
+def write_products(path, data=None, pairs=PAIRS, header=HEADER, frequencies=(10.0, 20.0)) -> Path:
+    """A value for every product, time and channel: 100 product + time + channel / 10."""
+    if data is None:
+        n = sum(1 if i == j else 2 for i, j in pairs)
+        product, time, channel = np.arange(n), np.arange(12), np.arange(len(frequencies))
+        data = 100.0 * product[None, :, None] + time[:, None, None] + channel / 10.0
+    images = {"data": data, "freq": np.array(frequencies), "combinations": np.array(pairs)}
+    return write_images(path, images, header)
+
+
 def write_response(path: Path) -> Path:
     """A small four-port response, FITS version 3, of four different short dipoles over ground."""
     theta, phi = np.linspace(0, 90, 13), np.linspace(0, 360, 25)

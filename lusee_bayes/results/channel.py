@@ -24,7 +24,7 @@ from lusee_bayes.judge.chi2 import HEADLINES, ChiSquare, Fit, Level
 from lusee_bayes.judge.coverage import Coverage, latitudes
 from lusee_bayes.judge.residuals import Group
 from lusee_bayes.linear.information import Information
-from lusee_bayes.results.sky_spectrum import Departure, Temperatures
+from lusee_bayes.results.sky_spectrum import Departure, RegionTemperatures
 
 # recurring types of NumPy arrays
 SkyModes = Float[np.ndarray, " mode"]
@@ -171,7 +171,7 @@ class ChannelData:
     information : Information or None
         Information in all these data, if it is kept for updates with new data.
     departure : Departure or None
-        What its sky has in common with those at other frequencies.
+        Its sky's departure from the prior, and the error in common with other frequencies.
     """
 
     frequency_mhz: float
@@ -246,7 +246,7 @@ class ChannelResult(ChannelData, Described):
         Receivers, ground and gain table, where the model has them.
     theta : InstrumentPosterior or None
         All unknowns of the instrument, and their effect on the map.
-    temperatures : Temperatures or None
+    temperatures : RegionTemperatures or None
         Of regions of the sky; None in files of earlier versions.
     """
 
@@ -267,7 +267,7 @@ class ChannelResult(ChannelData, Described):
     coverage: tuple[Coverage, ...] = ()
     unknowns: UnknownsReport | None = None
     theta: InstrumentPosterior | None = None
-    temperatures: Temperatures | None = None
+    temperatures: RegionTemperatures | None = None
 
     def description(self) -> tuple[str, ...]:
         return (

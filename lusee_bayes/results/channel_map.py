@@ -37,7 +37,7 @@ from lusee_bayes.linear.posterior import Posterior, pixel_std, prior_pixel_std
 from lusee_bayes.results.channel import ChannelData, ChannelResult, Details, Judged
 from lusee_bayes.results.finished_runs import SavedInformation, taken
 from lusee_bayes.results.map_result import prior_sentence
-from lusee_bayes.results.sky_spectrum import Departure, Temperatures
+from lusee_bayes.results.sky_spectrum import Departure, RegionTemperatures
 from lusee_bayes.sky.prior import DensePrior, Prior
 from lusee_bayes.systematics.beam import beam_rms_difference
 
@@ -376,7 +376,7 @@ def channel_result(
     instrument : Unknowns, optional
         Unknowns of the instrument given the sky, where the model has them.
     common : (modes, white) array, optional
-        Root of the covariance with other channels, as of :class:`.Temperatures`.
+        Root of the covariance with other channels, as of :class:`.RegionTemperatures`.
     joint : (all, modes) array, optional
         Draws of all channels together, in K.
     covariance_kept : bool
@@ -410,7 +410,7 @@ def channel_result(
         information_bits=information_bits,
         coverage=held,
         theta=theta,
-        temperatures=Temperatures.of(data.highest_altitude, mean, covariance, **options),
+        temperatures=RegionTemperatures.of(data.highest_altitude, mean, covariance, **options),
     )
 
 

@@ -72,7 +72,7 @@ def sky_regions(highest_altitude: Pixels) -> dict[str, Bool[np.ndarray, " fine"]
 
 @dataclass(frozen=True)
 class Departure:
-    """What a channel's sky and its error have in common with those at other frequencies.
+    """A channel's departure from its prior, and the error in common with other frequencies.
 
     Attributes
     ----------
@@ -108,8 +108,8 @@ class Departure:
 
 
 @dataclass(frozen=True)
-class Temperatures:
-    """Temperatures of regions in one channel.
+class RegionTemperatures:
+    """RegionTemperatures of regions in one channel.
 
     Attributes
     ----------
@@ -118,7 +118,7 @@ class Temperatures:
     mean, std : (regions,) array
     truth : (regions,) array or None
     common : (regions, shared) array
-        L W: per unit of what channels share.
+        L W: change per unit of the shared unknowns.
     departure : Departure or None
         None in a joint posterior.
     shares : (sources, regions) array
@@ -136,7 +136,7 @@ class Temperatures:
     common: Float[np.ndarray, "area shared"] = quantity("K", "root of the shared covariance")
     departure: Departure | None
     shares: Float[np.ndarray, "source area"] = quantity("1", "fraction of the variance")
-    draws: Float[np.ndarray, "draw area"] = quantity("K", "draws of a joint posterior")
+    draws: Float[np.ndarray, "joint_draw area"] = quantity("K", "draws of a joint posterior")
 
     @classmethod
     def of(
@@ -150,7 +150,7 @@ class Temperatures:
         common: Columns | None = None,
         departure: Departure | None = None,
         draws: Float[np.ndarray, "draw mode"] | None = None,
-    ) -> Temperatures:
+    ) -> RegionTemperatures:
         """Compute them from a posterior of the sky.
 
         Parameters
@@ -203,7 +203,7 @@ class SkySpectrum:
     Attributes
     ----------
     regions, sources : tuple of str
-        As of :class:`Temperatures`.
+        As of :class:`RegionTemperatures`.
     frequency : (frequencies,) array
     temperature : (regions, frequencies) array
     covariance : (regions, frequencies, frequencies) array
@@ -225,7 +225,7 @@ class SkySpectrum:
 
     @classmethod
     def of(
-        cls, frequencies_mhz: Sequence[float], channels: Sequence[Temperatures | None]
+        cls, frequencies_mhz: Sequence[float], channels: Sequence[RegionTemperatures | None]
     ) -> SkySpectrum | None:
         """Combine the temperatures of all channels; None if one lacks them (earlier versions)."""
         if any(one is None for one in channels):

@@ -9,8 +9,6 @@ import re
 import shlex
 import shutil
 import signal
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +20,16 @@ import xarray as xr
 from assertions import raising, refuse
 from astropy.io import fits
 from astropy.table import Table
-from commands import assert_drawn, content, posterior_of, refused, run, sky_draws_of, table_of
+from commands import (
+    assert_drawn,
+    content,
+    posterior_of,
+    python,
+    refused,
+    run,
+    sky_draws_of,
+    table_of,
+)
 from rich.console import Console
 
 import lusee_bayes
@@ -341,16 +348,15 @@ def test_evidences_of_other_data_are_not_compared(finished, change, reason):
     assert "ten is at 10 MHz instead of 25" in evidence_caveat([finished, ten])
 
 
-@pytest.mark.parametrize(
-    ("option", "message"),
-    [("--simulations=50", "at least 100 simulations"), ("--draws=20", "100 draws of each chain")],
-)
+FEW = [("--simulations=50", "at least 100 simulations"), ("--draws=20", "100 draws of each chain")]
+
+
+@pytest.mark.parametrize(("option", "message"), FEW)
 def test_options_are_checked_before_anything_is_loaded(option, message, tmp_path):
     """Not even a scenario that does not exist is looked for, nor JAX imported."""
     code = "import sys; from lusee_bayes.cli.main import main; code = main(sys.argv[1:]); "
     code += "print('jax' in sys.modules); raise SystemExit(code)"
-    command = [sys.executable, "-c", code, "validate", "no such scenario", option]
-    found = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
+    found = python("-c", code, "validate", "no such scenario", option, cwd=tmp_path, check=False)
     assert found.returncode == 2 and message in found.stderr
     assert found.stdout.strip() == "False"
     assert not list(tmp_path.iterdir())
@@ -413,9 +419,7 @@ def outcome(*arguments, count=False):
     program = PROGRAM.format(count=count, arguments=[str(a) for a in arguments])
     environment = {name: v for name, v in os.environ.items() if not name.startswith("JAX")}
     environment["LUSEE_BAYES_CACHE"] = "off"
-    command = [sys.executable, "-c", program]
-    found = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
-    n, *modules = found.stdout.splitlines()[-1].split()
+    n, *modules = python("-c", program, env=environment).stdout.splitlines()[-1].split()
     return int(n), set(modules)
 
 
@@ -463,8 +467,7 @@ print(sum("cache_hits" in name for name in found), flush=True)
 def compiled(cache, *without):
     """What the program says, in an environment without variables that begin so."""
     own = {k: v for k, v in os.environ.items() if not k.startswith(("JAX", *without))}
-    command, env = [sys.executable, "-c", COMPILING], own | {SWITCH: str(cache)}
-    done = subprocess.run(command, capture_output=True, text=True, check=True, env=env)
+    done = python("-c", COMPILING, env=own | {SWITCH: str(cache)})
     return done.stdout, done.stderr
 
 

@@ -122,9 +122,10 @@ def test_what_cannot_be_started_is_refused(given, message):
     refuse(message, opened, replace(DEMAND, task_bytes=1e13), **given)
 
 
-@pytest.mark.parametrize(
-    "answer", [b"", b"HTTP/1.0 400 Bad Request\r\n\r\n"], ids=["silent", "HTTP"]
-)
+ANSWERS = [b"", b"HTTP/1.0 400 Bad Request\r\n\r\n"]
+
+
+@pytest.mark.parametrize("answer", ANSWERS, ids=["silent", "HTTP"])
 def test_what_is_no_scheduler_is_refused_in_seconds(answer, monkeypatch):
     """A Client would wait for ever, deaf to Ctrl-C, or ask for exabytes of memory."""
     dask_engine = pytest.importorskip("lusee_bayes.core.dask_engine")

@@ -220,18 +220,18 @@ def test_an_interrupt_while_files_are_moved_loses_nothing(folder, monkeypatch):
         assert content(folder).keys() == {*OWN, *NEW, fs.MANIFEST}
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "{", "[]", "3", '{"kind": "map"}', '{"kind": "map", "files": 3, "discard": []}',
-        '{"kind": "map", "files": [1], "discard": []}', "\0",
-        # nothing outside the folder is to be moved or removed
-        '{"kind": "map", "files": ["../own.txt"], "discard": []}',
-        '{"kind": "map", "files": [], "discard": ["/tmp"]}',
-        '{"kind": "map", "files": [], "discard": ["."]}',
-        '{"kind": "map", "files": [], "discard": [], "origin": 3}',
-    ],
-)  # fmt: skip
+MANIFESTS = [
+    "{", "[]", "3", '{"kind": "map"}', '{"kind": "map", "files": 3, "discard": []}', "\0",
+    '{"kind": "map", "files": [1], "discard": []}',
+    # nothing outside the folder is to be moved or removed
+    '{"kind": "map", "files": ["../own.txt"], "discard": []}',
+    '{"kind": "map", "files": [], "discard": ["/tmp"]}',
+    '{"kind": "map", "files": [], "discard": ["."]}',
+    '{"kind": "map", "files": [], "discard": [], "origin": 3}',
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", MANIFESTS)
 def test_a_damaged_manifest_is_one_sentence_before_anything_is_written(text, folder):
     (folder / fs.MANIFEST).write_text(text)
     before = content(folder)

@@ -1,7 +1,5 @@
 """Products, factors and inverses of symmetric matrices against numpy."""
 
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -13,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from assertions import refuse
+from commands import python
 from reference_linear import exact
 from scipy.linalg.lapack import dpotri
 
@@ -79,8 +78,7 @@ def test_checked_cholesky(batch):
 
 def test_checked_cholesky_names_what_has_no_factor():
     """One of a stack is enough; its lowest eigenvalue is 1 - 2."""
-    bad = np.array([[1.0, 2.0], [2.0, 1.0]])
-    stack = jnp.asarray(np.stack([np.eye(2), bad]))
+    stack = jnp.asarray([np.eye(2), [[1.0, 2.0], [2.0, 1.0]]])
     words = "the noise is .* eigenvalue is -1 .largest entry 2"
     refuse(words, la.checked_cholesky, "the noise", stack)
     # values are not known there
@@ -97,8 +95,7 @@ def test_batched_solves_side_by_side_end():
         "print([float(jnp.abs(x - jnp.eye(60) / k).max()) < 1e-14\n"
         "       for _ in range(10) for k, x in enumerate(jax.jit(f)(a), 1)].count(True))"
     )
-    command = [sys.executable, "-c", program]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    done = python("-c", program, timeout=60, check=False)
     assert done.stdout == "80\n", done.stderr
 
 

@@ -9,8 +9,6 @@ import os
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 from importlib import import_module
 from pathlib import Path
 
@@ -19,6 +17,7 @@ import jax.numpy as jnp
 import nbformat
 import numpy as np
 import pytest
+from commands import python
 from matplotlib.figure import Figure
 from nbclient import NotebookClient
 
@@ -198,9 +197,8 @@ def test_the_worked_examples_pass_their_tests(tmp_path):
         else:
             path.write_text(applied(path.read_text(), match["how"], match["line"], match["code"]))
     environment = os.environ | {"PYTHONPATH": str(tmp_path), "MPLBACKEND": "agg"}
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests"]
-    options = {"cwd": tmp_path, "env": environment, "capture_output": True, "text": True}
-    found = subprocess.run(command, check=False, **options)
+    given = "-m", "pytest", "-q", "-p", "no:cacheprovider", "tests"
+    found = python(*given, cwd=tmp_path, env=environment, check=False)
     assert found.returncode == 0, found.stdout[-3000:]
     assert "6 passed" in found.stdout
 

@@ -62,9 +62,10 @@ def distance(inference, truth):
 ESSENTIAL = [pytest.mark.long, pytest.mark.essential]
 
 
-@pytest.mark.parametrize(
-    "term", [pytest.param(t, marks=[] if t in ("radiometer", "beam") else ESSENTIAL) for t in TERMS]
-)
+EACH_TERM = [pytest.param(t, marks=[] if t in ("radiometer", "beam") else ESSENTIAL) for t in TERMS]
+
+
+@pytest.mark.parametrize("term", EACH_TERM)
 def test_the_errors_are_what_is_claimed(term):
     scenario = wrong_data.scenario(LMAX, *TERMS[term])
     total, modes = 0.0, 0
@@ -142,7 +143,6 @@ def test_the_default_path_with_drifts(sigma, test_data):
     assert 1.0 - 4.0 * np.sqrt(2.0 / known) < total / known < 1.0 + 4.0 * np.sqrt(2.0 / known)
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_a_prior_that_does_not_settle_with_n_is_said_to(monkeypatch):
     """Rounds that may never end are cut short, and the map says by how much it still moves."""
@@ -173,7 +173,6 @@ def is_named(wrong, found):
     return any(wrong.cause in proposal.words for proposal in found.proposals[:3])
 
 
-@pytest.mark.long
 @pytest.mark.essential
 def test_the_cause_is_named():
     """One of many: the others take minutes."""

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from assertions import refuse, within
-from fits_files import write_images
+from fits_files import write_products
 from scipy import stats
 from scipy.linalg import eigh
 
@@ -110,15 +110,15 @@ def test_a_file_that_says_it_is_believed_whatever_is_simulated(tmp_path, window)
         assert (found.observation.windows is None) == (window == "instant")
 
 
-@pytest.mark.parametrize(
-    ("window", "timestamp", "words"),
-    [
-        (None, None, r"use --set observation.timestamp=start \(or middle, end, instant\)"),
-        ("instant", "start", "declares its samples instants, but the scenario"),
-        ("mean", "start", "declares its samples means over windows"),
-        ("mean", "instant", "observation.timestamp=instant; remove that"),
-    ],
-)
+UNCLEAR = [
+    (None, None, r"use --set observation.timestamp=start \(or middle, end, instant\)"),
+    ("instant", "start", "declares its samples instants, but the scenario"),
+    ("mean", "start", "declares its samples means over windows"),
+    ("mean", "instant", "observation.timestamp=instant; remove that"),
+]
+
+
+@pytest.mark.parametrize(("window", "timestamp", "words"), UNCLEAR)
 def test_what_is_unclear_or_contradicts_is_refused(tmp_path, window, timestamp, words):
     path, _ = file_of(tmp_path, window)
     given = [] if timestamp is None else [f"observation.timestamp={timestamp}"]
@@ -133,11 +133,7 @@ def test_no_experiment_of_data_with_unclear_times_or_a_fixed_axis_in_windows(tmp
 
 
 def test_waterfalls_are_instants_unless_the_scenario_says_other(tmp_path):
-    header = {"LUNAR_DAY": "2027-02-01 00:00:00 to 2027-02-02 00:00:00", "DELTAT_SEC": STEP}
-    header |= {"LUN_LAT_DEG": -23.814, "LUN_LONG_DEG": 182.258}
-    pairs = np.array([[i, j] for i in range(4) for j in range(i, 4)])
-    images = {"data": np.full((12, 16, 1), 3e4), "freq": np.array([25.0]), "combinations": pairs}
-    path = write_images(tmp_path / "w.fits", images, header)
+    path = write_products(tmp_path / "w.fits", np.full((12, 16, 1), 3e4), frequencies=(25.0,))
     found = lb.read_data(path, scenario())
     assert found.observation.windows is None and found.says_window
     started = lb.read_data(path, scenario("observation.timestamp=start")).observation

@@ -23,9 +23,10 @@ def variances(setup) -> np.ndarray:
     return np.asarray(full_model(setup).noise.diagonal())
 
 
-@pytest.mark.parametrize(
-    "override", ["seed=3", "noise={gain: {sigma: 0.02}, beam: {parameters: {length_m: 0.1}}}"]
-)
+CHANGES = ["seed=3", "noise={gain: {sigma: 0.02}, beam: {parameters: {length_m: 0.1}}}"]
+
+
+@pytest.mark.parametrize("override", CHANGES)
 def test_neither_noise_nor_seed_enter_a_setup(override, tiny_experiment):
     experiment = lb.build(small_scenario(override))
     for name in ("coupling", "prior", "beams", "background", "signal", "sky", "responses"):
@@ -138,21 +139,21 @@ def test_files_of_another_frequency_are_scaled(files):
     np.testing.assert_allclose(prior.mean, 2**2.5 * map_to_modes(pixels, FILE_LMAX), rtol=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("0 1\n1 2\n3 4\n", "no C_ell at ell = 2"),
-        ("2 1\n3 2\n", "no C_ell at ell = 0"),
-        ("0 1\n1 2\n", "no C_ell at ell = 2 and 4 more up to lmax = 6"),
-        ("0 1\n0 2\n", "does not increase"),
-        ("".join(f"{ell} 0\n" for ell in range(9)), "cl.txt: C_ell is zero"),
-        ("0 -1\n", "outside 0 to inf"),
-        ("0 nan\n", "NaN"),
-        ("0 1 2\n", "expected ell and C_ell"),
-        ("", "no numbers"),
-        ("\0\1", "cl.txt"),
-    ],
-)
+BAD_SPECTRA = [
+    ("0 1\n1 2\n3 4\n", "no C_ell at ell = 2"),
+    ("2 1\n3 2\n", "no C_ell at ell = 0"),
+    ("0 1\n1 2\n", "no C_ell at ell = 2 and 4 more up to lmax = 6"),
+    ("0 1\n0 2\n", "does not increase"),
+    ("".join(f"{ell} 0\n" for ell in range(9)), "cl.txt: C_ell is zero"),
+    ("0 -1\n", "outside 0 to inf"),
+    ("0 nan\n", "NaN"),
+    ("0 1 2\n", "expected ell and C_ell"),
+    ("", "no numbers"),
+    ("\0\1", "cl.txt"),
+]
+
+
+@pytest.mark.parametrize(("text", "words"), BAD_SPECTRA)
 def test_a_bad_spectrum_is_refused(tmp_path, text, words):
     path = tmp_path / "cl.txt"
     path.write_text(text)

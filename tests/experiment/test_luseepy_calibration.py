@@ -17,7 +17,6 @@ from reference_linear import assert_draws_follow
 from scipy.stats import chi2, kstest
 
 import lusee_bayes as lb
-from lusee_bayes.core.harmonics import from_healpy
 from lusee_bayes.experiment.model import base_model, set_up
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.instrument.waterfalls import read_waterfall
@@ -71,9 +70,7 @@ def test_the_naive_sum_is_luseepys(naive, test_data):
     folder = test_data / "luseepy"
     with fits.open(folder / "waterfall_exact_engine.fits") as hdus:
         data = hdus["data"].data[:, :, list(hdus["freq"].data).index(FREQUENCY)]
-    with np.load(folder / "sky_alm.npz") as file:
-        sky = dict(file)
-    modes = from_healpy(sky["alm"][list(sky["freq"]).index(FREQUENCY)])
+    modes = lb.sky_from_file(folder / "sky_alm.npz", FREQUENCY, 47).modes
     got = naive.rows(Time("2025-02-01 00:00:00", scale="utc") + 150 * STEP_S * u.s, 47) @ modes
     assert np.abs(got - data[150]).max() < 1e-12 * np.abs(data).max()
 

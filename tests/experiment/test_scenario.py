@@ -43,14 +43,9 @@ def test_a_resolved_scenario_is_the_same_scenario(name, tmp_path):
 
 
 @pytest.fixture
-def short(tmp_path):
+def short(write):
     """A scenario of a file with this text alone."""
-
-    def loaded(text, *overrides):
-        (tmp_path / "short.yaml").write_text(text)
-        return load_scenario(tmp_path / "short.yaml", overrides)
-
-    return loaded
+    return lambda text, *overrides: load_scenario(write(text, "short.yaml"), overrides)
 
 
 def test_overrides_reach_into_sections_that_the_file_leaves_out(short):

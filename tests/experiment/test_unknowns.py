@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
-from experiments import drawn, four_ports, unknowns_report, with_known_sky
+from experiments import drawn, four_ports, parts, unknowns_report, with_known_sky
 from reference_linear import white_posterior
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.experiment import Experiment
-from lusee_bayes.experiment.model import radiometer, set_up, true_values
+from lusee_bayes.experiment.model import set_up, true_values
 from lusee_bayes.experiment.unknowns import NullDirection
 from lusee_bayes.instrument.products import auto_indices
 from lusee_bayes.report.pages import map_page
@@ -34,9 +34,8 @@ def joint(experiment: Experiment):
     table = found.systematics[-1]
     factors = np.asarray(table.systematic.factors(table.centre))
     t = np.concatenate([np.asarray(s.columns) for s in found.systematics], axis=1)
-    a = np.concatenate([factors[:, None] * np.asarray(setup.coupling.dense()), t], axis=1)
-    prior = np.append(np.sqrt(np.asarray(setup.prior.variance())), np.ones(t.shape[1]))
-    noise = np.sqrt(np.asarray(radiometer(setup).diagonal()))
+    a, prior, noise = parts(setup)
+    a, prior = np.concatenate([factors[:, None] * a, t], axis=1), np.append(prior, np.ones(9))
     own = table.columns @ (np.asarray(table.centre) - table.expected)
     rest = np.asarray(experiment.data.data) - factors * np.asarray(setup.offset) + own
     return found, prior, white_posterior(a, prior, noise, rest)

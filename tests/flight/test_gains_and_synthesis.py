@@ -90,10 +90,10 @@ def test_luseepys_folder_and_own_file_hold_the_same(tmp_path, model):
     np.testing.assert_array_equal(read_gain_table(own).component_std, made.component_std)
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [({"mean": 0.0}, "gain"), ({"mean": -1.0}, "gain"), ({"anchor_mhz": 1e6}, "is this Hz")],
-)
+NO_GAINS = [({"mean": 0.0}, "gain"), ({"mean": -1.0}, "gain"), ({"anchor_mhz": 1e6}, "is this Hz")]
+
+
+@pytest.mark.parametrize(("changes", "words"), NO_GAINS)
 def test_gains_are_positive_and_their_frequencies_in_mhz(tmp_path, changes, words):
     """In luseepy's folder as in a file of the package."""
     made = table()

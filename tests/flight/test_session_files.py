@@ -283,9 +283,10 @@ DAMAGE = {
 }
 
 
-@pytest.mark.parametrize(
-    ("layout", "words", "damage"), [(k, *one) for k, damages in DAMAGE.items() for one in damages]
-)
+DAMAGED = [(k, *one) for k, damages in DAMAGE.items() for one in damages]
+
+
+@pytest.mark.parametrize(("layout", "words", "damage"), DAMAGED)
 def test_damaged_and_foreign_sessions_are_refused(request, layout, words, damage):
     path = request.getfixturevalue({3: "copy", 4: "newer"}[layout])
     with h5py.File(path, "a") as file:
@@ -329,10 +330,10 @@ def seconds_after(time, text):
 
 # TAI - UTC is 37 s since 2017, TT - TAI 32.184 s: a reading in TT is 69.184 s earlier in UTC. In a
 # second of a clock that runs slow more than a second passes
-@pytest.mark.parametrize(
-    ("scale", "offset", "rate"),
-    [("utc", 0.0, None), ("tai", -37.0, None), ("tt", -69.184, None), ("utc", 0.0, 1.0 + 1e-5)],
-)
+SCALES = [("utc", 0.0, None), ("tai", -37.0, None), ("tt", -69.184, None), ("utc", 0.0, 1.0 + 1e-5)]
+
+
+@pytest.mark.parametrize(("scale", "offset", "rate"), SCALES)
 def test_seconds_since_the_reference_in_each_scale(tmp_path, scale, offset, rate):
     utc = read_clock(clock_file(tmp_path, time_scale=scale, rate=rate)).utc(SECONDS)
     for k, raw in enumerate(SECONDS):

@@ -108,8 +108,7 @@ def files(tmp_path_factory, small_map, small_cube) -> Path:
     shutil.copy(small_cube.folder / "posterior.nc", folder / "cube.nc")
     shutil.copy(small_cube.folder / "mean.fits", folder / "cube.fits")
     write_alms(folder / "alm.fits", np.arange(1.0, 10.0), {"FREQ": 25.0})
-    alm = np.ones((2, 6), dtype=complex)
-    np.savez(folder / "alms.npz", freq=np.array([20.0, 25.0]), alm=alm)
+    np.savez(folder / "alms.npz", freq=np.array([20.0, 25.0]), alm=np.ones((2, 6), dtype=complex))
     write_sessions(folder)
     with h5py.File(folder / "sky.hdf5", "w") as file:
         file["smooth_absorb"] = np.linspace(1.0, 2.0, 192)
@@ -196,13 +195,13 @@ def sampled(tmp_path_factory) -> Path:
     return lb.run_sample(small_scenario(lmax=2), folder, sampler=sampler).folder
 
 
-@pytest.mark.parametrize(
-    ("kind", "n"),
-    [
-        *(("map", FEW), ("cube", FEW)),
-        *(pytest.param(k, OF_RESULTS, marks=pytest.mark.long) for k in ("map", "cube", "sample")),
-    ],
-)
+RESULTS = [
+    *(("map", FEW), ("cube", FEW)),
+    *(pytest.param(k, OF_RESULTS, marks=pytest.mark.long) for k in ("map", "cube", "sample")),
+]
+
+
+@pytest.mark.parametrize(("kind", "n"), RESULTS)
 def test_damaged_results(kind, n, tmp_path, request):
     if kind == "sample":
         source = request.getfixturevalue("sampled")
@@ -223,8 +222,7 @@ def test_damaged_results(kind, n, tmp_path, request):
             apply(path, change)
         changes.require_answer(lambda: write_report(folder))
         if kind == "map":
-            runs = [source, folder]
-            changes.require_answer(lambda: read_runs(runs))
+            changes.require_answer(lambda: read_runs([source, folder]))
         shutil.copy(source / name, path)
 
     @settings(max_examples=n)

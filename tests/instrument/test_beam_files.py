@@ -15,7 +15,6 @@ from fits_files import write_images
 from reference import hemisphere, real_harmonics
 
 import lusee_bayes as lb
-from lusee_bayes.core.harmonics import from_healpy
 from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.experiment.model import set_up, true_signal, true_values
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, product_beams
@@ -39,14 +38,12 @@ def luseepy(test_data):
     folder = test_data / "luseepy"
     with fits.open(folder / "waterfall_exact_engine.fits") as hdus:
         data, frequencies = hdus["data"].data.astype(float), hdus["freq"].data
-    with np.load(folder / "sky_alm.npz") as file:
-        sky = dict(file)
     times = Time("2025-02-01 00:00:00", scale="utc") + 7200.0 * np.arange(len(data)) * u.s
     observation = lb.Observation(182.258, -23.814, times, np.zeros(len(data), int), (0.0,), 7200.0)
     return (
         read_beam(folder / "synthetic_monopole_beam.fits"),
         {f: data[:, :, k].T for k, f in enumerate(frequencies)},
-        {f: from_healpy(alm) for f, alm in zip(sky["freq"], sky["alm"], strict=True)},
+        {f: lb.sky_from_file(folder / "sky_alm.npz", f, LMAX).modes for f in frequencies},
         Pointing.of(observation, LMAX, order=6),
     )
 

@@ -45,13 +45,12 @@ def test_embedded_beams():
     assert source.circuit(FREQUENCY) is None
 
 
+TWO_ARMS = {"moon_k": 250.0, "rotations_deg": (0.0, 90.0), "taper": False}
+BY_LUSEEPY = {"moon_k": 250.0, "luseepy_quadrature": True, "turntable_offset_deg": 7.0}, LUSEEPY
+
+
 @pytest.mark.parametrize(
-    ("options", "quadrature"),
-    [
-        ({}, SPLINES),
-        ({"moon_k": 250.0, "rotations_deg": (0.0, 90.0), "taper": False}, SPLINES),
-        ({"moon_k": 250.0, "luseepy_quadrature": True, "turntable_offset_deg": 7.0}, LUSEEPY),
-    ],
+    ("options", "quadrature"), [({}, SPLINES), (TWO_ARMS, SPLINES), BY_LUSEEPY]
 )
 def test_scalar_file_beams(scalar, options, quadrature):
     source = replace(scalar, **options)
@@ -60,13 +59,7 @@ def test_scalar_file_beams(scalar, options, quadrature):
     assert source.circuit(FREQUENCY) is None
 
 
-@pytest.mark.parametrize(
-    ("options", "quadrature"),
-    [
-        ({"antenna_k": 300.0}, SPLINES),
-        ({"moon_k": 250.0, "luseepy_quadrature": True, "turntable_offset_deg": 7.0}, LUSEEPY),
-    ],
-)
+@pytest.mark.parametrize(("options", "quadrature"), [({"antenna_k": 300.0}, SPLINES), BY_LUSEEPY])
 def test_response_beams(response, options, quadrature):
     losses = np.tile(0.5 * np.eye(4, dtype=complex), (4, 1, 1))
     source = replace(response, loss_ohm=losses, **options)

@@ -37,9 +37,10 @@ def coupling():
     return CouplingMatrix.observe(random_beams(1), two_runs())
 
 
-@pytest.mark.parametrize(
-    ("lmax", "turntable"), [pytest.param(16, 0.0, marks=pytest.mark.long), (8, 35.0)]
-)
+TURNTABLES = [pytest.param(16, 0.0, marks=pytest.mark.long), (8, 35.0)]
+
+
+@pytest.mark.parametrize(("lmax", "turntable"), TURNTABLES)
 def test_visibilities_agree_with_an_integral_over_the_sky_in_lunartopo(lmax, turntable):
     frequency = 25.0
     o = lb.Observation.from_runs([lb.Run(1.0, turntable)])

@@ -12,10 +12,10 @@ from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith
 GRID = HemisphereGrid.gauss_legendre(6, 8)
 
 
-@pytest.mark.parametrize(
-    ("frequency", "options"),
-    [(1.0, {}), (25.0, {}), (50.0, {"zenith_angle_deg": 100.0, "height_m": 0.7, "length_m": 2.5})],
-)
+LEANING = {"zenith_angle_deg": 100.0, "height_m": 0.7, "length_m": 2.5}
+
+
+@pytest.mark.parametrize(("frequency", "options"), [(1.0, {}), (25.0, {}), (50.0, LEANING)])
 def test_fields_agree_with_a_sum_along_the_arms(frequency, options):
     m = Monopoles(**options)
     fields = m.fields(frequency, GRID)
@@ -76,11 +76,10 @@ def test_permittivity_rises_linearly_over_the_layers():
 
 # the square root loses half the digits of a cosine near zero; 1 - |r| of a conductor is
 # 2 / (|n| cos theta) at worst, |n| = 2e8
-@pytest.mark.parametrize(
-    ("eps", "loss", "atol"),
-    [(5.0, 0.3, 1e-14), (4.0, 0.0, 1e-14), (1.0, 0.0, 1e-11), (4.0, 1e16, 2e-7)],
-    ids=["lossy", "lossless", "none", "conductor"],
-)
+LOSSY, NONE, CONDUCTOR = (5.0, 0.3, 1e-14), (1.0, 0.0, 1e-11), (4.0, 1e16, 2e-7)
+
+
+@pytest.mark.parametrize(("eps", "loss", "atol"), [LOSSY, (4.0, 0.0, 1e-14), NONE, CONDUCTOR])
 def test_uniform_ground_obeys_fresnel(eps, loss, atol):
     cosines = np.append(COSINES[:-1], 1.0) if loss > 1.0 else np.append(COSINES, 1.0)
     complex_eps = eps * (1 - 1j * loss)

@@ -168,9 +168,10 @@ def by_erfa_and_lunartopo(planet, time, lon_deg, lat_deg):
     return np.array([east, north, up]) / np.linalg.norm([east, north, up])
 
 
-@pytest.mark.parametrize(
-    ("body", "planet"), [("Sun", 0), ("Venus", 2), ("Earth", 3), ("Jupiter", 5), ("saturn", 6)]
-)
+BODIES = [("Sun", 0), ("Venus", 2), ("Earth", 3), ("Jupiter", 5), ("saturn", 6)]
+
+
+@pytest.mark.parametrize(("body", "planet"), BODIES)
 def test_directions_agree_with_erfa_and_lunartopo(body, planet):
     site = {"lon_deg": 23.4, "lat_deg": -61.0}
     observation = dates("2026-06-02T21:00:00", "2027-01-15T03:00:00", **site)

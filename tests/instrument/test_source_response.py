@@ -161,8 +161,7 @@ def around(n0, g, reach, n_radius, n_angle):
     other = np.cross(n0, across)
     alpha = 2 * np.pi * (np.arange(n_angle) + 0.5) / n_angle
     offset = np.cos(alpha)[:, None] * across + np.sin(alpha)[:, None] * other
-    sine = np.sqrt(1 - cosine**2)
-    n = cosine[:, None, None] * n0 + sine[:, None, None] * offset
+    n = cosine[:, None, None] * n0 + np.sqrt(1 - cosine**2)[:, None, None] * offset
     return n.reshape(-1, 3), np.repeat(kernel * ring, n_angle)
 
 

@@ -71,9 +71,10 @@ def test_temperatures_in_other_units_are_converted(data, tmp_path, unit, factor)
 
 
 # TAI - UTC is 37 s since 2017, TT - TAI 32.184 s, TDB - TT less than 2 ms
-@pytest.mark.parametrize(
-    ("scale", "s"), [("UTC", 0.0), ("tai", 37.0), ("TT", 69.184), ("tdb", 69.184)]
-)
+SCALES = [("UTC", 0.0), ("tai", 37.0), ("TT", 69.184), ("tdb", 69.184)]
+
+
+@pytest.mark.parametrize(("scale", "s"), SCALES)
 def test_times_in_other_scales_are_brought_to_utc(data, tmp_path, scale, s):
     path = tmp_path / "other.nc"
     altered(lambda d: [d[k].attrs.update(scale=scale) for k in ("jd1", "jd2")] and d)(data, path)
@@ -103,6 +104,8 @@ RNG = np.random.default_rng(3)
 VOLTAGES = RNG.normal(size=(N, 4, 50)) + 1j * RNG.normal(size=(N, 4, 50))
 # <s_i conj(s_j)>, by its definition
 MATRIX = 1e3 * np.einsum("tis,tjs->tij", VOLTAGES, VOLTAGES.conj()) / 50
+
+
 PAIRS = [(i, j) for i in range(4) for j in range(i, 4)]
 
 

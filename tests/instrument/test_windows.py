@@ -282,10 +282,10 @@ def test_equals_the_mean_of_200_instants(step_s, filled, lmax):
     assert wrong > {10.0: 1e-8, 600.0: 1e-4, 7200.0: 0.1, 43200.0: 10.0}[step_s]
 
 
-@pytest.mark.parametrize(
-    ("step_s", "filled", "lmax"),
-    [(7200.0, False, 12), pytest.param(43200.0, True, 47, marks=pytest.mark.long)],
-)
+LENGTHS = [(7200.0, False, 12), pytest.param(43200.0, True, 47, marks=pytest.mark.long)]
+
+
+@pytest.mark.parametrize(("step_s", "filled", "lmax"), LENGTHS)
 def test_equals_the_mean_of_20_instants_by_lunarsky(step_s, filled, lmax):
     o, beams, sky = observation(step_s, filled), lb.monopole_beams(25.0, lmax), steep_sky(lmax)
     got = np.asarray(lb.CouplingMatrix.observe(beams, o) @ sky).reshape(16, -1)

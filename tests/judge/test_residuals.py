@@ -133,11 +133,10 @@ def test_groups_and_single_data_by_hand(overrides, flags):
     assert "consistent" in found.fit().headline and "(p " not in found.fit().headline
 
 
-@pytest.mark.parametrize(
-    ("width", "said", "not_said"),
-    [(10.0, "narrower prior", "too narrow"),
-     (0.1, "too narrow", "narrower prior")],
-)  # fmt: skip
+PRIORS = [(10.0, "narrower prior", "too narrow"), (0.1, "too narrow", "narrower prior")]
+
+
+@pytest.mark.parametrize(("width", "said", "not_said"), PRIORS)
 def test_a_prior_that_is_too_wide_is_told_from_one_that_is_too_narrow(width, said, not_said):
     """The same data, under a prior ten times as wide as the sky's, and as narrow."""
     model, data = simulated()
@@ -173,9 +172,10 @@ def corrupted(data, where, by):
     return replace(data, data=data.layout.gather(jnp.asarray(np.nan_to_num(grid))))
 
 
-@pytest.mark.parametrize(
-    ("kind", "name"), [("product", "22R"), ("day", "2027-01-16"), ("turntable angle", "40")]
-)
+WRONG_GROUPS = [("product", "22R"), ("day", "2027-01-16"), ("turntable angle", "40")]
+
+
+@pytest.mark.parametrize(("kind", "name"), WRONG_GROUPS)
 def test_what_is_wrong_is_pointed_at(kind, name):
     model, data = simulated()
     where = {
@@ -335,8 +335,7 @@ def test_both_sides_count():
 
 
 def test_one_rate_for_all_tests_of_a_report():
-    below = 1.0 - 1e-9
-    assert not stands_out(FALSE_ALARM, 1) and stands_out(FALSE_ALARM * below, 1)
+    assert not stands_out(FALSE_ALARM, 1) and stands_out(FALSE_ALARM * (1.0 - 1e-9), 1)
     # the best of many is nothing special
     assert not stands_out(1e-4, 10) and stands_out(1e-4, 9)
 
@@ -390,8 +389,7 @@ def test_what_the_sky_takes_up_is_not_told():
     model = lb.LinearGaussian(DenseCoupling(a), prior, lb.DiagonalCovariance(np.ones(N_DATA)))
     data = rng.standard_normal(N_DATA)
     got = preferences(model.condition(data), a @ rng.standard_normal((a.shape[1], 1)))
-    assert np.isnan(got.amplitude).all()
-    assert np.isnan(got.std).all()
+    assert np.isnan([got.amplitude, got.std]).all()
 
 
 # --- groups of data left out, against A, S and N as matrices --------------------------------------

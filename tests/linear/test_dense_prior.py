@@ -58,9 +58,10 @@ def solved(n_data: int, form: type[Form], *, turned: bool) -> Posterior:
 SIZES = [(40, InMap), (40, FromInformation), (12, InData), (12, FromInformation)]
 
 
-@pytest.mark.parametrize(
-    ("n_data", "form"), [(40, InMap), pytest.param(12, InData, marks=pytest.mark.long)]
-)
+TURNED = [(40, InMap), pytest.param(12, InData, marks=pytest.mark.long)]
+
+
+@pytest.mark.parametrize(("n_data", "form"), TURNED)
 def test_a_turned_problem_has_the_turned_posterior(n_data, form):
     found, expected = (solved(n_data, form, turned=turned) for turned in (True, False))
     covariance = TURN @ np.asarray(expected.covariance()) @ TURN.T

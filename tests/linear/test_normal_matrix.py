@@ -67,10 +67,11 @@ def noise_of(kind, layout):
     return time_blocks.TimeBandedCovariance(jnp.asarray(band), layout)
 
 
+KINDS = ["diagonal", "blocks", "templates", pytest.param("banded", marks=pytest.mark.long)]
+
+
 @pytest.mark.parametrize("place", [on_host, on_device])
-@pytest.mark.parametrize(
-    "kind", ["diagonal", "blocks", "templates", pytest.param("banded", marks=pytest.mark.long)]
-)
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(("order", "missing"), [(0, True), (1, True), (2, True), (2, False)])
 def test_equals_the_product_of_matrices(place, kind, order, missing):
     coupling = place(setting(order, missing))
@@ -133,9 +134,10 @@ def model(kind="diagonal"):
     return lb.LinearGaussian(coupling, prior, noise, offset)
 
 
-@pytest.mark.parametrize(
-    "kind", ["diagonal", *(pytest.param(k, marks=pytest.mark.long) for k in ("offset", "low rank"))]
-)
+NOISES = ["diagonal", *(pytest.param(k, marks=pytest.mark.long) for k in ("offset", "low rank"))]
+
+
+@pytest.mark.parametrize("kind", NOISES)
 def test_information_gives_the_posterior_of_the_dense_form(kind):
     gaussian = model(kind)
     rng = np.random.default_rng(11)

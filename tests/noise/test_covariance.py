@@ -103,11 +103,12 @@ def test_contract_without_flags():
     check_covariance(*_terms(np.zeros_like(FLAGS))["blocks"], slopes=False)
 
 
+FIRST = [pytest.param(k, marks=pytest.mark.essential) if k == "blocks" else k for k in KINDS]
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("second", KINDS)
-@pytest.mark.parametrize(
-    "first", [pytest.param(k, marks=pytest.mark.essential) if k == "blocks" else k for k in KINDS]
-)
+@pytest.mark.parametrize("first", FIRST)
 def test_contract_of_sums(first, second, small_blocks):
     terms = _terms(FLAGS)
     (cov_a, dense_a), (cov_b, dense_b) = terms[first], terms[second]
@@ -125,10 +126,11 @@ def test_contract_of_low_rank_updates(kind, small_blocks):
 
 
 # blocks of two times: widths below, at and above a block, whole matrices; times no multiple of two
+WIDTHS = [*((w, False) for w in (0, 1, 2, 3, 6, 9)), *((w, True) for w in (2, 5))]
+
+
 @pytest.mark.essential
-@pytest.mark.parametrize(
-    ("width", "flagged"), [*((w, False) for w in (0, 1, 2, 3, 6, 9)), *((w, True) for w in (2, 5))]
-)
+@pytest.mark.parametrize(("width", "flagged"), WIDTHS)
 def test_bands_of_every_width(width, flagged, small_blocks):
     flags = np.zeros((3, 7), dtype=bool)
     if flagged:

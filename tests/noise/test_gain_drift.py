@@ -32,8 +32,7 @@ def visibilities(n_antennas, n_times=N_TIMES, seed=0):
 
 
 def c_g(hours, sigma, correlation):
-    lag = hours[:, None] - hours[None]
-    return sigma**2 * np.exp(-(lag**2) / (2.0 * correlation**2))
+    return sigma**2 * np.exp(-0.5 * ((hours[:, None] - hours) / correlation) ** 2)
 
 
 def by_the_papers_equation(d, hours, sigma, correlation, flags):
@@ -66,9 +65,10 @@ def term(drift, d, hours, flags, width=None) -> TimeBandedCovariance:
     return drift.covariance(jnp.asarray(d), hours, DataLayout.from_flags(flags), width)
 
 
-@pytest.mark.parametrize(
-    ("n_antennas", "sigma", "make_flags"), [(2, 0.3, complete), (2, 1e-3, gappy), (4, 0.3, gappy)]
-)
+CASES = [(2, 0.3, complete), (2, 1e-3, gappy), (4, 0.3, gappy)]
+
+
+@pytest.mark.parametrize(("n_antennas", "sigma", "make_flags"), CASES)
 def test_every_entry_is_the_papers(n_antennas, sigma, make_flags):
     flags = make_flags(n_antennas)
     d = visibilities(n_antennas)

@@ -152,11 +152,11 @@ LOST_PORT = np.zeros((N_PRODUCTS, N_TIMES), dtype=bool)
 LOST_PORT[[5, 6, 10, 11, 13, 14, 15]] = True
 
 
+ABSENT = [*product((WHOLE_TIME, LOST_PORT), ("paper", "exact")), (ONE_CROSS, "paper")]
+
+
 @pytest.mark.parametrize("absent", [0.0, np.nan])
-@pytest.mark.parametrize(
-    ("flags", "form"),
-    [*product((WHOLE_TIME, LOST_PORT), ("paper", "exact")), (ONE_CROSS, "paper")],
-)
+@pytest.mark.parametrize(("flags", "form"), ABSENT)
 def test_absent_samples_change_nothing_for_the_others(flags, form, absent):
     layout = DataLayout.from_flags(flags)
     seen = np.where(flags, absent, np.asarray(VISIBILITIES))

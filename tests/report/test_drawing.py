@@ -3,10 +3,10 @@
 import healpy
 import numpy as np
 import pytest
+from assertions import refuse
 from jinja2 import UndefinedError
 from matplotlib.projections.geo import MollweideAxes
 
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import map_to_modes, modes_to_map
 from lusee_bayes.judge.convergence import warnings_of
 from lusee_bayes.report.figures import drawing
@@ -97,10 +97,10 @@ def test_every_warning_has_its_reason(change, words):
     assert all(word in found for word in words)
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(0.0, "0"), (12500.0, "12,500"), (0.25, "0.25"), (1.5e10, "1.5e10"), (-2e-5, "-2e-5")],
-)
+TICKS = [(0.0, "0"), (12500.0, "12,500"), (0.25, "0.25"), (1.5e10, "1.5e10"), (-2e-5, "-2e-5")]
+
+
+@pytest.mark.parametrize(("value", "text"), TICKS)
 def test_ticks_are_short(value, text):
     assert drawing.number_of_tick(value) == text
     assert float(text.replace(",", "")) == value
@@ -109,10 +109,10 @@ def test_ticks_are_short(value, text):
 # --- templates: what is missing is an error -------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("value", "form", "text"),
-    [(1.234, ".2f", "1.23"), (0.5, ".1%", "50.0%"), (None, ".2f", "-"), (np.nan, "", "-")],
-)
+NUMBERS = [(1.234, ".2f", "1.23"), (0.5, ".1%", "50.0%"), (None, ".2f", "-"), (np.nan, "", "-")]
+
+
+@pytest.mark.parametrize(("value", "form", "text"), NUMBERS)
 def test_numbers_are_formatted_and_what_is_missing_is_said(value, form, text):
     assert formatted(value, form, "-") == text
     assert formatted("as it is", form, "-") == "as it is"
@@ -134,5 +134,4 @@ def test_what_users_write_cannot_become_tags_and_bad_rows_stand_out():
 def test_a_page_without_what_it_shows_is_an_error(tmp_path):
     with pytest.raises(UndefinedError, match="caveat"):
         render("comparison.html", tmp_path, runs=[], rows=[])
-    with pytest.raises(InputError, match=r"no figures/maps\.png"):
-        picture(tmp_path, "maps")
+    refuse(r"no figures/maps\.png", picture, tmp_path, "maps")

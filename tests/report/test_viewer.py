@@ -100,11 +100,11 @@ def test_maps_are_those_of_the_files_at_nside_64(page, small_map, tmp_path):
     assert got["mean_at"] == pytest.approx(float(y[0] @ channel.mean), rel=1e-6)
 
 
+PAGES = ["small_map", pytest.param("correlated", marks=pytest.mark.essential)]
+
+
 @needs_node
-@pytest.mark.parametrize(
-    "which",
-    ["small_map", pytest.param("correlated", marks=pytest.mark.essential)],
-)
+@pytest.mark.parametrize("which", PAGES)
 def test_point_spread_functions_are_those_of_the_posterior(which, request, tmp_path):
     """Against y^T R from the posterior; bytes are wrong by half a step at most, at random."""
     run = request.getfixturevalue(which)
@@ -161,8 +161,7 @@ def test_channels_of_the_page_are_those_of_the_files(small_cube, tmp_path):
     rng = np.random.default_rng(3)
     lon, lat = rng.uniform(0, 360, 40), np.degrees(np.arcsin(rng.uniform(-1, 1, 40)))
     points = json.dumps(np.stack([lon, lat], 1).tolist())
-    commands = f"const points = {points};" + PARTS["channels"]
-    told = run_page(page, tmp_path, commands)
+    told = run_page(page, tmp_path, f"const points = {points};" + PARTS["channels"])
     # the slider, and every selector of the page, choose the channel that is told of
     assert told["hidden"] == [True, True, False] and told["chosen"] == [1, 1]
     assert told["shown"] == [False, True, False]

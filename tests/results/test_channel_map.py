@@ -85,8 +85,7 @@ def test_arviz_opens_a_posterior(small_cube):
 
 
 def test_data_of_channels_at_other_times_have_gaps(tmp_path, numbers_alone):
-    sizes = ["lmax=3", "observation.runs.0.cycles=0.1", "frequencies_mhz=[20, 25]"]
-    scenario = lb.load_scenario("fiducial", sizes)
+    scenario = small_scenario("frequencies_mhz=[20, 25]", lmax=3, cycles=0.1)
     first, second = channels_of(scenario)
     both = [first, second.select(np.arange(second.observation.n_times) >= 5)]
     run = lb.run_map(scenario, tmp_path / "run", data=both)
@@ -102,8 +101,7 @@ def test_data_of_channels_at_other_times_have_gaps(tmp_path, numbers_alone):
 @pytest.fixture(scope="module")
 def bad(tmp_path_factory):
     """Data of three channels; a product of the second is too large."""
-    sizes = ["lmax=4", "observation.runs.0.cycles=0.1", "frequencies_mhz=[20, 25, 30]"]
-    scenario = lb.load_scenario("fiducial", sizes)
+    scenario = small_scenario("frequencies_mhz=[20, 25, 30]", lmax=4, cycles=0.1)
     data = channels_of(scenario)
     data[1] = scaled_product(data[1], 8, 1.2)
     return scenario, data
@@ -186,14 +184,14 @@ def test_modes_that_the_prior_knows_exactly_can_have_earlier_data():
     np.testing.assert_allclose(channel.judged.z.ravel(), expected, rtol=0, atol=1e-6 * reach.max())
 
 
-@pytest.mark.parametrize(
-    "kind", [[], ["joint=true", "spectral.components=[power_law]"]], ids=["independent", "joint"]
-)
+JOINT = ["joint=true", "spectral.components=[power_law]"]
+
+
+@pytest.mark.parametrize("kind", [[], JOINT], ids=["independent", "joint"])
 def test_covariances_of_every_channel_are_kept(kind, tmp_path, numbers_alone):
     """And with all that can be asked for at once, every channel is judged."""
-    sizes = ["lmax=3", "observation.runs.0.cycles=0.1", "frequencies_mhz=[20, 25, 30]"]
-    output = "output={covariance: true, draws: 2, information: true}"
-    scenario = lb.load_scenario("fiducial", [*sizes, output, *kind])
+    given = "output={covariance: true, draws: 2, information: true}", *kind
+    scenario = small_scenario("frequencies_mhz=[20, 25, 30]", *given, lmax=3, cycles=0.1)
     run = lb.run_map(scenario, tmp_path / "run", thorough=True)
     tree = posterior_of(run.folder)
     assert tree["covariance"].dims == ("frequency", "mode", "mode_2")

@@ -6,7 +6,6 @@ import pytest
 from commands import assert_drawn, refused, run, table_of
 
 import lusee_bayes as lb
-from lusee_bayes.results.finished_runs import evidence_caveat, read_runs
 
 pytestmark = pytest.mark.long
 SMALL = ["lmax=4", "observation.runs.0.cycles=0.1"]
@@ -45,12 +44,9 @@ def test_the_right_model_wins(runs, tmp_path, capsys):
 
 
 def test_different_data_are_told_apart(runs, tmp_path, capsys):
-    read = read_runs([runs / "fiducial", runs / "other"])
-    assert "has different values at the same times" in evidence_caveat(read)
-    assert evidence_caveat(read_runs([runs / "fiducial", runs / "gain_1e-2"])) is None
-    assert read[0].channel.mean.shape == read[1].channel.mean.shape
     assert run("compare", runs / "fiducial", runs / "other", "-o", tmp_path / "out") == 0
-    assert "Do not compare the evidences" in capsys.readouterr().out
+    told = " ".join(capsys.readouterr().out.split())
+    assert "Do not compare the evidences" in told and "different values at the same times" in told
 
 
 def test_what_cannot_be_compared(runs, small_cube, tmp_path, capsys, numbers_alone):

@@ -14,10 +14,10 @@ def cost_of(*overrides):
     return cost.posterior_cost(lb.load_scenario("fiducial", ["lmax=8", *overrides]))
 
 
-@pytest.mark.parametrize(
-    "more",
-    ["observation.step_s=600", "frequencies_mhz=[20, 25]", SOURCES, "noise.fields={lmax: 2}"],
-)
+MORE = ["observation.step_s=600", "frequencies_mhz=[20, 25]", SOURCES, "noise.fields={lmax: 2}"]
+
+
+@pytest.mark.parametrize("more", MORE)
 def test_more_of_everything_costs_time_and_memory(more, monkeypatch):
     monkeypatch.setattr(cost, "_operations_a_second", lambda: 1e9)
     one, other = cost_of(), cost_of(more)

@@ -113,11 +113,10 @@ def assert_forecast_is(found, a, s, n):
     np.testing.assert_allclose(found.snr_squared, known / left, rtol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("cycles", "systematic"),
-    [(0.01, "noise.beam={shift_mhz: 4.0}"), (0.3, "noise.gain={sigma: 0.01}")],
-    ids=["fewer data than modes", "more"],
-)
+FEWER = [(0.01, "noise.beam={shift_mhz: 4.0}"), (0.3, "noise.gain={sigma: 0.01}")]
+
+
+@pytest.mark.parametrize(("cycles", "systematic"), FEWER, ids=["fewer data than modes", "more"])
 def test_numbers_of_an_experiment_against_dense_algebra(cycles, systematic):
     variation = varied(f"observation.runs.0.cycles={cycles}", systematic)
     found = plan_run.forecast(variation)

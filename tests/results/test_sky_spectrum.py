@@ -14,8 +14,8 @@ from lusee_bayes.core.harmonics import averaging_rows, modes_to_map
 from lusee_bayes.results.signal_limit import named_template, signal_limit
 from lusee_bayes.results.sky_spectrum import (
     Departure,
+    RegionTemperatures,
     SkySpectrum,
-    Temperatures,
     cane_1979,
     novaco_brown_1978,
 )
@@ -132,7 +132,7 @@ def test_skies_that_are_alike_have_errors_that_are_alike():
     given, none = (("sky",), ()), np.zeros((1, 0))
     std, zero = np.sqrt([row**2 @ c]), np.zeros(1)
     channels = [
-        Temperatures(
+        RegionTemperatures(
             *given, zero, std, None, none, Departure(mean, (row * c)[None]), none.T, none.T
         )
         for mean in means[0]

@@ -42,8 +42,7 @@ def cube_of(response_file, *overrides, frequencies="[15, 20, 22]"):
 
 
 def ties(frequencies) -> np.ndarray:
-    octaves = np.log2(frequencies[:, None] / frequencies[None])
-    return np.exp(-(octaves**2) / (2.0 * OCTAVES**2))
+    return np.exp(-0.5 * (np.log2(frequencies[:, None] / frequencies) / OCTAVES) ** 2)
 
 
 @pytest.fixture(scope="module")

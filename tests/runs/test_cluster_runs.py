@@ -204,14 +204,14 @@ def test_workers_of_a_killed_command_end_with_it(tmp_path):
     assert list(tmp_path.glob("channels/*.nc"))
 
 
+OTHERS = [
+    ("plan --set lmax=6 --vary frequency_mhz=10,20,30", "plan.csv", 1e-6),
+    ("compare-priors --priors isotropic,local_scales", "priors.csv", 1e-4),
+]
+
+
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("arguments", "same", "rtol"),
-    [
-        ("plan --set lmax=6 --vary frequency_mhz=10,20,30", "plan.csv", 1e-6),
-        ("compare-priors --priors isotropic,local_scales", "priors.csv", 1e-4),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "same", "rtol"), OTHERS)
 def test_other_commands_say_the_same(arguments, same, rtol, cluster, tmp_path):
     """Sums of other numbers of threads differ by rounding. Learning a prior ends where a step moves
     the map by less than 0.01 standard deviations, and rounding decides where in that region: 1e-4

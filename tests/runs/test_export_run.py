@@ -2,14 +2,12 @@
 
 import hashlib
 import json
-import subprocess
-import sys
 
 import h5py
 import numpy as np
 import pytest
 from assertions import raising
-from commands import content, refused, run
+from commands import content, python, refused, run
 
 from lusee_bayes.core.harmonics import pixel_matrix
 from lusee_bayes.runs import export_run
@@ -35,8 +33,7 @@ def test_a_release_stands_alone(made, request, tmp_path, capsys, monkeypatch):
     assert metadata["types"]["resourceTypeGeneral"] == "Dataset"
     assert made.result.verdict() in metadata["descriptions"][0]["description"]
     program = "import runpy, sys; sys.modules['lusee_bayes'] = None; runpy.run_path(sys.argv[1])"
-    reader = [sys.executable, "-c", program, out / "read_it.py"]
-    said = subprocess.run(reader, capture_output=True, text=True, check=True, cwd=tmp_path).stdout
+    said = python("-c", program, out / "read_it.py", cwd=tmp_path).stdout
     y = pixel_matrix(made.result.scenario.map_nside, made.result.scenario.lmax)
     for one in made.result.channels:
         assert f"{one.frequency_mhz:g} MHz: mean {(y @ one.mean).mean():.8g} K, std " in said

@@ -206,8 +206,7 @@ def test_every_data_set_is_another_and_batches_do_not_matter():
     # an empty bin or a bin of 20 of 120 ranks: once in a million
     assert few.histogram()[0].max() < 20
     # truths and their ranks are not drawn with the same numbers
-    neighbours = np.corrcoef(few.ranks[1:, 0], few.ranks[:-1, 0])[0, 1]
-    assert abs(neighbours) < 5 / np.sqrt(120)
+    assert abs(np.corrcoef(few.ranks[1:, 0], few.ranks[:-1, 0])[0, 1]) < 5 / np.sqrt(120)
 
 
 WRONG_POSTERIORS = [

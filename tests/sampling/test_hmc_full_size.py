@@ -15,12 +15,11 @@ from lusee_bayes.sampling.validation import validate_draws
 LMAX = int(os.environ.get("LUSEE_BAYES_TEST_LMAX", "31"))
 
 
+SCENARIOS = [("gain_1e-2",), ("fiducial", "prior.model=local_scales")]
+
+
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "scenario",
-    [("gain_1e-2",), ("fiducial", "prior.model=local_scales")],
-    ids=["gains", "correlated modes"],
-)
+@pytest.mark.parametrize("scenario", SCENARIOS, ids=["gains", "correlated modes"])
 def test_nuts_agrees_with_every_mean_every_variance_and_the_covariance(scenario):
     name, *overrides = scenario
     experiment = lb.build(lb.load_scenario(name, [f"lmax={LMAX}", *overrides]))

@@ -4,8 +4,6 @@ Monte Carlo errors come from ArviZ's effective sample sizes, oracles from numpy 
 """
 
 import os
-import subprocess
-import sys
 import textwrap
 from pathlib import Path
 
@@ -15,6 +13,7 @@ import numpy as np
 import numpyro
 import pytest
 from assertions import refuse
+from commands import python
 from numpyro import distributions as dist
 from reference_linear import matrices, random_covariance
 from reference_linear import posterior as naive_posterior
@@ -385,9 +384,7 @@ def test_chains_are_shared_out_among_devices_and_draw_the_same(gaussian, data, t
         "PYTHONPATH": os.pathsep.join((str(ROOT), str(TESTS.parent))),
     }
     code = textwrap.dedent(DEVICES_SCRIPT.format(tests=str(TESTS)))
-    command = [sys.executable, "-c", code, str(tmp_path)]
-    options = {"env": env, "cwd": tmp_path, "capture_output": True, "text": True}
-    done = subprocess.run(command, check=False, **options)
+    done = python("-c", code, tmp_path, env=env, cwd=tmp_path, check=False)
     assert done.returncode == 0, done.stderr
     shared = np.load(tmp_path / "chains.npz")
     whitening = lb.Whitening.of(gaussian.condition(data).posterior)

@@ -16,7 +16,6 @@ from numpyro import handlers
 from reference_linear import assert_draws_follow, posterior
 from small_models import random_gaussian
 
-import lusee_bayes
 import lusee_bayes as lb
 from lusee_bayes.cli.main import main
 from lusee_bayes.experiment.experiment import program_pieces
@@ -112,9 +111,7 @@ def test_a_program_has_its_own_future_imports_only(write):
 
 def test_no_such_program(tmp_path):
     for source in ("sky_margnal", tmp_path / "missing.py", tmp_path):
-        with refused("no program") as error:
-            lb.load_program(source)
-        assert str(source) in str(error.value) and "sky_marginal" in str(error.value)
+        refuse(rf"no program.*{re.escape(str(source))}.*sky_marginal", lb.load_program, source)
 
 
 NO_PROGRAMS = [
@@ -155,8 +152,7 @@ def test_arguments_are_what_the_signature_names(write, gaussian):
         assert arguments[name] is getattr(gaussian, name)
     program = lb.load_program(write("def model(fixed_noise, data=None):\n    pass\n"))
     (factor,) = program.arguments(gaussian).values()
-    dense = np.asarray(gaussian.noise.dense())
-    identity = np.asarray(factor.solve(jnp.asarray(dense)))
+    identity = np.asarray(factor.solve(gaussian.noise.dense()))
     np.testing.assert_allclose(identity, np.eye(N_DATA), atol=1e-12)
     assert lb.load_program(write("def model(data=None):\n    pass\n")).arguments(gaussian) == {}
 
@@ -174,7 +170,10 @@ def test_which_programs_have_integrated_the_sky_out(write, gaussian):
     assert not programs.is_collapsed(kept, kept.arguments(gaussian), data)
 
 
-@pytest.mark.parametrize("name", ["sky", "sky_marginal", "prior_amplitude", "spectrum_bands"])
+NAMES = ["sky", "sky_marginal", "prior_amplitude", "spectrum_bands"]
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_what_is_seen_without_a_sky_shifts_the_data(gaussian, name):
     """p(d + offset | with an offset) = p(d | without), whatever the sites."""
     program, offset = lb.load_program(name), jnp.asarray(100.0 * OFFSET)
@@ -254,7 +253,7 @@ def test_replicated_data_are_the_skies_seen_with_new_noise(gaussian, collapsed, 
 # --- programs that cannot be sampled --------------------------------------------------------------
 
 
-ROOT = Path(lusee_bayes.__file__).resolve().parents[1]
+ROOT = Path(lb.__file__).resolve().parents[1]
 
 HEAD = """
 import jax.numpy as jnp
@@ -327,9 +326,7 @@ def test_a_good_program_passes(write, pieces):
     assert check(path, pieces) == ["sky", "x.y-1"]
 
 
-@pytest.mark.parametrize(
-    "name", ["sky", "sky_marginal", "prior_amplitude", "spectrum_bands", "student_t"]
-)
+@pytest.mark.parametrize("name", [*NAMES, "student_t"])
 def test_the_packages_programs_pass(name, pieces):
     assert check(name, pieces)
 

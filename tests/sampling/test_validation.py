@@ -99,9 +99,10 @@ def test_false_alarms_are_as_rare_as_stated(form, turns):
     assert sum(map(bool, alarms)) < 6, [a for a in alarms if a]
 
 
-@pytest.mark.parametrize(
-    "turns", [pytest.param("independent", marks=pytest.mark.long), "like NUTS"]
-)
+TURNING = [pytest.param("independent", marks=pytest.mark.long), "like NUTS"]
+
+
+@pytest.mark.parametrize("turns", TURNING)
 def test_scores_of_means_and_variances_are_standard_normal(turns):
     """30 runs of 16 uncorrelated modes: a scale of the scores that is off by a sixth is seen."""
     mean, scale = np.linspace(-1, 1, MODES), 10.0 ** np.linspace(-2, 2, MODES)
@@ -157,9 +158,10 @@ def test_a_mean_off_by_a_third_of_sigma_in_one_mode_fails(truth, turns, mode):
     assert found.mean_z[mode] < -10
 
 
-@pytest.mark.parametrize(
-    ("factor", "which"), [(1.8, "covariance, smallest"), (0.55, "covariance, largest")]
-)
+DIRECTIONS = [(1.8, "covariance, smallest"), (0.55, "covariance, largest")]
+
+
+@pytest.mark.parametrize(("factor", "which"), DIRECTIONS)
 def test_a_wrong_variance_of_one_direction_fails_though_no_mode_shows_it(factor, which):
     """Sixteen modes with the same share in the direction: each one's variance is off by a
     sixteenth of what the direction's is, 0.05 or 1.6 sigma; the direction's by 0.45 or 0.8,
@@ -266,8 +268,7 @@ def test_scores_of_variances_have_the_tails_of_chi2():
     expected = np.where(upper, 1.0, -1.0) * stats.norm.isf(tail)
     np.testing.assert_allclose(validation._chi2_z(ratio, dof), expected, rtol=1e-8)
     # a normal score of the ratio would be off by more than one at 50 degrees of freedom
-    normal = (ratio - 1) / np.sqrt(2 / dof)
-    assert np.abs(normal - expected)[[3, 9]].min() > 0.5
+    assert np.abs((ratio - 1) / np.sqrt(2 / dof) - expected)[[3, 9]].min() > 0.5
 
 
 def test_eigenvalues_of_independent_draws_lie_between_the_marchenko_pastur_edges():

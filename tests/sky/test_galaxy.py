@@ -92,28 +92,20 @@ def all_of_a_line(synchrotron, depth, frequency_mhz):
 # --- against ULSA -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("frequency_mhz", [1.0, 3.0, 10.0])
-def test_mean_temperature_is_ulsas(ulsa_map, frequency_mhz):
-    # Asked for: 25 %. The electron column, all that differs, is tuned at 1 MHz only: 5 % is had.
-    assert 0.95 < embedded_sky(frequency_mhz).mean() / ulsa_map(frequency_mhz).mean() < 1.05
-
-
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_spectrum_at_10_mhz_is_ulsas(ulsa_map, seed):
-    # A factor of two: loops and spurs add up to 80 % to the weakest odd multipoles.
-    diffuse = hp.anafast(galaxy.galaxy_map(10.0, NSIDE, seed), lmax=47)
-    ratio = (diffuse / hp.anafast(ulsa_map(10.0), lmax=47))[1:31]
-    assert ratio.min() > 0.7 and ratio.max() < 2.0, np.round(ratio, 2)
-
-
-def test_spectrum_with_the_sources_is_ulsas_within_a_factor_of_two(ulsa_map):
-    # ULSA's smooth map has none: their white C_ell, up to 60 % of it at ell = 30, comes on top.
-    ratio = (hp.anafast(embedded_sky(10.0), lmax=47) / hp.anafast(ulsa_map(10.0), lmax=47))[1:31]
-    assert ratio.min() > 0.5 and ratio.max() < 2.0, np.round(ratio, 2)
+@pytest.mark.parametrize("seed, least", [(1, 0.7), (2, 0.7), (3, 0.7), (None, 0.5)])
+def test_spectrum_at_10_mhz_is_ulsas(ulsa_map, seed, least):
+    # A factor of two: loops and spurs add up to 80 % to the weakest odd multipoles. Where there is
+    # no seed, with the sources: ULSA's smooth map has none, so that their white C_ell, up to 60 %
+    # of it at ell = 30, comes on top.
+    ours = embedded_sky(10.0) if seed is None else galaxy.galaxy_map(10.0, NSIDE, seed)
+    ratio = (hp.anafast(ours, lmax=47) / hp.anafast(ulsa_map(10.0), lmax=47))[1:31]
+    assert ratio.min() > least and ratio.max() < 2.0, np.round(ratio, 2)
 
 
 @pytest.mark.parametrize("frequency_mhz, floor", [(1.0, 0.8), (3.0, 0.8), (10.0, 0.97)])
-def test_pattern_is_ulsas(ulsa_map, frequency_mhz, floor):
+def test_mean_temperature_and_pattern_are_ulsas(ulsa_map, frequency_mhz, floor):
+    # Asked for: 25 %. The electron column, all that differs, is tuned at 1 MHz only: 5 % is had.
+    assert 0.95 < embedded_sky(frequency_mhz).mean() / ulsa_map(frequency_mhz).mean() < 1.05
     # Spectra forget phases. What we leave out shows below 10 MHz: Loop I's cap in the north at
     # 1 MHz, the arms at 3 MHz; each is about 15 % of the variance. So do our clouds and sources.
     ours, theirs = galaxy.galaxy_map(frequency_mhz, NSIDE), ulsa_map(frequency_mhz)
@@ -358,16 +350,13 @@ def test_spectrum_is_continuous_positive_and_turns_over(source):
 def test_unmeasured_turnovers_are_those_of_the_embedded_electrons(name):
     # Rounded to 0.1 MHz of 1.2: 4 % in nu_t, 9 % in depth; the nu^-2.1 law adds up to 7 %.
     source = SOURCES[name]
-    lon_deg, lat_deg = source.galactic()
-    slabs = galaxy.Slabs.towards(np.array([lon_deg]), np.array([lat_deg]))
-    _, depth = slabs.synchrotron(source.turnover_mhz)
-    assert depth[0 if lat_deg > 0 else 1, 0] == pytest.approx(1.0, rel=0.16)
+    _, depth = one_line(*source.galactic(), source.turnover_mhz)
+    assert depth == pytest.approx(1.0, rel=0.16)
 
 
 def test_kelvin_steradian_is_the_rayleigh_jeans_law():
     # A disc of 1 K and 0.01 sr at 30 MHz: S = 2 k T Omega / lambda^2, lambda = 9.993 m.
-    wavelength = 299792458.0 / 30e6
-    flux_jy = 2.0 * 1.380649e-23 * 0.01 / wavelength**2 / 1e-26
+    flux_jy = 2.0 * 1.380649e-23 * 0.01 / (299792458.0 / 30e6) ** 2 / 1e-26
     law = {"log_flux": (np.log10(flux_jy),), "valid_from_mhz": 1.0}
     source = dataclasses.replace(SOURCES["Cyg A"], **law)
     assert source.kelvin_steradian(30.0) == pytest.approx(0.01, rel=1e-12)

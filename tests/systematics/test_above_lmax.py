@@ -77,9 +77,10 @@ def test_beams_that_end_before_leave_a_map_and_a_doubt(monkeypatch):
     assert "too much memory" in lb.build(own, data).doubts[0]
 
 
-@pytest.mark.parametrize(
-    "prior", ["isotropic", pytest.param("local_scales", marks=pytest.mark.essential)]
-)
+PRIORS = ["isotropic", pytest.param("local_scales", marks=pytest.mark.essential)]
+
+
+@pytest.mark.parametrize("prior", PRIORS)
 def test_a_sky_that_does_not_end_at_lmax_has_error_bars_that_are_right(prior):
     """chi^2 per direction of those that the data know best; an order of magnitude off without."""
     given = "lmax=8", f"prior={{model: {prior}}}", "observation.step_s=14400"

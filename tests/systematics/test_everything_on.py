@@ -7,7 +7,7 @@ import healpy
 import numpy as np
 import pandas as pd
 import pytest
-from experiments import with_known_sky
+from experiments import pulls, rms_of_directions, with_known_sky
 from scipy.stats import chi2 as stats_chi2
 from scipy.stats import kstest, norm
 
@@ -15,7 +15,7 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import modes_to_map
 from lusee_bayes.experiment import rounds
 from lusee_bayes.experiment.experiment import program_pieces
-from lusee_bayes.experiment.model import set_up, simulate, true_values
+from lusee_bayes.experiment.model import set_up, simulate
 from lusee_bayes.experiment.rounds import Inference, settled
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.amplitudes import template_amplitudes
@@ -61,25 +61,6 @@ def of_another_sky(folder: Path, mhz: float, angles: int, **more) -> tuple[Setup
     return truth, lb.infer(lb.build(scenario(mhz, angles, **more), data=simulate(truth)))
 
 
-def whitened_error(truth: Setup, found: Inference) -> float:
-    """RMS over all directions of the sky, each in its own standard deviation."""
-    posterior = found.posterior
-    away = posterior.prior.whiten(truth.sky.modes) - posterior.white_mean
-    return float(np.sqrt(np.mean((np.asarray(posterior.lower).T @ away) ** 2)))
-
-
-def pulls(truth: Setup, found: Inference) -> dict[str, float]:
-    """How far every parameter is off, in its standard deviations."""
-    values, off = true_values(truth), {}
-    for part in found.expanded:
-        own, told = part.systematic, found.amplitudes(part)
-        true = own.true(values)
-        z = (np.array([true[name] for name in own.names]) - own.means) / own.stds
-        away = (np.asarray(part.expected) + told.mean - z) / told.std
-        off |= dict(zip(own.names, away.tolist(), strict=True))
-    return off
-
-
 @pytest.mark.essential
 def test_all_are_found_together(test_data):
     more = {"lmax": 6, "step_s": 21600.0, "prior": {"model": "isotropic"}, "seed": 1}
@@ -87,7 +68,7 @@ def test_all_are_found_together(test_data):
     away = pulls(truth, found)
     assert len(away) == 3 + 3 + 4
     assert not found.unsettled and found.rounds < 20
-    assert 0.75 < whitened_error(truth, found) < 1.25
+    assert 0.75 < rms_of_directions(found, truth.sky.modes) < 1.25
     assert max(map(abs, away.values())) < 3.5
 
 
@@ -139,7 +120,7 @@ def test_error_bars_of_all_together_are_right():
         off = np.array(list(pulls(truth, found).values()))
         below.append(norm.cdf(off))
         away = off * np.concatenate([found.amplitudes(part).std for part in found.expanded])
-        of_sky = prior.size * whitened_error(truth, found) ** 2
+        of_sky = prior.size * rms_of_directions(found, sky) ** 2
         chi2.append((of_sky, away @ np.linalg.solve(told.covariance, away)))
     n = prior.size, len(off)
     print(np.mean(chi2, axis=0) / n, [kstest(one, "uniform").pvalue for one in np.transpose(below)])
@@ -154,9 +135,10 @@ def test_error_bars_of_all_together_are_right():
 def test_all_are_found_together_at_full_resolution(test_data, mhz, angles):
     truth, found = of_another_sky(test_data, mhz, angles, lmax=16, seed=1)
     away = pulls(truth, found)
-    print(mhz, angles, whitened_error(truth, found), found.rounds, away)
+    full = rms_of_directions(found, truth.sky.modes)
+    print(mhz, angles, full, found.rounds, away)
     assert not found.unsettled and found.rounds < 20
-    assert 0.8 < whitened_error(truth, found) < 1.25
+    assert 0.8 < full < 1.25
     assert max(map(abs, away.values())) < 3.5
 
 

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 from assertions import close
-from experiments import differences
+from experiments import differences, rms_of_directions
 from reference import real_harmonics
 
 import lusee_bayes as lb
@@ -120,9 +120,7 @@ def test_maps_beside_errors_of_the_fields(seed):
     data = simulate(setup)
     for one in given:
         found = lb.infer(lb.build(one, data=data))
-        posterior = found.posterior
-        away = posterior.prior.whiten(setup.sky.modes) - posterior.white_mean
-        full.append(np.sqrt(np.mean((np.asarray(posterior.lower).T @ away) ** 2)))
+        full.append(rms_of_directions(found, setup.sky.modes))
         assert not found.unsettled
     assert 0.75 < full[0] < 1.25 and full[1] > 5.0
 

@@ -190,8 +190,7 @@ class Correlated(systematic.AdditiveNoise):
     hours: jax.Array
 
     def covariance(self) -> Covariance:
-        lag = self.hours[:, None] - self.hours[None]
-        kernel = jnp.exp(-jnp.abs(lag) / 3.0)
+        kernel = jnp.exp(-jnp.abs(self.hours[:, None] - self.hours[None]) / 3.0)
         return DenseCovariance(jnp.kron(jnp.eye(self.layout.n_products), kernel), "the hum")
 
 

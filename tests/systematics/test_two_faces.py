@@ -69,8 +69,7 @@ def test_white_noise_makes_drifts_of_the_right_covariance():
         drift = lb.GainDrift(0.02, correlation_h)
         # a margin for 10 hours cuts off longer ones at exp(-(60 / t)^2 2)
         root = np.asarray(drift.history(jnp.eye(drifts.grid.shape[0]), hours, drifts.grid))
-        lag = hours[:, None] - hours[None]
-        expected = 4e-4 * np.exp(-(lag**2) / (2 * correlation_h**2))
+        expected = 4e-4 * np.exp(-0.5 * ((hours[:, None] - hours) / correlation_h) ** 2)
         cut = np.exp(-2 * (60.0 / correlation_h) ** 2)
         within(root.T @ root, expected, 4e-4 * (1e-14 + cut))
 
@@ -236,8 +235,7 @@ def test_the_program_of_gain_scales():
     hours, products = np.asarray(data.observation.hours), all_products(4)
     drifts = GainDrifts.build(setup.scenario.noise.gain, setup, Around(data))
     around = np.asarray(drifts.visibilities)
-    lag = hours[:, None] - hours[None]
-    c = sigma**2 * np.exp(-(lag**2) / (2 * correlation_h**2))
+    c = sigma**2 * np.exp(-0.5 * ((hours[:, None] - hours) / correlation_h) ** 2)
     n_times = len(hours)
     noise = np.diag(np.asarray(radiometer(setup).diagonal()))
     for x, p in enumerate(products):

@@ -293,7 +293,7 @@ def channel_spectra(cube: MapResult) -> Panels:
 
 
 def sky_spectrum(cube: MapResult) -> Panels | None:
-    """Temperature of each region with error bars, and what the errors of the mean sky come from."""
+    """Temperature of each region with error bars, and errors of the mean sky by source."""
     if cube.single or (spectrum := cube.sky_spectrum()) is None:
         return None
     f = spectrum.frequency
