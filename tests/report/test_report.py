@@ -142,7 +142,7 @@ def test_report_makes_a_page_anew(which, manifest, request, tmp_path, capsys, mo
 
 
 def test_what_has_no_report_is_told(tmp_path, capsys):
-    assert "neither posterior.nc" in refused(capsys, "report", tmp_path)
+    assert "no results of" in refused(capsys, "report", tmp_path)
     (tmp_path / "posterior.nc").write_text("")
     assert "has no summary.json" in refused(capsys, "report", tmp_path)
     assert not (tmp_path / "report.html").exists()
