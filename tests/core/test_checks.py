@@ -46,7 +46,7 @@ def test_non_finite_entries_are_counted_and_the_first_three_located(bad):
     x[1, 3] = x[1, 4] = bad
     words = "x: NaN or infinity (2 of 10 entries, first at (1, 3), (1, 4))"
     refuse(words, require_finite, "x", x)
-    refuse("5 of 5 entries, first at (0,), (1,), (2,))", require_finite, "x", np.full(5, bad))
+    refuse(r"5 of 5.*\(0,\), \(1,\), \(2,\)\)", require_finite, "x", np.full(5, bad))
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, np.nan, np.inf])

@@ -177,11 +177,11 @@ LARGE = Demand(base_bytes=1e9, task_bytes=1e15)
 def test_workers_that_cannot_do_it_are_refused(engine, tmp_path, monkeypatch):
     new = DaskEngine(engine.client)
     greedy = DaskEngine(engine.client, LARGE)
-    refuse(r"is limited to .* of memory, but 1 task\(s\) at a time need", greedy.work_in, tmp_path)
-    refuse("does not see '.*gone'; command and workers", new.work_in, tmp_path / "gone")
+    refuse(r"memory.*1 task\(s\)", greedy.work_in, tmp_path)
+    refuse("gone'.*command and workers", new.work_in, tmp_path / "gone")
     with monkeypatch.context() as patch:
         patch.setattr(dask_engine, "code_versions", lambda: "lusee_bayes 0.0 and Python 3.0")
-        refuse("has lusee_bayes .*, the command lusee_bayes 0.0", new.work_in, tmp_path)
+        refuse(r"lusee_bayes.*command lusee_bayes 0\.0", new.work_in, tmp_path)
     with pytest.raises(RuntimeError, match="call work_in first"):
         DaskEngine(engine.client).each(tasks_of(abs, 1), Stages(), "s")
 

@@ -82,9 +82,9 @@ def test_spectrum_is_healpys():
 
 
 def test_bad_maps_are_refused():
-    refuse("100 pixels are not a HEALPix map", h.map_to_modes, np.ones(100), 2)
+    refuse("100 pixels.*HEALPix map", h.map_to_modes, np.ones(100), 2)
     hole = np.where(np.arange(48) == 5, np.nan, 1.0)
-    refuse("1 of 48 entries, first at (5,)", h.map_to_modes, hole, 2)
+    refuse(r"1 of 48.*\(5,\)", h.map_to_modes, hole, 2)
     refuse("supports lmax <= 5", h.map_to_modes, np.ones(48), 6)
     refuse("the field has shape", SphereGrid.of(3, 6).product_matrix, np.ones((3, 4)))
 

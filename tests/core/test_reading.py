@@ -74,7 +74,7 @@ def test_what_no_memory_holds_is_not_read(tmp_path, monkeypatch):
     with h5py.File(tmp_path / "x.h5", "w") as file:
         huge = file.create_dataset("data", shape=(400_000, 400_000), dtype="f8", chunks=True)
         layout = Layout("an example", {"data": Variable(("time", "product"))})
-        refuse("1,280 GB of numbers; this machine has 1", layout.checked, "x", {"data": huge}, {})
+        refuse("1,280 GB.*machine.* 1", layout.checked, "x", {"data": huge}, {})
 
 
 def test_tables_objects_and_arrays(tmp_path):
@@ -82,7 +82,7 @@ def test_tables_objects_and_arrays(tmp_path):
     table = Layout("a table", {"ell": Variable(("row",)), "name": Variable(("row",), "text")})
     np.testing.assert_array_equal(reading.read_table(tmp_path / "t.csv", table)["ell"], [0.0, 1.0])
     (tmp_path / "t.csv").write_text("ell,name\n0,a\n1\n")
-    refuse("line 3 has 1 entries for 2 columns", reading.read_table, tmp_path / "t.csv", table)
+    refuse("line 3.*2 columns", reading.read_table, tmp_path / "t.csv", table)
     (tmp_path / "o.json").write_text("[1]")
     refuse("contains a list", reading.read_json, tmp_path / "o.json", Layout("an object"))
     np.save(tmp_path / "a.npz", np.ones(3))
@@ -103,7 +103,7 @@ def test_a_file_without_end_is_refused(path, monkeypatch):
     monkeypatch.setattr(formats, "LIMIT_S", 0.2)
     monkeypatch.setattr(formats, "_read_all", lambda path, size: time.sleep(60))
     start = time.monotonic()
-    refuse("does not finish reading it within 0.2 s", require_readable_hdf5, path)
+    refuse(r"reading.*0\.2 s", require_readable_hdf5, path)
     assert time.monotonic() - start < 30
 
 
@@ -121,7 +121,7 @@ def test_a_name_whose_search_has_no_end_is_refused_even_where_none_can_be_listed
     formats._probe.cache_clear()
     monkeypatch.setattr(formats, "LIMIT_S", 0.2)
     monkeypatch.setattr(formats.h5py, "File", lambda path: nullcontext(file))
-    refuse("does not finish reading it within 0.2 s", require_readable_hdf5, path)
+    refuse(r"reading.*0\.2 s", require_readable_hdf5, path)
 
 
 def test_a_file_that_ends_the_process_is_refused(path, monkeypatch):
@@ -178,6 +178,6 @@ def test_what_is_not_valid_is_refused(text, message):
 def test_files_are_utf8(tmp_path):
     path = tmp_path / "x.yaml"
     path.write_bytes("a: é".encode("latin-1"))
-    refuse(r"x.yaml cannot be read as a scenario: .*utf-8", reading.read_yaml, path, "a scenario")
+    refuse(r"x\.yaml.*scenario.*utf-8", reading.read_yaml, path, "a scenario")
     path.write_bytes(b"\xef\xbb\xbfa: 1")
     assert reading.read_yaml(path, "a scenario") == {"a": 1}

@@ -127,7 +127,7 @@ def test_what_is_unclear_or_contradicts_is_refused(tmp_path, window, timestamp, 
 
 def test_no_experiment_of_data_with_unclear_times_or_a_fixed_axis_in_windows(tmp_path):
     data = read_visibilities(file_of(tmp_path, None)[0])
-    refuse("do not specify .* their times; use data.stamped", set_up, scenario(), data)
+    refuse(r"times.*data\.stamped", set_up, scenario(), data)
     data, fixed = read_visibilities(file_of(tmp_path, "mean")[0]), "observation.fixed_axis=true"
     refuse("means over windows.*remove observation.fixed_axis", set_up, scenario(fixed), data)
 
@@ -212,9 +212,9 @@ def test_a_plan_keeps_the_dates_of_a_schedule(given):
 def test_what_is_wrong_with_the_file_is_said(given, path):
     path.write_text(TABLE.replace("2027-01-18,", "2028-01-18,"))
     scenario = lb.load_scenario("fiducial", given)
-    refuse(r"nights.csv, row 2: the interval from .* begins", lb.build, scenario)
+    refuse(r"nights\.csv, row 2.*interval.*begins", lb.build, scenario)
     path.unlink()
-    refuse("no schedule, a table in CSV or .* at '", posterior_cost, scenario)
+    refuse("no schedule.*CSV.* at '", posterior_cost, scenario)
 
 
 DRAWS = 12

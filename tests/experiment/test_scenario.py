@@ -123,8 +123,8 @@ def test_errors_name_what_is_wrong(overrides, message):
 
 
 def test_errors_of_the_file_itself(short):
-    refuse("no scenario 'fiducail'.*did you mean 'fiducial'", load_scenario, "fiducail")
-    refuse("must contain keys and values, got a list", short, "- 1\n")
+    refuse("scenario 'fiducail'.*'fiducial'", load_scenario, "fiducail")
+    refuse("keys and values.*list", short, "- 1\n")
     refuse("not valid YAML", short, "a: [1\n")
 
 
@@ -407,7 +407,7 @@ def test_what_is_listed_of_a_key_is_enforced_and_the_key_is_named(key):
 def test_a_section_is_listed_alone_and_a_wrong_one_is_corrected():
     assert {key.path.split(".")[1] for key in scenario_keys("noise.gain")} == {"gain"}
     assert [key.path for key in scenario_keys("lmax")] == ["lmax"]
-    refuse("no key 'noise.gane'; did you mean 'noise.gain'?", scenario_keys, "noise.gane")
+    refuse(r"key 'noise\.gane'.*'noise\.gain'", scenario_keys, "noise.gane")
 
 
 def test_the_page_of_keys_is_up_to_date():

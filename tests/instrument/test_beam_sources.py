@@ -73,6 +73,6 @@ def test_a_file_has_no_embedded_antennas_and_no_other_frequencies(scalar, respon
     for source in (replace(scalar, moon_k=250.0), replace(response, moon_k=250.0)):
         refuse(r"embedded antennas, which beam\.file replaces", getattr, source, "monopoles")
         for ask in (lambda f, s=source: s.beams(f, 2), source.background):
-            refuse("to 50 MHz, not at 51", ask, 51.0)
-    refuse("to 50 MHz, not at 51", scalar.impedance, 51.0)
+            refuse("50 MHz.* 51", ask, 51.0)
+    refuse("50 MHz.* 51", scalar.impedance, 51.0)
     assert replace(scalar, impedance_ohm=None).impedance(51.0) is None

@@ -119,13 +119,13 @@ def test_modes_keep_leading_axes():
 
 def test_what_no_beams_are_is_refused():
     coarse = bf.HemisphereGrid.gauss_legendre(10, 8)
-    refuse("8 azimuths cannot resolve lmax = 4", coarse.modes, np.ones((10, 8)), 4)
+    refuse("8 azimuths.*lmax = 4", coarse.modes, np.ones((10, 8)), 4)
     good = short_dipole([0, 0, 1])
     refuse("e_theta must be", bf.AntennaFields, good.e_theta.astype(np.complex64), good.e_phi, GRID)
     refuse("e_theta has shape", bf.AntennaFields, good.e_theta[:, 1:], good.e_phi[:, 1:], GRID)
-    refuse("Stokes parameter 'W'; known: I, Q, U, V", bf.stokes_beam, good, "W")
+    refuse("Stokes.*'W'.*I, Q, U, V", bf.stokes_beam, good, "W")
     refuse("3 products do not match", bf.ProductBeams, np.zeros((3, 4)), 10.0)
-    refuse("5 coefficients do not match any lmax", bf.ProductBeams, np.zeros((4, 5)), 10.0)
+    refuse("5 coefficients.*lmax", bf.ProductBeams, np.zeros((4, 5)), 10.0)
 
 
 # --- luseepy's quadrature rules, against closed forms ---------------------------------------------

@@ -173,7 +173,7 @@ def test_what_cannot_be_is_refused(tables, tmp_path, capsys):
     refuse(said, read_beam_grid, write_table(tmp_path, rows[:3]))
     words = "has 2 files for surface_permittivity 1, zenith_angle_deg 3; expected one file"
     refuse(words, read_beam_grid, write_table(tmp_path, [*rows, rows[1]]))
-    refuse("a parameter of one value, or none", read_beam_grid, write_table(tmp_path, rows[:2]))
+    refuse("parameter.*one value.*none", read_beam_grid, write_table(tmp_path, rows[:2]))
     refuse("zenith_angle_deg", read_beam_grid, write_table(tmp_path, [*rows, ("e", 3, "steep")]))
     refuse("no beam file at", read_beam_grid, write_table(tmp_path, rows))
     assert main(["info", table]) == 0

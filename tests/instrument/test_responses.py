@@ -215,7 +215,7 @@ def test_receivers(tmp_path):
     measured = read_receiver(write_images(tmp_path / "zl.fits", images, {}))
     zl = 0.45 * loads[0] + 0.55 * loads[1]
     np.testing.assert_allclose(measured.load(21.0), zl, rtol=1e-13)
-    refuse(r"zl.fits has values from 10 to 30 MHz, not at 31", measured.load, 31.0)
+    refuse(r"zl\.fits.*10 to 30 MHz.* 31", measured.load, 31.0)
     open_ = replace(read_beam(write(tmp_path / "response.fits")), receiver=None)
     np.testing.assert_array_equal(open_.circuit(20.0).loading, np.eye(4))
     response = replace(open_, receiver=measured)
@@ -433,7 +433,7 @@ def test_open_ports_have_no_loads_to_write(luseepy, tmp_path):
     response, original, _ = luseepy
     channel = read_waterfall(original).at(5.0)
     circuit, path = replace(response, receiver=None).circuit(5.0), tmp_path / "w.fits"
-    refuse("ports are open; give another beam.rec", write_four_port, path, [channel], [circuit])
+    refuse(r"ports.*open.*beam\.rec", write_four_port, path, [channel], [circuit])
     assert not list(tmp_path.iterdir())
 
 

@@ -156,7 +156,7 @@ def test_files_come_back(tmp_path, kind, suffix):
     for f in (20.0, 24.0):
         ours, own = (np.asarray(b.beams(f, LMAX).modes) for b in (again, made))
         close(ours, own, 1e-13)
-    refuse("from 20 to 30 MHz, not at 31", again.beams, 31.0, LMAX)
+    refuse("20 to 30 MHz.* 31", again.beams, 31.0, LMAX)
     text = describe(path)
     assert "4 antennas" in text and "at 20, 30 MHz" in text
 
@@ -185,7 +185,7 @@ def test_product_beams_of_a_file_may_be_in_any_order(tmp_path):
     np.testing.assert_array_equal(read_beam(path).products, made.products)
     shuffled.attrs["products"] = "00R, 01R"
     shuffled.to_netcdf(path, engine="h5netcdf")
-    refuse(r"mine\.nc: products is 00R, 01R, expected the names", read_beam, path)
+    refuse(r"mine\.nc.*products.*00R, 01R.*names", read_beam, path)
 
 
 @pytest.mark.parametrize("kind", ["pixels", "grid"])

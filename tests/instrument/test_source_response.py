@@ -227,9 +227,9 @@ def test_the_circularly_polarised_part_enters_by_the_v_beam():
 
 def test_bad_directions_and_sources_are_refused():
     o, towards, response = observation(), mp.beams_towards, mp.source_response
-    refuse("frequency_mhz must be positive, got 0.0", towards, 0.0, ZENITH)
-    refuse("unit vectors, number 0 has length 1.1; divide", towards, FREQUENCY, 1.1 * ZENITH)
+    refuse(r"frequency_mhz.*positive.*0\.0", towards, 0.0, ZENITH)
+    refuse(r"unit vectors.*number 0.*1\.1", towards, FREQUENCY, 1.1 * ZENITH)
     for bad in (-1.5, np.nan):
         refuse(f"from -1 to 1, got {bad}", response, o, ZENITH[0], FREQUENCY, stokes_v=bad)
-    refuse("unit vectors, number 0 has length 2", response, o, 2.0 * ZENITH[0], FREQUENCY)
+    refuse("unit vectors.*number 0.*length 2", response, o, 2.0 * ZENITH[0], FREQUENCY)
     refuse("galactic has shape", response, o, np.zeros((2, 3)), FREQUENCY)

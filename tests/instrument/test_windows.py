@@ -199,7 +199,7 @@ def test_bins_of_which_nothing_remains_are_dropped():
     rarely = flagged(*((p, k) for p in range(16) for k in range(4) if p % 4 != k))
     halves = flagged(*((p, k) for p in range(16) for k in range(4) if p % 2 != k % 2))
     for data in (rarely, halves):
-        refuse("averaging over 2400 s leaves no data", averaged, data, 4 * STEP)
+        refuse("averaging.*2400 s.*no data", averaged, data, 4 * STEP)
 
 
 NOT_AVERAGED = [
@@ -323,11 +323,11 @@ def test_windows_that_cannot_be(sample, start, end, live, words):
 def test_windows_that_samples_cannot_have():
     o = lb.Observation.from_runs([lb.Run(0.05)], window="mean")
     n = np.ones(o.n_times)
-    with refused("the window of sample 0 lasts 8000 s, longer than the st"):
+    with refused("window.*sample 0.*8000 s.*longer"):
         replace(o, windows=Windows.whole(-4000 * n, 4000 * n))
-    with refused(r"samples 0 and 1 \(2027-01-15T01:00:00\) overlap by 600"):
+    with refused(r"samples 0 and 1 \(2027-01-15T01:00:00\).*overlap.*600"):
         replace(o, windows=Windows.whole(-3600 * n, 3600 * n + 600 * (o.hours == 0)), step_s=8e3)
-    refuse("windows of 3 samples for 16 times", replace, o, windows=Windows.whole(-n[:3], n[:3]))
+    refuse("windows.*3 samples.*16 times", replace, o, windows=Windows.whole(-n[:3], n[:3]))
     refuse("that are instants; use observation.window=instant", replace, o, fixed_axis=True)
 
 

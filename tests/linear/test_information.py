@@ -99,7 +99,7 @@ def test_information_about_other_modes_is_not_added():
     prior = lb.HarmonicPrior(jnp.asarray(SPECTRUM[:2]))
     few = replace(models[0], coupling=coupling, prior=prior).condition(data[0]).information
     refuse("the other reference sky", add, whole, few)
-    refuse("needs a prior over the same modes", whole.posterior, prior)
+    refuse("prior.*same modes", whole.posterior, prior)
 
 
 @pytest.mark.long

@@ -192,5 +192,5 @@ def test_bad_priors_and_channels_are_refused():
     refuse("'turnver'; did you mean 'turnover'", components, *all_four, ("turnver",))
     refuse("must not be negative", components, *all_four, residual=-0.1)
     few = FREQUENCIES[:2], skies()[:2]
-    refuse("3 spectral components need at least as many channels", components, *few)
-    refuse("fit any skies of 2 channels exactly", components, *few, ("power_law", "curvature"))
+    refuse("3 spectral components.*channels", components, *few)
+    refuse("skies.*2 channels.*exactly", components, *few, ("power_law", "curvature"))

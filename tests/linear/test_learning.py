@@ -120,7 +120,7 @@ def test_others_integrated_out(case):
 
 def test_nothing_settles_without_steps(case, monkeypatch):
     monkeypatch.setattr("lusee_bayes.priors.learning.MAX_STEPS", 0)
-    refuse("did not converge in 0 steps", learning.learn, case.family, case.information)
+    refuse("not converge.*0 steps", learning.learn, case.family, case.information)
     # a family far from its own start is still found
     far = replace(case.family, log_monopole=case.family.log_monopole + 1.0)
     monkeypatch.undo()

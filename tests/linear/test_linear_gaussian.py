@@ -258,7 +258,7 @@ def test_no_convergence_is_an_error(n_data):
 def test_noise_too_small_for_float64_is_an_error():
     """W from 1 to 1e9: Lambda holds 1 and 1e18, of which eps is 200."""
     model, d, exact = graded(24, 1e9)
-    refuse("could not be factorised|did not converge", model.condition, d, InMap)
+    refuse("factorised|not converge", model.condition, d, InMap)
     post = model.condition(d, InData).posterior  # the graded form still gets there
     assert np.abs((np.asarray(post.mean) - exact.mean) / exact.std).max() < PROMISED
 
@@ -338,7 +338,7 @@ def test_bad_parts_are_refused(small):
         lb.LinearGaussian(a, prior, noise, jnp.ones(8))
     bad = DenseCovariance(jnp.eye(9).at[0, 0].set(-2.0), "the gain term")
     condition = lb.LinearGaussian(a, prior, bad).condition
-    refuse("the gain term is not positive definite.*is -2 ", condition, d)
+    refuse("gain term.*not positive definite.* -2 ", condition, d)
 
 
 def test_slopes_with_fewer_data_and_an_ell_without_power():

@@ -178,7 +178,7 @@ def test_the_matrix_is_not_formed_where_there_is_structure(kind, monkeypatch):
 def test_information_that_cannot_settle_says_so(monkeypatch):
     monkeypatch.setattr(information, "CONVERGENCE", 0.0)
     gaussian = model()
-    refuse("did not converge: its last step", gaussian.condition, jnp.ones(gaussian.n_data))
+    refuse("not converge.*last step", gaussian.condition, jnp.ones(gaussian.n_data))
 
 
 @pytest.mark.parametrize(("lmax", "nside"), [(0, 1), (3, 2), (7, 4)])

@@ -218,9 +218,9 @@ def test_learned_laws_maximise_the_evidence():
 
 
 def test_bad_input_is_refused_in_a_sentence():
-    refuse("unknown field 'indx'; did you mean 'index'", skies_of, FREQUENCIES, ("level", "indx"))
+    refuse("field 'indx'.*'index'", skies_of, FREQUENCIES, ("level", "indx"))
     one, build = FREQUENCIES[:1], PositiveSkies.of
-    refuse("2 fields .* need at least as many channels", skies_of, one, ("level", "index"))
+    refuse("2 fields.*channels", skies_of, one, ("level", "index"))
     holes = [lambda theta, phi, f=f: band(f, theta, phi) - 50.0 for f in FREQUENCIES]
     refuse("the template", build, FREQUENCIES, holes, LMAX)
     skies = skies_of(FREQUENCIES[:1], ("level",))

@@ -132,7 +132,7 @@ def test_whitening_in_a_traced_program():
 def test_what_has_no_inverse_is_not_whitened():
     for form in FORMS:
         post, _ = conditioned(9, form, SINGULAR)
-        refuse("zero at ell = 1 and has no", post.whiten, post.sample(jax.random.key(0), 2))
+        refuse("zero.*ell = 1.* no", post.whiten, post.sample(jax.random.key(0), 2))
 
 
 # --- fidelity -------------------------------------------------------------------------------------

@@ -213,8 +213,8 @@ def test_derivatives_of_the_log_determinant():
 
 @pytest.mark.parametrize("bad", [0.0, -0.01, np.nan, np.inf])
 def test_bad_parameters_are_refused(bad):
-    refuse("the gain drift's sigma must be positive, got", GainDrift, bad)
-    refuse("the gain drift's correlation time in hours must be positive, got", GainDrift, 0.01, bad)
+    refuse("gain drift's sigma.*positive", GainDrift, bad)
+    refuse("gain drift's correlation time.*positive", GainDrift, 0.01, bad)
 
 
 def test_bad_visibilities_are_refused():
@@ -223,10 +223,10 @@ def test_bad_visibilities_are_refused():
     short, shapes = d[:, :5], r"the visibilities has shape \(4, 5\), expected \(4, 6\)"
     refuse(shapes, drift.covariance, short, HOURS[:5], layout)
     bad = d.at[2, 1].set(jnp.nan)
-    refuse(r"visibilities.*NaN .* first at \(2, 1\)", drift.covariance, bad, HOURS, layout)
+    refuse(r"visibilities.*NaN.*\(2, 1\)", drift.covariance, bad, HOURS, layout)
 
 
 def test_the_term_alone_is_not_a_noise():
     """It is singular: the Re and Im of a product drift together."""
     gain = term(GainDrift(0.01), visibilities(2), HOURS, complete(2))
-    refuse("the gain-drift covariance is not positive definite.*add the radiometer", gain.factor)
+    refuse("gain-drift covariance.*not positive definite.*radiometer", gain.factor)

@@ -123,8 +123,8 @@ def test_parameters_must_be_positive(name, bad):
 
 
 def test_bad_options_and_visibilities_are_refused():
-    refuse(r"duty_cycle must not exceed 1, got 1\.5", noise, duty_cycle=1.5)
-    refuse("radiometer form 'exakt'; did you mean 'exact'", noise, "exakt")
+    refuse(r"duty_cycle.*exceed 1.*1\.5", noise, duty_cycle=1.5)
+    refuse("radiometer form 'exakt'.*'exact'", noise, "exakt")
     never = np.zeros((N_PRODUCTS, N_TIMES), dtype=bool)
     never[7] = True
     for visibilities, layout, words in (
@@ -196,7 +196,7 @@ def test_every_sample_has_its_own_live_time(form):
     same = lb.radiometer_noise(v[:, :1], one, step_s=live.sum(), form=form).dense()
     np.testing.assert_allclose(got, same, rtol=1e-15)
     options = {"step_s": live[:4], "form": form}
-    refuse(r"step_s has shape \(4,\), expected \(5,\)", lb.radiometer_noise, v, layout, **options)
+    refuse(r"step_s.*\(4,\).*\(5,\)", lb.radiometer_noise, v, layout, **options)
 
 
 # --- sample covariances scatter so ----------------------------------------------------------------

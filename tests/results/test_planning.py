@@ -226,8 +226,8 @@ def test_what_will_be_known_of_clock_and_turntable():
 
 
 def test_ports_that_do_not_exist_and_none_left():
-    refuse("port 4 does not exist; ports are 0 to 3", plan_run.forecast, varied(lost=(4,)))
-    refuse("small, test: all .* samples are flagged", plan_run.forecast, varied(lost=(0, 1, 2, 3)))
+    refuse("port 4.*0 to 3", plan_run.forecast, varied(lost=(4,)))
+    refuse("small, test.*all .*samples.*flagged", plan_run.forecast, varied(lost=(0, 1, 2, 3)))
 
 
 TINY = ["--set", "lmax=6", "--set", "observation.runs.0.cycles=0.05"]

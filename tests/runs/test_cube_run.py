@@ -200,10 +200,10 @@ def test_what_too_few_channels_cannot_be_is_named(gap, tmp_path, numbers_alone):
     joint = three("joint=true", "spectral.components=[power_law, curvature]")
     refuse("spectral.components.*; not mapped: 25 MHz: ", lb.run_map, joint, tmp_path, data=gap)
     other = three(frequencies="[40, 45]")
-    refuse("no channel can be mapped: 40 MHz: ", lb.run_map, other, tmp_path, data=gap)
+    refuse("no channel.*mapped.*40 MHz", lb.run_map, other, tmp_path, data=gap)
     refuse("no data at", lb.run_map, three(), tmp_path, data=tmp_path / "gone.fits")
     lmax_of_fields = scenario_of().spectral.lmax_of_fields
-    refuse(r"lmax 80 have 13122 unknowns.*use lmax=69", lmax_of_fields, 80)
+    refuse("lmax 80.*13122 unknowns.*lmax=69", lmax_of_fields, 80)
     assert lmax_of_fields(60) == 69
 
 

@@ -167,7 +167,7 @@ def test_an_unreadable_chunk_is_named_and_deleting_it_helps(folder, damage):
 def test_a_chunk_missing_in_the_middle_is_noticed(folder):
     """Draws behind the gap would silently take the place of those in it."""
     chunks(folder)[2].unlink()
-    refuse("lacks the draws of iterations 8 to 12", again(folder).chunks)
+    refuse("draws.*iterations 8 to 12", again(folder).chunks)
 
 
 def test_chunks_without_a_marker_are_not_taken_for_ones_own(folder):

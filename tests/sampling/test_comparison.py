@@ -138,4 +138,4 @@ def test_where_there_is_no_mode_nothing_is_found():
 
     assert not bool(laplace_approximation(model, {"data": None}).converged)
     endless = Program("endless", model, "")
-    refuse("found no mode of the posterior", comparison.estimate_evidence, endless, {}, np.zeros(1))
+    refuse("no mode.*posterior", comparison.estimate_evidence, endless, {}, np.zeros(1))

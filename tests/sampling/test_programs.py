@@ -138,7 +138,7 @@ def test_files_that_are_no_programs(write, text, message, more):
         lb.load_program(path)
     assert str(path) in str(error.value) and more in str(error.value)
     assert len(str(error.value)) < 300
-    refuse("give the path of a Python file", lb.load_program, write(text, "mine.txt"))
+    refuse("path.*Python file", lb.load_program, write(text, "mine.txt"))
 
 
 # --- what they ask for ----------------------------------------------------------------------------
@@ -348,7 +348,7 @@ def test_bad_programs_are_one_sentence(name, write, pieces):
 @pytest.mark.parametrize("argument", ["coupling, /, ", "*, coupling, *noise, ", "**others, "])
 def test_arguments_are_given_by_name(argument, write):
     path = write(f"def model({argument}data=None):\n    pass\n")
-    refuse("fails when it is loaded|positional or starred argument", lb.load_program, path)
+    refuse("fails.*loaded|positional.*starred argument", lb.load_program, path)
 
 
 def test_a_density_that_is_nan_names_the_program(tmp_path, capsys):

@@ -172,7 +172,7 @@ def test_refusals():
     sky = log_normal(0.1)
     words, none = "ln A and the tilt of the sky.*NaN", np.array([-np.inf, TILTED])
     refuse(words, LogNormalPrior, sky, none)
-    refuse("of ln A or of the tilt must be", log_normal_prior, 0.1, (1.0, 0.0))
+    refuse("ln A or.*tilt", log_normal_prior, 0.1, (1.0, 0.0))
 
 
 @pytest.mark.parametrize("widths", [None, (0.7, 0.5)])

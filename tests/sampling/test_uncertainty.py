@@ -107,7 +107,7 @@ def test_modes_that_the_sky_does_not_have(skies):
 
 
 def test_what_has_no_pixels_is_refused():
-    refuse("15 coefficients do not match any lmax", pixel_statistics, np.zeros((1, 2, 15)), NSIDE)
+    refuse("15 coefficients.*lmax", pixel_statistics, np.zeros((1, 2, 15)), NSIDE)
 
 
 def test_the_summary_has_a_row_for_each_quantity_with_its_own_numbers(gaussian, skies):

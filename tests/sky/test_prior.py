@@ -89,14 +89,14 @@ def test_what_no_prior_is_is_refused():
     dense, harmonic, covariance = DensePrior.of_covariance, lb.HarmonicPrior, dense_covariance()
     skewed, singular = covariance.copy(), covariance - 10.0 * np.eye(16)
     skewed[3, 1] += 1e-6
-    refuse(r"not symmetric: S\[1, 3\] = .*S\[3, 1\]", dense, skewed)
-    refuse("definite: its lowest eigenvalue is -", dense, jnp.array(singular))
-    refuse("lower triangular with a positive diagonal", DensePrior, covariance)
+    refuse(r"not symmetric.*S\[1, 3\].*S\[3, 1\]", dense, skewed)
+    refuse("definite.*lowest eigenvalue.* -", dense, jnp.array(singular))
+    refuse("lower triangular.*positive diagonal", DensePrior, covariance)
     refuse("the prior mean has shape", dense, covariance, np.zeros(9))
     refuse("the prior covariance.*NaN", dense, np.full((4, 4), np.nan))
-    refuse(r"negative at ell = 2: C_ell = -0\.5", harmonic, jnp.array([1.0, 1.0, -0.5, -1.0]))
+    refuse(r"negative.*ell = 2.*C_ell = -0\.5", harmonic, jnp.array([1.0, 1.0, -0.5, -1.0]))
     refuse("prior spectrum.*NaN", harmonic, jnp.array([1.0, jnp.nan]))
-    refuse("power at ell = 2, where C_ell is", harmonic, jnp.asarray(SPECTRUM), mean=MEAN)
+    refuse("power.*ell = 2.*C_ell", harmonic, jnp.asarray(SPECTRUM), mean=MEAN)
     refuse("the prior mean has shape", harmonic, jnp.asarray(SPECTRUM[:2]), mean=MEAN)
 
 

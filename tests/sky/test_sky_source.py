@@ -133,7 +133,7 @@ def test_a_file_is_there_and_its_frequency_positive():
     given = lb.sky_from_file, "nowhere.fits", 25.0, LMAX
     for frequency in (0.0, -3.0, np.nan):
         refuse("file_frequency_mhz must be positive", *given, file_frequency_mhz=frequency)
-    refuse("no sky map at 'nowhere.fits'; check sky.file", *given)
+    refuse(r"'nowhere\.fits'.*sky\.file", *given)
 
 
 @pytest.fixture
@@ -198,7 +198,7 @@ def test_millikelvin_are_converted_and_lmax_has_to_fit(tmp_path, pixels):
     path = tmp_path / "map.fits"
     write_fits(path, pixels, "mK")
     np.testing.assert_allclose(ss.read_sky_file(path).pixels, pixels / 1e3, rtol=1e-14)
-    refuse("lmax = 48 is too large for a map of NSIDE 16", lb.sky_from_file, path, 10.0, 48)
+    refuse("lmax = 48.*NSIDE 16", lb.sky_from_file, path, 10.0, 48)
 
 
 CUBE_NSIDE = 8
@@ -233,7 +233,7 @@ def test_a_scenario_with_a_cube(tmp_path, maps):
 
 def test_cubes_that_cannot_be_used(tmp_path, maps):
     cube = ss.SkyCube.read(write_cube(tmp_path / "cube.fits", maps))
-    refuse("from 1 to 50 MHz, not at 50.5; set sky.file_freq", cube.map_at, 50.5)
+    refuse(r"1 to 50 MHz.*50\.5.*sky\.file_freq", cube.map_at, 50.5)
     refuse("expected 60 maps", ss.SkyCube.read, write_cube(tmp_path / "long.fits", maps, end=60))
     refuse("has 767 values", ss.SkyCube.read, write_cube(tmp_path / "odd.fits", maps[:, :-1]))
     in_hz = write_cube(tmp_path / "hz.fits", maps, start=1e6, step=1e6)
@@ -249,7 +249,7 @@ def test_cubes_that_cannot_be_used(tmp_path, maps):
     negative[9, 5] = -1.0
     cube = ss.SkyCube.read(write_cube(tmp_path / "negative.fits", negative))
     assert cube.map_at(10.0)[5] == -1.0
-    refuse("not positive at 9 or 10 MHz", cube.map_at, 9.5)
+    refuse("not positive.*9 or 10 MHz", cube.map_at, 9.5)
     path = tmp_path / "cube.fits"
     path.write_bytes(path.read_bytes()[:10_000])
     refuse("truncated", lb.sky_from_file, path, 25.0, 4)
@@ -284,20 +284,20 @@ def test_luseepys_coefficients_of_many_frequencies(test_data):
     sky = lb.sky_from_file(path, 25.0, 47)
     with np.load(path) as file:
         np.testing.assert_array_equal(sky.modes, from_healpy(file["alm"][4]))
-    refuse(r"no coefficients at 12 MHz \(it has 5, 10, 15", lb.sky_from_file, path, 12.0, 47)
+    refuse("no coefficients.*12 MHz.*5, 10, 15", lb.sky_from_file, path, 12.0, 47)
     assert "coefficients of 10 skies up to ell = 47, 5, 10" in describe(path)
 
 
 def test_coefficients_that_cannot_be_used(tmp_path, coefficients):
     path = ss.write_alms(tmp_path / "alm.fits", coefficients, {})
-    refuse("up to ell = 8, expected up to 9", lb.sky_from_file, path, 25.0, 9)
+    refuse("ell = 8.*expected.* 9", lb.sky_from_file, path, 25.0, 9)
     with fits.open(path) as hdus:
         table = hdus[1].data
         fits.BinTableHDU(table[:-1], name="ALM").writeto(tmp_path / "short.fits")
         bad = table.copy()
         bad["index"][3] = 2  # ell = 1, m = -1
         fits.BinTableHDU(bad, name="ALM").writeto(tmp_path / "negative.fits")
-    refuse("1 coefficients up to ell = 8 are missing", ss.SkyAlms.read, tmp_path / "short.fits")
+    refuse("1 coefficients.*ell = 8.*missing", ss.SkyAlms.read, tmp_path / "short.fits")
     refuse("0 <= m <= ell", ss.SkyAlms.read, tmp_path / "negative.fits")
     np.savez(tmp_path / "a.npz", alm=np.zeros((2, 45), complex))
     refuse(r"no freq \(it has alm\)", ss.SkyAlms.read, tmp_path / "a.npz")

@@ -174,12 +174,12 @@ def test_what_cannot_be(tmp_path):
     def tabled(*rows):
         setup_of(f"file: {written(tmp_path, rows)}, std_deg: 1")
 
-    refuse("has one row; expected two or more", tabled, (0, 1))
-    refuse("altitude_deg contains a value outside 0 to 45", tabled, (0, 1), (90, 46))
+    refuse("one row.*two or more", tabled, (0, 1))
+    refuse("altitude_deg.*outside 0 to 45", tabled, (0, 1), (90, 46))
     refuse("azimuth_deg has values of type", tabled, (0, 1), ("high", 2))
     (tmp_path / "other.csv").write_text("azimuth,altitude_deg\n0,1\n90,2")
     refuse("has no azimuth_deg", setup_of, f"file: {tmp_path / 'other.csv'}, std_deg: 1")
     refuse("no table of the horizon", setup_of, "file: none.csv, std_deg: 1")
     refuse("give file or altitude_deg: at", setup_of, "std_deg: 1")
     wrong = setup_of("std_deg: 1, altitude_deg: 1, true_values: {horizon_cos_9_deg: 1}")
-    refuse("has 'horizon_cos_9_deg', which has no prior", models.true_values, wrong)
+    refuse("'horizon_cos_9_deg'.*no prior", models.true_values, wrong)

@@ -165,5 +165,5 @@ def test_what_cannot_be_is_refused():
     setup = replace(setup_with(linear=0.01), beam_source=beams)
     why = "noise.polarisation: the beams: product beams, but this needs the E fields"
     refuse(why, model_about, setup, Around())
-    refuse("less than or equal to 1", small_scenario, "noise.polarisation.linear=1.5")
-    refuse("greater than or equal to 2", small_scenario, "noise.polarisation.lmax=1")
+    refuse("less than.*equal to 1", small_scenario, "noise.polarisation.linear=1.5")
+    refuse("greater than.*equal to 2", small_scenario, "noise.polarisation.lmax=1")

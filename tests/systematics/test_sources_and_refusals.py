@@ -258,7 +258,7 @@ def test_bands_beyond_the_highest_ell():
     e = experiment("prior.band_edges=[3, 7]", sources=CAS_A)
     program = lb.load_program("systematics")
     arguments = {n: v for n, v in program_arguments(program, e).items() if n != "data"}
-    refuse("a band starts at ell = 7, above lmax = 6", latent_sites, program.model, arguments)
+    refuse("band.*ell = 7.*lmax = 6", latent_sites, program.model, arguments)
     # 6 is the highest ell itself
     base = replace(models.base_model(e.setup), prior=lb.HarmonicPrior(jnp.ones(7)))
     with handlers.seed(rng_seed=0):
@@ -293,4 +293,4 @@ def test_what_the_scenario_does_not_have():
     for program, section in (("gains", "noise.gain"), ("sources", "sources")):
         refuse(f"the scenario has no {section}", program_arguments, lb.load_program(program), bare)
     asked = lb.load_program("systematics").arguments
-    refuse("asks for 'gaussian', a piece of an experiment", asked, models.base_model(bare.setup))
+    refuse("'gaussian'.*piece.*experiment", asked, models.base_model(bare.setup))
