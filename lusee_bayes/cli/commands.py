@@ -515,7 +515,7 @@ def spectrum_command(
     run
         Result folder of map.
     region
-        mean sky, observed sky, "cap b > 60", "cap b < -60" or "plane |b| < 10".
+        mean sky, observed sky, ``cap b > 60``, ``cap b < -60`` or ``plane |b| < 10``.
     signal
         trough:MHZ:WIDTH (a Gaussian absorption), excess (index -2.6), constant, or a CSV file with
         frequency_mhz and temperature_k; may be repeated.
