@@ -654,8 +654,9 @@ def spectrum() -> None:
         result = lb.run_map(lb.load_scenario("first_map", TEN_CHANNELS), f"{folder}/map").result
     for name, figure in sky_spectrum(result).items():
         figure.savefig(HERE / f"spectrum_{name}.png", dpi=90)
-    for region in (found := result.sky_spectrum()).regions:
-        print(region, found.chi2(region).words())
+    temperatures = result.sky_spectrum()
+    for region in temperatures.regions:
+        print(region, temperatures.chi2(region).words())
 
 
 FIGURES = (

@@ -30,8 +30,8 @@ from lusee_bayes.experiment.unknowns import ALL_TOGETHER
 from lusee_bayes.judge.chi2 import ChiSquare
 from lusee_bayes.results.sky_spectrum import OBSERVED, Frequencies, SkySpectrum
 
-# degree of the polynomial, and the relative tolerance of its fit
-ORDER, SETTLED = 6, 1e-12
+# degree of the polynomial, the relative tolerance of its fit, and the smallest template, in K
+ORDER, SETTLED, FAINT = 6, 1e-12, 1e-6
 # standard deviations of a detection, and the probability below the limit
 DETECTED, LEVEL = 5.0, 0.95
 TABLE = Layout(
@@ -75,17 +75,17 @@ class SignalLimit:
 
     def sentence(self) -> str:
         """The limit in words, with the source that sets it."""
-        found = f"{self.amplitude:.3g} +- {self.std:.2g} K"
+        amplitude = f"{self.amplitude:.3g} +- {self.std:.2g} K"
         if not self.fit.fits:
             return (
                 f"{self.name}: no limit, a smooth spectrum of the {self.region} does not fit "
                 f"({self.fit.words()}); raise --order"
             )
         if self.detected:
-            return f"{self.name}: detected, {found}"
+            return f"{self.name}: detected, {amplitude}"
         least = min(self.without, key=self.without.__getitem__)
         return (
-            f"{self.name}: below {self.limit:.3g} K (95 %), {found}; without errors from "
+            f"{self.name}: below {self.limit:.3g} K (95 %), {amplitude}; without errors from "
             f"{least} the error would be {self.without[least]:.2g} K"
         )
 
@@ -115,9 +115,12 @@ def signal_limit(
     Raises
     ------
     InputError
-        If the region is unknown, there are too few frequencies, or the fit does not converge.
+        If the region is unknown, there are too few frequencies, the template vanishes there, or
+        the fit does not converge.
     """
     k, f = spectrum.place(region), spectrum.frequency
+    if order < 0:
+        raise InputError(f"--order is {order}, expected 0 or more")
     if len(f) < order + 3:
         raise InputError(
             f"{len(f)} frequencies do not determine a polynomial of degree {order} and a signal: "
@@ -125,6 +128,11 @@ def signal_limit(
         )
     x = np.log(f / np.sqrt(f.min() * f.max())) / np.log(np.sqrt(f.max() / f.min()))
     smooth, t, y = chebvander(x, order), template(f), spectrum.temperature[k]
+    if not np.isfinite(t).all() or np.abs(t).max() < FAINT:
+        raise InputError(
+            f"{name}: the template vanishes, or is not finite, at the run's frequencies, "
+            f"{f.min():g} to {f.max():g} MHz"
+        )
     if not (np.isfinite(y) & (y > 0.0)).all():
         raise InputError(f"the {region} has temperatures that are not positive")
     whitener = np.linalg.inv(
@@ -138,19 +146,19 @@ def signal_limit(
         return np.column_stack([sky(values)[:, None] * smooth, t])
 
     start = np.append(np.linalg.lstsq(smooth, np.log(y), rcond=None)[0], 0.0)
-    found = least_squares(
+    solution = least_squares(
         lambda values: whitener @ (sky(values) + values[-1] * t - y),
         start,
         lambda values: whitener @ slopes(values),
         x_scale="jac",
         **dict.fromkeys(("ftol", "xtol", "gtol"), SETTLED),
     )
-    if not found.success:
+    if not solution.success:
         raise InputError(f"the smooth spectrum of the {region} does not converge; lower --order")
-    amplitude, off = float(found.x[-1]), found.fun
+    amplitude, off = float(solution.x[-1]), solution.fun
 
     def error_under(covariance: Square) -> float:
-        columns = slopes(found.x)
+        columns = slopes(solution.x)
         normal = columns.T @ np.linalg.solve(covariance, columns)
         return float(np.sqrt(np.linalg.inv(normal)[-1, -1]))
 
@@ -189,6 +197,8 @@ def named_template(text: str) -> tuple[str, Callable[[Frequencies], Vector]]:
     if kind == "trough":
         try:
             centre, width = map(float, numbers)
+            if not width > 0.0:
+                raise ValueError
         except ValueError:
             raise InputError(f"got '{text}', expected trough:MHZ:WIDTH, as trough:17.5:3") from None
         name = f"trough at {centre:g} MHz, {width:g} MHz wide"

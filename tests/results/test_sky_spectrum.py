@@ -111,9 +111,11 @@ def test_templates_and_what_has_no_limit(tmp_path):
     name, template = named_template(str(file))
     assert name == "dip" and template(np.array([15.0]))[0] == -0.5
     assert named_template("excess")[1](np.array([20.0]))[0] == 1.0
-    for text in ("trough:1", "nothing"):
+    for text in ("trough:1", "trough:17:0", "nothing"):
         refuse("expected trough|no template", named_template, text)
     refuse("no region", signal_limit, bent, *named_template("excess"), region="cap")
+    refuse("vanishes", signal_limit, bent, *named_template("trough:900:1"))
+    refuse("--order is -1", signal_limit, bent, *named_template("excess"), order=-1)
     few = spectrum_of(f[:6], bent.temperature[0, :6], np.eye(6))
     refuse("at least 9", signal_limit, few, *named_template("excess"))
 
