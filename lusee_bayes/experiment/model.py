@@ -28,6 +28,7 @@ from lusee_bayes.noise.covariance import Covariance, KnownFactor, LowRankUpdate
 from lusee_bayes.noise.radiometer import radiometer_noise
 from lusee_bayes.systematics.above_lmax import AboveLmax, sky_above
 from lusee_bayes.systematics.context import Around, Setup, noise_visibilities, prior_and_family
+from lusee_bayes.systematics.gain_drifts import GainDrifts
 from lusee_bayes.systematics.horizon import Horizon
 from lusee_bayes.systematics.noise_level import radiometer_about
 from lusee_bayes.systematics.registered import SYSTEMATICS
@@ -225,6 +226,8 @@ def in_noise(
         before = model
         if systematic.first_order:
             model = systematic.effect(model, systematic.values(systematic.centre(values)))
+        elif isinstance(systematic, GainDrifts):
+            model = systematic.averaged(model)
         stages.append((systematic, before, model.coupling.response))
     last, held = model.coupling.response, []
     for systematic, before, response in stages:

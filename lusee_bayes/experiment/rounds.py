@@ -31,7 +31,7 @@ from lusee_bayes.priors.learning import Learned, learn_whatever_fits, most_proba
 from lusee_bayes.sky.prior import Prior
 from lusee_bayes.systematics.above_lmax import AboveLmax
 from lusee_bayes.systematics.context import Around, Setup
-from lusee_bayes.systematics.gain_drifts import gains_about
+from lusee_bayes.systematics.gain_drifts import GainDrifts, gains_about
 from lusee_bayes.systematics.noise_level import radiometer_about
 from lusee_bayes.systematics.pointing_offsets import PointingOffsets
 from lusee_bayes.systematics.registered import SYSTEMATICS
@@ -65,6 +65,8 @@ ENOUGH = 8
 NEARLY, PRIOR_SETTLED, MAX_LEARNED = 0.5, 0.05, 8
 # number of noise draws, always the same, that estimate the volume of skies that fit
 VOLUME_DRAWS = 8
+# relative rms by which the visibilities may be off around which drifts of the gains are inferred
+SAME_VISIBILITIES = 0.1
 # steps that oscillate are halved, down to this fraction of the full step
 SHORTEST = 0.125
 
@@ -115,6 +117,12 @@ class Inference:
     def moving(self) -> tuple[Expanded, ...]:
         """Systematics that are expanded around values that the data determine."""
         return tuple(s for s in self.expanded if s.systematic.moves)
+
+    @property
+    def drifts(self) -> tuple[GainDrifts, ...]:
+        """Drifts of the gains in N, if any."""
+        parts = (s.systematic for s in self.systematics)
+        return tuple(one for one in parts if isinstance(one, GainDrifts))
 
     @property
     def offsets(self) -> Expanded | None:
@@ -366,6 +374,8 @@ def _less_moved(solution: Solution, held: Sequence[Marginalised]) -> Solution:
         if isinstance(part, Expanded):
             off = part.columns.T @ solved
             excess += float(off @ off - (off + part.expected) @ (off + part.expected))
+        elif isinstance(part.systematic, GainDrifts):
+            excess += part.systematic.inferred(solved)[1]
     return solution.less(excess)
 
 
@@ -416,11 +426,18 @@ def _around(setup: Setup, inference: Inference, step: _Step) -> tuple[Around, _S
         ok = around.tempered == 1.0 and inference.fits
         tempered = 1.0 if ok else _tempered(around.tempered * inference.misfit(), inference.rounds)
         around = replace(around, sky=sky, values=values, tempered=tempered)
-        if tempered == 1.0:
-            around = replace(around, volume=_volume(solution))
+    if around.tempered == 1.0 and inference.moving:
+        around = replace(around, volume=_volume(solution))
     if rebuilds_visibilities(setup):
         seen = prediction(moved(setup, around.values), inference, solved)
         around = replace(around, visibilities=seen)
+        for drifts in inference.drifts:
+            off = np.linalg.norm(seen - drifts.visibilities) / np.linalg.norm(seen)
+            gains = slope = None
+            if off < SAME_VISIBILITIES:
+                gains = drifts.inferred(solved)[0]
+                slope = drifts.volume_slope(solution, *(around.volume or _volume(solution)))
+            around = replace(around, gains=gains, gain_slope=slope)
     return around, step
 
 
@@ -497,6 +514,8 @@ def prediction(setup: Setup, inference: Inference, solved: DataVector) -> Grid:
     for part in inference.expanded:
         if not part.changes_coupling:
             besides = besides + part.columns @ (part.columns.T @ solved)
+    for drifts in inference.drifts:
+        besides = besides / np.asarray(drifts.response(drifts.about))
     return setup.under(mean).signal + setup.layout.scatter(besides)
 
 

@@ -13,7 +13,13 @@ Marginalised over g, the error is a noise term with (paper, appendix A) ::
                                                     + C_g (dik djl + dil djk) ]
 
 and with the mean sigma_g^2 d_ii in the autos. The quadratic part is not negligible: at sigma_g =
-0.01 it is 1e-4 of the signal, ten times the radiometer noise.
+0.01 it is 1e-4 of the signal, ten times the radiometer noise. Nor is it Gaussian, or independent of
+the linear part. About gains g^ that are found from the data, ::
+
+    V_ij -> (1 + g^_i)(1 + g^_j) V_ij + sum_a F_ija (g_a - g^_a),
+    F_ija = [dia (1 + g^_j) + dja (1 + g^_i)] V_ij,    Cov = sum_a F_ija(t) F_kla(t') C_g
+
+there is none: what is left of it, (g - g^)^2, is far below the noise.
 
 **Errors of the beams** in A: N_beam = dA (S + mu mu^T) dA^T along known directions dA. If the true
 coupling matrix is A + dA, the data contain dA m besides A m; over skies from the prior, that is
@@ -119,7 +125,12 @@ class GainDrift(eqx.Module):
         return int((np.arange(len(hours)) - first).max())
 
     def covariance(
-        self, visibilities: Grid, hours: Hours, layout: DataLayout, width: int | None = None
+        self,
+        visibilities: Grid,
+        hours: Hours,
+        layout: DataLayout,
+        width: int | None = None,
+        gains: Gains | None = None,
     ) -> TimeBandedCovariance:
         """Return the noise term of the drifts around given visibilities d.
 
@@ -134,6 +145,9 @@ class GainDrift(eqx.Module):
         layout : DataLayout
         width : int, optional
             Width of the band in samples, by default the reach of C_g.
+        gains : (antennas, times) array, optional
+            Drifts about which the term is linear; by default it is about none, with its quadratic
+            part.
 
         Returns
         -------
@@ -153,13 +167,25 @@ class GainDrift(eqx.Module):
         earlier = np.arange(layout.n_times)[:, None] - np.arange(width + 1)[None]
         lag = jnp.asarray(hours)[:, None] - jnp.asarray(hours)[np.maximum(earlier, 0)]
         kernel = jnp.where(jnp.asarray(earlier >= 0), self.kernel(lag), 0.0)
-        # number of antennas that two products share, and of ways in which they share two
-        i, j, _ = ports(round(np.sqrt(layout.n_products)))
+        n = round(np.sqrt(layout.n_products))
+        slopes = slopes_by_gains(
+            visibilities, np.zeros((n, layout.n_times)) if gains is None else gains
+        )
+        i, j, _ = ports(n)
+        # number of ways in which two products share two antennas
         ii, ij, ji, jj = (np.equal.outer(a, b).astype(np.float64) for a in (i, j) for b in (i, j))
-        linear, quadratic = ii + ij + ji + jj, ii * jj + ij * ji
-        arrays = map(jnp.asarray, (earlier, linear, quadratic))
-        band = _band(visibilities, kernel, *arrays)
+        quadratic = None if gains is not None else jnp.asarray(ii * jj + ij * ji)
+        band = _band(jnp.asarray(slopes), visibilities, kernel, jnp.asarray(earlier), quadratic)
         return TimeBandedCovariance(band, layout, "the gain-drift covariance")
+
+    def correlated(self, x: Gains, hours: Hours) -> Gains:
+        """Return C_g x of every antenna, (antennas, times)."""
+        total = float(self.sigma) ** 2 * x
+        for lag in range(1, self.width(hours) + 1):
+            kernel = np.asarray(self.kernel(hours[lag:] - hours[:-lag]))
+            total[:, lag:] += kernel * x[:, :-lag]
+            total[:, :-lag] += kernel * x[:, lag:]
+        return total
 
     def mean_response(self, n_products: int) -> Float[Array, " products"]:
         """Return the mean factor of each product: 1 + sigma_g^2 for autos, 1 for crosses."""
@@ -237,15 +263,28 @@ def with_gains(visibilities: Grid, gains: Gains) -> Grid:
     return (1.0 + gains[i]) * (1.0 + gains[j]) * visibilities
 
 
+def slopes_by_gains(visibilities: Grid, gains: Gains) -> Float[Array, "antennas products times"]:
+    """Return F_ija, the derivatives of :func:`with_gains` by the gain of every antenna."""
+    i, j, _ = ports(gains.shape[0])
+    antenna = np.arange(gains.shape[0])[:, None]
+    first, second = (np.equal(antenna, k).astype(np.float64)[..., None] for k in (i, j))
+    return (first * (1.0 + gains[j])[None] + second * (1.0 + gains[i])[None]) * visibilities[None]
+
+
 @eqx.filter_jit
 def _band(
-    visibilities: Array, kernel: Array, earlier: Array, linear: Array, quadratic: Array
+    slopes: Array, visibilities: Array, kernel: Array, earlier: Array, quadratic: Array | None
 ) -> Float[Array, "times widths products products"]:
-    row = visibilities.T
-    column = row[jnp.maximum(earlier, 0)]  # (times, widths, products)
+    earlier = jnp.maximum(earlier, 0)
+
+    def products(row: Array) -> Array:  # (products, times), at both times
+        return row.T[:, None, :, None] * row.T[earlier][:, :, None, :]
+
     weight = kernel[:, :, None, None]
-    pattern = linear[None, None] + weight * quadratic[None, None]
-    return row[:, None, :, None] * column[:, :, None, :] * weight * pattern
+    band = sum(products(row) for row in slopes)
+    if quadratic is not None:
+        band = band + products(visibilities) * weight * quadratic[None, None]
+    return band * weight
 
 
 def beam_error_noise(direction: Coupling, prior: Prior) -> LowRankCovariance:

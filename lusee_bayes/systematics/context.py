@@ -243,6 +243,9 @@ class Around:
         fit. None before there is a posterior.
     tempered : float
         Factor of radiometer noise in first rounds.
+    gains, gain_slope : (antennas, times) arrays or None
+        Drifts of the gains, and the slope of ln p by them that is due to the volume of skies and
+        drifts that fit; None before they are inferred.
     """
 
     data: Visibilities | None = None
@@ -251,6 +254,8 @@ class Around:
     values: Mapping[str, float | Float[Array, "..."]] | None = None
     volume: tuple[Float[Array, "draws modes"], Float[Array, "draws data"]] | None = None
     tempered: float = 1.0
+    gains: Float[Array, "antennas times"] | None = None
+    gain_slope: Float[Array, "antennas times"] | None = None
 
 
 def noise_visibilities(setup: Setup, around: Around, about: NoiseAbout) -> Grid:

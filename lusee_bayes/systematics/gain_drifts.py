@@ -13,12 +13,18 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 from pydantic import Field
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, DataVector
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.core.section import Positive, Section, Treatment, requires
 from lusee_bayes.instrument.products import DataLayout
-from lusee_bayes.linear.linear_gaussian import LinearGaussian
-from lusee_bayes.noise.instrument_errors import GainDrift, white_grid, with_gains
+from lusee_bayes.linear.linear_gaussian import LinearGaussian, Solution
+from lusee_bayes.noise.instrument_errors import (
+    GainDrift,
+    Gains,
+    slopes_by_gains,
+    white_grid,
+    with_gains,
+)
 from lusee_bayes.systematics.context import Around, NoiseAbout, Setup, noise_visibilities
 from lusee_bayes.systematics.systematic import (
     SKY,
@@ -28,6 +34,7 @@ from lusee_bayes.systematics.systematic import (
     Unknown,
     multiplied,
     scalar_or_none,
+    with_added,
 )
 
 # how far an unknown correlation time can be off, in standard deviations of its ln, and by which
@@ -105,6 +112,11 @@ class GainDrifts(Systematic):
         Of the covariance's band in samples, for ``drift`` and for the longest correlation time.
     log_sigma_std, log_correlation_std : () array, optional
         Prior standard deviations of the natural logarithms of the two; None if known.
+    found : (antennas, times) array, optional
+        Drifts about which the term of N is linear. None for a term about no drifts, with its
+        quadratic part.
+    slope : (antennas, times) array, optional
+        Slope of ln p(d | drifts) that is due to the volume of skies that fit.
     """
 
     key: ClassVar[str] = "noise.gain"
@@ -123,6 +135,8 @@ class GainDrifts(Systematic):
     widest: int = eqx.field(static=True)
     log_sigma_std: Float[Array, ""] | None = eqx.field(default=None, converter=scalar_or_none)
     log_correlation_std: Float[Array, ""] | None = eqx.field(default=None, converter=scalar_or_none)
+    found: Gains | None = None
+    slope: Gains | None = None
 
     @classmethod
     def of(
@@ -164,7 +178,11 @@ class GainDrifts(Systematic):
         drift = GainDrift(section.sigma, section.correlation_h)
         visibilities = noise_visibilities(setup, around, gains_about(setup))
         stds = section.log_sigma_std, section.log_correlation_std
-        return cls.of(drift, visibilities, setup.observation.hours, setup.layout, *stds)
+        drifts = cls.of(drift, visibilities, setup.observation.hours, setup.layout, *stds)
+        if gains_about(setup) != "posterior" or (around.data is not None and around.gains is None):
+            return drifts
+        found = drifts.about if around.gains is None else around.gains
+        return replace(drifts, found=found, slope=around.gain_slope)
 
     @classmethod
     def truth(cls, section: GainSection, setup: Setup, key: PRNGKeyArray) -> Truth:
@@ -251,14 +269,92 @@ class GainDrifts(Systematic):
         """
         width = self.width if drift is None else self.widest
         drift = self.drift if drift is None else drift
-        noise = drift.covariance(self.visibilities, self.hours, self.layout, width)
-        return replace(self.averaged(model, drift), noise=model.noise + noise)
+        about = self.visibilities, self.hours, self.layout, width, self.found
+        return replace(self.averaged(model, drift), noise=model.noise + drift.covariance(*about))
 
     def averaged(self, model: LinearGaussian, drift: GainDrift | None = None) -> LinearGaussian:
-        """Multiply by the mean response; parameters as for :meth:`marginalised`."""
-        mean = (drift or self.drift).mean_response(self.layout.n_products)[:, None]
-        grid = jnp.broadcast_to(mean, (self.layout.n_products, self.layout.n_times))
-        return multiplied(model, self.layout.gather(grid))
+        """Multiply by the mean response; parameters as for :meth:`marginalised`.
+
+        About found drifts g^, multiply by their response and add F (C_g slope - g^).
+        """
+        drift = drift or self.drift
+        if self.found is None:
+            mean = drift.mean_response(self.layout.n_products)[:, None]
+            grid = jnp.broadcast_to(mean, (self.layout.n_products, self.layout.n_times))
+            return multiplied(model, self.layout.gather(grid))
+        off = self.expected - self.found
+        shift = self.layout.gather((self.slopes * off[:, None]).sum(0))
+        return with_added(multiplied(model, self.response(self.found)), shift)
+
+    @property
+    def about(self) -> Gains:
+        """The drifts about which the term of N is built."""
+        if self.found is None:
+            return np.zeros((self.n_antennas, self.layout.n_times))
+        return self.found
+
+    @property
+    def expected(self) -> Gains:
+        """C_g slope, the prior mean with which the mode is that of p(g | d)."""
+        if self.slope is None:
+            return np.zeros_like(self.found)
+        return self.drift.correlated(self.slope, np.asarray(self.hours))
+
+    def inferred(self, solved: DataVector) -> tuple[Gains, float]:
+        """Posterior mean of the drifts, and how much more it adds to chi^2 than the solution's.
+
+        Parameters
+        ----------
+        solved : (data,) array
+            N^-1 (d - A m), with the mean map.
+        """
+        pull, hours = (self.slopes * self.layout.scatter(solved)).sum(1), np.asarray(self.hours)
+        whole = pull if self.slope is None else pull + self.slope
+        gains = self.drift.correlated(whole, hours)
+        less = float((pull * self.drift.correlated(pull, hours)).sum() - (whole * gains).sum())
+        return gains, less
+
+    @property
+    def slopes(self) -> Float[np.ndarray, "antennas products times"]:
+        """F: the derivatives of the visibilities by the gains."""
+        return np.asarray(slopes_by_gains(self.visibilities, self.about))
+
+    def volume_slope(
+        self,
+        solution: Solution,
+        skies: Float[Array, "draws modes"],
+        weighted: Float[Array, "draws data"],
+    ) -> Gains:
+        """Slope of ln p by the drifts that is due to the volume of skies and drifts that fit.
+
+        Fewer skies fit with larger gains; and with a smaller sky, more drifts do. With s and q the
+        sky and the drifts that noise n alone would seem to be, w = N^-1 n, and F(s) for the signal
+        of s, the slope is that of skies, and one of the sky that drifts make up for, whose
+        amplitude only the drifts' prior limits::
+
+            -E[F_a(s)^T w] + E[q_a F_a^T w] / (1 + g_a)
+
+        Parameters
+        ----------
+        solution : Solution
+            With this term in N.
+        skies, weighted : (draws, modes) and (draws, data) arrays
+            s = C A^T w, and w = N^-1 n.
+        """
+        slopes, about, total = self.slopes, self.about, 0.0
+        response = with_gains(np.ones_like(slopes[0]), about)
+
+        def pulled(slopes: Float[Array, "antennas products times"], data: DataVector) -> Gains:
+            return (slopes * self.layout.scatter(data)).sum(1)
+
+        for sky, weights in zip(skies, weighted, strict=True):
+            signal = np.asarray(solution.model.coupling @ sky)
+            left = weights - np.asarray(solution.factor.solve(signal))
+            drifts = self.drift.correlated(pulled(slopes, left), np.asarray(self.hours))
+            by_sky = slopes_by_gains(np.asarray(self.layout.scatter(signal)) / response, about)
+            total = total - pulled(by_sky, weights)
+            total = total + drifts / (1.0 + about) * pulled(slopes, weights)
+        return total / len(skies)
 
     def effect(self, model, values):
         """Multiply by the response to ``gains``."""

@@ -108,8 +108,8 @@ def test_what_n_is_built_around_by_default():
 def test_the_default_path_with_drifts(sigma, test_data):
     """ULSA's sky, the embedded one as model, the default prior, learned in the rounds of N.
 
-    The errors are those of a map whose N is built around the true visibilities; in the combinations
-    that it knows best, where the prior hardly matters, they are what is claimed.
+    The errors are those of a map whose N is built around the true visibilities and drifts; in the
+    combinations that it knows best, where the prior hardly matters, they are what is claimed.
     """
     file = test_data / "ulsa" / "exp10.0MHz_sky_map_with_absorption.hdf5"
     sky = FileSkySection(file=str(file)).at(10.0, 12)
@@ -121,11 +121,12 @@ def test_the_default_path_with_drifts(sigma, test_data):
         def distort(setup, v, seen=seen, seed=seed):
             seen["true"] = np.asarray(v)
             key, hours = jax.random.key(100 + seed), setup.observation.hours
-            return with_gains(v, lb.GainDrift(sigma, 10.0).sample(key, hours))
+            seen["gains"] = np.asarray(lb.GainDrift(sigma, 10.0).sample(key, hours))
+            return with_gains(v, seen["gains"])
 
         data = wrong_data.measured(scenario, sky, seed, distort=distort)
         found = lb.infer(lb.build(scenario, data))
-        around = Around(data, seen["true"])
+        around = Around(data, seen["true"], gains=seen["gains"])
         setup = set_up(scenario, data)
         information = full_model(setup, around).condition(data.data).information
         prior = learned_prior(setup, setup.family, information).prior

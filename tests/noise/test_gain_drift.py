@@ -230,3 +230,17 @@ def test_the_term_alone_is_not_a_noise():
     """It is singular: the Re and Im of a product drift together."""
     gain = term(GainDrift(0.01), visibilities(2), HOURS, complete(2))
     refuse("gain-drift covariance.*not positive definite.*radiometer", gain.factor)
+
+
+def test_about_found_drifts_it_is_linear_in_the_rest():
+    """F C_g F^T with derivatives of the exact product; beyond the band, below eps of the largest."""
+    d, flags, drift = visibilities(4), gappy(4), GainDrift(0.3, 10.0)
+    found = gain_histories(np.random.default_rng(2), 1, 4, 0.3)[0]
+    slopes = jax.jacfwd(lambda g: with_gains(jnp.asarray(d), g))(jnp.asarray(found))
+    slopes = np.asarray(slopes)[~flags]  # (data, antennas, times)
+    kernel = c_g(HOURS, 0.3, 10.0)
+    layout = DataLayout.from_flags(flags)
+    got = drift.covariance(jnp.asarray(d), HOURS, layout, gains=jnp.asarray(found))
+    close(got.dense(), np.einsum("kat,ts,las->kl", slopes, kernel, slopes), 1e-15 * 8)
+    x = np.random.default_rng(3).normal(size=(4, N_TIMES))
+    close(drift.correlated(x, HOURS), x @ kernel, 1e-14)
