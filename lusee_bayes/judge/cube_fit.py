@@ -5,7 +5,9 @@ prior and of whether channels share a posterior. Channels are independent: their
 each is above its median with a probability of one half. The sum and the number above the median
 reveal excesses too small to be seen in single channels, such as 38 of 46 channels above.
 
-The rest of chi^2 of all data under the model tests the prior.
+The rest of chi^2 of all data under the model tests the prior. Channels see one sky, whose departure
+from the prior is much the same in all: without a joint prior, its mean over channels is judged like
+that of one.
 
 Channels that share the instrument can contradict each other. The data of channel k constrain the
 shared unknowns by a likelihood N(y, L^-1), with L = V^-1 - 1 and L y = V^-1 E (:mod:`.amplitudes`);
@@ -78,7 +80,7 @@ class ChannelFits:
         chi^2 of each channel that no sky explains, and its mean if instrument and noise are
         correct.
     prior : ChiSquare
-        Of all channels together: tests the prior.
+        Tests the prior: of all channels in a joint posterior, else the mean over channels.
     joint : bool
         Whether channels share a posterior.
     shared : tuple of SharedTest
@@ -117,12 +119,13 @@ class ChannelFits:
         least = int(np.argmin(p))
         above = int((chdtrc(self.degrees, self.chi2) < 0.5).sum())
         signs = min(1.0, 2.0 * float(bdtr(min(above, n - above), n, 0.5)))
+        name = "prior" if self.joint else "prior, mean over channels"
         where = f"{self.frequencies_mhz[least]:g} MHz, {self.by_channel[least].chi2_words()}"
         return [
             JointTest("sum over all channels", self.total.p, 1, self.total.chi2_words()),
             JointTest("channels above the median", signs, 1, f"{above} of {n}"),
             JointTest("most deviant channel", float(p[least]), n, where),
-            JointTest("prior", self.prior.p, 1, self.prior.chi2_words(), of_prior=True),
+            JointTest(name, self.prior.p, 1, self.prior.chi2_words(), of_prior=True),
         ]
 
     def fit(self) -> Fit:

@@ -237,8 +237,10 @@ class MapResult(Described):
         chi2, degrees = (np.array([getattr(p, n) for p in parts]) for n in ("chi2", "degrees"))
         n_data = float(self.stacked("n_data").sum())
         total = float(self.stacked("chi2_model").sum()) if self.joint is None else self.joint.chi2
-        prior = ChiSquare(total - float(chi2.sum()), n_data - float(degrees.sum()))
+        prior = total - float(chi2.sum()), n_data - float(degrees.sum())
         joint = self.joint is not None
+        # one sky in all channels: their parts may be as good as the same, and a mean is no surer
+        prior = ChiSquare(*(x if joint else x / len(parts) for x in prior))
         return ChannelFits(self.frequencies_mhz, chi2, degrees, prior, joint, self.shared_tests)
 
     @cached_property

@@ -102,11 +102,12 @@ def test_chi2_of_a_channel_is_that_of_its_data_under_the_model(small_cube):
         assert channel.instrument.chi2 == pytest.approx(expected, abs=0.02 * expected)
     fits = run.fits()
     total, n_data = (sum(getattr(c, k) for c in run.channels) for k in ("chi2_model", "n_data"))
-    assert fits.prior.chi2 + fits.chi2.sum() == pytest.approx(total)
-    assert fits.prior.degrees + fits.degrees.sum() == pytest.approx(n_data)
+    n = len(fits.chi2)
+    assert n * fits.prior.chi2 + fits.chi2.sum() == pytest.approx(total)
+    assert n * fits.prior.degrees + fits.degrees.sum() == pytest.approx(n_data)
     told = json.loads((small_cube.folder / "summary.json").read_text())
     assert told["level"] == run.fit.level and told["verdict"] == run.verdict()
-    assert [t["name"] for t in told["tests"]][::3] == ["sum over all channels", "prior"]
+    assert [t["name"] for t in told["tests"]][::3] == ["sum over all channels", "prior, mean over channels"]
     for channel, p in zip(told["channels"], fits.p(), strict=True):
         assert channel["instrument"]["p"] == pytest.approx(p)
 
