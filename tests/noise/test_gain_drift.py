@@ -233,7 +233,7 @@ def test_the_term_alone_is_not_a_noise():
 
 
 def test_about_found_drifts_it_is_linear_in_the_rest():
-    """F C_g F^T with derivatives of the exact product; beyond the band, below eps of the largest."""
+    """F C_g F^T with derivatives of the exact product; what the band leaves out is below eps."""
     d, flags, drift = visibilities(4), gappy(4), GainDrift(0.3, 10.0)
     found = gain_histories(np.random.default_rng(2), 1, 4, 0.3)[0]
     slopes = jax.jacfwd(lambda g: with_gains(jnp.asarray(d), g))(jnp.asarray(found))

@@ -100,7 +100,7 @@ def test_found_drifts_have_the_shift_of_the_volume():
     """Of sky and drifts together, -ln|Lambda| / 2 has a slope; the map moves by what it pulls.
 
     Lambda is that of both, differentiated; draws are replaced by a basis, so that means over them
-    are exact. What the data's noise tells between sky and drifts, which the slope neglects, is below 1e-2.
+    are exact. The slope neglects what the noise tells between sky and drifts: below 1e-2.
     """
     e = small_experiment(GAINS % (0.05, "marginalised", "posterior"), lmax=2, cycles=0.1)
     found = settled(e.setup, e.data)
@@ -150,8 +150,10 @@ def test_a_map_with_found_drifts_is_that_of_hmc(tmp_path):
     both = [GAINS % (0.05, t, "posterior") for t in ("marginalised", "sampled")]
     marginal, sampled = (lb.load_scenario("fiducial", [*plain, *prior, t]) for t in both)
     posterior = lb.infer(lb.build(marginal)).posterior
-    drawn = lb.run_sample(sampled, tmp_path / "run", sampler=lb.Sampler(600, 300, 2)).result
-    sky = np.asarray(drawn.posterior["sky"]).reshape(-1, 25)
+    drawn = lb.run_sample(
+        sampled, tmp_path / "run", sampler=lb.Sampler(chains=2, warmup=300, draws=600)
+    ).result
+    sky = drawn[0].tree["posterior"]["sky"].values.reshape(-1, 25)
     off = (np.asarray(posterior.mean) - sky.mean(0)) / sky.std(0)
     assert np.abs(off).max() < 0.2
     within(np.sqrt(np.diag(np.asarray(posterior.covariance()))) / sky.std(0), 1.0, 0.15)
