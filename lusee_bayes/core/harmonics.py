@@ -180,6 +180,22 @@ def pixel_matrix(nside: int, lmax: int) -> Float[np.ndarray, "pixels modes"]:
     return synthesis_matrix(theta, phi, lmax)
 
 
+# what the Gaussian beam that drawn maps are smoothed with leaves of ell = lmax
+LEFT_AT_LMAX = 0.1
+
+
+def taper(lmax: int) -> Float[np.ndarray, " ells"]:
+    """Return the beam's factor at ell = 0..lmax: exp(-ell (ell + 1) sigma^2 / 2)."""
+    ell = np.arange(lmax + 1)
+    return LEFT_AT_LMAX ** (ell * (ell + 1.0) / max(lmax * (lmax + 1.0), 1.0))
+
+
+def taper_fwhm_deg(lmax: int) -> float:
+    """Return the beam's full width at half maximum in degrees; ``lmax`` is at least 1."""
+    sigma = np.sqrt(-2.0 * np.log(LEFT_AT_LMAX) / (lmax * (lmax + 1.0)))
+    return float(np.degrees(sigma * np.sqrt(8.0 * np.log(2.0))))
+
+
 def averaging_rows(
     inside: Bool[np.ndarray, "regions pixels"], lmax: int
 ) -> Float[np.ndarray, "regions modes"]:

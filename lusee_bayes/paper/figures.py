@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 
-from lusee_bayes.core.harmonics import lmax_of
+from lusee_bayes.core.harmonics import lmax_of, taper_fwhm_deg
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.paper.claims import FREQUENCIES, SHOWN_FREQUENCIES, TABLE, Cases, frequency_case
@@ -84,7 +84,7 @@ def frequency_maps(cases: Cases) -> Figure:
 
 def _how_drawn(case: xr.Dataset) -> str:
     """Note on the lines and the resolution in a figure of maps."""
-    width = drawing.taper_fwhm_deg(lmax_of(case.sizes["mode"]))
+    width = taper_fwhm_deg(lmax_of(case.sizes["mode"]))
     return f"dashed: never observed; drawn through a beam of {width:.1f}° (FWHM)"
 
 

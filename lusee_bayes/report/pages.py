@@ -11,7 +11,7 @@ import numpy as np
 
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import read_manifest, recover, replacing, require_files
-from lusee_bayes.core.harmonics import lmax_of
+from lusee_bayes.core.harmonics import lmax_of, taper_fwhm_deg
 from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.reading import read_model, read_table
 from lusee_bayes.flight.reduced import REASONS, REDUCED, Reduced, read_reduced
@@ -19,7 +19,6 @@ from lusee_bayes.judge.chi2 import ChiSquare, stands_out
 from lusee_bayes.judge.convergence import FAR, FEW, warnings_of
 from lusee_bayes.judge.cube_fit import N_TESTS
 from lusee_bayes.judge.left_out import KINDS
-from lusee_bayes.report.figures.drawing import taper_fwhm_deg
 from lusee_bayes.report.rendering import render, render_run
 from lusee_bayes.report.viewer import viewer
 from lusee_bayes.results.channel import Judged

@@ -37,7 +37,7 @@ from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.linear.information import Information
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.map_result import MapResult
-from lusee_bayes.results.sky_spectrum import SkySpectrum
+from lusee_bayes.results.sky_spectrum import IndexMaps, SkySpectrum
 from lusee_bayes.results.summaries import MapSummary
 
 
@@ -92,6 +92,16 @@ def write_map(
     extra = [(key, *value) for key, value in cards("maps", scenario).items()]
     named = {"column_names": [name.upper() for name in order], "column_units": list(units)}
     healpy.write_map(path, values, coord="G", extra_header=extra, dtype=list(dtypes), **named)
+
+
+def write_index_maps(path: Path, found: IndexMaps, scenario: Scenario) -> None:
+    """Write maps of the spectral index as the columns of a HEALPix file."""
+    extra = [(key, *card) for key, card in cards("index", scenario).items() if key != "FREQ"]
+    extra.append(("FREQREF", found.reference_mhz, "frequency of the index in MHz"))
+    units = ["MHz" if name.startswith("turnover") else "" for name in found.maps]
+    named = {"column_names": [name.upper() for name in found.maps], "column_units": units}
+    named |= {"coord": "G", "extra_header": extra, "dtype": np.float64}
+    healpy.write_map(path, list(found.maps.values()), **named)
 
 
 def write_cubes(

@@ -30,7 +30,7 @@ from lusee_bayes.judge.cube_fit import ChannelFits, SharedTest
 from lusee_bayes.linear.joint import Blocks
 from lusee_bayes.linear.positive_joint import PositiveMode
 from lusee_bayes.results.channel import ChannelResult
-from lusee_bayes.results.sky_spectrum import SkySpectrum
+from lusee_bayes.results.sky_spectrum import IndexMaps, SkySpectrum
 from lusee_bayes.results.summaries import JointSummary, MapSummary, PullSummary
 from lusee_bayes.sky.galaxy import LANDMARKS
 from lusee_bayes.sky.spectral_prior import SpectralPrior
@@ -407,6 +407,13 @@ class MapResult(Described):
         return SkySpectrum.of(
             self.frequencies_mhz.tolist(), [c.temperatures for c in self.channels]
         )
+
+    def index_maps(self) -> IndexMaps | None:
+        """Maps of the spectral index of a joint posterior; None for less than three channels."""
+        parts = [c.temperatures for c in self.channels]
+        if len(parts) < 3 or any(part is None or not len(part.cells) for part in parts):
+            return None
+        return IndexMaps.of(self.frequencies_mhz, np.stack([part.cells for part in parts]))
 
     def spectra(self) -> Table:
         """power_spectra.ecsv: a row for every channel and ell."""

@@ -30,7 +30,7 @@ from scipy.constants import Boltzmann, speed_of_light
 
 from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels
 from lusee_bayes.core.errors import InputError, nearest
-from lusee_bayes.core.harmonics import averaging_rows, lmax_of
+from lusee_bayes.core.harmonics import averaging_rows, lmax_of, modes_to_map, per_mode, taper
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.trees import quantity
 from lusee_bayes.experiment.unknowns import ALL_TOGETHER
@@ -49,6 +49,10 @@ OBSERVED = "observed sky"
 UNOBSERVED, UNMEASURED = "unobserved sky", "unmeasured structure"
 # draws of a joint posterior that the correlation of its channels is computed from
 N_DRAWS = 400
+# resolution of maps of the spectral index, and number of draws behind them
+INDEX_NSIDE, INDEX_DRAWS = 8, 100
+# a value is defined where at least this fraction of the draws has it
+DEFINED = 0.95
 
 
 def sky_regions(highest_altitude: Pixels) -> dict[str, Bool[np.ndarray, " fine"]]:
@@ -126,6 +130,9 @@ class RegionTemperatures:
         sky that never rises; and the fraction from E u. The fractions need not add up.
     draws : (draws, regions) array
         Of a joint posterior; empty otherwise.
+    cells : (draws, pixels) array
+        The first of them, smoothed as maps are drawn, at the centres of HEALPix cells (RING,
+        NSIDE 8).
     """
 
     regions: tuple[str, ...]
@@ -137,6 +144,7 @@ class RegionTemperatures:
     departure: Departure | None
     shares: Float[np.ndarray, "source area"] = quantity("1", "fraction of the variance")
     draws: Float[np.ndarray, "joint_draw area"] = quantity("K", "draws of a joint posterior")
+    cells: Float[np.ndarray, "cell_draw cell"] = quantity("K", "draws in cells of the sky")
 
     @classmethod
     def of(
@@ -183,6 +191,11 @@ class RegionTemperatures:
         if departure is not None:
             parts[UNMEASURED] = (departure.error**2).sum(1)
         none = np.zeros((0, len(mean)))
+        draws = none if draws is None else draws
+        few = draws[:INDEX_DRAWS] * per_mode(taper(lmax))
+        cells = np.array([modes_to_map(sky, INDEX_NSIDE) for sky in few]).reshape(
+            -1, healpy.nside2npix(INDEX_NSIDE)
+        )
         return cls(
             tuple(regions),
             tuple(parts),
@@ -192,7 +205,8 @@ class RegionTemperatures:
             rows @ (none.T if common is None else common),
             departure,
             np.stack([*parts.values()]) / total,
-            (none if draws is None else draws) @ rows.T,
+            draws @ rows.T,
+            cells,
         )
 
 
@@ -308,6 +322,59 @@ class SkySpectrum:
             columns[f"share of {name}"] = share.ravel()
         units = {"frequency_mhz": "MHz", "temperature_k": "K", "std_k": "K", "true_k": "K"}
         return Table(columns, units={name: u for name, u in units.items() if name in columns})
+
+
+@dataclass(frozen=True)
+class IndexMaps:
+    """The spectrum of every cell of the sky, ln T = a + b x + c x^2 with x = ln(f / f_0).
+
+    Fitted to joint draws of the skies, each point with its own weight; NaN where less than 95 % of
+    the draws are positive at all frequencies. The turnover is where T no longer grows with f: NaN
+    unless 95 % of the draws turn over within the band.
+
+    Attributes
+    ----------
+    reference_mhz : float
+        f_0, the geometric mean of the frequencies.
+    maps : dict of (pixels,) arrays
+        ``index`` (b), ``index_std``, ``curvature`` (c), ``curvature_std``, ``turnover`` and
+        ``turnover_std`` in MHz; HEALPix RING, Galactic.
+    """
+
+    reference_mhz: float
+    maps: dict[str, Pixels]
+
+    @classmethod
+    def of(
+        cls,
+        frequencies_mhz: Frequencies,
+        draws: Float[np.ndarray, "frequency draw cell"],
+    ) -> IndexMaps:
+        """Fit them to draws in K, at three or more frequencies."""
+        reference = float(np.exp(np.log(frequencies_mhz).mean()))
+        x = np.log(frequencies_mhz / reference)
+        positive = (draws > 0.0).all(0)
+        log = np.log(np.where(positive, draws, 1.0))
+        relative = draws.std(1) / draws.mean(1)
+        design = np.stack([np.ones_like(x), x, x**2], axis=1)[None] / relative.T[..., None]
+        normal = np.einsum("pfi,pfj->pij", design, design)
+        pulls = np.einsum("pfi,fdp->pid", design, log / relative[:, None])
+        _, b, c = np.linalg.solve(normal, pulls).swapaxes(0, 1)  # (cells, draws) each
+        with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+            turnover = reference * np.exp(-b / (2.0 * c))
+        inside = (turnover >= frequencies_mhz.min()) & (turnover <= frequencies_mhz.max())
+        maps = {}
+        for name, values, known in (
+            ("index", b, positive.T),
+            ("curvature", c, positive.T),
+            ("turnover", turnover, positive.T & inside & (c < 0.0)),
+        ):
+            shown = np.where(known.mean(1) >= DEFINED, 1.0, np.nan)
+            weights = np.where(known, 1.0, 0.0) / np.maximum(known.sum(1), 1)[:, None]
+            mean = (weights * np.where(known, values, 0.0)).sum(1)
+            off = np.where(known, values - mean[:, None], 0.0)
+            maps |= {name: shown * mean, f"{name}_std": shown * np.sqrt((weights * off**2).sum(1))}
+        return cls(reference, maps)
 
 
 def correlation_of(

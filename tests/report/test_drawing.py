@@ -7,6 +7,7 @@ from assertions import refuse
 from jinja2 import UndefinedError
 from matplotlib.projections.geo import MollweideAxes
 
+from lusee_bayes.core import harmonics
 from lusee_bayes.core.harmonics import map_to_modes, modes_to_map
 from lusee_bayes.judge.convergence import warnings_of
 from lusee_bayes.report.figures import drawing
@@ -39,13 +40,13 @@ def test_a_map_of_longitude_and_latitude_comes_out_as_it_went_in():
 
 @pytest.mark.parametrize("lmax", [1, 8, 47])
 def test_the_taper_is_healpys_gaussian_beam(lmax):
-    beam = healpy.gauss_beam(np.radians(drawing.taper_fwhm_deg(lmax)), lmax)
-    np.testing.assert_allclose(drawing.taper(lmax), beam, rtol=1e-12)
-    assert drawing.taper(lmax)[-1] == pytest.approx(drawing.LEFT_AT_LMAX)
+    beam = healpy.gauss_beam(np.radians(harmonics.taper_fwhm_deg(lmax)), lmax)
+    np.testing.assert_allclose(harmonics.taper(lmax), beam, rtol=1e-12)
+    assert harmonics.taper(lmax)[-1] == pytest.approx(harmonics.LEFT_AT_LMAX)
 
 
 def test_a_sky_of_one_mode_is_shown():
-    np.testing.assert_allclose(drawing.taper(0), [1.0])
+    np.testing.assert_allclose(harmonics.taper(0), [1.0])
     np.testing.assert_allclose(drawing.shown(np.array([2.0]), 4), 2.0 / np.sqrt(4.0 * np.pi))
 
 

@@ -10,10 +10,11 @@ from astropy.table import Table
 from commands import run
 
 import lusee_bayes as lb
-from lusee_bayes.core.harmonics import averaging_rows, modes_to_map
+from lusee_bayes.core.harmonics import averaging_rows, modes_to_map, per_mode, taper
 from lusee_bayes.results.signal_limit import named_template, signal_limit
 from lusee_bayes.results.sky_spectrum import (
     Departure,
+    IndexMaps,
     RegionTemperatures,
     SkySpectrum,
     cane_1979,
@@ -32,6 +33,34 @@ def test_published_spectra_are_brightness_temperatures():
             of = intensity * u.W / u.m**2 / u.Hz / u.sr
             expected = of.to(u.Jy / u.sr).to_value(u.K, u.brightness_temperature(f * u.MHz))
             assert law(np.array([f]))[0] == pytest.approx(expected, rel=1e-9)
+
+
+def test_index_and_turnover_are_those_of_a_parabola():
+    """Draws of known parabolas; errors as least squares propagates them, to 5 / sqrt(2 x 4000)."""
+    f, rng = np.geomspace(2.0, 50.0, 7), np.random.default_rng(5)
+    x = np.log(f / 10.0)
+    design = np.stack([np.ones(7), x, x**2], axis=1)
+    cells = np.array([[9.0, -2.5, 0.0], [9.0, -1.0, -1.5], [9.0, -2.2, -0.3]]).T
+    relative = np.linspace(0.01, 0.03, 7)[:, None, None]
+    skies = np.exp(design @ cells)[:, None] * np.exp(relative * rng.normal(size=(7, 4000, 3)))
+    skies[3, :400, 2] = -1.0  # a tenth of the draws has no logarithm
+    found = IndexMaps.of(f, skies)
+    assert found.reference_mhz == pytest.approx(10.0)
+    weighted = design / relative[:, 0]
+    std = np.sqrt(np.diag(np.linalg.inv(weighted.T @ weighted)))
+    for k, name in enumerate(("index", "curvature"), 1):
+        error = found.maps[f"{name}_std"]
+        within(error[:2] / std[k], 1.0, 5.0 / np.sqrt(8000.0))
+        within(found.maps[name][:2], cells[k, :2], 5.0 * std[k] / np.sqrt(4000.0))
+    # the first has none in the band; d ln T / dx = 0 at x = -b / 2 c
+    turnover = 10.0 * np.exp(-1.0 / 3.0)
+    gradient = np.array([0.0, 1.0, -2.0 / 3.0]) / 3.0
+    normal = np.linalg.inv(weighted.T @ weighted)
+    expected = turnover * np.sqrt(gradient @ normal @ gradient)
+    assert found.maps["turnover"][1] == pytest.approx(turnover, abs=0.1 * expected)
+    assert found.maps["turnover_std"][1] == pytest.approx(expected, rel=0.06)
+    assert np.isnan(found.maps["turnover"][[0, 2]]).all()
+    assert all(np.isnan(values[2]) for values in found.maps.values())
 
 
 def test_rows_average_the_pixels_of_a_map():
@@ -66,6 +95,13 @@ def test_files_have_the_spectrum_with_its_covariance(joint, tmp_path, capsys):
     assert "most of the variance from" in printed and "trough at 24 MHz" in printed
     page = (tmp_path / "cube" / "report.html").read_text(encoding="utf-8")
     assert "cap b &lt; -60" in page and "Novaco" not in page
+    assert (tmp_path / "cube" / "index.fits").exists() == bool(joint)
+    if joint:
+        index, std = healpy.read_map(tmp_path / "cube" / "index.fits", field=(0, 1))
+        true = [modes_to_map(c.truth * per_mode(taper(4)), 8) for c in result.channels]
+        # between the end frequencies: the embedded sky has little curvature there
+        slope = np.log(true[-1] / true[0]) / np.log(30.0 / 18.0)
+        assert np.mean(np.abs(index - slope) < 2.0 * std + 0.02) > 0.9 and np.median(std) < 0.1
 
 
 def spectrum_of(f, temperature, covariance):

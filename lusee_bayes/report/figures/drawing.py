@@ -34,7 +34,7 @@ from matplotlib.text import Text
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
 from lusee_bayes.core.arrays import Pixels
-from lusee_bayes.core.harmonics import lmax_of, modes_to_map, per_mode
+from lusee_bayes.core.harmonics import lmax_of, modes_to_map, per_mode, taper
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.version import printable
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
@@ -205,8 +205,9 @@ def mollweide(
 
     ``highest_altitude`` adds a dashed line round the region that never rose.
     """
-    # negative temperatures have no logarithm: use the darkest colour
-    colours = colormaps[cmap].with_extremes(bad=colormaps[cmap](0.0))
+    # negative temperatures have no logarithm: use the darkest colour; what is undefined is grey
+    bad = colormaps[cmap](0.0) if isinstance(norm, LogNorm) else "lightgrey"
+    colours = colormaps[cmap].with_extremes(bad=bad)
     rim = Ellipse((0.0, 0.0), 2 * EDGE[0], 2 * EDGE[1], fill=False, color="black", lw=0.8)
     extent = (-EDGE[0], EDGE[0], -EDGE[1], EDGE[1])
     style = {"origin": "lower", "cmap": colours, "norm": norm, "aspect": "equal"}
@@ -328,21 +329,6 @@ def _graticule(axes: Axes) -> None:
         label.set_path_effects(SEEN_ANYWHERE)
     for lat, x, y in zip(PARALLELS, ends, heights, strict=True):
         axes.text(-EDGE[0] * x - 0.05, EDGE[1] * y, f"{lat:.0f}°", ha="right", **style)
-
-
-LEFT_AT_LMAX = 0.1
-
-
-def taper(lmax: int) -> Float[np.ndarray, " ells"]:
-    """Return the beam's factor at ell = 0..lmax: exp(-ell (ell + 1) sigma^2 / 2)."""
-    ell = np.arange(lmax + 1)
-    return LEFT_AT_LMAX ** (ell * (ell + 1.0) / max(lmax * (lmax + 1.0), 1.0))
-
-
-def taper_fwhm_deg(lmax: int) -> float:
-    """Return the beam's full width at half maximum in degrees; ``lmax`` is at least 1."""
-    sigma = np.sqrt(-2.0 * np.log(LEFT_AT_LMAX) / (lmax * (lmax + 1.0)))
-    return float(np.degrees(sigma * np.sqrt(8.0 * np.log(2.0))))
 
 
 def shown(modes: Float[np.ndarray, " modes"], nside: int) -> Pixels:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
 from lusee_bayes.core.arrays import Modes
-from lusee_bayes.core.harmonics import lmax_of, modes_to_map
+from lusee_bayes.core.harmonics import lmax_of, modes_to_map, taper_fwhm_deg
 from lusee_bayes.experiment.unknowns import ALL_TOGETHER
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.judge.measures import ell_cross
@@ -175,7 +175,7 @@ def channel_map(channel: ChannelResult) -> Figure:
     figure.suptitle(
         f"{channel.frequency_mhz:g} MHz, Galactic coordinates; dashed: region that never rises\n"
         f"{', '.join(list(panels)[:-1])}: smoothed with a beam of "
-        f"{drawing.taper_fwhm_deg(lmax_of(len(channel.mean))):.1f}° (FWHM)"
+        f"{taper_fwhm_deg(lmax_of(len(channel.mean))):.1f}° (FWHM)"
     )
     return figure
 
@@ -325,6 +325,28 @@ def sky_spectrum(cube: MapResult) -> Panels | None:
         one.set(xlabel="frequency [MHz]", xscale="log", xlim=(0.93 * f.min(), 1.07 * f.max()))
         _frequency_ticks(one)
     return {"temperature": figure, "errors": errors}
+
+
+def spectral_index(cube: MapResult) -> Panels | None:
+    """Maps of the spectral index, its error, and the turnover where the draws agree on one."""
+    if (found := cube.index_maps()) is None:
+        return None
+    at = f"at {found.reference_mhz:.3g} MHz"
+    titles = {
+        f"index {at}": ("index", ""),
+        f"error of the index {at}": ("index_std", ""),
+        "turnover": ("turnover", "MHz"),
+    }
+    return {
+        title: drawing.sky_figure(
+            title,
+            found.maps[name],
+            Normalize(*np.nanpercentile(found.maps[name], (2, 98))),
+            unit=unit,
+        )
+        for title, (name, unit) in titles.items()
+        if np.isfinite(found.maps[name]).any()
+    }
 
 
 def _frequency_ticks(axes: Axes) -> None:
