@@ -123,12 +123,10 @@ def density(
     return float(got), trace
 
 
-def density_of(
-    experiment: Experiment, values: dict[str, Any], program: str = "systematics"
-) -> float:
+def density_of(e: Experiment, values: dict[str, Any], program: str = "systematics") -> float:
     """ln p of everything by a program of an experiment; no site may be left to chance."""
     asked = lb.load_program(program)
-    got, trace = density(asked, program_arguments(asked, experiment), values)
+    got, trace = density(asked, program_arguments(asked, e), values)
     assert set(trace) == {*values, "data"}
     return got
 

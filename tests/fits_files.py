@@ -49,14 +49,8 @@ def write_response(path: Path) -> Path:
     sky = np.array([(f / 10.0) ** 2 * arms.T @ arms for f in frequencies])
     moon = 0.8 * sky + 0.1 * np.eye(4)[None] * sky[:, :1, :1]
     reactance = -100j * np.eye(4)[None] * (10.0 / frequencies)[:, None, None]
-    images = {
-        "H_theta": np.repeat(h_theta, 3, 1),
-        "H_phi": np.repeat(h_phi, 3, 1),
-        "ZA": sky + moon + reactance,
-        "Rsky": sky,
-        "Rmoon": moon,
-        "Rloss": 0.0 * sky,
-    }
+    images = {"H_theta": np.repeat(h_theta, 3, 1), "H_phi": np.repeat(h_phi, 3, 1)}
+    images |= {"ZA": sky + moon + reactance, "Rsky": sky, "Rmoon": moon, "Rloss": 0.0 * sky}
     axes = {"freq": frequencies, "theta": theta, "phi": phi}
     return write_images(path, in_parts(images) | axes, {"VERSION": 3})
 

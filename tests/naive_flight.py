@@ -54,5 +54,4 @@ def naive_band(flight, name, row, f, comb=False):
     for label, spectrum in zip(FLIGHT_ORDER, counts[:, np.flatnonzero(within)], strict=True):
         gain = np.sqrt(gains[int(label[0])] * gains[int(label[1])])
         found[label] = weights @ (spectrum * 1e-18 / gain)
-    values = np.array([found[label] for label in labels()])
-    return values, 2.0**25 * stride / (weights @ weights)
+    return np.array([found[label] for label in labels()]), 2.0**25 * stride / (weights @ weights)

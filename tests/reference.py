@@ -93,8 +93,7 @@ def visibilities(response, grid, sky, time, *, lon_deg, lat_deg, turntable_deg=0
     turned = phi + np.radians(turntable_deg)
     directions = galactic_directions(theta, turned, time, lon_deg, lat_deg)
     lmax = round(np.sqrt(len(sky))) - 1
-    temperature = real_harmonics(*directions, lmax) @ sky
-    return response @ (temperature * solid_angle)
+    return response @ ((real_harmonics(*directions, lmax) @ sky) * solid_angle)
 
 
 def layered_reflection(permittivities, thickness_m, cos_theta, frequency_mhz):

@@ -1,4 +1,4 @@
-"""Gain drifts: to second order as a term of N, or exactly as factors (1 + g_i)(1 + g_j)."""
+"""Gain drifts: a term of N around found drifts or none, or exact factors (1 + g_i)(1 + g_j)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 from pydantic import Field
 
-from lusee_bayes.core.arrays import Array, DataVector
+from lusee_bayes.core.arrays import Array, DataVector, Grid
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.core.section import Positive, Section, Treatment, requires
 from lusee_bayes.instrument.products import DataLayout
@@ -73,7 +73,8 @@ class GainSection(Section):
     visibilities : {"model", "measured", "posterior"}, optional
         Visibilities from which the covariance is computed: those of the model sky, correct only for
         simulated data with an exactly known instrument; the data, whose own drifts shift the map by
-        about one standard deviation; or, by default, the map's prediction (iterative).
+        about one standard deviation; or, by default, the map's prediction, with the covariance of
+        drifts about those that the data determine (iterative).
     """
 
     sigma: Positive = 0.01
@@ -116,7 +117,9 @@ class GainDrifts(Systematic):
         Drifts about which the term of N is linear. None for a term about no drifts, with its
         quadratic part.
     slope : (antennas, times) array, optional
-        Slope of ln p(d | drifts) that is due to the volume of skies that fit.
+        Slope of ln p by them that is due to the volume of skies and drifts that fit.
+    shift : (products, times) array, optional
+        F (C_g slope - found): the mean of the data minus the response to the found drifts, in K.
     """
 
     key: ClassVar[str] = "noise.gain"
@@ -137,6 +140,7 @@ class GainDrifts(Systematic):
     log_correlation_std: Float[Array, ""] | None = eqx.field(default=None, converter=scalar_or_none)
     found: Gains | None = None
     slope: Gains | None = None
+    shift: Grid | None = None
 
     @classmethod
     def of(
@@ -182,7 +186,11 @@ class GainDrifts(Systematic):
         if gains_about(setup) != "posterior" or (around.data is not None and around.gains is None):
             return drifts
         found = drifts.about if around.gains is None else around.gains
-        return replace(drifts, found=found, slope=around.gain_slope)
+        off = -found
+        if (slope := around.gain_slope) is not None:
+            off = off + drifts.drift.correlated(slope, setup.observation.hours)
+        drifts = replace(drifts, found=found, slope=slope)
+        return replace(drifts, shift=(drifts.slopes * off[:, None]).sum(0))
 
     @classmethod
     def truth(cls, section: GainSection, setup: Setup, key: PRNGKeyArray) -> Truth:
@@ -282,9 +290,8 @@ class GainDrifts(Systematic):
             mean = drift.mean_response(self.layout.n_products)[:, None]
             grid = jnp.broadcast_to(mean, (self.layout.n_products, self.layout.n_times))
             return multiplied(model, self.layout.gather(grid))
-        off = self.expected - self.found
-        shift = self.layout.gather((self.slopes * off[:, None]).sum(0))
-        return with_added(multiplied(model, self.response(self.found)), shift)
+        found = multiplied(model, self.response(self.found))
+        return with_added(found, self.layout.gather(self.shift))
 
     @property
     def about(self) -> Gains:
@@ -292,13 +299,6 @@ class GainDrifts(Systematic):
         if self.found is None:
             return np.zeros((self.n_antennas, self.layout.n_times))
         return self.found
-
-    @property
-    def expected(self) -> Gains:
-        """C_g slope, the prior mean with which the mode is that of p(g | d)."""
-        if self.slope is None:
-            return np.zeros_like(self.found)
-        return self.drift.correlated(self.slope, np.asarray(self.hours))
 
     def inferred(self, solved: DataVector) -> tuple[Gains, float]:
         """Posterior mean of the drifts, and how much more it adds to chi^2 than the solution's.

@@ -82,8 +82,7 @@ def test_the_files_agree_with_each_other(folder):
     kelvin, got, observed, truth, residual, *drawn = columns
     np.testing.assert_allclose(kelvin, modes_to_map(mean, nside), rtol=1e-12)
     y = pixel_matrix(nside, 8)
-    expected = np.sqrt(np.einsum("pi,ij,pj->p", y, covariance, y))
-    np.testing.assert_allclose(got, expected, rtol=1e-6)
+    np.testing.assert_allclose(got, np.sqrt(np.einsum("pi,ij,pj->p", y, covariance, y)), rtol=1e-6)
     np.testing.assert_allclose(kelvin - truth, residual, rtol=0, atol=1e-9 * kelvin.max())
     (channel,) = read_channels(folder / "diagnostics.nc")
     np.testing.assert_array_equal(observed, channel.highest_altitude >= 0)
@@ -244,9 +243,9 @@ ENDINGS = [
 
 
 @pytest.mark.parametrize(("fail", "code", "words"), ENDINGS)
-def test_what_ends_a_run_is_one_sentence_and_leaves_nothing(
-    small_map, tmp_path, monkeypatch, capsys, fail, code, words
-):
+def test_what_ends_a_run(small_map, tmp_path, monkeypatch, capsys, fail, code, words):
+    """It is one sentence, and leaves nothing."""
+
     def write(result, folder):
         (folder / "mean.fits").write_text("half")
         fail()
@@ -285,8 +284,7 @@ def test_names_that_are_no_text_are_shown_by_their_escapes(small_map, tmp_path, 
         assert run("compare", "a\udcff", "b[red]", "-o", "c\udcff") == 0
     shown = capsys.readouterr().out
     assert r"a\udcff" in shown and "b[red]" in shown
-    page = (tmp_path / "c\udcff" / "comparison.html").read_bytes().decode("utf-8")
-    assert r"a\udcff" in page
+    assert r"a\udcff" in (tmp_path / "c\udcff" / "comparison.html").read_bytes().decode("utf-8")
 
 
 # --- the terminal, help, and what a command waits for ---------------------------------------------
@@ -306,8 +304,7 @@ def printed(table) -> list[str]:
 
 def with_data(run, name, change):
     """The same run with other data."""
-    channel = replace(run.channel, data=change(run.channel.data))
-    return replace(run, name=name, channels=(channel,))
+    return replace(run, name=name, channels=(replace(run.channel, data=change(run.channel.data)),))
 
 
 @pytest.mark.parametrize(("arguments", "code"), [(["keys"], 0), (["map", "no.yaml"], 2)])

@@ -176,8 +176,7 @@ LARGE = Demand(base_bytes=1e9, task_bytes=1e15)
 
 def test_workers_that_cannot_do_it_are_refused(engine, tmp_path, monkeypatch):
     new = DaskEngine(engine.client)
-    greedy = DaskEngine(engine.client, LARGE)
-    refuse(r"memory.*1 task\(s\)", greedy.work_in, tmp_path)
+    refuse(r"memory.*1 task\(s\)", DaskEngine(engine.client, LARGE).work_in, tmp_path)
     refuse("gone'.*command and workers", new.work_in, tmp_path / "gone")
     with monkeypatch.context() as patch:
         patch.setattr(dask_engine, "code_versions", lambda: "lusee_bayes 0.0 and Python 3.0")

@@ -251,8 +251,7 @@ def test_what_is_absent_has_its_default():
     for name in ("labels", "notes", "open", "remarks"):
         del tree.attrs[name]
     del tree["rows"], tree["table"]
-    expected = example(labels=(), rows=(), table=None)
-    assert same(expected, from_tree(Everything, tree, "a file"))
+    assert same(example(labels=(), rows=(), table=None), from_tree(Everything, tree, "a file"))
 
 
 def without(tree: xr.DataTree, name: str) -> None:

@@ -18,8 +18,8 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import lmax_of, synthesis_matrix
 from lusee_bayes.experiment import diagnosis
 from lusee_bayes.experiment.experiment import doubts
-from lusee_bayes.experiment.model import full_model, radiometer, set_up, simulate
-from lusee_bayes.experiment.rounds import learned_prior, settled
+from lusee_bayes.experiment.model import radiometer, set_up, simulate
+from lusee_bayes.experiment.rounds import settled
 from lusee_bayes.experiment.sky_sections import FileSkySection
 from lusee_bayes.instrument.products import to_matrix, to_real
 from lusee_bayes.judge.residuals import residuals
@@ -108,40 +108,30 @@ def test_what_n_is_built_around_by_default():
 def test_the_default_path_with_drifts(sigma, test_data):
     """ULSA's sky, the embedded one as model, the default prior, learned in the rounds of N.
 
-    The errors are those of a map whose N is built around the true visibilities and drifts; in the
-    combinations that it knows best, where the prior hardly matters, they are what is claimed.
+    Errors are what is claimed in all directions that the data inform, and the data fit: what is
+    quadratic in drifts is no independent noise, which would let chi^2 scatter by twice as much.
     """
     file = test_data / "ulsa" / "exp10.0MHz_sky_map_with_absorption.hdf5"
     sky = FileSkySection(file=str(file)).at(10.0, 12)
     scenario = wrong_data.scenario(12, f"noise.gain={{sigma: {sigma}}}", frequency_mhz=10.0)
-    total, known = 0.0, 0
+    pulls, full = [], []
     for seed in (1, 2, 3):
-        seen = {}
 
-        def distort(setup, v, seen=seen, seed=seed):
-            seen["true"] = np.asarray(v)
+        def distort(setup, v, seed=seed):
             key, hours = jax.random.key(100 + seed), setup.observation.hours
-            seen["gains"] = np.asarray(lb.GainDrift(sigma, 10.0).sample(key, hours))
-            return with_gains(v, seen["gains"])
+            return with_gains(v, lb.GainDrift(sigma, 10.0).sample(key, hours))
 
         data = wrong_data.measured(scenario, sky, seed, distort=distort)
         found = lb.infer(lb.build(scenario, data))
-        around = Around(data, seen["true"], gains=seen["gains"])
-        setup = set_up(scenario, data)
-        information = full_model(setup, around).condition(data.data).information
-        prior = learned_prior(setup, setup.family, information).prior
-        model = full_model(replace(setup, prior=prior), around)
-        ideal = replace(found, solution=model.condition(data.data))
-        here, there = (distance(one, sky.modes) / len(sky.modes) for one in (found, ideal))
-        assert here == pytest.approx(there, abs=0.1)
-        posterior = found.posterior
+        n, posterior = len(data.data), found.posterior
+        assert abs(found.solution.chi2 - n) < 4.0 * np.sqrt(2.0 * n)
         both = (np.asarray(one.covariance()) for one in (posterior, posterior.prior))
         share, directions = linalg.eigh(*both)
-        best = share < 1e-3
         off = directions.T @ (sky.modes - np.asarray(posterior.mean)) / np.sqrt(share)
-        total, known = total + float((off[best] ** 2).sum()), known + int(best.sum())
-    assert known > 60
-    assert 1.0 - 4.0 * np.sqrt(2.0 / known) < total / known < 1.0 + 4.0 * np.sqrt(2.0 / known)
+        full.append(float((off**2).mean()))
+        pulls.append(off[share < 0.5])
+    assert 0.8 < np.mean(np.concatenate(pulls) ** 2) < 1.3
+    assert 0.8 < np.mean(full) < 1.3
 
 
 @pytest.mark.essential

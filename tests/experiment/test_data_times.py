@@ -205,8 +205,7 @@ def test_a_plan_keeps_the_dates_of_a_schedule(given):
     assert {v.family for v in variations} == {"as given", "duty cycle", "antenna lost"}
     assert all(v.scenario.observation == scenario.observation for v in variations)
     # 3 days and 47.5 hours at half duty, and 5.5 days
-    live = (3.0 + 47.5 / 24.0) / 2.0 + 5.5
-    assert forecast(variations[0]).days == pytest.approx(live, abs=1e-9)
+    assert forecast(variations[0]).days == pytest.approx((3.0 + 47.5 / 24.0) / 2.0 + 5.5, abs=1e-9)
 
 
 def test_what_is_wrong_with_the_file_is_said(given, path):

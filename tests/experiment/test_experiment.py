@@ -74,8 +74,7 @@ def test_the_map_recovers_the_sky(small_experiment):
     _, channel = mapped(experiment)
     # z^2 of the truth averaged over 49 modes: a sky that is no Gaussian draw but has the
     # prior's spectrum stays well below twice its expectation
-    z = (channel.mean - np.asarray(experiment.data.truth)) / channel.std
-    assert np.mean(z**2) < 2.0
+    assert np.mean(((channel.mean - np.asarray(experiment.data.truth)) / channel.std) ** 2) < 2.0
     scatter = np.sqrt(2 * experiment.data.layout.size)
     assert channel.chi2 == pytest.approx(channel.chi2_expected, abs=5 * scatter)
 

@@ -50,7 +50,9 @@ def test_the_posteriors_own_prediction_has_settled():
     # the signal plus A (m - sky) cancels to rounding
     scale = float(jnp.abs(predicted).max())
     within(prediction(setup, found, np.zeros(found.model.n_data)), predicted, 1e-12 * scale)
-    again = full_model(setup, Around(data, predicted)).condition(data.data).posterior
+    gains = {"gains": found.around.gains, "gain_slope": found.around.gain_slope}
+    around = Around(data, predicted, **gains)
+    again = full_model(setup, around).condition(data.data).posterior
     assert float(again.rms_shift_from(posterior.mean)) < SETTLED
     # it did move on the way
     measured = inferred(GAIN, "noise.gain.visibilities=measured").posterior
@@ -73,9 +75,8 @@ def test_beam_parameters_are_directions_of_one_sigma():
         plus, minus = (experiment(*one).setup.coupling @ found.around.sky for one in beams)
         moved = sigma * (np.asarray(plus) - np.asarray(minus)) / 2e-4
         expected = expected + np.outer(moved, moved)
-    got = np.asarray(found.model.noise.dense())
     # central differences: h^2 f''' = 1e-8 of the slope
-    within(got, expected, 1e-6 * expected.max())
+    within(np.asarray(found.model.noise.dense()), expected, 1e-6 * expected.max())
     # the data's own beams differ by a draw of that size
     assert 1e-3 < beam_rms_difference(setup) < 0.3
     assert beam_rms_difference(experiment().setup) is None

@@ -48,9 +48,8 @@ def test_what_an_error_does_is_what_it_does_to_data(plain, spots, name, centre, 
     term = "noise." + section.get(name, "pointing={tilt_north_deg: 1}")
     scenario = scenario_of(ISOTROPIC, term, lmax=6, step_s=43200.0)
     sky = found.posterior.mean
-    above, below = (
-        moved(set_up(scenario), {name: centre + x}) for x in (size / 10.0, -size / 10.0)
-    )
+    steps = size / 10.0, -size / 10.0
+    above, below = (moved(set_up(scenario), {name: centre + step}) for step in steps)
     more = 5.0 * (np.asarray(above.coupling @ sky) - np.asarray(below.coupling @ sky))
     d = np.asarray(experiment.data.data)
     shift = found.model.condition(d + more).posterior.mean - found.model.condition(d).posterior.mean

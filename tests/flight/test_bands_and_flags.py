@@ -67,9 +67,8 @@ def test_a_comb_far_below_the_noise_of_a_channel_is_found(navgf):
     averaging = AVERAGING[navgf]
     spectra = autos(rng, rows=40, navgf=navgf)
     frames = np.full(40, FRAMES)
-    before = fl.comb_strength(spectra, frames, averaging, MHZ)
     # neighbours predict a channel to fourth order: at 5 MHz, 6e-8 of it
-    assert np.abs(before).max() < fl.COMB_LIMIT / 1.5
+    assert np.abs(fl.comb_strength(spectra, frames, averaging, MHZ)).max() < fl.COMB_LIMIT / 1.5
     spectra[::2, :, fl.comb_bins(averaging)] *= 1.0 + 1.0 / np.sqrt(FRAMES)
     found = np.abs(fl.comb_strength(spectra, frames, averaging, MHZ)) > fl.COMB_LIMIT
     assert found[::2].all() and not found[1::2].any()
@@ -274,7 +273,6 @@ def test_filter_banks_share_noise_as_noise_through_them_does(taps, taper):
     covariance = np.cov(power.T) * frames
     expected = shared_noise(taps, taper)
     for apart in range(3):
-        found = np.mean(covariance[inner, inner + apart])
         # of 3000 sets a variance scatters by 2.6 %, of the mean over channels by less; frames at
         # the ends have fewer neighbours: a share of taps / frames; h of 32 samples is coarse
-        assert found == pytest.approx(expected[apart], abs=0.06)
+        assert np.mean(covariance[inner, inner + apart]) == pytest.approx(expected[apart], abs=0.06)

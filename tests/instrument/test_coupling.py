@@ -67,9 +67,8 @@ def test_visibilities_agree_with_an_integral_over_the_sky_in_lunartopo(lmax, tur
     response = np.array([parts[x[2]](power[int(x[0]), int(x[1])]) for x in labels()])
     site = {**SITE, "turntable_deg": turntable}
     for k in np.random.default_rng(2).integers(0, o.n_times, 3):
-        expected = visibilities(response, grid, np.asarray(sky), o.times[k], **site)
         # Simpson with 120 steps along the arm, (k h)^4 / 180 = 1e-10, and the neglected tilts
-        close(got[:, k], expected, 5e-9)
+        close(got[:, k], visibilities(response, grid, np.asarray(sky), o.times[k], **site), 5e-9)
 
 
 def flagged():
@@ -178,15 +177,8 @@ def instrument(pointing, layout):
     return Instrument(Monopoles(), pointing, layout, FREQUENCY, LOW)
 
 
-PLACED = {
-    "length_m": 3.1,
-    "height_m": 1.7,
-    "zenith_angle_deg": 73.0,
-    "turntable_offset_deg": 5.0,
-    "surface_permittivity": 3.5,
-    "deep_permittivity": 6.5,
-    "loss_tangent": 0.02,
-}
+PLACED = {"length_m": 3.1, "height_m": 1.7, "zenith_angle_deg": 73.0, "turntable_offset_deg": 5.0}
+PLACED |= {"surface_permittivity": 3.5, "deep_permittivity": 6.5, "loss_tangent": 0.02}
 
 
 def test_a_of_placed_antennas_is_that_of_antennas_built_so(instrument, pointing, layout):

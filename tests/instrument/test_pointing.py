@@ -52,16 +52,9 @@ def test_sufficient_order_is_the_lowest_that_bounds_the_series(size, lmax):
 
 
 LMAX = 12
-VALUES = {
-    "clock_s": 60.0,
-    "clock_drift_s_per_day": 3.0,
-    "turntable_0_deg": 0.3,
-    "turntable_1_deg": -0.2,
-    "lon_deg": 0.05,
-    "lat_deg": -0.03,
-    "tilt_east_deg": 0.4,
-    "tilt_north_deg": 0.25,
-}
+VALUES = {"clock_s": 60.0, "clock_drift_s_per_day": 3.0}
+VALUES |= {"turntable_0_deg": 0.3, "turntable_1_deg": -0.2, "lon_deg": 0.05, "lat_deg": -0.03}
+VALUES |= {"tilt_east_deg": 0.4, "tilt_north_deg": 0.25}
 
 
 def two_runs():

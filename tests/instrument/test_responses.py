@@ -413,13 +413,9 @@ def test_gaps_are_written(luseepy, tmp_path):
     keep = np.arange(328) % 7 < 3
     grid = waterfall.grid[:, keep, :1].copy()
     grid[3, 2] = np.nan
-    part = replace(
-        waterfall,
-        grid=grid,
-        frequencies_mhz=waterfall.frequencies_mhz[:1],
-        observation=waterfall.observation.select(keep),
-        per_kelvin=waterfall.per_kelvin[:1],
-    )
+    first = {name: getattr(waterfall, name)[:1] for name in ("frequencies_mhz", "per_kelvin")}
+    observation = waterfall.observation.select(keep)
+    part = replace(waterfall, grid=grid, observation=observation, **first)
     path = write_four_port(tmp_path / "w.fits", [part.at(5.0)], [response.circuit(5.0)])
     back = read_waterfall(path)
     np.testing.assert_allclose(back.grid, grid, rtol=3e-16, atol=0)

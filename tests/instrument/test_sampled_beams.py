@@ -253,18 +253,11 @@ def test_a_file_has_to_say_whether_its_scale_is_absolute(tmp_path, suffix):
 def uvbeam(coordinates: str):
     """The embedded antennas as a UVBeam: feeds are its ports, azimuth from East towards North."""
     pyuvdata = pytest.importorskip("pyuvdata")
-    options = {
-        "telescope_name": "LuSEE-Night",
-        "data_normalization": "physical",
-        "freq_array": np.array([20e6, 30e6]),
-        "feed_name": "test",
-        "feed_version": "1",
-        "model_name": "monopoles",
-        "model_version": "1",
-        "feed_array": ["x", "y"],
-        "feed_angle": np.array([np.pi / 2, 0.0]),
-        "mount_type": "fixed",
-    }
+    options = {"telescope_name": "LuSEE-Night", "data_normalization": "physical"}
+    options |= {"freq_array": np.array([20e6, 30e6]), "mount_type": "fixed"}
+    options |= {"feed_array": ["x", "y"], "feed_angle": np.array([np.pi / 2, 0.0])}
+    options |= {"feed_name": "test", "model_name": "monopoles"}
+    options |= {"feed_version": "1", "model_version": "1"}
     if coordinates == "healpix":
         options |= {"nside": NSIDE}
         given = [on_pixels(Monopoles(), f) for f in (20.0, 30.0)]

@@ -502,7 +502,6 @@ NOT_OF_A_FILE = [
     (shifted_bounds, "time_bounds and the pieces of sample 0 differ by 30 s"),
     (changed("piece_start_s", np.nan), "piece_start_s.*NaN"),
     (changed("piece_sample", 0), "at least one piece for each"),
-    (changed("piece_live_s", 4000.0), "sample 1 was live for 4000 s of a window of 3600 s"),
     (bounds_alone(changed("live_time", -1.0)), "sample 1 has a live time of -1 s"),
     (bounds_alone(changed("time_bounds", np.datetime64("NaT", "ns"))), "time_bounds has no time"),
     (bounds_alone(numbers), "time_bounds has values of type float64, expected times"),

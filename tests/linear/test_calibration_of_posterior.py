@@ -43,12 +43,9 @@ class Setup:
         kernel = np.exp(-((hours[:, None] - hours[None]) ** 2) / (2 * 10.0**2))
         signal = np.asarray(fiducial)
         gain = DenseCovariance(jnp.asarray(1e-10 * np.outer(signal, signal) * kernel), "gain")
-        self.noise = {
-            "paper": paper,
-            "exact": exact,
-            "dense": DenseCovariance(exact.dense() + gain.dense()),
-            "diagonal+dense": paper + gain,
-        }
+        dense = DenseCovariance(exact.dense() + gain.dense())
+        self.noise = {"paper": paper, "exact": exact, "dense": dense}
+        self.noise["diagonal+dense"] = paper + gain
 
     def simulate(self, noise: Covariance):
         """(skies, data) of N_DRAWS skies from the prior and noise from N, by numpy."""

@@ -93,9 +93,8 @@ def test_learning_gains_over_the_start_under_local_scales():
     def evidence(shift):
         level = mean + shift * (np.arange(len(mean)) == 0)
         spread = lambda rows: np.einsum("ij,jk,ik->i", rows, about, rows)  # noqa: E731
-        return float(
-            information.posterior(family.prior(family.averaged(level, spread))).log_evidence
-        )
+        prior = family.prior(family.averaged(level, spread))
+        return float(information.posterior(prior).log_evidence)
 
     best = float(information.posterior(found.prior).log_evidence)
     assert evidence(0.0) == pytest.approx(best, abs=0.01)
@@ -303,8 +302,7 @@ def test_draws_are_those_of_the_integral_over_the_parameter(one_parameter):
             expected = integrate.simpson(below * density, x=theta)
             scatter = integrate.simpson((below - expected) ** 2 * density, x=theta)
             # 150 theta, each for 30 draws
-            error = np.sqrt(scatter / 150 + level * (1 - level) / 4500)
-            assert abs(level - expected) < 4.0 * error
+            assert abs(level - expected) < 4.0 * np.sqrt(scatter / 150 + level * (1 - level) / 4500)
 
 
 def weakly_known(family: IsotropicFamily, std: float) -> tuple[learning.Learned, Information]:

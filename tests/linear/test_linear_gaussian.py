@@ -42,12 +42,8 @@ def noise_terms(n_data: int):
     blocks = np.stack([oracle.random_covariance(rng, 3) for _ in range(layout.n_times)])
     time_blocks = TimeBlockCovariance(jnp.asarray(blocks), layout)
     dense = DenseCovariance(jnp.asarray(oracle.random_covariance(rng, n_data)))
-    return {
-        "diagonal": diagonal,
-        "blocks": time_blocks,
-        "dense": dense,
-        "diagonal+blocks": diagonal + time_blocks,
-    }
+    alone = {"diagonal": diagonal, "blocks": time_blocks, "dense": dense}
+    return alone | {"diagonal+blocks": diagonal + time_blocks}
 
 
 def well_scaled(n_data: int, noise="diagonal", spectrum=SPECTRUM, offset=None):
@@ -337,8 +333,7 @@ def test_bad_parts_are_refused(small):
     with pytest.raises((lb.InputError, TypeCheckError), match="offset"):  # types are checked first
         lb.LinearGaussian(a, prior, noise, jnp.ones(8))
     bad = DenseCovariance(jnp.eye(9).at[0, 0].set(-2.0), "the gain term")
-    condition = lb.LinearGaussian(a, prior, bad).condition
-    refuse("gain term.*not positive definite.* -2 ", condition, d)
+    refuse("gain term.*not positive definite.* -2 ", lb.LinearGaussian(a, prior, bad).condition, d)
 
 
 def test_slopes_with_fewer_data_and_an_ell_without_power():
@@ -385,7 +380,6 @@ def test_beside_a_solved_model_columns_are_changed(before, after, gain):
     wanted = replace(wanted, coupling=DenseCoupling(gain * wanted.coupling.dense()))
     found = FromInformation.beside(known, wanted).condition(d)
     expected = oracle.posterior(*oracle.matrices(wanted), d)
-    off = (found.posterior.mean - expected.mean) / expected.std
-    assert np.abs(off).max() < WELL_SCALED
+    assert np.abs((found.posterior.mean - expected.mean) / expected.std).max() < WELL_SCALED
     np.testing.assert_allclose(found.covariance, expected.covariance, atol=1e-10)
     assert float(found.posterior.log_evidence) == pytest.approx(expected.log_prob, abs=1e-9)

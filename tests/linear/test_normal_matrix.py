@@ -108,8 +108,7 @@ def test_products_without_weight_take_no_part(blocks):
         weights[1, 3] = weights[3, 1] = rng.uniform(0.0, 0.5, n_times)
     a = np.asarray(coupling.dense()).reshape(N_PRODUCTS, n_times, -1)
     expected = np.einsum("ktm,kjt,jtn->mn", a, weights, a, optimize=True)
-    given = weights if blocks else np.einsum("kkt->kt", weights)
-    close(summed(coupling, given), expected, 1e-12)
+    close(summed(coupling, weights if blocks else np.einsum("kkt->kt", weights)), expected, 1e-12)
 
 
 def test_what_has_no_structure_is_refused():
@@ -160,8 +159,7 @@ def test_inside_a_transformation_the_form_is_one_in_jax():
     data = jnp.asarray(np.random.default_rng(3).standard_normal((2, gaussian.n_data)))
     got = jax.jit(jax.vmap(lambda d: gaussian.condition(d).posterior.mean))(data)
     for one, mean in zip(data, got, strict=True):
-        expected = gaussian.condition(one).posterior.mean
-        np.testing.assert_allclose(mean, expected, rtol=0, atol=1e-11)
+        np.testing.assert_allclose(mean, gaussian.condition(one).posterior.mean, rtol=0, atol=1e-11)
 
 
 @pytest.mark.parametrize("kind", ["diagonal", "low rank"])

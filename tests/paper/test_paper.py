@@ -153,9 +153,8 @@ def test_only_what_changed_is_computed_again(four, tmp_path, computed, monkeypat
 @pytest.mark.parametrize("place", ["cases", "unfinished-cases"])
 def test_a_broken_case_file_is_computed_again(four, place, tmp_path, monkeypatch):
     computed = []
-    monkeypatch.setattr(
-        runs, "compute_case", lambda s: computed.append(s) or made_up("fiducial", s)
-    )
+    spy = lambda s: computed.append(s) or made_up("fiducial", s)  # noqa: E731
+    monkeypatch.setattr(runs, "compute_case", spy)
     monkeypatch.setattr(paper, "CASES", dict(list(paper.CASES.items())[:1]))
     (tmp_path / place).mkdir()
     (tmp_path / place / "fiducial.nc").write_text("truncated")
@@ -244,9 +243,7 @@ def synthetic(name: str, agrees: bool) -> xr.Dataset:
             "beam": (("pattern", "theta", "phi"), np.stack([beam] * 3)),
         },
         coords={"ell": ell, "theta": grid.theta, "phi": grid.phi, "product": products},
-        attrs={
-            "n_data": n_data, "n_modes": 2304, "beam_rms_difference": rms, "scenario": scenario,
-        },
+        attrs={"n_data": n_data, "n_modes": 2304, "beam_rms_difference": rms, "scenario": scenario},
     )  # fmt: skip
 
 

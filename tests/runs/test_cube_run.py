@@ -208,9 +208,7 @@ def test_what_too_few_channels_cannot_be_is_named(gap, tmp_path, numbers_alone):
 
 
 @pytest.mark.long
-def test_a_run_with_a_channel_that_cannot_be_mapped_goes_on(
-    gap, tmp_path, made, monkeypatch, numbers_alone
-):
+def test_a_run_with_an_unmapped_channel_goes_on(gap, tmp_path, made, monkeypatch, numbers_alone):
     conditioned = channels.conditioned
 
     def some(*arguments):

@@ -14,12 +14,8 @@ from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.noise.covariance import DenseCovariance
 
 # kinds of N
-NOISES = {
-    "paper": ("fiducial",),
-    "exact": ("fiducial", "noise.radiometer.form=exact"),
-    "gain": ("gain_1e-2",),
-    "beam": ("beam_4MHz",),
-}
+NOISES = {"paper": ("fiducial",), "exact": ("fiducial", "noise.radiometer.form=exact")}
+NOISES |= {"gain": ("gain_1e-2",), "beam": ("beam_4MHz",)}
 
 
 def noisy(noise: str, *more: str) -> Scenario:
@@ -89,6 +85,5 @@ def assert_mean(draws, expected, what, slack=1.1):
     """
     ess = array_stats.ess(draws, chain_axis=0, draw_axis=1, method="mean")
     assert ess.min() > 150, f"{what}: too few effective draws to judge"
-    error = draws.std((0, 1)) / np.sqrt(ess)
-    z = np.abs(draws.mean((0, 1)) - expected) / error
+    z = np.abs(draws.mean((0, 1)) - expected) / (draws.std((0, 1)) / np.sqrt(ess))
     assert z.max() < slack * z_of(z.size), f"{what} off by {z.max():.1f} Monte Carlo errors"

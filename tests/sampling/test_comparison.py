@@ -23,8 +23,7 @@ def log_integral(log_p, *nodes) -> float:
     for axis in range(weights.ndim):
         edges = weights.take([0, -1], axis=axis)
         assert edges.sum() < 1e-5 * weights.sum()
-    cell = np.prod([x[1] - x[0] for x in nodes])
-    return float(log_p.max() + np.log(weights.sum() * cell))
+    return float(log_p.max() + np.log(weights.sum() * np.prod([x[1] - x[0] for x in nodes])))
 
 
 LEVELS = np.linspace(-5.0, 5.0, 401)

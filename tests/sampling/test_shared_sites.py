@@ -106,9 +106,8 @@ def test_coordinates_are_those_of_the_gaussian_given_all_channels(octaves):
         for k, name in enumerate(FREQUENCIES)
         for j, u in enumerate(("common", "smooth", "own"))
     }
-    numbers = np.concatenate(
-        [[at[s], at[s] + 1][: shape[0] if shape else 1] for s, shape in white.sites]
-    )
+    numbers = [[at[s], at[s] + 1][: shape[0] if shape else 1] for s, shape in white.sites]
+    numbers = np.concatenate(numbers)
     scale, middle = (np.tile(v, 3)[numbers] for v in ([0.2, 2.0, 1.0, 1.0], [3.0, 0.0, 0.0, 0.0]))
     np.testing.assert_allclose(white.mean, middle + scale * mean[numbers], rtol=1e-9)
     whole = scale[:, None] * expected[np.ix_(numbers, numbers)] * scale

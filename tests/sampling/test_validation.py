@@ -284,9 +284,8 @@ def test_eigenvalues_of_independent_draws_lie_between_the_marchenko_pastur_edges
     for end, sign in [(-1, 1.0), (0, -1.0)]:
         edge = np.sqrt(n) + sign * np.sqrt(p)
         width = abs(edge) * abs(1 / np.sqrt(n) + sign / np.sqrt(p)) ** (1 / 3) / n
-        expected = edge**2 / n - sign * 1.2065 * width
         # 5 x 0.4 widths; about 1 % of the eigenvalue
-        assert abs(null[:, end].mean() - expected) < 2.0 * width
+        assert abs(null[:, end].mean() - (edge**2 / n - sign * 1.2065 * width)) < 2.0 * width
         assert 0.4 * width < null[:, end].std(ddof=1) < 3.0 * width
     # the mean eigenvalue is the trace: chi^2 of all numbers
     assert abs(null.mean() - 1) < 5 * np.sqrt(2 / (NULL_RUNS * n * p))

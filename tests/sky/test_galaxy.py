@@ -130,9 +130,7 @@ def test_without_electrons_the_integral_is_quads(lon_deg, lat_deg):
 
 @pytest.mark.parametrize("lon_deg, lat_deg", DIRECTIONS)
 @pytest.mark.parametrize("frequency_mhz, tolerance", [(1.0, 1e-2), (10.0, 1e-3)])
-def test_with_electrons_the_integral_is_that_of_tiny_steps(
-    lon_deg, lat_deg, frequency_mhz, tolerance
-):
+def test_with_electrons_it_is_that_of_tiny_steps(lon_deg, lat_deg, frequency_mhz, tolerance):
     # Slabs of constant j and kappa: second order in the depth of one, which is 100 times less
     # at 10 MHz than at 1 MHz. Tolerances: see the measured errors of Slabs.
     slab, source = slabs(lon_deg, lat_deg, frequency_mhz)

@@ -14,10 +14,8 @@ from lusee_bayes.systematics.context import prior_and_family
 
 LMAX, MARGIN = 5, 4
 N = n_modes(LMAX)
-SHARED = (
-    "observation={runs: [{cycles: 0.3}], step_s: 14400}",
-    "noise.radiometer.temperature=model",
-)
+RUNS = "observation={runs: [{cycles: 0.3}], step_s: 14400}"
+SHARED = RUNS, "noise.radiometer.temperature=model"
 
 
 def scenario(lmax, *more):

@@ -226,8 +226,7 @@ def test_simulation_based_calibration(response_file):
         z = [(truth[f"receiver_{port}_k"] - 2000.0) / 200.0 for port in range(4)]
         z += [(truth["regolith_k"] - 250.0) / 30.0, *truth["gain_table"]]
         true = np.concatenate([setup.sky.modes, z])
-        picked = [*MODES, *range(16, 25)]
-        ranks.append((draws < true).sum(0)[picked])
+        ranks.append((draws < true).sum(0)[[*MODES, *range(16, 25)]])
         # along the null direction, in prior standard deviations
         report = ex.unknowns_report(experiment, found)
         assert report.null.names[0] == SKY and report.null.names[-1] == COMMON_GAIN

@@ -23,20 +23,12 @@ from lusee_bayes.runs import channels
 from lusee_bayes.sampling.programs import require_sampleable
 from lusee_bayes.systematics.context import Setup
 
-SKIES = {
-    10.0: ("ulsa/exp10.0MHz_sky_map_with_absorption.hdf5", 10.0),
-    25.0: ("surveys/gsm2008_25MHz.fits", 25.0),
-}
+SKIES = {10.0: "ulsa/exp10.0MHz_sky_map_with_absorption.hdf5", 25.0: "surveys/gsm2008_25MHz.fits"}
 # half a percent of gains, 5 % of the ground, 0.3 degrees of the arms, 20 s, 0.2 degrees, 10 %
+ANTENNAS = {"surface_permittivity": 0.185, "deep_permittivity": 0.3, "zenith_angle_deg": 0.3}
 NOISE = {
     "gain": {"sigma": 0.005},
-    "beam": {
-        "parameters": {
-            "surface_permittivity": 0.185,
-            "deep_permittivity": 0.3,
-            "zenith_angle_deg": 0.3,
-        }
-    },
+    "beam": {"parameters": ANTENNAS},
     "pointing": {"clock_s": 20.0, "turntable_deg": 0.2},
     "receiver": {"power_k": 2e4, "relative_std": 0.1},
 }
@@ -53,10 +45,10 @@ def scenario(mhz: float, angles: int, **more) -> Scenario:
 
 def of_another_sky(folder: Path, mhz: float, angles: int, **more) -> tuple[Setup, Inference]:
     """Infer what data of a published map tell, which is not drawn from the prior."""
-    file, at = SKIES[mhz]
+    file = SKIES[mhz]
     if not (folder / file).exists():
         pytest.skip(f"needs {folder / file}")
-    sky = {"model": "file", "file": str(folder / file), "file_frequency_mhz": at}
+    sky = {"model": "file", "file": str(folder / file), "file_frequency_mhz": mhz}
     truth = set_up(scenario(mhz, angles, sky=sky, **more))
     return truth, lb.infer(lb.build(scenario(mhz, angles, **more), data=simulate(truth)))
 
@@ -207,7 +199,7 @@ def test_eight_channels_share_an_instrument(monkeypatch, tmp_path):
     noise = {key: NOISE[key] for key in ("gain", "receiver")}
     noise["receiver"] = noise["receiver"] | {"smooth_octaves": 1.0}
     noise["pointing"] = {"turntable_deg": 0.2}
-    noise["beam"] = {"parameters": NOISE["beam"]["parameters"] | {"loss_tangent": 0.002}}
+    noise["beam"] = {"parameters": ANTENNAS | {"loss_tangent": 0.002}}
     runs = [{"cycles": 0.5}, {"cycles": 0.5, "turntable_deg": 30.0}]
     tree = {
         "frequencies_mhz": [10.0, 12.9, 15.7, 18.6, 21.4, 24.3, 27.1, 30.0],
@@ -217,13 +209,11 @@ def test_eight_channels_share_an_instrument(monkeypatch, tmp_path):
         "output": {"draws": 0, "covariance": True},
     }
     shares, tied = [], channels.tie_channels
-    monkeypatch.setattr(
-        channels, "tie_channels", lambda *given: shares.extend(given[2]) or tied(*given)
-    )
+    spy = lambda *given: shares.extend(given[2]) or tied(*given)  # noqa: E731
+    monkeypatch.setattr(channels, "tie_channels", spy)
     cube = lb.run_map(Scenario.model_validate(tree), tmp_path / "cube").result
-    alone = pd.DataFrame(
-        [dict(zip(s.octaves, s.covariance.diagonal() ** 0.5, strict=True)) for s in shares]
-    )
+    stds = [dict(zip(s.octaves, s.covariance.diagonal() ** 0.5, strict=True)) for s in shares]
+    alone = pd.DataFrame(stds)
     assert not any(test.disagrees for test in cube.shared_tests)
     for one in cube.channels:
         off = one.mean - one.truth

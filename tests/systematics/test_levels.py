@@ -94,8 +94,7 @@ def test_levels_and_spectra_are_factors_of_n_and_c_ell(case, systematic, values,
     """A ratio of variances; C_ell A ((ell + 1) / 10)^tilt, and powers of bands."""
     expected = case.evidence(np.asarray(factors), level=values.get("noise_level", 1.0))
     for (name, value), std in zip(values.items(), stds, strict=True):
-        prior = norm(0.0, std) if name == "tilt" else lognorm(std)
-        expected += prior.logpdf(value).sum()
+        expected += (norm(0.0, std) if name == "tilt" else lognorm(std)).logpdf(value).sum()
     assert general(case, [systematic], values) == pytest.approx(expected, rel=CLOSE)
 
 

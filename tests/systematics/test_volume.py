@@ -74,8 +74,7 @@ def test_evidence_is_that_with_the_volume_as_a_factor():
     white, along = both - both @ q @ q.T
     log_det = 2.0 * np.log(np.abs(np.diag(triangle))).sum() + np.log(2.0 * np.pi * noise).sum()
     mean = (along @ white + g) / (1.0 + along @ along)
-    width = 1.0 / np.sqrt(1.0 + along @ along)
-    z = mean + width * np.linspace(-8.0, 8.0, 2001)
+    z = mean + (1.0 / np.sqrt(1.0 + along @ along)) * np.linspace(-8.0, 8.0, 2001)
     off = ((white[:, None] - along[:, None] * z) ** 2).sum(0) + z**2 - 2.0 * g * (z - mean)
     least = off.min()
     integral = np.log(np.exp(-(off - least) / 2.0).sum() * (z[1] - z[0]) / np.sqrt(2.0 * np.pi))
