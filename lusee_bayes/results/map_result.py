@@ -411,7 +411,7 @@ class MapResult(Described):
     def index_maps(self) -> IndexMaps | None:
         """Maps of the spectral index of a joint posterior; None for less than three channels."""
         parts = [c.temperatures for c in self.channels]
-        if len(parts) < 3 or any(part is None or not len(part.cells) for part in parts):
+        if len(parts) < 3 or any(part is None or part.cells is None for part in parts):
             return None
         return IndexMaps.of(self.frequencies_mhz, np.stack([part.cells for part in parts]))
 

@@ -130,9 +130,9 @@ class RegionTemperatures:
         sky that never rises; and the fraction from E u. The fractions need not add up.
     draws : (draws, regions) array
         Of a joint posterior; empty otherwise.
-    cells : (draws, pixels) array
+    cells : (draws, pixels) array or None
         The first of them, smoothed as maps are drawn, at the centres of HEALPix cells (RING,
-        NSIDE 8).
+        NSIDE 8); None without a joint posterior.
     """
 
     regions: tuple[str, ...]
@@ -144,7 +144,7 @@ class RegionTemperatures:
     departure: Departure | None
     shares: Float[np.ndarray, "source area"] = quantity("1", "fraction of the variance")
     draws: Float[np.ndarray, "joint_draw area"] = quantity("K", "draws of a joint posterior")
-    cells: Float[np.ndarray, "cell_draw cell"] = quantity("K", "draws in cells of the sky")
+    cells: Float[np.ndarray, "cell_draw cell"] | None = quantity("K", "draws in cells of the sky")
 
     @classmethod
     def of(
@@ -193,9 +193,7 @@ class RegionTemperatures:
         none = np.zeros((0, len(mean)))
         draws = none if draws is None else draws
         few = draws[:INDEX_DRAWS] * per_mode(taper(lmax))
-        cells = np.array([modes_to_map(sky, INDEX_NSIDE) for sky in few]).reshape(
-            -1, healpy.nside2npix(INDEX_NSIDE)
-        )
+        cells = np.array([modes_to_map(sky, INDEX_NSIDE) for sky in few]) if len(few) else None
         return cls(
             tuple(regions),
             tuple(parts),

@@ -171,7 +171,7 @@ def test_skies_that_are_alike_have_errors_that_are_alike():
     std, zero = np.sqrt([row**2 @ c]), np.zeros(1)
     channels = [
         RegionTemperatures(
-            *given, zero, std, None, none, Departure(mean, (row * c)[None]), none.T, none.T
+            *given, zero, std, None, none, Departure(mean, (row * c)[None]), none.T, none.T, None
         )
         for mean in means[0]
     ]
