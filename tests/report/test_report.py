@@ -167,7 +167,11 @@ def test_what_the_data_do_not_tell_is_said(tmp_path):
 def test_a_page_without_groups(tmp_path, monkeypatch):
     """Noise that couples times, and an A that would be too large to judge its data one by one."""
     monkeypatch.setattr(left_out, "DENSE_BYTES", 0.0)
-    overrides = ["lmax=4", "observation.runs.0.cycles=0.1", "noise.gain={sigma: 0.01}"]
+    overrides = [
+        "lmax=4",
+        "observation.runs.0.cycles=0.1",
+        "noise.gain={sigma: 0.01, visibilities: model}",
+    ]
     made = lb.run_map(lb.load_scenario("fiducial", overrides), tmp_path / "map")
     (channel,) = read_channels(made.folder / "diagnostics.nc")
     assert not channel.judged.groups
