@@ -96,6 +96,7 @@ def test_files_have_the_spectrum_with_its_covariance(joint, tmp_path, capsys):
     page = (tmp_path / "cube" / "report.html").read_text(encoding="utf-8")
     assert "cap b &lt; -60" in page and "Novaco" not in page
     assert (tmp_path / "cube" / "index.fits").exists() == bool(joint)
+    assert ("Spectral index of ln T" in page) == bool(joint)
     if joint:
         index, std = healpy.read_map(tmp_path / "cube" / "index.fits", field=(0, 1))
         true = [modes_to_map(c.truth * per_mode(taper(4)), 8) for c in result.channels]
