@@ -330,7 +330,7 @@ def require_apart(folder: Path, inputs: Iterable[str | Path]) -> None:
 
 @contextmanager
 def naming_disk(path: Path) -> Iterator[None]:
-    """Add the name of the written file to an OSError of the block that has none.
+    """Add the name of the written file to an OSError of the block that has none, or a scratch name.
 
     HDF5 gives the error number only in its message, and astropy gives none.
     """
@@ -342,7 +342,8 @@ def naming_disk(path: Path) -> Iterator[None]:
         code = error.errno or (int(number[1]) if number else full)
         if code is None:
             raise
-        raise OSError(code, os.strerror(code), error.filename or str(path)) from error
+        named = error.filename and ".partial" not in str(error.filename)
+        raise OSError(code, os.strerror(code), error.filename if named else str(path)) from error
 
 
 @contextmanager

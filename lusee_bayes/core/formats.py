@@ -8,6 +8,7 @@ reads each file first, with a time limit.
 from __future__ import annotations
 
 import faulthandler
+import io
 import os
 import signal
 import sys
@@ -151,6 +152,41 @@ def with_grid(dataset: xarray.Dataset) -> xarray.Dataset:
         numbers = dim, np.arange(n, dtype=np.int32), indices, {"zlib": True, "shuffle": True}
         dataset = dataset.assign_coords({index: numbers}).assign({grid: ((), np.int8(0), mapping)})
     return dataset
+
+
+class _File(io.FileIO):
+    """A file that keeps the first error of writing; what is written after it is lost.
+
+    The HDF5 library crashes the process if it cannot write what remains when a file is closed.
+    """
+
+    error: OSError | None = None
+
+    def write(self, data):
+        left = memoryview(data).cast("B")
+        try:
+            while self.error is None and left:
+                left = left[super().write(left) :]
+        except OSError as error:
+            self.error = error
+        return memoryview(data).nbytes
+
+
+@contextmanager
+def hdf5_file(path: Path) -> Iterator[io.FileIO]:
+    """Open a new file for the HDF5 library; the block ends with the OSError of a full disk."""
+    with _File(path, "w+b") as file:
+        try:
+            yield file
+        finally:
+            if file.error is not None:
+                raise file.error
+
+
+def write_netcdf(content: xarray.Dataset | xarray.DataTree, path: Path) -> None:
+    """Write a netCDF file."""
+    with hdf5_file(path) as file:
+        content.to_netcdf(file, engine="h5netcdf")
 
 
 # time attributes of the CF conventions; bounds may inherit them from the variable that they bound

@@ -29,7 +29,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from lusee_bayes.core.errors import InputError, refusing
 from lusee_bayes.core.files import replacing, user_path
-from lusee_bayes.core.formats import header, require_format, with_grid
+from lusee_bayes.core.formats import header, require_format, with_grid, write_netcdf
 from lusee_bayes.core.layouts import Attribute, Layout, Unloaded, Unread, Variable
 from lusee_bayes.core.lazy import pandas, xarray
 from lusee_bayes.core.reading import reading
@@ -157,7 +157,7 @@ def write_tree(
     tree = to_tree(value)
     tree.attrs |= header(format_) | dict(attributes or {})
     with replacing(path) as partial:
-        tree.to_netcdf(partial, engine="h5netcdf")
+        write_netcdf(tree, partial)
     return user_path(path)
 
 

@@ -22,7 +22,7 @@ from jaxtyping import Float, Float32, Int
 from lusee_bayes.core.arrays import Rows
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing, user_path
-from lusee_bayes.core.formats import is_fits, opened, require_readable_hdf5
+from lusee_bayes.core.formats import hdf5_file, is_fits, opened, require_readable_hdf5
 from lusee_bayes.core.reading import reading, require_file
 from lusee_bayes.flight.clock import DAY_S, MJD_ZERO
 from lusee_bayes.flight.layout_3 import INTERPOLATED, UNKNOWN, session_of_fits, session_of_hdf5
@@ -279,7 +279,7 @@ CUBE = {
 
 
 def _write_session_hdf5(path: Path, rows: SessionRows, blocks: Blocks) -> None:
-    with h5py.File(path, "w") as file:
+    with hdf5_file(path) as target, h5py.File(target, "w") as file:
         _write_all_but_spectra(file, rows)
         shape = (rows.n_rows, N_PRODUCTS, N_CHANNELS)
         cube = file.create_dataset("spectra/data", shape, "f4", chunks=(1, *shape[1:]), **PACKED)

@@ -26,7 +26,7 @@ from lusee_bayes.core import checks, formats
 from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing, user_path
-from lusee_bayes.core.formats import as_dataset, read_netcdf
+from lusee_bayes.core.formats import as_dataset, read_netcdf, write_netcdf
 from lusee_bayes.core.harmonics import lmax_of, n_modes
 from lusee_bayes.core.layouts import Attribute, Content, Layout, Variable, require_mhz
 from lusee_bayes.core.reading import naming, require_file
@@ -386,7 +386,7 @@ class Visibilities(checks.Described):
         Path
         """
         with replacing(path) as partial:
-            self.to_dataset().assign_attrs(attrs or {}).to_netcdf(partial, engine="h5netcdf")
+            write_netcdf(self.to_dataset().assign_attrs(attrs or {}), partial)
         return user_path(path)
 
 

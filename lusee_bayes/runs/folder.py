@@ -23,6 +23,7 @@ from xarray import Dataset, DataTree
 from lusee_bayes.core import files, reading
 from lusee_bayes.core.arrays import use_compilation_cache
 from lusee_bayes.core.errors import InputError, WorkersLost
+from lusee_bayes.core.formats import write_netcdf
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import Data, digest_of, files_of, names_of_data
 from lusee_bayes.experiment.scenario import Scenario
@@ -193,7 +194,7 @@ class Output:
     @classmethod
     def netcdf(cls, name: str, content: Callable[[Any], Dataset | DataTree]) -> Output:
         """A netCDF file from a dataset or a data tree."""
-        return cls(lambda run, folder: content(run).to_netcdf(folder / name, engine="h5netcdf"))
+        return cls(lambda run, folder: write_netcdf(content(run), folder / name))
 
 
 SCENARIO = Output.text("scenario.yaml", lambda result: result.scenario.to_yaml())

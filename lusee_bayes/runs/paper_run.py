@@ -9,6 +9,7 @@ import xarray as xr
 
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.files import replacing
+from lusee_bayes.core.formats import write_netcdf
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.paper.cases import case_table, compute_case, is_case, paper_scenarios
 from lusee_bayes.paper.claims import Cases, claim_table, claims_as_markdown
@@ -66,7 +67,7 @@ def run_paper(
             if is_case(path := path_of(name), scenarios[name]):
                 return
             with replacing(path) as partial:
-                compute_case(scenarios[name]).to_netcdf(partial, engine="h5netcdf")
+                write_netcdf(compute_case(scenarios[name]), partial)
 
         names = list(scenarios)
         engine.each(Tasks(compute, names, names), stages, "cases")
@@ -77,7 +78,7 @@ def run_paper(
 def _write_cases(cases: Cases, folder: Path) -> None:
     (folder / CASES).mkdir()
     for name, case in cases.items():
-        case.to_netcdf(folder / CASES / f"{name}.nc", engine="h5netcdf")
+        write_netcdf(case, folder / CASES / f"{name}.nc")
 
 
 # contents of the folder of the paper's run; a new file is one line here

@@ -237,6 +237,7 @@ ENDINGS = [
     (raising(RuntimeError("RESOURCE_EXHAUSTED: Out of memory")), 1, "not enough memory (RES"),
     (raising(RuntimeError("can't start new thread")), 1, "not enough memory (can't start"),
     (raising(OSError(errno.ENOSPC, "No space left on device")), 1, "mean.fits'); results"),
+    (raising(OSError(errno.ENOSPC, "", ".partial-a/mean.fits")), 1, "red]/mean.fits')"),
     (raising(OSError("Can't write data (errno = 28, error message = ..)")), 1, "mean.fits')"),
     (raising(OSError("Not enough space on disk: requested 839168")), 1, "mean.fits'); results"),
 ]

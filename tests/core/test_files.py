@@ -276,6 +276,31 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
     assert content(tmp_path) == {"a/page.html": "first"}
 
 
+FULL = """
+import resource, sys
+from pathlib import Path
+from xarray import Dataset
+from lusee_bayes.core.files import replacing
+from lusee_bayes.core.formats import write_netcdf
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), resource.RLIM_INFINITY))
+try:
+    with replacing(sys.argv[1]) as partial:
+        write_netcdf(Dataset({name: ("x", [0.0] * 5000) for name in "abc"}), partial)
+except OSError as error:
+    print(error)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the limit on a file is Linux's")
+@pytest.mark.parametrize("size", [10, 50_000, 120_000])
+def test_a_full_disk_does_not_crash_the_hdf5_library(tmp_path, size):
+    path = tmp_path / "data.nc"
+    command = [sys.executable, "-c", FULL, str(path), str(size)]
+    ended = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert ended.stdout == f"[Errno 27] File too large: '{path}'\n" and not ended.stderr
+    assert not list(tmp_path.iterdir())
+
+
 HOLD = """
 import sys
 from pathlib import Path

@@ -432,8 +432,7 @@ def write_sampled_beams(path: str | Path, beams: SampledBeams) -> Path:
             hdus += [fits.ImageHDU(a.copy(), name=name) for name, a in arrays.items()]
             fits.HDUList(hdus).writeto(partly)
         else:
-            dataset = formats.as_dataset(formats.BEAMS, declared, arrays, said)
-            dataset.to_netcdf(partly, engine="h5netcdf")
+            formats.write_netcdf(formats.as_dataset(formats.BEAMS, declared, arrays, said), partly)
     return path
 
 
