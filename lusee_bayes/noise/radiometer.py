@@ -75,7 +75,7 @@ def radiometer_noise(
     *,
     bandwidth_hz: Scalar = 1.0e6,
     step_s: Scalar | Float[Array, " samples"] = 7200.0,
-    form: str = "paper",
+    form: str = "exact",
     duty_cycle: Scalar = 1.0,
     factor: Scalar = 1.0,
 ) -> Covariance:

@@ -45,7 +45,7 @@ class RadiometerSection(Section):
         the data themselves or, if their noise would bias the map, the map's prediction.
     """
 
-    form: Literal["paper", "exact"] = "paper"
+    form: Literal["paper", "exact"] = "exact"
     bandwidth_hz: Positive = 1.0e6
     duty_cycle: Annotated[float, Field(gt=0, le=1)] = 1.0
     factor: Positive = 1.0

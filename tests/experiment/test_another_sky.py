@@ -174,6 +174,15 @@ def test_the_cause_is_named():
     assert wrong.cause in " ".join(found.sentences())
 
 
+@pytest.mark.essential
+def test_independent_noise_is_named_where_products_are_correlated():
+    data = wrong_data.measured(wrong_data.scenario(6), sky(6), 1)
+    experiment = lb.build(wrong_data.scenario(6, "noise.radiometer.form=paper"), data)
+    found = lb.infer(experiment)
+    (first,) = diagnosis.diagnose(experiment, found, residuals(found.solution, data)).proposals
+    assert "form=exact" in first.remedy and first.chi2.fits
+
+
 @pytest.mark.long
 def test_all_wrong_data_make_a_map_and_most_causes_are_named():
     named = 0

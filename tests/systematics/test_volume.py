@@ -17,6 +17,7 @@ def scenario(**noise) -> Scenario:
     runs = [{"cycles": 0.5, "turntable_deg": 30.0 * k} for k in range(2)]
     observation = {"runs": runs, "step_s": 86400.0}
     prior = {"model": "isotropic", "spectrum": "sky"}
+    noise = {"radiometer": {"form": "paper"}} | noise
     tree = {"lmax": 4, "observation": observation, "noise": noise, "prior": prior, "seed": 3}
     return Scenario.model_validate(tree)
 
