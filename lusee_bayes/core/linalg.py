@@ -95,7 +95,10 @@ def cholesky(matrix: Matrices, *, overwrite: bool = False) -> Matrices:
     return jax.lax.linalg.cholesky(matrix, symmetrize_input=False)
 
 
-def checked_cholesky(name: str, matrix: Matrices) -> Matrices:
+AMPLITUDE = "check the term's amplitude and symmetry"
+
+
+def checked_cholesky(name: str, matrix: Matrices, hint: str = AMPLITUDE) -> Matrices:
     """Return the lower Cholesky factor of a matrix, or of every matrix of a stack.
 
     Parameters
@@ -104,6 +107,8 @@ def checked_cholesky(name: str, matrix: Matrices) -> Matrices:
         Name of the matrix, for the error message.
     matrix : (..., n, n) array
         Symmetric; only the lower triangle is read.
+    hint : str
+        What to do, for the error message.
 
     Returns
     -------
@@ -121,7 +126,7 @@ def checked_cholesky(name: str, matrix: Matrices) -> Matrices:
         largest = float(np.abs(np.asarray(matrix)).max())
         raise InputError(
             f"{name} is not positive definite: its lowest eigenvalue is {lowest:.3g} "
-            f"(largest entry {largest:.3g}); check the term's amplitude and symmetry"
+            f"(largest entry {largest:.3g}); {hint}"
         )
     return lower
 
