@@ -95,10 +95,7 @@ def cholesky(matrix: Matrices, *, overwrite: bool = False) -> Matrices:
     return jax.lax.linalg.cholesky(matrix, symmetrize_input=False)
 
 
-AMPLITUDE = "check the term's amplitude and symmetry"
-
-
-def checked_cholesky(name: str, matrix: Matrices, hint: str = AMPLITUDE) -> Matrices:
+def checked_cholesky(name: str, matrix: Matrices) -> Matrices:
     """Return the lower Cholesky factor of a matrix, or of every matrix of a stack.
 
     Parameters
@@ -107,8 +104,6 @@ def checked_cholesky(name: str, matrix: Matrices, hint: str = AMPLITUDE) -> Matr
         Name of the matrix, for the error message.
     matrix : (..., n, n) array
         Symmetric; only the lower triangle is read.
-    hint : str
-        What to do, for the error message.
 
     Returns
     -------
@@ -126,7 +121,7 @@ def checked_cholesky(name: str, matrix: Matrices, hint: str = AMPLITUDE) -> Matr
         largest = float(np.abs(np.asarray(matrix)).max())
         raise InputError(
             f"{name} is not positive definite: its lowest eigenvalue is {lowest:.3g} "
-            f"(largest entry {largest:.3g}); {hint}"
+            f"(largest entry {largest:.3g}); check the term's amplitude and symmetry"
         )
     return lower
 

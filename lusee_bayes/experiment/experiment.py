@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from lusee_bayes.core.arrays import Draws, on_device
-from lusee_bayes.core.checks import Described
+from lusee_bayes.core.checks import Described, counted
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.progress import Stages
@@ -38,11 +38,13 @@ from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.judge.plausibility import require_plausible
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.noise.radiometer import of_voltages
 from lusee_bayes.priors.learning import Learned, draws_with_parameters
 from lusee_bayes.sky.sky_source import SkySource
 from lusee_bayes.systematics.beam import BeamErrors
-from lusee_bayes.systematics.context import Around, Setup
+from lusee_bayes.systematics.context import Around, Setup, noise_visibilities
 from lusee_bayes.systematics.gain_drifts import GainDrifts
+from lusee_bayes.systematics.noise_level import radiometer_about
 from lusee_bayes.systematics.sources import PointSources
 from lusee_bayes.systematics.systematic import Systematic
 
@@ -393,6 +395,16 @@ def doubts(experiment: Experiment, inference: Inference) -> tuple[str, ...]:
             f"wrong by up to {errors[worst]:.2g} radiometer standard deviations (rms), tested by "
             f"omitting the files of {worst}; use more files, in smaller steps."
         )
+    setup = experiment.setup
+    if setup.scenario.noise.radiometer.form == "exact":
+        seen = noise_visibilities(setup, inference.around, radiometer_about(setup))
+        if not (known := np.asarray(of_voltages(seen))).all():
+            notes.append(
+                f"At {(~known).sum()} of {counted(len(known), 'time')} no voltages of independent "
+                "ports have these visibilities; the noise of the products is taken as independent. "
+                "Products may be exchanged or wrong, or ports depend on each other, as those of "
+                "ideal dipoles do."
+            )
     if learned is not None and not learned.settled:
         notes.append("The prior is fixed and wide: its parameters do not converge for any noise.")
     elif learned is not None and learned.noise_factor > 1.0:

@@ -172,9 +172,12 @@ def radiometer(setup: Setup, around: Around | None = None) -> Covariance:
     else:
         given = section.model_dump(include={"bandwidth_hz", "duty_cycle"})
         given["step_s"] = setup.observation.live_s
-    common = {"form": section.form, "factor": section.factor}
+    tempered = 1.0 if around is None else around.tempered
+    # far from the mode, without the directions in which correlated noise is smallest
+    form = section.form if tempered == 1.0 else "paper"
+    common = {"form": form, "factor": section.factor}
     noise = radiometer_noise(visibilities, setup.layout, **given, **common)
-    return noise if around is None or around.tempered == 1.0 else noise.scaled(around.tempered)
+    return noise if tempered == 1.0 else noise.scaled(tempered)
 
 
 def moved(setup: Setup, values: Truth | None) -> Setup:

@@ -13,12 +13,16 @@ integration time dt (times the duty cycle)::
             Cov[V_ij, conj(V_kl)] = T_ik conj(T_jl) / (df dt),
             Cov[V_ij, V_kl]       = T_il conj(T_jk) / (df dt),
             which couples all products of one time.
+
+The exact form needs a positive definite T(t), as every covariance of independent voltages is. At
+other times, with exchanged products or the dependent responses of ideal dipoles, products are taken
+as independent.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Complex, Float
+from jaxtyping import Bool, Complex, Float
 
 from lusee_bayes.core import checks
 from lusee_bayes.core.arrays import Array, Grid, compiled, namespace
@@ -67,6 +71,8 @@ def sample_covariances(t: Matrices, n_averaged: float, generator: np.random.Gene
 Scalar = float | int | Float[Array, ""]
 
 RADIOMETER_FORMS = ("paper", "exact")
+# smallest eigenvalue of T over the largest: that of the products' covariance is about its square
+LEAST_EIGENVALUE = 1e-6
 
 
 def radiometer_noise(
@@ -147,8 +153,18 @@ def exact_blocks(visibilities: Grid) -> Float[Array, "times products products"]:
     """
     i, j, imaginary = ports(round(np.sqrt(visibilities.shape[0])))
     part = np.where(imaginary, -1j, 1.0 + 0j)
-    t = namespace(visibilities).moveaxis(to_matrix(visibilities), 2, 0)
+    xp = namespace(visibilities)
+    t = xp.moveaxis(to_matrix(visibilities), 2, 0)
     hermitian = t[:, i[:, None], i[None]] * t[:, j[:, None], j[None]].conj()
     pseudo = t[:, i[:, None], j[None]] * t[:, j[:, None], i[None]].conj()
     weights = (part[:, None] * part[None].conj())[None], (part[:, None] * part[None])[None]
-    return (weights[0] * hermitian + weights[1] * pseudo).real / 2.0
+    blocks = (weights[0] * hermitian + weights[1] * pseudo).real / 2.0
+    independent = paper_variance(visibilities).T[:, :, None] * np.eye(len(i))[None]
+    return xp.where(of_voltages(visibilities)[:, None, None], blocks, independent)
+
+
+def of_voltages(visibilities: Grid) -> Bool[Array, " times"]:
+    """Whether T(t) is positive definite, by more than rounding could undo."""
+    xp = namespace(visibilities)
+    values = xp.linalg.eigvalsh(xp.moveaxis(to_matrix(visibilities), 2, 0))
+    return values[:, 0] > LEAST_EIGENVALUE * values[:, -1]

@@ -25,12 +25,6 @@ from lusee_bayes.noise.covariance import CholeskyFactor, Covariance, DiagonalCov
 
 Band = Float[Array, "times widths products products"]
 
-# the usual cause where no covariance of one time is positive definite
-DEPENDENT = (
-    "if the ports' responses depend on each other, as those of ideal dipoles do, use "
-    "noise.radiometer.form=paper"
-)
-
 
 class _OverLayout(Covariance):
     """A covariance with the product and the time of each of its data."""
@@ -108,7 +102,7 @@ class TimeBlockCovariance(_OverLayout):
         return self.layout.gather(namespace(self).diagonal(self.blocks, axis1=1, axis2=2).T)
 
     def factor(self):
-        lower = linalg.checked_cholesky("the noise covariance of one time", self.blocks, DEPENDENT)
+        lower = linalg.checked_cholesky("the noise covariance of one time", self.blocks)
         return TimeBlockFactor(lower, self.layout)
 
     def time_weights(self, layout):

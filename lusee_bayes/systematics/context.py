@@ -242,7 +242,7 @@ class Around:
         Skies s = C A^T w of noise alone, in K, and w = N^-1 n, to estimate the volume of skies that
         fit. None before there is a posterior.
     tempered : float
-        Factor of radiometer noise in first rounds.
+        Factor of radiometer noise in first rounds; above 1, its products are independent.
     gains, gain_slope : (antennas, times) arrays or None
         Drifts of the gains, and the slope of ln p by them that is due to the volume of skies and
         drifts that fit; None before they are inferred.

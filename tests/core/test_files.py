@@ -280,12 +280,11 @@ FULL = """
 import resource, sys
 from pathlib import Path
 from xarray import Dataset
-from lusee_bayes.core.files import replacing
-from lusee_bayes.core.formats import write_netcdf
+from lusee_bayes.core import files, formats
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[2]), resource.RLIM_INFINITY))
 try:
-    with replacing(sys.argv[1]) as partial:
-        write_netcdf(Dataset({name: ("x", [0.0] * 5000) for name in "abc"}), partial)
+    with files.replacing(sys.argv[1]) as partial:
+        formats.write_netcdf(Dataset({name: ("x", [0.0] * 5000) for name in "abc"}), partial)
 except OSError as error:
     print(error)
 """
@@ -294,11 +293,10 @@ except OSError as error:
 @pytest.mark.skipif(sys.platform != "linux", reason="the limit on a file is Linux's")
 @pytest.mark.parametrize("size", [10, 50_000, 120_000])
 def test_a_full_disk_does_not_crash_the_hdf5_library(tmp_path, size):
-    path = tmp_path / "data.nc"
-    command = [sys.executable, "-c", FULL, str(path), str(size)]
+    command = [sys.executable, "-c", FULL, str(path := tmp_path / "data.nc"), str(size)]
     ended = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert ended.stdout == f"[Errno 27] File too large: '{path}'\n" and not ended.stderr
-    assert not list(tmp_path.iterdir())
+    assert ended.stdout == f"[Errno 27] File too large: '{path}'\n"
+    assert not ended.stderr and not list(tmp_path.iterdir())
 
 
 HOLD = """

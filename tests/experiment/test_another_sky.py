@@ -31,7 +31,6 @@ from lusee_bayes.systematics.noise_level import radiometer_about
 LMAX = 8
 TERMS = {
     "radiometer": (),
-    "exact radiometer": ("noise.radiometer.form=exact",),
     "gain drifts": ("noise.gain={sigma: 0.01}",),
     "beam": ("noise.beam={shift_mhz: 0.1}",),
     "pointing": ("noise.pointing={clock_s: 60, turntable_deg: 0.1}",),

@@ -94,6 +94,18 @@ def test_exact_variances_have_closed_forms():
     np.testing.assert_allclose(variance[4], (auto - v.real**2 + v.imag**2) / 2, rtol=1e-13)
 
 
+def test_products_of_no_voltages_are_independent():
+    """At one time |V_01|^2 exceeds T_00 T_11; at another, ports 0 and 3 are one."""
+    t = T.copy()
+    t[1, 0, 1] = 1.1 * np.sqrt(t[1, 0, 0] * t[1, 1, 1])
+    t[2, :3, 3], t[2, 3, 3] = t[2, :3, 0], t[2, 0, 0]
+    seen = real_products(t).T
+    blocks = np.asarray(exact_blocks(seen))
+    np.testing.assert_array_equal(blocks[0], np.asarray(exact_blocks(VISIBILITIES))[0])
+    for time in (1, 2):
+        np.testing.assert_array_equal(blocks[time], np.diag(paper_variance(seen)[:, time]))
+
+
 @pytest.mark.parametrize("form", ["paper", "exact"])
 def test_scalings(form):
     base = np.asarray(noise(form).dense())
