@@ -14,7 +14,7 @@ from dataclasses import replace
 import jax
 import numpy as np
 
-from lusee_bayes.core.arrays import Grid, Vector, on_device, on_host
+from lusee_bayes.core.arrays import Grid, ModesMatrix, on_device, on_host
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.scenario import Scenario
@@ -111,19 +111,19 @@ def set_up(
     return with_sky_above(setup)
 
 
-def with_sky_above(setup: Setup, parameters: Vector | None = None) -> Setup:
+def with_sky_above(setup: Setup, covariance: ModesMatrix | None = None) -> Setup:
     """Add the sky above lmax to a setup, if it is part of the model.
 
     Parameters
     ----------
     setup : Setup
-    parameters : (parameters,) array, optional
-        Parameters of the family of priors, learned from the data.
+    covariance : (modes, modes) array, optional
+        Prior covariance of all modes up to the highest ell, learned from the data, in K^2.
     """
     if AboveLmax.treatment(setup.scenario) is None:
         return setup
-    std = np.sqrt(np.asarray(radiometer(setup).diagonal()))
-    return replace(setup, above=sky_above(setup, std, parameters))
+    noise = on_host(radiometer(setup)).factor()
+    return replace(setup, above=sky_above(setup, noise, covariance))
 
 
 def require_fitting(data: Visibilities, scenario: Scenario) -> None:

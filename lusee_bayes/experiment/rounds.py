@@ -27,7 +27,7 @@ from lusee_bayes.linear.linear_gaussian import FromInformation, LinearGaussian, 
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.noise.covariance import LowRankFactor
 from lusee_bayes.priors.families import PriorFamily
-from lusee_bayes.priors.learning import Learned, learn_whatever_fits, most_probable
+from lusee_bayes.priors.learning import Learned, averaged_beyond, learn_whatever_fits
 from lusee_bayes.sky.prior import Prior
 from lusee_bayes.systematics.above_lmax import AboveLmax
 from lusee_bayes.systematics.context import Around, Setup
@@ -561,22 +561,24 @@ def with_learned_prior(
     if AboveLmax.treatment(setup.scenario) == "marginalised":
         # the expected sky above lmax follows from the prior learned below
         result = settled(setup, data, start, report=report)
-        first, start = first_parameters(setup, whole(result.solution.information)), result.around
-        setup = with_sky_above(setup, first)
+        coarse, learned = first_learned(setup, whole(result.solution.information))
+        start = result.around
+        if learned.settled:
+            first = setup.family.start_from(coarse, learned.parameters)
+            above = averaged_beyond(setup.above.family, coarse, learned.scores)
+            setup = with_sky_above(setup, above)
     result = settled(setup, data, start, learn, report)
     return replace(setup, prior=result.learned.prior), result
 
 
-def first_parameters(setup: Setup, information: Information) -> Vector | None:
-    """Parameters of the setup's family, learned up to a lower ell; None if they do not converge."""
-    scenario, family, seed = setup.scenario, setup.family, setup.scenario.seed
-    coarse = family
+def first_learned(setup: Setup, information: Information) -> tuple[PriorFamily, Learned]:
+    """Learn the parameters of the setup's family up to a lower ell; also return that family."""
+    scenario, family = setup.scenario, setup.family
     if scenario.lmax > COARSE_LMAX:
-        coarse = scenario.prior.family(scenario.frequency_mhz, COARSE_LMAX)
+        family = scenario.prior.family(scenario.frequency_mhz, COARSE_LMAX)
         n = n_modes(COARSE_LMAX)
         information = integrated_out(information, n, np.asarray(setup.prior.variance())[n:])
-    parameters = most_probable(coarse, information, seed)
-    return None if parameters is None else family.start_from(coarse, parameters)
+    return family, learn_whatever_fits(family, information, None, scenario.seed)
 
 
 def learned_prior(
@@ -598,7 +600,8 @@ def learned_prior(
         Starting point.
     """
     if start is None and setup.scenario.lmax > COARSE_LMAX:
-        start = first_parameters(setup, information)
+        coarse, learned = first_learned(setup, information)
+        start = family.start_from(coarse, learned.parameters) if learned.settled else None
     return learn_whatever_fits(family, information, start, setup.scenario.seed)
 
 

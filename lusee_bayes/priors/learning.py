@@ -45,7 +45,7 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 from numpy.random import Generator
 
-from lusee_bayes.core.arrays import Draws, Square
+from lusee_bayes.core.arrays import Draws, ModesMatrix, Square
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.linalg import checked_cholesky, cholesky, inverse_from_cholesky
@@ -54,7 +54,7 @@ from lusee_bayes.judge.measures import expected_chi2
 from lusee_bayes.judge.split import Split
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.priors.families import Hyperprior, Member, Parameters, PriorFamily
+from lusee_bayes.priors.families import Hyperprior, Member, Parameters, PriorFamily, Spread
 from lusee_bayes.sky.prior import Prior
 
 # steps of Newton's method, each halved until ln p is not lower
@@ -309,14 +309,6 @@ def learn_whatever_fits(
     return _fixed(family, information, float(demanded * HIGHER[-1]))
 
 
-def most_probable(family: PriorFamily, information: Information, seed: int) -> Parameters | None:
-    """Find the maximum of :func:`learn_whatever_fits`; None if it does not converge."""
-    for factor in demanded_factor(information, family.expected()) * HIGHER:
-        with suppress(InputError):
-            return _uphill(family, information.raised(factor), None, seed)[0].parameters
-    return None
-
-
 def demanded_factor(information: Information, prior: Prior) -> float:
     """Factor of N that brings the residual chi^2 to its expectation; 1 if it is not too large.
 
@@ -395,11 +387,7 @@ def _learned(
 ) -> Learned:
     covariance = np.linalg.inv(point.curvature(family, rng, FINAL_SIMULATIONS))
     scores = normal_scores(family.hyperprior, point.parameters, covariance)
-    mean, second = family.hyperprior.moments(scores.mean, scores.covariance)
-
-    def spread(rows: Float[np.ndarray, "rows parameters"]) -> Float[np.ndarray, " rows"]:
-        return np.einsum("ij,ij->i", rows @ second, rows)
-
+    mean, spread = _moments(family, scores)
     evidence = float(point.posterior.log_evidence) + scores.log_gain
 
     # S is a constant plus a part proportional to the level
@@ -423,6 +411,26 @@ def _learned(
 SHARED, LEAST = 30, 10
 # draws of theta before giving up, if rounding leaves no positive definite S
 ATTEMPTS = 5
+
+
+def _moments(family: PriorFamily, scores: Scores) -> tuple[Parameters, Spread]:
+    mean, second = family.hyperprior.moments(scores.mean, scores.covariance)
+
+    def spread(rows: Float[np.ndarray, "rows parameters"]) -> Float[np.ndarray, " rows"]:
+        return np.einsum("ij,ij->i", rows @ second, rows)
+
+    return mean, spread
+
+
+def averaged_beyond(family: PriorFamily, coarse: PriorFamily, scores: Scores) -> ModesMatrix:
+    """S of a family averaged over parameters that the same kind has learned up to a lower ell.
+
+    Further parameters have the hyperprior: beyond the data, the uncertainty grows.
+    """
+    places = np.flatnonzero(family.start_from(coarse, np.ones(len(scores.mean))))
+    mean, covariance = np.zeros(family.hyperprior.size), np.eye(family.hyperprior.size)
+    mean[places], covariance[np.ix_(places, places)] = scores.mean, scores.covariance
+    return family.averaged(*_moments(family, replace(scores, mean=mean, covariance=covariance)))
 
 
 def draws_with_parameters(

@@ -21,12 +21,13 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import Field
 
-from lusee_bayes.core.arrays import DataVector
+from lusee_bayes.core.arrays import DataVector, ModesMatrix
 from lusee_bayes.core.harmonics import LARGEST_LMAX
 from lusee_bayes.core.linalg import checked_cholesky, gram_matrix
 from lusee_bayes.core.section import Section, Treatment
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.pointing import Pointing
+from lusee_bayes.noise.covariance import Factor
 from lusee_bayes.systematics.context import Above, Around, Setup
 from lusee_bayes.systematics.systematic import LowRankNoise, with_added
 
@@ -94,18 +95,16 @@ class AboveLmax(LowRankNoise):
         return with_added(super().marginalised(model), self.mean)
 
 
-def sky_above(
-    setup: Setup, std: DataVector, parameters: Float[np.ndarray, " parameters"] | None = None
-) -> Above:
+def sky_above(setup: Setup, noise: Factor, learned: ModesMatrix | None = None) -> Above:
     """Compute the possible contribution of the sky above lmax to the data.
 
     Parameters
     ----------
     setup : Setup
-    std : (data,) array
-        Of the radiometer noise, in K.
-    parameters : (parameters,) array, optional
-        Of the setup's family of priors, learned from the data; by default the expected ones.
+    noise : Factor
+        Of the radiometer noise.
+    learned : (modes, modes) array, optional
+        Prior covariance of all modes, learned from the data, in K^2; by default the expected one.
     """
     scenario, n, above = setup.scenario, setup.prior.size, setup.above
     frequency_mhz, lmax = scenario.frequency_mhz, scenario.noise.above_lmax.top(scenario.lmax)
@@ -121,15 +120,14 @@ def sky_above(
     if family is None:
         covariance, mean = prior.covariance(), prior.mean
     else:
-        at = family.hyperprior.start()
-        at = at if parameters is None else family.start_from(setup.family, parameters)
-        covariance, mean = family.at(at).covariance, family.centre
-    covariance, std = np.asarray(covariance)[n:, n:], np.asarray(std)[:, None]
-    power = ((coupling / std) ** 2).sum(0) * np.diagonal(covariance)
+        covariance, mean = learned, family.centre
+        if learned is None:
+            covariance = family.at(family.hyperprior.start()).covariance
+    covariance = np.asarray(covariance)[n:, n:]
+    power = (np.asarray(noise.whiten(coupling)) ** 2).sum(0) * np.diagonal(covariance)
     power = np.add.reduceat(power, np.arange(scenario.lmax + 1, lmax + 1) ** 2 - n)
     root = coupling @ checked_cholesky("the prior above lmax", covariance)
-    white = root / std
-    values, vectors = np.linalg.eigh(gram_matrix(white))
+    values, vectors = np.linalg.eigh(gram_matrix(np.asarray(noise.whiten(root))))
     root = root @ vectors[:, np.cumsum(values) > LEFT_OUT]
     added = np.zeros(len(root)) if mean is None else coupling @ np.asarray(mean)[n:]
     return Above(coupling, modes, family, root, added, power)

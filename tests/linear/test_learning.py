@@ -102,6 +102,18 @@ def test_learning_gains_over_the_start_under_local_scales():
     assert [row["name"] for row in found.as_rows()] == list(family.names)
 
 
+def test_variances_beyond_the_data_are_means_over_parameters(case):
+    scores = learning.learn(case.family, case.information).scores
+    wider, rng, n = IsotropicFamily.around(2e4, 3 * LMAX), np.random.default_rng(3), 40_000
+    known = wider.start_from(case.family, np.ones(len(scores.mean))) > 0
+    drawn = rng.standard_normal((n, len(known)))
+    drawn[:, known] = rng.multivariate_normal(scores.mean, scores.covariance, n)
+    near = wider.hyperprior.near(np.where(known, drawn.mean(0), 0.0), drawn)
+    each = np.exp(near @ wider.basis.T)
+    got = np.diagonal(learning.averaged_beyond(wider, case.family, scores))[np.arange(19) ** 2]
+    assert (np.abs(each.mean(0) - got) <= 4.5 * each.std(0) / np.sqrt(n)).all()
+
+
 def test_others_integrated_out(case):
     """The evidence of the first modes alone, with the others' prior in it, is that of all."""
     spectrum = np.geomspace(1e8, 1e5, LMAX + 1)

@@ -121,12 +121,6 @@ def test_scalings(form):
     np.testing.assert_allclose(doubled.dense(), 4.0 * base, rtol=1e-14)
 
 
-def test_defaults_are_the_fiducial_experiment():
-    got = lb.radiometer_noise(VISIBILITIES, LAYOUT)
-    expected = T[:, 0, 0].real ** 2 / (1e6 * 7200.0)
-    np.testing.assert_allclose(got.diagonal()[:N_TIMES], expected, rtol=1e-14)
-
-
 @pytest.mark.parametrize("name", ["bandwidth_hz", "step_s", "factor", "duty_cycle"])
 @pytest.mark.parametrize("bad", [0.0, -1.0, float("nan"), float("inf")])
 def test_parameters_must_be_positive(name, bad):
@@ -155,11 +149,8 @@ def test_slopes_with_respect_to_the_noise_factor_flow(form):
 
 
 # one time without any sample, one product at a time, and port 3 never
-WHOLE_TIME = np.zeros((N_PRODUCTS, N_TIMES), dtype=bool)
-WHOLE_TIME[:, 1] = True
-ONE_CROSS = np.zeros((N_PRODUCTS, N_TIMES), dtype=bool)
-ONE_CROSS[4, 2] = True
-LOST_PORT = np.zeros((N_PRODUCTS, N_TIMES), dtype=bool)
+WHOLE_TIME, ONE_CROSS, LOST_PORT = np.zeros((3, N_PRODUCTS, N_TIMES), dtype=bool)
+WHOLE_TIME[:, 1] = ONE_CROSS[4, 2] = True
 LOST_PORT[[5, 6, 10, 11, 13, 14, 15]] = True
 
 
@@ -201,13 +192,10 @@ def test_every_sample_has_its_own_live_time(form):
     fine = np.asarray(lb.radiometer_noise(v, layout, step_s=live, form=form).dense())
     weight = np.kron(np.eye(16), live / live.sum())
     expected = weight @ fine @ weight.T
-    one = DataLayout(16, 1)
-    got = lb.radiometer_noise(v[:, :1], one, step_s=np.array([live.sum()]), form=form).dense()
+    given = {"step_s": np.array([live.sum()]), "form": form}
+    got = lb.radiometer_noise(v[:, :1], DataLayout(16, 1), **given).dense()
     np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-12 * expected.max())
-    same = lb.radiometer_noise(v[:, :1], one, step_s=live.sum(), form=form).dense()
-    np.testing.assert_allclose(got, same, rtol=1e-15)
-    options = {"step_s": live[:4], "form": form}
-    refuse(r"step_s.*\(4,\).*\(5,\)", lb.radiometer_noise, v, layout, **options)
+    refuse(r"step_s.*\(4,\)", lb.radiometer_noise, v, layout, **given | {"step_s": live[:4]})
 
 
 # --- sample covariances scatter so ----------------------------------------------------------------
