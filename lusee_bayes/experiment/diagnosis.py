@@ -48,7 +48,6 @@ from lusee_bayes.judge.residuals import Residuals
 from lusee_bayes.judge.split import WIDER, with_sky
 from lusee_bayes.linear.linear_gaussian import FromInformation, LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.noise.radiometer import RADIOMETER_FORMS
 from lusee_bayes.sky.prior import HarmonicPrior
 from lusee_bayes.systematics.context import Around, Setup
 
@@ -516,24 +515,24 @@ def diagnose(experiment: Experiment, inference: Inference, residuals: Residuals)
     nearly = [one for one in proposals if one.excess < excess]
     # these always absorb part of any misfit, and count only if they absorb all of it
     proposals += _noise_level(residuals, data)
-    proposals += _noise_form(judge)
-    finer = [] if any(one.chi2.fits for one in proposals) else list(_finer(judge))
-    proposals += finer
+    others = list(_correlated_noise(judge))
+    if not any(one.chi2.fits for one in [*proposals, *others]):
+        others += _finer(judge)
+    proposals += others
     listed = [one for one in proposals if one.chi2.fits] or nearly
     listed.sort(key=lambda one: one.excess)
-    return Diagnosis(base, tuple(_merged(listed)), len(of_data) + len(of_model) + 2 + len(finer))
+    return Diagnosis(base, tuple(_merged(listed)), len(of_data) + len(of_model) + 1 + len(others))
 
 
-def _noise_form(judge: UnderAnySky) -> Iterator[Proposal]:
-    """The radiometer noise with its products correlated instead of independent, or the reverse."""
-    form = judge.setup.scenario.noise.radiometer.form
-    other = next(one for one in RADIOMETER_FORMS if one != form)
-    scenario = load_scenario(judge.setup.scenario, [f"noise.radiometer.form={other}"])
-    model = full_model(replace(judge.setup, scenario=scenario), Around(judge.data))
-    chi2 = replace(judge, model=model).wide(model.coupling)[0]
-    words = "correlated" if other == "exact" else "independent"
-    remedy = f"use --set noise.radiometer.form={other}"
-    yield Proposal(f"the noise of the products is {words}", remedy, chi2)
+def _correlated_noise(judge: UnderAnySky) -> Iterator[Proposal]:
+    """Correlate the products in the noise, as a radiometer does, if the model does not."""
+    scenario = judge.setup.scenario
+    if scenario.noise.radiometer.form == "paper":
+        scenario = load_scenario(scenario, ["noise.radiometer.form=exact"])
+        model = full_model(replace(judge.setup, scenario=scenario), Around(judge.data))
+        chi2 = replace(judge, model=model).wide(model.coupling)[0]
+        remedy = "use --set noise.radiometer.form=exact"
+        yield Proposal("the products are correlated in the noise", remedy, chi2)
 
 
 def _merged(proposals: list[Proposal]) -> Iterator[Proposal]:
