@@ -8,7 +8,8 @@ where m' are the modes from lmax + 1 up to the highest ell seen (:meth:`AboveLma
 is their part of the prior's covariance, and A' is for the expected instrument. Integrating m' out
 adds A' mu' to the mean of the data, and A' S' A'^T to N. This omits directions that together change
 chi^2 by less than one, and the correlation of m' with m, through which the data constrain m' better
-than N assumes. If the prior is learned, S' and mu' follow from the parameters learned at lmax.
+than N assumes. If the prior is learned, S' is the mean over its uncertain parameters, those learned
+up to lmax and, for smaller scales, further ones from the hyperprior.
 
 Simulated data contain the modes of the scenario's sky up to the same ell.
 """

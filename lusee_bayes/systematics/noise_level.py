@@ -28,7 +28,8 @@ class RadiometerSection(Section):
     Attributes
     ----------
     form : {"paper", "exact"}
-        ``paper``: independent products; ``exact``: full covariance of the products at each time.
+        ``paper``: independent products; ``exact``: full covariance of the products at each time at
+        which voltages can have the visibilities, otherwise independent products.
     bandwidth_hz : float
         Channel width.
     duty_cycle : float
