@@ -82,13 +82,13 @@ def from_healpy(alm: Complex[np.ndarray, "*batch alms"]) -> Float[np.ndarray, "*
     return np.where(m == 0, picked.real, SQRT2 * np.where(m > 0, picked.real, picked.imag))
 
 
-def to_healpy(modes: Float[Array, " modes"]) -> Complex[np.ndarray, " alms"]:
+def to_healpy(modes: Float[Array, "*batch modes"]) -> Complex[np.ndarray, "*batch alms"]:
     """Convert real packed coefficients to healpy's; inverse of :func:`from_healpy`."""
     modes = np.asarray(modes)
     ell, m = healpy.Alm.getlm(lmax_of(modes.shape[-1]))
     centre = ell * (ell + 1)
-    alm = (modes[centre + m] + 1j * modes[centre - m]) / SQRT2
-    return np.where(m == 0, modes[centre] + 0j, alm)
+    alm = (modes[..., centre + m] + 1j * modes[..., centre - m]) / SQRT2
+    return np.where(m == 0, modes[..., centre] + 0j, alm)
 
 
 def map_to_modes(pixels: Float[np.ndarray, " pixels"], lmax: int) -> Float[np.ndarray, " modes"]:
@@ -125,10 +125,14 @@ def map_to_modes(pixels: Float[np.ndarray, " pixels"], lmax: int) -> Float[np.nd
     return from_healpy(healpy.map2alm(pixels, lmax=lmax, iter=10))
 
 
-def modes_to_map(modes: Float[Array, " modes"], nside: int) -> Float[np.ndarray, " pixels"]:
-    """Synthesise the HEALPix RING map of packed coefficients."""
+def modes_to_map(
+    modes: Float[Array, "*batch modes"], nside: int
+) -> Float[np.ndarray, "*batch pixels"]:
+    """Synthesise the HEALPix RING maps of packed coefficients."""
     require_nside(nside)
-    return healpy.alm2map(to_healpy(modes), nside, lmax=lmax_of(np.shape(modes)[-1]))
+    alm, lmax = to_healpy(modes), lmax_of(np.shape(modes)[-1])
+    maps = [healpy.alm2map(one, nside, lmax=lmax) for one in np.atleast_2d(alm)]
+    return np.reshape(maps, (*alm.shape[:-1], -1))
 
 
 @lru_cache(maxsize=8)

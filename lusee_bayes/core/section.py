@@ -46,7 +46,7 @@ Treatment = Literal["marginalised", "sampled", "ignored"]
 
 
 # entries that name files; an entry with its default value does not
-FILES = ("clock", "file", "gain_table", "lines", "mean_file", "schedule", "spectrum_file")
+FILES = ("clock", "file", "gain_table", "lines", "mask", "mean_file", "schedule", "spectrum_file")
 
 
 def _described(schema: dict[str, Any], section: type[BaseModel]) -> None:
@@ -78,6 +78,9 @@ class Section(BaseModel):
             value = getattr(self, name)
             if isinstance(value, Section):
                 absolute[name] = value.anchored()
+            elif isinstance(value, tuple):
+                parts = (x.anchored() if isinstance(x, Section) else x for x in value)
+                absolute[name] = tuple(parts)
             elif name in FILES and value is not None and value != declared.default:
                 absolute[name] = os.path.abspath(value)
         return self.model_copy(update=absolute)

@@ -412,6 +412,11 @@ def doubts(experiment: Experiment, inference: Inference) -> tuple[str, ...]:
             f"The prior was learned with N times {learned.noise_factor:.2g}, to match residual "
             "chi2; the map uses the scenario's N."
         )
+    for name, gain in ({} if learned is None else learned.survey_gains).items():
+        if gain < 0.0:
+            notes.append(
+                f"{name} does not agree with the data: ln p(d) is {-gain:.3g} higher without it."
+            )
     if learned is not None and learned.still_moves > 0.0:
         notes.append(
             "Learning the prior did not converge: the map still changes by "

@@ -27,7 +27,7 @@ from lusee_bayes.linear.linear_gaussian import FromInformation, LinearGaussian, 
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.noise.covariance import LowRankFactor
 from lusee_bayes.priors.families import PriorFamily
-from lusee_bayes.priors.learning import Learned, averaged_beyond, learn_whatever_fits
+from lusee_bayes.priors.learning import Learned, Row, averaged_beyond, learn_whatever_fits
 from lusee_bayes.sky.prior import Prior
 from lusee_bayes.systematics.above_lmax import AboveLmax
 from lusee_bayes.systematics.context import Around, Setup
@@ -568,7 +568,34 @@ def with_learned_prior(
             above = averaged_beyond(setup.above.family, coarse, learned.scores)
             setup = with_sky_above(setup, above)
     result = settled(setup, data, start, learn, report)
+    if setup.scenario.prior.surveys:
+        rows, gains = _compared_surveys(setup, whole(result.solution.information))
+        learned = replace(result.learned, survey_rows=rows, survey_gains=gains)
+        result = replace(result, learned=learned)
     return replace(setup, prior=result.learned.prior), result
+
+
+def _compared_surveys(
+    setup: Setup, information: Information
+) -> tuple[tuple[Row, ...], dict[str, float]]:
+    """Scale and zero level of every survey, and how much it alone increases ln p(d)."""
+    scenario = setup.scenario
+    section, at = scenario.prior, (scenario.frequency_mhz, scenario.lmax)
+
+    def learned(surveys: Sequence[sky_sections.SurveySection]) -> tuple[PriorFamily, Learned]:
+        family = section.model_copy(update={"surveys": tuple(surveys)}).family(*at)
+        return family, learned_prior(replace(setup, family=family), family, information)
+
+    _, alone = learned(())
+    others = information.raised(alone.noise_factor).posterior(alone.prior)
+    rows, gains = [], {}
+    for one in section.surveys:
+        family, known = learned((one,))
+        start = known.parameters if known.settled else family.hyperprior.start()
+        survey = one.at(*at)
+        rows += survey.calibrated(others, family.at(start).texture)
+        gains[survey.name] = known.log_evidence - alone.log_evidence
+    return tuple(rows), gains
 
 
 def first_learned(setup: Setup, information: Information) -> tuple[PriorFamily, Learned]:

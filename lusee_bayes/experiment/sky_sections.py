@@ -7,22 +7,35 @@ that is a :class:`SkySource` or has a :class:`Prior`, and add it to ``SKY_SECTIO
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
 
+from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.harmonics import n_modes
+from lusee_bayes.core.harmonics import modes_to_map, n_modes, per_mode
+from lusee_bayes.core.lazy import healpy
+from lusee_bayes.core.reading import require_file
 from lusee_bayes.core.section import Megahertz, Positive, Section, Seed, kinds_of, one_of, requires
 from lusee_bayes.priors.families import IsotropicFamily, PriorFamily
 from lusee_bayes.priors.local_scales import embedded_local_scales
+from lusee_bayes.priors.surveys import Survey
 from lusee_bayes.sampling.log_normal_prior import LogNormalPrior
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, diffuse_brightness, galactic_share
 from lusee_bayes.sky.positive_skies import LogNormalSky, PositiveSkies, deviation_spectrum
 from lusee_bayes.sky.prior import HarmonicPrior, Prior, read_mean, read_spectrum
-from lusee_bayes.sky.sky_source import Sky, SkySource, galaxy_sky, sky_from_file
+from lusee_bayes.sky.sky_source import (
+    Sky,
+    SkyMap,
+    SkySource,
+    galaxy_sky,
+    read_sky_file,
+    sky_from_file,
+)
 from lusee_bayes.sky.spectral_prior import SpectralPrior, check_components
 from lusee_bayes.systematics.prior_spectrum import SpectrumSection
 
@@ -76,6 +89,73 @@ class FileSkySection(Section, SkySource):
         return sky_from_file(self.file, frequency_mhz, lmax, **given)
 
 
+class SurveySection(Section):
+    """A survey of the sky, s = a (beam * sky) + b + errors, with unknown a and b.
+
+    The survey is scaled to the scenario's frequency. Its errors, which include those of the index,
+    are learned by position and scale.
+
+    Attributes
+    ----------
+    file : str
+        Path of a sky file in K, as for ``sky.file``; pixels without data are UNSEEN.
+    dataset : str
+        Dataset to read from an HDF5 file.
+    frequency_mhz : float
+        Frequency of the survey.
+    index : float
+        Index for scaling it to the scenario's frequency.
+    beam_deg : float
+        Full width of its beam at half maximum, in degrees.
+    scale_std : float
+        Prior standard deviation of its scale a, about 1.
+    zero_std_k : float
+        Prior standard deviation of its zero level b, in K at its own frequency.
+    mask : str
+        HEALPix FITS map of the same NSIDE: 0 where the survey is not to be used.
+    """
+
+    file: str
+    dataset: str | None = None
+    frequency_mhz: Megahertz
+    index: Annotated[float, Field(ge=-20, le=20)] = -2.5
+    beam_deg: Annotated[float, Field(ge=0, le=60)] = 0.0
+    scale_std: Positive = 0.1
+    zero_std_k: Positive = 1000.0
+    mask: str | None = None
+
+    def at(self, frequency_mhz: float, lmax: int) -> Survey:
+        """The survey at a frequency, up to lmax.
+
+        Raises
+        ------
+        InputError
+            If a file cannot be used, or the mask does not belong to the survey.
+        """
+        file = require_file(self.file, "survey", "check prior.surveys")
+        sky, unseen = read_sky_file(file, self.dataset), None
+        if self.mask is not None and not isinstance(sky, SkyMap):
+            raise InputError(f"{self.file} has no pixels for prior.surveys.mask")
+        if isinstance(sky, SkyMap):
+            unseen = sky.unseen
+            if self.mask is not None:
+                mask = SkyMap.read(require_file(self.mask, "mask", "check prior.surveys"))
+                require_shape(f"{self.mask}: the mask", mask.pixels, unseen.shape)
+                unseen = unseen | (mask.pixels == 0.0)
+            template = galaxy_sky(frequency_mhz, lmax, seed=None, sources=()).modes
+            filled = modes_to_map(template, healpy.npix2nside(unseen.size))
+            filled *= sky.pixels[~unseen].mean() / filled[~unseen].mean()
+            sky = replace(sky, pixels=np.where(unseen, filled, sky.pixels))
+        factor = (frequency_mhz / self.frequency_mhz) ** self.index
+        modes = factor * sky.modes_at(self.frequency_mhz, lmax)
+        ell = np.arange(lmax + 1.0)
+        sigma = np.radians(self.beam_deg) / np.sqrt(8.0 * np.log(2.0))
+        beam = per_mode(np.exp(-0.5 * ell * (ell + 1.0) * sigma**2))
+        widths = self.scale_std, factor * self.zero_std_k
+        blind = unseen if unseen is not None and unseen.any() else None
+        return Survey(Path(self.file).name, modes, beam, *widths, blind)
+
+
 SKY_SECTIONS = kinds_of(GalaxySection, FileSkySection)
 
 
@@ -123,6 +203,7 @@ class IsotropicPriorSection(SpectrumSection):
         applied once to the mean, twice to C_ell.
     """
 
+    surveys: ClassVar[tuple[SurveySection, ...]] = ()
     model: Literal["isotropic"] = "isotropic"
     spectrum: Literal["learned", "sky"] = "learned"
     scale: Positive = 1.0
@@ -195,6 +276,8 @@ class LocalScalesPriorSection(Section):
 
     Attributes
     ----------
+    surveys : tuple of SurveySection
+        Surveys of the sky, whose mean replaces the template.
     sources : bool
         Allow for the sources of the catalogue.
     """
@@ -205,11 +288,18 @@ class LocalScalesPriorSection(Section):
     samples: ClassVar[bool] = False
     is_learned: ClassVar[bool] = True
     model: Literal["local_scales"] = "local_scales"
+    surveys: tuple[SurveySection, ...] = ()
     sources: bool = True
 
     def family(self, frequency_mhz: float, lmax: int) -> PriorFamily:
         """The family from which data select a prior, up to lmax."""
-        return embedded_local_scales(frequency_mhz, lmax, BRIGHT_SOURCES if self.sources else ())
+        sources = BRIGHT_SOURCES if self.sources else ()
+        surveys = self.surveys_at(frequency_mhz, lmax)
+        return embedded_local_scales(frequency_mhz, lmax, sources, surveys=surveys)
+
+    def surveys_at(self, frequency_mhz: float, lmax: int) -> list[Survey]:
+        """The surveys at a frequency, up to lmax."""
+        return [one.at(frequency_mhz, lmax) for one in self.surveys]
 
 
 PRIOR_SECTIONS = kinds_of(LocalScalesPriorSection, IsotropicPriorSection)

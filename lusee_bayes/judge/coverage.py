@@ -14,14 +14,18 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from lusee_bayes.core.arrays import Draws, Modes, Pixels, Vector
+from lusee_bayes.core.arrays import Draws, Modes, Pixels
 from lusee_bayes.core.harmonics import lmax_of, mode_numbers, modes_to_map
 from lusee_bayes.core.lazy import healpy, special
 
+# absolute or signed pulls of several skies
+Pulls = Float[np.ndarray, "skies n"]
 # probabilities of the central intervals, and their names in files
 LEVELS = (0.50, 0.68, 0.90, 0.95)
 NAMES = tuple(f"{100 * level:.0f}" for level in LEVELS)
 REST = ("rms", "rms_scatter", "largest", "allowed")
+# skies whose pulls are counted at once
+AT_ONCE = 16
 # draws that determine the scatter, to 4 %
 N_DRAWS = 300
 # degrees of |b|: the plane, where the sky is furthest from the prior, its surroundings, the rest
@@ -106,19 +110,21 @@ class Counts:
             Draws of the posterior minus its mean, in K.
         """
         nside = healpy.npix2nside(len(std))
-        pulls = (modes_to_map(x, nside) / std for x in (error, *deviations))
-        return cls._of(latitudes(nside), pulls)
+        skies = np.stack([error, *deviations])
+        blocks = np.array_split(skies, -(-len(skies) // AT_ONCE))
+        return cls._of(latitudes(nside), (modes_to_map(some, nside) / std for some in blocks))
 
     @classmethod
     def of_modes(cls, std: Modes, error: Modes, deviations: Draws) -> Counts:
         """Count harmonic coefficients by multipole; exactly known ones have a pull of zero."""
         width = np.where(std > 0, std, np.inf)
-        return cls._of(multipoles(lmax_of(len(std))), (x / width for x in (error, *deviations)))
+        return cls._of(multipoles(lmax_of(len(std))), [np.stack([error, *deviations]) / width])
 
     @classmethod
-    def _of(cls, parts: Mapping[str, np.ndarray], pulls: Iterable[np.ndarray]) -> Counts:
-        counted = np.stack([_statistics(one, parts.values()) for one in pulls], axis=2)
-        return cls(tuple(parts), tuple(int(inside.sum()) for inside in parts.values()), counted)
+    def _of(cls, parts: Mapping[str, np.ndarray], pulls: Iterable[Pulls]) -> Counts:
+        inside = np.stack(list(parts.values()), axis=1)
+        counted = np.concatenate([_statistics(np.abs(some), inside) for some in pulls], axis=2)
+        return cls(tuple(parts), tuple(inside.sum(axis=0).tolist()), counted)
 
     def coverage(self) -> tuple[Coverage, ...]:
         """The coverage of each part, with its scatter."""
@@ -133,15 +139,13 @@ class Counts:
 
 
 def _statistics(
-    pulls: Vector, parts: Iterable[Bool[np.ndarray, " n"]]
-) -> Float[np.ndarray, "parts statistics"]:
+    size: Pulls, inside: Bool[np.ndarray, "n parts"]
+) -> Float[np.ndarray, "parts statistics skies"]:
+    weights = inside / inside.sum(axis=0)
     limits = special.ndtri(0.5 + 0.5 * np.array(LEVELS))
-    rows = []
-    for inside in parts:
-        size = np.abs(pulls[inside])
-        held = [(size < limit).mean() for limit in limits]
-        rows.append([*held, np.sqrt((size**2).mean()), size.max()])
-    return np.array(rows)
+    held = [(size < limit) @ weights for limit in limits]
+    largest = [size.take(np.flatnonzero(part), axis=1).max(axis=1) for part in inside.T]
+    return np.stack([*held, np.sqrt(size**2 @ weights), np.transpose(largest)]).transpose(2, 0, 1)
 
 
 def latitudes(nside: int) -> dict[str, Bool[np.ndarray, " pixels"]]:

@@ -34,7 +34,7 @@ each S(theta(z)).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -140,6 +140,10 @@ LEVELS = (-1.0, -0.5, 0.0)
 MOST_WIDENINGS = 4
 
 
+# name, value and standard deviation of a parameter
+Row = dict[str, float | str]
+
+
 class NotSettled(InputError):
     """The search for a prior's most probable parameters did not converge."""
 
@@ -170,6 +174,10 @@ class Learned:
     still_moves : float
         How far the map still moves in the last round (rms, in its standard deviations) if prior
         and N are inferred together; 0 once they have converged.
+    survey_rows : tuple of dict
+        Name, value and standard deviation of the surveys' parameters.
+    survey_gains : mapping of float
+        Increase of ln p(d) due to each survey alone, by its name.
     """
 
     prior: Prior
@@ -182,17 +190,20 @@ class Learned:
     noise_factor: float = field(default=1.0, kw_only=True)
     settled: bool = field(default=True, kw_only=True)
     still_moves: float = field(default=0.0, kw_only=True)
+    survey_rows: tuple[Row, ...] = field(default=(), kw_only=True)
+    survey_gains: Mapping[str, float] = field(default_factory=dict, kw_only=True)
 
     @property
     def fits(self) -> bool:
         """Whether the parameters were learned under the model's N, not a raised one."""
         return self.settled and self.noise_factor == 1.0
 
-    def as_rows(self) -> list[dict[str, float | str]]:
-        """Name, value and standard deviation of the named parameters."""
+    def as_rows(self) -> list[Row]:
+        """Name, value and standard deviation of the named parameters, and of surveys."""
         std = np.sqrt(np.diagonal(self.covariance))
         each = zip(self.names, self.parameters, std, strict=False)
-        return [{"name": name, "value": float(x), "std": float(width)} for name, x, width in each]
+        rows = [{"name": name, "value": float(x), "std": float(width)} for name, x, width in each]
+        return [*rows, *self.survey_rows]
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,11 @@
 
 ::
 
-    m = T + s_T x_1 T + s_0 x_0 Y_00 + sum_k s_k x_k o(k) + sum_b f_b s_b y(b)
-          + R sum_j w_j P [sqrt(v_j) n_j]
+    m = T + s_T x_1 T + s_0 x_0 Y_00 + sum_i x_i (T_i - T) + sum_k s_k x_k o(k)
+          + sum_b f_b s_b y(b) + R sum_j w_j P [sqrt(v_j) n_j]
 
-T is a template; its scale and the monopole have wide priors. o(k) are named extended objects, y(b)
+T is a template; its scale and the monopole have wide priors. With surveys of the sky, T is their
+mean, and T_i are the surveys and the embedded template. o(k) are named extended objects, y(b)
 the point sources of the catalogue. n_j is white noise on the sphere, v_j(p) a positive field, P the
 harmonic analysis, w_j windows in ell an octave wide with sum_j w_j^2 = 1, and R = diag(C_ell^1/2).
 If all v_j = 1, the last term is an isotropic field with spectrum C_ell. Its covariance is
@@ -17,6 +18,7 @@ power-law tail.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -31,6 +33,7 @@ from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.linalg import checked_cholesky, scaled
 from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.priors.families import Hyperprior, Member, Parameters, PriorFamily, SpectrumBasis
+from lusee_bayes.priors.surveys import Survey
 from lusee_bayes.sky.galaxy import (
     BRIGHT_SOURCES,
     EXTENDED_OBJECTS,
@@ -51,6 +54,8 @@ TRANSPARENT_MHZ = 50.0
 RELATIVE_STRENGTH = 0.05
 # standard deviations of the template's scale, and of the monopole in units of the template's
 SCALE_WIDTH = MONOPOLE_WIDTH = 1.0
+# of the weights of surveys and of the embedded template
+WEIGHT_WIDTH = 1.0
 # of ln f^2: so wide that the data decide whether the catalogue's sources exist at all
 SOURCES_WIDTH = 3.0
 # NSIDE at which templates are analysed and smoothed
@@ -345,8 +350,11 @@ def embedded_local_scales(
     lmax: int,
     sources: tuple[PointSource, ...] = BRIGHT_SOURCES,
     objects: tuple[ExtendedObject, ...] = EXTENDED_OBJECTS,
+    surveys: Sequence[Survey] = (),
 ) -> LocalScales:
-    """Make the family whose template is the embedded diffuse sky.
+    """Make the family whose template is the embedded diffuse sky, or the mean of surveys.
+
+    Small scales that a survey's beam removes are those of the embedded sky.
 
     Parameters
     ----------
@@ -356,6 +364,8 @@ def embedded_local_scales(
         The catalogue of possible sources.
     objects : tuple of ExtendedObject
         Objects that may be brighter or darker than their surroundings.
+    surveys : sequence of Survey
+        At this frequency, with the same lmax.
     """
     # the template, and the same sky nearly without absorption
     clear_mhz = max(TRANSPARENT_MHZ, frequency_mhz)
@@ -367,7 +377,15 @@ def embedded_local_scales(
     modes = [source.modes(frequency_mhz, lmax) for source in sources]
     level = mean[0] / np.sqrt(4.0 * np.pi)
     extended = [level * one.strength * one.modes(lmax) for one in objects]
-    wide = np.stack([SCALE_WIDTH * mean, MONOPOLE_WIDTH * monopole, *extended], axis=1)
+    scale, zero, weights = SCALE_WIDTH * mean, MONOPOLE_WIDTH * monopole, []
+    if surveys:
+        filled = [s.modes + (1.0 - s.beam) * (s.modes[0] / mean[0]) * mean for s in surveys]
+        weights, mean = [*filled, mean], np.mean(filled, axis=0)
+        weights = [WEIGHT_WIDTH * (one * (mean[0] / one[0]) - mean) for one in weights]
+        stds = np.array([[s.scale_std, np.sqrt(4.0 * np.pi) * s.zero_std] for s in surveys])
+        of_scale, of_zero = np.sqrt((stds**2).sum(axis=0)) / len(surveys)
+        scale, zero = of_scale * mean, of_zero * (np.arange(len(mean)) == 0)
+    wide = np.stack([scale, zero, *weights, *extended], axis=1)
     of_sources = np.reshape(modes, (-1, n_modes(lmax))).T
     spectrum = SpectrumBasis.around(4.0 * np.pi * strength**2 / 100.0, lmax)
     bands = tuple(Band.of(window, *smoothed) for window in windows(lmax))

@@ -40,7 +40,7 @@ def prior_sentence(experiment: Experiment) -> str:
     """The prior's model, the source of its C_ell and, if it was learned, its parameters."""
     section, prior = experiment.scenario.prior, experiment.learned
     rows = [] if prior is None else prior.as_rows()
-    learned = ", ".join(f"{r['name']}: {r['value']:.2f} +- {r['std']:.2f}" for r in rows)
+    learned = ", ".join(f"{r['name']}: {r['value']:.4g} +- {r['std']:.2g}" for r in rows)
     return f"Prior {section.model}, C_ell {section.origin}{'; ' if rows else ''}{learned}."
 
 

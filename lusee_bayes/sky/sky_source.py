@@ -24,7 +24,7 @@ import equinox as eqx
 import h5py
 import numpy as np
 from astropy.io import fits
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from lusee_bayes.core import harmonics
 from lusee_bayes.core.arrays import Array, Modes, Pixels
@@ -198,20 +198,26 @@ class SkyMap(SkyFile):
         hdf5 = h5py.is_hdf5(path)
         pixels = _read_hdf5(path, dataset or ULSA_DATASET) if hdf5 else _read_map(path)
         _require_healpix(path, pixels.size)
-        if (unseen := pixels == UNSEEN).any():
-            raise InputError(
-                f"{path}: {int(unseen.sum())} of {pixels.size} pixels are UNSEEN; give a full-sky "
-                "map"
-            )
         return cls(str(path), pixels)
 
+    @property
+    def unseen(self) -> Bool[np.ndarray, " pixels"]:
+        """Which pixels have no data."""
+        return self.pixels == UNSEEN
+
     def modes_at(self, frequency_mhz: float, lmax: int) -> Float[np.ndarray, " modes"]:
+        if self.unseen.any():
+            raise InputError(
+                f"{self.path}: {int(self.unseen.sum())} of {self.pixels.size} pixels are UNSEEN; "
+                "give a full-sky map, or use it as one of prior.surveys"
+            )
         return modes_of_map(self.path, self.pixels, lmax)
 
     def description(self) -> tuple[str, ...]:
-        pixels = self.pixels
+        pixels, n = self.pixels[~self.unseen], self.pixels.size
+        gaps = f", {n - pixels.size} pixels UNSEEN" if pixels.size < n else ""
         return (
-            f"HEALPix sky map, NSIDE {round((pixels.size / 12) ** 0.5)}, RING, Galactic",
+            f"HEALPix sky map, NSIDE {round((n / 12) ** 0.5)}, RING, Galactic{gaps}",
             f"mean {pixels.mean():.6g} K, from {pixels.min():.4g} to {pixels.max():.4g} K",
         )
 

@@ -1,0 +1,110 @@
+"""Surveys of the sky: the template of a prior, and what the data say about them.
+
+A survey s, scaled to the frequency of a channel, and the sky m are related by ::
+
+    s = a (B m) + b + errors,    or    B m = s / a - b / a + e,
+
+where B is the survey's beam. The prior takes the mean of all surveys as its template, with unknown
+scale and zero level (:mod:`.local_scales`); e are the deviations from it, whose strength is learned
+by position and scale. The weights of the surveys, and of the embedded template, are unknown, too: a
+survey that contradicts the visibilities loses its weight.
+
+a and b follow from the map without surveys, N(mu, C), ::
+
+    s ~ N(B mu, B C B + E + scale_std^2 s s^T + zero_std^2 (4 pi y_0 y_0^T)),
+
+where E is the covariance of the learned deviations. Where the survey has no data, white noise
+brighter than any sky is added.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from lusee_bayes.core.arrays import Modes, ModesMatrix
+from lusee_bayes.core.harmonics import lmax_of
+from lusee_bayes.core.lazy import healpy
+from lusee_bayes.core.linalg import checked_cholesky, gram_matrix, scaled, solve_lower
+from lusee_bayes.core.sphere_grid import SphereGrid
+from lusee_bayes.linear.posterior import Posterior
+
+# brightness of unseen parts of the sky, over the survey's mean
+BRIGHTEST = 10.0
+
+
+@dataclass(frozen=True)
+class Survey:
+    """A survey, scaled to the frequency of a channel.
+
+    Attributes
+    ----------
+    name : str
+    modes : (modes,) array
+        s, Galactic, in K; any values where it has no data.
+    beam : (modes,) array
+        B, a diagonal.
+    scale_std, zero_std : float
+        Prior standard deviations of a, and of b in K.
+    unseen : (pixels,) array of bool or None
+        HEALPix RING: where it has no data.
+    """
+
+    name: str
+    modes: Modes
+    beam: Modes
+    scale_std: float
+    zero_std: float
+    unseen: Bool[np.ndarray, " pixels"] | None = None
+
+    @property
+    def shapes(self) -> Float[np.ndarray, "2 modes"]:
+        """Changes of s with a and b, each times its prior standard deviation, in K."""
+        zero = np.zeros_like(self.modes)
+        zero[0] = np.sqrt(4.0 * np.pi) * self.zero_std
+        return np.stack([self.scale_std * self.modes, zero])
+
+    def calibrated(self, others: Posterior, errors: ModesMatrix) -> list[dict[str, float | str]]:
+        """Infer a and b; also the rms of the survey's errors.
+
+        Parameters
+        ----------
+        others : Posterior
+            Of the sky, from other data.
+        errors : (modes, modes) array
+            E, in K^2.
+
+        Returns
+        -------
+        list of dict
+            Name, value and standard deviation of a, and of b in K.
+        """
+        off = self.modes - self.beam * np.asarray(others.mean)
+        known = np.asarray(others.covariance()) + errors
+        whole = scaled(known, self.beam, overwrite=True) + gram_matrix(self.shapes)
+        if self.unseen is not None:
+            whole += self._blind()
+        root = checked_cholesky("the covariance of a survey", whole)
+        half = solve_lower(root, np.stack([off, *self.shapes]).T, transpose=False)
+        # unknowns 1 / a - 1 and -b / a
+        widths = np.array([self.scale_std, self.zero_std])
+        shift = -widths * (half[:, 1:].T @ half[:, 0])
+        covariance = scaled(np.eye(2) - gram_matrix(half[:, 1:]), widths)
+        scale = 1.0 / (1.0 + shift[0])
+        # a and b by these unknowns
+        slopes = np.array([[-(scale**2), 0.0], [shift[1] * scale**2, -scale]])
+        std = np.sqrt(np.diagonal(slopes @ covariance @ slopes.T))
+        values = {"scale": scale, "zero level (K)": -shift[1] * scale}
+        return [
+            {"name": f"{name} of {self.name}", "value": float(value), "std": float(width)}
+            for (name, value), width in zip(values.items(), std, strict=True)
+        ]
+
+    def _blind(self) -> ModesMatrix:
+        top = lmax_of(len(self.modes))
+        grid = SphereGrid.of(top, 2 * top)
+        near, _ = healpy.get_interp_weights(healpy.npix2nside(len(self.unseen)), *grid.directions())
+        blind = self.unseen[near].any(axis=0).reshape(grid.shape)
+        return grid.product_matrix(BRIGHTEST**2 * self.modes[0] ** 2 * blind)
