@@ -209,12 +209,6 @@ def _learned(
     return replace(experiment, setup=setup, learned=inference.learned, inference=inference)
 
 
-def with_truth(experiment: Experiment) -> Experiment:
-    """Return the experiment with the scenario's sky as the truth of its data."""
-    data = replace(experiment.data, truth=experiment.setup.sky.modes)
-    return replace(experiment, data=data)
-
-
 def under_sky(setup: Setup, source: SkySource, seed: int) -> Experiment:
     """Simulate data of a given sky, to be mapped with the scenario's prior.
 

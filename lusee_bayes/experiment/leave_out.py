@@ -76,14 +76,10 @@ class GroupsCompared:
         return GroupsCompared.of(self.left_out.without(gone), self.data)
 
     @property
-    def ratio(self) -> Float[np.ndarray, " times"]:
-        """chi^2 of each time over its mean, or 0."""
-        return np.where(self.degrees > 0.0, self.chi2 / np.maximum(self.degrees, 0.5), 0.0)
-
-    @property
     def size(self) -> Float[np.ndarray, " times"]:
         """How far each time, or its worst datum, stands out: chi^2 over its mean."""
-        return np.maximum(self.ratio, (self.z**2).max(axis=0) / len(self.z))
+        ratio = np.where(self.degrees > 0.0, self.chi2 / np.maximum(self.degrees, 0.5), 0.0)
+        return np.maximum(ratio, (self.z**2).max(axis=0) / len(self.z))
 
     def worst(self, false_alarm: float, least: float = 0.0) -> GridFlags:
         """Flag the worst outliers: whole times, or a value without which its time fits.
@@ -214,9 +210,6 @@ class Fitting:
     Attributes
     ----------
     flagged : (products, times) array of bool
-    chi2 : (times,) array
-        chi^2 of each time relative to its prediction from the others, over its mean, before
-        anything was flagged; 0 without a prediction.
     remark : str
         A remark for the report, or empty.
     groups : tuple of DataGroup
@@ -226,7 +219,6 @@ class Fitting:
     """
 
     flagged: GridFlags
-    chi2: Float[np.ndarray, " times"]
     remark: str = ""
     groups: tuple[DataGroup, ...] = ()
     share: float = 0.0
@@ -254,17 +246,15 @@ def fitting(
     """
     rules, stages = _Rules.of(data, false_alarm), stages or Stages()
     gone = nothing = np.zeros(rules.present.shape, dtype=bool)
-    before, groups, kept = np.zeros(nothing.shape[1]), (), ""
+    groups, kept = (), ""
     start = compared(setup, data, settle=False) if rebuilds(setup) else None
     if start is not None:
         least = OBVIOUS * max(float(np.median(start.size)), 1.0)
         _, obvious = rules.one_by_one(start, gone, nothing, least)
         gone = nothing if obvious is None else obvious
-        before = np.where(gone.any(axis=0), start.ratio, 0.0)
     for rounds in range(1, MAX_ROUNDS + 1):
         if (start := compared(*without(setup, data, gone))) is None:
-            return Fitting(nothing, before, NOT_JUDGED)
-        before = np.where(before > 0.0, before, start.ratio)
+            return Fitting(nothing, NOT_JUDGED)
         more, auto = rules.eliminated(start, gone)
         kept = kept or auto
         if more is None:
@@ -278,8 +268,8 @@ def fitting(
         if not flagged.any():
             share = rules.count(gone) / data.layout.size
             remark = " ".join(filter(None, [rules.remark(gone, groups, share), kept]))
-            return Fitting(gone, before, remark, groups, share)
-    return Fitting(nothing, before, f"{TOO_MANY} {kept}".strip())
+            return Fitting(gone, remark, groups, share)
+    return Fitting(nothing, f"{TOO_MANY} {kept}".strip())
 
 
 @dataclass(frozen=True)

@@ -195,11 +195,11 @@ def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, S
     """
     around = around or Around()
     moved_setup = moved(setup, around.values)
-    treated = [
-        (cls.treatment(setup.scenario), cls, section)
+    return [
+        (treatment, cls.build(section, moved_setup, around))
         for cls, section in present(SYSTEMATICS, setup.scenario)
+        if (treatment := cls.treatment(setup.scenario)) != "ignored"
     ]
-    return [(t, cls.build(s, moved_setup, around)) for t, cls, s in treated if t != "ignored"]
 
 
 def base_model(setup: Setup, around: Around | None = None) -> LinearGaussian:

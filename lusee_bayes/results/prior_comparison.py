@@ -17,7 +17,6 @@ from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.judge.chi2 import ChiSquare
 from lusee_bayes.judge.coverage import LEVELS, Coverage
 from lusee_bayes.judge.residuals import HeldOut
-from lusee_bayes.judge.split import Split
 from lusee_bayes.results.channel import ChannelResult, SkyErrors
 
 # a clear difference of two ln evidences, each of which is accurate to one or two
@@ -28,56 +27,24 @@ HELD_OUT = (
 )
 
 
-@dataclass(frozen=True)
-class UnderPrior:
-    """The data under one prior.
+class PriorSummary(BaseModel):
+    """The data under a prior, in priors.json.
 
     Attributes
     ----------
     name : str
-    words : str
+    prior : str
         The prior's model, the source of its C_ell, and its parameters.
-    channel : ChannelResult
+    parameters : int
+        Number of learned parameters.
     log_evidence : float
         ln p(d), with the sky and the prior's parameters, if it has any, integrated out (Laplace).
-    n_parameters : int
-        Number of learned parameters.
     held_out : tuple of HeldOut
         Empty if groups are not judged.
-    split : Split
+    instrument, rest : ChiSquare
         The parts of chi^2 that test instrument and noise, and the prior.
-    """
-
-    name: str
-    words: str
-    channel: ChannelResult
-    log_evidence: float
-    n_parameters: int
-    held_out: tuple[HeldOut, ...]
-    split: Split
-
-    def summary(self) -> PriorSummary:
-        """The prior's entry in priors.json."""
-        channel, has_truth = self.channel, self.channel.truth is not None
-        return PriorSummary(
-            name=self.name,
-            prior=self.words,
-            parameters=self.n_parameters,
-            log_evidence=self.log_evidence,
-            held_out=self.held_out,
-            instrument=self.split.instrument,
-            rest=self.split.prior,
-            coverage=channel.coverage,
-            errors=channel.errors_by_latitude() if has_truth else (),
-            snr=channel.snr_at_some_ell() if has_truth else {},
-        )
-
-
-class PriorSummary(BaseModel):
-    """The data under a prior, in priors.json.
-
-    ``instrument`` and ``rest`` are the parts of chi^2 that test instrument and noise, and the
-    prior. ``coverage``, ``errors`` and ``snr`` (by multipole) are empty unless the sky is known.
+    coverage, errors, snr
+        By part of the sky, latitude and multipole; empty unless the sky is known.
     """
 
     name: str
@@ -126,26 +93,29 @@ class PriorComparison:
     name : str
         Name of the scenario.
     scenario : Scenario
-    priors : tuple of UnderPrior
+    priors : tuple of PriorSummary
         Two or more.
+    channels : tuple of ChannelResult
+        The map under each prior.
     seconds : dict
         By stage.
     """
 
     name: str
     scenario: Scenario
-    priors: tuple[UnderPrior, ...]
+    priors: tuple[PriorSummary, ...]
+    channels: tuple[ChannelResult, ...]
     seconds: dict[str, float] = field(default_factory=dict)
 
     @property
-    def best(self) -> UnderPrior:
+    def best(self) -> PriorSummary:
         """The prior with the highest evidence."""
         return max(self.priors, key=lambda one: one.log_evidence)
 
     @property
     def known_sky(self) -> bool:
         """Whether the sky behind the data is known."""
-        return self.best.channel.truth is not None
+        return self.channels[0].truth is not None
 
     def headline(self) -> str:
         """Which prior the data prefer, and by how much."""
@@ -168,11 +138,11 @@ class PriorComparison:
 
     def table(self) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
         """Header and rows, a column for each prior."""
-        return prior_table([one.summary() for one in self.priors])
+        return prior_table(self.priors)
 
     def rows(self) -> list[dict[str, object]]:
         """Rows of priors.csv, one for each prior."""
-        return [_row(one.summary(), self.best.log_evidence) for one in self.priors]
+        return [_row(one, self.best.log_evidence) for one in self.priors]
 
     def summary(self) -> PriorsSummary:
         """Contents of priors.json."""
@@ -181,8 +151,8 @@ class PriorComparison:
             notes=self.lines()[1:],
             best=self.best.name,
             frequency_mhz=self.scenario.frequency_mhz,
-            n_data=self.best.channel.n_data,
-            priors=[one.summary() for one in self.priors],
+            n_data=self.channels[0].n_data,
+            priors=list(self.priors),
             **about_run(self.seconds),
         )
 

@@ -19,9 +19,10 @@ from lusee_bayes.report.figures.maps import curves_of_runs, maps_of_runs
 from lusee_bayes.report.figures.plans import priors
 from lusee_bayes.report.pages import comparison_page
 from lusee_bayes.report.rendering import render_text
+from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.channel_map import conditioned
 from lusee_bayes.results.finished_runs import FinishedRun, Provenance, comparison_rows, read_runs
-from lusee_bayes.results.prior_comparison import PriorComparison, UnderPrior
+from lusee_bayes.results.prior_comparison import PriorComparison, PriorSummary
 from lusee_bayes.runs.cost import measured_experiment
 from lusee_bayes.runs.folder import SCENARIO, Output, RunKind, RunOutcome, run_folder
 from lusee_bayes.systematics.context import Setup
@@ -123,16 +124,18 @@ def run_compare_priors(
         with stages("data"):
             inferred = settled(experiment.setup, experiment.data)
 
-        def under(prior: str) -> UnderPrior:
+        def under(prior: str) -> tuple[PriorSummary, ChannelResult]:
             return _under(prior, experiment.setup.with_prior(sections[prior]), experiment, inferred)
 
         engine.work_in(run.path)
         mapped = engine.each(Tasks(under, list(sections), list(sections)), stages, "priors")
-        result = PriorComparison(name, scenario, tuple(mapped), stages.seconds)
+        result = PriorComparison(name, scenario, *zip(*mapped, strict=True), stages.seconds)
         return run.write(result, stages, Provenance.of_experiment(experiment, data))
 
 
-def _under(name: str, setup: Setup, experiment: Experiment, inferred: Inference) -> UnderPrior:
+def _under(
+    name: str, setup: Setup, experiment: Experiment, inferred: Inference
+) -> tuple[PriorSummary, ChannelResult]:
     """Map the data under one prior or a family of priors, and predict held-out groups."""
     information = inferred.solution.information
     if setup.family is None:
@@ -144,11 +147,21 @@ def _under(name: str, setup: Setup, experiment: Experiment, inferred: Inference)
     mapped = replace(experiment, setup=setup, learned=learned, inference=solved)
     made = conditioned(mapped)
     channel = made.result(made.channel_data(alone=False))
-    solution = made.from_data.solution
-    n_parameters = 0 if learned is None else len(learned.parameters)
+    solution, has_truth = made.from_data.solution, channel.truth is not None
     split = Split.of(solution.posterior, channel.chi2_model, solution.model.n_data)
-    judged = held_out(solution, mapped.data), split
-    return UnderPrior(name, channel.prior, channel, evidence, n_parameters, *judged)
+    summary = PriorSummary(
+        name=name,
+        prior=channel.prior,
+        parameters=0 if learned is None else len(learned.parameters),
+        log_evidence=evidence,
+        held_out=held_out(solution, mapped.data),
+        instrument=split.instrument,
+        rest=split.prior,
+        coverage=channel.coverage,
+        errors=channel.errors_by_latitude() if has_truth else (),
+        snr=channel.snr_at_some_ell() if has_truth else {},
+    )
+    return summary, channel
 
 
 # contents of the folder of a comparison of priors; a new file is one line here

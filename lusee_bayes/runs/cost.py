@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from math import ceil
 
@@ -19,7 +19,7 @@ from lusee_bayes.core.engine import Demand
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages, gigabytes, memory_limit
 from lusee_bayes.experiment.data_files import Data, read_data
-from lusee_bayes.experiment.experiment import Experiment, build, with_truth
+from lusee_bayes.experiment.experiment import Experiment, build
 from lusee_bayes.experiment.leave_out import ARRAYS, MOST_MEMORY
 from lusee_bayes.experiment.rounds import first_order
 from lusee_bayes.experiment.scenario import Scenario
@@ -275,7 +275,10 @@ def measured_experiment(
     measured = None if data is None else read_data(data, scenario)
     require_resources(scenario, measured, stages, n_draws)
     experiment = make(scenario, measured, stages)
-    return with_truth(experiment) if truth else experiment
+    if not truth:
+        return experiment
+    data = replace(experiment.data, truth=experiment.setup.sky.modes)
+    return replace(experiment, data=data)
 
 
 def _smaller(scenario: Scenario) -> Iterator[tuple[str, float | str, Scenario]]:

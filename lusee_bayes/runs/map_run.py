@@ -17,7 +17,7 @@ from lusee_bayes.report.figures import judgement, maps
 from lusee_bayes.results import finished_runs
 from lusee_bayes.results.map_result import MapResult
 from lusee_bayes.runs.channels import CHANNELS, map_channels
-from lusee_bayes.runs.cost import posterior_cost, require_fits
+from lusee_bayes.runs.cost import require_resources
 from lusee_bayes.runs.folder import SCENARIO, Output, RunKind, RunOutcome, run_folder
 from lusee_bayes.sky.sky_source import write_alms
 
@@ -73,11 +73,9 @@ def run_map(
     stages = stages or Stages()
     scenario.require_marginal("a map", "use: lusee-bayes sample")
     if not scenario.single:
-        require_fits(cost := posterior_cost(scenario), scenario)
+        require_resources(scenario, None, stages)
     origin = {"truth": truth or None, "earlier": earlier}
     with run_folder(folder, MAP, scenario, data, earlier, replace=replace, **origin) as run:
-        if not scenario.single:
-            stages.say(cost.line())
         reduced = None if data is None else reduced_of(data, scenario, stages)
         given = _given(data, reduced, scenario, run.path)
         more = {"truth": truth, "earlier": earlier, "thorough": thorough, "engine": engine}

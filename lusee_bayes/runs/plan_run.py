@@ -36,7 +36,6 @@ from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.experiment.validity import NOTHING, blind_spots
 from lusee_bayes.instrument.products import DataLayout, all_products
 from lusee_bayes.judge.measures import effective_resolution_deg, prior_fraction_per_ell
-from lusee_bayes.linear.amplitudes import template_amplitudes
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.report.figures.plans import forecasts
 from lusee_bayes.results.forecast import AS_GIVEN, Forecast, Variation, forecast_rows
@@ -101,8 +100,7 @@ def expected_offsets(inference: Inference) -> dict[str, float]:
     """
     if inference.offsets is None:
         return {}
-    amplitudes = template_amplitudes(inference.solution, inference.offsets.columns)
-    return inference.offsets.systematic.in_units(amplitudes.std)
+    return inference.offsets.systematic.in_units(inference.amplitudes(inference.offsets).std)
 
 
 def turned(family: str) -> bool:

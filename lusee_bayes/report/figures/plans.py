@@ -157,11 +157,11 @@ def _evidence(axes: Axes, result: PriorComparison) -> None:
 
 def _coverage(axes: Axes, result: PriorComparison) -> None:
     n, k = len(result.priors), LEVELS.index(LEVEL)
-    parts = [part.name for part in result.priors[0].channel.coverage]
+    parts = [part.name for part in result.priors[0].coverage]
     for j, one in enumerate(result.priors):
         x = np.arange(len(parts)) + 0.6 * ((j + 0.5) / n - 0.5)
-        held = [100.0 * part.held[k] for part in one.channel.coverage]
-        scatter = [100.0 * part.scatter[k] for part in one.channel.coverage]
+        held = [100.0 * part.held[k] for part in one.coverage]
+        scatter = [100.0 * part.scatter[k] for part in one.coverage]
         colour = COLOURS[j % len(COLOURS)]
         axes.errorbar(x, held, yerr=scatter, fmt="o", color=colour, capsize=3, label=one.name)
     axes.axhline(100.0 * LEVEL, color=GREY, lw=0.8)
@@ -170,8 +170,7 @@ def _coverage(axes: Axes, result: PriorComparison) -> None:
 
 
 def _errors(axes: Axes, result: PriorComparison) -> None:
-    for j, one in enumerate(result.priors):
-        channel = one.channel
+    for j, (one, channel) in enumerate(zip(result.priors, result.channels, strict=True)):
         colour, line = COLOURS[j % len(COLOURS)], LINES[j % len(LINES)]
         expected = power_spectrum(channel.std)[1:]
         ell = np.arange(1, len(expected) + 1)
@@ -182,7 +181,7 @@ def _errors(axes: Axes, result: PriorComparison) -> None:
         error = power_spectrum(channel.mean - channel.truth)[1:]
         axes.semilogy(ell, error, color=colour, ls="-", lw=1.3, label=one.name)
     if result.known_sky:
-        truth = power_spectrum(result.best.channel.truth)[1:]
+        truth = power_spectrum(result.channels[0].truth)[1:]
         axes.semilogy(ell, truth, color=GREY, lw=1.0, label="true sky")
         axes.set_title("errors (dotted: expected from the error bars)", fontsize=9)
     else:
