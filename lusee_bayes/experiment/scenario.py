@@ -106,20 +106,17 @@ def _resolved(
     meant for another kind: ``sky.fil=X`` is read as a key of the galaxy.
     """
     path: list[str] = []
-    section: type[BaseModel] | None = model
-    sections = [model]
-    kinds: dict[str, type[BaseModel]] = {}
-    for number, key in enumerate(location):
+    sections = inner = [model]
+    kinds: set[str] = set()
+    for key in location:
         if key in kinds:
-            section, kinds = kinds[str(key)], {}
+            kinds = set()
             continue
         path.append(str(key))
-        if isinstance(key, int) or section is None or number == len(location) - 1:
-            continue
-        field = section.model_fields.get(key)
-        models = [] if field is None else _models_in(field.annotation)
-        kinds = {str(m.model_fields["model"].default): m for m in models if len(models) > 1}
-        section, sections = (models[0] if len(models) == 1 else None), models
+        fields = [one.model_fields[key] for one in inner if key in one.model_fields]
+        models = [section for field in fields for section in _models_in(field.annotation)]
+        kinds = {one.model_fields["model"].default for one in models if len(models) > 1}
+        sections, inner = inner, models or inner
     return path, sections
 
 

@@ -93,16 +93,6 @@ def expected_inference(setup: Setup) -> Inference:
     return Inference(model.condition(np.zeros(model.n_data)), held, 1, Around())
 
 
-def expected_offsets(inference: Inference) -> dict[str, float]:
-    """Expected standard deviations of clock and pointing, in the units that end their names.
-
-    Linearised about the scenario's sky and zero offsets; empty if the model has no offsets.
-    """
-    if inference.offsets is None:
-        return {}
-    return inference.offsets.systematic.in_units(inference.amplitudes(inference.offsets).std)
-
-
 def turned(family: str) -> bool:
     """Whether to look for unnoticed errors, which turntable angles can reveal, in a variation."""
     return family in (AS_GIVEN, "turned, same time", "turned, more time") or "runs" in family
@@ -128,7 +118,9 @@ def forecast(variation: Variation) -> Forecast:
         if variation.lost:
             setup = without_ports(setup, variation.lost)
         inference = expected_inference(setup)
-        posterior = inference.posterior
+        posterior, part = inference.posterior, inference.offsets
+        # linearised about the scenario's sky and zero offsets
+        offsets = {} if part is None else part.systematic.in_units(inference.amplitudes(part).std)
         return Forecast(
             variation=variation,
             days=float(setup.observation.live_s.sum()) / 86400.0,
@@ -137,7 +129,7 @@ def forecast(variation: Variation) -> Forecast:
             modes=informed_modes(posterior),
             snr_squared=expected_snr_squared(posterior),
             resolution_deg=effective_resolution_deg(prior_fraction_per_ell(posterior)),
-            offsets=expected_offsets(inference),
+            offsets=offsets,
             unnoticed=unnoticed(setup, inference) if turned(variation.family) else "",
         )
 

@@ -325,7 +325,8 @@ def run_sample(
     channels = {f"{one.frequency_mhz:.15g}MHz": one for one in scenario.channels()}
     with run_folder(folder, CUBES, scenario, data, program.path, **given) as run:
         runs = []
-        if samples_together(scenario):
+        treated = present(SYSTEMATICS, scenario)
+        if any(k.octaves(one) for k, one in treated if k.treatment(scenario) == "sampled"):
             experiments = {
                 name: measured_experiment(channel, data, stages, n_draws=n_draws)
                 for name, channel in channels.items()
@@ -345,13 +346,6 @@ def run_sample(
         results = tuple(each.result for each in runs)
         runs.append(run.write((scenario, results), stages))
         return RunOutcome(results, run.path, [file for each in runs for file in each.files])
-
-
-def samples_together(scenario: Scenario) -> bool:
-    """Whether channels share a sampled unknown."""
-    treated = present(SYSTEMATICS, scenario)
-    sampled = [one for one in treated if one[0].treatment(scenario) == "sampled"]
-    return any(cls.octaves(section) for cls, section in sampled)
 
 
 def named(program: Program) -> str:
