@@ -12,7 +12,6 @@ from jaxtyping import Float
 from lusee_bayes.core import formats
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import user_path
-from lusee_bayes.core.formats import format_of, image_names, is_fits, is_session
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.experiment.scenario import Scenario
@@ -114,7 +113,7 @@ def are_sessions(data: Data) -> bool:
         If one of several files is not a session.
     """
     files = files_of(data)
-    sessions = [is_session(require_file(path, "data", HINT)) for path in files]
+    sessions = [formats.is_session(require_file(path, "data", HINT)) for path in files]
     if len(files) > 1 and not all(sessions):
         odd = files[sessions.index(False)]
         raise InputError(f"'{odd}' is not a spectrometer session; give other data as one file")
@@ -132,7 +131,7 @@ def reduced_of(data: Data, scenario: Scenario, stages: Stages | None = None) -> 
     files = files_of(data)
     if are_sessions(data):
         return reduce_files(files, scenario, stages)
-    is_reduced = bool(files) and format_of(files[0]) == formats.REDUCED
+    is_reduced = bool(files) and formats.format_of(files[0]) == formats.REDUCED
     return read_reduced(files[0]) if is_reduced else None
 
 
@@ -179,10 +178,10 @@ def read_data(data: Data, scenario: Scenario) -> Visibilities:
 
 def _is_waterfall(path: Path) -> bool:
     """Whether a file is a luseepy waterfall, not our visibilities. InputError if neither."""
-    kind, is_waterfall = format_of(path), is_fits(path)
+    kind, is_waterfall = formats.format_of(path), formats.is_fits(path)
     is_data = kind == formats.VISIBILITIES
     if is_waterfall:
-        is_data = bool(WATERFALL_IMAGES & set(image_names(path)))
+        is_data = bool(WATERFALL_IMAGES & set(formats.image_names(path)))
     if not is_data:
         said = f" (its format is '{kind}')" if kind else ""
         raise InputError(f"{path} contains no data to map{said}; give {ACCEPTED}")
@@ -286,7 +285,7 @@ def reduce_files(
     for k, path in enumerate(resolved):
         if path in resolved[:k]:
             raise InputError(f"'{paths[k]}' is listed twice; list every session once")
-        if format_of(path) == formats.REDUCED:
+        if formats.format_of(path) == formats.REDUCED:
             raise InputError(f"'{paths[k]}' is reduced already; give it to lusee-bayes map --data")
     recipe = recipe_of(scenario)
     with stages("sessions"):

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.errors import require_known
 from lusee_bayes.core.reading import as_yaml
 from lusee_bayes.experiment.scenario import Scenario
 
@@ -75,11 +75,9 @@ def scenario_keys(within: str = "") -> list[Key]:
     keys = list(_keys_of(schema, schema["$defs"], "", ""))
     if not within:
         return keys
-    inside = [k for k in keys if k.path == within or k.path.startswith(f"{within}.")]
-    if not inside:
-        paths = {k.path.rsplit(".", n)[0] for k in keys for n in range(k.path.count(".") + 1)}
-        raise InputError(f"a scenario has no key '{within}'; {nearest(within, sorted(paths))}")
-    return inside
+    paths = {k.path.rsplit(".", n)[0] for k in keys for n in range(k.path.count(".") + 1)}
+    require_known("a scenario has no key", within, sorted(paths))
+    return [k for k in keys if k.path == within or k.path.startswith(f"{within}.")]
 
 
 def keys_as_markdown(keys: Iterable[Key]) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import DataVector, Grid, Modes, Vector
-from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.section import is_modelled
 from lusee_bayes.experiment import sky_sections
@@ -666,8 +666,7 @@ def named_priors(
     if names is None:
         names = [name for name in NAMED if known_sky or name != OF_TRUE_SKY]
     for name in names:
-        if name not in NAMED:
-            raise InputError(f"--priors: no prior '{name}'; {nearest(name, NAMED)}")
+        require_known("--priors: no prior", name, NAMED)
     if len(names) < 2 or len(set(names)) < len(names):
         raise InputError(
             f"--priors {','.join(names)}: give at least two different ones of {', '.join(NAMED)}"

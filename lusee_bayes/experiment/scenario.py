@@ -17,7 +17,7 @@ from typing import Annotated, Any, get_args
 
 from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
 
-from lusee_bayes.core.errors import InputError, nearest
+from lusee_bayes.core.errors import InputError, nearest, require_known
 from lusee_bayes.core.files import user_path
 from lusee_bayes.core.reading import as_yaml, parse_yaml, read_yaml
 from lusee_bayes.core.section import Frequency, Section, Seed
@@ -334,9 +334,7 @@ def scenario_names() -> list[str]:
 
 def scenario_text(name: str) -> str:
     """The YAML of a built-in scenario. InputError for an unknown name."""
-    names = scenario_names()
-    if name not in names:
-        raise InputError(f"the package has no scenario '{name}'; {nearest(name, names)}")
+    require_known("the package has no scenario", name, scenario_names())
     return (FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
 
 

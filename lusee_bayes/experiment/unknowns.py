@@ -105,8 +105,8 @@ class NullDirection:
         )
 
 
-# columns of a report's table, in order; "true" follows them if known
-UNKNOWN_COLUMNS = ("unknown", "unit", "value", "std", "prior", "prior_std")
+# columns of a report's table, in order; "true" only if known
+UNKNOWN_COLUMNS = ("unknown", "unit", "value", "std", "prior", "prior_std", "true")
 # name of the sky's monopole among the unknowns
 SKY = "uniform sky"
 # an unknown that keeps more of its prior standard deviation is unconstrained
@@ -362,8 +362,7 @@ class Unknowns:
         if COMMON_GAIN in self.names:
             gain = self.parts[self.names.index(COMMON_GAIN)]
             common = float(np.sqrt(gain @ posterior.covariance @ gain))
-        columns = [*UNKNOWN_COLUMNS, *(["true"] if "true" in rows else [])]
-        return UnknownsReport(rows[columns], null, common)
+        return UnknownsReport(rows.filter(UNKNOWN_COLUMNS), null, common)
 
     def instrument(
         self, mean: Modes, covariance: ModesMatrix, pixels: Pixels
@@ -407,11 +406,10 @@ class Unknowns:
         single = np.flatnonzero(rows["site"] == rows["unknown"])
         best = np.lexsort((given.std[single], self.octaves[single] == 0))[:MOST_IN_CORNER]
         corner = np.sort(single[best])
-        columns = [*UNKNOWN_COLUMNS, *(["true"] if "true" in rows else [])]
         nside = round(np.sqrt(len(pixels) / 12))
         theta = InstrumentPosterior(
             table,
-            rows.loc[corner, columns].reset_index(drop=True),
+            rows.loc[corner].filter(UNKNOWN_COLUMNS).reset_index(drop=True),
             {name: float((part**2).sum()) / total for name, part in parts.items()},
             correlation[np.ix_(corner, corner)],
             (pixel_std(every @ every.T, nside) / pixels) ** 2,
@@ -538,8 +536,7 @@ def _table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
     left = inference.offsets.systematic.beyond_first_order(model, inference.posterior.mean, shares)
     beyond = [float(np.sqrt(np.mean((left[name] / noise) ** 2))) for name in table["unknown"]]
     table = table.assign(beyond_first_order=beyond).rename(columns={"unknown": "offset"})
-    columns = ["offset", "value", "std", "prior_std", "beyond_first_order", "true"]
-    return table[[name for name in columns if name in table]]
+    return table.filter(["offset", "value", "std", "prior_std", "beyond_first_order", "true"])
 
 
 def _preferred(experiment: Experiment, result: Inference, values: dict[str, float]) -> pd.DataFrame:

@@ -61,6 +61,8 @@ NOTHING = 1e-3
 LITTLE = 0.1
 # largest number of errors in a sentence
 MOST_NAMED = 4
+# size of each error, by name
+Sizes = dict[str, float]
 
 
 def weighed(setup: Setup, data: np.ndarray, inference: Inference) -> tuple[float, float] | None:
@@ -175,27 +177,25 @@ def blind_sentence(spots: Iterable[BlindSpot]) -> str:
     )
 
 
-def errors_of(
-    setup: Setup, *, pointing: bool
-) -> Iterator[tuple[str, float, str, Systematic, slice]]:
-    """Name, size and unit of errors that a model may lack, with their systematic and its index."""
+def errors_of(setup: Setup, *, pointing: bool) -> Iterator[tuple[Systematic, Sizes, str]]:
+    """Systematics that a model may lack, with size and unit of the errors that they describe.
+
+    There is one error for each unknown, or one for all of them.
+    """
     source = setup.beam_source
     if source.has_fields:
         section = FieldErrorsSection(std=FIELDS, lmax=FIELD_LMAX, learned=False)
         fields = FieldErrors.build(section, setup, Around())
-        yield FIELDS_NAME, 100.0 * FIELDS, " %", fields, slice(None)
+        yield fields, {FIELDS_NAME: 100.0 * FIELDS}, " %"
     values = {name: float(p.value) for name, p in source.parameters().items() if float(p.value)}
     priors = tuple(Unknown(name, value, PARAMETERS * abs(value)) for name, value in values.items())
-    parameters = InstrumentParameters(setup.instrument, priors)
-    for k, name in enumerate(values):
-        yield name, 100.0 * PARAMETERS, " %", parameters, slice(k, k + 1)
+    sizes = dict.fromkeys(values, 100.0 * PARAMETERS)
+    yield InstrumentParameters(setup.instrument, priors), sizes, " %"
     if not pointing:
         return
     runs = setup.observation.n_runs
     steps = {name: step for kind, step in TESTED.items() for name in offset_names((kind,), runs)}
-    offsets = PointingOffsets.of(setup, steps, dict.fromkeys(steps, 0.0))
-    for k, (name, step) in enumerate(steps.items()):
-        yield name, step, "", offsets, slice(k, k + 1)
+    yield PointingOffsets.of(setup, steps, dict.fromkeys(steps, 0.0)), steps, ""
 
 
 def blind_spots(
@@ -219,21 +219,21 @@ def blind_spots(
     solution, model = inference.solution, base_model(moved_setup, inference.around)
     root = solution.posterior.root()
     wide = solution.under(inference.model.prior.widened(WIDE)).posterior.root()
-    spots, slopes, degrees = [], {}, max(inference.model.n_data - len(sky), 1)
-    for name, size, unit, systematic, which in errors_of(moved_setup, pointing=pointing):
-        if name in has:
+    spots, degrees = [], max(inference.model.n_data - len(sky), 1)
+    for systematic, sizes, unit in errors_of(moved_setup, pointing=pointing):
+        if has.issuperset(sizes):
             continue
-        if type(systematic) not in slopes:
-            centre = np.zeros(len(systematic.names))
-            columns = np.asarray(systematic.linearised(model, centre)(sky))
-            solved = np.asarray(solution.factor.solve(columns))
-            pull = np.asarray(inference.model.coupling.transpose_mv(solved))
-            moves = ((root.T @ pull) ** 2).sum(0)
-            left = (columns * solved).sum(0) - ((wide.T @ pull) ** 2).sum(0)
-            slopes[type(systematic)] = moves, left
-        moves, left = (x[which].sum() for x in slopes[type(systematic)])
-        bias = float(np.sqrt(moves / len(sky)))
-        spots.append(BlindSpot(name, size, unit, bias, float(left / np.sqrt(2.0 * degrees))))
+        centre = np.zeros(len(systematic.names))
+        columns = np.asarray(systematic.linearised(model, centre)(sky))
+        solved = np.asarray(solution.factor.solve(columns))
+        pull = np.asarray(inference.model.coupling.transpose_mv(solved))
+        moves = ((root.T @ pull) ** 2).sum(0)
+        left = (columns * solved).sum(0) - ((wide.T @ pull) ** 2).sum(0)
+        moves, left = (x.reshape(len(sizes), -1).sum(1) for x in (moves, left))
+        bias, shown = np.sqrt(moves / len(sky)), left / np.sqrt(2.0 * degrees)
+        for k, (name, size) in enumerate(sizes.items()):
+            if name not in has:
+                spots.append(BlindSpot(name, size, unit, float(bias[k]), float(shown[k])))
     return tuple(spots)
 
 

@@ -84,14 +84,12 @@ def write_map(
         Whether the pixel ever rose above the horizon: the third column, OBSERVED, 1 or 0.
     scenario : Scenario
     """
-    columns = {name: (pixels, np.float64, "K") for name, pixels in maps.items()}
-    names = list(columns)
-    columns["observed"] = observed, np.uint8, ""
-    order = [*names[:2], "observed", *names[2:]]
-    values, dtypes, units = zip(*(columns[name] for name in order), strict=True)
+    columns = [(name.upper(), pixels, np.float64, "K") for name, pixels in maps.items()]
+    columns.insert(2, ("OBSERVED", observed, np.uint8, ""))
+    names, values, dtypes, units = map(list, zip(*columns, strict=True))
     extra = [(key, *value) for key, value in cards("maps", scenario).items()]
-    named = {"column_names": [name.upper() for name in order], "column_units": list(units)}
-    healpy.write_map(path, values, coord="G", extra_header=extra, dtype=list(dtypes), **named)
+    named = {"column_names": names, "column_units": units, "dtype": dtypes}
+    healpy.write_map(path, values, coord="G", extra_header=extra, **named)
 
 
 def write_index_maps(path: Path, found: IndexMaps, scenario: Scenario) -> None:
@@ -176,18 +174,15 @@ def posterior_tree(result: MapResult) -> xr.DataTree:
 
 def _observed(channels: Sequence[ChannelResult], axis: dict) -> dict[str, xr.Dataset]:
     """The data and their times; NaN at times that a channel lacks."""
-    parts, turns = [], []
+    parts = []
     for channel in channels:
         coords = {"product": list(channel.labels), "time": ("time", channel.hours, HOURS)}
         grid = (("product", "time"), channel.data, {"units": "K"})
-        parts.append(xr.Dataset({"visibility": grid}, coords))
         angle = ("time", channel.turntable_deg, {"units": "degree"})
-        turns.append(xr.Dataset({"turntable_deg": angle}, {"time": coords["time"]}))
-    along = xr.Variable(*axis["frequency"][:2], axis["frequency"][2])
-    return {
-        name: xr.concat(each, along.to_index_variable(), join="outer")
-        for name, each in {"observed_data": parts, "constant_data": turns}.items()
-    }
+        parts.append(xr.Dataset({"visibility": grid, "turntable_deg": angle}, coords))
+    along = xr.Variable(*axis["frequency"]).to_index_variable()
+    whole = xr.concat(parts, along, join="outer")
+    return {"observed_data": whole[["visibility"]], "constant_data": whole[["turntable_deg"]]}
 
 
 INFORMATION = "information"

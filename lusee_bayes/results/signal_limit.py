@@ -22,7 +22,7 @@ from scipy.optimize import least_squares
 from scipy.stats import foldnorm
 
 from lusee_bayes.core.arrays import Square, Vector
-from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.errors import InputError, refusing
 from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.linalg import checked_cholesky
 from lusee_bayes.core.reading import read_table
@@ -195,12 +195,10 @@ def named_template(text: str) -> tuple[str, Callable[[Frequencies], Vector]]:
     if kind == "constant" and not numbers:
         return "constant", np.ones_like
     if kind == "trough":
-        try:
+        with refusing(f"got '{text}', expected trough:MHZ:WIDTH, as trough:17.5:3", ValueError):
             centre, width = map(float, numbers)
             if not width > 0.0:
                 raise ValueError
-        except ValueError:
-            raise InputError(f"got '{text}', expected trough:MHZ:WIDTH, as trough:17.5:3") from None
         name = f"trough at {centre:g} MHz, {width:g} MHz wide"
         return name, lambda f: -np.exp(-0.5 * ((f - centre) / width) ** 2)
     if not Path(text).is_file():

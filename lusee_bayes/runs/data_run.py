@@ -331,11 +331,6 @@ class Averages:
         """Share of the live time of all products that averaging drops because of flags."""
         return 1.0 - product_live_s(self.averaged) / product_live_s(self.data)
 
-    @property
-    def lost_bits(self) -> float | None:
-        """Information about the map that the averages lack, in bits; None if unknown."""
-        return None if self.bits is None else self.bits[0] - self.bits[1]
-
     def lines(self) -> tuple[str, ...]:
         """Lines for a terminal."""
         before, after = (d.observation for d in (self.data, self.averaged))
@@ -348,7 +343,7 @@ class Averages:
             fine, coarse = self.bits
             said.append(
                 f"information about the map: {fine:.2f} bits -> {coarse:.2f} bits, "
-                f"{self.lost_bits:.2g} lost"
+                f"{fine - coarse:.2g} lost"
             )
         return tuple(said)
 

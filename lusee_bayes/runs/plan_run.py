@@ -20,12 +20,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from lusee_bayes.core.arrays import namespace
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import replacing
 from lusee_bayes.core.harmonics import sum_over_m
-from lusee_bayes.core.linalg import solve_lower
+from lusee_bayes.core.linalg import invert_lower
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming, parse_yaml
 from lusee_bayes.core.version import __version__
@@ -60,9 +59,7 @@ def informed_modes(posterior: Posterior) -> int:
     They are counted on the covariance of the whitened sky, whose eigenvalues lie between 0 and 1.
     On Lambda, whose largest eigenvalue is 1e13, rounding would blur the threshold.
     """
-    xp = namespace(posterior.lower)
-    lower = xp.tril(posterior.lower)
-    half = np.asarray(solve_lower(lower, xp.eye(lower.shape[0]), transpose=False))
+    half = np.asarray(invert_lower(posterior.lower))
     return int((np.linalg.eigvalsh(half.T @ half) < 0.5).sum())
 
 

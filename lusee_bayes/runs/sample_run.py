@@ -10,6 +10,7 @@ import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace as replace_fields
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -208,14 +209,11 @@ def start_values(inference: Inference, latent: Sequence[str]) -> dict[str, np.nd
 
 def _chart(arguments: dict, latent: list[str]) -> Chart | None:
     """The curved coordinates of a systematic among a program's arguments, if any."""
-    gaussian = arguments.get("gaussian")
-    for piece in arguments.values():
-        for systematic in piece if isinstance(piece, tuple) else (piece,):
-            if gaussian is not None and isinstance(systematic, Systematic):
-                chart = systematic.chart(gaussian)
-                if chart is not None and set(chart.names) <= set(latent):
-                    return chart
-    return None
+    if (gaussian := arguments.get("gaussian")) is None:
+        return None
+    pieces = chain.from_iterable(p if isinstance(p, tuple) else (p,) for p in arguments.values())
+    charts = (piece.chart(gaussian) for piece in pieces if isinstance(piece, Systematic))
+    return next((c for c in charts if c is not None and set(c.names) <= set(latent)), None)
 
 
 def _finished(path: Path, identity: dict, sampler: Sampler) -> xr.DataTree | None:
