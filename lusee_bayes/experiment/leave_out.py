@@ -212,15 +212,12 @@ class Fitting:
     flagged : (products, times) array of bool
     remark : str
         A remark for the report, or empty.
-    groups : tuple of DataGroup
-        Products and days that are flagged as a whole.
     share : float
         Fraction of the values that is flagged.
     """
 
     flagged: GridFlags
     remark: str = ""
-    groups: tuple[DataGroup, ...] = ()
     share: float = 0.0
 
 
@@ -268,7 +265,7 @@ def fitting(
         if not flagged.any():
             share = rules.count(gone) / data.layout.size
             remark = " ".join(filter(None, [rules.remark(gone, groups, share), kept]))
-            return Fitting(gone, remark, groups, share)
+            return Fitting(gone, remark, share)
     return Fitting(nothing, f"{TOO_MANY} {kept}".strip())
 
 

@@ -183,7 +183,7 @@ class Inference:
 
 
 # learns a prior from the information in data, starting at given parameters
-Learning = Callable[[Information, Float[np.ndarray, " parameters"] | None], Learned]
+Learning = Callable[[Information, Vector | None], Learned]
 # receives the number of rounds done, and a remark
 Report = Callable[[int, str], None]
 
@@ -556,7 +556,7 @@ def with_learned_prior(
         return information if earlier is None else information + earlier
 
     def learn(information: Information, at: Vector | None) -> Learned:
-        return learned_prior(setup, setup.family, whole(information), first if at is None else at)
+        return learned_prior(setup, whole(information), first if at is None else at)
 
     if AboveLmax.treatment(setup.scenario) == "marginalised":
         # the expected sky above lmax follows from the prior learned below
@@ -608,19 +608,13 @@ def first_learned(setup: Setup, information: Information) -> tuple[PriorFamily, 
     return family, learn_whatever_fits(family, information, None, scenario.seed)
 
 
-def learned_prior(
-    setup: Setup,
-    family: PriorFamily,
-    information: Information,
-    start: Float[np.ndarray, " parameters"] | None = None,
-) -> Learned:
-    """Learn the prior of a family; if lmax is high, first up to a lower ell.
+def learned_prior(setup: Setup, information: Information, start: Vector | None = None) -> Learned:
+    """Learn the prior of the setup's family; if lmax is high, first up to a lower ell.
 
     Parameters
     ----------
     setup : Setup
-        Setup of the family's scenario.
-    family : PriorFamily
+        With a family of priors.
     information : Information
         The data's information about the sky.
     start : (parameters,) array, optional
@@ -628,8 +622,8 @@ def learned_prior(
     """
     if start is None and setup.scenario.lmax > COARSE_LMAX:
         coarse, learned = first_learned(setup, information)
-        start = family.start_from(coarse, learned.parameters) if learned.settled else None
-    return learn_whatever_fits(family, information, start, setup.scenario.seed)
+        start = setup.family.start_from(coarse, learned.parameters) if learned.settled else None
+    return learn_whatever_fits(setup.family, information, start, setup.scenario.seed)
 
 
 # uses C_ell of the scenario's sky, which is only known in simulations

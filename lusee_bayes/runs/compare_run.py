@@ -141,7 +141,7 @@ def _under(
     if setup.family is None:
         learned, evidence = None, float(information.posterior(setup.prior).log_evidence)
     else:
-        learned = learned_prior(setup, setup.family, information)
+        learned = learned_prior(setup, information)
         setup, evidence = replace(setup, prior=learned.prior), learned.log_evidence
     solved = None if rebuilds(setup) else inferred.under(setup.prior)
     mapped = replace(experiment, setup=setup, learned=learned, inference=solved)
