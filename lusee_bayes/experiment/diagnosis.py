@@ -46,8 +46,7 @@ from lusee_bayes.judge.chi2 import ChiSquare, stands_out, two_sided
 from lusee_bayes.judge.measures import expected_chi2
 from lusee_bayes.judge.residuals import Residuals
 from lusee_bayes.judge.split import WIDER, with_sky
-from lusee_bayes.linear.linear_gaussian import FromInformation, LinearGaussian
-from lusee_bayes.linear.posterior import Posterior
+from lusee_bayes.linear.linear_gaussian import FromInformation, LinearGaussian, Solution
 from lusee_bayes.sky.prior import HarmonicPrior
 from lusee_bayes.systematics.context import Around, Setup
 
@@ -237,8 +236,8 @@ class UnderAnySky:
         spectrum = mean_over_m(power) * (WIDER * np.fmax(1.0, brighter)) ** 2
         return cls(setup, data, model, spectrum)
 
-    def wide(self, coupling: Coupling) -> tuple[ChiSquare, Posterior]:
-        """Residual chi^2, and the posterior under the wide prior."""
+    def wide(self, coupling: Coupling) -> tuple[ChiSquare, Solution]:
+        """Residual chi^2, and the solution under the wide prior."""
         n_ells = lmax_of(coupling.shape[1]) + 1
         more = max(0, n_ells - len(self.spectrum))
         spectrum = np.pad(self.spectrum, (0, more), mode="edge")[:n_ells]
@@ -247,7 +246,7 @@ class UnderAnySky:
         posterior, n = solution.posterior, model.n_data
         chi2 = float(solution.information.chi2(posterior.mean) + posterior.prior_chi2())
         degrees = n - with_sky(n - expected_chi2(posterior, n))
-        return ChiSquare(chi2, float(degrees)), posterior
+        return ChiSquare(chi2, float(degrees)), solution
 
     def under(self, beams: ProductBeams, observation: Observation, pointing: Pointing) -> ChiSquare:
         """Residual chi^2 with other beams or another observation.
@@ -287,18 +286,18 @@ TIMES = 32
 class MixedProducts:
     """Q of the module's equations for some data.
 
-    judge : UnderAnySky; posterior : under the wide prior; grid : (products, times) array, in K; q :
+    judge : UnderAnySky; solution : under the wide prior; grid : (products, times) array, in K; q :
     (columns, columns) array, for every x_jk, ones in every product, the reversed times, and b
     """
 
     judge: UnderAnySky
-    posterior: Posterior
+    solution: Solution
     grid: Grid
     q: Float[np.ndarray, "columns columns"]
 
     @classmethod
-    def of(cls, judge: UnderAnySky, posterior: Posterior) -> MixedProducts:
-        """Compute Q from data and their posterior under the wide prior."""
+    def of(cls, judge: UnderAnySky, solution: Solution) -> MixedProducts:
+        """Compute Q from data and their solution under the wide prior."""
         grid, layout, offset = filled(judge.data), judge.data.layout, judge.model.offset
         n, product, time = len(grid), layout.product, layout.time
         mixed = np.zeros((layout.size, n, n))
@@ -306,7 +305,7 @@ class MixedProducts:
         steady = np.zeros(layout.size) if offset is None else np.asarray(offset)
         columns = [mixed.reshape(layout.size, -1), np.eye(n)[product]]
         columns += [np.stack([grid[:, ::-1][product, time], steady], axis=1)]
-        return cls(judge, posterior, grid, _gram(judge, posterior, np.concatenate(columns, axis=1)))
+        return cls(judge, solution, grid, _gram(solution, np.concatenate(columns, axis=1)))
 
     def tried(self) -> Iterator[tuple[float, DataMistake]]:
         """Yield every mistake in the data with its chi^2."""
@@ -363,23 +362,21 @@ class MixedProducts:
 
     def _times(self) -> Iterator[tuple[float, DataMistake]]:
         """A factor of all products at one time, for each of the worst times."""
-        judge, layout, values = self.judge, self.judge.data.layout, np.asarray(self.judge.data.data)
-        factor = judge.model.noise.factor()
-        # K^-1 (d - b)
-        off = values - np.asarray(judge.model.predict(self.posterior.mean))
-        left = np.asarray(factor.solve(off))
+        data, layout, values = self.judge.data, self.judge.data.layout, self.solution.data
+        left = self.solution.weighted_residual()  # K^-1 (d - b)
+        solved = np.asarray(self.solution.factor.solve(values))
         pull = np.bincount(layout.time, values * left, layout.n_times)
-        most = np.bincount(layout.time, values * np.asarray(factor.solve(values)), layout.n_times)
+        most = np.bincount(layout.time, values * solved, layout.n_times)
         worst = np.argsort(-(pull**2) / np.where(most > 0.0, most, np.inf))[:TIMES]
         worst = worst[most[worst] > 0.0]
         columns = np.where(layout.time[:, None] == worst, values[:, None], 0.0)
-        curvature = np.diagonal(_gram(judge, self.posterior, columns))
+        curvature = np.diagonal(_gram(self.solution, columns))
         whole = weights(np.eye(len(self.grid)))
         for time, bend in zip(worst.tolist(), curvature.tolist(), strict=True):
             if not bend > 0.0:  # other times do not predict this one
                 continue
             factor = 1.0 - pull[time] / bend
-            when = judge.data.observation.times[time].isot[:19]
+            when = data.observation.times[time].isot[:19]
             wrong = (
                 f"all products at {when} are {_number(1.0 / factor, bend**-0.5)} times the "
                 "prediction from other times"
@@ -394,12 +391,12 @@ def _number(factor: float, std: float) -> str:
     return f"{factor:.5g} +- {std * factor**2:.1g}"
 
 
-def _gram(judge: UnderAnySky, posterior: Posterior, columns: Float[np.ndarray, "data n"]) -> Square:
+def _gram(solution: Solution, columns: Float[np.ndarray, "data n"]) -> Square:
     """X^T K^-1 X with K^-1 = N^-1 - N^-1 A C A^T N^-1."""
-    solved = np.asarray(judge.model.noise.factor().solve(columns))
-    seen = np.asarray(judge.model.coupling.transpose_mv(solved)).T
-    white = np.asarray(posterior.prior.colour_columns(seen)).T
-    half = solve_lower(posterior.lower, white, transpose=False)
+    solved = np.asarray(solution.factor.solve(columns))
+    seen = np.asarray(solution.model.coupling.transpose_mv(solved)).T
+    white = np.asarray(solution.model.prior.colour_columns(seen)).T
+    half = solve_lower(solution.posterior.lower, white, transpose=False)
     return columns.T @ solved - half.T @ half
 
 
@@ -491,14 +488,14 @@ def diagnose(experiment: Experiment, inference: Inference, residuals: Residuals)
     """
     setup, data = experiment.setup, experiment.data
     judge = UnderAnySky.of(setup, data, inference.model)
-    base, posterior = judge.wide(judge.model.coupling)
+    base, solution = judge.wide(judge.model.coupling)
 
     def best(tried: Sequence[tuple[float, object]], most: float) -> list:
         """The mistakes with the smallest chi^2, below ``most``."""
         better = sorted((one for one in tried if one[0] < most), key=lambda one: one[0])
         return [one for _, one in better[:TRIED]]
 
-    of_data = list(MixedProducts.of(judge, posterior).tried())
+    of_data = list(MixedProducts.of(judge, solution).tried())
     promising = base.degrees + PROMISING * abs(base.chi2 - base.degrees)
     proposals = [Proposal(m.words, m.remedy, judge.without(m)) for m in best(of_data, promising)]
     low = Pointing.of(setup.observation, min(SCREENED_LMAX, setup.scenario.lmax))

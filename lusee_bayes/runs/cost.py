@@ -77,11 +77,7 @@ class Cost:
         return OVERHEAD_S + self.n_channels * each + self.operations / _operations_a_second()
 
     def line(self) -> str:
-        """Line for a terminal."""
-        return f"{self.sizes()} and {duration(self.seconds)}"
-
-    def sizes(self) -> str:
-        """:meth:`line` without the time, which does not include sampling."""
+        """Data, unknowns and memory in a line for a terminal."""
         channels = f"{self.n_channels} channels of " if self.n_channels > 1 else ""
         return (
             f"  {channels}{self.n_data:,} data, {self.n_unknowns:,} unknowns: about "
@@ -239,7 +235,8 @@ def require_resources(
     cost = posterior_cost(scenario, n_draws, n_data)
     require_fits(cost, scenario, n_draws, n_data)
     if stages.console is not None:
-        stages.say(cost.sizes() if n_draws else cost.line())
+        # the estimated time does not include sampling
+        stages.say(cost.line() + ("" if n_draws else f" and {duration(cost.seconds)}"))
 
 
 def measured_experiment(

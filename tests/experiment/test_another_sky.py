@@ -216,7 +216,7 @@ def test_chi2_of_mixed_data_is_that_of_matrices():
     model = lb.infer(lb.build(scenario, data)).model
     spectrum = 1e2 * np.asarray(setup.sky.spectrum())
     here = diagnosis.UnderAnySky(setup, data, model, spectrum)
-    base, posterior = here.wide(model.coupling)
+    base, solution = here.wide(model.coupling)
     a, s = np.asarray(model.coupling.dense()), np.asarray(lb.HarmonicPrior(spectrum).variance())
     inverse = np.linalg.inv(a @ np.diag(s) @ a.T + np.asarray(model.noise.dense()))
 
@@ -226,7 +226,7 @@ def test_chi2_of_mixed_data_is_that_of_matrices():
 
     grid = np.asarray(data.grid())
     assert base.chi2 == pytest.approx(expected(grid), rel=1e-4)
-    tried = list(diagnosis.MixedProducts.of(here, posterior).tried())
+    tried = list(diagnosis.MixedProducts.of(here, solution).tried())
     for chi2, mistake in tried[:40:5] + tried[-40::7]:
         right = expected(mistake.undone(grid))
         assert chi2 == pytest.approx(right, rel=1e-4, abs=1e-3 * base.chi2), mistake.words
