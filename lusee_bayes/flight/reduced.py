@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +13,10 @@ from jaxtyping import Bool, Float, Float32, Int, Shaped, UInt8
 from lusee_bayes.core import formats
 from lusee_bayes.core.checks import Described, counted, require_shape
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.lazy import xarray
 from lusee_bayes.core.reading import naming
 from lusee_bayes.core.trees import from_tree, opened_tree, quantity, write_tree
-from lusee_bayes.flight.gain_model import COUNTS, LEAD, LETTERS, N_COMPONENTS, PLACES, Curves
-from lusee_bayes.flight.session import AUTOS, FIRST_PORT, N_PRODUCTS, NO_LEVEL, PORTS, SECOND_PORT
+from lusee_bayes.flight.gain_model import COUNTS, LEAD, LETTERS, PLACES, Curves
+from lusee_bayes.flight.session import FIRST_PORT, NO_LEVEL, PORTS, SECOND_PORT
 from lusee_bayes.instrument.averaging import binned
 from lusee_bayes.instrument.beams.fields import place_of
 from lusee_bayes.instrument.observation import Observation, runs_of
@@ -52,139 +50,98 @@ NOISY, CURVED = 1.2, 0.5
 MUCH = 0.2
 
 
-@dataclass(frozen=True, repr=False, eq=False)
-class Reduced(Described):
-    """Spectra in bands, at every stage from single spectra to averages over time.
-
-    Numbers are for bands, products and bins of time. At first every spectrum is a separate bin; in
-    the end a bin has all spectra of a few hours. Flags are for spectra ("rows").
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Bands:
+    """What reduced spectra have in common with their file.
 
     Attributes
     ----------
-    frequencies_mhz : (bands,) array
-    bandwidth_mhz : float
-    observation : Observation
-        A sample for each spectrum; a run for each state of the spectrometer.
-    bin_of : (rows,) array of int
-        Time bin of each spectrum.
-    average_s : float or None
-        Length of the bins; None if each spectrum is one.
-    reason : (bands, rows) array of uint8
-        Why a spectrum is not used, as an index of :data:`REASONS`.
-    values : (bands, products, bins) array
-        In V^2/Hz at the receivers' inputs, NaN where no data remain.
-    before : (bands, products, bins) array
-        Means before flagging, for figures.
     n_averaged : (bands, bins) array
         Independent samples of voltages behind each value; 0 where no data remain.
     level : (bins, ports) array of str
         Levels of the gain.
     gain : (bands, ports, bins) array
         Counts for 1 nV^2/Hz.
-    slope : (bands, ports, components, bins) array
+    gain_slope : (bands, ports, components, bins) array
         Relative change of the power gain with each component of the gain table.
-    bend : (bands, ports, bins) array
-        Change of the autos by two further powers of the frequency, in standard deviations. From a
-        file it is one number for a band, its :attr:`curvature`; so are the next two.
-    span_scatter : (bands, spans) array
-        Scatter in time over the radiometer noise, for spans of a few hours; NaN if unknown.
-    slab_scatter : (bands, slabs) array
-        Scatter of channels about a smooth spectrum over the radiometer noise, for slabs of spectra.
-    lines : (bands, rows) array
-        Share of a spectrum's channels in a band that are flagged.
     component_std : (levels, ports, components) array or None
         Standard deviations of the components.
-    gain_std : float or None
-        Relative standard deviation of the gains of a level of a port.
     curves : Curves
         The gains over frequency, for figures.
-    sessions : tuple of mapping
+    scatter : (bands,) array
+        Median scatter of the spectra in time over the radiometer noise; NaN if unknown.
+    line_scatter : (bands,) array
+        Median scatter of the channels about a smooth spectrum, likewise.
+    curvature : (bands,) array
+        Change of the autos by two further powers of the frequency, in standard deviations: the mean
+        over bins, where noise averages out, for the worst port.
+    bin_of : (rows,) array of int
+        Time bin of each spectrum.
+    reason : (bands, rows) array of uint8
+        Why a spectrum is not used, as an index of :data:`REASONS`.
+    bandwidth_mhz : float
+    average_s : float or None
+        Length of the bins; None if each spectrum is one.
+    gain_std : float or None
+        Relative standard deviation of the gains of a level of a port.
+    sessions : tuple of dict
         Origin of the spectra.
-    recipe : mapping of str to str
-        How they were reduced, in words; empty if an older file lacks this.
+    recipe : dict of str to str
+        How they were reduced, in words.
+    """
+
+    n_averaged: Float[np.ndarray, "frequency bin"] = quantity("1", checks={"low": 0.0})
+    level: Shaped[np.ndarray, "bin port"] = quantity("", checks={"choices": (*LETTERS, NO_LEVEL)})
+    gain: Float[np.ndarray, "frequency port bin"] = quantity(COUNTS)
+    gain_slope: Float[np.ndarray, "frequency port component bin"] = quantity("1")
+    component_std: Float[np.ndarray, "letter port component"] | None = quantity(
+        "1", checks={"low": 0.0}
+    )
+    curves: Curves
+    scatter: Float[np.ndarray, " frequency"] = quantity("1", "over radiometer noise, in time")
+    line_scatter: Float[np.ndarray, " frequency"] = quantity("1", "of channels, likewise")
+    curvature: Float[np.ndarray, " frequency"] = quantity("1", "in standard deviations")
+    bin_of: Int[np.ndarray, " spectrum"] = quantity("1", checks={"low": 0.0})
+    reason: UInt8[np.ndarray, "frequency spectrum"] = quantity(
+        "1",
+        checks={"low": 0.0, "high": len(REASONS) - 1.0},
+        attributes={
+            "flag_values": np.arange(len(REASONS), dtype=np.uint8),
+            "flag_meanings": " ".join(reason.replace(" ", "_") for reason in REASONS),
+        },
+        packed=True,
+    )
+    bandwidth_mhz: float
+    average_s: float | None
+    gain_std: float | None
+    sessions: tuple[dict[str, Any], ...]
+    recipe: dict[str, str]
+
+
+@dataclass(frozen=True, kw_only=True, repr=False, eq=False)
+class Reduced(Described, Bands):
+    """Spectra in bands, averaged over time.
+
+    Numbers are for bands, products and bins of time; flags are for spectra ("rows").
+
+    Attributes
+    ----------
+    frequencies_mhz : (bands,) array
+    observation : Observation
+        A sample for each spectrum; a run for each state of the spectrometer.
+    values : (bands, products, bins) array
+        In V^2/Hz at the receivers' inputs, NaN where no data remain.
+    before : (bands, products, bins) array
+        Means before flagging, for figures.
+    lines : (bands, rows) array
+        Share of a spectrum's channels in a band that are flagged.
     """
 
     frequencies_mhz: Float[np.ndarray, " bands"]
-    bandwidth_mhz: float
     observation: Observation
-    bin_of: Int[np.ndarray, " rows"]
-    average_s: float | None
-    reason: UInt8[np.ndarray, "bands rows"]
     values: Float[np.ndarray, "bands products bins"]
     before: Float[np.ndarray, "bands products bins"]
-    n_averaged: Float[np.ndarray, "bands bins"]
-    level: Shaped[np.ndarray, "bins ports"]
-    gain: Float[np.ndarray, "bands ports bins"]
-    slope: Float[np.ndarray, "bands ports components bins"]
-    bend: Float[np.ndarray, "bands _ _"]
-    span_scatter: Float[np.ndarray, "bands spans"]
-    slab_scatter: Float[np.ndarray, "bands slabs"]
     lines: Float32[np.ndarray, "bands rows"]
-    component_std: Float[np.ndarray, "levels ports components"] | None
-    gain_std: float | None
-    curves: Curves
-    sessions: tuple[Mapping[str, Any], ...]
-    recipe: Mapping[str, str] = field(default_factory=dict)
-
-    @classmethod
-    def blank(
-        cls,
-        like: Mapping[str, Any],
-        observation: Observation,
-        bin_of: Int[np.ndarray, " rows"],
-        level: Shaped[np.ndarray, "bins ports"],
-        n_slabs: int = 0,
-    ) -> Reduced:
-        """Return a reduction without numbers, to be filled in place.
-
-        Parameters
-        ----------
-        like : mapping of str to object
-            All that does not depend on the spectra.
-        observation : Observation
-        bin_of : (rows,) array of int
-        level : (bins, ports) array of str
-        n_slabs : int
-            Number of slabs of spectra.
-        """
-        bands, rows, bins = len(like["frequencies_mhz"]), len(bin_of), len(level)
-        return cls(
-            observation=observation,
-            bin_of=bin_of,
-            level=level,
-            reason=np.zeros((bands, rows), dtype=np.uint8),
-            lines=np.zeros((bands, rows), dtype=np.float32),
-            values=np.full((bands, N_PRODUCTS, bins), np.nan),
-            before=np.full((bands, N_PRODUCTS, bins), np.nan),
-            n_averaged=np.zeros((bands, bins)),
-            gain=np.full((bands, PORTS, bins), np.nan),
-            slope=np.zeros((bands, PORTS, N_COMPONENTS, bins)),
-            bend=np.full((bands, PORTS, bins), np.nan),
-            span_scatter=np.empty((bands, 0)),
-            slab_scatter=np.full((bands, n_slabs), np.nan),
-            **like,
-        )
-
-    @cached_property
-    def scatter(self) -> Float[np.ndarray, " bands"]:
-        """Median scatter of the spectra in time over the radiometer noise; NaN if unknown."""
-        return _medians(self.span_scatter)
-
-    @cached_property
-    def line_scatter(self) -> Float[np.ndarray, " bands"]:
-        """Median scatter of the channels about a smooth spectrum, likewise."""
-        return _medians(self.slab_scatter)
-
-    @cached_property
-    def curvature(self) -> Float[np.ndarray, " bands"]:
-        """Mean of :attr:`bend` over bins, where noise averages out, for the worst port."""
-        means = xarray.DataArray(self.bend, dims=("band", "port", "bin")).mean("bin")
-        return np.abs(means).max("port").values
-
-    def noise(self, band: int) -> Float[np.ndarray, "ports bins"]:
-        """Return the standard deviations of the autos, from the radiometer equation."""
-        with np.errstate(invalid="ignore", divide="ignore"):
-            return np.abs(self.values[band, AUTOS]) / np.sqrt(self.n_averaged[band])
 
     def description(self) -> tuple[str, ...]:
         f = self.frequencies_mhz
@@ -335,7 +292,9 @@ class Reduced(Described):
         if self.gain_std is not None:
             yield place, np.where(at_level, self.gain_std, 0.0)
         if self.component_std is not None:
-            slopes = self.component_std[PLACES[place]][:, None] * self.slope[band, port][:, bins]
+            slopes = (
+                self.component_std[PLACES[place]][:, None] * self.gain_slope[band, port][:, bins]
+            )
             for number, slope in enumerate(slopes, start=1):
                 yield f"{place} PC{number}", np.where(at_level, slope, 0.0)
 
@@ -353,21 +312,14 @@ def _percent(shares: Mapping[str, float]) -> str:
     return ", ".join(f"{name} {share:.2%}" for name, share in shares.items())
 
 
-def _medians(parts: Float[np.ndarray, "bands parts"]) -> Float[np.ndarray, " bands"]:
-    return xarray.DataArray(parts, dims=("band", "part")).median("part").values
-
-
 HINT = "make it with: lusee-bayes reduce SCENARIO SESSION..."
 # name of the file of reduced spectra in a run
 REDUCED = "reduced.nc"
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Saved:
-    """Contents of a file: :class:`Reduced`, with an observation's times, windows and place.
-
-    Medians over parts of a band are one number for a band.
-    """
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Saved(Bands):
+    """Contents of a file, with an observation's times, windows and place."""
 
     frequency: Float[np.ndarray, " frequency"] = quantity(
         "MHz", checks={"low": 0.0, "grows": True, "unit": "MHz"}
@@ -375,53 +327,20 @@ class _Saved:
     product: Shaped[np.ndarray, " product"] = quantity("", checks={"choices": labels()})
     visibility: Float[np.ndarray, "frequency product bin"] = quantity("V2 Hz-1", packed=True)
     before_flags: Float32[np.ndarray, "frequency product bin"] = quantity("V2 Hz-1", packed=True)
-    n_averaged: Float[np.ndarray, "frequency bin"] = quantity("1", checks={"low": 0.0})
-    level: Shaped[np.ndarray, "bin port"] = quantity("", checks={"choices": (*LETTERS, NO_LEVEL)})
-    gain: Float[np.ndarray, "frequency port bin"] = quantity(COUNTS)
-    gain_slope: Float[np.ndarray, "frequency port component bin"] = quantity("1")
-    component_std: Float[np.ndarray, "letter port component"] | None = quantity(
-        "1", checks={"low": 0.0}
-    )
-    curves: Curves
-    scatter: Float[np.ndarray, " frequency"] = quantity("1", "over radiometer noise, in time")
-    line_scatter: Float[np.ndarray, " frequency"] = quantity("1", "of channels, likewise")
-    curvature: Float[np.ndarray, " frequency"] = quantity("1", "in standard deviations")
     jd1: Float[np.ndarray, " spectrum"] = quantity("d", "Julian date, UTC", checks={})
     jd2: Float[np.ndarray, " spectrum"] = quantity("d", "its second part", checks={})
     run: Int[np.ndarray, " spectrum"] = quantity("1", checks={"low": 0.0})
-    bin_of: Int[np.ndarray, " spectrum"] = quantity("1", checks={"low": 0.0})
     window_start_s: Float[np.ndarray, " spectrum"] | None = quantity("s", checks={})
     window_end_s: Float[np.ndarray, " spectrum"] | None = quantity("s", checks={})
     live_s: Float[np.ndarray, " spectrum"] | None = quantity("s", checks={"low": 0.0})
     turntable_deg: Float[np.ndarray, " state"] = quantity("degree", checks={})
-    reason: UInt8[np.ndarray, "frequency spectrum"] = quantity(
-        "1",
-        checks={"low": 0.0, "high": len(REASONS) - 1.0},
-        attributes={
-            "flag_values": np.arange(len(REASONS), dtype=np.uint8),
-            "flag_meanings": " ".join(reason.replace(" ", "_") for reason in REASONS),
-        },
-        packed=True,
-    )
     line_share: Float32[np.ndarray, "frequency spectrum"] = quantity(
         "1", "flagged channels", checks={"low": 0.0, "high": 1.0}, packed=True
     )
     lon_deg: float
     lat_deg: float
     step_s: float
-    bandwidth_mhz: float
-    average_s: float | None
-    gain_std: float | None
-    sessions: tuple[dict[str, Any], ...]
-    recipe: dict[str, str]
     scenario: str = ""
-
-
-# names in files, and the corresponding names in Reduced
-NAMES = {"frequency": "frequencies_mhz", "visibility": "values", "gain_slope": "slope"}
-NAMES |= {"line_share": "lines"}
-SAME = ("n_averaged", "level", "gain", "component_std", "gain_std", "curves", "bin_of", "reason")
-NAMES |= {name: name for name in (*SAME, "bandwidth_mhz", "average_s", "sessions", "recipe")}
 
 
 def write_reduced(path: str | Path, reduced: Reduced, scenario: str = "") -> Path:
@@ -436,8 +355,11 @@ def write_reduced(path: str | Path, reduced: Reduced, scenario: str = "") -> Pat
     """
     seen, windows = reduced.observation, reduced.observation.windows
     saved = _Saved(
+        frequency=reduced.frequencies_mhz,
         product=np.array(labels()),
+        visibility=reduced.values,
         before_flags=reduced.before.astype(np.float32),
+        line_share=reduced.lines,
         jd1=seen.times.jd1,
         jd2=seen.times.jd2,
         run=np.asarray(seen.run),
@@ -447,8 +369,7 @@ def write_reduced(path: str | Path, reduced: Reduced, scenario: str = "") -> Pat
         live_s=None if windows is None else windows.live_s,
         scenario=scenario,
         **{name: getattr(seen, name) for name in ("lon_deg", "lat_deg", "step_s")},
-        **{name: getattr(reduced, name) for name in ("scatter", "line_scatter", "curvature")},
-        **{name: getattr(reduced, ours) for name, ours in NAMES.items()},
+        **_in_common(reduced),
     )
     return write_tree(path, saved, formats.REDUCED)
 
@@ -483,10 +404,14 @@ def read_reduced(path: str | Path) -> Reduced:
     if saved.bin_of.max() >= saved.n_averaged.shape[1]:
         raise InputError(f"{path}: bin_of exceeds the {saved.n_averaged.shape[1]} bins")
     return Reduced(
+        frequencies_mhz=saved.frequency,
         observation=observation,
+        values=saved.visibility,
         before=saved.before_flags.astype(np.float64),
-        bend=saved.curvature[:, None, None],
-        span_scatter=saved.scatter[:, None],
-        slab_scatter=saved.line_scatter[:, None],
-        **{ours: getattr(saved, name) for name, ours in NAMES.items()},
+        lines=saved.line_share,
+        **_in_common(saved),
     )
+
+
+def _in_common(bands: Bands) -> dict[str, Any]:
+    return {one.name: getattr(bands, one.name) for one in fields(Bands)}

@@ -7,25 +7,26 @@ the final bins. No more spectra than that are ever in memory.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from lusee_bayes.core.arrays import RowFlags, Rows
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.lazy import xarray
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming
 from lusee_bayes.flight import flags, reduced, session
 from lusee_bayes.flight.bands import ChannelBand, shared_noise
-from lusee_bayes.flight.gain_model import NANO2, gain_curves
+from lusee_bayes.flight.gain_model import N_COMPONENTS, NANO2, gain_curves
 from lusee_bayes.flight.recipe import Recipe, Timeline, timeline
 from lusee_bayes.instrument.averaging import by_the_rule
 from lusee_bayes.instrument.times import seconds_from
@@ -36,6 +37,7 @@ SLAB, PIECE = 128, 1024
 Counts = Float32[np.ndarray, "rows products channels"]
 Strengths = Float[np.ndarray, "rows ports 3"]
 Scatter = Float[np.ndarray, " spans"]
+RowCounts = Int[np.ndarray, " rows"]
 StateOf = Callable[[int, tuple[str, ...]], "State"]
 
 
@@ -65,13 +67,13 @@ def reduce_sessions(
             f"({line.observation.step_s:g} s); use a longer one, or none"
         )
     level = np.concatenate([s.level for s in line.sessions])
-    like = _in_common(line, recipe, level)
     first = np.searchsorted(line.bin_of, np.arange(line.bin_of[-1] + 1))
-    whole = reduced.Reduced.blank(like, line.observation, line.bin_of, level[first])
-    numbers = range(len(recipe.frequencies_mhz))
+    n_bands, n_rows = len(recipe.frequencies_mhz), len(line.bin_of)
+    whole, numbers = Parts.blank(n_bands, n_rows, len(first)), range(n_bands)
+    live_s, times = line.observation.live_s, line.observation.times
     spans, slabs = [], []
     with (
-        stages.progress("spectra", len(line.bin_of)) as done,
+        stages.progress("spectra", n_rows) as done,
         ExitStack() as files,
         ThreadPoolExecutor(1) as ahead,
     ):
@@ -79,36 +81,84 @@ def reduce_sessions(
         counts = _read_ahead(ahead, files, line, pieces)
         state_of = lru_cache(maxsize=None)(partial(State.of, recipe))
         for piece in pieces:
-            keep = np.zeros(len(level), dtype=bool)
-            keep[piece] = True
-            starts = range(0, int(keep.sum()), SLAB)
-            layout = line.observation.select(keep), np.arange(keep.sum()), level[piece]
-            spectra = reduced.Reduced.blank(like, *layout, len(starts))
-            for start in starts:
+            n = piece.stop - piece.start
+            spectra = Parts.blank(n_bands, n, n)
+            for start in range(0, n, SLAB):
                 slab = _slab(line, recipe, state_of, piece.start + start, next(counts))
-                in_threads(partial(slab, spectra, start), numbers)
-            finish = partial(_finish, spectra, whole, piece, recipe.section.false_alarm)
-            spans.append(np.stack(in_threads(finish, numbers)))
-            slabs.append(spectra.slab_scatter)
+                slabs.append(in_threads(partial(slab, spectra, start), numbers))
+            seconds = seconds_from(times[piece][0], times[piece])
+            flag = partial(_flag_bursts, spectra, seconds, recipe.section.false_alarm)
+            spans.append(np.stack(in_threads(flag, numbers)))
+            mean = partial(_average, spectra, whole, piece, line.bin_of[piece], live_s[piece])
+            in_threads(mean, numbers)
             done(piece.stop)
-    of_spans, of_slabs = np.concatenate(spans, axis=1), np.concatenate(slabs, axis=1)
-    return replace(whole, span_scatter=of_spans, slab_scatter=of_slabs)
-
-
-def _in_common(line: Timeline, recipe: Recipe, level: session.PortLevels) -> dict[str, Any]:
-    """Attributes that do not depend on the spectra."""
     names = line.sessions[0].telemetry
     telemetry = {n: np.concatenate([s.telemetry[n] for s in line.sessions]) for n in names}
-    return {
-        "frequencies_mhz": np.array(recipe.frequencies_mhz),
-        "bandwidth_mhz": recipe.section.bandwidth_mhz,
-        "average_s": recipe.average_s,
-        "component_std": recipe.table.component_std,
-        "gain_std": recipe.section.gain_std,
-        "curves": gain_curves(recipe.table, recipe.section.gain_std, level, telemetry),
-        "sessions": tuple(_said_of(s, recipe) for s in line.sessions),
-        "recipe": recipe.words(),
-    }
+    bend = xarray.DataArray(whole.bend, dims=("band", "port", "bin")).mean("bin")
+    return reduced.Reduced(
+        frequencies_mhz=np.array(recipe.frequencies_mhz),
+        bandwidth_mhz=recipe.section.bandwidth_mhz,
+        average_s=recipe.average_s,
+        observation=line.observation,
+        bin_of=line.bin_of,
+        level=level[first],
+        component_std=recipe.table.component_std,
+        gain_std=recipe.section.gain_std,
+        curves=gain_curves(recipe.table, recipe.section.gain_std, level, telemetry),
+        sessions=tuple(_said_of(s, recipe) for s in line.sessions),
+        recipe=recipe.words(),
+        scatter=_medians(np.concatenate(spans, axis=1)),
+        line_scatter=_medians(np.array(slabs).T),
+        curvature=np.abs(bend).max("port").values,
+        **{one.name: getattr(whole, one.name) for one in fields(Parts) if one.name != "bend"},
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """Numbers of :class:`.Reduced`, while they are filled in: of a piece, or of all bins.
+
+    In a piece every spectrum is a separate bin.
+
+    Attributes
+    ----------
+    bend : (bands, ports, bins) array
+        Change of the autos by two further powers of the frequency, in standard deviations.
+    reason, lines, values, before, n_averaged, gain, gain_slope
+        As in :class:`.Reduced`.
+    """
+
+    reason: UInt8[np.ndarray, "bands rows"]
+    lines: Float32[np.ndarray, "bands rows"]
+    values: Float[np.ndarray, "bands products bins"]
+    before: Float[np.ndarray, "bands products bins"]
+    n_averaged: Float[np.ndarray, "bands bins"]
+    gain: Float[np.ndarray, "bands ports bins"]
+    gain_slope: Float[np.ndarray, "bands ports components bins"]
+    bend: Float[np.ndarray, "bands ports bins"]
+
+    @classmethod
+    def blank(cls, bands: int, rows: int, bins: int) -> Parts:
+        """Return arrays of these lengths, to be filled in."""
+        return cls(
+            reason=np.zeros((bands, rows), dtype=np.uint8),
+            lines=np.zeros((bands, rows), dtype=np.float32),
+            values=np.full((bands, session.N_PRODUCTS, bins), np.nan),
+            before=np.full((bands, session.N_PRODUCTS, bins), np.nan),
+            n_averaged=np.zeros((bands, bins)),
+            gain=np.full((bands, session.PORTS, bins), np.nan),
+            gain_slope=np.zeros((bands, session.PORTS, N_COMPONENTS, bins)),
+            bend=np.full((bands, session.PORTS, bins), np.nan),
+        )
+
+    def noise(self, band: int) -> Float[np.ndarray, "ports bins"]:
+        """Return the standard deviations of the autos, from the radiometer equation."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.abs(self.values[band, session.AUTOS]) / np.sqrt(self.n_averaged[band])
+
+
+def _medians(parts: Float[np.ndarray, "bands parts"]) -> Float[np.ndarray, " bands"]:
+    return xarray.DataArray(parts, dims=("band", "part")).median("part").values
 
 
 def _pieces(line: Timeline) -> list[slice]:
@@ -228,7 +278,7 @@ class State:
 
 def _slab(
     line: Timeline, recipe: Recipe, state_of: StateOf, start: int, counts: np.ndarray
-) -> Callable[[reduced.Reduced, int, int], None]:
+) -> Callable[[Parts, int, int], float]:
     """Return a function that puts the counts of some spectra, from a row on, into a band."""
     source, first = line.sessions[int(line.session[start])], int(line.row[start])
     rows_read = slice(first, first + len(counts))
@@ -244,8 +294,11 @@ def _slab(
     frames = source.frames[rows_read]
     lines, saturated = state.lines(counts, frames, notched), source.saturated[rows_read]
 
-    def calibrate(spectra: reduced.Reduced, start: int, number: int) -> None:
-        """Calibrate, flag and average the channels of a band, into spectra from ``start`` on."""
+    def calibrate(spectra: Parts, start: int, number: int) -> float:
+        """Calibrate, flag and average the channels of a band, into spectra from ``start`` on.
+
+        Returns the scatter of the channels about a smooth spectrum, over the radiometer noise.
+        """
         band, averaging = state.bands[number], session.AVERAGING[state.navgf]
         rows, at = slice(start, start + len(counts)), slice(band.first, band.last)
         basis = state.basis[:, :, at]
@@ -282,12 +335,12 @@ def _slab(
         noise = spectra.noise(number)[:, rows]
         spectra.bend[number, :, rows] = _over(further[:, session.AUTOS].T, noise)
         spectra.lines[number, rows] = 1.0 - kept.sum(axis=1) / len(band.basis)
-        spectra.slab_scatter[number, start // SLAB] = flags.robust_scale(z[:, 0], kept)
         middle = band.basis[:, 0] / len(band.basis)
         centre = np.einsum("rpk,k->pr", gain, middle)
         spectra.gain[number, :, rows] = centre
         components = np.einsum("pck,k->pc", basis[:, 1:], middle)
-        spectra.slope[number, ..., rows] = components[..., None] / centre[:, None]
+        spectra.gain_slope[number, ..., rows] = components[..., None] / centre[:, None]
+        return flags.robust_scale(z[:, 0], kept)
 
     return calibrate
 
@@ -298,21 +351,24 @@ def _over(values: Float[np.ndarray, "*n"], noise: Float[np.ndarray, "*n"]) -> np
         return np.where(np.isfinite(values) & (noise > 0.0), values / noise, np.nan)
 
 
-def _finish(
-    spectra: reduced.Reduced, whole: reduced.Reduced, rows: slice, false_alarm: float, number: int
-) -> Scatter:
-    """Flag bursts in a band of a piece, and put the means of its bins into the whole.
+def _flag_bursts(spectra: Parts, seconds: Rows, false_alarm: float, number: int) -> Scatter:
+    """Flag spectra that do not fit those before and after; return scatter over noise by span."""
+    autos, noise = spectra.values[number, session.AUTOS].T, spectra.noise(number).T
+    # absent autos neither stand out nor constrain the curve
+    finite = np.isfinite(autos)
+    autos, noise = np.where(finite, autos, 0.0), np.where(finite & (noise > 0.0), noise, np.inf)
+    reason = spectra.reason[number]
+    burst, scatter = flags.burst_flags(seconds, autos, noise, reason == reduced.USED, false_alarm)
+    reason[burst] = reduced.BURST
+    return scatter
 
-    Returns
-    -------
-    (spans,) array
-        Scatter over the noise.
-    """
-    scatter = _flag_bursts(spectra, false_alarm, number)
-    bin_of = whole.bin_of[rows] - whole.bin_of[rows.start]
-    n, first = int(bin_of[-1]) + 1, int(whole.bin_of[rows.start])
-    bins = slice(first, first + n)
-    live = spectra.observation.live_s
+
+def _average(
+    spectra: Parts, whole: Parts, rows: slice, bin_of: RowCounts, live: Rows, number: int
+) -> None:
+    """Put the means of a band over the bins of a piece into the whole."""
+    bins = slice(int(bin_of[0]), int(bin_of[-1]) + 1)
+    bin_of, n = bin_of - bins.start, bins.stop - bins.start
     reason, values = spectra.reason[number], spectra.values[number]
     good = reason == reduced.USED
     kept, used = by_the_rule(np.isfinite(values) & good, bin_of, live)
@@ -328,26 +384,10 @@ def _finish(
     whole.n_averaged[number, bins] = np.where(some, n_averaged, 0.0)
     averaged = partial(_means, first=np.searchsorted(bin_of, np.arange(n)))
     whole.values[number][:, bins] = np.where(kept & some, averaged(values, weights), np.nan)
-    whole.before[number][:, bins] = averaged(spectra.before[number], live)
-    whole.gain[number][:, bins] = averaged(spectra.gain[number], live)
-    whole.slope[number][..., bins] = averaged(spectra.slope[number], live)
+    for name in ("before", "gain", "gain_slope"):
+        getattr(whole, name)[number][..., bins] = averaged(getattr(spectra, name)[number], live)
     further = averaged(spectra.bend[number] * spectra.noise(number), weights)
     whole.bend[number][:, bins] = _over(further, whole.noise(number)[:, bins])
-    return scatter
-
-
-def _flag_bursts(spectra: reduced.Reduced, false_alarm: float, number: int) -> Scatter:
-    """Flag spectra that do not fit those before and after; return scatter over noise by span."""
-    times = spectra.observation.times
-    seconds = seconds_from(times[0], times)
-    autos, noise = spectra.values[number, session.AUTOS].T, spectra.noise(number).T
-    # absent autos neither stand out nor constrain the curve
-    finite = np.isfinite(autos)
-    autos, noise = np.where(finite, autos, 0.0), np.where(finite & (noise > 0.0), noise, np.inf)
-    reason = spectra.reason[number]
-    burst, scatter = flags.burst_flags(seconds, autos, noise, reason == reduced.USED, false_alarm)
-    reason[burst] = reduced.BURST
-    return scatter
 
 
 def _means(
@@ -361,7 +401,7 @@ def _means(
         return summed / total
 
 
-def _said_of(source: session.Session, recipe: Recipe) -> Mapping[str, Any]:
+def _said_of(source: session.Session, recipe: Recipe) -> dict[str, Any]:
     clock, whose = recipe.clock or source.clock, "session"
     if source.clock is None:
         whose = "clock file"
