@@ -15,7 +15,7 @@ from astropy.time import Time
 
 from lusee_bayes.core.arrays import Rows, Times
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.layouts import Layout, Unread
+from lusee_bayes.core.layouts import Layout, Unread, Variable
 from lusee_bayes.flight.clock import Clock
 from lusee_bayes.flight.layout_3 import no_spectra, said_in
 from lusee_bayes.flight.session import META, ROWS, SAID, TELEMETRY, Opener, Session, session_of
@@ -39,6 +39,14 @@ UNUSED = {
 }
 # ticks of the telemetry's clock in a second
 TICKS = 65536
+TELEMETRY_4 = Layout(
+    "telemetry as the current luseepy ingests it",
+    {
+        "field_names": Variable(("field",), "text"),
+        **dict.fromkeys(("mission_seconds", "lusee_subsecs"), Variable(("time",))),
+        "values": Variable(("time", "field"), missing=True),
+    },
+)
 
 
 def session_of_4(path: Path, file: h5py.File, opener: Opener) -> Session:
@@ -80,7 +88,7 @@ def session_of_4(path: Path, file: h5py.File, opener: Opener) -> Session:
     return session_of(path, content, arrays, opener=opener, **others)
 
 
-def _dataset(file: h5py.File, path: str) -> Unread | None:
+def _dataset(file: h5py.Group, path: str) -> Unread | None:
     """An array, not yet read, or None."""
     item = file.get(path)
     if not isinstance(item, h5py.Dataset):
@@ -96,16 +104,12 @@ def _metadata(path: Path, file: h5py.File, n: int) -> dict[str, Unread]:
     for ours, theirs in FIELDS.items():
         if (values := _dataset(file, f"{META}/fields/{theirs}/variant_000/data")) is None:
             continue
-        if tuple(values.shape)[:1] != (n,):
+        rows = _dataset(file, f"{META}/fields/{theirs}/variant_000/row_indices")
+        aligned = rows is None or np.array_equal(np.asarray(rows), np.arange(n))
+        if tuple(values.shape)[:1] != (n,) or not aligned:
             raise InputError(
                 f"{path}: {META}/fields/{theirs} has shape {tuple(values.shape)} for {n} spectra, "
-                "or several shapes; ingest the session again"
-            )
-        rows = _dataset(file, f"{META}/fields/{theirs}/variant_000/row_indices")
-        if rows is not None and not np.array_equal(np.asarray(rows), np.arange(n)):
-            raise InputError(
-                f"{path}: row_indices of {META}/fields/{theirs} are not 0 to {n - 1}, one for each "
-                "spectrum; ingest the session again"
+                f"several shapes, or row_indices other than 0 to {n - 1}; ingest the session again"
             )
         fields[f"{META}/{ours}"] = values
     if (navgf := _dataset(file, "spectra/navgf")) is not None:
@@ -149,18 +153,11 @@ def _telemetry_at_rows(path: Path, file: h5py.File, clock: Clock, raw_s: Rows) -
     """Telemetry at the times of the spectra, if both clocks have a reference."""
     if (anchor := _anchors(file).get("dcb")) is None or "telemetry" not in file:
         return {}
-    parts = ("field_names", "mission_seconds", "lusee_subsecs", "values")
-    arrays = {name: _dataset(file, f"telemetry/{name}") for name in parts}
-    for name, array in arrays.items():
-        if array is None:
-            raise InputError(
-                f"{path}: telemetry has no {name} (it has "
-                f"{', '.join(file['telemetry']) or 'nothing'}); ingest the session again with the "
-                "current luseepy"
-            )
-    names = np.asarray(arrays["field_names"]).tolist()
-    seconds, ticks, values = (np.asarray(arrays[name], dtype=np.float64) for name in parts[1:])
-    times_s = seconds + ticks / TICKS - anchor + clock.raw_s
+    group = file["telemetry"]
+    given = {name: array for name in group if (array := _dataset(group, name)) is not None}
+    arrays = TELEMETRY_4.checked(f"{path}: telemetry", given, {}).arrays
+    names, values = arrays["field_names"].tolist(), arrays["values"]
+    times_s = arrays["mission_seconds"] + arrays["lusee_subsecs"] / TICKS - anchor + clock.raw_s
     columns = {name: values[:, names.index(name)] for name in TELEMETRY if name in names}
     return {
         f"telemetry/{name}": _interpolated_to(f"{path}: telemetry {name}", raw_s, times_s, column)
@@ -176,9 +173,8 @@ def _interpolated_to(where: str, raw_s: Rows, times_s: Times, values: Times) -> 
     InputError
         If the telemetry does not cover them: nothing is extrapolated.
     """
-    order = np.argsort(times_s, kind="stable")
-    times_s, values = times_s[order], values[order]
-    good = np.isfinite(values)
+    good = np.argsort(times_s, kind="stable")
+    good = good[np.isfinite(values[good])]
     times_s, values = times_s[good], values[good]
     # a spectrum is longer than the telemetry's step, so its ends may lack half a step
     slack = 2.0 * float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0

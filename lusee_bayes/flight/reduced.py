@@ -19,7 +19,7 @@ from lusee_bayes.flight.gain_model import COUNTS, LEAD, LETTERS, PLACES, Curves
 from lusee_bayes.flight.session import FIRST_PORT, NO_LEVEL, PORTS, SECOND_PORT
 from lusee_bayes.instrument.averaging import binned
 from lusee_bayes.instrument.beams.fields import place_of
-from lusee_bayes.instrument.observation import Observation, runs_of
+from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.products import DataLayout, labels
 from lusee_bayes.instrument.times import Windows, utc_of
 from lusee_bayes.instrument.visibilities import Calibration, Visibilities
@@ -271,10 +271,9 @@ class Reduced(Described, Bands):
         scale = np.sqrt(per_kelvin[FIRST_PORT] * per_kelvin[SECOND_PORT])
         values = np.where(present, self.values[band], 0.0)[:, bins] / scale[:, None]
         layout = DataLayout.from_flags(~present[:, bins])
-        # one run for each stretch at one turntable angle, whatever the gains
-        angles = np.array(observation.turntable_deg)[observation.run]
-        run, turntable_deg = runs_of(angles, observation.n_times)
-        observation = replace(observation, run=run, turntable_deg=turntable_deg)
+        # one run, whatever the gains: the turntable stands still
+        run, angles = np.zeros(observation.n_times, dtype=int), observation.turntable_deg[:1]
+        observation = replace(observation, run=run, turntable_deg=angles)
         mhz = float(self.frequencies_mhz[band])
         stds = {n: x for place in PLACES for n, x in self._errors(band, bins, place) if x.any()}
         n_averaged, lost = self.n_averaged[band, bins], float(sum(self.flagged(band).values()))

@@ -37,7 +37,6 @@ SLAB, PIECE = 128, 1024
 Counts = Float32[np.ndarray, "rows products channels"]
 Strengths = Float[np.ndarray, "rows ports 3"]
 Scatter = Float[np.ndarray, " spans"]
-RowCounts = Int[np.ndarray, " rows"]
 StateOf = Callable[[int, tuple[str, ...]], "State"]
 
 
@@ -364,7 +363,7 @@ def _flag_bursts(spectra: Parts, seconds: Rows, false_alarm: float, number: int)
 
 
 def _average(
-    spectra: Parts, whole: Parts, rows: slice, bin_of: RowCounts, live: Rows, number: int
+    spectra: Parts, whole: Parts, rows: slice, bin_of: session.RowCounts, live: Rows, number: int
 ) -> None:
     """Put the means of a band over the bins of a piece into the whole."""
     bins = slice(int(bin_of[0]), int(bin_of[-1]) + 1)

@@ -351,10 +351,11 @@ def _levels(path: Path, arrays: Mapping[str, Unread], n: int) -> PortLevels:
     if codes.dtype.kind == "S" and codes.shape == (n,):
         # FITS joins the letters of a row
         codes = np.array([list(row.decode().ljust(PORTS)) for row in codes], dtype="U1")
-    if codes.shape != (n, PORTS):
-        raise InputError(f"{path}: {name} has shape {codes.shape}, expected ({n}, {PORTS})")
-    if codes.dtype.kind not in "iuSU":
-        raise InputError(f"{path}: {name} contains {codes.dtype}, expected gain codes or letters")
+    if codes.shape != (n, PORTS) or codes.dtype.kind not in "iuSU":
+        raise InputError(
+            f"{path}: {name} has shape {codes.shape} and type {codes.dtype}, expected "
+            f"({n}, {PORTS}) gain codes or letters"
+        )
     if codes.dtype.kind in "iu":
         codes = np.select([codes == code for code in CODES.values()], LETTERS, NO_LEVEL)
     levels = codes.astype("U1")
