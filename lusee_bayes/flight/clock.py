@@ -145,11 +145,10 @@ def read_clock(path: str | Path) -> Clock:
     with naming(path):
         scale = scale_of("time_scale", file.time_scale)
         time = time_of_text("clock_reference_isot", file.clock_reference_isot, scale)
+        clock = Clock(str(path), float(time.jd1), float(time.jd2), scale, 0.0, file.rate)
         if file.clocks is None:
-            raw_s, stated = 0.0, time_of_text("stated_utc_isot", file.stated_utc_isot)
-        else:
-            raw_s, stated = file.clocks.spectrometer.clock_reference_raw_seconds, None
-    return Clock(str(path), float(time.jd1), float(time.jd2), scale, raw_s, file.rate, stated)
+            return replace(clock, stated=time_of_text("stated_utc_isot", file.stated_utc_isot))
+        return replace(clock, raw_s=file.clocks.spectrometer.clock_reference_raw_seconds)
 
 
 def clock_of(path: str | Path, said: Clock | None, given: Clock | None, raw_s: Times) -> Clock:

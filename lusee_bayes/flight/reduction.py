@@ -37,7 +37,6 @@ SLAB, PIECE = 128, 1024
 Counts = Float32[np.ndarray, "rows products channels"]
 Strengths = Float[np.ndarray, "rows ports 3"]
 Scatter = Float[np.ndarray, " spans"]
-StateOf = Callable[[int, tuple[str, ...]], "State"]
 
 
 def reduce_sessions(
@@ -78,12 +77,11 @@ def reduce_sessions(
     ):
         pieces = _pieces(line)
         counts = _read_ahead(ahead, files, line, pieces)
-        state_of = lru_cache(maxsize=None)(partial(State.of, recipe))
         for piece in pieces:
             n = piece.stop - piece.start
             spectra = Parts.blank(n_bands, n, n)
             for start in range(0, n, SLAB):
-                slab = _slab(line, recipe, state_of, piece.start + start, next(counts))
+                slab = _slab(line, recipe, piece.start + start, next(counts))
                 slabs.append(in_threads(partial(slab, spectra, start), numbers))
             seconds = seconds_from(times[piece][0], times[piece])
             flag = partial(_flag_bursts, spectra, seconds, recipe.section.false_alarm)
@@ -223,6 +221,7 @@ class State:
     line_bins: Bool[np.ndarray, " bins"]
 
     @classmethod
+    @lru_cache(maxsize=16)
     def of(cls, recipe: Recipe, navgf: int, levels: tuple[str, ...]) -> State:
         """Prepare bands and gains.
 
@@ -276,12 +275,12 @@ class State:
 
 
 def _slab(
-    line: Timeline, recipe: Recipe, state_of: StateOf, start: int, counts: np.ndarray
+    line: Timeline, recipe: Recipe, start: int, counts: np.ndarray
 ) -> Callable[[Parts, int, int], float]:
     """Return a function that puts the counts of some spectra, from a row on, into a band."""
     source, first = line.sessions[int(line.session[start])], int(line.row[start])
     rows_read = slice(first, first + len(counts))
-    state = state_of(int(source.navgf[first]), tuple(map(str, source.level[first])))
+    state = State.of(recipe, int(source.navgf[first]), tuple(map(str, source.level[first])))
     telemetry = {name: values[rows_read] for name, values in source.telemetry.items()}
     notched = np.zeros(len(counts), dtype=bool)
     if source.notch is not None:

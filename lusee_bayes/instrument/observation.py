@@ -30,7 +30,7 @@ from scipy.spatial.transform import Rotation as SpatialRotation
 
 from lusee_bayes.core import checks
 from lusee_bayes.core.arrays import Times
-from lusee_bayes.core.errors import InputError, nearest, refusing
+from lusee_bayes.core.errors import InputError, nearest, refusing, require_known
 from lusee_bayes.instrument import times
 from lusee_bayes.instrument.schedule import Cut, Interval, Run, cut_intervals, cut_runs
 
@@ -89,10 +89,8 @@ class Observation(checks.Described):
         checks.require_positive("step_s", self.step_s)
         checks.require_finite("lon_deg and turntable_deg", [self.lon_deg, *self.turntable_deg])
         checks.require_finite("tilt_deg", self.tilt_deg)
-        if self.times.shape != self.run.shape or self.times.ndim != 1 or not self.times.size:
-            raise InputError(
-                f"times {self.times.shape} and run {self.run.shape} must be lists of one length"
-            )
+        checks.require_shape("times", self.times, (None,))
+        checks.require_shape("run", self.run, self.times.shape)
         back = np.flatnonzero(~(times.seconds_from(self.times[:-1], self.times[1:]) > 0.0))
         if back.size:
             before, after = self.times[back[0]].isot, self.times[back[0] + 1].isot
@@ -223,10 +221,9 @@ class Observation(checks.Described):
 
         A window of a schedule must be dark from start to end, a window of a run at its middle.
         """
-        parts = [(cut.start_s, cut.length_s, cut.live_s) for cut in cuts]
-        times_s, length_s, live_s = (np.concatenate(part) for part in zip(*parts, strict=True))
+        times_s, length_s, live_s = np.concatenate([cut.samples_s for cut in cuts], axis=1)
         times.require_ephemeris(np.array([t0.jd + times_s[-1] / 86400.0]))
-        cut_of = np.repeat(np.arange(len(cuts)), [len(cut.start_s) for cut in cuts])
+        cut_of = np.repeat(np.arange(len(cuts)), [cut.samples_s.shape[1] for cut in cuts])
         windows = None
         if window == "mean":
             half = length_s / 2.0
@@ -434,9 +431,7 @@ def body_direction(body: str, observation: Observation) -> Vectors:
     InputError
         If the body is unknown.
     """
-    if body.capitalize() not in BODIES:
-        hint = nearest(body.capitalize(), BODIES)
-        raise InputError(f"unknown body '{body}' in the sky of the Moon; {hint}")
+    require_known("unknown body in the sky of the Moon:", body.capitalize(), BODIES)
     with times.unannounced_leap_seconds():
         arrival = observation.times.tdb
     lander = _barycentric_km("moon", arrival) + MOON_RADIUS_KM * observation.zenith_galactic()

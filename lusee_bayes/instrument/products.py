@@ -127,8 +127,7 @@ def in_order(
     places = {label: place for place, label in enumerate(labels(n_antennas))}
     grid = np.full((len(places), *columns[0][1].shape), np.nan)
     for number, (name, values) in enumerate(columns):
-        if name not in places:
-            raise InputError(f"unknown product '{name}'; known: {', '.join(places)}")
+        require_known("unknown product", name, places)
         if name in [other for other, _ in columns[:number]]:
             raise InputError(f"the product {name} is listed twice; list each once")
         grid[places[name]] = values

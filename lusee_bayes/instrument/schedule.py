@@ -115,18 +115,15 @@ class Cut:
 
     Attributes
     ----------
-    start_s : (samples,) array
-        Start of every sample, in seconds from the start of the first cut.
-    length_s, live_s : (samples,) array
-        Duration of every sample, and the time integrated in it, in seconds.
+    samples_s : (3, samples) array
+        Start of every sample, in seconds from the start of the first cut, its duration, and the
+        time integrated in it.
     of : Run or Interval
     name : str
         Name in messages.
     """
 
-    start_s: Float[np.ndarray, " samples"]
-    length_s: Float[np.ndarray, " samples"]
-    live_s: Float[np.ndarray, " samples"]
+    samples_s: Float[np.ndarray, "3 samples"]
     of: Run | Interval
     name: str
 
@@ -151,7 +148,8 @@ def cut_runs(runs: Sequence[Run], step_s: float) -> list[Cut]:
                 f"run {number} of {run.cycles} cycles has no sample of {step_s} s; shorten step_s"
             )
         steps = np.full(n, float(step_s))
-        cuts.append(Cut(elapsed + step_s * np.arange(n), steps, steps, run, f"run {number}"))
+        samples = np.stack([elapsed + step_s * np.arange(n), steps, steps])
+        cuts.append(Cut(samples, run, f"run {number}"))
         elapsed += length
     return cuts
 
@@ -170,7 +168,8 @@ def cut_intervals(intervals: Sequence[Interval], step_s: float) -> list[Cut]:
         begins = step_s * np.arange(interval.n_samples(step_s))
         length = np.diff(begins, append=interval.length_s)
         start = times.seconds_from(intervals[0].start_time, interval.start_time) + begins
-        cuts.append(Cut(start, length, interval.duty_cycle * length, interval, name))
+        samples = np.stack([start, length, interval.duty_cycle * length])
+        cuts.append(Cut(samples, interval, name))
     return cuts
 
 

@@ -30,7 +30,7 @@ from astropy.time import Time
 from jaxtyping import Bool, Float, Int
 
 from lusee_bayes.core.arrays import Times
-from lusee_bayes.core.checks import Described, extent, require_finite
+from lusee_bayes.core.checks import Described, extent, require_finite, require_shape
 from lusee_bayes.core.errors import InputError, nearest, refusing, require_known
 from lusee_bayes.core.layouts import Attribute, Content
 from lusee_bayes.core.reading import naming
@@ -197,7 +197,7 @@ def step_of(times: Time, step_s: float | None) -> float:
 
 def counts_up(numbers: Int[np.ndarray, " n"]) -> bool:
     """Return whether integers count 0, 1, ... without going back or skipping one."""
-    return numbers[0] == 0 and bool(np.isin(np.diff(numbers), (0, 1)).all())
+    return bool((numbers[:1] == 0).any() and np.isin(np.diff(numbers), (0, 1)).all())
 
 
 # Julian dates in two parts are exact to less than a nanosecond, other times to a few
@@ -232,18 +232,14 @@ class Windows(Described):
     live_s: Float[np.ndarray, " pieces"]
 
     def __post_init__(self):
-        lengths = {x.shape for x in (self.sample, self.start_s, self.end_s, self.live_s)}
-        if len(lengths) > 1 or self.sample.ndim != 1 or not self.sample.size:
-            raise InputError(
-                "sample, start_s, end_s and live_s of windows must be lists of the same length, "
-                f"with at least one piece; got the shapes {sorted(lengths)}"
-            )
+        require_shape("sample of the windows", self.sample, (None,))
         if not counts_up(self.sample):
             raise InputError(
                 "pieces of windows must count the samples 0, 1, ... without going back, with at "
                 "least one piece for each"
             )
         for name in ("start_s", "end_s", "live_s"):
+            require_shape(f"{name} of the windows", getattr(self, name), self.sample.shape)
             require_finite(f"{name} of the windows", getattr(self, name))
         start, end, live = self.start_s, self.end_s, self.live_s
         early = (np.diff(self.sample) == 0) & (start[1:] < end[:-1] - ROUNDING_S)

@@ -292,7 +292,7 @@ class Visibilities(checks.Described):
         """Return a hash of data, layout, times and windows, which identifies the data set."""
         parts = [self.data, self.layout.product, self.layout.time, self.observation.times.jd]
         if (windows := self.observation.windows) is not None:
-            parts += [windows.sample, windows.start_s, windows.end_s, windows.live_s]
+            parts += vars(windows).values()
         if self.calibration is not None:
             parts.append(self.calibration.n_averaged)
         content = b"".join(np.ascontiguousarray(part).tobytes() for part in parts)
@@ -354,8 +354,7 @@ class Visibilities(checks.Described):
             "jd2": seen.times.jd2,
         }
         if windows is not None:
-            pieces = (windows.sample, windows.start_s, windows.end_s, windows.live_s)
-            arrays |= dict(zip(PIECES, pieces, strict=True))
+            arrays |= {f"piece_{name}": numbers for name, numbers in vars(windows).items()}
             arrays["live_time"] = windows.live_per_sample_s
         if receiver is not None:
             ohm = receiver.load_ohm

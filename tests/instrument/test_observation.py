@@ -99,7 +99,7 @@ INCONSISTENT = [
     ([0, 1, 0], (0.0, 1.0), "run must count"),
     ([0, 2, 2], (0.0, 1.0, 2.0), "run must count"),
     ([0, 0, 1], (0.0,), "run must count 0, 1, ... up to 0"),
-    ([0, 0], (0.0,), r"times \(3,\) and run \(2,\)"),
+    ([0, 0], (0.0,), r"run has shape \(2,\), expected \(3,\)"),
 ]
 
 

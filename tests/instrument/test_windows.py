@@ -311,7 +311,7 @@ IMPOSSIBLE = [
     ([0], [-1.0], [1.0], [0.0], "sample 0 has a live time of 0 s"),
     ([0, 0], [0.0, 0.5], [1.0, 2.0], [1.0, 1.0], "a piece that begins at 0.5 s, before"),
     ([0, 2], [0.0, 0.0], [1.0, 1.0], [1.0, 1.0], "must count the samples 0, 1"),
-    ([], [], [], [], "same length, with at least one piece"),
+    ([], [], [], [], "at least one piece for each"),
 ]
 
 
