@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Float, Float32, Int, UInt8
 
-from lusee_bayes.core.arrays import RowFlags, Rows
+from lusee_bayes.core.arrays import Rows
 from lusee_bayes.core.engine import in_threads
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.lazy import xarray
@@ -35,7 +35,7 @@ from lusee_bayes.instrument.times import seconds_from
 SLAB, PIECE = 128, 1024
 # of some spectra
 Counts = Float32[np.ndarray, "rows products channels"]
-Strengths = Float[np.ndarray, "rows ports 3"]
+Curve = Float[np.ndarray, "ports 3 bins"]
 Scatter = Float[np.ndarray, " spans"]
 
 
@@ -195,83 +195,29 @@ def _read_ahead(
     yield following.result()
 
 
-@dataclass(frozen=True, eq=False)
-class State:
-    """Data that many spectra share: the bands, the gains' splines, the known lines.
+@lru_cache(maxsize=16)
+def _prepared(
+    recipe: Recipe, navgf: int, levels: tuple[str, ...]
+) -> tuple[tuple[ChannelBand, ...], Curve, flags.BinFlags]:
+    """Return what many spectra share: the bands, the gains, and the bins with known lines.
 
-    Attributes
-    ----------
-    recipe : Recipe
-    navgf : int
-    levels : tuple of str
-        Levels of the ports.
-    bands : tuple of ChannelBand
-    basis : (ports, 3, bins) array
-        Mean and components of the gains, averaged over the channels of every bin; NaN where there
-        are none.
-    line_bins : (bins,) array of bool
-        Bins with known lines.
+    The gains are mean and components, averaged over the channels of every bin; NaN where there are
+    none.
     """
-
-    recipe: Recipe
-    navgf: int
-    levels: tuple[str, ...]
-    bands: tuple[ChannelBand, ...]
-    basis: Float[np.ndarray, "ports 3 bins"]
-    line_bins: Bool[np.ndarray, " bins"]
-
-    @classmethod
-    @lru_cache(maxsize=16)
-    def of(cls, recipe: Recipe, navgf: int, levels: tuple[str, ...]) -> State:
-        """Prepare bands and gains.
-
-        Raises
-        ------
-        InputError
-            If a band has too few bins.
-        """
-        section, averaging = recipe.section, session.AVERAGING[navgf]
-        middles = session.channel_mhz(section.bin_origin)
-        shared = shared_noise(section.filter_taps, section.filter_window)
-        channels = averaging.channels()
-        basis = np.full((session.PORTS, 3, averaging.n_bins), np.nan)
-        for port, level in enumerate(levels):
-            if level != session.NO_LEVEL:
-                basis[port] = recipe.table.basis(level, port, middles)[:, channels].mean(axis=2)
-        of_all = section.bandwidth_mhz, section.degree, averaging, middles, shared
-        bands = tuple(ChannelBand.of(f, *of_all) for f in recipe.frequencies_mhz)
-        lines = flags.line_bins(recipe.lines_mhz, averaging, middles)
-        if section.comb == "always":
-            lines = lines | flags.comb_bins(averaging)
-        return cls(recipe, navgf, levels, bands, basis, lines)
-
-    def strengths(self, telemetry: session.Telemetry, n_rows: int) -> Strengths:
-        """Return 1, q_1 and q_2 of every port; NaN if the port has no level."""
-        values = np.full((n_rows, session.PORTS, 3), np.nan)
-        for port, level in enumerate(self.levels):
-            if level != session.NO_LEVEL:
-                values[:, port, 0] = 1.0
-                values[:, port, 1:] = self.recipe.table.strengths(level, port, telemetry)
-        return values
-
-    def lines(self, counts: Counts, frames: Rows, notched: RowFlags) -> flags.Bins:
-        """Return the bins with known lines, and those of the comb where it is on.
-
-        Parameters
-        ----------
-        counts : (rows, products, channels) array
-        frames : (rows,) array
-            Frames in each spectrum.
-        notched : (rows,) array of bool
-            Whether the notch filter was on, according to the file.
-        """
-        averaging, comb = session.AVERAGING[self.navgf], notched
-        if self.recipe.section.comb == "found":
-            autos = counts[:, : session.PORTS].astype(np.float64)
-            middles = session.channel_mhz(self.recipe.section.bin_origin)
-            strength = flags.comb_strength(autos, frames, averaging, middles)
-            comb = comb | (np.abs(strength) > flags.COMB_LIMIT)
-        return self.line_bins | (comb[:, None] & flags.comb_bins(averaging))
+    section, averaging = recipe.section, session.AVERAGING[navgf]
+    middles = session.channel_mhz(section.bin_origin)
+    shared = shared_noise(section.filter_taps, section.filter_window)
+    channels = averaging.channels()
+    gains = np.full((session.PORTS, 3, averaging.n_bins), np.nan)
+    for port, level in enumerate(levels):
+        if level != session.NO_LEVEL:
+            gains[port] = recipe.table.basis(level, port, middles)[:, channels].mean(axis=2)
+    of_all = section.bandwidth_mhz, section.degree, averaging, middles, shared
+    bands = tuple(ChannelBand.of(f, *of_all) for f in recipe.frequencies_mhz)
+    lines = flags.line_bins(recipe.lines_mhz, averaging, middles)
+    if section.comb == "always":
+        lines = lines | flags.comb_bins(averaging)
+    return bands, gains, lines
 
 
 def _slab(
@@ -280,26 +226,33 @@ def _slab(
     """Return a function that puts the counts of some spectra, from a row on, into a band."""
     source, first = line.sessions[int(line.session[start])], int(line.row[start])
     rows_read = slice(first, first + len(counts))
-    state = State.of(recipe, int(source.navgf[first]), tuple(map(str, source.level[first])))
+    navgf, levels = int(source.navgf[first]), tuple(map(str, source.level[first]))
+    averaging, (bands, gains, lines) = session.AVERAGING[navgf], _prepared(recipe, navgf, levels)
+    frames, saturated = source.frames[rows_read], source.saturated[rows_read]
+    comb = source.notched[rows_read]
+    if recipe.section.comb == "found":
+        autos = counts[:, : session.PORTS].astype(np.float64)
+        middles = session.channel_mhz(recipe.section.bin_origin)
+        strength = flags.comb_strength(autos, frames, averaging, middles)
+        comb = comb | (np.abs(strength) > flags.COMB_LIMIT)
+    lines = lines | (comb[:, None] & flags.comb_bins(averaging))
     telemetry = {name: values[rows_read] for name, values in source.telemetry.items()}
-    notched = np.zeros(len(counts), dtype=bool)
-    if source.notch is not None:
-        # the mean of the comb's channels is subtracted, unless bit 4 negates this
-        notch = source.notch[rows_read]
-        notched = ((notch & 0b111) > 0) & ((notch & 0b10000) == 0)
+    # 1, q_1 and q_2 of every port; NaN if the port has no level
+    strengths = np.full((len(counts), session.PORTS, 3), np.nan)
     with naming(source.path):
-        strengths = state.strengths(telemetry, len(counts))
-    frames = source.frames[rows_read]
-    lines, saturated = state.lines(counts, frames, notched), source.saturated[rows_read]
+        for port, level in enumerate(levels):
+            if level != session.NO_LEVEL:
+                strengths[:, port, 0] = 1.0
+                strengths[:, port, 1:] = recipe.table.strengths(level, port, telemetry)
 
     def calibrate(spectra: Parts, start: int, number: int) -> float:
         """Calibrate, flag and average the channels of a band, into spectra from ``start`` on.
 
         Returns the scatter of the channels about a smooth spectrum, over the radiometer noise.
         """
-        band, averaging = state.bands[number], session.AVERAGING[state.navgf]
-        rows, at = slice(start, start + len(counts)), slice(band.first, band.last)
-        basis = state.basis[:, :, at]
+        band, rows = bands[number], slice(start, start + len(counts))
+        at = slice(band.first, band.last)
+        basis = gains[:, :, at]
         gain = np.einsum("rpc,pck->rpk", strengths, basis)
         with np.errstate(invalid="ignore"):
             root = np.sqrt(np.where(gain > 0.0, gain, np.nan))

@@ -211,6 +211,14 @@ class Session(Described, Recorded):
         ends = (self.adc_low <= ADC_LOW + 1) | (self.adc_high >= ADC_HIGH)
         return (ends | (self.adc_invalid > 0)).any(axis=1)
 
+    @property
+    def notched(self) -> Bool[np.ndarray, " rows"]:
+        """Whether the mean of the comb's channels is subtracted, according to the file."""
+        if self.notch is None:
+            return np.zeros(self.n_rows, dtype=bool)
+        # bit 4 negates the others
+        return ((self.notch & 0b111) > 0) & ((self.notch & 0b10000) == 0)
+
     @contextmanager
     def spectra(self) -> Iterator[Read]:
         """Open the file to read counts piece by piece.
