@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming
 from lusee_bayes.flight import flags, reduced, session
 from lusee_bayes.flight.bands import ChannelBand, shared_noise
-from lusee_bayes.flight.gain_model import N_COMPONENTS, NANO2, gain_curves
+from lusee_bayes.flight.gain_model import NANO2, gain_curves
 from lusee_bayes.flight.recipe import Recipe, Timeline, timeline
 from lusee_bayes.instrument.averaging import by_the_rule
 from lusee_bayes.instrument.times import seconds_from
@@ -36,7 +36,6 @@ SLAB, PIECE = 128, 1024
 # of some spectra
 Counts = Float32[np.ndarray, "rows products channels"]
 Curve = Float[np.ndarray, "ports 3 bins"]
-Scatter = Float[np.ndarray, " spans"]
 
 
 def reduce_sessions(
@@ -66,32 +65,33 @@ def reduce_sessions(
         )
     level = np.concatenate([s.level for s in line.sessions])
     first = np.searchsorted(line.bin_of, np.arange(line.bin_of[-1] + 1))
-    n_bands, n_rows = len(recipe.frequencies_mhz), len(line.bin_of)
-    whole, numbers = Parts.blank(n_bands, n_rows, len(first)), range(n_bands)
     live_s, times = line.observation.live_s, line.observation.times
-    spans, slabs = [], []
+    numbers, averages = range(len(recipe.frequencies_mhz)), []
     with (
-        stages.progress("spectra", n_rows) as done,
+        stages.progress("spectra", len(line.bin_of)) as done,
         ExitStack() as files,
         ThreadPoolExecutor(1) as ahead,
     ):
         pieces = _pieces(line)
         counts = _read_ahead(ahead, files, line, pieces)
         for piece in pieces:
-            n = piece.stop - piece.start
-            spectra = Parts.blank(n_bands, n, n)
-            for start in range(0, n, SLAB):
-                slab = _slab(line, recipe, piece.start + start, next(counts))
-                slabs.append(in_threads(partial(slab, spectra, start), numbers))
-            seconds = seconds_from(times[piece][0], times[piece])
-            flag = partial(_flag_bursts, spectra, seconds, recipe.section.false_alarm)
-            spans.append(np.stack(in_threads(flag, numbers)))
-            mean = partial(_average, spectra, whole, piece, line.bin_of[piece], live_s[piece])
-            in_threads(mean, numbers)
+            slabs = [
+                in_threads(_slab(line, recipe, start, next(counts)), numbers)
+                for start in range(piece.start, piece.stop, SLAB)
+            ]
+            spectra = [Parts.joined(band) for band in zip(*slabs, strict=True)]
+            seconds = seconds_from(times[piece.start], times[piece])
+            of_piece = seconds, live_s[piece], line.bin_of[piece], recipe.section.false_alarm
+            averages.append(in_threads(partial(_finish, *of_piece), spectra))
             done(piece.stop)
+    bands = [Parts.joined(band) for band in zip(*averages, strict=True)]
+    whole = {one.name: np.stack([getattr(x, one.name) for x in bands]) for one in fields(Parts)}
+    bend = xarray.DataArray(whole.pop("bend"), dims=("band", "port", "bin")).mean("bin")
+    for name in ("scatter", "line_scatter"):
+        parts = xarray.DataArray(whole[name], dims=("band", "part"))
+        whole[name] = parts.median("part").values
     names = line.sessions[0].telemetry
     telemetry = {n: np.concatenate([s.telemetry[n] for s in line.sessions]) for n in names}
-    bend = xarray.DataArray(whole.bend, dims=("band", "port", "bin")).mean("bin")
     return reduced.Reduced(
         frequencies_mhz=np.array(recipe.frequencies_mhz),
         bandwidth_mhz=recipe.section.bandwidth_mhz,
@@ -104,58 +104,43 @@ def reduce_sessions(
         curves=gain_curves(recipe.table, recipe.section.gain_std, level, telemetry),
         sessions=tuple(_said_of(s, recipe) for s in line.sessions),
         recipe=recipe.words(),
-        scatter=_medians(np.concatenate(spans, axis=1)),
-        line_scatter=_medians(np.array(slabs).T),
         curvature=np.abs(bend).max("port").values,
-        **{one.name: getattr(whole, one.name) for one in fields(Parts) if one.name != "bend"},
+        **whole,
     )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Parts:
-    """Numbers of :class:`.Reduced`, while they are filled in: of a piece, or of all bins.
-
-    In a piece every spectrum is a separate bin.
+    """Numbers of a band, for some spectra of which each is a bin, or for the bins of a piece.
 
     Attributes
     ----------
-    bend : (bands, ports, bins) array
+    bend : (ports, bins) array
         Change of the autos by two further powers of the frequency, in standard deviations.
+    scatter : (spans,) array
+        Scatter in time over the radiometer noise, for spans of a few hours; NaN if unknown.
+    line_scatter : (slabs,) array
+        Scatter of channels about a smooth spectrum over the radiometer noise.
     reason, lines, values, before, n_averaged, gain, gain_slope
-        As in :class:`.Reduced`.
+        As in :class:`.Reduced`, without the axis of bands.
     """
 
-    reason: UInt8[np.ndarray, "bands rows"]
-    lines: Float32[np.ndarray, "bands rows"]
-    values: Float[np.ndarray, "bands products bins"]
-    before: Float[np.ndarray, "bands products bins"]
-    n_averaged: Float[np.ndarray, "bands bins"]
-    gain: Float[np.ndarray, "bands ports bins"]
-    gain_slope: Float[np.ndarray, "bands ports components bins"]
-    bend: Float[np.ndarray, "bands ports bins"]
+    reason: UInt8[np.ndarray, " rows"]
+    lines: Float32[np.ndarray, " rows"]
+    values: Float[np.ndarray, "products bins"]
+    before: Float[np.ndarray, "products bins"]
+    n_averaged: Float[np.ndarray, " bins"]
+    gain: Float[np.ndarray, "ports bins"]
+    gain_slope: Float[np.ndarray, "ports components bins"]
+    bend: Float[np.ndarray, "ports bins"]
+    scatter: Float[np.ndarray, " spans"]
+    line_scatter: Float[np.ndarray, " slabs"]
 
     @classmethod
-    def blank(cls, bands: int, rows: int, bins: int) -> Parts:
-        """Return arrays of these lengths, to be filled in."""
-        return cls(
-            reason=np.zeros((bands, rows), dtype=np.uint8),
-            lines=np.zeros((bands, rows), dtype=np.float32),
-            values=np.full((bands, session.N_PRODUCTS, bins), np.nan),
-            before=np.full((bands, session.N_PRODUCTS, bins), np.nan),
-            n_averaged=np.zeros((bands, bins)),
-            gain=np.full((bands, session.PORTS, bins), np.nan),
-            gain_slope=np.zeros((bands, session.PORTS, N_COMPONENTS, bins)),
-            bend=np.full((bands, session.PORTS, bins), np.nan),
-        )
-
-    def noise(self, band: int) -> Float[np.ndarray, "ports bins"]:
-        """Return the standard deviations of the autos, from the radiometer equation."""
-        with np.errstate(invalid="ignore", divide="ignore"):
-            return np.abs(self.values[band, session.AUTOS]) / np.sqrt(self.n_averaged[band])
-
-
-def _medians(parts: Float[np.ndarray, "bands parts"]) -> Float[np.ndarray, " bands"]:
-    return xarray.DataArray(parts, dims=("band", "part")).median("part").values
+    def joined(cls, parts: Sequence[Parts]) -> Parts:
+        """Join parts in order of time."""
+        names = [one.name for one in fields(cls)]
+        return cls(**{n: np.concatenate([getattr(x, n) for x in parts], axis=-1) for n in names})
 
 
 def _pieces(line: Timeline) -> list[slice]:
@@ -220,9 +205,7 @@ def _prepared(
     return bands, gains, lines
 
 
-def _slab(
-    line: Timeline, recipe: Recipe, start: int, counts: np.ndarray
-) -> Callable[[Parts, int, int], float]:
+def _slab(line: Timeline, recipe: Recipe, start: int, counts: np.ndarray) -> Callable[[int], Parts]:
     """Return a function that puts the counts of some spectra, from a row on, into a band."""
     source, first = line.sessions[int(line.session[start])], int(line.row[start])
     rows_read = slice(first, first + len(counts))
@@ -245,12 +228,9 @@ def _slab(
                 strengths[:, port, 0] = 1.0
                 strengths[:, port, 1:] = recipe.table.strengths(level, port, telemetry)
 
-    def calibrate(spectra: Parts, start: int, number: int) -> float:
-        """Calibrate, flag and average the channels of a band, into spectra from ``start`` on.
-
-        Returns the scatter of the channels about a smooth spectrum, over the radiometer noise.
-        """
-        band, rows = bands[number], slice(start, start + len(counts))
+    def calibrate(number: int) -> Parts:
+        """Calibrate, flag and average the channels of a band."""
+        band = bands[number]
         at = slice(band.first, band.last)
         basis = gains[:, :, at]
         gain = np.einsum("rpc,pck->rpk", strengths, basis)
@@ -275,23 +255,27 @@ def _slab(
         clean = np.where(finite, channels, 0.0)
         values, variance, further = band.values(clean, mean_auto, kept)
         before, _, _ = band.values(clean, mean_auto, whole)
-        reason = spectra.reason[number, rows]
+        reason = np.full(len(counts), reduced.USED, dtype=np.uint8)
         reason[~np.isfinite(variance)] = reduced.TOO_MANY
         reason[~good.any(axis=1)] = reduced.COMB
         reason[~whole.any(axis=1)] = reduced.NO_DATA
         reason[saturated] = reduced.SATURATED
-        spectra.values[number, :, rows] = np.where(present, values, np.nan).T
-        spectra.before[number, :, rows] = np.where(present, before, np.nan).T
-        spectra.n_averaged[number, rows] = frames / variance
-        noise = spectra.noise(number)[:, rows]
-        spectra.bend[number, :, rows] = _over(further[:, session.AUTOS].T, noise)
-        spectra.lines[number, rows] = 1.0 - kept.sum(axis=1) / len(band.basis)
+        values, n_averaged = np.where(present, values, np.nan).T, frames / variance
         middle = band.basis[:, 0] / len(band.basis)
         centre = np.einsum("rpk,k->pr", gain, middle)
-        spectra.gain[number, :, rows] = centre
         components = np.einsum("pck,k->pc", basis[:, 1:], middle)
-        spectra.gain_slope[number, ..., rows] = components[..., None] / centre[:, None]
-        return flags.robust_scale(z[:, 0], kept)
+        return Parts(
+            reason=reason,
+            lines=(1.0 - kept.sum(axis=1) / len(band.basis)).astype(np.float32),
+            values=values,
+            before=np.where(present, before, np.nan).T,
+            n_averaged=n_averaged,
+            gain=centre,
+            gain_slope=components[..., None] / centre[:, None],
+            bend=_over(further[:, session.AUTOS].T, _noise(values, n_averaged)),
+            scatter=np.empty(0),
+            line_scatter=np.array([flags.robust_scale(z[:, 0], kept)]),
+        )
 
     return calibrate
 
@@ -302,43 +286,47 @@ def _over(values: Float[np.ndarray, "*n"], noise: Float[np.ndarray, "*n"]) -> np
         return np.where(np.isfinite(values) & (noise > 0.0), values / noise, np.nan)
 
 
-def _flag_bursts(spectra: Parts, seconds: Rows, false_alarm: float, number: int) -> Scatter:
-    """Flag spectra that do not fit those before and after; return scatter over noise by span."""
-    autos, noise = spectra.values[number, session.AUTOS].T, spectra.noise(number).T
+def _noise(
+    values: Float[np.ndarray, "products bins"], n_averaged: Float[np.ndarray, " bins"]
+) -> Float[np.ndarray, "ports bins"]:
+    """The standard deviations of the autos, from the radiometer equation."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.abs(values[session.AUTOS]) / np.sqrt(n_averaged)
+
+
+def _finish(
+    seconds: Rows, live: Rows, bin_of: session.RowCounts, false_alarm: float, spectra: Parts
+) -> Parts:
+    """Flag bursts, spectra that do not fit those before and after; average the others in bins."""
+    noise, reason = _noise(spectra.values, spectra.n_averaged), spectra.reason
     # absent autos neither stand out nor constrain the curve
+    autos = spectra.values[session.AUTOS].T
     finite = np.isfinite(autos)
-    autos, noise = np.where(finite, autos, 0.0), np.where(finite & (noise > 0.0), noise, np.inf)
-    reason = spectra.reason[number]
-    burst, scatter = flags.burst_flags(seconds, autos, noise, reason == reduced.USED, false_alarm)
-    reason[burst] = reduced.BURST
-    return scatter
-
-
-def _average(
-    spectra: Parts, whole: Parts, rows: slice, bin_of: session.RowCounts, live: Rows, number: int
-) -> None:
-    """Put the means of a band over the bins of a piece into the whole."""
-    bins = slice(int(bin_of[0]), int(bin_of[-1]) + 1)
-    bin_of, n = bin_of - bins.start, bins.stop - bins.start
-    reason, values = spectra.reason[number], spectra.values[number]
+    shown, sigma = np.where(finite, autos, 0.0), np.where(finite & (noise.T > 0.0), noise.T, np.inf)
+    burst, scatter = flags.burst_flags(seconds, shown, sigma, reason == reduced.USED, false_alarm)
+    reason = np.where(burst, np.uint8(reduced.BURST), reason)
     good = reason == reduced.USED
-    kept, used = by_the_rule(np.isfinite(values) & good, bin_of, live)
-    reason[good & ~used] = reduced.PRODUCT
-    whole.reason[number, rows] = reason
-    whole.lines[number, rows] = spectra.lines[number]
+    bin_of = bin_of - bin_of[0]
+    n = int(bin_of[-1]) + 1
+    kept, used = by_the_rule(np.isfinite(spectra.values) & good, bin_of, live)
     # weights are live times, both for the unflagged spectra and for all
     weights = np.where(used, live, 0.0)
     some = np.bincount(bin_of, weights, n) > 0.0
     with np.errstate(invalid="ignore", divide="ignore"):
-        squares = np.where(used, weights**2 / spectra.n_averaged[number], 0.0)
+        squares = np.where(used, weights**2 / spectra.n_averaged, 0.0)
         n_averaged = np.bincount(bin_of, weights, n) ** 2 / np.bincount(bin_of, squares, n)
-    whole.n_averaged[number, bins] = np.where(some, n_averaged, 0.0)
+    n_averaged = np.where(some, n_averaged, 0.0)
     averaged = partial(_means, first=np.searchsorted(bin_of, np.arange(n)))
-    whole.values[number][:, bins] = np.where(kept & some, averaged(values, weights), np.nan)
-    for name in ("before", "gain", "gain_slope"):
-        getattr(whole, name)[number][..., bins] = averaged(getattr(spectra, name)[number], live)
-    further = averaged(spectra.bend[number] * spectra.noise(number), weights)
-    whole.bend[number][:, bins] = _over(further, whole.noise(number)[:, bins])
+    values = np.where(kept & some, averaged(spectra.values, weights), np.nan)
+    return replace(
+        spectra,
+        reason=np.where(good & ~used, np.uint8(reduced.PRODUCT), reason),
+        values=values,
+        n_averaged=n_averaged,
+        bend=_over(averaged(spectra.bend * noise, weights), _noise(values, n_averaged)),
+        scatter=scatter,
+        **{n: averaged(getattr(spectra, n), live) for n in ("before", "gain", "gain_slope")},
+    )
 
 
 def _means(
