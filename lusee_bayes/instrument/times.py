@@ -412,21 +412,31 @@ def windows_of(
         For an unknown timestamp, for instants with live times or bounds, for a time outside its
         bounds, for a single sample without a step, and as :class:`.Windows`.
     """
-    if bounds is not None and timestamp != "instant":
-        return _bounded(times, utc_bounds(bounds, len(times)), step_s, live_s)
-    step_s = step_of(times, step_s)
+    require_known("unknown timestamp", timestamp, [*TO_MIDDLE, "instant"])
     if timestamp == "instant":
         if live_s is not None or bounds is not None:
             what = "live time" if bounds is None else "bounds"
             raise InputError(f"instants have no {what}; omit it, or give another timestamp")
-        return times, step_s, None
-    require_known("unknown timestamp", timestamp, [*TO_MIDDLE, "instant"])
-    ones = np.ones(len(times))
-    start, end = (step_s * (TO_MIDDLE[timestamp] + side) * ones for side in (-0.5, 0.5))
-    return _windowed(times, start, end, step_s, live_s)
+        return times, step_of(times, step_s), None
+    if bounds is not None:
+        start, end, step = _bounded(times, utc_bounds(bounds, len(times)), step_s)
+    else:
+        step, ones = step_of(times, step_s), np.ones(len(times))
+        start, end = (step * (TO_MIDDLE[timestamp] + side) * ones for side in (-0.5, 0.5))
+    # one piece each, with overlaps by rounding cut off
+    rounding = _rounding(step)
+    middles, half = later(times, (start + end) / 2.0), (end - start) / 2.0
+    overlap = end[:-1] - start[1:] - np.diff(seconds_from(times[0], times))
+    cut = np.where((overlap > 0.0) & (overlap <= rounding), overlap / 2.0, 0.0)
+    start, end = np.append(0.0, cut) - half, half - np.append(cut, 0.0)
+    if live_s is not None:
+        rounded = (live_s > end - start) & (live_s <= end - start + rounding)
+        live_s = np.where(rounded, end - start, live_s)
+    return middles, step, Windows.whole(start, end, live_s)
 
 
-def _bounded(times: Time, bounds: Time, step_s: Step, live_s: Live) -> Windowed:
+def _bounded(times: Time, bounds: Time, step_s: float | None) -> tuple[Times, Times, float]:
+    """Start and end of every sample, in seconds from its time, and the step."""
     start, end = (seconds_from(times, bounds[:, k]) for k in (0, 1))
     length = end - start
     step = step_of(times, float(length[0]) if step_s is None and len(times) == 1 else step_s)
@@ -441,7 +451,7 @@ def _bounded(times: Time, bounds: Time, step_s: Step, live_s: Live) -> Windowed:
         )
     if step_s is None and step < length.max() <= step + rounding:
         step = float(length.max())
-    return _windowed(times, start, end, step, live_s)
+    return start, end, step
 
 
 def utc_bounds(bounds: Any, n_times: int) -> Time:
@@ -469,16 +479,3 @@ def utc_bounds(bounds: Any, n_times: int) -> Time:
 
 def _rounding(step_s: float) -> float:
     return max(ROUNDED_S, ROUNDED_SHARE * step_s)
-
-
-def _windowed(times: Time, start_s: Times, end_s: Times, step_s: float, live_s: Live) -> Windowed:
-    """Middles, step and windows of one piece each, with overlaps by rounding cut off."""
-    middles, half = later(times, (start_s + end_s) / 2.0), (end_s - start_s) / 2.0
-    overlap = end_s[:-1] - start_s[1:] - np.diff(seconds_from(times[0], times))
-    cut = np.where((overlap > 0.0) & (overlap <= _rounding(step_s)), overlap / 2.0, 0.0)
-    start_s, end_s = np.append(0.0, cut) - half, half - np.append(cut, 0.0)
-    if live_s is not None:
-        length = end_s - start_s
-        rounded = (live_s > length) & (live_s <= length + _rounding(step_s))
-        live_s = np.where(rounded, length, live_s)
-    return middles, step_s, Windows.whole(start_s, end_s, live_s)
