@@ -265,9 +265,7 @@ class Reduced(Described, Bands):
         if self.average_s is None:
             observation = self.observation.select(keep)
         else:
-            _, bin_of_left = np.unique(self.bin_of[keep], return_inverse=True)
-            left = np.flatnonzero(keep)
-            observation = binned(self.observation, left, bin_of_left, self.average_s)
+            observation = binned(self.observation, keep, self.bin_of, self.average_s)
         scale = np.sqrt(per_kelvin[FIRST_PORT] * per_kelvin[SECOND_PORT])
         values = np.where(present, self.values[band], 0.0)[:, bins] / scale[:, None]
         layout = DataLayout.from_flags(~present[:, bins])

@@ -224,19 +224,19 @@ def averaged(data: Visibilities, to_s: float) -> Visibilities:
     live_s = windows.live_per_sample_s
     bin_of = bins_of(observation, windows.bounds_s, to_s)
     kept, used = by_the_rule(np.asarray(data.layout.present), bin_of, live_s)
-    if not (left := np.flatnonzero(used)).size:
+    if not used.any():
         raise InputError(
             f"averaging over {to_s:g} s leaves no data: products have no samples in common; give a "
             "shorter time"
         )
     # renumber the bins that are not empty
-    bins, bin_of_left = np.unique(bin_of[left], return_inverse=True)
-    weight = live_s[left] / np.bincount(bin_of_left, live_s[left])[bin_of_left]
-    grid = np.asarray(data.layout.scatter(data.data))[:, left] * weight
+    bins, bin_of_left = np.unique(bin_of[used], return_inverse=True)
+    weight = live_s[used] / np.bincount(bin_of_left, live_s[used])[bin_of_left]
+    grid = np.asarray(data.layout.scatter(data.data))[:, used] * weight
     first = np.searchsorted(bin_of_left, np.arange(len(bins)))
     layout = DataLayout.from_flags(~kept[:, bins])
     means = layout.gather(np.add.reduceat(grid, first, axis=1))
-    seen = binned(observation, left, bin_of_left, to_s)
+    seen = binned(observation, used, bin_of, to_s)
     return replace(data, data=means, layout=layout, observation=seen)
 
 
@@ -301,22 +301,23 @@ def by_the_rule(present: GridFlags, bin_of: Samples, live_s: Times) -> tuple[Bin
     return kept, used
 
 
-def binned(observation: Observation, left: Samples, bin_of: Samples, to_s: float) -> Observation:
+def binned(observation: Observation, keep: TimeFlags, bin_of: Samples, to_s: float) -> Observation:
     """Return the times and windows of bins.
 
     Parameters
     ----------
     observation : Observation
         Its samples have windows.
-    left : (samples,) array of int
-        The samples that the bins average.
-    bin_of : (samples,) array of int
-        The bin of each of these samples: 0, 1, ... without a gap.
+    keep : (times,) array of bool
+        The samples that the bins average; bins without any are dropped.
+    bin_of : (times,) array of int
+        :func:`bins_of`.
     to_s : float
         Length of the bins, in seconds.
     """
-    first = np.searchsorted(bin_of, np.arange(bin_of[-1] + 1))
-    kept = observation.select(np.isin(np.arange(observation.n_times), left))
+    bins, bin_of = np.unique(bin_of[keep], return_inverse=True)
+    first = np.searchsorted(bin_of, np.arange(len(bins)))
+    kept = observation.select(keep)
     windows = kept.windows
     seconds = seconds_from(kept.times[0], kept.times)
     offset = seconds[windows.sample]

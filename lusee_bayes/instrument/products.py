@@ -378,19 +378,18 @@ def without_gaps(visibilities: Grid, layout: DataLayout) -> Grid:
     absent = ~present & (np.isnan(values) | (values == 0.0))
     if not absent.any():
         return visibilities
-    products = all_products(antennas_of(layout.n_products))
+    i, j, _ = ports(antennas_of(layout.n_products))
     table = pandas.DataFrame(np.where(absent, np.nan, values).T)
     filled = table.interpolate(limit_direction="both").fillna(0.0).to_numpy().T
     values, measured = np.where(absent, filled, values), present.any(1)
-    autos = np.array([p.i == p.j for p in products])
-    unused = np.flatnonzero(autos & absent.all(1))
-    for auto in (products[k] for k in unused):
-        for product, is_there in zip(products, measured, strict=True):
-            if is_there and auto.i in (product.i, product.j):
-                raise InputError(
-                    f"the auto {auto.label} is missing at all times, but the noise of "
-                    f"{product.label} depends on it; give modelled visibilities of all samples, "
-                    "such as the signal of a CouplingMatrix without flags"
-                )
+    autos, names = i == j, labels_of(layout.n_products)
+    unused = autos & absent.all(1)
+    for auto in np.flatnonzero(unused):
+        if (needed := measured & ((i == i[auto]) | (j == i[auto]))).any():
+            raise InputError(
+                f"the auto {names[auto]} is missing at all times, but the noise of "
+                f"{names[int(needed.argmax())]} depends on it; give modelled visibilities of all "
+                "samples, such as the signal of a CouplingMatrix without flags"
+            )
     values[unused] = values[autos & ~absent.all(1)].mean(0)
     return namespace(visibilities).asarray(values)

@@ -194,7 +194,7 @@ UNUSABLE = [
     ({"change": lambda i: i.update(EPhi_imag=i["EPhi_imag"][:, :-1])}, "EPhi_imag has shape"),
     ({"change": lambda i: i.update(freq=i["freq"][::-1].copy())}, "freq does not increase"),
     ({"change": lambda i: i.update(gain_conv=i["gain_conv"][:-1])}, "gain_conv has shape"),
-    ({"header": {"THETA_MAX": 180.0}}, "theta 0 to 180"),
+    ({"header": {"THETA_MAX": 180.0}}, "THETA_MAX is 180.0, expected a number from 90 to 90"),
     ({"header": {"TIMECONV": "e-iwt"}}, "TIMECONV"),
     ({"change": lambda images: images["freq"].__imul__(1e6)}, "is this Hz"),
 ]

@@ -422,6 +422,7 @@ FIELD_NAMES = ("Etheta", "EPhi")
 FIELDS = parts_of(*FIELD_NAMES)
 IMPEDANCE = ("Z_real", "Z_imag")
 FIELD, OHM = Variable(("freq", "theta", "phi")), Variable(("freq",), optional=True, unit="Ohm")
+ENDS = {"THETA_MIN": 0.0, "THETA_MAX": 90.0, "PHI_MIN": 0.0, "PHI_MAX": 360.0}
 SCALAR_LAYOUT = Layout(
     "a scalar beam file of luseepy, FITS version 2",
     {
@@ -432,7 +433,7 @@ SCALAR_LAYOUT = Layout(
     },
     {
         **{key: Attribute("integer", low=2.0) for key in ("THETA_N", "PHI_N")},
-        **{key: Attribute() for key in ("THETA_MIN", "THETA_MAX", "PHI_MIN", "PHI_MAX")},
+        **{key: Attribute(low=degrees, high=degrees) for key, degrees in ENDS.items()},
         **dict.fromkeys(CONVENTIONS, Attribute("word", optional=True)),
     },
 )
@@ -542,12 +543,6 @@ def read_scalar_beam(path: str | Path) -> ScalarBeam:
     beam = read_fits(path, SCALAR_LAYOUT, "check beam.file")
     images, said, sizes = beam.arrays, beam.values, beam.sizes
     require_conventions(path, said)
-    ends = [said[key] for key in ("THETA_MIN", "THETA_MAX", "PHI_MIN", "PHI_MAX")]
-    if ends != [0.0, 90.0, 0.0, 360.0]:
-        raise InputError(
-            f"{path} covers theta {ends[0]:g} to {ends[1]:g} and phi {ends[2]:g} to {ends[3]:g} "
-            "degrees; expected 0 to 90 and 0 to 360"
-        )
     if (sizes["theta"], sizes["phi"]) != (said["THETA_N"], said["PHI_N"]):
         raise InputError(
             f"{path}: the fields have {sizes['theta']} x {sizes['phi']} directions, the header "
