@@ -177,7 +177,7 @@ class FlightSimulation:
             factor = self.scenario.noise.radiometer.factor
             t = sample_covariances(t, self.frames / factor, generator)
         levels = "".join(self.disturbances.level[rows.start])
-        counts = self._counting(levels)(to_real(t), self._telemetry(rows))
+        counts = self._counts(levels, to_real(t), rows)
         counts[self.disturbances.saturated[rows]] *= synthesis.SATURATED_FACTOR
         rounded = synthesis.rounded(counts, np.broadcast_to(self._slices[levels], counts.shape[:2]))
         rounded[self.disturbances.absent[rows]] = np.nan
@@ -187,14 +187,14 @@ class FlightSimulation:
     def _slices(self) -> dict[str, Int[np.ndarray, " products"]]:
         """Bit slices for each state of the gains."""
         first = slice(0, 1)
-        spectra, telemetry = self.spectra(first), self._telemetry(first)
+        spectra = self.spectra(first)
         states = {"".join(one) for one in np.unique(self.disturbances.level, axis=0)}
-        counts = {levels: self._counting(levels)(spectra, telemetry) for levels in states}
+        counts = {levels: self._counts(levels, spectra, first) for levels in states}
         return {levels: synthesis.bit_slices(one) for levels, one in counts.items()}
 
-    def _counting(self, levels: str) -> synthesis.Counting:
+    def _counts(self, levels: str, spectra: synthesis.AllChannels, rows: slice) -> synthesis.Counts:
         settings = self.section.navgf, self.origin, flight_of(self.scenario).sign
-        return synthesis.Counting(self.gains, levels, *settings)
+        return synthesis.in_counts(spectra, self._telemetry(rows), self.gains, levels, *settings)
 
     def _telemetry(self, rows: slice) -> Mapping[str, Float[np.ndarray, " _"]]:
         turns = 2.0 * np.pi * self.observation.hours[rows]

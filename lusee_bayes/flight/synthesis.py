@@ -10,7 +10,6 @@ constant; a single known frequency gives power laws of index -2.5.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Float32, Int, Shaped
@@ -127,12 +126,22 @@ BITS = 27
 REFERENCE = 31
 
 
-@dataclass(frozen=True, eq=False)
-class Counting:
-    """Conversion of spectra to counts, for one state of the spectrometer.
+def in_counts(
+    spectra: AllChannels,
+    telemetry: session.Telemetry,
+    table: GainModel,
+    levels: str,
+    navgf: int,
+    origin: session.BinOrigin,
+    sign: int,
+) -> Counts:
+    """Return the counts of spectra before rounding, for one state of the spectrometer.
 
-    Attributes
+    Parameters
     ----------
+    spectra : (products, rows, channels) array
+        In V^2/Hz, in the package's order.
+    telemetry : mapping of str to (rows,) array
     table : GainModel
         Channels beyond its frequencies have the gain at its ends.
     levels : str
@@ -143,51 +152,27 @@ class Counting:
         Part of channel k that lies at k times 25 kHz.
     sign : {1, -1}
         Sign of the spectrometer's imaginary parts, relative to those of <s_i conj(s_j)>.
+
+    Returns
+    -------
+    (rows, products, bins) array
+        In the spectrometer's order.
     """
-
-    table: GainModel
-    levels: str
-    navgf: int
-    origin: session.BinOrigin
-    sign: int = 1
-
-    @cached_property
-    def _basis(self) -> Float[np.ndarray, "ports 3 channels"]:
-        bases = []
-        for port, level in enumerate(self.levels):
-            anchors = self.table.anchor_mhz[LETTERS.index(level), port]
-            inside = np.clip(session.channel_mhz(self.origin), anchors[0], anchors[-1])
-            bases.append(self.table.basis(level, port, inside))
-        return np.array(bases)
-
-    def __call__(self, spectra: AllChannels, telemetry: session.Telemetry) -> Counts:
-        """Return counts before rounding.
-
-        Parameters
-        ----------
-        spectra : (products, rows, channels) array
-            In V^2/Hz, in the package's order.
-        telemetry : mapping of str to (rows,) array
-
-        Returns
-        -------
-        (rows, products, bins) array
-            In the spectrometer's order.
-        """
-        root = []
-        for port in range(session.PORTS):
-            q = self.table.strengths(self.levels[port], port, telemetry)
-            gain = self._basis[port, 0] + q @ self._basis[port, 1:]
-            # nothing is sent where a table has no gain
-            root.append(np.sqrt(np.maximum(gain, 0.0)))
-        averaging = session.AVERAGING[self.navgf]
-        members = averaging.channels()
-        summed = np.empty((spectra.shape[1], len(spectra), averaging.n_bins))
-        for k, product in enumerate(spectra):
-            counts = product * (root[session.FIRST_PORT[k]] * root[session.SECOND_PORT[k]]) / NANO2
-            counts = counts[:, members].sum(axis=2) / averaging.stride
-            summed[:, session.OF_FLIGHT[k]] = counts * (self.sign if session.IMAGINARY[k] else 1)
-        return summed
+    root, mhz = [], session.channel_mhz(origin)
+    for port, level in enumerate(levels):
+        anchors = table.anchor_mhz[LETTERS.index(level), port]
+        basis = table.basis(level, port, np.clip(mhz, anchors[0], anchors[-1]))
+        gain = basis[0] + table.strengths(level, port, telemetry) @ basis[1:]
+        # nothing is sent where a table has no gain
+        root.append(np.sqrt(np.maximum(gain, 0.0)))
+    averaging = session.AVERAGING[navgf]
+    members = averaging.channels()
+    summed = np.empty((spectra.shape[1], len(spectra), averaging.n_bins))
+    for k, product in enumerate(spectra):
+        counts = product * (root[session.FIRST_PORT[k]] * root[session.SECOND_PORT[k]]) / NANO2
+        counts = counts[:, members].sum(axis=2) / averaging.stride
+        summed[:, session.OF_FLIGHT[k]] = counts * (sign if session.IMAGINARY[k] else 1)
+    return summed
 
 
 def bit_slices(counts: Counts) -> Int[np.ndarray, " products"]:
