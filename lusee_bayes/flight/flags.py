@@ -34,13 +34,10 @@ from lusee_bayes.flight.session import CHANNEL_MHZ, Averaging, Middles
 # of spectra in bands: rows, autos and points of a curve; in time: one span, with rows as points
 Autos = Float[np.ndarray, "rows autos points"]
 BinFlags = Bool[np.ndarray, " bins"]
-Bins = Bool[np.ndarray, "rows bins"]
-Spectra = Float[np.ndarray, "rows ports bins"]
 Levels = Float[np.ndarray, "rows ports"]
 Span = Bool[np.ndarray, " span"]
 OneRow = Float[np.ndarray, "1 ports span"]
 Distances = Float[np.ndarray, "ports span"]
-Terms = Float[np.ndarray, "span terms"]
 Sums = Float[np.ndarray, "ports ends"]
 Ends = Float[np.ndarray, " ends"]
 
@@ -191,7 +188,7 @@ def comb_bins(averaging: Averaging) -> BinFlags:
     return (averaging.channels() % COMB_SPACING == COMB_FIRST).any(axis=1)
 
 
-def comb_strength(autos: Spectra, frames: Rows, averaging: Averaging, middles_mhz: Middles) -> Rows:
+def comb_strength(autos: Autos, frames: Rows, averaging: Averaging, middles_mhz: Middles) -> Rows:
     """Return by how many standard deviations the comb's channels differ from their neighbours.
 
     Parameters
@@ -226,8 +223,8 @@ def comb_strength(autos: Spectra, frames: Rows, averaging: Averaging, middles_mh
 
 
 def line_flags(
-    band: ChannelBand, autos: Spectra, frames: Rows, good: Bins, limit: float
-) -> tuple[Bins, Spectra]:
+    band: ChannelBand, autos: Autos, frames: Rows, good: Points, limit: float
+) -> tuple[Points, Autos]:
     """Find bins of a band off a smooth spectrum, in each spectrum independently.
 
     Parameters
@@ -348,7 +345,7 @@ def _one_span(
     return good & ~kept, float(np.median(scale))
 
 
-def _without_the_highest(values: OneRow, sigma: OneRow, good: Span, x: Terms, limit: float) -> Span:
+def _without_the_highest(values: OneRow, sigma: OneRow, good: Span, x: Basis, limit: float) -> Span:
     """Good spectra except those above the curve, which long bursts pull up."""
     kept = good.copy()
     for _ in range(MAX_ROUNDS):
@@ -362,7 +359,7 @@ def _without_the_highest(values: OneRow, sigma: OneRow, good: Span, x: Terms, li
 
 
 def _with_what_fits(
-    values: OneRow, sigma: OneRow, good: Span, kept: Span, x: Terms, limit: float
+    values: OneRow, sigma: OneRow, good: Span, kept: Span, x: Basis, limit: float
 ) -> Span:
     """Kept spectra, and others on the curve through them, singly and in stretches.
 
@@ -380,7 +377,7 @@ def _with_what_fits(
     return kept
 
 
-def _curve_is_known(values: OneRow, kept: Span, x: Terms) -> Span:
+def _curve_is_known(values: OneRow, kept: Span, x: Basis) -> Span:
     """Where the curve's error, common to a stretch, is below the noise of the stretch's sum."""
     _, leverage = fitted_curves(values, kept[None], x)
     return leverage[0] <= 1.0 / LENGTHS[-1]

@@ -485,10 +485,8 @@ def numbers_of_times(name: str, values: Any, n_times: int) -> Times:
         If shape or values are wrong; the message starts with ``name``.
     """
     expected = f"give one finite number, or one for each of {n_times} times"
-    try:
+    with refusing(f"{name} is {values!r}; {expected}", TypeError, ValueError):
         numbers = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name} is {values!r}; {expected}") from error
     if numbers.shape not in ((), (n_times,)) or not np.isfinite(numbers).all():
         raise InputError(f"{name} has shape {numbers.shape}; {expected}")
     return np.broadcast_to(numbers, (n_times,))

@@ -259,10 +259,8 @@ def _interval(place: str, row: dict[str, str]) -> Interval:
     with naming(place):
         options: dict[str, Any] = {"where": place}
         for name, default in (("turntable_deg", ""), ("duty_cycle", "1")):
-            try:
+            with refusing(f"{name} is '{row.get(name)}', expected a number", ValueError):
                 options[name] = float(row.get(name) or default)
-            except ValueError as error:
-                raise InputError(f"{name} is '{row[name]}', expected a number") from error
         night = (row.get("night_only", "").strip() or "false").lower()
         if night not in ("true", "false"):
             raise InputError(f"night_only is '{night}'; write true or false")

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Literal
@@ -158,14 +158,12 @@ def utc_times(times: Any) -> Time:
     given = np.atleast_1d(np.asarray(times)).ravel()
     listed = np.datetime_as_string(given, unit="ns") if given.dtype.kind == "M" else given
     texts = [_as_text(number, one) for number, one in enumerate(listed.tolist())]
-    try:
-        with unannounced_leap_seconds():
-            parsed = Time(texts, scale="utc")
-    except ValueError:
-        # dates of several formats, or an invalid one, which the message names
-        return Time([time_of_text(f"time {k}", text) for k, text in enumerate(texts)])
-    require_ephemeris(parsed.jd)
-    return parsed
+    with suppress(ValueError), unannounced_leap_seconds():
+        parsed = Time(texts, scale="utc")
+        require_ephemeris(parsed.jd)
+        return parsed
+    # dates of several formats, or an invalid one, which the message names
+    return Time([time_of_text(f"time {k}", text) for k, text in enumerate(texts)])
 
 
 def _as_text(number: int, one: Any) -> str:
