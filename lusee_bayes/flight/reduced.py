@@ -174,8 +174,7 @@ class Reduced(Described, Bands):
 
     def band(self, frequency_mhz: float) -> int:
         """Return the number of the band at a frequency; InputError if there is none."""
-        what = "the reduction has no band"
-        return place_of(what, self.frequencies_mhz, frequency_mhz)
+        return place_of("the reduction has no band", self.frequencies_mhz, frequency_mhz)
 
     def bins_at(self, band: int) -> Left:
         """Return the bins in which a band has data: the times of :meth:`at`."""

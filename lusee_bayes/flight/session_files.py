@@ -232,7 +232,15 @@ def write_session(
 
 
 def _write_session_fits(path: Path, rows: SessionRows, blocks: Blocks) -> None:
-    _fits_header(rows).writeto(path)
+    primary = fits.PrimaryHDU()
+    primary.header.update({"LAYOUTV": 3, "ORIGIN": "lusee_bayes"})
+    invariants, constants = (fits.ImageHDU(name=name) for name in ("SESSION_INV", "CONSTANTS"))
+    invariants.header["SW_VERS"] = rows.software
+    site = {"LUN_LAT": rows.lat_deg, "LUN_LON": rows.lon_deg, "LUN_HGT": 0.0}
+    raw_s, mjd, scale, source = rows.clock_words()
+    clock = {"RAWSHFT": raw_s, "MJDOFF": mjd, "TIMESYS": scale.upper(), "CLKSRC": source}
+    constants.header.update(site | clock)
+    fits.HDUList([primary, invariants, constants]).writeto(path)
     n, shape = rows.n_rows, (rows.n_rows, N_PRODUCTS, N_CHANNELS)
     header = fits.ImageHDU(np.broadcast_to(np.float32(0.0), shape), name="SPECTRA").header
     header.update({"NTIME": n, "NPROD": N_PRODUCTS, "NCHAN": N_CHANNELS})
@@ -249,20 +257,6 @@ def _write_session_fits(path: Path, rows: SessionRows, blocks: Blocks) -> None:
         tables = {"SPECTRA_TIMES": identity, "SPECTRA_META": rows.metadata()}
         for name, columns in (tables | {"SPEC_INTERP": {**times, **rows.telemetry}}).items():
             hdus.append(fits.BinTableHDU(Table(columns), name=name))
-
-
-def _fits_header(rows: SessionRows) -> fits.HDUList:
-    """All HDUs before the spectra."""
-    primary = fits.PrimaryHDU()
-    primary.header.update({"LAYOUTV": 3, "ORIGIN": "lusee_bayes"})
-    invariants = fits.ImageHDU(name="SESSION_INV")
-    invariants.header["SW_VERS"] = rows.software
-    raw_s, mjd, scale, source = rows.clock_words()
-    constants = fits.ImageHDU(name="CONSTANTS")
-    site = {"LUN_LAT": rows.lat_deg, "LUN_LON": rows.lon_deg, "LUN_HGT": 0.0}
-    clock = {"RAWSHFT": raw_s, "MJDOFF": mjd, "TIMESYS": scale.upper(), "CLKSRC": source}
-    constants.header.update(site | clock)
-    return fits.HDUList([primary, invariants, constants])
 
 
 # as in luseepy

@@ -493,8 +493,7 @@ def from_uvbeam(beam: Any, *, conjugate: bool = False, path: str = "the UVBeam")
     if (system := beam.pixel_coordinate_system) not in ("az_za", "healpix"):
         raise InputError(f"{path} has coordinates {system}; expected az_za or healpix")
     basis = np.asarray(beam.basis_vector_array)
-    unit = np.zeros_like(basis)
-    unit[0, 0] = unit[1, 1] = 1.0
+    unit = np.eye(2).reshape(2, 2, *(1,) * (basis.ndim - 2))
     if basis.shape[:2] != (2, 2) or not np.allclose(basis, unit, atol=1e-9):
         raise InputError(
             f"{path} has fields along vectors other than azimuth and zenith angle "
