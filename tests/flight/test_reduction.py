@@ -182,8 +182,8 @@ def test_shares_of_flags_are_those_of_the_values_that_there_were(reduced):
 
 def test_files_of_reduced_spectra_hold_all(reduced, tmp_path):
     found = rd.read_reduced(rd.write_reduced(tmp_path / "reduced.nc", reduced))
-    for name in ("values", "n_averaged", "reason", "gain", "gain_slope", "bin_of", "level", "lines"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(reduced, name))
+    for n in ("values", "n_averaged", "reason", "gain", "gain_slope", "bin_of", "level", "lines"):
+        np.testing.assert_array_equal(getattr(found, n), getattr(reduced, n))
     a, b = (one.at(25.0, np.ones(4)) for one in (found, reduced))
     assert a.digest() == b.digest()
     assert_refused(lambda: found.at(11.0, np.ones(4)))
