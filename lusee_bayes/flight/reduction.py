@@ -34,7 +34,6 @@ from lusee_bayes.instrument.times import seconds_from
 # spectra in a slab, and fewest spectra of a piece that ends between two bins
 SLAB, PIECE = 128, 1024
 # of some spectra
-Counts = Float32[np.ndarray, "rows products channels"]
 Curve = Float[np.ndarray, "ports 3 bins"]
 
 

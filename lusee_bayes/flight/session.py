@@ -43,10 +43,7 @@ NO_LEVEL = "-"
 PORTS = 4
 
 # autos of the four ports, then real and imaginary part of every pair
-FLIGHT_PRODUCTS = (
-    *(f"{i}{i}R" for i in range(PORTS)),
-    *(f"{i}{j}{part}" for i in range(PORTS) for j in range(i + 1, PORTS) for part in "RI"),
-)
+FLIGHT_PRODUCTS = tuple(sorted(labels(), key=lambda label: label[0] != label[1]))
 N_PRODUCTS = len(FLIGHT_PRODUCTS)
 # the package's products in the spectrometer's order, and the ports and part of each of them
 OF_FLIGHT = np.array([FLIGHT_PRODUCTS.index(label) for label in labels()])

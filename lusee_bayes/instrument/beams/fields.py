@@ -483,8 +483,7 @@ def from_rings(
         Complex if the pixels are.
     """
     nside = healpy.npix2nside(pixels.shape[-1])
-    sizes = 4 * np.minimum(np.arange(1, 2 * nside), nside)
-    starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+    starts, sizes, *_ = healpy.ringinfo(nside, np.arange(1, 2 * nside))
     ring_theta, first_phi = healpy.pix2ang(nside, starts)
     orders = np.arange(1 - 2 * nside, 2 * nside)
     # f_m of every ring; orders for which a ring has too few pixels are not used
