@@ -33,7 +33,7 @@ from lusee_bayes.instrument.times import seconds_from
 
 # spectra in a slab, and fewest spectra of a piece that ends between two bins
 SLAB, PIECE = 128, 1024
-# of some spectra
+# gains of the ports, each with two components, in the bins of one state
 Curve = Float[np.ndarray, "ports 3 bins"]
 
 

@@ -32,7 +32,6 @@ from jaxtyping import Bool, Float, Int
 from lusee_bayes.core.arrays import Times
 from lusee_bayes.core.checks import Described, extent, require_finite, require_shape
 from lusee_bayes.core.errors import InputError, nearest, refusing, require_known
-from lusee_bayes.core.layouts import Attribute, Content
 from lusee_bayes.core.reading import naming
 
 Numbers, Nodes = Int[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]
@@ -40,8 +39,6 @@ EPHEMERIS_YEARS = (1900, 2050)
 EPHEMERIS_JD = [float(Time(f"{year}-01-01", scale="tdb").jd) for year in EPHEMERIS_YEARS]
 # time scales that files may state
 SCALES = ("utc", "tai", "tt", "tdb")
-# attributes of Julian dates in two parts, jd1 and jd2, in a file
-JD_SCALES = {name: Attribute("text", optional=True) for name in ("jd1.scale", "jd2.scale")}
 
 
 @contextmanager
@@ -120,22 +117,6 @@ def scale_of(name: str, stated: str) -> str:
     if (scale := stated.strip().lower()) not in SCALES:
         raise InputError(f"{name} is '{stated}'; {nearest(scale, SCALES)}")
     return scale
-
-
-def utc_of_jd(content: Content) -> Time:
-    """Return times of a file's ``jd1`` and ``jd2``, in UTC.
-
-    Their scale is the one that the file states (:data:`JD_SCALES`), or UTC.
-
-    Raises
-    ------
-    InputError
-        If the scale is unknown or differs between the two, and as :func:`utc_of`.
-    """
-    scales = {scale_of(n, content.values[n]) for n in JD_SCALES if n in content.values} or {"utc"}
-    if len(scales) > 1:
-        raise InputError(f"jd1 and jd2 have different scales, {' and '.join(sorted(scales))}")
-    return utc_of(content.arrays["jd1"], content.arrays["jd2"], scales.pop())
 
 
 def utc_times(times: Any) -> Time:

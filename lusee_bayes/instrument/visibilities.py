@@ -33,12 +33,30 @@ from lusee_bayes.core.reading import naming, require_file
 from lusee_bayes.instrument.beams.source import MeasuredReceiver, receiver_of
 from lusee_bayes.instrument.observation import Observation, numbers_of_times, runs_of, site_of
 from lusee_bayes.instrument.products import N_ANTENNAS, DataLayout, labels_of, real_products
-from lusee_bayes.instrument.times import JD_SCALES, Windows, later, utc_of_jd, utc_times, windows_of
+from lusee_bayes.instrument.times import Windows, later, scale_of, utc_of, utc_times, windows_of
 
 PIECES = ("piece_sample", "piece_start_s", "piece_end_s", "piece_live_s")
+# attributes of Julian dates in two parts, jd1 and jd2, in a file
+JD_SCALES = {name: Attribute("text", optional=True) for name in ("jd1.scale", "jd2.scale")}
 # times for people are written to the millisecond
 SINCE = "milliseconds since 1970-01-01"
 ENCODING = {"units": SINCE, "calendar": "proleptic_gregorian", "dtype": "int64"}
+
+
+def _utc_of_jd(content: Content) -> Time:
+    """Return times of a file's ``jd1`` and ``jd2``, in UTC.
+
+    Their scale is the one that the file states (:data:`JD_SCALES`), or UTC.
+
+    Raises
+    ------
+    InputError
+        If the scale is unknown or differs between the two, and as :func:`utc_of`.
+    """
+    scales = {scale_of(n, content.values[n]) for n in JD_SCALES if n in content.values} or {"utc"}
+    if len(scales) > 1:
+        raise InputError(f"jd1 and jd2 have different scales, {' and '.join(sorted(scales))}")
+    return utc_of(content.arrays["jd1"], content.arrays["jd2"], scales.pop())
 
 
 def _datetimes(times: Time) -> np.ndarray:
@@ -446,7 +464,7 @@ def read_visibilities(path: str | Path) -> Visibilities:
     checks.require_finite(f"{path}: visibility (where not flagged)", values)
     with naming(path):
         layout = DataLayout.from_flags(flags)
-        times, windows = read_windows(content, utc_of_jd(content))
+        times, windows = read_windows(content, _utc_of_jd(content))
         says_window = windows is not None or said.get("window") == "instant"
         runs = arrays["run"], tuple(arrays["turntable_deg"].tolist()), said["step_s"]
         seen = Observation(said["lon_deg"], said["lat_deg"], times, *runs, windows=windows)
