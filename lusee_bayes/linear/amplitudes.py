@@ -325,16 +325,6 @@ class Patterns(eqx.Module):
             log_det=np.asarray(whole.log_det + 2.0 * np.log(np.diagonal(self.lower)).sum()),
         )
 
-    def whole_sky(self, diffuse: Modes) -> Modes:
-        """Compute the mean of m given d, in K.
-
-        Parameters
-        ----------
-        diffuse : (modes,) array
-            d, in K.
-        """
-        return self.whole_skies(diffuse[None], np.zeros((1, len(self.patterns))))[0]
-
     def whole_skies(self, diffuse: Skies, z: Float[np.ndarray, "skies patterns"]) -> Skies:
         """Compute draws of m given draws of d, in K.
 

@@ -528,9 +528,9 @@ class Whitened(Form):
     def _factorised(model: LinearGaussian) -> tuple[Factor, Array, Array, Array | None]:
         """L of N, W, L of Lambda, and the basis."""
 
-    @abstractmethod
     def _log_det(self) -> Float[Array, ""]:
         """ln|Lambda|."""
+        return 2.0 * jnp.log(jnp.diagonal(self.lower)).sum()
 
     def seen(self, u: Float[Array, " white"]) -> DataVector:
         """Compute W u."""
@@ -557,23 +557,6 @@ class Whitened(Form):
         traced = is_traced(*jax.tree.leaves(parts))
         return Solution(*(parts if traced else on_host(parts)))
 
-    def surprise(self, data: DataVector) -> DataVector:
-        """Compute L^-1 (d - E[d]), where E[d] is the prediction of the prior's mean sky.
-
-        Parameters
-        ----------
-        data : (data,) array
-            d, in K.
-
-        Returns
-        -------
-        (data,) array
-            White data, N(0, 1 + W W^T) under the model.
-        """
-        offset = self.model.offset
-        white = self.factor.whiten(data if offset is None else data - offset)
-        return white - self.seen(self.model.prior.white_mean)
-
 
 class InMap(Whitened):
     """Map-space form, which colours only a square: Lambda = 1 + G^T (A^T N^-1 A) G."""
@@ -590,9 +573,6 @@ class InMap(Whitened):
 
     def pulled(self, white):
         return self.model.prior.colour_columns((self.whitened.T @ white)[None])[0]
-
-    def _log_det(self):
-        return 2.0 * jnp.log(jnp.diagonal(self.lower)).sum()
 
 
 class InData(Whitened):
@@ -652,7 +632,9 @@ def _solve(solver: Whitened, data: DataVector) -> tuple[Array, Array, Array]:
     (corrected seminormal equations) restores the lost digits. Derivatives do not pass through the
     iteration: one more step with live arrays at its fixed point carries them exactly.
     """
-    white = solver.surprise(data)
+    # L^-1 (d - E[d]), where E[d] is the prediction of the prior's mean sky
+    offset, expected = solver.model.offset, solver.model.prior.white_mean
+    white = solver.factor.whiten(data if offset is None else data - offset) - solver.seen(expected)
     frozen, still = jax.lax.stop_gradient((solver, white))
 
     def refine(state):
@@ -673,4 +655,4 @@ def _solve(solver: Whitened, data: DataVector) -> tuple[Array, Array, Array]:
         + white.shape[0] * np.log(2.0 * np.pi)
     )
     # so far, u was the sky's deviation from the prior's mean
-    return u + solver.model.prior.white_mean, log_evidence, moved
+    return u + expected, log_evidence, moved

@@ -388,8 +388,9 @@ def positive_sky(
     beside = diffuse_part(skies, channel, information)
     slope = _slope(skies, channel, exponent)
     covariance = beside.whole_covariance(symmetric_product(slope @ joint_sky.covariance, slope.T))
-    mean = beside.whole_sky(_whole(skies, channel, joint_sky.mean))
     shape = len(draws), len(beside.patterns)
+    middle = _whole(skies, channel, joint_sky.mean)[None]
+    mean = beside.whole_skies(middle, np.zeros((1, shape[1])))[0]
     flux_key = jax.random.fold_in(jax.random.fold_in(key, channel), 1)
     z = np.asarray(jax.random.normal(flux_key, shape, dtype=jnp.float64))
     drawn = np.empty((len(draws), len(mean)))

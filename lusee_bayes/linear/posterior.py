@@ -69,10 +69,6 @@ class Posterior(Described, eqx.Module):
         """Posterior mean of m in K; harmonic coefficients are Galactic and real packed."""
         return self.prior.colour(self.white_mean)
 
-    def to_map(self, nside: int = 64) -> Pixels:
-        """Compute the mean as a Galactic HEALPix RING map, in K."""
-        return harmonics.modes_to_map(np.asarray(self.mean), nside)
-
     def pixel_covariance(self, lon_deg: Degrees, lat_deg: Degrees) -> Float[np.ndarray, "n n"]:
         """Compute the covariance of the sky's temperatures in given directions.
 

@@ -110,7 +110,6 @@ class Prior(Described, eqx.Module):
             As :meth:`require_density`.
         """
 
-    @abstractmethod
     def require_density(self) -> None:
         """Raise an InputError if S is singular, so that m has no density."""
 
@@ -270,9 +269,6 @@ class DensePrior(Prior):
     def log_det(self):
         xp = namespace(self)
         return xp.asarray(xp.log(xp.diagonal(self.root)).sum())
-
-    def require_density(self) -> None:
-        """Raise nothing, since G has an inverse."""
 
 
 def _require_symmetric_prior(covariance: Float[np.ndarray, "modes modes"]) -> None:

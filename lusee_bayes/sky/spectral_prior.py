@@ -13,10 +13,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import Float
 
 from lusee_bayes.core import checks
 from lusee_bayes.core.arrays import Array, namespace
@@ -261,16 +260,6 @@ class SpectralPrior(checks.Described, eqx.Module):
         if self.residual is None:
             return None
         return namespace(self).sqrt(per_mode(self.residual[channel]))
-
-    def sample(self, key: PRNGKeyArray) -> Float[Array, "channels modes"]:
-        """Draw skies of all channels from the prior, in K."""
-        roots = self.roots
-        first, second = jax.random.split(key)
-        skies = self.mixing @ (roots * jax.random.normal(first, roots.shape, dtype=jnp.float64))
-        if self.residual is None:
-            return skies
-        std = jnp.sqrt(per_mode(self.residual))
-        return skies + std * jax.random.normal(second, std.shape, dtype=jnp.float64)
 
 
 def _residual_spectra(skies: np.ndarray, residual: float) -> Float[Array, "channels ells"] | None:

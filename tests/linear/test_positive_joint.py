@@ -12,7 +12,7 @@ from reference import sphere
 from scipy import optimize, stats
 
 import lusee_bayes as lb
-from lusee_bayes.core.harmonics import n_modes, synthesis_matrix
+from lusee_bayes.core.harmonics import n_modes, per_mode, synthesis_matrix
 from lusee_bayes.linear import positive_joint as pj
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.joint import paired
@@ -47,12 +47,19 @@ def quadrature():
     return theta, phi, synthesis_matrix(theta, phi, LMAX), weights
 
 
+def drawn(prior, seed):
+    first, second = jax.random.split(jax.random.key(seed))
+    fields = prior.roots * jax.random.normal(first, prior.roots.shape, dtype=jnp.float64)
+    std = np.sqrt(per_mode(prior.residual))
+    residuals = std * jax.random.normal(second, std.shape, dtype=jnp.float64)
+    return np.asarray(prior.mixing @ fields + residuals)
+
+
 def observed(skies, laws, seed=0, noise=0.05, n_data=40, n_shared=0):
     """Skies drawn from the prior, seen by random couplings, beside what all channels share."""
     rng = np.random.default_rng(seed)
-    exponents = np.asarray(laws.prior(skies).sample(jax.random.key(seed)))
     found, shared = [], rng.standard_normal(n_shared)
-    for k, exponent in enumerate(exponents):
+    for k, exponent in enumerate(drawn(laws.prior(skies), seed)):
         fluxes = rng.exponential(size=skies.sources.shape[1])
         sky = skies.modes(k, exponent) + fluxes @ skies.sources[k]
         a = rng.standard_normal((n_data + 2 * k, N))
