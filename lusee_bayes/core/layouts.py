@@ -254,10 +254,8 @@ def _require_form(where: str, array: Unread, declared: Variable, sizes: dict[str
 
 def _checked_array(where: str, values: np.ndarray, declared: Variable, factor: float) -> np.ndarray:
     if declared.kind == "text":
-        texts = np.array([_text(where, x) for x in values.ravel()]).reshape(values.shape)
-        for text in texts.ravel() if declared.choices else ():
-            require_known(f"{where} is", str(text), declared.choices)
-        return texts
+        texts = [_text(where, x, declared) for x in values.ravel()]
+        return np.array(texts).reshape(values.shape)
     if declared.kind == "time":
         if np.isnat(values).any():
             first = tuple(np.argwhere(np.isnat(values))[0].tolist())
@@ -307,10 +305,7 @@ def _checked_value(where: str, value: Any, declared: Variable) -> Any:
     if kind == "word" and isinstance(value, int) and not isinstance(value, bool):
         value = str(value)
     if kind in ("text", "word"):
-        text = _text(where, value)
-        if declared.choices:
-            require_known(f"{where} is", text, declared.choices)
-        return text
+        return _text(where, value, declared)
     # a list of lists of different lengths is not an array
     number = np.asarray(None if isinstance(value, list) else value)
     good = number.ndim == 0 and number.dtype.kind in KINDS[kind][0]
@@ -325,9 +320,11 @@ def _checked_value(where: str, value: Any, declared: Variable) -> Any:
     return KINDS[kind][1](number).item()
 
 
-def _text(where: str, value: Any) -> str:
+def _text(where: str, value: Any, declared: Variable) -> str:
     with refusing(f"{where} contains text that is not UTF-8: {value!r}", UnicodeDecodeError):
         text = value.decode() if isinstance(value, bytes) else value
     if not isinstance(text, str):
         raise InputError(f"{where} is {value!r}, expected text")
+    if declared.choices:
+        require_known(f"{where} is", str(text), declared.choices)
     return str(text)

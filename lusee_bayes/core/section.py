@@ -119,6 +119,9 @@ def kinds_of(*sections: type[Section]) -> dict[str, type[Section]]:
 def one_of(kinds: Kinds, complete: Callable[[dict[str, Any]], None], *, strict: bool = True) -> Any:
     """The type of a section that has several kinds.
 
+    Entries that only its other kinds have are dropped: scenarios that were written with all keys,
+    or in which ``--set`` replaces one kind by another, still contain them.
+
     Parameters
     ----------
     kinds : mapping
@@ -126,7 +129,7 @@ def one_of(kinds: Kinds, complete: Callable[[dict[str, Any]], None], *, strict: 
     complete : callable
         Adds missing entries to the section's tree in place: at least ``model``.
     strict : bool
-        As in :func:`without_other_kinds`.
+        Refuse a key of another kind whose value is not that kind's default.
     """
 
     def completed(value: Any) -> Any:
@@ -134,7 +137,22 @@ def one_of(kinds: Kinds, complete: Callable[[dict[str, Any]], None], *, strict: 
             return value
         tree = dict(value)
         complete(tree)
-        return without_other_kinds(tree, kinds, strict=strict)
+        chosen = kinds.get(tree["model"]) if isinstance(tree["model"], str) else None
+        if chosen is None:
+            return tree
+        kept = {}
+        for key, entry in tree.items():
+            others = [k for k in kinds.values() if key in k.model_fields]
+            if key in chosen.model_fields or not others:
+                kept[key] = entry
+                continue
+            default = others[0].model_fields[key].get_default(call_default_factory=True)
+            # YAML has lists where sections have tuples
+            plain = list(default) if isinstance(default, tuple) else default
+            if strict and entry not in (None, default, plain):
+                names = ", ".join(name for name, kind in kinds.items() if kind in others)
+                raise ValueError(f"{key} belongs to model {names}, not to {tree['model']}")
+        return kept
 
     kind = Field(discriminator="model")
     return Annotated[reduce(or_, kinds.values()), kind, BeforeValidator(completed)]
@@ -143,46 +161,3 @@ def one_of(kinds: Kinds, complete: Callable[[dict[str, Any]], None], *, strict: 
 def is_modelled(section: Any) -> bool:
     """Whether a section is present and its treatment is not ``ignored``."""
     return section is not None and section.treatment != "ignored"
-
-
-def without_other_kinds(tree: dict[str, Any], kinds: Kinds, *, strict: bool) -> dict[str, Any]:
-    """Return a section's entries without those that only its other kinds have.
-
-    Scenarios that were written with all keys, or in which ``--set`` replaces one kind by another,
-    still contain keys of the other kind.
-
-    Parameters
-    ----------
-    tree : dict
-        The section's entries, including ``model``.
-    kinds : mapping
-        The section of each ``model``.
-    strict : bool
-        Refuse a key of another kind whose value is not that kind's default.
-
-    Returns
-    -------
-    dict
-        The entries that this kind has, and those that no kind has.
-
-    Raises
-    ------
-    ValueError
-        For such a key, if ``strict``.
-    """
-    chosen = kinds.get(tree["model"]) if isinstance(tree["model"], str) else None
-    if chosen is None:
-        return tree
-    kept = {}
-    for key, value in tree.items():
-        others = [k for k in kinds.values() if key in k.model_fields]
-        if key in chosen.model_fields or not others:
-            kept[key] = value
-            continue
-        default = others[0].model_fields[key].get_default(call_default_factory=True)
-        # YAML has lists where sections have tuples
-        plain = list(default) if isinstance(default, tuple) else default
-        if strict and value not in (None, default, plain):
-            names = ", ".join(name for name, kind in kinds.items() if kind in others)
-            raise ValueError(f"{key} belongs to model {names}, not to {tree['model']}")
-    return kept

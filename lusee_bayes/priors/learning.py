@@ -259,13 +259,6 @@ def learn(
     InputError
         If S is not positive definite.
     """
-    return _learned(family, information, *_uphill(family, information, start, seed))
-
-
-def _uphill(
-    family: PriorFamily, information: Information, start: Parameters | None, seed: int
-) -> tuple[_Point, Generator, int]:
-    """The most probable parameters, the random generator, and the number of steps."""
     rng, before, moves = np.random.default_rng(seed), None, []
     point = _at(family, information, family.hyperprior.start() if start is None else start)
     for steps in range(MAX_STEPS + 1):
@@ -277,7 +270,7 @@ def _uphill(
         step = np.linalg.solve(curvature, gradient)
         gain = 0.5 * float(gradient @ step)
         if gain < SETTLED:
-            return point, rng, steps
+            return _learned(family, information, point, rng, steps)
         point = _climb(family, information, point, step * min(1.0, LONGEST / np.abs(step).max()))
     raise NotSettled(
         f"the prior's parameters did not converge in {MAX_STEPS} steps: the next would still add "

@@ -178,15 +178,6 @@ def test_the_kernel_is_its_formula():
     np.testing.assert_allclose(prior.residual[:, ell], expected, rtol=1e-12)
 
 
-def test_draws_of_the_prior_have_its_covariance():
-    prior = PRIORS["components"]()
-    keys = jax.random.split(jax.random.key(0), 4000)
-    draws = np.asarray(jax.vmap(prior.sample)(keys)).reshape(4000, -1)
-    s = covariance_of(prior)
-    z = np.linalg.solve(np.linalg.cholesky(s), draws.T)
-    assert np.abs(z @ z.T / 4000 - np.eye(len(s))).max() < z_of(len(s) ** 2) * np.sqrt(2 / 4000)
-
-
 def test_bad_priors_and_channels_are_refused():
     all_four = FREQUENCIES, skies()
     refuse("'turnver'; did you mean 'turnover'", components, *all_four, ("turnver",))
