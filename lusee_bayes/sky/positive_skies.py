@@ -320,11 +320,11 @@ class PositiveSkies(eqx.Module):
         lmax: int,
         names: tuple[str, ...] = tuple(FIELDS),
         *,
+        sources: Float[np.ndarray, "channels sources modes"],
+        weight: Template,
+        lmax_fields: int,
         reference_mhz: float = 20.0,
         turnover_mhz: float = 5.0,
-        sources: Float[np.ndarray, "channels sources modes"] | None = None,
-        weight: Callable[[np.ndarray, np.ndarray], np.ndarray] | None = None,
-        lmax_fields: int | None = None,
         band: int | None = None,
     ) -> PositiveSkies:
         """Create the skies from a template for every frequency.
@@ -339,14 +339,14 @@ class PositiveSkies(eqx.Module):
             Highest ell of the maps.
         names : tuple of str
             Keys of ``FIELDS``.
+        sources : (channels, sources, modes) array
+            Coefficients of point sources, in K.
+        weight : callable
+            w, a function of Galactic theta and phi in radians.
+        lmax_fields : int
+            Highest ell of the exponents, at least ``lmax``.
         reference_mhz, turnover_mhz : float
             nu_ref and nu_turnover.
-        sources : (channels, sources, modes) array, optional
-            Coefficients of point sources, in K.
-        weight : callable, optional
-            w, a function of Galactic theta and phi in radians; by default one.
-        lmax_fields : int, optional
-            Highest ell of the exponents, at least ``lmax``; by default ``lmax``.
         band : int, optional
             Band limit of the grid; by default three times that of the exponents, and at least 192.
 
@@ -358,15 +358,13 @@ class PositiveSkies(eqx.Module):
         """
         frequencies = np.asarray(frequencies_mhz, dtype=np.float64)
         cls.require_fields(names, len(frequencies))
-        highest = lmax if lmax_fields is None else lmax_fields
-        grid = SphereGrid.of(highest, max(GRID * highest, FIELDS_GRID) if band is None else band)
+        finest = max(GRID * lmax_fields, FIELDS_GRID) if band is None else band
+        grid = SphereGrid.of(lmax_fields, finest)
         at = grid.directions()
         levels = np.stack([template(*at).reshape(grid.shape) for template in templates])
         require_positive("the template", levels, "its logarithm is modelled")
-        strength = np.ones(grid.shape) if weight is None else weight(*at).reshape(grid.shape)
+        strength = weight(*at).reshape(grid.shape)
         require_positive("the weight of the fields", strength)
-        if sources is None:
-            sources = np.zeros((len(frequencies), 0, n_modes(lmax)))
         require_shape("the sources", sources, (len(frequencies), None, n_modes(lmax)))
         x, y = frequencies / reference_mhz, frequencies / turnover_mhz
         mixing = np.stack([FIELDS[name](x, y) for name in names], axis=1)

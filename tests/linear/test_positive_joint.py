@@ -37,7 +37,7 @@ def skies_of(frequencies, names, n_sources=0):
     points = synthesis_matrix(np.array([0.4, 1.9]), np.array([2.0, 4.0]), LMAX)[:n_sources]
     sources = np.stack([20.0 * (f / 20.0) ** -2.5 * points for f in frequencies])
     templates = [partial(band, f) for f in frequencies]
-    options = {"sources": sources, "weight": weight, "band": 24}
+    options = {"sources": sources, "weight": weight, "lmax_fields": LMAX, "band": 24}
     return PositiveSkies.of(frequencies, templates, LMAX, names, **options)
 
 
@@ -226,10 +226,10 @@ def test_learned_laws_maximise_the_evidence():
 
 def test_bad_input_is_refused_in_a_sentence():
     refuse("field 'indx'.*'index'", skies_of, FREQUENCIES, ("level", "indx"))
-    one, build = FREQUENCIES[:1], PositiveSkies.of
-    refuse("2 fields.*channels", skies_of, one, ("level", "index"))
+    refuse("2 fields.*channels", skies_of, FREQUENCIES[:1], ("level", "index"))
+    options = {"sources": np.zeros((4, 0, N)), "weight": weight, "lmax_fields": LMAX}
     holes = [lambda theta, phi, f=f: band(f, theta, phi) - 50.0 for f in FREQUENCIES]
-    refuse("the template", build, FREQUENCIES, holes, LMAX)
+    refuse("the template", PositiveSkies.of, FREQUENCIES, holes, LMAX, **options)
     skies = skies_of(FREQUENCIES[:1], ("level",))
     other = Information(*(np.zeros(s) for s in ((4, 4), 4, 4, (), (), ())))
     refuse("the patterns", pj.linearised, skies, 0, other, np.zeros(N))
