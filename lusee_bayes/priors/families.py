@@ -196,10 +196,18 @@ class Member(ABC):
 
 
 class PriorFamily(ABC):
-    """Priors N(mean, S(theta)) over harmonic coefficients, in NumPy."""
+    """Priors N(mean, S(theta)) over harmonic coefficients, in NumPy.
 
-    # of the reported parameters, which come first
+    Attributes
+    ----------
+    names : tuple of str
+        Of the reported parameters, which come first.
+    mean : (modes,) array or None
+        Common mean of the priors, in K; None for zero.
+    """
+
     names: ClassVar[tuple[str, ...]] = ("ln C at ell = 9", "tilt", "curvature")
+    mean: Float[np.ndarray, " modes"] | None
 
     @property
     @abstractmethod
@@ -209,11 +217,6 @@ class PriorFamily(ABC):
     @abstractmethod
     def at(self, parameters: Parameters) -> Member:
         """Return the member with these parameters."""
-
-    @property
-    def centre(self) -> Float[np.ndarray, " modes"] | None:
-        """Common mean of its priors, in K; None for zero."""
-        return None
 
     def expected(self) -> Prior:
         """Return the prior with the most probable parameters under the hyperprior."""
@@ -295,6 +298,7 @@ class IsotropicFamily(PriorFamily):
         Expected ln C_0.
     """
 
+    mean: ClassVar[None] = None
     spectrum: SpectrumBasis
     log_monopole: float
 

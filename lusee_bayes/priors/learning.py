@@ -165,8 +165,6 @@ class Learned:
         The normal distribution of their normal scores, from which they are drawn.
     log_evidence : float
         ln p(d), with the sky and the parameters integrated out (Laplace).
-    steps : int
-        Number of steps.
     noise_factor : float
         Factor of N with which the parameters were learned; above 1 if the data do not fit.
     settled : bool
@@ -186,7 +184,6 @@ class Learned:
     covariance: Square
     scores: Scores
     log_evidence: float
-    steps: int
     noise_factor: float = field(default=1.0, kw_only=True)
     settled: bool = field(default=True, kw_only=True)
     still_moves: float = field(default=0.0, kw_only=True)
@@ -261,7 +258,7 @@ def learn(
     """
     rng, before, moves = np.random.default_rng(seed), None, []
     point = _at(family, information, family.hyperprior.start() if start is None else start)
-    for steps in range(MAX_STEPS + 1):
+    for _ in range(MAX_STEPS + 1):
         gradient = point.slope(family)
         if before is not None:
             moves.append((point.parameters - before[0], before[1] - gradient))
@@ -270,7 +267,7 @@ def learn(
         step = np.linalg.solve(curvature, gradient)
         gain = 0.5 * float(gradient @ step)
         if gain < SETTLED:
-            return _learned(family, information, point, rng, steps)
+            return _learned(family, information, point, rng)
         point = _climb(family, information, point, step * min(1.0, LONGEST / np.abs(step).max()))
     raise NotSettled(
         f"the prior's parameters did not converge in {MAX_STEPS} steps: the next would still add "
@@ -346,7 +343,7 @@ def _fixed(family: PriorFamily, information: Information, factor: float) -> Lear
         try:
             evidence = float(information.posterior(prior).log_evidence)
             none = Scores(np.zeros(0), np.zeros((0, 0)), 0.0)
-            return Learned(prior, (), none.mean, none.covariance, none, evidence, 0, settled=False)
+            return Learned(prior, (), none.mean, none.covariance, none, evidence, settled=False)
         except InputError as error:
             prior, failed = prior.widened(10.0), error
     raise failed
@@ -387,7 +384,7 @@ def _root(covariance: Square) -> Float[np.ndarray, "n k"]:
 
 
 def _learned(
-    family: PriorFamily, information: Information, point: _Point, rng: Generator, steps: int
+    family: PriorFamily, information: Information, point: _Point, rng: Generator
 ) -> Learned:
     covariance = np.linalg.inv(point.curvature(family, rng, FINAL_SIMULATIONS))
     scores = normal_scores(family.hyperprior, point.parameters, covariance)
@@ -408,7 +405,7 @@ def _learned(
     moved = np.zeros(len(mean))
     moved[0] = shift / family.hyperprior.slopes_of_scores(scores.mean)[0]
     prior, scores = at_level(shift).prior, replace(scores, mean=scores.mean + moved)
-    return Learned(prior, family.names, point.parameters, covariance, scores, evidence, steps)
+    return Learned(prior, family.names, point.parameters, covariance, scores, evidence)
 
 
 # at most SHARED skies have the same theta, and at most two do until there are LEAST theta

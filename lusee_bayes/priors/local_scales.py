@@ -217,10 +217,6 @@ class LocalScales(PriorFamily):
         widths = np.concatenate([self.spectrum.width, [SOURCES_WIDTH], width])
         return Hyperprior(centres, widths, N_CELLS)
 
-    @property
-    def centre(self):
-        return self.mean
-
     def at(self, parameters: Parameters) -> LocalScalesMember:
         return LocalScalesMember(self, *self._split(parameters))
 

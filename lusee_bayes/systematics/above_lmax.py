@@ -121,7 +121,7 @@ def sky_above(setup: Setup, noise: Factor, learned: ModesMatrix | None = None) -
     if family is None:
         covariance, mean = prior.covariance(), prior.mean
     else:
-        covariance, mean = learned, family.centre
+        covariance, mean = learned, family.mean
         if learned is None:
             covariance = family.at(family.hyperprior.start()).covariance
     covariance = np.asarray(covariance)[n:, n:]
