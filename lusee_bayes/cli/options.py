@@ -123,7 +123,8 @@ class Options:
         console = Console(quiet=self.quiet, soft_wrap=True)
         say(console, *(f"  {path}" for path in files if self.verbose))
         if table is not None:
-            show(console, table)
+            # within the width of the terminal, with wrapped cells
+            console.print(table, soft_wrap=False)
         say(console, *lines)
 
 
@@ -261,8 +262,3 @@ def say(console: Console, *lines: object) -> None:
     """Print lines without markup."""
     for line in lines:
         console.print(str(line), highlight=False, markup=False)
-
-
-def show(console: Console, table: Table) -> None:
-    """Print a table within the width of the terminal, with wrapped cells."""
-    console.print(table, soft_wrap=False)

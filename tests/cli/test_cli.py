@@ -34,7 +34,7 @@ from rich.console import Console
 
 import lusee_bayes
 from lusee_bayes.cli.commands import app
-from lusee_bayes.cli.options import ScenarioOptions, show
+from lusee_bayes.cli.options import ScenarioOptions
 from lusee_bayes.cli.tables import checks_table, comparison_table
 from lusee_bayes.core.arrays import SWITCH
 from lusee_bayes.core.harmonics import from_healpy, modes_to_map, pixel_matrix
@@ -299,7 +299,7 @@ def finished(small_map):
 def printed(table) -> list[str]:
     console = Console(width=80, soft_wrap=True, record=True, quiet=False, force_terminal=False)
     with console.capture() as captured:
-        show(console, table)
+        console.print(table, soft_wrap=False)
     return captured.get().splitlines()
 
 
