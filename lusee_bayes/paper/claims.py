@@ -7,7 +7,6 @@ by the two conditions given to :func:`grade`. All numbers are computed here from
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -30,48 +29,16 @@ SHOWN_FREQUENCIES = (5, 15, 25, 35, 45)
 SIDEREAL_MONTH_DAYS = 27.3
 
 
-@dataclass(frozen=True)
-class Verdict:
-    """The result obtained, and whether it agrees with the paper: yes, partly or no."""
-
-    obtained: str
-    agrees: str
-
-
-@dataclass(frozen=True)
-class Claim:
-    """A claim of the paper from claims.yaml.
-
-    Attributes
-    ----------
-    section, paper : str
-        Section of the paper, and its claim.
-    otherwise : str
-        Why it may fail with this beam and sky.
-    judge : str
-        The function of this module that decides, without its underscore.
-    of : tuple
-        Its arguments after the cases.
-    """
-
-    section: str
-    paper: str
-    otherwise: str
-    judge: str
-    of: tuple[str | float, ...] = ()
-
-    def verdict(self, cases: Cases) -> Verdict:
-        """Test the claim with the cases."""
-        return globals()[f"_{self.judge}"](cases, *self.of)
-
-
-ROWS = read_yaml(Path(__file__).with_name("claims.yaml"), "the paper's claims")
-CLAIMS = tuple(Claim(**row | {"of": tuple(row.get("of", ()))}) for row in ROWS)
+# each with its section, what the paper says, why it may fail here (``otherwise``), and the function
+# of this module that judges it, without its underscore
+CLAIMS = read_yaml(Path(__file__).with_name("claims.yaml"), "the paper's claims")
+# the result obtained, and whether it agrees with the paper: yes, partly or no
+Verdict = dict[str, str]
 
 
 def grade(obtained: str, agrees: bool | np.bool_, partly: bool | np.bool_ = False) -> Verdict:
     """A verdict; a NaN in a condition makes it false."""
-    return Verdict(obtained, "yes" if agrees else "partly" if partly else "no")
+    return {"obtained": obtained, "agrees": "yes" if agrees else "partly" if partly else "no"}
 
 
 def frequency_case(frequency_mhz: int) -> str:
@@ -446,8 +413,10 @@ def claim_table(cases: Cases) -> list[dict[str, object]]:
     """Rows of claims.csv, in the order of the paper."""
     rows = []
     for claim in CLAIMS:
-        row = {"section": claim.section, "paper": claim.paper} | asdict(claim.verdict(cases))
-        rows.append(row | {"reason": "agrees" if row["agrees"] == "yes" else claim.otherwise})
+        verdict = globals()[f"_{claim['judge']}"](cases, *claim.get("of", ()))
+        reason = "agrees" if verdict["agrees"] == "yes" else claim["otherwise"]
+        said = {"section": claim["section"], "paper": claim["paper"]}
+        rows.append(said | verdict | {"reason": reason})
     return rows
 
 
