@@ -36,14 +36,25 @@ class _OverLayout(Covariance):
         return self.layout.size
 
 
-def _masked(band: Band, layout: DataLayout) -> Band:
-    """Replace blocks before the first time, and missing samples, by those of the unit matrix."""
-    n_times, widths, products = band.shape[:3]
-    time, back = np.arange(n_times)[:, None], np.arange(widths)[None]
+def _checked(name: str, band: Band, layout: DataLayout) -> Band:
+    """The band, in which blocks before the first time, and missing samples, are the unit matrix's.
+
+    Raises
+    ------
+    InputError
+        If it does not match the layout, is not finite, or is not symmetric within one time.
+    """
+    checks.require_float64(name, band)
+    n = layout.n_products
+    checks.require_shape(name, band, (layout.n_times, None, n, n))
+    time, back = np.arange(layout.n_times)[:, None], np.arange(band.shape[1])[None]
     row = layout.present.T
     column = row[np.maximum(time - back, 0)] & (time >= back)[:, :, None]
-    unit = np.eye(products) * (back == 0)[:, :, None, None]
-    return namespace(band, layout).where(row[:, None, :, None] & column[:, :, None], band, unit)
+    unit = np.eye(n) * (back == 0)[:, :, None, None]
+    band = namespace(band, layout).where(row[:, None, :, None] & column[:, :, None], band, unit)
+    checks.require_finite(name, band)
+    checks.require_symmetric(f"{name} within one time", band[:, 0])
+    return band
 
 
 class TimeBlockFactor(CholeskyFactor):
@@ -86,13 +97,8 @@ class TimeBlockCovariance(_OverLayout):
     blocks: Float[Array, "times products products"]
 
     def __init__(self, blocks: Float[Array, "times products products"], layout: DataLayout):
-        checks.require_float64("the noise blocks", blocks)
-        n = layout.n_products
-        checks.require_shape("the noise blocks", blocks, (layout.n_times, n, n))
-        blocks = _masked(blocks[:, None], layout)[:, 0]
-        checks.require_finite("the noise blocks", blocks)
-        checks.require_symmetric("the noise covariance of one time", blocks)
-        self.blocks, self.layout = blocks, layout
+        self.blocks = _checked("the noise blocks", blocks[:, None], layout)[:, 0]
+        self.layout = layout
 
     def dense(self):
         unit = namespace(self).eye(self.size)
@@ -220,13 +226,7 @@ class TimeBandedCovariance(_OverLayout):
     name: str = eqx.field(static=True, default="the time-banded covariance")
 
     def __init__(self, band: Band, layout: DataLayout, name: str = "the time-banded covariance"):
-        checks.require_float64(name, band)
-        n = layout.n_products
-        checks.require_shape(name, band, (layout.n_times, None, n, n))
-        band = _masked(band, layout)
-        checks.require_finite(name, band)
-        checks.require_symmetric(f"{name} within one time", band[:, 0])
-        self.band, self.layout, self.name = band, layout, name
+        self.band, self.layout, self.name = _checked(name, band, layout), layout, name
 
     def dense(self):
         unit = namespace(self).eye(self.size)
