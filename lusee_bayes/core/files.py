@@ -104,8 +104,7 @@ def require_new(path: str | Path, *, replace: bool, inputs: Iterable[str | Path]
         :func:`require_target`.
     """
     require_target(path)
-    if user_path(path).resolve() in [user_path(read).resolve() for read in inputs]:
-        raise InputError(f"'{path}' is an input of this run; give another name with -o")
+    require_apart(user_path(path), inputs)
     if not replace and user_path(path).exists():
         raise InputError(f"'{path}' exists already; give another name, or --force")
 
@@ -321,7 +320,7 @@ def require_apart(folder: Path, inputs: Iterable[str | Path]) -> None:
     names = manifest["files"] if manifest else ()
     written = {folder.resolve(), *((folder / name).resolve() for name in names)}
     for path in inputs:
-        if Path(path).resolve() in written:
+        if user_path(path).resolve() in written:
             raise InputError(
                 f"'{path}' is an input of this run, which would replace it; give another place "
                 "for the results with -o"

@@ -11,7 +11,7 @@ import os
 import stat
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from io import StringIO
 from pathlib import Path
@@ -206,12 +206,10 @@ def read_table(path: str | Path, layout: Layout, hint: str = "") -> dict[str, np
     columns: dict[str, np.ndarray] = {}
     texts = {name for name, column in layout.variables.items() if column.kind == "text"}
     for name, values in zip(header, zip(*rows, strict=True), strict=True):
-        try:
-            if name in texts:
-                raise ValueError
-            columns[name] = np.array([float(value) if value else np.nan for value in values])
-        except ValueError:
-            columns[name] = np.array(values)
+        columns[name] = np.array(values)
+        if name not in texts:
+            with suppress(ValueError):
+                columns[name] = np.array([float(value) if value else np.nan for value in values])
     return columns | layout.checked(path, columns, {}).arrays
 
 

@@ -40,7 +40,6 @@ from lusee_bayes.sky.positive_skies import FieldLaws, PositiveSkies
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
 # arrays that recur; exponents are followed by the values of the shared unknowns
-Fields = Float[np.ndarray, "fields modes"]
 Exponents = Float[np.ndarray, "channels whole"]
 
 OfLaws = Float[np.ndarray, "laws ells"]
@@ -131,12 +130,6 @@ class PositiveMode:
     def prior(self) -> SpectralPrior:
         """Prior of the fields."""
         return self.laws.prior(self.skies)
-
-    @property
-    def fields(self) -> Fields:
-        """Posterior mean of the fields."""
-        k, n = len(self.skies.names), self.skies.n_fields
-        return np.asarray(self.posterior.mean)[: k * n].reshape(k, n)
 
 
 def diffuse_part(skies: PositiveSkies, channel: int, information: Information) -> Patterns:

@@ -4,7 +4,7 @@ m ~ N(mu, S) is expressed by a square root S = G G^T. All later steps work with 
 u = G^-1 m ~ N(G^-1 mu, 1). S is never inverted, so a mode without variance is known to be zero; it
 is not an error.
 
-Kinds: correlated coefficients, S = G G^T as a matrix; independent unknowns, S = diag(root^2); an
+Kinds: correlated coefficients, S = G G^T as a matrix; independent unknowns, S = diag(widths^2); an
 isotropic Gaussian sky in real harmonic coefficients, S = diag(C_ell). C_ell can be read from a
 text file, a mean sky from a FITS map.
 """
@@ -283,14 +283,13 @@ def _require_symmetric_prior(covariance: Float[np.ndarray, "modes modes"]) -> No
 
 
 class DiagonalPrior(Prior):
-    """A prior whose G is diagonal."""
+    """A prior whose G is diagonal.
+
+    Kinds have ``widths``, the diagonal of G: an array (unknowns,) of prior standard deviations,
+    each in its unknown's unit.
+    """
 
     independent: ClassVar[bool] = True
-
-    @property
-    @abstractmethod
-    def widths(self) -> Unknowns:
-        """The diagonal of G: prior standard deviations, each in its unknown's unit."""
 
     @property
     def size(self) -> int:
@@ -334,11 +333,11 @@ class DiagonalPrior(Prior):
 
 
 class IndependentPrior(DiagonalPrior):
-    """Independent unknowns of any kind, such as sky modes and source fluxes: S = diag(root^2).
+    """Independent unknowns of any kind, such as sky modes and source fluxes: S = diag(widths^2).
 
     Attributes
     ----------
-    root : (unknowns,) array
+    widths : (unknowns,) array
         Prior standard deviations, each in its unknown's unit.
 
     Raises
@@ -347,17 +346,13 @@ class IndependentPrior(DiagonalPrior):
         If they are not float64 or not finite.
     """
 
-    root: Unknowns
+    widths: Unknowns
 
     def __check_init__(self):
-        require_array("the prior's standard deviations", self.root)
-
-    @property
-    def widths(self) -> Unknowns:
-        return self.root
+        require_array("the prior's standard deviations", self.widths)
 
     def widened(self, factor):
-        return IndependentPrior(self.root * factor)
+        return IndependentPrior(self.widths * factor)
 
 
 class HarmonicPrior(DiagonalPrior):

@@ -112,7 +112,7 @@ def test_the_mode_of_one_channel_is_that_of_a_direct_minimisation():
     mode = pj.find_joint_mode(skies, laws, pj.ChannelsInMemory((information,)))
     # what a last step of 0.1 sigma at most leaves: the curvature's own error times that step
     np.testing.assert_allclose(mode.energy, 2.0 * direct.cost, atol=0.1**2)
-    np.testing.assert_allclose(mode.fields[0] / root, direct.x[:N], atol=0.02)
+    np.testing.assert_allclose(mode.posterior.mean[:N] / root, direct.x[:N], atol=0.02)
     assert mode.rounds > 1  # the sky is not linear in its logarithm
 
 
