@@ -54,6 +54,8 @@ def viewer(name: str, channels: Sequence[ChannelResult]) -> dict[str, Any]:
         skies |= {f"draw{k}": [sky] for k, sky in enumerate(details.draws, 1)}
         regions, resolutions = _regions(details), [resolution(details)]
     altitude = channels[0].highest_altitude
+    axes = coordinates.SkyCoord([0.0, 90.0, 0.0], [0.0, 0.0, 90.0], unit="deg", frame="galactic")
+    sources = [(source.name, *source.galactic()) for source in BRIGHT_SOURCES]
     colours = [scales(channel) for channel in channels]
     nside = nside_of_page(channels[0].nside, len(pixels) * len(channels))
     return {
@@ -61,14 +63,20 @@ def viewer(name: str, channels: Sequence[ChannelResult]) -> dict[str, Any]:
         "frequencies": [channel.frequency_mhz for channel in channels],
         "nside": max(NSIDE, channels[0].nside),
         "skies": {key: packed(np.stack(modes)) for key, modes in skies.items()},
-        "pixels": {key: _quantised(_degraded(cube, nside)) for key, cube in pixels.items()},
+        "pixels": {key: _quantised(cube, nside) for key, cube in pixels.items()},
         "mean_k": [float(channel.mean[0] / np.sqrt(4.0 * np.pi)) for channel in channels],
         "scales": {key: [_bounds(one[key]) for one in colours] for key in colours[0]},
         "highest_altitude": packed(altitude),
         "rim": [np.round(line, 1).tolist() for line in rim(altitude)],
         "regions": regions,
         "resolutions": resolutions,
-        **_furniture(),
+        "colours": {
+            kind: _base64(colormaps[name](np.arange(256), bytes=True)[:, :3])
+            for kind, name in {"sequential": SEQUENTIAL, "diverging": DIVERGING}.items()
+        },
+        # from Galactic to ICRS; columns: where the Galactic axes point
+        "rotation": axes.icrs.cartesian.xyz.value.ravel().tolist(),
+        "sources": [{"name": name, "l": lon, "b": lat} for name, lon, lat in sources],
     }
 
 
@@ -100,18 +108,13 @@ def packed(values: np.ndarray) -> str:
     return _base64(np.asarray(values, dtype="<f4"))
 
 
-def _degraded(cube: Maps, nside: int) -> Maps:
-    if healpy.npix2nside(cube.shape[1]) == nside:
-        return cube
-    return np.stack([healpy.ud_grade(pixels, nside) for pixels in cube])
-
-
-def _quantised(cube: Maps) -> dict[str, Any]:
-    """Quantise each channel from its smallest to its largest value in 65535 steps."""
+def _quantised(cube: Maps, nside: int) -> dict[str, Any]:
+    """Degrade every channel; quantise it from its smallest to its largest value in 65535 steps."""
+    if healpy.npix2nside(cube.shape[1]) != nside:
+        cube = np.stack([healpy.ud_grade(pixels, nside) for pixels in cube])
     low, high = cube.min(axis=1), cube.max(axis=1)
     step = np.where(high > low, high - low, 1.0) / LEVELS
     levels = np.rint((cube - low[:, None]) / step[:, None]).astype("<u2")
-    nside = healpy.npix2nside(cube.shape[1])
     scale = {"low": low.tolist(), "step": step.tolist()}
     return {"nside": nside, **scale, "levels": _base64(levels)}
 
@@ -129,21 +132,6 @@ def _regions(details: Details) -> dict[str, Any]:
         "nside": nside,
         "size_deg": float(np.degrees(healpy.nside2resol(nside))),
         **{name: packed(values) for name, values in regions.items()},
-    }
-
-
-def _furniture() -> dict[str, Any]:
-    """Colours, the rotation from Galactic to ICRS, and the bright sources, for sky_view.js."""
-    axes = coordinates.SkyCoord([0.0, 90.0, 0.0], [0.0, 0.0, 90.0], unit="deg", frame="galactic")
-    names = [(source.name, *source.galactic()) for source in BRIGHT_SOURCES]
-    return {
-        "colours": {
-            kind: _base64(colormaps[name](np.arange(256), bytes=True)[:, :3])
-            for kind, name in {"sequential": SEQUENTIAL, "diverging": DIVERGING}.items()
-        },
-        # columns: where the Galactic axes point
-        "rotation": axes.icrs.cartesian.xyz.value.ravel().tolist(),
-        "sources": [{"name": name, "l": lon, "b": lat} for name, lon, lat in names],
     }
 
 
