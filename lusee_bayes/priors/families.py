@@ -268,15 +268,16 @@ class SpectrumBasis:
     width: Parameters
 
     @classmethod
-    def around(cls, power: float, lmax: int) -> SpectrumBasis:
+    def around(cls, temperature: float, lmax: int) -> SpectrumBasis:
         """Make the basis.
 
         Parameters
         ----------
-        power : float
-            Expected C_ell at the pivot, in K^2.
+        temperature : float
+            Mean of the sky in K, to which expected fluctuations are relative.
         lmax : int
         """
+        power = 4.0 * np.pi * (RELATIVE_STRENGTH * temperature) ** 2 / 100.0
         x = np.log((np.arange(lmax + 1) + 1.0) / PIVOT)
         knots = np.arange(x[min(1, lmax)], x[-1] + SPACING, SPACING)
         hats = np.maximum(0.0, 1.0 - np.abs(x[:, None] - knots) / SPACING)
@@ -305,8 +306,8 @@ class IsotropicFamily(PriorFamily):
     @classmethod
     def around(cls, temperature: float, lmax: int) -> IsotropicFamily:
         """Make the family for skies with about this mean temperature, in K."""
-        power = 4.0 * np.pi * (RELATIVE_STRENGTH * temperature) ** 2 / 100.0
-        return cls(SpectrumBasis.around(power, lmax), float(np.log(4.0 * np.pi * temperature**2)))
+        log_monopole = float(np.log(4.0 * np.pi * temperature**2))
+        return cls(SpectrumBasis.around(temperature, lmax), log_monopole)
 
     @property
     def hyperprior(self) -> Hyperprior:

@@ -50,8 +50,6 @@ Covariates = Float[np.ndarray, " covariates"]
 Strengths = list[Float[np.ndarray, " _"]]
 # frequency in MHz at which the Galaxy is nearly transparent
 TRANSPARENT_MHZ = 50.0
-# expected fluctuations of the texture, relative to the template's mean
-RELATIVE_STRENGTH = 0.05
 # standard deviations of the template's scale, and of the monopole in units of the template's
 SCALE_WIDTH = MONOPOLE_WIDTH = 1.0
 # of the weights of surveys and of the embedded template
@@ -369,7 +367,6 @@ def embedded_local_scales(
     mean = np.asarray(galaxy_sky(frequency_mhz, lmax, seed=None, sources=()).modes)
     monopole = np.zeros_like(mean)
     monopole[0] = mean[0]
-    strength = RELATIVE_STRENGTH * np.exp(smoothed[0].mean_log)
     modes = [source.modes(frequency_mhz, lmax) for source in sources]
     level = mean[0] / np.sqrt(4.0 * np.pi)
     extended = [level * one.strength * one.modes(lmax) for one in objects]
@@ -383,6 +380,6 @@ def embedded_local_scales(
         scale, zero = of_scale * mean, of_zero * (np.arange(len(mean)) == 0)
     wide = np.stack([scale, zero, *weights, *extended], axis=1)
     of_sources = np.reshape(modes, (-1, n_modes(lmax))).T
-    spectrum = SpectrumBasis.around(4.0 * np.pi * strength**2 / 100.0, lmax)
+    spectrum = SpectrumBasis.around(np.exp(smoothed[0].mean_log), lmax)
     bands = tuple(Band.of(window, *smoothed) for window in windows(lmax))
     return LocalScales(mean, wide, of_sources, spectrum, bands, expected_covariates())
