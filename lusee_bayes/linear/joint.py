@@ -32,7 +32,7 @@ from lusee_bayes.core import linalg
 from lusee_bayes.core.arrays import Array, Modes, ModesMatrix, Square, Vector, on_host
 from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.harmonics import n_modes
-from lusee_bayes.linear.information import Information
+from lusee_bayes.linear.information import Information, precision_root
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sky.prior import IndependentPrior
 from lusee_bayes.sky.spectral_prior import SpectralPrior
@@ -90,9 +90,7 @@ def common_part(information: Information, residual_root: Modes | None) -> Inform
 def residual_lower(information: Information, residual_root: Modes) -> ModesMatrix:
     """L L^T = 1 + P."""
     n = len(residual_root)
-    normal = linalg.scaled(information.matrix[:n, :n], residual_root)
-    normal[np.diag_indices_from(normal)] += 1.0
-    return linalg.cholesky(normal, overwrite=True)
+    return precision_root(information.matrix[:n, :n], IndependentPrior(residual_root))
 
 
 def _indices(k: int) -> zip:
