@@ -54,6 +54,10 @@ LOG_MONOPOLE_WIDTH = 2.0
 # expected fluctuations relative to the mean
 RELATIVE_STRENGTH = 0.05
 
+# the density of a cell's factor falls as factor^-(1 + TAIL); factor^-STEEPNESS is gamma
+# distributed, with shape and rate SHAPE
+TAIL, STEEPNESS = 1.5, 2.0
+SHAPE = TAIL / STEEPNESS
 # nodes of the Gauss-Hermite rule for the means of cells' factors
 NODES = 20
 
@@ -68,7 +72,7 @@ class Hyperprior:
     Each theta follows a Student distribution with two degrees of freedom. The logarithm t of a
     factor of the variance in a cell has the density ::
 
-        p(t) ~ exp(-tail t - (tail / steepness) exp(-steepness t)),
+        p(t) ~ exp(-TAIL t - SHAPE exp(-STEEPNESS t)),
 
     which peaks at t = 0: a power law towards large factors, and a steep fall towards small ones.
 
@@ -76,17 +80,11 @@ class Hyperprior:
     ----------
     centre, width : (theta,) array
     n_cells : int
-    tail : float
-        The factor's density falls as factor^-(1 + tail).
-    steepness : float
-        factor^-steepness is gamma distributed, with shape and rate tail / steepness.
     """
 
     centre: Theta
     width: Theta
     n_cells: int = 0
-    tail: float = 1.5
-    steepness: float = 2.0
 
     @property
     def size(self) -> int:
@@ -106,16 +104,15 @@ class Hyperprior:
         h = FREEDOM / 2.0
         theta = -(h + 0.5) * np.log1p(z**2 / FREEDOM) - np.log(self.width)
         constant = special.gammaln(h + 0.5) - special.gammaln(h) - 0.5 * np.log(FREEDOM * np.pi)
-        shape = self.tail / self.steepness
-        cells = -self.tail * t - shape * np.exp(-self.steepness * t)
-        of_cell = np.log(self.steepness) + shape * np.log(shape) - special.gammaln(shape)
+        cells = -TAIL * t - SHAPE * np.exp(-STEEPNESS * t)
+        of_cell = np.log(STEEPNESS) + SHAPE * np.log(SHAPE) - special.gammaln(SHAPE)
         return np.concatenate([theta + constant, cells + of_cell])
 
     def gradient(self, parameters: Parameters) -> Parameters:
         """Compute the derivative of ln p(theta, t)."""
         z, t = self._parts(parameters)
         theta = -(FREEDOM + 1.0) * z / (FREEDOM + z**2) / self.width
-        return np.concatenate([theta, self.tail * np.expm1(-self.steepness * t)])
+        return np.concatenate([theta, TAIL * np.expm1(-STEEPNESS * t)])
 
     def curvature(self, parameters: Parameters) -> Parameters:
         """Compute second derivatives of -ln p, all positive: of a normal density that touches p.
@@ -124,29 +121,27 @@ class Hyperprior:
         """
         z, t = self._parts(parameters)
         theta = (FREEDOM + 1.0) / (FREEDOM + z**2) / self.width**2
-        cells = self.tail * self.steepness * np.exp(-self.steepness * t)
+        cells = TAIL * STEEPNESS * np.exp(-STEEPNESS * t)
         return np.concatenate([theta, cells])
 
     def scores(self, parameters: Parameters) -> Parameters:
         """Compute the standard normal score z of each: Phi(z) = P(parameter is smaller)."""
         x, t = self._parts(parameters)
-        shape = self.tail / self.steepness
         # the smaller of the two tails keeps its digits
         theta = np.sign(x) * -special.ndtri(special.stdtr(FREEDOM, -np.abs(x)))
-        power = shape * np.exp(-self.steepness * t)
-        below, above = special.gammaincc(shape, power), special.gammainc(shape, power)
+        power = SHAPE * np.exp(-STEEPNESS * t)
+        below, above = special.gammaincc(SHAPE, power), special.gammainc(SHAPE, power)
         cells = np.where(below < above, special.ndtri(below), -special.ndtri(above))
         return np.concatenate([theta, cells])
 
     def of_scores(self, scores: Scored) -> Scored:
         """Compute the inverse of :meth:`scores`."""
         x, t = np.split(scores, [len(self.centre)], axis=-1)
-        shape = self.tail / self.steepness
         theta = np.sign(x) * -special.stdtrit(FREEDOM, special.ndtr(-np.abs(x)))
-        above = special.gammainccinv(shape, special.ndtr(t))
-        below = special.gammaincinv(shape, special.ndtr(-t))
+        above = special.gammainccinv(SHAPE, special.ndtr(t))
+        below = special.gammaincinv(SHAPE, special.ndtr(-t))
         power = np.where(t < 0, above, below)
-        cells = -np.log(power / shape) / self.steepness
+        cells = -np.log(power / SHAPE) / STEEPNESS
         return np.concatenate([self.centre + self.width * theta, cells], axis=-1)
 
     def near(self, scores: Parameters, drawn: Scored) -> Scored:
