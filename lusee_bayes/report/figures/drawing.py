@@ -234,7 +234,7 @@ def sky_panel(
     unit: str = "K",
     *,
     altitude: Coarse | None = None,
-    **bar: float,
+    **bar: object,
 ) -> None:
     """Draw a map (:func:`mollweide`) with its title and a colour bar."""
     image = mollweide(axes, pixels, norm=norm, cmap=cmap, highest_altitude=altitude)
