@@ -34,13 +34,7 @@ from lusee_bayes.core.linalg import checked_cholesky, scaled
 from lusee_bayes.core.sphere_grid import SphereGrid
 from lusee_bayes.priors.families import Hyperprior, Member, Parameters, PriorFamily, SpectrumBasis
 from lusee_bayes.priors.surveys import Survey
-from lusee_bayes.sky.galaxy import (
-    BRIGHT_SOURCES,
-    EXTENDED_OBJECTS,
-    ExtendedObject,
-    PointSource,
-    galaxy_map,
-)
+from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, EXTENDED_OBJECTS, PointSource, galaxy_map
 from lusee_bayes.sky.prior import PIVOT, DensePrior
 from lusee_bayes.sky.sky_source import galaxy_sky
 
@@ -343,7 +337,6 @@ def embedded_local_scales(
     frequency_mhz: float,
     lmax: int,
     sources: tuple[PointSource, ...] = BRIGHT_SOURCES,
-    objects: tuple[ExtendedObject, ...] = EXTENDED_OBJECTS,
     surveys: Sequence[Survey] = (),
 ) -> LocalScales:
     """Make the family whose template is the embedded diffuse sky, or the mean of surveys.
@@ -356,8 +349,6 @@ def embedded_local_scales(
     lmax : int
     sources : tuple of PointSource
         The catalogue of possible sources.
-    objects : tuple of ExtendedObject
-        Objects that may be brighter or darker than their surroundings.
     surveys : sequence of Survey
         At this frequency, with the same lmax.
     """
@@ -369,7 +360,8 @@ def embedded_local_scales(
     monopole[0] = mean[0]
     modes = [source.modes(frequency_mhz, lmax) for source in sources]
     level = mean[0] / np.sqrt(4.0 * np.pi)
-    extended = [level * one.strength * one.modes(lmax) for one in objects]
+    # these may be brighter or darker than their surroundings
+    extended = [level * one.strength * one.modes(lmax) for one in EXTENDED_OBJECTS]
     scale, zero, weights = SCALE_WIDTH * mean, MONOPOLE_WIDTH * monopole, []
     if surveys:
         filled = [s.modes + (1.0 - s.beam) * (s.modes[0] / mean[0]) * mean for s in surveys]

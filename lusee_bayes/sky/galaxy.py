@@ -509,19 +509,15 @@ class Slabs:
             column[k] = length * (left * smooth + local)
         return cls(emitted, column)
 
-    def synchrotron(
-        self, frequency_mhz: float, electrons: float = 1.0
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def synchrotron(self, frequency_mhz: float) -> tuple[np.ndarray, np.ndarray]:
         """Compute the synchrotron emission in K and the total optical depth, both (2, lines).
 
         Parameters
         ----------
         frequency_mhz : float
             Frequency in MHz.
-        electrons : float
-            Factor of <n_e^2>.
         """
-        kappa = 1e3 * electrons * absorption_per_emission_measure(frequency_mhz)
+        kappa = 1e3 * absorption_per_emission_measure(frequency_mhz)
         scale = (frequency_mhz / REFERENCE_MHZ) ** SPECTRAL_INDEX
         synchrotron, depth = np.zeros((2, *self.column.shape[1:]))
         transmission = np.ones(self.column.shape[1:])

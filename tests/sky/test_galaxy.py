@@ -80,7 +80,9 @@ def slabs(lon_deg, lat_deg, frequency_mhz, steps=100_000):
 
 def one_line(lon_deg, lat_deg, frequency_mhz, electrons=1.0):
     lon, lat = np.array([float(lon_deg)]), np.array([float(lat_deg)])
-    synchrotron, depth = galaxy.Slabs.towards(lon, lat).synchrotron(frequency_mhz, electrons)
+    slabs = galaxy.Slabs.towards(lon, lat)
+    slabs = galaxy.Slabs(slabs.emitted, electrons * slabs.column)
+    synchrotron, depth = slabs.synchrotron(frequency_mhz)
     row = 0 if lat_deg >= 0 else 1
     return synchrotron[row, 0], depth[row, 0]
 
