@@ -180,7 +180,7 @@ def values_of(chart, seed=0) -> dict:
     rng = np.random.default_rng(seed)
     values = {
         "sky": jnp.asarray(1e4 * rng.normal(size=9)),
-        "gain_noise": jnp.asarray(rng.normal(size=(4, chart.grid.shape[0]))),
+        "gain_noise": jnp.asarray(rng.normal(size=(4, len(chart.drifts.grid)))),
         "other": jnp.asarray(rng.normal(size=3)),
     }
     if chart.sigma_is_site:
