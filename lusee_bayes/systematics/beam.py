@@ -6,7 +6,6 @@ besides A m, which adds dA (S + mu mu^T) dA^T to N. dA is the derivative of A by
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Annotated, ClassVar
 
@@ -85,16 +84,29 @@ class BeamErrors(Systematic):
 
     @classmethod
     def build(cls, section: BeamErrorSection, setup: Setup, around: Around) -> BeamErrors:
+        """Use a direction, or parameters about the values of the instrument.
+
+        Raises
+        ------
+        InputError
+            For unknown names, and for a prior that exceeds a parameter's domain.
+        """
         if not section.parameters:
             direction = difference_of_beams(section, setup)
             return BeamError(CouplingMatrix.of_modes(direction, setup.pointing, setup.layout))
-        return InstrumentParameters.centred(setup.instrument, section.parameters)
+        priors = []
+        for name, std in section.parameters.items():
+            p = setup.instrument.source.parameter(name)
+            unknown = Unknown(name, float(p.value), std, low=float(p.low), high=float(p.high))
+            unknown.prior()
+            priors.append(unknown)
+        return InstrumentParameters(setup.instrument, tuple(priors))
 
     @classmethod
     def truth(cls, section: BeamErrorSection, setup: Setup, key: PRNGKeyArray) -> Truth:
         if not section.parameters:
             return {"beam_amplitude": 1.0}
-        unknowns = InstrumentParameters.centred(setup.instrument, section.parameters).unknowns
+        unknowns = cls.build(section, setup, Around()).unknowns
         keys = jax.random.split(cls.own_key(key), len(unknowns))
         return {u.name: float(u.prior().sample(k)) for u, k in zip(unknowns, keys, strict=True)}
 
@@ -184,31 +196,6 @@ class InstrumentParameters(ChangedBeams, BeamErrors):
 
     instrument: Instrument
     priors: tuple[Unknown, ...] = eqx.field(static=True)
-
-    @classmethod
-    def centred(cls, instrument: Instrument, stds: Mapping[str, float]) -> InstrumentParameters:
-        """Build it with the instrument's values as prior means.
-
-        Parameters
-        ----------
-        instrument : Instrument
-            The instrument.
-        stds : mapping of float
-            Prior standard deviations by the parameters' names, in their units.
-
-        Raises
-        ------
-        InputError
-            For unknown names, and for a prior that exceeds a parameter's domain.
-        """
-        parameters = {name: instrument.source.parameter(name) for name in stds}
-        priors = tuple(
-            Unknown(name, float(p.value), float(stds[name]), low=float(p.low), high=float(p.high))
-            for name, p in parameters.items()
-        )
-        for unknown in priors:
-            unknown.prior()
-        return cls(instrument, priors)
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:

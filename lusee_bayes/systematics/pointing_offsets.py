@@ -147,9 +147,6 @@ class PointingOffsets(Systematic):
         back = {name: -value for name, value in values.items() if name not in CLOCK}
         observation = with_offsets(setup.observation, back)
         pointing = setup.pointing.placed(observation)
-        sources = None
-        if setup.responses and setup.scenario.sources.treatment != "ignored":
-            sources = MovingSources.of(setup)
         offsets = cls(
             tuple(stds),
             np.array(list(stds.values())),
@@ -158,11 +155,11 @@ class PointingOffsets(Systematic):
             setup.observation.hours,
             observation.lander_from_mcmf().T,
             setup.layout,
-            sources,
         )
-        if sources is None:
+        if not setup.responses or setup.scenario.sources.treatment == "ignored":
             return offsets
         # the setup's signal already contains its sources
+        sources = MovingSources.of(setup)
         orientation = offsets.orientation(dict.fromkeys(stds, 0.0) | dict(values))
         seen = np.asarray(sources.seen(orientation, setup.layout))
         return replace(offsets, sources=replace(sources, in_signal=seen))
