@@ -80,7 +80,6 @@ class PriorSpectrum(Scale):
     """
 
     key: ClassVar[str] = "prior"
-    section: ClassVar[type[Section]] = SpectrumSection
     # its true values are the sky's own
     moves_setup: ClassVar[bool] = True
 

@@ -183,7 +183,6 @@ class PointSources(Systematic):
     """
 
     key: ClassVar[str] = "sources"
-    section: ClassVar[type[Section]] = SourcesSection
     words: ClassVar[str] = "the sources"
     unit: ClassVar[str] = "K sr"
     draw: ClassVar[int] = 5

@@ -188,7 +188,7 @@ class Systematic(eqx.Module):
     key : str
         Path of its section in a scenario, such as ``noise.gain``.
     section : type
-        The schema of that section.
+        The schema of that section, if it is ``noise.KEY``.
     words : str
         Its name in messages.
     unit : str
