@@ -118,9 +118,9 @@ class SourcesSection(Section):
     @model_validator(mode="after")
     def _names_differ(self) -> SourcesSection:
         names = [source.name for source in self.list]
-        if len(set(names)) < len(names):
-            twice = next(name for name in names if names.count(name) > 1)
-            raise ValueError(f"the source '{twice}' is listed twice")
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"the source '{name}' is listed twice")
         return self
 
 
