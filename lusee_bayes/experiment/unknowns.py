@@ -583,9 +583,10 @@ def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
     held = next(s for s in inference.expanded if isinstance(s.systematic, PointSources))
     fluxes = _alone(experiment, inference, held)
     jansky = 1.0 / kelvin_steradian(1.0, experiment.scenario.frequency_mhz)
-    sources = held.systematic.sources
-    blocks = [(s.name, block, bool(up)) for s in sources for block, up in enumerate(s.seen())]
-    table = pd.DataFrame(blocks, columns=["source", "block", "above_horizon"]).assign(
+    own = zip(experiment.scenario.sources.list, held.systematic.n_blocks, strict=True)
+    blocks = [(source.name, block) for source, n in own for block in range(n)]
+    table = pd.DataFrame(blocks, columns=["source", "block"]).assign(
+        above_horizon=np.asarray(held.systematic.columns).any(0),
         flux_jy=fluxes["value"] * jansky,
         std_jy=fluxes["std"] * jansky,
         flux_k_sr=fluxes["value"],

@@ -11,11 +11,10 @@ from typing import Annotated, Any, ClassVar
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Float, Int, PRNGKeyArray
+from jaxtyping import Float, Int
 from pydantic import Field, model_validator
 
-from lusee_bayes.core.arrays import Array, Grid, namespace, scalar
-from lusee_bayes.core.checks import require_finite, require_positive, require_shape
+from lusee_bayes.core.arrays import Array, Grid
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.section import Positive, Section, Treatment, requires
 from lusee_bayes.instrument.beams.monopoles import source_response
@@ -25,7 +24,7 @@ from lusee_bayes.instrument.observation import BODIES, Observation, body_directi
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, galactic_unit_vector, kelvin_steradian
 from lusee_bayes.sky.sky_source import Sky
 from lusee_bayes.systematics.context import Around, Setup
-from lusee_bayes.systematics.systematic import Systematic, Truth, Unknown, with_added
+from lusee_bayes.systematics.systematic import Systematic, Unknown, with_added
 
 CATALOGUE = {source.name: source for source in BRIGHT_SOURCES}
 # instants in each piece of a window for the response to a source: antennas resolve nothing smaller
@@ -124,53 +123,6 @@ class SourcesSection(Section):
         return self
 
 
-class Source(eqx.Module):
-    """The response of the data to one source, and the prior of its flux.
-
-    Attributes
-    ----------
-    columns : (data, blocks) array
-        Response to 1 K sr in each block of time, in K per K sr.
-    mean, std : () array
-        Of the flux's Gaussian prior, in K sr.
-    name : str
-        The source's name.
-
-    Raises
-    ------
-    InputError
-        If the response is not finite or not a matrix, or if ``std`` is not positive.
-    """
-
-    columns: Float[Array, "data blocks"]
-    mean: Float[Array, ""] = eqx.field(converter=scalar)
-    std: Float[Array, ""] = eqx.field(converter=scalar)
-    name: str = eqx.field(static=True)
-
-    def __check_init__(self):
-        require_finite(f"the response to {self.name}", self.columns)
-        require_shape(f"the response to {self.name}", self.columns, (None, None))
-        require_positive(f"the prior standard deviation of {self.name}'s flux", self.std)
-
-    @property
-    def n_blocks(self) -> int:
-        """Number of amplitudes."""
-        return self.columns.shape[1]
-
-    @property
-    def unknown(self) -> Unknown:
-        """Its flux in K sr, or one for each block: ``flux_Cas_A``."""
-        size = None if self.n_blocks == 1 else self.n_blocks
-        return Unknown(f"flux_{self.name.replace(' ', '_')}", self.mean, self.std, size)
-
-    def seen(self) -> np.ndarray:
-        """Whether the source is ever above the horizon in each block: (blocks,) booleans.
-
-        If not, only the prior constrains its flux.
-        """
-        return np.abs(np.asarray(self.columns)).max(0) > 0
-
-
 class PointSources(Systematic):
     """Sources with independent Gaussian priors for their fluxes.
 
@@ -178,8 +130,14 @@ class PointSources(Systematic):
 
     Attributes
     ----------
-    sources : tuple of Source
-        The sources.
+    columns : (data, fluxes) array
+        Response to 1 K sr of each source in each of its blocks of time, in K per K sr.
+    fluxes, errors : (sources,) array
+        Means and standard deviations of the priors, in K sr.
+    sites : tuple of str
+        A site for each source: ``flux_Cas_A``.
+    n_blocks : tuple of int
+        Number of fluxes of each source.
     """
 
     key: ClassVar[str] = "sources"
@@ -189,7 +147,11 @@ class PointSources(Systematic):
     changes_coupling: ClassVar[bool] = False
     has_table: ClassVar[bool] = True
 
-    sources: tuple[Source, ...]
+    columns: Float[Array, "data fluxes"]
+    fluxes: Float[Array, " sources"]
+    errors: Float[Array, " sources"]
+    sites: tuple[str, ...] = eqx.field(static=True)
+    n_blocks: tuple[int, ...] = eqx.field(static=True)
 
     @classmethod
     def treatment(cls, scenario: Any) -> str | None:
@@ -197,40 +159,30 @@ class PointSources(Systematic):
 
     @classmethod
     def build(cls, section: SourcesSection, setup: Setup, around: Around) -> PointSources:
-        sources = []
+        columns, n_blocks = [], []
         for one, response in zip(section.list, setup.responses, strict=True):
-            flux = one.mean_flux(setup.frequency_mhz)
             block = one.blocks(setup.observation)
-            of_blocks = [
-                np.where((block == b)[None], response, 0.0) for b in range(block.max() + 1)
-            ]
-            columns = np.stack([setup.layout.gather(seen) for seen in of_blocks], axis=1)
-            sources.append(Source(columns, flux, one.relative_std * flux, one.name))
-        return cls(tuple(sources))
-
-    @classmethod
-    def truth(cls, section: SourcesSection, setup: Setup, key: PRNGKeyArray) -> Truth:
-        sources = cls.build(section, setup, Around()).sources
-        keys = jax.random.split(cls.own_key(key), len(sources))
-        truth: Truth = {}
-        for source, k in zip(sources, keys, strict=True):
-            z = np.asarray(jax.random.normal(k, (source.n_blocks,), dtype=np.float64))
-            flux = float(source.mean) + float(source.std) * z
-            truth[source.unknown.name] = flux if source.unknown.size else float(flux[0])
-        return truth
+            n_blocks.append(int(block.max()) + 1)
+            for number in range(n_blocks[-1]):
+                columns.append(setup.layout.gather(np.where(block == number, response, 0.0)))
+        fluxes = np.array([one.mean_flux(setup.frequency_mhz) for one in section.list])
+        errors = np.array([one.relative_std for one in section.list]) * fluxes
+        sites = tuple(f"flux_{one.name.replace(' ', '_')}" for one in section.list)
+        return cls(np.stack(columns, axis=1), fluxes, errors, sites, tuple(n_blocks))
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
-        return tuple(source.unknown for source in self.sources)
+        sizes = [None if n == 1 else n for n in self.n_blocks]
+        return tuple(map(Unknown, self.sites, self.fluxes, self.errors, sizes))
 
-    def columns(self) -> Float[Array, "data amplitudes"]:
-        """Return the responses of all sources and blocks side by side, in K per K sr."""
-        columns = [source.columns for source in self.sources]
-        return namespace(*columns).concatenate(columns, axis=1)
+    def drawn(self, key):
+        """Draw the fluxes of every source with a separate key."""
+        keys = zip(jax.random.split(key, len(self.sites)), self.n_blocks, strict=True)
+        return np.concatenate([jax.random.normal(one, (n,)) for one, n in keys])
 
     def effect(self, model, values):
         """Add every source, with the flux of each block in K sr."""
-        return with_added(model, self.columns() @ self.stacked(values))
+        return with_added(model, self.columns @ self.stacked(values))
 
 
 def source_responses(

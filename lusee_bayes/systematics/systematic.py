@@ -286,10 +286,8 @@ class Systematic(eqx.Module):
             Of :meth:`true_seed`.
         """
         built = cls.build(section, setup, Around())
-        z = np.asarray(jax.random.normal(cls.own_key(key), (len(built.names),)))
-        drawn = {
-            name: value if value.ndim else float(value) for name, value in built.values(z).items()
-        }
+        values = built.values(built.drawn(cls.own_key(key)))
+        drawn = {name: value if value.ndim else float(value) for name, value in values.items()}
         said = getattr(section, "true_values", {})
         for name in said:
             if name not in drawn:
@@ -344,6 +342,10 @@ class Systematic(eqx.Module):
             for u in self.unknowns
             for name in ([u.name] if u.size is None else [f"{u.name}_{k}" for k in range(u.size)])
         )
+
+    def drawn(self, key: PRNGKeyArray) -> Float[np.ndarray, " n"]:
+        """Draw all of them from N(0, 1): in prior standard deviations from the prior mean."""
+        return np.asarray(jax.random.normal(key, (len(self.names),)))
 
     @property
     def labels(self) -> tuple[str, ...]:

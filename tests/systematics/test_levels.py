@@ -23,7 +23,7 @@ from lusee_bayes.systematics import systematic
 from lusee_bayes.systematics.context import Around
 from lusee_bayes.systematics.noise_level import NoiseLevel
 from lusee_bayes.systematics.prior_spectrum import PriorSpectrum
-from lusee_bayes.systematics.sources import PointSources, Source
+from lusee_bayes.systematics.sources import PointSources
 
 LMAX, N_DATA = 4, 40
 ELLS = np.arange(LMAX + 1)
@@ -117,8 +117,13 @@ def test_several_at_once(case):
     """Noise level, bands and a source with two amplitudes; what is marginalised keeps its place."""
     rng = np.random.default_rng(8)
     columns, other = rng.normal(size=(N_DATA, 2)), rng.normal(size=(N_DATA, 1))
-    source = PointSources((Source(jnp.asarray(columns), 2.0, 0.5, "Cas A"),))
-    hidden = PointSources((Source(jnp.asarray(other), 3.0, 4.0, "Vir A"),))
+    source, hidden = (
+        PointSources(jnp.asarray(seen), np.array([mean]), np.array([std]), (site,), (n,))
+        for seen, mean, std, site, n in [
+            (columns, 2.0, 0.5, "flux_Cas_A", 2),
+            (other, 3.0, 4.0, "flux_Vir_A", 1),
+        ]
+    )
     level, power, flux = 2.5, np.array([0.6, 1.9]), np.array([1.2, 2.9])
     values = {"noise_level": level, "band_power": power, "flux_Cas_A": flux}
     priors = lognorm.logpdf(level, 0.7) + lognorm.logpdf(power, 0.8).sum()

@@ -27,7 +27,6 @@ from lusee_bayes.sampling.programs import latent_sites
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
 from lusee_bayes.systematics.context import Setup
 from lusee_bayes.systematics.prior_spectrum import PriorSpectrum
-from lusee_bayes.systematics.sources import Source
 from lusee_bayes.systematics.systematic import Unknown
 from lusee_bayes.testing import small_scenario
 
@@ -215,13 +214,6 @@ UNKNOWN_SOURCES = [
 @pytest.mark.parametrize(("source", "message"), UNKNOWN_SOURCES)
 def test_sources_that_are_not_known(source, message):
     refuse(message, lb.build, small_scenario(f"sources.list=[{{name: {source}}}]"))
-
-
-def test_sources_that_cannot_be():
-    refuse("the response to X.*NaN", Source, jnp.full((4, 1), np.nan), 1.0, 1.0, "X")
-    for std in (0.0, np.nan):
-        words = "standard deviation of X's flux must be positive"
-        refuse(words, Source, jnp.ones((4, 1)), 1.0, std, "X")
 
 
 # --- antennas -------------------------------------------------------------------------------------
