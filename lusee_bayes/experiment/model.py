@@ -33,7 +33,7 @@ from lusee_bayes.systematics.horizon import Horizon
 from lusee_bayes.systematics.noise_level import radiometer_about
 from lusee_bayes.systematics.registered import SYSTEMATICS
 from lusee_bayes.systematics.regolith import ground_per_kelvin
-from lusee_bayes.systematics.sources import expected_signal, source_responses
+from lusee_bayes.systematics.sources import source_responses
 from lusee_bayes.systematics.systematic import (
     Expanded,
     InPlace,
@@ -90,22 +90,21 @@ def set_up(
         if (noise := scenario.noise.receiver) is not None:
             autos = auto_indices(source.n_ports)
             background[autos] += noise.powers(source, scenario.frequency_mhz)
-        sources = scenario.sources.list
-        responses = source_responses(sources, observation, source, scenario.frequency_mhz)
+        responses = source_responses(scenario, observation, source, scenario.frequency_mhz)
     if data is not None and data.layout.n_products != beams.n_products:
         raise InputError(
             f"the data have {data.layout.n_products} products, the beams supply "
             f"{beams.n_products}; give beam.rotations_deg an angle for every port"
         )
     with stages("coupling"):
-        complete = CouplingMatrix.build(beams, pointing)
-        layout = complete.layout if data is None else data.layout
-        signal = expected_signal(sources, complete, sky, background, responses)
-        instrument = Instrument(source, pointing, layout, scenario.frequency_mhz, scenario.lmax)
-        coupling = replace(complete, layout=layout)
-    pieces = observation, sky, source, instrument, beams, coupling, prior, responses, background
-    of_data = None if data is None else data.calibration, data is not None
-    setup = Setup(scenario, *pieces, signal, receiver, *of_data, family)
+        coupling = CouplingMatrix.build(beams, pointing, None if data is None else data.layout)
+        instrument = Instrument(
+            source, pointing, coupling.layout, scenario.frequency_mhz, scenario.lmax
+        )
+        pieces = observation, sky, source, instrument, beams, coupling, prior, responses, background
+        calibration = None if data is None else data.calibration
+        of_data = {"receiver": receiver, "calibration": calibration, "measured": data is not None}
+        setup = Setup(scenario, *pieces, **of_data, family=family).with_signal()
     horizon = scenario.noise.horizon
     setup = setup if horizon is None else Horizon.moved(horizon, setup, {})
     return with_sky_above(setup)

@@ -119,14 +119,13 @@ class BeamErrors(Systematic):
         beams = source.beams(frequency_mhz, setup.beams.lmax)
         emitted = np.asarray(source.background(frequency_mhz))
         nominal = np.asarray(setup.beam_source.background(setup.frequency_mhz))
-        sources = setup.scenario.sources.list
         return replace(
             setup,
             beam_source=source,
             beams=beams,
             coupling=setup.instrument.coupling_of(beams),
             background=(setup.background.T + (emitted - nominal)).T,
-            responses=source_responses(sources, setup.observation, source, frequency_mhz),
+            responses=source_responses(setup.scenario, setup.observation, source, frequency_mhz),
         )
 
 

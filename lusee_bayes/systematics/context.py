@@ -92,7 +92,8 @@ class Setup:
     background : (products,) or (products, times) array
         Visibilities without any sky, from ground, antennas, the mean receiver and terrain, in K.
     signal : (products, times) array
-        Visibilities of sky, background and sources through the modelled beams, in K.
+        Visibilities of sky, background and sources with their mean fluxes through the modelled
+        beams, in K (:meth:`with_signal`).
     receiver : Receiver or None
         The receivers that the data name; None for other data.
     calibration : Calibration or None
@@ -117,7 +118,7 @@ class Setup:
     prior: Prior
     responses: tuple[Grid, ...]
     background: Float[Array, "products *times"]
-    signal: Grid
+    signal: Grid | None = None
     receiver: Receiver | None = None
     calibration: Calibration | None = None
     measured: bool = False
@@ -165,6 +166,15 @@ class Setup:
         scenario = self.scenario.model_copy(update={"prior": section})
         prior, family = prior_and_family(scenario, self.sky)
         return replace(self, scenario=scenario, prior=prior, family=family)
+
+    def with_signal(self) -> Setup:
+        """Return the same with :attr:`signal`, computed from everything else."""
+        complete, background = self.complete, self.background
+        signal = complete.layout.scatter(complete @ self.sky.modes)
+        signal = signal + background.reshape(len(background), -1)
+        for section, response in zip(self.scenario.sources.list, self.responses, strict=True):
+            signal = signal + section.mean_flux(self.sky.frequency_mhz) * response
+        return replace(self, signal=signal)
 
     def under(self, sky: Sky) -> Setup:
         """Point the instrument at another sky; the prior stays that of the scenario.

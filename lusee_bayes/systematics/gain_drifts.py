@@ -258,12 +258,7 @@ class GainDrifts(Systematic):
         if sigma * np.exp(3.0 * log_std) > STRONGEST:
             return None
         noise = self.layout.scatter(model.noise.diagonal())
-        floor = noise.sum() / (self.visibilities**2).sum()
-        reach, sigma_is_site = None, self.log_sigma_std is not None
-        if self.log_correlation_std is not None:
-            reach = CORRELATION_REACH * self.log_correlation_std
-        times = self.hours, self.grid
-        return GainCoordinates(self.drift, *times, self.n_antennas, floor, sigma_is_site, reach)
+        return GainCoordinates(self, noise.sum() / (self.visibilities**2).sum())
 
     def marginalised(self, model: LinearGaussian, drift: GainDrift | None = None) -> LinearGaussian:
         """Add the drifts' covariance to N, and multiply by the autos' mean response.
@@ -382,34 +377,20 @@ class GainCoordinates(Chart):
 
     Attributes
     ----------
-    drift : GainDrift
-        The drift whose white noise the coordinates are.
-    hours : (times,) array
-        Sample times in hours.
-    grid : (grid,) array
-        Times of the white noise in hours.
-    n_antennas : int
-        Number of antennas.
+    drifts : GainDrifts
+        Their white noise is changed, and their uncertain scales.
     floor : () array
         Variance of the noise, in units of the gains.
-    sigma_is_site : bool
-        Whether the drifts' standard deviation is a site.
-    log_correlation_reach : () array, optional
-        Half the length of the interval of ln correlation time; None if it is not a site.
     """
 
-    drift: GainDrift
-    hours: Float[Array, " times"]
-    grid: Float[Array, " grid"]
-    n_antennas: int = eqx.field(static=True)
+    drifts: GainDrifts
     floor: Float[Array, ""]
-    sigma_is_site: bool = eqx.field(static=True)
-    log_correlation_reach: Float[Array, ""] | None
 
     @property
     def names(self) -> tuple[str, ...]:
-        sites = [self.sigma_is_site, self.log_correlation_reach is not None]
-        return (SKY, GAIN_NOISE, *(n for n, used in zip(SCALES, sites, strict=True) if used))
+        stds = self.drifts.log_sigma_std, self.drifts.log_correlation_std
+        sites = [name for name, std in zip(SCALES, stds, strict=True) if std is not None]
+        return (SKY, GAIN_NOISE, *sites)
 
     @property
     def factorises(self) -> bool:
@@ -427,7 +408,7 @@ class GainCoordinates(Chart):
             gains, mixed = self._covariances(before, after)
             noise = noise + jnp.linalg.solve(gains, (noise @ (before - after)).T).T @ after.T
             change = jnp.linalg.slogdet(mixed)[1] - jnp.linalg.slogdet(gains)[1]
-            log_det = log_det + self.n_antennas * change
+            log_det = log_det + self.drifts.n_antennas * change
         return values | {GAIN_NOISE: noise}, log_det
 
     def from_values(self, values):
@@ -444,23 +425,27 @@ class GainCoordinates(Chart):
 
     def _shared(self) -> tuple[Float[Array, "1 grid"], Float[Array, "1 grid"]]:
         """Weights of white noise in the mean gain, and white noise whose gains are all one."""
-        mean = self._shape(self.drift).mean(1)[None] / self.n_antennas
+        mean, n_antennas = self._shape(self.drifts.drift).mean(1)[None], self.drifts.n_antennas
+        mean = mean / n_antennas
         # white noise constant in time gives constant gains, since the grid is wide enough
-        return mean, jnp.ones_like(mean) / (self.n_antennas * mean.sum())
+        return mean, jnp.ones_like(mean) / (n_antennas * mean.sum())
 
     def _shape(self, drift: GainDrift) -> Float[Array, "grid times"]:
         """Gains for unit white noise."""
-        return drift.history(jnp.eye(self.grid.shape[0]), self.hours, self.grid)
+        hours, grid = self.drifts.hours, self.drifts.grid
+        return drift.history(jnp.eye(len(grid)), hours, grid)
 
     def _shapes(self, values) -> tuple[Array, Array]:
         """:meth:`_shape` of the drift, and with the scales at these values."""
-        sigma, correlation_h = self.drift.sigma, self.drift.correlation_h
-        if self.sigma_is_site:
+        drift = self.drifts.drift
+        sigma, correlation_h = drift.sigma, drift.correlation_h
+        if SCALES[0] in self.names:
             sigma = jnp.exp(values[SCALES[0]])
-        if (reach := self.log_correlation_reach) is not None:
+        if SCALES[1] in self.names:
+            reach = CORRELATION_REACH * self.drifts.log_correlation_std
             within = dist.biject_to(dist.constraints.interval(-reach, reach))
             correlation_h = correlation_h * jnp.exp(within(values[SCALES[1]]))
-        return self._shape(self.drift), self._shape(GainDrift(sigma, correlation_h))
+        return self._shape(drift), self._shape(GainDrift(sigma, correlation_h))
 
     def _covariances(self, before: Array, after: Array) -> tuple[Array, Array]:
         """Covariances of the gains after, and of those before with those after; plus the floor.

@@ -81,7 +81,53 @@ class GainTable(Systematic):
 
     @classmethod
     def build(cls, section: GainTableSection, setup: Setup, around: Around) -> GainTable:
-        return cls(*table_errors(setup), setup.layout)
+        """Use the errors that the data name, or one for each port.
+
+        Raises
+        ------
+        InputError
+            If both the scenario and the data specify the errors, or neither does, and for errors
+            above 10 %.
+        """
+        std, calibration = section.std, setup.calibration
+        named = calibration is not None and calibration.gain_slope is not None
+        if named and std is not None:
+            raise InputError(
+                "the data already contain the errors of their gain table; remove "
+                "noise.gain_table.std"
+            )
+        if not named:
+            if std is None and setup.scenario.flight is not None:
+                # it applies to every level of every port: these data have one level
+                std = setup.scenario.flight.gain_std
+                if std is not None and std > LARGEST:
+                    raise InputError(
+                        f"flight.gain_std is {std:g}, but relative errors of power gains above "
+                        f"{LARGEST:g} are not modelled; give a smaller noise.gain_table.std for "
+                        "simulated data"
+                    )
+            if std is None:
+                raise InputError(
+                    "the data contain no gain table; give noise.gain_table.std, the relative error "
+                    "of every port's power gain"
+                )
+            n_ports = setup.beam_source.n_ports
+            slope = np.full((n_ports, setup.layout.n_times), std)
+            names = tuple(f"gain_{port}" for port in range(n_ports))
+            return cls(names, tuple(range(n_ports)), slope, setup.layout)
+        # the data do not constrain levels that no port has at these times
+        used = np.flatnonzero(calibration.gain_slope.any(1))
+        port, slope = calibration.gain_port[used], calibration.gain_slope[used]
+        for number in np.unique(port):
+            total = float(np.sqrt((slope[port == number] ** 2).sum(0)).max())
+            if total > LARGEST:
+                raise InputError(
+                    f"the data give the power gain of port {number} a relative error of "
+                    f"{total:.2g}, expected at most {LARGEST:g}; "
+                    "noise.gain_table.treatment=ignored treats it as exact"
+                )
+        names = tuple(f"gain_{calibration.gain_names[k].replace(' ', '_')}" for k in used)
+        return cls(names, tuple(port.tolist()), slope, setup.layout)
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
@@ -119,53 +165,3 @@ class GainTable(Systematic):
     def effect(self, model, values):
         """Multiply by F."""
         return multiplied(model, self.factors(values[GAIN_TABLE]))
-
-
-def table_errors(
-    setup: Setup,
-) -> tuple[tuple[str, ...], tuple[int, ...], Float[np.ndarray, "errors times"]]:
-    """Names, ports and slopes of the errors that the data name, or of one for each port.
-
-    Raises
-    ------
-    InputError
-        If both the scenario and the data specify the errors, or neither does, and for errors above
-        10 %.
-    """
-    std, calibration = setup.scenario.noise.gain_table.std, setup.calibration
-    named = calibration is not None and calibration.gain_slope is not None
-    if named and std is not None:
-        raise InputError(
-            "the data already contain the errors of their gain table; remove noise.gain_table.std"
-        )
-    if not named:
-        if std is None and setup.scenario.flight is not None:
-            # it applies to every level of every port: these data have one level
-            std = setup.scenario.flight.gain_std
-            if std is not None and std > LARGEST:
-                raise InputError(
-                    f"flight.gain_std is {std:g}, but relative errors of power gains above "
-                    f"{LARGEST:g} are not modelled; give a smaller noise.gain_table.std for "
-                    "simulated data"
-                )
-        if std is None:
-            raise InputError(
-                "the data contain no gain table; give noise.gain_table.std, the relative error of "
-                "every port's power gain"
-            )
-        ports = tuple(range(setup.beam_source.n_ports))
-        slope = np.full((len(ports), setup.layout.n_times), std)
-        return tuple(f"gain_{port}" for port in ports), ports, slope
-    # the data do not constrain levels that no port has at these times
-    used = np.flatnonzero(calibration.gain_slope.any(1))
-    port, slope = calibration.gain_port[used], calibration.gain_slope[used]
-    for number in np.unique(port):
-        total = float(np.sqrt((slope[port == number] ** 2).sum(0)).max())
-        if total > LARGEST:
-            raise InputError(
-                f"the data give the power gain of port {number} a relative error of {total:.2g}, "
-                f"expected at most {LARGEST:g}; noise.gain_table.treatment=ignored treats it as "
-                "exact"
-            )
-    names = tuple(f"gain_{calibration.gain_names[k].replace(' ', '_')}" for k in used)
-    return names, tuple(port.tolist()), slope

@@ -47,7 +47,6 @@ from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.instrument.pointing import offset_names, with_offsets
 from lusee_bayes.instrument.products import auto_indices, to_real
 from lusee_bayes.systematics.context import Around, Setup
-from lusee_bayes.systematics.sources import expected_signal
 from lusee_bayes.systematics.systematic import ChangedBeams, Unknown, Values, with_added
 
 Altitudes = Float[Array, "runs azimuths"]
@@ -204,8 +203,7 @@ class Horizon(ChangedBeams):
             background=(setup.background.T + emitted[observation.run]).T,
             hidden=hidden if setup.hidden is None else setup.hidden,
         )
-        parts = made.complete, made.sky, made.background, made.responses
-        return replace(made, signal=expected_signal(setup.scenario.sources.list, *parts))
+        return made.with_signal()
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:

@@ -33,7 +33,7 @@ from lusee_bayes.instrument.pointing import (
 )
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.systematics.context import Around, Setup
-from lusee_bayes.systematics.sources import SOURCE_NODES, expected_signal, source_responses
+from lusee_bayes.systematics.sources import SOURCE_NODES, source_responses
 from lusee_bayes.systematics.systematic import Systematic, Unknown, Values, with_added
 
 # a wider prior is no constraint: the sky would look entirely different
@@ -330,15 +330,11 @@ def shifted(setup: Setup, values: Mapping[str, float]) -> Setup:
         pointing = Pointing.of(observation, setup.sky.lmax, pole_frame=frame)
     else:  # the sky turns as before
         pointing = setup.pointing.placed(observation)
-    sources, frequency_mhz = setup.scenario.sources.list, setup.frequency_mhz
-    responses = source_responses(sources, observation, setup.beam_source, frequency_mhz)
-    complete = setup.complete.of(pointing=pointing)
-    parts = complete, setup.sky, setup.background, responses
+    inputs = setup.scenario, observation, setup.beam_source, setup.frequency_mhz
     return replace(
         setup,
         observation=observation,
         instrument=replace(setup.instrument, pointing=pointing),
-        coupling=replace(complete, layout=setup.layout),
-        responses=responses,
-        signal=expected_signal(sources, *parts),
-    )
+        coupling=setup.coupling.of(pointing=pointing),
+        responses=source_responses(*inputs),
+    ).with_signal()

@@ -19,10 +19,8 @@ from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.section import Positive, Section, Treatment, requires
 from lusee_bayes.instrument.beams.monopoles import source_response
 from lusee_bayes.instrument.beams.source import BeamSource
-from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.observation import BODIES, Observation, body_direction
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, galactic_unit_vector, kelvin_steradian
-from lusee_bayes.sky.sky_source import Sky
 from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.systematic import Systematic, Unknown, with_added
 
@@ -186,10 +184,7 @@ class PointSources(Systematic):
 
 
 def source_responses(
-    sources: tuple[SourceSection, ...],
-    observation: Observation,
-    beams: BeamSource,
-    frequency_mhz: float,
+    scenario: Any, observation: Observation, beams: BeamSource, frequency_mhz: float
 ) -> tuple[Grid, ...]:
     """Response to 1 K sr of each of a scenario's sources, with these beams, in K.
 
@@ -197,40 +192,13 @@ def source_responses(
 
     Responses are means over instants of each window, in which a source may rise and set.
     """
-    if not sources:
+    if not scenario.sources.list:
         return ()
     instants, sample, weight = observation.at_nodes(SOURCE_NODES)
     first = np.searchsorted(sample, np.arange(observation.n_times))
-    responses = (
-        source_response(
-            instants, one.direction(instants), frequency_mhz, beams.monopoles, stokes_v=one.stokes_v
-        )
-        for one in sources
-    )
-    return tuple(np.add.reduceat(np.asarray(r) * weight, first, axis=1) for r in responses)
-
-
-def expected_signal(
-    sources: tuple[SourceSection, ...],
-    complete: CouplingMatrix,
-    sky: Sky,
-    background: Float[Array, "products *times"],
-    responses: tuple[Grid, ...],
-) -> Grid:
-    """Visibilities of sky, background and sources with their mean fluxes, in K.
-
-    Parameters
-    ----------
-    sources : tuple of SourceSection
-    complete : CouplingMatrix
-        A, for all products at all times.
-    sky : Sky
-    background : (products,) or (products, times) array
-        In K.
-    responses : tuple of (products, times) arrays
-        As in :class:`.Setup`.
-    """
-    signal = complete.layout.scatter(complete @ sky.modes) + background.reshape(len(background), -1)
-    for section, response in zip(sources, responses, strict=True):
-        signal = signal + section.mean_flux(sky.frequency_mhz) * response
-    return signal
+    responses = []
+    for one in scenario.sources.list:
+        towards, antennas = one.direction(instants), beams.monopoles
+        seen = source_response(instants, towards, frequency_mhz, antennas, stokes_v=one.stokes_v)
+        responses.append(np.add.reduceat(np.asarray(seen) * weight, first, axis=1))
+    return tuple(responses)

@@ -183,9 +183,9 @@ def values_of(chart, seed=0) -> dict:
         "gain_noise": jnp.asarray(rng.normal(size=(4, len(chart.drifts.grid)))),
         "other": jnp.asarray(rng.normal(size=3)),
     }
-    if chart.sigma_is_site:
+    if "gain_sigma" in chart.names:
         values["gain_sigma"] = jnp.log(0.03) + jnp.asarray(0.4 * rng.normal())
-    if chart.log_correlation_reach is not None:
+    if "gain_log_correlation" in chart.names:
         values["gain_log_correlation"] = jnp.asarray(rng.normal())
     return values
 
