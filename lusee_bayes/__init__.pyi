@@ -32,10 +32,10 @@ from .sampling.distributions import CorrelatedNormal as CorrelatedNormal
 from .sampling.distributions import Marginal as Marginal
 from .sampling.distributions import SkyPrior as SkyPrior
 from .sampling.distributions import TimesStudentT as TimesStudentT
-from .sampling.evidence import estimate_evidence as estimate_evidence
 from .sampling.hmc import Sampler as Sampler
 from .sampling.hmc import Whitening as Whitening
 from .sampling.hmc import sample as sample
+from .sampling.mode import estimate_evidence as estimate_evidence
 from .sampling.programs import load_program as load_program
 from .sky.prior import HarmonicPrior as HarmonicPrior
 from .sky.sky_source import Sky as Sky

@@ -101,6 +101,7 @@ def set_up(
         instrument = Instrument(
             source, pointing, coupling.layout, scenario.frequency_mhz, scenario.lmax
         )
+        background = np.repeat(background[:, None], observation.n_times, axis=1)
         pieces = observation, sky, source, instrument, beams, coupling, prior, responses, background
         calibration = None if data is None else data.calibration
         of_data = {"receiver": receiver, "calibration": calibration, "measured": data is not None}
@@ -300,7 +301,7 @@ def model_to_sample(
         else:
             noise = KnownFactor.of(noise)
         model = replace(model, noise=noise)
-        later = [InPlace(s.systematic, s) if isinstance(s, Marginalised) else s for s in later]
+        later = [InPlace(s) if isinstance(s, Marginalised) else s for s in later]
     if later and not any(systematic.changes_coupling for systematic in later):
         model = replace(model, coupling=DenseCoupling(model.coupling.dense()))
     return model, tuple(later)

@@ -244,11 +244,6 @@ class Chunk:
     state: list[np.ndarray]
     draws: dict[str, np.ndarray]
 
-    @property
-    def start(self) -> int:
-        """Iterations done before the first of its draws."""
-        return self.iteration - max(map(len, self.draws.values()), default=0)
-
     @classmethod
     def read(cls, path: Path) -> Chunk:
         """Read a chunk's file. InputError if it cannot be read."""
@@ -321,12 +316,12 @@ class Checkpoints:
         InputError
             If one cannot be read, or is missing before the last.
         """
-        chunks = [Chunk.read(path) for path in self._paths()]
-        done = 0
+        chunks, done = [Chunk.read(path) for path in self._paths()], 0
         for chunk in chunks:
-            if chunk.draws and chunk.start != done:
+            start = chunk.iteration - max(map(len, chunk.draws.values()), default=0)
+            if chunk.draws and start != done:
                 raise InputError(
-                    f"'{self.folder}' lacks the draws of iterations {done} to {chunk.start}; "
+                    f"'{self.folder}' lacks the draws of iterations {done} to {start}; "
                     "delete the later chunks to continue from there"
                 )
             done = chunk.iteration

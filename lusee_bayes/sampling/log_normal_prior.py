@@ -7,7 +7,6 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from lusee_bayes.core.arrays import Array
-from lusee_bayes.core.checks import require_array, require_positive
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.sky.positive_skies import LogNormalSky
 from lusee_bayes.systematics.systematic import SKY
@@ -29,21 +28,11 @@ class LogNormalPrior(eqx.Module):
         ln A and the tilt, or their prior means.
     std : (2,) array or None
         Prior standard deviations of both; None if they are fixed.
-
-    Raises
-    ------
-    InputError
-        If ln A or the tilt is not finite, or a standard deviation not positive.
     """
 
     sky: LogNormalSky
     expected: Float[Array, "2"]
     std: Float[Array, "2"] | None = None
-
-    def __check_init__(self):
-        require_array("ln A and the tilt of the sky", self.expected, (2,))
-        if self.std is not None:
-            require_positive("the standard deviation of ln A or of the tilt", self.std)
 
     @property
     def samples_spectrum(self) -> bool:

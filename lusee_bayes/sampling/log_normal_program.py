@@ -48,7 +48,6 @@ from scipy.linalg import block_diag
 
 from lusee_bayes.core import linalg
 from lusee_bayes.core.arrays import Array, on_device, on_host
-from lusee_bayes.core.checks import require_shape
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.linear.information import Information
 from lusee_bayes.sampling.hmc import Whitening
@@ -222,12 +221,10 @@ def find_mode(
     Raises
     ------
     InputError
-        If the information has another lmax, or the search does not converge in 100 steps.
+        If the search does not converge in 100 steps.
     """
     sky, information = on_host((sky, information))
-    require_shape("the information", information.matrix, (sky.n_modes, sky.n_modes))
     white = np.zeros(sky.size) if start is None else np.array(start, dtype=np.float64)
-    require_shape("the start", white, (sky.size,))
     local, moved, damping, least = information.recentred(sky.modes(white)), np.inf, 0.0, 0.0
     for steps in range(MAX_STEPS + 1):
         jacobian = sky.jacobian(white)

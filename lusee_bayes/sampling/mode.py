@@ -1,4 +1,4 @@
-"""The mode of a program, the curvature there, and the uncertainty of quantities.
+"""The mode of a program, the curvature there, its evidence, and the uncertainty of quantities.
 
 Mode and curvature give the start and the coordinates of sampling. The curvature is the Hessian if
 few sites are sampled (the sky integrated out). If a program predicts the data at a site
@@ -6,6 +6,9 @@ CorrelatedNormal, as d ~ N(f(x), N), the curvature is that of Gauss and Newton, 
 prior's, J the derivative of f: it handles the sky and thousands of other unknowns at once. At a
 site TimesStudentT, N^-1 includes a weight for every time. Mode and curvature only set coordinates;
 the density sampled is the program's own.
+
+Evidences compare how well programs fit the data. They are estimated, with errors, by importance
+sampling from a Student t about the mode.
 
 Draws of the sky give maps of standard deviations and intervals, and statistics of chosen
 quantities. Skies are draws (chains, draws, modes) of Galactic harmonic coefficients in K, from HMC
@@ -15,6 +18,7 @@ or :meth:`Posterior.sample`; maps are HEALPix RING, Galactic, in K.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import arviz_base
@@ -34,8 +38,14 @@ from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, pixel_matrix, power_spectrum, synthesis_matrix
 from lusee_bayes.sampling.distributions import HALF_LOG_2PI, Prediction
-from lusee_bayes.sampling.hmc import Whitening
-from lusee_bayes.sampling.programs import latent_of, numpyro_promotion
+from lusee_bayes.sampling.hmc import Whitening, whitened
+from lusee_bayes.sampling.programs import (
+    DATA,
+    WHITE_SUFFIX,
+    Program,
+    latent_of,
+    numpyro_promotion,
+)
 from lusee_bayes.systematics.systematic import MOST_COLLAPSED, Chart
 
 # recurring types of arrays
@@ -355,6 +365,95 @@ def _climb(
     whitening = Whitening(x, root, log_det, problem.shapes.sites, problem.shapes.chart)
     log_evidence = -value + log_det + x.shape[0] * HALF_LOG_2PI
     return LaplaceApproximation(whitening, log_evidence, moved, n)
+
+
+# degrees of freedom of the proposal, whose tails are heavier than a Gaussian's
+TAILS = 7.0
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The evidence of a program.
+
+    Attributes
+    ----------
+    log_evidence : float
+        ln p(d).
+    error : float
+        Its standard error.
+    effective : float
+        Effective number of draws.
+    laplace : LaplaceApproximation
+        The Gaussian about the mode, behind the proposal.
+    """
+
+    log_evidence: float
+    error: float
+    effective: float
+    laplace: LaplaceApproximation
+
+
+def estimate_evidence(
+    program: Program,
+    arguments: Mapping[str, Any],
+    data: Float[Array, " data"],
+    *,
+    n: int = 400,
+    seed: int = 0,
+) -> Evidence:
+    """Estimate ln p(d) with everything that the program samples integrated out.
+
+    Use it for programs with few sites, the sky integrated out. Trust it if the effective number of
+    draws is a good share of ``n``.
+
+    Parameters
+    ----------
+    program : Program
+        The program.
+    arguments : mapping
+        Its arguments, without the data.
+    data : (data,) array
+        d, in K.
+    n : int
+        Number of draws.
+    seed : int
+        Seed of the draws.
+
+    Raises
+    ------
+    InputError
+        If the search for the posterior's mode does not converge.
+    """
+    arguments = {**arguments, DATA: jnp.asarray(data)}
+    laplace = laplace_approximation(program.model, arguments)
+    if not bool(laplace.converged):
+        raise InputError(
+            f"found no mode of the posterior in {int(laplace.steps)} steps (last step: "
+            f"{float(laplace.moved):.2g} standard deviations); narrow the priors"
+        )
+    with numpyro_promotion():
+        weights = np.asarray(_log_weights(program, arguments, laplace, n, jax.random.key(seed)))
+    largest, relative = weights.max(), np.exp(weights - weights.max())
+    error = relative.std(ddof=1) / relative.mean() / np.sqrt(n)
+    effective = relative.sum() ** 2 / (relative**2).sum()
+    log_evidence = largest + np.log(relative.mean())
+    return Evidence(float(log_evidence), float(error), float(effective), laplace)
+
+
+@eqx.filter_jit
+def _log_weights(
+    program: Program, arguments: dict[str, Any], laplace: LaplaceApproximation, n: int, key
+) -> Float[Array, " draws"]:
+    """ln of density over proposal, which is a Student t in the white coordinates."""
+    whitening = laplace.whitening
+    size = whitening.root.shape[1]
+    proposal = dist.MultivariateStudentT(TAILS, jnp.zeros(size), jnp.eye(size))
+    z = proposal.sample(key, (n,))
+
+    model = whitened(program.model, whitening)
+    site = f"{whitening.names[0]}{WHITE_SUFFIX}"
+    log_p = jax.lax.map(lambda z: -potential_energy(model, (), arguments, {site: z}), z)
+    return log_p - proposal.log_prob(z)
 
 
 # number of pixels whose draws are in memory at once

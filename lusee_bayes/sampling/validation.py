@@ -142,7 +142,6 @@ def calibrate(
     n_simulations: int = 500,
     seed: int = 0,
     batch: int = BATCH,
-    one_by_one: bool = False,
     regions: Sequence[str] = (),
     engine: Engine | None = None,
     stages: Stages | None = None,
@@ -164,10 +163,7 @@ def calibrate(
     seed : int
         Seed of all random numbers.
     batch : int
-        Number of data sets computed at once.
-    one_by_one : bool
-        Compute the data sets of a batch one after the other. Use it if their times differ, since
-        otherwise all wait for the slowest.
+        Number of data sets computed at once; all of them wait for the slowest.
     regions : sequence of str
         See :class:`Ranks`.
     engine : Engine, optional
@@ -184,7 +180,7 @@ def calibrate(
 
     def rank(start: int) -> dict[str, np.ndarray]:
         keys = jax.random.split(jax.random.key(seed), n_simulations)[start : start + batch]
-        return jax.tree.map(np.asarray, _rank_batch(simulate, draw, quantities, keys, one_by_one))
+        return jax.tree.map(np.asarray, _rank_batch(simulate, draw, quantities, keys))
 
     starts = range(0, n_simulations, batch)
     names = [f"data sets from {start} on" for start in starts]
@@ -200,9 +196,7 @@ def calibrate(
 
 
 @eqx.filter_jit
-def _rank_batch(
-    simulate, draw, quantities, keys: Key[Array, " n"], one_by_one: bool
-) -> dict[str, Array]:
+def _rank_batch(simulate, draw, quantities, keys: Key[Array, " n"]) -> dict[str, Array]:
     """Ranks for one batch of data sets: (simulations, ...) by name."""
 
     def one(key):
@@ -212,7 +206,7 @@ def _rank_batch(
         below = jax.tree.map(lambda q, t: (q < t[None]).sum(0), drawn, quantities(truth, data))
         return {name: jnp.atleast_1d(rank) for name, rank in below.items()}
 
-    return jax.lax.map(one, keys) if one_by_one else jax.vmap(one)(keys)
+    return jax.vmap(one)(keys)
 
 
 def calibrate_sky(

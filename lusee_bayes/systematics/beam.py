@@ -124,7 +124,7 @@ class BeamErrors(Systematic):
             beam_source=source,
             beams=beams,
             coupling=setup.instrument.coupling_of(beams),
-            background=(setup.background.T + (emitted - nominal)).T,
+            background=setup.background + (emitted - nominal)[:, None],
             responses=source_responses(setup.scenario, setup.observation, source, frequency_mhz),
         )
 

@@ -11,7 +11,7 @@ has neither problem.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -62,11 +62,6 @@ class Above:
     mean: DataVector
     power: Float[np.ndarray, " ells"]
 
-    def kept(self, place: Callable[[Array], Array]) -> Above:
-        """The same for other data; ``place`` maps an array of these data to those."""
-        arrays = {name: place(getattr(self, name)) for name in ("coupling", "root", "mean")}
-        return replace(self, **arrays)
-
 
 @dataclass(frozen=True)
 class Setup:
@@ -89,7 +84,7 @@ class Setup:
         S; if it is to be learned, the expected one.
     responses : tuple of (products, times) arrays
         To 1 K sr of each point source outside the map.
-    background : (products,) or (products, times) array
+    background : (products, times) array
         Visibilities without any sky, from ground, antennas, the mean receiver and terrain, in K.
     signal : (products, times) array
         Visibilities of sky, background and sources with their mean fluxes through the modelled
@@ -117,7 +112,7 @@ class Setup:
     coupling: CouplingMatrix
     prior: Prior
     responses: tuple[Grid, ...]
-    background: Float[Array, "products *times"]
+    background: Grid
     signal: Grid | None = None
     receiver: Receiver | None = None
     calibration: Calibration | None = None
@@ -152,8 +147,7 @@ class Setup:
         """The background in every datum, in K; None if there is none."""
         if not np.any(self.background):
             return None
-        grid = (self.layout.n_products, self.layout.n_times)
-        return self.layout.gather(np.broadcast_to(self.background.reshape(grid[0], -1), grid))
+        return self.layout.gather(self.background)
 
     def with_prior(self, section: Any) -> Setup:
         """Return the same with another prior, or family of priors.
@@ -169,9 +163,8 @@ class Setup:
 
     def with_signal(self) -> Setup:
         """Return the same with :attr:`signal`, computed from everything else."""
-        complete, background = self.complete, self.background
-        signal = complete.layout.scatter(complete @ self.sky.modes)
-        signal = signal + background.reshape(len(background), -1)
+        complete = self.complete
+        signal = complete.layout.scatter(complete @ self.sky.modes) + self.background
         for section, response in zip(self.scenario.sources.list, self.responses, strict=True):
             signal = signal + section.mean_flux(self.sky.frequency_mhz) * response
         return replace(self, signal=signal)
@@ -190,11 +183,17 @@ class Setup:
 
     def with_layout(self, layout: DataLayout) -> Setup:
         """Return the same for a subset of its data."""
-        above, instrument = self.above, replace(self.instrument, layout=layout)
-        if above is not None:
-            above = above.kept(lambda x: layout.gather(self.layout.scatter(x)))
-        coupling = replace(self.coupling, layout=layout)
+        instrument = replace(self.instrument, layout=layout)
+        coupling, above = replace(self.coupling, layout=layout), self._above_at(layout)
         return replace(self, instrument=instrument, coupling=coupling, above=above)
+
+    def _above_at(self, layout: DataLayout, keep: Any = np.s_[:]) -> Above | None:
+        """The sky above lmax in the data of another layout, which has only the times ``keep``."""
+        if self.above is None:
+            return None
+        names = ("coupling", "root", "mean")
+        grids = {name: self.layout.scatter(getattr(self.above, name)) for name in names}
+        return replace(self.above, **{n: layout.gather(grid[:, keep]) for n, grid in grids.items()})
 
     def select(self, keep: Bool[np.ndarray, " times"]) -> Setup:
         """Return the same at the times where ``keep`` is True, with some of every run."""
@@ -204,19 +203,17 @@ class Setup:
         pointing = replace(turns, **of_time, run_starts=tuple(ends))
         layout = DataLayout.from_flags(~np.asarray(self.layout.present)[:, keep])
         moved = {"pointing": pointing, "layout": layout}
-        background, calibration, above = self.background, self.calibration, self.above
-        if above is not None:
-            above = above.kept(lambda x: layout.gather(self.layout.scatter(x)[:, keep]))
+        calibration = self.calibration
         return replace(
             self,
             observation=observation,
             instrument=replace(self.instrument, **moved),
             coupling=replace(self.coupling, **moved),
             responses=tuple(grid[:, keep] for grid in self.responses),
-            background=background if background.ndim == 1 else background[:, keep],
+            background=self.background[:, keep],
             signal=self.signal[:, keep],
             calibration=None if calibration is None else calibration.select(keep),
-            above=above,
+            above=self._above_at(layout, keep),
         )
 
     @property

@@ -200,7 +200,7 @@ class Horizon(ChangedBeams):
         made = replace(
             setup,
             coupling=setup.coupling.of(modes=np.asarray(setup.beams.modes) + hidden),
-            background=(setup.background.T + emitted[observation.run]).T,
+            background=setup.background + emitted[observation.run].T,
             hidden=hidden if setup.hidden is None else setup.hidden,
         )
         return made.with_signal()

@@ -543,7 +543,7 @@ class Marginalised(eqx.Module):
         The systematic.
     """
 
-    systematic: Systematic
+    systematic: Systematic | Marginalised
 
     names: ClassVar[tuple[str, ...]] = ()
     needs_sky: ClassVar[bool] = False
@@ -567,15 +567,13 @@ class InPlace(Marginalised):
 
     Attributes
     ----------
-    held : Marginalised
+    systematic : Marginalised
         As part of N.
     """
 
-    held: Marginalised
-
     def sampled(self, model: LinearGaussian) -> LinearGaussian:
         """Apply its effects except the term of N."""
-        return replace(self.held.marginalised(model), noise=model.noise)
+        return replace(self.marginalised(model), noise=model.noise)
 
 
 class Expanded(Marginalised):
@@ -660,14 +658,10 @@ class ChangedBeams(Systematic):
     def modes(self, modes: BeamModes, values: Values) -> BeamModes:
         """Beams in the frame of the lander with values of the unknowns, from beams without them."""
 
-    def slopes(self, modes: BeamModes, centre: Vector) -> Iterator[BeamModes]:
-        """Derivatives of :meth:`modes` by the unknowns in prior standard deviations, one by one."""
-        return self.differences(lambda values: self.modes(modes, values), centre)
-
     def differences(
         self, made: Callable[[Values], Array], centre: Vector
     ) -> Iterator[Float[np.ndarray, "..."]]:
-        """Derivatives of any function of the values, likewise."""
+        """Derivatives of a function of the values by the unknowns in prior std's, one by one."""
         for step in STEP * np.eye(len(centre)):
             up, down = (np.asarray(made(self.values(centre + way))) for way in (step, -step))
             yield (up - down) / (2.0 * STEP)
@@ -679,7 +673,8 @@ class ChangedBeams(Systematic):
 
     def linearised(self, model, centre):
         """Differentiate the beams."""
-        slopes = self.slopes(np.asarray(model.coupling.modes), centre)
+        beams = np.asarray(model.coupling.modes)
+        slopes = self.differences(lambda values: self.modes(beams, values), centre)
         see, layout, response = model.coupling.along(slopes), model.coupling.layout, 1.0
         if model.coupling.response is not None:
             response = model.coupling.response

@@ -62,7 +62,7 @@ def measured(
     setup = set_up(truth)
     coupling = lb.CouplingMatrix.build(beams(setup), setup.pointing)
     signal = np.asarray(setup.layout.scatter(coupling @ sky.modes))
-    signal = signal + np.asarray(setup.background)[:, None]
+    signal = signal + np.asarray(setup.background)
     signal = np.asarray(distort(setup, signal))
     noise = radiometer(replace(setup, signal=signal)).sample(jax.random.key(seed))
     nominal = setup if seen_by is None else set_up(seen_by)

@@ -12,7 +12,7 @@ from scipy.stats import norm
 from small_models import Case
 
 import lusee_bayes as lb
-from lusee_bayes.sampling import evidence as comparison
+from lusee_bayes.sampling import mode as comparison
 from lusee_bayes.sampling.mode import laplace_approximation
 from lusee_bayes.sampling.programs import Program
 

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from assertions import refuse
 from scipy import optimize
 
 from lusee_bayes.core.arrays import on_device
@@ -162,17 +161,6 @@ def test_the_learned_spectrum_has_the_highest_evidence_and_its_curvature():
         # from it by sqrt(2 / 16) of that: two standard deviations
         assert 0.5 * (up + down) - top == pytest.approx(-0.5, abs=0.35)
         assert 0.5 * (up - down) == pytest.approx(0.0, abs=0.1)
-
-
-# --- refusals ---------------------------------------------------------------------------------
-
-
-def test_refusals():
-    refuse("the information has shape", ln.find_mode, log_normal(0.1, lmax=2), information())
-    sky = log_normal(0.1)
-    words, none = "ln A and the tilt of the sky.*NaN", np.array([-np.inf, TILTED])
-    refuse(words, LogNormalPrior, sky, none)
-    refuse("ln A or.*tilt", log_normal_prior, 0.1, (1.0, 0.0))
 
 
 @pytest.mark.parametrize("widths", [None, (0.7, 0.5)])

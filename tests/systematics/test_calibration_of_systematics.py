@@ -87,7 +87,7 @@ class Sites(eqx.Module):
 def ranks_of(program, arguments, quantities, *, draws=None, n=100, seed=1, regions=()) -> Ranks:
     """One data set after the other: in a batch, each would wait for the slowest."""
     given = Truth(program, arguments), draws or Draws(program, arguments, hmc(60)), quantities
-    options = {"n_simulations": n, "seed": seed, "one_by_one": True, "regions": regions}
+    options = {"n_simulations": n, "seed": seed, "batch": 1, "regions": regions}
     with numpyro_promotion():
         return calibrate(*given, **options)
 

@@ -125,7 +125,7 @@ def test_found_drifts_have_the_shift_of_the_volume():
 
     def seen(x):  # unit normals of the sky, then of the drifts
         sky, gains = x[: len(s)] * s, (root @ x[len(s) :]).reshape(4, -1)
-        signal = e.setup.layout.scatter(a @ sky) + e.setup.background[:, None]
+        signal = e.setup.layout.scatter(a @ sky) + e.setup.background
         return e.setup.layout.gather(with_gains(signal, gains)) / sigma
 
     def precision(x):
