@@ -30,7 +30,7 @@ from lusee_bayes.priors.families import PriorFamily
 from lusee_bayes.priors.learning import Learned, Row, averaged_beyond, learn_whatever_fits
 from lusee_bayes.sky.prior import Prior
 from lusee_bayes.systematics.above_lmax import AboveLmax
-from lusee_bayes.systematics.context import Around, Setup
+from lusee_bayes.systematics.context import Around, Setup, Volume
 from lusee_bayes.systematics.gain_drifts import GainDrifts, gains_about
 from lusee_bayes.systematics.noise_level import radiometer_about
 from lusee_bayes.systematics.pointing_offsets import PointingOffsets
@@ -436,7 +436,7 @@ def _around(setup: Setup, inference: Inference, step: _Step) -> tuple[Around, _S
             gains = slope = None
             if off < SAME_VISIBILITIES:
                 gains = drifts.inferred(solved)[0]
-                slope = drifts.volume_slope(solution, *(around.volume or _volume(solution)))
+                slope = drifts.volume_slope(solution, around.volume or _volume(solution))
             around = replace(around, gains=gains, gain_slope=slope)
     return around, step
 
@@ -470,7 +470,7 @@ def _tempered(misfit: float, rounds: int) -> float:
     return 1.0 if tempered < 2.0 or rounds >= MAX_TEMPERED_ROUNDS else tempered
 
 
-def _volume(solution: Solution) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:
+def _volume(solution: Solution) -> Volume:
     """:attr:`.Around.volume`."""
     white = np.random.default_rng(0).standard_normal((solution.model.n_data, VOLUME_DRAWS))
     weighted = np.asarray(solution.factor.whiten_transpose(white))

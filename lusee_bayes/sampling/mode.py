@@ -34,7 +34,7 @@ from numpyro import handlers
 from numpyro.infer import init_to_median
 from numpyro.infer.util import constrain_fn, potential_energy
 
-from lusee_bayes.core.arrays import Array
+from lusee_bayes.core.arrays import Array, DataVector
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import lmax_of, pixel_matrix, power_spectrum, synthesis_matrix
 from lusee_bayes.sampling.distributions import HALF_LOG_2PI, Prediction
@@ -394,12 +394,7 @@ class Evidence:
 
 
 def estimate_evidence(
-    program: Program,
-    arguments: Mapping[str, Any],
-    data: Float[Array, " data"],
-    *,
-    n: int = 400,
-    seed: int = 0,
+    program: Program, arguments: Mapping[str, Any], data: DataVector, *, n: int = 400, seed: int = 0
 ) -> Evidence:
     """Estimate ln p(d) with everything that the program samples integrated out.
 

@@ -17,7 +17,6 @@ from pydantic import Field
 
 from lusee_bayes.core.arrays import DataVector
 from lusee_bayes.core.section import Positive, Section, Treatment, requires
-from lusee_bayes.instrument.beams.fields import ProductBeams
 from lusee_bayes.instrument.beams.source import BeamSource
 from lusee_bayes.instrument.coupling import BeamModes, Coupling, CouplingMatrix, Instrument
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
@@ -58,9 +57,7 @@ class BeamErrorSection(Section):
     treatment: Treatment = "marginalised"
 
     _one_direction = requires(
-        lambda section: (
-            [section.shift_mhz, section.file, section.parameters or None].count(None) == 2
-        ),
+        lambda s: [s.shift_mhz, s.file, s.parameters or None].count(None) == 2,
         "give either shift_mhz, file or parameters",
     )
 
@@ -224,17 +221,11 @@ class InstrumentParameters(ChangedBeams, BeamErrors):
         return layout.gather(more[:, None] * each_time)
 
 
-def true_beams(setup: Setup) -> ProductBeams:
-    """The beams of simulated data."""
-    section = setup.scenario.noise.beam
-    if section is None:
-        return setup.beams
-    key = jax.random.key(BeamErrors.true_seed(section, setup.scenario))
-    return BeamErrors.moved(section, setup, BeamErrors.truth(section, setup, key)).beams
-
-
 def beam_rms_difference(setup: Setup) -> float | None:
     """RMS difference of the true and the model's beams, over the model's; None if the same."""
-    if setup.scenario.noise.beam is None:
+    section = setup.scenario.noise.beam
+    if section is None:
         return None
-    return instrument_errors.rms_difference(true_beams(setup), setup.beams)
+    key = jax.random.key(BeamErrors.true_seed(section, setup.scenario))
+    true = BeamErrors.moved(section, setup, BeamErrors.truth(section, setup, key))
+    return instrument_errors.rms_difference(true.beams, setup.beams)

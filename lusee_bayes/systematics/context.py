@@ -31,6 +31,8 @@ from lusee_bayes.priors.families import PriorFamily
 from lusee_bayes.sky.prior import Prior
 from lusee_bayes.sky.sky_source import Sky
 
+# skies of noise alone, in K, and the noise behind them, weighted
+Volume = tuple[Float[Array, "draws modes"], Float[Array, "draws data"]]
 # visibilities around which a term of N is built: the modelled sky's, the data, or the map's
 NoiseAbout = Literal["model", "measured", "posterior"]
 
@@ -259,7 +261,7 @@ class Around:
     visibilities: Grid | None = None
     sky: Modes | None = None
     values: Mapping[str, float | Float[Array, "..."]] | None = None
-    volume: tuple[Float[Array, "draws modes"], Float[Array, "draws data"]] | None = None
+    volume: Volume | None = None
     tempered: float = 1.0
     gains: Float[Array, "antennas times"] | None = None
     gain_slope: Float[Array, "antennas times"] | None = None

@@ -209,6 +209,13 @@ class FieldErrors(ChangedBeams):
         return self.expectation.learned
 
     def relearned(self, mean: Vector, variance: Vector) -> dict[str, float]:
+        """Learn the standard deviation from the posterior of the amplitudes.
+
+        Parameters
+        ----------
+        mean, variance : (n,) array
+            In prior standard deviations.
+        """
         expected = self.expectation
         now = np.asarray(self.of_ell)[0] / of_ell(1.0, expected.slope, expected.lmax)[0]
         std = float(now * np.sqrt(np.mean(mean**2 + variance)))

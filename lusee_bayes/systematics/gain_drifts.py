@@ -25,7 +25,7 @@ from lusee_bayes.noise.instrument_errors import (
     white_grid,
     with_gains,
 )
-from lusee_bayes.systematics.context import Around, NoiseAbout, Setup, noise_visibilities
+from lusee_bayes.systematics.context import Around, NoiseAbout, Setup, Volume, noise_visibilities
 from lusee_bayes.systematics.systematic import (
     SKY,
     Chart,
@@ -85,10 +85,7 @@ class GainSection(Section):
     visibilities: NoiseAbout | None = None
 
     _scales_are_sampled = requires(
-        lambda section: (
-            section.treatment != "marginalised"
-            or (section.log_sigma_std is None and section.log_correlation_std is None)
-        ),
+        lambda s: s.treatment != "marginalised" or not (s.log_sigma_std or s.log_correlation_std),
         "log_sigma_std and log_correlation_std need treatment 'sampled': a covariance has fixed "
         "scales",
     )
@@ -314,12 +311,7 @@ class GainDrifts(Systematic):
         """F: the derivatives of the visibilities by the gains."""
         return np.asarray(slopes_by_gains(self.visibilities, self.about))
 
-    def volume_slope(
-        self,
-        solution: Solution,
-        skies: Float[Array, "draws modes"],
-        weighted: Float[Array, "draws data"],
-    ) -> Gains:
+    def volume_slope(self, solution: Solution, volume: Volume) -> Gains:
         """Slope of ln p by the drifts that is due to the volume of skies and drifts that fit.
 
         Fewer skies fit with larger gains; and with a smaller sky, more drifts do. With s and q the
@@ -333,7 +325,7 @@ class GainDrifts(Systematic):
         ----------
         solution : Solution
             With this term in N.
-        skies, weighted : (draws, modes) and (draws, data) arrays
+        volume : ((draws, modes), (draws, data)) arrays
             s = C A^T w, and w = N^-1 n.
         """
         slopes, about, total = self.slopes, self.about, 0.0
@@ -342,14 +334,14 @@ class GainDrifts(Systematic):
         def pulled(slopes: Float[Array, "antennas products times"], data: DataVector) -> Gains:
             return (slopes * self.layout.scatter(data)).sum(1)
 
-        for sky, weights in zip(skies, weighted, strict=True):
+        for sky, weights in zip(*volume, strict=True):
             signal = np.asarray(solution.model.coupling @ sky)
             left = weights - np.asarray(solution.factor.solve(signal))
             drifts = self.drift.correlated(pulled(slopes, left), np.asarray(self.hours))
             by_sky = slopes_by_gains(np.asarray(self.layout.scatter(signal)) / response, about)
             total = total - pulled(by_sky, weights)
             total = total + drifts / (1.0 + about) * pulled(slopes, weights)
-        return total / len(skies)
+        return total / len(volume[0])
 
     def effect(self, model, values):
         """Multiply by the response to ``gains``."""

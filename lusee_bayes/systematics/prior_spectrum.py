@@ -47,9 +47,7 @@ class SpectrumSection(Section):
     log_band_std: Positive = 1.0
 
     _one_parameterisation = requires(
-        lambda section: (
-            not (section.band_edges and (section.log_amplitude_std or section.tilt_std))
-        ),
+        lambda s: not (s.band_edges and (s.log_amplitude_std or s.tilt_std)),
         "give either band_edges or log_amplitude_std and tilt_std",
     )
     _bands_grow = requires(
@@ -60,8 +58,7 @@ class SpectrumSection(Section):
     @property
     def samples(self) -> bool:
         """Whether a parameter of the prior is to be sampled."""
-        fixed = self.log_amplitude_std is None and self.tilt_std is None
-        return not fixed or bool(self.band_edges)
+        return bool(self.log_amplitude_std or self.tilt_std or self.band_edges)
 
 
 class PriorSpectrum(Scale):

@@ -103,10 +103,9 @@ class Receivers(Temperatures):
     def truth(cls, section: ReceiverNoiseSection, setup: Setup, key: PRNGKeyArray) -> Truth:
         if section.smooth_octaves is None:
             return super().truth(section, setup, key)
-        octave = float(np.log2(setup.frequency_mhz))
-        receivers = cls.build(section, setup, Around())
-        own_key, n = cls.own_key(key), len(receivers.unknowns)
-        return receivers.values(_smooth_spectra(own_key, n, octave / section.smooth_octaves))
+        x, n = np.log2(setup.frequency_mhz) / section.smooth_octaves, setup.beam_source.n_ports
+        z = _smooth_spectra(cls.own_key(key), n, float(x))
+        return cls.build(section, setup, Around()).values(z)
 
 
 def _smooth_spectra(key: PRNGKeyArray, n_ports: int, x: float) -> Float[np.ndarray, " ports"]:

@@ -46,7 +46,6 @@ import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
 from lusee_bayes.core.arrays import Array, DataVector, Modes, Vector, namespace, on_device, scalar
-from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.lazy import dist, numpyro
 from lusee_bayes.core.section import Section
@@ -157,7 +156,6 @@ class Unknown:
             kind, centre = (dist.LogNormal, jnp.log) if self.log else (dist.Normal, jnp.asarray)
             prior = kind(centre(scalar(mean)), scalar(std))
             return prior if self.size is None else prior.expand([self.size]).to_event(1)
-        require_positive(f"the prior standard deviation of {self.name}", std)
         cdf = NormalDist().cdf
         outside = cdf((low - mean) / std) + cdf((mean - high) / std)
         if outside > 0.0025:
@@ -210,7 +208,7 @@ class Systematic(eqx.Module):
     has_table : bool
         Whether reports have a separate table of its unknowns.
     learns : bool
-        Whether a parameter of its prior is learned in rounds (:meth:`relearned`).
+        Whether a parameter of its prior is learned in rounds, as in :meth:`.FieldErrors.relearned`.
     """
 
     key: ClassVar[str] = ""
@@ -458,16 +456,6 @@ class Systematic(eqx.Module):
 
         middle, ways = seen(0.0 * z), zip(self.names, np.diag(z), strict=True)
         return {name: (seen(way) + seen(-way)) / 2.0 - middle for name, way in ways}
-
-    def relearned(self, mean: Vector, variance: Vector) -> dict[str, float]:
-        """Learn parameters of its prior from the posterior of its unknowns, by name.
-
-        Parameters
-        ----------
-        mean, variance : (n,) array
-            In prior standard deviations.
-        """
-        return {}
 
     def behind(self, gains: DataVector) -> Systematic:
         """The same with its term of N multiplied by later gains; by default unchanged.

@@ -18,7 +18,7 @@ from lusee_bayes.experiment.model import full_model, radiometer, simulate, syste
 from lusee_bayes.experiment.rounds import SETTLED, Inference, prediction
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.noise.covariance import Covariance, LowRankCovariance, LowRankUpdate
-from lusee_bayes.systematics.beam import beam_rms_difference, difference_of_beams, true_beams
+from lusee_bayes.systematics.beam import beam_rms_difference, difference_of_beams
 from lusee_bayes.systematics.context import Around, Setup
 from lusee_bayes.systematics.registered import SYSTEMATICS, NoiseSection
 from lusee_bayes.systematics.systematic import AdditiveNoise, Systematic, Truth, multiplied
@@ -86,7 +86,7 @@ def test_a_shifted_beam_is_that_of_the_other_frequency():
     setup, data = experiment(SHIFT).setup, experiment(SHIFT).data
     other = lb.monopole_beams(29.0, 6)
     # the same beams compiled twice: rounding
-    within(true_beams(setup).modes, other.modes, 1e-15)
+    within(models.moved(setup, models.true_values(setup)).beams.modes, other.modes, 1e-15)
     change = np.asarray(other.modes) - np.asarray(setup.beams.modes)
     within(difference_of_beams(setup.scenario.noise.beam, setup), change, 1e-15)
     seen = lb.CouplingMatrix.build(other, setup.pointing) @ setup.sky.modes

@@ -16,14 +16,14 @@ from reference import hemisphere, real_harmonics
 
 import lusee_bayes as lb
 from lusee_bayes.experiment.experiment import program_pieces
-from lusee_bayes.experiment.model import set_up, true_signal, true_values
+from lusee_bayes.experiment.model import moved, set_up, true_signal, true_values
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, product_beams
 from lusee_bayes.instrument.beams.luseepy_files import FIELDS
 from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith
 from lusee_bayes.instrument.beams.sampled import read_beam
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.waterfalls import read_waterfall
-from lusee_bayes.systematics.beam import beam_rms_difference, difference_of_beams, true_beams
+from lusee_bayes.systematics.beam import beam_rms_difference, difference_of_beams
 from lusee_bayes.testing import small_scenario
 
 LMAX = 47
@@ -237,9 +237,11 @@ def test_a_second_file_as_the_true_beams(tmp_path):
     within(signal, 1.01**2 * modelled, 1e-9 * modelled.max())
     # against the embedded antennas, and a shift in frequency of a file
     setup = set_up(small_scenario(f"noise.beam.file={other}"))
-    np.testing.assert_array_equal(true_beams(setup).modes, read_beam(other).beams(25.0, 6).modes)
+    true = moved(setup, true_values(setup)).beams
+    np.testing.assert_array_equal(true.modes, read_beam(other).beams(25.0, 6).modes)
     setup = set_up(small_scenario(f"beam.file={path}", "noise.beam.shift_mhz=5"))
-    np.testing.assert_array_equal(true_beams(setup).modes, read_beam(path).beams(30.0, 6).modes)
+    true = moved(setup, true_values(setup)).beams
+    np.testing.assert_array_equal(true.modes, read_beam(path).beams(30.0, 6).modes)
 
 
 NOT_OF_A_FILE = [

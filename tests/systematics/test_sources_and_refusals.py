@@ -243,7 +243,6 @@ def test_the_nearer_end_is_named():
     # a quarter of a percent is allowed: 2.81 standard deviations
     Unknown("angle", 180.0 - 2.82, 1.0, low=0.0, high=180.0).prior()
     refuse("0.3% of its weight", Unknown("angle", 180.0 - 2.80, 1.0, low=0.0, high=180.0).prior)
-    refuse("standard deviation of angle", Unknown("angle", 1.0, 0.0, low=0.0).prior)
 
 
 def test_bands_beyond_the_highest_ell():
