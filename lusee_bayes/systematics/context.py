@@ -271,28 +271,21 @@ def noise_visibilities(setup: Setup, around: Around, about: NoiseAbout) -> Grid:
     """The visibilities around which a term of N is built, in K.
 
     Before there is a prediction, they are the measured ones or, if autos on which noise depends
-    were never measured, the modelled sky's.
-    """
-    if about == "model" or around.data is None:
-        return setup.signal
-    if about == "posterior" and around.visibilities is not None:
-        return around.visibilities
-    if about == "posterior" and not setup.has_autos:
-        return setup.signal
-    return measured_visibilities(around.data, setup.signal)
-
-
-def measured_visibilities(data: Visibilities, model: Grid) -> Grid:
-    """Visibilities that set a noise level: the measured ones, with missing samples interpolated.
-
-    A time without any sample gets the model's, which are not used.
+    were never measured, the modelled sky's. Missing samples of measured ones are interpolated. A
+    time without any sample gets the model's, which are not used.
 
     Raises
     ------
     InputError
         If an auto was never measured, but other products of its port were.
     """
-    some = data.layout.present.any(0)
+    data = around.data
+    if about == "model" or data is None:
+        return setup.signal
+    if about == "posterior" and around.visibilities is not None:
+        return around.visibilities
+    if about == "posterior" and not setup.has_autos:
+        return setup.signal
     try:
         measured = without_gaps(data.layout.scatter(data.data), data.layout)
     except InputError as error:
@@ -300,4 +293,4 @@ def measured_visibilities(data: Visibilities, model: Grid) -> Grid:
             f"{error}, or use noise.radiometer.temperature=posterior and "
             "noise.gain.visibilities=posterior"
         ) from error
-    return np.where(some[None], measured, model)
+    return np.where(data.layout.present.any(0)[None], measured, setup.signal)

@@ -14,7 +14,7 @@ import lusee_bayes as lb
 from lusee_bayes.core.harmonics import map_to_modes
 from lusee_bayes.experiment.model import full_model, simulate
 from lusee_bayes.sky.prior import read_spectrum
-from lusee_bayes.systematics.context import measured_visibilities
+from lusee_bayes.systematics.context import Around, noise_visibilities
 from lusee_bayes.testing import small_scenario
 
 
@@ -57,16 +57,16 @@ def test_flagged_data_are_left_out_of_a_and_n(small_experiment):
 
 def test_measured_temperatures(small_experiment):
     setup, data = small_experiment.setup, small_experiment.data
-    measured = measured_visibilities(data, setup.signal)
+    measured = noise_visibilities(setup, Around(data), "measured")
     np.testing.assert_array_equal(measured, data.layout.scatter(data.data))
     flags = np.zeros(measured.shape, dtype=bool)
     flags[2, 4] = True
-    gapped = measured_visibilities(flagged(data, flags), setup.signal)
+    gapped = noise_visibilities(setup, Around(flagged(data, flags)), "measured")
     np.testing.assert_array_equal(gapped[~flags], measured[~flags])
     np.testing.assert_allclose(gapped[2, 4], (measured[2, 3] + measured[2, 5]) / 2, rtol=1e-14)
     flags[0] = True
     words = "auto 00R is missing .* use noise.radiometer"
-    refuse(words, measured_visibilities, flagged(data, flags), setup.signal)
+    refuse(words, noise_visibilities, setup, Around(flagged(data, flags)), "measured")
 
 
 def test_the_map_recovers_the_sky(small_experiment):

@@ -13,7 +13,7 @@ from lusee_bayes.experiment.model import radiometer, set_up
 from lusee_bayes.instrument.visibilities import Calibration
 from lusee_bayes.judge.plausibility import SIGNIFICANT, about_information, require_plausible
 from lusee_bayes.systematics.above_lmax import AboveLmaxSection
-from lusee_bayes.systematics.context import measured_visibilities
+from lusee_bayes.systematics.context import Around, noise_visibilities
 from lusee_bayes.testing.contracts import assert_refused
 
 FALSE_ALARM = 1e-4
@@ -122,7 +122,7 @@ def test_an_auto_never_goes_without_its_crosses(experiment, strength):
     assert "11R" in found.remark and "kept" in found.remark
     _, kept = without(setup, data, found.flagged)
     # the level that noise is taken from is off by no more than the data that are kept
-    seen, signal = measured_visibilities(kept, setup.signal)[auto], setup.signal[auto]
+    seen, signal = noise_visibilities(setup, Around(kept), "measured")[auto], setup.signal[auto]
     noise = data.layout.scatter(np.sqrt(np.asarray(radiometer(setup).diagonal())))[auto]
     assert (np.abs(seen - signal) < 5.0 * (1.0 + strength) * noise).all()
 
