@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
 
 from lusee_bayes.core.arrays import DataVector, Grid, Modes, Vector
 from lusee_bayes.core.errors import InputError, require_known
@@ -584,7 +583,7 @@ def _compared_surveys(
 
     def learned(surveys: Sequence[sky_sections.SurveySection]) -> tuple[PriorFamily, Learned]:
         family = section.model_copy(update={"surveys": tuple(surveys)}).family(*at)
-        return family, learned_prior(replace(setup, family=family), family, information)
+        return family, learned_prior(replace(setup, family=family), information)
 
     _, alone = learned(())
     others = information.raised(alone.noise_factor).posterior(alone.prior)
