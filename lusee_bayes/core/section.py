@@ -46,7 +46,16 @@ Treatment = Literal["marginalised", "sampled", "ignored"]
 
 
 # entries that name files; an entry with its default value does not
-FILES = ("clock", "file", "gain_table", "lines", "mask", "mean_file", "schedule", "spectrum_file")
+FILES = (
+    "clock",
+    "file",
+    "gain_table",
+    "lines",
+    "mask_file",
+    "mean_file",
+    "schedule",
+    "spectrum_file",
+)
 
 
 def _described(schema: dict[str, Any], section: type[BaseModel]) -> None:

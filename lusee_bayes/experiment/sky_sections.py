@@ -111,7 +111,7 @@ class SurveySection(Section):
         Prior standard deviation of its scale a, about 1.
     zero_std_k : float
         Prior standard deviation of its zero level b, in K at its own frequency.
-    mask : str
+    mask_file : str
         HEALPix FITS map of the same NSIDE: 0 where the survey is not to be used.
     """
 
@@ -122,7 +122,7 @@ class SurveySection(Section):
     beam_deg: Annotated[float, Field(ge=0, le=60)] = 0.0
     scale_std: Positive = 0.1
     zero_std_k: Positive = 1000.0
-    mask: str | None = None
+    mask_file: str | None = None
 
     def at(self, frequency_mhz: float, lmax: int) -> Survey:
         """The survey at a frequency, up to lmax.
@@ -134,13 +134,13 @@ class SurveySection(Section):
         """
         file = require_file(self.file, "survey", "check prior.surveys")
         sky, unseen = read_sky_file(file, self.dataset), None
-        if self.mask is not None and not isinstance(sky, SkyMap):
-            raise InputError(f"{self.file} has no pixels for prior.surveys.mask")
+        if self.mask_file is not None and not isinstance(sky, SkyMap):
+            raise InputError(f"{self.file} has no pixels for prior.surveys.mask_file")
         if isinstance(sky, SkyMap):
             unseen = sky.unseen
-            if self.mask is not None:
-                mask = SkyMap.read(require_file(self.mask, "mask", "check prior.surveys"))
-                require_shape(f"{self.mask}: the mask", mask.pixels, unseen.shape)
+            if self.mask_file is not None:
+                mask = SkyMap.read(require_file(self.mask_file, "mask", "check prior.surveys"))
+                require_shape(f"{self.mask_file}: the mask", mask.pixels, unseen.shape)
                 unseen = unseen | (mask.pixels == 0.0)
             template = galaxy_sky(frequency_mhz, lmax, seed=None, sources=()).modes
             filled = modes_to_map(template, healpy.npix2nside(unseen.size))

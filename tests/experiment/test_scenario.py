@@ -320,6 +320,7 @@ WITHIN = {
     "noise.polarisation": "noise.polarisation={}",
     "noise.above_lmax": "noise.above_lmax={}",
     "noise.gain_table": "noise.gain_table={std: 0.01}",
+    "prior.surveys.0": "prior={model: local_scales, surveys: [{file: x, frequency_mhz: 45.0}]}",
     "sources.list.0": "sources.list=[{name: Cas A}]",
     "flight": "flight={}",
     "flight.simulated": "flight.simulated={}",

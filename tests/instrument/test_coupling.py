@@ -1,5 +1,7 @@
 """A against integrals over the sky, rows and rotations; and A of antennas that vary."""
 
+from types import SimpleNamespace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +18,7 @@ from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith
 from lusee_bayes.instrument.coupling import CouplingMatrix, DenseCoupling, Instrument
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout, auto_indices, labels
-from lusee_bayes.systematics.beam import BeamError, InstrumentParameters
+from lusee_bayes.systematics.beam import BeamError, BeamErrors, BeamErrorSection
 from lusee_bayes.testing.contracts import check_coupling
 
 LMAX = 8
@@ -205,7 +207,8 @@ def base(instrument):
 
 def test_sites_of_the_antennas_parameters(instrument, base):
     """Priors cut off at the ends of the domain; A is that of the values."""
-    systematic = InstrumentParameters.centred(instrument, STDS)
+    section = BeamErrorSection(parameters=STDS)
+    systematic = BeamErrors.build(section, SimpleNamespace(instrument=instrument), None)
     values = {"surface_permittivity": 3.2, "zenith_angle_deg": 76.0, "turntable_offset_deg": -0.4}
     arrays = {name: jnp.asarray(value) for name, value in values.items()}
     with (

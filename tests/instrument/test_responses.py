@@ -265,7 +265,7 @@ def test_a_scenario_with_a_response_and_a_warm_moon(tmp_path):
     setup, data = warm.setup, warm.data
     np.testing.assert_array_equal(setup.beams.modes, read_beam(path).beams(20.0, 6).modes)
     moon = np.asarray(replace(read_beam(path), moon_k=5e4).background(20.0))
-    np.testing.assert_array_equal(setup.background, moon)
+    np.testing.assert_array_equal(setup.background, moon[:, None] * np.ones(data.layout.n_times))
     np.testing.assert_array_equal(cold.setup.background, 0.0)
     added = np.asarray(setup.signal) - np.asarray(cold.setup.signal)
     np.testing.assert_allclose(added, np.tile(moon[:, None], added.shape[1]), rtol=1e-9, atol=1e-6)

@@ -180,7 +180,6 @@ BAD_MAPS = [
     ("ORDERING is NESTED, expected RING", lambda to, x: write_fits(to, x, nest=True)),
     ("COORDSYS is C, expected G", lambda to, x: write_fits(to, x, coord="C")),
     ("NaN or infinity: nan at .7", lambda to, x: write_fits(to, with_one(x, np.nan))),
-    ("1 of 3072 pixels are UNSEEN", lambda to, x: write_fits(to, with_one(x, healpy.UNSEEN))),
     ("has the unit 'Jy', expected K", lambda to, x: write_fits(to, x, "Jy")),
     ("neither HDF5 nor FITS", lambda to, x: to.write_text("not a map")),
     ("did you mean 'smooth_absorp'", lambda to, x: write_hdf5(to, smooth_absorp=x)),
