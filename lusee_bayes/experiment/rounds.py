@@ -586,14 +586,17 @@ def _compared_surveys(
         return family, learned_prior(replace(setup, family=family), information)
 
     _, alone = learned(())
-    others = information.raised(alone.noise_factor).posterior(alone.prior)
+    fitting = information.raised(alone.noise_factor)
+    others = fitting.posterior(alone.prior)
     rows, gains = [], {}
     for one in section.surveys:
         family, known = learned((one,))
         start = known.parameters if known.settled else family.hyperprior.start()
         survey = one.at(*at)
-        rows += survey.calibrated(others, family.at(start).texture)
-        gains[survey.name] = known.log_evidence - alone.log_evidence
+        errors = family.at(start).texture + family.white * np.eye(information.n_modes)
+        rows += survey.calibrated(others.mean, others.covariance(), errors)
+        gained = fitting.posterior(known.prior).log_evidence - others.log_evidence
+        gains[survey.name] = float(gained)
     return tuple(rows), gains
 
 

@@ -48,6 +48,8 @@ TRANSPARENT_MHZ = 50.0
 SCALE_WIDTH = MONOPOLE_WIDTH = 1.0
 # of the weights of surveys and of the embedded template
 WEIGHT_WIDTH = 1.0
+# C_ell of white errors, which every survey has: 0.1 % of the mean up to ell = 31, over C_0
+WHITE = 1e-6 / 1024
 # of ln f^2: so wide that the data decide whether the catalogue's sources exist at all
 SOURCES_WIDTH = 3.0
 # NSIDE at which templates are analysed and smoothed
@@ -193,6 +195,8 @@ class LocalScales(PriorFamily):
     bands : tuple of Band
     covariates : (centre, width) arrays
         Prior of the covariates' coefficients.
+    white : float
+        C_ell of white errors of surveys, in K^2.
     """
 
     mean: Modes
@@ -201,6 +205,7 @@ class LocalScales(PriorFamily):
     spectrum: SpectrumBasis
     bands: tuple[Band, ...]
     covariates: tuple[Covariates, Covariates]
+    white: float
 
     @property
     def hyperprior(self) -> Hyperprior:
@@ -239,7 +244,9 @@ class LocalScales(PriorFamily):
 
 def _covariance(family: LocalScales, flux: float, texture: ModesMatrix) -> ModesMatrix:
     columns = np.concatenate([family.wide, np.sqrt(flux) * family.sources], axis=1)
-    return columns @ columns.T + texture
+    total = columns @ columns.T + texture
+    total[np.diag_indices_from(total)] += family.white
+    return total
 
 
 def _texture(family: LocalScales, spectrum: Ells, strengths: Strengths) -> ModesMatrix:
@@ -341,8 +348,6 @@ def embedded_local_scales(
 ) -> LocalScales:
     """Make the family whose template is the embedded diffuse sky, or the mean of surveys.
 
-    Small scales that a survey's beam removes are those of the embedded sky.
-
     Parameters
     ----------
     frequency_mhz : float
@@ -364,7 +369,7 @@ def embedded_local_scales(
     extended = [level * one.strength * one.modes(lmax) for one in EXTENDED_OBJECTS]
     scale, zero, weights = SCALE_WIDTH * mean, MONOPOLE_WIDTH * monopole, []
     if surveys:
-        filled = [s.modes + (1.0 - s.beam) * (s.modes[0] / mean[0]) * mean for s in surveys]
+        filled = [survey.sharpened(mean) for survey in surveys]
         weights, mean = [*filled, mean], np.mean(filled, axis=0)
         weights = [WEIGHT_WIDTH * (one * (mean[0] / one[0]) - mean) for one in weights]
         stds = np.array([[s.scale_std, np.sqrt(4.0 * np.pi) * s.zero_std] for s in surveys])
@@ -374,4 +379,5 @@ def embedded_local_scales(
     of_sources = np.reshape(modes, (-1, n_modes(lmax))).T
     spectrum = SpectrumBasis.around(np.exp(smoothed[0].mean_log), lmax)
     bands = tuple(Band.of(window, *smoothed) for window in windows(lmax))
-    return LocalScales(mean, wide, of_sources, spectrum, bands, expected_covariates())
+    white = WHITE * mean[0] ** 2 if surveys else 0.0
+    return LocalScales(mean, wide, of_sources, spectrum, bands, expected_covariates(), white)

@@ -29,10 +29,11 @@ from lusee_bayes.core.harmonics import lmax_of
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.linalg import checked_cholesky, gram_matrix, scaled, solve_lower
 from lusee_bayes.core.sphere_grid import SphereGrid
-from lusee_bayes.linear.posterior import Posterior
 
 # brightness of unseen parts of the sky, over the survey's mean
 BRIGHTEST = 10.0
+# the beam is taken off where it leaves more than this part of the sky
+LEAST_BEAM = 0.2
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,12 @@ class Survey:
     zero_std: float
     unseen: Bool[np.ndarray, " pixels"] | None = None
 
+    def sharpened(self, template: Modes) -> Modes:
+        """s without its beam; what the beam removes is that of a template of the same mean."""
+        seen = self.beam > LEAST_BEAM
+        scaled_template = template * (self.modes[0] / template[0])
+        return np.where(seen, self.modes / np.where(seen, self.beam, 1.0), scaled_template)
+
     @property
     def shapes(self) -> Float[np.ndarray, "2 modes"]:
         """Changes of s with a and b, each times its prior standard deviation, in K."""
@@ -66,13 +73,15 @@ class Survey:
         zero[0] = np.sqrt(4.0 * np.pi) * self.zero_std
         return np.stack([self.scale_std * self.modes, zero])
 
-    def calibrated(self, others: Posterior, errors: ModesMatrix) -> list[dict[str, float | str]]:
-        """Infer a and b; also the rms of the survey's errors.
+    def calibrated(
+        self, mean: Modes, covariance: ModesMatrix, errors: ModesMatrix
+    ) -> list[dict[str, float | str]]:
+        """Infer a and b.
 
         Parameters
         ----------
-        others : Posterior
-            Of the sky, from other data.
+        mean, covariance : (modes,) and (modes, modes) array
+            Of the sky, from other data, in K and K^2.
         errors : (modes, modes) array
             E, in K^2.
 
@@ -81,9 +90,8 @@ class Survey:
         list of dict
             Name, value and standard deviation of a, and of b in K.
         """
-        off = self.modes - self.beam * np.asarray(others.mean)
-        known = np.asarray(others.covariance()) + errors
-        whole = scaled(known, self.beam, overwrite=True) + gram_matrix(self.shapes)
+        off = self.modes - self.beam * mean
+        whole = scaled(covariance + errors, self.beam, overwrite=True) + gram_matrix(self.shapes)
         if self.unseen is not None:
             whole += self._blind()
         root = checked_cholesky("the covariance of a survey", whole)
