@@ -38,21 +38,33 @@ def write_products(path, data=None, pairs=PAIRS, header=HEADER, frequencies=(10.
     return write_images(path, images, header)
 
 
-def write_response(path: Path) -> Path:
-    """A small four-port response, FITS version 3, of four different short dipoles over ground."""
-    theta, phi = np.linspace(0, 90, 13), np.linspace(0, 360, 25)
-    azimuth, zenith = np.radians([90.0, 0.0, 272.0, 178.0]), np.radians([80.0, 75.0, 70.0, 78.0])
-    arms = np.array([1.5, 1.4, 1.6, 1.45]) * vectors(zenith, azimuth).T
-    towards = tangents(np.radians(theta)[:, None], np.radians(phi))
-    h_theta, h_phi = (np.einsum("ai,tpa->itp", arms, along)[:, None] for along in towards)
+AZIMUTH, ZENITH = np.radians([90.0, 0.0, 272.0, 178.0]), np.radians([80.0, 75.0, 70.0, 78.0])
+ARMS = np.array([1.5, 1.4, 1.6, 1.45]) * vectors(ZENITH, AZIMUTH).T
+
+
+def effective_lengths(theta, phi) -> list[np.ndarray]:
+    """Of four different short dipoles along theta and along phi, in m; (port, directions)."""
+    return [np.einsum("xi,...x->i...", ARMS, along) for along in tangents(theta, phi)]
+
+
+def write_response(path: Path, change=lambda images: None, finer: int = 1) -> Path:
+    """A small four-port response, FITS version 3, of these dipoles over ground.
+
+    Images are changed as complex ones, and in their parts.
+    """
+    theta, phi = np.linspace(0, 90, 12 * finer + 1), np.linspace(0, 360, 24 * finer + 1)
+    lengths = effective_lengths(np.radians(theta)[:, None], np.radians(phi))
+    h_theta, h_phi = (np.repeat(h[:, None] + 0j, 3, 1) for h in lengths)
     frequencies = np.array([10.0, 20.0, 40.0])
-    sky = np.array([(f / 10.0) ** 2 * arms.T @ arms for f in frequencies])
+    sky = np.array([(f / 10.0) ** 2 * ARMS.T @ ARMS for f in frequencies])
     moon = 0.8 * sky + 0.1 * np.eye(4)[None] * sky[:, :1, :1]
     reactance = -100j * np.eye(4)[None] * (10.0 / frequencies)[:, None, None]
-    images = {"H_theta": np.repeat(h_theta, 3, 1), "H_phi": np.repeat(h_phi, 3, 1)}
-    images |= {"ZA": sky + moon + reactance, "Rsky": sky, "Rmoon": moon, "Rloss": 0.0 * sky}
-    axes = {"freq": frequencies, "theta": theta, "phi": phi}
-    return write_images(path, in_parts(images) | axes, {"VERSION": 3})
+    images = {"H_theta": h_theta, "H_phi": h_phi, "ZA": sky + moon + reactance}
+    images |= {"Rsky": sky, "Rmoon": moon, "Rloss": 0.0 * sky}
+    change(images)
+    images = in_parts(images) | {"freq": frequencies, "theta": theta, "phi": phi}
+    change(images)
+    return write_images(path, images, {"VERSION": 3})
 
 
 def in_parts(images: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -9,8 +9,8 @@ import pytest
 from assertions import close, off, refuse, within
 from astropy.io import fits
 from commands import judged_map, run, sets
-from fits_files import in_parts, write_images, write_response
-from reference import hemisphere, real_harmonics, tangents, vectors
+from fits_files import effective_lengths, write_images, write_response
+from reference import hemisphere, real_harmonics
 from scipy.constants import Boltzmann, c, physical_constants
 
 import lusee_bayes as lb
@@ -109,35 +109,6 @@ def test_sky_and_moon_of_one_temperature_are_an_enclosure(luseepy):
 # --- by hand ------------------------------------------------------------------------------------
 
 
-def short_dipoles(theta, phi, length):
-    """Effective lengths of four arms, 75 degrees from the zenith, in m; (port, directions)."""
-    arms = length * vectors(np.radians(75.0), np.radians([0.0, 90.0, 180.0, 270.0])).T
-    h_theta, h_phi = (np.einsum("xi,...x->i...", arms, along) for along in tangents(theta, phi))
-    return h_theta, h_phi, arms
-
-
-def write(path, *, change=lambda images: None):
-    frequencies = np.array([10.0, 20.0, 40.0])
-    theta, phi = np.linspace(0, 90, 31), np.linspace(0, 360, 121)
-    h_theta, h_phi, arms = short_dipoles(np.radians(theta)[:, None], np.radians(phi), 1.5)
-    # over a hemisphere dipoles radiate half as much as over the sphere: 2 pi / 3 arm.arm'
-    sky = [VACUUM / (4 * (c / (1e6 * f)) ** 2) * 4 * np.pi / 3 * arms.T @ arms for f in frequencies]
-    sky = np.array(sky)
-    reactance = -100j * np.eye(4)[None] * (10.0 / frequencies)[:, None, None]
-    images = {
-        "H_theta": np.repeat(h_theta[:, None], len(frequencies), 1) * (1 + 0.3j),
-        "H_phi": np.repeat(h_phi[:, None], len(frequencies), 1) * (1 + 0.3j),
-        "ZA": (1.09 * 2 * sky) + reactance,
-        "Rsky": 1.09 * sky,
-        "Rmoon": 1.09 * sky,
-        "Rloss": 0.0 * sky,
-    }
-    change(images)
-    flat = in_parts(images) | {"freq": frequencies, "theta": theta, "phi": phi}
-    change(flat)
-    return write_images(path, flat, {"VERSION": 3})
-
-
 def varied(images):
     """Effective lengths that are not the same at all frequencies."""
     if "H_theta" in images:
@@ -153,15 +124,14 @@ def between(values, part):
 def test_between_frequencies_as_luseepy_does(tmp_path):
     """ZA, resistances and the integrals of open ports over lambda^2 go straight from 20 to 40 MHz;
     M is that of the ZA in between."""
-    response = read_beam(write(tmp_path / "response.fits", change=varied))
+    response = read_beam(write_response(tmp_path / "response.fits", varied, 3))
     f, part = 27.0, 0.35
     theta, phi, solid_angle = hemisphere(20, 40)
     harmonics = real_harmonics(theta, phi, 3) * solid_angle[:, None]
     open_ = []
     for k, mhz in enumerate((10.0, 20.0, 40.0)):
-        images = {}
-        for name, h in zip(("H_theta", "H_phi"), short_dipoles(theta, phi, 1.5)[:2], strict=True):
-            images[name] = np.repeat(h[:, None], 3, 1) * (1 + 0.3j)
+        lengths = zip(("H_theta", "H_phi"), effective_lengths(theta, phi), strict=True)
+        images = {name: np.repeat(h[:, None] + 0j, 3, 1) for name, h in lengths}
         varied(images)
         pairs = sum(np.einsum("ip,jp,pm->ijm", h[:, k], h[:, k].conj(), harmonics)
                     for h in images.values())  # fmt: skip
@@ -216,7 +186,7 @@ def test_receivers(tmp_path):
     zl = 0.45 * loads[0] + 0.55 * loads[1]
     np.testing.assert_allclose(measured.load(21.0), zl, rtol=1e-13)
     refuse(r"zl\.fits.*10 to 30 MHz.* 31", measured.load, 31.0)
-    open_ = replace(read_beam(write(tmp_path / "response.fits")), receiver=None)
+    open_ = replace(read_beam(write_response(tmp_path / "response.fits")), receiver=None)
     np.testing.assert_array_equal(open_.circuit(20.0).loading, np.eye(4))
     response = replace(open_, receiver=measured)
     za = 0.95 * response.impedance_ohm[1] + 0.05 * response.impedance_ohm[2]
@@ -230,7 +200,7 @@ def test_losses_emit_at_the_antennas_temperature(tmp_path):
             images["Rloss"] = np.tile(0.5 * np.eye(4), (3, 1, 1))
             images["ZA"] = images["ZA"] + images["Rloss"]
 
-    response = read_beam(write(tmp_path / "response.fits", change=lossy))
+    response = read_beam(write_response(tmp_path / "response.fits", lossy))
     m = response.circuit(20.0).loading
     expected = 4 * Boltzmann * 300.0 * 0.5 * m @ m.conj().T
     got = volts(response, 20.0, replace(response, antenna_k=300.0).background(20.0)[:, None])
@@ -251,14 +221,14 @@ def test_files_that_cannot_be_used(tmp_path, name, change, message):
         if name in images:
             images[name] = change(images[name])
 
-    refuse(message, read_beam, write(tmp_path / "response.fits", change=changed))
+    refuse(message, read_beam, write_response(tmp_path / "response.fits", changed))
 
 
 # --- in scenarios -------------------------------------------------------------------------------
 
 
 def test_a_scenario_with_a_response_and_a_warm_moon(tmp_path):
-    path = write(tmp_path / "response.fits")
+    path = write_response(tmp_path / "response.fits")
     given = ["frequency_mhz=20", f"beam.file={path}", "beam.moon_temperature_k=5e4"]
     cold_scenario = small_scenario(*given[:-1], cycles=0.05)
     warm, cold = lb.build(small_scenario(*given, cycles=0.05)), lb.build(cold_scenario)

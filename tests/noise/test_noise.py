@@ -26,18 +26,8 @@ def temperatures(seed=0) -> np.ndarray:
     return 1e3 * x @ x.conj().swapaxes(1, 2)
 
 
-def real_products(v: np.ndarray) -> np.ndarray:
-    """00R, 01R, 01I, ... of (..., antennas, antennas), written out; shape (..., products)."""
-    rows = []
-    for i in range(N_ANTENNAS):
-        rows.append(v[..., i, i].real)
-        for j in range(i + 1, N_ANTENNAS):
-            rows += [v[..., i, j].real, v[..., i, j].imag]
-    return np.stack(rows, axis=-1)
-
-
 T = temperatures()
-VISIBILITIES = jnp.asarray(real_products(T).T)
+VISIBILITIES = to_real(jnp.asarray(np.moveaxis(T, 0, 2)))
 LAYOUT = DataLayout(N_PRODUCTS, N_TIMES)
 AUTOS = [0, 7, 12, 15]
 
@@ -70,7 +60,7 @@ def test_exact_form_is_what_complex_gaussian_voltages_do():
     n = 200_000
     white = np.random.default_rng(5).normal(size=(2, n, N_ANTENNAS)) / np.sqrt(2)
     s = (white[0] + 1j * white[1]) @ np.linalg.cholesky(T[0]).T
-    delta = real_products(s[:, :, None] * s[:, None, :].conj()) - real_products(T[0])
+    delta = (to_real(s.T[:, None] * s.T[None].conj()) - to_real(T[0])[:, None]).T
     # mean of the products: T itself (this pins <s_i conj(s_j)> and the products' order)
     z = delta.mean(0) / (delta.std(0) / np.sqrt(n))
     assert np.abs(z).max() < z_of(N_PRODUCTS)
@@ -99,7 +89,7 @@ def test_products_of_no_voltages_are_independent():
     t = T.copy()
     t[1, 0, 1] = 1.1 * np.sqrt(t[1, 0, 0] * t[1, 1, 1])
     t[2, :3, 3], t[2, 3, 3] = t[2, :3, 0], t[2, 0, 0]
-    seen = real_products(t).T
+    seen = to_real(np.moveaxis(t, 0, 2))
     blocks = np.asarray(exact_blocks(seen))
     np.testing.assert_array_equal(blocks[0], np.asarray(exact_blocks(VISIBILITIES))[0])
     for time in (1, 2):

@@ -131,7 +131,7 @@ def test_ground_at_zero_kelvin_has_a_template_all_the_same(response_file):
     np.testing.assert_allclose(full_model(cold).noise.dense(), bare + root @ root.T, rtol=1e-6)
 
 
-def test_receivers_sampled_have_the_density_of_the_closed_form(response_file):
+def test_receivers_sampled_have_the_density_of_the_closed_form(warm, response_file):
     """Priors by scipy, and the evidence of the sky alone given the five."""
     e = lb.build(four_ports(response_file, RECEIVER % "sampled", GROUND % "sampled"))
     setup, z = e.setup, np.array([0.3, -0.2, 0.1, 0.5, -1.2])
@@ -144,6 +144,9 @@ def test_receivers_sampled_have_the_density_of_the_closed_form(response_file):
     expected += norm.logpdf(z).sum() - 4 * np.log(200.0) - np.log(30.0)
     # chi^2 of 1e7, each of whose squares is right to 1e-10 of itself
     assert density_of(e, values) == pytest.approx(expected, rel=1e-8)
+    # in the model of first order they are in N all the same
+    noise, marginalised = (full_model(one).noise.dense() for one in (setup, warm.setup))
+    np.testing.assert_array_equal(noise, marginalised)
 
 
 def test_what_antennas_without_volts_or_ground_cannot_have():
