@@ -225,6 +225,8 @@ class LocalScales(PriorFamily):
             weight = band.window**2 * (2.0 * np.arange(len(band.window)) + 1.0)
             spectrum = (weight / weight.sum()) @ self.spectrum.matrix @ ells
             rows = spectrum[None] + band.covariates @ covariates
+            if self.white:  # the data only have an upper limit of the level, which is fitted later
+                rows[:, 0] = 0.0
             strengths.append(strength * np.exp(0.5 * spread(rows)))
         fluxes = float(np.exp(member.fluxes[0] + 0.5 * spread(flux)[0]))
         return _covariance(self, fluxes, _texture(self, member.spectrum, strengths))

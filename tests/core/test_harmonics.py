@@ -138,6 +138,16 @@ def test_a_turned_field_is_the_field_at_the_turned_back_direction(seed):
     within(field(h.Rotation.from_matrix(g, TURNED)(a), n), field(a, g.T @ n), 1e-11)
 
 
+def test_agreement_with_healpy():
+    psi, theta, phi = 0.3, 1.1, -2.0
+    a = random_modes(6)
+    alm = to_healpy(a)
+    healpy.rotate_alm(alm, psi, theta, phi)  # about z by psi, y by theta, z by phi
+    g = SpatialRotation.from_euler("ZYZ", [phi, theta, psi]).as_matrix()
+    # healpy's recursion is good to about 1e-12
+    within(h.Rotation.from_matrix(g, TURNED)(a), from_healpy(alm), 1e-11)
+
+
 def test_inverse_identity_and_leading_axes():
     d = h.Rotation.from_matrix(random_rotation(7), TURNED)
     a = random_modes(7, 2, 3)

@@ -1,7 +1,5 @@
 """A against integrals over the sky, rows and rotations; and A of antennas that vary."""
 
-from types import SimpleNamespace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +16,8 @@ from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith
 from lusee_bayes.instrument.coupling import CouplingMatrix, DenseCoupling, Instrument
 from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout, auto_indices, labels
-from lusee_bayes.systematics.beam import BeamError, BeamErrors, BeamErrorSection
+from lusee_bayes.systematics.beam import BeamError, InstrumentParameters
+from lusee_bayes.systematics.systematic import Unknown
 from lusee_bayes.testing.contracts import check_coupling
 
 LMAX = 8
@@ -192,8 +191,10 @@ def base(instrument):
 
 def test_sites_of_the_antennas_parameters(instrument, base):
     """Priors cut off at the ends of the domain; A is that of the values."""
-    section = BeamErrorSection(parameters=STDS)
-    systematic = BeamErrors.build(section, SimpleNamespace(instrument=instrument), None)
+    known = {name: instrument.source.parameter(name) for name in STDS}
+    bounds = {k: {"low": float(p.low), "high": float(p.high)} for k, p in known.items()}
+    priors = (Unknown(k, float(p.value), STDS[k], **bounds[k]) for k, p in known.items())
+    systematic = InstrumentParameters(instrument, tuple(priors))
     values = {"surface_permittivity": 3.2, "zenith_angle_deg": 76.0, "turntable_offset_deg": -0.4}
     arrays = {name: jnp.asarray(value) for name, value in values.items()}
     with (

@@ -5,7 +5,8 @@ import erfa
 import numpy as np
 import pytest
 from assertions import refuse, within
-from astropy.coordinates import ICRS, CartesianRepresentation, get_body_barycentric
+from astropy import coordinates
+from astropy.coordinates import ICRS, CartesianRepresentation, SkyCoord, get_body_barycentric
 from astropy.time import Time
 from lunarsky import MCMF, LunarTopo, MoonLocation
 from reference import galactic_directions, vectors
@@ -180,6 +181,16 @@ def test_directions_agree_with_erfa_and_lunartopo(body, planet):
         expected = by_erfa_and_lunartopo(planet, observation.times[k], **site)
         # the same series by another way: rounding of rotations, and 1e-4 s of light time
         assert angle(got[k], expected) < 1e-3 * ARCSECOND
+
+
+def test_jupiter_is_where_the_almanac_had_it():
+    # opposition of 10 January 2026, in Gemini near Pollux: RA 7h 23m, Dec 22
+    observation = dates("2026-01-10T00:00:00")
+    gal = body_direction("Jupiter", observation)
+    there = SkyCoord(coordinates.Galactic(CartesianRepresentation(gal[0]))).icrs
+    assert there.ra.deg == pytest.approx(110.8, abs=1.0)
+    assert there.dec.deg == pytest.approx(22.0, abs=0.5)
+    assert angle(gal, -body_direction("Sun", observation))[0] < np.radians(1.5)
 
 
 def test_unknown_bodies_are_refused():
