@@ -117,8 +117,10 @@ def checked_cholesky(name: str, matrix: Matrices) -> Matrices:
     """
     lower = cholesky(matrix)
     if not is_traced(lower) and not np.isfinite(np.asarray(lower)).all():
-        lowest = float(np.linalg.eigvalsh(np.asarray(matrix)).min())
         largest = float(np.abs(np.asarray(matrix)).max())
+        if not np.isfinite(largest):
+            raise InputError(f"{name} contains NaN or infinity: its terms are too large")
+        lowest = float(np.linalg.eigvalsh(np.asarray(matrix)).min())
         raise InputError(
             f"{name} is not positive definite: its lowest eigenvalue is {lowest:.3g} "
             f"(largest entry {largest:.3g}); check the term's amplitude and symmetry"

@@ -142,6 +142,11 @@ class SurveySection(Section):
                 mask = SkyMap.read(require_file(self.mask_file, "mask", "check prior.surveys"))
                 require_shape(f"{self.mask_file}: the mask", mask.pixels, unseen.shape)
                 unseen = unseen | (mask.pixels == 0.0)
+            if unseen.all() or not sky.pixels[~unseen].mean() > 0.0:
+                raise InputError(
+                    f"{self.file}: the mean of its pixels must be positive, and not all of them "
+                    "masked or UNSEEN"
+                )
             template = galaxy_sky(frequency_mhz, lmax, seed=None, sources=()).modes
             filled = modes_to_map(template, healpy.npix2nside(unseen.size))
             filled *= sky.pixels[~unseen].mean() / filled[~unseen].mean()

@@ -148,13 +148,15 @@ def test_several_surveys_share_scale_and_zero_level():
     [
         ("file: nothere.fits", "nothere.fits.*check prior.surveys"),
         ("file: {map}, mask_file: {small}", "the mask has shape"),
+        ("file: {map}, mask_file: {dark}", "not all of them masked"),
+        ("file: {dark}", "must be positive"),
         ("file: {alm}, mask_file: {small}", "has no pixels for prior.surveys.mask_file"),
     ],
 )
 def test_surveys_that_cannot_be_used_are_refused(tmp_path, entry, words):
-    names = {name: tmp_path / f"{name}.fits" for name in ("map", "small", "alm")}
-    for name, nside in (("map", NSIDE), ("small", 8)):
-        healpy.write_map(names[name], np.ones(12 * nside**2), dtype=np.float64)
+    names = {name: tmp_path / f"{name}.fits" for name in ("map", "small", "dark", "alm")}
+    for name, nside, value in (("map", NSIDE, 1.0), ("small", 8, 1.0), ("dark", NSIDE, 0.0)):
+        healpy.write_map(names[name], np.full(12 * nside**2, value), dtype=np.float64)
     write_alms(names["alm"], lb.galaxy_sky(25.0, 8).modes, {})
     survey = f"{{{entry.format(**names)}, frequency_mhz: 45.0}}"
     given = f"prior={{model: local_scales, surveys: [{survey}]}}"
