@@ -14,7 +14,7 @@ import numpy as np
 
 from lusee_bayes.core.arrays import DataVector, Grid, Modes, Vector
 from lusee_bayes.core.errors import InputError, require_known
-from lusee_bayes.core.harmonics import n_modes
+from lusee_bayes.core.harmonics import lmax_of, n_modes
 from lusee_bayes.core.section import is_modelled
 from lusee_bayes.experiment import sky_sections
 from lusee_bayes.experiment.model import model_about, moved, with_sky_above
@@ -549,7 +549,7 @@ def with_learned_prior(
         Under that prior, with how it was learned.
     """
 
-    first = None
+    first, surveys = None, setup.scenario.prior.surveys
 
     def whole(information: Information) -> Information:
         return information if earlier is None else information + earlier
@@ -560,14 +560,21 @@ def with_learned_prior(
     if AboveLmax.treatment(setup.scenario) == "marginalised":
         # the expected sky above lmax follows from the prior learned below
         result = settled(setup, data, start, report=report)
-        coarse, learned = first_learned(setup, whole(result.solution.information))
+        # a survey's resolution ends somewhere: what is above it is as strong as without surveys
+        plain = _with_surveys(setup, ()) if surveys else setup
+        coarse, learned = first_learned(plain, whole(result.solution.information))
         start = result.around
         if learned.settled:
-            first = setup.family.start_from(coarse, learned.parameters)
-            above = averaged_beyond(setup.above.family, coarse, learned.scores)
-            setup = with_sky_above(setup, above)
+            family = setup.above.family
+            if surveys:
+                top = setup.scenario.noise.above_lmax.top(setup.scenario.lmax)
+                as_strong = plain.scenario.prior.family(setup.frequency_mhz, top)
+                family = replace(as_strong, mean=family.mean, wide=family.wide)
+            else:
+                first = setup.family.start_from(coarse, learned.parameters)
+            setup = with_sky_above(setup, averaged_beyond(family, coarse, learned.scores))
     result = settled(setup, data, start, learn, report)
-    if setup.scenario.prior.surveys:
+    if surveys:
         rows, gains = _compared_surveys(setup, whole(result.solution.information))
         learned = replace(result.learned, survey_rows=rows, survey_gains=gains)
         result = replace(result, learned=learned)
@@ -578,35 +585,43 @@ def _compared_surveys(
     setup: Setup, information: Information
 ) -> tuple[tuple[Row, ...], dict[str, float]]:
     """Scale and zero level of every survey, and how much it alone increases ln p(d)."""
-    scenario = setup.scenario
-    section, at = scenario.prior, (scenario.frequency_mhz, scenario.lmax)
+    n = information.n_modes
 
-    def learned(surveys: Sequence[sky_sections.SurveySection]) -> tuple[PriorFamily, Learned]:
-        family = section.model_copy(update={"surveys": tuple(surveys)}).family(*at)
-        return family, learned_prior(replace(setup, family=family), information)
+    def learned(*surveys: sky_sections.SurveySection) -> tuple[PriorFamily, Learned]:
+        changed = _with_surveys(setup, surveys)
+        return changed.family, learned_prior(changed, information)
 
-    _, alone = learned(())
+    _, alone = learned()
     fitting = information.raised(alone.noise_factor)
     others = fitting.posterior(alone.prior)
     rows, gains = [], {}
-    for one in section.surveys:
-        family, known = learned((one,))
+    for one in setup.scenario.prior.surveys:
+        family, known = learned(one)
         start = known.parameters if known.settled else family.hyperprior.start()
-        survey = one.at(*at)
-        errors = family.at(start).texture + family.white * np.eye(information.n_modes)
+        survey = one.at(setup.frequency_mhz, lmax_of(n))
+        errors = family.at(start).texture + family.white * np.eye(n)
         rows += survey.calibrated(others.mean, others.covariance(), errors)
         gained = fitting.posterior(known.prior).log_evidence - others.log_evidence
         gains[survey.name] = float(gained)
     return tuple(rows), gains
 
 
+def _with_surveys(setup: Setup, surveys: Sequence[sky_sections.SurveySection]) -> Setup:
+    """Change the surveys of a setup's prior, before anything is learned."""
+    prior = setup.scenario.prior.model_copy(update={"surveys": tuple(surveys)})
+    family = prior.family(setup.frequency_mhz, setup.scenario.lmax)
+    scenario = setup.scenario.model_copy(update={"prior": prior})
+    return replace(setup, scenario=scenario, family=family, prior=family.expected())
+
+
 def first_learned(setup: Setup, information: Information) -> tuple[PriorFamily, Learned]:
     """Learn the parameters of the setup's family up to a lower ell; also return that family."""
-    scenario, family = setup.scenario, setup.family
+    scenario, prior, family = setup.scenario, setup.prior, setup.family
     if scenario.lmax > COARSE_LMAX:
         family = scenario.prior.family(scenario.frequency_mhz, COARSE_LMAX)
         n = n_modes(COARSE_LMAX)
-        information = integrated_out(information, n, np.asarray(setup.prior.variance())[n:])
+        mean = None if prior.mean is None else np.asarray(prior.mean)[n:]
+        information = integrated_out(information, n, np.asarray(prior.variance())[n:], mean)
     return family, learn_whatever_fits(family, information, None, scenario.seed)
 
 

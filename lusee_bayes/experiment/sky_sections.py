@@ -89,6 +89,11 @@ class FileSkySection(Section, SkySource):
         return sky_from_file(self.file, frequency_mhz, lmax, **given)
 
 
+# a survey fades out over its beam, or this width in degrees, beside pixels without data; it is
+# compared with the map where its weight is larger than SEEN
+EDGE_DEG, SEEN = 5.0, 0.99
+
+
 class SurveySection(Section):
     """A survey of the sky, s = a (beam * sky) + b + errors, with unknown a and b.
 
@@ -136,6 +141,9 @@ class SurveySection(Section):
         sky, unseen = read_sky_file(file, self.dataset), None
         if self.mask_file is not None and not isinstance(sky, SkyMap):
             raise InputError(f"{self.file} has no pixels for prior.surveys.mask_file")
+        ell = np.arange(lmax + 1.0)
+        sigma = np.radians(self.beam_deg) / np.sqrt(8.0 * np.log(2.0))
+        beam = per_mode(np.exp(-0.5 * ell * (ell + 1.0) * sigma**2))
         if isinstance(sky, SkyMap):
             unseen = sky.unseen
             if self.mask_file is not None:
@@ -147,18 +155,21 @@ class SurveySection(Section):
                     f"{self.file}: the mean of its pixels must be positive, and not all of them "
                     "masked or UNSEEN"
                 )
+        if unseen is not None and unseen.any():
             template = galaxy_sky(frequency_mhz, lmax, seed=None, sources=()).modes
-            filled = modes_to_map(template, healpy.npix2nside(unseen.size))
+            filled = modes_to_map(beam * template, healpy.npix2nside(unseen.size))
             filled *= sky.pixels[~unseen].mean() / filled[~unseen].mean()
-            sky = replace(sky, pixels=np.where(unseen, filled, sky.pixels))
+            # a sharp edge would be amplified where the beam is taken off
+            near = healpy.smoothing(unseen.astype(float), np.radians(max(self.beam_deg, EDGE_DEG)))
+            weight = np.where(unseen, 0.0, np.clip(1.0 - 2.0 * near, 0.0, 1.0) ** 2)
+            pixels = filled + weight * (sky.pixels - filled)
+            sky, unseen = replace(sky, pixels=pixels), weight < SEEN
+        else:
+            unseen = None
         factor = (frequency_mhz / self.frequency_mhz) ** self.index
         modes = factor * sky.modes_at(self.frequency_mhz, lmax)
-        ell = np.arange(lmax + 1.0)
-        sigma = np.radians(self.beam_deg) / np.sqrt(8.0 * np.log(2.0))
-        beam = per_mode(np.exp(-0.5 * ell * (ell + 1.0) * sigma**2))
         widths = self.scale_std, factor * self.zero_std_k
-        blind = unseen if unseen is not None and unseen.any() else None
-        return Survey(Path(self.file).name, modes, beam, *widths, blind)
+        return Survey(Path(self.file).name, modes, beam, *widths, unseen)
 
 
 SKY_SECTIONS = kinds_of(GalaxySection, FileSkySection)

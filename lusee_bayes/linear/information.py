@@ -313,10 +313,12 @@ def precision_root(matrix: ModesMatrix, prior: Prior) -> ModesMatrix:
     return cholesky(precision, overwrite=True)
 
 
-def integrated_out(information: Information, n: int, variance: Modes) -> Information:
+def integrated_out(
+    information: Information, n: int, variance: Modes, mean: Modes | None = None
+) -> Information:
     """Compute the information about the first unknowns, with the others integrated out.
 
-    With b ~ N(0, D) for the others, and K = M_bb + D^-1, ::
+    With b ~ N(mean, D) for the others, K = M_bb + D^-1, and v about that mean, ::
 
         M' = M_aa - M_ab K^-1 M_ba,    v' = v_a - M_ab K^-1 v_b
 
@@ -328,6 +330,8 @@ def integrated_out(information: Information, n: int, variance: Modes) -> Informa
         Number of unknowns that are kept.
     variance : (others,) array
         D of the others, in K^2, positive.
+    mean : (others,) array, optional
+        In K; by default zero.
 
     Returns
     -------
@@ -341,7 +345,8 @@ def integrated_out(information: Information, n: int, variance: Modes) -> Informa
     """
     others = information.n_modes - n
     require_shape("the variance", variance, (others,))
-    local = information.recentred(np.concatenate([information.reference[:n], np.zeros(others)]))
+    mean = np.zeros(others) if mean is None else mean
+    local = information.recentred(np.concatenate([information.reference[:n], mean]))
     scale = np.sqrt(variance)
     lower = cholesky(scaled(local.matrix[n:, n:], scale) + np.eye(others))
     across = solve_lower(lower, scale[:, None] * local.matrix[n:, :n], transpose=False)

@@ -13,6 +13,7 @@ from scipy.linalg import block_diag
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import map_to_modes, modes_to_map, n_modes, turn_about_z
 from lusee_bayes.experiment.experiment import doubts
+from lusee_bayes.experiment.sky_sections import SurveySection
 from lusee_bayes.priors.local_scales import embedded_local_scales
 from lusee_bayes.priors.surveys import Survey
 from lusee_bayes.sky.sky_source import write_alms
@@ -23,14 +24,17 @@ ABOVE = f"noise.above_lmax={{least_lmax: {TOP}}}"
 SCALE, ZERO, BEAM = 0.9, -0.1, 5.0
 
 
+def declinations(nside):
+    place = healpy.pix2ang(nside, np.arange(12 * nside**2), lonlat=True)
+    return healpy.Rotator(coord=["G", "C"])(*place, lonlat=True)[1]
+
+
 def survey_of(sky, path, unseen=False):
     """A map of a sky with another scale, zero level and resolution, without the southern cap."""
     pixels = modes_to_map(sky.modes, NSIDE)
     pixels = healpy.smoothing(SCALE * pixels, np.radians(BEAM)) + ZERO * pixels.mean()
     if unseen:
-        place = healpy.pix2ang(NSIDE, np.arange(pixels.size), lonlat=True)
-        declination = healpy.Rotator(coord=["G", "C"])(*place, lonlat=True)[1]
-        pixels[declination < -40.0] = healpy.UNSEEN
+        pixels[declinations(NSIDE) < -40.0] = healpy.UNSEEN
     healpy.write_map(path, pixels, dtype=np.float64, column_units="K", overwrite=True)
     return f"{{file: {path}, frequency_mhz: 25.0, beam_deg: {BEAM}, zero_std_k: 5000.0}}"
 
@@ -124,6 +128,18 @@ def test_scale_and_zero_level_are_those_of_one_normal_equation():
     for row, value, scattered in zip(rows, *expected, strict=True):
         assert row["value"] == pytest.approx(value, rel=1e-9)
         assert row["std"] == pytest.approx(1e4 * scattered.std(), rel=0.01)
+
+
+def test_the_edge_of_a_survey_stays_at_its_edge(tmp_path):
+    """Where the beam is taken off, a sharp edge would ring over the whole sky (620 K here)."""
+    sky = lb.galaxy_sky(25.0, 47, seed=2, sources=())
+    pixels = healpy.smoothing(modes_to_map(sky.modes, 32), np.radians(BEAM))
+    pixels[declinations(32) < -40.0] = healpy.UNSEEN
+    healpy.write_map(tmp_path / "s.fits", pixels, dtype=np.float64, column_units="K")
+    section = SurveySection(file=str(tmp_path / "s.fits"), frequency_mhz=25.0, beam_deg=BEAM)
+    sharp = section.at(25.0, 47).sharpened(lb.galaxy_sky(25.0, 47, seed=None, sources=()).modes)
+    off = modes_to_map(sharp - sky.modes, 32)[declinations(32) > -10.0]
+    assert off.std() < 100.0
 
 
 def test_several_surveys_share_scale_and_zero_level():
