@@ -152,7 +152,8 @@ def at_truth(setup: Setup) -> Setup:
     background = np.array(setup.beam_source.background(20.0))
     background += (truth["regolith_k"] - 250.0) * ground_per_kelvin(setup.beam_source, 20.0)
     background[auto_indices()] += [truth[f"receiver_{port}_k"] for port in range(4)]
-    return replace(setup, scenario=scenario, background=background)
+    at_all_times = np.tile(background[:, None], setup.layout.n_times)
+    return replace(setup, scenario=scenario, background=at_all_times)
 
 
 @pytest.mark.long
