@@ -499,16 +499,20 @@ def spectrum_command(
     region: str = "observed sky",
     signal: Annotated[tuple[str, ...], Repeated] = (),
     order: int = 6,
+    figure: Path | None = None,
+    table: Annotated[tuple[Path, ...], Repeated] = (),
 ) -> None:
     """Print the spectrum of the sky of a finished map of several channels.
 
     --signal also limits a global signal: a template beside a smooth spectrum, with sky and
-    instrument marginalised.
+    instrument marginalised. --figure draws the spectrum beside published ones and those of given
+    tables.
 
     **Examples**
 
     - ``lusee-bayes spectrum output/cube``
     - ``lusee-bayes spectrum output/cube --signal trough:17.5:3 --signal excess``
+    - ``lusee-bayes spectrum output/cube --figure spectrum.png --table measured.csv``
 
     Parameters
     ----------
@@ -521,11 +525,18 @@ def spectrum_command(
         frequency_mhz and temperature_k; may be repeated.
     order
         Degree of the smooth spectrum, a polynomial of ln T in ln f.
+    figure
+        PNG file to write.
+    table
+        CSV file with frequency_mhz, temperature_k and, if known, std_k, to draw in it; may be
+        repeated.
     """
     from lusee_bayes.cli.tables import table_of_numbers
     from lusee_bayes.results.finished_runs import FinishedRun
     from lusee_bayes.results.signal_limit import named_template, signal_limit
 
+    if table and figure is None:
+        raise InputError("--table draws a spectrum into a figure; give --figure FILE.png, too")
     spectrum = FinishedRun.read(run).sky_spectrum()
     templates = [named_template(one) for one in signal]
     rows = spectrum.rows(region)
@@ -534,6 +545,15 @@ def spectrum_command(
     console.print(table_of_numbers(*rows))
     for limit in limits:
         say(console, limit.sentence())
+    if figure is not None:
+        from lusee_bayes.core.files import replacing
+        from lusee_bayes.report.figures.drawing import save
+        from lusee_bayes.report.figures.maps import spectrum_figure
+
+        drawn = spectrum_figure(spectrum, table)
+        with replacing(figure) as path:
+            save(drawn, path, 150)
+        say(console, f"spectrum -> {figure}")
 
 
 @app.command(name="export", group="Results")

@@ -32,6 +32,7 @@ from scipy.constants import Boltzmann, speed_of_light
 from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.harmonics import averaging_rows, lmax_of, per_mode, pixel_matrix, taper
+from lusee_bayes.core.layouts import Layout, Variable
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.trees import quantity
 from lusee_bayes.experiment.unknowns import ALL_TOGETHER
@@ -424,3 +425,12 @@ PUBLISHED: dict[str, tuple[Callable, tuple[float, float]]] = {
     "poles: Cane 1979": (cane_1979, (0.25, 100.0)),
     "RAE 2: Novaco and Brown 1978": (novaco_brown_1978, (0.25, 9.2)),
 }
+# the table of a spectrum that others measured
+MEASURED = Layout(
+    "a spectrum",
+    {
+        "frequency_mhz": Variable(("frequency",), low=0.0),
+        "temperature_k": Variable(("frequency",)),
+        "std_k": Variable(("frequency",), low=0.0, optional=True),
+    },
+)

@@ -11,6 +11,7 @@ from commands import run
 
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import averaging_rows, modes_to_map, per_mode, taper
+from lusee_bayes.report.figures.maps import spectrum_figure
 from lusee_bayes.results.signal_limit import named_template, signal_limit
 from lusee_bayes.results.sky_spectrum import (
     Departure,
@@ -93,6 +94,16 @@ def test_files_have_the_spectrum_with_its_covariance(joint, tmp_path, capsys):
     assert run("spectrum", tmp_path / "cube", "--signal", "trough:24:2", "--order", "1") == 0
     printed = capsys.readouterr().out
     assert "most of the variance from" in printed and "trough at 24 MHz" in printed
+    (tmp_path / "rae.csv").write_text("frequency_mhz,temperature_k\n19,8e4\n22,5e4\n")
+    shown = ["--figure", tmp_path / "spectrum.png", "--table", tmp_path / "rae.csv"]
+    assert run("spectrum", tmp_path / "cube", *shown[2:]) == 2
+    assert "give --figure" in capsys.readouterr().err
+    assert run("spectrum", tmp_path / "cube", *shown) == 0
+    assert (tmp_path / "spectrum.png").read_bytes().startswith(b"\x89PNG")
+    axes = spectrum_figure(spectrum, [tmp_path / "rae.csv"]).axes[0]
+    drawn = {one.get_label(): one.lines[0].get_xydata() for one in axes.containers}
+    within(drawn["rae"], [[19.0, 8e4], [22.0, 5e4]], 1e-12)
+    within(drawn["mean sky"][:, 1] / spectrum.temperature[0], 1.0, 1e-12)
     page = (tmp_path / "cube" / "report.html").read_text(encoding="utf-8")
     assert "cap b &lt; -60" in page and "Novaco" not in page
     assert (tmp_path / "cube" / "index.fits").exists() == bool(joint)

@@ -60,7 +60,8 @@ def save(figure: Figure, path: Path, dpi: int) -> None:
         text.set_text(printable(text.get_text()))
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    imsave(path, canvas.buffer_rgba(), dpi=dpi, pil_kwargs={"compress_level": COMPRESSION})
+    options = {"format": "png", "dpi": dpi, "pil_kwargs": {"compress_level": COMPRESSION}}
+    imsave(path, canvas.buffer_rgba(), **options)
 
 
 def named_parts(name: str, drawn: Figure | dict[str, Figure] | None) -> dict[str, Figure]:

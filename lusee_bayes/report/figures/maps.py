@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
+from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,6 +14,7 @@ from matplotlib.ticker import LogLocator, NullLocator
 
 from lusee_bayes.core.arrays import Modes
 from lusee_bayes.core.harmonics import lmax_of, modes_to_map, taper_fwhm_deg
+from lusee_bayes.core.reading import read_table
 from lusee_bayes.experiment.unknowns import ALL_TOGETHER
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
 from lusee_bayes.judge.measures import ell_cross
@@ -21,7 +24,7 @@ from lusee_bayes.report.figures.drawing import BLUE, COLOURS, DIVERGING, GREY, L
 from lusee_bayes.results.channel import ChannelResult
 from lusee_bayes.results.finished_runs import FinishedRun
 from lusee_bayes.results.map_result import MapResult
-from lusee_bayes.results.sky_spectrum import PUBLISHED
+from lusee_bayes.results.sky_spectrum import MEASURED, PUBLISHED, Frequencies, SkySpectrum
 
 # figures shown side by side, or below each other on a phone, by their titles
 Panels = dict[str, Figure]
@@ -292,10 +295,20 @@ def channel_spectra(cube: MapResult) -> Panels:
     return figures
 
 
-def sky_spectrum(cube: MapResult) -> Panels | None:
-    """Temperature of each region with error bars, and errors of the mean sky by source."""
-    if cube.single or (spectrum := cube.sky_spectrum()) is None:
-        return None
+def spectrum_figure(spectrum: SkySpectrum, tables: Sequence[Path] = ()) -> Figure:
+    """Draw the temperature of each region with error bars, beside published and given spectra.
+
+    Parameters
+    ----------
+    spectrum : SkySpectrum
+    tables : sequence of Path
+        CSV files with ``frequency_mhz``, ``temperature_k`` and, if known, ``std_k``.
+
+    Raises
+    ------
+    InputError
+        If a table cannot be read.
+    """
     f = spectrum.frequency
     grid = np.geomspace(f.min(), f.max(), 200)
     figure, axes = drawing.framed((5.6, 4.6))
@@ -308,8 +321,20 @@ def sky_spectrum(cube: MapResult) -> Panels | None:
     for (name, (law, measured)), line in zip(PUBLISHED.items(), ("-", "--"), strict=True):
         if (inside := (grid >= measured[0]) & (grid <= measured[1])).any():
             axes.plot(grid[inside], law(grid[inside]), color=GREY, ls=line, lw=1, label=name)
+    for path, marker in zip(tables, cycle("sD^v")):
+        table = read_table(path, MEASURED)
+        values = table["frequency_mhz"], table["temperature_k"], table.get("std_k")
+        axes.errorbar(*values, color="black", fmt=marker, mfc="none", ms=5, lw=1, label=path.stem)
     axes.set(ylabel="brightness temperature [K]", yscale="log")
-    axes.legend(frameon=False, fontsize="small")
+    _over_frequencies(axes, f)
+    return figure
+
+
+def sky_spectrum(cube: MapResult) -> Panels | None:
+    """Temperature of each region with error bars, and errors of the mean sky by source."""
+    if cube.single or (spectrum := cube.sky_spectrum()) is None:
+        return None
+    f = spectrum.frequency
     errors, lower = drawing.framed((5.6, 4.6))
     mean = 100.0 * spectrum.std[0] / spectrum.temperature[0]
     lower.plot(f, mean, color="black", label=f"standard deviation, {spectrum.regions[0]}")
@@ -320,11 +345,14 @@ def sky_spectrum(cube: MapResult) -> Panels | None:
         off = spectrum.temperature[0] - spectrum.truth[0]
         lower.plot(f, 100.0 * np.abs(off) / spectrum.temperature[0], "k:", label="|mean - truth|")
     lower.set(ylabel="% of the temperature", yscale="log", ylim=(mean.min() / 50.0, None))
-    lower.legend(frameon=False, fontsize="small")
-    for one in (axes, lower):
-        one.set(xlabel="frequency [MHz]", xscale="log", xlim=(0.93 * f.min(), 1.07 * f.max()))
-        _frequency_ticks(one)
-    return {"temperature": figure, "errors": errors}
+    _over_frequencies(lower, f)
+    return {"temperature": spectrum_figure(spectrum), "errors": errors}
+
+
+def _over_frequencies(axes: Axes, f: Frequencies) -> None:
+    axes.legend(frameon=False, fontsize="small")
+    axes.set(xlabel="frequency [MHz]", xscale="log", xlim=(0.93 * f.min(), 1.07 * f.max()))
+    _frequency_ticks(axes)
 
 
 def spectral_index(cube: MapResult) -> Panels | None:
