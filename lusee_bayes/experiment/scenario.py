@@ -61,7 +61,7 @@ def _place(node: dict[str, Any] | list[Any], key: str, override: str) -> int | s
 
 
 def one_sentence(error: ValidationError, source: str, model: type[BaseModel]) -> str:
-    """Describe the first mistake: the entry, its value and the expected one.
+    """Describe an unknown key, or else the first mistake: entry, value and the expected one.
 
     Parameters
     ----------
@@ -72,7 +72,8 @@ def one_sentence(error: ValidationError, source: str, model: type[BaseModel]) ->
     model : type
         The model that validated it.
     """
-    first = error.errors()[0]
+    # a misspelt key is also missing
+    first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
     path, sections = _resolved(first["loc"], model)
     where = ".".join(path)
     if first["type"] == "extra_forbidden":
