@@ -24,7 +24,7 @@ from pydantic import Field
 
 from lusee_bayes.core.arrays import DataVector, ModesMatrix
 from lusee_bayes.core.harmonics import LARGEST_LMAX
-from lusee_bayes.core.linalg import checked_cholesky, gram_matrix
+from lusee_bayes.core.linalg import checked_cholesky, times_lower
 from lusee_bayes.core.section import Section, Treatment
 from lusee_bayes.instrument.coupling import CouplingMatrix
 from lusee_bayes.instrument.pointing import Pointing
@@ -34,6 +34,8 @@ from lusee_bayes.systematics.systematic import LowRankNoise, with_added
 
 # largest change of chi^2 by all omitted directions together
 LEFT_OUT = 1.0
+# number of directions in a block
+BLOCK = 256
 
 
 class AboveLmaxSection(Section):
@@ -124,14 +126,37 @@ def sky_above(setup: Setup, noise: Factor, learned: ModesMatrix | None = None) -
         covariance, mean = learned, family.mean
         if learned is None:
             covariance = family.at(family.hyperprior.start()).covariance
+    white = np.array(noise.whiten(coupling))
     covariance = np.asarray(covariance)[n:, n:]
-    power = (np.asarray(noise.whiten(coupling)) ** 2).sum(0) * np.diagonal(covariance)
+    power = (white**2).sum(0) * np.diagonal(covariance)
     power = np.add.reduceat(power, np.arange(scenario.lmax + 1, lmax + 1) ** 2 - n)
-    root = coupling @ checked_cholesky("the prior above lmax", covariance)
-    values, vectors = np.linalg.eigh(gram_matrix(np.asarray(noise.whiten(root))))
-    root = root @ vectors[:, np.cumsum(values) > LEFT_OUT]
-    added = np.zeros(len(root)) if mean is None else coupling @ np.asarray(mean)[n:]
+    root = checked_cholesky("the prior above lmax", covariance)
+    white = times_lower(white, root, transpose=False)
+    root = coupling @ (root @ _main_directions(white))
+    added = np.zeros(len(coupling)) if mean is None else coupling @ np.asarray(mean)[n:]
     return Above(coupling, modes, family, root, added, power)
+
+
+def _main_directions(white: Float[np.ndarray, "data modes"]) -> Float[np.ndarray, "modes few"]:
+    """Orthonormal directions beyond which the squares of a matrix add up to less than LEFT_OUT.
+
+    They are found among its images of random vectors (Halko, Martinsson & Tropp 2011, SIAM Review
+    53, 217), block by block; what the blocks leave out is known exactly.
+    """
+    (rows, modes), total, rng = white.shape, float(np.vdot(white, white)), np.random.default_rng(0)
+    q, inside = np.zeros((rows, 0)), np.zeros((0, modes))
+    while total - np.vdot(inside, inside) >= LEFT_OUT and len(inside) < min(rows, modes):
+        images = white @ rng.standard_normal((modes, min(BLOCK, min(rows, modes) - len(inside))))
+        for _ in range(2):  # the second time for the largest directions beyond q
+            for _ in range(2):  # the second time against rounding
+                images = np.linalg.qr(images - q @ (q.T @ images))[0]
+            products = images.T @ white
+            block, images = images, white @ products.T
+        q, inside = np.hstack([q, block]), np.vstack([inside, products])
+    squares, vectors = np.linalg.eigh(inside @ inside.T)
+    n = np.searchsorted(np.append(0.0, np.cumsum(squares[::-1])), total - LEFT_OUT)
+    largest = slice(len(squares) - n, None)
+    return inside.T @ (vectors[:, largest] / np.sqrt(squares[largest]))
 
 
 def _coupling(setup: Setup, lmax: int) -> Float[np.ndarray, "data modes"]:
