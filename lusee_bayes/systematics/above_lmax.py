@@ -52,7 +52,7 @@ class AboveLmaxSection(Section):
     """
 
     margin: Annotated[int, Field(ge=1, le=64)] = 16
-    least_lmax: Annotated[int, Field(ge=0, le=LARGEST_LMAX)] = 47
+    least_lmax: Annotated[int, Field(ge=0, le=LARGEST_LMAX)] = 63
     treatment: Treatment = "marginalised"
 
     def top(self, lmax: int) -> int:
