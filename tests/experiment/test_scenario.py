@@ -65,7 +65,6 @@ REFUSED = [
     ("frequncy_mhz=3", "unknown key 'frequncy_mhz'; did you mean 'frequency_mhz'"),
     ("observation.runs.0.cycels=1", "observation.runs.0.cycels'; did you mean 'cycles'"),
     ("prior={surveys: [{file: x, freq_mhz: 1}]}", "surveys.0.freq_mhz'; .*'frequency_mhz'?"),
-    ("beam.model=dipole", "beam.model is 'dipole', which is unknown; .*monopole"),
     ("sky.model=galaxi", "sky.model is 'galaxi', which is unknown; did you mean 'galaxy'?"),
     ("spectral.fields=[levle]", "spectral.fields"),
     # values

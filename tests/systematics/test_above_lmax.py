@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 
 import lusee_bayes as lb
-from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.experiment.model import full_model, radiometer, set_up, simulate, true_signal
 from lusee_bayes.systematics import above_lmax
 from lusee_bayes.systematics.context import prior_and_family
 
-LMAX, MARGIN = 5, 4
-N = n_modes(LMAX)
+LMAX, MARGIN, N = 5, 4, 36
 RUNS = "observation={runs: [{cycles: 0.3}], step_s: 14400}"
 SHARED = RUNS, "noise.radiometer.temperature=model"
 
@@ -73,6 +71,15 @@ def test_beams_that_end_before_leave_a_map_and_a_doubt(monkeypatch):
     monkeypatch.undo()
     monkeypatch.setattr("lusee_bayes.experiment.experiment.MOST_ABOVE", 1e5)
     assert "too much memory" in lb.build(own, data).doubts[0]
+
+
+def test_main_directions_leave_out_as_little_as_singular_vectors():
+    white = np.random.default_rng(1).standard_normal((700, 600)) * np.geomspace(30.0, 1e-4, 600)
+    found = above_lmax._main_directions(white)
+    np.testing.assert_allclose(found.T @ found, np.eye(found.shape[1]), atol=1e-9)
+    left = np.vdot(white, white) - np.vdot(white @ found, white @ found)
+    beyond = np.cumsum(np.linalg.svd(white)[1][::-1] ** 2)
+    assert left < 1.0 and found.shape[1] <= (beyond > 1.0).sum() + 2
 
 
 PRIORS = ["isotropic", pytest.param("local_scales", marks=pytest.mark.essential)]
