@@ -552,7 +552,7 @@ def spectrum_command(
 
         drawn = spectrum_figure(spectrum, table)
         with replacing(figure) as path:
-            save(drawn, path, 150)
+            save([(path, drawn)], 150)
         say(console, f"spectrum -> {figure}")
 
 

@@ -6,6 +6,7 @@ input (one sentence on standard error); 130 interrupted; 143 terminated.
 
 from __future__ import annotations
 
+import atexit
 import gc
 import io
 import os
@@ -75,6 +76,19 @@ def main(arguments: list[str] | None = None) -> int:
     if sentence:
         say(Console(stderr=True, soft_wrap=True), f"lusee-bayes: {sentence}")
     return code
+
+
+def program() -> None:
+    """Run the command of this process, and end it with its exit code.
+
+    The process ends without freeing its memory object by object, which takes half a second after a
+    map. Handlers registered for the exit have run, and output is flushed.
+    """
+    code = main()
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    os._exit(code)
 
 
 def _outcome(arguments: list[str], came: list[int]) -> tuple[int, str]:

@@ -365,7 +365,7 @@ class LeftOut:
             lower = np.zeros((len(across),) * 2)
             lower[:n, :n] = np.linalg.cholesky(across[:n])
             lower[n:, :n] = linalg.solve_lower(lower[:n, :n], across[n:].T, transpose=False).T
-            lower[n:, n:] = np.tril(posterior.lower)
+            lower[n:, n:] = linalg.lower_triangle(posterior.lower)
         if not np.isfinite(np.diagonal(lower)).all():
             raise InputError(
                 "the data are too precise to compare a part of them with its prediction from the "

@@ -8,7 +8,7 @@ import numpy as np
 
 from lusee_bayes.core.arrays import ModesMatrix, Square
 from lusee_bayes.core.errors import InputError
-from lusee_bayes.core.linalg import cholesky, solve_lower, times_lower
+from lusee_bayes.core.linalg import cholesky, lower_triangle, solve_lower, times_lower
 from lusee_bayes.judge.chi2 import ChiSquare
 from lusee_bayes.judge.measures import expected_chi2
 from lusee_bayes.linear.posterior import Posterior
@@ -114,7 +114,7 @@ def widened(
     if matrix is not None and prior.independent and posterior.basis is None:
         precision = prior.sandwich(matrix)
     else:
-        lower = np.tril(posterior.lower)
+        lower = lower_triangle(posterior.lower)
         precision = times_lower(lower, lower, transpose=True)
         # free memory: the next matrices are as large
         del lower

@@ -298,7 +298,10 @@ def common_covariance(prior: SpectralPrior, channel: int, covariances: Blocks) -
     whole = np.zeros((n + len(covariances[-1]),) * 2)
     parts = [*[slice(0, n)] * k, slice(n, None)]
     for (i, j), block in zip(_indices(k), covariances, strict=True):
-        whole[parts[i], parts[j]] += weights[i] * weights[j] * block
+        total, weight = whole[parts[i], parts[j]], weights[i] * weights[j]
+        for first in range(0, len(total), ROWS):
+            rows = slice(first, first + ROWS)
+            total[rows] += weight * block[rows]
     whole[:n, n:] = whole[n:, :n].T
     return whole
 
@@ -373,12 +376,15 @@ def channel_sky(
     covariance = None if covariances is None else common_covariance(prior, channel, covariances)
     if residual_root is not None:
         lower = residual_lower(information, residual_root)
-        # the residual's mean, given the common part
-        pull = information.vector[:n] - (whole - information.reference) @ information.matrix[:, :n]
-        half = linalg.solve_lower(lower, (residual_root * pull).T, transpose=False)
-        # a draw deviates from it by L^-T z
+        # given the common part c, the mean is m0 + R^1/2 (1 + P)^-1 [R^1/2 v + R^-1/2 (c - m0)]
+        off = whole - information.reference
+        pull = information.vector[:n] - off[:, n:] @ information.matrix[n:, :n]
+        towards = residual_root * pull + off[:, :n] / residual_root
+        half = linalg.solve_lower(lower, towards.T, transpose=False)
+        # a draw deviates from it by R^1/2 L^-T z
         half[:, 1:] += z.T
-        whole[:, :n] += residual_root * linalg.solve_lower(lower, half, transpose=True).T
+        moved = residual_root * linalg.solve_lower(lower, half, transpose=True).T
+        whole[:, :n] = information.reference[:n] + moved
         if covariance is not None:
             covariance = _with_residual(covariance, information, residual_root, lower)
     return ChannelSky(whole[0], covariance, whole[1:], information.chi2(whole[0]))
@@ -387,7 +393,7 @@ def channel_sky(
 def _with_residual(
     covariance: Square, information: Information, residual_root: Modes, lower: ModesMatrix
 ) -> Square:
-    """Covariance of the whole sky from that of the common part; ``lower`` is overwritten."""
+    """Covariance of the whole sky from that of the common part, which is overwritten."""
     n = len(residual_root)
     among, slope, across = covariance[n:, n:], np.zeros((n, 0)), np.zeros((n, 0))
     if len(among):
@@ -397,10 +403,10 @@ def _with_residual(
         # slope of the residual with the shared unknowns, and their covariance with the whole sky
         slope = -back[:, : len(among)]
         across = back[:, len(among) :] + slope @ among
-    white = linalg.scaled(covariance[:n, :n], 1.0 / residual_root)
-    white = linalg.inverse_sandwich(white, lower)
+    white = linalg.scaled(covariance[:n, :n], 1.0 / residual_root, overwrite=True)
+    white = linalg.inverse_sandwich(white, lower, overwrite=True)
     white[np.diag_indices(n)] += 1.0
-    white = linalg.sandwich(white, linalg.invert_lower(lower, overwrite=True))
+    white = linalg.inverse_sandwich(white, lower, transpose=True)
     sky = linalg.scaled(white, residual_root, overwrite=True)
     if not len(among):
         return sky

@@ -378,7 +378,7 @@ def _root(covariance: Square) -> Float[np.ndarray, "n k"]:
     """
     root = cholesky(covariance + ROUNDING * np.eye(len(covariance)))
     if np.isfinite(np.diagonal(root)).all():
-        return np.tril(root)
+        return root
     values, vectors = np.linalg.eigh(covariance)
     return vectors * np.sqrt(np.clip(values, 0.0, 1.0))
 

@@ -18,7 +18,7 @@ from jaxtyping import Float, Int8
 from lusee_bayes.core import harmonics
 from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels
 from lusee_bayes.core.lazy import healpy
-from lusee_bayes.core.linalg import solve_lower
+from lusee_bayes.core.linalg import mirrored, scaled, solve_lower
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.diagnosis import diagnose
 from lusee_bayes.experiment.experiment import Experiment, doubts, infer, posterior_draws, rounds_of
@@ -235,7 +235,12 @@ class Conditioned:
             return channel_result(*given, self.compared(), **more)
 
     def channel_data(
-        self, stages: Stages | None = None, *, alone: bool = True, thorough: bool = False
+        self,
+        stages: Stages | None = None,
+        *,
+        alone: bool = True,
+        joint: bool = False,
+        thorough: bool = False,
     ) -> ChannelData:
         """Examine these data.
 
@@ -245,6 +250,8 @@ class Conditioned:
             Reports progress.
         alone : bool
             Whether this is the only channel: the report then shows more.
+        joint : bool
+            Whether its sky will be that of a joint posterior: this one's covariance is not needed.
         thorough : bool
             Test groups of data and try the usual mistakes even if the data fit.
         """
@@ -258,7 +265,7 @@ class Conditioned:
         with stages("diagnostics"):
             if not (alone or thorough):
                 given = judge.posterior, judge.chi2, inference.model.n_data, judge.matrix
-                instrument = Split.of(*given, self.expected).instrument
+                instrument = Split.of(*given, None if joint else self.expected).instrument
             if alone or thorough or instrument.p < DOUBTFUL:
                 left = residuals(judge, data)
                 instrument, judged = left.split.instrument, self._judged(left)
@@ -275,7 +282,10 @@ class Conditioned:
             with stages("first order"):
                 doubtful += reach(experiment, inference)
         fitting = experiment.fitting
-        altitude = measures.highest_altitude(data.observation, scenario.map_nside)
+        altitude, departure = measures.highest_altitude(data.observation, scenario.map_nside), None
+        if not joint:
+            given = altitude, self.posterior, self.covariance, self._shared_root()
+            departure = Departure.of(*given)
         return ChannelData(
             frequency_mhz=scenario.frequency_mhz,
             taken=taken(data.observation),
@@ -304,7 +314,7 @@ class Conditioned:
             diagnosis=diagnosis,
             digests=self.digests,
             information=self.information if scenario.output.information else None,
-            departure=Departure.of(altitude, self.posterior, self.covariance, self._shared_root()),
+            departure=departure,
         )
 
     def _shared_root(self) -> Float[np.ndarray, "modes shared"]:
@@ -396,7 +406,7 @@ def channel_result(
     if instrument is not None:
         theta, roots = instrument.instrument(mean, covariance, width)
     options = {"truth": data.truth, "roots": roots, "common": common, "draws": joint}
-    options["departure"] = data.departure if joint is None else None
+    options |= {"departure": data.departure}
     return ChannelResult(
         **(vars(data) | {"doubts": (*data.doubts, *about_information(information_bits))}),
         **figures,
@@ -477,12 +487,14 @@ def packed_resolution(
     ell, _ = harmonics.mode_numbers(harmonics.lmax_of(len(variance)))
     width = np.sqrt(variance if prior.independent else harmonics.mean_over_m(variance)[ell])
     power = width > 0
-    # row by row, D^-1 C S^-1 D
-    left = prior.whiten_columns(prior.whiten(covariance))
-    left *= np.divide(width[None], width[:, None], out=np.zeros(left.shape), where=power[:, None])
-    white = np.diag(power.astype(np.float64)) - left
-    if prior.independent:  # but for rounding
-        white = (white + white.T) / 2.0
+    inverse = np.divide(1.0, width, out=np.zeros(len(width)), where=power)
+    if prior.independent:
+        white = mirrored(scaled(covariance, inverse))
+    else:  # row by row, D^-1 C S^-1 D
+        white = scaled(prior.whiten_columns(prior.whiten(covariance)), inverse, overwrite=True)
+        white *= width[None] ** 2
+    np.negative(white, out=white)
+    white[np.diag_indices_from(white)] += power
     starts = np.flatnonzero(np.diff(ell, prepend=-1))
     largest = np.maximum.reduceat(np.abs(white), starts, axis=0)
     largest = np.maximum.reduceat(largest, starts, axis=1)
@@ -509,6 +521,9 @@ def region_rows(nside: int, lmax: int) -> Float[np.ndarray, "regions modes"]:
     parts = by_part[first]
     sums = np.add.reduceat(harmonics.azimuth_functions(phi, lmax)[by_part], first)
     _, m = harmonics.mode_numbers(lmax)
-    rows = harmonics.polar_functions(heights, lmax)[ring[parts]] * sums[:, m + lmax]
-    _, first = np.unique(of[parts], return_index=True)
-    return np.add.reduceat(rows, first) / np.bincount(of)[:, None]
+    polar = harmonics.polar_functions(heights, lmax)
+    rows = np.empty((of.max() + 1, len(m)))
+    for region, row in enumerate(rows):
+        its = slice(*np.searchsorted(of[parts], [region, region + 1]))
+        row[:] = np.einsum("pm,pm->m", polar[ring[parts[its]]], sums[its][:, m + lmax])
+    return rows / np.bincount(of)[:, None]

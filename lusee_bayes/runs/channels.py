@@ -618,6 +618,7 @@ def map_channels(
     channels = tuple(channel.anchored() for channel in scenario.channels())
     alone = not scenario.joint and not scenario.shared
     kind = ChannelResult if alone else ChannelInformation if scenario.joint else ChannelAlone
+    examine = {"alone": False, "joint": scenario.joint, "thorough": thorough}
 
     begin: dict[str, float] | None = None
 
@@ -628,7 +629,7 @@ def map_channels(
             made = condition(channel, Stages(), begin)
             if begin is not None and not made.from_data.fits:
                 made = condition(channel, Stages())
-            channel_data = made.channel_data(alone=False, thorough=thorough)
+            channel_data = made.channel_data(**examine)
             return made.result(channel_data) if alone else kind.of(made, channel_data)
 
         try:
@@ -666,7 +667,7 @@ def map_channels(
                     made, before = condition(channel, Stages(), values), first.read(channel, kind)
                     if made.figures()["log_evidence"] < before.share.log_evidence:
                         return before
-                    return kind.of(made, made.channel_data(alone=False, thorough=thorough))
+                    return kind.of(made, made.channel_data(**examine))
 
                 return files.kept(channel, kind, make).seen()
 

@@ -272,9 +272,12 @@ class RunFolder:
             if kind.figures:
                 (stage / FIGURES).mkdir()
                 with stages("figures"):
-                    for name, draw in kind.figures.items():
-                        for part, figure in named_parts(name, draw(result)).items():
-                            save(figure, stage / FIGURES / f"{part}.png", kind.dpi)
+                    drawn = (
+                        (stage / FIGURES / f"{part}.png", figure)
+                        for name, draw in kind.figures.items()
+                        for part, figure in named_parts(name, draw(result)).items()
+                    )
+                    save(drawn, kind.dpi)
             with stages("files"):
                 for output in kind.outputs:
                     if output.wanted(result):

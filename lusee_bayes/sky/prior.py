@@ -304,7 +304,7 @@ class DiagonalPrior(Prior):
     def whiten(self, m):
         xp, root = namespace(m, self), self.widths.reshape(*(1,) * (m.ndim - 1), -1)
         power = root != 0
-        return xp.where(power, m / xp.where(power, root, 1.0), 0.0)
+        return m * xp.where(power, 1.0 / xp.where(power, root, 1.0), 0.0)
 
     def whiten_columns(self, a):
         return self.whiten(a)

@@ -12,7 +12,8 @@ figures; files and numbers are unsmoothed.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from pathlib import Path
 
@@ -53,15 +54,28 @@ Size = tuple[float | int, float | int]
 COMPRESSION = 2
 
 
-def save(figure: Figure, path: Path, dpi: int) -> None:
-    """Write a figure as a PNG, drawing it once (savefig would draw it twice)."""
+def save(figures: Iterable[tuple[Path, Figure]], dpi: int) -> None:
+    """Write figures as PNGs, drawing each once (savefig would draw it twice).
+
+    While one is compressed, the next is drawn.
+    """
+    options = {"format": "png", "dpi": dpi, "pil_kwargs": {"compress_level": COMPRESSION}}
+    with ThreadPoolExecutor(1) as other:
+        written = [
+            other.submit(imsave, path, _drawn(figure, dpi), **options) for path, figure in figures
+        ]
+    for one in written:
+        one.result()
+
+
+def _drawn(figure: Figure, dpi: int) -> memoryview:
+    """The pixels of a figure."""
     figure.set_dpi(dpi)
     for text in figure.findobj(Text):
         text.set_text(printable(text.get_text()))
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
-    options = {"format": "png", "dpi": dpi, "pil_kwargs": {"compress_level": COMPRESSION}}
-    imsave(path, canvas.buffer_rgba(), **options)
+    return canvas.buffer_rgba()
 
 
 def named_parts(name: str, drawn: Figure | dict[str, Figure] | None) -> dict[str, Figure]:
