@@ -153,10 +153,10 @@ def _main_directions(white: Float[np.ndarray, "data modes"]) -> Float[np.ndarray
             products = images.T @ white
             block, images = images, white @ products.T
         q, inside = np.hstack([q, block]), np.vstack([inside, products])
-    squares, vectors = np.linalg.eigh(inside @ inside.T)
-    n = np.searchsorted(np.append(0.0, np.cumsum(squares[::-1])), total - LEFT_OUT)
-    largest = slice(len(squares) - n, None)
-    return inside.T @ (vectors[:, largest] / np.sqrt(squares[largest]))
+    basis, triangle = np.linalg.qr(inside.T)
+    vectors, singular, _ = np.linalg.svd(triangle)
+    n = np.searchsorted(np.append(0.0, np.cumsum(singular**2)), total - LEFT_OUT)
+    return basis @ vectors[:, :n]
 
 
 def _coupling(setup: Setup, lmax: int) -> Float[np.ndarray, "data modes"]:
