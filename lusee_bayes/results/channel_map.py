@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int8
+from jaxtyping import Float, Int, Int8
 
 from lusee_bayes.core import harmonics
 from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels
@@ -502,11 +502,10 @@ def packed_resolution(
     return np.rint(white / steps[np.ix_(ell, ell)]).astype(np.int8), steps, width
 
 
-def region_of(nside: int) -> np.ndarray:
+def region_of(nside: int) -> Int[np.ndarray, " pixels"]:
     """The region (HEALPix RING) that contains each pixel (RING)."""
-    nested = healpy.ring2nest(nside, np.arange(healpy.nside2npix(nside)))
-    coarse = min(REGION_NSIDE, nside)
-    return healpy.nest2ring(coarse, nested // (nside // coarse) ** 2)
+    n_regions = healpy.nside2npix(min(REGION_NSIDE, nside))
+    return healpy.ud_grade(np.arange(float(n_regions)), nside).astype(int)
 
 
 def region_rows(nside: int, lmax: int) -> Float[np.ndarray, "regions modes"]:
@@ -515,15 +514,11 @@ def region_rows(nside: int, lmax: int) -> Float[np.ndarray, "regions modes"]:
     theta, phi = healpy.pix2ang(nside, np.arange(len(of)))
     heights, ring = np.unique(theta, return_inverse=True)
     # pixels of a region on one ring share lambda_l|m|(theta)
-    part = of * len(heights) + ring
-    by_part = np.argsort(part, kind="stable")
-    _, first = np.unique(part[by_part], return_index=True)
-    parts = by_part[first]
-    sums = np.add.reduceat(harmonics.azimuth_functions(phi, lmax)[by_part], first)
+    sums = np.zeros((of.max() + 1, len(heights), 2 * lmax + 1))
+    np.add.at(sums, (of, ring), harmonics.azimuth_functions(phi, lmax))
     _, m = harmonics.mode_numbers(lmax)
-    polar = harmonics.polar_functions(heights, lmax)
-    rows = np.empty((of.max() + 1, len(m)))
-    for region, row in enumerate(rows):
-        its = slice(*np.searchsorted(of[parts], [region, region + 1]))
-        row[:] = np.einsum("pm,pm->m", polar[ring[parts[its]]], sums[its][:, m + lmax])
+    polar, rows = harmonics.polar_functions(heights, lmax), np.empty((len(sums), len(m)))
+    for order, of_rings in enumerate(np.moveaxis(sums, -1, 0)):
+        mine = m + lmax == order
+        rows[:, mine] = of_rings @ polar[:, mine]
     return rows / np.bincount(of)[:, None]

@@ -225,12 +225,6 @@ class MapResult(Described):
         values = [getattr(channel, name) for channel in self.channels]
         return None if any(v is None for v in values) else np.stack(values)
 
-    def snr(self, *, independent: bool = False) -> Float[np.ndarray, "channels ells"] | None:
-        """SNR_ell of every channel, or of its mean given its own data; None if unknown."""
-        if self.stacked("truth") is None or (independent and self.stacked("independent") is None):
-            return None
-        return np.stack([c.snr(c.independent if independent else None) for c in self.channels])
-
     def fits(self) -> ChannelFits:
         """chi^2 of every channel, and the joint tests."""
         parts = [channel.instrument for channel in self.channels]

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullLocator
+from matplotlib.ticker import LogLocator
 
 from lusee_bayes.core.arrays import Modes
 from lusee_bayes.core.harmonics import lmax_of, modes_to_map, taper_fwhm_deg
@@ -155,16 +155,14 @@ def channel_panels(channel: ChannelResult) -> dict[str, tuple]:
     All except the standard deviation are smoothed with the beam of :mod:`.drawing`.
     """
     nside, norms = max(NSIDE, channel.nside), scales(channel)
-    mean, panels = drawing.shown(channel.mean, nside), {}
+    mean = drawing.shown(channel.mean, nside)
+    panels = {"posterior mean": (mean, norms["temperature"])}
     if channel.truth is not None:
         truth = drawing.shown(channel.truth, nside)
         percent = 100.0 * (mean - truth) / mean.mean()
-        panels["truth"] = truth, norms["temperature"]
+        panels = {"truth": (truth, norms["temperature"]), **panels}
         panels["mean - truth"] = percent, norms["residual"], DIVERGING, "% of the mean sky"
-    panels["posterior mean"] = mean, norms["temperature"]
-    panels["posterior standard deviation"] = channel.pixel_std, norms["std"]
-    order = ("truth", "posterior mean", "mean - truth", "posterior standard deviation")
-    return {title: panels[title] for title in order if title in panels}
+    return panels | {"posterior standard deviation": (channel.pixel_std, norms["std"])}
 
 
 def channel_map(channel: ChannelResult) -> Figure:
@@ -254,7 +252,7 @@ def instrument_share(result: MapResult) -> Panels | None:
     """Share of each pixel's variance that comes from unknowns of the instrument."""
     with_theta = [channel for channel in result.channels if channel.theta is not None]
     figures = {}
-    for channel in [with_theta[k] for k in _few_of(len(with_theta), SHOWN)] if with_theta else []:
+    for channel in (with_theta[k] for k in _few_of(len(with_theta), SHOWN)):
         share, title = 100.0 * channel.theta.pixel_share, f"{channel.frequency_mhz:g} MHz"
         scale = Normalize(0.0, max(float(np.percentile(share, 99.5)), 1e-3))
         options = {"altitude": channel.highest_altitude, "unit": "% of the variance"}
@@ -271,11 +269,10 @@ def maps_of_runs(runs: Sequence[FinishedRun]) -> Panels:
     level, figures = drawing.temperatures(np.concatenate(means)), {}
     for run, mean in zip(runs, means, strict=True):
         panels = {
-            "posterior mean": (mean, level),
-            "standard deviation": (run.channel.pixel_std, spread),
+            f"{run.name}: posterior mean": (mean, level),
+            f"{run.name}: standard deviation": (run.channel.pixel_std, spread),
         }
-        named = {f"{run.name}: {title}": panel for title, panel in panels.items()}
-        figures |= _figures(named, run.channel)
+        figures |= _figures(panels, run.channel)
     return figures
 
 
@@ -288,10 +285,8 @@ def channel_spectra(cube: MapResult) -> Panels:
         axes.errorbar(f, mean, std, color=BLUE, fmt=".", ms=4, lw=1, label="posterior")
         if "truth" in values:
             axes.plot(f, values["truth"], color=ORANGE, ls="--", lw=1.2, label="truth")
-        axes.set(title=name, yscale="log", xscale="log", xlim=(0.93 * f[0], 1.07 * f[-1]))
-        _frequency_ticks(axes)
-        axes.set(xlabel="frequency [MHz]", ylabel="brightness temperature [K]")
-        axes.legend(frameon=False)
+        axes.set(title=name, yscale="log", ylabel="brightness temperature [K]")
+        _over_frequencies(axes, f)
     return figures
 
 
@@ -352,7 +347,9 @@ def sky_spectrum(cube: MapResult) -> Panels | None:
 def _over_frequencies(axes: Axes, f: Frequencies) -> None:
     axes.legend(frameon=False, fontsize="small")
     axes.set(xlabel="frequency [MHz]", xscale="log", xlim=(0.93 * f.min(), 1.07 * f.max()))
-    _frequency_ticks(axes)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    drawing.without_minor_ticks(axes.xaxis)
 
 
 def spectral_index(cube: MapResult) -> Panels | None:
@@ -377,12 +374,6 @@ def spectral_index(cube: MapResult) -> Panels | None:
     }
 
 
-def _frequency_ticks(axes: Axes) -> None:
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.xaxis.set_minor_locator(NullLocator())
-
-
 def fidelity(cube: MapResult) -> Figure | Panels:
     """SNR_ell (or, without a truth, the prior's share) over frequency and ell, and its mean.
 
@@ -390,9 +381,8 @@ def fidelity(cube: MapResult) -> Figure | Panels:
     """
     if len(cube.channels) == 1:
         return map_fidelity(cube.channel)
-    snr, alone = cube.snr(), cube.snr(independent=True)
-    with_truth = snr is not None
-    values = snr if with_truth else cube.stacked("prior_fraction")
+    with_truth = cube.stacked("snr") is not None
+    values = cube.stacked("snr" if with_truth else "prior_fraction")
     label = r"$\mathrm{SNR}_\ell$" if with_truth else "fraction of the variance from the prior"
     norm = LogNorm(0.3, 30.0) if with_truth else Normalize(0.0, 1.0)
     figure, (left, right) = drawing.framed((12, 4.4), 1, 2)
@@ -404,9 +394,10 @@ def fidelity(cube: MapResult) -> Figure | Panels:
     left.set(xlabel=r"multipole $\ell$", ylabel="frequency [MHz]", title=label)
     figure.colorbar(image, ax=left, label=label, extend="both" if with_truth else "neither")
     right.plot(ell[1:], values[:, 1:].mean(0), color=BLUE, label="this run")
-    if alone is not None:
+    if with_truth and cube.stacked("independent") is not None:
+        alone = np.mean([channel.spectra()["snr_independent"] for channel in cube.channels], 0)
         style = {"color": ORANGE, "ls": "--", "label": "each channel independently"}
-        right.plot(ell[1:], alone[:, 1:].mean(0), **style)
+        right.plot(ell[1:], alone[1:], **style)
     if with_truth:
         right.set_yscale("log")
         right.axhline(1.0, color=GREY, lw=0.8, ls=":")
