@@ -36,8 +36,8 @@ The data that remain have N_0 without the group, so that D loses ``D_:s D_ss^-1 
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Sequence
-from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -309,13 +309,12 @@ class LeftOut:
         for k, group in enumerate(groups):
             batches.setdefault(self._within(group, -k - 1), []).append(k)
 
-        def leave_out(number: int) -> list[Missed]:
+        def leave_out(number: int) -> dict[int, Missed]:
             stretch = self._stretch(number) if number >= 0 else self._whole
-            return [self.missed(groups[k], stretch) for k in batches[number]]
+            return {k: self.missed(groups[k], stretch) for k in batches[number]}
 
-        missed = chain(*in_threads(leave_out, list(batches)))
-        by_number = dict(zip(chain(*batches.values()), missed, strict=True))
-        return [by_number[k] for k in range(len(groups))]
+        missed = ChainMap(*in_threads(leave_out, list(batches)))
+        return [missed[k] for k in range(len(groups))]
 
     def _within(self, group: GridFlags, neither: int) -> int:
         """Number of the stretch with all of a group; ``neither`` if none, or for all data."""

@@ -23,7 +23,7 @@ from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.progress import about_run
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.unknowns import UnknownsReport, flux_lines
+from lusee_bayes.experiment.unknowns import flux_lines
 from lusee_bayes.flight.reduced import Reduced
 from lusee_bayes.judge.chi2 import RULE, ChiSquare, Fit
 from lusee_bayes.judge.cube_fit import ChannelFits, SharedTest
@@ -51,57 +51,6 @@ def joint_prior_sentence(scenario: Scenario) -> str:
         sky = f"the embedded template times the exponential of {', '.join(section.fields)}"
         return f"Prior spectral.model=positive: {sky}, with C_ell learned from these data; {kept}."
     return f"Prior spectral.model={section.model}, C_ell from the scenario's skies; {kept}."
-
-
-@dataclass(frozen=True)
-class ChannelUnknowns:
-    """Reports on the unknowns of every channel.
-
-    Attributes
-    ----------
-    reports : dict of UnknownsReport
-        By frequency in MHz.
-    shared : dict of float
-        Unknowns that channels share, :attr:`.Scenario.shared`.
-    """
-
-    reports: dict[float, UnknownsReport]
-    shared: dict[str, float]
-
-    @property
-    def table(self) -> pd.DataFrame:
-        """unknowns.csv: the channels' tables, concatenated, with ``frequency_mhz``."""
-        return below({f: report.table for f, report in self.reports.items()})
-
-    def lines(self) -> list[str]:
-        """Lines for a terminal: the unknowns and the combination that are unconstrained."""
-        if len(self.reports) == 1:
-            return next(iter(self.reports.values())).lines()
-        n, reports = len(self.reports), self.reports.values()
-        weak = Counter(name for one in reports for name in one.table["unknown"][~one.constrained])
-        counts = [f"{name} (at {k} of {n} frequencies)" for name, k in weak.items()]
-        what = f"do not constrain {', '.join(counts)}" if counts else "constrain all of them"
-        lines = [f"Receivers, ground and gain table: the data {what}."]
-        for words, octaves in self.shared.items():
-            like = "the same" if np.isinf(octaves) else f"smooth over {octaves:g} octaves"
-            given = "every channel uses the constraints from all others"
-            lines.append(f"Unknowns of {words} are {like} at all frequencies: {given}.")
-        sentence = self._null_sentence()
-        return [*lines, sentence] if sentence else lines
-
-    def _null_sentence(self) -> str:
-        """Describe the least constrained combination of all channels; empty if there is none."""
-        nulls = {f: report.null for f, report in self.reports.items() if report.null is not None}
-        left_open = [f for f, null in nulls.items() if null.sentence()]
-        if not left_open:
-            return ""
-        worst = left_open[int(np.argmax([nulls[f].share for f in left_open]))]
-        words, share = nulls[worst].words(), nulls[worst].share
-        return (
-            f"One parameter combination is nearly unconstrained at {len(left_open)} of "
-            f"{len(nulls)} frequencies. At {worst:g} MHz ({words}, in prior standard deviations) "
-            f"its variance is {share:.0%} of the prior variance."
-        )
 
 
 def below(tables: dict[float, pd.DataFrame | None]) -> pd.DataFrame | None:
@@ -227,15 +176,14 @@ class MapResult(Described):
 
     def fits(self) -> ChannelFits:
         """chi^2 of every channel, and the joint tests."""
-        parts = [channel.instrument for channel in self.channels]
-        chi2, degrees = (np.array([getattr(p, n) for p in parts]) for n in ("chi2", "degrees"))
-        n_data = float(self.stacked("n_data").sum())
-        total = float(self.stacked("chi2_model").sum()) if self.joint is None else self.joint.chi2
-        prior = total - float(chi2.sum()), n_data - float(degrees.sum())
-        joint = self.joint is not None
+        parts, joint = tuple(c.instrument for c in self.channels), self.joint is not None
+        chi2 = self.joint.chi2 if joint else float(self.stacked("chi2_model").sum())
+        chi2 -= sum(part.chi2 for part in parts)
+        degrees = float(self.stacked("n_data").sum()) - sum(part.degrees for part in parts)
         # one sky in all channels: their parts may be as good as the same, and a mean is no surer
-        prior = ChiSquare(*(x if joint else x / len(parts) for x in prior))
-        return ChannelFits(self.frequencies_mhz, chi2, degrees, prior, joint, self.shared_tests)
+        n = 1 if joint else len(parts)
+        prior = ChiSquare(chi2 / n, degrees / n)
+        return ChannelFits(self.frequencies_mhz, parts, prior, joint, self.shared_tests)
 
     @cached_property
     def fit(self) -> Fit:
@@ -250,11 +198,31 @@ class MapResult(Described):
         ]
         return Fit(fit.level, " ".join([fit.details, *blamed[:NAMED]]))
 
-    @cached_property
-    def unknowns(self) -> ChannelUnknowns | None:
-        """Receivers, ground and gain table, where the model has them."""
+    def unknowns(self) -> list[str]:
+        """Unconstrained receivers, ground and gain table, in sentences; for one channel, all."""
         reports = {c.frequency_mhz: c.unknowns for c in self.channels if c.unknowns is not None}
-        return ChannelUnknowns(reports, self.scenario.shared) if reports else None
+        if len(reports) < 2:
+            return [line for report in reports.values() for line in report.lines()]
+        tables = [(report.table["unknown"], report.constrained) for report in reports.values()]
+        weak = Counter(name for names, constrained in tables for name in names[~constrained])
+        counts = [f"{name} (at {k} of {len(reports)} frequencies)" for name, k in weak.items()]
+        what = f"do not constrain {', '.join(counts)}" if counts else "constrain all of them"
+        lines = [f"Receivers, ground and gain table: the data {what}."]
+        for words, octaves in self.scenario.shared.items():
+            like = "the same" if np.isinf(octaves) else f"smooth over {octaves:g} octaves"
+            given = "every channel uses the constraints from all others"
+            lines.append(f"Unknowns of {words} are {like} at all frequencies: {given}.")
+        nulls = {f: report.null for f, report in reports.items() if report.null is not None}
+        left_open = [f for f, null in nulls.items() if null.sentence()]
+        if left_open:
+            worst = max(left_open, key=lambda f: nulls[f].share)
+            lines.append(
+                f"One parameter combination is nearly unconstrained at {len(left_open)} of "
+                f"{len(nulls)} frequencies. At {worst:g} MHz ({nulls[worst].words()}, in prior "
+                f"standard deviations) its variance is {nulls[worst].share:.0%} of the prior "
+                "variance."
+            )
+        return lines
 
     def table(self, name: str, part: str = "") -> pd.DataFrame | None:
         """A table of all channels: an attribute of each, or a part of that attribute."""
@@ -304,8 +272,7 @@ class MapResult(Described):
             prior = [channel.prior] if self.single else []
             lines += [f"{label}{line}" for line in (*causes, *prior, *fluxes, *offsets)]
         lines += [] if self.joint is None else [joint_prior_sentence(self.scenario)]
-        lines += [] if self.unknowns is None else self.unknowns.lines()
-        return [*lines, f"{RULE}."]
+        return [*lines, *self.unknowns(), f"{RULE}."]
 
     def _flags(self) -> list[str]:
         """The flagged share of flight data, and doubts about them."""
@@ -383,7 +350,7 @@ class MapResult(Described):
             tests=[] if self.single else self.fits().tests(),
             shared=self.shared_tests,
             pulls=[] if self.single else self.pulls(),
-            unknowns=[] if self.unknowns is None else self.unknowns.lines(),
+            unknowns=self.unknowns(),
             channels=list(self.channels),
             **about_run(self.seconds),
         )

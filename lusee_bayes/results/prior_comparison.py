@@ -169,8 +169,8 @@ def _row(one: PriorSummary, best: float) -> dict[str, object]:
     for name, part in (("instrument", one.instrument), ("prior", one.rest)):
         row |= {f"chi2_{name}": part.chi2, f"degrees_{name}": part.degrees}
     for part, error in zip(one.coverage, one.errors, strict=True):
-        numbers = part.row() | vars(error)
-        row |= {f"{part.name}: {key}": x for key, x in numbers.items() if key not in ("name", "n")}
+        errors = {"rms_error_k": error.rms_error_k, "std_over_sky": error.std_over_sky}
+        row |= {f"{part.name}: {key}": x for key, x in (part.row() | errors).items()}
     return row | {f"snr_{ell}": value for ell, value in one.snr.items()}
 
 

@@ -123,9 +123,9 @@ WIDE = 3.0
 
 def unknowns_by_frequency(result: MapResult) -> Figure | None:
     """Draw every unknown of all channels with its error, its prior and, if known, the truth."""
-    if result.single or result.unknowns is None:
+    table = result.table("unknowns", "table")
+    if result.single or table is None:
         return None
-    table = result.unknowns.table
     names = list(dict.fromkeys(table["unknown"]))
     n_rows = -(-len(names) // PANELS_IN_A_ROW)
     size = (13, 0.6 + 2.5 * n_rows)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import astuple
 from itertools import cycle
 from pathlib import Path
 
@@ -411,9 +412,8 @@ def chi2(cube: MapResult) -> Figure | None:
     if cube.single:
         return None
     figure, axes = drawing.framed((8, 4))
-    fits = cube.fits()
-    ratio, width = fits.chi2 / fits.degrees, np.sqrt(2.0 / fits.degrees)
-    mhz = cube.frequencies_mhz
+    chi2, degrees = np.transpose([astuple(channel.instrument) for channel in cube.channels])
+    ratio, width, mhz = chi2 / degrees, np.sqrt(2.0 / degrees), cube.frequencies_mhz
     axes.fill_between(mhz, 1 - 2 * width, 1 + 2 * width, color=GREY, alpha=0.3, lw=0)
     axes.axhline(1.0, color=GREY, lw=0.8)
     axes.plot(mhz, ratio, "o", ms=4, color=BLUE)
