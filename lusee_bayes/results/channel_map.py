@@ -224,15 +224,14 @@ class Conditioned:
     def result(self, data: ChannelData, stages: Stages | None = None) -> ChannelResult:
         """The channel's result under this posterior."""
         with (stages or Stages())("standard deviations"):
-            report = None
-            if self.unknowns is not None:
-                solution = self.from_data.solution
-                report = self.unknowns.report(solution.posterior.mean, solution.covariance)
-                report = report and replace(report, onto=self.onto)
             given = (data, self.posterior.mean, self.covariance, self.draws, self.log_likelihood())
-            more = {"unknowns": report, "pixels": self.pixel_std, **self.figures()}
-            more["instrument"] = self.unknowns
-            return channel_result(*given, self.compared(), **more)
+            more = {"pixels": self.pixel_std, "instrument": self.unknowns, **self.figures()}
+            made = channel_result(*given, self.compared(), **more)
+            if not self.onto or made.unknowns is None:
+                return made
+            alone = self.from_data.solution
+            report = self.unknowns.report(alone.posterior.mean, alone.covariance)
+            return replace(made, unknowns=replace(report, onto=True))
 
     def channel_data(
         self,
@@ -271,7 +270,7 @@ class Conditioned:
                 instrument, judged = left.split.instrument, self._judged(left)
             details = _details(self) if alone else None
         bad = judged is not None and judged.level == "does not fit"
-        if bad or (thorough and left is not None):
+        if bad or thorough:
             with stages("usual mistakes"):
                 diagnosis = diagnose(experiment, inference, left)
         if scenario.noise.pointing is not None or bad:
@@ -388,11 +387,11 @@ def channel_result(
     common : (modes, white) array, optional
         Root of the covariance with other channels, as of :class:`.RegionTemperatures`.
     joint : (all, modes) array, optional
-        Draws of all channels together, in K.
+        Draws of the sky in a posterior of all channels, in K.
     covariance_kept : bool
         Keep the covariance with the result.
     information_bits, **figures
-        Other attributes of :class:`.ChannelResult`: ``chi2``, ``unknowns``, ``independent`` ...
+        Other attributes of :class:`.ChannelResult`: ``chi2``, ``log_evidence``, ``independent`` ...
     """
     mean, covariance = np.asarray(mean), np.asarray(covariance)
     width, held, variance = pixels, (), np.diagonal(covariance)
@@ -402,8 +401,9 @@ def channel_result(
         held = Counts.of_pixels(width, data.truth - mean, np.asarray(compared)).coverage()
     power = data.prior_std**2
     share = np.divide(variance, power, out=np.zeros(len(variance)), where=power > 0)
-    theta, roots = None, {}
+    report, theta, roots = None, None, {}
     if instrument is not None:
+        report = instrument.report(mean, covariance, joint=joint is not None)
         theta, roots = instrument.instrument(mean, covariance, width)
     options = {"truth": data.truth, "roots": roots, "common": common, "draws": joint}
     options |= {"departure": data.departure}
@@ -419,6 +419,7 @@ def channel_result(
         covariance=covariance if covariance_kept else None,
         information_bits=information_bits,
         coverage=held,
+        unknowns=report,
         theta=theta,
         temperatures=RegionTemperatures.of(data.highest_altitude, mean, covariance, **options),
     )
