@@ -283,8 +283,7 @@ class Conditioned:
         fitting = experiment.fitting
         altitude, departure = measures.highest_altitude(data.observation, scenario.map_nside), None
         if not joint:
-            given = altitude, self.posterior, self.covariance, self._shared_root()
-            departure = Departure.of(*given)
+            departure = Departure.of(altitude, self.posterior, self.covariance, self._shared_root())
         return ChannelData(
             frequency_mhz=scenario.frequency_mhz,
             taken=taken(data.observation),

@@ -99,11 +99,6 @@ class Components:
         return self.mean[: shape[0] * shape[1]].reshape(shape)
 
     @property
-    def solver(self) -> str:
-        """How the mean was computed."""
-        return "direct" if self.mode is None else "Gauss-Newton rounds"
-
-    @property
     def iterations(self) -> int:
         """Number of rounds for positive skies, else 0."""
         return 0 if self.mode is None else self.mode.rounds
@@ -310,17 +305,13 @@ class MapResult(Described):
 
     def landmarks(self) -> dict[str, dict[str, np.ndarray]]:
         """Brightness, its standard deviation and, if known, its truth in some directions."""
-        nside = self.scenario.map_nside
-        mean, pixel_std, truth = (self.stacked(n) for n in ("mean", "pixel_std", "truth"))
-        values = {}
-        for name, (lon, lat) in LANDMARKS.items():
-            pixel = healpy.ang2pix(nside, lon, lat, lonlat=True)
-            theta, phi = healpy.pix2ang(nside, pixel)
-            y = synthesis_matrix(np.array([theta]), np.array([phi]), self.scenario.lmax)[0]
-            values[name] = {"mean": mean @ y, "std": pixel_std[:, pixel]}
-            if truth is not None:
-                values[name]["truth"] = truth @ y
-        return values
+        nside, truth = self.scenario.map_nside, self.stacked("truth")
+        pixels = healpy.ang2pix(nside, *np.transpose([*LANDMARKS.values()]), lonlat=True)
+        y = synthesis_matrix(*healpy.pix2ang(nside, pixels), self.scenario.lmax).T
+        values = {"mean": self.stacked("mean") @ y, "std": self.stacked("pixel_std")[:, pixels]}
+        if truth is not None:
+            values["truth"] = truth @ y
+        return {name: {n: x[:, k] for n, x in values.items()} for k, name in enumerate(LANDMARKS)}
 
     def pulls(self) -> list[PullSummary]:
         """How far the means of some directions are from the truth, in standard deviations."""
@@ -360,6 +351,7 @@ class MapResult(Described):
         if joint is None:
             return None
         named = {"prior": joint_prior_sentence(self.scenario), "components": joint.prior.names}
+        named["solver"] = "direct" if joint.mode is None else "Gauss-Newton rounds"
         same = set(JointSummary.model_fields) - set(named)
         return JointSummary(**named, **{name: getattr(joint, name) for name in same})
 
