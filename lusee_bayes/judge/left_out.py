@@ -228,17 +228,13 @@ class LeftOut:
         self._u = self._weighted_residuals()
         self.u = self._layout.scatter(self._cells.gather(self._u.T))
         self._kept, self._whole, self._spans = None, None, {}
-        self._lost = np.full(self._u.shape, np.nan)
-        if not self._summable:
-            self._kept = self._halves(weigh(self._weights, self._rows(None)))
-            return
-        self._day = self._data.observation.day
+        self._lost, self._day = np.full(self._u.shape, np.nan), self._data.observation.day
         short = len(self._u) <= SHARED and 16 * self._u.size * len(self._lower) <= KEPT_BYTES
         self._stretch_of = (self._day // DAYS) * (not short)
-        if short and self._weights.ndim == 2:
-            self._whole = self._stretch(0)
+        if not self._summable or (short and self._weights.ndim == 3):
+            self._kept = self._halves(weigh(self._weights, self._rows(None)))
         elif short:
-            self._kept = self._halves_at(np.arange(len(self._u)), self._weights)
+            self._whole = self._stretch(0)
 
     @classmethod
     def of(
@@ -318,7 +314,7 @@ class LeftOut:
 
     def _within(self, group: GridFlags, neither: int) -> int:
         """Number of the stretch with all of a group; ``neither`` if none, or for all data."""
-        if not self._summable or self._whole is not None:
+        if self._kept is not None or self._whole is not None:
             return neither
         stretches = self._stretch_of[group.any(axis=0)]
         return int(stretches[0]) if stretches[0] == stretches[-1] else neither
@@ -449,17 +445,13 @@ class LeftOut:
     def _stretch_at(self, times: Int[np.ndarray, " n"], span: Span) -> Stretch:
         return Stretch(times, *(x.swapaxes(0, 1) for x in self._halves_at(span.few)), span.factors)
 
-    def _halves_at(
-        self, times: Int[np.ndarray, " n"], weights: Weights | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """F L^-T and the sky's columns of F Q^-1 at some times; with weights, D F in place of F."""
+    def _halves_at(self, times: Int[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
+        """F L^-T and the sky's columns of F Q^-1 at some times."""
         shape, rank = (len(times), self._layout.n_products), len(self._lower)
         half, sky = np.empty((*shape, rank)), np.empty((*shape, rank - self._n_templates))
 
         def fill(part: Int[np.ndarray, " n"]) -> None:
-            rows = self._rows(times[part])
-            rows = rows if weights is None else weigh(weights[part], rows)
-            half[part], sky[part] = self._halves(rows)
+            half[part], sky[part] = self._halves(self._rows(times[part]))
 
         in_threads(fill, pieces(np.arange(len(times)), CHUNK))
         return half, sky
