@@ -55,10 +55,10 @@ def joint_prior_sentence(scenario: Scenario) -> str:
 
 def below(tables: dict[float, pd.DataFrame | None]) -> pd.DataFrame | None:
     """Concatenate tables of channels, with ``frequency_mhz`` first; None without any."""
-    present = {f: table.copy() for f, table in tables.items() if table is not None}
-    for frequency, table in present.items():
-        table.insert(0, "frequency_mhz", frequency)
-    return pd.concat(present.values(), ignore_index=True) if present else None
+    present = {f: table for f, table in tables.items() if table is not None}
+    if not present:
+        return None
+    return pd.concat(present, names=["frequency_mhz"]).reset_index(0).reset_index(drop=True)
 
 
 @dataclass(frozen=True)
@@ -370,12 +370,9 @@ class MapResult(Described):
 
     def spectra(self) -> Table:
         """power_spectra.ecsv: a row for every channel and ell."""
-        tables = {c.frequency_mhz: pd.DataFrame(c.spectra()) for c in self.channels}
-        table = Table.from_pandas(below(tables))
-        for name in table.colnames:
-            table[name].unit = "K2" if name.startswith("cl_") else None
-        table["frequency_mhz"].unit = "MHz"
-        return table
+        rows = below({c.frequency_mhz: pd.DataFrame(c.spectra()) for c in self.channels})
+        units = {name: "K2" for name in rows if name.startswith("cl_")}
+        return Table.from_pandas(rows, units=units | {"frequency_mhz": "MHz"})
 
     def maps(self) -> dict[str, Float[np.ndarray, "channels pixels"]]:
         """Cubes by name, in K: mean, std and, if the truth is known, truth and residual."""

@@ -351,9 +351,7 @@ class IndexMaps:
 
     @classmethod
     def of(
-        cls,
-        frequencies_mhz: Frequencies,
-        draws: Float[np.ndarray, "frequency draw cell"],
+        cls, frequencies_mhz: Frequencies, draws: Float[np.ndarray, "frequency draw cell"]
     ) -> IndexMaps:
         """Fit them to draws in K, at three or more frequencies."""
         reference = float(np.exp(np.log(frequencies_mhz).mean()))

@@ -357,22 +357,14 @@ def spectral_index(cube: MapResult) -> Panels | None:
     """Maps of the spectral index, its error, and the turnover where the draws agree on one."""
     if (found := cube.index_maps()) is None:
         return None
-    at = f"at {found.reference_mhz:.3g} MHz"
-    titles = {
-        f"index {at}": ("index", ""),
-        f"error of the index {at}": ("index_std", ""),
-        "turnover": ("turnover", "MHz"),
-    }
-    return {
-        title: drawing.sky_figure(
-            title,
-            found.maps[name],
-            Normalize(*np.nanpercentile(found.maps[name], (2, 98))),
-            unit=unit,
-        )
-        for title, (name, unit) in titles.items()
-        if np.isfinite(found.maps[name]).any()
-    }
+    at, figures = f"at {found.reference_mhz:.3g} MHz", {}
+    titles = {"index": f"index {at}", "index_std": f"error of the index {at}"}
+    for name, title in (titles | {"turnover": "turnover"}).items():
+        pixels, unit = found.maps[name], "MHz" if name == "turnover" else ""
+        if np.isfinite(pixels).any():
+            scale = Normalize(*np.nanpercentile(pixels, (2, 98)))
+            figures[title] = drawing.sky_figure(title, pixels, scale, unit=unit)
+    return figures
 
 
 def fidelity(cube: MapResult) -> Figure | Panels:
