@@ -436,7 +436,7 @@ class LeftOut:
             self._lost[times] = ((factors @ within) * factors).sum(-1).T * weights**2
             return stretch
         within = np.einsum("krm,lsm->krls", half, half, optimize=True)
-        for part in pieces(np.arange(len(times)), CHUNK):
+        for part in pieces(len(times)):
             u = factors[part]
             covariance = np.einsum("tr,krls,ts->tkl", u, within, u, optimize=True)
             self._lost[times[part]] = ((weights[part] @ covariance) * weights[part]).sum(-1)
@@ -453,7 +453,7 @@ class LeftOut:
         def fill(part: Int[np.ndarray, " n"]) -> None:
             half[part], sky[part] = self._halves(self._rows(times[part]))
 
-        in_threads(fill, pieces(np.arange(len(times)), CHUNK))
+        in_threads(fill, pieces(len(times)))
         return half, sky
 
     def _span(self, times: Int[np.ndarray, " n"]) -> Span:
@@ -551,9 +551,9 @@ class LeftOut:
         return float((chosen.b**2).sum() + (h**2).sum()), directions, log_det
 
 
-def pieces(times: Int[np.ndarray, " n"], most: int) -> list[np.ndarray]:
-    """Split times into pieces of at most ``most``."""
-    return np.array_split(times, -(-len(times) // most))
+def pieces(n: int) -> list[Int[np.ndarray, " part"]]:
+    """The numbers 0 to n - 1 in pieces of at most ``CHUNK``."""
+    return np.array_split(np.arange(n), -(-n // CHUNK))
 
 
 def diagonal_of(blocks: np.ndarray) -> Cells:

@@ -259,8 +259,8 @@ class SkySpectrum:
         else:
             errors = np.stack([c.departure.error for c in channels])
             covariance = np.einsum("frw,grw->rfg", common, common)
-            alike = correlation_of([c.departure.mean for c in channels])
-            covariance += alike * np.einsum("frw,grw->rfg", errors, errors)
+            u = np.stack([c.departure.mean / np.linalg.norm(c.departure.mean) for c in channels])
+            covariance += u @ u.T * np.einsum("frw,grw->rfg", errors, errors)
             covariance[:, *np.diag_indices(len(channels))] = std.T**2
         # an unknown that a channel lacks takes no part in its errors
         sources = tuple(dict.fromkeys(name for one in channels for name in one.sources))
@@ -378,15 +378,6 @@ class IndexMaps:
             off = np.where(known, values - mean[:, None], 0.0)
             maps |= {name: shown * mean, f"{name}_std": shown * np.sqrt((weights * off**2).sum(1))}
         return cls(reference, maps)
-
-
-def correlation_of(
-    departures: Sequence[Float[np.ndarray, " white"]],
-) -> Float[np.ndarray, "channels channels"]:
-    """rho: the correlation of the posterior means of u in different channels."""
-    u = np.stack(departures)
-    norm = np.sqrt((u**2).sum(1))
-    return u @ u.T / np.outer(norm, norm)
 
 
 def brightness_temperature(
