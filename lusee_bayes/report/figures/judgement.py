@@ -52,7 +52,7 @@ def residuals_by_product(result: MapResult) -> Figure | None:
     ):
         p = np.maximum([getattr(group, key) for group in products], LEAST_P)
         right.semilogx(p, rows, ls="", marker=marker, color=colour, ms=5, label=text)
-    drawing.without_minor_ticks(right.xaxis)
+    right.xaxis.minorticks_off()
     right.axvline(1.0, color=drawing.GREY, lw=0.5)
     right.set(xlabel=f"p-value (clipped at {LEAST_P:g})", xlim=(LEAST_P / 3, 3))
     right.grid(axis="y", lw=0.3)
@@ -254,10 +254,12 @@ def waterfall(result: MapResult) -> Figure | None:
         axes: Axes = panels[i, j]
         kept = reduced.values[band, number]
         flagged = ~np.isfinite(kept) | used_in_part
+        axes.margins(y=0.1)
         axes.plot(days, kept, ".", ms=3, color=drawing.BLUE, label="after flags")
+        limits = axes.get_ylim()
         style = {"ms": 4, "color": drawing.ORANGE, "label": "before flags, where flagged"}
         axes.plot(days[flagged], reduced.before[band, number][flagged], ".", **style)
-        axes.set_ylim(*_range(kept[np.isfinite(kept)]))
+        axes.set_ylim(limits)
         axes.set_title(product.label, fontsize=9)
         drawing.plain_ticks(axes, 3)
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:.3g}")
@@ -306,9 +308,8 @@ def _gains(left: Axes, reduced: Reduced) -> None:
                 left.errorbar(f, value, error, fmt="o", ms=4, capsize=3, color=colour)
     for f in reduced.frequencies_mhz:
         left.axvline(f, color=drawing.GREY, lw=0.5, zorder=0)
-    with_errors = bool((curves.std > 0).any())
-    largest = float(np.nanmax(curves.std / curves.gain)) if with_errors else 0.0
-    words = f"{100 * largest:.2g} % or better" if with_errors else "unknown"
+    largest = float(np.nanmax(curves.std / curves.gain))
+    words = f"{100 * largest:.2g} % or better" if largest > 0.0 else "unknown"
     left.set(xlabel="frequency [MHz]", ylabel="counts for 1 nV²/Hz", title=f"Gain errors: {words}")
     left.legend(frameon=False, ncols=2, fontsize=8)
 
@@ -346,12 +347,3 @@ def _days(reduced: Reduced) -> Float[np.ndarray, " rows"]:
 
 def _first(reduced: Reduced) -> str:
     return str(reduced.observation.times[0].isot)[:16]
-
-
-def _range(values: Float[np.ndarray, " kept"]) -> tuple[float, float]:
-    """Bounds of the kept values, with a margin of a tenth."""
-    if not values.size:
-        return 0.0, 1.0
-    low, high = float(values.min()), float(values.max())
-    edge = 0.1 * (high - low) or max(abs(high), 1e-30)
-    return low - edge, high + edge
