@@ -85,13 +85,12 @@ def strengths(deviation: Modes, of_modes: Modes, of_pixels: Pixels) -> dict[str,
     """
     rest = np.where(np.arange(len(deviation)) > 0, deviation, 0.0)
     nside = healpy.npix2nside(len(of_pixels))
-    bands = latitudes(nside)
-    ells = multipoles(lmax_of(len(deviation)))
-    parts = [(name, modes_to_map(rest, nside), of_pixels, bands[name]) for name in list(bands)[:-1]]
-    parts += [(name, rest, of_modes, ells[name]) for name in list(ells)[1:]]
+    seen, (*bands, _) = modes_to_map(rest, nside), latitudes(nside).items()
+    _, *ells = multipoles(lmax_of(len(deviation))).items()
+    parts = [(*band, seen, of_pixels) for band in bands] + [(*ell, rest, of_modes) for ell in ells]
     return {
         name: float((values[inside] ** 2).sum() / expected[inside].sum())
-        for name, values, expected, inside in parts
+        for name, inside, values, expected in parts
         if expected[inside].sum() > 0
     }
 

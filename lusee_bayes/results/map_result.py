@@ -276,14 +276,9 @@ class MapResult(Described):
             return []
         if not self.single:
             return [reduced.flag_line().capitalize(), *reduced.notes()]
-        band = self.band
+        band = reduced.band(self.channel.frequency_mhz)
         line = reduced.flag_line(band, self.channel.flagged_share)
         return [line.capitalize(), *reduced.doubts(band), *reduced.notes()]
-
-    @property
-    def band(self) -> int:
-        """Index of the first channel's band in the reduced spectra."""
-        return 0 if self.reduced is None else self.reduced.band(self.channel.frequency_mhz)
 
     def doubts(self) -> list[str]:
         """Doubts about the data, with the frequency if there are several channels."""

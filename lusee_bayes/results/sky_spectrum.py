@@ -372,11 +372,10 @@ class IndexMaps:
             ("curvature", c, positive.T),
             ("turnover", turnover, positive.T & inside & (c < 0.0)),
         ):
-            shown = np.where(known.mean(1) >= DEFINED, 1.0, np.nan)
-            weights = np.where(known, 1.0, 0.0) / np.maximum(known.sum(1), 1)[:, None]
-            mean = (weights * np.where(known, values, 0.0)).sum(1)
-            off = np.where(known, values - mean[:, None], 0.0)
-            maps |= {name: shown * mean, f"{name}_std": shown * np.sqrt((weights * off**2).sum(1))}
+            few = known.mean(1, keepdims=True) < DEFINED
+            shown = np.ma.array(np.where(known, values, 0.0), mask=~known | few)
+            maps[name] = shown.mean(1).filled(np.nan)
+            maps[f"{name}_std"] = shown.std(1).filled(np.nan)
         return cls(reference, maps)
 
 

@@ -241,9 +241,10 @@ def time_line(reduced: Reduced) -> Figure:
 
 def waterfall(result: MapResult) -> Figure | None:
     """Draw the 16 products of the map's band over time, before and after flags."""
-    reduced, band = result.reduced, result.band
+    reduced = result.reduced
     if not result.single or reduced is None:
         return None
+    band = reduced.band(result.channel.frequency_mhz)
     figure, panels = drawing.framed((13, 9), 4, 4, sharex=True)
     days = _days(reduced)[np.searchsorted(reduced.bin_of, np.arange(reduced.values.shape[2]))]
     n_bins = reduced.values.shape[2]
