@@ -293,17 +293,18 @@ class LeftOut:
         root = roots(self._weights[blocks], cells[blocks])
         b = solve_roots(root, np.where(cells[where], self._u[where], 0.0)[..., None])
         chosen = Chosen(cells, blocks, places, cells[where], root, b)
-        small = self._small(chosen, stretch)
         # all NaN if Q_s, or 1 - W W^T, has no root
-        answer = self._taken_out(chosen) if small is None else self._among_data(chosen, *small)
-        chi2, directions, log_det = answer
+        chi2, directions, log_det = self._small(chosen, stretch) or self._taken_out(chosen)
         return Missed(n, chi2, directions, log_det + 2.0 * float(np.log(diagonal_of(root)).sum()))
 
     def each(self, groups: Sequence[GridFlags]) -> list[Missed]:
         """Leave out each of several groups, in threads; those of one stretch share its rows."""
         batches: dict[int, list[int]] = {}
+        by_stretch = self._kept is None and self._whole is None
         for k, group in enumerate(groups):
-            batches.setdefault(self._within(group, -k - 1), []).append(k)
+            stretches = self._stretch_of[group.any(axis=0)]
+            within = by_stretch and stretches[0] == stretches[-1]
+            batches.setdefault(int(stretches[0]) if within else -k - 1, []).append(k)
 
         def leave_out(number: int) -> dict[int, Missed]:
             stretch = self._stretch(number) if number >= 0 else self._whole
@@ -311,13 +312,6 @@ class LeftOut:
 
         missed = ChainMap(*in_threads(leave_out, list(batches)))
         return [missed[k] for k in range(len(groups))]
-
-    def _within(self, group: GridFlags, neither: int) -> int:
-        """Number of the stretch with all of a group; ``neither`` if none, or for all data."""
-        if self._kept is not None or self._whole is not None:
-            return neither
-        stretches = self._stretch_of[group.any(axis=0)]
-        return int(stretches[0]) if stretches[0] == stretches[-1] else neither
 
     @once
     def inverse_diagonal(self) -> Grid:
@@ -443,18 +437,15 @@ class LeftOut:
         return stretch
 
     def _stretch_at(self, times: Int[np.ndarray, " n"], span: Span) -> Stretch:
-        return Stretch(times, *(x.swapaxes(0, 1) for x in self._halves_at(span.few)), span.factors)
-
-    def _halves_at(self, times: Int[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
-        """F L^-T and the sky's columns of F Q^-1 at some times."""
-        shape, rank = (len(times), self._layout.n_products), len(self._lower)
+        """F L^-T and the sky's columns of F Q^-1 at a few times that span others."""
+        shape, rank = (len(span.few), self._layout.n_products), len(self._lower)
         half, sky = np.empty((*shape, rank)), np.empty((*shape, rank - self._n_templates))
 
         def fill(part: Int[np.ndarray, " n"]) -> None:
-            half[part], sky[part] = self._halves(self._rows(times[part]))
+            half[part], sky[part] = self._halves(self._rows(span.few[part]))
 
-        in_threads(fill, pieces(len(times)))
-        return half, sky
+        in_threads(fill, pieces(len(span.few)))
+        return Stretch(times, half.swapaxes(0, 1), sky.swapaxes(0, 1), span.factors)
 
     def _span(self, times: Int[np.ndarray, " n"]) -> Span:
         """A few times that span all of these: first for every day, then for all days."""
@@ -480,10 +471,8 @@ class LeftOut:
 
     # --- groups in the space of their data ----------------------------------------------------
 
-    def _small(
-        self, chosen: Chosen, stretch: Stretch | None
-    ) -> tuple[Rows, SkyRows, Vector] | None:
-        """q^T W, q^T W L^-1, and q^T c^-1 u_s; None for a large group."""
+    def _small(self, chosen: Chosen, stretch: Stretch | None) -> Answer | None:
+        """chi^2_s, directions and ln|1 - W W^T|; None for a large group."""
         cells, blocks, places, some, root, b = chosen
         rank = max(len(self._lower), QUICK)
         if self._kept is not None:
@@ -491,7 +480,7 @@ class LeftOut:
                 return None
             halves = (some[..., None] * x[np.ix_(blocks, places)] for x in self._kept)
             w, with_sky = (solve_roots(root, x).reshape(some.size, -1) for x in halves)
-            return w, with_sky, b.ravel()
+            return self._among_data(chosen, w, with_sky, b.ravel())
         independent = self._weights.ndim == 2
         whole = independent or (cells[blocks] == self._on_cells(self.present)[blocks]).all()
         if not whole or len(blocks) > rank:
@@ -510,10 +499,10 @@ class LeftOut:
         mine = slice(None) if len(places) == len(stretch.half) else places
         few = ((combined @ x[mine]).reshape(len(r), r.shape[-1], -1) for x in stretch[1:3])
         w, with_sky = ((r @ x).reshape(-1, x.shape[-1]) for x in few)
-        return w, with_sky, (q.swapaxes(1, 2) @ b).ravel()
+        return self._among_data(chosen, w, with_sky, (q.swapaxes(1, 2) @ b).ravel())
 
     def _among_data(self, chosen: Chosen, w: Rows, with_sky: SkyRows, inside: Vector) -> Answer:
-        """chi^2_s, directions and ln|1 - W W^T|."""
+        """As :meth:`_small`, from q^T W, q^T W L^-1, and q^T c^-1 u_s."""
         lower = linalg.cholesky(np.eye(len(w)) - w @ w.T, overwrite=True)
         solved = linalg.solve_lower(lower, np.column_stack([inside, with_sky]), transpose=False)
         chi2, directions = (float((x**2).sum()) for x in (solved[:, 0], solved[:, 1:]))
