@@ -339,11 +339,10 @@ class ChannelResult(ChannelData, Described):
 
     def errors_by_latitude(self) -> tuple[SkyErrors, ...]:
         """Errors of the map by latitude, for a channel with a known truth."""
-        truth, mean = (modes_to_map(m, self.nside) for m in (self.truth, self.mean))
-        errors = []
+        maps, errors = self.maps(), []
         for name, inside in latitudes(self.nside).items():
-            rms = float(np.sqrt(((mean - truth)[inside] ** 2).mean()))
-            relative = float(self.pixel_std[inside].mean() / truth[inside].mean())
+            rms = float(np.sqrt((maps["residual"][inside] ** 2).mean()))
+            relative = float(maps["std"][inside].mean() / maps["truth"][inside].mean())
             errors.append(SkyErrors(name, rms, relative))
         return tuple(errors)
 
