@@ -75,17 +75,16 @@ def conditioned(
     """
     with rounds_of(experiment, stages or Stages(), "posterior") as report:
         new, data = infer(experiment, report), experiment.data
-        made = Conditioned(experiment, new, new, new, (data.digest(),))
-        if earlier is not None:
-            information = earlier.with_more(made.information, data.digest())
-            prior = new.model.prior
-            posterior = information.posterior(prior)
-            information = information.recentred(posterior.mean)
-            before = _given_earlier(earlier.information.posterior(prior))
-            total = replace(new, solution=Solution(new.model, data.data, posterior, information))
-            judged = replace(new, solution=new.solution.under(before))
-            made = Conditioned(experiment, new, total, judged, (*earlier.digests, data.digest()))
-        return made
+        if earlier is None:
+            return Conditioned(experiment, new, new, new, (data.digest(),))
+        information = earlier.with_more(new.solution.information, data.digest())
+        prior = new.model.prior
+        posterior = information.posterior(prior)
+        information = information.recentred(posterior.mean)
+        before = _given_earlier(earlier.information.posterior(prior))
+        total = replace(new, solution=Solution(new.model, data.data, posterior, information))
+        judged = replace(new, solution=new.solution.under(before))
+        return Conditioned(experiment, new, total, judged, (*earlier.digests, data.digest()))
 
 
 def _given_earlier(posterior: Posterior) -> DensePrior:
