@@ -91,23 +91,20 @@ def pointing_by_day(result: MapResult) -> Figure | None:
     """Draw the preferred value of every offset for each day, and for all days together."""
     if not result.single or result.channel.pointing is None:
         return None
-    preferred = result.channel.pointing.preferred
-    names = list(dict.fromkeys(preferred["offset"]))
-    size = (12, 0.6 + 2.1 * len(names))
-    figure, panels = drawing.framed(size, len(names), sharex=True, squeeze=False)
-    for axes, name in zip(panels[:, 0], names, strict=True):
-        mine = preferred[preferred["offset"] == name]
+    offsets = result.channel.pointing.preferred.groupby("offset", sort=False)
+    size = (12, 0.6 + 2.1 * len(offsets))
+    figure, panels = drawing.framed(size, len(offsets), sharex=True, squeeze=False)
+    for axes, (name, mine) in zip(panels[:, 0], offsets, strict=True):
         days, whole = mine[mine["first_day"] >= 0].dropna(), mine[mine["first_day"] < 0].dropna()
-        days = days[days["std"] < TOO_WIDE * days["std"].median()]
+        most = TOO_WIDE * days["std"].median()
+        days, whole = (rows[rows["std"] < most] for rows in (days, whole))
         middle = (days["first_day"] + days["last_day"] + 1) / 2.0
         axes.axhline(0.0, color=drawing.GREY, lw=0.8)
         style = {"fmt": "o", "ms": 3, "color": drawing.BLUE, "label": "each day"}
         axes.errorbar(middle, days["value"], days["std"], **style)
-        if len(whole):
-            value, std = float(whole["value"].iloc[0]), float(whole["std"].iloc[0])
-            if np.isfinite(std) and std < TOO_WIDE * days["std"].median():
-                axes.axhspan(value - std, value + std, color=drawing.ORANGE, alpha=0.3)
-                axes.axhline(value, color=drawing.ORANGE, label="all days together")
+        for value, std in whole[["value", "std"]].to_numpy():
+            axes.axhspan(value - std, value + std, color=drawing.ORANGE, alpha=0.3)
+            axes.axhline(value, color=drawing.ORANGE, label="all days together")
         kind, _, unit = name.rpartition("_")
         axes.set_ylabel(f"{kind.replace('_', ' ')} [{UNITS.get(unit, unit)}]")
     panels[0, 0].legend(loc="upper right", ncols=2, frameon=False)
@@ -126,12 +123,11 @@ def unknowns_by_frequency(result: MapResult) -> Figure | None:
     table = result.table("unknowns", "table")
     if result.single or table is None:
         return None
-    names = list(dict.fromkeys(table["unknown"]))
-    n_rows = -(-len(names) // PANELS_IN_A_ROW)
+    unknowns = table.groupby("unknown", sort=False)
+    n_rows = -(-len(unknowns) // PANELS_IN_A_ROW)
     size = (13, 0.6 + 2.5 * n_rows)
     figure, panels = drawing.framed(size, n_rows, PANELS_IN_A_ROW, squeeze=False)
-    for axes, name in zip(panels.flat, names, strict=False):
-        rows = table[table["unknown"] == name]
+    for axes, (name, rows) in zip(panels.flat, unknowns, strict=False):
         columns = ("frequency_mhz", "value", "std", "prior", "prior_std")
         f, value, std, prior, before = (rows[column].to_numpy() for column in columns)
         axes.fill_between(f, prior - before, prior + before, color=drawing.GREY, alpha=0.25, lw=0)
@@ -144,7 +140,7 @@ def unknowns_by_frequency(result: MapResult) -> Figure | None:
         axes.set(title=name, xlabel="frequency [MHz]", ylabel=rows["unit"].iloc[0])
         if prior.min() > 0.0 and prior.max() > WIDE * prior.min():
             axes.set_yscale("log")
-    for axes in panels.flat[len(names) :]:
+    for axes in panels.flat[len(unknowns) :]:
         axes.set_axis_off()
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper right", ncols=3, frameon=False)

@@ -166,14 +166,12 @@ def _coverage(axes: Axes, result: PriorComparison) -> None:
 def _errors(axes: Axes, result: PriorComparison) -> None:
     for j, (one, channel) in enumerate(zip(result.priors, result.channels, strict=True)):
         colour, line = COLOURS[j % len(COLOURS)], LINES[j % len(LINES)]
-        expected = power_spectrum(channel.std)[1:]
-        ell = np.arange(1, len(expected) + 1)
-        if channel.truth is None:
-            axes.semilogy(ell, expected, color=colour, ls=line, lw=1.3, label=one.name)
-            continue
-        axes.semilogy(ell, expected, color=colour, ls=":", lw=1.0)
-        error = power_spectrum(channel.mean - channel.truth)[1:]
-        axes.semilogy(ell, error, color=colour, ls="-", lw=1.3, label=one.name)
+        error = power_spectrum(channel.std)[1:]
+        ell = np.arange(1, len(error) + 1)
+        if channel.truth is not None:
+            axes.semilogy(ell, error, color=colour, ls=":", lw=1.0)
+            error, line = power_spectrum(channel.mean - channel.truth)[1:], "-"
+        axes.semilogy(ell, error, color=colour, ls=line, lw=1.3, label=one.name)
     if result.known_sky:
         truth = power_spectrum(result.channels[0].truth)[1:]
         axes.semilogy(ell, truth, color=GREY, lw=1.0, label="true sky")
