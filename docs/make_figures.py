@@ -46,7 +46,6 @@ from lusee_bayes.report.figures.drawing import (
     shown,
     sky_panel,
     temperatures,
-    without_minor_ticks,
 )
 from lusee_bayes.report.figures.maps import channel_map, sky_spectrum
 from lusee_bayes.results.channel import ChannelResult
@@ -403,7 +402,7 @@ def gallery_priors() -> None:
     )
     spectra.legend(frameon=False, fontsize=8, loc=(0.2, 0.62))
     spectra.set_ylim(None, 5e11)
-    without_minor_ticks(spectra.yaxis)
+    spectra.yaxis.minorticks_off()
     histogram.plot(z, norm.pdf(z), "k", lw=1.2)
     histogram.set(title="error / error bar (black: ideal)", yticks=[], xlim=(-4, 4))
     for row, label in enumerate(("K", "% of the mean sky", "error bars")):
@@ -491,7 +490,7 @@ def gallery_everything() -> None:
     pulls.set_title("and right")
     widths.set_yticks(rows, [CALLED.get(name, name) for name in table["unknown"]])
     widths.invert_yaxis()
-    without_minor_ticks(widths.xaxis)
+    widths.xaxis.minorticks_off()
     pull = (table["value"] - table["true"]) / table["std"]
     pulls.errorbar(pull, rows, xerr=1.0, fmt="o", color=BLUE, ms=5)
     pulls.axvline(0.0, color=ORANGE, lw=1.5)

@@ -559,9 +559,8 @@ def _preferred(experiment: Experiment, result: Inference, values: dict[str, floa
             if first < 0 or column.any():
                 rows.append((name, first, last))
                 columns.append(column)
-    preferred = preferences(result.solution, np.stack(columns, axis=1))
     table = pd.DataFrame(rows, columns=["offset", "first_day", "last_day"])
-    return table.assign(value=preferred.amplitude, std=preferred.std, chi2_gain=preferred.gain)
+    return table.assign(**preferences(result.solution, np.stack(columns, axis=1)))
 
 
 def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:

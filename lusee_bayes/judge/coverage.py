@@ -20,9 +20,8 @@ from lusee_bayes.core.lazy import healpy, special
 
 # absolute or signed pulls of several skies
 Pulls = Float[np.ndarray, "skies n"]
-# probabilities of the central intervals, and their names in files
+# probabilities of the central intervals, and the other numbers of a part
 LEVELS = (0.50, 0.68, 0.90, 0.95)
-NAMES = tuple(f"{100 * level:.0f}" for level in LEVELS)
 REST = ("rms", "rms_scatter", "largest", "allowed")
 # skies whose pulls are counted at once
 AT_ONCE = 16
@@ -66,15 +65,12 @@ class Coverage:
     largest: float
     allowed: float
 
-    def row(self) -> dict[str, float | str]:
-        """All attributes by name, for JSON and CSV."""
-        return {
-            "name": self.name,
-            "n": self.n,
-            **{f"held_{name}": x for name, x in zip(NAMES, self.held, strict=True)},
-            **{f"scatter_{name}": x for name, x in zip(NAMES, self.scatter, strict=True)},
-            **{name: getattr(self, name) for name in REST},
-        }
+    def row(self) -> dict[str, float]:
+        """Its numbers by name, for CSV."""
+        percent = [f"{100 * level:.0f}" for level in LEVELS]
+        held = {f"held_{name}": x for name, x in zip(percent, self.held, strict=True)}
+        scatter = {f"scatter_{name}": x for name, x in zip(percent, self.scatter, strict=True)}
+        return held | scatter | {name: getattr(self, name) for name in REST}
 
 
 @dataclass(frozen=True)

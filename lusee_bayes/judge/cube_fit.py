@@ -76,9 +76,8 @@ class ChannelFits:
     Attributes
     ----------
     frequencies_mhz : (channels,) array
-    chi2, degrees : (channels,) array
-        chi^2 of each channel that no sky explains, and its mean if instrument and noise are
-        correct.
+    channels : tuple of ChiSquare
+        chi^2 of each channel that no sky explains.
     prior : ChiSquare
         Tests the prior: of all channels in a joint posterior, else the mean over channels.
     joint : bool
@@ -88,25 +87,19 @@ class ChannelFits:
     """
 
     frequencies_mhz: Float[np.ndarray, " channels"]
-    chi2: Float[np.ndarray, " channels"]
-    degrees: Float[np.ndarray, " channels"]
+    channels: tuple[ChiSquare, ...]
     prior: ChiSquare
     joint: bool = False
     shared: tuple[SharedTest, ...] = ()
 
     @property
-    def by_channel(self) -> list[ChiSquare]:
-        """chi^2 of every channel."""
-        return list(map(ChiSquare, self.chi2.tolist(), self.degrees.tolist()))
-
-    @property
     def total(self) -> ChiSquare:
         """chi^2 of all channels together."""
-        return ChiSquare(float(self.chi2.sum()), float(self.degrees.sum()))
+        return ChiSquare(sum(c.chi2 for c in self.channels), sum(c.degrees for c in self.channels))
 
     def p(self) -> Float[np.ndarray, " channels"]:
         """Probability of every channel's chi^2, two-sided."""
-        return np.array([one.p for one in self.by_channel])
+        return np.array([one.p for one in self.channels])
 
     def extremes(self) -> list[int]:
         """Channels that stand out among all of them, the least probable first."""
@@ -115,12 +108,12 @@ class ChannelFits:
 
     def tests(self) -> list[JointTest]:
         """The joint tests: sum, number above the median, most deviant channel, and the prior."""
-        p, n = self.p(), len(self.chi2)
+        p, n = self.p(), len(self.channels)
         least = int(np.argmin(p))
-        above = int((chdtrc(self.degrees, self.chi2) < 0.5).sum())
+        above = sum(bool(chdtrc(one.degrees, one.chi2) < 0.5) for one in self.channels)
         signs = min(1.0, 2.0 * float(bdtr(min(above, n - above), n, 0.5)))
         name = "prior" if self.joint else "prior, mean over channels"
-        where = f"{self.frequencies_mhz[least]:g} MHz, {self.by_channel[least].chi2_words()}"
+        where = f"{self.frequencies_mhz[least]:g} MHz, {self.channels[least].chi2_words()}"
         return [
             JointTest("sum over all channels", self.total.p, 1, self.total.chi2_words()),
             JointTest("channels above the median", signs, 1, f"{above} of {n}"),
@@ -156,7 +149,7 @@ class ChannelFits:
 
     def _too_quiet(self) -> bool:
         """Whether the least probable chi^2, of a channel or of all together, is too small."""
-        return min([*self.by_channel, self.total], key=lambda one: one.p).too_small
+        return min([*self.channels, self.total], key=lambda one: one.p).too_small
 
     def _advice(self, level: Level) -> list[str]:
         if level == "does not fit" and self._too_quiet():

@@ -36,8 +36,8 @@ The data that remain have N_0 without the group, so that D loses ``D_:s D_ss^-1 
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Sequence
-from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -228,17 +228,13 @@ class LeftOut:
         self._u = self._weighted_residuals()
         self.u = self._layout.scatter(self._cells.gather(self._u.T))
         self._kept, self._whole, self._spans = None, None, {}
-        self._lost = np.full(self._u.shape, np.nan)
-        if not self._summable:
-            self._kept = self._halves(weigh(self._weights, self._rows(None)))
-            return
-        self._day = self._data.observation.day
+        self._lost, self._day = np.full(self._u.shape, np.nan), self._data.observation.day
         short = len(self._u) <= SHARED and 16 * self._u.size * len(self._lower) <= KEPT_BYTES
         self._stretch_of = (self._day // DAYS) * (not short)
-        if short and self._weights.ndim == 2:
-            self._whole = self._stretch(0)
+        if not self._summable or (short and self._weights.ndim == 3):
+            self._kept = self._halves(weigh(self._weights, self._rows(None)))
         elif short:
-            self._kept = self._halves_at(np.arange(len(self._u)), self._weights)
+            self._whole = self._stretch(0)
 
     @classmethod
     def of(
@@ -297,32 +293,25 @@ class LeftOut:
         root = roots(self._weights[blocks], cells[blocks])
         b = solve_roots(root, np.where(cells[where], self._u[where], 0.0)[..., None])
         chosen = Chosen(cells, blocks, places, cells[where], root, b)
-        small = self._small(chosen, stretch)
         # all NaN if Q_s, or 1 - W W^T, has no root
-        answer = self._taken_out(chosen) if small is None else self._among_data(chosen, *small)
-        chi2, directions, log_det = answer
+        chi2, directions, log_det = self._small(chosen, stretch) or self._taken_out(chosen)
         return Missed(n, chi2, directions, log_det + 2.0 * float(np.log(diagonal_of(root)).sum()))
 
     def each(self, groups: Sequence[GridFlags]) -> list[Missed]:
         """Leave out each of several groups, in threads; those of one stretch share its rows."""
         batches: dict[int, list[int]] = {}
+        by_stretch = self._kept is None and self._whole is None
         for k, group in enumerate(groups):
-            batches.setdefault(self._within(group, -k - 1), []).append(k)
+            stretches = self._stretch_of[group.any(axis=0)]
+            within = by_stretch and stretches[0] == stretches[-1]
+            batches.setdefault(int(stretches[0]) if within else -k - 1, []).append(k)
 
-        def leave_out(number: int) -> list[Missed]:
+        def leave_out(number: int) -> dict[int, Missed]:
             stretch = self._stretch(number) if number >= 0 else self._whole
-            return [self.missed(groups[k], stretch) for k in batches[number]]
+            return {k: self.missed(groups[k], stretch) for k in batches[number]}
 
-        missed = chain(*in_threads(leave_out, list(batches)))
-        by_number = dict(zip(chain(*batches.values()), missed, strict=True))
-        return [by_number[k] for k in range(len(groups))]
-
-    def _within(self, group: GridFlags, neither: int) -> int:
-        """Number of the stretch with all of a group; ``neither`` if none, or for all data."""
-        if not self._summable or self._whole is not None:
-            return neither
-        stretches = self._stretch_of[group.any(axis=0)]
-        return int(stretches[0]) if stretches[0] == stretches[-1] else neither
+        missed = ChainMap(*in_threads(leave_out, list(batches)))
+        return [missed[k] for k in range(len(groups))]
 
     @once
     def inverse_diagonal(self) -> Grid:
@@ -441,29 +430,22 @@ class LeftOut:
             self._lost[times] = ((factors @ within) * factors).sum(-1).T * weights**2
             return stretch
         within = np.einsum("krm,lsm->krls", half, half, optimize=True)
-        for part in pieces(np.arange(len(times)), CHUNK):
+        for part in pieces(len(times)):
             u = factors[part]
             covariance = np.einsum("tr,krls,ts->tkl", u, within, u, optimize=True)
             self._lost[times[part]] = ((weights[part] @ covariance) * weights[part]).sum(-1)
         return stretch
 
     def _stretch_at(self, times: Int[np.ndarray, " n"], span: Span) -> Stretch:
-        return Stretch(times, *(x.swapaxes(0, 1) for x in self._halves_at(span.few)), span.factors)
-
-    def _halves_at(
-        self, times: Int[np.ndarray, " n"], weights: Weights | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """F L^-T and the sky's columns of F Q^-1 at some times; with weights, D F in place of F."""
-        shape, rank = (len(times), self._layout.n_products), len(self._lower)
+        """F L^-T and the sky's columns of F Q^-1 at a few times that span others."""
+        shape, rank = (len(span.few), self._layout.n_products), len(self._lower)
         half, sky = np.empty((*shape, rank)), np.empty((*shape, rank - self._n_templates))
 
         def fill(part: Int[np.ndarray, " n"]) -> None:
-            rows = self._rows(times[part])
-            rows = rows if weights is None else weigh(weights[part], rows)
-            half[part], sky[part] = self._halves(rows)
+            half[part], sky[part] = self._halves(self._rows(span.few[part]))
 
-        in_threads(fill, pieces(np.arange(len(times)), CHUNK))
-        return half, sky
+        in_threads(fill, pieces(len(span.few)))
+        return Stretch(times, half.swapaxes(0, 1), sky.swapaxes(0, 1), span.factors)
 
     def _span(self, times: Int[np.ndarray, " n"]) -> Span:
         """A few times that span all of these: first for every day, then for all days."""
@@ -489,10 +471,8 @@ class LeftOut:
 
     # --- groups in the space of their data ----------------------------------------------------
 
-    def _small(
-        self, chosen: Chosen, stretch: Stretch | None
-    ) -> tuple[Rows, SkyRows, Vector] | None:
-        """q^T W, q^T W L^-1, and q^T c^-1 u_s; None for a large group."""
+    def _small(self, chosen: Chosen, stretch: Stretch | None) -> Answer | None:
+        """chi^2_s, directions and ln|1 - W W^T|; None for a large group."""
         cells, blocks, places, some, root, b = chosen
         rank = max(len(self._lower), QUICK)
         if self._kept is not None:
@@ -500,7 +480,7 @@ class LeftOut:
                 return None
             halves = (some[..., None] * x[np.ix_(blocks, places)] for x in self._kept)
             w, with_sky = (solve_roots(root, x).reshape(some.size, -1) for x in halves)
-            return w, with_sky, b.ravel()
+            return self._among_data(chosen, w, with_sky, b.ravel())
         independent = self._weights.ndim == 2
         whole = independent or (cells[blocks] == self._on_cells(self.present)[blocks]).all()
         if not whole or len(blocks) > rank:
@@ -519,10 +499,10 @@ class LeftOut:
         mine = slice(None) if len(places) == len(stretch.half) else places
         few = ((combined @ x[mine]).reshape(len(r), r.shape[-1], -1) for x in stretch[1:3])
         w, with_sky = ((r @ x).reshape(-1, x.shape[-1]) for x in few)
-        return w, with_sky, (q.swapaxes(1, 2) @ b).ravel()
+        return self._among_data(chosen, w, with_sky, (q.swapaxes(1, 2) @ b).ravel())
 
     def _among_data(self, chosen: Chosen, w: Rows, with_sky: SkyRows, inside: Vector) -> Answer:
-        """chi^2_s, directions and ln|1 - W W^T|."""
+        """As :meth:`_small`, from q^T W, q^T W L^-1, and q^T c^-1 u_s."""
         lower = linalg.cholesky(np.eye(len(w)) - w @ w.T, overwrite=True)
         solved = linalg.solve_lower(lower, np.column_stack([inside, with_sky]), transpose=False)
         chi2, directions = (float((x**2).sum()) for x in (solved[:, 0], solved[:, 1:]))
@@ -560,9 +540,9 @@ class LeftOut:
         return float((chosen.b**2).sum() + (h**2).sum()), directions, log_det
 
 
-def pieces(times: Int[np.ndarray, " n"], most: int) -> list[np.ndarray]:
-    """Split times into pieces of at most ``most``."""
-    return np.array_split(times, -(-len(times) // most))
+def pieces(n: int) -> list[Int[np.ndarray, " part"]]:
+    """The numbers 0 to n - 1 in pieces of at most ``CHUNK``."""
+    return np.array_split(np.arange(n), -(-n // CHUNK))
 
 
 def diagonal_of(blocks: np.ndarray) -> Cells:

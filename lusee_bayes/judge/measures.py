@@ -17,7 +17,6 @@ where the prior is too narrow, and smaller where it is too wide.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -35,25 +34,8 @@ from lusee_bayes.linear.posterior import Posterior
 ROUNDING = 1e-10
 
 
-@dataclass(frozen=True)
-class Preferences:
-    """The data's preferred amplitude of each template, without all others.
-
-    Attributes
-    ----------
-    amplitude, std : (n,) array
-        NaN where the data do not constrain it.
-    gain : (n,) array
-        Decrease of chi^2 of the data.
-    """
-
-    amplitude: Vector
-    std: Vector
-    gain: Vector
-
-
-def preferences(solution: Solution, templates: Float[np.ndarray, "data n"]) -> Preferences:
-    """Test templates one by one.
+def preferences(solution: Solution, templates: Float[np.ndarray, "data n"]) -> dict[str, Vector]:
+    """Test templates one by one: the data's preferred amplitude of each, without all others.
 
     Parameters
     ----------
@@ -64,8 +46,9 @@ def preferences(solution: Solution, templates: Float[np.ndarray, "data n"]) -> P
 
     Returns
     -------
-    Preferences
-        In these units.
+    dict of (n,) arrays
+        ``value`` and ``std`` of the amplitude in these units, NaN where the data do not constrain
+        it, and ``chi2_gain``, by which chi^2 of the data would decrease.
 
     Raises
     ------
@@ -80,7 +63,7 @@ def preferences(solution: Solution, templates: Float[np.ndarray, "data n"]) -> P
     # if the sky can absorb a template completely, only rounding remains
     determined = precision > ROUNDING * (templates * solved).sum(0)
     inverse = np.divide(1.0, precision, out=np.full(len(precision), np.nan), where=determined)
-    return Preferences(pull * inverse, np.sqrt(inverse), pull**2 * inverse)
+    return {"value": pull * inverse, "std": np.sqrt(inverse), "chi2_gain": pull**2 * inverse}
 
 
 def strengths(deviation: Modes, of_modes: Modes, of_pixels: Pixels) -> dict[str, float]:
@@ -102,13 +85,12 @@ def strengths(deviation: Modes, of_modes: Modes, of_pixels: Pixels) -> dict[str,
     """
     rest = np.where(np.arange(len(deviation)) > 0, deviation, 0.0)
     nside = healpy.npix2nside(len(of_pixels))
-    bands = latitudes(nside)
-    ells = multipoles(lmax_of(len(deviation)))
-    parts = [(name, modes_to_map(rest, nside), of_pixels, bands[name]) for name in list(bands)[:-1]]
-    parts += [(name, rest, of_modes, ells[name]) for name in list(ells)[1:]]
+    seen, (*bands, _) = modes_to_map(rest, nside), latitudes(nside).items()
+    _, *ells = multipoles(lmax_of(len(deviation))).items()
+    parts = [(*band, seen, of_pixels) for band in bands] + [(*ell, rest, of_modes) for ell in ells]
     return {
         name: float((values[inside] ** 2).sum() / expected[inside].sum())
-        for name, values, expected, inside in parts
+        for name, inside, values, expected in parts
         if expected[inside].sum() > 0
     }
 

@@ -162,10 +162,9 @@ def describe_folder(folder: Path) -> list[str]:
 def _cards(path: Path) -> list[str]:
     """The header of the package's FITS files, in words."""
     with formats.opened(path) as hdus:
-        headers = [hdu.header for hdu in hdus if "SCENHASH" in hdu.header]
-        if not headers:
+        header = next((hdu.header for hdu in hdus if "SCENHASH" in hdu.header), None)
+        if header is None:
             return []
-        (header, *_) = headers
         where = f" at {header['FREQ']:g} MHz" if "FREQ" in header else ""
         return [
             f"{header['CONTENT']} of the posterior{where} up to ell = {header['LMAX']}, beam "

@@ -67,11 +67,10 @@ def map_page(folder: Path, name: str) -> str:
 
 def _regions(run: FinishedRun) -> list[tuple[str, ChiSquare]]:
     """chi^2 of each region's spectrum; empty for one channel and unless the truth is known."""
-    if len(run.channels) == 1 or any(one.temperatures is None for one in run.channels):
+    known = all(c.truth is not None and c.temperatures is not None for c in run.channels)
+    if len(run.channels) == 1 or not known:
         return []
     spectrum = run.sky_spectrum()
-    if spectrum.truth is None:
-        return []
     return [(region, spectrum.chi2(region)) for region in spectrum.regions]
 
 

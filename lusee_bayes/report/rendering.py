@@ -65,11 +65,8 @@ def has_picture(folder: Path, name: str) -> bool:
 
 def pictures(folder: Path, name: str) -> list[str]:
     """Names of a run's pictures that belong side by side, in order."""
-    numbered = {
-        int(path.stem.removeprefix(f"{name}_").partition("_")[0]): path.stem
-        for path in (folder / "figures").glob(f"{name}_[0-9]*_*.png")
-    }
-    return [numbered[k] for k in sorted(numbered)]
+    names = [path.stem for path in (folder / "figures").glob(f"{name}_[0-9]*_*.png")]
+    return sorted(names, key=lambda one: int(one.removeprefix(f"{name}_").partition("_")[0]))
 
 
 def picture(folder: Path, name: str) -> str:

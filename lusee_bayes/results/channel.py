@@ -286,17 +286,15 @@ class ChannelResult(ChannelData, Described):
         """Share of the sky that was never above the horizon."""
         return float((self.highest_altitude < 0).mean())
 
-    def snr(self, mean: SkyModes | None = None) -> np.ndarray | None:
-        """SNR_ell of the map, or of another mean; None if the truth is unknown."""
-        if self.truth is None:
-            return None
-        return measures.signal_to_noise(self.mean if mean is None else mean, self.truth)
+    @property
+    def snr(self) -> np.ndarray | None:
+        """SNR_ell of the map; None if the truth is unknown."""
+        return None if self.truth is None else measures.signal_to_noise(self.mean, self.truth)
 
     @property
     def ell_cross(self) -> int | None:
         """First ell >= 1 with SNR < 1; None if there is none, or no truth."""
-        snr = self.snr()
-        return None if snr is None else measures.ell_cross(snr)
+        return None if self.snr is None else measures.ell_cross(self.snr)
 
     @property
     def resolution_deg(self) -> float | None:
@@ -309,14 +307,15 @@ class ChannelResult(ChannelData, Described):
         columns = {
             "ell": np.arange(len(self.prior_fraction)),
             "rho": None if truth is None else measures.correlation(self.mean, truth),
-            "snr": self.snr(),
+            "snr": self.snr,
             "cl_prior": power_spectrum(self.prior_std),
             "cl_mean": power_spectrum(self.mean),
             "cl_truth": None if truth is None else power_spectrum(truth),
             "cl_posterior_variance": power_spectrum(self.std),
             "prior_fraction": self.prior_fraction,
-            "snr_independent": None if alone is None else self.snr(alone),
         }
+        if truth is not None and alone is not None:
+            columns["snr_independent"] = measures.signal_to_noise(alone, truth)
         return {name: values for name, values in columns.items() if values is not None}
 
     def maps(self) -> dict[str, Pixels]:
@@ -340,15 +339,13 @@ class ChannelResult(ChannelData, Described):
 
     def errors_by_latitude(self) -> tuple[SkyErrors, ...]:
         """Errors of the map by latitude, for a channel with a known truth."""
-        truth, mean = (modes_to_map(m, self.nside) for m in (self.truth, self.mean))
-        errors = []
+        maps, errors = self.maps(), []
         for name, inside in latitudes(self.nside).items():
-            rms = float(np.sqrt(((mean - truth)[inside] ** 2).mean()))
-            relative = float(self.pixel_std[inside].mean() / truth[inside].mean())
+            rms = float(np.sqrt((maps["residual"][inside] ** 2).mean()))
+            relative = float(maps["std"][inside].mean() / maps["truth"][inside].mean())
             errors.append(SkyErrors(name, rms, relative))
         return tuple(errors)
 
     def snr_at_some_ell(self) -> dict[int, float]:
         """SNR_ell at 5, 10, 20 and 30 (up to the map's lmax), for a channel with a known truth."""
-        snr = self.snr()
-        return {ell: float(snr[ell]) for ell in ELLS if ell < len(snr)}
+        return {ell: float(self.snr[ell]) for ell in ELLS if ell < len(self.snr)}

@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int8
+from jaxtyping import Float, Int, Int8
 
 from lusee_bayes.core import harmonics
 from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels
@@ -75,17 +75,16 @@ def conditioned(
     """
     with rounds_of(experiment, stages or Stages(), "posterior") as report:
         new, data = infer(experiment, report), experiment.data
-        made = Conditioned(experiment, new, new, new, (data.digest(),))
-        if earlier is not None:
-            information = earlier.with_more(made.information, data.digest())
-            prior = new.model.prior
-            posterior = information.posterior(prior)
-            information = information.recentred(posterior.mean)
-            before = _given_earlier(earlier.information.posterior(prior))
-            total = replace(new, solution=Solution(new.model, data.data, posterior, information))
-            judged = replace(new, solution=new.solution.under(before))
-            made = Conditioned(experiment, new, total, judged, (*earlier.digests, data.digest()))
-        return made
+        if earlier is None:
+            return Conditioned(experiment, new, new, new, (data.digest(),))
+        information = earlier.with_more(new.solution.information, data.digest())
+        prior = new.model.prior
+        posterior = information.posterior(prior)
+        information = information.recentred(posterior.mean)
+        before = _given_earlier(earlier.information.posterior(prior))
+        total = replace(new, solution=Solution(new.model, data.data, posterior, information))
+        judged = replace(new, solution=new.solution.under(before))
+        return Conditioned(experiment, new, total, judged, (*earlier.digests, data.digest()))
 
 
 def _given_earlier(posterior: Posterior) -> DensePrior:
@@ -224,15 +223,14 @@ class Conditioned:
     def result(self, data: ChannelData, stages: Stages | None = None) -> ChannelResult:
         """The channel's result under this posterior."""
         with (stages or Stages())("standard deviations"):
-            report = None
-            if self.unknowns is not None:
-                solution = self.from_data.solution
-                report = self.unknowns.report(solution.posterior.mean, solution.covariance)
-                report = report and replace(report, onto=self.onto)
             given = (data, self.posterior.mean, self.covariance, self.draws, self.log_likelihood())
-            more = {"unknowns": report, "pixels": self.pixel_std, **self.figures()}
-            more["instrument"] = self.unknowns
-            return channel_result(*given, self.compared(), **more)
+            more = {"pixels": self.pixel_std, "instrument": self.unknowns, **self.figures()}
+            made = channel_result(*given, self.compared(), **more)
+            if not self.onto or made.unknowns is None:
+                return made
+            alone = self.from_data.solution
+            report = self.unknowns.report(alone.posterior.mean, alone.covariance)
+            return replace(made, unknowns=replace(report, onto=True))
 
     def channel_data(
         self,
@@ -271,7 +269,7 @@ class Conditioned:
                 instrument, judged = left.split.instrument, self._judged(left)
             details = _details(self) if alone else None
         bad = judged is not None and judged.level == "does not fit"
-        if bad or (thorough and left is not None):
+        if bad or thorough:
             with stages("usual mistakes"):
                 diagnosis = diagnose(experiment, inference, left)
         if scenario.noise.pointing is not None or bad:
@@ -284,8 +282,7 @@ class Conditioned:
         fitting = experiment.fitting
         altitude, departure = measures.highest_altitude(data.observation, scenario.map_nside), None
         if not joint:
-            given = altitude, self.posterior, self.covariance, self._shared_root()
-            departure = Departure.of(*given)
+            departure = Departure.of(altitude, self.posterior, self.covariance, self._shared_root())
         return ChannelData(
             frequency_mhz=scenario.frequency_mhz,
             taken=taken(data.observation),
@@ -388,11 +385,11 @@ def channel_result(
     common : (modes, white) array, optional
         Root of the covariance with other channels, as of :class:`.RegionTemperatures`.
     joint : (all, modes) array, optional
-        Draws of all channels together, in K.
+        Draws of the sky in a posterior of all channels, in K.
     covariance_kept : bool
         Keep the covariance with the result.
     information_bits, **figures
-        Other attributes of :class:`.ChannelResult`: ``chi2``, ``unknowns``, ``independent`` ...
+        Other attributes of :class:`.ChannelResult`: ``chi2``, ``log_evidence``, ``independent`` ...
     """
     mean, covariance = np.asarray(mean), np.asarray(covariance)
     width, held, variance = pixels, (), np.diagonal(covariance)
@@ -402,8 +399,9 @@ def channel_result(
         held = Counts.of_pixels(width, data.truth - mean, np.asarray(compared)).coverage()
     power = data.prior_std**2
     share = np.divide(variance, power, out=np.zeros(len(variance)), where=power > 0)
-    theta, roots = None, {}
+    report, theta, roots = None, None, {}
     if instrument is not None:
+        report = instrument.report(mean, covariance, joint=joint is not None)
         theta, roots = instrument.instrument(mean, covariance, width)
     options = {"truth": data.truth, "roots": roots, "common": common, "draws": joint}
     options |= {"departure": data.departure}
@@ -419,6 +417,7 @@ def channel_result(
         covariance=covariance if covariance_kept else None,
         information_bits=information_bits,
         coverage=held,
+        unknowns=report,
         theta=theta,
         temperatures=RegionTemperatures.of(data.highest_altitude, mean, covariance, **options),
     )
@@ -502,11 +501,10 @@ def packed_resolution(
     return np.rint(white / steps[np.ix_(ell, ell)]).astype(np.int8), steps, width
 
 
-def region_of(nside: int) -> np.ndarray:
+def region_of(nside: int) -> Int[np.ndarray, " pixels"]:
     """The region (HEALPix RING) that contains each pixel (RING)."""
-    nested = healpy.ring2nest(nside, np.arange(healpy.nside2npix(nside)))
-    coarse = min(REGION_NSIDE, nside)
-    return healpy.nest2ring(coarse, nested // (nside // coarse) ** 2)
+    n_regions = healpy.nside2npix(min(REGION_NSIDE, nside))
+    return healpy.ud_grade(np.arange(float(n_regions)), nside).astype(int)
 
 
 def region_rows(nside: int, lmax: int) -> Float[np.ndarray, "regions modes"]:
@@ -515,15 +513,11 @@ def region_rows(nside: int, lmax: int) -> Float[np.ndarray, "regions modes"]:
     theta, phi = healpy.pix2ang(nside, np.arange(len(of)))
     heights, ring = np.unique(theta, return_inverse=True)
     # pixels of a region on one ring share lambda_l|m|(theta)
-    part = of * len(heights) + ring
-    by_part = np.argsort(part, kind="stable")
-    _, first = np.unique(part[by_part], return_index=True)
-    parts = by_part[first]
-    sums = np.add.reduceat(harmonics.azimuth_functions(phi, lmax)[by_part], first)
+    sums = np.zeros((of.max() + 1, len(heights), 2 * lmax + 1))
+    np.add.at(sums, (of, ring), harmonics.azimuth_functions(phi, lmax))
     _, m = harmonics.mode_numbers(lmax)
-    polar = harmonics.polar_functions(heights, lmax)
-    rows = np.empty((of.max() + 1, len(m)))
-    for region, row in enumerate(rows):
-        its = slice(*np.searchsorted(of[parts], [region, region + 1]))
-        row[:] = np.einsum("pm,pm->m", polar[ring[parts[its]]], sums[its][:, m + lmax])
+    polar, rows = harmonics.polar_functions(heights, lmax), np.empty((len(sums), len(m)))
+    for order, of_rings in enumerate(np.moveaxis(sums, -1, 0)):
+        mine = m + lmax == order
+        rows[:, mine] = of_rings @ polar[:, mine]
     return rows / np.bincount(of)[:, None]

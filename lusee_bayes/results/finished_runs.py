@@ -480,11 +480,9 @@ def read_runs(folders: Sequence[str | Path]) -> list[FinishedRun]:
     if len(folders) < 2:
         raise InputError(f"give at least two folders to compare, got {len(folders)}")
     runs = [FinishedRun.read(folder) for folder in folders]
-    names = [run.name for run in runs]
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"two of the folders are named '{twice}'; rename one of them")
-    for run in runs:
+    for number, run in enumerate(runs):
+        if run.name in [other.name for other in runs[:number]]:
+            raise InputError(f"two of the folders are named '{run.name}'; rename one of them")
         if len(run.channels) > 1 or run.channel.judged is None:
             raise InputError(
                 f"'{run.name}' has several frequencies; give folders of single-frequency maps"

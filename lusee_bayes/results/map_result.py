@@ -23,7 +23,7 @@ from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.progress import about_run
 from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.experiment.unknowns import UnknownsReport, flux_lines
+from lusee_bayes.experiment.unknowns import flux_lines
 from lusee_bayes.flight.reduced import Reduced
 from lusee_bayes.judge.chi2 import RULE, ChiSquare, Fit
 from lusee_bayes.judge.cube_fit import ChannelFits, SharedTest
@@ -53,63 +53,12 @@ def joint_prior_sentence(scenario: Scenario) -> str:
     return f"Prior spectral.model={section.model}, C_ell from the scenario's skies; {kept}."
 
 
-@dataclass(frozen=True)
-class ChannelUnknowns:
-    """Reports on the unknowns of every channel.
-
-    Attributes
-    ----------
-    reports : dict of UnknownsReport
-        By frequency in MHz.
-    shared : dict of float
-        Unknowns that channels share, :attr:`.Scenario.shared`.
-    """
-
-    reports: dict[float, UnknownsReport]
-    shared: dict[str, float]
-
-    @property
-    def table(self) -> pd.DataFrame:
-        """unknowns.csv: the channels' tables, concatenated, with ``frequency_mhz``."""
-        return below({f: report.table for f, report in self.reports.items()})
-
-    def lines(self) -> list[str]:
-        """Lines for a terminal: the unknowns and the combination that are unconstrained."""
-        if len(self.reports) == 1:
-            return next(iter(self.reports.values())).lines()
-        n, reports = len(self.reports), self.reports.values()
-        weak = Counter(name for one in reports for name in one.table["unknown"][~one.constrained])
-        counts = [f"{name} (at {k} of {n} frequencies)" for name, k in weak.items()]
-        what = f"do not constrain {', '.join(counts)}" if counts else "constrain all of them"
-        lines = [f"Receivers, ground and gain table: the data {what}."]
-        for words, octaves in self.shared.items():
-            like = "the same" if np.isinf(octaves) else f"smooth over {octaves:g} octaves"
-            given = "every channel uses the constraints from all others"
-            lines.append(f"Unknowns of {words} are {like} at all frequencies: {given}.")
-        sentence = self._null_sentence()
-        return [*lines, sentence] if sentence else lines
-
-    def _null_sentence(self) -> str:
-        """Describe the least constrained combination of all channels; empty if there is none."""
-        nulls = {f: report.null for f, report in self.reports.items() if report.null is not None}
-        left_open = [f for f, null in nulls.items() if null.sentence()]
-        if not left_open:
-            return ""
-        worst = left_open[int(np.argmax([nulls[f].share for f in left_open]))]
-        words, share = nulls[worst].words(), nulls[worst].share
-        return (
-            f"One parameter combination is nearly unconstrained at {len(left_open)} of "
-            f"{len(nulls)} frequencies. At {worst:g} MHz ({words}, in prior standard deviations) "
-            f"its variance is {share:.0%} of the prior variance."
-        )
-
-
 def below(tables: dict[float, pd.DataFrame | None]) -> pd.DataFrame | None:
     """Concatenate tables of channels, with ``frequency_mhz`` first; None without any."""
-    present = {f: table.copy() for f, table in tables.items() if table is not None}
-    for frequency, table in present.items():
-        table.insert(0, "frequency_mhz", frequency)
-    return pd.concat(present.values(), ignore_index=True) if present else None
+    present = {f: table for f, table in tables.items() if table is not None}
+    if not present:
+        return None
+    return pd.concat(present, names=["frequency_mhz"]).reset_index(0).reset_index(drop=True)
 
 
 @dataclass(frozen=True)
@@ -148,11 +97,6 @@ class Components:
         """Mean of the component maps."""
         shape = np.shape(self.prior.roots)
         return self.mean[: shape[0] * shape[1]].reshape(shape)
-
-    @property
-    def solver(self) -> str:
-        """How the mean was computed."""
-        return "direct" if self.mode is None else "Gauss-Newton rounds"
 
     @property
     def iterations(self) -> int:
@@ -225,23 +169,16 @@ class MapResult(Described):
         values = [getattr(channel, name) for channel in self.channels]
         return None if any(v is None for v in values) else np.stack(values)
 
-    def snr(self, *, independent: bool = False) -> Float[np.ndarray, "channels ells"] | None:
-        """SNR_ell of every channel, or of its mean given its own data; None if unknown."""
-        if self.stacked("truth") is None or (independent and self.stacked("independent") is None):
-            return None
-        return np.stack([c.snr(c.independent if independent else None) for c in self.channels])
-
     def fits(self) -> ChannelFits:
         """chi^2 of every channel, and the joint tests."""
-        parts = [channel.instrument for channel in self.channels]
-        chi2, degrees = (np.array([getattr(p, n) for p in parts]) for n in ("chi2", "degrees"))
-        n_data = float(self.stacked("n_data").sum())
-        total = float(self.stacked("chi2_model").sum()) if self.joint is None else self.joint.chi2
-        prior = total - float(chi2.sum()), n_data - float(degrees.sum())
-        joint = self.joint is not None
+        parts, joint = tuple(c.instrument for c in self.channels), self.joint is not None
+        chi2 = self.joint.chi2 if joint else float(self.stacked("chi2_model").sum())
+        chi2 -= sum(part.chi2 for part in parts)
+        degrees = float(self.stacked("n_data").sum()) - sum(part.degrees for part in parts)
         # one sky in all channels: their parts may be as good as the same, and a mean is no surer
-        prior = ChiSquare(*(x if joint else x / len(parts) for x in prior))
-        return ChannelFits(self.frequencies_mhz, chi2, degrees, prior, joint, self.shared_tests)
+        n = 1 if joint else len(parts)
+        prior = ChiSquare(chi2 / n, degrees / n)
+        return ChannelFits(self.frequencies_mhz, parts, prior, joint, self.shared_tests)
 
     @cached_property
     def fit(self) -> Fit:
@@ -256,11 +193,31 @@ class MapResult(Described):
         ]
         return Fit(fit.level, " ".join([fit.details, *blamed[:NAMED]]))
 
-    @cached_property
-    def unknowns(self) -> ChannelUnknowns | None:
-        """Receivers, ground and gain table, where the model has them."""
+    def unknowns(self) -> list[str]:
+        """Unconstrained receivers, ground and gain table, in sentences; for one channel, all."""
         reports = {c.frequency_mhz: c.unknowns for c in self.channels if c.unknowns is not None}
-        return ChannelUnknowns(reports, self.scenario.shared) if reports else None
+        if len(reports) < 2:
+            return [line for report in reports.values() for line in report.lines()]
+        tables = [(report.table["unknown"], report.constrained) for report in reports.values()]
+        weak = Counter(name for names, constrained in tables for name in names[~constrained])
+        counts = [f"{name} (at {k} of {len(reports)} frequencies)" for name, k in weak.items()]
+        what = f"do not constrain {', '.join(counts)}" if counts else "constrain all of them"
+        lines = [f"Receivers, ground and gain table: the data {what}."]
+        for words, octaves in self.scenario.shared.items():
+            like = "the same" if np.isinf(octaves) else f"smooth over {octaves:g} octaves"
+            given = "every channel uses the constraints from all others"
+            lines.append(f"Unknowns of {words} are {like} at all frequencies: {given}.")
+        nulls = {f: report.null for f, report in reports.items() if report.null is not None}
+        left_open = [f for f, null in nulls.items() if null.sentence()]
+        if left_open:
+            worst = max(left_open, key=lambda f: nulls[f].share)
+            lines.append(
+                f"One parameter combination is nearly unconstrained at {len(left_open)} of "
+                f"{len(nulls)} frequencies. At {worst:g} MHz ({nulls[worst].words()}, in prior "
+                f"standard deviations) its variance is {nulls[worst].share:.0%} of the prior "
+                "variance."
+            )
+        return lines
 
     def table(self, name: str, part: str = "") -> pd.DataFrame | None:
         """A table of all channels: an attribute of each, or a part of that attribute."""
@@ -310,8 +267,7 @@ class MapResult(Described):
             prior = [channel.prior] if self.single else []
             lines += [f"{label}{line}" for line in (*causes, *prior, *fluxes, *offsets)]
         lines += [] if self.joint is None else [joint_prior_sentence(self.scenario)]
-        lines += [] if self.unknowns is None else self.unknowns.lines()
-        return [*lines, f"{RULE}."]
+        return [*lines, *self.unknowns(), f"{RULE}."]
 
     def _flags(self) -> list[str]:
         """The flagged share of flight data, and doubts about them."""
@@ -320,14 +276,9 @@ class MapResult(Described):
             return []
         if not self.single:
             return [reduced.flag_line().capitalize(), *reduced.notes()]
-        band = self.band
+        band = reduced.band(self.channel.frequency_mhz)
         line = reduced.flag_line(band, self.channel.flagged_share)
         return [line.capitalize(), *reduced.doubts(band), *reduced.notes()]
-
-    @property
-    def band(self) -> int:
-        """Index of the first channel's band in the reduced spectra."""
-        return 0 if self.reduced is None else self.reduced.band(self.channel.frequency_mhz)
 
     def doubts(self) -> list[str]:
         """Doubts about the data, with the frequency if there are several channels."""
@@ -349,17 +300,13 @@ class MapResult(Described):
 
     def landmarks(self) -> dict[str, dict[str, np.ndarray]]:
         """Brightness, its standard deviation and, if known, its truth in some directions."""
-        nside = self.scenario.map_nside
-        mean, pixel_std, truth = (self.stacked(n) for n in ("mean", "pixel_std", "truth"))
-        values = {}
-        for name, (lon, lat) in LANDMARKS.items():
-            pixel = healpy.ang2pix(nside, lon, lat, lonlat=True)
-            theta, phi = healpy.pix2ang(nside, pixel)
-            y = synthesis_matrix(np.array([theta]), np.array([phi]), self.scenario.lmax)[0]
-            values[name] = {"mean": mean @ y, "std": pixel_std[:, pixel]}
-            if truth is not None:
-                values[name]["truth"] = truth @ y
-        return values
+        nside, truth = self.scenario.map_nside, self.stacked("truth")
+        pixels = healpy.ang2pix(nside, *np.transpose([*LANDMARKS.values()]), lonlat=True)
+        y = synthesis_matrix(*healpy.pix2ang(nside, pixels), self.scenario.lmax).T
+        values = {"mean": self.stacked("mean") @ y, "std": self.stacked("pixel_std")[:, pixels]}
+        if truth is not None:
+            values["truth"] = truth @ y
+        return {name: {n: x[:, k] for n, x in values.items()} for k, name in enumerate(LANDMARKS)}
 
     def pulls(self) -> list[PullSummary]:
         """How far the means of some directions are from the truth, in standard deviations."""
@@ -389,7 +336,7 @@ class MapResult(Described):
             tests=[] if self.single else self.fits().tests(),
             shared=self.shared_tests,
             pulls=[] if self.single else self.pulls(),
-            unknowns=[] if self.unknowns is None else self.unknowns.lines(),
+            unknowns=self.unknowns(),
             channels=list(self.channels),
             **about_run(self.seconds),
         )
@@ -399,6 +346,7 @@ class MapResult(Described):
         if joint is None:
             return None
         named = {"prior": joint_prior_sentence(self.scenario), "components": joint.prior.names}
+        named["solver"] = "direct" if joint.mode is None else "Gauss-Newton rounds"
         same = set(JointSummary.model_fields) - set(named)
         return JointSummary(**named, **{name: getattr(joint, name) for name in same})
 
@@ -417,12 +365,9 @@ class MapResult(Described):
 
     def spectra(self) -> Table:
         """power_spectra.ecsv: a row for every channel and ell."""
-        tables = {c.frequency_mhz: pd.DataFrame(c.spectra()) for c in self.channels}
-        table = Table.from_pandas(below(tables))
-        for name in table.colnames:
-            table[name].unit = "K2" if name.startswith("cl_") else None
-        table["frequency_mhz"].unit = "MHz"
-        return table
+        rows = below({c.frequency_mhz: pd.DataFrame(c.spectra()) for c in self.channels})
+        units = {name: "K2" for name in rows if name.startswith("cl_")}
+        return Table.from_pandas(rows, units=units | {"frequency_mhz": "MHz"})
 
     def maps(self) -> dict[str, Float[np.ndarray, "channels pixels"]]:
         """Cubes by name, in K: mean, std and, if the truth is known, truth and residual."""

@@ -6,7 +6,7 @@ prior learned from all. If the sky is known, so is how often error bars cover it
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated
 
@@ -169,8 +169,8 @@ def _row(one: PriorSummary, best: float) -> dict[str, object]:
     for name, part in (("instrument", one.instrument), ("prior", one.rest)):
         row |= {f"chi2_{name}": part.chi2, f"degrees_{name}": part.degrees}
     for part, error in zip(one.coverage, one.errors, strict=True):
-        numbers = part.row() | vars(error)
-        row |= {f"{part.name}: {key}": x for key, x in numbers.items() if key not in ("name", "n")}
+        errors = {"rms_error_k": error.rms_error_k, "std_over_sky": error.std_over_sky}
+        row |= {f"{part.name}: {key}": x for key, x in (part.row() | errors).items()}
     return row | {f"snr_{ell}": value for ell, value in one.snr.items()}
 
 
@@ -179,34 +179,28 @@ def prior_table(priors: Sequence[PriorSummary]) -> tuple[tuple[str, ...], list[t
     header, first = ("", *(one.name for one in priors)), priors[0]
     rows: dict[str, list[str]] = {}
 
-    def each(form: str, of: Callable[[PriorSummary], float]) -> list[str]:
-        """A cell for each prior."""
-        return [format(of(one), form) for one in priors]
-
-    def less_best(of: Callable[[PriorSummary], float]) -> list[str]:
-        values = [of(one) for one in priors]
+    def less_best(values: list[float]) -> list[str]:
         return [f"{value - max(values):.1f}" for value in values]
 
-    rows["ln evidence"] = each(".1f", lambda one: one.log_evidence)
-    rows["minus the best"] = less_best(lambda one: one.log_evidence)
-    rows["parameters learned"] = each("", lambda one: one.parameters)
+    rows["ln evidence"] = [f"{one.log_evidence:.1f}" for one in priors]
+    rows["minus the best"] = less_best([one.log_evidence for one in priors])
+    rows["parameters learned"] = [str(one.parameters) for one in priors]
     for k, held in enumerate(first.held_out):
-        left_out = f"{held.kind}s left out"
-        density = less_best(lambda one, k=k: one.held_out[k].log_density)
-        rows[f"{left_out}: ln p minus the best"] = density
-        rows[f"{left_out}: chi2 of {held.n}"] = each(".0f", lambda one, k=k: one.held_out[k].chi2)
+        left_out, parts = f"{held.kind}s left out", [one.held_out[k] for one in priors]
+        rows[f"{left_out}: ln p minus the best"] = less_best([x.log_density for x in parts])
+        rows[f"{left_out}: chi2 of {held.n}"] = [f"{x.chi2:.0f}" for x in parts]
     for key, words in (("instrument", "instrument + noise"), ("rest", "prior")):
         parts = [getattr(one, key) for one in priors]
         rows[f"chi2 {words}"] = [f"{x.chi2:.0f} of {x.degrees:.0f}" for x in parts]
     for k, part in enumerate(first.coverage):
+        parts = [one.coverage[k] for one in priors]
         for level in (0.68, 0.95):
             n = LEVELS.index(level)
-            held = each(".1%", lambda one, k=k, n=n: one.coverage[k].held[n])
-            rows[f"{level:.0%} coverage, {part.name}"] = held
-        rows[f"rms pull, {part.name}"] = each(".2f", lambda one, k=k: one.coverage[k].rms)
+            rows[f"{level:.0%} coverage, {part.name}"] = [f"{x.held[n]:.1%}" for x in parts]
+        rows[f"rms pull, {part.name}"] = [f"{x.rms:.2f}" for x in parts]
     if first.coverage:
-        rows["largest pull"] = each(".1f", lambda one: one.coverage[-1].largest)
-        rows["rms error [K]"] = each(",.0f", lambda one: one.errors[-1].rms_error_k)
+        rows["largest pull"] = [f"{one.coverage[-1].largest:.1f}" for one in priors]
+        rows["rms error [K]"] = [f"{one.errors[-1].rms_error_k:,.0f}" for one in priors]
     for ell in first.snr:
-        rows[f"SNR at ell {ell}"] = each(".1f", lambda one, ell=ell: one.snr[ell])
+        rows[f"SNR at ell {ell}"] = [f"{one.snr[ell]:.1f}" for one in priors]
     return header, [(name, *cells) for name, cells in rows.items()]

@@ -167,12 +167,11 @@ class ValidationResult:
     def summary(self) -> ValidationSummary:
         """Contents of validation.json."""
         ranks = self.ranks
-        levels = ranks.coverage().items()
         return ValidationSummary(
             passed=self.passed,
             checks=self.checks,
             modes={name: getattr(self.comparison, name).tolist() for name in OF_MODES},
-            coverage={name: {f"{p:g}": x for p, x in shares.items()} for name, shares in levels},
+            coverage=ranks.coverage(),
             p_values=dict(zip(ranks.names, ranks.p_values().tolist(), strict=True)),
         )
 

@@ -259,8 +259,8 @@ class SkySpectrum:
         else:
             errors = np.stack([c.departure.error for c in channels])
             covariance = np.einsum("frw,grw->rfg", common, common)
-            alike = correlation_of([c.departure.mean for c in channels])
-            covariance += alike * np.einsum("frw,grw->rfg", errors, errors)
+            u = np.stack([c.departure.mean / np.linalg.norm(c.departure.mean) for c in channels])
+            covariance += u @ u.T * np.einsum("frw,grw->rfg", errors, errors)
             covariance[:, *np.diag_indices(len(channels))] = std.T**2
         # an unknown that a channel lacks takes no part in its errors
         sources = tuple(dict.fromkeys(name for one in channels for name in one.sources))
@@ -351,9 +351,7 @@ class IndexMaps:
 
     @classmethod
     def of(
-        cls,
-        frequencies_mhz: Frequencies,
-        draws: Float[np.ndarray, "frequency draw cell"],
+        cls, frequencies_mhz: Frequencies, draws: Float[np.ndarray, "frequency draw cell"]
     ) -> IndexMaps:
         """Fit them to draws in K, at three or more frequencies."""
         reference = float(np.exp(np.log(frequencies_mhz).mean()))
@@ -374,21 +372,11 @@ class IndexMaps:
             ("curvature", c, positive.T),
             ("turnover", turnover, positive.T & inside & (c < 0.0)),
         ):
-            shown = np.where(known.mean(1) >= DEFINED, 1.0, np.nan)
-            weights = np.where(known, 1.0, 0.0) / np.maximum(known.sum(1), 1)[:, None]
-            mean = (weights * np.where(known, values, 0.0)).sum(1)
-            off = np.where(known, values - mean[:, None], 0.0)
-            maps |= {name: shown * mean, f"{name}_std": shown * np.sqrt((weights * off**2).sum(1))}
+            few = known.mean(1, keepdims=True) < DEFINED
+            shown = np.ma.array(np.where(known, values, 0.0), mask=~known | few)
+            maps[name] = shown.mean(1).filled(np.nan)
+            maps[f"{name}_std"] = shown.std(1).filled(np.nan)
         return cls(reference, maps)
-
-
-def correlation_of(
-    departures: Sequence[Float[np.ndarray, " white"]],
-) -> Float[np.ndarray, "channels channels"]:
-    """rho: the correlation of the posterior means of u in different channels."""
-    u = np.stack(departures)
-    norm = np.sqrt((u**2).sum(1))
-    return u @ u.T / np.outer(norm, norm)
 
 
 def brightness_temperature(

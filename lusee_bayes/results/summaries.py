@@ -139,5 +139,5 @@ class ValidationSummary(BaseModel):
     passed: bool
     checks: list[CheckSummary]
     modes: dict[str, list[float | None]]
-    coverage: dict[str, dict[str, float]]
+    coverage: dict[str, dict[float, float]]
     p_values: dict[str, float]

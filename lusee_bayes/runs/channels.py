@@ -200,12 +200,9 @@ class ChannelInformation:
             means = (components.mean, spread, draws)
             sky = joint.channel_sky(components.prior, number, information, *means, key)
         mean, covariance, drawn = sky.mean[:n], sky.covariance[:n, :n], sky.draws[:, :n]
-        report = None
-        if unknowns is not None:
-            if tied is not None:
-                unknowns = unknowns.given_all(tied, number, sky.mean, sky.covariance)
-                data = data.given(unknowns.table(mean, covariance))
-            report = unknowns.report(mean, covariance, joint=True)
+        if unknowns is not None and tied is not None:
+            unknowns = unknowns.given_all(tied, number, sky.mean, sky.covariance)
+            data = data.given(unknowns.table(mean, covariance))
         return channel_result(
             data,
             mean,
@@ -213,7 +210,6 @@ class ChannelInformation:
             drawn[:n_draws],
             information.log_likelihood(sky.draws[:n_draws]),
             drawn - mean,
-            unknowns=report,
             instrument=unknowns,
             joint=drawn,
             independent=np.asarray(self.information.reference),
@@ -492,7 +488,6 @@ class ChannelAlone:
             skies,
             information.log_likelihood(skies),
             deviations[self.n_draws :],
-            unknowns=unknowns.report(moved, left),
             instrument=unknowns,
             common=gain @ tied.root[number, at],
             **(self.figures | information.fit(moved, left) | {"information_bits": float(bits)}),

@@ -157,7 +157,7 @@ MAP = RunKind(
         Output.table("sources.csv", lambda result: result.table("fluxes")),
         Output.table("pointing.csv", lambda result: result.table("pointing", "offsets")),
         Output.table("pointing_by_day.csv", lambda result: result.table("pointing", "preferred")),
-        Output.table("unknowns.csv", lambda result: result.unknowns and result.unknowns.table),
+        Output.table("unknowns.csv", lambda result: result.table("unknowns", "table")),
         Output(
             lambda r, folder: write_reduced(folder / REDUCED, r.reduced, r.scenario.to_yaml()),
             wanted=lambda r: r.reduced is not None,

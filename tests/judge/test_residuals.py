@@ -372,13 +372,13 @@ def test_amplitudes_errors_and_gains(low_rank):
     inverse = np.linalg.inv(k)
     information = np.einsum("da,de,ea->a", templates, inverse, templates)
     pull = templates.T @ inverse @ (data - mean)
-    np.testing.assert_allclose(got.std, information**-0.5, rtol=1e-9)
-    np.testing.assert_allclose(got.amplitude, pull / information, rtol=1e-8)
+    np.testing.assert_allclose(got["std"], information**-0.5, rtol=1e-9)
+    np.testing.assert_allclose(got["value"], pull / information, rtol=1e-8)
     # chi^2 of the data without the best amount of each template
     for number in range(N):
-        left = data - mean - got.amplitude[number] * templates[:, number]
+        left = data - mean - got["value"][number] * templates[:, number]
         gain = (data - mean) @ inverse @ (data - mean) - left @ inverse @ left
-        assert got.gain[number] == pytest.approx(gain, rel=1e-7)
+        assert got["chi2_gain"][number] == pytest.approx(gain, rel=1e-7)
 
 
 def test_what_the_sky_takes_up_is_not_told():
@@ -389,7 +389,7 @@ def test_what_the_sky_takes_up_is_not_told():
     model = lb.LinearGaussian(DenseCoupling(a), prior, lb.DiagonalCovariance(np.ones(N_DATA)))
     data = rng.standard_normal(N_DATA)
     got = preferences(model.condition(data), a @ rng.standard_normal((a.shape[1], 1)))
-    assert np.isnan([got.amplitude, got.std]).all()
+    assert np.isnan([got["value"], got["std"]]).all()
 
 
 # --- groups of data left out, against A, S and N as matrices --------------------------------------

@@ -16,7 +16,7 @@ from lusee_bayes.experiment.unknowns import ALL_TOGETHER
 from lusee_bayes.judge.cube_fit import disagreement, shared_tests
 from lusee_bayes.linear.amplitudes import tie
 from lusee_bayes.report.figures.judgement import corner
-from lusee_bayes.results.sky_spectrum import UNOBSERVED, correlation_of, sky_regions
+from lusee_bayes.results.sky_spectrum import UNOBSERVED, sky_regions
 from lusee_bayes.runs import channels
 from lusee_bayes.runs.channels import Share, kernel, map_channels, tie_channels
 
@@ -207,7 +207,7 @@ def test_temperatures_of_all_channels_are_those_of_one_gaussian(cube, expected, 
         left = np.linalg.inv(np.diag(std**-2.0) + a.T @ (a / noise[:, None] ** 2))
         missed.append(left / std)
         u.append(cube.channels[k].temperatures.departure.mean)
-    alike = correlation_of(u)
+    alike = np.inner(u, u) / np.outer(*[np.linalg.norm(u, axis=1)] * 2)
     assert (alike[0, 1:] > 0.5).all()
     spectrum, first = cube.sky_spectrum(), cube.channel
     regions = sky_regions(first.highest_altitude)

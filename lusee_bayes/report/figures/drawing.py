@@ -22,7 +22,6 @@ from contourpy import contour_generator
 from jaxtyping import Float
 from matplotlib import colormaps
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colorbar import Colorbar
@@ -32,7 +31,7 @@ from matplotlib.image import AxesImage, imsave
 from matplotlib.patches import Circle, Ellipse
 from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
-from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
+from matplotlib.ticker import LogLocator, MaxNLocator
 
 from lusee_bayes.core.arrays import Pixels
 from lusee_bayes.core.harmonics import lmax_of, modes_to_map, per_mode, taper
@@ -141,11 +140,6 @@ def number_of_tick(value: float) -> str:
         return f"{value:,.6g}"
     mantissa, power = f"{value:.3e}".split("e")
     return f"{float(mantissa):g}e{int(power)}"
-
-
-def without_minor_ticks(axis: Axis) -> None:
-    """Remove the minor ticks of a logarithmic axis: over many decades they are slow to draw."""
-    axis.set_minor_locator(NullLocator())
 
 
 def side_by_side(axes: Axes, products: Sequence[str], n_times: int) -> None:

@@ -52,7 +52,7 @@ def residuals_by_product(result: MapResult) -> Figure | None:
     ):
         p = np.maximum([getattr(group, key) for group in products], LEAST_P)
         right.semilogx(p, rows, ls="", marker=marker, color=colour, ms=5, label=text)
-    drawing.without_minor_ticks(right.xaxis)
+    right.xaxis.minorticks_off()
     right.axvline(1.0, color=drawing.GREY, lw=0.5)
     right.set(xlabel=f"p-value (clipped at {LEAST_P:g})", xlim=(LEAST_P / 3, 3))
     right.grid(axis="y", lw=0.3)
@@ -91,23 +91,20 @@ def pointing_by_day(result: MapResult) -> Figure | None:
     """Draw the preferred value of every offset for each day, and for all days together."""
     if not result.single or result.channel.pointing is None:
         return None
-    preferred = result.channel.pointing.preferred
-    names = list(dict.fromkeys(preferred["offset"]))
-    size = (12, 0.6 + 2.1 * len(names))
-    figure, panels = drawing.framed(size, len(names), sharex=True, squeeze=False)
-    for axes, name in zip(panels[:, 0], names, strict=True):
-        mine = preferred[preferred["offset"] == name]
+    offsets = result.channel.pointing.preferred.groupby("offset", sort=False)
+    size = (12, 0.6 + 2.1 * len(offsets))
+    figure, panels = drawing.framed(size, len(offsets), sharex=True, squeeze=False)
+    for axes, (name, mine) in zip(panels[:, 0], offsets, strict=True):
         days, whole = mine[mine["first_day"] >= 0].dropna(), mine[mine["first_day"] < 0].dropna()
-        days = days[days["std"] < TOO_WIDE * days["std"].median()]
+        most = TOO_WIDE * days["std"].median()
+        days, whole = (rows[rows["std"] < most] for rows in (days, whole))
         middle = (days["first_day"] + days["last_day"] + 1) / 2.0
         axes.axhline(0.0, color=drawing.GREY, lw=0.8)
         style = {"fmt": "o", "ms": 3, "color": drawing.BLUE, "label": "each day"}
         axes.errorbar(middle, days["value"], days["std"], **style)
-        if len(whole):
-            value, std = float(whole["value"].iloc[0]), float(whole["std"].iloc[0])
-            if np.isfinite(std) and std < TOO_WIDE * days["std"].median():
-                axes.axhspan(value - std, value + std, color=drawing.ORANGE, alpha=0.3)
-                axes.axhline(value, color=drawing.ORANGE, label="all days together")
+        for value, std in whole[["value", "std"]].to_numpy():
+            axes.axhspan(value - std, value + std, color=drawing.ORANGE, alpha=0.3)
+            axes.axhline(value, color=drawing.ORANGE, label="all days together")
         kind, _, unit = name.rpartition("_")
         axes.set_ylabel(f"{kind.replace('_', ' ')} [{UNITS.get(unit, unit)}]")
     panels[0, 0].legend(loc="upper right", ncols=2, frameon=False)
@@ -123,15 +120,14 @@ WIDE = 3.0
 
 def unknowns_by_frequency(result: MapResult) -> Figure | None:
     """Draw every unknown of all channels with its error, its prior and, if known, the truth."""
-    if result.single or result.unknowns is None:
+    table = result.table("unknowns", "table")
+    if result.single or table is None:
         return None
-    table = result.unknowns.table
-    names = list(dict.fromkeys(table["unknown"]))
-    n_rows = -(-len(names) // PANELS_IN_A_ROW)
+    unknowns = table.groupby("unknown", sort=False)
+    n_rows = -(-len(unknowns) // PANELS_IN_A_ROW)
     size = (13, 0.6 + 2.5 * n_rows)
     figure, panels = drawing.framed(size, n_rows, PANELS_IN_A_ROW, squeeze=False)
-    for axes, name in zip(panels.flat, names, strict=False):
-        rows = table[table["unknown"] == name]
+    for axes, (name, rows) in zip(panels.flat, unknowns, strict=False):
         columns = ("frequency_mhz", "value", "std", "prior", "prior_std")
         f, value, std, prior, before = (rows[column].to_numpy() for column in columns)
         axes.fill_between(f, prior - before, prior + before, color=drawing.GREY, alpha=0.25, lw=0)
@@ -144,7 +140,7 @@ def unknowns_by_frequency(result: MapResult) -> Figure | None:
         axes.set(title=name, xlabel="frequency [MHz]", ylabel=rows["unit"].iloc[0])
         if prior.min() > 0.0 and prior.max() > WIDE * prior.min():
             axes.set_yscale("log")
-    for axes in panels.flat[len(names) :]:
+    for axes in panels.flat[len(unknowns) :]:
         axes.set_axis_off()
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper right", ncols=3, frameon=False)
@@ -241,9 +237,10 @@ def time_line(reduced: Reduced) -> Figure:
 
 def waterfall(result: MapResult) -> Figure | None:
     """Draw the 16 products of the map's band over time, before and after flags."""
-    reduced, band = result.reduced, result.band
+    reduced = result.reduced
     if not result.single or reduced is None:
         return None
+    band = reduced.band(result.channel.frequency_mhz)
     figure, panels = drawing.framed((13, 9), 4, 4, sharex=True)
     days = _days(reduced)[np.searchsorted(reduced.bin_of, np.arange(reduced.values.shape[2]))]
     n_bins = reduced.values.shape[2]
@@ -254,10 +251,12 @@ def waterfall(result: MapResult) -> Figure | None:
         axes: Axes = panels[i, j]
         kept = reduced.values[band, number]
         flagged = ~np.isfinite(kept) | used_in_part
+        axes.margins(y=0.1)
         axes.plot(days, kept, ".", ms=3, color=drawing.BLUE, label="after flags")
+        limits = axes.get_ylim()
         style = {"ms": 4, "color": drawing.ORANGE, "label": "before flags, where flagged"}
         axes.plot(days[flagged], reduced.before[band, number][flagged], ".", **style)
-        axes.set_ylim(*_range(kept[np.isfinite(kept)]))
+        axes.set_ylim(limits)
         axes.set_title(product.label, fontsize=9)
         drawing.plain_ticks(axes, 3)
         axes.yaxis.set_major_formatter(lambda value, _: f"{value:.3g}")
@@ -306,9 +305,8 @@ def _gains(left: Axes, reduced: Reduced) -> None:
                 left.errorbar(f, value, error, fmt="o", ms=4, capsize=3, color=colour)
     for f in reduced.frequencies_mhz:
         left.axvline(f, color=drawing.GREY, lw=0.5, zorder=0)
-    with_errors = bool((curves.std > 0).any())
-    largest = float(np.nanmax(curves.std / curves.gain)) if with_errors else 0.0
-    words = f"{100 * largest:.2g} % or better" if with_errors else "unknown"
+    largest = float(np.nanmax(curves.std / curves.gain))
+    words = f"{100 * largest:.2g} % or better" if largest > 0.0 else "unknown"
     left.set(xlabel="frequency [MHz]", ylabel="counts for 1 nV²/Hz", title=f"Gain errors: {words}")
     left.legend(frameon=False, ncols=2, fontsize=8)
 
@@ -346,12 +344,3 @@ def _days(reduced: Reduced) -> Float[np.ndarray, " rows"]:
 
 def _first(reduced: Reduced) -> str:
     return str(reduced.observation.times[0].isot)[:16]
-
-
-def _range(values: Float[np.ndarray, " kept"]) -> tuple[float, float]:
-    """Bounds of the kept values, with a margin of a tenth."""
-    if not values.size:
-        return 0.0, 1.0
-    low, high = float(values.min()), float(values.max())
-    edge = 0.1 * (high - low) or max(abs(high), 1e-30)
-    return low - edge, high + edge

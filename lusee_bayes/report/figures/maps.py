@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import astuple
 from itertools import cycle
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullLocator
+from matplotlib.ticker import LogLocator
 
 from lusee_bayes.core.arrays import Modes
 from lusee_bayes.core.harmonics import lmax_of, modes_to_map, taper_fwhm_deg
@@ -155,16 +156,14 @@ def channel_panels(channel: ChannelResult) -> dict[str, tuple]:
     All except the standard deviation are smoothed with the beam of :mod:`.drawing`.
     """
     nside, norms = max(NSIDE, channel.nside), scales(channel)
-    mean, panels = drawing.shown(channel.mean, nside), {}
+    mean = drawing.shown(channel.mean, nside)
+    panels = {"posterior mean": (mean, norms["temperature"])}
     if channel.truth is not None:
         truth = drawing.shown(channel.truth, nside)
         percent = 100.0 * (mean - truth) / mean.mean()
-        panels["truth"] = truth, norms["temperature"]
+        panels = {"truth": (truth, norms["temperature"]), **panels}
         panels["mean - truth"] = percent, norms["residual"], DIVERGING, "% of the mean sky"
-    panels["posterior mean"] = mean, norms["temperature"]
-    panels["posterior standard deviation"] = channel.pixel_std, norms["std"]
-    order = ("truth", "posterior mean", "mean - truth", "posterior standard deviation")
-    return {title: panels[title] for title in order if title in panels}
+    return panels | {"posterior standard deviation": (channel.pixel_std, norms["std"])}
 
 
 def channel_map(channel: ChannelResult) -> Figure:
@@ -194,7 +193,8 @@ def map_fidelity(channel: ChannelResult) -> Panels:
     if "snr" in spectra:
         panels[0].axhline(0.0, color=GREY, lw=0.8)
         panels[1].axhline(1.0, color=GREY, lw=0.8, ls=":")
-        drawing.without_minor_ticks(panels[1].yaxis)
+        # over many decades they are slow to draw
+        panels[1].yaxis.minorticks_off()
         cross = ell_cross(spectra["snr"])
         if cross is not None:
             panels[1].axvline(cross, color=ORANGE, lw=1, ls="--", label=f"first below 1: {cross}")
@@ -235,7 +235,7 @@ def sky_spectra(channel: ChannelResult) -> Figure:
         if name in columns:
             axes.semilogy(ell, columns[name], color=colour, ls=line, label=label)
     axes.set(xlabel=r"multipole $\ell$", ylabel=r"$C_\ell$ [K$^2$]", xlim=(0, ell[-1]))
-    drawing.without_minor_ticks(axes.yaxis)
+    axes.yaxis.minorticks_off()
     axes.legend(frameon=False)
     axes.set_title(f"Power at {channel.frequency_mhz:g} MHz")
     return figure
@@ -254,7 +254,7 @@ def instrument_share(result: MapResult) -> Panels | None:
     """Share of each pixel's variance that comes from unknowns of the instrument."""
     with_theta = [channel for channel in result.channels if channel.theta is not None]
     figures = {}
-    for channel in [with_theta[k] for k in _few_of(len(with_theta), SHOWN)] if with_theta else []:
+    for channel in (with_theta[k] for k in _few_of(len(with_theta), SHOWN)):
         share, title = 100.0 * channel.theta.pixel_share, f"{channel.frequency_mhz:g} MHz"
         scale = Normalize(0.0, max(float(np.percentile(share, 99.5)), 1e-3))
         options = {"altitude": channel.highest_altitude, "unit": "% of the variance"}
@@ -271,11 +271,10 @@ def maps_of_runs(runs: Sequence[FinishedRun]) -> Panels:
     level, figures = drawing.temperatures(np.concatenate(means)), {}
     for run, mean in zip(runs, means, strict=True):
         panels = {
-            "posterior mean": (mean, level),
-            "standard deviation": (run.channel.pixel_std, spread),
+            f"{run.name}: posterior mean": (mean, level),
+            f"{run.name}: standard deviation": (run.channel.pixel_std, spread),
         }
-        named = {f"{run.name}: {title}": panel for title, panel in panels.items()}
-        figures |= _figures(named, run.channel)
+        figures |= _figures(panels, run.channel)
     return figures
 
 
@@ -288,10 +287,8 @@ def channel_spectra(cube: MapResult) -> Panels:
         axes.errorbar(f, mean, std, color=BLUE, fmt=".", ms=4, lw=1, label="posterior")
         if "truth" in values:
             axes.plot(f, values["truth"], color=ORANGE, ls="--", lw=1.2, label="truth")
-        axes.set(title=name, yscale="log", xscale="log", xlim=(0.93 * f[0], 1.07 * f[-1]))
-        _frequency_ticks(axes)
-        axes.set(xlabel="frequency [MHz]", ylabel="brightness temperature [K]")
-        axes.legend(frameon=False)
+        axes.set(title=name, yscale="log", ylabel="brightness temperature [K]")
+        _over_frequencies(axes, f)
     return figures
 
 
@@ -352,35 +349,23 @@ def sky_spectrum(cube: MapResult) -> Panels | None:
 def _over_frequencies(axes: Axes, f: Frequencies) -> None:
     axes.legend(frameon=False, fontsize="small")
     axes.set(xlabel="frequency [MHz]", xscale="log", xlim=(0.93 * f.min(), 1.07 * f.max()))
-    _frequency_ticks(axes)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.xaxis.minorticks_off()
 
 
 def spectral_index(cube: MapResult) -> Panels | None:
     """Maps of the spectral index, its error, and the turnover where the draws agree on one."""
     if (found := cube.index_maps()) is None:
         return None
-    at = f"at {found.reference_mhz:.3g} MHz"
-    titles = {
-        f"index {at}": ("index", ""),
-        f"error of the index {at}": ("index_std", ""),
-        "turnover": ("turnover", "MHz"),
-    }
-    return {
-        title: drawing.sky_figure(
-            title,
-            found.maps[name],
-            Normalize(*np.nanpercentile(found.maps[name], (2, 98))),
-            unit=unit,
-        )
-        for title, (name, unit) in titles.items()
-        if np.isfinite(found.maps[name]).any()
-    }
-
-
-def _frequency_ticks(axes: Axes) -> None:
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.xaxis.set_minor_locator(NullLocator())
+    at, figures = f"at {found.reference_mhz:.3g} MHz", {}
+    titles = {"index": f"index {at}", "index_std": f"error of the index {at}"}
+    for name, title in (titles | {"turnover": "turnover"}).items():
+        pixels, unit = found.maps[name], "MHz" if name == "turnover" else ""
+        if np.isfinite(pixels).any():
+            scale = Normalize(*np.nanpercentile(pixels, (2, 98)))
+            figures[title] = drawing.sky_figure(title, pixels, scale, unit=unit)
+    return figures
 
 
 def fidelity(cube: MapResult) -> Figure | Panels:
@@ -390,9 +375,8 @@ def fidelity(cube: MapResult) -> Figure | Panels:
     """
     if len(cube.channels) == 1:
         return map_fidelity(cube.channel)
-    snr, alone = cube.snr(), cube.snr(independent=True)
-    with_truth = snr is not None
-    values = snr if with_truth else cube.stacked("prior_fraction")
+    with_truth = cube.stacked("snr") is not None
+    values = cube.stacked("snr" if with_truth else "prior_fraction")
     label = r"$\mathrm{SNR}_\ell$" if with_truth else "fraction of the variance from the prior"
     norm = LogNorm(0.3, 30.0) if with_truth else Normalize(0.0, 1.0)
     figure, (left, right) = drawing.framed((12, 4.4), 1, 2)
@@ -404,9 +388,10 @@ def fidelity(cube: MapResult) -> Figure | Panels:
     left.set(xlabel=r"multipole $\ell$", ylabel="frequency [MHz]", title=label)
     figure.colorbar(image, ax=left, label=label, extend="both" if with_truth else "neither")
     right.plot(ell[1:], values[:, 1:].mean(0), color=BLUE, label="this run")
-    if alone is not None:
+    if with_truth and cube.stacked("independent") is not None:
+        alone = np.mean([channel.spectra()["snr_independent"] for channel in cube.channels], 0)
         style = {"color": ORANGE, "ls": "--", "label": "each channel independently"}
-        right.plot(ell[1:], alone[:, 1:].mean(0), **style)
+        right.plot(ell[1:], alone[1:], **style)
     if with_truth:
         right.set_yscale("log")
         right.axhline(1.0, color=GREY, lw=0.8, ls=":")
@@ -420,9 +405,8 @@ def chi2(cube: MapResult) -> Figure | None:
     if cube.single:
         return None
     figure, axes = drawing.framed((8, 4))
-    fits = cube.fits()
-    ratio, width = fits.chi2 / fits.degrees, np.sqrt(2.0 / fits.degrees)
-    mhz = cube.frequencies_mhz
+    chi2, degrees = np.transpose([astuple(channel.instrument) for channel in cube.channels])
+    ratio, width, mhz = chi2 / degrees, np.sqrt(2.0 / degrees), cube.frequencies_mhz
     axes.fill_between(mhz, 1 - 2 * width, 1 + 2 * width, color=GREY, alpha=0.3, lw=0)
     axes.axhline(1.0, color=GREY, lw=0.8)
     axes.plot(mhz, ratio, "o", ms=4, color=BLUE)

@@ -53,7 +53,12 @@ def forecasts(planned: Sequence[Forecast]) -> Figure:
         axis.margins(x=0.14)
         axis.tick_params(axis="y", length=0)
         axis.spines[["top", "right", "left"]].set_visible(False)
-    _label_rows(axes[0], rows)
+    labels = [name or family for family, name in rows]
+    axes[0].set_yticks(list(rows.values()), labels, fontsize=9)
+    axes[0].set_ylim(max(rows.values()) + 0.7, -0.7)  # from the top down
+    for (_, name), tick in zip(rows, axes[0].get_yticklabels(), strict=True):
+        if not name:
+            tick.set(fontweight="bold", color=GREY)
     if len(sources) > 1:
         handles = axes[0].get_legend_handles_labels()
         figure.legend(*handles, loc="outside lower center", ncols=4, frameon=False)
@@ -94,17 +99,6 @@ def _marks(
     reference = getattr(mine[0], name)
     if reference is not None:
         axes.axvline(reference, color=colour, lw=0.9, ls="--", zorder=0)
-
-
-def _label_rows(axes: Axes, rows: Rows) -> None:
-    """Label every row from the top down, with the families in bold."""
-    axes.set_yticks(list(rows.values()), [name or family for family, name in rows])
-    axes.set_ylim(max(rows.values()) + 0.7, -0.7)
-    for (_, name), tick in zip(rows, axes.get_yticklabels(), strict=True):
-        tick.set_fontsize(9)
-        if not name:
-            tick.set_fontweight("bold")
-            tick.set_color(GREY)
 
 
 def _title(planned: Sequence[Forecast], sources: Sequence[str]) -> str:
@@ -172,14 +166,12 @@ def _coverage(axes: Axes, result: PriorComparison) -> None:
 def _errors(axes: Axes, result: PriorComparison) -> None:
     for j, (one, channel) in enumerate(zip(result.priors, result.channels, strict=True)):
         colour, line = COLOURS[j % len(COLOURS)], LINES[j % len(LINES)]
-        expected = power_spectrum(channel.std)[1:]
-        ell = np.arange(1, len(expected) + 1)
-        if channel.truth is None:
-            axes.semilogy(ell, expected, color=colour, ls=line, lw=1.3, label=one.name)
-            continue
-        axes.semilogy(ell, expected, color=colour, ls=":", lw=1.0)
-        error = power_spectrum(channel.mean - channel.truth)[1:]
-        axes.semilogy(ell, error, color=colour, ls="-", lw=1.3, label=one.name)
+        error = power_spectrum(channel.std)[1:]
+        ell = np.arange(1, len(error) + 1)
+        if channel.truth is not None:
+            axes.semilogy(ell, error, color=colour, ls=":", lw=1.0)
+            error, line = power_spectrum(channel.mean - channel.truth)[1:], "-"
+        axes.semilogy(ell, error, color=colour, ls=line, lw=1.3, label=one.name)
     if result.known_sky:
         truth = power_spectrum(result.channels[0].truth)[1:]
         axes.semilogy(ell, truth, color=GREY, lw=1.0, label="true sky")

@@ -13,7 +13,6 @@ from matplotlib import pyplot
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from lusee_bayes.core.harmonics import mode_numbers
 from lusee_bayes.judge.coverage import LEVELS
 from lusee_bayes.report.figures import drawing
 from lusee_bayes.results.sample_result import SampleResult
@@ -161,7 +160,6 @@ def traces(run: SampleResult) -> Figure:
 def comparison(result: Comparison) -> Figure:
     """HMC compared with the analytic posterior: means, variances, covariance, effective sizes."""
     figure, ((means, variances), (covariance, sizes)) = drawing.framed((11, 7), 2, 2)
-    ell, _ = mode_numbers(round(np.sqrt(len(result.mean_z))) - 1)
     limit = result.checks[0].upper
     means.plot(result.mean_z, **DOTS)
     for bound in (-limit, limit):
@@ -169,7 +167,7 @@ def comparison(result: Comparison) -> Figure:
     means.set(xlabel="mode", ylabel="difference of means [Monte Carlo error]")
     means.set_title("Means of every mode")
     ratio, error = result.variance_ratio, result.variance_error
-    variances.errorbar(np.arange(len(ell)), ratio, error, elinewidth=0.3, **DOTS)
+    variances.errorbar(np.arange(len(ratio)), ratio, error, elinewidth=0.3, **DOTS)
     variances.axhline(1.0, color=drawing.GREY, lw=0.8)
     variances.set(xlabel="mode", ylabel="variance: draws / analytic", title="Variances")
     rank = np.arange(1, len(result.eigenvalues) + 1)
