@@ -32,7 +32,7 @@ from lusee_bayes.core.harmonics import n_modes, per_mode, sum_over_m, synthesis_
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.linalg import checked_cholesky, scaled
 from lusee_bayes.core.sphere_grid import SphereGrid
-from lusee_bayes.priors.families import Hyperprior, Member, Parameters, PriorFamily, SpectrumBasis
+from lusee_bayes.priors.families import Hyperprior, Member, Parameters, PriorFamily, spectrum_basis
 from lusee_bayes.priors.surveys import Survey
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, EXTENDED_OBJECTS, PointSource, galaxy_map
 from lusee_bayes.sky.prior import PIVOT, DensePrior
@@ -168,14 +168,15 @@ class SmoothedTemplate:
         return np.log(healpy.get_interp_val(smooth, theta, phi)) - self.mean_log
 
 
-def expected_covariates() -> tuple[Covariates, Covariates]:
-    """Return centre and width of the prior of the covariates' coefficients."""
+def hyperprior_of(centre: Parameters, width: Parameters) -> Hyperprior:
+    """The prior of all parameters, given that of the spectrum's."""
     ell = np.sqrt(np.arange(1, n_modes(FIELD_LMAX))).astype(int)
     named = [POWER_WIDTH, POWER_WIDTH, PLANE_WIDTH, TILTS_WIDTH, TILTS_WIDTH]
-    width = np.concatenate([named, FIELD_WIDTH / np.sqrt(2.0 * ell + 1.0)])
-    centre = np.zeros(len(width))
-    centre[0] = TEMPLATE_POWER
-    return centre, width
+    of_field = FIELD_WIDTH / np.sqrt(2.0 * ell + 1.0)
+    widths = np.concatenate([width, [SOURCES_WIDTH], named, of_field])
+    others = np.zeros(len(widths) - len(centre))
+    others[1] = TEMPLATE_POWER
+    return Hyperprior(np.concatenate([centre, others]), widths, N_CELLS)
 
 
 @dataclass(frozen=True)
@@ -190,11 +191,9 @@ class LocalScales(PriorFamily):
         Template, monopole and extended objects, times their standard deviations, in K.
     sources : (modes, sources) array
         Catalogued sources, in K.
-    spectrum : SpectrumBasis
-        C_ell.
+    spectrum : (ells, parameters) array
+        ln C_ell as a linear function of its parameters.
     bands : tuple of Band
-    covariates : (centre, width) arrays
-        Prior of the covariates' coefficients.
     white : float
         C_ell of white errors of surveys, in K^2.
     """
@@ -202,17 +201,10 @@ class LocalScales(PriorFamily):
     mean: Modes
     wide: Float[np.ndarray, "modes wide"]
     sources: Float[np.ndarray, "modes sources"]
-    spectrum: SpectrumBasis
+    spectrum: Float[np.ndarray, "ells spectrum"]
     bands: tuple[Band, ...]
-    covariates: tuple[Covariates, Covariates]
+    hyperprior: Hyperprior
     white: float
-
-    @property
-    def hyperprior(self) -> Hyperprior:
-        centre, width = self.covariates
-        centres = np.concatenate([self.spectrum.centre, [0.0], centre])
-        widths = np.concatenate([self.spectrum.width, [SOURCES_WIDTH], width])
-        return Hyperprior(centres, widths, N_CELLS)
 
     def at(self, parameters: Parameters) -> LocalScalesMember:
         return LocalScalesMember(self, *self._split(parameters))
@@ -223,7 +215,7 @@ class LocalScales(PriorFamily):
         strengths = []
         for band, strength in zip(self.bands, member.strengths, strict=True):
             weight = band.window**2 * (2.0 * np.arange(len(band.window)) + 1.0)
-            spectrum = (weight / weight.sum()) @ self.spectrum.matrix @ ells
+            spectrum = (weight / weight.sum()) @ self.spectrum @ ells
             rows = spectrum[None] + band.covariates @ covariates
             if self.white:  # the data only have an upper limit of the level, which is fitted later
                 rows[:, 0] = 0.0
@@ -236,12 +228,12 @@ class LocalScales(PriorFamily):
 
     def start_from(self, coarse, parameters):
         power, *others = coarse._split(parameters)
-        return np.concatenate([power, np.zeros(len(self.spectrum.centre) - len(power)), *others])
+        return np.concatenate([power, np.zeros(self.spectrum.shape[1] - len(power)), *others])
 
     def _split(self, parameters: np.ndarray) -> list[np.ndarray]:
         """Parameters of the spectrum, the sources, the covariates and the cells."""
-        n_spectrum, n_covariates = len(self.spectrum.centre), len(self.covariates[0])
-        return np.split(parameters, np.cumsum([n_spectrum, 1, n_covariates]))
+        sizes = self.spectrum.shape[1], 1, self.bands[0].covariates.shape[1]
+        return np.split(parameters, np.cumsum(sizes))
 
 
 def _covariance(family: LocalScales, flux: float, texture: ModesMatrix) -> ModesMatrix:
@@ -286,7 +278,7 @@ class LocalScalesMember(Member):
     @cached_property
     def spectrum(self) -> Ells:
         """C_ell, in K^2."""
-        return np.exp(self.family.spectrum.matrix @ self.power)
+        return np.exp(self.family.spectrum @ self.power)
 
     @cached_property
     def strengths(self) -> Strengths:
@@ -339,7 +331,7 @@ class LocalScalesMember(Member):
             covariates += (by_point @ (band.covariates * area[:, None])).T
             cells += band.cells.multiply(area[:, None]).T @ by_point.T
         fluxes = np.exp(self.fluxes[0]) * sources[None]
-        return np.concatenate([family.spectrum.matrix.T @ ells, fluxes, covariates, cells])
+        return np.concatenate([family.spectrum.T @ ells, fluxes, covariates, cells])
 
 
 def embedded_local_scales(
@@ -379,7 +371,7 @@ def embedded_local_scales(
         scale, zero = of_scale * mean, of_zero * (np.arange(len(mean)) == 0)
     wide = np.stack([scale, zero, *weights, *extended], axis=1)
     of_sources = np.reshape(modes, (-1, n_modes(lmax))).T
-    spectrum = SpectrumBasis.around(np.exp(smoothed[0].mean_log), lmax)
+    spectrum, *expected = spectrum_basis(np.exp(smoothed[0].mean_log), lmax)
     bands = tuple(Band.of(window, *smoothed) for window in windows(lmax))
     white = WHITE * mean[0] ** 2 if surveys else 0.0
-    return LocalScales(mean, wide, of_sources, spectrum, bands, expected_covariates(), white)
+    return LocalScales(mean, wide, of_sources, spectrum, bands, hyperprior_of(*expected), white)

@@ -134,10 +134,10 @@ def test_nothing_settles_without_steps(case, monkeypatch):
     monkeypatch.setattr("lusee_bayes.priors.learning.MAX_STEPS", 0)
     refuse("not converge.*0 steps", learning.learn, case.family, case.information)
     # a family far from its own start is still found
-    far = replace(case.family, log_monopole=case.family.log_monopole + 1.0)
+    far = replace(case.family.hyperprior, centre=case.truth + 0.5 * case.family.hyperprior.width)
     monkeypatch.undo()
-    found = learning.learn(far, case.information).parameters
-    assert (found != far.hyperprior.start()).any()
+    found = learning.learn(replace(case.family, hyperprior=far), case.information).parameters
+    assert (found != far.start()).any()
 
 
 def test_a_root_of_what_rounding_has_spoilt():
@@ -266,10 +266,11 @@ class Member:
 SCALE = 1e3
 
 
+PRIOR = Hyperprior(np.array([0.4]), np.array([1.0]))
+
+
 class Strength(IsotropicFamily):
     """S = exp(theta) s^2 1."""
-
-    hyperprior = Hyperprior(np.array([0.4]), np.array([1.0]))
 
     def at(self, parameters):
         return Member(np.exp(parameters[0]) * SCALE**2 * np.eye(SIZE))
@@ -288,7 +289,7 @@ def scores_of(hyperprior, theta, covariance) -> learning.Scores:
 @pytest.fixture(scope="module")
 def one_parameter():
     """Modes that are seen with noise from a tenth to ten times their strength; theta = 0.4 +- 1."""
-    family, width = Strength.around(2e4, LOW), 1.0
+    family, width = Strength(np.ones((LOW + 1, 1)), PRIOR), 1.0
     noise = np.geomspace(0.1, 10.0, SIZE) * SCALE
     seen = 2.0 * SCALE * np.ones(SIZE)
     unknown = [np.asarray(0.0)] * 3
@@ -346,7 +347,7 @@ class Hopeless(Strength):
 
 
 def test_parameters_without_a_covariance_are_drawn_anew_and_then_refused():
-    known = weakly_known(Strength.around(2e4, LOW), 1.0)
-    given = Hopeless.around(2e4, LOW), *known, jax.random.key(1), 3
+    plain, hopeless = (kind(np.ones((LOW + 1, 1)), PRIOR) for kind in (Strength, Hopeless))
+    given = hopeless, *weakly_known(plain, 1.0), jax.random.key(1), 3
     words = "cannot draw skies with uncertain prior parameters"
     refuse(words, learning.draws_with_parameters, *given)
