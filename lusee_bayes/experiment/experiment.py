@@ -128,7 +128,8 @@ def build(
         (:func:`.require_plausible`), or if the prior's parameters do not converge.
     """
     stages = stages or Stages()
-    return _learned(_fitting(observed(scenario, data, stages), stages), stages, earlier, values)
+    experiment = _fitting(observed(scenario, data, stages), stages)
+    return _learned(experiment, Around(experiment.data, values=values), stages, earlier)
 
 
 def observed(
@@ -147,7 +148,12 @@ def observed(
     scenario = scenario.with_section("noise", above_lmax=above)
     try:
         if above is not None and data is not None:
-            _require_room(data.layout.size, above.top(scenario.lmax))
+            n_data, top = data.layout.size, above.top(scenario.lmax)
+            if n_data * n_modes(top) > MOST_ABOVE:
+                raise InputError(
+                    f"with {n_data:,} data, the sky up to lmax = {top} takes too much memory; "
+                    "average the data, or raise lmax"
+                )
         setup = set_up(scenario, data, stages)
     except InputError as error:
         if above is None or data is None:
@@ -168,15 +174,6 @@ def observed(
     return Experiment(setup, data, tuple(doubts))
 
 
-def _require_room(n_data: int, lmax: int) -> None:
-    """Raise InputError if a matrix of data and modes is too large."""
-    if n_data * n_modes(lmax) > MOST_ABOVE:
-        raise InputError(
-            f"with {n_data:,} data, the sky up to lmax = {lmax} takes too much memory; average the "
-            "data, or raise lmax"
-        )
-
-
 def _fitting(experiment: Experiment, stages: Stages) -> Experiment:
     """Remove inconsistent data from an experiment with flight data."""
     section, data = experiment.scenario.flight, experiment.data
@@ -193,19 +190,15 @@ def _fitting(experiment: Experiment, stages: Stages) -> Experiment:
 
 
 def _learned(
-    experiment: Experiment,
-    stages: Stages,
-    earlier: Information | None = None,
-    values: Mapping[str, float] | None = None,
+    experiment: Experiment, start: Around, stages: Stages, earlier: Information | None = None
 ) -> Experiment:
-    setup, data = experiment.setup, experiment.data
-    start = None if values is None else Around(data, values=values)
+    setup = experiment.setup
     if setup.family is None:
-        if start is not None:
-            experiment = replace(experiment, inference=settled(setup, data, start))
-        return experiment
+        if start.values is None:
+            return experiment
+        return replace(experiment, inference=settled(setup, experiment.data, start))
     with rounds_of(experiment, stages, "prior") as report:
-        setup, inference = with_learned_prior(setup, data, earlier, start, report)
+        setup, inference = with_learned_prior(setup, start, earlier, report)
     return replace(experiment, setup=setup, learned=inference.learned, inference=inference)
 
 
@@ -236,7 +229,7 @@ def under_sky(setup: Setup, source: SkySource, seed: int) -> Experiment:
         modes = np.asarray(whole.modes)[seen.prior.size :]
         seen = replace(seen, above=replace(seen.above, modes=modes))
     data = simulate(seen).with_truth_up_to(scenario.lmax)
-    return _learned(Experiment(seen, data), Stages())
+    return _learned(Experiment(seen, data), Around(data), Stages())
 
 
 def rounds_of(experiment: Experiment, stages: Stages, name: str) -> AbstractContextManager:
@@ -352,9 +345,8 @@ def posterior_draws(
         In K.
     """
     key, learned = draw_key(experiment.scenario), experiment.learned
-    if learned is not None and learned.fits:
-        family = experiment.setup.family
-        return draws_with_parameters(family, learned, information(), key, n)
+    if learned is not None and learned.settled and learned.noise_factor == 1.0:
+        return draws_with_parameters(experiment.setup.family, learned, information(), key, n)
     return posterior.sample(key, n)
 
 

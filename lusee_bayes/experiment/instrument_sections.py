@@ -19,7 +19,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from lusee_bayes.core.section import Angle, Positive, Section, Temperature, kinds_of, one_of
 from lusee_bayes.instrument.beams.fields import Interpolation
-from lusee_bayes.instrument.beams.grid import read_beam_grid, read_grid_table
+from lusee_bayes.instrument.beams.grid import read_beam_grid
 from lusee_bayes.instrument.beams.luseepy_files import read_response, read_scalar_beam
 from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith
 from lusee_bayes.instrument.beams.sampled import beam_kind, read_sampled
@@ -31,7 +31,6 @@ from lusee_bayes.instrument.beams.source import (
     read_receiver,
 )
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.products import N_ANTENNAS
 from lusee_bayes.instrument.schedule import CYCLE_DAYS, Interval, Run, read_schedule
 from lusee_bayes.instrument.times import Timestamp
 
@@ -120,17 +119,13 @@ class ObservationSection(Section):
 
     def observation(self) -> Observation:
         """Site, times and turntable angles."""
-        return _observation(self, self._intervals)
+        return _observation(self, () if self.schedule is None else read_schedule(self.schedule))
 
     def n_samples(self) -> int:
         """Count the samples, including those by day."""
         if self.schedule is None:
             return sum(int(run.cycles * CYCLE_DAYS * 86400.0 // self.step_s) for run in self.runs)
-        return sum(interval.n_samples(self.step_s) for interval in self._intervals)
-
-    @property
-    def _intervals(self) -> tuple[Interval, ...]:
-        return () if self.schedule is None else read_schedule(self.schedule)
+        return sum(interval.n_samples(self.step_s) for interval in read_schedule(self.schedule))
 
 
 @lru_cache(maxsize=2)
@@ -229,10 +224,8 @@ class MonopoleBeamSection(BaseBeamSection):
 
     is_file: ClassVar[bool] = False
     has_parameters: ClassVar[bool] = True
-    # name for file headers, and number of antennas
+    # name for file headers
     label: ClassVar[str] = "monopole"
-    n_ports: ClassVar[int] = N_ANTENNAS
-
     errors: ClassVar[Mapping[str, float]] = {
         "surface_permittivity": 0.05,
         "deep_permittivity": 0.05,
@@ -321,11 +314,6 @@ class ScalarBeamSection(_LuseepySection):
     taper: bool = True
     rotations_deg: Annotated[tuple[Angle, ...], Field(min_length=1)] = (0.0, 90.0, 180.0, 270.0)
 
-    @property
-    def n_ports(self) -> int:
-        """Number of ports."""
-        return len(self.rotations_deg)
-
     def source(self) -> BeamSource:
         """The pattern of the file, rotated to every angle."""
         beam, own = read_scalar_beam(self.file), self.model_dump(include={"taper", "rotations_deg"})
@@ -349,7 +337,6 @@ class ResponseSection(_LuseepySection):
         Temperature of the antennas, whose losses add thermal emission.
     """
 
-    n_ports: ClassVar[int] = N_ANTENNAS
     model: Literal["response"] = "response"
     receiver: ReceiverSection | None = None
     antenna_temperature_k: Temperature = 0.0
@@ -376,11 +363,6 @@ class SampledBeamSection(_FileSection):
     model: Literal["sampled"] = "sampled"
     normalise: bool | None = None
 
-    @property
-    def n_ports(self) -> int:
-        """Number of ports."""
-        return read_sampled(self.file).n_ports
-
     def source(self) -> BeamSource:
         """The beams of the file."""
         asked = self.model_dump(exclude={"model", "file", "exact"})
@@ -402,11 +384,6 @@ class GridBeamSection(ScalarBeamSection, ResponseSection, SampledBeamSection):
 
     model: Literal["grid"] = "grid"
     values: dict[str, float] = Field(default_factory=dict)
-
-    @property
-    def n_ports(self) -> int:
-        """Number of ports."""
-        return self.of_file(read_grid_table(self.file)[0][0]).n_ports
 
     def source(self) -> BeamSource:
         """The beams of all files, interpolated."""

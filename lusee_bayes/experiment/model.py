@@ -340,10 +340,5 @@ def simulate(setup: Setup) -> Visibilities:
     noise = model.noise.sample(jax.random.key(setup.scenario.seed))
     if setup.above is not None:
         truth = np.concatenate([truth, setup.above.modes])
-    return Visibilities(
-        model.predict(setup.sky.modes) + noise,
-        setup.layout,
-        setup.observation,
-        setup.scenario.frequency_mhz,
-        truth,
-    )
+    where = setup.layout, setup.observation, setup.frequency_mhz
+    return Visibilities(model.predict(setup.sky.modes) + noise, *where, truth)

@@ -7,7 +7,7 @@ module also provides priors by name, to compare how probable the data are under 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -120,8 +120,7 @@ class Inference:
     @property
     def drifts(self) -> tuple[GainDrifts, ...]:
         """Drifts of the gains in N, if any."""
-        parts = (s.systematic for s in self.systematics)
-        return tuple(one for one in parts if isinstance(one, GainDrifts))
+        return tuple(s.systematic for s in self.systematics if isinstance(s.systematic, GainDrifts))
 
     @property
     def offsets(self) -> Expanded | None:
@@ -236,18 +235,15 @@ def settled(
     report = report or (lambda rounds, remark: None)
     start = start or Around(data)
     if start.sky is None:
-        if (few := _fewer(setup, data)) is not None:
-            inference, step = _nearby(*few, beginning(*few, start.values), report)
-            fixed = {
-                name
-                for s in inference.expanded
-                if not s.systematic.moves
-                for name in s.systematic.names
-            }
+        if (few := _fewer(setup, start)) is not None:
+            some, start = few
+            inference, step = _nearby(some, _beginning(some, start), report)
+            terms = (s.systematic for s in inference.expanded)
+            fixed = {name for one in terms if not one.moves for name in one.names}
             values = (inference.around.values or {}).items()
-            start = replace(start, values={n: v for n, v in values if n not in fixed})
-        start = beginning(setup, data, start.values)
-    inference, step = _nearby(setup, data, start, report)
+            start = Around(data, values={n: v for n, v in values if n not in fixed})
+        start = _beginning(setup, start)
+    inference, step = _nearby(setup, start, report)
     moves, n_learned, learned, in_rounds, idle = np.inf, 0, None, rebuilds(setup), 0
     while True:
         last = not in_rounds or inference.rounds >= MAX_ROUNDS or idle == IDLE
@@ -267,7 +263,7 @@ def settled(
         mean, n, as_learned = inference.posterior.mean, inference.rounds + 1, inference.learned
         excess = inference.excess
         del inference  # its N
-        inference = replace(_conditioned(setup, data, around, n), learned=as_learned)
+        inference = replace(_conditioned(setup, around, n), learned=as_learned)
         report(inference.rounds, inference.remark)
         moves = inference.moves_from(mean) if around.tempered == 1.0 else np.inf
         hopeless = inference.moving and inference.excess > STALLED * excess and not inference.fits
@@ -283,50 +279,44 @@ def settled(
     )
 
 
-def _fewer(setup: Setup, data: Visibilities) -> tuple[Setup, Visibilities] | None:
-    """Setup and data at a regular subset of times that suffices to find the instrument, or None."""
-    run = setup.observation.run
+def _fewer(setup: Setup, start: Around) -> tuple[Setup, Around] | None:
+    """The same at a regular subset of times that suffices to find the instrument, or None."""
+    run, data = setup.observation.run, start.data
     stride = len(data.data) // (ENOUGH * setup.prior.size)
     if stride < 2 or not first_order(setup.scenario):
         return None
     keep = (np.arange(len(run)) - np.searchsorted(run, run)) % stride == 0
-    return setup.select(keep), data.select(keep)
+    return setup.select(keep), replace(start, data=data.select(keep))
 
 
-def _nearby(
-    setup: Setup, data: Visibilities, around: Around, report: Report
-) -> tuple[Inference, _Step]:
+def _nearby(setup: Setup, around: Around, report: Report) -> tuple[Inference, _Step]:
     """Run rounds until the map has nearly converged; if it does not fit, restart elsewhere."""
-    best, step = _approached(setup, data, around, report)
+    best, step = _approached(setup, around, report)
     for way in range(OTHER_WAYS):
         if best.moving and not best.fits:
-            begin = _elsewhere(setup, data, best, way)
-            other = _approached(setup, data, begin, report)
+            other = _approached(setup, _elsewhere(setup, best, way), report)
             if other[0].posterior.log_evidence > best.posterior.log_evidence:
                 best, step = other
     return best, step
 
 
-def _approached(
-    setup: Setup, data: Visibilities, around: Around, report: Report
-) -> tuple[Inference, _Step]:
+def _approached(setup: Setup, around: Around, report: Report) -> tuple[Inference, _Step]:
     """Run rounds until the map has nearly converged; also return the last step."""
-    inference, step = _conditioned(setup, data, around, 1), _Step()
+    inference, step = _conditioned(setup, around, 1), _Step()
     moves, stalled = np.inf if rebuilds(setup) else 0.0, False
     while moves > NEARLY and not stalled and inference.rounds < MAX_TEMPERED_ROUNDS:
         (around, step), exact = _around(setup, inference, step), None
         mean, n, excess = inference.posterior.mean, inference.rounds + 1, inference.excess
         at_rest = step.whole is None or np.abs(step.whole).max() < NEARLY
-        if around.tempered > 1.0:
-            # at rest, a misfit that larger noise does not explain will not improve
-            stalled = at_rest and not inference.fits
+        # at rest, a misfit that larger noise does not explain will not improve
+        stalled = around.tempered > 1.0 and at_rest and not inference.fits
         del inference  # its N
         if around.tempered > 1.0:
             exact = _exact(setup, around)
             around = exact.around
             if at_rest:
                 around, exact = replace(around, tempered=1.0), None
-        inference = _conditioned(setup, data, around, n, exact)
+        inference = _conditioned(setup, around, n, exact)
         report(inference.rounds, inference.remark)
         moved_by = float(inference.posterior.rms_shift_from(mean))
         moves = moved_by if around.tempered == 1.0 else np.inf
@@ -334,7 +324,7 @@ def _approached(
     return inference, step
 
 
-def _elsewhere(setup: Setup, data: Visibilities, inference: Inference, way: int) -> Around:
+def _elsewhere(setup: Setup, inference: Inference, way: int) -> Around:
     """Another starting point: the likeliest of several draws, which may keep half of the values."""
     rng, best = np.random.default_rng(way), None
     parts = [part for part in inference.expanded if not part.systematic.learns]
@@ -346,7 +336,7 @@ def _elsewhere(setup: Setup, data: Visibilities, inference: Inference, way: int)
             z = np.where(kept, part.centre, drawn)
             values |= part.systematic.in_units(z)
             log_prior -= 0.5 * float(z @ z)
-        exact = _exact(setup, Around(data, values=values))
+        exact = _exact(setup, Around(inference.around.data, values=values))
         likely = float(exact.posterior.log_evidence) + log_prior
         if best is None or likely > best[0]:
             best = likely, replace(exact.around, tempered=_tempered(exact.misfit(), 0))
@@ -354,16 +344,15 @@ def _elsewhere(setup: Setup, data: Visibilities, inference: Inference, way: int)
 
 
 def _conditioned(
-    setup: Setup, data: Visibilities, around: Around, rounds: int, exact: Inference | None = None
+    setup: Setup, around: Around, rounds: int, exact: Inference | None = None
 ) -> Inference:
     """Solve one round; ``exact``, the solution at these values, supplies A^T N_0^-1 A for reuse."""
     model, held = model_about(setup, around)
     if exact is None or exact.solution.matrix is None:
-        solution = model.condition(data.data)
+        solution = model.condition(around.data.data)
     else:
-        solution = FromInformation.beside(exact.solution, model).condition(data.data)
-    solution = _less_moved(solution, held)
-    return Inference(solution, held, rounds, around)
+        solution = FromInformation.beside(exact.solution, model).condition(around.data.data)
+    return Inference(_less_moved(solution, held), held, rounds, around)
 
 
 def _less_moved(solution: Solution, held: Sequence[Marginalised]) -> Solution:
@@ -407,16 +396,12 @@ def _around(setup: Setup, inference: Inference, step: _Step) -> tuple[Around, _S
     around, solution = inference.around, inference.solution
     solved = solution.weighted_residual()
     if inference.moving:
-        ways = [s.expected + s.columns.T @ solved - s.centre for s in inference.expanded]
+        ways = [(s, s.expected + s.columns.T @ solved - s.centre) for s in inference.expanded]
         # learned prior widths do not indicate how far the first order is valid
-        far = [
-            way
-            for s, way in zip(inference.expanded, ways, strict=True)
-            if s.systematic.moves and not s.systematic.learns
-        ]
+        far = [way for s, way in ways if s.systematic.moves and not s.systematic.learns]
         step = step.after(np.concatenate(far)) if far else step
         values = {}
-        for s, way in zip(inference.expanded, ways, strict=True):
+        for s, way in ways:
             values |= s.systematic.in_units(s.centre + step.size * way)
             if s.systematic.learns and around.tempered == 1.0:
                 amplitudes = inference.amplitudes(s)
@@ -440,15 +425,12 @@ def _around(setup: Setup, inference: Inference, step: _Step) -> tuple[Around, _S
     return around, step
 
 
-def beginning(
-    setup: Setup, data: Visibilities, values: Mapping[str, float] | None = None
-) -> Around:
+def _beginning(setup: Setup, around: Around) -> Around:
     """The first expansion point of N: the data and, if the instrument is inferred, a sky.
 
     The sky is solved for the instrument with these values (default: the expected ones). The noise
     is increased if it does not fit.
     """
-    around = Around(data, values=values)
     if not first_order(setup.scenario):
         return around
     exact = _exact(setup, around)
@@ -509,10 +491,8 @@ def prediction(setup: Setup, inference: Inference, solved: DataVector) -> Grid:
         N^-1 (d - A m) of the mean map.
     """
     mean = replace(setup.sky, modes=inference.posterior.mean)
-    besides = np.zeros(len(solved))
-    for part in inference.expanded:
-        if not part.changes_coupling:
-            besides = besides + part.columns @ (part.columns.T @ solved)
+    columns = (part.columns for part in inference.expanded if not part.changes_coupling)
+    besides = sum((t @ (t.T @ solved) for t in columns), start=np.zeros(len(solved)))
     for drifts in inference.drifts:
         besides = besides / np.asarray(drifts.response(drifts.about))
     return setup.under(mean).signal + setup.layout.scatter(besides)
@@ -523,11 +503,7 @@ COARSE_LMAX = 24
 
 
 def with_learned_prior(
-    setup: Setup,
-    data: Visibilities,
-    earlier: Information | None = None,
-    start: Around | None = None,
-    report: Report | None = None,
+    setup: Setup, start: Around, earlier: Information | None, report: Report | None
 ) -> tuple[Setup, Inference]:
     """Learn the prior from data, with all terms of N (:func:`settled`).
 
@@ -535,10 +511,11 @@ def with_learned_prior(
     ----------
     setup : Setup
         With a family of priors.
-    data : Visibilities
-    earlier : Information, optional
+    start : Around
+        As in :func:`settled`, with the data.
+    earlier : Information or None
         Information in earlier data, from which the prior is also learned.
-    start, report : Around and callable, optional
+    report : callable or None
         As in :func:`settled`.
 
     Returns
@@ -559,7 +536,7 @@ def with_learned_prior(
 
     if AboveLmax.treatment(setup.scenario) == "marginalised":
         # the expected sky above lmax follows from the prior learned below
-        result = settled(setup, data, start, report=report)
+        result = settled(setup, start.data, start, report=report)
         # a survey's resolution ends somewhere: what is above it is as strong as without surveys
         plain = _with_surveys(setup, ()) if surveys else setup
         coarse, learned = first_learned(plain, whole(result.solution.information))
@@ -573,7 +550,7 @@ def with_learned_prior(
             else:
                 first = setup.family.start_from(coarse, learned.parameters)
             setup = with_sky_above(setup, averaged_beyond(family, coarse, learned.scores))
-    result = settled(setup, data, start, learn, report)
+    result = settled(setup, start.data, start, learn, report)
     if surveys:
         rows, gains = _compared_surveys(setup, whole(result.solution.information))
         learned = replace(result.learned, survey_rows=rows, survey_gains=gains)
@@ -608,10 +585,8 @@ def _compared_surveys(
 
 def _with_surveys(setup: Setup, surveys: Sequence[sky_sections.SurveySection]) -> Setup:
     """Change the surveys of a setup's prior, before anything is learned."""
-    prior = setup.scenario.prior.model_copy(update={"surveys": tuple(surveys)})
-    family = prior.family(setup.frequency_mhz, setup.scenario.lmax)
-    scenario = setup.scenario.model_copy(update={"prior": prior})
-    return replace(setup, scenario=scenario, family=family, prior=family.expected())
+    section = setup.scenario.prior.model_copy(update={"surveys": tuple(surveys)})
+    return setup.with_prior(section)
 
 
 def first_learned(setup: Setup, information: Information) -> tuple[PriorFamily, Learned]:

@@ -139,33 +139,32 @@ class SurveySection(Section):
         """
         file = require_file(self.file, "survey", "check prior.surveys")
         sky, unseen = read_sky_file(file, self.dataset), None
-        if self.mask_file is not None and not isinstance(sky, SkyMap):
-            raise InputError(f"{self.file} has no pixels for prior.surveys.mask_file")
         ell = np.arange(lmax + 1.0)
         sigma = np.radians(self.beam_deg) / np.sqrt(8.0 * np.log(2.0))
         beam = per_mode(np.exp(-0.5 * ell * (ell + 1.0) * sigma**2))
         if isinstance(sky, SkyMap):
-            unseen = sky.unseen
+            gaps = sky.unseen
             if self.mask_file is not None:
                 mask = SkyMap.read(require_file(self.mask_file, "mask", "check prior.surveys"))
-                require_shape(f"{self.mask_file}: the mask", mask.pixels, unseen.shape)
-                unseen = unseen | (mask.pixels == 0.0)
-            if unseen.all() or not sky.pixels[~unseen].mean() > 0.0:
+                require_shape(f"{self.mask_file}: the mask", mask.pixels, gaps.shape)
+                gaps = gaps | (mask.pixels == 0.0)
+            if gaps.all() or not sky.pixels[~gaps].mean() > 0.0:
                 raise InputError(
                     f"{self.file}: the mean of its pixels must be positive, and not all of them "
                     "masked or UNSEEN"
                 )
-        if unseen is not None and unseen.any():
-            template = galaxy_sky(frequency_mhz, lmax, seed=None, sources=()).modes
-            filled = modes_to_map(beam * template, healpy.npix2nside(unseen.size))
-            filled *= sky.pixels[~unseen].mean() / filled[~unseen].mean()
-            # a sharp edge would be amplified where the beam is taken off
-            near = healpy.smoothing(unseen.astype(float), np.radians(max(self.beam_deg, EDGE_DEG)))
-            weight = np.where(unseen, 0.0, np.clip(1.0 - 2.0 * near, 0.0, 1.0) ** 2)
-            pixels = filled + weight * (sky.pixels - filled)
-            sky, unseen = replace(sky, pixels=pixels), weight < SEEN
-        else:
-            unseen = None
+            if gaps.any():
+                template = galaxy_sky(frequency_mhz, lmax, seed=None, sources=()).modes
+                filled = modes_to_map(beam * template, healpy.npix2nside(gaps.size))
+                filled *= sky.pixels[~gaps].mean() / filled[~gaps].mean()
+                # a sharp edge would be amplified where the beam is taken off
+                width = np.radians(max(self.beam_deg, EDGE_DEG))
+                near = healpy.smoothing(gaps.astype(float), width)
+                weight = np.where(gaps, 0.0, np.clip(1.0 - 2.0 * near, 0.0, 1.0) ** 2)
+                pixels = filled + weight * (sky.pixels - filled)
+                sky, unseen = replace(sky, pixels=pixels), weight < SEEN
+        elif self.mask_file is not None:
+            raise InputError(f"{self.file} has no pixels for prior.surveys.mask_file")
         factor = (frequency_mhz / self.frequency_mhz) ** self.index
         modes = factor * sky.modes_at(self.frequency_mhz, lmax)
         widths = self.scale_std, factor * self.zero_std_k
@@ -310,12 +309,8 @@ class LocalScalesPriorSection(Section):
     def family(self, frequency_mhz: float, lmax: int) -> PriorFamily:
         """The family from which data select a prior, up to lmax."""
         sources = BRIGHT_SOURCES if self.sources else ()
-        surveys = self.surveys_at(frequency_mhz, lmax)
+        surveys = [one.at(frequency_mhz, lmax) for one in self.surveys]
         return embedded_local_scales(frequency_mhz, lmax, sources, surveys=surveys)
-
-    def surveys_at(self, frequency_mhz: float, lmax: int) -> list[Survey]:
-        """The surveys at a frequency, up to lmax."""
-        return [one.at(frequency_mhz, lmax) for one in self.surveys]
 
 
 PRIOR_SECTIONS = kinds_of(LocalScalesPriorSection, IsotropicPriorSection)

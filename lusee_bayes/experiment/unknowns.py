@@ -18,7 +18,7 @@ V, need not add up.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any
@@ -502,16 +502,14 @@ class PointingReport:
         columns = {name: table["offset"].map(unknowns[name]) for name in ("value", "std")}
         return replace(self, offsets=table.assign(**columns))
 
-    def lines(self) -> list[str]:
+    def lines(self) -> Iterator[str]:
         """One line per offset."""
-        lines = []
         for row in [] if self.offsets is None else self.offsets.to_dict("records"):
             left = row["beyond_first_order"]
             text = f"{_line(row['offset'], row)}; beyond first order: {left:.1g} of the noise"
             if left > NEGLIGIBLE:
                 text += ", too much: set noise.pointing.treatment=sampled"
-            lines.append(text)
-        return lines
+            yield text
 
 
 def pointing_report(experiment: Experiment, inference: Inference) -> PointingReport:
@@ -585,25 +583,19 @@ def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
     jansky = 1.0 / kelvin_steradian(1.0, experiment.scenario.frequency_mhz)
     own = zip(experiment.scenario.sources.list, held.systematic.n_blocks, strict=True)
     blocks = [(source.name, block) for source, n in own for block in range(n)]
-    table = pd.DataFrame(blocks, columns=["source", "block"]).assign(
-        above_horizon=np.asarray(held.systematic.columns).any(0),
-        flux_jy=fluxes["value"] * jansky,
-        std_jy=fluxes["std"] * jansky,
-        flux_k_sr=fluxes["value"],
-        std_k_sr=fluxes["std"],
-        prior_jy=fluxes["prior"] * jansky,
-        prior_std_jy=fluxes["prior_std"] * jansky,
-    )
-    return table.assign(true_jy=fluxes["true"] * jansky) if "true" in fluxes else table
+    table = pd.DataFrame(blocks, columns=["source", "block"])
+    table["above_horizon"] = np.asarray(held.systematic.columns).any(0)
+    in_jy = (fluxes.filter(["prior", "prior_std", "true"]) * jansky).add_suffix("_jy")
+    found = fluxes[["value", "std"]].rename(columns={"value": "flux"})
+    in_both = (found * jansky).add_suffix("_jy"), found.add_suffix("_k_sr")
+    return pd.concat([table, *in_both, in_jy], axis=1)
 
 
-def flux_lines(fluxes: pd.DataFrame) -> list[str]:
+def flux_lines(fluxes: pd.DataFrame) -> Iterator[str]:
     """One line per source, or per block of it."""
-    lines = []
     for row in fluxes.to_dict("records"):
         name = row["source"] if row["block"] == 0 else f"{row['source']} ({row['block']})"
         text = f"{name}: {row['flux_jy']:.4g} +- {row['std_jy']:.2g} Jy"
         if not row["above_horizon"]:
             text += " (prior: never above the horizon)"
-        lines.append(text)
-    return lines
+        yield text

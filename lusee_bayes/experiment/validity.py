@@ -158,10 +158,6 @@ class BlindSpot:
         factor = float(np.sqrt(SEEN / max(self.shown, np.finfo(np.float64).tiny)))
         return self.size * factor, self.bias * factor
 
-    def words(self) -> str:
-        """The error and its bias, in a few words."""
-        return f"{self.name} by {self.size:g}{self.unit} ({self.bias:.2g})"
-
 
 def blind_sentence(spots: Iterable[BlindSpot]) -> str:
     """Errors that would move the map unnoticed, in one sentence; empty if there are none."""
@@ -169,11 +165,12 @@ def blind_sentence(spots: Iterable[BlindSpot]) -> str:
     if not unseen:
         return ""
     unseen = sorted(unseen, key=lambda spot: -spot.bias)[:MOST_NAMED]
+    named = ", ".join(f"{one.name} by {one.size:g}{one.unit} ({one.bias:.2g})" for one in unseen)
     return (
         "The model assumes an exact instrument, and residual chi2 would not reveal an error of "
-        f"{', '.join(spot.words() for spot in unseen)}; in brackets, the resulting error of the "
-        "map in standard deviations (rms). noise.beam.parameters and noise.fields include such "
-        "errors; a second turntable angle reveals more of them."
+        f"{named}; in brackets, the resulting error of the map in standard deviations (rms). "
+        "noise.beam.parameters and noise.fields include such errors; a second turntable angle "
+        "reveals more of them."
     )
 
 

@@ -16,7 +16,6 @@ A learned C_ell has an amplitude, a tilt, a curvature and departures at half oct
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
@@ -62,9 +61,6 @@ TAIL, STEEPNESS = 1.5, 2.0
 SHAPE = TAIL / STEEPNESS
 # nodes of the Gauss-Hermite rule for the means of cells' factors
 NODES = 20
-
-# variance of linear combinations of parameters, one per row
-Spread = Callable[[Float[np.ndarray, "rows parameters"]], Float[np.ndarray, " rows"]]
 
 
 @dataclass(frozen=True)
@@ -218,16 +214,17 @@ class PriorFamily(ABC):
         return self.prior(self.at(self.hyperprior.start()).covariance)
 
     @abstractmethod
-    def averaged(self, parameters: Parameters, spread: Spread) -> ModesMatrix:
+    def averaged(self, parameters: Parameters, covariance: Square) -> ModesMatrix:
         """Compute S averaged over uncertain parameters: the means of its variances, in K^2.
+
+        Logarithms of variances are linear in the parameters, so that variances are log-normal.
 
         Parameters
         ----------
         parameters : (parameters,) array
             Mean of a normal distribution of the parameters.
-        spread : callable
-            Variance of linear combinations of the parameters under that distribution. Logarithms
-            of variances are such combinations, so that the variances are log-normal.
+        covariance : (parameters, parameters) array
+            Its covariance.
         """
 
     @abstractmethod
@@ -299,8 +296,9 @@ class IsotropicFamily(PriorFamily):
     def at(self, parameters: Parameters) -> IsotropicMember:
         return IsotropicMember(self, parameters)
 
-    def averaged(self, parameters, spread):
-        return np.diag(per_mode(np.exp(self.basis @ parameters + 0.5 * spread(self.basis))))
+    def averaged(self, parameters, covariance):
+        spread = np.einsum("ij,ij->i", self.basis @ covariance, self.basis)
+        return np.diag(per_mode(np.exp(self.basis @ parameters + 0.5 * spread)))
 
     def prior(self, covariance):
         lmax = self.basis.shape[0] - 1

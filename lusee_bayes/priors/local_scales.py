@@ -209,7 +209,7 @@ class LocalScales(PriorFamily):
     def at(self, parameters: Parameters) -> LocalScalesMember:
         return LocalScalesMember(self, *self._split(parameters))
 
-    def averaged(self, parameters, spread):
+    def averaged(self, parameters, covariance):
         member = self.at(parameters)
         ells, flux, covariates, _ = self._split(np.eye(len(parameters)))
         strengths = []
@@ -219,8 +219,9 @@ class LocalScales(PriorFamily):
             rows = spectrum[None] + band.covariates @ covariates
             if self.white:  # the data only have an upper limit of the level, which is fitted later
                 rows[:, 0] = 0.0
-            strengths.append(strength * np.exp(0.5 * spread(rows)))
-        fluxes = float(np.exp(member.fluxes[0] + 0.5 * spread(flux)[0]))
+            spread = np.einsum("ij,ij->i", rows @ covariance, rows)
+            strengths.append(strength * np.exp(0.5 * spread))
+        fluxes = float(np.exp(member.fluxes[0] + 0.5 * flux[0] @ covariance @ flux[0]))
         return _covariance(self, fluxes, _texture(self, member.spectrum, strengths))
 
     def prior(self, covariance):

@@ -92,8 +92,7 @@ def test_learning_gains_over_the_start_under_local_scales():
 
     def evidence(shift):
         level = mean + shift * (np.arange(len(mean)) == 0)
-        spread = lambda rows: np.einsum("ij,jk,ik->i", rows, about, rows)  # noqa: E731
-        prior = family.prior(family.averaged(level, spread))
+        prior = family.prior(family.averaged(level, about))
         return float(information.posterior(prior).log_evidence)
 
     best = float(information.posterior(found.prior).log_evidence)
@@ -297,7 +296,7 @@ def one_parameter():
     prior = family.prior(family.at(np.array([0.4])).covariance)
     theta, covariance = np.array([0.4]), np.array([[width**2]])
     scores = scores_of(family.hyperprior, theta, covariance)
-    learned = learning.Learned(prior, ("theta",), theta, covariance, scores, 0.0)
+    learned = learning.Learned(prior, theta, covariance, scores, 0.0)
     draws = learning.draws_with_parameters(family, learned, information, jax.random.key(1), 4500)
     return noise, seen, draws
 
@@ -328,7 +327,7 @@ def weakly_known(family: IsotropicFamily, std: float) -> tuple[learning.Learned,
     information = Information(matrix, np.ones(SIZE), np.zeros(SIZE), one, one, one)
     covariance = std**2 * np.eye(len(theta))
     scores = scores_of(family.hyperprior, theta, covariance)
-    return learning.Learned(prior, (), theta, covariance, scores, 0.0), information
+    return learning.Learned(prior, theta, covariance, scores, 0.0), information
 
 
 def test_few_draws_and_none():
