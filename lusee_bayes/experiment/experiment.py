@@ -22,16 +22,9 @@ from lusee_bayes.core.checks import Described, counted
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.progress import Stages
+from lusee_bayes.experiment import rounds
 from lusee_bayes.experiment.leave_out import Fitting, fitting, without
 from lusee_bayes.experiment.model import model_to_sample, radiometer, set_up, simulate, systematics
-from lusee_bayes.experiment.rounds import (
-    MAX_ROUNDS,
-    Inference,
-    Report,
-    rebuilds,
-    settled,
-    with_learned_prior,
-)
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.coupling import Instrument
 from lusee_bayes.instrument.visibilities import Visibilities
@@ -74,7 +67,7 @@ class Experiment(Described):
     doubts: tuple[str, ...] = ()
     learned: Learned | None = None
     fitting: Fitting | None = None
-    inference: Inference | None = None
+    inference: rounds.Inference | None = None
 
     def description(self) -> tuple[str, ...]:
         scenario = self.scenario
@@ -196,9 +189,9 @@ def _learned(
     if setup.family is None:
         if start.values is None:
             return experiment
-        return replace(experiment, inference=settled(setup, experiment.data, start))
+        return replace(experiment, inference=rounds.settled(setup, start))
     with rounds_of(experiment, stages, "prior") as report:
-        setup, inference = with_learned_prior(setup, start, earlier, report)
+        setup, inference = rounds.with_learned_prior(setup, start, earlier, report)
     return replace(experiment, setup=setup, learned=inference.learned, inference=inference)
 
 
@@ -234,11 +227,11 @@ def under_sky(setup: Setup, source: SkySource, seed: int) -> Experiment:
 
 def rounds_of(experiment: Experiment, stages: Stages, name: str) -> AbstractContextManager:
     """A stage; it shows the progress of rounds if the inference still needs them."""
-    in_rounds = experiment.inference is None and rebuilds(experiment.setup)
-    return stages.progress(name, MAX_ROUNDS) if in_rounds else stages(name)
+    in_rounds = experiment.inference is None and rounds.rebuilds(experiment.setup)
+    return stages.progress(name, rounds.MAX_ROUNDS) if in_rounds else stages(name)
 
 
-def infer(experiment: Experiment, report: Report | None = None) -> Inference:
+def infer(experiment: Experiment, report: rounds.Report | None = None) -> rounds.Inference:
     """Condition the experiment's model on its data (:func:`.settled`).
 
     Parameters
@@ -252,7 +245,8 @@ def infer(experiment: Experiment, report: Report | None = None) -> Inference:
     InputError
         As in :func:`.settled`.
     """
-    return experiment.inference or settled(experiment.setup, experiment.data, report=report)
+    start = Around(experiment.data)
+    return experiment.inference or rounds.settled(experiment.setup, start, report=report)
 
 
 def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
@@ -287,7 +281,7 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
     @cache
     def around() -> Around:
         # without such values, large offsets are not described, and gains belong to other antennas
-        if not rebuilds(setup):
+        if not rounds.rebuilds(setup):
             return Around(data)
         return infer(experiment).around
 
@@ -370,7 +364,7 @@ def interpolation_error(setup: Setup) -> dict[str, float]:
     return {where: max(map(rms, lines)) for where, lines in off.items()}
 
 
-def doubts(experiment: Experiment, inference: Inference) -> tuple[str, ...]:
+def doubts(experiment: Experiment, inference: rounds.Inference) -> tuple[str, ...]:
     """Doubts about an experiment's data, its prior and its rounds."""
     learned, notes = experiment.learned, list(experiment.doubts)
     errors = interpolation_error(experiment.setup)

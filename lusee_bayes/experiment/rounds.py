@@ -19,7 +19,6 @@ from lusee_bayes.core.section import is_modelled
 from lusee_bayes.experiment import sky_sections
 from lusee_bayes.experiment.model import model_about, moved, with_sky_above
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.amplitudes import Amplitudes, template_amplitudes
 from lusee_bayes.linear.information import Information, integrated_out
 from lusee_bayes.linear.linear_gaussian import FromInformation, LinearGaussian, Solution
@@ -187,11 +186,7 @@ Report = Callable[[int, str], None]
 
 
 def settled(
-    setup: Setup,
-    data: Visibilities,
-    start: Around | None = None,
-    learn: Learning | None = None,
-    report: Report | None = None,
+    setup: Setup, start: Around, learn: Learning | None = None, report: Report | None = None
 ) -> Inference:
     """Condition the model on data, in as many rounds as its N needs.
 
@@ -211,10 +206,9 @@ def settled(
     Parameters
     ----------
     setup : Setup
-    data : Visibilities
-    start : Around, optional
-        Expansion point of N in the first round. By default, the data and, if the instrument is
-        inferred, the sky for the given or else the expected values.
+    start : Around
+        The data, and the expansion point of N in the first round. If the instrument is inferred and
+        no sky is given, the sky is solved for the given or else the expected values.
     learn : callable, optional
         ``learn(information, start)`` learns the prior during the rounds: first when they have
         nearly converged, last when it moves the map by less than 0.05 standard deviations.
@@ -233,15 +227,13 @@ def settled(
         If N is not positive definite.
     """
     report = report or (lambda rounds, remark: None)
-    start = start or Around(data)
     if start.sky is None:
         if (few := _fewer(setup, start)) is not None:
-            some, start = few
-            inference, step = _nearby(some, _beginning(some, start), report)
+            inference, step = _nearby(few[0], _beginning(*few), report)
             terms = (s.systematic for s in inference.expanded)
             fixed = {name for one in terms if not one.moves for name in one.names}
             values = (inference.around.values or {}).items()
-            start = Around(data, values={n: v for n, v in values if n not in fixed})
+            start = replace(start, values={n: v for n, v in values if n not in fixed})
         start = _beginning(setup, start)
     inference, step = _nearby(setup, start, report)
     moves, n_learned, learned, in_rounds, idle = np.inf, 0, None, rebuilds(setup), 0
@@ -536,7 +528,7 @@ def with_learned_prior(
 
     if AboveLmax.treatment(setup.scenario) == "marginalised":
         # the expected sky above lmax follows from the prior learned below
-        result = settled(setup, start.data, start, report=report)
+        result = settled(setup, start, report=report)
         # a survey's resolution ends somewhere: what is above it is as strong as without surveys
         plain = _with_surveys(setup, ()) if surveys else setup
         coarse, learned = first_learned(plain, whole(result.solution.information))
@@ -550,7 +542,7 @@ def with_learned_prior(
             else:
                 first = setup.family.start_from(coarse, learned.parameters)
             setup = with_sky_above(setup, averaged_beyond(family, coarse, learned.scores))
-    result = settled(setup, start.data, start, learn, report)
+    result = settled(setup, start, learn, report)
     if surveys:
         rows, gains = _compared_surveys(setup, whole(result.solution.information))
         learned = replace(result.learned, survey_rows=rows, survey_gains=gains)

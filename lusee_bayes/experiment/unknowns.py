@@ -35,13 +35,7 @@ from lusee_bayes.experiment.model import base_model, radiometer, true_values
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.instrument.pointing import offset_names
 from lusee_bayes.judge.measures import preferences
-from lusee_bayes.linear.amplitudes import (
-    Amplitudes,
-    AmplitudesOfSky,
-    Shared,
-    Tied,
-    amplitudes_of_sky,
-)
+from lusee_bayes.linear.amplitudes import Amplitudes, AmplitudesOfSky, Shared, Tied
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import pixel_std
 from lusee_bayes.sky.galaxy import kelvin_steradian
@@ -282,7 +276,7 @@ class Unknowns:
         rows = before_data(held, true_values(experiment.setup) if has_truth else None)
         return cls(
             tuple(rows.to_dict("records")),
-            amplitudes_of_sky(inference.solution, columns),
+            AmplitudesOfSky.of(inference.solution, columns),
             np.concatenate([s.expected for s in held]),
             np.concatenate(octaves),
             tuple(name for names, _ in alike for name in names),

@@ -34,7 +34,7 @@ from lusee_bayes.experiment.model import base_model, moved, systematics
 from lusee_bayes.experiment.rounds import WIDE, Inference
 from lusee_bayes.experiment.unknowns import TESTED
 from lusee_bayes.instrument.pointing import offset_names
-from lusee_bayes.linear.amplitudes import amplitudes_of_sky
+from lusee_bayes.linear.amplitudes import AmplitudesOfSky
 from lusee_bayes.noise.covariance import LowRankFactor
 from lusee_bayes.systematics.beam import InstrumentParameters
 from lusee_bayes.systematics.context import Around, Setup
@@ -85,7 +85,7 @@ def weighed(setup: Setup, data: np.ndarray, inference: Inference) -> tuple[float
     if not inference.moving or not isinstance(factor, LowRankFactor):
         return None
     columns = np.concatenate([part.columns for part in parts], axis=1)
-    amplitudes = amplitudes_of_sky(inference.solution, columns)
+    amplitudes = AmplitudesOfSky.of(inference.solution, columns)
     keys = jax.random.split(jax.random.key(setup.scenario.seed), 2)
     skies = np.asarray(inference.posterior.sample(keys[0], N_WEIGHED))
     values, axes = np.linalg.eigh(amplitudes.covariance)

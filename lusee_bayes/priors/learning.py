@@ -377,8 +377,8 @@ def _learned(
     evidence = float(point.posterior.log_evidence) + scores.log_gain
 
     # S is a constant plus a part proportional to the level
-    doubled = np.concatenate([[mean[0] + np.log(2.0)], mean[1:]])
-    once, twice = (family.averaged(level, about) for level in (mean, doubled))
+    first = np.arange(len(mean)) == 0
+    once, twice = (family.averaged(mean + level * first, about) for level in (0.0, np.log(2.0)))
 
     def at_level(shift: float) -> Posterior:
         covariance = once + np.expm1(shift) * (twice - once)
@@ -387,8 +387,7 @@ def _learned(
     tried = [float(at_level(shift).log_evidence) for shift in LEVELS]
     square, linear, _ = np.polyfit(LEVELS, tried, 2)
     shift = -0.5 * linear / square if square < 0 else LEVELS[int(np.argmax(tried))]
-    moved = np.zeros(len(mean))
-    moved[0] = shift / family.hyperprior.slopes_of_scores(scores.mean)[0]
+    moved = shift * first / family.hyperprior.slopes_of_scores(scores.mean)[0]
     prior, scores = at_level(shift).prior, replace(scores, mean=scores.mean + moved)
     return Learned(prior, point.parameters, covariance, scores, evidence)
 

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -92,13 +92,15 @@ class Band:
     cells: sparse.csr_array
 
     @classmethod
-    def of(cls, window: Ells, template: SmoothedTemplate, transparent: SmoothedTemplate) -> Band:
+    def of(cls, window: Ells, frequency_mhz: float) -> Band:
         """Make the band of a window."""
         top = int(np.flatnonzero(window)[-1])
         grid = SphereGrid.of(top, max((3 * top + 1) // 2, LEAST_BAND))
         theta, phi = grid.directions()
         fwhm = float(np.hypot(RESOLUTION_DEG / _middle(window), FINEST_DEG))
-        seen, clear = (each.log(fwhm, theta, phi) for each in (template, transparent))
+        # the template, and the same sky nearly without absorption
+        frequencies = frequency_mhz, max(TRANSPARENT_MHZ, frequency_mhz)
+        seen, clear = (smoothed_log(mhz, fwhm, theta, phi) for mhz in frequencies)
         latitude = 90.0 - np.degrees(theta)
         thickness = PLANE_DEG**2 + (fwhm / np.sqrt(8.0 * np.log(2.0))) ** 2
         plane = np.exp(-0.5 * latitude**2 / thickness)
@@ -139,33 +141,20 @@ def _middle(window: Ells) -> float:
     return float(np.sqrt((weight * ell**2).sum() / weight.sum()))
 
 
-@dataclass(frozen=True)
-class SmoothedTemplate:
-    """A positive template at any resolution.
+@lru_cache(maxsize=4)
+def _template(frequency_mhz: float) -> tuple[Complex[np.ndarray, " alms"], float]:
+    """The embedded diffuse sky, without random structure, in K, and the mean of its logarithm."""
+    pixels = galaxy_map(frequency_mhz, TEMPLATE_NSIDE, seed=None)
+    return healpy.map2alm(pixels, lmax=TEMPLATE_LMAX, iter=3), float(np.log(pixels).mean())
 
-    Attributes
-    ----------
-    alm : (alms,) array
-        Its complex coefficients, in K.
-    mean_log : float
-        Mean of its logarithm.
-    """
 
-    alm: Complex[np.ndarray, " alms"]
-    mean_log: float
-
-    @classmethod
-    def of(cls, frequency_mhz: float) -> SmoothedTemplate:
-        """Analyse the embedded diffuse sky, without its random component, at a frequency in MHz."""
-        pixels = galaxy_map(frequency_mhz, TEMPLATE_NSIDE, seed=None)
-        return cls(healpy.map2alm(pixels, lmax=TEMPLATE_LMAX, iter=3), float(np.log(pixels).mean()))
-
-    def log(self, fwhm_deg: float, theta: Vector, phi: Vector) -> Vector:
-        """ln of the smoothed template minus :attr:`mean_log`, in given directions."""
-        alm = healpy.almxfl(self.alm, healpy.gauss_beam(np.radians(fwhm_deg), lmax=TEMPLATE_LMAX))
-        smooth = healpy.alm2map(alm, TEMPLATE_NSIDE, lmax=TEMPLATE_LMAX)
-        require_positive("the smoothed template", smooth)
-        return np.log(healpy.get_interp_val(smooth, theta, phi)) - self.mean_log
+def smoothed_log(frequency_mhz: float, fwhm_deg: float, theta: Vector, phi: Vector) -> Vector:
+    """ln of the smoothed template minus the mean logarithm, in given directions."""
+    alm, mean_log = _template(frequency_mhz)
+    alm = healpy.almxfl(alm, healpy.gauss_beam(np.radians(fwhm_deg), lmax=TEMPLATE_LMAX))
+    smooth = healpy.alm2map(alm, TEMPLATE_NSIDE, lmax=TEMPLATE_LMAX)
+    require_positive("the smoothed template", smooth)
+    return np.log(healpy.get_interp_val(smooth, theta, phi)) - mean_log
 
 
 def hyperprior_of(centre: Parameters, width: Parameters) -> Hyperprior:
@@ -352,27 +341,23 @@ def embedded_local_scales(
     surveys : sequence of Survey
         At this frequency, with the same lmax.
     """
-    # the template, and the same sky nearly without absorption
-    clear_mhz = max(TRANSPARENT_MHZ, frequency_mhz)
-    smoothed = [SmoothedTemplate.of(mhz) for mhz in (frequency_mhz, clear_mhz)]
     mean = np.asarray(galaxy_sky(frequency_mhz, lmax, seed=None, sources=()).modes)
-    monopole = np.zeros_like(mean)
-    monopole[0] = mean[0]
+    constant = np.arange(len(mean)) == 0
     modes = [source.modes(frequency_mhz, lmax) for source in sources]
     level = mean[0] / np.sqrt(4.0 * np.pi)
     # these may be brighter or darker than their surroundings
     extended = [level * one.strength * one.modes(lmax) for one in EXTENDED_OBJECTS]
-    scale, zero, weights = SCALE_WIDTH * mean, MONOPOLE_WIDTH * monopole, []
+    scale, zero, weights = SCALE_WIDTH * mean, MONOPOLE_WIDTH * mean * constant, []
     if surveys:
         filled = [survey.sharpened(mean) for survey in surveys]
         weights, mean = [*filled, mean], np.mean(filled, axis=0)
         weights = [WEIGHT_WIDTH * (one * (mean[0] / one[0]) - mean) for one in weights]
         stds = np.array([[s.scale_std, np.sqrt(4.0 * np.pi) * s.zero_std] for s in surveys])
         of_scale, of_zero = np.sqrt((stds**2).sum(axis=0)) / len(surveys)
-        scale, zero = of_scale * mean, of_zero * (np.arange(len(mean)) == 0)
+        scale, zero = of_scale * mean, of_zero * constant
     wide = np.stack([scale, zero, *weights, *extended], axis=1)
     of_sources = np.reshape(modes, (-1, n_modes(lmax))).T
-    spectrum, *expected = spectrum_basis(np.exp(smoothed[0].mean_log), lmax)
-    bands = tuple(Band.of(window, *smoothed) for window in windows(lmax))
+    spectrum, *expected = spectrum_basis(np.exp(_template(frequency_mhz)[1]), lmax)
+    bands = tuple(Band.of(window, frequency_mhz) for window in windows(lmax))
     white = WHITE * mean[0] ** 2 if surveys else 0.0
     return LocalScales(mean, wide, of_sources, spectrum, bands, hyperprior_of(*expected), white)
