@@ -60,8 +60,7 @@ def items_of(data: object) -> tuple[Visibilities, ...] | tuple[Path, ...]:
         If there are no data, another type, or both sets and files.
     """
     one = Visibilities | str | Path
-    given = (data,) if isinstance(data, one) else data
-    items = given if isinstance(given, Sequence) else (given,)
+    items = data if isinstance(data, Sequence) and not isinstance(data, str) else (data,)
     if wrong := [item for item in items if not isinstance(item, one)]:
         raise InputError(
             "data must be Visibilities, paths of files, or lists of either, not a "

@@ -344,5 +344,4 @@ def _drawn_gains(scenario: Scenario, flight: FlightSection) -> tuple[GainModel, 
             "noise.gain_table needs the errors of the gains; give flight.gain_std, or "
             "flight.component_std"
         )
-    generator = np.random.default_rng([scenario.seed, 3])
-    return table, *draw_gains(table, flight.gain_std, generator)
+    return table, *draw_gains(table, flight.gain_std, np.random.default_rng([scenario.seed, 3]))

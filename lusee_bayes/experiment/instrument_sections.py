@@ -2,9 +2,9 @@
 
 They specify site, times and turntable angles, the beams, and the receivers at their ports. A
 section in :mod:`lusee_bayes.flight.recipe` specifies how spectrometer sessions become visibilities.
-Beams and receivers have one section per kind, selected by ``model``. To add a kind of beams, write
-a subclass of :class:`BaseBeamSection` here, with its :class:`BeamSource`, and add it to
-``BEAM_SECTIONS``.
+Beams and receivers have one section per kind, selected by ``model``; those of receivers are in
+:mod:`lusee_bayes.instrument.beams.source`. To add a kind of beams, write a subclass of
+:class:`BaseBeamSection` here, with its :class:`BeamSource`, and add it to ``BEAM_SECTIONS``.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from lusee_bayes.core.section import Angle, Positive, Section, Temperature, kinds_of, one_of
 from lusee_bayes.instrument.beams.fields import Interpolation
@@ -23,13 +23,7 @@ from lusee_bayes.instrument.beams.grid import read_beam_grid
 from lusee_bayes.instrument.beams.luseepy_files import read_response, read_scalar_beam
 from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith
 from lusee_bayes.instrument.beams.sampled import beam_kind, read_sampled
-from lusee_bayes.instrument.beams.source import (
-    BeamSource,
-    CapacitorReceiver,
-    JFETReceiver,
-    Receiver,
-    read_receiver,
-)
+from lusee_bayes.instrument.beams.source import BeamSource, ReceiverSection
 from lusee_bayes.instrument.observation import Observation
 from lusee_bayes.instrument.schedule import CYCLE_DAYS, Interval, Run, read_schedule
 from lusee_bayes.instrument.times import Timestamp
@@ -136,45 +130,6 @@ def _observation(section: ObservationSection, intervals: tuple[Interval, ...]) -
         return Observation.from_schedule(intervals, **common)
     runs = tuple(Run(r.cycles, r.turntable_deg, r.night_only) for r in section.runs)
     return Observation.from_runs(runs, start=section.start, **common)
-
-
-class ReceiverFileSection(Section):
-    """Load impedances from a file with images ``freq``, ``ZL_real`` and ``ZL_imag``.
-
-    Attributes
-    ----------
-    file : str
-        Path of the file.
-    """
-
-    model: Literal["file"] = "file"
-    file: str
-
-    def receiver(self) -> Receiver | None:
-        """The receiver, or None for open ports."""
-        return read_receiver(self.file)
-
-
-class OpenSection(Section):
-    """Open ports: no receiver connected."""
-
-    model: Literal["open"] = "open"
-
-    def receiver(self) -> Receiver | None:
-        """The receiver, or None for open ports."""
-        return None
-
-
-def _named(value: Any) -> Any:
-    """``receiver: open`` means ``receiver: {model: open}``."""
-    return {"model": value} if isinstance(value, str) else value
-
-
-ReceiverSection = Annotated[
-    JFETReceiver | CapacitorReceiver | ReceiverFileSection | OpenSection,
-    Field(discriminator="model"),
-    BeforeValidator(_named),
-]
 
 
 class BaseBeamSection(Section):

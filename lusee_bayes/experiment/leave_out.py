@@ -309,13 +309,12 @@ class _Rules:
         return None
 
     def one_by_one(
-        self, start: GroupsCompared, gone: GridFlags, groups: GridFlags, least: float
+        self, left: GroupsCompared, gone: GridFlags, groups: GridFlags, least: float
     ) -> tuple[GroupsCompared, GridFlags | None]:
-        """Flag the worst data first; ``gone``, missing from ``start``, includes ``groups``.
+        """Flag the worst data first; ``gone``, missing from ``left``, includes ``groups``.
 
         Returns the last comparison, and all flags; None in their place if they are too many.
         """
-        left = start
         while (worst := left.worst(self.false_alarm, least)).any():
             gone = gone | worst
             if self.broken(gone, groups):

@@ -77,8 +77,7 @@ def set_up(
         if data is None:
             observation = scenario.observation.observation()
         else:
-            fixed_axis = scenario.observation.fixed_axis
-            observation = replace(data.observation, fixed_axis=fixed_axis)
+            observation = replace(data.observation, fixed_axis=scenario.observation.fixed_axis)
         pointing = Pointing.of(observation, scenario.lmax)
     with stages("beams"):
         receiver = None if data is None else data.receiver
@@ -204,8 +203,7 @@ def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, S
 
 def base_model(setup: Setup, around: Around | None = None) -> LinearGaussian:
     """d = A m + background + n with radiometer noise only."""
-    noise = radiometer(setup, around)
-    return LinearGaussian(setup.coupling, setup.prior, noise, setup.offset)
+    return LinearGaussian(setup.coupling, setup.prior, radiometer(setup, around), setup.offset)
 
 
 def in_noise(

@@ -6,7 +6,6 @@ module also provides priors by name, to compare how probable the data are under 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -160,7 +159,7 @@ class Inference:
     def fits(self) -> bool:
         """Whether chi^2 is acceptable, under the prior or one that allows any sky."""
         n, solution = len(self.solution.data), self.solution
-        most = n + FAR_OFF * math.sqrt(2.0 * n)
+        most = n + FAR_OFF * (2.0 * n) ** 0.5
         if solution.chi2 >= most:
             solution = self.under(self.model.prior.widened(WIDE)).solution
         return solution.chi2 < most
@@ -577,8 +576,7 @@ def _compared_surveys(
 
 def _with_surveys(setup: Setup, surveys: Sequence[sky_sections.SurveySection]) -> Setup:
     """Change the surveys of a setup's prior, before anything is learned."""
-    section = setup.scenario.prior.model_copy(update={"surveys": tuple(surveys)})
-    return setup.with_prior(section)
+    return setup.with_prior(setup.scenario.prior.model_copy(update={"surveys": tuple(surveys)}))
 
 
 def first_learned(setup: Setup, information: Information) -> tuple[PriorFamily, Learned]:

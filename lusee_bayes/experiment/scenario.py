@@ -348,9 +348,7 @@ def load_scenario(
 
     InputError with one sentence for a missing file, bad YAML, an unknown key or a bad value.
     """
-    scenario = source
-    if not isinstance(source, Scenario):
-        scenario = _validate(_read_yaml(source), source)
+    scenario = source if isinstance(source, Scenario) else _validate(_read_yaml(source), source)
     if not overrides:
         return scenario
     tree = scenario.model_dump(mode="json")  # includes defaults, so that any entry can be set

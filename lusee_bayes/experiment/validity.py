@@ -104,8 +104,7 @@ def weighed(setup: Setup, data: np.ndarray, inference: Inference) -> tuple[float
         model = base
         for systematic in built:
             if type(systematic) in z:
-                sites = systematic.values(z[type(systematic)])
-                model = systematic.effect(model, sites)
+                model = systematic.effect(model, systematic.values(z[type(systematic)]))
             elif not systematic.first_order:
                 model = systematic.averaged(model)
         first_order[:, k] = inference.model.predict(sky) + columns @ a
@@ -182,8 +181,7 @@ def errors_of(setup: Setup, *, pointing: bool) -> Iterator[tuple[Systematic, Siz
     source = setup.beam_source
     if source.has_fields:
         section = FieldErrorsSection(std=FIELDS, lmax=FIELD_LMAX, learned=False)
-        fields = FieldErrors.build(section, setup, Around())
-        yield fields, {FIELDS_NAME: 100.0 * FIELDS}, " %"
+        yield FieldErrors.build(section, setup, Around()), {FIELDS_NAME: 100.0 * FIELDS}, " %"
     values = {name: float(p.value) for name, p in source.parameters().items() if float(p.value)}
     priors = tuple(Unknown(name, value, PARAMETERS * abs(value)) for name, value in values.items())
     sizes = dict.fromkeys(values, 100.0 * PARAMETERS)

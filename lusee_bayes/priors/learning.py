@@ -38,6 +38,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -243,14 +244,12 @@ def learn(
         If S is not positive definite, the search does not converge in 60 steps, or ln p falls along
         its gradient.
     """
-    rng, before, moves = np.random.default_rng(seed), None, []
+    rng, path = np.random.default_rng(seed), []
     point = _at(family, information, family.hyperprior.start() if start is None else start)
     for _ in range(MAX_STEPS + 1):
         gradient = point.slope(family)
-        if before is not None:
-            moves.append((point.parameters - before[0], before[1] - gradient))
-        before = point.parameters, gradient
-        curvature = _corrected(point.curvature(family, rng, SIMULATIONS), moves)
+        path.append((point.parameters, gradient))
+        curvature = _corrected(point.curvature(family, rng, SIMULATIONS), path)
         step = np.linalg.solve(curvature, gradient)
         gain = 0.5 * float(gradient @ step)
         if gain < SETTLED:
@@ -262,9 +261,10 @@ def learn(
     )
 
 
-def _corrected(curvature: Square, moves: Sequence[tuple[Parameters, Parameters]]) -> Square:
+def _corrected(curvature: Square, path: Sequence[tuple[Parameters, Parameters]]) -> Square:
     """Correct the curvature by how the gradient fell along earlier steps (BFGS)."""
-    for step, fall in moves:
+    for (start, before), (end, after) in pairwise(path):
+        step, fall = end - start, before - after
         along = curvature @ step
         if fall @ step > STEEP_ENOUGH * (step @ along):
             curvature = curvature - np.outer(along, along) / (step @ along)

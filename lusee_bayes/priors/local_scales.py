@@ -343,7 +343,6 @@ def embedded_local_scales(
     """
     mean = np.asarray(galaxy_sky(frequency_mhz, lmax, seed=None, sources=()).modes)
     constant = np.arange(len(mean)) == 0
-    modes = [source.modes(frequency_mhz, lmax) for source in sources]
     level = mean[0] / np.sqrt(4.0 * np.pi)
     # these may be brighter or darker than their surroundings
     extended = [level * one.strength * one.modes(lmax) for one in EXTENDED_OBJECTS]
@@ -356,7 +355,7 @@ def embedded_local_scales(
         of_scale, of_zero = np.sqrt((stds**2).sum(axis=0)) / len(surveys)
         scale, zero = of_scale * mean, of_zero * constant
     wide = np.stack([scale, zero, *weights, *extended], axis=1)
-    of_sources = np.reshape(modes, (-1, n_modes(lmax))).T
+    of_sources = np.reshape([s.modes(frequency_mhz, lmax) for s in sources], (-1, len(mean))).T
     spectrum, *expected = spectrum_basis(np.exp(_template(frequency_mhz)[1]), lmax)
     bands = tuple(Band.of(window, frequency_mhz) for window in windows(lmax))
     white = WHITE * mean[0] ** 2 if surveys else 0.0
