@@ -24,7 +24,7 @@ from lusee_bayes.linear.linear_gaussian import FromInformation, LinearGaussian, 
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.noise.covariance import LowRankFactor
 from lusee_bayes.priors.families import PriorFamily
-from lusee_bayes.priors.learning import Learned, Row, averaged_beyond, learn_whatever_fits
+from lusee_bayes.priors.learning import Learned, averaged_beyond, learn_whatever_fits
 from lusee_bayes.sky.prior import Prior
 from lusee_bayes.systematics.above_lmax import AboveLmax
 from lusee_bayes.systematics.context import Around, Setup, Volume
@@ -254,7 +254,7 @@ def settled(
         mean, n, as_learned = inference.posterior.mean, inference.rounds + 1, inference.learned
         excess = inference.excess
         del inference  # its N
-        inference = replace(_conditioned(setup, around, n), learned=as_learned)
+        inference = replace(_conditioned(setup, around, n, None), learned=as_learned)
         report(inference.rounds, inference.remark)
         moves = inference.moves_from(mean) if around.tempered == 1.0 else np.inf
         hopeless = inference.moving and inference.excess > STALLED * excess and not inference.fits
@@ -293,7 +293,7 @@ def _nearby(setup: Setup, around: Around, report: Report) -> tuple[Inference, _S
 
 def _approached(setup: Setup, around: Around, report: Report) -> tuple[Inference, _Step]:
     """Run rounds until the map has nearly converged; also return the last step."""
-    inference, step = _conditioned(setup, around, 1), _Step()
+    inference, step = _conditioned(setup, around, 1, None), _Step()
     moves, stalled = np.inf if rebuilds(setup) else 0.0, False
     while moves > NEARLY and not stalled and inference.rounds < MAX_TEMPERED_ROUNDS:
         (around, step), exact = _around(setup, inference, step), None
@@ -334,9 +334,7 @@ def _elsewhere(setup: Setup, inference: Inference, way: int) -> Around:
     return best[1]
 
 
-def _conditioned(
-    setup: Setup, around: Around, rounds: int, exact: Inference | None = None
-) -> Inference:
+def _conditioned(setup: Setup, around: Around, rounds: int, exact: Inference | None) -> Inference:
     """Solve one round; ``exact``, the solution at these values, supplies A^T N_0^-1 A for reuse."""
     model, held = model_about(setup, around)
     if exact is None or exact.solution.matrix is None:
@@ -543,35 +541,32 @@ def with_learned_prior(
             setup = with_sky_above(setup, averaged_beyond(family, coarse, learned.scores))
     result = settled(setup, start, learn, report)
     if surveys:
-        rows, gains = _compared_surveys(setup, whole(result.solution.information))
-        learned = replace(result.learned, survey_rows=rows, survey_gains=gains)
+        learned = _compared_surveys(setup, whole(result.solution.information), result.learned)
         result = replace(result, learned=learned)
     return replace(setup, prior=result.learned.prior), result
 
 
-def _compared_surveys(
-    setup: Setup, information: Information
-) -> tuple[tuple[Row, ...], dict[str, float]]:
-    """Scale and zero level of every survey, and how much it alone increases ln p(d)."""
+def _compared_surveys(setup: Setup, information: Information, learned: Learned) -> Learned:
+    """Add scale and zero level of every survey, and how much it alone increases ln p(d)."""
     n = information.n_modes
 
-    def learned(*surveys: sky_sections.SurveySection) -> tuple[PriorFamily, Learned]:
+    def under(*surveys: sky_sections.SurveySection) -> tuple[PriorFamily, Learned]:
         changed = _with_surveys(setup, surveys)
         return changed.family, learned_prior(changed, information)
 
-    _, alone = learned()
+    _, alone = under()
     fitting = information.raised(alone.noise_factor)
     others = fitting.posterior(alone.prior)
     rows, gains = [], {}
     for one in setup.scenario.prior.surveys:
-        family, known = learned(one)
+        family, known = under(one)
         start = known.parameters if known.settled else family.hyperprior.start()
         survey = one.at(setup.frequency_mhz, lmax_of(n))
         errors = family.at(start).texture + family.white * np.eye(n)
         rows += survey.calibrated(others.mean, others.covariance(), errors)
         gained = fitting.posterior(known.prior).log_evidence - others.log_evidence
         gains[survey.name] = float(gained)
-    return tuple(rows), gains
+    return replace(learned, survey_rows=tuple(rows), survey_gains=gains)
 
 
 def _with_surveys(setup: Setup, surveys: Sequence[sky_sections.SurveySection]) -> Setup:

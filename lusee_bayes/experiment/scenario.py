@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from functools import lru_cache
 from importlib import resources
 from itertools import pairwise
@@ -339,9 +340,7 @@ def scenario_text(name: str) -> str:
     return (FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
 
 
-def load_scenario(
-    source: str | Path | Scenario, overrides: list[str] | tuple[str, ...] = ()
-) -> Scenario:
+def load_scenario(source: str | Path | Scenario, overrides: Sequence[str] = ()) -> Scenario:
     """Read a YAML file, or a built-in scenario by name, and apply ``key.path=value``.
 
     A Scenario is accepted as it is, so that runs accept a scenario, its file or its name.

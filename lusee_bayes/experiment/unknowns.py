@@ -392,9 +392,8 @@ class Unknowns:
         kinds = rows.groupby("systematic", sort=False).indices
         parts = {ALL_TOGETHER: every} | {name: root(at) for name, at in kinds.items()}
         moved = (rows["value"] - rows["prior"]) / rows["prior_std"]
-        squares = rows.assign(n=1, moved=moved**2, width=given.std**2)
-        named = squares.rename(columns={"unknown": "one", "site": "unknown"})
-        groups = named.groupby(["systematic", "unknown"], sort=False)
+        squares = rows.assign(unknown=rows["site"], n=1, moved=moved**2, width=given.std**2)
+        groups = squares.groupby(["systematic", "unknown"], sort=False)
         table = groups.agg({"n": "sum", "moved": "mean", "width": "mean"}).reset_index()
         table[["moved", "width"]] **= 0.5
         single = np.flatnonzero(rows["site"] == rows["unknown"])
@@ -413,8 +412,7 @@ class Unknowns:
     def _null_direction(self, posterior: Amplitudes, variance: float) -> NullDirection:
         mixed = self.parts @ posterior.with_sky[0] / self.sky_std
         inner = self.parts @ posterior.covariance @ self.parts.T
-        sky = variance / self.sky_std**2
-        blocks = np.block([[np.full((1, 1), sky), mixed[None]], [mixed[:, None], inner]])
+        blocks = np.block([[variance / self.sky_std**2, mixed], [mixed[:, None], inner]])
         return NullDirection.of((SKY, *self.names), blocks)
 
 
