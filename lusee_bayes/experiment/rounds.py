@@ -31,8 +31,8 @@ from lusee_bayes.systematics.context import Around, Setup, Volume
 from lusee_bayes.systematics.gain_drifts import GainDrifts, gains_about
 from lusee_bayes.systematics.noise_level import radiometer_about
 from lusee_bayes.systematics.pointing_offsets import PointingOffsets
-from lusee_bayes.systematics.registered import SYSTEMATICS
-from lusee_bayes.systematics.systematic import Expanded, Marginalised, Systematic, present
+from lusee_bayes.systematics.registered import present
+from lusee_bayes.systematics.systematic import Expanded, Marginalised, Systematic
 
 # N is rebuilt until the map moves by less than this (rms, in standard deviations)
 SETTLED, MAX_ROUNDS = 1e-2, 30
@@ -457,7 +457,7 @@ def first_order(scenario: Scenario) -> tuple[type[Systematic], ...]:
     """Systematics that are expanded to first order around values inferred from the data."""
     return tuple(
         cls
-        for cls, section in present(SYSTEMATICS, scenario)
+        for cls, section in present(scenario)
         if cls.treatment(scenario) != "ignored" and cls.in_rounds(section)
     )
 

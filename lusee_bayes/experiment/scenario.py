@@ -27,9 +27,8 @@ from lusee_bayes.flight.recipe import FlightSection
 from lusee_bayes.systematics.above_lmax import AboveLmaxSection
 from lusee_bayes.systematics.beam import BeamErrorSection
 from lusee_bayes.systematics.field_errors import FieldErrorsSection
-from lusee_bayes.systematics.registered import SYSTEMATICS, NoiseSection
+from lusee_bayes.systematics.registered import SYSTEMATICS, NoiseSection, present
 from lusee_bayes.systematics.sources import SourcesSection
-from lusee_bayes.systematics.systematic import present
 
 
 def apply_override(tree: dict[str, Any], override: str) -> None:
@@ -261,7 +260,7 @@ class Scenario(Section):
             return {}
         return {
             cls.words: octaves
-            for cls, section in present(SYSTEMATICS, self)
+            for cls, section in present(self)
             if cls.treatment(self) != "ignored" and (octaves := cls.octaves(section))
         }
 
