@@ -60,8 +60,7 @@ def items_of(data: object) -> tuple[Visibilities, ...] | tuple[Path, ...]:
         If there are no data, another type, or both sets and files.
     """
     one = Visibilities | str | Path
-    given = (data,) if isinstance(data, one) else data
-    items = given if isinstance(given, Sequence) else (given,)
+    items = data if isinstance(data, Sequence) and not isinstance(data, str) else (data,)
     if wrong := [item for item in items if not isinstance(item, one)]:
         raise InputError(
             "data must be Visibilities, paths of files, or lists of either, not a "
@@ -163,7 +162,7 @@ def read_data(data: Data, scenario: Scenario) -> Visibilities:
         data = _stamped(path, read_visibilities(path), timestamp)
     else:
         waterfall = read_waterfall(path)
-        data = waterfall.at(scenario.frequency_mhz, scenario.beam.n_ports)
+        data = waterfall.at(scenario.frequency_mhz, scenario.beam.source().n_ports)
         if waterfall.per_kelvin is not None:
             _require_same_instrument(waterfall, scenario)
         # samples of luseepy's simulators are instants; its format cannot declare windows
@@ -352,7 +351,8 @@ def per_kelvin_of(scenario: Scenario) -> Float[np.ndarray, " ports"]:
         If neither the beams nor the scenario specify it, or both do.
     """
     said = None if scenario.flight is None else scenario.flight.per_kelvin_v2_hz
-    circuit = scenario.beam.source().circuit(scenario.frequency_mhz)
+    source = scenario.beam.source()
+    circuit = source.circuit(scenario.frequency_mhz)
     if circuit is None and said is None:
         raise InputError(
             "flight data are in V^2/Hz, at the receivers' inputs, but these beams are not "
@@ -365,7 +365,7 @@ def per_kelvin_of(scenario: Scenario) -> Float[np.ndarray, " ports"]:
             "it"
         )
     if circuit is None:
-        return np.full(scenario.beam.n_ports, float(said))
+        return np.full(source.n_ports, float(said))
     return np.ascontiguousarray(circuit.per_kelvin.diagonal().real)
 
 

@@ -167,14 +167,11 @@ def model_mistakes(setup: Setup) -> Iterator[ModelMistake]:
     observation, beams = setup.observation, setup.beams
     turntables = offset_names(("turntable_deg",), observation.n_runs)
     angles = dict(zip(turntables, observation.turntable_deg, strict=True))
-    offsets: list[tuple[str, str, dict[str, float]]] = [
-        (
-            f"the array is rotated by {turn:g} degrees from East towards North",
-            f"use --set beam.turntable_offset_deg={turn:g}",
-            dict.fromkeys(turntables, turn),
-        )
-        for turn in (90.0, 180.0, 270.0)
-    ]
+    offsets: list[tuple[str, str, dict[str, float]]] = []
+    for turn in (90.0, 180.0, 270.0):
+        wrong = f"the array is rotated by {turn:g} degrees from East towards North"
+        remedy = f"use --set beam.turntable_offset_deg={turn:g}"
+        offsets.append((wrong, remedy, dict.fromkeys(turntables, turn)))
     if any(angles.values()):
         wrong = "the turntable's angles have the wrong sign"
         opposite = {name: -2.0 * angle for name, angle in angles.items()}

@@ -22,16 +22,9 @@ from lusee_bayes.core.checks import Described, counted
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import n_modes
 from lusee_bayes.core.progress import Stages
+from lusee_bayes.experiment import rounds
 from lusee_bayes.experiment.leave_out import Fitting, fitting, without
 from lusee_bayes.experiment.model import model_to_sample, radiometer, set_up, simulate, systematics
-from lusee_bayes.experiment.rounds import (
-    MAX_ROUNDS,
-    Inference,
-    Report,
-    rebuilds,
-    settled,
-    with_learned_prior,
-)
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.instrument.coupling import Instrument
 from lusee_bayes.instrument.visibilities import Visibilities
@@ -74,7 +67,7 @@ class Experiment(Described):
     doubts: tuple[str, ...] = ()
     learned: Learned | None = None
     fitting: Fitting | None = None
-    inference: Inference | None = None
+    inference: rounds.Inference | None = None
 
     def description(self) -> tuple[str, ...]:
         scenario = self.scenario
@@ -128,7 +121,8 @@ def build(
         (:func:`.require_plausible`), or if the prior's parameters do not converge.
     """
     stages = stages or Stages()
-    return _learned(_fitting(observed(scenario, data, stages), stages), stages, earlier, values)
+    experiment = _fitting(observed(scenario, data, stages), stages)
+    return _learned(experiment, Around(experiment.data, values=values), stages, earlier)
 
 
 def observed(
@@ -147,7 +141,12 @@ def observed(
     scenario = scenario.with_section("noise", above_lmax=above)
     try:
         if above is not None and data is not None:
-            _require_room(data.layout.size, above.top(scenario.lmax))
+            n_data, top = data.layout.size, above.top(scenario.lmax)
+            if n_data * n_modes(top) > MOST_ABOVE:
+                raise InputError(
+                    f"with {n_data:,} data, the sky up to lmax = {top} takes too much memory; "
+                    "average the data, or raise lmax"
+                )
         setup = set_up(scenario, data, stages)
     except InputError as error:
         if above is None or data is None:
@@ -168,15 +167,6 @@ def observed(
     return Experiment(setup, data, tuple(doubts))
 
 
-def _require_room(n_data: int, lmax: int) -> None:
-    """Raise InputError if a matrix of data and modes is too large."""
-    if n_data * n_modes(lmax) > MOST_ABOVE:
-        raise InputError(
-            f"with {n_data:,} data, the sky up to lmax = {lmax} takes too much memory; average the "
-            "data, or raise lmax"
-        )
-
-
 def _fitting(experiment: Experiment, stages: Stages) -> Experiment:
     """Remove inconsistent data from an experiment with flight data."""
     section, data = experiment.scenario.flight, experiment.data
@@ -193,19 +183,15 @@ def _fitting(experiment: Experiment, stages: Stages) -> Experiment:
 
 
 def _learned(
-    experiment: Experiment,
-    stages: Stages,
-    earlier: Information | None = None,
-    values: Mapping[str, float] | None = None,
+    experiment: Experiment, start: Around, stages: Stages, earlier: Information | None = None
 ) -> Experiment:
-    setup, data = experiment.setup, experiment.data
-    start = None if values is None else Around(data, values=values)
+    setup = experiment.setup
     if setup.family is None:
-        if start is not None:
-            experiment = replace(experiment, inference=settled(setup, data, start))
-        return experiment
+        if start.values is None:
+            return experiment
+        return replace(experiment, inference=rounds.settled(setup, start))
     with rounds_of(experiment, stages, "prior") as report:
-        setup, inference = with_learned_prior(setup, data, earlier, start, report)
+        setup, inference = rounds.with_learned_prior(setup, start, earlier, report)
     return replace(experiment, setup=setup, learned=inference.learned, inference=inference)
 
 
@@ -236,16 +222,16 @@ def under_sky(setup: Setup, source: SkySource, seed: int) -> Experiment:
         modes = np.asarray(whole.modes)[seen.prior.size :]
         seen = replace(seen, above=replace(seen.above, modes=modes))
     data = simulate(seen).with_truth_up_to(scenario.lmax)
-    return _learned(Experiment(seen, data), Stages())
+    return _learned(Experiment(seen, data), Around(data), Stages())
 
 
 def rounds_of(experiment: Experiment, stages: Stages, name: str) -> AbstractContextManager:
     """A stage; it shows the progress of rounds if the inference still needs them."""
-    in_rounds = experiment.inference is None and rebuilds(experiment.setup)
-    return stages.progress(name, MAX_ROUNDS) if in_rounds else stages(name)
+    in_rounds = experiment.inference is None and rounds.rebuilds(experiment.setup)
+    return stages.progress(name, rounds.MAX_ROUNDS) if in_rounds else stages(name)
 
 
-def infer(experiment: Experiment, report: Report | None = None) -> Inference:
+def infer(experiment: Experiment, report: rounds.Report | None = None) -> rounds.Inference:
     """Condition the experiment's model on its data (:func:`.settled`).
 
     Parameters
@@ -259,7 +245,8 @@ def infer(experiment: Experiment, report: Report | None = None) -> Inference:
     InputError
         As in :func:`.settled`.
     """
-    return experiment.inference or settled(experiment.setup, experiment.data, report=report)
+    start = Around(experiment.data)
+    return experiment.inference or rounds.settled(experiment.setup, start, report=report)
 
 
 def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
@@ -294,7 +281,7 @@ def program_pieces(experiment: Experiment) -> dict[str, Callable[[], Any]]:
     @cache
     def around() -> Around:
         # without such values, large offsets are not described, and gains belong to other antennas
-        if not rebuilds(setup):
+        if not rounds.rebuilds(setup):
             return Around(data)
         return infer(experiment).around
 
@@ -352,9 +339,8 @@ def posterior_draws(
         In K.
     """
     key, learned = draw_key(experiment.scenario), experiment.learned
-    if learned is not None and learned.fits:
-        family = experiment.setup.family
-        return draws_with_parameters(family, learned, information(), key, n)
+    if learned is not None and learned.settled and learned.noise_factor == 1.0:
+        return draws_with_parameters(experiment.setup.family, learned, information(), key, n)
     return posterior.sample(key, n)
 
 
@@ -378,7 +364,7 @@ def interpolation_error(setup: Setup) -> dict[str, float]:
     return {where: max(map(rms, lines)) for where, lines in off.items()}
 
 
-def doubts(experiment: Experiment, inference: Inference) -> tuple[str, ...]:
+def doubts(experiment: Experiment, inference: rounds.Inference) -> tuple[str, ...]:
     """Doubts about an experiment's data, its prior and its rounds."""
     learned, notes = experiment.learned, list(experiment.doubts)
     errors = interpolation_error(experiment.setup)

@@ -100,7 +100,8 @@ class FlightSimulation:
         return 2.0**self.navg_shift
 
     @cached_property
-    def _spectra(self) -> synthesis.ChannelSpectra:
+    def _in_channels(self) -> synthesis.ChannelSpectra:
+        """Gives spectra of all channels without noise or disturbances, in V^2/Hz."""
         return synthesis.ChannelSpectra.of(self.frequencies_mhz, channel_mhz(self.origin))
 
     @cached_property
@@ -165,12 +166,8 @@ class FlightSimulation:
         for k in range(0, len(blocks), together):
             yield from in_threads(self._block, blocks[k : k + together])
 
-    def spectra(self, rows: slice) -> Float[np.ndarray, "products _ channels"]:
-        """Return the spectra of all channels without noise or disturbances, in V^2/Hz."""
-        return self._spectra(self.visibilities[..., rows])
-
     def _block(self, rows: slice) -> Float32[np.ndarray, "_ products bins"]:
-        t = to_matrix(self.spectra(rows))
+        t = to_matrix(self._in_channels(self.visibilities[..., rows]))
         self.disturbances.add(t, rows, self.frames)
         if self.section.radiometer:
             generator = np.random.default_rng([self.scenario.seed, 2, rows.start])
@@ -187,7 +184,7 @@ class FlightSimulation:
     def _slices(self) -> dict[str, Int[np.ndarray, " products"]]:
         """Bit slices for each state of the gains."""
         first = slice(0, 1)
-        spectra = self.spectra(first)
+        spectra = self._in_channels(self.visibilities[..., first])
         states = {"".join(one) for one in np.unique(self.disturbances.level, axis=0)}
         counts = {levels: self._counts(levels, spectra, first) for levels in states}
         return {levels: synthesis.bit_slices(one) for levels, one in counts.items()}
@@ -347,5 +344,4 @@ def _drawn_gains(scenario: Scenario, flight: FlightSection) -> tuple[GainModel, 
             "noise.gain_table needs the errors of the gains; give flight.gain_std, or "
             "flight.component_std"
         )
-    generator = np.random.default_rng([scenario.seed, 3])
-    return table, *draw_gains(table, flight.gain_std, generator)
+    return table, *draw_gains(table, flight.gain_std, np.random.default_rng([scenario.seed, 3]))

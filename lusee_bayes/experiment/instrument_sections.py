@@ -2,9 +2,9 @@
 
 They specify site, times and turntable angles, the beams, and the receivers at their ports. A
 section in :mod:`lusee_bayes.flight.recipe` specifies how spectrometer sessions become visibilities.
-Beams and receivers have one section per kind, selected by ``model``. To add a kind of beams, write
-a subclass of :class:`BaseBeamSection` here, with its :class:`BeamSource`, and add it to
-``BEAM_SECTIONS``.
+Beams and receivers have one section per kind, selected by ``model``; those of receivers are in
+:mod:`lusee_bayes.instrument.beams.source`. To add a kind of beams, write a subclass of
+:class:`BaseBeamSection` here, with its :class:`BeamSource`, and add it to ``BEAM_SECTIONS``.
 """
 
 from __future__ import annotations
@@ -15,23 +15,16 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import Field, model_validator
 
 from lusee_bayes.core.section import Angle, Positive, Section, Temperature, kinds_of, one_of
 from lusee_bayes.instrument.beams.fields import Interpolation
-from lusee_bayes.instrument.beams.grid import read_beam_grid, read_grid_table
+from lusee_bayes.instrument.beams.grid import read_beam_grid
 from lusee_bayes.instrument.beams.luseepy_files import read_response, read_scalar_beam
 from lusee_bayes.instrument.beams.monopoles import Monopoles, Regolith
 from lusee_bayes.instrument.beams.sampled import beam_kind, read_sampled
-from lusee_bayes.instrument.beams.source import (
-    BeamSource,
-    CapacitorReceiver,
-    JFETReceiver,
-    Receiver,
-    read_receiver,
-)
+from lusee_bayes.instrument.beams.source import BeamSource, ReceiverSection
 from lusee_bayes.instrument.observation import Observation
-from lusee_bayes.instrument.products import N_ANTENNAS
 from lusee_bayes.instrument.schedule import CYCLE_DAYS, Interval, Run, read_schedule
 from lusee_bayes.instrument.times import Timestamp
 
@@ -120,17 +113,13 @@ class ObservationSection(Section):
 
     def observation(self) -> Observation:
         """Site, times and turntable angles."""
-        return _observation(self, self._intervals)
+        return _observation(self, () if self.schedule is None else read_schedule(self.schedule))
 
     def n_samples(self) -> int:
         """Count the samples, including those by day."""
         if self.schedule is None:
             return sum(int(run.cycles * CYCLE_DAYS * 86400.0 // self.step_s) for run in self.runs)
-        return sum(interval.n_samples(self.step_s) for interval in self._intervals)
-
-    @property
-    def _intervals(self) -> tuple[Interval, ...]:
-        return () if self.schedule is None else read_schedule(self.schedule)
+        return sum(interval.n_samples(self.step_s) for interval in read_schedule(self.schedule))
 
 
 @lru_cache(maxsize=2)
@@ -141,45 +130,6 @@ def _observation(section: ObservationSection, intervals: tuple[Interval, ...]) -
         return Observation.from_schedule(intervals, **common)
     runs = tuple(Run(r.cycles, r.turntable_deg, r.night_only) for r in section.runs)
     return Observation.from_runs(runs, start=section.start, **common)
-
-
-class ReceiverFileSection(Section):
-    """Load impedances from a file with images ``freq``, ``ZL_real`` and ``ZL_imag``.
-
-    Attributes
-    ----------
-    file : str
-        Path of the file.
-    """
-
-    model: Literal["file"] = "file"
-    file: str
-
-    def receiver(self) -> Receiver | None:
-        """The receiver, or None for open ports."""
-        return read_receiver(self.file)
-
-
-class OpenSection(Section):
-    """Open ports: no receiver connected."""
-
-    model: Literal["open"] = "open"
-
-    def receiver(self) -> Receiver | None:
-        """The receiver, or None for open ports."""
-        return None
-
-
-def _named(value: Any) -> Any:
-    """``receiver: open`` means ``receiver: {model: open}``."""
-    return {"model": value} if isinstance(value, str) else value
-
-
-ReceiverSection = Annotated[
-    JFETReceiver | CapacitorReceiver | ReceiverFileSection | OpenSection,
-    Field(discriminator="model"),
-    BeforeValidator(_named),
-]
 
 
 class BaseBeamSection(Section):
@@ -229,10 +179,8 @@ class MonopoleBeamSection(BaseBeamSection):
 
     is_file: ClassVar[bool] = False
     has_parameters: ClassVar[bool] = True
-    # name for file headers, and number of antennas
+    # name for file headers
     label: ClassVar[str] = "monopole"
-    n_ports: ClassVar[int] = N_ANTENNAS
-
     errors: ClassVar[Mapping[str, float]] = {
         "surface_permittivity": 0.05,
         "deep_permittivity": 0.05,
@@ -321,11 +269,6 @@ class ScalarBeamSection(_LuseepySection):
     taper: bool = True
     rotations_deg: Annotated[tuple[Angle, ...], Field(min_length=1)] = (0.0, 90.0, 180.0, 270.0)
 
-    @property
-    def n_ports(self) -> int:
-        """Number of ports."""
-        return len(self.rotations_deg)
-
     def source(self) -> BeamSource:
         """The pattern of the file, rotated to every angle."""
         beam, own = read_scalar_beam(self.file), self.model_dump(include={"taper", "rotations_deg"})
@@ -349,7 +292,6 @@ class ResponseSection(_LuseepySection):
         Temperature of the antennas, whose losses add thermal emission.
     """
 
-    n_ports: ClassVar[int] = N_ANTENNAS
     model: Literal["response"] = "response"
     receiver: ReceiverSection | None = None
     antenna_temperature_k: Temperature = 0.0
@@ -376,11 +318,6 @@ class SampledBeamSection(_FileSection):
     model: Literal["sampled"] = "sampled"
     normalise: bool | None = None
 
-    @property
-    def n_ports(self) -> int:
-        """Number of ports."""
-        return read_sampled(self.file).n_ports
-
     def source(self) -> BeamSource:
         """The beams of the file."""
         asked = self.model_dump(exclude={"model", "file", "exact"})
@@ -402,11 +339,6 @@ class GridBeamSection(ScalarBeamSection, ResponseSection, SampledBeamSection):
 
     model: Literal["grid"] = "grid"
     values: dict[str, float] = Field(default_factory=dict)
-
-    @property
-    def n_ports(self) -> int:
-        """Number of ports."""
-        return self.of_file(read_grid_table(self.file)[0][0]).n_ports
 
     def source(self) -> BeamSource:
         """The beams of all files, interpolated."""

@@ -140,9 +140,7 @@ def _judged(missed: list[Missed]) -> tuple[Vector, Vector]:
 
 def _tail(chi2: Vector, degrees: Vector) -> Vector:
     """Probability of this chi^2 or more; 1 where there are no degrees of freedom."""
-    some = degrees > 0.0
-    tail = special.chdtrc(np.where(some, degrees, 1.0), np.maximum(chi2, 0.0))
-    return np.where(some, tail, 1.0)
+    return np.where(degrees > 0.0, special.chdtrc(degrees, np.maximum(chi2, 0.0)), 1.0)
 
 
 def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> GroupsCompared | None:
@@ -169,7 +167,7 @@ def compared(setup: Setup, data: Visibilities, *, settle: bool = True) -> Groups
     n, across = data.layout.size, is_modelled(setup.scenario.noise.gain)
     if 8.0 * ARRAYS * n * (setup.prior.size + n * across) > MOST_MEMORY * memory_limit():
         return None
-    inference = settled(setup, data) if settle else None
+    inference = settled(setup, Around(data)) if settle else None
     if inference is not None and not inference.unsettled:
         model, posterior = inference.model, inference.posterior
     else:  # with bad data, rounds may never converge
@@ -311,13 +309,12 @@ class _Rules:
         return None
 
     def one_by_one(
-        self, start: GroupsCompared, gone: GridFlags, groups: GridFlags, least: float
+        self, left: GroupsCompared, gone: GridFlags, groups: GridFlags, least: float
     ) -> tuple[GroupsCompared, GridFlags | None]:
-        """Flag the worst data first; ``gone``, missing from ``start``, includes ``groups``.
+        """Flag the worst data first; ``gone``, missing from ``left``, includes ``groups``.
 
         Returns the last comparison, and all flags; None in their place if they are too many.
         """
-        left = start
         while (worst := left.worst(self.false_alarm, least)).any():
             gone = gone | worst
             if self.broken(gone, groups):

@@ -31,18 +31,10 @@ from lusee_bayes.systematics.context import Around, Setup, noise_visibilities, p
 from lusee_bayes.systematics.gain_drifts import GainDrifts
 from lusee_bayes.systematics.horizon import Horizon
 from lusee_bayes.systematics.noise_level import radiometer_about
-from lusee_bayes.systematics.registered import SYSTEMATICS
+from lusee_bayes.systematics.registered import present
 from lusee_bayes.systematics.regolith import ground_per_kelvin
 from lusee_bayes.systematics.sources import source_responses
-from lusee_bayes.systematics.systematic import (
-    Expanded,
-    InPlace,
-    Marginalised,
-    Scale,
-    Systematic,
-    Truth,
-    present,
-)
+from lusee_bayes.systematics.systematic import Expanded, Marginalised, Scale, Systematic, Truth
 
 # sites closer than this, 30 m, count as one
 SAME_SITE_DEG = 1e-3
@@ -77,8 +69,7 @@ def set_up(
         if data is None:
             observation = scenario.observation.observation()
         else:
-            fixed_axis = scenario.observation.fixed_axis
-            observation = replace(data.observation, fixed_axis=fixed_axis)
+            observation = replace(data.observation, fixed_axis=scenario.observation.fixed_axis)
         pointing = Pointing.of(observation, scenario.lmax)
     with stages("beams"):
         receiver = None if data is None else data.receiver
@@ -182,7 +173,7 @@ def radiometer(setup: Setup, around: Around | None = None) -> Covariance:
 
 def moved(setup: Setup, values: Truth | None) -> Setup:
     """The setup with these values of the instrument, and its signal for them."""
-    for cls, section in present(SYSTEMATICS, setup.scenario) if values else ():
+    for cls, section in present(setup.scenario) if values else ():
         setup = cls.moved(section, setup, values)
     return setup
 
@@ -197,15 +188,14 @@ def systematics(setup: Setup, around: Around | None = None) -> list[tuple[str, S
     moved_setup = moved(setup, around.values)
     return [
         (treatment, cls.build(section, moved_setup, around))
-        for cls, section in present(SYSTEMATICS, setup.scenario)
+        for cls, section in present(setup.scenario)
         if (treatment := cls.treatment(setup.scenario)) != "ignored"
     ]
 
 
 def base_model(setup: Setup, around: Around | None = None) -> LinearGaussian:
     """d = A m + background + n with radiometer noise only."""
-    noise = radiometer(setup, around)
-    return LinearGaussian(setup.coupling, setup.prior, noise, setup.offset)
+    return LinearGaussian(setup.coupling, setup.prior, radiometer(setup, around), setup.offset)
 
 
 def in_noise(
@@ -270,6 +260,20 @@ def full_model(setup: Setup, around: Around | None = None) -> LinearGaussian:
     return model_about(setup, around or Around())[0]
 
 
+class InPlace(Marginalised):
+    """A systematic at its place among sampled ones, in a model whose N contains it already.
+
+    Attributes
+    ----------
+    systematic : Marginalised
+        As part of N.
+    """
+
+    def sampled(self, model: LinearGaussian) -> LinearGaussian:
+        """Apply its effects except the term of N."""
+        return replace(self.marginalised(model), noise=model.noise)
+
+
 def model_to_sample(
     setup: Setup, around: Around
 ) -> tuple[LinearGaussian, tuple[Systematic | Marginalised, ...]]:
@@ -310,7 +314,7 @@ def model_to_sample(
 def true_values(setup: Setup) -> Truth:
     """True values of the systematics in simulated data, by the names of their sites."""
     truth: Truth = {}
-    for cls, section in present(SYSTEMATICS, setup.scenario):
+    for cls, section in present(setup.scenario):
         key = jax.random.key(cls.true_seed(section, setup.scenario))
         truth |= cls.truth(section, setup, key)
     return truth
@@ -321,7 +325,7 @@ def true_model(setup: Setup, truth: Truth) -> LinearGaussian:
     key = jax.random.key(setup.scenario.seed)
     true = moved(setup, truth)
     model = LinearGaussian(true.coupling, setup.prior, radiometer(setup), true.offset)
-    for cls, section in present(SYSTEMATICS, setup.scenario):
+    for cls, section in present(setup.scenario):
         model = cls.in_data(section, true, model, truth, key)
     return model
 
@@ -340,10 +344,5 @@ def simulate(setup: Setup) -> Visibilities:
     noise = model.noise.sample(jax.random.key(setup.scenario.seed))
     if setup.above is not None:
         truth = np.concatenate([truth, setup.above.modes])
-    return Visibilities(
-        model.predict(setup.sky.modes) + noise,
-        setup.layout,
-        setup.observation,
-        setup.scenario.frequency_mhz,
-        truth,
-    )
+    where = setup.layout, setup.observation, setup.frequency_mhz
+    return Visibilities(model.predict(setup.sky.modes) + noise, *where, truth)

@@ -6,8 +6,7 @@ module also provides priors by name, to compare how probable the data are under 
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,22 +18,21 @@ from lusee_bayes.core.section import is_modelled
 from lusee_bayes.experiment import sky_sections
 from lusee_bayes.experiment.model import model_about, moved, with_sky_above
 from lusee_bayes.experiment.scenario import Scenario
-from lusee_bayes.instrument.visibilities import Visibilities
 from lusee_bayes.linear.amplitudes import Amplitudes, template_amplitudes
 from lusee_bayes.linear.information import Information, integrated_out
 from lusee_bayes.linear.linear_gaussian import FromInformation, LinearGaussian, Solution
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.noise.covariance import LowRankFactor
 from lusee_bayes.priors.families import PriorFamily
-from lusee_bayes.priors.learning import Learned, Row, averaged_beyond, learn_whatever_fits
+from lusee_bayes.priors.learning import Learned, averaged_beyond, learn_whatever_fits
 from lusee_bayes.sky.prior import Prior
 from lusee_bayes.systematics.above_lmax import AboveLmax
 from lusee_bayes.systematics.context import Around, Setup, Volume
 from lusee_bayes.systematics.gain_drifts import GainDrifts, gains_about
 from lusee_bayes.systematics.noise_level import radiometer_about
 from lusee_bayes.systematics.pointing_offsets import PointingOffsets
-from lusee_bayes.systematics.registered import SYSTEMATICS
-from lusee_bayes.systematics.systematic import Expanded, Marginalised, Systematic, present
+from lusee_bayes.systematics.registered import present
+from lusee_bayes.systematics.systematic import Expanded, Marginalised, Systematic
 
 # N is rebuilt until the map moves by less than this (rms, in standard deviations)
 SETTLED, MAX_ROUNDS = 1e-2, 30
@@ -120,8 +118,7 @@ class Inference:
     @property
     def drifts(self) -> tuple[GainDrifts, ...]:
         """Drifts of the gains in N, if any."""
-        parts = (s.systematic for s in self.systematics)
-        return tuple(one for one in parts if isinstance(one, GainDrifts))
+        return tuple(s.systematic for s in self.systematics if isinstance(s.systematic, GainDrifts))
 
     @property
     def offsets(self) -> Expanded | None:
@@ -162,7 +159,7 @@ class Inference:
     def fits(self) -> bool:
         """Whether chi^2 is acceptable, under the prior or one that allows any sky."""
         n, solution = len(self.solution.data), self.solution
-        most = n + FAR_OFF * math.sqrt(2.0 * n)
+        most = n + FAR_OFF * (2.0 * n) ** 0.5
         if solution.chi2 >= most:
             solution = self.under(self.model.prior.widened(WIDE)).solution
         return solution.chi2 < most
@@ -188,11 +185,7 @@ Report = Callable[[int, str], None]
 
 
 def settled(
-    setup: Setup,
-    data: Visibilities,
-    start: Around | None = None,
-    learn: Learning | None = None,
-    report: Report | None = None,
+    setup: Setup, start: Around, learn: Learning | None = None, report: Report | None = None
 ) -> Inference:
     """Condition the model on data, in as many rounds as its N needs.
 
@@ -212,10 +205,9 @@ def settled(
     Parameters
     ----------
     setup : Setup
-    data : Visibilities
-    start : Around, optional
-        Expansion point of N in the first round. By default, the data and, if the instrument is
-        inferred, the sky for the given or else the expected values.
+    start : Around
+        The data, and the expansion point of N in the first round. If the instrument is inferred and
+        no sky is given, the sky is solved for the given or else the expected values.
     learn : callable, optional
         ``learn(information, start)`` learns the prior during the rounds: first when they have
         nearly converged, last when it moves the map by less than 0.05 standard deviations.
@@ -234,20 +226,15 @@ def settled(
         If N is not positive definite.
     """
     report = report or (lambda rounds, remark: None)
-    start = start or Around(data)
     if start.sky is None:
-        if (few := _fewer(setup, data)) is not None:
-            inference, step = _nearby(*few, beginning(*few, start.values), report)
-            fixed = {
-                name
-                for s in inference.expanded
-                if not s.systematic.moves
-                for name in s.systematic.names
-            }
+        if (few := _fewer(setup, start)) is not None:
+            inference, step = _nearby(few[0], _beginning(*few), report)
+            terms = (s.systematic for s in inference.expanded)
+            fixed = {name for one in terms if not one.moves for name in one.names}
             values = (inference.around.values or {}).items()
             start = replace(start, values={n: v for n, v in values if n not in fixed})
-        start = beginning(setup, data, start.values)
-    inference, step = _nearby(setup, data, start, report)
+        start = _beginning(setup, start)
+    inference, step = _nearby(setup, start, report)
     moves, n_learned, learned, in_rounds, idle = np.inf, 0, None, rebuilds(setup), 0
     while True:
         last = not in_rounds or inference.rounds >= MAX_ROUNDS or idle == IDLE
@@ -267,7 +254,7 @@ def settled(
         mean, n, as_learned = inference.posterior.mean, inference.rounds + 1, inference.learned
         excess = inference.excess
         del inference  # its N
-        inference = replace(_conditioned(setup, data, around, n), learned=as_learned)
+        inference = replace(_conditioned(setup, around, n, None), learned=as_learned)
         report(inference.rounds, inference.remark)
         moves = inference.moves_from(mean) if around.tempered == 1.0 else np.inf
         hopeless = inference.moving and inference.excess > STALLED * excess and not inference.fits
@@ -283,50 +270,44 @@ def settled(
     )
 
 
-def _fewer(setup: Setup, data: Visibilities) -> tuple[Setup, Visibilities] | None:
-    """Setup and data at a regular subset of times that suffices to find the instrument, or None."""
-    run = setup.observation.run
+def _fewer(setup: Setup, start: Around) -> tuple[Setup, Around] | None:
+    """The same at a regular subset of times that suffices to find the instrument, or None."""
+    run, data = setup.observation.run, start.data
     stride = len(data.data) // (ENOUGH * setup.prior.size)
     if stride < 2 or not first_order(setup.scenario):
         return None
     keep = (np.arange(len(run)) - np.searchsorted(run, run)) % stride == 0
-    return setup.select(keep), data.select(keep)
+    return setup.select(keep), replace(start, data=data.select(keep))
 
 
-def _nearby(
-    setup: Setup, data: Visibilities, around: Around, report: Report
-) -> tuple[Inference, _Step]:
+def _nearby(setup: Setup, around: Around, report: Report) -> tuple[Inference, _Step]:
     """Run rounds until the map has nearly converged; if it does not fit, restart elsewhere."""
-    best, step = _approached(setup, data, around, report)
+    best, step = _approached(setup, around, report)
     for way in range(OTHER_WAYS):
         if best.moving and not best.fits:
-            begin = _elsewhere(setup, data, best, way)
-            other = _approached(setup, data, begin, report)
+            other = _approached(setup, _elsewhere(setup, best, way), report)
             if other[0].posterior.log_evidence > best.posterior.log_evidence:
                 best, step = other
     return best, step
 
 
-def _approached(
-    setup: Setup, data: Visibilities, around: Around, report: Report
-) -> tuple[Inference, _Step]:
+def _approached(setup: Setup, around: Around, report: Report) -> tuple[Inference, _Step]:
     """Run rounds until the map has nearly converged; also return the last step."""
-    inference, step = _conditioned(setup, data, around, 1), _Step()
+    inference, step = _conditioned(setup, around, 1, None), _Step()
     moves, stalled = np.inf if rebuilds(setup) else 0.0, False
     while moves > NEARLY and not stalled and inference.rounds < MAX_TEMPERED_ROUNDS:
         (around, step), exact = _around(setup, inference, step), None
         mean, n, excess = inference.posterior.mean, inference.rounds + 1, inference.excess
         at_rest = step.whole is None or np.abs(step.whole).max() < NEARLY
-        if around.tempered > 1.0:
-            # at rest, a misfit that larger noise does not explain will not improve
-            stalled = at_rest and not inference.fits
+        # at rest, a misfit that larger noise does not explain will not improve
+        stalled = around.tempered > 1.0 and at_rest and not inference.fits
         del inference  # its N
         if around.tempered > 1.0:
             exact = _exact(setup, around)
             around = exact.around
             if at_rest:
                 around, exact = replace(around, tempered=1.0), None
-        inference = _conditioned(setup, data, around, n, exact)
+        inference = _conditioned(setup, around, n, exact)
         report(inference.rounds, inference.remark)
         moved_by = float(inference.posterior.rms_shift_from(mean))
         moves = moved_by if around.tempered == 1.0 else np.inf
@@ -334,7 +315,7 @@ def _approached(
     return inference, step
 
 
-def _elsewhere(setup: Setup, data: Visibilities, inference: Inference, way: int) -> Around:
+def _elsewhere(setup: Setup, inference: Inference, way: int) -> Around:
     """Another starting point: the likeliest of several draws, which may keep half of the values."""
     rng, best = np.random.default_rng(way), None
     parts = [part for part in inference.expanded if not part.systematic.learns]
@@ -346,24 +327,21 @@ def _elsewhere(setup: Setup, data: Visibilities, inference: Inference, way: int)
             z = np.where(kept, part.centre, drawn)
             values |= part.systematic.in_units(z)
             log_prior -= 0.5 * float(z @ z)
-        exact = _exact(setup, Around(data, values=values))
+        exact = _exact(setup, Around(inference.around.data, values=values))
         likely = float(exact.posterior.log_evidence) + log_prior
         if best is None or likely > best[0]:
             best = likely, replace(exact.around, tempered=_tempered(exact.misfit(), 0))
     return best[1]
 
 
-def _conditioned(
-    setup: Setup, data: Visibilities, around: Around, rounds: int, exact: Inference | None = None
-) -> Inference:
+def _conditioned(setup: Setup, around: Around, rounds: int, exact: Inference | None) -> Inference:
     """Solve one round; ``exact``, the solution at these values, supplies A^T N_0^-1 A for reuse."""
     model, held = model_about(setup, around)
     if exact is None or exact.solution.matrix is None:
-        solution = model.condition(data.data)
+        solution = model.condition(around.data.data)
     else:
-        solution = FromInformation.beside(exact.solution, model).condition(data.data)
-    solution = _less_moved(solution, held)
-    return Inference(solution, held, rounds, around)
+        solution = FromInformation.beside(exact.solution, model).condition(around.data.data)
+    return Inference(_less_moved(solution, held), held, rounds, around)
 
 
 def _less_moved(solution: Solution, held: Sequence[Marginalised]) -> Solution:
@@ -407,16 +385,12 @@ def _around(setup: Setup, inference: Inference, step: _Step) -> tuple[Around, _S
     around, solution = inference.around, inference.solution
     solved = solution.weighted_residual()
     if inference.moving:
-        ways = [s.expected + s.columns.T @ solved - s.centre for s in inference.expanded]
+        ways = [(s, s.expected + s.columns.T @ solved - s.centre) for s in inference.expanded]
         # learned prior widths do not indicate how far the first order is valid
-        far = [
-            way
-            for s, way in zip(inference.expanded, ways, strict=True)
-            if s.systematic.moves and not s.systematic.learns
-        ]
+        far = [way for s, way in ways if s.systematic.moves and not s.systematic.learns]
         step = step.after(np.concatenate(far)) if far else step
         values = {}
-        for s, way in zip(inference.expanded, ways, strict=True):
+        for s, way in ways:
             values |= s.systematic.in_units(s.centre + step.size * way)
             if s.systematic.learns and around.tempered == 1.0:
                 amplitudes = inference.amplitudes(s)
@@ -440,15 +414,12 @@ def _around(setup: Setup, inference: Inference, step: _Step) -> tuple[Around, _S
     return around, step
 
 
-def beginning(
-    setup: Setup, data: Visibilities, values: Mapping[str, float] | None = None
-) -> Around:
+def _beginning(setup: Setup, around: Around) -> Around:
     """The first expansion point of N: the data and, if the instrument is inferred, a sky.
 
     The sky is solved for the instrument with these values (default: the expected ones). The noise
     is increased if it does not fit.
     """
-    around = Around(data, values=values)
     if not first_order(setup.scenario):
         return around
     exact = _exact(setup, around)
@@ -486,7 +457,7 @@ def first_order(scenario: Scenario) -> tuple[type[Systematic], ...]:
     """Systematics that are expanded to first order around values inferred from the data."""
     return tuple(
         cls
-        for cls, section in present(SYSTEMATICS, scenario)
+        for cls, section in present(scenario)
         if cls.treatment(scenario) != "ignored" and cls.in_rounds(section)
     )
 
@@ -509,10 +480,8 @@ def prediction(setup: Setup, inference: Inference, solved: DataVector) -> Grid:
         N^-1 (d - A m) of the mean map.
     """
     mean = replace(setup.sky, modes=inference.posterior.mean)
-    besides = np.zeros(len(solved))
-    for part in inference.expanded:
-        if not part.changes_coupling:
-            besides = besides + part.columns @ (part.columns.T @ solved)
+    columns = (part.columns for part in inference.expanded if not part.changes_coupling)
+    besides = sum((t @ (t.T @ solved) for t in columns), start=np.zeros(len(solved)))
     for drifts in inference.drifts:
         besides = besides / np.asarray(drifts.response(drifts.about))
     return setup.under(mean).signal + setup.layout.scatter(besides)
@@ -523,11 +492,7 @@ COARSE_LMAX = 24
 
 
 def with_learned_prior(
-    setup: Setup,
-    data: Visibilities,
-    earlier: Information | None = None,
-    start: Around | None = None,
-    report: Report | None = None,
+    setup: Setup, start: Around, earlier: Information | None, report: Report | None
 ) -> tuple[Setup, Inference]:
     """Learn the prior from data, with all terms of N (:func:`settled`).
 
@@ -535,10 +500,11 @@ def with_learned_prior(
     ----------
     setup : Setup
         With a family of priors.
-    data : Visibilities
-    earlier : Information, optional
+    start : Around
+        As in :func:`settled`, with the data.
+    earlier : Information or None
         Information in earlier data, from which the prior is also learned.
-    start, report : Around and callable, optional
+    report : callable or None
         As in :func:`settled`.
 
     Returns
@@ -559,7 +525,7 @@ def with_learned_prior(
 
     if AboveLmax.treatment(setup.scenario) == "marginalised":
         # the expected sky above lmax follows from the prior learned below
-        result = settled(setup, data, start, report=report)
+        result = settled(setup, start, report=report)
         # a survey's resolution ends somewhere: what is above it is as strong as without surveys
         plain = _with_surveys(setup, ()) if surveys else setup
         coarse, learned = first_learned(plain, whole(result.solution.information))
@@ -573,45 +539,39 @@ def with_learned_prior(
             else:
                 first = setup.family.start_from(coarse, learned.parameters)
             setup = with_sky_above(setup, averaged_beyond(family, coarse, learned.scores))
-    result = settled(setup, data, start, learn, report)
+    result = settled(setup, start, learn, report)
     if surveys:
-        rows, gains = _compared_surveys(setup, whole(result.solution.information))
-        learned = replace(result.learned, survey_rows=rows, survey_gains=gains)
+        learned = _compared_surveys(setup, whole(result.solution.information), result.learned)
         result = replace(result, learned=learned)
     return replace(setup, prior=result.learned.prior), result
 
 
-def _compared_surveys(
-    setup: Setup, information: Information
-) -> tuple[tuple[Row, ...], dict[str, float]]:
-    """Scale and zero level of every survey, and how much it alone increases ln p(d)."""
+def _compared_surveys(setup: Setup, information: Information, learned: Learned) -> Learned:
+    """Add scale and zero level of every survey, and how much it alone increases ln p(d)."""
     n = information.n_modes
 
-    def learned(*surveys: sky_sections.SurveySection) -> tuple[PriorFamily, Learned]:
+    def under(*surveys: sky_sections.SurveySection) -> tuple[PriorFamily, Learned]:
         changed = _with_surveys(setup, surveys)
         return changed.family, learned_prior(changed, information)
 
-    _, alone = learned()
+    _, alone = under()
     fitting = information.raised(alone.noise_factor)
     others = fitting.posterior(alone.prior)
     rows, gains = [], {}
     for one in setup.scenario.prior.surveys:
-        family, known = learned(one)
+        family, known = under(one)
         start = known.parameters if known.settled else family.hyperprior.start()
         survey = one.at(setup.frequency_mhz, lmax_of(n))
         errors = family.at(start).texture + family.white * np.eye(n)
         rows += survey.calibrated(others.mean, others.covariance(), errors)
         gained = fitting.posterior(known.prior).log_evidence - others.log_evidence
         gains[survey.name] = float(gained)
-    return tuple(rows), gains
+    return replace(learned, survey_rows=tuple(rows), survey_gains=gains)
 
 
 def _with_surveys(setup: Setup, surveys: Sequence[sky_sections.SurveySection]) -> Setup:
     """Change the surveys of a setup's prior, before anything is learned."""
-    prior = setup.scenario.prior.model_copy(update={"surveys": tuple(surveys)})
-    family = prior.family(setup.frequency_mhz, setup.scenario.lmax)
-    scenario = setup.scenario.model_copy(update={"prior": prior})
-    return replace(setup, scenario=scenario, family=family, prior=family.expected())
+    return setup.with_prior(setup.scenario.prior.model_copy(update={"surveys": tuple(surveys)}))
 
 
 def first_learned(setup: Setup, information: Information) -> tuple[PriorFamily, Learned]:

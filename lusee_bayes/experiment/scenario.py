@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from functools import lru_cache
 from importlib import resources
 from itertools import pairwise
@@ -26,9 +27,8 @@ from lusee_bayes.flight.recipe import FlightSection
 from lusee_bayes.systematics.above_lmax import AboveLmaxSection
 from lusee_bayes.systematics.beam import BeamErrorSection
 from lusee_bayes.systematics.field_errors import FieldErrorsSection
-from lusee_bayes.systematics.registered import SYSTEMATICS, NoiseSection
+from lusee_bayes.systematics.registered import SYSTEMATICS, NoiseSection, present
 from lusee_bayes.systematics.sources import SourcesSection
-from lusee_bayes.systematics.systematic import present
 
 
 def apply_override(tree: dict[str, Any], override: str) -> None:
@@ -260,7 +260,7 @@ class Scenario(Section):
             return {}
         return {
             cls.words: octaves
-            for cls, section in present(SYSTEMATICS, self)
+            for cls, section in present(self)
             if cls.treatment(self) != "ignored" and (octaves := cls.octaves(section))
         }
 
@@ -339,18 +339,14 @@ def scenario_text(name: str) -> str:
     return (FOLDER / f"{name}.yaml").read_text(encoding="utf-8")
 
 
-def load_scenario(
-    source: str | Path | Scenario, overrides: list[str] | tuple[str, ...] = ()
-) -> Scenario:
+def load_scenario(source: str | Path | Scenario, overrides: Sequence[str] = ()) -> Scenario:
     """Read a YAML file, or a built-in scenario by name, and apply ``key.path=value``.
 
     A Scenario is accepted as it is, so that runs accept a scenario, its file or its name.
 
     InputError with one sentence for a missing file, bad YAML, an unknown key or a bad value.
     """
-    scenario = source
-    if not isinstance(source, Scenario):
-        scenario = _validate(_read_yaml(source), source)
+    scenario = source if isinstance(source, Scenario) else _validate(_read_yaml(source), source)
     if not overrides:
         return scenario
     tree = scenario.model_dump(mode="json")  # includes defaults, so that any entry can be set

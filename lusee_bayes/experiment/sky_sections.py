@@ -25,22 +25,15 @@ from lusee_bayes.priors.families import IsotropicFamily, PriorFamily
 from lusee_bayes.priors.local_scales import embedded_local_scales
 from lusee_bayes.priors.surveys import Survey
 from lusee_bayes.sampling.log_normal_prior import LogNormalPrior
+from lusee_bayes.sky import sky_source
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, diffuse_brightness, galactic_share
 from lusee_bayes.sky.positive_skies import LogNormalSky, PositiveSkies, deviation_spectrum
 from lusee_bayes.sky.prior import HarmonicPrior, Prior, read_mean, read_spectrum
-from lusee_bayes.sky.sky_source import (
-    Sky,
-    SkyMap,
-    SkySource,
-    galaxy_sky,
-    read_sky_file,
-    sky_from_file,
-)
 from lusee_bayes.sky.spectral_prior import SpectralPrior, check_components
 from lusee_bayes.systematics.prior_spectrum import SpectrumSection
 
 
-class GalaxySection(Section, SkySource):
+class GalaxySection(Section, sky_source.SkySource):
     """The embedded model of the Galaxy.
 
     Attributes
@@ -55,12 +48,12 @@ class GalaxySection(Section, SkySource):
     seed: Seed = 1
     sources: bool = True
 
-    def at(self, frequency_mhz: float, lmax: int) -> Sky:
+    def at(self, frequency_mhz: float, lmax: int) -> sky_source.Sky:
         sources = BRIGHT_SOURCES if self.sources else ()
-        return galaxy_sky(frequency_mhz, lmax, seed=self.seed, sources=sources)
+        return sky_source.galaxy_sky(frequency_mhz, lmax, seed=self.seed, sources=sources)
 
 
-class FileSkySection(Section, SkySource):
+class FileSkySection(Section, sky_source.SkySource):
     """A sky from a file: ULSA HDF5, HEALPix FITS, luseepy multi-map FITS, or coefficients.
 
     Attributes
@@ -84,9 +77,9 @@ class FileSkySection(Section, SkySource):
     file_frequency_mhz: Megahertz | None = None
     spectral_index: Annotated[float, Field(ge=-20, le=20)] = -2.5
 
-    def at(self, frequency_mhz: float, lmax: int) -> Sky:
+    def at(self, frequency_mhz: float, lmax: int) -> sky_source.Sky:
         given = self.model_dump(exclude={"model", "file"})
-        return sky_from_file(self.file, frequency_mhz, lmax, **given)
+        return sky_source.sky_from_file(self.file, frequency_mhz, lmax, **given)
 
 
 # a survey fades out over its beam, or this width in degrees, beside pixels without data; it is
@@ -138,34 +131,34 @@ class SurveySection(Section):
             If a file cannot be used, or the mask does not belong to the survey.
         """
         file = require_file(self.file, "survey", "check prior.surveys")
-        sky, unseen = read_sky_file(file, self.dataset), None
-        if self.mask_file is not None and not isinstance(sky, SkyMap):
-            raise InputError(f"{self.file} has no pixels for prior.surveys.mask_file")
+        sky, unseen = sky_source.read_sky_file(file, self.dataset), None
         ell = np.arange(lmax + 1.0)
         sigma = np.radians(self.beam_deg) / np.sqrt(8.0 * np.log(2.0))
         beam = per_mode(np.exp(-0.5 * ell * (ell + 1.0) * sigma**2))
-        if isinstance(sky, SkyMap):
-            unseen = sky.unseen
+        if isinstance(sky, sky_source.SkyMap):
+            gaps = sky.unseen
             if self.mask_file is not None:
-                mask = SkyMap.read(require_file(self.mask_file, "mask", "check prior.surveys"))
-                require_shape(f"{self.mask_file}: the mask", mask.pixels, unseen.shape)
-                unseen = unseen | (mask.pixels == 0.0)
-            if unseen.all() or not sky.pixels[~unseen].mean() > 0.0:
+                path = require_file(self.mask_file, "mask", "check prior.surveys")
+                mask = sky_source.SkyMap.read(path)
+                require_shape(f"{self.mask_file}: the mask", mask.pixels, gaps.shape)
+                gaps = gaps | (mask.pixels == 0.0)
+            if gaps.all() or not sky.pixels[~gaps].mean() > 0.0:
                 raise InputError(
                     f"{self.file}: the mean of its pixels must be positive, and not all of them "
                     "masked or UNSEEN"
                 )
-        if unseen is not None and unseen.any():
-            template = galaxy_sky(frequency_mhz, lmax, seed=None, sources=()).modes
-            filled = modes_to_map(beam * template, healpy.npix2nside(unseen.size))
-            filled *= sky.pixels[~unseen].mean() / filled[~unseen].mean()
-            # a sharp edge would be amplified where the beam is taken off
-            near = healpy.smoothing(unseen.astype(float), np.radians(max(self.beam_deg, EDGE_DEG)))
-            weight = np.where(unseen, 0.0, np.clip(1.0 - 2.0 * near, 0.0, 1.0) ** 2)
-            pixels = filled + weight * (sky.pixels - filled)
-            sky, unseen = replace(sky, pixels=pixels), weight < SEEN
-        else:
-            unseen = None
+            if gaps.any():
+                template = sky_source.galaxy_sky(frequency_mhz, lmax, seed=None, sources=()).modes
+                filled = modes_to_map(beam * template, healpy.npix2nside(gaps.size))
+                filled *= sky.pixels[~gaps].mean() / filled[~gaps].mean()
+                # a sharp edge would be amplified where the beam is taken off
+                width = np.radians(max(self.beam_deg, EDGE_DEG))
+                near = healpy.smoothing(gaps.astype(float), width)
+                weight = np.where(gaps, 0.0, np.clip(1.0 - 2.0 * near, 0.0, 1.0) ** 2)
+                pixels = filled + weight * (sky.pixels - filled)
+                sky, unseen = replace(sky, pixels=pixels), weight < SEEN
+        elif self.mask_file is not None:
+            raise InputError(f"{self.file} has no pixels for prior.surveys.mask_file")
         factor = (frequency_mhz / self.frequency_mhz) ** self.index
         modes = factor * sky.modes_at(self.frequency_mhz, lmax)
         widths = self.scale_std, factor * self.zero_std_k
@@ -255,10 +248,10 @@ class IsotropicPriorSection(SpectrumSection):
         """The family from which data select a prior, up to lmax; None if C_ell is given."""
         if not self.is_learned:
             return None
-        mean = galaxy_sky(frequency_mhz, 0, seed=None, sources=()).mean_temperature
+        mean = sky_source.galaxy_sky(frequency_mhz, 0, seed=None, sources=()).mean_temperature
         return IsotropicFamily.around(mean, lmax)
 
-    def prior(self, sky: Sky) -> Prior:
+    def prior(self, sky: sky_source.Sky) -> Prior:
         """The prior, S and mean, at the frequency and up to the lmax of a model sky."""
         read_at = self.file_frequency_mhz or sky.frequency_mhz
         steepening = (sky.frequency_mhz / read_at) ** self.spectral_index
@@ -310,12 +303,8 @@ class LocalScalesPriorSection(Section):
     def family(self, frequency_mhz: float, lmax: int) -> PriorFamily:
         """The family from which data select a prior, up to lmax."""
         sources = BRIGHT_SOURCES if self.sources else ()
-        surveys = self.surveys_at(frequency_mhz, lmax)
+        surveys = [one.at(frequency_mhz, lmax) for one in self.surveys]
         return embedded_local_scales(frequency_mhz, lmax, sources, surveys=surveys)
-
-    def surveys_at(self, frequency_mhz: float, lmax: int) -> list[Survey]:
-        """The surveys at a frequency, up to lmax."""
-        return [one.at(frequency_mhz, lmax) for one in self.surveys]
 
 
 PRIOR_SECTIONS = kinds_of(LocalScalesPriorSection, IsotropicPriorSection)

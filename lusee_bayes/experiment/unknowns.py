@@ -18,7 +18,7 @@ V, need not add up.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Any
@@ -35,13 +35,7 @@ from lusee_bayes.experiment.model import base_model, radiometer, true_values
 from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.instrument.pointing import offset_names
 from lusee_bayes.judge.measures import preferences
-from lusee_bayes.linear.amplitudes import (
-    Amplitudes,
-    AmplitudesOfSky,
-    Shared,
-    Tied,
-    amplitudes_of_sky,
-)
+from lusee_bayes.linear.amplitudes import Amplitudes, AmplitudesOfSky, Shared, Tied
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import pixel_std
 from lusee_bayes.sky.galaxy import kelvin_steradian
@@ -282,7 +276,7 @@ class Unknowns:
         rows = before_data(held, true_values(experiment.setup) if has_truth else None)
         return cls(
             tuple(rows.to_dict("records")),
-            amplitudes_of_sky(inference.solution, columns),
+            AmplitudesOfSky.of(inference.solution, columns),
             np.concatenate([s.expected for s in held]),
             np.concatenate(octaves),
             tuple(name for names, _ in alike for name in names),
@@ -398,9 +392,8 @@ class Unknowns:
         kinds = rows.groupby("systematic", sort=False).indices
         parts = {ALL_TOGETHER: every} | {name: root(at) for name, at in kinds.items()}
         moved = (rows["value"] - rows["prior"]) / rows["prior_std"]
-        squares = rows.assign(n=1, moved=moved**2, width=given.std**2)
-        named = squares.rename(columns={"unknown": "one", "site": "unknown"})
-        groups = named.groupby(["systematic", "unknown"], sort=False)
+        squares = rows.assign(unknown=rows["site"], n=1, moved=moved**2, width=given.std**2)
+        groups = squares.groupby(["systematic", "unknown"], sort=False)
         table = groups.agg({"n": "sum", "moved": "mean", "width": "mean"}).reset_index()
         table[["moved", "width"]] **= 0.5
         single = np.flatnonzero(rows["site"] == rows["unknown"])
@@ -419,8 +412,7 @@ class Unknowns:
     def _null_direction(self, posterior: Amplitudes, variance: float) -> NullDirection:
         mixed = self.parts @ posterior.with_sky[0] / self.sky_std
         inner = self.parts @ posterior.covariance @ self.parts.T
-        sky = variance / self.sky_std**2
-        blocks = np.block([[np.full((1, 1), sky), mixed[None]], [mixed[:, None], inner]])
+        blocks = np.block([[variance / self.sky_std**2, mixed], [mixed[:, None], inner]])
         return NullDirection.of((SKY, *self.names), blocks)
 
 
@@ -502,16 +494,14 @@ class PointingReport:
         columns = {name: table["offset"].map(unknowns[name]) for name in ("value", "std")}
         return replace(self, offsets=table.assign(**columns))
 
-    def lines(self) -> list[str]:
+    def lines(self) -> Iterator[str]:
         """One line per offset."""
-        lines = []
         for row in [] if self.offsets is None else self.offsets.to_dict("records"):
             left = row["beyond_first_order"]
             text = f"{_line(row['offset'], row)}; beyond first order: {left:.1g} of the noise"
             if left > NEGLIGIBLE:
                 text += ", too much: set noise.pointing.treatment=sampled"
-            lines.append(text)
-        return lines
+            yield text
 
 
 def pointing_report(experiment: Experiment, inference: Inference) -> PointingReport:
@@ -584,25 +574,19 @@ def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
     jansky = 1.0 / kelvin_steradian(1.0, experiment.scenario.frequency_mhz)
     own = zip(experiment.scenario.sources.list, held.systematic.n_blocks, strict=True)
     blocks = [(source.name, block) for source, n in own for block in range(n)]
-    table = pd.DataFrame(blocks, columns=["source", "block"]).assign(
-        above_horizon=np.asarray(held.systematic.columns).any(0),
-        flux_jy=fluxes["value"] * jansky,
-        std_jy=fluxes["std"] * jansky,
-        flux_k_sr=fluxes["value"],
-        std_k_sr=fluxes["std"],
-        prior_jy=fluxes["prior"] * jansky,
-        prior_std_jy=fluxes["prior_std"] * jansky,
-    )
-    return table.assign(true_jy=fluxes["true"] * jansky) if "true" in fluxes else table
+    table = pd.DataFrame(blocks, columns=["source", "block"])
+    table["above_horizon"] = np.asarray(held.systematic.columns).any(0)
+    in_jy = (fluxes.filter(["prior", "prior_std", "true"]) * jansky).add_suffix("_jy")
+    found = fluxes[["value", "std"]].rename(columns={"value": "flux"})
+    in_both = (found * jansky).add_suffix("_jy"), found.add_suffix("_k_sr")
+    return pd.concat([table, *in_both, in_jy], axis=1)
 
 
-def flux_lines(fluxes: pd.DataFrame) -> list[str]:
+def flux_lines(fluxes: pd.DataFrame) -> Iterator[str]:
     """One line per source, or per block of it."""
-    lines = []
     for row in fluxes.to_dict("records"):
         name = row["source"] if row["block"] == 0 else f"{row['source']} ({row['block']})"
         text = f"{name}: {row['flux_jy']:.4g} +- {row['std_jy']:.2g} Jy"
         if not row["above_horizon"]:
             text += " (prior: never above the horizon)"
-        lines.append(text)
-    return lines
+        yield text

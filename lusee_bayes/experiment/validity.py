@@ -34,7 +34,7 @@ from lusee_bayes.experiment.model import base_model, moved, systematics
 from lusee_bayes.experiment.rounds import WIDE, Inference
 from lusee_bayes.experiment.unknowns import TESTED
 from lusee_bayes.instrument.pointing import offset_names
-from lusee_bayes.linear.amplitudes import amplitudes_of_sky
+from lusee_bayes.linear.amplitudes import AmplitudesOfSky
 from lusee_bayes.noise.covariance import LowRankFactor
 from lusee_bayes.systematics.beam import InstrumentParameters
 from lusee_bayes.systematics.context import Around, Setup
@@ -85,7 +85,7 @@ def weighed(setup: Setup, data: np.ndarray, inference: Inference) -> tuple[float
     if not inference.moving or not isinstance(factor, LowRankFactor):
         return None
     columns = np.concatenate([part.columns for part in parts], axis=1)
-    amplitudes = amplitudes_of_sky(inference.solution, columns)
+    amplitudes = AmplitudesOfSky.of(inference.solution, columns)
     keys = jax.random.split(jax.random.key(setup.scenario.seed), 2)
     skies = np.asarray(inference.posterior.sample(keys[0], N_WEIGHED))
     values, axes = np.linalg.eigh(amplitudes.covariance)
@@ -104,8 +104,7 @@ def weighed(setup: Setup, data: np.ndarray, inference: Inference) -> tuple[float
         model = base
         for systematic in built:
             if type(systematic) in z:
-                sites = systematic.values(z[type(systematic)])
-                model = systematic.effect(model, sites)
+                model = systematic.effect(model, systematic.values(z[type(systematic)]))
             elif not systematic.first_order:
                 model = systematic.averaged(model)
         first_order[:, k] = inference.model.predict(sky) + columns @ a
@@ -158,10 +157,6 @@ class BlindSpot:
         factor = float(np.sqrt(SEEN / max(self.shown, np.finfo(np.float64).tiny)))
         return self.size * factor, self.bias * factor
 
-    def words(self) -> str:
-        """The error and its bias, in a few words."""
-        return f"{self.name} by {self.size:g}{self.unit} ({self.bias:.2g})"
-
 
 def blind_sentence(spots: Iterable[BlindSpot]) -> str:
     """Errors that would move the map unnoticed, in one sentence; empty if there are none."""
@@ -169,11 +164,12 @@ def blind_sentence(spots: Iterable[BlindSpot]) -> str:
     if not unseen:
         return ""
     unseen = sorted(unseen, key=lambda spot: -spot.bias)[:MOST_NAMED]
+    named = ", ".join(f"{one.name} by {one.size:g}{one.unit} ({one.bias:.2g})" for one in unseen)
     return (
         "The model assumes an exact instrument, and residual chi2 would not reveal an error of "
-        f"{', '.join(spot.words() for spot in unseen)}; in brackets, the resulting error of the "
-        "map in standard deviations (rms). noise.beam.parameters and noise.fields include such "
-        "errors; a second turntable angle reveals more of them."
+        f"{named}; in brackets, the resulting error of the map in standard deviations (rms). "
+        "noise.beam.parameters and noise.fields include such errors; a second turntable angle "
+        "reveals more of them."
     )
 
 
@@ -185,8 +181,7 @@ def errors_of(setup: Setup, *, pointing: bool) -> Iterator[tuple[Systematic, Siz
     source = setup.beam_source
     if source.has_fields:
         section = FieldErrorsSection(std=FIELDS, lmax=FIELD_LMAX, learned=False)
-        fields = FieldErrors.build(section, setup, Around())
-        yield fields, {FIELDS_NAME: 100.0 * FIELDS}, " %"
+        yield FieldErrors.build(section, setup, Around()), {FIELDS_NAME: 100.0 * FIELDS}, " %"
     values = {name: float(p.value) for name, p in source.parameters().items() if float(p.value)}
     priors = tuple(Unknown(name, value, PARAMETERS * abs(value)) for name, value in values.items())
     sizes = dict.fromkeys(values, 100.0 * PARAMETERS)

@@ -74,6 +74,10 @@ Skies = Float[np.ndarray, "skies modes"]
 PatternModes = Float[np.ndarray, "patterns modes"]
 
 
+# leading data that are compared first, to find a column among many
+FEW = 8
+
+
 @dataclass(frozen=True)
 class Amplitudes:
     """Posterior of templates' amplitudes in prior standard deviations, the sky integrated out.
@@ -127,6 +131,40 @@ class AmplitudesOfSky:
     pull: Float[np.ndarray, "n modes"]
     covariance: Square
     reference: Modes
+
+    @classmethod
+    def of(cls, solution: Solution, templates: Float[Array, "data n"]) -> AmplitudesOfSky:
+        """Compute the posterior of templates' amplitudes given the sky.
+
+        Parameters
+        ----------
+        solution : Solution
+            Of a model with ``templates @ templates.T`` in its noise. Its posterior mean becomes the
+            reference sky, so that differences from it keep their digits.
+        templates : (data, n) array
+            T, columns of U, in K.
+
+        Raises
+        ------
+        InputError
+            If N is not positive definite.
+        """
+        model, t, factor = solution.model, np.asarray(templates), solution.factor
+        if isinstance(factor, LowRankFactor):
+            root = np.asarray(model.noise.update.root)
+            at: list[int] = []
+            for column in t.T:  # two may be alike
+                alike = np.flatnonzero((root[:FEW] == column[:FEW, None]).all(0))
+                alike = (int(k) for k in alike if k not in at)
+                at.append(next(k for k in alike if (root[:, k] == column).all()))
+            left = cho_solve((np.asarray(factor.lower), True), np.eye(root.shape[1])[:, at])
+            solved, covariance = factor.base.whiten_transpose(factor.v @ left), left[at]
+        else:
+            solved = np.asarray(factor.solve(t))
+            covariance = np.eye(t.shape[1]) - t.T @ solved
+        pull = np.asarray(model.coupling.transpose_mv(np.asarray(solved))).T
+        mean = t.T @ solution.weighted_residual()
+        return cls(mean, pull, covariance, solution.posterior.mean)
 
     def integrated(self, mean: Modes, covariance: ModesMatrix) -> Amplitudes:
         """Integrate out a sky N(mean, covariance), in K and K^2, given any additional data."""
@@ -225,51 +263,13 @@ class Shared:
         )
 
 
-# leading data that are compared first, to find a column among many
-FEW = 8
-
-
-def amplitudes_of_sky(solution: Solution, templates: Float[Array, "data n"]) -> AmplitudesOfSky:
-    """Compute the posterior of templates' amplitudes given the sky.
-
-    Parameters
-    ----------
-    solution : Solution
-        Of a model with ``templates @ templates.T`` in its noise. Its posterior mean becomes the
-        reference sky, so that differences from it keep their digits.
-    templates : (data, n) array
-        T, columns of U, in K.
-
-    Raises
-    ------
-    InputError
-        If N is not positive definite.
-    """
-    model, t, factor = solution.model, np.asarray(templates), solution.factor
-    if isinstance(factor, LowRankFactor):
-        root = np.asarray(model.noise.update.root)
-        at: list[int] = []
-        for column in t.T:  # two may be alike
-            alike = np.flatnonzero((root[:FEW] == column[:FEW, None]).all(0))
-            alike = (int(k) for k in alike if k not in at)
-            at.append(next(k for k in alike if (root[:, k] == column).all()))
-        left = cho_solve((np.asarray(factor.lower), True), np.eye(root.shape[1])[:, at])
-        solved, covariance = factor.base.whiten_transpose(factor.v @ left), left[at]
-    else:
-        solved = np.asarray(factor.solve(t))
-        covariance = np.eye(t.shape[1]) - t.T @ solved
-    pull = np.asarray(model.coupling.transpose_mv(np.asarray(solved))).T
-    mean = t.T @ solution.weighted_residual()
-    return AmplitudesOfSky(mean, pull, covariance, solution.posterior.mean)
-
-
 def template_amplitudes(solution: Solution, templates: Float[Array, "data n"]) -> Amplitudes:
     """Compute the posterior of templates' amplitudes, the sky integrated out.
 
-    Parameters and errors are those of :func:`amplitudes_of_sky`, and of
+    Parameters and errors are those of :meth:`AmplitudesOfSky.of`, and of
     :meth:`Posterior.covariance`.
     """
-    of_sky = amplitudes_of_sky(solution, templates)
+    of_sky = AmplitudesOfSky.of(solution, templates)
     return of_sky.integrated(solution.posterior.mean, solution.covariance)
 
 

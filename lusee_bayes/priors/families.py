@@ -16,7 +16,6 @@ A learned C_ell has an amplitude, a tilt, a curvature and departures at half oct
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar
@@ -31,6 +30,8 @@ from lusee_bayes.sky.prior import PIVOT, HarmonicPrior, Prior
 
 # arrays that recur
 Parameters = Float[np.ndarray, " parameters"]
+
+Basis = Float[np.ndarray, "ells parameters"]
 
 Scored = Float[np.ndarray, "*n parameters"]
 
@@ -60,9 +61,6 @@ TAIL, STEEPNESS = 1.5, 2.0
 SHAPE = TAIL / STEEPNESS
 # nodes of the Gauss-Hermite rule for the means of cells' factors
 NODES = 20
-
-# variance of linear combinations of parameters, one per row
-Spread = Callable[[Float[np.ndarray, "rows parameters"]], Float[np.ndarray, " rows"]]
 
 
 @dataclass(frozen=True)
@@ -199,15 +197,13 @@ class PriorFamily(ABC):
         Of the reported parameters, which come first.
     mean : (modes,) array or None
         Common mean of the priors, in K; None for zero.
+    hyperprior : Hyperprior
+        Prior of the parameters.
     """
 
     names: ClassVar[tuple[str, ...]] = ("ln C at ell = 9", "tilt", "curvature")
     mean: Float[np.ndarray, " modes"] | None
-
-    @property
-    @abstractmethod
-    def hyperprior(self) -> Hyperprior:
-        """Prior of the parameters."""
+    hyperprior: Hyperprior
 
     @abstractmethod
     def at(self, parameters: Parameters) -> Member:
@@ -218,16 +214,17 @@ class PriorFamily(ABC):
         return self.prior(self.at(self.hyperprior.start()).covariance)
 
     @abstractmethod
-    def averaged(self, parameters: Parameters, spread: Spread) -> ModesMatrix:
+    def averaged(self, parameters: Parameters, covariance: Square) -> ModesMatrix:
         """Compute S averaged over uncertain parameters: the means of its variances, in K^2.
+
+        Logarithms of variances are linear in the parameters, so that variances are log-normal.
 
         Parameters
         ----------
         parameters : (parameters,) array
             Mean of a normal distribution of the parameters.
-        spread : callable
-            Variance of linear combinations of the parameters under that distribution. Logarithms
-            of variances are such combinations, so that the variances are log-normal.
+        covariance : (parameters, parameters) array
+            Its covariance.
         """
 
     @abstractmethod
@@ -247,73 +244,61 @@ class PriorFamily(ABC):
         """
 
 
-@dataclass(frozen=True)
-class SpectrumBasis:
-    """ln C_ell as a linear function of its parameters.
+def spectrum_basis(temperature: float, lmax: int) -> tuple[Basis, Parameters, Parameters]:
+    """Make ln C_ell as a linear function of its parameters.
 
-    Attributes
+    Parameters
     ----------
-    matrix : (ells, parameters) array
-    centre, width : (parameters,) array
-        Of the parameters' prior.
+    temperature : float
+        Mean of the sky in K, to which expected fluctuations are relative.
+    lmax : int
+
+    Returns
+    -------
+    (ells, parameters) array
+    (parameters,), (parameters,) array
+        Centre and width of the parameters' prior.
     """
-
-    matrix: Float[np.ndarray, "ells parameters"]
-    centre: Parameters
-    width: Parameters
-
-    @classmethod
-    def around(cls, temperature: float, lmax: int) -> SpectrumBasis:
-        """Make the basis.
-
-        Parameters
-        ----------
-        temperature : float
-            Mean of the sky in K, to which expected fluctuations are relative.
-        lmax : int
-        """
-        power = 4.0 * np.pi * (RELATIVE_STRENGTH * temperature) ** 2 / 100.0
-        x = np.log((np.arange(lmax + 1) + 1.0) / PIVOT)
-        knots = np.arange(x[min(1, lmax)], x[-1] + SPACING, SPACING)
-        hats = np.maximum(0.0, 1.0 - np.abs(x[:, None] - knots) / SPACING)
-        matrix = np.column_stack([np.ones(lmax + 1), x, 0.5 * x**2, hats])
-        departures = np.full(len(knots), DEPARTURE_WIDTH)
-        centre = np.concatenate([[np.log(power), TILT, 0.0], np.zeros(len(knots))])
-        width = np.concatenate([[LOG_AMPLITUDE_WIDTH, TILT_WIDTH, CURVATURE_WIDTH], departures])
-        return cls(matrix, centre, width)
+    power = 4.0 * np.pi * (RELATIVE_STRENGTH * temperature) ** 2 / 100.0
+    x = np.log((np.arange(lmax + 1) + 1.0) / PIVOT)
+    knots = np.arange(x[min(1, lmax)], x[-1] + SPACING, SPACING)
+    hats = np.maximum(0.0, 1.0 - np.abs(x[:, None] - knots) / SPACING)
+    basis = np.column_stack([np.ones(lmax + 1), x, 0.5 * x**2, hats])
+    departures = np.full(len(knots), DEPARTURE_WIDTH)
+    centre = np.concatenate([[np.log(power), TILT, 0.0], np.zeros(len(knots))])
+    width = np.concatenate([[LOG_AMPLITUDE_WIDTH, TILT_WIDTH, CURVATURE_WIDTH], departures])
+    return basis, centre, width
 
 
 @dataclass(frozen=True)
 class IsotropicFamily(PriorFamily):
-    """S = diag(C_ell), with C_ell of :class:`SpectrumBasis` for ell > 0 and a separate C_0.
+    """S = diag(C_ell), with C_ell of :func:`spectrum_basis` for ell > 0 and a separate C_0.
 
     Attributes
     ----------
-    spectrum : SpectrumBasis
-    log_monopole : float
-        Expected ln C_0.
+    basis : (ells, parameters) array
+        ln C_ell as a linear function of the parameters; that of C_0 is the last.
     """
 
     mean: ClassVar[None] = None
-    spectrum: SpectrumBasis
-    log_monopole: float
+    basis: Basis
+    hyperprior: Hyperprior
 
     @classmethod
     def around(cls, temperature: float, lmax: int) -> IsotropicFamily:
         """Make the family for skies with about this mean temperature, in K."""
-        log_monopole = float(np.log(4.0 * np.pi * temperature**2))
-        return cls(SpectrumBasis.around(temperature, lmax), log_monopole)
-
-    @property
-    def hyperprior(self) -> Hyperprior:
-        width = np.append(self.spectrum.width, LOG_MONOPOLE_WIDTH)
-        return Hyperprior(np.append(self.spectrum.centre, self.log_monopole), width)
+        basis, centre, width = spectrum_basis(temperature, lmax)
+        basis[0] = 0.0
+        centre = np.append(centre, np.log(4.0 * np.pi * temperature**2))
+        hyperprior = Hyperprior(centre, np.append(width, LOG_MONOPOLE_WIDTH))
+        return cls(np.column_stack([basis, np.arange(lmax + 1) == 0]), hyperprior)
 
     def at(self, parameters: Parameters) -> IsotropicMember:
         return IsotropicMember(self, parameters)
 
-    def averaged(self, parameters, spread):
-        return np.diag(per_mode(np.exp(self.basis @ parameters + 0.5 * spread(self.basis))))
+    def averaged(self, parameters, covariance):
+        spread = np.einsum("ij,ij->i", self.basis @ covariance, self.basis)
+        return np.diag(per_mode(np.exp(self.basis @ parameters + 0.5 * spread)))
 
     def prior(self, covariance):
         lmax = self.basis.shape[0] - 1
@@ -322,13 +307,6 @@ class IsotropicFamily(PriorFamily):
     def start_from(self, coarse, parameters):
         more = np.zeros(self.hyperprior.size - len(parameters))
         return np.concatenate([parameters[:-1], more, parameters[-1:]])
-
-    @cached_property
-    def basis(self) -> Float[np.ndarray, "ells parameters"]:
-        """ln C_ell as a linear function of the parameters."""
-        form = self.spectrum.matrix.copy()
-        form[0] = 0.0
-        return np.column_stack([form, np.arange(len(form)) == 0])
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
@@ -54,7 +55,7 @@ from lusee_bayes.judge.measures import expected_chi2
 from lusee_bayes.judge.split import Split
 from lusee_bayes.linear.information import Information
 from lusee_bayes.linear.posterior import Posterior
-from lusee_bayes.priors.families import Hyperprior, Member, Parameters, PriorFamily, Spread
+from lusee_bayes.priors.families import Hyperprior, Member, Parameters, PriorFamily
 from lusee_bayes.sky.prior import Prior
 
 # steps of Newton's method, each halved until ln p is not lower
@@ -125,8 +126,8 @@ MAX_STEPS = 60
 STEEP_ENOUGH = 1e-3
 # longest step of a parameter
 LONGEST = 3.0
-# smallest fraction of a step that is tried
-SHORTEST = 2.0**-10
+# fractions of a step that are tried
+FRACTIONS = 0.5 ** np.arange(11)
 # simulated data sets for the Fisher information: on the way to the maximum, and at it
 SIMULATIONS, FINAL_SIMULATIONS = 200, 500
 # added to a covariance with eigenvalues from 0 to 1 before its root is computed: rounding makes the
@@ -144,10 +145,6 @@ MOST_WIDENINGS = 4
 Row = dict[str, float | str]
 
 
-class NotSettled(InputError):
-    """The search for a prior's most probable parameters did not converge."""
-
-
 @dataclass(frozen=True)
 class Learned:
     """A prior whose parameters were learned.
@@ -155,8 +152,6 @@ class Learned:
     Attributes
     ----------
     prior : Prior
-    names : tuple of str
-        Of the first parameters.
     parameters : (parameters,) array
         Most probable values.
     covariance : (parameters, parameters) array
@@ -179,7 +174,6 @@ class Learned:
     """
 
     prior: Prior
-    names: tuple[str, ...]
     parameters: Parameters
     covariance: Square
     scores: Scores
@@ -190,15 +184,10 @@ class Learned:
     survey_rows: tuple[Row, ...] = field(default=(), kw_only=True)
     survey_gains: Mapping[str, float] = field(default_factory=dict, kw_only=True)
 
-    @property
-    def fits(self) -> bool:
-        """Whether the parameters were learned under the model's N, not a raised one."""
-        return self.settled and self.noise_factor == 1.0
-
     def as_rows(self) -> list[Row]:
         """Name, value and standard deviation of the named parameters, and of surveys."""
         std = np.sqrt(np.diagonal(self.covariance))
-        each = zip(self.names, self.parameters, std, strict=False)
+        each = zip(PriorFamily.names, self.parameters, std, strict=False)
         rows = [{"name": name, "value": float(x), "std": float(width)} for name, x, width in each]
         return [*rows, *self.survey_rows]
 
@@ -251,33 +240,31 @@ def learn(
 
     Raises
     ------
-    NotSettled
-        If the search does not converge in 60 steps, or ln p falls along its gradient.
     InputError
-        If S is not positive definite.
+        If S is not positive definite, the search does not converge in 60 steps, or ln p falls along
+        its gradient.
     """
-    rng, before, moves = np.random.default_rng(seed), None, []
+    rng, path = np.random.default_rng(seed), []
     point = _at(family, information, family.hyperprior.start() if start is None else start)
     for _ in range(MAX_STEPS + 1):
         gradient = point.slope(family)
-        if before is not None:
-            moves.append((point.parameters - before[0], before[1] - gradient))
-        before = point.parameters, gradient
-        curvature = _corrected(point.curvature(family, rng, SIMULATIONS), moves)
+        path.append((point.parameters, gradient))
+        curvature = _corrected(point.curvature(family, rng, SIMULATIONS), path)
         step = np.linalg.solve(curvature, gradient)
         gain = 0.5 * float(gradient @ step)
         if gain < SETTLED:
             return _learned(family, information, point, rng)
         point = _climb(family, information, point, step * min(1.0, LONGEST / np.abs(step).max()))
-    raise NotSettled(
+    raise InputError(
         f"the prior's parameters did not converge in {MAX_STEPS} steps: the next would still add "
         f"{gain:.2g} to ln p (accepted: {SETTLED:g})"
     )
 
 
-def _corrected(curvature: Square, moves: Sequence[tuple[Parameters, Parameters]]) -> Square:
+def _corrected(curvature: Square, path: Sequence[tuple[Parameters, Parameters]]) -> Square:
     """Correct the curvature by how the gradient fell along earlier steps (BFGS)."""
-    for step, fall in moves:
+    for (start, before), (end, after) in pairwise(path):
+        step, fall = end - start, before - after
         along = curvature @ step
         if fall @ step > STEEP_ENOUGH * (step @ along):
             curvature = curvature - np.outer(along, along) / (step @ along)
@@ -343,7 +330,7 @@ def _fixed(family: PriorFamily, information: Information, factor: float) -> Lear
         try:
             evidence = float(information.posterior(prior).log_evidence)
             none = Scores(np.zeros(0), np.zeros((0, 0)), 0.0)
-            return Learned(prior, (), none.mean, none.covariance, none, evidence, settled=False)
+            return Learned(prior, none.mean, none.covariance, none, evidence, settled=False)
         except InputError as error:
             prior, failed = prior.widened(10.0), error
     raise failed
@@ -358,14 +345,12 @@ def _at(family: PriorFamily, information: Information, parameters: Parameters) -
 
 def _climb(family: PriorFamily, information: Information, base: _Point, step: Parameters) -> _Point:
     """The end of a step, or of a half, a quarter, ... of it, if ln p is not lower there."""
-    part = 1.0
-    while part >= SHORTEST:
+    for part in FRACTIONS:
         with suppress(InputError):  # too far: S has no Cholesky factor there
             trial = _at(family, information, base.parameters + part * step)
             if trial.value >= base.value - SETTLED / 10.0:
                 return trial
-        part /= 2.0
-    raise NotSettled(
+    raise InputError(
         "the prior's parameters do not converge: ln p decreases along its gradient, by rounding"
     )
 
@@ -388,12 +373,12 @@ def _learned(
 ) -> Learned:
     covariance = np.linalg.inv(point.curvature(family, rng, FINAL_SIMULATIONS))
     scores = normal_scores(family.hyperprior, point.parameters, covariance)
-    mean, spread = _moments(family, scores)
+    mean, about = family.hyperprior.moments(scores.mean, scores.covariance)
     evidence = float(point.posterior.log_evidence) + scores.log_gain
 
     # S is a constant plus a part proportional to the level
-    doubled = np.concatenate([[mean[0] + np.log(2.0)], mean[1:]])
-    once, twice = (family.averaged(level, spread) for level in (mean, doubled))
+    first = np.arange(len(mean)) == 0
+    once, twice = (family.averaged(mean + level * first, about) for level in (0.0, np.log(2.0)))
 
     def at_level(shift: float) -> Posterior:
         covariance = once + np.expm1(shift) * (twice - once)
@@ -402,25 +387,15 @@ def _learned(
     tried = [float(at_level(shift).log_evidence) for shift in LEVELS]
     square, linear, _ = np.polyfit(LEVELS, tried, 2)
     shift = -0.5 * linear / square if square < 0 else LEVELS[int(np.argmax(tried))]
-    moved = np.zeros(len(mean))
-    moved[0] = shift / family.hyperprior.slopes_of_scores(scores.mean)[0]
+    moved = shift * first / family.hyperprior.slopes_of_scores(scores.mean)[0]
     prior, scores = at_level(shift).prior, replace(scores, mean=scores.mean + moved)
-    return Learned(prior, family.names, point.parameters, covariance, scores, evidence)
+    return Learned(prior, point.parameters, covariance, scores, evidence)
 
 
 # at most SHARED skies have the same theta, and at most two do until there are LEAST theta
 SHARED, LEAST = 30, 10
 # draws of theta before giving up, if rounding leaves no positive definite S
 ATTEMPTS = 5
-
-
-def _moments(family: PriorFamily, scores: Scores) -> tuple[Parameters, Spread]:
-    mean, second = family.hyperprior.moments(scores.mean, scores.covariance)
-
-    def spread(rows: Float[np.ndarray, "rows parameters"]) -> Float[np.ndarray, " rows"]:
-        return np.einsum("ij,ij->i", rows @ second, rows)
-
-    return mean, spread
 
 
 def averaged_beyond(family: PriorFamily, coarse: PriorFamily, scores: Scores) -> ModesMatrix:
@@ -431,7 +406,7 @@ def averaged_beyond(family: PriorFamily, coarse: PriorFamily, scores: Scores) ->
     places = np.flatnonzero(family.start_from(coarse, np.ones(len(scores.mean))))
     mean, covariance = np.zeros(family.hyperprior.size), np.eye(family.hyperprior.size)
     mean[places], covariance[np.ix_(places, places)] = scores.mean, scores.covariance
-    return family.averaged(*_moments(family, replace(scores, mean=mean, covariance=covariance)))
+    return family.averaged(*family.hyperprior.moments(mean, covariance))
 
 
 def draws_with_parameters(

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from jaxtyping import Complex, Float
@@ -32,7 +32,7 @@ from lusee_bayes.core.harmonics import n_modes, per_mode, sum_over_m, synthesis_
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.linalg import checked_cholesky, scaled
 from lusee_bayes.core.sphere_grid import SphereGrid
-from lusee_bayes.priors.families import Hyperprior, Member, Parameters, PriorFamily, SpectrumBasis
+from lusee_bayes.priors.families import Hyperprior, Member, Parameters, PriorFamily, spectrum_basis
 from lusee_bayes.priors.surveys import Survey
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES, EXTENDED_OBJECTS, PointSource, galaxy_map
 from lusee_bayes.sky.prior import PIVOT, DensePrior
@@ -92,13 +92,15 @@ class Band:
     cells: sparse.csr_array
 
     @classmethod
-    def of(cls, window: Ells, template: SmoothedTemplate, transparent: SmoothedTemplate) -> Band:
+    def of(cls, window: Ells, frequency_mhz: float) -> Band:
         """Make the band of a window."""
         top = int(np.flatnonzero(window)[-1])
         grid = SphereGrid.of(top, max((3 * top + 1) // 2, LEAST_BAND))
         theta, phi = grid.directions()
         fwhm = float(np.hypot(RESOLUTION_DEG / _middle(window), FINEST_DEG))
-        seen, clear = (each.log(fwhm, theta, phi) for each in (template, transparent))
+        # the template, and the same sky nearly without absorption
+        frequencies = frequency_mhz, max(TRANSPARENT_MHZ, frequency_mhz)
+        seen, clear = (smoothed_log(mhz, fwhm, theta, phi) for mhz in frequencies)
         latitude = 90.0 - np.degrees(theta)
         thickness = PLANE_DEG**2 + (fwhm / np.sqrt(8.0 * np.log(2.0))) ** 2
         plane = np.exp(-0.5 * latitude**2 / thickness)
@@ -139,43 +141,31 @@ def _middle(window: Ells) -> float:
     return float(np.sqrt((weight * ell**2).sum() / weight.sum()))
 
 
-@dataclass(frozen=True)
-class SmoothedTemplate:
-    """A positive template at any resolution.
-
-    Attributes
-    ----------
-    alm : (alms,) array
-        Its complex coefficients, in K.
-    mean_log : float
-        Mean of its logarithm.
-    """
-
-    alm: Complex[np.ndarray, " alms"]
-    mean_log: float
-
-    @classmethod
-    def of(cls, frequency_mhz: float) -> SmoothedTemplate:
-        """Analyse the embedded diffuse sky, without its random component, at a frequency in MHz."""
-        pixels = galaxy_map(frequency_mhz, TEMPLATE_NSIDE, seed=None)
-        return cls(healpy.map2alm(pixels, lmax=TEMPLATE_LMAX, iter=3), float(np.log(pixels).mean()))
-
-    def log(self, fwhm_deg: float, theta: Vector, phi: Vector) -> Vector:
-        """ln of the smoothed template minus :attr:`mean_log`, in given directions."""
-        alm = healpy.almxfl(self.alm, healpy.gauss_beam(np.radians(fwhm_deg), lmax=TEMPLATE_LMAX))
-        smooth = healpy.alm2map(alm, TEMPLATE_NSIDE, lmax=TEMPLATE_LMAX)
-        require_positive("the smoothed template", smooth)
-        return np.log(healpy.get_interp_val(smooth, theta, phi)) - self.mean_log
+@lru_cache(maxsize=4)
+def _template(frequency_mhz: float) -> tuple[Complex[np.ndarray, " alms"], float]:
+    """The embedded diffuse sky, without random structure, in K, and the mean of its logarithm."""
+    pixels = galaxy_map(frequency_mhz, TEMPLATE_NSIDE, seed=None)
+    return healpy.map2alm(pixels, lmax=TEMPLATE_LMAX, iter=3), float(np.log(pixels).mean())
 
 
-def expected_covariates() -> tuple[Covariates, Covariates]:
-    """Return centre and width of the prior of the covariates' coefficients."""
+def smoothed_log(frequency_mhz: float, fwhm_deg: float, theta: Vector, phi: Vector) -> Vector:
+    """ln of the smoothed template minus the mean logarithm, in given directions."""
+    alm, mean_log = _template(frequency_mhz)
+    alm = healpy.almxfl(alm, healpy.gauss_beam(np.radians(fwhm_deg), lmax=TEMPLATE_LMAX))
+    smooth = healpy.alm2map(alm, TEMPLATE_NSIDE, lmax=TEMPLATE_LMAX)
+    require_positive("the smoothed template", smooth)
+    return np.log(healpy.get_interp_val(smooth, theta, phi)) - mean_log
+
+
+def hyperprior_of(centre: Parameters, width: Parameters) -> Hyperprior:
+    """The prior of all parameters, given that of the spectrum's."""
     ell = np.sqrt(np.arange(1, n_modes(FIELD_LMAX))).astype(int)
     named = [POWER_WIDTH, POWER_WIDTH, PLANE_WIDTH, TILTS_WIDTH, TILTS_WIDTH]
-    width = np.concatenate([named, FIELD_WIDTH / np.sqrt(2.0 * ell + 1.0)])
-    centre = np.zeros(len(width))
-    centre[0] = TEMPLATE_POWER
-    return centre, width
+    of_field = FIELD_WIDTH / np.sqrt(2.0 * ell + 1.0)
+    widths = np.concatenate([width, [SOURCES_WIDTH], named, of_field])
+    others = np.zeros(len(widths) - len(centre))
+    others[1] = TEMPLATE_POWER
+    return Hyperprior(np.concatenate([centre, others]), widths, N_CELLS)
 
 
 @dataclass(frozen=True)
@@ -190,11 +180,9 @@ class LocalScales(PriorFamily):
         Template, monopole and extended objects, times their standard deviations, in K.
     sources : (modes, sources) array
         Catalogued sources, in K.
-    spectrum : SpectrumBasis
-        C_ell.
+    spectrum : (ells, parameters) array
+        ln C_ell as a linear function of its parameters.
     bands : tuple of Band
-    covariates : (centre, width) arrays
-        Prior of the covariates' coefficients.
     white : float
         C_ell of white errors of surveys, in K^2.
     """
@@ -202,33 +190,27 @@ class LocalScales(PriorFamily):
     mean: Modes
     wide: Float[np.ndarray, "modes wide"]
     sources: Float[np.ndarray, "modes sources"]
-    spectrum: SpectrumBasis
+    spectrum: Float[np.ndarray, "ells spectrum"]
     bands: tuple[Band, ...]
-    covariates: tuple[Covariates, Covariates]
+    hyperprior: Hyperprior
     white: float
-
-    @property
-    def hyperprior(self) -> Hyperprior:
-        centre, width = self.covariates
-        centres = np.concatenate([self.spectrum.centre, [0.0], centre])
-        widths = np.concatenate([self.spectrum.width, [SOURCES_WIDTH], width])
-        return Hyperprior(centres, widths, N_CELLS)
 
     def at(self, parameters: Parameters) -> LocalScalesMember:
         return LocalScalesMember(self, *self._split(parameters))
 
-    def averaged(self, parameters, spread):
+    def averaged(self, parameters, covariance):
         member = self.at(parameters)
         ells, flux, covariates, _ = self._split(np.eye(len(parameters)))
         strengths = []
         for band, strength in zip(self.bands, member.strengths, strict=True):
             weight = band.window**2 * (2.0 * np.arange(len(band.window)) + 1.0)
-            spectrum = (weight / weight.sum()) @ self.spectrum.matrix @ ells
+            spectrum = (weight / weight.sum()) @ self.spectrum @ ells
             rows = spectrum[None] + band.covariates @ covariates
             if self.white:  # the data only have an upper limit of the level, which is fitted later
                 rows[:, 0] = 0.0
-            strengths.append(strength * np.exp(0.5 * spread(rows)))
-        fluxes = float(np.exp(member.fluxes[0] + 0.5 * spread(flux)[0]))
+            spread = np.einsum("ij,ij->i", rows @ covariance, rows)
+            strengths.append(strength * np.exp(0.5 * spread))
+        fluxes = float(np.exp(member.fluxes[0] + 0.5 * flux[0] @ covariance @ flux[0]))
         return _covariance(self, fluxes, _texture(self, member.spectrum, strengths))
 
     def prior(self, covariance):
@@ -236,12 +218,12 @@ class LocalScales(PriorFamily):
 
     def start_from(self, coarse, parameters):
         power, *others = coarse._split(parameters)
-        return np.concatenate([power, np.zeros(len(self.spectrum.centre) - len(power)), *others])
+        return np.concatenate([power, np.zeros(self.spectrum.shape[1] - len(power)), *others])
 
     def _split(self, parameters: np.ndarray) -> list[np.ndarray]:
         """Parameters of the spectrum, the sources, the covariates and the cells."""
-        n_spectrum, n_covariates = len(self.spectrum.centre), len(self.covariates[0])
-        return np.split(parameters, np.cumsum([n_spectrum, 1, n_covariates]))
+        sizes = self.spectrum.shape[1], 1, self.bands[0].covariates.shape[1]
+        return np.split(parameters, np.cumsum(sizes))
 
 
 def _covariance(family: LocalScales, flux: float, texture: ModesMatrix) -> ModesMatrix:
@@ -286,7 +268,7 @@ class LocalScalesMember(Member):
     @cached_property
     def spectrum(self) -> Ells:
         """C_ell, in K^2."""
-        return np.exp(self.family.spectrum.matrix @ self.power)
+        return np.exp(self.family.spectrum @ self.power)
 
     @cached_property
     def strengths(self) -> Strengths:
@@ -339,7 +321,7 @@ class LocalScalesMember(Member):
             covariates += (by_point @ (band.covariates * area[:, None])).T
             cells += band.cells.multiply(area[:, None]).T @ by_point.T
         fluxes = np.exp(self.fluxes[0]) * sources[None]
-        return np.concatenate([family.spectrum.matrix.T @ ells, fluxes, covariates, cells])
+        return np.concatenate([family.spectrum.T @ ells, fluxes, covariates, cells])
 
 
 def embedded_local_scales(
@@ -359,27 +341,22 @@ def embedded_local_scales(
     surveys : sequence of Survey
         At this frequency, with the same lmax.
     """
-    # the template, and the same sky nearly without absorption
-    clear_mhz = max(TRANSPARENT_MHZ, frequency_mhz)
-    smoothed = [SmoothedTemplate.of(mhz) for mhz in (frequency_mhz, clear_mhz)]
     mean = np.asarray(galaxy_sky(frequency_mhz, lmax, seed=None, sources=()).modes)
-    monopole = np.zeros_like(mean)
-    monopole[0] = mean[0]
-    modes = [source.modes(frequency_mhz, lmax) for source in sources]
+    constant = np.arange(len(mean)) == 0
     level = mean[0] / np.sqrt(4.0 * np.pi)
     # these may be brighter or darker than their surroundings
     extended = [level * one.strength * one.modes(lmax) for one in EXTENDED_OBJECTS]
-    scale, zero, weights = SCALE_WIDTH * mean, MONOPOLE_WIDTH * monopole, []
+    scale, zero, weights = SCALE_WIDTH * mean, MONOPOLE_WIDTH * mean * constant, []
     if surveys:
         filled = [survey.sharpened(mean) for survey in surveys]
         weights, mean = [*filled, mean], np.mean(filled, axis=0)
         weights = [WEIGHT_WIDTH * (one * (mean[0] / one[0]) - mean) for one in weights]
         stds = np.array([[s.scale_std, np.sqrt(4.0 * np.pi) * s.zero_std] for s in surveys])
         of_scale, of_zero = np.sqrt((stds**2).sum(axis=0)) / len(surveys)
-        scale, zero = of_scale * mean, of_zero * (np.arange(len(mean)) == 0)
+        scale, zero = of_scale * mean, of_zero * constant
     wide = np.stack([scale, zero, *weights, *extended], axis=1)
-    of_sources = np.reshape(modes, (-1, n_modes(lmax))).T
-    spectrum = SpectrumBasis.around(np.exp(smoothed[0].mean_log), lmax)
-    bands = tuple(Band.of(window, *smoothed) for window in windows(lmax))
+    of_sources = np.reshape([s.modes(frequency_mhz, lmax) for s in sources], (-1, len(mean))).T
+    spectrum, *expected = spectrum_basis(np.exp(_template(frequency_mhz)[1]), lmax)
+    bands = tuple(Band.of(window, frequency_mhz) for window in windows(lmax))
     white = WHITE * mean[0] ** 2 if surveys else 0.0
-    return LocalScales(mean, wide, of_sources, spectrum, bands, expected_covariates(), white)
+    return LocalScales(mean, wide, of_sources, spectrum, bands, hyperprior_of(*expected), white)

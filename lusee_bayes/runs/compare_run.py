@@ -10,8 +10,8 @@ from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.experiment.data_files import Data
-from lusee_bayes.experiment.experiment import Experiment, observed
-from lusee_bayes.experiment.rounds import Inference, learned_prior, named_priors, rebuilds, settled
+from lusee_bayes.experiment.experiment import Experiment, infer, observed
+from lusee_bayes.experiment.rounds import Inference, learned_prior, named_priors, rebuilds
 from lusee_bayes.experiment.scenario import Scenario, load_scenario
 from lusee_bayes.judge.residuals import held_out
 from lusee_bayes.judge.split import Split
@@ -122,7 +122,7 @@ def run_compare_priors(
     with run_folder(folder, COMPARE_PRIORS, scenario, data, replace=replace, **origin) as run:
         experiment = measured_experiment(scenario, data, stages, truth=truth, make=observed)
         with stages("data"):
-            inferred = settled(experiment.setup, experiment.data)
+            inferred = infer(experiment)
 
         def under(prior: str) -> tuple[PriorSummary, ChannelResult]:
             return _under(prior, experiment.setup.with_prior(sections[prior]), experiment, inferred)

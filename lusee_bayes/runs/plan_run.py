@@ -225,7 +225,8 @@ def default_variations(source: str, scenario: Scenario) -> list[Variation]:
     for duty in DUTY_CYCLES:
         section = radiometer.model_copy(update={"duty_cycle": duty})
         scenarios["duty cycle", f"{duty:g}"] = scenario.with_section("noise", radiometer=section)
-    ports = range(scenario.beam.n_ports if scenario.beam.n_ports > 1 else 0)
+    n_ports = scenario.beam.source().n_ports
+    ports = range(n_ports if n_ports > 1 else 0)
     lost = [Variation(source, "antenna lost", f"port {k}", scenario, (k,)) for k in ports]
     return [Variation(source, *named, varied) for named, varied in scenarios.items()] + lost
 

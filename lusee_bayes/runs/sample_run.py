@@ -48,8 +48,8 @@ from lusee_bayes.sampling.programs import Program
 from lusee_bayes.sampling.shared_sites import SharedSites, gaussian_of_sites, of_channel
 from lusee_bayes.sampling.validation import BATCH, N_DRAWS, calibrate_sky, validate_draws
 from lusee_bayes.systematics.gain_drifts import SCALES
-from lusee_bayes.systematics.registered import SYSTEMATICS
-from lusee_bayes.systematics.systematic import SKY, Chart, Systematic, Unknown, present
+from lusee_bayes.systematics.registered import present
+from lusee_bayes.systematics.systematic import SKY, Chart, Systematic, Unknown
 
 # number of starts of the search for the mode of a collapsed program
 STARTS = 4
@@ -323,7 +323,7 @@ def run_sample(
     channels = {f"{one.frequency_mhz:.15g}MHz": one for one in scenario.channels()}
     with run_folder(folder, CUBES, scenario, data, program.path, **given) as run:
         runs = []
-        treated = present(SYSTEMATICS, scenario)
+        treated = present(scenario)
         if any(k.octaves(one) for k, one in treated if k.treatment(scenario) == "sampled"):
             experiments = {
                 name: measured_experiment(channel, data, stages, n_draws=n_draws)

@@ -5,6 +5,9 @@ To add one, add a file beside this one, and a line here.
 
 from __future__ import annotations
 
+from operator import attrgetter
+from typing import Any
+
 from pydantic import create_model
 
 from lusee_bayes.core.section import Section
@@ -53,3 +56,9 @@ NoiseSection = create_model(
     __module__=__name__,
     **_TERMS,
 )
+
+
+def present(scenario: Any) -> list[tuple[type[Systematic], Any]]:
+    """The systematics that a scenario has, with their sections."""
+    classes = [cls for cls in SYSTEMATICS if cls.treatment(scenario) is not None]
+    return [(cls, attrgetter(cls.key)(scenario)) for cls in classes]

@@ -550,20 +550,6 @@ class Marginalised(eqx.Module):
         return self.marginalised(model)
 
 
-class InPlace(Marginalised):
-    """A systematic at its place among sampled ones, in a model whose N contains it already.
-
-    Attributes
-    ----------
-    systematic : Marginalised
-        As part of N.
-    """
-
-    def sampled(self, model: LinearGaussian) -> LinearGaussian:
-        """Apply its effects except the term of N."""
-        return replace(self.marginalised(model), noise=model.noise)
-
-
 class Expanded(Marginalised):
     """A systematic to first order about values, as part of N.
 
@@ -768,12 +754,6 @@ class Scale(Systematic):
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Return the model unchanged."""
         return model
-
-
-def present(systematics: Sequence[type[Systematic]], scenario: Any) -> list[tuple[type, Any]]:
-    """The systematics that a scenario has, with their sections."""
-    classes = [cls for cls in systematics if cls.treatment(scenario) is not None]
-    return [(cls, attrgetter(cls.key)(scenario)) for cls in classes]
 
 
 def sky_is_sampled(systematics: Sequence[Systematic | Marginalised]) -> bool:

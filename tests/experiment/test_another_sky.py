@@ -70,7 +70,8 @@ def test_the_errors_are_what_is_claimed(term):
     total, modes = 0.0, 0
     for seed in (1, 2):
         data, prior, truth = measured(scenario, seed)
-        found = settled(replace(set_up(scenario, data), prior=prior, family=None), data)
+        setup = replace(set_up(scenario, data), prior=prior, family=None)
+        found = settled(setup, Around(data))
         assert not found.unsettled
         total, modes = total + distance(found, truth), modes + len(truth)
     p = 2.0 * min(stats.chi2.sf(total, modes), stats.chi2.cdf(total, modes))

@@ -245,14 +245,14 @@ def test_what_an_old_scenario_says_of_beams_is_kept(tmp_path, scalar, response):
     of_files = {"quadrature": "luseepy", "moon_temperature_k": 250.0, "turntable_offset_deg": 7.0}
     arm = {"file": scalar, "taper": False, "rotations_deg": [0.0, 90.0], **of_files}
     ports = {"file": response, "receiver": "open", "antenna_temperature_k": 300.0}
-    for beam, kind, n_ports in (
-        (embedded, instrument_sections.MonopoleBeamSection, 4),
-        (arm, ScalarBeamSection, 2),
-        (ports, ResponseSection, 4),
+    for beam, kind in (
+        (embedded, instrument_sections.MonopoleBeamSection),
+        (arm, ScalarBeamSection),
+        (ports, ResponseSection),
     ):
         prior = {"scale": 2.0, "tilt_std": 0.5}
         found = old_scenario(tmp_path / "old.yaml", beam=beam, prior=prior)
-        assert found.beam == kind(**beam) and found.beam.n_ports == n_ports
+        assert found.beam == kind(**beam)
         assert found.prior == IsotropicPriorSection(**prior)
         assert_kept(found, tmp_path)
 

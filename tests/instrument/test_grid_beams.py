@@ -97,7 +97,7 @@ def test_weights(n):
 def test_beams_at_files_are_those_of_the_files_and_the_contract_holds(tables):
     section = scenario(tables[0.4], 0.4, moon_temperature_k=250.0).beam
     grid, places = section.source(), product((3.3, 3.7, 4.1), (71.0, 75.0, 79.0))
-    assert section.n_ports == 4
+    assert section.source().n_ports == 4
     assert grid.values == pytest.approx(named(*MIDDLE))
     for place, source in zip(places, grid.sources, strict=True):
         here = grid.with_values(named(*place))

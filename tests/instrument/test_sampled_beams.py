@@ -166,7 +166,7 @@ def test_a_scenario_takes_the_file(tmp_path):
     write_sampled_beams(path, lb.sampled_beams(FREQUENCY, **embedded("pixels")))
     scenario = small_scenario(f"beam.file={path}")
     assert scenario.beam.model == "sampled"
-    assert (scenario.beam.n_ports, scenario.beam.label) == (4, "mine.nc")
+    assert (scenario.beam.source().n_ports, scenario.beam.label) == (4, "mine.nc")
     ours, own = (lb.build(s).setup.signal for s in (scenario, small_scenario()))
     assert np.abs(ours - own).max() < SPLINES * np.abs(own).max()
     given = f"beam={{model: sampled, file: {path}, rotations_deg: [0, 10]}}"

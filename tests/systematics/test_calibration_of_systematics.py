@@ -16,7 +16,6 @@ from scipy import stats
 import lusee_bayes as lb
 from lusee_bayes.experiment.experiment import program_pieces
 from lusee_bayes.experiment.model import full_model, set_up, true_values
-from lusee_bayes.experiment.rounds import settled
 from lusee_bayes.experiment.unknowns import SKY
 from lusee_bayes.judge.coverage import LEVELS
 from lusee_bayes.sampling.mode import laplace_approximation
@@ -218,7 +217,7 @@ def test_simulation_based_calibration(response_file):
     for seed in range(N):
         experiment = ex.drawn(first, seed)
         setup = experiment.setup
-        found, truth = settled(setup, experiment.data), true_values(setup)
+        found, truth = lb.infer(experiment), true_values(setup)
         mean, covariance = ex.sky_and_amplitudes(found)
         mean[16:] += np.concatenate([s.expected for s in found.systematics])
         rng = np.random.default_rng((seed, 1))

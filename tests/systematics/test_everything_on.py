@@ -21,7 +21,7 @@ from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.linear.amplitudes import template_amplitudes
 from lusee_bayes.runs import channels
 from lusee_bayes.sampling.programs import require_sampleable
-from lusee_bayes.systematics.context import Setup
+from lusee_bayes.systematics.context import Around, Setup
 
 SKIES = {10.0: "ulsa/exp10.0MHz_sky_map_with_absorption.hdf5", 25.0: "surveys/gsm2008_25MHz.fits"}
 # half a percent of gains, 5 % of the ground, 0.3 degrees of the arms, 20 s, 0.2 degrees, 10 %
@@ -105,7 +105,7 @@ def test_error_bars_of_all_together_are_right():
         white = np.random.default_rng(seed).standard_normal(prior.size)
         sky = np.asarray(prior.colour(white)) + np.asarray(prior.mean)
         truth = own.under(replace(own.sky, modes=sky))
-        found = settled(replace(own, measured=True), simulate(truth))
+        found = settled(replace(own, measured=True), Around(simulate(truth)))
         assert not found.unsettled
         columns = np.concatenate([np.asarray(part.columns) for part in found.expanded], axis=1)
         told = template_amplitudes(found.solution, columns)

@@ -103,7 +103,7 @@ def test_found_drifts_have_the_shift_of_the_volume():
     are exact. The slope neglects what the noise tells between sky and drifts: below 1e-2.
     """
     e = small_experiment(GAINS % (0.05, "marginalised", "posterior"), lmax=2, cycles=0.1)
-    found = settled(e.setup, e.data)
+    found = settled(e.setup, Around(e.data))
     (drifts,), solution, n = found.drifts, found.solution, len(e.data.data)
     assert drifts.found is not None
     weighted = np.asarray(solution.factor.whiten_transpose(np.sqrt(n) * np.eye(n)))

@@ -210,6 +210,45 @@ def read_receiver(path: str | Path) -> MeasuredReceiver:
     return receiver_of(path, images, "freq", *LOADS)
 
 
+class ReceiverFileSection(Section):
+    """Load impedances from a file with images ``freq``, ``ZL_real`` and ``ZL_imag``.
+
+    Attributes
+    ----------
+    file : str
+        Path of the file.
+    """
+
+    model: Literal["file"] = "file"
+    file: str
+
+    def receiver(self) -> Receiver | None:
+        """The receiver, or None for open ports."""
+        return read_receiver(self.file)
+
+
+class OpenSection(Section):
+    """Open ports: no receiver connected."""
+
+    model: Literal["open"] = "open"
+
+    def receiver(self) -> Receiver | None:
+        """The receiver, or None for open ports."""
+        return None
+
+
+def _named(value: Any) -> Any:
+    """``receiver: open`` means ``receiver: {model: open}``."""
+    return {"model": value} if isinstance(value, str) else value
+
+
+ReceiverSection = Annotated[
+    JFETReceiver | CapacitorReceiver | ReceiverFileSection | OpenSection,
+    Field(discriminator="model"),
+    BeforeValidator(_named),
+]
+
+
 @dataclass(frozen=True)
 class Circuit:
     """Antennas with their losses, and receivers.
