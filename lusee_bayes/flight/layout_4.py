@@ -18,7 +18,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.layouts import Layout, Unread, Variable
 from lusee_bayes.flight.clock import Clock
 from lusee_bayes.flight.layout_3 import no_spectra, said_in
-from lusee_bayes.flight.session import META, ROWS, SAID, TELEMETRY, Opener, Session, session_of
+from lusee_bayes.flight.session import META, ROWS, SAID, TELEMETRY, Session, session_of
 from lusee_bayes.instrument.times import scale_of, unannounced_leap_seconds
 
 LAYOUT_4 = Layout("a session of lusee.ingest, layout 4", ROWS, SAID)
@@ -49,7 +49,7 @@ TELEMETRY_4 = Layout(
 )
 
 
-def session_of_4(path: Path, file: h5py.File, opener: Opener) -> Session:
+def session_of_4(path: Path, file: h5py.File) -> Session:
     """Create a session from a file of layout 4.
 
     Parameters
@@ -57,8 +57,6 @@ def session_of_4(path: Path, file: h5py.File, opener: Opener) -> Session:
     path : Path
     file : h5py.File
         The open file.
-    opener : callable
-        Opens the spectra.
 
     Raises
     ------
@@ -84,8 +82,7 @@ def session_of_4(path: Path, file: h5py.File, opener: Opener) -> Session:
         for group, name in UNUSED.items()
         if group in file
     }
-    others = {"layout": 4, "kind": "HDF5", "clock": clock, "unused": unused}
-    return session_of(path, content, arrays, opener=opener, **others)
+    return session_of(path, content, arrays, layout=4, kind="HDF5", clock=clock, unused=unused)
 
 
 def _dataset(file: h5py.Group, path: str) -> Unread | None:
