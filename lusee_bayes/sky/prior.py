@@ -92,9 +92,9 @@ class Prior(Described, eqx.Module):
     def variance(self) -> Unknowns:
         """Return the diagonal of S, in K^2."""
 
-    @abstractmethod
     def covariance(self) -> Covered:
         """Return S as a matrix, in K^2."""
+        return self.colour_covariance(namespace(self).eye(self.size))
 
     @abstractmethod
     def widened(self, factor: float) -> Prior:
@@ -231,10 +231,6 @@ class DensePrior(Prior):
     def variance(self):
         return namespace(self).einsum("ij,ij->i", self.root, self.root)
 
-    def covariance(self):
-        product = linalg.times_lower(self.root, self.root, transpose=True)
-        return (product + product.T) / 2.0
-
     def log_det(self):
         xp = namespace(self)
         return xp.asarray(xp.log(xp.diagonal(self.root)).sum())
@@ -275,9 +271,6 @@ class DiagonalPrior(Prior):
 
     def variance(self):
         return self.widths**2
-
-    def covariance(self):
-        return namespace(self).diag(self.variance())
 
     def log_det(self):
         self.require_density()

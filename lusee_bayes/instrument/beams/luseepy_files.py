@@ -345,12 +345,11 @@ class PortResponse(LuseepyBeam):
         return AntennaFields(*parts, grid)
 
     def _linear(self, frequency_mhz, lmax, grid):
-        opened = np.zeros((N_ANTENNAS**2, (lmax + 1) ** 2))
+        opened, mixing = 0.0, self._mixing(frequency_mhz)
         for k, weight in self._neighbours(frequency_mhz):
             fields = self._open([self.e_theta[k], self.e_phi[k]], grid)
             wavelength = speed_of_light / (1e6 * self.frequencies_mhz[k])
             opened += weight / wavelength**2 * product_modes(fields, lmax, normalise=False)
-        mixing = self._mixing(frequency_mhz)
         seen = np.einsum("ai,ijm,bj->abm", mixing, to_matrix(opened), mixing.conj(), optimize=True)
         return to_real(seen)
 
