@@ -11,7 +11,6 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from astropy.time import Time
 
 from lusee_bayes.core.arrays import Rows, Times
 from lusee_bayes.core.errors import InputError
@@ -19,7 +18,7 @@ from lusee_bayes.core.layouts import Layout, Unread, Variable
 from lusee_bayes.flight.clock import Clock
 from lusee_bayes.flight.layout_3 import no_spectra, said_in
 from lusee_bayes.flight.session import META, ROWS, SAID, TELEMETRY, Session, session_of
-from lusee_bayes.instrument.times import scale_of, unannounced_leap_seconds
+from lusee_bayes.instrument.times import scale_of, time_of_text
 
 LAYOUT_4 = Layout("a session of lusee.ingest, layout 4", ROWS, SAID)
 # names in layout 4 of those in layout 3
@@ -131,8 +130,7 @@ def _clock_by_reference(path: Path, file: h5py.File) -> Clock | None:
     scale = scale_of(f"{path}: time_scale", str(said["time_scale"]))
     if (raw_s := _anchors(file).get("spectrometer")) is None:
         return None
-    with unannounced_leap_seconds():
-        time = Time(str(said["clock_reference_isot"]), format="isot", scale=scale)
+    time = time_of_text("clock_reference_isot", str(said["clock_reference_isot"]), scale)
     return Clock(str(path), float(time.jd1), float(time.jd2), scale, raw_s)
 
 
