@@ -198,7 +198,7 @@ def read_table(path: str | Path, layout: Layout, hint: str = "") -> dict[str, np
 
 
 def read_arrays(path: str | Path, layout: Layout, hint: str = "") -> Content:
-    """Read arrays from NumPy's .npz; values are stored as arrays with one entry.
+    """Read arrays from NumPy's .npz.
 
     Raises
     ------
@@ -214,8 +214,7 @@ def read_arrays(path: str | Path, layout: Layout, hint: str = "") -> Content:
         if not isinstance(arrays, np.lib.npyio.NpzFile):
             raise InputError(f"{path} contains a single array; expected {layout.what}")
         members = {name: _unloaded(arrays, name) for name in arrays.files}
-        values = {name: arrays[name] for name in layout.attributes if name in members}
-        return layout.checked(path, members, values)
+        return layout.checked(path, members, {})
 
 
 def _unloaded(arrays: np.lib.npyio.NpzFile, name: str) -> Unloaded:
