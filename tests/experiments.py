@@ -91,7 +91,7 @@ def correlated(prior: Prior) -> DensePrior:
     rng = np.random.default_rng(6)
     covariance = random_covariance(rng, len(width)) * width * width[:, None]
     mean = 0.3 * width * rng.normal(size=len(width))
-    return DensePrior.of_covariance(jnp.asarray(covariance), jnp.asarray(mean))
+    return DensePrior(jnp.linalg.cholesky(covariance), mean=jnp.asarray(mean))
 
 
 def flagged(data: lb.Visibilities, flags: np.ndarray) -> lb.Visibilities:

@@ -1,9 +1,7 @@
 """Linear algebra: LAPACK for NumPy arrays; for JAX arrays, cheaper than XLA's own routines.
 
 XLA has no symmetric rank-k update on the CPU: ``W.T @ W`` computes both triangles. Splitting the
-columns and forming only the blocks on and below the diagonal does 5/8 of the work. XLA also solves
-triangular systems as if their right-hand sides were full. Inverting L by halves, and omitting the
-zeros of L^-1 in L^-T L^-1, each take n^3 / 3 multiplications, in matrix products.
+columns and forming only the blocks on and below the diagonal does 5/8 of the work.
 
 SciPy's wrappers of LAPACK keep the interpreter's lock while they compute, so that channels in two
 threads would wait for each other. We call the same routines in :mod:`scipy.linalg.cython_lapack`
@@ -76,9 +74,6 @@ MIRRORED = 128
 
 # error of combinations of a few rows of a matrix, relative to its largest row
 SPANNED = 1e-12
-
-# largest triangle to invert by substitution
-MAX_SUBSTITUTED = 160
 
 
 def cholesky(matrix: Matrices, *, overwrite: bool = False) -> Matrices:
@@ -168,7 +163,11 @@ def symmetric_product(left: Float[Array, "n inner"], right: Float[Array, "inner 
         for first, end in _strips(n):
             np.matmul(left[first:end], right[:, :end], out=product[first:end, :end])
         return mirrored(product)
-    return _from_strips([left[first:end] @ right[:, :end] for first, end in _strips(n)])
+    # the symmetric matrix with these strips of rows, each up to its diagonal block
+    strips = [left[first:end] @ right[:, :end] for first, end in _strips(n)]
+    rows = [jnp.pad(strip, ((0, 0), (0, n - strip.shape[1]))) for strip in strips]
+    lower = jnp.tril(jnp.concatenate(rows))
+    return lower + jnp.tril(lower, -1).T
 
 
 def scaled(matrix: Matrix, scale: Float[Array, " n"], *, overwrite: bool = False) -> Matrix:
@@ -258,14 +257,7 @@ def invert_lower(lower: Matrix, *, overwrite: bool = False) -> Matrix:
         inverse = lower if overwrite else lower_triangle(lower)
         _called("dtrtri", b"U", b"N", len(inverse), inverse, len(inverse))
         return inverse
-    n = lower.shape[0]
-    if n <= MAX_SUBSTITUTED:
-        return solve_lower(jnp.tril(lower), jnp.eye(n), transpose=False)
-    h = n // 2
-    first, last = invert_lower(lower[:h, :h]), invert_lower(lower[h:, h:])
-    between = -last @ (lower[h:, :h] @ first)
-    top = jnp.concatenate([first, jnp.zeros((h, n - h))], axis=1)
-    return jnp.concatenate([top, jnp.concatenate([between, last], axis=1)])
+    return solve_lower(jnp.tril(lower), jnp.eye(lower.shape[0]), transpose=False)
 
 
 def trace_of_inverse(lower: Float[np.ndarray, "n n"]) -> float:
@@ -286,9 +278,7 @@ def inverse_from_cholesky(lower: Matrix) -> Matrix:
         inverse = lower.copy(order="C")
         _called("dpotri", b"U", len(inverse), inverse, len(inverse))
         return mirrored(inverse)
-    x = invert_lower(lower)
-    # columns of L^-1 begin at their own row
-    return _from_strips([x[a:, a:b].T @ x[a:, :b] for a, b in _strips(x.shape[0])])
+    return gram_matrix(invert_lower(lower))
 
 
 def spanning_rows(
@@ -343,11 +333,3 @@ def _reversed(matrix: Matrix) -> Matrix:
 def _strips(n: int) -> Iterator[tuple[int, int]]:
     """First row and end of each strip of a triangle with n rows."""
     return pairwise(np.linspace(0, n, min(N_BLOCKS, n) + 1).astype(int).tolist())
-
-
-def _from_strips(strips: list[Float[Array, "_ _"]]) -> Matrix:
-    """The symmetric matrix with these strips of rows, each up to its diagonal block."""
-    n = strips[-1].shape[1]
-    rows = [jnp.pad(strip, ((0, 0), (0, n - strip.shape[1]))) for strip in strips]
-    lower = jnp.tril(jnp.concatenate(rows))
-    return lower + jnp.tril(lower, -1).T

@@ -6,7 +6,6 @@ This module reads JSON, CSV, NumPy's .npz and YAML (version 1.2, except that dat
 from __future__ import annotations
 
 import csv
-import json
 import os
 import stat
 import warnings
@@ -18,7 +17,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ValidationError
+from pydantic import TypeAdapter, ValidationError
 from ruamel.yaml import YAML, YAMLError
 from ruamel.yaml.constructor import SafeConstructor
 
@@ -26,7 +25,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import user_path
 from lusee_bayes.core.layouts import Content, Layout, Unloaded
 
-Model = TypeVar("Model", bound=BaseModel)
+T = TypeVar("T")
 # no person and no part of this package writes a larger text file
 LARGEST_TEXT = 50_000_000
 
@@ -141,29 +140,14 @@ def read_text(path: str | Path, what: str, hint: str = "") -> str:
     return text
 
 
-def read_json(path: str | Path, layout: Layout, hint: str = "") -> dict[str, Any]:
-    """Read a JSON object, and check its values against a layout; undeclared values are kept as is.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, is not an object, or lacks a value.
-    """
-    with reading(path, layout.what, hint):
-        tree = json.loads(read_text(path, layout.what))
-    if not isinstance(tree, dict):
-        raise InputError(f"{path} contains a {type(tree).__name__}; expected {layout.what}")
-    return tree | layout.checked(path, {}, tree).values
-
-
-def read_model(path: str | Path, kind: type[Model], what: str, hint: str = "") -> Model:
-    """Read a JSON object into a pydantic model.
+def read_model(path: str | Path, kind: type[T], what: str, hint: str = "") -> T:
+    """Read JSON into a pydantic model, or into another type that pydantic checks.
 
     Parameters
     ----------
     path : str or Path
     kind : type
-        The model.
+        The model, or for instance dict.
     what : str
         Description of the expected file, for messages.
     hint : str
@@ -175,7 +159,7 @@ def read_model(path: str | Path, kind: type[Model], what: str, hint: str = "") -
         If the file cannot be read or violates the model; the message gives the first violation.
     """
     try:
-        return kind.model_validate_json(read_text(path, what, hint))
+        return TypeAdapter(kind).validate_json(read_text(path, what, hint))
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])
@@ -214,7 +198,7 @@ def read_table(path: str | Path, layout: Layout, hint: str = "") -> dict[str, np
 
 
 def read_arrays(path: str | Path, layout: Layout, hint: str = "") -> Content:
-    """Read arrays from NumPy's .npz; values are stored as arrays with one entry.
+    """Read arrays from NumPy's .npz.
 
     Raises
     ------
@@ -230,8 +214,7 @@ def read_arrays(path: str | Path, layout: Layout, hint: str = "") -> Content:
         if not isinstance(arrays, np.lib.npyio.NpzFile):
             raise InputError(f"{path} contains a single array; expected {layout.what}")
         members = {name: _unloaded(arrays, name) for name in arrays.files}
-        values = {name: arrays[name] for name in layout.attributes if name in members}
-        return layout.checked(path, members, values)
+        return layout.checked(path, members, {})
 
 
 def _unloaded(arrays: np.lib.npyio.NpzFile, name: str) -> Unloaded:

@@ -54,6 +54,7 @@ def quantity(
     checks: Mapping[str, Any] | None = None,
     attributes: Mapping[str, Any] | None = None,
     packed: bool = False,
+    stored: str | None = None,
     **options: Any,
 ) -> Any:
     """A dataclass field for an array, with its unit in UDUNITS notation and its description.
@@ -71,6 +72,8 @@ def quantity(
         Further CF attributes, such as ``flag_meanings``.
     packed : bool
         Compress the array in files.
+    stored : str, optional
+        Name in files; by default that of the field.
     **options
         As in ``dataclasses.field``.
     """
@@ -80,6 +83,7 @@ def quantity(
         "attributes": attributes,
         "checks": ANY if checks is None else checks,
         "encoding": {"zlib": True, "complevel": 1} if packed else {},
+        "stored": stored,
     }
     return field(metadata=metadata, **options)
 
@@ -90,7 +94,7 @@ class _Kind:
 
     what : "array", "number", "text", "json", "group", "table" or "frame"; of : the type of the
     value or of its rows; optional : whether it may be None; required : whether it has no default;
-    declared : layout of an array or attribute; attributes, encoding : for an array
+    declared : layout of an array or attribute; attributes, encoding : for an array; field : name
     """
 
     what: str
@@ -100,6 +104,7 @@ class _Kind:
     declared: Variable | None = None
     attributes: Mapping[str, str] = field(default_factory=dict)
     encoding: Mapping[str, Any] = field(default_factory=dict)
+    field: str = ""
 
 
 def to_tree(value: Any) -> xarray.DataTree:
@@ -115,7 +120,7 @@ def to_tree(value: Any) -> xarray.DataTree:
     """
     variables, attributes, groups, empty = {}, {}, {}, {}
     for name, kind in _fields(type(value)).items():
-        held = getattr(value, name)
+        held = getattr(value, kind.field)
         if held is None:
             continue
         if kind.what == "array":
@@ -248,16 +253,16 @@ def from_tree(kind: type[T], tree: xarray.DataTree | StoredTree, where: str) -> 
     for name, one in kinds.items():
         place = f"{where}: {name}"
         if name in content.arrays:
-            entries[name] = content.arrays[name].astype(one.of, copy=False)
+            entries[one.field] = content.arrays[name].astype(one.of, copy=False)
         elif name in content.values:
             value = content.values[name]
-            entries[name] = _of_json(one.of, value, place) if one.what == "json" else value
+            entries[one.field] = _of_json(one.of, value, place) if one.what == "json" else value
         elif name in empty:
-            entries[name] = np.zeros([int(n) for n in empty[name]], dtype=one.of)
+            entries[one.field] = np.zeros([int(n) for n in empty[name]], dtype=one.of)
         elif name in tree.children:
-            entries[name] = _of_group(one, tree.children[name], place)
+            entries[one.field] = _of_group(one, tree.children[name], place)
         elif one.optional:
-            entries[name] = None
+            entries[one.field] = None
         elif one.required:
             raise InputError(f"{where} has no {name} (it has {', '.join(tree.children)})")
     return kind(**entries)
@@ -279,7 +284,8 @@ def _fields(kind: type) -> dict[str, _Kind]:
         required = not what.optional and one.default is one.default_factory is MISSING
         declared = what.declared and replace(what.declared, optional=not required)
         written = {n: x for n, x in one.metadata.items() if n in ("attributes", "encoding")}
-        by_name[one.name] = replace(what, required=required, declared=declared, **written)
+        written |= {"required": required, "declared": declared, "field": one.name}
+        by_name[one.metadata.get("stored") or one.name] = replace(what, **written)
     return by_name
 
 

@@ -88,11 +88,8 @@ class GainModel(Described):
         )
 
     def __post_init__(self):
-        require_shape(f"{self.path}: mean", self.mean, (*LEAD, None))
-        anchors = self.mean.shape[2]
-        shapes = {"anchor_mhz": [anchors], "components": [N_COMPONENTS, anchors]}
-        for name, shape in (shapes | {"coefficient": [N_COMPONENTS, N_TERMS]}).items():
-            require_shape(f"{self.path}: {name}", getattr(self, name), (*LEAD, *shape))
+        terms = (*LEAD, N_COMPONENTS, N_TERMS)
+        require_shape(f"{self.path}: coefficient", self.coefficient, terms)
         if not (np.diff(self.anchor_mhz, axis=2) > 0.0).all():
             raise InputError(f"{self.path}: the frequencies of the gains do not increase")
         require_mhz(f"{self.path}: the frequencies of the gains", self.anchor_mhz)
@@ -297,7 +294,7 @@ def write_gain_table(path: str | Path, table: GainModel) -> Path:
 
 
 # luseepy's arrays of every level and port
-ARRAYS = {"freqs": ("anchor",), "mean": ("anchor",), "eigvecs": ("anchor", "component")}
+ARRAYS = {"freqs": ("anchor",), "mean": ("anchor",), "eigvecs": ("anchor", N_COMPONENTS)}
 
 
 def _read_folder(folder: Path, model: str) -> GainModel:

@@ -14,7 +14,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.formats import unread_image
 from lusee_bayes.core.layouts import Attribute, Content, Layout, Unread
 from lusee_bayes.flight.clock import DAY_S, MJD_ZERO, SAME_S, Clock
-from lusee_bayes.flight.session import META, ROWS, SAID, TELEMETRY, Opener, Session, session_of
+from lusee_bayes.flight.session import META, ROWS, SAID, TELEMETRY, Session, session_of
 from lusee_bayes.instrument.times import scale_of
 
 INTERPOLATED = "spectra_interpolated_telemetry"
@@ -63,15 +63,13 @@ def no_spectra(path: Path, lacking: str, names: Iterable[str]) -> InputError:
     )
 
 
-def session_of_hdf5(path: Path, file: h5py.File, opener: Opener) -> Session:
+def session_of_hdf5(path: Path, file: h5py.File) -> Session:
     """Create a session from an open HDF5 file.
 
     Parameters
     ----------
     path : Path
     file : h5py.File
-    opener : callable
-        Opens the spectra.
 
     Raises
     ------
@@ -93,10 +91,10 @@ def session_of_hdf5(path: Path, file: h5py.File, opener: Opener) -> Session:
         if not np.array_equal(theirs, ours):
             raise InputError(f"{path}: {INTERPOLATED}/time differs from the times of the spectra")
     arrays |= {f"telemetry/{name}": group[name] for name in TELEMETRY if name in group}
-    return _checked_session(path, "HDF5", arrays, said_in(file), opener)
+    return _checked_session(path, "HDF5", arrays, said_in(file))
 
 
-def session_of_fits(path: Path, hdus: fits.HDUList, opener: Opener) -> Session:
+def session_of_fits(path: Path, hdus: fits.HDUList) -> Session:
     """Create a session from an open FITS file, as :func:`session_of_hdf5`."""
     names = [hdu.name for hdu in hdus]
     if "SPECTRA" not in names:
@@ -111,15 +109,15 @@ def session_of_fits(path: Path, hdus: fits.HDUList, opener: Opener) -> Session:
         for (hdu, word), ours in WORDS.items()
         if hdu in names and word in hdus[hdu].header
     }
-    return _checked_session(path, "FITS", arrays, values, opener)
+    return _checked_session(path, "FITS", arrays, values)
 
 
 def _checked_session(
-    path: Path, kind: str, arrays: dict[str, Any], values: dict[str, Any], opener: Opener
+    path: Path, kind: str, arrays: dict[str, Any], values: dict[str, Any]
 ) -> Session:
     content = LAYOUT_3.checked(path, arrays, values)
     clock = _clock_by_epoch(path, content)
-    return session_of(path, content, arrays, layout=3, kind=kind, clock=clock, opener=opener)
+    return session_of(path, content, arrays, layout=3, kind=kind, clock=clock)
 
 
 def _clock_by_epoch(path: Path, content: Content) -> Clock | None:

@@ -11,15 +11,14 @@ from pathlib import Path
 
 import h5py
 import numpy as np
-from astropy.time import Time
 
 from lusee_bayes.core.arrays import Rows, Times
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.layouts import Layout, Unread, Variable
 from lusee_bayes.flight.clock import Clock
 from lusee_bayes.flight.layout_3 import no_spectra, said_in
-from lusee_bayes.flight.session import META, ROWS, SAID, TELEMETRY, Opener, Session, session_of
-from lusee_bayes.instrument.times import scale_of, unannounced_leap_seconds
+from lusee_bayes.flight.session import META, ROWS, SAID, TELEMETRY, Session, session_of
+from lusee_bayes.instrument.times import scale_of, time_of_text
 
 LAYOUT_4 = Layout("a session of lusee.ingest, layout 4", ROWS, SAID)
 # names in layout 4 of those in layout 3
@@ -49,7 +48,7 @@ TELEMETRY_4 = Layout(
 )
 
 
-def session_of_4(path: Path, file: h5py.File, opener: Opener) -> Session:
+def session_of_4(path: Path, file: h5py.File) -> Session:
     """Create a session from a file of layout 4.
 
     Parameters
@@ -57,8 +56,6 @@ def session_of_4(path: Path, file: h5py.File, opener: Opener) -> Session:
     path : Path
     file : h5py.File
         The open file.
-    opener : callable
-        Opens the spectra.
 
     Raises
     ------
@@ -84,8 +81,7 @@ def session_of_4(path: Path, file: h5py.File, opener: Opener) -> Session:
         for group, name in UNUSED.items()
         if group in file
     }
-    others = {"layout": 4, "kind": "HDF5", "clock": clock, "unused": unused}
-    return session_of(path, content, arrays, opener=opener, **others)
+    return session_of(path, content, arrays, layout=4, kind="HDF5", clock=clock, unused=unused)
 
 
 def _dataset(file: h5py.Group, path: str) -> Unread | None:
@@ -134,8 +130,7 @@ def _clock_by_reference(path: Path, file: h5py.File) -> Clock | None:
     scale = scale_of(f"{path}: time_scale", str(said["time_scale"]))
     if (raw_s := _anchors(file).get("spectrometer")) is None:
         return None
-    with unannounced_leap_seconds():
-        time = Time(str(said["clock_reference_isot"]), format="isot", scale=scale)
+    time = time_of_text("clock_reference_isot", str(said["clock_reference_isot"]), scale)
     return Clock(str(path), float(time.jd1), float(time.jd2), scale, raw_s)
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -50,12 +51,71 @@ NOISY, CURVED = 1.2, 0.5
 MUCH = 0.2
 
 
+in_volts = partial(quantity, "V2 Hz-1", packed=True)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Bands:
-    """What reduced spectra have in common with their file.
+class StoredObservation:
+    """An observation in the terms of a file: times, windows of one piece each, and place.
+
+    Attributes are those of :class:`.Observation` and :class:`.Windows`; there are no windows for
+    instants.
+    """
+
+    jd1: Float[np.ndarray, " spectrum"] = quantity("d", "Julian date, UTC", checks={})
+    jd2: Float[np.ndarray, " spectrum"] = quantity("d", "its second part", checks={})
+    run: Int[np.ndarray, " spectrum"] = quantity("1", checks={"low": 0.0})
+    window_start_s: Float[np.ndarray, " spectrum"] | None = quantity("s", checks={})
+    window_end_s: Float[np.ndarray, " spectrum"] | None = quantity("s", checks={})
+    live_s: Float[np.ndarray, " spectrum"] | None = quantity("s", checks={"low": 0.0})
+    turntable_deg: Float[np.ndarray, " state"] = quantity("degree", checks={})
+    lon_deg: float
+    lat_deg: float
+    step_s: float
+
+    @classmethod
+    def of(cls, observation: Observation) -> StoredObservation:
+        """Return the terms of an observation."""
+        windows = observation.windows
+        return cls(
+            jd1=observation.times.jd1,
+            jd2=observation.times.jd2,
+            run=np.asarray(observation.run),
+            window_start_s=None if windows is None else windows.start_s,
+            window_end_s=None if windows is None else windows.end_s,
+            live_s=None if windows is None else windows.live_s,
+            turntable_deg=np.array(observation.turntable_deg),
+            **{name: getattr(observation, name) for name in ("lon_deg", "lat_deg", "step_s")},
+        )
+
+    @cached_property
+    def observation(self) -> Observation:
+        """A sample for each spectrum; a run for each state of the spectrometer."""
+        windows = None
+        if self.window_start_s is not None and self.window_end_s is not None:
+            windows = Windows.whole(self.window_start_s, self.window_end_s, self.live_s)
+        place, times = (self.lon_deg, self.lat_deg), utc_of(self.jd1, self.jd2)
+        runs = self.run, tuple(self.turntable_deg.tolist()), self.step_s
+        return Observation(*place, times, *runs, windows=windows)
+
+
+@dataclass(frozen=True, kw_only=True, repr=False, eq=False)
+class Reduced(Described, StoredObservation):
+    """Spectra in bands, averaged over time.
+
+    Numbers are for bands, products and bins of time; flags are for spectra ("rows").
 
     Attributes
     ----------
+    frequencies_mhz : (bands,) array
+    product : (products,) array of str
+        Names of the package's products, in order.
+    values : (bands, products, bins) array
+        In V^2/Hz at the receivers' inputs, NaN where no data remain.
+    before : (bands, products, bins) array
+        Means before flagging, for figures.
+    lines : (bands, rows) array
+        Share of a spectrum's channels in a band that are flagged.
     n_averaged : (bands, bins) array
         Independent samples of voltages behind each value; 0 where no data remain.
     level : (bins, ports) array of str
@@ -90,6 +150,15 @@ class Bands:
         How they were reduced, in words.
     """
 
+    frequencies_mhz: Float[np.ndarray, " frequency"] = quantity(
+        "MHz", checks={"low": 0.0, "grows": True, "unit": "MHz"}, stored="frequency"
+    )
+    product: Shaped[np.ndarray, " product"] = quantity("", checks={"choices": labels()})
+    values: Float[np.ndarray, "frequency product bin"] = in_volts(stored="visibility")
+    before: Float32[np.ndarray, "frequency product bin"] = in_volts(stored="before_flags")
+    lines: Float32[np.ndarray, "frequency spectrum"] = quantity(
+        "1", "flagged channels", checks={"low": 0.0, "high": 1.0}, packed=True, stored="line_share"
+    )
     n_averaged: Float[np.ndarray, "frequency bin"] = quantity("1", checks={"low": 0.0})
     level: Shaped[np.ndarray, "bin port"] = quantity("", checks={"choices": (*LETTERS, NO_LEVEL)})
     gain: Float[np.ndarray, "frequency port bin"] = quantity(COUNTS)
@@ -116,32 +185,6 @@ class Bands:
     gain_std: float | None
     sessions: tuple[dict[str, Any], ...]
     recipe: dict[str, str]
-
-
-@dataclass(frozen=True, kw_only=True, repr=False, eq=False)
-class Reduced(Described, Bands):
-    """Spectra in bands, averaged over time.
-
-    Numbers are for bands, products and bins of time; flags are for spectra ("rows").
-
-    Attributes
-    ----------
-    frequencies_mhz : (bands,) array
-    observation : Observation
-        A sample for each spectrum; a run for each state of the spectrometer.
-    values : (bands, products, bins) array
-        In V^2/Hz at the receivers' inputs, NaN where no data remain.
-    before : (bands, products, bins) array
-        Means before flagging, for figures.
-    lines : (bands, rows) array
-        Share of a spectrum's channels in a band that are flagged.
-    """
-
-    frequencies_mhz: Float[np.ndarray, " bands"]
-    observation: Observation
-    values: Float[np.ndarray, "bands products bins"]
-    before: Float[np.ndarray, "bands products bins"]
-    lines: Float32[np.ndarray, "bands rows"]
 
     def description(self) -> tuple[str, ...]:
         f = self.frequencies_mhz
@@ -313,32 +356,6 @@ HINT = "make it with: lusee-bayes reduce SCENARIO SESSION..."
 REDUCED = "reduced.nc"
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Saved(Bands):
-    """Contents of a file, with an observation's times, windows and place."""
-
-    frequency: Float[np.ndarray, " frequency"] = quantity(
-        "MHz", checks={"low": 0.0, "grows": True, "unit": "MHz"}
-    )
-    product: Shaped[np.ndarray, " product"] = quantity("", checks={"choices": labels()})
-    visibility: Float[np.ndarray, "frequency product bin"] = quantity("V2 Hz-1", packed=True)
-    before_flags: Float32[np.ndarray, "frequency product bin"] = quantity("V2 Hz-1", packed=True)
-    jd1: Float[np.ndarray, " spectrum"] = quantity("d", "Julian date, UTC", checks={})
-    jd2: Float[np.ndarray, " spectrum"] = quantity("d", "its second part", checks={})
-    run: Int[np.ndarray, " spectrum"] = quantity("1", checks={"low": 0.0})
-    window_start_s: Float[np.ndarray, " spectrum"] | None = quantity("s", checks={})
-    window_end_s: Float[np.ndarray, " spectrum"] | None = quantity("s", checks={})
-    live_s: Float[np.ndarray, " spectrum"] | None = quantity("s", checks={"low": 0.0})
-    turntable_deg: Float[np.ndarray, " state"] = quantity("degree", checks={})
-    line_share: Float32[np.ndarray, "frequency spectrum"] = quantity(
-        "1", "flagged channels", checks={"low": 0.0, "high": 1.0}, packed=True
-    )
-    lon_deg: float
-    lat_deg: float
-    step_s: float
-    scenario: str = ""
-
-
 def write_reduced(path: str | Path, reduced: Reduced, scenario: str = "") -> Path:
     """Write reduced spectra, complete or not at all.
 
@@ -349,25 +366,7 @@ def write_reduced(path: str | Path, reduced: Reduced, scenario: str = "") -> Pat
     scenario : str
         Text of the scenario of the reduction.
     """
-    seen, windows = reduced.observation, reduced.observation.windows
-    saved = _Saved(
-        frequency=reduced.frequencies_mhz,
-        product=np.array(labels()),
-        visibility=reduced.values,
-        before_flags=reduced.before.astype(np.float32),
-        line_share=reduced.lines,
-        jd1=seen.times.jd1,
-        jd2=seen.times.jd2,
-        run=np.asarray(seen.run),
-        turntable_deg=np.array(seen.turntable_deg),
-        window_start_s=None if windows is None else windows.start_s,
-        window_end_s=None if windows is None else windows.end_s,
-        live_s=None if windows is None else windows.live_s,
-        scenario=scenario,
-        **{name: getattr(seen, name) for name in ("lon_deg", "lat_deg", "step_s")},
-        **_in_common(reduced),
-    )
-    return write_tree(path, saved, formats.REDUCED)
+    return write_tree(path, reduced, formats.REDUCED, {"scenario": scenario})
 
 
 def read_reduced(path: str | Path) -> Reduced:
@@ -383,31 +382,15 @@ def read_reduced(path: str | Path) -> Reduced:
         If the file is missing, of another kind or damaged.
     """
     with opened_tree(path, formats.REDUCED, "reduced spectra", HINT) as tree:
-        saved = from_tree(_Saved, tree, str(path))
-    if tuple(saved.product) != labels():
+        read = from_tree(Reduced, tree, str(path))
+    if tuple(read.product) != labels():
         raise InputError(f"{path} does not have the products {', '.join(labels())}")
     with naming(path):
-        require_shape("level", saved.level, (None, PORTS))
-        require_shape("curves", saved.curves.gain, (*LEAD, None))
-        if saved.component_std is not None:
-            require_shape("component_std", saved.component_std, (*LEAD, None))
-        windows = None
-        if saved.window_start_s is not None and saved.window_end_s is not None:
-            windows = Windows.whole(saved.window_start_s, saved.window_end_s, saved.live_s)
-        place, times = (saved.lon_deg, saved.lat_deg), utc_of(saved.jd1, saved.jd2)
-        runs = saved.run, tuple(saved.turntable_deg.tolist()), saved.step_s
-        observation = Observation(*place, times, *runs, windows=windows)
-    if saved.bin_of.max() >= saved.n_averaged.shape[1]:
-        raise InputError(f"{path}: bin_of exceeds the {saved.n_averaged.shape[1]} bins")
-    return Reduced(
-        frequencies_mhz=saved.frequency,
-        observation=observation,
-        values=saved.visibility,
-        before=saved.before_flags.astype(np.float64),
-        lines=saved.line_share,
-        **_in_common(saved),
-    )
-
-
-def _in_common(bands: Bands) -> dict[str, Any]:
-    return {one.name: getattr(bands, one.name) for one in fields(Bands)}
+        require_shape("level", read.level, (None, PORTS))
+        require_shape("curves", read.curves.gain, (*LEAD, None))
+        if read.component_std is not None:
+            require_shape("component_std", read.component_std, (*LEAD, None))
+        require_shape("the times", read.observation.times, read.bin_of.shape)
+    if read.bin_of.max() >= read.n_averaged.shape[1]:
+        raise InputError(f"{path}: bin_of exceeds the {read.n_averaged.shape[1]} bins")
+    return read

@@ -29,6 +29,7 @@ from lusee_bayes.flight.bands import ChannelBand, shared_noise
 from lusee_bayes.flight.gain_model import NANO2, gain_curves
 from lusee_bayes.flight.recipe import Recipe, Timeline, timeline
 from lusee_bayes.instrument.averaging import by_the_rule
+from lusee_bayes.instrument.products import labels
 from lusee_bayes.instrument.times import seconds_from
 
 # spectra in a slab, and fewest spectra of a piece that ends between two bins
@@ -95,7 +96,8 @@ def reduce_sessions(
         frequencies_mhz=np.array(recipe.frequencies_mhz),
         bandwidth_mhz=recipe.section.bandwidth_mhz,
         average_s=recipe.average_s,
-        observation=line.observation,
+        product=np.array(labels()),
+        before=whole.pop("before").astype(np.float32),
         bin_of=line.bin_of,
         level=level[first],
         component_std=recipe.table.component_std,
@@ -105,6 +107,7 @@ def reduce_sessions(
         recipe=recipe.words(),
         curvature=np.abs(bend).max("port").values,
         **whole,
+        **vars(reduced.StoredObservation.of(line.observation)),
     )
 
 

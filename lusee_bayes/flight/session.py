@@ -8,17 +8,19 @@ second, of which 4096 form a spectrum of 2048 channels, 25 kHz apart, every 40 m
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+import h5py
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Shaped
 
 from lusee_bayes.core.arrays import Rows
 from lusee_bayes.core.checks import Described, counted
 from lusee_bayes.core.errors import InputError
+from lusee_bayes.core.formats import opened
 from lusee_bayes.core.layouts import Attribute, Content, Unread, Variable
 from lusee_bayes.core.reading import reading
 from lusee_bayes.flight.clock import Clock
@@ -97,7 +99,6 @@ def channel_mhz(origin: BinOrigin) -> Middles:
 TELEMETRY = ("THERM_FPGA", "SPE_ADC0_T", "SPE_ADC1_T", "SPE_1VAD8_V", "VMON_1V2D", "SPE_1VAD8_C")
 # counts of spectra [first:last] of all products and channels
 Read = Callable[[int, int], Float32[np.ndarray, "rows products channels"]]
-Opener = Callable[[], AbstractContextManager[Read]]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -163,8 +164,6 @@ class Session(Described, Recorded):
         Whether the average of every fourth channel is subtracted; None if the file lacks it.
     software : str
         Version of the flight software, such as 0x307.
-    opener : callable
-        Opens the file: a context manager that gives a :data:`Read`.
     unused : mapping of str to int
         Other families of data in the file, and their numbers of rows.
     """
@@ -176,7 +175,6 @@ class Session(Described, Recorded):
     errors: RowCounts
     notch: RowCounts | None
     software: str
-    opener: Opener
     unused: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self):
@@ -225,8 +223,14 @@ class Session(Described, Recorded):
         InputError
             If the file is damaged where it is read.
         """
-        with reading(self.path, "a session"), self.opener() as read:
-            yield read
+        with reading(self.path, "a session") as path, ExitStack() as stack:
+            if self.kind == "FITS":
+                cube = stack.enter_context(opened(path, "a session"))["SPECTRA"].section
+            else:
+                with h5py.File(path) as file:
+                    cache = cache_for(file["spectra/data"].chunks)
+                cube = stack.enter_context(h5py.File(path, **cache))["spectra/data"]
+            yield lambda first, last: np.asarray(cube[first:last], dtype=np.float32)
 
     def description(self) -> tuple[str, ...]:
         states = ["".join(row) for row in np.unique(self.level, axis=0)]
@@ -253,6 +257,28 @@ class Session(Described, Recorded):
             "telemetry of the gain table: " + ("lacks " + ", ".join(lacking) if lacking else "all"),
             *(["not used: " + ", ".join(unused)] if unused else []),
         )
+
+
+# luseepy lets h5py choose its chunks; for a long session one contains a thousand spectra of few
+# channels. Unless all chunks of these spectra are cached, each is decompressed again for every slab
+LARGEST_CACHE = 1 << 29
+# far more places than chunks, so that two chunks do not compete for one
+PLACES = 1_000_003
+
+
+def cache_for(chunks: tuple[int, ...] | None) -> dict[str, Any]:
+    """Return options of :class:`h5py.File` for reading spectra piece by piece.
+
+    Parameters
+    ----------
+    chunks : (rows, products, channels) or None
+        None for a dataset without chunks.
+    """
+    if chunks is None:
+        return {}
+    spectra = chunks[0] * N_PRODUCTS * (N_CHANNELS + chunks[2]) * 4
+    size = min(int(1.25 * spectra), LARGEST_CACHE)
+    return {"rdcc_nbytes": max(size, 1 << 20), "rdcc_nslots": PLACES, "rdcc_w0": 1.0}
 
 
 META = "spectra/metadata"
@@ -301,7 +327,7 @@ def session_of(path: Path, parsed: Content, arrays: Mapping[str, Unread], **othe
     arrays : mapping of str to array
         All arrays of the file, not yet read, by names as in :data:`ROWS`.
     **others
-        Other attributes of :class:`Session`: layout, kind, clock and opener.
+        Other attributes of :class:`Session`: layout, kind and clock.
 
     Raises
     ------

@@ -7,9 +7,7 @@ data of luseepy's sessions, such as waveforms and housekeeping packets.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +25,7 @@ from lusee_bayes.core.reading import reading, require_file
 from lusee_bayes.flight.clock import DAY_S, MJD_ZERO
 from lusee_bayes.flight.layout_3 import INTERPOLATED, UNKNOWN, session_of_fits, session_of_hdf5
 from lusee_bayes.flight.layout_4 import session_of_4
-from lusee_bayes.flight.session import CODES, META, N_CHANNELS, N_PRODUCTS, Read, Recorded, Session
+from lusee_bayes.flight.session import CODES, META, N_CHANNELS, N_PRODUCTS, Recorded, Session
 
 Counts = Float32[np.ndarray, "_ products _"]
 Blocks = Iterable[Counts]
@@ -56,15 +54,14 @@ def read_session(path: str | Path) -> Session:
                     f"{path} is of layout 4 in FITS, but this version reads layout 4 only in HDF5; "
                     "ingest the session again with luseepy, as HDF5"
                 )
-            return session_of_fits(path, hdus, partial(_fits_spectra, path))
+            return session_of_fits(path, hdus)
     with reading(path, HDF5):
         if not h5py.is_hdf5(path):
             raise InputError(f"{path} is neither HDF5 nor FITS; expected a session of lusee.ingest")
         require_readable_hdf5(path)
         with h5py.File(path) as file:
             version = _version_of(path, file.attrs.get("layout_version"))
-            made = session_of_4 if version == 4 else session_of_hdf5
-            return made(path, file, partial(_hdf5_spectra, path))
+            return (session_of_4 if version == 4 else session_of_hdf5)(path, file)
 
 
 def _version_of(path: Path, version: Any) -> int:
@@ -83,44 +80,6 @@ def _version_of(path: Path, version: Any) -> int:
             f"{path} is of layout {number}; this version reads 3 and {NEWEST}; update lusee_bayes"
         )
     return number
-
-
-@contextmanager
-def _fits_spectra(path: Path) -> Iterator[Read]:
-    with opened(path, FITS) as hdus:
-        cube = hdus["SPECTRA"].section
-        yield lambda first, last: np.asarray(cube[first:last], dtype=np.float32)
-
-
-@contextmanager
-def _hdf5_spectra(path: Path) -> Iterator[Read]:
-    with h5py.File(path) as file:
-        cache = cache_for(file["spectra/data"].chunks)
-    with h5py.File(path, **cache) as file:
-        cube = file["spectra/data"]
-        yield lambda first, last: np.asarray(cube[first:last], dtype=np.float32)
-
-
-# luseepy lets h5py choose its chunks; for a long session one contains a thousand spectra of few
-# channels. Unless all chunks of these spectra are cached, each is decompressed again for every slab
-LARGEST_CACHE = 1 << 29
-# far more places than chunks, so that two chunks do not compete for one
-PLACES = 1_000_003
-
-
-def cache_for(chunks: tuple[int, ...] | None) -> dict[str, Any]:
-    """Return options of :class:`h5py.File` for reading or writing spectra piece by piece.
-
-    Parameters
-    ----------
-    chunks : (rows, products, channels) or None
-        None for a dataset without chunks.
-    """
-    if chunks is None:
-        return {}
-    spectra = chunks[0] * N_PRODUCTS * (N_CHANNELS + chunks[2]) * 4
-    size = min(int(1.25 * spectra), LARGEST_CACHE)
-    return {"rdcc_nbytes": max(size, 1 << 20), "rdcc_nslots": PLACES, "rdcc_w0": 1.0}
 
 
 def whole_spectra(path: Path, blocks: Blocks, n_rows: int) -> Iterator[tuple[int, Counts]]:

@@ -107,12 +107,7 @@ class ChannelSpectra:
         logs = _at_channels(self.autos, np.log(np.moveaxis(autos, 1, -1)))
         length = np.sqrt((np.abs(low) ** 2).sum(axis=1))
         low *= (np.exp((logs + self.offset) / 2.0) / length)[:, None]
-        full = np.empty_like(low)
-        for i in ports:
-            for j in ports[: i + 1]:
-                full[i, j] = sum(low[i, k] * low[j, k].conj() for k in ports[: j + 1])
-                full[j, i] = full[i, j].conj()
-        return to_real(full)
+        return to_real(np.einsum("ikrc,jkrc->ijrc", low, low.conj()))
 
 
 def _at_channels(weights: Float[np.ndarray, "channels nodes"], values: np.ndarray) -> np.ndarray:

@@ -374,9 +374,7 @@ class Observation(checks.Described):
         checks.require_array("galactic", galactic, shape)
         vectors = np.broadcast_to(galactic, (self.n_times, 3))
         mcmf = np.einsum("tij,tj->ti", self.mcmf_from_galactic, vectors)
-        topocentric_from_mcmf = self.topocentric_from_mcmf()
-        leaning = self.lander_from_mcmf() @ topocentric_from_mcmf.T
-        east, north, up = leaning @ (mcmf @ topocentric_from_mcmf.T).T
+        east, north, up = self.lander_from_mcmf() @ mcmf.T
         turned = np.radians(np.asarray(self.turntable_deg, dtype=np.float64))[self.run]
         cos, sin = np.cos(turned), np.sin(turned)
         return np.stack([cos * east + sin * north, cos * north - sin * east, up], axis=1)

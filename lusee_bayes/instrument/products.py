@@ -18,7 +18,6 @@ import re
 from collections.abc import Sequence
 from functools import lru_cache
 from itertools import combinations_with_replacement
-from operator import attrgetter
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -313,8 +312,8 @@ class DataLayout(Described, eqx.Module):
         InputError
             If it does not.
         """
-        sizes = attrgetter("n_products", "n_times", "size")
-        same = sizes(self) == sizes(other)
+        ours, theirs = ((one.n_products, one.n_times, one.size) for one in (self, other))
+        same = ours == theirs
         if same and self.index is not None and other.index is not None:
             same = is_traced(self.index, other.index) or np.array_equal(self.index, other.index)
         if not same:

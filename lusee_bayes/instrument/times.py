@@ -354,13 +354,11 @@ TO_MIDDLE = {"start": 0.5, "middle": 0.0, "end": -0.5}
 ROUNDED_S, ROUNDED_SHARE = 1e-3, 1e-4
 # optional arguments: time from sample to sample, and the time integrated, in seconds
 Step, Live = float | None, Times | None
-# middles, step and windows of samples
-Windowed = tuple[Time, float, Windows | None]
 
 
 def windows_of(
     times: Time, timestamp: str, step_s: Step = None, live_s: Live = None, bounds: Any = None
-) -> Windowed:
+) -> tuple[Time, float, Windows | None]:
     """Return the middles, the step and the windows of samples.
 
     Parameters

@@ -507,7 +507,7 @@ def write_four_port(
         )
     enclosure = np.array([circuit.per_kelvin for circuit in circuits])
     root = np.sqrt(enclosure.diagonal(axis1=1, axis2=2).real)
-    i, j = np.array([(p.i, p.j) for p in products.all_products()]).T
+    i, j, _ = products.ports()
     data = _kelvin(path, channels) * (root[:, i] * root[:, j]).T
     condition = np.linalg.cond([c.antenna_ohm + c.load_ohm for c in circuits])
     eigenvalues = _eigenvalues(data)

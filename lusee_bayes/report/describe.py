@@ -15,8 +15,7 @@ from lusee_bayes.core import formats
 from lusee_bayes.core.checks import counted
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.files import read_manifest, recover
-from lusee_bayes.core.layouts import Layout
-from lusee_bayes.core.reading import read_json, require_file
+from lusee_bayes.core.reading import read_model, require_file
 from lusee_bayes.core.trees import from_tree, opened_tree
 
 
@@ -154,7 +153,7 @@ def describe_folder(folder: Path) -> list[str]:
         lines += [f"command: {facts.command}"] if facts.command else []
     for name in FIGURES:
         if (folder / name).is_file():
-            figures = read_json(folder / name, Layout("the figures of a run"))
+            figures = read_model(folder / name, dict, "the figures of a run")
             lines += [str(figures["verdict"])] if "verdict" in figures else []
     return [*lines, f"files: {', '.join(sorted(manifest['files']))}"]
 

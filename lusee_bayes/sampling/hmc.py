@@ -36,9 +36,8 @@ from lusee_bayes.core.arrays import Array
 from lusee_bayes.core.checks import is_traced, require_positive
 from lusee_bayes.core.errors import InputError, require_known
 from lusee_bayes.core.files import replacing
-from lusee_bayes.core.layouts import Layout
 from lusee_bayes.core.lazy import dist, numpyro
-from lusee_bayes.core.reading import read_json, reading
+from lusee_bayes.core.reading import read_model, reading
 from lusee_bayes.linear.linear_gaussian import LinearGaussian
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.sampling import programs
@@ -221,7 +220,7 @@ def _given(value: Float[Array, "..."], log_det: float | Float[Array, ""]) -> Cal
     return reparametrised
 
 
-IDENTITY_LAYOUT = Layout("the description of an unfinished run (else delete its folder)")
+WHAT = "the description of an unfinished run (else delete its folder)"
 IDENTITY = "run.json"
 CHUNK_GLOB = "chunk-*.npz"
 
@@ -296,7 +295,7 @@ class Checkpoints:
                 f"'{self.folder}' contains an unfinished run ({done} iterations done); continue "
                 "with --resume, or delete the folder"
             )
-        saved = read_json(marker, IDENTITY_LAYOUT)
+        saved = read_model(marker, dict, WHAT)
         for name in sorted({*saved, *described}):
             if saved.get(name) != described.get(name):
                 raise InputError(

@@ -39,6 +39,7 @@ from jaxtyping import Float
 from scipy.constants import Boltzmann, speed_of_light
 
 from lusee_bayes.core.arrays import Vector
+from lusee_bayes.core.checks import require_positive
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import per_mode, require_nside, synthesis_matrix
 from lusee_bayes.core.lazy import coordinates, healpy
@@ -225,10 +226,7 @@ class PointSource:
             For frequencies that are not positive.
         """
         frequency = np.asarray(frequency_mhz, dtype=np.float64)
-        if not np.all(frequency > 0.0):
-            raise InputError(
-                f"frequency_mhz is {frequency_mhz}, expected positive numbers; give it in MHz"
-            )
+        require_positive("frequency_mhz", frequency, "give it in MHz")
         edge = self.valid_from_mhz
         # The mean slope of two octaves: the tangent of a quartic at its end is mostly noise.
         slope = math.log(self._measured(4.0 * edge) / self._measured(edge)) / math.log(4.0)

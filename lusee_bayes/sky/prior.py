@@ -92,9 +92,9 @@ class Prior(Described, eqx.Module):
     def variance(self) -> Unknowns:
         """Return the diagonal of S, in K^2."""
 
-    @abstractmethod
     def covariance(self) -> Covered:
         """Return S as a matrix, in K^2."""
+        return self.colour_covariance(namespace(self).eye(self.size))
 
     @abstractmethod
     def widened(self, factor: float) -> Prior:
@@ -137,10 +137,6 @@ class Prior(Described, eqx.Module):
         return self.colour(u + self.white_mean.reshape(*(1,) * (u.ndim - 1), -1))
 
 
-# largest difference of S_ij and S_ji, in prior standard deviations of both
-ASYMMETRY = 1e-10
-
-
 class DensePrior(Prior):
     """S = G G^T over correlated modes, with G lower triangular, about a mean sky.
 
@@ -171,36 +167,9 @@ class DensePrior(Prior):
         above = any(row[k + 1 :].any() for k, row in enumerate(root))
         if above or not (np.diagonal(root) > 0).all():
             raise InputError(
-                "the root of the prior must be lower triangular with a positive diagonal; use "
-                "DensePrior.of_covariance(S)"
+                "the root of the prior must be lower triangular with a positive diagonal; give the "
+                "Cholesky factor of S"
             )
-
-    @classmethod
-    def of_covariance(
-        cls, covariance: Float[Array, "modes columns"], mean: Unknowns | None = None
-    ) -> DensePrior:
-        """Create the prior from a covariance.
-
-        Parameters
-        ----------
-        covariance : (modes, modes) array
-            S, in K^2.
-        mean : (modes,) array, optional
-            Prior mean, in K.
-
-        Returns
-        -------
-        DensePrior
-
-        Raises
-        ------
-        InputError
-            If S is not float64, not finite, not symmetric or not positive definite.
-        """
-        require_array("the prior covariance", covariance, (len(covariance), len(covariance)))
-        if not is_traced(covariance):
-            _require_symmetric_prior(np.asarray(covariance))
-        return cls(linalg.checked_cholesky("the prior covariance", covariance), mean=mean)
 
     @classmethod
     def of_root(
@@ -262,24 +231,9 @@ class DensePrior(Prior):
     def variance(self):
         return namespace(self).einsum("ij,ij->i", self.root, self.root)
 
-    def covariance(self):
-        product = linalg.times_lower(self.root, self.root, transpose=True)
-        return (product + product.T) / 2.0
-
     def log_det(self):
         xp = namespace(self)
         return xp.asarray(xp.log(xp.diagonal(self.root)).sum())
-
-
-def _require_symmetric_prior(covariance: Float[np.ndarray, "modes modes"]) -> None:
-    width = np.sqrt(np.abs(np.diagonal(covariance)))
-    uneven = np.abs(covariance - covariance.T)
-    if (uneven > ASYMMETRY * width[:, None] * width[None]).any():
-        i, j = np.unravel_index(int(np.argmax(uneven)), uneven.shape)
-        raise InputError(
-            f"the prior covariance is not symmetric: S[{i}, {j}] = {covariance[i, j]:.6g}, "
-            f"S[{j}, {i}] = {covariance[j, i]:.6g} K^2; give (S + S^T) / 2"
-        )
 
 
 class DiagonalPrior(Prior):
@@ -317,9 +271,6 @@ class DiagonalPrior(Prior):
 
     def variance(self):
         return self.widths**2
-
-    def covariance(self):
-        return namespace(self).diag(self.variance())
 
     def log_det(self):
         self.require_density()

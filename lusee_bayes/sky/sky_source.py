@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float
 
 from lusee_bayes.core import harmonics
 from lusee_bayes.core.arrays import Array, Modes, Pixels
-from lusee_bayes.core.checks import Described, number, require_array, require_finite, require_whole
+from lusee_bayes.core.checks import Described, number, require_array, require_whole
 from lusee_bayes.core.errors import InputError, nearest
 from lusee_bayes.core.files import replacing, user_path
 from lusee_bayes.core.formats import has_words, is_fits, opened, require_readable_hdf5
@@ -336,7 +336,6 @@ class SkyAlms(SkyFile):
                 )
         else:
             frequencies, alm = None, _read_alm_fits(path)
-        require_finite(f"{path}: the coefficients", np.stack([alm.real, alm.imag]))
         return cls(str(path), frequencies, harmonics.from_healpy(np.atleast_2d(alm)))
 
     @property
@@ -403,23 +402,20 @@ def _read_alm_fits(path: Path) -> np.ndarray:
         units = {f"{one.name.lower()}.units": one.unit for one in table.columns}
         arrays = TABLE.checked(path, columns, units).arrays
     index, real, imag = (arrays[name] for name in COLUMNS)
-    ell = np.floor(np.sqrt(index - 1.0) + 1e-9).astype(int)
-    m = index - 1 - ell**2 - ell
-    # coefficients beyond the largest lmax, or written twice, fill no lmax either
-    once = index.max() <= harmonics.LARGEST_LMAX**2 and len(set(index.tolist())) == len(index)
-    if not once or (m < 0).any() or (m > ell).any():
+    lmax = min(int(np.sqrt(index.max() - 1.0)), harmonics.LARGEST_LMAX)
+    ell, m = healpy.Alm.getlm(lmax)
+    expected = ell**2 + ell + m + 1
+    if not np.isin(index, expected).all() or len(np.unique(index)) < len(index):
         raise InputError(
             f"{path}: index must be ell^2 + ell + m + 1, each once, with 0 <= m <= ell <= "
             f"{harmonics.LARGEST_LMAX}"
         )
-    lmax = int(ell.max())
-    alm = np.full(healpy.Alm.getsize(lmax), np.nan + 0j)
-    alm[healpy.Alm.getidx(lmax, ell, m)] = real + 1j * imag
-    if np.isnan(alm).any():
+    if missing := len(expected) - len(index):
         raise InputError(
-            f"{path}: {int(np.isnan(alm).sum())} coefficients up to ell = {lmax} are missing or "
-            "not finite; write all m up to ell"
+            f"{path}: {missing} coefficients up to ell = {lmax} are missing; write all m up to ell"
         )
+    alm = np.empty(len(index), dtype=np.complex128)
+    alm[np.argsort(expected)] = (real + 1j * imag)[np.argsort(index)]
     return alm
 
 

@@ -47,7 +47,7 @@ def test_symmetric_product(xp):
     np.testing.assert_allclose(got, a @ s @ a.T, rtol=0, atol=1e-13 * np.abs(got).max())
 
 
-@pytest.mark.parametrize("n", [1, 7, la.MAX_SUBSTITUTED + 1, 4 * la.MAX_SUBSTITUTED + 3])
+@pytest.mark.parametrize("n", [1, 7, 161, 643])
 @ARRAYS
 def test_inverses_of_triangles(n, xp):
     matrix = spd(n)

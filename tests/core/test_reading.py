@@ -84,7 +84,7 @@ def test_tables_objects_and_arrays(tmp_path):
     (tmp_path / "t.csv").write_text("ell,name\n0,a\n1\n")
     refuse("line 3.*2 columns", reading.read_table, tmp_path / "t.csv", table)
     (tmp_path / "o.json").write_text("[1]")
-    refuse("contains a list", reading.read_json, tmp_path / "o.json", Layout("an object"))
+    refuse("should be an object", reading.read_model, tmp_path / "o.json", dict, "an object")
     np.save(tmp_path / "a.npz", np.ones(3))
     refuse("a.npz", reading.read_arrays, tmp_path / "a.npz.npy", Layout("arrays"))
 

@@ -59,8 +59,9 @@ def test_likelihoods_and_sums_are_those_of_matrices():
 PRIORS = {
     "half": lambda: lb.HarmonicPrior(jnp.asarray(0.5 * SPECTRUM)),
     "zero": lambda: lb.HarmonicPrior(jnp.asarray([4.0, 0.0, 0.5])),
-    "correlated": lambda: DensePrior.of_covariance(
-        random_covariance(np.random.default_rng(6), N), np.linspace(-1.0, 2.0, N)
+    "correlated": lambda: DensePrior(
+        np.linalg.cholesky(random_covariance(np.random.default_rng(6), N)),
+        mean=np.linspace(-1.0, 2.0, N),
     ),
 }
 

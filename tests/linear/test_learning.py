@@ -15,7 +15,6 @@ from lusee_bayes.linear.information import Information, integrated_out
 from lusee_bayes.priors import learning
 from lusee_bayes.priors.families import FREEDOM, Hyperprior, IsotropicFamily
 from lusee_bayes.priors.local_scales import embedded_local_scales
-from lusee_bayes.sky.prior import DensePrior
 
 LMAX, N_DATA = 6, 120
 
@@ -342,7 +341,7 @@ class Hopeless(Strength):
     """No theta has an S."""
 
     def prior(self, covariance):
-        return DensePrior.of_covariance(-covariance)
+        raise lb.InputError("it has no root")
 
 
 def test_parameters_without_a_covariance_are_drawn_anew_and_then_refused():

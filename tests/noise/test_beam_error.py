@@ -47,7 +47,7 @@ def test_the_term_is_da_s_da(beams, shifted):
     # a prior that correlates modes, about a mean sky
     root = np.sqrt(per_mode)
     s = root[:, None] * random_covariance(np.random.default_rng(1), len(root)) * root
-    got = beam_error_noise(direction, DensePrior.of_covariance(s, root))
+    got = beam_error_noise(direction, DensePrior(np.linalg.cholesky(s), mean=root))
     seen = error @ root
     close(got.dense(), error @ s @ error.T + np.outer(seen, seen), 1e-11)
 

@@ -80,8 +80,8 @@ def test_hmc_finds_it_where_the_prior_correlates_modes():
     w = Witness("paper", "prior.model=local_scales")
     assert w.found()[1] > 0.3
     # without its correlations, or a standard deviation elsewhere, the prior is another one
-    variances = jnp.diag(w.model.prior.variance())
-    alone = DensePrior.of_covariance(variances, jnp.asarray(w.model.prior.mean))
+    widths = jnp.sqrt(w.model.prior.variance())
+    alone = DensePrior(jnp.diag(widths), mean=jnp.asarray(w.model.prior.mean))
     assert not w.judge(w.condition(prior=alone)).passed
-    elsewhere = replace(w.model.prior, mean=w.model.prior.mean + jnp.sqrt(jnp.diag(variances)))
+    elsewhere = replace(w.model.prior, mean=w.model.prior.mean + widths)
     assert "mean" in failed(w.judge(w.condition(prior=elsewhere)))

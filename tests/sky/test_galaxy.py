@@ -288,7 +288,7 @@ SOURCES = {source.name: source for source in BRIGHT_SOURCES}
 
 @pytest.mark.parametrize("bad", [0.0, -3.0, float("nan")])
 def test_frequencies_are_positive(bad):
-    refuse("expected positive", SOURCES["Cyg A"].flux_jy, bad)
+    refuse("must be positive", SOURCES["Cyg A"].flux_jy, bad)
 
 
 POSITIONS = [

@@ -35,7 +35,7 @@ from lusee_bayes.core.reading import read_table
 from lusee_bayes.instrument.beams.fields import HemisphereGrid, Interpolation, Pairs, ProductBeams
 from lusee_bayes.instrument.beams.sampled import read_beam
 from lusee_bayes.instrument.beams.source import BeamSource, Circuit, Lines, Parameter, Receiver
-from lusee_bayes.instrument.products import all_products
+from lusee_bayes.instrument.products import ports
 
 Nodes = Float[np.ndarray, " nodes"]
 # largest number of values for one polynomial; more values get cubic splines
@@ -166,7 +166,7 @@ def _in_unit(source: BeamSource, unit: Circuit | None, frequency_mhz: float, lma
     if unit is None:
         return both
     ours, other = (c.per_kelvin.diagonal().real for c in (source.circuit(frequency_mhz), unit))
-    first, second, _ = map(list, zip(*all_products(source.n_ports), strict=True))
+    first, second, _ = ports(source.n_ports)
     return both * np.sqrt((ours / other)[first] * (ours / other)[second])[:, None]
 
 

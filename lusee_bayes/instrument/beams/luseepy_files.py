@@ -59,7 +59,7 @@ from lusee_bayes.instrument.beams.fields import (
     product_modes,
 )
 from lusee_bayes.instrument.beams.source import BeamSource, Circuit, JFETReceiver, Receiver
-from lusee_bayes.instrument.products import N_ANTENNAS, auto_indices, to_matrix, to_real
+from lusee_bayes.instrument.products import N_ANTENNAS, auto_indices, to_real
 
 # conventions of the images that this package assumes, in lower case
 CONVENTIONS: Mapping[str, str] = {
@@ -258,17 +258,33 @@ class LuseepyBeam(Described, BeamSource):
         """The directions of the file with luseepy's rule."""
 
     @abstractmethod
-    def _linear(self, frequency_mhz: float, lmax: int, grid: HemisphereGrid) -> np.ndarray:
-        """Coefficients of the beams of all products by luseepy's rule."""
+    def _received(
+        self, parts: list[np.ndarray], file_mhz: float, mhz: float, grid: HemisphereGrid
+    ) -> AntennaFields:
+        """Fields of all ports at ``mhz``, from the file's e_theta and e_phi at ``file_mhz``."""
+
+    def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
+        """Return the fields of the ports in sqrt(1 / sr); their products are beams in K per K.
+
+        Between the file's frequencies this needs splines. With linear interpolation the fields
+        themselves are interpolated here, for pictures; use :meth:`beams` for products.
+        """
+        parts = self._at(frequency_mhz, self.e_theta, self.e_phi)
+        return self._received(parts, frequency_mhz, frequency_mhz, grid)
 
     def beams(self, frequency_mhz: float, lmax: int) -> ProductBeams:
         # these nodes treat the cut at the horizon exactly
         exact = HemisphereGrid.gauss_legendre(2 * len(self.theta), self.n_phi)
         grid = self.luseepy_grid if self.luseepy_quadrature else exact
         if self.interpolation == "spline":
-            modes = product_modes(self.fields(frequency_mhz, grid), lmax, normalise=False)
+            weighted = [(1.0, self.fields(frequency_mhz, grid))]
         else:
-            modes = self._linear(frequency_mhz, lmax, grid)
+            known = self.frequencies_mhz
+            weighted = [
+                (w, self._received([self.e_theta[k], self.e_phi[k]], known[k], frequency_mhz, grid))
+                for k, w in self._neighbours(frequency_mhz)
+            ]
+        modes = sum(w * product_modes(fields, lmax, normalise=False) for w, fields in weighted)
         return ProductBeams(modes, float(frequency_mhz))
 
     def interpolated(self, frequency_mhz: float) -> Interpolation | None:
@@ -333,26 +349,13 @@ class PortResponse(LuseepyBeam):
         """Return U_aa, the V^2/Hz at each receiver's input in an enclosure at 1 K."""
         return self.circuit(frequency_mhz).per_kelvin.diagonal().real
 
-    def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
-        """Return the fields of the ports; their products are beams in K per K and sr.
-
-        Between the file's frequencies this needs splines. With linear interpolation the fields
-        themselves are interpolated here, for pictures; use :meth:`beams` for products.
-        """
-        opened = self._open(self._at(frequency_mhz, self.e_theta, self.e_phi), grid)
-        mixing = self._mixing(frequency_mhz) / (speed_of_light / (1e6 * frequency_mhz))
-        parts = (np.tensordot(mixing, part, axes=1) for part in (opened.e_theta, opened.e_phi))
-        return AntennaFields(*parts, grid)
-
-    def _linear(self, frequency_mhz, lmax, grid):
-        opened = np.zeros((N_ANTENNAS**2, (lmax + 1) ** 2))
-        for k, weight in self._neighbours(frequency_mhz):
-            fields = self._open([self.e_theta[k], self.e_phi[k]], grid)
-            wavelength = speed_of_light / (1e6 * self.frequencies_mhz[k])
-            opened += weight / wavelength**2 * product_modes(fields, lmax, normalise=False)
-        mixing = self._mixing(frequency_mhz)
-        seen = np.einsum("ai,ijm,bj->abm", mixing, to_matrix(opened), mixing.conj(), optimize=True)
-        return to_real(seen)
+    def _received(self, parts, file_mhz, mhz, grid):
+        # product beams are halves of the sums over polarisations
+        scale = np.sqrt(2.0 * Boltzmann * VACUUM_OHM / self.per_kelvin(mhz))
+        mixing = scale[:, None] * self.circuit(mhz).loading * (1e6 * file_mhz / speed_of_light)
+        turn_deg = self.turntable_offset_deg
+        turned = (np.stack([on_grid(h, self.theta, grid, turn_deg) for h in p]) for p in parts)
+        return AntennaFields(*(np.tensordot(mixing, part, axes=1) for part in turned), grid)
 
     def background(self, frequency_mhz: float) -> Float[Array, " products"]:
         if self.moon_k == self.antenna_k == 0.0:
@@ -361,18 +364,6 @@ class PortResponse(LuseepyBeam):
         seen = circuit.emitted(self.moon_k * circuit.moon_ohm + self.antenna_k * circuit.loss_ohm)
         root = np.sqrt(self.per_kelvin(frequency_mhz))
         return to_real(seen / (root[:, None] * root[None]))
-
-    def _mixing(self, frequency_mhz: float) -> Complex[np.ndarray, "ports ports"]:
-        """M, scaled so that products of open ports' fields / wavelength become beams."""
-        # product beams are halves of the sums over polarisations
-        scale = np.sqrt(2.0 * Boltzmann * VACUUM_OHM) / np.sqrt(self.per_kelvin(frequency_mhz))
-        return scale[:, None] * self.circuit(frequency_mhz).loading
-
-    def _open(self, parts: list[np.ndarray], grid: HemisphereGrid) -> AntennaFields:
-        """The effective lengths of the open ports at one frequency, on a grid."""
-        turn_deg = self.turntable_offset_deg
-        turned = (np.stack([on_grid(h, self.theta, grid, turn_deg) for h in p]) for p in parts)
-        return AntennaFields(*turned, grid)
 
 
 def read_response(path: str | Path) -> PortResponse:
@@ -476,22 +467,15 @@ class ScalarBeam(LuseepyBeam):
         """The directions of the file with sin(theta) dtheta dphi, in equal steps up to pi / 2."""
         return HemisphereGrid(self.theta, np.sin(self.theta) * self.theta[1], self.n_phi)
 
-    def fields(self, frequency_mhz: float, grid: HemisphereGrid) -> AntennaFields:
-        """Return the fields of the arms in sqrt(1 / sr); their products are beams in K per K.
-
-        Between the file's frequencies this needs splines. With linear interpolation the fields
-        themselves are interpolated here, for pictures; use :meth:`beams` for products.
-        """
-        *parts, gain = self._at(frequency_mhz, self.e_theta, self.e_phi, self.gain)
-        return self._put_up(parts, float(gain), grid)
-
-    def _linear(self, frequency_mhz, lmax, grid):
-        (gain,) = self._at(frequency_mhz, self.gain)
-        modes = 0
-        for k, weight in self._neighbours(frequency_mhz):
-            fields = self._put_up([self.e_theta[k], self.e_phi[k]], float(gain), grid)
-            modes = modes + weight * product_modes(fields, lmax, normalise=False)
-        return modes
+    def _received(self, parts, file_mhz, mhz, grid):
+        (gain,) = self._at(mhz, self.gain)
+        scale = np.full(len(grid.theta), np.sqrt(2.0 * float(gain) / (4.0 * np.pi)))
+        if self.taper:
+            below = np.arctan((grid.theta - np.pi / 2.0) / TAPER_WIDTH) / np.pi + 0.5
+            scale = scale * (1.0 - below**2)
+        angles = [angle + self.turntable_offset_deg for angle in self.rotations_deg]
+        turned = [np.stack([on_grid(p, self.theta, grid, a) for a in angles]) for p in parts]
+        return AntennaFields(*((x * scale[:, None]).astype(np.complex128) for x in turned), grid)
 
     def impedance(self, frequency_mhz: float) -> complex | None:
         if self.impedance_ohm is None:
@@ -510,16 +494,6 @@ class ScalarBeam(LuseepyBeam):
             return super().background(frequency_mhz)
         sky = np.sqrt(4.0 * np.pi) * self.beams(frequency_mhz, 0).modes[:, 0]
         return self.moon_k * (to_real(np.eye(self.n_ports, dtype=np.complex128)) - sky)
-
-    def _put_up(self, parts: list[np.ndarray], gain: float, grid: HemisphereGrid) -> AntennaFields:
-        """The fields of one arm, turned for each port and scaled by the gain."""
-        scale = np.full(len(grid.theta), np.sqrt(2.0 * gain / (4.0 * np.pi)))
-        if self.taper:
-            below = np.arctan((grid.theta - np.pi / 2.0) / TAPER_WIDTH) / np.pi + 0.5
-            scale = scale * (1.0 - below**2)
-        angles = [angle + self.turntable_offset_deg for angle in self.rotations_deg]
-        turned = [np.stack([on_grid(p, self.theta, grid, a) for a in angles]) for p in parts]
-        return AntennaFields(*((x * scale[:, None]).astype(np.complex128) for x in turned), grid)
 
 
 def read_scalar_beam(path: str | Path) -> ScalarBeam:

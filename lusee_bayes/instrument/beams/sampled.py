@@ -166,8 +166,7 @@ class Directions:
         own_phi = grid.phi - np.radians(turn_deg)
         fixed = [from_rings(one, grid.theta, own_phi) for one in along]
         back = _axes(grid.theta[:, None], own_phi[None])
-        turned = [sum(a * one for a, one in zip(axis, fixed, strict=True)) for axis in back]
-        return turned[0], turned[1]
+        return tuple(sum(a * one for a, one in zip(axis, fixed, strict=True)) for axis in back)
 
 
 def _axes(theta: np.ndarray, phi: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
