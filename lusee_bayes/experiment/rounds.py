@@ -175,7 +175,7 @@ class Inference:
     def under(self, prior: Prior, learned: Learned | None = None) -> Inference:
         """The inference under another prior, with how it was learned."""
         solution = self.solution.under(prior)
-        return replace(self, solution=_less_moved(solution, self.expanded), learned=learned)
+        return replace(self, solution=_less_moved(solution, self.systematics), learned=learned)
 
 
 # learns a prior from the information in data, starting at given parameters

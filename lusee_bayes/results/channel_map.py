@@ -83,7 +83,7 @@ def conditioned(
         information = information.recentred(posterior.mean)
         before = _given_earlier(earlier.information.posterior(prior))
         total = replace(new, solution=Solution(new.model, data.data, posterior, information))
-        judged = replace(new, solution=new.solution.under(before))
+        judged = replace(new, solution=new.under(before).solution)
         return Conditioned(experiment, new, total, judged, (*earlier.digests, data.digest()))
 
 

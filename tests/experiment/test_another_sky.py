@@ -73,6 +73,8 @@ def test_the_errors_are_what_is_claimed(term):
         setup = replace(set_up(scenario, data), prior=prior, family=None)
         found = settled(setup, Around(data))
         assert not found.unsettled
+        same = found.under(found.model.prior).solution
+        np.testing.assert_allclose(same.chi2, found.solution.chi2, rtol=1e-8)
         total, modes = total + distance(found, truth), modes + len(truth)
     p = 2.0 * min(stats.chi2.sf(total, modes), stats.chi2.cdf(total, modes))
     assert p > 1e-3, total / modes
