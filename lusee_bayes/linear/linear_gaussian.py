@@ -258,10 +258,10 @@ class Solution(Described):
         d, in K.
     posterior : Posterior
         Over the sky, with the evidence of the data.
+    factor : Factor
+        L of N = L L^T.
     kept_information : Information or None
         :attr:`information`, if the posterior was computed from it.
-    of_noise : Factor or None
-        :attr:`factor`, if it was computed.
     excess : float
         Excess of chi^2 if prior means of unknowns in N are shifted, to make up for volume.
     """
@@ -269,17 +269,12 @@ class Solution(Described):
     model: LinearGaussian
     data: DataVector
     posterior: Posterior
+    factor: Factor
     kept_information: Information | None = None
-    of_noise: Factor | None = None
     excess: float = 0.0
 
     def description(self) -> tuple[str, ...]:
         return (*self.posterior.description(), "posterior, information, covariance, under(prior)")
-
-    @cached_property
-    def factor(self) -> Factor:
-        """L of N = L L^T."""
-        return self.model.noise.factor() if self.of_noise is None else self.of_noise
 
     @cached_property
     def information(self) -> Information:
@@ -287,11 +282,6 @@ class Solution(Described):
         if self.kept_information is not None:
             return self.kept_information
         return FromInformation.of(self.model).condition(self.data).less(self.excess).information
-
-    @property
-    def matrix(self) -> ModesMatrix | None:
-        """A^T N^-1 A, if it has been computed."""
-        return None if self.kept_information is None else self.kept_information.matrix
 
     @cached_property
     def covariance(self) -> Float[Array, "unknowns unknowns"]:
@@ -338,8 +328,7 @@ class Solution(Described):
         model = replace(self.model, prior=prior)
         if form_of(model) is not FromInformation:
             return model.condition(self.data)
-        matrices = self.information.matrix, self.of_noise
-        return FromInformation.of(model, *matrices).condition(self.data)
+        return FromInformation.of(model, self.information.matrix, self.factor).condition(self.data)
 
 
 def form_of(model: LinearGaussian, *, transformed: bool = False) -> type[Form]:
@@ -461,7 +450,7 @@ class FromInformation(Form):
         if not isinstance(host.noise, LowRankUpdate):
             return cls.of(model)
         base = old.base if isinstance(old, LowRankFactor) else old
-        factor, matrix = host.noise.factor(base), solution.matrix
+        factor, matrix = host.noise.factor(base), solution.information.matrix
         largest = (np.asarray(solution.posterior.lower) ** 2).sum(1).max()
         for sign, one in ((1.0, old), (-1.0, factor)):
             if isinstance(one, LowRankFactor):
@@ -483,7 +472,7 @@ class FromInformation(Form):
         u, _, _ = self._about(data, np.zeros(prior.size)).white_mean(prior, self.lower, most=1)
         information = self._about(data, prior.colour(u))
         posterior = information.posterior(prior, self.lower)
-        return Solution(self.model, data, posterior, information, self.factor)
+        return Solution(self.model, data, posterior, self.factor, information)
 
     def _about(self, data: DataVector, sky: Modes) -> Information:
         """Information of the data, about a reference sky."""
@@ -552,7 +541,7 @@ class Whitened(Form):
             )
         prior = self.model.prior
         posterior = Posterior(prior, u, self.lower, self.basis, log_evidence, moved)
-        parts = self.model, data, posterior
+        parts = self.model, data, posterior, self.factor
         # if the evidence is differentiated outside of jit, the last step alone is not traced
         traced = is_traced(*jax.tree.leaves(parts))
         return Solution(*(parts if traced else on_host(parts)))

@@ -406,11 +406,8 @@ class CrankNicolson(MCMCKernel):
         return jnp.where(jnp.isnan(total), jnp.inf, total), drawn
 
     def init(self, rng_key, num_warmup, init_params, model_args, model_kwargs):
-        """The first state of one chain, or of all: a sample from N(0, 1)."""
+        """The first state of a chain: a sample from N(0, 1)."""
         self.warmup = num_warmup
-        if rng_key.ndim > 1:
-            given = num_warmup, init_params, model_args, model_kwargs
-            return jax.vmap(lambda key: self.init(key, *given))(rng_key)
         key, of_start, of_skies = jax.random.split(rng_key, 3)
         start, zero = jax.random.normal(of_start, (self.size,)), jnp.zeros(())
         potential, z = self._looked(model_args, model_kwargs, start, of_skies)
@@ -421,9 +418,7 @@ class CrankNicolson(MCMCKernel):
         return HMCState(**fields | {"accept_prob": zero, "mean_accept_prob": zero})
 
     def sample(self, state, model_args, model_kwargs):
-        """The next state of one chain, or of all."""
-        if state.rng_key.ndim > 1:
-            return jax.vmap(lambda one: self.sample(one, model_args, model_kwargs))(state)
+        """The next state of a chain."""
         key, of_turn, of_skies, of_choice = jax.random.split(state.rng_key, 4)
         z, turn = state.z[self.site], state.adapt_state.step_size
         p = jax.random.normal(of_turn, z.shape)
@@ -643,8 +638,8 @@ class _Run:
         self.advance = jax.jit(self._advance)
 
     def _of_chains(self, function: Callable[[Any], HMCState], chains: Any) -> HMCState:
-        """Apply a NumPyro function, which takes one chain or all of them."""
-        return jax.lax.map(function, chains) if self.one_by_one else function(chains)
+        """Apply a function of one chain to all of them."""
+        return jax.lax.map(function, chains) if self.one_by_one else jax.vmap(function)(chains)
 
     def start(self) -> HMCState:
         """The first state of every chain."""

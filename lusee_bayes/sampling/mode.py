@@ -177,8 +177,8 @@ SETTLED = 1e-2
 MAX_STEPS = 100
 # most halvings of a step until it leads downwards
 HALVINGS = 20
-# first scale for differences, in standard deviations of the prior
-FIRST = 1e-3
+# first scale for differences, in standard deviations of the prior, from this number of samples
+FIRST, SCALED = 1e-3, 100
 # samples from the prior that are compared for every further start
 CANDIDATES = 12
 
@@ -250,8 +250,7 @@ def laplace_approximation(
     """
     arguments = dict(arguments)
     trace = _trace(program, arguments, start or {})
-    latent = {name: trace[name] for name in latent_of(trace)}
-    unconstrained = {name: _unconstrained(site) for name, site in latent.items()}
+    unconstrained = {name: _unconstrained(trace[name]) for name in latent_of(trace)}
     sites = tuple((name, value.shape) for name, value in unconstrained.items())
     n = sum(value.size for value in unconstrained.values())
     shapes = Whitening(jnp.zeros(n), jnp.zeros((n, 0)), jnp.zeros(()), sites, chart)
@@ -265,7 +264,7 @@ def laplace_approximation(
             "CorrelatedNormal, whose curvature needs no Hessian"
         )
     free = jnp.ones(n).at[problem.held()].set(0.0)
-    scale = FIRST * _prior_scale(latent)
+    scale = FIRST * _drawn(program, arguments, shapes, SCALED).std(0)
     if starts == 1:
         return _climb(problem, first, free, scale)
     drawn = _drawn(program, arguments, shapes, CANDIDATES * (starts - 1))
@@ -302,16 +301,6 @@ def _trace(program: Callable, arguments: dict, start: Mapping[str, Array]) -> di
 
     model = handlers.seed(program, jax.random.PRNGKey(0))
     return handlers.trace(handlers.substitute(model, substitute_fn=place)).get_trace(**arguments)
-
-
-def _prior_scale(latent: dict) -> Coordinates:
-    """Standard deviations of the priors in the unconstrained coordinates, from draws."""
-    scales = []
-    for name, site in latent.items():
-        draws = site["fn"].sample(jax.random.PRNGKey(len(name)), (100,))
-        x = jax.vmap(dist.biject_to(site["fn"].support).inv)(jnp.asarray(draws, jnp.float64))
-        scales.append(x.std(0).reshape(-1))
-    return jnp.concatenate(scales)
 
 
 @eqx.filter_jit
