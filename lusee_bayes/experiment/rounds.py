@@ -358,7 +358,7 @@ def _conditioned(
 ) -> Inference:
     """Solve one round; ``exact``, the solution at these values, supplies A^T N_0^-1 A for reuse."""
     model, held = model_about(setup, around)
-    if exact is None or exact.solution.kept_information is None:
+    if exact is None or exact.solution.matrix is None:
         solution = model.condition(data.data)
     else:
         solution = FromInformation.beside(exact.solution, model).condition(data.data)

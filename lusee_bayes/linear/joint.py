@@ -317,14 +317,11 @@ class ChannelSky(eqx.Module):
         In K^2; None if the covariance of the component maps was not given.
     draws : (n, modes + shared) array
         In K.
-    chi2 : () array
-        Of the channel's data, at the mean.
     """
 
     mean: Float[Array, " whole"]
     covariance: Float[Array, "whole whole"] | None
     draws: Whole
-    chi2: Float[Array, ""]
 
 
 def channel_sky(
@@ -387,7 +384,7 @@ def channel_sky(
         whole[:, :n] = information.reference[:n] + moved
         if covariance is not None:
             covariance = _with_residual(covariance, information, residual_root, lower)
-    return ChannelSky(whole[0], covariance, whole[1:], information.chi2(whole[0]))
+    return ChannelSky(whole[0], covariance, whole[1:])
 
 
 def _with_residual(

@@ -283,6 +283,11 @@ class Solution(Described):
             return self.kept_information
         return FromInformation.of(self.model).condition(self.data).less(self.excess).information
 
+    @property
+    def matrix(self) -> ModesMatrix | None:
+        """A^T N^-1 A, if it has been computed."""
+        return None if self.kept_information is None else self.kept_information.matrix
+
     @cached_property
     def covariance(self) -> Float[Array, "unknowns unknowns"]:
         """C of the posterior, in K^2."""
@@ -427,13 +432,10 @@ class FromInformation(Form):
         model = on_host(model)
         coupling = model.coupling
         factor = model.noise.factor() if factor is None else factor
-        structured = has_structure(coupling, model.noise)
-        if not structured:
+        if not has_structure(coupling, model.noise):
             coupling = DenseCoupling(coupling.dense())
-        if matrix is None and structured:
+        if matrix is None:
             matrix = normal_matrix(coupling, model.noise, factor)
-        elif matrix is None:
-            matrix = gram_matrix(np.asarray(factor.whiten(coupling.dense())))
         return cls(model, factor, coupling, matrix, precision_root(matrix, model.prior))
 
     @classmethod
@@ -450,7 +452,7 @@ class FromInformation(Form):
         if not isinstance(host.noise, LowRankUpdate):
             return cls.of(model)
         base = old.base if isinstance(old, LowRankFactor) else old
-        factor, matrix = host.noise.factor(base), solution.information.matrix
+        factor, matrix = host.noise.factor(base), solution.matrix
         largest = (np.asarray(solution.posterior.lower) ** 2).sum(1).max()
         for sign, one in ((1.0, old), (-1.0, factor)):
             if isinstance(one, LowRankFactor):

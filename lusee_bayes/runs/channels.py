@@ -38,7 +38,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import h5py
 import jax
@@ -249,20 +249,15 @@ class ChannelsInFiles:
     stages: Stages
     tied: Tied | None = None
 
-    def each(
-        self,
-        function: Callable[[int, Information], dict[str, np.ndarray]],
-        shapes: dict[str, tuple[int, ...]],
-    ) -> dict[str, np.ndarray]:
-        """Call a function with number and information of every channel, and stack its arrays."""
+    def each(self, function: Callable[[int, Information], Any]) -> list[Any]:
+        """Call a function with number and information of every channel."""
         files, channels, tied = self.files, self.channels, self.tied
 
-        def call(number: int) -> dict[str, np.ndarray]:
+        def call(number: int) -> Any:
             return function(number, files.information(channels[number], number, tied))
 
         tasks = Tasks(call, range(len(channels)), [names_of((one,)) for one in channels])
-        parts = self.engine.each(tasks, self.stages, "joint sums")
-        return {name: np.stack([np.asarray(one[name]) for one in parts]) for name in shapes}
+        return self.engine.each(tasks, self.stages, "joint sums")
 
     def summed(
         self,

@@ -33,7 +33,6 @@ from lusee_bayes.systematics.systematic import (
     Truth,
     Unknown,
     multiplied,
-    scalar_or_none,
     with_added,
 )
 
@@ -108,7 +107,7 @@ class GainDrifts(Systematic):
         The data.
     width, widest : int
         Of the covariance's band in samples, for ``drift`` and for the longest correlation time.
-    log_sigma_std, log_correlation_std : () array, optional
+    log_sigma_std, log_correlation_std : float, optional
         Prior standard deviations of the natural logarithms of the two; None if known.
     found : (antennas, times) array, optional
         Drifts about which the term of N is linear. None for a term about no drifts, with its
@@ -133,8 +132,8 @@ class GainDrifts(Systematic):
     # shapes follow from them, so they are structure
     width: int = eqx.field(static=True)
     widest: int = eqx.field(static=True)
-    log_sigma_std: Float[Array, ""] | None = eqx.field(default=None, converter=scalar_or_none)
-    log_correlation_std: Float[Array, ""] | None = eqx.field(default=None, converter=scalar_or_none)
+    log_sigma_std: float | None = eqx.field(default=None, static=True)
+    log_correlation_std: float | None = eqx.field(default=None, static=True)
     found: Gains | None = None
     slope: Gains | None = None
     shift: Grid | None = None
@@ -251,8 +250,7 @@ class GainDrifts(Systematic):
         None for drifts so strong that their mean could be -1, which the coordinates exclude.
         """
         sigma = float(self.drift.sigma)
-        log_std = 0.0 if self.log_sigma_std is None else float(self.log_sigma_std)
-        if sigma * np.exp(3.0 * log_std) > STRONGEST:
+        if sigma * np.exp(3.0 * (self.log_sigma_std or 0.0)) > STRONGEST:
             return None
         noise = self.layout.scatter(model.noise.diagonal())
         return GainCoordinates(self, noise.sum() / (self.visibilities**2).sum())
