@@ -52,7 +52,7 @@ MAX_ROUNDS, HALVINGS = 60, 20
 # arrays by name
 Arrays = dict[str, np.ndarray]
 # called with the number of every round, and how far it moved
-Report = Callable[[int, str], None] | None
+Report = Callable[[int, str], None]
 # functions of a channel's number and information
 OfChannel = Callable[[int, Information], Any]
 Linearised = Callable[[int, Information], Information]
@@ -199,10 +199,10 @@ def find_joint_mode(
     skies: PositiveSkies,
     laws: FieldLaws,
     channels: Channels,
-    shared: Vector | None = None,
+    shared: Vector | tuple[()] = (),
     *,
     learn: bool = False,
-    report: Report = None,
+    report: Report = lambda rounds, moved: None,
 ) -> PositiveMode:
     """Find the most probable skies, starting from the templates.
 
@@ -225,7 +225,6 @@ def find_joint_mode(
     InputError
         If the rounds do not converge, or the data are too precise to solve for.
     """
-    shared = np.zeros(0) if shared is None else shared
     start = np.concatenate([np.zeros(len(skies.names) * skies.n_fields), shared])
     exponents = np.tile(np.append(np.zeros(skies.n_fields), shared), (len(skies.levels), 1))
     point = _Point(start, exponents, _chi2(skies, channels, exponents))
@@ -235,8 +234,7 @@ def find_joint_mode(
         posterior, mean, arrays = _linear_round(skies, channels, prior, point.exponents, learn)
         energy = point.energy(prior)
         moved = np.sqrt(max(energy - mean.energy(prior), 0.0))
-        if report is not None:
-            report(rounds, f"{moved:.2g} sigma")
+        report(rounds, f"{moved:.2g} sigma")
         change = np.zeros_like(laws.parameters)
         if learn:
             change = laws.matched(*_powers(posterior, prior, arrays)).parameters - laws.parameters
@@ -395,7 +393,7 @@ COARSE_LMAX = 16
 
 
 def learn_laws(
-    skies: PositiveSkies, channels: Channels, *, lmax_fields: int, report: Report = None
+    skies: PositiveSkies, channels: Channels, *, lmax_fields: int, report: Report
 ) -> FieldLaws:
     """Learn C_ell of all fields and residuals by maximising the evidence.
 
@@ -406,7 +404,7 @@ def learn_laws(
         Their data.
     lmax_fields : int
         Highest ell of the exponents while laws are learned, at least that of the coarse maps.
-    report : callable, optional
+    report : callable
         Called with the number of every round, and how far it moved.
 
     Raises

@@ -194,7 +194,7 @@ class GainDrift(eqx.Module):
 
     def sample(self, key: PRNGKeyArray, hours: Hours, n_antennas: int = 4) -> Gains:
         """Draw g_i(t), (antennas, times), with exactly this covariance."""
-        grid = white_grid(hours, float(self.correlation_h))
+        grid = white_grid(hours, *[float(self.correlation_h)] * 2)
         white = jax.random.normal(key, (n_antennas, len(grid)), dtype=jnp.float64)
         return self.history(white, hours, grid)
 
@@ -228,7 +228,7 @@ class GainDrift(eqx.Module):
 def white_grid(
     hours: Hours,
     shortest_h: float,
-    longest_h: float | None = None,
+    longest_h: float,
     *,
     per_correlation: float = 4.0,
     margin: float = REACH,
@@ -240,7 +240,7 @@ def white_grid(
     hours : (times,) array
         Times of the samples.
     shortest_h, longest_h : float
-        Range of correlation times in hours that the grid serves; by default a single one.
+        Range of correlation times in hours that the grid serves.
     per_correlation : float
         Number of grid times in the shortest correlation time.
     margin : float
@@ -251,7 +251,6 @@ def white_grid(
     (grid,) array
         In hours.
     """
-    longest_h = shortest_h if longest_h is None else longest_h
     hours = np.asarray(hours)
     first, end = hours.min() - margin * longest_h, hours.max() + margin * longest_h
     return np.arange(first, end, shortest_h / per_correlation)

@@ -314,6 +314,7 @@ def solve_components(
     """
     spectral, stages, frequencies = scenario.spectral, channels.stages, scenario.frequencies_mhz
     tied, mode = channels.tied, None
+    white = np.zeros(0) if tied is None else tied.white
     if spectral.model == "positive":
         with stages("templates"):
             skies = spectral.positive_skies(frequencies, scenario.lmax)
@@ -323,12 +324,10 @@ def solve_components(
             alone = replace(silent, tied=None)
             laws = positive_joint.learn_laws(skies, alone, lmax_fields=coarse, report=report)
         with stages.progress("positive skies", positive_joint.MAX_ROUNDS) as report:
-            start = None if tied is None else tied.white
-            mode = positive_joint.find_joint_mode(skies, laws, silent, start, report=report)
+            mode = positive_joint.find_joint_mode(skies, laws, silent, white, report=report)
         prior, posterior, chi2, moved = mode.prior, mode.posterior, mode.energy, mode.moved
     else:
         prior = spectral.prior(np.array(frequencies), np.array([one.sky for one in seen]))
-        white = np.zeros(0) if tied is None else tied.white
         reference = np.array([np.concatenate([one.reference, white]) for one in seen])
         information = channels.summed(prior, reference, lambda _, information: information)
     with stages("joint posterior"):

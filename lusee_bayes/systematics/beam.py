@@ -209,9 +209,7 @@ class InstrumentParameters(ChangedBeams, BeamErrors):
         """Emission of ground and antennas beyond the background, in K."""
         source, frequency_mhz = self.instrument.source, self.instrument.frequency_mhz
         more = source.with_values(values).background(frequency_mhz)
-        more, layout = more - source.background(frequency_mhz), self.instrument.layout
-        each_time = np.ones((1, layout.n_times))
-        return layout.gather(more[:, None] * each_time)
+        return (more - source.background(frequency_mhz))[self.instrument.layout.product]
 
 
 def beam_rms_difference(setup: Setup) -> float | None:

@@ -277,9 +277,8 @@ class GainDrifts(Systematic):
         """
         drift = drift or self.drift
         if self.found is None:
-            mean = drift.mean_response(self.layout.n_products)[:, None]
-            grid = jnp.broadcast_to(mean, (self.layout.n_products, self.layout.n_times))
-            return multiplied(model, self.layout.gather(grid))
+            mean = drift.mean_response(self.layout.n_products)
+            return multiplied(model, mean[self.layout.product])
         found = multiplied(model, self.response(self.found))
         return with_added(found, self.layout.gather(self.shift))
 
