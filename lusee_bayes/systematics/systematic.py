@@ -359,12 +359,9 @@ class Systematic(eqx.Module):
 
     def values(self, z: Float[Array, " n"]) -> dict[str, float | Float[Array, "..."]]:
         """Values by site, from numbers in prior standard deviations from the prior mean."""
-        by_site, first = {}, 0
-        for u in self.unknowns:
-            numbers = z[first] if u.size is None else z[first : first + u.size]
-            by_site[u.name] = u.at(numbers)
-            first += u.size or 1
-        return by_site
+        ends = np.cumsum([u.size or 1 for u in self.unknowns], dtype=int)
+        parts = zip(self.unknowns, namespace(z).split(z, ends[:-1]), strict=False)
+        return {u.name: u.at(part[0] if u.size is None else part) for u, part in parts}
 
     def stacked(self, values: Values) -> Float[Array, " n"]:
         """Values by site as one array."""

@@ -77,12 +77,9 @@ def steep(tilt):
 SETUP = object.__new__(Setup)
 
 
-def spectrum(**options):
-    return PriorSpectrum.build(SpectrumSection(**options), SETUP, Around())
-
-
-def bands(*edges):
-    return spectrum(band_edges=edges, log_band_std=0.8)
+def spectrum(*edges, **options):
+    section = SpectrumSection(band_edges=edges, log_band_std=0.8, **options)
+    return PriorSpectrum.build(section, SETUP, Around())
 
 
 LEVEL = NoiseLevel.build(RadiometerSection(log_factor_std=0.7), SETUP, Around())
@@ -94,8 +91,8 @@ FACTORS = [
     (spectrum(tilt_std=0.6), {"tilt": -1.0}, [0.6], steep(-1.0)),
     (BOTH, {"amplitude": 0.3, "tilt": 1.4}, [0.4, 0.6], 0.3 * steep(1.4)),
     # an edge is the first ell of its band; the lowest begins at 0, the highest ends it
-    (bands(2), {"band_power": [0.5, 3.0]}, [0.8], [0.5, 0.5, 3.0, 3.0, 3.0]),
-    (bands(1, 2, 4), {"band_power": [4.0, 0.3, 1.5, 0.7]}, [0.8], [4.0, 0.3, 1.5, 1.5, 0.7]),
+    (spectrum(2), {"band_power": [0.5, 3.0]}, [0.8], [0.5, 0.5, 3.0, 3.0, 3.0]),
+    (spectrum(1, 2, 4), {"band_power": [4.0, 0.3, 1.5, 0.7]}, [0.8], [4.0, 0.3, 1.5, 1.5, 0.7]),
 ]
 
 
@@ -138,14 +135,14 @@ def test_several_at_once(case):
     hidden = systematic.Marginalised(hidden)
     # the order of those that do not touch the noise is all the same
     for order in (
-        [LEVEL, bands(3), source, hidden],
-        [source, LEVEL, hidden, bands(3)],
+        [LEVEL, spectrum(3), source, hidden],
+        [source, LEVEL, hidden, spectrum(3)],
     ):
         expected = case.evidence(factors, level, term, mean) + priors
         assert general(case, order, values) == pytest.approx(expected, rel=CLOSE)
     # a level behind the marginalised source scales that, too
     expected = case.evidence(factors, level, level * term, mean) + priors
-    got = general(case, [bands(3), hidden, LEVEL, source], values)
+    got = general(case, [spectrum(3), hidden, LEVEL, source], values)
     assert got == pytest.approx(expected, rel=CLOSE)
 
 
