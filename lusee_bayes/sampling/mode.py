@@ -177,9 +177,9 @@ SETTLED = 1e-2
 MAX_STEPS = 100
 # most halvings of a step until it leads downwards
 HALVINGS = 20
-# first scale for differences, in standard deviations of the prior, from this number of samples
-FIRST, SCALED = 1e-3, 100
-# samples from the prior that are compared for every further start
+# first scale for differences, in standard deviations of the prior
+FIRST = 1e-3
+# samples from the prior for every start: they give its widths, and are compared for further starts
 CANDIDATES = 12
 
 
@@ -264,10 +264,10 @@ def laplace_approximation(
             "CorrelatedNormal, whose curvature needs no Hessian"
         )
     free = jnp.ones(n).at[problem.held()].set(0.0)
-    scale = FIRST * _drawn(program, arguments, shapes, SCALED).std(0)
+    drawn = _drawn(program, arguments, shapes, CANDIDATES * starts)
+    scale = FIRST * drawn.std(0)
     if starts == 1:
         return _climb(problem, first, free, scale)
-    drawn = _drawn(program, arguments, shapes, CANDIDATES * (starts - 1))
     heights = jax.lax.map(problem.value, drawn)
     best = jnp.argsort(jnp.where(jnp.isnan(heights), jnp.inf, heights))[: starts - 1]
     places = jnp.concatenate([first[None], drawn[best]])
