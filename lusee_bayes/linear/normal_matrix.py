@@ -291,9 +291,8 @@ def _streamed(
     white = np.zeros((window, n_modes))
     for block in range(n_blocks):
         times = slice(block * steps, (block + 1) * steps)
-        beams = np.einsum(
-            "tj,tkjc->ktc", pointing.functions[times], coupling.body_beams[run_of[times]]
-        )
+        body = coupling.body_beams[run_of[times]]
+        beams = np.einsum("tj,tkjc->ktc", pointing.functions[times], body)
         a = turned_about_pole(beams, pointing.azimuth[times]).swapaxes(0, 1)
         a = (a * present[times][:, :, None]).reshape(-1, n_modes)
         a = np.pad(a, ((0, rows - len(a)), (0, 0)))

@@ -168,9 +168,8 @@ class GainDrift(eqx.Module):
         lag = jnp.asarray(hours)[:, None] - jnp.asarray(hours)[np.maximum(earlier, 0)]
         kernel = jnp.where(jnp.asarray(earlier >= 0), self.kernel(lag), 0.0)
         n = round(np.sqrt(layout.n_products))
-        slopes = slopes_by_gains(
-            visibilities, np.zeros((n, layout.n_times)) if gains is None else gains
-        )
+        about = np.zeros((n, layout.n_times)) if gains is None else gains
+        slopes = slopes_by_gains(visibilities, about)
         i, j, _ = ports(n)
         # number of ways in which two products share two antennas
         ii, ij, ji, jj = (np.equal.outer(a, b).astype(np.float64) for a in (i, j) for b in (i, j))

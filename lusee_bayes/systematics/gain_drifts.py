@@ -169,9 +169,8 @@ class GainDrifts(Systematic):
         ends = middle / factor, middle * factor
         grid = white_grid(hours, *ends, per_correlation=PER_CORRELATION, margin=MARGIN)
         widths, stds = (drift.width(hours), longest.width(hours)), (log_sigma_std, log_std)
-        return cls(
-            drift, visibilities, jnp.asarray(hours), jnp.asarray(grid), layout, *widths, *stds
-        )
+        times = jnp.asarray(hours), jnp.asarray(grid)
+        return cls(drift, visibilities, *times, layout, *widths, *stds)
 
     @classmethod
     def build(cls, section: GainSection, setup: Setup, around: Around) -> GainDrifts:

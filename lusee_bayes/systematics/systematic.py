@@ -511,9 +511,8 @@ class Systematic(eqx.Module):
         LinearGaussian
             The model given the values of its sites.
         """
-        return self.effect(
-            model, {u.name: numpyro.sample(u.name, u.prior()) for u in self.unknowns}
-        )
+        values = {u.name: numpyro.sample(u.name, u.prior()) for u in self.unknowns}
+        return self.effect(model, values)
 
 
 class Marginalised(eqx.Module):

@@ -73,16 +73,13 @@ def steep(tilt):
     return ((ELLS + 1) / 10) ** tilt
 
 
-# neither the spectrum nor the level depends on it
-SETUP = object.__new__(Setup)
-
-
+# neither the spectrum nor the level depends on the setup
 def spectrum(*edges, **options):
     section = SpectrumSection(band_edges=edges, log_band_std=0.8, **options)
-    return PriorSpectrum.build(section, SETUP, Around())
+    return PriorSpectrum.build(section, object.__new__(Setup), Around())
 
 
-LEVEL = NoiseLevel.build(RadiometerSection(log_factor_std=0.7), SETUP, Around())
+LEVEL = NoiseLevel.build(RadiometerSection(log_factor_std=0.7), object.__new__(Setup), Around())
 BOTH = spectrum(log_amplitude_std=0.4, tilt_std=0.6)
 FACTORS = [
     (LEVEL, {"noise_level": 0.2}, [0.7], 1.0),

@@ -25,7 +25,7 @@ from lusee_bayes.experiment.experiment import Experiment
 from lusee_bayes.experiment.unknowns import flux_table
 from lusee_bayes.sampling.programs import latent_sites
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
-from lusee_bayes.systematics.context import Around, Setup
+from lusee_bayes.systematics.context import Setup
 from lusee_bayes.systematics.prior_spectrum import PriorSpectrum
 from lusee_bayes.systematics.systematic import Unknown
 from lusee_bayes.testing import small_scenario
@@ -253,8 +253,7 @@ def test_bands_beyond_the_highest_ell():
     # 6 is the highest ell itself
     base = replace(models.base_model(e.setup), prior=lb.HarmonicPrior(jnp.ones(7)))
     with handlers.seed(rng_seed=0):
-        within = e.scenario.prior.model_copy(update={"band_edges": (3, 6)})
-        PriorSpectrum.build(within, e.setup, Around()).sampled(base)
+        PriorSpectrum((Unknown("band_power", size=3),), (3, 6)).sampled(base)
 
 
 # --- programs that do not fit the scenario --------------------------------------------------------
