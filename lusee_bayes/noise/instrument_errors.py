@@ -76,7 +76,6 @@ def template_noise(
         For templates of the wrong length, and for a P that is not positive definite.
     """
     checks.require_array("the templates", templates, (layout.size, None))
-    checks.require_float64("the templates' prior", prior)
     if prior.ndim == 1:
         checks.require_positive("the templates' prior variance", prior)
         prior = jnp.diag(prior)

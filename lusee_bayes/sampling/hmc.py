@@ -224,6 +224,7 @@ def _given(value: Float[Array, "..."], log_det: float | Float[Array, ""]) -> Cal
 IDENTITY_LAYOUT = Layout("the description of an unfinished run (else delete its folder)")
 IDENTITY = "run.json"
 CHUNK_GLOB = "chunk-*.npz"
+CHECKPOINT = "a checkpoint (else delete it to continue from the one before)"
 
 
 @dataclass(frozen=True)
@@ -248,13 +249,10 @@ class Chunk:
     def read(cls, path: Path) -> Chunk:
         """Read a chunk's file. InputError if it cannot be read."""
         kinds: dict[str, dict[str, np.ndarray]] = {"state": {}, "draws": {}}
-        try:
-            with reading(path, "a checkpoint"), path.open("rb") as file, np.load(file) as arrays:
-                for key in sorted(arrays.files):
-                    kind, name = key.split(":", 1)
-                    kinds[kind][name] = arrays[key]
-        except InputError as error:
-            raise InputError(f"{error}; delete it to continue from the one before") from error
+        with reading(path, CHECKPOINT), path.open("rb") as file, np.load(file) as arrays:
+            for key in sorted(arrays.files):
+                kind, name = key.split(":", 1)
+                kinds[kind][name] = arrays[key]
         return cls(_iteration(path), list(kinds["state"].values()), kinds["draws"])
 
 
