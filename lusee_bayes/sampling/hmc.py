@@ -141,12 +141,6 @@ class Whitening(eqx.Module):
         """Names of the sites."""
         return tuple(name for name, _ in self.sites)
 
-    def split(self, x: Float[Array, " unknowns"]) -> dict[str, Float[Array, "..."]]:
-        """Split x by site, and restore shapes."""
-        ends = np.cumsum([math.prod(shape) for _, shape in self.sites])
-        parts = zip(self.sites, jnp.split(x, ends[:-1]), strict=True)
-        return {name: part.reshape(shape) for (name, shape), part in parts}
-
     def to_values(
         self, x: Float[Array, " unknowns"], hold: Sequence[str] = ()
     ) -> tuple[dict[str, Float[Array, "..."]], Float[Array, ""]]:
@@ -154,7 +148,9 @@ class Whitening(eqx.Module):
 
         The sites ``hold`` have no derivatives.
         """
-        values = self.split(x)
+        ends = np.cumsum([math.prod(shape) for _, shape in self.sites])
+        parts = zip(self.sites, jnp.split(x, ends[:-1]), strict=True)
+        values = {name: part.reshape(shape) for (name, shape), part in parts}
         values |= {n: jax.lax.stop_gradient(values[n]) for n in hold if n in values}
         return (values, jnp.zeros(())) if self.chart is None else self.chart.to_values(values)
 
