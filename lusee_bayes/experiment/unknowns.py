@@ -572,8 +572,8 @@ def flux_table(experiment: Experiment, inference: Inference) -> pd.DataFrame:
     held = next(s for s in inference.expanded if isinstance(s.systematic, PointSources))
     fluxes = _alone(experiment, inference, held)
     jansky = 1.0 / kelvin_steradian(1.0, experiment.scenario.frequency_mhz)
-    own = zip(experiment.scenario.sources.list, held.systematic.n_blocks, strict=True)
-    blocks = [(source.name, block) for source, n in own for block in range(n)]
+    own = zip(experiment.scenario.sources.list, held.systematic.unknowns, strict=True)
+    blocks = [(source.name, block) for source, flux in own for block in range(flux.size or 1)]
     table = pd.DataFrame(blocks, columns=["source", "block"])
     table["above_horizon"] = np.asarray(held.systematic.columns).any(0)
     in_jy = (fluxes.filter(["prior", "prior_std", "true"]) * jansky).add_suffix("_jy")

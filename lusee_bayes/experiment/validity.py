@@ -185,7 +185,7 @@ def errors_of(setup: Setup, *, pointing: bool) -> Iterator[tuple[Systematic, Siz
     values = {name: float(p.value) for name, p in source.parameters().items() if float(p.value)}
     priors = tuple(Unknown(name, value, PARAMETERS * abs(value)) for name, value in values.items())
     sizes = dict.fromkeys(values, 100.0 * PARAMETERS)
-    yield InstrumentParameters(setup.instrument, priors), sizes, " %"
+    yield InstrumentParameters(priors, setup.instrument), sizes, " %"
     if not pointing:
         return
     runs = setup.observation.n_runs

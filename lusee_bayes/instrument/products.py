@@ -287,12 +287,12 @@ class DataLayout(Described, eqx.Module):
         return self.n_products * self.n_times if self.index is None else self.index.shape[0]
 
     @property
-    def product(self) -> np.ndarray:
+    def product(self) -> Int[Array, " data"]:
         """Product number of every entry, shape (data,)."""
         return self._positions() // self.n_times
 
     @property
-    def time(self) -> np.ndarray:
+    def time(self) -> Int[Array, " data"]:
         """Time number of every entry, shape (data,)."""
         return self._positions() % self.n_times
 
@@ -301,8 +301,8 @@ class DataLayout(Described, eqx.Module):
         """Whether each sample of the grid is in d."""
         return self.scatter(namespace(self.index).ones(self.size, dtype=bool))
 
-    def _positions(self) -> np.ndarray:
-        return np.arange(self.size) if self.index is None else np.asarray(self.index)
+    def _positions(self) -> Int[Array, " data"]:
+        return np.arange(self.size) if self.index is None else self.index
 
     def require_same(self, other: DataLayout) -> None:
         """Check that another layout has the same samples, if both are known.

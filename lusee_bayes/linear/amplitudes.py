@@ -335,10 +335,8 @@ class Patterns(eqx.Module):
         z : (skies, patterns) array
             Draws of independent unit normals; zero for the mean.
         """
-        shifted = diffuse + self.expected
-        pull = self.information.vector - (shifted - self.information.reference) @ (
-            self.information.matrix
-        )
+        shifted, whole = diffuse + self.expected, self.information
+        pull = whole.vector - (shifted - whole.reference) @ whole.matrix
         half = solve_lower(self.lower, self.patterns @ pull.T, transpose=False) + z.T
         return shifted + solve_lower(self.lower, half, transpose=True).T @ self.patterns
 

@@ -134,8 +134,6 @@ class Information(Described, eqx.Module):
         factor : float
             Of N, positive.
         """
-        if factor == 1.0:
-            return self
         return replace(
             self,
             matrix=self.matrix / factor,

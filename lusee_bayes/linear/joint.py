@@ -177,12 +177,8 @@ class ComponentSums(eqx.Module):
 
     def plus(self, others: ComponentSums) -> ComponentSums:
         """Add the sums of other channels, about the same reference; neither is changed."""
-        blocks = tuple(a + b for a, b in zip(self.blocks, others.blocks, strict=True))
-        return replace(self._plus(others, "vector", "misfit", "log_det", "n_data"), blocks=blocks)
-
-    def _plus(self, others: ComponentSums | Information, *names: str) -> ComponentSums:
-        both = {name: np.asarray(getattr(self, name) + getattr(others, name)) for name in names}
-        return replace(self, **both)
+        total = jax.tree.map(lambda a, b: np.asarray(a + b), self, others)
+        return replace(total, reference=self.reference)
 
     def information(self) -> Information:
         """Information about all component maps in one vector, then about the shared unknowns."""
@@ -230,7 +226,9 @@ def summed_information(
             total[lower] += weight * block[lower]
     maps = weights[:k, None] * common.vector[:n]
     vector = sums.vector + np.concatenate([maps.reshape(-1), common.vector[n:]])
-    return replace(sums, vector=vector)._plus(common, "misfit", "log_det", "n_data")
+    names = ("misfit", "log_det", "n_data")
+    scalars = {name: np.asarray(getattr(sums, name) + getattr(common, name)) for name in names}
+    return replace(sums, vector=vector, **scalars)
 
 
 def component_posterior(information: Information, prior: SpectralPrior) -> Posterior:
@@ -317,14 +315,11 @@ class ChannelSky(eqx.Module):
         In K^2; None if the covariance of the component maps was not given.
     draws : (n, modes + shared) array
         In K.
-    chi2 : () array
-        Of the channel's data, at the mean.
     """
 
     mean: Float[Array, " whole"]
     covariance: Float[Array, "whole whole"] | None
     draws: Whole
-    chi2: Float[Array, ""]
 
 
 def channel_sky(
@@ -387,7 +382,7 @@ def channel_sky(
         whole[:, :n] = information.reference[:n] + moved
         if covariance is not None:
             covariance = _with_residual(covariance, information, residual_root, lower)
-    return ChannelSky(whole[0], covariance, whole[1:], information.chi2(whole[0]))
+    return ChannelSky(whole[0], covariance, whole[1:])
 
 
 def _with_residual(

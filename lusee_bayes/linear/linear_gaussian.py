@@ -258,10 +258,10 @@ class Solution(Described):
         d, in K.
     posterior : Posterior
         Over the sky, with the evidence of the data.
+    factor : Factor
+        L of N = L L^T.
     kept_information : Information or None
         :attr:`information`, if the posterior was computed from it.
-    of_noise : Factor or None
-        :attr:`factor`, if it was computed.
     excess : float
         Excess of chi^2 if prior means of unknowns in N are shifted, to make up for volume.
     """
@@ -269,17 +269,12 @@ class Solution(Described):
     model: LinearGaussian
     data: DataVector
     posterior: Posterior
+    factor: Factor
     kept_information: Information | None = None
-    of_noise: Factor | None = None
     excess: float = 0.0
 
     def description(self) -> tuple[str, ...]:
         return (*self.posterior.description(), "posterior, information, covariance, under(prior)")
-
-    @cached_property
-    def factor(self) -> Factor:
-        """L of N = L L^T."""
-        return self.model.noise.factor() if self.of_noise is None else self.of_noise
 
     @cached_property
     def information(self) -> Information:
@@ -338,8 +333,7 @@ class Solution(Described):
         model = replace(self.model, prior=prior)
         if form_of(model) is not FromInformation:
             return model.condition(self.data)
-        matrices = self.information.matrix, self.of_noise
-        return FromInformation.of(model, *matrices).condition(self.data)
+        return FromInformation.of(model, self.information.matrix, self.factor).condition(self.data)
 
 
 def form_of(model: LinearGaussian, *, transformed: bool = False) -> type[Form]:
@@ -438,13 +432,10 @@ class FromInformation(Form):
         model = on_host(model)
         coupling = model.coupling
         factor = model.noise.factor() if factor is None else factor
-        structured = has_structure(coupling, model.noise)
-        if not structured:
+        if not has_structure(coupling, model.noise):
             coupling = DenseCoupling(coupling.dense())
-        if matrix is None and structured:
+        if matrix is None:
             matrix = normal_matrix(coupling, model.noise, factor)
-        elif matrix is None:
-            matrix = gram_matrix(np.asarray(factor.whiten(coupling.dense())))
         return cls(model, factor, coupling, matrix, precision_root(matrix, model.prior))
 
     @classmethod
@@ -483,7 +474,7 @@ class FromInformation(Form):
         u, _, _ = self._about(data, np.zeros(prior.size)).white_mean(prior, self.lower, most=1)
         information = self._about(data, prior.colour(u))
         posterior = information.posterior(prior, self.lower)
-        return Solution(self.model, data, posterior, information, self.factor)
+        return Solution(self.model, data, posterior, self.factor, information)
 
     def _about(self, data: DataVector, sky: Modes) -> Information:
         """Information of the data, about a reference sky."""
@@ -504,12 +495,15 @@ class Whitened(Form):
         W; in map space L^-1 A.
     lower : (rank, rank) array
         Cholesky factor of Lambda, or of Lambda_v if ``basis`` is given.
+    log_det : () array
+        ln|Lambda|.
     basis : (white, rank) array or None
         Q of the data-space form; None in map space.
     """
 
     whitened: Float[Array, "data white"]
     lower: Float[Array, "rank rank"]
+    log_det: Float[Array, ""]
     basis: Float[Array, "white rank"] | None
 
     @classmethod
@@ -525,12 +519,8 @@ class Whitened(Form):
 
     @staticmethod
     @abstractmethod
-    def _factorised(model: LinearGaussian) -> tuple[Factor, Array, Array, Array | None]:
-        """L of N, W, L of Lambda, and the basis."""
-
-    def _log_det(self) -> Float[Array, ""]:
-        """ln|Lambda|."""
-        return 2.0 * jnp.log(jnp.diagonal(self.lower)).sum()
+    def _factorised(model: LinearGaussian) -> tuple[Factor, Array, Array, Array, Array | None]:
+        """L of N, W, L of Lambda, ln|Lambda|, and the basis."""
 
     def seen(self, u: Float[Array, " white"]) -> DataVector:
         """Compute W u."""
@@ -552,7 +542,7 @@ class Whitened(Form):
             )
         prior = self.model.prior
         posterior = Posterior(prior, u, self.lower, self.basis, log_evidence, moved)
-        parts = self.model, data, posterior
+        parts = self.model, data, posterior, self.factor
         # if the evidence is differentiated outside of jit, the last step alone is not traced
         traced = is_traced(*jax.tree.leaves(parts))
         return Solution(*(parts if traced else on_host(parts)))
@@ -566,7 +556,7 @@ class InMap(Whitened):
     def _factorised(model):
         factor = model.noise.factor()
         whitened = factor.whiten(model.coupling.dense())
-        return factor, whitened, _root(model.prior.sandwich(gram_matrix(whitened))), None
+        return factor, whitened, *_root(model.prior.sandwich(gram_matrix(whitened))), None
 
     def seen(self, u):
         return self.whitened @ self.model.prior.colour(u)
@@ -584,29 +574,15 @@ class InData(Whitened):
         factor = model.noise.factor()
         whitened = factor.whiten(model.prior.colour_columns(model.coupling.dense()))
         basis, triangle = jnp.linalg.qr(jax.lax.stop_gradient(whitened).T)
-        return factor, whitened, _root(triangle @ triangle.T), basis
-
-    def _log_det(self):
-        return _log_det_in_span(self.whitened, jax.lax.stop_gradient(self.lower))
-
-
-def _root(normal: Array) -> Array:
-    return jax.lax.linalg.cholesky(normal + jnp.eye(len(normal)), symmetrize_input=False)
+        # |1 + W W^T|, since QR has no derivative at low rank
+        _, log_det = _root(gram_matrix(whitened.T))
+        return factor, whitened, _root(triangle @ triangle.T)[0], log_det, basis
 
 
-@jax.custom_jvp
-def _log_det_in_span(whitened: Array, lower: Array) -> Array:
-    """ln|1 + W W^T| from the data-space form, whose QR has no derivative at low rank."""
-    return 2.0 * jnp.log(jnp.diagonal(lower)).sum()
-
-
-@_log_det_in_span.defjvp
-def _log_det_in_span_jvp(primals, tangents):
-    """d ln|1 + W W^T| = 2 sum( (1 + W W^T)^-1 W * dW )."""
-    whitened, lower = primals
-    gram_of_data = jnp.eye(whitened.shape[0]) + whitened @ whitened.T
-    slope = jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(gram_of_data), True), whitened)
-    return _log_det_in_span(whitened, lower), 2.0 * (slope * tangents[0]).sum()
+def _root(normal: Array) -> tuple[Array, Array]:
+    """L of 1 + M = L L^T, and ln|1 + M|."""
+    lower = jax.lax.linalg.cholesky(normal + jnp.eye(len(normal)), symmetrize_input=False)
+    return lower, 2.0 * jnp.log(jnp.diagonal(lower)).sum()
 
 
 def _newton(solver: Whitened, white: Array, u: Array) -> tuple[Array, Array]:
@@ -651,7 +627,7 @@ def _solve(solver: Whitened, data: DataVector) -> tuple[Array, Array, Array]:
         misfit @ misfit
         + u @ u
         + solver.factor.log_det()
-        + solver._log_det()
+        + solver.log_det
         + white.shape[0] * np.log(2.0 * np.pi)
     )
     # so far, u was the sky's deviation from the prior's mean

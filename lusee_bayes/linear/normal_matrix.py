@@ -27,7 +27,6 @@ from jaxtyping import Complex, Float, Int
 
 from lusee_bayes.core.arrays import ModesMatrix, on_host
 from lusee_bayes.core.checks import require_shape
-from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.harmonics import Rotation, mode_numbers, modes_by_size_of_order
 from lusee_bayes.core.linalg import gram_matrix, mirrored, solve_lower
 from lusee_bayes.instrument.coupling import Coupling, CouplingMatrix, turned_about_pole
@@ -142,7 +141,7 @@ def _rows_of_order(m: int, beams: Beams, f: Sums) -> Blocks:
 def normal_matrix(
     coupling: Coupling, noise: covariance.Covariance, factor: covariance.Factor | None = None
 ) -> ModesMatrix:
-    """Compute A^T N^-1 A without forming A.
+    """Compute A^T N^-1 A, without forming A if it and N have structure in time.
 
     Exact for the coupling's functions of time. JAX arrays are copied to the host, so that it cannot
     be called inside JAX's transformations. For diagonal noise and blocks in time the cost is nearly
@@ -152,9 +151,9 @@ def normal_matrix(
     Parameters
     ----------
     coupling : Coupling
-        A, with structure in time.
+        A.
     noise : Covariance
-        N, in K^2, of one of the kinds in ``NORMAL_MATRICES``.
+        N, in K^2.
     factor : Factor, optional
         Of N, if it has been computed.
 
@@ -166,21 +165,16 @@ def normal_matrix(
     Raises
     ------
     InputError
-        If A or N has no structure in time (:func:`has_structure`), their sizes differ, or N is not
-        positive definite.
+        If their sizes differ, or N is not positive definite.
     """
     require_shape("N", np.empty((noise.size, 0)), (coupling.shape[0], None))
-    if not has_structure(coupling, noise):
-        raise InputError(
-            f"{type(noise).__name__} has no structure in time to compute A^T N^-1 A with, or the "
-            "coupling has a separate response; use the dense form"
-        )
     factor = noise.factor() if factor is None else factor
-    return NORMAL_MATRICES[type(noise)](*on_host((coupling, noise, factor)))
+    kind = NORMAL_MATRICES[type(noise)] if has_structure(coupling, noise) else _dense
+    return kind(*on_host((coupling, noise, factor)))
 
 
 def has_structure(coupling: Coupling, noise: covariance.Covariance) -> bool:
-    """Check whether :func:`normal_matrix` can be used.
+    """Check whether :func:`normal_matrix` does not form A.
 
     Parameters
     ----------
@@ -215,6 +209,10 @@ def is_within_times(noise: covariance.Covariance) -> bool:
 
 def _base(noise: covariance.Covariance) -> covariance.Covariance:
     return noise.base if isinstance(noise, covariance.LowRankUpdate) else noise
+
+
+def _dense(coupling: Coupling, _: covariance.Covariance, factor: covariance.Factor) -> ModesMatrix:
+    return gram_matrix(np.asarray(factor.whiten(coupling.dense())))
 
 
 def _within_times(coupling: CouplingMatrix, noise: covariance.Covariance, _) -> ModesMatrix:
@@ -293,9 +291,8 @@ def _streamed(
     white = np.zeros((window, n_modes))
     for block in range(n_blocks):
         times = slice(block * steps, (block + 1) * steps)
-        beams = np.einsum(
-            "tj,tkjc->ktc", pointing.functions[times], coupling.body_beams[run_of[times]]
-        )
+        body = coupling.body_beams[run_of[times]]
+        beams = np.einsum("tj,tkjc->ktc", pointing.functions[times], body)
         a = turned_about_pole(beams, pointing.azimuth[times]).swapaxes(0, 1)
         a = (a * present[times][:, :, None]).reshape(-1, n_modes)
         a = np.pad(a, ((0, rows - len(a)), (0, 0)))

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -49,12 +49,12 @@ SETTLED, SETTLED_LAW = 0.1, 0.05
 MAX_ROUNDS, HALVINGS = 60, 20
 
 
-# arrays by name, and their shapes
-Arrays, Shapes = dict[str, np.ndarray], dict[str, tuple[int, ...]]
+# arrays by name
+Arrays = dict[str, np.ndarray]
 # called with the number of every round, and how far it moved
-Report = Callable[[int, str], None] | None
+Report = Callable[[int, str], None]
 # functions of a channel's number and information
-OfChannel = Callable[[int, Information], Arrays]
+OfChannel = Callable[[int, Information], Any]
 Linearised = Callable[[int, Information], Information]
 
 
@@ -62,8 +62,8 @@ Linearised = Callable[[int, Information], Information]
 class Channels(Protocol):
     """The channels of a joint posterior, wherever their data are."""
 
-    def each(self, function: OfChannel, shapes: Shapes) -> Arrays:
-        """Call a function with number and information of every channel, and stack its arrays."""
+    def each(self, function: OfChannel) -> list[Any]:
+        """Call a function with number and information of every channel."""
 
     def summed(
         self, prior: SpectralPrior, reference: Exponents, function: Linearised
@@ -83,10 +83,9 @@ class ChannelsInMemory:
 
     informations: tuple[Information, ...]
 
-    def each(self, function: OfChannel, shapes: Shapes) -> Arrays:
-        """Call a function with number and information of every channel, and stack its arrays."""
-        parts = [function(k, information) for k, information in enumerate(self.informations)]
-        return {name: np.stack([part[name] for part in parts]) for name in shapes}
+    def each(self, function: OfChannel) -> list[Any]:
+        """Call a function with number and information of every channel."""
+        return [function(k, information) for k, information in enumerate(self.informations)]
 
     def summed(
         self, prior: SpectralPrior, reference: Exponents, function: Linearised
@@ -200,10 +199,10 @@ def find_joint_mode(
     skies: PositiveSkies,
     laws: FieldLaws,
     channels: Channels,
-    shared: Vector | None = None,
+    shared: Vector | tuple[()] = (),
     *,
     learn: bool = False,
-    report: Report = None,
+    report: Report = lambda rounds, moved: None,
 ) -> PositiveMode:
     """Find the most probable skies, starting from the templates.
 
@@ -226,21 +225,16 @@ def find_joint_mode(
     InputError
         If the rounds do not converge, or the data are too precise to solve for.
     """
-    shared = np.zeros(0) if shared is None else shared
     start = np.concatenate([np.zeros(len(skies.names) * skies.n_fields), shared])
     exponents = np.tile(np.append(np.zeros(skies.n_fields), shared), (len(skies.levels), 1))
     point = _Point(start, exponents, _chi2(skies, channels, exponents))
-    shapes: Shapes = {"exponent": exponents.shape[1:], "chi2": ()}
-    if learn:
-        shapes |= dict.fromkeys(("power", "known"), (skies.grid.lmax + 1,))
     last = np.zeros_like(laws.parameters)
     for rounds in range(MAX_ROUNDS):
         prior = laws.prior(skies)
-        posterior, mean, arrays = _linear_round(skies, channels, prior, point.exponents, shapes)
+        posterior, mean, arrays = _linear_round(skies, channels, prior, point.exponents, learn)
         energy = point.energy(prior)
         moved = np.sqrt(max(energy - mean.energy(prior), 0.0))
-        if report is not None:
-            report(rounds, f"{moved:.2g} sigma")
+        report(rounds, f"{moved:.2g} sigma")
         change = np.zeros_like(laws.parameters)
         if learn:
             change = laws.matched(*_powers(posterior, prior, arrays)).parameters - laws.parameters
@@ -259,11 +253,11 @@ def find_joint_mode(
 
 
 def _chi2(skies: PositiveSkies, channels: Channels, exponents: Exponents) -> float:
-    def chi2(channel: int, information: Information) -> Arrays:
+    def chi2(channel: int, information: Information) -> float:
         diffuse = diffuse_part(skies, channel, information).without()
-        return {"chi2": np.asarray(diffuse.chi2(_whole(skies, channel, exponents[channel])))}
+        return float(diffuse.chi2(_whole(skies, channel, exponents[channel])))
 
-    return float(channels.each(chi2, {"chi2": ()})["chi2"].sum())
+    return float(np.sum(channels.each(chi2)))
 
 
 def _linear_round(
@@ -271,7 +265,7 @@ def _linear_round(
     channels: Channels,
     prior: SpectralPrior,
     exponents: Exponents,
-    shapes: Shapes,
+    learn: bool,
 ) -> tuple[Posterior, _Point, Arrays]:
     """Posterior of skies that are linear about exponents, its mean, and every channel there."""
 
@@ -281,12 +275,13 @@ def _linear_round(
     information = channels.summed(prior, exponents, relative)
     posterior = joint.component_posterior(information, prior)
     mean = np.asarray(posterior.mean)
-    spread = joint.paired(posterior.covariance(), prior) if "power" in shapes else None
+    spread = joint.paired(posterior.covariance(), prior) if learn else None
 
     def judged(channel: int, information: Information) -> Arrays:
         return _judged(prior, channel, relative(channel, information), mean, spread)
 
-    arrays = channels.each(judged, shapes)
+    parts = channels.each(judged)
+    arrays = {name: np.stack([part[name] for part in parts]) for name in parts[0]}
     return posterior, _Point(mean, arrays["exponent"], float(arrays["chi2"].sum())), arrays
 
 
@@ -300,7 +295,7 @@ def _judged(
     """Exponent and chi^2 of a channel at the mean of a linear round, and its residual's power."""
     none = np.zeros((0, len(mean)))
     sky = joint.channel_sky(prior, channel, information, mean, None, none, jax.random.key(0))
-    judged = {"exponent": sky.mean, "chi2": sky.chi2}
+    judged = {"exponent": sky.mean, "chi2": information.chi2(sky.mean)}
     if spread is None:
         return judged
     root = prior.residual_root(channel)
@@ -390,7 +385,7 @@ def positive_sky(
     for first in range(0, len(draws), CHUNK):
         chunk = slice(first, first + CHUNK)
         drawn[chunk] = _whole(skies, channel, joint_sky.draws[chunk])
-    return joint.ChannelSky(mean, covariance, beside.whole_skies(drawn, z), information.chi2(mean))
+    return joint.ChannelSky(mean, covariance, beside.whole_skies(drawn, z))
 
 
 # highest ell of the maps from which laws are learned
@@ -398,7 +393,7 @@ COARSE_LMAX = 16
 
 
 def learn_laws(
-    skies: PositiveSkies, channels: Channels, *, lmax_fields: int, report: Report = None
+    skies: PositiveSkies, channels: Channels, *, lmax_fields: int, report: Report
 ) -> FieldLaws:
     """Learn C_ell of all fields and residuals by maximising the evidence.
 
@@ -409,7 +404,7 @@ def learn_laws(
         Their data.
     lmax_fields : int
         Highest ell of the exponents while laws are learned, at least that of the coarse maps.
-    report : callable, optional
+    report : callable
         Called with the number of every round, and how far it moved.
 
     Raises
@@ -425,21 +420,13 @@ def learn_laws(
 
 def _large_scales(skies: PositiveSkies, channels: Channels, n: int) -> ChannelsInMemory:
     """Information of all channels about the first modes."""
-    names = ("matrix", "vector", "reference", "misfit", "log_det", "n_data")
 
-    def large(channel: int, information: Information) -> Arrays:
-        if information.n_modes > n:
-            # small scales have the power of the template and its sources
-            template = skies.modes(channel, np.zeros(skies.n_fields))
-            power = power_spectrum(template) + power_spectrum(skies.sources[channel]).sum(0)
-            information = integrated_out(information, n, per_mode(power)[n:])
-        return {name: getattr(information, name) for name in names}
+    def large(channel: int, information: Information) -> Information:
+        if information.n_modes == n:
+            return information
+        # small scales have the power of the template and its sources
+        template = skies.modes(channel, np.zeros(skies.n_fields))
+        power = power_spectrum(template) + power_spectrum(skies.sources[channel]).sum(0)
+        return integrated_out(information, n, per_mode(power)[n:])
 
-    shapes = dict(zip(names, ((n, n), (n,), (n,), (), (), ()), strict=True))
-    arrays = channels.each(large, shapes)
-    return ChannelsInMemory(
-        tuple(
-            Information(*(np.asarray(arrays[name][k]) for name in names))
-            for k in range(len(skies.levels))
-        )
-    )
+    return ChannelsInMemory(tuple(channels.each(large)))

@@ -237,12 +237,8 @@ class Posterior(Described, eqx.Module):
         () array
             Rms over modes, in standard deviations of this posterior.
         """
-        xp, shift = namespace(self), self.white_mean - self.prior.whiten(sky)
-        inside = shift if self.basis is None else self.basis.T @ shift
-        squared = ((inside @ xp.tril(self.lower)) ** 2).sum()
-        if self.basis is not None:
-            squared = squared + ((shift - self.basis @ inside) ** 2).sum()
-        return xp.asarray(xp.sqrt(squared / shift.shape[0]))
+        xp = namespace(self)
+        return xp.asarray(xp.sqrt((_whiten(self, xp.asarray(sky)[None]) ** 2).mean()))
 
     def information_bits(self) -> Float[Array, ""]:
         """Compute the information about the sky gained from the data: ln|Lambda| / 2 in bits.

@@ -76,7 +76,6 @@ def template_noise(
         For templates of the wrong length, and for a P that is not positive definite.
     """
     checks.require_array("the templates", templates, (layout.size, None))
-    checks.require_float64("the templates' prior", prior)
     if prior.ndim == 1:
         checks.require_positive("the templates' prior variance", prior)
         prior = jnp.diag(prior)
@@ -168,9 +167,8 @@ class GainDrift(eqx.Module):
         lag = jnp.asarray(hours)[:, None] - jnp.asarray(hours)[np.maximum(earlier, 0)]
         kernel = jnp.where(jnp.asarray(earlier >= 0), self.kernel(lag), 0.0)
         n = round(np.sqrt(layout.n_products))
-        slopes = slopes_by_gains(
-            visibilities, np.zeros((n, layout.n_times)) if gains is None else gains
-        )
+        about = np.zeros((n, layout.n_times)) if gains is None else gains
+        slopes = slopes_by_gains(visibilities, about)
         i, j, _ = ports(n)
         # number of ways in which two products share two antennas
         ii, ij, ji, jj = (np.equal.outer(a, b).astype(np.float64) for a in (i, j) for b in (i, j))
@@ -194,7 +192,7 @@ class GainDrift(eqx.Module):
 
     def sample(self, key: PRNGKeyArray, hours: Hours, n_antennas: int = 4) -> Gains:
         """Draw g_i(t), (antennas, times), with exactly this covariance."""
-        grid = white_grid(hours, float(self.correlation_h))
+        grid = white_grid(hours, *[float(self.correlation_h)] * 2)
         white = jax.random.normal(key, (n_antennas, len(grid)), dtype=jnp.float64)
         return self.history(white, hours, grid)
 
@@ -228,7 +226,7 @@ class GainDrift(eqx.Module):
 def white_grid(
     hours: Hours,
     shortest_h: float,
-    longest_h: float | None = None,
+    longest_h: float,
     *,
     per_correlation: float = 4.0,
     margin: float = REACH,
@@ -240,7 +238,7 @@ def white_grid(
     hours : (times,) array
         Times of the samples.
     shortest_h, longest_h : float
-        Range of correlation times in hours that the grid serves; by default a single one.
+        Range of correlation times in hours that the grid serves.
     per_correlation : float
         Number of grid times in the shortest correlation time.
     margin : float
@@ -251,7 +249,6 @@ def white_grid(
     (grid,) array
         In hours.
     """
-    longest_h = shortest_h if longest_h is None else longest_h
     hours = np.asarray(hours)
     first, end = hours.min() - margin * longest_h, hours.max() + margin * longest_h
     return np.arange(first, end, shortest_h / per_correlation)

@@ -229,17 +229,13 @@ class TimeBandedCovariance(_OverLayout):
         self.band, self.layout, self.name = _checked(name, band, layout), layout, name
 
     def dense(self):
-        unit = namespace(self).eye(self.size)
-        grid = self.layout.by_time(unit)
-
-        def add(w, total):
-            block = jax.lax.dynamic_index_in_dim(self.band, w, 1, keepdims=False)
-            earlier = block @ jnp.roll(grid, w, axis=0)  # band[t, w] is zero where t < w
-            later = jnp.roll(jnp.swapaxes(block, 1, 2) @ grid, -w, axis=0)
-            return total + earlier + jnp.where(w > 0, 1.0, 0.0) * later
-
-        total = jax.lax.fori_loop(0, self.band.shape[1], add, jnp.zeros_like(grid))
-        return self.layout.from_times(total, unit.shape)
+        n_times, widths, n, _ = self.band.shape
+        time, back = np.nonzero(np.arange(n_times)[:, None] >= np.arange(widths)[None])
+        grid = jnp.zeros((n_times, n, n_times, n))
+        grid = grid.at[time, :, time - back].set(self.band[time, back])
+        lower = grid.reshape(n_times * n, n_times * n)
+        place = self.layout.time * n + self.layout.product
+        return (jnp.tril(lower) + jnp.tril(lower, -1).T)[place[:, None], place[None]]
 
     def diagonal(self):
         return self.layout.gather(jnp.diagonal(self.band[:, 0], axis1=1, axis2=2).T)

@@ -32,7 +32,6 @@ from lusee_bayes.judge.plausibility import about_information
 from lusee_bayes.judge.residuals import Residuals, residuals
 from lusee_bayes.judge.split import Split
 from lusee_bayes.linear.information import Information
-from lusee_bayes.linear.linear_gaussian import Solution
 from lusee_bayes.linear.posterior import Posterior, pixel_std, prior_pixel_std
 from lusee_bayes.results.channel import ChannelData, ChannelResult, Details, Judged
 from lusee_bayes.results.finished_runs import SavedInformation, taken
@@ -82,7 +81,8 @@ def conditioned(
         posterior = information.posterior(prior)
         information = information.recentred(posterior.mean)
         before = _given_earlier(earlier.information.posterior(prior))
-        total = replace(new, solution=Solution(new.model, data.data, posterior, information))
+        parts = {"posterior": posterior, "kept_information": information, "excess": 0.0}
+        total = replace(new, solution=replace(new.solution, **parts))
         judged = replace(new, solution=new.under(before).solution)
         return Conditioned(experiment, new, total, judged, (*earlier.digests, data.digest()))
 

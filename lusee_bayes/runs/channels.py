@@ -38,7 +38,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import h5py
 import jax
@@ -245,20 +245,15 @@ class ChannelsInFiles:
     stages: Stages
     tied: Tied | None = None
 
-    def each(
-        self,
-        function: Callable[[int, Information], dict[str, np.ndarray]],
-        shapes: dict[str, tuple[int, ...]],
-    ) -> dict[str, np.ndarray]:
-        """Call a function with number and information of every channel, and stack its arrays."""
+    def each(self, function: Callable[[int, Information], Any]) -> list[Any]:
+        """Call a function with number and information of every channel."""
         files, channels, tied = self.files, self.channels, self.tied
 
-        def call(number: int) -> dict[str, np.ndarray]:
+        def call(number: int) -> Any:
             return function(number, files.information(channels[number], number, tied))
 
         tasks = Tasks(call, range(len(channels)), [names_of((one,)) for one in channels])
-        parts = self.engine.each(tasks, self.stages, "joint sums")
-        return {name: np.stack([np.asarray(one[name]) for one in parts]) for name in shapes}
+        return self.engine.each(tasks, self.stages, "joint sums")
 
     def summed(
         self,
@@ -315,6 +310,7 @@ def solve_components(
     """
     spectral, stages, frequencies = scenario.spectral, channels.stages, scenario.frequencies_mhz
     tied, mode = channels.tied, None
+    white = np.zeros(0) if tied is None else tied.white
     if spectral.model == "positive":
         with stages("templates"):
             skies = spectral.positive_skies(frequencies, scenario.lmax)
@@ -324,12 +320,10 @@ def solve_components(
             alone = replace(silent, tied=None)
             laws = positive_joint.learn_laws(skies, alone, lmax_fields=coarse, report=report)
         with stages.progress("positive skies", positive_joint.MAX_ROUNDS) as report:
-            start = None if tied is None else tied.white
-            mode = positive_joint.find_joint_mode(skies, laws, silent, start, report=report)
+            mode = positive_joint.find_joint_mode(skies, laws, silent, white, report=report)
         prior, posterior, chi2, moved = mode.prior, mode.posterior, mode.energy, mode.moved
     else:
         prior = spectral.prior(np.array(frequencies), np.array([one.sky for one in seen]))
-        white = np.zeros(0) if tied is None else tied.white
         reference = np.array([np.concatenate([one.reference, white]) for one in seen])
         information = channels.summed(prior, reference, lambda _, information: information)
     with stages("joint posterior"):

@@ -183,8 +183,7 @@ class TimesStudentT(Prediction):
         z = jax.random.normal(of_normal, (layout.size, n), dtype=jnp.float64)
         gamma = jax.random.gamma(of_weight, self.nu / 2.0, (layout.n_times, n), dtype=jnp.float64)
         wider = jnp.sqrt(self.nu / 2.0 / gamma)
-        grid = jnp.broadcast_to(wider[None], (layout.n_products, *wider.shape))
-        draws = self.loc[:, None] + self.factor.colour(z) * layout.gather(grid)
+        draws = self.loc[:, None] + self.factor.colour(z) * wider[layout.time]
         return draws.T.reshape(*sample_shape, -1)
 
     def log_prob(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -203,8 +202,7 @@ class TimesStudentT(Prediction):
     def residual(self, value: DataVector) -> DataVector:
         """Compute sqrt(w_t) L^-1 (d - loc), N = L L^T, with fixed weights w_t."""
         held = jax.lax.stop_gradient(jnp.sqrt(self.weights(value)))
-        grid = jnp.broadcast_to(held[None], (self.layout.n_products, self.layout.n_times))
-        return self.layout.gather(grid) * self.factor.whiten(value - self.loc)
+        return held[self.layout.time] * self.factor.whiten(value - self.loc)
 
     def weights(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
         """Compute E[w_t | d, loc] = (nu + n_t) / (nu + chi^2_t) for n_t data, ``(..., times)``.

@@ -140,12 +140,6 @@ class Whitening(eqx.Module):
         """Names of the sites."""
         return tuple(name for name, _ in self.sites)
 
-    def split(self, x: Float[Array, " unknowns"]) -> dict[str, Float[Array, "..."]]:
-        """Split x by site, and restore shapes."""
-        ends = np.cumsum([math.prod(shape) for _, shape in self.sites])
-        parts = zip(self.sites, jnp.split(x, ends[:-1]), strict=True)
-        return {name: part.reshape(shape) for (name, shape), part in parts}
-
     def to_values(
         self, x: Float[Array, " unknowns"], hold: Sequence[str] = ()
     ) -> tuple[dict[str, Float[Array, "..."]], Float[Array, ""]]:
@@ -153,7 +147,9 @@ class Whitening(eqx.Module):
 
         The sites ``hold`` have no derivatives.
         """
-        values = self.split(x)
+        ends = np.cumsum([math.prod(shape) for _, shape in self.sites])
+        parts = zip(self.sites, jnp.split(x, ends[:-1]), strict=True)
+        values = {name: part.reshape(shape) for (name, shape), part in parts}
         values |= {n: jax.lax.stop_gradient(values[n]) for n in hold if n in values}
         return (values, jnp.zeros(())) if self.chart is None else self.chart.to_values(values)
 
@@ -223,6 +219,7 @@ def _given(value: Float[Array, "..."], log_det: float | Float[Array, ""]) -> Cal
 WHAT = "the description of an unfinished run (else delete its folder)"
 IDENTITY = "run.json"
 CHUNK_GLOB = "chunk-*.npz"
+CHECKPOINT = "a checkpoint (else delete it to continue from the one before)"
 
 
 @dataclass(frozen=True)
@@ -247,13 +244,10 @@ class Chunk:
     def read(cls, path: Path) -> Chunk:
         """Read a chunk's file. InputError if it cannot be read."""
         kinds: dict[str, dict[str, np.ndarray]] = {"state": {}, "draws": {}}
-        try:
-            with reading(path, "a checkpoint"), path.open("rb") as file, np.load(file) as arrays:
-                for key in sorted(arrays.files):
-                    kind, name = key.split(":", 1)
-                    kinds[kind][name] = arrays[key]
-        except InputError as error:
-            raise InputError(f"{error}; delete it to continue from the one before") from error
+        with reading(path, CHECKPOINT), path.open("rb") as file, np.load(file) as arrays:
+            for key in sorted(arrays.files):
+                kind, name = key.split(":", 1)
+                kinds[kind][name] = arrays[key]
         return cls(_iteration(path), list(kinds["state"].values()), kinds["draws"])
 
 
@@ -405,11 +399,8 @@ class CrankNicolson(MCMCKernel):
         return jnp.where(jnp.isnan(total), jnp.inf, total), drawn
 
     def init(self, rng_key, num_warmup, init_params, model_args, model_kwargs):
-        """The first state of one chain, or of all: a sample from N(0, 1)."""
+        """The first state of a chain: a sample from N(0, 1)."""
         self.warmup = num_warmup
-        if rng_key.ndim > 1:
-            given = num_warmup, init_params, model_args, model_kwargs
-            return jax.vmap(lambda key: self.init(key, *given))(rng_key)
         key, of_start, of_skies = jax.random.split(rng_key, 3)
         start, zero = jax.random.normal(of_start, (self.size,)), jnp.zeros(())
         potential, z = self._looked(model_args, model_kwargs, start, of_skies)
@@ -420,9 +411,7 @@ class CrankNicolson(MCMCKernel):
         return HMCState(**fields | {"accept_prob": zero, "mean_accept_prob": zero})
 
     def sample(self, state, model_args, model_kwargs):
-        """The next state of one chain, or of all."""
-        if state.rng_key.ndim > 1:
-            return jax.vmap(lambda one: self.sample(one, model_args, model_kwargs))(state)
+        """The next state of a chain."""
         key, of_turn, of_skies, of_choice = jax.random.split(state.rng_key, 4)
         z, turn = state.z[self.site], state.adapt_state.step_size
         p = jax.random.normal(of_turn, z.shape)
@@ -642,8 +631,8 @@ class _Run:
         self.advance = jax.jit(self._advance)
 
     def _of_chains(self, function: Callable[[Any], HMCState], chains: Any) -> HMCState:
-        """Apply a NumPyro function, which takes one chain or all of them."""
-        return jax.lax.map(function, chains) if self.one_by_one else function(chains)
+        """Apply a function of one chain to all of them."""
+        return jax.lax.map(function, chains) if self.one_by_one else jax.vmap(function)(chains)
 
     def start(self) -> HMCState:
         """The first state of every chain."""

@@ -35,14 +35,9 @@ class LogNormalPrior(eqx.Module):
     std: Float[Array, "2"] | None = None
 
     @property
-    def samples_spectrum(self) -> bool:
-        """Whether A and the tilt are unknowns."""
-        return self.std is not None
-
-    @property
     def sites(self) -> tuple[str, ...]:
         """The sampled sites."""
-        return (AMPLITUDE, TILT, STRUCTURE) if self.samples_spectrum else (STRUCTURE,)
+        return (STRUCTURE,) if self.std is None else (AMPLITUDE, TILT, STRUCTURE)
 
     def sampled(self) -> Float[Array, " modes"]:
         """Sample the sky inside a NumPyro program.
@@ -56,7 +51,7 @@ class LogNormalPrior(eqx.Module):
             m, in K.
         """
         sky = self.sky
-        if self.samples_spectrum:
+        if self.std is not None:
             amplitude, tilt = zip(self.expected, self.std, strict=True)
             amplitude = numpyro.sample(AMPLITUDE, dist.LogNormal(*amplitude))
             sky = sky.with_power_law(amplitude, numpyro.sample(TILT, dist.Normal(*tilt)))

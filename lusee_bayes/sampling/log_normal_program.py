@@ -193,11 +193,6 @@ class LogNormalMode:
     power_law: Pair | None = None
     covariance: PairMatrix | None = None
 
-    @property
-    def modes(self) -> Float[np.ndarray, " modes"]:
-        """The mode's sky: real packed coefficients, Galactic, in K."""
-        return np.asarray(self.information.reference)
-
 
 def find_mode(
     sky: LogNormalSky, information: Information, start: Unknowns | None = None
@@ -340,9 +335,9 @@ def coordinates_of(prior: LogNormalPrior, information: Information) -> Whitening
         As :func:`find_mode` and :func:`learn_spectrum`.
     """
     prior = on_host(prior)
-    if prior.samples_spectrum:
-        return straight_coordinates(learn_spectrum(prior, information))
-    return straight_coordinates(find_mode(prior.sky, information))
+    learned = prior.std is not None
+    mode = learn_spectrum(prior, information) if learned else find_mode(prior.sky, information)
+    return straight_coordinates(mode)
 
 
 def straight_coordinates(mode: LogNormalMode) -> Whitening:
@@ -369,7 +364,7 @@ def straight_coordinates(mode: LogNormalMode) -> Whitening:
         slopes = mode.sky.power_law_slopes()[:, 1:]
         left_open += np.einsum("im,ij,jm->m", slopes, mode.covariance, slopes).max()
     bounds = _bounds(strength[stiff], GAIN**2 * left_open)
-    chart = StraightSky(mode.sky, mode.white, mode.modes, across, down, bounds)
+    chart = StraightSky(mode.sky, mode.white, mode.information.reference, across, down, bounds)
     log_det, mean = -np.log(np.diagonal(mode.lower)).sum(), mode.white
     sites: tuple[tuple[str, tuple[int, ...]], ...] = ((STRUCTURE, (mode.sky.size,)),)
     if mode.power_law is not None:

@@ -179,7 +179,7 @@ MAX_STEPS = 100
 HALVINGS = 20
 # first scale for differences, in standard deviations of the prior
 FIRST = 1e-3
-# samples from the prior that are compared for every further start
+# samples from the prior for every start: they give its widths, and are compared for further starts
 CANDIDATES = 12
 
 
@@ -250,8 +250,7 @@ def laplace_approximation(
     """
     arguments = dict(arguments)
     trace = _trace(program, arguments, start or {})
-    latent = {name: trace[name] for name in latent_of(trace)}
-    unconstrained = {name: _unconstrained(site) for name, site in latent.items()}
+    unconstrained = {name: _unconstrained(trace[name]) for name in latent_of(trace)}
     sites = tuple((name, value.shape) for name, value in unconstrained.items())
     n = sum(value.size for value in unconstrained.values())
     shapes = Whitening(jnp.zeros(n), jnp.zeros((n, 0)), jnp.zeros(()), sites, chart)
@@ -265,10 +264,10 @@ def laplace_approximation(
             "CorrelatedNormal, whose curvature needs no Hessian"
         )
     free = jnp.ones(n).at[problem.held()].set(0.0)
-    scale = FIRST * _prior_scale(latent)
+    drawn = _drawn(program, arguments, shapes, CANDIDATES * starts)
+    scale = FIRST * drawn.std(0)
     if starts == 1:
         return _climb(problem, first, free, scale)
-    drawn = _drawn(program, arguments, shapes, CANDIDATES * (starts - 1))
     heights = jax.lax.map(problem.value, drawn)
     best = jnp.argsort(jnp.where(jnp.isnan(heights), jnp.inf, heights))[: starts - 1]
     places = jnp.concatenate([first[None], drawn[best]])
@@ -302,16 +301,6 @@ def _trace(program: Callable, arguments: dict, start: Mapping[str, Array]) -> di
 
     model = handlers.seed(program, jax.random.PRNGKey(0))
     return handlers.trace(handlers.substitute(model, substitute_fn=place)).get_trace(**arguments)
-
-
-def _prior_scale(latent: dict) -> Coordinates:
-    """Standard deviations of the priors in the unconstrained coordinates, from draws."""
-    scales = []
-    for name, site in latent.items():
-        draws = site["fn"].sample(jax.random.PRNGKey(len(name)), (100,))
-        x = jax.vmap(dist.biject_to(site["fn"].support).inv)(jnp.asarray(draws, jnp.float64))
-        scales.append(x.std(0).reshape(-1))
-    return jnp.concatenate(scales)
 
 
 @eqx.filter_jit

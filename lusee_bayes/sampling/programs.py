@@ -134,11 +134,6 @@ class Program:
         return {name: pieces[name]() for name in names if name != DATA}
 
 
-def program_names() -> list[str]:
-    """Return the names of the programs that come with the package."""
-    return sorted({path.stem for folder in FOLDERS for path in folder.glob("*.py")})
-
-
 def load_program(source: str | Path) -> Program:
     """Load a program.
 
@@ -187,10 +182,10 @@ def load_program(source: str | Path) -> Program:
 
 
 def _find(source: str | Path) -> Path:
-    names = program_names()
-    if str(source) in names:
-        return next(f / f"{source}.py" for f in FOLDERS if (f / f"{source}.py").exists())
-    path, programs = user_path(source), ", ".join(names)
+    own = {path.stem: path for folder in reversed(FOLDERS) for path in folder.glob("*.py")}
+    if str(source) in own:
+        return own[str(source)]
+    path, programs = user_path(source), ", ".join(sorted(own))
     if path.suffix == ".py":
         return require_file(path, "program", f"the package has {programs}")
     raise InputError(f"no program '{source}': give the path of a Python file, or one of {programs}")

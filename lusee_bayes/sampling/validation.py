@@ -65,14 +65,12 @@ MEMORY = 10_000_000
 
 @dataclass(frozen=True)
 class Ranks:
-    """Ranks 0..n_draws of the truth among the draws, for every data set and quantity.
+    """Ranks 0..N_DRAWS of the truth among the draws, for every data set and quantity.
 
     Attributes
     ----------
     ranks : (simulations, quantities) array of int
         The ranks.
-    n_draws : int
-        Number of draws.
     names : tuple of str
         Names of the quantities.
     regions : tuple of str
@@ -81,7 +79,6 @@ class Ranks:
     """
 
     ranks: Int[np.ndarray, "simulations quantities"]
-    n_draws: int
     names: tuple[str, ...]
     regions: tuple[str, ...] = ()
 
@@ -92,7 +89,7 @@ class Ranks:
 
     def histogram(self) -> Int[np.ndarray, "quantities bins"]:
         """Count the ranks in each of 20 equal bins."""
-        edges = np.linspace(0, self.n_draws + 1, N_BINS + 1) - 0.5
+        edges = np.linspace(0, N_DRAWS + 1, N_BINS + 1) - 0.5
         return np.stack([np.histogram(r, edges)[0] for r in self.ranks.T])
 
     def band(self, probability: float = 0.99) -> tuple[int, int]:
@@ -106,8 +103,7 @@ class Ranks:
 
     def coverage(self) -> dict[str, dict[float, float]]:
         """Return the share of truths within the 50, 68, 90 and 95 % regions, by quantity."""
-        n = self.n_draws + 1
-        middle = self.n_draws / 2
+        n, middle = N_DRAWS + 1, N_DRAWS / 2
         table = {}
         for name, ranks in zip(self.names, self.ranks.T, strict=True):
             if name in self.regions:
@@ -192,7 +188,7 @@ def calibrate(
         ranks = np.concatenate([p[name] for p in parts])
         names += [name] if ranks.shape[1] == 1 else [f"{name} {i}" for i in range(ranks.shape[1])]
         columns.append(ranks)
-    return Ranks(np.concatenate(columns, axis=1), N_DRAWS, tuple(names), tuple(regions))
+    return Ranks(np.concatenate(columns, axis=1), tuple(names), tuple(regions))
 
 
 @eqx.filter_jit

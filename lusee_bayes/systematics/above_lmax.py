@@ -112,15 +112,13 @@ def sky_above(setup: Setup, noise: Factor, learned: ModesMatrix | None = None) -
     scenario, n, above = setup.scenario, setup.prior.size, setup.above
     frequency_mhz, lmax = scenario.frequency_mhz, scenario.noise.above_lmax.top(scenario.lmax)
     if above is None:
-        sky, family = (
-            scenario.sky.at(frequency_mhz, lmax),
-            scenario.prior.family(frequency_mhz, lmax),
-        )
+        sky = scenario.sky.at(frequency_mhz, lmax)
+        family = scenario.prior.family(frequency_mhz, lmax)
         coupling, modes = _coupling(setup, lmax), np.asarray(sky.modes)[n:]
-        prior = None if family is not None else scenario.prior.prior(sky)
     else:
         coupling, modes, family = above.coupling, above.modes, above.family
     if family is None:
+        prior = scenario.prior.prior(sky)
         covariance, mean = prior.covariance(), prior.mean
     else:
         covariance, mean = learned, family.mean

@@ -91,13 +91,13 @@ class BeamErrors(Systematic):
         if not section.parameters:
             direction = difference_of_beams(section, setup)
             return BeamError(CouplingMatrix.of_modes(direction, setup.pointing, setup.layout))
-        priors = []
+        unknowns = []
         for name, std in section.parameters.items():
             p = setup.instrument.source.parameter(name)
             unknown = Unknown(name, float(p.value), std, low=float(p.low), high=float(p.high))
             unknown.prior()
-            priors.append(unknown)
-        return InstrumentParameters(setup.instrument, tuple(priors))
+            unknowns.append(unknown)
+        return InstrumentParameters(tuple(unknowns), setup.instrument)
 
     @classmethod
     def truth(cls, section: BeamErrorSection, setup: Setup, key: PRNGKeyArray) -> Truth:
@@ -159,13 +159,10 @@ class BeamError(BeamErrors):
         dA for an amplitude of one, such as the difference to another beam.
     """
 
+    unknowns: ClassVar[tuple[Unknown, ...]] = (Unknown("beam_amplitude"),)
     first_order: ClassVar[bool] = False
 
     direction: Coupling
-
-    @property
-    def unknowns(self) -> tuple[Unknown, ...]:
-        return (Unknown("beam_amplitude"),)
 
     def effect(self, model, values):
         """Use A + amplitude dA."""
@@ -183,19 +180,15 @@ class InstrumentParameters(ChangedBeams, BeamErrors):
 
     Attributes
     ----------
+    unknowns : tuple of Unknown
+        As numbers: arrays would be traced, and the checks of the priors and the ends of their
+        domains need values.
     instrument : Instrument
         The instrument with the prior means of its parameters.
-    priors : tuple of Unknown
-        The unknowns, as numbers: arrays would be traced, and the checks of the priors and the ends
-        of their domains need values.
     """
 
+    unknowns: tuple[Unknown, ...] = eqx.field(static=True)
     instrument: Instrument
-    priors: tuple[Unknown, ...] = eqx.field(static=True)
-
-    @property
-    def unknowns(self) -> tuple[Unknown, ...]:
-        return self.priors
 
     def modes(self, modes, values):
         """Beams of antennas with these values; a horizon hides the same as without them."""
@@ -216,9 +209,7 @@ class InstrumentParameters(ChangedBeams, BeamErrors):
         """Emission of ground and antennas beyond the background, in K."""
         source, frequency_mhz = self.instrument.source, self.instrument.frequency_mhz
         more = source.with_values(values).background(frequency_mhz)
-        more, layout = more - source.background(frequency_mhz), self.instrument.layout
-        each_time = np.ones((1, layout.n_times))
-        return layout.gather(more[:, None] * each_time)
+        return (more - source.background(frequency_mhz))[self.instrument.layout.product]
 
 
 def beam_rms_difference(setup: Setup) -> float | None:

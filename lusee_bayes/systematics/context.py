@@ -139,12 +139,6 @@ class Setup:
         return self.coupling.layout
 
     @property
-    def complete(self) -> CouplingMatrix:
-        """A for all products at all times."""
-        layout = DataLayout(self.layout.n_products, self.layout.n_times)
-        return replace(self.coupling, layout=layout)
-
-    @property
     def offset(self) -> DataVector | None:
         """The background in every datum, in K; None if there is none."""
         if not np.any(self.background):
@@ -165,8 +159,7 @@ class Setup:
 
     def with_signal(self) -> Setup:
         """Return the same with :attr:`signal`, computed from everything else."""
-        complete = self.complete
-        signal = complete.layout.scatter(complete @ self.sky.modes) + self.background
+        signal = self._of_sky(self.sky.modes) + self.background
         for section, response in zip(self.scenario.sources.list, self.responses, strict=True):
             signal = signal + section.mean_flux(self.sky.frequency_mhz) * response
         return replace(self, signal=signal)
@@ -179,9 +172,12 @@ class Setup:
         sky : Sky
             Of the same frequency and lmax.
         """
-        complete = self.complete
-        change = complete.layout.scatter(complete @ (sky.modes - self.sky.modes))
-        return replace(self, sky=sky, signal=self.signal + change)
+        return replace(self, sky=sky, signal=self.signal + self._of_sky(sky.modes - self.sky.modes))
+
+    def _of_sky(self, modes: Modes) -> Grid:
+        """The visibilities of a sky, for all products at all times."""
+        layout = DataLayout(self.layout.n_products, self.layout.n_times)
+        return layout.scatter(replace(self.coupling, layout=layout) @ modes)
 
     def with_layout(self, layout: DataLayout) -> Setup:
         """Return the same for a subset of its data."""

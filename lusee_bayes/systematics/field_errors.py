@@ -71,10 +71,6 @@ class FieldErrorsSection(Section):
     treatment: Treatment = "marginalised"
 
 
-# data whose columns are computed at once
-BLOCK = 1024
-
-
 class FieldErrors(ChangedBeams):
     """Smooth errors of each port's field.
 
@@ -180,8 +176,7 @@ class FieldErrors(ChangedBeams):
         sets = np.concatenate([used, np.zeros((-len(used) % n**2, size))]).reshape(-1, n**2, size)
         see, layout, (i, j, imaginary) = coupling.along(sets), coupling.layout, ports(n)
         first, second, imaginary = (x[np.asarray(layout.product)] for x in (i, j, imaginary))
-        owns = (np.equal.outer(x, np.arange(n))[:, :, None, None] for x in (first, second))
-        by_first, by_second = owns
+        data, time, sizes = np.arange(len(first)), np.asarray(layout.time), np.asarray(self.sizes)
         scale = np.repeat(np.asarray(self.of_ell), 2 * ells + 1)
         place = [slice(ell**2, (ell + 1) ** 2) for ell in ells]
 
@@ -190,17 +185,17 @@ class FieldErrors(ChangedBeams):
             seen = seen.reshape(-1, 2, n, 2, layout.n_times)
             # ports, components, harmonics, times
             seen = np.moveaxis(seen[:, 0] + 1j * seen[:, 1], 0, 2) * scale[:, None]
-            matrix = np.empty((len(first), len(self.names)))
-            for rows in np.array_split(np.arange(len(first)), 1 + len(first) // BLOCK):
-                at = np.asarray(layout.time)[rows]
-                straight = by_first[rows] * seen[second[rows], :, :, at][:, None]
-                turned = by_second[rows] * seen[first[rows], :, :, at].conj()[:, None]
-                both = np.stack([straight + turned, 1j * (straight - turned)], axis=1)
-                both = np.where(imaginary[rows, None, None, None, None], both.imag, both.real)
-                both = both * self.sizes[:, None, None]
-                parts = [both[..., k].reshape(len(rows), -1) for k in place]
-                matrix[rows] = np.concatenate(parts, axis=1)
-            return matrix
+            blocks = []
+            for orders in place:
+                block = np.zeros((len(data), 2, n, 2, orders.stop - orders.start))
+                for own, other, sign in ((first, second, 1.0), (second, first, -1.0)):
+                    by_real = sizes[own, None, None] * seen[other, :, orders, time]
+                    by_real = by_real.conj() if sign < 0 else by_real
+                    for part, slope in enumerate((by_real, sign * 1j * by_real)):
+                        slope = np.where(imaginary[:, None, None], slope.imag, slope.real)
+                        block[data, part, own] += slope
+                blocks.append(block.reshape(len(data), -1))
+            return np.concatenate(blocks, axis=1)
 
         return columns
 

@@ -33,7 +33,6 @@ from lusee_bayes.systematics.systematic import (
     Truth,
     Unknown,
     multiplied,
-    scalar_or_none,
     with_added,
 )
 
@@ -108,7 +107,7 @@ class GainDrifts(Systematic):
         The data.
     width, widest : int
         Of the covariance's band in samples, for ``drift`` and for the longest correlation time.
-    log_sigma_std, log_correlation_std : () array, optional
+    log_sigma_std, log_correlation_std : float, optional
         Prior standard deviations of the natural logarithms of the two; None if known.
     found : (antennas, times) array, optional
         Drifts about which the term of N is linear. None for a term about no drifts, with its
@@ -133,8 +132,8 @@ class GainDrifts(Systematic):
     # shapes follow from them, so they are structure
     width: int = eqx.field(static=True)
     widest: int = eqx.field(static=True)
-    log_sigma_std: Float[Array, ""] | None = eqx.field(default=None, converter=scalar_or_none)
-    log_correlation_std: Float[Array, ""] | None = eqx.field(default=None, converter=scalar_or_none)
+    log_sigma_std: float | None = eqx.field(default=None, static=True)
+    log_correlation_std: float | None = eqx.field(default=None, static=True)
     found: Gains | None = None
     slope: Gains | None = None
     shift: Grid | None = None
@@ -170,9 +169,8 @@ class GainDrifts(Systematic):
         ends = middle / factor, middle * factor
         grid = white_grid(hours, *ends, per_correlation=PER_CORRELATION, margin=MARGIN)
         widths, stds = (drift.width(hours), longest.width(hours)), (log_sigma_std, log_std)
-        return cls(
-            drift, visibilities, jnp.asarray(hours), jnp.asarray(grid), layout, *widths, *stds
-        )
+        times = jnp.asarray(hours), jnp.asarray(grid)
+        return cls(drift, visibilities, *times, layout, *widths, *stds)
 
     @classmethod
     def build(cls, section: GainSection, setup: Setup, around: Around) -> GainDrifts:
@@ -251,8 +249,7 @@ class GainDrifts(Systematic):
         None for drifts so strong that their mean could be -1, which the coordinates exclude.
         """
         sigma = float(self.drift.sigma)
-        log_std = 0.0 if self.log_sigma_std is None else float(self.log_sigma_std)
-        if sigma * np.exp(3.0 * log_std) > STRONGEST:
+        if sigma * np.exp(3.0 * (self.log_sigma_std or 0.0)) > STRONGEST:
             return None
         noise = self.layout.scatter(model.noise.diagonal())
         return GainCoordinates(self, noise.sum() / (self.visibilities**2).sum())
@@ -279,9 +276,8 @@ class GainDrifts(Systematic):
         """
         drift = drift or self.drift
         if self.found is None:
-            mean = drift.mean_response(self.layout.n_products)[:, None]
-            grid = jnp.broadcast_to(mean, (self.layout.n_products, self.layout.n_times))
-            return multiplied(model, self.layout.gather(grid))
+            mean = drift.mean_response(self.layout.n_products)
+            return multiplied(model, mean[self.layout.product])
         found = multiplied(model, self.response(self.found))
         return with_added(found, self.layout.gather(self.shift))
 

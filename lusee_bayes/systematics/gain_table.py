@@ -145,14 +145,13 @@ class GainTable(Systematic):
         return np.sqrt((slope**2).sum(1) / (slope != 0).sum(1))
 
     def like_the_sky(self) -> tuple[tuple[str, ...], Float[np.ndarray, "parts n"]]:
-        """Their common part: errors of single ports and levels do not look like a sky."""
-        return (COMMON_GAIN,), self.common[None]
+        """Their common part, along the mean power gain of all ports and times.
 
-    @property
-    def common(self) -> Vector:
-        """Unit vector of errors along the mean power gain of all ports and times."""
+        Errors of single ports and levels do not look like a sky.
+        """
         along = np.asarray(self.slope).mean(1)
-        return along / max(float(np.linalg.norm(along)), np.finfo(np.float64).tiny)
+        common = along / max(float(np.linalg.norm(along)), np.finfo(np.float64).tiny)
+        return (COMMON_GAIN,), common[None]
 
     def factors(self, z: Float[Array, " errors"]) -> DataVector:
         """Compute F of every datum from values in prior standard deviations."""

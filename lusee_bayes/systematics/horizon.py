@@ -35,7 +35,7 @@ from typing import Annotated, ClassVar
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
-from numpy.polynomial.legendre import leggauss, legvander
+from numpy.polynomial.legendre import leggauss, legint, legval, legvander
 from pydantic import Field
 
 from lusee_bayes.core.arrays import Array, Modes, namespace
@@ -128,6 +128,8 @@ class Horizon(ChangedBeams):
 
     Attributes
     ----------
+    unknowns : tuple of Unknown
+        The coefficients, in degrees.
     patterns : (products, rings, azimuths) array
         Of the antennas, at the expansion point of other unknowns, in the strip above altitude 0, in
         1/sr; azimuths from East towards North in the antennas' frame.
@@ -141,9 +143,6 @@ class Horizon(ChangedBeams):
         Upper end of the strip, in radians; higher altitudes are clipped to it.
     lmax : int
         Of the beams.
-    std_deg : float
-        Of each coefficient.
-    harmonics : int
     moon_k : float
         Temperature of the terrain, in K.
     """
@@ -154,14 +153,13 @@ class Horizon(ChangedBeams):
     unit: ClassVar[str] = "deg"
     moves_setup: ClassVar[bool] = True
 
+    unknowns: tuple[Unknown, ...] = eqx.field()
     patterns: Float[Array, "products rings azimuths"]
     azimuth: Altitudes
     altitudes: Altitudes
     before: Float[Array, "runs products modes"] | float
     highest: float = eqx.field(static=True)
     lmax: int = eqx.field(static=True)
-    std_deg: float = eqx.field(static=True)
-    harmonics: int = eqx.field(static=True)
     moon_k: float = eqx.field(static=True)
 
     @classmethod
@@ -182,9 +180,11 @@ class Horizon(ChangedBeams):
         autos = auto_indices(source.n_ports)
         scale = np.asarray(beams.modes)[autos, 0].mean() / whole.modes(all_round, 0)[autos].mean()
         before = 0.0 if setup.hidden is None else setup.hidden
-        series = section.std_deg / (1.0 + section.harmonics) ** 0.5, section.harmonics
-        parts = patterns * scale, azimuth, altitude, before, highest, beams.lmax, *series
-        return cls(*parts, section.moon_temperature_k)
+        orders, std_deg = section.harmonics, section.std_deg / (1.0 + section.harmonics) ** 0.5
+        waves = [f"{wave}_{k}_" for k in range(1, orders + 1) for wave in ("cos", "sin")]
+        unknowns = tuple(Unknown(f"horizon_{wave}deg", 0.0, std_deg) for wave in ("", *waves))
+        parts = patterns * scale, azimuth, altitude, before, highest, beams.lmax
+        return cls(unknowns, *parts, section.moon_temperature_k)
 
     @classmethod
     def moved(cls, section: HorizonSection, setup: Setup, values: Values) -> Setup:
@@ -206,19 +206,13 @@ class Horizon(ChangedBeams):
         return made.with_signal()
 
     @property
-    def unknowns(self) -> tuple[Unknown, ...]:
-        orders = range(1, self.harmonics + 1)
-        waves = [f"horizon_{wave}_{k}_deg" for k in orders for wave in ("cos", "sin")]
-        return tuple(Unknown(name, 0.0, self.std_deg) for name in ("horizon_deg", *waves))
-
-    @property
     def uniform(self) -> Modes:
         """A sky of the terrain's temperature."""
         return np.eye(1, (self.lmax + 1) ** 2)[0] * (np.sqrt(4.0 * np.pi) * self.moon_k)
 
     def altitude(self, values: Values) -> Altitudes:
         """The altitude in every direction, in radians."""
-        orders = np.arange(1.0, self.harmonics + 1.0)[None, None]
+        orders = np.arange(1.0, 1.0 + len(self.unknowns) // 2)[None, None]
         angle, xp = orders * self.azimuth[..., None], namespace(self.azimuth, *values.values())
         waves = xp.stack([xp.cos(angle), xp.sin(angle)], axis=-1).reshape(*angle.shape[:2], -1)
         series = self.stacked(values) * (np.pi / 180.0)
@@ -230,15 +224,13 @@ class Horizon(ChangedBeams):
         xp = namespace(altitude, self.patterns)
         sign = xp.where(altitude < 0.0, -1.0, 1.0)
         x = 2.0 * xp.minimum(sign * altitude, self.highest) / self.highest - 1.0
-        legendre = [xp.ones_like(x), x]
-        for k in range(1, n):
-            legendre.append(((2 * k + 1) * x * legendre[k] - k * legendre[k - 1]) / (k + 1))
-        # (2 k + 1) times the integral of polynomial k from -1
-        integrals = [x + 1.0, *(legendre[k + 1] - legendre[k - 1] for k in range(1, n))]
         nodes, weights = leggauss(n)
-        lagrange = legvander(nodes, n - 1) * weights[:, None] * (self.highest / 4.0)
-        inside = sign[:, None] * xp.einsum("qk,krj->rqj", lagrange, xp.stack(integrals))
-        return -_rings(n, self.highest).modes(self.patterns[None] * inside[:, None], self.lmax)
+        # Legendre coefficients of Lagrange's polynomials, and of their integrals
+        lagrange = legvander(nodes, n - 1).T * weights * (np.arange(n) + 0.5)[:, None]
+        integrals = legint(lagrange, lbnd=-1) * (self.highest / 2.0)
+        inside = sign[None] * legval(x[None], integrals[:, :, None, None], tensor=False)
+        seen = self.patterns[None] * inside.swapaxes(0, 1)[:, None]
+        return -_rings(n, self.highest).modes(seen, self.lmax)
 
     def modes(self, modes, values):
         """Beams behind terrain with these values, in every run."""

@@ -10,10 +10,8 @@ from typing import Annotated, Any, ClassVar, Literal
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
 from pydantic import Field
 
-from lusee_bayes.core.arrays import Array, scalar
 from lusee_bayes.core.section import Positive, Section
 from lusee_bayes.systematics.context import Around, NoiseAbout, Setup
 from lusee_bayes.systematics.systematic import Scale, Unknown
@@ -59,15 +57,15 @@ class NoiseLevel(Scale):
 
     Attributes
     ----------
-    log_std : () array
-        Prior standard deviation of the natural logarithm of the factor, whose median is one.
+    unknowns : tuple of Unknown
+        The factor, whose median is one.
     """
 
     key: ClassVar[str] = "noise.radiometer"
     section: ClassVar[type[Section]] = RadiometerSection
     draw: ClassVar[int] = 4
 
-    log_std: Float[Array, ""] = eqx.field(converter=scalar)
+    unknowns: tuple[Unknown, ...] = eqx.field()
 
     @classmethod
     def treatment(cls, scenario: Any) -> str | None:
@@ -75,11 +73,7 @@ class NoiseLevel(Scale):
 
     @classmethod
     def build(cls, section: RadiometerSection, setup: Setup, around: Around) -> NoiseLevel:
-        return cls(section.log_factor_std)
-
-    @property
-    def unknowns(self) -> tuple[Unknown, ...]:
-        return (Unknown("noise_level", 1.0, self.log_std, log=True),)
+        return cls((Unknown("noise_level", 1.0, section.log_factor_std, log=True),))
 
     def effect(self, model, values):
         """Scale N by the ratio of variances."""

@@ -93,10 +93,8 @@ class PointingOffsets(Systematic):
 
     Attributes
     ----------
-    offsets : tuple of str
-        Their names (:func:`.offset_names`).
-    errors : (offsets,) array
-        Prior standard deviations, in the units that the names end with.
+    unknowns : tuple of Unknown
+        With the names of :func:`.offset_names`, in the units that these end with.
     expansion_point : (2,) array
         Offsets of clock and drift in :attr:`pointing`.
     pointing : Pointing
@@ -119,8 +117,7 @@ class PointingOffsets(Systematic):
     moves_setup: ClassVar[bool] = True
     has_table: ClassVar[bool] = True
 
-    offsets: tuple[str, ...] = eqx.field(static=True)
-    errors: Float[Array, " offsets"]
+    unknowns: tuple[Unknown, ...] = eqx.field()
     expansion_point: Float[Array, "2"]
     pointing: Pointing
     hours: Float[Array, " times"]
@@ -148,8 +145,7 @@ class PointingOffsets(Systematic):
         observation = with_offsets(setup.observation, back)
         pointing = setup.pointing.placed(observation)
         offsets = cls(
-            tuple(stds),
-            np.array(list(stds.values())),
+            tuple(Unknown(name, 0.0, std) for name, std in stds.items()),
             np.array([values.get(name, 0.0) for name in CLOCK]),
             pointing,
             setup.observation.hours,
@@ -171,14 +167,10 @@ class PointingOffsets(Systematic):
         offsets = {name: value for name, value in values.items() if name in names}
         return shifted(setup, offsets) if offsets else setup
 
-    @property
-    def unknowns(self) -> tuple[Unknown, ...]:
-        return tuple(map(Unknown, self.offsets, np.zeros(len(self.offsets)), self.errors))
-
     def turned(self, values: Values) -> Pointing:
         """The pointing for values by name."""
         clock = dict(zip(CLOCK, self.expansion_point, strict=True))
-        left = {name: values[name] - clock.get(name, 0.0) for name in self.offsets}
+        left = {name: values[name] - clock.get(name, 0.0) for name in self.names}
         return turned_by_offsets(self.pointing, self.hours, left)
 
     def effect(self, model, values):
@@ -245,15 +237,11 @@ def _slopes(offsets: PointingOffsets, centre: Array) -> tuple[Array, Array, Arra
 
 
 def _about(axis: int, angle: float | Array) -> Float[Array, "*batch 3 3"]:
-    """Rotations about an axis by angles in radians."""
-    xp = namespace(angle)
-    cosine, sine, one, zero = xp.cos(angle), xp.sin(angle), xp.ones_like(angle), 0.0 * angle
-    # about x, from y towards z; the others by a cyclic swap
-    rows = [[one, zero, zero], [zero, cosine, -sine], [zero, sine, cosine]]
-    return xp.stack(
-        [xp.stack([rows[(i - axis) % 3][(j - axis) % 3] for j in range(3)], -1) for i in range(3)],
-        -2,
-    )
+    """Rotations about an axis by angles in radians: about x, from y towards z."""
+    xp, unit = namespace(angle), np.eye(3)
+    slope = np.cross(unit, unit[axis])
+    factors = xp.stack([xp.ones_like(angle), xp.sin(angle), 1.0 - xp.cos(angle)], axis=-1)
+    return xp.tensordot(factors, np.stack([unit, slope, slope @ slope]), 1)
 
 
 class MovingSources(eqx.Module):

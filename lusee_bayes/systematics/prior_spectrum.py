@@ -12,15 +12,14 @@ from typing import Annotated, Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 from pydantic import Field
 
-from lusee_bayes.core.arrays import Array, scalar
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.section import Positive, Section, requires
 from lusee_bayes.sky.prior import HarmonicPrior
 from lusee_bayes.systematics.context import Around, Setup
-from lusee_bayes.systematics.systematic import Scale, Truth, Unknown, scalar_or_none
+from lusee_bayes.systematics.systematic import Scale, Truth, Unknown
 
 # the ell at which the amplitude of the spectrum is defined, plus one
 PIVOT = 10.0
@@ -66,24 +65,18 @@ class PriorSpectrum(Scale):
 
     Attributes
     ----------
-    log_amplitude_std : () array, optional
-        Prior standard deviation of ln A; None if A is known.
-    tilt_std : () array, optional
-        Prior standard deviation of the tilt; None if it is known.
+    unknowns : tuple of Unknown
+        The sites ``amplitude`` and ``tilt``, or ``band_power``: lowest ells first.
     edges : tuple of int
         First ell of every band except the lowest, increasing; empty for no bands.
-    log_band_std : () array
-        Prior standard deviation of the natural logarithm of each band's factor.
     """
 
     key: ClassVar[str] = "prior"
     # its true values are the sky's own
     moves_setup: ClassVar[bool] = True
 
-    log_amplitude_std: Float[Array, ""] | None = eqx.field(default=None, converter=scalar_or_none)
-    tilt_std: Float[Array, ""] | None = eqx.field(default=None, converter=scalar_or_none)
-    edges: tuple[int, ...] = eqx.field(static=True, default=())
-    log_band_std: Float[Array, ""] = eqx.field(default=1.0, converter=scalar)
+    unknowns: tuple[Unknown, ...] = eqx.field()
+    edges: tuple[int, ...] = eqx.field(static=True)
 
     @classmethod
     def treatment(cls, scenario: Any) -> str | None:
@@ -91,25 +84,18 @@ class PriorSpectrum(Scale):
 
     @classmethod
     def build(cls, section: SpectrumSection, setup: Setup, around: Around) -> PriorSpectrum:
-        stds = section.log_amplitude_std, section.tilt_std
-        return cls(*stds, section.band_edges, section.log_band_std)
+        sites, n_bands = [], len(section.band_edges) + 1
+        if section.log_amplitude_std is not None:
+            sites.append(Unknown("amplitude", 1.0, section.log_amplitude_std, log=True))
+        if section.tilt_std is not None:
+            sites.append(Unknown("tilt", 0.0, section.tilt_std))
+        if section.band_edges:
+            sites.append(Unknown("band_power", 1.0, section.log_band_std, n_bands, log=True))
+        return cls(tuple(sites), section.band_edges)
 
     @classmethod
     def truth(cls, section: Any, setup: Setup, key: PRNGKeyArray) -> Truth:
         return {}
-
-    @property
-    def unknowns(self) -> tuple[Unknown, ...]:
-        """The sites ``amplitude`` and ``tilt``, or ``band_power``: lowest ells first."""
-        sites = []
-        if self.log_amplitude_std is not None:
-            sites.append(Unknown("amplitude", 1.0, self.log_amplitude_std, log=True))
-        if self.tilt_std is not None:
-            sites.append(Unknown("tilt", 0.0, self.tilt_std))
-        if self.edges:
-            n_bands = len(self.edges) + 1
-            sites.append(Unknown("band_power", 1.0, self.log_band_std, n_bands, log=True))
-        return tuple(sites)
 
     def effect(self, model, values):
         """Multiply C_ell by the factor of each ell.

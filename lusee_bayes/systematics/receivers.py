@@ -18,7 +18,7 @@ from lusee_bayes.core.section import Megahertz, Positive, Section, Treatment, re
 from lusee_bayes.instrument.beams.source import BeamSource
 from lusee_bayes.instrument.products import auto_indices
 from lusee_bayes.systematics.context import Around, Setup
-from lusee_bayes.systematics.systematic import Temperatures, Truth
+from lusee_bayes.systematics.systematic import Temperatures, Truth, Unknown
 
 # number of cosines and sines in a smooth spectrum
 N_WAVES = 512
@@ -96,8 +96,9 @@ class Receivers(Temperatures):
     def build(cls, section: ReceiverNoiseSection, setup: Setup, around: Around) -> Receivers:
         powers = section.powers(setup.beam_source, setup.frequency_mhz)
         on_auto = np.asarray(setup.layout.product)[:, None] == auto_indices(len(powers))[None]
-        sites = tuple(f"receiver_{port}_k" for port in range(len(powers)))
-        return cls(sites, powers, section.relative_std * powers, on_auto.astype(np.float64))
+        sites = [f"receiver_{port}_k" for port in range(len(powers))]
+        unknowns = tuple(map(Unknown, sites, powers, section.relative_std * powers))
+        return cls(unknowns, on_auto.astype(np.float64))
 
     @classmethod
     def truth(cls, section: ReceiverNoiseSection, setup: Setup, key: PRNGKeyArray) -> Truth:

@@ -13,7 +13,7 @@ from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.section import Positive, Section, Treatment
 from lusee_bayes.instrument.beams.source import BeamSource
 from lusee_bayes.systematics.context import Around, Setup
-from lusee_bayes.systematics.systematic import Temperatures
+from lusee_bayes.systematics.systematic import Temperatures, Unknown
 
 
 class RegolithSection(Section):
@@ -44,8 +44,8 @@ class RegolithTemperature(Temperatures):
     def build(cls, section: RegolithSection, setup: Setup, around: Around):
         added = ground_per_kelvin(setup.beam_source, setup.beams.frequency_mhz)
         seen = added[np.asarray(setup.layout.product)]
-        mean = np.array([setup.scenario.beam.moon_temperature_k])
-        return cls(("regolith_k",), mean, np.array([section.std_k]), seen[:, None])
+        mean = setup.scenario.beam.moon_temperature_k
+        return cls((Unknown("regolith_k", mean, section.std_k),), seen[:, None])
 
 
 def ground_per_kelvin(source: BeamSource, frequency_mhz: float) -> Float[Array, " products"]:

@@ -128,14 +128,10 @@ class PointSources(Systematic):
 
     Attributes
     ----------
+    unknowns : tuple of Unknown
+        A site for each source, ``flux_Cas_A``, with its flux in K sr, or that of each block.
     columns : (data, fluxes) array
         Response to 1 K sr of each source in each of its blocks of time, in K per K sr.
-    fluxes, errors : (sources,) array
-        Means and standard deviations of the priors, in K sr.
-    sites : tuple of str
-        A site for each source: ``flux_Cas_A``.
-    n_blocks : tuple of int
-        Number of fluxes of each source.
     """
 
     key: ClassVar[str] = "sources"
@@ -145,11 +141,8 @@ class PointSources(Systematic):
     changes_coupling: ClassVar[bool] = False
     has_table: ClassVar[bool] = True
 
+    unknowns: tuple[Unknown, ...] = eqx.field()
     columns: Float[Array, "data fluxes"]
-    fluxes: Float[Array, " sources"]
-    errors: Float[Array, " sources"]
-    sites: tuple[str, ...] = eqx.field(static=True)
-    n_blocks: tuple[int, ...] = eqx.field(static=True)
 
     @classmethod
     def treatment(cls, scenario: Any) -> str | None:
@@ -157,26 +150,23 @@ class PointSources(Systematic):
 
     @classmethod
     def build(cls, section: SourcesSection, setup: Setup, around: Around) -> PointSources:
-        columns, n_blocks = [], []
+        columns, unknowns = [], []
         for one, response in zip(section.list, setup.responses, strict=True):
-            block = one.blocks(setup.observation)
-            n_blocks.append(int(block.max()) + 1)
-            for number in range(n_blocks[-1]):
+            block, flux = (
+                one.blocks(setup.observation),
+                np.float64(one.mean_flux(setup.frequency_mhz)),
+            )
+            n_blocks = int(block.max()) + 1
+            for number in range(n_blocks):
                 columns.append(setup.layout.gather(np.where(block == number, response, 0.0)))
-        fluxes = np.array([one.mean_flux(setup.frequency_mhz) for one in section.list])
-        errors = np.array([one.relative_std for one in section.list]) * fluxes
-        sites = tuple(f"flux_{one.name.replace(' ', '_')}" for one in section.list)
-        return cls(np.stack(columns, axis=1), fluxes, errors, sites, tuple(n_blocks))
-
-    @property
-    def unknowns(self) -> tuple[Unknown, ...]:
-        sizes = [None if n == 1 else n for n in self.n_blocks]
-        return tuple(map(Unknown, self.sites, self.fluxes, self.errors, sizes))
+            site, size = f"flux_{one.name.replace(' ', '_')}", None if n_blocks == 1 else n_blocks
+            unknowns.append(Unknown(site, flux, one.relative_std * flux, size))
+        return cls(tuple(unknowns), np.stack(columns, axis=1))
 
     def drawn(self, key):
         """Draw the fluxes of every source with a separate key."""
-        keys = zip(jax.random.split(key, len(self.sites)), self.n_blocks, strict=True)
-        return np.concatenate([jax.random.normal(one, (n,)) for one, n in keys])
+        keys = zip(jax.random.split(key, len(self.unknowns)), self.unknowns, strict=True)
+        return np.concatenate([jax.random.normal(one, (u.size or 1,)) for one, u in keys])
 
     def effect(self, model, values):
         """Add every source, with the flux of each block in K sr."""

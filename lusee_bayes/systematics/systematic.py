@@ -34,7 +34,7 @@ from __future__ import annotations
 import zlib
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from operator import attrgetter
 from statistics import NormalDist
 from typing import Any, ClassVar
@@ -116,8 +116,7 @@ class Chart(eqx.Module):
         """Compute the coordinates of unconstrained values by site."""
 
 
-@dataclass(frozen=True)
-class Unknown:
+class Unknown(eqx.Module):
     """An unknown number, or several of the same kind: a site of programs.
 
     Attributes
@@ -134,13 +133,13 @@ class Unknown:
         Ends of the domain, at which the prior is cut off.
     """
 
-    name: str
+    name: str = eqx.field(static=True)
     mean: float | Float[Array, ""] = 0.0
     std: float | Float[Array, ""] = 1.0
-    size: int | None = None
-    log: bool = False
-    low: float = -np.inf
-    high: float = np.inf
+    size: int | None = eqx.field(default=None, static=True)
+    log: bool = eqx.field(default=False, static=True)
+    low: float = eqx.field(default=-np.inf, static=True)
+    high: float = eqx.field(default=np.inf, static=True)
 
     def prior(self) -> dist.Distribution:
         """Return the prior of all its numbers.
@@ -183,6 +182,8 @@ class Systematic(eqx.Module):
 
     Attributes
     ----------
+    unknowns : tuple of Unknown
+        The sites, with their priors; a field or a property of the subclass.
     key : str
         Path of its section in a scenario, such as ``noise.gain``.
     section : type
@@ -211,6 +212,7 @@ class Systematic(eqx.Module):
         Whether a parameter of its prior is learned in rounds, as in :meth:`.FieldErrors.relearned`.
     """
 
+    unknowns: ClassVar[tuple[Unknown, ...]] = ()
     key: ClassVar[str] = ""
     section: ClassVar[type[Section]]
     words: ClassVar[str] = "a systematic"
@@ -328,11 +330,6 @@ class Systematic(eqx.Module):
     # --- its unknowns ---
 
     @property
-    def unknowns(self) -> tuple[Unknown, ...]:
-        """The sites, with their priors."""
-        return ()
-
-    @property
     def names(self) -> tuple[str, ...]:
         """Names of all unknown numbers."""
         return tuple(
@@ -362,12 +359,9 @@ class Systematic(eqx.Module):
 
     def values(self, z: Float[Array, " n"]) -> dict[str, float | Float[Array, "..."]]:
         """Values by site, from numbers in prior standard deviations from the prior mean."""
-        by_site, first = {}, 0
-        for u in self.unknowns:
-            numbers = z[first] if u.size is None else z[first : first + u.size]
-            by_site[u.name] = u.at(numbers)
-            first += u.size or 1
-        return by_site
+        ends = np.cumsum([u.size or 1 for u in self.unknowns], dtype=int)
+        parts = zip(self.unknowns, namespace(z).split(z, ends[:-1]), strict=False)
+        return {u.name: u.at(part[0] if u.size is None else part) for u, part in parts}
 
     def stacked(self, values: Values) -> Float[Array, " n"]:
         """Values by site as one array."""
@@ -517,9 +511,8 @@ class Systematic(eqx.Module):
         LinearGaussian
             The model given the values of its sites.
         """
-        return self.effect(
-            model, {u.name: numpyro.sample(u.name, u.prior()) for u in self.unknowns}
-        )
+        values = {u.name: numpyro.sample(u.name, u.prior()) for u in self.unknowns}
+        return self.effect(model, values)
 
 
 class Marginalised(eqx.Module):
@@ -604,14 +597,11 @@ class Expanded(Marginalised):
         columns = columns if gains is None else columns * gains[:, None]
         return cls(systematic, centre, columns, expected, shift)
 
-    def seen(self, model: LinearGaussian) -> LinearGaussian:
-        """The model at z_0."""
-        return self.systematic.effect(model, self.systematic.values(self.centre))
-
     def marginalised(self, model: LinearGaussian) -> LinearGaussian:
         """Apply the effect at z_0, add T T^T to N and T (expected - z_0) to the mean."""
         noise = model.noise + LowRankCovariance(self.columns, self.systematic.words)
-        return with_added(replace(self.seen(model), noise=noise), self.shift)
+        at_centre = self.systematic.effect(model, self.systematic.values(self.centre))
+        return with_added(replace(at_centre, noise=noise), self.shift)
 
 
 @eqx.filter_jit
@@ -716,10 +706,8 @@ class Temperatures(Systematic):
 
     Attributes
     ----------
-    sites : tuple of str
-        Their names, which end with ``_k``.
-    expectation, errors : (n,) array
-        Means and standard deviations of the priors, in K.
+    unknowns : tuple of Unknown
+        With names that end with ``_k``, in K.
     per_kelvin : (data, n) array
         Contribution of each kelvin to the data.
     """
@@ -727,22 +715,17 @@ class Temperatures(Systematic):
     unit: ClassVar[str] = "K"
     changes_coupling: ClassVar[bool] = False
 
-    sites: tuple[str, ...] = eqx.field(static=True)
-    expectation: Float[Array, " n"]
-    errors: Float[Array, " n"]
+    unknowns: tuple[Unknown, ...] = eqx.field()
     per_kelvin: Float[Array, "data n"]
 
     @property
-    def unknowns(self) -> tuple[Unknown, ...]:
-        return tuple(map(Unknown, self.sites, self.expectation, self.errors))
-
-    @property
     def labels(self) -> tuple[str, ...]:
-        return tuple(name.removesuffix("_k").replace("_", " ") for name in self.sites)
+        return tuple(name.removesuffix("_k").replace("_", " ") for name in self.names)
 
     def effect(self, model, values):
         """Add the emission of their deviations from the means."""
-        return with_added(model, self.per_kelvin @ (self.stacked(values) - self.expectation))
+        deviations = {u.name: values[u.name] - u.mean for u in self.unknowns}
+        return with_added(model, self.per_kelvin @ self.stacked(deviations))
 
 
 class Scale(Systematic):
@@ -775,8 +758,3 @@ def multiplied(model: LinearGaussian, response: DataVector) -> LinearGaussian:
         root = (noise.update.root.T * response[None]).T
         noise = replace(noise, update=replace(noise.update, root=root))
     return replace(model, coupling=coupling, noise=noise, offset=offset)
-
-
-def scalar_or_none(value: float | Float[Array, ""] | None) -> Float[Array, ""] | None:
-    """Convert a number like :func:`scalar`; None stays None."""
-    return None if value is None else scalar(value)

@@ -194,7 +194,7 @@ def test_sites_of_the_antennas_parameters(instrument, base):
     known = {name: instrument.source.parameter(name) for name in STDS}
     bounds = {k: {"low": float(p.low), "high": float(p.high)} for k, p in known.items()}
     priors = (Unknown(k, float(p.value), STDS[k], **bounds[k]) for k, p in known.items())
-    systematic = InstrumentParameters(instrument, tuple(priors))
+    systematic = InstrumentParameters(tuple(priors), instrument)
     values = {"surface_permittivity": 3.2, "zenith_angle_deg": 76.0, "turntable_offset_deg": -0.4}
     arrays = {name: jnp.asarray(value) for name, value in values.items()}
     with (

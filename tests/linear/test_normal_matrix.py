@@ -111,15 +111,15 @@ def test_products_without_weight_take_no_part(blocks):
     close(summed(coupling, weights if blocks else np.einsum("kkt->kt", weights)), expected, 1e-12)
 
 
-def test_what_has_no_structure_is_refused():
+def test_without_structure():
     coupling = setting()
-    layout = coupling.layout
-    diagonal = noise_of("diagonal", layout)
+    diagonal = noise_of("diagonal", coupling.layout)
     dense = cov.DenseCovariance(diagonal.dense())
-    for noise in (dense, dense + cov.LowRankCovariance(jnp.ones((layout.size, 1)))):
-        refuse("no structure in time", normal_matrix, coupling, noise)
-    response = coupling.with_response(jnp.ones(layout.size))
-    refuse("separate response", normal_matrix, response, diagonal)
+    more = dense + cov.LowRankCovariance(jnp.ones((dense.size, 1)))
+    response = coupling.with_response(jnp.linspace(1.0, 2.0, dense.size))
+    for made, noise in ((coupling, dense), (coupling, more), (response, diagonal)):
+        a = np.asarray(made.dense())
+        close(normal_matrix(made, noise), a.T @ np.linalg.solve(noise.dense(), a), 1e-12)
     refuse("N has shape", normal_matrix, coupling, lb.DiagonalCovariance(jnp.ones(7)))
 
 

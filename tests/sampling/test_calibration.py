@@ -49,9 +49,9 @@ def assert_calibrated(ranks: validation.Ranks) -> None:
 # --- ranks ------------------------------------------------------------------------------------
 
 
-def ranks_of(*columns, n_draws=99, regions=()) -> validation.Ranks:
+def ranks_of(*columns, regions=()) -> validation.Ranks:
     names = tuple("abcdefgh"[: len(columns)])
-    return validation.Ranks(np.stack(columns, axis=1), n_draws, names, regions)
+    return validation.Ranks(np.stack(columns, axis=1), names, regions)
 
 
 def test_the_histogram_has_twenty_bins_of_five_ranks():
@@ -150,7 +150,6 @@ def test_ranks_count_the_draws_below_the_truth():
     options = {"n_simulations": 130, "batch": 60, "stages": stages}
     ranks = validation.calibrate(simulate, draw, lambda sky, data: sky, **options)
     assert ranks.names == ("x 0", "x 1", "x 2", "y")
-    assert ranks.n_draws == validation.N_DRAWS
     # 37 of 1, 2, ... lie below 37.5; 97 below 98
     np.testing.assert_array_equal(ranks.ranks, np.tile([37, 0, validation.N_DRAWS, 97], (130, 1)))
     assert stages.done == [1, 2, 3]  # batches

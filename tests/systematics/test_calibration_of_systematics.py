@@ -235,7 +235,7 @@ def test_simulation_based_calibration(response_file):
         shares.append(report.null.share)
     names = [f"mode {k}" for k in MODES] + [f"receiver {port}" for port in range(4)]
     names += ["regolith", *(f"gain {port}" for port in range(4))]
-    table = Ranks(np.array(ranks), N_DRAWS, tuple(names))
+    table = Ranks(np.array(ranks), tuple(names))
     assert table.passed, dict(zip(names, table.p_values(), strict=True))
     # the direction that the data do not tell scatters as its share of the prior says
     assert min(shares) > 0.9

@@ -20,9 +20,9 @@ from lusee_bayes.noise.covariance import Covariance, DenseCovariance, LowRankCov
 from lusee_bayes.noise.instrument_errors import difference
 from lusee_bayes.sampling.programs import numpyro_promotion
 from lusee_bayes.systematics import systematic
-from lusee_bayes.systematics.context import Around
-from lusee_bayes.systematics.noise_level import NoiseLevel
-from lusee_bayes.systematics.prior_spectrum import PriorSpectrum
+from lusee_bayes.systematics.context import Around, Setup
+from lusee_bayes.systematics.noise_level import NoiseLevel, RadiometerSection
+from lusee_bayes.systematics.prior_spectrum import PriorSpectrum, SpectrumSection
 from lusee_bayes.systematics.sources import PointSources
 
 LMAX, N_DATA = 4, 40
@@ -73,19 +73,23 @@ def steep(tilt):
     return ((ELLS + 1) / 10) ** tilt
 
 
-def bands(*edges):
-    return PriorSpectrum(edges=edges, log_band_std=0.8)
+# neither the spectrum nor the level depends on the setup
+def spectrum(*edges, **options):
+    section = SpectrumSection(band_edges=edges, log_band_std=0.8, **options)
+    return PriorSpectrum.build(section, object.__new__(Setup), Around())
 
 
+LEVEL = NoiseLevel.build(RadiometerSection(log_factor_std=0.7), object.__new__(Setup), Around())
+BOTH = spectrum(log_amplitude_std=0.4, tilt_std=0.6)
 FACTORS = [
-    (NoiseLevel(0.7), {"noise_level": 0.2}, [0.7], 1.0),
-    (NoiseLevel(0.7), {"noise_level": 7.0}, [0.7], 1.0),
-    (PriorSpectrum(0.4), {"amplitude": 5.0}, [0.4], 5.0),
-    (PriorSpectrum(tilt_std=0.6), {"tilt": -1.0}, [0.6], steep(-1.0)),
-    (PriorSpectrum(0.4, 0.6), {"amplitude": 0.3, "tilt": 1.4}, [0.4, 0.6], 0.3 * steep(1.4)),
+    (LEVEL, {"noise_level": 0.2}, [0.7], 1.0),
+    (LEVEL, {"noise_level": 7.0}, [0.7], 1.0),
+    (spectrum(log_amplitude_std=0.4), {"amplitude": 5.0}, [0.4], 5.0),
+    (spectrum(tilt_std=0.6), {"tilt": -1.0}, [0.6], steep(-1.0)),
+    (BOTH, {"amplitude": 0.3, "tilt": 1.4}, [0.4, 0.6], 0.3 * steep(1.4)),
     # an edge is the first ell of its band; the lowest begins at 0, the highest ends it
-    (bands(2), {"band_power": [0.5, 3.0]}, [0.8], [0.5, 0.5, 3.0, 3.0, 3.0]),
-    (bands(1, 2, 4), {"band_power": [4.0, 0.3, 1.5, 0.7]}, [0.8], [4.0, 0.3, 1.5, 1.5, 0.7]),
+    (spectrum(2), {"band_power": [0.5, 3.0]}, [0.8], [0.5, 0.5, 3.0, 3.0, 3.0]),
+    (spectrum(1, 2, 4), {"band_power": [4.0, 0.3, 1.5, 0.7]}, [0.8], [4.0, 0.3, 1.5, 1.5, 0.7]),
 ]
 
 
@@ -117,30 +121,25 @@ def test_several_at_once(case):
     """Noise level, bands and a source with two amplitudes; what is marginalised keeps its place."""
     rng = np.random.default_rng(8)
     columns, other = rng.normal(size=(N_DATA, 2)), rng.normal(size=(N_DATA, 1))
-    source, hidden = (
-        PointSources(jnp.asarray(seen), np.array([mean]), np.array([std]), (site,), (n,))
-        for seen, mean, std, site, n in [
-            (columns, 2.0, 0.5, "flux_Cas_A", 2),
-            (other, 3.0, 4.0, "flux_Vir_A", 1),
-        ]
-    )
+    source = PointSources((systematic.Unknown("flux_Cas_A", 2.0, 0.5, 2),), jnp.asarray(columns))
+    hidden = PointSources((systematic.Unknown("flux_Vir_A", 3.0, 4.0),), jnp.asarray(other))
     level, power, flux = 2.5, np.array([0.6, 1.9]), np.array([1.2, 2.9])
     values = {"noise_level": level, "band_power": power, "flux_Cas_A": flux}
     priors = lognorm.logpdf(level, 0.7) + lognorm.logpdf(power, 0.8).sum()
     priors += norm.logpdf(flux, 2.0, 0.5).sum()
     factors = np.array([0.6, 0.6, 0.6, 1.9, 1.9])
     mean, term = columns @ flux + 3.0 * other[:, 0], 16.0 * other @ other.T
-    levels, bands = NoiseLevel(0.7), PriorSpectrum(edges=(3,), log_band_std=0.8)
+    hidden = systematic.Marginalised(hidden)
     # the order of those that do not touch the noise is all the same
     for order in (
-        [levels, bands, source, systematic.Marginalised(hidden)],
-        [source, levels, systematic.Marginalised(hidden), bands],
+        [LEVEL, spectrum(3), source, hidden],
+        [source, LEVEL, hidden, spectrum(3)],
     ):
         expected = case.evidence(factors, level, term, mean) + priors
         assert general(case, order, values) == pytest.approx(expected, rel=CLOSE)
     # a level behind the marginalised source scales that, too
     expected = case.evidence(factors, level, level * term, mean) + priors
-    got = general(case, [bands, systematic.Marginalised(hidden), levels, source], values)
+    got = general(case, [spectrum(3), hidden, LEVEL, source], values)
     assert got == pytest.approx(expected, rel=CLOSE)
 
 

@@ -253,7 +253,7 @@ def test_bands_beyond_the_highest_ell():
     # 6 is the highest ell itself
     base = replace(models.base_model(e.setup), prior=lb.HarmonicPrior(jnp.ones(7)))
     with handlers.seed(rng_seed=0):
-        PriorSpectrum(edges=(3, 6)).sampled(base)
+        PriorSpectrum((Unknown("band_power", 1.0, 1.0, 3, log=True),), (3, 6)).sampled(base)
 
 
 # --- programs that do not fit the scenario --------------------------------------------------------
