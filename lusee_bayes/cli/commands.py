@@ -596,7 +596,6 @@ def export_command(
     quiet
         Print only errors.
     """
-    from lusee_bayes.core.errors import InputError
     from lusee_bayes.runs.export_run import BLANK, METADATA, run_export, write_skyh5
 
     if (release is None) == (skyh5 is None):

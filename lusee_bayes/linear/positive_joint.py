@@ -49,8 +49,8 @@ SETTLED, SETTLED_LAW = 0.1, 0.05
 MAX_ROUNDS, HALVINGS = 60, 20
 
 
-# arrays by name, and their shapes
-Arrays, Shapes = dict[str, np.ndarray], dict[str, tuple[int, ...]]
+# arrays by name
+Arrays = dict[str, np.ndarray]
 # called with the number of every round, and how far it moved
 Report = Callable[[int, str], None] | None
 # functions of a channel's number and information
@@ -62,7 +62,7 @@ Linearised = Callable[[int, Information], Information]
 class Channels(Protocol):
     """The channels of a joint posterior, wherever their data are."""
 
-    def each(self, function: OfChannel, shapes: Shapes) -> Arrays:
+    def each(self, function: OfChannel) -> Arrays:
         """Call a function with number and information of every channel, and stack its arrays."""
 
     def summed(
@@ -83,10 +83,10 @@ class ChannelsInMemory:
 
     informations: tuple[Information, ...]
 
-    def each(self, function: OfChannel, shapes: Shapes) -> Arrays:
+    def each(self, function: OfChannel) -> Arrays:
         """Call a function with number and information of every channel, and stack its arrays."""
         parts = [function(k, information) for k, information in enumerate(self.informations)]
-        return {name: np.stack([part[name] for part in parts]) for name in shapes}
+        return {name: np.stack([part[name] for part in parts]) for name in parts[0]}
 
     def summed(
         self, prior: SpectralPrior, reference: Exponents, function: Linearised
@@ -230,13 +230,10 @@ def find_joint_mode(
     start = np.concatenate([np.zeros(len(skies.names) * skies.n_fields), shared])
     exponents = np.tile(np.append(np.zeros(skies.n_fields), shared), (len(skies.levels), 1))
     point = _Point(start, exponents, _chi2(skies, channels, exponents))
-    shapes: Shapes = {"exponent": exponents.shape[1:], "chi2": ()}
-    if learn:
-        shapes |= dict.fromkeys(("power", "known"), (skies.grid.lmax + 1,))
     last = np.zeros_like(laws.parameters)
     for rounds in range(MAX_ROUNDS):
         prior = laws.prior(skies)
-        posterior, mean, arrays = _linear_round(skies, channels, prior, point.exponents, shapes)
+        posterior, mean, arrays = _linear_round(skies, channels, prior, point.exponents, learn)
         energy = point.energy(prior)
         moved = np.sqrt(max(energy - mean.energy(prior), 0.0))
         if report is not None:
@@ -263,7 +260,7 @@ def _chi2(skies: PositiveSkies, channels: Channels, exponents: Exponents) -> flo
         diffuse = diffuse_part(skies, channel, information).without()
         return {"chi2": np.asarray(diffuse.chi2(_whole(skies, channel, exponents[channel])))}
 
-    return float(channels.each(chi2, {"chi2": ()})["chi2"].sum())
+    return float(channels.each(chi2)["chi2"].sum())
 
 
 def _linear_round(
@@ -271,7 +268,7 @@ def _linear_round(
     channels: Channels,
     prior: SpectralPrior,
     exponents: Exponents,
-    shapes: Shapes,
+    learn: bool,
 ) -> tuple[Posterior, _Point, Arrays]:
     """Posterior of skies that are linear about exponents, its mean, and every channel there."""
 
@@ -281,12 +278,12 @@ def _linear_round(
     information = channels.summed(prior, exponents, relative)
     posterior = joint.component_posterior(information, prior)
     mean = np.asarray(posterior.mean)
-    spread = joint.paired(posterior.covariance(), prior) if "power" in shapes else None
+    spread = joint.paired(posterior.covariance(), prior) if learn else None
 
     def judged(channel: int, information: Information) -> Arrays:
         return _judged(prior, channel, relative(channel, information), mean, spread)
 
-    arrays = channels.each(judged, shapes)
+    arrays = channels.each(judged)
     return posterior, _Point(mean, arrays["exponent"], float(arrays["chi2"].sum())), arrays
 
 
@@ -435,8 +432,7 @@ def _large_scales(skies: PositiveSkies, channels: Channels, n: int) -> ChannelsI
             information = integrated_out(information, n, per_mode(power)[n:])
         return {name: getattr(information, name) for name in names}
 
-    shapes = dict(zip(names, ((n, n), (n,), (n,), (), (), ()), strict=True))
-    arrays = channels.each(large, shapes)
+    arrays = channels.each(large)
     return ChannelsInMemory(
         tuple(
             Information(*(np.asarray(arrays[name][k]) for name in names))

@@ -25,11 +25,12 @@ from lusee_bayes.core.arrays import use_compilation_cache
 from lusee_bayes.core.errors import InputError, WorkersLost
 from lusee_bayes.core.formats import write_netcdf
 from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.version import __version__
 from lusee_bayes.experiment.data_files import Data, digest_of, files_of, names_of_data
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.report.figures.drawing import named_parts, save
 from lusee_bayes.report.pages import PAGES, REPORT
-from lusee_bayes.results.finished_runs import Provenance
+from lusee_bayes.results.finished_runs import Provenance, text_hash
 
 Origin = Mapping[str, str]
 
@@ -66,6 +67,11 @@ def origin_of(
         names = ", ".join(f"'{Path(name).name}'" for name in names_of_data(data))
         origin["data"] = f"{names} ({digest_of(data)[:12]})"
     return origin | {name: str(value) for name, value in others.items() if value is not None}
+
+
+def identity_of(scenario: Scenario, *inputs: object) -> str:
+    """Digest of everything that determines results: scenario, other inputs, and version."""
+    return text_hash(json.dumps([scenario.to_yaml(), *map(str, inputs), __version__]))
 
 
 def inputs_of(
