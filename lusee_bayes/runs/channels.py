@@ -190,20 +190,13 @@ class ChannelInformation:
                 unknowns = unknowns.given_all(tied, number, sky.mean, sky.covariance)
                 data = data.given(unknowns.table(mean, covariance))
             report = unknowns.report(mean, covariance, joint=True)
-        return channel_result(
-            data,
-            mean,
-            covariance,
-            drawn[:n_draws],
-            information.log_likelihood(sky.draws[:n_draws]),
-            drawn - mean,
-            unknowns=report,
-            instrument=unknowns,
-            joint=drawn,
-            independent=np.asarray(self.information.reference),
-            covariance_kept=scenario.output.covariance,
-            **information.fit(sky.mean, sky.covariance),
-        )
+        likely = information.log_likelihood(sky.draws[:n_draws])
+        more = {"unknowns": report, "instrument": unknowns, "joint": drawn}
+        more |= information.fit(sky.mean, sky.covariance)
+        more["independent"] = np.asarray(self.information.reference)
+        more["covariance_kept"] = scenario.output.covariance
+        given = data, mean, covariance, drawn[:n_draws], likely, drawn - mean
+        return channel_result(*given, **more)
 
 
 # number of channels that one task sums, one after the other
@@ -318,17 +311,10 @@ def solve_components(
             posterior = joint.component_posterior(information, prior)
             chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
             moved = float(posterior.refinement)
-        return Components(
-            prior,
-            np.asarray(posterior.mean),
-            jax.block_until_ready(joint.paired(posterior.covariance(), prior)),
-            posterior.sample(draw_key(scenario), n_draws),
-            chi2,
-            float(posterior.log_evidence),
-            float(posterior.information_bits()),
-            moved,
-            mode=mode,
-        )
+        spread = jax.block_until_ready(joint.paired(posterior.covariance(), prior))
+        drawn = posterior.sample(draw_key(scenario), n_draws)
+        figures = chi2, float(posterior.log_evidence), float(posterior.information_bits()), moved
+        return Components(prior, np.asarray(posterior.mean), spread, drawn, *figures, mode)
 
 
 # folded into the random key of the draws; channel numbers are smaller
@@ -457,20 +443,13 @@ class ChannelAlone:
         gained = np.linalg.slogdet(np.eye(len(shared)) + (covariance - v) @ sky_share)[1]
         bits = self.figures["information_bits"] - 0.5 * gained / np.log(2.0)
         information = information_given(self.information, amplitudes, precision, vector, expansion)
-        n_draws = scenario.output.draws
-        skies = moved + deviations[:n_draws]
-        return channel_result(
-            self.known.given(unknowns.table(moved, left)),
-            moved,
-            left,
-            skies,
-            information.log_likelihood(skies),
-            deviations[n_draws:],
-            unknowns=unknowns.report(moved, left),
-            instrument=unknowns,
-            common=gain @ tied.root[number, at],
-            **(self.figures | information.fit(moved, left) | {"information_bits": float(bits)}),
-        )
+        drawn, compared = np.split(deviations, [scenario.output.draws])
+        skies, data = moved + drawn, self.known.given(unknowns.table(moved, left))
+        more = self.figures | information.fit(moved, left) | {"information_bits": float(bits)}
+        more |= {"unknowns": unknowns.report(moved, left), "instrument": unknowns}
+        more["common"] = gain @ tied.root[number, at]
+        likely = information.log_likelihood(skies)
+        return channel_result(data, moved, left, skies, likely, compared, **more)
 
 
 def tie_channels(

@@ -376,7 +376,23 @@ def check_prior(prior: Prior, covariance: np.ndarray, mean: np.ndarray | None = 
     close(traced["sandwich"], root.T @ inputs[3] @ root)
     close(traced["colour_covariance"], root @ inputs[2] @ root.T)
     expected = np.zeros(n) if mean is None else mean
-    _check_inverse(prior, covariance, root, u, a @ root)
+    powerless = np.diag(covariance) == 0
+    for one in (on_host(prior), on_device(prior)):
+        back = np.asarray(one.whiten(one.colour(u)))
+        close(back, np.where(powerless, 0.0, u))
+        close(one.whiten(one.colour(u[0, 0])), back[0, 0])
+        restored = np.asarray(one.whiten_columns(a @ root))
+        close(restored @ root, a @ root)
+        whole = one.sandwich(one.whitened_sandwich(u[0].T @ u[0]))
+        close(whole, np.where(np.outer(~powerless, ~powerless), u[0].T @ u[0], 0.0))
+        assert (restored[:, powerless] == 0.0).all()
+    if powerless.any():
+        assert_refused(prior.require_density)
+        assert_refused(prior.log_det)
+    else:
+        prior.require_density()
+        log_det = 0.5 * np.linalg.slogdet(covariance)[1]
+        np.testing.assert_allclose(prior.log_det(), log_det, atol=TOL)
     close(prior.colour(prior.white_mean), expected)
     wide = prior.widened(3.0)
     close(wide.covariance(), 9.0 * covariance)
@@ -396,27 +412,6 @@ def _numbers_of_prior(prior: Prior, u, a, white, matrix):
         "sandwich": prior.sandwich(matrix),
         "colour_covariance": prior.colour_covariance(white),
     }
-
-
-def _check_inverse(
-    prior: Prior, covariance: np.ndarray, root: np.ndarray, u: np.ndarray, columns: np.ndarray
-) -> None:
-    powerless = np.diag(covariance) == 0
-    for one in (on_host(prior), on_device(prior)):
-        back = np.asarray(one.whiten(one.colour(u)))
-        close(back, np.where(powerless, 0.0, u))
-        close(one.whiten(one.colour(u[0, 0])), back[0, 0])
-        restored = np.asarray(one.whiten_columns(columns))
-        close(restored @ root, columns)
-        whole = one.sandwich(one.whitened_sandwich(u[0].T @ u[0]))
-        close(whole, np.where(np.outer(~powerless, ~powerless), u[0].T @ u[0], 0.0))
-        assert (restored[:, powerless] == 0.0).all()
-    if powerless.any():
-        assert_refused(prior.require_density)
-        assert_refused(prior.log_det)
-        return
-    prior.require_density()
-    np.testing.assert_allclose(prior.log_det(), 0.5 * np.linalg.slogdet(covariance)[1], atol=TOL)
 
 
 def check_sky_source(
