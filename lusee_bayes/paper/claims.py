@@ -104,7 +104,7 @@ def entry(case: xr.Dataset, path: str) -> float:
     """An entry of the case's scenario, by its dotted path."""
     node = parse_yaml(case.attrs["scenario"], "the scenario of a case")
     for key in path.split("."):
-        node = node[int(key)] if isinstance(node, list) else node[key]
+        node = node[key]
     return float(node)
 
 

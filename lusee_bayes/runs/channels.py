@@ -110,9 +110,7 @@ class ChannelFiles:
         with h5py.File(path) as file:
             return from_tree(kind, StoredTree(file), str(path))
 
-    def information(
-        self, channel: Scenario, number: int = 0, tied: Tied | None = None
-    ) -> Information:
+    def information(self, channel: Scenario, number: int, tied: Tied | None) -> Information:
         """Read only the information of a :class:`ChannelInformation`, with tied unknowns if any."""
         path = self.path(channel, ChannelInformation)
         with h5py.File(path) as file:
@@ -498,10 +496,9 @@ def from_fitting(
     """Values, by name, of the unknowns common to all channels, given those that fit."""
     fitting = [(f, one) for f, one in zip(frequencies_mhz, shared, strict=True) if one.fits]
     tied, _ = tie_channels(scenario, *zip(*fitting, strict=True))
-    common = [n for n, over in fitting[0][1].octaves.items() if np.isinf(over)]
-    priors, at = fitting[0][1].priors, [tied.names.index(name) for name in common]
-    z = dict(zip(common, tied.mean[0, at], strict=True))
-    return {name: priors[name][0] + priors[name][1] * float(z[name]) for name in common}
+    z, (_, first) = dict(zip(tied.names, tied.mean[0].tolist(), strict=True)), fitting[0]
+    common = {name: first.priors[name] for name, over in first.octaves.items() if np.isinf(over)}
+    return {name: prior + std * z[name] for name, (prior, std) in common.items()}
 
 
 def map_channels(
@@ -639,11 +636,7 @@ def map_channels(
         """Write the result of a channel, given the data of all channels."""
         number = mapped.index(channel)
         common = (channel, tied) if components is None else (scenario, tied, components)
-
-        def make() -> ChannelResult:
-            return files.read(channel, kind).given(number, *common)
-
-        files.kept(channel, ChannelResult, make)
+        files.kept(channel, ChannelResult, lambda: files.read(channel, kind).given(number, *common))
 
     if not alone:
         each(finish, mapped, "joint skies" if scenario.joint else "shared instrument")
