@@ -539,10 +539,9 @@ def spectrum_command(
         raise InputError("--table draws a spectrum into a figure; give --figure FILE.png, too")
     spectrum = FinishedRun.read(run).sky_spectrum()
     templates = [named_template(one) for one in signal]
-    rows = spectrum.rows(region)
     limits = [signal_limit(spectrum, *one, region=region, order=order) for one in templates]
     console = Console(soft_wrap=True)
-    console.print(table_of_numbers(*rows))
+    console.print(table_of_numbers(*spectrum.rows(region)))
     for limit in limits:
         say(console, limit.sentence())
     if figure is not None:
@@ -550,9 +549,8 @@ def spectrum_command(
         from lusee_bayes.report.figures.drawing import save
         from lusee_bayes.report.figures.maps import spectrum_figure
 
-        drawn = spectrum_figure(spectrum, table)
         with replacing(figure) as path:
-            save([(path, drawn)], 150)
+            save([(path, spectrum_figure(spectrum, table))], 150)
         say(console, f"spectrum -> {figure}")
 
 

@@ -168,12 +168,12 @@ class ChannelInformation:
         scenario : Scenario
             The scenario of all channels.
         tied : Tied or None
-            The prior of the shared unknowns.
+            The prior of the shared unknowns, which every channel then has.
         components : Components
         """
         information, unknowns, data = self.information, self.unknowns, self.known
         n, key, n_draws = information.n_modes, draw_key(scenario), scenario.output.draws
-        if unknowns is not None and tied is not None:
+        if tied is not None:
             information = unknowns.whole(information, tied, number)
         draws, spread = components.draws, components.spread
         if (mode := components.mode) is not None:
@@ -182,12 +182,10 @@ class ChannelInformation:
             means = (components.mean, spread, draws)
             sky = joint.channel_sky(components.prior, number, information, *means, key)
         mean, covariance, drawn = sky.mean[:n], sky.covariance[:n, :n], sky.draws[:, :n]
-        report = None
-        if unknowns is not None:
-            if tied is not None:
-                unknowns = unknowns.given_all(tied, number, sky.mean, sky.covariance)
-                data = data.given(unknowns.table(mean, covariance))
-            report = unknowns.report(mean, covariance, joint=True)
+        if tied is not None:
+            unknowns = unknowns.given_all(tied, number, sky.mean, sky.covariance)
+            data = data.given(unknowns.table(mean, covariance))
+        report = None if unknowns is None else unknowns.report(mean, covariance, joint=True)
         likely = information.log_likelihood(sky.draws[:n_draws])
         more = {"unknowns": report, "instrument": unknowns, "joint": drawn}
         more |= information.fit(sky.mean, sky.covariance)

@@ -79,8 +79,7 @@ def run_simulate(
         )
     channels = (scenario,) if scenario.single else scenario.channels()
     require_fits(simulation_cost(scenario, len(channels)), scenario)
-    each = Stages(stages.console, verbose=stages.verbose)
-    experiments = [observed(channel, stages=each) for channel in channels]
+    experiments = [observed(channel, stages=stages) for channel in channels]
     data = [experiment.data for experiment in experiments]
     if is_waterfall:
         _write_waterfall(path, experiments, scenario)

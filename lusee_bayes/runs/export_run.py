@@ -109,13 +109,12 @@ def write_skyh5(run: str | Path, path: str | Path) -> RunOutcome[list[str]]:
     """
     finished, path = FinishedRun.read(run), files.user_path(path)
     stokes_i = np.stack([channel.maps()["mean"] for channel in finished.channels])
-    hertz = [1e6 * channel.frequency_mhz for channel in finished.channels]
     text = {"component_type": "healpix", "spectral_type": "full", "hpx_order": "ring"}
     text |= {"hpx_frame/frame": "galactic", "history": f"lusee_bayes {__version__}: {run}"}
     content = {f"Header/{name}": np.bytes_(value) for name, value in text.items()} | {
         "Header/Ncomponents": stokes_i.shape[1],
         "Header/Nfreqs": len(stokes_i),
-        "Header/freq_array": hertz,
+        "Header/freq_array": [1e6 * channel.frequency_mhz for channel in finished.channels],
         "Header/hpx_inds": np.arange(stokes_i.shape[1]),
         "Header/nside": finished.channel.nside,
         # I, Q, U, V

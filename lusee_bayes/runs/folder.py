@@ -127,10 +127,6 @@ FIGURES = "figures"
 Result = TypeVar("Result")
 
 
-class RunInterrupted(KeyboardInterrupt):
-    """Raised if a run is interrupted; the message gives the state of its folder."""
-
-
 @dataclass(frozen=True)
 class RunOutcome(Generic[Result]):
     """A finished run.
@@ -332,10 +328,8 @@ def run_folder(
     InputError
         If ``folder`` or one of its parents is a file, if another run works in it or has left its
         results there, or if the results to be replaced include a file that the run reads.
-    RunInterrupted
-        Instead of KeyboardInterrupt.
-    WorkersLost
-        With the state of the folder added to its message.
+    KeyboardInterrupt, WorkersLost
+        With the state of the folder in the message.
     """
     origin, read = origin_of(scenario, data, **others), inputs_of(scenario, data, *inputs)
     folder = files.user_path(folder)
@@ -353,11 +347,10 @@ def run_folder(
             use_compilation_cache()
             try:
                 yield RunFolder(folder, kind, origin)
-            except RunInterrupted:
-                # raised by a run in a folder inside this one
-                raise
             except KeyboardInterrupt as interrupt:
-                raise RunInterrupted(_state(folder, before, kind)) from interrupt
+                if interrupt.args:  # the state of a folder inside this one
+                    raise
+                raise KeyboardInterrupt(_state(folder, before, kind)) from interrupt
             except WorkersLost as error:
                 raise WorkersLost(f"{error}; {_state(folder, before, kind)}") from error
     finally:

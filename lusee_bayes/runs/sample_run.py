@@ -91,9 +91,8 @@ def sample_together(
     with stages("posterior"):
         inferences = {name: infer(one) for name, one in experiments.items()}
     several = len(experiments) > 1
-    scenarios = [one.scenario.to_yaml() for one in experiments.values()]
     identity = {
-        "scenario": "---\n".join(scenarios),
+        "scenario": "---\n".join(one.scenario.to_yaml() for one in experiments.values()),
         "data": " ".join(one.data.digest() for one in experiments.values()),
         "program": program.name,
         "program text": program.digest,
@@ -109,7 +108,7 @@ def sample_together(
     for name, one in experiments.items():
         inference = inferences[name]
         arguments[name] = program.arguments(inference.model, program_pieces(one))
-        n_modes = inference.posterior.mean.shape[0]
+        n_modes = len(inference.posterior.mean)
         latent[name] = programs.require_sampleable(program, arguments[name], one.data.data, n_modes)
     data = {name: one.data.data for name, one in experiments.items()}
     first = next(iter(experiments))
@@ -305,13 +304,12 @@ def run_sample(
     sampler = sampler or Sampler(seed=scenario.seed)
 
     given = {"replace": replace, "program": named(program)}
-    n_draws = sampler.chains * sampler.draws
 
     def draw(
         channels: Mapping[str, Scenario], folder: Path, stages: Stages
     ) -> Sequence[SampleResult]:
         experiments = {
-            name: measured_experiment(channel, data, stages, n_draws=n_draws)
+            name: measured_experiment(channel, data, stages, n_draws=sampler.chains * sampler.draws)
             for name, channel in channels.items()
         }
         return sample_together(experiments, program, sampler, folder, resume=resume, stages=stages)
