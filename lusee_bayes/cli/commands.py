@@ -394,10 +394,9 @@ def plan_command(
     with engine.open(demand_of(*(v.scenario for v in variations))) as opened:
         run = run_plan(variations, options.output or Path("output/plan"), engine=opened, **given)
     by_source = [[f for f in run.result if f.variation.source == source] for source in sources]
-    for forecasts in by_source:
-        options.print(forecast_table(forecasts))
+    tables = [forecast_table(forecasts) for forecasts in by_source]
     lines = [line for forecasts in by_source for line in forecast_lines(forecasts)]
-    options.print(*lines, f"look at {run.folder}/figures/plan.png", files=run.files)
+    options.print(*tables, *lines, f"look at {run.folder}/figures/plan.png", files=run.files)
 
 
 @app.command(name="compare", group="Results")
