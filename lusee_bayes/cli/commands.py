@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Annotated
 
 from cyclopts import App, Parameter
-from rich.console import Console
 
 from lusee_bayes.cli.options import (
     Algorithm,
@@ -353,7 +352,7 @@ def validate_command(
         given |= chains.running(loaded.seed) | options.running()
         run = run_validate(loaded, options.folder(scenario, "-validation"), **given)
     verdict = f"{run.result.headline()}; look at {run.page}"
-    options.print(verdict, files=run.files, table=checks_table(run.result.checks))
+    options.print(checks_table(run.result.checks), verdict, files=run.files)
     return 0 if run.result.passed else 1
 
 
@@ -395,10 +394,9 @@ def plan_command(
     with engine.open(demand_of(*(v.scenario for v in variations))) as opened:
         run = run_plan(variations, options.output or Path("output/plan"), engine=opened, **given)
     by_source = [[f for f in run.result if f.variation.source == source] for source in sources]
-    for forecasts in by_source:
-        options.print(table=forecast_table(forecasts))
+    tables = [forecast_table(forecasts) for forecasts in by_source]
     lines = [line for forecasts in by_source for line in forecast_lines(forecasts)]
-    options.print(*lines, f"look at {run.folder}/figures/plan.png", files=run.files)
+    options.print(*tables, *lines, f"look at {run.folder}/figures/plan.png", files=run.files)
 
 
 @app.command(name="compare", group="Results")
@@ -423,7 +421,7 @@ def compare_command(*folders: Path, options: Options = Options()) -> None:
 
     run = run_compare(folders, options.output or Path("output/comparison"), **options.running())
     lines = filter(None, [evidence_caveat(run.result), f"look at {run.folder}/comparison.html"])
-    options.print(*lines, files=run.files, table=comparison_table(run.result))
+    options.print(comparison_table(run.result), *lines, files=run.files)
 
 
 @app.command(name="compare-priors", group="Maps")
@@ -467,7 +465,7 @@ def compare_priors_command(
         given = {"truth": truth, "name": Path(scenario).stem, "engine": opened}
         run = run_compare_priors(loaded, folder, names, **given, **options.running())
     lines = [*run.result.lines(), f"look at {run.page}"]
-    options.print(*lines, files=run.files, table=table_of_numbers(*run.result.table()))
+    options.print(table_of_numbers(*run.result.table()), *lines, files=run.files)
 
 
 @app.command(name="report", group="Results")
@@ -489,7 +487,7 @@ def report_command(folder: Path, *, open: Flag = False, quiet: Quiet = False) ->
     """
     from lusee_bayes.report.pages import write_report
 
-    say(Console(quiet=quiet, soft_wrap=True), look_at(write_report(folder), open))
+    say(look_at(write_report(folder), open), quiet=quiet)
 
 
 @app.command(name="spectrum", group="Results")
@@ -539,21 +537,16 @@ def spectrum_command(
         raise InputError("--table draws a spectrum into a figure; give --figure FILE.png, too")
     spectrum = FinishedRun.read(run).sky_spectrum()
     templates = [named_template(one) for one in signal]
-    rows = spectrum.rows(region)
     limits = [signal_limit(spectrum, *one, region=region, order=order) for one in templates]
-    console = Console(soft_wrap=True)
-    console.print(table_of_numbers(*rows))
-    for limit in limits:
-        say(console, limit.sentence())
+    say(table_of_numbers(*spectrum.rows(region)), *(limit.sentence() for limit in limits))
     if figure is not None:
         from lusee_bayes.core.files import replacing
         from lusee_bayes.report.figures.drawing import save
         from lusee_bayes.report.figures.maps import spectrum_figure
 
-        drawn = spectrum_figure(spectrum, table)
         with replacing(figure) as path:
-            save([(path, drawn)], 150)
-        say(console, f"spectrum -> {figure}")
+            save([(path, spectrum_figure(spectrum, table))], 150)
+        say(f"spectrum -> {figure}")
 
 
 @app.command(name="export", group="Results")
@@ -596,7 +589,6 @@ def export_command(
     quiet
         Print only errors.
     """
-    from lusee_bayes.core.errors import InputError
     from lusee_bayes.runs.export_run import BLANK, METADATA, run_export, write_skyh5
 
     if (release is None) == (skyh5 is None):
@@ -608,7 +600,7 @@ def export_command(
         lines = [f"{len(written.files)} files in {release}"]
         for blank in written.result:
             lines.append(f"{blank}: replace {BLANK} in {release / METADATA}")
-    say(Console(quiet=quiet, soft_wrap=True), *lines)
+    say(*lines, quiet=quiet)
 
 
 @app.command(name="info", group="Data")
@@ -631,17 +623,16 @@ def info_command(files: Annotated[list[Path], Parameter(required=True)], /) -> i
     """
     from lusee_bayes.report.describe import describe
 
-    console, errors = Console(soft_wrap=True), Console(stderr=True, soft_wrap=True)
     refused = 0
     for number, file in enumerate(files):
         try:
             text = describe(file)
         except InputError as error:
-            say(errors, f"lusee-bayes: {error}")
+            say(f"lusee-bayes: {error}", stderr=True)
             refused += 1
         else:
             # one block per file
-            say(console, f"\n{text}" if number else text)
+            say(f"\n{text}" if number else text)
     return 2 if refused else 0
 
 
@@ -671,7 +662,7 @@ def keys_command(key: str = "", *, markdown: Flag = False, schema: Flag = False)
         return
     keys = scenario_keys(key)
     lines = [keys_as_markdown(keys).rstrip()] if markdown else map(str, keys)
-    say(Console(soft_wrap=True), *lines)
+    say(*lines)
 
 
 @app.command(name="scenarios", group="Scenarios")
@@ -686,7 +677,7 @@ def scenarios_command() -> None:
 
     for name in scenario_names():
         comment = takewhile(lambda line: line.startswith("#"), scenario_text(name).splitlines())
-        say(Console(soft_wrap=True), f"{name}: {' '.join(line.lstrip('# ') for line in comment)}")
+        say(f"{name}: {' '.join(line.lstrip('# ') for line in comment)}")
 
 
 @app.command(name="init", group="Scenarios")
@@ -714,7 +705,7 @@ def init_command(file: Path, *, like: str = FIRST_MAP, force: Flag = False) -> N
     require_new(file, replace=force)
     with replacing(file) as path:
         path.write_text(text, encoding="utf-8")
-    say(Console(soft_wrap=True), f"{file}; map it: lusee-bayes map {file}")
+    say(f"{file}; map it: lusee-bayes map {file}")
 
 
 @app.command(name="paper", group="Results")

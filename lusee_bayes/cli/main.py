@@ -20,7 +20,6 @@ from os.path import expanduser
 from threading import current_thread, main_thread
 
 from cyclopts import CycloptsError
-from rich.console import Console
 
 from lusee_bayes.cli.commands import app
 from lusee_bayes.cli.options import say
@@ -74,7 +73,7 @@ def main(arguments: list[str] | None = None) -> int:
     finally:
         COMMAND.reset(before)
     if sentence:
-        say(Console(stderr=True, soft_wrap=True), f"lusee-bayes: {sentence}")
+        say(f"lusee-bayes: {sentence}", stderr=True)
     return code
 
 

@@ -118,14 +118,9 @@ class Options:
         stages = Stages(Console(quiet=self.quiet, soft_wrap=True), verbose=self.verbose)
         return {"replace": self.force, "stages": stages}
 
-    def print(self, *lines: object, files: Sequence[Path] = (), table: Table | None = None) -> None:
-        """Print the files with --verbose, the table and the lines."""
-        console = Console(quiet=self.quiet, soft_wrap=True)
-        say(console, *(f"  {path}" for path in files if self.verbose))
-        if table is not None:
-            # within the width of the terminal, with wrapped cells
-            console.print(table, soft_wrap=False)
-        say(console, *lines)
+    def print(self, *lines: object, files: Sequence[Path] = ()) -> None:
+        """Print the files with --verbose, then lines and tables."""
+        say(*(f"  {path}" for path in files if self.verbose), *lines, quiet=self.quiet)
 
 
 @Parameter(name="*")
@@ -258,7 +253,11 @@ class ChainOptions:
         return {"sampler": sampler, "resume": self.resume}
 
 
-def say(console: Console, *lines: object) -> None:
-    """Print lines without markup."""
+def say(*lines: object, quiet: bool = False, stderr: bool = False) -> None:
+    """Print lines without markup, and tables with wrapped cells in the width of the terminal."""
+    console = Console(quiet=quiet, stderr=stderr)
     for line in lines:
-        console.print(str(line), highlight=False, markup=False)
+        if isinstance(line, Table):
+            console.print(line)
+        else:
+            console.print(str(line), soft_wrap=True, highlight=False, markup=False)

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from astropy import units as u
 from astropy.coordinates import SkyCoord
 from jaxtyping import Bool, Float, Shaped
 
@@ -104,7 +103,7 @@ def entry(case: xr.Dataset, path: str) -> float:
     """An entry of the case's scenario, by its dotted path."""
     node = parse_yaml(case.attrs["scenario"], "the scenario of a case")
     for key in path.split("."):
-        node = node[int(key)] if isinstance(node, list) else node[key]
+        node = node[key]
     return float(node)
 
 
@@ -245,7 +244,7 @@ def _unobserved_cap(cases: Cases) -> Verdict:
     nside = healpy.npix2nside(hidden.size)
     radius = float(np.degrees(np.arccos(1 - 2 * hidden.mean())))
     centre = np.array(healpy.pix2vec(nside, np.flatnonzero(hidden))).sum(axis=1)
-    pole = SkyCoord(0 * u.deg, 90 * u.deg, frame="icrs").galactic.cartesian.xyz.value
+    pole = SkyCoord(0, 90, unit="deg", frame="icrs").galactic.cartesian.xyz.value
     away = float(np.degrees(np.arccos(centre @ pole / max(np.linalg.norm(centre), 1e-30))))
     text = f"a cap of {radius:.1f} degrees, its centre {away:.1f} degrees from that pole"
     return grade(text, abs(radius - 24) < 1.5 and away < 3, abs(radius - 24) < 1.5)

@@ -99,10 +99,9 @@ def flat_bar(figure: Figure, axes: Axes | list[Axes], image, unit: str) -> None:
     aspect = 30 if isinstance(axes, Axes) else 60
     bar = figure.colorbar(image, ax=axes, label=unit, aspect=aspect, **style)
     if isinstance(image.norm, LogNorm):
-        low, high = np.log10([image.norm.vmin, image.norm.vmax])
-        ticks = [float(f"{10**t:.1e}") for t in np.linspace(low, high, 5)[[0, 2, 4]]]
-        inside = np.clip(ticks, image.norm.vmin, image.norm.vmax)
-        bar.set_ticks(inside, labels=[f"{tick:,.0f}" for tick in ticks])
+        bounds = image.norm.vmin, image.norm.vmax
+        ticks = [float(f"{value:.1e}") for value in np.geomspace(*bounds, 3)]
+        bar.set_ticks(np.clip(ticks, *bounds), labels=[f"{tick:,.0f}" for tick in ticks])
         bar.set_ticks([], minor=True)
 
 

@@ -63,7 +63,7 @@ def cards(name: str, scenario: Scenario) -> dict[str, tuple]:
 
 
 def text_hash(text: str) -> str:
-    """SHA-256 of a resolved scenario in YAML."""
+    """SHA-256 of a text, such as a resolved scenario in YAML."""
     return hashlib.sha256(text.encode()).hexdigest()
 
 

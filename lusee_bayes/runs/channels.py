@@ -32,8 +32,6 @@ replaced. A joint posterior sums the information in the files of all channels.
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -46,16 +44,14 @@ import numpy as np
 from jaxtyping import Float
 
 from lusee_bayes.core import formats
-from lusee_bayes.core.arrays import Square, T, Vector
+from lusee_bayes.core.arrays import T
 from lusee_bayes.core.engine import Engine, Tasks, ThisProcess
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.formats import says
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.trees import StoredTree, from_tree, write_tree
-from lusee_bayes.core.version import __version__
 from lusee_bayes.experiment.data_files import Data, anchored, digest_of
 from lusee_bayes.experiment.experiment import build, draw_key
-from lusee_bayes.experiment.rounds import Inference
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.experiment.unknowns import Unknowns
 from lusee_bayes.judge.cube_fit import SharedTest, shared_tests
@@ -68,27 +64,29 @@ from lusee_bayes.results.finished_runs import information_file, read_information
 from lusee_bayes.results.map_result import Components, MapResult
 from lusee_bayes.results.sky_spectrum import N_DRAWS
 from lusee_bayes.runs.cost import measured_experiment
+from lusee_bayes.runs.folder import identity_of
 from lusee_bayes.sky.spectral_prior import SpectralPrior
 
 CHANNELS = "channels"
 
 
+@dataclass(frozen=True)
 class ChannelFiles:
-    """The files of a run's channels.
+    """The files of a run's channels; those with another identity are not used.
 
-    Parameters
+    Attributes
     ----------
     folder : Path
-        Folder of the run.
+        Folder of unfinished work.
     identity : str
-        Identity of the run (:func:`identity_of`); files with another one are not used.
+        Identity of the run (:func:`identity_of`).
     again : set of float
         Frequencies of channels that were solved twice: the second solution is used.
     """
 
-    def __init__(self, folder: Path, identity: str, again: frozenset[float] = frozenset()):
-        self.folder = folder / CHANNELS
-        self.identity, self.again = identity, again
+    folder: Path
+    identity: str
+    again: frozenset[float] = frozenset()
 
     def path(self, channel: Scenario, kind: type) -> Path:
         """File of a channel's stored dataclass, such as :class:`ChannelInformation`."""
@@ -112,9 +110,7 @@ class ChannelFiles:
         with h5py.File(path) as file:
             return from_tree(kind, StoredTree(file), str(path))
 
-    def information(
-        self, channel: Scenario, number: int = 0, tied: Tied | None = None
-    ) -> Information:
+    def information(self, channel: Scenario, number: int, tied: Tied | None) -> Information:
         """Read only the information of a :class:`ChannelInformation`, with tied unknowns if any."""
         path = self.path(channel, ChannelInformation)
         with h5py.File(path) as file:
@@ -124,20 +120,6 @@ class ChannelFiles:
                 return information
             unknowns = from_tree(Unknowns, tree.children["unknowns"], str(path))
         return unknowns.whole(information, tied, number)
-
-
-def identity_of(scenario: Scenario, data: Data | None, *others: object) -> str:
-    """Digest of everything that determines a run's results: scenario, data, others, and version.
-
-    Raises
-    ------
-    InputError
-        If a data file does not exist.
-    """
-    parts = [scenario.to_yaml(), *map(str, others), __version__]
-    if data is not None:
-        parts.append(digest_of(data))
-    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -167,7 +149,7 @@ class ChannelInformation:
         """Make it from all data of a channel, earlier data included."""
         sky, share = np.asarray(made.experiment.setup.sky.modes), None
         if made.unknowns is not None and made.unknowns.shared.size:
-            share = Share.of(made.unknowns, made.posterior.mean, made.covariance, 0, made.from_data)
+            share = Share.of(made)
         return cls(made.information, made.of_all(data), made.unknowns, sky, share)
 
     def seen(self) -> Seen:
@@ -186,12 +168,12 @@ class ChannelInformation:
         scenario : Scenario
             The scenario of all channels.
         tied : Tied or None
-            The prior of the shared unknowns.
+            The prior of the shared unknowns, which every channel then has.
         components : Components
         """
         information, unknowns, data = self.information, self.unknowns, self.known
         n, key, n_draws = information.n_modes, draw_key(scenario), scenario.output.draws
-        if unknowns is not None and tied is not None:
+        if tied is not None:
             information = unknowns.whole(information, tied, number)
         draws, spread = components.draws, components.spread
         if (mode := components.mode) is not None:
@@ -200,7 +182,7 @@ class ChannelInformation:
             means = (components.mean, spread, draws)
             sky = joint.channel_sky(components.prior, number, information, *means, key)
         mean, covariance, drawn = sky.mean[:n], sky.covariance[:n, :n], sky.draws[:, :n]
-        if unknowns is not None and tied is not None:
+        if tied is not None:
             unknowns = unknowns.given_all(tied, number, sky.mean, sky.covariance)
             data = data.given(unknowns.table(mean, covariance))
         return channel_result(
@@ -259,7 +241,7 @@ class ChannelsInFiles:
         self,
         prior: SpectralPrior,
         reference: Float[np.ndarray, "channels modes"],
-        function: Callable[[int, Information], Information],
+        function: positive_joint.Linearised,
     ) -> Information:
         """Apply a function to every channel's information, and sum it for the component maps."""
         files, channels, tied = self.files, self.channels, self.tied
@@ -272,10 +254,8 @@ class ChannelsInFiles:
             return sums
 
         # the same blocks and the same summation tree, wherever tasks run
-        blocks = [
-            range(first, min(first + BLOCK, len(channels)))
-            for first in range(0, len(channels), BLOCK)
-        ]
+        numbers = range(len(channels))
+        blocks = [numbers[first : first + BLOCK] for first in numbers[::BLOCK]]
         names = [names_of(channels[block.start : block.stop]) for block in blocks]
         return self.engine.reduced(
             Tasks(add, blocks, names), joint.ComponentSums.plus, self.stages, "joint sums"
@@ -331,17 +311,10 @@ def solve_components(
             posterior = joint.component_posterior(information, prior)
             chi2 = float(information.chi2(posterior.mean) + posterior.prior_chi2())
             moved = float(posterior.refinement)
-        return Components(
-            prior,
-            np.asarray(posterior.mean),
-            jax.block_until_ready(joint.paired(posterior.covariance(), prior)),
-            posterior.sample(draw_key(scenario), n_draws),
-            chi2,
-            float(posterior.log_evidence),
-            float(posterior.information_bits()),
-            moved,
-            mode=mode,
-        )
+        spread = jax.block_until_ready(joint.paired(posterior.covariance(), prior))
+        drawn = posterior.sample(draw_key(scenario), n_draws)
+        figures = chi2, float(posterior.log_evidence), float(posterior.information_bits()), moved
+        return Components(prior, np.asarray(posterior.mean), spread, drawn, *figures, mode)
 
 
 # folded into the random key of the draws; channel numbers are smaller
@@ -366,11 +339,11 @@ class Share:
     log_evidence: float
 
     @classmethod
-    def of(
-        cls, unknowns: Unknowns, mean: Vector, covariance: Square, n_draws: int, inferred: Inference
-    ) -> Share:
-        """Make it from a channel's unknowns and its own posterior of the sky, in K and K^2."""
-        posterior, shared = unknowns.amplitudes.integrated(mean, covariance), unknowns.shared
+    def of(cls, made: Conditioned, n_draws: int = 0) -> Share:
+        """Make it from a channel: its unknowns, and its posterior of the sky."""
+        unknowns, inferred = made.unknowns, made.from_data
+        posterior = unknowns.amplitudes.integrated(made.posterior.mean, made.covariance)
+        shared = unknowns.shared
         octaves = dict(zip(unknowns.shared_names, unknowns.octaves[shared].tolist(), strict=True))
         priors = {row["unknown"]: (row["prior"], row["prior_std"]) for row in unknowns.rows}
         spread = posterior.covariance[np.ix_(shared, shared)]
@@ -400,9 +373,7 @@ class ChannelAlone:
     mean, covariance : (modes,) and (modes, modes) array
         In K and K^2.
     deviations : (all, modes) array
-        Draws minus the mean, in K: first the ``n_draws`` of the result, then those for coverage.
-    n_draws : int
-        Number of draws in the result.
+        Draws minus the mean, in K: first those of the scenario's output, then those for coverage.
     figures : dict
         :meth:`.Conditioned.figures`.
     share : Share
@@ -415,7 +386,6 @@ class ChannelAlone:
     mean: Float[np.ndarray, " mode"]
     covariance: Float[np.ndarray, "mode mode_2"]
     deviations: Float[np.ndarray, "all mode"]
-    n_draws: int
     figures: dict[str, float | bool]
     share: Share
 
@@ -426,8 +396,7 @@ class ChannelAlone:
         deviations = made.draws - mean
         if compared is not None:
             deviations = np.concatenate([deviations, compared])
-        share = Share.of(made.unknowns, mean, made.covariance, len(deviations), made.from_data)
-        kept = made.covariance, deviations, len(made.draws), made.figures(), share
+        kept = made.covariance, deviations, made.figures(), Share.of(made, len(deviations))
         return cls(data, made.from_data.solution.information, made.unknowns, mean, *kept)
 
     def seen(self) -> Seen:
@@ -474,14 +443,15 @@ class ChannelAlone:
         gained = np.linalg.slogdet(np.eye(len(shared)) + (covariance - v) @ sky_share)[1]
         bits = self.figures["information_bits"] - 0.5 * gained / np.log(2.0)
         information = information_given(self.information, amplitudes, precision, vector, expansion)
-        skies = moved + deviations[: self.n_draws]
+        drawn, compared = np.split(deviations, [scenario.output.draws])
+        skies = moved + drawn
         return channel_result(
             self.known.given(unknowns.table(moved, left)),
             moved,
             left,
             skies,
             information.log_likelihood(skies),
-            deviations[self.n_draws :],
+            compared,
             instrument=unknowns,
             common=gain @ tied.root[number, at],
             **(self.figures | information.fit(moved, left) | {"information_bits": float(bits)}),
@@ -534,10 +504,9 @@ def from_fitting(
     """Values, by name, of the unknowns common to all channels, given those that fit."""
     fitting = [(f, one) for f, one in zip(frequencies_mhz, shared, strict=True) if one.fits]
     tied, _ = tie_channels(scenario, *zip(*fitting, strict=True))
-    common = [n for n, over in fitting[0][1].octaves.items() if np.isinf(over)]
-    priors, at = fitting[0][1].priors, [tied.names.index(name) for name in common]
-    z = dict(zip(common, tied.mean[0, at], strict=True))
-    return {name: priors[name][0] + priors[name][1] * float(z[name]) for name in common}
+    z, (_, first) = dict(zip(tied.names, tied.mean[0].tolist(), strict=True)), fitting[0]
+    common = {name: first.priors[name] for name, over in first.octaves.items() if np.isinf(over)}
+    return {name: prior + std * z[name] for name, (prior, std) in common.items()}
 
 
 def map_channels(
@@ -602,8 +571,9 @@ def map_channels(
         channel_data = made.channel_data(stages, alone=True, thorough=thorough)
         return MapResult(scenario, (made.result(channel_data, stages),), seconds=stages.seconds)
     engine.work_in(folder)
-    digest = None if kept is None else digest_of(kept)
-    files = ChannelFiles(folder.resolve(), identity_of(scenario, data, truth, digest, thorough))
+    digests = [None if given is None else digest_of(given) for given in (data, kept)]
+    identity = identity_of(scenario, *digests, truth, thorough)
+    files = ChannelFiles(folder.resolve() / CHANNELS, identity)
     channels = tuple(channel.anchored() for channel in scenario.channels())
     alone = not scenario.joint and not scenario.shared
     kind = ChannelResult if alone else ChannelInformation if scenario.joint else ChannelAlone
@@ -627,13 +597,16 @@ def map_channels(
             return str(error)
         return Seen(None) if alone else kept.seen()
 
-    names, views = [names_of((channel,)) for channel in channels], []
+    def each(function: Callable[[Scenario], Any], channels: Sequence[Scenario], stage: str) -> list:
+        names = [names_of((channel,)) for channel in channels]
+        return engine.each(Tasks(function, channels, names), stages, stage)
+
+    views = []
     if scenario.shared:  # the others start from the instrument of the first
-        views = engine.each(Tasks(observe, channels[:1], names[:1]), stages, "first channel")
+        views = each(observe, channels[:1], "first channel")
         if isinstance(views[0], Seen) and views[0].share.fits:
             begin = from_fitting(scenario, [channels[0].frequency_mhz], [views[0].share]) or None
-    left = channels[len(views) :], names[len(views) :]
-    views = [*views, *engine.each(Tasks(observe, *left), stages, "channels")]
+    views += each(observe, channels[len(views) :], "channels")
     by_channel = list(zip(channels, views, strict=True))
     unmapped = {channel.frequency_mhz: why for channel, why in by_channel if isinstance(why, str)}
     if len(unmapped) == len(channels):
@@ -642,15 +615,14 @@ def map_channels(
     components, tied, tests = None, None, ()
     if scenario.shared:
         frequencies, shares = [channel.frequency_mhz for channel in mapped], [s.share for s in seen]
-        unfit = [number for number, one in enumerate(shares) if not one.fits]
+        unfit = [channel for channel, one in zip(mapped, shares, strict=True) if not one.fits]
         if 0 < len(unfit) < len(mapped):
             values = from_fitting(scenario, frequencies, shares)
-            again = frozenset(frequencies[number] for number in unfit)
-            first, files = files, ChannelFiles(folder.resolve(), files.identity, again)
+            again = [channel.frequency_mhz for channel in unfit]
+            first, files = files, replace(files, again=frozenset(again))
 
-            def look_again(number: int) -> Seen:
+            def look_again(channel: Scenario) -> Seen:
                 """Solve a channel again, starting from the instrument of the others."""
-                channel = mapped[number]
 
                 def make() -> ChannelInformation | ChannelAlone:
                     made, before = condition(channel, Stages(), values), first.read(channel, kind)
@@ -660,40 +632,25 @@ def map_channels(
 
                 return files.kept(channel, kind, make).seen()
 
-            tasks = Tasks(look_again, unfit, [names_of((mapped[number],)) for number in unfit])
-            looked = engine.each(tasks, stages, "channels again")
-            changed = dict(zip(unfit, looked, strict=True))
-            seen = [changed.get(number, one) for number, one in enumerate(seen)]
+            changed = dict(zip(again, each(look_again, unfit, "channels again"), strict=True))
+            seen = [changed.get(f, one) for f, one in zip(frequencies, seen, strict=True)]
         tied, tests = tie_channels(scenario, frequencies, [one.share for one in seen])
     if scenario.joint:
         at_hand = ChannelsInFiles(mapped, files, engine, stages, tied)
         n_draws = max(scenario.output.draws, N_DRAWS)
         components = solve_components(_without(unmapped, scenario), at_hand, seen, n_draws)
 
-    def finish(number: int) -> None:
+    def finish(channel: Scenario) -> None:
         """Write the result of a channel, given the data of all channels."""
-        channel = mapped[number]
+        number = mapped.index(channel)
         common = (channel, tied) if components is None else (scenario, tied, components)
-
-        def make() -> ChannelResult:
-            return files.read(channel, kind).given(number, *common)
-
-        files.kept(channel, ChannelResult, make)
+        files.kept(channel, ChannelResult, lambda: files.read(channel, kind).given(number, *common))
 
     if not alone:
-        tasks = Tasks(finish, range(len(mapped)), [names_of((channel,)) for channel in mapped])
-        engine.each(tasks, stages, "joint skies" if scenario.joint else "shared instrument")
+        each(finish, mapped, "joint skies" if scenario.joint else "shared instrument")
     results = tuple(files.read(channel, ChannelResult) for channel in mapped)
-    tie = 0.0 if tied is None else tied.log_evidence
-    return MapResult(
-        scenario,
-        results,
-        components,
-        stages.seconds,
-        unmapped,
-        tie_log_evidence=tie,
-        shared_tests=tests,
-    )
+    more = {"tie_log_evidence": 0.0 if tied is None else tied.log_evidence, "shared_tests": tests}
+    return MapResult(scenario, results, components, stages.seconds, unmapped, **more)
 
 
 def _without(unmapped: dict[float, str], scenario: Scenario) -> Scenario:

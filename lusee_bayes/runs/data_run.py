@@ -79,8 +79,7 @@ def run_simulate(
         )
     channels = (scenario,) if scenario.single else scenario.channels()
     require_fits(simulation_cost(scenario, len(channels)), scenario)
-    each = Stages(stages.console, verbose=stages.verbose)
-    experiments = [observed(channel, stages=each) for channel in channels]
+    experiments = [observed(channel, stages=stages) for channel in channels]
     data = [experiment.data for experiment in experiments]
     if is_waterfall:
         _write_waterfall(path, experiments, scenario)
@@ -101,9 +100,8 @@ def _write_waterfall(path: Path, experiments: Sequence[Experiment], scenario: Sc
         write_four_port(path, data, circuits, **emission, **said, scenario=scenario.to_yaml())
         return
     unknown = complex(np.nan, np.nan)
-    impedance = [source.impedance(f) for source, f in sources]
-    ohm = np.array([unknown if z is None else z for z in impedance])
-    write_waterfall(path, data, ohm, scenario.to_yaml())
+    ohm = [unknown if (z := source.impedance(f)) is None else z for source, f in sources]
+    write_waterfall(path, data, np.array(ohm), scenario.to_yaml())
 
 
 def reduced_lines(reduced: Reduced) -> list[str]:
@@ -268,9 +266,7 @@ def _to_be_mapped(made: FlightSimulation, folder: Path) -> Scenario:
         "site": "file",
         "simulated": made.section,
     }
-    average_s = observation.average_s
-    if average_s is None and observation.step_s < AVERAGE_S:
-        average_s = AVERAGE_S
+    average_s = observation.average_s or (AVERAGE_S if observation.step_s < AVERAGE_S else None)
     times = {"timestamp": "middle", "average_s": average_s}
     scenario = made.scenario.anchored()
     return scenario.model_copy(

@@ -6,7 +6,6 @@ its texts are in ``report/templates/release``.
 
 from __future__ import annotations
 
-import hashlib
 import shutil
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -19,6 +18,7 @@ from lusee_bayes.core import files
 from lusee_bayes.core.errors import InputError
 from lusee_bayes.core.reading import parse_yaml, read_text
 from lusee_bayes.core.version import __version__
+from lusee_bayes.experiment.data_files import digest_of
 from lusee_bayes.report.describe import describe_folder
 from lusee_bayes.report.rendering import render_text
 from lusee_bayes.results.finished_runs import NAME, FinishedRun, Provenance
@@ -86,7 +86,7 @@ def run_export(
             text = render_text(f"release/{name}.jinja", **context)
             (stage / name).write_text(text, encoding="utf-8")
         summed = sorted({*names, *TEXTS} - {METADATA})
-        sums = "".join(f"{_sha256(stage / name)}  {name}\n" for name in summed)
+        sums = "".join(f"{digest_of(stage / name)}  {name}\n" for name in summed)
         (stage / SUMS).write_text(sums, encoding="utf-8")
     blanks = [name for name, value in {"creators": creators, "doi": doi}.items() if not value]
     return RunOutcome(blanks, folder, [folder / name for name in (*summed, METADATA, SUMS)])
@@ -109,13 +109,12 @@ def write_skyh5(run: str | Path, path: str | Path) -> RunOutcome[list[str]]:
     """
     finished, path = FinishedRun.read(run), files.user_path(path)
     stokes_i = np.stack([channel.maps()["mean"] for channel in finished.channels])
-    hertz = [1e6 * channel.frequency_mhz for channel in finished.channels]
     text = {"component_type": "healpix", "spectral_type": "full", "hpx_order": "ring"}
     text |= {"hpx_frame/frame": "galactic", "history": f"lusee_bayes {__version__}: {run}"}
     content = {f"Header/{name}": np.bytes_(value) for name, value in text.items()} | {
         "Header/Ncomponents": stokes_i.shape[1],
         "Header/Nfreqs": len(stokes_i),
-        "Header/freq_array": hertz,
+        "Header/freq_array": [1e6 * channel.frequency_mhz for channel in finished.channels],
         "Header/hpx_inds": np.arange(stokes_i.shape[1]),
         "Header/nside": finished.channel.nside,
         # I, Q, U, V
@@ -128,8 +127,3 @@ def write_skyh5(run: str | Path, path: str | Path) -> RunOutcome[list[str]]:
             if name in units:
                 file[name].attrs["unit"] = units[name]
     return RunOutcome([], path.parent, [path])
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -25,11 +25,12 @@ from lusee_bayes.core.arrays import use_compilation_cache
 from lusee_bayes.core.errors import InputError, WorkersLost
 from lusee_bayes.core.formats import write_netcdf
 from lusee_bayes.core.progress import Stages
+from lusee_bayes.core.version import __version__
 from lusee_bayes.experiment.data_files import Data, digest_of, files_of, names_of_data
 from lusee_bayes.experiment.scenario import Scenario
 from lusee_bayes.report.figures.drawing import named_parts, save
 from lusee_bayes.report.pages import PAGES, REPORT
-from lusee_bayes.results.finished_runs import Provenance
+from lusee_bayes.results.finished_runs import Provenance, text_hash
 
 Origin = Mapping[str, str]
 
@@ -66,6 +67,11 @@ def origin_of(
         names = ", ".join(f"'{Path(name).name}'" for name in names_of_data(data))
         origin["data"] = f"{names} ({digest_of(data)[:12]})"
     return origin | {name: str(value) for name, value in others.items() if value is not None}
+
+
+def identity_of(scenario: Scenario, *inputs: object) -> str:
+    """Digest of everything that determines results: scenario, other inputs, and version."""
+    return text_hash(json.dumps([scenario.to_yaml(), *map(str, inputs), __version__]))
 
 
 def inputs_of(
@@ -119,10 +125,6 @@ def require_own(folder: Path, kinds: Sequence[str], origin: Origin) -> None:
 
 FIGURES = "figures"
 Result = TypeVar("Result")
-
-
-class RunInterrupted(KeyboardInterrupt):
-    """Raised if a run is interrupted; the message gives the state of its folder."""
 
 
 @dataclass(frozen=True)
@@ -326,10 +328,8 @@ def run_folder(
     InputError
         If ``folder`` or one of its parents is a file, if another run works in it or has left its
         results there, or if the results to be replaced include a file that the run reads.
-    RunInterrupted
-        Instead of KeyboardInterrupt.
-    WorkersLost
-        With the state of the folder added to its message.
+    KeyboardInterrupt, WorkersLost
+        With the state of the folder in the message.
     """
     origin, read = origin_of(scenario, data, **others), inputs_of(scenario, data, *inputs)
     folder = files.user_path(folder)
@@ -347,11 +347,10 @@ def run_folder(
             use_compilation_cache()
             try:
                 yield RunFolder(folder, kind, origin)
-            except RunInterrupted:
-                # raised by a run in a folder inside this one
-                raise
             except KeyboardInterrupt as interrupt:
-                raise RunInterrupted(_state(folder, before, kind)) from interrupt
+                if interrupt.args:  # the state of a folder inside this one
+                    raise
+                raise KeyboardInterrupt(_state(folder, before, kind)) from interrupt
             except WorkersLost as error:
                 raise WorkersLost(f"{error}; {_state(folder, before, kind)}") from error
     finally:

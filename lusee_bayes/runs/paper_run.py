@@ -57,22 +57,19 @@ def run_paper(
         # workers may have another working directory
         home = run.path.resolve()
 
-        def path_of(name: str) -> Path:
-            """The file of a case, whether it has been computed or not."""
-            earlier, kept = home / UNFINISHED / f"{name}.nc", home / CASES / f"{name}.nc"
-            is_kept = not is_case(earlier, scenarios[name]) and is_case(kept, scenarios[name])
-            return kept if is_kept else earlier
-
-        def compute(name: str) -> None:
-            if is_case(path := path_of(name), scenarios[name]):
-                return
+        def computed(name: str) -> Path:
+            """The file of a case, which is computed if no file contains it."""
+            for path in (home / place / f"{name}.nc" for place in (CASES, UNFINISHED)):
+                if is_case(path, scenarios[name]):
+                    return path
             with replacing(path) as partial:
                 write_netcdf(compute_case(scenarios[name]), partial)
+            return path
 
         names = list(scenarios)
-        engine.each(Tasks(compute, names, names), stages, "cases")
-        cases = {name: xr.load_dataset(path_of(name), engine="h5netcdf") for name in names}
-        return run.write(cases, stages)
+        paths = engine.each(Tasks(computed, names, names), stages, "cases")
+        kept = [xr.load_dataset(path, engine="h5netcdf") for path in paths]
+        return run.write(dict(zip(names, kept, strict=True)), stages)
 
 
 def _write_cases(cases: Cases, folder: Path) -> None:

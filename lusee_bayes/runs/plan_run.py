@@ -13,7 +13,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +26,6 @@ from lusee_bayes.core.harmonics import sum_over_m
 from lusee_bayes.core.linalg import invert_lower
 from lusee_bayes.core.progress import Stages
 from lusee_bayes.core.reading import naming, parse_yaml
-from lusee_bayes.core.version import __version__
 from lusee_bayes.experiment.instrument_sections import RunSection
 from lusee_bayes.experiment.model import model_about, set_up
 from lusee_bayes.experiment.rounds import Inference
@@ -37,9 +35,10 @@ from lusee_bayes.instrument.products import DataLayout, all_products
 from lusee_bayes.judge.measures import effective_resolution_deg, prior_fraction_per_ell
 from lusee_bayes.linear.posterior import Posterior
 from lusee_bayes.report.figures.plans import forecasts
+from lusee_bayes.results.finished_runs import text_hash
 from lusee_bayes.results.forecast import AS_GIVEN, Forecast, Variation, forecast_rows
 from lusee_bayes.runs.cost import duration, posterior_cost, require_fits
-from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, inputs_of, run_folder
+from lusee_bayes.runs.folder import Output, RunKind, RunOutcome, identity_of, inputs_of, run_folder
 from lusee_bayes.systematics.context import Around, Setup
 
 
@@ -281,8 +280,7 @@ def kept_forecast(folder: Path, variation: Variation) -> Forecast:
 
 def _digest(variation: Variation) -> str:
     """Digest of everything that determines a forecast."""
-    parts = [variation.scenario.to_yaml(), list(variation.lost), __version__]
-    return sha256(json.dumps(parts).encode()).hexdigest()[:32]
+    return identity_of(variation.scenario, variation.lost)
 
 
 def forecasts_of(
@@ -369,7 +367,7 @@ def run_plan(
         with naming(f"{v.source}, {v.family}, {v.name}"):
             require_fits(posterior_cost(v.scenario), v.scenario)
     scenarios = {f"{v.source}, {v.family}, {v.name}": v.scenario for v in variations}
-    digests = {name: sha256(s.to_yaml().encode()).hexdigest()[:12] for name, s in scenarios.items()}
+    digests = {name: text_hash(s.to_yaml())[:12] for name, s in scenarios.items()}
     inputs = [path for v in variations for path in inputs_of(v.scenario)]
     with run_folder(folder, PLAN, None, None, *inputs, replace=replace, **digests) as run:
         engine.work_in(run.path)

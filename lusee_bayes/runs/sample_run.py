@@ -91,9 +91,8 @@ def sample_together(
     with stages("posterior"):
         inferences = {name: infer(one) for name, one in experiments.items()}
     several = len(experiments) > 1
-    scenarios = [one.scenario.to_yaml() for one in experiments.values()]
     identity = {
-        "scenario": "---\n".join(scenarios),
+        "scenario": "---\n".join(one.scenario.to_yaml() for one in experiments.values()),
         "data": " ".join(one.data.digest() for one in experiments.values()),
         "program": program.name,
         "program text": program.digest,
@@ -109,7 +108,7 @@ def sample_together(
     for name, one in experiments.items():
         inference = inferences[name]
         arguments[name] = program.arguments(inference.model, program_pieces(one))
-        n_modes = inference.posterior.mean.shape[0]
+        n_modes = len(inference.posterior.mean)
         latent[name] = programs.require_sampleable(program, arguments[name], one.data.data, n_modes)
     data = {name: one.data.data for name, one in experiments.items()}
     first = next(iter(experiments))
@@ -306,41 +305,36 @@ def run_sample(
 
     given = {"replace": replace, "program": named(program)}
 
-    n_draws = sampler.chains * sampler.draws
+    def draw(
+        channels: Mapping[str, Scenario], folder: Path, stages: Stages
+    ) -> Sequence[SampleResult]:
+        experiments = {
+            name: measured_experiment(channel, data, stages, n_draws=sampler.chains * sampler.draws)
+            for name, channel in channels.items()
+        }
+        return sample_together(experiments, program, sampler, folder, resume=resume, stages=stages)
 
-    def one(channel: Scenario, folder: Path, stages: Stages) -> RunOutcome[SampleResult]:
+    def one(
+        channel: Scenario, folder: Path, stages: Stages, drawn: SampleResult | None = None
+    ) -> RunOutcome[SampleResult]:
+        """Write the folder of a channel; sample it, unless its draws are given."""
         with run_folder(folder, SAMPLE, channel, data, program.path, **given) as run:
-            experiment = measured_experiment(channel, data, stages, n_draws=n_draws)
-            (made,) = sample_together(
-                {"": experiment}, program, sampler, run.path, resume=resume, stages=stages
-            )
-            return run.write(made, stages, Provenance.of_experiment(experiment, data))
+            made = drawn or draw({"": channel}, run.path, stages)[0]
+            return run.write(made, stages, Provenance.of_experiment(made.experiment, data))
 
     folder, stages = user_path(folder), stages or Stages()
     if scenario.single:
         made = one(scenario, folder, stages)
         return replace_fields(made, result=(made.result,))
     channels = {f"{one.frequency_mhz:.15g}MHz": one for one in scenario.channels()}
+    treated = present(scenario)
+    together = any(k.octaves(one) for k, one in treated if k.treatment(scenario) == "sampled")
     with run_folder(folder, CUBES, scenario, data, program.path, **given) as run:
+        drawn = draw(channels, run.path, stages) if together else [None] * len(channels)
         runs = []
-        treated = present(scenario)
-        if any(k.octaves(one) for k, one in treated if k.treatment(scenario) == "sampled"):
-            experiments = {
-                name: measured_experiment(channel, data, stages, n_draws=n_draws)
-                for name, channel in channels.items()
-            }
-            drawn = sample_together(
-                experiments, program, sampler, run.path, resume=resume, stages=stages
-            )
-            for name, result in zip(channels, drawn, strict=True):
-                given_to = run.path / name, SAMPLE, channels[name], data, program.path
-                with run_folder(*given_to, **given) as channel_run:
-                    origin = Provenance.of_experiment(experiments[name], data)
-                    runs.append(channel_run.write(result, stages, origin))
-        else:
-            for name, channel in channels.items():
-                progress = Stages(stages.console, verbose=stages.verbose)
-                runs.append(one(channel, run.path / name, progress))
+        for (name, channel), made in zip(channels.items(), drawn, strict=True):
+            progress = stages if together else Stages(stages.console, verbose=stages.verbose)
+            runs.append(one(channel, run.path / name, progress, made))
         results = tuple(each.result for each in runs)
         runs.append(run.write((scenario, results), stages))
         return RunOutcome(results, run.path, [file for each in runs for file in each.files])

@@ -27,8 +27,7 @@ from lusee_bayes.instrument.waterfalls import write_waterfall
 from lusee_bayes.linear.linear_gaussian import Form, form_of
 from lusee_bayes.runs.cost import posterior_cost, simulation_cost
 from lusee_bayes.runs.plan_run import default_variations, expected_inference, forecast
-from lusee_bayes.testing import small_scenario
-from lusee_bayes.testing.contracts import assert_refused
+from lusee_bayes.testing import assert_refused, small_scenario
 
 STEP = 7200.0
 # from the stamps to the beginning of the windows

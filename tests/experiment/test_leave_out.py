@@ -14,7 +14,7 @@ from lusee_bayes.instrument.visibilities import Calibration
 from lusee_bayes.judge.plausibility import SIGNIFICANT, about_information, require_plausible
 from lusee_bayes.systematics.above_lmax import AboveLmaxSection
 from lusee_bayes.systematics.context import Around, noise_visibilities
-from lusee_bayes.testing.contracts import assert_refused
+from lusee_bayes.testing import assert_refused
 
 FALSE_ALARM = 1e-4
 

@@ -6,7 +6,7 @@ import pytest
 from lusee_bayes.flight import flags as fl
 from lusee_bayes.flight.bands import FRAME, ChannelBand, impulse_response, shared_noise
 from lusee_bayes.flight.session import AVERAGING, channel_mhz
-from lusee_bayes.testing.contracts import assert_refused
+from lusee_bayes.testing import assert_refused
 
 MHZ = channel_mhz("centre")
 FRAMES, ROWS = 2.0**20, 400

@@ -10,7 +10,7 @@ from lusee_bayes.flight.gain_model import GainModel, read_gain_table, write_gain
 from lusee_bayes.flight.session import OF_FLIGHT, channel_mhz
 from lusee_bayes.flight.synthesis import ChannelSpectra, bit_slices, rounded
 from lusee_bayes.instrument.products import to_matrix, to_real
-from lusee_bayes.testing.contracts import assert_refused
+from lusee_bayes.testing import assert_refused
 
 ANCHORS = np.array([0.1, 1.1, 5.1, 10.1, 20.1, 30.1, 50.1, 70.1])
 

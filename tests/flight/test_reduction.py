@@ -14,7 +14,7 @@ from lusee_bayes.flight.recipe import FlightSection, Recipe
 from lusee_bayes.flight.reduction import reduce_sessions
 from lusee_bayes.flight.session_files import read_session
 from lusee_bayes.instrument.products import auto_indices, labels
-from lusee_bayes.testing.contracts import assert_refused
+from lusee_bayes.testing import assert_refused
 
 F = (10.0, 25.0)
 

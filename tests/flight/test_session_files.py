@@ -22,7 +22,7 @@ from lusee_bayes.flight.clock import Clock, clock_of, read_clock
 from lusee_bayes.flight.session import FLIGHT_PRODUCTS, OF_FLIGHT, TELEMETRY
 from lusee_bayes.flight.session_files import SessionRows, read_session, write_session
 from lusee_bayes.instrument.products import labels
-from lusee_bayes.testing.contracts import assert_refused
+from lusee_bayes.testing import assert_refused
 
 
 @pytest.fixture

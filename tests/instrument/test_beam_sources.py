@@ -9,7 +9,7 @@ from assertions import refuse
 from lusee_bayes.instrument.beams.monopoles import Monopoles
 from lusee_bayes.instrument.beams.sampled import read_beam
 from lusee_bayes.instrument.beams.source import BeamSource
-from lusee_bayes.testing.contracts import check_beam_source
+from lusee_bayes.testing import check_beam_source
 
 FREQUENCY, LMAX, TURNED_DEG = 25.0, 6, 30.0
 

@@ -18,7 +18,7 @@ from lusee_bayes.instrument.pointing import Pointing
 from lusee_bayes.instrument.products import DataLayout, auto_indices, labels
 from lusee_bayes.systematics.beam import BeamError, InstrumentParameters
 from lusee_bayes.systematics.systematic import Unknown
-from lusee_bayes.testing.contracts import check_coupling
+from lusee_bayes.testing import check_coupling
 
 LMAX = 8
 SITE = {"lon_deg": 182.258, "lat_deg": -23.814}

@@ -21,7 +21,7 @@ from lusee_bayes.instrument.beams.grid import GridBeams, read_beam_grid, weights
 from lusee_bayes.instrument.beams.luseepy_files import read_response
 from lusee_bayes.instrument.beams.monopoles import Monopoles
 from lusee_bayes.instrument.products import all_products
-from lusee_bayes.testing.contracts import check_beam_source
+from lusee_bayes.testing import check_beam_source
 
 MHZ, LMAX = 10.0, 8
 NAMES, MIDDLE = ("surface_permittivity", "zenith_angle_deg"), (3.7, 75.0)

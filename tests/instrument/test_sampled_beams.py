@@ -18,8 +18,7 @@ from lusee_bayes.instrument.beams.monopoles import Monopoles, wavenumber
 from lusee_bayes.instrument.beams.sampled import from_uvbeam, read_beam, write_sampled_beams
 from lusee_bayes.instrument.products import labels, to_real
 from lusee_bayes.report.describe import describe
-from lusee_bayes.testing import small_scenario
-from lusee_bayes.testing.contracts import check_beam_source
+from lusee_bayes.testing import check_beam_source, small_scenario
 
 FREQUENCY, LMAX, NSIDE = 25.0, 4, 16
 THETA, PHI = healpy.pix2ang(NSIDE, np.arange(12 * NSIDE**2))

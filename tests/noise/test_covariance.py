@@ -15,7 +15,7 @@ import lusee_bayes as lb
 from lusee_bayes.instrument.products import DataLayout
 from lusee_bayes.noise import covariance, time_blocks
 from lusee_bayes.noise.instrument_errors import template_noise
-from lusee_bayes.testing.contracts import check_covariance, close
+from lusee_bayes.testing import check_covariance, close
 
 N_PRODUCTS, N_TIMES = 3, 4
 FLAGS = np.zeros((N_PRODUCTS, N_TIMES), dtype=bool)

@@ -20,7 +20,7 @@ from lusee_bayes.judge.residuals import residuals
 from lusee_bayes.priors.families import Hyperprior, IsotropicFamily, PriorFamily
 from lusee_bayes.priors.local_scales import embedded_local_scales, windows
 from lusee_bayes.sky.prior import DensePrior, IndependentPrior
-from lusee_bayes.testing.contracts import check_prior
+from lusee_bayes.testing import check_prior
 
 SPECTRUM = np.array([4.0, 1.0, 0.0, 0.25])  # nothing at ell = 2
 LMAX, NSIDE = 3, 2

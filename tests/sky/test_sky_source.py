@@ -17,7 +17,7 @@ from lusee_bayes.experiment.sky_sections import FileSkySection, GalaxySection
 from lusee_bayes.report.describe import describe
 from lusee_bayes.sky import sky_source as ss
 from lusee_bayes.sky.galaxy import BRIGHT_SOURCES
-from lusee_bayes.testing.contracts import assert_refused, check_sky_source
+from lusee_bayes.testing import assert_refused, check_sky_source
 
 NSIDE, LMAX = 16, 8
 # healpy's iterated quadrature of a map of NSIDE 16 without power above ell = 4, rms
