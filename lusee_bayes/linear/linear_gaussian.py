@@ -495,15 +495,12 @@ class Whitened(Form):
         W; in map space L^-1 A.
     lower : (rank, rank) array
         Cholesky factor of Lambda, or of Lambda_v if ``basis`` is given.
-    log_det : () array
-        ln|Lambda|.
     basis : (white, rank) array or None
         Q of the data-space form; None in map space.
     """
 
     whitened: Float[Array, "data white"]
     lower: Float[Array, "rank rank"]
-    log_det: Float[Array, ""]
     basis: Float[Array, "white rank"] | None
 
     @classmethod
@@ -519,8 +516,12 @@ class Whitened(Form):
 
     @staticmethod
     @abstractmethod
-    def _factorised(model: LinearGaussian) -> tuple[Factor, Array, Array, Array, Array | None]:
-        """L of N, W, L of Lambda, ln|Lambda|, and the basis."""
+    def _factorised(model: LinearGaussian) -> tuple[Factor, Array, Array, Array | None]:
+        """L of N, W, L of Lambda, and the basis."""
+
+    def _log_det(self) -> Float[Array, ""]:
+        """ln|Lambda|."""
+        return 2.0 * jnp.log(jnp.diagonal(self.lower)).sum()
 
     def seen(self, u: Float[Array, " white"]) -> DataVector:
         """Compute W u."""
@@ -556,7 +557,7 @@ class InMap(Whitened):
     def _factorised(model):
         factor = model.noise.factor()
         whitened = factor.whiten(model.coupling.dense())
-        return factor, whitened, *_root(model.prior.sandwich(gram_matrix(whitened))), None
+        return factor, whitened, _root(model.prior.sandwich(gram_matrix(whitened))), None
 
     def seen(self, u):
         return self.whitened @ self.model.prior.colour(u)
@@ -574,15 +575,29 @@ class InData(Whitened):
         factor = model.noise.factor()
         whitened = factor.whiten(model.prior.colour_columns(model.coupling.dense()))
         basis, triangle = jnp.linalg.qr(jax.lax.stop_gradient(whitened).T)
-        # |1 + W W^T|, since QR has no derivative at low rank
-        _, log_det = _root(gram_matrix(whitened.T))
-        return factor, whitened, _root(triangle @ triangle.T)[0], log_det, basis
+        return factor, whitened, _root(triangle @ triangle.T), basis
+
+    def _log_det(self):
+        return _log_det_in_span(self.whitened, jax.lax.stop_gradient(self.lower))
 
 
-def _root(normal: Array) -> tuple[Array, Array]:
-    """L of 1 + M = L L^T, and ln|1 + M|."""
-    lower = jax.lax.linalg.cholesky(normal + jnp.eye(len(normal)), symmetrize_input=False)
-    return lower, 2.0 * jnp.log(jnp.diagonal(lower)).sum()
+def _root(normal: Array) -> Array:
+    return jax.lax.linalg.cholesky(normal + jnp.eye(len(normal)), symmetrize_input=False)
+
+
+@jax.custom_jvp
+def _log_det_in_span(whitened: Array, lower: Array) -> Array:
+    """ln|1 + W W^T| from the data-space form, whose QR has no derivative at low rank."""
+    return 2.0 * jnp.log(jnp.diagonal(lower)).sum()
+
+
+@_log_det_in_span.defjvp
+def _log_det_in_span_jvp(primals, tangents):
+    """d ln|1 + W W^T| = 2 sum( (1 + W W^T)^-1 W * dW )."""
+    whitened, lower = primals
+    gram_of_data = jnp.eye(whitened.shape[0]) + whitened @ whitened.T
+    slope = jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(gram_of_data), True), whitened)
+    return _log_det_in_span(whitened, lower), 2.0 * (slope * tangents[0]).sum()
 
 
 def _newton(solver: Whitened, white: Array, u: Array) -> tuple[Array, Array]:
@@ -627,7 +642,7 @@ def _solve(solver: Whitened, data: DataVector) -> tuple[Array, Array, Array]:
         misfit @ misfit
         + u @ u
         + solver.factor.log_det()
-        + solver.log_det
+        + solver._log_det()
         + white.shape[0] * np.log(2.0 * np.pi)
     )
     # so far, u was the sky's deviation from the prior's mean
