@@ -142,8 +142,9 @@ def describe_folder(folder: Path) -> list[str]:
             "folder of a finished run"
         )
     lines = [f"results of lusee-bayes {manifest['kind']}"]
-    facts = resolve_name("lusee_bayes.results.finished_runs:Provenance").read(folder)
-    if facts is not None:
+    provenance = "lusee_bayes.results.finished_runs:Provenance"
+    if "provenance.json" in manifest["files"]:
+        facts = resolve_name(provenance).read(folder)
         lines += [
             f"data: {facts.data_line()}",
             f"{facts.first} to {facts.last} UTC, {facts.n_times} times, site {facts.lon_deg:g}, "

@@ -67,8 +67,7 @@ def map_page(folder: Path, name: str) -> str:
 
 def _regions(run: FinishedRun) -> list[tuple[str, ChiSquare]]:
     """chi^2 of each region's spectrum; empty for one channel and unless the truth is known."""
-    known = all(c.truth is not None and c.temperatures is not None for c in run.channels)
-    if len(run.channels) == 1 or not known:
+    if len(run.channels) == 1 or any(channel.truth is None for channel in run.channels):
         return []
     spectrum = run.sky_spectrum()
     return [(region, spectrum.chi2(region)) for region in spectrum.regions]
@@ -199,10 +198,8 @@ def write_report(folder: str | Path) -> Path:
     if not os.path.isdir(folder):
         raise InputError(f"'{folder}' is not a folder; give the folder of a finished run")
     recover(folder)
-    manifest, old = read_manifest(folder), {"samples.nc": "sample", "posterior.nc": "map"}
-    # folders of earlier versions have no manifest
-    guessed = [kind for name, kind in old.items() if (folder / name).is_file()]
-    kind = manifest["kind"] if manifest is not None else next(iter(guessed), None)
+    manifest = read_manifest(folder)
+    kind = manifest and manifest["kind"]
     if kind not in PAGES:
         raise InputError(
             f"'{folder}' has no results of lusee-bayes map, sample, validate or compare-priors; "

@@ -21,7 +21,7 @@ from markupsafe import Markup
 from lusee_bayes.core.checks import counted
 from lusee_bayes.core.files import require_files
 from lusee_bayes.core.reading import read_text
-from lusee_bayes.core.version import __version__, printable
+from lusee_bayes.core.version import printable
 from lusee_bayes.judge.chi2 import HEADLINES, RULE, probability
 from lusee_bayes.judge.convergence import CRITERIA
 from lusee_bayes.results.finished_runs import Provenance, text_hash
@@ -151,7 +151,6 @@ def render_run(template: str, path: Path, run: Mapping[str, Any], **context: Any
         run=run,
         doubts=run.get("doubts", ()),
         provenance=Provenance.read(folder),
-        version=__version__,
         scenario=scenario,
         scenario_hash=text_hash(scenario)[:12],
         bytes_of={file.name: file.stat().st_size for file in folder.iterdir() if file.is_file()},

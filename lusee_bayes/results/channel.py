@@ -44,8 +44,8 @@ class Judged:
         The part of chi^2 that tests the prior.
     extremes, suspects : tuple of str
         Groups that stand out, and those without which the others fit.
-    predicted, z : (products, times) array
-        Data predicted by the mean map, in K, and z of each datum given all others; NaN if missing.
+    z : (products, times) array
+        z of each datum given all others; NaN if missing.
     groups : tuple of Group
         Products, days and turntable angles; empty if groups are not judged.
     """
@@ -55,7 +55,6 @@ class Judged:
     prior: ChiSquare
     extremes: tuple[str, ...]
     suspects: tuple[str, ...]
-    predicted: OnGrid = quantity("K", "visibilities of the mean map")
     z: OnGrid = quantity("1", "data minus prediction from all other data, in standard deviations")
     groups: tuple[Group, ...] = ()
 
@@ -246,8 +245,8 @@ class ChannelResult(ChannelData, Described):
         Receivers, ground and gain table, where the model has them.
     theta : InstrumentPosterior or None
         All unknowns of the instrument, and their effect on the map.
-    temperatures : RegionTemperatures or None
-        Of regions of the sky; None in files of earlier versions.
+    temperatures : RegionTemperatures
+        Of regions of the sky.
     """
 
     mean: SkyModes = quantity("K", "posterior mean")
@@ -267,7 +266,7 @@ class ChannelResult(ChannelData, Described):
     coverage: tuple[Coverage, ...] = ()
     unknowns: UnknownsReport | None = None
     theta: InstrumentPosterior | None = None
-    temperatures: RegionTemperatures | None = None
+    temperatures: RegionTemperatures
 
     def description(self) -> tuple[str, ...]:
         return (

@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, Int8
+from jaxtyping import Float, Int8
 
 from lusee_bayes.core import harmonics
 from lusee_bayes.core.arrays import Modes, ModesMatrix, Pixels
@@ -325,25 +325,19 @@ class Conditioned:
 
     def _judged(self, misfit: Residuals) -> Judged:
         """Describe the residuals, with the verdict in words."""
-        data = self.experiment.data
-        prior = self.from_all.model.prior
+        layout, prior = self.experiment.data.layout, self.from_all.model.prior
         expected = prior.variance() - np.diagonal(self.covariance)
         left, before = self.without_monopole
         moved = self.posterior.mean - prior.colour(prior.white_mean)
         strong = measures.strengths(moved, expected, before - left)
         fit = misfit.fit(measures.strengths_in_words(strong))
-
-        def on_grid(values: np.ndarray) -> np.ndarray:
-            return np.where(data.layout.present, data.layout.scatter(values), np.nan)
-
         return Judged(
             level=fit.level,
             verdict=fit.text,
             prior=misfit.split.prior,
             extremes=tuple(map(str, misfit.extremes())),
             suspects=tuple(map(str, misfit.suspects())),
-            predicted=on_grid(misfit.predicted),
-            z=on_grid(misfit.z),
+            z=np.where(layout.present, layout.scatter(misfit.z), np.nan),
             groups=misfit.groups,
         )
 
@@ -501,23 +495,11 @@ def packed_resolution(
     return np.rint(white / steps[np.ix_(ell, ell)]).astype(np.int8), steps, width
 
 
-def region_of(nside: int) -> Int[np.ndarray, " pixels"]:
-    """The region (HEALPix RING) that contains each pixel (RING)."""
-    n_regions = healpy.nside2npix(min(REGION_NSIDE, nside))
-    return healpy.ud_grade(np.arange(float(n_regions)), nside).astype(int)
-
-
 def region_rows(nside: int, lmax: int) -> Float[np.ndarray, "regions modes"]:
-    """Rows that average a map's pixels over each region."""
-    of = region_of(nside)
-    theta, phi = healpy.pix2ang(nside, np.arange(len(of)))
-    heights, ring = np.unique(theta, return_inverse=True)
-    # pixels of a region on one ring share lambda_l|m|(theta)
-    sums = np.zeros((of.max() + 1, len(heights), 2 * lmax + 1))
-    np.add.at(sums, (of, ring), harmonics.azimuth_functions(phi, lmax))
-    _, m = harmonics.mode_numbers(lmax)
-    polar, rows = harmonics.polar_functions(heights, lmax), np.empty((len(sums), len(m)))
-    for order, of_rings in enumerate(np.moveaxis(sums, -1, 0)):
-        mine = m + lmax == order
-        rows[:, mine] = of_rings @ polar[:, mine]
-    return rows / np.bincount(of)[:, None]
+    """Rows that average a map's pixels over each region, a coarse pixel in RING order."""
+    coarse = min(REGION_NSIDE, nside)
+    in_ring_order = healpy.ring2nest(coarse, np.arange(healpy.nside2npix(coarse)))
+    # in NESTED order, the pixels of a region follow one another
+    angles = np.stack(healpy.pix2ang(nside, np.arange(healpy.nside2npix(nside)), nest=True), axis=1)
+    regions = angles.reshape(len(in_ring_order), -1, 2)[in_ring_order]
+    return np.stack([harmonics.synthesis_matrix(*of.T, lmax).mean(0) for of in regions])

@@ -42,14 +42,15 @@ from lusee_bayes.results.summaries import MapSummary
 
 
 def cards(name: str, scenario: Scenario) -> dict[str, tuple]:
-    """Header cards of a result: content, frequency, beam, site and scenario.
+    """Header cards of a result: content, frequency if there is one, beam, site and scenario.
 
     Values are (value, comment), or (value,) for text that leaves no room for a comment.
     """
     beam, site = scenario.beam, scenario.observation
+    one = {"FREQ": (scenario.frequency_mhz, "frequency in MHz")} if scenario.single else {}
     return {
         "CONTENT": (name, "of the posterior over the sky"),
-        "FREQ": (scenario.frequency_mhz, "frequency in MHz"),
+        **one,
         "LMAX": (scenario.lmax, "highest ell included"),
         "FRAME": ("galactic", "of directions"),
         "BEAM": (beam.label, "the antennas"),
@@ -84,22 +85,28 @@ def write_map(
         Whether the pixel ever rose above the horizon: the third column, OBSERVED, 1 or 0.
     scenario : Scenario
     """
-    columns = [(name.upper(), pixels, np.float64, "K") for name, pixels in maps.items()]
-    columns.insert(2, ("OBSERVED", observed, np.uint8, ""))
-    names, values, dtypes, units = map(list, zip(*columns, strict=True))
-    extra = [(key, *value) for key, value in cards("maps", scenario).items()]
-    named = {"column_names": names, "column_units": units, "dtype": dtypes}
-    healpy.write_map(path, values, coord="G", extra_header=extra, **named)
+    columns = [(name, pixels, "K") for name, pixels in maps.items()]
+    columns.insert(2, ("observed", observed.astype(np.uint8), ""))
+    _write_columns(path, columns, cards("maps", scenario))
 
 
 def write_index_maps(path: Path, found: IndexMaps, scenario: Scenario) -> None:
     """Write maps of the spectral index as the columns of a HEALPix file."""
-    extra = [(key, *card) for key, card in cards("index", scenario).items() if key != "FREQ"]
-    extra.append(("FREQREF", found.reference_mhz, "frequency of the index in MHz"))
-    units = ["MHz" if name.startswith("turnover") else "" for name in found.maps]
-    named = {"column_names": [name.upper() for name in found.maps], "column_units": units}
-    named |= {"coord": "G", "extra_header": extra, "dtype": np.float64}
-    healpy.write_map(path, list(found.maps.values()), **named)
+    units = {"turnover": "MHz", "turnover_std": "MHz"}
+    columns = [(name, pixels, units.get(name, "")) for name, pixels in found.maps.items()]
+    reference = {"FREQREF": (found.reference_mhz, "frequency of the index in MHz")}
+    _write_columns(path, columns, cards("index", scenario) | reference)
+
+
+def _write_columns(
+    path: Path, columns: Sequence[tuple[str, np.ndarray, str]], header: Mapping[str, tuple]
+) -> None:
+    """Write a HEALPix file, RING and Galactic, from columns (name, pixels, unit)."""
+    names, pixels, units = zip(*columns, strict=True)
+    named = {"column_names": [name.upper() for name in names], "column_units": units}
+    extra = [(key, *card) for key, card in header.items()]
+    dtypes = [one.dtype for one in pixels]
+    healpy.write_map(path, pixels, coord="G", dtype=dtypes, extra_header=extra, **named)
 
 
 def write_cubes(
@@ -113,17 +120,17 @@ def write_cubes(
     Each file has one image (frequency, pixel), HEALPix RING, Galactic, K, float64. A table after it
     lists the frequencies, because the header can only give even steps.
     """
-    steps = np.diff(frequencies_mhz)
+    steps = np.diff(frequencies_mhz) if len(frequencies_mhz) > 1 else np.ones(1)
     for name, pixels in cubes.items():
         image = fits.PrimaryHDU(np.asarray(pixels, dtype=np.float64))
         header = image.header
-        header.update({k: card for k, card in cards(name, scenario).items() if k != "FREQ"})
+        header.update(cards(name, scenario))
         header["BUNIT"], header["COORDSYS"], header["ORDERING"] = "K", "G", "RING"
         header["NSIDE"] = scenario.map_nside
-        if not len(steps) or np.allclose(steps, steps[0], rtol=1e-9):
+        if np.allclose(steps, steps[0], rtol=1e-9):
             header["HIERARCH FREQ_START"] = (frequencies_mhz[0], "MHz")
             header["FREQ_END"] = (frequencies_mhz[-1], "MHz")
-            header["HIERARCH FREQ_STEP"] = (steps[0] if len(steps) else 1.0, "MHz")
+            header["HIERARCH FREQ_STEP"] = (steps[0], "MHz")
         column = fits.Column("FREQUENCY", "D", unit="MHz", array=frequencies_mhz)
         table = fits.BinTableHDU.from_columns([column], name="FREQUENCIES")
         fits.HDUList([image, table]).writeto(folder / f"{name}.fits")
@@ -396,15 +403,9 @@ class Provenance(BaseModel, frozen=True):
         return cls.of(experiment.scenario, times, data, known_sky=experiment.data.truth is not None)
 
     @classmethod
-    def read(cls, folder: Path) -> Provenance | None:
-        """Read what :meth:`write` wrote; None for a folder of an older version.
-
-        InputError if the file cannot be read.
-        """
-        path = folder / NAME
-        if not path.is_file():
-            return None
-        return read_model(path, cls, "the provenance of a run's results")
+    def read(cls, folder: Path) -> Provenance:
+        """Read what :meth:`write` wrote. InputError if the file is missing or cannot be read."""
+        return read_model(folder / NAME, cls, "the provenance of a run's results")
 
     def write(self, folder: Path) -> None:
         """Write provenance.json."""
@@ -421,15 +422,12 @@ class Provenance(BaseModel, frozen=True):
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """A finished map run: the name of its folder, its figures, and its channels.
-
-    ``provenance`` is None for a folder of an earlier version, which did not record it.
-    """
+    """A finished map run: the name of its folder, its figures, its channels, and its origin."""
 
     name: str
     summary: MapSummary
     channels: tuple[ChannelResult, ...]
-    provenance: Provenance | None
+    provenance: Provenance
 
     @property
     def channel(self) -> ChannelResult:
@@ -445,13 +443,13 @@ class FinishedRun:
         return "no truth" if self.channel.truth is None else f"> {lmax}"
 
     def sky_spectrum(self) -> SkySpectrum:
-        """The spectrum of the sky. InputError for one channel, or a run of an earlier version."""
+        """The spectrum of the sky. InputError for one channel."""
+        if len(self.channels) == 1:
+            raise InputError(
+                f"'{self.name}' has one frequency; make a map with --frequencies 5:50:1"
+            )
         temperatures = [channel.temperatures for channel in self.channels]
-        spectrum = SkySpectrum.of(self.summary.frequencies_mhz, temperatures)
-        if len(temperatures) == 1 or spectrum is None:
-            reason = "has one frequency" if len(temperatures) == 1 else "is of an earlier version"
-            raise InputError(f"'{self.name}' {reason}; make a map with --frequencies 5:50:1")
-        return spectrum
+        return SkySpectrum.of(self.summary.frequencies_mhz, temperatures)
 
     @classmethod
     def read(cls, folder: str | Path) -> FinishedRun:

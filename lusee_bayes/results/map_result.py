@@ -350,18 +350,17 @@ class MapResult(Described):
         same = set(JointSummary.model_fields) - set(named)
         return JointSummary(**named, **{name: getattr(joint, name) for name in same})
 
-    def sky_spectrum(self) -> SkySpectrum | None:
-        """Temperatures of regions of the sky; None for files of earlier versions."""
-        return SkySpectrum.of(
-            self.frequencies_mhz.tolist(), [c.temperatures for c in self.channels]
-        )
+    def sky_spectrum(self) -> SkySpectrum:
+        """Temperatures of regions of the sky."""
+        temperatures = [channel.temperatures for channel in self.channels]
+        return SkySpectrum.of(self.frequencies_mhz.tolist(), temperatures)
 
     def index_maps(self) -> IndexMaps | None:
         """Maps of the spectral index of a joint posterior; None for less than three channels."""
-        parts = [c.temperatures for c in self.channels]
-        if len(parts) < 3 or any(part is None or part.cells is None for part in parts):
+        if self.joint is None or len(self.channels) < 3:
             return None
-        return IndexMaps.of(self.frequencies_mhz, np.stack([part.cells for part in parts]))
+        cells = np.stack([channel.temperatures.cells for channel in self.channels])
+        return IndexMaps.of(self.frequencies_mhz, cells)
 
     def spectra(self) -> Table:
         """power_spectra.ecsv: a row for every channel and ell."""

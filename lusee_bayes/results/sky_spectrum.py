@@ -244,11 +244,9 @@ class SkySpectrum:
 
     @classmethod
     def of(
-        cls, frequencies_mhz: Sequence[float], channels: Sequence[RegionTemperatures | None]
-    ) -> SkySpectrum | None:
-        """Combine the temperatures of all channels; None if one lacks them (earlier versions)."""
-        if any(one is None for one in channels):
-            return None
+        cls, frequencies_mhz: Sequence[float], channels: Sequence[RegionTemperatures]
+    ) -> SkySpectrum:
+        """Combine the temperatures of all channels."""
         first = channels[0]
         std, common = np.stack([c.std for c in channels]), np.stack([c.common for c in channels])
         if len(first.draws):

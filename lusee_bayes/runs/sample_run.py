@@ -373,7 +373,6 @@ SAMPLE = RunKind(
         "ranks": lambda result: figures.ranks(result.quantities()),
         "energy": lambda result: figures.energy(result.tree["sample_stats"].dataset),
         "pairs": lambda result: figures.pairs(result.quantities()),
-        "against_analytic": lambda result: figures.against_analytic(result.tree),
     },
     unfinished=CHAINS,
     resume=RESUME,

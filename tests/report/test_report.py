@@ -18,7 +18,6 @@ from reference_linear import matrices
 import lusee_bayes as lb
 from lusee_bayes.core.harmonics import pixel_matrix
 from lusee_bayes.judge import left_out
-from lusee_bayes.results.channel_map import region_of
 from lusee_bayes.results.finished_runs import read_channels
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
@@ -90,7 +89,7 @@ def test_a_pixels_posterior_is_that_of_the_file(small_map):
     nside = channel.nside
     y = pixel_matrix(nside, 8)
     # regions are means of their pixels
-    of = region_of(nside)
+    of = healpy.ud_grade(np.arange(768.0), nside)
     rows = np.stack([y[of == region].mean(0) for region in (0, 300, 767)])
     std = np.sqrt(np.einsum("pi,ij,pj->p", rows, covariance, rows))
     for name, values in (("mean", rows @ mean), ("std", std)):
@@ -123,14 +122,11 @@ def test_a_page_of_many_channels_has_a_part_for_each(small_cube):
 
 
 @pytest.mark.parametrize("which", [MAP, CUBE, SAMPLED])
-@pytest.mark.parametrize("manifest", [True, False], ids=["manifest", "an older folder without"])
-def test_report_makes_a_page_anew(which, manifest, request, tmp_path, capsys, monkeypatch):
+def test_report_makes_a_page_anew(which, request, tmp_path, capsys, monkeypatch):
     # the title is the folder's name
     folder = request.getfixturevalue(which).folder
     mine = shutil.copytree(folder, tmp_path / folder.name)
     (mine / "report.html").unlink()
-    if not manifest:
-        (mine / "manifest.json").unlink()
     seen = []
     monkeypatch.setattr("webbrowser.open", seen.append)
     assert run("report", mine, "--open") == 0
@@ -142,7 +138,7 @@ def test_report_makes_a_page_anew(which, manifest, request, tmp_path, capsys, mo
 
 def test_what_has_no_report_is_told(tmp_path, capsys):
     assert "no results of" in refused(capsys, "report", tmp_path)
-    (tmp_path / "posterior.nc").write_text("")
+    (tmp_path / "manifest.json").write_text('{"kind": "map", "files": [], "discard": []}')
     assert "has no summary.json" in refused(capsys, "report", tmp_path)
     assert not (tmp_path / "report.html").exists()
 

@@ -275,16 +275,22 @@ def waterfall(result: MapResult) -> Figure | None:
 def calibration(reduced: Reduced) -> Figure:
     """Draw the gains with their errors, and the ratio of measured to expected noise.
 
-    For one band, points with error bars mark the gains at its frequency, and the two kinds of
-    scatter are side by side.
+    For one band, points with error bars mark the gains at its frequency.
     """
     figure, (left, right) = drawing.framed((12, 4.2), 1, 2)
     _gains(left, reduced)
-    _scatter(right, reduced)
     right.axhline(1.0, color=drawing.GREY, lw=0.8)
-    right.set(ylabel="scatter / radiometer noise", title="Measured / expected noise")
+    for values, colour, mark, name in (
+        (reduced.line_scatter, drawing.BLUE, "o", "channels about a smooth spectrum"),
+        (reduced.scatter, drawing.ORANGE, "s", "spectra about a smooth curve in time"),
+    ):
+        label = name if np.isfinite(values).any() else f"{name}: unknown"
+        style = {"color": colour, "label": label, "fillstyle": "none"}
+        right.plot(reduced.frequencies_mhz, values, mark, **style)
     ratios = np.concatenate([reduced.line_scatter, reduced.scatter, [1.0]])
-    right.set_ylim(0.0, 1.3 * float(np.nanmax(ratios)))
+    right.set(ylim=(0.0, 1.3 * float(np.nanmax(ratios))), ylabel="scatter / radiometer noise")
+    right.set(xlabel="frequency [MHz]", title="Measured / expected noise")
+    right.legend(frameon=False, fontsize=8)
     return figure
 
 
@@ -309,32 +315,6 @@ def _gains(left: Axes, reduced: Reduced) -> None:
     words = f"{100 * largest:.2g} % or better" if largest > 0.0 else "unknown"
     left.set(xlabel="frequency [MHz]", ylabel="counts for 1 nV²/Hz", title=f"Gain errors: {words}")
     left.legend(frameon=False, ncols=2, fontsize=8)
-
-
-def _scatter(right: Axes, reduced: Reduced) -> None:
-    kinds = (
-        (reduced.line_scatter, drawing.BLUE, "o", "channels about\na smooth spectrum"),
-        (reduced.scatter, drawing.ORANGE, "s", "spectra about\na smooth curve in time"),
-    )
-    alone = len(reduced.frequencies_mhz) == 1
-    for place, (values, colour, mark, name) in enumerate(kinds):
-        measured = np.isfinite(values).any()
-        if measured and alone:
-            right.plot([place], values, mark, ms=8, color=colour)
-            point = (place, values[0])
-            right.annotate(f"{values[0]:.3f}", point, (12, 8), textcoords="offset points")
-        elif measured:
-            style = {"color": colour, "label": name.replace("\n", " "), "fillstyle": "none"}
-            right.plot(reduced.frequencies_mhz, values, mark, **style)
-        elif alone:
-            right.text(place, 0.5, "unknown", ha="center", color=drawing.GREY)
-    if alone:
-        right.set_xticks(range(len(kinds)), [kind[-1] for kind in kinds])
-        right.set_xlim(-0.6, len(kinds) - 0.4)
-        return
-    right.set_xlabel("frequency [MHz]")
-    if right.get_legend_handles_labels()[0]:
-        right.legend(frameon=False, fontsize=8)
 
 
 def _days(reduced: Reduced) -> Float[np.ndarray, " rows"]:

@@ -329,8 +329,9 @@ def spectrum_figure(spectrum: SkySpectrum, tables: Sequence[Path] = ()) -> Figur
 
 def sky_spectrum(cube: MapResult) -> Panels | None:
     """Temperature of each region with error bars, and errors of the mean sky by source."""
-    if cube.single or (spectrum := cube.sky_spectrum()) is None:
+    if cube.single:
         return None
+    spectrum = cube.sky_spectrum()
     f = spectrum.frequency
     errors, lower = drawing.framed((5.6, 4.6))
     mean = 100.0 * spectrum.std[0] / spectrum.temperature[0]

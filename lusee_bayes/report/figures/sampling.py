@@ -18,7 +18,6 @@ from lusee_bayes.report.figures import drawing
 from lusee_bayes.results.sample_result import SampleResult
 from lusee_bayes.sampling.least import N_BINS
 from lusee_bayes.sampling.validation import Comparison, Ranks
-from lusee_bayes.systematics.systematic import SKY
 
 # style of a value for every mode
 DOTS = {"ls": "", "marker": ".", "ms": 3, "color": drawing.BLUE}
@@ -58,9 +57,6 @@ def pairs(quantities: Quantities) -> Figure:
     figure = _drawn(arviz_plots.plot_pair, "posterior", chosen, title, size, visuals=visuals)
     for axes in figure.axes:
         drawing.plain_ticks(axes, 3)
-        axes.tick_params(labelsize=8)
-        for label in (axes.xaxis.label, axes.yaxis.label):
-            label.set(text=label.get_text().replace(" [", "\n["), size=9)
     return figure
 
 
@@ -80,22 +76,6 @@ def _drawn(
     figure = plot(tree, backend="matplotlib", figure_kwargs=frame, **options).viz["figure"].item()
     figure.suptitle(title)
     pyplot.close(figure)
-    return figure
-
-
-def against_analytic(tree: xr.DataTree) -> Figure:
-    """Means and standard deviations of the sky's draws, compared with the analytic posterior."""
-    skies, constants = tree["posterior"][SKY].values, tree["constant_data"]
-    mean, std = constants["analytic_mean"].values, constants["analytic_std"].values
-    flat = skies.reshape(-1, skies.shape[-1])
-    figure, (left, right) = drawing.framed((11, 4), 1, 2)
-    left.plot((flat.mean(axis=0) - mean) / std, **DOTS)
-    left.axhline(0.0, color=drawing.GREY, lw=0.8)
-    left.set(xlabel="mode", ylabel="difference [standard deviations]", title="Means")
-    right.plot(flat.std(axis=0, ddof=1) / std, **DOTS)
-    right.axhline(1.0, color=drawing.GREY, lw=0.8)
-    right.set(xlabel="mode", ylabel="draws / analytic", title="Standard deviations")
-    figure.suptitle("Draws compared with the analytic posterior, mode by mode")
     return figure
 
 
