@@ -83,9 +83,8 @@ def compute_case(scenario: Scenario) -> xr.Dataset:
     spectra, maps = channel.spectra(), channel.maps()
     variances = data.layout.scatter(radiometer(setup).diagonal())
     grid = HemisphereGrid.gauss_legendre(*BEAM_NODES)
-    beams = np.abs(stokes_beam(setup.beam_source.fields(scenario.frequency_mhz, grid)))
+    beams = stokes_beam(setup.beam_source.fields(scenario.frequency_mhz, grid))[0, [0, 2, 1]]
     rms = channel.beam_rms_difference
-    beams = np.stack([beams[0, 0], beams[0, 2], beams[0, 1]]).astype(np.float32)
     units = {"rho": "1", "snr": "1", "cl_mean": "K2", "cl_truth": "K2"}
     grid_of_data, kelvin, angle = ("product", "time"), {"units": "K"}, {"units": "rad"}
     variables = {
@@ -95,7 +94,7 @@ def compute_case(scenario: Scenario) -> xr.Dataset:
         "highest_altitude": ("pixel", channel.highest_altitude, {"units": "1"}),
         "data": (grid_of_data, data.grid(), kelvin),
         "noise_std": (grid_of_data, np.sqrt(np.asarray(variances)), kelvin),
-        "beam": (("pattern", "theta", "phi"), beams, {"units": "1"}),
+        "beam": (("pattern", "theta", "phi"), np.abs(beams).astype(np.float32), {"units": "1"}),
     }
     coords = {
         "ell": np.arange(scenario.lmax + 1),

@@ -17,7 +17,6 @@ from jaxtyping import Bool, Float, Shaped
 from lusee_bayes.core.lazy import healpy
 from lusee_bayes.core.reading import parse_yaml, read_yaml
 from lusee_bayes.instrument.beams.fields import HemisphereGrid
-from lusee_bayes.judge.measures import ell_cross
 
 Cases = Mapping[str, xr.Dataset]
 # the cases by name: their scenarios, and their labels in figures
@@ -52,8 +51,7 @@ def bands(cases: Cases, frequencies: tuple[int, ...] = FREQUENCIES) -> list[xr.D
 
 def cross(case: xr.Dataset) -> int:
     """First ell >= 1 with SNR < 1; lmax + 1 if there is none."""
-    first = ell_cross(case["snr"].values)
-    return case.sizes["ell"] if first is None else first
+    return first_below(case["snr"].values, 1.0)
 
 
 def first_below(values: Float[np.ndarray, " ells"], level: float) -> int:

@@ -142,15 +142,17 @@ def number_of_tick(value: float) -> str:
     return f"{float(mantissa):g}e{int(power)}"
 
 
-def side_by_side(axes: Axes, products: Sequence[str], n_times: int) -> None:
-    """Label axes with products side by side, time running within each."""
-    starts = n_times * np.arange(len(products))
+def side_by_side(axes: Axes, data: Float[np.ndarray, "n times"], products: Sequence[str]) -> None:
+    """Draw products side by side, time running within each."""
+    n_times = data.shape[1]
+    starts = np.arange(0, data.size, n_times)
+    axes.plot(data.ravel(), color=BLUE, lw=0.7)
     for start in starts:
         axes.axvline(start, color=GREY, lw=0.4)
     axes.set_xticks(starts + 0.5 * n_times, products, fontsize=8)
     axes.tick_params(axis="x", length=0)
     axes.set(xlabel="product (time runs within each)", ylabel="visibility [K]")
-    axes.set_xlim(0, n_times * len(products))
+    axes.set_xlim(0, data.size)
 
 
 def orthographic(axes: Axes, grid: HemisphereGrid, pattern: Float[np.ndarray, "theta phi"]):

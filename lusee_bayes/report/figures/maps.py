@@ -39,8 +39,7 @@ def data_vector(result: MapResult) -> Figure | None:
         return None
     channel = result.channel
     figure, (axes,) = drawing.in_places((11, 4), left=0.08, right=0.99, bottom=0.13, top=0.91)
-    axes.plot(channel.data.ravel(), color=BLUE, lw=0.7)
-    drawing.side_by_side(axes, channel.labels, len(channel.hours))
+    drawing.side_by_side(axes, channel.data, channel.labels)
     missing = f", {channel.n_missing} missing" if channel.n_missing else ""
     samples = f"{channel.n_data} samples{missing}"
     axes.set_title(f"Data vector at {channel.frequency_mhz:g} MHz, {samples}")
