@@ -123,7 +123,8 @@ def describe_samples(path: Path) -> list[str]:
     ]
 
 
-FIGURES = ("summary.json", "sampling.json", "priors.json")
+# the files that contain a verdict
+VERDICTS = ("summary.json", "priors.json")
 
 
 def describe_folder(folder: Path) -> list[str]:
@@ -152,10 +153,11 @@ def describe_folder(folder: Path) -> list[str]:
             f"up to ell = {facts.lmax}; made {facts.made} UTC by lusee_bayes {facts.version}",
         ]
         lines += [f"command: {facts.command}"] if facts.command else []
-    for name in FIGURES:
-        if (folder / name).is_file():
-            figures = read_model(folder / name, dict, "the figures of a run")
-            lines += [str(figures["verdict"])] if "verdict" in figures else []
+    for name in VERDICTS:
+        if name in manifest["files"]:
+            lines.append(
+                str(read_model(folder / name, dict, "the figures of a run").get("verdict"))
+            )
     return [*lines, f"files: {', '.join(sorted(manifest['files']))}"]
 
 

@@ -223,9 +223,10 @@ class Conditioned:
     def result(self, data: ChannelData, stages: Stages | None = None) -> ChannelResult:
         """The channel's result under this posterior."""
         with (stages or Stages())("standard deviations"):
-            given = (data, self.posterior.mean, self.covariance, self.draws, self.log_likelihood())
+            given = data, self.posterior.mean, self.covariance, self.compared()
             more = {"pixels": self.pixel_std, "instrument": self.unknowns, **self.figures()}
-            made = channel_result(*given, self.compared(), **more)
+            more |= {"draws": self.draws, "log_likelihood": self.log_likelihood()}
+            made = channel_result(*given, **more)
             if not self.onto or made.unknowns is None:
                 return made
             alone = self.from_data.solution
@@ -346,8 +347,6 @@ def channel_result(
     data: ChannelData,
     mean: Modes,
     covariance: ModesMatrix,
-    draws: Float[np.ndarray, "n modes"],
-    log_likelihood: Float[np.ndarray, " n"],
     compared: Float[np.ndarray, "more modes"] | None = None,
     *,
     pixels: Pixels | None = None,
@@ -366,10 +365,6 @@ def channel_result(
         The channel's own data.
     mean, covariance : (modes,) and (modes, modes) array
         In K and K^2.
-    draws : (n, modes) array
-        In K.
-    log_likelihood : (n,) array
-        For each of the draws.
     compared : (more, modes) array, optional
         Draws minus mean for :class:`.Counts`, in K, if the truth is known.
     pixels : (pixels,) array, optional
@@ -383,7 +378,7 @@ def channel_result(
     covariance_kept : bool
         Keep the covariance with the result.
     information_bits, **figures
-        Other attributes of :class:`.ChannelResult`: ``chi2``, ``log_evidence``, ``independent`` ...
+        Other attributes of :class:`.ChannelResult`: ``chi2``, ``draws``, ``log_likelihood`` ...
     """
     mean, covariance = np.asarray(mean), np.asarray(covariance)
     width, held, variance = pixels, (), np.diagonal(covariance)
@@ -406,8 +401,6 @@ def channel_result(
         std=np.sqrt(variance),
         prior_fraction=harmonics.mean_over_m(share),
         pixel_std=width,
-        draws=np.asarray(draws),
-        log_likelihood=np.asarray(log_likelihood),
         covariance=covariance if covariance_kept else None,
         information_bits=information_bits,
         coverage=held,

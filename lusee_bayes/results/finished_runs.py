@@ -145,8 +145,8 @@ def posterior_tree(result: MapResult) -> xr.DataTree:
     """
     scenario, joint, channels = result.scenario, result.joint, result.channels
     ell, m = mode_numbers(scenario.lmax)
-    named = {"independent_mean": "independent", **{n: n for n in ("mean", "std", "prior_std")}}
-    skies = {name: result.stacked(kept) for name, kept in (*named.items(), ("truth", "truth"))}
+    skies = {name: result.stacked(name) for name in ("mean", "std", "prior_std", "truth")}
+    skies["independent_mean"] = result.stacked("independent")
     on_modes, kelvin = ("frequency", "mode"), {"units": "K"}
     variables = {n: (on_modes, values, kelvin) for n, values in skies.items() if values is not None}
     covariance = result.stacked("covariance")

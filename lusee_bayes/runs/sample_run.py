@@ -371,7 +371,6 @@ SAMPLE = RunKind(
         "uncertainty": figures.uncertainty,
         "traces": figures.traces,
         "ranks": lambda result: figures.ranks(result.quantities()),
-        "energy": lambda result: figures.energy(result.tree["sample_stats"].dataset),
         "pairs": lambda result: figures.pairs(result.quantities()),
     },
     unfinished=CHAINS,

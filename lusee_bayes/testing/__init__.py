@@ -162,9 +162,7 @@ def assert_refused(call: Callable[[], object]) -> None:
     try:
         call()
     except InputError as error:
-        message = str(error)
-        assert message
-        assert "\n" not in message
+        assert str(error) and "\n" not in str(error)
     else:
         raise AssertionError("expected an InputError")
 

@@ -224,7 +224,7 @@ def test_sample_writes_what_it_promises(runs):
     files = "samples.nc summary.csv map.fits scenario.yaml sampling.json report.html figures "
     files += "manifest.json provenance.json"
     assert {p.name for p in whole.iterdir()} == set(files.split())
-    figures = {"uncertainty", "traces", "ranks", "energy", "pairs"}
+    figures = {"uncertainty", "traces", "ranks", "pairs"}
     drawn = list((whole / "figures").iterdir())
     assert {re.sub("uncertainty_[1-4]_.*", "uncertainty", p.stem) for p in drawn} == figures
     assert_drawn(*drawn)

@@ -7,7 +7,6 @@ from collections.abc import Callable
 import arviz_base
 import arviz_plots
 import numpy as np
-import xarray as xr
 from jaxtyping import Float
 from matplotlib import pyplot
 from matplotlib.colors import Normalize
@@ -38,14 +37,7 @@ def ranks(quantities: Quantities) -> Figure:
     chosen = dict(list(quantities.items())[:N_RANKS])
     size = (12, 2.6 * ((len(chosen) + 3) // 4) + 0.4)
     title = "Ranks among the draws of all chains, one curve per chain"
-    return _drawn(arviz_plots.plot_rank, "posterior", chosen, title, size)
-
-
-def energy(statistics: xr.Dataset) -> Figure:
-    """Energies of the draws about their mean, their changes from draw to draw, and BFMI."""
-    energies = {"energy": statistics["energy"].values}
-    title = "Energies (BFMI below 0.3: chains move slowly)"
-    return _drawn(arviz_plots.plot_energy, "sample_stats", energies, title, (11, 3.6))
+    return _drawn(arviz_plots.plot_rank, chosen, title, size)
 
 
 def pairs(quantities: Quantities) -> Figure:
@@ -54,7 +46,7 @@ def pairs(quantities: Quantities) -> Figure:
     side = 2.2 * len(chosen) + 0.6
     visuals = {"scatter": {"alpha": 0.3}, "divergence": False}
     size, title = (side, side), "Pairs of quantities"
-    figure = _drawn(arviz_plots.plot_pair, "posterior", chosen, title, size, visuals=visuals)
+    figure = _drawn(arviz_plots.plot_pair, chosen, title, size, visuals=visuals)
     for axes in figure.axes:
         drawing.plain_ticks(axes, 3)
     return figure
@@ -62,7 +54,6 @@ def pairs(quantities: Quantities) -> Figure:
 
 def _drawn(
     plot: Callable[..., arviz_plots.PlotCollection],
-    group: str,
     quantities: Quantities,
     title: str,
     size: drawing.Size,
@@ -71,7 +62,7 @@ def _drawn(
     """ArviZ's figure, closed in pyplot; a note if there are too few draws."""
     if any(x.shape[1] < FEWEST or not (np.ptp(x, axis=1) > 0).all() for x in quantities.values()):
         return drawing.note(title, TOO_FEW)
-    tree = arviz_base.from_dict({group: quantities})
+    tree = arviz_base.from_dict({"posterior": quantities})
     frame = {"layout": "constrained", "figsize": size}
     figure = plot(tree, backend="matplotlib", figure_kwargs=frame, **options).viz["figure"].item()
     figure.suptitle(title)
@@ -85,30 +76,25 @@ def uncertainty(run: SampleResult) -> Figure | dict[str, Figure]:
     if run.skies.shape[0] * run.skies.shape[1] < 2:
         why = "not drawn: a single draw has no standard deviation"
         return drawing.note("Uncertainty of the drawn maps", why)
-    level = maps["mean"].mean()
     width = maps["upper"] - maps["lower"]
-    spread, interval = 100.0 * maps["std"] / level, 100.0 * width / level
     excess = maps["upper"] + maps["lower"] - 2.0 * maps["mean"]
     # identical draws have no width, and no asymmetry
     skewness = np.divide(excess, width, out=np.zeros_like(width), where=width > 0)
     limit = np.percentile(np.abs(skewness), 99.0)
-    percent, chance = "% of the mean sky", "fraction of the width"
-    skewed = "asymmetry of the 90 % interval about the mean"
-    signed, kelvin = Normalize(-limit, limit), drawing.temperatures(maps["mean"])
-    panels = [
-        ("mean of the draws", maps["mean"], kelvin, drawing.SEQUENTIAL, "K"),
-        ("standard deviation", spread, _range(spread), drawing.SEQUENTIAL, percent),
-        ("width of the 90 % interval", interval, _range(interval), drawing.SEQUENTIAL, percent),
-        (skewed, skewness, signed, drawing.DIVERGING, chance),
-    ]
+    skewed = Normalize(-limit, limit), drawing.DIVERGING, "fraction of the width"
+    panels = {"mean of the draws": (maps["mean"], drawing.temperatures(maps["mean"]))}
+    for title, kelvin in {
+        "standard deviation": maps["std"],
+        "width of the 90 % interval": width,
+    }.items():
+        percent = 100.0 * kelvin / maps["mean"].mean()
+        scale = Normalize(*np.percentile(percent, [0.5, 99.5]))
+        panels[title] = percent, scale, drawing.SEQUENTIAL, "% of the mean sky"
+    panels["asymmetry of the 90 % interval about the mean"] = skewness, *skewed
     return {
         title: drawing.sky_figure(title, *panel, altitude=run.highest_altitude)
-        for title, *panel in panels
+        for title, panel in panels.items()
     }
-
-
-def _range(values: Float[np.ndarray, " pixels"]) -> Normalize:
-    return Normalize(*np.percentile(values, [0.5, 99.5]))
 
 
 def traces(run: SampleResult) -> Figure:
